@@ -1,0 +1,1 @@
+"""Linear and multilinear algebra that the invariants stand on: knows tensors only, nothing of cameras or people."""

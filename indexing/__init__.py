@@ -1,0 +1,25 @@
+"""Learn actions from one to a few example clips and find them in other clips, from other viewpoints, by other people."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from indexing.clip import Clip as Clip
+    from indexing.clip import ClipSet as ClipSet
+    from indexing.indexer import ActionIndexer as ActionIndexer
+    from indexing.scoring import Event as Event
+
+_HOME = {"Clip": "indexing.clip", "ClipSet": "indexing.clip", "ActionIndexer": "indexing.indexer", "Event": "indexing.scoring"}
+__all__ = sorted(_HOME)
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOME:
+        return getattr(import_module(_HOME[name]), name)
+    raise AttributeError(f"module 'indexing' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return __all__

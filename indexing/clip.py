@@ -1,0 +1,298 @@
+"""Clip and ClipSet: the only data types of ``indexing``.
+
+A clip is one recording of one person: joints over time, in the units they were measured in.  It holds what was seen and
+nothing else: missing joints are NaN, times are seconds, and no value is invented here (interpolation happens in
+:mod:`indexing.windows`, on a copy).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, cast, overload
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from indexing.skeleton import Skeleton
+
+FloatArray = NDArray[np.floating[Any]]
+UP_AXES = ("y", "-y", "z", "-z")
+
+
+@dataclass(frozen=True, eq=False)
+class Clip:
+    """One person's joints over time.
+
+    Args:
+        joints: ``(frames, joints, 2 | 3)``; pixels, metres or any unit.  NaN (in any coordinate) = joint not seen.
+        times: ``(frames,)`` seconds, strictly increasing.  Default: ``arange(frames) / fps``.
+        confidence: ``(frames, joints)`` as the detector gave it; kept, and NaN only where the joint is NaN.
+        fps: frame rate used where ``times`` is not given (30 by default, and then ``fps_assumed`` is true).
+        label: the action, if known.
+        name: what to call the clip in messages and reports (usually the file's name).
+        skeleton: joint names and bones, where known (pictures, joint matching).
+        up: the direction that points up in the scene: ``"y"`` (default), ``"-y"`` (image coordinates, where y points down),
+            ``"z"`` or ``"-z"`` (3D only).  Every reader of pixel files sets ``"-y"``.
+        meta: whatever else is known of the clip: subject, view, trial, split...
+
+    Raises:
+        ValueError: shapes do not fit, times are not increasing, or ``up`` is unknown.
+
+    Example:
+        >>> import numpy as np
+        >>> clip = Clip(np.zeros((4, 17, 2)), fps=25.0)
+        >>> clip.times.tolist(), clip.duration
+        ([0.0, 0.04, 0.08, 0.12], 0.12)
+    """
+
+    joints: FloatArray
+    times: FloatArray = None  # type: ignore[assignment]  # filled from fps in __post_init__
+    confidence: FloatArray | None = None
+    fps: float | None = None
+    label: Hashable | None = None
+    name: str = ""
+    skeleton: Skeleton | None = None
+    up: str = "y"
+    meta: Mapping[str, Any] = field(default_factory=dict)
+    fps_assumed: bool = False
+
+    def __post_init__(self) -> None:
+        who = f"clip {self.name!r}" if self.name else "clip"
+        joints = _float_array(self.joints, f"{who}: joints")
+        if joints.ndim != 3 or joints.shape[2] not in (2, 3):
+            raise ValueError(
+                f"{who}: joints must be (frames, joints, 2 or 3), got shape {joints.shape}; "
+                "one clip is one person, several clips are a list"
+            )
+        if joints.shape[0] == 0 or joints.shape[1] == 0:
+            raise ValueError(f"{who}: joints is empty (shape {joints.shape}); a clip needs at least one frame and one joint")
+        if np.isinf(joints).any():
+            raise ValueError(f"{who}: joints contains infinite values; mark missing joints with NaN")
+        assumed = self.fps_assumed
+        if cast("FloatArray | None", self.times) is None:
+            fps = 30.0 if self.fps is None else self.fps
+            assumed = assumed or self.fps is None
+            if not (np.isfinite(fps) and fps > 0):
+                raise ValueError(f"{who}: fps must be a positive number of frames per second, got {self.fps!r}")
+            times = np.arange(len(joints)) / fps
+        else:
+            times = _float_array(self.times, f"{who}: times").astype(np.float64)
+            _check_times(times, len(joints), who)
+            fps = self.fps if self.fps is not None else _rate(times)
+        confidence = self.confidence
+        if confidence is not None:
+            confidence = _float_array(confidence, f"{who}: confidence")
+            if confidence.shape != joints.shape[:2]:
+                raise ValueError(f"{who}: confidence must be (frames, joints) = {joints.shape[:2]}, got {confidence.shape}")
+            seen = ~np.isnan(joints).any(axis=2)
+            if np.isnan(confidence[seen]).any():
+                at = np.argwhere(np.isnan(confidence) & seen)[0]
+                raise ValueError(
+                    f"{who}: confidence is NaN at frame {at[0]}, joint {at[1]}, though the joint has coordinates; "
+                    "give 0 for a joint that is not trusted, or NaN coordinates for one that was not seen"
+                )
+        if self.up not in UP_AXES or (self.up.endswith("z") and joints.shape[2] == 2):
+            raise ValueError(f"{who}: up must be one of {UP_AXES} (z only for 3D joints), got {self.up!r}")
+        if self.skeleton is not None and len(self.skeleton.joints) != joints.shape[1]:
+            raise ValueError(
+                f"{who}: the skeleton {self.skeleton.name!r} has {len(self.skeleton.joints)} joints, the data {joints.shape[1]}"
+            )
+        final = {"joints": joints, "times": times, "confidence": confidence, "fps": fps, "fps_assumed": assumed}
+        for key, value in final.items():
+            object.__setattr__(self, key, value)
+
+    def __len__(self) -> int:
+        return len(self.joints)
+
+    def __repr__(self) -> str:
+        frames, joints, dims = self.joints.shape
+        label = f", label={self.label!r}" if self.label is not None else ""
+        return f"Clip({self.name!r}{label}, {frames} frames x {joints} joints x {dims}D, {self.duration:.2f} s)"
+
+    @property
+    def dims(self) -> int:
+        """2 or 3."""
+        return int(self.joints.shape[2])
+
+    @property
+    def duration(self) -> float:
+        """Seconds from the first frame to the last."""
+        return float(self.times[-1] - self.times[0])
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """``(frames, joints)``: which joints have coordinates."""
+        return np.asarray(~np.isnan(self.joints).any(axis=2))
+
+    def between(self, start: float, end: float) -> Clip:
+        """The frames with ``start <= time <= end`` (seconds, on the clip's own clock).
+
+        Raises:
+            ValueError: no frame lies in the interval.
+        """
+        keep = (self.times >= start) & (self.times <= end)
+        if not keep.any():
+            raise ValueError(
+                f"clip {self.name!r}: no frame between {start} s and {end} s; it runs from {self.times[0]:g} s to {self.times[-1]:g} s"
+            )
+        return dataclasses.replace(
+            self,
+            joints=self.joints[keep],
+            times=self.times[keep],
+            confidence=None if self.confidence is None else self.confidence[keep],
+        )
+
+    def replace(self, **changes: Any) -> Clip:
+        """A copy with the named fields changed."""
+        return dataclasses.replace(self, **changes)
+
+    @classmethod
+    def load(cls, path: str | Path, **options: Any) -> Clip:
+        """Read one clip from a keypoint file or folder; see :func:`indexing.readers.read_clip`."""
+        from indexing.readers import read_clip
+
+        return read_clip(path, **options)
+
+
+class ClipSet(Sequence[Clip]):
+    """A list of clips that can be selected by what is known of them.
+
+    Example:
+        >>> import numpy as np
+        >>> clips = ClipSet([Clip(np.zeros((5, 3, 2)), label="walk", meta={"view": v}) for v in (1, 2, 3)])
+        >>> len(clips.select(view=[1, 2])), clips.labels.tolist()
+        (2, ['walk', 'walk', 'walk'])
+    """
+
+    def __init__(self, clips: Iterable[Clip], name: str = "") -> None:
+        self.clips: tuple[Clip, ...] = tuple(clips)
+        self.name = name
+
+    @overload
+    def __getitem__(self, index: int) -> Clip: ...
+
+    @overload
+    def __getitem__(self, index: slice | Sequence[int] | NDArray[Any]) -> ClipSet: ...
+
+    def __getitem__(self, index: int | slice | Sequence[int] | NDArray[Any]) -> Clip | ClipSet:
+        if isinstance(index, (int, np.integer)):
+            return self.clips[index]
+        if isinstance(index, slice):
+            return ClipSet(self.clips[index], self.name)
+        chosen = np.asarray(index)
+        if chosen.dtype == bool:
+            if len(chosen) != len(self):
+                raise ValueError(f"clip set {self.name!r}: a mask of {len(chosen)} values cannot select from {len(self)} clips")
+            chosen = np.flatnonzero(chosen)
+        return ClipSet((self.clips[int(i)] for i in chosen), self.name)
+
+    def __len__(self) -> int:
+        return len(self.clips)
+
+    def __iter__(self) -> Iterator[Clip]:
+        return iter(self.clips)
+
+    def __repr__(self) -> str:
+        return f"ClipSet({self.name!r}, {len(self)} clips, fields: {', '.join(self.fields) or 'none'})"
+
+    @property
+    def labels(self) -> NDArray[Any]:
+        """``(clips,)`` the actions; ``None`` where unknown."""
+        values = [clip.label for clip in self.clips]
+        if any(value is None for value in values):
+            out = np.empty(len(values), dtype=object)
+            out[:] = values
+            return out
+        return np.asarray(values)
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Names that :meth:`select` and :meth:`column` accept."""
+        names: dict[str, None] = {}
+        for clip in self.clips:
+            names.update(dict.fromkeys(clip.meta))
+        return tuple(names)
+
+    def column(self, name: str) -> NDArray[Any]:
+        """``(clips, ...)`` one field of every clip; ``"action"`` or ``"label"`` gives the labels.
+
+        Raises:
+            ValueError: the field is unknown to some clip; the message lists the known ones.
+        """
+        if name in ("action", "label") and name not in self.fields:
+            return self.labels
+        missing = [i for i, clip in enumerate(self.clips) if name not in clip.meta]
+        if missing or not self.clips:
+            raise ValueError(f"clip set {self.name!r}: no field {name!r}; known fields: {', '.join(self.fields) or 'none'}")
+        return np.asarray([clip.meta[name] for clip in self.clips])
+
+    def select(self, **criteria: Any) -> ClipSet:
+        """The clips whose fields equal the given value, or one of the given values.
+
+        Raises:
+            ValueError: an unknown field.
+        """
+        keep = np.ones(len(self), dtype=bool)
+        for name, wanted in criteria.items():
+            column = self.column(name)
+            if column.ndim != 1:
+                raise ValueError(f"clip set {self.name!r}: field {name!r} has several columns; select one of them, e.g. {name}0")
+            values = [wanted] if isinstance(wanted, str) or not isinstance(wanted, Iterable) else list(wanted)
+            keep &= np.isin(column.astype(str), [str(value) for value in values])
+        return self[keep]
+
+    def save(self, path: str | Path) -> None:
+        """Write a clip-set ``.npz`` (the format that :meth:`load` reads)."""
+        from indexing.readers.clipset import write_clip_set
+
+        write_clip_set(self, path)
+
+    @classmethod
+    def load(cls, path: str | Path, **options: Any) -> ClipSet:
+        """Read a clip-set ``.npz``, or any keypoint file as a set of one; see :func:`indexing.readers.read`."""
+        from indexing.readers import read
+
+        return read(path, **options)
+
+
+def as_clip(value: Clip | ArrayLike, fps: float = 30.0, name: str = "") -> Clip:
+    """A :class:`Clip` from a clip, or from a uniformly sampled ``(frames, joints, 2 | 3)`` array at ``fps``."""
+    if isinstance(value, Clip):
+        return value
+    return Clip(_float_array(value, f"clip {name!r}" if name else "clip"), fps=fps, name=name)
+
+
+def _float_array(value: Any, what: str) -> FloatArray:
+    """A real array of float32 or float64 that nobody else can change."""
+    try:
+        array = np.asarray(value.detach().cpu().numpy() if hasattr(value, "detach") else value)
+        if array.dtype.kind not in "fiub":
+            raise TypeError(f"dtype {array.dtype}")
+        array = np.array(array, dtype=array.dtype if array.dtype in (np.float32, np.float64) else np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{what}: expected an array of numbers, got {type(value).__name__} ({error})") from None
+    array.flags.writeable = False
+    return array
+
+
+def _check_times(times: FloatArray, frames: int, who: str) -> None:
+    if times.shape != (frames,):
+        raise ValueError(f"{who}: times must hold one value per frame ({frames}), got shape {times.shape}")
+    if not np.isfinite(times).all():
+        raise ValueError(
+            f"{who}: times contains NaN or infinite values at frame {int(np.argmin(np.isfinite(times)))}; drop those frames"
+        )
+    steps = np.diff(times)
+    if (steps <= 0).any():
+        at = int(np.argmax(steps <= 0)) + 1
+        raise ValueError(
+            f"{who}: times must increase, but frame {at} is at {times[at]:g} s after {times[at - 1]:g} s; "
+            "sort the frames by time and drop repeated ones"
+        )
+
+
+def _rate(times: FloatArray) -> float:
+    return float(1.0 / np.median(np.diff(times))) if len(times) > 1 else 30.0

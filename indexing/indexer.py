@@ -1,0 +1,282 @@
+"""ActionIndexer: learn actions from one to a few clips each, recognize them in others, find them in long recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from sklearn.base import BaseEstimator, ClassifierMixin
+from sklearn.utils.validation import check_is_fitted
+
+from indexing.checks import check_parameters, check_queries, gather, gather_labels
+from indexing.clip import Clip
+from indexing.scoring import Event, probabilities, reject_threshold
+from indexing.shape.bank import Windows
+from indexing.shape.exemplars import Exemplars, Plan, cut
+from indexing.shape.model import ShapeModel, learn
+from indexing.shape.symmetry import mirror_permutation
+from indexing.skeleton import Skeleton
+from indexing.stream import Stream, find_events, score_stream
+from indexing.windows import ragged, whole
+
+Array = NDArray[Any]
+
+
+class ActionIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
+    r"""Recognize actions from keypoints, from other viewpoints than they were learned from.
+
+    Two affine images of one space-time shape (all joints over all frames) obey one linear relation, so the largest canonical
+    correlation between their coordinate spaces is 1 whatever the two viewpoints are (thesis chapter 7, rank conditions).
+    The distance of that correlation from 1, fused over three ways of centring, finds the nearest exemplar; a kernel machine
+    over virtual views of the exemplars is added to it.
+
+    Args:
+        view: ``"any"``: queries may be seen from elsewhere; ``"same"``: from about where the exemplars were.  Declared, never
+            guessed: cross-validation inside one view always prefers what is bound to that view.
+        weights: of the channels of the nearest-exemplar score: ``"equal"``, or ``"learned"`` by leave-one-out.
+        reject: ``None``: closed set.  A number between 0 and 1: the rate at which clips of an unknown action may be taken
+            for a known one, calibrated by leaving each class out of the training clips.  Any other number: the least
+            :meth:`evidence` that is accepted.
+        none_label: what :meth:`predict` answers for a rejected clip.
+        fps: frame rate of clips given as arrays.
+        length: steps that a window is resampled to.
+        search: also compare with crops of the exemplars (extent and tempo).
+        mirror: ``"auto"``: exemplars also count mirrored, unless left and right are different actions here; ``False``: never.
+        scorer: ``"both"``, ``"nearest"`` (no training, fastest) or ``"kernel"``; ``view="same"`` uses the kernel machine.
+        virtual_views: copies of every exemplar for the kernel machine.
+        repair: replace joints that jump (Hampel filter): for bad detectors at a regular frame rate.
+        window, stride, tempi, pool: of :meth:`score_frames`: seconds, seconds between exemplar windows, speed factors tried,
+            and seconds over which scores are averaged.
+        random_state: of the virtual views.
+        device: where to compute, e.g. ``"cuda"``.
+
+    Attributes:
+        classes_: ``(classes,)`` labels as given.  model_: the learned :class:`~indexing.shape.model.ShapeModel`.
+        n_joints_: joints per frame.  skeleton_: their names, where the clips had them.
+        reject_threshold_: evidence below it is rejected, or ``None``.
+
+    Example:
+        >>> from indexing.actors import Person, dataset
+        >>> actors = dataset(3, ["squat", "wave", "kick"], azimuth=0, rng=0)
+        >>> indexer = ActionIndexer().fit(actors.select(subject=0), actors.select(subject=0).labels)
+        >>> turned = dataset(3, ["squat", "wave", "kick"], azimuth=60, rng=1).select(subject=1)
+        >>> [str(label) for label in indexer.predict(turned)]
+        ['squat', 'wave', 'kick']
+
+    Source: Wolf 2003, chapters 4 and 7 and section 10.1.
+    """
+
+    def __init__(
+        self,
+        view: str = "any",
+        weights: str = "equal",
+        reject: float | None = None,
+        none_label: Any = -1,
+        fps: float = 30.0,
+        *,
+        length: int = 12,
+        search: bool = True,
+        mirror: str | bool = "auto",
+        scorer: str = "both",
+        virtual_views: int = 4,
+        repair: bool = False,
+        window: float = 1.0,
+        stride: float = 0.3,
+        tempi: Sequence[float] = (0.7, 1.0, 1.4),
+        pool: float = 2.1,
+        random_state: int = 0,
+        device: str = "cpu",
+    ) -> None:
+        self.view = view
+        self.weights = weights
+        self.reject = reject
+        self.none_label = none_label
+        self.fps = fps
+        self.length = length
+        self.search = search
+        self.mirror = mirror
+        self.scorer = scorer
+        self.virtual_views = virtual_views
+        self.repair = repair
+        self.window = window
+        self.stride = stride
+        self.tempi = tempi
+        self.pool = pool
+        self.random_state = random_state
+        self.device = device
+
+    # ---- learning ----------------------------------------------------------------------------------------------------
+    def fit(self, clips: Iterable[Any], labels: ArrayLike | None = None) -> Self:
+        """Learn from clips.
+
+        Args:
+            clips: of :class:`Clip`, or ``(frames, joints, 2 | 3)`` arrays, or tuples of synchronized views of one
+                performance (an array ``(views, frames, joints, 2)`` too).  One 2D clip per action is enough.
+            labels: ``(clips,)``; by default the clips' own.
+
+        Raises:
+            ValueError: naming the clip or the parameter, what is wrong and what to do.
+        """
+        check_parameters(self)
+        found, owners = gather(clips, self.fps)
+        values = gather_labels(found, owners, labels)
+        classes, numbers = np.unique(values, return_inverse=True)
+        if len(classes) < 2:
+            raise ValueError(
+                f"labels: only one class ({classes[0]!r}); give clips of at least two actions, for example one of ordinary movement"
+            )
+        self._rng = np.random.default_rng(self.random_state)
+        self.n_joints_ = found[0].joints.shape[1]
+        self.skeleton_: Skeleton | None = next((clip.skeleton for clip in found if clip.skeleton is not None), None)
+        return self._learn(cut(found, self._plan(), self._rng), classes, torch.from_numpy(numbers))
+
+    def partial_fit(self, clips: Iterable[Any], labels: ArrayLike | None = None, classes: ArrayLike | None = None) -> Self:
+        """Learn from further clips, of known or new actions; the earlier ones stay.  Fits where nothing was fitted yet."""
+        if not hasattr(self, "model_"):
+            return self.fit(clips, labels)
+        check_parameters(self)
+        found, owners = gather(clips, self.fps, self.n_joints_)
+        values = gather_labels(found, owners, labels)
+        old = self.classes_[self.model_.labels.numpy()]
+        merged = _joined(old, values)
+        known, numbers = np.unique(merged, return_inverse=True)
+        rng = getattr(self, "_rng", None) or np.random.default_rng([self.random_state, len(old)])
+        return self._learn(self.model_.exemplars.extended(cut(found, self._plan(), rng)), known, torch.from_numpy(numbers))
+
+    def _plan(self) -> Plan:
+        return Plan(self.length, self.search, self.virtual_views, self.view == "any", self.repair, self.window, self.stride)
+
+    def _learn(self, exemplars: Exemplars, classes: Array, numbers: torch.Tensor) -> Self:
+        symmetry = None
+        if self.mirror == "auto":
+            symmetry = mirror_permutation(self.skeleton_, exemplars.crop(0).values[:500])
+        self.classes_ = classes
+        self.model_: ShapeModel = learn(
+            exemplars,
+            numbers.long(),
+            len(classes),
+            view=self.view,
+            scorer="kernel" if self.view == "same" else self.scorer,
+            learned=self.weights == "learned",
+            symmetry=symmetry,
+        )
+        self._calibrate()
+        return self
+
+    def _calibrate(self) -> None:
+        self.reject_threshold_ = reject_threshold(self.reject, self.model_.evidence_out)
+
+    # ---- recognition -------------------------------------------------------------------------------------------------
+    def _queries(self, clips: Iterable[Any]) -> Windows:
+        check_is_fitted(self, "model_")
+        found = check_queries(clips, self.fps, self.n_joints_)
+        source = ragged(found, self.repair)
+        return Windows(whole(source, self.length), torch.from_numpy(source.seen)).to(self.device)
+
+    def _model(self) -> ShapeModel:
+        return self.model_.to(self.device)
+
+    def decision_function(self, clips: Iterable[Any]) -> Array:
+        """``(clips, classes)`` scores, larger is better; columns are ``classes_``."""
+        return np.asarray(self._model().scores(self._queries(clips)).cpu().numpy())
+
+    def evidence(self, clips: Iterable[Any]) -> Array:
+        """``(clips,)`` how well the best class explains a clip: the nearest-exemplar score, comparable between clips."""
+        return np.asarray(self._model().nearest_scores(self._queries(clips)).max(dim=1).values.cpu().numpy())
+
+    def predict_proba(self, clips: Iterable[Any]) -> Array:
+        """``(clips, classes)`` probabilities of the known classes, rows sum to 1 (a softmax of the standardized scores)."""
+        return probabilities(self.decision_function(clips))
+
+    def predict(self, clips: Iterable[Any]) -> Array:
+        """``(clips,)`` labels; ``none_label`` where ``reject`` is set and no class explains the clip."""
+        query = self._queries(clips)
+        model = self._model()
+        labels = self.classes_[model.scores(query).argmax(dim=1).cpu().numpy()]
+        if self.reject_threshold_ is None:
+            return np.asarray(labels)
+        refused = (model.nearest_scores(query).max(dim=1).values < self.reject_threshold_).cpu().numpy()
+        return _refuse(labels, refused, self.none_label)
+
+    def score(self, clips: Iterable[Any], labels: ArrayLike, sample_weight: ArrayLike | None = None) -> float:
+        """Mean accuracy of :meth:`predict`; labels that were never learned count as wrong."""
+        right = np.asarray([str(a) == str(b) for a, b in zip(self.predict(clips), np.asarray(labels), strict=True)], dtype=float)
+        return float(np.average(right, weights=None if sample_weight is None else np.asarray(sample_weight)))
+
+    # ---- long recordings ---------------------------------------------------------------------------------------------
+    def _stream(self) -> Stream:
+        return Stream(self.length, self.window, tuple(self.tempi), self.pool, self.repair, self.device)
+
+    def score_frames(self, clip: Any, progress: Any = None) -> Array:
+        """``(frames, classes)`` score of every frame of an untrimmed recording, larger is better.
+
+        Short windows at several tempi are compared with short windows of the exemplars, and averaged over ``pool`` seconds.
+
+        Args:
+            progress: called with the share done, 0..1.
+        """
+        check_is_fitted(self, "model_")
+        (found,) = check_queries([clip], self.fps, self.n_joints_)
+        return score_stream(self._model(), found, self._stream(), progress)
+
+    def find(self, clip: Any, progress: Any = None) -> list[Event]:
+        """The actions in an untrimmed recording, in order of time: label, start, end (seconds), score and margin.
+
+        Frames whose best score is below the level that wrong actions reach (calibrated at fit by leaving classes out; at
+        the rate ``reject`` where that is set) belong to no action.
+        """
+        check_is_fitted(self, "model_")
+        (found,) = check_queries([clip], self.fps, self.n_joints_)
+        return find_events(self._model(), found, self._stream(), self.classes_, self.reject, progress)
+
+    # ---- files -------------------------------------------------------------------------------------------------------
+    def save(self, path: str | Path) -> None:
+        """Write a ``.safetensors`` file with JSON metadata; atomically, and without pickle."""
+        from indexing.persistence import save
+
+        check_is_fitted(self, "model_")
+        save(self, path)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read what :meth:`save` wrote.
+
+        Raises:
+            ValueError: the file is missing, or is not such a model.
+        """
+        from indexing.persistence import load
+
+        return load(cls, path)
+
+    def exemplar(self, index: int) -> Clip:
+        """Exemplar number ``index`` as it is compared: resampled, y up (for pictures)."""
+        check_is_fitted(self, "model_")
+        windows = self.model_.exemplars.crop(0)
+        joints = windows.values[index].numpy().copy()
+        joints[:, ~windows.seen[index].numpy()] = np.nan
+        return Clip(joints, label=self.classes_[int(self.model_.labels[index])], skeleton=self.skeleton_, name=f"exemplar {index}")
+
+    def __sklearn_is_fitted__(self) -> bool:
+        return hasattr(self, "model_")
+
+
+def _joined(first: Array, second: Array) -> Array:
+    """Labels of both, refusing to mix kinds that numpy would silently turn into strings."""
+    if first.dtype.kind != second.dtype.kind and {first.dtype.kind, second.dtype.kind} & {"U", "S", "O"}:
+        raise ValueError(
+            f"labels: the fitted labels are of type {first.dtype}, the new ones {second.dtype}; give one kind of label"
+        )
+    return np.concatenate([first, second])
+
+
+def _refuse(labels: Array, refused: NDArray[np.bool_], none_label: Any) -> Array:
+    if not refused.any():
+        return np.asarray(labels)
+    wide = np.asarray(none_label).dtype.kind == labels.dtype.kind
+    out = labels.astype(np.result_type(labels.dtype, np.asarray(none_label).dtype) if wide else object)
+    out[refused] = none_label
+    return np.asarray(out)

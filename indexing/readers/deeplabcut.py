@@ -1,0 +1,86 @@
+"""DeepLabCut CSV: header rows scorer, bodyparts, coords; with several animals: scorer, individuals, bodyparts, coords.
+
+The columns are x, y, likelihood per body part (labels made by hand: x, y; triangulated: x, y, z), the first column or
+columns the frame number or the image's name.  Individuals are tracks; body parts that belong to no individual
+(``single``) are not read when there are individuals.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from indexing.clip import ClipSet
+from indexing.readers.files import Source, error, frame_number, read_columns
+from indexing.readers.options import Options
+from indexing.readers.recording import IntArray, Recording, to_clips
+from indexing.skeleton import Skeleton
+
+Layout = dict[str, dict[str, dict[str, int]]]  # animal -> body part -> coordinate -> column
+REMEDY = "export with deeplabcut.analyze_videos(..., save_as_csv=True) or analyze_videos_converth5_to_csv"
+
+
+def read(source: Source, options: Options) -> ClipSet:
+    """Read a DeepLabCut CSV; times are frame number / fps.
+
+    Raises:
+        ValueError: a header row is missing, or a body part lacks x or y.
+    """
+    source.need("deeplabcut", "csv")
+    header = {row[0].strip().lower(): [cell.strip() for cell in row] for row in source.data[:4]}
+    lacking = [name for name in ("bodyparts", "coords") if name not in header]
+    if lacking:
+        raise error(source.path, f"has no header row {lacking[0]!r} among the first four rows", REMEDY)
+    if len({len(row) for row in header.values()}) > 1:
+        raise error(source.path, "the header rows have different lengths", REMEDY)
+    individuals = header.get("individuals")
+    skip = 4 if individuals else 3
+    layout = _layout(source, header["bodyparts"], header["coords"], individuals)
+    parts = list(next(iter(layout.values())))
+    columns = [column for animal in layout.values() for part in parts for column in animal[part].values()]
+    kinds = list(next(iter(next(iter(layout.values())).values())))
+    start = next(i for i, cell in enumerate(header["coords"]) if cell.lower() == "x")
+    values, keys = read_columns(source.path, skip, columns, [start - 1])
+    table = values.reshape(-1, len(parts), len(kinds))  # one row per frame and animal
+    dims = 3 if "z" in kinds else 2
+    frames = _frames(source, keys[0])
+    recording = Recording(
+        frames=frames,
+        at=np.repeat(np.arange(len(frames)), len(layout)),
+        joints=table[..., :dims],
+        confidence=table[..., kinds.index("likelihood")] if "likelihood" in kinds else None,
+        tracks=list(layout) * len(frames) if individuals else None,
+        skeleton=Skeleton(source.path.stem, tuple(parts)),
+    )
+    return to_clips(source.path, recording, options)
+
+
+def _layout(source: Source, parts: list[str], coords: list[str], individuals: list[str] | None) -> Layout:
+    layout: Layout = {}
+    for column, coord in enumerate(coords):
+        if coord.lower() in ("x", "y", "z", "likelihood"):
+            animal = individuals[column] if individuals else ""
+            layout.setdefault(animal, {}).setdefault(parts[column], {})[coord.lower()] = column
+    if len(layout) > 1:
+        layout.pop("single", None)
+    if not layout:
+        raise error(source.path, "the row 'coords' names no x and y", REMEDY)
+    first = next(iter(layout.values()))
+    kinds = tuple(next(iter(first.values())))
+    for animal, its in layout.items():
+        for part, columns in its.items():
+            if tuple(columns) != kinds or kinds[:2] != ("x", "y"):
+                who = f"{animal} {part}".strip()
+                raise error(source.path, f"{who} has the columns {', '.join(columns)}, not x, y, likelihood", REMEDY)
+        if its.keys() != first.keys():
+            raise error(
+                source.path, f"the individual {animal!r} has other body parts than the first", "export animals of one kind per file"
+            )
+    return layout
+
+
+def _frames(source: Source, keys: list[str]) -> IntArray:
+    """Frame numbers from the index column: numbers, or names of images."""
+    numbers = [frame_number(key) for key in keys]
+    if None in numbers:
+        raise error(source.path, f"frame {keys[numbers.index(None)]!r} has no number", "number the frames, or the images by frame")
+    return np.array(numbers, dtype=np.int64)

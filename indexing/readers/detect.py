@@ -1,0 +1,101 @@
+"""Which format an opened file has: decided by its structure, not by its name."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from indexing.readers.files import Source, error
+
+REMEDY = "export one of the formats in indexing.readers.FORMATS, or name it with format="
+
+
+def detect(source: Source) -> str:
+    """The name of the format.
+
+    Raises:
+        ValueError: no reader knows this structure; the message says what was found.
+    """
+    if source.kind == "npz":
+        return "clipset"
+    if source.kind == "csv":
+        return _detect_csv(source)
+    if source.kind == "txt folder":
+        return "ultralytics"
+    if source.kind == "json folder":
+        frames = [frame.data for frame in source.data]
+        found, shown = next((name for frame in frames if (name := detect_json(frame))), None), frames[0]
+        empty = all(map(_only_empty_lists, frames))
+    else:
+        found, shown = detect_json(source.data), source.data
+        empty = _only_empty_lists(shown)
+    if empty:
+        raise error(source.path, "no person was detected in any frame", "check the video or the pose estimator's threshold")
+    if found is None:
+        raise error(source.path, f"JSON without keypoints that a reader knows ({_describe(shown)})", REMEDY)
+    return found
+
+
+def detect_json(data: Any) -> str | None:
+    """The format of parsed JSON, or None.
+
+    Example:
+        >>> detect_json({"version": 1.3, "people": []}), detect_json([{"image_id": 0, "keypoints": [1, 2, 0.5]}])
+        ('openpose', 'coco')
+    """
+    if isinstance(data, dict):
+        if "people" in data or "bodies" in data:
+            return "openpose"
+        if "instance_info" in data:
+            return "mmpose"
+        if "annotations" in data:
+            return "coco"
+        # AlphaPose --format open | cmu: one such object per image name
+        first = next(iter(data.values()), None)
+        return "openpose" if isinstance(first, dict) and ("people" in first or "bodies" in first) else None
+    if not isinstance(data, list):
+        return None
+    return next((name for item in data if (name := _detect_item(item))), None)
+
+
+def _detect_item(item: Any) -> str | None:
+    """The format of a list, from one of its elements."""
+    if isinstance(item, list):  # a frame: a list of people
+        return next((name for person in item if (name := _detect_item(person))), None)
+    if isinstance(item, str):  # Ultralytics' to_json() gives text: one string per frame
+        return "ultralytics" if item.lstrip().startswith("[") else None
+    if not isinstance(item, dict):
+        return None
+    if "people" in item or "bodies" in item:
+        return "openpose"
+    if "instances" in item or "keypoint_scores" in item:
+        return "mmpose"
+    if isinstance(item.get("keypoints"), dict) or {"box", "class"} <= item.keys():
+        return "ultralytics"
+    return "coco" if "image_id" in item else None
+
+
+def _detect_csv(source: Source) -> str:
+    rows = source.data
+    header = [cell.strip().lower() for cell in rows[0]]
+    if header[0] == "scorer" or (len(rows) > 1 and rows[1][0].strip().lower() in ("bodyparts", "individuals")):
+        return "deeplabcut"
+    if "frame_idx" in header and any(cell.endswith(".x") for cell in header):
+        return "sleap"
+    from indexing.readers.mediapipe import find_columns
+
+    if find_columns(rows[0]) is None:
+        shown = ", ".join(rows[0][:6]) + (", ..." if len(rows[0]) > 6 else "")
+        raise error(source.path, f"text without keypoint columns that a reader knows (first row: {shown[:120]})", REMEDY)
+    return "mediapipe"
+
+
+def _only_empty_lists(data: Any) -> bool:
+    return isinstance(data, list) and all(item in ([], "[]") for item in data)
+
+
+def _describe(data: Any) -> str:
+    if isinstance(data, dict):
+        return f"an object with {', '.join(list(map(str, data))[:5]) or 'nothing in it'}"
+    if isinstance(data, list) and data and isinstance(data[0], dict):
+        return f"a list of objects with {', '.join(list(map(str, data[0]))[:5])}"
+    return f"a {type(data).__name__}"

@@ -1,0 +1,264 @@
+"""Detections of any format -> clips: the one place where people, missing joints and times are settled.
+
+A format module turns its file into a :class:`Recording` (directly, or through :func:`gather` where the file lists people
+frame by frame); :func:`to_clips` does the rest, the same for all formats.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from indexing.clip import Clip, ClipSet, FloatArray
+from indexing.readers.files import error
+from indexing.readers.options import Options
+from indexing.readers.people import choose
+from indexing.skeleton import Skeleton
+
+IntArray = NDArray[np.int64]
+LAST_FRAME = 2**53  # whole numbers are exact below it
+NORMALIZED = 4.0  # coordinates from 0 to 1 stay below it even for joints guessed outside the image; pixels do not
+
+
+class Detection(NamedTuple):
+    """One person in one frame, as the file says it."""
+
+    joints: FloatArray  # (n, 2 | 3)
+    confidence: FloatArray | None  # (n,)
+    track: Hashable | None = None
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Everything one file says: ``m`` detections in ``f`` frames.
+
+    Args:
+        frames: ``(f,)`` the frame numbers that the file names, increasing, with or without people.
+        at: ``(m,)`` which of the frames each detection is in.
+        joints: ``(m, n, 2 | 3)``.
+        confidence: ``(m, n)``, or None where the file has none.
+        tracks: one identity per detection (None = not tracked), or None where the file has none.
+        times: ``(f,)`` seconds, where the file has them; otherwise times are frame number / fps.
+        up: as in :class:`indexing.clip.Clip`.
+    """
+
+    frames: IntArray
+    at: IntArray
+    joints: FloatArray
+    confidence: FloatArray | None
+    tracks: Sequence[Hashable | None] | None = None
+    times: FloatArray | None = None
+    skeleton: Skeleton | None = None
+    up: str = "-y"
+
+
+def numbers(path: Path, where: str, value: Any) -> FloatArray:
+    """An array of float64 from parsed JSON (``null`` = NaN).
+
+    Raises:
+        ValueError: it holds something else than numbers, or rows of different lengths.
+    """
+    try:
+        return np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise error(path, f"{where}: expected numbers, got {str(value)[:60]}", "export the file again") from None
+
+
+def frame_numbers(path: Path, values: FloatArray) -> IntArray:
+    """Frame numbers from a column of a table.
+
+    Raises:
+        ValueError: a row has none, or one that no frame can have.
+    """
+    bad = np.flatnonzero(~(np.abs(values) < LAST_FRAME))
+    if bad.size:
+        raise error(path, f"data row {bad[0] + 1} has no frame number ({values[bad[0]]:g})", "number every row")
+    return values.astype(np.int64)
+
+
+def track_id(value: Any) -> Hashable | None:
+    """A person's identity as trackers write it (a number or text, perhaps in a list); None where there is none (``-1``)."""
+    while isinstance(value, list):
+        value = value[0] if value else None
+    if isinstance(value, (int, float)):
+        return int(value) if 0 <= value < LAST_FRAME else None
+    return value if isinstance(value, str) and value else None
+
+
+def flat(path: Path, where: str, value: Any, width: int = 3) -> tuple[FloatArray, FloatArray]:
+    """``(n, width - 1)`` joints and ``(n,)`` confidences from a flat list ``x, y, c, x, y, c, ...``.
+
+    Raises:
+        ValueError: the length is not a multiple of ``width``.
+    """
+    array = numbers(path, where, value)
+    if array.ndim == 2 and array.shape[1] == width:  # some exporters keep one row per joint
+        array = array.ravel()
+    if array.ndim != 1 or array.size == 0 or array.size % width:
+        raise error(
+            path,
+            f"{where}: expected a flat list of {width} numbers per joint, got shape {array.shape}",
+            "export x, y and confidence of every joint",
+        )
+    table = array.reshape(-1, width)
+    return table[:, :-1], table[:, -1]
+
+
+def gather(path: Path, frames: Sequence[tuple[int, Sequence[Detection]]]) -> Recording:
+    """A recording from the people of each frame.
+
+    Args:
+        frames: frame number and detections, in any order.
+
+    Raises:
+        ValueError: no person at all, or people with different numbers of joints.
+    """
+    frames = sorted(frames, key=lambda frame: frame[0])
+    if frames and max(abs(frames[0][0]), abs(frames[-1][0])) >= LAST_FRAME:
+        raise error(path, f"frame number {frames[-1][0]} is beyond any recording", "number images by frame")
+    found = [(i, number, person) for i, (number, people) in enumerate(frames) for person in people]
+    if not found:
+        raise nobody(path, len(frames))
+    shape = found[0][2].joints.shape
+    for _, number, person in found:
+        if person.joints.shape != shape:
+            raise error(
+                path,
+                f"frame {number} has a person with joints {person.joints.shape}, frame {found[0][1]} one with {shape}",
+                "export every person with the same joint layout, or one file per layout",
+            )
+    confidence = None
+    if any(person.confidence is not None for *_, person in found):
+        confidence = np.stack([np.ones(shape[0]) if p.confidence is None else p.confidence for *_, p in found])
+    return Recording(
+        frames=np.array([number for number, _ in frames], dtype=np.int64),
+        at=np.array([i for i, *_ in found], dtype=np.int64),
+        joints=np.stack([person.joints for *_, person in found]),
+        confidence=confidence,
+        tracks=[person.track for *_, person in found],
+    )
+
+
+def to_clips(path: Path, recording: Recording, options: Options) -> ClipSet:
+    """Choose people by ``options.person`` and make their clips.
+
+    Raises:
+        ValueError: nobody was seen, frames or times do not increase, a confidence is NaN, or the person rule does not apply.
+    """
+    recording = _mask(path, _scale(path, recording, options), options.min_confidence)
+    times, fps = _times(path, recording, options.fps)
+    name = path.name or path.resolve().name
+    clips = []
+    for track, rows in choose(path, recording, options.person):
+        frames = slice(0, len(times))
+        if options.person == "all":  # each person's clip spans what was seen of that person
+            seen = recording.at[rows]
+            frames = slice(int(seen.min()), int(seen.max()) + 1)
+        joints, confidence = _fill(recording, rows)
+        clips.append(
+            Clip(
+                joints=joints[frames],
+                times=times[frames],
+                confidence=None if confidence is None else confidence[frames],
+                fps=fps,
+                label=options.label,
+                name=name if options.person != "all" else f"{name}#{track}",
+                skeleton=recording.skeleton,
+                up=recording.up,
+                meta={} if options.person != "all" else {"person": track},
+                fps_assumed=recording.times is None and options.fps is None,
+            )
+        )
+    return ClipSet(clips, name)
+
+
+def nobody(path: Path, frames: int) -> ValueError:
+    """The error for a file without a single usable detection."""
+    return error(
+        path, f"no person was detected in any of {frames} frames", "check the video, the estimator's threshold and min_confidence"
+    )
+
+
+def _scale(path: Path, recording: Recording, options: Options) -> Recording:
+    """Coordinates from 0 to 1 -> pixels, where the image size is given."""
+    if options.size is None:
+        return recording
+    finite = np.abs(recording.joints[np.isfinite(recording.joints)])
+    if recording.joints.shape[2] != 2 or (finite.size and np.median(finite) > NORMALIZED):
+        raise error(path, "size= is for 2D coordinates from 0 to 1, and these are not", "leave size away")
+    return replace(recording, joints=recording.joints * np.asarray(options.size, dtype=float))
+
+
+def _mask(path: Path, recording: Recording, min_confidence: float) -> Recording:
+    """Joints that were not seen -> NaN, detections without any joint -> dropped."""
+    joints, confidence = recording.joints.astype(np.float64), recording.confidence
+    missing = np.asarray(np.isnan(joints).any(axis=2))
+    if joints.shape[2] == 2:  # exactly (0, 0) is how detectors write "not found" (in 3D the origin is a real place)
+        missing |= (joints == 0).all(axis=2)
+    if confidence is not None:
+        odd = np.isnan(confidence) & ~missing
+        if odd.any():
+            row, joint = np.argwhere(odd)[0]
+            raise error(
+                path,
+                f"frame {recording.frames[recording.at[row]]}, joint {joint}: the confidence is NaN, but the joint has coordinates",
+                "write 0 for a joint that was not seen",
+            )
+        missing |= ~(confidence > 0) | (confidence < min_confidence)
+    elif min_confidence > 0:
+        raise error(path, "has no confidences, so min_confidence cannot be applied", "leave min_confidence at 0")
+    if np.isinf(joints[~missing]).any():
+        row, joint = np.argwhere(np.isinf(joints).any(axis=2) & ~missing)[0]
+        raise error(path, f"frame {recording.frames[recording.at[row]]}, joint {joint}: infinite coordinates", "leave them empty")
+    joints[missing] = np.nan
+    keep = np.asarray(~missing.all(axis=1))
+    if not keep.any():
+        raise nobody(path, len(recording.frames))
+    tracks = None if recording.tracks is None else [track for track, kept in zip(recording.tracks, keep, strict=True) if kept]
+    return replace(
+        recording,
+        at=recording.at[keep],
+        joints=joints[keep],
+        confidence=None if confidence is None else np.nan_to_num(confidence[keep]),
+        tracks=tracks,
+    )
+
+
+def _times(path: Path, recording: Recording, fps: float | None) -> tuple[FloatArray, float | None]:
+    repeated = np.flatnonzero(np.diff(recording.frames) <= 0)
+    if repeated.size:
+        a, b = recording.frames[repeated[0] : repeated[0] + 2]
+        raise error(path, f"frame numbers must increase, but {b} follows {a}", "sort the frames and drop repeated ones")
+    if recording.times is None:
+        rate = 30.0 if fps is None else float(fps)
+        return recording.frames / rate, rate
+    bad = np.flatnonzero(~np.isfinite(recording.times))
+    if bad.size:
+        raise error(path, f"frame {recording.frames[bad[0]]} has no time", "give every row a time, or drop the column and use fps=")
+    back = np.flatnonzero(np.diff(recording.times) <= 0)
+    if back.size:
+        a, b = recording.times[back[0] : back[0] + 2]
+        raise error(
+            path,
+            f"times must increase, but frame {recording.frames[back[0] + 1]} is at {b:g} s after {a:g} s",
+            "sort the rows by time and drop repeated ones",
+        )
+    return recording.times, None
+
+
+def _fill(recording: Recording, rows: IntArray) -> tuple[FloatArray, FloatArray | None]:
+    """``(f, n, d)`` and ``(f, n)``: the chosen detections in their frames, NaN (confidence 0) in the others."""
+    f, (_, n, d) = len(recording.frames), recording.joints.shape
+    at = recording.at[rows]
+    joints = np.full((f, n, d), np.nan)
+    joints[at] = recording.joints[rows]
+    if recording.confidence is None:
+        return joints, None
+    confidence = np.zeros((f, n))
+    confidence[at] = recording.confidence[rows]
+    return joints, confidence

@@ -1,0 +1,20 @@
+"""Reports: pages, pictures, tables and manifests, written whole or not at all.
+
+Importing this package loads neither matplotlib nor scikit-learn nor torch; they are imported when something is drawn or measured.
+"""
+
+from indexing.report.files import manifest, prepare, write_bytes, write_json, write_text
+from indexing.report.recognition import EvaluationResult, Event, RecognitionReport, RecordingResult, write_recognition
+
+__all__ = [
+    "EvaluationResult",
+    "Event",
+    "RecognitionReport",
+    "RecordingResult",
+    "manifest",
+    "prepare",
+    "write_bytes",
+    "write_json",
+    "write_recognition",
+    "write_text",
+]

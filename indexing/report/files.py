@@ -1,0 +1,182 @@
+"""Output folders that are never left half-written, and the manifest that says how a result came about."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import datetime
+import hashlib
+import json
+import math
+import os
+import platform
+import re
+import secrets
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+PACKAGES = ("dyntorch", "torch", "numpy", "scikit-learn")
+MANIFEST = "manifest.json"
+
+
+def prepare(folder: str | Path) -> Path:
+    """Create an output folder (with its parents) and make sure that files can be written in it.
+
+    Raises:
+        ValueError: the folder cannot be made or written; the message names what is in the way and what to do.
+    """
+    path = Path(folder).expanduser()
+    try:
+        in_the_way = next((part for part in (path, *path.parents) if part.exists() and not part.is_dir()), None)
+        if in_the_way is not None:
+            raise ValueError(f"output folder {str(path)!r}: {str(in_the_way)!r} is a file; choose another folder, or move it away")
+        path.mkdir(parents=True, exist_ok=True)
+        # Only writing shows whether writing works: permission bits say nothing to root or on network shares.
+        probe = _temporary(path)
+        os.close(os.open(probe, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
+        probe.unlink()
+    except OSError as error:
+        raise ValueError(
+            f"output folder {str(path)!r}: cannot be written ({error.strerror or error}); choose a folder you may write to"
+        ) from error
+    return path
+
+
+def write_bytes(path: str | Path, data: bytes) -> Path:
+    """Write a file whole or not at all: under a temporary name in the same folder, then renamed.
+
+    Raises:
+        ValueError: the file cannot be written; an older file of this name is then still as it was.
+    """
+    target = Path(path)
+    temporary = _temporary(target.parent)
+    try:
+        # os.open rather than tempfile: mkstemp's mode 0600 would keep colleagues from opening the report.
+        descriptor = os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY | getattr(os, "O_BINARY", 0), 0o666)
+        with os.fdopen(descriptor, "wb") as stream:
+            stream.write(data)
+        os.replace(temporary, target)
+    except BaseException as error:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+        if isinstance(error, OSError):
+            raise ValueError(
+                f"cannot write {str(target)!r} ({error.strerror or error}); free the name or the disk, or choose another folder"
+            ) from error
+        raise
+    return target
+
+
+def write_text(path: str | Path, text: str) -> Path:
+    """Write UTF-8 text whole or not at all, line ends as given; see :func:`write_bytes`.
+
+    Bytes of a file name that are no UTF-8 (Python's lone surrogates) are written as ``\\udcXX``.
+    """
+    return write_bytes(path, text.encode("utf-8", "backslashreplace"))
+
+
+def write_json(path: str | Path, value: Any) -> Path:
+    """Write JSON whole or not at all: arrays as lists, paths as text, and NaN or infinity as ``null`` (JSON has neither)."""
+    return write_text(path, json.dumps(plain(value), indent=2, ensure_ascii=False, allow_nan=False) + "\n")
+
+
+def plain(value: Any) -> Any:
+    """The value in the types that JSON knows; what has no such form becomes its ``str``.
+
+    Example:
+        >>> plain({1: np.float32(0.5), "t": (float("nan"), Path("a"))})
+        {'1': 0.5, 't': [None, 'a']}
+    """
+    if isinstance(value, (np.generic, np.ndarray)):
+        value = value.tolist()
+    if value is None or isinstance(value, (bool, int, str)):
+        return str(value) if isinstance(value, str) else value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {str(plain(key)): plain(item) for key, item in value.items()}
+    if isinstance(value, (set, frozenset)):
+        return sorted((plain(item) for item in value), key=str)
+    if isinstance(value, Sequence) and not isinstance(value, (bytes, bytearray)):
+        return [plain(item) for item in value]
+    return str(value)
+
+
+def manifest(
+    arguments: Mapping[str, Any] | Sequence[str],
+    inputs: Iterable[str | Path] = (),
+    seed: int | None = None,
+    timings: Mapping[str, float] | None = None,
+) -> dict[str, Any]:
+    """What is needed to run a result again, and to know whether it would be the same.
+
+    Args:
+        arguments: the command line, or the options by name.
+        inputs: files and folders that were read; a folder counts with every file in it.
+        seed: of the random numbers, where there were any.
+        timings: seconds per step.
+
+    Returns:
+        a dict of JSON types: ``time`` (UTC), ``arguments``, ``seed``, ``timings``, ``versions``, ``platform`` and
+        ``inputs`` (path -> sha256, or path -> {relative path -> sha256} for a folder).
+
+    Raises:
+        ValueError: an input does not exist or cannot be read.
+    """
+    from importlib import metadata  # here, because it takes longer to import than all of the report room
+
+    versions: dict[str, str | None] = {"python": platform.python_version()}
+    for name in PACKAGES:  # from the installed metadata: importing torch for its version would cost seconds
+        try:
+            versions[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            versions[name] = None
+    return {
+        "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "arguments": plain(arguments),
+        "seed": plain(seed),
+        "timings": plain(timings or {}),
+        "versions": versions,
+        "platform": {"system": platform.platform(), "machine": platform.machine(), "processors": os.cpu_count()},
+        "inputs": {str(path): _hashes(Path(path)) for path in inputs},
+    }
+
+
+def remove_stale(folder: Path, written: Iterable[str], ours: str) -> None:
+    """Delete what an earlier run wrote here and this one did not, so that no old picture lies beside a new report.
+
+    Only files that the folder's own manifest lists under ``files``, and whose name matches the pattern ``ours``, are touched.
+    """
+    try:
+        listed = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))["files"]
+        stale = {str(name) for name in listed} - set(written)
+    except (OSError, ValueError, KeyError, TypeError):
+        return  # no manifest, or not one of ours: then nothing here is known to be ours
+    for name in stale:
+        if re.fullmatch(ours, name):
+            with contextlib.suppress(OSError):
+                (folder / name).unlink()
+
+
+def _temporary(folder: Path) -> Path:
+    return folder / f".dyntorch-{secrets.token_hex(8)}.tmp"
+
+
+def _hashes(path: Path) -> str | dict[str, str]:
+    try:
+        if path.is_dir():
+            files = sorted(child for child in path.rglob("*") if child.is_file())
+            return {child.relative_to(path).as_posix(): _sha256(child) for child in files}
+        return _sha256(path)
+    except OSError as error:
+        raise ValueError(f"input {str(path)!r}: cannot be read ({error.strerror or error}); check the path") from error
+
+
+def _sha256(path: Path) -> str:
+    with open(path, "rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -1,0 +1,120 @@
+"""The numbers of a recognition report, from labels and intervals; scikit-learn does the arithmetic of recognition."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from indexing.report.results import EvaluationResult, Event, RecognitionReport, RecordingResult, Truth
+
+
+def measure(report: RecognitionReport) -> dict[str, Any]:
+    """All numbers of a report, in JSON types (NaN where a number does not exist).
+
+    Returns:
+        the report's own ``metrics``, and
+        for evaluations ``clips, accuracy, accuracy_interval, macro_f1, accuracy_by_setting, per_class, confusion``;
+        for recordings ``recordings, seconds, events, events_by_class``, and ``known_events, missed_events`` where some are known.
+    """
+    out = dict(report.metrics)
+    if report.evaluations:
+        out.update(recognition(report.evaluations))
+    if report.recordings:
+        out.update(_search(report.recordings))
+    return out
+
+
+def recognition(evaluations: Sequence[EvaluationResult]) -> dict[str, Any]:
+    """Accuracy per setting and over all clips, and precision, recall, F1 per class over all clips."""
+    from sklearn.metrics import accuracy_score, confusion_matrix, f1_score, precision_recall_fscore_support
+
+    settings: dict[str, list[tuple[str, str]]] = {}
+    names: dict[str, None] = dict.fromkeys(str(name) for evaluation in evaluations for name in evaluation.classes)
+    for evaluation in evaluations:
+        pairs = [(str(true), str(guess)) for true, guess in zip(evaluation.truth, evaluation.predicted, strict=True)]
+        settings.setdefault(evaluation.setting, []).extend(pairs)
+        names.update(dict.fromkeys(sorted({label for pair in pairs for label in pair} - set(names))))
+    labels = list(names)
+    true, guess = (list(column) for column in zip(*(pair for pairs in settings.values() for pair in pairs), strict=True))
+    precision, recall, f1, support = precision_recall_fscore_support(true, guess, labels=labels, zero_division=np.nan)
+    performed = [name for name in labels if name in set(true)]
+    accuracy = float(accuracy_score(true, guess))
+    with warnings.catch_warnings():  # that there is just one class is no mistake
+        warnings.filterwarnings("ignore", message="A single label was found")
+        counts = confusion_matrix(true, guess, labels=labels)
+    return {
+        "clips": len(true),
+        "accuracy": accuracy,
+        "accuracy_interval": wilson(accuracy, len(true)),
+        # Over the actions that were performed: a class without a clip has no recall to average.
+        "macro_f1": float(f1_score(true, guess, labels=performed, average="macro", zero_division=0)),
+        "accuracy_by_setting": {
+            name: float(accuracy_score(*(list(column) for column in zip(*pairs, strict=True)))) for name, pairs in settings.items()
+        },
+        "clips_by_setting": {name: len(pairs) for name, pairs in settings.items()},
+        "per_class": {
+            name: {"precision": float(p), "recall": float(r), "f1": float(f), "clips": int(n)}
+            for name, p, r, f, n in zip(labels, precision, recall, f1, support, strict=True)
+        },
+        "confusion": {"labels": labels, "counts": counts.tolist()},
+    }
+
+
+def wilson(share: float, number: int) -> tuple[float, float]:
+    """95 % interval of a proportion (Wilson's; it also holds near 0 and 1, where the usual one is empty).
+
+    Example:
+        >>> [round(end, 3) for end in wilson(1.0, 10)]
+        [0.722, 1.0]
+    """
+    z = 1.959964
+    middle = (share + z * z / (2 * number)) / (1 + z * z / number)
+    half = z / (1 + z * z / number) * math.sqrt(share * (1 - share) / number + z * z / (4 * number * number))
+    return max(0.0, middle - half), min(1.0, middle + half)
+
+
+def overlapping(event: Event, truth: Sequence[Truth]) -> str | None:
+    """The known action that shares most time with an event; of equals, the one with the event's own label.  None = no one."""
+    own = str(event.label)
+    shared = [(min(event.end, end) - max(event.start, start), str(label) == own, str(label)) for label, start, end in truth]
+    best = max(shared, default=None)
+    return best[2] if best is not None and best[0] > 0 else None
+
+
+def missed(recording: RecordingResult) -> list[Truth]:
+    """Known actions that no event of the same label overlaps."""
+    by_label: dict[str, list[Event]] = {}
+    for event in recording.events:
+        by_label.setdefault(str(event.label), []).append(event)
+    return [
+        (label, start, end)
+        for label, start, end in recording.truth or ()
+        if not any(event.start < end and event.end > start for event in by_label.get(str(label), ()))
+    ]
+
+
+def confused_with(confusion: Mapping[str, Any], label: str) -> tuple[str, int] | None:
+    """What a class is most often mistaken for, and how often."""
+    labels, counts = confusion["labels"], confusion["counts"]
+    row = Counter({name: count for name, count in zip(labels, counts[labels.index(label)], strict=True) if name != label and count})
+    return row.most_common(1)[0] if row else None
+
+
+def _search(recordings: Sequence[RecordingResult]) -> dict[str, Any]:
+    events = Counter(str(event.label) for recording in recordings for event in recording.events)
+    out: dict[str, Any] = {
+        "recordings": len(recordings),
+        "seconds": float(sum(recording.duration for recording in recordings)),
+        "events": sum(events.values()),
+        "events_by_class": dict(events.most_common()),
+    }
+    known = [recording for recording in recordings if recording.truth is not None]
+    if known:
+        out["known_events"] = sum(len(recording.truth or ()) for recording in known)
+        out["missed_events"] = sum(len(missed(recording)) for recording in known)
+    return out

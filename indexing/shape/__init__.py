@@ -1,0 +1,1 @@
+"""Space-time shapes of actions: what is compared between two windows, and how."""

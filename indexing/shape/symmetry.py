@@ -1,0 +1,118 @@
+"""Which joints are each other's mirror image: from their names, or from the data where nothing is named.
+
+A person may do the same action with the other hand, and an exemplar of one is an exemplar of the other once the image is
+mirrored *and* left and right joints change places.  Measured with one exemplar camera: Florence3D +2.5 %, UTKinect +-0.
+"""
+
+from __future__ import annotations
+
+import re
+
+import torch
+from torch import Tensor
+
+from indexing.skeleton import Skeleton
+
+DISTORTION = 0.25  # of the mean joint distance: the right layout fits to .02-.12 (one clip: .25), wrong ones to .34-.71
+
+
+def mirror_permutation(skeleton: Skeleton | None, windows: Tensor) -> Tensor | None:
+    """``(joints,)`` index of every joint's mirror image (itself on the midline), or ``None`` where it cannot be told."""
+    if skeleton is not None:
+        named = from_names(skeleton.joints)
+        if named is not None:
+            return named
+    return from_data(windows)
+
+
+def from_names(names: tuple[str, ...]) -> Tensor | None:
+    """From names that say left and right (``left_knee``, ``LKnee``, ``knee.r``...); ``None`` where no pair is found.
+
+    Example:
+        >>> from_names(("nose", "left_hand", "right_hand")).tolist()
+        [0, 2, 1]
+    """
+    index = {name: i for i, name in enumerate(names)}
+    swap = list(range(len(names)))
+    for name, i in index.items():
+        for pattern, other in _SIDES:
+            partner, changed = re.subn(pattern, other, name, count=1)
+            if changed and partner != name and partner in index:
+                swap[i] = index[partner]
+                break
+    if all(i == j for i, j in enumerate(swap)) or any(swap[j] != i for i, j in enumerate(swap)):
+        return None
+    return torch.tensor(swap)
+
+
+_SIDES = (
+    ("left", "right"), ("right", "left"), ("Left", "Right"), ("Right", "Left"), ("LEFT", "RIGHT"), ("RIGHT", "LEFT"),
+    (r"(?<![a-zA-Z])[lL](?=[A-Z_\-. ])", lambda m: {"l": "r", "L": "R"}[m[0]]),
+    (r"(?<![a-zA-Z])[rR](?=[A-Z_\-. ])", lambda m: {"r": "l", "R": "L"}[m[0]]),
+    (r"(?<=[_\-. ])[lL](?![a-zA-Z])", lambda m: {"l": "r", "L": "R"}[m[0]]),
+    (r"(?<=[_\-. ])[rR](?![a-zA-Z])", lambda m: {"r": "l", "R": "L"}[m[0]]),
+    (r"^l(?=[a-z]{3})", "r"), (r"^r(?=[a-z]{3})", "l"),
+)  # fmt: skip
+
+
+# Mirror pairs of the common layouts, by number of joints, for data that come without names.
+_LAYOUTS: dict[int, tuple[tuple[tuple[int, int], ...], ...]] = {
+    13: (((1, 2), (3, 4), (5, 6), (7, 8), (9, 10), (11, 12)),),  # Penn Action
+    14: (((0, 5), (1, 4), (2, 3), (6, 11), (7, 10), (8, 9)),),  # LSP
+    15: (
+        ((3, 6), (4, 7), (5, 8), (9, 12), (10, 13), (11, 14)),  # NITE: head, neck, torso, then limb by limb
+        ((3, 4), (5, 6), (7, 8), (9, 10), (11, 12), (13, 14)),  # JHMDB: joint by joint
+        ((2, 5), (3, 6), (4, 7), (8, 11), (9, 12), (10, 13)),  # OpenPose MPI
+    ),
+    16: (((0, 5), (1, 4), (2, 3), (10, 15), (11, 14), (12, 13)),),  # MPII
+    17: (
+        ((1, 2), (3, 4), (5, 6), (7, 8), (9, 10), (11, 12), (13, 14), (15, 16)),  # COCO
+        ((1, 4), (2, 5), (3, 6), (11, 14), (12, 15), (13, 16)),  # Human3.6M
+    ),
+    18: (((2, 5), (3, 6), (4, 7), (8, 11), (9, 12), (10, 13), (14, 15), (16, 17)),),  # OpenPose COCO
+    20: (
+        ((4, 8), (5, 9), (6, 10), (7, 11), (12, 16), (13, 17), (14, 18), (15, 19)),  # Kinect SDK
+        ((0, 1), (4, 5), (7, 8), (9, 10), (11, 12), (13, 14), (15, 16), (17, 18)),  # MSR Action3D
+    ),
+    24: (((1, 2), (4, 5), (7, 8), (10, 11), (13, 14), (16, 17), (18, 19), (20, 21), (22, 23)),),  # SMPL
+    25: (
+        ((4, 8), (5, 9), (6, 10), (7, 11), (12, 16), (13, 17), (14, 18), (15, 19), (21, 23), (22, 24)),  # Kinect 2
+        ((2, 5), (3, 6), (4, 7), (9, 12), (10, 13), (11, 14), (15, 16), (17, 18), (19, 22), (20, 23), (21, 24)),  # BODY_25
+    ),
+    26: (
+        ((1, 2), (3, 4), (5, 6), (7, 8), (9, 10), (11, 12), (13, 14), (15, 16), (20, 21), (22, 23), (24, 25)),  # Halpe
+    ),
+    33: (
+        (
+            (1, 4), (2, 5), (3, 6), (7, 8), (9, 10), (11, 12), (13, 14), (15, 16), (17, 18), (19, 20), (21, 22), (23, 24),
+            (25, 26), (27, 28), (29, 30), (31, 32),
+        ),  # MediaPipe
+    ),
+}  # fmt: skip
+
+
+def from_data(windows: Tensor) -> Tensor | None:
+    r"""The common layout with this number of joints whose mirror image keeps the distances between joints.
+
+    A permutation :math:`\pi` is a mirror symmetry where the mean distances obey :math:`D_{ij} = D_{\pi(i)\pi(j)}`; the
+    layout that distorts them least is taken, and none where even that distorts by more than a quarter.
+
+    Args:
+        windows: ``(N, length, joints, 2)``.
+    """
+    joints = windows.shape[2]
+    if joints not in _LAYOUTS:
+        return None
+    x = windows.double()
+    apart = (x[:, :, :, None] - x[:, :, None]).abs()
+    tables = torch.stack([apart[..., 1].mean((0, 1)), apart.square().sum(-1).sqrt().mean((0, 1))])
+    tables = tables / tables.mean(dim=(1, 2), keepdim=True).clamp(min=1e-30)
+    best, chosen = DISTORTION, None
+    for pairs in _LAYOUTS[joints]:
+        swap = torch.arange(joints)
+        for i, j in pairs:
+            swap[i], swap[j] = j, i
+        distortion = float((tables - tables[:, swap][:, :, swap]).abs().mean())
+        if distortion < best:
+            best, chosen = distortion, swap
+    return chosen

@@ -1,0 +1,171 @@
+"""Clips -> batched windows: every window is resampled uniformly in seconds, with missing joints interpolated in time.
+
+All clips are handled together as one ragged array (frames of all clips end to end), so there is no loop over windows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from indexing.cameras import y_up
+from indexing.clip import Clip, FloatArray
+
+SUBSAMPLES = 4  # box average per step: a cheap denoiser; 1 costs about 1 % accuracy at 15 mm noise
+CHUNK = 16_000_000  # numbers interpolated at once: bounds memory whatever the number of windows
+
+
+@dataclass(frozen=True)
+class Ragged:
+    """Frames of many clips end to end, y up, missing joints filled in time."""
+
+    joints: FloatArray  # (frames of all, joints, dims)
+    times: FloatArray  # (frames of all,)
+    starts: NDArray[np.intp]  # (clips + 1,)
+    seen: NDArray[np.bool_]  # (clips, joints): seen at least once; the others are zeros in `joints`
+
+
+def ragged(clips: Sequence[Clip], repair: bool = False) -> Ragged:
+    """Lay clips end to end and fill what is missing by linear interpolation in time, joint by joint.
+
+    Before its first and after its last sighting a joint keeps the nearest seen position.  A joint never seen in a clip is
+    marked in ``seen`` and left out of every comparison.
+
+    Args:
+        clips: checked by :func:`check_clips`.
+        repair: replace wrong joints first (:func:`hampel`).
+    """
+    joints = np.concatenate([y_up(clip) for clip in clips]).astype(np.float32)
+    times = np.concatenate([clip.times for clip in clips])
+    lengths = np.array([len(clip) for clip in clips])
+    starts = np.concatenate([[0], np.cumsum(lengths)])
+    if repair:
+        for i in range(len(clips)):
+            joints[starts[i] : starts[i + 1]] = hampel(joints[starts[i] : starts[i + 1]])
+    there = ~np.isnan(joints).any(axis=2)
+    seen = np.logical_or.reduceat(there, starts[:-1], axis=0)
+    if not there.all():
+        joints = _fill(joints, there, times, np.repeat(starts[:-1], lengths), np.repeat(starts[1:], lengths))
+    return Ragged(joints, times, starts, seen)
+
+
+def _fill(joints: FloatArray, there: NDArray[np.bool_], times: FloatArray, first: FloatArray, last: FloatArray) -> FloatArray:
+    """Linear interpolation in time between the sightings of each joint inside its own clip; zeros where there is none."""
+    frame = np.arange(len(joints))[:, None]
+    before = np.maximum.accumulate(np.where(there, frame, -1), axis=0)
+    after = np.minimum.accumulate(np.where(there, frame, len(joints))[::-1], axis=0)[::-1]
+    no_before, no_after = before < first[:, None], after >= last[:, None]
+    before, after = np.where(no_before, after, before), np.where(no_after, before, after)
+    nothing = no_before & no_after
+    before, after = np.where(nothing, 0, before), np.where(nothing, 0, after)
+    span = times[after] - times[before]
+    weight = np.where(span > 0, (times[:, None] - times[before]) / np.where(span > 0, span, 1.0), 0.0).astype(joints.dtype)
+    column = np.arange(joints.shape[1])[None]
+    low, high = joints[before, column], joints[after, column]
+    filled = low + weight[..., None] * (high - low)
+    filled[nothing] = 0.0
+    return np.where(there[..., None], joints, filled)
+
+
+def hampel(joints: FloatArray, width: int = 9, limit: float = 6.0) -> FloatArray:
+    """Repair of wrong joints: a sample further than ``limit`` MAD (+ 1 % of the body) from the running median becomes NaN.
+
+    For bad detectors at a regular frame rate only: on clean data it costs about 1 %, and 5 to 8 % where half of the frames
+    are missing.
+
+    Args:
+        joints: ``(frames, joints, dims)``, NaN = missing.
+
+    Source: Hampel 1974; parameters from measurements on corrupted queries.
+    """
+    half = width // 2
+    padded = np.pad(joints, ((half, half), (0, 0), (0, 0)), constant_values=np.nan)
+    windows = np.lib.stride_tricks.sliding_window_view(padded, width, axis=0)
+    with np.errstate(all="ignore"):
+        import warnings
+
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # a joint missing in the whole window: the median is NaN, as meant
+            median = np.nanmedian(windows, axis=-1)
+            spread = 1.4826 * np.nanmedian(np.abs(windows - median[..., None]), axis=-1)
+            size = np.nanmedian(np.nanmax(joints, axis=1) - np.nanmin(joints, axis=1), axis=0).max()
+        wrong = (np.abs(joints - median) > limit * spread + 0.01 * size).any(axis=2)
+    return np.where(wrong[..., None], np.float32(np.nan), joints)
+
+
+def check_clips(clips: Sequence[Clip], joints: int | None = None) -> None:
+    """Raise where a clip cannot be compared.
+
+    Raises:
+        ValueError: naming the clip: fewer than two frames, no joint ever seen, all joints at one place, or a number of
+            joints other than that of the others (or ``joints``).
+    """
+    for i, clip in enumerate(clips):
+        who = f"clip {i}" + (f" ({clip.name!r})" if clip.name else "")
+        expected = joints if joints is not None else clips[0].joints.shape[1]
+        if clip.joints.shape[1] != expected:
+            other = "the fitted clips have" if joints is not None else "clip 0 has"
+            raise ValueError(f"{who}: joints: {clip.joints.shape[1]} joints, but {other} {expected}; use clips of one joint layout")
+        reason = unusable(clip)
+        if reason:
+            raise ValueError(f"{who}: joints: {reason}; leave the clip out")
+
+
+def unusable(clip: Clip) -> str | None:
+    """Why a clip cannot be compared with others, or ``None``."""
+    if len(clip) < 2:
+        return "one frame only, but an action needs at least two"
+    if not clip.seen.any():
+        return "no joint was seen in any frame (all NaN)"
+    first = clip.joints[clip.seen]
+    if (first == first[0]).all():
+        return f"all joints are at one place in all frames (all {first[0, 0]:g})"
+    return None
+
+
+def sample(source: Ragged, owner: NDArray[np.intp], start: FloatArray, end: FloatArray, length: int) -> Tensor:
+    """Windows resampled to ``length`` steps, each the box average of its time slot.
+
+    Args:
+        owner: ``(windows,)`` index of the clip that each window is cut from.
+        start, end: ``(windows,)`` seconds on the clip's clock; times outside the clip repeat its first or last frame.
+        length: steps per window.
+
+    Returns:
+        ``(windows, length, joints, dims)`` float32.
+    """
+    joints, dims = source.joints.shape[1:]
+    # one increasing clock for all clips: clip i lives in [2 i, 2 i + 1], so that one search serves every window
+    begin, finish = source.times[source.starts[:-1]], source.times[source.starts[1:] - 1]
+    span = np.maximum(finish - begin, 1e-12)
+    which = np.repeat(np.arange(len(span)), np.diff(source.starts))
+    clock = (source.times - begin[which]) / span[which] + 2.0 * which
+    slots = (np.arange(length * SUBSAMPLES) + 0.5) / (length * SUBSAMPLES)
+    out = torch.empty(len(owner), length, joints, dims)
+    step = max(1, CHUNK // (length * SUBSAMPLES * joints * dims))
+    for at in range(0, len(owner), step):
+        own, lo, hi = owner[at : at + step], start[at : at + step], end[at : at + step]
+        moment = ((lo[:, None] + (hi - lo)[:, None] * slots) - begin[own, None]) / span[own, None]
+        moment = np.clip(moment, 0.0, 1.0) + 2.0 * own[:, None]
+        right = np.clip(
+            np.searchsorted(clock, moment, side="right"), source.starts[own, None] + 1, source.starts[own + 1, None] - 1
+        )
+        left = right - 1
+        gap = clock[right] - clock[left]
+        weight = np.clip((moment - clock[left]) / np.where(gap > 0, gap, 1.0), 0.0, 1.0).astype(np.float32)
+        low = source.joints[left]
+        values = low + weight[..., None, None] * (source.joints[right] - low)
+        out[at : at + step] = torch.from_numpy(values.reshape(len(own), length, SUBSAMPLES, joints, dims).mean(axis=2))
+    return out
+
+
+def whole(source: Ragged, length: int, crop: tuple[float, float] = (0.0, 1.0)) -> Tensor:
+    """Every clip as one window: the part between two fractions of its duration.  ``(clips, length, joints, dims)``."""
+    begin, finish = source.times[source.starts[:-1]], source.times[source.starts[1:] - 1]
+    span = finish - begin
+    return sample(source, np.arange(len(span)), begin + crop[0] * span, begin + crop[1] * span, length)

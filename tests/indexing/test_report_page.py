@@ -1,0 +1,214 @@
+"""The recognition page: safe with any name, self-contained, honest about what it leaves out, and complete in its files."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import re
+from dataclasses import dataclass
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from indexing.clip import Clip
+from indexing.report import EvaluationResult, RecognitionReport, RecordingResult, files, manifest, page, write_recognition
+from indexing.report.recognition import events_csv
+from indexing.skeleton import from_names
+
+SCRIPT = "<script>alert(1)</script>"
+STICK = from_names(
+    "stick", ("nose", "left_hand", "right_hand", "hip", "left_foot", "right_foot"),
+    (("nose", "hip"), ("nose", "left_hand"), ("nose", "right_hand"), ("hip", "left_foot"), ("hip", "right_foot")),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Hit:
+    label: object
+    start: float
+    end: float
+    score: float = -0.5
+    margin: float = 0.25
+    exemplar: int | None = None
+
+
+def person(frames=60, up="y", fps=30.0):
+    joints = np.zeros((frames, 6, 2))
+    joints[:] = [[0, 1.7], [-0.6, 1.2], [0.6, 1.2], [0, 0.9], [-0.2, 0], [0.2, 0]]
+    joints[:, 1:3, 1] += 0.5 * np.sin(np.arange(frames) / 8)[:, None]
+    return Clip(joints * ([1, -1] if up == "-y" else [1, 1]), fps=fps, skeleton=STICK, up=up)
+
+
+def recording(events=(), truth=None, classes=("squat", "lunge"), frames=300, name="session.json", clip=True):
+    rng = np.random.default_rng(0)
+    times = np.arange(frames) / 30
+    return RecordingResult(
+        name, person(frames) if clip else None, times, list(classes), rng.normal(size=(frames, len(classes))), events, truth
+    )
+
+
+class Page(HTMLParser):
+    """Tags that do not nest, addresses that leave the file, and ids of what is on the page."""
+
+    VOID = {"meta", "img", "rect", "path", "br"}
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.bad, self.tags, self.addresses = [], [], [], []
+        self.feed(text)
+        self.bad += self.open
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.addresses += [value for name, value in attrs if name in ("src", "srcset", "href", "data", "action")]
+        self.bad += [f"{tag} {name}" for name, _ in attrs if name.startswith("on")]
+        if tag == "img" and not dict(attrs).get("alt"):
+            self.bad.append("img without alt")
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.tags.append(tag)
+
+    def handle_endtag(self, tag):
+        if not self.open or self.open.pop() != tag:
+            self.bad.append(f"/{tag}")
+
+
+def write(folder, report):
+    """The written page, after what must hold of every page."""
+    path = write_recognition(folder, report)
+    text = path.read_text(encoding="utf-8")
+    parsed = Page(text)
+    assert parsed.bad == []
+    assert "script" not in parsed.tags and "link" not in parsed.tags and "iframe" not in parsed.tags
+    assert all(address.startswith("data:image/png;base64,") for address in parsed.addresses)
+    assert "url(" not in text and "@import" not in text and "default-src 'none'" in text
+    assert not list(path.parent.glob(".*"))
+    return text
+
+
+def test_a_full_report(tmp_path):
+    events = [Hit("squat", 1, 3), Hit("lunge", 5, 6.5, exemplar=1)]
+    report = RecognitionReport(
+        "Session",
+        recordings=[recording(events, [("squat", 1.0, 3.0), ("squat", 7.0, 8.0)])],
+        evaluations=[EvaluationResult(["squat", "lunge"], ["squat", "lunge"], ["squat", "squat"], f"azimuth {a}") for a in (0, 90)],
+        exemplars={"squat": person(), "lunge": [person(40), person(50)]},
+        metrics={"mean_overlap": 0.81, "nested": {"x": np.arange(2)}},
+        manifest=manifest({"command": "scan"}, [__file__], seed=1),
+    )
+    text = write(tmp_path, report)
+    names = ["confusion.png", "events.csv", "manifest.json", "metrics.json", "report.html", "timeline.png"]
+    assert sorted(file.name for file in tmp_path.iterdir()) == names
+    assert text.count('<svg class="strip"') == 4 and "left limbs" in text
+    said = ["2 actions of 2 kinds were found", "2 of 4 clips (50.0%)", "Mean overlap", "azimuth 90", "✓ agrees", "Each action"]
+    said += ["nothing known here", "Known, but not found: squat 7.0 to 8.0 s", "command", "1.00 to 3.00 s"]
+    for words in said:
+        assert words in text, words
+    numbers = json.loads((tmp_path / "metrics.json").read_text())
+    assert numbers["accuracy"] == 0.5 and numbers["nested"] == {"x": [0, 1]} and numbers["missed_events"] == 1
+    kept = json.loads((tmp_path / "manifest.json").read_text())
+    assert kept["files"] == names and kept["seed"] == 1
+
+
+def test_names_cannot_break_out_of_the_page(tmp_path):
+    evil = ['"><img src=x onerror=alert(1)>', SCRIPT, "a\x00b\x1b", "深蹲 приседание नमस्ते", "=1+1", "</style>$title"]
+    events = [Hit(name, i, i + 1) for i, name in enumerate(evil)]
+    report = RecognitionReport(
+        f"T {SCRIPT}", summary=f"S {SCRIPT}",
+        recordings=[recording(events, [(SCRIPT, 0, 9)], classes=evil, name=f"file {SCRIPT}")],
+        evaluations=[EvaluationResult(evil, evil, evil[::-1], f"setting {SCRIPT}")],
+        exemplars={name: person() for name in evil},
+        metrics={SCRIPT: SCRIPT},
+        manifest={"arguments": {SCRIPT: [SCRIPT]}, "time": SCRIPT, "versions": {"dyntorch": SCRIPT}},
+    )  # fmt: skip
+    text = write(tmp_path, report)
+    assert "<script" not in text and text.count("&lt;script&gt;alert(1)&lt;/script&gt;") > 12
+    assert "onerror=alert(1)&gt;" in text and "深蹲 приседание नमस्ते" in text and "\x00" not in text and "\x1b" not in text
+
+
+def test_nothing_found_and_nothing_known(tmp_path):
+    text = write(tmp_path, RecognitionReport("Empty", recordings=[recording(classes=["only"])]))
+    assert "No action was found in 1 recording" in text and "Nothing was found" in text and "Known" not in text
+    assert (tmp_path / "events.csv").read_text() == "file,label,start,end,score,margin\n"
+    assert not (tmp_path / "confusion.png").exists()
+    assert "neither recordings nor evaluations" in write(tmp_path / "none", RecognitionReport("Nothing"))
+    assert "0 of 1" in write(tmp_path / "missed", RecognitionReport("Missed", recordings=[recording([], [("squat", 1, 2)])]))
+
+
+def test_odd_scores_and_videos_without_joints(tmp_path):
+    events = [Hit("squat", 0, 0, np.nan, np.inf), Hit(3, 1, 2, 12345.6)]
+    text = write(tmp_path, RecognitionReport("Odd", recordings=[recording(events, clip=False)]))
+    assert "n/a" in text and "12,346" in text and '<svg class="strip"' not in text and ">nan<" not in text
+    rows = list(csv.DictReader(io.StringIO((tmp_path / "events.csv").read_text())))
+    assert rows[0]["score"] == rows[0]["margin"] == "" and float(rows[1]["score"]) == 12345.6
+
+
+def test_many_events_are_counted_not_drawn(tmp_path):
+    events = [Hit("squat", i / 20, i / 20 + 0.04) for i in range(1200)]
+    report = RecognitionReport(
+        "Many", recordings=[recording(events, frames=2000), recording(events[:1], name="second")], exemplars={"squat": person()}
+    )
+    text = write(tmp_path, report)
+    assert text.count('<svg class="strip"') == 120 and "940 more without pictures" in text
+    assert "200 further actions are listed in events.csv only" in text and len(text) < 5_000_000
+    assert len((tmp_path / "events.csv").read_text().splitlines()) == 1202
+
+
+def test_an_hour_in_one_page(tmp_path):
+    frames = 108_000
+    classes = [f"action {i}" for i in range(12)]
+    result = RecordingResult(
+        "hour", None, np.arange(frames) / 30, classes, np.random.default_rng(0).normal(size=(frames, 12)),
+        [Hit(f"action {i % 12}", 18 * i, 18 * i + 2) for i in range(200)],
+    )  # fmt: skip
+    assert len(write(tmp_path, RecognitionReport("Hour", recordings=[result]))) < 5_000_000
+
+
+def test_an_earlier_reports_pictures_do_not_stay(tmp_path):
+    write(tmp_path, RecognitionReport("Two", recordings=[recording(), recording(name="b")]))
+    assert (tmp_path / "timeline-2.png").exists()
+    (tmp_path / "timeline-3.png").write_text("the user's own")
+    (tmp_path / "notes.txt").write_text("the user's own")
+    listed = json.loads((tmp_path / "manifest.json").read_text())
+    files.write_json(tmp_path / "manifest.json", {**listed, "files": [*listed["files"], "notes.txt", "../x"]})
+    write(tmp_path, RecognitionReport("None", evaluations=[EvaluationResult(["a"], ["a"], ["a"])]))
+    left = ["confusion.png", "manifest.json", "metrics.json", "notes.txt", "report.html", "timeline-3.png"]
+    assert sorted(file.name for file in tmp_path.iterdir()) == left
+
+
+@pytest.mark.parametrize(
+    "label", ["=cmd|' /C calc'!A0", "+1", "-squat", "@x", "\tx", "  =1", 'quo"te, comma', "two\nlines", "plain", "深蹲"]
+)
+def test_csv_cells_are_quoted_and_never_formulas(label):
+    text = events_csv([recording([Hit(label, 1.23456, 2, score=-0.5, margin=1e-9)], name=label)])
+    row = next(csv.DictReader(io.StringIO(text, newline="")))
+    guarded = label.strip(" ")[0] in "=+-@\t"
+    assert row["label"] == row["file"] == ("'" + label if guarded else label)
+    assert (row["start"], row["end"], row["score"], row["margin"]) == ("1.235", "2.000", "-0.5", "1e-09")
+
+
+def test_csv_labels_that_are_numbers_stay_numbers():
+    text = events_csv([recording([Hit(-1, 0, 1), Hit(np.int64(-2), 2, 3), Hit("-3", 4, 5)])])
+    assert [row["label"] for row in csv.DictReader(io.StringIO(text))] == ["-1", "-2", "'-3"]
+
+
+def test_a_file_in_the_way_is_refused_before_anything_is_written(tmp_path):
+    (tmp_path / "out").write_text("x")
+    with pytest.raises(ValueError, match="choose another folder"):
+        write_recognition(tmp_path / "out", RecognitionReport("t"))
+    assert (tmp_path / "out").read_text() == "x"
+
+
+def test_page_parts_escape_and_nest():
+    body = page.section(
+        "A & B", page.cards([page.Card("<n>", "1", "<i>")]) + page.details("more", page.settings({"a": {"b": [1, 2]}}))
+    )
+    text = page.page("<t>", body, summary="<s>", kind="<k>", footer="<f>")
+    assert Page(text).bad == [] and "A &amp; B" in text and "<code>a.b</code>" in text and "<code>1 2</code>" in text
+    assert not re.search(r"<(n|i|s|k|f|t)>", text)
+    assert "5 more lines" in page.settings({str(i): i for i in range(205)})
+    assert 'width="100.0"' in page.bar(1.7) and 'width="0.0"' in page.bar(-1)
