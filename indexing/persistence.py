@@ -1,3 +1,122 @@
 """Model files: safetensors with JSON metadata.  Nothing in them can run."""
 
 from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from indexing.files import write_bytes
+from indexing.shape.bank import Kernels, Windows
+from indexing.shape.channels import JointMetric
+from indexing.shape.exemplars import Exemplars
+from indexing.shape.machine import PairwiseMachine
+from indexing.shape.model import KERNEL_WHITENING, ShapeModel
+from indexing.skeleton import Skeleton
+
+if TYPE_CHECKING:
+    from indexing.indexer import ActionIndexer
+
+FORMAT = "dyntorch.action-indexer"
+VERSION = 1
+SAVED = "fit on the clips again and save with this version"
+
+Indexer = TypeVar("Indexer", bound="ActionIndexer")
+
+
+def save(indexer: ActionIndexer, path: str | Path) -> None:
+    """Write a fitted indexer.
+
+    Raises:
+        ValueError: the file cannot be written, or the labels are neither text nor numbers.
+    """
+    from safetensors.torch import save as to_bytes
+
+    classes = indexer.classes_
+    if classes.dtype.kind not in "USiufb":
+        raise ValueError(f"labels of type {classes.dtype} cannot be saved; use text or numbers")
+    skeleton = indexer.skeleton_
+    metadata = {
+        "format": FORMAT,
+        "version": VERSION,
+        "parameters": _plain(indexer.get_params()),
+        "classes": {"values": classes.tolist(), "dtype": classes.dtype.str},
+        "joints": indexer.n_joints_,
+        "view": indexer.model_.view,
+        "skeleton": None if skeleton is None else [skeleton.name, list(skeleton.joints), [list(b) for b in skeleton.bones]],
+    }
+    data = to_bytes(_tensors(indexer.model_), metadata={"dyntorch": json.dumps(metadata)})
+    write_bytes(Path(path), data)
+
+
+def load(kind: type[Indexer], path: str | Path) -> Indexer:
+    """Read a fitted indexer; see :meth:`indexing.ActionIndexer.load`."""
+    from safetensors import SafetensorError, safe_open
+
+    path = Path(path)
+    if not path.is_file():
+        raise ValueError(f"{path}: no such model file; make one with 'dyntorch index fit ... -o {path.name}'")
+    try:
+        with safe_open(path, framework="pt") as file:
+            header = (file.metadata() or {}).get("dyntorch")
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  (safe_open is no mapping)
+    except (SafetensorError, OSError) as error:
+        raise ValueError(f"{path}: not a model file (safetensors says: {error}); give the file that 'index fit' wrote") from None
+    try:
+        metadata = json.loads(header or "{}")
+        if metadata.get("format") != FORMAT:
+            raise ValueError(f"{path}: a safetensors file, but not an action indexer; give the file that 'index fit' wrote")
+        if metadata.get("version") != VERSION:
+            raise ValueError(f"{path}: model version {metadata.get('version')!r}, this program reads {VERSION}; {SAVED}")
+        indexer = kind(**metadata["parameters"])
+        indexer.classes_ = np.array(metadata["classes"]["values"], dtype=np.dtype(metadata["classes"]["dtype"]))
+        indexer.n_joints_ = int(metadata["joints"])
+        name, joints, bones = metadata["skeleton"] or (None, (), ())
+        indexer.skeleton_ = Skeleton(name, tuple(joints), tuple((a, b) for a, b in bones)) if name is not None else None
+        indexer.model_ = _model(tensors, len(indexer.classes_), metadata["view"])
+        indexer._calibrate()
+    except (KeyError, TypeError, json.JSONDecodeError) as error:
+        raise ValueError(f"{path}: the model's metadata is damaged ({type(error).__name__}: {error}); {SAVED}") from None
+    return indexer
+
+
+def _tensors(model: ShapeModel) -> dict[str, Tensor]:
+    named: dict[str, Tensor | None] = {
+        "labels": model.labels, "mirrored": model.mirrored, "weights": model.weights, "hub": model.hub, "moment_hub": model.moment_hub, "symmetry": model.symmetry,
+        "metric": model.metric.covariance, "metric_power": torch.tensor(model.metric.power), "owner": model.exemplars.owner, "solid": model.exemplars.solid,
+        "evidence_in": model.evidence_in, "evidence_out": model.evidence_out,
+        **_windows("crops", model.exemplars.crops), **_windows("views", model.exemplars.views), **_windows("moments", model.exemplars.moments),
+    }  # fmt: skip
+    if model.kernels is not None and model.support is not None and model.machine is not None:
+        machine = model.machine
+        named |= {"scales": model.kernels.scales, **_windows("support", model.support), "machine.support": machine.support}
+        named |= {"machine.dual": machine.dual, "machine.intercept": machine.intercept, "machine.counts": machine.counts}
+    return {name: value.detach().cpu().contiguous().clone() for name, value in named.items() if value is not None}
+
+
+def _windows(name: str, windows: Windows) -> dict[str, Tensor]:
+    return {f"{name}.values": windows.values, f"{name}.seen": windows.seen}
+
+
+def _model(tensors: dict[str, Tensor], classes: int, view: str) -> ShapeModel:
+    def windows(name: str) -> Windows:
+        return Windows(tensors[f"{name}.values"], tensors[f"{name}.seen"])
+
+    metric = JointMetric(tensors["metric"], float(tensors["metric_power"]))
+    trained = "scales" in tensors
+    kernels = Kernels(JointMetric(metric.covariance, KERNEL_WHITENING), view == "same", tensors["scales"]) if trained else None
+    machine = PairwiseMachine(*(tensors[f"machine.{n}"] for n in ("support", "dual", "intercept", "counts"))) if trained else None
+    return ShapeModel(
+        Exemplars(windows("crops"), windows("views"), windows("moments"), tensors["owner"], tensors["solid"]), tensors["labels"], classes, view, metric,
+        tensors.get("symmetry"), tensors["mirrored"], tensors["weights"], tensors["hub"], tensors["moment_hub"], kernels,
+        windows("support") if trained else None, machine, tensors["evidence_out"], tensors["evidence_in"],
+    )  # fmt: skip
+
+
+def _plain(parameters: dict[str, Any]) -> dict[str, Any]:
+    """Parameters as JSON has them: numpy scalars become Python's, tuples lists."""
+    return {k: v.item() if isinstance(v, np.generic) else list(v) if isinstance(v, tuple) else v for k, v in parameters.items()}

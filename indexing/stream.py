@@ -14,8 +14,8 @@ from torch import Tensor
 
 from indexing.clip import Clip
 from indexing.scoring import FALSE_ALARMS, Event, events, smooth
-from indexing.shape.bank import Windows, fused_residual
-from indexing.shape.model import ShapeModel, mirror_some
+from indexing.shape.bank import Windows
+from indexing.shape.model import MOMENT_SAMPLE, ShapeModel
 from indexing.windows import Ragged, ragged, sample
 
 Array = NDArray[Any]
@@ -23,7 +23,6 @@ Progress = Callable[[float], None] | None
 
 STEP = 0.1  # seconds between the windows of a recording
 BLOCK = 1200  # windows compared at once: bounds memory whatever the length of the recording
-TERMS = ("epi", "up", "nn")  # what is bound to the view helps on short windows, even at 90 degrees
 
 
 @dataclass(frozen=True)
@@ -38,21 +37,6 @@ class Stream:
     device: str
 
 
-def moments(model: ShapeModel) -> tuple[list[Windows], Tensor]:
-    """The exemplars' short windows (and their mirror images), and the class of each."""
-    plain, owner = model.exemplars.moments, model.exemplars.owner
-    copies = [plain]
-    if model.symmetry is not None and bool(model.mirrored.any()):
-        copies.append(mirror_some(plain, model.symmetry, model.mirrored[owner]))
-    return copies, model.labels[owner]
-
-
-def class_evidence(model: ShapeModel, query: Windows, copies: list[Windows], labels: Tensor) -> Tensor:
-    """``(Q, classes)`` minus the residual to the nearest short window of each class."""
-    residual = fused_residual(query, copies, model.metric, terms=TERMS)
-    return torch.stack([-residual[:, labels == c].min(dim=1).values for c in range(model.classes)], dim=1)
-
-
 def centres(clip: Clip) -> Array:
     """``(T,)`` times at which windows are centred."""
     return np.asarray(clip.times[0] + STEP * np.arange(max(2, int(np.ceil(clip.duration / STEP)) + 1)))
@@ -61,7 +45,6 @@ def centres(clip: Clip) -> Array:
 def window_scores(model: ShapeModel, clip: Clip, stream: Stream, progress: Progress = None) -> tuple[Array, Array]:
     """Times ``(T,)`` and pooled class scores ``(T, classes)`` along a recording."""
     source = ragged([clip], stream.repair)
-    copies, labels = moments(model)
     at = centres(clip)
     scores = np.empty((len(at), model.classes))
     for begin in range(0, len(at), BLOCK):
@@ -69,7 +52,7 @@ def window_scores(model: ShapeModel, clip: Clip, stream: Stream, progress: Progr
         best: Tensor | None = None
         for tempo in stream.tempi:
             query = _windows(source, part, stream.window * tempo, stream.length).to(stream.device)
-            one = class_evidence(model, query, copies, labels)
+            one = model.moment_scores(query)
             best = one if best is None else torch.maximum(best, one)
         if best is None:
             raise ValueError("tempi: give at least one speed factor")
@@ -105,8 +88,7 @@ def find_events(
         return []
     middle = np.array([(event.start + event.end) / 2 for event in found])
     query = _windows(ragged([clip], stream.repair), middle, stream.window, stream.length).to(stream.device)
-    copies, _ = moments(model)
-    residual = fused_residual(query, copies, model.metric, terms=TERMS)
+    residual = model.moment_residuals(query)
     numbers = {label: i for i, label in enumerate(classes)}
     out = []
     for row, event in zip(residual, found, strict=True):
@@ -120,9 +102,8 @@ def stream_threshold(model: ShapeModel, stream: Stream, reject: float | None) ->
     """The score that windows of one class reach for other classes only at the accepted rate of false alarms."""
     if reject is not None and not 0 < reject < 1:
         return reject
-    copies, labels = moments(model)
-    query = copies[0][torch.arange(0, len(copies[0]), max(1, len(copies[0]) // 500))]
-    own = labels[torch.arange(0, len(labels), max(1, len(labels) // 500))]
-    scores = class_evidence(model, query, copies, labels)
-    scores[torch.arange(len(own)), own] = -torch.inf
+    moments, labels = model.exemplars.moments, model.labels[model.exemplars.owner]
+    sample = torch.arange(0, len(moments), max(1, len(moments) // MOMENT_SAMPLE))
+    scores = model.moment_scores(moments[sample])
+    scores[torch.arange(len(sample)), labels[sample]] = -torch.inf
     return float(torch.quantile(scores.max(dim=1).values, 1 - (FALSE_ALARMS if reject is None else reject)))

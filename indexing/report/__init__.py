@@ -3,7 +3,7 @@
 Importing this package loads neither matplotlib nor scikit-learn nor torch; they are imported when something is drawn or measured.
 """
 
-from indexing.report.files import manifest, prepare, write_bytes, write_json, write_text
+from indexing.files import manifest, prepare, write_bytes, write_json, write_text
 from indexing.report.recognition import EvaluationResult, Event, RecognitionReport, RecordingResult, write_recognition
 
 __all__ = [

@@ -19,11 +19,17 @@ def measure(report: RecognitionReport) -> dict[str, Any]:
     Returns:
         the report's own ``metrics``, and
         for evaluations ``clips, accuracy, accuracy_interval, macro_f1, accuracy_by_setting, per_class, confusion``;
-        for recordings ``recordings, seconds, events, events_by_class``, and ``known_events, missed_events`` where some are known.
+        for recordings ``recordings, seconds, events, events_by_class``, and where some are known ``known_events, missed_events,
+        frame_accuracy, frame_agreement``.
     """
     out = dict(report.metrics)
+    if report.notes:
+        out["notes"] = list(report.notes)
     if report.evaluations:
         out.update(recognition(report.evaluations))
+        plain = _baseline(report)
+        if plain:
+            out["baseline"] = plain
     if report.recordings:
         out.update(_search(report.recordings))
     return out
@@ -65,6 +71,20 @@ def recognition(evaluations: Sequence[EvaluationResult]) -> dict[str, Any]:
     }
 
 
+def _baseline(report: RecognitionReport) -> dict[str, Any]:
+    """Name, accuracy and accuracy per setting of the plain method that the evaluations were compared with; empty without one."""
+    right: dict[str, list[bool]] = {}
+    for evaluation in report.evaluations:
+        if evaluation.baseline is not None:
+            pairs = zip(evaluation.truth, evaluation.baseline, strict=True)
+            right.setdefault(evaluation.setting, []).extend(str(true) == str(guess) for true, guess in pairs)
+    if not right:
+        return {}
+    together = [value for values in right.values() for value in values]
+    by_setting = {name: float(np.mean(values)) for name, values in right.items()}
+    return {"name": report.baseline[0], "accuracy": float(np.mean(together)), "accuracy_by_setting": by_setting}
+
+
 def wilson(share: float, number: int) -> tuple[float, float]:
     """95 % interval of a proportion (Wilson's; it also holds near 0 and 1, where the usual one is empty).
 
@@ -98,6 +118,30 @@ def missed(recording: RecordingResult) -> list[Truth]:
     ]
 
 
+def frame_accuracy(recording: RecordingResult) -> float:
+    """Share of the frames inside known actions whose best-scoring action is the known one; NaN without such frames."""
+    known = _known_frames(recording)
+    inside = known != ""
+    best = np.array([str(name) for name in recording.classes], dtype=object)[np.nan_to_num(recording.scores, nan=-np.inf).argmax(axis=1)]
+    return float((best[inside] == known[inside]).mean()) if inside.any() else math.nan
+
+
+def frame_agreement(recording: RecordingResult) -> float:
+    """Share of all frames for which the reported events say what is known: the same action, or none."""
+    said = np.full(len(recording.times), "", dtype=object)
+    for event in recording.events:
+        said[(recording.times >= event.start) & (recording.times <= event.end)] = str(event.label)
+    return float((said == _known_frames(recording)).mean())
+
+
+def _known_frames(recording: RecordingResult) -> Any:
+    """``(F,)`` the known action of each frame; empty text where none is known."""
+    known = np.full(len(recording.times), "", dtype=object)
+    for label, start, end in recording.truth or ():
+        known[(recording.times >= start) & (recording.times <= end)] = str(label)
+    return known
+
+
 def confused_with(confusion: Mapping[str, Any], label: str) -> tuple[str, int] | None:
     """What a class is most often mistaken for, and how often."""
     labels, counts = confusion["labels"], confusion["counts"]
@@ -117,4 +161,9 @@ def _search(recordings: Sequence[RecordingResult]) -> dict[str, Any]:
     if known:
         out["known_events"] = sum(len(recording.truth or ()) for recording in known)
         out["missed_events"] = sum(len(missed(recording)) for recording in known)
+        inside = np.array([(_known_frames(recording) != "").sum() for recording in known], dtype=float)
+        shares = np.array([frame_accuracy(recording) for recording in known])
+        out["frame_accuracy"] = float(np.nansum(shares * inside) / inside.sum()) if inside.any() else math.nan
+        frames = [len(recording.times) for recording in known]
+        out["frame_agreement"] = float(np.average([frame_agreement(recording) for recording in known], weights=frames))
     return out

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from indexing.report import files, pictures
+from indexing import files
+from indexing.report import pictures
 from indexing.report.measures import measure
 from indexing.report.page import made_by, page
 from indexing.report.recognition_page import TIMELINES, body, describe

@@ -23,14 +23,14 @@ Pictures = Mapping[str, tuple[bytes, bytes]]  # file name -> PNG for light and f
 
 def body(report: RecognitionReport, measured: Mapping[str, Any], drawn: Pictures) -> str:
     """The page's sections: headline numbers, recordings, settings, actions, confusion, and how the report was made."""
-    parts = [cards(_headline(report, measured))]
+    parts = [cards(_headline(report, measured)), _notes(report)]
     timelines = [pair for name, pair in drawn.items() if name.startswith("timeline")]
     before = 0
     for index, recording in enumerate(report.recordings):
         parts.append(_recording(report, recording, timelines[index] if index < len(timelines) else None, before))
         before += len(recording.events)
     if report.evaluations:
-        parts += [_by_setting(measured), _by_class(measured), _confusion(measured, drawn["confusion.png"])]
+        parts += [_by_setting(report, measured), _by_class(measured), _confusion(measured, drawn["confusion.png"])]
     if not report.recordings and not report.evaluations:
         parts.append(section("Nothing to show", "", "The report holds neither recordings nor evaluations."))
     if report.manifest:
@@ -83,11 +83,18 @@ def _headline(report: RecognitionReport, measured: Mapping[str, Any]) -> list[Ca
         if measured.get("known_events"):
             got = measured["known_events"] - measured["missed_events"]
             items.append(Card("Known actions hit", f"{got} of {measured['known_events']}", "overlap a find of the same name"))
+            note = f"of those in known actions, by the best score; {_percent(measured['frame_agreement'])} of all, by what was reported"
+            items.append(Card("Frames right", _percent(measured["frame_accuracy"]), note))
         items.append(Card("Searched", _duration(measured["seconds"]), f"in {_count(measured['recordings'], 'recording')}"))
     for name, value in report.metrics.items():
         if isinstance(value, (int, float, str, np.number, np.bool_)) and measured.get(name) is value:
             items.append(Card(str(name).replace("_", " ").capitalize(), value if isinstance(value, str) else _plain(value)))
     return items
+
+
+def _notes(report: RecognitionReport) -> str:
+    lines = "".join(f"<li>{escape(note)}</li>" for note in report.notes)
+    return section("Please note", f"<ul>{lines}</ul>") if lines else ""
 
 
 def _recording(report: RecognitionReport, recording: RecordingResult, drawn: tuple[bytes, bytes] | None, before: int) -> str:
@@ -163,7 +170,7 @@ def _verdict(event: Event, known: str | None) -> str:
     return f'<span class="bad">✗ {"nothing known here" if known is None else f"is {escape(known)}"}</span>'
 
 
-def _by_setting(measured: Mapping[str, Any]) -> str:
+def _by_setting(report: RecognitionReport, measured: Mapping[str, Any]) -> str:
     values = measured["accuracy_by_setting"]
     guess = 1 / len(measured["confusion"]["labels"])
     rows = [
@@ -172,6 +179,14 @@ def _by_setting(measured: Mapping[str, Any]) -> str:
     ]
     columns = [Column("Setting"), Column("Clips", "number"), Column("Accuracy", "number"), Column("0 to 100%", "wide")]
     note = f"Share of clips recognized. The tick is what guessing would reach ({_percent(guess)})."
+    plain = measured.get("baseline")
+    if plain:
+        name, how = report.baseline
+        columns += [Column(name, "number"), Column(f"{name}, 0 to 100%", "wide")]
+        for row, setting in zip(rows, values, strict=True):
+            share = plain["accuracy_by_setting"].get(setting, np.nan)
+            row += [NONE, ""] if np.isnan(share) else [_percent(share), bar(share, guess)]
+        note += f" {name}, for comparison: {how}." if how else ""
     return section("Accuracy by setting", table(columns, rows), note) if len(values) > 1 or "" not in values else ""
 
 

@@ -83,21 +83,27 @@ class EvaluationResult:
         truth: ``(N,)`` labels.
         predicted: ``(N,)`` labels; one that is not in ``classes`` (the none label, say) gets a row of its own.
         setting: what was measured, e.g. ``"azimuth 90"``.
+        baseline: ``(N,)`` what a plain method answers, where one was asked for comparison.
 
     Raises:
-        ValueError: ``truth`` and ``predicted`` differ in length, or are empty.
+        ValueError: ``truth``, ``predicted`` and ``baseline`` differ in length, or are empty.
     """
 
     classes: Sequence[Hashable]
     truth: Sequence[Hashable] | NDArray[Any]
     predicted: Sequence[Hashable] | NDArray[Any]
     setting: str = ""
+    baseline: Sequence[Hashable] | NDArray[Any] | None = None
 
     def __post_init__(self) -> None:
         if len(self.truth) != len(self.predicted) or not len(self.truth):
             raise ValueError(
                 f"evaluation {self.setting!r}: truth and predicted must hold one label per clip, at least one; "
                 f"got {len(self.truth)} and {len(self.predicted)}"
+            )
+        if self.baseline is not None and len(self.baseline) != len(self.truth):
+            raise ValueError(
+                f"evaluation {self.setting!r}: baseline must hold one label per clip ({len(self.truth)}), got {len(self.baseline)}"
             )
 
 
@@ -112,7 +118,9 @@ class RecognitionReport:
         evaluations: measured recognition, one per setting.
         exemplars: label -> the clip it was learned from, or a list of them, of which an event's ``exemplar`` names one.
         metrics: further numbers for metrics.json; those at its top level are shown as cards.
-        manifest: of :func:`indexing.report.files.manifest`.
+        baseline: name of the method behind the evaluations' ``baseline``, and how it works in a few words.
+        notes: what a reader must know to judge the numbers, a sentence each.
+        manifest: of :func:`indexing.files.manifest`.
     """
 
     title: str
@@ -121,6 +129,8 @@ class RecognitionReport:
     evaluations: Sequence[EvaluationResult] = ()
     exemplars: Mapping[Hashable, Clip | Sequence[Clip]] = field(default_factory=dict)
     metrics: Mapping[str, Any] = field(default_factory=dict)
+    baseline: tuple[str, str] = ("Baseline", "")
+    notes: Sequence[str] = ()
     manifest: Mapping[str, Any] = field(default_factory=dict)
 
     def exemplar(self, event: Event) -> Clip | None:

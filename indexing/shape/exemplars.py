@@ -37,16 +37,17 @@ class Exemplars:
     """Windows of ``N`` exemplars.
 
     crops: ``C * N`` windows, crop by crop; views: ``V * N``, view by view; moments: short windows of all exemplars, with
-    ``owner`` telling whose they are.
+    ``owner`` telling whose they are; solid: ``(N,)`` which exemplars had depth.
     """
 
     crops: Windows
     views: Windows
     moments: Windows
     owner: torch.Tensor
+    solid: torch.Tensor
 
     def __len__(self) -> int:
-        return int(self.owner.max()) + 1 if len(self.owner) else 0
+        return len(self.solid)
 
     def crop(self, index: int) -> Windows:
         """``N`` windows of one crop; 0 is the whole exemplar."""
@@ -71,6 +72,7 @@ class Exemplars:
             interleave(self.views, other.views) if len(self.views) else self.views,
             stack([self.moments, other.moments]),
             torch.cat([self.owner, other.owner + mine]),
+            torch.cat([self.solid, other.solid]),
         )
 
 
@@ -83,7 +85,8 @@ def cut(clips: Sequence[Clip], plan: Plan, random_state: np.random.Generator) ->
     cropped = stack([Windows(whole(source, plan.length, crop), seen) for crop in crops])
     views = [_view(clips, source, plan, random_state) for _ in range(plan.views)]
     moments, owner = slide(source, plan.length, plan.window, plan.stride)
-    return Exemplars(cropped, stack(views) if views else cropped[:0], moments, owner)
+    solid = torch.tensor([clip.dims == 3 for clip in clips])
+    return Exemplars(cropped, stack(views) if views else cropped[:0], moments, owner, solid)
 
 
 def _render(clip: Clip, azimuth: float, elevation: float, random_state: np.random.Generator) -> Clip:

@@ -12,8 +12,9 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
+from indexing import files
 from indexing.clip import Clip
-from indexing.report import EvaluationResult, RecognitionReport, RecordingResult, files, manifest, page, write_recognition
+from indexing.report import EvaluationResult, RecognitionReport, RecordingResult, manifest, page, write_recognition
 from indexing.report.recognition import events_csv
 from indexing.skeleton import from_names
 

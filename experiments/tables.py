@@ -1,0 +1,63 @@
+"""Measured figures beside their goals, as a table to print and as rows to keep."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Row:
+    """One figure: ``measured`` (a mean), its standard deviation over repetitions where there are any, and the goal."""
+
+    task: str
+    setting: str
+    measured: float
+    goal: float | None = None
+    spread: float | None = None
+    at_most: bool = False  # the goal is an upper bound (seconds, megabytes)
+    unit: str = ""
+
+    @property
+    def reached(self) -> bool | None:
+        """Whether the unrounded figure reaches the goal; ``None`` where there is no goal."""
+        if self.goal is None:
+            return None
+        return self.measured <= self.goal if self.at_most else self.measured >= self.goal
+
+
+def markdown(rows: Sequence[Row], title: str = "") -> str:
+    """The rows as a Markdown table, ready for the README."""
+    head = ("task", "setting", "measured", "goal", "reached")
+    lines = [head, *(_cells(row) for row in rows)]
+    widths = [max(len(line[k]) for line in lines) for k in range(len(head))]
+    text = ["| " + " | ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)) + " |" for line in lines]
+    text.insert(1, "|" + "|".join("-" * (width + 2) for width in widths) + "|")
+    return "\n".join([f"\n### {title}\n", *text] if title else text)
+
+
+def _cells(row: Row) -> tuple[str, ...]:
+    value = f"{_number(row.measured)}{row.unit}" + ("" if row.spread is None else f" ± {row.spread:.3f}")
+    if row.goal is None:
+        return row.task, row.setting, value, "", ""
+    sign = "<=" if row.at_most else ">="
+    return row.task, row.setting, value, f"{sign} {_number(row.goal)}{row.unit}", "yes" if row.reached else "NO"
+
+
+def _number(value: float) -> str:
+    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}" if abs(value) > 1 else f"{value:.3f}"
+
+
+def note(message: str) -> None:
+    """Progress, apart from the tables: on stderr."""
+    print(message, file=sys.stderr, flush=True)
+
+
+def command(run: Callable[[], None]) -> None:
+    """Run a script; bad input ends in one line on stderr and exit code 2."""
+    try:
+        run()
+    except ValueError as problem:
+        print(f"error: {problem}", file=sys.stderr)
+        raise SystemExit(2) from None

@@ -1,0 +1,135 @@
+"""The command line: ``dyntorch demo | index fit | index scan | index evaluate``, one file per command.
+
+A command is a dataclass whose fields are its flags, with ``run() -> exit code``.  Only what parsing needs is imported here,
+so that ``--help`` answers at once; a command imports its tools when it runs.
+
+A new command is a new file, and a line in :data:`COMMANDS` (or :data:`INDEX` for a verb of ``dyntorch index``).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import sys
+import warnings
+from collections.abc import Iterator, Sequence
+from typing import Annotated, Any, Protocol, cast
+
+import tyro
+
+from indexing.cli.console import complain, one_line
+from indexing.cli.demo import Demo
+from indexing.cli.evaluate import Evaluate
+from indexing.cli.fit import Fit
+from indexing.cli.scan import Scan
+
+DONE, BAD_INPUT, REFUSED, INTERRUPTED, BROKEN_PIPE = 0, 2, 3, 130, 141
+
+Command = tyro.conf.subcommand
+INDEX: Any = (
+    Annotated[Fit, Command("fit", description="Learn actions from example clips.")]
+    | Annotated[Scan, Command("scan", description="Find learned actions in long recordings.")]
+    | Annotated[Evaluate, Command("evaluate", description="Measure recognition on a labelled clip set.")]
+)
+COMMANDS: Any = (
+    Annotated[Demo, Command("demo", description="See it work on built-in synthetic people.")]
+    | Annotated[INDEX, Command("index", description="Learn actions from one clip each and find them elsewhere.")]
+)  # next: sync, segment, align, count
+GROUPS = ("index",)  # words that need another one behind them
+DESCRIPTION = """Learn actions from one clip each, find them in other clips, from other viewpoints.
+
+'dyntorch demo' shows it; 'dyntorch COMMAND --help' explains a command; 'dyntorch --version' says the version."""
+
+
+class Runnable(Protocol):
+    """What parsing gives: a command with its flags."""
+
+    def run(self) -> int: ...
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command.
+
+    Args:
+        argv: words after ``dyntorch``; by default those of the process.
+
+    Returns:
+        0 done, 2 bad input (one line on stderr), 3 refused, 130 interrupted, 141 when nobody reads the output any more.
+    """
+    words = list(sys.argv[1:] if argv is None else argv)
+    try:
+        with _output():
+            if words in (["--version"], ["-V"]):
+                print(f"dyntorch {_version()}")
+                return DONE
+            command = parse(words)
+            code = command if isinstance(command, int) else command.run()
+            sys.stdout.flush()
+            return code
+    except KeyboardInterrupt:
+        complain("interrupted; nothing was left half-written")
+        return INTERRUPTED
+    except BrokenPipeError:
+        _silence()
+        return BROKEN_PIPE
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename is not None else ""
+        complain(f"{where}{error.strerror or error}; check the path and its permissions")
+        return BAD_INPUT
+    except ValueError as error:
+        complain(str(error))
+        return BAD_INPUT
+
+
+def parse(words: list[str]) -> Runnable | int:
+    """The command that the words ask for, or the exit code where they ask for help or for what does not exist."""
+    if not words or (len(words) == 1 and words[0] in GROUPS):
+        words = [*words, "--help"]
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            parsed = tyro.cli(
+                COMMANDS,
+                prog="dyntorch",
+                description=DESCRIPTION,
+                args=words,
+                config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone),
+            )
+    except SystemExit as stop:
+        if stop.code in (None, 0):
+            return DONE
+        complain(_unboxed(said.getvalue()))
+        return BAD_INPUT
+    return cast("Runnable", parsed)
+
+
+def _unboxed(text: str) -> str:
+    """The parser's message, which it draws in a box, as one line."""
+    lines = [line.strip("│╭╰╮╯─+-| \t") for line in text.splitlines()]
+    return one_line(" ".join(line for line in lines if line)) or "the command line makes no sense; see dyntorch --help"
+
+
+def _version() -> str:
+    from importlib import metadata
+
+    return metadata.version("dyntorch")
+
+
+@contextlib.contextmanager
+def _output() -> Iterator[None]:
+    """Warnings as one line each, and no failure over a letter that the terminal cannot show."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
+            stream.reconfigure(errors="backslashreplace")
+    with warnings.catch_warnings():
+        warnings.showwarning = lambda message, *_, **__: complain(f"warning: {message}")
+        yield
+
+
+def _silence() -> None:
+    """Keep the interpreter from failing once more, at exit, over the pipe that nobody reads."""
+    with contextlib.suppress(OSError, ValueError, AttributeError):
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, sys.stdout.fileno())
+        os.close(nowhere)

@@ -1,0 +1,190 @@
+"""``dyntorch index evaluate``: measure recognition on a labelled clip set."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from indexing.cli.console import Progress, progress, say, table
+from indexing.cli.inputs import Reading, assumed, usable
+from indexing.cli.outputs import check_report
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from indexing.cli.protocol import Cameras, Fold
+    from indexing.clip import ClipSet
+    from indexing.report import EvaluationResult
+
+REJECTED = "(rejected)"
+Criteria = Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="FIELD=VALUES")]
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Learn from some clips of a set, recognize the others, and say how often that was right.
+
+    dyntorch index evaluate SET.npz --train view=1,2 --test view=3 --report out/
+    dyntorch index evaluate SET.npz --leave-out subject --camera virtual --azimuth 0,45,90
+    """
+
+    clips: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SET.npz")]
+    """a clip set with labels"""
+    train: Criteria = ()
+    """learn from the clips with these values, e.g. view=1,2 (repeat the option for further fields); by default all but --test"""
+    test: Criteria = ()
+    """ask about these clips; by default all but --train"""
+    leave_out: Annotated[str | None, tyro.conf.arg(metavar="FIELD")] = None
+    """instead of --train and --test: ask about each value of this field in turn and learn from the others, e.g. subject"""
+    camera: Literal["none", "perspective", "virtual"] = "none"
+    """none: clips as they are; perspective: image x/z, y/z of 3D joints in camera coordinates; virtual: render 3D joints
+    (4.5 m away, height 1.5 m, 15 mm noise), examples from azimuth 0, queries from each --azimuth"""
+    azimuth: Annotated[str, tyro.conf.arg(metavar="DEGREES")] = "0"
+    """of the virtual cameras of queries, e.g. 0,45,90"""
+    exemplars: Literal["2d", "3d"] = "2d"
+    """3d: learn from the 3D joints, while queries are still images"""
+    shots: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """learn from this many examples per action only, drawn at random"""
+    view: Literal["any", "same"] = "any"
+    """from where queries are seen: from anywhere, or from about where the examples were"""
+    weights: Literal["equal", "learned"] = "equal"
+    """of the channels that are compared"""
+    reject: Annotated[float | None, tyro.conf.arg(metavar="R")] = None
+    """share of clips of unknown actions that may be taken for a known one, 0 to 1; any other number is the least score"""
+    mirror: bool = True
+    """let examples count mirrored, too, where left and right are not different actions"""
+    seed: int = 0
+    """of noise, cameras and drawn examples"""
+    report: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
+    """where to write report.html, confusion.png, metrics.json and manifest.json; without it, print only"""
+    reading: Reading = field(default_factory=Reading)
+
+    def run(self) -> int:
+        """Read, split, learn and ask for every fold; write the report and print the numbers."""
+        folder = check_report(self.report, [self.clips])
+        started = time.perf_counter()
+        with progress("loading", steps=False):
+            import indexing.indexer  # noqa: F401  (its import takes longer than the reading)
+            from indexing.cli.protocol import Cameras, check_dims, splits, strangers
+
+            clips, notes = self._load()
+            cameras = Cameras(self.camera, _degrees(self.azimuth), self.exemplars == "3d", self.seed)
+            check_dims(clips, cameras)
+            folds, warned = splits(clips, self.train, self.test, self.leave_out)
+            labels = clips.labels.astype(str)
+            folds, few = self._shots(folds, labels)
+        notes += warned + few + strangers(folds, labels)
+        timings = {"load": time.perf_counter() - started, "learn": 0.0, "recognize": 0.0}
+        with progress("learning and recognizing") as bar:
+            results = self._measure(clips, labels, folds, cameras, timings, bar)
+        from indexing.report.measures import recognition
+
+        measured = recognition([result for _, result in results])
+        groups = _by_group(results) if self.leave_out is not None else {}
+        page = None if folder is None else self._write(folder, [result for _, result in results], groups, notes, timings)
+        _show(measured, groups)
+        for note in notes:
+            say(note if note.startswith("warning") else f"note: {note}")
+        low, high = measured["accuracy_interval"]
+        say(f"accuracy {measured['accuracy']:.3f} ({measured['clips']:,} clips; 95 % interval {low:.3f} to {high:.3f})")
+        say(f"learned in {timings['learn']:.1f} s, recognized in {timings['recognize']:.1f} s")
+        if page is not None:
+            say(f"report: {page}")
+        return 0
+
+    def _load(self) -> tuple[ClipSet, list[str]]:
+        clips = self.reading.read(self.clips)
+        if all(clip.label is None for clip in clips):
+            raise ValueError(f"{self.clips}: says nothing of the actions; give a clip set with 'action' (and 'action_names')")
+        clips, notes = usable(clips, self.clips)
+        return clips, notes + assumed(clips)
+
+    def _shots(self, folds: list[Fold], labels: NDArray[np.str_]) -> tuple[list[Fold], list[str]]:
+        from indexing.cli.protocol import draw_shots
+
+        if self.shots is None:
+            return folds, []
+        drawn = [draw_shots(fold, labels, self.shots, self.seed) for fold in folds]
+        return [fold for fold, _ in drawn], [note for _, few in drawn for note in few]
+
+    def _measure(
+        self, clips: ClipSet, labels: NDArray[np.str_], folds: list[Fold], cameras: Cameras, timings: dict[str, float], bar: Progress
+    ) -> list[tuple[str, EvaluationResult]]:  # fmt: skip
+        """One result per fold and camera, each with the name of its fold."""
+        from indexing.indexer import ActionIndexer
+        from indexing.report import EvaluationResult
+
+        classes = sorted(set(labels))
+        out = []
+        for number, fold in enumerate(folds):
+            started = time.perf_counter()
+            indexer = ActionIndexer(
+                view=self.view, weights=self.weights, reject=self.reject, none_label=REJECTED,
+                mirror="auto" if self.mirror else False, random_state=self.seed,
+            )  # fmt: skip
+            indexer.fit([cameras.exemplar(clips[i], int(i)) for i in fold.train], labels[fold.train])
+            timings["learn"] += time.perf_counter() - started
+            for view, setting in enumerate(cameras.settings):
+                queries = [cameras.query(clips[i], int(i), view) for i in fold.test]
+                started = time.perf_counter()
+                predicted = indexer.predict(queries)
+                timings["recognize"] += time.perf_counter() - started
+                out.append((fold.name, EvaluationResult(classes, labels[fold.test], predicted, setting or fold.name)))
+                bar((number + (view + 1) / len(cameras.settings)) / len(folds))
+        return out
+
+    def _write(
+        self, folder: Path, results: list[EvaluationResult], groups: dict[str, float], notes: list[str], timings: dict[str, float]
+    ) -> Path:
+        from indexing.files import manifest
+        from indexing.report import RecognitionReport, write_recognition
+
+        report = RecognitionReport(
+            f"Recognition of {self.clips.name}",
+            evaluations=results,
+            metrics={"accuracy_by_group": groups} if groups else {},
+            notes=notes,
+            manifest=manifest(
+                {"command": "index evaluate", **dataclasses.asdict(self)}, [self.clips.expanduser()], self.seed, timings
+            ),
+        )
+        with progress("drawing the report", steps=False):
+            return write_recognition(folder, report)
+
+
+def _degrees(text: str) -> tuple[float, ...]:
+    try:
+        return tuple(float(word) for word in text.split(","))
+    except ValueError:
+        raise ValueError(f"--azimuth {text!r}: expected degrees, such as 0,45,90") from None
+
+
+def _by_group(results: list[tuple[str, EvaluationResult]]) -> dict[str, float]:
+    """Accuracy of each group that was left out, over all cameras."""
+    right: dict[str, list[bool]] = {}
+    for name, result in results:
+        right.setdefault(name, []).extend(str(a) == str(b) for a, b in zip(result.truth, result.predicted, strict=True))
+    return {name: sum(values) / len(values) for name, values in right.items()}
+
+
+def _show(measured: Mapping[str, Any], groups: dict[str, float]) -> None:
+    from indexing.report.measures import confused_with
+
+    rows = []
+    for name, row in measured["per_class"].items():
+        wrong = confused_with(measured["confusion"], name)
+        taken = f"{wrong[0]} ({wrong[1]})" if wrong else ""
+        if row["clips"]:
+            rows.append([name, row["clips"], f"{row['recall']:.3f}", f"{row['precision']:.3f}", taken])
+    table(["action", "clips ", "accuracy ", "precision ", "most often taken for"], rows)
+    settings = measured["accuracy_by_setting"]
+    shown = settings | {name: value for name, value in groups.items() if name not in settings}
+    if set(shown) != {""}:
+        table(["setting", "accuracy "], [[name, f"{value:.3f}"] for name, value in shown.items()])

@@ -1,0 +1,243 @@
+"""What commands read: example clips as ``label=file``, recordings, known events, and the flags that say how to read them."""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from indexing.cli.console import count, names
+
+if TYPE_CHECKING:
+    from indexing.clip import Clip, ClipSet
+
+Format = Literal["clipset", "openpose", "coco", "mediapipe", "deeplabcut", "mmpose", "ultralytics", "sleap"]
+People = Literal["largest", "confident", "tracked", "all"]
+TRIM = re.compile(r"(?P<path>.+)@(?P<start>\d+(\.\d*)?|\.\d+)?-(?P<end>\d+(\.\d*)?|\.\d+)?")
+KnownEvent = tuple[Hashable, float, float]
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How keypoint files are read."""
+
+    fps: Annotated[float | None, tyro.conf.arg(metavar="N")] = None
+    """frames per second, for files that do not say (30 is assumed then, and the output says so)"""
+    person: People = "largest"
+    """who is followed where a frame shows several people"""
+    min_confidence: Annotated[float, tyro.conf.arg(metavar="C")] = 0.0
+    """joints that the detector trusts less are taken as not seen"""
+    format: Format | None = None
+    """of the keypoint files; by default their content decides"""
+    size: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="W H")] = None
+    """width and height of the image in pixels, for files with coordinates from 0 to 1"""
+
+    def read(self, path: Path, label: str | None = None) -> ClipSet:
+        """All clips of a file or folder."""
+        from indexing.readers import read
+
+        return read(
+            path, format=self.format, fps=self.fps, person=self.person, min_confidence=self.min_confidence, label=label,
+            size=self.size,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Example:
+    """One word of ``dyntorch index fit``: a file, its label unless it is a labelled clip set, and the seconds that count."""
+
+    path: Path
+    label: str | None = None
+    start: float | None = None
+    end: float | None = None
+
+
+def parse_example(text: str) -> Example:
+    """``label=file``, ``label=file@1.5-4`` (seconds; an end may be left open) or ``set.npz``.
+
+    The label ends at the first ``=``.  A file whose whole name looks like a trim is taken for what it is.
+
+    Raises:
+        ValueError: no label or no file before or after ``=``, or seconds in the wrong order.
+
+    Example:
+        >>> parse_example("raise arm=take=2.json@1.5-4")
+        Example(path=PosixPath('take=2.json'), label='raise arm', start=1.5, end=4.0)
+    """
+    label, equals, rest = text.partition("=")
+    if not equals or (Path(text).expanduser().exists() and not _trimmed(rest).path.expanduser().exists()):
+        found = _trimmed(text)
+        return found
+    if not label.strip() or not rest:
+        raise ValueError(f"example {text!r}: expected label=file, such as squat=a.json; give both the label and the file")
+    found = _trimmed(rest)
+    return Example(found.path, label.strip(), found.start, found.end)
+
+
+def _trimmed(text: str) -> Example:
+    match = TRIM.fullmatch(text)
+    if match is None or Path(text).expanduser().exists() or match["start"] == match["end"] is None:
+        return Example(Path(text))
+    start, end = (None if value is None else float(value) for value in (match["start"], match["end"]))
+    if start is not None and end is not None and not start < end:
+        raise ValueError(f"example {text!r}: it ends at {end:g} s, but starts at {start:g} s; write file@start-end in seconds")
+    return Example(Path(match["path"]), None, start, end)
+
+
+def read_examples(examples: Sequence[Example], reading: Reading, select: Sequence[str]) -> tuple[list[Clip], list[str]]:
+    """Labelled clips, and what a person should know about them.
+
+    Raises:
+        ValueError: naming the file: it cannot be read, has no labels, or its clip cannot be learned from.
+    """
+    from indexing.cli.selection import choose
+
+    clips: list[Clip] = []
+    notes: list[str] = []
+    for example in examples:
+        found = reading.read(example.path, example.label)
+        is_set = example.label is None
+        if is_set and all(clip.label is None for clip in found):
+            raise ValueError(
+                f"{example.path}: says nothing of the action; give it with its label, as in squat={example.path}"
+                + (", or save 'action' in the clip set" if example.path.suffix == ".npz" else "")
+            )
+        if is_set and select:
+            found = found[choose(found, select, "--select")]
+        if example.start is not None or example.end is not None:
+            found = _cut(found, example)
+        if is_set or len(found) > 1:
+            found, left_out = usable(found, example.path)
+            notes += left_out
+        clips += _checked(found, example.path)
+    return clips, notes + assumed(clips)
+
+
+def _cut(clips: ClipSet, example: Example) -> ClipSet:
+    from indexing.clip import ClipSet
+
+    start, end = example.start if example.start is not None else -math.inf, example.end if example.end is not None else math.inf
+    return ClipSet((clip.between(start, end) for clip in clips), clips.name)
+
+
+def _checked(clips: Sequence[Clip], path: Path) -> list[Clip]:
+    from indexing.windows import unusable
+
+    for clip in clips:
+        reason = unusable(clip)
+        if reason:
+            raise ValueError(f"{path}: {reason}; leave it out or record it again")
+    return list(clips)
+
+
+def usable(clips: ClipSet, path: Path) -> tuple[ClipSet, list[str]]:
+    """The clips with a label that can be compared, and a note on those left out.
+
+    Raises:
+        ValueError: none is left.
+    """
+    import numpy as np
+
+    from indexing.windows import unusable
+
+    reasons = [unusable(clip) or ("its action is not known" if clip.label is None else None) for clip in clips]
+    bad = [i for i, reason in enumerate(reasons) if reason]
+    if not bad:
+        return clips, []
+    first = f"{clips[bad[0]].name}: {reasons[bad[0]]}"
+    if len(bad) == len(clips):
+        raise ValueError(f"{path}: none of its {count(len(clips), 'clip')} can be used; the first, {first}")
+    return clips[np.setdiff1d(np.arange(len(clips)), bad)], [f"{count(len(bad), 'clip')} of {path} left out; the first, {first}"]
+
+
+def assumed(clips: Sequence[Clip]) -> list[str]:
+    """A note on clips whose frame rate nobody said."""
+    found = list(dict.fromkeys(clip.name for clip in clips if clip.fps_assumed))
+    return [f"30 frames per second assumed for {names(found)}; --fps says otherwise"] if found else []
+
+
+def read_recordings(paths: Sequence[Path], reading: Reading, joints: int, model: Path) -> list[Clip]:
+    """Recordings with names that differ, checked against the model.
+
+    Raises:
+        ValueError: naming the file: unreadable, unusable, or with other joints than the model.
+    """
+    found: list[tuple[Path, Clip]] = []
+    for path in paths:
+        for clip in reading.read(path):
+            if clip.joints.shape[1] != joints:
+                raise ValueError(
+                    f"{path}: has {clip.joints.shape[1]} joints, but the model {model} was learned from clips with {joints}; "
+                    "use the same pose estimator and joint layout for both"
+                )
+            found += [(path, clip) for clip in _checked([clip], path)]
+    twice = [clip.name for _, clip in found]
+    return [
+        clip if twice.count(clip.name) == 1 else clip.replace(name=f"{path}" if len(paths) == len(found) else f"{path} {clip.name}")
+        for path, clip in found
+    ]
+
+
+def read_truth(path: Path, recordings: Sequence[Clip]) -> tuple[list[list[KnownEvent]], list[str]]:
+    """Known events of each recording from a CSV with the columns ``label,start,end`` and, for several recordings, ``file``.
+
+    Raises:
+        ValueError: naming file, row and column.
+    """
+    rows = _rows(path)
+    if len(recordings) > 1 and rows and "file" not in rows[0][1]:
+        raise ValueError(f"{path}: has no column 'file', but {len(recordings)} recordings are scanned; add it, with their names")
+    known: list[list[KnownEvent]] = [[] for _ in recordings]
+    elsewhere = []
+    for line, row in rows:
+        event = _event(path, line, row)
+        file = row.get("file", "")
+        owner = [i for i, clip in enumerate(recordings) if not file or {file, Path(file).name} & {clip.name, Path(clip.name).name}]
+        if owner:
+            known[owner[0]].append(event)
+        else:
+            elsewhere.append(file)
+    if rows and len(elsewhere) == len(rows):
+        raise ValueError(f"{path}: column 'file' names {names(sorted(set(elsewhere)))}, none of the recordings; correct the names")
+    left = [f"{count(len(elsewhere), 'row')} of {path} left out: of other recordings ({names(sorted(set(elsewhere)))})"]
+    return known, left if elsewhere else []
+
+
+def _rows(path: Path) -> list[tuple[int, dict[str, str]]]:
+    """Line number and cells by column name."""
+    if not path.expanduser().is_file():
+        raise ValueError(f"{path}: no such file; give the known events as CSV with the columns label,start,end")
+    try:
+        text = path.expanduser().read_text(encoding="utf-8-sig")
+        lines = list(csv.reader(text.splitlines(), delimiter=max(",;\t", key=text.partition("\n")[0].count)))
+    except (UnicodeDecodeError, csv.Error):
+        raise ValueError(f"{path}: is not a CSV file in UTF-8; write one with the columns label,start,end") from None
+    head = [name.strip().lower() for name in lines[0]] if lines else []
+    missing = [name for name in ("label", "start", "end") if name not in head]
+    if missing:
+        raise ValueError(f"{path}: has no column {missing[0]!r}; the first line must name the columns label,start,end")
+    cells = [(i, [cell.strip() for cell in row]) for i, row in enumerate(lines, 1) if i > 1 and any(row)]
+    return [(i, dict(zip(head, row + [""] * len(head), strict=False))) for i, row in cells]
+
+
+def _event(path: Path, line: int, row: dict[str, str]) -> KnownEvent:
+    seconds = []
+    for column in ("start", "end"):
+        try:
+            value = float(row[column])
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise ValueError(f"{path}: line {line}, column {column!r}: {row[column]!r} is no number; give seconds")
+        seconds.append(value)
+    if not seconds[0] <= seconds[1]:
+        raise ValueError(f"{path}: line {line}: ends at {seconds[1]:g} s, but starts at {seconds[0]:g} s; give start first")
+    if not row["label"]:
+        raise ValueError(f"{path}: line {line}, column 'label' is empty; name the action")
+    return row["label"], seconds[0], seconds[1]

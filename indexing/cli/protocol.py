@@ -1,0 +1,132 @@
+"""How recognition is measured: who is learned from, who is asked, and through which cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from indexing.cameras import perspective, virtual
+from indexing.cli.console import count, names
+from indexing.cli.selection import choose, column, known
+from indexing.clip import Clip, ClipSet
+
+IntArray = NDArray[np.int64]
+ELEVATION, SPREAD = 0.1, 0.1  # radians: of virtual cameras, and how much a query's may differ either way
+
+
+@dataclass(frozen=True)
+class Fold:
+    """Indices of the clips to learn from and to ask about; the name is the group left out, or empty."""
+
+    name: str
+    train: IntArray
+    test: IntArray
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """Through which cameras clips are seen: ``"none"`` (as they are), ``"perspective"`` or ``"virtual"``.
+
+    azimuths: degrees, of queries; solid: exemplars stay 3D; seed: of noise and elevations.
+    """
+
+    kind: str
+    azimuths: tuple[float, ...]
+    solid: bool
+    seed: int
+
+    def exemplar(self, clip: Clip, number: int) -> Clip:
+        """A clip as it is learned from: seen from azimuth 0, unless it stays 3D."""
+        if self.kind == "none" or self.solid:
+            return clip
+        if self.kind == "perspective":
+            return perspective(clip)
+        return virtual(clip, 0.0, ELEVATION, random_state=np.random.default_rng([self.seed, number]))
+
+    def query(self, clip: Clip, number: int, view: int) -> Clip:
+        """A clip as it is asked about, by the camera with this number."""
+        if self.kind == "none":
+            return clip
+        if self.kind == "perspective":
+            return perspective(clip)
+        rng = np.random.default_rng([self.seed, number, view + 1])
+        elevation = ELEVATION + float(rng.uniform(-SPREAD, SPREAD))
+        return virtual(clip, self.azimuths[view], elevation, random_state=rng)
+
+    @property
+    def settings(self) -> list[str]:
+        """What the cameras of queries are called; one without a name where there are no virtual ones."""
+        return [f"azimuth {azimuth:g}" for azimuth in self.azimuths] if self.kind == "virtual" else [""]
+
+
+def check_dims(clips: Sequence[Clip], cameras: Cameras) -> None:
+    """Raise where a camera needs 3D joints and there are none."""
+    flat = next((clip for clip in clips if clip.dims == 2), None)
+    if flat is None:
+        return
+    if cameras.kind != "none":
+        raise ValueError(f"--camera {cameras.kind}: needs 3D joints, but clip {flat.name!r} is 2D; leave --camera away")
+    if cameras.solid:
+        raise ValueError(f"--exemplars 3d: clip {flat.name!r} is 2D; leave --exemplars away")
+
+
+def splits(clips: ClipSet, train: Sequence[str], test: Sequence[str], leave_out: str | None) -> tuple[list[Fold], list[str]]:
+    """The folds that the options ask for, and what a person should know about them.
+
+    Raises:
+        ValueError: no or contradictory options, an unknown field or value, or nothing left to learn from or to ask about.
+    """
+    if leave_out is not None:
+        if train or test:
+            raise ValueError("--leave-out makes its own training and test sets; leave --train and --test away")
+        return _leave_out(clips, leave_out), []
+    if not train and not test:
+        raise ValueError(f"say what to learn from and what to test: --train view=1,2 --test view=3, or --leave-out field; {known(clips)}")
+    everything = np.arange(len(clips))
+    asked = choose(clips, test, "--test") if test else np.setdiff1d(everything, choose(clips, train, "--train"))
+    learned = choose(clips, train, "--train") if train else np.setdiff1d(everything, asked)
+    for name, chosen, other in (("--test", asked, "--train"), ("--train", learned, "--test")):
+        if not len(chosen):
+            raise ValueError(f"{name}: {other} takes all {count(len(clips), 'clip')} of {clips.name}; {known(clips)}")
+    both = np.intersect1d(asked, learned)
+    notes = [f"warning: {count(len(both), 'clip')} in both --train and --test, so the accuracy is too good"] if len(both) else []
+    return [Fold("", learned, asked)], notes
+
+
+def _leave_out(clips: ClipSet, field: str) -> list[Fold]:
+    values = column(clips, field, "--leave-out")
+    groups = np.unique(values)
+    if len(groups) < 2:
+        raise ValueError(f"--leave-out {field}: all clips of {clips.name} have the value {groups[0]}; {known(clips)}")
+    return [Fold(f"{field} {value}", np.flatnonzero(values != value), np.flatnonzero(values == value)) for value in groups]
+
+
+def draw_shots(fold: Fold, labels: NDArray[np.str_], shots: int, seed: int) -> tuple[Fold, list[str]]:
+    """The fold with at most ``shots`` training clips per class, drawn at random; classes with fewer keep all they have.
+
+    Raises:
+        ValueError: ``shots`` is not positive.
+    """
+    if shots < 1:
+        raise ValueError(f"--shots must be 1 or more, got {shots}")
+    rng = np.random.default_rng(seed)
+    chosen, few = [], []
+    for label in np.unique(labels[fold.train]):
+        mine = fold.train[labels[fold.train] == label]
+        chosen.append(rng.permutation(mine)[:shots])
+        if len(mine) < shots:
+            few.append(str(label))
+    where = f" without {fold.name}" if fold.name else ""
+    notes = [f"fewer than {count(shots, 'example')}{where} of {names(few)}"] if few else []
+    return Fold(fold.name, np.sort(np.concatenate(chosen)), fold.test), notes
+
+
+def strangers(folds: Sequence[Fold], labels: NDArray[np.str_]) -> list[str]:
+    """A note on test clips whose action was never learned."""
+    found = [label for fold in folds for label in labels[fold.test] if label not in set(labels[fold.train])]
+    if not found:
+        return []
+    return [f"{count(len(found), 'test clip')} of actions that were not learned ({names(sorted(set(found)))}) count as wrong"]

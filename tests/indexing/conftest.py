@@ -1,0 +1,73 @@
+"""Synthetic people for the tests of the indexer: one clip per action to learn from, other people from elsewhere to recognize."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from indexing import ActionIndexer, Clip, ClipSet
+from indexing.actors import ACTIONS, Person, dataset
+from indexing.shape.bank import Windows
+from indexing.windows import ragged, whole
+
+TEACHER, *STUDENTS = (Person.random(seed) for seed in range(4))
+
+
+@pytest.fixture(scope="session")
+def lesson() -> ClipSet:
+    """One 2D clip of each of the 13 actions, by one person in one view."""
+    return dataset([TEACHER], ACTIONS, azimuth=0.0, rng=0)
+
+
+@pytest.fixture(scope="session")
+def lesson_3d() -> ClipSet:
+    """The same as 3D joints."""
+    return dataset([TEACHER], ACTIONS, azimuth=None, rng=0)
+
+
+@pytest.fixture(scope="session")
+def others() -> ClipSet:
+    """All actions by three other people, from three viewpoints that were not learned from."""
+    return dataset(STUDENTS, ACTIONS, azimuth=(60.0, 90.0, 150.0), rng=100)
+
+
+@pytest.fixture(scope="session")
+def _fitted(lesson: ClipSet) -> ActionIndexer:
+    return ActionIndexer().fit(lesson)
+
+
+@pytest.fixture
+def indexer(_fitted: ActionIndexer) -> ActionIndexer:
+    """Fitted to ``lesson``; a copy for each test."""
+    copy = ActionIndexer(**_fitted.get_params())
+    copy.__dict__.update(_fitted.__dict__)
+    copy._rng = np.random.default_rng(0)
+    return copy
+
+
+@pytest.fixture(scope="session")
+def windows_of() -> Callable[[Sequence[Clip]], Windows]:
+    """Clips as whole windows of 12 steps."""
+
+    def make(clips: Sequence[Clip], length: int = 12) -> Windows:
+        source = ragged(list(clips))
+        return Windows(whole(source, length), torch.from_numpy(source.seen))
+
+    return make
+
+
+@pytest.fixture
+def random_clip() -> Callable[..., Clip]:
+    """A clip of smooth random joints."""
+
+    def make(seed: int = 0, frames: int = 30, joints: int = 8, dims: int = 2, **known: Any) -> Clip:
+        rng = np.random.default_rng(seed)
+        t = np.linspace(0, 1, frames)[:, None, None]
+        waves = sum(rng.normal(size=(1, joints, dims)) * np.sin(2 * np.pi * k * t + rng.uniform(0, 6, (1, joints, dims))) for k in (1, 2))
+        return Clip(rng.normal(size=(1, joints, dims)) * 3 + waves, **known)
+
+    return make

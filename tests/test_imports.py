@@ -1,0 +1,82 @@
+"""Imports point one way, and importing a package costs nothing before something is used."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+HEAVY = ("torch", "sklearn", "scipy", "kornia", "matplotlib", "safetensors", "cv2", "av", "rich")
+
+
+def files(package):
+    found = sorted((ROOT / package).rglob("*.py"))
+    assert found, package
+    return found
+
+
+def imported(path):
+    """``(module, names)`` of every import of a file, wherever in it: names is None for ``import module``."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"), str(path))):
+        if isinstance(node, ast.Import):
+            yield from ((alias.name, None) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            here = path.relative_to(ROOT).with_suffix("").parts
+            base = ".".join(here[: len(here) - node.level]) if node.level else ""
+            yield ".".join(part for part in (base, node.module) if part), [alias.name for alias in node.names]
+
+
+def offenders(package, wrong):
+    return [
+        f"{path.relative_to(ROOT)}: {module} {names or ''}"
+        for path in files(package)
+        for module, names in imported(path)
+        if wrong(module, names)
+    ]
+
+
+def within(module, package):
+    return module == package or module.startswith(package + ".")
+
+
+def test_dyntorch_never_imports_indexing():
+    assert offenders("dyntorch", lambda module, names: within(module, "indexing")) == []
+
+
+@pytest.mark.parametrize("package", ["dyntorch", "indexing"])
+def test_packages_do_not_import_what_stands_on_them(package):
+    assert offenders(package, lambda module, names: any(within(module, p) for p in ("experiments", "tests", "benchmarks"))) == []
+
+
+def test_indexing_uses_only_public_names_of_dyntorch():
+    public = set(__import__("dyntorch").__all__) | {"__version__"}
+
+    def wrong(module, names):
+        return within(module, "dyntorch") and (module != "dyntorch" or not set(names or ()) <= public)
+
+    assert offenders("indexing", wrong) == []
+
+
+def test_only_the_demo_uses_the_actors():
+    inside = ("indexing/actors/", "indexing/cli/", "indexing/demo")
+    found = offenders("indexing", lambda module, names: within(module, "indexing.actors") or (names and "actors" in names))
+    assert [line for line in found if not line.startswith(inside)] == []
+
+
+@pytest.mark.parametrize("package", ["dyntorch", "indexing"])
+def test_every_public_name_exists(package):
+    module = __import__(package)
+    for name in module.__all__:
+        assert getattr(module, name) is not None
+    assert set(module.__all__) <= set(dir(module))
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = module.nothing
+
+
+@pytest.mark.parametrize("package", ["dyntorch", "indexing"])
+def test_importing_a_package_loads_nothing_heavy(package):
+    code = f"import sys, {package}; print(*sorted(set({HEAVY!r}) & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert done.stdout.split() == []
