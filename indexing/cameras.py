@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from indexing.clip import Clip, FloatArray
 
@@ -69,11 +70,11 @@ def virtual(
     """
     _need_3d(clip, "a virtual camera")
     points = y_up(clip).astype(np.float64)
-    seen = ~np.isnan(points).any(axis=2)
+    seen: NDArray[np.bool_] = np.asarray(np.isfinite(points).all(axis=2))
     if not seen.any():
         raise ValueError(f"clip {clip.name!r}: no joint was seen in any frame; leave the clip out")
     with np.errstate(all="ignore"):
-        extents = np.array([np.ptp(frame[ok, 1]) for frame, ok in zip(points, seen, strict=True) if ok.sum() > 1])
+        extents = np.array([np.ptp(points[i, seen[i], 1]) for i in range(len(points)) if seen[i].sum() > 1])
     extent = float(np.median(extents)) if len(extents) else 0.0
     if not extent > 0:
         raise ValueError(f"clip {clip.name!r}: the joints have no vertical extent (all zero?); leave the clip out")

@@ -81,11 +81,17 @@ def gather_labels(clips: list[Clip], owners: list[int], labels: ArrayLike | None
     return np.asarray(values[owners])
 
 
+_CHOICES: dict[str, tuple[Any, ...]] = {
+    "view": ("any", "same"),
+    "weights": ("equal", "learned"),
+    "scorer": ("both", "nearest", "kernel"),
+    "mirror": ("auto", True, False),
+}
+
+
 def check_parameters(indexer: Any) -> None:
     """Raise on parameters that make no sense, naming the parameter and what it accepts."""
-    for name, accepted in (
-        ("view", ("any", "same")), ("weights", ("equal", "learned")), ("scorer", ("both", "nearest", "kernel")), ("mirror", ("auto", True, False)),
-    ):  # fmt: skip
+    for name, accepted in _CHOICES.items():
         if getattr(indexer, name) not in accepted:
             raise ValueError(f"{name} must be one of {', '.join(map(repr, accepted))}, got {getattr(indexer, name)!r}")
     for name in ("fps", "window", "stride"):
@@ -109,4 +115,4 @@ def check_parameters(indexer: Any) -> None:
 
 
 def _positive(value: Any) -> bool:
-    return isinstance(value, (int, float, np.integer, np.floating)) and bool(np.isfinite(value)) and value > 0
+    return isinstance(value, (int, float, np.integer, np.floating)) and bool(np.isfinite(value) and value > 0)

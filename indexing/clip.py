@@ -75,11 +75,11 @@ class Clip:
         if cast("FloatArray | None", self.times) is None:
             fps = 30.0 if self.fps is None else self.fps
             assumed = assumed or self.fps is None
-            if not (np.isfinite(fps) and fps > 0):
+            if not (isinstance(fps, (int, float, np.integer, np.floating)) and np.isfinite(fps) and fps > 0):
                 raise ValueError(f"{who}: fps must be a positive number of frames per second, got {self.fps!r}")
-            times = np.arange(len(joints)) / fps
+            times = np.arange(len(joints)) / float(fps)
         else:
-            times = _float_array(self.times, f"{who}: times").astype(np.float64)
+            times = np.array(_float_array(self.times, f"{who}: times"), dtype=np.float64)
             _check_times(times, len(joints), who)
             fps = self.fps if self.fps is not None else _rate(times)
         confidence = self.confidence
@@ -101,6 +101,7 @@ class Clip:
                 f"{who}: the skeleton {self.skeleton.name!r} has {len(self.skeleton.joints)} joints, the data {joints.shape[1]}"
             )
         final = {"joints": joints, "times": times, "confidence": confidence, "fps": fps, "fps_assumed": assumed}
+        times.flags.writeable = False
         for key, value in final.items():
             object.__setattr__(self, key, value)
 
@@ -136,7 +137,8 @@ class Clip:
         keep = (self.times >= start) & (self.times <= end)
         if not keep.any():
             raise ValueError(
-                f"clip {self.name!r}: no frame between {start} s and {end} s; it runs from {self.times[0]:g} s to {self.times[-1]:g} s"
+                f"clip {self.name!r}: no frame between {start} s and {end} s; "
+                f"it runs from {self.times[0]:g} s to {self.times[-1]:g} s"
             )
         return dataclasses.replace(
             self,
@@ -202,7 +204,7 @@ class ClipSet(Sequence[Clip]):
     def labels(self) -> NDArray[Any]:
         """``(clips,)`` the actions; ``None`` where unknown."""
         values = [clip.label for clip in self.clips]
-        if any(value is None for value in values):
+        if any(value is None or isinstance(value, tuple) for value in values):
             out = np.empty(len(values), dtype=object)
             out[:] = values
             return out
@@ -241,7 +243,7 @@ class ClipSet(Sequence[Clip]):
             if column.ndim != 1:
                 raise ValueError(f"clip set {self.name!r}: field {name!r} has several columns; select one of them, e.g. {name}0")
             values = [wanted] if isinstance(wanted, str) or not isinstance(wanted, Iterable) else list(wanted)
-            keep &= np.isin(column.astype(str), [str(value) for value in values])
+            keep &= np.array([any(_same(entry, value) for value in values) for entry in column.tolist()], dtype=bool)
         return self[keep]
 
     def save(self, path: str | Path) -> None:
@@ -256,6 +258,16 @@ class ClipSet(Sequence[Clip]):
         from indexing.readers import read
 
         return read(path, **options)
+
+
+def _same(entry: Any, value: Any) -> bool:
+    """Whether a field equals a value that may come as text (command line): 60 == 60.0 == "60"."""
+    if entry == value or str(entry) == str(value):
+        return True
+    try:
+        return float(entry) == float(value)
+    except (TypeError, ValueError):
+        return False
 
 
 def as_clip(value: Clip | ArrayLike, fps: float = 30.0, name: str = "") -> Clip:

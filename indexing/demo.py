@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -35,7 +35,7 @@ class Demonstration:
     """
 
     BASELINE: ClassVar[str] = (
-        f"the clip of least distance after both are resampled to {STEPS} poses, each pose centred on the hips, and scaled to one size"
+        f"the clip at the least distance, after both are resampled to {STEPS} poses centred on the hips and scaled to one size"
     )
 
     classes: Sequence[str]
@@ -43,7 +43,7 @@ class Demonstration:
     evaluations: Sequence[EvaluationResult]
     recording: RecordingResult
     stream_azimuth: float
-    exemplars: Mapping[str, Clip]
+    exemplars: Mapping[Hashable, Clip]
     timings: Mapping[str, float]
 
     @property
@@ -54,7 +54,10 @@ class Demonstration:
     def accuracy(self) -> dict[str, tuple[float, float]]:
         """Setting -> share right of the indexer and of the baseline."""
         return {
-            result.setting: (_share(result.truth, result.predicted), _share(result.truth, [] if result.baseline is None else result.baseline))
+            result.setting: (
+                _share(result.truth, result.predicted),
+                _share(result.truth, [] if result.baseline is None else result.baseline),
+            )
             for result in self.evaluations
         }
 
@@ -76,7 +79,7 @@ def demonstrate(
     Example:
         >>> shown = demonstrate(people=1, actions=["squat", "jumping_jack", "kick"])
         >>> list(shown.accuracy())
-        ['0 degrees', '45 degrees', '90 degrees', '150 degrees']
+        ['turned by 0 degrees', 'turned by 45 degrees', 'turned by 90 degrees', 'turned by 150 degrees']
     """
     if people < 1:
         raise ValueError(f"people must be 1 or more, got {people}")
@@ -98,10 +101,11 @@ def demonstrate(
         clock.lap("recognize")
         plain = nearest_2d(list(examples), examples.labels, list(asked))
         clock.lap("baseline")
-        evaluations.append(EvaluationResult(list(actions), asked.labels, predicted, f"{azimuth:g} degrees", baseline=plain))
+        setting = f"turned by {azimuth:g} degrees"
+        evaluations.append(EvaluationResult(list(actions), asked.labels, predicted, setting, baseline=plain))
         tell(0.45 + 0.1 * (number + 1))
     recording = _search(indexer, actions, walker, lambda share: tell(0.85 + 0.15 * share), clock)
-    exemplars = {str(clip.label): clip for clip in examples}
+    exemplars: dict[Hashable, Clip] = {str(clip.label): clip for clip in examples}
     return Demonstration(list(actions), people, evaluations, recording, STREAM_AZIMUTH, exemplars, clock.laps)
 
 
@@ -150,8 +154,8 @@ def report(shown: Demonstration, made: Mapping[str, Any]) -> RecognitionReport:
         "One example per action is enough",
         summary=(
             f"{len(shown.classes)} actions were learned from one 2D clip each: one synthetic person, one camera, keypoints with a "
-            f"detector's noise, gaps and mistakes. Then {others} did them, seen by that camera and by others turned about the person. "
-            "Last, the actions were searched in an untrimmed recording of one more person. All people are synthetic; "
+            f"detector's noise, gaps and mistakes. Then {others} did them, seen by that camera and by others turned about the "
+            "person. Last, the actions were searched in an untrimmed recording of one more person. All people are synthetic; "
             "run 'dyntorch index evaluate' for figures on your own recordings."
         ),
         recordings=[shown.recording],

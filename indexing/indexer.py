@@ -45,7 +45,7 @@ class ActionIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         fps: frame rate of clips given as arrays.
         length: steps that a window is resampled to.
         search: also compare with crops of the exemplars (extent and tempo).
-        mirror: ``"auto"``: exemplars also count mirrored, unless left and right are different actions here; ``False``: never.
+        mirror: ``"auto"``: exemplars also count mirrored, unless left and right are different actions here; ``True``: always; ``False``: never.
         scorer: ``"both"``, ``"nearest"`` (no training, fastest) or ``"kernel"``; ``view="same"`` uses the kernel machine.
         virtual_views: copies of every exemplar for the kernel machine.
         repair: replace joints that jump (Hampel filter): for bad detectors at a regular frame rate.
@@ -152,8 +152,12 @@ class ActionIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
 
     def _learn(self, exemplars: Exemplars, classes: Array, numbers: torch.Tensor) -> Self:
         symmetry = None
-        if self.mirror == "auto":
-            symmetry = mirror_permutation(self.skeleton_, exemplars.crop(0).values[:500])
+        if self.mirror:
+            symmetry = mirror_permutation(self.skeleton_, exemplars.crop(0).values[:500], exemplars.crop(0).seen[:500])
+        if self.mirror is True and symmetry is None:
+            raise ValueError(
+                "mirror=True: the joints' mirror images are not known; give clips a skeleton with names, or mirror='auto'"
+            )
         self.classes_ = classes
         self.model_: ShapeModel = learn(
             exemplars,
@@ -163,6 +167,7 @@ class ActionIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
             scorer="kernel" if self.view == "same" else self.scorer,
             learned=self.weights == "learned",
             symmetry=symmetry,
+            guard=self.mirror == "auto",
         )
         self._calibrate()
         return self

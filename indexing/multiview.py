@@ -27,7 +27,8 @@ def combine(views: tuple[Clip, ...]) -> list[Clip]:
     for i, view in enumerate(views):
         if view.joints.shape[1:] != first.joints.shape[1:] or view.dims != 2:
             raise ValueError(
-                f"views of one performance must be 2D with the same joints: view 0 is {first.joints.shape[1:]}, view {i} {view.joints.shape[1:]}"
+                "views of one performance must be 2D with the same joints: "
+                f"view 0 is {first.joints.shape[1:]}, view {i} {view.joints.shape[1:]}"
             )
     start, end = max(view.times[0] for view in views), min(view.times[-1] for view in views)
     if not end > start:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 FORMAT = "dyntorch.action-indexer"
 VERSION = 1
+PLAIN = ("labels", "symmetry", "mirrored", "weights", "hub", "moment_hub", "evidence_out", "evidence_in")  # tensors as they are
 SAVED = "fit on the clips again and save with this version"
 
 Indexer = TypeVar("Indexer", bound="ActionIndexer")
@@ -85,12 +86,11 @@ def load(kind: type[Indexer], path: str | Path) -> Indexer:
 
 
 def _tensors(model: ShapeModel) -> dict[str, Tensor]:
-    named: dict[str, Tensor | None] = {
-        "labels": model.labels, "mirrored": model.mirrored, "weights": model.weights, "hub": model.hub, "moment_hub": model.moment_hub, "symmetry": model.symmetry,
-        "metric": model.metric.covariance, "metric_power": torch.tensor(model.metric.power), "owner": model.exemplars.owner, "solid": model.exemplars.solid,
-        "evidence_in": model.evidence_in, "evidence_out": model.evidence_out,
-        **_windows("crops", model.exemplars.crops), **_windows("views", model.exemplars.views), **_windows("moments", model.exemplars.moments),
-    }  # fmt: skip
+    exemplars = model.exemplars
+    named: dict[str, Tensor | None] = {name: getattr(model, name) for name in PLAIN}
+    named |= {"metric": model.metric.covariance, "metric_power": torch.tensor(model.metric.power)}
+    named |= {"owner": exemplars.owner, "solid": exemplars.solid}
+    named |= {**_windows("crops", exemplars.crops), **_windows("views", exemplars.views), **_windows("moments", exemplars.moments)}
     if model.kernels is not None and model.support is not None and model.machine is not None:
         machine = model.machine
         named |= {"scales": model.kernels.scales, **_windows("support", model.support), "machine.support": machine.support}
@@ -110,11 +110,18 @@ def _model(tensors: dict[str, Tensor], classes: int, view: str) -> ShapeModel:
     trained = "scales" in tensors
     kernels = Kernels(JointMetric(metric.covariance, KERNEL_WHITENING), view == "same", tensors["scales"]) if trained else None
     machine = PairwiseMachine(*(tensors[f"machine.{n}"] for n in ("support", "dual", "intercept", "counts"))) if trained else None
+    exemplars = Exemplars(windows("crops"), windows("views"), windows("moments"), tensors["owner"], tensors["solid"])
+    plain: dict[str, Any] = {name: None if name == "symmetry" and name not in tensors else tensors[name] for name in PLAIN}
     return ShapeModel(
-        Exemplars(windows("crops"), windows("views"), windows("moments"), tensors["owner"], tensors["solid"]), tensors["labels"], classes, view, metric,
-        tensors.get("symmetry"), tensors["mirrored"], tensors["weights"], tensors["hub"], tensors["moment_hub"], kernels,
-        windows("support") if trained else None, machine, tensors["evidence_out"], tensors["evidence_in"],
-    )  # fmt: skip
+        exemplars=exemplars,
+        classes=classes,
+        view=view,
+        metric=metric,
+        kernels=kernels,
+        support=windows("support") if trained else None,
+        machine=machine,
+        **plain,
+    )
 
 
 def _plain(parameters: dict[str, Any]) -> dict[str, Any]:

@@ -47,7 +47,7 @@ def ragged(clips: Sequence[Clip], repair: bool = False) -> Ragged:
     if repair:
         for i in range(len(clips)):
             joints[starts[i] : starts[i + 1]] = hampel(joints[starts[i] : starts[i + 1]])
-    there = ~np.isnan(joints).any(axis=2)
+    there: NDArray[np.bool_] = np.asarray(np.isfinite(joints).all(axis=2))
     seen = np.logical_or.reduceat(there, starts[:-1], axis=0)
     if not there.all():
         joints = _fill(joints, there, times, np.repeat(starts[:-1], lengths), np.repeat(starts[1:], lengths))

@@ -27,19 +27,15 @@ from indexing.cli.scan import Scan
 DONE, BAD_INPUT, REFUSED, INTERRUPTED, BROKEN_PIPE = 0, 2, 3, 130, 141
 
 Command = tyro.conf.subcommand
-INDEX: Any = (
-    Annotated[Fit, Command("fit", description="Learn actions from example clips.")]
-    | Annotated[Scan, Command("scan", description="Find learned actions in long recordings.")]
-    | Annotated[Evaluate, Command("evaluate", description="Measure recognition on a labelled clip set.")]
-)
+INDEX: Any = Annotated[Fit, Command("fit")] | Annotated[Scan, Command("scan")] | Annotated[Evaluate, Command("evaluate")]
 COMMANDS: Any = (
-    Annotated[Demo, Command("demo", description="See it work on built-in synthetic people.")]
+    Annotated[Demo, Command("demo")]
     | Annotated[INDEX, Command("index", description="Learn actions from one clip each and find them elsewhere.")]
 )  # next: sync, segment, align, count
 GROUPS = ("index",)  # words that need another one behind them
-DESCRIPTION = """Learn actions from one clip each, find them in other clips, from other viewpoints.
+DESCRIPTION = """Learn actions from one clip each and find them in other clips, from other viewpoints.
 
-'dyntorch demo' shows it; 'dyntorch COMMAND --help' explains a command; 'dyntorch --version' says the version."""
+dyntorch COMMAND --help explains a command, dyntorch --version says the version."""
 
 
 class Runnable(Protocol):
@@ -58,6 +54,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         0 done, 2 bad input (one line on stderr), 3 refused, 130 interrupted, 141 when nobody reads the output any more.
     """
     words = list(sys.argv[1:] if argv is None else argv)
+    # Threads that wait must not spin: where other programs use the cores, the demo takes 12 s instead of 52 s (two cores, two
+    # other programs), and nothing changes where it is alone.  Read by OpenMP when torch is loaded.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     try:
         with _output():
             if words in (["--version"], ["-V"]):
@@ -78,6 +77,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         complain(f"{where}{error.strerror or error}; check the path and its permissions")
         return BAD_INPUT
     except ValueError as error:
+        if os.environ.get("DYNTORCH_TRACEBACK"):
+            raise  # for a report of a bug
         complain(str(error))
         return BAD_INPUT
 
@@ -105,9 +106,22 @@ def parse(words: list[str]) -> Runnable | int:
 
 
 def _unboxed(text: str) -> str:
-    """The parser's message, which it draws in a box, as one line."""
-    lines = [line.strip("│╭╰╮╯─+-| \t") for line in text.splitlines()]
-    return one_line(" ".join(line for line in lines if line)) or "the command line makes no sense; see dyntorch --help"
+    """The parser's message, which it draws in a box with rules between the parts, as one line."""
+    parts = [""]
+    for line in text.splitlines():
+        words = line.strip().strip("│|").strip()
+        if not words.strip("─-╰╯+"):
+            parts.append("")
+        elif not words.startswith(("╭", "+")):  # the box's title says what its text says
+            parts[-1] += f" {words}"
+    kept = [part.strip().removesuffix(".") for part in parts if part.strip() and "Argument helptext:" not in part]
+    said = (
+        one_line("; ".join(kept))
+        .replace("For full helptext, run:", "see")
+        .replace("For full helptext, run", "see")
+        .replace("For full helptext, see", "see")
+    )
+    return said.replace("[bold]", "").replace("[/bold]", "") or "the command line makes no sense; see dyntorch --help"
 
 
 def _version() -> str:

@@ -55,9 +55,10 @@ def _show(shown: Demonstration) -> None:
     from indexing.report.measures import frame_accuracy, missed
 
     say(f"Learned {count(len(shown.classes), 'action')} from ONE 2D clip each: one person, one camera, noisy keypoints.")
-    say(f"Asked about {count(shown.people, 'other person' if shown.people == 1 else 'other people').removesuffix('s')}, other cameras:")
+    others = "one other person" if shown.people == 1 else f"{shown.people} other people"
+    say(f"Asked about {others}, seen by that camera and by others turned about the person:")
     rows = [[name, f"{ours:.0%}", f"{plain:.0%}"] for name, (ours, plain) in shown.accuracy().items()]
-    table(["camera turned by", "dyntorch ", "2D nearest neighbour "], rows)
+    table(["camera", "dyntorch ", "2D nearest neighbour "], rows)
     say(f"2D nearest neighbour: {shown.BASELINE}.")
     stream = shown.recording
     known = stream.truth or ()

@@ -32,6 +32,7 @@ class Evaluate:
     """Learn from some clips of a set, recognize the others, and say how often that was right.
 
     dyntorch index evaluate SET.npz --train view=1,2 --test view=3 --report out/
+
     dyntorch index evaluate SET.npz --leave-out subject --camera virtual --azimuth 0,45,90
     """
 
@@ -41,28 +42,27 @@ class Evaluate:
     """learn from the clips with these values, e.g. view=1,2 (repeat the option for further fields); by default all but --test"""
     test: Criteria = ()
     """ask about these clips; by default all but --train"""
-    leave_out: Annotated[str | None, tyro.conf.arg(metavar="FIELD")] = None
+    leave_out: Annotated[str | None, tyro.conf.arg(metavar="FIELD", help_behavior_hint="")] = None
     """instead of --train and --test: ask about each value of this field in turn and learn from the others, e.g. subject"""
     camera: Literal["none", "perspective", "virtual"] = "none"
-    """none: clips as they are; perspective: image x/z, y/z of 3D joints in camera coordinates; virtual: render 3D joints
-    (4.5 m away, height 1.5 m, 15 mm noise), examples from azimuth 0, queries from each --azimuth"""
-    azimuth: Annotated[str, tyro.conf.arg(metavar="DEGREES")] = "0"
-    """of the virtual cameras of queries, e.g. 0,45,90"""
+    """none: clips as they are; perspective: x/z, y/z of 3D joints in camera coordinates; virtual: 3D joints rendered with noise"""
+    azimuth: Annotated[str | None, tyro.conf.arg(metavar="DEGREES", help_behavior_hint="(default: 0)")] = None
+    """of the virtual cameras of queries, e.g. 0,45,90; examples are seen from 0"""
     exemplars: Literal["2d", "3d"] = "2d"
     """3d: learn from the 3D joints, while queries are still images"""
-    shots: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    shots: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
     """learn from this many examples per action only, drawn at random"""
     view: Literal["any", "same"] = "any"
     """from where queries are seen: from anywhere, or from about where the examples were"""
     weights: Literal["equal", "learned"] = "equal"
     """of the channels that are compared"""
-    reject: Annotated[float | None, tyro.conf.arg(metavar="R")] = None
+    reject: Annotated[float | None, tyro.conf.arg(metavar="R", help_behavior_hint="")] = None
     """share of clips of unknown actions that may be taken for a known one, 0 to 1; any other number is the least score"""
     mirror: bool = True
     """let examples count mirrored, too, where left and right are not different actions"""
     seed: int = 0
     """of noise, cameras and drawn examples"""
-    report: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
+    report: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
     """where to write report.html, confusion.png, metrics.json and manifest.json; without it, print only"""
     reading: Reading = field(default_factory=Reading)
 
@@ -72,13 +72,14 @@ class Evaluate:
         started = time.perf_counter()
         with progress("loading", steps=False):
             import indexing.indexer  # noqa: F401  (its import takes longer than the reading)
-            from indexing.cli.protocol import Cameras, check_dims, splits, strangers
+            from indexing.cli.protocol import Cameras, check_classes, check_dims, splits, strangers
 
             clips, notes = self._load()
-            cameras = Cameras(self.camera, _degrees(self.azimuth), self.exemplars == "3d", self.seed)
-            check_dims(clips, cameras)
+            cameras = Cameras(self.camera, self._azimuths(), self.exemplars == "3d", self.seed)
+            notes += check_dims(clips, cameras)
             folds, warned = splits(clips, self.train, self.test, self.leave_out)
             labels = clips.labels.astype(str)
+            check_classes(folds, labels, clips.name)
             folds, few = self._shots(folds, labels)
         notes += warned + few + strangers(folds, labels)
         timings = {"load": time.perf_counter() - started, "learn": 0.0, "recognize": 0.0}
@@ -104,7 +105,17 @@ class Evaluate:
         if all(clip.label is None for clip in clips):
             raise ValueError(f"{self.clips}: says nothing of the actions; give a clip set with 'action' (and 'action_names')")
         clips, notes = usable(clips, self.clips)
-        return clips, notes + assumed(clips)
+        return clips, notes + assumed(clips, self.clips)
+
+    def _azimuths(self) -> tuple[float, ...]:
+        if self.azimuth is None:
+            return (0.0,)
+        if self.camera != "virtual":
+            raise ValueError(f"--azimuth {self.azimuth}: only virtual cameras turn; add --camera virtual")
+        try:
+            return tuple(float(word) for word in self.azimuth.split(","))
+        except ValueError:
+            raise ValueError(f"--azimuth {self.azimuth!r}: expected degrees, such as 0,45,90") from None
 
     def _shots(self, folds: list[Fold], labels: NDArray[np.str_]) -> tuple[list[Fold], list[str]]:
         from indexing.cli.protocol import draw_shots
@@ -115,7 +126,8 @@ class Evaluate:
         return [fold for fold, _ in drawn], [note for _, few in drawn for note in few]
 
     def _measure(
-        self, clips: ClipSet, labels: NDArray[np.str_], folds: list[Fold], cameras: Cameras, timings: dict[str, float], bar: Progress
+        self, clips: ClipSet, labels: NDArray[np.str_], folds: list[Fold], cameras: Cameras, timings: dict[str, float],
+        bar: Progress,
     ) -> list[tuple[str, EvaluationResult]]:  # fmt: skip
         """One result per fold and camera, each with the name of its fold."""
         from indexing.indexer import ActionIndexer
@@ -157,13 +169,6 @@ class Evaluate:
         )
         with progress("drawing the report", steps=False):
             return write_recognition(folder, report)
-
-
-def _degrees(text: str) -> tuple[float, ...]:
-    try:
-        return tuple(float(word) for word in text.split(","))
-    except ValueError:
-        raise ValueError(f"--azimuth {text!r}: expected degrees, such as 0,45,90") from None
 
 
 def _by_group(results: list[tuple[str, EvaluationResult]]) -> dict[str, float]:

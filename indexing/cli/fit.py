@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from indexing.cli.console import count, progress, say, table
+from indexing.cli.console import count, names, progress, say, table
 from indexing.cli.inputs import Reading, parse_example, read_examples
 from indexing.cli.outputs import check_file
 
@@ -22,26 +22,26 @@ class Fit:
     """Learn actions from example clips and write a model file.
 
     dyntorch index fit squat=a.json "lunge left"=b.json@1.5-4 -o moves.safetensors
+
     dyntorch index fit clips.npz --select view=1,2 -o moves.safetensors
     """
 
-    examples: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="LABEL=FILE")]
-    """keypoint files (or OpenPose folders) as label=file, one or several per label; label=file@1.5-4 uses these seconds of it
-    (either end may be left open). Or clip sets with labels: SET.npz"""
+    examples: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="LABEL=FILE ...", help_behavior_hint="")]
+    """keypoint files or OpenPose folders, one or more per label; label=file@1.5-4 uses these seconds; a labelled set: SET.npz"""
     output: Annotated[Path, tyro.conf.arg(aliases=("-o",), metavar="FILE")]
     """the model to write, usually *.safetensors"""
     select: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="FIELD=VALUES")] = ()
     """of clip sets, learn only from clips with these values, e.g. view=1,2"""
     view: Literal["any", "same"] = "any"
     """from where recordings will be seen: from anywhere, or from about where the examples were"""
-    reject: Annotated[float | None, tyro.conf.arg(metavar="R")] = None
+    reject: Annotated[float | None, tyro.conf.arg(metavar="R", help_behavior_hint="")] = None
     """share of clips of unknown actions that may be taken for a known one, 0 to 1; any other number is the least score"""
     weights: Literal["equal", "learned"] = "equal"
     """of the channels that are compared"""
     mirror: bool = True
     """let examples count mirrored, too, where left and right are not different actions"""
     seed: int = 0
-    """of the random numbers"""
+    """of the virtual views"""
     reading: Reading = field(default_factory=Reading)
 
     def run(self) -> int:
@@ -52,6 +52,11 @@ class Fit:
         output = check_file(self.output, [example.path for example in examples])
         with progress("reading", steps=False):
             clips, notes = read_examples(examples, self.reading, self.select)
+        if len({str(clip.label) for clip in clips}) < 2:
+            files = names([str(example.path) for example in examples])
+            raise ValueError(
+                f"{files}: only one action ({clips[0].label}); give examples of two or more, such as ordinary movement"
+            )
         started = time.perf_counter()
         with progress(f"learning from {count(len(clips), 'clip')}", steps=False):
             from indexing.files import prepare

@@ -27,15 +27,15 @@ KnownEvent = tuple[Hashable, float, float]
 class Reading:
     """How keypoint files are read."""
 
-    fps: Annotated[float | None, tyro.conf.arg(metavar="N")] = None
+    fps: Annotated[float | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
     """frames per second, for files that do not say (30 is assumed then, and the output says so)"""
     person: People = "largest"
     """who is followed where a frame shows several people"""
     min_confidence: Annotated[float, tyro.conf.arg(metavar="C")] = 0.0
     """joints that the detector trusts less are taken as not seen"""
-    format: Format | None = None
+    format: Annotated[Format | None, tyro.conf.arg(help_behavior_hint="")] = None
     """of the keypoint files; by default their content decides"""
-    size: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="W H")] = None
+    size: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="W H", help_behavior_hint="")] = None
     """width and height of the image in pixels, for files with coordinates from 0 to 1"""
 
     def read(self, path: Path, label: str | None = None) -> ClipSet:
@@ -72,8 +72,7 @@ def parse_example(text: str) -> Example:
     """
     label, equals, rest = text.partition("=")
     if not equals or (Path(text).expanduser().exists() and not _trimmed(rest).path.expanduser().exists()):
-        found = _trimmed(text)
-        return found
+        return _trimmed(text)
     if not label.strip() or not rest:
         raise ValueError(f"example {text!r}: expected label=file, such as squat=a.json; give both the label and the file")
     found = _trimmed(rest)
@@ -100,6 +99,7 @@ def read_examples(examples: Sequence[Example], reading: Reading, select: Sequenc
 
     clips: list[Clip] = []
     notes: list[str] = []
+    guessed: list[Clip] = []
     for example in examples:
         found = reading.read(example.path, example.label)
         is_set = example.label is None
@@ -115,8 +115,12 @@ def read_examples(examples: Sequence[Example], reading: Reading, select: Sequenc
         if is_set or len(found) > 1:
             found, left_out = usable(found, example.path)
             notes += left_out
+        if is_set:
+            notes += assumed(found, example.path)
+        else:
+            guessed += found
         clips += _checked(found, example.path)
-    return clips, notes + assumed(clips)
+    return clips, notes + assumed(guessed)
 
 
 def _cut(clips: ClipSet, example: Example) -> ClipSet:
@@ -156,10 +160,11 @@ def usable(clips: ClipSet, path: Path) -> tuple[ClipSet, list[str]]:
     return clips[np.setdiff1d(np.arange(len(clips)), bad)], [f"{count(len(bad), 'clip')} of {path} left out; the first, {first}"]
 
 
-def assumed(clips: Sequence[Clip]) -> list[str]:
-    """A note on clips whose frame rate nobody said."""
-    found = list(dict.fromkeys(clip.name for clip in clips if clip.fps_assumed))
-    return [f"30 frames per second assumed for {names(found)}; --fps says otherwise"] if found else []
+def assumed(clips: Sequence[Clip], path: Path | None = None) -> list[str]:
+    """A note on clips whose frame rate nobody said: the names of recordings, or the number of clips of a set."""
+    found = [clip.name for clip in clips if clip.fps_assumed]
+    who = names(list(dict.fromkeys(found))) if path is None else f"{count(len(found), 'clip')} of {path}"
+    return [f"30 frames per second assumed for {who}; --fps says otherwise"] if found else []
 
 
 def read_recordings(paths: Sequence[Path], reading: Reading, joints: int, model: Path) -> list[Clip]:

@@ -62,15 +62,16 @@ class Cameras:
         return [f"azimuth {azimuth:g}" for azimuth in self.azimuths] if self.kind == "virtual" else [""]
 
 
-def check_dims(clips: Sequence[Clip], cameras: Cameras) -> None:
-    """Raise where a camera needs 3D joints and there are none."""
+def check_dims(clips: Sequence[Clip], cameras: Cameras) -> list[str]:
+    """Raise where a camera needs 3D joints and there are none; a note where 3D joints have no camera."""
     flat = next((clip for clip in clips if clip.dims == 2), None)
     if flat is None:
-        return
+        return ["3D joints without --camera: learned from all around, asked as seen along z"] if cameras.kind == "none" else []
     if cameras.kind != "none":
         raise ValueError(f"--camera {cameras.kind}: needs 3D joints, but clip {flat.name!r} is 2D; leave --camera away")
     if cameras.solid:
         raise ValueError(f"--exemplars 3d: clip {flat.name!r} is 2D; leave --exemplars away")
+    return []
 
 
 def splits(clips: ClipSet, train: Sequence[str], test: Sequence[str], leave_out: str | None) -> tuple[list[Fold], list[str]]:
@@ -84,7 +85,9 @@ def splits(clips: ClipSet, train: Sequence[str], test: Sequence[str], leave_out:
             raise ValueError("--leave-out makes its own training and test sets; leave --train and --test away")
         return _leave_out(clips, leave_out), []
     if not train and not test:
-        raise ValueError(f"say what to learn from and what to test: --train view=1,2 --test view=3, or --leave-out field; {known(clips)}")
+        raise ValueError(
+            f"say what to learn from and what to ask: --train view=1 --test view=2, or --leave-out field; {known(clips)}"
+        )
     everything = np.arange(len(clips))
     asked = choose(clips, test, "--test") if test else np.setdiff1d(everything, choose(clips, train, "--train"))
     learned = choose(clips, train, "--train") if train else np.setdiff1d(everything, asked)
@@ -122,6 +125,15 @@ def draw_shots(fold: Fold, labels: NDArray[np.str_], shots: int, seed: int) -> t
     where = f" without {fold.name}" if fold.name else ""
     notes = [f"fewer than {count(shots, 'example')}{where} of {names(few)}"] if few else []
     return Fold(fold.name, np.sort(np.concatenate(chosen)), fold.test), notes
+
+
+def check_classes(folds: Sequence[Fold], labels: NDArray[np.str_], name: str) -> None:
+    """Raise where fewer than two actions are left to learn."""
+    for fold in folds:
+        found = np.unique(labels[fold.train])
+        if len(found) < 2:
+            where = f" without {fold.name}" if fold.name else ""
+            raise ValueError(f"{name}: only one action ({found[0]}) to learn from{where}; choose training clips of at least two")
 
 
 def strangers(folds: Sequence[Fold], labels: NDArray[np.str_]) -> list[str]:

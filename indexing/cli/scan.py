@@ -27,15 +27,15 @@ class Scan:
     dyntorch index scan session.json -m moves.safetensors --report out/
     """
 
-    recordings: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="FILE")]
+    recordings: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="FILE ...", help_behavior_hint="")]
     """keypoint files; a folder in OpenPose form is one recording"""
     model: Annotated[Path, tyro.conf.arg(aliases=("-m",), metavar="FILE")]
     """what 'dyntorch index fit' wrote"""
-    report: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
+    report: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
     """where to write report.html, events.csv, timeline.png, metrics.json and manifest.json; without it, print only"""
-    truth: Annotated[Path | None, tyro.conf.arg(metavar="CSV")] = None
+    truth: Annotated[Path | None, tyro.conf.arg(metavar="CSV", help_behavior_hint="")] = None
     """what is known to have happened: columns label,start,end in seconds (and file, where there are several recordings)"""
-    reject: Annotated[float | None, tyro.conf.arg(metavar="R")] = None
+    reject: Annotated[float | None, tyro.conf.arg(metavar="R", help_behavior_hint="")] = None
     """rate of false alarms that is accepted, 0 to 1, or else the least score; by default that of the model"""
     reading: Reading = field(default_factory=Reading)
 

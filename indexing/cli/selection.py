@@ -72,7 +72,7 @@ def known(clips: ClipSet) -> str:
             continue  # some clips lack it
         if values.ndim == 1:
             several = sorted({str(value) for value in values}, key=_natural)
-            parts.append(f"{field} ({', '.join(several[:8])}{', ...' if len(several) > 8 else ''})")
+            parts.append(f"{field} ({', '.join(several) if len(several) <= LISTED else f'{len(several)} values'})")
     return f"known fields: {', '.join(parts) or 'none'}"
 
 

@@ -122,7 +122,8 @@ def frame_accuracy(recording: RecordingResult) -> float:
     """Share of the frames inside known actions whose best-scoring action is the known one; NaN without such frames."""
     known = _known_frames(recording)
     inside = known != ""
-    best = np.array([str(name) for name in recording.classes], dtype=object)[np.nan_to_num(recording.scores, nan=-np.inf).argmax(axis=1)]
+    names = np.array([str(name) for name in recording.classes], dtype=object)
+    best = names[np.nan_to_num(recording.scores, nan=-np.inf).argmax(axis=1)]
     return float((best[inside] == known[inside]).mean()) if inside.any() else math.nan
 
 

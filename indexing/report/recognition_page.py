@@ -24,13 +24,15 @@ Pictures = Mapping[str, tuple[bytes, bytes]]  # file name -> PNG for light and f
 def body(report: RecognitionReport, measured: Mapping[str, Any], drawn: Pictures) -> str:
     """The page's sections: headline numbers, recordings, settings, actions, confusion, and how the report was made."""
     parts = [cards(_headline(report, measured)), _notes(report)]
+    if report.evaluations:
+        parts.append(_by_setting(report, measured))
     timelines = [pair for name, pair in drawn.items() if name.startswith("timeline")]
     before = 0
     for index, recording in enumerate(report.recordings):
         parts.append(_recording(report, recording, timelines[index] if index < len(timelines) else None, before))
         before += len(recording.events)
     if report.evaluations:
-        parts += [_by_setting(report, measured), _by_class(measured), _confusion(measured, drawn["confusion.png"])]
+        parts += [_by_class(measured), _confusion(measured, drawn["confusion.png"])]
     if not report.recordings and not report.evaluations:
         parts.append(section("Nothing to show", "", "The report holds neither recordings nor evaluations."))
     if report.manifest:
@@ -83,7 +85,8 @@ def _headline(report: RecognitionReport, measured: Mapping[str, Any]) -> list[Ca
         if measured.get("known_events"):
             got = measured["known_events"] - measured["missed_events"]
             items.append(Card("Known actions hit", f"{got} of {measured['known_events']}", "overlap a find of the same name"))
-            note = f"of those in known actions, by the best score; {_percent(measured['frame_agreement'])} of all, by what was reported"
+            every = _percent(measured["frame_agreement"])
+            note = f"in known actions, by the best score; {every} of all frames, by what was reported"
             items.append(Card("Frames right", _percent(measured["frame_accuracy"]), note))
         items.append(Card("Searched", _duration(measured["seconds"]), f"in {_count(measured['recordings'], 'recording')}"))
     for name, value in report.metrics.items():

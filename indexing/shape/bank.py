@@ -55,17 +55,23 @@ def stack(parts: list[Windows]) -> Windows:
     return Windows(torch.cat([part.values for part in parts]), torch.cat([part.seen for part in parts]))
 
 
-def between(query: Windows, bank: Windows, compare: Callable[[Tensor, Tensor, Tensor | slice], Tensor]) -> Tensor:
+COMMON = 3  # joints that two windows must share: two always fit one another
+
+
+def between(query: Windows, bank: Windows, compare: Callable[[Tensor, Tensor, Tensor | slice], Tensor], worst: float) -> Tensor:
     """Fill a ``(queries, bank)`` table from ``compare(query values, bank values, joints)``, on the joints both sides saw.
 
     Windows are grouped by which joints were seen, so that a comparison is always exact on the joints it has; pairs that
-    share fewer than three joints get NaN-free worst residuals from their zero shapes.
+    share fewer than three joints get the value ``worst``.
     """
     groups = list(bank.patterns())
     out = query.values.new_empty(len(query), len(bank))
     for rows, seen in query.patterns():
         for columns, known in groups:
             both = seen & known
+            if int(both.sum()) < min(COMMON, len(both)):
+                out[rows[:, None], columns] = worst
+                continue
             joints: Tensor | slice = slice(None) if bool(both.all()) else both.nonzero()[:, 0]
             right = bank.values[columns][:, :, joints]
             step = max(1, PAIRS_AT_ONCE // max(1, len(columns)))
@@ -111,9 +117,11 @@ def fused_residual(
                 total.mul_(residual)
         return total
 
+    total_weight = len(channels) if weights is None else float(weights.sum())
+    worst = (1.0 + EPSILON) ** (len(terms) * total_weight)
     best: Tensor | None = None
     for copy in copies:
-        one = between(query, copy, product)
+        one = between(query, copy, product, worst)
         best = one if best is None else torch.minimum(best, one)
     if best is None:
         raise ValueError("no exemplar to compare with")
@@ -160,7 +168,7 @@ class Kernels:
             def one(left: Tensor, right: Tensor, joints: Tensor | slice, k: int = k) -> Tensor:
                 return next(d for i, d in enumerate(self._distances(left, right, joints)) if i == k)
 
-            scales.append(0.5 * between(chosen, chosen, one)[off].median().clamp(min=1e-6))
+            scales.append(0.5 * between(chosen, chosen, one, worst=1.0)[off].median().clamp(min=1e-6))
         self.scales = torch.stack(scales)
         return self(windows, windows)
 
@@ -176,7 +184,7 @@ class Kernels:
                 out.add_(distance.div_(-scale).exp_())
             return out.div_(len(scales))
 
-        return between(query, bank, total)
+        return between(query, bank, total, worst=0.0)
 
     def _distances(self, left: Tensor, right: Tensor, joints: Tensor | slice) -> Iterator[Tensor]:
         """``(Q, E)`` distances between windows restricted to some joints, one kernel after the other."""

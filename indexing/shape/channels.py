@@ -81,6 +81,10 @@ class JointMetric:
     @classmethod
     def learn(cls, windows: Tensor, seen: Tensor, power: float) -> JointMetric:
         """From windows ``(N, length, joints, dims)`` and the joints seen in each, ``(N, joints)``."""
+        # joints never seen go to the middle of the others, where they change no mean
+        known = seen[:, None, :, None].to(windows)
+        middle = (windows * known).sum(dim=2, keepdim=True) / known.sum(dim=2, keepdim=True).clamp(min=1.0)
+        windows = torch.where(known > 0, windows, middle)
         covariances = []
         for name in CHANNELS:
             x = channel(windows, name) * seen[:, None, :, None]

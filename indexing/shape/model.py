@@ -130,7 +130,15 @@ def mirror_some(windows: Windows, symmetry: Tensor, chosen: Tensor) -> Windows:
 
 # ---- learning ----------------------------------------------------------------------------------------------------------
 def learn(
-    exemplars: Exemplars, labels: Tensor, classes: int, *, view: str, scorer: str, learned: bool, symmetry: Tensor | None
+    exemplars: Exemplars,
+    labels: Tensor,
+    classes: int,
+    *,
+    view: str,
+    scorer: str,
+    learned: bool,
+    symmetry: Tensor | None,
+    guard: bool = True,
 ) -> ShapeModel:
     """Learn everything from the exemplars' windows.
 
@@ -138,6 +146,7 @@ def learn(
         labels: ``(N,)`` class numbers; view: ``"any"`` or ``"same"``; scorer: ``"nearest"``, ``"kernel"`` or ``"both"``.
         learned: weigh the channels of A by what tells the exemplars apart (else equally).
         symmetry: joint permutation of the mirror image, or ``None`` to go without mirror images.
+        guard: leave out mirror images of classes that they would turn into one another.
     """
     originals = exemplars.crop(0)
     metric = JointMetric.learn(originals.values, originals.seen, WHITENING)
@@ -148,7 +157,7 @@ def learn(
         torch.zeros(len(labels)), torch.zeros(len(exemplars.owner)), None, None, None,
     )  # fmt: skip
     if symmetry is not None:
-        model = _replace(model, mirrored=_mirror_is_same_action(model, originals))
+        model = _replace(model, mirrored=_mirror_is_same_action(model, originals) if guard else ~none)
     if learned:
         model = _replace(model, weights=channel_weights(originals, model.copies(), metric, labels, classes))
     model = _with_hubs(model, originals)

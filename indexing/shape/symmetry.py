@@ -13,16 +13,17 @@ from torch import Tensor
 
 from indexing.skeleton import Skeleton
 
+SHUFFLES = 20
 DISTORTION = 0.25  # of the mean joint distance: the right layout fits to .02-.12 (one clip: .25), wrong ones to .34-.71
 
 
-def mirror_permutation(skeleton: Skeleton | None, windows: Tensor) -> Tensor | None:
+def mirror_permutation(skeleton: Skeleton | None, windows: Tensor, seen: Tensor | None = None) -> Tensor | None:
     """``(joints,)`` index of every joint's mirror image (itself on the midline), or ``None`` where it cannot be told."""
     if skeleton is not None:
         named = from_names(skeleton.joints)
         if named is not None:
             return named
-    return from_data(windows)
+    return from_data(windows, seen)
 
 
 def from_names(names: tuple[str, ...]) -> Tensor | None:
@@ -91,28 +92,40 @@ _LAYOUTS: dict[int, tuple[tuple[tuple[int, int], ...], ...]] = {
 }  # fmt: skip
 
 
-def from_data(windows: Tensor) -> Tensor | None:
+def from_data(windows: Tensor, seen: Tensor | None = None) -> Tensor | None:
     r"""The common layout with this number of joints whose mirror image keeps the distances between joints.
 
     A permutation :math:`\pi` is a mirror symmetry where the mean distances obey :math:`D_{ij} = D_{\pi(i)\pi(j)}`; the
-    layout that distorts them least is taken, and none where even that distorts by more than a quarter.
+    layout that distorts them least is taken, and none where even that distorts by more than a quarter,
+    or by half as much as shuffled joints (then the distances tell nothing).
 
     Args:
-        windows: ``(N, length, joints, 2)``.
+        windows: ``(N, length, joints, 2)``; seen: ``(N, joints)`` which joints count in each (all).
     """
     joints = windows.shape[2]
     if joints not in _LAYOUTS:
         return None
+    if seen is None:
+        seen = torch.ones(len(windows), joints, dtype=torch.bool)
     x = windows.double()
     apart = (x[:, :, :, None] - x[:, :, None]).abs()
-    tables = torch.stack([apart[..., 1].mean((0, 1)), apart.square().sum(-1).sqrt().mean((0, 1))])
-    tables = tables / tables.mean(dim=(1, 2), keepdim=True).clamp(min=1e-30)
-    best, chosen = DISTORTION, None
+    both = (seen[:, :, None] & seen[:, None]).double()
+    known = both.sum(0) > 0
+    mean = [(d.mean(1) * both).sum(0) / both.sum(0).clamp(min=1) for d in (apart[..., 1], apart.square().sum(-1).sqrt())]
+    tables = torch.stack(mean)
+    tables = tables / (tables.sum(dim=(1, 2), keepdim=True) / known.sum().clamp(min=1)).clamp(min=1e-30)
+
+    def distortion(swap: Tensor) -> float:
+        counted = known & known[swap][:, swap]
+        return float((tables - tables[:, swap][:, :, swap]).abs().mean(0)[counted].mean())
+
+    shuffles = torch.Generator().manual_seed(0)
+    chance = sum(distortion(torch.randperm(joints, generator=shuffles)) for _ in range(SHUFFLES)) / SHUFFLES
+    best, chosen = min(DISTORTION, chance / 2), None
     for pairs in _LAYOUTS[joints]:
         swap = torch.arange(joints)
         for i, j in pairs:
             swap[i], swap[j] = j, i
-        distortion = float((tables - tables[:, swap][:, :, swap]).abs().mean())
-        if distortion < best:
-            best, chosen = distortion, swap
+        if distortion(swap) < best:
+            best, chosen = distortion(swap), swap
     return chosen

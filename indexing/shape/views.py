@@ -1,9 +1,9 @@
 """Virtual views of the exemplars: what they would look like to cameras placed elsewhere.
 
-Where an exemplar has 3D joints they are rendered (:func:`indexing.cameras.virtual`).  Where it has one image only, the person is taken for a flat card and
-the card is turned: a random horizontal squeeze or mirror image with a slight pitch.  Measured, that gives 65-85 % of the
-gain of true 3D to a view-bound kernel and nearly all of it once heights are compared too; it needs no weights, no
-training and no particular joints.
+Where an exemplar has 3D joints they are rendered (:func:`indexing.cameras.virtual`).  Where it has one image only, the
+person is taken for a flat card and the card is turned: a random horizontal squeeze or mirror image with a slight pitch.
+Measured, that gives 65-85 % of the gain of true 3D to a view-bound kernel and nearly all of it once heights are compared
+too; it needs no weights, no training and no particular joints.
 """
 
 from __future__ import annotations

@@ -17,11 +17,11 @@ import numpy as np
 import pytest
 
 from indexing.clip import Clip
+from indexing import files
 from indexing.report import (
     EvaluationResult,
     RecognitionReport,
     RecordingResult,
-    files,
     manifest,
     pictures,
     prepare,

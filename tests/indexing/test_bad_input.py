@@ -1,0 +1,249 @@
+"""Misuse: always a ``ValueError`` that names the clip or the parameter, and a fitted indexer that stays as it was."""
+
+import numpy as np
+import pytest
+
+from indexing import ActionIndexer, Clip
+
+FRAMES, JOINTS = 12, 17
+
+
+def good(seed=0, **known):
+    return Clip(np.random.default_rng(seed).normal(size=(FRAMES, JOINTS, 2)).cumsum(axis=0), **known)
+
+
+def bad_array(kind):
+    x = good().joints.copy()
+    return {
+        "two axes": x[:, 0],
+        "five axes": x[None, None],
+        "four coordinates": np.concatenate([x, x], axis=2),
+        "no frames": x[:0],
+        "one frame": x[:1],
+        "fewer joints": x[:, :5],
+        "all zero": 0 * x,
+        "all NaN": np.nan * x,
+        "constant": 0 * x + 3,
+        "infinite": np.where(np.arange(FRAMES)[:, None, None] == 3, np.inf, x),
+        "text": "squat.json",
+        "a number": 3.0,
+        "nothing": None,
+        "words": [[["a", "b"]] * JOINTS] * FRAMES,
+        "ragged": [[[1.0, 2.0]], [[1.0, 2.0], [3.0, 4.0]]],
+        "complex": x * 1j,
+        "a dictionary": {"joints": x},
+    }[kind]
+
+
+KINDS = (
+    "two axes", "five axes", "four coordinates", "no frames", "one frame", "fewer joints", "all zero", "all NaN", "constant", "infinite",
+    "text", "a number", "nothing", "words", "ragged", "complex", "a dictionary",
+)  # fmt: skip
+
+
+def state(indexer):
+    """Everything that was learned, comparable."""
+    found = {name: value for name, value in vars(indexer).items() if name.endswith("_") and name != "model_"}
+    found |= {f"model_.{name}": value for name, value in vars(indexer.model_).items()}
+    return {name: (id(value), repr(value)) for name, value in found.items()}
+
+
+@pytest.fixture
+def unchanged(indexer, others):
+    """A fitted indexer that must answer the same afterwards."""
+    before, answers = state(indexer), indexer.decision_function(others[:6])
+    yield indexer
+    assert state(indexer) == before
+    np.testing.assert_array_equal(indexer.decision_function(others[:6]), answers)
+
+
+# ---- clips -------------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("kind", KINDS)
+def test_bad_clips_are_named_everywhere(kind, unchanged):
+    bad = bad_array(kind)
+    clips = [good(0), good(1), bad]
+    for verb in (
+        lambda: unchanged.fit(clips, ["a", "b", "a"]),
+        lambda: ActionIndexer().fit(clips, ["a", "b", "a"]),
+        lambda: unchanged.partial_fit(clips, ["a", "b", "a"]),
+        lambda: unchanged.predict(clips),
+        lambda: unchanged.decision_function(clips),
+        lambda: unchanged.predict_proba(clips),
+        lambda: unchanged.score(clips, ["a", "b", "a"]),
+    ):
+        with pytest.raises(ValueError, match=r"(clip|item) '?2\b"):
+            verb()
+    for verb in (unchanged.find, unchanged.score_frames):
+        with pytest.raises(ValueError, match=r"clip|item"):
+            verb(bad)
+
+
+@pytest.mark.parametrize("clips", [[], (), iter([]), np.empty((0, 5, 17, 2))], ids=["list", "tuple", "iterator", "array"])
+def test_an_empty_list(clips, unchanged):
+    for verb in (lambda: unchanged.fit(clips, []), lambda: unchanged.partial_fit(clips, []), lambda: unchanged.predict(clips)):
+        with pytest.raises(ValueError, match="clips: the list is empty; give at least one clip"):
+            verb()
+
+
+@pytest.mark.parametrize("clips", [good(), "clips.npz", b"x", None, 5, 2.0], ids=lambda v: type(v).__name__)
+def test_something_other_than_a_list(clips, unchanged):
+    for verb in (lambda: unchanged.fit(clips, ["a"]), lambda: unchanged.predict(clips)):
+        with pytest.raises(ValueError, match=r"clips: expected a list of clips or arrays, got .*; put a single clip in a list: \[clip\]"):
+            verb()
+
+
+def test_one_array_instead_of_a_list_says_what_a_clip_is(unchanged):
+    with pytest.raises(ValueError, match="several clips are a list"):
+        unchanged.predict(good().joints)
+
+
+def test_the_number_of_joints_is_that_of_the_fit(unchanged):
+    with pytest.raises(ValueError, match=r"clip 0: joints: 5 joints, but the fitted clips have 17; use clips of one joint layout"):
+        unchanged.predict([Clip(good().joints[:, :5])])
+
+
+def test_names_of_clips_are_in_the_message(unchanged):
+    with pytest.raises(ValueError, match=r"clip 1 \('squat-3'\): joints: one frame only"):
+        unchanged.predict([good(), Clip(good().joints[:1], name="squat-3")])
+
+
+def test_several_views_are_no_query(unchanged):
+    with pytest.raises(ValueError, match="item 1 holds 2 views; a query is one view"):
+        unchanged.predict([good(), (good(), good(1))])
+
+
+@pytest.mark.parametrize(
+    ("views", "message"),
+    [
+        ((good(), Clip(good().joints[:, :5])), "same joints"),
+        ((good(), Clip(np.random.default_rng(0).normal(size=(FRAMES, JOINTS, 3)))), "must be 2D"),
+        ((good(), good().replace(times=np.arange(FRAMES) + 100.0, fps=None)), "share no time"),
+        ((good(), good().replace(joints=good().joints * np.nan)), "no joint was seen"),
+        ((good(), None), "array of numbers"),
+    ],
+)
+def test_views_that_do_not_belong_together(views, message, unchanged):
+    for indexer in (ActionIndexer(), unchanged):
+        with pytest.raises(ValueError, match=message):
+            indexer.fit([good(), views], ["a", "b"])
+
+
+def test_the_item_is_counted_as_the_user_does(unchanged):
+    with pytest.raises(ValueError, match=r"(clip|item) 1\b"):
+        unchanged.fit([(good(), good(1)), Clip(good().joints[:1]), good(2)], ["a", "b", "a"])
+
+
+def flat(joints=JOINTS):
+    """3D joints in one horizontal plane: a good clip until it is rendered."""
+    x = np.random.default_rng(0).normal(size=(FRAMES, joints, 3))
+    x[..., 1] = 2.0
+    return Clip(x, name="flat")
+
+
+def test_failures_late_in_fit_change_nothing(unchanged):
+    with pytest.raises(ValueError, match="clip 'flat': the joints have no vertical extent"):
+        unchanged.fit([flat(5), flat(5)], ["a", "b"])
+    with pytest.raises(ValueError, match="'flat'"):
+        unchanged.partial_fit([good(), flat()], ["new", "squat"])
+    with pytest.raises(ValueError, match="'flat'"):
+        unchanged.predict([flat()])
+
+
+def test_a_crash_in_learning_changes_nothing(unchanged, monkeypatch):
+    def crash(*args, **kwargs):
+        raise RuntimeError("out of memory")
+
+    monkeypatch.setattr("indexing.indexer.learn", crash)
+    with pytest.raises(RuntimeError):
+        unchanged.fit([Clip(good(s).joints[:, :5]) for s in range(2)], ["a", "b"])
+    with pytest.raises(RuntimeError):
+        unchanged.partial_fit([good()], ["a new one"])
+
+
+# ---- labels ------------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("labels", "message"),
+    [
+        (["a", None, "b"], "label of clip 1 is missing"),
+        ([1.0, np.nan, 2.0], "label of clip 1 is missing"),
+        (np.array(["a", np.nan, "b"], dtype=object), "label of clip 1 is missing"),
+        (["a", float("nan"), "b"], "label of clip 1 is missing"),
+        (["a", "b"], r"labels: expected one per clip \(3\), got shape \(2,\)"),
+        (["a", "b", "a", "b"], "expected one per clip"),
+        ([["a"], ["b"], ["a"]], "expected one per clip"),
+        ([["a"], ["b", "c"], ["a"]], "labels"),
+        ("abc", "expected one per clip"),
+        (["a", "a", "a"], r"labels: only one class \(.*'a'.*\); give clips of at least two actions"),
+        (None, r"labels: none given, and clip 0 \(''\) has no label; pass fit\(clips, labels\)"),
+        (np.array(["a", 1, "b"], dtype=object), "labels"),
+        (["a", 1, "b"], "labels"),
+    ],
+    ids=str,
+)
+def test_bad_labels(labels, message, unchanged):
+    clips = [good(s) for s in range(3)]
+    for indexer in (ActionIndexer(), unchanged):
+        with pytest.raises(ValueError, match=message):
+            indexer.fit(clips, labels)
+
+
+def test_clips_whose_own_label_is_missing(unchanged):
+    for label in (None, float("nan")):
+        with pytest.raises(ValueError, match=r"clip 1 .*label|label of clip 1"):
+            unchanged.fit([good(0, label="a"), good(1, label=label), good(2, label="b")])
+
+
+@pytest.mark.parametrize("labels", [[None], [np.nan], ["a", "b"], [3]], ids=str)
+def test_bad_labels_for_learning_on(labels, unchanged):
+    with pytest.raises(ValueError, match="labels"):
+        unchanged.partial_fit([good()], labels)
+
+
+def test_labels_never_learned_count_as_wrong(indexer, others):
+    truth = others[:4].labels.astype(object)
+    truth[:2] = "never learned"
+    assert indexer.score(others[:4], truth) == (indexer.predict(others[2:4]) == truth[2:]).mean() / 2
+
+
+@pytest.mark.parametrize("labels", [["a"], ["a"] * 3, [["a", "b"]]], ids=str)
+def test_score_needs_one_label_per_clip(labels, unchanged):
+    with pytest.raises(ValueError, match=r"labels: expected one per clip \(2\)"):
+        unchanged.score([good(), good(1)], labels)
+
+
+# ---- parameters --------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("view", "front"), ("view", None), ("view", ["any"]), ("weights", "uniform"), ("weights", np.ones(3)), ("scorer", "C"),
+        ("mirror", "always"), ("mirror", None), ("fps", 0), ("fps", -30), ("fps", np.nan), ("fps", "30"), ("fps", None),
+        ("window", 0), ("window", np.inf), ("stride", 0.0), ("stride", -1), ("pool", -1), ("pool", np.nan), ("pool", "2"),
+        ("tempi", ()), ("tempi", (1.0, 0.0)), ("tempi", (np.nan,)), ("tempi", 1.0), ("tempi", None), ("tempi", "fast"),
+        ("length", 3), ("length", 12.0), ("length", True), ("length", None), ("virtual_views", -1), ("virtual_views", 1.5),
+        ("reject", np.nan), ("reject", "0.1"), ("reject", (0.1,)), ("device", "moon"), ("device", "cuda:99"),
+        ("random_state", "seed"), ("random_state", -1), ("random_state", 1.5),
+    ],
+    ids=str,
+)  # fmt: skip
+def test_bad_parameters_are_named(name, value, unchanged):
+    clips, labels = [good(s) for s in range(3)], ["a", "b", "a"]
+    old = unchanged.get_params()[name]
+    unchanged.set_params(**{name: value})
+    for verb in (unchanged.fit, unchanged.partial_fit):
+        with pytest.raises(ValueError, match=name):
+            verb(clips, labels)
+    unchanged.set_params(**{name: old})
+
+
+@pytest.mark.parametrize("change", [{"length": 20}, {"search": False}, {"virtual_views": 2}], ids=str)
+def test_windows_cut_otherwise_cannot_be_added(change, unchanged, lesson):
+    old = {name: unchanged.get_params()[name] for name in change}
+    unchanged.set_params(**change)
+    with pytest.raises(ValueError, match=next(iter(change))):
+        unchanged.partial_fit(lesson[:2])
+    unchanged.set_params(**old)
+
+
+def test_a_pool_of_any_real_type_is_taken(lesson):
+    for pool in (0, np.float32(1.0), np.int64(2)):
+        ActionIndexer(pool=pool, scorer="nearest").fit(lesson)

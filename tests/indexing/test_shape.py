@@ -1,0 +1,236 @@
+"""Shapes: channels, the joint metric, all-pairs residuals and kernels, and the kernel machine, against slow references."""
+
+import numpy as np
+import pytest
+import torch
+from sklearn.svm import SVC
+
+from dyntorch import canonical_correlation
+from indexing.shape.bank import EPSILON, Kernels, Windows, fused_residual
+from indexing.shape.channels import CHANNELS, JointMetric, channel, order_free
+from indexing.shape.machine import PairwiseMachine
+from indexing.shape.views import mirror, turn
+
+LENGTH, JOINTS = 8, 6
+
+
+def random(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).float()
+
+
+def random_windows(count, seed=0, holes=False):
+    values = random(count, LENGTH, JOINTS, 2, seed=seed)
+    seen = torch.ones(count, JOINTS, dtype=torch.bool)
+    if holes:
+        seen[::2, 1] = False
+        seen[::3, 4] = False
+        values = values * seen[:, None, :, None]
+    return Windows(values, seen)
+
+
+def metric_of(windows, power=0.25):
+    return JointMetric.learn(windows.values, windows.seen, power)
+
+
+def test_channels_by_definition():
+    x = random(3, LENGTH, JOINTS, 2).numpy()
+    np.testing.assert_allclose(channel(torch.from_numpy(x), "clip"), x - x.mean(axis=(1, 2), keepdims=True), atol=1e-6)
+    np.testing.assert_allclose(channel(torch.from_numpy(x), "frame"), x - x.mean(axis=2, keepdims=True), atol=1e-6)
+    np.testing.assert_allclose(channel(torch.from_numpy(x), "motion"), x - x.mean(axis=1, keepdims=True), atol=1e-6)
+    np.testing.assert_allclose(channel(torch.from_numpy(x), "velocity"), x[:, 2:] - x[:, :-2], atol=1e-6)
+    with pytest.raises(ValueError, match="unknown channel 'pose'; known: clip, frame, motion, velocity"):
+        channel(torch.zeros(1, 4, 3, 2), "pose")
+
+
+def test_channels_ignore_where_the_image_has_its_origin():
+    x = random(2, LENGTH, JOINTS, 2)
+    for name in CHANNELS:
+        torch.testing.assert_close(channel(x + 7, name), channel(x, name), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("whole_image", [False, True])
+def test_order_free_moments(whole_image):
+    x = random(3, LENGTH, JOINTS, 2)
+    f = channel(x, "frame").double().numpy()
+    f = f.reshape(3, LENGTH, -1) if whole_image else f[..., 1]
+    m, v = f - f.mean(axis=1, keepdims=True), np.diff(f, axis=1)
+    expected = [sum(np.einsum("ni,nj->nij", a[:, t], a[:, t]) for t in range(a.shape[1])).reshape(3, -1) for a in (f, m, v)]
+    np.testing.assert_allclose(order_free(x, whole_image), np.stack(expected), atol=1e-4)
+
+
+def test_joint_metric_by_definition():
+    windows = random_windows(7, seed=1)
+    metric = metric_of(windows)
+    for k, name in enumerate(CHANNELS):
+        x = channel(windows.values, name).double().numpy()
+        x = x / np.sqrt((x**2).sum(axis=(1, 2, 3), keepdims=True))
+        sigma = np.einsum("ntjd,ntkd->jk", x, x)
+        sigma *= JOINTS / np.trace(sigma)
+        np.testing.assert_allclose(metric.covariance[k], sigma, atol=1e-6)
+        values, vectors = np.linalg.eigh(sigma + 0.1 * np.eye(JOINTS))
+        np.testing.assert_allclose(metric.weights(name), vectors @ np.diag(values**-0.25) @ vectors.T, atol=1e-5)
+    assert metric_of(windows, power=0.0).weights("clip") is None
+
+
+def test_joint_metric_ignores_where_the_image_has_its_origin():
+    windows = random_windows(9, seed=2, holes=True)
+    moved = Windows((windows.values + 50) * windows.seen[:, None, :, None], windows.seen)
+    torch.testing.assert_close(metric_of(moved).covariance, metric_of(windows).covariance, atol=1e-3, rtol=0)
+
+
+def test_joint_metric_keeps_the_rank_condition():
+    shape = random(LENGTH * JOINTS, 3, seed=3).double()
+    views = torch.stack([shape @ random(3, 2, seed=seed).double() + 5 * seed for seed in (4, 5)]).unflatten(1, (LENGTH, JOINTS))
+    metric = metric_of(random_windows(7, seed=6))
+    for name in CHANNELS:
+        a, b = metric.apply(views[:1], name), metric.apply(views[1:], name)
+        assert metric.weights(name) is not None
+        assert (a - channel(views[:1], name).flatten(1, 2)).abs().max() > 1e-3  # it does weigh
+        s = canonical_correlation(torch.linalg.qr(a).Q, torch.linalg.qr(b).Q)
+        assert abs(float(s) - 1) < 1e-6
+
+
+def slow_residual(query, exemplar, metric, channels, terms, weights):
+    """One pair in float64: SVD bases, and only the joints that both saw."""
+    total = 0.0
+    for i, name in enumerate(channels):
+        w = metric.weights(name, slice(None) if bool(query[1].all() & exemplar[1].all()) else (query[1] & exemplar[1]).nonzero()[:, 0])
+        both = (query[1] & exemplar[1]).nonzero()[:, 0]
+        sides = []
+        for values, _ in (query, exemplar):
+            x = channel(values[None, :, both].double(), name)[0]
+            x = torch.einsum("jk,tkd->tjd", w.double(), x) if w is not None else x
+            sides.append(x.flatten(0, 1))
+        a, b = sides
+        for term in terms:
+            if term == "epi":
+                u, v = (torch.linalg.svd(x, full_matrices=False).U for x in (a, b))
+                r = 1 - torch.linalg.svdvals(u.mT @ v)[0]
+            else:
+                a1, b1 = (a[:, 1], b[:, 1]) if term == "up" else (a.flatten(), b.flatten())
+                r = 1 - (a1 @ b1) / (a1.norm() * b1.norm())
+            total += float(weights[i]) * float(torch.log(r + EPSILON))
+    return total
+
+
+@pytest.mark.parametrize("holes", [False, True])
+@pytest.mark.parametrize("terms", [("epi",), ("epi", "up", "nn")])
+@pytest.mark.parametrize("weights", [None, (0.5, 1.0, 2.0)])
+def test_fused_residual_against_singular_values(holes, terms, weights):
+    query, bank, second = random_windows(5, 7, holes), random_windows(7, 8, holes), random_windows(7, 9)
+    metric = metric_of(bank)
+    names = ("clip", "frame", "velocity")
+    w = None if weights is None else torch.tensor(weights)
+    got = fused_residual(query, [bank, second], metric, names, w, terms)
+    assert got.shape == (5, 7)
+    for i in range(5):
+        for j in range(7):
+            copies = ((x.values[j], x.seen[j]) for x in (bank, second))
+            pair = (query.values[i], query.seen[i])
+            expected = min(slow_residual(pair, copy, metric, names, terms, weights or (1, 1, 1)) for copy in copies)
+            assert float(got[i, j]) == pytest.approx(expected, abs=5e-3)
+
+
+def test_residual_of_two_views_of_one_shape_is_the_noise_floor():
+    shape = random(LENGTH * JOINTS, 3, seed=10)
+    views = torch.stack([shape @ random(3, 2, seed=s) for s in (11, 12)]).unflatten(1, (LENGTH, JOINTS))
+    seen = torch.ones(1, JOINTS, dtype=torch.bool)
+    pair = [Windows(views[:1], seen), Windows(views[1:], seen)]
+    metric = metric_of(random_windows(5))
+    assert float(fused_residual(pair[0], [pair[1]], metric)) == pytest.approx(3 * np.log(EPSILON), abs=0.5)
+
+
+def test_residuals_do_not_depend_on_the_chunk(monkeypatch):
+    query, bank = random_windows(6, 13, holes=True), random_windows(5, 14, holes=True)
+    metric = metric_of(bank)
+    expected = fused_residual(query, [bank], metric)
+    monkeypatch.setattr("indexing.shape.bank.PAIRS_AT_ONCE", 4)
+    torch.testing.assert_close(fused_residual(query, [bank], metric), expected, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("common", [0, 1, 2])
+def test_pairs_with_too_few_common_joints_get_the_worst_residual(common):
+    query, bank = random_windows(1, 15), random_windows(1, 16)
+    query.seen[0, 4:] = False
+    bank.seen[0, : 4 - common] = False
+    got = float(fused_residual(query, [bank], metric_of(random_windows(5))))
+    assert got == pytest.approx(3 * np.log(1 + EPSILON), abs=1e-3)
+
+
+def test_no_exemplars_is_refused():
+    with pytest.raises(ValueError, match="no exemplar"):
+        fused_residual(random_windows(2), [], metric_of(random_windows(3)))
+
+
+@pytest.mark.parametrize("one_side", [False, True])
+def test_kernels_are_symmetric_with_ones_on_the_diagonal(one_side):
+    windows = random_windows(20, 17)
+    kernel = Kernels(metric_of(windows, 0.0), one_side).fit(windows)
+    assert kernel.shape == (20, 20)
+    torch.testing.assert_close(kernel, kernel.mT, atol=1e-5, rtol=0)
+    torch.testing.assert_close(kernel.diagonal(), torch.ones(20), atol=2e-2 if one_side else 1e-4, rtol=0)
+    assert kernel.min() >= 0 and kernel.max() <= 1 + 1e-5
+    if not one_side:
+        assert torch.linalg.eigvalsh(kernel.double()).min() > -1e-4
+
+
+def test_kernel_by_definition():
+    query, bank = random_windows(4, 18), random_windows(9, 19)
+    kernels = Kernels(metric_of(bank, 0.0))
+    kernels.fit(bank)
+
+    def features(windows):
+        x = [channel(windows.values, name).double() for name in CHANNELS]
+        both = [part for one in x for part in (one[..., 1].flatten(1), one.flatten(1))]
+        return both + [moment.double() for moment in order_free(windows.values)]
+
+    def distances(a, b):
+        unit = torch.nn.functional.normalize
+        return [1 - unit(p, dim=1) @ unit(q, dim=1).mT for p, q in zip(features(a), features(b), strict=True)]
+
+    off = ~torch.eye(9, dtype=torch.bool)
+    scales = [d[off].median() / 2 for d in distances(bank, bank)]
+    torch.testing.assert_close(kernels.scales.double(), torch.stack(scales), atol=1e-5, rtol=1e-4)
+    expected = sum(torch.exp(-d / s) for d, s in zip(distances(query, bank), scales, strict=True)) / len(scales)
+    torch.testing.assert_close(kernels(query, bank).double(), expected, atol=1e-4, rtol=0)
+
+
+def test_kernels_need_scales():
+    with pytest.raises(ValueError, match="fit them first"):
+        Kernels(metric_of(random_windows(3)))(random_windows(2), random_windows(3))
+
+
+@pytest.mark.parametrize("classes", [2, 3, 6])
+def test_pairwise_machine_is_the_support_vector_machine(classes):
+    rng = np.random.default_rng(classes)
+    labels = np.arange(60) % classes
+    x = rng.normal(size=(60, 4)) + 1.5 * rng.normal(size=(classes, 4))[labels]
+    q = rng.normal(size=(40, 4)) * 2
+    gram, cross = x @ x.T, q @ x.T
+    machine = PairwiseMachine.fit(torch.from_numpy(gram).float(), labels)
+    got = machine(torch.from_numpy(cross).float()[:, machine.support]).numpy()
+    reference = SVC(C=PairwiseMachine.PENALTY, kernel="precomputed", decision_function_shape="ovr").fit(gram, labels)
+    expected = reference.decision_function(cross)
+    assert got.shape == (40, classes)
+    if classes == 2:
+        np.testing.assert_array_equal(got[:, 1] > got[:, 0], expected > 0)
+        np.testing.assert_array_equal(got.argmax(axis=1), reference.predict(cross))
+    else:
+        np.testing.assert_allclose(got, expected, atol=2e-3)
+
+
+def test_mirroring_twice_gives_the_window_back():
+    x = random(3, LENGTH, JOINTS, 2)
+    swap = torch.tensor([0, 2, 1, 3, 5, 4])
+    assert torch.equal(mirror(mirror(x, swap), swap), x)
+    once = mirror(x, swap)
+    torch.testing.assert_close(once[:, :, 1, 0], -x[:, :, 2, 0])
+    torch.testing.assert_close(once[:, :, 1, 1], x[:, :, 2, 1])
+
+
+def test_a_turned_card_keeps_its_heights_and_is_squeezed():
+    x = random(2, LENGTH, JOINTS, 2, seed=20)
+    centred = channel(x, "clip")
+    got = turn(x, np.array([np.pi / 3, np.pi]), np.zeros(2))
+    torch.testing.assert_close(got[..., 1], centred[..., 1], atol=1e-5, rtol=0)
+    torch.testing.assert_close(got[..., 0], centred[..., 0] * torch.tensor([0.5, -1.0])[:, None, None], atol=1e-5, rtol=0)

@@ -1,0 +1,129 @@
+"""Mirror images: which joints change places, and which actions are still themselves in the mirror."""
+
+import numpy as np
+import pytest
+import torch
+
+from indexing import ActionIndexer, Clip
+from indexing.actors import Person, dataset
+from indexing.shape.symmetry import from_data, from_names, mirror_permutation
+from indexing.shape.views import mirror
+from indexing.skeleton import BODY25, COCO17, HALPE26, MEDIAPIPE33, OPENPOSE18, Skeleton
+
+COCO = [0, 2, 1, 4, 3, 6, 5, 8, 7, 10, 9, 12, 11, 14, 13, 16, 15]
+
+
+@pytest.mark.parametrize(
+    ("left", "right"),
+    [
+        ("left_knee", "right_knee"), ("LeftKnee", "RightKnee"), ("LEFT KNEE", "RIGHT KNEE"), ("kneeLeft", "kneeRight"),
+        ("lfemur", "rfemur"), ("lfoot", "rfoot"), ("LKnee", "RKnee"), ("lKnee", "rKnee"), ("L_knee", "R_knee"), ("l.knee", "r.knee"),
+        ("knee.l", "knee.r"), ("knee_R", "knee_L"), ("hand_l", "hand_r"), ("hand-L", "hand-R"), ("mouth_left", "mouth_right"),
+        ("L Knee", "R Knee"), ("lowerleg_l", "lowerleg_r"), ("upper_arm.L", "upper_arm.R"),
+    ],
+)  # fmt: skip
+def test_sides_in_names(left, right):
+    assert from_names(("nose", left, "thorax", right)).tolist() == [0, 3, 2, 1]
+
+
+@pytest.mark.parametrize(
+    "names",
+    [("nose", "neck"), ("left_knee", "nose"), ("1", "2", "3"), ("lower", "roof"), ("root", "lumbar", "thorax"), ("leftover", "rim")],
+)
+def test_names_without_pairs_tell_nothing(names):
+    assert from_names(names) is None
+
+
+@pytest.mark.parametrize("skeleton", [COCO17, BODY25, HALPE26, MEDIAPIPE33, OPENPOSE18], ids=lambda s: s.name)
+def test_known_skeletons_pair_left_with_right(skeleton):
+    swap = from_names(skeleton.joints)
+    assert torch.equal(swap[swap], torch.arange(len(swap)))
+    for i, j in enumerate(swap.tolist()):
+        name = skeleton.joints[i]
+        mirrored = name.replace("left", "@").replace("right", "left").replace("@", "right")
+        assert skeleton.joints[j] == mirrored
+
+
+def test_names_come_before_data():
+    names = ("left_a", "right_a", *(f"x{i}" for i in range(15)))
+    swap = mirror_permutation(Skeleton("odd", names), torch.zeros(1, 4, 17, 2))
+    assert swap.tolist() == [1, 0, *range(2, 17)]
+
+
+@pytest.mark.parametrize("azimuth", [0.0, 45.0, 90.0])
+def test_coco_is_recognized_without_names(azimuth, windows_of):
+    clips = dataset(3, azimuth=azimuth, rng=4)
+    assert from_data(windows_of(clips).values).tolist() == COCO
+
+
+@pytest.mark.parametrize("every", [13, 2])
+def test_coco_is_recognized_where_a_joint_is_never_seen(lesson, every):
+    clips = [clip.replace(skeleton=None) for clip in lesson]
+    for i in range(0, 13, every):
+        joints = clips[i].joints.copy()
+        joints[:, 9] = np.nan
+        clips[i] = clips[i].replace(joints=joints)
+    model = ActionIndexer(scorer="nearest").fit(clips, lesson.labels).model_
+    assert model.symmetry is not None and model.symmetry.tolist() == COCO
+
+
+def test_shuffled_joints_and_unknown_layouts_have_no_symmetry(windows_of, lesson):
+    windows = windows_of(lesson).values
+    order = torch.randperm(17, generator=torch.Generator().manual_seed(3))
+    assert from_data(windows[:, :, order]) is None
+    assert from_data(windows[:, :, :11]) is None
+
+
+def in_the_mirror(clip):
+    swap = torch.tensor(COCO)
+    return clip.replace(joints=mirror(torch.from_numpy(clip.joints.copy())[None], swap)[0].numpy(), up=clip.up)
+
+
+def sides(actions, people, azimuth, rng):
+    """Every action once as it is and once mirrored, as 2D clips about x = 0."""
+    clips = dataset(people, actions, azimuth=azimuth, rng=rng, image=(1280, 720))
+    centred = [clip.replace(joints=clip.joints - [640.0, 0.0]) for clip in clips]
+    return [clip.replace(label=f"right {clip.label}") for clip in centred], [
+        in_the_mirror(clip).replace(label=f"left {clip.label}") for clip in centred
+    ]
+
+
+def test_left_and_right_as_different_actions_are_not_mirrored():
+    people = [Person.random(1)]
+    right, left = sides(["punch", "kick"], people, 0.0, 1)
+    ordinary = [clip.replace(joints=clip.joints - [640.0, 0.0]) for clip in dataset(people, ["wave", "squat"], azimuth=0.0, rng=1)]
+    clips = [*right, *left, *ordinary]
+    indexer = ActionIndexer().fit(clips)
+    told = {clip.label: bool(flag) for clip, flag in zip(clips, indexer.model_.mirrored, strict=True)}
+    assert told == {
+        "right punch": False, "right kick": False, "left punch": False, "left kick": False, "wave": True, "squat": True,
+    }  # fmt: skip
+    other_right, other_left = sides(["punch", "kick"], [Person.random(7)], 30.0, 5)
+    assert indexer.score([*other_right, *other_left], [clip.label for clip in [*other_right, *other_left]]) == 1.0
+
+
+def test_one_sided_actions_are_found_on_the_other_side():
+    actions = ["punch", "kick", "wave", "throw"]
+    right, _ = sides(actions, [Person.random(1)], 0.0, 1)
+    _, left = sides(actions, [Person.random(7), Person.random(8)], 0.0, 2)
+    labels = [clip.label.replace("left", "right") for clip in left]
+    free = ActionIndexer(scorer="nearest").fit(right)
+    assert free.model_.mirrored.all()
+    assert free.score(left, labels) == 1.0
+    bound = ActionIndexer(scorer="nearest", mirror=False).fit(right)
+    assert bound.model_.symmetry is None and not bound.model_.mirrored.any()
+    assert bound.score(left, labels) < free.score(left, labels)
+
+
+def test_mirror_true_mirrors_everything(lesson):
+    model = ActionIndexer(scorer="nearest", mirror=True).fit(lesson).model_
+    assert model.symmetry is not None
+    assert model.mirrored.all()
+
+
+def test_layouts_without_symmetry_still_work(random_clip):
+    clips = [random_clip(seed=s, label="ab"[s % 2]) for s in range(4)]
+    indexer = ActionIndexer().fit(clips)
+    assert indexer.model_.symmetry is None
+    assert indexer.predict(clips).tolist() == list("abab")
+    assert isinstance(clips[0], Clip)

@@ -1,0 +1,210 @@
+"""Windows against slow references: interpolation joint by joint with np.interp, repair, and what is refused."""
+
+import numpy as np
+import pytest
+import torch
+
+from indexing import Clip
+from indexing.windows import SUBSAMPLES, check_clips, hampel, ragged, sample, unusable, whole
+
+
+def irregular(seed, frames=17, joints=5, dims=2, start=0.0):
+    rng = np.random.default_rng(seed)
+    times = start + np.cumsum(rng.uniform(0.01, 0.2, frames))
+    return Clip(rng.normal(size=(frames, joints, dims)), times=times)
+
+
+def with_holes(clip, share=0.4, seed=0):
+    joints = clip.joints.copy()
+    joints[np.random.default_rng(seed).random(joints.shape[:2]) < share] = np.nan
+    return clip.replace(joints=joints)
+
+
+def slow_window(clip, start, end, length):
+    """Box average of SUBSAMPLES linear interpolations per step, joint by joint; missing joints do not count as samples."""
+    at = start + (end - start) * (np.arange(length * SUBSAMPLES) + 0.5) / (length * SUBSAMPLES)
+    out = np.zeros((length * SUBSAMPLES, *clip.joints.shape[1:]))
+    for j in range(clip.joints.shape[1]):
+        ok = clip.seen[:, j]
+        for d in range(clip.dims):
+            if ok.any():
+                filled = np.interp(clip.times, clip.times[ok], clip.joints[ok, j, d])
+                out[:, j, d] = np.interp(at, clip.times, filled)
+    return out.reshape(length, SUBSAMPLES, *clip.joints.shape[1:]).mean(axis=1)
+
+
+CLIPS = [irregular(0), irregular(1, frames=2), irregular(2, frames=60, start=1e5), irregular(3, start=-7.0)]
+
+
+def test_whole_clips_against_interpolation():
+    got = whole(ragged(CLIPS), 12)
+    assert got.shape == (4, 12, 5, 2) and got.dtype == torch.float32
+    for clip, window in zip(CLIPS, got, strict=True):
+        np.testing.assert_allclose(window, slow_window(clip, clip.times[0], clip.times[-1], 12), atol=2e-5)
+
+
+@pytest.mark.parametrize("crop", [(0.0, 0.7), (0.15, 1.0), (0.3, 0.4)])
+def test_crops_are_parts_of_the_duration(crop):
+    got = whole(ragged(CLIPS), 9, crop)
+    for clip, window in zip(CLIPS, got, strict=True):
+        low, high = (clip.times[0] + share * clip.duration for share in crop)
+        np.testing.assert_allclose(window, slow_window(clip, low, high, 9), atol=2e-5)
+
+
+def test_windows_anywhere_also_beyond_the_ends():
+    clips = [with_holes(clip, seed=i) for i, clip in enumerate(CLIPS)]
+    owner = np.array([2, 0, 0, 3, 1, 2])
+    start = np.array([clips[i].times[0] for i in owner]) + [-0.5, 0.1, -9.0, 0.3, 0.0, 3.0]
+    end = start + [1.0, 0.4, 2.0, 1.5, 5.0, 90.0]
+    got = sample(ragged(clips), owner, start, end, 8)
+    for i, window in enumerate(got):
+        clip = clips[owner[i]]
+        # the first and last frame are repeated outside: that is what np.interp does too
+        np.testing.assert_allclose(window, slow_window(clip, start[i], end[i], 8), atol=2e-5)
+
+
+def test_the_result_does_not_depend_on_the_chunk(monkeypatch):
+    source = ragged(CLIPS)
+    owner, start = np.arange(4).repeat(3), np.zeros(12)
+    begin = np.array([clip.times[0] for clip in CLIPS])[owner] + start
+    expected = sample(source, owner, begin, begin + 0.5, 6)
+    monkeypatch.setattr("indexing.windows.CHUNK", 6 * SUBSAMPLES * 5 * 2 * 5)
+    assert torch.equal(sample(source, owner, begin, begin + 0.5, 6), expected)
+
+
+def test_clips_do_not_leak_into_one_another():
+    together = whole(ragged(CLIPS), 7)
+    alone = torch.cat([whole(ragged([clip]), 7) for clip in CLIPS])
+    torch.testing.assert_close(together, alone, atol=1e-5, rtol=0)
+
+
+def test_missing_joints_are_interpolated_in_time():
+    clips = [with_holes(clip, seed=i) for i, clip in enumerate(CLIPS)]
+    source = ragged(clips)
+    for i, clip in enumerate(clips):
+        part = source.joints[source.starts[i] : source.starts[i + 1]]
+        for j in range(5):
+            ok = clip.seen[:, j]
+            assert source.seen[i, j] == ok.any()
+            for d in range(2):
+                expected = np.interp(clip.times, clip.times[ok], clip.joints[ok, j, d]) if ok.any() else np.zeros(len(clip))
+                np.testing.assert_allclose(part[:, j, d], expected, atol=1e-5)
+
+
+def test_a_joint_with_one_coordinate_missing_is_missing():
+    joints = CLIPS[0].joints.copy()
+    joints[4, 1, 0] = np.nan
+    filled = ragged([CLIPS[0].replace(joints=joints)]).joints[4, 1]
+    ok = np.arange(17) != 4
+    expected = [np.interp(CLIPS[0].times[4], CLIPS[0].times[ok], joints[ok, 1, d]) for d in range(2)]
+    np.testing.assert_allclose(filled, expected, atol=1e-5)
+
+
+def test_never_seen_joints_are_marked_and_zero():
+    joints = CLIPS[0].joints.copy()
+    joints[:, 3] = np.nan
+    source = ragged([CLIPS[1], CLIPS[0].replace(joints=joints), CLIPS[2]])
+    assert source.seen.tolist() == [[True] * 5, [True, True, True, False, True], [True] * 5]
+    assert (source.joints[source.starts[1] : source.starts[2], 3] == 0).all()
+    assert torch.isfinite(whole(source, 6)).all()
+
+
+def test_y_points_up_in_windows():
+    clip = irregular(5)
+    np.testing.assert_allclose(ragged([clip.replace(up="-y")]).joints, clip.joints * [1, -1], rtol=1e-6)
+
+
+def test_frame_rate_changes_nothing_that_moves_linearly():
+    path = np.linspace(0, 1, 5)[:, None, None] * np.array([[[3.0, 1.0], [0.0, -2.0]]])
+    slow, fast = Clip(path, fps=4), Clip(np.stack([np.interp(np.linspace(0, 4, 81), np.arange(5), column) for column in path.reshape(5, 4).T], 1)
+                                         .reshape(81, 2, 2), fps=80)  # fmt: skip
+    got = whole(ragged([slow, fast]), 10)
+    torch.testing.assert_close(got[0], got[1], atol=1e-6, rtol=0)
+
+
+# ---- repair ------------------------------------------------------------------------------------------------------------
+def smooth_walk(frames=80, joints=6):
+    t = np.linspace(0, 4 * np.pi, frames)[:, None]
+    phase, size = np.linspace(0, 3, joints), np.linspace(0.2, 1, joints)
+    return np.stack([np.sin(t + phase) * size + np.arange(joints), np.cos(t + phase) * size], axis=2).astype(np.float32)
+
+
+def test_hampel_finds_planted_jumps_and_only_those():
+    clean = smooth_walk()
+    joints = clean.copy()
+    jumps = [(10, 2), (11, 2), (40, 0), (41, 5), (70, 3)]
+    for frame, joint in jumps:
+        joints[frame, joint] += [4.0, -3.0]
+    repaired = hampel(joints)
+    lost = {tuple(at) for at in np.argwhere(np.isnan(repaired).any(axis=2))}
+    assert lost == set(jumps)
+    keep = ~np.isnan(repaired)
+    np.testing.assert_array_equal(repaired[keep], clean[keep])
+
+
+def test_hampel_leaves_clean_data_and_its_input_alone():
+    joints = smooth_walk()
+    before = joints.copy()
+    np.testing.assert_array_equal(hampel(joints), before)
+    np.testing.assert_array_equal(joints, before)
+    still = np.repeat(joints[:1], 30, axis=0)
+    np.testing.assert_array_equal(hampel(still), still)
+
+
+def test_hampel_does_not_depend_on_the_unit():
+    joints = smooth_walk()
+    joints[20, 1] += 5
+    for unit in (1e-3, 700.0):
+        np.testing.assert_array_equal(np.isnan(hampel(joints * np.float32(unit))), np.isnan(hampel(joints)))
+
+
+def test_hampel_keeps_missing_joints_missing():
+    joints = smooth_walk()
+    joints[:, 4] = np.nan
+    joints[5:30, 1] = np.nan
+    np.testing.assert_array_equal(np.isnan(hampel(joints)), np.isnan(joints))
+
+
+def test_repair_interpolates_what_was_wrong():
+    clean = smooth_walk()
+    joints = clean.copy()
+    joints[33, 2] = 50
+    source = ragged([Clip(joints), Clip(clean)], repair=True)
+    np.testing.assert_allclose(source.joints[:80], clean, atol=0.02)
+    assert np.abs(ragged([Clip(joints)]).joints - clean).max() > 40
+
+
+# ---- refusals ----------------------------------------------------------------------------------------------------------
+GOOD = Clip(np.random.default_rng(0).normal(size=(5, 4, 2)), name="good")
+
+
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [
+        (GOOD.joints[:1], "one frame only"),
+        (np.full((5, 4, 2), np.nan), r"no joint was seen in any frame \(all NaN\)"),
+        (np.zeros((5, 4, 2)), r"all joints are at one place in all frames \(all 0\)"),
+        (np.full((5, 4, 2), 3.5), r"all joints are at one place.*all 3.5"),
+    ],
+)
+def test_unusable_clips_are_named(bad, message):
+    clip = Clip(bad, name="bad")
+    with pytest.raises(ValueError, match=r"clip 1 \('bad'\): joints: " + message + ".*; leave the clip out"):
+        check_clips([GOOD, clip])
+    assert unusable(GOOD) is None and unusable(clip) is not None
+
+
+def test_joint_counts_must_agree():
+    other = Clip(np.random.default_rng(1).normal(size=(5, 3, 2)))
+    with pytest.raises(ValueError, match=r"clip 1: joints: 3 joints, but clip 0 has 4"):
+        check_clips([GOOD, other])
+    with pytest.raises(ValueError, match=r"clip 0 \('good'\): joints: 4 joints, but the fitted clips have 17"):
+        check_clips([GOOD], joints=17)
+    check_clips([GOOD, GOOD], joints=4)
+
+
+def test_half_missing_and_still_but_not_collapsed_clips_are_usable():
+    joints = GOOD.joints.copy()
+    joints[1:] = np.nan
+    assert unusable(Clip(joints)) is None
+    assert unusable(Clip(np.repeat(GOOD.joints[:1], 4, axis=0))) is None
