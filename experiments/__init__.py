@@ -1,1 +1,1 @@
-"""One script per table or figure; each reads the folder named by ``DYNTORCH_DATA`` and runs with ``python -m experiments.<name>``."""
+"""One script per table or figure, run as ``python -m experiments.<name>``; recordings are read from the folder DYNTORCH_DATA."""

@@ -123,9 +123,7 @@ def official_splits(config: Config) -> list[Row]:
 def streams(config: Config) -> list[Row]:
     """Frames of untrimmed exercise streams, learned from the other subject's streams."""
     exercises = protocol.load_exercises(FILES["mocap6"])
-    found = [
-        protocol.stream_accuracy(partial(ActionIndexer, random_state=seed), exercises, seed) for seed in range(config.seeds)
-    ]
+    found = [protocol.stream_accuracy(partial(ActionIndexer, random_state=seed), exercises, seed) for seed in range(config.seeds)]
     runs = np.array([accuracy for accuracy, _ in found])
     return [
         Row(

@@ -64,7 +64,9 @@ class WarpedNearest:
 
     def predict(self, clips: Sequence[Clip]) -> Array:
         """The label of the nearest exemplar."""
-        table = self.distance(self._series(clips), self.bank, window=self.BAND, n_jobs=self.jobs)
+        series, threads = self._series(clips), torch.get_num_threads()
+        table = self.distance(series, self.bank, window=self.BAND, n_jobs=self.jobs)
+        torch.set_num_threads(threads)  # numba and torch share one OpenMP: aeon's call changes torch's number of threads
         return np.asarray(self.labels[table.argmin(axis=1)])
 
     def _series(self, clips: Sequence[Clip]) -> Array:

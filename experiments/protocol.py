@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -164,7 +165,7 @@ def runs(labels: Array) -> list[tuple[int, int]]:
     """``(start, end)`` of the maximal runs of one label, end exclusive."""
     cuts = np.flatnonzero(labels[1:] != labels[:-1]) + 1
     bounds = [0, *cuts.tolist(), len(labels)]
-    return list(zip(bounds[:-1], bounds[1:], strict=True))
+    return list(pairwise(bounds))
 
 
 def cut_runs(exercise: Exercise, image: Clip) -> tuple[list[Clip], list[int]]:

@@ -79,7 +79,7 @@ def demonstrate(
     Example:
         >>> shown = demonstrate(people=1, actions=["squat", "jumping_jack", "kick"])
         >>> list(shown.accuracy())
-        ['turned by 0 degrees', 'turned by 45 degrees', 'turned by 90 degrees', 'turned by 150 degrees']
+        ['turned 0°', 'turned 45°', 'turned 90°', 'turned 150°']
     """
     if people < 1:
         raise ValueError(f"people must be 1 or more, got {people}")
@@ -101,7 +101,7 @@ def demonstrate(
         clock.lap("recognize")
         plain = nearest_2d(list(examples), examples.labels, list(asked))
         clock.lap("baseline")
-        setting = f"turned by {azimuth:g} degrees"
+        setting = f"turned {azimuth:g}°"
         evaluations.append(EvaluationResult(list(actions), asked.labels, predicted, setting, baseline=plain))
         tell(0.45 + 0.1 * (number + 1))
     recording = _search(indexer, actions, walker, lambda share: tell(0.85 + 0.15 * share), clock)

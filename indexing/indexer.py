@@ -231,12 +231,13 @@ class ActionIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
     def find(self, clip: Any, progress: Any = None) -> list[Event]:
         """The actions in an untrimmed recording, in order of time: label, start, end (seconds), score and margin.
 
-        Frames whose best score is below the level that wrong actions reach (calibrated at fit by leaving classes out; at
-        the rate ``reject`` where that is set) belong to no action.
+        An event needs a class to stand out from the others further than wrong actions do, at a rate calibrated by leaving
+        classes out: ``reject`` where that is a rate, else 0.3.  While the person is at rest nothing is found.
         """
         check_is_fitted(self, "model_")
         (found,) = check_queries([clip], self.fps, self.n_joints_)
-        return find_events(self._model(), found, self._stream(), self.classes_, self.reject, progress)
+        rate = self.reject if self.reject is not None and 0 < self.reject < 1 else None
+        return find_events(self._model(), found, self._stream(), self.classes_, rate, progress)
 
     # ---- files -------------------------------------------------------------------------------------------------------
     def save(self, path: str | Path) -> None:

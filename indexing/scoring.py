@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 SHARPNESS = 2.0  # of the softmax over standardized scores: leave-one-out likelihood peaks between 1.5 and 2.5 on UTKinect
-FALSE_ALARMS = 0.1  # rate at which `find` may take a wrong action for a known one, where `reject` is not set
-SHORTEST = 0.3  # seconds: shorter finds are flicker
+SHORTEST = 0.4  # seconds: shorter finds are flicker
+BRIDGE = 0.5  # seconds: a gap up to this between two finds of one class does not part them
 
 Array = NDArray[Any]
 
@@ -71,29 +71,42 @@ def smooth(scores: Array, times: Array, seconds: float) -> Array:
     return np.asarray((total[high] - total[low]) / (high - low)[:, None])
 
 
-def events(scores: Array, times: Array, classes: Sequence[Any], threshold: float) -> list[Event]:
-    """Runs of samples whose best class is the same and reaches the threshold.
+def events(scores: Array, times: Array, classes: Sequence[Any], peak: float, floor: float) -> list[Event]:
+    """Runs of samples whose best class is the same: at least ``floor`` throughout and ``peak`` somewhere.
 
     Args:
-        scores: ``(T, classes)``; times: ``(T,)`` seconds.
+        scores: ``(T, classes)``, -inf where nothing may be found; times: ``(T,)`` seconds.
 
     Example:
         >>> import numpy as np
-        >>> found = events(np.array([[0, 1], [5, 1], [5, 2], [0, 1.0]]), np.arange(4.0), ["a", "b"], 3.0)
-        >>> [(e.label, e.start, e.end, e.margin) for e in found]
-        [('a', 0.5, 2.5, 3.5)]
+        >>> found = events(np.array([[0, 1], [5, 1], [6, 2], [0, 1.0]]), np.arange(4.0), ["a", "b"], 6.0, 3.0)
+        >>> [(e.label, e.start, e.end, e.score, e.margin) for e in found]
+        [('a', 0.5, 2.5, 5.5, 4.0)]
     """
-    best = scores.argmax(axis=1)
     top = scores.max(axis=1)
-    state = np.where(top >= threshold, best, -1)
-    cuts = np.flatnonzero(np.diff(state)) + 1
-    edges = np.concatenate([[times[0]], (times[cuts - 1] + times[cuts]) / 2, [times[-1]]])
+    state = np.where(top >= floor, scores.argmax(axis=1), -1)
+    middle = (times[1:] + times[:-1]) / 2
+    edges = np.concatenate([times[:1], middle, times[-1:]])
+    runs: list[list[int]] = []
+    for first, last in _runs(state):
+        if runs and state[runs[-1][0]] == state[first] and edges[first] - edges[runs[-1][1] + 1] <= BRIDGE:
+            runs[-1][1] = last
+        else:
+            runs.append([first, last])
     found = []
-    for i, run in enumerate(np.split(np.arange(len(times)), cuts)):
-        label = state[run[0]]
-        if label < 0 or edges[i + 1] - edges[i] < SHORTEST:
+    for first, last in runs:
+        label, inside = int(state[first]), np.arange(first, last + 1)
+        inside = inside[state[inside] == label]
+        start, end = float(edges[first]), float(edges[last + 1])
+        if end - start < SHORTEST or top[inside].max() < peak:
             continue
-        others = np.delete(scores[run], label, axis=1)
-        margin = float((top[run] - others.max(axis=1)).mean()) if others.shape[1] else float("inf")
-        found.append(Event(classes[label], float(edges[i]), float(edges[i + 1]), float(top[run].mean()), margin))
+        others = np.delete(scores[inside], label, axis=1).max(axis=1)
+        found.append(Event(classes[label], start, end, float(top[inside].mean()), float((top[inside] - others).mean())))
     return found
+
+
+def _runs(state: Array) -> list[tuple[int, int]]:
+    """First and last sample of every run of one state that is not -1."""
+    cuts = np.flatnonzero(np.diff(state)) + 1
+    firsts, lasts = np.concatenate([[0], cuts]), np.concatenate([cuts, [len(state)]]) - 1
+    return [(int(a), int(b)) for a, b in zip(firsts, lasts, strict=True) if state[a] >= 0]

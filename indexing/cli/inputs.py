@@ -120,6 +120,11 @@ def read_examples(examples: Sequence[Example], reading: Reading, select: Sequenc
         else:
             guessed += found
         clips += _checked(found, example.path)
+        first, last = clips[0].joints.shape[1], clips[-1].joints.shape[1]
+        if first != last:
+            raise ValueError(
+                f"{example.path}: has {last} joints, but {examples[0].path} has {first}; use one pose estimator and joint layout"
+            )
     return clips, notes + assumed(guessed)
 
 

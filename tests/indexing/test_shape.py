@@ -94,7 +94,9 @@ def slow_residual(query, exemplar, metric, channels, terms, weights):
     """One pair in float64: SVD bases, and only the joints that both saw."""
     total = 0.0
     for i, name in enumerate(channels):
-        w = metric.weights(name, slice(None) if bool(query[1].all() & exemplar[1].all()) else (query[1] & exemplar[1]).nonzero()[:, 0])
+        w = metric.weights(
+            name, slice(None) if bool(query[1].all() & exemplar[1].all()) else (query[1] & exemplar[1]).nonzero()[:, 0]
+        )
         both = (query[1] & exemplar[1]).nonzero()[:, 0]
         sides = []
         for values, _ in (query, exemplar):

@@ -1,5 +1,7 @@
 """Untrimmed recordings: a score for every frame, and the events they form."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -51,7 +53,7 @@ def test_find_contract(indexer, recordings):
             found = indexer.find(one)
             assert found and all(isinstance(event, Event) for event in found)
             assert all(one.times[0] <= e.start < e.end <= one.times[-1] for e in found)
-            assert all(a.end <= b.start for a, b in zip(found, found[1:], strict=False))
+            assert all(a.end <= b.start for a, b in pairwise(found))
             assert all(e.label in indexer.classes_ and np.isfinite([e.score, e.margin]).all() and e.margin >= 0 for e in found)
             assert all(indexer.classes_[indexer.model_.labels[e.exemplar]] == e.label for e in found)
 
@@ -118,7 +120,7 @@ def test_progress_grows_to_one(indexer, recordings, monkeypatch):
     told = []
     blocks = indexer.score_frames(recordings[0][0], progress=told.append)
     assert len(told) > 1 and told == sorted(told)
-    assert 0 < told[0] and told[-1] == 1.0
+    assert told[0] > 0 and told[-1] == 1.0
     monkeypatch.undo()
     np.testing.assert_allclose(blocks, indexer.score_frames(recordings[0][0]), atol=1e-3)
 
@@ -143,7 +145,10 @@ def test_events_by_hand():
     scores = np.full((10, 2), -1.0)
     scores[1:4, 0], scores[4:6, 1], scores[8, 1] = 5.0, 3.0, 0.5
     found = events(scores, times, ["a", "b"], 1.0)
-    assert [(e.label, e.start, e.end, e.score, e.margin) for e in found] == [("a", 0.25, 1.75, 5.0, 6.0), ("b", 1.75, 2.75, 3.0, 4.0)]
+    assert [(e.label, e.start, e.end, e.score, e.margin) for e in found] == [
+        ("a", 0.25, 1.75, 5.0, 6.0),
+        ("b", 1.75, 2.75, 3.0, 4.0),
+    ]
     assert events(scores, times, ["a", "b"], 9.0) == []
     assert [e.label for e in events(scores, times, ["a", "b"], -5.0)][:1] == ["a"]
 

@@ -17,9 +17,9 @@ COCO = [0, 2, 1, 4, 3, 6, 5, 8, 7, 10, 9, 12, 11, 14, 13, 16, 15]
     ("left", "right"),
     [
         ("left_knee", "right_knee"), ("LeftKnee", "RightKnee"), ("LEFT KNEE", "RIGHT KNEE"), ("kneeLeft", "kneeRight"),
-        ("lfemur", "rfemur"), ("lfoot", "rfoot"), ("LKnee", "RKnee"), ("lKnee", "rKnee"), ("L_knee", "R_knee"), ("l.knee", "r.knee"),
-        ("knee.l", "knee.r"), ("knee_R", "knee_L"), ("hand_l", "hand_r"), ("hand-L", "hand-R"), ("mouth_left", "mouth_right"),
-        ("L Knee", "R Knee"), ("lowerleg_l", "lowerleg_r"), ("upper_arm.L", "upper_arm.R"),
+        ("lfemur", "rfemur"), ("lfoot", "rfoot"), ("LKnee", "RKnee"), ("lKnee", "rKnee"), ("L_knee", "R_knee"),
+        ("l.knee", "r.knee"), ("knee.l", "knee.r"), ("knee_R", "knee_L"), ("hand_l", "hand_r"), ("hand-L", "hand-R"),
+        ("mouth_left", "mouth_right"), ("L Knee", "R Knee"), ("lowerleg_l", "lowerleg_r"), ("upper_arm.L", "upper_arm.R"),
     ],
 )  # fmt: skip
 def test_sides_in_names(left, right):
@@ -28,7 +28,14 @@ def test_sides_in_names(left, right):
 
 @pytest.mark.parametrize(
     "names",
-    [("nose", "neck"), ("left_knee", "nose"), ("1", "2", "3"), ("lower", "roof"), ("root", "lumbar", "thorax"), ("leftover", "rim")],
+    [
+        ("nose", "neck"),
+        ("left_knee", "nose"),
+        ("1", "2", "3"),
+        ("lower", "roof"),
+        ("root", "lumbar", "thorax"),
+        ("leftover", "rim"),
+    ],
 )
 def test_names_without_pairs_tell_nothing(names):
     assert from_names(names) is None

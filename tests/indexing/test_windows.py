@@ -54,8 +54,8 @@ def test_crops_are_parts_of_the_duration(crop):
 def test_windows_anywhere_also_beyond_the_ends():
     clips = [with_holes(clip, seed=i) for i, clip in enumerate(CLIPS)]
     owner = np.array([2, 0, 0, 3, 1, 2])
-    start = np.array([clips[i].times[0] for i in owner]) + [-0.5, 0.1, -9.0, 0.3, 0.0, 3.0]
-    end = start + [1.0, 0.4, 2.0, 1.5, 5.0, 90.0]
+    start = np.array([clips[i].times[0] for i in owner]) + np.array([-0.5, 0.1, -9.0, 0.3, 0.0, 3.0])
+    end = start + np.array([1.0, 0.4, 2.0, 1.5, 5.0, 90.0])
     got = sample(ragged(clips), owner, start, end, 8)
     for i, window in enumerate(got):
         clip = clips[owner[i]]
@@ -115,9 +115,8 @@ def test_y_points_up_in_windows():
 
 
 def test_frame_rate_changes_nothing_that_moves_linearly():
-    path = np.linspace(0, 1, 5)[:, None, None] * np.array([[[3.0, 1.0], [0.0, -2.0]]])
-    slow, fast = Clip(path, fps=4), Clip(np.stack([np.interp(np.linspace(0, 4, 81), np.arange(5), column) for column in path.reshape(5, 4).T], 1)
-                                         .reshape(81, 2, 2), fps=80)  # fmt: skip
+    direction = np.array([[[3.0, 1.0], [0.0, -2.0]]])
+    slow, fast = (Clip(np.linspace(0, 1, n)[:, None, None] * direction, fps=n - 1) for n in (5, 81))
     got = whole(ragged([slow, fast]), 10)
     torch.testing.assert_close(got[0], got[1], atol=1e-6, rtol=0)
 

@@ -1,0 +1,150 @@
+"""Speed and memory of the action indexer, beside the goals.  Needs no recordings.
+
+    python -m experiments.benchmarks.action_indexer
+
+Recognition: 1000 exemplars x 500 queries of 16 frames x 20 joints, ten classes.  Scanning: keypoints of 17 joints at 30 fps.
+Start-up: ``import dyntorch`` against ``import torch``, and ``dyntorch --help``.  Every measurement runs in a process of its
+own; the workloads take turns, and the figure is the median over rounds of the median in each.  Memory is the peak above
+what the process held after its imports: data, model and all.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import Annotated, Any
+
+import tyro
+
+from experiments.benchmarks.workloads import EXEMPLARS, QUERIES
+from experiments.tables import Row, command, markdown, note
+from indexing.files import manifest, prepare, write_json
+
+PLAIN, SEARCH, WARPING, PART, SCAN = "plain", "search", "warping", "scan 20 minutes", "scan 1 hour"
+TASK = f"{EXEMPLARS} exemplars x {QUERIES} queries"
+STARTS = {
+    "import torch": [sys.executable, "-c", "import torch"],
+    "import dyntorch": [sys.executable, "-c", "import dyntorch"],
+    "dyntorch --help": [str(Path(sys.executable).with_name("dyntorch")), "--help"],
+}
+
+
+@dataclass(frozen=True)
+class Config:
+    """Speed and memory of the action indexer, beside the goals."""
+
+    rounds: int = 3
+    """How often every workload runs."""
+    starts: int = 7
+    """How often every start-up is timed."""
+    threads: int = 0
+    """CPU threads; 0 leaves torch's default."""
+    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/benchmark_action_indexer.json")
+    """Where the results and this configuration are written as JSON."""
+
+
+def measure(workloads: Sequence[str], rounds: int, threads: int) -> dict[str, list[dict[str, Any]]]:
+    """Run the workloads in turn, each in its own process.
+
+    Raises:
+        ValueError: one of them failed; the message ends with what it said.
+    """
+    environment = dict(os.environ)
+    if threads > 0:
+        environment["OMP_NUM_THREADS"] = str(threads)
+    found: dict[str, list[dict[str, Any]]] = {name: [] for name in workloads}
+    for i in range(rounds):
+        for name in workloads:
+            note(f"... round {i + 1} of {rounds}: {name}")
+            arguments = [sys.executable, "-m", "experiments.benchmarks.workloads", name]
+            done = subprocess.run(arguments, capture_output=True, text=True, env=environment, check=False)
+            if done.returncode:
+                last = done.stderr.strip().splitlines()[-1:] or ["no message"]
+                raise ValueError(f"workload {name!r} ended with code {done.returncode}: {last[0]}")
+            found[name].append(json.loads(done.stdout.splitlines()[-1]))
+    return found
+
+
+def start_ups(repeats: int) -> dict[str, float]:
+    """Median seconds of each command that can be started at all; they take turns."""
+    seconds: dict[str, list[float]] = {name: [] for name in STARTS}
+    for _ in range(repeats + 1):
+        for name, arguments in STARTS.items():
+            start = time.perf_counter()
+            try:
+                code = subprocess.run(arguments, capture_output=True, check=False).returncode
+            except OSError:
+                code = 127
+            if code == 0:
+                seconds[name].append(time.perf_counter() - start)
+            elif not seconds[name]:
+                note(f"{name}: cannot be started (code {code}); left out")
+    return {name: median(values[1:]) for name, values in seconds.items() if len(values) > 1}  # the first fills the disk cache
+
+
+def table(found: dict[str, list[dict[str, Any]]], starts: dict[str, float]) -> list[Row]:
+    """Everything measured, beside its goal."""
+
+    def seconds(name: str) -> float:
+        return median(median(one["seconds"]) for one in found[name])
+
+    def most(name: str, key: str = "megabytes") -> float:
+        return max(float(one[key]) for one in found[name])
+
+    rows = []
+    for name, setting, goal in ((PLAIN, "nearest, no search", 0.2), (SEARCH, "default, with search", 2.0)):
+        rows.append(Row(TASK, f"{setting}: predict", seconds(name), goal, at_most=True, unit=" s"))
+        rows.append(Row(TASK, f"{setting}: peak memory of predict", most(name), 500.0, at_most=True, unit=" MB"))
+        rows.append(Row(TASK, f"{setting}: fit", median(one["fit_seconds"] for one in found[name]), unit=" s"))
+        rows.append(Row(TASK, f"{setting}: peak memory of fit", most(name, "fit_megabytes"), 500.0, at_most=True, unit=" MB"))
+    if found.get(WARPING):
+        for name, setting in ((PLAIN, "nearest, no search"), (SEARCH, "default")):
+            rows.append(Row(TASK, f"time of DTW (32 steps, one thread) over {setting}", seconds(WARPING) / seconds(name), 100.0))
+    rows.append(Row("scan 1 hour at 30 fps", "score_frames", seconds(SCAN), unit=" s"))
+    rows.append(Row("scan 1 hour at 30 fps", "peak memory", most(SCAN), 1000.0, at_most=True, unit=" MB"))
+    rows.append(Row("scan 20 minutes", "peak memory", most(PART), unit=" MB"))
+    if {"import torch", "import dyntorch"} <= starts.keys():
+        rows.append(Row("start", "import torch", starts["import torch"], unit=" s"))
+        limit = starts["import torch"] + 0.3
+        rows.append(Row("start", "import dyntorch", starts["import dyntorch"], limit, at_most=True, unit=" s"))
+    if "dyntorch --help" in starts:
+        rows.append(Row("start", "dyntorch --help", starts["dyntorch --help"], 0.5, at_most=True, unit=" s"))
+    return rows
+
+
+def has_aeon() -> bool:
+    """Whether the baseline can run."""
+    from importlib.util import find_spec
+
+    return find_spec("aeon") is not None
+
+
+def run(config: Config) -> None:
+    """Measure, print the table, write the file.
+
+    Raises:
+        ValueError: nothing to repeat, or a workload failed.
+    """
+    if config.rounds < 1 or config.starts < 1:
+        raise ValueError(f"rounds and starts must be at least 1, got {config.rounds} and {config.starts}")
+    target = config.out.expanduser()
+    prepare(target.parent)
+    names = [PLAIN, SEARCH, *([WARPING] if has_aeon() else []), PART, SCAN]
+    found, starts = measure(names, config.rounds, config.threads), start_ups(config.starts)
+    rows = table(found, starts)
+    print(markdown(rows, "Speed and memory of the action indexer"), flush=True)
+    load = os.getloadavg() if hasattr(os, "getloadavg") else ()
+    about = {"manifest": manifest(vars(config)), "load": load, "raw": found, "starts": starts}
+    write_json(target, {**about, "table": [{**vars(row), "reached": row.reached} for row in rows]})
+    note(f"written: {target}")
+
+
+if __name__ == "__main__":
+    command(lambda: run(tyro.cli(Config, prog="python -m experiments.benchmarks.action_indexer")))
