@@ -20,11 +20,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
 import tyro
+from numpy.typing import NDArray
 
 from experiments import protocol
 from experiments.tables import Row, command, markdown, note
@@ -74,6 +75,11 @@ class Results:
         print(markdown(self.rows[title], title), flush=True)
 
 
+def spread(values: NDArray[Any]) -> float | None:
+    """Standard deviation over repetitions, where there are several."""
+    return float(values.std()) if len(values) > 1 else None
+
+
 def turned(name: str, config: Config, *, solid: bool) -> list[Row]:
     """Leave-one-subject-out, queries turned; exemplars are one 2D view, or 3D joints (``solid``)."""
     clips = protocol.load_set(FILES[name])
@@ -85,10 +91,10 @@ def turned(name: str, config: Config, *, solid: bool) -> list[Row]:
     )
     goals = (GOALS_3D if solid else GOALS_2D)[name]
     rows = [
-        Row(TITLES[name], f"turned {turn} degrees", float(runs[:, k].mean()), goals[k], float(runs[:, k].std()))
+        Row(TITLES[name], f"turned {turn} degrees", float(runs[:, k].mean()), goals[k], spread(runs[:, k]))
         for k, turn in enumerate(protocol.TURNS)
     ]
-    return [*rows, Row(TITLES[name], "mean of the turns", float(runs.mean()), spread=float(runs.mean(axis=1).std()))]
+    return [*rows, Row(TITLES[name], "mean of the turns", float(runs.mean()), spread=spread(runs.mean(axis=1)))]
 
 
 def few_shots(name: str, config: Config) -> list[Row]:
@@ -103,7 +109,7 @@ def few_shots(name: str, config: Config) -> list[Row]:
             make = partial(ActionIndexer, random_state=seed)
             means.append(float(protocol.accuracy_by_turn(make, views, choose=choose).mean()))
         setting = f"{count} example{'s' if count > 1 else ''} per class, mean of the turns"
-        rows.append(Row(TITLES[name], setting, float(np.mean(means)), goal, float(np.std(means))))
+        rows.append(Row(TITLES[name], setting, float(np.mean(means)), goal, spread(np.array(means))))
     return rows
 
 
@@ -116,8 +122,8 @@ def official_splits(config: Config) -> list[Row]:
             for seed in range(config.seeds)
         ]
     )
-    rows = [Row("JHMDB", f"split {k + 1}", float(runs[:, k].mean()), spread=float(runs[:, k].std())) for k in range(3)]
-    return [*rows, Row("JHMDB", "mean of 3 splits", float(runs.mean()), GOAL_JHMDB, float(runs.mean(axis=1).std()))]
+    rows = [Row("JHMDB", f"split {k + 1}", float(runs[:, k].mean()), spread=spread(runs[:, k])) for k in range(3)]
+    return [*rows, Row("JHMDB", "mean of 3 splits", float(runs.mean()), GOAL_JHMDB, spread(runs.mean(axis=1)))]
 
 
 def streams(config: Config) -> list[Row]:
@@ -131,7 +137,7 @@ def streams(config: Config) -> list[Row]:
             f"{found[0][1]} frames, camera turned {turn} degrees",
             float(runs[:, k].mean()),
             GOALS_STREAMS[k],
-            float(runs[:, k].std()),
+            spread(runs[:, k]),
         )
         for k, turn in enumerate(protocol.STREAM_TURNS)
     ]

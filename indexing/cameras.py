@@ -82,6 +82,11 @@ def virtual(
     if random_state is not None:
         points = points + random_state.normal(scale=noise, size=points.shape)
     points = points @ rotation(np.deg2rad(azimuth), elevation).T
+    if np.nanmin(points[..., 2]) <= -distance:
+        raise ValueError(
+            f"clip {clip.name!r}: a joint lies behind the virtual camera at {distance:g} m; cut the clip where the person leaves, "
+            "or move the camera away"
+        )
     return clip.replace(joints=points[..., :2] / (points[..., 2:] + distance) * distance, up="y")
 
 

@@ -27,8 +27,8 @@ def as_clips(clips: Iterable[Any], fps: float) -> list[Clip | tuple[Clip, ...]]:
     for i, value in enumerate(clips):
         if isinstance(value, (str, bytes)):
             raise ValueError(f"clips: item {i} is text ({value!r}); read a file first with Clip.load(path)")
-        several = isinstance(value, (tuple, list)) and value and all(isinstance(v, Clip) or np.ndim(v) == 3 for v in value)
-        if several or (not isinstance(value, Clip) and np.ndim(value) == 4):
+        several = isinstance(value, (tuple, list)) and value and all(isinstance(v, Clip) or _axes(v) == 3 for v in value)
+        if several or (not isinstance(value, Clip) and _axes(value) == 4):
             found.append(tuple(as_clip(view, fps, f"{i} view {v}") for v, view in enumerate(value)))
         else:
             found.append(as_clip(value, fps, "" if isinstance(value, Clip) else str(i)))
@@ -45,7 +45,7 @@ def gather(clips: Iterable[Any], fps: float, joints: int | None = None) -> tuple
         parts = combine(item) if isinstance(item, tuple) else [item]
         found += parts
         owners += [i] * len(parts)
-    check_clips(found, joints)
+    check_clips(found, joints, owners)
     return found, owners
 
 
@@ -63,22 +63,48 @@ def check_queries(clips: Iterable[Any], fps: float, joints: int) -> list[Clip]:
 def gather_labels(clips: list[Clip], owners: list[int], labels: ArrayLike | None) -> Array:
     """``(clips,)`` labels in the dtype given; by default the clips' own."""
     if labels is None:
-        missing = [i for i, clip in enumerate(clips) if clip.label is None]
+        missing = [i for i, clip in enumerate(clips) if _missing(clip.label)]
         if missing:
             raise ValueError(
-                f"labels: none given, and clip {missing[0]} ({clips[missing[0]].name!r}) has no label; pass fit(clips, labels)"
+                f"labels: none given, and clip {owners[missing[0]]} ({clips[missing[0]].name!r}) has no label; "
+                "pass fit(clips, labels)"
             )
         return np.asarray([clip.label for clip in clips])
-    values = np.asarray(labels)
-    items = owners[-1] + 1
+    return np.asarray(check_labels(labels, owners[-1] + 1)[owners])
+
+
+def check_labels(labels: ArrayLike, items: int) -> Array:
+    """``(items,)`` labels, one kind of thing and none missing."""
+    given = labels.tolist() if isinstance(labels, np.ndarray) else labels
+    if isinstance(given, Iterable) and not isinstance(given, (str, bytes)):
+        given = list(given)
+        bad = [i for i, value in enumerate(given) if _missing(value)]  # before numpy turns NaN among words into 'nan'
+        if bad:
+            raise ValueError(
+                f"labels: the label of clip {bad[0]} is missing ({given[bad[0]]!r}); leave the clip out or name its action"
+            )
+    try:
+        values = np.asarray(labels)
+    except ValueError:
+        raise ValueError(f"labels: expected one per clip ({items}), got lists of different lengths") from None
     if values.ndim != 1 or len(values) != items:
         raise ValueError(f"labels: expected one per clip ({items}), got shape {values.shape}")
-    bad = [i for i, v in enumerate(values.tolist()) if v is None or v != v]
-    if bad:
-        raise ValueError(
-            f"labels: the label of clip {bad[0]} is missing ({values[bad[0]]!r}); leave the clip out or name its action"
-        )
-    return np.asarray(values[owners])
+    try:
+        np.unique(values)
+    except TypeError as error:
+        raise ValueError(f"labels: they cannot be sorted ({error}); give one kind of label, text or numbers") from None
+    return values
+
+
+def _missing(label: Any) -> bool:
+    return label is None or (isinstance(label, (float, np.floating)) and bool(np.isnan(label)))
+
+
+def _axes(value: Any) -> int:
+    try:
+        return int(np.ndim(value))
+    except ValueError:  # nested lists of different lengths: refused as a clip, by name
+        return -1
 
 
 _CHOICES: dict[str, tuple[Any, ...]] = {
@@ -97,9 +123,9 @@ def check_parameters(indexer: Any) -> None:
     for name in ("fps", "window", "stride"):
         if not _positive(getattr(indexer, name)):
             raise ValueError(f"{name} must be a positive number, got {getattr(indexer, name)!r}")
-    if not (isinstance(indexer.pool, (int, float)) and indexer.pool >= 0):
+    if not (_number(indexer.pool) and indexer.pool >= 0):
         raise ValueError(f"pool must be seconds, 0 or more, got {indexer.pool!r}")
-    tempi = list(indexer.tempi)
+    tempi = list(indexer.tempi) if isinstance(indexer.tempi, Iterable) else []
     if not tempi or not all(_positive(tempo) for tempo in tempi):
         raise ValueError(f"tempi must be positive speed factors such as (0.7, 1.0, 1.4), got {indexer.tempi!r}")
     for name, least in (("length", 4), ("virtual_views", 0)):
@@ -109,10 +135,32 @@ def check_parameters(indexer: Any) -> None:
     if indexer.reject is not None and not (isinstance(indexer.reject, (int, float, np.floating)) and np.isfinite(indexer.reject)):
         raise ValueError(f"reject must be None, a rate between 0 and 1 or a threshold, got {indexer.reject!r}")
     try:
+        np.random.default_rng(indexer.random_state)
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"random_state must be None, a whole number from 0, or a generator, got {indexer.random_state!r} ({error})"
+        ) from None
+    try:
         torch.empty(0, device=indexer.device)
     except (RuntimeError, AssertionError) as error:
         raise ValueError(f"device {indexer.device!r} is not there: {str(error).splitlines()[0]}; use device='cpu'") from None
 
 
 def _positive(value: Any) -> bool:
-    return isinstance(value, (int, float, np.integer, np.floating)) and bool(np.isfinite(value) and value > 0)
+    return _number(value) and bool(value > 0)
+
+
+def _number(value: Any) -> bool:
+    return isinstance(value, (int, float, np.integer, np.floating)) and bool(np.isfinite(value))
+
+
+def check_plan(indexer: Any, crops: int, exemplars: Any) -> None:
+    """Raise where windows would be cut otherwise than those that are there."""
+    count = len(exemplars)
+    for name, now, then in (
+        ("length", indexer.length, exemplars.crops.values.shape[1]),
+        ("search", crops, len(exemplars.crops) // count),
+        ("virtual_views", indexer.virtual_views, len(exemplars.views) // count),
+    ):
+        if now != then:
+            raise ValueError(f"{name} was changed since the clips were learned; set it back, or fit all clips again")

@@ -117,8 +117,7 @@ def _search(
     solid, truth = stream(order, Person.random(rng), rng=rng)
     seen = detect(solid, azimuth=STREAM_AZIMUTH, rng=rng)
     clock.lap("perform")
-    scores = indexer.score_frames(seen, lambda share: tell(share / 2))
-    events = indexer.find(seen, lambda share: tell(0.5 + share / 2))
+    scores, events = indexer.scan(seen, tell)
     clock.lap("search")
     # one example per action: it is number 0 of its label
     found = [dataclasses.replace(event, exemplar=0) for event in events]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import copy
+import dataclasses
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -12,15 +14,15 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.base import BaseEstimator, ClassifierMixin
 from sklearn.utils.validation import check_is_fitted
 
-from indexing.checks import check_parameters, check_queries, gather, gather_labels
+from indexing.checks import check_labels, check_parameters, check_plan, check_queries, gather, gather_labels
 from indexing.clip import Clip
 from indexing.scoring import Event, probabilities, reject_threshold
 from indexing.shape.bank import Windows
-from indexing.shape.exemplars import Exemplars, Plan, cut
+from indexing.shape.exemplars import CROPS, Exemplars, Plan, cut
 from indexing.shape.model import ShapeModel, learn
 from indexing.shape.symmetry import mirror_permutation
 from indexing.skeleton import Skeleton
-from indexing.stream import Stream, find_events, score_stream
+from indexing.stream import Stream, find_events, frame_scores, window_scores
 from indexing.windows import ragged, whole
 
 Array = NDArray[Any]
@@ -45,7 +47,8 @@ class ActionIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         fps: frame rate of clips given as arrays.
         length: steps that a window is resampled to.
         search: also compare with crops of the exemplars (extent and tempo).
-        mirror: ``"auto"``: exemplars also count mirrored, unless left and right are different actions here; ``True``: always; ``False``: never.
+        mirror: ``"auto"``: exemplars also count mirrored, unless left and right are different actions here; ``True``:
+            always; ``False``: never.
         scorer: ``"both"``, ``"nearest"`` (no training, fastest) or ``"kernel"``; ``view="same"`` uses the kernel machine.
         virtual_views: copies of every exemplar for the kernel machine.
         repair: replace joints that jump (Hampel filter): for bad detectors at a regular frame rate.
@@ -129,10 +132,9 @@ class ActionIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
             raise ValueError(
                 f"labels: only one class ({classes[0]!r}); give clips of at least two actions, for example one of ordinary movement"
             )
-        self._rng = np.random.default_rng(self.random_state)
-        self.n_joints_ = found[0].joints.shape[1]
-        self.skeleton_: Skeleton | None = next((clip.skeleton for clip in found if clip.skeleton is not None), None)
-        return self._learn(cut(found, self._plan(), self._rng), classes, torch.from_numpy(numbers))
+        rng = np.random.default_rng(self.random_state)
+        skeleton = next((clip.skeleton for clip in found if clip.skeleton is not None), None)
+        return self._learn(cut(found, self._plan(), rng), classes, numbers, skeleton, rng)
 
     def partial_fit(self, clips: Iterable[Any], labels: ArrayLike | None = None, classes: ArrayLike | None = None) -> Self:
         """Learn from further clips, of known or new actions; the earlier ones stay.  Fits where nothing was fitted yet."""
@@ -144,24 +146,29 @@ class ActionIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         old = self.classes_[self.model_.labels.numpy()]
         merged = _joined(old, values)
         known, numbers = np.unique(merged, return_inverse=True)
-        rng = getattr(self, "_rng", None) or np.random.default_rng([self.random_state, len(old)])
-        return self._learn(self.model_.exemplars.extended(cut(found, self._plan(), rng)), known, torch.from_numpy(numbers))
+        check_plan(self, len(CROPS) if self.search else 1, self.model_.exemplars)
+        # a copy, so that a failure leaves nothing changed
+        seed = 0 if self.random_state is None else self.random_state
+        rng = copy.deepcopy(self._rng) if hasattr(self, "_rng") else np.random.default_rng([seed, len(old)])
+        return self._learn(self.model_.exemplars.extended(cut(found, self._plan(), rng)), known, numbers, self.skeleton_, rng)
 
     def _plan(self) -> Plan:
         return Plan(self.length, self.search, self.virtual_views, self.view == "any", self.repair, self.window, self.stride)
 
-    def _learn(self, exemplars: Exemplars, classes: Array, numbers: torch.Tensor) -> Self:
+    def _learn(
+        self, exemplars: Exemplars, classes: Array, numbers: Array, skeleton: Skeleton | None, rng: np.random.Generator
+    ) -> Self:
+        """Learn everything, and only then change anything."""
         symmetry = None
         if self.mirror:
-            symmetry = mirror_permutation(self.skeleton_, exemplars.crop(0).values[:500], exemplars.crop(0).seen[:500])
+            symmetry = mirror_permutation(skeleton, exemplars.crop(0).values[:500], exemplars.crop(0).seen[:500])
         if self.mirror is True and symmetry is None:
             raise ValueError(
                 "mirror=True: the joints' mirror images are not known; give clips a skeleton with names, or mirror='auto'"
             )
-        self.classes_ = classes
-        self.model_: ShapeModel = learn(
+        model = learn(
             exemplars,
-            numbers.long(),
+            torch.from_numpy(numbers).long(),
             len(classes),
             view=self.view,
             scorer="kernel" if self.view == "same" else self.scorer,
@@ -169,6 +176,11 @@ class ActionIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
             symmetry=symmetry,
             guard=self.mirror == "auto",
         )
+        self.model_: ShapeModel = model
+        self.classes_ = classes
+        self.n_joints_ = int(exemplars.crops.values.shape[2])
+        self.skeleton_ = skeleton
+        self._rng = rng
         self._calibrate()
         return self
 
@@ -209,35 +221,46 @@ class ActionIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
 
     def score(self, clips: Iterable[Any], labels: ArrayLike, sample_weight: ArrayLike | None = None) -> float:
         """Mean accuracy of :meth:`predict`; labels that were never learned count as wrong."""
-        right = np.asarray([str(a) == str(b) for a, b in zip(self.predict(clips), np.asarray(labels), strict=True)], dtype=float)
+        answers = self.predict(clips)
+        truth = check_labels(labels, len(answers))
+        right = np.asarray([a == b for a, b in zip(answers.tolist(), truth.tolist(), strict=True)], dtype=float)
         return float(np.average(right, weights=None if sample_weight is None else np.asarray(sample_weight)))
 
     # ---- long recordings ---------------------------------------------------------------------------------------------
     def _stream(self) -> Stream:
         return Stream(self.length, self.window, tuple(self.tempi), self.pool, self.repair, self.device)
 
-    def score_frames(self, clip: Any, progress: Any = None) -> Array:
-        """``(frames, classes)`` score of every frame of an untrimmed recording, larger is better.
-
-        Short windows at several tempi are compared with short windows of the exemplars, and averaged over ``pool`` seconds.
+    def scan(self, clip: Any, progress: Callable[[float], None] | None = None) -> tuple[Array, list[Event]]:
+        """:meth:`score_frames` and :meth:`find` in one pass.
 
         Args:
             progress: called with the share done, 0..1.
         """
         check_is_fitted(self, "model_")
         (found,) = check_queries([clip], self.fps, self.n_joints_)
-        return score_stream(self._model(), found, self._stream(), progress)
+        model, stream = self._model(), self._stream()
+        begin = float(found.times[0])
+        found = found.replace(times=found.times - begin)  # rounding must not depend on what the clock shows
+        at, scores = window_scores(model, found, stream, progress)
+        events = find_events(model, found, stream, at, scores, self.classes_, self.reject)
+        events = [dataclasses.replace(event, start=event.start + begin, end=event.end + begin) for event in events]
+        return frame_scores(found, stream, at, scores), events
 
-    def find(self, clip: Any, progress: Any = None) -> list[Event]:
+    def score_frames(self, clip: Any, progress: Callable[[float], None] | None = None) -> Array:
+        """``(frames, classes)`` score of every frame of an untrimmed recording, larger is better.
+
+        Short windows at several tempi are compared with short windows of the exemplars, and averaged over ``pool`` seconds.
+        """
+        return self.scan(clip, progress)[0]
+
+    def find(self, clip: Any, progress: Callable[[float], None] | None = None) -> list[Event]:
         """The actions in an untrimmed recording, in order of time: label, start, end (seconds), score and margin.
 
         An event needs a class to stand out from the others further than wrong actions do, at a rate calibrated by leaving
-        classes out: ``reject`` where that is a rate, else 0.3.  While the person is at rest nothing is found.
+        classes out: ``reject``, else 0.3 (outside 0..1 it is the least score an event needs).  While the person is at rest
+        nothing is found.
         """
-        check_is_fitted(self, "model_")
-        (found,) = check_queries([clip], self.fps, self.n_joints_)
-        rate = self.reject if self.reject is not None and 0 < self.reject < 1 else None
-        return find_events(self._model(), found, self._stream(), self.classes_, rate, progress)
+        return self.scan(clip, progress)[1]
 
     # ---- files -------------------------------------------------------------------------------------------------------
     def save(self, path: str | Path) -> None:
@@ -248,15 +271,15 @@ class ActionIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         save(self, path)
 
     @classmethod
-    def load(cls, path: str | Path) -> Self:
-        """Read what :meth:`save` wrote.
+    def load(cls, path: str | Path, device: str = "cpu") -> Self:
+        """Read what :meth:`save` wrote, for computing on ``device`` (the file does not say where).
 
         Raises:
             ValueError: the file is missing, or is not such a model.
         """
         from indexing.persistence import load
 
-        return load(cls, path)
+        return load(cls, path, device)
 
     def exemplar(self, index: int) -> Clip:
         """Exemplar number ``index`` as it is compared: resampled, y up (for pictures)."""

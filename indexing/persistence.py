@@ -10,9 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from indexing.checks import check_parameters
 from indexing.files import write_bytes
-from indexing.shape.bank import Kernels, Windows
-from indexing.shape.channels import JointMetric
+from indexing.shape.bank import NEAREST, Kernels, Windows
+from indexing.shape.channels import CHANNELS, JointMetric
 from indexing.shape.exemplars import Exemplars
 from indexing.shape.machine import PairwiseMachine
 from indexing.shape.model import KERNEL_WHITENING, ShapeModel
@@ -38,23 +39,32 @@ def save(indexer: ActionIndexer, path: str | Path) -> None:
     from safetensors.torch import save as to_bytes
 
     classes = indexer.classes_
-    if classes.dtype.kind not in "USiufb":
+    if classes.dtype.kind not in "Uiufb" and not (classes.dtype.kind == "O" and all(isinstance(c, str) for c in classes)):
         raise ValueError(f"labels of type {classes.dtype} cannot be saved; use text or numbers")
+    parameters = _plain(indexer.get_params())
+    del parameters["device"]  # where to compute belongs to the machine, not to the model
     skeleton = indexer.skeleton_
     metadata = {
         "format": FORMAT,
         "version": VERSION,
-        "parameters": _plain(indexer.get_params()),
+        "parameters": parameters,
         "classes": {"values": classes.tolist(), "dtype": classes.dtype.str},
         "joints": indexer.n_joints_,
         "view": indexer.model_.view,
         "skeleton": None if skeleton is None else [skeleton.name, list(skeleton.joints), [list(b) for b in skeleton.bones]],
     }
-    data = to_bytes(_tensors(indexer.model_), metadata={"dyntorch": json.dumps(metadata)})
+    try:
+        header = json.dumps(metadata)
+    except TypeError as error:
+        bad = [name for name, value in parameters.items() if not _is_json(value)]
+        raise ValueError(
+            f"{', '.join(bad)}: a model file holds text, numbers and lists only ({error}); set it to one of these"
+        ) from None
+    data = to_bytes(_tensors(indexer.model_), metadata={"dyntorch": header})
     write_bytes(Path(path), data)
 
 
-def load(kind: type[Indexer], path: str | Path) -> Indexer:
+def load(kind: type[Indexer], path: str | Path, device: str = "cpu") -> Indexer:
     """Read a fitted indexer; see :meth:`indexing.ActionIndexer.load`."""
     from safetensors import SafetensorError, safe_open
 
@@ -69,20 +79,53 @@ def load(kind: type[Indexer], path: str | Path) -> Indexer:
         raise ValueError(f"{path}: not a model file (safetensors says: {error}); give the file that 'index fit' wrote") from None
     try:
         metadata = json.loads(header or "{}")
-        if metadata.get("format") != FORMAT:
-            raise ValueError(f"{path}: a safetensors file, but not an action indexer; give the file that 'index fit' wrote")
+        if not isinstance(metadata, dict) or metadata.get("format") != FORMAT:
+            raise ValueError("a safetensors file, but not an action indexer; give the file that 'index fit' wrote")
         if metadata.get("version") != VERSION:
-            raise ValueError(f"{path}: model version {metadata.get('version')!r}, this program reads {VERSION}; {SAVED}")
-        indexer = kind(**metadata["parameters"])
+            raise ValueError(f"model version {metadata.get('version')!r}, this program reads {VERSION}")
+        indexer = kind(**metadata["parameters"], device=device)
         indexer.classes_ = np.array(metadata["classes"]["values"], dtype=np.dtype(metadata["classes"]["dtype"]))
         indexer.n_joints_ = int(metadata["joints"])
         name, joints, bones = metadata["skeleton"] or (None, (), ())
         indexer.skeleton_ = Skeleton(name, tuple(joints), tuple((a, b) for a, b in bones)) if name is not None else None
         indexer.model_ = _model(tensors, len(indexer.classes_), metadata["view"])
+        check_parameters(indexer)
+        _check_fit(indexer)
         indexer._calibrate()
-    except (KeyError, TypeError, json.JSONDecodeError) as error:
-        raise ValueError(f"{path}: the model's metadata is damaged ({type(error).__name__}: {error}); {SAVED}") from None
+    except (KeyError, TypeError, IndexError, ValueError, RuntimeError, AttributeError) as error:
+        raise ValueError(f"{path}: not a model that can be used ({type(error).__name__}: {error}); {SAVED}") from None
     return indexer
+
+
+def _check_fit(indexer: ActionIndexer) -> None:
+    """Raise where the parts of a file do not belong together."""
+    model, parts = indexer.model_, indexer.model_.exemplars
+    count, joints = len(model.labels), indexer.n_joints_
+    skeleton = indexer.skeleton_
+    fine = {
+        "labels": len(parts) == count and int(model.labels.max()) + 1 == model.classes,
+        "owner": len(parts.owner) == len(parts.moments) and len(parts.owner.unique()) == count,
+        "joints": parts.crops.values.shape[2] == joints and (skeleton is None or len(skeleton.joints) == joints),
+        "metric": model.metric.covariance.shape == (len(CHANNELS), joints, joints),
+        "weights": len(model.weights) == len(NEAREST),
+        "view": model.view == indexer.view,
+    }
+    for name, windows in (("crops", parts.crops), ("views", parts.views), ("moments", parts.moments)):
+        fine[name] = len(windows.values) == len(windows.seen) and (name == "moments" or len(windows) % count == 0)
+    fine |= {name: len(getattr(model, name)) == count for name in ("hub", "mirrored", "evidence_out", "evidence_in")}
+    if model.machine is not None:
+        fine["machine"] = model.machine.dual.shape == (model.classes - 1, len(model.machine.support))
+    wrong = [name for name, good in fine.items() if not good]
+    if wrong:
+        raise ValueError(f"{', '.join(wrong)} do not fit the rest")
+
+
+def _is_json(value: Any) -> bool:
+    try:
+        json.dumps(value)
+    except TypeError:
+        return False
+    return True
 
 
 def _tensors(model: ShapeModel) -> dict[str, Tensor]:
@@ -126,4 +169,7 @@ def _model(tensors: dict[str, Tensor], classes: int, view: str) -> ShapeModel:
 
 def _plain(parameters: dict[str, Any]) -> dict[str, Any]:
     """Parameters as JSON has them: numpy scalars become Python's, tuples lists."""
-    return {k: v.item() if isinstance(v, np.generic) else list(v) if isinstance(v, tuple) else v for k, v in parameters.items()}
+    return {
+        k: v.tolist() if isinstance(v, (np.generic, np.ndarray)) else list(v) if isinstance(v, tuple) else v
+        for k, v in parameters.items()
+    }

@@ -87,22 +87,30 @@ def events(scores: Array, times: Array, classes: Sequence[Any], peak: float, flo
     state = np.where(top >= floor, scores.argmax(axis=1), -1)
     middle = (times[1:] + times[:-1]) / 2
     edges = np.concatenate([times[:1], middle, times[-1:]])
-    runs: list[list[int]] = []
-    for first, last in _runs(state):
-        if runs and state[runs[-1][0]] == state[first] and edges[first] - edges[runs[-1][1] + 1] <= BRIDGE:
-            runs[-1][1] = last
-        else:
-            runs.append([first, last])
+    runs = _bridged(_runs(state), state, edges)
+    # once flicker is gone, what it parted is one again
+    runs = _bridged([(a, b) for a, b in runs if edges[b + 1] - edges[a] >= SHORTEST], state, edges)
     found = []
     for first, last in runs:
         label, inside = int(state[first]), np.arange(first, last + 1)
         inside = inside[state[inside] == label]
-        start, end = float(edges[first]), float(edges[last + 1])
-        if end - start < SHORTEST or top[inside].max() < peak:
+        if top[inside].max() < peak:
             continue
         others = np.delete(scores[inside], label, axis=1).max(axis=1)
-        found.append(Event(classes[label], start, end, float(top[inside].mean()), float((top[inside] - others).mean())))
+        score, margin = float(top[inside].mean()), float((top[inside] - others).mean())
+        found.append(Event(classes[label], float(edges[first]), float(edges[last + 1]), score, margin))
     return found
+
+
+def _bridged(runs: list[tuple[int, int]], state: Array, edges: Array) -> list[tuple[int, int]]:
+    """Runs of one class that only a short gap parts become one."""
+    out: list[tuple[int, int]] = []
+    for first, last in runs:
+        if out and state[out[-1][0]] == state[first] and edges[first] - edges[out[-1][1] + 1] <= BRIDGE:
+            out[-1] = (out[-1][0], last)
+        else:
+            out.append((first, last))
+    return out
 
 
 def _runs(state: Array) -> list[tuple[int, int]]:

@@ -50,7 +50,7 @@ def centres(clip: Clip) -> Array:
 
 
 def window_scores(model: ShapeModel, clip: Clip, stream: Stream, progress: Progress = None) -> tuple[Array, Array]:
-    """Times ``(T,)`` and pooled class scores ``(T, classes)`` along a recording."""
+    """Times ``(T,)`` and class scores ``(T, classes)`` of the windows along a recording, not pooled."""
     source = ragged([clip], stream.repair)
     at = centres(clip)
     scores = np.empty((len(at), model.classes))
@@ -66,7 +66,7 @@ def window_scores(model: ShapeModel, clip: Clip, stream: Stream, progress: Progr
         scores[begin : begin + len(part)] = best.cpu().numpy()
         if progress is not None:
             progress(min(1.0, (begin + len(part)) / len(at)))
-    return at, smooth(scores, at, stream.pool)
+    return at, scores
 
 
 def _windows(source: Ragged, middle: Array, seconds: float, length: int) -> Windows:
@@ -78,14 +78,13 @@ def _windows(source: Ragged, middle: Array, seconds: float, length: int) -> Wind
     return Windows(values, torch.from_numpy(source.seen).expand(len(middle), -1))
 
 
-def score_stream(model: ShapeModel, clip: Clip, stream: Stream, progress: Progress = None) -> Array:
-    """``(frames, classes)``: the pooled scores, read off at the clip's own frames."""
-    at, scores = window_scores(model, clip, stream, progress)
-    return np.stack([np.interp(clip.times, at, column) for column in scores.T], axis=1)
+def frame_scores(clip: Clip, stream: Stream, at: Array, scores: Array) -> Array:
+    """``(frames, classes)``: the window scores, pooled and read off at the clip's own frames."""
+    return np.stack([np.interp(clip.times, at, column) for column in smooth(scores, at, stream.pool).T], axis=1)
 
 
 def find_events(
-    model: ShapeModel, clip: Clip, stream: Stream, classes: Sequence[Any] | Array, rate: float | None, progress: Progress = None
+    model: ShapeModel, clip: Clip, stream: Stream, at: Array, scores: Array, classes: Sequence[Any] | Array, rate: float | None
 ) -> list[Event]:
     """Events of a recording, each with the exemplar that fits its middle best.
 
@@ -94,16 +93,21 @@ def find_events(
     exemplars ever do is at rest and does nothing.
 
     Args:
-        rate: at which the contrast of wrong actions may reach the level that an event needs; 0.3 by default.
+        at, scores: of :func:`window_scores`.
+        rate: at which the contrast of wrong actions may reach the level that an event needs (0.3 by default); a number
+            outside 0..1 is that level itself.
     """
-    at, scores = window_scores(model, clip, dataclasses.replace(stream, pool=EVENT_POOL * stream.pool), progress)
+    scores = smooth(scores, at, EVENT_POOL * stream.pool)
     contrast = scores - scores.mean(axis=1, keepdims=True)
     source = ragged([clip], stream.repair)
     still = np.concatenate([_motion(_windows(source, part, stream.window, stream.length)) for part in _blocks(at)])
     wrong, moving = _levels(model)
     contrast[smooth(still[:, None], at, stream.window)[:, 0] < moving] = -np.inf
     wanted = FALSE_ALARMS if rate is None else rate
-    peak, floor = np.quantile(wrong, [1 - wanted, 1 - min(1.0, EXTENT * wanted)])
+    if 0 < wanted < 1:
+        peak, floor = np.quantile(wrong, [1 - wanted, 1 - min(1.0, EXTENT * wanted)])
+    else:
+        peak = floor = wanted
     found = events(contrast, np.minimum(at, clip.times[-1]), list(classes), float(peak), float(floor))
     if not found:
         return []

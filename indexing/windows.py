@@ -98,15 +98,15 @@ def hampel(joints: FloatArray, width: int = 9, limit: float = 6.0) -> FloatArray
     return np.where(wrong[..., None], np.float32(np.nan), joints)
 
 
-def check_clips(clips: Sequence[Clip], joints: int | None = None) -> None:
-    """Raise where a clip cannot be compared.
+def check_clips(clips: Sequence[Clip], joints: int | None = None, items: Sequence[int] | None = None) -> None:
+    """Raise where a clip cannot be compared; ``items``: the numbers that the user knows the clips by.
 
     Raises:
         ValueError: naming the clip: fewer than two frames, no joint ever seen, all joints at one place, or a number of
             joints other than that of the others (or ``joints``).
     """
     for i, clip in enumerate(clips):
-        who = f"clip {i}" + (f" ({clip.name!r})" if clip.name else "")
+        who = f"clip {i if items is None else items[i]}" + (f" ({clip.name!r})" if clip.name else "")
         expected = joints if joints is not None else clips[0].joints.shape[1]
         if clip.joints.shape[1] != expected:
             other = "the fitted clips have" if joints is not None else "clip 0 has"

@@ -49,7 +49,9 @@ def metric_upgrade(shape: Tensor, cameras: Tensor) -> tuple[Tensor, Tensor]:
         views are too few or too alike; the shape returned is then the affine one, unchanged).
     """
     a, b = cameras[..., 0].double(), cameras[..., 1].double()
-    if len(cameras) < 3:
+    extent = shape.double().norm(dim=0)
+    # a flat shape leaves the third row of the cameras to chance
+    if len(cameras) < 3 or not extent.min() > 1e-6 * extent.max():
         return shape, torch.tensor(False)
     rows = torch.cat([_quadratic(a, b), _quadratic(a, a) - _quadratic(b, b)])
     _, s, vt = torch.linalg.svd(rows, full_matrices=True)

@@ -64,7 +64,7 @@ def canonical_correlation(first: Tensor, second: Tensor, *, shared: int = 1) -> 
         >>> round(float(canonical_correlation(u, v)), 3), round(float(canonical_correlation(u, v, shared=2)), 3)
         (1.0, 0.707)
     """
-    if first.shape[-1] != 2 or second.shape[-1] != 2 or first.shape[-2] != second.shape[-2]:
+    if first.ndim != 3 or second.ndim != 3 or first.shape[-1] != 2 or second.shape[-1] != 2 or first.shape[1] != second.shape[1]:
         raise ValueError(f"expected bases (m, rows, 2) and (k, rows, 2), got {tuple(first.shape)} and {tuple(second.shape)}")
     # planes of coordinates, so that the four entries of every product are contiguous (m, k) matrices
     left, right = first.permute(2, 0, 1), second.permute(2, 1, 0)

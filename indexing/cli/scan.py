@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from indexing.cli.console import Progress, count, names, progress, say, table
+from indexing.cli.console import count, names, progress, say, table
 from indexing.cli.inputs import KnownEvent, Reading, assumed, read_recordings, read_truth
 from indexing.cli.outputs import check_report
 
@@ -72,8 +72,7 @@ class Scan:
 
         which = f" ({index + 1} of {total})" if total > 1 else ""
         with progress(f"scanning {clip.name}{which}") as bar:
-            scores = indexer.score_frames(clip, _part(bar, 0.0))
-            events = indexer.find(clip, _part(bar, 0.5))
+            scores, events = indexer.scan(clip, bar)
         mine = [dataclasses.replace(event, exemplar=within_label(indexer, event.exemplar)) for event in events]
         return RecordingResult(clip.name, clip, clip.times, [str(c) for c in indexer.classes_], scores, mine, truth)
 
@@ -111,11 +110,6 @@ def exemplars(indexer: ActionIndexer) -> dict[Any, list[Clip]]:
         clip = indexer.exemplar(index)
         found.setdefault(clip.label, []).append(clip)
     return found
-
-
-def _part(bar: Progress, done: float) -> Progress:
-    """The second of two passes begins at half of the bar."""
-    return lambda share: bar(done + share / 2)
 
 
 def _unknown(truth: list[list[KnownEvent]] | None, indexer: ActionIndexer) -> list[str]:

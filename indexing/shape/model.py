@@ -198,17 +198,31 @@ def _mirror_is_same_action(model: ShapeModel, originals: Windows) -> Tensor:
 
 def _with_hubs(model: ShapeModel, originals: Windows) -> ShapeModel:
     """Measure, among the exemplars, how close each is to other classes, and the evidence that leave-one-out gives."""
-    between = model.residuals(originals)
-    hub = _hub(between, model.labels, model.labels)
-    between = between - hub
+    between_raw = model.residuals(originals)
+    hub = _hub(between_raw, model.labels, model.labels)
+    between = between_raw - hub
     between.fill_diagonal_(torch.inf)
     scores = class_scores(between, model.labels, model.classes)
     own = torch.nn.functional.one_hot(model.labels, model.classes).bool()
     # an exemplar alone in its class has no leave-one-out evidence (its only residual is its own, taken out)
-    model = _replace(model, hub=hub, evidence_out=scores.masked_fill(own, -torch.inf).max(dim=1).values, evidence_in=scores[own])
+    model = _replace(model, hub=hub, evidence_out=_foreign_evidence(between_raw, model), evidence_in=scores[own])
     sample = torch.arange(0, len(model.exemplars.moments), max(1, len(model.exemplars.moments) // MOMENT_SAMPLE))
     labels = model.labels[model.exemplars.owner]
     return _replace(model, moment_hub=_hub(model.moment_residuals(model.exemplars.moments[sample]), labels[sample], labels))
+
+
+def _foreign_evidence(residual: Tensor, model: ShapeModel) -> Tensor:
+    """``(N,)`` the best evidence each exemplar finds for a wrong class, were its own class unknown.
+
+    The hubs must not know the class either: with it in them, 10 % asked for were 18 to 21 % (14 % so; 30 %: 53, now 35).
+    """
+    out = residual.new_empty(len(model.labels))
+    for c in range(model.classes):
+        mine, rest = model.labels == c, model.labels != c
+        hub = _hub(residual[rest][:, rest], model.labels[rest], model.labels[rest])
+        scores = class_scores(residual[mine][:, rest] - hub, model.labels[rest], model.classes)
+        out[mine] = scores.max(dim=1).values
+    return out
 
 
 def _hub(residual: Tensor, rows: Tensor, columns: Tensor) -> Tensor:

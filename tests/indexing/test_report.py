@@ -16,8 +16,8 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from indexing.clip import Clip
 from indexing import files
+from indexing.clip import Clip
 from indexing.report import (
     EvaluationResult,
     RecognitionReport,
