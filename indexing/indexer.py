@@ -22,7 +22,7 @@ from indexing.shape.exemplars import CROPS, Exemplars, Plan, cut
 from indexing.shape.model import ShapeModel, learn
 from indexing.shape.symmetry import mirror_permutation
 from indexing.skeleton import Skeleton
-from indexing.stream import Stream, find_events, frame_scores, window_scores
+from indexing.stream import Stream, find_events, frame_scores, scan
 from indexing.windows import ragged, whole
 
 Array = NDArray[Any]
@@ -241,10 +241,10 @@ class ActionIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         model, stream = self._model(), self._stream()
         begin = float(found.times[0])
         found = found.replace(times=found.times - begin)  # rounding must not depend on what the clock shows
-        at, scores = window_scores(model, found, stream, progress)
-        events = find_events(model, found, stream, at, scores, self.classes_, self.reject)
+        windows = scan(model, found, stream, progress)
+        events = find_events(model, found, stream, windows, self.classes_, self.reject)
         events = [dataclasses.replace(event, start=event.start + begin, end=event.end + begin) for event in events]
-        return frame_scores(found, stream, at, scores), events
+        return frame_scores(found, stream, windows), events
 
     def score_frames(self, clip: Any, progress: Callable[[float], None] | None = None) -> Array:
         """``(frames, classes)`` score of every frame of an untrimmed recording, larger is better.

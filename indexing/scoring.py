@@ -71,11 +71,13 @@ def smooth(scores: Array, times: Array, seconds: float) -> Array:
     return np.asarray((total[high] - total[low]) / (high - low)[:, None])
 
 
-def events(scores: Array, times: Array, classes: Sequence[Any], peak: float, floor: float) -> list[Event]:
+def events(
+    scores: Array, times: Array, classes: Sequence[Any], peak: float, floor: float, blocked: Array | None = None
+) -> list[Event]:
     """Runs of samples whose best class is the same: at least ``floor`` throughout and ``peak`` somewhere.
 
     Args:
-        scores: ``(T, classes)``, -inf where nothing may be found; times: ``(T,)`` seconds.
+        scores: ``(T, classes)``; times: ``(T,)`` seconds; blocked: ``(T,)`` bool, where nothing may be found.
 
     Example:
         >>> import numpy as np
@@ -84,7 +86,8 @@ def events(scores: Array, times: Array, classes: Sequence[Any], peak: float, flo
         [('a', 0.5, 2.5, 5.5, 4.0)]
     """
     top = scores.max(axis=1)
-    state = np.where(top >= floor, scores.argmax(axis=1), -1)
+    open_ = top >= floor if blocked is None else (top >= floor) & ~blocked
+    state = np.where(open_, scores.argmax(axis=1), -1)
     middle = (times[1:] + times[:-1]) / 2
     edges = np.concatenate([times[:1], middle, times[-1:]])
     runs = _bridged(_runs(state), state, edges)

@@ -28,7 +28,9 @@ STEP = 0.1  # seconds between the windows of a recording
 FALSE_ALARMS = 0.3  # rate at which a wrong action may reach an event's peak
 EXTENT = 1.7  # times that rate for the level that an event's ends reach
 EVENT_POOL = 0.7  # of `pool`: events need sharper ends than frames
+CONVINCING = 0.95  # quantile of the contrast of wrong actions above which a person may stand still
 STILL = 0.1  # quantile of the exemplars' motion below which a person is at rest
+MARGIN = 2.0  # seconds of frames on both sides of a block, from which missing joints are interpolated
 BLOCK = 1200  # windows compared at once: bounds memory whatever the length of the recording
 
 
@@ -49,24 +51,42 @@ def centres(clip: Clip) -> Array:
     return np.asarray(clip.times[0] + STEP * np.arange(max(2, int(np.ceil(clip.duration / STEP)) + 1)))
 
 
-def window_scores(model: ShapeModel, clip: Clip, stream: Stream, progress: Progress = None) -> tuple[Array, Array]:
-    """Times ``(T,)`` and class scores ``(T, classes)`` of the windows along a recording, not pooled."""
-    source = ragged([clip], stream.repair)
+@dataclass(frozen=True)
+class Scan:
+    """What the windows along a recording say: times ``(T,)``, class scores ``(T, classes)`` and motion ``(T,)``, not pooled."""
+
+    times: Array
+    scores: Array
+    motion: Array
+
+
+def scan(model: ShapeModel, clip: Clip, stream: Stream, progress: Progress = None) -> Scan:
+    """Score the windows along a recording, block by block: memory does not grow with its length."""
     at = centres(clip)
-    scores = np.empty((len(at), model.classes))
+    scores, motion = np.empty((len(at), model.classes)), np.empty(len(at))
     for begin in range(0, len(at), BLOCK):
-        part = at[begin : begin + BLOCK]
+        part = slice(begin, begin + BLOCK)
+        source = _around(clip, at[part][0], at[part][-1], stream)
         best: Tensor | None = None
         for tempo in stream.tempi:
-            query = _windows(source, part, stream.window * tempo, stream.length).to(stream.device)
+            query = _windows(source, at[part], stream.window * tempo, stream.length).to(stream.device)
             one = model.moment_scores(query)
             best = one if best is None else torch.maximum(best, one)
         if best is None:
             raise ValueError("tempi: give at least one speed factor")
-        scores[begin : begin + len(part)] = best.cpu().numpy()
+        scores[part] = best.cpu().numpy()
+        motion[part] = _motion(_windows(source, at[part], stream.window, stream.length))
         if progress is not None:
-            progress(min(1.0, (begin + len(part)) / len(at)))
-    return at, scores
+            progress(min(1.0, (begin + BLOCK) / len(at)))
+    return Scan(at, scores, motion)
+
+
+def _around(clip: Clip, begin: float, end: float, stream: Stream) -> Ragged:
+    """The frames that windows centred between two times can touch, and some more to interpolate missing joints from."""
+    margin = max(stream.tempi) * stream.window + MARGIN
+    first = max(0, min(int(np.searchsorted(clip.times, begin - margin)), len(clip) - 2))
+    last = max(int(np.searchsorted(clip.times, end + margin, side="right")), first + 2)
+    return ragged([clip.replace(joints=clip.joints[first:last], times=clip.times[first:last], confidence=None)], stream.repair)
 
 
 def _windows(source: Ragged, middle: Array, seconds: float, length: int) -> Windows:
@@ -78,52 +98,49 @@ def _windows(source: Ragged, middle: Array, seconds: float, length: int) -> Wind
     return Windows(values, torch.from_numpy(source.seen).expand(len(middle), -1))
 
 
-def frame_scores(clip: Clip, stream: Stream, at: Array, scores: Array) -> Array:
+def frame_scores(clip: Clip, stream: Stream, found: Scan) -> Array:
     """``(frames, classes)``: the window scores, pooled and read off at the clip's own frames."""
-    return np.stack([np.interp(clip.times, at, column) for column in smooth(scores, at, stream.pool).T], axis=1)
+    pooled = smooth(found.scores, found.times, stream.pool)
+    return np.stack([np.interp(clip.times, found.times, column) for column in pooled.T], axis=1)
 
 
 def find_events(
-    model: ShapeModel, clip: Clip, stream: Stream, at: Array, scores: Array, classes: Sequence[Any] | Array, rate: float | None
+    model: ShapeModel, clip: Clip, stream: Stream, windows: Scan, classes: Sequence[Any] | Array, rate: float | None
 ) -> list[Event]:
     """Events of a recording, each with the exemplar that fits its middle best.
 
     Found on the contrast: how far the best class stands above the mean of all.  Unlike the score itself it hardly changes
     with the viewpoint, so levels calibrated among the exemplars hold for other views.  A person who moves less than the
-    exemplars ever do is at rest and does nothing.
+    exemplars do is at rest, unless the contrast is convincing (a wave moves one hand only).
 
     Args:
-        at, scores: of :func:`window_scores`.
+        windows: of :func:`scan`.
         rate: at which the contrast of wrong actions may reach the level that an event needs (0.3 by default); a number
             outside 0..1 is that level itself.
     """
-    scores = smooth(scores, at, EVENT_POOL * stream.pool)
+    at = windows.times
+    scores = smooth(windows.scores, at, EVENT_POOL * stream.pool)
     contrast = scores - scores.mean(axis=1, keepdims=True)
-    source = ragged([clip], stream.repair)
-    still = np.concatenate([_motion(_windows(source, part, stream.window, stream.length)) for part in _blocks(at)])
     wrong, moving = _levels(model)
-    contrast[smooth(still[:, None], at, stream.window)[:, 0] < moving] = -np.inf
+    resting = smooth(windows.motion[:, None], at, stream.window)[:, 0] < moving
+    resting &= contrast.max(axis=1) < np.quantile(wrong, CONVINCING)
     wanted = FALSE_ALARMS if rate is None else rate
     if 0 < wanted < 1:
         peak, floor = np.quantile(wrong, [1 - wanted, 1 - min(1.0, EXTENT * wanted)])
     else:
         peak = floor = wanted
-    found = events(contrast, np.minimum(at, clip.times[-1]), list(classes), float(peak), float(floor))
+    found = events(contrast, np.minimum(at, clip.times[-1]), list(classes), float(peak), float(floor), resting)
     if not found:
         return []
-    middle = np.array([(event.start + event.end) / 2 for event in found])
-    residual = model.moment_residuals(_windows(source, middle, stream.window, stream.length).to(stream.device))
     numbers = {label: i for i, label in enumerate(classes)}
     out = []
-    for row, event in zip(residual, found, strict=True):
+    for event in found:
+        middle = np.array([(event.start + event.end) / 2])
+        query = _windows(_around(clip, middle[0], middle[0], stream), middle, stream.window, stream.length).to(stream.device)
         mine = model.labels[model.exemplars.owner] == numbers[event.label]
-        nearest = int(torch.where(mine, row, torch.inf).argmin())
+        nearest = int(torch.where(mine, model.moment_residuals(query)[0], torch.inf).argmin())
         out.append(dataclasses.replace(event, exemplar=int(model.exemplars.owner[nearest])))
     return out
-
-
-def _blocks(times: Array) -> list[Array]:
-    return [times[i : i + BLOCK] for i in range(0, len(times), BLOCK)]
 
 
 def _motion(windows: Windows) -> Array:
@@ -137,7 +154,7 @@ def _motion(windows: Windows) -> Array:
 def _levels(model: ShapeModel) -> tuple[Array, float]:
     """The contrast that short windows of one class reach with other classes, and the least motion of an exemplar."""
     moments, labels = model.exemplars.moments, model.labels[model.exemplars.owner]
-    sample = torch.arange(0, len(moments), max(1, len(moments) // MOMENT_SAMPLE))
-    scores = model.moment_scores(moments[sample]).cpu().numpy()
-    scores[np.arange(len(sample)), labels[sample].cpu().numpy()] = np.nan
+    chosen = torch.arange(0, len(moments), max(1, len(moments) // MOMENT_SAMPLE))
+    scores = model.moment_scores(moments[chosen]).cpu().numpy()
+    scores[np.arange(len(chosen)), labels[chosen].cpu().numpy()] = np.nan
     return np.nanmax(scores, axis=1) - np.nanmean(scores, axis=1), float(np.quantile(_motion(moments), STILL))
