@@ -120,6 +120,8 @@ def unusable(clip: Clip) -> str | None:
     """Why a clip cannot be compared with others, or ``None``."""
     if len(clip) < 2:
         return "one frame only, but an action needs at least two"
+    if np.isfinite(clip.joints[0]).all() and (clip.joints[0] != clip.joints[0, 0]).any():
+        return None  # the common case, without looking at every frame
     if not clip.seen.any():
         return "no joint was seen in any frame (all NaN)"
     first = clip.joints[clip.seen]
