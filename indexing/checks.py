@@ -120,18 +120,7 @@ def check_parameters(indexer: Any) -> None:
     for name, accepted in _CHOICES.items():
         if getattr(indexer, name) not in accepted:
             raise ValueError(f"{name} must be one of {', '.join(map(repr, accepted))}, got {getattr(indexer, name)!r}")
-    for name in ("fps", "window", "stride"):
-        if not _positive(getattr(indexer, name)):
-            raise ValueError(f"{name} must be a positive number, got {getattr(indexer, name)!r}")
-    if not (_number(indexer.pool) and indexer.pool >= 0):
-        raise ValueError(f"pool must be seconds, 0 or more, got {indexer.pool!r}")
-    tempi = list(indexer.tempi) if isinstance(indexer.tempi, Iterable) else []
-    if not tempi or not all(_positive(tempo) for tempo in tempi):
-        raise ValueError(f"tempi must be positive speed factors such as (0.7, 1.0, 1.4), got {indexer.tempi!r}")
-    for name, least in (("length", 4), ("virtual_views", 0)):
-        value = getattr(indexer, name)
-        if not isinstance(value, (int, np.integer)) or isinstance(value, bool) or value < least:
-            raise ValueError(f"{name} must be a whole number, {least} or more, got {value!r}")
+    _check_numbers(indexer)
     if indexer.reject is not None and not (isinstance(indexer.reject, (int, float, np.floating)) and np.isfinite(indexer.reject)):
         raise ValueError(f"reject must be None, a rate between 0 and 1 or a threshold, got {indexer.reject!r}")
     try:
@@ -144,6 +133,23 @@ def check_parameters(indexer: Any) -> None:
         torch.empty(0, device=indexer.device)
     except (RuntimeError, AssertionError) as error:
         raise ValueError(f"device {indexer.device!r} is not there: {str(error).splitlines()[0]}; use device='cpu'") from None
+
+
+def _check_numbers(indexer: Any) -> None:
+    for name in ("fps", "window", "stride"):
+        if not _positive(getattr(indexer, name)):
+            raise ValueError(f"{name} must be a positive number, got {getattr(indexer, name)!r}")
+    if not (_number(indexer.pool) and indexer.pool >= 0):
+        raise ValueError(f"pool must be seconds, 0 or more, got {indexer.pool!r}")
+    tempi = list(indexer.tempi) if isinstance(indexer.tempi, Iterable) else []
+    if not tempi or not all(_positive(tempo) for tempo in tempi):
+        raise ValueError(f"tempi must be positive speed factors such as (0.7, 1.0, 1.4), got {indexer.tempi!r}")
+    for name, least in (("length", 4), ("virtual_views", 0)):
+        value = getattr(indexer, name)
+        if name == "virtual_views" and value is None:
+            continue
+        if not isinstance(value, (int, np.integer)) or isinstance(value, bool) or value < least:
+            raise ValueError(f"{name} must be a whole number, {least} or more, got {value!r}")
 
 
 def _positive(value: Any) -> bool:
@@ -162,5 +168,5 @@ def check_plan(indexer: Any, crops: int, exemplars: Any) -> None:
         ("search", crops, len(exemplars.crops) // count),
         ("virtual_views", indexer.virtual_views, len(exemplars.views) // count),
     ):
-        if now != then:
+        if now is not None and now != then:
             raise ValueError(f"{name} was changed since the clips were learned; set it back, or fit all clips again")

@@ -18,7 +18,7 @@ from indexing.checks import check_labels, check_parameters, check_plan, check_qu
 from indexing.clip import Clip
 from indexing.scoring import Event, probabilities, reject_threshold
 from indexing.shape.bank import Windows
-from indexing.shape.exemplars import CROPS, Exemplars, Plan, cut
+from indexing.shape.exemplars import CROPS, VIEWS, VIEWS_SOLID, Exemplars, Plan, cut
 from indexing.shape.model import ShapeModel, learn
 from indexing.shape.symmetry import mirror_permutation
 from indexing.skeleton import Skeleton
@@ -50,7 +50,7 @@ class ActionIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         mirror: ``"auto"``: exemplars also count mirrored, unless left and right are different actions here; ``True``:
             always; ``False``: never.
         scorer: ``"both"``, ``"nearest"`` (no training, fastest) or ``"kernel"``; ``view="same"`` uses the kernel machine.
-        virtual_views: copies of every exemplar for the kernel machine.
+        virtual_views: copies of every exemplar for the kernel machine; by default 4, and 12 where exemplars have depth.
         repair: replace joints that jump (Hampel filter): for bad detectors at a regular frame rate.
         window, stride, tempi, pool: of :meth:`score_frames`: seconds, seconds between exemplar windows, speed factors tried,
             and seconds over which scores are averaged.
@@ -85,7 +85,7 @@ class ActionIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         search: bool = True,
         mirror: str | bool = "auto",
         scorer: str = "both",
-        virtual_views: int = 4,
+        virtual_views: int | None = None,
         repair: bool = False,
         window: float = 1.0,
         stride: float = 0.3,
@@ -134,7 +134,7 @@ class ActionIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
             )
         rng = np.random.default_rng(self.random_state)
         skeleton = next((clip.skeleton for clip in found if clip.skeleton is not None), None)
-        return self._learn(cut(found, self._plan(), rng), classes, numbers, skeleton, rng)
+        return self._learn(cut(found, self._plan(_default_views(found)), rng), classes, numbers, skeleton, rng)
 
     def partial_fit(self, clips: Iterable[Any], labels: ArrayLike | None = None, classes: ArrayLike | None = None) -> Self:
         """Learn from further clips, of known or new actions; the earlier ones stay.  Fits where nothing was fitted yet."""
@@ -147,13 +147,15 @@ class ActionIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         merged = _joined(old, values)
         known, numbers = np.unique(merged, return_inverse=True)
         check_plan(self, len(CROPS) if self.search else 1, self.model_.exemplars)
+        plan = self._plan(len(self.model_.exemplars.views) // len(old))
         # a copy, so that a failure leaves nothing changed
         seed = 0 if self.random_state is None else self.random_state
         rng = copy.deepcopy(self._rng) if hasattr(self, "_rng") else np.random.default_rng([seed, len(old)])
-        return self._learn(self.model_.exemplars.extended(cut(found, self._plan(), rng)), known, numbers, self.skeleton_, rng)
+        return self._learn(self.model_.exemplars.extended(cut(found, plan, rng)), known, numbers, self.skeleton_, rng)
 
-    def _plan(self) -> Plan:
-        return Plan(self.length, self.search, self.virtual_views, self.view == "any", self.repair, self.window, self.stride)
+    def _plan(self, views: int) -> Plan:
+        views = views if self.virtual_views is None else self.virtual_views
+        return Plan(self.length, self.search, views, self.view == "any", self.repair, self.window, self.stride)
 
     def _learn(
         self, exemplars: Exemplars, classes: Array, numbers: Array, skeleton: Skeleton | None, rng: np.random.Generator
@@ -291,6 +293,10 @@ class ActionIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
 
     def __sklearn_is_fitted__(self) -> bool:
         return hasattr(self, "model_")
+
+
+def _default_views(clips: Sequence[Clip]) -> int:
+    return VIEWS_SOLID if any(clip.dims == 3 for clip in clips) else VIEWS
 
 
 def _joined(first: Array, second: Array) -> Array:

@@ -27,9 +27,9 @@ HUB_SHARE, HUB_NEIGHBOURS = 0.5, 5  # of an exemplar's closeness to other classe
 MOMENT_TERMS = ("epi", "nn")  # on short windows what is bound to the view helps even at 90 degrees: .83/.82 -> .93/.85
 MOMENT_SAMPLE = 500  # short windows whose closeness to others sets the hub shares
 BALANCE = 1.5  # weight of A against B after standardizing over classes; 1 .. 2 differ by 1 %
-BALANCE_SOLID = 1.0  # the same for exemplars with depth: B then sees true views (1.5: -.6 % on Florence3D)
+BALANCE_SOLID = 0.5  # the same for exemplars with depth: B then sees true views (1.5: -1.5 % on Florence3D, UTKinect +-0)
 KERNEL_WHITENING = 0.0
-ROWS = 3000  # training rows of B at most: its fit grows with their square
+ROWS, ROWS_SOLID = 3000, 5000  # training rows of B at most (its fit grows with their square); true views are worth more
 
 
 @dataclass(frozen=True)
@@ -239,7 +239,8 @@ def _with_machine(model: ShapeModel) -> ShapeModel:
     """Train scorer B on the exemplars, their virtual views and mirror images, as many as the budget of rows allows."""
     exemplars, count = model.exemplars, len(model.exemplars)
     both = model.symmetry is not None and bool(model.mirrored.any())
-    copies = max(1, ROWS // (count * (1 + both)))
+    rows_at_most = ROWS_SOLID if bool(exemplars.solid.any()) else ROWS
+    copies = max(1, rows_at_most // (count * (1 + both)))
     parts = [exemplars.crop(0)] + [exemplars.view(i) for i in range(min(copies - 1, len(exemplars.views) // count))]
     rows, labels = stack(parts), model.labels.repeat(len(parts))
     if both and model.symmetry is not None:
