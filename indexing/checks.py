@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from indexing.cameras import virtual
 from indexing.clip import Clip, as_clip
 from indexing.multiview import combine
+from indexing.shape.bank import COMMON
 from indexing.windows import check_clips
 
 Array = NDArray[Any]
@@ -60,6 +61,22 @@ def check_queries(clips: Iterable[Any], fps: float, joints: int) -> list[Clip]:
     return [virtual(clip, 0.0, 0.1) if clip.dims == 3 else clip for clip in found]
 
 
+def check_common(clips: list[Clip], seen: NDArray[np.bool_], known: NDArray[np.bool_]) -> None:
+    """Raise where a query shares too few joints with every exemplar to be compared at all.
+
+    Args:
+        seen: ``(clips, joints)`` joints seen in the queries; known: ``(exemplars, joints)``.
+    """
+    most = (seen.astype(int) @ np.unique(known, axis=0).astype(int).T).max(axis=1)
+    few = np.flatnonzero(most < min(COMMON, seen.shape[1]))
+    if len(few):
+        clip = clips[few[0]]
+        raise ValueError(
+            f"clip {few[0]} ({clip.name!r}): joints: it shares {most[few[0]]} joints with the learned clips, {COMMON} are needed; "
+            "leave it out, or learn from clips that show these joints"
+        )
+
+
 def gather_labels(clips: list[Clip], owners: list[int], labels: ArrayLike | None) -> Array:
     """``(clips,)`` labels in the dtype given; by default the clips' own."""
     if labels is None:
@@ -83,6 +100,9 @@ def check_labels(labels: ArrayLike, items: int) -> Array:
             raise ValueError(
                 f"labels: the label of clip {bad[0]} is missing ({given[bad[0]]!r}); leave the clip out or name its action"
             )
+        kinds = {isinstance(value, (str, bytes, np.str_)) for value in given}
+        if len(kinds) > 1:
+            raise ValueError("labels: text and numbers are mixed; give one kind of label")
     try:
         values = np.asarray(labels)
     except ValueError:

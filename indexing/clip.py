@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from indexing.skeleton import Skeleton
 
 FloatArray = NDArray[np.floating[Any]]
+LARGEST = 1e9  # of a coordinate: pixels, millimetres and map metres stay far below; float32 arithmetic needs a bound
 UP_AXES = ("y", "-y", "z", "-z")
 
 
@@ -69,8 +70,8 @@ class Clip:
             )
         if joints.shape[0] == 0 or joints.shape[1] == 0:
             raise ValueError(f"{who}: joints is empty (shape {joints.shape}); a clip needs at least one frame and one joint")
-        if np.isinf(joints).any():
-            raise ValueError(f"{who}: joints contains infinite values; mark missing joints with NaN")
+        if (np.abs(joints) > LARGEST).any():
+            raise ValueError(f"{who}: joints contains infinite or huge values (over {LARGEST:g}); mark missing joints with NaN")
         assumed = self.fps_assumed
         if cast("FloatArray | None", self.times) is None:
             fps = 30.0 if self.fps is None else self.fps

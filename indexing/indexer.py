@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -14,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.base import BaseEstimator, ClassifierMixin
 from sklearn.utils.validation import check_is_fitted
 
-from indexing.checks import check_labels, check_parameters, check_plan, check_queries, gather, gather_labels
+from indexing.checks import check_common, check_labels, check_parameters, check_plan, check_queries, gather, gather_labels
 from indexing.clip import Clip
 from indexing.scoring import Event, probabilities, reject_threshold
 from indexing.shape.bank import Windows
@@ -134,7 +133,7 @@ class ActionIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
             )
         rng = np.random.default_rng(self.random_state)
         skeleton = next((clip.skeleton for clip in found if clip.skeleton is not None), None)
-        return self._learn(cut(found, self._plan(_default_views(found)), rng), classes, numbers, skeleton, rng)
+        return self._learn(cut(found, self._plan(_default_views(found)), rng), classes, numbers, skeleton)
 
     def partial_fit(self, clips: Iterable[Any], labels: ArrayLike | None = None, classes: ArrayLike | None = None) -> Self:
         """Learn from further clips, of known or new actions; the earlier ones stay.  Fits where nothing was fitted yet."""
@@ -148,18 +147,15 @@ class ActionIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         known, numbers = np.unique(merged, return_inverse=True)
         check_plan(self, len(CROPS) if self.search else 1, self.model_.exemplars)
         plan = self._plan(len(self.model_.exemplars.views) // len(old))
-        # a copy, so that a failure leaves nothing changed
         seed = 0 if self.random_state is None else self.random_state
-        rng = copy.deepcopy(self._rng) if hasattr(self, "_rng") else np.random.default_rng([seed, len(old)])
-        return self._learn(self.model_.exemplars.extended(cut(found, plan, rng)), known, numbers, self.skeleton_, rng)
+        rng = np.random.default_rng([seed, len(old)])
+        return self._learn(self.model_.exemplars.extended(cut(found, plan, rng)), known, numbers, self.skeleton_)
 
     def _plan(self, views: int) -> Plan:
         views = views if self.virtual_views is None else self.virtual_views
         return Plan(self.length, self.search, views, self.view == "any", self.repair, self.window, self.stride)
 
-    def _learn(
-        self, exemplars: Exemplars, classes: Array, numbers: Array, skeleton: Skeleton | None, rng: np.random.Generator
-    ) -> Self:
+    def _learn(self, exemplars: Exemplars, classes: Array, numbers: Array, skeleton: Skeleton | None) -> Self:
         """Learn everything, and only then change anything."""
         symmetry = None
         if self.mirror:
@@ -168,6 +164,8 @@ class ActionIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
             raise ValueError(
                 "mirror=True: the joints' mirror images are not known; give clips a skeleton with names, or mirror='auto'"
             )
+        if self.reject is not None and any(_equal(value, self.none_label) for value in classes.tolist()):
+            raise ValueError(f"none_label={self.none_label!r} is one of the learned labels; choose another for rejected clips")
         model = learn(
             exemplars,
             torch.from_numpy(numbers).long(),
@@ -182,7 +180,6 @@ class ActionIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         self.classes_ = classes
         self.n_joints_ = int(exemplars.crops.values.shape[2])
         self.skeleton_ = skeleton
-        self._rng = rng
         self._calibrate()
         return self
 
@@ -194,6 +191,7 @@ class ActionIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         check_is_fitted(self, "model_")
         found = check_queries(clips, self.fps, self.n_joints_)
         source = ragged(found, self.repair)
+        check_common(found, source.seen, self.model_.exemplars.crop(0).seen.numpy())
         return Windows(whole(source, self.length), torch.from_numpy(source.seen)).to(self.device)
 
     def _model(self) -> ShapeModel:
@@ -259,8 +257,9 @@ class ActionIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         """The actions in an untrimmed recording, in order of time: label, start, end (seconds), score and margin.
 
         An event needs a class to stand out from the others further than wrong actions do, at a rate calibrated by leaving
-        classes out: ``reject``, else 0.3 (outside 0..1 it is the least score an event needs).  While the person is at rest
-        nothing is found.
+        classes out: ``reject``, else 0.3 (outside 0..1 it is the least score an event needs).  Nothing is found where nobody
+        is seen, and hardly anything while the person rests.  Two or three classes have little to stand out from: add a class
+        of ordinary movement.
         """
         return self.scan(clip, progress)[1]
 
@@ -293,6 +292,10 @@ class ActionIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
 
     def __sklearn_is_fitted__(self) -> bool:
         return hasattr(self, "model_")
+
+
+def _equal(a: Any, b: Any) -> bool:
+    return type(a) is type(b) and bool(a == b)
 
 
 def _default_views(clips: Sequence[Clip]) -> int:

@@ -113,7 +113,23 @@ def _check_fit(indexer: ActionIndexer) -> None:
     for name, windows in (("crops", parts.crops), ("views", parts.views), ("moments", parts.moments)):
         fine[name] = len(windows.values) == len(windows.seen) and (name == "moments" or len(windows) % count == 0)
     fine |= {name: len(getattr(model, name)) == count for name in ("hub", "mirrored", "evidence_out", "evidence_in")}
+    values = (parts.crops.values, parts.views.values, parts.moments.values)
+    for name, value in (
+        ("metric", model.metric.covariance),
+        ("hub", model.hub),
+        ("moment_hub", model.moment_hub),
+        ("weights", model.weights),
+    ):
+        fine[name] = fine.get(name, True) and bool(value.isfinite().all())
+    fine["windows"] = all(bool(value.isfinite().all()) for value in values)
+    fine["evidence"] = not bool(torch.cat([model.evidence_in, model.evidence_out]).isnan().any())
     if model.machine is not None:
+        machine, pairs = model.machine, model.classes * (model.classes - 1) // 2
+        fine["machine.counts"] = len(machine.counts) == model.classes and int(machine.counts.sum()) == len(machine.support)
+        fine["machine.intercept"] = len(machine.intercept) == pairs and bool(machine.intercept.isfinite().all())
+        fine["machine.dual"] = (
+            bool(machine.dual.isfinite().all()) and model.support is not None and len(model.support) == len(machine.support)
+        )
         fine["machine"] = model.machine.dual.shape == (model.classes - 1, len(model.machine.support))
     wrong = [name for name, good in fine.items() if not good]
     if wrong:

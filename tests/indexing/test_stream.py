@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from indexing import ActionIndexer, Event
-from indexing.actors import Person, dataset, detect, stream
+from indexing.actors import ACTIONS, Person, dataset, detect, stream
 from indexing.scoring import events, probabilities, reject_threshold, smooth
 
 KNOWN = ("squat", "wave", "bow", "jumping_jack", "kick", "walk")
@@ -191,3 +191,27 @@ def test_reject_threshold():
     assert reject_threshold(None, wrong) is None
     assert reject_threshold(0.1, wrong) == pytest.approx(90)
     assert reject_threshold(-3.5, wrong) == -3.5 and reject_threshold(7, wrong) == 7
+
+
+# ---- nobody there, nothing done ------------------------------------------------------------------------------------------
+def test_nothing_is_found_while_nobody_is_seen(indexer, recordings):
+    clip = recordings[0][0]
+    half = len(clip) // 2
+    gap = np.full((6000, *clip.joints.shape[1:]), np.nan)
+    joints = np.concatenate([clip.joints[:half], gap, clip.joints[half:]])
+    holed = clip.replace(joints=joints, times=None, fps=30.0, confidence=None)
+    jump = clip.replace(times=np.where(np.arange(len(clip)) < half, clip.times, clip.times + 200.0), fps=None)
+    for one in (holed, jump):
+        start, end = one.times[half - 1] + 0.8, clip.times[half - 1] + 199.0
+        assert all(event.end <= start or event.start >= end for event in indexer.find(one))
+        assert np.isfinite(indexer.score_frames(one)).all()
+
+
+def test_a_resting_person_is_mostly_left_alone():
+    lesson = dataset([Person.random(10)], ACTIONS, azimuth=0.0, rng=10)
+    indexer = ActionIndexer(scorer="nearest").fit(lesson)
+    solid, truth = stream(["squat", "kick", "wave", "bow"], Person.random(2), rng=3, rest=(6.0, 8.0))
+    found = indexer.find(detect(solid, azimuth=30, rng=3))
+    idle = [e for e in found if all(e.end <= start or e.start >= end for _, start, end in truth)]
+    assert sum(e.end - e.start for e in idle) < 0.15 * solid.duration
+    assert np.mean(hits(found, truth)) >= 0.75
