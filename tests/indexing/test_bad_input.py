@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from indexing import ActionIndexer, Clip
+from indexing.actors import Person, dataset
 
 FRAMES, JOINTS = 12, 17
 
@@ -248,3 +249,36 @@ def test_windows_cut_otherwise_cannot_be_added(change, unchanged, lesson):
 def test_a_pool_of_any_real_type_is_taken(lesson):
     for pool in (0, np.float32(1.0), np.int64(2)):
         ActionIndexer(pool=pool, scorer="nearest").fit(lesson)
+
+
+# ---- comparisons that would mean nothing ---------------------------------------------------------------------------------
+def test_a_query_without_common_joints_is_refused():
+    lesson = dataset([Person.random(1)], ["squat", "wave", "kick"], azimuth=0.0, rng=0)
+
+    def keep(clip, joints):
+        only = np.full_like(clip.joints, np.nan)
+        only[:, joints] = clip.joints[:, joints]
+        return clip.replace(joints=only, confidence=None)
+
+    upper, lower = slice(0, 11), slice(11, 17)
+    indexer = ActionIndexer(scorer="nearest").fit([keep(clip, upper) for clip in lesson], lesson.labels)
+    with pytest.raises(ValueError, match="shares 0 joints with the learned clips, 3 are needed"):
+        indexer.predict([keep(lesson[0], lower)])
+    assert list(indexer.predict([keep(lesson[0], slice(0, 13))])) == ["squat"]
+
+
+def test_the_none_label_must_not_be_an_action():
+    lesson = dataset([Person.random(1)], ["squat", "wave", "kick"], azimuth=0.0, rng=0)
+    with pytest.raises(ValueError, match="none_label=-1 is one of the learned labels; choose another"):
+        ActionIndexer(scorer="nearest", reject=0.1).fit(lesson, [-1, 0, 1])
+
+
+def test_text_and_numbers_are_not_mixed():
+    lesson = dataset([Person.random(1)], ["squat", "wave", "kick"], azimuth=0.0, rng=0)
+    with pytest.raises(ValueError, match="labels: text and numbers are mixed"):
+        ActionIndexer(scorer="nearest").fit(lesson, [1, "wave", 2])
+
+
+def test_huge_coordinates_are_refused():
+    with pytest.raises(ValueError, match="joints contains infinite or huge values"):
+        Clip(np.full((4, 3, 2), 1e12))
