@@ -63,6 +63,8 @@ class Scan:
         for note in notes:
             say(f"note: {note}")
         say(_summary(results, timings["scan"]))
+        if truth is not None:
+            say(_against_truth(results))
         if page is not None:
             say(f"report: {page}")
         return 0
@@ -134,3 +136,14 @@ def _summary(results: list[RecordingResult], seconds: float) -> str:
     found, length = sum(len(result.events) for result in results), sum(result.duration for result in results)
     where = f"{count(len(results), 'recording')} ({length:.1f} s long)"
     return f"{count(found, 'action') if found else 'no action'} found in {where} in {seconds:.1f} s"
+
+
+def _against_truth(results: list[RecordingResult]) -> str:
+    """How many of the known actions an event of the same name overlaps, and which are missed."""
+    from indexing.report.measures import missed
+
+    lost = [(result, event) for result in results for event in missed(result)]
+    known = sum(len(result.truth or ()) for result in results)
+    named = ", ".join(f"{label} at {start:.2f} to {end:.2f} s" for _, (label, start, end) in lost[:5])
+    more = f" and {len(lost) - 5} more" if len(lost) > 5 else ""
+    return f"{known - len(lost)} of {count(known, 'known action')} found" + (f"; missed: {named}{more}" if lost else "")

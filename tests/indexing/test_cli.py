@@ -223,6 +223,7 @@ def test_scan_prints_hits_and_writes_the_report(run, tmp_path: Path) -> None:
     rows = list(csv.DictReader((folder / "events.csv").open()))
     assert rows and {row["label"] for row in rows} <= set(ACTIONS)
     measured = json.loads((folder / "metrics.json").read_text())
+    assert f"{3 - measured['missed_events']} of 3 known actions found" in out
     assert measured["known_events"] == 3 and 0.5 < measured["frame_accuracy"] <= 1
     assert "assumed" in measured["notes"][0]
     made = json.loads((folder / "manifest.json").read_text())
