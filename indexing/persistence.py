@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 FORMAT = "dyntorch.action-indexer"
 VERSION = 1
-PLAIN = ("labels", "symmetry", "mirrored", "weights", "hub", "moment_hub", "evidence_out", "evidence_in")  # tensors as they are
+PLAIN = ("labels", "symmetry", "mirrored", "weights", "hub", "moment_hub", "evidence_out")  # tensors as they are
 SAVED = "fit on the clips again and save with this version"
 
 Indexer = TypeVar("Indexer", bound="ActionIndexer")
@@ -51,6 +51,7 @@ def save(indexer: ActionIndexer, path: str | Path) -> None:
         "classes": {"values": classes.tolist(), "dtype": classes.dtype.str},
         "joints": indexer.n_joints_,
         "view": indexer.model_.view,
+        "scorer": indexer.model_.scorer,
         "skeleton": None if skeleton is None else [skeleton.name, list(skeleton.joints), [list(b) for b in skeleton.bones]],
     }
     try:
@@ -88,7 +89,7 @@ def load(kind: type[Indexer], path: str | Path, device: str = "cpu") -> Indexer:
         indexer.n_joints_ = int(metadata["joints"])
         name, joints, bones = metadata["skeleton"] or (None, (), ())
         indexer.skeleton_ = Skeleton(name, tuple(joints), tuple((a, b) for a, b in bones)) if name is not None else None
-        indexer.model_ = _model(tensors, len(indexer.classes_), metadata["view"])
+        indexer.model_ = _model(tensors, len(indexer.classes_), metadata["view"], metadata["scorer"])
         check_parameters(indexer)
         _check_fit(indexer)
         indexer._calibrate()
@@ -109,10 +110,11 @@ def _check_fit(indexer: ActionIndexer) -> None:
         "metric": model.metric.covariance.shape == (len(CHANNELS), joints, joints),
         "weights": len(model.weights) == len(NEAREST),
         "view": model.view == indexer.view,
+        "scorer": model.scorer in ("nearest", "kernel", "both") and (model.machine is None) == (model.scorer == "nearest"),
     }
     for name, windows in (("crops", parts.crops), ("views", parts.views), ("moments", parts.moments)):
         fine[name] = len(windows.values) == len(windows.seen) and (name == "moments" or len(windows) % count == 0)
-    fine |= {name: len(getattr(model, name)) == count for name in ("hub", "mirrored", "evidence_out", "evidence_in")}
+    fine |= {name: len(getattr(model, name)) == count for name in ("hub", "mirrored", "evidence_out")}
     values = (parts.crops.values, parts.views.values, parts.moments.values)
     for name, value in (
         ("metric", model.metric.covariance),
@@ -122,7 +124,7 @@ def _check_fit(indexer: ActionIndexer) -> None:
     ):
         fine[name] = fine.get(name, True) and bool(value.isfinite().all())
     fine["windows"] = all(bool(value.isfinite().all()) for value in values)
-    fine["evidence"] = not bool(torch.cat([model.evidence_in, model.evidence_out]).isnan().any())
+    fine["evidence"] = not bool(model.evidence_out.isnan().any())
     if model.machine is not None:
         machine, pairs = model.machine, model.classes * (model.classes - 1) // 2
         fine["machine.counts"] = len(machine.counts) == model.classes and int(machine.counts.sum()) == len(machine.support)
@@ -161,7 +163,7 @@ def _windows(name: str, windows: Windows) -> dict[str, Tensor]:
     return {f"{name}.values": windows.values, f"{name}.seen": windows.seen}
 
 
-def _model(tensors: dict[str, Tensor], classes: int, view: str) -> ShapeModel:
+def _model(tensors: dict[str, Tensor], classes: int, view: str, scorer: str) -> ShapeModel:
     def windows(name: str) -> Windows:
         return Windows(tensors[f"{name}.values"], tensors[f"{name}.seen"])
 
@@ -175,6 +177,7 @@ def _model(tensors: dict[str, Tensor], classes: int, view: str) -> ShapeModel:
         exemplars=exemplars,
         classes=classes,
         view=view,
+        scorer=scorer,
         metric=metric,
         kernels=kernels,
         support=windows("support") if trained else None,

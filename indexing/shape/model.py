@@ -28,7 +28,7 @@ MOMENT_TERMS = ("epi", "nn")  # on short windows what is bound to the view helps
 MOMENT_SAMPLE = 500  # short windows whose closeness to others sets the hub shares
 BALANCE = 1.5  # weight of A against B after standardizing over classes; 1 .. 2 differ by 1 %
 BALANCE_SOLID = 0.5  # the same for exemplars with depth: B then sees true views (1.5: -1.5 % on Florence3D, UTKinect +-0)
-KERNEL_WHITENING = 0.0
+KERNEL_WHITENING = 0.0  # power of the joint metric of B: .15 gives UTKinect +1 %, takes 1 % from Florence3D
 ROWS, ROWS_SOLID = 3000, 5000  # training rows of B at most (its fit grows with their square); true views are worth more
 
 
@@ -40,6 +40,7 @@ class ShapeModel:
     labels: Tensor
     classes: int
     view: str
+    scorer: str  # "nearest" (A), "kernel" (B) or "both"
     metric: JointMetric
     symmetry: Tensor | None  # joint permutation of the mirror image, or None
     mirrored: Tensor  # (N,) which exemplars also count mirrored
@@ -50,7 +51,6 @@ class ShapeModel:
     support: Windows | None  # windows behind the machine's support rows
     machine: PairwiseMachine | None
     evidence_out: Tensor = field(default_factory=lambda: torch.zeros(0))  # (N,) best evidence for a wrong class
-    evidence_in: Tensor = field(default_factory=lambda: torch.zeros(0))  # (N,) leave-one-out evidence for the own class
 
     def to(self, device: str | torch.device) -> ShapeModel:
         """The model on another device."""
@@ -94,9 +94,9 @@ class ShapeModel:
 
     def scores(self, query: Windows) -> Tensor:
         """``(Q, classes)`` larger is better: A, B or their sum, standardized over the classes of each query."""
-        if self.machine is None:
+        if self.scorer == "nearest":
             return self.nearest_scores(query)
-        if self.view == "same":
+        if self.scorer == "kernel":
             return self.machine_scores(query)
         share = float(self.exemplars.solid.float().mean())
         balance = share * BALANCE_SOLID + (1 - share) * BALANCE
@@ -153,7 +153,7 @@ def learn(
     weights = torch.ones(len(NEAREST))
     none = torch.zeros(len(labels), dtype=torch.bool)
     model = ShapeModel(
-        exemplars, labels, classes, view, metric, symmetry, none, weights,
+        exemplars, labels, classes, view, scorer, metric, symmetry, none, weights,
         torch.zeros(len(labels)), torch.zeros(len(exemplars.owner)), None, None, None,
     )  # fmt: skip
     if symmetry is not None:
@@ -197,15 +197,10 @@ def _mirror_is_same_action(model: ShapeModel, originals: Windows) -> Tensor:
 
 
 def _with_hubs(model: ShapeModel, originals: Windows) -> ShapeModel:
-    """Measure, among the exemplars, how close each is to other classes, and the evidence that leave-one-out gives."""
-    between_raw = model.residuals(originals)
-    hub = _hub(between_raw, model.labels, model.labels)
-    between = between_raw - hub
-    between.fill_diagonal_(torch.inf)
-    scores = class_scores(between, model.labels, model.classes)
-    own = torch.nn.functional.one_hot(model.labels, model.classes).bool()
-    # an exemplar alone in its class has no leave-one-out evidence (its only residual is its own, taken out)
-    model = _replace(model, hub=hub, evidence_out=_foreign_evidence(between_raw, model), evidence_in=scores[own])
+    """Measure, among the exemplars, how close each is to other classes, and the evidence that wrong classes reach."""
+    residual = model.residuals(originals)
+    hub = _hub(residual, model.labels, model.labels)
+    model = _replace(model, hub=hub, evidence_out=_foreign_evidence(residual, model))
     sample = torch.arange(0, len(model.exemplars.moments), max(1, len(model.exemplars.moments) // MOMENT_SAMPLE))
     labels = model.labels[model.exemplars.owner]
     return _replace(model, moment_hub=_hub(model.moment_residuals(model.exemplars.moments[sample]), labels[sample], labels))

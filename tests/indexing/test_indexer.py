@@ -28,6 +28,17 @@ def test_one_example_recognizes_other_people_from_other_viewpoints(indexer, less
     assert accuracy > view_bound + 0.05
 
 
+def test_each_scorer_is_what_it_says(lesson, others):
+    from indexing.shape.bank import Windows
+
+    both = ActionIndexer().fit(lesson)
+    for name, scores in (("nearest", both.model_.nearest_scores), ("kernel", both.model_.machine_scores)):
+        alone = ActionIndexer(scorer=name).fit(lesson)
+        query: Windows = alone._queries(others)
+        np.testing.assert_allclose(alone.decision_function(others), scores(query).numpy(), atol=1e-4)
+        assert not np.allclose(alone.decision_function(others), both.decision_function(others))
+
+
 @pytest.mark.parametrize("scorer", ["nearest", "kernel"])
 def test_each_scorer_alone(scorer, lesson, others):
     assert ActionIndexer(scorer=scorer).fit(lesson).score(others, others.labels) > 0.88
