@@ -11,17 +11,44 @@ from typing import Any
 __version__ = "0.1.0"
 
 _HOME = {
+    # invariants: what is measured, and the tensor behind it
+    "Collineation": "dyntorch.invariants.collineation",
+    "FundamentalMatrix": "dyntorch.invariants.fundamental_matrix",
+    "HomographyTensor": "dyntorch.invariants.homography_tensor",
+    "DualHomographyTensor": "dyntorch.invariants.dual_homography_tensor",
+    "JoinTensor": "dyntorch.invariants.join_tensor",
+    "MinimalJoinTensor": "dyntorch.invariants.minimal_join_tensor",
+    "ConstantVelocityTensor": "dyntorch.invariants.constant_velocity_tensor",
+    "TranslatingLinesMatrix": "dyntorch.invariants.translating_lines_matrix",
+    "Invariant": "dyntorch.invariant",
+    # from matches to the tensor and its motion
+    "null_space": "dyntorch.nullspace",
+    "fit": "dyntorch.fitting",
+    "robust_fit": "dyntorch.robust",
+    "refine": "dyntorch.refinement",
+    "sampson": "dyntorch.residual",
+    "algebraic": "dyntorch.residual",
+    "Solution": "dyntorch.solution",
+    "Status": "dyntorch.solution",
+    # tasks
+    "align_planar": "dyntorch.tasks.align",
+    "align_points": "dyntorch.tasks.align",
+    "align_lines": "dyntorch.tasks.align",
+    # subspaces and factorization
     "canonical_correlation": "dyntorch.algebra.subspaces",
     "orthonormal_basis": "dyntorch.algebra.subspaces",
     "affine_factorization": "dyntorch.algebra.factorization",
     "metric_upgrade": "dyntorch.algebra.factorization",
 }
-__all__ = sorted(_HOME)
+_MODULES = ("counting",)
+__all__ = sorted([*_HOME, *_MODULES])
 
 
 def __getattr__(name: str) -> Any:
     if name in _HOME:
         return getattr(import_module(_HOME[name]), name)
+    if name in _MODULES:
+        return import_module(f"dyntorch.{name}")
     raise AttributeError(f"module 'dyntorch' has no attribute {name!r}")
 
 

@@ -19,6 +19,7 @@ from typing import Annotated, Any, Protocol, cast
 import tyro
 
 from indexing.cli.console import complain, one_line
+from indexing.cli.count import Count
 from indexing.cli.demo import Demo
 from indexing.cli.evaluate import Evaluate
 from indexing.cli.fit import Fit
@@ -31,7 +32,8 @@ INDEX: Any = Annotated[Fit, Command("fit")] | Annotated[Scan, Command("scan")] |
 COMMANDS: Any = (
     Annotated[Demo, Command("demo")]
     | Annotated[INDEX, Command("index", description="Learn actions from one clip each and find them elsewhere.")]
-)  # next: sync, segment, align, count
+    | Annotated[Count, Command("count")]
+)  # next: sync, segment, align
 GROUPS = ("index",)  # words that need another one behind them
 DESCRIPTION = """Learn actions from one clip each and find them in other clips, from other viewpoints.
 

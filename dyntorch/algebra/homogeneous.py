@@ -1,0 +1,192 @@
+"""Homogeneous coordinates, to and from them without NaN; collineations, their canonical scale and sign; hyperplanes of a point."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def homogeneous(x: Tensor) -> Tensor:
+    r"""Append the coordinate 1: :math:`p = (x, 1)`.
+
+    Args:
+        x: ``(..., d)`` inhomogeneous points, in any unit.
+
+    Returns:
+        ``(..., d + 1)``.
+
+    Example:
+        >>> import torch
+        >>> homogeneous(torch.tensor([2.0, 3.0])).tolist()
+        [2.0, 3.0, 1.0]
+    """
+    return torch.cat([x, torch.ones_like(x[..., :1])], dim=-1)
+
+
+def inhomogeneous(p: Tensor) -> Tensor:
+    r"""Divide by the last coordinate: :math:`x = (p_1, \dots, p_d) / p_{d+1}`, with finite values and gradients everywhere.
+
+    A point at infinity, :math:`|p_{d+1}| \le \epsilon \max_i |p_i|` with the precision :math:`\epsilon` of the dtype, is put
+    where its direction meets the distance :math:`1/\epsilon`; its value then does not depend on :math:`p_{d+1}` (gradient
+    0).  The zero vector, which is no point at all, gives 0.  So one bad point of a batch never spoils a gradient of another.
+
+    Args:
+        p: ``(..., d + 1)`` homogeneous points of any scale and sign.
+
+    Returns:
+        ``(..., d)``, no coordinate above :math:`1/\epsilon` for finite input.
+
+    Example:
+        >>> import torch
+        >>> inhomogeneous(torch.tensor([4.0, 6.0, 2.0])).tolist()
+        [2.0, 3.0]
+        >>> bool(inhomogeneous(torch.tensor([4.0, 6.0, 0.0])).isfinite().all())
+        True
+    """
+    w = p[..., -1:]
+    with torch.no_grad():
+        floor = torch.finfo(p.dtype).eps * p.abs().amax(dim=-1, keepdim=True)
+        far = w.abs() <= floor
+        limit = torch.where(floor > 0, torch.copysign(floor, w), torch.ones_like(floor))
+    return p[..., :-1] / torch.where(far, limit, w)
+
+
+def apply(collineation: Tensor, points: Tensor) -> Tensor:
+    r"""Map points by a collineation or a projection and return them inhomogeneous: :math:`\pi(A (x, 1))`.
+
+    Args:
+        collineation: ``(*batch, e, d + 1)`` of any scale and sign.
+        points: ``(*batch, n, d)``.
+
+    Returns:
+        ``(*batch, n, e - 1)``; images at infinity as in :func:`inhomogeneous`.
+
+    Raises:
+        ValueError: the matrix does not take ``d + 1`` coordinates.
+
+    Example:
+        >>> import torch
+        >>> shift = torch.tensor([[1.0, 0.0, 5.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+        >>> apply(shift, torch.tensor([[1.0, 2.0]])).tolist()
+        [[6.0, 2.0]]
+    """
+    d = points.shape[-1]
+    if points.ndim < 2 or collineation.ndim < 2 or collineation.shape[-1] != d + 1:
+        raise ValueError(
+            f"collineation must be (*batch, e, d + 1) for points (*batch, n, d), "
+            f"got {tuple(collineation.shape)} for {tuple(points.shape)}"
+        )
+    # the last column is the image of the appended 1: adding it saves the copy that homogeneous() makes
+    return inhomogeneous(points @ collineation[..., :d].mT + collineation[..., None, :, d])
+
+
+def unit(matrix: Tensor) -> Tensor:
+    r"""The canonical representative of a matrix up to scale: :math:`\|A\|_F = 1` and a fixed sign.
+
+    A square matrix of odd size is given a positive determinant; every other one, and one that is singular to working
+    precision, a positive entry of largest magnitude.  (With even size the sign of the determinant does not depend on the
+    scale, so it cannot fix the sign.)  The zero matrix is returned unchanged.
+
+    Args:
+        matrix: ``(*batch, rows, columns)``.
+
+    Returns:
+        ``(*batch, rows, columns)``.
+
+    Raises:
+        ValueError: fewer than two dimensions.
+
+    Example:
+        >>> import torch
+        >>> unit(-3 * torch.eye(4)).diagonal().tolist()
+        [0.5, 0.5, 0.5, 0.5]
+    """
+    if matrix.ndim < 2:
+        raise ValueError(f"matrix must be (*batch, rows, columns), got {tuple(matrix.shape)}; unsqueeze a vector first")
+    norm = torch.linalg.matrix_norm(matrix, keepdim=True)
+    scaled = matrix / torch.where(norm > 0, norm, torch.ones_like(norm))
+    return scaled * _sign(scaled.detach())
+
+
+def _sign(matrix: Tensor) -> Tensor:
+    """``(*batch, 1, 1)`` sign, +1 or -1, that makes a matrix of norm 1 canonical."""
+    flat = matrix.flatten(-2)
+    leading = flat.gather(-1, flat.abs().argmax(dim=-1, keepdim=True))
+    rows, columns = matrix.shape[-2:]
+    if rows == columns and rows % 2:
+        det = torch.linalg.det(matrix)[..., None]
+        # Hadamard's bounds, by rows and by columns, are the size that the rounding error of the determinant is relative to
+        bound = torch.minimum(matrix.norm(dim=-1).prod(dim=-1), matrix.norm(dim=-2).prod(dim=-1))[..., None]
+        leading = torch.where(det.abs() > 10 * torch.finfo(matrix.dtype).eps * bound, det, leading)
+    return torch.where(leading < 0, -1.0, 1.0).to(matrix.dtype)[..., None]
+
+
+def skew(v: Tensor) -> Tensor:
+    r"""The matrix of the cross product: :math:`[v]_\times w = v \times w`.
+
+    Args:
+        v: ``(*batch, 3)``.
+
+    Returns:
+        ``(*batch, 3, 3)``.
+
+    Raises:
+        ValueError: the last dimension is not 3.
+
+    Example:
+        >>> import torch
+        >>> (skew(torch.tensor([0.0, 0.0, 1.0])) @ torch.tensor([1.0, 0.0, 0.0])).tolist()
+        [0.0, 1.0, 0.0]
+    """
+    if v.shape[-1:] != (3,):
+        raise ValueError(f"v must be (*batch, 3), got {tuple(v.shape)}")
+    x, y, z = v.unbind(-1)
+    o = torch.zeros_like(x)
+    return torch.stack([o, -z, y, z, o, -x, -y, x, o], dim=-1).unflatten(-1, (3, 3))
+
+
+def similarity(scale: Tensor, centre: Tensor) -> Tensor:
+    r"""The similarity :math:`x \mapsto s\,(x - c)` as a collineation: it moves the centre to the origin, then scales.
+
+    Args:
+        scale: ``(*batch,)``.
+        centre: ``(*batch, d)``.
+
+    Returns:
+        ``(*batch, d + 1, d + 1)``, last row ``(0, ..., 0, 1)``.
+
+    Example:
+        >>> import torch
+        >>> apply(similarity(torch.tensor(2.0), torch.tensor([1.0, 1.0])), torch.tensor([[3.0, 1.0]])).tolist()
+        [[4.0, 0.0]]
+    """
+    d = centre.shape[-1]
+    eye = torch.eye(d + 1, dtype=centre.dtype, device=centre.device)
+    upper = torch.cat([eye[:d, :d].expand(*centre.shape, d), -centre[..., None]], dim=-1) * scale[..., None, None]
+    return torch.cat([upper, eye[d:].expand(*upper.shape[:-2], 1, d + 1)], dim=-2)
+
+
+def hyperplanes_through(x: Tensor) -> Tensor:
+    r"""Orthonormal basis of the hyperplanes through each point: :math:`N (x, 1) = 0`, :math:`N N^T = I`.
+
+    The Householder reflection that takes the homogeneous point to the last axis, without its last row:
+
+    .. math:: N = \left[\, I - \frac{x x^T}{s (s + 1)} \;\Big|\; -\frac{x}{s} \,\right], \qquad s = \sqrt{1 + \|x\|^2}.
+
+    It is smooth in x everywhere, which a basis from an SVD is not.
+
+    Args:
+        x: ``(*batch, n, d)``; conditioned best where the coordinates are of order 1.
+
+    Returns:
+        ``(*batch, n, d, d + 1)``: ``d`` hyperplanes per point.
+
+    Example:
+        >>> import torch
+        >>> hyperplanes_through(torch.zeros(1, 2)).abs().tolist()
+        [[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]]
+    """
+    s = (1 + x.square().sum(-1, keepdim=True)).sqrt()
+    eye = torch.eye(x.shape[-1], dtype=x.dtype, device=x.device)
+    outer = (x / s)[..., :, None] * (x / (s + 1))[..., None, :]
+    return torch.cat([eye - outer, -(x / s)[..., None]], dim=-1)

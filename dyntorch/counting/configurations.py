@@ -1,0 +1,225 @@
+"""Configurations of the invariants by name: which matches each takes, in which order, and the rows they give.
+
+A configuration is a function of a field and of the numbers of matches of each kind.  Its first keyword, whose default is None,
+is the kind that it is usually estimated from; None takes as many as raise the rank.  It returns its steps with that kind last.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from dyntorch.counting.field import Field, IntArray
+from dyntorch.counting.views import Measure, Views
+
+
+@dataclass(frozen=True)
+class Step:
+    """Matches of one kind.
+
+    Args:
+        kind: its name.
+        matches: how many; None: as many as raise the rank.
+        draw: gives the rows ``(rows, width)`` of the next match.
+        constraint: these rows hold without any match.
+        patience: matches in a row that add nothing before no more are drawn; in general position the first one tells.
+    """
+
+    kind: str
+    matches: int | None
+    draw: Callable[[], IntArray]
+    constraint: bool = False
+    patience: int = 20
+
+
+Configuration = Callable[..., list[Step]]
+
+
+def homography(
+    field: Field, *, moving: int | None = None, static: int = 0, labelled_static: int = 0, lines: Sequence[int] = (),
+    static_lines: Sequence[int] = (),
+) -> list[Step]:  # fmt: skip
+    """Points of a plane that move along straight lines, three views: homography tensor, 3x3x3."""
+    return _moving_points(Views(field, 2, (2, 2, 2), ("join",) * 3), moving, static, labelled_static, lines, static_lines)
+
+
+def dual_homography(
+    field: Field, *, moving: int | None = None, static: int = 0, labelled_static: int = 0, static_points: int = 0
+) -> list[Step]:
+    """Lines of a plane that meet in a point, three views: dual homography tensor, 3x3x3."""
+    dual = Views(field, 2, (2, 2, 2), ("join",) * 3)  # of the dual plane: its points are lines, its lines are pencils
+    return [
+        Step("static point", static_points, lambda: dual.filled(dual.extensor(2))),
+        *_moving_points(dual, moving, static, labelled_static, (), ()),
+    ]
+
+
+def join(
+    field: Field, *, moving: int | None = None, static: int = 0, labelled_static: int = 0, lines: Sequence[int] = (),
+    static_lines: Sequence[int] = (),
+) -> list[Step]:  # fmt: skip
+    """3D points that move along straight lines, three poses: join tensors, 4x4x4."""
+    return _moving_points(Views(field, 3, (3, 3, 3), ("join",) * 3), moving, static, labelled_static, lines, static_lines)
+
+
+def minimal_join(
+    field: Field, *, moving: int | None = None, static: int = 0, labelled_static: int = 0, lines: Sequence[int] = (),
+    static_lines: Sequence[int] = (),
+) -> list[Step]:  # fmt: skip
+    """3D points that move along straight lines, the third pose through a camera: minimal join tensor, 4x4x3."""
+    return _moving_points(Views(field, 3, (3, 3, 2), ("join",) * 3), moving, static, labelled_static, lines, static_lines)
+
+
+def constant_velocity(
+    field: Field, *, moving: int | None = None, static: int = 0, equal_velocity: int = 0, linear_velocity: int = 0,
+    planar_velocity: int = 0,
+) -> list[Step]:  # fmt: skip
+    """3D points with constant velocities, three poses: constant velocity tensor, 4x4x4."""
+    return _velocities(field, 4, moving, static, equal_velocity, linear_velocity, planar_velocity)
+
+
+def constant_velocity_3x4x4(
+    field: Field, *, moving: int | None = None, static: int = 0, equal_velocity: int = 0, linear_velocity: int = 0,
+    planar_velocity: int = 0,
+) -> list[Step]:  # fmt: skip
+    """3D points with constant velocities, the third pose through a camera: constant velocity tensor, 3x4x4."""
+    return _velocities(field, 3, moving, static, equal_velocity, linear_velocity, planar_velocity)
+
+
+def lines(
+    field: Field, *, moving: int | None = None, translating: int = 0, static: int = 0, objects: Sequence[int] = (),
+    static_points: int = 0,
+) -> list[Step]:  # fmt: skip
+    """3D lines that move within planes, two poses: translating lines matrix, 6x6."""
+    space = Views(field, 3, (3, 3), ("join", "join"))
+
+    def direction() -> IntArray:
+        return np.append(field.random(3), 0)
+
+    def translated(shift: IntArray) -> IntArray:
+        before = np.hstack([field.random(2, 3), np.ones((2, 1), dtype=np.int64)])
+        return field.kron(*space.images([before, before + shift]))
+
+    def static_point() -> IntArray:
+        # every line through a point in one view matches every line through it in the other
+        seen = [field.product(camera, point) for point in space.extensor(1) for camera in space.cameras]
+        stars = [[field.join([point, corner]) for corner in np.eye(4, dtype=np.int64)] for point in seen]
+        return field.kron(*stars)
+
+    def rigid(shift: IntArray) -> Callable[[], IntArray]:
+        return lambda: translated(shift)
+
+    return [
+        Step("static point", static_points, static_point),
+        Step("static", static, lambda: space.fixed(space.extensor(2))),
+        *(Step("object", number, rigid(direction())) for number in objects),
+        Step("translating", translating, lambda: translated(direction())),
+        Step("moving", moving, lambda: space.moving(space.extensor(3), 2)),
+    ]
+
+
+def fundamental(field: Field, *, static: int | None = None, coplanar: int = 0) -> list[Step]:
+    """Points, two views: fundamental matrix, 3x3."""
+    return _static_points(Views(field, 3, (2, 2), ("join", "join")), static, coplanar)
+
+
+def trifocal(field: Field, *, static: int | None = None, coplanar: int = 0) -> list[Step]:
+    """A point in one view, lines through it in two others: trifocal tensor, 3x3x3."""
+    return _static_points(Views(field, 3, (2, 2, 2), ("join", "hyper", "hyper")), static, coplanar)
+
+
+def quadrifocal(field: Field, *, static: int | None = None, coplanar: int = 0) -> list[Step]:
+    """Lines through a point in each of four views: quadrifocal tensor, 3x3x3x3."""
+    return _static_points(Views(field, 3, (2, 2, 2, 2), ("hyper",) * 4), static, coplanar)
+
+
+def shape_tensor(field: Field, *, images: int | None = None, synthetic: bool = False) -> list[Step]:
+    """Images of 8 points, 4 of them coplanar; each is a match: shape tensor, 3x3x3x3."""
+    points = field.random(4, 4)
+
+    def image() -> IntArray:
+        *shift, scale = field.random(4).tolist()  # the camera is (scale I | shift) once the coplanar points are the basis
+        seen = scale * points[:, :3] % field.prime + points[:, 3:] * np.array(shift) % field.prime
+        return field.kron(*(field.null(point) for point in seen))
+
+    def concurrent() -> IntArray:
+        lines = (field.null(field.random(3)) for _ in range(81))
+        return np.vstack([field.kron(*field.product(field.random(4, 2), pencil)) for pencil in lines])
+
+    return [Step("synthetic", int(synthetic), concurrent, constraint=True), Step("image", images, image)]
+
+
+def by_numbers(
+    field: Field, *, k: int, views: Sequence[int], m: int = 1, r: int = 1, measure: Measure | Sequence[Measure] = "join",
+    matches: int | None = None,
+) -> list[Step]:  # fmt: skip
+    """Primitives of ``m`` points, anywhere within extensors of ``r`` points of ``P^k``, seen in views ``P^l``."""
+    kinds = (measure,) * len(views) if isinstance(measure, str) else tuple(measure)
+    if not views:
+        raise ValueError("views is empty; give the projective dimension of each view, such as [2, 2, 2]")
+    if len(kinds) != len(views) or set(kinds) - {"join", "hyper"}:
+        raise ValueError(f"measure must be join or hyper, one word or one for each of {len(views)} views, got {measure!r}")
+    if not 1 <= m <= r <= k + 1:
+        raise ValueError(
+            f"expected 1 <= m <= r <= k + 1, got m = {m}, r = {r}, k = {k}: m points lie within an extensor of r points"
+        )
+    for size, kind in zip(views, kinds, strict=True):
+        if m > size + (kind == "join"):
+            raise ValueError(f"{m} points have no {kind} in a view of dimension {size}; views must be larger or m smaller")
+    space = Views(field, k, views, kinds)
+    return [Step("general", matches, lambda: space.moving(space.extensor(r), m))]
+
+
+CONFIGURATIONS: dict[str, Configuration] = {
+    function.__name__: function
+    for function in (
+        homography, dual_homography, join, minimal_join, constant_velocity, constant_velocity_3x4x4, lines, fundamental, trifocal,
+        quadrifocal, shape_tensor,
+    )
+}  # fmt: skip
+
+
+def _moving_points(
+    views: Views, moving: int | None, static: int, labelled_static: int, lines: Sequence[int], static_lines: Sequence[int]
+) -> list[Step]:
+    def on(line: IntArray) -> Callable[[], IntArray]:
+        return lambda: views.moving(line)
+
+    def fixed_on(line: IntArray) -> Callable[[], IntArray]:
+        return lambda: views.fixed(views.within(line))
+
+    return [
+        Step("labelled static", labelled_static, lambda: views.labelled(views.extensor(1))),
+        Step("static", static, lambda: views.fixed(views.extensor(1))),
+        *(Step("static line", number, fixed_on(views.extensor(2))) for number in static_lines),
+        *(Step("line", number, on(views.extensor(2))) for number in lines),
+        Step("moving", moving, lambda: views.moving(views.extensor(2))),
+    ]
+
+
+def _velocities(field: Field, third: int, moving: int | None, static: int, equal: int, linear: int, planar: int) -> list[Step]:
+    poses = [field.random(4, 4), field.random(4, 4), field.random(third, 4)]
+    common, plane = field.random(1, 3), field.random(2, 3)
+
+    def match(velocity: IntArray) -> IntArray:
+        start, step = np.append(field.random(3), 1), np.append(velocity, 0)
+        first, second, last = (field.product(pose, start + time * step) for time, pose in enumerate(poses))
+        return field.kron(first, second, field.null(last))
+
+    return [
+        Step("static", static, lambda: match(np.zeros(3, dtype=np.int64))),
+        Step("equal velocity", equal, lambda: match(common[0])),
+        Step("linear velocity", linear, lambda: match(field.product(field.random(1), common))),
+        Step("planar velocity", planar, lambda: match(field.product(field.random(2), plane))),
+        Step("moving", moving, lambda: match(field.random(3))),
+    ]
+
+
+def _static_points(views: Views, static: int | None, coplanar: int) -> list[Step]:
+    plane = views.extensor(3)
+    return [
+        Step("coplanar", coplanar, lambda: views.fixed(views.within(plane))),
+        Step("static", static, lambda: views.fixed(views.extensor(1))),
+    ]

@@ -1,0 +1,64 @@
+"""Views of a projective space, and the rows that geometric primitives in it give to an estimation matrix."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+
+from dyntorch.counting.field import Field, IntArray
+
+Measure = Literal["join", "hyper"]
+
+
+class Views:
+    r"""Random projections :math:`P^k \to P^{l_v}`, and what is measured in each.
+
+    Primitives are given as the points that span them, ``(m, k + 1)``.  A view measures either their ``join``, the Pluecker
+    coordinates of their extensor (a point stays a point), or every ``hyper`` plane that contains them.
+
+    Args:
+        field: where random elements come from.
+        k: projective dimension of the space.
+        views: projective dimensions ``l_v`` of the views.
+        measure: ``"join"`` or ``"hyper"`` per view.
+    """
+
+    def __init__(self, field: Field, k: int, views: Sequence[int], measure: Sequence[Measure]) -> None:
+        self.field, self.k, self.measure = field, k, tuple(measure)
+        self.cameras = [field.random(size + 1, k + 1) for size in views]
+
+    def extensor(self, step: int) -> IntArray:
+        """Random points, one per row, that span an extensor of this step."""
+        return self.field.random(step, self.k + 1)
+
+    def within(self, extensor: IntArray, number: int = 1) -> IntArray:
+        """Random points inside an extensor."""
+        return self.field.product(self.field.random(number, len(extensor)), extensor)
+
+    def images(self, primitives: Sequence[IntArray]) -> list[IntArray]:
+        """What each view measures of its primitive: one row (``join``), or several (``hyper``)."""
+        seen = [self.field.product(points, camera.T) for points, camera in zip(primitives, self.cameras, strict=True)]
+        return [
+            self.field.join(points)[None] if kind == "join" else self.field.null(points)
+            for points, kind in zip(seen, self.measure, strict=True)
+        ]
+
+    def fixed(self, primitive: IntArray) -> IntArray:
+        """Rows of a primitive that does not move."""
+        return self.field.kron(*self.images([primitive] * len(self.cameras)))
+
+    def moving(self, extensor: IntArray, number: int = 1) -> IntArray:
+        """Rows of a primitive spanned by this number of points that are anywhere within an extensor, in every view anew."""
+        return self.field.kron(*self.images([self.within(extensor, number) for _ in self.cameras]))
+
+    def labelled(self, primitive: IntArray) -> IntArray:
+        """Rows of a primitive that is known not to move: any measurement of one view completes those of the others."""
+        seen = self.images([primitive] * len(self.cameras))
+        free = [np.eye(image.shape[1], dtype=np.int64) for image in seen]
+        return np.vstack([self.field.kron(*seen[:view], free[view], *seen[view + 1 :]) for view in range(len(seen))])
+
+    def filled(self, extensor: IntArray) -> IntArray:
+        """Rows of an extensor, any point of which matches any other."""
+        return self.field.kron(*(self.field.product(extensor, camera.T) for camera in self.cameras))

@@ -1,0 +1,177 @@
+"""Eigenspaces of the smallest eigenvalues of many small Gram matrices, with a certificate, and their reduced resolvent.
+
+Everything here takes ``(b, D, D)`` float64 matrices scaled to trace 1 and has the vectors as columns.  A decision that looks
+at values is made on the CPU only: on an accelerator it would wait for everything queued before it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+
+EPS = torch.finfo(torch.float64).eps
+ANGLE = 1e-11  # that an accepted eigenspace may be off by, rounding of the Gram apart
+NULL = 1e-14  # of the largest eigenvalue: below it a Gram holds rounding only (rank defects 1e-17 ... 2e-15, kappa 1e6 1e-12)
+RESOLVED = 1e-11  # of the trace: a competing eigenvalue that inverse iteration still tells from rounding
+
+
+@dataclass(frozen=True)
+class Eigenspace:
+    """Ritz vectors of the smallest eigenvalues, ascending, and whether to believe them."""
+
+    vectors: Tensor  # (b, D, k)
+    values: Tensor  # (b, k)
+    competing: Tensor  # (b,) estimate of the next eigenvalue, from above and rarely by more than a factor of two
+    certified: Tensor  # (b,) no smaller eigenvalue was missed, and the angle is below ANGLE
+    factor: Tensor  # (b, D, D) lower Cholesky factor of G + D eps I
+    deflated: Tensor  # (b, D, D) lower Cholesky factor of G - shift I + V V^T
+
+
+def on_host(tensor: Tensor) -> bool:
+    """Whether a decision may look at values."""
+    return tensor.device.type == "cpu"
+
+
+def unit_trace(gram: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Gram matrices scaled to trace 1, the factor ``(b,)`` applied, and which were finite; the others become I / D."""
+    trace = gram.diagonal(dim1=-2, dim2=-1).sum(-1)
+    scale = trace.clamp(min=1e-300).reciprocal()
+    finite = torch.isfinite(gram.sum((-2, -1))) & torch.isfinite(trace)
+    scaled = gram * scale[:, None, None]
+    if not on_host(gram) or not bool(finite.all()):
+        eye = torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device) / gram.shape[-1]
+        scaled = torch.where(finite[:, None, None], scaled, eye)
+        scale = torch.where(finite, scale, torch.ones_like(scale))
+    return scaled, scale, finite
+
+
+def orthonormal(columns: Tensor) -> Tensor:
+    """Orthonormal columns with the same span."""
+    return torch.linalg.qr(columns).Q
+
+
+def fix_signs(vectors: Tensor) -> Tensor:
+    """Columns turned to the side of a generic direction (a largest entry would be a tie in skew-symmetric tensors)."""
+    product = _generic(vectors.shape[-2], 1).to(vectors.device).T @ vectors
+    return torch.where(product < 0, -vectors, vectors)
+
+
+@lru_cache(maxsize=64)
+def _generic(size: int, count: int) -> Tensor:
+    """``(size, count)`` fixed directions without symmetry."""
+    with torch.inference_mode(False):
+        index = torch.arange(1, size * count + 1, dtype=torch.float64)
+        return (torch.frac(index * 0.6180339887498949) + 0.1 * torch.cos(index**2) - 0.5).reshape(count, size).T.contiguous()
+
+
+def by_inverse_iteration(gram: Tensor, dim: int) -> Eigenspace:
+    r"""Subspace iteration with :math:`(G + \mu I)^{-1}`, then Newton corrections with a certificate.
+
+    One vector more than ``dim`` is carried along: its Ritz value estimates the next eigenvalue.  With the largest Ritz value
+    :math:`\sigma` of the ``dim`` others, a successful Cholesky factorization of :math:`S = G - \sigma I + V V^T` proves that
+    no more than ``dim`` eigenvalues are below :math:`\sigma`, and :math:`V - S^{-1}(G V - V V^T G V)` contracts the error by
+    :math:`|\sigma - \rho_j| / (\lambda_{dim+1} - \sigma)`, which for one vector is the square of the error before.
+
+    Args:
+        gram: ``(b, D, D)`` symmetric, finite, trace 1.
+        dim: below D.
+    """
+    size, host = gram.shape[-1], on_host(gram)
+    factor, indefinite = torch.linalg.cholesky_ex(_shifted(gram.clone(), size * EPS))
+    block = _generic(size, dim + 1).to(gram.device).expand(len(gram), -1, -1)
+    for _ in range(3 if host else 6):
+        block = orthonormal(torch.cholesky_solve(block, factor))
+    block, values = ritz(gram, block)
+    vectors = block[..., :dim]
+    sigma, competing = values[:, dim - 1].clamp(0.0, 1.0), values[:, dim]
+    deflated, missed = torch.linalg.cholesky_ex(_shifted(torch.baddbmm(gram, vectors, vectors.mT), -sigma[:, None]))
+    sound = (indefinite == 0) & (missed == 0)
+    vectors, values, bound = newton(gram, deflated, vectors, sigma, competing)
+    if host:
+        for _ in range(3):
+            rest = (sound & (bound > ANGLE)).nonzero()[:, 0]
+            if len(rest) == 0:
+                break
+            again = newton(gram[rest], deflated[rest], vectors[rest], sigma[rest], competing[rest])
+            vectors[rest], values[rest], bound[rest] = again
+    else:
+        for _ in range(2):
+            vectors, values, bound = newton(gram, deflated, vectors, sigma, competing)
+    if dim > 1:
+        vectors, values = ritz(gram, vectors)
+    return Eigenspace(vectors, values.clamp(min=0.0), competing, sound & (bound <= ANGLE), factor, deflated)
+
+
+def newton(gram: Tensor, deflated: Tensor, vectors: Tensor, sigma: Tensor, competing: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """One correction of Ritz vectors: vectors, Ritz values, and the angle left beyond what rounding of the Gram explains."""
+    image = gram @ vectors
+    small = vectors.mT @ image
+    residual = image - vectors @ small
+    step = torch.cholesky_solve(residual, deflated)
+    # the correction is of second order in the values, and of third in the rotation among the vectors
+    values = small.diagonal(dim1=-2, dim2=-1) - (step * residual).sum(-2)
+    length = step.square().sum((-2, -1)).sqrt()
+    gap = (0.25 * (competing - sigma)).clamp(min=EPS)  # competing comes from above
+    contraction = (sigma[:, None] - values).abs().amax(-1) / gap
+    return orthonormal(vectors - step), values, length * (contraction + length) - EPS / gap
+
+
+def ritz(gram: Tensor, vectors: Tensor) -> tuple[Tensor, Tensor]:
+    """Ritz vectors and ascending Ritz values in the span of orthonormal columns."""
+    values, rotation = torch.linalg.eigh(torch.nan_to_num(vectors.mT @ (gram @ vectors)))
+    return vectors @ rotation, values
+
+
+def competing_sum(factor: Tensor, vectors: Tensor) -> Tensor:
+    """Sum of 1 / eigenvalue outside the eigenspace, from the Cholesky factor of the (slightly shifted) Gram: ``(b,)``."""
+    eye = torch.eye(factor.shape[-1], dtype=factor.dtype, device=factor.device)
+    inverse = torch.linalg.solve_triangular(factor, eye, upper=False)
+    return inverse.square().sum((-2, -1)) - (inverse @ vectors).square().sum((-2, -1))
+
+
+def by_eigh(gram: Tensor, dim: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Vectors, values, sum of 1 / eigenvalue over the others, and whether the next eigenvalue is numerically zero as well."""
+    every, vectors = torch.linalg.eigh(gram)
+    others = every[:, dim:].clamp(min=EPS / gram.shape[-1])
+    degenerate = (others <= NULL * every[:, -1:].clamp(min=EPS)).any(-1)
+    return vectors[..., :dim].contiguous(), every[:, :dim].clamp(min=0.0), others.reciprocal().sum(-1), degenerate
+
+
+def resolvent(gram: Tensor, vectors: Tensor, gradient: Tensor) -> Tensor:
+    r""":math:`w_j = (G - \rho_j I)^+ (I - V V^T) g_j` for each Ritz vector; rotations inside the eigenspace are left out.
+
+    One Cholesky factorization of :math:`G - \rho_j I + V V^T` each.  Where the eigenspace is not separated from the rest the
+    result is large, but finite.
+
+    Args:
+        gram: ``(b, D, D)`` of trace 1.
+        vectors: ``(b, D, k)`` Ritz vectors.
+        gradient: ``(b, D, k)``.
+    """
+    values = (vectors * (gram @ vectors)).sum(-2)
+    gradient = gradient - vectors @ (vectors.mT @ gradient)
+    deflated = torch.baddbmm(gram, vectors, vectors.mT)
+    columns = []
+    for j in range(vectors.shape[-1]):
+        factor = _regularized_factor(_shifted(deflated.clone(), gram.shape[-1] * EPS - values[:, j, None]))
+        columns.append(torch.cholesky_solve(gradient[..., j : j + 1], factor))
+    found = torch.cat(columns, dim=-1)
+    return found - vectors @ (vectors.mT @ found)
+
+
+def _regularized_factor(matrix: Tensor) -> Tensor:
+    """Cholesky factors; a matrix of trace about 1 that is singular to rounding gets a small multiple of the identity."""
+    factor, info = torch.linalg.cholesky_ex(matrix)
+    failed = info > 0
+    if on_host(matrix) and not bool(failed.any()):
+        return factor
+    return torch.linalg.cholesky_ex(_shifted(matrix.clone(), torch.where(failed, 1e-10, 0.0)[:, None])).L
+
+
+def _shifted(matrix: Tensor, shift: Tensor | float) -> Tensor:
+    """The matrix itself, with ``shift`` added to its diagonal."""
+    matrix.diagonal(dim1=-2, dim2=-1).add_(shift)
+    return matrix

@@ -1,0 +1,185 @@
+"""fit(): matches -> normalization -> estimation matrix or Gram -> null space -> tensor, for every invariant."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from dyntorch.blocks import map_blocks
+from dyntorch.invariant import Invariant, as_invariant
+from dyntorch.matches import Matches, matches
+from dyntorch.matrix import estimation_matrix, gram
+from dyntorch.normalize import Normalization, denormalize, normalization
+from dyntorch.nullspace import gram_null_space, null_space
+from dyntorch.primitives import Primitive
+from dyntorch.solution import FAILED, Solution, Status, copied
+
+AMBIGUOUS = 0.5
+"""Residual energy of the solution over that of all other tensors together (harmonic): above it another one fits as well.  Exactly
+determined scenes stay under 0.2 with noise up to where estimation breaks down; scenes of lower rank with noise exceed 1."""
+ILL_CONDITIONED = 1e-10
+"""Rounding error of a null vector from a float64 Gram, eps * (s_1 / s_{D-1})^2, above which the matrix itself is decomposed, unless
+the noise outweighs it a thousandfold anyway."""
+BLOCK = 1 << 19
+"""Numbers in the largest temporary of one block of the batch (4 MB)."""
+
+
+def fit(
+    invariant: Invariant | type[Invariant],
+    *views: Tensor,
+    weights: Tensor | None = None,
+    static: Tensor | None = None,
+    normalize: bool = True,
+) -> Solution:
+    r"""Fit a multilinear invariant to matches: the null vector(s) of the estimation matrix, for a whole batch at once.
+
+    Every match puts rows :math:`u_1 \otimes u_2 \otimes \dots` into a matrix whose null space holds the tensor.  The matches
+    are normalized, the Gram of the matrix is summed up without building the matrix, its null space is found with a
+    certificate (problems that are ill-conditioned take the matrix itself), and the tensor is carried back.  Differentiable
+    with respect to matches and weights.
+
+    Args:
+        invariant: an invariant class such as ``dyntorch.HomographyTensor``, or an instance of a family: ``Collineation(3)``.
+        *views: matches, one argument per view, ``(*batch, n, ...)``; NaN = missing.
+        weights: ``(*batch, n)`` not negative; 0 leaves a match out.
+        static: ``(*batch, n)`` bool: matches known not to move add all their rows (segmented configuration, thesis 8.1).
+        normalize: False skips the similarity of every view (for matches that are of order 1 already).
+
+    Returns:
+        A :class:`Solution` with ``tensor``, ``status``, ``singular_values``, ``motion``; same dtype and device as the views.
+
+    Raises:
+        ValueError: misuse - too few matches per problem, shapes, dtypes or devices that do not agree.
+
+    Source: thesis chapters 2, 3, 8; Hartley 1997 (normalization).
+
+    Example:
+        >>> import torch, dyntorch as dyn
+        >>> x2 = torch.rand(20, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        >>> A = torch.tensor([[1.0, 0.1, 2.0], [-0.1, 1.0, 3.0], [0.1, 0.2, 1.0]], dtype=torch.float64)
+        >>> p1 = torch.cat([x2, torch.ones(20, 1, dtype=torch.float64)], dim=-1) @ A.T
+        >>> solution = dyn.fit(dyn.Collineation(2), p1[:, :2] / p1[:, 2:], x2)
+        >>> solution
+        Solution(Collineation(n=2), matches=20, batch=(): 1 OK)
+        >>> (solution.tensor / solution.tensor[2, 2]).mul(1000).round().div(1000).tolist()
+        [[1.0, 0.1, 2.0], [-0.1, 1.0, 3.0], [0.1, 0.2, 1.0]]
+    """
+    invariant = as_invariant(invariant)
+    return fit_matches(invariant, matches(invariant, views, weights, static), normalize=normalize)
+
+
+def fit_matches(invariant: Invariant, data: Matches, *, normalize: bool = True) -> Solution:
+    """:func:`fit` for checked matches."""
+    rows = data.count * invariant.rows()
+    if data.static is not None:
+        # a static match frees one slot at a time; how many of its rows are new the rank will say
+        rows = max(rows, data.count * max(p.width for p in invariant.primitives))
+    if data.views[0].shape[0] and rows < invariant.width() - invariant.nullity:
+        raise ValueError(f"{invariant!r} needs at least {invariant.minimal()} matches, got {data.count}; add matches")
+    views, weights, static = copied(invariant, data)
+    options = () if static is None else (static,)
+
+    def solve(*block: Tensor) -> tuple[Tensor, ...]:
+        return _solve(invariant, block[: len(views)], block[len(views)], block[len(views) + 1 :], normalize)
+
+    per_problem = data.count * max(1, invariant.copies or 1) * _largest(invariant)
+    parts = map_blocks(solve, *views, weights, *options, size=max(1, BLOCK // max(1, per_problem)))
+    normalized, tensor, status, uncertainty = parts[:4]
+    count = len(invariant.primitives)
+    frames = parts[4 : 4 + count]
+    norm = Normalization(
+        frames,
+        tuple(p.normalized(t) for p, t in zip(invariant.primitives, frames, strict=True)),
+        parts[4 + count :],
+        tuple(t[..., 0, 0] for t in frames),
+    )
+    return Solution(invariant, data.back(tensor), data.back(status), data.back(uncertainty), data, norm, normalized)
+
+
+def _largest(invariant: Invariant) -> int:
+    """Numbers per match in the largest temporary of the Gram."""
+    size = 1
+    for primitive in invariant.primitives[1:]:
+        size *= primitive.width * (primitive.width + 1) // 2
+    return size
+
+
+def _solve(
+    invariant: Invariant, views: tuple[Tensor, ...], weights: Tensor, options: tuple[Tensor, ...], normalize: bool
+) -> tuple[Tensor, ...]:
+    """One block: normalized tensor, tensor, status, uncertainty, transforms and actions."""
+    static = options[0] if options else None
+    # components first in memory: every later pass then runs along the matches
+    views = tuple(x.mT.contiguous().mT for x in views)
+    # weights of any unit: a problem that counts its matches in thousands is no different
+    weights = weights / weights.amax(-1, keepdim=True).clamp(min=torch.finfo(weights.dtype).tiny)
+    norm = normalization(invariant, views, weights) if normalize else _identity(invariant, views)
+    moved = norm.apply(invariant, views)
+    basis, status, uncertainty = _null(invariant, norm.primitives, moved, weights, static)
+    tensor = basis.unflatten(-1, tuple(p.width for p in invariant.primitives))
+    lead = basis.ndim - 1
+    tensor = tensor.permute(*range(lead), *(lead + v for v in invariant.axes()))
+    if invariant.nullity == 1:
+        tensor = tensor.squeeze(lead - 1)
+    tensor = invariant.normalized(norm.transforms).constrain(tensor)
+    if invariant.copies is not None:
+        status, uncertainty = status.amax(-1), uncertainty.amax(-1)
+    failed = torch.zeros_like(status, dtype=torch.bool)
+    for state in FAILED:
+        failed = failed | (status == state)
+    zero = failed[(..., *([None] * (tensor.ndim - failed.ndim)))]
+    tensor = torch.where(zero, torch.zeros_like(tensor), tensor)
+    back = denormalize(invariant, tensor, norm.actions)
+    return (tensor, torch.where(zero, torch.zeros_like(back), back), status, uncertainty, *norm.transforms, *norm.actions)
+
+
+def _null(
+    invariant: Invariant, primitives: tuple[Primitive, ...], views: tuple[Tensor, ...], weights: Tensor, static: Tensor | None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Null space ``(*batch, nullity, D)``, status and uncertainty ``(*batch,)`` of normalized matches."""
+    nullity, width = invariant.nullity, invariant.width()
+    present = (weights > 0).sum(-1) * invariant.rows()
+    if static is not None:
+        present = present + ((weights > 0) & static).sum(-1) * (max(p.width for p in primitives) - 1)
+    g = gram(primitives, views, weights, static)
+    found = gram_null_space(g, nullity)
+    basis = found.basis
+    spare = (present - (width - nullity)).clamp(min=0)
+    # the noise that the solution leaves, per row, against what every other direction has
+    noise = found.residual.clamp(min=0).mean(-1) / spare.clamp(min=1)
+    square = torch.where(spare > 0, noise * found.competing, torch.zeros_like(noise)).detach()
+    rounding = torch.finfo(g.dtype).eps * (g.diagonal(dim1=-2, dim2=-1).sum(-1) * found.competing).detach()
+    exact = (rounding > ILL_CONDITIONED) & (rounding > 1e-3 * square) & ~found.degenerate
+    if g.device.type == "cpu" and bool(exact.any()):
+        basis = _with_matrix(basis, exact, primitives, views, weights, static, nullity)
+    few = present < width - nullity
+    ambiguous = square * present.clamp(min=1) > AMBIGUOUS
+    status = torch.full_like(present, int(Status.OK))
+    status = torch.where(ambiguous, int(Status.AMBIGUOUS), status)
+    status = torch.where(found.degenerate, int(Status.DEGENERATE), status)
+    status = torch.where(few, int(Status.TOO_FEW), status)
+    return basis, status, square.sqrt()
+
+
+def _with_matrix(
+    basis: Tensor,
+    exact: Tensor,
+    primitives: tuple[Primitive, ...],
+    views: tuple[Tensor, ...],
+    weights: Tensor,
+    static: Tensor | None,
+    nullity: int,
+) -> Tensor:
+    """Replace the null spaces of the chosen problems by those of their estimation matrices, which are not squared."""
+    matrix = estimation_matrix(primitives, views, weights, static)
+    return basis.index_put(tuple(exact.nonzero().T), null_space(matrix[exact], nullity))
+
+
+def _identity(invariant: Invariant, views: tuple[Tensor, ...]) -> Normalization:
+    transforms = []
+    for primitive, x in zip(invariant.primitives, views, strict=True):
+        eye = torch.eye(primitive.dim + 1, dtype=x.dtype, device=x.device)
+        transforms.append(eye.expand(*x.shape[: primitive.match_axis(x)], -1, -1))
+    actions = tuple(p.action(t) for p, t in zip(invariant.primitives, transforms, strict=True))
+    primitives = tuple(p.normalized(t) for p, t in zip(invariant.primitives, transforms, strict=True))
+    return Normalization(tuple(transforms), primitives, actions, tuple(t[..., 0, 0] for t in transforms))

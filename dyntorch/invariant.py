@@ -1,0 +1,153 @@
+"""The contract of one multilinear invariant: what is measured, how large the null space is, and the motion behind the tensor.
+
+An invariant states only its mathematics.  A match puts the rows
+
+.. math:: u_1 \\otimes u_2 \\otimes \\dots \\otimes u_n
+
+into the estimation matrix, one for every choice of a vector :math:`u_v` of its measurement in view v; the tensor spans the
+null space of that matrix.  Minimal counts, rows, normalization, robust estimation and refinement follow from the declaration.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Concatenate, Generic, ParamSpec, TypeVar
+
+from torch import Tensor
+
+from dyntorch.primitives import Primitive
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+class on_class(Generic[P, R]):  # noqa: N801 - reads as a decorator
+    """A method that may also be called on the class, which then stands for its instance with default parameters."""
+
+    def __init__(self, function: Callable[Concatenate[Any, P], R]) -> None:
+        self.function = function
+        self.__doc__ = function.__doc__
+
+    def __get__(self, instance: Any, owner: type) -> Callable[P, R]:
+        return partial(self.function, owner() if instance is None else instance)
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Between which coordinates one part of the motion maps: a matrix from ``source`` to ``target``, or a vector in ``target``.
+
+    Views count from 0; None is the world, whose coordinates normalization leaves alone.
+    """
+
+    target: int | None
+    source: int | None = None
+    vector: bool = False
+
+
+class Invariant:
+    """Base of all invariants.  A subclass sets the attributes and writes ``compose`` and ``decompose``.
+
+    A family with parameters is a frozen dataclass; where all parameters have defaults the class itself can be used like an
+    instance: ``dyn.HomographyTensor.minimal()``.
+    """
+
+    primitives: tuple[Primitive, ...]
+    """What is measured in each view."""
+    nullity: int = 1
+    """Dimension of the null space that general matches leave."""
+    motion: tuple[Frame, ...] = ()
+    """The parts of the motion, in the order in which ``compose`` takes them."""
+    dof: int = 0
+    """Degrees of freedom of the motion (what refinement divides by, and the rank of its information matrix)."""
+    codim: int = 1
+    """Conditions that the true positions of one moving match fulfil."""
+    layout: tuple[int, ...] | None = None
+    """Which view each axis of the tensor belongs to; None: in the order of the views."""
+    copies: int | None = None
+    """Tensors per problem, where one set of matches is solved several times (one per given camera)."""
+    labels_static: bool = False
+    """Whether a match known to be static says more than one that may move (the argument ``static``)."""
+
+    compose: Callable[..., Tensor]
+    """The tensor of a motion, ``(*batch, *axes)`` (with ``(*batch, nullity, *axes)`` where nullity > 1)."""
+    decompose: Callable[..., Any]
+    """The motion of a tensor: one part alone, or the tuple of the parts."""
+
+    def constrain(self, tensor: Tensor) -> Tensor:
+        """The nearest tensor that fulfils the internal constraints, in normalized coordinates; by default the tensor itself."""
+        return tensor
+
+    def whitened(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor | None:
+        r"""Whitened geometric residual :math:`Q^{-1/2} e` of each match, :math:`Q = \sum_v s_v^2 J_v J_v^T`.
+
+        Args:
+            motion: parts as in :attr:`motion`.
+            views: matches.
+            scales: ``(*batch,)`` standard deviation of the noise of each view, in the unit of these coordinates.
+
+        Returns:
+            ``(*batch, n, c)`` with expected square sum ``codim``; None for the Sampson residual of the multilinear form itself.
+        """
+        return None
+
+    def whitened_static(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
+        """The same for matches that do not move: all their views agree under the motion.  ``(*batch, n, c)``."""
+        raise ValueError(f"{self!r} has no separate residual for static matches; leave out static=")
+
+    def normalized(self, transforms: tuple[Tensor, ...]) -> Invariant:
+        """The invariant that the tensor of normalized matches belongs to: the same one, unless it depends on coordinates."""
+        return self
+
+    def subset(self, keep: Tensor) -> Invariant:
+        """The invariant of some problems of a batch (indices): the same one, unless it holds coordinates of each problem."""
+        return self
+
+    @on_class
+    def shape(self) -> tuple[int, ...]:
+        """Shape of one tensor."""
+        widths = tuple(p.width for p in self.primitives)
+        return tuple(widths[v] for v in self.axes())
+
+    @on_class
+    def axes(self) -> tuple[int, ...]:
+        """Which view each axis of the tensor belongs to."""
+        return self.layout if self.layout is not None else tuple(range(len(self.primitives)))
+
+    @on_class
+    def width(self) -> int:
+        """Columns of the estimation matrix."""
+        return math.prod(p.width for p in self.primitives)
+
+    @on_class
+    def rows(self) -> int:
+        """Independent rows that one match gives."""
+        return math.prod(p.rows for p in self.primitives)
+
+    @on_class
+    def minimal(self) -> int:
+        """Fewest matches that determine the tensor linearly: (width - nullity) / rows, rounded up."""
+        return -(-(self.width() - self.nullity) // self.rows())
+
+    def __repr__(self) -> str:
+        return type(self).__name__
+
+
+def as_invariant(invariant: Invariant | type[Invariant]) -> Invariant:
+    """The invariant itself, or the default instance of a class.
+
+    Raises:
+        ValueError: anything else, or a family whose parameters were not given.
+    """
+    if isinstance(invariant, Invariant):
+        return invariant
+    if isinstance(invariant, type) and issubclass(invariant, Invariant):
+        try:
+            return invariant()
+        except TypeError as error:
+            raise ValueError(
+                f"{invariant.__name__} is a family: give its parameters, {invariant.__name__}(...) ({error})"
+            ) from None
+    raise ValueError(f"expected an invariant such as dyntorch.HomographyTensor, got {invariant!r}")

@@ -1,0 +1,293 @@
+"""The constant velocity tensor: points of space that move at constant velocity, each with its own, seen by three moving sensors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from dyntorch.algebra.constant_velocity import (
+    adjugate,
+    back_project,
+    constant_velocity_maps,
+    constant_velocity_tensor,
+    drift,
+    project,
+    structure,
+    third_infinity,
+    unit_tensor,
+)
+from dyntorch.algebra.constant_velocity_p6 import constant_velocity_maps_p6
+from dyntorch.algebra.extensors import compound, dual, join
+from dyntorch.algebra.homogeneous import homogeneous, inhomogeneous, unit
+from dyntorch.invariant import Frame, Invariant
+from dyntorch.primitives import HyperplanesThrough, Point, Primitive
+from dyntorch.residual import whiten
+
+Motion = tuple[Tensor, Tensor, Tensor]
+
+
+@dataclass(frozen=True)
+class ConstantVelocityTensor(Invariant):
+    r"""Constant velocity tensor, :math:`T(P_0, P_1, \cdot) \sim P_2` with :math:`P_t \sim A_t (x + t v, 1)`.
+
+    21 matches between three sensors in space, or 24 with a camera as the third view.  The motion, three maps from the world
+    to the sensors at the times 0, 1, 2, is found up to an affinity of the world and a velocity u common to all points (which
+    no measurement tells from a motion of the sensors; static points do, see :meth:`fix_gauge`).
+
+    Matches that are all static or of one velocity (rank 36 of 63), or with velocities along a line (49) or in a plane (58,
+    cars on a road), do not determine the tensor.
+
+    Args:
+        third: ``"space"``, the third view measures points of space ``(*batch, n, 3)``; ``"image"``, it is a camera
+            ``(*batch, n, 2)`` with a finite centre, and :math:`A_2` is 3 x 4.
+
+    Raises:
+        ValueError: another ``third``.
+
+    Source: thesis section 8.3.
+
+    Example:
+        >>> ConstantVelocityTensor.minimal(), ConstantVelocityTensor("image").minimal()
+        (21, 24)
+        >>> from dyntorch.scenes import constant_velocity
+        >>> scene = constant_velocity(30)
+        >>> T = ConstantVelocityTensor.compose(*scene.motion)
+        >>> bool((ConstantVelocityTensor.transfer(T, *scene.views[:2]) - scene.views[2]).abs().max() < 1e-9)
+        True
+    """
+
+    third: Literal["space", "image"] = "space"
+
+    nullity = 1
+    motion = (Frame(0), Frame(1), Frame(2))
+
+    def __post_init__(self) -> None:
+        if self.third not in ("space", "image"):
+            raise ValueError(f"third must be 'space' or 'image', got {self.third!r}")
+
+    @property
+    def primitives(self) -> tuple[Primitive, ...]:  # type: ignore[override]
+        return (Point(3), Point(3), HyperplanesThrough(self.codim))
+
+    @property
+    def codim(self) -> int:  # type: ignore[override]
+        return 3 if self.third == "space" else 2
+
+    @property
+    def dof(self) -> int:  # type: ignore[override]
+        """Parameters of three maps up to scale, less 12 of the affinity of the world and 3 of the common velocity."""
+        return 30 if self.third == "space" else 26
+
+    @staticmethod
+    def compose(first: Tensor, second: Tensor, third: Tensor) -> Tensor:
+        r"""The tensor of the maps :math:`A_0, A_1, A_2`; see :func:`~dyntorch.algebra.constant_velocity.constant_velocity_tensor`.
+
+        Args:
+            first: ``(*batch, 4, 4)``.
+            second: ``(*batch, 4, 4)``.
+            third: ``(*batch, 4, 4)``, or ``(*batch, 3, 4)`` of a camera.
+
+        Returns:
+            ``(*batch, 4, 4, 4)`` or ``(*batch, 4, 4, 3)``, of norm 1.
+        """
+        return constant_velocity_tensor(first, second, third)
+
+    @staticmethod
+    def decompose(tensor: Tensor) -> Motion:
+        r"""The maps of a tensor in closed form; see :func:`~dyntorch.algebra.constant_velocity.constant_velocity_maps`.
+
+        Differentiable (first derivatives), up to the gauge: take gradients of functions that neither an affinity of the world
+        nor a common velocity changes, such as ``compose(*decompose(T))``.
+
+        Args:
+            tensor: ``(*batch, 4, 4, 4)``, or ``(*batch, 4, 4, 3)`` of a camera.
+
+        Returns:
+            :math:`A_0, A_1, A_2` of norm 1.  Zero matrices for a tensor that is 0 or not finite.
+        """
+        return _solve(tensor, constant_velocity_maps)
+
+    @staticmethod
+    def decompose_p6(tensor: Tensor) -> Motion:
+        r"""The same by way of a projective reconstruction in :math:`P^6`, as in the thesis, in another gauge: a cross-check."""
+        return _solve(tensor, constant_velocity_maps_p6)
+
+    @staticmethod
+    def diagnose(tensor: Tensor) -> dict[str, Tensor]:
+        r"""How far a tensor is from one of constant velocity; both figures are at the level of the noise for good data.
+
+        Args:
+            tensor: ``(*batch, 4, 4, 4)``, or ``(*batch, 4, 4, 3)`` of a camera.
+
+        Returns:
+            ``"structure"`` ``(*batch,)``, the part :math:`\|T - \alpha \otimes Q - K \otimes \beta\| / \|T\|` that does not fit
+            three projections from :math:`P^6`; in space also ``"infinity"`` ``(*batch,)``, the ratio
+            :math:`\sigma_4 / \sigma_3` of the equations of the plane at infinity of the third frame.  1 for a tensor that is 0.
+        """
+        exact = unit_tensor(tensor)
+        alpha, beta, q, k = structure(exact)
+        fitted = torch.einsum("...i,...kj->...ijk", alpha, q) + torch.einsum("...ki,...j->...ijk", k, beta)
+        left = (exact - fitted).flatten(-3).norm(dim=-1)
+        present = exact.flatten(-3).abs().amax(-1) > 0
+        figures = {"structure": torch.where(present, left, torch.ones_like(left)).to(tensor.dtype)}
+        if tensor.shape[-1] == 4:
+            values = torch.linalg.svdvals(third_infinity(alpha, beta, q, k))
+            ratio = values[..., 3] / torch.where(values[..., 2] > 0, values[..., 2], torch.ones_like(left))
+            figures["infinity"] = torch.where(values[..., 2] > 0, ratio, torch.ones_like(ratio)).to(tensor.dtype)
+        return figures
+
+    @staticmethod
+    def transfer(tensor: Tensor, x1: Tensor | None = None, x2: Tensor | None = None, x3: Tensor | None = None) -> Tensor:
+        r"""The point of one view from those of the other two, without the motion.
+
+        The third view is :math:`T(P_0, P_1, \cdot)`; the first solves :math:`T(\cdot, P_1, \cdot)\, P_0 \sim P_2`, the second
+        likewise (with a camera as the third view only the third can be predicted).
+
+        Args:
+            tensor: ``(*batch, 4, 4, 4)``, or ``(*batch, 4, 4, 3)`` of a camera.
+            x1, x2, x3: two of the three views, ``(*batch, n, 3)`` or ``(*batch, n, 2)``.
+
+        Returns:
+            ``(*batch, n, 3)`` or ``(*batch, n, 2)``, the view that was not given.
+
+        Raises:
+            ValueError: not exactly two views, or one that a camera cannot predict.
+        """
+        given = [None if x is None else homogeneous(x) for x in (x1, x2, x3)]
+        if sum(p is None for p in given) != 1:
+            raise ValueError(f"transfer takes two of x1, x2, x3 and returns the third, got {sum(p is not None for p in given)}")
+        if given[2] is None:
+            return inhomogeneous(torch.einsum("...ijk,...ni,...nj->...nk", tensor, given[0], given[1]))
+        if tensor.shape[-1] == 3:
+            raise ValueError("an image as the third view does not determine a point of space: give x1 and x2")
+        terms, known = ("...ijk,...nj->...nki", given[1]) if given[0] is None else ("...ijk,...ni->...nkj", given[0])
+        return inhomogeneous((adjugate(torch.einsum(terms, tensor, known)) @ given[2][..., None])[..., 0])
+
+    @staticmethod
+    def positions(motion: Motion, x1: Tensor, x2: Tensor, x3: Tensor) -> Tensor:
+        r"""World positions :math:`y_t = \pi(A_t^{-1} P_t)` of the matches at the three times.
+
+        Args:
+            motion: the three maps.
+            x1, x2: ``(*batch, n, 3)``.
+            x3: ``(*batch, n, 3)``; of an image only the first two views are used, :math:`y_2 = 2 y_1 - y_0`.
+
+        Returns:
+            ``(*batch, n, 3, 3)``: times, then coordinates, in the world of the motion.
+        """
+        y0, y1 = back_project(motion[0], x1)[0], back_project(motion[1], x2)[0]
+        y2 = back_project(motion[2], x3)[0] if x3.shape[-1] == 3 else 2 * y1 - y0
+        return torch.stack([y0, y1, y2], dim=-2)
+
+    @staticmethod
+    def velocities(motion: Motion, x1: Tensor, x2: Tensor, x3: Tensor) -> Tensor:
+        """World velocities of the matches per step of time, ``(*batch, n, 3)``, up to the common one that the gauge chooses."""
+        y = ConstantVelocityTensor.positions(motion, x1, x2, x3)
+        return (y[..., 2, :] - y[..., 0, :]) / 2
+
+    @staticmethod
+    def fix_gauge(motion: Motion, x1: Tensor, x2: Tensor, x3: Tensor, weights: Tensor | None = None) -> Motion:
+        r"""Choose the common velocity u such that the given matches stand still.
+
+        .. math:: A_t \to A_t \begin{pmatrix} I & t u \\ 0 & 1 \end{pmatrix}
+
+        Args:
+            motion: the three maps.
+            x1, x2, x3: matches known to be static, ``(*batch, n, 3 | 2)``, one or more.
+            weights: ``(*batch, n)``, 0 for a match that moves or is not known to be static.
+
+        Returns:
+            the maps in the new gauge, of norm 1; unchanged where all weights are 0.
+
+        Raises:
+            ValueError: no matches.
+        """
+        if x1.shape[-2] == 0:
+            raise ValueError("x1 has no matches; the common velocity takes one static match or more")
+        velocity = ConstantVelocityTensor.velocities(motion, x1, x2, x3)
+        weight = torch.ones_like(velocity[..., 0]) if weights is None else weights.to(velocity)
+        total = weight.sum(-1, keepdim=True)
+        # a match of weight 0 may be anything, also not a number
+        used = torch.where(weight[..., None] > 0, velocity, torch.zeros_like(velocity))
+        common = (weight[..., None] * used).sum(-2) / torch.where(total > 0, total, torch.ones_like(total))
+        first, second, third = (unit(drift(matrix, t * common)) for t, matrix in enumerate(motion))
+        return first, second, third
+
+    @staticmethod
+    def trajectory(motion: Motion, x1: Tensor, x2: Tensor, x3: Tensor, *, view: int = 1) -> Tensor:
+        r"""The line on which each point moves, as the given view sees it; it depends on the common velocity (:meth:`fix_gauge`).
+
+        Args:
+            motion: the three maps.
+            x1, x2, x3: matches.
+            view: 1, 2 or 3: in whose frame.
+
+        Returns:
+            ``(*batch, n, 6)`` Pluecker coordinates (01, 02, 03, 12, 13, 23); ``(*batch, n, 3)`` in an image.  0 for a point
+            that does not move.
+
+        Raises:
+            ValueError: another view.
+        """
+        if view not in (1, 2, 3):
+            raise ValueError(f"view must be 1, 2 or 3, got {view!r}")
+        y = ConstantVelocityTensor.positions(motion, x1, x2, x3)
+        velocity = (y[..., 2, :] - y[..., 0, :]) / 2
+        direction = torch.cat([velocity, torch.zeros_like(velocity[..., :1])], dim=-1)
+        line = join(homogeneous(y.mean(-2)), direction) @ compound(motion[view - 1], 2).mT
+        return line if line.shape[-1] == 6 else dual(line, 3, 2)
+
+    @staticmethod
+    def static_distance(motion: Motion, x1: Tensor, x2: Tensor, x3: Tensor) -> Tensor:
+        r"""How far each match is from standing still, ``(*batch, n)``, once the gauge is fixed.
+
+        With noise of standard deviation s in every coordinate the square divided by :math:`s^2` follows :math:`\chi^2` with 6
+        degrees of freedom for a static match, 5 with an image as the third view.
+        """
+        one = torch.ones((), dtype=x1.dtype, device=x1.device)
+        return ConstantVelocityTensor().whitened_static(motion, (x1, x2, x3), (one, one, one)).norm(dim=-1)
+
+    def whitened(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
+        r"""The residual :math:`e = y_0 - 2 y_1 + y_2`, whitened; in an image :math:`e = \pi(A_2 (2 y_1 - y_0, 1)) - x_3`.
+
+        Returns:
+            ``(*batch, n, 3)``, or ``(*batch, n, 2)`` with an image.
+        """
+        (y0, j0), (y1, j1) = back_project(motion[0], views[0]), back_project(motion[1], views[1])
+        j0, j1 = scales[0][..., None, None, None] * j0, 2 * scales[1][..., None, None, None] * j1
+        if views[2].shape[-1] == 3:
+            y2, j2 = back_project(motion[2], views[2])
+            j2 = scales[2][..., None, None, None] * j2
+            return whiten(y0 - 2 * y1 + y2, j0 @ j0.mT + j1 @ j1.mT + j2 @ j2.mT)
+        seen, j = project(motion[2], 2 * y1 - y0)
+        noise = torch.eye(2, dtype=seen.dtype, device=seen.device) * scales[2][..., None, None, None].square()
+        return whiten(seen - views[2], j @ (j0 @ j0.mT + j1 @ j1.mT) @ j.mT + noise)
+
+    def whitened_static(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
+        r"""Residual of matches that stand still, :math:`(y_1 - y_0, y_2 - y_1)`, whitened; it holds the common velocity at 0.
+
+        Returns:
+            ``(*batch, n, 6)``, or ``(*batch, n, 5)`` with an image.
+        """
+        (y0, j0), (y1, j1) = back_project(motion[0], views[0]), back_project(motion[1], views[1])
+        q0 = scales[0][..., None, None, None].square() * (j0 @ j0.mT)
+        q1 = scales[1][..., None, None, None].square() * (j1 @ j1.mT)
+        if views[2].shape[-1] == 3:
+            y2, j2 = back_project(motion[2], views[2])
+            last, cross, corner = y2 - y1, -q1, q1 + scales[2][..., None, None, None].square() * (j2 @ j2.mT)
+        else:
+            seen, j = project(motion[2], y1)
+            noise = torch.eye(2, dtype=seen.dtype, device=seen.device) * scales[2][..., None, None, None].square()
+            last, cross, corner = seen - views[2], j @ q1, j @ q1 @ j.mT + noise
+        covariance = torch.cat([torch.cat([q0 + q1, cross.mT], dim=-1), torch.cat([cross, corner], dim=-1)], dim=-2)
+        return whiten(torch.cat([y1 - y0, last], dim=-1), covariance)
+
+
+def _solve(tensor: Tensor, solver: Callable[[Tensor], Motion]) -> Motion:
+    """Run a decomposition in float64."""
+    first, second, third = solver(unit_tensor(tensor))
+    return first.to(tensor.dtype), second.to(tensor.dtype), third.to(tensor.dtype)

@@ -1,0 +1,128 @@
+"""The fundamental matrix of two views of static points in space."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from dyntorch.algebra.homogeneous import homogeneous, skew, unit
+from dyntorch.algebra.rank_two import null_vectors
+from dyntorch.invariant import Frame, Invariant
+from dyntorch.primitives import Hyperplane, Point
+
+
+class FundamentalMatrix(Invariant):
+    r"""Static points of space in two views: :math:`p_2^T F p_1 = 0`, rank two.
+
+    Its motion is a collineation A of view 1 to view 2 (the homography of some plane) and the epipole :math:`e_2`:
+    :math:`F = [e_2]_\times A`.
+
+    Source: Hartley and Zisserman, chapters 9 and 11.
+
+    Example:
+        >>> import torch
+        >>> F = FundamentalMatrix.compose(torch.eye(3), torch.tensor([1.0, 0.0, 0.0]))  # sideways: rows correspond
+        >>> FundamentalMatrix.epipolar_lines(F, torch.tensor([[4.0, 7.0]])).abs().round().tolist()
+        [[0.0, 1.0, 7.0]]
+    """
+
+    primitives = (Point(2),) * 2
+    motion = (Frame(1, 0), Frame(1, vector=True))
+    dof = 7
+    layout = (1, 0)
+
+    @staticmethod
+    def compose(A: Tensor, e2: Tensor) -> Tensor:
+        r"""The fundamental matrix of a plane's homography and the epipole: :math:`F = [e_2]_\times A`.
+
+        Args:
+            A: ``(*batch, 3, 3)``, view 1 to view 2.
+            e2: ``(*batch, 3)``, homogeneous, in view 2.
+
+        Returns:
+            ``(*batch, 3, 3)``, norm 1; zero where A or :math:`e_2` is zero.
+
+        Example:
+            >>> import torch
+            >>> FundamentalMatrix.compose(torch.eye(3), torch.tensor([0.0, 0.0, 2.0]))[0, 1]
+            tensor(-0.7071)
+        """
+        tensor = skew(e2) @ A
+        return tensor / torch.linalg.matrix_norm(tensor, keepdim=True).clamp(min=torch.finfo(tensor.dtype).tiny)
+
+    @staticmethod
+    def decompose(tensor: Tensor) -> tuple[Tensor, Tensor]:
+        r"""An invertible collineation and the epipole: :math:`A = \|F\|\, e_2 e_1^T / \sqrt 2 - [e_2]_\times F`.
+
+        Every :math:`A + e_2 v^T` gives the same F; this one has the singular values of F beside :math:`\|F\| / \sqrt 2`.
+        Where F has rank three the motion is that of the nearest matrix of rank two.
+
+        Args:
+            tensor: ``(*batch, 3, 3)`` of any scale.
+
+        Returns:
+            A ``(*batch, 3, 3)``, norm 1, determinant not negative, and :math:`e_2` ``(*batch, 3)``, norm 1, its largest
+            coordinate positive; zero for a zero matrix (a failed fit).
+
+        Example:
+            >>> import torch
+            >>> F = FundamentalMatrix.compose(torch.eye(3), torch.tensor([3.0, 0.0, 4.0]))
+            >>> A, e2 = FundamentalMatrix.decompose(F)
+            >>> e2.round(decimals=4).tolist(), bool(torch.linalg.det(A) > 0.1)
+            ([0.6000000238418579, 0.0, 0.800000011920929], True)
+        """
+        e1, e2 = FundamentalMatrix.epipoles(tensor.double())
+        size = torch.linalg.matrix_norm(tensor.double(), keepdim=True) * 0.5**0.5
+        collineation = size * e2[..., :, None] * e1[..., None, :] - skew(e2) @ tensor.double()
+        return unit(collineation).to(tensor.dtype), e2.to(tensor.dtype)
+
+    def constrain(self, tensor: Tensor) -> Tensor:
+        r"""The nearest matrix of rank two, :math:`F - F v v^T` with the singular vector v to the smallest singular value."""
+        right = null_vectors(tensor)[1]
+        return tensor - (tensor @ right[..., :, None]) * right[..., None, :]
+
+    @staticmethod
+    def epipoles(tensor: Tensor) -> tuple[Tensor, Tensor]:
+        r"""The epipoles: :math:`F e_1 = 0,\ F^T e_2 = 0`.
+
+        Args:
+            tensor: ``(*batch, 3, 3)``; where it has rank three, those of the nearest matrix of rank two.
+
+        Returns:
+            :math:`e_1` in view 1 and :math:`e_2` in view 2, homogeneous ``(*batch, 3)``, norm 1, the largest coordinate
+            positive; zero where the rank is below two.
+
+        Example:
+            >>> import torch
+            >>> F = FundamentalMatrix.compose(torch.eye(3), torch.tensor([0.0, 0.0, 2.0]))
+            >>> [e.tolist() for e in FundamentalMatrix.epipoles(F)]
+            [[0.0, 0.0, 1.0], [0.0, 0.0, 1.0]]
+        """
+        left, right = null_vectors(tensor.double())
+        return unit(right[..., None])[..., 0].to(tensor.dtype), unit(left[..., None])[..., 0].to(tensor.dtype)
+
+    @staticmethod
+    def epipolar_lines(tensor: Tensor, x: Tensor, view: int = 2) -> Tensor:
+        r"""The lines of one view on which the matches of points of the other lie: :math:`l_2 = F p_1`, :math:`l_1 = F^T p_2`.
+
+        Args:
+            tensor: ``(*batch, 3, 3)``.
+            x: ``(*batch, n, 2)`` points of the other view.
+            view: the view of the lines, 1 or 2.
+
+        Returns:
+            ``(*batch, n, 3)`` lines with unit normals; zero for a point at the epipole, which has none.
+
+        Raises:
+            ValueError: view is not 1 or 2.
+
+        Example:
+            >>> import torch
+            >>> F = FundamentalMatrix.compose(torch.eye(3), torch.tensor([0.0, 1.0, 0.0]))
+            >>> FundamentalMatrix.epipolar_lines(F, torch.tensor([[4.0, 7.0]]), view=1).abs().tolist()
+            [[1.0, 0.0, 4.0]]
+        """
+        if view not in (1, 2):
+            raise ValueError(f"view must be 1 or 2, the view of the lines, got {view}")
+        line = homogeneous(x) @ (tensor.mT if view == 2 else tensor)
+        return Hyperplane(2).raw(line)

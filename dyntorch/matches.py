@@ -1,0 +1,116 @@
+"""What comes in: matches of several views, checked once, in float64, with missing ones weighing nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dyntorch.invariant import Invariant
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Checked matches with one flat batch dimension, ready to be cut into blocks."""
+
+    views: tuple[Tensor, ...]
+    """``(b, n, ...)`` float64 and finite, one per view."""
+    weights: Tensor
+    """``(b, n)``, 0 where the match is missing in any view."""
+    static: Tensor | None
+    """``(b, n)`` bool."""
+    batch: tuple[int, ...]
+    """The leading dimensions that came in."""
+    dtype: torch.dtype
+    device: torch.device
+
+    @property
+    def count(self) -> int:
+        """Matches per problem."""
+        return int(self.weights.shape[-1])
+
+    def back(self, result: Tensor) -> Tensor:
+        """A float64 result with a flat batch, in the caller's shape, dtype and device."""
+        result = result.reshape(*self.batch, *result.shape[1:])
+        return result.to(device=self.device, dtype=self.dtype if result.is_floating_point() else result.dtype)
+
+    def restricted(self, keep: Tensor) -> Matches:
+        """The same matches with weight 0 where ``keep (b, n)`` is False."""
+        return Matches(self.views, self.weights * keep, self.static, self.batch, self.dtype, self.device)
+
+
+def matches(invariant: Invariant, views: Sequence[Tensor], weights: Tensor | None = None, static: Tensor | None = None) -> Matches:
+    """Check the views of one invariant and put them into float64.
+
+    A match with a coordinate that is NaN or infinite in any view, or a weight that is, weighs nothing.
+
+    Raises:
+        ValueError: another number of views, shapes that do not agree, mixed dtypes or devices, negative weights, or ``static``
+            for an invariant that knows no labelled static matches.
+    """
+    _check(invariant, views)
+    first = views[0]
+    axis = invariant.primitives[0].match_axis(first)
+    batch, n = tuple(first.shape[:axis]), int(first.shape[axis])
+    if static is not None and not invariant.labels_static:
+        raise ValueError(f"{invariant!r} has no rows for labelled static matches; leave out static=")
+    # a device without float64 lends its data to the CPU and gets the result back
+    home = torch.device("cpu") if first.device.type == "mps" else first.device
+    flat = [x.to(home).to(torch.float64).reshape(-1, *x.shape[axis:]) if batch else x.to(home, torch.float64)[None] for x in views]
+    weight = _option("weights", weights, batch, n, first)
+    weight = torch.ones(flat[0].shape[:2], dtype=torch.float64, device=home) if weight is None else weight.to(home, torch.float64)
+    if bool((weight < 0).any()) if weight.device.type == "cpu" else False:
+        raise ValueError(f"weights must not be negative, got {float(weight.min()):g}; use 0 to leave a match out")
+    label = _option("static", static, batch, n, first)
+    present = weight.isfinite()
+    for x in flat:
+        present = present & x.isfinite().flatten(2).all(-1)
+    clean = [torch.where(present[(..., *([None] * (x.ndim - 2)))], x, torch.zeros_like(x)) for x in flat]
+    if home.type == "cpu" and bool(present.all()):
+        clean = flat  # nothing to replace: no copy
+    return Matches(
+        tuple(clean),
+        torch.where(present, weight, torch.zeros_like(weight)),
+        None if label is None else label.to(home).bool(),
+        batch,
+        first.dtype,
+        first.device,
+    )
+
+
+def _check(invariant: Invariant, views: Sequence[Tensor]) -> None:
+    if len(views) != len(invariant.primitives):
+        raise ValueError(f"{invariant!r} takes matches in {len(invariant.primitives)} views, got {len(views)}")
+    leading: list[tuple[int, ...]] = []
+    for v, (primitive, x) in enumerate(zip(invariant.primitives, views, strict=True), start=1):
+        if not isinstance(x, Tensor):
+            raise ValueError(f"view {v} must be a torch.Tensor, got {type(x).__name__}; use torch.as_tensor(...)")
+        if not x.is_floating_point():
+            raise ValueError(f"view {v} must be of floating point, got {x.dtype}; use .double()")
+        try:
+            axis = primitive.match_axis(x)
+        except ValueError as error:
+            raise ValueError(f"view {v} of {invariant!r}: {error}") from None
+        leading.append(tuple(x.shape[: axis + 1]))
+    if len(set(leading)) > 1:
+        raise ValueError(f"all views need the same (*batch, n), got {leading}; expand the smaller ones")
+    if len({x.dtype for x in views}) > 1:
+        raise ValueError(f"all views need one dtype, got {[str(x.dtype) for x in views]}; use .to(dtype)")
+    if len({x.device for x in views}) > 1:
+        raise ValueError(f"all views need one device, got {[str(x.device) for x in views]}; use .to(device)")
+
+
+def _option(name: str, value: Tensor | None, batch: tuple[int, ...], n: int, like: Tensor) -> Tensor | None:
+    """``weights`` or ``static`` with the batch of the views, flat."""
+    if value is None:
+        return None
+    if not isinstance(value, Tensor):
+        raise ValueError(f"{name} must be a torch.Tensor, got {type(value).__name__}; use torch.as_tensor(...)")
+    if value.device != like.device:
+        raise ValueError(f"{name} is on {value.device}, the matches on {like.device}; use .to(device)")
+    try:
+        return value.expand(*batch, n).reshape(-1, n) if batch else value.expand(1, n)
+    except RuntimeError:
+        raise ValueError(f"{name} must be (*batch, n) = {(*batch, n)}, got {tuple(value.shape)}") from None

@@ -1,0 +1,110 @@
+"""Well-conditioned matches and the way back: one similarity per view, and what it does to tensors and motions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dyntorch.algebra.homogeneous import similarity, unit
+from dyntorch.invariant import Frame, Invariant
+from dyntorch.primitives import Primitive
+
+LETTERS = "abcdefgh"
+
+
+@dataclass(frozen=True)
+class Normalization:
+    """Similarities of all views, ``(*batch, d + 1, d + 1)`` each, and what they do to the vectors of the primitives."""
+
+    transforms: tuple[Tensor, ...]
+    primitives: tuple[Primitive, ...]
+    actions: tuple[Tensor, ...]
+    scales: tuple[Tensor, ...]
+
+    def apply(self, invariant: Invariant, views: Sequence[Tensor]) -> tuple[Tensor, ...]:
+        """Measurements in normalized coordinates."""
+        return tuple(p.move(x, t) for p, x, t in zip(invariant.primitives, views, self.transforms, strict=True))
+
+
+def normalization(invariant: Invariant, views: Sequence[Tensor], weights: Tensor) -> Normalization:
+    r"""Hartley's similarity of each view: the weighted centroid goes to 0, the RMS distance from it to :math:`\sqrt d`.
+
+    Without it a null vector from noisy pixels does not even improve with more matches (measured, homography tensor: 1.5 to 8
+    times less accurate from twice the minimal count on); see Hartley 1997, "In defense of the eight-point algorithm".
+
+    Args:
+        invariant: says what is measured.
+        views: ``(*batch, n, ...)`` finite matches.
+        weights: ``(*batch, n)``.
+    """
+    transforms = tuple(_similarity(p.points(x), weights) for p, x in zip(invariant.primitives, views, strict=True))
+    primitives = tuple(p.normalized(t) for p, t in zip(invariant.primitives, transforms, strict=True))
+    actions = tuple(p.action(t) for p, t in zip(invariant.primitives, transforms, strict=True))
+    return Normalization(transforms, primitives, actions, tuple(t[..., 0, 0] for t in transforms))
+
+
+def _similarity(points: Tensor, weights: Tensor) -> Tensor:
+    """Similarity of points ``(*batch, n, k, d)``; k points of one match share its weight."""
+    d = points.shape[-1]
+    present = (weights > 0).to(points.dtype)
+    share = (present / (present.sum(-1, keepdim=True).clamp(min=1.0) * points.shape[-2]))[..., None]
+    flat = points.flatten(-2)  # (*batch, n, k d)
+    centre = (flat * share).sum(-2).unflatten(-1, points.shape[-2:]).sum(-2)
+    shifted = flat - centre.repeat(*([1] * (centre.ndim - 1)), points.shape[-2])[..., None, :]
+    spread = (shifted.square() * share).sum((-2, -1))
+    # equal points have no scale: 1 keeps everything finite, and the rank says that they decide nothing
+    scale = torch.where(spread > 0, (d / torch.where(spread > 0, spread, 1.0)).sqrt(), 1.0)
+    return similarity(scale, centre)
+
+
+def denormalize(invariant: Invariant, tensor: Tensor, actions: Sequence[Tensor]) -> Tensor:
+    r"""The tensor of the measured coordinates, :math:`T_{ijk} = \hat T_{abc} (M_1)_{ai} (M_2)_{bj} (M_3)_{ck}`, norm 1.
+
+    Args:
+        invariant: says which view an axis belongs to.
+        tensor: ``(*batch, *axes)`` or ``(*batch, nullity, *axes)`` of normalized matches.
+        actions: ``(*batch, width, width)`` per view.
+
+    Returns:
+        The same shape; several tensors are orthonormal again.
+    """
+    axes = [int(v) for v in invariant.axes()]
+    small = "".join(LETTERS[i] for i in range(len(axes)))
+    large = small.upper()
+    maps = ",".join(f"...{small[i]}{large[i]}" for i in range(len(axes)))
+    ordered = [actions[v] for v in axes]
+    if invariant.nullity > 1:
+        ordered = [a.unsqueeze(-3) for a in ordered]
+    result = torch.einsum(f"...{small},{maps}->...{large}", tensor, *ordered)
+    rank = len(axes)
+    if invariant.nullity == 1:
+        return result / result.flatten(-rank).norm(dim=-1)[(..., *([None] * rank))].clamp(min=torch.finfo(result.dtype).tiny)
+    flat = result.flatten(-rank)
+    # rows of equal length first, so that the triangular factor of a failed (zero) problem stays finite
+    basis = torch.linalg.qr(flat.mT)[0].mT
+    return torch.where(flat.abs().amax((-2, -1), keepdim=True) > 0, basis, flat).unflatten(-1, result.shape[-rank:])
+
+
+def denormalize_motion(invariant: Invariant, motion: Sequence[Tensor], transforms: Sequence[Tensor]) -> tuple[Tensor, ...]:
+    r"""The motion of the measured coordinates: :math:`A = T_{target}^{-1} \hat A\, T_{source}`, canonical scale and sign."""
+    return tuple(_moved(part, frame, transforms, forward=False) for part, frame in zip(motion, invariant.motion, strict=True))
+
+
+def normalize_motion(invariant: Invariant, motion: Sequence[Tensor], transforms: Sequence[Tensor]) -> tuple[Tensor, ...]:
+    r"""The inverse of :func:`denormalize_motion`: :math:`\hat A = T_{target} A\, T_{source}^{-1}`."""
+    return tuple(_moved(part, frame, transforms, forward=True) for part, frame in zip(motion, invariant.motion, strict=True))
+
+
+def _moved(part: Tensor, frame: Frame, transforms: Sequence[Tensor], *, forward: bool) -> Tensor:
+    matrix = part[..., None] if frame.vector else part
+    for view, left in ((frame.target, True), (frame.source, False)):
+        if view is None:
+            continue
+        transform = transforms[view] if left == forward else torch.linalg.inv(transforms[view])
+        matrix = transform @ matrix if left else matrix @ transform
+    if frame.vector:
+        return matrix[..., 0] / matrix.norm(dim=(-2, -1))[..., None].clamp(min=torch.finfo(matrix.dtype).tiny)
+    return unit(matrix)

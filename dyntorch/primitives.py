@@ -1,0 +1,296 @@
+"""What is measured in one view: points, hyperplanes, lines.  The vectors each of them puts into the estimation matrix.
+
+A multilinear invariant is a form :math:`T(u, v, w)` on vectors that the measured things give, one slot per view.  A slot is
+described by its :class:`Primitive`: how a measurement becomes vectors, how these change under a collineation of the view, and
+what replaces them where the invariant holds for *every* vector in the slot (a match known to be static).
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dyntorch.algebra.extensors import compound, join, plucker, plucker_form
+from dyntorch.algebra.homogeneous import homogeneous, hyperplanes_through
+
+
+class Primitive(ABC):
+    """One slot of a multilinear invariant."""
+
+    dim: int
+    """Dimension d of the space that is measured."""
+    width: int
+    """Length of the vectors."""
+    rows: int = 1
+    """Independent vectors per measurement."""
+
+    @abstractmethod
+    def shapes(self) -> tuple[tuple[int, ...], ...]:
+        """The trailing shapes of one measurement that are understood."""
+
+    @abstractmethod
+    def vectors(self, x: Tensor) -> Tensor:
+        """Unit vectors of the measurements, ``(*batch, n, rows, width)``."""
+
+    @abstractmethod
+    def action(self, transform: Tensor) -> Tensor:
+        r"""The matrix M with :math:`\mathrm{vector}(T x) \sim M\,\mathrm{vector}(x)`, ``(*batch, width, width)``."""
+
+    @abstractmethod
+    def pullback(self, x: Tensor, gradient: Tensor) -> Tensor:
+        r"""Chain rule :math:`J^T g` from the (unscaled) vector back to the measured coordinates.
+
+        Args:
+            x: measurements.
+            gradient: ``(*batch, n, width)`` derivative of a scalar with respect to :meth:`raw`.
+
+        Returns:
+            ``(*batch, n, coordinates)`` derivative with respect to the measured coordinates.
+        """
+
+    @abstractmethod
+    def pushforward(self, x: Tensor, change: Tensor) -> Tensor:
+        r"""The other way: the change :math:`J c` of the raw vector, ``(*batch, n, width)``, for a change of the coordinates."""
+
+    def raw(self, x: Tensor) -> Tensor:
+        """The one vector of a measurement before it is scaled to unit length, ``(*batch, n, width)`` (``rows == 1`` only)."""
+        return self.vectors(x)[..., 0, :]
+
+    def components(self, x: Tensor) -> Tensor:
+        """The raw vectors with the components first, ``(*batch, width, n)``."""
+        return self.raw(x).mT
+
+    def form(self, x: Tensor) -> Tensor:
+        r"""The sum :math:`\sum_r v_r v_r^T` over the vectors of each measurement, ``(*batch, n, width, width)``."""
+        vectors = self.vectors(x)
+        return vectors.mT @ vectors
+
+    def free(self, x: Tensor) -> Tensor:
+        """The form of all vectors that a static match allows in this slot: every vector, unless the primitive says otherwise."""
+        eye = torch.eye(self.width, dtype=x.dtype, device=x.device)
+        return eye.expand(*x.shape[: self.match_axis(x) + 1], self.width, self.width)
+
+    def points(self, x: Tensor) -> Tensor:
+        """Points ``(*batch, n, k, d)`` that stand for the size and place of each measurement (for the normalization)."""
+        return x.unsqueeze(-2)
+
+    def move(self, x: Tensor, transform: Tensor) -> Tensor:
+        """The measurement after a similarity of its view (a scale and a shift), ``(*batch, d+1, d+1)``, in the same shape."""
+        return torch.addcmul(transform[..., None, :-1, -1], x, transform[..., :1, :1])
+
+    def normalized(self, transform: Tensor) -> Primitive:
+        """The primitive that measures in normalized coordinates: the same one, unless it depends on the coordinates."""
+        return self
+
+    def match_axis(self, x: Tensor) -> int:
+        """Axis of the matches in ``x``: the one before the shape of a measurement."""
+        for shape in self.shapes():
+            if tuple(x.shape[x.ndim - len(shape) :]) == shape and x.ndim > len(shape):
+                return x.ndim - len(shape) - 1
+        raise ValueError(f"expected (*batch, n, {' or '.join(str(s) for s in self.shapes())}), got {tuple(x.shape)}")
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.dim})"
+
+
+@dataclass(frozen=True, repr=False)
+class Point(Primitive):
+    """A point of P^d, measured as d inhomogeneous coordinates: one vector (x, 1)."""
+
+    dim: int = 2
+
+    @property
+    def width(self) -> int:  # type: ignore[override]
+        return self.dim + 1
+
+    def shapes(self) -> tuple[tuple[int, ...], ...]:
+        return ((self.dim,),)
+
+    def raw(self, x: Tensor) -> Tensor:
+        return homogeneous(x)
+
+    def components(self, x: Tensor) -> Tensor:
+        return torch.cat([x.mT, torch.ones_like(x.mT[..., :1, :])], dim=-2)
+
+    def vectors(self, x: Tensor) -> Tensor:
+        return torch.nn.functional.normalize(homogeneous(x), dim=-1)[..., None, :]
+
+    def action(self, transform: Tensor) -> Tensor:
+        return transform
+
+    def pullback(self, x: Tensor, gradient: Tensor) -> Tensor:
+        return gradient[..., :-1]
+
+    def pushforward(self, x: Tensor, change: Tensor) -> Tensor:
+        return torch.cat([change, torch.zeros_like(change[..., :1])], dim=-1)
+
+
+@dataclass(frozen=True, repr=False)
+class HyperplanesThrough(Point):
+    """A measured point of P^d, through the d independent hyperplanes that contain it."""
+
+    @property
+    def rows(self) -> int:  # type: ignore[override]
+        return self.dim
+
+    def vectors(self, x: Tensor) -> Tensor:
+        return hyperplanes_through(x)
+
+    def form(self, x: Tensor) -> Tensor:
+        # the projector onto the complement of the point: no basis is needed
+        unit = torch.nn.functional.normalize(homogeneous(x), dim=-1)
+        eye = torch.eye(self.width, dtype=x.dtype, device=x.device)
+        return eye - unit[..., :, None] * unit[..., None, :]
+
+    def action(self, transform: Tensor) -> Tensor:
+        return torch.linalg.inv(transform).mT
+
+    def pullback(self, x: Tensor, gradient: Tensor) -> Tensor:
+        raise NotImplementedError("a point measured through hyperplanes has no single vector")
+
+    def pushforward(self, x: Tensor, change: Tensor) -> Tensor:
+        raise NotImplementedError("a point measured through hyperplanes has no single vector")
+
+
+@dataclass(frozen=True, repr=False)
+class Hyperplane(Primitive):
+    """A measured hyperplane of P^d (a line of an image, a plane in space), homogeneous, of any scale."""
+
+    dim: int = 2
+
+    @property
+    def width(self) -> int:  # type: ignore[override]
+        return self.dim + 1
+
+    def shapes(self) -> tuple[tuple[int, ...], ...]:
+        return ((self.dim + 1,),)
+
+    def raw(self, x: Tensor) -> Tensor:
+        """The hyperplane with a unit normal: its last coordinate is then a distance."""
+        return x / x[..., :-1].norm(dim=-1, keepdim=True).clamp(min=torch.finfo(x.dtype).tiny)
+
+    def vectors(self, x: Tensor) -> Tensor:
+        return torch.nn.functional.normalize(x, dim=-1)[..., None, :]
+
+    def action(self, transform: Tensor) -> Tensor:
+        return torch.linalg.inv(transform).mT
+
+    def pullback(self, x: Tensor, gradient: Tensor) -> Tensor:
+        # noise turns the unit normal (tangentially) and shifts the offset
+        normal = self.raw(x)[..., :-1]
+        turn = gradient[..., :-1] - (gradient[..., :-1] * normal).sum(-1, keepdim=True) * normal
+        return torch.cat([turn, gradient[..., -1:]], dim=-1)
+
+    def pushforward(self, x: Tensor, change: Tensor) -> Tensor:
+        return change
+
+    def points(self, x: Tensor) -> Tensor:
+        """The foot of the perpendicular from the origin."""
+        unit = self.raw(x)
+        return (-unit[..., -1:] * unit[..., :-1]).unsqueeze(-2)
+
+    def move(self, x: Tensor, transform: Tensor) -> Tensor:
+        return x @ torch.linalg.inv(transform)
+
+
+@dataclass(frozen=True, repr=False)
+class Line(Primitive):
+    """A line of space: two points on it ``(*batch, n, 2, 3)``, or Pluecker coordinates ``(*batch, n, 6)`` (01,02,03,12,13,23)."""
+
+    dim: int = 3
+    width: int = 6
+
+    def shapes(self) -> tuple[tuple[int, ...], ...]:
+        return ((2, 3), (6,))
+
+    def raw(self, x: Tensor) -> Tensor:
+        return plucker(x) if self._as_points(x) else x
+
+    def vectors(self, x: Tensor) -> Tensor:
+        return torch.nn.functional.normalize(self.raw(x), dim=-1)[..., None, :]
+
+    def free(self, x: Tensor) -> Tensor:
+        """A line that lies still may be replaced by any line that meets it."""
+        dual = torch.nn.functional.normalize(self.raw(x) @ plucker_form(dtype=x.dtype, device=x.device), dim=-1)
+        eye = torch.eye(6, dtype=x.dtype, device=x.device)
+        return eye - dual[..., :, None] * dual[..., None, :]
+
+    def action(self, transform: Tensor) -> Tensor:
+        return compound(transform, 2)
+
+    def pullback(self, x: Tensor, gradient: Tensor) -> Tensor:
+        if not self._as_points(x):
+            return gradient
+        # l = P ^ Q is bilinear: with the skew matrix W of the gradient, dh/dP = W Q and dh/dQ = -W P
+        skew = torch.zeros(*gradient.shape[:-1], 4, 4, dtype=gradient.dtype, device=gradient.device)
+        rows, columns = torch.triu_indices(4, 4, 1, device=gradient.device)
+        skew[..., rows, columns] = gradient
+        skew = skew - skew.mT
+        first, second = homogeneous(x).unbind(-2)
+        return torch.cat([(skew @ second[..., None])[..., :3, 0], -(skew @ first[..., None])[..., :3, 0]], dim=-1)
+
+    def pushforward(self, x: Tensor, change: Tensor) -> Tensor:
+        if not self._as_points(x):
+            return change
+        first, second = homogeneous(x).unbind(-2)
+        moved = torch.nn.functional.pad(change.unflatten(-1, (2, 3)), (0, 1))
+        return join(moved[..., 0, :], second) + join(first, moved[..., 1, :])
+
+    def points(self, x: Tensor) -> Tensor:
+        return x if self._as_points(x) else _feet(x).unsqueeze(-2)
+
+    def move(self, x: Tensor, transform: Tensor) -> Tensor:
+        if self._as_points(x):
+            return torch.addcmul(transform[..., None, None, :-1, -1], x, transform[..., None, :1, :1])
+        return x @ compound(transform, 2).mT
+
+    def _as_points(self, x: Tensor) -> bool:
+        return x.ndim >= 3 and tuple(x.shape[-2:]) == (2, 3)
+
+
+def _feet(line: Tensor) -> Tensor:
+    """Foot of the perpendicular from the origin of each Pluecker line: direction x moment / |direction|^2."""
+    direction = -line[..., [2, 4, 5]]  # P3 Q - Q3 P of the homogeneous points
+    moment = torch.stack([line[..., 3], -line[..., 1], line[..., 0]], dim=-1)
+    return torch.linalg.cross(direction, moment) / direction.square().sum(-1, keepdim=True).clamp(min=torch.finfo(line.dtype).tiny)
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class Projected(Primitive):
+    """A measured point of space seen through given cameras M ``(cameras, 3, 4)``: the vector M (x, 1).
+
+    The cameras are a batch dimension: one estimation problem per camera, from the same matches.
+    """
+
+    cameras: Tensor
+    dim: int = 3
+    width: int = 3
+
+    def shapes(self) -> tuple[tuple[int, ...], ...]:
+        return ((self.dim,),)
+
+    def raw(self, x: Tensor) -> Tensor:
+        return homogeneous(x) @ self.cameras.to(x).mT
+
+    def vectors(self, x: Tensor) -> Tensor:
+        return torch.nn.functional.normalize(self.raw(x), dim=-1)[..., None, :]
+
+    def normalized(self, transform: Tensor) -> Primitive:
+        return Projected(self._split(transform)[1])
+
+    def action(self, transform: Tensor) -> Tensor:
+        return torch.linalg.inv(self._split(transform)[0])
+
+    def pullback(self, x: Tensor, gradient: Tensor) -> Tensor:
+        return (gradient @ self.cameras.to(x))[..., :3]
+
+    def pushforward(self, x: Tensor, change: Tensor) -> Tensor:
+        return change @ self.cameras.to(x)[..., :3].mT
+
+    def _split(self, transform: Tensor) -> tuple[Tensor, Tensor]:
+        """M T^-1 = L Q with orthonormal rows Q, the well-conditioned camera of the normalized points."""
+        q, r = torch.linalg.qr((self.cameras.to(transform) @ torch.linalg.inv(transform)).mT)
+        return r.mT, q.mT

@@ -1,0 +1,314 @@
+"""Batched Levenberg-Marquardt: the motion that minimizes the Sampson distances of all matches."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from dyntorch.blocks import map_blocks
+from dyntorch.invariant import Invariant
+from dyntorch.matches import Matches, matches
+from dyntorch.normalize import Normalization, denormalize, denormalize_motion
+from dyntorch.residual import multilinear_derivative, whitened
+from dyntorch.solution import FAILED, Solution
+
+ITERATIONS = 30
+CONVERGED = 1e-9  # relative decrease of the cost
+BLOCK = 1 << 18
+"""Entries of the Jacobian per block of the batch: larger ones leave the cache, smaller ones pay for the calls."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Least squares in the entries of a motion, over a block of problems."""
+
+    invariant: Invariant
+    shapes: tuple[torch.Size, ...]
+    views: tuple[Tensor, ...]
+    scales: tuple[Tensor, ...]
+    weights: Tensor
+    static: Tensor | None
+
+    def parts(self, theta: Tensor) -> tuple[Tensor, ...]:
+        """The motion ``(b, *shape)`` of parameters ``(b, p)``."""
+        sizes = [shape.numel() for shape in self.shapes]
+        return tuple(part.unflatten(-1, shape) for part, shape in zip(theta.split(sizes, -1), self.shapes, strict=True))
+
+    def subset(self, keep: Tensor) -> Problem:
+        """Only some of the problems."""
+        cut = [x[keep] for x in self.views], [s[keep] for s in self.scales], self.weights[keep]
+        static = None if self.static is None else self.static[keep]
+        invariant = self.invariant.subset(keep)
+        return Problem(invariant, self.shapes, tuple(cut[0]), tuple(cut[1]), cut[2], static)
+
+    def residual(self, theta: Tensor, piece: slice) -> tuple[Tensor, Tensor]:
+        """Weighted whitened residuals ``(b, rows)`` of some of the matches, and their derivative ``(b, p, rows)``."""
+        views, weights = tuple(x[:, piece] for x in self.views), self.weights[:, piece]
+        still = None if self.static is None else self.static[:, piece]
+        moving = weights if still is None else weights * ~still
+        value, derivative = self._moving(theta, views)
+        root = moving.sqrt()[..., None].expand(*moving.shape, value.shape[1] // moving.shape[1]).flatten(1)
+        value, derivative = value * root, derivative * root[:, None]
+        if still is None:
+            return value, derivative
+        resting = (weights * still).sqrt()[..., None]
+        more = _jacobian(lambda t: (self.invariant.whitened_static(self.parts(t), views, self.scales) * resting).flatten(1), theta)
+        return torch.cat([value, more[0]], dim=-1), torch.cat([derivative, more[1]], dim=-1)
+
+    def _moving(self, theta: Tensor, views: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+        """Unweighted residuals of matches that may move, and their derivative."""
+        if type(self.invariant).whitened is not Invariant.whitened:
+            return _jacobian(lambda t: whitened(self.invariant, self.parts(t), views, self.scales).flatten(1), theta)
+        # one row per match: by hand through the tensor, several times cheaper than forward mode through the matches
+        tensor, slope = _jacobian(lambda t: self.invariant.compose(*self.parts(t)).flatten(1), theta)
+        shape = self.invariant.shape()
+        value, derivative = multilinear_derivative(self.invariant, tensor.unflatten(1, shape), views, self.scales)
+        return value, slope @ derivative.mT
+
+    def pieces(self, width: int) -> list[slice]:
+        """The matches in slices whose Jacobians fit into memory, whatever their number."""
+        n = self.weights.shape[-1]
+        step = max(256, 8 * BLOCK // (max(1, width) * max(1, self.weights.shape[0])))
+        return [slice(start, start + step) for start in range(0, max(n, 1), step)]
+
+    def normal_equations(self, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Cost ``(b,)``, gradient ``(b, p)`` and Gauss-Newton matrix ``(b, p, p)``."""
+        cost = torch.zeros(theta.shape[0], dtype=theta.dtype, device=theta.device)
+        gradient, matrix = torch.zeros_like(theta), theta.new_zeros(*theta.shape, theta.shape[-1])
+        for piece in self.pieces(theta.shape[-1]):
+            value, derivative = self.residual(theta, piece)
+            cost = cost + value.square().sum(-1)
+            gradient = gradient + (derivative @ value[..., None])[..., 0]
+            matrix = matrix + derivative @ derivative.mT
+        return torch.where(cost.isfinite(), cost, torch.inf), gradient, matrix
+
+
+def _jacobian(function: Callable[[Tensor], Tensor], theta: Tensor) -> tuple[Tensor, Tensor]:
+    """Value ``(b, rows)`` and transposed Jacobian ``(b, p, rows)`` by one vectorized forward-mode pass over the parameters."""
+    count = theta.shape[-1]
+    tangents = torch.eye(count, dtype=theta.dtype, device=theta.device)[:, None, :].expand(count, *theta.shape)
+
+    def along(tangent: Tensor) -> tuple[Tensor, Tensor]:
+        return torch.func.jvp(function, (theta,), (tangent,))
+
+    values, columns = torch.func.vmap(along, out_dims=(None, 0))(tangents)
+    return values, columns.transpose(0, 1)
+
+
+def refine(
+    solution: Solution,
+    *views: Tensor,
+    weights: Tensor | None = None,
+    static: Tensor | None = None,
+    iterations: int = ITERATIONS,
+) -> Solution:
+    r"""Refine the motion of a solution: minimize :math:`\sum_n w_n d_n^2` over its entries by Levenberg-Marquardt.
+
+    :math:`d_n` is the Sampson distance of match n, for several conditions per match its vector form
+    :math:`Q^{-1/2} e`.  The internal constraints of the tensor hold exactly, because its motion is what is varied.  Matches
+    labelled static are held to agree in all views (the segmented refinement).  The cost never rises; where the solution had
+    failed it is returned as it was.
+
+    Args:
+        solution: from :func:`dyntorch.fit` or :func:`dyntorch.robust_fit`.
+        *views: the same matches.
+        weights: ``(*batch, n)``; default: the solution's inliers, else its weights.
+        static: ``(*batch, n)`` bool, matches that do not move; default: those labelled in the fit.
+        iterations: at most so many steps.
+
+    Returns:
+        The solution with ``tensor``, ``motion``, ``sigma`` (noise per coordinate, in the unit of the matches, that the
+        residuals show) and ``covariance`` of the entries of the motion (rank ``invariant.dof``: its scale is fixed; infinite
+        where no match is left to estimate the noise).
+
+    Raises:
+        ValueError: matches that do not fit the solution.
+
+    Source: theory of nonlinear estimation as in Hartley and Zisserman, appendix A6.
+
+    Example:
+        >>> import torch, dyntorch as dyn
+        >>> from dyntorch import scenes
+        >>> scene = scenes.planar(n=60, sigma=0.5, generator=torch.Generator().manual_seed(0))
+        >>> solution = dyn.fit(dyn.HomographyTensor, *scene.views)
+        >>> refined = dyn.refine(solution, *scene.views)
+        >>> bool((refined.sigma - 0.5).abs() < 0.15)
+        True
+    """
+    invariant = solution.invariant
+    data = matches(invariant, views, weights, static)
+    old = solution.matches
+    if data.batch != old.batch or data.count != old.count:
+        raise ValueError(
+            f"these matches have batch {data.batch} and {data.count} matches, the solution was fitted to batch {old.batch} and "
+            f"{old.count}; give the same ones"
+        )
+    if weights is None:
+        keep = old.weights if solution.inliers is None else solution.inliers.reshape(old.weights.shape).to(old.weights)
+        data = replace(data, weights=data.weights * (keep > 0 if solution.inliers is not None else keep))
+    if static is None and old.static is not None:
+        data = replace(data, static=old.static)
+    return refine_matches(solution, data, iterations)
+
+
+def refine_matches(solution: Solution, data: Matches, iterations: int = ITERATIONS) -> Solution:
+    """:func:`refine` for checked matches."""
+    invariant, norm = solution.invariant, _plain(solution)
+    parts = solution.normalized_motion()
+    shapes = tuple(part.shape[1:] for part in parts)
+    theta = torch.cat([part.flatten(1) for part in parts], dim=-1).detach()
+    moved = tuple(x.detach() for x in norm.apply(invariant, data.views))
+    frames = tuple(t.detach() for t in norm.transforms)
+    base = invariant.normalized(tuple(t.detach() for t in solution.normalization.transforms))
+    flags = () if data.static is None else (data.static,)
+    count = len(moved)
+
+    def run(*block: Tensor) -> tuple[Tensor, ...]:
+        views, scales, rest = block[1 : 1 + count], block[1 + count : 1 + 2 * count], block[1 + 2 * count :]
+        problem = Problem(base, shapes, views, scales, rest[0], rest[1] if len(rest) > 1 else None)
+        return _minimize(problem, block[0], iterations)
+
+    size = max(1, BLOCK // max(1, data.count * theta.shape[-1]))
+    with torch.no_grad():
+        start = torch.where(theta.isfinite(), theta, torch.zeros_like(theta))
+        best, cost, matrix = map_blocks(run, start, *moved, *norm.scales, data.weights, *flags, size=size)
+        return _refined(solution, data, norm, frames, shapes, best, cost, matrix)
+
+
+def _minimize(problem: Problem, theta: Tensor, iterations: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Parameters, cost and Gauss-Newton matrix at the minimum of every problem of a block."""
+    theta = _unit_parts(problem, theta)
+    result = (theta, *problem.normal_equations(theta))
+    damping = torch.full_like(result[1], 1e-3)
+    left = torch.arange(theta.shape[0], device=theta.device)
+    state, current = result, problem
+    for _ in range(iterations):
+        state, damping, done = _step(current, state, damping)
+        if theta.device.type != "cpu":
+            result = state
+            continue
+        # problems that are done leave: the slow ones do not make the others wait
+        result = tuple(whole.index_copy(0, left, part) for whole, part in zip(result, state, strict=True))
+        keep = (~done).nonzero().flatten()
+        if not len(keep):
+            break
+        if len(keep) < len(left):
+            left, damping, current = left[keep], damping[keep], current.subset(keep)
+            state = tuple(part[keep] for part in state)
+    return result[0], result[1], result[3]
+
+
+def _step(problem: Problem, state: tuple[Tensor, ...], damping: Tensor) -> tuple[tuple[Tensor, ...], Tensor, Tensor]:
+    """One damped step of every problem: the new state, the new damping, and which problems are done."""
+    theta, cost, gradient, matrix = state
+    diagonal = matrix.diagonal(dim1=-2, dim2=-1)
+    # the scales of the parts are free: a floor keeps their directions from being divided by zero
+    floor = diagonal + 1e-9 * diagonal.amax(-1, keepdim=True) + torch.finfo(theta.dtype).tiny
+    factor, _ = torch.linalg.cholesky_ex(matrix + torch.diag_embed(damping[:, None] * floor))
+    step = torch.cholesky_solve(gradient[..., None], factor)[..., 0]
+    step = torch.where(step.isfinite(), step, torch.zeros_like(step))
+    trial = _unit_parts(problem, theta - step)
+    fresh = (trial, *problem.normal_equations(trial))
+    better = fresh[1] < cost
+    # a problem is done when it gains nothing any more, does not move, or finds no way down even by the shortest steps
+    gained = torch.where(better, cost - fresh[1], torch.inf) <= CONVERGED * cost
+    done = gained | (step.abs().amax(-1) < 1e-13) | (~better & (damping > 1e6)) | ~cost.isfinite()
+    damping = torch.where(better, (damping * 0.1).clamp(min=1e-12), damping * 8)
+    chosen = tuple(torch.where(better[(..., *([None] * (new.ndim - 1)))], new, old) for new, old in zip(fresh, state, strict=True))
+    return chosen, damping, done
+
+
+def _unit_parts(problem: Problem, theta: Tensor) -> Tensor:
+    """Every part of the motion with norm 1, which changes nothing but the size of the numbers."""
+    scaled = [part.flatten(1) / part.flatten(1).norm(dim=-1, keepdim=True).clamp(min=1e-30) for part in problem.parts(theta)]
+    return torch.cat(scaled, dim=-1)
+
+
+def _refined(
+    solution: Solution,
+    data: Matches,
+    norm: Normalization,
+    frames: tuple[Tensor, ...],
+    shapes: tuple[torch.Size, ...],
+    theta: Tensor,
+    cost: Tensor,
+    matrix: Tensor,
+) -> Solution:
+    """The solution with the refined motion, where refinement was possible."""
+    invariant = solution.invariant
+    problem = Problem(invariant, shapes, (), (), data.weights, None)
+    status = solution.status.reshape(-1).to(theta.device)
+    good = cost.isfinite()
+    for state in FAILED:
+        good = good & (status != state)
+    motion = tuple(
+        torch.where(good[(..., *([None] * (part.ndim - 1)))], part, old)
+        for part, old in zip(problem.parts(theta), solution.normalized_motion(), strict=True)
+    )
+    safe = tuple(torch.where(good[(..., *([None] * (part.ndim - 1)))], part, _any(part)) for part in motion)
+    # tensors of copies have the axis of the copies behind the batch, like the transforms of the solution
+    normalized = invariant.normalized(solution.normalization.transforms).compose(*safe)
+    tensor = denormalize(invariant, normalized, solution.normalization.actions)
+    keep = good[(..., *([None] * (tensor.ndim - 1)))]
+    conditions = torch.full_like(data.weights, float(invariant.codim))
+    if data.static is not None:
+        still = sum(int(p.dim) for p in invariant.primitives[1:])
+        conditions = torch.where(data.static, float(still), conditions)
+    spare = ((data.weights > 0) * conditions).sum(-1) - invariant.dof
+    mean = cost / data.weights.amax(-1).clamp(min=torch.finfo(cost.dtype).tiny)
+    sigma = torch.where(spare > 0, (mean / spare.clamp(min=1)).sqrt(), torch.inf)
+    covariance = _covariance(invariant, problem, frames, theta, matrix, sigma, data.weights)
+    return replace(
+        solution,
+        tensor=torch.where(data.back(keep), data.back(tensor), solution.tensor),
+        normalized=torch.where(keep, normalized, solution.normalized),
+        refined=motion,
+        sigma=data.back(torch.where(good, sigma, torch.zeros_like(sigma))),
+        covariance=data.back(torch.where(good[:, None, None], covariance, torch.zeros_like(covariance))),
+    )
+
+
+def _covariance(
+    invariant: Invariant,
+    problem: Problem,
+    frames: tuple[Tensor, ...],
+    theta: Tensor,
+    matrix: Tensor,
+    sigma: Tensor,
+    weights: Tensor,
+) -> Tensor:
+    r"""Covariance ``(b, p, p)`` of the motion in the coordinates of the matches: :math:`\sigma^2 D H^+ D^T`, H of rank dof."""
+    values, vectors = torch.linalg.eigh(torch.where(matrix.isfinite(), matrix, torch.zeros_like(matrix)))
+    count = min(invariant.dof, values.shape[-1])
+    values, vectors = values[..., -count:], vectors[..., -count:]
+    root = vectors * values.clamp(min=1e-12 * values[..., -1:].clamp(min=torch.finfo(values.dtype).tiny)).rsqrt()[..., None, :]
+
+    def moved(t: Tensor) -> Tensor:
+        return torch.cat([part.flatten(1) for part in denormalize_motion(invariant, problem.parts(t), frames)], dim=-1)
+
+    _, derivative = _jacobian(moved, theta)
+    spread = derivative.mT @ root
+    scale = sigma * weights.amax(-1).sqrt()
+    return (spread @ spread.mT) * torch.where(scale.isfinite(), scale, torch.ones_like(scale)).square()[
+        :, None, None
+    ] + torch.where(scale.isfinite(), 0.0, torch.inf)[:, None, None]
+
+
+def _any(part: Tensor) -> Tensor:
+    """A harmless motion in place of one that failed."""
+    if part.ndim == 3:
+        return torch.eye(part.shape[-2], part.shape[-1], dtype=part.dtype, device=part.device).expand_as(part)
+    return torch.ones_like(part)
+
+
+def _plain(solution: Solution) -> Normalization:
+    """The normalization of one problem each, without the dimension of copies."""
+    norm = solution.normalization
+    if solution.invariant.copies is None:
+        return norm
+    return Normalization(
+        tuple(t[:, 0] for t in norm.transforms), norm.primitives, norm.actions, tuple(s[:, 0] for s in norm.scales)
+    )

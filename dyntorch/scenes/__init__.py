@@ -1,0 +1,18 @@
+"""Ground-truth scenes for tests, benchmarks and experiments: one function per kind of motion, all batched."""
+
+from dyntorch.scenes.lines import translating_lines
+from dyntorch.scenes.plane import lines_concurrent, planar
+from dyntorch.scenes.scene import Scene
+from dyntorch.scenes.space import constant_velocity, moving_points
+from dyntorch.scenes.static import collineation, two_view
+
+__all__ = [
+    "Scene",
+    "collineation",
+    "constant_velocity",
+    "lines_concurrent",
+    "moving_points",
+    "planar",
+    "translating_lines",
+    "two_view",
+]

@@ -1,0 +1,172 @@
+"""Scenes in a plane seen by a moving calibrated camera: moving points, and lines through static points."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from dyntorch.algebra.homogeneous import apply, homogeneous
+from dyntorch.scenes.scene import Draw, Scene
+
+WIDTH, HEIGHT, FOCAL = 640, 480, 700.0
+
+
+def planar(
+    n: int = 100,
+    *,
+    batch: int | Sequence[int] = (),
+    sigma: float = 0.0,
+    static: float = 0.0,
+    outliers: float = 0.0,
+    step: tuple[float, float] = (25.0, 80.0),
+    generator: torch.Generator | None = None,
+    dtype: torch.dtype = torch.float64,
+) -> Scene:
+    r"""Points of a plane that move on straight lines at changing speed: :math:`\det[p_1, A p_2, B p_3] = 0`.
+
+    Three views of 640 x 480 pixels, focal length 700, of a plane seen at a slant; a point moves along its line by a random
+    amount between two views, forwards or backwards, in pixels of the second view.
+
+    Args:
+        n: number of matches.
+        batch: shape of the batch of independent scenes.
+        sigma: noise, pixels.
+        static: share of static points.
+        outliers: share of matches of which view 2 or 3 is replaced by a random point.
+        step: least and greatest motion between views, pixels.
+        generator: source of all randomness.
+        dtype: of the result; the scene is made in float64.
+
+    Returns:
+        Scene with ``views`` three ``(*batch, n, 2)``; ``motion`` (A, B), the homographies of the plane from view 2 and 3 to
+        view 1.  A single-view outlier of a static match still satisfies the equation: see ``extras["moving"]``.
+
+    Raises:
+        ValueError: shares outside 0 to 1, negative sigma, n < 1.
+
+    Source: thesis chapter 2 (homography tensor).
+
+    Example:
+        >>> import torch
+        >>> scene = planar(5, generator=torch.Generator().manual_seed(0))
+        >>> p1, p2, p3 = (homogeneous(x) for x in scene.views)
+        >>> A, B = scene.motion
+        >>> cosine = normalize(p1) * normalize(torch.linalg.cross(p2 @ A.mT, p3 @ B.mT))
+        >>> bool(cosine.sum(-1).abs().max() < 1e-10)
+        True
+    """
+    draw = Draw(n, batch, sigma, static, outliers, generator, dtype)
+    to_image = _plane_to_images(draw)
+    angle = draw.uniform(n, high=2 * torch.pi)
+    # half of the points turn back: near constant speed would leave a family of B undetermined (four times the error)
+    steps = draw.uniform(n, 2, 1, low=step[0], high=step[1]) * torch.where(draw.uniform(n, 2, 1) < 0.5, -1.0, 1.0)
+    path = torch.stack([angle.cos(), angle.sin()], dim=-1)[..., None, :] * steps
+    path = torch.where(draw.moving[..., None, None], path, 0.0)
+    middle = _in_image(draw)
+    # the straight paths are drawn in the second view and carried over to the others by the plane
+    from_second = to_image @ torch.linalg.inv(to_image[..., 1:2, :, :])
+    placed = (middle - path[..., 0, :], middle, middle + path[..., 1, :])
+    exact = [apply(from_second[..., v, :, :], x) for v, x in enumerate(placed)]
+    return draw.scene(exact, _to_first(to_image))
+
+
+def lines_concurrent(
+    n: int = 100,
+    *,
+    batch: int | Sequence[int] = (),
+    sigma: float = 0.0,
+    static: float = 0.0,
+    outliers: float = 0.0,
+    generator: torch.Generator | None = None,
+    dtype: torch.dtype = torch.float64,
+) -> Scene:
+    r"""Three lines, one per view, through one static point of a plane: :math:`\det[l_1, A^{-T} l_2, B^{-T} l_3] = 0`.
+
+    The dual of :func:`planar`, with its cameras.  A line is measured by two points 60 to 160 pixels apart, which carry the
+    noise.
+
+    Args:
+        n: number of matches.
+        batch: shape of the batch of independent scenes.
+        sigma: noise of the two points, pixels.
+        static: share of matches that are one and the same static line in all views (the dual of a static point).
+        outliers: share of matches of which the line of view 2 or 3 is replaced by a random line.
+        generator: source of all randomness.
+        dtype: of the result; the scene is made in float64.
+
+    Returns:
+        Scene with ``views`` three ``(*batch, n, 3)``, lines with unit normals; ``motion`` (A, B) maps points from view 2 and
+        3 to view 1; ``extras["segments"]`` ``(*batch, 3, n, 2, 2)`` the noisy points, ``extras["points"]`` ``(*batch, 3, n,
+        2)`` the exact images of the static points.
+
+    Raises:
+        ValueError: shares outside 0 to 1, negative sigma, n < 1.
+
+    Source: thesis chapter 2 (homography tensor, upper indices).
+
+    Example:
+        >>> import torch
+        >>> scene = lines_concurrent(5, generator=torch.Generator().manual_seed(0))
+        >>> bool((scene.views[0] * homogeneous(scene.extras["points"][0])).sum(-1).abs().max() < 1e-9)
+        True
+    """
+    draw = Draw(n, batch, sigma, static, outliers, generator, dtype)
+    to_image = _plane_to_images(draw)
+    from_second = to_image @ torch.linalg.inv(to_image[..., 1:2, :, :])
+    middle = _in_image(draw)
+    angle = draw.uniform(3, n, high=torch.pi)
+    reach = draw.uniform(3, n, 2, 1, low=30.0, high=80.0) * torch.tensor([[-1.0], [1.0]], dtype=torch.float64, device=angle.device)
+    points, segments = [], []
+    for v in range(3):
+        to_view = from_second[..., v, :, :]
+        # a moving match has its own direction in each view; a static line has that of the second, carried over
+        direction = torch.stack([angle[..., v, :].cos(), angle[..., v, :].sin()], dim=-1)
+        common = torch.stack([angle[..., 1, :].cos(), angle[..., 1, :].sin()], dim=-1)
+        here = apply(to_view, middle)
+        carried = normalize(apply(to_view, middle + common) - here, dim=-1)
+        along = torch.where(draw.moving[..., None], direction, carried)
+        points.append(here)
+        segments.append(here[..., None, :] + reach[..., v, :, :, :] * along[..., None, :])
+    found = draw.scene(segments, _to_first(to_image), points=torch.stack(points, dim=-3))
+    return replace(
+        found,
+        views=tuple(map(_lines, found.views)),
+        exact=tuple(map(_lines, found.exact)),
+        extras={**found.extras, "segments": torch.stack(found.views, dim=-4)},
+    )
+
+
+def _lines(segments: Tensor) -> Tensor:
+    """``(*batch, n, 3)`` lines with unit normals through the two points ``(*batch, n, 2, 2)``."""
+    first, second = homogeneous(segments).unbind(-2)
+    line = torch.linalg.cross(first, second)
+    return line / line[..., :2].norm(dim=-1, keepdim=True)
+
+
+def _in_image(draw: Draw) -> Tensor:
+    """``(*batch, n, 2)`` points all over the image."""
+    return torch.stack([draw.uniform(draw.n, high=WIDTH), draw.uniform(draw.n, high=HEIGHT)], dim=-1)
+
+
+def _to_first(to_image: Tensor) -> list[Tensor]:
+    """A and B, from the second and the third view to the first."""
+    return [to_image[..., 0, :, :] @ torch.linalg.inv(to_image[..., v, :, :]) for v in (1, 2)]
+
+
+def _plane_to_images(draw: Draw) -> Tensor:
+    r"""``(*batch, 3, 3, 3)`` maps :math:`K R\,[e_1, e_2, -c]` of the plane z = 0 to three views that look at its origin."""
+    slant = draw.uniform(1, low=0.35, high=0.7) + draw.uniform(3, low=-0.15, high=0.15)
+    around = draw.uniform(1, high=2 * torch.pi) + draw.uniform(3, low=-0.4, high=0.4)
+    distance = draw.uniform(3, 1, low=6.0, high=8.0)
+    ray = torch.stack([slant.sin() * around.cos(), slant.sin() * around.sin(), -slant.cos()], dim=-1)
+    up = torch.zeros_like(ray)
+    up[..., 1] = 1.0
+    x = normalize(torch.linalg.cross(up, -ray), dim=-1)
+    rotation = draw.rotations(3, spread=0.03) @ torch.stack([x, torch.linalg.cross(-ray, x), -ray], dim=-2)
+    plane = torch.cat([torch.eye(3, 2, dtype=ray.dtype, device=ray.device).expand(*ray.shape, 2), -(ray * distance)[..., None]], -1)
+    calibration = torch.tensor([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]], dtype=ray.dtype, device=ray.device)
+    return calibration @ rotation @ plane

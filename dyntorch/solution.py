@@ -1,0 +1,150 @@
+"""What a fit returns: the tensor, an honest status per problem, and what later steps need."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from enum import IntEnum
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from dyntorch.invariant import Invariant
+from dyntorch.matches import Matches
+from dyntorch.matrix import CHUNK, estimation_matrix
+from dyntorch.normalize import Normalization, denormalize_motion
+
+
+class Status(IntEnum):
+    """How one problem of a batch ended."""
+
+    OK = 0
+    TOO_FEW = 1
+    """Fewer matches with weight than determine the tensor.  The tensor is zero."""
+    DEGENERATE = 2
+    """The matches leave more than the invariant's null space, exactly: several tensors fulfil all of them.  The tensor is zero."""
+    AMBIGUOUS = 3
+    """Other tensors fit the matches as well as this one, within the noise.  The tensor is one of them."""
+    NO_CONSENSUS = 4
+    """Robust estimation found no tensor that enough matches agree with.  The tensor is the best one found."""
+    NOT_CONVERGED = 5
+    """The solver's own certificate failed (devices on which it may not look at the numbers).  The tensor is its last iterate."""
+
+
+REMEDY = {
+    Status.TOO_FEW: "give more matches, or weigh fewer of them 0",
+    Status.DEGENERATE: "add matches in general position (other trajectories, other directions of motion), or use a smaller model",
+    Status.AMBIGUOUS: "add matches that differ more, lower the noise, or use a model with fewer degrees of freedom",
+    Status.NO_CONSENSUS: "raise the threshold, or give matches of which more belong to the model",
+    Status.NOT_CONVERGED: "solve on the CPU",
+}
+FAILED = (Status.TOO_FEW, Status.DEGENERATE)
+"""The states that leave no tensor."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Solution:
+    """Result of :func:`dyntorch.fit`, :func:`dyntorch.robust_fit` and :func:`dyntorch.refine`.
+
+    Attributes:
+        invariant: what was fitted.
+        tensor: ``(*batch, *axes)``, ``(*batch, nullity, *axes)`` where the nullity is above 1; Frobenius norm 1, zero where
+            the status says that there is none.
+        status: ``(*batch,)`` of :class:`Status` values.
+        uncertainty: ``(*batch,)`` expected relative error of the tensor from the noise that the residuals show; 0 where the
+            matches are as few as can be (nothing is left to judge by).
+        inliers: ``(*batch, n)`` bool, after robust estimation.
+        covariance: ``(*batch, p, p)`` of the entries of all parts of ``motion``, one after the other, after refinement.
+        sigma: ``(*batch,)`` noise of one coordinate that the residuals show, after robust estimation or refinement.
+    """
+
+    invariant: Invariant
+    tensor: Tensor
+    status: Tensor
+    uncertainty: Tensor
+    matches: Matches = field(repr=False)
+    normalization: Normalization = field(repr=False)
+    normalized: Tensor = field(repr=False)
+    """The tensor of the normalized matches, flat batch, float64."""
+    inliers: Tensor | None = None
+    covariance: Tensor | None = None
+    sigma: Tensor | None = None
+    refined: tuple[Tensor, ...] | None = field(default=None, repr=False)
+    """Motion in normalized coordinates, flat batch, where it does not come from the tensor."""
+
+    @cached_property
+    def motion(self) -> tuple[Tensor, ...]:
+        """The parts of the motion in the coordinates of the matches; decomposed in normalized ones, which is more accurate."""
+        parts = self.normalized_motion()
+        moved = denormalize_motion(self.invariant, parts, self._frames())
+        return tuple(self.matches.back(self._or_zero(part)) for part in moved)
+
+    @cached_property
+    def singular_values(self) -> Tensor:
+        """``(*batch, D)`` of the estimation matrix of the normalized, weighted matches, descending.
+
+        Computed on first use from the matrix itself, so that they are accurate down to the rounding of the largest one.
+        """
+        m = self.matches
+        views, weights, static = copied(self.invariant, m)
+        moved = self.normalization.apply(self.invariant, views)
+        width, rows = self.invariant.width(), self.invariant.rows()
+        step = max(2 * width, CHUNK // (width * rows * max(1, weights.numel() // max(1, weights.shape[-1]))))
+        factor: Tensor | None = None
+        for start in range(0, max(1, weights.shape[-1]), step):
+            piece = slice(start, start + step)
+            part = [x.narrow(2 if self.invariant.copies else 1, start, min(step, weights.shape[-1] - start)) for x in moved]
+            label = None if static is None else static[..., piece]
+            matrix = estimation_matrix(self.normalization.primitives, part, weights[..., piece], label)
+            stacked = matrix if factor is None else torch.cat([factor, matrix], dim=-2)
+            factor = torch.linalg.qr(stacked, mode="r")[1] if stacked.shape[-2] > width else stacked
+        assert factor is not None
+        values = torch.linalg.svdvals(factor)
+        return self.matches.back(torch.nn.functional.pad(values, (0, width - values.shape[-1])))
+
+    def normalized_motion(self) -> tuple[Tensor, ...]:
+        """Parts of the motion in normalized coordinates, flat batch, float64."""
+        if self.refined is not None:
+            return self.refined
+        parts = self.invariant.normalized(self.normalization.transforms).decompose(self.normalized)
+        return parts if isinstance(parts, tuple) else (parts,)
+
+    def check(self) -> Solution:
+        """Raise where any problem failed.
+
+        Raises:
+            ValueError: says which problems of the batch failed, how, and what to do.
+        """
+        status = self.status.reshape(-1)
+        for state in Status:
+            where = (status == state).nonzero().flatten().tolist()
+            if state != Status.OK and where:
+                shown = ", ".join(str(i) for i in where[:8]) + (", ..." if len(where) > 8 else "")
+                problems = f"problem {shown} of {len(status)}" if self.status.ndim else "the problem"
+                raise ValueError(f"{self.invariant!r}: {problems}: {state.name}; {REMEDY[state]}")
+        return self
+
+    def __repr__(self) -> str:
+        counted = Counter(Status(s).name for s in self.status.reshape(-1).tolist())
+        states = ", ".join(f"{count} {name}" for name, count in sorted(counted.items(), key=lambda item: Status[item[0]]))
+        shape = tuple(self.status.shape)
+        return f"Solution({self.invariant!r}, matches={self.matches.count}, batch={shape}: {states or 'empty'})"
+
+    def _frames(self) -> tuple[Tensor, ...]:
+        """Transforms without the dimension of copies."""
+        return tuple(t[:, 0] for t in self.normalization.transforms) if self.invariant.copies else self.normalization.transforms
+
+    def _or_zero(self, part: Tensor) -> Tensor:
+        failed = torch.zeros(part.shape[0], dtype=torch.bool, device=part.device)
+        for state in FAILED:
+            failed = failed | (self.status.reshape(-1).to(part.device) == state)
+        return torch.where(failed[(..., *([None] * (part.ndim - 1)))], torch.zeros_like(part), part)
+
+
+def copied(invariant: Invariant, matches: Matches) -> tuple[tuple[Tensor, ...], Tensor, Tensor | None]:
+    """Views, weights and labels with the dimension of copies behind the batch, for an invariant that has it."""
+    if invariant.copies is None:
+        return matches.views, matches.weights, matches.static
+    static = None if matches.static is None else matches.static[:, None]
+    return tuple(x[:, None] for x in matches.views), matches.weights[:, None], static

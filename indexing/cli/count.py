@@ -1,0 +1,176 @@
+"""``dyntorch count``: how many matches an invariant takes, exactly."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from indexing.cli.console import say, table
+
+if TYPE_CHECKING:
+    from dyntorch import counting
+
+Number = Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")]
+Numbers = Annotated[tuple[int, ...], tyro.conf.arg(metavar="N ...", help_behavior_hint="")]
+
+
+@dataclass(frozen=True)
+class Matches:
+    """How many matches of each kind; with none of these, as many as raise the rank."""
+
+    moving: Number = None
+    """that move as the configuration lets them"""
+    static: Number = None
+    """that stay where they are, without anyone knowing it"""
+    labelled_static: Number = None
+    """that are known to stay where they are"""
+    lines: Numbers = ()
+    """moving points on each of several trajectory lines"""
+    static_lines: Numbers = ()
+    """static points on each of several lines"""
+    static_points: Number = None
+    """of dual_homography and lines: static points, through which all lines match"""
+    translating: Number = None
+    """of lines: each with a translation of its own"""
+    objects: Numbers = ()
+    """of lines: how many on each of several rigid objects that translate"""
+    equal_velocity: Number = None
+    """of constant_velocity: all with the same velocity"""
+    linear_velocity: Number = None
+    """of constant_velocity: with velocities along one direction"""
+    planar_velocity: Number = None
+    """of constant_velocity: with velocities in one plane, such as cars on a road"""
+    coplanar: Number = None
+    """of fundamental, trifocal and quadrifocal: static points of one plane"""
+    images: Number = None
+    """of shape_tensor"""
+    synthetic: tyro.conf.FlagCreatePairsOff[bool] = False
+    """of shape_tensor: use the constraints that hold without any image"""
+
+    def given(self) -> dict[str, Any]:
+        """The options that were given."""
+        return {name: value for name, value in asdict(self).items() if value is not None and value is not False and value != ()}
+
+
+@dataclass(frozen=True)
+class General:
+    """Instead of a name: a primitive that moves within an extensor of P^k, seen in several views."""
+
+    k: Annotated[int | None, tyro.conf.arg(metavar="K", help_behavior_hint="")] = None
+    """projective dimension of the space"""
+    views: Numbers = ()
+    """projective dimension of each view"""
+    m: Annotated[int, tyro.conf.arg(metavar="M")] = 1
+    """points that span the primitive: 1 point, 2 line"""
+    r: Annotated[int, tyro.conf.arg(metavar="R")] = 1
+    """points that span the extensor in which it moves: r = m stays, 2 is a line, 3 a plane"""
+    measure: tuple[Literal["join", "hyper"], ...] = ("join",)
+    """what a view sees: Pluecker coordinates (a point is a point) or the hyperplanes through it; once, or for each view"""
+    matches: Number = None
+    """how many; by default as many as raise the rank"""
+
+
+@dataclass(frozen=True)
+class Count:
+    """Count how many matches an invariant takes, and the rank they reach: exactly, in a prime field.
+
+    dyntorch count homography --moving 30 --static 2
+
+    dyntorch count --k 3 --views 2 2 2 2 --r 2
+
+    dyntorch count --dim-v 3 3 2
+    """
+
+    configuration: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="[NAME]", help_behavior_hint="")] = ""
+    """of an invariant, such as homography or join; without it, a table of all"""
+    dim_v: Annotated[tuple[int, int, int] | None, tyro.conf.arg(metavar="N M K", help_behavior_hint="")] = None
+    """print the dimension of V(n,m,k), the span of products of m vectors of n-space that lie in a common k-space"""
+    json: tyro.conf.FlagCreatePairsOff[bool] = False
+    """print JSON, with the rank after every match"""
+    seed: int = 0
+    """of the random matches; the ranks do not depend on it"""
+    matches: Matches = field(default_factory=Matches)
+    general: General = field(default_factory=General)
+
+    def run(self) -> int:
+        """Count, and print."""
+        from dyntorch import counting
+
+        given, general = self.matches.given(), self.general != General()
+        if (self.configuration != "") + general + (self.dim_v is not None) > 1:
+            raise ValueError("a configuration's name, numbers (--k, --views...) and --dim-v exclude each other; give one of them")
+        if given and not self.configuration:
+            flag = "--" + next(iter(given)).replace("_", "-")
+            raise ValueError(f"{flag} needs a configuration before it, one of {', '.join(counting.CONFIGURATIONS)}")
+        if self.dim_v is not None:
+            self._print_dimension(*self.dim_v)
+        elif self.configuration:
+            name = self.configuration.replace("-", "_")
+            if name not in counting.CONFIGURATIONS:
+                raise ValueError(f"unknown configuration {self.configuration!r}; known are {', '.join(counting.CONFIGURATIONS)}")
+            self._print(counting.count(name, seed=self.seed, **given), purpose(name))
+        elif general:
+            self._print_general()
+        else:
+            results = [counting.count(name, seed=self.seed) for name in counting.CONFIGURATIONS]
+            say(json.dumps([asdict(result) for result in results])) if self.json else overview(results)
+        return 0
+
+    def _print_dimension(self, n: int, m: int, k: int) -> None:
+        from dyntorch import counting
+
+        dimension = counting.dim_v(n, m, k)
+        say(json.dumps({"n": n, "m": m, "k": k, "dim_v": dimension}) if self.json else f"dim V({n}, {m}, {k}) = {dimension}")
+
+    def _print_general(self) -> None:
+        from dyntorch import counting
+
+        if self.general.k is None or not self.general.views:
+            raise ValueError("numbers need at least --k, the dimension of the space, and --views, such as --k 2 --views 2 2 2")
+        numbers = asdict(self.general)
+        if len(self.general.measure) == 1:
+            numbers["measure"] = self.general.measure[0]
+        result = counting.count(numbers.pop("k"), seed=self.seed, **numbers)
+        what = {1: "points", 2: "lines"}.get(self.general.m, f"extensors of {self.general.m} points")
+        within = "that stay" if self.general.m == self.general.r else f"that move within extensors of {self.general.r} points"
+        seen = ", ".join(f"P^{size}" for size in self.general.views)
+        self._print(result, f"{what} of P^{self.general.k} {within}, views {seen}")
+
+    def _print(self, result: counting.Count, heading: str) -> None:
+        if self.json:
+            say(json.dumps(asdict(result)))
+            return
+        say(heading)
+        if len(result.kinds) > 1:
+            rows = [[kind.name, kind.matches, kind.useful, kind.rank] for kind in result.kinds]
+            table(["matches", "given ", "useful ", "rank so far "], rows)
+        given = len(result.profile)
+        taken = f"{result.minimal} of {given}" if result.minimal < given else f"{given}"
+        say(f"rank {result.rank} of {result.width}, nullity {result.nullity}, from {taken} {plural(given)}")
+        if result.missing:
+            say(f"not enough: rank {result.full} takes {result.missing} more {plural(result.missing)} ({result.usual})")
+        elif result.nullity == 0:
+            say("no constraint: no tensor satisfies all matches")
+        else:
+            say("enough: more matches do not raise the rank")
+
+
+def overview(results: list[counting.Count]) -> None:
+    """A table of what each invariant takes."""
+    rows = [[r.name, r.width, r.rank, r.nullity, r.minimal, r.usual, purpose(r.name).partition(":")[0]] for r in results]
+    table(["configuration", "unknowns ", "rank ", "nullity ", "matches ", "kind", "of"], rows)
+
+
+def purpose(name: str) -> str:
+    """What a configuration is, in one line."""
+    from dyntorch import counting
+
+    return (counting.CONFIGURATIONS[name].__doc__ or name).splitlines()[0].removesuffix(".")
+
+
+def plural(number: int) -> str:
+    """The word for so many matches."""
+    return "match" if number == 1 else "matches"

@@ -1,0 +1,152 @@
+"""Fundamental matrix: Hartley and Zisserman's orientation, rank, epipoles, decomposition, nearest rank two, kornia, gradients."""
+
+import kornia
+import pytest
+import torch
+
+from dyntorch import scenes
+from dyntorch.algebra.homogeneous import homogeneous
+from dyntorch.invariants.fundamental_matrix import FundamentalMatrix
+
+
+def random(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def unit(m):
+    return m / torch.linalg.matrix_norm(m, keepdim=True)
+
+
+def same_up_to_sign(a, b, tolerance):
+    a, b = a.flatten(-2), b.flatten(-2)
+    return bool(torch.minimum((a - b).norm(dim=-1), (a + b).norm(dim=-1)).max() < tolerance)
+
+
+def scene(n, **options):
+    return scenes.two_view(n, generator=torch.Generator().manual_seed(0), **options)
+
+
+def test_eight_matches_determine_it():
+    assert FundamentalMatrix.minimal() == 8
+    (F,), views = scene(12).motion, scene(12).views
+    centred = [(x - x.mean(0)) / x.std() for x in views]
+    p1, p2 = (homogeneous(x) for x in centred)
+    rows = torch.einsum("na,nb->nab", p2, p1).flatten(1)
+    assert torch.linalg.matrix_rank(rows) == 8
+    assert torch.linalg.matrix_rank(rows[:8]) == 8
+    assert torch.linalg.matrix_rank(rows[:7]) == 7
+    # axes of the tensor: view 2, then view 1
+    assert FundamentalMatrix.axes() == (1, 0)
+    assert FundamentalMatrix.shape() == (3, 3)
+    residual = torch.einsum("na,ab,nb->n", homogeneous(views[1]), F, homogeneous(views[0]))
+    assert residual.abs().max() < 1e-10
+
+
+def test_of_cameras_it_is_that_of_kornia():
+    P1 = torch.cat([torch.eye(3), torch.zeros(3, 1)], -1).double()
+    for seed in range(20):
+        P2 = random(3, 4, seed=seed)
+        theirs = kornia.geometry.epipolar.fundamental_from_projections(P1[None], P2[None])[0]
+        # P1 = [I | 0], P2 = [A | e2]
+        assert same_up_to_sign(FundamentalMatrix.compose(P2[:, :3], P2[:, 3]), unit(theirs), 1e-10)
+
+
+def test_kornia_finds_the_same_matrix():
+    found = scene(20, batch=3)
+    theirs = kornia.geometry.epipolar.find_fundamental(found.views[0], found.views[1], torch.ones(3, 20).double())
+    residual = torch.einsum("bna,bac,bnc->bn", homogeneous(found.views[1]), unit(theirs), homogeneous(found.views[0]))
+    assert residual.abs().max() < 1e-5
+    assert same_up_to_sign(unit(theirs), found.motion[0], 1e-6)
+    torch.testing.assert_close(
+        FundamentalMatrix.epipolar_lines(theirs, found.views[0]).abs(),
+        kornia.geometry.epipolar.compute_correspond_epilines(found.views[0], theirs).abs(),
+        rtol=1e-6,
+        atol=1e-6,
+    )
+
+
+def test_decomposition_composes_to_the_matrix_and_is_well_conditioned():
+    F = FundamentalMatrix.compose(random(300, 3, 3), random(300, 3, seed=1))
+    A, e2 = FundamentalMatrix.decompose(-5 * F)
+    assert same_up_to_sign(FundamentalMatrix.compose(A, e2), F, 1e-10)
+    torch.testing.assert_close(A.flatten(1).norm(dim=1), torch.ones(300).double())
+    values, own = torch.linalg.svdvals(A), torch.linalg.svdvals(F)
+    condition = values[:, 0] / values[:, 2]
+    assert (condition < 1.01 * own[:, 0] / own[:, 1]).all()
+    again = FundamentalMatrix.decompose(FundamentalMatrix.compose(A, e2))
+    torch.testing.assert_close(again, (A, e2), rtol=1e-9, atol=1e-9)
+    for i in range(5):
+        torch.testing.assert_close(FundamentalMatrix.decompose(-5 * F[i]), (A[i], e2[i]))
+
+
+def test_decomposition_in_pixels():
+    found = scene(10, batch=50)
+    F = found.motion[0]
+    A, e2 = FundamentalMatrix.decompose(F)
+    assert same_up_to_sign(FundamentalMatrix.compose(A, e2), F, 1e-12)
+    lines = FundamentalMatrix.epipolar_lines(FundamentalMatrix.compose(A, e2), found.views[0])
+    assert (lines * homogeneous(found.views[1])).sum(-1).abs().max() < 1e-7
+    # the true epipoles: where each camera sees the centre of the other
+    k = torch.tensor([[700.0, 0, 320], [0, 700, 240], [0, 0, 1]]).double()
+    e1, e2 = FundamentalMatrix.epipoles(F)
+    t, R = found.extras["translation"], found.extras["rotation"]
+    for found_epipole, truth in ((e2, t @ k.T), (e1, (R.mT @ t[..., None])[..., 0] @ k.T)):
+        sine = torch.linalg.cross(found_epipole, truth / truth.norm(dim=-1, keepdim=True)).norm(dim=-1)
+        assert sine.max() < 1e-8
+
+
+def test_nearest_rank_two_is_the_truncated_singular_value_decomposition():
+    F = random(200, 3, 3)
+    u, s, vt = torch.linalg.svd(F)
+    clear = s[:, 2] < 0.6 * s[:, 1]
+    truncated = u[..., :2] @ (s[..., :2, None] * vt[:, :2])
+    found = FundamentalMatrix().constrain(F)
+    torch.testing.assert_close(found[clear], truncated[clear], rtol=1e-8, atol=1e-8)
+    assert torch.linalg.svdvals(found[clear])[:, 2].max() < 1e-8
+    torch.testing.assert_close(FundamentalMatrix().constrain(found[clear]), found[clear], rtol=1e-8, atol=1e-8)
+    assert FundamentalMatrix().constrain(torch.eye(3).double()).isfinite().all()
+
+
+def test_epipolar_lines_pass_through_the_matches_and_the_epipole():
+    found = scene(15, batch=2)
+    F, (x1, x2) = found.motion[0], found.views
+    e1, e2 = FundamentalMatrix.epipoles(F)
+    for view, source, match, epipole in ((2, x1, x2, e2), (1, x2, x1, e1)):
+        lines = FundamentalMatrix.epipolar_lines(F, source, view=view)
+        torch.testing.assert_close(lines[..., :2].norm(dim=-1), torch.ones(2, 15).double())
+        assert (lines * homogeneous(match)).sum(-1).abs().max() < 1e-8
+        assert (lines @ epipole[..., None]).abs().max() < 1e-9
+    with pytest.raises(ValueError, match="got 3"):
+        FundamentalMatrix.epipolar_lines(F, x1, view=3)
+
+
+def test_degenerate_matrices_are_never_nan():
+    bad = torch.stack([torch.zeros(3, 3), torch.ones(3, 3), torch.eye(3)]).double().requires_grad_()
+    A, e2 = FundamentalMatrix.decompose(bad)
+    back = FundamentalMatrix.compose(A, e2)
+    (back.sum() + FundamentalMatrix().constrain(bad).sum()).backward()
+    assert A.isfinite().all() and e2.isfinite().all() and back.isfinite().all() and bad.grad.isfinite().all()
+    assert torch.equal(A[0], torch.zeros(3, 3).double())
+    assert torch.equal(e2[0], torch.zeros(3).double())
+    at_epipole = FundamentalMatrix.epipolar_lines(FundamentalMatrix.compose(torch.eye(3), torch.tensor([0.0, 0, 1])), torch.zeros(1, 2))
+    assert torch.equal(at_epipole, torch.zeros(1, 3))
+
+
+def test_gradients_and_forward_mode():
+    A, e2 = random(2, 3, 3).requires_grad_(), random(2, 3, seed=1).requires_grad_()
+
+    def gauge_free(A, e2):
+        F = FundamentalMatrix.compose(*FundamentalMatrix.decompose(FundamentalMatrix.compose(A, e2)))
+        return F[..., :, :, None, None] * F[..., None, None, :, :]
+
+    assert torch.autograd.gradcheck(gauge_free, (A, e2))
+    assert torch.autograd.gradcheck(FundamentalMatrix().constrain, random(3, 3, seed=4).requires_grad_())
+    x = random(2, 4, 2, seed=2).requires_grad_()
+    assert torch.autograd.gradcheck(FundamentalMatrix.epipolar_lines, (random(2, 3, 3, seed=3).requires_grad_(), x))
+
+    def composed(t):
+        return FundamentalMatrix.compose(t[:9].unflatten(0, (3, 3)), t[9:])
+
+    theta = torch.cat([A[0].flatten(), e2[0]]).detach()
+    forward = torch.func.vmap(lambda v: torch.func.jvp(composed, (theta,), (v,))[1])(torch.eye(12).double())
+    torch.testing.assert_close(forward.movedim(0, -1), torch.func.jacrev(composed)(theta))

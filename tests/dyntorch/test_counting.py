@@ -1,0 +1,647 @@
+"""Counting against every rank that is known for these configurations, brute force and identities of the field."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from itertools import combinations, product
+from math import comb, prod
+
+import numpy as np
+import pytest
+
+from dyntorch.counting import (
+    CONFIGURATIONS,
+    Count,
+    Field,
+    count,
+    dim_v,
+    dim_v_closed_form,
+    options_of,
+    partitions,
+    semistandard_tableaux,
+    standard_tableaux,
+)  # fmt: skip
+from dyntorch.counting.field import Echelon
+from dyntorch.counting.ranks import PRIMES
+from dyntorch.counting.tally import LARGEST
+
+# ---------------------------------------------------------------------------------------------------- dim V
+
+
+@pytest.mark.parametrize(
+    ("n", "m", "k", "dimension"),
+    [
+        (3, 3, 2, 26),
+        (4, 3, 2, 60),
+        (3, 3, 1, 10),
+        (4, 3, 1, 20),
+        (3, 4, 2, 72),
+        (2, 3, 2, 8),
+        (2, 3, 1, 4),
+        (4, 4, 3, 255),
+        (4, 4, 2, 210),
+    ],
+)
+def test_dimensions_quoted_in_the_literature(n, m, k, dimension):
+    assert dim_v(n, m, k) == dimension
+
+
+def test_dimension_has_the_limits_of_fixed_and_of_free_points():
+    for n, m in product(range(1, 6), range(1, 6)):
+        assert dim_v(n, m, 0) == 0
+        assert dim_v(n, m, 1) == comb(n + m - 1, m)  # symmetric tensors
+        assert dim_v(n, m, m) == dim_v(n, m, m + 3) == n**m
+        assert dim_v(n, m, n) == n**m  # n vectors span everything
+
+
+def test_closed_forms_equal_the_sum():
+    checked = 0
+    for n, m, codim in product(range(1, 7), range(1, 7), (1, 2, 3)):
+        if m >= codim:
+            assert dim_v_closed_form(n, m, codim) == dim_v(n, m, m - codim)
+            checked += 1
+    assert checked == 6 * (6 + 5 + 4)
+
+
+@pytest.mark.parametrize("n", range(1, 6))
+def test_dimension_equals_brute_force_rank(n):
+    for m in range(1, 6):
+        for k in range(1, m + 1):
+            if n**m <= 700:
+                assert count(n - 1, views=[n - 1] * m, r=min(k, n)).rank == dim_v(n, m, k), (n, m, k)
+
+
+def test_all_tableaux_together_fill_the_space():
+    for n, m in product(range(1, 6), range(1, 8)):
+        assert sum(standard_tableaux(shape) * semistandard_tableaux(shape, n) for shape in partitions(m)) == n**m
+    assert dim_v(3, 100, 1) == comb(102, 2)  # short partitions only, of 190 million
+
+
+def tableaux(shape, n, strict_rows):
+    """Fillings by 1..n with increasing columns, by trying them all."""
+    boxes = [(i, j) for i, length in enumerate(shape) for j in range(length)]
+    good = 0
+    for values in product(range(n), repeat=len(boxes)):
+        at = dict(zip(boxes, values, strict=True))
+        columns = all(at[i, j] < at[i + 1, j] for i, j in boxes if (i + 1, j) in at)
+        rows = all(at[i, j] + strict_rows <= at[i, j + 1] for i, j in boxes if (i, j + 1) in at)
+        good += columns and rows and (not strict_rows or len(set(values)) == len(boxes))
+    return good
+
+
+@pytest.mark.parametrize("m", [1, 2, 3, 4, 5])
+def test_hook_lengths_equal_enumeration(m):
+    for shape in partitions(m):
+        assert standard_tableaux(shape) == tableaux(shape, m, 1)
+        assert semistandard_tableaux(shape, 3) == tableaux(shape, 3, 0)
+
+
+def test_condition_n_at_least_m_is_not_needed():
+    """The thesis asks n >= m >= k and uses V(2,3,2) and V(3,4,2)."""
+    assert dim_v(2, 3, 2) == count(1, views=[1, 1, 1], r=2).rank == 8
+    assert dim_v(3, 4, 2) == count(2, views=[2] * 4, r=2).rank == 72
+
+
+def test_excluded_partitions_are_those_of_smaller_numbers_only_up_to_2k_plus_2():
+    """The thesis states it for all m."""
+    number = [len(list(partitions(size))) for size in range(9)]
+    for m in range(1, 9):
+        for k in range(1, m + 1):
+            excluded = sum(len(shape) > k for shape in partitions(m))
+            assert (excluded == sum(number[: m - k])) == (m <= 2 * k + 2), (m, k)
+    assert sum(len(shape) > 1 for shape in partitions(5)) == 6 != sum(number[:4])
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: dim_v(0, 3, 2), "n must be an integer of at least 1, got 0"),
+        (lambda: dim_v(3, 3, -1), "k must be"),
+        (lambda: dim_v(3, 2.5, 1), "m must be"),
+        (lambda: dim_v(True, 3, 1), "n must be"),
+        (lambda: dim_v_closed_form(3, 3, 4), "codim must be 1, 2 or 3, got 4"),
+        (lambda: dim_v_closed_form(3, 2, 3), "m must be an integer of at least 3"),
+    ],
+)
+def test_dimension_misuse(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+# ------------------------------------------------------------------------------------- ranks by name and by numbers
+
+
+def ranks(counted: Count):
+    return counted.rank, counted.width, counted.minimal
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "rank", "width", "minimal"),
+    [
+        ("fundamental", {}, 8, 9, 8),
+        ("fundamental", {"coplanar": 20}, 6, 9, 6),
+        ("trifocal", {}, 26, 27, 7),
+        ("trifocal", {"coplanar": 20}, 21, 27, None),
+        ("quadrifocal", {}, 80, 81, 6),
+        ("quadrifocal", {"coplanar": 20}, 72, 81, None),
+        ("homography", {}, 26, 27, 26),
+        ("homography", {"static": 40}, 10, 27, 10),
+        ("homography", {"static": 2, "moving": 30}, 26, 27, 26),
+        ("homography", {"static": 30, "moving": 15}, 25, 27, 25),
+        ("dual_homography", {}, 26, 27, 26),
+        ("dual_homography", {"static": 40}, 10, 27, 10),
+        ("join", {}, 60, 64, 60),
+        ("join", {"static": 40}, 20, 64, 20),
+        ("join", {"static": 40, "moving": 39}, 59, 64, 59),
+        ("join", {"static": 40, "moving": 40}, 60, 64, 60),
+        ("minimal_join", {}, 47, 48, 47),
+        ("constant_velocity", {}, 63, 64, 21),
+        ("constant_velocity", {"static": 40}, 36, 64, 12),
+        ("constant_velocity", {"equal_velocity": 40}, 36, 64, 12),
+        ("constant_velocity", {"linear_velocity": 60}, 49, 64, None),
+        ("constant_velocity", {"planar_velocity": 60}, 58, 64, None),
+        ("constant_velocity", {"static": 5, "moving": 16}, 63, 64, 21),
+        ("constant_velocity", {"static": 10, "moving": 11}, 63, 64, 21),
+        ("constant_velocity", {"static": 15, "moving": 9}, 63, 64, 21),
+        ("constant_velocity", {"static": 20, "moving": 9}, 63, 64, 21),
+        ("constant_velocity_3x4x4", {}, 47, 48, 24),
+        ("lines", {}, 35, 36, 35),
+        ("lines", {"translating": 60}, 31, 36, 31),
+        ("lines", {"static": 60}, 20, 36, 20),
+        ("lines", {"objects": [60]}, 20, 36, 20),
+        ("lines", {"objects": [60, 60]}, 28, 36, 28),
+        ("lines", {"objects": [60, 60, 60]}, 31, 36, 31),
+        ("lines", {"objects": [60, 60, 60, 60]}, 31, 36, 31),
+        ("shape_tensor", {}, 80, 81, 6),
+    ],
+)
+def test_rank_of_named_configurations(name, options, rank, width, minimal):
+    counted = count(name, **options)
+    assert (counted.rank, counted.width, counted.nullity) == (rank, width, width - rank)
+    assert minimal in (None, counted.minimal)
+    assert counted.agreed
+    assert counted.full == {"join": 60}.get(name, width - 1)
+    assert (counted.missing == 0) == (counted.rank == counted.full)
+
+
+@pytest.mark.parametrize(
+    ("k", "numbers", "rank", "width", "minimal"),
+    [
+        (3, {"views": [2, 2]}, 8, 9, 8),
+        (2, {"views": [2, 2]}, 6, 9, 6),
+        (2, {"views": [2, 2], "measure": ["hyper", "join"]}, 8, 9, 4),  # DLT of a collineation
+        (3, {"views": [2, 2, 2]}, 17, 27, 17),
+        (3, {"views": [2, 2, 2], "measure": ["join", "hyper", "hyper"]}, 26, 27, 7),
+        (2, {"views": [2, 2, 2], "measure": ["join", "hyper", "hyper"]}, 21, 27, None),
+        (3, {"views": [2] * 4, "measure": "hyper"}, 80, 81, 6),
+        (2, {"views": [2] * 4, "measure": "hyper"}, 72, 81, None),
+        (3, {"views": [2, 2, 2], "m": 2, "r": 2}, 23, 27, 23),
+        (2, {"views": [2, 2, 2], "r": 2}, 26, 27, 26),
+        (2, {"views": [2, 2, 2], "measure": "hyper"}, 26, 27, 4),
+        (3, {"views": [3, 3, 3], "r": 2}, 60, 64, 60),
+        (3, {"views": [3, 3, 2], "r": 2}, 47, 48, 47),
+        (3, {"views": [3] * 4, "r": 3}, 255, 256, 255),
+        (3, {"views": [3] * 4, "r": 2}, 210, 256, 210),
+        (2, {"views": [2] * 4, "r": 2}, 72, 81, 72),
+        (3, {"views": [2] * 4, "r": 2}, 81, 81, 81),
+        (3, {"views": [2] * 5, "r": 2}, 243, 243, 243),
+        (3, {"views": [2] * 6, "r": 2}, 728, 729, 728),
+        (2, {"views": [1, 1, 1]}, 7, 8, 7),
+        (3, {"views": [3, 3], "m": 2, "r": 3}, 35, 36, 35),
+        (6, {"views": [3, 3, 3], "measure": ["join", "join", "hyper"]}, 63, 64, 21),
+        (6, {"views": [3, 3, 2], "measure": ["join", "join", "hyper"]}, 47, 48, 24),
+        (7, {"views": [3, 3, 3], "measure": ["join", "join", "hyper"]}, 64, 64, None),  # "P^7": no constraint is left
+    ],
+)
+def test_rank_by_numbers(k, numbers, rank, width, minimal):
+    counted = count(k, **numbers)
+    assert (counted.rank, counted.width, counted.nullity) == (rank, width, width - rank)
+    assert minimal in (None, counted.minimal)
+    assert counted.agreed
+    assert (counted.full, counted.missing) == (rank, 0)
+
+
+@pytest.mark.parametrize("static", [0, 5, 10, 14])
+def test_unlabelled_static_points_add_at_most_10_and_20(static):
+    for moving in (5, 16, 20, 26):
+        assert count("homography", static=static, moving=moving).rank == min(26, min(static, 10) + moving)
+    for moving in (39, 40, 55):
+        assert count("join", static=2 * static, moving=moving).rank == min(60, min(2 * static, 20) + moving)
+
+
+def kind_ranks(counted: Count):
+    return [kind.rank for kind in counted.kinds]
+
+
+@pytest.mark.parametrize(
+    ("name", "option", "numbers", "expected"),
+    [
+        ("homography", "lines", [20] * 5, [8, 15, 21, 26, 26]),
+        ("homography", "lines", [8, 7, 6, 5], [8, 15, 21, 26]),
+        ("homography", "lines", [8, 8, 8, 2], [8, 15, 21, 23]),  # "at most 8 points on a line" is not sufficient
+        ("homography", "static_lines", [20] * 4, [4, 7, 9, 10]),
+        ("join", "lines", [20] * 11, [8, 16, 24, 32, 40, 44, 48, 52, 56, 60, 60]),
+        ("join", "lines", [8] * 5 + [4] * 5, [8, 16, 24, 32, 40, 44, 48, 52, 56, 60]),
+        ("lines", "objects", [60] * 4, [20, 28, 31, 31]),
+    ],
+)
+def test_rank_grows_line_by_line(name, option, numbers, expected):
+    assert kind_ranks(count(name, **{option: numbers})) == expected
+
+
+@pytest.mark.parametrize(
+    ("name", "option", "options", "profile"),
+    [
+        ("homography", "labelled_static", {}, [7, 14, 21, 26]),
+        ("dual_homography", "labelled_static", {}, [7, 14, 21, 26]),
+        ("dual_homography", "static_points", {}, [8, 15, 21, 26]),
+        ("join", "labelled_static", {}, [10, 20, 30, 40, 50, 56, 60]),
+        ("shape_tensor", "images", {}, [16, 31, 45, 58, 70, 80]),
+        ("shape_tensor", "images", {"synthetic": True}, [77, 80]),
+        ("quadrifocal", "static", {}, [16, 31, 45, 58, 70, 80]),
+        ("lines", "static_points", {}, [9, 17, 24, 30, 35]),
+    ],
+)
+def test_rank_grows_match_by_match(name, option, options, profile):
+    counted = count(name, **{option: len(profile) + 2}, **options)
+    assert counted.profile == (*profile, profile[-1], profile[-1])
+    assert counted.minimal == len(profile)
+
+
+@pytest.mark.parametrize(("labelled", "moving"), [(0, 26), (1, 19), (2, 12), (3, 5), (4, 0)])
+def test_labelled_static_points_save_moving_ones(labelled, moving):
+    assert count("homography", labelled_static=labelled, moving=0).missing == moving
+
+
+@pytest.mark.parametrize(("labelled", "moving"), [(0, 60), (1, 50), (2, 40), (3, 30), (4, 20), (5, 10), (6, 4), (7, 0)])
+def test_labelled_static_points_save_moving_ones_in_space(labelled, moving):
+    assert count("join", labelled_static=labelled, moving=0).missing == moving
+
+
+def test_synthetic_constraints_of_the_shape_tensor_leave_nine_dimensions():
+    counted = count("shape_tensor", synthetic=True)
+    assert counted.rank == 80 and counted.minimal == 2
+    assert count("shape_tensor", synthetic=True, images=0).rank == dim_v(3, 4, 2) == 72
+
+
+def test_static_points_repair_translating_lines():
+    """Two rigid objects reach 28 alone ("two objects are sufficient") and 35 with two static points."""
+    assert [count("lines", static_points=k, translating=60).rank for k in (0, 1, 2)] == [31, 34, 35]
+    assert [count("lines", static_points=k, objects=[60]).rank for k in (1, 2, 3, 4)] == [28, 33, 34, 35]
+    assert [count("lines", static_points=k, objects=[60, 60]).rank for k in (0, 2)] == [28, 35]
+
+
+def test_smaller_constant_velocity_tensor_takes_more_matches():
+    assert count("constant_velocity_3x4x4").minimal == 24 > count("constant_velocity").minimal == 21
+
+
+def test_static_points_of_a_join_in_more_views_follow_dim_v():
+    assert count(3, views=[3] * 4).rank == dim_v(4, 4, 1) == 35
+
+
+# --------------------------------------------------------------------------------------------------- samplers
+
+
+def labelled_static(field):
+    """The labelled static points of the homography tensor, with the cameras A = B = identity given."""
+    while True:
+        point, free = field.random(3), np.eye(3, dtype=int)
+        yield np.vstack([field.kron(point, point, free), field.kron(point, free, point), field.kron(free, point, point)])
+
+
+def shared_translation(field):
+    """Lines of one object that translates, between two random frames."""
+    poses, shift = field.random(2, 4, 4), np.append(field.random(3), 0)
+    while True:
+        before = np.hstack([field.random(2, 3), np.ones((2, 1), dtype=int)])
+        first, second = (
+            field.join(field.product(ends, pose.T)) for ends, pose in zip((before, before + shift), poses, strict=True)
+        )
+        yield field.kron(second, first)
+
+
+def on_four_lines(field):
+    """8 + 8 + 8 + 2 points."""
+    for number in (8, 8, 8, 2):
+        line = field.random(2, 3)
+        for _ in range(number):
+            yield field.kron(*field.product(field.random(3, 2), line))
+
+
+def given_cameras(field):
+    """Images of 3D points by two cameras with small integer entries."""
+    cameras = [[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], [[0, 0, 1, 2], [0, 1, 0, -1], [-1, 0, 0, 3]]]
+    while True:
+        point = field.random(4)
+        yield field.kron(*(field.product(camera, point) for camera in cameras))
+
+
+@pytest.mark.parametrize(
+    ("sampler", "rank", "width", "minimal"),
+    [(labelled_static, 26, 27, 4), (shared_translation, 20, 36, 20), (on_four_lines, 23, 27, 23), (given_cameras, 8, 9, 8)],
+)
+def test_rank_of_a_sampler(sampler, rank, width, minimal):
+    counted = count(sampler)
+    assert ranks(counted) == (rank, width, minimal)
+    assert counted.full is counted.missing is None
+    assert counted.name == sampler.__name__
+
+
+def test_sampler_takes_the_number_of_matches_asked_for():
+    counted = count(labelled_static, matches=2)
+    assert counted.profile == (7, 14)
+
+
+def minimal_join_tensor(field, first, second, camera):
+    """N_ijk = eps_lmk W_li (W A)_mj for W = M B^-1, from its equation det[W p, W A p', q] = 0."""
+    projection = field.product(camera, field.inverse(second))
+    moved = field.product(projection, first)
+    tensor = np.zeros((4, 4, 3), dtype=np.int64)
+    for left, middle, right, sign in ((0, 1, 2, 1), (1, 2, 0, 1), (2, 0, 1, 1), (1, 0, 2, -1), (2, 1, 0, -1), (0, 2, 1, -1)):
+        tensor[:, :, right] += sign * (projection[left][:, None] * moved[middle][None] % field.prime)
+    return tensor % field.prime
+
+
+def skew_rows(slices):
+    """Linear equations on vec(A) of A^T S + S^T A = 0."""
+    for form in slices:
+        for i in range(4):
+            for j in range(i, 4):
+                row = np.zeros((4, 4), dtype=np.int64)
+                row[:, i] += form[:, j]
+                row[:, j] += form[:, i]
+                yield row.ravel()
+
+
+@pytest.mark.parametrize(("cameras", "rank"), [(1, 11), (2, 15)])
+def test_one_minimal_join_tensor_does_not_determine_the_motion(cameras, rank):
+    def equations(field):
+        first, second = field.random(4, 4), field.random(4, 4)
+        for _ in range(cameras):
+            tensor = minimal_join_tensor(field, first, second, field.random(3, 4))
+            yield from skew_rows(np.moveaxis(tensor, 2, 0))
+
+    assert count(equations).rank == rank
+
+
+@pytest.mark.parametrize(("slices", "nullity"), [(1, 4), (2, 1), (3, 1)])
+def test_slices_of_the_homography_tensor_that_determine_the_motion(slices, nullity):
+    def equations(field):
+        a, b = field.random(3, 3), field.random(3, 3)
+        for column in b.T[:slices].tolist():
+            cross = np.array([[0, -column[2], column[1]], [column[2], 0, -column[0]], [-column[1], column[0], 0]])
+            form = -field.product(cross, a)  # G_k = -[b_k] A
+            for i in range(3):
+                for j in range(i, 3):
+                    row = np.zeros((3, 3), dtype=np.int64)
+                    row[:, i] += form[:, j]
+                    row[:, j] += form[:, i]
+                    yield row
+
+    def flattened(field):
+        return (row.ravel() for row in equations(field))
+
+    assert count(flattened).nullity == nullity
+
+
+def tangents(field, tensor, parameters):
+    """Directions in which a polynomial tensor moves, exact: its value is linear in each parameter of one matrix at a time."""
+    for which, matrix in enumerate(parameters):
+        for at in np.ndindex(matrix.shape):
+            unit = np.zeros_like(matrix)
+            unit[at] = 1
+            yield tensor(*parameters[:which], unit, *parameters[which + 1 :]).ravel()
+
+
+def test_dimension_of_the_cone_of_homography_tensors():
+    def directions(field):
+        levi = np.zeros((3, 3, 3), dtype=np.int64)
+        levi[[0, 1, 2], [1, 2, 0], [2, 0, 1]], levi[[0, 2, 1], [2, 1, 0], [1, 0, 2]] = 1, -1
+
+        def tensor(a, b):
+            return np.stack([field.product(field.product(a.T, face % field.prime), b) for face in levi])
+
+        yield from tangents(field, tensor, [field.random(3, 3), field.random(3, 3)])
+
+    assert count(directions).rank == 17  # 8 + 8 + 1
+
+
+def test_dimension_of_the_cone_of_minimal_join_tensors():
+    """22 + 1 although (A, B) has 30 + 1: eight unknowns are lost.  W = M B^-1 enters twice, A once."""
+
+    def directions(field):
+        a, w = field.random(4, 4), field.random(3, 4)
+
+        def tensor(left, right):  # cross products of the columns of W with those of W A
+            right = field.product(right, a)
+            return np.stack([
+                (left[i][:, None] * right[j] % field.prime - left[j][:, None] * right[i] % field.prime) % field.prime
+                for i, j in ((1, 2), (2, 0), (0, 1))
+            ])  # fmt: skip
+
+        for at in np.ndindex(w.shape):
+            unit = np.zeros_like(w)
+            unit[at] = 1
+            yield (tensor(unit, w) + tensor(w, unit)).ravel()
+        for at in np.ndindex(a.shape):
+            unit = np.zeros_like(a)
+            unit[at] = 1
+            moved = field.product(w, unit)
+            yield np.stack([w[i][:, None] * moved[j] % field.prime - w[j][:, None] * moved[i] % field.prime
+                            for i, j in ((1, 2), (2, 0), (0, 1))]).ravel()  # fmt: skip
+
+    assert count(directions).rank == 23
+
+
+def test_structure_equations_of_constant_velocity_have_rank_11_of_14():
+    def equations(field):
+        gauge = field.random(7, 7)
+        poses = field.random(3, 4, 4)
+        w = [field.product(np.hstack([pose, time * pose[:, :3]]), gauge) for time, pose in enumerate(poses)]
+        zero = np.zeros_like(w[0])
+        yield np.hstack([zero, w[0]])  # w0 g' = 0
+        yield np.hstack([-w[1], w[1]])  # w1 (g' - g) = 0
+        yield np.hstack([-2 * w[2], w[2]])
+
+    assert ranks(count(equations))[:2] == (11, 14)
+
+
+# ------------------------------------------------------------------------------------------------- the field
+
+
+@pytest.mark.parametrize("prime", [7, *PRIMES])
+def test_field_arithmetic_equals_python_integers(prime):
+    field = Field(prime, seed=3)
+    for inner in (3, 2100):  # few and many entries go different ways
+        a, b = field.random(5, inner), field.random(inner, 4)
+        expected = [[sum(x * y for x, y in zip(row, column, strict=True)) % prime for column in b.T.tolist()] for row in a.tolist()]
+        assert field.product(a, b).tolist() == expected
+        assert field.product(a, b[:, 0]).tolist() == [row[0] for row in expected]
+        assert field.product(a[0], b).tolist() == expected[0]
+    largest = np.full((2, 2048), prime - 1)
+    assert (field.product(largest, largest.T) == 2048 % prime).all()  # (-1)(-1), 2048 times
+    x, y = field.random(2, 3), field.random(2, 2)
+    rows = [[i * j % prime for i in p for j in q] for p in x.tolist() for q in y.tolist()]
+    assert field.kron(x, y).tolist() == rows
+
+
+def test_moduli_are_prime():
+    for prime in PRIMES:
+        assert all(prime % divisor for divisor in [2, *range(3, int(prime**0.5) + 1, 2)])
+
+
+def test_join_has_the_order_and_signs_of_minors():
+    field = Field(PRIMES[0])
+    assert field.join([[1, 0, 0, 0], [0, 1, 0, 0]]).tolist() == [1, 0, 0, 0, 0, 0]
+    points = np.array([[2, 3, 5, 7], [11, 13, 17, 19], [23, 29, 31, 37]])
+    for size in (1, 2, 3):
+        chosen = [round(np.linalg.det(points[:size][:, list(columns)])) for columns in combinations(range(4), size)]
+        signed = field.join(points[:size])
+        assert np.where(signed > PRIMES[0] // 2, signed - PRIMES[0], signed).tolist() == chosen
+
+
+def test_null_space_and_inverse():
+    field = Field(PRIMES[1], seed=1)
+    matrix = field.product(field.random(5, 2), field.random(2, 6))
+    basis = field.null(matrix)
+    assert basis.shape == (4, 6)
+    assert not field.product(matrix, basis.T).any()
+    square = field.random(5, 5)
+    assert (field.product(square, field.inverse(square)) == np.eye(5)).all()
+    with pytest.raises(ValueError, match="no inverse"):
+        field.inverse([[1, 2], [2, 4]])
+
+
+def test_echelon_says_which_rows_raise_the_rank_however_they_are_grouped():
+    field = Field(11, seed=5)
+    rows = field.product(field.random(30, 6), field.random(6, 9))
+    rows[3], rows[4] = 0, rows[1]
+    one, many = Echelon(field, 9), Echelon(field, 9)
+    singly = np.concatenate([one.add(row[None]) for row in rows])
+    assert (many.add(rows) == singly).all()
+    assert singly.sum() == one.rank == many.rank <= 6
+    for i in range(len(rows)):  # the first rows up to i, counted anew
+        fresh = Echelon(field, 9)
+        fresh.add(rows[: i + 1])
+        assert fresh.rank == singly[: i + 1].sum()
+    identity = many.basis[:, many.pivots]
+    assert (identity == np.eye(many.rank)).all()
+
+
+def test_rank_agrees_with_floating_point_on_small_integers():
+    generator = np.random.default_rng(0)
+    for _ in range(20):
+        matrix = generator.integers(-3, 4, (6, 4)) @ generator.integers(-3, 4, (4, 7))
+        field = Field(PRIMES[0])
+        echelon = Echelon(field, 7)
+        echelon.add(field.reduce(matrix))
+        assert echelon.rank == np.linalg.matrix_rank(matrix.astype(float))
+
+
+# ------------------------------------------------------------------------------------------- result and misuse
+
+
+def test_result_reads_well():
+    text = str(count("homography", static=12, moving=10))
+    assert text == (
+        "homography: rank 20 of 27, nullity 7, from 20 of 22 matches: 10 of 12 static (rank 10), 10 of 10 moving (rank 20);"
+        " rank 26 takes 6 more moving"
+    )
+    assert "profile" not in repr(count("join"))
+    with pytest.raises(AttributeError):
+        count("fundamental").rank = 3
+
+
+def test_results_do_not_depend_on_the_seed():
+    for name in ("homography", "lines", "trifocal"):
+        assert count(name, seed=1) == count(name, seed=2)
+
+
+def test_nothing_given_counts_nothing_but_what_is_missing():
+    counted = count("homography", moving=0)
+    assert (counted.rank, counted.profile, counted.missing, counted.full) == (0, (), 26, 26)
+
+
+def test_large_numbers_of_matches_stop_early():
+    counted = count("homography", moving=1_000_000)
+    assert len(counted.profile) == 1_000_000 and counted.minimal == 26
+
+
+def test_first_option_is_the_usual_kind():
+    for name in CONFIGURATIONS:
+        default, *others = options_of(name).values()
+        assert default is None and None not in others
+    assert count("homography", labelled_static=2, moving=None).minimal == 2 + 12
+
+
+def floats(field):
+    yield np.ones(3) / 2
+
+
+def ragged(field):
+    yield [1, 2, 3]
+    yield [1, 2]
+
+
+def empty(field):
+    return []
+
+
+def wide(field):
+    yield np.ones(LARGEST + 1, dtype=int)
+
+
+@pytest.mark.parametrize(
+    ("what", "options", "message"),
+    [
+        ("homografy", {}, "unknown configuration 'homografy'; known are homography"),
+        ("homography", {"planar": 3}, "no option planar; it has moving, static"),
+        ("homography", {"views": [2, 2]}, "no option views"),
+        ("homography", {"static": -1}, "static must be a number from 0 to 1,000,000, got -1"),
+        ("homography", {"static": None}, "static must be a number"),
+        ("homography", {"static": 1.5}, "static must be a number"),
+        ("homography", {"static": True}, "static must be a number"),
+        ("homography", {"moving": 10**9}, "moving must be a number"),
+        ("homography", {"lines": 8}, "lines must be a list of numbers"),
+        ("homography", {"lines": [8, -1]}, "lines must be a list of numbers"),
+        ("shape_tensor", {"synthetic": 3}, "synthetic must be True or False"),
+        (3, {}, "needs views"),
+        (3, {"views": []}, "views is empty"),
+        (3, {"views": [2, 2], "m": 2}, "expected 1 <= m <= r <= k"),
+        (3, {"views": [2, 2], "r": 5}, "expected 1 <= m <= r <= k"),
+        (3, {"views": [2, 2], "m": 0}, "expected 1 <= m <= r <= k"),
+        (3, {"views": [2, 1], "m": 3, "r": 3}, "3 points have no join in a view of dimension 1"),
+        (3, {"views": [2, 2], "m": 3, "r": 3, "measure": "hyper"}, "no hyper in a view of dimension 2"),
+        (3, {"views": [2, 2], "measure": "meet"}, "measure must be join or hyper"),
+        (3, {"views": [2, 2], "measure": ["join"]}, "measure must be join or hyper"),
+        (3, {"views": [9] * 4}, "10,000 unknowns are too many"),
+        (3, {"views": [2, 2], "moving": 3}, "no option moving; it has views, m, r, measure, matches"),
+        (-1, {"views": [2]}, "expected the name"),
+        (True, {"views": [2]}, "expected the name"),
+        (None, {}, "expected the name"),
+        (floats, {}, "integers only"),
+        (ragged, {}, "one width, got widths"),
+        (empty, {}, "gave no matches"),
+        (wide, {}, "4,097 unknowns are too many"),
+        (on_four_lines, {"matches": 30}, "ended after 26 matches, 30 were asked for"),
+    ],
+)
+def test_count_misuse(what, options, message):
+    with pytest.raises(ValueError, match=message):
+        count(what, **options)
+
+
+def test_field_needs_a_modulus_that_fits():
+    with pytest.raises(ValueError, match="prime must lie"):
+        Field(2**31 + 11)
+
+
+def test_width_is_the_product_of_the_views():
+    for name, views in {"homography": (3, 3, 3), "join": (4, 4, 4), "minimal_join": (4, 4, 3), "lines": (6, 6)}.items():
+        assert count(name).width == prod(views)
+
+
+def test_counting_does_not_load_torch():
+    code = "import sys; from dyntorch.counting import count; count('homography'); print('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "False"

@@ -1,0 +1,178 @@
+"""Extensors against determinants one by one, Cauchy-Binet, incidence of points, lines and planes."""
+
+from itertools import combinations, permutations
+
+import pytest
+import torch
+
+from dyntorch.algebra.extensors import compound, dual, join, levi_civita, meet, plucker, plucker_form
+from dyntorch.algebra.homogeneous import apply, homogeneous, inhomogeneous
+
+
+def random(*shape, seed=0, dtype=torch.float64):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=dtype)
+
+
+def minors(matrix, order):
+    """Reference: every minor of one matrix by its own determinant."""
+    rows, columns = (list(combinations(range(n), order)) for n in matrix.shape)
+    return torch.tensor([[torch.linalg.det(matrix[list(r)][:, list(c)]) for c in columns] for r in rows], dtype=matrix.dtype)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 4])
+def test_levi_civita_computes_determinants(n):
+    e, m = levi_civita(n), random(n, n)
+    assert int(e.abs().sum()) == len(list(permutations(range(n))))
+    value = e
+    for row in m:
+        value = torch.tensordot(row, value, dims=([0], [0]))
+    torch.testing.assert_close(value, torch.linalg.det(m))
+
+
+def test_levi_civita_is_cached_and_safe_for_gradients():
+    with torch.inference_mode():
+        first = levi_civita(3, dtype=torch.float32)
+    assert levi_civita(3, dtype=torch.float32) is first
+    x = torch.ones(3, requires_grad=True)
+    torch.einsum("ijk,i,j->k", first, x, x).sum().backward()
+    assert x.grad.isfinite().all()
+    assert levi_civita(3).dtype == torch.float64
+    for n in (0, 7):
+        with pytest.raises(ValueError, match="n must be 1 to 6"):
+            levi_civita(n)
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns", "order"), [(4, 4, 1), (4, 4, 2), (4, 4, 3), (4, 4, 4), (3, 5, 2), (6, 4, 3), (2, 7, 2)]
+)
+def test_compound_holds_every_minor(rows, columns, order):
+    m = random(2, 3, rows, columns)
+    c = compound(m, order)
+    for i in range(2):
+        for j in range(3):
+            torch.testing.assert_close(c[i, j], minors(m[i, j], order))
+
+
+@pytest.mark.parametrize("order", [1, 2, 3])
+def test_cauchy_binet(order):
+    a, b = random(5, 4, 6), random(5, 6, 3, seed=1)
+    torch.testing.assert_close(compound(a @ b, order), compound(a, order) @ compound(b, order), rtol=1e-10, atol=1e-10)
+
+
+def test_compound_of_the_inverse_and_of_the_identity():
+    a = random(5, 4, 4)
+    torch.testing.assert_close(compound(torch.linalg.inv(a), 2), torch.linalg.inv(compound(a, 2)), rtol=1e-8, atol=1e-8)
+    torch.testing.assert_close(compound(torch.eye(5), 3), torch.eye(10))
+    # Sylvester-Franke: det C_k(A) = det(A)^binomial(n-1, k-1)
+    torch.testing.assert_close(torch.linalg.det(compound(a, 2)), torch.linalg.det(a) ** 3, rtol=1e-9, atol=1e-9)
+
+
+def test_compound_is_exact_on_integers_and_differentiable_at_any_rank():
+    m = torch.tensor([[2.0, 3.0, 5.0], [7.0, 11.0, 13.0], [17.0, 19.0, 23.0]])
+    assert compound(m, 3).item() == -78.0
+    assert compound(m.long(), 3).dtype == torch.int64 and compound(m.long(), 3).item() == -78
+    assert torch.autograd.gradcheck(lambda x: compound(x, 3), random(4, 4).requires_grad_())
+    flat = (random(4, 1) @ random(1, 4, seed=1)).requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: compound(x, 3), flat)
+
+
+@pytest.mark.parametrize("order", [0, 4])
+def test_compound_refuses_orders_without_minors(order):
+    with pytest.raises(ValueError, match="order must be"):
+        compound(random(3, 5), order)
+
+
+@pytest.mark.parametrize("d", [1, 2, 3, 6])
+def test_join_of_two_points(d):
+    p, q = random(4, 5, d + 1), random(4, 5, d + 1, seed=1)
+    expected = torch.stack([p[..., i] * q[..., j] - p[..., j] * q[..., i] for i, j in combinations(range(d + 1), 2)], -1)
+    torch.testing.assert_close(join(p, q), expected)
+    torch.testing.assert_close(join(q, p), -expected)
+    assert join(p, 2 * p).abs().max() == 0
+
+
+def test_join_of_all_is_the_determinant_and_batches_broadcast():
+    points = random(4, 6, 4)
+    torch.testing.assert_close(join(*points)[..., 0], torch.linalg.det(points.movedim(0, -2)))
+    assert torch.equal(join(points[0], points[1, 0]), join(points[0], points[1, 0].expand(6, 4)))
+    assert torch.equal(join(points[0]), points[0])
+
+
+@pytest.mark.parametrize("sizes", [(), (3, 4), (2, 2, 2)])
+def test_join_and_meet_refuse_other_arguments(sizes):
+    with pytest.raises(ValueError, match="join takes"):
+        join(*(random(s) for s in sizes))
+    with pytest.raises(ValueError, match="meet takes"):
+        meet(*(random(s) for s in sizes))
+
+
+def test_meet_of_lines_and_planes():
+    a, b, c = random(3, 7, 3)
+    torch.testing.assert_close(meet(a, b), torch.linalg.cross(a, b))
+    torch.testing.assert_close(
+        meet(join(a, b).flip(-1) * a.new_tensor([1, -1, 1]), c), torch.linalg.cross(torch.linalg.cross(a, b), c)
+    )
+    planes = random(3, 7, 4, seed=1)
+    point = meet(*planes)
+    assert (planes * point).sum(-1).abs().max() < 1e-13
+    assert torch.equal(meet(planes[0]), dual(planes[0], 4, 1))
+
+
+def test_meet_of_two_planes_is_the_join_of_two_of_their_points():
+    p, q, r, s = (homogeneous(x) for x in random(4, 6, 3))
+    line = join(p, q)
+    other = meet(meet_of_points(p, q, r), meet_of_points(p, q, s))
+    scale = (line * other).sum(-1, keepdim=True) / (line * line).sum(-1, keepdim=True)
+    torch.testing.assert_close(other, scale * line, rtol=1e-9, atol=1e-9)
+
+
+def meet_of_points(p, q, r):
+    """The plane through three points, from the null space of their matrix."""
+    return torch.linalg.svd(torch.stack([p, q, r], -2)).Vh[..., -1, :]
+
+
+def test_dual_twice_is_the_extensor_up_to_the_known_sign():
+    for size, step in [(3, 1), (3, 2), (4, 1), (4, 2), (4, 3), (7, 2)]:
+        x = join(*random(step, 5, size))
+        twice = dual(dual(x, size, step), size, size - step)
+        assert torch.equal(twice, (-1.0) ** (step * (size - step)) * x)
+    with pytest.raises(ValueError, match="has 6 entries, got 4"):
+        dual(random(4), 4, 2)
+
+
+def test_dual_completes_to_the_squared_norm():
+    for size, step in [(3, 2), (4, 3)]:
+        points = random(step, size)
+        x = join(*points)
+        torch.testing.assert_close(join(*points, dual(x, size, step))[0], (x * x).sum())
+
+
+def test_plucker_form_is_the_determinant_of_the_four_points():
+    pair = random(8, 2, 2, 3)
+    lines = plucker(pair)
+    assert lines.shape == (8, 2, 6)
+    det = torch.linalg.det(homogeneous(pair).reshape(8, 4, 4))
+    torch.testing.assert_close(torch.einsum("ni,ij,nj->n", lines[:, 0], plucker_form(), lines[:, 1]), det)
+    j = plucker_form()
+    torch.testing.assert_close(j @ j, torch.eye(6, dtype=torch.float64))
+    assert torch.einsum("nki,ij,nkj->nk", lines, j, lines).abs().max() < 1e-13
+
+
+def test_plucker_lines_map_by_the_second_compound():
+    a, pair = random(5, 4, 4), random(5, 9, 2, 3, seed=1)
+    c, j = compound(a, 2), plucker_form()
+    mapped = homogeneous(pair) @ a.mT[:, None]
+    torch.testing.assert_close((plucker(pair) @ c.mT), join(mapped[..., 0, :], mapped[..., 1, :]))
+    torch.testing.assert_close(c.mT @ j @ c, torch.linalg.det(a)[:, None, None] * j, rtol=1e-9, atol=1e-9)
+    # the same line through the inhomogeneous images of its points
+    other = plucker(apply(a, pair.flatten(1, 2)).unflatten(1, (9, 2)))
+    cosine = torch.nn.functional.cosine_similarity(plucker(pair) @ c.mT, other, dim=-1)
+    torch.testing.assert_close(cosine.abs(), torch.ones(5, 9, dtype=torch.float64))
+    assert torch.equal(inhomogeneous(homogeneous(pair)), pair)
+
+
+def test_plucker_refuses_other_shapes_and_keeps_the_dtype():
+    with pytest.raises(ValueError, match="two points of each line"):
+        plucker(random(5, 6))
+    assert plucker(random(5, 2, 3, dtype=torch.float32)).dtype == torch.float32
+    assert plucker_form(dtype=torch.float32).dtype == torch.float32

@@ -1,0 +1,122 @@
+"""``dyntorch count``: what it prints, as text and as JSON, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from indexing.cli import main
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]):
+    def call(*words: str) -> tuple[int, str, str]:
+        code = main(["count", *words])
+        said = capsys.readouterr()
+        return code, said.out, said.err
+
+    return call
+
+
+def cells(text: str) -> list[list[str]]:
+    return [line.split() for line in text.splitlines() if line.strip()]
+
+
+def test_name_and_numbers_of_matches(run):
+    code, out, err = run("homography", "--moving", "30", "--static", "2")
+    assert (code, err) == (0, "")
+    lines = cells(out)
+    assert out.startswith("Points of a plane that move along straight lines, three views: homography tensor")
+    assert ["static", "2", "2", "2"] in lines and ["moving", "30", "24", "26"] in lines
+    assert "rank 26 of 27, nullity 1, from 26 of 32 matches\nenough: more matches do not raise the rank\n" in out
+
+
+def test_too_few_matches_say_how_many_are_missing(run):
+    code, out, _ = run("homography", "--lines", "8", "8", "8", "2")
+    assert code == 0
+    assert [line for line in cells(out) if line[0] == "line"] == [
+        ["line", "8", "8", "8"], ["line", "8", "7", "15"], ["line", "8", "6", "21"], ["line", "2", "2", "23"],
+    ]  # fmt: skip
+    assert "nullity 4, from 23 of 26 matches\nnot enough: rank 26 takes 3 more matches (moving)" in out
+    assert (
+        "rank 21 of 27, nullity 6, from 3 matches\nnot enough: rank 26 takes 5 more"
+        in run("homography", "--labelled-static", "3")[1]
+    )
+    assert "takes 1 more match (image)" in run("shape-tensor", "--synthetic", "--images", "1")[1]
+
+
+def test_numbers(run):
+    code, out, _ = run("--k", "3", "--views", "2", "2", "2", "2", "--r", "2")
+    assert code == 0
+    assert out.startswith("points of P^3 that move within extensors of 2 points, views P^2, P^2, P^2, P^2\n")
+    assert "rank 81 of 81, nullity 0, from 81 matches\nno constraint" in out
+    assert (
+        "rank 63 of 64, nullity 1, from 21 matches"
+        in run("--k", "6", "--views", "3", "3", "3", "--measure", "join", "join", "hyper")[1]
+    )
+    assert (
+        "rank 5 of 9, nullity 4, from 5 matches\nnot enough: rank 8 takes 3 more"
+        in run(*["--k", "3", "--views", "2", "2", "--matches", "5"])[1]
+    )
+
+
+def test_dimension(run):
+    assert run("--dim-v", "3", "3", "2") == (0, "dim V(3, 3, 2) = 26\n", "")
+    assert json.loads(run("--dim-v", "3", "4", "2", "--json")[1]) == {"n": 3, "m": 4, "k": 2, "dim_v": 72}
+
+
+def test_table_of_all(run):
+    code, out, _ = run()
+    assert code == 0
+    rows = {line[0]: line[1:6] for line in cells(out)}
+    assert rows["join"] == ["64", "60", "4", "60", "moving"]
+    assert rows["trifocal"] == ["27", "26", "1", "7", "static"]
+    assert max(map(len, out.splitlines())) <= 132
+    listed = json.loads(run("--json")[1])
+    assert {entry["name"] for entry in listed} <= rows.keys() and len(listed) == 11
+
+
+def test_json_has_the_profile(run):
+    result = json.loads(run("homography", "--static", "12", "--moving", "1", "--json")[1])
+    assert result["profile"] == [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 10, 10, 11]
+    assert (result["rank"], result["nullity"], result["minimal"], result["missing"]) == (11, 16, 11, 15)
+    assert result["kinds"][0] == {"name": "static", "matches": 12, "useful": 10, "rank": 10}
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("homografy", "unknown configuration 'homografy'; known are homography, dual_homography"),
+        ("homography --coplanar 3", "homography has no option coplanar; it has moving, static"),
+        ("homography --static -1", "static must be a number from 0 to 1,000,000, got -1"),
+        ("homography --static x", "--static"),
+        ("homography --k 2", "exclude each other"),
+        ("homography --dim-v 3 3 2", "exclude each other"),
+        ("--static 3", "--static needs a configuration before it"),
+        ("--labelled-static 3", "--labelled-static needs a configuration"),
+        ("--k 2", "numbers need at least --k"),
+        ("--views 2 2", "numbers need at least --k"),
+        ("--k 2 --views 2 2 --m 3 --r 2", "expected 1 <= m <= r <= k + 1"),
+        ("--k 2 --views 2 2 --measure meet", "--measure"),
+        ("--k 2 --views 2 2 --measure join join join", "measure must be join or hyper"),
+        ("--k 9 --views 9 9 9 9", "10,000 unknowns are too many"),
+        ("--dim-v 3 3", "--dim-v"),
+        ("--dim-v 0 3 1", "n must be an integer of at least 1, got 0"),
+        ("homography --seed -1", "seed must be"),
+    ],
+)
+def test_bad_input_is_one_line_and_code_2(run, words, message):
+    code, out, err = run(*words.split())
+    assert (code, out) == (2, "")
+    assert err.startswith("dyntorch: ") and err.count("\n") == 1 and message in err
+
+
+def test_nothing_heavy_is_loaded():
+    code = (
+        "import sys; from indexing.cli import main; main(['count', 'join']); print(*{'torch', 'sklearn'} & set(sys.modules), 'end')"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1].strip() == "end"
