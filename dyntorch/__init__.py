@@ -31,9 +31,9 @@ _HOME = {
     "Solution": "dyntorch.solution",
     "Status": "dyntorch.solution",
     # tasks
-    "align_planar": "dyntorch.tasks.align",
-    "align_points": "dyntorch.tasks.align",
-    "align_lines": "dyntorch.tasks.align",
+    "align_planar": "dyntorch.tasks.align_planar",
+    "align_points": "dyntorch.tasks.align_points",
+    "align_lines": "dyntorch.tasks.align_lines",
     # subspaces and factorization
     "canonical_correlation": "dyntorch.algebra.subspaces",
     "orthonormal_basis": "dyntorch.algebra.subspaces",

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import combinations
 
 import torch
 from torch import Tensor
@@ -38,7 +39,7 @@ def on_host(tensor: Tensor) -> bool:
 def unit_trace(gram: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Gram matrices scaled to trace 1, the factor ``(b,)`` applied, and which were finite; the others become I / D."""
     trace = gram.diagonal(dim1=-2, dim2=-1).sum(-1)
-    scale = trace.clamp(min=1e-300).reciprocal()
+    scale = torch.where(trace > 1e-300, trace.reciprocal(), 1.0)
     finite = torch.isfinite(gram.sum((-2, -1))) & torch.isfinite(trace)
     scaled = gram * scale[:, None, None]
     if not on_host(gram) or not bool(finite.all()):
@@ -50,20 +51,34 @@ def unit_trace(gram: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 def orthonormal(columns: Tensor) -> Tensor:
     """Orthonormal columns with the same span."""
-    return torch.linalg.qr(columns).Q
+    if on_host(columns):
+        basis: Tensor = torch.linalg.qr(columns).Q
+        return basis
+    # the batched QR of accelerators loops over the problems; Gram-Schmidt, every column twice, keeps them together
+    basis = columns[..., :0]
+    for j in range(columns.shape[-1]):
+        column = _unit(columns[..., j : j + 1])
+        for _ in range(2):
+            column = _unit(column - basis @ (basis.mT @ column))
+        basis = torch.cat([basis, column], dim=-1)
+    return basis
+
+
+def _unit(columns: Tensor) -> Tensor:
+    return columns / columns.norm(dim=-2, keepdim=True).clamp(min=1e-300)
 
 
 def fix_signs(vectors: Tensor) -> Tensor:
     """Columns turned to the side of a generic direction (a largest entry would be a tie in skew-symmetric tensors)."""
-    product = _generic(vectors.shape[-2], 1).to(vectors.device).T @ vectors
+    product = _generic(vectors.shape[-2], 1, vectors.device).T @ vectors
     return torch.where(product < 0, -vectors, vectors)
 
 
-@lru_cache(maxsize=64)
-def _generic(size: int, count: int) -> Tensor:
+@lru_cache(maxsize=64)  # made on the device: a copy to it would wait
+def _generic(size: int, count: int, device: torch.device) -> Tensor:
     """``(size, count)`` fixed directions without symmetry."""
     with torch.inference_mode(False):
-        index = torch.arange(1, size * count + 1, dtype=torch.float64)
+        index = torch.arange(1, size * count + 1, dtype=torch.float64, device=device)
         return (torch.frac(index * 0.6180339887498949) + 0.1 * torch.cos(index**2) - 0.5).reshape(count, size).T.contiguous()
 
 
@@ -81,17 +96,18 @@ def by_inverse_iteration(gram: Tensor, dim: int) -> Eigenspace:
     """
     size, host = gram.shape[-1], on_host(gram)
     factor, indefinite = torch.linalg.cholesky_ex(_shifted(gram.clone(), size * EPS))
-    block = _generic(size, dim + 1).to(gram.device).expand(len(gram), -1, -1)
-    for _ in range(3 if host else 6):
+    # half an iteration: any start is as good as any other
+    block = orthonormal(torch.linalg.solve_triangular(factor.mT, _generic(size, dim + 1, gram.device), upper=True))
+    for _ in range(2 if host else 6):
         block = orthonormal(torch.cholesky_solve(block, factor))
     block, values = ritz(gram, block)
     vectors = block[..., :dim]
     sigma, competing = values[:, dim - 1].clamp(0.0, 1.0), values[:, dim]
-    deflated, missed = torch.linalg.cholesky_ex(_shifted(torch.baddbmm(gram, vectors, vectors.mT), -sigma[:, None]))
+    deflated, missed = torch.linalg.cholesky_ex(_shifted(_deflated(gram, vectors), -sigma[:, None]))
     sound = (indefinite == 0) & (missed == 0)
     vectors, values, bound = newton(gram, deflated, vectors, sigma, competing)
     if host:
-        for _ in range(3):
+        for _ in range(8):
             rest = (sound & (bound > ANGLE)).nonzero()[:, 0]
             if len(rest) == 0:
                 break
@@ -111,33 +127,59 @@ def newton(gram: Tensor, deflated: Tensor, vectors: Tensor, sigma: Tensor, compe
     small = vectors.mT @ image
     residual = image - vectors @ small
     step = torch.cholesky_solve(residual, deflated)
-    # the correction is of second order in the values, and of third in the rotation among the vectors
-    values = small.diagonal(dim1=-2, dim2=-1) - (step * residual).sum(-2)
-    length = step.square().sum((-2, -1)).sqrt()
+    values = small.diagonal(dim1=-2, dim2=-1)
+    inner = 0 if vectors.shape[-1] == 1 else 2
+    for _ in range(inner):  # towards the shift of each vector, at half the cost of a correction
+        step = torch.cholesky_solve(residual - step * (sigma[:, None] - values)[:, None], deflated)
     gap = (0.25 * (competing - sigma)).clamp(min=EPS)  # competing comes from above
-    contraction = (sigma[:, None] - values).abs().amax(-1) / gap
+    # the correction is of second order in the values, and of third in the rotation among the vectors
+    values = values - (step * residual).sum(-2)
+    contraction = ((sigma[:, None] - values).abs().amax(-1) / gap) ** (1 + inner)
+    length = step.square().sum((-2, -1)).sqrt()
     return orthonormal(vectors - step), values, length * (contraction + length) - EPS / gap
 
 
 def ritz(gram: Tensor, vectors: Tensor) -> tuple[Tensor, Tensor]:
     """Ritz vectors and ascending Ritz values in the span of orthonormal columns."""
-    values, rotation = torch.linalg.eigh(torch.nan_to_num(vectors.mT @ (gram @ vectors)))
+    small = torch.nan_to_num(vectors.mT @ (gram @ vectors))
+    values, rotation = torch.linalg.eigh(small) if on_host(small) else jacobi(small)
     return vectors @ rotation, values
+
+
+def jacobi(matrix: Tensor, sweeps: int = 6) -> tuple[Tensor, Tensor]:
+    """Ascending eigenvalues and eigenvectors of tiny symmetric matrices: unlike eigh it never waits to check for errors."""
+    size = matrix.shape[-1]
+    eye = torch.eye(size, dtype=matrix.dtype, device=matrix.device)
+    vectors = eye.expand_as(matrix)
+    pairs = list(combinations(range(size), 2))
+    for i, j in pairs * (sweeps if size > 2 else 1):
+        twice, difference = 2 * matrix[:, i, j], matrix[:, j, j] - matrix[:, i, i]
+        length = (difference.square() + twice.square()).sqrt() + difference.abs()
+        tangent = torch.where(difference < 0, -twice, twice) / length.clamp(min=1e-300)
+        cosine = (1 + tangent.square()).rsqrt()
+        rotation = eye.repeat(len(matrix), 1, 1)
+        rotation[:, i, i] = rotation[:, j, j] = cosine
+        rotation[:, i, j], rotation[:, j, i] = tangent * cosine, -tangent * cosine
+        matrix, vectors = rotation.mT @ matrix @ rotation, vectors @ rotation
+    values, order = matrix.diagonal(dim1=-2, dim2=-1).sort(dim=-1)
+    return values, vectors.gather(-1, order[:, None].expand_as(vectors))
 
 
 def competing_sum(factor: Tensor, vectors: Tensor) -> Tensor:
     """Sum of 1 / eigenvalue outside the eigenspace, from the Cholesky factor of the (slightly shifted) Gram: ``(b,)``."""
     eye = torch.eye(factor.shape[-1], dtype=factor.dtype, device=factor.device)
     inverse = torch.linalg.solve_triangular(factor, eye, upper=False)
-    return inverse.square().sum((-2, -1)) - (inverse @ vectors).square().sum((-2, -1))
+    total: Tensor = inverse.square().sum((-2, -1)) - (inverse @ vectors).square().sum((-2, -1))
+    return total
 
 
 def by_eigh(gram: Tensor, dim: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Vectors, values, sum of 1 / eigenvalue over the others, and whether the next eigenvalue is numerically zero as well."""
     every, vectors = torch.linalg.eigh(gram)
-    others = every[:, dim:].clamp(min=EPS / gram.shape[-1])
+    others = every[:, dim:]
     degenerate = (others <= NULL * every[:, -1:].clamp(min=EPS)).any(-1)
-    return vectors[..., :dim].contiguous(), every[:, :dim].clamp(min=0.0), others.reciprocal().sum(-1), degenerate
+    competing = others.clamp(min=EPS / gram.shape[-1]).reciprocal().sum(-1)
+    return vectors[..., :dim].contiguous(), every[:, :dim].clamp(min=0.0), competing, degenerate
 
 
 def resolvent(gram: Tensor, vectors: Tensor, gradient: Tensor) -> Tensor:
@@ -153,7 +195,7 @@ def resolvent(gram: Tensor, vectors: Tensor, gradient: Tensor) -> Tensor:
     """
     values = (vectors * (gram @ vectors)).sum(-2)
     gradient = gradient - vectors @ (vectors.mT @ gradient)
-    deflated = torch.baddbmm(gram, vectors, vectors.mT)
+    deflated = _deflated(gram, vectors)
     columns = []
     for j in range(vectors.shape[-1]):
         factor = _regularized_factor(_shifted(deflated.clone(), gram.shape[-1] * EPS - values[:, j, None]))
@@ -164,11 +206,20 @@ def resolvent(gram: Tensor, vectors: Tensor, gradient: Tensor) -> Tensor:
 
 def _regularized_factor(matrix: Tensor) -> Tensor:
     """Cholesky factors; a matrix of trace about 1 that is singular to rounding gets a small multiple of the identity."""
+    factor: Tensor
     factor, info = torch.linalg.cholesky_ex(matrix)
     failed = info > 0
     if on_host(matrix) and not bool(failed.any()):
         return factor
-    return torch.linalg.cholesky_ex(_shifted(matrix.clone(), torch.where(failed, 1e-10, 0.0)[:, None])).L
+    factor, _ = torch.linalg.cholesky_ex(_shifted(matrix.clone(), torch.where(failed, 1e-10, 0.0)[:, None]))
+    return factor
+
+
+def _deflated(gram: Tensor, vectors: Tensor) -> Tensor:
+    """G + V V^T: the eigenspace moves to the other end of the spectrum."""
+    if vectors.shape[-1] == 1:
+        return torch.addcmul(gram, vectors, vectors.mT)  # twice as fast as the product
+    return torch.baddbmm(gram, vectors, vectors.mT)
 
 
 def _shifted(matrix: Tensor, shift: Tensor | float) -> Tensor:

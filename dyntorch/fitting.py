@@ -15,8 +15,9 @@ from dyntorch.primitives import Primitive
 from dyntorch.solution import FAILED, Solution, Status, copied
 
 AMBIGUOUS = 0.5
-"""Residual energy of the solution over that of all other tensors together (harmonic): above it another one fits as well.  Exactly
-determined scenes stay under 0.2 with noise up to where estimation breaks down; scenes of lower rank with noise exceed 1."""
+"""Residual energy of the solution times the harmonic sum of that of all other directions: above it another tensor fits as well.
+Measured: 0.02 for the homography tensor at 2 px and 0.1 at 5 px (100 matches), 0.01 to 0.1 for the tensors of space at usual noise;
+1 to 5 for scenes of lower rank with noise (velocities in a plane, lines that only translate), 3 % of them below 0.5."""
 ILL_CONDITIONED = 1e-10
 """Rounding error of a null vector from a float64 Gram, eps * (s_1 / s_{D-1})^2, above which the matrix itself is decomposed, unless
 the noise outweighs it a thousandfold anyway."""
@@ -73,7 +74,7 @@ def fit_matches(invariant: Invariant, data: Matches, *, normalize: bool = True) 
     rows = data.count * invariant.rows()
     if data.static is not None:
         # a static match frees one slot at a time; how many of its rows are new the rank will say
-        rows = max(rows, data.count * max(p.width for p in invariant.primitives))
+        rows = max(rows, data.count * sum(p.width for p in invariant.primitives))
     if data.views[0].shape[0] and rows < invariant.width() - invariant.nullity:
         raise ValueError(f"{invariant!r} needs at least {invariant.minimal()} matches, got {data.count}; add matches")
     views, weights, static = copied(invariant, data)
@@ -140,7 +141,7 @@ def _null(
     nullity, width = invariant.nullity, invariant.width()
     present = (weights > 0).sum(-1) * invariant.rows()
     if static is not None:
-        present = present + ((weights > 0) & static).sum(-1) * (max(p.width for p in primitives) - 1)
+        present = present + ((weights > 0) & static).sum(-1) * (sum(p.width for p in primitives) - invariant.rows())
     g = gram(primitives, views, weights, static)
     found = gram_null_space(g, nullity)
     basis = found.basis

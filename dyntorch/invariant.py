@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import partial, update_wrapper
 from typing import Any, Concatenate, Generic, ParamSpec, TypeVar
 
 from torch import Tensor
@@ -24,12 +24,12 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-class on_class(Generic[P, R]):  # noqa: N801 - reads as a decorator
+class on_class(Generic[P, R]):
     """A method that may also be called on the class, which then stands for its instance with default parameters."""
 
     def __init__(self, function: Callable[Concatenate[Any, P], R]) -> None:
         self.function = function
-        self.__doc__ = function.__doc__
+        update_wrapper(self, function)
 
     def __get__(self, instance: Any, owner: type) -> Callable[P, R]:
         return partial(self.function, owner() if instance is None else instance)

@@ -33,7 +33,7 @@ class Matches:
 
     def back(self, result: Tensor) -> Tensor:
         """A float64 result with a flat batch, in the caller's shape, dtype and device."""
-        result = result.reshape(*self.batch, *result.shape[1:])
+        result = result.reshape((*self.batch, *result.shape[1:]))
         return result.to(device=self.device, dtype=self.dtype if result.is_floating_point() else result.dtype)
 
     def restricted(self, keep: Tensor) -> Matches:

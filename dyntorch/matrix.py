@@ -11,14 +11,14 @@ from torch import Tensor
 
 from dyntorch.primitives import Primitive
 
-CHUNK = 1 << 21
-"""Numbers per temporary of the Gram (16 MB): matches beyond it are added up in pieces, so that memory does not grow with n."""
+CHUNK = 1 << 18
+"""Numbers per temporary of the Gram (2 MB, best of 1 to 16 MB): further matches are added in pieces, and memory does not grow."""
 
 
 def estimation_matrix(
     primitives: Sequence[Primitive], views: Sequence[Tensor], weights: Tensor, static: Tensor | None = None
 ) -> Tensor:
-    r"""Rows :math:`\sqrt w\; u_1 \otimes u_2 \otimes \dots` of all matches, with unit vectors u.
+    r"""Rows :math:`\sqrt w\; u_1 \otimes u_2 \otimes \dots` of all matches, with the vectors u of the primitives.
 
     A match labelled static puts, for every slot in turn, all the vectors that a static match allows there.
 
@@ -38,7 +38,8 @@ def estimation_matrix(
     for v, (primitive, x) in enumerate(zip(primitives, views, strict=True)):
         # a projector is its own Gram, so its rows serve as the vectors
         blocks.append(_kronecker([*vectors[:v], primitive.free(x), *vectors[v + 1 :]], weights * static))
-    return torch.cat(blocks, dim=-2)
+    lead = torch.broadcast_shapes(*(block.shape[:-2] for block in blocks))
+    return torch.cat([block.expand(*lead, -1, -1) for block in blocks], dim=-2)
 
 
 def _kronecker(vectors: Sequence[Tensor], weights: Tensor) -> Tensor:
@@ -65,32 +66,38 @@ def gram(primitives: Sequence[Primitive], views: Sequence[Tensor], weights: Tens
     Returns:
         ``(*batch, width, width)``.
     """
-    packed, norms = zip(*(packed_form(p, x) for p, x in zip(primitives, views, strict=True)), strict=True)
-    for norm in norms:
-        weights = weights if norm is None else weights / norm
+    n = weights.shape[-1]
+    lead = max(1, math.prod(torch.broadcast_shapes(*(x.shape[: p.match_axis(x)] for p, x in zip(primitives, views, strict=True)))))
+    step = max(256, CHUNK // (lead * math.prod(p.width * (p.width + 1) // 2 for p in primitives[1:])))
+    total: Tensor | None = None
+    for start in range(0, max(n, 1), step):
+        count = min(step, n - start)
+        piece = [x.narrow(p.match_axis(x), start, count) for p, x in zip(primitives, views, strict=True)] if count < n else views
+        label = None if static is None else static.narrow(-1, start, count)
+        part = _moments(primitives, piece, weights.narrow(-1, start, count), label)
+        total = part if total is None else total + part
+    assert total is not None
+    return unpack(total, tuple(p.width for p in primitives))
+
+
+def _moments(primitives: Sequence[Primitive], views: Sequence[Tensor], weights: Tensor, static: Tensor | None) -> Tensor:
+    """Packed Gram of one piece of the matches."""
+    packed = [packed_form(p, x) for p, x in zip(primitives, views, strict=True)]
     if static is None:
-        moments = moment(packed, weights)
-    else:
-        moments = moment(packed, weights * ~static)
-        for v, (primitive, x) in enumerate(zip(primitives, views, strict=True)):
-            free, norm = _pack(primitive.free(x)), norms[v]
-            kept = weights * static if norm is None else weights * static * norm
-            moments = moments + moment([*packed[:v], free, *packed[v + 1 :]], kept)
-    return unpack(moments, tuple(p.width for p in primitives))
+        return moment(packed, weights)
+    moments = moment(packed, weights * ~static)
+    for v, (primitive, x) in enumerate(zip(primitives, views, strict=True)):
+        moments = moments + moment([*packed[:v], _pack(primitive.free(x)), *packed[v + 1 :]], weights * static)
+    return moments
 
 
-def packed_form(primitive: Primitive, x: Tensor) -> tuple[Tensor, Tensor | None]:
-    """Upper triangle of each measurement's form, component first: ``(*batch, width (width + 1) / 2, n)``.
-
-    The form of a single vector is left unscaled; the second result is its squared norm ``(*batch, n)``, by which the weight
-    of the match is divided instead (one pass over n numbers, not over all components).
-    """
+def packed_form(primitive: Primitive, x: Tensor) -> Tensor:
+    """Upper triangle of each measurement's form, component first: ``(*batch, width (width + 1) / 2, n)``."""
     if primitive.rows > 1:
-        return _pack(primitive.form(x)), None
+        return _pack(primitive.form(x))
     vector = primitive.components(x)
     rows, columns = _triangle(primitive.width, x.device)
-    packed = vector.index_select(-2, rows) * vector.index_select(-2, columns)
-    return packed, vector.square().sum(-2).clamp(min=torch.finfo(x.dtype).tiny)
+    return vector.index_select(-2, rows) * vector.index_select(-2, columns)
 
 
 def _pack(form: Tensor) -> Tensor:
@@ -100,21 +107,10 @@ def _pack(form: Tensor) -> Tensor:
 
 def moment(packed: Sequence[Tensor], weights: Tensor) -> Tensor:
     """Sums of the products of packed forms over the matches, ``(*batch, m1 m2 ...)``."""
-    sizes = [m.shape[-2] for m in packed]
-    per_match = math.prod(sizes[1:]) * max(1, math.prod(torch.broadcast_shapes(*(m.shape[:-2] for m in packed))))
-    n = weights.shape[-1]
-    step = max(256, CHUNK // max(1, per_match))
-    total: Tensor | None = None
-    for start in range(0, max(n, 1), step):
-        piece = slice(start, start + step)
-        left = packed[0][..., piece] * weights[..., None, piece]
-        right = packed[1][..., piece]
-        for m in packed[2:]:
-            right = (right[..., :, None, :] * m[..., None, :, piece]).flatten(-3, -2)
-        part = (left @ right.mT).flatten(-2)
-        total = part if total is None else total + part
-    assert total is not None
-    return total
+    right = packed[1]
+    for m in packed[2:]:
+        right = (right[..., :, None, :] * m[..., None, :, :]).flatten(-3, -2)
+    return ((packed[0] * weights[..., None, :]) @ right.mT).flatten(-2)
 
 
 def unpack(moments: Tensor, widths: tuple[int, ...]) -> Tensor:

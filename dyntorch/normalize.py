@@ -49,8 +49,8 @@ def normalization(invariant: Invariant, views: Sequence[Tensor], weights: Tensor
 def _similarity(points: Tensor, weights: Tensor) -> Tensor:
     """Similarity of points ``(*batch, n, k, d)``; k points of one match share its weight."""
     d = points.shape[-1]
-    present = (weights > 0).to(points.dtype)
-    share = (present / (present.sum(-1, keepdim=True).clamp(min=1.0) * points.shape[-2]))[..., None]
+    total = weights.sum(-1, keepdim=True).clamp(min=torch.finfo(weights.dtype).tiny)
+    share = (weights / (total * points.shape[-2]))[..., None]
     flat = points.flatten(-2)  # (*batch, n, k d)
     centre = (flat * share).sum(-2).unflatten(-1, points.shape[-2:]).sum(-2)
     shifted = flat - centre.repeat(*([1] * (centre.ndim - 1)), points.shape[-2])[..., None, :]
@@ -81,11 +81,14 @@ def denormalize(invariant: Invariant, tensor: Tensor, actions: Sequence[Tensor])
     result = torch.einsum(f"...{small},{maps}->...{large}", tensor, *ordered)
     rank = len(axes)
     if invariant.nullity == 1:
-        return result / result.flatten(-rank).norm(dim=-1)[(..., *([None] * rank))].clamp(min=torch.finfo(result.dtype).tiny)
+        norm = result.flatten(-rank).norm(dim=-1)[(..., *([None] * rank))]
+        return result / torch.where(norm > 0, norm, 1.0)
     flat = result.flatten(-rank)
-    # rows of equal length first, so that the triangular factor of a failed (zero) problem stays finite
-    basis = torch.linalg.qr(flat.mT)[0].mT
-    return torch.where(flat.abs().amax((-2, -1), keepdim=True) > 0, basis, flat).unflatten(-1, result.shape[-rank:])
+    # the derivative of the triangular factorization of a failed (zero) problem would be NaN: any basis stands in for it
+    none = flat.abs().amax((-2, -1), keepdim=True) == 0
+    other = torch.eye(*flat.shape[-2:], dtype=flat.dtype, device=flat.device)
+    basis = torch.linalg.qr(torch.where(none, other, flat).mT)[0].mT
+    return torch.where(none, torch.zeros_like(basis), basis).unflatten(-1, result.shape[-rank:])
 
 
 def denormalize_motion(invariant: Invariant, motion: Sequence[Tensor], transforms: Sequence[Tensor]) -> tuple[Tensor, ...]:
@@ -106,5 +109,6 @@ def _moved(part: Tensor, frame: Frame, transforms: Sequence[Tensor], *, forward:
         transform = transforms[view] if left == forward else torch.linalg.inv(transforms[view])
         matrix = transform @ matrix if left else matrix @ transform
     if frame.vector:
-        return matrix[..., 0] / matrix.norm(dim=(-2, -1))[..., None].clamp(min=torch.finfo(matrix.dtype).tiny)
+        norm = matrix.norm(dim=(-2, -1))[..., None]
+        return matrix[..., 0] / torch.where(norm > 0, norm, 1.0)
     return unit(matrix)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import prod
 from typing import Any
 
 import torch
@@ -10,9 +11,22 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from dyntorch.blocks import map_blocks
-from dyntorch.eigenspace import by_eigh, fix_signs, lowest, on_host, orthonormal, resolvent, transpose_times, unit_trace
+from dyntorch.eigenspace import (
+    NULL,
+    RESOLVED,
+    by_eigh,
+    by_inverse_iteration,
+    competing_sum,
+    fix_signs,
+    on_host,
+    orthonormal,
+    resolvent,
+    unit_trace,
+)
 
-BLOCK = 512 * 1024  # bytes of Gram matrices or rows per block: half of a common L2 cache
+GRAM_BLOCK, ROWS_BLOCK = 2 * 2**20, 8 * 2**20  # bytes per block
+ACCURATE = 1e-6  # of the trace: a competing eigenvalue for which a Gram gives the null space to 1e-10
+STABLE = 1e-13  # |A v| / |A| of an LU that did not go wrong
 FEW = 4  # problems up to which one eigh each beats the overhead of many small operations
 
 
@@ -60,8 +74,7 @@ def null_space(matrix: Tensor, dim: int = 1) -> Tensor:
         )
     if matrix.device.type == "mps":  # no float64
         return null_space(matrix.cpu(), dim).to(matrix.device)
-    flat = matrix.reshape(-1, rows, size)
-    basis: Tensor = _OfRows.apply(flat, dim)
+    basis: Tensor = _OfRows.apply(_flat(matrix), dim)  # type: ignore[no-untyped-call]
     return basis.reshape(*matrix.shape[:-2], dim, size)
 
 
@@ -91,7 +104,7 @@ def gram_null_space(gram: Tensor, dim: int = 1) -> GramNullSpace:
     if gram.device.type == "mps":  # no float64
         found = gram_null_space(gram.cpu(), dim)
         return GramNullSpace(*(part.to(gram.device) for part in vars(found).values()))
-    basis, residual, competing, degenerate = _OfGram.apply(gram.reshape(-1, size, size), dim)
+    basis, residual, competing, degenerate = _OfGram.apply(_flat(gram), dim)  # type: ignore[no-untyped-call]
     batch = gram.shape[:-2]
     return GramNullSpace(
         basis.reshape(*batch, dim, size), residual.reshape(*batch, dim), competing.reshape(batch), degenerate.reshape(batch)
@@ -105,14 +118,22 @@ def _check(matrix: Tensor, name: str, dim: int) -> None:
         raise ValueError(f"dim must be from 1 to D = {matrix.shape[-1]}, got {dim}")
 
 
-def _block(numbers: int) -> int:
-    return max(1, BLOCK // (8 * max(1, numbers)))
+def _flat(matrix: Tensor) -> Tensor:
+    return matrix.reshape(prod(matrix.shape[:-2]), *matrix.shape[-2:])
+
+
+def _size(matrix: Tensor) -> int:
+    """Problems per block."""
+    rows, size = matrix.shape[-2:]
+    problems = min(GRAM_BLOCK // (8 * size * size), ROWS_BLOCK // (8 * max(rows, 1) * size))
+    # an accelerator wants everything at once: there the block only bounds the memory
+    return max(1, problems if on_host(matrix) else 256 * problems)
 
 
 class _OfGram(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, gram: Tensor, dim: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        found = map_blocks(lambda block: _solve_gram(block.double(), dim), gram, size=_block(gram.shape[-1] ** 2))
+        found = map_blocks(lambda block: _solve_gram(block.double(), dim), gram, size=_size(gram))
         basis, residual, competing = (part.to(gram.dtype) for part in found[:3])
         ctx.save_for_backward(gram, basis)
         ctx.mark_non_differentiable(residual, competing, found[3])
@@ -126,71 +147,136 @@ class _OfGram(torch.autograd.Function):
         def block(gram: Tensor, basis: Tensor, grad: Tensor) -> Tensor:
             scaled, scale, finite = unit_trace(gram.double())
             vectors = basis.double().mT
-            w = resolvent(scaled, vectors, grad.double().mT) * scale[:, None, None]
-            product = w @ vectors.mT
-            return torch.where(finite[:, None, None], -0.5 * (product + product.mT), 0.0).to(gram.dtype)
+            product = resolvent(scaled, vectors, grad.double().mT) @ vectors.mT * (-0.5 * scale)[:, None, None]
+            return torch.where(finite[:, None, None], product + product.mT, 0.0).to(gram.dtype)
 
-        return map_blocks(block, gram, basis, grad, size=_block(gram.shape[-1] ** 2)), None
+        return map_blocks(block, gram, basis, grad, size=_size(gram)), None
 
 
 class _OfRows(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, matrix: Tensor, dim: int) -> Tensor:
-        rows, size = matrix.shape[-2:]
-        basis = map_blocks(
-            lambda block: _solve_rows(block.double(), dim).to(block.dtype), matrix, size=_block(max(rows, size) * size)
-        )
-        ctx.save_for_backward(matrix, basis)
+        minimal = matrix.shape[-2] == matrix.shape[-1] - dim
+        solve = _solve_few if on_host(matrix) and len(matrix) <= FEW else _solve_rows
+        # half of the backward would be to form the Gram again
+        keep = ctx.needs_input_grad[0] and not minimal
+
+        def block(matrix: Tensor) -> tuple[Tensor, Tensor]:
+            a = matrix.double()
+            none = a.new_empty(len(a), 0, 0)
+            if minimal:
+                return fix_signs(_solve_minimal(a, dim)).mT.to(matrix.dtype), none
+            gram = a.mT @ a
+            return fix_signs(solve(a, gram, dim)).mT.to(matrix.dtype), gram if keep else none
+
+        basis, gram = map_blocks(block, matrix, size=_size(matrix))
+        ctx.save_for_backward(matrix, gram, basis)
         return basis
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
-        matrix, basis = ctx.saved_tensors
-        rows, size = matrix.shape[-2:]
+        matrix, gram, basis = ctx.saved_tensors
+        result = torch.empty_like(matrix, memory_format=torch.contiguous_format)
 
-        def block(matrix: Tensor, basis: Tensor, grad: Tensor) -> Tensor:
+        def block(matrix: Tensor, gram: Tensor, basis: Tensor, grad: Tensor, result: Tensor) -> Tensor:
             a = matrix.double()
-            scaled, scale, finite = unit_trace(transpose_times(a))
+            scaled, scale, finite = unit_trace(gram if gram.numel() else a.mT @ a)
+            if not on_host(a) or not bool(finite.all()):
+                a = torch.where(finite[:, None, None], a, 0.0)
             vectors = torch.nan_to_num(basis.double()).mT
-            w = resolvent(scaled, vectors, grad.double().mT) * scale[:, None, None]
-            both = a @ torch.cat([w, vectors], -1)
-            result = both @ torch.cat([vectors, w], -1).mT
-            return torch.where(finite[:, None, None], -result, 0.0).to(matrix.dtype)
+            w = resolvent(scaled, vectors, grad.double().mT) * -scale[:, None, None]
+            left, right = a @ torch.cat([w, vectors], -1), torch.cat([vectors, w], -1).mT
+            # written in place: fresh memory for arrays of this size costs as much as the products
+            if result.dtype == left.dtype:
+                torch.bmm(left, right, out=result)
+            else:
+                result.copy_(left @ right)
+            return finite
 
-        return map_blocks(block, matrix, basis, grad, size=_block(max(rows, size) * size)), None
+        map_blocks(block, matrix, gram, basis, grad, result, size=_size(matrix))
+        return result, None
 
 
 def _solve_gram(gram: Tensor, dim: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Basis, residual, competing and degenerate of one block."""
     scaled, scale, finite = unit_trace(gram)
-    if on_host(gram) and len(gram) <= FEW:
+    host = on_host(gram)
+    if (host and len(gram) <= FEW) or dim == gram.shape[-1]:
         vectors, values, competing, degenerate = by_eigh(scaled, dim)
     else:
-        found = lowest(scaled, dim)
-        vectors, values, competing, degenerate = found.vectors, found.values, found.competing, ~found.certified
-        if on_host(gram):
-            hard = degenerate.nonzero()[:, 0]
-            if len(hard):
-                again = by_eigh(scaled[hard], dim)
-                vectors[hard], values[hard], competing[hard], degenerate[hard] = again
+        found = by_inverse_iteration(scaled, dim)
+        vectors, values, competing = found.vectors, found.values, competing_sum(found.factor, found.vectors)
+        degenerate = ~found.certified | (found.competing <= (RESOLVED if host else NULL))
+        hard = degenerate.nonzero()[:, 0] if host else degenerate[:0]
+        if len(hard):
+            vectors[hard], values[hard], competing[hard], degenerate[hard] = by_eigh(scaled[hard], dim)
     basis = torch.where(finite[:, None, None], fix_signs(vectors).mT, 0.0)
     return basis, values / scale[:, None], competing * scale, degenerate | ~finite
 
 
-def _solve_rows(matrix: Tensor, dim: int) -> Tensor:
-    rows, size = matrix.shape[-2:]
-    finite = torch.isfinite(matrix.sum((-2, -1)))
-    scaled, scale, resolved = unit_trace(transpose_times(matrix))
-    found = lowest(scaled, dim)
+def _solve_rows(matrix: Tensor, gram: Tensor, dim: int) -> Tensor:
+    """Null spaces ``(b, D, dim)`` through the Gram, where it carries them; corrected with the rows; SVD for the rest."""
+    scaled, scale, finite = unit_trace(gram)
+    if dim == matrix.shape[-1]:
+        return torch.where(finite[:, None, None], by_eigh(scaled, dim)[0], torch.nan)
+    found = by_inverse_iteration(scaled, dim)
     vectors = found.vectors
+    if not on_host(matrix):
+        return torch.where(finite[:, None, None], _corrected(matrix, scale, vectors, found.deflated), torch.nan)
+    slow = (finite & ~found.certified & (found.competing > ACCURATE)).nonzero()[:, 0]
+    if len(slow):
+        vectors[slow] = by_eigh(scaled[slow], dim)[0]
+    inexact = (finite & found.certified & (found.competing <= ACCURATE) & (found.competing > RESOLVED)).nonzero()[:, 0]
+    if len(inexact):
+        vectors[inexact] = _corrected(matrix[inexact], scale[inexact], vectors[inexact], found.deflated[inexact])
+    return _with_svd(matrix, vectors, ~(finite & (found.competing > torch.where(found.certified, RESOLVED, ACCURATE))))
+
+
+def _corrected(matrix: Tensor, scale: Tensor, vectors: Tensor, deflated: Tensor) -> Tensor:
+    """Newton corrections whose residual comes from the rows: the error is that of the SVD, eps kappa, not eps kappa^2."""
     for _ in range(2):
         image = matrix @ vectors
-        small = transpose_times(image) * scale[:, None, None]
-        step = torch.cholesky_solve((matrix.mT @ image) * scale[:, None, None] - vectors @ small, found.factor)
-        vectors = orthonormal(vectors - step)
-    if on_host(matrix):
-        hard = ((~found.certified | ~resolved) & finite).nonzero()[:, 0]
-        if len(hard):
-            vh = torch.linalg.svd(matrix[hard], full_matrices=rows < size).Vh
-            vectors[hard] = vh[:, size - dim :].flip(-2).mT
-    return torch.where(finite[:, None, None], fix_signs(vectors).mT, torch.nan)
+        residual = (matrix.mT @ image - vectors @ (image.mT @ image)) * scale[:, None, None]
+        vectors = orthonormal(vectors - torch.cholesky_solve(residual, deflated))
+    return vectors
+
+
+def _solve_few(matrix: Tensor, gram: Tensor, dim: int) -> Tensor:
+    """One call of eigh: for a few problems the overhead of many small operations outweighs their speed."""
+    scaled, _, finite = unit_trace(gram)
+    values, vectors = torch.linalg.eigh(scaled)
+    return _with_svd(matrix, vectors[..., :dim].contiguous(), ~finite | (values[:, dim:] < ACCURATE).any(-1))
+
+
+def _solve_minimal(matrix: Tensor, dim: int) -> Tensor:
+    r"""Exactly D - dim rows: :math:`A^T = P L U`, and what is orthogonal to the columns of :math:`P L` is a null vector."""
+    rows, size = matrix.shape[-2:]
+    if rows == 0:
+        return torch.eye(size, dtype=matrix.dtype, device=matrix.device).expand(len(matrix), -1, -1).clone()
+    factors, pivots, _ = torch.linalg.lu_factor_ex(matrix.mT)
+    upper, last = factors[:, :rows].mT, factors[:, rows:].mT
+    head = torch.linalg.solve_triangular(upper, -last, upper=True, unitriangular=True)
+    eye = torch.eye(dim, dtype=matrix.dtype, device=matrix.device).expand(len(matrix), -1, -1)
+    permutation = torch.lu_unpack(factors, pivots, unpack_data=False)[0]
+    vectors = orthonormal(permutation @ torch.cat([head, eye], dim=-2))
+    error = (matrix @ vectors).square().sum((-2, -1))
+    sound = error <= STABLE**2 * matrix.square().sum((-2, -1))
+    return (
+        _with_svd(matrix, vectors, ~sound)
+        if on_host(matrix)
+        else torch.where(torch.isfinite(error)[:, None, None], vectors, torch.nan)
+    )
+
+
+def _with_svd(matrix: Tensor, vectors: Tensor, hard: Tensor) -> Tensor:
+    """``vectors``, with the SVD's where ``hard`` (CPU only)."""
+    chosen = hard.nonzero()[:, 0]
+    if len(chosen) == 0:
+        return vectors
+    rows, size = matrix.shape[-2:]
+    picked = matrix[chosen]
+    finite = torch.isfinite(picked).all(-1).all(-1)[:, None, None]
+    vh = torch.linalg.svd(torch.where(finite, picked, 0.0), full_matrices=rows < size).Vh  # raises for the whole batch on NaN
+    vectors[chosen] = torch.where(finite, vh[:, size - vectors.shape[-1] :].flip(-2).mT, torch.nan)
+    return vectors

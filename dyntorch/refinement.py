@@ -92,10 +92,11 @@ def _jacobian(function: Callable[[Tensor], Tensor], theta: Tensor) -> tuple[Tens
     tangents = torch.eye(count, dtype=theta.dtype, device=theta.device)[:, None, :].expand(count, *theta.shape)
 
     def along(tangent: Tensor) -> tuple[Tensor, Tensor]:
-        return torch.func.jvp(function, (theta,), (tangent,))
+        value, column = torch.func.jvp(function, (theta,), (tangent,))[:2]
+        return value, column
 
-    values, columns = torch.func.vmap(along, out_dims=(None, 0))(tangents)
-    return values, columns.transpose(0, 1)
+    values, columns = torch.func.vmap(along)(tangents)
+    return values[0], columns.transpose(0, 1)
 
 
 def refine(
@@ -181,7 +182,7 @@ def refine_matches(solution: Solution, data: Matches, iterations: int = ITERATIO
 def _minimize(problem: Problem, theta: Tensor, iterations: int) -> tuple[Tensor, Tensor, Tensor]:
     """Parameters, cost and Gauss-Newton matrix at the minimum of every problem of a block."""
     theta = _unit_parts(problem, theta)
-    result = (theta, *problem.normal_equations(theta))
+    result: tuple[Tensor, ...] = (theta, *problem.normal_equations(theta))
     damping = torch.full_like(result[1], 1e-3)
     left = torch.arange(theta.shape[0], device=theta.device)
     state, current = result, problem

@@ -94,7 +94,9 @@ def _maps(centred: Tensor, mean: Tensor, count: Tensor, total: Tensor) -> Affine
     safe = torch.cat([safe, safe.new_zeros(centred.shape[-2] - 6, 9)])
     null = null_space(torch.where(ok[..., None, None], centred, safe), 3)
     blocks = null.unflatten(-1, (3, 3)).movedim(-2, -3)
-    inverses, info = torch.linalg.inv_ex(torch.where(ok[..., None, None, None], blocks, torch.eye(3).to(blocks)))
+    inverses, info = torch.linalg.inv_ex(
+        torch.where(ok[..., None, None, None], blocks, torch.eye(3, dtype=blocks.dtype, device=blocks.device))
+    )
     ok = ok & (info == 0).all(-1) & inverses.isfinite().flatten(-3).all(-1)
     keep = ok[..., None, None]
     n0, n1 = blocks[..., 0, :, :], blocks[..., 1, :, :]
@@ -102,7 +104,7 @@ def _maps(centred: Tensor, mean: Tensor, count: Tensor, total: Tensor) -> Affine
     m1, m0 = -inverses[..., 2, :, :] @ n1, -l2
     first, second, third = mean.unflatten(-1, (3, 3)).unbind(-2)
     t = third - (m1 @ second[..., None] + m0 @ first[..., None])[..., 0]
-    parts = (torch.eye(3).to(l1).expand_as(l1), l1, l2)
+    parts = (torch.eye(3, dtype=l1.dtype, device=l1.device).expand_as(l1), l1, l2)
     maps = [torch.where(keep, _affine(a, shift), 0.0) for a, shift in zip(parts, (first, second, third), strict=True)]
     left = (centred @ null.mT).square().sum((-1, -2)) / (3 * total.clamp(min=torch.finfo(total.dtype).tiny))
     residual = torch.where(ok, left, torch.zeros_like(left)).clamp(min=torch.finfo(left.dtype).tiny).sqrt()

@@ -16,35 +16,14 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from dyntorch.algebra.extensors import compound
-from dyntorch.algebra.homogeneous import inhomogeneous, unit
+from dyntorch.algebra.homogeneous import unit
+from dyntorch.algebra.projection import adjugate
 from dyntorch.nullspace import null_space
 
 # 300 scenes each: with 24 matches and noise of 2e-3 of the scene the global minimum is found always (camera: always), with 21
 # matches and 5e-3 in 98 %; 3 and 3 steps leave 2 % unconverged, 30 alternations gain nothing
 ALTERNATIONS = 10
 NEWTON_STEPS = 4
-
-
-def adjugate(matrix: Tensor) -> Tensor:
-    r"""The adjugate, :math:`A\,\mathrm{adj}(A) = \det(A)\, I`: the inverse up to scale, finite and smooth at any rank.
-
-    Args:
-        matrix: ``(*batch, n, n)``, n from 2 to 4 in this library.
-
-    Returns:
-        ``(*batch, n, n)``, polynomials of the entries.
-
-    Example:
-        >>> import torch
-        >>> adjugate(torch.tensor([[1.0, 2.0], [3.0, 4.0]])).tolist()
-        [[4.0, -2.0], [-3.0, 1.0]]
-    """
-    n = matrix.shape[-1]
-    # minors in lexicographic order: the last one is without the first row
-    minors = compound(matrix, n - 1).flip(-1, -2)
-    signs = 1.0 - 2.0 * (torch.arange(n, device=matrix.device) % 2).to(matrix.dtype)
-    return (minors * (signs[:, None] * signs)).mT
 
 
 def constant_velocity_tensor(first: Tensor, second: Tensor, third: Tensor) -> Tensor:
@@ -89,8 +68,7 @@ def infinity_planes(tensor: Tensor) -> tuple[Tensor, Tensor]:
     Returns:
         two ``(*batch, 4)``, of norm 1, the last coordinate not negative.
 
-    Source: thesis section 8.3.1, where they are epipoles found as generalized eigenvectors; these eigenvalues are 4-fold and
-    defective here, so that the way over eigenvectors loses half of the digits.
+    Source: thesis section 8.3.1: epipoles as generalized eigenvectors, but these are 4-fold and defective, and lose the digits.
 
     Example:
         >>> import torch
@@ -120,6 +98,12 @@ def structure(tensor: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
     Returns:
         alpha and beta ``(*batch, 4)``, Q and K ``(*batch, m, 4)``.
+
+    Example:
+        >>> import torch
+        >>> parts = structure(constant_velocity_tensor(*torch.eye(4, dtype=torch.float64).expand(3, 4, 4)))
+        >>> [tuple(part.shape) for part in parts]
+        [(4,), (4,), (4, 4), (4, 4)]
     """
     alpha, beta = infinity_planes(tensor)
     q = torch.einsum("...ijk,...i->...kj", tensor, alpha)
@@ -157,6 +141,12 @@ def constant_velocity_maps(tensor: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         ``(*batch, 4, 4)`` twice and ``(*batch, 4 | 3, 4)``, of norm 1.  Zero matrices for a tensor that is 0.
 
     Source: thesis section 8.3.1; closed form and scale derived here.
+
+    Example:
+        >>> import torch
+        >>> maps = constant_velocity_maps(constant_velocity_tensor(*torch.eye(4, dtype=torch.float64).expand(3, 4, 4)))
+        >>> bool(torch.allclose(maps[0].abs(), torch.eye(4, dtype=torch.float64) / 2, atol=1e-9))
+        True
     """
     alpha, beta, q, k = structure(tensor)
     first = complement_frame(alpha)
@@ -186,24 +176,23 @@ def unit_tensor(tensor: Tensor) -> Tensor:
     return _unit(exact)
 
 
-def project(matrix: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
-    r"""Images :math:`y = \pi(A (x, 1))` of points ``(*batch, n, d)``, and the Jacobian ``(*batch, n, e, d)`` of each."""
-    p = points @ matrix[..., :-1].mT + matrix[..., None, :, -1]
-    y, w = inhomogeneous(p), p[..., -1:]
-    # as in inhomogeneous: a point at infinity stays finite
-    floor = torch.finfo(p.dtype).eps * p.detach().abs().amax(-1, keepdim=True)
-    w = torch.where(w.abs() > floor, w, torch.where(floor > 0, floor, torch.ones_like(floor)))
-    return y, (matrix[..., None, :-1, :-1] - y[..., :, None] * matrix[..., None, -1:, :-1]) / w[..., None]
+def balanced(tensor: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
+    r"""Bring each view to a unit in which its points are of order 1: :math:`T_{ijk} = \hat T_{ijk}\, d_i e_j f_k`.
 
-
-def back_project(matrix: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
-    """World positions of the points that a sensor ``(*batch, 4, 4)`` measured, and their Jacobians."""
-    return project(adjugate(matrix), x)
-
-
-def drift(matrix: Tensor, shift: Tensor) -> Tensor:
-    r"""The map after a translation of the world, :math:`A \begin{pmatrix} I & s \\ 0 & 1 \end{pmatrix}`."""
-    return torch.cat([matrix[..., :3], matrix[..., 3:] + matrix[..., :3] @ shift[..., None]], dim=-1)
+    A tensor of points far from 1 has entries 1e-9 and 1 side by side, and would lose the small ones.  All coordinates of a
+    view share one scale, the one for which the norms of the slices are related as for three equal sensors: scaling every
+    slice to norm 1 instead doubles the noise of the maps.
+    """
+    scales = []
+    for axis, like in ((-3, 13**-0.5), (-2, 1.0), (-1, 5**0.5)):
+        size = torch.linalg.vector_norm(tensor, dim=[a for a in (-3, -2, -1) if a != axis]).square()
+        inner, last = size[..., :-1].mean(-1, keepdim=True), size[..., -1:]
+        usable = (inner > 0) & (last > 0)
+        scale = torch.where(usable, (inner / torch.where(usable, last, 1.0)).clamp(min=1e-300).sqrt() / like, 1.0)
+        factor = torch.cat([scale.expand_as(size[..., :-1]), torch.ones_like(last)], dim=-1)
+        tensor = tensor / factor.unflatten(-1, [-1 if a == axis else 1 for a in (-3, -2, -1)])
+        scales.append(factor)
+    return _unit(tensor), (scales[0], scales[1], scales[2])
 
 
 def complement_frame(plane: Tensor) -> Tensor:
@@ -254,7 +243,9 @@ def _newton(tensor: Tensor, alpha: Tensor, beta: Tensor) -> tuple[Tensor, Tensor
         hessian = torch.cat([torch.cat([diagonal[0], cross], dim=-1), torch.cat([cross.mT, diagonal[1]], dim=-1)], dim=-2)
         factor, info = torch.linalg.cholesky_ex(hessian)
         strict = (info == 0)[..., None, None]
-        inverse = torch.where(strict, torch.cholesky_inverse(torch.where(strict, factor, torch.eye(8).to(factor))), 0.0)
+        inverse = torch.where(
+            strict, torch.cholesky_inverse(torch.where(strict, factor, torch.eye(8, dtype=factor.dtype, device=factor.device))), 0.0
+        )
     step = (inverse @ gradient)[..., 0]
     return normalize(alpha + step[..., :4], dim=-1), normalize(beta + step[..., 4:], dim=-1)
 

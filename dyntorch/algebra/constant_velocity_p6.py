@@ -25,6 +25,13 @@ def constant_velocity_maps_p6(tensor: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         as :func:`constant_velocity_maps`, in another gauge.
 
     Source: thesis section 8.3.1.
+
+    Example:
+        >>> from dyntorch.algebra.constant_velocity import constant_velocity_tensor
+        >>> T = constant_velocity_tensor(*torch.eye(4, dtype=torch.float64).expand(3, 4, 4))
+        >>> again = constant_velocity_tensor(*constant_velocity_maps_p6(T))
+        >>> bool(torch.allclose(again * (again * T).sum().sign(), T, atol=1e-9))
+        True
     """
     alpha, beta = infinity_planes(tensor)
     turn = complement_frame(beta) @ complement_frame(alpha).mT

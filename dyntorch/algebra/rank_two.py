@@ -39,9 +39,9 @@ def null_vectors(matrix: Tensor) -> tuple[Tensor, Tensor]:
     r"""Left and right null vector of a 3 x 3 matrix of rank two: :math:`y^T M = 0,\ M z = 0`.
 
     The cofactors of such a matrix are :math:`c\, y z^T`.  For a matrix that noise has made regular, the result is the pair of
-    singular vectors to its smallest singular value: the leading ones of the cofactors, found by repeated squaring.  Each
-    coordinate is accurate relative to itself where the rank is exactly two, however different the units of the coordinates
-    are (pixels beside the constant 1), which no orthogonal decomposition is.
+    singular vectors to its smallest singular value: the leading ones of the cofactors, found by repeated squaring.  Where
+    the rank is exactly two, the units of the coordinates (pixels beside the constant 1) cost no accuracy, as they do in an
+    orthogonal decomposition.
 
     Args:
         matrix: ``(*batch, 3, 3)`` of any scale.
@@ -58,7 +58,6 @@ def null_vectors(matrix: Tensor) -> tuple[Tensor, Tensor]:
         >>> left.abs().tolist(), right.abs().tolist()
         ([0.0, 1.0, 0.0], [0.0, 1.0, 0.0])
     """
-    tiny = torch.finfo(matrix.dtype).tiny
     adjoint = cofactors(_scaled(matrix))
     power = adjoint @ _scaled(adjoint).mT
     for _ in range(SQUARINGS):
@@ -67,11 +66,16 @@ def null_vectors(matrix: Tensor) -> tuple[Tensor, Tensor]:
     # every column is a multiple of the vector; the longest one of them is never zero
     pick = power.detach().diagonal(dim1=-2, dim2=-1).argmax(dim=-1, keepdim=True)[..., None].expand(*power.shape[:-1], 1)
     left = _scaled(power.gather(-1, pick))[..., 0]
-    left = left / torch.linalg.vector_norm(left, dim=-1, keepdim=True).clamp(min=tiny)
+    left = left / _nonzero(torch.linalg.vector_norm(left, dim=-1, keepdim=True))
     right = (_scaled(adjoint).mT @ left[..., None])[..., 0]
-    return left, right / torch.linalg.vector_norm(right, dim=-1, keepdim=True).clamp(min=tiny)
+    return left, right / _nonzero(torch.linalg.vector_norm(right, dim=-1, keepdim=True))
 
 
 def _scaled(matrix: Tensor) -> Tensor:
     """Largest entry 1.  The scale is no variable: the null vectors do not depend on it."""
-    return matrix / matrix.detach().abs().amax(dim=(-2, -1), keepdim=True).clamp(min=torch.finfo(matrix.dtype).tiny)
+    return matrix / _nonzero(matrix.detach().abs().amax(dim=(-2, -1), keepdim=True))
+
+
+def _nonzero(size: Tensor) -> Tensor:
+    """A divisor that leaves zero, and its gradient, alone."""
+    return torch.where(size > 0, size, torch.ones_like(size))

@@ -68,6 +68,8 @@ def _skew_partner(slices: Tensor) -> Tensor:
     eye = torch.eye(4, dtype=slices.dtype, device=slices.device)
     # entry (m, n) of X^T S + S^T X as a function of X[l, x]: S[l, n] where x = m, and S[l, m] where x = n
     system = s[..., columns, :, None] * eye[rows, None, :] + s[..., rows, :, None] * eye[columns, None, :]
+    # an equation off the diagonal stands for two: with its weight a rotation of the coordinates changes nothing
+    system = system * torch.where(rows == columns, 1.0, 2**0.5).to(s)[:, None, None]
     return unit(null_space(system.flatten(-2).flatten(-3, -2))[..., 0, :].unflatten(-1, (4, 4)))
 
 
@@ -110,7 +112,7 @@ def collinearity(motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: 
     weights = (cos / math.sqrt(6) - sin / math.sqrt(2), -2 * cos / math.sqrt(6), cos / math.sqrt(6) + sin / math.sqrt(2))
     w1, w2, w3 = ((w * s[..., None, None]).square()[..., None] for w, s in zip(weights, scales, strict=True))
     eye = torch.eye(3, dtype=ja.dtype, device=ja.device)
-    return _whiten_normal(error, _direction(along), w1 * eye + w2 * _outer(ja) + w3 * _outer(jb))
+    return _whiten_normal(error, _direction(along), w1 * eye + w2 * (ja @ ja.mT) + w3 * (jb @ jb.mT))
 
 
 def _principal(u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
@@ -129,16 +131,11 @@ def _direction(vector: Tensor) -> Tensor:
     return torch.where(none, axis, vector * torch.where(none, 1.0, square).rsqrt())
 
 
-def _outer(jacobian: Tensor) -> Tensor:
-    # multiplied out: a batched product of hundreds of thousands of 3 x 3 matrices loops over them
-    return (jacobian[..., :, None, :] * jacobian[..., None, :, :]).sum(-1)
-
-
 def _whiten_normal(error: Tensor, direction: Tensor, covariance: Tensor) -> Tensor:
     """The symmetric root of the inverse covariance within the plane normal to the direction, times an error in that plane."""
 
     def apply(x: Tensor) -> Tensor:
-        return (covariance * x[..., None, :]).sum(-1)
+        return (covariance @ x[..., None])[..., 0]
 
     def dot(x: Tensor, y: Tensor) -> Tensor:
         return (x * y).sum(-1, keepdim=True)
@@ -147,7 +144,7 @@ def _whiten_normal(error: Tensor, direction: Tensor, covariance: Tensor) -> Tens
     adjugate = torch.stack([torch.linalg.cross(r1, r2), torch.linalg.cross(r2, r0), torch.linalg.cross(r0, r1)], dim=-2)
     # not negative but for rounding, where the line passes through infinity
     trace = (covariance.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True) - dot(direction, apply(direction))).clamp(min=0.0)
-    det = dot(direction, (adjugate * direction[..., None, :]).sum(-1)).clamp(min=0.0)
+    det = dot(direction, (adjugate @ direction[..., None])[..., 0]).clamp(min=0.0)
     info = torch.finfo(error.dtype)
     root = (det + (info.eps * trace).square() + info.tiny).sqrt()  # a singular motion leaves a large residual, not an infinite one
     moved = apply(error)

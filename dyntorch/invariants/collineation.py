@@ -69,7 +69,8 @@ class Collineation(Invariant):
             >>> Collineation.compose(2 * torch.eye(4)).diagonal().tolist()
             [0.5, 0.5, 0.5, 0.5]
         """
-        return A / torch.linalg.matrix_norm(A, keepdim=True).clamp(min=torch.finfo(A.dtype).tiny)
+        norm = torch.linalg.matrix_norm(A, keepdim=True)
+        return A / torch.where(norm > 0, norm, torch.ones_like(norm))
 
     @staticmethod
     def decompose(tensor: Tensor) -> Tensor:

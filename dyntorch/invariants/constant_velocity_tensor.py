@@ -4,18 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
 from dyntorch.algebra.constant_velocity import (
-    adjugate,
-    back_project,
+    balanced,
     constant_velocity_maps,
     constant_velocity_tensor,
-    drift,
-    project,
     structure,
     third_infinity,
     unit_tensor,
@@ -23,11 +20,21 @@ from dyntorch.algebra.constant_velocity import (
 from dyntorch.algebra.constant_velocity_p6 import constant_velocity_maps_p6
 from dyntorch.algebra.extensors import compound, dual, join
 from dyntorch.algebra.homogeneous import homogeneous, inhomogeneous, unit
+from dyntorch.algebra.projection import adjugate, back_project
 from dyntorch.invariant import Frame, Invariant
+from dyntorch.invariants.constant_velocity_residual import moving_residual, resting_residual
 from dyntorch.primitives import HyperplanesThrough, Point, Primitive
-from dyntorch.residual import whiten
 
 Motion = tuple[Tensor, Tensor, Tensor]
+
+
+class Diagnosis(NamedTuple):
+    """Evidence against a constant velocity tensor, ``(*batch,)`` each: small with good data, 1 for a zero tensor."""
+
+    misfit: Tensor
+    r"""The part :math:`\|T - \alpha \otimes Q - K \otimes \beta\| / \|T\|` that does not fit three projections from :math:`P^6`."""
+    infinity: Tensor
+    r""":math:`\sigma_4 / \sigma_3` of the equations of the plane at infinity of the third frame; 0 with a camera."""
 
 
 @dataclass(frozen=True)
@@ -44,9 +51,6 @@ class ConstantVelocityTensor(Invariant):
     Args:
         third: ``"space"``, the third view measures points of space ``(*batch, n, 3)``; ``"image"``, it is a camera
             ``(*batch, n, 2)`` with a finite centre, and :math:`A_2` is 3 x 4.
-
-    Raises:
-        ValueError: another ``third``.
 
     Source: thesis section 8.3.
 
@@ -86,13 +90,8 @@ class ConstantVelocityTensor(Invariant):
     def compose(first: Tensor, second: Tensor, third: Tensor) -> Tensor:
         r"""The tensor of the maps :math:`A_0, A_1, A_2`; see :func:`~dyntorch.algebra.constant_velocity.constant_velocity_tensor`.
 
-        Args:
-            first: ``(*batch, 4, 4)``.
-            second: ``(*batch, 4, 4)``.
-            third: ``(*batch, 4, 4)``, or ``(*batch, 3, 4)`` of a camera.
-
         Returns:
-            ``(*batch, 4, 4, 4)`` or ``(*batch, 4, 4, 3)``, of norm 1.
+            ``(*batch, 4, 4, 4)``, or ``(*batch, 4, 4, 3)`` where :math:`A_2` is that of a camera; of norm 1.
         """
         return constant_velocity_tensor(first, second, third)
 
@@ -108,6 +107,14 @@ class ConstantVelocityTensor(Invariant):
 
         Returns:
             :math:`A_0, A_1, A_2` of norm 1.  Zero matrices for a tensor that is 0 or not finite.
+
+        Example:
+            >>> from dyntorch.scenes import constant_velocity
+            >>> scene = constant_velocity(5)
+            >>> maps = ConstantVelocityTensor.decompose(ConstantVelocityTensor.compose(*scene.motion))
+            >>> y = ConstantVelocityTensor.positions(maps, *scene.views)
+            >>> bool((y[:, 0] - 2 * y[:, 1] + y[:, 2]).abs().max() < 1e-9)
+            True
         """
         return _solve(tensor, constant_velocity_maps)
 
@@ -117,28 +124,23 @@ class ConstantVelocityTensor(Invariant):
         return _solve(tensor, constant_velocity_maps_p6)
 
     @staticmethod
-    def diagnose(tensor: Tensor) -> dict[str, Tensor]:
-        r"""How far a tensor is from one of constant velocity; both figures are at the level of the noise for good data.
+    def diagnose(tensor: Tensor) -> Diagnosis:
+        """How far a tensor is from one of constant velocity; see :class:`Diagnosis`.
 
         Args:
             tensor: ``(*batch, 4, 4, 4)``, or ``(*batch, 4, 4, 3)`` of a camera.
-
-        Returns:
-            ``"structure"`` ``(*batch,)``, the part :math:`\|T - \alpha \otimes Q - K \otimes \beta\| / \|T\|` that does not fit
-            three projections from :math:`P^6`; in space also ``"infinity"`` ``(*batch,)``, the ratio
-            :math:`\sigma_4 / \sigma_3` of the equations of the plane at infinity of the third frame.  1 for a tensor that is 0.
         """
-        exact = unit_tensor(tensor)
+        exact = balanced(unit_tensor(tensor))[0]
         alpha, beta, q, k = structure(exact)
         fitted = torch.einsum("...i,...kj->...ijk", alpha, q) + torch.einsum("...ki,...j->...ijk", k, beta)
         left = (exact - fitted).flatten(-3).norm(dim=-1)
-        present = exact.flatten(-3).abs().amax(-1) > 0
-        figures = {"structure": torch.where(present, left, torch.ones_like(left)).to(tensor.dtype)}
-        if tensor.shape[-1] == 4:
-            values = torch.linalg.svdvals(third_infinity(alpha, beta, q, k))
-            ratio = values[..., 3] / torch.where(values[..., 2] > 0, values[..., 2], torch.ones_like(left))
-            figures["infinity"] = torch.where(values[..., 2] > 0, ratio, torch.ones_like(ratio)).to(tensor.dtype)
-        return figures
+        one = torch.ones_like(left)
+        misfit = torch.where(exact.flatten(-3).abs().amax(-1) > 0, left, one)
+        if tensor.shape[-1] == 3:
+            return Diagnosis(misfit.to(tensor.dtype), torch.zeros_like(misfit).to(tensor.dtype))
+        values = torch.linalg.svdvals(third_infinity(alpha, beta, q, k))
+        ratio = torch.where(values[..., 2] > 0, values[..., 3] / torch.where(values[..., 2] > 0, values[..., 2], one), one)
+        return Diagnosis(misfit.to(tensor.dtype), ratio.to(tensor.dtype))
 
     @staticmethod
     def transfer(tensor: Tensor, x1: Tensor | None = None, x2: Tensor | None = None, x3: Tensor | None = None) -> Tensor:
@@ -156,6 +158,14 @@ class ConstantVelocityTensor(Invariant):
 
         Raises:
             ValueError: not exactly two views, or one that a camera cannot predict.
+
+        Example:
+            >>> from dyntorch.scenes import constant_velocity
+            >>> scene = constant_velocity(5)
+            >>> T = ConstantVelocityTensor.compose(*scene.motion)
+            >>> found = ConstantVelocityTensor.transfer(T, x2=scene.views[1], x3=scene.views[2])
+            >>> bool((found - scene.views[0]).abs().max() < 1e-9)
+            True
         """
         given = [None if x is None else homogeneous(x) for x in (x1, x2, x3)]
         if sum(p is None for p in given) != 1:
@@ -205,6 +215,14 @@ class ConstantVelocityTensor(Invariant):
 
         Raises:
             ValueError: no matches.
+
+        Example:
+            >>> from dyntorch.scenes import constant_velocity
+            >>> scene = constant_velocity(5, static=0.4)
+            >>> maps = ConstantVelocityTensor.decompose(ConstantVelocityTensor.compose(*scene.motion))
+            >>> maps = ConstantVelocityTensor.fix_gauge(maps, *scene.views, weights=(scene.labels == 1).double())
+            >>> int((ConstantVelocityTensor.static_distance(maps, *scene.views) < 1e-9).sum())
+            2
         """
         if x1.shape[-2] == 0:
             raise ValueError("x1 has no matches; the common velocity takes one static match or more")
@@ -214,7 +232,7 @@ class ConstantVelocityTensor(Invariant):
         # a match of weight 0 may be anything, also not a number
         used = torch.where(weight[..., None] > 0, velocity, torch.zeros_like(velocity))
         common = (weight[..., None] * used).sum(-2) / torch.where(total > 0, total, torch.ones_like(total))
-        first, second, third = (unit(drift(matrix, t * common)) for t, matrix in enumerate(motion))
+        first, second, third = (unit(_drift(matrix, t * common)) for t, matrix in enumerate(motion))
         return first, second, third
 
     @staticmethod
@@ -249,7 +267,7 @@ class ConstantVelocityTensor(Invariant):
         degrees of freedom for a static match, 5 with an image as the third view.
         """
         one = torch.ones((), dtype=x1.dtype, device=x1.device)
-        return ConstantVelocityTensor().whitened_static(motion, (x1, x2, x3), (one, one, one)).norm(dim=-1)
+        return resting_residual(motion, (x1, x2, x3), (one, one, one)).norm(dim=-1)
 
     def whitened(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
         r"""The residual :math:`e = y_0 - 2 y_1 + y_2`, whitened; in an image :math:`e = \pi(A_2 (2 y_1 - y_0, 1)) - x_3`.
@@ -257,15 +275,7 @@ class ConstantVelocityTensor(Invariant):
         Returns:
             ``(*batch, n, 3)``, or ``(*batch, n, 2)`` with an image.
         """
-        (y0, j0), (y1, j1) = back_project(motion[0], views[0]), back_project(motion[1], views[1])
-        j0, j1 = scales[0][..., None, None, None] * j0, 2 * scales[1][..., None, None, None] * j1
-        if views[2].shape[-1] == 3:
-            y2, j2 = back_project(motion[2], views[2])
-            j2 = scales[2][..., None, None, None] * j2
-            return whiten(y0 - 2 * y1 + y2, j0 @ j0.mT + j1 @ j1.mT + j2 @ j2.mT)
-        seen, j = project(motion[2], 2 * y1 - y0)
-        noise = torch.eye(2, dtype=seen.dtype, device=seen.device) * scales[2][..., None, None, None].square()
-        return whiten(seen - views[2], j @ (j0 @ j0.mT + j1 @ j1.mT) @ j.mT + noise)
+        return moving_residual(motion, views, scales)
 
     def whitened_static(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
         r"""Residual of matches that stand still, :math:`(y_1 - y_0, y_2 - y_1)`, whitened; it holds the common velocity at 0.
@@ -273,21 +283,18 @@ class ConstantVelocityTensor(Invariant):
         Returns:
             ``(*batch, n, 6)``, or ``(*batch, n, 5)`` with an image.
         """
-        (y0, j0), (y1, j1) = back_project(motion[0], views[0]), back_project(motion[1], views[1])
-        q0 = scales[0][..., None, None, None].square() * (j0 @ j0.mT)
-        q1 = scales[1][..., None, None, None].square() * (j1 @ j1.mT)
-        if views[2].shape[-1] == 3:
-            y2, j2 = back_project(motion[2], views[2])
-            last, cross, corner = y2 - y1, -q1, q1 + scales[2][..., None, None, None].square() * (j2 @ j2.mT)
-        else:
-            seen, j = project(motion[2], y1)
-            noise = torch.eye(2, dtype=seen.dtype, device=seen.device) * scales[2][..., None, None, None].square()
-            last, cross, corner = seen - views[2], j @ q1, j @ q1 @ j.mT + noise
-        covariance = torch.cat([torch.cat([q0 + q1, cross.mT], dim=-1), torch.cat([cross, corner], dim=-1)], dim=-2)
-        return whiten(torch.cat([y1 - y0, last], dim=-1), covariance)
+        return resting_residual(motion, views, scales)
+
+
+def _drift(matrix: Tensor, shift: Tensor) -> Tensor:
+    r"""The map after a translation of the world, :math:`A \begin{pmatrix} I & s \\ 0 & 1 \end{pmatrix}`."""
+    return torch.cat([matrix[..., :3], matrix[..., 3:] + matrix[..., :3] @ shift[..., None]], dim=-1)
 
 
 def _solve(tensor: Tensor, solver: Callable[[Tensor], Motion]) -> Motion:
-    """Run a decomposition in float64."""
-    first, second, third = solver(unit_tensor(tensor))
-    return first.to(tensor.dtype), second.to(tensor.dtype), third.to(tensor.dtype)
+    """Run a decomposition in float64 and in coordinates of order 1."""
+    even, (first, second, third) = balanced(unit_tensor(tensor))
+    maps = solver(even)
+    scaled = (maps[0] / first[..., None], maps[1] / second[..., None], maps[2] * third[..., None])
+    first, second, third = (unit(m).to(tensor.dtype) for m in scaled)
+    return first, second, third

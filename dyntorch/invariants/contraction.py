@@ -47,3 +47,10 @@ def _contraction(tensor: Tensor, vectors: Tensor, source: int, target: int) -> T
         raise ValueError(f"source and target must be two different views of 1, 2, 3, got {source} and {target}")
     to, other = AXES[target - 1], AXES[6 - source - target - 1]
     return torch.einsum(f"...{AXES},...n{AXES[source - 1]}->...n{to}{other}", tensor.double(), vectors.double())
+
+
+def unit_normal(line: Tensor) -> Tensor:
+    """The line with a unit normal; the line at infinity, which has none, is kept finite, and zero stays zero."""
+    floor = torch.finfo(line.dtype).eps * line.detach().abs().amax(dim=-1, keepdim=True)
+    size = torch.maximum(torch.linalg.vector_norm(line[..., :2], dim=-1, keepdim=True), floor)
+    return line / torch.where(size > 0, size, torch.ones_like(size))

@@ -12,7 +12,7 @@ from dyntorch.algebra.homogeneous import inhomogeneous, unit
 from dyntorch.algebra.rank_two import cofactors
 from dyntorch.invariant import Frame, Invariant
 from dyntorch.invariants.agreement import static_residual, whitened_agreement
-from dyntorch.invariants.contraction import static_map, static_map_derivative, third_vector
+from dyntorch.invariants.contraction import static_map, static_map_derivative, third_vector, unit_normal
 from dyntorch.invariants.homography_tensor import HomographyTensor
 from dyntorch.primitives import Hyperplane, HyperplanesThrough, Primitive
 
@@ -131,7 +131,7 @@ class DualHomographyTensor(Invariant):
             raise ValueError(f"quadrifocal must be (*batch, 3, 3, 3, 3) and line (*batch, 3), got {got}")
         tensor = torch.einsum("...ijkl,...l->...ijk", quadrifocal, line)
         norm = torch.linalg.vector_norm(tensor, dim=(-3, -2, -1), keepdim=True)
-        return tensor / norm.clamp(min=torch.finfo(tensor.dtype).tiny)
+        return tensor / torch.where(norm > 0, norm, torch.ones_like(norm))
 
     @staticmethod
     def transfer(tensor: Tensor, lines: Tensor, source: int = 2, target: int = 1) -> Tensor:
@@ -159,7 +159,7 @@ class DualHomographyTensor(Invariant):
             >>> (line / line[:, :1])[0, 2].round(decimals=4)
             tensor(-5.)
         """
-        return Hyperplane(2).raw(static_map(tensor, lines, source, target)).to(lines.dtype)
+        return unit_normal(static_map(tensor, lines, source, target)).to(lines.dtype)
 
     @staticmethod
     def concurrency(tensor: Tensor, lines_a: Tensor, lines_b: Tensor, view: int = 1) -> Tensor:
@@ -211,7 +211,7 @@ class DualHomographyTensor(Invariant):
         """
         parts = []
         for source, line in ((2, lines2.double()), (3, lines3.double())):
-            image, derivative = static_map_derivative(tensor, Hyperplane(2).raw(line), source, 1)
+            image, derivative = static_map_derivative(tensor, unit_normal(line), source, 1)
             parts.append(_line_error(image, derivative, line, lines1.double()))
         one = torch.ones((), dtype=torch.float64, device=lines1.device)
         return whitened_agreement(parts, (one,) * 3).norm(dim=-1).to(lines1.dtype)
@@ -229,7 +229,7 @@ class DualHomographyTensor(Invariant):
         parts = []
         for matrix, line in zip(motion, others, strict=True):
             to_first = cofactors(matrix)
-            parts.append(_line_error(Hyperplane(2).raw(line) @ to_first.mT, to_first[..., None, :, :], line, first))
+            parts.append(_line_error(unit_normal(line) @ to_first.mT, to_first[..., None, :, :], line, first))
         return whitened_agreement(parts, scales)
 
 
@@ -275,10 +275,11 @@ def _line_error(image: Tensor, derivative: Tensor, source: Tensor, line: Tensor)
     Returns:
         ``(*batch, n, 2)`` and ``(*batch, n, 2, 2)``.
     """
-    reference, start = Hyperplane(2).raw(line), Hyperplane(2).raw(source)
+    reference, start = unit_normal(line), unit_normal(source)
     # the line at infinity has no normal: a short one stands in for it
-    floor = torch.finfo(image.dtype).eps * image.detach().abs().amax(dim=-1, keepdim=True) + torch.finfo(image.dtype).tiny
+    floor = torch.finfo(image.dtype).eps * image.detach().abs().amax(dim=-1, keepdim=True)
     length = torch.maximum(torch.linalg.vector_norm(image[..., :2], dim=-1, keepdim=True), floor)
+    length = torch.where(length > 0, length, torch.ones_like(length))
     unit_line = image / length
     across = reference[..., 0] * unit_line[..., 1] - reference[..., 1] * unit_line[..., 0]
     along = (reference[..., :2] * unit_line[..., :2]).sum(-1)

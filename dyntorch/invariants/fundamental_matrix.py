@@ -48,13 +48,14 @@ class FundamentalMatrix(Invariant):
             tensor(-0.7071)
         """
         tensor = skew(e2) @ A
-        return tensor / torch.linalg.matrix_norm(tensor, keepdim=True).clamp(min=torch.finfo(tensor.dtype).tiny)
+        norm = torch.linalg.matrix_norm(tensor, keepdim=True)
+        return tensor / torch.where(norm > 0, norm, torch.ones_like(norm))
 
     @staticmethod
     def decompose(tensor: Tensor) -> tuple[Tensor, Tensor]:
-        r"""An invertible collineation and the epipole: :math:`A = \|F\|\, e_2 e_1^T / \sqrt 2 - [e_2]_\times F`.
+        r"""An invertible collineation and the epipole: :math:`A = e_2 e_1^T / \sqrt 2 - [e_2]_\times F`, with :math:`\|F\| = 1`.
 
-        Every :math:`A + e_2 v^T` gives the same F; this one has the singular values of F beside :math:`\|F\| / \sqrt 2`.
+        Every :math:`A + e_2 v^T` gives the same F; this one has the singular values of F beside :math:`1 / \sqrt 2`.
         Where F has rank three the motion is that of the nearest matrix of rank two.
 
         Args:
@@ -72,8 +73,8 @@ class FundamentalMatrix(Invariant):
             ([0.6000000238418579, 0.0, 0.800000011920929], True)
         """
         e1, e2 = FundamentalMatrix.epipoles(tensor.double())
-        size = torch.linalg.matrix_norm(tensor.double(), keepdim=True) * 0.5**0.5
-        collineation = size * e2[..., :, None] * e1[..., None, :] - skew(e2) @ tensor.double()
+        matrix = _canonical(tensor.double().flatten(-2)).unflatten(-1, (3, 3))
+        collineation = 0.5**0.5 * e2[..., :, None] * e1[..., None, :] - skew(e2) @ matrix
         return unit(collineation).to(tensor.dtype), e2.to(tensor.dtype)
 
     def constrain(self, tensor: Tensor) -> Tensor:
@@ -99,7 +100,7 @@ class FundamentalMatrix(Invariant):
             [[0.0, 0.0, 1.0], [0.0, 0.0, 1.0]]
         """
         left, right = null_vectors(tensor.double())
-        return unit(right[..., None])[..., 0].to(tensor.dtype), unit(left[..., None])[..., 0].to(tensor.dtype)
+        return _canonical(right).to(tensor.dtype), _canonical(left).to(tensor.dtype)
 
     @staticmethod
     def epipolar_lines(tensor: Tensor, x: Tensor, view: int = 2) -> Tensor:
@@ -126,3 +127,8 @@ class FundamentalMatrix(Invariant):
             raise ValueError(f"view must be 1 or 2, the view of the lines, got {view}")
         line = homogeneous(x) @ (tensor.mT if view == 2 else tensor)
         return Hyperplane(2).raw(line)
+
+
+def _canonical(vector: Tensor) -> Tensor:
+    """Norm 1, the largest coordinate positive; ``(*batch, size)``."""
+    return unit(vector[..., None])[..., 0]

@@ -11,9 +11,9 @@ from dyntorch.algebra.homogeneous import homogeneous, inhomogeneous, unit
 from dyntorch.algebra.rank_two import cofactors
 from dyntorch.invariant import Frame, Invariant
 from dyntorch.invariants.agreement import point_error, static_residual, whitened_agreement
-from dyntorch.invariants.contraction import static_map, static_map_derivative, third_vector
+from dyntorch.invariants.contraction import static_map, static_map_derivative, third_vector, unit_normal
 from dyntorch.nullspace import null_space
-from dyntorch.primitives import Hyperplane, Point
+from dyntorch.primitives import Point
 
 
 class Diagnosis(NamedTuple):
@@ -49,7 +49,7 @@ class HomographyTensor(Invariant):
 
     @staticmethod
     def compose(A: Tensor, B: Tensor) -> Tensor:
-        r"""The tensor of two homographies: :math:`H_{ijk} = \epsilon_{iuv} A_{uj} B_{vk}`, i.e. :math:`H_{\cdot jk} = a_j \times b_k`.
+        r"""The tensor of two homographies: :math:`H_{ijk} = \epsilon_{iuv} A_{uj} B_{vk}`, :math:`H_{\cdot jk} = a_j \times b_k`.
 
         Args:
             A: ``(*batch, 3, 3)``, view 2 to view 1.
@@ -65,14 +65,16 @@ class HomographyTensor(Invariant):
         """
         tensor = torch.linalg.cross(A.mT[..., :, None, :], B.mT[..., None, :, :], dim=-1).movedim(-1, -3)
         norm = torch.linalg.vector_norm(tensor, dim=(-3, -2, -1), keepdim=True)
-        return tensor / norm.clamp(min=torch.finfo(tensor.dtype).tiny)
+        return tensor / torch.where(norm > 0, norm, torch.ones_like(norm))
 
     @staticmethod
     def decompose(tensor: Tensor) -> tuple[Tensor, Tensor]:
         r"""The two homographies of a tensor, from linear systems.
 
         The slices :math:`G_k = H_{\cdot\cdot k} = -[b_k]_\times A` make :math:`A^T G_k` skew-symmetric: 18 equations whose
-        only solution is A, up to scale.  The slices :math:`H_{\cdot j \cdot} = [a_j]_\times B` give B in the same way.
+        only solution is A, up to scale.  The slices :math:`H_{\cdot j \cdot} = [a_j]_\times B` give B in the same way.  Of a
+        noisy tensor this is a least-squares solution, best where the matches are centred and of order 1, as in
+        ``Solution.motion`` (100 matches, 0.5 px: 1.3 px off, from the tensor in pixels 1.9, and 16 instead of 2.1 in one of ten).
 
         Args:
             tensor: ``(*batch, 3, 3, 3)`` of any scale, in any coordinates.
@@ -119,7 +121,7 @@ class HomographyTensor(Invariant):
             (True, True)
         """
         a, b = HomographyTensor.decompose(tensor.double())
-        h = _balanced(tensor.double())[0]
+        h, (_, second, third) = _balanced(tensor.double())
         conditions = []
         for slices in (h, h.mT):
             # singular values of one problem that is not finite would stop the whole batch
@@ -129,8 +131,6 @@ class HomographyTensor(Invariant):
         flat = (tensor / norm.clamp(min=torch.finfo(norm.dtype).tiny)).flatten(-3)
         model = HomographyTensor.compose(a, b).flatten(-3)
         misfit = (flat - (flat * model).sum(-1, keepdim=True) * model).norm(dim=-1)
-        # in the balanced coordinates, where no entry drowns the others
-        _, (_, second, third) = _balanced(tensor.double())
         own = unit(_solution(h.permute(*range(h.ndim - 3), -2, -1, -3)))
         relative = unit(cofactors(a).mT @ b * second[..., :, None] / third[..., None, :])
         difference = torch.linalg.matrix_norm(own - relative)
@@ -196,7 +196,7 @@ class HomographyTensor(Invariant):
             >>> line.abs().tolist()
             [[0.0, 1.0, 1.0]]
         """
-        return Hyperplane(2).raw(third_vector(tensor, homogeneous(x_a), homogeneous(x_b), view)).to(x_a.dtype)
+        return unit_normal(third_vector(tensor, homogeneous(x_a), homogeneous(x_b), view)).to(x_a.dtype)
 
     @staticmethod
     def transfer_moving(tensor: Tensor, x_a: Tensor, x_b: Tensor, line: Tensor, view: int = 1) -> Tensor:

@@ -30,8 +30,8 @@ class MinimalJoinTensor(CollinearPoints):
     the tensor therefore has one part per camera.
 
     Attributes:
-        cameras: ``(c, 3, 4)`` in the coordinates of view 3; by default the four that drop one homogeneous coordinate each,
-            which is where the noise does least (measured, 47 matches: a fifth of the error of two of them).
+        cameras: ``(c, 3, 4)`` in the coordinates of view 3; by default the four that drop one homogeneous coordinate each
+            (measured, 60 matches: .0105 of error against .0138 with two of them, and .0634 of the join tensor).
 
     Raises:
         ValueError: cameras of another shape, of rank below 3, or all with the same centre.

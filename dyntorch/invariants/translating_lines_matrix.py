@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from dyntorch.algebra.constant_velocity import project
 from dyntorch.algebra.extensors import compound, plucker_form
 from dyntorch.algebra.homogeneous import hyperplanes_through, inhomogeneous
 from dyntorch.algebra.line_collineation import common_point, compound_root, skew_line, wedge
+from dyntorch.algebra.projection import project
 from dyntorch.invariant import Frame, Invariant
 from dyntorch.nullspace import null_space
 from dyntorch.primitives import Line
@@ -69,51 +69,61 @@ class TranslatingLinesMatrix(Invariant):
         Returns:
             ``(*batch, 4, 4)`` A of norm 1 and canonical sign; 0 for a matrix that is 0 or not finite.
         """
+        if matrix.ndim < 2 or matrix.shape[-2:] != (6, 6):
+            raise ValueError(f"matrix must be (*batch, 6, 6), got {tuple(matrix.shape)}")
         return compound_root(plucker_form(dtype=matrix.dtype, device=matrix.device) @ matrix.mT)
 
     @staticmethod
-    def transfer(matrix: Tensor, l1: Tensor | None = None, l2: Tensor | None = None) -> Tensor:
+    def transfer(matrix: Tensor, lines: Tensor, source: int = 2) -> Tensor:
         r"""Where a line of one view lies in the other if it does not move: :math:`l_1 \sim J F^T l_2`, :math:`l_2 \sim J F\, l_1`.
 
-        A moving match is a line that meets it.
+        A line that moves meets it there.
 
         Args:
             matrix: ``(*batch, 6, 6)``.
-            l1, l2: lines of one of the views.
+            lines: ``(*batch, n, 2, 3)`` or ``(*batch, n, 6)``.
+            source: view of the lines, 1 or 2.
 
         Returns:
-            ``(*batch, n, 6)`` Pluecker coordinates in the other view.
+            ``(*batch, n, 6)`` Pluecker coordinates in the other view, of any scale.
 
         Raises:
-            ValueError: lines of both views or of none.
+            ValueError: another view.
+
+        Example:
+            >>> import torch
+            >>> F = TranslatingLinesMatrix.compose(torch.eye(4))
+            >>> TranslatingLinesMatrix.transfer(F, torch.tensor([[1.0, 0.0, 0.0, 0.0, 0.0, 0.0]])).sign().tolist()
+            [[1.0, 0.0, 0.0, 0.0, 0.0, 0.0]]
         """
-        if (l1 is None) == (l2 is None):
-            raise ValueError("transfer takes the lines of one view, l1 or l2")
+        if source not in (1, 2):
+            raise ValueError(f"source must be view 1 or 2, got {source!r}")
         form = plucker_form(dtype=matrix.dtype, device=matrix.device)
-        if l2 is not None:
-            return Line().raw(l2) @ matrix @ form
-        return Line().raw(_given(l1)) @ matrix.mT @ form
+        return Line().raw(lines) @ (matrix if source == 2 else matrix.mT) @ form
 
     @staticmethod
-    def transfer_points(matrix: Tensor, x1: Tensor | None = None, x2: Tensor | None = None) -> Tensor:
+    def transfer_points(matrix: Tensor, points: Tensor, source: int = 2) -> Tensor:
         r"""Where a static point of one view lies in the other: the common point of three transferred lines through it.
 
         Args:
             matrix: ``(*batch, 6, 6)``.
-            x1, x2: ``(*batch, n, 3)`` points of one of the views.
+            points: ``(*batch, n, 3)``.
+            source: view of the points, 1 or 2.
 
         Returns:
             ``(*batch, n, 3)`` in the other view.
 
         Raises:
-            ValueError: points of both views or of none.
+            ValueError: another view.
+
+        Example:
+            >>> import torch
+            >>> F = TranslatingLinesMatrix.compose(torch.diag(torch.tensor([2.0, 2.0, 2.0, 1.0])))
+            >>> TranslatingLinesMatrix.transfer_points(F, torch.tensor([[1.0, 2.0, 3.0]])).round(decimals=4).tolist()
+            [[2.0, 4.0, 6.0]]
         """
-        if (x1 is None) == (x2 is None):
-            raise ValueError("transfer_points takes the points of one view, x1 or x2")
-        points = _given(x1 if x2 is None else x2)
         stars = _star(points)
-        side = {"l1": stars.flatten(-3, -2)} if x2 is None else {"l2": stars.flatten(-3, -2)}
-        moved = TranslatingLinesMatrix.transfer(matrix, **side).unflatten(-2, stars.shape[-3:-1])
+        moved = TranslatingLinesMatrix.transfer(matrix, stars.flatten(-3, -2), source).unflatten(-2, stars.shape[-3:-1])
         return inhomogeneous(common_point(normalize(moved, dim=-1)))
 
     @staticmethod
@@ -127,8 +137,16 @@ class TranslatingLinesMatrix(Invariant):
         Returns:
             ``(*batch, n, 4)`` of norm 1 (least squares where the lines do not quite meet); any plane through a line that is
             static.
+
+        Example:
+            >>> import torch
+            >>> F = TranslatingLinesMatrix.compose(torch.eye(4))
+            >>> l1 = torch.tensor([[[0.0, 0.0, 5.0], [1.0, 0.0, 5.0]]])
+            >>> plane = TranslatingLinesMatrix.swept_plane(F, l1, l1 + torch.tensor([0.0, 1.0, 0.0]))
+            >>> (plane / plane[:, 2:3]).round(decimals=4).abs().tolist()
+            [[0.0, 0.0, 1.0, 5.0]]
         """
-        first, second = Line().raw(l1), TranslatingLinesMatrix.transfer(matrix, l2=l2)
+        first, second = Line().raw(l1), TranslatingLinesMatrix.transfer(matrix, l2)
         # a plane contains a line if it contains the points where that meets the coordinate planes
         points = torch.stack([normalize(first, dim=-1), normalize(second, dim=-1)], dim=-2)
         return null_space(skew_line(points).flatten(-3, -2))[..., 0, :]
@@ -178,6 +196,11 @@ class TranslatingLinesMatrix(Invariant):
 
         Returns:
             ``(*batch, 5, 6, 6)`` orthonormal basis, whose span contains ``compose(matrix)``.
+
+        Example:
+            >>> import torch
+            >>> tuple(TranslatingLinesMatrix.pure_translation_family(torch.eye(4)).shape)
+            (5, 6, 6)
         """
         eye = torch.eye(4, dtype=matrix.dtype, device=matrix.device)
         plane = eye[3] if infinity is None else infinity / infinity[..., 3:]
@@ -210,11 +233,6 @@ class TranslatingLinesMatrix(Invariant):
         blocks = [[common[..., i, j, None, None] * eye + (own[..., i, :, :] if i == j else 0.0) for j in (0, 1)] for i in (0, 1)]
         covariance = torch.cat([torch.cat(row, dim=-1) for row in blocks], dim=-2)
         return whiten((gap @ across.mT).flatten(-2), covariance)
-
-
-def _given(x: Tensor | None) -> Tensor:
-    assert x is not None
-    return x
 
 
 def _ends(x: Tensor) -> Tensor:

@@ -128,7 +128,9 @@ def test_degenerate_matrices_are_never_nan():
     assert A.isfinite().all() and e2.isfinite().all() and back.isfinite().all() and bad.grad.isfinite().all()
     assert torch.equal(A[0], torch.zeros(3, 3).double())
     assert torch.equal(e2[0], torch.zeros(3).double())
-    at_epipole = FundamentalMatrix.epipolar_lines(FundamentalMatrix.compose(torch.eye(3), torch.tensor([0.0, 0, 1])), torch.zeros(1, 2))
+    at_epipole = FundamentalMatrix.epipolar_lines(
+        FundamentalMatrix.compose(torch.eye(3), torch.tensor([0.0, 0, 1])), torch.zeros(1, 2)
+    )
     assert torch.equal(at_epipole, torch.zeros(1, 3))
 
 

@@ -1,0 +1,201 @@
+"""Static, moving or outlier: labels from a motion, and the motion from the labels, in turns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from dyntorch.invariant import Invariant
+from dyntorch.matches import Matches
+from dyntorch.normalize import Normalization, normalization, normalize_motion
+from dyntorch.refinement import Problem, refine_matches
+from dyntorch.residual import whiten, whitened
+from dyntorch.solution import Solution
+from dyntorch.tasks.alignment import MOVING, OUTLIER, STATIC
+
+CHI_SQUARE = {1: 9.0, 2: 11.829, 3: 14.156, 4: 16.251, 6: 20.062}
+"""Quantiles of chi^2 at 99.73 %: what three standard deviations are for one condition, for several."""
+SIGMAS = 3.0
+"""The threshold in standard deviations of the noise."""
+ROUNDS = 3
+ROUGH = 3.0
+"""How much wider than the noise the first labels are where the motion comes from a minimal sample."""
+WIDEST = 4.0
+"""No uncertainty of the motion widens the limit for static matches more than so many times: calling a static match moving costs
+some accuracy, calling a moving one static gives a wrong motion."""
+STEPS = 6
+"""Levenberg-Marquardt steps between two labellings."""
+
+
+@dataclass(frozen=True)
+class Labelled:
+    """Motions with the labels they give, flat batch."""
+
+    theta: Tensor
+    """``(b, p)`` motion in normalized coordinates, all parts one after the other, of norm 1 each."""
+    labels: Tensor
+    """``(b, n)``."""
+    sigma: Tensor
+    """``(b,)`` standard deviation of the noise that the labels assume, in the unit of the matches."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Matches whose labels are sought, prepared: residuals of any motion in the unit of the matches."""
+
+    invariant: Invariant
+    data: Matches
+    norm: Normalization
+    views: tuple[Tensor, ...]
+    """Normalized."""
+    floor: Tensor
+    """``(b,)`` the least noise that the numbers allow, in the unit of the matches."""
+
+    @classmethod
+    def of(cls, invariant: Invariant, data: Matches) -> Evidence:
+        """From checked matches; those with ``data.static`` are known not to move."""
+        largest = data.weights.amax(-1, keepdim=True).clamp(min=torch.finfo(torch.float64).tiny)
+        flat = replace(
+            data, weights=data.weights / largest, batch=data.weights.shape[:1], dtype=torch.float64, device=data.weights.device
+        )
+        norm = normalization(invariant, flat.views, flat.weights)
+        floor = 100 * torch.finfo(data.dtype).eps / torch.stack(norm.scales).amin(0)
+        return cls(invariant, flat, norm, norm.apply(invariant, flat.views), floor)
+
+    def repeated(self, count: int) -> Evidence:
+        """The same problems several times, one block after the other."""
+
+        def again(x: Tensor) -> Tensor:
+            return x.repeat(count, *([1] * (x.ndim - 1)))
+
+        static = None if self.data.static is None else again(self.data.static)
+        data = replace(self.data, views=tuple(map(again, self.data.views)), weights=again(self.data.weights), static=static)
+        norm = self.norm
+        again_norm = Normalization(
+            tuple(map(again, norm.transforms)), norm.primitives, tuple(map(again, norm.actions)), tuple(map(again, norm.scales))
+        )
+        data = replace(data, batch=data.weights.shape[:1])
+        return Evidence(self.invariant, data, again_norm, tuple(map(again, self.views)), again(self.floor))
+
+    def parameters(self, motion: tuple[Tensor, ...]) -> Tensor:
+        """``(b, p)`` from motions ``(b, ...)`` in the coordinates of the matches."""
+        parts = normalize_motion(self.invariant, motion, self.norm.transforms)
+        return torch.cat([part.flatten(1) for part in parts], dim=-1)
+
+    def problem(self, labels: Tensor) -> Problem:
+        """Least squares over the inliers, as refinement sees it."""
+        shapes = tuple(
+            torch.Size((self.norm.transforms[frame.target or 0].shape[-1],) * (1 if frame.vector else 2))
+            for frame in self.invariant.motion
+        )
+        weights = self.data.weights * (labels != OUTLIER)
+        return Problem(self.invariant, shapes, self.views, self.norm.scales, weights, labels == STATIC)
+
+    def residuals(self, theta: Tensor) -> tuple[Tensor, Tensor]:
+        """Square ``(b, n)`` of the residual of every match if it moves, and its vector ``(b, n, c)`` if it stands still."""
+        motion = self.problem(torch.zeros_like(self.data.weights)).parts(theta)
+        moving = whitened(self.invariant, motion, self.views, self.norm.scales).square().sum(-1)
+        return moving, self.invariant.whitened_static(motion, self.views, self.norm.scales)
+
+    def cost(self, theta: Tensor, sigma: Tensor) -> Tensor:
+        """How badly the motion explains the matches, ``(b,)``.
+
+        A static match costs its chi^2; a moving one as much as the worst static match, plus its chi^2; an outlier as much as
+        the worst moving one.  So every match takes the simplest explanation that fits.
+        """
+        moving, resting = self.residuals(theta)
+        variance = sigma.square()[:, None]
+        still, path = CHI_SQUARE[resting.shape[-1]], CHI_SQUARE[self.invariant.codim]
+        other = still + (moving / variance).clamp(max=path)
+        if self.data.static is not None:
+            other = torch.where(self.data.static, still + path, other)
+        cost = torch.minimum(resting.square().sum(-1) / variance, other)
+        return (self.data.weights * cost.nan_to_num(nan=still + path)).sum(-1)
+
+    def labels(self, theta: Tensor, sigma: Tensor, spread: Tensor | None = None) -> Tensor:
+        """``(b, n)``; ``spread (b, p, p)`` is the covariance of theta for noise 1, which widens the limit for static matches."""
+        moving, resting = self.residuals(theta)
+        variance = sigma.square()[:, None]
+        plain = resting.square().sum(-1)
+        limit = CHI_SQUARE[resting.shape[-1]] * variance
+        still = plain <= limit
+        if spread is not None:
+            widened = torch.cat([self._widened(theta, spread, piece) for piece in self._pieces(theta)], dim=-1)
+            still = still | ((widened <= limit) & (plain <= WIDEST**2 * limit))
+        path = moving <= CHI_SQUARE[self.invariant.codim] * variance
+        if self.data.static is not None:
+            path = path & ~self.data.static
+        labels = torch.where(still, STATIC, torch.where(path, MOVING, OUTLIER))
+        return torch.where(self.data.weights > 0, labels, OUTLIER)
+
+    def _pieces(self, theta: Tensor) -> list[slice]:
+        return self.problem(torch.zeros_like(self.data.weights)).pieces(theta.shape[-1])
+
+    def _widened(self, theta: Tensor, spread: Tensor, piece: slice) -> Tensor:
+        """Square of the static residual ``(b, piece)`` whitened by the uncertainty of the motion as well."""
+        views = tuple(x[:, piece] for x in self.views)
+        problem = self.problem(torch.zeros_like(self.data.weights))
+
+        def resting(t: Tensor) -> Tensor:
+            return self.invariant.whitened_static(problem.parts(t), views, self.norm.scales).flatten(1)
+
+        def along(tangent: Tensor) -> tuple[Tensor, Tensor]:
+            return torch.func.jvp(resting, (theta,), (tangent,))
+
+        tangents = torch.eye(theta.shape[-1], dtype=theta.dtype, device=theta.device)[:, None].expand(-1, *theta.shape)
+        value, derivative = torch.func.vmap(along, out_dims=(None, 0))(tangents)
+        size = value.shape[-1] // max(1, views[0].shape[1])
+        j = derivative.movedim(0, -1).unflatten(1, (-1, size))  # (b, n, c, p)
+        eye = torch.eye(size, dtype=theta.dtype, device=theta.device)
+        covariance = eye + (j @ spread[:, None]) @ j.mT
+        return whiten(value.unflatten(1, (-1, size)), covariance).square().sum(-1)
+
+    def information(self, theta: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
+        """Eigenvalues ``(b, dof)``, ascending, of the information that the labelled matches hold on theta per unit of variance,
+        and the covariance ``(b, p, p)`` of theta for noise 1."""
+        _, _, matrix = self.problem(labels).normal_equations(theta)
+        finite = matrix.isfinite().flatten(1).all(-1)
+        values, vectors = torch.linalg.eigh(torch.where(finite[:, None, None], matrix, 0.0))
+        values, vectors = values[:, -self.invariant.dof :], vectors[..., -self.invariant.dof :]
+        floor = 1e-12 * values[:, -1:].clamp(min=torch.finfo(values.dtype).tiny)
+        root = vectors * values.clamp(min=floor).rsqrt()[:, None, :]
+        return values, root @ root.mT
+
+    def refined(self, theta: Tensor, labels: Tensor, steps: int) -> Solution:
+        """Segmented refinement: moving matches by their Sampson distance, static ones by their disagreement."""
+        problem = self.problem(labels)
+        zero = torch.zeros(len(theta), dtype=torch.long, device=theta.device)
+        parts = problem.parts(theta)
+        tensor = self.invariant.compose(*parts)
+        data = replace(self.data, weights=problem.weights, static=problem.static)
+        start = Solution(self.invariant, tensor, zero, torch.zeros_like(theta[:, 0]), data, self.norm, tensor, refined=parts)
+        return refine_matches(start, data, steps)
+
+    def improved(self, theta: Tensor, sigma: Tensor, rough: Tensor) -> Tensor:
+        """One labelling and refinement; where ``rough (b,)``, the motion comes from a minimal sample of static matches."""
+        labels = self.labels(theta, torch.where(rough, ROUGH * sigma, sigma))
+        # what a rough motion says about moving matches is left to chance
+        labels = torch.where(rough[:, None] & (labels == MOVING), OUTLIER, labels)
+        return joined(self.refined(theta, labels, STEPS))
+
+    def settled(self, theta: Tensor, sigma: Tensor, *, estimate: bool) -> Labelled:
+        """Label and refine in turns, until the labels stay; ``estimate``: and the noise with them."""
+        labels = self.labels(theta, sigma)
+        for _ in range(ROUNDS):
+            _, spread = self.information(theta, labels)
+            new = self.labels(theta, sigma, spread)
+            if bool((new == labels).all()) and not estimate:
+                break
+            labels = new
+            found = self.refined(theta, labels, STEPS)
+            theta = joined(found)
+            if estimate and found.sigma is not None:
+                sigma = torch.where(found.sigma.isfinite() & (found.sigma > 0), found.sigma, sigma).maximum(self.floor)
+        return Labelled(theta, labels, sigma)
+
+
+def joined(solution: Solution) -> Tensor:
+    """``(b, p)`` normalized motion of a solution."""
+    return torch.cat([part.flatten(1) for part in solution.normalized_motion()], dim=-1)

@@ -1,0 +1,253 @@
+"""Whole fits, points in and tensor out, against the ways people do it now.  Needs no recordings.
+
+    python -m experiments.benchmarks.fits
+
+1. Every large invariant, 1024 problems of 200 matches in float64, against building the rows and ``torch.linalg.svd``.
+2. Fundamental matrices and homographies, 1000 problems of 50 matches, against kornia and a loop over OpenCV, with the error.
+3. How time and memory grow with the number of matches and of problems.
+
+All candidates of a row take turns in one process; the figures are medians, the ratios are within the row.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated, Any
+
+import torch
+import tyro
+from torch import Tensor
+
+import dyntorch as dyn
+from dyntorch import scenes
+from dyntorch.algebra.homogeneous import homogeneous
+from dyntorch.invariant import as_invariant
+from dyntorch.matrix import estimation_matrix
+from dyntorch.scenes import Scene
+from experiments.benchmarks.interleaved import interleaved, threads
+from experiments.tables import Row, command, markdown, note
+from indexing.files import manifest, prepare, write_json
+
+SCENES: dict[str, tuple[Any, Callable[..., Scene]]] = {
+    "HomographyTensor": (dyn.HomographyTensor, scenes.planar),
+    "TranslatingLinesMatrix": (dyn.TranslatingLinesMatrix, scenes.translating_lines),
+    "ConstantVelocityTensor": (dyn.ConstantVelocityTensor, scenes.constant_velocity),
+    "JoinTensor": (dyn.JoinTensor, scenes.moving_points),
+}
+
+
+@dataclass(frozen=True)
+class Config:
+    """Whole fits against rows + SVD, kornia and OpenCV."""
+
+    rounds: int = 7
+    """How often every candidate runs."""
+    quick: bool = False
+    """Small batches and few rounds: checks that everything runs, the figures mean nothing."""
+    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/benchmark_fits.json")
+    """Where the results are written as JSON; a plot goes beside it."""
+
+
+def rows_and_svd(invariant: Any, views: tuple[Tensor, ...]) -> Tensor:
+    """What one would write today: all rows of the (normalized) matches, then the SVD of every problem."""
+    solver = as_invariant(invariant)
+    weights = torch.ones(views[0].shape[:2], dtype=views[0].dtype, device=views[0].device)
+    matrix = estimation_matrix(solver.primitives, views, weights)
+    return torch.linalg.svd(matrix, full_matrices=False)[2][..., -solver.nullity :, :]
+
+
+def large(config: Config, device: str) -> list[Row]:
+    """Section 1."""
+    batch, n, rounds = (16, 80, 1) if config.quick else (1024, 200, config.rounds)
+    rows = []
+    for name, (invariant, scene) in SCENES.items():
+        note(f"... {name} on {device}")
+        views = scene(n=n, batch=batch, sigma=1e-3, generator=torch.Generator().manual_seed(0)).to(device=device).views
+
+        def ours(invariant: Any = invariant, views: tuple[Tensor, ...] = views) -> object:
+            return dyn.fit(invariant, *views)
+
+        def theirs(invariant: Any = invariant, views: tuple[Tensor, ...] = views) -> object:
+            return rows_and_svd(invariant, views)
+
+        with threads(1):
+            found = interleaved({"dyntorch": ours, "rows + svd": theirs}, rounds)
+        goal = 6.0 if name == "HomographyTensor" and device == "cpu" else None
+        setting = f"{batch} x {n}, {device}, one core"
+        rows.append(Row(f"{name}: dyn.fit", setting, found["dyntorch"] / batch * 1e6, unit=" us"))
+        rows.append(Row(f"{name}: rows + svd", setting, found["rows + svd"] / batch * 1e6, unit=" us"))
+        rows.append(Row(f"{name}: times faster", setting, found["rows + svd"] / found["dyntorch"], goal))
+        if device == "cpu" and torch.get_num_threads() > 1:
+            one = found["dyntorch"]
+            many = interleaved({"all": ours}, rounds)["all"]
+            rows.append(Row(f"{name}: gain of {torch.get_num_threads()} cores", setting, one / many))
+    return rows
+
+
+def small(config: Config) -> list[Row]:
+    """Section 2."""
+    import kornia.geometry.epipolar as epipolar
+    from kornia.geometry.homography import find_homography_dlt
+
+    batch, n, rounds = (20, 50, 1) if config.quick else (1000, 50, 3 * config.rounds)
+    generator = torch.Generator().manual_seed(0)
+    pair = scenes.two_view(n=n, batch=batch, sigma=0.5, generator=generator)
+    plane = scenes.planar(n=n, batch=batch, sigma=0.5, static=1.0, generator=generator)
+    f1, f2, h1, h2 = *pair.views, *plane.views[:2]
+    ones = torch.ones(batch, n, dtype=torch.float64)
+    fundamental: dict[str, Callable[[], Any]] = {
+        "dyntorch": lambda: dyn.fit(dyn.FundamentalMatrix, f1, f2).tensor,
+        "kornia": lambda: epipolar.find_fundamental(f1, f2, ones, method="8POINT"),
+    }
+    homography: dict[str, Callable[[], Any]] = {
+        "dyntorch": lambda: dyn.fit(dyn.Collineation(2), h1, h2).tensor,
+        "kornia": lambda: find_homography_dlt(h2, h1, ones),
+        "kornia, solver=svd": lambda: find_homography_dlt(h2, h1, ones, solver="svd"),
+    }
+    fundamental.update(_opencv_fundamental(f1, f2))
+    homography.update(_opencv_homography(h1, h2))
+    rows = []
+    for title, candidates, exact, error in (
+        ("fundamental matrix", fundamental, pair.exact[:2], _epipolar_error),
+        ("homography", homography, plane.exact[:2], _transfer_error),
+    ):
+        note(f"... {title}")
+        with threads(1):
+            found = interleaved(candidates, rounds)
+        setting = f"{batch} x {n}, float64, one core"
+        for name, run in candidates.items():
+            rows.append(Row(f"{title}: {name}", setting, found[name] / batch * 1e6, unit=" us"))
+            rows.append(Row(f"{title}: {name}, rms", "0.5 px, exact points", error(run(), *exact), unit=" px"))
+        for name in [name for name in candidates if name != "dyntorch"]:
+            goal = 1.5 if name == "kornia" else None
+            rows.append(Row(f"{title}: times faster than {name}", setting, found[name] / found["dyntorch"], goal))
+    return rows
+
+
+def _opencv_fundamental(x1: Tensor, x2: Tensor) -> dict[str, Callable[[], Any]]:
+    try:
+        import cv2
+    except ImportError:
+        note("OpenCV is not installed (extra `video`): left out")
+        return {}
+    a, b = x1.numpy(), x2.numpy()
+    return {
+        "OpenCV loop": lambda: torch.stack(
+            [torch.as_tensor(cv2.findFundamentalMat(p, q, cv2.FM_8POINT)[0]) for p, q in zip(a, b, strict=True)]
+        )
+    }
+
+
+def _opencv_homography(x1: Tensor, x2: Tensor) -> dict[str, Callable[[], Any]]:
+    try:
+        import cv2
+    except ImportError:
+        return {}
+    a, b = x1.numpy(), x2.numpy()
+    return {
+        "OpenCV loop": lambda: torch.stack([torch.as_tensor(cv2.findHomography(q, p, 0)[0]) for p, q in zip(a, b, strict=True)])
+    }
+
+
+def _epipolar_error(fundamental: Tensor, x1: Tensor, x2: Tensor) -> float:
+    """Median over the problems of the RMS distance of exact points to their epipolar lines in view 2."""
+    lines = homogeneous(x1) @ fundamental.mT
+    distance = (homogeneous(x2) * lines).sum(-1) / lines[..., :2].norm(dim=-1)
+    return float(distance.square().mean(-1).sqrt().median())
+
+
+def _transfer_error(homography: Tensor, x1: Tensor, x2: Tensor) -> float:
+    """Median over the problems of the RMS distance between exact points and their images from view 2."""
+    image = homogeneous(x2) @ homography.mT
+    return float((image[..., :2] / image[..., 2:] - x1).square().sum(-1).mean(-1).sqrt().median())
+
+
+def growth(config: Config) -> list[Row]:
+    """Section 3."""
+    rows = []
+    sizes = (1_000, 10_000) if config.quick else (10_000, 100_000, 1_000_000)
+    for name, (invariant, scene) in SCENES.items():
+        note(f"... growth of {name}")
+        views = {n: scene(n=n, sigma=1e-3, generator=torch.Generator().manual_seed(0)).views for n in sizes}
+        runs = {str(n): (lambda v=v, i=invariant: dyn.fit(i, *v)) for n, v in views.items()}
+        with threads(1):
+            found = interleaved(runs, 1 if config.quick else 3)
+        for small_n, large_n in pairwise(sizes):
+            rows.append(
+                Row(
+                    f"{name}: time(10 N) / time(N)",
+                    f"N = {small_n}, one problem",
+                    found[str(large_n)] / found[str(small_n)],
+                    12.0,
+                    at_most=True,
+                )
+            )
+        largest = views[sizes[-1]]
+        limit = 3 * sum(x.numel() * x.element_size() for x in largest) / 2**20 + 200
+        with threads(1):
+            peak = _peak(runs[str(sizes[-1])])
+        if peak is not None:
+            rows.append(Row(f"{name}: peak memory", f"N = {sizes[-1]}", peak, limit, at_most=True, unit=" MB"))
+    return rows
+
+
+def _peak(run: Callable[[], object]) -> float | None:
+    """Megabytes above the present state while ``run`` works; None where the system does not say."""
+    try:
+        Path("/proc/self/clear_refs").write_text("5")
+    except OSError:
+        return None
+    before = _memory("VmRSS")
+    run()
+    return max(0.0, _memory("VmHWM") - before)
+
+
+def _memory(field: str) -> float:
+    text = Path("/proc/self/status").read_text()
+    return int(text.split(f"{field}:")[1].split()[0]) / 1024
+
+
+def plot(rows: list[Row], path: Path) -> None:
+    """Bars: how many times faster, with the goal 1 as a line."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    chosen = [row for row in rows if "times faster" in row.task]
+    figure, axes = plt.subplots(figsize=(8, 0.5 * len(chosen) + 1))
+    labels = [row.task.replace(": times faster", "\n") + (f"\n{row.setting}" if "svd" not in row.task else "") for row in chosen]
+    axes.barh(
+        [label.split("\n")[0] + label.split("\n")[1] for label in labels][::-1],
+        [row.measured for row in chosen][::-1],
+        color="#2a6f97",
+    )
+    axes.bar_label(axes.containers[0], fmt="%.1fx", padding=3)  # type: ignore[arg-type]
+    axes.axvline(1, color="0.3", linewidth=1)
+    axes.set_xlabel("times faster, one core (rows + torch.linalg.svd, unless named)")
+    axes.spines[["top", "right"]].set_visible(False)
+    figure.tight_layout()
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+
+
+def run() -> None:
+    config = tyro.cli(Config, description=__doc__)
+    prepare(config.out.parent)
+    sections = {"Large invariants": large(config, "cpu"), "Small invariants": small(config), "Growth": growth(config)}
+    if torch.cuda.is_available():
+        sections["Large invariants on the GPU"] = large(config, "cuda")
+    else:
+        note("no CUDA device: the rows of the GPU are left out")
+    for title, rows in sections.items():
+        print(markdown(rows, title))
+    everything = [row for rows in sections.values() for row in rows]
+    plot(everything, config.out.with_suffix(".png"))
+    write_json(config.out, {"settings": manifest(vars(config)), "rows": [asdict(row) for row in everything]})
+
+
+if __name__ == "__main__":
+    command(run)

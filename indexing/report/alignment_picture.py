@@ -1,0 +1,155 @@
+"""The picture of an alignment: view 1 with the paths of what moves, and the other views, coloured alike."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from indexing.report.canvas import Theme, new_figure, png, shorten, style
+
+if TYPE_CHECKING:
+    from indexing.report.alignment import AlignmentReport
+
+FloatArray = NDArray[np.float64]
+# apart for colour-blind eyes, too, on both papers; outliers are crosses besides
+COLOURS = {"static": "#2f7fb8", "moving": "#e8741e", "outlier": "#8b949c"}
+MARKS = {"static": "o", "moving": "o", "outlier": "x"}
+PATHS = 1500  # paths drawn; more are a blot
+ROOM = 0.06  # around the points, of their extent
+
+
+def picture_of(report: AlignmentReport, theme: Theme) -> bytes:
+    """PNG: view 1, large, with the path of every moving match carried over from the other views; beside it the other views."""
+    kinds = np.array(report.kinds) if report.solved else np.where(report.missing, "missing", "unlabelled")
+    colours = {**COLOURS, "unlabelled": theme.muted}
+    segments = report.views[0].ndim == 3
+    axes_shown, turned = _axes(report)
+    flat = [view[..., axes_shown] for view in report.views]
+    with style(theme):
+        figure = new_figure(10.2, 5.6 if len(flat) > 2 else 4.9)
+        grid = figure.add_gridspec(len(flat) - 1, 2, width_ratios=(1.75, 1) if len(flat) > 2 else (1, 1), wspace=0.14, hspace=0.3)
+        places = [grid[:, 0], *(grid[i, 1] for i in range(len(flat) - 1))]
+        for number, (points, place) in enumerate(zip(flat, places, strict=True), start=1):
+            panel = figure.add_subplot(place)
+            box = _box(points, kinds)
+            if number == 1 and report.solved:
+                _draw_paths(panel, report, kinds, axes_shown, box)
+            _draw_points(panel, points, kinds, colours, large=number == 1, segments=segments)
+            _finish(panel, box, turned, theme)
+            panel.set_title(f"view {number}: {shorten(report.names[number - 1], 40)}", fontsize=9, loc="left", parse_math=False)
+            if number == 1:
+                panel.set_xlabel("xyz"[axes_shown[0]])
+                panel.set_ylabel("xyz"[axes_shown[1]])
+        _legend(figure, kinds, colours, theme, segments)
+        return png(figure, tight=True)
+
+
+def _axes(report: AlignmentReport) -> tuple[list[int], bool]:
+    """The two coordinates in which view 1 extends most, and whether the second points down, as in images."""
+    points = report.views[0].reshape(-1, report.views[0].shape[-1])
+    if points.shape[-1] == 2:
+        return [0, 1], True
+    spread = (
+        np.nan_to_num(np.nanpercentile(points, 95, axis=0) - np.nanpercentile(points, 5, axis=0)) if len(points) else np.ones(3)
+    )
+    return sorted(np.argsort(-spread, kind="stable")[:2].tolist()), False
+
+
+def _box(points: FloatArray, kinds: NDArray[Any]) -> tuple[float, float, float, float]:
+    """Left, right, low, high of the matches that fit (of all, where none does), with room around."""
+    kept = np.isin(kinds, ("static", "moving"))
+    shown = points[kept if kept.sum() > 1 else kinds != "missing"].reshape(-1, 2)
+    if not len(shown):
+        return 0.0, 1.0, 0.0, 1.0
+    low, high = shown.min(axis=0), shown.max(axis=0)
+    room = ROOM * max(float((high - low).max()), 1e-9 * max(1.0, float(np.abs(shown).max())))
+    room = room if room > 1e-12 else 1.0
+    return float(low[0] - room), float(high[0] + room), float(low[1] - room), float(high[1] + room)
+
+
+def carried(matrix: FloatArray, points: FloatArray) -> FloatArray:
+    """Points ``(..., d)`` moved by a collineation."""
+    moved = points @ matrix[:-1, :-1].T + matrix[:-1, -1]
+    last = points @ matrix[-1, :-1] + matrix[-1, -1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        out: FloatArray = moved / last[..., None]
+    return out
+
+
+def _draw_paths(panel: Any, report: AlignmentReport, kinds: NDArray[Any], shown: list[int], box: tuple[float, ...]) -> None:
+    from matplotlib.collections import LineCollection
+
+    colour = COLOURS["moving"]
+    fits = [view.shape[-1] + 1 == matrix.shape[-1] for view, matrix in zip(report.views[1:], report.motion, strict=True)]
+    if not all(fits):
+        return
+    moving = np.flatnonzero(kinds == "moving")[:PATHS]
+    others = [carried(matrix, view[moving]) for view, matrix in zip(report.views[1:], report.motion, strict=True)]
+    if report.views[0].ndim == 3:  # lines: where view 2 saw them, dashed
+        panel.add_collection(
+            LineCollection(list(others[0][..., shown]), colors=colour, linewidths=0.9, alpha=0.55, linestyles=(0, (3, 2)))
+        )
+        return
+    path = np.stack([report.views[0][moving], *others], axis=1)[..., shown]
+    size = max(box[1] - box[0], box[3] - box[2])
+    near = np.isfinite(path).all(axis=(1, 2)) & (np.abs(path - path[:, :1]).max(axis=(1, 2), initial=0) < 2 * size)
+    path = path[near]
+    if not len(path):
+        return
+    centre = path.mean(axis=1, keepdims=True)
+    _, _, direction = np.linalg.svd(path - centre)
+    along = ((path - centre) @ direction[:, 0, :, None])[..., 0]
+    reach = 0.5 * (along.max(axis=1) - along.min(axis=1))
+    ends = np.stack([along.min(axis=1) - reach, along.max(axis=1) + reach], axis=1)
+    panel.add_collection(
+        LineCollection(list(centre + ends[..., None] * direction[:, :1]), colors=colour, linewidths=0.7, alpha=0.28)
+    )
+    panel.add_collection(LineCollection(list(path), colors=colour, linewidths=1.3, alpha=0.75))
+    for i, size in ((1, 9), (2, 4)):
+        panel.scatter(*path[:, i].T, s=size, facecolor=panel.get_facecolor(), edgecolor=colour, linewidth=0.9, zorder=3)
+
+
+def _draw_points(panel: Any, points: FloatArray, kinds: NDArray[Any], colours: dict[str, str], large: bool, segments: bool) -> None:
+    from matplotlib.collections import LineCollection
+
+    size = float(np.clip(4000 / max(1, len(points)), 3, 22)) * (1.0 if large else 0.5)
+    for kind in ("unlabelled", "outlier", "static", "moving"):  # what matters most on top
+        mine = points[kinds == kind]
+        if not len(mine):
+            continue
+        if segments:
+            look: Any = (0, (1, 1.5)) if kind == "outlier" else "solid"
+            panel.add_collection(
+                LineCollection(list(mine), colors=colours[kind], linewidths=1.4 if large else 1.0, linestyles=look, zorder=4)
+            )
+            panel.scatter(*mine.reshape(-1, 2).T, s=size / 3, color=colours[kind], linewidth=0, zorder=4)
+        else:
+            line = {"linewidth": 1.1} if kind == "outlier" else {"linewidth": 0}
+            panel.scatter(*mine.T, s=size, c=colours[kind], marker=MARKS.get(kind, "o"), zorder=4, **line)
+
+
+def _finish(panel: Any, box: tuple[float, float, float, float], turned: bool, theme: Theme) -> None:
+    panel.set(xlim=box[:2], ylim=box[2:][::-1] if turned else box[2:])
+    panel.set_aspect("equal", adjustable="datalim" if not turned else "box")
+    panel.tick_params(length=2.5, labelsize=7.5)
+    panel.locator_params(nbins=6)
+    panel.ticklabel_format(useOffset=False)
+    for side in panel.spines.values():
+        side.set_linewidth(0.8)
+
+
+def _legend(figure: Any, kinds: NDArray[Any], colours: dict[str, str], theme: Theme, segments: bool) -> None:
+    from matplotlib.lines import Line2D
+
+    handles = []
+    for kind in ("static", "moving", "outlier", "unlabelled"):
+        number = int((kinds == kind).sum())
+        if number:
+            mark = None if segments else MARKS.get(kind, "o")
+            look: Any = ("solid" if kind != "outlier" else "dotted") if segments else ""
+            handles.append(
+                Line2D([], [], color=colours[kind], marker=mark, linestyle=look, markersize=5, label=f"{number:,} {kind}")
+            )
+    figure.legend(handles=handles, loc="upper center", bbox_to_anchor=(0.5, 0.0), ncols=4, frameon=False, labelcolor=theme.ink)

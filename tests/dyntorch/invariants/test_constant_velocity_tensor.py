@@ -1,0 +1,499 @@
+"""Constant velocity: against Cramer's rule in P^6, brute-force ranks, finite differences and the truth of synthetic scenes."""
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+
+from dyntorch.algebra.affine_constant_velocity import affine_constant_velocity
+from dyntorch.algebra.constant_velocity import infinity_planes
+from dyntorch.algebra.homogeneous import apply, homogeneous, unit
+from dyntorch.algebra.projection import adjugate
+from dyntorch.invariants.constant_velocity_tensor import ConstantVelocityTensor
+from dyntorch.scenes import constant_velocity
+
+CV = ConstantVelocityTensor
+ONES = (torch.ones((), dtype=torch.float64),) * 3
+
+
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def random(*shape, seed=0):
+    return torch.randn(*shape, generator=generator(seed), dtype=torch.float64)
+
+
+def rows(views):
+    """Rows P0 x P1 x L of all matches, with planes L from an SVD of the third point."""
+    p0, p1, p2 = (homogeneous(x) for x in views)
+    planes = torch.linalg.svd(p2[..., None, :]).Vh[..., 1:, :]
+    return torch.einsum("...ni,...nj,...nrk->...nrijk", p0, p1, planes).flatten(-3).flatten(-3, -2)
+
+
+def rank(views):
+    matrix = rows(views)
+    return int(torch.linalg.matrix_rank(matrix / matrix.norm(dim=-1, keepdim=True), rtol=1e-9))
+
+
+def join_scenes(*scenes):
+    """Matches of several scenes before the sensors of the first."""
+    maps = scenes[0].motion
+    return tuple(
+        torch.cat([apply(maps[t], s.extras["points"] + t * s.extras["velocities"]) for s in scenes], dim=-2) for t in range(3)
+    )
+
+
+def distance(first, second):
+    """Distance of two tensors up to sign."""
+    a, b = first.flatten(-3), second.flatten(-3)
+    return torch.minimum((a - b).norm(dim=-1), (a + b).norm(dim=-1))
+
+
+def fitted(views):
+    """The linear solution in Hartley's coordinates, and its maps there, denormalized."""
+    moved, transforms = [], []
+    for x in views:
+        d = x.shape[-1]
+        centre = x.mean(-2, keepdim=True)
+        scale = (d / (x - centre).square().sum(-1).mean(-1)).sqrt()[..., None, None]
+        moved.append((x - centre) * scale)
+        top = torch.cat([torch.eye(d, dtype=x.dtype).expand(*x.shape[:-2], d, d), -centre.mT], dim=-1) * scale
+        last = torch.eye(d + 1, dtype=x.dtype)[d:].expand(*x.shape[:-2], 1, d + 1)
+        transforms.append(torch.cat([top, last], dim=-2))
+    matrix = rows(moved)
+    tensor = torch.linalg.svd(matrix / matrix.norm(dim=-1, keepdim=True)).Vh[..., -1, :]
+    maps = CV.decompose(tensor.unflatten(-1, (4, 4, views[2].shape[-1] + 1)))
+    return tuple(torch.linalg.inv(t) @ m for t, m in zip(transforms, maps, strict=True))
+
+
+def test_counts():
+    assert (CV.minimal(), CV.width(), CV.rows(), CV.shape()) == (21, 64, 3, (4, 4, 4))
+    camera = CV("image")
+    assert (camera.minimal(), camera.width(), camera.rows(), camera.shape()) == (24, 48, 2, (4, 4, 3))
+    assert (CV().codim, camera.codim) == (3, 2)
+    with pytest.raises(ValueError, match="'space' or 'image'"):
+        CV("plane")
+
+
+@pytest.mark.parametrize("height", [4, 3])
+def test_compose_is_cramers_rule_in_p6(height):
+    maps = [random(4, 4, seed=1).numpy(), random(4, 4, seed=2).numpy(), random(height, 4, seed=3).numpy()]
+    tensor = CV.compose(*(torch.tensor(m) for m in maps)).numpy()
+    lifted = [np.hstack([m, t * m[:, :3]]) for t, m in enumerate(maps)]
+    for seed in range(5):
+        p0, p1 = random(2, 4, seed=10 + seed).numpy()
+        zero = np.zeros((4, 1))
+        system = np.vstack([np.hstack([lifted[0], p0[:, None], zero]), np.hstack([lifted[1], zero, p1[:, None]])])
+        minors = [(-1) ** c * np.linalg.det(np.delete(system, c, axis=1)) for c in range(9)]
+        p2 = lifted[2] @ np.array(minors[:7])
+        found = np.einsum("ijk,i,j->k", tensor, p0, p1)
+        cosine = abs(p2 @ found) / np.linalg.norm(p2) / np.linalg.norm(found)
+        assert cosine == pytest.approx(1, abs=1e-12)
+
+
+@pytest.mark.parametrize("camera", [False, True])
+def test_scenes_fulfil_the_tensor_and_determine_it(camera):
+    minimal = 24 if camera else 21
+    scene = constant_velocity(minimal, camera=camera, generator=generator(1))
+    width = 48 if camera else 64
+    assert rank(scene.views) == width - 1
+    assert rank(tuple(x[:-1] for x in scene.views)) < width - 1
+    tensor = CV.compose(*scene.motion)
+    assert (rows(scene.views) @ tensor.flatten()).abs().max() < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({"static": 1.0}, 36),
+        ({"velocities": "equal"}, 36),
+        ({"velocities": "linear"}, 49),
+        ({"velocities": "planar"}, 58),
+        ({}, 63),
+    ],
+)
+def test_degenerate_ranks(options, expected):
+    assert rank(constant_velocity(80, generator=generator(2), **options).views) == expected
+
+
+@pytest.mark.parametrize(("still", "moving"), [(5, 16), (10, 11), (15, 9), (20, 9)])
+def test_static_matches_replace_moving_ones(still, moving):
+    static, scene = (constant_velocity(n, static=s, generator=generator(3)) for n, s in ((still, 1.0), (moving, 0.0)))
+    assert rank(join_scenes(scene, static)) == 63
+    assert rank(tuple(x[:-1] for x in join_scenes(static, scene))) < 63
+
+
+@pytest.mark.parametrize("height", [4, 3])
+def test_dof_is_the_rank_of_compose(height):
+    maps = tuple(random(4 if t < 2 else height, 4, seed=t) for t in range(3))
+    jacobian = torch.autograd.functional.jacobian(CV.compose, maps)
+    stacked = torch.cat([j.flatten(3).flatten(0, 2) for j in jacobian], dim=-1)
+    invariant = CV("space" if height == 4 else "image")
+    assert int(torch.linalg.matrix_rank(stacked, rtol=1e-10)) == invariant.dof
+
+
+def test_epipoles_are_fourfold_defective_eigenvalues():
+    tensor = CV.compose(*constant_velocity(5, generator=generator(4)).motion)
+    alpha, _ = infinity_planes(tensor)
+    a, b = random(2, 4, seed=5)
+    first, second = (torch.einsum("i,ijk->kj", c, tensor) for c in (a, b))
+    pencil = first @ torch.linalg.inv(second)
+    ratio = (a @ alpha) / (b @ alpha)
+    left = pencil - ratio * torch.eye(4, dtype=pencil.dtype)
+    assert torch.linalg.matrix_rank(left, rtol=1e-9) == 1
+    assert (left @ left).abs().max() < 1e-10 * left.abs().max()
+    # the eigenvalues keep half of the digits, their mean all
+    assert (torch.linalg.eigvals(pencil) - ratio).abs().max() > 1e-10 * ratio.abs()
+    assert abs(pencil.trace() / 4 - ratio) < 1e-11 * ratio.abs()
+    # hence the determinant of a slice is the fourth power of a linear form
+    slices = torch.einsum("ni,ijk->nkj", random(20, 4, seed=6), tensor)
+    power = (random(20, 4, seed=6) @ alpha) ** 4
+    assert torch.allclose(torch.linalg.det(slices) / power, torch.linalg.det(first) / (a @ alpha) ** 4, rtol=1e-8)
+
+
+@pytest.mark.parametrize("height", [4, 3])
+@pytest.mark.parametrize("method", ["decompose", "decompose_p6"])
+def test_round_trip(height, method):
+    maps = (random(40, 4, 4, seed=7), random(40, 4, 4, seed=8), random(40, height, 4, seed=9))
+    tensor = CV.compose(*maps)
+    for scale in (1.0, -3.0):
+        found = getattr(CV, method)(scale * tensor)
+        assert [tuple(m.shape) for m in found] == [(40, 4, 4), (40, 4, 4), (40, height, 4)]
+        assert distance(CV.compose(*found), tensor).max() < 1e-9
+        assert all(torch.allclose(torch.linalg.matrix_norm(m), torch.ones(40, dtype=m.dtype)) for m in found)
+
+
+@pytest.mark.parametrize("camera", [False, True])
+@pytest.mark.parametrize("method", ["decompose", "decompose_p6"])
+def test_maps_are_the_true_ones_up_to_an_affinity_and_a_velocity(camera, method):
+    scene = constant_velocity(30, batch=5, camera=camera, generator=generator(10))
+    found = getattr(CV, method)(CV.compose(*scene.motion))
+    x, v = scene.extras["points"], scene.extras["velocities"]
+    y = CV.positions(found, *scene.views)
+    # an affinity of space-time: y_t = L x + t (L v + u) + c
+    base = homogeneous(x)
+    truth = torch.cat(
+        [torch.stack([base, torch.cat([x + t * v, torch.ones_like(x[..., :1])], -1)], -2)[..., 1, :] for t in range(3)], -2
+    )
+    design = torch.cat([truth, torch.cat([torch.full((5, 30, 1), float(t), dtype=x.dtype) for t in range(3)], -2)], -1)
+    target = torch.cat([y[..., t, :] for t in range(3)], -2)
+    solution = torch.linalg.lstsq(design, target).solution
+    assert (design @ solution - target).abs().max() < 1e-8 * target.abs().max()
+
+
+def test_units_far_from_one():
+    scene = constant_velocity(30, batch=10, generator=generator(11))
+    move = torch.diag(torch.tensor([1e3, 1e3, 1e3, 1.0], dtype=torch.float64))
+    move[:3, 3] = 5e3
+    views = tuple(apply(move, x) for x in scene.views)
+    maps = CV.decompose(CV.compose(*(move @ m for m in scene.motion)))
+    y = CV.positions(maps, *views)
+    assert (apply(maps[2], 2 * y[..., 1, :] - y[..., 0, :]) - views[2]).abs().max() < 1e-8
+
+
+@pytest.mark.parametrize("camera", [False, True])
+def test_gauge_changes_nothing(camera):
+    scene = constant_velocity(10, camera=camera, generator=generator(12))
+    affinity = torch.eye(4, dtype=torch.float64)
+    affinity[:3] += 0.3 * random(3, 4, seed=13)
+    moved = []
+    for t, m in enumerate(scene.motion):
+        drift = torch.eye(4, dtype=torch.float64)
+        drift[:3, 3] = t * random(3, seed=14)
+        moved.append((t + 2.0) * m @ drift @ affinity)
+    assert distance(CV.compose(*moved), CV.compose(*scene.motion)) < 1e-13
+    noisy = tuple(x + 0.01 * random(*x.shape, seed=15 + i) for i, x in enumerate(scene.views))
+    invariant = CV("image" if camera else "space")
+    before, after = (invariant.whitened(m, noisy, ONES).norm(dim=-1) for m in (scene.motion, tuple(moved)))
+    assert torch.allclose(before, after, rtol=1e-9)
+
+
+@pytest.mark.parametrize("camera", [False, True])
+def test_static_points_fix_the_common_velocity(camera):
+    scene = constant_velocity(40, batch=3, static=0.2, camera=camera, generator=generator(16))
+    still = ~scene.extras["moving"]
+    broken = torch.where(still[..., None], scene.views[0], scene.views[0].clone().fill_(float("nan")))
+    maps = CV.fix_gauge(CV.decompose(CV.compose(*scene.motion)), broken, *scene.views[1:], weights=still.double())
+    velocity = CV.velocities(maps, *scene.views)
+    assert velocity[still].abs().max() < 1e-9
+    # the rest is one affinity: its linear part takes the true velocities to the found ones
+    true = scene.extras["velocities"]
+    linear = torch.linalg.lstsq(true, velocity).solution
+    assert (true @ linear - velocity).abs().max() < 1e-9
+    if not camera:
+        relations = torch.stack([unit(torch.linalg.inv(a) @ b) for a, b in zip(scene.motion, maps, strict=True)])
+        assert (relations - relations[:1]).abs().max() < 1e-9
+    assert CV.static_distance(maps, *scene.views)[still].max() < 1e-9
+    assert CV.static_distance(maps, *scene.views)[~still].min() > 0.05
+    unchanged = CV.fix_gauge(maps, *scene.views, weights=torch.zeros_like(still, dtype=torch.float64))
+    assert all(torch.allclose(a, b) for a, b in zip(maps, unchanged, strict=True))
+    with pytest.raises(ValueError, match="no matches"):
+        CV.fix_gauge(maps, *(x[..., :0, :] for x in scene.views))
+
+
+def test_transfer_between_all_views():
+    scene = constant_velocity(30, batch=2, generator=generator(17))
+    tensor = CV.compose(*scene.motion)
+    x1, x2, x3 = scene.views
+    assert (CV.transfer(tensor, x1, x2) - x3).abs().max() < 1e-10
+    assert (CV.transfer(tensor, x1=x1, x3=x3) - x2).abs().max() < 1e-9
+    assert (CV.transfer(tensor, x2=x2, x3=x3) - x1).abs().max() < 1e-9
+    with pytest.raises(ValueError, match="two of x1, x2, x3"):
+        CV.transfer(tensor, x1)
+    seen = constant_velocity(30, camera=True, generator=generator(17))
+    assert (CV.transfer(CV.compose(*seen.motion), *seen.views[:2]) - seen.views[2]).abs().max() < 1e-9
+    with pytest.raises(ValueError, match="does not determine"):
+        CV.transfer(CV.compose(*seen.motion), x2=seen.views[1], x3=seen.views[2])
+
+
+@pytest.mark.parametrize("camera", [False, True])
+def test_trajectories_pass_through_the_positions(camera):
+    scene = constant_velocity(12, camera=camera, generator=generator(18))
+    for view in (1, 2, 3):
+        line = CV.trajectory(scene.motion, *scene.views, view=view)
+        for time in (-1.0, 0.0, 3.0):
+            point = homogeneous(apply(scene.motion[view - 1], scene.extras["points"] + time * scene.extras["velocities"]))
+            if line.shape[-1] == 3:
+                missed = (point * line).sum(-1)
+            else:
+                missed = torch.stack([
+                    line[:, place(j, k)] * point[:, i] - line[:, place(i, k)] * point[:, j] + line[:, place(i, j)] * point[:, k]
+                    for i, j, k in itertools.combinations(range(4), 3)
+                ])  # fmt: skip
+            assert missed.abs().max() < 1e-10
+    with pytest.raises(ValueError, match="view must be"):
+        CV.trajectory(scene.motion, *scene.views, view=0)
+
+
+def place(i, j):
+    return list(itertools.combinations(range(4), 2)).index((i, j))
+
+
+def test_camera_of_space_points_gives_the_third_sensor():
+    """The image tensor sees only M A_2; the predicted positions and the points in space give A_2 itself."""
+    scene = constant_velocity(40, generator=generator(19))
+    m = random(3, 4, seed=20)
+    first, second, seen = CV.decompose(CV.compose(scene.motion[0], scene.motion[1], m @ scene.motion[2]))
+    y = CV.positions((first, second, seen), *scene.views[:2], apply(m, scene.views[2]))[..., 2, :]
+    planes = torch.linalg.svd(homogeneous(scene.views[2])[:, None, :]).Vh[:, 1:]
+    system = torch.einsum("nrk,nj->nrkj", planes, homogeneous(y)).flatten(2).flatten(0, 1)
+    third = torch.linalg.svd(system).Vh[-1].reshape(4, 4)
+    assert distance(CV.compose(first, second, third), CV.compose(*scene.motion)) < 1e-9
+    assert torch.minimum((unit(m @ third) - seen).norm(), (unit(m @ third) + seen).norm()) < 1e-9
+
+
+def reference_square(residual, views, scales):
+    """e^T (sum s^2 J J^T)^-1 e of one match, with automatic derivatives."""
+    e = residual(*views)
+    jacobians = torch.autograd.functional.jacobian(residual, views)
+    q = sum(s**2 * j @ j.mT for s, j in zip(scales, jacobians, strict=True))
+    return e @ torch.linalg.solve(q, e)
+
+
+@pytest.mark.parametrize("camera", [False, True])
+def test_whitened_residuals_against_automatic_derivatives(camera):
+    scene = constant_velocity(6, camera=camera, static=0.5, sigma=0.02, generator=generator(21))
+    scales = (1.0, 0.5, 2.0)
+    inverse = [torch.linalg.inv(m) for m in scene.motion[:2]]
+
+    def world(t, x):
+        return apply(inverse[t], x[None])[0]
+
+    def last(y0, y1, x3, y):
+        return apply(scene.motion[2], y[None])[0] - x3 if camera else apply(torch.linalg.inv(scene.motion[2]), x3[None])[0] - y
+
+    def moving(x1, x2, x3):
+        y0, y1 = world(0, x1), world(1, x2)
+        return last(y0, y1, x3, 2 * y1 - y0)
+
+    def static(x1, x2, x3):
+        y0, y1 = world(0, x1), world(1, x2)
+        return torch.cat([y1 - y0, last(y0, y1, x3, y1)])
+
+    invariant = CV("image" if camera else "space")
+    tensors = tuple(torch.tensor(s, dtype=torch.float64) for s in scales)
+    for method, residual in ((invariant.whitened, moving), (invariant.whitened_static, static)):
+        found = method(scene.motion, scene.views, tensors).square().sum(-1)
+        expected = torch.stack([reference_square(residual, tuple(x[n] for x in scene.views), scales) for n in range(6)])
+        assert torch.allclose(found, expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("camera", [False, True])
+def test_residuals_follow_chi_squared(camera):
+    sigma = 1e-3
+    invariant = CV("image" if camera else "space")
+    scales = tuple(torch.tensor(sigma, dtype=torch.float64) for _ in range(3))
+    moving = constant_velocity(4000, camera=camera, sigma=sigma, generator=generator(22))
+    still = constant_velocity(4000, camera=camera, static=1.0, sigma=sigma, generator=generator(23))
+    for scene, method, freedom in (
+        (moving, invariant.whitened, 2 if camera else 3),
+        (still, invariant.whitened_static, 5 if camera else 6),
+    ):
+        square = method(scene.motion, scene.views, scales).square().sum(-1)
+        # 4 standard errors of the mean and variance of 4000 draws
+        assert square.mean().item() == pytest.approx(freedom, abs=4 * (2 * freedom / 4000) ** 0.5)
+        assert square.var().item() == pytest.approx(2 * freedom, rel=0.25)
+
+
+@pytest.mark.parametrize("camera", [False, True])
+def test_forward_mode_derivatives(camera):
+    scene = constant_velocity(5, camera=camera, sigma=0.01, generator=generator(24))
+    invariant = CV("image" if camera else "space")
+    for method in (invariant.whitened, invariant.whitened_static):
+        tangents = torch.stack([random(4, 4, seed=s) for s in (25, 26)])
+
+        def value(first, method=method):
+            return method((first, *scene.motion[1:]), scene.views, ONES)
+
+        forward = torch.func.vmap(lambda d, value=value: torch.func.jvp(value, (scene.motion[0],), (d,))[1])(tangents)
+        step = 1e-6
+        for d, found in zip(tangents, forward, strict=True):
+            numeric = (value(scene.motion[0] + step * d) - value(scene.motion[0] - step * d)) / (2 * step)
+            assert torch.allclose(found, numeric, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("height", [4, 3])
+@pytest.mark.parametrize("noise", [0.0, 0.02])
+def test_gradient_of_the_nearest_tensor(height, noise):
+    maps = (random(4, 4, seed=27), random(4, 4, seed=28), random(height, 4, seed=29))
+    tensor = (CV.compose(*maps) + noise * random(4, 4, height, seed=30) / 8).requires_grad_()
+
+    def projector(x):
+        t = CV.compose(*CV.decompose(x)).flatten()
+        return (t[:, None] * t)[::7, ::5]
+
+    assert torch.autograd.gradcheck(projector, tensor, eps=1e-7, atol=1e-5, fast_mode=True)
+
+
+def test_nothing_spoils_a_batch():
+    tensor = CV.compose(*constant_velocity(1, batch=6, generator=generator(31)).motion)
+    bad = tensor.clone()
+    bad[1], bad[2], bad[3] = 0.0, float("nan"), random(4, 4, 4, seed=40)
+    bad[4] = torch.einsum("i,j,k->ijk", *random(3, 4, seed=41))
+    bad.requires_grad_()
+    for method in (CV.decompose, CV.decompose_p6):
+        found = method(bad)
+        assert all(m.isfinite().all() for m in found)
+        assert distance(CV.compose(*found)[[0, 5]], tensor[[0, 5]]).max() < 1e-9
+        assert (found[2][1:3] == 0).all()
+        assert distance(CV.compose(*method(bad[4:]))[1], CV.compose(*found)[5]) < 1e-12
+    (gradient,) = torch.autograd.grad(sum(m[[0, 5]].square().sum() + m[[0, 5], 0].sum() for m in CV.decompose(bad)), bad)
+    assert gradient.isfinite().all()
+    assert all(x.isfinite().all() for x in CV.diagnose(bad))
+    assert CV.diagnose(bad).misfit[1] == 1
+    with pytest.raises(ValueError, match="tensor must be"):
+        CV.decompose(tensor[0, 0])
+    assert CV.decompose(tensor.float())[0].dtype == torch.float32
+    assert distance(CV.compose(*CV.decompose(tensor.float())).double(), tensor).max() < 1e-3
+    assert CV.decompose(tensor[:0])[0].shape == (0, 4, 4)
+
+
+def test_repeated_matches_give_finite_residuals():
+    views = tuple(torch.zeros(5, 3, dtype=torch.float64) for _ in range(3))
+    maps = tuple(torch.zeros(4, 4, dtype=torch.float64) for _ in range(3))
+    for motion in (maps, CV.decompose(torch.zeros(4, 4, 4, dtype=torch.float64))):
+        assert CV().whitened(motion, views, ONES).isfinite().all()
+        assert CV().whitened_static(motion, views, ONES).isfinite().all()
+        assert CV.positions(motion, *views).isfinite().all()
+
+
+def test_diagnosis_tells_other_tensors_apart():
+    good = CV.diagnose(CV.compose(*(random(20, 4, 4, seed=42 + t) for t in range(3))))
+    assert good.misfit.max() < 1e-12 and good.infinity.max() < 1e-9
+    # projections from P^6 without the structure of constant velocity: planes alpha, beta, but none in the third frame
+    alpha, beta = random(2, 20, 4, seed=45)
+    q, k = random(2, 20, 4, 4, seed=46)
+    other = torch.einsum("bi,bkj->bijk", alpha, q) + torch.einsum("bki,bj->bijk", k, beta)
+    found = CV.diagnose(other)
+    assert found.misfit.max() < 1e-9 and found.infinity.median() > 0.05
+    assert CV.diagnose(random(20, 4, 4, 4, seed=47)).misfit.min() > 0.1
+    assert (CV.diagnose(CV.compose(random(4, 4), random(4, 4, seed=1), random(3, 4, seed=2))).infinity == 0).all()
+
+
+@pytest.mark.parametrize(("n", "sigma", "bound"), [(24, 5e-4, 0.0085), (50, 2e-3, 0.010), (200, 2e-3, 0.0044)])
+def test_linear_solution_under_noise(n, sigma, bound):
+    """Error of the predicted third view; the bounds are the medians of an independent prototype on like scenes, with a margin."""
+    scene = constant_velocity(n, batch=15, sigma=sigma, generator=generator(48))
+    maps = fitted(scene.views)
+    y = CV.positions(maps, *scene.exact)
+    error = (apply(maps[2], 2 * y[..., 1, :] - y[..., 0, :]) - scene.exact[2]).square().sum(-1).mean(-1).sqrt()
+    assert error.median() < 1.3 * bound
+
+
+def test_adjugate():
+    for n in (2, 3, 4):
+        matrix = random(7, n, n, seed=n)
+        matrix[0] = 0
+        expected = torch.linalg.det(matrix)[:, None, None] * torch.eye(n, dtype=torch.float64)
+        assert torch.allclose(matrix @ adjugate(matrix), expected, atol=1e-12)
+
+
+def test_affine_mode_from_seven_matches():
+    scene = constant_velocity(7, batch=20, sensors="affine", generator=generator(50))
+    found = affine_constant_velocity(*scene.views)
+    assert found.ok.all() and found.residual.max() < 1e-10
+    x1, x2, x3 = scene.views
+    assert (x2 @ found.M1.mT + x1 @ found.M0.mT + found.t[:, None] - x3).abs().max() < 1e-9
+    linear = [m[..., :3, :3] / m[..., 3:, 3:] for m in scene.motion]
+    assert torch.allclose(found.M1, 2 * linear[2] @ torch.linalg.inv(linear[1]), atol=1e-8)
+    assert torch.allclose(found.M0, -linear[2] @ torch.linalg.inv(linear[0]), atol=1e-8)
+    assert distance(CV.compose(*found.motion), CV.compose(*scene.motion)).max() < 1e-9
+    with pytest.raises(ValueError, match="6 matches"):
+        affine_constant_velocity(*(x[:, :6] for x in scene.views))
+    with pytest.raises(ValueError, match="alike"):
+        affine_constant_velocity(x1, x2, x3[..., :2])
+    with pytest.raises(ValueError, match="weights"):
+        affine_constant_velocity(x1, x2, x3, weights=torch.ones(3))
+
+
+def test_affine_mode_refuses_what_does_not_decide():
+    options = ({"velocities": "planar"}, {"static": 1.0}, {"velocities": "equal"}, {})
+    views = [constant_velocity(20, sensors="affine", generator=generator(51), **o).views for o in options]
+    x1, x2, x3 = (torch.stack(x) for x in zip(*views, strict=True))
+    weights = torch.ones(4, 20)
+    found = affine_constant_velocity(x1, x2, x3, weights)
+    assert found.ok.tolist() == [False, False, False, True]
+    weights[3, 6:] = 0
+    few = affine_constant_velocity(x1, x2, x3, weights)
+    assert not few.ok.any()
+    for result in (found, few):
+        assert all(m.isfinite().all() for m in (*result.motion, result.M1, result.M0, result.t, result.residual))
+    assert (found.M1[0] == 0).all() and (found.motion[0][0] == 0).all()
+
+
+def test_affine_mode_ignores_missing_and_unweighted_matches():
+    scene = constant_velocity(30, sensors="affine", sigma=0.01, generator=generator(52))
+    x1, x2, x3 = (x.clone() for x in scene.views)
+    expected = affine_constant_velocity(x1[4:], x2[4:], x3[4:])
+    x1[0], x2[1], x3[2:4] = float("nan"), float("inf"), 100.0
+    weights = torch.ones(30)
+    weights[2:4] = 0
+    found = affine_constant_velocity(x1, x2, x3, weights)
+    assert torch.allclose(found.M1, expected.M1) and torch.allclose(found.t, expected.t)
+    assert found.residual.isfinite()
+
+
+def test_affine_mode_is_the_least_squares_solution():
+    """It is the factorization: the conditions are the least singular vectors; their residual is the noise."""
+    sigma = 0.01
+    scene = constant_velocity(400, batch=4, sensors="affine", sigma=sigma, generator=generator(53))
+    found = affine_constant_velocity(*scene.views)
+    stacked = torch.cat(scene.views, -1)
+    values = torch.linalg.svdvals(stacked - stacked.mean(-2, keepdim=True))
+    assert torch.allclose(found.residual, (values[..., 6:].square().sum(-1) / 1200).sqrt(), rtol=1e-9)
+    assert (found.residual / sigma - 1).abs().max() < 0.1
+    square = CV().whitened(found.motion, scene.views, ONES).square().sum(-1)
+    assert square.mean().sqrt().item() == pytest.approx(sigma * 3**0.5, rel=0.05)
+
+
+def test_affine_mode_gradient():
+    scene = constant_velocity(9, sensors="affine", sigma=0.05, generator=generator(54))
+
+    def relation(x1, x2, x3):
+        found = affine_constant_velocity(x1, x2, x3)
+        return torch.cat([found.M1, found.M0, found.t[:, None]], dim=-1)
+
+    views = tuple(x.clone().requires_grad_() for x in scene.views)
+    assert torch.autograd.gradcheck(relation, views, atol=1e-5)

@@ -1,0 +1,235 @@
+"""Dual homography tensor: lines and static points, ranks, quadrifocal contraction, maps of lines, distances, degenerate input."""
+
+import pytest
+import torch
+from torch.nn.functional import normalize
+
+from dyntorch import scenes
+from dyntorch.algebra.homogeneous import apply, homogeneous, unit
+from dyntorch.invariants.dual_homography_tensor import DualHomographyTensor, quadrifocal
+from dyntorch.residual import multilinear, whiten
+
+LINES, POINTS = DualHomographyTensor("lines"), DualHomographyTensor("points")
+ONES = (torch.ones(()).double(),) * 3
+
+
+def random(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def near_identity(*batch, seed=0):
+    return [unit(torch.eye(3).double() + 0.2 * random(*batch, 3, 3, seed=seed + s)) for s in (0, 1)]
+
+
+def raw(line):
+    return line / line[..., :2].norm(dim=-1, keepdim=True)
+
+
+def concurrent(motion, n, seed=0):
+    """Lines of three views through static points of order 1, and those points in every view."""
+    first = random(n, 2, seed=seed)
+    points = [first, *(apply(torch.linalg.inv(m), first) for m in motion)]
+    views = [raw(torch.linalg.cross(homogeneous(x), random(n, 3, seed=seed + 1 + v))) for v, x in enumerate(points)]
+    return views, points
+
+
+def static_lines(motion, n, seed=0):
+    first = random(n, 3, seed=seed)
+    return [raw(first), *(raw(first @ m) for m in motion)]  # l = A^T l1
+
+
+def rows(invariant, views):
+    u, v, w = (p.vectors(x) for p, x in zip(invariant.primitives, views, strict=True))
+    return torch.einsum("nri,nsj,ntk->nrstijk", u, v, w).reshape(-1, 27)
+
+
+def test_ranks():
+    motion = near_identity()
+    views, points = concurrent(motion, 40)
+    assert (LINES.minimal(), POINTS.minimal(), LINES.codim, POINTS.codim) == (26, 4, 1, 4)
+    assert torch.linalg.matrix_rank(rows(LINES, views), rtol=1e-10) == 26
+    assert torch.linalg.matrix_rank(rows(LINES, views)[:26], rtol=1e-12) == 26
+    ranks = [int(torch.linalg.matrix_rank(rows(POINTS, [x[:k] for x in points]), rtol=1e-10)) for k in (1, 2, 3, 4, 5)]
+    assert ranks == [8, 15, 21, 26, 26]
+    tensor = DualHomographyTensor.compose(*motion)
+    assert (rows(LINES, views) @ tensor.flatten()).abs().max() < 1e-13
+    assert (rows(POINTS, points) @ tensor.flatten()).abs().max() < 1e-13
+
+
+def test_form_is_the_determinant_of_the_carried_lines():
+    A, B = motion = near_identity()
+    s, r, q = random(3, 20, 3)
+    value = torch.einsum("ijk,ni,nj,nk->n", DualHomographyTensor.compose(*motion), s, r, q)
+    truth = torch.linalg.det(torch.stack([s, r @ torch.linalg.inv(A), q @ torch.linalg.inv(B)], dim=-1))
+    torch.testing.assert_close(value / value.norm(), truth / truth.norm())
+
+
+def test_scene_of_lines_fulfils_it():
+    found = scenes.lines_concurrent(50, generator=torch.Generator().manual_seed(0))
+    tensor = DualHomographyTensor.compose(*found.motion)
+    assert multilinear(LINES, tensor, found.views, ONES).abs().max() < 1e-8
+
+
+def test_round_trip_and_batch_is_loop():
+    motion = unit(random(200, 3, 3)), unit(random(200, 3, 3, seed=1))
+    tensor = DualHomographyTensor.compose(*motion) * random(200, 1, 1, 1, seed=2)
+    found = DualHomographyTensor.decompose(tensor)
+    condition = torch.maximum(*(torch.linalg.cond(m) for m in motion))
+    for matrix, truth in zip(found, motion, strict=True):
+        assert (matrix - truth).flatten(1).norm(dim=1)[condition < 50].max() < 1e-10
+    for i in range(0, 200, 50):
+        torch.testing.assert_close(DualHomographyTensor.decompose(tensor[i]), (found[0][i], found[1][i]), rtol=1e-9, atol=1e-11)
+
+
+def test_quadrifocal_contracted_with_a_line_is_the_tensor_of_its_plane():
+    cameras, line = random(4, 6, 3, 4), random(6, 3, seed=1)
+    tensor = DualHomographyTensor.from_quadrifocal(quadrifocal(*cameras), line)
+    planes = (line[:, None] @ cameras[3])[:, 0]
+    basis = torch.linalg.svd(planes[:, None]).Vh[:, 1:].mT
+    to_view = [P @ basis for P in cameras[:3]]
+    motion = [to_view[0] @ torch.linalg.inv(g) for g in to_view[1:]]
+    direct = DualHomographyTensor.compose(*motion)
+    alignment = (tensor * direct).flatten(1).sum(1).abs()
+    torch.testing.assert_close(alignment, torch.ones(6).double(), rtol=0, atol=1e-12)
+    with pytest.raises(ValueError, match=r"\(3, 3, 3\)"):
+        DualHomographyTensor.from_quadrifocal(torch.zeros(3, 3, 3), torch.zeros(3))
+    with pytest.raises(ValueError, match=r"\(3, 3\)"):
+        quadrifocal(*torch.zeros(4, 3, 3))
+
+
+def test_quadrifocal_of_lines_through_one_point():
+    cameras, point = random(4, 3, 4), random(4, seed=1)
+    lines = [torch.linalg.cross(P @ point, random(3, seed=2 + v)) for v, P in enumerate(cameras)]
+    value = torch.einsum("ijkl,i,j,k,l->", quadrifocal(*cameras), *lines)
+    minors = torch.stack(
+        [torch.stack([cameras[v][i] for v, i in enumerate(rows)]) for rows in torch.cartesian_prod(*[torch.arange(3)] * 4)]
+    )
+    torch.testing.assert_close(quadrifocal(*cameras).flatten(), torch.linalg.det(minors))
+    assert abs(float(value)) < 1e-10
+
+
+@pytest.mark.parametrize(("source", "target"), [(2, 1), (3, 1), (1, 2), (3, 2), (1, 3), (2, 3)])
+def test_static_lines_are_transferred(source, target):
+    motion = near_identity()
+    lines = static_lines(motion, 20)
+    found = DualHomographyTensor.transfer(-2 * DualHomographyTensor.compose(*motion), 3 * lines[source - 1], source, target)
+    sign = (found * lines[target - 1]).sum(-1, keepdim=True).sign()
+    torch.testing.assert_close(sign * found, lines[target - 1], rtol=1e-9, atol=1e-10)
+
+
+@pytest.mark.parametrize("view", [1, 2, 3])
+def test_concurrency_is_the_static_point(view):
+    motion = near_identity()
+    views, points = concurrent(motion, 20)
+    others = [x for v, x in enumerate(views) if v != view - 1]
+    found = DualHomographyTensor.concurrency(DualHomographyTensor.compose(*motion), *others, view=view)
+    torch.testing.assert_close(found, points[view - 1], rtol=1e-8, atol=1e-8)
+
+
+def angle_and_offset(motion, views):
+    """Angle and offset of the carried lines against the first, for lines of about the same orientation."""
+    parts = []
+    for matrix, line in zip(motion, views[1:], strict=True):
+        carried = raw(line @ torch.linalg.inv(matrix))
+        carried = carried * (carried[:, :2] * views[0][:, :2]).sum(-1, keepdim=True).sign()
+        turn = torch.atan2(carried[:, 1], carried[:, 0]) - torch.atan2(views[0][:, 1], views[0][:, 0])
+        parts += [torch.remainder(turn + torch.pi, 2 * torch.pi) - torch.pi, carried[:, 2] - views[0][:, 2]]
+    return torch.stack(parts, dim=-1)
+
+
+def disturbed(lines, turn, shift):
+    angle = torch.atan2(lines[:, 1], lines[:, 0]) + turn
+    return torch.stack([angle.cos(), angle.sin(), lines[:, 2] + shift], dim=-1)
+
+
+def test_residual_of_static_lines_agrees_with_finite_differences():
+    motion = near_identity()
+    views = [disturbed(line, *(0.1 * random(2, 10, seed=5 + v))) for v, line in enumerate(static_lines(motion, 10))]
+    scales = tuple(torch.tensor(s).double() for s in (0.5, 1.5, 2.0))
+    covariance, step = torch.zeros(10, 4, 4).double(), 1e-6
+    for v in range(3):
+        for direction in ((step, 0.0), (0.0, step)):
+            ends = []
+            for sign in (1, -1):
+                moved = list(views)
+                moved[v] = disturbed(views[v], sign * direction[0], sign * direction[1])
+                ends.append(angle_and_offset(motion, moved))
+            column = (ends[0] - ends[1]) / (2 * step) * scales[v]
+            covariance = covariance + column[:, :, None] * column[:, None, :]
+    truth = whiten(angle_and_offset(motion, views), covariance)
+    torch.testing.assert_close(LINES.whitened_static(tuple(motion), tuple(views), scales), truth, rtol=1e-5, atol=1e-7)
+    flipped = (views[0], -views[1], 3 * views[2])
+    torch.testing.assert_close(LINES.whitened_static(tuple(motion), flipped, scales), truth, rtol=1e-5, atol=1e-7)
+
+
+def test_static_distance_needs_no_motion_and_is_chi_square():
+    motion, sigma = near_identity(), 1e-3
+    exact = static_lines(motion, 5000)
+    views = [disturbed(line, *(sigma * random(2, 5000, seed=5 + v))) for v, line in enumerate(exact)]
+    tensor = DualHomographyTensor.compose(*motion)
+    distance = DualHomographyTensor.static_distance(-tensor, *views)
+    truth = LINES.whitened_static(tuple(motion), tuple(views), ONES).norm(dim=-1)
+    torch.testing.assert_close(distance, truth, rtol=1e-6, atol=1e-9)
+    assert abs(float((distance / sigma).square().mean()) - 4) < 0.2
+    moving, _ = concurrent(motion, 50)
+    assert DualHomographyTensor.static_distance(tensor, *moving).median() > 100 * sigma
+
+
+def test_residual_of_points_is_their_disagreement():
+    motion, sigma = near_identity(), 1e-3
+    points = [x + sigma * random(4000, 2, seed=7 + v) for v, x in enumerate(concurrent(motion, 4000)[1])]
+    scales = (torch.tensor(sigma).double(),) * 3
+    w = POINTS.whitened(tuple(motion), tuple(points), scales)
+    assert w.shape == (4000, 4)
+    assert abs(float(w.square().sum(-1).median()) - 3.357) < 0.2  # median of chi-square with 4 degrees of freedom
+    assert LINES.whitened(tuple(motion), tuple(points), scales) is None
+
+
+def test_degenerate_input_is_never_nan():
+    tensors = torch.stack([torch.zeros(3, 3, 3), torch.ones(3, 3, 3), random(3, 3, 3)]).double().requires_grad_()
+    lines = random(3, 4, 3)
+    with torch.no_grad():
+        lines[:, 0] = torch.tensor([0.0, 0.0, 1.0])
+    outputs = [
+        *DualHomographyTensor.decompose(tensors),
+        DualHomographyTensor.transfer(tensors, lines),
+        DualHomographyTensor.concurrency(tensors, lines, lines),
+        DualHomographyTensor.static_distance(tensors, lines, lines, lines),
+    ]
+    assert all(o.isfinite().all() for o in outputs)
+    for output in outputs:
+        (gradient,) = torch.autograd.grad(output.sum(), tensors, retain_graph=True)
+        assert gradient.isfinite().all()
+    assert torch.equal(outputs[0][0], torch.zeros(3, 3).double())
+
+
+def test_misuse_is_refused():
+    with pytest.raises(ValueError, match="'circles'"):
+        DualHomographyTensor("circles")
+    with pytest.raises(ValueError, match="got 1 and 1"):
+        DualHomographyTensor.transfer(torch.zeros(3, 3, 3), torch.zeros(1, 3), 1, 1)
+
+
+def test_gradients_and_forward_mode():
+    motion = [m.requires_grad_() for m in near_identity(2)]
+
+    def gauge_free(A, B):
+        return DualHomographyTensor.decompose(DualHomographyTensor.compose(A, B))
+
+    assert torch.autograd.gradcheck(gauge_free, motion)
+    tensor, lines = DualHomographyTensor.compose(*motion).detach().requires_grad_(), random(2, 3, 3).requires_grad_()
+
+    def projector(tensor, lines):
+        line = normalize(DualHomographyTensor.transfer(tensor, lines), dim=-1)
+        return line[..., :, None] * line[..., None, :]
+
+    assert torch.autograd.gradcheck(projector, (tensor, lines))
+    views = tuple(static_lines([m[0].detach() for m in motion], 3))
+    views = (views[0] + 0.05 * random(3, 3, seed=4), *views[1:])
+    theta = torch.stack([m[0].detach() for m in motion]).flatten()
+    for function in (
+        lambda t: DualHomographyTensor.compose(*t.unflatten(0, (2, 3, 3))),
+        lambda t: LINES.whitened_static(tuple(t.unflatten(0, (2, 3, 3))), views, ONES),
+    ):
+        forward = torch.func.vmap(lambda v, f=function: torch.func.jvp(f, (theta,), (v,))[1])(torch.eye(18).double())
+        torch.testing.assert_close(forward.movedim(0, -1), torch.func.jacrev(function)(theta))

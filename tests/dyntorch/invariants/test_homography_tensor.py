@@ -1,0 +1,269 @@
+"""Homography tensor: ranks, round trip, maps without A and B against those with them, distances, gradients, degenerate input."""
+
+import pytest
+import torch
+from torch.nn.functional import normalize
+
+from dyntorch import scenes
+from dyntorch.algebra.homogeneous import apply, homogeneous, unit
+from dyntorch.invariants.homography_tensor import HomographyTensor
+from dyntorch.residual import multilinear
+
+ONES = (torch.ones(()).double(),) * 3
+
+
+def random(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def scene(n, **options):
+    return scenes.planar(n, generator=torch.Generator().manual_seed(0), **options)
+
+
+def motions(*batch, seed=0):
+    return unit(random(*batch, 3, 3, seed=seed)), unit(random(*batch, 3, 3, seed=seed + 1))
+
+
+def normalized(views):
+    """A scene around 0 at size 1, with the map of each view that did it."""
+    maps = torch.eye(3).double().repeat(3, 1, 1)
+    for v, x in enumerate(views):
+        scale = 1 / x.std()
+        maps[v] = torch.diag(torch.stack([scale, scale, torch.ones(()).double()]))
+        maps[v, :2, 2] = -scale * x.mean(0)
+    return maps, [apply(m, x) for m, x in zip(maps, views, strict=True)]
+
+
+def rows(views):
+    p1, p2, p3 = (normalize(homogeneous(x), dim=-1) for x in views)
+    return torch.einsum("ni,nj,nk->nijk", p1, p2, p3).flatten(1)
+
+
+def to_view(motion, view):
+    """Homographies from view 1, 2, 3 to one of them."""
+    A, B = motion
+    first = (torch.eye(3).double().expand_as(A), A, B)
+    return [torch.linalg.inv(first[view - 1]) @ m for m in first]
+
+
+@pytest.mark.parametrize(("static", "rank"), [(0.0, 26), (10 / 40, 26), (1.0, 10)])
+def test_ranks_of_exact_matches(static, rank):
+    matrix = rows(normalized(scene(40, static=static).views)[1])
+    values = torch.linalg.svdvals(matrix)
+    assert values[rank - 1] > 1e-6
+    assert (values[rank:] < 1e-12).all()
+    assert HomographyTensor.minimal() == 26
+
+
+def test_composed_tensor_is_the_null_vector_and_the_determinant():
+    found = scene(40)
+    maps, views = normalized(found.views)
+    A, B = (maps[0] @ m @ torch.linalg.inv(maps[v]) for v, m in zip((1, 2), found.motion, strict=True))
+    H = HomographyTensor.compose(A, B)
+    assert (rows(views) @ H.flatten()).abs().max() < 1e-13
+    p, q, r = random(3, 50, 3)
+    values = torch.einsum("ijk,ni,nj,nk->n", H, p, q, r)
+    determinants = torch.linalg.det(torch.stack([p, q @ A.T, r @ B.T], dim=-1))
+    torch.testing.assert_close(values / values.norm(), determinants / determinants.norm())
+    torch.testing.assert_close(H.norm(), torch.ones(()).double())
+
+
+@pytest.mark.parametrize("labelled", [1, 2, 3, 4])
+def test_labelled_static_points_give_nine_rows_of_rank_seven(labelled):
+    views = normalized(scene(labelled, static=1.0).views)[1]
+    p = [normalize(homogeneous(x), dim=-1) for x in views]
+    eye = torch.eye(3).double().expand(labelled, 3, 3)
+    blocks = []
+    for v, primitive in enumerate(HomographyTensor.primitives):
+        slots = [u[:, None] for u in p]
+        slots[v] = primitive.free(views[v])
+        torch.testing.assert_close(slots[v], eye)
+        blocks.append(torch.einsum("nri,nsj,ntk->nrstijk", *slots).reshape(-1, 27))
+    assert torch.linalg.matrix_rank(torch.cat(blocks), rtol=1e-10) == (7, 14, 21, 26)[labelled - 1]
+    assert HomographyTensor.labels_static
+
+
+def test_round_trip_and_batch_is_loop():
+    A, B = motions(300)
+    H = HomographyTensor.compose(A, B) * random(300, 1, 1, 1, seed=5)
+    found = HomographyTensor.decompose(H)
+    condition = torch.maximum(torch.linalg.cond(A), torch.linalg.cond(B))
+    for matrix, truth in zip(found, (A, B), strict=True):
+        error = (matrix - truth).flatten(1).norm(dim=1)
+        assert error.max() < 1e-10 * max(1.0, float(condition.max()) / 100)
+        assert error[condition < 100].max() < 1e-10
+    for i in range(0, 300, 60):
+        torch.testing.assert_close(HomographyTensor.decompose(H[i]), (found[0][i], found[1][i]), rtol=1e-10, atol=1e-12)
+    nested = HomographyTensor.decompose(H.unflatten(0, (20, 15)))
+    torch.testing.assert_close(nested[1].flatten(0, 1), found[1], rtol=1e-10, atol=1e-12)
+
+
+def test_round_trip_in_pixels():
+    A, B = scene(4, batch=100).motion
+    for matrix, truth in zip(HomographyTensor.decompose(HomographyTensor.compose(A, B)), (A, B), strict=True):
+        grid = torch.cartesian_prod(torch.linspace(0, 640, 5), torch.linspace(0, 480, 5)).double()
+        assert (apply(matrix, grid) - apply(truth, grid)).norm(dim=-1).max() < 1e-7
+
+
+def test_diagnosis_tells_motions_from_other_tensors():
+    A, B = scene(4, batch=50).motion
+    healthy = HomographyTensor.diagnose(HomographyTensor.compose(A, B))
+    assert torch.minimum(healthy.condition_a, healthy.condition_b).min() > 0.05
+    assert healthy.misfit.max() < 1e-9
+    assert healthy.disagreement.max() < 1e-9
+    # singular values of the systems, built entry by entry
+    a, b = motions()
+    H = HomographyTensor.compose(a, b)
+    system = [
+        (torch.autograd.functional.jacobian(lambda X, k=k: (X.T @ H[:, :, k] + H[:, :, k].T @ X).flatten(), a)).flatten(1)
+        for k in range(3)
+    ]
+    null = torch.linalg.svd(torch.cat(system)).Vh[-1]
+    assert abs(float(null @ a.flatten())) > 1 - 1e-12
+    noise = HomographyTensor.diagnose(random(50, 3, 3, 3))
+    assert noise.misfit.min() > 0.1
+    assert noise.disagreement.median() > 0.1
+    zero = HomographyTensor.diagnose(torch.zeros(3, 3, 3).double())
+    assert [float(x) for x in zero] == [0.0, 0.0, 1.0, 1.0]
+
+
+@pytest.mark.parametrize(("source", "target"), [(2, 1), (3, 1), (1, 2), (3, 2), (1, 3), (2, 3)])
+def test_static_transfer_is_that_of_the_homographies(source, target):
+    found = scene(30, batch=4)
+    H, x = HomographyTensor.compose(*found.motion), found.views[source - 1]
+    truth = apply(to_view(found.motion, target)[source - 1], x)
+    torch.testing.assert_close(HomographyTensor.transfer(-3 * H, x, source, target), truth, rtol=1e-9, atol=1e-7)
+    single = HomographyTensor.transfer(H.float(), x.float(), source, target)
+    assert single.dtype == torch.float32
+    assert (single - truth).norm(dim=-1).median() < 0.1
+
+
+@pytest.mark.parametrize("view", [1, 2, 3])
+def test_trajectory_and_moving_transfer(view):
+    found = scene(30, batch=4)
+    H = HomographyTensor.compose(*found.motion)
+    maps = to_view(found.motion, view)
+    a, b = (v for v in (1, 2, 3) if v != view)
+    x_a, x_b, truth = found.views[a - 1], found.views[b - 1], found.views[view - 1]
+    line = HomographyTensor.trajectory(H, x_a, x_b, view=view)
+    torch.testing.assert_close(line[..., :2].norm(dim=-1), torch.ones(4, 30).double())
+    for x, m in ((x_a, maps[a - 1]), (x_b, maps[b - 1]), (truth, maps[view - 1])):
+        assert (line * homogeneous(apply(m, x))).sum(-1).abs().max() < 1e-6
+    across = torch.linalg.cross(homogeneous(truth), homogeneous(truth + random(4, 30, 2)))
+    moved = HomographyTensor.transfer_moving(H, x_a, x_b, across, view=view)
+    clear = torch.linalg.cross(normalize(across[..., :2], dim=-1)[..., [0, 1, 1]], line[..., [0, 1, 1]])[..., 2].abs() > 0.1
+    assert clear.sum() > 60
+    torch.testing.assert_close(moved[clear], truth[clear], rtol=1e-7, atol=1e-6)
+
+
+def test_static_distance_is_the_whitened_disagreement_under_the_motion():
+    found = scene(200, batch=3, static=0.5, sigma=0.5)
+    H = HomographyTensor.compose(*found.motion)
+    distance = HomographyTensor.static_distance(-2 * H, *found.views)
+    residual = HomographyTensor().whitened_static(found.motion, found.views, ONES)
+    torch.testing.assert_close(distance, residual.norm(dim=-1), rtol=1e-6, atol=1e-7)
+    still = found.labels == 1
+    assert abs(float((distance[still] / 0.5).square().mean()) - 4) < 0.5
+    assert distance[~still].min() > distance[still].median()
+
+
+def test_sampson_is_the_true_geometric_distance_of_moving_points():
+    found = scene(100, sigma=0.5)
+    H = HomographyTensor.compose(*found.motion)
+    start = torch.cat(found.views, -1)
+
+    def form(z):
+        p, q, r = (homogeneous(x) for x in z.split(2))
+        return torch.einsum("ijk,i,j,k->", H, p, q, r)
+
+    moved = start.clone()
+    for _ in range(20):
+        gradient, value = torch.func.vmap(torch.func.grad_and_value(form))(moved)
+        value = value + (gradient * (start - moved)).sum(-1)
+        moved = start - gradient * (value / gradient.square().sum(-1))[:, None]
+    truth = (moved - start).norm(dim=-1)
+    found_distance = multilinear(HomographyTensor(), H, found.views, ONES).abs()
+    assert HomographyTensor().whitened(found.motion, found.views, ONES) is None
+    assert ((found_distance - truth).abs() / truth.mean()).max() < 0.01
+    assert abs(float((found_distance / 0.5).square().mean()) - 1) < 0.35
+
+
+def test_degenerate_input_is_never_nan_and_never_a_motion():
+    A, B = motions()
+    good = HomographyTensor.compose(A, B)
+    bad = torch.stack([torch.zeros(3, 3, 3).double(), torch.ones(3, 3, 3).double(), good])
+    a, b = HomographyTensor.decompose(bad)
+    assert a.isfinite().all() and b.isfinite().all()
+    assert torch.equal(a[0], torch.zeros(3, 3).double())
+    torch.testing.assert_close((a[2], b[2]), (A, B), rtol=1e-9, atol=1e-9)
+    tensors, x = bad.requires_grad_(), random(3, 4, 2)
+    outputs = [
+        HomographyTensor.transfer(tensors, x),
+        HomographyTensor.trajectory(tensors, x, x),
+        HomographyTensor.transfer_moving(tensors, x, x, homogeneous(x)),
+        HomographyTensor.static_distance(tensors, x, x, x),
+    ]
+    assert all(o.isfinite().all() for o in outputs)
+    sum(o.sum() for o in outputs).backward()
+    assert tensors.grad.isfinite().all()
+    assert all(f.isfinite().all() for f in HomographyTensor.diagnose(bad.detach()))
+    zero = torch.zeros(3, 3).double().requires_grad_()
+    HomographyTensor.compose(zero, zero).sum().backward()
+    assert torch.equal(zero.grad, torch.zeros(3, 3).double())
+
+
+def test_one_failed_tensor_leaves_the_others_untouched():
+    good = HomographyTensor.compose(*motions())
+    batch = torch.stack([good, torch.full((3, 3, 3), torch.nan).double(), good])
+    for found, alone in zip(HomographyTensor.decompose(batch), HomographyTensor.decompose(good), strict=True):
+        torch.testing.assert_close(found[0], alone)
+        torch.testing.assert_close(found[2], alone)
+    torch.testing.assert_close(HomographyTensor.diagnose(batch).condition_a[2], HomographyTensor.diagnose(good).condition_a)
+
+
+def test_static_points_have_no_trajectory():
+    found = scene(5, static=1.0)
+    maps, views = normalized(found.views)
+    A, B = (maps[0] @ m @ torch.linalg.inv(maps[v]) for v, m in zip((1, 2), found.motion, strict=True))
+    plain = torch.einsum("ijk,nj,nk->ni", HomographyTensor.compose(A, B), homogeneous(views[1]), homogeneous(views[2]))
+    assert plain.abs().max() < 1e-13
+    same = HomographyTensor.trajectory(HomographyTensor.compose(torch.eye(3), torch.eye(3)), torch.ones(1, 2), torch.ones(1, 2))
+    assert torch.equal(same, torch.zeros(1, 3))
+
+
+def test_misuse_is_refused():
+    H, x = torch.zeros(3, 3, 3), torch.zeros(1, 2)
+    with pytest.raises(ValueError, match="got 2 and 2"):
+        HomographyTensor.transfer(H, x, 2, 2)
+    with pytest.raises(ValueError, match="got 4 and 1"):
+        HomographyTensor.transfer(H, x, 4)
+    with pytest.raises(ValueError, match="got 0"):
+        HomographyTensor.trajectory(H, x, x, view=0)
+    with pytest.raises(ValueError, match=r"\(3, 3\)"):
+        HomographyTensor.decompose(torch.zeros(3, 3))
+
+
+def test_gradients():
+    A, B = (m.requires_grad_() for m in motions(2))
+    x, y = (0.3 * random(2, 3, 2, seed=6)).requires_grad_(), (0.3 * random(2, 3, 2, seed=7)).requires_grad_()
+
+    def gauge_free(A, B):
+        return HomographyTensor.decompose(HomographyTensor.compose(A, B))
+
+    assert torch.autograd.gradcheck(gauge_free, (A, B))
+    H = HomographyTensor.compose(A, B).detach().requires_grad_()
+    assert torch.autograd.gradcheck(lambda H, x: normalize(homogeneous(HomographyTensor.transfer(H, x)), dim=-1), (H, x))
+    assert torch.autograd.gradcheck(lambda H, x, y: HomographyTensor.trajectory(H, x, y, view=3), (H, x, y))
+    # of a tensor that is not that of a motion: the least-squares solution
+    noisy = (H + 0.01 * random(2, 3, 3, 3, seed=9)).detach().requires_grad_()
+    assert torch.autograd.gradcheck(HomographyTensor.decompose, noisy)
+
+
+def test_compose_in_forward_mode_under_vmap():
+    theta = torch.cat([m.flatten() for m in motions()])
+
+    def composed(t):
+        return HomographyTensor.compose(*t.unflatten(0, (2, 3, 3)))
+
+    forward = torch.func.vmap(lambda v: torch.func.jvp(composed, (theta,), (v,))[1])(torch.eye(18).double())
+    torch.testing.assert_close(forward.movedim(0, -1), torch.func.jacrev(composed)(theta))

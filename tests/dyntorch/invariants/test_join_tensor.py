@@ -1,0 +1,285 @@
+"""Join tensors: exact ranks, the family and its motion, transfer and trajectories against A and B, accuracy with noise."""
+
+import math
+
+import pytest
+import torch
+
+from dyntorch.algebra.homogeneous import apply, homogeneous, similarity, unit
+from dyntorch.invariant import as_invariant
+from dyntorch.invariants.join_tensor import JoinTensor
+from dyntorch.metrics import point_error
+from dyntorch.scenes import moving_points
+
+ONE = torch.ones((), dtype=torch.float64)
+
+
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def random(*shape, seed=0):
+    return torch.randn(*shape, generator=generator(seed), dtype=torch.float64)
+
+
+def rows(*points):
+    """Unit rows P x P' x P'' of homogeneous points."""
+    result = points[0]
+    for p in points[1:]:
+        result = (result[..., :, None] * p[..., None, :]).flatten(-2)
+    return torch.nn.functional.normalize(result, dim=-1)
+
+
+def rank(matrix):
+    values = torch.linalg.svdvals(matrix)
+    return int((values > 1e-9 * values[0]).sum())
+
+
+def projector(basis):
+    flat = basis.flatten(-3)
+    return flat.mT @ flat
+
+
+def normalized(views):
+    """Views with centroid 0 and RMS distance sqrt 3, and the similarities."""
+    frames = []
+    for x in views:
+        centre = x.mean(-2)
+        frames.append(similarity((3 / (x - centre[..., None, :]).square().sum(-1).mean(-1)).sqrt(), centre))
+    return [homogeneous(apply(t, x)) for t, x in zip(frames, views, strict=True)], frames
+
+
+def denormalized(motion, frames):
+    return [torch.linalg.inv(frames[0]) @ m @ t for m, t in zip(motion, frames[1:], strict=True)]
+
+
+def grid_error(motion, scene):
+    """RMS error over a grid of the scene, the worse of A and B."""
+    side = torch.linspace(-2, 2, 5, dtype=torch.float64)
+    grid = torch.cartesian_prod(side, side, side)
+    sensors = scene.extras["sensors"].unbind(-3)
+    errors = [point_error(m, t, apply(s, grid)) for m, t, s in zip(motion, scene.motion, sensors[1:], strict=True)]
+    return torch.stack(errors).amax(0)
+
+
+def test_declaration():
+    invariant = as_invariant(JoinTensor)
+    assert (JoinTensor.minimal(), JoinTensor.width(), JoinTensor.rows(), JoinTensor.shape()) == (60, 64, 1, (4, 4, 4))
+    assert (invariant.nullity, invariant.dof, invariant.codim, invariant.labels_static) == (4, 30, 2, True)
+    assert repr(invariant) == "JoinTensor"
+
+
+@pytest.mark.parametrize(
+    ("still", "moving", "expected"), [(0, 59, 59), (0, 60, 60), (0, 90, 60), (20, 40, 60), (40, 39, 59), (40, 0, 20), (10, 45, 55)]
+)
+def test_rank_of_static_and_moving_matches(still, moving, expected):
+    pieces = [moving_points(n, static=s, generator=generator(1), sensors="affine") for n, s in ((still, 1.0), (moving, 0.0)) if n]
+    # the same sensors serve both: map the points of the second scene by those of the first
+    sensors = pieces[0].extras["sensors"]
+    points = []
+    for piece in pieces:
+        own = piece.extras["sensors"]
+        points.append([apply(s @ torch.linalg.inv(o), x) for s, o, x in zip(sensors, own, piece.exact, strict=True)])
+    views = [homogeneous(torch.cat(v)) for v in zip(*points, strict=True)]
+    assert rank(rows(*views)) == expected
+
+
+def test_rank_of_labelled_static_matches():
+    """A static match puts every vector into one slot at a time."""
+    scene = moving_points(8, static=1.0, generator=generator(38))
+    one, two, three = (homogeneous(x)[:, None, :] for x in scene.exact)
+    free = torch.eye(4, dtype=torch.float64)
+    parts = [torch.broadcast_tensors(*p) for p in ((free, two, three), (one, free, three), (one, two, free))]
+    blocks = torch.cat([rows(*p) for p in parts], dim=1)
+    assert [rank(blocks[:k].flatten(0, 1)) for k in range(1, 9)] == [10, 20, 30, 40, 50, 56, 60, 60]
+
+
+@pytest.mark.parametrize(("lines", "expected"), [(1, 8), (4, 32), (5, 40), (6, 44), (9, 56), (10, 60), (12, 60)])
+def test_rank_of_full_trajectory_lines(lines, expected):
+    start, along = random(lines, 1, 1, 3, seed=2), random(lines, 1, 1, 3, seed=3)
+    points = (start + random(lines, 12, 3, 1, seed=4) * along).flatten(0, 1)
+    sensors = torch.eye(4, dtype=torch.float64) + 0.2 * random(3, 4, 4, seed=5)
+    assert rank(rows(*(homogeneous(points[:, v]) @ sensors[v].mT for v in range(3)))) == expected
+
+
+def test_family_is_the_null_space_of_exact_matches():
+    scene = moving_points(80, generator=generator(6))
+    matrix = rows(*(homogeneous(x) for x in scene.exact))
+    null = torch.linalg.svd(matrix).Vh[60:]
+    basis = JoinTensor.compose(*scene.motion)
+    torch.testing.assert_close(projector(basis), null.mT @ null, atol=1e-8, rtol=0)
+
+
+def test_family_holds_all_determinants_and_is_orthonormal():
+    a, b = random(3, 4, 4, seed=7), random(3, 4, 4, seed=8)
+    basis = JoinTensor.compose(a, b)
+    assert basis.shape == (3, 4, 4, 4, 4)
+    flat = basis.flatten(-3)
+    torch.testing.assert_close(flat @ flat.mT, torch.eye(4, dtype=torch.float64).expand(3, 4, 4), atol=1e-12, rtol=0)
+    p, v = random(3, 1, 4, seed=9), random(4, seed=10)
+    q, r = random(3, 5, 4, seed=11), random(3, 5, 4, seed=12)
+    columns = [p.expand(3, 5, 4), q @ a.mT, r @ b.mT, v.expand(3, 5, 4)]
+    determinants = torch.linalg.det(torch.stack(columns, dim=-1))
+    values = torch.einsum("zaijk,zni,znj,znk->zna", basis, p.expand(3, 5, 4), q, r)
+    # the determinant with any V is one linear combination of the four forms
+    weights = torch.linalg.lstsq(values, determinants[..., None]).solution
+    torch.testing.assert_close((values @ weights)[..., 0], determinants, atol=1e-10, rtol=1e-10)
+
+
+def test_cone_of_the_family_has_dimension_thirty():
+    """Tangent rank of the projector onto the family: (A, B) without their two scales."""
+    a, b = random(4, 4, seed=13), random(4, 4, seed=14)
+    jacobian = torch.autograd.functional.jacobian(
+        lambda t: projector(JoinTensor.compose(*t.unflatten(-1, (2, 4, 4)))), torch.stack([a, b]).flatten(), vectorize=True
+    )
+    assert rank(jacobian.flatten(0, 1)) == 30
+
+
+@pytest.mark.parametrize("batch", [(), (5,), (2, 3)])
+def test_round_trip(batch):
+    a, b = random(*batch, 4, 4, seed=15), random(*batch, 4, 4, seed=16)
+    basis = JoinTensor.compose(a, b)
+    turned = torch.einsum("...ab,...bijk->...aijk", random(*batch, 4, 4, seed=17), basis)
+    for tensor in (basis, turned):
+        for got, true in zip(JoinTensor.decompose(tensor), (a, b), strict=True):
+            torch.testing.assert_close(got, unit(true), atol=1e-9, rtol=0)
+    torch.testing.assert_close(projector(JoinTensor.compose(-3 * a, 0.1 * b)), projector(basis), atol=1e-10, rtol=0)
+
+
+def test_batch_equals_loop():
+    tensor = JoinTensor.compose(random(6, 4, 4, seed=18), random(6, 4, 4, seed=19)) + 0.01 * random(6, 4, 4, 4, 4, seed=20)
+    together = JoinTensor.decompose(tensor)
+    for i in range(6):
+        for got, alone in zip(together, JoinTensor.decompose(tensor[i]), strict=True):
+            torch.testing.assert_close(got[i], alone, atol=1e-11, rtol=0)
+
+
+@pytest.mark.parametrize(("source", "target"), [(1, 2), (1, 3), (2, 1), (2, 3), (3, 1), (3, 2)])
+def test_transfer_between_all_views(source, target):
+    scene = moving_points(15, batch=2, static=1.0, generator=generator(21))
+    tensor = JoinTensor.compose(*scene.motion)
+    got = JoinTensor.transfer(tensor, scene.exact[source - 1], source, target)
+    torch.testing.assert_close(got, scene.exact[target - 1], atol=1e-9, rtol=0)
+
+
+@pytest.mark.parametrize("view", [1, 2, 3])
+def test_trajectory_joins_the_positions(view):
+    scene = moving_points(15, batch=2, generator=generator(22))
+    others = [v for v in range(3) if v != view - 1]
+    frames = [torch.eye(4, dtype=torch.float64).expand(2, 4, 4), *scene.motion]
+    tensor = JoinTensor.compose(*scene.motion)
+    given = [scene.exact[v] for v in others]
+    positions = [homogeneous(apply(torch.linalg.inv(frames[view - 1]) @ frames[v], scene.exact[v])) for v in others]
+    planes = JoinTensor.trajectory_planes(tensor, *given, view)
+    assert planes.shape == (2, 15, 4, 4)
+    for p in positions:
+        assert (planes @ p[..., None]).abs().max() < 1e-10
+    line = JoinTensor.trajectory(tensor, *given, view)
+    p, q = positions
+    expected = torch.stack([p[..., i] * q[..., j] - p[..., j] * q[..., i] for i in range(4) for j in range(i + 1, 4)], dim=-1)
+    expected = expected / expected.norm(dim=-1, keepdim=True)
+    assert torch.minimum((line - expected).norm(dim=-1), (line + expected).norm(dim=-1)).max() < 1e-8
+    # the pencil has rank 2, and none is left where the point stays
+    assert (torch.linalg.svdvals(planes)[..., 2] < 1e-10).all()
+    still = moving_points(15, batch=2, static=1.0, generator=generator(22))
+    rest = JoinTensor.trajectory_planes(JoinTensor.compose(*still.motion), *(still.exact[v] for v in others), view)
+    assert rest.abs().max() < 1e-10
+    assert JoinTensor.trajectory(JoinTensor.compose(*still.motion), *(still.exact[v] for v in others), view).isfinite().all()
+
+
+def test_static_distance_tells_static_from_moving():
+    scene = moving_points(400, static=0.5, sigma=0.005, generator=generator(23))
+    distance = JoinTensor.static_distance(JoinTensor.compose(*scene.motion), *scene.views) / 0.005
+    still = scene.labels == 1
+    assert abs(distance[still].square().mean() - 6) < 0.8
+    assert (distance[~still] > distance[still].max()).all()
+
+
+def test_static_residual_has_six_degrees_of_freedom():
+    scene = moving_points(5000, batch=2, static=1.0, sigma=0.003, generator=generator(24))
+    residual = as_invariant(JoinTensor).whitened_static(scene.motion, scene.views, (0.003 * ONE,) * 3)
+    assert residual.shape == (2, 5000, 6)
+    assert abs(residual.square().sum(-1).mean() / 6 - 1) < 0.02
+    moving = as_invariant(JoinTensor).whitened(scene.motion, scene.views, (0.003 * ONE,) * 3)
+    assert abs(moving.square().sum(-1).mean() / 2 - 0.5) < 0.04
+
+
+@pytest.mark.parametrize(
+    ("n", "sigma", "reach"), [(60, 0.002, 0.12), (100, 0.002, 0.008), (500, 0.002, 0.0027), (500, 0.01, 0.013)]
+)
+def test_linear_accuracy_with_noise(n, sigma, reach):
+    """Normalized matches, singular vectors, decomposition: medians of 16 scenes, measured .082, .0052, .0021, .0103."""
+    scene = moving_points(n, batch=16, sigma=sigma, generator=generator(n))
+    points, frames = normalized(scene.views)
+    factor = torch.linalg.qr(rows(*points), mode="r").R
+    tensor = torch.linalg.svd(factor).Vh[..., -4:, :].unflatten(-1, (4, 4, 4))
+    motion = denormalized(JoinTensor.decompose(tensor), frames)
+    assert grid_error(motion, scene).median() < reach
+
+
+def test_compose_and_decompose_are_differentiable():
+    a, b = random(4, 4, seed=25).requires_grad_(), random(4, 4, seed=26).requires_grad_()
+    fixed = random(64, 3, seed=37)
+    assert torch.autograd.gradcheck(lambda a, b: projector(JoinTensor.compose(a, b)) @ fixed, (a, b), check_forward_ad=True)
+    noisy = (JoinTensor.compose(a, b).detach() + 0.03 * random(4, 4, 4, 4, seed=27)).requires_grad_()
+    assert torch.autograd.gradcheck(lambda t: torch.stack(JoinTensor.decompose(t)), (noisy,))
+
+
+def test_transfer_and_trajectory_are_differentiable():
+    scene = moving_points(2, generator=generator(28))
+    tensor = (JoinTensor.compose(*scene.motion) + 0.01 * random(4, 4, 4, 4, seed=29)).requires_grad_()
+    x, y = (v.clone().requires_grad_() for v in scene.exact[1:])
+    assert torch.autograd.gradcheck(lambda t, x: JoinTensor.transfer(t, x, 2, 1), (tensor, x))
+
+    def projector_of_line(t, x, y):
+        line = JoinTensor.trajectory(t, x, y)
+        return line[..., :, None] * line[..., None, :]
+
+    assert torch.autograd.gradcheck(projector_of_line, (tensor, x, y))
+
+
+def test_single_precision():
+    scene = moving_points(20, batch=2, static=1.0, generator=generator(30), dtype=torch.float32)
+    tensor = JoinTensor.compose(*scene.motion)
+    assert tensor.dtype == torch.float32
+    for got, true in zip(JoinTensor.decompose(tensor), scene.motion, strict=True):
+        torch.testing.assert_close(got, unit(true), atol=1e-5, rtol=0)
+    torch.testing.assert_close(JoinTensor.transfer(tensor, scene.exact[1], 2, 1), scene.exact[0], atol=1e-3, rtol=0)
+
+
+def test_degenerate_input_stays_finite():
+    zero = torch.zeros(4, 4, dtype=torch.float64)
+    a = torch.stack([zero, random(4, 4, seed=31)]).requires_grad_()
+    b = torch.stack([random(4, 4, seed=32), random(4, 4, seed=33)]).requires_grad_()
+    tensor = JoinTensor.compose(a, b)
+    assert (tensor[0] == 0).all()
+    torch.testing.assert_close(tensor[1], JoinTensor.compose(a[1], b[1]))
+    parts = JoinTensor.decompose(tensor)
+    assert all(part.isfinite().all() for part in parts)
+    torch.testing.assert_close(parts[0][1], unit(a[1]), atol=1e-10, rtol=0)
+    sum(part.square().sum() for part in JoinTensor.decompose(tensor + 0.1 * random(4, 4, 4, 4, seed=34))).backward()
+    assert a.grad.isfinite().all() and b.grad.isfinite().all()
+    assert JoinTensor.transfer(torch.zeros(4, 4, 4, 4, dtype=torch.float64), random(3, 3), 2, 1).isfinite().all()
+
+
+def test_nan_in_one_problem_leaves_the_others_alone():
+    tensor = JoinTensor.compose(random(3, 4, 4, seed=35), random(3, 4, 4, seed=36))
+    expected = JoinTensor.decompose(tensor)
+    broken = tensor.clone()
+    broken[1] = math.nan
+    for got, true in zip(JoinTensor.decompose(broken), expected, strict=True):
+        torch.testing.assert_close(got[[0, 2]], true[[0, 2]], atol=1e-12, rtol=0)
+
+
+def test_misuse_is_refused():
+    eye = torch.eye(4)
+    with pytest.raises(ValueError, match="A and B must be"):
+        JoinTensor.compose(eye, torch.eye(3))
+    with pytest.raises(ValueError, match="the four tensors of a fit"):
+        JoinTensor.decompose(torch.zeros(4, 4, 4))
+    tensor = JoinTensor.compose(eye, eye)
+    for source, target in ((1, 1), (0, 1), (2, 4)):
+        with pytest.raises(ValueError, match="two different views"):
+            JoinTensor.transfer(tensor, torch.zeros(1, 3), source, target)
+    with pytest.raises(ValueError, match="view must be 1, 2 or 3, got 0"):
+        JoinTensor.trajectory(tensor, torch.zeros(1, 3), torch.zeros(1, 3), view=0)

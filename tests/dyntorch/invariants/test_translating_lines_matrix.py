@@ -1,0 +1,351 @@
+"""Translating lines: against determinants of four points, brute-force ranks, automatic derivatives and synthetic scenes."""
+
+import pytest
+import torch
+
+from dyntorch.algebra.extensors import compound, plucker, plucker_form
+from dyntorch.algebra.homogeneous import apply, homogeneous, unit
+from dyntorch.invariants.translating_lines_matrix import TranslatingLinesMatrix
+from dyntorch.primitives import Line
+from dyntorch.residual import multilinear
+from dyntorch.scenes import translating_lines
+
+TL = TranslatingLinesMatrix
+ONES = (torch.ones((), dtype=torch.float64),) * 2
+
+
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def random(*shape, seed=0):
+    return torch.randn(*shape, generator=generator(seed), dtype=torch.float64)
+
+
+def wedge(p, q):
+    """Pluecker coordinates written out from the definition."""
+    return torch.stack([p[..., i] * q[..., j] - p[..., j] * q[..., i] for i in range(4) for j in range(i + 1, 4)], dim=-1)
+
+
+def lines(ends):
+    p, q = homogeneous(ends).unbind(-2)
+    return torch.nn.functional.normalize(wedge(p, q), dim=-1)
+
+
+def rows(l1, l2):
+    """Rows l2 x l1 from two points of each line."""
+    return torch.einsum("ni,nj->nij", lines(l2), lines(l1)).flatten(1)
+
+
+def rank(matrix):
+    return int(torch.linalg.matrix_rank(matrix, rtol=1e-9))
+
+
+def distance(first, second):
+    a, b = first.flatten(-2), second.flatten(-2)
+    return torch.minimum((a - b).norm(dim=-1), (a + b).norm(dim=-1))
+
+
+def move_ends(matrix, ends):
+    return apply(matrix, ends.flatten(-3, -2)).unflatten(-2, ends.shape[-3:-1])
+
+
+def test_declaration():
+    assert (TL.minimal(), TL.width(), TL.rows(), TL.shape(), TL.axes()) == (35, 36, 1, (6, 6), (1, 0))
+
+
+def test_compose_is_the_determinant_of_four_points():
+    matrix = random(4, 4, seed=1)
+    form = TL.compose(matrix)
+    ends1, ends2 = random(2, 20, 2, 3, seed=2)
+    p = homogeneous(ends1)
+    q = homogeneous(ends2) @ matrix.mT
+    determinant = torch.linalg.det(torch.cat([p, q], dim=-2))
+    value = torch.einsum("ni,ij,nj->n", plucker(ends2), form, plucker(ends1))
+    assert torch.allclose(value / determinant, (value / determinant)[0], rtol=1e-9)
+    scene = translating_lines(50, generator=generator(3))
+    assert (rows(*scene.views) @ TL.compose(*scene.motion).flatten()).abs().max() < 1e-13
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({}, 35),
+        ({"motion": "translation"}, 31),
+        ({"static": 1.0}, 20),
+        ({"motion": "objects", "objects": 1}, 20),
+        ({"motion": "objects", "objects": 2}, 28),
+        ({"motion": "objects", "objects": 3}, 31),
+        ({"motion": "objects", "objects": 4}, 31),
+    ],
+)
+def test_ranks(options, expected):
+    scene = translating_lines(150, generator=generator(4), **options)
+    assert rank(rows(*scene.views)) == expected
+    if expected in (31, 35):
+        assert rank(rows(*(x[:expected] for x in scene.views))) == expected
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({"motion": "translation"}, [31, 34, 35]),
+        ({"motion": "objects", "objects": 2}, [28, 34, 35]),
+        ({"motion": "objects", "objects": 1}, [20, 28, 33, 34, 35]),
+    ],
+)
+def test_static_points_complete_the_rank(options, expected):
+    scene = translating_lines(150, static_points=len(expected), generator=generator(5), **options)
+    found = []
+    for k in range(len(expected)):
+        l1, l2 = TL.static_point_lines(scene.extras["points1"][:k], scene.extras["points2"][:k])
+        found.append(rank(torch.cat([rows(*scene.views), rows(l1, l2)])))
+    assert found == expected
+
+
+def test_static_points_alone():
+    scene = translating_lines(1, batch=2, static_points=5, generator=generator(6))
+    x1, x2 = scene.extras["points1"], scene.extras["points2"]
+    l1, l2 = TL.static_point_lines(x1, x2, length=2.0)
+    assert l1.shape == l2.shape == (2, 45, 2, 3)
+    assert [rank(rows(l1[0, : 9 * k], l2[0, : 9 * k])) for k in range(1, 6)] == [9, 17, 24, 30, 35]
+    values = torch.einsum("bni,bij,bnj->bn", lines(l2), TL.compose(*scene.motion), lines(l1))
+    assert values.abs().max() < 1e-13
+    assert torch.equal(l1[..., 0, :], x1.repeat_interleave(9, dim=-2)) and torch.equal(
+        l2[..., 0, :], x2.repeat_interleave(9, dim=-2)
+    )
+    assert torch.allclose((l1[..., 1, :] - l1[..., 0, :]).norm(dim=-1), torch.full((2, 45), 2.0, dtype=torch.float64))
+    with pytest.raises(ValueError, match="alike"):
+        TL.static_point_lines(x1, x2[:, :4])
+
+
+def meeting(line, count, seed):
+    """Random lines that meet a line given by two points."""
+    on = line[0] + random(count, 1, seed=seed) * (line[1] - line[0])
+    return torch.stack([on, random(count, 3, seed=seed + 1)], dim=-2)
+
+
+def test_labelled_static_lines_against_brute_force():
+    """A static line may be replaced in either view by any line that meets it: 9 rows, and six such lines determine the matrix."""
+    scene = translating_lines(7, static=1.0, generator=generator(7))
+    l1, l2 = scene.views
+    direct, brute = [], []
+    for k in range(7):
+        first, second = lines(l1[k : k + 1]), lines(l2[k : k + 1])
+        free1, free2 = Line().free(l1[k : k + 1])[0], Line().free(l2[k : k + 1])[0]
+        direct += [torch.kron(free2, first), torch.kron(second, free1)]
+        for seed in (100 * k, 100 * k + 50):
+            brute += [rows(l1[k : k + 1].expand(20, 2, 3), meeting(l2[k], 20, seed + 10))]
+            brute += [rows(meeting(l1[k], 20, seed + 20), l2[k : k + 1].expand(20, 2, 3))]
+    found = [rank(torch.cat(direct[: 2 * k])) for k in range(1, 8)]
+    assert found == [rank(torch.cat(brute[: 4 * k])) for k in range(1, 8)]
+    assert found == [rank(torch.cat(direct[: 2 * k] + brute[: 4 * k])) for k in range(1, 8)]
+    assert found == [9, 18, 26, 31, 34, 35, 35]
+    assert (torch.cat(direct) @ TL.compose(*scene.motion).flatten()).abs().max() < 1e-12
+
+
+def test_pure_translation_family():
+    scene = translating_lines(120, motion="translation", sensors="projective", generator=generator(8))
+    (matrix,) = scene.motion
+    null = torch.linalg.svd(rows(*scene.views)).Vh[-5:]
+    # the plane at infinity of the world, as view 1 sees it: parallel lines of the world meet in it
+    infinity = infinity_of(scene)
+    family = TL.pure_translation_family(matrix, infinity).flatten(-2)
+    assert torch.allclose(family @ family.mT, torch.eye(5, dtype=torch.float64), atol=1e-12)
+    assert (rows(*scene.views) @ family.mT).abs().max() < 1e-11
+    assert torch.allclose(null.mT @ null, family.mT @ family, atol=1e-8)
+    member = TL.compose(matrix).flatten()
+    assert (member - family.mT @ (family @ member)).norm() < 1e-12
+    rigid = translating_lines(60, motion="translation", sensors="rigid", batch=3, generator=generator(9))
+    family = TL.pure_translation_family(*rigid.motion)
+    assert family.shape == (3, 5, 6, 6)
+    values = torch.einsum("bni,bkij,bnj->bkn", lines(rigid.views[1]), family, lines(rigid.views[0]))
+    assert values.abs().max() < 1e-12
+
+
+def infinity_of(scene):
+    """The plane that holds the meeting points of corresponding lines: they are parallel in the world."""
+    first = Line().raw(scene.exact[0])
+    second = Line().raw(move_ends(*scene.motion, scene.exact[1]))
+    points = []
+    for line1, line2 in zip(first, second, strict=True):
+        skew = torch.zeros(2, 4, 4, dtype=line1.dtype)
+        for k, line in enumerate((line1, line2 @ plucker_form())):
+            i, j = torch.triu_indices(4, 4, 1)
+            skew[k, i, j] = line
+        skew = skew - skew.mT
+        points.append(torch.linalg.svd(skew[0] @ skew[1]).U[:, 0])
+    return torch.linalg.svd(torch.stack(points)).Vh[-1]
+
+
+@pytest.mark.parametrize("scale", [1.0, -1.0, 2.5, -1e-3])
+def test_round_trip(scale):
+    matrix = unit(random(50, 4, 4, seed=10))
+    matrix[:25] = unit(torch.eye(4, dtype=torch.float64) + 0.2 * random(25, 4, 4, seed=11))
+    found = TL.decompose(scale * TL.compose(matrix))
+    assert (found - matrix).abs().max() < 1e-9
+    assert (torch.linalg.det(matrix) < 0).any() and (torch.linalg.det(matrix) > 0).any()
+
+
+def test_dof_is_the_rank_of_compose():
+    jacobian = torch.autograd.functional.jacobian(TL.compose, random(4, 4, seed=12))
+    assert rank(jacobian.flatten(2).flatten(0, 1)) == TL.dof
+
+
+def test_transfer_of_lines_and_points():
+    (matrix,) = translating_lines(1, batch=3, generator=generator(13)).motion
+    form = TL.compose(matrix)
+    ends2, points2 = random(3, 8, 2, 3, seed=14), random(3, 8, 3, seed=15)
+    ends1, points1 = move_ends(matrix, ends2), apply(matrix, points2)
+    for found, expected in (
+        (TL.transfer(form, ends2), lines(ends1)),
+        (TL.transfer(form, plucker(ends2), source=2), lines(ends1)),
+        (TL.transfer(form, ends1, source=1), lines(ends2)),
+    ):
+        cosine = (torch.nn.functional.normalize(found, dim=-1) * expected).sum(-1).abs()
+        assert torch.allclose(cosine, torch.ones_like(cosine), atol=1e-12)
+    assert (TL.transfer_points(form, points2) - points1).abs().max() < 1e-9
+    assert (TL.transfer_points(form, points1, source=1) - points2).abs().max() < 1e-9
+    with pytest.raises(ValueError, match="source must be"):
+        TL.transfer(form, ends1, source=3)
+
+
+def test_swept_plane_contains_both_lines():
+    scene = translating_lines(30, batch=2, generator=generator(16))
+    plane = TL.swept_plane(TL.compose(*scene.motion), *scene.views)
+    assert plane.shape == (2, 30, 4)
+    for ends in (scene.views[0], move_ends(*scene.motion, scene.views[1])):
+        assert torch.einsum("bnki,bni->bnk", homogeneous(ends), plane).abs().max() < 1e-10
+
+
+def test_linear_fit_recovers_the_motion():
+    scene = translating_lines(35, generator=generator(17))
+    null = torch.linalg.svd(rows(*scene.views)).Vh[-1].reshape(6, 6)
+    assert (TL.decompose(null) - scene.motion[0]).abs().max() < 1e-8
+    two = translating_lines(80, motion="objects", objects=2, static_points=2, generator=generator(18))
+    static = TL.static_point_lines(two.extras["points1"], two.extras["points2"])
+    matrix = torch.cat([rows(*two.views), rows(*static)])
+    assert (TL.decompose(torch.linalg.svd(matrix).Vh[-1].reshape(6, 6)) - two.motion[0]).abs().max() < 1e-8
+
+
+def reference_square(residual, views, scales):
+    """e^T (sum s^2 J J^T)^-1 e of one match, with automatic derivatives."""
+    e = residual(*views)
+    jacobians = [j.flatten(1) for j in torch.autograd.functional.jacobian(residual, views)]
+    q = sum(s**2 * j @ j.mT for s, j in zip(scales, jacobians, strict=True))
+    return e @ torch.linalg.solve(q, e)
+
+
+def test_moving_residual_against_automatic_derivatives():
+    scene = translating_lines(8, sigma=0.02, generator=generator(19))
+    (matrix,) = scene.motion
+    scales = tuple(torch.tensor(s, dtype=torch.float64) for s in (1.0, 0.5))
+    assert TL().whitened(scene.motion, scene.views, scales) is None
+    found = multilinear(TL(), TL.compose(matrix), scene.views, scales).square()
+
+    def residual(l1, l2):
+        return torch.linalg.det(torch.cat([homogeneous(l1), homogeneous(l2) @ matrix.mT]))[None]
+
+    expected = torch.stack([reference_square(residual, tuple(x[n] for x in scene.views), scales) for n in range(8)])
+    assert torch.allclose(found, expected, rtol=1e-9)
+
+
+def test_static_residual_against_automatic_derivatives():
+    scene = translating_lines(8, static=0.5, sigma=0.02, generator=generator(20))
+    (matrix,) = scene.motion
+    scales = tuple(torch.tensor(s, dtype=torch.float64) for s in (1.0, 0.5))
+    found = TL().whitened_static(scene.motion, scene.views, scales).square().sum(-1)
+    expected = []
+    for n in range(8):
+        l1, l2 = (x[n] for x in scene.views)
+        along = torch.nn.functional.normalize(l1[1] - l1[0], dim=0)
+        across = torch.linalg.svd(along[None]).Vh[1:]
+
+        def residual(a, b, across=across, along=along):
+            mapped = apply(matrix, b)
+            # where the line of view 1 passes at the same place, a constant as far as the noise is concerned
+            direction = a[1] - a[0]
+            place = ((mapped - a[0]) @ along) / (direction @ along)
+            return ((mapped - a[0] - place[:, None] * direction) @ across.mT).flatten()
+
+        e = residual(l1, l2)
+        expected.append((e, reference_square(residual, (l1, l2), scales)))
+    # to first order: the covariances differ by the angle between the lines, which is of the size of the residual
+    exact = torch.stack([s for _, s in expected])
+    still = ~scene.extras["moving"]
+    assert torch.allclose(found[still], exact[still], rtol=0.1)
+    assert (found[~still] > 50 * found[still].median()).all()
+    clean = translating_lines(10, static=1.0, generator=generator(21))
+    assert TL().whitened_static(clean.motion, clean.views, ONES).abs().max() < 1e-10
+    assert TL().whitened_static(clean.motion, tuple(map(plucker, clean.views)), ONES).abs().max() < 1e-9
+
+
+def test_residuals_follow_chi_squared():
+    sigma = torch.tensor(1e-3, dtype=torch.float64)
+    moving = translating_lines(4000, sigma=float(sigma), generator=generator(22))
+    still = translating_lines(4000, static=1.0, sigma=float(sigma), generator=generator(23))
+    square = multilinear(TL(), TL.compose(*moving.motion), moving.views, (sigma, sigma)).square()
+    assert square.mean().item() == pytest.approx(1, abs=4 * (2 / 4000) ** 0.5)
+    square = TL().whitened_static(still.motion, still.views, (sigma, sigma)).square().sum(-1)
+    assert square.mean().item() == pytest.approx(4, abs=4 * (8 / 4000) ** 0.5)
+    assert square.var().item() == pytest.approx(8, rel=0.25)
+
+
+def test_forward_mode_derivatives():
+    scene = translating_lines(5, sigma=0.01, generator=generator(24))
+    (matrix,) = scene.motion
+    tangents = random(2, 4, 4, seed=25)
+    step = 1e-6
+    for value in (
+        lambda m: multilinear(TL(), TL.compose(m), scene.views, ONES),
+        lambda m: TL().whitened_static((m,), scene.views, ONES),
+    ):
+        forward = torch.func.vmap(lambda d, value=value: torch.func.jvp(value, (matrix,), (d,))[1])(tangents)
+        for d, found in zip(tangents, forward, strict=True):
+            numeric = (value(matrix + step * d) - value(matrix - step * d)) / (2 * step)
+            assert torch.allclose(found, numeric, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.02])
+def test_gradient_of_the_nearest_matrix(noise):
+    form = (TL.compose(random(4, 4, seed=26)) + noise * random(6, 6, seed=27) / 6).requires_grad_()
+
+    def projector(x):
+        f = TL.compose(TL.decompose(x)).flatten()
+        return (f[:, None] * f)[::5, ::3]
+
+    assert torch.autograd.gradcheck(projector, form, eps=1e-7, atol=1e-5)
+
+
+def test_nothing_spoils_a_batch():
+    matrix = unit(random(5, 4, 4, seed=28))
+    bad = TL.compose(matrix)
+    bad[1], bad[2], bad[3] = 0.0, float("nan"), torch.outer(*random(2, 6, seed=29))
+    bad.requires_grad_()
+    found = TL.decompose(bad)
+    assert found.isfinite().all() and (found[1:3] == 0).all()
+    assert (found[[0, 4]] - matrix[[0, 4]]).abs().max() < 1e-9
+    assert (found[4] - TL.decompose(bad[4])).abs().max() < 1e-12
+    (gradient,) = torch.autograd.grad(found[[0, 4]].pow(3).sum(), bad)
+    assert gradient.isfinite().all()
+    zero = torch.zeros(4, 4, dtype=torch.float64)
+    same = torch.zeros(6, 2, 3, dtype=torch.float64)
+    assert TL.compose(zero).isfinite().all()
+    for m in (zero, matrix[0]):
+        assert TL().whitened_static((m,), (same, same), ONES).isfinite().all()
+        assert multilinear(TL(), TL.compose(m), (same, same), ONES).isfinite().all()
+        assert TL.swept_plane(TL.compose(m), same, same).isfinite().all()
+    assert TL.decompose(bad.float()).dtype == torch.float32
+    assert TL.decompose(bad[:0]).shape == (0, 4, 4)
+    with pytest.raises(ValueError, match="matrix must be"):
+        TL.decompose(matrix)
+
+
+def test_compound_root_needs_its_signs():
+    """The rows as common points of lines alone are no collineation: each is known up to scale and sign."""
+    matrix = unit(random(200, 4, 4, seed=30))
+    minors = compound(matrix, 2)
+    found = TL.decompose((plucker_form() @ minors).mT)
+    assert distance(found, matrix).max() < 1e-8
+    rescaled = unit(found / found.norm(dim=-1, keepdim=True))
+    assert distance(rescaled, matrix).median() > 0.1

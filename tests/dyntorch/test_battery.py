@@ -1,0 +1,32 @@
+"""The battery over all invariants."""
+
+import pytest
+
+import dyntorch as dyn
+from dyntorch.invariant import Invariant
+from tests import battery, battery_input, battery_noise
+from tests.cases import CASES
+
+PAIRS = [
+    pytest.param(check, case, id=f"{check.__name__}-{case!r}")
+    for check, applies in [*battery.CHECKS, *battery_noise.CHECKS, *battery_input.CHECKS]
+    for case in CASES
+    if applies(case)
+]
+
+
+@pytest.mark.parametrize(("check", "case"), PAIRS)
+def test_property(check, case):
+    check(case)
+
+
+def test_every_public_invariant_has_a_case():
+    public = {getattr(dyn, name) for name in dyn.__all__ if name[0].isupper()}
+    invariants = {x for x in public if isinstance(x, type) and issubclass(x, Invariant) and x is not Invariant}
+    assert len(invariants) >= 8
+    missing = invariants - {type(case.invariant) for case in CASES}
+    assert not missing, f"tests/cases.py has no case for {sorted(x.__name__ for x in missing)}"
+
+
+def test_cases_are_different():
+    assert len({repr(case) for case in CASES}) == len(CASES)

@@ -1,0 +1,428 @@
+"""Null spaces against the SVD and closed forms, their certificates on hard spectra, gradients against finite differences."""
+
+import pytest
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from dyntorch import eigenspace, nullspace
+from dyntorch.nullspace import gram_null_space, null_space
+
+aten = torch.ops.aten
+
+
+def random(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def rotation(*shape, seed=0):
+    return torch.linalg.qr(random(*shape, seed=seed)).Q
+
+
+def with_spectrum(singular, rows, batch=20, seed=0):
+    """``(batch, rows, D)`` matrices with these singular values (cut where rows are few), and their right vectors as rows."""
+    singular = torch.as_tensor(singular, dtype=torch.float64)
+    size = len(singular)
+    count = min(rows, size)
+    v = rotation(batch, size, size, seed=seed)
+    u = rotation(batch, rows, count, seed=seed + 1)
+    return (u * singular[:count]) @ v[..., :count].mT, v.mT
+
+
+def noisy_spectrum(size, dim, kappa=50.0, ratio=0.1):
+    s = torch.logspace(0, -torch.log10(torch.tensor(kappa)).item(), size - dim, dtype=torch.float64)
+    return torch.cat([s, s[-1] * ratio * torch.linspace(1.0, 0.5, dim, dtype=torch.float64)])
+
+
+def angle(a, b):
+    """Largest sine between row spaces, per problem."""
+    return (a - a @ b.mT @ b).norm(dim=(-2, -1))
+
+
+def projector(basis):
+    return basis.mT @ basis
+
+
+def gradient_holds(function, *inputs):
+    return torch.autograd.gradcheck(function, inputs, fast_mode=True)
+
+
+@pytest.fixture
+def accelerator(monkeypatch):
+    """The code takes the branches of an accelerator, and reading a value on the host raises."""
+    for module in (eigenspace, nullspace):
+        monkeypatch.setattr(module, "on_host", lambda tensor: False)
+    forbidden = {aten._local_scalar_dense.default, aten.nonzero.default, aten.is_nonzero.default, aten.equal.default}
+    forbidden |= {aten._linalg_eigh.default, aten._linalg_svd.default, aten._linalg_check_errors.default}
+
+    class NoWaiting(TorchDispatchMode):
+        def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+            # waits for the device: the values of a tensor, a decomposition that checks for errors, an index of booleans
+            masks = [i for i in args[1] if i is not None and i.dtype == torch.bool] if func is aten.index.Tensor else []
+            assert func not in forbidden and not masks, f"{func} waits for the device"
+            return func(*args, **(kwargs or {}))
+
+    return NoWaiting
+
+
+# --- values
+
+
+@pytest.mark.parametrize("size", [4, 9, 27, 36])
+@pytest.mark.parametrize("extra", [0, 1, 7, 60])
+@pytest.mark.parametrize("dim", [1, 3])
+@pytest.mark.parametrize("batch", [1, 24])
+def test_spans_what_the_svd_spans(size, extra, dim, batch):
+    matrix, expected = with_spectrum(noisy_spectrum(size, dim), size - dim + extra, batch, seed=size + extra)
+    basis = null_space(matrix, dim)
+    assert angle(basis, expected[:, -dim:]).max() < 1e-10
+    torch.testing.assert_close(basis @ basis.mT, torch.eye(dim, dtype=torch.float64).expand(batch, -1, -1))
+
+
+@pytest.mark.parametrize("dim", [1, 4])
+def test_gram_gives_the_same_space_with_its_eigenvalues(dim):
+    matrix, expected = with_spectrum(noisy_spectrum(64, dim), 80)
+    gram = matrix.mT @ matrix
+    found = gram_null_space(gram, dim)
+    values = torch.linalg.eigvalsh(gram)
+    assert angle(found.basis, expected[:, -dim:]).max() < 1e-10
+    torch.testing.assert_close(found.residual, values[:, :dim], rtol=1e-6, atol=1e-14)
+    torch.testing.assert_close(found.competing, (1 / values[:, dim:]).sum(-1), rtol=1e-6, atol=0)
+    assert not found.degenerate.any()
+    # rows of the basis are eigenvectors, in the order of the eigenvalues
+    torch.testing.assert_close(found.basis @ gram, found.residual[..., None] * found.basis, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("ratio", [1e-8, 0.3, 0.6, 0.9, 0.99, 0.9999])
+@pytest.mark.parametrize("dim", [1, 4])
+def test_close_competitors_are_told_apart(ratio, dim):
+    spectrum = noisy_spectrum(27, dim, kappa=30, ratio=ratio)
+    matrix, expected = with_spectrum(spectrum, 60, batch=50, seed=3)
+    limit = 1e-10 / (1 - ratio)
+    assert angle(null_space(matrix, dim), expected[:, -dim:]).max() < limit
+    assert angle(gram_null_space(matrix.mT @ matrix, dim).basis, expected[:, -dim:]).max() < limit
+
+
+@pytest.mark.parametrize(("kappa", "limit"), [(1e1, 1e-12), (1e3, 1e-10), (1e5, 1e-9), (1e7, 1e-7), (1e9, 1e-5)])
+def test_rows_lose_no_more_than_the_svd(kappa, limit):
+    matrix, expected = with_spectrum(noisy_spectrum(27, 1, kappa), 54, batch=30, seed=4)
+    assert angle(null_space(matrix), expected[:, -1:]).max() < limit
+    assert angle(null_space(matrix[:3]), expected[:3, -1:]).max() < limit
+
+
+def test_start_vectors_that_miss_the_null_vector_are_noticed():
+    start = eigenspace._generic(12, 2, torch.device("cpu"))
+    missed = rotation(12, 12, seed=5)
+    missed[:, 0] = torch.linalg.qr(torch.cat([start, missed], -1)).Q[:, 2]  # orthogonal to every start vector
+    v = torch.linalg.qr(missed).Q
+    gram = (v * torch.tensor([1e-4, *torch.linspace(0.1, 1, 11)])) @ v.mT
+    found = gram_null_space(gram.expand(20, -1, -1).contiguous())
+    assert angle(found.basis, v[:, :1].mT).max() < 1e-10
+
+
+def test_minimal_rows_that_are_dependent_still_give_a_null_vector():
+    matrix = random(10, 8, 9)
+    matrix[:, 3] = matrix[:, 1] - matrix[:, 2]
+    matrix[5:, 0] = 0.0
+    basis = null_space(matrix)
+    assert (matrix @ basis.mT).abs().max() < 1e-13
+    torch.testing.assert_close(basis.norm(dim=-1), torch.ones(10, 1, dtype=torch.float64))
+
+
+def test_growth_in_the_elimination_is_noticed():
+    # Wilkinson's matrix doubles an entry in every step of partial pivoting
+    size = 70
+    columns = torch.eye(size, dtype=torch.float64) - torch.ones(size, size, dtype=torch.float64).tril(-1)
+    columns[:, -1] = 1.0
+    matrix = (columns[:, :-1] + 1e-3 * random(size, size - 1, seed=6)).T.contiguous()
+    expected = torch.linalg.svd(matrix, full_matrices=True).Vh[-1:]
+    assert angle(null_space(matrix.expand(8, -1, -1)), expected).max() < 1e-10
+
+
+def test_no_rows_leave_everything():
+    basis = null_space(torch.zeros(3, 0, 4, dtype=torch.float64), dim=4)
+    torch.testing.assert_close(projector(basis), torch.eye(4, dtype=torch.float64).expand(3, -1, -1))
+
+
+@pytest.mark.parametrize("scale", [1e-140, 1e-20, 1e20, 1e140, 1e200])
+@pytest.mark.parametrize("rows", [26, 40])
+def test_units_do_not_matter(scale, rows):
+    matrix, expected = with_spectrum(noisy_spectrum(27, 1), rows)
+    assert angle(null_space(matrix * scale), expected[:, -1:]).max() < 1e-10
+
+
+def test_closed_form_of_a_plane():
+    points = random(30, 3, 3, seed=7)
+    normal = torch.linalg.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
+    plane = torch.cat([normal, -(normal * points[:, 0]).sum(-1, keepdim=True)], -1)
+    found = null_space(torch.cat([points, torch.ones(30, 3, 1, dtype=torch.float64)], -1))
+    assert angle(found, torch.nn.functional.normalize(plane, dim=-1)[:, None]).max() < 1e-11
+
+
+# --- the contract
+
+
+@pytest.mark.parametrize("rows", [8, 30])
+@pytest.mark.parametrize("batch", [(), (1,), (3,), (2, 5), (2, 3, 4)])
+def test_batch_equals_loop_including_signs(rows, batch):
+    matrix = random(*batch, rows, 9, seed=rows)
+    basis = null_space(matrix)
+    assert basis.shape == (*batch, 1, 9)
+    single = torch.stack([null_space(one) for one in matrix.reshape(-1, rows, 9)]).reshape(basis.shape)
+    torch.testing.assert_close(basis, single, rtol=0, atol=1e-9)
+    found = gram_null_space(matrix.mT @ matrix, 2)
+    assert found.basis.shape == (*batch, 2, 9) and found.residual.shape == (*batch, 2)
+    assert found.competing.shape == found.degenerate.shape == batch
+
+
+def test_signs_hold_where_entries_tie():
+    # skew tensors have pairs of entries of equal size: the sign must not hang on which one rounding makes larger
+    skew = torch.tensor([0.0, 3, -1, -3, 0, 2, 1, -2, 0], dtype=torch.float64)
+    skew = skew / skew.norm()
+    complement = torch.linalg.qr(torch.cat([skew[:, None], random(9, 8, seed=8)], -1)).Q[:, 1:]
+    matrices = torch.stack([random(8, 8, seed=seed) @ complement.T for seed in range(40)])
+    basis = null_space(matrices)
+    torch.testing.assert_close(basis, basis[:1].expand_as(basis), rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float16, torch.bfloat16])
+@pytest.mark.parametrize("rows", [26, 60])
+def test_lower_precision_is_solved_in_double(dtype, rows):
+    matrix, _ = with_spectrum(noisy_spectrum(27, 1), rows)
+    rounded = matrix.to(dtype)
+    basis = null_space(rounded)
+    assert basis.dtype == dtype
+    assert angle(basis.double(), null_space(rounded.double())).max() < 2 * torch.finfo(dtype).eps
+    found = gram_null_space((rounded.double().mT @ rounded.double()).float())
+    assert found.basis.dtype == found.residual.dtype == found.competing.dtype == torch.float32
+
+
+@pytest.mark.parametrize("shape", [(0, 5, 6), (0, 9, 6), (3, 0, 9, 6)])
+def test_no_problems_no_trouble(shape):
+    matrix = torch.zeros(shape, dtype=torch.float64, requires_grad=True)
+    null_space(matrix).sum().backward()
+    assert matrix.grad.shape == shape
+    found = gram_null_space(torch.zeros(*shape[:-2], 6, 6))
+    assert found.basis.shape == (*shape[:-2], 1, 6) and found.degenerate.shape == shape[:-2]
+
+
+@pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])
+@pytest.mark.parametrize(("rows", "batch"), [(8, 10), (30, 10), (30, 3), (8, 2)])
+def test_one_bad_problem_leaves_the_others_alone(value, rows, batch):
+    matrix = random(batch, rows, 9)
+    gram = matrix.mT @ matrix
+    expected, sound = null_space(matrix), gram_null_space(gram)
+    matrix[1, 2, 3], gram[1, 4, 4] = value, value
+    keep = torch.arange(batch) != 1
+    basis, found = null_space(matrix), gram_null_space(gram)
+    torch.testing.assert_close(basis[keep], expected[keep], rtol=0, atol=1e-12)
+    torch.testing.assert_close(found.basis[keep], sound.basis[keep], rtol=0, atol=1e-12)
+    assert basis[1].isnan().all()
+    assert (found.basis[1] == 0).all() and found.degenerate.tolist() == (~keep).tolist()
+    assert found.residual.isfinite().all() and found.competing.isfinite().all()
+
+
+@pytest.mark.parametrize("batch", [2, 30])
+@pytest.mark.parametrize(("size", "rank"), [(9, 7), (27, 25), (27, 10), (64, 62), (64, 1)])
+def test_a_null_space_that_is_larger_is_reported(batch, size, rank):
+    matrix = random(batch, 100, rank, seed=1) @ random(batch, rank, size, seed=2)
+    gram = matrix.mT @ matrix
+    found = gram_null_space(gram)
+    assert found.degenerate.all()
+    assert (gram @ found.basis.mT).norm(dim=(-2, -1)).max() < 1e-12 * gram.norm(dim=(-2, -1)).max()
+    assert not gram_null_space(gram, size - rank).degenerate.any()
+
+
+@pytest.mark.parametrize("batch", [2, 30])
+@pytest.mark.parametrize("size", [9, 27, 64])
+def test_bad_conditioning_is_not_a_larger_null_space(batch, size):
+    spectra = [
+        noisy_spectrum(size, 1, 1e6, ratio=1e-3),
+        torch.tensor([1.0] + [1e-6] * (size - 2) + [0.0]),
+        torch.tensor([1.0] * (size - 2) + [1e-6, 0.0]),
+    ]
+    for spectrum in spectra:
+        matrix, expected = with_spectrum(spectrum, 80, batch)
+        found = gram_null_space(matrix.mT @ matrix)
+        assert not found.degenerate.any()
+        assert angle(found.basis, expected[:, -1:]).max() < 1e-2
+
+
+def test_zero_and_identity_give_finite_results():
+    for gram in (torch.zeros(10, 6, 6), torch.eye(6).expand(10, -1, -1)):
+        found = gram_null_space(gram.double())
+        torch.testing.assert_close(found.basis.norm(dim=-1), torch.ones(10, 1, dtype=torch.float64))
+        assert found.residual.isfinite().all() and found.competing.isfinite().all()
+    assert gram_null_space(torch.zeros(10, 6, 6)).degenerate.all()
+
+
+def test_the_whole_space_is_a_null_space():
+    gram = random(6, 7, 3).mT @ random(6, 7, 3)
+    found = gram_null_space(gram, 3)
+    torch.testing.assert_close(projector(found.basis), torch.eye(3, dtype=torch.float64).expand(6, -1, -1))
+    torch.testing.assert_close(found.residual, torch.linalg.eigvalsh(gram))
+    assert (found.competing == 0).all() and not found.degenerate.any()
+
+
+def test_inference_mode_before_anything_else():
+    eigenspace._generic.cache_clear()
+    matrix = random(10, 30, 9)
+    with torch.inference_mode():
+        null_space(matrix)
+    leaf = matrix.clone().requires_grad_()
+    null_space(leaf).sum().backward()
+    assert leaf.grad.isfinite().all()
+
+
+def test_two_threads_give_the_same():
+    matrix = random(900, 60, 27)
+    expected = null_space(matrix)
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    found = null_space(matrix)
+    torch.set_num_threads(before)
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-10)
+
+
+def test_misuse_is_refused():
+    with pytest.raises(ValueError, match=r"\(5, 6, 9\).*6 rows.*at least 8.*dim=3"):
+        null_space(random(5, 6, 9))
+    with pytest.raises(ValueError, match="dim must be from 1 to D = 9, got 0"):
+        null_space(random(9, 9), dim=0)
+    with pytest.raises(ValueError, match="dim must be from 1 to D = 9, got 10"):
+        gram_null_space(random(9, 9), dim=10)
+    with pytest.raises(ValueError, match="matrix must be a floating point tensor"):
+        null_space(torch.ones(9, 9, dtype=torch.int64))
+    with pytest.raises(ValueError, match=r"gram must be a floating point tensor .*\(9,\)"):
+        gram_null_space(random(9))
+    with pytest.raises(ValueError, match=r"gram must be square .*\(8, 9\)"):
+        gram_null_space(random(8, 9))
+
+
+# --- gradients
+
+
+@pytest.mark.parametrize(
+    ("rows", "size", "dim"), [(8, 9, 1), (12, 9, 1), (60, 27, 1), (26, 27, 1), (20, 12, 4), (8, 12, 4), (10, 12, 4)]
+)
+@pytest.mark.parametrize("batch", [2, 6])
+def test_gradient_of_the_projector(rows, size, dim, batch):
+    matrix = with_spectrum(noisy_spectrum(size, dim, kappa=5, ratio=0.3), rows, batch)[0].requires_grad_()
+    assert gradient_holds(lambda a: projector(null_space(a, dim)), matrix)
+    assert gradient_holds(lambda a: projector(gram_null_space(a.mT @ a, dim).basis), matrix)
+
+
+def test_gradient_of_the_vector_itself():
+    matrix = random(6, 12, 9).requires_grad_()
+    assert gradient_holds(null_space, matrix)
+    assert gradient_holds(lambda a: gram_null_space(a.mT @ a).basis, matrix)
+
+
+def test_gradient_with_a_gram_alone():
+    gram = with_spectrum(noisy_spectrum(9, 1, kappa=5, ratio=0.3), 20)[0]
+    gram = (gram.mT @ gram).requires_grad_()
+    assert gradient_holds(lambda g: projector(gram_null_space((g + g.mT) / 2).basis), gram)
+
+
+@pytest.mark.parametrize("rows", [8, 20])
+def test_gradient_with_equal_other_singular_values(rows):
+    # torch.linalg.svd divides by their differences
+    spectrum = [1.0, 1.0, 1.0, 1.0, 0.5, 0.5, 0.5, 0.5, 0.1]
+    matrix = with_spectrum(spectrum, rows, batch=6)[0].requires_grad_()
+    assert gradient_holds(lambda a: projector(null_space(a)), matrix)
+
+
+def test_gradient_of_an_exact_null_space_of_four():
+    matrix = with_spectrum([3.0, 2.5, 2, 1.5, 1, 0, 0, 0, 0], 20, batch=6)[0].requires_grad_()
+    weights = random(9, 9, seed=9)
+    (projector(null_space(matrix, 4)) * weights).sum().backward()
+    # finite differences along directions that keep the null space exact, the only ones along which the function is smooth
+    step = (random(6, 20, 20, seed=10) @ matrix + matrix @ random(6, 9, 9, seed=11)).detach()
+    h = 1e-6
+
+    def loss(a):
+        vh = torch.linalg.svd(a.detach(), full_matrices=False).Vh[:, -4:]
+        return (projector(vh) * weights).sum((-2, -1))
+
+    expected = (loss(matrix + h * step) - loss(matrix - h * step)) / (2 * h)
+    torch.testing.assert_close((matrix.grad * step).sum((-2, -1)), expected, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("batch", [2, 10])
+def test_gradient_of_an_ambiguous_null_vector_is_finite_and_not_silent(batch):
+    matrix = with_spectrum([3.0, 2, 1, 0, 0], 12, batch)[0].requires_grad_()
+    (null_space(matrix) * random(5)).sum().backward()
+    assert matrix.grad.isfinite().all() and (matrix.grad.abs().amax((-2, -1)) > 0).all()
+    gram = (matrix.mT @ matrix).detach().requires_grad_()
+    (gram_null_space(gram).basis * random(5)).sum().backward()
+    assert gram.grad.isfinite().all() and (gram.grad.abs().amax((-2, -1)) > 0).all()
+
+
+@pytest.mark.parametrize("rows", [8, 20])
+def test_gradient_of_a_bad_problem_is_zero_and_of_the_others_unchanged(rows):
+    matrix = random(7, rows, 9)
+    good = matrix.clone().requires_grad_()
+    null_space(good).sum().backward()
+    matrix[2, 1, 1] = torch.nan
+    bad = matrix.requires_grad_()
+    null_space(bad).sum().backward()
+    keep = torch.arange(7) != 2
+    torch.testing.assert_close(bad.grad[keep], good.grad[keep])
+    assert (bad.grad[2] == 0).all()
+    gram = (matrix.mT @ matrix).detach().requires_grad_()
+    gram_null_space(gram).basis.sum().backward()
+    assert gram.grad.isfinite().all() and (gram.grad[2] == 0).all()
+
+
+@pytest.mark.parametrize("rows", [26, 60])
+def test_gradient_in_single_precision(rows):
+    matrix = with_spectrum(noisy_spectrum(27, 1, kappa=10), rows)[0].float()
+    exact, single = matrix.double().requires_grad_(), matrix.clone().requires_grad_()
+    null_space(exact).sum().backward()
+    null_space(single).sum().backward()
+    assert single.grad.dtype == torch.float32
+    torch.testing.assert_close(single.grad.double(), exact.grad, rtol=1e-4, atol=1e-4)
+
+
+# --- accelerators
+
+
+@pytest.mark.parametrize(("rows", "dim"), [(26, 1), (60, 1), (60, 4), (23, 4)])
+def test_nothing_waits_for_an_accelerator(accelerator, rows, dim):
+    matrix, expected = with_spectrum(noisy_spectrum(27, dim), rows)
+    matrix[3, 0, 0] = torch.nan
+    keep = torch.arange(20) != 3
+    leaf = matrix.requires_grad_()
+    with accelerator():
+        basis = null_space(leaf, dim)
+        basis.sum().backward()
+        gram = (leaf.mT @ leaf).detach().requires_grad_()
+        found = gram_null_space(gram, dim)
+        found.basis.sum().backward()
+    for result in (basis, found.basis):
+        assert angle(result[keep], expected[keep, -dim:]).max() < 1e-10
+    assert basis[3].isnan().all() and (found.basis[3] == 0).all()
+    assert found.degenerate.tolist() == (~keep).tolist()
+    assert leaf.grad.isfinite().all() and gram.grad.isfinite().all()
+
+
+def test_accelerator_reports_what_it_could_not_decide(accelerator):
+    matrix = random(10, 40, 5) @ random(10, 5, 9, seed=1)
+    assert gram_null_space(matrix.mT @ matrix).degenerate.all()
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+@pytest.mark.parametrize(("rows", "dim"), [(26, 1), (60, 1), (60, 4)])
+def test_cuda_equals_cpu(rows, dim):
+    matrix, _ = with_spectrum(noisy_spectrum(27, dim), rows)
+    here, there = matrix.clone().requires_grad_(), matrix.cuda().requires_grad_()
+    null_space(here.detach().cuda(), dim)  # libraries start up with waits of their own
+    torch.cuda.set_sync_debug_mode("error")
+    basis = null_space(there, dim)
+    projector(basis).square().sum((-2, -1)).sum().backward()
+    torch.cuda.set_sync_debug_mode("default")
+    projector(null_space(here, dim)).square().sum().backward()
+    assert basis.is_cuda
+    assert angle(basis.detach().cpu(), null_space(matrix, dim)).max() < 1e-10
+    torch.testing.assert_close(there.grad.cpu(), here.grad, rtol=1e-6, atol=1e-8)
+    gram = matrix.mT @ matrix
+    assert angle(gram_null_space(gram.cuda(), dim).basis.cpu(), gram_null_space(gram, dim).basis).max() < 1e-10
