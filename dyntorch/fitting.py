@@ -21,8 +21,8 @@ Measured: 0.02 for the homography tensor at 2 px and 0.1 at 5 px (100 matches), 
 ILL_CONDITIONED = 1e-10
 """Rounding error of a null vector from a float64 Gram, eps * (s_1 / s_{D-1})^2, above which the matrix itself is decomposed, unless
 the noise outweighs it a thousandfold anyway."""
-BLOCK = 1 << 19
-"""Numbers in the largest temporary of one block of the batch (4 MB)."""
+BLOCK = 1 << 20
+"""Numbers in the largest temporary of one block of the batch (8 MB)."""
 
 
 def fit(

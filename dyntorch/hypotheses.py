@@ -43,7 +43,7 @@ class Bundle:
 
     def first(self, weights: Tensor) -> Tensor:
         """Null spaces ``(b, c, K, a, D)`` of the weightings ``(b, K, n)`` of rows of unit length."""
-        norms = torch.ones((), dtype=weights.dtype, device=weights.device)
+        norms = torch.ones(1, 1, 1, dtype=weights.dtype, device=weights.device)
         for primitive, u in zip(self.primitives, self.vectors, strict=True):
             norms = norms * u.square().sum(-2) if primitive.rows == 1 else norms
         gram = self._gram(weights[:, None] / norms[:, :, None].clamp(min=1e-300))
@@ -116,7 +116,7 @@ class Bundle:
         return whiten(error, covariance).square().sum(-1)[:, 0], 1 / (size + SINGULAR)
 
     def _pullback(self, view: int, gradient: Tensor) -> Tensor:
-        """Derivative by the measured coordinates ``(b, c, .., coordinates, n)`` from that by the vectors ``(b, c, .., width, n)``."""
+        """Derivatives by the measured coordinates ``(b, c, .., d, n)`` from those by the vectors ``(b, c, .., width, n)``."""
         primitive = self.primitives[view]
         if isinstance(primitive, Point):
             return gradient[..., :-1, :]
@@ -137,7 +137,7 @@ def bundle(
     for primitive, x in zip(primitives, views, strict=True):
         rows, columns = torch.triu_indices(primitive.width, primitive.width, device=x.device)
         if primitive.rows > 1:
-            packed.append(primitive.form(x)[..., rows, columns])
+            packed.append(primitive.packed(x).mT)
             vectors.append(x.new_zeros(0))
         else:
             vectors.append(primitive.components(x))

@@ -64,20 +64,25 @@ def matches(invariant: Invariant, views: Sequence[Tensor], weights: Tensor | Non
     if bool((weight < 0).any()) if weight.device.type == "cpu" else False:
         raise ValueError(f"weights must not be negative, got {float(weight.min()):g}; use 0 to leave a match out")
     label = _option("static", static, batch, n, first)
+    if home.type == "cpu" and bool(torch.stack([x.detach().sum() for x in (*flat, weight)]).isfinite().all()):
+        # nothing is missing: one sum per view says so, and nothing is copied
+        return Matches(tuple(flat), weight, _labels(label, home), batch, first.dtype, first.device)
     present = weight.isfinite()
     for x in flat:
         present = present & x.isfinite().flatten(2).all(-1)
     clean = [torch.where(present[(..., *([None] * (x.ndim - 2)))], x, torch.zeros_like(x)) for x in flat]
-    if home.type == "cpu" and bool(present.all()):
-        clean = flat  # nothing to replace: no copy
     return Matches(
         tuple(clean),
         torch.where(present, weight, torch.zeros_like(weight)),
-        None if label is None else label.to(home).bool(),
+        _labels(label, home),
         batch,
         first.dtype,
         first.device,
     )
+
+
+def _labels(label: Tensor | None, home: torch.device) -> Tensor | None:
+    return None if label is None else label.to(home).bool()
 
 
 def _check(invariant: Invariant, views: Sequence[Tensor]) -> None:

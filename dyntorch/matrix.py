@@ -9,7 +9,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from dyntorch.primitives import Primitive
+from dyntorch.primitives import Primitive, triangle
 
 CHUNK = 1 << 18
 """Numbers per temporary of the Gram (2 MB, best of 1 to 16 MB): further matches are added in pieces, and memory does not grow."""
@@ -66,15 +66,22 @@ def gram(primitives: Sequence[Primitive], views: Sequence[Tensor], weights: Tens
     Returns:
         ``(*batch, width, width)``.
     """
-    n = weights.shape[-1]
-    lead = max(1, math.prod(torch.broadcast_shapes(*(x.shape[: p.match_axis(x)] for p, x in zip(primitives, views, strict=True)))))
-    step = max(256, CHUNK // (lead * math.prod(p.width * (p.width + 1) // 2 for p in primitives[1:])))
+    n, width = weights.shape[-1], math.prod(p.width * (p.width + 1) // 2 for p in primitives[1:])
+    shapes = [x.shape[: p.match_axis(x)] for p, x in zip(primitives, views, strict=True)]
+    lead = math.prod(torch.broadcast_shapes(*shapes, weights.shape[:-1]))
+    if weights.ndim == 2 and lead * n * width > CHUNK and len(weights) > 1:
+        # a few problems at a time, so that their products stay in the cache (copies have primitives of each problem)
+        size = max(1, CHUNK * len(weights) // max(1, lead * n * width))
+        label = [None] * len(weights.split(size)) if static is None else static.split(size)
+        parts = zip(*(x.split(size) for x in views), weights.split(size), label, strict=True)
+        return torch.cat([gram(primitives, part[:-2], part[-2], part[-1]) for part in parts])
+    step = max(256, CHUNK // max(1, lead * width))
     total: Tensor | None = None
     for start in range(0, max(n, 1), step):
         count = min(step, n - start)
         piece = [x.narrow(p.match_axis(x), start, count) for p, x in zip(primitives, views, strict=True)] if count < n else views
-        label = None if static is None else static.narrow(-1, start, count)
-        part = _moments(primitives, piece, weights.narrow(-1, start, count), label)
+        some = None if static is None else static.narrow(-1, start, count)
+        part = _moments(primitives, piece, weights.narrow(-1, start, count), some)
         total = part if total is None else total + part
     assert total is not None
     return unpack(total, tuple(p.width for p in primitives))
@@ -82,7 +89,7 @@ def gram(primitives: Sequence[Primitive], views: Sequence[Tensor], weights: Tens
 
 def _moments(primitives: Sequence[Primitive], views: Sequence[Tensor], weights: Tensor, static: Tensor | None) -> Tensor:
     """Packed Gram of one piece of the matches."""
-    packed = [packed_form(p, x) for p, x in zip(primitives, views, strict=True)]
+    packed = [p.packed(x) for p, x in zip(primitives, views, strict=True)]
     if static is None:
         return moment(packed, weights)
     moments = moment(packed, weights * ~static)
@@ -91,17 +98,8 @@ def _moments(primitives: Sequence[Primitive], views: Sequence[Tensor], weights: 
     return moments
 
 
-def packed_form(primitive: Primitive, x: Tensor) -> Tensor:
-    """Upper triangle of each measurement's form, component first: ``(*batch, width (width + 1) / 2, n)``."""
-    if primitive.rows > 1:
-        return _pack(primitive.form(x))
-    vector = primitive.components(x)
-    rows, columns = _triangle(primitive.width, x.device)
-    return vector.index_select(-2, rows) * vector.index_select(-2, columns)
-
-
 def _pack(form: Tensor) -> Tensor:
-    rows, columns = _triangle(form.shape[-1], form.device)
+    rows, columns = triangle(form.shape[-1], form.device)
     return form[..., rows, columns].mT
 
 
@@ -117,14 +115,6 @@ def unpack(moments: Tensor, widths: tuple[int, ...]) -> Tensor:
     """The Gram ``(*batch, D, D)`` of packed moments ``(*batch, m1 m2 ...)``."""
     size = math.prod(widths)
     return moments.index_select(-1, _unpacking(widths, moments.device)).unflatten(-1, (size, size))
-
-
-@lru_cache(maxsize=64)
-def _triangle(width: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    # an inference tensor left in the cache would break every later gradient
-    with torch.inference_mode(False):
-        rows, columns = torch.triu_indices(width, width, device=device)
-    return rows, columns
 
 
 @lru_cache(maxsize=64)

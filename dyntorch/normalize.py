@@ -40,7 +40,12 @@ def normalization(invariant: Invariant, views: Sequence[Tensor], weights: Tensor
         views: ``(*batch, n, ...)`` finite matches.
         weights: ``(*batch, n)``.
     """
-    transforms = tuple(_similarity(p.points(x), weights) for p, x in zip(invariant.primitives, views, strict=True))
+    points = [p.points(x) for p, x in zip(invariant.primitives, views, strict=True)]
+    if len({x.shape for x in points}) == 1:
+        # all views in one pass: a copy costs less than two more rounds of small operations
+        transforms = _similarity(torch.stack(points), weights).unbind(0)
+    else:
+        transforms = tuple(_similarity(x, weights) for x in points)
     primitives = tuple(p.normalized(t) for p, t in zip(invariant.primitives, transforms, strict=True))
     actions = tuple(p.action(t) for p, t in zip(invariant.primitives, transforms, strict=True))
     return Normalization(transforms, primitives, actions, tuple(t[..., 0, 0] for t in transforms))
@@ -55,8 +60,9 @@ def _similarity(points: Tensor, weights: Tensor) -> Tensor:
     centre = (flat * share).sum(-2).unflatten(-1, points.shape[-2:]).sum(-2)
     shifted = flat - centre.repeat(*([1] * (centre.ndim - 1)), points.shape[-2])[..., None, :]
     spread = (shifted.square() * share).sum((-2, -1))
-    # equal points have no scale: 1 keeps everything finite, and the rank says that they decide nothing
-    scale = torch.where(spread > 0, (d / torch.where(spread > 0, spread, 1.0)).sqrt(), 1.0)
+    # points that are equal to rounding have no scale: 1 keeps everything finite, and the rank says that they decide nothing
+    extended = spread > 1e-28 * centre.detach().square().sum(-1)
+    scale = torch.where(extended, (d / torch.where(extended, spread, 1.0)).sqrt(), 1.0)
     return similarity(scale, centre)
 
 

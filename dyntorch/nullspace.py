@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import prod
+from math import ceil, prod
 from typing import Any
 
 import torch
@@ -27,7 +27,8 @@ from dyntorch.eigenspace import (
 GRAM_BLOCK, ROWS_BLOCK = 2 * 2**20, 8 * 2**20  # bytes per block
 ACCURATE = 1e-6  # of the trace: a competing eigenvalue for which a Gram gives the null space to 1e-10
 STABLE = 1e-13  # |A v| / |A| of an LU that did not go wrong
-FEW = 4  # problems up to which one eigh each beats the overhead of many small operations
+FEW = 20_000  # entries of Gram matrices per block up to which eigh beats the overhead of many small operations (D = 9 ... 64)
+TINY = 150_000  # rows * D^2 in all up to which one SVD beats that of a Gram with eigh as well (8 problems of 200 x 9)
 
 
 @dataclass(frozen=True)
@@ -124,10 +125,18 @@ def _flat(matrix: Tensor) -> Tensor:
 
 def _size(matrix: Tensor) -> int:
     """Problems per block."""
-    rows, size = matrix.shape[-2:]
-    problems = min(GRAM_BLOCK // (8 * size * size), ROWS_BLOCK // (8 * max(rows, 1) * size))
-    # an accelerator wants everything at once: there the block only bounds the memory
-    return max(1, problems if on_host(matrix) else 256 * problems)
+    batch, rows, size = matrix.shape
+    problems = max(1, min(GRAM_BLOCK // (8 * size * size), ROWS_BLOCK // (8 * max(rows, 1) * size)))
+    if not on_host(matrix):
+        return 256 * problems  # an accelerator wants everything at once: there the block only bounds the memory
+    # as many blocks for every thread, unless that leaves too little to be worth a thread
+    threads = torch.get_num_threads()
+    blocks = threads * ceil(batch / (problems * threads))
+    return max(min(8, problems), ceil(batch / max(blocks, 1)))
+
+
+def _few(gram: Tensor) -> bool:
+    return on_host(gram) and gram.numel() <= FEW
 
 
 class _OfGram(torch.autograd.Function):
@@ -157,17 +166,19 @@ class _OfRows(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, matrix: Tensor, dim: int) -> Tensor:
         minimal = matrix.shape[-2] == matrix.shape[-1] - dim
-        solve = _solve_few if on_host(matrix) and len(matrix) <= FEW else _solve_rows
         # half of the backward would be to form the Gram again
-        keep = ctx.needs_input_grad[0] and not minimal
+        keep = ctx.needs_input_grad[0]
+        tiny = on_host(matrix) and matrix.numel() * matrix.shape[-1] <= TINY
 
         def block(matrix: Tensor) -> tuple[Tensor, Tensor]:
             a = matrix.double()
             none = a.new_empty(len(a), 0, 0)
             if minimal:
                 return fix_signs(_solve_minimal(a, dim)).mT.to(matrix.dtype), none
+            if tiny:
+                return fix_signs(_by_svd(a, dim)).mT.to(matrix.dtype), none
             gram = a.mT @ a
-            return fix_signs(solve(a, gram, dim)).mT.to(matrix.dtype), gram if keep else none
+            return fix_signs(_solve_rows(a, gram, dim)).mT.to(matrix.dtype), gram if keep else none
 
         basis, gram = map_blocks(block, matrix, size=_size(matrix))
         ctx.save_for_backward(matrix, gram, basis)
@@ -202,7 +213,7 @@ def _solve_gram(gram: Tensor, dim: int) -> tuple[Tensor, Tensor, Tensor, Tensor]
     """Basis, residual, competing and degenerate of one block."""
     scaled, scale, finite = unit_trace(gram)
     host = on_host(gram)
-    if (host and len(gram) <= FEW) or dim == gram.shape[-1]:
+    if _few(gram) or dim == gram.shape[-1]:
         vectors, values, competing, degenerate = by_eigh(scaled, dim)
     else:
         found = by_inverse_iteration(scaled, dim)
@@ -220,6 +231,9 @@ def _solve_rows(matrix: Tensor, gram: Tensor, dim: int) -> Tensor:
     scaled, scale, finite = unit_trace(gram)
     if dim == matrix.shape[-1]:
         return torch.where(finite[:, None, None], by_eigh(scaled, dim)[0], torch.nan)
+    if _few(gram):
+        values, vectors = torch.linalg.eigh(scaled)
+        return _with_svd(matrix, vectors[..., :dim].contiguous(), ~finite | (values[:, dim] < ACCURATE))
     found = by_inverse_iteration(scaled, dim)
     vectors = found.vectors
     if not on_host(matrix):
@@ -240,13 +254,6 @@ def _corrected(matrix: Tensor, scale: Tensor, vectors: Tensor, deflated: Tensor)
         residual = (matrix.mT @ image - vectors @ (image.mT @ image)) * scale[:, None, None]
         vectors = orthonormal(vectors - torch.cholesky_solve(residual, deflated))
     return vectors
-
-
-def _solve_few(matrix: Tensor, gram: Tensor, dim: int) -> Tensor:
-    """One call of eigh: for a few problems the overhead of many small operations outweighs their speed."""
-    scaled, _, finite = unit_trace(gram)
-    values, vectors = torch.linalg.eigh(scaled)
-    return _with_svd(matrix, vectors[..., :dim].contiguous(), ~finite | (values[:, dim:] < ACCURATE).any(-1))
 
 
 def _solve_minimal(matrix: Tensor, dim: int) -> Tensor:
@@ -272,11 +279,15 @@ def _solve_minimal(matrix: Tensor, dim: int) -> Tensor:
 def _with_svd(matrix: Tensor, vectors: Tensor, hard: Tensor) -> Tensor:
     """``vectors``, with the SVD's where ``hard`` (CPU only)."""
     chosen = hard.nonzero()[:, 0]
-    if len(chosen) == 0:
-        return vectors
-    rows, size = matrix.shape[-2:]
-    picked = matrix[chosen]
-    finite = torch.isfinite(picked).all(-1).all(-1)[:, None, None]
-    vh = torch.linalg.svd(torch.where(finite, picked, 0.0), full_matrices=rows < size).Vh  # raises for the whole batch on NaN
-    vectors[chosen] = torch.where(finite, vh[:, size - vectors.shape[-1] :].flip(-2).mT, torch.nan)
+    if len(chosen):
+        vectors[chosen] = _by_svd(matrix[chosen], vectors.shape[-1])
     return vectors
+
+
+def _by_svd(matrix: Tensor, dim: int) -> Tensor:
+    rows, size = matrix.shape[-2:]
+    finite = torch.isfinite(matrix).flatten(1).all(-1)[:, None, None]
+    sound = bool(finite.all())  # the SVD raises for the whole batch
+    vh = torch.linalg.svd(matrix if sound else torch.where(finite, matrix, 0.0), full_matrices=rows < size).Vh
+    vectors = vh[:, size - dim :].flip(-2).mT
+    return vectors if sound else torch.where(finite, vectors, torch.nan)

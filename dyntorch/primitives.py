@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -18,6 +19,15 @@ from dyntorch.algebra.homogeneous import homogeneous
 
 DIRECTION = [2, 4, 5]
 """Pluecker coordinates that hold the direction of a line (up to sign): those with the last homogeneous coordinate."""
+
+
+@lru_cache(maxsize=64)
+def triangle(width: int, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Rows and columns of the upper triangle of a square matrix, in the order in which symmetric matrices are packed."""
+    # an inference tensor left in the cache would break every later gradient
+    with torch.inference_mode(False):
+        rows, columns = torch.triu_indices(width, width, device=device)
+    return rows, columns
 
 
 class Primitive(ABC):
@@ -70,10 +80,14 @@ class Primitive(ABC):
     def pushforward(self, x: Tensor, change: Tensor) -> Tensor:
         r"""The other way: the change :math:`J c` of the raw vector, ``(*batch, n, width)``, for a change of the coordinates."""
 
-    def form(self, x: Tensor) -> Tensor:
-        r"""The sum :math:`\sum_r v_r v_r^T` over the vectors of each measurement, ``(*batch, n, width, width)``."""
-        vectors = self.vectors(x)
-        return vectors.mT @ vectors
+    def packed(self, x: Tensor) -> Tensor:
+        r"""Upper triangle of :math:`\sum_r v_r v_r^T` of each measurement, component first: ``(*batch, w (w + 1) / 2, n)``."""
+        rows, columns = triangle(self.width, x.device)
+        if self.rows > 1:
+            vectors = self.vectors(x)
+            return (vectors.mT @ vectors)[..., rows, columns].mT
+        components = self.components(x)
+        return components.index_select(-2, rows) * components.index_select(-2, columns)
 
     def free(self, x: Tensor) -> Tensor:
         """The form of all vectors that a static match allows in this slot: every vector, unless the primitive says otherwise."""
@@ -91,6 +105,10 @@ class Primitive(ABC):
     def normalized(self, transform: Tensor) -> Primitive:
         """The primitive that measures in normalized coordinates: the same one, unless it depends on the coordinates."""
         return self
+
+    def freedom(self) -> int:
+        """Degrees of freedom of one measurement, which is also how many conditions it fulfils where it is known."""
+        return self.dim
 
     def match_axis(self, x: Tensor) -> int:
         """Axis of the matches in ``x``: the one before the shape of a measurement."""
@@ -153,6 +171,12 @@ class HyperplanesThrough(Point):
     def vectors(self, x: Tensor) -> Tensor:
         eye = torch.eye(self.dim, dtype=x.dtype, device=x.device)
         return torch.cat([eye.expand(*x.shape, self.dim), -x[..., None]], dim=-1)
+
+    def packed(self, x: Tensor) -> Tensor:
+        moved = x.mT
+        one, zero = torch.ones_like(moved[..., :1, :]), torch.zeros_like(moved)
+        rows = [torch.cat([one, zero[..., i + 1 :, :], -moved[..., i : i + 1, :]], dim=-2) for i in range(self.dim)]
+        return torch.cat([*rows, moved.square().sum(-2, keepdim=True)], dim=-2)
 
     def action(self, transform: Tensor) -> Tensor:
         return torch.linalg.inv(transform).mT
@@ -228,6 +252,9 @@ class Line(Primitive):
         line = self.raw(x)
         length = line[..., DIRECTION].norm(dim=-1, keepdim=True).clamp(min=torch.finfo(x.dtype).eps)
         return (line / (length.sqrt() if self._as_points(x) else length)).mT
+
+    def freedom(self) -> int:
+        return 2 * (self.dim - 1)
 
     def free(self, x: Tensor) -> Tensor:
         """A line that lies still may be replaced by any line that meets it."""

@@ -256,7 +256,7 @@ def _refined(
     keep = good[(..., *([None] * (tensor.ndim - 1)))]
     conditions = torch.full_like(data.weights, float(invariant.codim))
     if data.static is not None:
-        still = sum(int(p.dim) for p in invariant.primitives[1:])
+        still = sum(p.freedom() for p in invariant.primitives[1:])
         conditions = torch.where(data.static, float(still), conditions)
     spare = ((data.weights > 0) * conditions).sum(-1) - invariant.dof
     mean = cost / data.weights.amax(-1).clamp(min=torch.finfo(cost.dtype).tiny)

@@ -168,21 +168,26 @@ def whiten(error: Tensor, covariance: Tensor) -> Tensor:
         >>> whiten(torch.tensor([2.0, 3.0]), torch.diag(torch.tensor([4.0, 9.0]))).tolist()
         [1.0, 1.0]
     """
-    size = error.shape[-1]
-    tiny = torch.finfo(error.dtype).eps ** 2
-    factor: list[list[Tensor]] = []
+    entries = [[covariance[..., i, j] for j in range(i + 1)] for i in range(error.shape[-1])]
+    return torch.stack(whiten_entries(error.unbind(-1), entries), dim=-1)
+
+
+def whiten_entries(error: Sequence[Tensor], covariance: Sequence[Sequence[Tensor | float]]) -> list[Tensor]:
+    """:func:`whiten` of c components, given the lower triangle of the covariance entry by entry (0.0 where it is zero)."""
+    tiny = torch.finfo(error[0].dtype).eps ** 2
+    factor: list[list[Tensor]] = []  # rows of the Cholesky factor, with the inverse on the diagonal
     solved: list[Tensor] = []
-    for i in range(size):
+    for i, value in enumerate(error):
         row: list[Tensor] = []
         for j in range(i):
-            inner = covariance[..., i, j]
+            inner = covariance[i][j]
             for k in range(j):
                 inner = inner - row[k] * factor[j][k]
-            row.append(inner / factor[j][j])
-        pivot, value = covariance[..., i, i], error[..., i]
+            row.append(inner * factor[j][j])
+        pivot = torch.as_tensor(covariance[i][i])
         for k in range(i):
             pivot, value = pivot - row[k].square(), value - row[k] * solved[k]
-        row.append(pivot.clamp(min=tiny).sqrt())
+        row.append(pivot.clamp(min=tiny).rsqrt())
         factor.append(row)
-        solved.append(value / row[i])
-    return torch.stack(solved, dim=-1)
+        solved.append(value * row[i])
+    return solved

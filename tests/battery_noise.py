@@ -6,12 +6,9 @@ import torch
 from torch import Tensor
 
 import dyntorch as dyn
-from tests.battery import CHECKS as SHARED
 from tests.battery import example, many, ok, prop, worst
 from tests.cases import Case, Motion, carried, moved_views
 from tests.references import apart, first_order, geometric, noisy, spans
-
-CHECKS = SHARED
 
 
 def projector(case: Case, tensor: Tensor) -> Tensor:
@@ -226,8 +223,8 @@ def covariance_is_calibrated(case: Case) -> None:
 
 @prop()
 def robust_fit_survives_outliers(case: Case) -> None:
-    n, sigma = max(100, 200 if case.outliers < 0.3 else 0), 0.5 * case.noise
-    scene = case.scene(n, batch=(3,), seed=31, outliers=case.outliers)
+    n, sigma = min(200, max(60, 5 * case.minimal)), 0.5 * case.noise
+    scene = case.scene(n, batch=(2,), seed=31, outliers=case.outliers)
     views = noisy(case, scene.views, sigma, seed=32)
     good = scene.labels != 0
     oracle = dyn.fit(case.invariant, *views, weights=good.double())

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.algebra.homogeneous import homogeneous, inhomogeneous
+from dyntorch.fitting import fit_matches
 from dyntorch.invariant import Invariant
 from dyntorch.invariants.join_tensor import JoinTensor
 from dyntorch.invariants.minimal_join_tensor import MinimalJoinTensor
@@ -15,14 +16,15 @@ from dyntorch.matches import Matches
 from dyntorch.robust import robust_fit
 from dyntorch.solution import FAILED, Solution, Status
 from dyntorch.tasks.alignment import MOVING, OUTLIER, STATIC, Alignment, Notice, NoticeCode, notices
-from dyntorch.tasks.labelling import CHI_SQUARE, ROUGH, SIGMAS, Evidence, Labelled
+from dyntorch.tasks.labelling import CHI_SQUARE, ROUGH, SIGMAS, Evidence, Labelled, joined
 from dyntorch.tasks.static_consensus import static_consensus
 
 MINIMAL = {"join": 47, "minimal_join": 47}
 FULL = 60  # matches for the join tensor itself, which joins the starts from there on
 SAMPLES = 1000
 """Samples of five matches: 97 % to draw five static ones where they are 20 % of all."""
-MEDIANS = {4: 3.357, 6: 5.348}  # of chi-square: what static_consensus divides by, what three views of space have
+MEDIAN = 1.386  # of chi-square with two degrees of freedom
+STATIC_MEDIANS = 3.357, 5.348  # of 4 (what static_consensus divides by) and of 6 (what three views of space have)
 STEPS = 30
 LABELLED = 9
 """Fewest matches where some are labelled static: five determine A and B, and room to tell static from moving."""
@@ -79,19 +81,18 @@ def _search(evidence: Evidence, threshold: float | None, model: str, generator: 
     given = None if threshold is None else torch.full_like(evidence.floor, threshold / SIGMAS).maximum(evidence.floor)
     starts = [_from_static(evidence, given, generator)]
     if evidence.data.count >= MINIMAL[model]:
-        starts.append(_from_tensor(MinimalJoinTensor(), evidence, given, threshold, generator))
+        starts.append(_from_tensor(MinimalJoinTensor(), evidence, given, generator))
         if model == "join" and evidence.data.count >= FULL:
-            starts.append(_from_tensor(JoinTensor(), evidence, given, threshold, generator))
-    size, count = len(evidence.floor), len(starts)
-    common = torch.stack([noise for _, noise in starts]).amin(0).maximum(evidence.floor)
-    rough = torch.arange(count, device=common.device).repeat_interleave(size) == 0
-    several = evidence.repeated(count)
-    sigma = common if given is not None else 2 * common
-    settled = several.settle(torch.cat([theta for theta, _ in starts]), sigma.repeat(count), rough, estimate=given is None)
-    shared = settled.sigma.unflatten(0, (count, size)).amin(0)
-    cost = several.cost(settled.theta, shared.repeat(count)).unflatten(0, (count, size))
-    chosen = cost.argmin(0) * size + torch.arange(size, device=cost.device)
-    return Labelled(settled.theta[chosen], settled.labels[chosen], settled.sigma[chosen], cost.amin(0))
+            starts.append(_from_tensor(JoinTensor(), evidence, given, generator))
+    count, size = len(starts), len(evidence.floor)
+    # the least estimate is that of a motion most matches agree with; it may still be low, for static matches show half the noise
+    sigma = given if given is not None else 2 * torch.stack([noise for _, noise in starts]).amin(0).maximum(evidence.floor)
+    several, noise = evidence.repeated(count), sigma.repeat(count)
+    rough = torch.arange(count, device=sigma.device).repeat_interleave(size) == 0
+    theta = several.improved(torch.cat([start for start, _ in starts]), noise, rough)
+    best = several.cost(theta, noise).unflatten(0, (count, size)).argmin(0)
+    chosen = theta[best * size + torch.arange(size, device=best.device)]
+    return evidence.settled(chosen, sigma, estimate=given is None)
 
 
 def _from_static(evidence: Evidence, given: Tensor | None, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
@@ -108,34 +109,44 @@ def _from_static(evidence: Evidence, given: Tensor | None, generator: torch.Gene
     theta = torch.cat([part.flatten(1) for part in motion], dim=-1)
     if given is not None:
         return theta, given
-    return theta, (variance * MEDIANS[4] / MEDIANS[6]).nan_to_num(posinf=1.0).sqrt() / scale
+    return theta, (variance * STATIC_MEDIANS[0] / STATIC_MEDIANS[1]).nan_to_num(posinf=1.0).sqrt() / scale
 
 
 def _from_tensor(
-    invariant: Invariant, evidence: Evidence, given: Tensor | None, threshold: float | None, generator: torch.Generator | None
+    invariant: Invariant, evidence: Evidence, given: Tensor | None, generator: torch.Generator | None
 ) -> tuple[Tensor, Tensor]:
     """Motion of a tensor by robust estimation, and the noise that the median of all matches shows."""
     data = evidence.data
-    found = robust_fit(invariant, *data.views, threshold=threshold, weights=data.weights, generator=generator)
+    # of so few matches no half determines a motion, so that the noise cannot be told from outliers
+    plain = (given is None and data.count < 3 * JoinTensor.dof) or not len(data.weights)
+    found = (
+        fit_matches(invariant, replace(data, static=None))
+        if plain
+        else robust_fit(invariant, *data.views, threshold=given, weights=data.weights, generator=generator)
+    )
     theta = evidence.parameters(tuple(part.reshape(-1, 4, 4) for part in found.motion))
     usable = theta.isfinite().all(-1)
     for state in FAILED:
-        usable = usable & (found.status != state)
+        usable = usable & (found.status.reshape(-1) != state)
     identity = torch.eye(4, dtype=theta.dtype, device=theta.device).flatten().repeat(2) / 2
     theta = torch.where(usable[:, None], theta, identity)
     if given is not None:
         return theta, given
-    moving, _ = evidence.residuals(theta)
-    present = data.weights > 0
-    spare = (1 - JoinTensor.dof / (2.0 * present.sum(-1)).clamp(min=31)).clamp(min=0.1)
-    noise = torch.where(present, moving, torch.nan).nanmedian(dim=-1).values.nan_to_num() / (1.386 * spare)
-    return theta, torch.where(usable, noise.sqrt(), torch.inf)
+    if plain:
+        refined = evidence.refined(theta, torch.where(data.weights > 0, MOVING, OUTLIER), STEPS)
+        assert refined.sigma is not None
+        theta, noise = joined(refined), refined.sigma
+    else:
+        motion = evidence.problem(torch.zeros_like(data.weights)).parts(theta)
+        moving = JoinTensor().whitened(motion, evidence.views, evidence.norm.scales).square().sum(-1)
+        noise = (torch.where(data.weights > 0, moving, torch.nan).nanmedian(dim=-1).values / MEDIAN).sqrt()
+    return theta, torch.where(usable & noise.isfinite(), noise, torch.inf)
 
 
 def _solved(evidence: Evidence, best: Labelled) -> tuple[Solution, Tensor, Tensor]:
     """The solution with its status, the final labels (none where there is no motion), and the worst standard deviation."""
     refined = evidence.refined(best.theta, best.labels, STEPS)
-    theta = torch.cat([part.flatten(1) for part in refined.normalized_motion()], dim=-1)
+    theta = joined(refined)
     values, spread = evidence.information(theta, best.labels)
     labels = evidence.labels(theta, best.sigma, spread)
     worst = best.sigma * values[:, 0].clamp(min=torch.finfo(values.dtype).tiny).rsqrt() * torch.stack(evidence.norm.scales).amax(0)

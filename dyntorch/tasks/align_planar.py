@@ -21,14 +21,21 @@ SAMPLES = 1000
 """Samples of four matches: 96 % to draw four static ones where they are 24 % of all (30 % static, 20 % outliers)."""
 STEPS = 30
 MINIMAL = HomographyTensor.minimal()
+FEW = 3 * HomographyTensor.dof
+"""Matches below which half of them do not determine a motion with certainty: noise and outliers cannot be told apart by it."""
 LABELLED = 9
 """Fewest matches where some are labelled static: nine rows each for 26 equations, and room to tell static from moving."""
 INDETERMINATE = 1e-13
 """Information on the worst direction of the motion over that on the best, below which it is rounding error."""
 AMBIGUOUS = 0.5
 """Standard deviation of the worst direction of the motion, of norm 1, above which the motion is not known at all."""
+NOISY = 0.05
+"""Noise over the extent of the points, above which agreement with a motion is an accident."""
 CONSENSUS = 0.4
 """Share of inliers below which the best motion may be an accident."""
+UNIFORM, DOUBTFUL = 1.3, 0.7
+"""Noise that the inliers show over the assumed noise, above which they fill the limits evenly as random matches do (1.7), where
+their share is below the second figure."""
 SPARE = 8
 """Conditions beyond the 16 degrees of freedom that inliers must fulfil: a minimal set fulfils 16 whatever it is."""
 
@@ -42,6 +49,7 @@ def align_planar(
     x1: Tensor,
     x2: Tensor,
     x3: Tensor,
+    *,
     threshold: float | None = 1.5,
     weights: Tensor | None = None,
     static: Tensor | None = None,
@@ -131,13 +139,16 @@ def _align(data: Matches, threshold: float | None, generator: torch.Generator | 
 
 def _search(evidence: Evidence, threshold: float | None, generator: torch.Generator | None) -> Labelled:
     """The better one of the motions that the two searches start from, with its labels."""
+    size = len(evidence.floor)
     given = None if threshold is None else torch.full_like(evidence.floor, threshold / SIGMAS).maximum(evidence.floor)
     starts = [_from_static(evidence, given, generator)]
-    if evidence.data.count >= MINIMAL:
+    if MINIMAL <= evidence.data.count < FEW:
+        starts.append(_from_all(evidence, given))
+    if size and evidence.data.count >= (MINIMAL if given is not None else FEW):
         starts.append(_from_tensor(evidence, given, generator))
-    count, size = len(starts), len(evidence.floor)
+    count = len(starts)
     # the smaller estimate is that of a motion most matches agree with; it may still be low, for static matches show half the noise
-    sigma = given if given is not None else 2 * torch.stack([noise for _, noise in starts]).amin(0).maximum(evidence.floor)
+    sigma = given if given is not None else 1.5 * torch.stack([noise for _, noise in starts]).amin(0).maximum(evidence.floor)
     several, noise = evidence.repeated(count), sigma.repeat(count)
     rough = torch.arange(count, device=sigma.device).repeat_interleave(size) == 0
     theta = several.improved(torch.cat([start for start, _ in starts]), noise, rough)
@@ -164,29 +175,32 @@ def _from_static(evidence: Evidence, given: Tensor | None, generator: torch.Gene
 def _from_tensor(evidence: Evidence, given: Tensor | None, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
     """Motion of the homography tensor by robust estimation, and the noise by the median distance from it."""
     data = evidence.data
-    # of so few matches no half determines a motion, so that the noise cannot be told from outliers
-    plain = given is None and data.count < 3 * HomographyTensor.dof
-    found = (
-        fit_matches(HomographyTensor(), replace(data, static=None))
-        if plain
-        else robust_fit(HomographyTensor, *data.views, threshold=given, weights=data.weights, generator=generator)
-    )
+    found = robust_fit(HomographyTensor, *data.views, threshold=given, weights=data.weights, generator=generator)
+    theta, usable = _usable(evidence, found)
+    if given is not None:
+        return theta, given
+    moving, _ = evidence.residuals(theta)
+    noise = torch.where(data.weights > 0, moving[..., 0].abs(), torch.nan).nanmedian(dim=-1).values / 0.6745
+    return theta, torch.where(usable & noise.isfinite(), noise, torch.inf)
+
+
+def _from_all(evidence: Evidence, given: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Motion as if all matches were moving inliers, and the noise that they then show."""
+    data = evidence.data
+    theta, usable = _usable(evidence, fit_matches(HomographyTensor(), replace(data, static=None)))
+    refined = evidence.refined(theta, torch.where(data.weights > 0, MOVING, OUTLIER), STEPS)
+    assert refined.sigma is not None
+    return joined(refined), torch.where(usable, refined.sigma, torch.inf) if given is None else given
+
+
+def _usable(evidence: Evidence, found: Solution) -> tuple[Tensor, Tensor]:
+    """The motion of a solution, the identity where it failed, and where it did not."""
     theta = evidence.parameters(tuple(part.reshape(-1, 3, 3) for part in found.motion))
     usable = theta.isfinite().all(-1)
     for state in FAILED:
         usable = usable & (found.status != state)
     identity = torch.eye(3, dtype=theta.dtype, device=theta.device).flatten().repeat(2)
-    theta = torch.where(usable[:, None], theta, identity)
-    if given is not None:
-        return theta, given
-    if plain:
-        refined = evidence.refined(theta, torch.where(data.weights > 0, MOVING, OUTLIER), STEPS)
-        assert refined.sigma is not None
-        theta, noise = joined(refined), refined.sigma
-    else:
-        moving, _ = evidence.residuals(theta)
-        noise = torch.where(data.weights > 0, moving, torch.nan).nanmedian(dim=-1).values.sqrt() / 0.6745
-    return theta, torch.where(usable & noise.isfinite(), noise, torch.inf)
+    return torch.where(usable[:, None], theta, identity), usable
 
 
 def _solved(evidence: Evidence, best: Labelled) -> tuple[Solution, Labelled]:
@@ -196,10 +210,11 @@ def _solved(evidence: Evidence, best: Labelled) -> tuple[Solution, Labelled]:
     values, spread = evidence.information(theta, best.labels)
     labels = evidence.labels(theta, best.sigma, spread)
     worst = best.sigma * values[:, 0].clamp(min=torch.finfo(values.dtype).tiny).rsqrt()
-    status = _status(evidence, labels, worst, values[:, 0] <= INDETERMINATE * values[:, -1])
+    assert refined.sigma is not None and refined.covariance is not None
+    best = Labelled(theta, labels, best.sigma)
+    status = _status(evidence, best, refined.sigma, worst, values[:, 0] <= INDETERMINATE * values[:, -1])
     failed = (status == Status.DEGENERATE) | (status == Status.TOO_FEW)
     labels = torch.where(failed[:, None], OUTLIER, labels)
-    assert refined.sigma is not None and refined.covariance is not None
     zero = failed[:, None, None]
     solution = replace(
         refined,
@@ -211,16 +226,22 @@ def _solved(evidence: Evidence, best: Labelled) -> tuple[Solution, Labelled]:
         uncertainty=torch.where(failed, 0.0, worst),
         inliers=labels != OUTLIER,
     )
-    return solution, replace(best, theta=theta, labels=labels)
+    return solution, replace(best, labels=labels)
 
 
-def _status(evidence: Evidence, labels: Tensor, worst: Tensor, undetermined: Tensor) -> Tensor:
-    """``(b,)`` from the inliers, the standard deviation of the worst direction of the motion, and whether there is none at all."""
+def _status(evidence: Evidence, best: Labelled, shown: Tensor, worst: Tensor, undetermined: Tensor) -> Tensor:
+    """``(b,)`` from the inliers, the noise they show, the uncertainty of the motion, and whether a part of it is free."""
     usable = evidence.data.weights > 0
     present = usable.sum(-1)
     known = torch.zeros_like(present) if evidence.data.static is None else (usable & evidence.data.static).sum(-1)
-    still, moving = (labels == STATIC).sum(-1), (labels == MOVING).sum(-1)
-    accident = (still + moving < CONSENSUS * present) | (4 * still + moving < HomographyTensor.dof + SPARE)
+    still, moving = (best.labels == STATIC).sum(-1), (best.labels == MOVING).sum(-1)
+    share = (still + moving) / present.clamp(min=1)
+    accident = (
+        (share < CONSENSUS)
+        | ((share < DOUBTFUL) & (shown > UNIFORM * best.sigma))
+        | (4 * still + moving < HomographyTensor.dof + SPARE)
+    )
+    accident = accident | (best.sigma * torch.stack(evidence.norm.scales).amax(0) > NOISY)
     status = torch.full_like(present, int(Status.OK))
     status = torch.where(worst > AMBIGUOUS, int(Status.AMBIGUOUS), status)
     status = torch.where(accident, int(Status.NO_CONSENSUS), status)

@@ -13,7 +13,7 @@ from dyntorch.robust import robust_fit
 from dyntorch.solution import FAILED, Status
 from dyntorch.tasks.alignment import OUTLIER, STATIC, Alignment, Notice, NoticeCode, notices
 from dyntorch.tasks.labelling import CHI_SQUARE, SIGMAS, Evidence
-from dyntorch.tasks.velocity_model import DOF, GAUGE, Velocities, information, settle, world_velocities
+from dyntorch.tasks.velocity_model import DOF, GAUGE, Velocities, information, residuals, settle, world_velocities
 
 MINIMAL = {False: 21, True: 7}
 SAMPLES, SAMPLE = 150, 8
@@ -155,7 +155,7 @@ def _affine_maps(null: Tensor, mean: Tensor, ok: Tensor) -> Tensor:
 def _starting_noise(evidence: Evidence, theta: Tensor, given: Tensor | None) -> Tensor:
     if given is not None:
         return given
-    moving, _ = evidence.residuals(theta)
+    moving, _ = residuals(evidence, theta)
     middle = torch.where(evidence.data.weights > 0, moving, torch.nan).nanmedian(dim=-1).values.nan_to_num()
     return (middle / MEDIAN).sqrt().maximum(evidence.floor)
 

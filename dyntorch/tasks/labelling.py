@@ -19,12 +19,15 @@ CHI_SQUARE = {1: 9.0, 2: 11.829, 3: 14.156, 4: 16.251, 6: 20.062}
 """Quantiles of chi^2 at 99.73 %: what three standard deviations are for one condition, for several."""
 SIGMAS = 3.0
 """The threshold in standard deviations of the noise."""
-ROUNDS = 3
+ROUNDS, ESTIMATING = 3, 6
+"""Turns of labelling and refining, with the noise known and with the noise to be found as well."""
 ROUGH = 3.0
 """How much wider than the noise the first labels are where the motion comes from a minimal sample."""
+STEADY = 0.02
+"""Relative change of the noise that needs no further turn."""
 WIDEST = 4.0
-"""No uncertainty of the motion widens the limit for static matches more than so many times: calling a static match moving costs
-some accuracy, calling a moving one static gives a wrong motion."""
+"""No uncertainty of the motion widens a limit more than so many times: calling a static match moving costs some accuracy, calling
+a moving one static gives a wrong motion."""
 STEPS = 6
 """Levenberg-Marquardt steps between two labellings."""
 
@@ -94,9 +97,9 @@ class Evidence:
         return Problem(self.invariant, shapes, self.views, self.norm.scales, weights, labels == STATIC)
 
     def residuals(self, theta: Tensor) -> tuple[Tensor, Tensor]:
-        """Square ``(b, n)`` of the residual of every match if it moves, and its vector ``(b, n, c)`` if it stands still."""
+        """Whitened residual ``(b, n, c)`` of every match if it moves, and if it stands still."""
         motion = self.problem(torch.zeros_like(self.data.weights)).parts(theta)
-        moving = whitened(self.invariant, motion, self.views, self.norm.scales).square().sum(-1)
+        moving = whitened(self.invariant, motion, self.views, self.norm.scales)
         return moving, self.invariant.whitened_static(motion, self.views, self.norm.scales)
 
     def cost(self, theta: Tensor, sigma: Tensor) -> Tensor:
@@ -108,49 +111,52 @@ class Evidence:
         moving, resting = self.residuals(theta)
         variance = sigma.square()[:, None]
         still, path = CHI_SQUARE[resting.shape[-1]], CHI_SQUARE[self.invariant.codim]
-        other = still + (moving / variance).clamp(max=path)
+        other = still + (moving.square().sum(-1) / variance).clamp(max=path)
         if self.data.static is not None:
             other = torch.where(self.data.static, still + path, other)
         cost = torch.minimum(resting.square().sum(-1) / variance, other)
         return (self.data.weights * cost.nan_to_num(nan=still + path)).sum(-1)
 
     def labels(self, theta: Tensor, sigma: Tensor, spread: Tensor | None = None) -> Tensor:
-        """``(b, n)``; ``spread (b, p, p)`` is the covariance of theta for noise 1, which widens the limit for static matches."""
+        """``(b, n)``; ``spread (b, p, p)`` is the covariance of theta for noise 1, which widens the limits."""
         moving, resting = self.residuals(theta)
         variance = sigma.square()[:, None]
-        plain = resting.square().sum(-1)
-        limit = CHI_SQUARE[resting.shape[-1]] * variance
-        still = plain <= limit
+        path, still = moving.square().sum(-1), resting.square().sum(-1)
+        limits = [CHI_SQUARE[c] * variance for c in (self.invariant.codim, resting.shape[-1])]
+        agree = [path <= limits[0], still <= limits[1]]
         if spread is not None:
-            widened = torch.cat([self._widened(theta, spread, piece) for piece in self._pieces(theta)], dim=-1)
-            still = still | ((widened <= limit) & (plain <= WIDEST**2 * limit))
-        path = moving <= CHI_SQUARE[self.invariant.codim] * variance
+            pieces = [self._widened(theta, spread, piece) for piece in self._pieces(theta)]
+            for k, (plain, limit) in enumerate(zip((path, still), limits, strict=True)):
+                widened = torch.cat([piece[k] for piece in pieces], dim=-1)
+                agree[k] = agree[k] | ((widened <= limit) & (plain <= WIDEST**2 * limit))
         if self.data.static is not None:
-            path = path & ~self.data.static
-        labels = torch.where(still, STATIC, torch.where(path, MOVING, OUTLIER))
+            agree[0] = agree[0] & ~self.data.static
+        labels = torch.where(agree[1], STATIC, torch.where(agree[0], MOVING, OUTLIER))
         return torch.where(self.data.weights > 0, labels, OUTLIER)
 
     def _pieces(self, theta: Tensor) -> list[slice]:
         return self.problem(torch.zeros_like(self.data.weights)).pieces(theta.shape[-1])
 
-    def _widened(self, theta: Tensor, spread: Tensor, piece: slice) -> Tensor:
-        """Square of the static residual ``(b, piece)`` whitened by the uncertainty of the motion as well."""
+    def _widened(self, theta: Tensor, spread: Tensor, piece: slice) -> tuple[Tensor, Tensor]:
+        """Squares ``(b, piece)`` of the two residuals whitened by the uncertainty of the motion as well."""
         views = tuple(x[:, piece] for x in self.views)
         problem = self.problem(torch.zeros_like(self.data.weights))
 
-        def resting(t: Tensor) -> Tensor:
-            return self.invariant.whitened_static(problem.parts(t), views, self.norm.scales).flatten(1)
+        def both(t: Tensor) -> tuple[Tensor, Tensor]:
+            motion, scales = problem.parts(t), self.norm.scales
+            return whitened(self.invariant, motion, views, scales), self.invariant.whitened_static(motion, views, scales)
 
-        def along(tangent: Tensor) -> tuple[Tensor, Tensor]:
-            return torch.func.jvp(resting, (theta,), (tangent,))
+        def along(tangent: Tensor) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
+            return torch.func.jvp(both, (theta,), (tangent,))
 
         tangents = torch.eye(theta.shape[-1], dtype=theta.dtype, device=theta.device)[:, None].expand(-1, *theta.shape)
-        value, derivative = torch.func.vmap(along, out_dims=(None, 0))(tangents)
-        size = value.shape[-1] // max(1, views[0].shape[1])
-        j = derivative.movedim(0, -1).unflatten(1, (-1, size))  # (b, n, c, p)
-        eye = torch.eye(size, dtype=theta.dtype, device=theta.device)
-        covariance = eye + (j @ spread[:, None]) @ j.mT
-        return whiten(value.unflatten(1, (-1, size)), covariance).square().sum(-1)
+        values, derivatives = torch.func.vmap(along, out_dims=(None, 0))(tangents)
+        squares = []
+        for value, derivative in zip(values, derivatives, strict=True):
+            j = derivative.movedim(0, -1)  # (b, n, c, p)
+            eye = torch.eye(j.shape[-2], dtype=theta.dtype, device=theta.device)
+            squares.append(whiten(value, eye + (j @ spread[:, None]) @ j.mT).square().sum(-1))
+        return squares[0], squares[1]
 
     def information(self, theta: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
         """Eigenvalues ``(b, dof)``, ascending, of the information that the labelled matches hold on theta per unit of variance,
@@ -182,17 +188,18 @@ class Evidence:
 
     def settled(self, theta: Tensor, sigma: Tensor, *, estimate: bool) -> Labelled:
         """Label and refine in turns, until the labels stay; ``estimate``: and the noise with them."""
-        labels = self.labels(theta, sigma)
-        for _ in range(ROUNDS):
+        labels, steady = self.labels(theta, sigma), not estimate
+        for _ in range(ESTIMATING if estimate else ROUNDS):
             _, spread = self.information(theta, labels)
             new = self.labels(theta, sigma, spread)
-            if bool((new == labels).all()) and not estimate:
+            if bool((new == labels).all()) and steady:
                 break
             labels = new
             found = self.refined(theta, labels, STEPS)
             theta = joined(found)
             if estimate and found.sigma is not None:
-                sigma = torch.where(found.sigma.isfinite() & (found.sigma > 0), found.sigma, sigma).maximum(self.floor)
+                old, sigma = sigma, torch.where(found.sigma.isfinite() & (found.sigma > 0), found.sigma, sigma).maximum(self.floor)
+                steady = bool(((sigma - old).abs() <= STEADY * old).all())
         return Labelled(theta, labels, sigma)
 
 

@@ -17,6 +17,13 @@ from dyntorch.tasks.labelling import CHI_SQUARE, Evidence, Labelled
 
 RANK = 1e-9
 """Singular value of the estimation matrix, over the largest, that rounding alone leaves."""
+NEAR = 2.0
+"""Strength of the weakest equation of the tensor: 0.4 to 0.7 where all stands still, 1.3 to 1.6 where points move by 1 to 5 pixels
+at 0.5 pixels of noise, 15 to 25 where they move by 25 to 80 (100 matches)."""
+THIN = 3.0
+"""Standard deviations of the noise across a line of points, below which they may as well lie on it."""
+ROOM = 3.0
+"""Standard deviations of the noise within which a match belongs to a trajectory line."""
 LINES, FEWEST = 4, 16
 """Trajectory lines, and moving matches, that the tensor needs where nothing stands still (thesis chapter 2)."""
 
@@ -37,8 +44,8 @@ def planar_notices(evidence: Evidence, best: Labelled, status: Tensor, batch: tu
     rank, strength = tensor_rank(data.restricted(best.labels != OUTLIER), evidence, sigma)
     text = "the matches leave {value:g} of 26 equations on the tensor; the motion rests on its static matches"
     note(NoticeCode.DEGENERATE, text, rank, solved & (rank < HomographyTensor.width() - 1))
-    text = "so little moves that the tensor stands {value:.2g} times above the noise; the motion rests on its static matches"
-    note(NoticeCode.NEAR_STATIC, text, strength, solved & (rank == HomographyTensor.width() - 1) & (strength < NEAR))
+    text = "the weakest equation on the tensor is only {value:.2g} times the noise; the motion rests on its static matches"
+    note(NoticeCode.NEAR_STATIC, text, strength, solved & (rank >= HomographyTensor.width() - 1) & (strength < NEAR))
     text = f"{{value:g}} matches move, {FEWEST} would determine the motion without static ones"
     note(NoticeCode.FEW_MOVING, text, count, solved & (count < FEWEST))
     lines = trajectory_lines(evidence, best, moving)
@@ -121,6 +128,3 @@ def thinness(evidence: Evidence, sigma: Tensor) -> Tensor:
         across = det / (mean + (mean.square() - det).clamp(min=0).sqrt()).clamp(min=torch.finfo(mean.dtype).tiny)
         found.append(across.clamp(min=0).sqrt() / (scale * sigma.maximum(evidence.floor)))
     return torch.stack(found).amin(0)
-
-
-NEAR, THIN, ROOM = 1.0, 3.0, 3.0

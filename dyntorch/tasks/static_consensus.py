@@ -89,7 +89,7 @@ def _search(
 
 
 def _collineation(target: Tensor, source: Tensor) -> Tensor:
-    """``(..., d + 1, d + 1)`` from d + 2 points ``(..., d + 2, d + 1)`` each; some matrix where they are not in general position."""
+    """``(..., d + 1, d + 1)`` from d + 2 points ``(..., d + 2, d + 1)`` each; any matrix where three are on a line."""
     bases, coordinates = [], []
     for points in (target, source):
         inverse, _ = torch.linalg.inv_ex(points[..., :-1, :].mT)

@@ -46,6 +46,8 @@ class Velocities:
 def refined(evidence: Evidence, theta: Tensor, labels: Tensor, affine: bool) -> Tensor:
     """The maps ``(b, 48)`` that minimize the residuals of the labelled matches, by Levenberg-Marquardt; affine maps stay affine."""
     problem, free = evidence.problem(labels), _free(theta, affine)
+    if not bool((labels == STATIC).any()):
+        problem = replace(problem, static=None)  # half of the work
     cost, gradient, matrix = problem.normal_equations(theta)
     damping = torch.full_like(cost, 1e-3)
     for _ in range(STEPS):
@@ -128,6 +130,13 @@ def world_velocities(evidence: Evidence, theta: Tensor) -> Tensor:
     return (apply(motion[0], start + v) - apply(motion[0], start)) / evidence.norm.scales[0][:, None, None]
 
 
+def residuals(evidence: Evidence, theta: Tensor) -> tuple[Tensor, Tensor]:
+    """Squared residuals ``(b, n)`` of each match as a moving point and as a static one, in the unit of the matches."""
+    model, motion, scales = ConstantVelocityTensor(), _maps(evidence, theta), evidence.norm.scales
+    moving = model.whitened(motion, evidence.views, scales).square().sum(-1)
+    return moving, model.whitened_static(motion, evidence.views, scales).square().sum(-1)
+
+
 def _rounds(evidence: Evidence, state: Velocities, affine: bool, estimate: bool) -> Velocities:
     theta, labels, sigma = state.theta, state.labels, state.sigma
     for _ in range(ROUNDS):
@@ -142,9 +151,9 @@ def _rounds(evidence: Evidence, state: Velocities, affine: bool, estimate: bool)
 
 
 def _labels(evidence: Evidence, theta: Tensor, sigma: Tensor, grounded: Tensor) -> Tensor:
-    moving, resting = evidence.residuals(theta)
+    moving, resting = residuals(evidence, theta)
     variance, known = sigma.square()[:, None], evidence.data.static
-    still = (resting.square().sum(-1) <= CHI_SQUARE[6] * variance) & grounded[:, None]
+    still = (resting <= CHI_SQUARE[6] * variance) & grounded[:, None]
     path = moving <= CHI_SQUARE[3] * variance
     path = path if known is None else path & ~known
     labels = torch.where(still, STATIC, torch.where(path, MOVING, OUTLIER))
@@ -152,8 +161,8 @@ def _labels(evidence: Evidence, theta: Tensor, sigma: Tensor, grounded: Tensor) 
 
 
 def _noise(evidence: Evidence, theta: Tensor, labels: Tensor, before: Tensor, dof: Tensor) -> Tensor:
-    moving, resting = evidence.residuals(theta)
-    square = torch.where(labels == STATIC, resting.square().sum(-1), moving)
+    moving, resting = residuals(evidence, theta)
+    square = torch.where(labels == STATIC, resting, moving)
     spare = (6 * (labels == STATIC) + 3 * (labels == MOVING)).sum(-1) - dof
     shown = (torch.where(labels == OUTLIER, 0.0, square).sum(-1) / spare.clamp(min=1)).sqrt()
     return torch.where(spare >= 6, shown, before).maximum(evidence.floor)
@@ -176,7 +185,7 @@ def _ground(evidence: Evidence, state: Velocities) -> tuple[Tensor, Tensor]:
     best = (near.sum(-1) * inliers[:, chosen]).argmax(-1)
     members = near[torch.arange(len(best), device=best.device), best]
     theta = _fixed(evidence, state.theta, members)
-    members = (evidence.residuals(theta)[1].square().sum(-1) <= limit) & inliers
+    members = (residuals(evidence, theta)[1] <= limit) & inliers
     count = members.sum(-1)
     enough = (count >= 3) & (count >= STANDING * inliers.sum(-1))
     free = torch.where(state.grounded[:, None], False, torch.where(enough[:, None], members, inliers))
@@ -184,7 +193,8 @@ def _ground(evidence: Evidence, state: Velocities) -> tuple[Tensor, Tensor]:
 
 
 def _fixed(evidence: Evidence, theta: Tensor, members: Tensor) -> Tensor:
-    motion = ConstantVelocityTensor.fix_gauge(_maps(evidence, theta), *evidence.views, weights=members.to(theta))
+    x1, x2, x3 = evidence.views
+    motion = ConstantVelocityTensor.fix_gauge(_maps(evidence, theta), x1, x2, x3, weights=members.to(theta))
     return torch.cat([part.flatten(1) for part in motion], dim=-1)
 
 

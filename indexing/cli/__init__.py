@@ -1,4 +1,4 @@
-"""The command line: ``dyntorch demo | index fit | index scan | index evaluate``, one file per command.
+"""The command line: ``dyntorch demo | index fit | index scan | index evaluate | align | count``, one file per command.
 
 A command is a dataclass whose fields are its flags, with ``run() -> exit code``.  Only what parsing needs is imported here,
 so that ``--help`` answers at once; a command imports its tools when it runs.
@@ -18,6 +18,7 @@ from typing import Annotated, Any, Protocol, cast
 
 import tyro
 
+from indexing.cli.align import Align
 from indexing.cli.console import complain, one_line
 from indexing.cli.count import Count
 from indexing.cli.demo import Demo
@@ -32,10 +33,13 @@ INDEX: Any = Annotated[Fit, Command("fit")] | Annotated[Scan, Command("scan")] |
 COMMANDS: Any = (
     Annotated[Demo, Command("demo")]
     | Annotated[INDEX, Command("index", description="Learn actions from one clip each and find them elsewhere.")]
+    | Annotated[Align, Command("align")]
     | Annotated[Count, Command("count")]
-)  # next: sync, segment, align
+)  # next: sync, segment
 GROUPS = ("index",)  # words that need another one behind them
-DESCRIPTION = """Learn actions from one clip each and find them in other clips, from other viewpoints.
+DESCRIPTION = """Geometry of scenes in which everything moves: learn actions from one clip each and find them in other clips, from
+other viewpoints (index); find how a camera or 3D sensor moved among things that move, and what stood still (align); count how many
+matches such a problem takes (count).
 
 dyntorch COMMAND --help explains a command, dyntorch --version says the version."""
 

@@ -37,7 +37,9 @@ def describe(report: AlignmentReport) -> str:
     what = "lines" if report.views[0].ndim == 3 else "points"
     if report.status != "OK":
         start = f"The {number:,} {what} do not decide how the sensor moved."
-        return f"{start} {report.reason}." + (" What follows is the best motion found, and not to be relied on." * report.solved)
+        return f"{start} {_sentence(report.reason)}" + (
+            " What follows is the best motion found, and not to be relied on." * report.solved
+        )
     parts = [f"{counts['static']:,} stand still and {counts['moving']:,} move"]
     if counts["outlier"]:
         parts.append(f"{counts['outlier']:,} fit neither")
@@ -57,6 +59,7 @@ def display_scale(matrix: FloatArray, covariance: FloatArray) -> tuple[FloatArra
         return matrix, np.sqrt(np.clip(np.diagonal(covariance), 0, None)).reshape(matrix.shape), False
     derivative = np.eye(flat.size) / last
     derivative[:, -1] -= flat / last**2
+    derivative[-1] = 0.0  # the last entry is 1 by decree, whatever rounding says
     spread = np.sqrt(np.clip(np.diagonal(derivative @ covariance @ derivative.T), 0, None))
     return matrix / last, spread.reshape(matrix.shape), True
 
@@ -130,11 +133,12 @@ def _picture(report: AlignmentReport, drawn: tuple[bytes, bytes]) -> str:
         caption = (
             "In view 1, the path of each moving point: where view 1 saw it (filled), where the others did, carried over by A and B "
             "(open, view 3 the smaller), and the straight line it moves on."
-        )
+        ) + (" Dashed: static in two views, mismatched or moved in the third." * bool(np.any(report.unverified)))
     if report.views[0].shape[-1] == 3:
         caption += " Of the three coordinates, the two are shown in which view 1 extends most."
     alt = f"The views: {counts['static']} static, {counts['moving']} moving, {counts['outlier']} outliers"
-    return section("What moves", picture(drawn[0], alt, dark=drawn[1], caption=caption.strip()), note)
+    title = "What moves" if report.solved else "The matches"
+    return section(title, picture(drawn[0], alt, dark=drawn[1], caption=caption.strip()), note)
 
 
 def _motion(report: AlignmentReport) -> str:

@@ -18,6 +18,7 @@ COLOURS = {"static": "#2f7fb8", "moving": "#e8741e", "outlier": "#8b949c"}
 MARKS = {"static": "o", "moving": "o", "outlier": "x"}
 PATHS = 1500  # paths drawn; more are a blot
 ROOM = 0.06  # around the points, of their extent
+WIDTH = 10.2  # inches
 
 
 def picture_of(report: AlignmentReport, theme: Theme) -> bytes:
@@ -27,13 +28,19 @@ def picture_of(report: AlignmentReport, theme: Theme) -> bytes:
     segments = report.views[0].ndim == 3
     axes_shown, turned = _axes(report)
     flat = [view[..., axes_shown] for view in report.views]
+    boxes = [_box(points, kinds) for points in flat]
     with style(theme):
-        figure = new_figure(10.2, 5.6 if len(flat) > 2 else 4.9)
-        grid = figure.add_gridspec(len(flat) - 1, 2, width_ratios=(1.75, 1) if len(flat) > 2 else (1, 1), wspace=0.14, hspace=0.3)
+        wide = (1.9, 1.0) if len(flat) > 2 else (1.0, 1.0)
+        room = WIDTH - 1.3
+        tall = [(box[3] - box[2]) / (box[1] - box[0]) for box in boxes]
+        column = sum(room * wide[1] / sum(wide) * ratio + 0.6 for ratio in tall[1:])
+        height = float(np.clip(max(room * wide[0] / sum(wide) * tall[0], column), 3.0, 7.0))
+        figure = new_figure(WIDTH, height + 0.8)
+        grid = figure.add_gridspec(len(flat) - 1, 2, width_ratios=wide, wspace=0.12, hspace=0.3, left=0.07, right=0.995,
+                                   bottom=0.6 / (height + 0.8), top=1 - 0.25 / (height + 0.8))  # fmt: skip
         places = [grid[:, 0], *(grid[i, 1] for i in range(len(flat) - 1))]
-        for number, (points, place) in enumerate(zip(flat, places, strict=True), start=1):
+        for number, (points, place, box) in enumerate(zip(flat, places, boxes, strict=True), start=1):
             panel = figure.add_subplot(place)
-            box = _box(points, kinds)
             if number == 1 and report.solved:
                 _draw_paths(panel, report, kinds, axes_shown, box)
             _draw_points(panel, points, kinds, colours, large=number == 1, segments=segments)
@@ -64,9 +71,31 @@ def _box(points: FloatArray, kinds: NDArray[Any]) -> tuple[float, float, float, 
     if not len(shown):
         return 0.0, 1.0, 0.0, 1.0
     low, high = shown.min(axis=0), shown.max(axis=0)
-    room = ROOM * max(float((high - low).max()), 1e-9 * max(1.0, float(np.abs(shown).max())))
-    room = room if room > 1e-12 else 1.0
+    # points that all but coincide keep a box that the ticks can name
+    room = max(ROOM * float((high - low).max()), 1e-3 * float(np.abs(shown).max()), 1e-6)
     return float(low[0] - room), float(high[0] + room), float(low[1] - room), float(high[1] + room)
+
+
+def as_segments(lines: FloatArray) -> FloatArray:
+    """Two points ``(n, 2, 3)`` of lines in Pluecker coordinates ``(n, 6)`` (01, 02, 03, 12, 13, 23), around their common middle.
+
+    Example:
+        >>> a, b = np.array([0.0, 2.0, 3.0, 1.0]), np.array([4.0, 2.0, 3.0, 1.0])  # along x, through (., 2, 3)
+        >>> pairs = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
+        >>> as_segments(np.array([[a[i] * b[j] - a[j] * b[i] for i, j in pairs]]))[0, :, 1:].tolist()
+        [[2.0, 3.0], [2.0, 3.0]]
+    """
+    direction = -lines[:, [2, 4, 5]]
+    moment = np.stack([lines[:, 3], -lines[:, 1], lines[:, 0]], axis=1)
+    square = np.square(direction).sum(axis=1, keepdims=True)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        foot = np.cross(direction, moment) / square
+        unit = direction / np.sqrt(square)
+    middle = np.nan_to_num(np.nanmedian(foot, axis=0)) if np.isfinite(foot).any() else np.zeros(3)
+    foot = foot + ((middle - foot) * unit).sum(axis=1, keepdims=True) * unit
+    reach = 0.5 * float(np.nan_to_num(np.nanmedian(np.abs(foot - middle)))) or 0.5
+    out: FloatArray = np.stack([foot - reach * unit, foot + reach * unit], axis=1)
+    return out
 
 
 def carried(matrix: FloatArray, points: FloatArray) -> FloatArray:
@@ -95,7 +124,11 @@ def _draw_paths(panel: Any, report: AlignmentReport, kinds: NDArray[Any], shown:
     path = np.stack([report.views[0][moving], *others], axis=1)[..., shown]
     size = max(box[1] - box[0], box[3] - box[2])
     near = np.isfinite(path).all(axis=(1, 2)) & (np.abs(path - path[:, :1]).max(axis=(1, 2), initial=0) < 2 * size)
-    path = path[near]
+    doubtful = np.zeros(len(path), dtype=bool) if report.unverified is None else report.unverified[moving]
+    if (near & doubtful).any():
+        look: Any = {"linewidths": 0.9, "alpha": 0.6, "linestyles": (0, (2, 2))}
+        panel.add_collection(LineCollection(list(path[near & doubtful]), colors=colour, **look))
+    path = path[near & ~doubtful]
     if not len(path):
         return
     centre = path.mean(axis=1, keepdims=True)
@@ -132,7 +165,7 @@ def _draw_points(panel: Any, points: FloatArray, kinds: NDArray[Any], colours: d
 
 def _finish(panel: Any, box: tuple[float, float, float, float], turned: bool, theme: Theme) -> None:
     panel.set(xlim=box[:2], ylim=box[2:][::-1] if turned else box[2:])
-    panel.set_aspect("equal", adjustable="datalim" if not turned else "box")
+    panel.set_aspect("equal", adjustable="box", anchor="N")
     panel.tick_params(length=2.5, labelsize=7.5)
     panel.locator_params(nbins=6)
     panel.ticklabel_format(useOffset=False)
@@ -150,6 +183,21 @@ def _legend(figure: Any, kinds: NDArray[Any], colours: dict[str, str], theme: Th
             mark = None if segments else MARKS.get(kind, "o")
             look: Any = ("solid" if kind != "outlier" else "dotted") if segments else ""
             handles.append(
-                Line2D([], [], color=colours[kind], marker=mark, linestyle=look, markersize=5, label=f"{number:,} {kind}")
+                Line2D(
+                    [],
+                    [],
+                    color=colours[kind],
+                    marker=mark,
+                    linestyle=look,
+                    markersize=5,
+                    label=f"{number:,} {kind}{'s' * (kind == 'outlier' and number > 1)}",
+                )
             )
-    figure.legend(handles=handles, loc="upper center", bbox_to_anchor=(0.5, 0.0), ncols=4, frameon=False, labelcolor=theme.ink)
+    figure.legend(
+        handles=handles,
+        loc="upper center",
+        bbox_to_anchor=(0.5, 0.25 / figure.get_figheight()),
+        ncols=4,
+        frameon=False,
+        labelcolor=theme.ink,
+    )

@@ -4,15 +4,11 @@ import pytest
 
 import dyntorch as dyn
 from dyntorch.invariant import Invariant
-from tests import battery, battery_input, battery_noise
+from tests import battery_input, battery_noise  # noqa: F401 - they add to the list
+from tests.battery import CHECKS
 from tests.cases import CASES
 
-PAIRS = [
-    pytest.param(check, case, id=f"{check.__name__}-{case!r}")
-    for check, applies in [*battery.CHECKS, *battery_noise.CHECKS, *battery_input.CHECKS]
-    for case in CASES
-    if applies(case)
-]
+PAIRS = [pytest.param(check, case, id=f"{check.__name__}-{case!r}") for check, applies in CHECKS for case in CASES if applies(case)]
 
 
 @pytest.mark.parametrize(("check", "case"), PAIRS)

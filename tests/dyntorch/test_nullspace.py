@@ -283,6 +283,19 @@ def test_two_threads_give_the_same():
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-10)
 
 
+@pytest.mark.parametrize("rows", [26, 60])
+def test_blocks_of_unequal_size_give_the_same(monkeypatch, rows):
+    matrix, _ = with_spectrum(noisy_spectrum(27, 1), rows, batch=50)
+    whole, parts = matrix.clone().requires_grad_(), matrix.clone().requires_grad_()
+    expected = null_space(whole)
+    expected.sum().backward()
+    monkeypatch.setattr(nullspace, "GRAM_BLOCK", 16 * 8 * 27 * 27)
+    found = null_space(parts)
+    found.sum().backward()
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-10)
+    torch.testing.assert_close(parts.grad, whole.grad, rtol=1e-6, atol=1e-7)
+
+
 def test_misuse_is_refused():
     with pytest.raises(ValueError, match=r"\(5, 6, 9\).*6 rows.*at least 8.*dim=3"):
         null_space(random(5, 6, 9))

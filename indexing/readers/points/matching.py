@@ -88,7 +88,10 @@ def read_matches(
             resting[0].path, f"{len(points.views)} files of {points.dims[0]}D static points", "give 3D points for each view"
         )
     notes = matched.notes + tuple(f"static points: {note}" for note in points.notes)
-    return replace(matched, static_points=points.views, notes=notes)
+    seen = np.isfinite(np.concatenate(points.views, axis=1)).all(axis=1)
+    if not seen.all():
+        notes += (f"static points: {int((~seen).sum())} missing in a view were left out",)
+    return replace(matched, static_points=tuple(view[seen] for view in points.views), notes=notes)
 
 
 def open_points(path: Path) -> PointSet | Sequence:

@@ -1,0 +1,188 @@
+"""Lines that move in planes, static lines and static points between two views: residuals, refinement, labels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from dyntorch.algebra.homogeneous import homogeneous, unit
+from dyntorch.invariants.agreement import point_error, static_residual
+from dyntorch.invariants.translating_lines_matrix import TranslatingLinesMatrix
+from dyntorch.matches import Matches
+from dyntorch.normalize import Normalization, denormalize_motion
+from dyntorch.primitives import Line
+from dyntorch.residual import multilinear
+from dyntorch.tasks.alignment import MOVING, OUTLIER, STATIC
+from dyntorch.tasks.labelling import CHI_SQUARE
+
+ROUNDS, STEPS = 4, 12
+CONVERGED = 1e-10  # relative decrease of the cost
+DOF = TranslatingLinesMatrix.dof
+
+
+@dataclass(frozen=True)
+class Lines:
+    """Lines as two points each, and static points, in normalized coordinates; flat batch.
+
+    Attributes:
+        data: lines ``(b, n, 2, 3)`` as measured.
+        views: normalized.
+        points: normalized static points ``(b, k, 3)`` of both views, k may be 0.
+        norm: the similarities of both views.
+        floor: ``(b,)`` the least noise that the numbers allow, in the unit of the points.
+    """
+
+    data: Matches
+    views: tuple[Tensor, ...]
+    points: tuple[Tensor, ...]
+    norm: Normalization
+    floor: Tensor
+
+    @classmethod
+    def of(cls, data: Matches, points: tuple[Tensor, Tensor] | None, norm: Normalization) -> Lines:
+        """From measured lines and points."""
+        empty = data.views[0][:, :0, 0]
+        pair = (empty, empty) if points is None else points
+        moved = tuple(x @ t[:, :3, :3].mT + t[:, None, :3, 3] for x, t in zip(pair, norm.transforms, strict=True))
+        floor = 100 * torch.finfo(torch.float64).eps / torch.stack(norm.scales).amin(0)
+        return cls(data, norm.apply(TranslatingLinesMatrix(), data.views), moved, norm, floor)
+
+    def moving(self, theta: Tensor) -> Tensor:
+        """Signed Sampson residual ``(b, n)`` of each line that may move, in the unit of the points."""
+        tensor = TranslatingLinesMatrix.compose(theta.unflatten(-1, (4, 4)))
+        return multilinear(TranslatingLinesMatrix(), tensor, self.views, self.norm.scales)
+
+    def still(self, theta: Tensor) -> Tensor:
+        """Distances ``(b, n, 6)`` of both points of a line in view 2, carried into view 1, from the line there; 4 conditions."""
+        first, second = self.views[0].unbind(-2)
+        along = second - first
+        square = along.square().sum(-1, keepdim=True).clamp(min=torch.finfo(theta.dtype).tiny)
+        s1, s2 = (s[:, None, None] for s in self.norm.scales)
+        matrix = theta.unflatten(-1, (4, 4))
+        parts = []
+        for point in self.views[1].unbind(-2):
+            error, jacobian = point_error(homogeneous(point) @ matrix.mT, matrix[:, None], first)
+            place = (error * along).sum(-1, keepdim=True) / square
+            across = error - place * along
+            # isotropic: the noise of the line at this place, and that of the point, averaged over the plane across
+            other = (jacobian.square().sum((-1, -2)) / 3)[..., None]
+            variance = s1.square() * ((1 - place).square() + place.square()) + s2.square() * other
+            parts.append(across * variance.rsqrt())
+        return torch.cat(parts, dim=-1)
+
+    def at_points(self, theta: Tensor) -> Tensor:
+        """Disagreement ``(b, k, 3)`` of static points."""
+        return static_residual([theta.unflatten(-1, (4, 4))], self.points, self.norm.scales)
+
+    def residual(self, theta: Tensor, labels: Tensor) -> Tensor:
+        """All weighted residuals ``(b, rows)`` of the labelled lines and the static points, in the unit of the points."""
+        root = self.data.weights.sqrt()
+        moving = self.moving(theta) * torch.where(labels == MOVING, root, 0.0)
+        still = self.still(theta) * torch.where(labels == STATIC, root, 0.0)[..., None]
+        return torch.cat([moving, still.flatten(1), self.at_points(theta).flatten(1)], dim=-1)
+
+
+def as_points(views: tuple[Tensor, ...], weights: Tensor) -> tuple[Tensor, ...]:
+    """Lines ``(b, n, 2 3)`` or ``(b, n, 6)`` as two points each, of Pluecker lines near the centre of the scene."""
+    return tuple(x if x.ndim == 4 else _two_points(x, (weights > 0).to(x)) for x in views)
+
+
+def _two_points(line: Tensor, present: Tensor) -> Tensor:
+    direction = normalize(-line[..., [2, 4, 5]], dim=-1)
+    foot = Line().points(line)[..., 0, :]
+    share = (present / present.sum(-1, keepdim=True).clamp(min=1.0))[..., None]
+    centre = (share * foot).sum(-2, keepdim=True)
+    nearest = foot + direction * (direction * (centre - foot)).sum(-1, keepdim=True)
+    size = ((nearest - centre).square() * share).sum((-2, -1)).sqrt()[:, None, None]
+    size = torch.where(size > 0, size, 1.0)
+    return torch.stack([nearest - size / 2 * direction, nearest + size / 2 * direction], dim=-2)
+
+
+def settle(lines: Lines, theta: Tensor, sigma: Tensor, *, estimate: bool, plain: bool) -> tuple[Tensor, Tensor, Tensor]:
+    """Label and refine in turns: A ``(b, 16)`` in normalized coordinates, labels ``(b, n)``, noise ``(b,)``.
+
+    Args:
+        lines: the matches.
+        theta: ``(b, 16)`` to start from.
+        sigma: ``(b,)`` noise.
+        estimate: whether the noise is estimated anew in every round.
+        plain: whether no line is called an outlier before the first refinement.
+    """
+    present = lines.data.weights > 0
+    labels = torch.where(present, MOVING, OUTLIER) if plain else _labels(lines, theta, sigma)
+    for _ in range(ROUNDS):
+        theta = refined(lines, theta, labels)
+        if estimate:
+            left = lines.residual(theta, labels).square().sum(-1)
+            spare = (labels == MOVING).sum(-1) + 4 * (labels == STATIC).sum(-1) + 3 * lines.points[0].shape[1] - DOF
+            sigma = torch.where(spare >= 4, (left / spare.clamp(min=1)).sqrt(), sigma).maximum(lines.floor)
+        new = _labels(lines, theta, sigma)
+        if bool((new == labels).all()):
+            break
+        labels = new
+    return theta, labels, sigma
+
+
+def refined(lines: Lines, theta: Tensor, labels: Tensor) -> Tensor:
+    """A that minimizes the residuals of all labelled matches, by Levenberg-Marquardt."""
+    cost, gradient, matrix = _equations(lines, theta, labels)
+    damping = torch.full_like(cost, 1e-3)
+    for _ in range(STEPS):
+        diagonal = matrix.diagonal(dim1=-2, dim2=-1)
+        floor = diagonal + 1e-9 * diagonal.amax(-1, keepdim=True) + torch.finfo(theta.dtype).tiny
+        factor, _ = torch.linalg.cholesky_ex(matrix + torch.diag_embed(damping[:, None] * floor))
+        step = torch.cholesky_solve(gradient[..., None], factor)[..., 0]
+        trial = normalize(theta - torch.where(step.isfinite(), step, 0.0), dim=-1)
+        fresh = _equations(lines, trial, labels)
+        better = fresh[0] < cost
+        done = (better & (cost - fresh[0] <= CONVERGED * cost)) | (~better & (damping > 1e5))
+        theta, gradient = torch.where(better[:, None], trial, theta), torch.where(better[:, None], fresh[1], gradient)
+        matrix, cost = torch.where(better[:, None, None], fresh[2], matrix), torch.where(better, fresh[0], cost)
+        damping = torch.where(better, (damping * 0.1).clamp(min=1e-12), damping * 8)
+        if theta.device.type == "cpu" and bool(done.all()):
+            break
+    return theta
+
+
+def spread(lines: Lines, theta: Tensor, labels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Extreme information ``(b, 2)`` on A, A ``(b, 4, 4)`` as measured, and its covariance ``(b, 16, 16)`` for noise 1."""
+    _, _, matrix = _equations(lines, theta, labels)
+    values, vectors = torch.linalg.eigh(torch.where(matrix.isfinite(), matrix, 0.0))
+    values, vectors = values[:, -DOF:], vectors[..., -DOF:]
+    root = vectors * values.clamp(min=1e-12 * values[:, -1:].clamp(min=1e-300)).rsqrt()[:, None]
+
+    def measured(t: Tensor) -> Tensor:
+        part = denormalize_motion(TranslatingLinesMatrix(), (t.unflatten(-1, (4, 4)),), lines.norm.transforms)[0]
+        return unit(part).flatten(1)
+
+    def along(tangent: Tensor) -> Tensor:
+        return torch.func.jvp(measured, (theta,), (tangent,))[1]
+
+    moved = torch.func.vmap(along)(root.movedim(-1, 0)).movedim(0, -1)
+    return values[:, [0, -1]], measured(theta).unflatten(-1, (4, 4)), moved @ moved.mT
+
+
+def _equations(lines: Lines, theta: Tensor, labels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Cost ``(b,)``, gradient ``(b, 16)`` and Gauss-Newton matrix."""
+    tangents = torch.eye(16, dtype=theta.dtype, device=theta.device)[:, None].expand(-1, *theta.shape)
+
+    def along(tangent: Tensor) -> tuple[Tensor, Tensor]:
+        value, column = torch.func.jvp(lambda t: lines.residual(t, labels), (theta,), (tangent,))[:2]
+        return value, column
+
+    values, columns = torch.func.vmap(along)(tangents)
+    value, jacobian = values[0], columns.transpose(0, 1)
+    cost = value.square().sum(-1)
+    return torch.where(cost.isfinite(), cost, torch.inf), (jacobian @ value[..., None])[..., 0], jacobian @ jacobian.mT
+
+
+def _labels(lines: Lines, theta: Tensor, sigma: Tensor) -> Tensor:
+    square, known = sigma.square()[:, None], lines.data.static
+    still = lines.still(theta).square().sum(-1) <= CHI_SQUARE[4] * square
+    path = lines.moving(theta).square() <= CHI_SQUARE[1] * square
+    path = path if known is None else path & ~known
+    labels = torch.where(still, STATIC, torch.where(path, MOVING, OUTLIER))
+    return torch.where(lines.data.weights > 0, labels, OUTLIER)

@@ -1,0 +1,284 @@
+"""Speed and accuracy of batched null spaces, beside ``torch.linalg.svd`` in float64 and the goals.  Needs no data.
+
+    python -m experiments.benchmarks.null_space            # about two minutes
+    python -m experiments.benchmarks.null_space --quick    # does it run at all
+
+Matrices of 200 rows whose singular values fall from 1 to 1/50, with a null space 0.02 to 0.3 below the last of them, as
+normalized image measurements give; and minimal samples of exactly D - 1 rows.  The two sides of every ratio take turns in one
+process and the figure is the ratio of their medians: CPU time on one thread, wall time for threads and accelerators.  The
+error is the largest angle to the SVD's null space over the batch.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from statistics import median
+from typing import Annotated
+
+import torch
+import tyro
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from torch import Tensor
+
+from dyntorch.nullspace import gram_null_space, null_space
+from experiments.tables import command, note
+from indexing.files import manifest, prepare, write_json
+
+ANGLE = 1e-10
+ROWS = 200
+SOLVE, MINIMAL, BACKWARD, GRAM = "null space", "D - 1 rows", "forward + backward", "Gram given"
+
+
+@dataclass(frozen=True)
+class Config:
+    """Speed and accuracy of batched null spaces."""
+
+    batch: int = 1024
+    """Problems per call."""
+    rounds: int = 7
+    """How often the two sides take turns."""
+    quick: bool = False
+    """Small batch, one round: a smoke test; goals are not judged."""
+    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/benchmark_null_space.json")
+    """Where the results are written as JSON; the plot goes beside it as PNG."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One comparison: what is done to matrices of D columns, and how much faster it should be than the SVD."""
+
+    task: str
+    size: int
+    dim: int = 1
+    goal: float | None = None
+
+    @property
+    def rows(self) -> int:
+        return self.size - self.dim if self.task == MINIMAL else ROWS
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A comparison measured: microseconds per problem of both sides, their ratio, and the error."""
+
+    task: str
+    where: str
+    size: int
+    dim: int
+    reference: float
+    ours: float
+    angle: float
+    goal: float | None
+
+    @property
+    def ratio(self) -> float:
+        return self.reference / self.ours
+
+    @property
+    def reached(self) -> bool | None:
+        """Whether speed and accuracy reach the goal; ``None`` where there is none."""
+        return None if self.goal is None else self.ratio >= self.goal and self.angle <= ANGLE
+
+
+ONE_THREAD = (
+    Case(SOLVE, 9),
+    *(Case(SOLVE, size, goal=5.0) for size in (27, 36, 48, 64)),
+    Case(SOLVE, 64, dim=4),
+    *(Case(GRAM, size) for size in (27, 64)),
+    *(Case(MINIMAL, size, goal=6.0) for size in (9, 27, 36, 64)),
+    Case(BACKWARD, 27, goal=3.0),
+    Case(BACKWARD, 64),
+)
+SEVERAL_THREADS = (Case(SOLVE, 27, goal=1.8), Case(SOLVE, 64, goal=1.8), Case(MINIMAL, 27))
+CUDA = (*(Case(SOLVE, size) for size in (27, 64)), Case(MINIMAL, 27), Case(BACKWARD, 27))
+
+
+def matrices(case: Case, batch: int) -> Tensor:
+    """``(batch, rows, D)`` with the spectrum of normalized measurements."""
+    generator = torch.Generator().manual_seed(case.size)
+
+    def random(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    count = min(case.rows, case.size)
+    signal = torch.logspace(0.0, -torch.log10(torch.tensor(50.0)).item(), case.size - case.dim, dtype=torch.float64)
+    ratio = 0.02 * 15.0 ** torch.rand(batch, 1, generator=generator, dtype=torch.float64)
+    null = signal[-1] * ratio * torch.linspace(1.0, 0.5, case.dim, dtype=torch.float64)
+    spectrum = torch.cat([signal.expand(batch, -1), null], dim=-1)[:, None, :count]
+    left, right = (torch.linalg.qr(random(batch, n, count)).Q for n in (case.rows, case.size))
+    product: Tensor = (left * spectrum) @ right.mT
+    return product
+
+
+def svd_null_space(matrix: Tensor, dim: int) -> Tensor:
+    """What everybody writes; the full matrix of vectors only where the rows do not suffice, elsewhere it is much slower."""
+    rows, size = matrix.shape[-2:]
+    basis: Tensor = torch.linalg.svd(matrix, full_matrices=rows < size).Vh[:, -dim:]
+    return basis
+
+
+def backward(solve: Callable[[Tensor, int], Tensor], matrix: Tensor, dim: int) -> Tensor:
+    """Solve, and the gradient of a function of the projector."""
+    leaf = matrix.detach().requires_grad_()
+    basis = solve(leaf, dim)
+    basis.square()[..., 0].sum().backward()
+    return basis.detach()
+
+
+def sides(case: Case, matrix: Tensor) -> tuple[Callable[[], Tensor], Callable[[], Tensor]]:
+    """The reference and ours."""
+    if case.task == GRAM:
+        gram = matrix.mT @ matrix
+        return lambda: torch.linalg.eigh(gram).eigenvectors[..., : case.dim].mT, lambda: gram_null_space(gram, case.dim).basis
+    if case.task == BACKWARD:
+        return lambda: backward(svd_null_space, matrix, case.dim), lambda: backward(null_space, matrix, case.dim)
+    return lambda: svd_null_space(matrix, case.dim), lambda: null_space(matrix, case.dim)
+
+
+def alternate(
+    first: Callable[[], Tensor], second: Callable[[], Tensor], rounds: int, clock: Callable[[], float]
+) -> tuple[float, float, Tensor, Tensor]:
+    """Median seconds of both, taking turns, and what they returned."""
+    results = first(), second()
+    seconds: tuple[list[float], list[float]] = [], []
+    for _ in range(rounds):
+        for function, taken in zip((first, second), seconds, strict=True):
+            start = clock()
+            function()
+            taken.append(clock() - start)
+    return median(seconds[0]), median(seconds[1]), *results
+
+
+def angle(basis: Tensor, expected: Tensor) -> float:
+    """Largest sine of the angle between row spaces."""
+    return float((basis - basis @ expected.mT @ expected).norm(dim=(-2, -1)).max())
+
+
+def on_one_thread(case: Case, config: Config) -> Figure:
+    """Against the SVD (or eigh, for a Gram) in CPU time."""
+    matrix = matrices(case, config.batch)
+    reference, ours, expected, basis = alternate(*sides(case, matrix), config.rounds, time.process_time)
+    return figure(case, "1 thread", config, reference, ours, angle(basis, expected))
+
+
+def on_threads(case: Case, threads: int, config: Config) -> Figure:
+    """Ours on one thread against ours on several, in wall time."""
+    matrix = matrices(case, config.batch)
+
+    def run(count: int) -> Tensor:
+        torch.set_num_threads(count)
+        return null_space(matrix, case.dim)
+
+    # more rounds: wall time is shared with whatever else runs
+    reference, ours, expected, basis = alternate(lambda: run(1), lambda: run(threads), 3 * config.rounds, time.perf_counter)
+    torch.set_num_threads(1)
+    return figure(case, f"{threads} threads / 1", config, reference, ours, angle(basis, expected))
+
+
+def on_cuda(case: Case, config: Config) -> Figure:
+    """Against the SVD on the same device, in wall time between synchronizations."""
+
+    def clock() -> float:
+        torch.cuda.synchronize()
+        return time.perf_counter()
+
+    matrix = matrices(case, config.batch).cuda()
+    reference, ours, expected, basis = alternate(*sides(case, matrix), config.rounds, clock)
+    return figure(case, torch.cuda.get_device_name(), config, reference, ours, angle(basis, expected))
+
+
+def figure(case: Case, where: str, config: Config, reference: float, ours: float, error: float) -> Figure:
+    scale = 1e6 / config.batch
+    goal = None if config.quick else case.goal
+    return Figure(case.task, where, case.size, case.dim, reference * scale, ours * scale, error, goal)
+
+
+def measure(config: Config) -> list[Figure]:
+    """All comparisons this machine can make."""
+    threads = torch.get_num_threads()
+    cores = min(threads if threads > 1 else os.cpu_count() or 1, 2)
+    torch.set_num_threads(1)
+    figures = []
+    for case in ONE_THREAD:
+        note(f"... {case.task}, {case.rows} x {case.size}")
+        figures.append(on_one_thread(case, config))
+    for case in SEVERAL_THREADS if cores > 1 else ():
+        note(f"... {cores} threads, {case.rows} x {case.size}")
+        figures.append(on_threads(case, cores, config))
+    torch.set_num_threads(threads)
+    for case in CUDA if torch.cuda.is_available() else ():
+        note(f"... CUDA, {case.task}, {case.rows} x {case.size}")
+        figures.append(on_cuda(case, config))
+    return figures
+
+
+def table(figures: list[Figure], batch: int) -> Table:
+    """The figures beside their goals; what could not be measured says so."""
+    shown = Table(title=f"Null spaces, batch of {batch}, float64, µs per problem", box=box.MARKDOWN)
+    for name in ("task", "where", "D", "dim", "reference", "ours", "ratio", "goal", "reached", "largest angle"):
+        shown.add_column(name, justify="left" if name in ("task", "where") else "right", no_wrap=True)
+    for one in figures:
+        goal = "" if one.goal is None else f">= {one.goal:g}"
+        reached = {None: "", True: "yes", False: "NO"}[one.reached]
+        times = (f"{one.reference:.1f}", f"{one.ours:.1f}", f"{one.ratio:.2f}")
+        shown.add_row(one.task, one.where, str(one.size), str(one.dim), *times, goal, reached, f"{one.angle:.0e}")
+    wheres = [one.where for one in figures]
+    if not any("threads" in where for where in wheres):
+        shown.add_row("several threads", "skipped: one core")
+    if not torch.cuda.is_available():
+        shown.add_row("CUDA", "skipped: no device")
+    return shown
+
+
+def plot(figures: list[Figure], path: Path) -> None:
+    """Time per problem over D, both sides."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    canvas = plt.figure(figsize=(6, 4), layout="constrained")
+    axes = canvas.subplots()
+    for task, style in ((SOLVE, "-"), (MINIMAL, "--")):
+        chosen = [one for one in figures if one.task == task and one.where == "1 thread" and one.dim == 1]
+        sizes = [one.size for one in chosen]
+        axes.plot(sizes, [one.reference for one in chosen], f"o{style}", color="tab:gray", label=f"svd, {task}")
+        axes.plot(sizes, [one.ours for one in chosen], f"o{style}", color="tab:blue", label=f"dyntorch, {task}")
+    axes.set(xlabel="D (columns)", ylabel="µs per problem, one thread", xscale="log", yscale="log")
+    axes.set_xticks([9, 27, 36, 48, 64], ["9", "27", "36", "48", "64"], minor=False)
+    axes.minorticks_off()
+    axes.grid(alpha=0.3)
+    axes.legend()
+    canvas.savefig(str(path), dpi=150)
+    plt.close()
+
+
+def run(config: Config) -> None:
+    """Measure, print the table, write the file and the plot.
+
+    Raises:
+        ValueError: nothing to measure.
+    """
+    if config.batch < 1 or config.rounds < 1:
+        raise ValueError(f"batch and rounds must be at least 1, got {config.batch} and {config.rounds}")
+    if config.quick:
+        config = Config(batch=min(config.batch, 32), rounds=1, quick=True, out=config.out)
+    target = config.out.expanduser()
+    prepare(target.parent)
+    figures = measure(config)
+    Console(width=132).print(table(figures, config.batch))
+    load = os.getloadavg() if hasattr(os, "getloadavg") else ()
+    found = [{**asdict(one), "ratio": one.ratio, "reached": one.reached} for one in figures]
+    write_json(target, {"manifest": manifest(vars(config)), "load": load, "table": found})
+    plot(figures, target.with_suffix(".png"))
+    note(f"written: {target} and {target.with_suffix('.png').name}")
+
+
+if __name__ == "__main__":
+    command(lambda: run(tyro.cli(Config, prog="python -m experiments.benchmarks.null_space")))

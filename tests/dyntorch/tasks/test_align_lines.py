@@ -1,0 +1,121 @@
+"""align_lines: scenes of known motion, the family that translation leaves, static points, degenerate and bad input."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from dyntorch import scenes
+from dyntorch.algebra.extensors import plucker
+from dyntorch.metrics import relative_error
+from dyntorch.solution import Status
+from dyntorch.tasks.align_lines import align_lines
+from dyntorch.tasks.alignment import MOVING, OUTLIER, STATIC
+from dyntorch.tasks.line_model import as_points
+
+F64 = torch.float64
+
+
+def draw(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def test_exact_from_the_fewest_lines() -> None:
+    scene = scenes.translating_lines(35, batch=3, generator=draw())
+    found = align_lines(*scene.views, threshold=1e-3, generator=draw(1)).check()
+    assert bool((relative_error(found.A, scene.motion[0]) < 1e-6).all())
+    assert found.B is None and bool((found.labels == MOVING).all())
+
+
+@pytest.mark.parametrize("threshold", [0.015, None])
+def test_noise_and_static_lines(threshold: float | None) -> None:
+    scene = scenes.translating_lines(90, batch=3, sigma=0.005, static=0.3, generator=draw(2))
+    found = align_lines(*scene.views, threshold=threshold, generator=draw(3)).check()
+    assert bool((relative_error(found.A, scene.motion[0]) < 0.01).all())
+    assert float((found.labels == scene.labels).double().mean()) > 0.93
+    assert bool(((found.sigma / 0.005 - 1).abs() < 0.35).all())
+    assert found.covariance.shape == (3, 16, 16)
+
+
+def test_a_few_outliers() -> None:
+    scene = scenes.translating_lines(120, batch=3, sigma=0.002, outliers=0.05, generator=draw(4))
+    found = align_lines(*scene.views, threshold=0.006, generator=draw(5)).check()
+    assert bool((relative_error(found.A, scene.motion[0]) < 0.01).all())
+    assert float((found.labels == OUTLIER)[scene.labels == OUTLIER].double().mean()) > 0.9
+
+
+def test_pluecker_coordinates_give_the_same_motion() -> None:
+    scene = scenes.translating_lines(60, sigma=0.002, generator=draw(6))
+    by_points = align_lines(*scene.views, threshold=None, generator=draw(7)).check()
+    by_pluecker = align_lines(*(plucker(x) for x in scene.views), threshold=None, generator=draw(7)).check()
+    assert relative_error(by_points.A, by_pluecker.A) < 0.01
+    # the two points lie on the line that they stand for
+    line = plucker(scene.views[0])[None]
+    again = plucker(as_points((line,), torch.ones(1, 60, dtype=F64))[0])
+    parallel = (torch.nn.functional.normalize(line, dim=-1) * torch.nn.functional.normalize(again, dim=-1)).sum(-1).abs()
+    torch.testing.assert_close(parallel, torch.ones(1, 60, dtype=F64))
+
+
+class TestPureTranslation:
+    @pytest.mark.parametrize("sigma", [0.0, 0.005])
+    def test_without_static_points_it_says_what_remains(self, sigma: float) -> None:
+        scene = scenes.translating_lines(60, batch=2, sigma=sigma, motion="translation", generator=draw(8))
+        found = align_lines(*scene.views, threshold=0.015, generator=draw(9))
+        assert bool((found.status != Status.OK).all())
+        assert bool(found.flagged("pure_translation").all())
+        assert "four degrees of freedom" in str(found.warnings[0]) and "static points" in str(found.warnings[0])
+        assert "position and the scale" in found.ambiguity
+
+    @pytest.mark.parametrize("motion", ["translation", "objects"])
+    def test_two_static_points_make_it_unique(self, motion: str) -> None:
+        scene = scenes.translating_lines(60, batch=2, motion=motion, static_points=2, generator=draw(10))
+        points = (scene.extras["points1"], scene.extras["points2"])
+        found = align_lines(*scene.views, static_points=points, threshold=1e-3, generator=draw(11)).check()
+        assert bool((relative_error(found.A, scene.motion[0]) < 1e-6).all())
+
+    def test_with_noise(self) -> None:
+        scene = scenes.translating_lines(60, batch=3, sigma=0.005, motion="translation", static_points=4, generator=draw(12))
+        points = (scene.extras["points1"], scene.extras["points2"])
+        found = align_lines(*scene.views, static_points=points, threshold=0.015, generator=draw(13)).check()
+        assert bool((relative_error(found.A, scene.motion[0]) < 0.03).all())
+
+
+def test_labelled_static_lines_and_missing_ones() -> None:
+    scene = scenes.translating_lines(70, batch=2, sigma=0.003, static=0.3, generator=draw(14))
+    views = [x.clone() for x in scene.views]
+    views[0][0, 3] = math.nan
+    found = align_lines(views[0], views[1], static=scene.labels == STATIC, threshold=0.009, generator=draw(15)).check()
+    assert bool((relative_error(found.A, scene.motion[0]) < 0.01).all())
+    assert int(found.labels[0, 3]) == OUTLIER
+
+
+def test_degenerate_data_have_a_status() -> None:
+    same = torch.ones(40, 2, 3, dtype=F64) + torch.tensor([[0.0], [1.0]], dtype=F64)
+    found = align_lines(same, same, threshold=0.01, generator=draw(16))
+    assert int(found.status) != Status.OK
+    assert bool(found.A.isfinite().all()) and bool(found.covariance.isfinite().all())
+
+
+@pytest.mark.parametrize(
+    ("count", "change", "text"),
+    [
+        (30, {}, "needs at least 35 lines, got 30 and 0 static points"),
+        (40, {"threshold": -1.0}, "threshold must be a positive distance.*got -1"),
+        (40, {"static_points": (torch.zeros(2, 3, dtype=F64), torch.zeros(3, 3, dtype=F64))}, "static_points must be two"),
+        (40, {"static_points": (torch.zeros(2, 3), torch.zeros(2, 3))}, "static_points must be torch.float64"),
+        (40, {"static_points": (torch.full((2, 3), math.nan, dtype=F64),) * 2}, "static_points must be finite"),
+        (40, {"weights": torch.ones(7, dtype=F64)}, "weights must be"),
+    ],
+)
+def test_misuse(count: int, change: dict[str, object], text: str) -> None:
+    scene = scenes.translating_lines(count, generator=draw())
+    with pytest.raises(ValueError, match=text):
+        align_lines(*scene.views, **change)  # type: ignore[arg-type]
+
+
+def test_empty_batch() -> None:
+    empty = torch.zeros(0, 40, 2, 3)
+    found = align_lines(empty, empty, threshold=0.1)
+    assert found.A.shape == (0, 4, 4) and found.status.shape == (0,)

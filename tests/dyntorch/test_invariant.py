@@ -1,0 +1,87 @@
+"""The contract of an invariant: what follows from a declaration, and use of the class in place of its default instance."""
+
+from dataclasses import dataclass
+
+import pytest
+import torch
+
+import dyntorch as dyn
+from dyntorch.invariant import Frame, Invariant, as_invariant, on_class
+from dyntorch.primitives import HyperplanesThrough, Line, Point
+
+
+@pytest.mark.parametrize(
+    ("primitives", "nullity", "layout", "expected"),
+    [
+        ((Point(2), Point(2)), 1, (1, 0), ((3, 3), 9, 1, 8)),
+        ((Point(3), Point(2), HyperplanesThrough(2)), 1, None, ((4, 3, 3), 36, 2, 18)),
+        ((HyperplanesThrough(3), Point(3)), 1, None, ((4, 4), 16, 3, 5)),
+        ((Point(3), Point(2)), 2, (1, 0), ((3, 4), 12, 1, 10)),
+        ((Line(), Point(1)), 5, (0, 1), ((6, 2), 12, 1, 7)),
+    ],
+)
+def test_sizes_follow_from_the_declaration(primitives, nullity, layout, expected):
+    class Declared(Invariant):
+        pass
+
+    Declared.primitives, Declared.nullity, Declared.layout = primitives, nullity, layout
+    for invariant in (Declared, Declared()):
+        assert (invariant.shape(), invariant.width(), invariant.rows(), invariant.minimal()) == expected
+
+
+def test_counts_of_the_thesis():
+    expected = {
+        dyn.FundamentalMatrix: 8,
+        dyn.HomographyTensor: 26,
+        dyn.DualHomographyTensor: 26,
+        dyn.JoinTensor: 60,
+        dyn.MinimalJoinTensor: 47,
+        dyn.ConstantVelocityTensor: 21,
+        dyn.TranslatingLinesMatrix: 35,
+    }
+    assert {kind: kind.minimal() for kind in expected} == expected
+
+
+def test_defaults_leave_everything_as_it_is():
+    invariant, tensor = Invariant(), torch.rand(2, 3)
+    assert invariant.constrain(tensor) is tensor
+    assert invariant.normalized((tensor,)) is invariant
+    assert invariant.subset(torch.tensor([0])) is invariant
+    assert invariant.whitened((), (), ()) is None
+    with pytest.raises(ValueError, match="Invariant has no separate residual for static matches; leave out static="):
+        invariant.whitened_static((), (), ())
+
+
+def test_on_class_stands_for_the_default_instance():
+    @dataclass(frozen=True)
+    class Family:
+        size: int = 3
+
+        @on_class
+        def doubled(self, add: int = 0) -> int:
+            """Twice the size."""
+            return 2 * self.size + add
+
+    assert Family.doubled() == 6 and Family(5).doubled() == 10 and Family.doubled(add=1) == 7
+    assert vars(Family)["doubled"].__doc__ == "Twice the size."
+
+
+def test_as_invariant():
+    assert isinstance(as_invariant(dyn.HomographyTensor), dyn.HomographyTensor)
+    given = dyn.Collineation(3)
+    assert as_invariant(given) is given
+
+    @dataclass(frozen=True)
+    class Family(Invariant):
+        k: int
+
+    with pytest.raises(ValueError, match=r"Family is a family: give its parameters, Family\(\.\.\.\)"):
+        as_invariant(Family)
+    for wrong in ("HomographyTensor", 3, torch.rand, int):
+        with pytest.raises(ValueError, match=r"expected an invariant such as dyntorch\.HomographyTensor, got "):
+            as_invariant(wrong)
+
+
+def test_frames_say_what_they_map():
+    assert Frame(0, 1) == Frame(target=0, source=1, vector=False)
+    assert [f.target for f in dyn.ConstantVelocityTensor.motion] == [0, 1, 2]
