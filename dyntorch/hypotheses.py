@@ -43,7 +43,7 @@ class Bundle:
 
     def first(self, weights: Tensor) -> Tensor:
         """Null spaces ``(b, c, K, a, D)`` of the weightings ``(b, K, n)`` of rows of unit length."""
-        norms = torch.ones(1, 1, 1, dtype=weights.dtype, device=weights.device)
+        norms = torch.ones((), dtype=weights.dtype, device=weights.device)
         for primitive, u in zip(self.primitives, self.vectors, strict=True):
             norms = norms * u.square().sum(-2) if primitive.rows == 1 else norms
         gram = self._gram(weights[:, None] / norms[:, :, None].clamp(min=1e-300))

@@ -21,6 +21,7 @@ from dyntorch.eigenspace import (
     on_host,
     orthonormal,
     resolvent,
+    solve,
     unit_trace,
 )
 
@@ -252,7 +253,7 @@ def _corrected(matrix: Tensor, scale: Tensor, vectors: Tensor, deflated: Tensor)
     for _ in range(2):
         image = matrix @ vectors
         residual = (matrix.mT @ image - vectors @ (image.mT @ image)) * scale[:, None, None]
-        vectors = orthonormal(vectors - torch.cholesky_solve(residual, deflated))
+        vectors = orthonormal(vectors - solve(residual, deflated))
     return vectors
 
 

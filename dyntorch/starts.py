@@ -33,8 +33,8 @@ NEAR = 5.0
 MIXED = 4
 """Random sets of matches, made by mixing up the views, on which the chance of an inlier is measured."""
 DOUBT = 0.15
-"""Matches between one and three thresholds away, per inlier, above which the search goes on (a wrong model has many such: measured
-0.7 and more for constant velocity tensors at 20 % outliers, 0.03 at most where right; right homography tensors reach 0.15 at 60 %)."""
+"""Matches between one and three thresholds away, per inlier, above which the search goes on: a wrong model has many (constant
+velocity tensors, 20 % outliers: wrong 0.7 and more, right 0.03 at most; right homography tensors reach 0.15 at 60 %)."""
 
 
 @dataclass(frozen=True)

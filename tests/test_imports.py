@@ -50,6 +50,51 @@ def test_packages_do_not_import_what_stands_on_them(package):
     assert offenders(package, lambda module, names: any(within(module, p) for p in ("experiments", "tests", "benchmarks"))) == []
 
 
+LAYERS = [
+    {"algebra", "blocks", "eigenspace", "nullspace", "primitives"},
+    {"invariant"},
+    {"matches", "normalize", "matrix"},
+    {"residual"},
+    {"invariants"},
+    {"solution", "fitting"},
+    {"refinement"},
+    {"hypotheses", "starts", "robust"},
+    {"tasks"},
+]
+ASIDE = {"counting", "scenes", "metrics"}
+"""Nothing of the library stands on these: counting is alone, the others serve tests, experiments and the demo."""
+
+
+def rooms_of(module):
+    parts = module.split(".")
+    return parts[1] if parts[0] == "dyntorch" and len(parts) > 1 else None
+
+
+def test_the_layers_of_dyntorch_import_downwards():
+    level = {room: number for number, rooms in enumerate(LAYERS) for room in rooms}
+    wrong, seen = [], set()
+    for path in files("dyntorch"):
+        here = path.relative_to(ROOT / "dyntorch").with_suffix("").parts[0]
+        if here in ASIDE | {"__init__"}:
+            continue
+        seen.add(here)
+        for module, _ in imported(path):
+            room = rooms_of(module)
+            if room and (room in ASIDE or level[room] > level[here]):
+                wrong.append(f"{path.relative_to(ROOT)}: {module}")
+            # one path for all invariants: what fits them does not know them by name
+            if room == "invariants" and here in {"solution", "fitting", "refinement", "hypotheses", "starts", "robust"}:
+                wrong.append(f"{path.relative_to(ROOT)}: {module}")
+    assert wrong == []
+    assert seen == set(level)
+
+
+def test_counting_stands_alone():
+    found = {module for path in files("dyntorch/counting") for module, _ in imported(path)}
+    outside = {module for module in found if module.split(".")[0] not in sys.stdlib_module_names}
+    assert {module for module in outside if not within(module, "dyntorch.counting")} == {"numpy"}
+
+
 def test_indexing_uses_only_public_names_of_dyntorch():
     public = set(__import__("dyntorch").__all__) | {"__version__"}
 

@@ -211,10 +211,9 @@ def _rank(lines: Lines, labels: Tensor, sigma: Tensor, usable: Tensor, points: t
     if joined.count < MINIMAL:
         return torch.full_like(labels[:, 0], MINIMAL)
     values = fit_matches(TranslatingLinesMatrix(), joined).singular_values
-    noise = (
-        torch.where(usable, sigma, lines.floor) * torch.stack(lines.norm.scales).mean(0) * joined.weights.square().sum(-1).sqrt()
-    )
-    return (values > torch.maximum(ABOVE * noise[:, None] / 12**0.5, 1e-9 * values[:, :1])).sum(-1)
+    noise = torch.where(usable, sigma, lines.floor) * torch.stack(lines.norm.scales).mean(0)
+    noise = noise * joined.weights.square().sum(-1).sqrt()
+    return (values > torch.maximum(ABOVE * noise[:, None], 1e-9 * values[:, :1])).sum(-1)
 
 
 def _notices(rank: Tensor, worst: Tensor, none: Tensor, enough: Tensor, batch: tuple[int, ...]) -> tuple[Notice, ...]:

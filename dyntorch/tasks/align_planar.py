@@ -181,6 +181,9 @@ def _from_tensor(evidence: Evidence, given: Tensor | None, generator: torch.Gene
         return theta, given
     moving, _ = evidence.residuals(theta)
     noise = torch.where(data.weights > 0, moving[..., 0].abs(), torch.nan).nanmedian(dim=-1).values / 0.6745
+    if found.sigma is not None:
+        # what its inliers show is less than the median, where there are many outliers
+        noise = torch.where((found.status == Status.OK) & (found.sigma > 0), torch.minimum(found.sigma, noise), noise)
     return theta, torch.where(usable & noise.isfinite(), noise, torch.inf)
 
 

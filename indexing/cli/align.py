@@ -31,7 +31,7 @@ PURPOSE = {
 }
 REASONS = {
     "TOO_FEW": "too few matches are present in all views; give more",
-    "DEGENERATE": "the matches leave several motions, exactly; add matches elsewhere that move otherwise, or use a model with fewer unknowns",
+    "DEGENERATE": "several motions fit all matches exactly; add matches that move otherwise, or use a model with fewer unknowns",
     "AMBIGUOUS": "other motions fit as well; add matches that differ more, lower the noise, or use a model with fewer unknowns",
     "NO_CONSENSUS": "no motion fits enough of the matches; raise --threshold, or give matches of which more belong to the model",
     "NOT_CONVERGED": "the solver did not converge; give more matches, or a larger --threshold",
@@ -240,7 +240,7 @@ def show(report: AlignmentReport) -> None:
         if known:
             values, spread, scaled = display_scale(matrix, block)
             cells = [
-                [" ± ".join(figures(float(v), float(s))).removesuffix(" ± 0") for v, s in zip(*row, strict=True)]
+                [" ± ".join(filter(None, figures(float(v), float(s)))) for v, s in zip(*row, strict=True)]
                 for row in zip(values, spread, strict=True)
             ]
             rows = [[f"row {i}", *row] for i, row in enumerate(cells, start=1)]

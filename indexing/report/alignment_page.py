@@ -57,6 +57,10 @@ def display_scale(matrix: FloatArray, covariance: FloatArray) -> tuple[FloatArra
     flat, last = matrix.ravel(), float(matrix[-1, -1])
     if abs(last) < 1e-9 * float(np.abs(flat).max()):
         return matrix, np.sqrt(np.clip(np.diagonal(covariance), 0, None)).reshape(matrix.shape), False
+    if not np.isfinite(covariance).all():  # as few matches as can be: nothing is left to judge by
+        spread = np.full(flat.size, np.inf)
+        spread[-1] = 0.0
+        return matrix / last, spread.reshape(matrix.shape), True
     derivative = np.eye(flat.size) / last
     derivative[:, -1] -= flat / last**2
     derivative[-1] = 0.0  # the last entry is 1 by decree, whatever rounding says
@@ -73,14 +77,15 @@ def turn_and_shift(matrix: FloatArray) -> tuple[float, FloatArray]:
 
 
 def figures(value: float, spread: float) -> tuple[str, str]:
-    """A number and its standard deviation, with as many decimals as the deviation supports (two figures of it).
+    """A number and its standard deviation, with as many decimals as the deviation supports (two figures of it); empty where it is
+    zero or unknown.
 
     Example:
         >>> figures(0.98765432, 0.00123), figures(412.3456, 1.5), figures(2.0, 0.0), figures(-3.2e-06, 4.5e-08)
-        (('0.9877', '0.0012'), ('412.3', '1.5'), ('2', '0'), ('-3.200e-06', '4.5e-08'))
+        (('0.9877', '0.0012'), ('412.3', '1.5'), ('2', ''), ('-3.200e-06', '4.5e-08'))
     """
     if not (math.isfinite(spread) and spread > 0 and math.isfinite(value)):
-        return f"{value:.6g}", "0" if spread == 0 else "unknown"
+        return f"{value:.6g}", ""
     places = 1 - math.floor(math.log10(spread))
     if places > 6:
         power = math.floor(math.log10(abs(value))) if value else 0
@@ -164,7 +169,7 @@ def _motion(report: AlignmentReport) -> str:
 
 
 def _cell(value: str, spread: str) -> str:
-    return f'{value} <small class="none">± {spread}</small>' if spread != "0" else value
+    return f'{value} <small class="none">± {spread}</small>' if spread else value
 
 
 def _labels(report: AlignmentReport) -> str:

@@ -1,0 +1,337 @@
+"""``dyntorch align``: every model on files of a scene whose truth is known, what is written, and what is refused and how."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from dyntorch import scenes
+from indexing.cli import main
+from indexing.report.alignment import FILES, AlignmentReport, as_json, labels_csv, write_alignment
+from indexing.report.alignment_page import display_scale, figures, turn_and_shift
+from indexing.report.alignment_picture import as_segments, carried
+
+SCRIPT = "<script>alert(1)</script>"
+
+
+def draw(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def table(path: Path, values: np.ndarray, names: list[str] | None = None, header: str = "") -> Path:
+    rows = values.reshape(len(values), -1)
+    lines = [",".join([*([names[i]] if names else []), *(f"{v:.6f}" for v in row)]) for i, row in enumerate(rows)]
+    path.write_text("\n".join([*([header] if header else []), *lines]) + "\n")
+    return path
+
+
+@pytest.fixture(scope="module")
+def planar():
+    return scenes.planar(n=90, sigma=0.5, static=0.35, outliers=0.1, generator=draw(0))
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory, planar) -> Path:
+    """``a.csv, b.csv, c.csv`` of a plane, ``rigid.npz``, ``l1.csv, l2.csv`` with static points ``p1.csv, p2.csv``."""
+    folder = tmp_path_factory.mktemp("align")
+    names = [f"p{i}" for i in range(90)]
+    for name, view in zip("abc", planar.views, strict=True):
+        table(folder / f"{name}.csv", view.numpy(), names, "id,x,y")
+    rigid = scenes.moving_points(60, sigma=0.01, static=0.3, outliers=0.1, sensors="rigid", generator=draw(1))
+    np.savez(folder / "rigid.npz", **{f"P{i}": view.numpy() for i, view in enumerate(rigid.views, start=1)})
+    np.save(folder / "truth.npy", rigid.motion[0].numpy())
+    lines = scenes.translating_lines(60, sigma=0.002, static_points=6, generator=draw(2))
+    for i in (1, 2):
+        table(folder / f"l{i}.csv", lines.views[i - 1].numpy(), header="x1,y1,z1,x2,y2,z2")
+        table(folder / f"p{i}.csv", lines.extras[f"points{i}"].numpy())
+    np.save(folder / "line_truth.npy", lines.motion[0].numpy())
+    return folder
+
+
+@pytest.fixture
+def run(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    """Runs the command in an empty folder; ``@/`` in a word stands for the folder of the data."""
+    monkeypatch.chdir(tmp_path)
+    capsys.readouterr()
+
+    def call(line: str) -> tuple[int, str, str]:
+        code = main(["align", *(word.replace("@/", f"{data}/") for word in line.split())])
+        said = capsys.readouterr()
+        return code, said.out, said.err
+
+    return call
+
+
+def read(folder: str | Path = "out") -> dict:
+    return json.loads((Path(folder) / "alignment.json").read_text())
+
+
+# ---- what is found -------------------------------------------------------------------------------------------------------
+def test_planar_from_csv(run, planar, tmp_path):
+    code, out, err = run("@/a.csv @/b.csv @/c.csv --model planar --threshold 1.5 --out out/")
+    assert (code, err) == (0, "")
+    assert sorted(path.name for path in Path("out").iterdir()) == sorted(FILES)
+    found = read()
+    assert found["status"] == "OK" and found["model"] == "planar" and found["threshold"] == 1.5
+    for name, truth in zip("AB", planar.motion, strict=True):
+        error = np.abs(np.array(found[name]) - truth.numpy())
+        spread = np.array(found[f"{name}_deviation"])
+        assert np.linalg.norm(error) < 0.02 and (error <= 6 * spread + 1e-9).all()  # the files have 6 decimals
+    assert np.array(found["covariance"]).shape == (18, 18) and 0.3 < found["sigma"] < 0.7
+    labels = np.array(found["labels"])
+    assert (labels == planar.labels.numpy()).mean() > 0.85
+    with Path("out/labels.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["id"] for row in rows] == found["ids"] == [f"p{i}" for i in range(90)]
+    assert [int(row["label"]) for row in rows] == labels.tolist()
+    assert {row["name"]: row["label"] for row in rows} == {"outlier": "0", "static": "1", "moving": "2"}
+    assert sum(found["counts"].values()) == 90 and found["ambiguity"]
+    assert found["manifest"]["seed"] == 0 and len(found["manifest"]["inputs"]) == 3
+    counts = [str(found["counts"][name]) for name in ("static", "moving", "outlier", "missing")]
+    assert ["90", *counts] in [line.split()[:5] for line in out.splitlines()] and "report: out/report.html" in out
+    assert "A: view 2 to view 1" in out and "open: A and B are unique" in out
+    page = Path("out/report.html").read_text()
+    assert page.count("data:image/png;base64,") == 2 and f"{counts[0]} stand still and {counts[1]} move" in page
+    assert Path("out/alignment.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_model_follows_from_the_files_and_the_output_says_so(run, data):
+    code, out, _ = run("@/rigid.npz --out out")
+    assert code == 0 and "note: model rigid, because the files hold 3D points; if their scale" in out
+    truth = np.load(data / "truth.npy")
+    found = read()
+    np.testing.assert_allclose(found["A"], truth / truth[3, 3], atol=0.03)
+    assert found["threshold"] is None and 0.005 < found["sigma"] < 0.02
+    assert "A turn by" in Path("out/report.html").read_text()
+
+
+def test_the_same_seed_gives_the_same_result(run):
+    for name in ("one", "two"):
+        assert run(f"@/rigid.npz --seed 3 --out {name}")[0] == 0
+    first, second = read("one"), read("two")
+    assert {key: value for key, value in first.items() if key != "manifest"} == {
+        key: value for key, value in second.items() if key != "manifest"
+    }
+
+
+@pytest.mark.parametrize("model", ["join", "minimal_join"])
+def test_projective_points(run, tmp_path, model):
+    scene = scenes.moving_points(120, sigma=0.002, static=0.3, sensors="projective", generator=draw(4))
+    np.savez(tmp_path / "m.npz", **{f"P{i}": view.numpy() for i, view in enumerate(scene.views, start=1)})
+    assert run(f"m.npz --model {model} --threshold 0.006 --out out")[0] == 0
+    assert np.linalg.norm(np.array(read()["B"]) - scene.motion[1].numpy()) < 0.05
+
+
+@pytest.mark.parametrize(("model", "sensors"), [("constant_velocity", "projective"), ("affine_constant_velocity", "affine")])
+def test_constant_velocity(run, tmp_path, model, sensors):
+    scene = scenes.constant_velocity(80, sigma=0.002, static=0.3, sensors=sensors, generator=draw(5))
+    np.savez(tmp_path / "m.npz", **{f"P{i}": view.numpy() for i, view in enumerate(scene.views, start=1)})
+    assert run(f"m.npz --model {model} --threshold 0.006 --out out")[0] == 0
+    found = read()
+    truth = (scene.motion[0] @ torch.linalg.inv(scene.motion[1])).numpy()
+    assert np.linalg.norm(np.array(found["A"]) - truth / np.linalg.norm(truth) * np.sign(truth[3, 3])) < 0.05
+    assert np.array(found["velocities"]).shape == (80, 3)
+
+
+def test_lines_with_static_points(run, data):
+    code, out, _ = run("@/l1.csv @/l2.csv --model lines --threshold 0.006 --static-points @/p1.csv @/p2.csv --out out")
+    assert code == 0 and "B: view 3" not in out
+    truth = np.load(data / "line_truth.npy")
+    assert np.linalg.norm(np.array(read()["A"]) - truth) < 0.05 and "B" not in read()
+
+
+def test_pluecker_lines(run, data, tmp_path):
+    views = [np.loadtxt(data / f"l{i}.csv", delimiter=",", skiprows=1).reshape(-1, 2, 3) for i in (1, 2)]
+    ends = [np.concatenate([view, np.ones((len(view), 2, 1))], axis=2) for view in views]
+    pairs = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
+    both = [np.stack([e[:, 0, i] * e[:, 1, j] - e[:, 0, j] * e[:, 1, i] for i, j in pairs], axis=1) for e in ends]
+    np.savez(tmp_path / "m.npz", l1=both[0], l2=both[1])
+    assert run("m.npz --out out")[0] == 0
+    assert np.linalg.norm(np.array(read()["A"]) - np.load(data / "line_truth.npy")) < 0.05
+    segments = as_segments(both[0])
+    across = np.cross(segments - views[0][:, :1], (views[0][:, 1] - views[0][:, 0])[:, None])
+    assert np.abs(across).max() < 1e-6
+
+
+def test_rows_are_matched_by_name_and_missing_ones_said(run, data, tmp_path):
+    rows = (data / "b.csv").read_text().splitlines()
+    mixed = [rows[0], *reversed(rows[4:]), "p1,,7", "stranger,1,2"]  # p0 and p2 are absent, p1 is missing
+    (tmp_path / "b.csv").write_text("\n".join(mixed) + "\n")
+    code, out, _ = run("@/a.csv b.csv @/c.csv --threshold 1.5 --out out")
+    assert code == 0 and "note: 3 names are not in every view and were left out: p0, p2, stranger" in out
+    found = read()
+    assert found["matches"] == 88 and found["counts"]["missing"] == 1 and found["status"] == "OK"
+    assert "p1,0,missing" in Path("out/labels.csv").read_text().splitlines()
+    assert run("@/a.csv @/b.csv @/c.csv --threshold 1.5 --out whole")[0] == 0
+    assert np.abs(np.array(found["A"]) - np.array(read("whole")["A"])).max() < 0.01
+
+
+def test_without_a_folder_nothing_is_written(run, tmp_path):
+    code, out, _ = run("@/rigid.npz")
+    assert code == 0 and "report" not in out and list(tmp_path.iterdir()) == []
+
+
+def test_frames_of_one_file(run, data, tmp_path):
+    archive = np.load(data / "rigid.npz")
+    views = [archive[f"P{i}"] for i in (1, 2, 3)]
+    np.save(tmp_path / "walk.npy", np.stack([views[0], views[0], views[1], views[1], views[2]]))
+    assert run("walk.npy --frames 0,2,4 --model rigid --out one")[0] == 0
+    assert run("@/rigid.npz --model rigid --out two")[0] == 0
+    assert read("one")["A"] == read("two")["A"] and read("one")["views"][1] == "walk.npy frame 2"
+
+
+# ---- what is refused -----------------------------------------------------------------------------------------------------
+def test_data_that_cannot_decide_are_refused_with_code_3(run, tmp_path):
+    equal = table(tmp_path / "e.csv", np.full((40, 2), 5.0))
+    code, out, err = run(f"{equal} {equal} {equal} --model planar --out out")
+    assert code == 3 and re.fullmatch(r"dyntorch: refused: [^\n]+; add matches[^\n]+\n", err)
+    assert "degenerate" in out and "A: view" not in out
+    found = read()
+    assert found["status"] == "DEGENERATE" and "A" not in found and found["covariance"] is None and found["warnings"]
+    assert found["reason"] and "Refused" in Path("out/report.html").read_text()
+    assert sorted(path.name for path in Path("out").iterdir()) == sorted(FILES)
+
+
+def test_noise_alone_is_refused(run, tmp_path):
+    rng = np.random.default_rng(0)
+    for name in "abc":
+        table(tmp_path / f"{name}.csv", rng.uniform(0, 500, size=(60, 2)))
+    code, _, err = run("a.csv b.csv c.csv --threshold 0.1 --out out")
+    assert code == 3 and "refused" in err and read()["status"] != "OK"
+
+
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        ("", "no files; give a file of points for each view"),
+        ("no.csv @/b.csv @/c.csv", "no.csv: no such file; check the path"),
+        ("@/a.csv @/b.csv", "--model planar needs 3 views, got 2 views"),
+        ("@/a.csv @/b.csv @/c.csv --model rigid", "a.csv: holds 2D points, --model rigid needs 3D points; use --model planar"),
+        ("@/rigid.npz --model planar", "holds 3D points, --model planar needs 2D points; use --model rigid, join"),
+        ("@/l1.csv @/l2.csv --model join", "l1.csv: holds lines, --model join needs 3D points; use --model lines"),
+        ("@/a.csv @/l1.csv @/l2.csv", "holds lines, but"),
+        ("@/p1.csv @/p2.csv @/a.csv --model rigid", "a.csv"),
+        ("@/a.csv @/b.csv @/c.csv --model plane", "plane"),
+        ("@/a.csv @/b.csv @/c.csv --threshold 0", "--threshold must be a positive distance"),
+        ("@/a.csv @/b.csv @/c.csv --threshold x", "threshold"),
+        ("@/a.csv @/b.csv @/c.csv --seed -1", "--seed must be a whole number"),
+        ("@/a.csv @/b.csv @/c.csv --motion constant_velocity", "--motion constant_velocity belongs to --model rigid"),
+        ("@/rigid.npz --frames 1,x,3", "--frames '1,x,3': expected whole numbers"),
+        ("@/rigid.npz --frames 1,2,3", "an .npz has no frames"),
+        ("@/a.csv @/b.csv @/c.csv --static-points @/p1.csv", "static points are for lines"),
+        ("@/a.csv @/b.csv @/c.csv --out @/a.csv", "is a file; choose another folder"),
+    ],
+)
+def test_bad_input_is_one_line_and_code_2(run, tmp_path, line, says):
+    code, out, err = run(line)
+    assert (code, out) == (2, "") and list(tmp_path.iterdir()) == []
+    assert err.startswith("dyntorch: ") and err.count("\n") == 1 and says in err
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda rows: rows[:6], "a.csv, b.csv, c.csv: align_planar needs at least 26 matches, got 5"),
+        (lambda rows: [row.partition(",")[2] for row in rows][:-1], "b.csv: has 90 rows, "),
+        (lambda rows: ["id,u,v", *rows[1:]], "a.csv: its columns are id, u, v"),
+        (lambda rows: [*rows[:7], "p6,12,abc", *rows[8:]], "a.csv: row 8, column 'y': 'abc' is not a number"),
+        (lambda rows: [rows[0], *(f"q{row}" for row in rows[1:])], "a.csv: no name is in all of"),
+        (lambda rows: [], "a.csv: the file is empty"),
+    ],
+)
+def test_bad_files_are_one_line_and_code_2(run, data, tmp_path, change, says):
+    for name in "abc":
+        rows = (data / f"{name}.csv").read_text().splitlines()
+        rows = change(rows) if name == "a" else rows
+        (tmp_path / f"{name}.csv").write_text("\n".join(rows))
+    code, out, err = run("a.csv b.csv c.csv --model planar --out out")
+    assert (code, out) == (2, "") and not Path("out").exists()
+    assert err.startswith("dyntorch: ") and err.count("\n") == 1 and says in err
+
+
+def test_an_input_is_not_overwritten(run, data, tmp_path):
+    before = (data / "a.csv").read_text()
+    (tmp_path / "labels.csv").write_text(before)
+    code, _, err = run("labels.csv @/b.csv @/c.csv --out .")
+    assert code == 2 and "labels.csv: is an input" in err and (tmp_path / "labels.csv").read_text() == before
+
+
+def test_help_loads_nothing_heavy_and_names_the_models():
+    code = (
+        "import sys; from indexing.cli import main; main(['align', '--help']); main(['--help'])\n"
+        "print('loaded', *{'torch', 'sklearn', 'matplotlib'} & set(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1].strip() == "loaded" and "affine_constant_velocity" in done.stdout
+
+
+# ---- the report ----------------------------------------------------------------------------------------------------------
+def report(**changes) -> AlignmentReport:
+    points = np.array([[0.0, 0.0], [3.0, 1.0], [1.0, 2.0], [np.nan, 1.0]])
+    values = {
+        "title": SCRIPT, "model": ("planar", "Points."), "views": [points] * 3, "names": [SCRIPT, "b", "c"],
+        "ids": [SCRIPT, "=1+1", "-2", "d"], "labels": np.array([1, 1, 2, 0]), "motion": [np.eye(3), np.eye(3)],
+        "covariance": np.eye(18) * 1e-8, "sigma": 0.1, "warnings": [("few_moving", 1.0, SCRIPT)],
+    }  # fmt: skip
+    return AlignmentReport(**{**values, **changes})
+
+
+def test_what_comes_from_files_is_escaped(tmp_path):
+    page = write_alignment(tmp_path, report()).read_text()
+    assert SCRIPT not in page and "&lt;script&gt;" in page
+    assert labels_csv(report()).splitlines() == [
+        "id,label,name", f"{SCRIPT},1,static", "'=1+1,1,static", "-2,2,moving", "d,0,missing",
+    ]  # fmt: skip
+
+
+def test_every_kind_of_data_can_be_drawn(tmp_path):
+    lines = np.random.default_rng(0).normal(size=(5, 2, 3))
+    for i, changes in enumerate((
+        {"status": "DEGENERATE", "reason": "no", "motion": [np.zeros((3, 3))] * 2},
+        {"views": [np.full((4, 2), np.nan)] * 3, "labels": np.zeros(4, dtype=int)},
+        {"views": [np.full((4, 2), 1e9)] * 3},
+        {"views": [lines, lines], "labels": np.array([0, 1, 2, 2, 1]), "ids": list("abcde"), "names": ["a", "b"],
+         "motion": [np.eye(4)], "covariance": np.eye(16)},
+        {"unverified": np.array([False, False, True, False])},
+        {"motion": [np.diag([1.0, 1.0, 0.0]), np.eye(3)]},
+        {"covariance": np.full((18, 18), np.inf)},
+    )):  # fmt: skip
+        page = write_alignment(tmp_path / str(i), report(**changes)).read_text()
+        assert "<img" in page and "nan" not in page.partition("<main>")[2].replace("data:image", "").split("base64")[0]
+        json.loads((tmp_path / str(i) / "alignment.json").read_text())
+
+
+def test_json_has_no_motion_where_there_is_none():
+    found = as_json(report(motion=[np.zeros((3, 3))] * 2, status="DEGENERATE", reason="why"))
+    assert found["status"] == "DEGENERATE" and found["reason"] == "why" and "A" not in found
+
+
+def test_display_scale_against_differences():
+    rng = np.random.default_rng(1)
+    matrix = rng.normal(size=(3, 3))
+    root = rng.normal(size=(9, 9)) * 1e-4
+    shown, spread, scaled = display_scale(matrix, root @ root.T)
+    assert scaled and shown[2, 2] == 1 and spread[2, 2] == 0
+    draws = matrix.ravel() + rng.normal(size=(40000, 9)) @ root.T
+    np.testing.assert_allclose((draws / draws[:, -1:]).std(axis=0).reshape(3, 3)[:2], spread[:2], rtol=0.03)
+    assert not display_scale(np.diag([1.0, 1.0, 0.0]), np.eye(9))[2]
+
+
+def test_small_numbers_of_the_page():
+    angle = np.radians(170)
+    motion = np.eye(4)
+    motion[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    motion[:3, 3] = 1, 2, 3
+    turn, shift = turn_and_shift(2 * motion)
+    assert abs(turn - 170) < 1e-9 and shift.tolist() == [1, 2, 3]
+    np.testing.assert_allclose(carried(motion, np.array([[1.0, 0, 0]])), [[1 + np.cos(angle), 2 + np.sin(angle), 3]])
+    assert figures(1.0, float("inf")) == ("1", "") and figures(0.0, 1e-9)[1] == "1.0e-09"
+    assert figures(123456.0, 2345.0) == ("123456", "2345")
