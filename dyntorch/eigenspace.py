@@ -67,12 +67,15 @@ def orthonormal(columns: Tensor) -> Tensor:
 
 
 def _unit(columns: Tensor) -> Tensor:
-    return columns / columns.norm(dim=-2, keepdim=True).clamp(min=1e-300)
+    length: Tensor = columns.norm(dim=-2, keepdim=True)
+    return columns / length.clamp(min=1e-300)
 
 
 def solve(right: Tensor, factor: Tensor) -> Tensor:
     """Solution for a lower Cholesky factor: for one column two triangular solves take half the time of cholesky_solve."""
-    return torch.linalg.solve_triangular(factor.mT, torch.linalg.solve_triangular(factor, right, upper=False), upper=True)
+    half = torch.linalg.solve_triangular(factor, right, upper=False)
+    whole: Tensor = torch.linalg.solve_triangular(factor.mT, half, upper=True)
+    return whole
 
 
 def fix_signs(vectors: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial, update_wrapper
-from typing import Any, Concatenate, Generic, ParamSpec, TypeVar
+from typing import Any, Concatenate, Generic, ParamSpec, TypeVar, cast
 
 from torch import Tensor
 
@@ -29,7 +29,7 @@ class on_class(Generic[P, R]):
 
     def __init__(self, function: Callable[Concatenate[Any, P], R]) -> None:
         self.function = function
-        update_wrapper(self, function)
+        update_wrapper(cast("Callable[..., R]", self), function)
 
     def __get__(self, instance: Any, owner: type) -> Callable[P, R]:
         return partial(self.function, owner() if instance is None else instance)
@@ -92,6 +92,16 @@ class Invariant:
             ``(*batch, n, c)`` with expected square sum ``codim``; None for the Sampson residual of the multilinear form itself.
         """
         return None
+
+    def shared(self, motion: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+        """Functions of the motion that the residuals of all matches share (inverses): refinement computes them once per motion."""
+        return motion
+
+    def whitened_shared(self, shared: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
+        """:meth:`whitened` from :meth:`shared`."""
+        found = self.whitened(shared, views, scales)
+        assert found is not None
+        return found
 
     def whitened_static(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
         """The same for matches that do not move: all their views agree under the motion.  ``(*batch, n, c)``."""

@@ -49,24 +49,52 @@ class Problem:
         views, weights = tuple(x[:, piece] for x in self.views), self.weights[:, piece]
         still = None if self.static is None else self.static[:, piece]
         moving = weights if still is None else weights * ~still
-        value, derivative = self._moving(theta, views)
+        value, derivative = self.moving(theta, views)
         root = moving.sqrt()[..., None].expand(*moving.shape, value.shape[1] // moving.shape[1]).flatten(1)
         value, derivative = value * root, derivative * root[:, None]
         if still is None:
             return value, derivative
         resting = (weights * still).sqrt()[..., None]
-        more = _jacobian(lambda t: (self.invariant.whitened_static(self.parts(t), views, self.scales) * resting).flatten(1), theta)
+        more = self.resting(theta, views)
+        more = (
+            (more[0].unflatten(1, (views[0].shape[1], -1)) * resting).flatten(1),
+            more[1] * resting.expand(*resting.shape[:2], more[0].shape[1] // resting.shape[1]).flatten(1)[:, None],
+        )
         return torch.cat([value, more[0]], dim=-1), torch.cat([derivative, more[1]], dim=-1)
 
-    def _moving(self, theta: Tensor, views: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+    def moving(self, theta: Tensor, views: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
         """Unweighted residuals of matches that may move, and their derivative."""
-        if type(self.invariant).whitened is not Invariant.whitened:
-            return _jacobian(lambda t: whitened(self.invariant, self.parts(t), views, self.scales).flatten(1), theta)
+        empty = tuple(x[:0] for x in views), tuple(scale[:0] for scale in self.scales)
+        if self.invariant.whitened(self.parts(theta[:0]), *empty) is not None:
+            shared, slope = _jacobian(lambda t: _flat(self.invariant.shared(self.parts(t))), theta)
+            value, derivative = self._by_match(self.invariant.whitened_shared, shared, views)
+            return value, slope @ derivative
         # one row per match: by hand through the tensor, several times cheaper than forward mode through the matches
         tensor, slope = _jacobian(lambda t: self.invariant.compose(*self.parts(t)).flatten(1), theta)
         shape = self.invariant.shape()
         value, derivative = multilinear_derivative(self.invariant, tensor.unflatten(1, shape), views, self.scales)
         return value, slope @ derivative.mT
+
+    def resting(self, theta: Tensor, views: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+        """Unweighted residuals of matches that do not move, and their derivative."""
+        return self._by_match(self.invariant.whitened_static, theta, views)
+
+    def _by_match(self, function: Callable[..., Tensor], theta: Tensor, views: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+        """Residuals ``(b, n c)`` and derivative ``(b, p, n c)`` in reverse mode: a few conditions per match, many parameters.
+
+        Every match gets its own copy of the parameters, so that one backward pass per condition serves all matches.
+        """
+        count = views[0].shape[1]
+        single = tuple(x.unsqueeze(2) for x in views)
+        scales = tuple(scale[:, None].expand(-1, count) for scale in self.scales)
+
+        def residual(copies: Tensor) -> Tensor:
+            return function(self.parts(copies), single, scales)[..., 0, :]
+
+        value, pull = torch.func.vjp(residual, theta[:, None].expand(-1, count, -1))[:2]
+        one = torch.eye(value.shape[-1], dtype=value.dtype, device=value.device)
+        rows = torch.stack([pull(unit.expand_as(value).contiguous())[0] for unit in one], dim=2)
+        return value.flatten(1), rows.flatten(1, 2).mT
 
     def pieces(self, width: int) -> list[slice]:
         """The matches in slices whose Jacobians fit into memory, whatever their number."""
@@ -84,6 +112,11 @@ class Problem:
             gradient = gradient + (derivative @ value[..., None])[..., 0]
             matrix = matrix + derivative @ derivative.mT
         return torch.where(cost.isfinite(), cost, torch.inf), gradient, matrix
+
+
+def _flat(parts: tuple[Tensor, ...]) -> Tensor:
+    """All entries of a motion, ``(b, p)``."""
+    return torch.cat([part.flatten(1) for part in parts], dim=-1)
 
 
 def _jacobian(function: Callable[[Tensor], Tensor], theta: Tensor) -> tuple[Tensor, Tensor]:
@@ -160,7 +193,7 @@ def refine_matches(solution: Solution, data: Matches, iterations: int = ITERATIO
     invariant, norm = solution.invariant, _plain(solution)
     parts = solution.normalized_motion()
     shapes = tuple(part.shape[1:] for part in parts)
-    theta = torch.cat([part.flatten(1) for part in parts], dim=-1).detach()
+    theta = _flat(parts).detach()
     moved = tuple(x.detach() for x in norm.apply(invariant, data.views))
     frames = tuple(t.detach() for t in norm.transforms)
     base = invariant.normalized(tuple(t.detach() for t in solution.normalization.transforms))
@@ -288,7 +321,7 @@ def _covariance(
     root = vectors * values.clamp(min=1e-12 * values[..., -1:].clamp(min=torch.finfo(values.dtype).tiny)).rsqrt()[..., None, :]
 
     def moved(t: Tensor) -> Tensor:
-        return torch.cat([part.flatten(1) for part in denormalize_motion(invariant, problem.parts(t), frames)], dim=-1)
+        return _flat(denormalize_motion(invariant, problem.parts(t), frames))
 
     _, derivative = _jacobian(moved, theta)
     spread = derivative.mT @ root

@@ -22,7 +22,7 @@ from dyntorch.algebra.extensors import compound, dual, join
 from dyntorch.algebra.homogeneous import homogeneous, inhomogeneous, unit
 from dyntorch.algebra.projection import adjugate, back_project
 from dyntorch.invariant import Frame, Invariant
-from dyntorch.invariants.constant_velocity_residual import moving_residual, resting_residual
+from dyntorch.invariants.constant_velocity_residual import inverses, moving_residual, resting_residual
 from dyntorch.primitives import HyperplanesThrough, Point, Primitive
 
 Motion = tuple[Tensor, Tensor, Tensor]
@@ -267,7 +267,7 @@ class ConstantVelocityTensor(Invariant):
         degrees of freedom for a static match, 5 with an image as the third view.
         """
         one = torch.ones((), dtype=x1.dtype, device=x1.device)
-        return resting_residual(motion, (x1, x2, x3), (one, one, one)).norm(dim=-1)
+        return resting_residual(inverses(motion), (x1, x2, x3), (one, one, one)).norm(dim=-1)
 
     def whitened(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
         r"""The residual :math:`e = y_0 - 2 y_1 + y_2`, whitened; in an image :math:`e = \pi(A_2 (2 y_1 - y_0, 1)) - x_3`.
@@ -275,7 +275,13 @@ class ConstantVelocityTensor(Invariant):
         Returns:
             ``(*batch, n, 3)``, or ``(*batch, n, 2)`` with an image.
         """
-        return moving_residual(motion, views, scales)
+        return moving_residual(inverses(motion), views, scales)
+
+    def shared(self, motion: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+        return inverses(motion)
+
+    def whitened_shared(self, shared: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
+        return moving_residual(shared, views, scales)
 
     def whitened_static(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
         r"""Residual of matches that stand still, :math:`(y_1 - y_0, y_2 - y_1)`, whitened; it holds the common velocity at 0.
@@ -283,7 +289,7 @@ class ConstantVelocityTensor(Invariant):
         Returns:
             ``(*batch, n, 6)``, or ``(*batch, n, 5)`` with an image.
         """
-        return resting_residual(motion, views, scales)
+        return resting_residual(inverses(motion), views, scales)
 
 
 def _drift(matrix: Tensor, shift: Tensor) -> Tensor:

@@ -141,21 +141,12 @@ class Evidence:
         """Squares ``(b, piece)`` of the two residuals whitened by the uncertainty of the motion as well."""
         views = tuple(x[:, piece] for x in self.views)
         problem = self.problem(torch.zeros_like(self.data.weights))
-
-        def both(t: Tensor) -> tuple[Tensor, Tensor]:
-            motion, scales = problem.parts(t), self.norm.scales
-            return whitened(self.invariant, motion, views, scales), self.invariant.whitened_static(motion, views, scales)
-
-        def along(tangent: Tensor) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
-            return torch.func.jvp(both, (theta,), (tangent,))
-
-        tangents = torch.eye(theta.shape[-1], dtype=theta.dtype, device=theta.device)[:, None].expand(-1, *theta.shape)
-        values, derivatives = torch.func.vmap(along, out_dims=(None, 0))(tangents)
         squares = []
-        for value, derivative in zip(values, derivatives, strict=True):
-            j = derivative.movedim(0, -1)  # (b, n, c, p)
+        for value, derivative in (problem.moving(theta, views), problem.resting(theta, views)):
+            e = value.unflatten(1, (views[0].shape[1], -1))
+            j = derivative.mT.unflatten(1, e.shape[1:])  # (b, n, c, p)
             eye = torch.eye(j.shape[-2], dtype=theta.dtype, device=theta.device)
-            squares.append(whiten(value, eye + (j @ spread[:, None]) @ j.mT).square().sum(-1))
+            squares.append(whiten(e, eye + (j @ spread[:, None]) @ j.mT).square().sum(-1))
         return squares[0], squares[1]
 
     def information(self, theta: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:

@@ -13,11 +13,13 @@ if TYPE_CHECKING:
     from indexing.report.alignment import AlignmentReport
 
 FloatArray = NDArray[np.float64]
+Box = tuple[float, float, float, float]  # left, right, low, high
 # apart for colour-blind eyes, too, on both papers; outliers are crosses besides
 COLOURS = {"static": "#2f7fb8", "moving": "#e8741e", "outlier": "#8b949c"}
 MARKS = {"static": "o", "moving": "o", "outlier": "x"}
 PATHS = 1500  # paths drawn; more are a blot
 ROOM = 0.06  # around the points, of their extent
+REACH = 0.6  # how far beyond view 1 paths are shown, of its extent
 WIDTH = 10.2  # inches
 
 
@@ -29,6 +31,8 @@ def picture_of(report: AlignmentReport, theme: Theme) -> bytes:
     axes_shown, turned = _axes(report)
     flat = [view[..., axes_shown] for view in report.views]
     boxes = [_box(points, kinds) for points in flat]
+    if report.solved:
+        boxes[0] = _widened(boxes[0], report, kinds, axes_shown)
     with style(theme):
         wide = (1.9, 1.0) if len(flat) > 2 else (1.0, 1.0)
         room = WIDTH - 1.3
@@ -64,7 +68,7 @@ def _axes(report: AlignmentReport) -> tuple[list[int], bool]:
     return sorted(np.argsort(-spread, kind="stable")[:2].tolist()), False
 
 
-def _box(points: FloatArray, kinds: NDArray[Any]) -> tuple[float, float, float, float]:
+def _box(points: FloatArray, kinds: NDArray[Any]) -> Box:
     """Left, right, low, high of the matches that fit (of all, where none does), with room around."""
     kept = np.isin(kinds, ("static", "moving"))
     shown = points[kept if kept.sum() > 1 else kinds != "missing"].reshape(-1, 2)
@@ -74,6 +78,21 @@ def _box(points: FloatArray, kinds: NDArray[Any]) -> tuple[float, float, float, 
     # points that all but coincide keep a box that the ticks can name
     room = max(ROOM * float((high - low).max()), 1e-3 * float(np.abs(shown).max()), 1e-6)
     return float(low[0] - room), float(high[0] + room), float(low[1] - room), float(high[1] + room)
+
+
+def _widened(box: Box, report: AlignmentReport, kinds: NDArray[Any], shown: list[int]) -> Box:
+    """The box of view 1 with the paths of what moves in it, as far as they do not lead far away."""
+    found = [
+        carried(matrix, view[kinds == "moving"])[..., shown].reshape(-1, 2)
+        for view, matrix in zip(report.views[1:], report.motion, strict=True)
+        if view.shape[-1] + 1 == matrix.shape[-1]
+    ]
+    low, high = np.array(box[::2]), np.array(box[1::2])
+    room = REACH * (high - low).max()
+    places = np.concatenate([low[None], high[None], *found])
+    places = places[((places >= low - room) & (places <= high + room)).all(axis=1)]
+    least, most = places.min(axis=0), places.max(axis=0)
+    return float(least[0]), float(most[0]), float(least[1]), float(most[1])
 
 
 def as_segments(lines: FloatArray) -> FloatArray:
@@ -107,7 +126,7 @@ def carried(matrix: FloatArray, points: FloatArray) -> FloatArray:
     return out
 
 
-def _draw_paths(panel: Any, report: AlignmentReport, kinds: NDArray[Any], shown: list[int], box: tuple[float, ...]) -> None:
+def _draw_paths(panel: Any, report: AlignmentReport, kinds: NDArray[Any], shown: list[int], box: Box) -> None:
     from matplotlib.collections import LineCollection
 
     colour = COLOURS["moving"]
@@ -163,7 +182,7 @@ def _draw_points(panel: Any, points: FloatArray, kinds: NDArray[Any], colours: d
             panel.scatter(*mine.T, s=size, c=colours[kind], marker=MARKS.get(kind, "o"), zorder=4, **line)
 
 
-def _finish(panel: Any, box: tuple[float, float, float, float], turned: bool, theme: Theme) -> None:
+def _finish(panel: Any, box: Box, turned: bool, theme: Theme) -> None:
     panel.set(xlim=box[:2], ylim=box[2:][::-1] if turned else box[2:])
     panel.set_aspect("equal", adjustable="box", anchor="N")
     panel.tick_params(length=2.5, labelsize=7.5)

@@ -20,6 +20,8 @@ from indexing.report.alignment_page import display_scale, figures, turn_and_shif
 from indexing.report.alignment_picture import as_segments, carried
 
 SCRIPT = "<script>alert(1)</script>"
+# torch's own, when it first loads its transforms; hidden outside of tests
+pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated")
 
 
 def draw(seed: int) -> torch.Generator:

@@ -33,7 +33,7 @@ def visible(scene):
 @pytest.mark.parametrize("threshold", [1.5, None])
 def test_outliers_are_found_and_the_motion_survives_them(static, outliers, threshold):
     draw = generator(1)
-    scene = scenes.planar(100, batch=4, sigma=0.5, static=static, outliers=outliers, generator=draw)
+    scene = scenes.planar(100, batch=3, sigma=0.5, static=static, outliers=outliers, generator=draw)
     result = align_planar(*scene.views, threshold=threshold, generator=draw)
     assert (result.status == Status.OK).all()
     assert error(result, scene.motion).max() < 3
@@ -44,13 +44,13 @@ def test_outliers_are_found_and_the_motion_survives_them(static, outliers, thres
 
 def test_all_moving_and_forty_percent_outliers():
     draw = generator(2)
-    scene = scenes.planar(200, batch=4, sigma=0.5, outliers=0.4, generator=draw)
+    scene = scenes.planar(200, batch=2, sigma=0.5, outliers=0.4, generator=draw)
     result = align_planar(*scene.views, generator=draw)
     assert (error(result, scene.motion) < 3).double().mean() >= 0.95
     assert (result.labels == scene.labels).double().mean() > 0.95
 
 
-@pytest.mark.parametrize(("n", "sigma"), [(50, 0.5), (100, 0.5), (100, 2.0)])
+@pytest.mark.parametrize(("n", "sigma"), [(50, 0.5), (80, 2.0)])
 def test_labels_and_accuracy_are_those_of_known_labels(n, sigma):
     draw = generator(3)
     scene = scenes.planar(n, batch=8, sigma=sigma, static=0.4, generator=draw)
@@ -89,7 +89,7 @@ def test_exactly_static_scenes_are_solved_with_a_warning():
 
 
 def test_static_scenes_with_noise_are_flagged_and_as_good_as_two_homographies():
-    scene = scenes.planar(100, batch=6, sigma=0.5, static=1.0, generator=generator(6))
+    scene = scenes.planar(100, batch=4, sigma=0.5, static=1.0, generator=generator(6))
     result = align_planar(*scene.views, generator=generator())
     assert (result.status == Status.OK).all()
     assert result.flagged("near_static").all()
@@ -101,7 +101,7 @@ def test_static_scenes_with_noise_are_flagged_and_as_good_as_two_homographies():
 
 
 def test_a_scene_that_moves_is_not_called_static():
-    scene = scenes.planar(100, batch=6, sigma=0.5, generator=generator(7))
+    scene = scenes.planar(100, batch=4, sigma=0.5, generator=generator(7))
     result = align_planar(*scene.views, generator=generator())
     assert codes(result) <= {NoticeCode.UNVERIFIED}
 
@@ -223,7 +223,7 @@ def test_equal_points_and_duplicates_are_degenerate():
 
 def test_random_matches_are_refused():
     draw = generator(17)
-    views = torch.rand(3, 2, 100, 2, generator=draw, dtype=torch.float64) * 500
+    views = torch.rand(3, 1, 60, 2, generator=draw, dtype=torch.float64) * 500
     for threshold in (1.5, None):
         result = align_planar(*views, threshold=threshold, generator=draw)
         assert (result.status != Status.OK).all()

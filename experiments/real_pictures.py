@@ -1,0 +1,140 @@
+"""Pictures of the experiments on real recordings.  They show other people's data: only ever under results/."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import torch
+from torch import Tensor
+
+from dyntorch.algebra.homogeneous import apply
+from dyntorch.tasks.alignment import MOVING, OUTLIER, STATIC, Alignment
+
+COLOURS = {STATIC: "#5a7d9a", MOVING: "#e07b39", OUTLIER: "#b3123a"}
+NAMES = {STATIC: "static", MOVING: "moving", OUTLIER: "outlier"}
+LINES = ("#e07b39", "#5a7d9a", "#6aa84f", "#8e5ea2")
+MARKS = ("o", "s", "^", "D")
+
+
+class Aligned(Protocol):
+    """A sequence and its alignment."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def views(self) -> tuple[Tensor, Tensor, Tensor]: ...
+    @property
+    def result(self) -> Alignment: ...
+    @property
+    def accuracy(self) -> float: ...
+
+
+def save(figure: Any, path: Path) -> None:
+    """Write and close a figure."""
+    figure.savefig(path, dpi=110, bbox_inches="tight", facecolor="white")
+    plt.close(figure)
+
+
+def traffic_picture(shown: Sequence[Aligned], path: Path) -> None:
+    """Every sequence: the points of view 1, and where moving ones go after the motion of the camera is taken out."""
+    columns = min(4, len(shown))
+    rows = -(-len(shown) // columns)
+    figure, axes = plt.subplots(rows, columns, figsize=(4.2 * columns, 3.5 * rows), squeeze=False, layout="constrained")
+    for axis in axes.flat:
+        axis.axis("off")
+    for axis, one in zip(axes.flat, shown, strict=False):
+        axis.axis("on")
+        A, B, labels = one.result.A, one.result.B, one.result.labels
+        assert B is not None
+        path_points = torch.stack([one.views[0], apply(A, one.views[1]), apply(B, one.views[2])])
+        for label in (STATIC, OUTLIER, MOVING):
+            mine = labels == label
+            axis.plot(*one.views[0][mine].T, ".", color=COLOURS[label], ms=3, label=f"{NAMES[label]} ({int(mine.sum())})")
+            if label == MOVING:
+                axis.plot(*path_points[:, mine].unbind(-1), color=COLOURS[label], lw=0.5, alpha=0.7)
+        top = one.views[0].amax(0) + 15
+        axis.set(xlim=(-15, float(top[0])), ylim=(float(top[1]), -15), xticks=[], yticks=[])
+        axis.set_title(f"{one.name}: {one.accuracy:.0%} of labels right", fontsize=10)
+        axis.legend(loc="upper left", fontsize=7, framealpha=0.8, markerscale=2)
+        axis.set_aspect("equal")
+    figure.suptitle("Points of view 1; lines: where moving points go once the camera's own motion is taken out", fontsize=12)
+    save(figure, path)
+
+
+def shares_picture(curves: Mapping[str, Tensor], shares: Sequence[float], path: Path) -> None:
+    """Error of the background as its points are taken away: medians, and every sequence as a dot."""
+    figure, axis = plt.subplots(figsize=(7, 4.4), layout="constrained")
+    for k, (name, values) in enumerate(curves.items()):
+        place = torch.arange(len(shares), dtype=torch.float64)
+        axis.plot(place, values.median(-1).values, color=LINES[k], marker=MARKS[k], lw=2, label=name)
+        spread = (place + 0.08 * (2 * k - 1))[:, None].expand_as(values)
+        axis.plot(spread.flatten(), values.flatten(), ".", color=LINES[k], alpha=0.45, ms=5)
+    axis.set_xticks(range(len(shares)), [f"{share:.0%}" for share in shares])
+    axis.set(yscale="log", xlabel="share of the background points that is kept", ylabel="error of all background points, px")
+    axis.set_title("Cars on roads: the camera's motion with less and less that stands still", fontsize=11)
+    axis.grid(alpha=0.25)
+    axis.legend()
+    save(figure, path)
+
+
+def board_picture(errors: Mapping[str, Mapping[str, Sequence[float]]], path: Path) -> None:
+    """Errors of held-out corners of every triple, by configuration and kind of match."""
+    ways = ("all move", "moving, static and a fifth wrong", "identities given")
+    figure, axes = plt.subplots(1, len(errors), figsize=(5.2 * len(errors), 4.2), squeeze=False, sharey=True, layout="constrained")
+    draw = torch.Generator().manual_seed(0)
+    for axis, (kind, found) in zip(axes.flat, errors.items(), strict=True):
+        for k, way in enumerate(ways):
+            values = torch.tensor(found[way])
+            jitter = k + 0.25 * (torch.rand(len(values), generator=draw) - 0.5)
+            axis.plot(jitter, values, ".", color=LINES[k], alpha=0.6)
+            median = float(values.median())
+            axis.plot([k - 0.25, k + 0.25], [median, median], color="black", lw=1.5)
+            axis.annotate(f"{median:.2f} px", (k + 0.27, median), fontsize=9, va="center")
+        axis.set_xticks(range(3), ["all matches move", "moving, static,\na fifth wrong", "identities given\n(best possible)"])
+        axis.set(yscale="log", xlim=(-0.5, 2.8))
+        axis.set_title(f"{kind} ({len(found['OK'])} triples)", fontsize=11)
+        axis.grid(alpha=0.25, axis="y")
+    axes[0, 0].set_ylabel("error of held-out corners, px")
+    save(figure, path)
+
+
+def movers_picture(curves: Mapping[str, Tensor], shares: Sequence[float], path: Path) -> None:
+    """Rotation and translation errors ``(shares, 3)`` of each method against the share of boxes that move."""
+    labels = ("rotation error, degrees", "translation error, m", "translation error up to a common velocity, m")
+    figure, axes = plt.subplots(1, 3, figsize=(14, 4.4), layout="constrained")
+    for k, axis in enumerate(axes):
+        for style, (name, values) in enumerate(curves.items()):
+            axis.plot([100 * s for s in shares], values[:, k], color=LINES[style], marker=MARKS[style], lw=2, label=name)
+        axis.set(yscale="log", xlabel="boxes that move, %", title=labels[k], xticks=[100 * s for s in shares])
+        axis.grid(alpha=0.25)
+    axes[0].legend(fontsize=9)
+    figure.suptitle("Sensor motion from annotated boxes of traffic (medians over triples of sweeps)", fontsize=12)
+    save(figure, path)
+
+
+def bodies_picture(
+    aligned: Tensor, labels: Tensor, curves: Mapping[str, Sequence[float]], spacings: Sequence[int], path: Path
+) -> None:
+    """Left: pooled bodies seen from the front with their labels; right: errors against the spacing of the frames."""
+    figure, (left, right) = plt.subplots(1, 2, figsize=(13, 4.8), layout="constrained", width_ratios=(1.25, 1))
+    for label in (STATIC, OUTLIER, MOVING):
+        mine = labels == label
+        paths = aligned[:, mine]
+        left.plot(paths[..., 0], paths[..., 1], color=COLOURS[label], lw=1)
+        left.plot(paths[0, :, 0], paths[0, :, 1], ".", color=COLOURS[label], ms=4, label=f"{NAMES[label]} ({int(mine.sum())})")
+    left.set(aspect="equal", xlabel="m", ylabel="m")
+    left.set_title("Joints of pooled takes, three views aligned", fontsize=11)
+    left.legend(fontsize=9)
+    for style, (name, values) in enumerate(curves.items()):
+        right.plot(spacings, [1000 * v for v in values], color=LINES[style % 4], marker=MARKS[style % 4], lw=2, label=name)
+    right.set(yscale="log", xlabel="frames between views (60 per second)", xticks=list(spacings), ylabel="error of A and B, mm")
+    right.set_title("Training takes: error against the spacing", fontsize=11)
+    right.grid(alpha=0.25)
+    right.legend(fontsize=9)
+    save(figure, path)
