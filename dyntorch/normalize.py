@@ -40,7 +40,7 @@ def normalization(invariant: Invariant, views: Sequence[Tensor], weights: Tensor
         views: ``(*batch, n, ...)`` finite matches.
         weights: ``(*batch, n)``.
     """
-    points = [p.points(x) for p, x in zip(invariant.primitives, views, strict=True)]
+    points = [p.points(x, weights) for p, x in zip(invariant.primitives, views, strict=True)]
     if len({x.shape for x in points}) == 1:
         # all views in one pass: a copy costs less than two more rounds of small operations
         transforms = _similarity(torch.stack(points), weights).unbind(0)

@@ -94,8 +94,13 @@ class Primitive(ABC):
         eye = torch.eye(self.width, dtype=x.dtype, device=x.device)
         return eye.expand(*x.shape[: self.match_axis(x) + 1], self.width, self.width)
 
-    def points(self, x: Tensor) -> Tensor:
-        """Points ``(*batch, n, k, d)`` that stand for the size and place of each measurement (for the normalization)."""
+    def points(self, x: Tensor, weights: Tensor | None = None) -> Tensor:
+        """Points ``(*batch, n, k, d)`` that stand for the size and place of each measurement (for the normalization).
+
+        Args:
+            x: measurements.
+            weights: ``(*batch, n)``; None for equal ones.
+        """
         return x.unsqueeze(-2)
 
     def move(self, x: Tensor, transform: Tensor) -> Tensor:
@@ -139,6 +144,12 @@ class Point(Primitive):
 
     def components(self, x: Tensor) -> Tensor:
         return torch.cat([x.mT, torch.ones_like(x.mT[..., :1, :])], dim=-2)
+
+    def packed(self, x: Tensor) -> Tensor:
+        moved = x.mT
+        # the products with the last coordinate, 1, are there already
+        rows = [part for i in range(self.dim) for part in (moved[..., i:, :] * moved[..., i : i + 1, :], moved[..., i : i + 1, :])]
+        return torch.cat([*rows, torch.ones_like(moved[..., :1, :])], dim=-2)
 
     def action(self, transform: Tensor) -> Tensor:
         return transform
@@ -225,10 +236,17 @@ class Hyperplane(Primitive):
     def pushforward(self, x: Tensor, change: Tensor) -> Tensor:
         return change
 
-    def points(self, x: Tensor) -> Tensor:
-        """The foot of the perpendicular from the origin."""
-        unit = self.raw(x)
-        return (-unit[..., -1:] * unit[..., :-1]).unsqueeze(-2)
+    def points(self, x: Tensor, weights: Tensor | None = None) -> Tensor:
+        """The feet of the perpendiculars from the point that is nearest to all hyperplanes: a shift of the view shifts them."""
+        normal, offset = self.raw(x).split([self.dim, 1], dim=-1)
+        weighted = (normal if weights is None else normal * weights[..., None]).mT
+        eye = torch.eye(self.dim, dtype=x.dtype, device=x.device)
+        square = weighted @ normal
+        # parallel hyperplanes have no nearest point: a ridge takes the one next to the origin
+        ridge = 1e-9 * square.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None] + torch.finfo(x.dtype).tiny
+        nearest = -torch.linalg.solve_ex(square + ridge * eye, weighted @ offset)[0]
+        distance = normal @ nearest + offset
+        return (nearest.mT - distance * normal).unsqueeze(-2)
 
     def move(self, x: Tensor, transform: Tensor) -> Tensor:
         return x @ torch.linalg.inv(transform)
@@ -283,7 +301,7 @@ class Line(Primitive):
         moved = torch.nn.functional.pad(change.unflatten(-1, (2, 3)), (0, 1))
         return join(moved[..., 0, :], second) + join(first, moved[..., 1, :])
 
-    def points(self, x: Tensor) -> Tensor:
+    def points(self, x: Tensor, weights: Tensor | None = None) -> Tensor:
         return x if self._as_points(x) else _feet(x).unsqueeze(-2)
 
     def move(self, x: Tensor, transform: Tensor) -> Tensor:

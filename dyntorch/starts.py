@@ -21,8 +21,12 @@ SMALL = 8
 """Largest minimal sample for which samples of that size are drawn; other starts take 2.5 times the minimal number."""
 DRAWN, KEPT = 32, 4
 """Minimal samples per start, and starts per sample that is annealed: the best samples are near already."""
-ANNEALED = {"all": 30, "many": 20, "minimal": 10}
-"""Reweightings of a start from all matches, from 2.5 times the minimal number, from a minimal sample."""
+ANNEALED = {"all": 30, "many": 20, "guided": 30, "minimal": 10}
+"""Reweightings of a start from all matches, from 2.5 times the minimal number (guided by a motion or not), from a minimal sample."""
+GUIDED = 4
+"""One start of so many is not guided by a motion.  Successes per start, not guided and guided: homography tensor (100 matches, 50 %
+outliers) 0.48 and 0.70, translating lines (175, 30 %) 0.01 and 0.20, constant velocity tensor (150, 35 %) 0.53 and 0.52, but in
+one scene of eight 0.9 and 0."""
 
 BLOCK = 1 << 20
 """Numbers in one block of the batch (8 MB)."""
@@ -92,7 +96,20 @@ class Search:
         def block(chosen: Tensor, *rest: Tensor) -> Tensor:
             work = self._bundle(rest)
             basis = _best(work, work.first(chosen), lambda square: median(square, work.weights), 17)
-            return median(work.distances(concentrate(work, basis, None, 12))[0], work.weights).amin(1)
+            import os
+            G=os.environ.get('G','0')
+            if G=='1': basis=concentrate(work, basis, None, 12, guided=True)
+            elif G=='2': basis=concentrate(work, basis, None, 20, guided=True)
+            elif G=='3':
+                from dyntorch.hypotheses import HOLD
+                for i in range(20):
+                    sq,rows=work.distances(work.constrained(basis) if i<14 else basis)
+                    if i<10: rows=(rows/work.lengths()[:,:,None]).sqrt()
+                    a=median(sq,work.weights)[:,None,:,None]
+                    basis=work.next((a/(a+sq[:,None])).square()*rows*work.weights[:,None,None],basis)
+                basis=concentrate(work, basis, None, 5)
+            else: basis=concentrate(work, basis, None, 12)
+            return median(work.distances(basis)[0], work.weights).amin(1)
 
         middle = self._map(block, everyone, chosen)
         # Rousseeuw and Leroy 1987: the median of so few is too small
@@ -126,8 +143,13 @@ class Search:
                 return msac(square, work.weights, limit)
 
             basis = _best(work, work.first(chosen), score, keep)
-            basis = _best(work, anneal(work, basis, limit, steps), score, 1)
-            basis = concentrate(work, basis, limit, 5)
+            if kind == "many":
+                free, rest = basis.split((-(-keep // GUIDED), keep - -(-keep // GUIDED)), dim=2)
+                led = anneal(work, rest, limit, ANNEALED["guided"], guided=True)
+                basis = torch.cat([anneal(work, free, limit, steps), led], dim=2)
+            else:
+                basis = anneal(work, basis, limit, steps)
+            basis = concentrate(work, _best(work, basis, score, 1), limit, 5)
             square = work.distances(basis)[0]
             return basis[:, :, 0], score(square)[:, 0], *judge(work, basis, square[:, 0], limit), square[:, 0] <= limit[:, None]
 
@@ -169,7 +191,7 @@ class Search:
         count = len(self.invariant.primitives)
         weights, views, transforms = rest[0], rest[1 : 1 + count], rest[1 + count :]
         primitives = tuple(p.normalized(t) for p, t in zip(self.invariant.primitives, transforms, strict=True))
-        return bundle(self.invariant, primitives, views, tuple(t.flatten(1)[:, 0] for t in transforms), weights)
+        return bundle(self.invariant.normalized(transforms), primitives, views, tuple(t.flatten(1)[:, 0] for t in transforms), weights)
 
 
 def judge(work: Bundle, basis: Tensor, square: Tensor, limit: Tensor) -> tuple[Tensor, Tensor]:
@@ -207,7 +229,7 @@ def _mixed(work: Bundle) -> list[Bundle]:
         for v in range(1, count):
             weights = weights * work.weights.roll(v * step, -1)
         views = tuple(x.roll(v * step, 2) for v, x in enumerate(work.views))
-        vectors = tuple(u.roll(v * step, -1) if u.ndim > 1 else u for v, u in enumerate(work.vectors))
+        vectors = tuple(u.roll(v * step, -1) for v, u in enumerate(work.vectors))
         mixed.append(replace(work, views=views, vectors=vectors, weights=weights))
     return mixed
 

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from dyntorch.algebra.homogeneous import apply
 from dyntorch.tasks.alignment import MOVING, OUTLIER, STATIC, Alignment
+from experiments.real_data import Board
 
 COLOURS = {STATIC: "#5a7d9a", MOVING: "#e07b39", OUTLIER: "#b3123a"}
 NAMES = {STATIC: "static", MOVING: "moving", OUTLIER: "outlier"}
@@ -43,9 +44,9 @@ def save(figure: Any, path: Path) -> None:
 
 def traffic_picture(shown: Sequence[Aligned], path: Path) -> None:
     """Every sequence: the points of view 1, and where moving ones go after the motion of the camera is taken out."""
-    columns = min(4, len(shown))
+    columns = min(5, len(shown))
     rows = -(-len(shown) // columns)
-    figure, axes = plt.subplots(rows, columns, figsize=(4.2 * columns, 3.5 * rows), squeeze=False, layout="constrained")
+    figure, axes = plt.subplots(rows, columns, figsize=(3.8 * columns, 3.2 * rows), squeeze=False, layout="constrained")
     for axis in axes.flat:
         axis.axis("off")
     for axis, one in zip(axes.flat, shown, strict=False):
@@ -83,25 +84,45 @@ def shares_picture(curves: Mapping[str, Tensor], shares: Sequence[float], path: 
     save(figure, path)
 
 
-def board_picture(errors: Mapping[str, Mapping[str, Sequence[float]]], path: Path) -> None:
-    """Errors of held-out corners of every triple, by configuration and kind of match."""
-    ways = ("all move", "moving, static and a fifth wrong", "identities given")
-    figure, axes = plt.subplots(1, len(errors), figsize=(5.2 * len(errors), 4.2), squeeze=False, sharey=True, layout="constrained")
+def board_picture(seen: Board, errors: Mapping[str, Mapping[str, Sequence[float]]], path: Path) -> None:
+    """The board as one camera sees it at three instants with some itineraries, and the errors of held-out corners."""
+    figure, axes = plt.subplots(1, 1 + len(errors), figsize=(5 * (1 + len(errors)), 4.2), layout="constrained")
+    _sightings(axes[0], seen)
     draw = torch.Generator().manual_seed(0)
-    for axis, (kind, found) in zip(axes.flat, errors.items(), strict=True):
+    ways = ("all move", "moving, static and a fifth wrong", "identities given")
+    for axis, (kind, found) in zip(axes[1:], errors.items(), strict=True):
         for k, way in enumerate(ways):
             values = torch.tensor(found[way])
-            jitter = k + 0.25 * (torch.rand(len(values), generator=draw) - 0.5)
-            axis.plot(jitter, values, ".", color=LINES[k], alpha=0.6)
-            median = float(values.median())
-            axis.plot([k - 0.25, k + 0.25], [median, median], color="black", lw=1.5)
-            axis.annotate(f"{median:.2f} px", (k + 0.27, median), fontsize=9, va="center")
+            ok = values[values.isfinite()]
+            axis.plot(k + 0.25 * (torch.rand(len(ok), generator=draw) - 0.5), ok, ".", color=LINES[k], alpha=0.6)
+            if len(ok):
+                median = float(ok.median())
+                axis.plot([k - 0.25, k + 0.25], [median, median], color="black", lw=1.5)
+                axis.annotate(f"{median:.2f} px", (k + 0.27, median), fontsize=9, va="center")
+            axis.annotate(f"{len(ok)} of {len(values)} OK", (k, 0.97), xycoords=("data", "axes fraction"), ha="center", va="top")
         axis.set_xticks(range(3), ["all matches move", "moving, static,\na fifth wrong", "identities given\n(best possible)"])
-        axis.set(yscale="log", xlim=(-0.5, 2.8))
-        axis.set_title(f"{kind} ({len(found['OK'])} triples)", fontsize=11)
+        axis.set(yscale="log", xlim=(-0.5, 2.8), ylabel="error of held-out corners, px")
+        axis.margins(y=0.25)
+        axis.yaxis.set_major_formatter("{x:g}")
+        axis.yaxis.set_minor_formatter("{x:g}")
+        axis.set_title(kind, fontsize=11)
         axis.grid(alpha=0.25, axis="y")
-    axes[0, 0].set_ylabel("error of held-out corners, px")
     save(figure, path)
+
+
+def _sightings(axis: Any, seen: Board) -> None:
+    """Corners of one camera at three instants, joined by itineraries along a row, a column and a diagonal of the board."""
+    full = [t for t, x in sorted(seen.seen[1].items()) if bool(x.isfinite().all())]
+    views = [seen.seen[1][t] for t in (full[0], full[len(full) // 3], full[2 * len(full) // 3])]
+    for k, x in enumerate(views):
+        axis.plot(*x.T, MARKS[k], color=LINES[k], ms=5, label=f"instant {k + 1}")
+    for stops in ((0, 1, 2), (11, 8, 5), (0, 4, 8), (9, 9, 3)):
+        path = torch.stack([x[stop] for x, stop in zip(views, stops, strict=True)])
+        axis.plot(*path.T, color="0.45", lw=1)
+    axis.invert_yaxis()
+    axis.set(aspect="equal", xticks=[], yticks=[])
+    axis.set_title("A board moved by hand; grey: points that move on it", fontsize=11)
+    axis.legend(fontsize=9)
 
 
 def movers_picture(curves: Mapping[str, Tensor], shares: Sequence[float], path: Path) -> None:
@@ -114,7 +135,7 @@ def movers_picture(curves: Mapping[str, Tensor], shares: Sequence[float], path: 
         axis.set(yscale="log", xlabel="boxes that move, %", title=labels[k], xticks=[100 * s for s in shares])
         axis.grid(alpha=0.25)
     axes[0].legend(fontsize=9)
-    figure.suptitle("Sensor motion from annotated boxes of traffic (medians over triples of sweeps)", fontsize=12)
+    figure.suptitle("Pose of a driving sensor from annotated boxes of traffic (medians over triples of sweeps)", fontsize=12)
     save(figure, path)
 
 
@@ -122,7 +143,7 @@ def bodies_picture(
     aligned: Tensor, labels: Tensor, curves: Mapping[str, Sequence[float]], spacings: Sequence[int], path: Path
 ) -> None:
     """Left: pooled bodies seen from the front with their labels; right: errors against the spacing of the frames."""
-    figure, (left, right) = plt.subplots(1, 2, figsize=(13, 4.8), layout="constrained", width_ratios=(1.25, 1))
+    figure, (left, right) = plt.subplots(1, 2, figsize=(15, 4.8), layout="constrained", width_ratios=(1.25, 1))
     for label in (STATIC, OUTLIER, MOVING):
         mine = labels == label
         paths = aligned[:, mine]
@@ -132,9 +153,10 @@ def bodies_picture(
     left.set_title("Joints of pooled takes, three views aligned", fontsize=11)
     left.legend(fontsize=9)
     for style, (name, values) in enumerate(curves.items()):
-        right.plot(spacings, [1000 * v for v in values], color=LINES[style % 4], marker=MARKS[style % 4], lw=2, label=name)
+        dashes = "-" if name.startswith("align") else ":" if name.startswith("all still") else "--"
+        right.plot(spacings, [1000 * v for v in values], dashes, color=f"C{style}", marker=MARKS[style % 4], lw=2, label=name)
     right.set(yscale="log", xlabel="frames between views (60 per second)", xticks=list(spacings), ylabel="error of A and B, mm")
     right.set_title("Training takes: error against the spacing", fontsize=11)
     right.grid(alpha=0.25)
-    right.legend(fontsize=9)
+    right.legend(fontsize=9, loc="center left", bbox_to_anchor=(1.0, 0.5))
     save(figure, path)

@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 import dyntorch as dyn
-from dyntorch.primitives import Hyperplane
 from dyntorch.solution import Solution
 from tests.cases import Case, carried, moved_views
 from tests.references import apart, matrices, noisy, pulled_back, rank, spans
@@ -60,15 +59,14 @@ def worst(error: Tensor) -> float:
 
 
 def similarities(case: Case, seed: int = 5) -> tuple[Tensor, ...]:
-    """A rotation, a scale and (but for hyperplanes, whose noise is relative to the origin) a shift for every view."""
+    """A rotation, a scale and a shift for every view."""
     g = torch.Generator().manual_seed(seed)
     frames = []
     for v, primitive in enumerate(case.invariant.primitives):
         frame = torch.eye(primitive.dim + 1, dtype=torch.float64)
         turn = torch.linalg.qr(torch.randn(primitive.dim, primitive.dim, generator=g, dtype=torch.float64)).Q
         frame[:-1, :-1] = (0.1, 3.0, 40.0)[v] * turn
-        if not isinstance(primitive, Hyperplane):
-            frame[:-1, -1] = 20.0 * torch.randn(primitive.dim, generator=g, dtype=torch.float64)
+        frame[:-1, -1] = 20.0 * torch.randn(primitive.dim, generator=g, dtype=torch.float64)
         frames.append(frame)
     return tuple(frames)
 

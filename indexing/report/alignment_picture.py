@@ -20,7 +20,8 @@ MARKS = {"static": "o", "moving": "o", "outlier": "x"}
 PATHS = 1500  # paths drawn; more are a blot
 ROOM = 0.06  # around the points, of their extent
 REACH = 0.6  # how far beyond view 1 paths are shown, of its extent
-WIDTH = 10.2  # inches
+WIDTH, MARGIN, GAP, TITLE, FOOT = 10.2, 0.65, 0.6, 0.3, 0.35  # inches
+WIDE = 0.62  # height over width of view 1, below which it gets the whole width
 
 
 def picture_of(report: AlignmentReport, theme: Theme) -> bytes:
@@ -34,17 +35,11 @@ def picture_of(report: AlignmentReport, theme: Theme) -> bytes:
     if report.solved:
         boxes[0] = _widened(boxes[0], report, kinds, axes_shown)
     with style(theme):
-        wide = (1.9, 1.0) if len(flat) > 2 else (1.0, 1.0)
-        room = WIDTH - 1.3
-        tall = [(box[3] - box[2]) / (box[1] - box[0]) for box in boxes]
-        column = sum(room * wide[1] / sum(wide) * ratio + 0.6 for ratio in tall[1:])
-        height = float(np.clip(max(room * wide[0] / sum(wide) * tall[0], column), 3.0, 7.0))
-        figure = new_figure(WIDTH, height + 0.8)
-        grid = figure.add_gridspec(len(flat) - 1, 2, width_ratios=wide, wspace=0.12, hspace=0.3, left=0.07, right=0.995,
-                                   bottom=0.6 / (height + 0.8), top=1 - 0.25 / (height + 0.8))  # fmt: skip
-        places = [grid[:, 0], *(grid[i, 1] for i in range(len(flat) - 1))]
+        height, places = _layout([(box[3] - box[2]) / (box[1] - box[0]) for box in boxes])
+        figure = new_figure(WIDTH, height)
         for number, (points, place, box) in enumerate(zip(flat, places, boxes, strict=True), start=1):
-            panel = figure.add_subplot(place)
+            left, top, width, tall = place
+            panel = figure.add_axes((left / WIDTH, 1 - (top + tall) / height, width / WIDTH, tall / height))
             if number == 1 and report.solved:
                 _draw_paths(panel, report, kinds, axes_shown, box)
             _draw_points(panel, points, kinds, colours, large=number == 1, segments=segments)
@@ -55,6 +50,37 @@ def picture_of(report: AlignmentReport, theme: Theme) -> bytes:
                 panel.set_ylabel("xyz"[axes_shown[1]])
         _legend(figure, kinds, colours, theme, segments)
         return png(figure, tight=True)
+
+
+def _layout(ratios: list[float]) -> tuple[float, list[Box]]:
+    """Height of the figure, and left, top, width and height of every panel, in inches.
+
+    View 1 is large: above the others where it is wide, left of them otherwise.
+
+    Args:
+        ratios: height over width of what each panel shows.
+    """
+
+    def fitted(left: float, top: float, width: float, ratio: float, limit: float) -> Box:
+        tall = min(limit, max(0.6, width * ratio))
+        return left, top, min(width, tall / ratio), tall
+
+    room = WIDTH - MARGIN
+    half = (room - GAP) / 2
+    if len(ratios) == 2:
+        found = [fitted(MARGIN + i * (half + GAP), TITLE, half, ratio, 5.5) for i, ratio in enumerate(ratios)]
+    elif ratios[0] < WIDE:
+        first = fitted(MARGIN, TITLE, room, ratios[0], 5.0)
+        below = first[1] + first[3] + FOOT + TITLE
+        found = [first, *(fitted(MARGIN + i * (half + GAP), below, half, ratio, 4.0) for i, ratio in enumerate(ratios[1:]))]
+    else:
+        large = 0.64 * (room - GAP)
+        found = [fitted(MARGIN, TITLE, large, ratios[0], 6.5)]
+        top = TITLE
+        for ratio in ratios[1:]:
+            found.append(fitted(MARGIN + large + GAP, top, room - GAP - large, ratio, 3.2))
+            top = found[-1][1] + found[-1][3] + FOOT + TITLE
+    return max(place[1] + place[3] for place in found) + FOOT + 0.4, found
 
 
 def _axes(report: AlignmentReport) -> tuple[list[int], bool]:

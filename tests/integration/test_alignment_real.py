@@ -1,0 +1,130 @@
+"""Alignment on real recordings; skipped where DYNTORCH_DATA names no folder."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import dyntorch as dyn
+from dyntorch import metrics
+from dyntorch.tasks.alignment import MOVING, OUTLIER, STATIC
+from experiments import real_data, real_planar, real_space
+from experiments.real_bodies import Crowd, crowd
+from experiments.real_solvers import aligned, gap, rigid_ransac
+from experiments.tables import Row
+
+pytestmark = pytest.mark.skipif(not os.environ.get("DYNTORCH_DATA"), reason="DYNTORCH_DATA is not set: no real data")
+
+
+@pytest.mark.parametrize("name", ["cars2B", "cars3", "cars7"])
+def test_cars_move_and_roads_do_not(name: str) -> None:
+    sequence = next(one for one in real_data.traffic() if one.name == name)
+    frames = real_planar.triples(len(sequence.tracks))[1]
+    one = real_planar.scored(sequence, frames, real_planar.Config())
+    assert one.result.status == dyn.Status.OK
+    assert one.accuracy > 0.95
+    assert one.share(STATIC, ~sequence.background) == 0
+    assert one.share(MOVING, ~sequence.background) > 0.9
+    assert one.error < 0.5
+    assert 0.05 < float(one.result.sigma) < 0.5
+
+
+def test_a_car_that_turns_is_not_on_a_straight_path() -> None:
+    sequence = next(one for one in real_data.traffic() if one.name == "cars4")
+    one = real_planar.scored(sequence, real_planar.triples(len(sequence.tracks))[0], real_planar.Config())
+    assert one.share(OUTLIER, ~sequence.background) > 0.9
+    assert one.share(STATIC, sequence.background) > 0.9
+    assert one.error < 2
+
+
+def test_points_that_all_move_on_a_board_give_its_homographies() -> None:
+    seen = real_data.board()
+    views = max(real_planar.instants(seen, (1, 1, 1), 2), key=lambda v: float((v[2] - v[0]).norm(dim=-1).median()))
+    held = [1, 4, 7, 10]
+    known = [k for k in range(len(seen.place)) if k not in held]
+    index = torch.tensor([hop for hop in real_planar.itineraries(seen.place, known) if len(set(hop)) > 1])
+    one = dyn.align_planar(*(x[index[:, i]] for i, x in enumerate(views)), generator=torch.Generator().manual_seed(0))
+    assert one.status == dyn.Status.OK
+    assert float((one.labels == STATIC).double().mean()) < 0.02
+    everyone = torch.zeros(len(seen.place), dtype=torch.bool)
+    everyone[held] = True
+    assert real_planar.transfer(one.B, views, everyone) < 2
+    # the hops are in a plane that really moved: without its motion they are far off
+    assert real_planar.transfer(torch.eye(3).double(), views, everyone) > 5
+
+
+def test_lens_distortion_is_inverted() -> None:
+    matrix = np.array([[700.0, 0, 620], [0, 705, 350], [0, 0, 1]])
+    k1, k2, p1, p2, k3 = distortions = np.array([0.19, -0.26, 0.003, -0.005, 0.11])
+    ideal = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 2))
+    x, y = ideal.T
+    r = x * x + y * y
+    radial = 1 + k1 * r + k2 * r**2 + k3 * r**3
+    bent = np.stack([x * radial + 2 * p1 * x * y + p2 * (r + 2 * x * x), y * radial + p1 * (r + 2 * y * y) + 2 * p2 * x * y], -1)
+    pixels = bent * matrix[[0, 1], [0, 1]] + matrix[:2, 2]
+    expected = ideal * matrix[[0, 1], [0, 1]] + matrix[:2, 2]
+    np.testing.assert_allclose(real_data.undistorted(pixels, matrix, distortions), expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("motion", ["straight", "constant_velocity"])
+def test_pose_of_a_car_from_boxes_in_traffic(motion: str) -> None:
+    errors = []
+    for drive in real_data.drives():
+        for start in (10, 60, 110):
+            views, moving, _, B = drive.triple(start, 3)
+            # at the true pose parked boxes are where they were, and moving ones are not
+            off = (views[0] - views[2] @ B[:3, :3].T - B[:3, 3]).norm(dim=-1)
+            assert float(off[~moving].max()) < 0.4 and float(off[moving].min()) > 0.25
+            draw = torch.Generator().manual_seed(0)
+            one = dyn.align_points(*views, model="rigid", threshold=0.1, motion=motion, generator=draw)
+            assert one.status == dyn.Status.OK and one.B is not None
+            errors.append([float(metrics.rotation_error(one.B, B)), float(metrics.translation_error(one.B, B))])
+            assert float(metrics.rotation_error(rigid_ransac(views[0], views[2], 0.1, draw), B)) < 0.2
+    assert np.median([e[0] for e in errors]) < 0.05
+    assert np.median([e[1] for e in errors]) < 0.05
+
+
+def test_projective_tensors_say_that_traffic_is_degenerate() -> None:
+    for drive in real_data.drives():
+        views, _, _, _ = drive.triple(60, 3)
+        for invariant in (dyn.JoinTensor, dyn.MinimalJoinTensor):
+            assert dyn.fit(invariant, *views).status in (dyn.Status.DEGENERATE, dyn.Status.AMBIGUOUS)
+
+
+def test_rigid_sensors_among_bodies_that_all_move() -> None:
+    pool = real_data.takes()[1::2]
+    draw = torch.Generator().manual_seed(0)
+    turns, ours, none = [], [], []
+    for _ in range(5):
+        people = crowd(pool, 4, "rigid", draw)
+        assert float(people.deviation.median()) < 5e-3
+        (A, B), state = aligned("rigid")(people.views, people.motion)
+        assert state.startswith("OK")
+        turns.append(float(metrics.rotation_error(B, people.motion[1])))
+        ours.append(gap((A, B), people.motion, people.views))
+        eye = torch.eye(4, dtype=torch.float64)
+        none.append(gap((eye, eye), people.motion, people.views))
+    # joints nearly keep their velocity, so that static ones alone tell the velocity common to all
+    assert np.median(turns) < 2
+    assert np.median(ours) < 0.05 < 0.2 < np.median(none)
+
+
+def test_one_command_writes_figures_and_pictures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(real_space, "STEPS", (3,))
+    monkeypatch.setattr(real_space, "SHARES", (0.0, 1.0))
+    monkeypatch.setattr(real_space, "PROJECTIVE", real_space.PROJECTIVE[:3])
+
+    def one_crowd(pool: list[real_data.Take], crowds: int, seed: int) -> tuple[list[Row], dict[str, list[float]], Crowd]:
+        return [], {"none": [1.0] * 3}, crowd(pool[:3], 1, "rigid", torch.Generator().manual_seed(seed))
+
+    monkeypatch.setattr(real_space, "bodies_rows", one_crowd)
+    real_space.run(real_space.Config(quick=True, out=tmp_path))
+    written = json.loads((tmp_path / "figures.json").read_text())
+    assert len(written["tables"]) == 3
+    assert (tmp_path / "movers.png").stat().st_size > 10_000
+    assert (tmp_path / "bodies.png").stat().st_size > 10_000
