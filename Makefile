@@ -26,10 +26,19 @@ lint: install
 	$(BIN)/mypy
 
 bench: install
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[experiments]'
+	$(BIN)/python -m experiments.benchmarks.null_space
+	$(BIN)/python -m experiments.benchmarks.fits
+	$(BIN)/python -m experiments.benchmarks.robust_peers
 	$(BIN)/python -m experiments.benchmarks.action_indexer
 
 tables: install
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[experiments]'
+	$(BIN)/python -m experiments.homography_tensor_noise
+	$(BIN)/python -m experiments.tensor_noise_3d
+	$(BIN)/python -m experiments.robust_estimation
+	$(BIN)/python -m experiments.real_planar
+	$(BIN)/python -m experiments.real_space
 	$(BIN)/python -m experiments.action_recognition
 	$(BIN)/python -m experiments.action_baselines
 

@@ -185,7 +185,7 @@ def transfer_slot(primitives: Sequence[Primitive]) -> int | None:
     return slots[0] if len(slots) == 1 and all(p.rows == 1 for v, p in enumerate(primitives) if v not in slots) else None
 
 
-def anneal(data: Bundle, basis: Tensor, end: Tensor, iterations: int, *, guided: bool = False) -> Tensor:
+def anneal(data: Bundle, basis: Tensor, end: Tensor | None, iterations: int, *, guided: bool = False) -> Tensor:
     r"""Graduated non-convexity: weights :math:`(a / (a + d^2))^2` (Geman-McClure) with a scale a that shrinks to ``end``.
 
     The scale starts at four times the median squared distance of each start (a mean would be that of the outliers).
@@ -193,7 +193,7 @@ def anneal(data: Bundle, basis: Tensor, end: Tensor, iterations: int, *, guided:
     Args:
         data: matches.
         basis: ``(b, c, K, a, D)``.
-        end: ``(b,)`` squared scale at the end.
+        end: ``(b,)`` squared scale at the end; None: the scale is the median squared distance itself, all the time.
         iterations: reweightings; the last 30 % are at the final scale.
         guided: measure the distances, until the scale is final, to the tensor of a motion, which has fewer degrees of freedom,
             so that fewer outliers can bend it; costs a decomposition per reweighting.
@@ -203,30 +203,27 @@ def anneal(data: Bundle, basis: Tensor, end: Tensor, iterations: int, *, guided:
 
     Source: Black and Rangarajan 1996; Yang, Antonante, Tzoumas and Carlone 2020.
     """
-    stop = end[:, None, None, None]
     start: Tensor | None = None
     for i in range(iterations):
         square, rows = data.distances(data.constrained(basis) if guided and i < HOLD * iterations else basis)
-        if start is None:
-            start = torch.maximum(4 * median(square, data.weights)[:, None, :, None], stop)
         if guided and 2 * i < iterations:
             # the gradients of a wrong tensor mislead: half their say doubles the successes of lines (175, 30 % outliers)
             rows = (rows / data.lengths()[:, :, None]).sqrt()
-        scale = start * (stop / start) ** min(1.0, i / (HOLD * iterations))
+        if end is None:
+            scale = median(square, data.weights)[:, None, :, None].clamp(min=torch.finfo(square.dtype).tiny)
+        else:
+            stop = end[:, None, None, None]
+            start = torch.maximum(4 * median(square, data.weights)[:, None, :, None], stop) if start is None else start
+            scale = start * (stop / start) ** min(1.0, i / (HOLD * iterations))
         weights = (scale / (scale + square[:, None])).square() * data.weights[:, None, None] * rows
         basis = data.next(weights, basis)
     return basis
 
 
-def concentrate(data: Bundle, basis: Tensor, cut: Tensor | None, iterations: int, *, guided: bool = False) -> Tensor:
-    """Refit to the matches with a squared distance up to ``cut (b,)``, or (None) to the nearer half of them.
-
-    ``guided`` as in :func:`anneal`, but for the last 30 %.
-    """
-    for i in range(iterations):
-        square, rows = data.distances(data.constrained(basis) if guided and i < HOLD * iterations else basis)
-        if guided and 2 * i < iterations:
-            rows = (rows / data.lengths()[:, :, None]).sqrt()
+def concentrate(data: Bundle, basis: Tensor, cut: Tensor | None, iterations: int) -> Tensor:
+    """Refit to the matches with a squared distance up to ``cut (b,)``, or (None) to the nearer half of them."""
+    for _ in range(iterations):
+        square, rows = data.distances(basis)
         limit = median(square, data.weights)[:, :, None] if cut is None else cut[:, None, None]
         basis = data.next((square <= limit)[:, None] * data.weights[:, None, None] * rows, basis)
     return basis

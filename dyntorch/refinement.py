@@ -12,7 +12,7 @@ from dyntorch.blocks import map_blocks
 from dyntorch.invariant import Invariant
 from dyntorch.matches import Matches, matches
 from dyntorch.normalize import Normalization, denormalize, denormalize_motion
-from dyntorch.residual import multilinear_derivative, whitened
+from dyntorch.residual import multilinear_derivative
 from dyntorch.solution import FAILED, Solution
 
 ITERATIONS = 30

@@ -125,6 +125,25 @@ def _sightings(axis: Any, seen: Board) -> None:
     axis.legend(fontsize=9)
 
 
+def drive_picture(views: Sequence[Tensor], one: Alignment, path: Path) -> None:
+    """Boxes from above at three sweeps: as the sensor measured them, and with its motion taken out."""
+    assert one.B is not None
+    placed = (torch.stack(list(views)), torch.stack([views[0], apply(one.A, views[1]), apply(one.B, views[2])]))
+    figure, axes = plt.subplots(1, 2, figsize=(13, 5.6), sharex=True, sharey=True, layout="constrained")
+    for axis, paths, title in zip(axes, placed, ("as measured by the moving sensor", "aligned to the first sweep"), strict=True):
+        for label in (STATIC, OUTLIER, MOVING):
+            mine = one.labels == label
+            axis.plot(paths[:, mine, 0], paths[:, mine, 1], color=COLOURS[label], lw=1.4)
+            name = f"{NAMES[label]} ({int(mine.sum())})"
+            axis.plot(paths[0, mine, 0], paths[0, mine, 1], ".", color=COLOURS[label], ms=5, label=name)
+        axis.plot(0, 0, "k^", ms=9, label="sensor")
+        axis.set(aspect="equal", xlabel="forward, m", title=title)
+        axis.grid(alpha=0.2)
+    axes[0].set_ylabel("left, m")
+    axes[1].legend(fontsize=9)
+    save(figure, path)
+
+
 def movers_picture(curves: Mapping[str, Tensor], shares: Sequence[float], path: Path) -> None:
     """Rotation and translation errors ``(shares, 3)`` of each method against the share of boxes that move."""
     labels = ("rotation error, degrees", "translation error, m", "translation error up to a common velocity, m")

@@ -37,7 +37,7 @@ from dyntorch.algebra.homogeneous import apply
 from experiments.protocol import data_folder
 from experiments.real_bodies import SPACINGS, bodies_rows
 from experiments.real_data import Drive, drives, takes
-from experiments.real_pictures import bodies_picture, movers_picture
+from experiments.real_pictures import bodies_picture, drive_picture, movers_picture
 from experiments.real_solvers import Matrices, Solver, aligned, gap, listed, median, rigid_ransac, tensor
 from experiments.tables import Row, command, markdown, note
 from indexing.files import manifest, plain, prepare, write_json
@@ -166,6 +166,9 @@ def run(config: Config) -> None:
     title = f"Drives: rigid motion against the share of movers, 0.3 s between sweeps, threshold {THRESHOLD} m"
     tables[title], curves = movers_rows(logs, config)
     movers_picture(curves, SHARES, config.out / "movers.png")
+    views, _, _, _ = logs[0].triple(100, 5)
+    seen = dyn.align_points(*views, model="rigid", threshold=THRESHOLD, generator=torch.Generator().manual_seed(config.seed))
+    drive_picture(views, seen, config.out / "drive.png")
     tables["Bodies: error of A and B"], errors, shown = bodies_rows(takes(), 2 if config.quick else config.crowds, config.seed)
     one = dyn.align_points(*shown.views, model="rigid", generator=torch.Generator().manual_seed(0))
     assert one.B is not None

@@ -8,8 +8,19 @@ from pathlib import Path
 README = Path(__file__).parent.parent / "README.md"
 
 
+def blocks() -> list[str]:
+    return re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
+
+
+def test_the_alignment_example_prints_what_it_says(capsys):
+    (source,) = [block for block in blocks() if "align_planar" in block]
+    exec(compile(source, str(README), "exec"), {})
+    printed = capsys.readouterr().out.strip()
+    assert f"```\n{printed}\n```" in README.read_text(encoding="utf-8")
+
+
 def test_the_python_example_runs_and_prints_what_it_says(tmp_path, monkeypatch, capsys):
-    (source,) = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
+    (source,) = [block for block in blocks() if "ActionIndexer" in block]
     monkeypatch.chdir(tmp_path)
     exec(compile(source, str(README), "exec"), {})
     first, *events = capsys.readouterr().out.splitlines()
