@@ -20,8 +20,9 @@ def map_blocks(function: Callable[..., Result], *tensors: Tensor, size: int) -> 
 
     On the CPU torch factorizes a batch of matrices one after the other on one core (``svd``, ``eigh``, ``cholesky`` and
     the triangular solves), and releases the interpreter meanwhile; threads over blocks give the other cores their share.
-    The pool has ``torch.get_num_threads()`` workers, whose own operations run on one thread each.  One block, one thread
-    or an accelerator needs no pool.  The caller's grad mode holds in the workers.
+    The pool has ``torch.get_num_threads()`` workers, whose own operations run on one thread each: also a single block of many
+    small problems goes there, because teams of threads on small operations cost ten times what they gain.  A single problem,
+    one thread or an accelerator needs no pool.  The caller's grad mode holds in the workers.
 
     Args:
         function: takes one block per tensor and returns a tensor, or a tuple of tensors, with the same leading dimension.
@@ -44,10 +45,10 @@ def map_blocks(function: Callable[..., Result], *tensors: Tensor, size: int) -> 
         raise ValueError(f"map_blocks needs tensors of the same leading dimension, got {[tuple(t.shape) for t in tensors]}")
     if size < 1:
         raise ValueError(f"size must be at least 1 problem per block, got {size}")
-    if len(tensors[0]) <= size:
-        return function(*tensors)
-    blocks = list(zip(*(tensor.split(size) for tensor in tensors), strict=True))
     threads = torch.get_num_threads() if tensors[0].device.type == "cpu" else 1
+    if len(tensors[0]) <= min(size, 1) or (threads == 1 and len(tensors[0]) <= size):
+        return function(*tensors)  # one large problem may use all cores in its operations
+    blocks = list(zip(*(tensor.split(size) for tensor in tensors), strict=True))
     if threads == 1:
         return _concatenate([function(*block) for block in blocks])
     grad, inference = torch.is_grad_enabled(), torch.is_inference_mode_enabled()

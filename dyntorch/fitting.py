@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from dyntorch.ambiguity import within_noise
 from dyntorch.blocks import map_blocks
 from dyntorch.invariant import Invariant, as_invariant
 from dyntorch.matches import Matches, matches
@@ -21,7 +22,9 @@ Measured: 0.02 for the homography tensor at 2 px and 0.1 at 5 px (100 matches), 
 ILL_CONDITIONED = 1e-10
 """Rounding error of a null vector from a float64 Gram, eps * (s_1 / s_{D-1})^2, above which the matrix itself is decomposed, unless
 the noise outweighs it a thousandfold anyway."""
-BLOCK, LEAST = 5 << 19, 64
+WEAK = 1e4
+"""Squared ratio of the first to the last but one singular value above which the noise may reach it (general motion: 1e2 to 1e3)."""
+BLOCK, LEAST = 5 << 19, 16
 """Numbers in the largest temporary of one block of the batch, summed in pieces by the Gram, and fewest problems in a block that
 is cut for the sake of another core.  Measured best: 364 problems of 200 points of the plane (47 us each; 128: 59), 131 of space."""
 
@@ -157,6 +160,11 @@ def _null(
         basis = _with_matrix(basis, exact, primitives, views, weights, static, nullity)
     few = present < width - nullity
     ambiguous = square * present.clamp(min=1) > AMBIGUOUS
+    weak = (spare > 0) & ~found.degenerate & (g.diagonal(dim1=-2, dim2=-1).sum(-1) * found.competing > WEAK)
+    if not invariant.resolves_noise and g.device.type == "cpu" and bool(weak.any()):
+        chosen = [x[weak] for x in views], weights[weak], None if static is None else static[weak], basis[weak]
+        with torch.no_grad():
+            ambiguous[weak] = ambiguous[weak] | within_noise(primitives, *chosen)
     status = torch.full_like(present, int(Status.OK))
     status = torch.where(ambiguous, int(Status.AMBIGUOUS), status)
     status = torch.where(found.degenerate, int(Status.DEGENERATE), status)

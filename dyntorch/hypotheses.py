@@ -30,7 +30,7 @@ class Bundle:
     """
 
     invariant: Invariant
-    """In these coordinates."""
+    """In these coordinates, for tensors ``(b, K, ..)``."""
     primitives: tuple[Primitive, ...]
     views: tuple[Tensor, ...]
     """``(b, 1, n, ...)``."""
@@ -57,19 +57,15 @@ class Bundle:
 
     def constrained(self, basis: Tensor) -> Tensor:
         """The tensors of the motions that tensors ``(b, c, K, a, D)`` decompose into; where there is none, the tensors."""
-        inv, count = self.invariant, basis.shape[2]
-        axes = inv.axes()
-        back = [axes.index(v) for v in range(len(axes))]
-        own = basis.transpose(1, 2).flatten(0, 1).unflatten(-1, [p.width for p in self.primitives])
-        tensor = own.permute(0, 1, 2, *(3 + v for v in axes))
-        tensor = tensor.squeeze(2) if inv.nullity == 1 else tensor
-        tensor = tensor if inv.copies else tensor.squeeze(1)
-        each = inv.subset(torch.arange(len(basis), device=basis.device).repeat_interleave(count)) if count > 1 else inv
-        motion = each.decompose(tensor)
-        made = each.compose(*motion) if isinstance(motion, tuple) else each.compose(motion)
+        inv, axes = self.invariant, self.invariant.axes()
+        tensor = basis.transpose(1, 2).unflatten(-1, [p.width for p in self.primitives])
+        tensor = tensor.permute(0, 1, 2, 3, *(4 + v for v in axes))
+        tensor = tensor.squeeze(3) if inv.nullity == 1 else tensor
+        motion = inv.decompose(tensor if inv.copies else tensor.squeeze(2))
+        made = inv.compose(*motion) if isinstance(motion, tuple) else inv.compose(motion)
         lead = made.ndim - len(axes)
-        made = made.permute(*range(lead), *(lead + v for v in back)).flatten(lead)
-        made = made.reshape(len(basis), count, basis.shape[1], *basis.shape[3:]).transpose(1, 2)
+        made = made.permute(*range(lead), *(lead + axes.index(v) for v in range(len(axes)))).flatten(lead)
+        made = made.reshape(basis.transpose(1, 2).shape).transpose(1, 2)
         sound = made.isfinite().all(-1, keepdim=True) & (made.abs().amax(-1, keepdim=True) > 0)
         return torch.where(sound.all(-2, keepdim=True).all(1, keepdim=True), made, basis)
 

@@ -68,6 +68,8 @@ class Invariant:
     """Which view each axis of the tensor belongs to; None: in the order of the views."""
     copies: int | None = None
     """Tensors per problem, where one set of matches is solved several times (one per given camera)."""
+    resolves_noise: bool = True
+    """Whether, among tensors that nearly all matches fulfil, the one with the least residual under noise is the true one."""
     labels_static: bool = False
     """Whether a match known to be static says more than one that may move (the argument ``static``)."""
 

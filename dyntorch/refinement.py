@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from threading import Lock
 
 import torch
 from torch import Tensor
@@ -19,6 +20,8 @@ ITERATIONS = 30
 CONVERGED = 1e-9  # relative decrease of the cost
 BLOCK = 1 << 18
 """Entries of the Jacobian per block of the batch: larger ones leave the cache, smaller ones pay for the calls."""
+FORWARD = Lock()
+"""Forward mode differentiates in one thread at a time: the level of its dual numbers belongs to the whole process."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +131,8 @@ def _jacobian(function: Callable[[Tensor], Tensor], theta: Tensor) -> tuple[Tens
         value, column = torch.func.jvp(function, (theta,), (tangent,))[:2]
         return value, column
 
-    values, columns = torch.func.vmap(along)(tangents)
+    with FORWARD:
+        values, columns = torch.func.vmap(along)(tangents)
     return values[0], columns.transpose(0, 1)
 
 
@@ -205,7 +209,8 @@ def refine_matches(solution: Solution, data: Matches, iterations: int = ITERATIO
         problem = Problem(base, shapes, views, scales, rest[0], rest[1] if len(rest) > 1 else None)
         return _minimize(problem, block[0], iterations)
 
-    size = max(1, BLOCK // max(1, data.count * theta.shape[-1]))
+    # a block for every thread at least: threads inside of small operations cost more than they bring
+    size = max(1, min(BLOCK // max(1, data.count * theta.shape[-1]), -(-len(theta) // torch.get_num_threads())))
     with torch.no_grad():
         start = torch.where(theta.isfinite(), theta, torch.zeros_like(theta))
         best, cost, matrix = map_blocks(run, start, *moved, *norm.scales, data.weights, *flags, size=size)

@@ -18,7 +18,7 @@ from dyntorch.residual import multilinear, whitened
 from dyntorch.solution import FAILED, Solution, Status
 from dyntorch.starts import Found, Search, chi, threshold_of
 
-STARTS = (1, 4, 16, 64)
+STARTS = (1, 4, 16, 64, 256)
 SETTLING = 4  # updates of an estimated threshold per round
 WIDE = 1.5
 """Times the threshold up to which distances count when it is estimated: cut at the threshold itself the noise comes out 14 % too
@@ -178,7 +178,7 @@ def distances(solution: Solution) -> Tensor:
             return multilinear(invariant, motion[0], views, scales).abs()
         return whitened(invariant, motion, views, scales).norm(dim=-1)
 
-    size = max(1, BLOCK // max(1, data.count))
+    size = max(1, min(BLOCK // max(1, data.count), -(-len(data.weights) // torch.get_num_threads())))
     return map_blocks(block, *transforms, *data.views, *parts, size=size).nan_to_num(nan=torch.inf)
 
 

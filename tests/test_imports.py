@@ -56,7 +56,7 @@ LAYERS = [
     {"matches", "normalize", "matrix"},
     {"residual"},
     {"invariants"},
-    {"solution", "fitting"},
+    {"solution", "ambiguity", "fitting"},
     {"refinement"},
     {"hypotheses", "starts", "robust"},
     {"tasks"},

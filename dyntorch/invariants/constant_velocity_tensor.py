@@ -68,6 +68,7 @@ class ConstantVelocityTensor(Invariant):
 
     nullity = 1
     motion = (Frame(0), Frame(1), Frame(2))
+    resolves_noise = False
 
     def __post_init__(self) -> None:
         if self.third not in ("space", "image"):

@@ -42,6 +42,7 @@ class TranslatingLinesMatrix(Invariant):
     motion = (Frame(0, 1),)
     dof = 15
     codim = 1
+    resolves_noise = False
     layout = (1, 0)
     labels_static = True
 

@@ -19,6 +19,8 @@ from dyntorch.matrix import estimation_matrix
 from dyntorch.normalize import denormalize
 from dyntorch.scenes.scene import OUTLIER
 from dyntorch.starts import Search, chi, judge
+from tests.cases import CASES as KNOWN
+from tests.cases import Case
 
 
 def seeded(seed: int = 0) -> torch.Generator:
@@ -110,6 +112,60 @@ def test_noise_is_estimated(invariant: Invariant, scene: Any, sigma: float) -> N
     assert abs(float(solution.sigma.mean()) / sigma - 1) < 0.15
     assert float(rms.max()) < sigma
     assert float(kept.mean()) > 0.95
+
+
+@pytest.mark.parametrize("case", KNOWN, ids=repr)
+def test_estimated_threshold_for_every_invariant(case: Case) -> None:
+    scale = case.units[0] if case.units else 1.0
+    made = case.scene(max(120, 5 * case.minimal), batch=2, seed=41, outliers=0.2, sigma=case.noise / scale)
+    solution = dyn.robust_fit(case.invariant, *made.views, generator=seeded())
+    right = made.labels != OUTLIER
+    assert solution.inliers is not None
+    assert solution.sigma is not None
+    assert solution.status.tolist() == [Status.OK, Status.OK]
+    assert bool(((solution.inliers & right).sum(-1) >= 0.9 * right.sum(-1)).all())
+    assert bool(((solution.sigma / shown_noise(case, made) - 1).abs() < 0.25).all())
+
+
+def shown_noise(case: Case, made: scenes.Scene) -> Tensor:
+    """The noise of one coordinate that the true matches show under the true motion."""
+    tensor = case.invariant.compose(*made.motion)
+    square = dyn.sampson(case.invariant, tensor, *made.views).square() / case.invariant.codim
+    right = made.labels != OUTLIER
+    return ((square * right).sum(-1) / right.sum(-1)).sqrt()
+
+
+def test_translating_lines_with_many_outliers() -> None:
+    case = KNOWN[-1]
+    made = case.scene(200, batch=4, seed=31, outliers=0.3, sigma=1e-3)
+    solution = dyn.robust_fit(case.invariant, *made.views, threshold=3e-3, generator=seeded())
+    assert solution.status.tolist() == [Status.OK] * 4
+    assert float(judge_fit(made, solution)[1].min()) > 0.95
+
+
+def test_several_slots_of_hyperplanes_have_distances_right_in_the_mean() -> None:
+    """Against the pseudo-inverse of the whole covariance of the eight rows, which the motion makes of rank four."""
+    made = scenes.planar(400, sigma=0.3, static=1.0, generator=seeded(8))
+    invariant = dyn.DualHomographyTensor("points")
+    search = Search(invariant, matches(invariant, made.views), seeded())
+    work = search._bundle((search.weights, *search.views, *search.norm.transforms))
+    basis = work.first(search.weights[:, None])
+    square = work.distances(basis)[0][0, 0]
+    assert float(square.mean()) == pytest.approx(4 * 0.3**2, rel=0.1)
+    exact = dyn.sampson(invariant, invariant.compose(*made.motion), *made.views).square()
+    assert float(torch.corrcoef(torch.stack([square, exact]))[0, 1]) > 0.8
+
+
+def test_constrained_tensors_of_motions_are_themselves() -> None:
+    for case in KNOWN:
+        made = case.scene(max(120, 3 * case.minimal), batch=2, seed=3)
+        search = Search(case.invariant, matches(case.invariant, made.views), seeded())
+        work = search._bundle((search.weights, *search.views, *search.norm.transforms))
+        basis = work.first(search.weights[:, None].expand(-1, 3, -1))
+        again = work.constrained(basis)
+        # spans: sign and basis are free
+        inside = basis @ again.mT @ (again @ again.mT).inverse() @ again
+        assert torch.allclose(inside, basis, atol=1e-6), case
 
 
 def test_random_matches_have_no_consensus() -> None:
