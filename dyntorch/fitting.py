@@ -13,7 +13,7 @@ from dyntorch.matrix import estimation_matrix, gram
 from dyntorch.normalize import Normalization, denormalize, normalization
 from dyntorch.nullspace import gram_null_space, null_space
 from dyntorch.primitives import Primitive
-from dyntorch.solution import FAILED, Solution, Status, copied
+from dyntorch.solution import Solution, Status, copied, failed
 
 AMBIGUOUS = 0.5
 """Residual energy of the solution times the harmonic sum of that of all other directions: above it another tensor fits as well.
@@ -130,10 +130,7 @@ def _solve(
     tensor = invariant.normalized(norm.transforms).constrain(tensor)
     if invariant.copies is not None:
         status, uncertainty = status.amax(-1), uncertainty.amax(-1)
-    failed = torch.zeros_like(status, dtype=torch.bool)
-    for state in FAILED:
-        failed = failed | (status == state)
-    zero = failed[(..., *([None] * (tensor.ndim - failed.ndim)))]
+    zero = failed(status)[(..., *([None] * (tensor.ndim - status.ndim)))]
     tensor = torch.where(zero, torch.zeros_like(tensor), tensor)
     back = denormalize(invariant, tensor, norm.actions)
     return (tensor, torch.where(zero, torch.zeros_like(back), back), status, uncertainty, *norm.transforms, *norm.actions)

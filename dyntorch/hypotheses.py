@@ -12,7 +12,7 @@ from dyntorch.eigenspace import orthonormal
 from dyntorch.invariant import Invariant
 from dyntorch.matrix import unpack
 from dyntorch.nullspace import gram_null_space
-from dyntorch.primitives import HyperplanesThrough, Point, Primitive
+from dyntorch.primitives import HyperplanesThrough, Point, Primitive, triangle
 from dyntorch.residual import SINGULAR, whiten
 
 STEPS = 2
@@ -161,7 +161,7 @@ def bundle(
     """Prepare matches ``(b, 1, n, ...)`` in normalized coordinates, with weights ``(b, n)``."""
     packed, vectors = [], []
     for primitive, x in zip(primitives, views, strict=True):
-        rows, columns = torch.triu_indices(primitive.width, primitive.width, device=x.device)
+        rows, columns = triangle(primitive.width, x.device)
         if primitive.rows > 1:
             vectors.append(primitive.vectors(x).permute(0, 1, 4, 3, 2).contiguous())
             packed.append(primitive.packed(x).mT)

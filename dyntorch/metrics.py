@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.algebra.homogeneous import apply, unit
+from dyntorch.algebra.rigid import nearest_rotation
 
 
 def relative_error(estimated: Tensor, true: Tensor, *, dims: int = 2) -> Tensor:
@@ -117,7 +118,7 @@ def rotation_error(estimated: Tensor, true: Tensor) -> Tensor:
         90.0
     """
     (first, valid), (second, also) = _rigid_scale(true), _rigid_scale(estimated)
-    difference = _rotation(first).mT @ _rotation(second)
+    difference = nearest_rotation(first[..., :3, :3]).mT @ nearest_rotation(second[..., :3, :3])
     axis = torch.stack([difference[..., i, j] - difference[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0))], dim=-1)
     trace = difference.diagonal(dim1=-2, dim2=-1).sum(-1)
     # both the sine and the cosine, for the arc cosine alone loses half of the digits near 0
@@ -157,14 +158,6 @@ def _rigid_scale(matrix: Tensor) -> tuple[Tensor, Tensor]:
     valid = scaled.isfinite().flatten(-2).all(dim=-1)
     eye = torch.eye(4, dtype=matrix.dtype, device=matrix.device)
     return torch.where(valid[..., None, None], scaled, eye), valid
-
-
-def _rotation(rigid: Tensor) -> Tensor:
-    """Nearest rotation to the upper left block."""
-    u, _, vt = torch.linalg.svd(rigid[..., :3, :3])
-    flip = torch.ones_like(u[..., 0])
-    flip[..., 2] = torch.linalg.det(u @ vt).sign()
-    return (u * flip[..., None, :]) @ vt
 
 
 def affine_gauge(estimated: Tensor, true: Tensor) -> tuple[Tensor, Tensor]:

@@ -112,7 +112,7 @@ def _moved(part: Tensor, frame: Frame, transforms: Sequence[Tensor], *, forward:
     for view, left in ((frame.target, True), (frame.source, False)):
         if view is None:
             continue
-        transform = transforms[view] if left == forward else torch.linalg.inv(transforms[view])
+        transform = transforms[view] if left == forward else torch.linalg.inv_ex(transforms[view])[0]
         matrix = transform @ matrix if left else matrix @ transform
     if frame.vector:
         norm = matrix.norm(dim=(-2, -1))[..., None]

@@ -17,9 +17,6 @@ from torch import Tensor
 from dyntorch.algebra.extensors import compound, join, plucker, plucker_form
 from dyntorch.algebra.homogeneous import homogeneous
 
-DIRECTION = [2, 4, 5]
-"""Pluecker coordinates that hold the direction of a line (up to sign): those with the last homogeneous coordinate."""
-
 
 @lru_cache(maxsize=64)
 def triangle(width: int, device: torch.device) -> tuple[Tensor, Tensor]:
@@ -28,6 +25,17 @@ def triangle(width: int, device: torch.device) -> tuple[Tensor, Tensor]:
     with torch.inference_mode(False):
         rows, columns = torch.triu_indices(width, width, device=device)
     return rows, columns
+
+
+def _inverse(matrix: Tensor) -> Tensor:
+    """Without the check of ``torch.linalg.inv``, for which an accelerator would wait."""
+    return torch.linalg.inv_ex(matrix)[0]
+
+
+def direction(line: Tensor) -> Tensor:
+    """Direction ``(..., 3)`` from the first to the second point of Pluecker lines ``(..., 6)``: P3 Q - Q3 P."""
+    # one by one: a list of indices would have to be copied to an accelerator
+    return -torch.stack([line[..., 2], line[..., 4], line[..., 5]], dim=-1)
 
 
 class Primitive(ABC):
@@ -190,7 +198,7 @@ class HyperplanesThrough(Point):
         return torch.cat([*rows, moved.square().sum(-2, keepdim=True)], dim=-2)
 
     def action(self, transform: Tensor) -> Tensor:
-        return torch.linalg.inv(transform).mT
+        return _inverse(transform).mT
 
     def pullback(self, x: Tensor, gradient: Tensor) -> Tensor:
         self._check_single()
@@ -225,7 +233,7 @@ class Hyperplane(Primitive):
         return x / torch.maximum(x[..., :-1].norm(dim=-1, keepdim=True), torch.where(floor > 0, floor, 1.0))
 
     def action(self, transform: Tensor) -> Tensor:
-        return torch.linalg.inv(transform).mT
+        return _inverse(transform).mT
 
     def pullback(self, x: Tensor, gradient: Tensor) -> Tensor:
         # noise turns the unit normal (tangentially) and shifts the offset
@@ -249,7 +257,7 @@ class Hyperplane(Primitive):
         return (nearest.mT - distance * normal).unsqueeze(-2)
 
     def move(self, x: Tensor, transform: Tensor) -> Tensor:
-        return x @ torch.linalg.inv(transform)
+        return x @ _inverse(transform)
 
 
 @dataclass(frozen=True, repr=False)
@@ -268,7 +276,7 @@ class Line(Primitive):
     def components(self, x: Tensor) -> Tensor:
         """Scaled by the length of the segment: a longer one is a better line (its square root is best, measured: 1.2 to 0.8)."""
         line = self.raw(x)
-        length = line[..., DIRECTION].norm(dim=-1, keepdim=True).clamp(min=torch.finfo(x.dtype).eps)
+        length = direction(line).norm(dim=-1, keepdim=True).clamp(min=torch.finfo(x.dtype).eps)
         return (line / (length.sqrt() if self._as_points(x) else length)).mT
 
     def freedom(self) -> int:
@@ -315,9 +323,9 @@ class Line(Primitive):
 
 def _feet(line: Tensor) -> Tensor:
     """Foot of the perpendicular from the origin of each Pluecker line: direction x moment / |direction|^2."""
-    direction = -line[..., DIRECTION]  # P3 Q - Q3 P of the homogeneous points
+    along = direction(line)
     moment = torch.stack([line[..., 3], -line[..., 1], line[..., 0]], dim=-1)
-    return torch.linalg.cross(direction, moment) / direction.square().sum(-1, keepdim=True).clamp(min=torch.finfo(line.dtype).tiny)
+    return torch.linalg.cross(along, moment) / along.square().sum(-1, keepdim=True).clamp(min=torch.finfo(line.dtype).tiny)
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -341,7 +349,7 @@ class Projected(Primitive):
         return Projected(self._split(transform)[1])
 
     def action(self, transform: Tensor) -> Tensor:
-        return torch.linalg.inv(self._split(transform)[0])
+        return _inverse(self._split(transform)[0])
 
     def pullback(self, x: Tensor, gradient: Tensor) -> Tensor:
         return (gradient @ self.cameras.to(x))[..., :3]
@@ -351,5 +359,5 @@ class Projected(Primitive):
 
     def _split(self, transform: Tensor) -> tuple[Tensor, Tensor]:
         """M T^-1 = L Q with orthonormal rows Q, the well-conditioned camera of the normalized points."""
-        q, r = torch.linalg.qr((self.cameras.to(transform) @ torch.linalg.inv(transform)).mT)
+        q, r = torch.linalg.qr((self.cameras.to(transform) @ _inverse(transform)).mT)
         return r.mT, q.mT

@@ -14,7 +14,7 @@ from dyntorch.invariant import Invariant
 from dyntorch.matches import Matches, matches
 from dyntorch.normalize import Normalization, denormalize, denormalize_motion
 from dyntorch.residual import multilinear_derivative
-from dyntorch.solution import FAILED, Solution
+from dyntorch.solution import Solution, failed
 
 ITERATIONS = 30
 CONVERGED = 1e-9  # relative decrease of the cost
@@ -280,9 +280,7 @@ def _refined(
     invariant = solution.invariant
     problem = Problem(invariant, shapes, (), (), data.weights, None)
     status = solution.status.reshape(-1).to(theta.device)
-    good = cost.isfinite()
-    for state in FAILED:
-        good = good & (status != state)
+    good = cost.isfinite() & ~failed(status)
     motion = tuple(
         torch.where(good[(..., *([None] * (part.ndim - 1)))], part, old)
         for part, old in zip(problem.parts(theta), solution.normalized_motion(), strict=True)

@@ -15,7 +15,7 @@ from dyntorch.matches import Matches, matches
 from dyntorch.normalize import denormalize
 from dyntorch.refinement import refine_matches
 from dyntorch.residual import multilinear, whitened
-from dyntorch.solution import FAILED, Solution, Status
+from dyntorch.solution import Solution, Status, failed
 from dyntorch.starts import Found, Search, chi, threshold_of
 
 STARTS = (1, 4, 16, 64, 256)
@@ -223,9 +223,7 @@ def _judged(solution: Solution, evidence: Tensor, degenerate: Tensor, inliers: T
     status = torch.where(degenerate, int(Status.DEGENERATE), status)
     few = (data.weights > 0).sum(-1) < invariant.minimal()
     status = torch.where(few, int(Status.TOO_FEW), status)
-    good = torch.ones_like(few)
-    for state in FAILED:
-        good = good & (status != state)
+    good = ~failed(status)
     return replace(
         solution,
         tensor=_where(data.back(good), solution.tensor, torch.zeros_like(solution.tensor)),

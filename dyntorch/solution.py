@@ -39,8 +39,11 @@ REMEDY = {
     Status.NO_CONSENSUS: "raise the threshold, or give matches of which more belong to the model",
     Status.NOT_CONVERGED: "solve on the CPU",
 }
-FAILED = (Status.TOO_FEW, Status.DEGENERATE)
-"""The states that leave no tensor."""
+
+
+def failed(status: Tensor) -> Tensor:
+    """Where a status leaves no tensor, bool of the same shape."""
+    return (status == Status.TOO_FEW) | (status == Status.DEGENERATE)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -136,10 +139,8 @@ class Solution:
         return tuple(t[:, 0] for t in self.normalization.transforms) if self.invariant.copies else self.normalization.transforms
 
     def _or_zero(self, part: Tensor) -> Tensor:
-        failed = torch.zeros(part.shape[0], dtype=torch.bool, device=part.device)
-        for state in FAILED:
-            failed = failed | (self.status.reshape(-1).to(part.device) == state)
-        return torch.where(failed[(..., *([None] * (part.ndim - 1)))], torch.zeros_like(part), part)
+        none = failed(self.status.reshape(-1).to(part.device))
+        return torch.where(none[(..., *([None] * (part.ndim - 1)))], torch.zeros_like(part), part)
 
 
 def copied(invariant: Invariant, matches: Matches) -> tuple[tuple[Tensor, ...], Tensor, Tensor | None]:

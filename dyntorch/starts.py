@@ -15,6 +15,7 @@ from dyntorch.hypotheses import Bundle, anneal, bundle, concentrate, median, msa
 from dyntorch.invariant import Invariant
 from dyntorch.matches import Matches
 from dyntorch.normalize import Normalization, normalization
+from dyntorch.sampling import uniform
 from dyntorch.solution import copied
 
 SMALL = 8
@@ -164,9 +165,7 @@ class Search:
         return replace(data, views=tuple(x[rows, order] for x in data.views), weights=data.weights[rows, order])
 
     def _random(self, *shape: int) -> Tensor:
-        home = self.data.weights.device
-        device = home if self.generator is None else self.generator.device
-        return torch.rand(*shape, generator=self.generator, dtype=torch.float64, device=device).to(home)
+        return uniform(*shape, generator=self.generator, device=self.data.weights.device)
 
     def _map(self, function: Callable[..., Result], where: Tensor, starts: Tensor, *more: Tensor) -> Result:
         inv, n = self.invariant, self.weights.shape[-1]

@@ -12,7 +12,7 @@ from dyntorch.algebra.line_collineation import common_point, compound_root, skew
 from dyntorch.algebra.projection import project
 from dyntorch.invariant import Frame, Invariant
 from dyntorch.nullspace import null_space
-from dyntorch.primitives import Line
+from dyntorch.primitives import Line, direction
 from dyntorch.residual import whiten
 
 
@@ -241,7 +241,7 @@ def _ends(x: Tensor) -> Tensor:
     if x.ndim >= 3 and tuple(x.shape[-2:]) == (2, 3):
         return x
     foot = Line().points(x)
-    return torch.cat([foot, foot + normalize(x[..., None, [2, 4, 5]], dim=-1)], dim=-2)
+    return torch.cat([foot, foot + normalize(direction(x)[..., None, :], dim=-1)], dim=-2)
 
 
 def _across(direction: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ from dyntorch.invariants.join_tensor import JoinTensor
 from dyntorch.invariants.minimal_join_tensor import MinimalJoinTensor
 from dyntorch.matches import Matches
 from dyntorch.robust import robust_fit
-from dyntorch.solution import FAILED, Solution, Status
+from dyntorch.solution import Solution, Status, failed
 from dyntorch.tasks.alignment import MOVING, OUTLIER, STATIC, Alignment, Notice, NoticeCode, notices
 from dyntorch.tasks.labelling import CHI_SQUARE, ROUGH, SIGMAS, Evidence, Labelled, joined
 from dyntorch.tasks.static_consensus import static_consensus
@@ -125,9 +125,7 @@ def _from_tensor(
         else robust_fit(invariant, *data.views, threshold=given, weights=data.weights, generator=generator)
     )
     theta = evidence.parameters(tuple(part.reshape(-1, 4, 4) for part in found.motion))
-    usable = theta.isfinite().all(-1)
-    for state in FAILED:
-        usable = usable & (found.status.reshape(-1) != state)
+    usable = theta.isfinite().all(-1) & ~failed(found.status.reshape(-1))
     identity = torch.eye(4, dtype=theta.dtype, device=theta.device).flatten().repeat(2) / 2
     theta = torch.where(usable[:, None], theta, identity)
     if given is not None:
@@ -151,18 +149,18 @@ def _solved(evidence: Evidence, best: Labelled) -> tuple[Solution, Tensor, Tenso
     labels = evidence.labels(theta, best.sigma, spread)
     worst = best.sigma * values[:, 0].clamp(min=torch.finfo(values.dtype).tiny).rsqrt() * torch.stack(evidence.norm.scales).amax(0)
     status = _status(evidence, labels, worst, values[:, 0] <= INDETERMINATE * values[:, -1])
-    failed = (status == Status.DEGENERATE) | (status == Status.TOO_FEW)
-    labels = torch.where(failed[:, None], OUTLIER, labels)
+    none = failed(status)
+    labels = torch.where(none[:, None], OUTLIER, labels)
     assert refined.sigma is not None and refined.covariance is not None
-    lead = failed[(..., *[None] * 4)]
+    lead = none[(..., *[None] * 4)]
     solution = replace(
         refined,
         status=status,
         tensor=torch.where(lead, 0.0, refined.tensor),
         normalized=torch.where(lead, 0.0, refined.normalized),
-        covariance=torch.where(failed[:, None, None], 0.0, refined.covariance),
-        sigma=torch.where(failed, 0.0, refined.sigma),
-        uncertainty=torch.where(failed, 0.0, worst),
+        covariance=torch.where(none[:, None, None], 0.0, refined.covariance),
+        sigma=torch.where(none, 0.0, refined.sigma),
+        uncertainty=torch.where(none, 0.0, worst),
     )
     return solution, labels, worst
 
@@ -180,7 +178,7 @@ def _status(evidence: Evidence, labels: Tensor, worst: Tensor, undetermined: Ten
 
 
 def _notices(evidence: Evidence, best: Labelled, worst: Tensor, status: Tensor, batch: tuple[int, ...]) -> tuple[Notice, ...]:
-    solved = (status != Status.DEGENERATE) & (status != Status.TOO_FEW)
+    solved = ~failed(status)
     moving, still = (best.labels == MOVING).sum(-1), (best.labels == STATIC).sum(-1)
     text = f"{{value:g}} matches move, {MOVERS} and more would determine the motion without static ones"
     found = notices(NoticeCode.FEW_MOVING, text, moving, solved & (moving < MOVERS) & (still < ENOUGH), batch)

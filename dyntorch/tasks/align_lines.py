@@ -11,7 +11,7 @@ from dyntorch.fitting import fit_matches
 from dyntorch.invariants.translating_lines_matrix import TranslatingLinesMatrix
 from dyntorch.matches import Matches, matches
 from dyntorch.robust import robust_fit
-from dyntorch.solution import FAILED, Solution, Status
+from dyntorch.solution import Solution, Status, failed
 from dyntorch.tasks.alignment import OUTLIER, STATIC, Alignment, Notice, NoticeCode, notices
 from dyntorch.tasks.labelling import SIGMAS
 from dyntorch.tasks.line_model import Lines, as_points, settle, spread
@@ -135,9 +135,7 @@ def _align(
             generator=generator,
         )
     )
-    usable = torch.ones_like(start.status, dtype=torch.bool)
-    for state in FAILED:
-        usable = usable & (start.status != state)
+    usable = ~failed(start.status)
     lines = Lines.of(flat, points, start.normalization)
     theta = torch.where(usable[:, None], start.normalized_motion()[0].flatten(1), torch.eye(4).to(flat.weights).flatten() / 2)
     sigma = _noise(lines, theta, plain) if given is None else given.maximum(lines.floor)
@@ -189,7 +187,7 @@ def _result(
     status = torch.where((rank <= RANKS[-1][0]) & (status == Status.OK), int(Status.AMBIGUOUS), status)
     status = torch.where(extent[:, 0] <= INDETERMINATE * extent[:, 1], int(Status.DEGENERATE), status)
     status = torch.where(usable, status, start.status.to(status))
-    none = (status == Status.DEGENERATE) | (status == Status.TOO_FEW)
+    none = failed(status)
     labels = torch.where(none[:, None], OUTLIER, labels)
     zero = none[:, None, None]
     return Alignment(

@@ -11,7 +11,7 @@ from dyntorch.fitting import fit_matches
 from dyntorch.invariants.homography_tensor import HomographyTensor
 from dyntorch.matches import Matches, matches
 from dyntorch.robust import robust_fit
-from dyntorch.solution import FAILED, Solution, Status
+from dyntorch.solution import Solution, Status, failed
 from dyntorch.tasks.alignment import MOVING, OUTLIER, STATIC, Alignment
 from dyntorch.tasks.labelling import CHI_SQUARE, ROUGH, SIGMAS, Evidence, Labelled, joined
 from dyntorch.tasks.planar_notices import planar_notices, unverified
@@ -29,6 +29,8 @@ INDETERMINATE = 1e-13
 """Information on the worst direction of the motion over that on the best, below which it is rounding error."""
 AMBIGUOUS = 0.5
 """Standard deviation of the worst direction of the motion, of norm 1, above which the motion is not known at all."""
+SINGULAR = 1e-3
+"""Ratio of the singular values of a homography in normalized coordinates below which no camera sees the plane so (usual: above 0.1)."""
 NOISY = 0.05
 """Noise over the extent of the points, above which agreement with a motion is an accident."""
 CONSENSUS = 0.4
@@ -152,9 +154,16 @@ def _search(evidence: Evidence, threshold: float | None, generator: torch.Genera
     several, noise = evidence.repeated(count), sigma.repeat(count)
     rough = torch.arange(count, device=sigma.device).repeat_interleave(size) == 0
     theta = several.improved(torch.cat([start for start, _ in starts]), noise, rough)
-    best = several.cost(theta, noise).unflatten(0, (count, size)).argmin(0)
+    cost = torch.where(_singular(theta), torch.inf, several.cost(theta, noise))
+    best = cost.unflatten(0, (count, size)).argmin(0)
     chosen = theta[best * size + torch.arange(size, device=best.device)]
     return evidence.settled(chosen, sigma, estimate=given is None)
+
+
+def _singular(theta: Tensor) -> Tensor:
+    """Whether a motion ``(b, 18)`` maps the plane into a line or a point, which fulfils every match and explains none."""
+    values = torch.linalg.svdvals(theta.nan_to_num().unflatten(-1, (2, 3, 3)))
+    return (values[..., 2] < SINGULAR * values[..., 0]).any(-1)
 
 
 def _from_static(evidence: Evidence, given: Tensor | None, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
@@ -199,9 +208,7 @@ def _from_all(evidence: Evidence, given: Tensor | None) -> tuple[Tensor, Tensor]
 def _usable(evidence: Evidence, found: Solution) -> tuple[Tensor, Tensor]:
     """The motion of a solution, the identity where it failed, and where it did not."""
     theta = evidence.parameters(tuple(part.reshape(-1, 3, 3) for part in found.motion))
-    usable = theta.isfinite().all(-1)
-    for state in FAILED:
-        usable = usable & (found.status != state)
+    usable = theta.isfinite().all(-1) & ~failed(found.status)
     identity = torch.eye(3, dtype=theta.dtype, device=theta.device).flatten().repeat(2)
     return torch.where(usable[:, None], theta, identity), usable
 
@@ -216,17 +223,17 @@ def _solved(evidence: Evidence, best: Labelled) -> tuple[Solution, Labelled]:
     assert refined.sigma is not None and refined.covariance is not None
     best = Labelled(theta, labels, best.sigma)
     status = _status(evidence, best, refined.sigma, worst, values[:, 0] <= INDETERMINATE * values[:, -1])
-    failed = (status == Status.DEGENERATE) | (status == Status.TOO_FEW)
-    labels = torch.where(failed[:, None], OUTLIER, labels)
-    zero = failed[:, None, None]
+    none = failed(status)
+    labels = torch.where(none[:, None], OUTLIER, labels)
+    zero = none[:, None, None]
     solution = replace(
         refined,
         status=status,
         tensor=torch.where(zero[..., None], 0.0, refined.tensor),
         normalized=torch.where(zero[..., None], 0.0, refined.normalized),
         covariance=torch.where(zero, 0.0, refined.covariance),
-        sigma=torch.where(failed, 0.0, refined.sigma),
-        uncertainty=torch.where(failed, 0.0, worst),
+        sigma=torch.where(none, 0.0, refined.sigma),
+        uncertainty=torch.where(none, 0.0, worst),
         inliers=labels != OUTLIER,
     )
     return solution, replace(best, labels=labels)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from dyntorch.algebra.homogeneous import similarity
 from dyntorch.algebra.rigid import rigid_alignment
 from dyntorch.matches import Matches
-from dyntorch.solution import Status
+from dyntorch.solution import Status, failed
 from dyntorch.tasks.alignment import MOVING, OUTLIER, STATIC, Alignment, Notice, NoticeCode, notices
 from dyntorch.tasks.labelling import CHI_SQUARE, SIGMAS
 from dyntorch.tasks.rigid import MOTIONS, Sightings, combinations, squares
@@ -63,29 +64,27 @@ def _from_static(data: Sightings, known: Tensor) -> Tensor:
 
 
 def _result(data: Matches, sightings: Sightings, found: Rigid, centres: list[Tensor], scale: Tensor) -> Alignment:
-    b = len(scale)
     motion = sightings.motion
     labels = _labels(sightings, found)
     dof = torch.where(found.grounded, 12, 9)
     values, covariance = _inverse(found.information, dof)
     worst = found.sigma * values.clamp(min=torch.finfo(values.dtype).tiny).rsqrt()
     top = found.information.diagonal(dim1=-2, dim2=-1).amax(-1)
-    status = _status(labels, sightings.weights, worst, values <= INDETERMINATE * top, dof, MOTIONS[motion], found.grounded)
-    failed = (status == Status.DEGENERATE) | (status == Status.TOO_FEW)
-    labels = torch.where(failed[:, None], OUTLIER, labels)
+    status = _status(labels, sightings.weights, worst, values <= INDETERMINATE * top, dof, MOTIONS[motion])
+    none = failed(status)
+    labels = torch.where(none[:, None], OUTLIER, labels)
     matrices, entries = _measured(found.motions, covariance * found.sigma.square()[:, None, None], centres, scale)
     entries = torch.where(torch.isfinite(found.sigma)[:, None, None], entries, torch.inf)
     u, _, _, _ = combinations(found.motions, sightings)
     velocity = torch.where((labels == OUTLIER)[..., None], 0.0, -u / 2**0.5 / scale[:, None, None])
-    zero = failed[:, None, None]
-    warnings = _notices(labels, worst, found.grounded, failed, motion, data.batch)
-    assert len(labels) == b
+    zero = none[:, None, None]
+    warnings = _notices(labels, worst, found.grounded, none, motion, data.batch)
     return Alignment(
         A=data.back(torch.where(zero, 0.0, matrices[:, 0])),
         B=data.back(torch.where(zero, 0.0, matrices[:, 1])),
         labels=data.back(labels),
         status=data.back(status),
-        sigma=data.back(torch.where(failed, 0.0, found.sigma / scale)),
+        sigma=data.back(torch.where(none, 0.0, found.sigma / scale)),
         covariance=data.back(torch.where(zero, 0.0, entries)),
         ambiguity=AMBIGUITY[motion],
         warnings=warnings,
@@ -111,9 +110,7 @@ def _inverse(information: Tensor, dof: Tensor) -> tuple[Tensor, Tensor]:
     return least, (vectors * inverse[:, None]) @ vectors.mT
 
 
-def _status(
-    labels: Tensor, weights: Tensor, worst: Tensor, undetermined: Tensor, dof: Tensor, conditions: int, grounded: Tensor
-) -> Tensor:
+def _status(labels: Tensor, weights: Tensor, worst: Tensor, undetermined: Tensor, dof: Tensor, conditions: int) -> Tensor:
     present = (weights > 0).sum(-1)
     still, moving = (labels == STATIC).sum(-1), (labels == MOVING).sum(-1)
     accident = (still + moving < CONSENSUS * present) | (6 * still + conditions * moving < dof + SPARE)
@@ -135,7 +132,7 @@ def _measured(motions: Tensor, covariance: Tensor, centres: list[Tensor], scale:
     basis = torch.zeros(6, 4, 4, dtype=motions.dtype, device=motions.device)
     for k, (i, j) in enumerate(((2, 1), (0, 2), (1, 0))):
         basis[k, i, j], basis[k, j, i], basis[3 + k, k, 3] = 1.0, -1.0, 1.0
-    outward, inward = _about(1 / scale, first), _about(scale, -first * scale[:, None])
+    outward, inward = similarity(1 / scale, -first * scale[:, None]), similarity(scale, first)
     moved = outward[:, None] @ basis @ inward[:, None]  # (b, 6, 4, 4)
     derivative = motions.new_zeros(len(scale), 2, 16, 12)
     for part in range(2):
@@ -144,17 +141,10 @@ def _measured(motions: Tensor, covariance: Tensor, centres: list[Tensor], scale:
     return result, derivative @ covariance @ derivative.mT
 
 
-def _about(scale: Tensor, shift: Tensor) -> Tensor:
-    """x -> scale x + shift, ``(b, 4, 4)``."""
-    matrix = torch.diag_embed(torch.cat([scale[:, None].expand(-1, 3), torch.ones_like(scale[:, None])], dim=-1))
-    matrix[:, :3, 3] = shift
-    return matrix
-
-
 def _notices(
-    labels: Tensor, worst: Tensor, grounded: Tensor, failed: Tensor, motion: str, batch: tuple[int, ...]
+    labels: Tensor, worst: Tensor, grounded: Tensor, none: Tensor, motion: str, batch: tuple[int, ...]
 ) -> tuple[Notice, ...]:
-    moving, solved = (labels == MOVING).sum(-1), ~failed
+    moving, solved = (labels == MOVING).sum(-1), ~none
     found = notices(
         NoticeCode.UNCERTAIN,
         "the worst direction of the motion has a standard deviation of {value:.2g} radians or sizes of the scene; add matches, "

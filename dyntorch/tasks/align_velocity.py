@@ -10,7 +10,8 @@ from dyntorch.fitting import fit_matches
 from dyntorch.invariants.constant_velocity_tensor import ConstantVelocityTensor
 from dyntorch.matches import Matches
 from dyntorch.robust import robust_fit
-from dyntorch.solution import FAILED, Status
+from dyntorch.sampling import uniform
+from dyntorch.solution import Status, failed
 from dyntorch.tasks.alignment import OUTLIER, STATIC, Alignment, Notice, NoticeCode, notices
 from dyntorch.tasks.labelling import CHI_SQUARE, SIGMAS, Evidence
 from dyntorch.tasks.velocity_model import DOF, GAUGE, Velocities, information, residuals, settle, world_velocities
@@ -41,12 +42,12 @@ def align_velocity(data: Matches, threshold: float | None, affine: bool, generat
     evidence = Evidence.of(ConstantVelocityTensor(), data)
     given = None if threshold is None else torch.full_like(evidence.floor, threshold / SIGMAS).maximum(evidence.floor)
     start = _affine_start(evidence, given, generator) if affine else _projective_start(evidence, given, threshold, generator)
-    theta, sigma, failed = start
+    theta, sigma, found = start
     state = settle(evidence, theta, sigma, affine, given is None)
     extent, motions, covariance = information(evidence, state, affine)
     worst = state.sigma * extent[:, 0].clamp(min=torch.finfo(theta.dtype).tiny).rsqrt()
-    status = _status(evidence, state, worst, extent[:, 0] <= INDETERMINATE * extent[:, 1], failed, affine)
-    none = (status == Status.DEGENERATE) | (status == Status.TOO_FEW)
+    status = _status(evidence, state, worst, extent[:, 0] <= INDETERMINATE * extent[:, 1], found, affine)
+    none = failed(status)
     labels = torch.where(none[:, None], OUTLIER, state.labels)
     zero = none[:, None, None]
     velocities = world_velocities(evidence, state.theta)
@@ -71,9 +72,7 @@ def _projective_start(
     data = evidence.data
     found = robust_fit(ConstantVelocityTensor(), *data.views, threshold=threshold, weights=data.weights, generator=generator)
     theta = evidence.parameters(tuple(part.reshape(-1, 4, 4) for part in found.motion))
-    usable = theta.isfinite().all(-1)
-    for state in FAILED:
-        usable = usable & (found.status != state)
+    usable = theta.isfinite().all(-1) & ~failed(found.status)
     theta = torch.where(usable[:, None], theta, _identity(theta))
     return theta, _starting_noise(evidence, theta, given), torch.where(usable, int(Status.OK), found.status)
 
@@ -86,8 +85,7 @@ def _affine_start(evidence: Evidence, given: Tensor | None, generator: torch.Gen
     nine = torch.cat([x / s[:, None, None] for x, s in zip(evidence.views, scale / scale.mean(0), strict=True)], dim=-1)
     size = scale.mean(0)
     present = data.weights > 0
-    home = generator.device if generator is not None else nine.device
-    draws = torch.rand(len(nine), SAMPLES, nine.shape[1], generator=generator, device=home).to(nine)
+    draws = uniform(len(nine), SAMPLES, nine.shape[1], generator=generator, device=nine.device)
     order = (draws + 2.0 * ~present[:, None]).argsort(-1)[..., :SAMPLE]
     noise = torch.zeros_like(size) if given is None else given * size
 
@@ -164,7 +162,7 @@ def _identity(theta: Tensor) -> Tensor:
     return torch.eye(4, dtype=theta.dtype, device=theta.device).flatten().repeat(3) / 2
 
 
-def _status(evidence: Evidence, state: Velocities, worst: Tensor, undetermined: Tensor, failed: Tensor, affine: bool) -> Tensor:
+def _status(evidence: Evidence, state: Velocities, worst: Tensor, undetermined: Tensor, found: Tensor, affine: bool) -> Tensor:
     present = (evidence.data.weights > 0).sum(-1)
     still = (state.labels == STATIC).sum(-1)
     moving = (state.labels != OUTLIER).sum(-1) - still
@@ -173,7 +171,7 @@ def _status(evidence: Evidence, state: Velocities, worst: Tensor, undetermined: 
     status = torch.where(worst > AMBIGUOUS, int(Status.AMBIGUOUS), torch.zeros_like(present))
     status = torch.where(accident, int(Status.NO_CONSENSUS), status)
     status = torch.where(undetermined & ~accident, int(Status.DEGENERATE), status)
-    status = torch.where(failed != Status.OK, failed.to(status), status)
+    status = torch.where(found != Status.OK, found.to(status), status)
     return torch.where(present < MINIMAL[affine], int(Status.TOO_FEW), status)
 
 

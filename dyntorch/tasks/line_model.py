@@ -13,7 +13,7 @@ from dyntorch.invariants.agreement import point_error, static_residual
 from dyntorch.invariants.translating_lines_matrix import TranslatingLinesMatrix
 from dyntorch.matches import Matches
 from dyntorch.normalize import Normalization, denormalize_motion
-from dyntorch.primitives import Line
+from dyntorch.primitives import Line, direction
 from dyntorch.residual import multilinear
 from dyntorch.tasks.alignment import MOVING, OUTLIER, STATIC
 from dyntorch.tasks.labelling import CHI_SQUARE
@@ -91,14 +91,14 @@ def as_points(views: tuple[Tensor, ...], weights: Tensor) -> tuple[Tensor, ...]:
 
 
 def _two_points(line: Tensor, present: Tensor) -> Tensor:
-    direction = normalize(-line[..., [2, 4, 5]], dim=-1)
+    along = normalize(direction(line), dim=-1)
     foot = Line().points(line)[..., 0, :]
     share = (present / present.sum(-1, keepdim=True).clamp(min=1.0))[..., None]
     centre = (share * foot).sum(-2, keepdim=True)
-    nearest = foot + direction * (direction * (centre - foot)).sum(-1, keepdim=True)
+    nearest = foot + along * (along * (centre - foot)).sum(-1, keepdim=True)
     size = ((nearest - centre).square() * share).sum((-2, -1)).sqrt()[:, None, None]
     size = torch.where(size > 0, size, 1.0)
-    return torch.stack([nearest - size / 2 * direction, nearest + size / 2 * direction], dim=-2)
+    return torch.stack([nearest - size / 2 * along, nearest + size / 2 * along], dim=-2)
 
 
 def settle(lines: Lines, theta: Tensor, sigma: Tensor, *, estimate: bool, plain: bool) -> tuple[Tensor, Tensor, Tensor]:

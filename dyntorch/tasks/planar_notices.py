@@ -11,7 +11,7 @@ from dyntorch.fitting import fit_matches
 from dyntorch.invariants.agreement import static_residual
 from dyntorch.invariants.homography_tensor import HomographyTensor
 from dyntorch.matches import Matches
-from dyntorch.solution import FAILED
+from dyntorch.solution import failed
 from dyntorch.tasks.alignment import MOVING, OUTLIER, Notice, NoticeCode, notices
 from dyntorch.tasks.labelling import CHI_SQUARE, Evidence, Labelled
 
@@ -31,9 +31,7 @@ LINES, FEWEST = 4, 16
 def planar_notices(evidence: Evidence, best: Labelled, status: Tensor, batch: tuple[int, ...]) -> tuple[Notice, ...]:
     """All notices on a flat batch of problems with final labels, in the order of the problems."""
     data, sigma = evidence.data, best.sigma
-    solved = torch.ones_like(status, dtype=torch.bool)
-    for state in FAILED:
-        solved = solved & (status != state)
+    solved = ~failed(status)
     moving = best.labels == MOVING
     count = moving.sum(-1)
     found: list[Notice] = []

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from dyntorch.algebra.rigid import rigid_alignment
 from dyntorch.blocks import map_blocks
+from dyntorch.sampling import uniform
 from dyntorch.tasks.labelling import CHI_SQUARE
 from dyntorch.tasks.rigid import Sightings, combinations, descend, normal_equations, squares
 
@@ -69,9 +70,9 @@ def search(
         floor: least noise that is believed.
     """
     b, n = data.weights.shape
-    draws = torch.rand(b, STATIC_STARTS + MOVING_STARTS, n, generator=generator, dtype=data.x1.dtype, device=None)
+    draws = uniform(b, STATIC_STARTS + MOVING_STARTS, n, generator=generator, device=data.x1.device)
     # matches of weight 0 come last, so that they are drawn only where there is nothing else
-    order = (draws.to(data.x1.device) + 2.0 * (data.weights <= 0)[:, None]).argsort(-1)[..., : SAMPLE[data.motion]]
+    order = (draws + 2.0 * (data.weights <= 0)[:, None]).argsort(-1)[..., : SAMPLE[data.motion]]
     known = torch.zeros(b, dtype=data.x1.dtype, device=data.x1.device) if sigma is None else sigma
     flags = torch.zeros(b, n, dtype=torch.bool, device=data.x1.device) if still is None else still
 

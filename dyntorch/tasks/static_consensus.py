@@ -7,6 +7,7 @@ from torch import Tensor
 
 from dyntorch.algebra.homogeneous import apply, homogeneous
 from dyntorch.blocks import map_blocks
+from dyntorch.sampling import uniform
 
 BLOCK = 1 << 19
 """Numbers in the largest temporary of one block of the batch (4 MB)."""
@@ -41,11 +42,10 @@ def static_consensus(
     """
     b, n, d = views[0].shape
     device = views[0].device
-    home = generator.device if generator is not None else device
-    shuffled = (torch.rand(b, n, generator=generator, device=home).to(device) + 2.0 * ~pool).argsort(dim=-1)
+    shuffled = (uniform(b, n, generator=generator, device=device) + 2.0 * ~pool).argsort(dim=-1)
     count = pool.sum(-1)
     # distinct places: draw from ever fewer, and step over those already taken
-    draws = torch.rand(b, samples, d + 2, generator=generator, device=home).to(device)
+    draws = uniform(b, samples, d + 2, generator=generator, device=device)
     taken: list[Tensor] = []
     for k in range(d + 2):
         place = (draws[..., k] * (count - k).clamp(min=1)[:, None]).long()
