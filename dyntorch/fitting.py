@@ -122,12 +122,7 @@ def _solve(
     norm = normalization(invariant, views, weights) if normalize else _identity(invariant, views)
     moved = norm.apply(invariant, views)
     basis, status, uncertainty = _null(invariant, norm.primitives, moved, weights, static)
-    tensor = basis.unflatten(-1, tuple(p.width for p in invariant.primitives))
-    lead = basis.ndim - 1
-    tensor = tensor.permute(*range(lead), *(lead + v for v in invariant.axes()))
-    if invariant.nullity == 1:
-        tensor = tensor.squeeze(lead - 1)
-    tensor = invariant.normalized(norm.transforms).constrain(tensor)
+    tensor = invariant.normalized(norm.transforms).constrain(invariant.tensor_of(basis))
     if invariant.copies is not None:
         status, uncertainty = status.amax(-1), uncertainty.amax(-1)
     zero = failed(status)[(..., *([None] * (tensor.ndim - status.ndim)))]

@@ -57,15 +57,10 @@ class Bundle:
 
     def constrained(self, basis: Tensor) -> Tensor:
         """The tensors of the motions that tensors ``(b, c, K, a, D)`` decompose into; where there is none, the tensors."""
-        inv, axes = self.invariant, self.invariant.axes()
-        tensor = basis.transpose(1, 2).unflatten(-1, [p.width for p in self.primitives])
-        tensor = tensor.permute(0, 1, 2, 3, *(4 + v for v in axes))
-        tensor = tensor.squeeze(3) if inv.nullity == 1 else tensor
-        motion = inv.decompose(tensor if inv.copies else tensor.squeeze(2))
+        inv, own = self.invariant, basis.transpose(1, 2)
+        motion = inv.decompose(inv.tensor_of(own if inv.copies else own[:, :, 0]))
         made = inv.compose(*motion) if isinstance(motion, tuple) else inv.compose(motion)
-        lead = made.ndim - len(axes)
-        made = made.permute(*range(lead), *(lead + axes.index(v) for v in range(len(axes)))).flatten(lead)
-        made = made.reshape(basis.transpose(1, 2).shape).transpose(1, 2)
+        made = inv.basis_of(made).reshape(own.shape).transpose(1, 2)
         sound = made.isfinite().all(-1, keepdim=True) & (made.abs().amax(-1, keepdim=True) > 0)
         return torch.where(sound.all(-2, keepdim=True).all(1, keepdim=True), made, basis)
 

@@ -128,6 +128,20 @@ class Invariant:
         """Which view each axis of the tensor belongs to."""
         return self.layout if self.layout is not None else tuple(range(len(self.primitives)))
 
+    def tensor_of(self, basis: Tensor) -> Tensor:
+        """The tensor of a null space ``(*batch, nullity, width)``, whose columns are in the order of the views."""
+        tensor = basis.unflatten(-1, tuple(p.width for p in self.primitives))
+        lead = basis.ndim - 1
+        tensor = tensor.permute(*range(lead), *(lead + v for v in self.axes()))
+        return tensor.squeeze(lead - 1) if self.nullity == 1 else tensor
+
+    def basis_of(self, tensor: Tensor) -> Tensor:
+        """The inverse of :meth:`tensor_of`: ``(*batch, nullity, width)``."""
+        axes = self.axes()
+        lead = tensor.ndim - len(axes)
+        basis = tensor.permute(*range(lead), *(lead + axes.index(v) for v in range(len(axes)))).flatten(lead)
+        return basis.unsqueeze(-2) if self.nullity == 1 else basis
+
     @on_class
     def width(self) -> int:
         """Columns of the estimation matrix."""

@@ -50,7 +50,7 @@ def matches(invariant: Invariant, views: Sequence[Tensor], weights: Tensor | Non
         ValueError: another number of views, shapes that do not agree, mixed dtypes or devices, negative weights, or ``static``
             for an invariant that knows no labelled static matches.
     """
-    _check(invariant, views)
+    check_views(invariant, views)
     first = views[0]
     axis = invariant.primitives[0].match_axis(first)
     batch, n = tuple(first.shape[:axis]), int(first.shape[axis])
@@ -85,7 +85,8 @@ def _labels(label: Tensor | None, home: torch.device) -> Tensor | None:
     return None if label is None else label.to(home).bool()
 
 
-def _check(invariant: Invariant, views: Sequence[Tensor]) -> None:
+def check_views(invariant: Invariant, views: Sequence[Tensor]) -> None:
+    """Raise a ``ValueError`` for another number of views, shapes that do not agree, mixed dtypes or devices."""
     if len(views) != len(invariant.primitives):
         raise ValueError(f"{invariant!r} takes matches in {len(invariant.primitives)} views, got {len(views)}")
     leading: list[tuple[int, ...]] = []

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.invariant import Invariant, as_invariant
+from dyntorch.matches import check_views
 
 SINGULAR = 1e-14  # squared gradient, in normalized units, added where value and gradient vanish together (static points)
 LETTERS = "abcdefgh"
@@ -25,7 +26,7 @@ def algebraic(invariant: Invariant | type[Invariant], tensor: Tensor, *views: Te
         ``(*batch, n)``.
 
     Raises:
-        ValueError: an invariant whose matches give several rows.
+        ValueError: an invariant whose matches give several rows; shapes, dtypes or devices that do not fit.
 
     Example:
         >>> import torch, dyntorch as dyn
@@ -33,7 +34,9 @@ def algebraic(invariant: Invariant | type[Invariant], tensor: Tensor, *views: Te
         >>> algebraic(dyn.FundamentalMatrix, F, torch.tensor([[0.0, 1.0]]), torch.tensor([[5.0, 3.0]])).tolist()
         [-2.0]
     """
-    return _form(as_invariant(invariant), tensor, views)[0]
+    invariant = as_invariant(invariant)
+    _check(invariant, tensor, views)
+    return _form(invariant, tensor, views)[0]
 
 
 def sampson(invariant: Invariant | type[Invariant], tensor: Tensor, *views: Tensor) -> Tensor:
@@ -56,7 +59,7 @@ def sampson(invariant: Invariant | type[Invariant], tensor: Tensor, *views: Tens
         ``(*batch, n)`` distances, not negative, in the unit of the measurements.
 
     Raises:
-        ValueError: shapes that do not fit.
+        ValueError: shapes, dtypes or devices that do not fit.
 
     Source: Sampson 1982; Hartley and Zisserman, section 11.4.
 
@@ -67,13 +70,24 @@ def sampson(invariant: Invariant | type[Invariant], tensor: Tensor, *views: Tens
         1.4142
     """
     invariant = as_invariant(invariant)
-    if len(views) != len(invariant.primitives):
-        raise ValueError(f"{invariant!r} takes {len(invariant.primitives)} views, got {len(views)}")
-    ones = tuple(torch.ones(tensor.shape[:1] * 0, dtype=tensor.dtype, device=tensor.device) for _ in views)
+    _check(invariant, tensor, views)
+    ones = (torch.ones((), dtype=tensor.dtype, device=tensor.device),) * len(views)
     if invariant.codim == 1 and invariant.rows() == 1:
         return multilinear(invariant, tensor, views, ones).abs()
     motion = invariant.decompose(tensor)
     return distance(invariant, motion if isinstance(motion, tuple) else (motion,), views, ones)
+
+
+def _check(invariant: Invariant, tensor: Tensor, views: Sequence[Tensor]) -> None:
+    check_views(invariant, views)
+    shape = (invariant.nullity,) * (invariant.nullity > 1) + invariant.shape()
+    if not isinstance(tensor, Tensor) or tuple(tensor.shape[-len(shape) :]) != shape:
+        given = tuple(tensor.shape) if isinstance(tensor, Tensor) else type(tensor).__name__
+        raise ValueError(f"tensor of {invariant!r} must be (*batch, {', '.join(map(str, shape))}), got {given}")
+    if (tensor.dtype, tensor.device) != (views[0].dtype, views[0].device):
+        raise ValueError(
+            f"tensor is {tensor.dtype} on {tensor.device}, the views {views[0].dtype} on {views[0].device}; use .to(views[0])"
+        )
 
 
 def distance(invariant: Invariant, motion: tuple[Tensor, ...], views: Sequence[Tensor], scales: tuple[Tensor, ...]) -> Tensor:

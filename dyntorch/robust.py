@@ -150,12 +150,7 @@ def _within(data: Matches, distance: Tensor, cut: Tensor) -> Tensor:
 def _solution(search: Search, found: Found) -> Solution:
     """The tensors found, as a solution in the coordinates of the search."""
     invariant, norm, data = search.invariant, search.norm, search.data
-    tensor = found.basis if invariant.copies else found.basis[:, 0]
-    tensor = tensor.unflatten(-1, tuple(p.width for p in invariant.primitives))
-    lead = tensor.ndim - len(invariant.primitives)
-    tensor = tensor.permute(*range(lead), *(lead + v for v in invariant.axes()))
-    if invariant.nullity == 1:
-        tensor = tensor.squeeze(lead - 1)
+    tensor = invariant.tensor_of(found.basis if invariant.copies else found.basis[:, 0])
     tensor = invariant.normalized(norm.transforms).constrain(tensor)
     status = torch.full(tensor.shape[:1], int(Status.OK), device=tensor.device)
     back = data.back(denormalize(invariant, tensor, norm.actions))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from functools import cached_property
 
@@ -112,6 +112,19 @@ class Solution:
             return self.refined
         parts = self.invariant.normalized(self.normalization.transforms).decompose(self.normalized)
         return parts if isinstance(parts, tuple) else (parts,)
+
+    def back(self, data: Matches) -> Solution:
+        """This solution of flat float64 problems in the batch, dtype and device of the caller's matches."""
+        return replace(
+            self,
+            tensor=data.back(self.tensor),
+            status=data.back(self.status),
+            uncertainty=data.back(self.uncertainty),
+            inliers=None if self.inliers is None else data.back(self.inliers),
+            sigma=None if self.sigma is None else data.back(self.sigma),
+            covariance=None if self.covariance is None else data.back(self.covariance),
+            matches=data,
+        )
 
     def check(self) -> Solution:
         """Raise where any problem failed.

@@ -110,9 +110,7 @@ class Search:
     def evidence(self, tensor: Tensor, cut: Tensor) -> Tensor:
         """Evidence ``(b,)``, see :class:`Found`, of normalized tensors as a solution holds them, with another threshold."""
         inv = self.invariant
-        lead = tensor.ndim - len(inv.axes())
-        views = tensor.permute(*range(lead), *(lead + inv.axes().index(v) for v in range(len(inv.primitives)))).flatten(lead)
-        views = views if inv.nullity > 1 else views[..., None, :]
+        tensors = inv.basis_of(tensor)
         everyone = torch.arange(len(cut), device=cut.device)
 
         def block(basis: Tensor, cut: Tensor, *rest: Tensor) -> Tensor:
@@ -120,7 +118,7 @@ class Search:
             square = work.distances(basis[:, :, None])[0][:, 0]
             return judge(work, basis[:, :, None], square, cut.square())[0]
 
-        return self._map(block, everyone, views if inv.copies else views[:, None], cut)
+        return self._map(block, everyone, tensors if inv.copies else tensors[:, None], cut)
 
     def _solve(self, where: Tensor, cut: Tensor, count: int) -> Found:
         chosen = self.weights[where, None] if count == 1 else self._samples(where, count)

@@ -50,17 +50,7 @@ def align_join(data: Matches, threshold: float | None, model: str, generator: to
     evidence = Evidence.of(JoinTensor(), data)
     best = _search(evidence, threshold, model, generator)
     solution, labels, worst = _solved(evidence, best)
-    assert solution.sigma is not None and solution.covariance is not None
-    outcome = replace(
-        solution,
-        tensor=data.back(solution.tensor),
-        status=data.back(solution.status),
-        uncertainty=data.back(solution.uncertainty),
-        inliers=data.back(labels != OUTLIER),
-        sigma=data.back(solution.sigma),
-        covariance=data.back(solution.covariance),
-        matches=data,
-    )
+    outcome = replace(solution, inliers=labels != OUTLIER).back(data)
     A, B = outcome.motion
     assert outcome.sigma is not None and outcome.covariance is not None
     return Alignment(

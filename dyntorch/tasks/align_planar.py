@@ -112,17 +112,7 @@ def align_planar(
 def _align(data: Matches, threshold: float | None, generator: torch.Generator | None) -> Alignment:
     evidence = Evidence.of(HomographyTensor(), data)
     solution, best = _solved(evidence, _search(evidence, threshold, generator))
-    assert solution.sigma is not None and solution.covariance is not None and solution.inliers is not None
-    outcome = replace(
-        solution,
-        tensor=data.back(solution.tensor),
-        status=data.back(solution.status),
-        uncertainty=data.back(solution.uncertainty),
-        inliers=data.back(solution.inliers),
-        sigma=data.back(solution.sigma),
-        covariance=data.back(solution.covariance),
-        matches=data,
-    )
+    outcome = solution.back(data)
     A, B = outcome.motion
     assert outcome.sigma is not None and outcome.covariance is not None
     return Alignment(
