@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -58,7 +59,8 @@ def matches(invariant: Invariant, views: Sequence[Tensor], weights: Tensor | Non
         raise ValueError(f"{invariant!r} has no rows for labelled static matches; leave out static=")
     # a device without float64 lends its data to the CPU and gets the result back
     home = torch.device("cpu") if first.device.type == "mps" else first.device
-    flat = [x.to(home).to(torch.float64).reshape(-1, *x.shape[axis:]) if batch else x.to(home, torch.float64)[None] for x in views]
+    # not reshape(-1): without matches any batch would do
+    flat = [x.to(home, torch.float64).reshape(math.prod(batch), *x.shape[axis:]) for x in views]
     weight = _option("weights", weights, batch, n, first)
     weight = torch.ones(flat[0].shape[:2], dtype=torch.float64, device=home) if weight is None else weight.to(home, torch.float64)
     if bool((weight < 0).any()) if weight.device.type == "cpu" else False:
@@ -117,6 +119,6 @@ def _option(name: str, value: Tensor | None, batch: tuple[int, ...], n: int, lik
     if value.device != like.device:
         raise ValueError(f"{name} is on {value.device}, the matches on {like.device}; use .to(device)")
     try:
-        return value.expand(*batch, n).reshape(-1, n) if batch else value.expand(1, n)
+        return value.expand(*batch, n).reshape(math.prod(batch), n) if batch else value.expand(1, n)
     except RuntimeError:
         raise ValueError(f"{name} must be (*batch, n) = {(*batch, n)}, got {tuple(value.shape)}") from None

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from threading import Lock
 
 import torch
 from torch import Tensor
 
 from dyntorch.blocks import map_blocks
+from dyntorch.forward import jacobian
 from dyntorch.invariant import Invariant
 from dyntorch.matches import Matches, matches
 from dyntorch.normalize import Normalization, denormalize, denormalize_motion
@@ -20,8 +20,6 @@ ITERATIONS = 30
 CONVERGED = 1e-9  # relative decrease of the cost
 BLOCK = 1 << 18
 """Entries of the Jacobian per block of the batch: larger ones leave the cache, smaller ones pay for the calls."""
-FORWARD = Lock()
-"""Forward mode differentiates in one thread at a time: the level of its dual numbers belongs to the whole process."""
 
 
 @dataclass(frozen=True)
@@ -69,11 +67,11 @@ class Problem:
         """Unweighted residuals of matches that may move, and their derivative."""
         empty = tuple(x[:0] for x in views), tuple(scale[:0] for scale in self.scales)
         if self.invariant.whitened(self.parts(theta[:0]), *empty) is not None:
-            shared, slope = _jacobian(lambda t: _flat(self.invariant.shared(self.parts(t))), theta)
+            shared, slope = jacobian(lambda t: _flat(self.invariant.shared(self.parts(t))), theta)
             value, derivative = self._by_match(self.invariant.whitened_shared, shared, views)
             return value, slope @ derivative
         # one row per match: by hand through the tensor, several times cheaper than forward mode through the matches
-        tensor, slope = _jacobian(lambda t: self.invariant.compose(*self.parts(t)).flatten(1), theta)
+        tensor, slope = jacobian(lambda t: self.invariant.compose(*self.parts(t)).flatten(1), theta)
         shape = self.invariant.shape()
         value, derivative = multilinear_derivative(self.invariant, tensor.unflatten(1, shape), views, self.scales)
         return value, slope @ derivative.mT
@@ -120,20 +118,6 @@ class Problem:
 def _flat(parts: tuple[Tensor, ...]) -> Tensor:
     """All entries of a motion, ``(b, p)``."""
     return torch.cat([part.flatten(1) for part in parts], dim=-1)
-
-
-def _jacobian(function: Callable[[Tensor], Tensor], theta: Tensor) -> tuple[Tensor, Tensor]:
-    """Value ``(b, rows)`` and transposed Jacobian ``(b, p, rows)`` by one vectorized forward-mode pass over the parameters."""
-    count = theta.shape[-1]
-    tangents = torch.eye(count, dtype=theta.dtype, device=theta.device)[:, None, :].expand(count, *theta.shape)
-
-    def along(tangent: Tensor) -> tuple[Tensor, Tensor]:
-        value, column = torch.func.jvp(function, (theta,), (tangent,))[:2]
-        return value, column
-
-    with FORWARD:
-        values, columns = torch.func.vmap(along)(tangents)
-    return values[0], columns.transpose(0, 1)
 
 
 def refine(
@@ -326,12 +310,13 @@ def _covariance(
     def moved(t: Tensor) -> Tensor:
         return _flat(denormalize_motion(invariant, problem.parts(t), frames))
 
-    _, derivative = _jacobian(moved, theta)
+    _, derivative = jacobian(moved, theta)
     spread = derivative.mT @ root
     scale = sigma * weights.amax(-1).sqrt()
-    return (spread @ spread.mT) * torch.where(scale.isfinite(), scale, torch.ones_like(scale)).square()[
-        :, None, None
-    ] + torch.where(scale.isfinite(), 0.0, torch.inf)[:, None, None]
+    covariance = (spread @ spread.mT) * scale.square()[:, None, None]
+    # a motion without a matrix in the coordinates of the matches (singular) is not known at all, like one without spare matches
+    known = scale.isfinite() & covariance.isfinite().flatten(1).all(-1)
+    return torch.where(known[:, None, None], covariance, torch.inf)
 
 
 def _any(part: Tensor) -> Tensor:

@@ -91,9 +91,17 @@ def robust_fit(
         data = matches(invariant, views, weights)
         _check(invariant, data, starts)
         cut = None if threshold is None else _threshold(threshold, data)
+        if not len(data.weights):
+            return _empty(fit_matches(invariant, data))
         search = Search(invariant, data, generator)
         limit = search.scale() if cut is None else cut
         return _finish(search, search.run(limit, starts), limit, ROUNDS if polish else (), estimate=cut is None)
+
+
+def _empty(solution: Solution) -> Solution:
+    """The robust fit of no problem."""
+    data = solution.matches
+    return replace(solution, inliers=data.back(data.weights > 0), sigma=data.back(data.weights.new_zeros(0)))
 
 
 def _check(invariant: Invariant, data: Matches, starts: Sequence[int]) -> None:
@@ -110,7 +118,7 @@ def _threshold(threshold: float | Tensor, data: Matches) -> Tensor:
         value = value.expand(data.batch).reshape(-1)
     except RuntimeError:
         raise ValueError(f"threshold must be a number or (*batch,) = {data.batch}, got {tuple(value.shape)}") from None
-    if not bool((value > 0).all()):
+    if not bool(((value > 0) & value.isfinite()).all()):
         raise ValueError(f"threshold must be a distance > 0 in the unit of the matches, got {threshold}; None estimates it")
     return value
 
@@ -218,13 +226,14 @@ def _judged(solution: Solution, evidence: Tensor, degenerate: Tensor, inliers: T
     status = torch.where(degenerate, int(Status.DEGENERATE), status)
     few = (data.weights > 0).sum(-1) < invariant.minimal()
     status = torch.where(few, int(Status.TOO_FEW), status)
-    good = ~failed(status)
+    good, covariance = ~failed(status), solution.covariance
     return replace(
         solution,
         tensor=_where(data.back(good), solution.tensor, torch.zeros_like(solution.tensor)),
         normalized=_where(good, solution.normalized, torch.zeros_like(solution.normalized)),
         status=data.back(status),
         uncertainty=linear.uncertainty,
+        covariance=None if covariance is None else _where(data.back(good), covariance, torch.zeros_like(covariance)),
         inliers=data.back(inliers & good[:, None]),
         sigma=data.back(torch.where(good, sigma, torch.zeros_like(sigma))),
     )

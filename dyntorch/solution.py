@@ -28,8 +28,6 @@ class Status(IntEnum):
     """Other tensors fit the matches as well as this one, within the noise.  The tensor is one of them."""
     NO_CONSENSUS = 4
     """Robust estimation found no tensor that enough matches agree with.  The tensor is the best one found."""
-    NOT_CONVERGED = 5
-    """The solver's own certificate failed (devices on which it may not look at the numbers).  The tensor is its last iterate."""
 
 
 REMEDY = {
@@ -37,7 +35,6 @@ REMEDY = {
     Status.DEGENERATE: "add matches in general position (other trajectories, other directions of motion), or use a smaller model",
     Status.AMBIGUOUS: "add matches that differ more, lower the noise, or use a model with fewer degrees of freedom",
     Status.NO_CONSENSUS: "raise the threshold, or give matches of which more belong to the model",
-    Status.NOT_CONVERGED: "solve on the CPU",
 }
 
 

@@ -79,8 +79,9 @@ class Search:
             starts: numbers of starts, one after the other.
         """
         found = self._solve(torch.arange(len(cut), device=cut.device), cut, starts[0])
+        enough = (self.weights > 0).sum(-1) >= self.invariant.minimal()
         for count in starts[1:]:
-            left = found.doubt.nonzero()[:, 0]
+            left = (found.doubt & enough).nonzero()[:, 0]
             if not len(left):
                 break
             new = self._solve(left, cut, count)

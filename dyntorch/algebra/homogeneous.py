@@ -43,12 +43,15 @@ def inhomogeneous(p: Tensor) -> Tensor:
         >>> bool(inhomogeneous(torch.tensor([4.0, 6.0, 0.0])).isfinite().all())
         True
     """
+    return p[..., :-1] / finite_depth(p)
+
+
+def finite_depth(p: Tensor) -> Tensor:
+    """The last coordinate ``(..., 1)`` of homogeneous points; at infinity the stand-in of :func:`inhomogeneous`, a constant."""
     w = p[..., -1:]
-    with torch.no_grad():
-        floor = torch.finfo(p.dtype).eps * p.abs().amax(dim=-1, keepdim=True)
-        far = w.abs() <= floor
-        limit = torch.where(floor > 0, torch.copysign(floor, w), torch.ones_like(floor))
-    return p[..., :-1] / torch.where(far, limit, w)
+    floor = torch.finfo(p.dtype).eps * p.detach().abs().amax(dim=-1, keepdim=True)
+    limit = torch.where(floor > 0, torch.copysign(floor, w.detach()), 1.0)
+    return torch.where(w.abs() <= floor, limit, w)
 
 
 def apply(collineation: Tensor, points: Tensor) -> Tensor:

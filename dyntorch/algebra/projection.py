@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.algebra.extensors import compound
-from dyntorch.algebra.homogeneous import inhomogeneous
+from dyntorch.algebra.homogeneous import finite_depth
 
 
 def adjugate(matrix: Tensor) -> Tensor:
@@ -48,12 +48,22 @@ def project(matrix: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
         >>> image.tolist(), jacobian.tolist()
         ([[3.0]], [[[0.5, -1.5]]])
     """
-    p = points @ matrix[..., :-1].mT + matrix[..., None, :, -1]
-    y, w = inhomogeneous(p), p[..., -1:]
-    # the same finite stand-in at infinity as in inhomogeneous()
-    floor = torch.finfo(p.dtype).eps * p.detach().abs().amax(-1, keepdim=True)
-    w = torch.where(w.abs() > floor, w, torch.where(floor > 0, torch.copysign(floor, w.detach()), 1.0))
-    return y, (matrix[..., None, :-1, :-1] - y[..., :, None] * matrix[..., None, -1:, :-1]) / w[..., None]
+    return dehomogenized(points @ matrix[..., :-1].mT + matrix[..., None, :, -1], matrix[..., None, :, :-1])
+
+
+def dehomogenized(p: Tensor, derivative: Tensor) -> tuple[Tensor, Tensor]:
+    r"""Points :math:`\pi(p)` and the derivative of their coordinates.
+
+    Args:
+        p: ``(*batch, n, e + 1)`` homogeneous points of any scale.
+        derivative: ``(*batch, n, e + 1, d)`` of p, at the same scale; multiples of p in it do not matter.
+
+    Returns:
+        ``(*batch, n, e)`` and ``(*batch, n, e, d)``.
+    """
+    depth = finite_depth(p)
+    y = p[..., :-1] / depth
+    return y, (derivative[..., :-1, :] - y[..., :, None] * derivative[..., -1:, :]) / depth[..., None]
 
 
 def back_project(matrix: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from dyntorch.algebra.homogeneous import inhomogeneous
+from dyntorch.algebra.projection import dehomogenized
 from dyntorch.residual import whiten, whiten_entries
 
 
@@ -82,13 +82,7 @@ def point_error(image: Tensor, derivative: Tensor, x: Tensor) -> tuple[Tensor, T
     Returns:
         ``(*batch, n, d)`` and ``(*batch, n, d, d)``.
     """
-    d = x.shape[-1]
-    y = inhomogeneous(image)
-    floor = torch.finfo(image.dtype).eps * image.detach().abs().amax(dim=-1, keepdim=True)
-    depth = image[..., -1:]
-    # at infinity the same finite stand-in as in inhomogeneous()
-    depth = torch.where(depth.abs() > floor, depth, torch.where(floor > 0, torch.copysign(floor, depth.detach()), 1.0))
-    jacobian = (derivative[..., :d, :d] - y[..., :, None] * derivative[..., d:, :d]) / depth[..., None]
+    y, jacobian = dehomogenized(image, derivative[..., :-1])
     return y - x, jacobian
 
 

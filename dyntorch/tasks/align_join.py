@@ -16,15 +16,13 @@ from dyntorch.matches import Matches
 from dyntorch.robust import robust_fit
 from dyntorch.solution import Solution, Status, failed
 from dyntorch.tasks.alignment import MOVING, OUTLIER, STATIC, Alignment, Notice, NoticeCode, notices
-from dyntorch.tasks.labelling import CHI_SQUARE, ROUGH, SIGMAS, Evidence, Labelled, joined
+from dyntorch.tasks.labelling import CHI_SQUARE, MEDIAN, ROUGH, SIGMAS, Evidence, Labelled, joined
 from dyntorch.tasks.static_consensus import static_consensus
 
 MINIMAL = {"join": 47, "minimal_join": 47}
 FULL = 60  # matches for the join tensor itself, which joins the starts from there on
 SAMPLES = 1000
 """Samples of five matches: 97 % to draw five static ones where they are 20 % of all."""
-MEDIAN = 1.386  # of chi-square with two degrees of freedom
-STATIC_MEDIANS = 3.357, 5.348  # of 4 (what static_consensus divides by) and of 6 (what three views of space have)
 STEPS = 30
 LABELLED = 9
 """Fewest matches where some are labelled static: five determine A and B, and room to tell static from moving."""
@@ -99,7 +97,8 @@ def _from_static(evidence: Evidence, given: Tensor | None, generator: torch.Gene
     theta = torch.cat([part.flatten(1) for part in motion], dim=-1)
     if given is not None:
         return theta, given
-    return theta, (variance * STATIC_MEDIANS[0] / STATIC_MEDIANS[1]).nan_to_num(posinf=1.0).sqrt() / scale
+    # static_consensus divides by the median of 4 conditions; three views of space have 6
+    return theta, (variance * MEDIAN[4] / MEDIAN[6]).nan_to_num(posinf=1.0).sqrt() / scale
 
 
 def _from_tensor(
@@ -127,7 +126,7 @@ def _from_tensor(
     else:
         motion = evidence.problem(torch.zeros_like(data.weights)).parts(theta)
         moving = JoinTensor().whitened(motion, evidence.views, evidence.norm.scales).square().sum(-1)
-        noise = (torch.where(data.weights > 0, moving, torch.nan).nanmedian(dim=-1).values / MEDIAN).sqrt()
+        noise = (torch.where(data.weights > 0, moving, torch.nan).nanmedian(dim=-1).values / MEDIAN[JoinTensor.codim]).sqrt()
     return theta, torch.where(usable & noise.isfinite(), noise, torch.inf)
 
 

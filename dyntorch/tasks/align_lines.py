@@ -13,14 +13,13 @@ from dyntorch.matches import Matches, matches
 from dyntorch.robust import robust_fit
 from dyntorch.solution import Solution, Status, failed
 from dyntorch.tasks.alignment import OUTLIER, STATIC, Alignment, Notice, NoticeCode, notices
-from dyntorch.tasks.labelling import SIGMAS
+from dyntorch.tasks.labelling import MEDIAN, SIGMAS
 from dyntorch.tasks.line_model import Lines, as_points, settle, spread
 
 MINIMAL = TranslatingLinesMatrix.minimal()
 PER_POINT = 9  # matches of lines that one static point gives
 CERTAIN = 45
 """Lines (three times the degrees of freedom) below which noise of unknown size cannot be told from outliers."""
-MEDIAN = 0.4549  # of chi-square with one degree of freedom
 ABOVE = 2.0
 """A singular value counts from so many times the noise on: those that the model lacks reach 1.7, those of 45 lines in general
 position at a noise of a two-hundredth of the scene begin at 2.4 (measured)."""
@@ -161,7 +160,7 @@ def _noise(lines: Lines, theta: Tensor, plain: bool) -> Tensor:
     if plain:
         return (torch.where(present, square, 0.0).sum(-1) / present.sum(-1).clamp(min=1)).sqrt().maximum(lines.floor)
     middle = torch.where(present, square, torch.nan).nanmedian(dim=-1).values.nan_to_num()
-    return 1.5 * (middle / MEDIAN).sqrt().maximum(lines.floor)
+    return 1.5 * (middle / MEDIAN[1]).sqrt().maximum(lines.floor)
 
 
 def _result(

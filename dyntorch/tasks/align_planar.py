@@ -30,7 +30,7 @@ INDETERMINATE = 1e-13
 AMBIGUOUS = 0.5
 """Standard deviation of the worst direction of the motion, of norm 1, above which the motion is not known at all."""
 SINGULAR = 1e-3
-"""Ratio of the singular values of a homography in normalized coordinates below which no camera sees the plane so (usual: above 0.1)."""
+"""Ratio of the singular values of a homography in normalized coordinates (usually above 0.1) that no camera gives a plane."""
 NOISY = 0.05
 """Noise over the extent of the points, above which agreement with a motion is an accident."""
 CONSENSUS = 0.4

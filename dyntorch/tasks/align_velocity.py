@@ -13,14 +13,13 @@ from dyntorch.robust import robust_fit
 from dyntorch.sampling import uniform
 from dyntorch.solution import Status, failed
 from dyntorch.tasks.alignment import OUTLIER, STATIC, Alignment, Notice, NoticeCode, notices
-from dyntorch.tasks.labelling import CHI_SQUARE, SIGMAS, Evidence
+from dyntorch.tasks.labelling import CHI_SQUARE, MEDIAN, SIGMAS, Evidence
 from dyntorch.tasks.velocity_model import DOF, GAUGE, Velocities, information, residuals, settle, world_velocities
 
 MINIMAL = {False: 21, True: 7}
 SAMPLES, SAMPLE = 150, 8
 """Affine samples, one match above the minimum: 40 % outliers leave 1.7 % of such samples clean, 92 % to draw one."""
 HELD = 1e-9  # eigenvalue over the largest: 3e-5 of the size of the data, far below any real noise
-MEDIAN = 2.366  # of chi-square with 3 degrees of freedom
 INDETERMINATE = 1e-13  # information on the worst direction over that on the best: rounding error below it
 AMBIGUOUS, UNCERTAIN = 0.5, 0.05
 """Standard deviation of the worst direction of the maps, of norm 1, above which they are not known at all; or hardly."""
@@ -116,7 +115,7 @@ def _affine_consensus(points: Tensor, weights: Tensor, index: Tensor, sigma: Ten
         middle = ((count - 1) // 2).clamp(min=0)[:, None, None].expand(-1, square.shape[1], 1)
         score = ranked.gather(-1, middle)[..., 0]
         spare = (1 - DOF[True] / (3 * count).clamp(min=22)).clamp(min=0.1)
-        limit = CHI_SQUARE[3] * score.amin(-1) / (MEDIAN * spare)
+        limit = CHI_SQUARE[3] * score.amin(-1) / (MEDIAN[3] * spare)
     else:
         limit = CHI_SQUARE[3] * sigma.square()
         score = (square.minimum(limit[:, None, None]) * present[:, None]).sum(-1)
@@ -155,7 +154,7 @@ def _starting_noise(evidence: Evidence, theta: Tensor, given: Tensor | None) -> 
         return given
     moving, _ = residuals(evidence, theta)
     middle = torch.where(evidence.data.weights > 0, moving, torch.nan).nanmedian(dim=-1).values.nan_to_num()
-    return (middle / MEDIAN).sqrt().maximum(evidence.floor)
+    return (middle / MEDIAN[3]).sqrt().maximum(evidence.floor)
 
 
 def _identity(theta: Tensor) -> Tensor:

@@ -17,6 +17,8 @@ from dyntorch.tasks.alignment import MOVING, OUTLIER, STATIC
 
 CHI_SQUARE = {1: 9.0, 2: 11.829, 3: 14.156, 4: 16.251, 6: 20.062}
 """Quantiles of chi^2 at 99.73 %: what three standard deviations are for one condition, for several."""
+MEDIAN = {1: 0.4549, 2: 1.386, 3: 2.366, 4: 3.357, 6: 5.348}
+"""Medians of chi^2."""
 SIGMAS = 3.0
 """The threshold in standard deviations of the noise."""
 ROUNDS, ESTIMATING = 3, 6

@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from dyntorch.algebra.homogeneous import homogeneous, unit
+from dyntorch.forward import derivatives, jacobian
 from dyntorch.invariants.agreement import point_error, static_residual
 from dyntorch.invariants.translating_lines_matrix import TranslatingLinesMatrix
 from dyntorch.matches import Matches
@@ -64,11 +65,11 @@ class Lines:
         matrix = theta.unflatten(-1, (4, 4))
         parts = []
         for point in self.views[1].unbind(-2):
-            error, jacobian = point_error(homogeneous(point) @ matrix.mT, matrix[:, None], first)
+            error, slope = point_error(homogeneous(point) @ matrix.mT, matrix[:, None], first)
             place = (error * along).sum(-1, keepdim=True) / square
             across = error - place * along
             # isotropic: the noise of the line at this place, and that of the point, averaged over the plane across
-            other = (jacobian.square().sum((-1, -2)) / 3)[..., None]
+            other = (slope.square().sum((-1, -2)) / 3)[..., None]
             variance = s1.square() * ((1 - place).square() + place.square()) + s2.square() * other
             parts.append(across * variance.rsqrt())
         return torch.cat(parts, dim=-1)
@@ -158,25 +159,15 @@ def spread(lines: Lines, theta: Tensor, labels: Tensor) -> tuple[Tensor, Tensor,
         part = denormalize_motion(TranslatingLinesMatrix(), (t.unflatten(-1, (4, 4)),), lines.norm.transforms)[0]
         return unit(part).flatten(1)
 
-    def along(tangent: Tensor) -> Tensor:
-        return torch.func.jvp(measured, (theta,), (tangent,))[1]
-
-    moved = torch.func.vmap(along)(root.movedim(-1, 0)).movedim(0, -1)
-    return values[:, [0, -1]], measured(theta).unflatten(-1, (4, 4)), moved @ moved.mT
+    place, moved = derivatives(measured, theta, root.movedim(-1, 0))
+    return values[:, [0, -1]], place.unflatten(-1, (4, 4)), moved.mT @ moved
 
 
 def _equations(lines: Lines, theta: Tensor, labels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Cost ``(b,)``, gradient ``(b, 16)`` and Gauss-Newton matrix."""
-    tangents = torch.eye(16, dtype=theta.dtype, device=theta.device)[:, None].expand(-1, *theta.shape)
-
-    def along(tangent: Tensor) -> tuple[Tensor, Tensor]:
-        value, column = torch.func.jvp(lambda t: lines.residual(t, labels), (theta,), (tangent,))[:2]
-        return value, column
-
-    values, columns = torch.func.vmap(along)(tangents)
-    value, jacobian = values[0], columns.transpose(0, 1)
+    value, slope = jacobian(lambda t: lines.residual(t, labels), theta)
     cost = value.square().sum(-1)
-    return torch.where(cost.isfinite(), cost, torch.inf), (jacobian @ value[..., None])[..., 0], jacobian @ jacobian.mT
+    return torch.where(cost.isfinite(), cost, torch.inf), (slope @ value[..., None])[..., 0], slope @ slope.mT
 
 
 def _labels(lines: Lines, theta: Tensor, sigma: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ from torch import Tensor
 from dyntorch.algebra.rigid import rigid_alignment
 from dyntorch.blocks import map_blocks
 from dyntorch.sampling import uniform
-from dyntorch.tasks.labelling import CHI_SQUARE
+from dyntorch.tasks.labelling import CHI_SQUARE, MEDIAN
 from dyntorch.tasks.rigid import Sightings, combinations, descend, normal_equations, squares
 
 STATIC_STARTS = 60
@@ -24,7 +24,6 @@ BITS = CHI_SQUARE[2] / 2
 straight line (4) above the limit of chi-square with 2 degrees of freedom."""
 ROUNDS = 4  # of labelling and least squares
 PROBLEMS = 16  # of a batch solved together
-QUANTILE = {2: 1.386, 3: 2.366}  # medians of chi-square
 SEEDS = 512  # velocities tried as the common one
 STANDING = 0.1
 """Least share of the matches that must have one velocity before they are taken for the static background (and at least 3)."""
@@ -141,7 +140,7 @@ def _scales(moving: Tensor, data: Sightings, floor: float) -> Tensor:
     ranked = torch.where(present, moving, torch.inf).sort(-1).values
     middle = ranked.gather(-1, ((count - 1) // 2).clamp(min=0).expand(ranked.shape[:-1])[..., None])[..., 0]
     middle = torch.where(middle.isfinite(), middle, 0.0)
-    return (middle / (QUANTILE[data.conditions] * spare)).sqrt().clamp(min=floor)
+    return (middle / (MEDIAN[data.conditions] * spare)).sqrt().clamp(min=floor)
 
 
 def _score(moving: Tensor, static: Tensor, held: Tensor, data: Sightings, sigma: Tensor) -> Tensor:

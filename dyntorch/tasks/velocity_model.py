@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.algebra.homogeneous import apply, unit
+from dyntorch.forward import derivatives
 from dyntorch.invariants.constant_velocity_tensor import ConstantVelocityTensor
 from dyntorch.normalize import denormalize_motion
 from dyntorch.tasks.alignment import MOVING, OUTLIER, STATIC
@@ -112,13 +113,8 @@ def information(evidence: Evidence, state: Velocities, affine: bool) -> tuple[Te
     least = values.gather(-1, 48 - dof[:, None])[:, 0]
     floor = 1e-12 * values[:, -1:].clamp(min=torch.finfo(values.dtype).tiny)
     root = vectors * torch.where(used, values.clamp(min=floor).rsqrt(), 0.0)[:, None]
-    tangents = root.movedim(-1, 0)
-
-    def along(tangent: Tensor) -> Tensor:
-        return torch.func.jvp(lambda t: _between(evidence, t).flatten(1), (state.theta,), (tangent,))[1]
-
-    spread = torch.func.vmap(along)(tangents).movedim(0, -1)
-    return torch.stack([least, values[:, -1]], dim=-1), _between(evidence, state.theta), spread @ spread.mT
+    motions, spread = derivatives(lambda t: _between(evidence, t).flatten(1), state.theta, root.movedim(-1, 0))
+    return torch.stack([least, values[:, -1]], dim=-1), motions.unflatten(-1, (2, 4, 4)), spread.mT @ spread
 
 
 def world_velocities(evidence: Evidence, theta: Tensor) -> Tensor:

@@ -34,7 +34,6 @@ REASONS = {
     "DEGENERATE": "several motions fit all matches exactly; add matches that move otherwise, or use a model with fewer unknowns",
     "AMBIGUOUS": "other motions fit as well; add matches that differ more, lower the noise, or use a model with fewer unknowns",
     "NO_CONSENSUS": "no motion fits enough of the matches; raise --threshold, or give matches of which more belong to the model",
-    "NOT_CONVERGED": "the solver did not converge; give more matches, or a larger --threshold",
 }
 
 

@@ -85,3 +85,12 @@ def test_a_class_of_numbers_that_is_not_a_tensor_is_named():
         matches(H, views(), torch.ones(4, device="meta"))
     with pytest.raises(ValueError, match=r"view 2 of HomographyTensor: expected \(\*batch, n, \(2,\)\), got \(2,\)"):
         matches(H, (views()[0], torch.zeros(2).double(), views()[2]))
+
+
+@pytest.mark.parametrize("batch", [(), (2,), (2, 0)])
+def test_no_matches_at_all_keep_their_batch(batch):
+    data = matches(H, [torch.zeros(*batch, 0, 2).double()] * 3, torch.zeros(0).double())
+    assert data.views[0].shape == (torch.Size(batch).numel(), 0, 2) and data.back(data.weights).shape == (*batch, 0)
+    if 0 not in batch:
+        with pytest.raises(ValueError, match="needs at least 26 matches, got 0"):
+            dyn.fit(H, *[torch.zeros(*batch, 0, 2).double()] * 3)

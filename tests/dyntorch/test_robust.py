@@ -333,3 +333,42 @@ def test_misuse_is_named() -> None:
         dyn.robust_fit(dyn.HomographyTensor, *views, threshold=1.5, starts=())
     with pytest.raises(ValueError, match="needs at least 26 matches, got 20"):
         dyn.robust_fit(dyn.HomographyTensor, *(x[:20] for x in views), threshold=1.5)
+
+
+@pytest.mark.parametrize("name", list(KNOWN))
+@pytest.mark.parametrize("threshold", [None, 1.0])
+def test_no_problems_give_an_empty_solution(name: str, threshold: float | None) -> None:
+    case = KNOWN[name]
+    views = [x[:0] for x in case.scene(case.minimal, batch=(2,)).views]
+    solution = dyn.robust_fit(case.invariant, *views, threshold=threshold)
+    assert solution.check() is solution and solution.tensor.shape[0] == 0
+    assert solution.inliers is not None and solution.inliers.shape == (0, case.minimal)
+    assert solution.sigma is not None and solution.sigma.shape == (0,)
+
+
+@pytest.mark.parametrize("threshold", [None, 0.1])
+def test_covariance_of_what_fails_is_never_nan(threshold: float | None) -> None:
+    exact = scenes.two_view(30, generator=torch.Generator().manual_seed(1)).views
+    equal = [x[:1].expand_as(x) for x in exact]
+    line = [x[:1] + torch.linspace(0, 9, 30)[:, None].to(x) * (x[1:2] - x[:1]) for x in exact]
+    views = [torch.stack(pair) for pair in zip(equal, line, strict=True)]
+    solution = dyn.robust_fit(dyn.FundamentalMatrix, *views, threshold=threshold, generator=torch.Generator().manual_seed(0))
+    assert (solution.status != Status.OK).all()
+    assert solution.covariance is not None and not solution.covariance.isnan().any()
+    failed = (solution.status == Status.DEGENERATE) | (solution.status == Status.TOO_FEW)
+    assert (solution.covariance[failed] == 0).all()
+
+
+def test_too_few_matches_with_weight_are_not_searched(monkeypatch: pytest.MonkeyPatch) -> None:
+    views = scenes.planar(60, generator=torch.Generator().manual_seed(0)).views
+    counts: list[int] = []
+    solve = Search._solve
+    monkeypatch.setattr(Search, "_solve", lambda self, where, cut, count: counts.append(count) or solve(self, where, cut, count))
+    solution = dyn.robust_fit(dyn.HomographyTensor, *views, threshold=1.0, weights=torch.zeros(60).double())
+    assert int(solution.status) == Status.TOO_FEW and counts == [1]
+
+
+def test_an_infinite_threshold_is_refused() -> None:
+    views = scenes.planar(30, generator=torch.Generator().manual_seed(0)).views
+    with pytest.raises(ValueError, match="threshold must be a distance > 0 .*, got inf"):
+        dyn.robust_fit(dyn.HomographyTensor, *views, threshold=math.inf)
