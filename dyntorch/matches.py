@@ -69,7 +69,8 @@ def matches(invariant: Invariant, views: Sequence[Tensor], weights: Tensor | Non
     if home.type == "cpu" and bool(torch.stack([x.detach().sum() for x in (*flat, weight)]).isfinite().all()):
         # nothing is missing: one sum per view says so, and nothing is copied
         return Matches(tuple(flat), weight, _labels(label, home), batch, first.dtype, first.device)
-    present = weight.isfinite()
+    # an accelerator does not wait for the check of the sign above: there a negative weight is a missing match
+    present = weight.isfinite() & (weight >= 0)
     for x in flat:
         present = present & x.isfinite().flatten(2).all(-1)
     clean = [torch.where(present[(..., *([None] * (x.ndim - 2)))], x, torch.zeros_like(x)) for x in flat]

@@ -23,7 +23,8 @@ class Status(IntEnum):
     TOO_FEW = 1
     """Fewer matches with weight than determine the tensor.  The tensor is zero."""
     DEGENERATE = 2
-    """The matches leave more than the invariant's null space, exactly: several tensors fulfil all of them.  The tensor is zero."""
+    """The matches leave more than the invariant's null space, exactly: several tensors fulfil all of them.  The tensor is zero.  (On
+    accelerators, which never wait to try another solver, also where the solver's own certificate fails.)"""
     AMBIGUOUS = 3
     """Other tensors fit the matches as well as this one, within the noise.  The tensor is one of them."""
     NO_CONSENSUS = 4
@@ -46,6 +47,8 @@ def failed(status: Tensor) -> Tensor:
 @dataclass(frozen=True, eq=False, repr=False)
 class Solution:
     """Result of :func:`dyntorch.fit`, :func:`dyntorch.robust_fit` and :func:`dyntorch.refine`.
+
+    It refers to the matches it was given, without a copy: what is computed on first use (``singular_values``) follows them.
 
     Attributes:
         invariant: what was fitted.

@@ -57,7 +57,7 @@ LAYERS = [
     {"residual"},
     {"invariants"},
     {"solution", "ambiguity", "fitting"},
-    {"refinement"},
+    {"least_squares", "refinement"},
     {"hypotheses", "starts", "robust"},
     {"tasks"},
 ]

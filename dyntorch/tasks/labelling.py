@@ -8,9 +8,10 @@ import torch
 from torch import Tensor
 
 from dyntorch.invariant import Invariant
+from dyntorch.least_squares import Problem
 from dyntorch.matches import Matches
 from dyntorch.normalize import Normalization, normalization, normalize_motion
-from dyntorch.refinement import Problem, refine_matches
+from dyntorch.refinement import refine_matches
 from dyntorch.residual import whiten, whitened
 from dyntorch.solution import Solution
 from dyntorch.tasks.alignment import MOVING, OUTLIER, STATIC

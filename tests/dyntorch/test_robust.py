@@ -335,10 +335,9 @@ def test_misuse_is_named() -> None:
         dyn.robust_fit(dyn.HomographyTensor, *(x[:20] for x in views), threshold=1.5)
 
 
-@pytest.mark.parametrize("name", list(KNOWN))
+@pytest.mark.parametrize("case", KNOWN, ids=repr)
 @pytest.mark.parametrize("threshold", [None, 1.0])
-def test_no_problems_give_an_empty_solution(name: str, threshold: float | None) -> None:
-    case = KNOWN[name]
+def test_no_problems_give_an_empty_solution(case: Case, threshold: float | None) -> None:
     views = [x[:0] for x in case.scene(case.minimal, batch=(2,)).views]
     solution = dyn.robust_fit(case.invariant, *views, threshold=threshold)
     assert solution.check() is solution and solution.tensor.shape[0] == 0
@@ -370,5 +369,5 @@ def test_too_few_matches_with_weight_are_not_searched(monkeypatch: pytest.Monkey
 
 def test_an_infinite_threshold_is_refused() -> None:
     views = scenes.planar(30, generator=torch.Generator().manual_seed(0)).views
-    with pytest.raises(ValueError, match="threshold must be a distance > 0 .*, got inf"):
+    with pytest.raises(ValueError, match=r"threshold must be a distance > 0 .*, got inf"):
         dyn.robust_fit(dyn.HomographyTensor, *views, threshold=math.inf)

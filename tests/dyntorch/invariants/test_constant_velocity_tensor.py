@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from dyntorch.algebra.affine_constant_velocity import affine_constant_velocity
 from dyntorch.algebra.constant_velocity import infinity_planes
 from dyntorch.algebra.homogeneous import apply, homogeneous, unit
 from dyntorch.algebra.projection import adjugate
@@ -428,72 +427,3 @@ def test_adjugate():
         matrix[0] = 0
         expected = torch.linalg.det(matrix)[:, None, None] * torch.eye(n, dtype=torch.float64)
         assert torch.allclose(matrix @ adjugate(matrix), expected, atol=1e-12)
-
-
-def test_affine_mode_from_seven_matches():
-    scene = constant_velocity(7, batch=20, sensors="affine", generator=generator(50))
-    found = affine_constant_velocity(*scene.views)
-    assert found.ok.all() and found.residual.max() < 1e-10
-    x1, x2, x3 = scene.views
-    assert (x2 @ found.M1.mT + x1 @ found.M0.mT + found.t[:, None] - x3).abs().max() < 1e-9
-    linear = [m[..., :3, :3] / m[..., 3:, 3:] for m in scene.motion]
-    assert torch.allclose(found.M1, 2 * linear[2] @ torch.linalg.inv(linear[1]), atol=1e-8)
-    assert torch.allclose(found.M0, -linear[2] @ torch.linalg.inv(linear[0]), atol=1e-8)
-    assert distance(CV.compose(*found.motion), CV.compose(*scene.motion)).max() < 1e-9
-    with pytest.raises(ValueError, match="6 matches"):
-        affine_constant_velocity(*(x[:, :6] for x in scene.views))
-    with pytest.raises(ValueError, match="alike"):
-        affine_constant_velocity(x1, x2, x3[..., :2])
-    with pytest.raises(ValueError, match="weights"):
-        affine_constant_velocity(x1, x2, x3, weights=torch.ones(3))
-
-
-def test_affine_mode_refuses_what_does_not_decide():
-    options = ({"velocities": "planar"}, {"static": 1.0}, {"velocities": "equal"}, {})
-    views = [constant_velocity(20, sensors="affine", generator=generator(51), **o).views for o in options]
-    x1, x2, x3 = (torch.stack(x) for x in zip(*views, strict=True))
-    weights = torch.ones(4, 20)
-    found = affine_constant_velocity(x1, x2, x3, weights)
-    assert found.ok.tolist() == [False, False, False, True]
-    weights[3, 6:] = 0
-    few = affine_constant_velocity(x1, x2, x3, weights)
-    assert not few.ok.any()
-    for result in (found, few):
-        assert all(m.isfinite().all() for m in (*result.motion, result.M1, result.M0, result.t, result.residual))
-    assert (found.M1[0] == 0).all() and (found.motion[0][0] == 0).all()
-
-
-def test_affine_mode_ignores_missing_and_unweighted_matches():
-    scene = constant_velocity(30, sensors="affine", sigma=0.01, generator=generator(52))
-    x1, x2, x3 = (x.clone() for x in scene.views)
-    expected = affine_constant_velocity(x1[4:], x2[4:], x3[4:])
-    x1[0], x2[1], x3[2:4] = float("nan"), float("inf"), 100.0
-    weights = torch.ones(30)
-    weights[2:4] = 0
-    found = affine_constant_velocity(x1, x2, x3, weights)
-    assert torch.allclose(found.M1, expected.M1) and torch.allclose(found.t, expected.t)
-    assert found.residual.isfinite()
-
-
-def test_affine_mode_is_the_least_squares_solution():
-    """It is the factorization: the conditions are the least singular vectors; their residual is the noise."""
-    sigma = 0.01
-    scene = constant_velocity(400, batch=4, sensors="affine", sigma=sigma, generator=generator(53))
-    found = affine_constant_velocity(*scene.views)
-    stacked = torch.cat(scene.views, -1)
-    values = torch.linalg.svdvals(stacked - stacked.mean(-2, keepdim=True))
-    assert torch.allclose(found.residual, (values[..., 6:].square().sum(-1) / 1200).sqrt(), rtol=1e-9)
-    assert (found.residual / sigma - 1).abs().max() < 0.1
-    square = CV().whitened(found.motion, scene.views, ONES).square().sum(-1)
-    assert square.mean().sqrt().item() == pytest.approx(sigma * 3**0.5, rel=0.05)
-
-
-def test_affine_mode_gradient():
-    scene = constant_velocity(9, sensors="affine", sigma=0.05, generator=generator(54))
-
-    def relation(x1, x2, x3):
-        found = affine_constant_velocity(x1, x2, x3)
-        return torch.cat([found.M1, found.M0, found.t[:, None]], dim=-1)
-
-    views = tuple(x.clone().requires_grad_() for x in scene.views)
-    assert torch.autograd.gradcheck(relation, views, atol=1e-5)
