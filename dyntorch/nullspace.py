@@ -127,6 +127,20 @@ def _flat(matrix: Tensor) -> Tensor:
     return matrix.reshape(prod(matrix.shape[:-2]), *matrix.shape[-2:])
 
 
+def _gram(rows: Tensor) -> Tensor:
+    """The Gram; a few columns beyond a multiple of eight, on which MKL is slow, apart (27 columns: 9.7 us instead of 16.1)."""
+    size = rows.shape[-1]
+    even = size - size % 8
+    if not on_host(rows) or even < 16 or size - even not in (1, 2, 3):
+        return rows.mT @ rows
+    head, tail = rows[..., :even], rows[..., even:]
+    gram = rows.new_empty(*rows.shape[:-2], size, size)
+    gram[..., :even, :even] = head.mT @ head
+    gram[..., even:, :] = tail.mT @ rows
+    gram[..., :even, even:] = gram[..., even:, :even].mT
+    return gram
+
+
 def _size(matrix: Tensor) -> int:
     """Problems per block."""
     batch, rows, size = matrix.shape
@@ -181,7 +195,7 @@ class _OfRows(torch.autograd.Function):
                 return fix_signs(_solve_minimal(a, dim)).mT.to(matrix.dtype), none
             if tiny:
                 return fix_signs(_by_svd(a, dim)).mT.to(matrix.dtype), none
-            gram = a.mT @ a
+            gram = _gram(a)
             return fix_signs(_solve_rows(a, gram, dim)).mT.to(matrix.dtype), gram if keep else none
 
         basis, gram = map_blocks(block, matrix, size=_size(matrix))
@@ -196,7 +210,7 @@ class _OfRows(torch.autograd.Function):
 
         def block(matrix: Tensor, gram: Tensor, basis: Tensor, grad: Tensor, result: Tensor) -> Tensor:
             a = matrix.double()
-            scaled, scale, finite = unit_trace(gram if gram.numel() else a.mT @ a)
+            scaled, scale, finite = unit_trace(gram if gram.numel() else _gram(a))
             if not on_host(a) or not bool(finite.all()):
                 a = torch.where(finite[:, None, None], a, 0.0)
             vectors = torch.nan_to_num(basis.double()).mT

@@ -49,8 +49,8 @@ def robust_fit(
     number and p the chance of an inlier (measured on matches whose views are mixed up), the expected number of such finds
     :math:`(n - m) \binom{n}{k} \binom{k}{m} p^{k-m}` is not below 1.
 
-    No gradient passes; refit with ``weights=solution.inliers.to(x.dtype)`` for one.  On the CPU the result depends, to rounding, on nothing
-    but the arguments and the state of the generator.
+    No gradient passes; refit with ``weights=solution.inliers.to(x.dtype)`` for one.  On the CPU the result depends, to
+    rounding, on nothing but the arguments and the state of the generator.
 
     Args:
         invariant: an invariant class such as ``dyntorch.HomographyTensor``, or an instance of a family.

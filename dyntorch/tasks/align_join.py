@@ -16,7 +16,7 @@ from dyntorch.matches import Matches
 from dyntorch.robust import robust_fit
 from dyntorch.solution import Solution, Status, failed
 from dyntorch.tasks.alignment import MOVING, OUTLIER, STATIC, Alignment, Notice, NoticeCode, notices
-from dyntorch.tasks.labelling import CHI_SQUARE, MEDIAN, ROUGH, SIGMAS, Evidence, Labelled, joined
+from dyntorch.tasks.labelling import CHI_SQUARE, MEDIAN, NOISY, ROUGH, SIGMAS, Evidence, Labelled, joined
 from dyntorch.tasks.static_consensus import static_consensus
 
 MINIMAL = {"join": 47, "minimal_join": 47}
@@ -137,7 +137,7 @@ def _solved(evidence: Evidence, best: Labelled) -> tuple[Solution, Tensor, Tenso
     values, spread = evidence.information(theta, best.labels)
     labels = evidence.labels(theta, best.sigma, spread)
     worst = best.sigma * values[:, 0].clamp(min=torch.finfo(values.dtype).tiny).rsqrt() * torch.stack(evidence.norm.scales).amax(0)
-    status = _status(evidence, labels, worst, values[:, 0] <= INDETERMINATE * values[:, -1])
+    status = _status(evidence, replace(best, labels=labels), worst, values[:, 0] <= INDETERMINATE * values[:, -1])
     none = failed(status)
     labels = torch.where(none[:, None], OUTLIER, labels)
     assert refined.sigma is not None and refined.covariance is not None
@@ -154,12 +154,13 @@ def _solved(evidence: Evidence, best: Labelled) -> tuple[Solution, Tensor, Tenso
     return solution, labels, worst
 
 
-def _status(evidence: Evidence, labels: Tensor, worst: Tensor, undetermined: Tensor) -> Tensor:
+def _status(evidence: Evidence, best: Labelled, worst: Tensor, undetermined: Tensor) -> Tensor:
     usable = evidence.data.weights > 0
     present = usable.sum(-1)
     known = torch.zeros_like(present) if evidence.data.static is None else (usable & evidence.data.static).sum(-1)
-    still, moving = (labels == STATIC).sum(-1), (labels == MOVING).sum(-1)
+    still, moving = (best.labels == STATIC).sum(-1), (best.labels == MOVING).sum(-1)
     accident = (still + moving < CONSENSUS * present) | (6 * still + 2 * moving < JoinTensor.dof + SPARE)
+    accident = accident | (best.sigma * torch.stack(evidence.norm.scales).amax(0) > NOISY)
     status = torch.where(worst > AMBIGUOUS, int(Status.AMBIGUOUS), torch.zeros_like(present))
     status = torch.where(accident, int(Status.NO_CONSENSUS), status)
     status = torch.where(undetermined, int(Status.DEGENERATE), status)

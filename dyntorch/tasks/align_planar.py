@@ -13,7 +13,7 @@ from dyntorch.matches import Matches, matches
 from dyntorch.robust import robust_fit
 from dyntorch.solution import Solution, Status, failed
 from dyntorch.tasks.alignment import MOVING, OUTLIER, STATIC, Alignment
-from dyntorch.tasks.labelling import CHI_SQUARE, ROUGH, SIGMAS, Evidence, Labelled, joined
+from dyntorch.tasks.labelling import CHI_SQUARE, NOISY, ROUGH, SIGMAS, Evidence, Labelled, joined
 from dyntorch.tasks.planar_notices import planar_notices, unverified
 from dyntorch.tasks.static_consensus import static_consensus
 
@@ -31,8 +31,6 @@ AMBIGUOUS = 0.5
 """Standard deviation of the worst direction of the motion, of norm 1, above which the motion is not known at all."""
 SINGULAR = 1e-3
 """Ratio of the singular values of a homography in normalized coordinates (usually above 0.1) that no camera gives a plane."""
-NOISY = 0.05
-"""Noise over the extent of the points, above which agreement with a motion is an accident."""
 CONSENSUS = 0.4
 """Share of inliers below which the best motion may be an accident."""
 UNIFORM, DOUBTFUL = 1.3, 0.7

@@ -10,7 +10,7 @@ from dyntorch.algebra.rigid import rigid_alignment
 from dyntorch.matches import Matches
 from dyntorch.solution import Status, failed
 from dyntorch.tasks.alignment import MOVING, OUTLIER, STATIC, Alignment, Notice, NoticeCode, notices
-from dyntorch.tasks.labelling import CHI_SQUARE, SIGMAS
+from dyntorch.tasks.labelling import CHI_SQUARE, NOISY, SIGMAS
 from dyntorch.tasks.rigid import MOTIONS, Sightings, combinations, squares
 from dyntorch.tasks.rigid_search import Rigid, search
 
@@ -70,7 +70,8 @@ def _result(data: Matches, sightings: Sightings, found: Rigid, centres: list[Ten
     values, covariance = _inverse(found.information, dof)
     worst = found.sigma * values.clamp(min=torch.finfo(values.dtype).tiny).rsqrt()
     top = found.information.diagonal(dim1=-2, dim2=-1).amax(-1)
-    status = _status(labels, sightings.weights, worst, values <= INDETERMINATE * top, dof, MOTIONS[motion])
+    noisy = found.sigma.isfinite() & (found.sigma > NOISY)
+    status = _status(labels, sightings.weights, worst, noisy, values <= INDETERMINATE * top, dof, MOTIONS[motion])
     none = failed(status)
     labels = torch.where(none[:, None], OUTLIER, labels)
     matrices, entries = _measured(found.motions, covariance * found.sigma.square()[:, None, None], centres, scale)
@@ -110,10 +111,12 @@ def _inverse(information: Tensor, dof: Tensor) -> tuple[Tensor, Tensor]:
     return least, (vectors * inverse[:, None]) @ vectors.mT
 
 
-def _status(labels: Tensor, weights: Tensor, worst: Tensor, undetermined: Tensor, dof: Tensor, conditions: int) -> Tensor:
+def _status(
+    labels: Tensor, weights: Tensor, worst: Tensor, noisy: Tensor, undetermined: Tensor, dof: Tensor, conditions: int
+) -> Tensor:
     present = (weights > 0).sum(-1)
     still, moving = (labels == STATIC).sum(-1), (labels == MOVING).sum(-1)
-    accident = (still + moving < CONSENSUS * present) | (6 * still + conditions * moving < dof + SPARE)
+    accident = (still + moving < CONSENSUS * present) | (6 * still + conditions * moving < dof + SPARE) | noisy
     status = torch.full_like(present, int(Status.OK))
     status = torch.where(worst > AMBIGUOUS, int(Status.AMBIGUOUS), status)
     status = torch.where(accident, int(Status.NO_CONSENSUS), status)

@@ -13,7 +13,7 @@ from dyntorch.robust import robust_fit
 from dyntorch.sampling import uniform
 from dyntorch.solution import Status, failed
 from dyntorch.tasks.alignment import OUTLIER, STATIC, Alignment, Notice, NoticeCode, notices
-from dyntorch.tasks.labelling import CHI_SQUARE, MEDIAN, SIGMAS, Evidence
+from dyntorch.tasks.labelling import CHI_SQUARE, MEDIAN, NOISY, SIGMAS, Evidence
 from dyntorch.tasks.velocity_model import DOF, GAUGE, Velocities, information, residuals, settle, world_velocities
 
 MINIMAL = {False: 21, True: 7}
@@ -44,6 +44,9 @@ def align_velocity(data: Matches, threshold: float | None, affine: bool, generat
     theta, sigma, found = start
     state = settle(evidence, theta, sigma, affine, given is None)
     extent, motions, covariance = information(evidence, state, affine)
+    covariance = covariance * state.sigma.square()[:, None, None]
+    # singular maps have no motion between them to be known
+    covariance = torch.where(covariance.isfinite().flatten(1).all(-1)[:, None, None], covariance, torch.inf)
     worst = state.sigma * extent[:, 0].clamp(min=torch.finfo(theta.dtype).tiny).rsqrt()
     status = _status(evidence, state, worst, extent[:, 0] <= INDETERMINATE * extent[:, 1], found, affine)
     none = failed(status)
@@ -57,7 +60,7 @@ def align_velocity(data: Matches, threshold: float | None, affine: bool, generat
         labels=data.back(labels),
         status=data.back(status),
         sigma=data.back(torch.where(none, 0.0, state.sigma)),
-        covariance=data.back(torch.where(zero, 0.0, covariance * state.sigma.square()[:, None, None])),
+        covariance=data.back(torch.where(zero, 0.0, covariance)),
         ambiguity=AMBIGUITY,
         warnings=_notices(evidence, state, worst, none, affine, data.batch),
         velocities=data.back(velocities),
@@ -167,6 +170,7 @@ def _status(evidence: Evidence, state: Velocities, worst: Tensor, undetermined: 
     moving = (state.labels != OUTLIER).sum(-1) - still
     dof = DOF[affine] + GAUGE * state.grounded.long()
     accident = (still + moving < CONSENSUS * present) | (6 * still + 3 * moving < dof + SPARE * (present > MINIMAL[affine] + 1))
+    accident = accident | (state.sigma * torch.stack(evidence.norm.scales).amax(0) > NOISY)
     status = torch.where(worst > AMBIGUOUS, int(Status.AMBIGUOUS), torch.zeros_like(present))
     status = torch.where(accident, int(Status.NO_CONSENSUS), status)
     status = torch.where(undetermined & ~accident, int(Status.DEGENERATE), status)

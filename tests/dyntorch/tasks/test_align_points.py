@@ -12,7 +12,7 @@ from dyntorch import scenes
 from dyntorch.algebra.rigid import moved_by, nearest_rotation, rigid_alignment, rigid_motion, rotation_exponential
 from dyntorch.metrics import label_scores, point_error, relative_error, rotation_error, translation_error
 from dyntorch.solution import Status
-from dyntorch.tasks.align_points import align_points
+from dyntorch.tasks.align_points import Model, align_points
 from dyntorch.tasks.alignment import MOVING, OUTLIER, STATIC
 from dyntorch.tasks.rigid import Sightings, normal_equations, squares
 
@@ -282,6 +282,14 @@ def test_misuse_of_the_views() -> None:
         align_points(x1, x2[..., :2], x3)
     with pytest.raises(ValueError, match="same"):
         align_points(x1, x2[:49], x3)
+
+
+@pytest.mark.parametrize("model", ["join", "rigid", "constant_velocity", "affine_constant_velocity"])
+def test_random_matches_are_refused_with_the_noise_unknown(model: Model) -> None:
+    views = [100 * torch.randn(80, 3, generator=draw(i), dtype=torch.float64) for i in range(3)]
+    found = align_points(*views, model=model, generator=draw(0))
+    assert int(found.status) != Status.OK
+    assert not found.covariance.isnan().any()
 
 
 def test_empty_batch_and_float32() -> None:
