@@ -22,8 +22,9 @@ Measured: 0.02 for the homography tensor at 2 px and 0.1 at 5 px (100 matches), 
 ILL_CONDITIONED = 1e-10
 """Rounding error of a null vector from a float64 Gram, eps * (s_1 / s_{D-1})^2, above which the matrix itself is decomposed, unless
 the noise outweighs it a thousandfold anyway."""
-WEAK = 1e4
-"""Squared ratio of the first to the last but one singular value above which the noise may reach it (general motion: 1e2 to 1e3)."""
+WEAK = 5e5
+"""Trace of the Gram times the harmonic sum of its other eigenvalues above which noise may reach the last of them.  General motion
+has 1e4 (lines) to 3e5 (constant velocity, 60 matches), data of lower rank 1e6 at noise of 1 % of the scene and 1e9 at 0.03 %."""
 BLOCK, LEAST = 5 << 19, 16
 """Numbers in the largest temporary of one block of the batch, summed in pieces by the Gram, and fewest problems in a block that
 is cut for the sake of another core.  Measured best: 364 problems of 200 points of the plane (47 us each; 128: 59), 131 of space."""
