@@ -15,7 +15,7 @@ from dyntorch.matches import Matches, matches
 from dyntorch.normalize import denormalize
 from dyntorch.refinement import refine_matches
 from dyntorch.residual import multilinear, whitened
-from dyntorch.solution import Solution, Status, failed
+from dyntorch.solution import NOISY, Solution, Status, failed
 from dyntorch.starts import Found, Search, chi, threshold_of
 
 STARTS = (1, 4, 16, 64, 256)
@@ -113,11 +113,11 @@ def _check(invariant: Invariant, data: Matches, starts: Sequence[int]) -> None:
 
 def _threshold(threshold: float | Tensor, data: Matches) -> Tensor:
     """``(b,)``."""
-    value = torch.as_tensor(threshold, dtype=torch.float64, device=data.weights.device)
     try:
-        value = value.expand(data.batch).reshape(-1)
-    except RuntimeError:
-        raise ValueError(f"threshold must be a number or (*batch,) = {data.batch}, got {tuple(value.shape)}") from None
+        value = torch.as_tensor(threshold, dtype=torch.float64, device=data.weights.device).expand(data.batch).reshape(-1)
+    except (RuntimeError, TypeError, ValueError):
+        got = tuple(threshold.shape) if isinstance(threshold, Tensor) else repr(threshold)
+        raise ValueError(f"threshold must be a number or (*batch,) = {data.batch}, got {got}; None estimates it") from None
     if not bool(((value > 0) & value.isfinite()).all()):
         raise ValueError(f"threshold must be a distance > 0 in the unit of the matches, got {threshold}; None estimates it")
     return value
@@ -141,7 +141,12 @@ def _finish(search: Search, found: Found, cut: Tensor, rounds: Sequence[int], *,
     # a tensor that the matches leave open has no motion, and so no inliers by it
     exact = fit_matches(invariant, search.some.restricted(found.inliers)).status.reshape(-1).to(cut.device)
     degenerate = (exact == int(Status.DEGENERATE)) & (found.evidence < 0)
-    return _judged(solution, evidence, degenerate, _within(data, distance, cut), _sigma(invariant, data, distance, cut))
+    sigma = _sigma(invariant, data, distance, cut)
+    if estimate:
+        # with the noise unknown, a tensor whose inliers fill the scene has found nothing
+        extent = torch.stack([t.reshape(len(cut), -1, *t.shape[-2:])[:, 0, 0, 0] for t in search.norm.transforms]).amax(0)
+        evidence = torch.where(sigma * extent > NOISY, 1.0, evidence)
+    return _judged(solution, evidence, degenerate, _within(data, distance, cut), sigma)
 
 
 def _settled(invariant: Invariant, data: Matches, distance: Tensor, cut: Tensor) -> Tensor:

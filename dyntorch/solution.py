@@ -31,6 +31,9 @@ class Status(IntEnum):
     """Robust estimation found no tensor that enough matches agree with.  The tensor is the best one found."""
 
 
+NOISY = 0.05
+"""Estimated noise over the extent of the points above which agreement with a tensor is an accident: random matches of space, with
+the noise estimated, agreed with every model, at 0.29 to 1.0."""
 REMEDY = {
     Status.TOO_FEW: "give more matches, or weigh fewer of them 0",
     Status.DEGENERATE: "add matches in general position (other trajectories, other directions of motion), or use a smaller model",

@@ -118,7 +118,8 @@ class Primitive(ABC):
         for shape in self.shapes():
             if tuple(x.shape[x.ndim - len(shape) :]) == shape and x.ndim > len(shape):
                 return x.ndim - len(shape) - 1
-        raise ValueError(f"expected (*batch, n, {' or '.join(str(s) for s in self.shapes())}), got {tuple(x.shape)}")
+        known = " or ".join(f"(*batch, n, {', '.join(map(str, shape))})" for shape in self.shapes())
+        raise ValueError(f"expected {known}, got {tuple(x.shape)}")
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.dim})"

@@ -12,7 +12,7 @@ from dyntorch.invariants.translating_lines_matrix import TranslatingLinesMatrix
 from dyntorch.matches import Matches, matches
 from dyntorch.robust import robust_fit
 from dyntorch.solution import Solution, Status, failed
-from dyntorch.tasks.alignment import OUTLIER, STATIC, Alignment, Notice, NoticeCode, notices
+from dyntorch.tasks.alignment import OUTLIER, STATIC, Alignment, Notice, NoticeCode, check_threshold, notices
 from dyntorch.tasks.labelling import MEDIAN, SIGMAS
 from dyntorch.tasks.line_model import Lines, as_points, settle, spread
 
@@ -86,8 +86,7 @@ def align_lines(
         >>> bool((result.A - scene.motion[0]).norm() < 0.02)
         True
     """
-    if threshold is not None and not 0 < float(threshold) < float("inf"):
-        raise ValueError(f"threshold must be a positive distance in the unit of the points, got {threshold}; None estimates it")
+    check_threshold(threshold)
     data = matches(TranslatingLinesMatrix(), (l1, l2), weights, static)
     points = _points(static_points, data, l1)
     extra = 0 if points is None else points[0].shape[1]

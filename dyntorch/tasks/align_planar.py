@@ -11,9 +11,9 @@ from dyntorch.fitting import fit_matches
 from dyntorch.invariants.homography_tensor import HomographyTensor
 from dyntorch.matches import Matches, matches
 from dyntorch.robust import robust_fit
-from dyntorch.solution import Solution, Status, failed
-from dyntorch.tasks.alignment import MOVING, OUTLIER, STATIC, Alignment
-from dyntorch.tasks.labelling import CHI_SQUARE, NOISY, ROUGH, SIGMAS, Evidence, Labelled, joined
+from dyntorch.solution import NOISY, Solution, Status, failed
+from dyntorch.tasks.alignment import MOVING, OUTLIER, STATIC, Alignment, check_threshold
+from dyntorch.tasks.labelling import CHI_SQUARE, ROUGH, SIGMAS, Evidence, Labelled, joined
 from dyntorch.tasks.planar_notices import planar_notices, unverified
 from dyntorch.tasks.static_consensus import static_consensus
 
@@ -96,8 +96,7 @@ def align_planar(
         >>> float((result.labels == scene.labels).double().mean()) > 0.9
         True
     """
-    if threshold is not None and not 0 < float(threshold) < float("inf"):
-        raise ValueError(f"threshold must be a positive distance in the unit of the points, got {threshold}; None estimates it")
+    check_threshold(threshold)
     data = matches(HomographyTensor(), (x1, x2, x3), weights, static)
     least = MINIMAL if static is None else LABELLED
     if data.count < least:

@@ -10,7 +10,7 @@ from torch import Tensor
 from dyntorch.invariants.join_tensor import JoinTensor
 from dyntorch.matches import Matches, matches
 from dyntorch.tasks import align_join, align_rigid, align_velocity
-from dyntorch.tasks.alignment import Alignment
+from dyntorch.tasks.alignment import Alignment, check_threshold
 
 Model = Literal["join", "minimal_join", "constant_velocity", "affine_constant_velocity", "rigid"]
 Motion = Literal["straight", "constant_velocity"]
@@ -95,8 +95,7 @@ def align_points(
         raise ValueError(f"motion must be one of {', '.join(get_args(Motion))}, got {motion!r}")
     if motion != "straight" and model != "rigid":
         raise ValueError(f"motion={motion!r} belongs to model='rigid', got model={model!r}; use model='constant_velocity'")
-    if threshold is not None and not 0 < float(threshold) < float("inf"):
-        raise ValueError(f"threshold must be a positive distance in the unit of the points, got {threshold}; None estimates it")
+    check_threshold(threshold)
     data = matches(JoinTensor(), (P1, P2, P3), weights, static)
     least = (LEAST if static is None else LABELLED)[model]
     if data.count < least:

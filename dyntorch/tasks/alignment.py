@@ -46,6 +46,20 @@ class NoticeCode(StrEnum):
     """The noise leaves the motion so uncertain that it says little."""
 
 
+def check_threshold(threshold: float | None) -> None:
+    """Refuse what is not one distance.
+
+    Raises:
+        ValueError: not a number, not positive, or not finite.
+    """
+    try:
+        value = 1.0 if threshold is None else float(threshold)
+    except (TypeError, ValueError, RuntimeError):
+        value = float("nan")
+    if not 0 < value < float("inf"):
+        raise ValueError(f"threshold must be a positive distance in the unit of the points, got {threshold!r}; None estimates it")
+
+
 @dataclass(frozen=True)
 class Notice:
     """Something about the data of one problem that limits what its result can be trusted for.

@@ -31,9 +31,6 @@ STEADY = 0.02
 WIDEST = 4.0
 """No uncertainty of the motion widens a limit more than so many times: calling a static match moving costs some accuracy, calling
 a moving one static gives a wrong motion."""
-NOISY = 0.05
-"""Noise over the extent of the points above which agreement with a motion is an accident: on random matches of space, with the
-noise estimated, every model agreed with nearly all, at 0.29 to 1.0."""
 STEPS = 6
 """Levenberg-Marquardt steps between two labellings."""
 

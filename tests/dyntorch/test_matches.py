@@ -83,7 +83,7 @@ def test_a_class_of_numbers_that_is_not_a_tensor_is_named():
         matches(H, views(), None, [True] * 4)
     with pytest.raises(ValueError, match=r"weights is on meta, the matches on cpu; use .to\(device\)"):
         matches(H, views(), torch.ones(4, device="meta"))
-    with pytest.raises(ValueError, match=r"view 2 of HomographyTensor: expected \(\*batch, n, \(2,\)\), got \(2,\)"):
+    with pytest.raises(ValueError, match=r"view 2 of HomographyTensor: expected \(\*batch, n, 2\), got \(2,\)"):
         matches(H, (views()[0], torch.zeros(2).double(), views()[2]))
 
 

@@ -51,7 +51,7 @@ def test_shapes(primitive, x):
     form = torch.einsum("...ri,...rj->...ij", vectors, vectors)[..., rows, columns]
     torch.testing.assert_close(primitive.packed(x), form.mT)
     assert repr(primitive).startswith(type(primitive).__name__)
-    with pytest.raises(ValueError, match=r"expected \(\*batch, n, \(\d.*got \(2, 5, 17\)"):
+    with pytest.raises(ValueError, match=r"expected \(\*batch, n, \d.*\), got \(2, 5, 17\)"):
         primitive.match_axis(torch.zeros(2, 5, 17))
 
 
