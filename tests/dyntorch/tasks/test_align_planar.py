@@ -287,5 +287,5 @@ def test_unknown_notice_codes_are_refused():
 @pytest.mark.parametrize("threshold", ["wide", 0, -1.0, float("nan"), float("inf"), torch.ones(2)])
 def test_what_is_no_distance_is_refused(threshold):
     views = scenes.planar(30, generator=torch.Generator().manual_seed(0)).views
-    with pytest.raises(ValueError, match="threshold must be a positive distance .*, got .*; None estimates it"):
+    with pytest.raises(ValueError, match=r"threshold must be a positive distance .*, got .*; None estimates it"):
         align_planar(*views, threshold=threshold)
