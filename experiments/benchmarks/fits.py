@@ -219,12 +219,8 @@ def plot(rows: list[Row], path: Path) -> None:
 
     chosen = [row for row in rows if "times faster" in row.task]
     figure, axes = plt.subplots(figsize=(8, 0.5 * len(chosen) + 1))
-    labels = [row.task.replace(": times faster", "\n") + (f"\n{row.setting}" if "svd" not in row.task else "") for row in chosen]
-    axes.barh(
-        [label.split("\n")[0] + label.split("\n")[1] for label in labels][::-1],
-        [row.measured for row in chosen][::-1],
-        color="#2a6f97",
-    )
+    labels = [row.task.replace(": times faster than ", ", against ").replace(": times faster", "") for row in chosen]
+    axes.barh(labels[::-1], [row.measured for row in chosen][::-1], color="#2a6f97")
     axes.bar_label(axes.containers[0], fmt="%.1fx", padding=3)  # type: ignore[arg-type]
     axes.axvline(1, color="0.3", linewidth=1)
     axes.set_xlabel("times faster, one core (rows + torch.linalg.svd, unless named)")
