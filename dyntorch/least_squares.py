@@ -112,3 +112,24 @@ class Problem:
 def flattened(parts: tuple[Tensor, ...]) -> Tensor:
     """All entries of a motion, ``(b, p)``."""
     return torch.cat([part.flatten(1) for part in parts], dim=-1)
+
+
+def damped_step(gradient: Tensor, matrix: Tensor, damping: Tensor, free: Tensor | None = None) -> Tensor:
+    r"""The step of Levenberg and Marquardt, :math:`(H + \mu\,\mathrm{diag}\,H)^{-1} g`, to be subtracted; 0 where it is not finite.
+
+    Args:
+        gradient: ``(b, p)``.
+        matrix: ``(b, p, p)``.
+        damping: ``(b,)``.
+        free: ``(p,)``, 0 for parameters that stay as they are.
+    """
+    if free is not None:
+        gradient, matrix = gradient * free, matrix * free * free[:, None]
+    diagonal = matrix.diagonal(dim1=-2, dim2=-1)
+    # directions that the matches leave open (scales, a common velocity) must not be divided by zero
+    floor = damping[:, None] * (diagonal + 1e-9 * diagonal.amax(-1, keepdim=True) + torch.finfo(matrix.dtype).tiny)
+    # a parameter that stays has an equation of its own, step = 0
+    floor = floor if free is None else floor + (1 - free)
+    factor, _ = torch.linalg.cholesky_ex(matrix + torch.diag_embed(floor))
+    step = torch.cholesky_solve(gradient[..., None], factor)[..., 0]
+    return torch.where(step.isfinite(), step, torch.zeros_like(step))

@@ -10,7 +10,7 @@ from torch import Tensor
 from dyntorch.blocks import map_blocks
 from dyntorch.forward import jacobian
 from dyntorch.invariant import Invariant
-from dyntorch.least_squares import BLOCK, Problem, flattened
+from dyntorch.least_squares import BLOCK, Problem, damped_step, flattened
 from dyntorch.matches import Matches, matches
 from dyntorch.normalize import Normalization, denormalize, denormalize_motion
 from dyntorch.solution import Solution, failed
@@ -126,12 +126,7 @@ def _minimize(problem: Problem, theta: Tensor, iterations: int) -> tuple[Tensor,
 def _step(problem: Problem, state: tuple[Tensor, ...], damping: Tensor) -> tuple[tuple[Tensor, ...], Tensor, Tensor]:
     """One damped step of every problem: the new state, the new damping, and which problems are done."""
     theta, cost, gradient, matrix = state
-    diagonal = matrix.diagonal(dim1=-2, dim2=-1)
-    # the scales of the parts are free: a floor keeps their directions from being divided by zero
-    floor = diagonal + 1e-9 * diagonal.amax(-1, keepdim=True) + torch.finfo(theta.dtype).tiny
-    factor, _ = torch.linalg.cholesky_ex(matrix + torch.diag_embed(damping[:, None] * floor))
-    step = torch.cholesky_solve(gradient[..., None], factor)[..., 0]
-    step = torch.where(step.isfinite(), step, torch.zeros_like(step))
+    step = damped_step(gradient, matrix, damping)
     trial = _unit_parts(problem, theta - step)
     fresh = (trial, *problem.normal_equations(trial))
     better = fresh[1] < cost

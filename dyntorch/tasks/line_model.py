@@ -12,6 +12,7 @@ from dyntorch.algebra.homogeneous import homogeneous, unit
 from dyntorch.forward import derivatives, jacobian
 from dyntorch.invariants.agreement import point_error, static_residual
 from dyntorch.invariants.translating_lines_matrix import TranslatingLinesMatrix
+from dyntorch.least_squares import damped_step
 from dyntorch.matches import Matches
 from dyntorch.normalize import Normalization, denormalize_motion
 from dyntorch.primitives import Line, direction
@@ -132,11 +133,7 @@ def refined(lines: Lines, theta: Tensor, labels: Tensor) -> Tensor:
     cost, gradient, matrix = _equations(lines, theta, labels)
     damping = torch.full_like(cost, 1e-3)
     for _ in range(STEPS):
-        diagonal = matrix.diagonal(dim1=-2, dim2=-1)
-        floor = diagonal + 1e-9 * diagonal.amax(-1, keepdim=True) + torch.finfo(theta.dtype).tiny
-        factor, _ = torch.linalg.cholesky_ex(matrix + torch.diag_embed(damping[:, None] * floor))
-        step = torch.cholesky_solve(gradient[..., None], factor)[..., 0]
-        trial = normalize(theta - torch.where(step.isfinite(), step, 0.0), dim=-1)
+        trial = normalize(theta - damped_step(gradient, matrix, damping), dim=-1)
         fresh = _equations(lines, trial, labels)
         better = fresh[0] < cost
         done = (better & (cost - fresh[0] <= CONVERGED * cost)) | (~better & (damping > 1e5))

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from dyntorch.algebra.homogeneous import skew
 from dyntorch.algebra.rigid import moved_by
+from dyntorch.least_squares import damped_step
 
 MOTIONS = {"straight": 2, "constant_velocity": 3}
 """Conditions that a moving point fulfils."""
@@ -174,13 +175,7 @@ def descend(
 
 def _step(pose: Tensor, gradient: Tensor, matrix: Tensor, damping: Tensor) -> Tensor:
     """The motions after a damped Gauss-Newton step."""
-    diagonal = matrix.diagonal(dim1=-2, dim2=-1)
-    # what the matches leave open (common velocity, too few of them) must not be divided by zero
-    floor = diagonal + 1e-9 * diagonal.amax(-1, keepdim=True) + torch.finfo(pose.dtype).tiny
-    eye = torch.eye(12, dtype=pose.dtype, device=pose.device)
-    factor, _ = torch.linalg.cholesky_ex(matrix + (damping[:, None] * floor)[..., None] * eye)
-    step = torch.cholesky_solve(gradient[..., None], factor)[..., 0]
-    step = torch.where(step.isfinite(), step, torch.zeros_like(step))
+    step = damped_step(gradient, matrix, damping)
     # half a radian is as far as the linearization of a rotation can be trusted
     length = step.unflatten(-1, (2, 2, 3))[:, :, 0].norm(dim=-1).amax(-1)
     step = step / (2 * length).clamp(min=1.0)[:, None]

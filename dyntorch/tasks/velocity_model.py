@@ -10,6 +10,7 @@ from torch import Tensor
 from dyntorch.algebra.homogeneous import apply, unit
 from dyntorch.forward import derivatives
 from dyntorch.invariants.constant_velocity_tensor import ConstantVelocityTensor
+from dyntorch.least_squares import damped_step
 from dyntorch.normalize import denormalize_motion
 from dyntorch.tasks.alignment import MOVING, OUTLIER, STATIC
 from dyntorch.tasks.labelling import CHI_SQUARE, ROUGH, Evidence
@@ -52,13 +53,7 @@ def refined(evidence: Evidence, theta: Tensor, labels: Tensor, affine: bool) -> 
     cost, gradient, matrix = problem.normal_equations(theta)
     damping = torch.full_like(cost, 1e-3)
     for _ in range(STEPS):
-        masked = matrix * free * free[:, None]
-        diagonal = masked.diagonal(dim1=-2, dim2=-1)
-        floor = diagonal + 1e-9 * diagonal.amax(-1, keepdim=True) + torch.finfo(theta.dtype).tiny
-        # a frozen entry has an equation of its own, step = 0
-        factor, _ = torch.linalg.cholesky_ex(masked + torch.diag_embed(damping[:, None] * floor + (1 - free)))
-        step = torch.cholesky_solve((gradient * free)[..., None], factor)[..., 0]
-        trial = _scaled(theta - torch.where(step.isfinite(), step, 0.0))
+        trial = _scaled(theta - damped_step(gradient, matrix, damping, free))
         fresh = problem.normal_equations(trial)
         better = fresh[0] < cost
         small = ~better | (cost - fresh[0] <= CONVERGED * cost)
