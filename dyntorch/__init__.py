@@ -20,11 +20,13 @@ _HOME = {
     "MinimalJoinTensor": "dyntorch.invariants.minimal_join_tensor",
     "ConstantVelocityTensor": "dyntorch.invariants.constant_velocity_tensor",
     "TranslatingLinesMatrix": "dyntorch.invariants.translating_lines_matrix",
+    "GrassmannTensor": "dyntorch.invariants.grassmann_tensor",
     "Invariant": "dyntorch.invariant",
     # from matches to the tensor and its motion
     "null_space": "dyntorch.nullspace",
     "fit": "dyntorch.fitting",
     "robust_fit": "dyntorch.robust",
+    "constrain": "dyntorch.constrained",
     "refine": "dyntorch.refinement",
     "sampson": "dyntorch.residual",
     "algebraic": "dyntorch.residual",

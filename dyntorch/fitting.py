@@ -76,11 +76,11 @@ def fit(
 
 def fit_matches(invariant: Invariant, data: Matches, *, normalize: bool = True) -> Solution:
     """:func:`fit` for checked matches."""
-    rows = data.count * invariant.rows()
+    few = data.count < invariant.minimal()
     if data.static is not None:
         # a static match frees one slot at a time; how many of its rows are new the rank will say
-        rows = max(rows, data.count * sum(p.width for p in invariant.primitives))
-    if data.views[0].shape[0] and rows < invariant.width() - invariant.nullity:
+        few = few and data.count * sum(p.width for p in invariant.primitives) < invariant.width() - invariant.nullity
+    if data.views[0].shape[0] and few:
         raise ValueError(f"{invariant!r} needs at least {invariant.minimal()} matches, got {data.count}; add matches")
     views, weights, static = copied(invariant, data)
     options = () if static is None else (static,)
@@ -152,6 +152,8 @@ def _null(
     if g.device.type == "cpu" and bool(exact.any()):
         basis = _with_matrix(basis, exact, primitives, views, weights, static, nullity)
     few = present < width - nullity
+    if static is None:
+        few = few | ((weights > 0).sum(-1) < invariant.minimal())
     ambiguous = square * present.clamp(min=1) > AMBIGUOUS
     weak = (spare > 0) & ~found.degenerate & (g.diagonal(dim1=-2, dim2=-1).sum(-1) * found.competing > WEAK)
     if not invariant.resolves_noise and g.device.type == "cpu" and bool(weak.any()):

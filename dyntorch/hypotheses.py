@@ -134,11 +134,11 @@ class Bundle:
     def _slopes(self, view: int, gradient: Tensor) -> Tensor:
         """Derivatives by the measured coordinates ``(b, c, .., d, n)`` from those by the vectors ``(b, c, .., width, n)``.
 
-        Of several hyperplanes [I | -x] each moves with one coordinate only: this is the whole diagonal.
+        Of several hyperplanes [I | -x] each moves with some coordinates only: these are all of their derivatives.
         """
         primitive = self.primitives[view]
         if isinstance(primitive, HyperplanesThrough):
-            return -gradient[..., -1:, :].expand(*gradient.shape[:-2], primitive.dim, -1)
+            return primitive.slopes(gradient)
         if isinstance(primitive, Point):
             return gradient[..., :-1, :]
         x = self.views[view]
@@ -172,7 +172,7 @@ def bundle(
 
 def transfer_slot(primitives: Sequence[Primitive]) -> int | None:
     """The only view measured through all hyperplanes of its points, which the other views then predict."""
-    slots = [v for v, p in enumerate(primitives) if isinstance(p, HyperplanesThrough)]
+    slots = [v for v, p in enumerate(primitives) if isinstance(p, HyperplanesThrough) and p.order == 1]
     return slots[0] if len(slots) == 1 and all(p.rows == 1 for v, p in enumerate(primitives) if v not in slots) else None
 
 

@@ -16,8 +16,10 @@ from dataclasses import dataclass
 from functools import partial, update_wrapper
 from typing import Any, Concatenate, Generic, ParamSpec, TypeVar, cast
 
+import torch
 from torch import Tensor
 
+from dyntorch.forward import jacobian
 from dyntorch.primitives import Primitive
 
 P = ParamSpec("P")
@@ -45,6 +47,8 @@ class Frame:
     target: int | None
     source: int | None = None
     vector: bool = False
+    dual: bool = False
+    """Whether the images are hyperplanes of the target, which change by the inverse transposed."""
 
 
 class Invariant:
@@ -70,6 +74,8 @@ class Invariant:
     """Tensors per problem, where one set of matches is solved several times (one per given camera)."""
     resolves_noise: bool = True
     """Whether, among tensors that nearly all matches fulfil, the one with the least residual under noise is the true one."""
+    staged: bool = False
+    """Whether the linear tensor is too far from that of a motion to refine it by distances: the algebraic error comes first."""
     labels_static: bool = False
     """Whether a match known to be static says more than one that may move (the argument ``static``)."""
 
@@ -94,6 +100,29 @@ class Invariant:
             ``(*batch, n, c)`` with expected square sum ``codim``; None for the Sampson residual of the multilinear form itself.
         """
         return None
+
+    def linearized(
+        self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]
+    ) -> tuple[Tensor, Tensor] | None:
+        """:meth:`whitened`, flat ``(b, n c)``, and its derivative by all entries of the motion ``(b, p, n c)``, where they are known
+        by hand; None: they are found by automatic differentiation."""
+        return None
+
+    def compose_derivative(self, motion: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+        """The tensor, flat ``(b, D)``, and its derivative ``(b, p, D)`` by all entries of the motion ``(b, ...)``."""
+        shapes = [part.shape[1:] for part in motion]
+        sizes = [shape.numel() for shape in shapes]
+
+        def tensor(theta: Tensor) -> Tensor:
+            parts = zip(theta.split(sizes, -1), shapes, strict=True)
+            return self.compose(*(part.unflatten(-1, shape) for part, shape in parts)).flatten(1)
+
+        return jacobian(tensor, torch.cat([part.flatten(1) for part in motion], dim=-1))
+
+    def starts(self, tensor: Tensor) -> tuple[Tensor, ...]:
+        """Motions ``(tries, *batch, ...)`` from which to look for the one of a noisy tensor; by default what it decomposes into."""
+        found = self.decompose(tensor)
+        return tuple(part[None] for part in (found if isinstance(found, tuple) else (found,)))
 
     def shared(self, motion: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
         """Functions of the motion that the residuals of all matches share (inverses): refinement computes them once per motion."""

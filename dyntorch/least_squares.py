@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -14,6 +15,25 @@ from dyntorch.residual import multilinear_derivative
 
 BLOCK = 1 << 18
 """Entries of the Jacobian per block of the batch: larger ones leave the cache, smaller ones pay for the calls."""
+
+
+CONVERGED = 1e-9  # relative decrease of the cost
+
+
+class Minimand(Protocol):
+    """A block of least squares problems in the entries of motions."""
+
+    def parts(self, theta: Tensor) -> tuple[Tensor, ...]:
+        """The parts ``(b, *shape)`` of parameters ``(b, p)``, each of any scale."""
+        ...
+
+    def normal_equations(self, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Cost ``(b,)``, gradient ``(b, p)`` and Gauss-Newton matrix ``(b, p, p)``."""
+        ...
+
+    def subset(self, keep: Tensor) -> Minimand:
+        """Only some of the problems."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -29,8 +49,7 @@ class Problem:
 
     def parts(self, theta: Tensor) -> tuple[Tensor, ...]:
         """The motion ``(b, *shape)`` of parameters ``(b, p)``."""
-        sizes = [shape.numel() for shape in self.shapes]
-        return tuple(part.unflatten(-1, shape) for part, shape in zip(theta.split(sizes, -1), self.shapes, strict=True))
+        return parts_of(theta, self.shapes)
 
     def subset(self, keep: Tensor) -> Problem:
         """Only some of the problems."""
@@ -59,13 +78,16 @@ class Problem:
 
     def moving(self, theta: Tensor, views: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
         """Unweighted residuals of matches that may move, and their derivative."""
+        known = self.invariant.linearized(self.parts(theta), views, self.scales)
+        if known is not None:
+            return known
         empty = tuple(x[:0] for x in views), tuple(scale[:0] for scale in self.scales)
         if self.invariant.whitened(self.parts(theta[:0]), *empty) is not None:
             shared, slope = jacobian(lambda t: flattened(self.invariant.shared(self.parts(t))), theta)
             value, derivative = self._by_match(self.invariant.whitened_shared, shared, views)
             return value, slope @ derivative
         # one row per match: by hand through the tensor, several times cheaper than forward mode through the matches
-        tensor, slope = jacobian(lambda t: self.invariant.compose(*self.parts(t)).flatten(1), theta)
+        tensor, slope = self.invariant.compose_derivative(self.parts(theta))
         shape = self.invariant.shape()
         value, derivative = multilinear_derivative(self.invariant, tensor.unflatten(1, shape), views, self.scales)
         return value, slope @ derivative.mT
@@ -109,6 +131,12 @@ class Problem:
         return torch.where(cost.isfinite(), cost, torch.inf), gradient, matrix
 
 
+def parts_of(theta: Tensor, shapes: Sequence[torch.Size]) -> tuple[Tensor, ...]:
+    """The inverse of :func:`flattened`."""
+    sizes = [shape.numel() for shape in shapes]
+    return tuple(part.unflatten(-1, shape) for part, shape in zip(theta.split(sizes, -1), shapes, strict=True))
+
+
 def flattened(parts: tuple[Tensor, ...]) -> Tensor:
     """All entries of a motion, ``(b, p)``."""
     return torch.cat([part.flatten(1) for part in parts], dim=-1)
@@ -133,3 +161,53 @@ def damped_step(gradient: Tensor, matrix: Tensor, damping: Tensor, free: Tensor 
     factor, _ = torch.linalg.cholesky_ex(matrix + torch.diag_embed(floor))
     step = torch.cholesky_solve(gradient[..., None], factor)[..., 0]
     return torch.where(step.isfinite(), step, torch.zeros_like(step))
+
+
+def minimize(problem: Minimand, theta: Tensor, iterations: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Parameters, cost and Gauss-Newton matrix at the minimum of every problem of a block, by Levenberg-Marquardt.
+
+    Args:
+        problem: says cost and derivatives.
+        theta: ``(b, p)`` start.
+        iterations: at most so many steps.
+    """
+    theta = _unit_parts(problem, theta)
+    result: tuple[Tensor, ...] = (theta, *problem.normal_equations(theta))
+    damping = torch.full_like(result[1], 1e-3)
+    left = torch.arange(theta.shape[0], device=theta.device)
+    state, current = result, problem
+    for _ in range(iterations):
+        state, damping, done = _step(current, state, damping)
+        if theta.device.type != "cpu":
+            result = state
+            continue
+        # problems that are done leave: the slow ones do not make the others wait
+        result = tuple(whole.index_copy(0, left, part) for whole, part in zip(result, state, strict=True))
+        keep = (~done).nonzero().flatten()
+        if not len(keep):
+            break
+        if len(keep) < len(left):
+            left, damping, current = left[keep], damping[keep], current.subset(keep)
+            state = tuple(part[keep] for part in state)
+    return result[0], result[1], result[3]
+
+
+def _step(problem: Minimand, state: tuple[Tensor, ...], damping: Tensor) -> tuple[tuple[Tensor, ...], Tensor, Tensor]:
+    """One damped step of every problem: the new state, the new damping, and which problems are done."""
+    theta, cost, gradient, matrix = state
+    step = damped_step(gradient, matrix, damping)
+    trial = _unit_parts(problem, theta - step)
+    fresh = (trial, *problem.normal_equations(trial))
+    better = fresh[1] < cost
+    # a problem is done when it gains nothing any more, does not move, or finds no way down even by the shortest steps
+    gained = torch.where(better, cost - fresh[1], torch.inf) <= CONVERGED * cost
+    done = gained | (step.abs().amax(-1) < 1e-13) | (~better & (damping > 1e6)) | ~cost.isfinite()
+    damping = torch.where(better, (damping * 0.1).clamp(min=1e-12), damping * 8)
+    chosen = tuple(torch.where(better[(..., *([None] * (new.ndim - 1)))], new, old) for new, old in zip(fresh, state, strict=True))
+    return chosen, damping, done
+
+
+def _unit_parts(problem: Minimand, theta: Tensor) -> Tensor:
+    """Every part of the motion with norm 1, which changes nothing but the size of the numbers."""
+    scaled = [part.flatten(1) / part.flatten(1).norm(dim=-1, keepdim=True).clamp(min=1e-30) for part in problem.parts(theta)]
+    return torch.cat(scaled, dim=-1)

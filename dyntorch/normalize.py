@@ -112,7 +112,9 @@ def _moved(part: Tensor, frame: Frame, transforms: Sequence[Tensor], *, forward:
     for view, left in ((frame.target, True), (frame.source, False)):
         if view is None:
             continue
-        transform = transforms[view] if left == forward else torch.linalg.inv_ex(transforms[view])[0]
+        # dual images change by the inverse transposed, which is the other way round
+        transform = transforms[view] if (left == forward) != (left and frame.dual) else torch.linalg.inv_ex(transforms[view])[0]
+        transform = transform.mT if left and frame.dual else transform
         matrix = transform @ matrix if left else matrix @ transform
     if frame.vector:
         norm = matrix.norm(dim=(-2, -1))[..., None]

@@ -8,15 +8,15 @@ import torch
 from torch import Tensor
 
 from dyntorch.blocks import map_blocks
+from dyntorch.constrained import algebraic_motion
 from dyntorch.forward import jacobian
 from dyntorch.invariant import Invariant
-from dyntorch.least_squares import BLOCK, Problem, damped_step, flattened
+from dyntorch.least_squares import BLOCK, Problem, flattened, minimize
 from dyntorch.matches import Matches, matches
 from dyntorch.normalize import Normalization, denormalize, denormalize_motion
 from dyntorch.solution import Solution, failed
 
 ITERATIONS = 30
-CONVERGED = 1e-9  # relative decrease of the cost
 
 
 def refine(
@@ -80,7 +80,9 @@ def refine_matches(solution: Solution, data: Matches, iterations: int = ITERATIO
     invariant, norm = solution.invariant, _plain(solution)
     parts = solution.normalized_motion()
     shapes = tuple(part.shape[1:] for part in parts)
-    theta = flattened(parts).detach()
+    thetas = [flattened(parts).detach()]
+    if invariant.staged and solution.refined is None:
+        thetas.append(flattened(algebraic_motion(solution, data)))
     moved = tuple(x.detach() for x in norm.apply(invariant, data.views))
     frames = tuple(t.detach() for t in norm.transforms)
     base = invariant.normalized(tuple(t.detach() for t in solution.normalization.transforms))
@@ -90,58 +92,20 @@ def refine_matches(solution: Solution, data: Matches, iterations: int = ITERATIO
     def run(*block: Tensor) -> tuple[Tensor, ...]:
         views, scales, rest = block[1 : 1 + count], block[1 + count : 1 + 2 * count], block[1 + 2 * count :]
         problem = Problem(base, shapes, views, scales, rest[0], rest[1] if len(rest) > 1 else None)
-        return _minimize(problem, block[0], iterations)
+        starts = block[0]
+        if starts.shape[1] == 1:
+            return minimize(problem, starts[:, 0], iterations)
+        costs = torch.stack([problem.normal_equations(theta)[0] for theta in starts.unbind(1)], dim=1)
+        best = costs.argmin(1)[:, None, None].expand(-1, 1, starts.shape[-1])
+        return minimize(problem, starts.gather(1, best)[:, 0], iterations)
 
     # a block for every thread at least: threads inside of small operations cost more than they bring
+    theta = torch.stack(thetas, dim=1)
     size = max(1, min(BLOCK // max(1, data.count * theta.shape[-1]), -(-len(theta) // torch.get_num_threads())))
     with torch.no_grad():
         start = torch.where(theta.isfinite(), theta, torch.zeros_like(theta))
         best, cost, matrix = map_blocks(run, start, *moved, *norm.scales, data.weights, *flags, size=size)
         return _refined(solution, data, norm, frames, shapes, best, cost, matrix)
-
-
-def _minimize(problem: Problem, theta: Tensor, iterations: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Parameters, cost and Gauss-Newton matrix at the minimum of every problem of a block."""
-    theta = _unit_parts(problem, theta)
-    result: tuple[Tensor, ...] = (theta, *problem.normal_equations(theta))
-    damping = torch.full_like(result[1], 1e-3)
-    left = torch.arange(theta.shape[0], device=theta.device)
-    state, current = result, problem
-    for _ in range(iterations):
-        state, damping, done = _step(current, state, damping)
-        if theta.device.type != "cpu":
-            result = state
-            continue
-        # problems that are done leave: the slow ones do not make the others wait
-        result = tuple(whole.index_copy(0, left, part) for whole, part in zip(result, state, strict=True))
-        keep = (~done).nonzero().flatten()
-        if not len(keep):
-            break
-        if len(keep) < len(left):
-            left, damping, current = left[keep], damping[keep], current.subset(keep)
-            state = tuple(part[keep] for part in state)
-    return result[0], result[1], result[3]
-
-
-def _step(problem: Problem, state: tuple[Tensor, ...], damping: Tensor) -> tuple[tuple[Tensor, ...], Tensor, Tensor]:
-    """One damped step of every problem: the new state, the new damping, and which problems are done."""
-    theta, cost, gradient, matrix = state
-    step = damped_step(gradient, matrix, damping)
-    trial = _unit_parts(problem, theta - step)
-    fresh = (trial, *problem.normal_equations(trial))
-    better = fresh[1] < cost
-    # a problem is done when it gains nothing any more, does not move, or finds no way down even by the shortest steps
-    gained = torch.where(better, cost - fresh[1], torch.inf) <= CONVERGED * cost
-    done = gained | (step.abs().amax(-1) < 1e-13) | (~better & (damping > 1e6)) | ~cost.isfinite()
-    damping = torch.where(better, (damping * 0.1).clamp(min=1e-12), damping * 8)
-    chosen = tuple(torch.where(better[(..., *([None] * (new.ndim - 1)))], new, old) for new, old in zip(fresh, state, strict=True))
-    return chosen, damping, done
-
-
-def _unit_parts(problem: Problem, theta: Tensor) -> Tensor:
-    """Every part of the motion with norm 1, which changes nothing but the size of the numbers."""
-    scaled = [part.flatten(1) / part.flatten(1).norm(dim=-1, keepdim=True).clamp(min=1e-30) for part in problem.parts(theta)]
-    return torch.cat(scaled, dim=-1)
 
 
 def _refined(

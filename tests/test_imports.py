@@ -57,8 +57,9 @@ LAYERS = [
     {"residual"},
     {"invariants"},
     {"solution", "ambiguity", "fitting"},
-    {"least_squares", "refinement"},
-    {"hypotheses", "starts", "robust"},
+    {"least_squares", "constrained", "refinement"},
+    {"hypotheses", "starts", "robust", "bundle_problem", "bundle_adjustment"},
+    {"motions"},
     {"tasks"},
 ]
 ASIDE = {"counting", "scenes", "metrics"}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import lru_cache
 from itertools import combinations, permutations
+from math import comb
 
 import torch
 from torch import Tensor
@@ -151,12 +152,19 @@ def dual(extensor: Tensor, size: int, step: int) -> Tensor:
         >>> dual(torch.tensor([1.0, 2.0, 3.0]), 3, 2).tolist()
         [3.0, -2.0, 1.0]
     """
-    sets = list(combinations(range(size), step))
-    if extensor.shape[-1] != len(sets):
-        raise ValueError(f"an extensor of step {step} among {size} coordinates has {len(sets)} entries, got {extensor.shape[-1]}")
-    signs = [float(_parity(s + tuple(i for i in range(size) if i not in s))) for s in sets]
+    if extensor.shape[-1] != comb(size, step):
+        raise ValueError(
+            f"an extensor of step {step} among {size} coordinates has {comb(size, step)} entries, got {extensor.shape[-1]}"
+        )
     # lexicographic order reverses under taking complements
-    return (extensor * extensor.new_tensor(signs)).flip(-1)
+    return (extensor * _dual_signs(size, step).to(extensor)).flip(-1)
+
+
+@lru_cache(maxsize=256)
+def _dual_signs(size: int, step: int) -> Tensor:
+    signs = [_parity(s + tuple(i for i in range(size) if i not in s)) for s in combinations(range(size), step)]
+    with torch.inference_mode(False):
+        return torch.tensor(signs)
 
 
 def meet(*hyperplanes: Tensor) -> Tensor:

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
+from itertools import combinations
+from math import comb
 
 import torch
 from torch import Tensor
 
+from dyntorch.algebra.extensors import compound
 from dyntorch.algebra.homogeneous import homogeneous
 from dyntorch.primitives.base import Primitive, inverse
 
@@ -47,47 +51,92 @@ class Point(Primitive):
 
 
 @dataclass(frozen=True, repr=False)
-class HyperplanesThrough(Point):
-    """A measured point of P^d, through the d hyperplanes :math:`[I \\mid -x]` that contain it.
+class HyperplanesThrough(Primitive):
+    r"""A measured point of P^d, through the meets of ``order`` of the d hyperplanes :math:`[I \mid -x]` that contain it.
 
-    Their incidence with an image point w (y, 1) is w times the difference y - x, the geometric error up to its depth.
+    The vectors are the rows of the compound matrix :math:`C_a([I \mid -x])`, linear in x.  Of order 1 they are the
+    hyperplanes: their incidence with an image point w (y, 1) is w times the difference y - x, the geometric error up to its
+    depth.  Of order d there is one, the point itself up to the order and signs of its coordinates: (1, -y, x) in the plane.
     """
+
+    dim: int = 2
+    order: int = 1
+
+    @property
+    def width(self) -> int:  # type: ignore[override]
+        return comb(self.dim + 1, self.order)
 
     @property
     def rows(self) -> int:  # type: ignore[override]
-        return self.dim
+        return comb(self.dim, self.order)
+
+    def shapes(self) -> tuple[tuple[int, ...], ...]:
+        return ((self.dim,),)
 
     def raw(self, x: Tensor) -> Tensor:
         self._check_single()
-        return torch.cat([torch.ones_like(x), -x], dim=-1)
+        return self.components(x).mT
 
     def components(self, x: Tensor) -> Tensor:
-        return self.raw(x).mT
+        self._check_single()
+        coordinates, sign = self._moving(x)[1:]
+        return torch.cat([torch.ones_like(x[..., :1]), (x[..., coordinates] * sign).flip(-1)], dim=-1).mT
 
     def vectors(self, x: Tensor) -> Tensor:
         eye = torch.eye(self.dim, dtype=x.dtype, device=x.device)
-        return torch.cat([eye.expand(*x.shape, self.dim), -x[..., None]], dim=-1)
+        hyperplanes = torch.cat([eye.expand(*x.shape, self.dim), -x[..., None]], dim=-1)
+        return compound(hyperplanes, self.order)
 
     def packed(self, x: Tensor) -> Tensor:
+        if self.order > 1:
+            return super().packed(x)
         moved = x.mT
         one, zero = torch.ones_like(moved[..., :1, :]), torch.zeros_like(moved)
         rows = [torch.cat([one, zero[..., i + 1 :, :], -moved[..., i : i + 1, :]], dim=-2) for i in range(self.dim)]
         return torch.cat([*rows, moved.square().sum(-2, keepdim=True)], dim=-2)
 
     def action(self, transform: Tensor) -> Tensor:
-        return inverse(transform).mT
+        return compound(inverse(transform).mT, self.order)
 
     def pullback(self, x: Tensor, gradient: Tensor) -> Tensor:
         self._check_single()
-        return -gradient[..., 1:]
+        place, _, sign = self._moving(gradient)
+        return gradient[..., place] * sign
 
     def pushforward(self, x: Tensor, change: Tensor) -> Tensor:
         self._check_single()
-        return torch.cat([torch.zeros_like(change), -change], dim=-1)
+        return torch.cat([torch.zeros_like(change[..., :1]), (change * self._moving(change)[2]).flip(-1)], dim=-1)
+
+    def slopes(self, gradient: Tensor) -> Tensor:
+        """Derivatives ``(.., rows * order, n)`` of the forms of all rows by the coordinates on which each depends.
+
+        Args:
+            gradient: ``(.., width, n)`` of the form by the vector.
+        """
+        place, _, sign = self._moving(gradient)
+        return gradient.index_select(-2, place) * sign[:, None]
+
+    def _moving(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        place, coordinates, sign = _moving_minors(self.dim, self.order, like.device)
+        return place, coordinates, sign.to(like.dtype)
 
     def _check_single(self) -> None:
-        if self.dim > 1:
+        if self.rows > 1:
             raise NotImplementedError(f"a point of P^{self.dim} lies on {self.dim} hyperplanes: it has no single vector")
+
+
+@lru_cache(maxsize=64)
+def _moving_minors(dim: int, order: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+    """The minors of [I | -x] that are a coordinate up to sign, row by row of the compound: their places, coordinates, signs."""
+    columns = {s: i for i, s in enumerate(combinations(range(dim + 1), order))}
+    found = [
+        (columns[(*(i for i in row if i != j), dim)], j, (-1) ** (p + order))
+        for row in combinations(range(dim), order)
+        for p, j in enumerate(row)
+    ]
+    with torch.inference_mode(False):
+        place, coordinates, sign = torch.tensor(found, device=device).unbind(-1)
+    return place, coordinates, sign
 
 
 @dataclass(frozen=True, repr=False)

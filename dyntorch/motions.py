@@ -1,0 +1,179 @@
+"""Motion models as declarations: how a moving point of the scene is a static point of a higher projective space."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from dyntorch.algebra.lift import gauge_algebra, least_views
+from dyntorch.invariants.grassmann_tensor import GrassmannTensor
+
+Lift = Callable[[Tensor], Tensor]
+
+AFFINE = "an affinity of the world and a velocity common to all points"
+STENCIL = ((-2, 1 / 12), (-1, -2 / 3), (1, 2 / 3), (2, -1 / 12))
+"""Central differences of fourth order, exact for motions that are polynomials of the time."""
+STEP = 1e-2
+"""Step of these differences over the mean spacing of the views."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    r"""A motion model: the position at time t is :math:`X(t) \sim B(t)\,Y`, linear in the unknown constants Y of a point.
+
+    Everything else follows from the lift B: the space :math:`P^k` of the constants, the Grassmann tensor, how many views and
+    matches are needed, and what no view can tell.
+
+    Args:
+        lift: B, takes one time (a scalar tensor) and returns ``(d + 1, K)``; the world has dimension d, the last row gives its
+            homogeneous coordinate.
+        name: for messages.
+        sensor: dimension of what a view measures, 2 for images, 3 for 3D sensors.
+        leaves_open: the ambiguity that remains, in words.
+        bodies: 2 for two bodies in relative translation at arbitrary steps, which need no lift (``k`` instead).
+        k: dimension of the space of the constants, where there is no lift.
+
+    Raises:
+        ValueError: a lift that does not return a matrix with more columns than rows, or neither lift nor k.
+
+    Source: thesis chapter 3.
+
+    Example:
+        >>> import torch
+        >>> def falling(t):  # in a plane, the same unknown acceleration direction e_2 for all, each with its own strength
+        ...     B = torch.zeros(3, 4, dtype=torch.float64)
+        ...     B[:, :3] = torch.eye(3)
+        ...     B[1, 3] = t**2
+        ...     return B
+        >>> Motion(falling, "falling").minimal([0.0, 1.0, 2.0])
+        (3, 7)
+    """
+
+    lift: Lift | None = None
+    name: str = "custom"
+    sensor: int = 2
+    leaves_open: str = ""
+    bodies: int = 1
+    k: int = 0
+    static: bool = field(default=False)
+    """Whether the points do not move at all."""
+
+    def __post_init__(self) -> None:
+        if self.lift is None and self.k < 2:
+            raise ValueError(f"Motion takes a lift, or k >= 2 for bodies without one, got k={self.k}")
+        if self.lift is not None:
+            matrix = self.lift(torch.zeros((), dtype=torch.float64))
+            if not isinstance(matrix, Tensor) or matrix.ndim != 2 or not 2 <= matrix.shape[0] <= matrix.shape[1]:
+                got = tuple(matrix.shape) if isinstance(matrix, Tensor) else type(matrix).__name__
+                raise ValueError(f"the lift of {self.name!r} must return a tensor (d + 1, K) with K >= d + 1 > 1, got {got}")
+            object.__setattr__(self, "k", int(matrix.shape[1]) - 1)
+
+    @property
+    def dim(self) -> int:
+        """Dimension d of the world."""
+        return self.k - 1 if self.lift is None else int(self._at(0.0).shape[0]) - 1
+
+    def lifts(self, times: Tensor | Sequence[float]) -> Tensor:
+        """The lifts ``(views, d + 1, K)`` at these times, float64."""
+        if self.lift is None:
+            raise ValueError(f"{self.name!r} has no lift")
+        return torch.stack([self._at(float(t)) for t in times])
+
+    def slope(self, time: float, spacing: float = 1.0) -> Tensor:
+        """The derivative of the lift by the time, ``(d + 1, K)``."""
+        step = STEP * spacing
+        return sum((c * self._at(time + i * step) for i, c in STENCIL), torch.zeros(())) / step
+
+    def profile(self, views: int) -> tuple[int, ...]:
+        """The profile of so many views: one hyperplane each, then more for the first ones, up to all of a point's."""
+        left = self.k + 1 - views
+        found = []
+        for _ in range(views):
+            more = min(self.sensor - 1, left)
+            found.append(1 + more)
+            left -= more
+        return tuple(found)
+
+    def tensor(self, views: int) -> GrassmannTensor:
+        """The invariant of so many views, of which at most k + 1 can be used at once."""
+        return GrassmannTensor(self.k, self.profile(views), self.sensor)
+
+    def views(self, times: Tensor | Sequence[float]) -> int:
+        """Fewest views that determine the scene up to its ambiguity; one more than there are times where they do not suffice."""
+        enough = -(-(self.k + 1) // self.sensor)
+        if self.lift is None or self.static:
+            return max(2, enough)
+        return max(2, enough, least_views(self.lifts(times), self.sensor + 1))
+
+    def minimal(self, times: Tensor | Sequence[float]) -> tuple[int, int]:
+        """Fewest views, and fewest matches in them."""
+        views = self.views(times)
+        return views, self.tensor(min(views, self.k + 1)).minimal()
+
+    def ambiguity(self, times: Tensor | Sequence[float]) -> int:
+        """Dimension of the ambiguity of a reconstruction from views at these times."""
+        return (self.k + 1) ** 2 - 1 if self.lift is None else len(gauge_algebra(self.lifts(times))) - 1
+
+    def _at(self, time: float) -> Tensor:
+        assert self.lift is not None
+        return self.lift(torch.tensor(time, dtype=torch.float64)).to(torch.float64)
+
+    def __repr__(self) -> str:
+        return f"Motion({self.name})"
+
+
+def polynomial(dim: int, directions: int, degree: int = 1) -> Lift:
+    """The lift of points of a world of some dimension whose first coordinates are polynomials of the time.
+
+    Args:
+        dim: of the world.
+        directions: number of coordinates that change.
+        degree: of the polynomials.
+
+    Example:
+        >>> import torch
+        >>> polynomial(2, 1)(torch.tensor(3.0)).tolist()
+        [[1.0, 0.0, 0.0, 3.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]
+    """
+    eye = torch.eye(dim + 1, dtype=torch.float64)
+
+    def lift(time: Tensor) -> Tensor:
+        return torch.cat([eye, *(eye[:, :directions] * time.to(eye) ** n for n in range(1, degree + 1))], dim=1)
+
+    return lift
+
+
+_PARTLY = "a collineation of the world that keeps the direction{} of motion, and a linear function of the position added to all velocities"
+MOTIONS: dict[str, Motion] = {
+    motion.name: motion
+    for motion in (
+        Motion(polynomial(2, 0), "static_2d", leaves_open="a collineation of the plane", static=True),
+        Motion(polynomial(3, 0), "static_3d", leaves_open="a collineation of space", static=True),
+        Motion(polynomial(2, 1), "constant_direction_2d", leaves_open=_PARTLY.format("")),
+        Motion(polynomial(2, 2), "constant_velocity_2d", leaves_open=AFFINE),
+        Motion(polynomial(2, 2, 2), "constant_acceleration_2d", leaves_open=f"{AFFINE}, and likewise a common acceleration"),
+        Motion(polynomial(3, 1), "constant_direction_3d", leaves_open=_PARTLY.format("")),
+        Motion(polynomial(3, 2), "constant_velocity_planes_3d", leaves_open=_PARTLY.format("s")),
+        Motion(polynomial(3, 3), "constant_velocity_3d", leaves_open=AFFINE),
+        Motion(polynomial(3, 3), "constant_velocity_3d_sensors", sensor=3, leaves_open=AFFINE),
+        Motion(None, "two_bodies_2d", bodies=2, k=3, leaves_open="an affinity of each body, with a linear part common to both"),
+        Motion(None, "two_bodies_3d", bodies=2, k=4, leaves_open="an affinity of each body, with a linear part common to both"),
+    )
+}
+"""The declared models; ``constant_direction``: all points move along one common, unknown direction; ``planes``: within parallel planes."""
+
+
+def as_motion(motion: str | Motion) -> Motion:
+    """The declared model of that name, or the model itself.
+
+    Raises:
+        ValueError: an unknown name.
+    """
+    if isinstance(motion, Motion):
+        return motion
+    if motion not in MOTIONS:
+        raise ValueError(f"motion must be 'auto', a dyntorch.Motion or one of {', '.join(MOTIONS)}, got {motion!r}")
+    return MOTIONS[motion]
