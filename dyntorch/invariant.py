@@ -104,8 +104,10 @@ class Invariant:
     def linearized(
         self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]
     ) -> tuple[Tensor, Tensor] | None:
-        """:meth:`whitened`, flat ``(b, n c)``, and its derivative by all entries of the motion ``(b, p, n c)``, where they are known
-        by hand; None: they are found by automatic differentiation."""
+        """:meth:`whitened`, flat ``(b, n c)``, and its derivative by all entries of the motion ``(b, p, n c)``, by hand.
+
+        None: they are found by automatic differentiation.
+        """
         return None
 
     def compose_derivative(self, motion: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:

@@ -146,7 +146,7 @@ def polynomial(dim: int, directions: int, degree: int = 1) -> Lift:
     return lift
 
 
-_PARTLY = "a collineation of the world that keeps the direction{} of motion, and a linear function of the position added to all velocities"
+_PARTLY = "a collineation of the world that keeps the direction{} of motion, and a velocity, linear in the position, added to all"
 MOTIONS: dict[str, Motion] = {
     motion.name: motion
     for motion in (
@@ -163,7 +163,8 @@ MOTIONS: dict[str, Motion] = {
         Motion(None, "two_bodies_3d", bodies=2, k=4, leaves_open="an affinity of each body, with a linear part common to both"),
     )
 }
-"""The declared models; ``constant_direction``: all points move along one common, unknown direction; ``planes``: within parallel planes."""
+"""The declared models.  ``constant_direction``: all points move along one common, unknown direction; ``planes``: within parallel
+planes."""
 
 
 def as_motion(motion: str | Motion) -> Motion:

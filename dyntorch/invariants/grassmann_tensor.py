@@ -23,7 +23,8 @@ class GrassmannTensor(Invariant):
 
     .. math:: \det(S_1 M_1; \dots; S_n M_n) = \langle A, C_{\alpha_1}(S_1) \otimes \dots \otimes C_{\alpha_n}(S_n) \rangle = 0,
 
-    where A holds the determinants of :math:`\alpha_i` rows of each :math:`M_i` (:func:`~dyntorch.algebra.grassmann.grassmann_tensor`).
+    where A holds the determinants of :math:`\alpha_i` rows of each :math:`M_i`
+    (:func:`~dyntorch.algebra.grassmann.grassmann_tensor`).
     A moving point whose position is linear in some parameters is a static point of a higher space: ``(4, (2, 2, 1))`` are
     points of a plane at constant velocity, ``(6, (2, 2, 2, 1))`` points of space at constant velocity, ``(3, (2, 1, 1))`` is
     the trifocal and ``(3, (2, 2))`` the fundamental tensor; :func:`dyntorch.reconstruct` goes on to the scene.
@@ -97,7 +98,7 @@ class GrassmannTensor(Invariant):
         """Coordinates of all views, less those of the point; hyperplanes fulfil one condition each."""
         return (len(self.profile) if self.dual else sum(self.dims)) - self.k
 
-    def minimal(self) -> int:  # type: ignore[override]
+    def minimal(self) -> int:
         r"""Fewest matches that determine the tensor linearly.
 
         The rows of j matches have in common what their common hyperplanes give, :math:`\prod_i \binom{l_i + 1 - j}{\alpha_i}`
@@ -105,16 +106,15 @@ class GrassmannTensor(Invariant):
         """
         if self.dual:
             return self.width() - 1
-        shared = [
-            prod(comb(d + 1 - j, a) for d, a in zip(self.dims, self.profile, strict=True)) for j in range(1, min(self.dims) + 1)
-        ]
+        orders = range(1, min(self.dims) + 1)
+        shared = [prod(comb(d + 1 - j, a) for d, a in zip(self.dims, self.profile, strict=True)) for j in orders]
         n, rank = 0, 0
         while rank < self.width() - 1:
             n += 1
             rank = sum((-1) ** j * comb(n, j + 1) * common for j, common in enumerate(shared))
         return n
 
-    def compose(self, *projections: Tensor) -> Tensor:  # type: ignore[override]
+    def compose(self, *projections: Tensor) -> Tensor:
         """The Grassmann tensor of projections ``(*batch, l_i + 1, k + 1)``, norm 1; zero for projections of a common null vector.
 
         Example:
@@ -128,7 +128,7 @@ class GrassmannTensor(Invariant):
         norm = tensor.flatten(-order).norm(dim=-1)[(..., *[None] * order)]
         return tensor / norm.where(norm > 0, 1.0)
 
-    def decompose(self, tensor: Tensor) -> tuple[Tensor, ...]:  # type: ignore[override]
+    def decompose(self, tensor: Tensor) -> tuple[Tensor, ...]:
         r"""The projections of the nearest Grassmann tensor, in closed form for a tensor that is one.
 
         Args:

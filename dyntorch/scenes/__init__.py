@@ -1,5 +1,6 @@
 """Ground-truth scenes for tests, benchmarks and experiments: one function per kind of motion, all batched."""
 
+from dyntorch.scenes.lifts import LiftedScene, lifted
 from dyntorch.scenes.lines import translating_lines
 from dyntorch.scenes.plane import lines_concurrent, planar
 from dyntorch.scenes.scene import Scene
@@ -7,9 +8,11 @@ from dyntorch.scenes.space import constant_velocity, moving_points
 from dyntorch.scenes.static import collineation, two_view
 
 __all__ = [
+    "LiftedScene",
     "Scene",
     "collineation",
     "constant_velocity",
+    "lifted",
     "lines_concurrent",
     "moving_points",
     "planar",
