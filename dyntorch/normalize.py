@@ -43,15 +43,15 @@ def normalization(invariant: Invariant, views: Sequence[Tensor], weights: Tensor
     points = [p.points(x, weights) for p, x in zip(invariant.primitives, views, strict=True)]
     if len({x.shape for x in points}) == 1:
         # all views in one pass: a copy costs less than two more rounds of small operations
-        transforms = _similarity(torch.stack(points), weights).unbind(0)
+        transforms = hartley(torch.stack(points), weights).unbind(0)
     else:
-        transforms = tuple(_similarity(x, weights) for x in points)
+        transforms = tuple(hartley(x, weights) for x in points)
     primitives = tuple(p.normalized(t) for p, t in zip(invariant.primitives, transforms, strict=True))
     actions = tuple(p.action(t) for p, t in zip(invariant.primitives, transforms, strict=True))
     return Normalization(transforms, primitives, actions, tuple(t[..., 0, 0] for t in transforms))
 
 
-def _similarity(points: Tensor, weights: Tensor) -> Tensor:
+def hartley(points: Tensor, weights: Tensor) -> Tensor:
     """Similarity of points ``(*batch, n, k, d)``; k points of one match share its weight."""
     d = points.shape[-1]
     total = weights.sum(-1, keepdim=True).clamp(min=torch.finfo(weights.dtype).tiny)
