@@ -36,13 +36,15 @@ _HOME = {
     "align_planar": "dyntorch.tasks.align_planar",
     "align_points": "dyntorch.tasks.align_points",
     "align_lines": "dyntorch.tasks.align_lines",
+    "reconstruct": "dyntorch.tasks.reconstruct",
+    "Motion": "dyntorch.motions",
     # subspaces and factorization
     "canonical_correlation": "dyntorch.algebra.subspaces",
     "orthonormal_basis": "dyntorch.algebra.subspaces",
     "affine_factorization": "dyntorch.algebra.factorization",
     "metric_upgrade": "dyntorch.algebra.factorization",
 }
-_MODULES = ("counting",)
+_MODULES = ("counting", "motions")
 __all__ = sorted([*_HOME, *_MODULES])
 
 

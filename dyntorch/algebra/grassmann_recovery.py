@@ -69,7 +69,10 @@ def check(tensor: Tensor, profile: Sequence[int], sizes: Sequence[int]) -> None:
         raise ValueError(f"profile must have 1 to m_i rows of at least two views, got {tuple(profile)} for sizes {tuple(sizes)}")
     shape = tuple(comb(m, a) for m, a in zip(sizes, profile, strict=True))
     if tuple(tensor.shape[-len(shape) :]) != shape or not tensor.is_floating_point():
-        raise ValueError(f"the tensor of profile {tuple(profile)} is floating point (*batch, {str(shape)[1:-1]}), got {tuple(tensor.shape)} {tensor.dtype}")
+        raise ValueError(
+            f"the tensor of profile {tuple(profile)} is floating point (*batch, {str(shape)[1:-1]}), "
+            f"got {tuple(tensor.shape)} {tensor.dtype}"
+        )
 
 
 def unit(tensor: Tensor) -> tuple[Tensor, Tensor]:
@@ -81,8 +84,14 @@ def unit(tensor: Tensor) -> tuple[Tensor, Tensor]:
     return (flat / flat.norm(dim=-1, keepdim=True)).view(tensor.shape), sound[:, 0]
 
 
+def direction(vector: Tensor) -> Tensor:
+    """Unit vectors; zero stays."""
+    length = vector.norm(dim=-1, keepdim=True)
+    return vector / torch.where(length > 0, length, 1.0)
+
+
 def balanced(parts: Sequence[Tensor]) -> list[Tensor]:
-    """The same projections up to a collineation: all of norm 1, and orthogonal columns of the stack up to that norm.  Zeros stay."""
+    """The same projections up to a collineation: all of norm 1, the columns of the stack orthogonal but for that.  Zeros stay."""
     parts = _normalized(parts)
     stack = torch.cat(parts, dim=-2)
     stack = torch.linalg.qr(stack).Q * (stack != 0).any(-1, keepdim=True)
@@ -94,7 +103,7 @@ def rotated(tensor: Tensor, compounds: Sequence[Tensor]) -> Tensor:
     tries, count = compounds[0].shape[0], len(compounds)
     result = tensor.expand(tries, *tensor.shape)
     for matrix in reversed(compounds):  # the last axis is moved to the front n times, and all are in order again
-        product = result.reshape(tries, -1, matrix.shape[-1]) @ matrix.mT
+        product = result.flatten(1, -2) @ matrix.mT
         result = product.view(result.shape).movedim(-1, -count)
     return result
 
@@ -140,7 +149,7 @@ def _replacements(size: int, alpha: int) -> tuple[Tensor, Tensor, Tensor]:
     places, signs, orders = [], [], []
     for subset in subsets:
         extra = [row for row in range(size) if row not in subset]
-        sets = [subset, *(subset[:j] + (row,) + subset[j + 1 :] for row in extra for j in range(alpha))]
+        sets = [subset, *((*subset[:j], row, *subset[j + 1 :]) for row in extra for j in range(alpha))]
         places.append([number[tuple(sorted(rows))] for rows in sets])
         signs.append([(-1.0) ** sum(a > b for a, b in combinations(rows, 2)) for rows in sets])
         orders.append([*subset, *extra])
@@ -151,7 +160,7 @@ def _recover(tensor: Tensor, table: Tables) -> list[Tensor]:
     """All candidates ``(tries, b, m_i, K)`` for tensors ``(b, ...)`` of norm 1."""
     values = rotated(tensor, table.compounds)
     tries, count = values.shape[:2]
-    flat = values.reshape(tries * count, -1)
+    flat = values.flatten(0, 1).flatten(1)
     # the rows of the largest minor become the unit vectors; the minors count relative to it
     pivot = torch.unravel_index(flat.abs().argmax(-1), tensor.shape[1:])
     place = torch.zeros(len(flat), 1, dtype=torch.long, device=flat.device)
@@ -171,7 +180,7 @@ def _recover(tensor: Tensor, table: Tables) -> list[Tensor]:
 
 
 def _rows(minors: Tensor, table: Tables) -> list[Tensor]:
-    """Projections ``(b, m_i, K)`` whose first rows are unit vectors, from the relative signed minors ``(b, 1 + e_1 alpha_1, ...)``."""
+    """Projections ``(b, m_i, K)`` whose first rows are unit vectors, from relative signed minors ``(b, 1 + e_1 alpha_1, ...)``."""
     views = range(len(table.profile))
     extra = [m - a for m, a in zip(table.sizes, table.profile, strict=True)]
     block = {(i, i): _minors(minors, i).unflatten(-1, (extra[i], table.profile[i])) for i in views}
@@ -203,13 +212,13 @@ def _rank_one(matrix: Tensor) -> tuple[Tensor, Tensor]:
     if 0 in matrix.shape[1:]:
         return matrix.new_zeros(matrix.shape[:2]), matrix.new_zeros(len(matrix), matrix.shape[2])
     longest = matrix.square().sum(-1).argmax(-1)[:, None, None].expand(-1, 1, matrix.shape[2])
-    right = _direction(matrix.gather(1, longest)[:, 0])
+    right = direction(matrix.gather(1, longest)[:, 0])
     for _ in range(POWER_STEPS):
         left = (matrix * right[:, None]).sum(-1)
-        right = _direction((matrix * left[..., None]).sum(1))
+        right = direction((matrix * left[..., None]).sum(1))
     left = (matrix * right[:, None]).sum(-1)
     root = left.norm(dim=-1, keepdim=True).sqrt()
-    return _direction(left) * root, right * root
+    return direction(left) * root, right * root
 
 
 def _scale(minors: Tensor, block: dict[tuple[int, int], Tensor], i: int, q: int) -> Tensor:
@@ -219,7 +228,9 @@ def _scale(minors: Tensor, block: dict[tuple[int, int], Tensor], i: int, q: int)
     ``(b_j b_g b_t; c_j c_g c_t; d_j d_g d_t)``, of which c_t and d_g have the unknown factors.
     """
     # all with the dimensions (batch, b, j, c, g, d, t)
-    (bj, bg, bt), (cj, cg, ct), (dj, dg, dt) = ([_axes(block[u, v], a, b) for b, v in enumerate((0, i, q))] for a, u in enumerate((0, i, q)))
+    (bj, bg, bt), (cj, cg, ct), (dj, dg, dt) = (
+        [_axes(block[u, v], a, b) for b, v in enumerate((0, i, q))] for a, u in enumerate((0, i, q))
+    )
     known = bj * cg * dt - bj * ct * dg - bg * cj * dt - bt * cg * dj
     x, y = (bg * ct * dj).flatten(1), (bt * cj * dg).flatten(1)
     z = minors.flatten(1) - known.flatten(1)
@@ -244,12 +255,6 @@ def _axes(block: Tensor, row: int, column: int) -> Tensor:
     return (block if row <= column else block.mT).reshape(len(block), *shape)
 
 
-def _direction(vector: Tensor) -> Tensor:
-    """Unit vectors; zero stays."""
-    length = vector.norm(dim=-1, keepdim=True)
-    return vector / torch.where(length > 0, length, 1.0)
-
-
 def _normalized(parts: Sequence[Tensor]) -> list[Tensor]:
     """Matrices of Frobenius norm 1; zero stays, and so does what is not finite."""
-    return [_direction(part.nan_to_num(0.0, 0.0, 0.0).flatten(-2)).view(part.shape) for part in parts]
+    return [direction(part.nan_to_num(0.0, 0.0, 0.0).flatten(-2)).view(part.shape) for part in parts]

@@ -52,7 +52,9 @@ def finite(cameras: Tensor, structure: Tensor, lifts: Tensor, algebra: Tensor, w
     values, vh = torch.linalg.svd(rows, full_matrices=False)[1:]
     rank = int((values > TOLERANCE * values[0]).sum())
     if bool(((last - last[0]).norm(dim=-1) > TOLERANCE * last.norm()).any()) or rank == 1:
-        return G, cameras, structure  # the homogeneous coordinate changes with time, or is what it is
+        # the homogeneous coordinate changes with time, or is what it is up to its sign
+        sign = _majority((structure @ last[0]).sign().sum(-1))
+        return G, cameras * sign[..., None, None, None], structure * sign[..., None, None]
     basis = vh[:rank]
     known = (structure != 0).any(-1)
     inside = structure @ basis.mT

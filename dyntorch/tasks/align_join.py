@@ -15,8 +15,9 @@ from dyntorch.invariants.minimal_join_tensor import MinimalJoinTensor
 from dyntorch.matches import Matches
 from dyntorch.robust import robust_fit
 from dyntorch.solution import NOISY, Solution, Status, failed
-from dyntorch.tasks.alignment import MOVING, OUTLIER, STATIC, Alignment, Notice, NoticeCode, notices
+from dyntorch.tasks.alignment import MOVING, OUTLIER, STATIC, Alignment
 from dyntorch.tasks.labelling import CHI_SQUARE, MEDIAN, ROUGH, SIGMAS, Evidence, Labelled, joined
+from dyntorch.tasks.notices import Notice, NoticeCode, notices
 from dyntorch.tasks.static_consensus import static_consensus
 
 MINIMAL = {"join": 47, "minimal_join": 47}

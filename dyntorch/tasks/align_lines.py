@@ -12,9 +12,10 @@ from dyntorch.invariants.translating_lines_matrix import TranslatingLinesMatrix
 from dyntorch.matches import Matches, matches
 from dyntorch.robust import robust_fit
 from dyntorch.solution import Solution, Status, failed
-from dyntorch.tasks.alignment import OUTLIER, STATIC, Alignment, Notice, NoticeCode, check_threshold, notices
+from dyntorch.tasks.alignment import OUTLIER, STATIC, Alignment
 from dyntorch.tasks.labelling import MEDIAN, SIGMAS
 from dyntorch.tasks.line_model import Lines, as_points, settle, spread
+from dyntorch.tasks.notices import Notice, NoticeCode, check_threshold, notices
 
 MINIMAL = TranslatingLinesMatrix.minimal()
 PER_POINT = 9  # matches of lines that one static point gives

@@ -12,8 +12,9 @@ from dyntorch.invariants.homography_tensor import HomographyTensor
 from dyntorch.matches import Matches, matches
 from dyntorch.robust import robust_fit
 from dyntorch.solution import NOISY, Solution, Status, failed
-from dyntorch.tasks.alignment import MOVING, OUTLIER, STATIC, Alignment, check_threshold
+from dyntorch.tasks.alignment import MOVING, OUTLIER, STATIC, Alignment
 from dyntorch.tasks.labelling import CHI_SQUARE, ROUGH, SIGMAS, Evidence, Labelled, joined
+from dyntorch.tasks.notices import check_threshold
 from dyntorch.tasks.planar_notices import planar_notices, unverified
 from dyntorch.tasks.static_consensus import static_consensus
 

@@ -10,7 +10,8 @@ from torch import Tensor
 from dyntorch.invariants.join_tensor import JoinTensor
 from dyntorch.matches import Matches, matches
 from dyntorch.tasks import align_join, align_rigid, align_velocity
-from dyntorch.tasks.alignment import Alignment, check_threshold
+from dyntorch.tasks.alignment import Alignment
+from dyntorch.tasks.notices import check_threshold
 
 Model = Literal["join", "minimal_join", "constant_velocity", "affine_constant_velocity", "rigid"]
 Motion = Literal["straight", "constant_velocity"]

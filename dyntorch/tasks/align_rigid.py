@@ -9,8 +9,9 @@ from dyntorch.algebra.homogeneous import similarity
 from dyntorch.algebra.rigid import rigid_alignment
 from dyntorch.matches import Matches
 from dyntorch.solution import NOISY, Status, failed
-from dyntorch.tasks.alignment import MOVING, OUTLIER, STATIC, Alignment, Notice, NoticeCode, notices
+from dyntorch.tasks.alignment import MOVING, OUTLIER, STATIC, Alignment
 from dyntorch.tasks.labelling import CHI_SQUARE, SIGMAS
+from dyntorch.tasks.notices import Notice, NoticeCode, notices
 from dyntorch.tasks.rigid import MOTIONS, Sightings, combinations, squares
 from dyntorch.tasks.rigid_search import Rigid, search
 

@@ -12,8 +12,9 @@ from dyntorch.matches import Matches
 from dyntorch.robust import robust_fit
 from dyntorch.sampling import uniform
 from dyntorch.solution import NOISY, Status, failed
-from dyntorch.tasks.alignment import OUTLIER, STATIC, Alignment, Notice, NoticeCode, notices
+from dyntorch.tasks.alignment import OUTLIER, STATIC, Alignment
 from dyntorch.tasks.labelling import CHI_SQUARE, MEDIAN, SIGMAS, Evidence
+from dyntorch.tasks.notices import Notice, NoticeCode, notices
 from dyntorch.tasks.velocity_model import DOF, GAUGE, Velocities, information, residuals, settle, world_velocities
 
 MINIMAL = {False: 21, True: 7}

@@ -12,8 +12,9 @@ from dyntorch.invariants.agreement import static_residual
 from dyntorch.invariants.homography_tensor import HomographyTensor
 from dyntorch.matches import Matches
 from dyntorch.solution import failed
-from dyntorch.tasks.alignment import MOVING, OUTLIER, Notice, NoticeCode, notices
+from dyntorch.tasks.alignment import MOVING, OUTLIER
 from dyntorch.tasks.labelling import CHI_SQUARE, Evidence, Labelled
+from dyntorch.tasks.notices import Notice, NoticeCode, notices
 
 RANK = 1e-9
 """Singular value of the estimation matrix, over the largest, that rounding alone leaves."""

@@ -8,7 +8,7 @@ from dyntorch import scenes
 from dyntorch.metrics import grid_transfer_error, label_scores
 from dyntorch.solution import Status
 from dyntorch.tasks.align_planar import align_planar
-from dyntorch.tasks.alignment import Notice, NoticeCode
+from dyntorch.tasks.notices import Notice, NoticeCode
 
 
 def generator(seed=0):

@@ -1,0 +1,142 @@
+"""Projections P^k -> P^l and points from tracks: tensor of a few views, resection of the others, free bundle adjustment."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+from math import comb
+
+import torch
+from torch import Tensor
+
+from dyntorch.algebra.triangulation import reproject, resect, triangulate
+from dyntorch.bundle_adjustment import bundle_adjust
+from dyntorch.constrained import constrain_matches
+from dyntorch.fitting import fit_matches
+from dyntorch.invariants.grassmann_tensor import GrassmannTensor
+from dyntorch.matches import Matches
+from dyntorch.solution import Status, failed
+
+SUBSETS = 6
+"""Choices of views for the tensor, where there are more than it takes; the one of least error in all views wins."""
+LOOKED_AT = 60
+"""Choices of which the most seen and best spread ones are taken."""
+FREE = 10
+"""Steps of free bundle adjustment."""
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Tracks with one flat batch dimension, every view normalized."""
+
+    x: Tensor
+    """``(b, views, n, l)``, 0 where missing."""
+    weights: Tensor
+    """``(b, views, n)`` of normalized coordinates: 1 over the square of the scale of the view, 0 where missing."""
+    scales: Tensor
+    """``(b, views)`` normalized unit over measured unit."""
+    transforms: Tensor
+    """``(b, views, l + 1, l + 1)`` from measured to normalized coordinates."""
+    times: Tensor
+    """``(views,)``."""
+
+    def subset(self, keep: Tensor) -> Tracks:
+        """Some problems of the batch."""
+        return Tracks(self.x[keep], self.weights[keep], self.scales[keep], self.transforms[keep], self.times)
+
+    def only(self, weights: Tensor) -> Tracks:
+        """Other weights."""
+        return Tracks(self.x, weights, self.scales, self.transforms, self.times)
+
+    def repeated(self, count: int) -> Tracks:
+        """Every problem so many times in a row."""
+        parts = (part.repeat_interleave(count, dim=0) for part in (self.x, self.weights, self.scales, self.transforms))
+        return Tracks(*parts, self.times)
+
+
+@dataclass(frozen=True)
+class Projections:
+    """Projections and points in a projective frame, or their failure."""
+
+    projections: Tensor
+    """``(b, views, l + 1, K)``, zero where there are none."""
+    structure: Tensor
+    """``(b, n, K)``, zero where a point is not determined."""
+    status: Tensor
+    """``(b,)`` of :class:`~dyntorch.solution.Status`."""
+
+
+def choices(tracks: Tracks, size: int) -> Tensor:
+    """Indices ``(b, s, size)`` of views for the tensor: seen by many points in common, spread over the time."""
+    views = tracks.weights.shape[1]
+    device = tracks.x.device
+    if comb(views, size) <= LOOKED_AT:
+        options = torch.tensor(list(combinations(range(views), size)), device=device)
+    else:
+        draw = torch.rand(LOOKED_AT, views, generator=torch.Generator().manual_seed(0))
+        options = draw.argsort(-1)[:, :size].sort(-1).values.to(device)
+        even = torch.linspace(0, views - 1, size).round().long().to(device)
+        options = torch.cat([even[None], options]).unique(dim=0)
+    seen = (tracks.weights > 0).to(tracks.x.dtype)[:, options].prod(2).sum(-1)  # (b, options)
+    span = (tracks.times.amax() - tracks.times.amin()).clamp(min=torch.finfo(tracks.x.dtype).tiny)
+    ordered = (tracks.times[options].sort(-1).values / span).to(tracks.x)
+    gap = ordered.diff(dim=-1).amin(-1) * (size - 1)
+    score = seen * gap.clamp(min=1e-6).sqrt()
+    best = score.topk(min(SUBSETS, len(options)), dim=-1).indices
+    return options[best]
+
+
+def projections_of_tracks(tracks: Tracks, invariant: GrassmannTensor, subsets: Tensor | None = None) -> Projections:
+    """Linear, constrained, resected, adjusted: the best of several choices of views.
+
+    Args:
+        tracks: flat batch.
+        invariant: of as many views as the tensor takes.
+        subsets: ``(b, s, size)`` choices of views; None: those of :func:`choices`.
+    """
+    size = len(invariant.profile)
+    subsets = choices(tracks, size) if subsets is None else subsets
+    b, count, _ = subsets.shape
+    many = tracks.repeated(count)
+    found = _from_subset(many, invariant, subsets.flatten(0, 1))
+    if count == 1:
+        return found
+    error = mean_error(many, found).nan_to_num(nan=torch.inf)
+    error = torch.where(failed(found.status), torch.inf, error).unflatten(0, (b, count))
+    # where all fail the status of the first choice stands
+    best = error.argmin(1) + count * torch.arange(b, device=error.device)
+    return Projections(found.projections[best], found.structure[best], found.status[best])
+
+
+def mean_error(tracks: Tracks, found: Projections) -> Tensor:
+    """Mean square reprojection error ``(b,)`` over the spare observations, in measured units; points that are not determined
+    cost the extent of the image."""
+    error = (tracks.x - reproject(found.projections, found.structure)).square().sum(-1) * tracks.weights
+    known = (found.structure != 0).any(-1)[:, None] & (tracks.weights > 0)
+    missed = ((tracks.weights > 0) & ~known).to(error.dtype) * tracks.weights
+    return (torch.where(known, error, 0.0) + missed).flatten(1).sum(-1) / (tracks.weights > 0).flatten(1).sum(-1).clamp(min=1)
+
+
+def _from_subset(tracks: Tracks, invariant: GrassmannTensor, chosen: Tensor) -> Projections:
+    """From one choice of views ``(b, size)`` each."""
+    b, views, n, dim = tracks.x.shape
+    x = tracks.x.gather(1, chosen[..., None, None].expand(-1, -1, n, dim))
+    seen = tracks.weights.gather(1, chosen[..., None].expand(-1, -1, n)) > 0
+    parts = x.unbind(1)
+    data = Matches(tuple(parts), seen.all(1).to(x.dtype), None, (b,), x.dtype, x.device)
+    linear = fit_matches(invariant, data)
+    some = torch.stack(constrain_matches(linear, data).motion, dim=1)  # (b, size, l + 1, K)
+    status = linear.status
+    structure = triangulate(some, x, seen.to(x.dtype))
+    if views > len(invariant.profile):
+        whole = resect(structure, tracks.x, tracks.weights)
+        whole = whole.scatter(1, chosen[..., None, None].expand(-1, -1, *some.shape[2:]), some)
+        structure = triangulate(whole, tracks.x, tracks.weights)
+        lost = (whole == 0).flatten(2).all(-1).any(-1)
+        status = torch.where(lost & (status == Status.OK), int(Status.DEGENERATE), status)
+    else:
+        order = chosen.argsort(1)
+        whole = some.gather(1, order[..., None, None].expand_as(some))
+    adjusted = bundle_adjust(tracks.x, tracks.weights, whole, structure, iterations=FREE)
+    bad = failed(status)[:, None, None]
+    return Projections(torch.where(bad[..., None], 0.0, adjusted.cameras), torch.where(bad, 0.0, adjusted.structure), status)

@@ -1,0 +1,174 @@
+"""The steps of a reconstruction: projections, scene, outliers, frame, labels, notices."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from dyntorch.algebra.triangulation import triangulate
+from dyntorch.motions import Motion
+from dyntorch.solution import failed
+from dyntorch.tasks.lifted_bodies import bodies_of
+from dyntorch.tasks.lifted_diagnosis import diagnose
+from dyntorch.tasks.lifted_projections import Projections, Tracks, projections_of_tracks
+from dyntorch.tasks.lifted_robust import robust_projections, suspicious
+from dyntorch.tasks.lifted_scene import Lifting, Scene, distances, framed, positions, scene_of, velocities
+from dyntorch.tasks.reconstruction import Reconstruction
+
+CHI_SQUARE = {2: 9.210, 3: 11.345, 4: 13.277}
+"""99 % quantiles."""
+
+
+def solve(
+    tracks: Tracks,
+    motion: Motion,
+    static: Tensor | None,
+    limit: float | None,
+    generator: torch.Generator | None,
+    batch: tuple[int, ...],
+) -> Reconstruction:
+    """Reconstruct a flat batch of checked problems.
+
+    Args:
+        tracks: flat batch.
+        motion: the model.
+        static: ``(b, n)`` bool.
+        limit: three standard deviations of the noise; None: estimated; infinite: no outliers.
+        generator: of random samples.
+        batch: the shape that the flat dimension comes from.
+    """
+    lifting = None if motion.lift is None else Lifting.of(motion, tracks.times, tracks.x)
+    views = motion.views(tracks.times)
+    invariant = motion.tensor(min(views, motion.k + 1))
+    found = projections_of_tracks(tracks, invariant)
+    scene = _scene(tracks, found, lifting)
+    doubt = suspicious(tracks, _distances(tracks, scene, lifting), motion.k, limit) | failed(found.status)
+    if limit != float("inf") and bool(doubt.any()):
+        chosen = doubt.nonzero()[:, 0]
+        some, fewer = robust_projections(tracks.subset(chosen), invariant, lifting, limit, generator)
+        again = _scene(fewer, some, lifting)
+        tracks = tracks.only(tracks.weights.index_copy(0, chosen, fewer.weights))
+        found = _merged(found, some, chosen)
+        scene = _merged(scene, again, chosen)
+    return _result(tracks, motion, lifting, found, scene, static, batch)
+
+
+def _scene(tracks: Tracks, found: Projections, lifting: Lifting | None) -> Scene:
+    """With a lift the scene in any of its frames; bodies stay in the projective one, with their projections for cameras."""
+    if lifting is not None:
+        return scene_of(tracks, found, lifting)
+    return Scene(found.projections, found.structure, tracks.x.new_zeros(len(tracks.x)))
+
+
+def _merged(old: Projections | Scene, new: Projections | Scene, chosen: Tensor) -> Projections | Scene:
+    """Results of some problems in their places."""
+    return type(old)(*(a.index_copy(0, chosen, b) for a, b in zip(vars(old).values(), vars(new).values(), strict=True)))
+
+
+def _distances(tracks: Tracks, scene: Scene, lifting: Lifting | None) -> Tensor:
+    return distances(tracks, scene.cameras if lifting is None else scene.cameras @ lifting.lifts, scene.structure)
+
+
+def _result(
+    tracks: Tracks,
+    motion: Motion,
+    lifting: Lifting | None,
+    found: Projections,
+    scene: Scene,
+    static: Tensor | None,
+    batch: tuple[int, ...],
+) -> Reconstruction:
+    """Frame, labels, residuals and notices of solved problems, in the caller's batch."""
+    bodies = None
+    if lifting is None:
+        bodies, points, labels, scene = bodies_of(tracks, scene)
+        cameras, speed, projections = bodies[:, 0], None, scene.cameras
+        structure, status = scene.structure, found.status
+    else:
+        scene = framed(tracks, scene, lifting, static)
+        projections = scene.cameras @ lifting.lifts
+        known = (scene.structure != 0).any(-1)
+        labels = torch.where(known, 2, 0)
+        if static is not None:
+            labels = torch.where(known & _rests(tracks, scene, lifting, projections), 1, labels)
+        status = found.status
+        cameras, structure = scene.cameras, scene.structure @ torch.linalg.inv(lifting.root).mT
+        points = positions(scene.structure, lifting.start)
+        speed = velocities(scene.structure, lifting.start, lifting.slope)
+    apart = distances(tracks, projections, scene.structure)
+    counted = apart.isfinite()
+    total = torch.where(counted, apart.square(), 0.0).flatten(1).sum(-1)
+    number = counted.flatten(1).sum(-1)
+    sigma = (total / spare(tracks, counted, motion, lifting).clamp(min=1)).sqrt()
+    back = torch.linalg.inv(tracks.transforms)
+    bad = failed(status)
+    status, warnings = diagnose(tracks, scene, lifting, motion, status, sigma, batch)
+    bad = failed(status)
+
+    def shaped(value: Tensor, none: float = 0.0) -> Tensor:
+        wide = bad[(..., *[None] * (value.ndim - 1))]
+        return torch.where(wide, torch.full_like(value, none), value).reshape((*batch, *value.shape[1:]))
+
+    nan = float("nan")
+    return Reconstruction(
+        motion=motion,
+        cameras=shaped(_unit(back @ cameras)),
+        points=shaped(points, nan),
+        velocities=None if speed is None else shaped(speed, nan),
+        labels=shaped(labels),
+        residual=shaped((total / number.clamp(min=1)).sqrt()),
+        residuals=shaped(apart, nan),
+        sigma=shaped(sigma),
+        status=status.reshape(batch),
+        structure=shaped(structure),
+        projections=shaped(_unit(back @ (projections if lifting is None else projections @ lifting.root))),
+        inliers=shaped(counted),
+        times=tracks.times,
+        ambiguity=_open(motion, static),
+        warnings=warnings,
+        bodies=None if bodies is None else shaped(_unit(back[:, None] @ bodies)),
+    )
+
+
+def spare(tracks: Tracks, counted: Tensor, motion: Motion, lifting: Lifting | None) -> Tensor:
+    """Observed coordinates less all unknowns, ``(b,)``."""
+    seen = counted.any(1).sum(-1)
+    views, size = tracks.x.shape[1], motion.k + 1
+    wide = motion.sensor + 1
+    if lifting is None:
+        cameras = views * (wide * size - 1) - (size * size - 1)
+    else:
+        cameras = views * (wide * lifting.lifts.shape[1] - 1) - (len(lifting.algebra) - 1)
+    return counted.flatten(1).sum(-1) * motion.sensor - seen * motion.k - cameras
+
+
+def _rests(tracks: Tracks, scene: Scene, lifting: Lifting, projections: Tensor) -> Tensor:
+    """Which points ``(b, n)`` are explained as well, within the noise, by one position for all times."""
+    change = (lifting.lifts - lifting.lifts.mean(0)).flatten(0, 1)
+    still = torch.linalg.svd(change).Vh[-lifting.lifts.shape[1] :].mT  # constants of points at rest
+    moving = _cost(tracks, projections, scene.structure)
+    resting = _cost(tracks, projections @ still, triangulate(projections @ still, tracks.x, tracks.weights, steps=2))
+    count = (tracks.weights > 0).flatten(1).sum(-1)
+    seen = (scene.structure != 0).any(-1).sum(-1)
+    free = (count * tracks.x.shape[-1] - seen * (lifting.lifts.shape[-1] - 1)).clamp(min=1)
+    sigma = moving.sum(-1, keepdim=True) / free[:, None]
+    extra = lifting.lifts.shape[-1] - lifting.lifts.shape[1]
+    return resting - moving <= CHI_SQUARE.get(extra, 3.0 * extra + 4.0) * sigma
+
+
+def _cost(tracks: Tracks, projections: Tensor, structure: Tensor) -> Tensor:
+    """Squared reprojection error of each point, ``(b, n)``, measured units."""
+    return distances(tracks, projections, structure).square().nansum(1)
+
+
+def _unit(cameras: Tensor) -> Tensor:
+    return cameras / cameras.flatten(-2).norm(dim=-1)[..., None, None].clamp(min=torch.finfo(cameras.dtype).tiny)
+
+
+def _open(motion: Motion, static: Tensor | None) -> str:
+    """What the tracks cannot tell."""
+    if motion.lift is None or motion.static:
+        return f"known up to {motion.leaves_open}" if motion.leaves_open else ""
+    if static is not None:
+        return f"known up to {motion.leaves_open}; the given static points fix the common motion"
+    return f"known up to {motion.leaves_open}; without static points the frame is the one in which the points move least"

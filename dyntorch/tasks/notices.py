@@ -1,0 +1,107 @@
+"""What should be known about the data of one problem before its result is trusted: notices with their figures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import torch
+from torch import Tensor
+
+
+class NoticeCode(StrEnum):
+    """What a :class:`Notice` is about."""
+
+    DEGENERATE = "degenerate"
+    """The matches leave several tensors, exactly; the motion rests on static matches alone."""
+    NEAR_STATIC = "near_static"
+    """So little moves that the noise decides between tensors; the motion rests on the static matches."""
+    FEW_MOVING = "few_moving"
+    """Fewer moving matches than determine the motion by themselves."""
+    FEW_LINES = "few_lines"
+    """The moving matches lie on fewer lines than determine the motion by themselves."""
+    ONE_LINE = "one_line"
+    """All moving matches lie on one line."""
+    COLLINEAR = "collinear"
+    """All matches of a view lie on one line."""
+    UNVERIFIED = "unverified"
+    """Matches that stand still between two views only: points that paused, or static points mismatched in one view."""
+    PLANAR_VELOCITIES = "planar_velocities"
+    """The velocities lie in a plane."""
+    LINEAR_VELOCITIES = "linear_velocities"
+    """The velocities lie along one line."""
+    EQUAL_VELOCITIES = "equal_velocities"
+    """All matches have one velocity, or all are static."""
+    COMMON_VELOCITY = "common_velocity"
+    """No static match fixes the velocity common to all points."""
+    PURE_TRANSLATION = "pure_translation"
+    """The lines only translate: the motion is known up to a family, unless static points fix it."""
+    STATIC_SCENE = "static_scene"
+    """Nothing moves: the model leaves more than its tensor."""
+    TURNING_CAMERA = "turning_camera"
+    """The centres of all cameras are one point."""
+    UNIFORM_CAMERA = "uniform_camera"
+    """The camera itself moves at constant velocity, which the points' velocities cannot be told from."""
+    WEAK_STACK = "weak_stack"
+    """The projections of all views nearly share a centre: points are known badly along it."""
+    BEHIND = "behind"
+    """Points behind cameras, or at infinity, in every frame."""
+    FEW_OBSERVED = "few_observed"
+    """Points seen in too few views."""
+    UNUSED_VIEW = "unused_view"
+    """A view whose camera was not found."""
+    UNCERTAIN = "uncertain"
+    """The noise leaves the motion so uncertain that it says little."""
+
+
+def check_threshold(threshold: float | None) -> None:
+    """Refuse what is not one distance.
+
+    Raises:
+        ValueError: not a number, not positive, or not finite.
+    """
+    try:
+        value = 1.0 if threshold is None else float(threshold)
+    except (TypeError, ValueError, RuntimeError):
+        value = float("nan")
+    if not 0 < value < float("inf"):
+        raise ValueError(f"threshold must be a positive distance in the unit of the points, got {threshold!r}; None estimates it")
+
+
+@dataclass(frozen=True)
+class Notice:
+    """Something about the data of one problem that limits what its result can be trusted for.
+
+    Attributes:
+        code: what it is about.
+        value: the measured figure behind it.
+        message: one sentence with the figure and the remedy.
+        problem: index into the batch, () for a single problem.
+    """
+
+    code: NoticeCode
+    value: float
+    message: str
+    problem: tuple[int, ...] = ()
+
+    def __str__(self) -> str:
+        place = f"problem {', '.join(map(str, self.problem))}: " if self.problem else ""
+        return f"{place}{self.code}: {self.message}"
+
+
+def notices(code: NoticeCode, message: str, values: Tensor, flagged: Tensor, batch: tuple[int, ...]) -> list[Notice]:
+    """A notice for every flagged problem.
+
+    Args:
+        code: what it is about.
+        message: a sentence with ``{value:g}`` in it.
+        values: ``(b,)`` figures.
+        flagged: ``(b,)`` bool.
+        batch: shape that the flat dimension b comes from.
+    """
+    found = []
+    for flat in flagged.nonzero().flatten().tolist():
+        value = float(values[flat])
+        place = tuple(int(i) for i in torch.unravel_index(torch.tensor(flat), batch)) if batch else ()
+        found.append(Notice(code, value, message.format(value=value), place))
+    return found

@@ -1,0 +1,175 @@
+"""reconstruct(): from tracks of a scene in which everything moves to cameras, points and velocities, in one call."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from dyntorch.algebra.triangulation import observed
+from dyntorch.motions import Motion, as_motion
+from dyntorch.normalize import hartley
+from dyntorch.tasks.lifted_choice import choose
+from dyntorch.tasks.lifted_projections import Tracks
+from dyntorch.tasks.lifted_solver import solve
+from dyntorch.tasks.reconstruction import Reconstruction
+
+
+def reconstruct(
+    tracks: Tensor,
+    motion: str | Motion,
+    times: Tensor | Sequence[float] | None = None,
+    *,
+    static: Tensor | None = None,
+    threshold: float | None = None,
+    weights: Tensor | None = None,
+    generator: torch.Generator | None = None,
+) -> Reconstruction:
+    r"""Cameras, points and velocities from tracks of moving points, seen by moving, uncalibrated cameras.
+
+    A moving point whose position :math:`X(t) = B(t)\,Y` is linear in some constants Y is a static point of a higher projective
+    space :math:`P^k`, and a camera at time t a projection :math:`M = P\,B(t)` of it.  The Grassmann tensor of a few views is
+    estimated linearly and constrained, the projections follow from it in closed form, all other views by resection; the known
+    B(t) then fix the frame of :math:`P^k` up to an ambiguity of the scene, linearly, and bundle adjustment over all views ends
+    it.  Where matches disagree, all of this is done robustly.
+
+    Args:
+        tracks: ``(*batch, views, n, 2)`` pixels (3D sensors: ``(*batch, views, n, 3)``), NaN = missing.
+        motion: a name in ``dyntorch.motions.MOTIONS``, a :class:`dyntorch.Motion` (any lift B(t)), or ``"auto"``: the declared
+            models are tried and the one of least penalized cost is taken.
+
+            ============================== ======== ===== =======================================================
+            model                          views    n     the points
+            ============================== ======== ===== =======================================================
+            static_2d, static_3d           2        4, 8  stand still, in a plane or in space
+            constant_direction_2d, \_3d    3        7, 13 move along one common direction, each at its own speed
+            constant_velocity_2d           3        13    move in a plane, each at its own velocity
+            constant_acceleration_2d       4        40    and acceleration
+            constant_velocity_planes_3d    4        20    move in space within parallel planes
+            constant_velocity_3d           4        40    move in space, each at its own velocity
+            constant_velocity_3d_sensors   3        21    the same, before sensors that measure 3D points
+            two_bodies_2d, two_bodies_3d   2, 3     9, 14 belong to two bodies in relative translation, in any steps
+            ============================== ======== ===== =======================================================
+
+        times: of the views, any unit and spacing; default 0, 1, 2, ...
+        static: ``(*batch, n)`` bool, points known to stand still: they fix the motion common to all points, which no view can
+            tell; without them the frame is the one in which the points move least.
+        threshold: three standard deviations of the noise of one coordinate, in the unit of the tracks.  None estimates it from the
+            tracks; infinity declares that there are no outliers.
+        weights: ``(*batch, views, n)`` not negative; 0 leaves an observation out.
+        generator: source of the random samples of the robust estimate.
+
+    Returns:
+        A :class:`~dyntorch.tasks.reconstruction.Reconstruction`: ``cameras (*batch, views, 3, d + 1)``, ``points (*batch, n, d)``
+        at time 0, ``velocities (*batch, n, d)`` per unit of the times, ``labels``, ``residual``, ``status``, ``warnings`` and the
+        remaining ``ambiguity`` in words.
+
+    Raises:
+        ValueError: fewer views or tracks than the model needs, equal times, tracks of another shape, an unknown model.
+
+    Source: thesis chapter 3 and section 8.3; Wolf and Shashua 2002; Hartley and Schaffalitzky 2004.
+
+    Example:
+        >>> import torch, dyntorch as dyn
+        >>> from dyntorch import metrics, scenes
+        >>> scene = scenes.lifted("constant_velocity_2d", 40, views=4, sigma=0.5, generator=torch.Generator().manual_seed(0))
+        >>> found = dyn.reconstruct(scene.tracks, motion="constant_velocity_2d")
+        >>> found.cameras.shape, found.points.shape, found.velocities.shape
+        (torch.Size([4, 3, 3]), torch.Size([40, 2]), torch.Size([40, 2]))
+        >>> error = metrics.lifted_error(found.structure, scene.structure, scene.lifts)
+        >>> bool(error.position < 0.03), bool(found.residual < 0.7)
+        (True, True)
+    """
+    model = None if motion == "auto" else as_motion(motion)
+    moment, x, w, batch = _checked(tracks, times, weights, threshold)
+    label = _static(static, batch, x)
+    data = _normalized(x, w, moment)
+    limit = threshold if threshold is None or math.isfinite(threshold) else math.inf
+    with torch.no_grad():
+        if model is None:
+            found = choose(data, label, limit, generator, batch)
+        else:
+            _enough(model, moment, x)
+            found = solve(data, model, label, limit, generator, batch)
+    return _returned(found, tracks)
+
+
+def _checked(
+    tracks: Tensor, times: Tensor | Sequence[float] | None, weights: Tensor | None, threshold: float | None
+) -> tuple[Tensor, Tensor, Tensor, tuple[int, ...]]:
+    """Times, flat tracks and weights, and the batch."""
+    if not isinstance(tracks, Tensor) or not tracks.is_floating_point():
+        got = f"{tracks.dtype}" if isinstance(tracks, Tensor) else type(tracks).__name__
+        raise ValueError(f"tracks must be a floating point torch.Tensor, got {got}; use torch.as_tensor(...).double()")
+    if tracks.ndim < 3 or tracks.shape[-1] not in (2, 3):
+        raise ValueError(f"tracks must be (*batch, views, n, 2), or (..., 3) of 3D sensors, got {tuple(tracks.shape)}")
+    if threshold is not None and not threshold > 0:
+        raise ValueError(f"threshold must be positive, in the unit of the tracks, got {threshold!r}; None estimates it")
+    batch, (views, n, dim) = tuple(tracks.shape[:-3]), tracks.shape[-3:]
+    moment = torch.arange(views, dtype=torch.float64) if times is None else torch.as_tensor(times).detach().cpu().double()
+    if moment.shape != (views,) or not bool(moment.isfinite().all()):
+        raise ValueError(f"times must be {views} finite numbers, one per view, got {times!r}")
+    if weights is not None and weights.shape[-2:] != (views, n):
+        raise ValueError(f"weights must be (*batch, views, n) = {(*batch, views, n)}, got {tuple(weights.shape)}")
+    if weights is not None and bool((weights < 0).any()):
+        raise ValueError(f"weights must not be negative, got {float(weights.min()):g}; use 0 to leave an observation out")
+    x, w = observed(tracks.detach(), None if weights is None else weights.detach())
+    count = math.prod(batch)
+    w = w.double().expand(*batch, views, n)
+    return moment, x.double().reshape(count, views, n, dim), w.reshape(count, views, n), batch
+
+
+def _static(static: Tensor | None, batch: tuple[int, ...], x: Tensor) -> Tensor | None:
+    if static is None:
+        return None
+    n = x.shape[2]
+    if not isinstance(static, Tensor) or static.shape[-1:] != (n,) or static.dtype != torch.bool:
+        got = f"{tuple(static.shape)} {static.dtype}" if isinstance(static, Tensor) else type(static).__name__
+        raise ValueError(f"static must be a bool tensor (*batch, n) = {(*batch, n)}, got {got}")
+    return static.expand(*batch, n).reshape(len(x), n)
+
+
+def _normalized(x: Tensor, weights: Tensor, times: Tensor) -> Tracks:
+    """Every view of mean 0 and rms sqrt(l), the weights such that the error stays that of the measured units."""
+    transforms = hartley(x.unsqueeze(-2), (weights > 0).to(x.dtype))
+    scales = transforms[..., 0, 0]
+    moved = x * scales[..., None, None] + transforms[..., None, :-1, -1]
+    moved = torch.where((weights > 0)[..., None], moved, 0.0)
+    # of order one: the views' scales over their mean
+    share = scales.square().mean(-1, keepdim=True) / scales.square()
+    return Tracks(moved, weights * share[..., None], scales, transforms, times)
+
+
+def _enough(model: Motion, times: Tensor, x: Tensor) -> None:
+    """Refuse what no problem of this shape can be solved from."""
+    views, n, dim = x.shape[1:]
+    if dim != model.sensor:
+        kind = "3D sensors" if model.sensor == 3 else "images"
+        raise ValueError(f"{model.name!r} takes tracks of {kind}, (*batch, views, n, {model.sensor}), got {tuple(x.shape[1:])}")
+    if not model.static and model.lift is not None and len(times.unique()) < min(len(times), 2):
+        raise ValueError(f"all times are {float(times[0]):g}: views at different times are needed to see a motion; give times=")
+    least = model.views(times)
+    if views < least or (model.lift is not None and least > len(times)):
+        usual = model.views(torch.arange(12.0))
+        if views >= usual and len(times.unique()) < len(times):
+            raise ValueError(
+                f"{model.name!r} needs views at {usual} different times or more, got {len(times.unique())} in {views} views"
+            )
+        raise ValueError(f"{model.name!r} needs at least {usual} views, got {views}; add views, or use a model with fewer unknowns")
+    need = max(model.tensor(min(least, model.k + 1)).minimal(), (model.k + 1) * (model.k + 2) // 2 - 1 if model.bodies > 1 else 0)
+    if n < need:
+        raise ValueError(f"{model.name!r} needs at least {need} tracks through {least} views, got {n}; add tracks")
+
+
+def _returned(found: Reconstruction, tracks: Tensor) -> Reconstruction:
+    """Floating point results in the dtype and on the device of the tracks."""
+    from dataclasses import fields, replace
+
+    changed = {
+        f.name: getattr(found, f.name).to(device=tracks.device, dtype=tracks.dtype)
+        for f in fields(found)
+        if isinstance(getattr(found, f.name), Tensor) and getattr(found, f.name).is_floating_point() and f.name != "times"
+    }
+    return replace(found, **changed)

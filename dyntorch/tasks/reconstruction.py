@@ -1,0 +1,135 @@
+"""What ``reconstruct`` returns: cameras, points and velocities of a moving scene, and what should be known about them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from dyntorch.algebra.homogeneous import inhomogeneous
+from dyntorch.algebra.triangulation import reproject
+from dyntorch.motions import Motion
+from dyntorch.solution import REMEDY, Status
+from dyntorch.tasks.notices import Notice
+
+
+class Ranked(NamedTuple):
+    """How one model did when the model was to be chosen."""
+
+    motion: str
+    score: float
+    """Penalized cost, less is better; infinite where the model failed."""
+    residual: float
+    """Rms reprojection error in the unit of the tracks."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Reconstruction:
+    """Result of :func:`dyntorch.reconstruct`.
+
+    Attributes:
+        motion: the model.
+        cameras: :math:`P_i`, ``(*batch, views, l + 1, d + 1)`` of norm 1, :math:`x_i \\sim P_i X(t_i)`; zero where the status says
+            that there are none.  Of two bodies: those of body 1.
+        points: ``(*batch, n, d)`` positions at time 0; NaN where a point was not found.  Of two bodies: each in the frame of its
+            own body.
+        velocities: ``(*batch, n, d)`` per unit of the times, at time 0; None for two bodies.
+        labels: ``(*batch, n)`` 0 outlier or not found, 1 static (known only where static points were given), 2 moving; of two
+            bodies 1 and 2.
+        residual: ``(*batch,)`` rms reprojection error of the observations that count, in the unit of the tracks.
+        residuals: ``(*batch, views, n)`` reprojection distances; NaN where missing or not found.
+        sigma: ``(*batch,)`` noise of one coordinate that the residuals show.
+        status: ``(*batch,)`` of :class:`dyntorch.Status`.
+        structure: ``(*batch, n, K)`` homogeneous constants Y of the model, :math:`X(t) \\sim B(t)\\,Y`.
+        projections: ``(*batch, views, l + 1, K)``, :math:`M_i \\sim P_i B_i`.
+        inliers: ``(*batch, views, n)`` observations that count.
+        times: ``(views,)``.
+        ambiguity: a sentence: what the tracks cannot tell, even without noise.
+        warnings: notices on single problems of the batch.
+        bodies: cameras of both bodies, ``(*batch, 2, views, l + 1, d + 1)``; None without.
+        candidates: the models that were tried, best first, where the model was to be chosen.
+    """
+
+    motion: Motion
+    cameras: Tensor
+    points: Tensor
+    velocities: Tensor | None
+    labels: Tensor
+    residual: Tensor
+    residuals: Tensor
+    sigma: Tensor
+    status: Tensor
+    structure: Tensor
+    projections: Tensor
+    inliers: Tensor
+    times: Tensor
+    ambiguity: str
+    warnings: tuple[Notice, ...] = ()
+    bodies: Tensor | None = None
+    candidates: tuple[Ranked, ...] = field(default=())
+
+    def at(self, time: float) -> Tensor:
+        """Positions ``(*batch, n, d)`` at any time; of two bodies the points, which rest in their frames.
+
+        Example:
+            >>> import torch, dyntorch as dyn
+            >>> from dyntorch import scenes
+            >>> scene = scenes.lifted("constant_velocity_2d", 30, generator=torch.Generator().manual_seed(0))
+            >>> found = dyn.reconstruct(scene.tracks, "constant_velocity_2d")
+            >>> bool(torch.allclose(found.at(2.0), found.points + 2 * found.velocities))
+            True
+        """
+        if self.motion.lift is None:
+            return self.points
+        lift = self.motion.lifts([time])[0].to(self.structure)
+        return torch.where(self.points.isnan(), self.points, inhomogeneous(self.structure @ lift.mT))
+
+    def image(self, camera: Tensor, time: float) -> Tensor:
+        """Where a camera ``(*batch, l + 1, d + 1)`` sees the points at any time, ``(*batch, n, l)``: views that nobody took."""
+        if self.motion.lift is None:
+            raise ValueError(f"{self.motion!r} says nothing about times between the views")
+        lift = self.motion.lifts([time])[0].to(self.structure)
+        seen = reproject((camera @ lift).unsqueeze(-3), self.structure).squeeze(-3)
+        return torch.where(self.points.isnan().any(-1, keepdim=True), torch.nan, seen)
+
+    def check(self) -> Reconstruction:
+        """Raise where any problem failed.
+
+        Raises:
+            ValueError: says which problems failed, how, and what to do.
+        """
+        status = self.status.reshape(-1)
+        for state in Status:
+            where = (status == state).nonzero().flatten().tolist()
+            if state != Status.OK and where:
+                reasons = " ".join(str(w) for w in self.warnings[:3])
+                shown = ", ".join(str(i) for i in where[:8]) + (", ..." if len(where) > 8 else "")
+                problems = f"problem {shown} of {len(status)}" if self.status.ndim else "the problem"
+                raise ValueError(
+                    f"{self.motion!r}: {problems}: {state.name}; {REMEDY[state]}" + (f" ({reasons})" if reasons else "")
+                )
+        return self
+
+    def __repr__(self) -> str:
+        states = Counter(Status(s).name for s in self.status.reshape(-1).tolist())
+        kinds = ("outlier", "body 1", "body 2") if self.motion.bodies > 1 else ("outlier", "static", "moving")
+        flat = self.labels.reshape(-1)
+        counted = ", ".join(f"{int((flat == i).sum())} {kind}" for i, kind in enumerate(kinds) if i or bool((flat == 0).any()))
+        views, n = self.residuals.shape[-2:]
+        listed = ", ".join(f"{count} {name}" for name, count in states.items()) or "empty"
+        lines = [
+            f"Reconstruction({self.motion.name}, views={views}, points={n}, batch={tuple(self.status.shape)}: {listed})",
+            f"  labels: {counted}",
+        ]
+        if self.residual.numel():
+            middle = float(self.residual.double().nan_to_num().median())
+            lines.append(f"  residual: {middle:.3g} rms" + (" (median)" if self.status.ndim else ""))
+        if self.status.ndim:
+            seen = Counter(w.code.value for w in self.warnings)
+            lines += [f"  warning {code}: {count} of {self.status.numel()} problems" for code, count in sorted(seen.items())]
+        else:
+            lines += [f"  warning {w}" for w in self.warnings]
+        return "\n".join(lines)
