@@ -1,8 +1,8 @@
 r"""The least squares problem of bundle adjustment: reprojection errors in cameras and points, and its damped step.
 
 The points are eliminated first, each by the Cholesky factorization of its :math:`K \times K` block, column by column for all
-points at once: their index is the last one of every array here.  (LAPACK takes more than 1 us for the matrix of one point; the
-columns of 32 problems of 60 points 0.2 us.)
+points at once: their index is the last one of every array here.  (64 problems of 60 points of P^4: 0.09 us per point, LAPACK on
+one matrix after the other 0.28 us; a single problem loses 0.08 ms that way.)
 """
 
 from __future__ import annotations

@@ -65,7 +65,7 @@ def similarities(case: Case, seed: int = 5) -> tuple[Tensor, ...]:
     for v, primitive in enumerate(case.invariant.primitives):
         frame = torch.eye(primitive.dim + 1, dtype=torch.float64)
         turn = torch.linalg.qr(torch.randn(primitive.dim, primitive.dim, generator=g, dtype=torch.float64)).Q
-        frame[:-1, :-1] = (0.1, 3.0, 40.0)[v] * turn
+        frame[:-1, :-1] = (0.1, 3.0, 40.0, 0.7)[v] * turn
         frame[:-1, -1] = 20.0 * torch.randn(primitive.dim, generator=g, dtype=torch.float64)
         frames.append(frame)
     return tuple(frames)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import combinations, product
 
 import torch
 from torch import Tensor
@@ -22,6 +23,9 @@ PIXELS = (1 / 250.0, (320.0, 240.0))
 
 LINES = (1 / 120.0, (320.0, 240.0))
 """The same for lines, whose distances from the centre are less than those of points; noise in the angle is in these units."""
+
+IMAGE = (1 / 350.0, (500.0, 500.0))
+"""The same for pictures of lifted scenes."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +55,8 @@ class Case:
     """Scale and centre that bring the scene to order 1."""
     truth: Callable[[Motion], Motion] = lambda motion: motion
     """The motion of a scene in the parts that the invariant has."""
+    projected: bool = False
+    """Whether distances are those to the nearest exact match itself, not the first order of it."""
     follows: Callable[[Invariant, tuple[Tensor, ...]], Invariant] = lambda invariant, frames: invariant
     """The invariant after a change of coordinates of every view."""
 
@@ -74,7 +80,9 @@ class Case:
         )
 
     def __repr__(self) -> str:
-        return repr(self.invariant).replace("third=", "").replace("measure=", "").replace("n=", "").replace("'", "")
+        return (
+            repr(self.invariant).replace("third=", "").replace("measure=", "").replace("n=", "").replace("'", "").replace(" ", "")
+        )
 
 
 def lift(x: Tensor) -> Tensor:
@@ -207,6 +215,73 @@ def still_points(**options: object) -> Scene:
     return scenes.planar(**options, static=1.0)  # type: ignore[arg-type]
 
 
+def lifted(motion: str, times: tuple[float, ...], **options: object) -> Scene:
+    """Views of points that are static in a higher space, with the projections from it."""
+    made = scenes.lifted(motion, times=times, **options)  # type: ignore[arg-type]
+    views, exact = (x.unbind(-3) for x in (made.tracks, made.exact))
+    return Scene(views, exact, tuple(unit(made.projections).unbind(-3)), made.labels, made.sigma)
+
+
+def unit(matrix: Tensor) -> Tensor:
+    return matrix / matrix.norm(dim=(-2, -1), keepdim=True)
+
+
+def hyperplanes(x: Tensor) -> Tensor:
+    """The hyperplanes [I | -x] through points ``(..., d)``: ``(..., d, d + 1)``."""
+    eye = torch.eye(x.shape[-1], dtype=x.dtype, device=x.device).expand(*x.shape, -1)
+    return torch.cat([eye, -x[..., None]], dim=-1)
+
+
+def minors(profile: tuple[int, ...], motion: Motion) -> Tensor:
+    """All determinants of rows of the projections, so many of each as the profile says, one by one: ``(*batch, D)``."""
+    sets = product(*(combinations(range(m.shape[-2]), a) for a, m in zip(profile, motion, strict=True)))
+    stacks = [torch.cat([m[..., list(rows), :] for m, rows in zip(motion, chosen, strict=True)], dim=-2) for chosen in sets]
+    return torch.linalg.det(torch.stack(stacks, dim=-3))
+
+
+def tensor_error(profile: tuple[int, ...], estimated: Motion, true: Motion) -> Tensor:
+    """Relative distance of the minors of the projections, which a collineation of the space scales alike."""
+    a, b = (torch.nn.functional.normalize(minors(profile, m), dim=-1) for m in (estimated, true))
+    return torch.minimum((a - b).norm(dim=-1), (a + b).norm(dim=-1))
+
+
+def seen(motion: Motion, *views: Tensor) -> Tensor:
+    """One point of the space lies on all hyperplanes that the images span: what is left of them at the nearest one.
+
+    A choice of hyperplanes whose determinants vanish would do, too, but also where the chosen ones themselves are dependent.
+    """
+    rows = torch.cat([hyperplanes(x) @ m for x, m in zip(views, motion, strict=True)])
+    if rows.shape[0] == rows.shape[1]:
+        return torch.linalg.det(rows)[None]
+    return rows @ torch.linalg.eigh(rows.mT @ rows)[1][:, 0]
+
+
+def grassmann(
+    k: int,
+    profile: tuple[int, ...],
+    motion: str,
+    times: tuple[float, ...],
+    minimal: int,
+    *,
+    dims: int = 2,
+    jitter: float = 0.5,
+    **options: object,
+) -> Case:
+    invariant = dyn.GrassmannTensor(k, profile, dims)
+    single = sum(dims for _ in profile) - k == 1
+    return Case(
+        invariant,
+        partial(lifted, motion, times, jitter=jitter),
+        1,
+        partial(tensor_error, profile),
+        seen,
+        minimal,
+        units=None if dims == 3 else IMAGE,
+        projected=not single,
+        **options,  # type: ignore[arg-type]
+    )
+
+
 JOIN_LABELLED = {0: 60, 1: 50, 2: 40, 3: 30, 4: 20, 5: 10, 6: 4, 7: 0}
 PLANE = {"moves": True, "labelled": {0: 26, 1: 19, 2: 12, 3: 5, 4: 0}}
 SPACE = {"moves": True, "outliers": 0.2}
@@ -229,4 +304,12 @@ CASES = (
         **SPACE,
     ),
     Case(dyn.TranslatingLinesMatrix(), scenes.translating_lines, 1, parts_error, coplanar, 35, moves=True),
+    grassmann(3, (2, 2), "static_3d", (0, 1), 8, jitter=1.0),
+    grassmann(3, (2, 1, 1), "static_3d", (0, 1, 2), 7),
+    grassmann(3, (1, 1, 1, 1), "static_3d", (0, 1, 2, 3), 6),
+    grassmann(4, (2, 2, 1), "constant_velocity_2d", (0, 4, 9), 13, moves=True),
+    grassmann(5, (2, 2, 2), "constant_velocity_planes_3d", (0, 4, 9), 26, moves=True),
+    grassmann(5, (2, 2, 1, 1), "constant_velocity_planes_3d", (0, 4, 9, 13), 20, moves=True),
+    grassmann(6, (2, 2, 2, 1), "constant_velocity_3d", (0, 4, 9, 13), 40, moves=True),
+    grassmann(6, (3, 3, 1), "constant_velocity_3d_sensors", (0, 4, 9), 21, dims=3, moves=True),
 )

@@ -20,6 +20,12 @@ def plucker(ends: Tensor) -> Tensor:
     return torch.stack([p[..., i] * q[..., j] - p[..., j] * q[..., i] for i, j in combinations(range(4), 2)], dim=-1)
 
 
+def subdeterminants(matrix: Tensor, order: int) -> Tensor:
+    """All minors of an order, in lexicographic order of rows and columns."""
+    rows, columns = (list(combinations(range(size), order)) for size in matrix.shape)
+    return torch.stack([torch.stack([torch.linalg.det(matrix[list(r)][:, list(c)]) for c in columns]) for r in rows])
+
+
 def vectors(primitive: Primitive, x: Tensor) -> list[Tensor]:
     """All vectors that one measurement puts into its slot, as long as they count."""
     if isinstance(primitive, Hyperplane):
@@ -27,7 +33,8 @@ def vectors(primitive: Primitive, x: Tensor) -> list[Tensor]:
     if isinstance(primitive, Line):
         return [plucker(x) / (x[1] - x[0]).norm().sqrt()]
     if isinstance(primitive, HyperplanesThrough):
-        return list(torch.cat([torch.eye(len(x), dtype=x.dtype), -x[:, None]], dim=1))
+        planes = torch.cat([torch.eye(len(x), dtype=x.dtype), -x[:, None]], dim=1)
+        return list(subdeterminants(planes, primitive.order))
     return [lift(x)]
 
 
@@ -172,10 +179,10 @@ def pulled_back(case: Case, tensor: Tensor, frames: Views) -> Tensor:
             continue  # the cameras followed: what they see has not changed
         if isinstance(primitives[v], Hyperplane | HyperplanesThrough):
             frame = torch.linalg.inv(frame).mT
+        if isinstance(primitives[v], HyperplanesThrough):
+            frame = subdeterminants(frame, primitives[v].order)
         if isinstance(primitives[v], Line):
-            pairs = list(combinations(range(4), 2))
-            minors = [[frame[i, k] * frame[j, m] - frame[i, m] * frame[j, k] for k, m in pairs] for i, j in pairs]
-            frame = torch.stack([torch.stack(row) for row in minors])
+            frame = subdeterminants(frame, 2)
         tensor = torch.tensordot(tensor, frame, dims=([lead + axis], [0])).movedim(-1, lead + axis)
     flat = spans(case, tensor)
     return torch.linalg.qr(flat.mT)[0].mT.reshape(tensor.shape)

@@ -14,10 +14,9 @@ STEPS = 2
 """Gauss-Newton steps from the algebraic point to the one of least reprojection error."""
 SPREAD = 1e-12
 """Of the trace: what keeps the inverse of a point's information finite where its views do not determine it."""
-
-
 FLOOR = 1e-15
 """Of the last coordinate of an image, with point and projections of norm 1: points at infinity stay finite."""
+TINY = 1e-100
 
 
 class Linearization(NamedTuple):
@@ -61,13 +60,14 @@ def linearize(projections: Sequence[Tensor], views: Sequence[Tensor], scales: Se
         image = (top @ y[..., None])[..., 0] / depth
         slope = (top - image[..., None] * last) * (weight / depth)[..., None]
         information = slope.mT @ slope
-        trace = information.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
+        # projections that see nothing have no information, but an inverse
+        trace = information.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None].clamp(min=TINY)
         fixed = information + trace * (y[..., :, None] * y[..., None, :] + SPREAD * _eye(information))
         inverse = torch.linalg.inv_ex(fixed)[0]
         error = (x - image) * weight
         if step < STEPS:
             y = y + (inverse @ (slope.mT @ error[..., None]))[..., 0]
-            y = y / y.norm(dim=-1, keepdim=True)
+            y = y / y.norm(dim=-1, keepdim=True).clamp(min=TINY)
     return Linearization(error, y, slope, inverse, depth, image, weight)
 
 

@@ -16,7 +16,7 @@ from dyntorch.algebra.line_cameras import line_camera
 from dyntorch.least_squares import damped_step
 
 STEPS = 15
-FOLLOWED, NEAR = 3, 1e-4
+FOLLOWED, NEAR = 5, 1e-4
 """Steps that carry derivatives, where they are as small as at a minimum."""
 FREE = 1e-13  # eigenvalue of a Gauss-Newton matrix of trace 1 that is rounding
 FLAT = 1e-12  # relative size of an image line, or a depth, below which an image is no measurement

@@ -205,6 +205,21 @@ def test_the_cost_never_rises_and_no_step_is_the_start():
         before = after
 
 
+def test_the_unit_of_the_images_does_not_matter():
+    x, cameras, structure, lifts = scene("space, constant velocity", noise=0.005)
+    pixels = torch.tensor([[1000.0, 0, 800], [0, 1000, 600], [0, 0, 1]]).double()
+    plain = bundle_adjust(x, None, cameras, structure, lifts, tolerance=1e-12)
+    found = bundle_adjust(1000 * x + pixels[:2, 2], None, pixels @ cameras, structure, lifts, tolerance=1e-12)
+    torch.testing.assert_close(found.cost, 1e6 * plain.cost, rtol=1e-6, atol=0)
+
+
+def test_degenerate_problems_stay_finite():
+    x, cameras, structure, _ = scene("static", (3,), noise=0.005)
+    cameras[0], structure[1], x[2] = cameras[0, :1], structure[1, :1], 0.0  # one camera, one point, one image
+    found = bundle_adjust(x, None, cameras, structure)
+    assert found.cameras.isfinite().all() and found.structure.isfinite().all() and found.cost.isfinite().all()
+
+
 def test_single_precision_and_an_empty_batch():
     x, cameras, structure, lifts = scene("static", (2,))
     found = bundle_adjust(x.float(), None, cameras.float(), structure.float())

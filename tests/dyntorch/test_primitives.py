@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from dyntorch.primitives import Hyperplane, HyperplanesThrough, Line, Point, Projected
-from tests.references import free_vectors, plucker
+from tests.references import free_vectors, plucker, subdeterminants
 
 G = torch.Generator()
 
@@ -21,6 +21,10 @@ ALL = [
     (HyperplanesThrough(1), random(2, 5, 1)),
     (HyperplanesThrough(2), random(2, 5, 2)),
     (HyperplanesThrough(3), random(2, 5, 3)),
+    (HyperplanesThrough(2, 2), random(2, 5, 2)),
+    (HyperplanesThrough(3, 2), random(2, 5, 3)),
+    (HyperplanesThrough(3, 3), random(2, 5, 3)),
+    (HyperplanesThrough(4, 2), random(2, 5, 4)),
     (Hyperplane(2), random(2, 5, 3)),
     (Hyperplane(3), random(2, 5, 4)),
     (Line(), random(2, 5, 2, 3)),
@@ -65,6 +69,36 @@ def test_points_and_the_hyperplanes_through_them():
         # [I | -x] times another point is the difference
         other = random(7, d, seed=1)
         torch.testing.assert_close((planes @ torch.cat([other, torch.ones(7, 1)], -1)[..., None])[..., 0], other - x)
+
+
+@pytest.mark.parametrize(("d", "order"), [(1, 1), (2, 1), (2, 2), (3, 1), (3, 2), (3, 3), (4, 2), (4, 3)])
+def test_meets_of_hyperplanes_are_their_minors(d, order):
+    x = random(4, d)
+    primitive = HyperplanesThrough(d, order)
+    expected = [subdeterminants(torch.cat([torch.eye(d, dtype=torch.float64), -y[:, None]], dim=1), order) for y in x]
+    torch.testing.assert_close(primitive.vectors(x), torch.stack(expected))
+    # linear in x: every row depends on so many coordinates, whose derivatives slopes() lists row by row
+    gradient = random(primitive.width, 4, seed=2)
+    jacobian = torch.stack([torch.func.jacrev(lambda y: primitive.vectors(y[None])[0])(y) for y in x])  # (n, rows, width, d)
+    full = torch.einsum("nrwd,wn->rdn", jacobian, gradient)
+    found = primitive.slopes(gradient)
+    assert found.shape == (primitive.rows * order, 4)
+    torch.testing.assert_close(found.unflatten(0, (primitive.rows, order)).square().sum(1), full.square().sum(1))
+    torch.testing.assert_close(found.unflatten(0, (primitive.rows, order)).sort(1).values, _dependent(full, order).sort(1).values)
+
+
+def _dependent(slopes, order):
+    """The entries ``(rows, order, n)`` of ``(rows, d, n)`` that are not always zero."""
+    where = slopes.abs().amax(-1) > 0
+    assert (where.sum(1) == order).all()
+    return slopes[where].unflatten(0, (len(slopes), order))
+
+
+def test_the_meet_of_all_hyperplanes_is_the_point():
+    x = random(6, 2)
+    one = torch.ones(6, dtype=torch.float64)
+    torch.testing.assert_close(HyperplanesThrough(2, 2).raw(x), torch.stack([one, -x[:, 1], x[:, 0]], dim=-1))
+    assert HyperplanesThrough(3, 3).raw(random(5, 3)).shape == (5, 4)
 
 
 def test_hyperplanes_of_any_scale_have_unit_normals():

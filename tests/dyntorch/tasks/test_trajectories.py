@@ -159,9 +159,9 @@ def test_gradients_of_points():
     (gradient,) = torch.autograd.grad(value(x), x)
     for index in ((0, 0, 0), (3, 1, 1), (5, 0, 1)):
         step = torch.zeros_like(x)
-        step[index] = 1e-3
-        numeric = (value(x + step) - value(x - step)) / 2e-3
-        torch.testing.assert_close(gradient[index], numeric.detach(), rtol=1e-4, atol=1e-9)
+        step[index] = 1e-2
+        numeric = (value(x + step) - value(x - step)) / 2e-2
+        torch.testing.assert_close(gradient[index], numeric.detach(), rtol=1e-5, atol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,114 @@
+"""Lifts: ambiguities of the theory, the upgrade by random cameras, the views that it needs."""
+
+import pytest
+import torch
+
+from dyntorch.algebra.lift import balanced, gauge_algebra, kernel, least_views, upgrade
+
+
+def random(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def lifts(dim, axes, times, degree=1):
+    """[I | t E | t^2 E], written down entry by entry."""
+    found = torch.zeros(len(times), dim + 1, dim + 1 + axes * degree, dtype=torch.float64)
+    for i, t in enumerate(times):
+        for j in range(dim + 1):
+            found[i, j, j] = 1.0
+        for power in range(degree):
+            for j in range(axes):
+                found[i, j, dim + 1 + power * axes + j] = t ** (power + 1)
+    return found
+
+
+# world dimension, moving axes, degree, rows of a camera, dimension of the ambiguity, views that the upgrade needs
+TABLE = {
+    "constant_direction_2d": (2, 1, 1, 3, 9, 3),
+    "constant_velocity_2d": (2, 2, 1, 3, 9, 3),
+    "constant_acceleration_2d": (2, 2, 2, 3, 11, 4),
+    "constant_direction_3d": (3, 1, 1, 3, 16, 3),
+    "constant_velocity_planes_3d": (3, 2, 1, 3, 16, 4),
+    "constant_velocity_3d": (3, 3, 1, 3, 16, 4),
+    "constant_velocity_3d_sensors": (3, 3, 1, 4, 16, 3),
+}
+TIMES = [(0.0, 1.0, 2.0, 3.0, 4.0, 5.0), (-3.0, 0.5, 1.0, 4.0, 9.0, 9.5), (100.0, 101.0, 103.0, 104.0, 107.0, 110.0)]
+
+
+@pytest.mark.parametrize("times", TIMES, ids=["even", "uneven", "far from zero"])
+@pytest.mark.parametrize("name", TABLE)
+def test_ambiguities_of_the_theory(name, times):
+    dim, axes, degree, rows, ambiguity, views = TABLE[name]
+    B = lifts(dim, axes, times, degree)
+    algebra = gauge_algebra(balanced(B)[0])
+    assert len(algebra) == ambiguity
+    flat = algebra.flatten(1)
+    torch.testing.assert_close(flat @ flat.T, torch.eye(ambiguity).double())
+    # closed under products, as changes of frame are
+    products = (algebra[:, None] @ algebra[None]).flatten(2).flatten(0, 1)
+    assert (products - (products @ flat.T) @ flat).abs().max() < 1e-10
+    # from unbalanced lifts, moved back
+    whole = balanced(B)
+    torch.testing.assert_close(whole[0] @ whole[1], B, rtol=1e-9, atol=1e-9)
+    assert least_views(whole[0], rows) == views
+
+
+def test_kernels():
+    B = lifts(3, 2, (0.0, 2.0, 5.0))
+    N = kernel(B)
+    assert N.shape == (3, 6, 2) and (B @ N).abs().max() < 1e-14
+    torch.testing.assert_close(N.mT @ N, torch.eye(2).double().expand(3, 2, 2))
+    square = lifts(2, 0, (0.0, 1.0))
+    assert kernel(square).shape == (2, 3, 0) and len(gauge_algebra(square)) == 9
+
+
+def test_balanced_lifts_are_orthonormal():
+    B = lifts(2, 2, (1000.0, 1001.0, 1005.0))
+    Q, R = balanced(B)
+    stack = Q.flatten(0, 1)
+    torch.testing.assert_close(stack.T @ stack / 3, torch.eye(5).double())
+    torch.testing.assert_close(Q @ R, B)
+
+
+@pytest.mark.parametrize("name", TABLE)
+def test_upgrade_finds_cameras(name):
+    dim, axes, degree, rows, ambiguity, views = TABLE[name]
+    B = lifts(dim, axes, (0.0, 1.0, 2.5, 4.0)[:views], degree)
+    size = B.shape[-1]
+    cameras, frame = random(2, 3, views, rows, dim + 1), random(2, 3, size, size, seed=1)
+    scale = torch.rand(2, 3, views, 1, 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 1.3
+    projections = scale * cameras @ B @ frame[..., None, :, :]
+    T, found = upgrade(projections, B)
+    assert T.shape == (2, 3, size, size) and found.shape == (2, 3, views, rows, dim + 1)
+    torch.testing.assert_close(projections @ T[..., None, :, :], found @ B, rtol=1e-6, atol=1e-7)
+    assert torch.linalg.cond(T).max() < 1e4
+    # T is the true frame up to an ambiguity of the lifts
+    change = (frame @ T).flatten(0, 1).flatten(1)
+    flat = gauge_algebra(B).flatten(1)
+    assert (change - (change @ flat.T) @ flat).norm() < 1e-6 * change.norm()
+    # batch = loop, up to that ambiguity too
+    alone = upgrade(projections[1, 2], B)
+    torch.testing.assert_close(projections[1, 2] @ alone[0], alone[1] @ B, rtol=1e-6, atol=1e-7)
+
+
+def test_upgrade_of_a_plane_of_static_points():
+    B = lifts(2, 0, (0.0, 1.0))
+    cameras = random(4, 2, 3, 3)
+    T, found = upgrade(cameras, B)
+    assert torch.equal(T, torch.eye(3).double().expand(4, 3, 3))
+    torch.testing.assert_close(found, cameras)
+
+
+def test_too_few_views():
+    B = lifts(3, 3, (0.0, 1.0))
+    with pytest.raises(ValueError, match=r"2 views give 18 equations, 33 are needed; add views"):
+        upgrade(random(2, 3, 7), B)
+    # enough equations are not enough views: with three ones wrong frames remain
+    B = lifts(3, 2, (0.0, 1.0, 2.0))
+    assert least_views(B, 3) == 4 and least_views(B[:2], 3) == 3
+
+
+def test_equal_times_decide_nothing():
+    assert least_views(lifts(2, 2, (1.0, 1.0, 1.0)), 3) == 4
+    # of four views two at the same time are one more camera at that time
+    assert least_views(lifts(2, 2, (0.0, 1.0, 1.0, 2.0)), 3) == 4

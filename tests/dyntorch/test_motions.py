@@ -1,0 +1,119 @@
+"""Motion models: what follows from a lift, against the table of the theory, the scenes, and derivatives by hand."""
+
+import pytest
+import torch
+
+import dyntorch as dyn
+from dyntorch import scenes
+from dyntorch.motions import MOTIONS, Motion, as_motion, polynomial
+
+# k, profile of the fewest views that determine the scene, those views and matches, dimension of the ambiguity
+TABLE = {
+    "static_2d": (2, (2, 1), 2, 4, 8),
+    "static_3d": (3, (2, 2), 2, 8, 15),
+    "constant_direction_2d": (3, (2, 1, 1), 3, 7, 8),
+    "constant_velocity_2d": (4, (2, 2, 1), 3, 13, 8),
+    "constant_acceleration_2d": (6, (2, 2, 2, 1), 4, 40, 10),
+    "constant_direction_3d": (4, (2, 2, 1), 3, 13, 15),
+    "constant_velocity_planes_3d": (5, (2, 2, 1, 1), 4, 20, 15),
+    "constant_velocity_3d": (6, (2, 2, 2, 1), 4, 40, 15),
+    "constant_velocity_3d_sensors": (6, (3, 3, 1), 3, 21, 15),
+    "two_bodies_2d": (3, (2, 2), 2, 8, 15),
+    "two_bodies_3d": (4, (2, 2, 1), 3, 13, 24),
+}
+TIMES = (0.0, 1.0, 2.5, 4.0, 7.0)
+
+
+def test_every_model_is_in_the_table():
+    assert set(TABLE) == set(MOTIONS)
+    assert all(name == motion.name and motion.leaves_open for name, motion in MOTIONS.items())
+
+
+@pytest.mark.parametrize("name", TABLE)
+def test_counts_of_the_theory(name):
+    k, profile, views, matches, ambiguity = TABLE[name]
+    motion = as_motion(name)
+    assert motion.k == k and motion.views(TIMES) == views and motion.minimal(TIMES) == (views, matches)
+    assert motion.profile(views) == profile and motion.ambiguity(TIMES) == ambiguity
+    invariant = motion.tensor(views)
+    assert invariant == dyn.GrassmannTensor(k, profile, motion.sensor) and invariant.minimal() == matches
+    assert motion.dim == (3 if "3d" in name else 2) and repr(motion) == f"Motion({name})"
+
+
+@pytest.mark.parametrize("name", [name for name in TABLE if "bodies" not in name])
+def test_lifts_are_those_of_the_scenes(name):
+    scene = scenes.lifted(name, 3, times=TIMES, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(as_motion(name).lifts(TIMES), scene.lifts)
+
+
+def test_profiles_of_many_views():
+    motion = as_motion("constant_velocity_3d")
+    assert [motion.profile(n) for n in (4, 5, 6, 7)] == [(2, 2, 2, 1), (2, 2, 1, 1, 1), (2, 1, 1, 1, 1, 1), (1,) * 7]
+    sensors = as_motion("constant_velocity_3d_sensors")
+    assert [sensors.profile(n) for n in (3, 4, 5)] == [(3, 3, 1), (3, 2, 1, 1), (3, 1, 1, 1, 1)]
+    for n in (4, 5, 6):
+        assert sum(motion.profile(n)) == motion.k + 1
+
+
+def test_times_of_any_origin_and_unit():
+    motion = as_motion("constant_velocity_3d")
+    times = [1e4 + 0.01 * t for t in TIMES]
+    assert motion.minimal(times) == (4, 40) and motion.ambiguity(times) == 15
+
+
+def test_times_that_do_not_suffice():
+    motion = as_motion("constant_velocity_2d")
+    assert motion.views((0.0, 0.0, 0.0)) == 4
+    assert motion.views((0.0, 1.0)) == 3
+
+
+def test_slope_is_the_derivative():
+    for name in ("constant_velocity_2d", "constant_acceleration_2d"):
+        motion = as_motion(name)
+        expected = torch.zeros(3, motion.k + 1, dtype=torch.float64)
+        expected[0, 3] = expected[1, 4] = 1.0
+        if motion.k == 6:
+            expected[0, 5] = expected[1, 6] = 2 * 1.7
+        for spacing in (1.0, 0.1):
+            torch.testing.assert_close(motion.slope(1.7, spacing), expected, rtol=1e-8, atol=1e-8)
+
+    def turning(t):
+        return torch.stack([torch.stack([t.cos(), t.sin(), t * 0]), torch.stack([t * 0, t * 0, t * 0 + 1])])
+
+    own = Motion(turning, "turning")
+    assert own.dim == 1 and own.k == 2
+    torch.testing.assert_close(own.slope(0.3)[0, :2], torch.tensor([-0.3, 0.3]).double().sin().cos() * 0 + torch.tensor([-0.29552020666, 0.95533648913]).double())
+
+
+def test_motion_of_ones_own():
+    def lift(t):
+        # one common direction, with speeds that change as the square root of the time
+        return torch.cat([torch.eye(3, dtype=t.dtype), torch.stack([t.sqrt(), t * 0, t * 0])[:, None]], dim=1).float()
+
+    motion = Motion(lift, "braking", leaves_open="little")
+    assert (motion.k, motion.dim, motion.sensor, motion.bodies) == (3, 2, 2, 1)
+    found = motion.lifts(torch.tensor([1.0, 4.0]))
+    assert found.shape == (2, 3, 4) and found.dtype == torch.float64 and found[:, 0, 3].tolist() == [1.0, 2.0]
+    assert as_motion(motion) is motion and motion.minimal((1.0, 4.0, 9.0)) == (3, 7)
+
+
+def test_polynomial_lifts():
+    torch.testing.assert_close(polynomial(3, 0)(torch.tensor(5.0)), torch.eye(4, dtype=torch.float64))
+    B = polynomial(2, 2, 3)(torch.tensor(2.0))
+    assert B.shape == (3, 9) and B[0].tolist() == [1, 0, 0, 2, 0, 4, 0, 8, 0] and B[2].tolist() == [0, 0, 1, 0, 0, 0, 0, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Motion(), r"takes a lift, or k >= 2 for bodies without one, got k=0"),
+        (lambda: Motion(lambda t: torch.zeros(4, 3), "tall"), r"lift of 'tall' must return a tensor \(d \+ 1, K\) .*got \(4, 3\)"),
+        (lambda: Motion(lambda t: [1.0]), r"lift of 'custom' .*got list"),
+        (lambda: Motion(lambda t: t), r"got \(\)"),
+        (lambda: as_motion("constant_jerk"), r"motion must be .*constant_velocity_3d.*got 'constant_jerk'"),
+        (lambda: MOTIONS["two_bodies_3d"].lifts((0.0, 1.0)), r"'two_bodies_3d' has no lift"),
+    ],
+)
+def test_misuse(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
