@@ -31,6 +31,7 @@ bench: install
 	$(BIN)/python -m experiments.benchmarks.null_space
 	$(BIN)/python -m experiments.benchmarks.fits
 	$(BIN)/python -m experiments.benchmarks.robust_peers
+	$(BIN)/python -m experiments.benchmarks.lifted
 	$(BIN)/python -m experiments.benchmarks.action_indexer
 
 tables: install
@@ -38,6 +39,10 @@ tables: install
 	$(BIN)/python -m experiments.homography_tensor_noise
 	$(BIN)/python -m experiments.tensor_noise_3d
 	$(BIN)/python -m experiments.robust_estimation
+	$(BIN)/python -m experiments.lifted_noise
+	$(BIN)/python -m experiments.lifted_outliers
+	$(BIN)/python -m experiments.trajectories
+	$(BIN)/python -m experiments.real_lifted
 	$(BIN)/python -m experiments.real_planar
 	$(BIN)/python -m experiments.real_space
 	$(BIN)/python -m experiments.action_recognition

@@ -85,7 +85,7 @@ def reconstruct(
     model = None if motion == "auto" else as_motion(motion)
     moment, x, w, batch = _checked(tracks, times, weights, threshold)
     label = _static(static, batch, x)
-    data = _normalized(x, w, moment)
+    data = normalized(x, w, moment)
     limit = threshold if threshold is None or math.isfinite(threshold) else math.inf
     with torch.no_grad():
         if model is None:
@@ -131,7 +131,7 @@ def _static(static: Tensor | None, batch: tuple[int, ...], x: Tensor) -> Tensor 
     return static.expand(*batch, n).reshape(len(x), n)
 
 
-def _normalized(x: Tensor, weights: Tensor, times: Tensor) -> Tracks:
+def normalized(x: Tensor, weights: Tensor, times: Tensor) -> Tracks:
     """Every view of mean 0 and rms sqrt(l), the weights such that the error stays that of the measured units."""
     transforms = hartley(x.unsqueeze(-2), (weights > 0).to(x.dtype))
     scales = transforms[..., 0, 0]

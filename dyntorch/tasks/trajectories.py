@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.algebra.extensors import compound
-from dyntorch.algebra.homogeneous import inhomogeneous
+from dyntorch.algebra.homogeneous import inhomogeneous, unit
 from dyntorch.algebra.klein_quadric import lines_of_pencil, nearest_line
 from dyntorch.algebra.line_cameras import line_camera
 from dyntorch.algebra.line_collineation import skew_line
@@ -23,7 +23,7 @@ STILL = 2.0
 """A point whose reprojection errors as a static point are below so many sigma (RMS per degree of freedom) is called static."""
 UNCERTAIN = 0.1
 """Expected error of the unit vector of a line, cameras normalized, above which other lines explain the views as well.
-Five views, 0.5 px: between 0.03 and 0.1 nine of ten points are within 0.04 of the scene's radius, between 0.1 and 0.3 within 0.13."""
+Five views, 0.5 px: at 0.03 to 0.1 nine of ten points are within 0.04 of the scene's radius, at 0.1 to 0.3 within 0.13."""
 ROUNDING = 1e-10
 """Noise, in units of the normalized images, that even exact data are taken to have."""
 
@@ -47,7 +47,8 @@ class Trajectories:
     """Result of :func:`triangulate_trajectories`.
 
     Attributes:
-        lines: ``(*batch, n, 6)`` Pluecker coordinates of norm 1, order 01, 02, 03, 12, 13, 23; 0 where the status says so.
+        lines: ``(*batch, n, 6)`` Pluecker coordinates, order 01, 02, 03, 12, 13, 23, of norm 1, the largest positive; 0 where the
+            status says so.
         second: ``(*batch, n, 6)`` the other solution where the status is ``TWO_FOLD``, otherwise 0; its points are
             ``points_on_lines(cameras, x, second)``.
         points: ``(*batch, views, n, 3)`` where the point was at each view, in the world of the cameras; 0 at views that miss it.
@@ -128,7 +129,7 @@ def triangulate_trajectories(
     total = data.weights.sum(-2)
     residual = torch.where(static, still.cost, line.cost).div(torch.where(total > 0, total, 1.0)).sqrt()
     lift = compound(back, 2).mT
-    lines, second = (torch.where(none, 0.0, torch.nn.functional.normalize(v @ lift, dim=-1)) for v in (line.vectors, second))
+    lines, second = (torch.where(none, 0.0, unit((v @ lift)[..., None])[..., 0]) for v in (line.vectors, second))
     moving = _feet(data, line.vectors)
     place = torch.where(static[..., None, :, None], still.vectors[..., None, :, :], moving) @ back.mT[..., None, :, :]
     points = torch.where(((data.weights > 0) & ~few[..., None, :])[..., None], inhomogeneous(place), 0.0)

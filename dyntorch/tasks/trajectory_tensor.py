@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from dyntorch.algebra.homogeneous import unit
 from dyntorch.algebra.line_cameras import cameras_of_lines
 from dyntorch.fitting import fit
 from dyntorch.invariants.grassmann_tensor import GrassmannTensor
@@ -42,8 +43,8 @@ def trajectory_cameras(
     The determinant of the six rows :math:`x_i^T M_i` vanishes for a point on a line: 3^6 = 729 coefficients, 728 matches.  The
     tensor gives the line cameras up to a collineation of P^5, and the Klein quadric, which it has moved, the cameras
     (:func:`~dyntorch.algebra.line_cameras.cameras_of_lines`).  The distances from the images of the lines that this linear result
-    leaves are 200 to 400 times the noise with 728 matches and 17 times with 1500 (``python -m experiments.trajectories``); all cameras
-    and lines are then adjusted together, which brings them down to the noise.
+    leaves are 200 to 400 times the noise with 728 matches and 17 times with 1500 (``python -m experiments.trajectories``); all
+    cameras and lines are then adjusted together, which brings them down to the noise.
 
     Static points are of no use here: alone they give the tensor rank 78.
 
@@ -102,4 +103,4 @@ def _adjusted(cameras: Tensor, x: Tensor, weights: Tensor) -> Tensor:
         # a line whose start from the first cameras was bad stays in a minimum of its own: all get a new start
         data = adjust(data, fitted_lines(data))
     moved = torch.linalg.solve(transform, data.cameras)
-    return moved / torch.linalg.matrix_norm(moved, keepdim=True)
+    return unit(moved)
