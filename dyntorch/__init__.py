@@ -38,6 +38,15 @@ _HOME = {
     "align_lines": "dyntorch.tasks.align_lines",
     "reconstruct": "dyntorch.tasks.reconstruct",
     "Motion": "dyntorch.motions",
+    "triangulate_trajectories": "dyntorch.tasks.trajectories",
+    "trajectory_cameras": "dyntorch.tasks.trajectory_tensor",
+    # projections P^k -> P^l of any k and l
+    "triangulate": "dyntorch.algebra.triangulation",
+    "resect": "dyntorch.algebra.triangulation",
+    "reproject": "dyntorch.algebra.triangulation",
+    "bundle_adjust": "dyntorch.bundle_adjustment",
+    "projective_factorization": "dyntorch.algebra.projective_factorization",
+    "velocity_factorization": "dyntorch.algebra.velocity_factorization",
     # subspaces and factorization
     "canonical_correlation": "dyntorch.algebra.subspaces",
     "orthonormal_basis": "dyntorch.algebra.subspaces",

@@ -3,7 +3,7 @@
     DYNTORCH_DATA=../shared/data OMP_NUM_THREADS=1 python -m experiments.trajectories
 
 Synthetic: cameras at 5 units around points that move by up to 2 units at random speeds, f = 1300 px; per number of views the
-error of the line, 1 - cos of the angle between unit vectors of R^6, and of the points.
+error of the line, 1 - cos of the angle between unit vectors of R^6, and of the points; then the tensor of six uncalibrated views.
 
 Real (drone_tracking/dataset3, Li et al. 2020, CC BY-NC-SA 4.0): the cameras are resected from the detections of the first half
 of the flight and the RTK track, whose clock is found by the way.  In the second half, wherever the track is straight and the
@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from time import perf_counter
 from typing import Annotated, Any
 
 import cv2
@@ -26,6 +27,7 @@ from torch import Tensor
 from dyntorch.algebra.extensors import plucker
 from dyntorch.algebra.homogeneous import apply
 from dyntorch.tasks.trajectories import LineStatus, points_on_lines, triangulate_trajectories
+from dyntorch.tasks.trajectory_tensor import trajectory_cameras
 from experiments.protocol import data_folder
 from experiments.tables import command, note
 from indexing.files import manifest, prepare, write_json
@@ -80,9 +82,8 @@ def interpolated(track: Array, place: Array) -> Array:
     return np.asarray(track[first] * (1 - part) + track[first + 1] * part)
 
 
-def synthetic(views: int, noise: float, config: Config, generator: torch.Generator) -> dict[str, float]:
-    """One row of the noise table."""
-    shape = (config.scenes, views)
+def scene(shape: tuple[int, int], n: int, noise: float, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Cameras ``(scenes, views, 3, 4)``, images, points ``(scenes, views, n, 3)`` and lines ``(scenes, n, 6)``."""
 
     def random(*size: int) -> Tensor:
         return torch.randn(*size, generator=generator, dtype=torch.float64)
@@ -93,12 +94,18 @@ def synthetic(views: int, noise: float, config: Config, generator: torch.Generat
     turn = torch.stack([across, torch.linalg.cross(z, across), z], dim=-2)
     lens = torch.tensor([[1300.0, 0, 500], [0, 1300, 500], [0, 0, 1]]).double()
     cameras = lens @ torch.cat([turn, -turn @ centres[..., None]], dim=-1)
-    start, heading = 0.6 * random(config.scenes, 200, 3), torch.nn.functional.normalize(random(config.scenes, 200, 3), dim=-1)
-    place = 2 * torch.rand(*shape, 200, 1, generator=generator, dtype=torch.float64) - 1
+    start, heading = 0.6 * random(shape[0], n, 3), torch.nn.functional.normalize(random(shape[0], n, 3), dim=-1)
+    place = 2 * torch.rand(*shape, n, 1, generator=generator, dtype=torch.float64) - 1
     points = start[:, None] + place * heading[:, None]
-    x = apply(cameras, points) + noise * random(*shape, 200, 2)
-    found = triangulate_trajectories(cameras, x)
+    x = apply(cameras, points) + noise * random(*shape, n, 2)
     lines = torch.nn.functional.normalize(plucker(torch.stack([start, start + heading], dim=-2)), dim=-1)
+    return cameras, x, points, lines
+
+
+def synthetic(views: int, noise: float, config: Config, generator: torch.Generator) -> dict[str, float]:
+    """One row of the noise table."""
+    cameras, x, points, lines = scene((config.scenes, views), 200, noise, generator)
+    found = triangulate_trajectories(cameras, x)
     angle = 1 - torch.maximum((found.lines * lines).sum(-1).abs(), (found.second * lines).sum(-1).abs())
     ok = (found.status == LineStatus.OK) | (found.status == LineStatus.TWO_FOLD)
     # of four views nothing tells which line is true: the better one counts
@@ -112,6 +119,17 @@ def synthetic(views: int, noise: float, config: Config, generator: torch.Generat
         "one_minus_cos_90": float(angle[ok].quantile(0.9)),
         "points": float(error[ok].median()),
     }
+
+
+def uncalibrated(n: int, noise: float, config: Config) -> dict[str, float]:
+    """One row of the table of six uncalibrated views, one scene: noise that the residuals show, px, before and after adjustment."""
+    x = scene((1, 6), n, noise, torch.Generator().manual_seed(config.seed))[1][0]
+    row: dict[str, float] = {"matches": n, "noise": noise}
+    for name, bundle in (("linear", False), ("adjusted", True)):
+        begin = perf_counter()
+        row[name] = float(trajectory_cameras(x, bundle=bundle).trajectories.sigma)
+        row[f"{name}_seconds"] = perf_counter() - begin
+    return row
 
 
 def flight() -> Flight:
@@ -265,11 +283,14 @@ def run(config: Config) -> None:
     generator = torch.Generator().manual_seed(config.seed)
     noise = [synthetic(v, 0.5, config, generator) for v in (4, 5, 6, 8)]
     print(table(noise, "Synthetic, medians: 1 - cos of lines in R^6, points in units of a scene of radius 1"))
+    tensors = [uncalibrated(n, noise, config) for n, noise in ((728, 0.0), (728, 0.01), (1500, 0.1), (1500, 0.5), (3000, 0.5))]
+    print(table(tensors, "Six uncalibrated views: noise that the residuals show, px"))
     data = flight()
     note(f"clock of the track: {data.clock[0]:.4f} samples/s, {data.clock[1]:.2f} at time 0")
     rows = [real(data, length, count, config.seed) for length in (0.5, 1.0) for count in (5, 8, 16, None)]
     print(table(rows, "Drone, pieces of straight flight: medians and 90 %, degrees and metres against RTK"))
-    write_json(target, {"manifest": manifest(vars(config), seed=config.seed), "synthetic": noise, "real": rows})
+    tables = {"synthetic": noise, "uncalibrated": tensors, "real": rows}
+    write_json(target, {"manifest": manifest(vars(config), seed=config.seed), **tables})
     note(f"written: {target}")
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import combinations, product
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,6 +15,7 @@ from dyntorch import metrics, scenes
 from dyntorch.invariant import Invariant
 from dyntorch.primitives import Hyperplane, Line
 from dyntorch.scenes import Scene
+from tests.projections import collinear_images, lifted, on_image_lines, seen, tensor_error
 
 Motion = tuple[Tensor, ...]
 PIXELS = (1 / 250.0, (320.0, 240.0))
@@ -121,7 +122,7 @@ def carried(invariant: Invariant, motion: Motion, frames: tuple[Tensor, ...]) ->
     for part, frame in zip(motion, invariant.motion, strict=True):
         matrix = part[..., None] if frame.vector else part
         if frame.target is not None:
-            matrix = frames[frame.target] @ matrix
+            matrix = (torch.linalg.inv(frames[frame.target]).mT if frame.dual else frames[frame.target]) @ matrix
         if frame.source is not None:
             matrix = matrix @ torch.linalg.inv(frames[frame.source])
         matrix = matrix / matrix.norm(dim=(-2, -1), keepdim=True)
@@ -215,71 +216,11 @@ def still_points(**options: object) -> Scene:
     return scenes.planar(**options, static=1.0)  # type: ignore[arg-type]
 
 
-def lifted(motion: str, times: tuple[float, ...], **options: object) -> Scene:
-    """Views of points that are static in a higher space, with the projections from it."""
-    made = scenes.lifted(motion, times=times, **options)  # type: ignore[arg-type]
-    views, exact = (x.unbind(-3) for x in (made.tracks, made.exact))
-    return Scene(views, exact, tuple(unit(made.projections).unbind(-3)), made.labels, made.sigma)
-
-
-def unit(matrix: Tensor) -> Tensor:
-    return matrix / matrix.norm(dim=(-2, -1), keepdim=True)
-
-
-def hyperplanes(x: Tensor) -> Tensor:
-    """The hyperplanes [I | -x] through points ``(..., d)``: ``(..., d, d + 1)``."""
-    eye = torch.eye(x.shape[-1], dtype=x.dtype, device=x.device).expand(*x.shape, -1)
-    return torch.cat([eye, -x[..., None]], dim=-1)
-
-
-def minors(profile: tuple[int, ...], motion: Motion) -> Tensor:
-    """All determinants of rows of the projections, so many of each as the profile says, one by one: ``(*batch, D)``."""
-    sets = product(*(combinations(range(m.shape[-2]), a) for a, m in zip(profile, motion, strict=True)))
-    stacks = [torch.cat([m[..., list(rows), :] for m, rows in zip(motion, chosen, strict=True)], dim=-2) for chosen in sets]
-    return torch.linalg.det(torch.stack(stacks, dim=-3))
-
-
-def tensor_error(profile: tuple[int, ...], estimated: Motion, true: Motion) -> Tensor:
-    """Relative distance of the minors of the projections, which a collineation of the space scales alike."""
-    a, b = (torch.nn.functional.normalize(minors(profile, m), dim=-1) for m in (estimated, true))
-    return torch.minimum((a - b).norm(dim=-1), (a + b).norm(dim=-1))
-
-
-def seen(motion: Motion, *views: Tensor) -> Tensor:
-    """One point of the space lies on all hyperplanes that the images span: what is left of them at the nearest one.
-
-    A choice of hyperplanes whose determinants vanish would do, too, but also where the chosen ones themselves are dependent.
-    """
-    rows = torch.cat([hyperplanes(x) @ m for x, m in zip(views, motion, strict=True)])
-    if rows.shape[0] == rows.shape[1]:
-        return torch.linalg.det(rows)[None]
-    return rows @ torch.linalg.eigh(rows.mT @ rows)[1][:, 0]
-
-
-def grassmann(
-    k: int,
-    profile: tuple[int, ...],
-    motion: str,
-    times: tuple[float, ...],
-    minimal: int,
-    *,
-    dims: int = 2,
-    jitter: float = 0.5,
-    **options: object,
-) -> Case:
-    invariant = dyn.GrassmannTensor(k, profile, dims)
-    single = sum(dims for _ in profile) - k == 1
-    return Case(
-        invariant,
-        partial(lifted, motion, times, jitter=jitter),
-        1,
-        partial(tensor_error, profile),
-        seen,
-        minimal,
-        units=None if dims == 3 else IMAGE,
-        projected=not single,
-        **options,  # type: ignore[arg-type]
-    )
+def grassmann(k: int, profile: tuple[int, ...], make: Callable[..., Scene], minimal: int, *, dims: int = 2, **options: Any) -> Case:
+    """A Grassmann tensor; distances are the first order of one condition, or those to the nearest exact match."""
+    projected = dims * len(profile) - k > 1
+    error, units = partial(tensor_error, profile), None if dims == 3 else IMAGE
+    return Case(dyn.GrassmannTensor(k, profile, dims), make, 1, error, seen, minimal, projected=projected, units=units, **options)
 
 
 JOIN_LABELLED = {0: 60, 1: 50, 2: 40, 3: 30, 4: 20, 5: 10, 6: 4, 7: 0}
@@ -304,12 +245,13 @@ CASES = (
         **SPACE,
     ),
     Case(dyn.TranslatingLinesMatrix(), scenes.translating_lines, 1, parts_error, coplanar, 35, moves=True),
-    grassmann(3, (2, 2), "static_3d", (0, 1), 8, jitter=1.0),
-    grassmann(3, (2, 1, 1), "static_3d", (0, 1, 2), 7),
-    grassmann(3, (1, 1, 1, 1), "static_3d", (0, 1, 2, 3), 6),
-    grassmann(4, (2, 2, 1), "constant_velocity_2d", (0, 4, 9), 13, moves=True),
-    grassmann(5, (2, 2, 2), "constant_velocity_planes_3d", (0, 4, 9), 26, moves=True),
-    grassmann(5, (2, 2, 1, 1), "constant_velocity_planes_3d", (0, 4, 9, 13), 20, moves=True),
-    grassmann(6, (2, 2, 2, 1), "constant_velocity_3d", (0, 4, 9, 13), 40, moves=True),
-    grassmann(6, (3, 3, 1), "constant_velocity_3d_sensors", (0, 4, 9), 21, dims=3, moves=True),
+    grassmann(3, (2, 2), lifted("static_3d", (0, 1), jitter=1.0), 8),
+    grassmann(3, (2, 1, 1), lifted("static_3d", (0, 1, 2)), 7),
+    grassmann(3, (1, 1, 1, 1), lifted("static_3d", (0, 1, 2, 3)), 6),
+    grassmann(4, (2, 2, 1), lifted("constant_velocity_2d", (0, 4, 9)), 13, moves=True),
+    grassmann(5, (2, 2, 2), lifted("constant_velocity_planes_3d", (0, 4, 9)), 26, moves=True),
+    grassmann(5, (2, 2, 1, 1), lifted("constant_velocity_planes_3d", (0, 4, 9, 13)), 20, moves=True),
+    grassmann(6, (2, 2, 2, 1), lifted("constant_velocity_3d", (0, 4, 9, 13)), 40, moves=True),
+    grassmann(6, (3, 3, 1), lifted("constant_velocity_3d_sensors", (0, 4, 9)), 21, dims=3, moves=True),
+    Case(dyn.GrassmannTensor(2, (1, 1, 1), dual=True), collinear_images, 1, partial(tensor_error, (1, 1, 1)), on_image_lines, 26),
 )

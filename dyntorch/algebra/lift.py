@@ -13,8 +13,9 @@ from dyntorch.nullspace import null_space
 
 DRAWS = 64
 """Random members of the solution space among which the best conditioned one is taken."""
-RANK = 1e-9
-"""Of the largest singular value: below it a singular value of matrices made of lifts alone is zero."""
+ZERO = 1e-8
+"""Relative size of a singular value of matrices made of lifts alone that counts as 0: the known motions give below 1e-11 or above
+0.1 (3 to 12 views from time 0, 100 and 1000)."""
 
 
 def kernel(lifts: Tensor) -> Tensor:
@@ -34,6 +35,9 @@ def gauge_algebra(lifts: Tensor) -> Tensor:
     Returns:
         ``(dim, K, K)`` orthonormal; all matrices where the lifts are invertible.
 
+    Raises:
+        ValueError: no stack of lifts with a + 1 <= K.
+
     Source: thesis section 3; the equations of the affine upgrade.
 
     Example:
@@ -43,20 +47,35 @@ def gauge_algebra(lifts: Tensor) -> Tensor:
         >>> gauge_algebra(lifts).shape
         torch.Size([9, 5, 5])
     """
-    size = lifts.shape[-1]
-    rows = torch.einsum("vai,vjr->varij", lifts, kernel(lifts)).reshape(-1, size * size)
-    if not len(rows):
-        return torch.eye(size * size, dtype=lifts.dtype, device=lifts.device).unflatten(-1, (size, size))
-    _, values, vh = torch.linalg.svd(rows, full_matrices=True)
-    rank = int((values > RANK * values[0]).sum())
-    return vh[rank:].unflatten(-1, (size, size))
+    if lifts.ndim != 3 or lifts.shape[-2] > lifts.shape[-1]:
+        raise ValueError(f"lifts must be (views, a + 1, K) with a + 1 <= K, got {tuple(lifts.shape)}")
+    even, root = balanced(lifts)
+    found = torch.linalg.solve(root, balanced_algebra(even) @ root)
+    return torch.linalg.qr(found.flatten(1).mT).Q.mT.unflatten(-1, found.shape[1:]).to(lifts.dtype)
+
+
+def balanced_algebra(lifts: Tensor) -> Tensor:
+    """:func:`gauge_algebra` of balanced lifts."""
+    rows, size = lifts.shape[-2:]
+    q, _ = torch.linalg.qr(lifts.mT, mode="complete")
+    equations = torch.einsum("vai,vbj->vijab", q[..., :rows], q[..., rows:]).reshape(-1, size * size)
+    equations = torch.cat([equations, equations.new_zeros(max(0, size * size - len(equations)), size * size)])
+    _, values, vh = torch.linalg.svd(equations, full_matrices=False)
+    return vh[values <= ZERO * values[0].clamp(min=ZERO)].unflatten(-1, (size, size))
 
 
 def balanced(lifts: Tensor) -> tuple[Tensor, Tensor]:
-    """Lifts whose stack has orthonormal columns, ``(views, a + 1, K)``, and the R with ``lifts = balanced @ R``: no unit of time
-    or origin of it matters."""
-    q, r = torch.linalg.qr(lifts.flatten(0, 1))
-    return q.unflatten(0, lifts.shape[:2]) * len(lifts) ** 0.5, r / len(lifts) ** 0.5
+    """Lifts ``(views, a + 1, K)`` whose stack has orthonormal columns, and the root R with ``lifts = balanced @ R``.
+
+    Neither the unit nor the origin of time matters to them.  Columns that no view sees stay zero.
+    """
+    stack = lifts.double().flatten(0, 1)
+    _, values, vh = torch.linalg.svd(stack, full_matrices=False)
+    if vh.shape[0] < vh.shape[1]:
+        vh = torch.linalg.qr(vh.mT, mode="complete").Q.mT
+        values = torch.cat([values, values.new_zeros(len(vh) - len(values))])
+    values = torch.where(values > 1e-12 * values[0], values, values[0]) / len(lifts) ** 0.5
+    return lifts.double() @ (vh.mT / values), values[:, None] * vh
 
 
 def upgrade(projections: Tensor, lifts: Tensor) -> tuple[Tensor, Tensor]:
@@ -121,7 +140,7 @@ def least_views(lifts: Tensor, rows: int) -> int:
             continue
         stack = torch.einsum("vmi,vjr->vmrij", (cameras @ lifts)[:views], vectors[:views]).reshape(-1, width * width)
         values = torch.linalg.svdvals(stack)
-        rank = int((values > RANK * values[0]).sum()) if values.numel() else 0
+        rank = int((values > ZERO * values[0]).sum()) if values.numel() else 0
         if width * width - rank == whole == len(gauge_algebra(lifts[:views])):
             return views
     return total + 1

@@ -11,6 +11,8 @@ from torch import Tensor
 
 TOLERANCE = 1e-8
 """Of a matrix made of lifts alone, relative: below it a change of the world belongs to the ambiguity."""
+DRAWS = 16
+"""Members of the ambiguity with the same plane at infinity among which the one that leaves the points roundest is taken."""
 
 
 def moved(G: Tensor, cameras: Tensor, structure: Tensor, lifts: Tensor) -> tuple[Tensor, Tensor]:
@@ -55,24 +57,45 @@ def finite(cameras: Tensor, structure: Tensor, lifts: Tensor, algebra: Tensor, w
         # the homogeneous coordinate changes with time, or is what it is up to its sign
         sign = _majority((structure @ last[0]).sign().sum(-1))
         return G, cameras * sign[..., None, None, None], structure * sign[..., None, None]
-    basis = vh[:rank]
-    known = (structure != 0).any(-1)
+    functional = _nearly_constant(structure, vh[:rank]) @ vh[:rank]
+    return _member(functional, rows, algebra, structure), cameras, structure
+
+
+def _nearly_constant(structure: Tensor, basis: Tensor) -> Tensor:
+    """Coefficients ``(*batch, r)`` of the linear function of the points that is next to 1, relative to its value at each."""
     inside = structure @ basis.mT
-    # a few rounds that look at the points nearest to infinity most
-    weight = known.to(structure.dtype)
+    known = (structure != 0).any(-1).to(structure.dtype)
+    weight = known
+    eye = torch.eye(len(basis), dtype=structure.dtype, device=structure.device)
     target = torch.zeros_like(inside[..., 0, :])
     for _ in range(10):
+        # a few rounds that look at the points nearest to infinity most
         normal = inside.mT @ (inside * weight[..., None])
-        ridge = (
-            1e-12 * normal.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None] * torch.eye(rank, dtype=eye.dtype, device=eye.device)
-        )
-        target = torch.linalg.solve_ex(normal + ridge, (inside.mT @ weight[..., None]))[0][..., 0]
+        ridge = 1e-12 * normal.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None] + torch.finfo(normal.dtype).tiny
+        target = torch.linalg.solve_ex(normal + ridge * eye, inside.mT @ weight[..., None])[0][..., 0]
         value = (inside @ target[..., None])[..., 0]
         weight = known / value.clamp(min=0.05).square()
-    # of all members with this last coordinate the one next to the identity
-    wanted = target @ basis - last[0]
-    step = torch.linalg.lstsq(rows.mT, wanted.reshape(-1, size).mT).solution.mT.reshape(*wanted.shape[:-1], len(algebra))
-    return G + torch.einsum("...d,dij->...ij", step, algebra), cameras, structure
+    return target
+
+
+def _member(functional: Tensor, rows: Tensor, algebra: Tensor, structure: Tensor) -> Tensor:
+    """Of some members of the algebra that have this last row the one that brings the points into the roundest shape."""
+    size = algebra.shape[-1]
+    whole = torch.linalg.svd(rows.mT, full_matrices=True)
+    rank = int((whole.S > TOLERANCE * whole.S[0]).sum())
+    free = whole.Vh[rank:]
+    start = functional @ torch.linalg.pinv(rows)
+    # draws of its own: the same points get the same frame
+    draw = torch.randn(DRAWS, len(free), generator=torch.Generator().manual_seed(0), dtype=torch.float64).to(rows)
+    spread = start.norm(dim=-1)[..., None, None] * draw / max(1, len(free)) ** 0.5
+    trial = torch.einsum("...sd,dij->...sij", start[..., None, :] + spread @ free, algebra)
+    moments = structure.mT @ structure
+    trace = moments.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None].clamp(min=torch.finfo(moments.dtype).tiny)
+    eye = torch.eye(size, dtype=rows.dtype, device=rows.device)
+    shape = torch.linalg.cholesky_ex(moments / trace + 1e-9 * eye)[0]
+    values = torch.linalg.svdvals((trial @ shape[..., None, :, :]).nan_to_num())
+    best = (values[..., -1] / values[..., 0].clamp(min=torch.finfo(values.dtype).tiny)).argmax(-1)
+    return trial.gather(-3, best[..., None, None, None].expand(*best.shape, 1, size, size)).squeeze(-3)
 
 
 def _before(cameras: Tensor, structure: Tensor, lifts: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
@@ -80,12 +103,10 @@ def _before(cameras: Tensor, structure: Tensor, lifts: Tensor, weights: Tensor) 
     projections = cameras @ lifts
     cameras = cameras / projections[..., -1, :].norm(dim=-1)[..., None, None].clamp(min=torch.finfo(cameras.dtype).tiny)
     depth = (structure[..., None, :, :] @ (cameras @ lifts)[..., -1, :, None])[..., 0] * (weights > 0)
-    # signs of a matrix of rank one: those of its leading singular vectors, by a few power iterations on the signs
-    sign = depth.sign()
-    view = torch.ones_like(sign[..., 0])
-    for _ in range(5):
-        point = _majority((view[..., None] * sign).sum(-2))
-        view = _majority((point[..., None, :] * sign).sum(-1))
+    # the signs are those of a matrix of rank one where all depths can be positive: its leading singular vectors
+    sign = depth.sign().nan_to_num()
+    view = _majority(torch.linalg.eigh(sign @ sign.mT).eigenvectors[..., -1])
+    point = _majority((view[..., None] * sign).sum(-2))
     cameras = cameras * view[..., None, None]
     mean = (depth * view[..., None]).sum(-2) / (weights > 0).sum(-2).clamp(min=1)
     scale = mean.abs().clamp(min=1e-12 * structure.norm(dim=-1).clamp(min=torch.finfo(mean.dtype).tiny))
@@ -146,24 +167,29 @@ def centred(structure: Tensor, lifts: Tensor, weights: Tensor) -> Tensor:
     good = (depth > 1e-9) & (weights[..., None, :, None] > 0)
     x = torch.where(good, homogeneous[..., :-1] / torch.where(good, depth, 1.0), 0.0).flatten(-3, -2)
     weight = good.flatten(-3, -2).to(x.dtype)
+    counted = weight.sum(-2, keepdim=True) > 0
     total = weight.sum(-2, keepdim=True).clamp(min=1)
     mean = (x * weight).sum(-2, keepdim=True) / total
     off = (x - mean) * weight
     covariance = off.mT @ off / total
     variance = covariance.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None].clamp(min=torch.finfo(x.dtype).tiny)
     eye = torch.eye(x.shape[-1], dtype=x.dtype, device=x.device)
+    plain = (variance / x.shape[-1]).sqrt() * eye
     # U with U U^T = C, upper triangular: the Cholesky factor of C turned by half a turn
     factor = torch.linalg.cholesky_ex((covariance + 1e-6 * variance * eye).flip(-1, -2))[0].flip(-1, -2)
-    plain = (variance / x.shape[-1]).sqrt() * eye
-    for scale in (factor, plain):
-        linear = torch.linalg.inv_ex(scale)[0]
-        world = torch.cat([linear, -linear @ mean.mT], dim=-1)
-        world = torch.cat([world, torch.nn.functional.pad(torch.zeros_like(world[..., :1, :-1]), (0, 1), value=1.0)], dim=-2)
-        G, left = _induced(world, lifts)
-        if bool((left < TOLERANCE).all()):
-            return G
-    size = lifts.shape[-1]
-    return torch.eye(size, dtype=x.dtype, device=x.device).expand(*structure.shape[:-2], size, size)
+    G = same = torch.eye(lifts.shape[-1], dtype=x.dtype, device=x.device).expand(*structure.shape[:-2], -1, -1)
+    # a matrix of one kind that the lifts allow tells that they allow the kind, whatever the points
+    for scale, example in ((factor, eye + torch.ones_like(eye).triu()), (plain, 2 * eye)):
+        if _induced(_world(example, torch.ones_like(eye[:1])), lifts)[1] < TOLERANCE:
+            G = _induced(_world(torch.linalg.inv_ex(scale)[0], mean), lifts)[0]
+            break
+    return torch.where(counted & G.isfinite().flatten(-2).all(-1)[..., None, None], G, same)
+
+
+def _world(linear: Tensor, mean: Tensor) -> Tensor:
+    """The change x -> A (x - mean) of the world, homogeneous; ``mean (*batch, 1, d)``."""
+    top = torch.cat([linear, -linear @ mean.mT], dim=-1)
+    return torch.cat([top, torch.nn.functional.pad(torch.zeros_like(top[..., :1, :-1]), (0, 1), value=1.0)], dim=-2)
 
 
 def _induced(world: Tensor, lifts: Tensor) -> tuple[Tensor, Tensor]:

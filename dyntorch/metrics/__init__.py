@@ -3,7 +3,7 @@
 A failed estimate (NaN, or no solution at all) has the worst error, not NaN, so that medians over a batch count it.
 """
 
-from dyntorch.metrics.lifted import LiftedError, body_error, gauge_algebra, lifted_error
+from dyntorch.metrics.lifted import LiftedError, body_error, lifted_error
 from dyntorch.metrics.matrices import (
     LabelScores,
     affine_gauge,
@@ -21,7 +21,6 @@ __all__ = [
     "LiftedError",
     "affine_gauge",
     "body_error",
-    "gauge_algebra",
     "grid_transfer_error",
     "label_scores",
     "lifted_error",

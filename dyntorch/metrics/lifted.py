@@ -9,13 +9,9 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from dyntorch.algebra.homogeneous import homogeneous, inhomogeneous
+from dyntorch.algebra.lift import balanced, balanced_algebra
 from dyntorch.least_squares import damped_step
 from dyntorch.nullspace import null_space
-
-ZERO = 1e-8
-"""Relative size of a singular value that counts as 0: the known motions give below 1e-11 or above 0.1 (3 to 12 views from
-time 0, 100 and 1000)."""
-
 
 STEPS = 15
 """Of the robust alignments, from a start that is nearly right."""
@@ -26,57 +22,6 @@ class LiftedError(NamedTuple):
 
     position: Tensor
     velocity: Tensor
-
-
-def gauge_algebra(lifts: Tensor) -> Tensor:
-    r"""Basis of the changes of the lifted space that lifts leave open: all S with :math:`B_i\,S\,\mathrm{null}(B_i) = 0`.
-
-    The invertible ones among them are the ambiguity of a reconstruction: :math:`B_i S = H_i B_i`, and cameras
-    :math:`P_i H_i` see :math:`S^{-1} Y` as the cameras :math:`P_i` see Y.
-
-    Args:
-        lifts: ``(views, d + 1, K)``, each of full row rank.
-
-    Returns:
-        ``(dim, K, K)``, orthonormal.
-
-    Raises:
-        ValueError: no stack of lifts with d + 1 <= K.
-
-    Source: theory of lifted projections, the linear upgrade; thesis chapter 3.
-
-    Example:
-        >>> import torch
-        >>> eye = torch.eye(3, dtype=torch.float64)
-        >>> lifts = torch.stack([torch.cat([eye, t * eye[:, :2]], dim=-1) for t in range(3)])
-        >>> gauge_algebra(lifts).shape  # two affinities with a common linear part, of positions and velocities, and the scale
-        torch.Size([9, 5, 5])
-    """
-    if lifts.ndim != 3 or lifts.shape[-2] > lifts.shape[-1]:
-        raise ValueError(f"lifts must be (views, d + 1, K) with d + 1 <= K, got {tuple(lifts.shape)}")
-    white, back = _whitening(lifts)
-    found = _white_algebra(lifts.double() @ white)
-    return torch.linalg.qr((white @ found @ back).flatten(1).mT).Q.mT.unflatten(-1, found.shape[1:]).to(lifts.dtype)
-
-
-def _white_algebra(lifts: Tensor) -> Tensor:
-    """The algebra ``(dim, K, K)`` of whitened lifts."""
-    rows, size = lifts.shape[-2:]
-    q, _ = torch.linalg.qr(lifts.mT, mode="complete")
-    equations = torch.einsum("vai,vbj->vijab", q[..., :rows], q[..., rows:]).reshape(-1, size * size)
-    equations = torch.cat([equations, equations.new_zeros(max(0, size * size - len(equations)), size * size)])
-    _, s, vh = torch.linalg.svd(equations, full_matrices=False)
-    return vh[s <= ZERO * s[0].clamp(min=ZERO)].unflatten(-1, (size, size))
-
-
-def _whitening(lifts: Tensor) -> tuple[Tensor, Tensor]:
-    """W for which the stacked ``B_i W`` have orthonormal columns, and its inverse: times far from 0 then do no harm."""
-    _, s, vh = torch.linalg.svd(lifts.double().flatten(0, 1), full_matrices=False)
-    s = torch.cat([s, s.new_zeros(lifts.shape[-1] - len(s))])
-    s = torch.where(s > 1e-12 * s[0], s, s[0])
-    if vh.shape[0] < vh.shape[1]:
-        vh = torch.linalg.qr(vh.mT, mode="complete").Q.mT
-    return vh.mT / s, s[:, None] * vh
 
 
 def lifted_error(structure: Tensor, true: Tensor, lifts: Tensor, mask: Tensor | None = None) -> LiftedError:
@@ -124,13 +69,13 @@ def lifted_error(structure: Tensor, true: Tensor, lifts: Tensor, mask: Tensor | 
     z = torch.where(counts[..., None], z, 0.0)
     placed = inhomogeneous(z[:, None] @ lifts.double().mT)
     # both sides in coordinates in which they fill the space: whatever the gauges, the least squares are well conditioned
-    white, back = _whitening(lifts)
+    even, back = balanced(lifts)
     right, y = _balanced(torch.where(weights[..., None] > 0, y, 0.0) @ back.mT)
     left, z = _balanced(torch.where(weights[..., None] > 0, z, 0.0) @ back.mT)
-    basis = torch.linalg.solve(left[:, None], _white_algebra(lifts.double() @ white) @ right[:, None])
+    basis = torch.linalg.solve(left[:, None], balanced_algebra(even) @ right[:, None])
     basis = torch.linalg.qr(basis.flatten(2).mT).Q.mT.unflatten(-1, (size, size))
     image = (basis @ y.mT[:, None]).permute(0, 3, 2, 1)
-    seen = (lifts.double() @ white @ left[:, None])[:, :, None] @ image[:, None]
+    seen = (even @ left[:, None])[:, :, None] @ image[:, None]
     c = _refined(_algebraic(image, z, weights), seen, placed, weights)
     return _errors(inhomogeneous((seen @ c[:, None, None, :, None])[..., 0]), placed, counts, valid, batch)
 

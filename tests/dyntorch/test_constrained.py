@@ -10,7 +10,7 @@ from dyntorch import scenes
 from dyntorch.constrained import constrain_matches
 from dyntorch.matches import matches
 from dyntorch.solution import failed
-from tests.cases import tensor_error, unit
+from tests.projections import tensor_error, unit
 
 P4, P6 = dyn.GrassmannTensor(4, (2, 2, 1)), dyn.GrassmannTensor(6, (2, 2, 2, 1))
 
@@ -64,12 +64,14 @@ def test_least_error_of_all_motions(invariant, views):
 
 
 def test_p6_needs_it():
-    """Half a pixel of noise: the images of the constrained motion are nearer than those of what the linear tensor decomposes into."""
+    """Half a pixel of noise: the constrained motion shows the images better than what the linear tensor decomposes into."""
     views, _, true = scene("constant_velocity_3d", (0, 1, 2, 3), 60, 0.5, batch=8)
     linear = dyn.fit(P6, *views)
     found, refined = dyn.constrain(linear), dyn.refine(linear, *views)
     ones = (torch.ones((), dtype=torch.float64),) * 4
-    off = [P6.whitened(motion, views, ones).square().mean((-2, -1)).sqrt() for motion in (linear.motion, found.motion, refined.motion)]
+    off = [
+        P6.whitened(motion, views, ones).square().mean((-2, -1)).sqrt() for motion in (linear.motion, found.motion, refined.motion)
+    ]
     assert off[1].median() < 0.6 * off[0].median() and (off[2] < off[1]).all()
     # refinement begins with it: the error is that of a start from the truth
     known = replace(linear, refined=tuple(f @ m for f, m in zip(linear.normalization.transforms, true, strict=True)))

@@ -72,7 +72,7 @@ def test_balanced_lifts_are_orthonormal():
 
 @pytest.mark.parametrize("name", TABLE)
 def test_upgrade_finds_cameras(name):
-    dim, axes, degree, rows, ambiguity, views = TABLE[name]
+    dim, axes, degree, rows, _, views = TABLE[name]
     B = lifts(dim, axes, (0.0, 1.0, 2.5, 4.0)[:views], degree)
     size = B.shape[-1]
     cameras, frame = random(2, 3, views, rows, dim + 1), random(2, 3, size, size, seed=1)
@@ -101,7 +101,7 @@ def test_upgrade_of_a_plane_of_static_points():
 
 def test_too_few_views():
     B = lifts(3, 3, (0.0, 1.0))
-    with pytest.raises(ValueError, match=r"2 views give 18 equations, 33 are needed; add views"):
+    with pytest.raises(ValueError, match=r"2 views give 18 equations, 24 are needed; add views"):
         upgrade(random(2, 3, 7), B)
     # enough equations are not enough views: with three ones wrong frames remain
     B = lifts(3, 2, (0.0, 1.0, 2.0))

@@ -52,7 +52,7 @@ def test_camera_of_lines_is_the_inverse(scale):
     found = camera_of_lines(scale * line_camera(P))
     assert parallel(P, found) < 1e-14
     torch.testing.assert_close(found.flatten(-2).norm(dim=-1), torch.ones(7, 2, dtype=torch.float64))
-    # a row of P that vanishes leaves no image, and two equal rows no camera: both are data
+    # what is no camera is data
     bad = torch.stack([line_camera(P[0, 0]), torch.full((3, 6), torch.nan).double(), torch.zeros(3, 6).double()])
     assert camera_of_lines(bad)[0].abs().max() > 0
     assert not camera_of_lines(bad)[1:].any()

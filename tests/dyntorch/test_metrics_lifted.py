@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from dyntorch.metrics import body_error, gauge_algebra, lifted_error
+from dyntorch.algebra.lift import gauge_algebra
+from dyntorch.metrics import body_error, lifted_error
 from dyntorch.scenes import lifted
 
 DIMENSIONS = {

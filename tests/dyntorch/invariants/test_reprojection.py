@@ -1,4 +1,4 @@
-"""Reprojection residuals without the point: against chi-square, minimization over the points, finite differences, and changes of frame."""
+"""Reprojection residuals without the point: chi-square, minimization over the points, finite differences, changes of frame."""
 
 import pytest
 import torch
@@ -40,7 +40,9 @@ def scales_of(motion, values):
 
 
 def noisy(views, scales, size, seed=9):
-    return tuple(x + size * s[..., None, None] * random(*x.shape, seed=seed + i) for i, (x, s) in enumerate(zip(views, scales, strict=True)))
+    return tuple(
+        x + size * s[..., None, None] * random(*x.shape, seed=seed + i) for i, (x, s) in enumerate(zip(views, scales, strict=True))
+    )
 
 
 @pytest.mark.parametrize("invariant", PROFILES, ids=repr)
@@ -149,6 +151,10 @@ def test_degenerate_matches_stay_finite():
 
 
 def test_one_condition_is_left_to_the_form_itself():
-    for invariant in (dyn.GrassmannTensor(5, (2, 2, 2)), dyn.GrassmannTensor(3, (2, 2)), dyn.GrassmannTensor(3, (1,) * 4, dual=True)):
+    for invariant in (
+        dyn.GrassmannTensor(5, (2, 2, 2)),
+        dyn.GrassmannTensor(3, (2, 2)),
+        dyn.GrassmannTensor(3, (1,) * 4, dual=True),
+    ):
         empty = tuple(torch.zeros(1, m, invariant.k + 1, dtype=torch.float64) for m in invariant.sizes)
         assert invariant.whitened(empty, (), ()) is None and invariant.linearized(empty, (), ()) is None
