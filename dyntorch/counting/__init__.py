@@ -1,10 +1,12 @@
 r"""Counting: how many matches a multilinear constraint takes, and how many tensors satisfy them all.  Exact, without torch.
 
 :func:`dim_v` is the dimension of :math:`V(n,m,k)`, the constraints of points that move within extensors of step k, by
-hook lengths.  :func:`count` gives the exact rank of the estimation matrix of any configuration of matches over a prime field.
+hook lengths.  :func:`count` gives the exact rank of the estimation matrix of any configuration of matches over a prime field:
+of the invariants, of the motion models of :func:`dyntorch.reconstruct` by name, and of any Grassmann tensor by its profile.
 
 Both reproduce the numbers of the thesis, except where it is wrong:
 
+- Section 1.3: the tensor of six views of points on trajectory lines has 729 entries ("36"); its 728 matches are right.
 - Section 8.1, 9.3: at most 8 points of a trajectory line help, but four lines with 8 + 8 + 8 + 2 of 26 points reach rank 23 only;
   8 + 7 + 6 + 5 reach 26.
 - Section 8.2: one minimal join tensor does not determine A.  The equations of its slices have rank 11 of 16; with a second camera

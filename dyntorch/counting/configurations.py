@@ -7,34 +7,13 @@ is the kind that it is usually estimated from; None takes as many as raise the r
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from dyntorch.counting.field import Field, IntArray
+from dyntorch.counting.lifted import MOTIONS
+from dyntorch.counting.step import Configuration, Step
 from dyntorch.counting.views import Measure, Views
-
-
-@dataclass(frozen=True)
-class Step:
-    """Matches of one kind.
-
-    Args:
-        kind: its name.
-        matches: how many; None: as many as raise the rank.
-        draw: gives the rows ``(rows, width)`` of the next match.
-        constraint: these rows hold without any match.
-        patience: matches in a row that add nothing before no more are drawn; in general position the first one tells.
-    """
-
-    kind: str
-    matches: int | None
-    draw: Callable[[], IntArray]
-    constraint: bool = False
-    patience: int = 20
-
-
-Configuration = Callable[..., list[Step]]
 
 
 def homography(
@@ -152,33 +131,40 @@ def shape_tensor(field: Field, *, images: int | None = None, synthetic: bool = F
 
 
 def by_numbers(
-    field: Field, *, k: int, views: Sequence[int], m: int = 1, r: int = 1, measure: Measure | Sequence[Measure] = "join",
-    matches: int | None = None,
+    field: Field, *, k: int, views: Sequence[int] = (), m: int = 1, r: int = 1, measure: Measure | Sequence[Measure] = "join",
+    matches: int | None = None, profile: Sequence[int] = (),
 ) -> list[Step]:  # fmt: skip
     """Primitives of ``m`` points, anywhere within extensors of ``r`` points of ``P^k``, seen in views ``P^l``."""
-    kinds = (measure,) * len(views) if isinstance(measure, str) else tuple(measure)
-    if not views:
+    if profile and measure != "join":
+        raise ValueError("profile and measure exclude each other: join takes all hyperplanes through a point, hyper takes one")
+    sizes = tuple(views) or (2,) * len(profile)
+    kinds: Sequence[Measure | int] = tuple(profile) or ((measure,) * len(sizes) if isinstance(measure, str) else tuple(measure))
+    if not sizes:
         raise ValueError("views is empty; give the projective dimension of each view, such as [2, 2, 2]")
-    if len(kinds) != len(views) or set(kinds) - {"join", "hyper"}:
-        raise ValueError(f"measure must be join or hyper, one word or one for each of {len(views)} views, got {measure!r}")
+    if profile and len(profile) != len(sizes):
+        raise ValueError(f"profile must have one number for each of {len(sizes)} views, got {len(profile)}")
+    if not profile and (len(kinds) != len(sizes) or set(kinds) - {"join", "hyper"}):
+        raise ValueError(f"measure must be join or hyper, one word or one for each of {len(sizes)} views, got {measure!r}")
     if not 1 <= m <= r <= k + 1:
         raise ValueError(
             f"expected 1 <= m <= r <= k + 1, got m = {m}, r = {r}, k = {k}: m points lie within an extensor of r points"
         )
-    for size, kind in zip(views, kinds, strict=True):
-        if m > size + (kind == "join"):
+    for size, kind in zip(sizes, kinds, strict=True):
+        if isinstance(kind, int) and not 1 <= kind <= size + 1 - m:
+            raise ValueError(
+                f"profile: {m} points lie in {max(size + 1 - m, 0)} hyperplanes of a view of dimension {size}, got {kind}"
+            )
+        if not isinstance(kind, int) and m > size + (kind == "join"):
             raise ValueError(f"{m} points have no {kind} in a view of dimension {size}; views must be larger or m smaller")
-    space = Views(field, k, views, kinds)
+    space = Views(field, k, sizes, kinds)
     return [Step("general", matches, lambda: space.moving(space.extensor(r), m))]
 
 
-CONFIGURATIONS: dict[str, Configuration] = {
-    function.__name__: function
-    for function in (
-        homography, dual_homography, join, minimal_join, constant_velocity, constant_velocity_3x4x4, lines, fundamental, trifocal,
-        quadrifocal, shape_tensor,
-    )
-}  # fmt: skip
+_NAMED: tuple[Configuration, ...] = (
+    homography, dual_homography, join, minimal_join, constant_velocity, constant_velocity_3x4x4, lines, fundamental, trifocal,
+    quadrifocal, shape_tensor, *MOTIONS,
+)  # fmt: skip
+CONFIGURATIONS: dict[str, Configuration] = {function.__name__: function for function in _NAMED}
 
 
 def _moving_points(

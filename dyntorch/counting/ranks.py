@@ -10,8 +10,10 @@ from typing import Any, overload
 
 import numpy as np
 
-from dyntorch.counting.configurations import CONFIGURATIONS, Configuration, Step, by_numbers
+from dyntorch.counting.configurations import CONFIGURATIONS, by_numbers
 from dyntorch.counting.field import Field, IntArray
+from dyntorch.counting.lifted import SETTINGS
+from dyntorch.counting.step import Configuration, Step
 from dyntorch.counting.tally import Kind, Tally
 from dyntorch.counting.views import Measure
 
@@ -65,11 +67,11 @@ class Count:
 
 
 @overload
-def count(what: str, /, *, seed: int = 0, **options: int | Sequence[int] | None) -> Count: ...
+def count(what: str, /, *, seed: int = 0, **options: int | str | Sequence[int] | None) -> Count: ...
 @overload
 def count(
-    what: int, /, *, views: Sequence[int], m: int = 1, r: int = 1, measure: Measure | Sequence[Measure] = "join",
-    matches: int | None = None, seed: int = 0,
+    what: int, /, *, views: Sequence[int] = (), m: int = 1, r: int = 1, measure: Measure | Sequence[Measure] = "join",
+    matches: int | None = None, profile: Sequence[int] = (), seed: int = 0,
 ) -> Count: ...  # fmt: skip
 @overload
 def count(what: Sampler, /, *, matches: int | None = None, seed: int = 0) -> Count: ...
@@ -82,12 +84,16 @@ def count(what: str | int | Sampler, /, *, seed: int = 0, **options: Any) -> Cou
     **A name** of :data:`CONFIGURATIONS`, with the number of matches of each kind, such as ``moving=30, static=2``.  Of the first
     kind, None means as many as raise the rank, and so does no number at all.  Lists give the number of points on each of several
     ``lines``, or of lines on each of several translating ``objects``.  ``labelled_static`` are known to be static, ``static``
-    are not.
+    are not.  The motion models of :func:`dyntorch.reconstruct` also take the ``profile`` of their tensor, the ``times`` of the
+    views (by default random) and the path of the ``camera``: ``"generic"``, ``"fixed"``, ``"constant_velocity"``, or
+    ``"along"`` the motion.
 
-    **Numbers**: ``count(k, views=[l1, l2, ...], m=, r=, measure=)``.  A primitive spanned by ``m`` points is, in every view
+    **Numbers**: ``count(k, views=[l1, l2, ...], m=, r=, measure=)``, and ``count(k, profile=[a1, a2, ...])`` for the
+    Grassmann tensor of points in views of the plane, or in ``views=``.  A primitive spanned by ``m`` points is, in every view
     anew, anywhere within a random extensor of ``r`` points of :math:`P^k` (r = m: it stays; m = 1, r = 2: a point on a line), and
     seen through random projections :math:`P^k \to P^{l_v}`.  A view measures its Pluecker coordinates (``"join"``) or the
-    hyperplanes that contain it (``"hyper"``); one word for all views, or one for each.
+    hyperplanes that contain it (``"hyper"``); one word for all views, or one for each.  A profile says how many of these
+    hyperplanes are taken at once.
 
     **A sampler** for anything else: a function that takes a :class:`Field` and returns an iterable, usually a generator, of the
     rows of each match, ``(width,)`` or ``(rows, width)`` integers, taken modulo ``field.prime``.  It is called once per prime.
@@ -102,6 +108,7 @@ def count(what: str | int | Sampler, /, *, seed: int = 0, **options: Any) -> Cou
         r: points that span the extensor in which it moves.
         measure: ``"join"`` or ``"hyper"``, for all views or for each.
         matches: how many; by default as many as raise the rank.
+        profile: hyperplanes through the primitive in each view, instead of ``measure``; constraints need k + 1 in all.
         seed: of the random matches.
         **options: of a named configuration, the number of matches of each kind.
 
@@ -111,15 +118,17 @@ def count(what: str | int | Sampler, /, *, seed: int = 0, **options: Any) -> Cou
     Raises:
         ValueError: an unknown name or option, numbers that make no sense, or rows that are no integers or differ in width.
 
-    Source: thesis chapter 9; the ranks quoted in its chapter 8.
+    Source: thesis chapter 9; the ranks quoted in its chapters 3 and 8.
 
     Example:
         >>> print(count("homography", static=12, moving=30))
         homography: rank 26 of 27, nullity 1, from 26 of 42 matches: 10 of 12 static (rank 10), 16 of 30 moving (rank 26)
         >>> count("join").minimal, count("homography", labelled_static=2).missing
         (60, 12)
-        >>> count(3, views=[2, 2]).rank  # points seen by two cameras
-        8
+        >>> count("constant_velocity_3d", static=100).missing, count("constant_velocity_3d", camera="fixed").rank
+        (18, 75)
+        >>> count(3, views=[2, 2]).rank, count(6, profile=[2, 2, 1, 1, 1]).minimal  # points seen by two cameras, by five
+        (8, 31)
         >>> def one_line(field):  # all points on one line of the plane
         ...     line, cameras = field.random(2, 3), field.random(3, 3, 3)
         ...     while True:
@@ -136,11 +145,16 @@ def count(what: str | int | Sampler, /, *, seed: int = 0, **options: Any) -> Cou
     _check(name, configure, options)
     if not _is_number(seed):
         raise ValueError(f"seed must be a number from 0 to {MOST:,}, got {seed!r}")
-    if isinstance(what, str) and main not in options and any(value for value in options.values() if value is not True):
+    if isinstance(what, str) and main not in options and any(_counts(name, value) for name, value in options.items()):
         options[main] = 0
     found = [_count(name, configure, Field(prime, [seed, prime]), options) for prime in PRIMES]
     best = max(found, key=lambda result: result.rank)
     return dataclasses.replace(best, agreed=len({result.rank for result in found}) == 1)
+
+
+def _counts(option: str, value: Any) -> bool:
+    """Whether an option asks for matches."""
+    return option not in SETTINGS and value is not True and bool(value)
 
 
 def _configuration(what: str | int | Sampler, options: dict[str, Any]) -> tuple[str, Configuration, str]:
@@ -153,8 +167,8 @@ def _configuration(what: str | int | Sampler, options: dict[str, Any]) -> tuple[
         return getattr(what, "__name__", "sampler"), _sampled, "matches"
     if isinstance(what, bool) or not isinstance(what, int) or what < 0:
         raise ValueError(f"expected the name of a configuration, the dimension of a space or a sampler, got {what!r}")
-    if "views" not in options:
-        raise ValueError(f"count({what}) needs views, the projective dimension of each, such as views=[2, 2, 2]")
+    if not {"views", "profile"} & options.keys():
+        raise ValueError(f"count({what}) needs views, the projective dimension of each, such as views=[2, 2, 2], or a profile")
     return f"P^{what}", by_numbers, "matches"
 
 
@@ -178,12 +192,14 @@ def _check(name: str, configure: Configuration, options: dict[str, Any]) -> None
         if option not in known:
             names = [other for other in known if other not in ("k", "sampler")]
             raise ValueError(f"{name} has no option {option}; it has {', '.join(names)}")
-        if option == "views" or isinstance(known[option], tuple):
+        if isinstance(known[option], tuple):
             if isinstance(value, str) or not isinstance(value, Sequence) or not all(map(_is_number, value)):
                 raise ValueError(f"{option} must be a list of numbers from 0 to {MOST:,}, got {value!r}")
         elif isinstance(known[option], bool):
             if not isinstance(value, bool):
                 raise ValueError(f"{option} must be True or False, got {value!r}")
+        elif option == "camera":
+            continue  # checked with the others of the views
         elif option not in ("sampler", "measure") and not (value is None is known[option]) and not _is_number(value):
             raise ValueError(f"{option} must be a number from 0 to {MOST:,}, got {value!r}")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import combinations
 from typing import Literal
 
 import numpy as np
@@ -16,18 +17,27 @@ class Views:
     r"""Random projections :math:`P^k \to P^{l_v}`, and what is measured in each.
 
     Primitives are given as the points that span them, ``(m, k + 1)``.  A view measures either their ``join``, the Pluecker
-    coordinates of their extensor (a point stays a point), or every ``hyper`` plane that contains them.
+    coordinates of their extensor (a point stays a point), every ``hyper`` plane that contains them, or, given a number, every
+    intersection of so many of these, as the Pluecker coordinates of the hyperplanes (a Grassmann tensor takes k + 1 in all).
 
     Args:
         field: where random elements come from.
         k: projective dimension of the space.
         views: projective dimensions ``l_v`` of the views.
-        measure: ``"join"`` or ``"hyper"`` per view.
+        measure: ``"join"``, ``"hyper"`` or a number of hyperplanes, per view.
+        cameras: the projections ``(l_v + 1, k + 1)``, where they are not random.
     """
 
-    def __init__(self, field: Field, k: int, views: Sequence[int], measure: Sequence[Measure]) -> None:
+    def __init__(
+        self,
+        field: Field,
+        k: int,
+        views: Sequence[int],
+        measure: Sequence[Measure | int],
+        cameras: Sequence[IntArray] | None = None,
+    ) -> None:
         self.field, self.k, self.measure = field, k, tuple(measure)
-        self.cameras = [field.random(size + 1, k + 1) for size in views]
+        self.cameras = [field.random(size + 1, k + 1) for size in views] if cameras is None else list(cameras)
 
     def extensor(self, step: int) -> IntArray:
         """Random points, one per row, that span an extensor of this step."""
@@ -40,10 +50,18 @@ class Views:
     def images(self, primitives: Sequence[IntArray]) -> list[IntArray]:
         """What each view measures of its primitive: one row (``join``), or several (``hyper``)."""
         seen = [self.field.product(points, camera.T) for points, camera in zip(primitives, self.cameras, strict=True)]
-        return [
-            self.field.join(points)[None] if kind == "join" else self.field.null(points)
-            for points, kind in zip(seen, self.measure, strict=True)
-        ]
+        return [self.measured(points, kind) for points, kind in zip(seen, self.measure, strict=True)]
+
+    def measured(self, points: IntArray, kind: Measure | int) -> IntArray:
+        """What a view measures of the primitive that these points of it span, ``(rows, width)``."""
+        if kind == "join":
+            return self.field.join(points)[None]
+        through = self.field.null(points)
+        return (
+            through
+            if kind in ("hyper", 1)
+            else np.stack([self.field.join(through[list(c)]) for c in combinations(range(len(through)), int(kind))])
+        )
 
     def fixed(self, primitive: IntArray) -> IntArray:
         """Rows of a primitive that does not move."""

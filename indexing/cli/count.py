@@ -36,13 +36,13 @@ class Matches:
     translating: Number = None
     """of lines: each with a translation of its own"""
     objects: Numbers = ()
-    """of lines: how many on each of several rigid objects that translate"""
+    """of lines and two_bodies: how many on each of several rigid objects that translate"""
     equal_velocity: Number = None
-    """of constant_velocity: all with the same velocity"""
+    """of constant velocities: all with the same one"""
     linear_velocity: Number = None
-    """of constant_velocity: with velocities along one direction"""
+    """of constant velocities: along one direction"""
     planar_velocity: Number = None
-    """of constant_velocity: with velocities in one plane, such as cars on a road"""
+    """of constant velocities in space: within one plane, such as cars on a road"""
     coplanar: Number = None
     """of fundamental, trifocal and quadrifocal: static points of one plane"""
     images: Number = None
@@ -53,6 +53,22 @@ class Matches:
     def given(self) -> dict[str, Any]:
         """The options that were given."""
         return {name: value for name, value in asdict(self).items() if value is not None and value is not False and value != ()}
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Of the motion models (constant_velocity_2d...): their views."""
+
+    profile: Numbers = ()
+    """hyperplanes used of each view, k + 1 in all, such as 2 2 1; also with --k"""
+    times: Numbers = ()
+    """of the views; by default random"""
+    camera: Literal["generic", "fixed", "constant_velocity", "along"] = "generic"
+    """path of the camera: anywhere, in one place (it may rotate), at constant velocity, or along the motion at constant velocity"""
+
+    def given(self) -> dict[str, Any]:
+        """The options that were given."""
+        return {name: value for name, value in asdict(self).items() if value not in ((), "generic")}
 
 
 @dataclass(frozen=True)
@@ -79,13 +95,17 @@ class Count:
 
     dyntorch count homography --moving 30 --static 2
 
+    dyntorch count constant_velocity_3d --static 100 --camera fixed
+
     dyntorch count --k 3 --views 2 2 2 2 --r 2
+
+    dyntorch count --k 6 --profile 2 2 2 1
 
     dyntorch count --dim-v 3 3 2
     """
 
     configuration: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="[NAME]", help_behavior_hint="")] = ""
-    """of an invariant, such as homography or join; without it, a table of all"""
+    """of an invariant, such as join, or of a motion model, such as constant_velocity_2d; without it, a table of all"""
     dim_v: Annotated[tuple[int, int, int] | None, tyro.conf.arg(metavar="N M K", help_behavior_hint="")] = None
     """print the dimension of V(n,m,k), the span of products of m vectors of n-space that lie in a common k-space"""
     json: tyro.conf.FlagCreatePairsOff[bool] = False
@@ -93,13 +113,16 @@ class Count:
     seed: int = 0
     """of the random matches; the ranks do not depend on it"""
     matches: Matches = field(default_factory=Matches)
+    motion: Motion = field(default_factory=Motion)
     general: General = field(default_factory=General)
 
     def run(self) -> int:
         """Count, and print."""
         from dyntorch import counting
 
-        given, general = self.matches.given(), self.general != General()
+        given, general = self.matches.given(), self.general != General() or bool(self.motion.profile and not self.configuration)
+        if not general:
+            given |= self.motion.given()
         if (self.configuration != "") + general + (self.dim_v is not None) > 1:
             raise ValueError("a configuration's name, numbers (--k, --views...) and --dim-v exclude each other; give one of them")
         if given and not self.configuration:
@@ -111,7 +134,8 @@ class Count:
             name = self.configuration.replace("-", "_")
             if name not in counting.CONFIGURATIONS:
                 raise ValueError(f"unknown configuration {self.configuration!r}; known are {', '.join(counting.CONFIGURATIONS)}")
-            self._print(counting.count(name, seed=self.seed, **given), purpose(name))
+            result = counting.count(name, seed=self.seed, **given)
+            self._print(result, purpose(name), unique="profile" in counting.options_of(name))
         elif general:
             self._print_general()
         else:
@@ -128,18 +152,20 @@ class Count:
     def _print_general(self) -> None:
         from dyntorch import counting
 
-        if self.general.k is None or not self.general.views:
+        sizes = self.general.views or (2,) * len(self.motion.profile)
+        if self.general.k is None or not sizes:
             raise ValueError("numbers need at least --k, the dimension of the space, and --views, such as --k 2 --views 2 2 2")
-        numbers = asdict(self.general)
+        numbers = asdict(self.general) | self.motion.given() | {"views": sizes}
         if len(self.general.measure) == 1:
             numbers["measure"] = self.general.measure[0]
         result = counting.count(numbers.pop("k"), seed=self.seed, **numbers)
         what = {1: "points", 2: "lines"}.get(self.general.m, f"extensors of {self.general.m} points")
         within = "that stay" if self.general.m == self.general.r else f"that move within extensors of {self.general.r} points"
-        seen = ", ".join(f"P^{size}" for size in self.general.views)
+        seen = ", ".join(f"P^{size}" for size in sizes)
         self._print(result, f"{what} of P^{self.general.k} {within}, views {seen}")
 
-    def _print(self, result: counting.Count, heading: str) -> None:
+    def _print(self, result: counting.Count, heading: str, unique: bool = False) -> None:
+        """Print a count; ``unique``: there is one tensor, unless the views are degenerate."""
         if self.json:
             say(json.dumps(asdict(result)))
             return
@@ -150,7 +176,9 @@ class Count:
         given = len(result.profile)
         taken = f"{result.minimal} of {given}" if result.minimal < given else f"{given}"
         say(f"rank {result.rank} of {result.width}, nullity {result.nullity}, from {taken} {plural(given)}")
-        if result.missing:
+        if unique and result.full is not None and result.full < result.width - 1:
+            say(f"degenerate views: no matches exceed rank {result.full}, so they do not determine the tensor")
+        elif result.missing:
             say(f"not enough: rank {result.full} takes {result.missing} more {plural(result.missing)} ({result.usual})")
         elif result.nullity == 0:
             say("no constraint: no tensor satisfies all matches")

@@ -63,6 +63,24 @@ def test_numbers(run):
     )
 
 
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("constant_velocity_3d --static 100", "3D points with constant velocities: Grassmann tensor P^6 -> P^2\nrank 44 of 81"),
+        ("constant_velocity_3d --static 100", "not enough: rank 80 takes 18 more matches (moving)\n"),
+        ("constant-velocity-3d --camera fixed --times 0 1 2 4", "rank 75 of 81, nullity 6, from 38 matches\ndegenerate views"),
+        ("constant_velocity_3d --camera fixed --static 50", "degenerate views: no matches exceed rank 75, so"),
+        ("constant_velocity_2d --profile 2 1 1 1", "rank 80 of 81, nullity 1, from 10 matches\nenough"),
+        ("two_bodies_3d --objects 60 2", "rank 26 of 27, nullity 1, from 13 of 62 matches\nenough"),
+        ("--k 6 --profile 2 2 2 1", "points of P^6 that stay, views P^2, P^2, P^2, P^2\nrank 80 of 81, nullity 1, from 40 matches"),
+        ("--k 6 --profile 3 3 1 --views 3 3 2", "rank 47 of 48, nullity 1, from 24 matches"),
+    ],
+)  # fmt: skip
+def test_motion_models_and_grassmann_tensors(run, words, expected):
+    code, out, err = run(*words.split())
+    assert (code, err) == (0, "") and expected in out
+
+
 def test_dimension(run):
     assert run("--dim-v", "3", "3", "2") == (0, "dim V(3, 3, 2) = 26\n", "")
     assert json.loads(run("--dim-v", "3", "4", "2", "--json")[1]) == {"n": 3, "m": 4, "k": 2, "dim_v": 72}
@@ -74,9 +92,10 @@ def test_table_of_all(run):
     rows = {line[0]: line[1:6] for line in cells(out)}
     assert rows["join"] == ["64", "60", "4", "60", "moving"]
     assert rows["trifocal"] == ["27", "26", "1", "7", "static"]
+    assert rows["constant_velocity_planes_3d"] == ["81", "80", "1", "20", "moving"]
     assert max(map(len, out.splitlines())) <= 132
     listed = json.loads(run("--json")[1])
-    assert {entry["name"] for entry in listed} <= rows.keys() and len(listed) == 11
+    assert {entry["name"] for entry in listed} <= rows.keys() and len(listed) == 22
 
 
 def test_json_has_the_profile(run):
@@ -99,6 +118,13 @@ def test_json_has_the_profile(run):
         ("--labelled-static 3", "--labelled-static needs a configuration"),
         ("--k 2", "numbers need at least --k"),
         ("--views 2 2", "numbers need at least --k"),
+        ("--profile 2 2 1", "numbers need at least --k"),
+        ("--k 4 --profile 2 2 1 --camera fixed", "no option camera"),
+        ("--camera fixed", "--camera needs a configuration before it"),
+        ("homography --profile 2 1 1", "homography has no option profile"),
+        ("constant_velocity_2d --profile 2 2 2", "add up to k + 1 = 5, got [2, 2, 2]"),
+        ("static_3d --camera along", "camera must be one of generic, fixed"),
+        ("constant_velocity_2d --camera up", "--camera"),
         ("--k 2 --views 2 2 --m 3 --r 2", "expected 1 <= m <= r <= k + 1"),
         ("--k 2 --views 2 2 --measure meet", "--measure"),
         ("--k 2 --views 2 2 --measure join join join", "measure must be join or hyper"),
