@@ -56,7 +56,9 @@ class Bundle:
         return norms.clamp(min=1e-300)
 
     def constrained(self, basis: Tensor) -> Tensor:
-        """The tensors of the motions that tensors ``(b, c, K, a, D)`` decompose into; where there is none, the tensors."""
+        """The tensors of the motions that tensors ``(b, c, K, a, D)`` decompose into; where no motion guides, the tensors."""
+        if not self.invariant.guides:
+            return basis
         inv, own = self.invariant, basis.transpose(1, 2)
         motion = inv.decompose(inv.tensor_of(own if inv.copies else own[:, :, 0]))
         made = inv.compose(*motion) if isinstance(motion, tuple) else inv.compose(motion)

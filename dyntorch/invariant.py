@@ -76,6 +76,8 @@ class Invariant:
     """Whether, among tensors that nearly all matches fulfil, the one with the least residual under noise is the true one."""
     staged: bool = False
     """Whether the linear tensor is too far from that of a motion to refine it by distances: the algebraic error comes first."""
+    guides: bool = True
+    """Whether robust estimation measures distances to the motions behind its tensors, which takes a decomposition each time."""
     labels_static: bool = False
     """Whether a match known to be static says more than one that may move (the argument ``static``)."""
 

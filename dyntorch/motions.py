@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from math import comb
 
 import torch
 from torch import Tensor
@@ -58,8 +59,10 @@ class Motion:
     leaves_open: str = ""
     bodies: int = 1
     k: int = 0
-    static: bool = field(default=False)
+    static: bool = False
     """Whether the points do not move at all."""
+    shift: Callable[[float], Tensor] | None = None
+    r"""R(c) with :math:`B(t + c) = B(t)\,R(c)`, where there is one: then times far from 0 (those of a clock) lose no digits."""
 
     def __post_init__(self) -> None:
         if self.lift is None and self.k < 2:
@@ -82,8 +85,21 @@ class Motion:
             raise ValueError(f"{self.name!r} has no lift")
         return torch.stack([self._at(float(t)) for t in times])
 
+    def centred(self, times: Tensor | Sequence[float]) -> tuple[Tensor, Tensor, float]:
+        """Lifts at times counted from c, ``(views, d + 1, K)``, the R with ``lifts(times) = centred @ R``, and c.
+
+        c is the mean time where the motion has a :attr:`shift`, else 0.
+        """
+        moments = [float(t) for t in times]
+        if self.shift is None:
+            return self.lifts(moments), torch.eye(self.k + 1, dtype=torch.float64), 0.0
+        origin = sum(moments) / max(1, len(moments))
+        return self.lifts([t - origin for t in moments]), self.shift(origin), origin
+
     def slope(self, time: float, spacing: float = 1.0) -> Tensor:
         """The derivative of the lift by the time, ``(d + 1, K)``."""
+        if self.shift is not None and time != 0:
+            return self.slope(0.0, spacing) @ self.shift(time)  # differences of large numbers would lose digits
         step = STEP * spacing
         return sum((c * self._at(time + i * step) for i, c in STENCIL), torch.zeros(())) / step
 
@@ -106,7 +122,7 @@ class Motion:
         enough = -(-(self.k + 1) // self.sensor)
         if self.lift is None or self.static:
             return max(2, enough)
-        return max(2, enough, least_views(self.lifts(times), self.sensor + 1))
+        return max(2, enough, least_views(self.centred(times)[0], self.sensor + 1))
 
     def minimal(self, times: Tensor | Sequence[float]) -> tuple[int, int]:
         """Fewest views, and fewest matches in them."""
@@ -115,7 +131,7 @@ class Motion:
 
     def ambiguity(self, times: Tensor | Sequence[float]) -> int:
         """Dimension of the ambiguity of a reconstruction from views at these times."""
-        return (self.k + 1) ** 2 - 1 if self.lift is None else len(gauge_algebra(self.lifts(times))) - 1
+        return (self.k + 1) ** 2 - 1 if self.lift is None else len(gauge_algebra(self.centred(times)[0])) - 1
 
     def _at(self, time: float) -> Tensor:
         assert self.lift is not None
@@ -146,19 +162,50 @@ def polynomial(dim: int, directions: int, degree: int = 1) -> Lift:
     return lift
 
 
+def polynomial_shift(dim: int, directions: int, degree: int = 1) -> Callable[[float], Tensor]:
+    """The shift of :func:`polynomial`: the coefficients of a polynomial of t + c.
+
+    Example:
+        >>> import torch
+        >>> lift, shift = polynomial(2, 2, 2), polynomial_shift(2, 2, 2)
+        >>> bool(torch.allclose(lift(torch.tensor(5.0)), lift(torch.tensor(2.0)) @ shift(3.0)))
+        True
+    """
+    eye = torch.eye(dim + 1, dtype=torch.float64)[:, :directions]
+
+    def shift(c: float) -> Tensor:
+        size = dim + 1 + degree * directions
+        matrix = torch.eye(size, dtype=torch.float64)
+        place = [dim + 1 + (n - 1) * directions for n in range(1, degree + 1)]
+        for n, column in enumerate(place, start=1):
+            matrix[: dim + 1, column : column + directions] = c**n * eye
+            for m, row in enumerate(place[: n - 1], start=1):
+                block = comb(n, m) * c ** (n - m) * torch.eye(directions, dtype=torch.float64)
+                matrix[row : row + directions, column : column + directions] = block
+        return matrix
+
+    return shift
+
+
+def _polynomial(name: str, leaves_open: str, dim: int, directions: int, degree: int = 1, sensor: int = 2) -> Motion:
+    shift = polynomial_shift(dim, directions, degree)
+    static = directions == 0
+    return Motion(polynomial(dim, directions, degree), name, sensor, leaves_open, static=static, shift=shift)
+
+
 _PARTLY = "a collineation of the world that keeps the direction{} of motion, and a velocity, linear in the position, added to all"
 MOTIONS: dict[str, Motion] = {
     motion.name: motion
     for motion in (
-        Motion(polynomial(2, 0), "static_2d", leaves_open="a collineation of the plane", static=True),
-        Motion(polynomial(3, 0), "static_3d", leaves_open="a collineation of space", static=True),
-        Motion(polynomial(2, 1), "constant_direction_2d", leaves_open=_PARTLY.format("")),
-        Motion(polynomial(2, 2), "constant_velocity_2d", leaves_open=AFFINE),
-        Motion(polynomial(2, 2, 2), "constant_acceleration_2d", leaves_open=f"{AFFINE}, and likewise a common acceleration"),
-        Motion(polynomial(3, 1), "constant_direction_3d", leaves_open=_PARTLY.format("")),
-        Motion(polynomial(3, 2), "constant_velocity_planes_3d", leaves_open=_PARTLY.format("s")),
-        Motion(polynomial(3, 3), "constant_velocity_3d", leaves_open=AFFINE),
-        Motion(polynomial(3, 3), "constant_velocity_3d_sensors", sensor=3, leaves_open=AFFINE),
+        _polynomial("static_2d", "a collineation of the plane", 2, 0),
+        _polynomial("static_3d", "a collineation of space", 3, 0),
+        _polynomial("constant_direction_2d", _PARTLY.format(""), 2, 1),
+        _polynomial("constant_velocity_2d", AFFINE, 2, 2),
+        _polynomial("constant_acceleration_2d", f"{AFFINE}, and likewise a common acceleration", 2, 2, 2),
+        _polynomial("constant_direction_3d", _PARTLY.format(""), 3, 1),
+        _polynomial("constant_velocity_planes_3d", _PARTLY.format("s"), 3, 2),
+        _polynomial("constant_velocity_3d", AFFINE, 3, 3),
+        _polynomial("constant_velocity_3d_sensors", AFFINE, 3, 3, sensor=3),
         Motion(None, "two_bodies_2d", bodies=2, k=3, leaves_open="an affinity of each body, with a linear part common to both"),
         Motion(None, "two_bodies_3d", bodies=2, k=4, leaves_open="an affinity of each body, with a linear part common to both"),
     )

@@ -130,7 +130,7 @@ def _figures(
 ) -> tuple[float, float, float]:
     """Reprojection, position (%) and velocity (%) error, medians over the scenes."""
     rms = distances(tracks, projections, structure).square().nanmean((1, 2)).sqrt()
-    error = metrics.lifted_error(structure @ torch.linalg.inv(lifting.root).mT, scene.structure, motion_lifts(scene))
+    error = metrics.lifted_error(structure @ lifting.back.mT, scene.structure, motion_lifts(scene))
     return float(rms.median()), 100 * float(error.position.median()), 100 * float(error.velocity.median())
 
 

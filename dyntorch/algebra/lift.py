@@ -130,6 +130,7 @@ def least_views(lifts: Tensor, rows: int) -> int:
     Measured on random cameras: the equations of the upgrade have no more solutions than the ambiguity of these lifts.  One
     more than the number of lifts where they do not suffice.
     """
+    lifts = balanced(lifts)[0]
     draw = torch.Generator().manual_seed(0)
     total, width = lifts.shape[0], lifts.shape[-1]
     whole = len(gauge_algebra(lifts))

@@ -81,9 +81,8 @@ def _nearly_constant(structure: Tensor, basis: Tensor) -> Tensor:
 def _member(functional: Tensor, rows: Tensor, algebra: Tensor, structure: Tensor) -> Tensor:
     """Of some members of the algebra that have this last row the one that brings the points into the roundest shape."""
     size = algebra.shape[-1]
-    whole = torch.linalg.svd(rows.mT, full_matrices=True)
-    rank = int((whole.S > TOLERANCE * whole.S[0]).sum())
-    free = whole.Vh[rank:]
+    _, scales, vh = torch.linalg.svd(rows.mT, full_matrices=True)
+    free = vh[int((scales > TOLERANCE * scales[0]).sum()) :]
     start = functional @ torch.linalg.pinv(rows)
     # draws of its own: the same points get the same frame
     draw = torch.randn(DRAWS, len(free), generator=torch.Generator().manual_seed(0), dtype=torch.float64).to(rows)

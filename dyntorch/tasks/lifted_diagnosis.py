@@ -2,19 +2,278 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
-from dyntorch.motions import Motion
-from dyntorch.solution import Status
-from dyntorch.tasks.lifted_projections import Tracks
-from dyntorch.tasks.lifted_scene import Lifting, Scene
-from dyntorch.tasks.notices import Notice
+from dyntorch.algebra.hyperplane_pair import hyperplane_pair
+from dyntorch.motions import MOTIONS, Motion, polynomial
+from dyntorch.solution import NOISY, Status, failed
+from dyntorch.tasks.lifted_projections import Tracks, projections_of_tracks
+from dyntorch.tasks.lifted_scene import Lifting, Scene, distances, scene_of
+from dyntorch.tasks.lifted_uncertainty import point_uncertainty
+from dyntorch.tasks.notices import Notice, NoticeCode, notices
+
+Note = Callable[[NoticeCode, str, Tensor, Tensor], None]
+
+UNCERTAIN = 0.1
+"""Expected error of the points over the size of the scene above which smaller models are tried, and a notice given.  80 points at
+0.5 px, 10 scenes each: 0.001 to 0.14 (constant_velocity_3d before 4 views), true errors about half of that; 0.2 to 13 with a camera
+that stands still or moves at constant velocity, where the true errors are 0.3 to 1."""
+UNKNOWN = 0.3
+"""The same above which the result is one of many."""
+EXPLAINED = 1.25
+"""Noise that a smaller model leaves over that of the model, up to which it explains the tracks as well."""
+EXACT = 1e-7
+"""Noise over the extent of the images that counts as none."""
+WEAK, NOISE_OF_STACK = 3e-3, 0.3
+"""Least singular value of the stacked projections over the largest, and noise over it: 0.015 to 0.8 and up to 0.1 in sound scenes
+at 0.5 px; below 0.005 and above 0.3 with a fixed camera."""
+THIN = 3.0
+"""Standard deviations of the noise across a line of images below which they may as well lie on it."""
+
+
+class Smaller(NamedTuple):
+    """A model of fewer unknowns, and what it means that it explains the tracks."""
+
+    motion: Motion
+    code: NoticeCode
+    cause: str
+
+
+_FLAT = "the points lie in a plane, or the camera stands still or only turns: let it move around points in space"
+_UNIFORM = "the camera stands still, only turns or itself moves at constant velocity, or all is in a plane: change its velocity"
+_LINE = "the velocities have one direction: take {!r}"
+_STILL = "nothing moves, or too few points: take {!r}, or add moving points"
+_TURNING = Motion(lambda t: torch.cat([torch.eye(3, dtype=torch.float64), t * torch.eye(3, dtype=torch.float64)], 1), "turning")
+_RESTING_SENSORS = Motion(polynomial(3, 0), "static_3d_sensors", sensor=3, static=True)
+
+
+def _smaller(name: str, code: NoticeCode, cause: str) -> Smaller:
+    return Smaller(MOTIONS[name], code, cause.format(name))
+
+
+_STATIC = {d: _smaller(f"static_{d}d", NoticeCode.STATIC_SCENE, _STILL) for d in (2, 3)}
+_ONE = {
+    d: _smaller(
+        f"static_{d}d",
+        NoticeCode.ONE_BODY,
+        "one body, or too few points on the other: take {!r}" + (d - 2) * ", or move the camera",
+    )
+    for d in (2, 3)
+}
+SMALLER: dict[str, tuple[Smaller, ...]] = {
+    "static_3d": (_smaller("static_2d", NoticeCode.TURNING_CAMERA, _FLAT),),
+    "constant_direction_2d": (_STATIC[2],),
+    "constant_velocity_2d": (_STATIC[2], _smaller("constant_direction_2d", NoticeCode.LINEAR_VELOCITIES, _LINE)),
+    "constant_acceleration_2d": (
+        _STATIC[2],
+        _smaller("constant_velocity_2d", NoticeCode.DEGENERATE, "nothing is accelerated: take {!r}"),
+    ),
+    "constant_direction_3d": (
+        _smaller("constant_direction_2d", NoticeCode.TURNING_CAMERA, _FLAT),
+        _STATIC[3],
+        _smaller("constant_velocity_2d", NoticeCode.UNIFORM_CAMERA, _UNIFORM),
+    ),
+    "constant_velocity_planes_3d": (
+        _smaller("constant_velocity_2d", NoticeCode.TURNING_CAMERA, _FLAT),
+        _STATIC[3],
+        _smaller("constant_direction_3d", NoticeCode.LINEAR_VELOCITIES, _LINE),
+        Smaller(_TURNING, NoticeCode.UNIFORM_CAMERA, _UNIFORM),
+    ),
+    "constant_velocity_3d": (
+        _STATIC[3],
+        _smaller("constant_direction_3d", NoticeCode.LINEAR_VELOCITIES, _LINE),
+        Smaller(_TURNING, NoticeCode.UNIFORM_CAMERA, _UNIFORM),
+        _smaller("constant_velocity_planes_3d", NoticeCode.PLANAR_VELOCITIES, "the velocities are parallel to a plane: take {!r}"),
+    ),
+    "constant_velocity_3d_sensors": (
+        Smaller(_RESTING_SENSORS, NoticeCode.STATIC_SCENE, "nothing moves, or too few points: add moving points"),
+    ),
+    "two_bodies_2d": (_ONE[2],),
+    "two_bodies_3d": (_ONE[3],),
+}
+"""Models that leave the larger one undetermined where they explain the tracks.  Seen by a camera that does not accelerate, a moving
+point is one of the plane, :math:`x \\sim p + t q` with p and q of three coordinates."""
 
 
 def diagnose(
     tracks: Tracks, scene: Scene, lifting: Lifting | None, motion: Motion, status: Tensor, sigma: Tensor, batch: tuple[int, ...]
 ) -> tuple[Tensor, tuple[Notice, ...]]:
-    """The status ``(b,)`` of every problem, judged by the scene, and the notices on all of them."""
-    status = torch.where(status == Status.AMBIGUOUS, int(Status.OK), status)
-    return status, ()
+    """The status ``(b,)`` of every problem, judged by the scene, and the notices on all of them.
+
+    The linear fit of a tensor has more unknowns than the scene: what it calls ambiguous may be well determined.  A problem is
+    ambiguous where its points are uncertain by :data:`UNKNOWN` of their extent, or a model with fewer unknowns explains the
+    tracks as well, which also tells the cause.
+
+    Args:
+        tracks: flat batch, weights 0 for outliers.
+        scene: in the frame that is shown, normalized images; bodies with their projections for cameras.
+        lifting: None for bodies.
+        motion: the model.
+        status: ``(b,)`` of the fit of the tensor.
+        sigma: ``(b,)`` noise in measured units.
+        batch: the shape that the flat dimension comes from.
+    """
+    found: list[Notice] = []
+
+    def note(code: NoticeCode, message: str, values: Tensor, flagged: Tensor) -> None:
+        found.extend(notices(code, message, values, flagged, batch))
+
+    lost = (scene.cameras == 0).flatten(1).all(-1) | ~scene.cameras.isfinite().flatten(1).all(-1)
+    status = torch.where(lost & ~failed(status), int(Status.DEGENERATE), status)
+    solved = ~failed(status)
+    noise = sigma * tracks.scales.square().mean(-1).sqrt()
+    stack, doubt = conditions(tracks, scene, lifting, noise)
+    stack, doubt = torch.where(solved, stack, 0.0), torch.where(solved, doubt, torch.inf)
+    cheap = motion.k <= 4 or motion.bodies > 1
+    suspect = (status == Status.DEGENERATE) | (solved & (doubt > UNCERTAIN)) | ((status == Status.AMBIGUOUS) & cheap)
+    explained = torch.zeros_like(solved)
+    for smaller in SMALLER.get(motion.name, ()):
+        asked = (suspect | (smaller.motion.static & (status == Status.AMBIGUOUS))) & ~explained
+        left = _noise_of(tracks, smaller.motion, asked)
+        same = asked & (left <= EXPLAINED * torch.where(solved, noise, 0.0) + EXACT)
+        note(smaller.code, f"a smaller model leaves a residual of {{value:.2g}}: {smaller.cause}", left / _scale(tracks), same)
+        explained = explained | same
+    judged = torch.where((explained | (doubt > UNKNOWN)) & solved, int(Status.AMBIGUOUS), int(Status.OK))
+    judged = torch.where(solved & ~explained & (noise > NOISY), int(Status.NO_CONSENSUS), judged)
+    status = torch.where((status == Status.OK) | (status == Status.AMBIGUOUS), judged, status)
+    text = "the noise makes the points uncertain by {value:.2g} of the size of the scene; add views, points or motion"
+    note(NoticeCode.UNCERTAIN, text, doubt, solved & (doubt > UNCERTAIN))
+    text = "the projections of all views nearly share a centre (singular value {value:.2g} of the largest); move the camera more"
+    note(NoticeCode.WEAK_STACK, text, stack, solved & ((stack < WEAK) | (noise > NOISE_OF_STACK * stack)))
+    _observations(tracks, motion, status, note)
+    _images(tracks, scene, lifting, noise, solved, note)
+    if lifting is None:
+        status = _bodies(scene, status, noise, solved, note)
+    return status, tuple(sorted(found, key=lambda notice: notice.problem))
+
+
+def conditions(tracks: Tracks, scene: Scene, lifting: Lifting | None, noise: Tensor) -> tuple[Tensor, Tensor]:
+    """Least singular value of the stacked projections over the largest, in coordinates in which the points fill the space, and the
+    median expected error of the points over the size of the scene, ``(b,)`` each.
+
+    Args:
+        tracks: flat batch.
+        scene: normalized images.
+        lifting: None for bodies.
+        noise: ``(b,)`` of one coordinate, in normalized images.
+    """
+    unit = torch.nn.functional.normalize(scene.structure.nan_to_num(), dim=-1)
+    size = unit.shape[-1]
+    eye = torch.eye(size, dtype=unit.dtype, device=unit.device)
+    known = (unit != 0).any(-1)
+    moments = unit.mT @ unit / known.sum(-1).clamp(min=1)[:, None, None] + 1e-12 * eye
+    spread = torch.linalg.cholesky_ex(moments)[0]
+    projections = scene.cameras if lifting is None else scene.cameras @ lifting.lifts
+    white = _unit(projections @ spread[:, None]).nan_to_num()
+    values = torch.linalg.svdvals(white.flatten(1, 2))
+    stack = values[:, -1] / values[:, 0].clamp(min=torch.finfo(values.dtype).tiny)
+    views = projections.shape[1]
+    if lifting is None:
+        points = torch.nn.functional.normalize(torch.linalg.solve_triangular(spread, unit.mT, upper=False).mT, dim=-1)
+        cameras, lifts, depth = white, eye.expand(views, -1, -1), points
+        gauge, extent = views + size**2 - 1, torch.ones_like(stack)
+    else:
+        cameras, lifts, points = _unit(scene.cameras).nan_to_num(), lifting.lifts, scene.structure.nan_to_num()
+        depth = lifts[:, -1].mean(0)
+        gauge, extent = views + len(lifting.algebra) - 1, _extent(points, depth, known)
+    found = point_uncertainty(cameras, points, lifts, depth, tracks.weights, gauge)
+    middle = torch.where(known, found, torch.nan).nanmedian(-1).values
+    return stack, (middle * noise / extent).nan_to_num(nan=torch.inf)
+
+
+def _extent(structure: Tensor, depth: Tensor, known: Tensor) -> Tensor:
+    """Median distance of the points, scaled to depth 1, from their middle, ``(b,)``."""
+    below = (structure @ depth)[..., None]
+    unit = torch.where(known[..., None], structure / torch.where(below.abs() > 1e-12, below, 1.0), torch.nan)
+    off = (unit - unit.nanmedian(1, keepdim=True).values).norm(dim=-1)
+    return off.nanmedian(-1).values.nan_to_num().clamp(min=torch.finfo(off.dtype).tiny)
+
+
+def _noise_of(tracks: Tracks, motion: Motion, asked: Tensor) -> Tensor:
+    """Noise ``(b,)`` in normalized images that another model leaves; infinite where it was not asked for, or has no result."""
+    left = torch.full_like(tracks.x[:, 0, 0, 0], torch.inf)
+    chosen = asked.nonzero()[:, 0]
+    views, n = tracks.weights.shape[1:]
+    need = motion.views(tracks.times)
+    if not len(chosen) or need > views or n < motion.tensor(min(need, motion.k + 1)).minimal():
+        return left
+    some = tracks.subset(chosen)
+    found = projections_of_tracks(some, motion.tensor(min(need, motion.k + 1)))
+    projections, structure, unknowns = found.projections, found.structure, (motion.sensor + 1) * (motion.k + 1) - 1
+    unknowns = views * unknowns - (motion.k + 1) ** 2 + 1
+    if motion.lift is not None:
+        lifting = Lifting.of(motion, tracks.times, tracks.x)
+        scene = scene_of(some, found, lifting)
+        projections, structure = scene.cameras @ lifting.lifts, scene.structure
+        unknowns = views * ((motion.sensor + 1) * lifting.lifts.shape[1] - 1) - len(lifting.algebra) + 1
+    apart = distances(some, projections, structure) * _scale(some)[:, None, None]
+    counted = apart.isfinite()
+    spare = counted.flatten(1).sum(-1) * motion.sensor - counted.any(1).sum(-1) * motion.k - unknowns
+    mean = (apart.square().nansum((1, 2)) / spare.clamp(min=1)).sqrt()
+    # a model that loses points explains nothing
+    whole = counted.flatten(1).sum(-1) >= 0.9 * (some.weights > 0).flatten(1).sum(-1)
+    return left.index_copy(0, chosen, torch.where(failed(found.status) | ~whole, torch.inf, mean))
+
+
+def _observations(tracks: Tracks, motion: Motion, status: Tensor, note: Note) -> None:
+    """Notices on tracks and views with too few observations."""
+    seen = tracks.weights > 0
+    views = seen.shape[1]
+    need = -(-motion.k // motion.sensor)
+    count = seen.sum(1)
+    few = ((count > 0) & (count < need)).sum(-1)
+    text = f"{{value:g}} tracks are seen in fewer than {need} views and have no position; track them longer"
+    note(NoticeCode.FEW_OBSERVED, text, few, (few > 0) & ~failed(status))
+    size = min(motion.views(tracks.times), motion.k + 1)
+    enough, least = (count >= size).sum(-1), motion.tensor(size).minimal()
+    text = f"{{value:g}} tracks are seen in {size} views or more, {motion.name!r} needs {least} through the same ones; add tracks"
+    note(NoticeCode.FEW_OBSERVED, text, enough, status == Status.TOO_FEW)
+    resection = -(-((motion.sensor + 1) * (motion.k + 1) - 1) // motion.sensor)
+    for view in range(views):
+        here = seen[:, view].sum(-1)
+        text = f"view {view} shows {{value:g}} tracks, its camera needs {resection}; leave the view out or add tracks"
+        note(NoticeCode.UNUSED_VIEW, text, here, here < resection)
+
+
+def _images(tracks: Tracks, scene: Scene, lifting: Lifting | None, noise: Tensor, solved: Tensor, note: Note) -> None:
+    """Notices on images on a line, and on points behind the cameras."""
+    seen = (tracks.weights > 0).to(tracks.x.dtype)
+    number = seen.sum(-1).clamp(min=1)[..., None]
+    off = (tracks.x - (seen[..., None] * tracks.x).sum(2, keepdim=True) / number[..., None]) * seen[..., None]
+    across = torch.linalg.eigvalsh(off.mT @ off / number[..., None])[..., -2].clamp(min=0).sqrt()
+    across = torch.where(seen.sum(-1) > 2, across, torch.inf).amin(1)
+    thin = across / noise.nan_to_num(posinf=0.0).clamp(min=EXACT)
+    text = "the images of a view lie on a line, to {value:.2g} standard deviations; points off it are needed"
+    note(NoticeCode.COLLINEAR, text, thin, thin < THIN)
+    if lifting is None or tracks.x.shape[-1] != 2:
+        return
+    depth = (scene.structure[:, None] @ (scene.cameras @ lifting.lifts)[..., -1, :, None])[..., 0] * seen
+    front = torch.where(depth.sign().sum(-1, keepdim=True) < 0, -depth, depth)
+    behind = (front < 0).any(1).sum(-1)
+    text = "{value:g} points are behind a camera or at infinity; noise, or tracks that do not follow the motion"
+    note(NoticeCode.BEHIND, text, behind, solved & (behind > 0))
+
+
+def _bodies(scene: Scene, status: Tensor, noise: Tensor, solved: Tensor, note: Note) -> Tensor:
+    """The status where a body has too few points for its hyperplane, and a notice."""
+    known = (scene.structure != 0).any(-1) & solved[:, None]
+    pair = hyperplane_pair(scene.structure, known.to(scene.structure.dtype))
+    least, size = torch.stack([(pair.labels == body).sum(-1) for body in (1, 2)]).amin(0), scene.structure.shape[-1]
+    # a hyperplane of noisy points takes the nearest one of the others in
+    few = solved & (least < size - 1 + (noise > EXACT))
+    text = f"{{value:g}} points lie on the smaller body, {size - 1} determine it and others have to confirm it; add points on it"
+    note(NoticeCode.ONE_BODY, text, least, few)
+    return torch.where(few & (status == Status.OK), int(Status.AMBIGUOUS), status)
+
+
+def _unit(cameras: Tensor) -> Tensor:
+    return cameras / cameras.flatten(2).norm(dim=-1)[..., None, None].clamp(min=torch.finfo(cameras.dtype).tiny)
+
+
+def _scale(tracks: Tracks) -> Tensor:
+    """Normalized unit over measured unit, ``(b,)``."""
+    return tracks.scales.square().mean(-1).sqrt()

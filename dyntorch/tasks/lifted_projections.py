@@ -21,8 +21,10 @@ SUBSETS = 6
 """Choices of views for the tensor, where there are more than it takes; the one of least error in all views wins."""
 LOOKED_AT = 60
 """Choices of which the most seen and best spread ones are taken."""
-FREE = 10
-"""Steps of free bundle adjustment."""
+ALGEBRAIC, FREE, ROUGH = 5, 5, 1e-2
+"""At most so many steps of the constrained fit and of free bundle adjustment, which ends where a step gains less than this share:
+they start the structured one.  Of 20 scenes of constant velocity, 4 views of 60 points at 0.5 px, 18 reach its minimum that way in
+7 ms each, and 18 in 31 ms with 30 steps, 10 steps and 1e-9; below P^6 all do."""
 
 
 @dataclass(frozen=True)
@@ -125,7 +127,7 @@ def _from_subset(tracks: Tracks, invariant: GrassmannTensor, chosen: Tensor) -> 
     parts = x.unbind(1)
     data = Matches(tuple(parts), seen.all(1).to(x.dtype), None, (b,), x.dtype, x.device)
     linear = fit_matches(invariant, data)
-    some = torch.stack(constrain_matches(linear, data).motion, dim=1)  # (b, size, l + 1, K)
+    some = torch.stack(constrain_matches(linear, data, ALGEBRAIC).motion, dim=1)  # (b, size, l + 1, K)
     status = linear.status
     structure = triangulate(some, x, seen.to(x.dtype))
     if views > len(invariant.profile):
@@ -137,6 +139,6 @@ def _from_subset(tracks: Tracks, invariant: GrassmannTensor, chosen: Tensor) -> 
     else:
         order = chosen.argsort(1)
         whole = some.gather(1, order[..., None, None].expand_as(some))
-    adjusted = bundle_adjust(tracks.x, tracks.weights, whole, structure, iterations=FREE)
+    adjusted = bundle_adjust(tracks.x, tracks.weights, whole, structure, iterations=FREE, tolerance=ROUGH)
     bad = failed(status)[:, None, None]
     return Projections(torch.where(bad[..., None], 0.0, adjusted.cameras), torch.where(bad, 0.0, adjusted.structure), status)

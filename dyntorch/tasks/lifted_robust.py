@@ -5,14 +5,25 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from dyntorch.algebra.triangulation import reproject, resect, triangulate
+from dyntorch.bundle_adjustment import bundle_adjust
 from dyntorch.invariants.grassmann_tensor import GrassmannTensor
-from dyntorch.tasks.lifted_projections import Projections, Tracks, projections_of_tracks
-from dyntorch.tasks.lifted_scene import Lifting
+from dyntorch.solution import Status
+from dyntorch.tasks.lifted_agreement import agreeing, bound, distance, freedom, noise
+from dyntorch.tasks.lifted_consensus import EXACT, Consensus, consensus, doubtful, settled_noise
+from dyntorch.tasks.lifted_projections import Projections, Tracks
+from dyntorch.tasks.lifted_scene import Lifting, scene_of
 
 SMEARED = 1.5
 """Noise by the mean square over noise by the median above which some tracks do not belong to the model."""
-FAR = 2.0
-"""Residual over the threshold above which an observation is wrong."""
+SUSPECT = 0.9999
+"""Share of the points of one problem without outliers that are nearer than the farthest one may be."""
+WIDTHS = (6.0, 3.0, 1.5, 1.0, 1.0)
+"""Thresholds over the final one, while all views settle."""
+RESECTED = 10
+"""Reweightings of the views that the tensor does not see."""
+ADJUSTED = 10
+"""Steps of bundle adjustment after each choice of the observations."""
 
 
 def suspicious(tracks: Tracks, apart: Tensor, k: int, limit: float | None) -> Tensor:
@@ -24,18 +35,89 @@ def suspicious(tracks: Tracks, apart: Tensor, k: int, limit: float | None) -> Te
         k: dimension of the space of the points.
         limit: three standard deviations of the noise, None: judged by the residuals alone.
     """
-    if limit is not None:
-        return (apart.nan_to_num() > FAR * limit).flatten(1).any(-1)
-    seen = apart.isfinite().sum(1)
-    square = apart.square().nansum(1) / (seen * tracks.x.shape[-1] - k).clamp(min=1)
-    square = torch.where(seen * tracks.x.shape[-1] > k, square, torch.nan)
-    middle, mean = square.nanmedian(-1).values, square.nanmean(-1)
-    extent = 1 / tracks.scales.amin(1)
-    return (mean.sqrt() > SMEARED * middle.sqrt()) & (mean.sqrt() > 1e-9 * extent)
+    seen, square = apart.isfinite(), apart.square().nansum(1)
+    free = (seen.sum(1) * tracks.x.shape[-1] - k).clamp(min=0)
+    least = EXACT / tracks.scales.amin(1)
+    sigma = noise(square, free, free >= 1) if limit is None else torch.full_like(least, limit / 3)
+    sigma = torch.maximum(sigma, least)
+    return (square > sigma.square()[:, None] * bound(free, SUSPECT)).logical_and(free >= 1).any(-1)
 
 
 def robust_projections(
     tracks: Tracks, invariant: GrassmannTensor, lifting: Lifting | None, limit: float | None, generator: torch.Generator | None
 ) -> tuple[Projections, Tracks]:
-    """Projections from the tracks that agree, and the tracks with weight 0 for all other observations."""
-    return projections_of_tracks(tracks, invariant), tracks
+    """Projections from the tracks that agree, and the tracks with weight 0 for all other observations.
+
+    Args:
+        tracks: flat batch.
+        invariant: of as many views as the tensor takes.
+        lifting: the model, or None.
+        limit: three standard deviations of the noise of one coordinate, measured unit; None: estimated.
+        generator: of the random samples.
+    """
+    given = None if limit is None else torch.full_like(tracks.scales[:, 0], limit / 3)
+    best, sigma, _ = consensus(tracks, invariant, given, generator)
+    cameras = _extended(tracks, best, sigma)
+    cameras = _settled(tracks, cameras, None, sigma, WIDTHS)
+    sigma = _level(tracks, cameras, sigma, given)
+    if lifting is not None:
+        cameras = _structured(tracks, cameras, lifting, sigma, given)
+        sigma = _level(tracks, cameras, sigma, given)
+    fewer = tracks.only(agreeing(tracks, cameras, sigma))
+    doubt = doubtful(tracks, distance(tracks, cameras), sigma, invariant)
+    status = torch.where(doubt, int(Status.NO_CONSENSUS), int(Status.OK))
+    return Projections(cameras, triangulate(cameras, fewer.x, fewer.weights, steps=2), status), fewer
+
+
+def _level(tracks: Tracks, cameras: Tensor, sigma: Tensor, given: Tensor | None) -> Tensor:
+    """The noise ``(b,)``: as given, or that of the points that agree."""
+    if given is not None:
+        return given
+    fewer = tracks.only(agreeing(tracks, cameras, sigma))
+    free = freedom(fewer, cameras.shape[-1] - 1)
+    return settled_noise(tracks, distance(fewer, cameras), free, free >= 1)
+
+
+def _extended(tracks: Tracks, found: Consensus, sigma: Tensor) -> Tensor:
+    """Projections of all views: the others by resection from the points that agree, reweighted."""
+    b, size = found.chosen.shape
+    if size == tracks.x.shape[1]:
+        return found.projections.gather(1, found.chosen.argsort(1)[..., None, None].expand_as(found.projections))
+    rows = torch.arange(b, device=found.chosen.device)[:, None]
+    inside = tracks.x.new_zeros(tracks.weights.shape[:2]).index_put((rows, found.chosen), torch.ones((), dtype=tracks.x.dtype))
+    some = (tracks.x[rows, found.chosen], tracks.weights[rows, found.chosen])
+    structure = triangulate(found.projections, *some, steps=2)
+    free = torch.full_like(found.square, size * tracks.x.shape[-1] - structure.shape[-1] + 1).long()
+    known = found.square <= sigma.square()[:, None] * bound(free)
+    structure = torch.where(known[..., None], structure, 0.0)
+    counted = (tracks.weights > 0) & known[:, None]
+    weights, scale = tracks.weights, None
+    for _ in range(RESECTED):
+        whole = resect(structure, tracks.x, weights)
+        square = (tracks.x - reproject(whole, structure)).square().sum(-1) / tracks.scales.square()[..., None]
+        middle = square.masked_fill(~counted, torch.nan).nanmedian(-1).values.nan_to_num(nan=0.0)
+        middle = torch.maximum(middle, sigma.square()[:, None])
+        scale = 4 * middle if scale is None else torch.maximum(scale / 2, middle)
+        weights = tracks.weights * (scale[..., None] / (scale[..., None] + square)).square()
+    return whole.index_put((rows, found.chosen), found.projections)
+
+
+def _settled(tracks: Tracks, cameras: Tensor, lifts: Tensor | None, sigma: Tensor, widths: tuple[float, ...]) -> Tensor:
+    """Projections adjusted to the observations that agree, which are chosen again after each time."""
+    for width in widths:
+        projections = cameras if lifts is None else cameras @ lifts
+        weights = agreeing(tracks, projections, width * sigma)
+        structure = triangulate(projections, tracks.x, weights, steps=2)
+        cameras = bundle_adjust(tracks.x, weights, cameras, structure, lifts, iterations=ADJUSTED).cameras
+    return cameras if lifts is None else cameras @ lifts
+
+
+def _structured(tracks: Tracks, cameras: Tensor, lifting: Lifting, sigma: Tensor, given: Tensor | None) -> Tensor:
+    """Projections that the lifts allow, where as many observations agree with them."""
+    weights = agreeing(tracks, cameras, sigma)
+    fewer = tracks.only(weights)
+    found = Projections(cameras, triangulate(cameras, fewer.x, weights, steps=2), torch.zeros_like(sigma).long())
+    scene = scene_of(fewer, found, lifting)
+    better = _settled(tracks, scene.cameras, lifting.lifts, sigma, (1.0, 1.0))
+    more = (agreeing(tracks, better, sigma) > 0).sum((1, 2)) >= 0.98 * (weights > 0).sum((1, 2))
+    return torch.where(more[:, None, None, None], better, cameras)

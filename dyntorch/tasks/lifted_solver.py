@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.algebra.triangulation import triangulate
+from dyntorch.bundle_adjustment import bundle_adjust
 from dyntorch.motions import Motion
 from dyntorch.solution import failed
 from dyntorch.tasks.lifted_bodies import bodies_of
@@ -57,7 +58,8 @@ def _scene(tracks: Tracks, found: Projections, lifting: Lifting | None) -> Scene
     """With a lift the scene in any of its frames; bodies stay in the projective one, with their projections for cameras."""
     if lifting is not None:
         return scene_of(tracks, found, lifting)
-    return Scene(found.projections, found.structure, tracks.x.new_zeros(len(tracks.x)))
+    done = bundle_adjust(tracks.x, tracks.weights, found.projections, found.structure)
+    return Scene(done.cameras, done.structure, done.cost)
 
 
 def _merged(old: Projections | Scene, new: Projections | Scene, chosen: Tensor) -> Projections | Scene:
@@ -92,7 +94,7 @@ def _result(
         if static is not None:
             labels = torch.where(known & _rests(tracks, scene, lifting, projections), 1, labels)
         status = found.status
-        cameras, structure = scene.cameras, scene.structure @ torch.linalg.inv(lifting.root).mT
+        cameras, structure = scene.cameras, scene.structure @ lifting.back.mT
         points = positions(scene.structure, lifting.start)
         speed = velocities(scene.structure, lifting.start, lifting.slope)
     apart = distances(tracks, projections, scene.structure)

@@ -50,6 +50,8 @@ class NoticeCode(StrEnum):
     """Points seen in too few views."""
     UNUSED_VIEW = "unused_view"
     """A view whose camera was not found."""
+    ONE_BODY = "one_body"
+    """All points belong to one of the two bodies, or too few to the other."""
     UNCERTAIN = "uncertain"
     """The noise leaves the motion so uncertain that it says little."""
 

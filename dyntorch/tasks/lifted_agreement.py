@@ -1,0 +1,109 @@
+"""Which observations agree with given projections: per point all of its views, or all but the fewest that spoil it."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+
+from dyntorch.algebra.triangulation import reproject, triangulate
+from dyntorch.starts import chi
+from dyntorch.tasks.lifted_projections import Tracks
+
+SHARE = 0.997
+"""Of the inliers that agree: what three standard deviations are for one coordinate."""
+SPARE = 2
+"""Equations that must remain to confirm a point that has lost a view: with fewer, wrong ones confirm each other."""
+STEPS = 2
+"""Of triangulation."""
+FAR = 1e30
+"""Squared distance in place of one that is no number."""
+PAIRS = 1 << 14
+"""Points that are looked at together with one view left out."""
+
+
+def distance(tracks: Tracks, projections: Tensor) -> Tensor:
+    """Squared reprojection error of every point over its views, ``(b, n)``, measured units; :data:`FAR` where there is none."""
+    structure = triangulate(projections, tracks.x, tracks.weights, steps=STEPS)
+    error = (tracks.x - reproject(projections, structure)).square().sum(-1) / tracks.scales.square()[..., None]
+    total = torch.where(tracks.weights > 0, error, 0.0).sum(1)
+    return torch.where((structure != 0).any(-1), total, FAR).nan_to_num(nan=FAR, posinf=FAR).clamp(max=FAR)
+
+
+def freedom(tracks: Tracks, k: int) -> Tensor:
+    """Equations that every point fulfils beside those that determine it, ``(b, n)``, not negative."""
+    return ((tracks.weights > 0).sum(1) * tracks.x.shape[-1] - k).clamp(min=0)
+
+
+def bound(free: Tensor, share: float = SHARE) -> Tensor:
+    """The squared distance, in standard deviations, that so many of the inliers keep; 0 where nothing is left to judge by."""
+    top = int(free.max()) if free.numel() else 0
+    return torch.tensor(_bounds(top, share), dtype=torch.float64, device=free.device)[free]
+
+
+@lru_cache(maxsize=64)
+def _bounds(top: int, share: float) -> tuple[float, ...]:
+    return (0.0, *(chi(free, share) ** 2 for free in range(1, top + 1)))
+
+
+def noise(square: Tensor, free: Tensor, chosen: Tensor) -> Tensor:
+    """Standard deviation ``(b,)`` of one coordinate from the median of the chosen points; 0 where there are none.
+
+    Args:
+        square: ``(b, n)`` squared distances.
+        free: ``(b, n)`` of :func:`freedom`.
+        chosen: ``(b, n)`` bool.
+    """
+    relative = square / bound(free, 0.5).clamp(min=torch.finfo(square.dtype).tiny)
+    return relative.masked_fill(~chosen | (free < 1), torch.nan).nanmedian(-1).values.nan_to_num(nan=0.0).sqrt()
+
+
+def agreeing(tracks: Tracks, projections: Tensor, sigma: Tensor) -> Tensor:
+    r"""Weights ``(b, views, n)``, 0 for all observations that do not agree with the projections.
+
+    A point agrees where its squared distance is below the quantile of :math:`\sigma^2 \chi^2`.  Of one that does not, the view
+    without which the others agree best is left out, and the next one, as long as enough remains to tell.
+
+    Args:
+        tracks: flat batch.
+        projections: ``(b, views, l + 1, K)``.
+        sigma: ``(b,)`` noise of one coordinate, measured unit.
+    """
+    k, size = projections.shape[-1] - 1, tracks.x.shape[-1]
+    free = freedom(tracks, k)
+    agrees = (distance(tracks, projections) <= sigma.square()[:, None] * bound(free)) & (free >= 1)
+    kept = tracks.weights * agrees[:, None]
+    rest = (~agrees & (free - size >= SPARE)).nonzero()
+    for some in rest.split(PAIRS):
+        problem, point = some.unbind(-1)
+        kept[problem, :, point] = _without(tracks, projections, sigma, problem, point)
+    return kept
+
+
+def _without(tracks: Tracks, projections: Tensor, sigma: Tensor, problem: Tensor, point: Tensor) -> Tensor:
+    """Weights ``(p, views)`` of single points, without the views that spoil them; all 0 where no views agree."""
+    alone = Tracks(
+        tracks.x[problem, :, point][:, :, None],
+        tracks.weights[problem, :, point][:, :, None],
+        tracks.scales[problem],
+        tracks.transforms[problem],
+        tracks.times,
+    )
+    matrices, limit = projections[problem], sigma[problem].square()
+    views, k, size = matrices.shape[1], matrices.shape[-1] - 1, tracks.x.shape[-1]
+    result = torch.zeros_like(alone.weights[..., 0])
+    left = torch.arange(len(problem), device=problem.device)
+    others = 1 - torch.eye(views, dtype=tracks.x.dtype, device=tracks.x.device)
+    while len(left):
+        seen = alone.weights[:, :, 0] > 0
+        fewer = alone.repeated(views).only((alone.weights[:, None] * others[:, :, None]).flatten(0, 1))
+        square = distance(fewer, matrices.repeat_interleave(views, dim=0)).unflatten(0, (-1, views))[..., 0]
+        least, worst = square.masked_fill(~seen, torch.inf).min(-1)
+        alone = alone.only(alone.weights * others[worst][:, :, None])
+        free = freedom(alone, k)[:, 0]
+        agrees = least <= limit * bound(free)
+        result[left[agrees]] = alone.weights[agrees][..., 0]
+        on = (~agrees & (free - size >= SPARE)).nonzero()[:, 0]
+        left, alone, matrices, limit = left[on], alone.subset(on), matrices[on], limit[on]
+    return result
