@@ -58,8 +58,19 @@ class World:
         """``(views, n)`` distances from the straight lines, metres."""
         return (self.places - self.bent(0.0).places).norm(dim=-1)
 
+    def turned(self) -> World:
+        """Turned about the vertical until the first axis is the main horizontal direction of motion."""
+        speed = self.straight[1].clone()
+        speed[:, 2] = 0.0
+        axes = torch.linalg.svd(speed, full_matrices=False).Vh
+        across = torch.linalg.cross(torch.tensor([0.0, 0.0, 1.0], dtype=axes.dtype), axes[0])
+        turn = torch.stack([axes[0], across, torch.tensor([0.0, 0.0, 1.0], dtype=axes.dtype)])
+        return World(self.places @ turn.mT, self.times, self.moving)
+
     def structure(self, motion: str) -> Tensor:
-        """True lifted points ``(n, K)`` of a model of space, by least squares."""
+        """True lifted points ``(n, K)`` of a model of space, by least squares; a common direction is the first axis."""
+        if as_motion(motion).static:
+            return homogeneous(self.places.mean(0))
         start, speed = self.straight
         return torch.cat([homogeneous(start), speed[:, : as_motion(motion).k - 3]], dim=-1)
 

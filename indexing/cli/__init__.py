@@ -1,4 +1,4 @@
-"""The command line: ``dyntorch demo | index fit | index scan | index evaluate | align | count``, one file per command.
+"""The command line: ``dyntorch demo | index fit | index scan | index evaluate | align | reconstruct | count``, a file for each.
 
 A command is a dataclass whose fields are its flags, with ``run() -> exit code``.  Only what parsing needs is imported here,
 so that ``--help`` answers at once; a command imports its tools when it runs.
@@ -24,6 +24,7 @@ from indexing.cli.count import Count
 from indexing.cli.demo import Demo
 from indexing.cli.evaluate import Evaluate
 from indexing.cli.fit import Fit
+from indexing.cli.reconstruct import Reconstruct
 from indexing.cli.scan import Scan
 
 DONE, BAD_INPUT, REFUSED, INTERRUPTED, BROKEN_PIPE = 0, 2, 3, 130, 141
@@ -34,12 +35,13 @@ COMMANDS: Any = (
     Annotated[Demo, Command("demo")]
     | Annotated[INDEX, Command("index", description="Learn actions from one clip each and find them elsewhere.")]
     | Annotated[Align, Command("align")]
+    | Annotated[Reconstruct, Command("reconstruct")]
     | Annotated[Count, Command("count")]
 )  # next: sync, segment
 GROUPS = ("index",)  # words that need another one behind them
 DESCRIPTION = """Geometry of scenes in which everything moves: learn actions from one clip each and find them in other clips, from
-other viewpoints (index); find how a camera or 3D sensor moved among things that move, and what stood still (align); count how many
-matches such a problem takes (count).
+other viewpoints (index); find how a camera or 3D sensor moved among things that move, and what stood still (align); find cameras,
+points and velocities from tracks through several views (reconstruct); count how many matches such a problem takes (count).
 
 dyntorch COMMAND --help explains a command, dyntorch --version says the version."""
 

@@ -163,10 +163,10 @@ def labels_csv(report: AlignmentReport) -> str:
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(["id", "label", "name"])
-    writer.writerows(zip(map(_cell, report.ids), report.labels.tolist(), report.kinds, strict=True))
+    writer.writerows(zip(map(safe_cell, report.ids), report.labels.tolist(), report.kinds, strict=True))
     return out.getvalue()
 
 
-def _cell(name: str) -> str:
+def safe_cell(name: str) -> str:
     """A name as a cell.  Spreadsheets run text that begins like a formula; an apostrophe keeps it text."""
     return f"'{name}" if name.lstrip(" ")[:1] in tuple("=+@\t\r\n") or (name[:1] == "-" and not name[1:2].isdigit()) else name

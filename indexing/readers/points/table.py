@@ -27,10 +27,10 @@ def read(path: Path) -> PointSet:
     Raises:
         ValueError: no rows, unknown columns, a short row, or a cell that is not a number: with row, column and value.
     """
-    rows = _rows(path)
+    rows = read_rows(path)
     if not rows:
         raise error(path, "the file is empty", "export it again")
-    header = None if _numbers(rows[0][1]) else [cell.strip().lower() for cell in rows[0][1]]
+    header = None if is_data(rows[0][1]) else [cell.strip().lower() for cell in rows[0][1]]
     if header is None:
         names = _unnamed(path, rows[0][1])
     else:
@@ -46,12 +46,14 @@ def read(path: Path) -> PointSet:
     twice = [name for name in names if names.count(name) > 1 and name in (*columns, *IDS)]
     if twice:
         raise error(path, f"there are two columns {twice[0]!r}", "leave one of them out")
-    values = _column_values(path, rows, names, columns)
+    values = column_values(path, rows, names, columns)
     values = values.reshape(-1, 2, 3) if columns == LINE else values
-    return PointSet(str(path), values, _ids(path, rows, names), _optional(path, rows, names, WEIGHTS), _flags(path, rows, names))
+    return PointSet(
+        str(path), values, _ids(path, rows, names), optional_column(path, rows, names, WEIGHTS), flags(path, rows, names)
+    )
 
 
-def _rows(path: Path) -> list[Row]:
+def read_rows(path: Path) -> list[Row]:
     """Line number (1-based) and cells of every row that is not blank."""
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
@@ -65,14 +67,14 @@ def _rows(path: Path) -> list[Row]:
     return [(line, [cell.replace(",", ".") for cell in cells]) for line, cells in found] if delimiter == ";" else found
 
 
-def _numbers(cells: Sequence[str]) -> bool:
+def is_data(cells: Sequence[str]) -> bool:
     """Whether a row is one of numbers (and perhaps a name before them) rather than a header."""
-    return any(_number(cell) is not None and cell.strip().lower() not in MISSING for cell in cells)
+    return any(number(cell) is not None and cell.strip().lower() not in MISSING for cell in cells)
 
 
 def _unnamed(path: Path, cells: Sequence[str]) -> list[str]:
     """Names of the columns of a file without a header."""
-    named = _number(cells[0]) is None  # words before numbers name the rows
+    named = number(cells[0]) is None  # words before numbers name the rows
     size = len(cells) - named
     shape = next((shape for shape in SHAPES if len(shape) == size), None)
     if shape is None:
@@ -80,7 +82,7 @@ def _unnamed(path: Path, cells: Sequence[str]) -> list[str]:
     return [*(["id"] if named else []), *shape]
 
 
-def _number(cell: str) -> float | None:
+def number(cell: str) -> float | None:
     if cell.strip().lower() in MISSING:
         return math.nan
     try:
@@ -89,12 +91,12 @@ def _number(cell: str) -> float | None:
         return None
 
 
-def _column_values(path: Path, rows: Sequence[Row], names: Sequence[str], columns: Sequence[str]) -> FloatArray:
+def column_values(path: Path, rows: Sequence[Row], names: Sequence[str], columns: Sequence[str]) -> FloatArray:
     places = [names.index(name) for name in columns]
     out = np.empty((len(rows), len(columns)))
     for i, (line, cells) in enumerate(rows):
         for j, (name, place) in enumerate(zip(columns, places, strict=True)):
-            value = _number(cells[place])
+            value = number(cells[place])
             if value is None or math.isinf(value):
                 what = "is not a number" if value is None else "is not finite"
                 raise error(path, f"row {line}, column {name!r}: {cells[place]!r} {what}", "correct the cell or leave it empty")
@@ -118,15 +120,15 @@ def _ids(path: Path, rows: Sequence[Row], names: Sequence[str]) -> tuple[str, ..
     return tuple(found)
 
 
-def _optional(path: Path, rows: Sequence[Row], names: Sequence[str], known: Sequence[str]) -> FloatArray | None:
+def optional_column(path: Path, rows: Sequence[Row], names: Sequence[str], known: Sequence[str]) -> FloatArray | None:
     name = next((name for name in known if name in names), None)
-    return None if name is None else _column_values(path, rows, names, [name])[:, 0]
+    return None if name is None else column_values(path, rows, names, [name])[:, 0]
 
 
-def _flags(path: Path, rows: Sequence[Row], names: Sequence[str]) -> np.ndarray | None:
+def flags(path: Path, rows: Sequence[Row], names: Sequence[str]) -> np.ndarray | None:
     words = {"true": "1", "yes": "1", "false": "0", "no": "0", "": "0"}
     plain = [(line, [words.get(cell.strip().lower(), cell) for cell in cells]) for line, cells in rows]
-    values = _optional(path, plain, names, STATIC)
+    values = optional_column(path, plain, names, STATIC)
     if values is not None and not np.isin(values, (0, 1)).all():
         at = int(np.flatnonzero(~np.isin(values, (0, 1)))[0])
         raise error(path, f"row {rows[at][0]}, column 'static': {values[at]:g} is neither 0 nor 1", "use 1 for known static")

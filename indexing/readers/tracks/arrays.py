@@ -1,0 +1,67 @@
+"""Tracks as the arrays of an ``.npz``."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from indexing.readers.points.pointset import FloatArray, as_view, error
+from indexing.readers.tracks.trackset import TrackSet, numbered
+
+KEYS = "give 'tracks' (views, n, 2 or 3) or 'y' (frames, points, 2), and perhaps 'times', 'ids', 'static', 'weights'"
+EXTRA = ("times", "ids", "static", "weights")
+
+
+def read(path: Path, key: str | None) -> TrackSet:
+    """Tracks of an ``.npz``.
+
+    Raises:
+        ValueError: no tracks in it, several without a key, arrays that do not fit.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            before, name = _chosen(path, list(archive.files), key)
+            values, extra = archive[name], {kind: archive[before + kind] for kind in EXTRA if before + kind in archive.files}
+    except (OSError, EOFError, zipfile.BadZipFile, ValueError) as problem:
+        if str(problem).startswith(str(path)):
+            raise
+        raise error(path, f"cannot be read as numpy data ({problem})", "write it again with numpy.savez") from None
+    if values.ndim != 3 or values.shape[-1] not in (2, 3):
+        raise error(path, f"{name} has shape {values.shape}", KEYS)
+    flat = as_view(values.reshape(-1, values.shape[-1]), f"{path} {name}")
+    views, n = values.shape[:2]
+    for kind, shape in (("times", (views,)), ("ids", (n,)), ("static", (n,)), ("weights", (views, n))):
+        if kind in extra and extra[kind].shape != shape:
+            raise error(path, f"{kind} has shape {extra[kind].shape}, {name} has {values.shape}", f"expected {shape}")
+    ids = tuple(map(str, extra["ids"].tolist())) if "ids" in extra else numbered(n)
+    return TrackSet(
+        str(path), flat.reshape(values.shape), ids, tuple(map(str, range(views))), _reals(path, extra, "times"),
+        _reals(path, extra, "weights", 0.0), None if "static" not in extra else extra["static"].astype(bool),
+    )  # fmt: skip
+
+
+def _chosen(path: Path, names: list[str], key: str | None) -> tuple[str, str]:
+    """What the names of the arrays begin with, and the name of the tracks."""
+    several = [name[:-2] for name in names if name.endswith("/y")]
+    if key is not None and key not in several:
+        raise error(path, f"has no sequence {key!r}", f"its sequences are {', '.join(several[:6]) or 'without names'}")
+    if key is None and several:
+        raise error(path, f"holds {len(several)} sequences ({', '.join(several[:4])}, ...)", f"say which: --key {several[0]}")
+    before = "" if key is None else f"{key}/"
+    name = next((f"{before}{kind}" for kind in ("tracks", "y") if f"{before}{kind}" in names), None)
+    if name is None:
+        raise error(path, f"its arrays are {', '.join(names[:8]) or 'none'}", KEYS)
+    return before, name
+
+
+def _reals(path: Path, extra: dict[str, Any], kind: str, least: float = -np.inf) -> FloatArray | None:
+    if kind not in extra:
+        return None
+    values = extra[kind]
+    if values.dtype.kind not in "fiub" or not np.isfinite(values).all() or (values < least).any():
+        of = "" if np.isinf(least) else f" of {least:g} or more"
+        raise error(path, f"{kind} holds values that are no finite numbers{of}", "correct them")
+    return values.astype(np.float64)

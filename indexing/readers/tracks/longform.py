@@ -1,0 +1,127 @@
+"""Tracks as one table: a row per point and view, columns ``frame`` (or ``time``), ``id``, ``x``, ``y`` and perhaps ``z``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from indexing.readers.points.pointset import BoolArray, FloatArray, error
+from indexing.readers.points.table import IDS, STATIC, WEIGHTS, Row, column_values, flags, number, read_rows
+from indexing.readers.tracks.trackset import TrackSet
+
+IntArray = NDArray[np.intp]
+VIEWS = ("view", "frame", "image")
+TIMES = ("time", "t", "seconds", "timestamp")
+EXPECTED = "name the columns frame (or time), id, x, y, and z for 3D points"
+
+
+def header(path: Path) -> list[str]:
+    """The headings of a table, in small letters; empty where its first row is data."""
+    rows = read_rows(path)
+    cells = [cell.strip().lower() for cell in rows[0][1]] if rows else []
+    return [] if any(number(cell) is not None for cell in cells) else cells
+
+
+def is_long(names: Sequence[str]) -> bool:
+    """Whether these are headings of tracks, rather than of the points of one view."""
+    return bool({*VIEWS, *TIMES} & set(names)) and {"x", "y"} <= set(names)
+
+
+def read(path: Path) -> TrackSet:
+    """The tracks of a table; rows that are absent and cells that are empty are missing observations.
+
+    Raises:
+        ValueError: columns that are absent, cells that are no numbers, a point twice in a view, a view with several times.
+    """
+    rows, names = read_rows(path)[1:], header(path)
+    if not rows:
+        raise error(path, "the file has a header but no rows", "export it again")
+    for line, cells in rows:
+        if len(cells) != len(names):
+            raise error(path, f"row {line} has {len(cells)} cells, the first row {len(names)}", "correct the row")
+    point = next((names.index(name) for name in IDS if name in names), None)
+    if point is None:
+        raise error(path, f"no column names the points (its columns are {', '.join(names)})", EXPECTED)
+    timed = next((name for name in TIMES if name in names), None)
+    viewed = next((name for name in VIEWS if name in names), timed)
+    assert viewed is not None  # is_long
+    axes = [axis for axis in ("x", "y", "z") if axis in names]
+    xyz = column_values(path, rows, names, axes)
+    place = _present(path, rows, names, viewed)
+    moments, views = np.unique(place, return_inverse=True)
+    ids: dict[str, int] = {}
+    columns = np.array([ids.setdefault(_named(path, line, cells[point], names[point]), len(ids)) for line, cells in rows])
+    _once(path, rows, names[point], views, columns, moments)
+    shape = (len(moments), len(ids))
+    values = np.full((*shape, len(axes)), np.nan)
+    values[views, columns] = xyz
+    return TrackSet(
+        str(path), values, tuple(ids), tuple(f"{moment:.10g}" for moment in moments),
+        None if timed is None else moments if timed == viewed else _times(path, rows, names, timed, views, moments),
+        _weights(path, rows, names, views, columns, shape), _static(path, rows, names, columns, len(ids)),
+    )  # fmt: skip
+
+
+def _present(path: Path, rows: Sequence[Row], names: Sequence[str], column: str) -> FloatArray:
+    """A column of numbers of which none may be missing."""
+    found = column_values(path, rows, names, [column])[:, 0]
+    if np.isnan(found).any():
+        line = rows[int(np.flatnonzero(np.isnan(found))[0])][0]
+        raise error(path, f"row {line}, column {column!r}: is empty", "every row needs the view that it belongs to")
+    return found
+
+
+def _named(path: Path, line: int, cell: str, column: str) -> str:
+    if not cell.strip():
+        raise error(path, f"row {line}, column {column!r}: is empty", "name the point")
+    return cell.strip()
+
+
+def _once(path: Path, rows: Sequence[Row], point: str, views: IntArray, columns: IntArray, moments: FloatArray) -> None:
+    before: dict[tuple[int, int], int] = {}
+    for (line, cells), view, column in zip(rows, views.tolist(), columns.tolist(), strict=True):
+        if (view, column) in before:
+            said = (
+                f"row {line}: point {column + 1} of the file was in frame {moments[view]:g} before, in row {before[view, column]}"
+            )
+            raise error(path, f"{said} (row: {', '.join(cells)})", f"give each point one row per frame; column {point!r} names it")
+        before[view, column] = line
+
+
+def _times(path: Path, rows: Sequence[Row], names: Sequence[str], column: str, views: IntArray, moments: FloatArray) -> FloatArray:
+    found = _present(path, rows, names, column)
+    out = np.array([found[views == i][0] for i in range(len(moments))])
+    wrong = np.flatnonzero(found != out[views])
+    if len(wrong):
+        line, view = rows[wrong[0]][0], views[wrong[0]]
+        said = f"row {line}: frame {moments[view]:g} has the {column} {found[wrong[0]]:g} here and {out[view]:g} before"
+        raise error(path, said, "a view has one time")
+    return out
+
+
+def _weights(
+    path: Path, rows: Sequence[Row], names: Sequence[str], views: IntArray, columns: IntArray, shape: tuple[int, int]
+) -> FloatArray | None:
+    column = next((name for name in WEIGHTS if name in names), None)
+    if column is None:
+        return None
+    found = np.nan_to_num(column_values(path, rows, names, [column])[:, 0])
+    if (found < 0).any():
+        at = int(np.flatnonzero(found < 0)[0])
+        raise error(path, f"row {rows[at][0]}, column {column!r}: the weight is {found[at]:g}", "weights are 0 or more")
+    out = np.zeros(shape)
+    out[views, columns] = found
+    return out
+
+
+def _static(path: Path, rows: Sequence[Row], names: Sequence[str], columns: IntArray, count: int) -> BoolArray | None:
+    """A point is static where all of its rows say so."""
+    if not set(STATIC) & set(names):
+        return None
+    found = np.asarray(flags(path, rows, names))
+    out = np.ones(count, dtype=bool)
+    out[columns[~found]] = False
+    return out

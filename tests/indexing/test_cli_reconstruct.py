@@ -1,0 +1,330 @@
+"""``dyntorch reconstruct``: scenes whose truth is known from files to files, and what is refused and how."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import pytest
+import torch
+
+from dyntorch import metrics, motions, scenes
+from indexing.cli import main
+from indexing.cli.reconstruct import PURPOSE, REASONS, MotionName
+from indexing.readers.tracks import TrackSet
+from indexing.report.reconstruction import FILES, ReconstructionReport, as_json, points_csv, write_reconstruction
+from indexing.report.reconstruction_scene import nearest_frame
+from indexing.report.reconstruction_tracks import as_first_camera
+
+SCRIPT = "<script>alert(1)</script>"
+# torch's own, when it first loads its transforms; hidden outside of tests
+pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated")
+TIMES = [0.0, 1.0, 2.5, 3.0]
+
+
+def draw(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def table(path: Path, tracks: np.ndarray, times, static=None) -> Path:
+    header = ["frame", "time", "id", *"xyz"[: tracks.shape[-1]], *(["static"] if static is not None else [])]
+    lines = [",".join(header)]
+    for i, time in enumerate(times):
+        for j, place in enumerate(tracks[i]):
+            if np.isfinite(place).all():
+                mark = [str(int(static[j]))] if static is not None else []
+                lines.append(",".join([str(10 * i), repr(float(time)), f"p{j}", *(f"{v:.6f}" for v in place), *mark]))
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return scenes.lifted("constant_velocity_2d", 50, times=TIMES, sigma=0.3, static=0.4, generator=draw(0))
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory, scene) -> Path:
+    """``plane.csv`` with a column static, ``bare.csv`` without, ``parked.csv`` with static names, ``v0.csv ...`` per view."""
+    folder = tmp_path_factory.mktemp("tracks")
+    tracks, static = scene.tracks.numpy(), (scene.labels == 1).numpy()
+    table(folder / "plane.csv", tracks, TIMES, static)
+    table(folder / "bare.csv", tracks, TIMES)
+    (folder / "parked.csv").write_text("\n".join(["id", *(f"p{j}" for j in np.flatnonzero(static))]))
+    np.savez(folder / "plane.npz", tracks=tracks)
+    for i, view in enumerate(tracks):
+        (folder / f"v{i}.csv").write_text("\n".join(["x,y", *(f"{x:.6f},{y:.6f}" for x, y in view)]))
+    return folder
+
+
+@pytest.fixture
+def run(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    """Runs the command in an empty folder; ``@/`` in a word stands for the folder of the data."""
+    monkeypatch.chdir(tmp_path)
+    capsys.readouterr()
+
+    def call(line: str) -> tuple[int, str, str]:
+        code = main(["reconstruct", *(word.replace("@/", f"{data}/") for word in line.split())])
+        said = capsys.readouterr()
+        return code, said.out, said.err
+
+    return call
+
+
+def read(folder: str | Path = "out") -> dict:
+    return json.loads((Path(folder) / "reconstruction.json").read_text())
+
+
+# ---- what is found -------------------------------------------------------------------------------------------------------
+def test_a_plane_from_a_table(run, scene):
+    code, out, err = run("@/plane.csv --motion constant_velocity_2d --threshold none --out out/")
+    assert (code, err) == (0, "") and "report: out/report.html" in out and "open: known up to an affinity" in out
+    assert sorted(path.name for path in Path("out").iterdir()) == sorted(FILES)
+    found, arrays = read(), np.load("out/reconstruction.npz")
+    assert found["status"] == "OK" and found["motion"] == "constant_velocity_2d" and found["times"] == TIMES
+    assert found["residual"] < 0.45 and np.array(found["cameras"]).shape == (4, 3, 3) and found["threshold"] is None
+    assert found["manifest"]["seed"] == 0 and len(found["manifest"]["inputs"]) == 1
+    structure = torch.from_numpy(arrays["structure"])
+    error = metrics.lifted_error(structure, scene.structure, scene.lifts)
+    assert error.position < 0.03
+    # x ~ P (X + t v), with what the files say
+    assert str(arrays["status"]) == "OK" and arrays["ids"].tolist() == [f"p{j}" for j in range(50)]
+    for i, time in enumerate(TIMES):
+        rays = np.c_[arrays["points"] + time * arrays["velocities"], np.ones(50)] @ arrays["cameras"][i].T
+        distance = np.linalg.norm(rays[:, :2] / rays[:, 2:] - arrays["tracks"][i], axis=1)
+        np.testing.assert_allclose(distance, arrays["residuals"][i], atol=1e-6)
+    with Path("out/points.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert list(rows[0]) == ["id", "label", "name", "x", "y", "vx", "vy", "views", "rms"] and len(rows) == 50
+    assert float(rows[7]["vx"]) == pytest.approx(arrays["velocities"][7, 0], rel=1e-6) and rows[7]["views"] == "4"
+    still = arrays["velocities"][(scene.labels == 1).numpy()]
+    assert np.abs(still).max() < 0.1 * np.abs(arrays["velocities"]).max()
+    page = Path("out/report.html").read_text()
+    assert page.count("data:image/png;base64,") == 4 and "each at its own constant velocity" in page
+
+
+def test_the_same_from_other_files(run, scene):
+    results = []
+    for i, files in enumerate((
+        "@/plane.csv",
+        "@/bare.csv --static @/parked.csv",
+        "@/v0.csv @/v1.csv @/v2.csv @/v3.csv --times 5,6,7.5,8",
+        "@/plane.npz --times 0,1,2.5,3",
+    )):  # fmt: skip
+        code, out, _ = run(f"{files} --motion constant_velocity_2d --threshold none")
+        assert code == 0 and ("time 0 of the result is the first view, at 5" in out) == (i == 2)
+        assert ("no point is known to stand still" in out) == (i > 1)
+        results.append(re.search(r"constant_velocity_2d +4 +50 .* ([\d.]+) +ok", out)[1])
+    assert len(set(results)) == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "times", "says"),
+    [
+        ("--fps 10", [0, 1, 2, 3], ""),
+        ("--frames 0,20,30", [0, 2.5, 3], ""),
+        ("--frames 10,20,30", [0, 1.5, 2], "note: time 0 of the result is the first view, at 1"),
+    ],
+)
+def test_times(run, options, times, says):
+    code, out, _ = run(f"@/bare.csv --motion constant_velocity_2d --threshold none --out out {options}")
+    assert code in (0, 3) and says in out
+    assert read()["times"] == times
+
+
+def test_numbers_of_frames_are_times_where_there_are_no_others(run):
+    code, out, _ = run("@/plane.npz --motion constant_velocity_2d --threshold none")
+    assert code in (0, 3) and "note: times are the numbers of the frames" in out
+
+
+def test_two_bodies(run, tmp_path):
+    scene = scenes.lifted("two_bodies_3d", 60, views=4, sigma=0.3, generator=draw(1))
+    table(tmp_path / "t.csv", scene.tracks.numpy(), range(4))
+    assert run("t.csv --motion two_bodies_3d --threshold none --out out")[0] == 0
+    labels = np.load("out/reconstruction.npz")["labels"]
+    share = (labels == scene.labels.numpy()).mean()
+    assert max(share, 1 - share) > 0.95 and "velocities" not in np.load("out/reconstruction.npz").files
+    assert "are on body 1" in Path("out/report.html").read_text()
+
+
+def test_the_model_is_chosen_and_the_others_listed(run, tmp_path):
+    scene = scenes.lifted("static_2d", 40, views=3, sigma=0.3, generator=draw(2))
+    table(tmp_path / "t.csv", scene.tracks.numpy(), range(3))
+    code, out, _ = run("t.csv --out out")
+    assert code == 0 and re.search(r"static_2d +3 +40", out) and "penalized cost" in out
+    tried = read()["candidates"]
+    assert tried[0]["motion"] == read()["motion"] == "static_2d" and "static_3d" in [one["motion"] for one in tried]
+    assert "Which motion" in Path("out/report.html").read_text()
+
+
+def test_missing_observations_and_tracks_seen_once(run, scene, tmp_path):
+    tracks = scene.tracks.numpy().copy()
+    tracks[1, 3] = np.nan
+    tracks[1:, 4] = np.nan
+    table(tmp_path / "t.csv", tracks, TIMES)
+    code, out, _ = run("t.csv --motion constant_velocity_2d --threshold none --out out")
+    assert code == 0 and "note: 1 track is seen in fewer than 2 views and was left out" in out
+    arrays = np.load("out/reconstruction.npz")
+    assert "p4" not in arrays["ids"] and len(arrays["ids"]) == 49
+    assert np.isnan(arrays["residuals"][1, 3]) and np.isfinite(arrays["points"]).all()
+
+
+# ---- what is refused -----------------------------------------------------------------------------------------------------
+def test_data_that_cannot_decide_are_refused_with_code_3(run, tmp_path, monkeypatch):
+    import dyntorch
+
+    solve = dyntorch.reconstruct
+
+    def undecided(*args, **options):
+        found = solve(*args, **options)
+        notice = type("Notice", (), {"code": type("Code", (), {"value": "static_scene"}), "value": 1.0, "message": "nothing moves"})
+        return dataclasses.replace(found, status=torch.tensor(3), warnings=(notice,))
+
+    monkeypatch.setattr(dyntorch, "reconstruct", undecided, raising=False)
+    code, out, err = run("@/plane.csv --motion constant_velocity_2d --threshold none --out out")
+    assert (code, err) == (3, "dyntorch: refused: nothing moves\n") and "warning: static scene: nothing moves" in out
+    assert read()["status"] == "AMBIGUOUS" and read()["reason"] == "nothing moves"
+    page = Path("out/report.html").read_text()
+    assert "Refused" in page and "not to be relied on" in page
+
+
+def test_equal_images_are_refused(run, tmp_path):
+    still = np.repeat(np.random.default_rng(0).uniform(0, 500, size=(1, 40, 2)), 4, axis=0)
+    table(tmp_path / "t.csv", still, TIMES)
+    code, _, err = run("t.csv --motion constant_velocity_2d --threshold none --out out")
+    assert code == 3 and re.fullmatch(r"dyntorch: refused: [^\n]+\n", err)
+    assert "Refused" in Path("out/report.html").read_text() and read()["status"] != "OK"
+
+
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        ("", "no files; give a table of tracks with columns frame, id, x, y"),
+        ("no.csv", "no.csv: no such file; check the path"),
+        ("@/plane.csv --motion sideways", "sideways"),
+        ("@/plane.csv --threshold 0", "--threshold must be a positive distance"),
+        ("@/plane.csv --threshold x", "threshold"),
+        ("@/plane.csv --fps 0", "--fps must be a positive number"),
+        ("@/plane.csv --fps 5 --times 0,1,2,3", "leave one away"),
+        ("@/plane.csv --seed -1", "--seed must be a whole number"),
+        ("@/plane.csv --times 0,1", "--times '0,1': 2 times for 4 views; give one finite number per view"),
+        ("@/plane.csv --times 0,1,2,x", "expected numbers with commas between them"),
+        ("@/plane.csv --times 1,1,1,1 --motion constant_velocity_2d", "all times are 0"),
+        ("@/plane.csv --frames 0,5", "has no frame 5; its 4 frames are 0 to 30"),
+        ("@/plane.csv --key cars", "--key cars: has no keys"),
+        ("@/plane.csv --static no.csv", "no.csv: no such file"),
+        (
+            "@/plane.csv --frames 0,10 --motion constant_velocity_2d",
+            "plane.csv: 'constant_velocity_2d' needs at least 3 views, got 2",
+        ),
+        (
+            "@/plane.csv --motion constant_velocity_3d_sensors",
+            "plane.csv: 'constant_velocity_3d_sensors' takes tracks of 3D sensors",
+        ),
+        ("@/v0.csv", "v0.csv: holds the points of one view"),
+        ("@/plane.csv --out @/plane.csv", "is a file; choose another folder"),
+    ],
+)
+def test_bad_input_is_one_line_and_code_2(run, tmp_path, line, says):
+    code, out, err = run(line)
+    assert (code, out) == (2, "") and list(tmp_path.iterdir()) == []
+    assert err.startswith("dyntorch: ") and err.count("\n") == 1 and says in err
+
+
+def test_too_few_tracks_are_bad_input(run, data, tmp_path):
+    rows = (data / "bare.csv").read_text().splitlines()
+    (tmp_path / "t.csv").write_text("\n".join(row for row in rows if re.search(r",p\d,|id", row)))
+    code, _, err = run("t.csv --motion constant_velocity_2d")
+    assert code == 2 and "t.csv: 'constant_velocity_2d' needs at least 13 tracks through 3 views, got 10; add tracks" in err
+
+
+def test_an_input_is_not_overwritten(run, data, tmp_path):
+    before = (data / "plane.csv").read_text()
+    (tmp_path / "points.csv").write_text(before)
+    code, _, err = run("points.csv --out .")
+    assert code == 2 and "points.csv: is an input" in err and (tmp_path / "points.csv").read_text() == before
+
+
+def test_help_loads_nothing_heavy_and_names_the_models():
+    code = (
+        "import sys; from indexing.cli import main; main(['reconstruct', '--help'])\n"
+        "print('loaded', *{'torch', 'numpy', 'sklearn', 'matplotlib'} & set(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1].strip() == "loaded" and "constant_velocity_planes_3d" in done.stdout
+
+
+def test_every_model_and_status_is_named():
+    assert set(get_args(MotionName)) == {*motions.MOTIONS, "auto"} and set(PURPOSE) == set(motions.MOTIONS)
+    from dyntorch import Status
+
+    assert set(REASONS) == {status.name for status in Status} - {"OK"}
+
+
+# ---- the report ----------------------------------------------------------------------------------------------------------
+def report(dim: int = 2, **changes) -> ReconstructionReport:
+    """Five points that move by (1, 0, ...) per view, of which the last is missing, seen by two cameras."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform(1, 5, size=(5, dim))
+    speed = np.eye(dim)[0]
+    positions = points + np.arange(2.0)[:, None, None] * speed
+    cameras = np.stack([np.eye(3, dim + 1), np.eye(3, dim + 1)])
+    cameras[:, 2] = np.eye(dim + 1)[-1] + 0.1 * np.eye(dim + 1)[-2]
+    rays = positions @ cameras[0, :, :-1].T + cameras[0, :, -1]
+    tracks = TrackSet("t.csv", rays[..., :2] / rays[..., 2:], (SCRIPT, "=1+1", "-2", "d", "e"), ("0", SCRIPT), np.arange(2.0))
+    points[4] = positions[:, 4] = tracks.values[1, 4] = np.nan
+    values = {
+        "title": SCRIPT, "motion": ("constant_velocity_2d", "Points."), "tracks": tracks, "cameras": cameras, "points": points,
+        "positions": positions, "velocities": np.tile(speed, (5, 1)), "labels": np.array([1, 2, 0, 2, 0]), "residual": 0.1,
+        "residuals": np.full((2, 5), 0.1), "inliers": np.ones((2, 5), dtype=bool), "structure": np.ones((5, 2 * dim + 1)),
+        "projections": np.ones((2, 3, 2 * dim + 1)), "sigma": 0.1, "warnings": [("weak_stack", 1.0, SCRIPT)],
+        "candidates": [("constant_velocity_2d", 1.0, 0.1), (SCRIPT, float("inf"), float("nan"))],
+    }  # fmt: skip
+    return ReconstructionReport(**{**values, **changes})
+
+
+def test_what_comes_from_files_is_escaped(tmp_path):
+    page = write_reconstruction(tmp_path, report()).read_text()
+    assert SCRIPT not in page and "&lt;script&gt;" in page
+    rows = list(csv.reader(points_csv(report()).splitlines()))
+    assert [row[0] for row in rows[1:]] == [SCRIPT, "'=1+1", "-2", "d", "e"]
+    assert [row[2] for row in rows[1:]] == ["static", "moving", "outlier", "moving", "missing"] and rows[5][3:5] == ["", ""]
+
+
+def test_every_kind_of_data_can_be_drawn(tmp_path):
+    nothing = np.full((5, 2), np.nan)
+    for i, made in enumerate((
+        report(3),
+        report(cameras=np.zeros((2, 3, 3)), points=nothing, positions=np.stack([nothing] * 2), status="DEGENERATE", reason="no"),
+        report(2, bodies=2, velocities=None),
+        report(3, bodies=2, velocities=None),
+        report(labels=np.zeros(5, dtype=int)),
+        report(velocities=np.zeros((5, 2)), positions=np.stack([report().points] * 2)),
+    )):  # fmt: skip
+        page = write_reconstruction(tmp_path / str(i), made).read_text()
+        assert "<img" in page and "nan" not in page.partition("<main>")[2].replace("data:image", "").split("base64")[0]
+        json.loads((tmp_path / str(i) / "reconstruction.json").read_text())
+
+
+def test_json_has_no_scene_where_there_is_none():
+    found = as_json(report(cameras=np.zeros((2, 3, 3)), status="DEGENERATE", reason="why"))
+    assert found["status"] == "DEGENERATE" and found["reason"] == "why" and found["cameras"] is None
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_what_the_pictures_show(dim):
+    made = report(dim, labels=np.full(5, 2))
+    seen = as_first_camera(made)
+    np.testing.assert_allclose(seen[:, :4], made.tracks.values[:, :4], atol=1e-12)  # both cameras are the same
+    assert np.isnan(seen[:, 4]).all() and as_first_camera(report(velocities=None)) is None
+    # an affinity of the positions: equal steps stay equal, and the plane comes near its image
+    shown = nearest_frame(report(dim, labels=np.array([2, 2, 2, 2, 0])))
+    steps = shown[1, :4] - shown[0, :4]
+    np.testing.assert_allclose(steps, np.broadcast_to(steps[0], steps.shape), atol=1e-9)
