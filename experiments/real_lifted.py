@@ -6,7 +6,7 @@
 alike and without labels, go into ``reconstruct``; the sixth, within or after them, is predicted: its camera is resected from a
 random half of the background, and the table gives the median distance of the cars, and of the other half, from where they
 are.  Whatever stays put (one homography from the nearest frame) and two ways that know which points are background stand
-beside it.  *Two bodies*: labels of all points of the 57 two-group sequences, six frames each.  The groups are bodies that
+beside it.  *Two bodies*: labels of all points of the 66 two-group sequences, six frames each.  The groups are bodies that
 translate against each other only in some of them (T without R in the name, cars); a board or car that turns is no such body.
 ``auto`` is asked which motion the traffic has.
 
@@ -238,8 +238,8 @@ def run(config: Config) -> None:
     case = asked(shown, 4, True, torch.Generator().manual_seed(config.seed))
     assert case is not None
     when = torch.tensor(case.frames).double()
-    # static points fix the velocity common to all
-    found = dyn.reconstruct(shown.tracks[case.frames], "constant_velocity_2d", when, static=case.known, threshold=math.inf)
+    # all cars drive along one road: the plane's velocities are known up to more than static points fix, the common direction's not
+    found = dyn.reconstruct(shown.tracks[case.frames], "constant_direction_2d", when, static=case.known, threshold=math.inf)
     traffic_picture(shown.tracks, case.frames, found, shown.background, waits, steps, config.out / "traffic.png")
     world = crowd(pool, 4, 7, torch.Generator().manual_seed(config.seed)).bent(0.1)
     one = judged(world, "constant_velocity_3d", torch.Generator().manual_seed(config.seed))

@@ -19,6 +19,12 @@ STEPS = 2
 """Of triangulation."""
 FAR = 1e30
 """Squared distance in place of one that is no number."""
+WIDE, SETTLING = 1.5, 4
+"""Times the threshold up to which distances count when the noise is estimated, and how often that is repeated."""
+SMALL = 2.0
+"""Largest correction of the variance for the degrees of freedom of the projections."""
+EXACT = 1e-8
+"""Least noise, as part of the image."""
 PAIRS = 1 << 14
 """Points that are looked at together with one view left out."""
 
@@ -47,16 +53,43 @@ def _bounds(top: int, share: float) -> tuple[float, ...]:
     return (0.0, *(chi(free, share) ** 2 for free in range(1, top + 1)))
 
 
-def noise(square: Tensor, free: Tensor, chosen: Tensor) -> Tensor:
-    """Standard deviation ``(b,)`` of one coordinate from the median of the chosen points; 0 where there are none.
+def noise(square: Tensor, free: Tensor, chosen: Tensor, part: float = 0.5) -> Tensor:
+    """Standard deviation ``(b,)`` of one coordinate from a quantile of the chosen points; 0 where there are none.
 
     Args:
         square: ``(b, n)`` squared distances.
         free: ``(b, n)`` of :func:`freedom`.
         chosen: ``(b, n)`` bool.
+        part: the quantile, the median by default.
     """
-    relative = square / bound(free, 0.5).clamp(min=torch.finfo(square.dtype).tiny)
-    return relative.masked_fill(~chosen | (free < 1), torch.nan).nanmedian(-1).values.nan_to_num(nan=0.0).sqrt()
+    relative = square / bound(free, part).clamp(min=torch.finfo(square.dtype).tiny)
+    counted = chosen & (free >= 1)
+    order = relative.masked_fill(~counted, torch.inf).sort(-1).values
+    number = counted.sum(-1, keepdim=True)
+    place = (number * part).long().clamp(min=0, max=max(0, square.shape[-1] - 1))
+    found = order.gather(-1, torch.minimum(place, (number - 1).clamp(min=0)))[:, 0]
+    return torch.where(number[:, 0] > 0, found, 0.0).sqrt()
+
+
+def settled_noise(tracks: Tracks, square: Tensor, free: Tensor, chosen: Tensor, used: int, part: float = 0.5) -> Tensor:
+    """Noise ``(b,)`` of one coordinate from a quantile of the chosen points, then the median of those within its threshold.
+
+    Args:
+        tracks: flat batch.
+        square: ``(b, n)`` squared distances.
+        free: ``(b, n)`` of :func:`freedom`.
+        chosen: ``(b, n)`` bool.
+        used: degrees of freedom of the projections, fitted to these points.
+        part: the first quantile.
+    """
+    least = EXACT / tracks.scales.amin(1)
+    level = torch.maximum(noise(square, free, chosen, part), least)
+    for _ in range(SETTLING):
+        inside = chosen & (square <= (WIDE * level).square()[:, None] * bound(free))
+        rows = (free * inside).sum(-1)
+        small = rows / (rows - used).clamp(min=1)
+        level = torch.maximum(noise(square, free, inside) * small.clamp(min=1, max=SMALL).sqrt(), least)
+    return level
 
 
 def agreeing(tracks: Tracks, projections: Tensor, sigma: Tensor) -> Tensor:

@@ -2,15 +2,161 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
+from dyntorch.motions import MOTIONS, Motion
+from dyntorch.solution import failed
+from dyntorch.tasks.lifted_diagnosis import least_squares, spare
 from dyntorch.tasks.lifted_projections import Tracks
-from dyntorch.tasks.reconstruction import Reconstruction
+from dyntorch.tasks.lifted_solver import solve
+from dyntorch.tasks.reconstruction import Ranked, Reconstruction
+
+OUTLIER = 2.0
+"""Cost of a coordinate too many that does not fit, in variances of the noise: Torr's lambda 3."""
+LABEL = 0.2
+"""Cost of the label of a point of two bodies, which is free to take the better one.  4 views of 80 points: 0 takes two bodies for
+one plane once in 5 scenes (by 5), log 2 = 0.7 takes a static scene for two planes (by 30)."""
+AGREED = 0.6
+"""Share of observations that have to fit a model before the noise is taken from it."""
+SIMILAR = 1.8
+"""Noise over the least that any model leaves, up to which a model fits.  A model with too many unknowns may leave 0.6 times the
+noise that is there (constant_velocity_3d of points moving along one direction in a plane, 4 views of 80 points)."""
+FLOOR = 1e-9
+"""Least noise over the extent of the images: rounding."""
 
 
 def choose(
     tracks: Tracks, static: Tensor | None, limit: float | None, generator: torch.Generator | None, batch: tuple[int, ...]
 ) -> Reconstruction:
-    """Reconstruct with the declared model of least penalized cost; the others are listed in ``candidates``."""
-    raise NotImplementedError
+    r"""Reconstruct with the declared model of least penalized cost; the others are listed in ``candidates``.
+
+    .. math:: \mathrm{GRIC} = \sum_j \min\Big(\frac{|e_j|^2}{\sigma^2},\; \lambda_3 (r_j - d)\Big)
+        + \sum_j d \log r_j + c \log \sum_j r_j
+
+    with the residual :math:`e_j` of the :math:`r_j` observed coordinates of a point, d unknowns of a point and c of the cameras
+    less the ambiguity (the label of a point of two bodies counts as well, a little).  The noise :math:`\sigma` is what the models
+    leave that most observations agree with and that fit about equally well.  One model is chosen for a whole batch.  All are
+    fitted by least squares, robustly only where the best of these finds outliers.
+
+    Two planar bodies are also two planes of a static scene; the smaller of the two models that say so wins, two bodies.
+
+    Args:
+        tracks: flat batch.
+        static: ``(b, n)`` bool, or None.
+        limit: three standard deviations of the noise; None: estimated; infinite: no outliers.
+        generator: of random samples.
+        batch: the shape that the flat dimension comes from.
+
+    Raises:
+        ValueError: too few views or tracks for any model.
+
+    Source: Torr 2002, Bayesian model estimation and selection for epipolar geometry and generic manifold fitting (GRIC).
+    """
+    views, n = tracks.weights.shape[1:]
+    models = [m for m in MOTIONS.values() if m.sensor == tracks.x.shape[-1] and _fits(m, tracks.times, views, n)]
+    if not models:
+        first = next(m for m in MOTIONS.values() if m.sensor == tracks.x.shape[-1])
+        need = least(first, tracks.times)
+        raise ValueError(
+            f"no declared motion takes {views} views of {n} tracks; {first.name!r} needs {need[0]} views and {need[1]} tracks"
+        )
+    plain = [Fit.of(tracks, model, *least_squares(tracks, model)) for model in models]
+    listed = ranked(tracks, plain, limit)
+    best = solve(tracks, MOTIONS[listed[0].motion], static, limit, generator, batch)
+    whole = next(fit.apart.isfinite() for fit in plain if fit.motion is best.motion)
+    if bool((best.inliers.reshape(whole.shape) >= whole).all()):
+        return replace(best, candidates=listed)
+    robust = {model.name: solve(tracks, model, static, limit, generator, batch) for model in models}
+    fits = [
+        Fit.of(tracks, one.motion, one.residuals.reshape(tracks.weights.shape), one.status.reshape(-1)) for one in robust.values()
+    ]
+    listed = ranked(tracks, fits, limit)
+    return replace(robust[listed[0].motion], candidates=listed)
+
+
+class Fit(NamedTuple):
+    """How a model fits the problems of a batch."""
+
+    motion: Motion
+    apart: Tensor
+    """``(b, views, n)`` reprojection distances, NaN where an observation does not count."""
+    lost: Tensor
+    """``(b,)`` whether it failed."""
+    sigma: Tensor
+    """``(b,)`` noise that it leaves."""
+
+    @classmethod
+    def of(cls, tracks: Tracks, motion: Motion, apart: Tensor, status: Tensor) -> Fit:
+        """With the noise from the distances."""
+        counted = apart.isfinite()
+        sigma = (apart.square().nansum((1, 2)) / spare(tracks, counted, motion).clamp(min=1)).sqrt()
+        return cls(motion, apart, failed(status), sigma)
+
+
+def least(motion: Motion, times: Tensor) -> tuple[int, int]:
+    """Fewest views and tracks that a model can be fitted to.
+
+    Example:
+        >>> import torch
+        >>> least(MOTIONS["two_bodies_2d"], torch.arange(3.0))
+        (2, 9)
+    """
+    views = motion.views(times)
+    bodies = (motion.k + 1) * (motion.k + 2) // 2 - 1 if motion.bodies > 1 else 0
+    return views, max(motion.tensor(min(views, motion.k + 1)).minimal(), bodies)
+
+
+def _fits(motion: Motion, times: Tensor, views: int, n: int) -> bool:
+    """Whether there are views and tracks enough, and observations to spare."""
+    need = least(motion, times)
+    if motion.lift is not None and need[0] <= views and motion.ambiguity(times) > motion.ambiguity(range(12)):
+        return False  # too few different times
+    return need[0] <= views and need[1] <= n and views * motion.sensor > motion.k - (motion.bodies > 1)
+
+
+def ranked(tracks: Tracks, fits: list[Fit], limit: float | None) -> tuple[Ranked, ...]:
+    """The models by their penalized costs over the whole batch, the least first."""
+    sigma = _noise(tracks, fits, limit)
+    found = []
+    for fit in fits:
+        score = float("inf") if bool(fit.lost.all()) else float(penalized(tracks, fit, sigma).sum())
+        rest = fit.apart[~fit.lost]
+        found.append(Ranked(fit.motion.name, score, float(rest.square().nanmean().sqrt())))
+    return tuple(sorted(found, key=lambda one: one.score))
+
+
+def _noise(tracks: Tracks, fits: list[Fit], limit: float | None) -> Tensor:
+    """The noise of every problem, ``(b,)``: a third of the limit, or what the models that fit leave in the middle."""
+    floor = FLOOR / tracks.scales.square().mean(-1).sqrt()
+    if limit is not None and math.isfinite(limit):
+        return floor.clamp(min=limit / 3)
+    count = (tracks.weights > 0).flatten(1).sum(-1)
+    sound = [(fit.apart.isfinite().flatten(1).sum(-1) >= AGREED * count) & ~fit.lost for fit in fits]
+    sigma = torch.stack([torch.where(ok, fit.sigma, torch.nan) for ok, fit in zip(sound, fits, strict=True)])
+    near = sigma <= SIMILAR * sigma.nan_to_num(nan=torch.inf).amin(0)
+    return torch.where(near, sigma, torch.nan).nanmedian(0).values.nan_to_num(nan=1.0).maximum(floor)
+
+
+def penalized(tracks: Tracks, fit: Fit, sigma: Tensor) -> Tensor:
+    """The penalized cost ``(b,)`` of one model; where it failed, that of outliers only.
+
+    Args:
+        tracks: flat batch, all observations with weight.
+        fit: of the same problems.
+        sigma: ``(b,)`` noise in the unit of the tracks.
+    """
+    motion, seen = fit.motion, tracks.weights > 0
+    r = seen.sum(1).to(sigma.dtype) * motion.sensor
+    free = motion.k - (motion.bodies > 1)
+    square = (fit.apart / sigma[:, None, None]).square()
+    # an observation that was left out costs as much as one can
+    square = torch.where(seen & square.isfinite(), square, torch.where(seen, OUTLIER * motion.sensor, 0.0)).sum(1)
+    misfit = square.minimum(OUTLIER * (r - free).clamp(min=0)).sum(-1)
+    cameras = r.sum(-1) - (r > 0).sum(-1) * free - spare(tracks, seen, motion)
+    points = free * r.clamp(min=1).log() + LABEL * (motion.bodies - 1) * (r > 0)
+    return misfit + points.sum(-1) + cameras * r.sum(-1).clamp(min=1).log()

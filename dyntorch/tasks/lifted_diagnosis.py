@@ -11,6 +11,7 @@ from torch import Tensor
 from dyntorch.algebra.hyperplane_pair import hyperplane_pair
 from dyntorch.motions import MOTIONS, Motion, polynomial
 from dyntorch.solution import NOISY, Status, failed
+from dyntorch.tasks.lifted_bodies import bodies_of
 from dyntorch.tasks.lifted_projections import Tracks, projections_of_tracks
 from dyntorch.tasks.lifted_scene import Lifting, Scene, distances, scene_of
 from dyntorch.tasks.lifted_uncertainty import point_uncertainty
@@ -56,14 +57,8 @@ def _smaller(name: str, code: NoticeCode, cause: str) -> Smaller:
 
 
 _STATIC = {d: _smaller(f"static_{d}d", NoticeCode.STATIC_SCENE, _STILL) for d in (2, 3)}
-_ONE = {
-    d: _smaller(
-        f"static_{d}d",
-        NoticeCode.ONE_BODY,
-        "one body, or too few points on the other: take {!r}" + (d - 2) * ", or move the camera",
-    )
-    for d in (2, 3)
-}
+_SINGLE = "one body, too few points on the other, or a camera that only turns: take {!r}"
+_ONE = {d: _smaller(f"static_{d}d", NoticeCode.ONE_BODY, _SINGLE) for d in (2, 3)}
 SMALLER: dict[str, tuple[Smaller, ...]] = {
     "static_3d": (_smaller("static_2d", NoticeCode.TURNING_CAMERA, _FLAT),),
     "constant_direction_2d": (_STATIC[2],),
@@ -124,6 +119,8 @@ def diagnose(
 
     lost = (scene.cameras == 0).flatten(1).all(-1) | ~scene.cameras.isfinite().flatten(1).all(-1)
     status = torch.where(lost & ~failed(status), int(Status.DEGENERATE), status)
+    enough, size = _through(tracks, motion)
+    status = torch.where(failed(status) & (enough < motion.tensor(size).minimal()), int(Status.TOO_FEW), status)
     solved = ~failed(status)
     noise = sigma * tracks.scales.square().mean(-1).sqrt()
     stack, doubt = conditions(tracks, scene, lifting, noise)
@@ -141,7 +138,8 @@ def diagnose(
     judged = torch.where(solved & ~explained & (noise > NOISY), int(Status.NO_CONSENSUS), judged)
     status = torch.where((status == Status.OK) | (status == Status.AMBIGUOUS), judged, status)
     text = "the noise makes the points uncertain by {value:.2g} of the size of the scene; add views, points or motion"
-    note(NoticeCode.UNCERTAIN, text, doubt, solved & (doubt > UNCERTAIN))
+    note(NoticeCode.UNCERTAIN, text, doubt, solved & (doubt > UNCERTAIN) & doubt.isfinite())
+    note(NoticeCode.UNCERTAIN, "several scenes give the same images; move points or the camera more", doubt, solved & doubt.isinf())
     text = "the projections of all views nearly share a centre (singular value {value:.2g} of the largest); move the camera more"
     note(NoticeCode.WEAK_STACK, text, stack, solved & ((stack < WEAK) | (noise > NOISE_OF_STACK * stack)))
     _observations(tracks, motion, status, note)
@@ -171,18 +169,22 @@ def conditions(tracks: Tracks, scene: Scene, lifting: Lifting | None, noise: Ten
     white = _unit(projections @ spread[:, None]).nan_to_num()
     values = torch.linalg.svdvals(white.flatten(1, 2))
     stack = values[:, -1] / values[:, 0].clamp(min=torch.finfo(values.dtype).tiny)
-    views = projections.shape[1]
+    points = torch.linalg.solve_triangular(spread, unit.mT, upper=False).mT
     if lifting is None:
-        points = torch.nn.functional.normalize(torch.linalg.solve_triangular(spread, unit.mT, upper=False).mT, dim=-1)
-        cameras, lifts, depth = white, eye.expand(views, -1, -1), points
-        gauge, extent = views + size**2 - 1, torch.ones_like(stack)
+        points = torch.nn.functional.normalize(points, dim=-1)
+        cameras, lifts, depth, metric = white, eye.expand(*white.shape[:2], -1, -1), points, eye.expand(len(white), -1, -1)
+        gauge, extent = size**2 - 1, torch.ones_like(stack)
     else:
-        cameras, lifts, points = _unit(scene.cameras).nan_to_num(), lifting.lifts, scene.structure.nan_to_num()
-        depth = lifts[:, -1].mean(0)
-        gauge, extent = views + len(lifting.algebra) - 1, _extent(points, depth, known)
-    found = point_uncertainty(cameras, points, lifts, depth, tracks.weights, gauge)
+        below = lifting.lifts[:, -1].mean(0)
+        world = (unit[:, None] @ lifting.lifts.mT).flatten(1, 2)
+        axes = torch.linalg.cholesky_ex(world.mT @ world / world.shape[1] + 1e-12 * eye[: world.shape[-1], : world.shape[-1]])[0]
+        cameras = _unit(scene.cameras @ axes[:, None]).nan_to_num()
+        lifts = torch.linalg.solve_triangular(axes[:, None], lifting.lifts @ spread[:, None], upper=False)
+        depth, metric = (below @ spread)[:, None], spread
+        gauge, extent = len(lifting.algebra) - 1, _extent(scene.structure.nan_to_num(), below, known)
+    found = point_uncertainty(cameras, points, lifts, depth, tracks.weights, gauge, metric)
     middle = torch.where(known, found, torch.nan).nanmedian(-1).values
-    return stack, (middle * noise / extent).nan_to_num(nan=torch.inf)
+    return stack, (middle * noise / extent).nan_to_num(nan=torch.inf, posinf=torch.inf)
 
 
 def _extent(structure: Tensor, depth: Tensor, known: Tensor) -> Tensor:
@@ -191,6 +193,29 @@ def _extent(structure: Tensor, depth: Tensor, known: Tensor) -> Tensor:
     unit = torch.where(known[..., None], structure / torch.where(below.abs() > 1e-12, below, 1.0), torch.nan)
     off = (unit - unit.nanmedian(1, keepdim=True).values).norm(dim=-1)
     return off.nanmedian(-1).values.nan_to_num().clamp(min=torch.finfo(off.dtype).tiny)
+
+
+def least_squares(tracks: Tracks, motion: Motion) -> tuple[Tensor, Tensor]:
+    """Reprojection distances ``(b, views, n)`` of a model fitted to all observations, in the unit of the tracks, and its status."""
+    size = min(motion.views(tracks.times), motion.k + 1)
+    found = projections_of_tracks(tracks, motion.tensor(size))
+    if motion.lift is None:
+        scene = bodies_of(tracks, Scene(found.projections, found.structure, torch.zeros_like(tracks.x[:, 0, 0, 0])))[-1]
+        return distances(tracks, scene.cameras, scene.structure), found.status
+    lifting = Lifting.of(motion, tracks.times, tracks.x)
+    scene = scene_of(tracks, found, lifting)
+    return distances(tracks, scene.cameras @ lifting.lifts, scene.structure), found.status
+
+
+def spare(tracks: Tracks, counted: Tensor, motion: Motion) -> Tensor:
+    """Observed coordinates less all unknowns, ``(b,)``; two bodies with their hyperplanes."""
+    views, size, wide = tracks.x.shape[1], motion.k + 1, motion.sensor + 1
+    cameras, point = views * (wide * size - 1) - (size * size - 1), motion.k
+    if motion.lift is None:
+        cameras, point = cameras + 2 * motion.k, motion.k - 1
+    else:
+        cameras = views * (wide * (motion.dim + 1) - 1) - motion.ambiguity(tracks.times)
+    return counted.flatten(1).sum(-1) * motion.sensor - counted.any(1).sum(-1) * point - cameras
 
 
 def _noise_of(tracks: Tracks, motion: Motion, asked: Tensor) -> Tensor:
@@ -202,41 +227,32 @@ def _noise_of(tracks: Tracks, motion: Motion, asked: Tensor) -> Tensor:
     if not len(chosen) or need > views or n < motion.tensor(min(need, motion.k + 1)).minimal():
         return left
     some = tracks.subset(chosen)
-    found = projections_of_tracks(some, motion.tensor(min(need, motion.k + 1)))
-    projections, structure, unknowns = found.projections, found.structure, (motion.sensor + 1) * (motion.k + 1) - 1
-    unknowns = views * unknowns - (motion.k + 1) ** 2 + 1
-    if motion.lift is not None:
-        lifting = Lifting.of(motion, tracks.times, tracks.x)
-        scene = scene_of(some, found, lifting)
-        projections, structure = scene.cameras @ lifting.lifts, scene.structure
-        unknowns = views * ((motion.sensor + 1) * lifting.lifts.shape[1] - 1) - len(lifting.algebra) + 1
-    apart = distances(some, projections, structure) * _scale(some)[:, None, None]
+    apart, status = least_squares(some, motion)
     counted = apart.isfinite()
-    spare = counted.flatten(1).sum(-1) * motion.sensor - counted.any(1).sum(-1) * motion.k - unknowns
-    mean = (apart.square().nansum((1, 2)) / spare.clamp(min=1)).sqrt()
+    mean = (apart.square().nansum((1, 2)) / spare(some, counted, motion).clamp(min=1)).sqrt() * _scale(some)
     # a model that loses points explains nothing
     whole = counted.flatten(1).sum(-1) >= 0.9 * (some.weights > 0).flatten(1).sum(-1)
-    return left.index_copy(0, chosen, torch.where(failed(found.status) | ~whole, torch.inf, mean))
+    return left.index_copy(0, chosen, torch.where(failed(status) | ~whole, torch.inf, mean))
 
 
 def _observations(tracks: Tracks, motion: Motion, status: Tensor, note: Note) -> None:
     """Notices on tracks and views with too few observations."""
     seen = tracks.weights > 0
-    views = seen.shape[1]
     need = -(-motion.k // motion.sensor)
     count = seen.sum(1)
     few = ((count > 0) & (count < need)).sum(-1)
     text = f"{{value:g}} tracks are seen in fewer than {need} views and have no position; track them longer"
     note(NoticeCode.FEW_OBSERVED, text, few, (few > 0) & ~failed(status))
-    size = min(motion.views(tracks.times), motion.k + 1)
-    enough, least = (count >= size).sum(-1), motion.tensor(size).minimal()
+    enough, size = _through(tracks, motion)
+    least = motion.tensor(size).minimal()
     text = f"{{value:g}} tracks are seen in {size} views or more, {motion.name!r} needs {least} through the same ones; add tracks"
     note(NoticeCode.FEW_OBSERVED, text, enough, status == Status.TOO_FEW)
-    resection = -(-((motion.sensor + 1) * (motion.k + 1) - 1) // motion.sensor)
-    for view in range(views):
-        here = seen[:, view].sum(-1)
-        text = f"view {view} shows {{value:g}} tracks, its camera needs {resection}; leave the view out or add tracks"
-        note(NoticeCode.UNUSED_VIEW, text, here, here < resection)
+
+
+def _through(tracks: Tracks, motion: Motion) -> tuple[Tensor, int]:
+    """How many tracks ``(b,)`` are seen in as many views as the tensor takes, and these."""
+    size = min(motion.views(tracks.times), motion.k + 1)
+    return ((tracks.weights > 0).sum(1) >= size).sum(-1), size
 
 
 def _images(tracks: Tracks, scene: Scene, lifting: Lifting | None, noise: Tensor, solved: Tensor, note: Note) -> None:

@@ -21,7 +21,7 @@ SUBSETS = 6
 """Choices of views for the tensor, where there are more than it takes; the one of least error in all views wins."""
 LOOKED_AT = 60
 """Choices of which the most seen and best spread ones are taken."""
-ALGEBRAIC, FREE, ROUGH = 5, 5, 1e-2
+ALGEBRAIC, FREE, ROUGH = 3, 3, 1e-2
 """At most so many steps of the constrained fit and of free bundle adjustment, which ends where a step gains less than this share:
 they start the structured one.  Of 20 scenes of constant velocity, 4 views of 60 points at 0.5 px, 18 reach its minimum that way in
 7 ms each, and 18 in 31 ms with 30 steps, 10 steps and 1e-9; below P^6 all do."""
@@ -46,14 +46,20 @@ class Tracks:
         """Some problems of the batch."""
         return Tracks(self.x[keep], self.weights[keep], self.scales[keep], self.transforms[keep], self.times)
 
+    def at(self, views: Tensor) -> Tracks:
+        """Some views."""
+        return Tracks(self.x[:, views], self.weights[:, views], self.scales[:, views], self.transforms[:, views], self.times[views])
+
     def only(self, weights: Tensor) -> Tracks:
         """Other weights."""
         return Tracks(self.x, weights, self.scales, self.transforms, self.times)
 
     def repeated(self, count: int) -> Tracks:
         """Every problem so many times in a row."""
-        parts = (part.repeat_interleave(count, dim=0) for part in (self.x, self.weights, self.scales, self.transforms))
-        return Tracks(*parts, self.times)
+        x, weights, scales, transforms = (
+            part.repeat_interleave(count, dim=0) for part in (self.x, self.weights, self.scales, self.transforms)
+        )
+        return Tracks(x, weights, scales, transforms, self.times)
 
 
 @dataclass(frozen=True)

@@ -9,15 +9,13 @@ from dyntorch.algebra.triangulation import reproject, resect, triangulate
 from dyntorch.bundle_adjustment import bundle_adjust
 from dyntorch.invariants.grassmann_tensor import GrassmannTensor
 from dyntorch.solution import Status
-from dyntorch.tasks.lifted_agreement import agreeing, bound, distance, freedom, noise
-from dyntorch.tasks.lifted_consensus import EXACT, Consensus, consensus, doubtful, settled_noise
+from dyntorch.tasks.lifted_agreement import EXACT, agreeing, bound, distance, freedom, noise, settled_noise
+from dyntorch.tasks.lifted_consensus import Consensus, consensus, doubtful
 from dyntorch.tasks.lifted_projections import Projections, Tracks
 from dyntorch.tasks.lifted_scene import Lifting, scene_of
 
-SMEARED = 1.5
-"""Noise by the mean square over noise by the median above which some tracks do not belong to the model."""
-SUSPECT = 0.9999
-"""Share of the points of one problem without outliers that are nearer than the farthest one may be."""
+ALARMS = 0.05
+"""Share of the problems without outliers that are suspected: those whose farthest point is farther than in the others."""
 WIDTHS = (6.0, 3.0, 1.5, 1.0, 1.0)
 """Thresholds over the final one, while all views settle."""
 RESECTED = 10
@@ -40,7 +38,7 @@ def suspicious(tracks: Tracks, apart: Tensor, k: int, limit: float | None) -> Te
     least = EXACT / tracks.scales.amin(1)
     sigma = noise(square, free, free >= 1) if limit is None else torch.full_like(least, limit / 3)
     sigma = torch.maximum(sigma, least)
-    return (square > sigma.square()[:, None] * bound(free, SUSPECT)).logical_and(free >= 1).any(-1)
+    return (square > sigma.square()[:, None] * bound(free, 1 - ALARMS / max(1, apart.shape[-1]))).logical_and(free >= 1).any(-1)
 
 
 def robust_projections(
@@ -75,7 +73,9 @@ def _level(tracks: Tracks, cameras: Tensor, sigma: Tensor, given: Tensor | None)
         return given
     fewer = tracks.only(agreeing(tracks, cameras, sigma))
     free = freedom(fewer, cameras.shape[-1] - 1)
-    return settled_noise(tracks, distance(fewer, cameras), free, free >= 1)
+    views, rows, size = cameras.shape[1:]
+    used = views * (rows * size - 1) - (size * size - 1)
+    return settled_noise(tracks, distance(fewer, cameras), free, free >= 1, used)
 
 
 def _extended(tracks: Tracks, found: Consensus, sigma: Tensor) -> Tensor:
@@ -84,7 +84,6 @@ def _extended(tracks: Tracks, found: Consensus, sigma: Tensor) -> Tensor:
     if size == tracks.x.shape[1]:
         return found.projections.gather(1, found.chosen.argsort(1)[..., None, None].expand_as(found.projections))
     rows = torch.arange(b, device=found.chosen.device)[:, None]
-    inside = tracks.x.new_zeros(tracks.weights.shape[:2]).index_put((rows, found.chosen), torch.ones((), dtype=tracks.x.dtype))
     some = (tracks.x[rows, found.chosen], tracks.weights[rows, found.chosen])
     structure = triangulate(found.projections, *some, steps=2)
     free = torch.full_like(found.square, size * tracks.x.shape[-1] - structure.shape[-1] + 1).long()

@@ -2,28 +2,31 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from dyntorch.algebra.lift import balanced, balanced_algebra, upgrade
 from dyntorch.algebra.lift_frames import centred, finite, moved, steady
-from dyntorch.algebra.triangulation import reproject, triangulate
+from dyntorch.algebra.triangulation import reproject, resect, triangulate
 from dyntorch.bundle_adjustment import bundle_adjust
 from dyntorch.motions import Motion
+from dyntorch.solution import Status, failed
 from dyntorch.tasks.lifted_projections import Projections, Tracks
-from dyntorch.tasks.lifted_starts import can_rest, resting, start_of
+from dyntorch.tasks.lifted_starts import can_rest, middle, resting, tilted
 
-STRUCTURED, FINE = 60, 1e-6
-"""At most so many steps of structured bundle adjustment, and the share of the cost that the last one gains (the cost is then within
-1e-8 of the least one)."""
+STRUCTURED, FINE = 60, 1e-7
+"""At most so many steps of structured bundle adjustment, and the share of the cost that the last one gains."""
 SEVERAL = 7
 """Size K of the space of the constants from which on one start is not enough.  Of 20 scenes, 4 views of 60 points, the start from
 the tensor misses the minimum in 5 (constant velocity, 0.5 px) and 20 (weak constant acceleration in a plane, 1 px), that of the
-resting scene in 1 and 0, and both together in none; below P^6 the first reaches it in all."""
-FRAMES = 4
-"""Starts from the resting scene, at most."""
+scene at rest in 1 and 0, and both together in none; below P^6 the first reaches it in all."""
+SPARE = 6
+"""Spare coordinates per point beyond which the start from the tensor is enough in those spaces as well: of 20 scenes it misses the
+minimum in up to 18 with 5 views and 1 with 6, in none with 7, 8 and 12."""
+FRAMES, UNAIDED = 3, 6
+"""Starts from the scene at rest, at most: next to that from the tensor, and without one."""
 SAME, EXACT = 1e-2, 1e-22
 """Relative difference of the costs of the same minimum, and of costs that are only rounding, per observation."""
 
@@ -76,21 +79,42 @@ class Scene:
 
 
 def scene_of(tracks: Tracks, found: Projections, lifting: Lifting, scale: Tensor | None = None) -> Scene:
-    """Cameras and points from projections in a projective frame; in high spaces also from the scene as if it stood still.
+    """Cameras and points from projections in a projective frame, and from the scene as if it stood still where that is safer.
+
+    The second start is taken in high spaces with few spare images (:data:`SEVERAL`, :data:`SPARE`), and where no views have
+    enough points in common for the tensor.
 
     Args:
         tracks: flat batch.
         found: projections and points.
         lifting: the model.
         scale: ``(b,)`` robust scale of normalized, weighted images; None: least squares.
+
+    Returns:
+        Scene, of infinite cost where none was found.
     """
-    sound = ~(found.projections == 0).flatten(1).all(-1)
-    projections = torch.where(sound[:, None, None, None], found.projections, torch.ones_like(found.projections))
-    known = (found.structure != 0).any(-1)
-    scene = _scene(tracks, upgrade(projections, lifting.lifts)[1], known, lifting, scale)
-    if lifting.lifts.shape[-1] < SEVERAL or not can_rest(lifting.lifts) or not bool(sound.any()):
-        return scene
-    return _confirmed(tracks, scene, sound, known, lifting, scale)
+    lost = failed(found.status)
+    coordinates = (tracks.weights > 0).sum(1) * tracks.x.shape[-1]
+    size = lifting.lifts.shape[-1]
+    known = torch.where(lost[:, None], coordinates >= size - 1, (found.structure != 0).any(-1))
+    scene = _scene(tracks, _upgraded(found, lost, lifting), known & ~lost[:, None], lifting, scale)
+    scene = Scene(scene.cameras, scene.structure, torch.where(lost, torch.inf, scene.cost))
+    spare = (coordinates * known).sum(-1) - (size - 1) * known.sum(-1)
+    shaky = ~lost & (size >= SEVERAL) & (spare <= SPARE * known.sum(-1))
+    unaided = (found.status == Status.TOO_FEW) & (spare > _unknown(lifting, tracks))
+    left = (shaky | unaided).nonzero()[:, 0] if can_rest(lifting.lifts) else lost.new_zeros(0, dtype=torch.long)
+    return _confirmed(tracks, scene, left, known, lifting, scale) if len(left) else scene
+
+
+def _upgraded(found: Projections, lost: Tensor, lifting: Lifting) -> Tensor:
+    """Cameras; of lost problems anything finite."""
+    return upgrade(torch.where(lost[:, None, None, None], 1.0, found.projections), lifting.lifts)[1]
+
+
+def _unknown(lifting: Lifting, tracks: Tracks) -> int:
+    """Number of unknowns of all cameras, less the ambiguity."""
+    views, rows, columns = tracks.x.shape[1], tracks.x.shape[-1] + 1, lifting.lifts.shape[1]
+    return views * (rows * columns - 1) - (len(lifting.algebra) - 1)
 
 
 def _scene(tracks: Tracks, cameras: Tensor, known: Tensor, lifting: Lifting, scale: Tensor | None) -> Scene:
@@ -99,30 +123,45 @@ def _scene(tracks: Tracks, cameras: Tensor, known: Tensor, lifting: Lifting, sca
     start = Scene(cameras, torch.where(known[..., None], structure, 0.0), torch.zeros_like(tracks.x[:, 0, 0, 0]))
     done = adjusted(tracks, start, lifting, scale)
     # a point that was lost costs the extent of the image
-    lost = known & (done.structure == 0).all(-1)
-    return Scene(done.cameras, done.structure, done.cost + (tracks.weights * lost[:, None]).flatten(1).sum(-1))
+    gone = known & (done.structure == 0).all(-1)
+    return Scene(done.cameras, done.structure, done.cost + (tracks.weights * gone[:, None]).flatten(1).sum(-1))
 
 
-def _confirmed(tracks: Tracks, scene: Scene, sound: Tensor, known: Tensor, lifting: Lifting, scale: Tensor | None) -> Scene:
-    """The scene of least cost among those of several starts: further ones until two of them end in the same minimum."""
-    left = sound.nonzero()[:, 0]
-    rest = resting(tracks.subset(left), lifting.motion.sensor, lifting.motion.dim)
-    seen = torch.ones_like(left)
+def _confirmed(tracks: Tracks, scene: Scene, left: Tensor, known: Tensor, lifting: Lifting, scale: Tensor | None) -> Scene:
+    """The scenes of least cost among those of several starts: further ones until two of them end in the same minimum."""
     cameras, structure, cost = scene.cameras.clone(), scene.structure.clone(), scene.cost.clone()
+    seen = cost[left].isfinite().long()
+    alone = left[seen == 0]
     floor = EXACT * (tracks.weights > 0).flatten(1).sum(-1)
-    for number in range(FRAMES):
+    for number in range(UNAIDED):
         some = None if scale is None else scale[left]
-        fresh = _scene(tracks.subset(left), start_of(rest, number), known[left], lifting, some)
-        band = SAME * cost[left] + floor[left]
-        seen = torch.where(fresh.cost < cost[left] - band, 1, seen + (fresh.cost <= cost[left] + band))
-        better = fresh.cost < cost[left]
+        fresh = _scene(tracks.subset(left), _started(tracks.subset(left), number, lifting, some), known[left], lifting, some)
+        least = cost[left]
+        near = fresh.cost <= least * (1 + SAME) + floor[left]
+        seen = torch.where(fresh.cost * (1 + SAME) + floor[left] < least, 1, seen + near)
+        better = fresh.cost < least
         taken = left[better]
         cameras[taken], structure[taken], cost[taken] = fresh.cameras[better], fresh.structure[better], fresh.cost[better]
-        doubt = seen < 2
-        left, seen, rest = left[doubt], seen[doubt], rest[doubt]
+        doubt = (seen < 2) & (torch.isin(left, alone) | (number + 1 < FRAMES))
+        left, seen = left[doubt], seen[doubt]
         if not len(left):
             break
+    # without a tensor only what was found twice counts
+    cost[left[torch.isin(left, alone)]] = torch.inf
     return Scene(cameras, structure, cost)
+
+
+def _started(tracks: Tracks, number: int, lifting: Lifting, scale: Tensor | None) -> Tensor:
+    """Cameras of all views from those of the scene at rest; of a part of many views: adjusted, the others by resection."""
+    window = middle(tracks.times, number)
+    near = tracks.at(window)
+    cameras = tilted(resting(near, lifting.motion.sensor, lifting.motion.dim), number)
+    if len(window) == tracks.x.shape[1]:
+        return cameras
+    some = replace(lifting, lifts=lifting.lifts[window])
+    part = _scene(near, cameras, torch.ones_like(tracks.weights[:, 0], dtype=torch.bool), some, scale)
+    whole = resect(part.structure, tracks.x, tracks.weights, lifts=lifting.lifts)
+    return whole.index_copy(1, window.to(whole.device), part.cameras)
 
 
 def adjusted(tracks: Tracks, scene: Scene, lifting: Lifting, scale: Tensor | None = None) -> Scene:

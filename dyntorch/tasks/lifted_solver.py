@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import torch
 from torch import Tensor
 
 from dyntorch.algebra.triangulation import triangulate
 from dyntorch.bundle_adjustment import bundle_adjust
 from dyntorch.motions import Motion
-from dyntorch.solution import failed
+from dyntorch.solution import Status, failed
 from dyntorch.tasks.lifted_bodies import bodies_of
 from dyntorch.tasks.lifted_diagnosis import diagnose
 from dyntorch.tasks.lifted_projections import Projections, Tracks, projections_of_tracks
 from dyntorch.tasks.lifted_robust import robust_projections, suspicious
 from dyntorch.tasks.lifted_scene import Lifting, Scene, distances, framed, positions, scene_of, velocities
 from dyntorch.tasks.reconstruction import Reconstruction
+
+Part = TypeVar("Part", Projections, Scene)
 
 CHI_SQUARE = {2: 9.210, 3: 11.345, 4: 13.277}
 """99 % quantiles."""
@@ -42,27 +46,30 @@ def solve(
     views = motion.views(tracks.times)
     invariant = motion.tensor(min(views, motion.k + 1))
     found = projections_of_tracks(tracks, invariant)
-    scene = _scene(tracks, found, lifting)
+    found, scene = _scene(tracks, found, lifting)
     doubt = suspicious(tracks, _distances(tracks, scene, lifting), motion.k, limit) | failed(found.status)
     if limit != float("inf") and bool(doubt.any()):
         chosen = doubt.nonzero()[:, 0]
         some, fewer = robust_projections(tracks.subset(chosen), invariant, lifting, limit, generator)
-        again = _scene(fewer, some, lifting)
+        some, again = _scene(fewer, some, lifting)
         tracks = tracks.only(tracks.weights.index_copy(0, chosen, fewer.weights))
         found = _merged(found, some, chosen)
         scene = _merged(scene, again, chosen)
     return _result(tracks, motion, lifting, found, scene, static, batch)
 
 
-def _scene(tracks: Tracks, found: Projections, lifting: Lifting | None) -> Scene:
+def _scene(tracks: Tracks, found: Projections, lifting: Lifting | None) -> tuple[Projections, Scene]:
     """With a lift the scene in any of its frames; bodies stay in the projective one, with their projections for cameras."""
     if lifting is not None:
-        return scene_of(tracks, found, lifting)
+        scene = scene_of(tracks, found, lifting)
+        # too few points in common for a tensor, but a scene was found without it
+        status = torch.where((found.status == Status.TOO_FEW) & scene.cost.isfinite(), int(Status.OK), found.status)
+        return Projections(found.projections, found.structure, status), scene
     done = bundle_adjust(tracks.x, tracks.weights, found.projections, found.structure)
-    return Scene(done.cameras, done.structure, done.cost)
+    return found, Scene(done.cameras, done.structure, done.cost)
 
 
-def _merged(old: Projections | Scene, new: Projections | Scene, chosen: Tensor) -> Projections | Scene:
+def _merged(old: Part, new: Part, chosen: Tensor) -> Part:
     """Results of some problems in their places."""
     return type(old)(*(a.index_copy(0, chosen, b) for a, b in zip(vars(old).values(), vars(new).values(), strict=True)))
 

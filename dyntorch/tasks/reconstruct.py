@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import fields, replace
 
 import torch
 from torch import Tensor
@@ -11,9 +12,11 @@ from torch import Tensor
 from dyntorch.algebra.triangulation import observed
 from dyntorch.motions import Motion, as_motion
 from dyntorch.normalize import hartley
-from dyntorch.tasks.lifted_choice import choose
+from dyntorch.solution import failed
+from dyntorch.tasks.lifted_choice import choose, least
 from dyntorch.tasks.lifted_projections import Tracks
 from dyntorch.tasks.lifted_solver import solve
+from dyntorch.tasks.notices import NoticeCode, notices
 from dyntorch.tasks.reconstruction import Reconstruction
 
 
@@ -83,21 +86,22 @@ def reconstruct(
         (True, True)
     """
     model = None if motion == "auto" else as_motion(motion)
-    moment, x, w, batch = _checked(tracks, times, weights, threshold)
+    moment, x, w, batch = _checked(tracks, times, weights)
     label = _static(static, batch, x)
-    data = normalized(x, w, moment)
-    limit = threshold if threshold is None or math.isfinite(threshold) else math.inf
+    limit = _limit(threshold)
     with torch.no_grad():
         if model is None:
-            found = choose(data, label, limit, generator, batch)
+            found = choose(normalized(x, w, moment), label, limit, generator, batch)
         else:
             _enough(model, moment, x)
-            found = solve(data, model, label, limit, generator, batch)
+            used = (w > 0).sum(-1) >= _resection(model)
+            data = normalized(x, w * used[..., None], moment)
+            found = _noted(solve(data, model, label, limit, generator, batch), label, used)
     return _returned(found, tracks)
 
 
 def _checked(
-    tracks: Tensor, times: Tensor | Sequence[float] | None, weights: Tensor | None, threshold: float | None
+    tracks: Tensor, times: Tensor | Sequence[float] | None, weights: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor, tuple[int, ...]]:
     """Times, flat tracks and weights, and the batch."""
     if not isinstance(tracks, Tensor) or not tracks.is_floating_point():
@@ -105,27 +109,48 @@ def _checked(
         raise ValueError(f"tracks must be a floating point torch.Tensor, got {got}; use torch.as_tensor(...).double()")
     if tracks.ndim < 3 or tracks.shape[-1] not in (2, 3):
         raise ValueError(f"tracks must be (*batch, views, n, 2), or (..., 3) of 3D sensors, got {tuple(tracks.shape)}")
-    if threshold is not None and not threshold > 0:
-        raise ValueError(f"threshold must be positive, in the unit of the tracks, got {threshold!r}; None estimates it")
     batch, (views, n, dim) = tuple(tracks.shape[:-3]), tracks.shape[-3:]
-    moment = torch.arange(views, dtype=torch.float64) if times is None else torch.as_tensor(times).detach().cpu().double()
+    try:
+        moment = torch.arange(views) if times is None else torch.as_tensor(times).detach().cpu()
+    except (TypeError, ValueError, RuntimeError):
+        moment = torch.empty(0)
+    moment = moment.double()
     if moment.shape != (views,) or not bool(moment.isfinite().all()):
         raise ValueError(f"times must be {views} finite numbers, one per view, got {times!r}")
-    if weights is not None and weights.shape[-2:] != (views, n):
-        raise ValueError(f"weights must be (*batch, views, n) = {(*batch, views, n)}, got {tuple(weights.shape)}")
-    if weights is not None and bool((weights < 0).any()):
-        raise ValueError(f"weights must not be negative, got {float(weights.min()):g}; use 0 to leave an observation out")
-    x, w = observed(tracks.detach(), None if weights is None else weights.detach())
+    w = torch.ones_like(tracks[..., 0]) if weights is None else weights
+    if not isinstance(w, Tensor) or not _expands(w, (*batch, views, n)):
+        given = tuple(w.shape) if isinstance(w, Tensor) else type(w).__name__
+        raise ValueError(f"weights must be a tensor (*batch, views, n) = {(*batch, views, n)}, got {given}")
+    if not bool((w >= 0).all()):
+        raise ValueError(f"weights must not be negative or NaN, got {float(w.min()):g}; use 0 to leave an observation out")
+    x, w = observed(tracks.detach(), w.detach().expand(*batch, views, n))
     count = math.prod(batch)
-    w = w.double().expand(*batch, views, n)
-    return moment, x.double().reshape(count, views, n, dim), w.reshape(count, views, n), batch
+    return moment, x.reshape(count, views, n, dim), w.reshape(count, views, n), batch
+
+
+def _expands(tensor: Tensor, shape: tuple[int, ...]) -> bool:
+    """Whether a tensor of whole problems expands to the batch."""
+    tail = min(2, len(shape)) if tensor.dtype != torch.bool else 1
+    short = len(shape) - tensor.ndim
+    fits = all(have in (1, want) for have, want in zip(tensor.shape, shape[max(short, 0) :], strict=False))
+    return short >= 0 and tensor.shape[-tail:] == shape[-tail:] and fits
+
+
+def _limit(threshold: float | None) -> float | None:
+    try:
+        value = None if threshold is None else float(threshold)
+    except (TypeError, ValueError, RuntimeError):
+        value = math.nan
+    if value is not None and not value > 0:
+        raise ValueError(f"threshold must be a positive number in the unit of the tracks, got {threshold!r}; None estimates it")
+    return value
 
 
 def _static(static: Tensor | None, batch: tuple[int, ...], x: Tensor) -> Tensor | None:
     if static is None:
         return None
     n = x.shape[2]
-    if not isinstance(static, Tensor) or static.shape[-1:] != (n,) or static.dtype != torch.bool:
+    if not isinstance(static, Tensor) or static.dtype != torch.bool or not _expands(static, (*batch, n)):
         got = f"{tuple(static.shape)} {static.dtype}" if isinstance(static, Tensor) else type(static).__name__
         raise ValueError(f"static must be a bool tensor (*batch, n) = {(*batch, n)}, got {got}")
     return static.expand(*batch, n).reshape(len(x), n)
@@ -134,12 +159,25 @@ def _static(static: Tensor | None, batch: tuple[int, ...], x: Tensor) -> Tensor 
 def normalized(x: Tensor, weights: Tensor, times: Tensor) -> Tracks:
     """Every view of mean 0 and rms sqrt(l), the weights such that the error stays that of the measured units."""
     transforms = hartley(x.unsqueeze(-2), (weights > 0).to(x.dtype))
-    scales = transforms[..., 0, 0]
+    # a view without images has the scale of the others: no weight of theirs depends on it
+    seen = (weights > 0).any(-1)
+    scales = torch.where(seen, transforms[..., 0, 0], torch.nan)
+    scales = torch.where(seen, scales, scales.square().nanmean(-1, keepdim=True).sqrt()).nan_to_num(nan=1.0)
+    transforms = torch.where(seen[..., None, None], transforms, _scaling(scales, x.shape[-1]))
     moved = x * scales[..., None, None] + transforms[..., None, :-1, -1]
     moved = torch.where((weights > 0)[..., None], moved, 0.0)
     # of order one: the views' scales over their mean
     share = scales.square().mean(-1, keepdim=True) / scales.square()
     return Tracks(moved, weights * share[..., None], scales, transforms, times)
+
+
+def _scaling(scales: Tensor, dim: int) -> Tensor:
+    return torch.diag_embed(torch.cat([scales[..., None].expand(*scales.shape, dim), torch.ones_like(scales[..., None])], -1))
+
+
+def _resection(model: Motion) -> int:
+    """Tracks that a view has to show for its projection."""
+    return -(-((model.sensor + 1) * (model.k + 1) - 1) // model.sensor)
 
 
 def _enough(model: Motion, times: Tensor, x: Tensor) -> None:
@@ -148,25 +186,44 @@ def _enough(model: Motion, times: Tensor, x: Tensor) -> None:
     if dim != model.sensor:
         kind = "3D sensors" if model.sensor == 3 else "images"
         raise ValueError(f"{model.name!r} takes tracks of {kind}, (*batch, views, n, {model.sensor}), got {tuple(x.shape[1:])}")
-    if not model.static and model.lift is not None and len(times.unique()) < min(len(times), 2):
+    moves, different = not model.static and model.lift is not None, len(times.unique())
+    if moves and views > 1 and different == 1:
         raise ValueError(f"all times are {float(times[0]):g}: views at different times are needed to see a motion; give times=")
-    least = model.views(times)
-    if views < least or (model.lift is not None and least > len(times)):
-        usual = model.views(torch.arange(12.0))
-        if views >= usual and len(times.unique()) < len(times):
-            raise ValueError(
-                f"{model.name!r} needs views at {usual} different times or more, got {len(times.unique())} in {views} views"
-            )
+    many = torch.arange(12, dtype=torch.float64)
+    usual = model.views(many)
+    if usual > len(many):
+        raise ValueError(f"no number of views determines {model.name!r}: its lift leaves constants of the points unseen")
+    if views < usual:
         raise ValueError(f"{model.name!r} needs at least {usual} views, got {views}; add views, or use a model with fewer unknowns")
-    need = max(model.tensor(min(least, model.k + 1)).minimal(), (model.k + 1) * (model.k + 2) // 2 - 1 if model.bodies > 1 else 0)
-    if n < need:
-        raise ValueError(f"{model.name!r} needs at least {need} tracks through {least} views, got {n}; add tracks")
+    if moves and (model.views(times) > views or (different < views and model.ambiguity(times) > model.ambiguity(many))):
+        hint = (
+            f"got {different} in {views} views" if different < views else f"{views} views at {times.tolist()} do not determine it"
+        )
+        raise ValueError(f"{model.name!r} needs views at {usual} different times or more, {hint}; add views at other times")
+    need = least(model, times)
+    if n < need[1]:
+        raise ValueError(f"{model.name!r} needs at least {need[1]} tracks through {need[0]} views, got {n}; add tracks")
+
+
+def _noted(found: Reconstruction, static: Tensor | None, used: Tensor) -> Reconstruction:
+    """Without cameras for views that show too little, and with the notices on what was given."""
+    batch = found.status.shape
+    good = ~failed(found.status).reshape(-1)
+    unused = (~used).sum(-1)
+    text = f"{{value:g}} views show fewer than {_resection(found.motion)} tracks and have no camera; leave them out, or add tracks"
+    notes = notices(NoticeCode.UNUSED_VIEW, text, unused, unused > 0, tuple(batch))
+    if static is not None and found.velocities is not None and not found.motion.static:
+        given = static & found.points.reshape(*static.shape, -1).isfinite().all(-1)
+        text = "{value:g} of the static points have a position: the motion common to all points is not fixed"
+        notes += notices(NoticeCode.COMMON_VELOCITY, text, given.sum(-1), good & ~given.any(-1), tuple(batch))
+    seen = used.reshape(*batch, -1)
+    warnings = tuple(sorted((*found.warnings, *notes), key=lambda notice: notice.problem))
+    bodies = None if found.bodies is None else found.bodies * seen[..., None, :, None, None]
+    return replace(found, cameras=found.cameras * seen[..., None, None], bodies=bodies, warnings=warnings)
 
 
 def _returned(found: Reconstruction, tracks: Tensor) -> Reconstruction:
     """Floating point results in the dtype and on the device of the tracks."""
-    from dataclasses import fields, replace
-
     changed = {
         f.name: getattr(found, f.name).to(device=tracks.device, dtype=tracks.dtype)
         for f in fields(found)

@@ -12,7 +12,7 @@ from torch import Tensor
 from dyntorch.algebra.homogeneous import inhomogeneous
 from dyntorch.algebra.triangulation import reproject
 from dyntorch.motions import Motion
-from dyntorch.solution import REMEDY, Status
+from dyntorch.solution import REMEDY, Status, failed
 from dyntorch.tasks.notices import Notice
 
 
@@ -102,33 +102,38 @@ class Reconstruction:
             ValueError: says which problems failed, how, and what to do.
         """
         status = self.status.reshape(-1)
+        places = torch.arange(len(status)).reshape(self.status.shape)
         for state in Status:
             where = (status == state).nonzero().flatten().tolist()
             if state != Status.OK and where:
-                reasons = " ".join(str(w) for w in self.warnings[:3])
                 shown = ", ".join(str(i) for i in where[:8]) + (", ..." if len(where) > 8 else "")
                 problems = f"problem {shown} of {len(status)}" if self.status.ndim else "the problem"
-                raise ValueError(
-                    f"{self.motion!r}: {problems}: {state.name}; {REMEDY[state]}" + (f" ({reasons})" if reasons else "")
-                )
+                reasons = [str(w) for w in self.warnings if int(places[w.problem]) in where]
+                known = f" ({'; '.join(reasons[:3])})" if reasons else ""
+                raise ValueError(f"{self.motion.name}: {problems}: {state.name}; {REMEDY[state]}{known}")
         return self
 
     def __repr__(self) -> str:
         states = Counter(Status(s).name for s in self.status.reshape(-1).tolist())
-        kinds = ("outlier", "body 1", "body 2") if self.motion.bodies > 1 else ("outlier", "static", "moving")
-        flat = self.labels.reshape(-1)
-        counted = ", ".join(f"{int((flat == i).sum())} {kind}" for i, kind in enumerate(kinds) if i or bool((flat == 0).any()))
         views, n = self.residuals.shape[-2:]
         listed = ", ".join(f"{count} {name}" for name, count in states.items()) or "empty"
-        lines = [
-            f"Reconstruction({self.motion.name}, views={views}, points={n}, batch={tuple(self.status.shape)}: {listed})",
-            f"  labels: {counted}",
-        ]
-        if self.residual.numel():
-            middle = float(self.residual.double().nan_to_num().median())
+        lines = [f"Reconstruction({self.motion.name}, views={views}, points={n}, batch={tuple(self.status.shape)}: {listed})"]
+        good = ~failed(self.status)
+        if bool(good.any()):
+            kinds = ("outlier", "body 1", "body 2") if self.motion.bodies > 1 else ("outlier", "static", "moving")
+            kinds = ("outlier", "static", "static") if self.motion.static else kinds
+            count = Counter(kinds[int(label)] for label in self.labels[good].flatten().tolist())
+            lines.append("  labels: " + ", ".join(f"{count[kind]} {kind}" for kind in dict.fromkeys(kinds) if count[kind]))
+            middle = float(self.residual[good].double().median())
             lines.append(f"  residual: {middle:.3g} rms" + (" (median)" if self.status.ndim else ""))
+        if self.candidates:
+            best = self.candidates[0].score
+            others = ", ".join(f"{c.motion} (+{c.score - best:.0f})" for c in self.candidates[1:4])
+            lines.append(f"  chosen by a penalized cost of {best:.0f}; then {others or 'no other'}")
+        if self.ambiguity:
+            lines.append(f"  {self.ambiguity}")
         if self.status.ndim:
-            seen = Counter(w.code.value for w in self.warnings)
+            seen = Counter(code for code, _ in {(w.code.value, w.problem) for w in self.warnings})
             lines += [f"  warning {code}: {count} of {self.status.numel()} problems" for code, count in sorted(seen.items())]
         else:
             lines += [f"  warning {w}" for w in self.warnings]

@@ -1,0 +1,47 @@
+"""Starts without a tensor: exact for a scene at rest, and frames that differ by a collineation of the world."""
+
+import pytest
+import torch
+
+from dyntorch import scenes
+from dyntorch.algebra.triangulation import reproject, triangulate
+from dyntorch.motions import MOTIONS
+from dyntorch.tasks.lifted_starts import can_rest, middle, resting, tilted
+from dyntorch.tasks.reconstruct import normalized
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_scene_at_rest_is_explained_exactly_and_stands_before_all_cameras(dim):
+    scene = scenes.lifted(f"static_{dim}d", 40, views=4, batch=(3,), generator=torch.Generator().manual_seed(0))
+    tracks = normalized(scene.tracks, torch.ones_like(scene.tracks[..., 0]), scene.times)
+    cameras = resting(tracks, 2, dim)
+    points = triangulate(cameras, tracks.x)
+    torch.testing.assert_close(reproject(cameras, points), tracks.x, rtol=0, atol=1e-9)
+    points = points / points[..., -1:]
+    depth = (points[:, None] @ cameras.mT)[..., -1]
+    assert bool((depth * depth[:, :1, :1].sign() > 0).all())
+    deviation = points[..., :-1].std(1)
+    torch.testing.assert_close(deviation, torch.ones_like(deviation), rtol=0.05, atol=0)
+
+
+def test_frames_are_collineations_of_the_first():
+    cameras = torch.rand(2, 4, 3, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    assert torch.equal(tilted(cameras, 0), cameras)
+    frames = [torch.linalg.lstsq(cameras.flatten(0, 2), tilted(cameras, k).flatten(0, 2)).solution for k in (1, 2)]
+    for frame in frames:
+        torch.testing.assert_close(frame[:-1], torch.eye(4, dtype=torch.float64)[:-1])
+    assert not torch.allclose(frames[0], frames[1])
+
+
+def test_points_can_rest_where_some_constants_do_not_move_them():
+    times = torch.arange(4.0)
+    assert can_rest(MOTIONS["constant_velocity_3d"].lifts(times))
+    always = torch.stack([torch.eye(3, 4, dtype=torch.float64).roll(int(t), 1) for t in range(4)])
+    assert not can_rest(always)
+
+
+def test_middle_views_are_neighbours_in_time():
+    assert middle(torch.tensor([0.0, 1.0, 2.0])).tolist() == [0, 1, 2]
+    many = torch.tensor([7.0, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
+    assert middle(many).tolist() == [2, 3, 4, 5, 6, 7]
+    assert middle(many, 1).tolist() == [2, 3, 4, 5, 6]

@@ -1,0 +1,177 @@
+"""reconstruct: every motion, any times, gaps, batches, custom lifts: structure, consistency of what is returned, gauge."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+import dyntorch as dyn
+from dyntorch import metrics, scenes
+from dyntorch.motions import MOTIONS, Motion
+from dyntorch.scenes.lifts import KINDS
+from dyntorch.solution import Status
+from dyntorch.tasks.reconstruction import Reconstruction
+
+F64 = torch.float64
+NAMES = list(KINDS)
+LIFTED = [name for name in NAMES if MOTIONS[name].lift is not None]
+
+
+def draw(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def scene_of(name: str, n: int = 60, **options: object) -> scenes.LiftedScene:
+    if "times" not in options:
+        options.setdefault("views", max(4, KINDS[name].views))
+    return scenes.lifted(name, n, generator=draw(3), **options)
+
+
+def error(found: Reconstruction, scene: scenes.LiftedScene) -> Tensor:
+    if scene.lifts is not None:
+        return metrics.lifted_error(found.structure, scene.structure, scene.lifts).position
+    swapped = torch.where(scene.labels > 0, 3 - scene.labels, 0)
+    either = [metrics.body_error(found.points, scene.points, labels).amax(-1) for labels in (scene.labels, swapped)]
+    return torch.minimum(*either)
+
+
+def off(found: Reconstruction, scene: scenes.LiftedScene) -> Tensor:
+    """Distances of the images of ``at(times)`` by the cameras from the tracks, ``(*batch, views, n)``."""
+    places = torch.stack([found.at(t) for t in scene.times.tolist()], dim=-3)
+    image = torch.cat([places, torch.ones_like(places[..., :1])], -1) @ found.cameras.mT
+    return (image[..., :-1] / image[..., -1:] - scene.tracks).norm(dim=-1)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_exact_scenes_in_a_batch_with_gaps(name: str) -> None:
+    scene = scene_of(name, n=90, batch=(2, 1), missing=0.1, views=max(4, KINDS[name].views) + 1)
+    found = dyn.reconstruct(scene.tracks, name, scene.times)
+    assert (found.status == Status.OK).all()
+    assert found.cameras.shape[:3] == (2, 1, len(scene.times))
+    assert bool((error(found, scene) < 1e-8).all())
+    assert bool((found.residual < 1e-6).all())
+    assert bool((found.points.abs().amax((-1, -2)) < 30).all())
+
+
+@pytest.mark.parametrize("name", LIFTED)
+def test_cameras_points_and_velocities_agree(name: str) -> None:
+    scene = scene_of(name, times=[-3.0, -2.2, 0.5, 0.7, 4.0])
+    found = dyn.reconstruct(scene.tracks, name, scene.times)
+    assert found.status == Status.OK
+    assert bool((off(found, scene) < 1e-6).all())
+    torch.testing.assert_close(found.at(0.0), found.points)
+    step = 1e-4
+    torch.testing.assert_close((found.at(step) - found.at(-step)) / (2 * step), found.velocities, rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(found.image(found.cameras[2], 0.5), scene.tracks[2], rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["constant_velocity_2d", "constant_direction_3d", "two_bodies_2d"])
+def test_batch_is_loop(name: str) -> None:
+    scene = scene_of(name, batch=(3,), sigma=0.5)
+    whole = dyn.reconstruct(scene.tracks, name)
+    for i in range(3):
+        one = dyn.reconstruct(scene.tracks[i], name)
+        torch.testing.assert_close(one.residuals, whole.residuals[i], rtol=1e-5, atol=1e-5)
+        if scene.lifts is not None:
+            assert float(metrics.lifted_error(one.structure, whole.structure[i], scene.lifts).position) < 1e-4
+
+
+def test_a_lost_problem_leaves_the_others_alone() -> None:
+    scene = scene_of("constant_direction_3d", batch=(3,))
+    tracks = scene.tracks.clone()
+    tracks[1] = torch.nan
+    found = dyn.reconstruct(tracks, "constant_direction_3d")
+    assert found.status.tolist() == [Status.OK, Status.TOO_FEW, Status.OK]
+    alone = dyn.reconstruct(scene.tracks[[0, 2]], "constant_direction_3d")
+    assert bool((metrics.lifted_error(found.structure[[0, 2]], alone.structure, scene.lifts).position < 1e-8).all())
+    assert bool(found.points[1].isnan().all()) and bool((found.cameras[1] == 0).all())
+
+
+@pytest.mark.parametrize("name", ["constant_velocity_2d", "constant_velocity_3d", "constant_direction_2d"])
+def test_static_points_fix_the_common_motion(name: str) -> None:
+    scene = scene_of(name, static=0.3)
+    still = scene.labels == 1
+    found = dyn.reconstruct(scene.tracks, name, static=still)
+    assert bool((found.velocities[still].abs() < 1e-8).all())
+    assert bool((found.velocities[~still].norm(dim=-1).median() > 1e-2).all())
+
+
+def test_float32_and_units() -> None:
+    scene = scene_of("constant_velocity_2d")
+    single = dyn.reconstruct(scene.tracks.float(), "constant_velocity_2d", scene.times)
+    assert single.points.dtype == single.cameras.dtype == torch.float32
+    assert float(metrics.lifted_error(single.structure.double(), scene.structure, scene.lifts).position) < 1e-4
+    milli = dyn.reconstruct(scene.tracks, "constant_velocity_2d", scene.times * 1e-3)
+    assert bool((off(milli, scene_at(scene, scene.times * 1e-3)) < 1e-6).all())
+
+
+def scene_at(scene: scenes.LiftedScene, times: Tensor) -> scenes.LiftedScene:
+    from dataclasses import replace
+
+    return replace(scene, times=times)
+
+
+@pytest.mark.parametrize("name", ["constant_velocity_2d", "constant_velocity_3d"])
+def test_times_far_from_zero(name: str) -> None:
+    scene = scene_of(name, times=[1000.0, 1000.6, 1002.0, 1003.0, 1003.3])
+    found = dyn.reconstruct(scene.tracks, name, scene.times)
+    assert found.status == Status.OK
+    assert float(error(found, scene)) < 1e-8
+    assert bool((off(found, scene) < 1e-3).all())
+
+
+def test_twelve_views() -> None:
+    scene = scene_of("constant_velocity_2d", views=12, sigma=0.5)
+    found = dyn.reconstruct(scene.tracks, "constant_velocity_2d")
+    assert found.status == Status.OK and float(error(found, scene)) < 3e-3
+
+
+def test_observations_of_weight_zero_do_not_count() -> None:
+    scene = scene_of("constant_velocity_2d", views=5)
+    tracks, weights = scene.tracks.clone(), torch.ones(5, 60, dtype=F64)
+    tracks[0, :5], weights[0, :5] = 999.0, 0.0
+    weights[:, 7] = 0.0
+    found = dyn.reconstruct(tracks, "constant_velocity_2d", weights=weights)
+    assert float(found.residual) < 1e-6 and bool(found.residuals[0, :5].isnan().all())
+    assert found.labels[7] == 0 and bool(found.points[7].isnan().all())
+
+
+def falling(t: Tensor) -> Tensor:
+    lift = torch.zeros(3, 4, dtype=F64)
+    lift[:, :3] = torch.eye(3)
+    lift[1, 3] = t**2
+    return lift
+
+
+def circling(t: Tensor) -> Tensor:
+    """All points turn at one known rate about centres of their own."""
+    c, s = math.cos(0.7 * float(t)), math.sin(0.7 * float(t))
+    return torch.tensor([[1.0, 0, 0, c, -s], [0, 1, 0, s, c], [0, 0, 1, 0, 0]], dtype=F64)
+
+
+def thrown(t: Tensor) -> Tensor:
+    """Own velocities in space and a known acceleration common to all."""
+    lift = torch.cat([torch.eye(4, dtype=F64), float(t) * torch.eye(4, 3, dtype=F64)], dim=1)
+    lift[2, 3] = -0.1 * float(t) ** 2
+    return lift
+
+
+@pytest.mark.parametrize("lift", [falling, circling, thrown])
+def test_custom_lifts(lift) -> None:
+    times = [0.0, 1.0, 2.5, 3.0, 4.2]
+    motion = Motion(lift, lift.__name__)
+    rows, size = lift(torch.tensor(0.0)).shape
+    rand = draw(1)
+    structure = torch.randn(60, size, generator=rand, dtype=F64)
+    structure[:, rows - 1] = 1.0
+    structure[:, rows:] *= 0.2
+    cameras = scenes.lifted(f"static_{rows - 1}d", 5, times=times, generator=rand).cameras
+    lifts = motion.lifts(times)
+    image = structure @ (cameras @ lifts).mT
+    found = dyn.reconstruct(image[..., :2] / image[..., 2:], motion, times)
+    assert found.status == Status.OK
+    assert float(metrics.lifted_error(found.structure, structure, lifts).position) < 1e-6
+    assert bool((found.points.norm(dim=-1) < 100).all())
