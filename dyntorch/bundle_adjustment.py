@@ -44,6 +44,8 @@ def bundle_adjust(
     scale: Tensor | float | None = None,
     loss: str = "geman_mcclure",
     tolerance: float = 1e-9,
+    confined: Tensor | None = None,
+    subspace: Tensor | None = None,
 ) -> Adjusted:
     r"""Cameras and points that minimize the reprojection error :math:`\sum_{ij} w_{ij}\, \rho(|x_{ij} - \pi(P_i B_i Y_j)|^2)`.
 
@@ -66,6 +68,8 @@ def bundle_adjust(
         scale: error beyond which an image counts as an outlier, in the unit of ``x``, one or ``(*batch,)``; None: none does.
         loss: ``"geman_mcclure"`` or ``"huber"``, used with a scale.
         tolerance: done where a step lowers the cost by less than this fraction.
+        confined: ``(*batch, n)`` bool: points kept within a subspace of the constants, such as those known to stand still.
+        subspace: ``(k + 1, r)`` orthonormal columns that span it.
 
     Returns:
         Adjusted, in the dtype of ``x``.  A problem whose start is not finite keeps it and has cost infinity.
@@ -85,7 +89,7 @@ def bundle_adjust(
         >>> bool(bundle_adjust(x, None, *start).cost < 1e-20)
         True
     """
-    batch = _check(x, weights, cameras, structure, lifts, loss)
+    batch = check(x, weights, cameras, structure, lifts, loss)
     count, (views, n, size) = prod(batch), x.shape[-3:]
 
     def flat(tensor: Tensor, *shape: int) -> Tensor:
@@ -96,10 +100,16 @@ def bundle_adjust(
     w, moves, seen = _counted(flat(w, views, n), start[1], size)
     extra: tuple[Tensor, ...] = () if lifts is None else (flat(lifts, *lifts.shape[-3:]),)
     extra += () if scale is None else (_scales(scale, batch, x.device),)
+    if confined is not None:
+        start, outside = _inside(*start, confined.expand(*batch, n).reshape(count, n), subspace)
+        extra += (outside,)
 
     def run(*block: Tensor) -> tuple[Tensor, ...]:
-        lift, limit = None if lifts is None else block[4], None if scale is None else block[-1]
-        problem = BundleProblem(block[0].mT.contiguous(), block[1], lift, limit, loss)
+        rest = list(block[4:])
+        lift = None if lifts is None else rest.pop(0)
+        limit = None if scale is None else rest.pop(0)
+        outside = rest.pop(0).permute(0, 2, 3, 1) if rest else None
+        problem = BundleProblem(block[0].mT.contiguous(), block[1], lift, limit, loss, outside)
         return _minimize(problem, block[2], block[3].mT.contiguous(), iterations, tolerance)
 
     a, k = cameras.shape[-1], structure.shape[-1]
@@ -117,92 +127,6 @@ def bundle_adjust(
         torch.where(sound[:, 0], found[2], torch.inf).reshape(batch).to(x.dtype),
         found[3].reshape(batch),
     )
-
-
-def point_information(cameras: Tensor, structure: Tensor, weights: Tensor | None = None, lifts: Tensor | None = None) -> Tensor:
-    r"""What the images tell about each point, given the cameras.
-
-    .. math:: V_j = \sum_i w_{ij}\, J_{ij}^T J_{ij}, \qquad J_{ij} = \partial \pi(P_i B_i Y_j) / \partial Y_j
-
-    It refers to the point at norm 1, and has it as a null vector.
-
-    Args:
-        cameras: ``(*batch, views, l + 1, a + 1)``.
-        structure: ``(*batch, n, k + 1)``.
-        weights: ``(*batch, views, n)``, 0 = missing, or None.
-        lifts: as in :func:`bundle_adjust`.
-
-    Returns:
-        ``(*batch, n, k + 1, k + 1)``, in the unit of 1 / images squared.
-
-    Raises:
-        ValueError: shapes that do not fit each other.
-
-    Example:
-        >>> import torch
-        >>> point_information(torch.eye(3)[None], torch.tensor([[0.0, 0.0, 2.0]]))[0].diagonal().tolist()
-        [1.0, 1.0, 0.0]
-    """
-    batch, views, n = cameras.shape[:-3], cameras.shape[-3], structure.shape[-2]
-    x = cameras.new_zeros(*batch, views, n, cameras.shape[-2] - 1)
-    _check(x, weights, cameras, structure, lifts, LOSSES[0])
-    count = prod(batch)
-
-    def flat(tensor: Tensor, *shape: int) -> Tensor:
-        return tensor.double().expand(*batch, *shape).reshape(count, *shape)
-
-    w = flat(observed(x, weights)[1], views, n)
-    points = normalize(flat(structure, *structure.shape[-2:]), dim=-1).mT
-    w = w * (points != 0).any(1)[:, None]
-    lift = None if lifts is None else flat(lifts, *lifts.shape[-3:])
-    problem = BundleProblem(flat(x, views, n, x.shape[-1]).mT, w, lift, None, LOSSES[0])
-    found = problem.information(flat(cameras, *cameras.shape[-3:]), points)
-    return found.permute(0, 3, 1, 2).reshape(*batch, n, *found.shape[1:3]).to(cameras.dtype)
-
-
-def structure_covariance(
-    cameras: Tensor,
-    structure: Tensor,
-    weights: Tensor | None = None,
-    lifts: Tensor | None = None,
-    *,
-    sigma: Tensor | float = 1.0,
-) -> Tensor:
-    r"""Covariance of each point, given the cameras: :math:`\sigma^2 V_j^+`, tangent to the unit sphere at the point of norm 1.
-
-    Args:
-        cameras: ``(*batch, views, l + 1, a + 1)``.
-        structure: ``(*batch, n, k + 1)``.
-        weights: ``(*batch, views, n)``, 0 = missing, or None.
-        lifts: as in :func:`bundle_adjust`.
-        sigma: noise per coordinate of an image of weight 1, one or ``(*batch,)``.
-
-    Returns:
-        ``(*batch, n, k + 1, k + 1)`` of rank k; infinite where the images do not determine the point.
-
-    Raises:
-        ValueError: shapes that do not fit each other.
-
-    Source: Hartley and Zisserman, chapter 5 and appendix A6.
-
-    Example:
-        >>> import torch
-        >>> structure_covariance(torch.eye(3)[None], torch.tensor([[0.0, 0.0, 2.0]]), sigma=0.5)[0].diagonal().tolist()
-        [0.25, 0.25, 0.0]
-    """
-    information = point_information(cameras, structure, weights, lifts).double()
-    points = normalize(structure.double(), dim=-1)
-    along = points[..., :, None] * points[..., None, :]
-    # of trace 1, so that the point, its null vector, gets an eigenvalue of the same size as the others
-    trace = information.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
-    held = torch.nan_to_num(information / trace, 0.0, 0.0, 0.0) + along
-    factor, failed = torch.linalg.cholesky_ex(held)
-    factor = torch.where(failed[..., None, None] > 0, torch.eye(held.shape[-1], dtype=held.dtype, device=held.device), factor)
-    inverse = torch.cholesky_inverse(factor)
-    # the eigenvalues of what is not determined are rounding
-    open_ = (failed > 0) | (inverse.diagonal(dim1=-2, dim2=-1).amax(-1) > 1e13) | (trace[..., 0, 0] == 0)
-    noise = torch.as_tensor(sigma, dtype=held.dtype, device=held.device)[..., None, None, None].square()
-    return torch.where(open_[..., None, None], torch.inf, (inverse - along) / trace * noise).to(cameras.dtype)
 
 
 def _counted(weights: Tensor, structure: Tensor, size: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -253,6 +177,18 @@ def _step(problem: BundleProblem, state: list[Tensor], tolerance: float, floor: 
     return [cameras, points, torch.where(better, fresh, cost), damping], done
 
 
+def _inside(cameras: Tensor, structure: Tensor, confined: Tensor, subspace: Tensor | None) -> tuple[tuple[Tensor, Tensor], Tensor]:
+    """The start with the confined points within the subspace, and the projectors ``(b, n, K, K)`` onto what is forbidden."""
+    size = structure.shape[-1]
+    if subspace is None or subspace.shape[0] != size:
+        got = None if subspace is None else tuple(subspace.shape)
+        raise ValueError(f"confined points need a subspace ({size}, r) of orthonormal columns, got {got}")
+    basis = subspace.to(structure)
+    away = torch.eye(size, dtype=basis.dtype, device=basis.device) - basis @ basis.mT
+    outside = away * confined[..., None, None]
+    return (cameras, structure - (structure[..., None, :] @ outside)[..., 0, :]), outside
+
+
 def _unit_cameras(cameras: Tensor) -> Tensor:
     return normalize(cameras.flatten(2), dim=-1).view_as(cameras)
 
@@ -265,7 +201,7 @@ def _scales(scale: Tensor | float, batch: torch.Size, device: torch.device) -> T
     return given.expand(batch).reshape(prod(batch))
 
 
-def _check(x: Tensor, weights: Tensor | None, cameras: Tensor, structure: Tensor, lifts: Tensor | None, loss: str) -> torch.Size:
+def check(x: Tensor, weights: Tensor | None, cameras: Tensor, structure: Tensor, lifts: Tensor | None, loss: str) -> torch.Size:
     """The batch."""
     if x.ndim < 3:
         raise ValueError(f"x must be (*batch, views, n, l), got {tuple(x.shape)}; unsqueeze a single view")

@@ -35,12 +35,15 @@ class BundleProblem:
     """``(b,)`` the error beyond which one counts as an outlier, or None for least squares."""
     loss: str
     """How outliers count: ``"geman_mcclure"`` or ``"huber"``."""
+    outside: Tensor | None = None
+    """``(b, k + 1, k + 1, n)`` projector onto what is forbidden to each point, 0 for free points; None where all are free."""
 
     def subset(self, keep: Tensor) -> BundleProblem:
         """Only some of the problems."""
         lifts = None if self.lifts is None else self.lifts[keep]
         scale = None if self.scale is None else self.scale[keep]
-        return BundleProblem(self.x[keep], self.weights[keep], lifts, scale, self.loss)
+        outside = None if self.outside is None else self.outside[keep]
+        return BundleProblem(self.x[keep], self.weights[keep], lifts, scale, self.loss, outside)
 
     def world(self, points: Tensor) -> Tensor:
         """The points :math:`B_i Y_j` that the cameras see, ``(b, v, a + 1, n)``."""
@@ -95,7 +98,7 @@ class BundleProblem:
         """
         at = self._linear(cameras, points)
         images, slope, error = at.images, at.slope, at.error
-        panel, pivots = _eliminated(_damped(_gram(at.by_point), points, damping), at.by_point)
+        panel, pivots = _eliminated(_damped(_gram(at.by_point), points, damping, self.outside), at.by_point)
         reduced = panel[:, points.shape[1] :]
         whitened = (reduced * error.flatten(1, 2)[:, :, None]).sum(1)
         rest = error - (reduced * whitened[:, None]).sum(2).view_as(error)
@@ -118,7 +121,8 @@ class BundleProblem:
         """
         at = self._linear(cameras, points)
         gradient = (at.by_point * at.error.flatten(1, 2)[:, :, None]).sum(1, keepdim=True)
-        panel, pivots = _eliminated(_damped(_gram(at.by_point), points, torch.full_like(points[:, 0, 0], 1e-9)), gradient)
+        blocks = _damped(_gram(at.by_point), points, torch.full_like(points[:, 0, 0], 1e-9), self.outside)
+        panel, pivots = _eliminated(blocks, gradient)
         moved = normalize(points - _back_substituted(panel, pivots, panel[:, -1]), dim=1)
         costs = self.costs(cameras, moved)
         better = costs < at.costs
@@ -140,7 +144,8 @@ class BundleProblem:
     def _by_point(self, cameras: Tensor, images: Tensor, slope: Tensor) -> Tensor:
         """Derivative of the weighted images by the points, ``(b, v l, k + 1, n)``."""
         projections = cameras if self.lifts is None else cameras @ self.lifts
-        return push(projections[..., None], images[:, :, :, None], slope[:, :, :, None]).flatten(1, 2)
+        rows = push(projections[..., None], images[:, :, :, None], slope[:, :, :, None]).flatten(1, 2)
+        return rows if self.outside is None else rows - torch.einsum("brkn,bkjn->brjn", rows, self.outside)
 
 
 @dataclass(frozen=True)
@@ -174,11 +179,14 @@ def _gram(rows: Tensor) -> Tensor:
     return total
 
 
-def _damped(gram: Tensor, points: Tensor, damping: Tensor) -> Tensor:
-    """The point blocks with damping, with the free scale of every point held, and regular where nothing is known."""
+def _damped(gram: Tensor, points: Tensor, damping: Tensor, outside: Tensor | None) -> Tensor:
+    """The point blocks with damping, the free scale and the forbidden directions of every point held, and regular where nothing is
+    known."""
     diagonal = gram.diagonal(dim1=1, dim2=2)
     extra, trace = diagonal * damping[:, None, None], diagonal.sum(-1)
     gram.addcmul_((points * trace[:, None])[:, :, None], points[:, None])
+    if outside is not None:
+        gram.addcmul_(outside, trace[:, None, None])
     gram.diagonal(dim1=1, dim2=2).add_(extra + (trace == 0)[..., None])
     return gram
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -119,15 +118,14 @@ def unpack(moments: Tensor, widths: tuple[int, ...]) -> Tensor:
     return moments.gather(-1, index.expand(*moments.shape[:-1], -1)).unflatten(-1, (size, size))
 
 
-@lru_cache(maxsize=64)
+@constant
 def _unpacking(widths: tuple[int, ...], device: torch.device) -> Tensor:
     """Where entry (i1 i2 .., j1 j2 ..) of the Gram lies among the packed moments."""
-    with torch.inference_mode(False):
-        index = torch.zeros(1, 1, dtype=torch.long)
-        for width in widths:
-            rows, columns = torch.triu_indices(width, width)
-            place = torch.zeros(width, width, dtype=torch.long)
-            place[rows, columns] = place[columns, rows] = torch.arange(len(rows))
-            packed = width * (width + 1) // 2
-            index = (index[:, None, :, None] * packed + place[None, :, None, :]).flatten(0, 1).flatten(1)
-        return index.flatten().to(device)
+    index = torch.zeros(1, 1, dtype=torch.long)
+    for width in widths:
+        rows, columns = torch.triu_indices(width, width)
+        place = torch.zeros(width, width, dtype=torch.long)
+        place[rows, columns] = place[columns, rows] = torch.arange(len(rows))
+        packed = width * (width + 1) // 2
+        index = (index[:, None, :, None] * packed + place[None, :, None, :]).flatten(0, 1).flatten(1)
+    return index.flatten().to(device)

@@ -58,7 +58,7 @@ LAYERS = [
     {"invariants"},
     {"solution", "ambiguity", "fitting"},
     {"least_squares", "constrained", "refinement"},
-    {"hypotheses", "starts", "robust", "bundle_problem", "bundle_adjustment"},
+    {"hypotheses", "starts", "robust", "bundle_problem", "bundle_adjustment", "bundle_information"},
     {"motions"},
     {"tasks"},
 ]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
 from itertools import combinations, permutations
 from math import comb
 
@@ -10,6 +9,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.algebra.homogeneous import homogeneous
+from dyntorch.constants import constant
 
 
 def levi_civita(n: int, *, dtype: torch.dtype = torch.float64, device: torch.device | str | None = None) -> Tensor:
@@ -34,14 +34,12 @@ def levi_civita(n: int, *, dtype: torch.dtype = torch.float64, device: torch.dev
     return _levi_civita(n, dtype, torch.empty(0, device=device).device)
 
 
-@lru_cache(maxsize=64)
+@constant
 def _levi_civita(n: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    # an inference tensor left in the cache would break every later gradient
-    with torch.inference_mode(False):
-        tensor = torch.zeros((n,) * n, dtype=dtype)
-        for order in permutations(range(n)):
-            tensor[order] = _parity(order)
-        return tensor.to(device)
+    tensor = torch.zeros((n,) * n, dtype=dtype)
+    for order in permutations(range(n)):
+        tensor[order] = _parity(order)
+    return tensor.to(device)
 
 
 def _parity(order: tuple[int, ...]) -> int:
@@ -83,8 +81,8 @@ def compound(matrix: Tensor, order: int) -> Tensor:
 def _expand(matrix: Tensor, smaller: Tensor, order: int) -> Tensor:
     """Minors of one order from those of the order below, by Laplace expansion along the first row."""
     rows, columns = matrix.shape[-2:]
-    first, rest, _, _ = _laplace(rows, order)
-    _, _, taken, left = _laplace(columns, order)
+    first, rest, _, _ = _laplace(rows, order, matrix.device)
+    _, _, taken, left = _laplace(columns, order, matrix.device)
     terms = (
         (-1) ** j * matrix[..., first[:, None], taken[j][None, :]] * smaller[..., rest[:, None], left[j][None, :]]
         for j in range(order)
@@ -92,8 +90,8 @@ def _expand(matrix: Tensor, smaller: Tensor, order: int) -> Tensor:
     return torch.stack(list(terms)).sum(0)
 
 
-@lru_cache(maxsize=256)
-def _laplace(n: int, order: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+@constant
+def _laplace(n: int, order: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Index tables of a Laplace expansion of the minors of ``order`` among ``n`` lines.
 
     For every combination: its first line, where the rest stands among the smaller combinations, and, for each j, its j-th
@@ -103,8 +101,8 @@ def _laplace(n: int, order: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     sets = list(combinations(range(n), order))
     taken = [[c[j] for c in sets] for j in range(order)]
     left = [[place[c[:j] + c[j + 1 :]] for c in sets] for j in range(order)]
-    with torch.inference_mode(False):
-        return torch.tensor(taken[0]), torch.tensor(left[0]), torch.tensor(taken), torch.tensor(left)
+    chosen, place_left = torch.tensor(taken, device=device), torch.tensor(left, device=device)
+    return chosen[0], place_left[0], chosen, place_left
 
 
 def join(*points: Tensor) -> Tensor:
@@ -157,14 +155,13 @@ def dual(extensor: Tensor, size: int, step: int) -> Tensor:
             f"an extensor of step {step} among {size} coordinates has {comb(size, step)} entries, got {extensor.shape[-1]}"
         )
     # lexicographic order reverses under taking complements
-    return (extensor * _dual_signs(size, step).to(extensor)).flip(-1)
+    return (extensor * _dual_signs(size, step, extensor.device).to(extensor.dtype)).flip(-1)
 
 
-@lru_cache(maxsize=256)
-def _dual_signs(size: int, step: int) -> Tensor:
+@constant
+def _dual_signs(size: int, step: int, device: torch.device) -> Tensor:
     signs = [_parity(s + tuple(i for i in range(size) if i not in s)) for s in combinations(range(size), step)]
-    with torch.inference_mode(False):
-        return torch.tensor(signs)
+    return torch.tensor(signs, device=device)
 
 
 def meet(*hyperplanes: Tensor) -> Tensor:

@@ -5,7 +5,6 @@ The Hodge star is :func:`dyntorch.algebra.extensors.dual`.
 
 from __future__ import annotations
 
-from functools import lru_cache
 from itertools import combinations
 from math import comb
 
@@ -13,6 +12,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.algebra.extensors import dual, join
+from dyntorch.constants import constant
 from dyntorch.nullspace import null_space
 
 
@@ -45,7 +45,7 @@ def wedge(left: Tensor, right: Tensor, size: int, steps: tuple[int, int]) -> Ten
         check_extensor(extensor, size, step)
     if sum(steps) > size:
         raise ValueError(f"steps {steps} do not fit into {size} coordinates: their join is 0")
-    first, second, sign = (table.to(left.device) for table in _splits(size, *steps))
+    first, second, sign = _splits(size, *steps, left.device)
     return (left[..., first] * right[..., second] * sign.to(left.dtype)).sum(-1)
 
 
@@ -150,8 +150,8 @@ def check_extensor(extensor: Tensor, size: int, step: int) -> None:
         raise ValueError(f"an extensor of step {step} among {size} coordinates has {entries} entries, got {extensor.shape[-1]}")
 
 
-@lru_cache(maxsize=256)
-def _splits(size: int, a: int, b: int) -> tuple[Tensor, Tensor, Tensor]:
+@constant
+def _splits(size: int, a: int, b: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
     """For every set of a + b coordinates, all ways to cut it: places of both parts and the sign, ``(sets, ways)`` each."""
     place = {step: {s: i for i, s in enumerate(combinations(range(size), step))} for step in (a, b)}
     first, second, sign = [], [], []
@@ -160,6 +160,4 @@ def _splits(size: int, a: int, b: int) -> tuple[Tensor, Tensor, Tensor]:
         first.append([place[a][part] for part, _ in parts])
         second.append([place[b][rest] for _, rest in parts])
         sign.append([-1 if sum(i > j for i in part for j in rest) % 2 else 1 for part, rest in parts])
-    # an inference tensor left in the cache would break every later gradient
-    with torch.inference_mode(False):
-        return torch.tensor(first), torch.tensor(second), torch.tensor(sign)
+    return torch.tensor(first, device=device), torch.tensor(second, device=device), torch.tensor(sign, device=device)

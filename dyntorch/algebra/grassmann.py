@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
 from itertools import combinations
 
 import torch
@@ -11,6 +10,7 @@ from torch import Tensor
 
 from dyntorch.algebra.extensors import compound, dual
 from dyntorch.algebra.exterior import wedge
+from dyntorch.constants import constant
 
 
 def grassmann_tensor(projections: Sequence[Tensor], profile: Sequence[int]) -> Tensor:
@@ -113,33 +113,31 @@ def _minor_slopes(matrix: Tensor, order: int, weight: Tensor) -> Tensor:
     :math:`\partial \det M_{IS} / \partial M_{rc} = \pm \det M_{I \setminus r, S \setminus c}` for r in I and c in S.
     """
     rows, columns = matrix.shape[-2:]
-    place, sign = (table.to(matrix.device) for table in _removals(columns, order))
+    place, sign = _removals(columns, order, matrix.device)
     taken = (weight[..., place] * sign.to(matrix.dtype)).movedim(-3, -1)  # (.., c, T, rest)
     smaller = compound(matrix, order - 1) if order > 1 else torch.ones_like(matrix[..., :1, :1])
     inner = smaller[..., None, :, :] @ taken  # (.., c, U, rest)
-    place, sign = (table.to(matrix.device) for table in _insertions(rows, order))
+    place, sign = _insertions(rows, order, matrix.device)
     # (.., c, r, I, rest): the sets without a row that they have; sign 0 where they do not
     slope = inner[..., place, :] * sign.to(matrix.dtype)[..., None]
     return slope.movedim(-4, -3).flatten(-4, -3)
 
 
-@lru_cache(maxsize=64)
-def _removals(size: int, order: int) -> tuple[Tensor, Tensor]:
+@constant
+def _removals(size: int, order: int, device: torch.device) -> tuple[Tensor, Tensor]:
     """For every element c and set T of ``order - 1`` others: the place of c with T among the sets, and the sign; 0 if c is in T."""
     place = {s: i for i, s in enumerate(combinations(range(size), order))}
     smaller = list(combinations(range(size), order - 1))
     found = [[place.get(tuple(sorted((c, *t))), 0) for t in smaller] for c in range(size)]
     signs = [[0 if c in t else (-1) ** sum(i < c for i in t) for t in smaller] for c in range(size)]
-    with torch.inference_mode(False):
-        return torch.tensor(found), torch.tensor(signs)
+    return torch.tensor(found, device=device), torch.tensor(signs, device=device)
 
 
-@lru_cache(maxsize=64)
-def _insertions(size: int, order: int) -> tuple[Tensor, Tensor]:
+@constant
+def _insertions(size: int, order: int, device: torch.device) -> tuple[Tensor, Tensor]:
     """For every element r and set I: the place of I without r among the smaller sets, and the sign; 0 if r is not in I."""
     place = {s: i for i, s in enumerate(combinations(range(size), order - 1))}
     sets = list(combinations(range(size), order))
     found = [[place.get(tuple(i for i in s if i != r), 0) for s in sets] for r in range(size)]
     signs = [[(-1) ** s.index(r) if r in s else 0 for s in sets] for r in range(size)]
-    with torch.inference_mode(False):
-        return torch.tensor(found), torch.tensor(signs)
+    return torch.tensor(found, device=device), torch.tensor(signs, device=device)

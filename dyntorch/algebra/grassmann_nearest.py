@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
 from itertools import accumulate, combinations, product
 from math import comb, prod
 
@@ -13,6 +12,7 @@ from torch import Tensor
 from dyntorch.algebra.grassmann import grassmann_derivative, grassmann_tensor
 from dyntorch.algebra.grassmann_recovery import balanced, candidates, check, direction, rotated, tables, unit
 from dyntorch.blocks import map_blocks
+from dyntorch.constants import constant
 
 STEPS, NEWTON = 30, 8
 """At most, of Levenberg-Marquardt and of Newton, in each round."""
@@ -256,13 +256,12 @@ def _views(sizes: Sequence[int], width: int) -> list[slice]:
     return [slice(start, end) for start, end in zip([0, *ends], ends, strict=False)]
 
 
-@lru_cache(maxsize=64)
+@constant
 def _chosen(profile: tuple[int, ...], sizes: tuple[int, ...], device: torch.device) -> Tensor:
     """The rows of the stack of which each entry of the tensor is the determinant, ``(D, K)``."""
     starts = [0, *accumulate(sizes)]
     sets = [combinations(range(start, start + size), alpha) for start, size, alpha in zip(starts, sizes, profile, strict=False)]
-    with torch.inference_mode(False):
-        return torch.tensor([[row for part in rows for row in part] for rows in product(*sets)], device=device)
+    return torch.tensor([[row for part in rows for row in part] for rows in product(*sets)], device=device)
 
 
 def _across(vector: Tensor, unit: Tensor) -> Tensor:

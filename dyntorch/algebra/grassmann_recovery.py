@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from itertools import combinations
 from math import comb, prod
 
@@ -12,6 +11,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.algebra.extensors import compound
+from dyntorch.constants import constant
 
 POWER_STEPS = 3
 """Power iterations for a rank-1 split: exact without noise, and the error of a noisy one falls by (s_2 / s_1)^2 in each."""
@@ -127,20 +127,18 @@ class Tables:
     """``(N_i, m_i)``: the rows of I, then the extra rows."""
 
 
-@lru_cache(maxsize=64)
+@constant
 def tables(profile: tuple[int, ...], sizes: tuple[int, ...], tries: int, device: torch.device) -> Tables:
     """The tables of a profile; the rotations are always the same."""
     generator = torch.Generator().manual_seed(0)
-    # an inference tensor left in the cache would break every later gradient
-    with torch.inference_mode(False), torch.no_grad():
-        rotations, compounds, rest = [], [], []
-        for alpha, size in zip(profile, sizes, strict=True):
-            rotation = torch.linalg.qr(torch.randn(tries, size, size, generator=generator, dtype=torch.float64)).Q
-            rotations.append(rotation.to(device))
-            compounds.append(compound(rotation, alpha).to(device))
-            rest.append(tuple(table.to(device) for table in _replacements(size, alpha)))
-        places, signs, orders = zip(*rest, strict=True)
-        return Tables(profile, sizes, tuple(rotations), tuple(compounds), places, signs, orders)
+    rotations, compounds, rest = [], [], []
+    for alpha, size in zip(profile, sizes, strict=True):
+        rotation = torch.linalg.qr(torch.randn(tries, size, size, generator=generator, dtype=torch.float64)).Q
+        rotations.append(rotation.to(device))
+        compounds.append(compound(rotation, alpha).to(device))
+        rest.append(tuple(table.to(device) for table in _replacements(size, alpha)))
+    places, signs, orders = zip(*rest, strict=True)
+    return Tables(profile, sizes, tuple(rotations), tuple(compounds), places, signs, orders)
 
 
 def _replacements(size: int, alpha: int) -> tuple[Tensor, Tensor, Tensor]:

@@ -108,7 +108,8 @@ def _before(cameras: Tensor, structure: Tensor, lifts: Tensor, weights: Tensor) 
     point = _majority((view[..., None] * sign).sum(-2))
     cameras = cameras * view[..., None, None]
     mean = (depth * view[..., None]).sum(-2) / (weights > 0).sum(-2).clamp(min=1)
-    scale = mean.abs().clamp(min=1e-12 * structure.norm(dim=-1).clamp(min=torch.finfo(mean.dtype).tiny))
+    size = structure.norm(dim=-1)
+    scale = torch.where(size > 0, mean.abs().maximum(1e-12 * size), 1.0)
     return cameras, structure * (point / scale)[..., None]
 
 

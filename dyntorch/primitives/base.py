@@ -8,18 +8,17 @@ what replaces them where the invariant holds for *every* vector in the slot (a m
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from functools import lru_cache
 
 import torch
 from torch import Tensor
 
+from dyntorch.constants import constant
 
-@lru_cache(maxsize=64)
+
+@constant
 def triangle(width: int, device: torch.device) -> tuple[Tensor, Tensor]:
     """Rows and columns of the upper triangle of a square matrix, in the order in which symmetric matrices are packed."""
-    # an inference tensor left in the cache would break every later gradient
-    with torch.inference_mode(False):
-        rows, columns = torch.triu_indices(width, width, device=device)
+    rows, columns = torch.triu_indices(width, width, device=device)
     return rows, columns
 
 

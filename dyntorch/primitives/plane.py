@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from itertools import combinations
 from math import comb
 
@@ -12,6 +11,7 @@ from torch import Tensor
 
 from dyntorch.algebra.extensors import compound
 from dyntorch.algebra.homogeneous import homogeneous
+from dyntorch.constants import constant
 from dyntorch.primitives.base import Primitive, inverse
 
 
@@ -125,7 +125,7 @@ class HyperplanesThrough(Primitive):
             raise NotImplementedError(f"a point of P^{self.dim} lies on {self.dim} hyperplanes: it has no single vector")
 
 
-@lru_cache(maxsize=64)
+@constant
 def _moving_minors(dim: int, order: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
     """The minors of [I | -x] that are a coordinate up to sign, row by row of the compound: their places, coordinates, signs."""
     columns = {s: i for i, s in enumerate(combinations(range(dim + 1), order))}
@@ -134,8 +134,7 @@ def _moving_minors(dim: int, order: int, device: torch.device) -> tuple[Tensor, 
         for row in combinations(range(dim), order)
         for p, j in enumerate(row)
     ]
-    with torch.inference_mode(False):
-        place, coordinates, sign = torch.tensor(found, device=device).unbind(-1)
+    place, coordinates, sign = torch.tensor(found, device=device).unbind(-1)
     return place, coordinates, sign
 
 

@@ -8,7 +8,8 @@ from torch import Tensor
 from dyntorch.algebra.hyperplane_pair import hyperplane_pair
 from dyntorch.algebra.triangulation import triangulate
 from dyntorch.algebra.two_bodies import two_bodies
-from dyntorch.bundle_adjustment import bundle_adjust, point_information
+from dyntorch.bundle_adjustment import bundle_adjust
+from dyntorch.bundle_information import point_information
 from dyntorch.tasks.lifted_projections import Tracks
 from dyntorch.tasks.lifted_scene import Scene
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from math import comb
 
@@ -41,25 +41,35 @@ class Tracks:
     """``(b, views, l + 1, l + 1)`` from measured to normalized coordinates."""
     times: Tensor
     """``(views,)``."""
+    static: Tensor | None = None
+    """``(b, n)`` bool: points known to stand still."""
 
     def subset(self, keep: Tensor) -> Tracks:
         """Some problems of the batch."""
-        return Tracks(self.x[keep], self.weights[keep], self.scales[keep], self.transforms[keep], self.times)
+        static = None if self.static is None else self.static[keep]
+        return Tracks(self.x[keep], self.weights[keep], self.scales[keep], self.transforms[keep], self.times, static)
 
     def at(self, views: Tensor) -> Tracks:
         """Some views."""
-        return Tracks(self.x[:, views], self.weights[:, views], self.scales[:, views], self.transforms[:, views], self.times[views])
+        x, weights, scales, transforms = (p[:, views] for p in (self.x, self.weights, self.scales, self.transforms))
+        return Tracks(x, weights, scales, transforms, self.times[views], self.static)
 
     def only(self, weights: Tensor) -> Tracks:
         """Other weights."""
-        return Tracks(self.x, weights, self.scales, self.transforms, self.times)
+        return replace(self, weights=weights)
+
+    def resting(self) -> Tracks:
+        """The points known to stand still alone."""
+        assert self.static is not None
+        return self.only(self.weights * self.static[:, None])
 
     def repeated(self, count: int) -> Tracks:
         """Every problem so many times in a row."""
         x, weights, scales, transforms = (
             part.repeat_interleave(count, dim=0) for part in (self.x, self.weights, self.scales, self.transforms)
         )
-        return Tracks(x, weights, scales, transforms, self.times)
+        static = None if self.static is None else self.static.repeat_interleave(count, dim=0)
+        return Tracks(x, weights, scales, transforms, self.times, static)
 
 
 @dataclass(frozen=True)
@@ -140,7 +150,7 @@ def _from_subset(tracks: Tracks, invariant: GrassmannTensor, chosen: Tensor) -> 
         whole = resect(structure, tracks.x, tracks.weights)
         whole = whole.scatter(1, chosen[..., None, None].expand(-1, -1, *some.shape[2:]), some)
         structure = triangulate(whole, tracks.x, tracks.weights)
-        lost = (whole == 0).flatten(2).all(-1).any(-1)
+        lost = ((whole == 0).flatten(2).all(-1) & (tracks.weights > 0).any(-1)).any(-1)
         status = torch.where(lost & (status == Status.OK), int(Status.DEGENERATE), status)
     else:
         order = chosen.argsort(1)

@@ -14,7 +14,7 @@ from dyntorch.bundle_adjustment import bundle_adjust
 from dyntorch.motions import Motion
 from dyntorch.solution import Status, failed
 from dyntorch.tasks.lifted_projections import Projections, Tracks
-from dyntorch.tasks.lifted_starts import can_rest, middle, resting, tilted
+from dyntorch.tasks.lifted_starts import middle, resting, resting_constants, tilted
 
 STRUCTURED, FINE = 60, 1e-7
 """At most so many steps of structured bundle adjustment, and the share of the cost that the last one gains."""
@@ -27,6 +27,9 @@ SPARE = 6
 minimum in up to 18 with 5 views and 1 with 6, in none with 7, 8 and 12."""
 FRAMES, UNAIDED = 3, 6
 """Starts from the scene at rest, at most: next to that from the tensor, and without one."""
+AIDED = {2: 6, 3: 12}
+"""Points known to stand still and seen by all views, half as many more as determine the cameras, from which on they do: in a plane
+and in space."""
 SAME, EXACT = 1e-2, 1e-22
 """Relative difference of the costs of the same minimum, and of costs that are only rounding, per observation."""
 
@@ -51,6 +54,8 @@ class Lifting:
     """``(a + 1, K)`` the lift at the mean time of the views."""
     algebra: Tensor
     """``(dim, K, K)`` the ambiguity."""
+    still: Tensor
+    """``(K, a + 1)`` orthonormal: the constants of points that stand still; of no columns where none can."""
 
     @classmethod
     def of(cls, motion: Motion, times: Tensor, like: Tensor) -> Lifting:
@@ -63,7 +68,8 @@ class Lifting:
         middle = motion.lifts([float(times.mean()) - origin])[0] @ inverse
         # a shift is inverted exactly by the opposite one, however far
         back = (torch.eye(len(root), dtype=root.dtype) if motion.shift is None else motion.shift(-origin)) @ inverse
-        return cls(motion, *(part.to(like) for part in (lifts, root @ shift, back, start, slope, middle, balanced_algebra(lifts))))
+        parts = (lifts, root @ shift, back, start, slope, middle, balanced_algebra(lifts), resting_constants(lifts))
+        return cls(motion, *(part.to(like) for part in parts))
 
 
 @dataclass(frozen=True)
@@ -94,6 +100,7 @@ def scene_of(tracks: Tracks, found: Projections, lifting: Lifting, scale: Tensor
         Scene, of infinite cost where none was found.
     """
     lost = failed(found.status)
+    aided = _aided(tracks, lifting)
     coordinates = (tracks.weights > 0).sum(1) * tracks.x.shape[-1]
     size = lifting.lifts.shape[-1]
     known = torch.where(lost[:, None], coordinates >= size - 1, (found.structure != 0).any(-1))
@@ -102,8 +109,16 @@ def scene_of(tracks: Tracks, found: Projections, lifting: Lifting, scale: Tensor
     spare = (coordinates * known).sum(-1) - (size - 1) * known.sum(-1)
     shaky = ~lost & (size >= SEVERAL) & (spare <= SPARE * known.sum(-1))
     unaided = (found.status == Status.TOO_FEW) & (spare > _unknown(lifting, tracks))
-    left = (shaky | unaided).nonzero()[:, 0] if can_rest(lifting.lifts) else lost.new_zeros(0, dtype=torch.long)
+    left = (shaky | unaided | aided).nonzero()[:, 0] if lifting.still.shape[-1] else lost.new_zeros(0, dtype=torch.long)
     return _confirmed(tracks, scene, left, known, lifting, scale) if len(left) else scene
+
+
+def _aided(tracks: Tracks, lifting: Lifting) -> Tensor:
+    """Problems ``(b,)`` whose cameras follow from the points known to stand still."""
+    if tracks.static is None or lifting.motion.static or not lifting.still.shape[-1]:
+        return torch.zeros_like(tracks.x[:, 0, 0, 0], dtype=torch.bool)
+    resting = (tracks.weights > 0) & tracks.static[:, None]
+    return resting.all(1).sum(-1) >= AIDED[min(lifting.motion.dim, 3)]
 
 
 def _upgraded(found: Projections, lost: Tensor, lifting: Lifting) -> Tensor:
@@ -146,42 +161,53 @@ def _confirmed(tracks: Tracks, scene: Scene, left: Tensor, known: Tensor, liftin
         left, seen = left[doubt], seen[doubt]
         if not len(left):
             break
-    # without a tensor only what was found twice counts
-    cost[left[torch.isin(left, alone)]] = torch.inf
+    # without a tensor and without points known to stand still only what was found twice counts
+    cost[left[torch.isin(left, alone) & ~_aided(tracks, lifting)[left]]] = torch.inf
     return Scene(cameras, structure, cost)
 
 
 def _started(tracks: Tracks, number: int, lifting: Lifting, scale: Tensor | None) -> Tensor:
     """Cameras of all views from those of the scene at rest; of a part of many views: adjusted, the others by resection."""
+    aided = bool(_aided(tracks, lifting).all())
     window = middle(tracks.times, number)
     near = tracks.at(window)
+    near = near.resting() if aided else near
     cameras = tilted(resting(near, lifting.motion.sensor, lifting.motion.dim), number)
     if len(window) == tracks.x.shape[1]:
         return cameras
     some = replace(lifting, lifts=lifting.lifts[window])
-    part = _scene(near, cameras, torch.ones_like(tracks.weights[:, 0], dtype=torch.bool), some, scale)
+    part = _scene(tracks.at(window), cameras, torch.ones_like(tracks.weights[:, 0], dtype=torch.bool), some, scale)
     whole = resect(part.structure, tracks.x, tracks.weights, lifts=lifting.lifts)
     return whole.index_copy(1, window.to(whole.device), part.cameras)
 
 
 def adjusted(tracks: Tracks, scene: Scene, lifting: Lifting, scale: Tensor | None = None) -> Scene:
     """Structured bundle adjustment."""
+    confined = tracks.static if lifting.still.shape[-1] else None
     done = bundle_adjust(
-        tracks.x, tracks.weights, scene.cameras, scene.structure, lifting.lifts, iterations=STRUCTURED, scale=scale, tolerance=FINE
+        tracks.x,
+        tracks.weights,
+        scene.cameras,
+        scene.structure,
+        lifting.lifts,
+        iterations=STRUCTURED,
+        scale=scale,
+        tolerance=FINE,
+        confined=confined,
+        subspace=None if confined is None else lifting.still,
     )
     return Scene(done.cameras, done.structure, done.cost)
 
 
-def framed(tracks: Tracks, scene: Scene, lifting: Lifting, static: Tensor | None) -> Scene:
+def framed(tracks: Tracks, scene: Scene, lifting: Lifting) -> Scene:
     """The scene in its frame: finite, with no motion common to all points (to the static ones), centred, of unit size.
 
     Args:
         tracks: flat batch.
         scene: of :func:`scene_of`.
         lifting: the model.
-        static: ``(b, n)`` bool, or None.
     """
-    lifts = lifting.lifts
+    lifts, static = lifting.lifts, tracks.static
     known = (scene.structure != 0).any(-1)
     G, cameras, structure = finite(scene.cameras, scene.structure, lifts, lifting.algebra, tracks.weights)
     cameras, structure = moved(G, cameras, structure, lifts)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TypeVar
 
 import torch
@@ -22,6 +23,8 @@ Part = TypeVar("Part", Projections, Scene)
 
 CHI_SQUARE = {2: 9.210, 3: 11.345, 4: 13.277}
 """99 % quantiles."""
+EXACT = 1e-18
+"""Square of the noise, over that of the extent of the image, that exact data are taken to have."""
 
 
 def solve(
@@ -43,6 +46,7 @@ def solve(
         batch: the shape that the flat dimension comes from.
     """
     lifting = None if motion.lift is None else Lifting.of(motion, tracks.times, tracks.x)
+    tracks = replace(tracks, static=static)
     views = motion.views(tracks.times)
     invariant = motion.tensor(min(views, motion.k + 1))
     found = projections_of_tracks(tracks, invariant)
@@ -55,15 +59,15 @@ def solve(
         tracks = tracks.only(tracks.weights.index_copy(0, chosen, fewer.weights))
         found = _merged(found, some, chosen)
         scene = _merged(scene, again, chosen)
-    return _result(tracks, motion, lifting, found, scene, static, batch)
+    return _result(tracks, motion, lifting, found, scene, batch)
 
 
 def _scene(tracks: Tracks, found: Projections, lifting: Lifting | None) -> tuple[Projections, Scene]:
     """With a lift the scene in any of its frames; bodies stay in the projective one, with their projections for cameras."""
     if lifting is not None:
         scene = scene_of(tracks, found, lifting)
-        # too few points in common for a tensor, but a scene was found without it
-        status = torch.where((found.status == Status.TOO_FEW) & scene.cost.isfinite(), int(Status.OK), found.status)
+        # no tensor: too few points in common, or too like each other; but a scene was found without it
+        status = torch.where(failed(found.status) & scene.cost.isfinite(), int(Status.OK), found.status)
         return Projections(found.projections, found.structure, status), scene
     done = bundle_adjust(tracks.x, tracks.weights, found.projections, found.structure)
     return found, Scene(done.cameras, done.structure, done.cost)
@@ -84,7 +88,6 @@ def _result(
     lifting: Lifting | None,
     found: Projections,
     scene: Scene,
-    static: Tensor | None,
     batch: tuple[int, ...],
 ) -> Reconstruction:
     """Frame, labels, residuals and notices of solved problems, in the caller's batch."""
@@ -94,12 +97,12 @@ def _result(
         cameras, speed, projections = bodies[:, 0], None, scene.cameras
         structure, status = scene.structure, found.status
     else:
-        scene = framed(tracks, scene, lifting, static)
+        scene = framed(tracks, scene, lifting)
         projections = scene.cameras @ lifting.lifts
         known = (scene.structure != 0).any(-1)
         labels = torch.where(known, 2, 0)
-        if static is not None:
-            labels = torch.where(known & _rests(tracks, scene, lifting, projections), 1, labels)
+        if tracks.static is not None:
+            labels = torch.where(known & (tracks.static | _rests(tracks, scene, lifting, projections)), 1, labels)
         status = found.status
         cameras, structure = scene.cameras, scene.structure @ lifting.back.mT
         points = positions(scene.structure, lifting.start)
@@ -133,7 +136,7 @@ def _result(
         projections=shaped(_unit(back @ (projections if lifting is None else projections @ lifting.root))),
         inliers=shaped(counted),
         times=tracks.times,
-        ambiguity=_open(motion, static),
+        ambiguity=_open(motion, tracks.static),
         warnings=warnings,
         bodies=None if bodies is None else shaped(_unit(back[:, None] @ bodies)),
     )
@@ -153,14 +156,13 @@ def spare(tracks: Tracks, counted: Tensor, motion: Motion, lifting: Lifting | No
 
 def _rests(tracks: Tracks, scene: Scene, lifting: Lifting, projections: Tensor) -> Tensor:
     """Which points ``(b, n)`` are explained as well, within the noise, by one position for all times."""
-    change = (lifting.lifts - lifting.lifts.mean(0)).flatten(0, 1)
-    still = torch.linalg.svd(change).Vh[-lifting.lifts.shape[1] :].mT  # constants of points at rest
+    still = lifting.still
     moving = _cost(tracks, projections, scene.structure)
     resting = _cost(tracks, projections @ still, triangulate(projections @ still, tracks.x, tracks.weights, steps=2))
-    count = (tracks.weights > 0).flatten(1).sum(-1)
-    seen = (scene.structure != 0).any(-1).sum(-1)
-    free = (count * tracks.x.shape[-1] - seen * (lifting.lifts.shape[-1] - 1)).clamp(min=1)
-    sigma = moving.sum(-1, keepdim=True) / free[:, None]
+    free = spare(tracks, distances(tracks, projections, scene.structure).isfinite(), lifting.motion, lifting).clamp(min=1)
+    # rounding is noise as well
+    extent = (1 / tracks.scales.amin(-1, keepdim=True)).square()
+    sigma = moving.sum(-1, keepdim=True) / free[:, None] + EXACT * extent
     extra = lifting.lifts.shape[-1] - lifting.lifts.shape[1]
     return resting - moving <= CHI_SQUARE.get(extra, 3.0 * extra + 4.0) * sigma
 

@@ -28,10 +28,12 @@ def middle(times: Tensor, number: int = 0) -> Tensor:
     return times.argsort()[first : first + count].sort().values
 
 
-def can_rest(lifts: Tensor) -> bool:
-    """Whether all positions are those of points that do not move."""
+def resting_constants(lifts: Tensor) -> Tensor:
+    """Orthonormal ``(K, a + 1)`` constants of the points that do not move; of no columns where not all positions are theirs."""
     change = (lifts - lifts.mean(0)).flatten(0, 1)
-    return lifts.shape[-1] - int(torch.linalg.matrix_rank(change, atol=REST * float(lifts.norm()))) >= lifts.shape[-2]
+    _, values, vh = torch.linalg.svd(change, full_matrices=True)
+    still = vh[int((values > REST * lifts.norm()).sum()) :].mT
+    return still if still.shape[-1] >= lifts.shape[-2] else still[:, :0]
 
 
 def resting(tracks: Tracks, sensor: int, dim: int) -> Tensor:

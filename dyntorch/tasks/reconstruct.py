@@ -213,10 +213,10 @@ def _noted(found: Reconstruction, static: Tensor | None, used: Tensor) -> Recons
     text = f"{{value:g}} views show fewer than {_resection(found.motion)} tracks and have no camera; leave them out, or add tracks"
     notes = notices(NoticeCode.UNUSED_VIEW, text, unused, unused > 0, tuple(batch))
     if static is not None and found.velocities is not None and not found.motion.static:
-        given = static & found.points.reshape(*static.shape, -1).isfinite().all(-1)
+        given = static & found.points.reshape(*static.shape, found.points.shape[-1]).isfinite().all(-1)
         text = "{value:g} of the static points have a position: the motion common to all points is not fixed"
         notes += notices(NoticeCode.COMMON_VELOCITY, text, given.sum(-1), good & ~given.any(-1), tuple(batch))
-    seen = used.reshape(*batch, -1)
+    seen = used.reshape(*batch, used.shape[-1])
     warnings = tuple(sorted((*found.warnings, *notes), key=lambda notice: notice.problem))
     bodies = None if found.bodies is None else found.bodies * seen[..., None, :, None, None]
     return replace(found, cameras=found.cameras * seen[..., None, None], bodies=bodies, warnings=warnings)

@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from dyntorch.algebra.triangulation import reproject
-from dyntorch.bundle_adjustment import bundle_adjust, point_information, structure_covariance
+from dyntorch.bundle_adjustment import bundle_adjust
+from dyntorch.bundle_information import point_information, structure_covariance
 from dyntorch.bundle_problem import BundleProblem
 
 

@@ -98,7 +98,7 @@ def test_batch_equals_loop():
 @pytest.mark.parametrize("name", ["constant_velocity_2d", "constant_velocity_3d", "constant_direction_3d"])
 def test_the_frame_is_finite_round_and_brings_static_points_to_rest(name):
     truth, tracks, lifting, _, scene = solved(name, 60, views=6, static=0.3, batch=(2,))
-    shown = framed(tracks, scene, lifting, truth.labels == 1)
+    shown = framed(replace(tracks, static=truth.labels == 1), scene, lifting)
     assert float(distances(tracks, shown.cameras @ lifting.lifts, shown.structure).max()) < 1e-6
     speed = velocities(shown.structure, lifting.start, lifting.slope)
     assert float(speed[truth.labels == 1].abs().max()) < 1e-6

@@ -6,7 +6,7 @@ import torch
 from dyntorch import scenes
 from dyntorch.algebra.triangulation import reproject, triangulate
 from dyntorch.motions import MOTIONS
-from dyntorch.tasks.lifted_starts import can_rest, middle, resting, tilted
+from dyntorch.tasks.lifted_starts import middle, resting, resting_constants, tilted
 from dyntorch.tasks.reconstruct import normalized
 
 
@@ -33,11 +33,16 @@ def test_frames_are_collineations_of_the_first():
     assert not torch.allclose(frames[0], frames[1])
 
 
-def test_points_can_rest_where_some_constants_do_not_move_them():
+def test_constants_of_resting_points_do_not_move_them():
     times = torch.arange(4.0)
-    assert can_rest(MOTIONS["constant_velocity_3d"].lifts(times))
+    lifts = MOTIONS["constant_velocity_3d"].lifts(times)
+    still = resting_constants(lifts)
+    assert still.shape == (7, 4)
+    torch.testing.assert_close(still.mT @ still, torch.eye(4, dtype=torch.float64))
+    places = lifts @ still
+    torch.testing.assert_close(places, places[:1].expand_as(places))
     always = torch.stack([torch.eye(3, 4, dtype=torch.float64).roll(int(t), 1) for t in range(4)])
-    assert not can_rest(always)
+    assert resting_constants(always).shape == (4, 0)
 
 
 def test_middle_views_are_neighbours_in_time():

@@ -152,14 +152,7 @@ def circling(t: Tensor) -> Tensor:
     return torch.tensor([[1.0, 0, 0, c, -s], [0, 1, 0, s, c], [0, 0, 1, 0, 0]], dtype=F64)
 
 
-def thrown(t: Tensor) -> Tensor:
-    """Own velocities in space and a known acceleration common to all."""
-    lift = torch.cat([torch.eye(4, dtype=F64), float(t) * torch.eye(4, 3, dtype=F64)], dim=1)
-    lift[2, 3] = -0.1 * float(t) ** 2
-    return lift
-
-
-@pytest.mark.parametrize("lift", [falling, circling, thrown])
+@pytest.mark.parametrize("lift", [falling, circling])
 def test_custom_lifts(lift) -> None:
     times = [0.0, 1.0, 2.5, 3.0, 4.2]
     motion = Motion(lift, lift.__name__)

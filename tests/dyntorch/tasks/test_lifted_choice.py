@@ -1,0 +1,43 @@
+"""motion="auto": the model of a scene is found, and the runners-up are listed."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+import dyntorch as dyn
+from dyntorch import scenes
+from dyntorch.motions import MOTIONS
+from dyntorch.solution import Status
+from dyntorch.tasks.lifted_choice import LABEL, OUTLIER, Fit, least, penalized
+from dyntorch.tasks.reconstruct import normalized
+
+
+@pytest.mark.parametrize("name", ["static_3d", "constant_velocity_2d", "constant_direction_3d", "two_bodies_3d"])
+def test_the_model_of_the_scene(name: str) -> None:
+    scene = scenes.lifted(name, 80, views=4, sigma=0.5, generator=torch.Generator().manual_seed(7))
+    found = dyn.reconstruct(scene.tracks, "auto", threshold=math.inf)
+    assert found.motion.name == name and found.status == Status.OK
+    scores = [one.score for one in found.candidates]
+    assert scores == sorted(scores) and len(scores) >= 8
+    assert f"then {found.candidates[1].motion}" in repr(found)
+
+
+def test_formula() -> None:
+    scene = scenes.lifted("constant_velocity_2d", 10, views=3, generator=torch.Generator().manual_seed(0))
+    weights = torch.ones(1, 3, 10, dtype=torch.float64)
+    tracks = normalized(scene.tracks[None], weights, scene.times)
+    apart = torch.full((1, 3, 10), 0.5, dtype=torch.float64)
+    apart[0, :, 0] = 100.0
+    motion = MOTIONS["constant_velocity_2d"]
+    found = penalized(tracks, Fit(motion, apart, torch.tensor([False]), torch.ones(1)), torch.full((1,), 0.5, dtype=torch.float64))
+    # 3 cameras of 8, less the ambiguity of 8; every good point leaves 3 sigma^2, but no more than that of 6 - 4 coordinates
+    expected = 10 * min(3.0, OUTLIER * 2) - 3.0 + OUTLIER * 2 + 10 * 4 * math.log(6) + (24 - 8) * math.log(60)
+    assert abs(float(found) - expected) < 1e-9
+    assert math.log(2) > LABEL
+
+
+def test_fewest_tracks_of_two_bodies() -> None:
+    assert least(MOTIONS["two_bodies_3d"], torch.arange(5.0)) == (3, 14)
