@@ -7,11 +7,12 @@ at values is made on the CPU only: on an accelerator it would wait for everythin
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from itertools import combinations
 
 import torch
 from torch import Tensor
+
+from dyntorch.constants import constant
 
 EPS = torch.finfo(torch.float64).eps
 ANGLE = 1e-11  # that an accepted eigenspace may be off by, rounding of the Gram apart
@@ -85,12 +86,12 @@ def fix_signs(vectors: Tensor) -> Tensor:
     return torch.where(product < 0, -vectors, vectors)
 
 
-@lru_cache(maxsize=64)  # made on the device: a copy to it would wait
+@constant
 def _generic(size: int, count: int, device: torch.device) -> Tensor:
     """``(size, count)`` fixed directions without symmetry."""
-    with torch.inference_mode(False):
-        index = torch.arange(1, size * count + 1, dtype=torch.float64, device=device)
-        return (torch.frac(index * 0.6180339887498949) + 0.1 * torch.cos(index**2) - 0.5).reshape(count, size).T.contiguous()
+    index = torch.arange(1, size * count + 1, dtype=torch.float64)
+    values = torch.frac(index * 0.6180339887498949) + 0.1 * torch.cos(index**2) - 0.5
+    return values.reshape(count, size).T.contiguous().to(device)
 
 
 def by_inverse_iteration(gram: Tensor, dim: int) -> Eigenspace:

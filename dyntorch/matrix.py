@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from dyntorch.constants import constant
 from dyntorch.primitives import Primitive, triangle
 
 CHUNK = 1 << 18

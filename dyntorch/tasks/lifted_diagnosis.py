@@ -210,12 +210,17 @@ def least_squares(tracks: Tracks, motion: Motion) -> tuple[Tensor, Tensor]:
 def spare(tracks: Tracks, counted: Tensor, motion: Motion) -> Tensor:
     """Observed coordinates less all unknowns, ``(b,)``; two bodies with their hyperplanes."""
     views, size, wide = tracks.x.shape[1], motion.k + 1, motion.sensor + 1
-    cameras, point = views * (wide * size - 1) - (size * size - 1), motion.k
-    if motion.lift is None:
-        cameras, point = cameras + 2 * motion.k, motion.k - 1
-    else:
+    cameras = views * (wide * size - 1) - (size * size - 1) + 2 * motion.k
+    if motion.lift is not None:
         cameras = views * (wide * (motion.dim + 1) - 1) - motion.ambiguity(tracks.times)
-    return counted.flatten(1).sum(-1) * motion.sensor - counted.any(1).sum(-1) * point - cameras
+    points = torch.where(counted.any(1), unknowns(tracks, motion), 0).sum(-1)
+    return counted.flatten(1).sum(-1) * motion.sensor - points - cameras
+
+
+def unknowns(tracks: Tracks, motion: Motion) -> Tensor:
+    """Unknowns of every point, ``(b, n)``: those of the model, of a point known to stand still its position."""
+    free = torch.full_like(tracks.weights[:, 0], motion.k - (motion.bodies > 1), dtype=torch.long)
+    return free if tracks.static is None or motion.lift is None else torch.where(tracks.static, motion.dim, free)
 
 
 def _noise_of(tracks: Tracks, motion: Motion, asked: Tensor) -> Tensor:

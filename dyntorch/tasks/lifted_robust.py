@@ -24,17 +24,17 @@ ADJUSTED = 10
 """Steps of bundle adjustment after each choice of the observations."""
 
 
-def suspicious(tracks: Tracks, apart: Tensor, k: int, limit: float | None) -> Tensor:
+def suspicious(tracks: Tracks, apart: Tensor, unknowns: Tensor | int, limit: float | None) -> Tensor:
     """Which problems ``(b,)`` show outliers after least squares.
 
     Args:
         tracks: flat batch.
         apart: ``(b, views, n)`` reprojection distances, NaN = missing.
-        k: dimension of the space of the points.
+        unknowns: of every point, ``(b, n)`` or one number.
         limit: three standard deviations of the noise, None: judged by the residuals alone.
     """
     seen, square = apart.isfinite(), apart.square().nansum(1)
-    free = (seen.sum(1) * tracks.x.shape[-1] - k).clamp(min=0)
+    free = (seen.sum(1) * tracks.x.shape[-1] - unknowns).clamp(min=0)
     least = EXACT / tracks.scales.amin(1)
     sigma = noise(square, free, free >= 1) if limit is None else torch.full_like(least, limit / 3)
     sigma = torch.maximum(sigma, least)

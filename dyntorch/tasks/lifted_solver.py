@@ -13,7 +13,7 @@ from dyntorch.bundle_adjustment import bundle_adjust
 from dyntorch.motions import Motion
 from dyntorch.solution import Status, failed
 from dyntorch.tasks.lifted_bodies import bodies_of
-from dyntorch.tasks.lifted_diagnosis import diagnose
+from dyntorch.tasks.lifted_diagnosis import diagnose, spare, unknowns
 from dyntorch.tasks.lifted_projections import Projections, Tracks, projections_of_tracks
 from dyntorch.tasks.lifted_robust import robust_projections, suspicious
 from dyntorch.tasks.lifted_scene import Lifting, Scene, distances, framed, positions, scene_of, velocities
@@ -51,7 +51,7 @@ def solve(
     invariant = motion.tensor(min(views, motion.k + 1))
     found = projections_of_tracks(tracks, invariant)
     found, scene = _scene(tracks, found, lifting)
-    doubt = suspicious(tracks, _distances(tracks, scene, lifting), motion.k, limit) | failed(found.status)
+    doubt = suspicious(tracks, _distances(tracks, scene, lifting), unknowns(tracks, motion), limit) | failed(found.status)
     if limit != float("inf") and bool(doubt.any()):
         chosen = doubt.nonzero()[:, 0]
         some, fewer = robust_projections(tracks.subset(chosen), invariant, lifting, limit, generator)
@@ -111,7 +111,7 @@ def _result(
     counted = apart.isfinite()
     total = torch.where(counted, apart.square(), 0.0).flatten(1).sum(-1)
     number = counted.flatten(1).sum(-1)
-    sigma = (total / spare(tracks, counted, motion, lifting).clamp(min=1)).sqrt()
+    sigma = (total / spare(tracks, counted, motion).clamp(min=1)).sqrt()
     back = torch.linalg.inv(tracks.transforms)
     bad = failed(status)
     status, warnings = diagnose(tracks, scene, lifting, motion, status, sigma, batch)
@@ -142,24 +142,12 @@ def _result(
     )
 
 
-def spare(tracks: Tracks, counted: Tensor, motion: Motion, lifting: Lifting | None) -> Tensor:
-    """Observed coordinates less all unknowns, ``(b,)``."""
-    seen = counted.any(1).sum(-1)
-    views, size = tracks.x.shape[1], motion.k + 1
-    wide = motion.sensor + 1
-    if lifting is None:
-        cameras = views * (wide * size - 1) - (size * size - 1)
-    else:
-        cameras = views * (wide * lifting.lifts.shape[1] - 1) - (len(lifting.algebra) - 1)
-    return counted.flatten(1).sum(-1) * motion.sensor - seen * motion.k - cameras
-
-
 def _rests(tracks: Tracks, scene: Scene, lifting: Lifting, projections: Tensor) -> Tensor:
     """Which points ``(b, n)`` are explained as well, within the noise, by one position for all times."""
     still = lifting.still
     moving = _cost(tracks, projections, scene.structure)
     resting = _cost(tracks, projections @ still, triangulate(projections @ still, tracks.x, tracks.weights, steps=2))
-    free = spare(tracks, distances(tracks, projections, scene.structure).isfinite(), lifting.motion, lifting).clamp(min=1)
+    free = spare(tracks, distances(tracks, projections, scene.structure).isfinite(), lifting.motion).clamp(min=1)
     # rounding is noise as well
     extent = (1 / tracks.scales.amin(-1, keepdim=True)).square()
     sigma = moving.sum(-1, keepdim=True) / free[:, None] + EXACT * extent

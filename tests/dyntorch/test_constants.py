@@ -1,0 +1,102 @@
+"""Cached tables serve every later call, wherever the first one came from."""
+
+import ast
+from pathlib import Path
+
+import pytest
+import torch
+
+from dyntorch import eigenspace, matrix
+from dyntorch.algebra import extensors, exterior, grassmann, grassmann_nearest, grassmann_recovery
+from dyntorch.constants import constant
+from dyntorch.primitives import base, plane
+
+CPU = torch.device("cpu")
+TABLES = [
+    (extensors._levi_civita, (3, torch.float64, CPU)),
+    (extensors._laplace, (4, 2, CPU)),
+    (extensors._dual_signs, (4, 2, CPU)),
+    (exterior._splits, (4, 2, 1, CPU)),
+    (grassmann._removals, (4, 2, CPU)),
+    (grassmann._insertions, (4, 2, CPU)),
+    (grassmann_nearest._chosen, ((2, 1, 1), (3, 3, 3), CPU)),
+    (grassmann_recovery.tables, ((2, 1, 1), (3, 3, 3), 2, CPU)),
+    (plane._moving_minors, (3, 2, CPU)),
+    (base.triangle, (4, CPU)),
+    (matrix._unpacking, ((3, 3), CPU)),
+    (eigenspace._generic, (5, 2, CPU)),
+]
+"""All of them: the last test says so."""
+
+
+def tensors(table):
+    if isinstance(table, torch.Tensor):
+        return [table]
+    return [t for part in (table if isinstance(table, tuple) else vars(table).values()) for t in tensors_of(part)]
+
+
+def tensors_of(part):
+    return tensors(part) if isinstance(part, torch.Tensor | tuple) else []
+
+
+def within_grad(function):
+    torch.func.grad(lambda x: (function(), x)[1])(torch.ones(()))
+
+
+def within_vmap(function):
+    torch.func.vmap(lambda x: (function(), x)[1])(torch.ones(2))
+
+
+def within_jvp(function):
+    torch.func.vmap(lambda t: torch.func.jvp(lambda x: (function(), x)[1], (torch.ones(()),), (t,)))(torch.ones(2))
+
+
+def within_inference(function):
+    with torch.inference_mode():
+        function()
+
+
+def on_another_device(function):
+    with torch.device("meta"):
+        function()
+
+
+@pytest.mark.parametrize("around", [within_grad, within_vmap, within_jvp, within_inference, on_another_device])
+@pytest.mark.parametrize(("table", "sizes"), TABLES, ids=[table.__name__ for table, _ in TABLES])
+def test_what_surrounds_the_first_call_leaves_no_trace(table, sizes, around):
+    for other, _ in TABLES:  # some are made from others
+        other.cache_clear()
+    around(lambda: table(*sizes))
+    assert table.cache_info().currsize == 1
+    found = tensors(table(*sizes))
+    table.cache_clear()
+    expected = tensors(table(*sizes))
+    assert len(found) == len(expected) > 0
+    for tensor, again in zip(found, expected, strict=True):
+        assert not torch._C._functorch.is_functorch_wrapped_tensor(tensor)
+        assert not tensor.is_inference() and not tensor.requires_grad
+        assert tensor.device == CPU
+        assert tensor.equal(again)
+
+
+def test_a_mistake_is_the_callers():
+    @constant
+    def table(n):
+        raise ValueError(f"no table of {n}")
+
+    with pytest.raises(ValueError, match="no table of 3"):
+        table(3)
+
+
+def test_no_other_function_caches_tensors():
+    listed = {table.__name__ for table, _ in TABLES}
+    decorated, cached = set(), set()
+    for path in sorted(Path(extensors.__file__).parents[1].rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.FunctionDef):
+                names = {ast.unparse(d).split("(")[0] for d in node.decorator_list}
+                decorated |= {node.name} if "constant" in names else set()
+                # what comes from a cache of the standard library must not be a tensor
+                cached |= {node.name} if names & {"lru_cache", "cache"} and "Tensor" in ast.unparse(node.returns) else set()
+    assert decorated == listed
+    assert cached == set()
