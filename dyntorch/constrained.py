@@ -64,6 +64,8 @@ def constrain(solution: Solution, *, iterations: int = ITERATIONS) -> Solution:
     Raises:
         ValueError: an invariant of nullity above one or with copies, whose tensors do not stand alone.
 
+    Source: Hartley and Zisserman, sections 11.3 and 16.3 (algebraic minimization), for the motion of any invariant.
+
     Example:
         >>> import torch, dyntorch as dyn
         >>> draw = torch.Generator().manual_seed(0)

@@ -36,6 +36,8 @@ class Motion:
         leaves_open: the ambiguity that remains, in words.
         bodies: 2 for two bodies in relative translation at arbitrary steps, which need no lift (``k`` instead).
         k: dimension of the space of the constants, where there is no lift.
+        static: whether the points do not move at all.
+        shift: :math:`R(c)` with :math:`B(t + c) = B(t)\,R(c)`, where there is one: then times far from 0 lose no digits.
 
     Raises:
         ValueError: a lift that does not return a matrix with more columns than rows, or neither lift nor k.
@@ -60,9 +62,7 @@ class Motion:
     bodies: int = 1
     k: int = 0
     static: bool = False
-    """Whether the points do not move at all."""
     shift: Callable[[float], Tensor] | None = None
-    r"""R(c) with :math:`B(t + c) = B(t)\,R(c)`, where there is one: then times far from 0 (those of a clock) lose no digits."""
 
     def __post_init__(self) -> None:
         if self.lift is None and self.k < 2:
@@ -130,7 +130,7 @@ class Motion:
         return views, self.tensor(min(views, self.k + 1)).minimal()
 
     def ambiguity(self, times: Tensor | Sequence[float]) -> int:
-        """Dimension of the ambiguity of a reconstruction from views at these times."""
+        """Dimension of the ambiguity from views at these times; without a lift that of the projections, all collineations."""
         return (self.k + 1) ** 2 - 1 if self.lift is None else len(gauge_algebra(self.centred(times)[0])) - 1
 
     def _at(self, time: float) -> Tensor:
@@ -165,6 +165,11 @@ def polynomial(dim: int, directions: int, degree: int = 1) -> Lift:
 def polynomial_shift(dim: int, directions: int, degree: int = 1) -> Callable[[float], Tensor]:
     """The shift of :func:`polynomial`: the coefficients of a polynomial of t + c.
 
+    Args:
+        dim: of the world.
+        directions: number of coordinates that change.
+        degree: of the polynomials.
+
     Example:
         >>> import torch
         >>> lift, shift = polynomial(2, 2, 2), polynomial_shift(2, 2, 2)
@@ -194,6 +199,7 @@ def _polynomial(name: str, leaves_open: str, dim: int, directions: int, degree: 
 
 
 _PARTLY = "a collineation of the world that keeps the direction{} of motion, and a velocity, linear in the position, added to all"
+_BODIES = "an affinity of each body, with a linear part common to both"
 MOTIONS: dict[str, Motion] = {
     motion.name: motion
     for motion in (
@@ -206,8 +212,9 @@ MOTIONS: dict[str, Motion] = {
         _polynomial("constant_velocity_planes_3d", _PARTLY.format("s"), 3, 2),
         _polynomial("constant_velocity_3d", AFFINE, 3, 3),
         _polynomial("constant_velocity_3d_sensors", AFFINE, 3, 3, sensor=3),
-        Motion(None, "two_bodies_2d", bodies=2, k=3, leaves_open="an affinity of each body, with a linear part common to both"),
-        Motion(None, "two_bodies_3d", bodies=2, k=4, leaves_open="an affinity of each body, with a linear part common to both"),
+        Motion(None, "two_bodies_2d", bodies=2, k=3, leaves_open=_BODIES),
+        # in a plane the centres of the cameras, where both bodies would meet, show how large one is against the other
+        Motion(None, "two_bodies_3d", bodies=2, k=4, leaves_open=f"{_BODIES}, and the size of one body against the other"),
     )
 }
 """The declared models.  ``constant_direction``: all points move along one common, unknown direction; ``planes``: within parallel

@@ -143,19 +143,23 @@ def dual(extensor: Tensor, size: int, step: int) -> Tensor:
         ``(*batch, binomial(size, size - step))``.
 
     Raises:
-        ValueError: the length is not the binomial coefficient.
+        ValueError: a step outside 0 to ``size``, or the length is not the binomial coefficient.
 
     Example:
         >>> import torch
         >>> dual(torch.tensor([1.0, 2.0, 3.0]), 3, 2).tolist()
         [3.0, -2.0, 1.0]
     """
-    if extensor.shape[-1] != comb(size, step):
-        raise ValueError(
-            f"an extensor of step {step} among {size} coordinates has {comb(size, step)} entries, got {extensor.shape[-1]}"
-        )
+    check_extensor(extensor, size, step)
     # lexicographic order reverses under taking complements
     return (extensor * _dual_signs(size, step, extensor.device).to(extensor.dtype)).flip(-1)
+
+
+def check_extensor(extensor: Tensor, size: int, step: int) -> None:
+    """Raise a ``ValueError`` for an extensor whose length is not the binomial coefficient."""
+    if not 0 <= step <= size or extensor.shape[-1] != comb(size, step):
+        entries = comb(size, step) if 0 <= step <= size else "no"
+        raise ValueError(f"an extensor of step {step} among {size} coordinates has {entries} entries, got {extensor.shape[-1]}")
 
 
 @constant

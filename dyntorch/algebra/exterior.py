@@ -6,12 +6,11 @@ The Hodge star is :func:`dyntorch.algebra.extensors.dual`.
 from __future__ import annotations
 
 from itertools import combinations
-from math import comb
 
 import torch
 from torch import Tensor
 
-from dyntorch.algebra.extensors import dual, join
+from dyntorch.algebra.extensors import check_extensor, dual, join
 from dyntorch.constants import constant
 from dyntorch.nullspace import null_space
 
@@ -141,13 +140,6 @@ def subspace_of(extensor: Tensor, size: int, step: int) -> Tensor:
     if step == size:
         return eye.expand(*extensor.shape[:-1], size, size)
     return null_space(wedge(extensor[..., None, :], eye, size, (step, 1)).mT, step)
-
-
-def check_extensor(extensor: Tensor, size: int, step: int) -> None:
-    """Raise a ``ValueError`` for an extensor whose length is not the binomial coefficient."""
-    if not 0 <= step <= size or extensor.shape[-1] != comb(size, step):
-        entries = comb(size, step) if 0 <= step <= size else "no"
-        raise ValueError(f"an extensor of step {step} among {size} coordinates has {entries} entries, got {extensor.shape[-1]}")
 
 
 @constant

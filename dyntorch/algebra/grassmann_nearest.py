@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from dyntorch.algebra.grassmann import grassmann_derivative, grassmann_tensor
-from dyntorch.algebra.grassmann_recovery import balanced, candidates, check, direction, rotated, tables, unit
+from dyntorch.algebra.grassmann_recovery import balanced, candidates, check, rotated, tables, unit
+from dyntorch.algebra.homogeneous import unit_vectors
 from dyntorch.blocks import map_blocks
 from dyntorch.constants import constant
 
@@ -114,7 +115,7 @@ class _Nearest:
     def starts(self, target: Tensor) -> list[Tensor]:
         """The nearest candidates, ``(b, p)`` each."""
         found = candidates(target.unflatten(-1, self.shape), self.profile, self.sizes)
-        cosine = (direction(grassmann_tensor(found, self.profile).flatten(2)) * target).sum(-1)
+        cosine = (unit_vectors(grassmann_tensor(found, self.profile).flatten(2)) * target).sum(-1)
         order = (1 - cosine.square()).clamp(min=EQUAL).argsort(stable=True, dim=0)[:STARTS]
         every = torch.arange(len(target), device=target.device)
         return [self.joined([part[best, every] for part in found]) for best in order]
@@ -142,12 +143,13 @@ class _Nearest:
         eye = torch.eye(self.width, dtype=theta.dtype, device=theta.device)
         rows = stack @ stack.mT
         gram = torch.einsum("bij,cd->bicjd", rows, eye).flatten(3).flatten(1, 2)
+        every = torch.eye(stack.shape[-2], dtype=theta.dtype, device=theta.device)
         for view in _views(self.sizes, self.width):
             scale = theta[:, view]
             gram[:, view, view] += scale[..., None] * scale[:, None]
         for alpha, part in zip(self.profile, self.parts(theta), strict=True):
             if alpha == part.shape[-2]:
-                gram += torch.einsum("ij,bcd->bicjd", torch.eye(stack.shape[-2]).to(gram), part.mT @ part).flatten(3).flatten(1, 2)
+                gram += torch.einsum("ij,bcd->bicjd", every, part.mT @ part).flatten(3).flatten(1, 2)
         return gram
 
     def nearest(self, theta: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
@@ -227,7 +229,7 @@ class _Nearest:
         return second
 
     def cost(self, theta: Tensor, target: Tensor) -> Tensor:
-        u = direction(grassmann_tensor(self.parts(theta), self.profile).flatten(1))
+        u = unit_vectors(grassmann_tensor(self.parts(theta), self.profile).flatten(1))
         return 0.5 * (u - target).square().sum(-1)
 
 

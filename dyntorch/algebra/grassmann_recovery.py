@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.algebra.extensors import compound
+from dyntorch.algebra.homogeneous import unit_vectors
 from dyntorch.constants import constant
 
 POWER_STEPS = 3
@@ -82,12 +83,6 @@ def unit(tensor: Tensor) -> tuple[Tensor, Tensor]:
     sound = largest.isfinite() & (largest > 0)  # NaN is the largest
     flat = torch.where(sound, flat, torch.ones_like(flat)) / torch.where(sound, largest, torch.ones_like(largest))
     return (flat / flat.norm(dim=-1, keepdim=True)).view(tensor.shape), sound[:, 0]
-
-
-def direction(vector: Tensor) -> Tensor:
-    """Unit vectors; zero stays."""
-    length = vector.norm(dim=-1, keepdim=True)
-    return vector / torch.where(length > 0, length, 1.0)
 
 
 def balanced(parts: Sequence[Tensor]) -> list[Tensor]:
@@ -210,13 +205,13 @@ def _rank_one(matrix: Tensor) -> tuple[Tensor, Tensor]:
     if 0 in matrix.shape[1:]:
         return matrix.new_zeros(matrix.shape[:2]), matrix.new_zeros(len(matrix), matrix.shape[2])
     longest = matrix.square().sum(-1).argmax(-1)[:, None, None].expand(-1, 1, matrix.shape[2])
-    right = direction(matrix.gather(1, longest)[:, 0])
+    right = unit_vectors(matrix.gather(1, longest)[:, 0])
     for _ in range(POWER_STEPS):
         left = (matrix * right[:, None]).sum(-1)
-        right = direction((matrix * left[..., None]).sum(1))
+        right = unit_vectors((matrix * left[..., None]).sum(1))
     left = (matrix * right[:, None]).sum(-1)
     root = left.norm(dim=-1, keepdim=True).sqrt()
-    return direction(left) * root, right * root
+    return unit_vectors(left) * root, right * root
 
 
 def _scale(minors: Tensor, block: dict[tuple[int, int], Tensor], i: int, q: int) -> Tensor:
@@ -255,4 +250,4 @@ def _axes(block: Tensor, row: int, column: int) -> Tensor:
 
 def _normalized(parts: Sequence[Tensor]) -> list[Tensor]:
     """Matrices of Frobenius norm 1; zero stays, and so does what is not finite."""
-    return [direction(part.nan_to_num(0.0, 0.0, 0.0).flatten(-2)).view(part.shape) for part in parts]
+    return [unit_vectors(part.nan_to_num(0.0, 0.0, 0.0).flatten(-2)).view(part.shape) for part in parts]

@@ -1,4 +1,4 @@
-"""Homogeneous coordinates, to and from them without NaN; collineations, their canonical scale and sign; hyperplanes of a point."""
+"""Homogeneous coordinates, to and from them without NaN; canonical scales and signs; hyperplanes of a point."""
 
 from __future__ import annotations
 
@@ -121,7 +121,30 @@ def _sign(matrix: Tensor) -> Tensor:
         # Hadamard's bounds, by rows and by columns, are the size that the rounding error of the determinant is relative to
         bound = torch.minimum(matrix.norm(dim=-1).prod(dim=-1), matrix.norm(dim=-2).prod(dim=-1))[..., None]
         leading = torch.where(det.abs() > 10 * torch.finfo(matrix.dtype).eps * bound, det, leading)
-    return torch.where(leading < 0, -1.0, 1.0).to(matrix.dtype)[..., None]
+    return nonzero_sign(leading)[..., None]
+
+
+def unit_vectors(vectors: Tensor) -> Tensor:
+    """Vectors ``(..., d)`` at norm 1 with the sign that they have; the zero vector stays, with finite gradients.
+
+    Example:
+        >>> import torch
+        >>> unit_vectors(torch.tensor([[0.0, -2.0], [0.0, 0.0]])).tolist()
+        [[0.0, -1.0], [0.0, 0.0]]
+    """
+    length = vectors.norm(dim=-1, keepdim=True)
+    return vectors / torch.where(length > 0, length, 1.0)
+
+
+def nonzero_sign(values: Tensor) -> Tensor:
+    """-1 where values are negative, 1 elsewhere: a factor that may turn a vector, but never removes it.
+
+    Example:
+        >>> import torch
+        >>> nonzero_sign(torch.tensor([-2.0, 0.0, 3.0])).tolist()
+        [-1.0, 1.0, 1.0]
+    """
+    return torch.where(values < 0, -1.0, 1.0).to(values.dtype)
 
 
 def skew(v: Tensor) -> Tensor:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from dyntorch.algebra.homogeneous import unit_vectors
 from dyntorch.nullspace import gram_null_space
 
 REWEIGHTINGS, CANDIDATES = 3, 4
@@ -83,7 +84,7 @@ def hyperplane_pair(structure: Tensor, weights: Tensor | None = None, *, informa
     distances = _distances(unit, covariance, planes)
     labels = torch.where(weights > 0, 1 + distances.detach().argmin(dim=-2), 0)
     same = 1 - (planes[..., 0, :] * planes[..., 1, :]).sum(-1).square() < RIDGE
-    hyperplanes = _normalized(planes @ frame)  # z = frame Y
+    hyperplanes = unit_vectors(planes @ frame)  # z = frame Y
     dtype = structure.dtype
     return HyperplanePair(hyperplanes.to(dtype), labels, distances.to(dtype), lost.any(-1) | same | several)
 
@@ -113,7 +114,7 @@ def _checked(structure: Tensor, weights: Tensor | None, information: Tensor | No
 
 def _whitened(points: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Unit vectors z_n = scale_n frame Y_n, whose second moment is about the same in all directions; frame; scale."""
-    unit = _normalized(points)
+    unit = unit_vectors(points)
     moment = (unit * weights[..., None]).mT @ unit
     size = points.shape[-1]
     eye = torch.eye(size, dtype=points.dtype, device=points.device)
@@ -185,7 +186,7 @@ def _split(quadric: Tensor) -> Tensor:
     floor = 1e-3 * torch.maximum(plus.norm(dim=-1), minus.norm(dim=-1))[..., None]
     plus = torch.where(plus.norm(dim=-1, keepdim=True) < floor, vectors[..., -1] * floor, plus)
     minus = torch.where(minus.norm(dim=-1, keepdim=True) < floor, vectors[..., 0] * floor, minus)
-    return _normalized(torch.stack([plus + minus, plus - minus], dim=-2))
+    return unit_vectors(torch.stack([plus + minus, plus - minus], dim=-2))
 
 
 def _turn(unit: Tensor, weights: Tensor, covariance: Tensor | None, planes: Tensor) -> tuple[Tensor, Tensor]:
@@ -230,8 +231,3 @@ def _larger_first(planes: Tensor, unit: Tensor, weights: Tensor, covariance: Ten
 def _mean(values: Tensor, weights: Tensor) -> Tensor:
     total = weights.sum(-1)
     return (values * weights).sum(-1) / torch.where(total > 0, total, 1.0)
-
-
-def _normalized(vectors: Tensor) -> Tensor:
-    norm = vectors.norm(dim=-1, keepdim=True)
-    return vectors / torch.where(norm > 0, norm, 1.0)

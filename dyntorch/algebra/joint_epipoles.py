@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import one_hot
 
 from dyntorch.algebra.extensors import compound, dual, meet
-from dyntorch.algebra.homogeneous import unit
+from dyntorch.algebra.homogeneous import unit, unit_vectors
 from dyntorch.algebra.rank_two import cofactors, null_vectors
 
 FLAT = 1e-12
@@ -143,7 +143,8 @@ def joint_epipoles_of_tensor(tensor: Tensor) -> JointEpipoles:
     finite = tensor.isfinite().flatten(-3).all(-1)[..., None, None, None]
     slices = torch.where(finite, tensor.double(), 0.0).movedim(-1, -3)
     slices = dual(dual(slices, 3, 2).mT, 3, 2).mT  # (*batch, k, i, j)
-    slices = slices / _safe(torch.linalg.vector_norm(slices.detach(), dim=(-3, -2, -1), keepdim=True))
+    size = torch.linalg.vector_norm(slices.detach(), dim=(-3, -2, -1), keepdim=True)
+    slices = slices / torch.where(size > 0, size, 1.0)
     left, right = null_vectors(slices)
     of_first, of_second = null_vectors(left)[1], null_vectors(right)[1]
     first = _third_line(slices.movedim(-3, -1), of_first)
@@ -184,8 +185,7 @@ def _third_line(slices: Tensor, line: Tensor) -> Tensor:
 def _across(line: Tensor) -> Tensor:
     """Two unit vectors orthogonal to a unit vector and to each other."""
     least = one_hot(line.abs().argmin(dim=-1), 3).to(line)
-    first = torch.linalg.cross(line, least)
-    first = first / _safe(torch.linalg.vector_norm(first, dim=-1, keepdim=True))
+    first = unit_vectors(torch.linalg.cross(line, least))
     return torch.stack([first, torch.linalg.cross(line, first)], dim=-2)
 
 
@@ -197,7 +197,7 @@ def _image_in_third(slices: Tensor, first: Tensor, second: Tensor) -> Tensor:
 
 def _meeting(lines: Tensor, coordinates: Tensor, dtype: torch.dtype) -> JointEpipoles:
     """Intersections of both lines ``(*batch, 3, 2, 3)`` of every view, in image coordinates that ``coordinates`` leads back to."""
-    lines = lines / _safe(torch.linalg.vector_norm(lines, dim=-1, keepdim=True))
+    lines = unit_vectors(lines)
     crossing = torch.linalg.cross(lines[..., 0, :], lines[..., 1, :])
     sine = torch.linalg.vector_norm(crossing, dim=-1)
     points = torch.where((sine > FLAT)[..., None], (coordinates @ crossing[..., None])[..., 0], 0.0)
@@ -208,7 +208,3 @@ def _meeting(lines: Tensor, coordinates: Tensor, dtype: torch.dtype) -> JointEpi
 def _oriented(vectors: Tensor) -> Tensor:
     """Unit vectors whose largest entry is positive."""
     return unit(vectors[..., None])[..., 0]
-
-
-def _safe(size: Tensor) -> Tensor:
-    return torch.where(size > 0, size, 1.0)

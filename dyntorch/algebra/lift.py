@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dyntorch.nullspace import null_space
 
-DRAWS = 64
+DRAWS = 16
 """Random members of the solution space among which the best conditioned one is taken."""
 ZERO = 1e-8
 """Relative size of a singular value of matrices made of lifts alone that counts as 0: the known motions give below 1e-11 or above
@@ -90,7 +90,7 @@ def upgrade(projections: Tensor, lifts: Tensor) -> tuple[Tensor, Tensor]:
         cameras :math:`P_i = M_i T B_i^+`, ``(*batch, views, m, a + 1)``.
 
     Raises:
-        ValueError: too few views for a unique solution; see :func:`solutions`.
+        ValueError: too few views for a unique solution; see :func:`least_views`.
 
     Source: thesis section 3.
 

@@ -9,6 +9,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from dyntorch.algebra.homogeneous import nonzero_sign
+
 TOLERANCE = 1e-8
 """Of a matrix made of lifts alone, relative: below it a change of the world belongs to the ambiguity."""
 DRAWS = 16
@@ -55,7 +57,7 @@ def finite(cameras: Tensor, structure: Tensor, lifts: Tensor, algebra: Tensor, w
     rank = int((values > TOLERANCE * values[0]).sum())
     if bool(((last - last[0]).norm(dim=-1) > TOLERANCE * last.norm()).any()) or rank == 1:
         # the homogeneous coordinate changes with time, or is what it is up to its sign
-        sign = _majority((structure @ last[0]).sign().sum(-1))
+        sign = nonzero_sign((structure @ last[0]).sign().sum(-1))
         return G, cameras * sign[..., None, None, None], structure * sign[..., None, None]
     functional = _nearly_constant(structure, vh[:rank]) @ vh[:rank]
     return _member(functional, rows, algebra, structure), cameras, structure
@@ -104,17 +106,13 @@ def _before(cameras: Tensor, structure: Tensor, lifts: Tensor, weights: Tensor) 
     depth = (structure[..., None, :, :] @ (cameras @ lifts)[..., -1, :, None])[..., 0] * (weights > 0)
     # the signs are those of a matrix of rank one where all depths can be positive: its leading singular vectors
     sign = depth.sign().nan_to_num()
-    view = _majority(torch.linalg.eigh(sign @ sign.mT).eigenvectors[..., -1])
-    point = _majority((view[..., None] * sign).sum(-2))
+    view = nonzero_sign(torch.linalg.eigh(sign @ sign.mT).eigenvectors[..., -1])
+    point = nonzero_sign((view[..., None] * sign).sum(-2))
     cameras = cameras * view[..., None, None]
     mean = (depth * view[..., None]).sum(-2) / (weights > 0).sum(-2).clamp(min=1)
     size = structure.norm(dim=-1)
     scale = torch.where(size > 0, mean.abs().maximum(1e-12 * size), 1.0)
     return cameras, structure * (point / scale)[..., None]
-
-
-def _majority(total: Tensor) -> Tensor:
-    return torch.where(total < 0, -1.0, 1.0).to(total.dtype)
 
 
 def steady(structure: Tensor, lifts: Tensor, start: Tensor, algebra: Tensor, weights: Tensor) -> Tensor:

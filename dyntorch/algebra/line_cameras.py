@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dyntorch.algebra.extensors import compound, dual
+from dyntorch.algebra.extensors import compound, dual, join
 from dyntorch.algebra.homogeneous import unit
 from dyntorch.algebra.klein_quadric import klein_frame
-from dyntorch.algebra.line_collineation import common_point, wedge
+from dyntorch.algebra.line_collineation import common_point
 
 PAIRS = ((0, 1), (0, 2), (1, 2))  # rows of the second compound of a camera
 
@@ -72,7 +72,7 @@ def camera_of_lines(matrix: Tensor) -> Tensor:
     shared = torch.tensor([[p for p, pair in enumerate(PAIRS) if i in pair] for i in range(3)], device=matrix.device)
     rows = common_point(lines[..., shared, :])
     pairs = torch.tensor(PAIRS, device=matrix.device)
-    joined = wedge(rows[..., pairs[:, 0], :], rows[..., pairs[:, 1], :])
+    joined = join(rows[..., pairs[:, 0], :], rows[..., pairs[:, 1], :])
     square = joined.square().sum(-1)
     ratio = (joined * lines).sum(-1) / torch.where(square > 0, square, 1.0)
     scale = ratio[..., shared].prod(-1)

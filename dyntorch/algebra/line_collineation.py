@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dyntorch.algebra.extensors import plucker_form
+from dyntorch.algebra.extensors import join, plucker_form
 from dyntorch.algebra.homogeneous import unit
 from dyntorch.nullspace import null_space
 
@@ -47,7 +47,7 @@ def compound_root(matrix: Tensor) -> Tensor:
     shared = [[p for p, pair in enumerate(PAIRS) if i in pair] for i in range(4)]
     rows = common_point(lines[..., torch.tensor(shared, device=lines.device), :])
     pairs = torch.tensor(PAIRS, device=lines.device)
-    joined = wedge(rows[..., pairs[:, 0], :], rows[..., pairs[:, 1], :])
+    joined = join(rows[..., pairs[:, 0], :], rows[..., pairs[:, 1], :])
     square = joined.square().sum(-1)
     ratio = (joined * lines).sum(-1) / torch.where(square > 0, square, torch.ones_like(square))
     return torch.where(good, unit(_scales(ratio)[..., None] * rows), torch.zeros_like(rows)).to(matrix.dtype)
@@ -65,11 +65,6 @@ def skew_line(lines: Tensor) -> Tensor:
     o = torch.zeros_like(p01)
     entries = (o, p01, p02, p03, -p01, o, p12, p13, -p02, -p12, o, p23, -p03, -p13, -p23, o)
     return torch.stack(entries, dim=-1).unflatten(-1, (4, 4))
-
-
-def wedge(p: Tensor, q: Tensor) -> Tensor:
-    """Pluecker coordinates of the line through two homogeneous points."""
-    return torch.stack([p[..., i] * q[..., j] - p[..., j] * q[..., i] for i, j in PAIRS], dim=-1)
 
 
 def _scales(ratio: Tensor) -> Tensor:

@@ -96,8 +96,8 @@ def _check(tracks: Tensor, rank: int, weights: Tensor | None) -> int:
     if tracks.ndim < 3 or not tracks.is_floating_point():
         raise ValueError(f"tracks must be floating point (*batch, views, n, l), got {tuple(tracks.shape)} {tracks.dtype}")
     views, n, size = tracks.shape[-3:]
-    if weights is not None and weights.shape[-2:] != (views, n):
-        raise ValueError(f"weights must be (*batch, views, n) = (*batch, {views}, {n}), got {tuple(weights.shape)}")
+    if weights is not None and weights.shape != tracks.shape[:-1]:
+        raise ValueError(f"weights must be (*batch, views, n) = {tuple(tracks.shape[:-1])}, got {tuple(weights.shape)}")
     if rank <= size + 1:
         raise ValueError(f"rank must exceed l + 1 = {size + 1}, or one view decides everything; got {rank}")
     # every point has rank - 1 unknowns, and must leave equations for the projections

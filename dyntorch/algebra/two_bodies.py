@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.algebra.extensors import meet
-from dyntorch.algebra.homogeneous import inhomogeneous
+from dyntorch.algebra.homogeneous import inhomogeneous, nonzero_sign, unit_vectors
 from dyntorch.nullspace import gram_null_space, null_space
 
 PARALLEL = 1e-12
@@ -120,17 +120,17 @@ def _check(projections: Tensor, structure: Tensor, hyperplanes: Tensor, labels: 
 
 def _positive_depths(views: Tensor, points: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
     """Projections and unit points with the signs for which the last coordinate of M_i Y_n is positive."""
-    points = _normalized(points)
+    points = unit_vectors(points)
     depth = (views[..., -1, :] @ points.mT).detach().sign() * known[..., None, :]
-    of_view = _sign((depth * depth[..., :1, :]).sum(-1))
-    of_point = _sign((depth * of_view[..., None]).sum(-2))
+    of_view = nonzero_sign((depth * depth[..., :1, :]).sum(-1))
+    of_point = nonzero_sign((depth * of_view[..., None]).sum(-2))
     return views * of_view[..., None, None], points * of_point[..., None]
 
 
 def _oriented(pair: Tensor, points: Tensor, bodies: Tensor) -> tuple[Tensor, Tensor]:
     """Unit hyperplanes, each positive on the points of the other body, and whether they are two."""
-    pair = _normalized(pair)
-    sign = _sign(((pair @ points.mT).detach() * bodies.flip(-2)).sum(-1))
+    pair = unit_vectors(pair)
+    sign = nonzero_sign(((pair @ points.mT).detach() * bodies.flip(-2)).sum(-1))
     cosine = (pair[..., 0, :] * pair[..., 1, :]).sum(-1)
     nonzero = (pair != 0).any(-1).all(-1)
     return pair * sign[..., None], nonzero & (1 - cosine.square() > PARALLEL)
@@ -138,8 +138,8 @@ def _oriented(pair: Tensor, points: Tensor, bodies: Tensor) -> tuple[Tensor, Ten
 
 def _ratio(views: Tensor, pair: Tensor) -> Tensor:
     """Scales ``(*batch, 2)`` of the hyperplanes for which h_1 + h_2 vanishes at the centre of every view."""
-    at_centres = meet(*_normalized(views).unbind(-2)) @ pair.mT
-    rows = _normalized(at_centres)
+    at_centres = meet(*unit_vectors(views).unbind(-2)) @ pair.mT
+    rows = unit_vectors(at_centres)
     # a positive pair: the signs are those of the depths
     scales = gram_null_space(rows.mT @ rows).basis[..., 0, :].abs()
     return torch.where((scales > 0).all(-1, keepdim=True), scales, 1.0)
@@ -160,12 +160,3 @@ def _gauge(points: Tensor, frame: Tensor, pair: Tensor, bodies: Tensor, *, toget
         size = radius.nanmedian(dim=-1).values
     size = torch.where(size > 0, size, 1.0)
     return centre[..., 0, :] / size[..., None], size
-
-
-def _sign(values: Tensor) -> Tensor:
-    return torch.where(values < 0, -1.0, 1.0).to(values.dtype)
-
-
-def _normalized(vectors: Tensor) -> Tensor:
-    norm = vectors.norm(dim=-1, keepdim=True)
-    return vectors / torch.where(norm > 0, norm, 1.0)

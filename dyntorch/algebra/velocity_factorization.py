@@ -106,8 +106,8 @@ def _check(tracks: Tensor, times: Tensor, dim: int, weights: Tensor | None) -> N
     if dim not in (2, 3):
         raise ValueError(f"dim must be 3, space, or 2, a plane, got {dim}")
     views, n = tracks.shape[-3:-1]
-    if weights is not None and weights.shape[-2:] != (views, n):
-        raise ValueError(f"weights must be (*batch, views, n) = (*batch, {views}, {n}), got {tuple(weights.shape)}")
+    if weights is not None and weights.shape != tracks.shape[:-1]:
+        raise ValueError(f"weights must be (*batch, views, n) = {tuple(tracks.shape[:-1])}, got {tuple(weights.shape)}")
     least = 5 if dim == 3 else 3
     if views < least:
         raise ValueError(f"constant velocity in {dim} dimensions needs at least {least} affine views, got {views}: add views")

@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from dyntorch.algebra.extensors import compound, plucker_form
+from dyntorch.algebra.extensors import compound, join, plucker_form
 from dyntorch.algebra.homogeneous import hyperplanes_through, inhomogeneous
-from dyntorch.algebra.line_collineation import common_point, compound_root, skew_line, wedge
+from dyntorch.algebra.line_collineation import common_point, compound_root, skew_line
 from dyntorch.algebra.projection import project
 from dyntorch.invariant import Frame, Invariant
 from dyntorch.nullspace import null_space
@@ -255,7 +255,7 @@ def _across(direction: Tensor) -> Tensor:
 def _star(points: Tensor) -> Tensor:
     """Three independent unit lines ``(..., 3, 6)`` through each point ``(..., 3)``."""
     p = torch.cat([points, torch.ones_like(points[..., :1])], dim=-1)[..., None, :]
-    return wedge(normalize(p, dim=-1).expand(*points.shape[:-1], 3, 4), hyperplanes_through(points))
+    return join(normalize(p, dim=-1), hyperplanes_through(points))
 
 
 def _translation_forms(like: Tensor) -> Tensor:

@@ -25,10 +25,11 @@ class LiftedError(NamedTuple):
 
 
 def lifted_error(structure: Tensor, true: Tensor, lifts: Tensor, mask: Tensor | None = None) -> LiftedError:
-    r"""Errors of lifted points: the S of :func:`gauge_algebra` that aligns them best, then where the world points are.
+    r"""Errors of lifted points after the best alignment that their lifts allow, in the positions of the world points.
 
-    S starts as the least-squares solution of :math:`Y_{true} \sim S\,Y` on whitened points and is refined on the positions
-    :math:`\pi(B_i S Y)` at all views, gross errors weighing little.
+    The S of :func:`~dyntorch.algebra.lift.gauge_algebra` that aligns them starts as the least-squares solution of
+    :math:`Y_{true} \sim S\,Y` on whitened points and is refined on the positions :math:`\pi(B_i S Y)` at all views, gross errors
+    weighing little.
 
     Args:
         structure: ``(*batch, n, K)`` estimated, homogeneous, in any gauge that the lifts leave open.

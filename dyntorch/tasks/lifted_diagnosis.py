@@ -32,6 +32,8 @@ EXACT = 1e-7
 WEAK, NOISE_OF_STACK = 3e-3, 0.3
 """Least singular value of the stacked projections over the largest, and noise over it: 0.015 to 0.8 and up to 0.1 in sound scenes
 at 0.5 px; below 0.005 and above 0.3 with a fixed camera."""
+ASKED = 20
+"""Points whose median uncertainty is taken, about."""
 THIN = 3.0
 """Standard deviations of the noise across a line of images below which they may as well lie on it."""
 
@@ -182,8 +184,9 @@ def conditions(tracks: Tracks, scene: Scene, lifting: Lifting | None, noise: Ten
         lifts = torch.linalg.solve_triangular(axes[:, None], lifting.lifts @ spread[:, None], upper=False)
         depth, metric = (below @ spread)[:, None], spread
         gauge, extent = len(lifting.algebra) - 1, _extent(scene.structure.nan_to_num(), below, known)
-    found = point_uncertainty(cameras, points, lifts, depth, tracks.weights, gauge, metric)
-    middle = torch.where(known, found, torch.nan).nanmedian(-1).values
+    step = -(-known.shape[-1] // ASKED)
+    found = point_uncertainty(cameras, points, lifts, depth, tracks.weights, gauge, metric, step)
+    middle = torch.where(known[:, ::step], found, torch.nan).nanmedian(-1).values
     return stack, (middle * noise / extent).nan_to_num(nan=torch.inf, posinf=torch.inf)
 
 

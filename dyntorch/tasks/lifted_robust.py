@@ -12,10 +12,17 @@ from dyntorch.solution import Status
 from dyntorch.tasks.lifted_agreement import EXACT, agreeing, bound, distance, freedom, noise, settled_noise
 from dyntorch.tasks.lifted_consensus import Consensus, consensus, doubtful
 from dyntorch.tasks.lifted_projections import Projections, Tracks
-from dyntorch.tasks.lifted_scene import Lifting, scene_of
+from dyntorch.tasks.lifted_scene import Lifting, Scene, adjusted, distances, scene_of
 
-ALARMS = 0.05
-"""Share of the problems without outliers that are suspected: those whose farthest point is farther than in the others."""
+ALARMS, RARE = 0.05, 1e-4
+"""Share of the problems without outliers that are suspected, those whose farthest point is farther than in the others: where few
+conditions are left for every unknown of the cameras, and where there are :data:`PLENTY`."""
+PLENTY = 6.0
+"""Conditions per unknown of the projections from which on one outlier cannot hide.  Of 200 scenes of constant velocity in a plane
+with one outlier among 30, 60 and 100 points the rare alarm misses 40, 3.5, 0.5 %, the other one 12, 0.5, 0 % (space, 60, 100 and
+200 points: 60, 28 and 8 %, 28, 8 and 0 %).  A false alarm costs the time of a robust search, fifty times that of a clean batch."""
+TRIMS, MOST = 2, 0.9
+"""Times that observations are taken from the least squares scene, and share of them that has to stay."""
 WIDTHS = (6.0, 3.0, 1.5, 1.0, 1.0)
 """Thresholds over the final one, while all views settle."""
 RESECTED = 10
@@ -38,7 +45,38 @@ def suspicious(tracks: Tracks, apart: Tensor, unknowns: Tensor | int, limit: flo
     least = EXACT / tracks.scales.amin(1)
     sigma = noise(square, free, free >= 1) if limit is None else torch.full_like(least, limit / 3)
     sigma = torch.maximum(sigma, least)
-    return (square > sigma.square()[:, None] * bound(free, 1 - ALARMS / max(1, apart.shape[-1]))).logical_and(free >= 1).any(-1)
+    views, wide = tracks.x.shape[1], tracks.x.shape[-1] + 1
+    size = int(torch.as_tensor(unknowns).max()) + 1
+    used = views * (wide * size - 1) - (size * size - 1)
+    plenty = size <= 5 and int(free.sum(-1).min()) >= PLENTY * used
+    share = (RARE if plenty else ALARMS) / max(1, apart.shape[-1])
+    return (square > sigma.square()[:, None] * bound(free, 1 - share)).logical_and(free >= 1).any(-1)
+
+
+def trimmed(tracks: Tracks, scene: Scene, lifting: Lifting, unknowns: Tensor, limit: float | None) -> tuple[Scene, Tracks, Tensor]:
+    """The least squares scene after the few observations that disagree with it are taken away, the tracks without them, and whether
+    ``(b,)`` that is all there was to do: one wrong track in many does not need a search.
+
+    Args:
+        tracks: flat batch of suspected problems.
+        scene: of least squares.
+        lifting: the model.
+        unknowns: of every point, ``(b, n)``.
+        limit: three standard deviations of the noise, None: judged by the residuals alone.
+    """
+    fewer = tracks
+    for _ in range(TRIMS):
+        projections = scene.cameras @ lifting.lifts
+        apart = distances(fewer, projections, scene.structure)
+        free = (apart.isfinite().sum(1) * tracks.x.shape[-1] - unknowns).clamp(min=0)
+        sigma = noise(apart.square().nansum(1), free, free >= 1) if limit is None else torch.full_like(scene.cost, limit / 3)
+        sigma = torch.maximum(sigma, EXACT / tracks.scales.amin(1))
+        fewer = tracks.only(agreeing(tracks, projections, sigma))
+        structure = triangulate(projections, fewer.x, fewer.weights, steps=2)
+        scene = adjusted(fewer, Scene(scene.cameras, structure, scene.cost), lifting)
+    apart = distances(fewer, scene.cameras @ lifting.lifts, scene.structure)
+    kept = (fewer.weights > 0).flatten(1).sum(-1) / (tracks.weights > 0).flatten(1).sum(-1).clamp(min=1)
+    return scene, fewer, ~suspicious(fewer, apart, unknowns, limit) & (kept >= MOST)
 
 
 def robust_projections(

@@ -15,7 +15,7 @@ from dyntorch.solution import Status, failed
 from dyntorch.tasks.lifted_bodies import bodies_of
 from dyntorch.tasks.lifted_diagnosis import diagnose, spare, unknowns
 from dyntorch.tasks.lifted_projections import Projections, Tracks, projections_of_tracks
-from dyntorch.tasks.lifted_robust import robust_projections, suspicious
+from dyntorch.tasks.lifted_robust import robust_projections, suspicious, trimmed
 from dyntorch.tasks.lifted_scene import Lifting, Scene, distances, framed, positions, scene_of, velocities
 from dyntorch.tasks.reconstruction import Reconstruction
 
@@ -51,9 +51,16 @@ def solve(
     invariant = motion.tensor(min(views, motion.k + 1))
     found = projections_of_tracks(tracks, invariant)
     found, scene = _scene(tracks, found, lifting)
-    doubt = suspicious(tracks, _distances(tracks, scene, lifting), unknowns(tracks, motion), limit) | failed(found.status)
-    if limit != float("inf") and bool(doubt.any()):
-        chosen = doubt.nonzero()[:, 0]
+    free = unknowns(tracks, motion)
+    doubt = suspicious(tracks, _distances(tracks, scene, lifting), free, limit) | failed(found.status)
+    chosen = doubt.nonzero()[:, 0] if limit != float("inf") else doubt.nonzero()[:0, 0]
+    if lifting is not None and len(chosen):
+        again, fewer, fine = trimmed(tracks.subset(chosen), _part(scene, chosen), lifting, free[chosen], limit)
+        fine = fine & ~failed(found.status[chosen])
+        tracks = tracks.only(tracks.weights.index_copy(0, chosen[fine], fewer.weights[fine]))
+        scene = _merged(scene, _part(again, fine), chosen[fine])
+        chosen = chosen[~fine]
+    if len(chosen):
         some, fewer = robust_projections(tracks.subset(chosen), invariant, lifting, limit, generator)
         some, again = _scene(fewer, some, lifting)
         tracks = tracks.only(tracks.weights.index_copy(0, chosen, fewer.weights))
@@ -76,6 +83,11 @@ def _scene(tracks: Tracks, found: Projections, lifting: Lifting | None) -> tuple
 def _merged(old: Part, new: Part, chosen: Tensor) -> Part:
     """Results of some problems in their places."""
     return type(old)(*(a.index_copy(0, chosen, b) for a, b in zip(vars(old).values(), vars(new).values(), strict=True)))
+
+
+def _part(whole: Part, keep: Tensor) -> Part:
+    """Some problems."""
+    return type(whole)(*(part[keep] for part in vars(whole).values()))
 
 
 def _distances(tracks: Tracks, scene: Scene, lifting: Lifting | None) -> Tensor:

@@ -15,7 +15,7 @@ ROUNDING = 1e-10
 
 
 def point_uncertainty(
-    cameras: Tensor, structure: Tensor, lifts: Tensor, depth: Tensor, weights: Tensor, gauge: int, metric: Tensor
+    cameras: Tensor, structure: Tensor, lifts: Tensor, depth: Tensor, weights: Tensor, gauge: int, metric: Tensor, step: int = 1
 ) -> Tensor:
     r"""Standard deviation of each point per unit of noise, when cameras and points are both unknown.
 
@@ -34,9 +34,10 @@ def point_uncertainty(
         weights: ``(b, views, n)``, 0 = missing.
         gauge: dimension of what is open, without the scales of the cameras.
         metric: ``(b, K, K)`` from these coordinates, best ones that the points fill, to those in which errors are measured.
+        step: distance of the points that are asked for; all of them tell about the cameras.
 
     Returns:
-        ``(b, n)``: root of the trace of the covariance of a point scaled to depth 1, in the unit
+        ``(b, n)`` (fewer with ``step``): root of the trace of the covariance of a point scaled to depth 1, in the unit
         of ``metric`` times ``structure`` over that of the images; infinite where a point, or the cameras, are not determined.
 
     Source: Triggs et al. 2000, Bundle adjustment, section 9; Hartley and Zisserman, appendix A6.
@@ -49,15 +50,15 @@ def point_uncertainty(
     functional = depth.expand(b, n, -1)
 
     def run(*block: Tensor) -> Tensor:
-        return _uncertainty(block, gauge)
+        return _uncertainty(block, gauge, step)
 
     found = map_blocks(
         run, cameras, unit, functional, weights * known[:, None], lifts, metric, size=max(1, BLOCK // (n * wide + 1))
     )
-    return torch.where(known & found.isfinite(), found, torch.inf)
+    return torch.where(known[:, ::step] & found.isfinite(), found, torch.inf)
 
 
-def _uncertainty(block: tuple[Tensor, ...], gauge: int) -> Tensor:
+def _uncertainty(block: tuple[Tensor, ...], gauge: int, step: int) -> Tensor:
     cameras, structure, depth, weights, lifts, metric = block
     by_camera, by_point = _derivatives(cameras, structure, weights, lifts)
     information = torch.einsum("bvnlk,bvnlj->bnkj", by_point, by_point)
@@ -79,6 +80,7 @@ def _uncertainty(block: tuple[Tensor, ...], gauge: int) -> Tensor:
     rounding = torch.where(free, -torch.inf, values).amax(-1, keepdim=True)
     told = values > torch.maximum(ROUNDING * values[:, -1:], 100 * rounding)
     spread = vectors * torch.where(free & told, values.clamp(min=torch.finfo(values.dtype).tiny).rsqrt(), 0.0)[:, None]
+    factor, whitened, structure, depth = factor[:, ::step], whitened[:, ::step], structure[:, ::step], depth[:, ::step]
     inverse = torch.linalg.solve_triangular(factor, eye.expand_as(factor), upper=False)
     moved = torch.cat([inverse.mT, inverse.mT @ (whitened @ spread[:, None])], dim=-1)
     # at depth 1: what only changes the scale does not count

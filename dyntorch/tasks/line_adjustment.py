@@ -49,7 +49,7 @@ def adjust(data: Sightings, lines: Tensor) -> Sightings:
         lines = torch.where(better[..., None, None], ends, lines)
         cost, damping = torch.where(better, found, cost), torch.where(better, damping / 10, damping * 10).clamp(min=1e-12)
         done = done | settled
-        if bool(done.all()):
+        if done.device.type == "cpu" and bool(done.all()):
             break
     return data
 
@@ -70,12 +70,14 @@ def _step(data: Sightings, lines: Tensor, damping: Tensor) -> tuple[Tensor, Tens
     own = by_line.mT @ by_line
     size = own.diagonal(dim1=-2, dim2=-1).sum(-1) + torch.finfo(own.dtype).tiny
     own = own + torch.diag_embed(own.diagonal(dim1=-2, dim2=-1) * damping[..., None, None])
-    factor, _ = torch.linalg.cholesky_ex(own + size[..., None, None] * (across.mT @ across + 1e-12 * torch.eye(6).to(own)))
+    factor, _ = torch.linalg.cholesky_ex(
+        own + size[..., None, None] * (across.mT @ across + 1e-12 * torch.eye(6, dtype=own.dtype, device=own.device))
+    )
     pull = torch.einsum("...nvk,...vn->...nk", by_line, distance)
     mixed = (by_camera.transpose(-3, -2)[..., None] * by_line[..., None, :]).flatten(-3, -2)  # (*batch, n, 12 views, 6)
     solved = torch.cholesky_solve(mixed.mT, factor).mT
     whole = torch.einsum("...vnp,...vnq->...vpq", by_camera, by_camera)
-    blocks = torch.eye(views).to(whole)[:, None, :, None] * whole[..., :, :, None, :]
+    blocks = torch.eye(views, dtype=whole.dtype, device=whole.device)[:, None, :, None] * whole[..., :, :, None, :]
     reduced = blocks.flatten(-4, -3).flatten(-2) - (mixed.transpose(-3, -2).flatten(-2) @ solved.transpose(-3, -2).flatten(-2).mT)
     gradient = torch.einsum("...vnp,...vn->...vp", by_camera, distance).flatten(-2) - (solved @ pull[..., None])[..., 0].sum(-2)
     shift = damped_step(gradient.flatten(0, -2), reduced.flatten(0, -3), damping.flatten()).view(gradient.shape)

@@ -74,6 +74,8 @@ def trajectory_cameras(
     """
     if x.ndim < 3 or x.shape[-3] != 6 or x.shape[-1] != 2:
         raise ValueError(f"x must be (*batch, 6, n, 2), six views, got {tuple(x.shape)}")
+    if weights is not None and weights.shape != (*x.shape[:-3], x.shape[-2]):
+        raise ValueError(f"weights must be (*batch, n) = {(*x.shape[:-3], x.shape[-2])}, one per point, got {tuple(weights.shape)}")
     flat = x.reshape(-1, *x.shape[-3:]).double()
     mass = torch.ones_like(flat[:, 0, :, 0]) if weights is None else weights.reshape(flat.shape[0], -1).double()
     solution = fit(SIX, *flat.unbind(1), weights=mass)

@@ -138,6 +138,8 @@ def test_dual_twice_is_the_extensor_up_to_the_known_sign():
         assert torch.equal(twice, (-1.0) ** (step * (size - step)) * x)
     with pytest.raises(ValueError, match="has 6 entries, got 4"):
         dual(random(4), 4, 2)
+    with pytest.raises(ValueError, match="has no entries, got 4"):
+        dual(random(4), 4, -1)
 
 
 def test_dual_completes_to_the_squared_norm():

@@ -3,7 +3,17 @@
 import pytest
 import torch
 
-from dyntorch.algebra.homogeneous import apply, homogeneous, hyperplanes_through, inhomogeneous, similarity, skew, unit
+from dyntorch.algebra.homogeneous import (
+    apply,
+    homogeneous,
+    hyperplanes_through,
+    inhomogeneous,
+    nonzero_sign,
+    similarity,
+    skew,
+    unit,
+    unit_vectors,
+)
 
 
 def random(*shape, seed=0, dtype=torch.float64):
@@ -140,3 +150,19 @@ def test_hyperplanes_are_smooth():
     angles = torch.linspace(0, 2 * torch.pi, 2000, dtype=torch.float64)
     n = hyperplanes_through(x + torch.stack([angles.cos(), angles.sin()], -1))
     assert (n[1:] - n[:-1]).abs().max() < 0.01
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_unit_vectors_and_signs_leave_zero_alone(dtype):
+    x = random(4, 3, dtype=dtype)
+    x[1] = 0
+    x.requires_grad_()
+    found = unit_vectors(x)
+    torch.testing.assert_close(found.norm(dim=-1), torch.tensor([1.0, 0, 1, 1], dtype=dtype))
+    assert ((found * x).sum(-1)[[0, 2, 3]] > 0).all() and found.dtype == dtype
+    (gradient,) = torch.autograd.grad(found[:, 0].sum(), x)
+    assert gradient.isfinite().all()
+    # across the vector: its length does not matter
+    assert (gradient * x).sum(-1).abs().max() < 10 * torch.finfo(dtype).eps
+    sign = nonzero_sign(x.detach())
+    assert sign.dtype == dtype and torch.equal(sign * x.abs(), x) and (sign[1] == 1).all()

@@ -210,5 +210,11 @@ def test_bundle_adjustment_reaches_the_noise():
     best = trajectory_cameras(x)
     assert best.trajectories.residual.median() < 0.05
     torch.testing.assert_close(best.trajectories.sigma, torch.tensor(0.05).double(), rtol=0.2, atol=0)
+
+
+def test_misuse_of_six_views():
+    x = torch.zeros(6, 10, 2)
     with pytest.raises(ValueError, match="six views"):
         trajectory_cameras(x[:5])
+    with pytest.raises(ValueError, match=r"weights must be \(\*batch, n\) = \(10,\), one per point, got \(6, 10\)"):
+        trajectory_cameras(x, torch.ones(6, 10))
