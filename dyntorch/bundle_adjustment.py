@@ -72,7 +72,7 @@ def bundle_adjust(
         subspace: ``(k + 1, r)`` orthonormal columns that span it.
 
     Returns:
-        Adjusted, in the dtype of ``x``.  A problem whose start is not finite keeps it and has cost infinity.
+        Adjusted, in the dtype of ``x``, without gradients.  A problem whose start is not finite keeps it and has cost infinity.
 
     Raises:
         ValueError: shapes that do not fit each other, another loss, or a scale that is not positive.

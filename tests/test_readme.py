@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import pytest
+
 README = Path(__file__).parent.parent / "README.md"
 
 
@@ -12,8 +14,9 @@ def blocks() -> list[str]:
     return re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
 
 
-def test_the_alignment_example_prints_what_it_says(capsys):
-    (source,) = [block for block in blocks() if "align_planar" in block]
+@pytest.mark.parametrize("name", ["align_planar", "dyn.reconstruct"])
+def test_the_geometry_examples_print_what_they_say(name, capsys):
+    (source,) = [block for block in blocks() if name in block]
     exec(compile(source, str(README), "exec"), {})
     printed = capsys.readouterr().out.strip()
     assert f"```\n{printed}\n```" in README.read_text(encoding="utf-8")

@@ -5,12 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dyntorch.algebra.extensors import compound, dual, join
+from dyntorch.algebra.extensors import compound, dual
 from dyntorch.algebra.homogeneous import unit
 from dyntorch.algebra.klein_quadric import klein_frame
-from dyntorch.algebra.line_collineation import common_point
-
-PAIRS = ((0, 1), (0, 2), (1, 2))  # rows of the second compound of a camera
+from dyntorch.algebra.line_collineation import compound_rows
 
 
 def line_camera(camera: Tensor) -> Tensor:
@@ -69,13 +67,9 @@ def camera_of_lines(matrix: Tensor) -> Tensor:
     standard = line_camera(torch.eye(3, 4, dtype=torch.float64, device=matrix.device))
     safe = torch.where(good, matrix.double(), standard)
     lines = dual((safe / torch.linalg.matrix_norm(safe, keepdim=True)).mT, 3, 1).mT
-    shared = torch.tensor([[p for p, pair in enumerate(PAIRS) if i in pair] for i in range(3)], device=matrix.device)
-    rows = common_point(lines[..., shared, :])
-    pairs = torch.tensor(PAIRS, device=matrix.device)
-    joined = join(rows[..., pairs[:, 0], :], rows[..., pairs[:, 1], :])
-    square = joined.square().sum(-1)
-    ratio = (joined * lines).sum(-1) / torch.where(square > 0, square, 1.0)
-    scale = ratio[..., shared].prod(-1)
+    rows, ratio = compound_rows(lines, 3)
+    k01, k02, k12 = ratio.unbind(-1)
+    scale = torch.stack([k01 * k02, k01 * k12, k02 * k12], dim=-1)
     return torch.where(good, unit(scale[..., None] * rows), 0.0).to(matrix.dtype)
 
 

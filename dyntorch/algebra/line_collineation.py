@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import combinations
+
 import torch
 from torch import Tensor
 
@@ -44,13 +46,28 @@ def compound_root(matrix: Tensor) -> Tensor:
     good = (matrix.isfinite().flatten(-2).all(-1) & (matrix.abs().amax((-1, -2)) > 0))[..., None, None]
     safe = torch.where(good, matrix, torch.eye(6, dtype=matrix.dtype, device=matrix.device)).double()
     lines = safe / torch.linalg.matrix_norm(safe, keepdim=True)
-    shared = [[p for p, pair in enumerate(PAIRS) if i in pair] for i in range(4)]
-    rows = common_point(lines[..., torch.tensor(shared, device=lines.device), :])
-    pairs = torch.tensor(PAIRS, device=lines.device)
-    joined = join(rows[..., pairs[:, 0], :], rows[..., pairs[:, 1], :])
-    square = joined.square().sum(-1)
-    ratio = (joined * lines).sum(-1) / torch.where(square > 0, square, torch.ones_like(square))
+    rows, ratio = compound_rows(lines, 4)
     return torch.where(good, unit(_scales(ratio)[..., None] * rows), torch.zeros_like(rows)).to(matrix.dtype)
+
+
+def compound_rows(lines: Tensor, size: int) -> tuple[Tensor, Tensor]:
+    r"""The rows of a matrix, up to a scale each, from its second compound matrix, up to scale as well.
+
+    Args:
+        lines: ``(*batch, size (size - 1) / 2, 6)``, the lines that pairs of rows span, in lexicographic order.
+        size: number of rows.
+
+    Returns:
+        rows :math:`a_i` of norm 1 ``(*batch, size, 4)``, and :math:`k_{ij} = \langle a_i \wedge a_j, \Lambda_{ij} \rangle /
+        \|a_i \wedge a_j\|^2`, one for each line.
+    """
+    pairs = list(combinations(range(size), 2))
+    shared = torch.tensor([[p for p, pair in enumerate(pairs) if i in pair] for i in range(size)], device=lines.device)
+    rows = common_point(lines[..., shared, :])
+    first, second = torch.tensor(pairs, device=lines.device).unbind(-1)
+    joined = join(rows[..., first, :], rows[..., second, :])
+    square = joined.square().sum(-1)
+    return rows, (joined * lines).sum(-1) / torch.where(square > 0, square, 1.0)
 
 
 def common_point(lines: Tensor) -> Tensor:

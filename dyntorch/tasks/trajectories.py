@@ -151,7 +151,9 @@ def points_on_lines(cameras: Tensor, x: Tensor, lines: Tensor) -> Tensor:
         lines: ``(*batch, n, 6)`` Pluecker coordinates of any scale.
 
     Returns:
-        ``(*batch, views, n, 3)``.
+        ``(*batch, views, n, 3)``, NaN where x is; differentiable.
+
+    Source: thesis section 1.3.
 
     Example:
         >>> import torch

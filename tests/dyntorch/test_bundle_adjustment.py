@@ -9,6 +9,7 @@ from dyntorch.algebra.triangulation import reproject
 from dyntorch.bundle_adjustment import bundle_adjust
 from dyntorch.bundle_information import point_information, structure_covariance
 from dyntorch.bundle_problem import BundleProblem
+from dyntorch.scenes import lifted
 
 
 def lift(dim, moving, views):
@@ -264,3 +265,29 @@ def test_misuse():
         bundle_adjust(x, None, cameras, structure, lifts, scale=1.0, loss="tukey")
     with pytest.raises(ValueError, match="scale must be positive"):
         bundle_adjust(x, None, cameras, structure, lifts, scale=0.0)
+
+
+def test_confined_points_stay_in_their_subspace_and_cost_least_there():
+    scene = lifted("constant_velocity_2d", 30, 5, static=0.5, sigma=0.5, generator=torch.Generator().manual_seed(7))
+    assert scene.lifts is not None
+    x, still = (scene.tracks - 500) / 300, torch.eye(5, dtype=torch.float64)[:, :3]
+    frame = torch.tensor([[1 / 300, 0, -5 / 3], [0, 1 / 300, -5 / 3], [0, 0, 1]], dtype=torch.float64)
+    cameras, resting = frame @ scene.cameras, scene.labels == 1
+    start = scene.structure + 0.01 * torch.randn(30, 5, generator=torch.Generator().manual_seed(8), dtype=torch.float64)
+    found = bundle_adjust(x, None, cameras, start, scene.lifts, confined=resting, subspace=still, tolerance=1e-14)
+    assert found.structure[resting][:, 3:].abs().max() < 1e-12
+    assert found.structure[~resting][:, 3:].abs().max() > 1e-3
+    # the same by points of their own space: resting ones are points of the plane for every view
+    free = bundle_adjust(x[:, resting], None, cameras, start[resting][:, :3], tolerance=1e-14)
+    alone = bundle_adjust(
+        x[:, resting], None, cameras, start[resting], scene.lifts, confined=resting[resting], subspace=still, tolerance=1e-14
+    )
+    torch.testing.assert_close(alone.cost, free.cost, rtol=1e-8, atol=0)
+    assert found.cost > bundle_adjust(x, None, cameras, start, scene.lifts, tolerance=1e-14).cost
+
+
+def test_confined_points_need_a_subspace():
+    points = torch.ones(4, 5, dtype=torch.float64)
+    x, cameras = torch.zeros(3, 4, 2, dtype=torch.float64), torch.ones(3, 3, 5, dtype=torch.float64)
+    with pytest.raises(ValueError, match=r"confined points need a subspace \(5, r\)"):
+        bundle_adjust(x, None, cameras, points, confined=torch.ones(4, dtype=torch.bool))

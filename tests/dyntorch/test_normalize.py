@@ -72,7 +72,7 @@ def test_denormalized_tensor_takes_the_measured_vectors(case):
     torch.testing.assert_close(span @ span.mT, torch.eye(invariant.nullity).double().expand(2, -1, -1), rtol=0, atol=1e-9)
     if invariant.nullity > 1:
         return
-    letters = "ijk"[:order]
+    letters = "ijklpq"[:order]
     before = [p.vectors(x)[:, :, 0] for p, x in zip(invariant.primitives, scene.exact, strict=True)]
     after = [v @ m.mT for v, m in zip(before, norm.actions, strict=True)]
     terms = ",".join(f"bn{letter}" for letter in letters)

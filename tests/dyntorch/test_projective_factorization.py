@@ -175,3 +175,5 @@ def test_misuse_is_refused(shape, rank, message):
 def test_weights_of_another_shape_are_refused():
     with pytest.raises(ValueError, match="weights must be"):
         projective_factorization(torch.zeros(5, 20, 2), 5, torch.ones(20))
+    with pytest.raises(ValueError, match=r"weights must be .* = \(5, 20\), got \(2, 5, 20\)"):
+        projective_factorization(torch.zeros(5, 20, 2), 5, weights=torch.ones(2, 5, 20))

@@ -168,3 +168,38 @@ def test_custom_lifts(lift) -> None:
     assert found.status == Status.OK
     assert float(metrics.lifted_error(found.structure, structure, lifts).position) < 1e-6
     assert bool((found.points.norm(dim=-1) < 100).all())
+
+
+def test_known_static_points_determine_what_the_tensor_does_not() -> None:
+    """Two columns of cars on a road: two velocities leave the tensor degenerate, the cameras follow from the road."""
+    scene = scene_of("constant_velocity_2d", static=0.5)
+    still = scene.labels == 1
+    structure = scene.structure / scene.structure[..., 2:3]
+    columns = torch.tensor([[0.08, 0.05], [-0.06, 0.1]], dtype=F64)[torch.arange(60) % 2]
+    structure = torch.where(still[..., None], structure, torch.cat([structure[..., :3], columns], -1))
+    images = structure[..., None, :, :] @ scene.projections.mT
+    exact = images[..., :2] / images[..., 2:]
+    tracks = exact + 0.3 * torch.randn(exact.shape, generator=draw(4), dtype=F64)
+    linear = dyn.fit(MOTIONS["constant_velocity_2d"].tensor(3), *exact[:3])
+    assert linear.status == Status.DEGENERATE
+    found = dyn.reconstruct(tracks, "constant_velocity_2d", scene.times, static=still)
+    assert found.status == Status.OK
+    assert float(found.velocities[still].abs().max()) < 1e-9
+    assert float(metrics.lifted_error(found.structure, structure, scene.lifts).position) < 0.05
+
+
+def test_labels_of_exact_tracks() -> None:
+    scene = scene_of("constant_velocity_2d", static=0.4)
+    given = (scene.labels == 1) & (torch.arange(scene.labels.shape[-1]) % 2 == 0)
+    found = dyn.reconstruct(scene.tracks, "constant_velocity_2d", scene.times, static=given)
+    assert torch.equal(found.labels, scene.labels)  # also the static points that were not given
+
+
+def test_one_wrong_track_is_found_without_losing_the_others() -> None:
+    scene = scene_of("constant_velocity_2d", sigma=0.4)
+    tracks = scene.tracks.clone()
+    tracks[1, 5] += 40.0
+    found = dyn.reconstruct(tracks, "constant_velocity_2d", scene.times)
+    assert found.status == Status.OK
+    assert not bool(found.inliers[1, 5]) and float(found.inliers.double().mean()) > 0.95
+    assert float(metrics.lifted_error(found.structure, scene.structure, scene.lifts).position) < 0.05
