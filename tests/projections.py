@@ -26,9 +26,10 @@ def lifted(motion: str, times: tuple[float, ...], **fixed: Any) -> Callable[...,
 
 
 def collinear_images(
-    n: int, *, batch: tuple[int, ...] = (), sigma: float = 0.0, outliers: float = 0.0, generator: torch.Generator
+    n: int, *, batch: int | tuple[int, ...] = (), sigma: float = 0.0, outliers: float = 0.0, generator: torch.Generator
 ) -> Scene:
     """One point in each of three views on the image of a line, which a matrix takes from the plane of the lines."""
+    batch = (batch,) if isinstance(batch, int) else batch
 
     def draw(*shape: int) -> Tensor:
         return torch.randn(*batch, *shape, generator=generator, dtype=torch.float64)

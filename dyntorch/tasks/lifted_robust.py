@@ -46,6 +46,8 @@ def suspicious(tracks: Tracks, apart: Tensor, unknowns: Tensor | int, limit: flo
     sigma = noise(square, free, free >= 1) if limit is None else torch.full_like(least, limit / 3)
     sigma = torch.maximum(sigma, least)
     views, wide = tracks.x.shape[1], tracks.x.shape[-1] + 1
+    if not len(apart):
+        return apart.new_zeros(0, dtype=torch.bool)
     size = int(torch.as_tensor(unknowns).max()) + 1
     used = views * (wide * size - 1) - (size * size - 1)
     plenty = size <= 5 and int(free.sum(-1).min()) >= PLENTY * used

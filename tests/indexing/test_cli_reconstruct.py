@@ -122,7 +122,9 @@ def test_the_same_from_other_files(run, scene):
         assert code == 0 and ("time 0 of the result is the first view, at 5" in out) == (i == 2)
         assert ("no point is known to stand still" in out) == (i > 1)
         results.append(re.search(r"constant_velocity_2d +4 +50 .* ([\d.]+) +ok", out)[1])
-    assert len(set(results)) == 1
+    # known static points hold the cameras: another estimate of the noise (0.3), and the better one
+    assert results[0] == results[1] and results[2] == results[3]
+    assert abs(float(results[0]) - 0.3) < abs(float(results[2]) - 0.3) < 0.05
 
 
 @pytest.mark.parametrize(
