@@ -115,6 +115,20 @@ def _before(cameras: Tensor, structure: Tensor, lifts: Tensor, weights: Tensor) 
     return cameras, structure * (point / scale)[..., None]
 
 
+def behind(cameras: Tensor, structure: Tensor, lifts: Tensor, weights: Tensor) -> Tensor:
+    """Points ``(b, n)`` that are behind one of the cameras that see them, or beyond infinity, in a frame of :func:`finite`.
+
+    Args:
+        cameras: ``(b, views, m, a + 1)``.
+        structure: ``(b, n, K)``.
+        lifts: ``(views, a + 1, K)``.
+        weights: ``(b, views, n)``.
+    """
+    world = structure @ lifts[0, -1]
+    depth = (structure[:, None] @ (cameras @ lifts)[..., -1, :, None])[..., 0] * (weights > 0) * world.sign()[:, None]
+    return (torch.where(depth.sign().sum(-1, keepdim=True) < 0, -depth, depth) < 0).any(1)
+
+
 def steady(structure: Tensor, lifts: Tensor, start: Tensor, algebra: Tensor, weights: Tensor) -> Tensor:
     r"""The frame in which the chosen points move least: a motion common to all, which no view can tell, is taken off.
 

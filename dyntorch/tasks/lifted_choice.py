@@ -58,9 +58,11 @@ def choose(
     Source: Torr 2002, Bayesian model estimation and selection for epipolar geometry and generic manifold fitting (GRIC).
     """
     views, n = tracks.weights.shape[1:]
-    models = [m for m in MOTIONS.values() if m.sensor == tracks.x.shape[-1] and _fits(m, tracks.times, views, n)]
+    reasons = {m.name: _lacks(m, tracks.times, views, n) for m in MOTIONS.values() if m.sensor == tracks.x.shape[-1]}
+    models = [MOTIONS[name] for name, reason in reasons.items() if not reason]
+    untried = tuple(Ranked(name, math.inf, math.nan, reason) for name, reason in reasons.items() if reason)
     if not models:
-        first = next(m for m in MOTIONS.values() if m.sensor == tracks.x.shape[-1])
+        first = MOTIONS[next(iter(reasons))]
         need = least(first, tracks.times)
         raise ValueError(
             f"no declared motion takes {views} views of {n} tracks; {first.name!r} needs {need[0]} views and {need[1]} tracks"
@@ -70,13 +72,13 @@ def choose(
     best = solve(tracks, MOTIONS[listed[0].motion], static, limit, generator, batch)
     whole = next(fit.apart.isfinite() for fit in plain if fit.motion is best.motion)
     if bool((best.inliers.reshape(whole.shape) >= whole).all()):
-        return replace(best, candidates=listed)
+        return replace(best, candidates=listed + untried)
     robust = {model.name: solve(tracks, model, static, limit, generator, batch) for model in models}
     fits = [
         Fit.of(tracks, one.motion, one.residuals.reshape(tracks.weights.shape), one.status.reshape(-1)) for one in robust.values()
     ]
     listed = ranked(tracks, fits, limit)
-    return replace(robust[listed[0].motion], candidates=listed)
+    return replace(robust[listed[0].motion], candidates=listed + untried)
 
 
 class Fit(NamedTuple):
@@ -111,12 +113,19 @@ def least(motion: Motion, times: Tensor) -> tuple[int, int]:
     return views, max(motion.tensor(min(views, motion.k + 1)).minimal(), bodies)
 
 
-def _fits(motion: Motion, times: Tensor, views: int, n: int) -> bool:
-    """Whether there are views and tracks enough, and observations to spare."""
+def _lacks(motion: Motion, times: Tensor, views: int, n: int) -> str:
+    """What is missing of views, tracks, and observations to spare; empty where nothing is."""
+    usual = motion.views(range(12))
+    if views < usual:
+        return f"needs {usual} views"
     need = least(motion, times)
-    if motion.lift is not None and need[0] <= views and motion.ambiguity(times) > motion.ambiguity(range(12)):
-        return False  # too few different times
-    return need[0] <= views and need[1] <= n and views * motion.sensor > motion.k - (motion.bodies > 1)
+    if need[0] > views or (motion.lift is not None and motion.ambiguity(times) > motion.ambiguity(range(12))):
+        return f"needs views at {usual} different times"
+    if need[1] > n:
+        return f"needs {need[1]} tracks"
+    if views * motion.sensor <= motion.k - (motion.bodies > 1):
+        return "needs more views: a point has no observation to spare"
+    return ""
 
 
 def ranked(tracks: Tracks, fits: list[Fit], limit: float | None) -> tuple[Ranked, ...]:

@@ -9,11 +9,12 @@ import torch
 from torch import Tensor
 
 from dyntorch.algebra.hyperplane_pair import hyperplane_pair
+from dyntorch.algebra.lift_frames import behind
 from dyntorch.motions import MOTIONS, Motion, polynomial
 from dyntorch.solution import NOISY, Status, failed
 from dyntorch.tasks.lifted_bodies import bodies_of
 from dyntorch.tasks.lifted_projections import Tracks, projections_of_tracks
-from dyntorch.tasks.lifted_scene import Lifting, Scene, distances, scene_of
+from dyntorch.tasks.lifted_scene import Lifting, Scene, distances, scene_of, wild
 from dyntorch.tasks.lifted_uncertainty import point_uncertainty
 from dyntorch.tasks.notices import Notice, NoticeCode, notices
 
@@ -124,7 +125,7 @@ def diagnose(
     enough, size = _through(tracks, motion)
     status = torch.where(failed(status) & (enough < motion.tensor(size).minimal()), int(Status.TOO_FEW), status)
     solved = ~failed(status)
-    noise = sigma * tracks.scales.square().mean(-1).sqrt()
+    noise = sigma * tracks.scale()
     stack, doubt = conditions(tracks, scene, lifting, noise)
     stack, doubt = torch.where(solved, stack, 0.0), torch.where(solved, doubt, torch.inf)
     cheap = motion.k <= 4 or motion.bodies > 1
@@ -134,10 +135,11 @@ def diagnose(
         asked = (suspect | (smaller.motion.static & (status == Status.AMBIGUOUS))) & ~explained
         left = _noise_of(tracks, smaller.motion, asked)
         same = asked & (left <= EXPLAINED * torch.where(solved, noise, 0.0) + EXACT)
-        note(smaller.code, f"a smaller model leaves a residual of {{value:.2g}}: {smaller.cause}", left / _scale(tracks), same)
+        note(smaller.code, f"a smaller model leaves a residual of {{value:.2g}}: {smaller.cause}", left / tracks.scale(), same)
         explained = explained | same
     judged = torch.where((explained | (doubt > UNKNOWN)) & solved, int(Status.AMBIGUOUS), int(Status.OK))
-    judged = torch.where(solved & ~explained & (noise > NOISY), int(Status.NO_CONSENSUS), judged)
+    astray = torch.zeros_like(solved) if lifting is None else wild(tracks, scene, lifting)
+    judged = torch.where(solved & ~explained & ((noise > NOISY) | astray), int(Status.NO_CONSENSUS), judged)
     status = torch.where((status == Status.OK) | (status == Status.AMBIGUOUS), judged, status)
     text = "the noise makes the points uncertain by {value:.2g} of the size of the scene; add views, points or motion"
     note(NoticeCode.UNCERTAIN, text, doubt, solved & (doubt > UNCERTAIN) & doubt.isfinite())
@@ -237,7 +239,7 @@ def _noise_of(tracks: Tracks, motion: Motion, asked: Tensor) -> Tensor:
     some = tracks.subset(chosen)
     apart, status = least_squares(some, motion)
     counted = apart.isfinite()
-    mean = (apart.square().nansum((1, 2)) / spare(some, counted, motion).clamp(min=1)).sqrt() * _scale(some)
+    mean = (apart.square().nansum((1, 2)) / spare(some, counted, motion).clamp(min=1)).sqrt() * some.scale()
     # a model that loses points explains nothing
     whole = counted.flatten(1).sum(-1) >= 0.9 * (some.weights > 0).flatten(1).sum(-1)
     return left.index_copy(0, chosen, torch.where(failed(status) | ~whole, torch.inf, mean))
@@ -275,11 +277,9 @@ def _images(tracks: Tracks, scene: Scene, lifting: Lifting | None, noise: Tensor
     note(NoticeCode.COLLINEAR, text, thin, thin < THIN)
     if lifting is None or tracks.x.shape[-1] != 2:
         return
-    depth = (scene.structure[:, None] @ (scene.cameras @ lifting.lifts)[..., -1, :, None])[..., 0] * seen
-    front = torch.where(depth.sign().sum(-1, keepdim=True) < 0, -depth, depth)
-    behind = (front < 0).any(1).sum(-1)
+    count = behind(scene.cameras, scene.structure, lifting.lifts, tracks.weights).sum(-1)
     text = "{value:g} points are behind a camera or at infinity; noise, or tracks that do not follow the motion"
-    note(NoticeCode.BEHIND, text, behind, solved & (behind > 0))
+    note(NoticeCode.BEHIND, text, count, solved & (count > 0))
 
 
 def _bodies(scene: Scene, status: Tensor, noise: Tensor, solved: Tensor, note: Note) -> Tensor:
@@ -296,8 +296,3 @@ def _bodies(scene: Scene, status: Tensor, noise: Tensor, solved: Tensor, note: N
 
 def _unit(cameras: Tensor) -> Tensor:
     return cameras / cameras.flatten(2).norm(dim=-1)[..., None, None].clamp(min=torch.finfo(cameras.dtype).tiny)
-
-
-def _scale(tracks: Tracks) -> Tensor:
-    """Normalized unit over measured unit, ``(b,)``."""
-    return tracks.scales.square().mean(-1).sqrt()

@@ -54,6 +54,10 @@ class Tracks:
         x, weights, scales, transforms = (p[:, views] for p in (self.x, self.weights, self.scales, self.transforms))
         return Tracks(x, weights, scales, transforms, self.times[views], self.static)
 
+    def scale(self) -> Tensor:
+        """Normalized unit over measured unit, ``(b,)``, over all views."""
+        return self.scales.square().mean(-1).sqrt()
+
     def only(self, weights: Tensor) -> Tracks:
         """Other weights."""
         return replace(self, weights=weights)
@@ -149,8 +153,8 @@ def _from_subset(tracks: Tracks, invariant: GrassmannTensor, chosen: Tensor) -> 
     if views > len(invariant.profile):
         whole = resect(structure, tracks.x, tracks.weights)
         whole = whole.scatter(1, chosen[..., None, None].expand(-1, -1, *some.shape[2:]), some)
-        structure = triangulate(whole, tracks.x, tracks.weights)
-        lost = ((whole == 0).flatten(2).all(-1) & (tracks.weights > 0).any(-1)).any(-1)
+        whole, structure = _grown(tracks, whole)
+        lost = _unknown(tracks, whole).any(-1)
         status = torch.where(lost & (status == Status.OK), int(Status.DEGENERATE), status)
     else:
         order = chosen.argsort(1)
@@ -158,3 +162,36 @@ def _from_subset(tracks: Tracks, invariant: GrassmannTensor, chosen: Tensor) -> 
     adjusted = bundle_adjust(tracks.x, tracks.weights, whole, structure, iterations=FREE, tolerance=ROUGH)
     bad = failed(status)[:, None, None]
     return Projections(torch.where(bad[..., None], 0.0, adjusted.cameras), torch.where(bad, 0.0, adjusted.structure), status)
+
+
+def _grown(tracks: Tracks, whole: Tensor) -> tuple[Tensor, Tensor]:
+    """All views and points from some of them, in turns: tracks shorter than the recording lead from views to their neighbours.
+
+    Args:
+        tracks: flat batch.
+        whole: ``(b, views, l + 1, K)``, zero where a view is not known yet.
+    """
+    structure = triangulate(whole, tracks.x, _seen(tracks, whole))
+    missing = _unknown(tracks, whole)
+    left = (missing.any(-1) & (structure != 0).flatten(1).any(-1)).nonzero()[:, 0]
+    while len(left):
+        some, before = tracks.subset(left), missing[left]
+        # drift is adjusted away before it is built upon
+        seen = _seen(some, whole[left])
+        done = bundle_adjust(some.x, seen, whole[left], structure[left], iterations=FREE, tolerance=ROUGH)
+        more = torch.where(before[..., None, None], resect(done.structure, some.x, some.weights), done.cameras)
+        whole = whole.index_copy(0, left, more)
+        structure = structure.index_copy(0, left, triangulate(more, some.x, _seen(some, more)))
+        missing = _unknown(tracks, whole)
+        left = left[missing[left].any(-1) & (missing[left].sum(-1) < before.sum(-1))]
+    return whole, structure
+
+
+def _unknown(tracks: Tracks, whole: Tensor) -> Tensor:
+    """Views ``(b, views)`` that see something but are not known."""
+    return (whole == 0).flatten(2).all(-1) & (tracks.weights > 0).any(-1)
+
+
+def _seen(tracks: Tracks, whole: Tensor) -> Tensor:
+    """The weights of the views that are known."""
+    return tracks.weights * (whole != 0).flatten(2).any(-1)[..., None]

@@ -21,8 +21,17 @@ PLENTY = 6.0
 """Conditions per unknown of the projections from which on one outlier cannot hide.  Of 200 scenes of constant velocity in a plane
 with one outlier among 30, 60 and 100 points the rare alarm misses 40, 3.5, 0.5 %, the other one 12, 0.5, 0 % (space, 60, 100 and
 200 points: 60, 28 and 8 %, 28, 8 and 0 %).  A false alarm costs the time of a robust search, fifty times that of a clean batch."""
+LOUD = 0.01
+"""Noise over the extent of the images from which on even residuals without extremes are looked into: where a fifth of the tracks
+are altogether wrong, least squares spreads the misfit over all."""
+TRUSTED = 0.7
+"""Share of the observations that agree from which on no more is asked: wrong ones may be spread over most of the tracks."""
 TRIMS, MOST = 2, 0.9
 """Times that observations are taken from the least squares scene, and share of them that has to stay."""
+WRONG = 2.0
+"""Threshold of points said to stand still over that of the others, above which they move."""
+TOLERANT = 4
+"""Coordinates of a point beyond its unknowns that make an accidental agreement of most observations impossible."""
 WIDTHS = (6.0, 3.0, 1.5, 1.0, 1.0)
 """Thresholds over the final one, while all views settle."""
 RESECTED = 10
@@ -52,7 +61,26 @@ def suspicious(tracks: Tracks, apart: Tensor, unknowns: Tensor | int, limit: flo
     used = views * (wide * size - 1) - (size * size - 1)
     plenty = size <= 5 and int(free.sum(-1).min()) >= PLENTY * used
     share = (RARE if plenty else ALARMS) / max(1, apart.shape[-1])
-    return (square > sigma.square()[:, None] * bound(free, 1 - share)).logical_and(free >= 1).any(-1)
+    loud = sigma * tracks.scales.amax(1) > LOUD
+    return loud | (square > sigma.square()[:, None] * bound(free, 1 - share)).logical_and(free >= 1).any(-1)
+
+
+def unfounded(tracks: Tracks, apart: Tensor, unknowns: Tensor) -> Tensor:
+    """The points ``(b, n)`` said to stand still that fit by far the worst: they move.
+
+    Args:
+        tracks: flat batch, with ``static``.
+        apart: ``(b, views, n)`` reprojection distances, NaN = missing.
+        unknowns: of every point, ``(b, n)``.
+    """
+    assert tracks.static is not None
+    square = apart.square().nansum(1)
+    free = (apart.isfinite().sum(1) * tracks.x.shape[-1] - unknowns).clamp(min=0)
+    sigma = torch.maximum(noise(square, free, free >= 1), EXACT / tracks.scales.amin(1))
+    excess = torch.where(
+        tracks.static, square / (sigma.square()[:, None] * bound(free)).clamp(min=torch.finfo(sigma.dtype).tiny), 0.0
+    )
+    return (excess > WRONG**2) & (excess >= excess.amax(-1, keepdim=True) / 2)
 
 
 def trimmed(tracks: Tracks, scene: Scene, lifting: Lifting, unknowns: Tensor, limit: float | None) -> tuple[Scene, Tracks, Tensor]:
@@ -102,7 +130,9 @@ def robust_projections(
         cameras = _structured(tracks, cameras, lifting, sigma, given)
         sigma = _level(tracks, cameras, sigma, given)
     fewer = tracks.only(agreeing(tracks, cameras, sigma))
-    doubt = doubtful(tracks, distance(tracks, cameras), sigma, invariant)
+    kept = (fewer.weights > 0).flatten(1).sum(-1) / (tracks.weights > 0).flatten(1).sum(-1).clamp(min=1)
+    ample = tracks.x.shape[1] * tracks.x.shape[-1] >= cameras.shape[-1] + TOLERANT
+    doubt = doubtful(tracks, distance(tracks, cameras), sigma, invariant) & ~((kept >= TRUSTED) & ample)
     status = torch.where(doubt, int(Status.NO_CONSENSUS), int(Status.OK))
     return Projections(cameras, triangulate(cameras, fewer.x, fewer.weights, steps=2), status), fewer
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.algebra.lift import balanced, balanced_algebra, upgrade
-from dyntorch.algebra.lift_frames import centred, finite, moved, steady
+from dyntorch.algebra.lift_frames import behind, centred, finite, moved, steady
 from dyntorch.algebra.triangulation import reproject, resect, triangulate
 from dyntorch.bundle_adjustment import bundle_adjust
 from dyntorch.motions import Motion
@@ -27,6 +27,8 @@ SPARE = 6
 minimum in up to 18 with 5 views and 1 with 6, in none with 7, 8 and 12."""
 FRAMES, UNAIDED = 3, 6
 """Starts from the scene at rest, at most: next to that from the tensor, and without one."""
+BEHIND = 0.05
+"""Share of points behind cameras from which on a scene is not believed: wrong minima have a tenth to a half of them there."""
 AIDED = {2: 6, 3: 12}
 """Points known to stand still and seen by all views, half as many more as determine the cameras, from which on they do: in a plane
 and in space."""
@@ -108,9 +110,19 @@ def scene_of(tracks: Tracks, found: Projections, lifting: Lifting, scale: Tensor
     scene = Scene(scene.cameras, scene.structure, torch.where(lost, torch.inf, scene.cost))
     spare = (coordinates * known).sum(-1) - (size - 1) * known.sum(-1)
     shaky = ~lost & (size >= SEVERAL) & (spare <= SPARE * known.sum(-1))
+    shaky = shaky | (~lost & wild(tracks, _finite(tracks, scene, lifting), lifting))
     unaided = (found.status == Status.TOO_FEW) & (spare > _unknown(lifting, tracks))
     left = (shaky | unaided | aided).nonzero()[:, 0] if lifting.still.shape[-1] else lost.new_zeros(0, dtype=torch.long)
     return _confirmed(tracks, scene, left, known, lifting, scale) if len(left) else scene
+
+
+def wild(tracks: Tracks, scene: Scene, lifting: Lifting) -> Tensor:
+    """Problems ``(b,)`` with so many points behind cameras that the scene, in a finite frame, is that of a wrong minimum."""
+    if tracks.x.shape[-1] != 2:
+        return torch.zeros_like(scene.cost, dtype=torch.bool)
+    known = (scene.structure != 0).any(-1)
+    count = (behind(scene.cameras, scene.structure, lifting.lifts, tracks.weights) & known).sum(-1)
+    return count > (BEHIND * known.sum(-1)).clamp(min=2)
 
 
 def _aided(tracks: Tracks, lifting: Lifting) -> Tensor:
@@ -209,8 +221,8 @@ def framed(tracks: Tracks, scene: Scene, lifting: Lifting) -> Scene:
     """
     lifts, static = lifting.lifts, tracks.static
     known = (scene.structure != 0).any(-1)
-    G, cameras, structure = finite(scene.cameras, scene.structure, lifts, lifting.algebra, tracks.weights)
-    cameras, structure = moved(G, cameras, structure, lifts)
+    scene = _finite(tracks, scene, lifting)
+    cameras, structure = scene.cameras, scene.structure
     weights = known if static is None else torch.where((known & static).any(-1, keepdim=True), known & static, known)
     G = steady(structure, lifts, lifting.middle, lifting.algebra, weights.to(structure.dtype))
     cameras, structure = moved(G, cameras, structure, lifts)
@@ -220,6 +232,12 @@ def framed(tracks: Tracks, scene: Scene, lifting: Lifting) -> Scene:
     depth = structure @ lifts[0, -1]
     structure = structure / torch.where(depth.abs() > 1e-12, depth, 1.0)[..., None]
     return Scene(cameras / norm.clamp(min=torch.finfo(norm.dtype).tiny), structure, scene.cost)
+
+
+def _finite(tracks: Tracks, scene: Scene, lifting: Lifting) -> Scene:
+    """The scene in a frame in which all points are finite, if there is one."""
+    G, cameras, structure = finite(scene.cameras, scene.structure, lifting.lifts, lifting.algebra, tracks.weights)
+    return Scene(*moved(G, cameras, structure, lifting.lifts), scene.cost)
 
 
 def positions(structure: Tensor, lift: Tensor) -> Tensor:

@@ -15,14 +15,17 @@ from dyntorch.solution import Status, failed
 from dyntorch.tasks.lifted_bodies import bodies_of
 from dyntorch.tasks.lifted_diagnosis import diagnose, spare, unknowns
 from dyntorch.tasks.lifted_projections import Projections, Tracks, projections_of_tracks
-from dyntorch.tasks.lifted_robust import robust_projections, suspicious, trimmed
-from dyntorch.tasks.lifted_scene import Lifting, Scene, distances, framed, positions, scene_of, velocities
+from dyntorch.tasks.lifted_robust import robust_projections, suspicious, trimmed, unfounded
+from dyntorch.tasks.lifted_scene import Lifting, Scene, adjusted, distances, framed, positions, scene_of, velocities
+from dyntorch.tasks.notices import NoticeCode, notices
 from dyntorch.tasks.reconstruction import Reconstruction
 
 Part = TypeVar("Part", Projections, Scene)
 
 CHI_SQUARE = {2: 9.210, 3: 11.345, 4: 13.277}
 """99 % quantiles."""
+CORRECTIONS = 4
+"""Times that points said to stand still are looked at."""
 EXACT = 1e-18
 """Square of the noise, over that of the extent of the image, that exact data are taken to have."""
 
@@ -51,6 +54,8 @@ def solve(
     invariant = motion.tensor(min(views, motion.k + 1))
     found = projections_of_tracks(tracks, invariant)
     found, scene = _scene(tracks, found, lifting)
+    if lifting is not None and static is not None and not motion.static:
+        tracks, scene = _corrected(tracks, scene, lifting)
     free = unknowns(tracks, motion)
     doubt = suspicious(tracks, _distances(tracks, scene, lifting), free, limit) | failed(found.status)
     chosen = doubt.nonzero()[:, 0] if limit != float("inf") else doubt.nonzero()[:0, 0]
@@ -66,7 +71,23 @@ def solve(
         tracks = tracks.only(tracks.weights.index_copy(0, chosen, fewer.weights))
         found = _merged(found, some, chosen)
         scene = _merged(scene, again, chosen)
-    return _result(tracks, motion, lifting, found, scene, batch)
+    return _result(tracks, motion, lifting, found, scene, static, batch)
+
+
+def _corrected(tracks: Tracks, scene: Scene, lifting: Lifting) -> tuple[Tracks, Scene]:
+    """The scene without points said to stand still that move, a few at a time, and the tracks with the others."""
+    for _ in range(CORRECTIONS):
+        assert tracks.static is not None
+        wrong = unfounded(tracks, _distances(tracks, scene, lifting), unknowns(tracks, lifting.motion))
+        left = (wrong.any(-1) & scene.cost.isfinite()).nonzero()[:, 0]
+        if not len(left):
+            break
+        tracks = replace(tracks, static=tracks.static & ~wrong)
+        some = tracks.subset(left)
+        structure = triangulate(scene.cameras[left] @ lifting.lifts, some.x, some.weights)
+        again = adjusted(some, Scene(scene.cameras[left], structure, scene.cost[left]), lifting)
+        scene = _merged(scene, again, left)
+    return tracks, scene
 
 
 def _scene(tracks: Tracks, found: Projections, lifting: Lifting | None) -> tuple[Projections, Scene]:
@@ -100,6 +121,7 @@ def _result(
     lifting: Lifting | None,
     found: Projections,
     scene: Scene,
+    given: Tensor | None,
     batch: tuple[int, ...],
 ) -> Reconstruction:
     """Frame, labels, residuals and notices of solved problems, in the caller's batch."""
@@ -114,7 +136,8 @@ def _result(
         known = (scene.structure != 0).any(-1)
         labels = torch.where(known, 2, 0)
         if tracks.static is not None:
-            labels = torch.where(known & (tracks.static | _rests(tracks, scene, lifting, projections)), 1, labels)
+            rests = tracks.static.any(-1, keepdim=True) & _rests(tracks, scene, lifting, projections)
+            labels = torch.where(known & (tracks.static | rests), 1, labels)
         status = found.status
         cameras, structure = scene.cameras, scene.structure @ lifting.back.mT
         points = positions(scene.structure, lifting.start)
@@ -127,6 +150,10 @@ def _result(
     back = torch.linalg.inv(tracks.transforms)
     bad = failed(status)
     status, warnings = diagnose(tracks, scene, lifting, motion, status, sigma, batch)
+    if given is not None and tracks.static is not None:
+        wrong = (given & ~tracks.static).sum(-1)
+        text = "{value:g} points given as static move, and are taken as moving; take them off static="
+        warnings += tuple(notices(NoticeCode.STATIC_MOVES, text, wrong, wrong > 0, batch))
     bad = failed(status)
 
     def shaped(value: Tensor, none: float = 0.0) -> Tensor:
@@ -148,7 +175,7 @@ def _result(
         projections=shaped(_unit(back @ (projections if lifting is None else projections @ lifting.root))),
         inliers=shaped(counted),
         times=tracks.times,
-        ambiguity=_open(motion, tracks.static),
+        ambiguity=_open(motion, tracks.times, tracks.static),
         warnings=warnings,
         bodies=None if bodies is None else shaped(_unit(back[:, None] @ bodies)),
     )
@@ -176,10 +203,11 @@ def _unit(cameras: Tensor) -> Tensor:
     return cameras / cameras.flatten(-2).norm(dim=-1)[..., None, None].clamp(min=torch.finfo(cameras.dtype).tiny)
 
 
-def _open(motion: Motion, static: Tensor | None) -> str:
+def _open(motion: Motion, times: Tensor, static: Tensor | None) -> str:
     """What the tracks cannot tell."""
-    if motion.lift is None or motion.static:
-        return f"known up to {motion.leaves_open}" if motion.leaves_open else ""
+    text = motion.open_text(times)
+    if motion.lift is None or motion.static or motion.k == motion.dim:
+        return f"known up to {text}" if text else ""
     if static is not None:
-        return f"known up to {motion.leaves_open}; the given static points fix the common motion"
-    return f"known up to {motion.leaves_open}; without static points the frame is the one in which the points move least"
+        return f"known up to {text}; the given static points fix the common motion"
+    return f"known up to {text}; without static points the frame is the one in which the points move least"

@@ -38,6 +38,8 @@ class NoticeCode(StrEnum):
     """The lines only translate: the motion is known up to a family, unless static points fix it."""
     STATIC_SCENE = "static_scene"
     """Nothing moves: the model leaves more than its tensor."""
+    STATIC_MOVES = "static_moves"
+    """Points given as static that move."""
     TURNING_CAMERA = "turning_camera"
     """The centres of all cameras are one point."""
     UNIFORM_CAMERA = "uniform_camera"

@@ -19,13 +19,20 @@ from dyntorch.tasks.lifted_solver import solve
 from dyntorch.tasks.notices import NoticeCode, notices
 from dyntorch.tasks.reconstruction import Reconstruction
 
+ROUNDED = 1e-3
+"""Rounding of the times over the spacing of the views that is too much."""
+FRAME = 1 / 16
+"""Rounding below which whole numbers are frames, exact, rather than rounded."""
+FAR = (1e4, 1e9)
+"""Distance of the times from 0 over their span from which the points at time 0 are noise: float32 tracks, float64."""
+
 
 def reconstruct(
     tracks: Tensor,
     motion: str | Motion,
     times: Tensor | Sequence[float] | None = None,
     *,
-    static: Tensor | None = None,
+    static: Tensor | Sequence[bool] | None = None,
     threshold: float | None = None,
     weights: Tensor | None = None,
     generator: torch.Generator | None = None,
@@ -36,12 +43,12 @@ def reconstruct(
     space :math:`P^k`, and a camera at time t a projection :math:`M = P\,B(t)` of it.  The Grassmann tensor of a few views is
     estimated linearly and constrained, the projections follow from it in closed form, all other views by resection; the known
     B(t) then fix the frame of :math:`P^k` up to an ambiguity of the scene, linearly, and bundle adjustment over all views ends
-    it.  Where matches disagree, all of this is done robustly.
+    it.  Where matches disagree, all of this is done robustly.  The results carry no gradients.
 
     Args:
-        tracks: ``(*batch, views, n, 2)`` pixels (3D sensors: ``(*batch, views, n, 3)``), NaN = missing.
+        tracks: ``(*batch, views, n, 2)`` pixels (3D sensors: ``(*batch, views, n, 3)``), NaN or infinite = missing.
         motion: a name in ``dyntorch.motions.MOTIONS``, a :class:`dyntorch.Motion` (any lift B(t)), or ``"auto"``: the declared
-            models are tried and the one of least penalized cost is taken.
+            models are tried and the one of least penalized cost is taken, one for the whole batch.
 
             ============================== ======== ===== =======================================================
             model                          views    n     the points
@@ -56,9 +63,11 @@ def reconstruct(
             two_bodies_2d, two_bodies_3d   2, 3     9, 14 belong to two bodies in relative translation, in any steps
             ============================== ======== ===== =======================================================
 
-        times: of the views, any unit and spacing; default 0, 1, 2, ...
+            The tensor of two bodies needs 8 and 13 tracks, the pair of hyperplanes that tells them apart 9 and 14.
+        times: of the views, any unit and spacing; default 0, 1, 2, ...  Far from 0 the points at time 0 lose digits: count from the
+            first view.
         static: ``(*batch, n)`` bool, points known to stand still: they fix the motion common to all points, which no view can
-            tell; without them the frame is the one in which the points move least.
+            tell; without them, or with none True, the frame is the one in which the points move least.
         threshold: three standard deviations of the noise of one coordinate, in the unit of the tracks.  None estimates it from the
             tracks; infinity declares that there are no outliers.
         weights: ``(*batch, views, n)`` not negative; 0 leaves an observation out.
@@ -70,7 +79,8 @@ def reconstruct(
         remaining ``ambiguity`` in words.
 
     Raises:
-        ValueError: fewer views or tracks than the model needs, equal times, tracks of another shape, an unknown model.
+        ValueError: fewer views or tracks than the model needs, times that are equal or that the precision does not resolve, tracks
+            of another shape, an unknown model, a lift that is not finite or of too low a rank.
 
     Source: thesis chapter 3 and section 8.3; Wolf and Shashua 2002; Hartley and Schaffalitzky 2004.
 
@@ -86,7 +96,11 @@ def reconstruct(
         (True, True)
     """
     model = None if motion == "auto" else as_motion(motion)
+    if generator is not None and not isinstance(generator, torch.Generator):
+        raise ValueError(f"generator must be a torch.Generator or None, got {generator!r}; use torch.Generator().manual_seed(...)")
     moment, x, w, batch = _checked(tracks, times, weights)
+    if model is None or _moves(model):
+        _resolved(moment, times, tracks.dtype)
     label = _static(static, batch, x)
     limit = _limit(threshold)
     with torch.no_grad():
@@ -110,13 +124,7 @@ def _checked(
     if tracks.ndim < 3 or tracks.shape[-1] not in (2, 3):
         raise ValueError(f"tracks must be (*batch, views, n, 2), or (..., 3) of 3D sensors, got {tuple(tracks.shape)}")
     batch, (views, n, dim) = tuple(tracks.shape[:-3]), tracks.shape[-3:]
-    try:
-        moment = torch.arange(views) if times is None else torch.as_tensor(times).detach().cpu()
-    except (TypeError, ValueError, RuntimeError):
-        moment = torch.empty(0)
-    moment = moment.double()
-    if moment.shape != (views,) or not bool(moment.isfinite().all()):
-        raise ValueError(f"times must be {views} finite numbers, one per view, got {times!r}")
+    moment = _times(times, views, n)
     w = torch.ones_like(tracks[..., 0]) if weights is None else weights
     if not isinstance(w, Tensor) or not _expands(w, (*batch, views, n)):
         given = tuple(w.shape) if isinstance(w, Tensor) else type(w).__name__
@@ -126,6 +134,42 @@ def _checked(
     x, w = observed(tracks.detach(), w.detach().expand(*batch, views, n))
     count = math.prod(batch)
     return moment, x.reshape(count, views, n, dim), w.reshape(count, views, n), batch
+
+
+def _times(times: Tensor | Sequence[float] | None, views: int, n: int) -> Tensor:
+    """One time per view, float64."""
+    try:
+        moment = torch.arange(views) if times is None else torch.as_tensor(times, dtype=torch.float64).detach().cpu()
+    except (TypeError, ValueError, RuntimeError):
+        moment = torch.empty(0)
+    if moment.shape != (views,) or not bool(moment.isfinite().all()):
+        swapped = "; tracks are (*batch, views, n, 2); yours look transposed" if moment.shape == (n,) and n != views else ""
+        raise ValueError(f"times must be {views} finite numbers, one per view, got {times!r}{swapped}")
+    return moment.double()
+
+
+def _resolved(moment: Tensor, times: Tensor | Sequence[float] | None, dtype: torch.dtype) -> None:
+    """Refuse times that were rounded before they came here, and those so far from 0 that the points at time 0 would be noise."""
+    if not len(moment):
+        return
+    furthest, different = float(moment.abs().max()), moment.unique()
+    kind = torch.as_tensor(times).dtype if hasattr(times, "dtype") else torch.float64
+    if kind.is_floating_point and kind != torch.float64:
+        rounding = torch.finfo(kind).eps / 2 * furthest
+        spacing = float(different.diff().median()) if len(different) > 1 else 1.0
+        frames = bool((moment == moment.round()).all()) and rounding < FRAME
+        if rounding > ROUNDED * spacing and not frames:
+            raise ValueError(
+                f"times of {kind} near {furthest:g} are rounded by up to {rounding:.2g}, for views {spacing:.2g} apart; "
+                "give them as float64 (.double() before anything is added), or count them from the first view"
+            )
+    span = float(different[-1] - different[0])
+    far = FAR[dtype == torch.float64]
+    if span and furthest > far * span:
+        raise ValueError(
+            f"times reach {furthest:g}, {furthest / span:.2g} times what they span: in {dtype} the points at time 0 would be noise "
+            f"(limit {far:.0e}); count times from the first view"
+        )
 
 
 def _expands(tensor: Tensor, shape: tuple[int, ...]) -> bool:
@@ -138,7 +182,7 @@ def _expands(tensor: Tensor, shape: tuple[int, ...]) -> bool:
 
 def _limit(threshold: float | None) -> float | None:
     try:
-        value = None if threshold is None else float(threshold)
+        value = None if threshold is None else math.nan if isinstance(threshold, bool) else float(threshold)
     except (TypeError, ValueError, RuntimeError):
         value = math.nan
     if value is not None and not value > 0:
@@ -146,14 +190,19 @@ def _limit(threshold: float | None) -> float | None:
     return value
 
 
-def _static(static: Tensor | None, batch: tuple[int, ...], x: Tensor) -> Tensor | None:
+def _static(static: Tensor | Sequence[bool] | None, batch: tuple[int, ...], x: Tensor) -> Tensor | None:
+    """Flat, or None where no point is known to stand still."""
     if static is None:
         return None
     n = x.shape[2]
-    if not isinstance(static, Tensor) or static.dtype != torch.bool or not _expands(static, (*batch, n)):
-        got = f"{tuple(static.shape)} {static.dtype}" if isinstance(static, Tensor) else type(static).__name__
+    try:
+        known = torch.as_tensor(static, device=x.device)
+    except (TypeError, ValueError, RuntimeError):
+        known = torch.empty(0)
+    if known.dtype != torch.bool or not _expands(known, (*batch, n)):
+        got = type(static).__name__ if known.shape == (0,) else f"{tuple(known.shape)} {known.dtype}"
         raise ValueError(f"static must be a bool tensor (*batch, n) = {(*batch, n)}, got {got}")
-    return static.expand(*batch, n).reshape(len(x), n)
+    return known.expand(*batch, n).reshape(len(x), n) if bool(known.any()) else None
 
 
 def normalized(x: Tensor, weights: Tensor, times: Tensor) -> Tracks:
@@ -180,16 +229,23 @@ def _resection(model: Motion) -> int:
     return -(-((model.sensor + 1) * (model.k + 1) - 1) // model.sensor)
 
 
+def _moves(model: Motion) -> bool:
+    """Whether the times matter: there are constants that only views at different times tell."""
+    return model.lift is not None and not model.static and model.k > model.dim
+
+
 def _enough(model: Motion, times: Tensor, x: Tensor) -> None:
     """Refuse what no problem of this shape can be solved from."""
     views, n, dim = x.shape[1:]
     if dim != model.sensor:
         kind = "3D sensors" if model.sensor == 3 else "images"
         raise ValueError(f"{model.name!r} takes tracks of {kind}, (*batch, views, n, {model.sensor}), got {tuple(x.shape[1:])}")
-    moves, different = not model.static and model.lift is not None, len(times.unique())
+    moves, different = _moves(model), len(times.unique())
     if moves and views > 1 and different == 1:
         raise ValueError(f"all times are {float(times[0]):g}: views at different times are needed to see a motion; give times=")
     many = torch.arange(12, dtype=torch.float64)
+    if model.shift is None and different > 1:  # the lift may make sense between the views only
+        many = torch.linspace(float(times.min()), float(times.max()), 12, dtype=torch.float64)
     usual = model.views(many)
     if usual > len(many):
         raise ValueError(f"no number of views determines {model.name!r}: its lift leaves constants of the points unseen")
@@ -215,7 +271,7 @@ def _noted(found: Reconstruction, static: Tensor | None, used: Tensor) -> Recons
     if static is not None and found.velocities is not None and not found.motion.static:
         given = static & found.points.reshape(*static.shape, found.points.shape[-1]).isfinite().all(-1)
         text = "{value:g} of the static points have a position: the motion common to all points is not fixed"
-        notes += notices(NoticeCode.COMMON_VELOCITY, text, given.sum(-1), good & ~given.any(-1), tuple(batch))
+        notes += notices(NoticeCode.COMMON_VELOCITY, text, given.sum(-1), good & static.any(-1) & ~given.any(-1), tuple(batch))
     seen = used.reshape(*batch, used.shape[-1])
     warnings = tuple(sorted((*found.warnings, *notes), key=lambda notice: notice.problem))
     bodies = None if found.bodies is None else found.bodies * seen[..., None, :, None, None]

@@ -21,9 +21,11 @@ class Ranked(NamedTuple):
 
     motion: str
     score: float
-    """Penalized cost, less is better; infinite where the model failed."""
+    """Penalized cost, less is better; infinite where the model failed or was not tried."""
     residual: float
-    """Rms reprojection error in the unit of the tracks."""
+    """Rms reprojection error in the unit of the tracks; NaN where there is none."""
+    reason: str = ""
+    """Why it was not tried; empty where it was."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -50,7 +52,8 @@ class Reconstruction:
         ambiguity: a sentence: what the tracks cannot tell, even without noise.
         warnings: notices on single problems of the batch.
         bodies: cameras of both bodies, ``(*batch, 2, views, l + 1, d + 1)``; None without.
-        candidates: the models that were tried, best first, where the model was to be chosen.
+        candidates: where the model was to be chosen, the models that were tried, best first, and those that could not be, with the
+            reason.
     """
 
     motion: Motion
@@ -128,8 +131,10 @@ class Reconstruction:
             lines.append(f"  residual: {middle:.3g} rms" + (" (median)" if self.status.ndim else ""))
         if self.candidates:
             best = self.candidates[0].score
-            others = ", ".join(f"{c.motion} (+{c.score - best:.0f})" for c in self.candidates[1:4])
+            tried = [c for c in self.candidates[1:] if not c.reason]
+            others = ", ".join(f"{c.motion} (+{c.score - best:.0f})" for c in tried[:3])
             lines.append(f"  chosen by a penalized cost of {best:.0f}; then {others or 'no other'}")
+            lines += [f"  not tried: {c.motion} ({c.reason})" for c in self.candidates if c.reason]
         if self.ambiguity:
             lines.append(f"  {self.ambiguity}")
         if self.status.ndim:

@@ -100,6 +100,23 @@ def test_motion_of_ones_own():
     assert as_motion(motion) is motion and motion.minimal((1.0, 4.0, 9.0)) == (3, 7)
 
 
+def test_what_a_lift_leaves_open_in_words():
+    assert Motion(polynomial(2, 2)).open_text(TIMES) == "an ambiguity of 8 dimensions that the lift leaves open"
+    assert Motion(polynomial(2, 2), leaves_open="little").open_text(TIMES) == "little"
+    assert Motion(None, k=4, bodies=2).open_text(TIMES) == ""
+
+
+def test_as_many_constants_as_coordinates_are_a_static_model():
+    motion = Motion(polynomial(2, 0), "rigid")
+    assert motion.k == motion.dim == 2 and motion.minimal((0.0, 1.0)) == (2, 4) and motion.ambiguity((0.0, 1.0)) == 8
+
+
+def test_lifts_are_good_far_from_0():
+    for degree in (1, 2):
+        motion = Motion(polynomial(2, 2, degree))
+        assert motion.lifts([1.7e9, 1.7e9 + 1]).isfinite().all() and len(motion.centred([1.7e9])[0]) == 1
+
+
 def test_polynomial_lifts():
     torch.testing.assert_close(polynomial(3, 0)(torch.tensor(5.0)), torch.eye(4, dtype=torch.float64))
     B = polynomial(2, 2, 3)(torch.tensor(2.0))
@@ -113,6 +130,11 @@ def test_polynomial_lifts():
         (lambda: Motion(lambda t: torch.zeros(4, 3), "tall"), r"lift of 'tall' must return a tensor \(d \+ 1, K\) .*got \(4, 3\)"),
         (lambda: Motion(lambda t: [1.0]), r"lift of 'custom' .*got list"),
         (lambda: Motion(lambda t: t), r"got \(\)"),
+        (lambda: Motion("x"), r"lift must be a function of one time, got 'x'"),
+        (lambda: Motion(lambda t: torch.full((3, 4), math.nan), "lost"), r"lift of 'lost' is not finite at time 0"),
+        (lambda: Motion(lambda t: torch.zeros(3, 4), "none"), r"lift of 'none' must have rank d \+ 1 = 3, got 0 at time 0"),
+        (lambda: Motion(lambda t: torch.eye(3, 4) + 0j, "turn"), r"lift of 'turn' must be real, got torch.complex"),
+        (lambda: Motion(lambda t: torch.eye(3, 4 + int(t)), "grow").lifts((0.0, 1.0)), r"'grow' has another shape, \(3, 5\)"),
         (lambda: as_motion("constant_jerk"), r"motion must be .*constant_velocity_3d.*got 'constant_jerk'"),
         (lambda: MOTIONS["two_bodies_3d"].lifts((0.0, 1.0)), r"'two_bodies_3d' has no lift"),
     ],

@@ -11,7 +11,7 @@ import dyntorch as dyn
 from dyntorch import scenes
 from dyntorch.motions import MOTIONS
 from dyntorch.solution import Status
-from dyntorch.tasks.lifted_choice import LABEL, OUTLIER, Fit, least, penalized
+from dyntorch.tasks.lifted_choice import LABEL, OUTLIER, Fit, _lacks, least, penalized
 from dyntorch.tasks.reconstruct import normalized
 
 
@@ -37,6 +37,19 @@ def test_formula() -> None:
     expected = 10 * min(3.0, OUTLIER * 2) - 3.0 + OUTLIER * 2 + 10 * 4 * math.log(6) + (24 - 8) * math.log(60)
     assert abs(float(found) - expected) < 1e-9
     assert math.log(2) > LABEL
+
+
+def test_models_that_were_not_tried_say_why() -> None:
+    scene = scenes.lifted("constant_direction_2d", 30, views=4, sigma=0.5, generator=torch.Generator().manual_seed(7))
+    found = dyn.reconstruct(scene.tracks, "auto", threshold=math.inf)
+    reasons = {one.motion: one.reason for one in found.candidates if one.reason}
+    assert reasons == {"constant_acceleration_2d": "needs 40 tracks", "constant_velocity_3d": "needs 40 tracks"}
+    assert "not tried: constant_velocity_3d (needs 40 tracks)" in repr(found)
+    assert all(one.score == math.inf for one in found.candidates if one.reason)
+    times = torch.tensor([0.0, 0.0, 1.0, 1.0], dtype=torch.float64)
+    assert _lacks(MOTIONS["constant_velocity_2d"], times, 4, 30) == "needs views at 3 different times"
+    assert _lacks(MOTIONS["constant_velocity_3d"], times[:2], 2, 30) == "needs 4 views"
+    assert _lacks(MOTIONS["static_3d"], times, 4, 30) == ""
 
 
 def test_fewest_tracks_of_two_bodies() -> None:

@@ -203,3 +203,37 @@ def test_one_wrong_track_is_found_without_losing_the_others() -> None:
     assert found.status == Status.OK
     assert not bool(found.inliers[1, 5]) and float(found.inliers.double().mean()) > 0.95
     assert float(metrics.lifted_error(found.structure, scene.structure, scene.lifts).position) < 0.05
+
+
+def test_a_moving_point_said_to_stand_still_is_named() -> None:
+    scene = scenes.lifted("constant_velocity_2d", 60, views=6, sigma=0.5, static=0.5, generator=draw(4))
+    given = (scene.labels == 1) & (scene.labels == 1).cumsum(-1).le(10)
+    wrong = int((scene.labels == 2).nonzero()[0])
+    given[wrong] = True
+    found = dyn.reconstruct(scene.tracks, "constant_velocity_2d", scene.times, static=given)
+    assert found.status == Status.OK and int(found.labels[wrong]) == 2
+    assert [w.value for w in found.warnings if w.code == "static_moves"] == [1.0]
+    assert float(error(found, scene)) < 0.01
+
+
+def test_tracks_shorter_than_the_recording_lead_from_view_to_view() -> None:
+    times = [0.4 * i for i in range(16)]
+    scene = scenes.lifted("constant_velocity_2d", 160, times=times, sigma=0.2, jitter=0.1, drift=2.0, generator=draw(2))
+    start = torch.randint(-3, 12, (160,), generator=draw(3))
+    frame = torch.arange(16)[:, None]
+    tracks = torch.where(((frame < start) | (frame >= start + 8))[..., None], torch.nan, scene.tracks)
+    found = dyn.reconstruct(tracks, "constant_velocity_2d", scene.times, threshold=math.inf)
+    assert found.status == Status.OK
+    assert float(metrics.lifted_error(found.structure, scene.structure, scene.lifts).position) < 0.05
+
+
+def test_wrong_observations_in_most_tracks_cost_only_themselves() -> None:
+    scene = scenes.lifted("constant_velocity_2d", 80, times=[0.5 * i for i in range(10)], sigma=0.5, generator=draw(1))
+    wrong = torch.rand(10, 80, generator=draw(4)) < 0.1
+    off = 100 * (torch.rand(10, 80, 2, generator=draw(6), dtype=F64) - 0.5)
+    tracks = torch.where(wrong[..., None], scene.tracks + off, scene.tracks)
+    found = dyn.reconstruct(tracks, "constant_velocity_2d", scene.times, threshold=1.5)
+    assert found.status == Status.OK
+    far = wrong & (off.norm(dim=-1) > 5)
+    assert not bool(found.inliers[far].any()) and float(found.inliers[~wrong].double().mean()) > 0.97
+    assert float(error(found, scene)) < 0.01
