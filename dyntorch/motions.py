@@ -19,6 +19,8 @@ STENCIL = ((-2, 1 / 12), (-1, -2 / 3), (1, 2 / 3), (2, -1 / 12))
 """Central differences of fourth order, exact for motions that are polynomials of the time."""
 STEP = 1e-2
 """Step of these differences over the mean spacing of the views."""
+RANK = 1e-13
+"""Relative singular value below which a row of a lift depends on the others."""
 
 
 @dataclass(frozen=True)
@@ -30,17 +32,20 @@ class Motion:
 
     Args:
         lift: B, takes one time (a scalar tensor) and returns ``(d + 1, K)``; the world has dimension d, the last row gives its
-            homogeneous coordinate.
+            homogeneous coordinate.  K = d + 1 leaves nothing to see in the motion: a static model, of points that stand still or
+            move in one known way.
         name: for messages.
         sensor: dimension of what a view measures, 2 for images, 3 for 3D sensors.
-        leaves_open: the ambiguity that remains, in words.
+        leaves_open: the ambiguity that remains, in words; by default :meth:`open_text` counts its dimensions.
         bodies: 2 for two bodies in relative translation at arbitrary steps, which need no lift (``k`` instead).
         k: dimension of the space of the constants, where there is no lift.
-        static: whether the points do not move at all.
-        shift: :math:`R(c)` with :math:`B(t + c) = B(t)\,R(c)`, where there is one: then times far from 0 lose no digits.
+        static: whether the points do not move at all: the times do not matter, no frame is chosen in which they move least.
+        shift: takes c and returns :math:`R(c)`, ``(K, K)`` float64, with :math:`B(t + c) = B(t)\,R(c)` for all t, where there is
+            one (for polynomials: :func:`polynomial_shift`): then times far from 0 lose no digits.
 
     Raises:
-        ValueError: a lift that does not return a matrix with more columns than rows, or neither lift nor k.
+        ValueError: a lift that does not return, at time 0, a finite real matrix of full rank with no fewer columns than rows, or
+            neither lift nor k.
 
     Source: thesis chapter 3.
 
@@ -68,11 +73,16 @@ class Motion:
         if self.lift is None and self.k < 2:
             raise ValueError(f"Motion takes a lift, or k >= 2 for bodies without one, got k={self.k}")
         if self.lift is not None:
+            if not callable(self.lift):
+                raise ValueError(f"lift must be a function of one time, got {self.lift!r}")
             matrix = self.lift(torch.zeros((), dtype=torch.float64))
             if not isinstance(matrix, Tensor) or matrix.ndim != 2 or not 2 <= matrix.shape[0] <= matrix.shape[1]:
                 got = tuple(matrix.shape) if isinstance(matrix, Tensor) else type(matrix).__name__
                 raise ValueError(f"the lift of {self.name!r} must return a tensor (d + 1, K) with K >= d + 1 > 1, got {got}")
+            if matrix.is_complex():
+                raise ValueError(f"the lift of {self.name!r} must be real, got {matrix.dtype}")
             object.__setattr__(self, "k", int(matrix.shape[1]) - 1)
+            self.centred([0.0])
 
     @property
     def dim(self) -> int:
@@ -80,21 +90,39 @@ class Motion:
         return self.k - 1 if self.lift is None else int(self._at(0.0).shape[0]) - 1
 
     def lifts(self, times: Tensor | Sequence[float]) -> Tensor:
-        """The lifts ``(views, d + 1, K)`` at these times, float64."""
+        """The lifts ``(views, d + 1, K)`` at these times, float64.
+
+        Raises:
+            ValueError: no lift, or one that changes its shape or is not finite.
+        """
         if self.lift is None:
             raise ValueError(f"{self.name!r} has no lift")
-        return torch.stack([self._at(float(t)) for t in times])
+        found = [self._at(float(t)) for t in times]
+        for time, matrix in zip(times, found, strict=True):
+            where = f"at time {float(time):g}; the positions at time 0 and the views need it"
+            if matrix.shape != found[0].shape:
+                raise ValueError(f"the lift of {self.name!r} has another shape, {tuple(matrix.shape)}, {where}")
+            if not bool(matrix.isfinite().all()):
+                raise ValueError(f"the lift of {self.name!r} is not finite {where}")
+        return torch.stack(found)
 
     def centred(self, times: Tensor | Sequence[float]) -> tuple[Tensor, Tensor, float]:
         """Lifts at times counted from c, ``(views, d + 1, K)``, the R with ``lifts(times) = centred @ R``, and c.
 
         c is the mean time where the motion has a :attr:`shift`, else 0.
+
+        Raises:
+            ValueError: a lift that loses a dimension of the world at one of these times.
         """
         moments = [float(t) for t in times]
-        if self.shift is None:
-            return self.lifts(moments), torch.eye(self.k + 1, dtype=torch.float64), 0.0
-        origin = sum(moments) / max(1, len(moments))
-        return self.lifts([t - origin for t in moments]), self.shift(origin), origin
+        origin = 0.0 if self.shift is None else sum(moments) / max(1, len(moments))
+        lifts = self.lifts([t - origin for t in moments])
+        # rows of norm 1: the unit of time does not matter
+        ranks = torch.linalg.matrix_rank(torch.nn.functional.normalize(lifts, dim=-1), rtol=RANK)
+        for time, rank in zip(moments, ranks.tolist(), strict=True):
+            if rank < lifts.shape[1]:
+                raise ValueError(f"the lift of {self.name!r} must have rank d + 1 = {lifts.shape[1]}, got {rank} at time {time:g}")
+        return lifts, torch.eye(self.k + 1, dtype=torch.float64) if self.shift is None else self.shift(origin), origin
 
     def slope(self, time: float, spacing: float = 1.0) -> Tensor:
         """The derivative of the lift by the time, ``(d + 1, K)``."""
@@ -132,6 +160,17 @@ class Motion:
     def ambiguity(self, times: Tensor | Sequence[float]) -> int:
         """Dimension of the ambiguity from views at these times; without a lift that of the projections, all collineations."""
         return (self.k + 1) ** 2 - 1 if self.lift is None else len(gauge_algebra(self.centred(times)[0])) - 1
+
+    def open_text(self, times: Tensor | Sequence[float]) -> str:
+        """The ambiguity from views at these times in words: :attr:`leaves_open`, or its dimension.
+
+        Example:
+            >>> Motion(polynomial(2, 1)).open_text([0.0, 1.0, 2.0])
+            'an ambiguity of 8 dimensions that the lift leaves open'
+        """
+        if self.leaves_open or self.lift is None:
+            return self.leaves_open
+        return f"an ambiguity of {self.ambiguity(times)} dimensions that the lift leaves open"
 
     def _at(self, time: float) -> Tensor:
         assert self.lift is not None
