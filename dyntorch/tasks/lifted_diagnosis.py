@@ -278,7 +278,7 @@ def _images(tracks: Tracks, scene: Scene, lifting: Lifting | None, noise: Tensor
     if lifting is None or tracks.x.shape[-1] != 2:
         return
     count = behind(scene.cameras, scene.structure, lifting.lifts, tracks.weights).sum(-1)
-    text = "{value:g} points are behind a camera or at infinity; noise, or tracks that do not follow the motion"
+    text = "{value:g} points behind a camera or at infinity; noise, or tracks that do not follow the motion"
     note(NoticeCode.BEHIND, text, count, solved & (count > 0))
 
 

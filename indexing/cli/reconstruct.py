@@ -75,14 +75,14 @@ class Reconstruct:
     """frames per second, where the file numbers frames: times are then in seconds"""
     static: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
     """names of points known to stand still, in a column id (or a column static, 0 or 1, in the table of the tracks)"""
-    threshold: Annotated[float | Literal["auto", "none"], tyro.conf.arg(metavar="T|auto|none")] = "auto"
+    threshold: Annotated[str, tyro.conf.arg(metavar="T|auto|none")] = "auto"
     """three times the noise of a coordinate, in the unit of the tracks; auto estimates it, none declares that all tracks fit"""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
     """where to write report.html, reconstruction.npz, reconstruction.json, points.csv and pictures; without it, print only"""
     frames: Annotated[str | None, tyro.conf.arg(metavar="N,N,...", help_behavior_hint="")] = None
-    """the views to take, by the number of their frame; all by default"""
+    """the views to take, by the number of their frame, or by their time where there is none; all by default"""
     key: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
-    """of an npz with several sequences, the one to take"""
+    """of an npz with several sequences or arrays, the one to take"""
     seed: int = 0
     """of the random samples"""
 
@@ -124,16 +124,30 @@ class Reconstruct:
         """Raise on flags that make no sense by themselves, before any file is read."""
         if not self.files:
             raise ValueError("no files; give a table of tracks with columns frame, id, x, y, an .npz, or a file for each view")
-        if isinstance(self.threshold, (int, float)) and not 0 < self.threshold < float("inf"):
-            raise ValueError(
-                f"--threshold must be a positive distance in the unit of the tracks, auto or none, got {self.threshold:g}"
-            )
+        self._limit()
         if self.fps is not None and not 0 < self.fps < float("inf"):
             raise ValueError(f"--fps must be a positive number of frames per second, got {self.fps:g}")
         if self.fps is not None and self.times is not None:
             raise ValueError("--fps and --times both give times; leave one away")
         if self.seed < 0:
             raise ValueError(f"--seed must be a whole number from 0, got {self.seed}")
+
+    def _limit(self) -> float | None:
+        """The threshold as the library takes it: None = estimated, inf = all tracks fit.
+
+        Raises:
+            ValueError: something else.
+        """
+        if self.threshold in ("auto", "none"):
+            return None if self.threshold == "auto" else math.inf
+        try:
+            limit = float(self.threshold)
+        except ValueError:
+            limit = math.nan
+        if not 0 < limit < math.inf:
+            said = "--threshold must be a positive distance in the unit of the tracks, auto or none"
+            raise ValueError(f"{said}, got {self.threshold}")
+        return limit
 
     def _timed(self, tracks: TrackSet) -> TrackSet:
         """The tracks with times that begin at 0, and what to say about them.
@@ -142,6 +156,8 @@ class Reconstruct:
             ValueError: other than one time per view.
         """
         import numpy as np
+
+        from indexing.readers.tracks import exact
 
         notes = []
         if self.times is not None:
@@ -156,9 +172,10 @@ class Reconstruct:
                 notes.append(f"times are {unit}, because the files have none; --times or --fps give others")
             else:
                 times = times / self.fps
-        if times[0] != 0:
-            notes.append(f"time 0 of the result is the first view, at {times[0]:g}")
-        return dataclasses.replace(tracks.seen(), times=times - times[0], notes=(*tracks.seen().notes, *notes))
+        timed = dataclasses.replace(tracks.seen(), times=times).since_first()
+        if timed.start != 0:
+            notes.append(f"time 0 of the result is the first view, at {exact(timed.start)}")
+        return dataclasses.replace(timed, notes=(*timed.notes, *notes))
 
     def _solve(self, tracks: TrackSet) -> Any:
         """The reconstruction, by the library.
@@ -170,14 +187,13 @@ class Reconstruct:
 
         import dyntorch
 
-        limit = {"auto": None, "none": float("inf")}.get(str(self.threshold), self.threshold)
         try:
             return dyntorch.reconstruct(
                 torch.from_numpy(tracks.values),
                 self.motion,
                 torch.from_numpy(tracks.times),
                 static=None if tracks.static is None else torch.from_numpy(tracks.static),
-                threshold=None if limit is None else float(limit),
+                threshold=self._limit(),
                 weights=None if tracks.weights is None else torch.from_numpy(tracks.weights),
                 generator=torch.Generator().manual_seed(self.seed),
             )
@@ -189,18 +205,29 @@ class Reconstruct:
 
         from dyntorch import Status
         from indexing.files import manifest
-        from indexing.report.reconstruction import ReconstructionReport
+        from indexing.report.reconstruction import ReconstructionReport, rested
+        from indexing.report.reconstruction_words import one
 
         status, name = Status(int(result.status)).name, result.motion.name
-        warnings = [(notice.code.value, notice.value, in_flags(notice.message)) for notice in result.warnings]
+        warnings = [(notice.code.value, notice.value, one(in_flags(notice.message))) for notice in result.warnings]
         notes = list(tracks.notes)
-        if status == "OK" and tracks.static is None and result.velocities is not None and not result.motion.static:
+        if (
+            status == "OK"
+            and (tracks.static is None or not tracks.static.any())
+            and result.velocities is not None
+            and not result.motion.static
+        ):
             notes.append(UNFIXED)
-        because = "; ".join(message for _, _, message in warnings[:2])
+        # that nothing fits is no consequence of what a notice says of the scene that fits best
+        because = "" if status == "NO_CONSENSUS" else "; ".join(message for _, _, message in warnings[:2])
         arrays = ("cameras", "points", "velocities", "labels", "residuals", "inliers", "structure", "projections")
         found: dict[str, Any] = {
             field: None if getattr(result, field) is None else getattr(result, field).numpy() for field in arrays
         }
+        found["velocities"] = rested(found["velocities"], found["points"], float(result.times.max() - result.times.min()))
+        if result.motion.static and result.motion.bodies == 1:
+            found["labels"] = found["labels"].clip(max=1)
+        limit = self._limit()
         return ReconstructionReport(
             title="What moves, and how" if status == "OK" else "The tracks do not decide",
             motion=(name, PURPOSE.get(name, "")),
@@ -212,8 +239,8 @@ class Reconstruct:
             ambiguity=in_flags(result.ambiguity),
             warnings=warnings,
             notes=notes,
-            candidates=[tuple(candidate) for candidate in result.candidates],
-            threshold=self.threshold if isinstance(self.threshold, (int, float)) else None,
+            candidates=[(tried.motion, tried.score, tried.residual, tried.reason) for tried in result.candidates],
+            threshold=None if limit == math.inf else limit,
             manifest=manifest({"command": "reconstruct", **dataclasses.asdict(self)}, inputs, self.seed, timings),
             bodies=result.motion.bodies,
             positions=torch.stack([result.at(float(moment)) for moment in result.times]).numpy(),
@@ -251,6 +278,8 @@ def in_flags(message: str) -> str:
 
 def show(report: ReconstructionReport) -> None:
     """Print the result."""
+    from indexing.report.reconstruction_words import heading, left_out
+
     counts = report.counts
     known = report.solved
     cells = [number if known or name == "missing" else "" for name, number in counts.items()]
@@ -258,14 +287,13 @@ def show(report: ReconstructionReport) -> None:
     row += [f"{report.residual:.3g}" if known else "", report.status.lower().replace("_", " ")]
     table(["motion", "views ", "tracks ", *(f"{name} " for name in counts), "rms residual ", "status"], [row])
     if report.candidates:
-        fitted = [(name, score, residual) for name, score, residual in report.candidates if math.isfinite(score)]
+        fitted = [(name, score, residual) for name, score, residual, _ in report.candidates if math.isfinite(score)]
         table(["model", "penalized cost ", "rms residual "], [[name, f"{s:.6g}", f"{r:.3g}"] for name, s, r in fitted])
-        failed = [name for name, score, _ in report.candidates if not math.isfinite(score)]
-        if failed:
-            say(f"note: failed, having too few views or tracks or none that decide: {', '.join(failed)}")
+        if failed := left_out(report.candidates):
+            say(f"note: {failed}")
     for note in report.notes:
         say(f"note: {note}")
     for code, _, message in report.warnings:
-        say(f"warning: {code.replace('_', ' ')}: {message}")
+        say(f"warning: {heading(code)}: {message}")
     if known and report.ambiguity:
         say(f"open: {report.ambiguity}")

@@ -20,10 +20,12 @@ from indexing.report.page import made_by, page
 from indexing.report.reconstruction_page import body, describe
 from indexing.report.reconstruction_scene import scene_picture
 from indexing.report.reconstruction_tracks import tracks_picture
+from indexing.report.reconstruction_words import Candidate
 
 FloatArray = NDArray[np.float64]
 
 FILES = ("report.html", "reconstruction.npz", "reconstruction.json", "points.csv", "tracks.png", "scene.png")
+ROUNDING = 1e-12
 LABELS = (("outlier", "static", "moving"), ("outlier", "body 1", "body 2"))
 
 
@@ -51,7 +53,7 @@ class ReconstructionReport:
         ambiguity: what the data cannot tell, even without noise.
         warnings: code, figure and message of each.
         notes: what a reader should know about the input, a sentence each.
-        candidates: name, penalized cost and residual of the models that were compared, best first.
+        candidates: name, penalized cost and residual of the models that were compared, best first, and why one was not tried.
         threshold: as given; None = estimated, or no outliers.
         bodies: 2 for two bodies.
         manifest: of :func:`indexing.files.manifest`.
@@ -76,7 +78,7 @@ class ReconstructionReport:
     ambiguity: str = ""
     warnings: Sequence[tuple[str, float, str]] = ()
     notes: Sequence[str] = ()
-    candidates: Sequence[tuple[str, float, float]] = ()
+    candidates: Sequence[Candidate] = ()
     threshold: float | None = None
     bodies: int = 1
     manifest: Mapping[str, Any] = field(default_factory=dict)
@@ -85,6 +87,11 @@ class ReconstructionReport:
     def solved(self) -> bool:
         """Whether there is a scene at all, good or doubtful."""
         return bool(np.isfinite(self.cameras).all() and np.abs(self.cameras).max() > 0 and self.found.any())
+
+    @property
+    def drawable(self) -> bool:
+        """Whether there is a scene worth a picture: of one that the data do not decide, it would only mislead."""
+        return self.solved and self.status == "OK"
 
     @property
     def found(self) -> NDArray[np.bool_]:
@@ -102,8 +109,10 @@ class ReconstructionReport:
         """What each point is: outlier, static, moving (or body 1, body 2), or missing, where too few views show it."""
         names = np.array(LABELS[self.bodies > 1])
         kinds = np.where(self.found, names[self.labels], "outlier")
-        seen = np.isfinite(self.tracks.values).all(axis=2).sum(axis=0)
-        few = seen * self.tracks.values.shape[2] < self.structure.shape[1] - 1  # than the unknowns of a point
+        given = np.isfinite(self.tracks.values).all(axis=2)
+        seen = (given if self.tracks.weights is None else given & (self.tracks.weights > 0)).sum(axis=0)
+        # no more coordinates than the unknowns of a point fit any camera, and so place none
+        few = seen * self.tracks.values.shape[2] <= self.structure.shape[1] - 1
         return [str(kind) for kind in np.where(few & ~self.found, "missing", kinds)]
 
     @property
@@ -124,7 +133,7 @@ def write_reconstruction(folder: str | Path, report: ReconstructionReport) -> Pa
     """
     where = files.prepare(folder)
     tracks = tracks_picture(report, LIGHT), tracks_picture(report, DARK)
-    scene = (scene_picture(report, LIGHT), scene_picture(report, DARK)) if report.solved else None
+    scene = (scene_picture(report, LIGHT), scene_picture(report, DARK)) if report.drawable else None
     summary = describe(report)
     html = page(
         report.title,
@@ -145,10 +154,12 @@ def write_reconstruction(folder: str | Path, report: ReconstructionReport) -> Pa
 
 
 def as_npz(report: ReconstructionReport) -> bytes:
-    """All arrays, without pickle: cameras, points, velocities, labels, residuals, inliers, structure, projections, times, ids."""
+    """All arrays, without pickle: cameras, points, velocities, labels, residuals, inliers, structure, projections, times, ids, and
+    ``first_time``, the time in the files of the first view, which ``times`` count from."""
     names = ("cameras", "points", "velocities", "labels", "residuals", "inliers", "structure", "projections", "times")
     arrays: dict[str, Any] = {name: getattr(report, name) for name in names if getattr(report, name) is not None}
     arrays |= {"tracks": report.tracks.values, "ids": np.array(report.tracks.ids), "status": np.array(report.status)}
+    arrays["first_time"] = np.array(report.tracks.start)
     stream = io.BytesIO()
     np.savez_compressed(stream, **arrays)
     return stream.getvalue()
@@ -162,6 +173,7 @@ def as_json(report: ReconstructionReport) -> dict[str, Any]:
         "motion": report.motion[0],
         "views": list(report.tracks.views),
         "times": report.times,
+        "first_time": report.tracks.start,
         "tracks": len(report.tracks.ids),
         "counts": report.counts,
         "residual": report.residual if report.solved else None,
@@ -169,11 +181,27 @@ def as_json(report: ReconstructionReport) -> dict[str, Any]:
         "threshold": report.threshold,
         "cameras": report.cameras if report.solved else None,
         "ambiguity": report.ambiguity,
-        "candidates": [{"motion": name, "score": score, "residual": residual} for name, score, residual in report.candidates],
+        "candidates": [
+            {"motion": name, "score": score, "residual": residual, "not_tried": reason or None}
+            for name, score, residual, reason in report.candidates
+        ],
         "warnings": [{"code": code, "value": value, "message": message} for code, value, message in report.warnings],
         "notes": list(report.notes),
         "manifest": report.manifest,
     }
+
+
+def rested(velocities: FloatArray | None, points: FloatArray, span: float) -> FloatArray | None:
+    """Velocities without what is nothing but rounding: ways, from first to last view, that are no part of the scene's size.
+
+    Example:
+        >>> rested(np.array([[1e-17, 0.0], [1e-3, 1e-17]]), np.array([[0.0, 0.0], [1.0, 2.0]]), 1.0).tolist()
+        [[0.0, 0.0], [0.001, 0.0]]
+    """
+    if velocities is None:
+        return None
+    size = float(np.nan_to_num(np.abs(points)).max(initial=0.0))
+    return np.where(np.abs(velocities) * span <= ROUNDING * size, 0.0, velocities)
 
 
 def points_csv(report: ReconstructionReport) -> str:

@@ -17,12 +17,13 @@ FloatArray = NDArray[np.float64]
 COLOURS = {"static": "#2f7fb8", "moving": "#e8741e", "body 1": "#2f7fb8", "body 2": "#e8741e", "outlier": "#8b949c"}
 WIDTH, FOOT, TITLE, TICKS = 10.2, 0.4, 0.3, 0.25  # inches
 SHOWN = 1500  # tracks drawn; more are a blot
+TANGLE, LONG = 60, 0.06  # paths drawn where half of them are longer than this share of the picture
 ROOM = 0.06  # around the points, of their extent
 
 
 def kinds_of(report: ReconstructionReport) -> NDArray[Any]:
-    """What every track is drawn as: its kind, or ``unlabelled`` where there is no scene."""
-    return np.array(report.kinds) if report.solved else np.full(len(report.tracks.ids), "unlabelled")
+    """What every track is drawn as: its kind, or ``unlabelled`` where no scene was decided on."""
+    return np.array(report.kinds) if report.drawable else np.full(len(report.tracks.ids), "unlabelled")
 
 
 def layout(boxes: list[tuple[FloatArray, FloatArray]], tall: float, edge: float, gap: float) -> tuple[Any, list[Any]]:
@@ -72,6 +73,31 @@ def limits(points: FloatArray, share: float = 1.0) -> tuple[FloatArray, FloatArr
     low, high = np.percentile(flat, 100 * (1 - share), axis=0), np.percentile(flat, 100 * share, axis=0)
     room = max(ROOM * float((high - low).max()), 1e-3 * float(np.abs(flat).max()), 1e-6)
     return low - room, high + room
+
+
+def around(paths: FloatArray, share: float) -> tuple[FloatArray, FloatArray]:
+    """Low and high ``(d,)`` around whole paths ``(views, n, d)``, from dot to arrow head, but for those that stray far away.
+
+    Example:
+        >>> starts = np.linspace(0.0, 1.0, 100)[:, None] * np.ones(2)
+        >>> low, high = around(np.stack([starts, starts + np.eye(100)[:, -1:]]), 0.99)  # the last one goes to (2, 2)
+        >>> high.round(2).tolist()
+        [2.12, 2.12]
+    """
+    low, high = limits(paths, share)
+    with np.errstate(invalid="ignore"):
+        near = ((paths > low - (high - low)) & (paths < high + (high - low))).all(axis=(0, 2))
+    return limits(paths[:, near]) if near.any() else (low, high)
+
+
+def sample(paths: FloatArray, box: tuple[FloatArray, FloatArray]) -> NDArray[np.intp]:
+    """Of paths ``(views, n, d)`` those to be drawn: all, or where long ones would tangle, every so many."""
+    count = paths.shape[1]
+    if count <= TANGLE:
+        return np.arange(count)
+    ways = np.linalg.norm(paths[-1] - paths[0], axis=-1)
+    long = float(np.nanmedian(ways)) > LONG * float((box[1] - box[0]).max()) if np.isfinite(ways).any() else False
+    return np.linspace(0, count - 1, TANGLE).round().astype(np.intp) if long else np.arange(min(count, SHOWN))
 
 
 def legend(figure: Any, kinds: NDArray[Any], theme: Theme) -> None:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from indexing.report.page import Card, Column, cards, details, escape, picture, section, settings, table
+from indexing.report.reconstruction_words import MEANING, heading, left_out
 
 if TYPE_CHECKING:
     from indexing.report.reconstruction import ReconstructionReport
@@ -33,8 +34,10 @@ def describe(report: ReconstructionReport) -> str:
     """The result in plain words."""
     number, views, counts = len(report.tracks.ids), len(report.tracks.views), report.counts
     if report.status != "OK":
-        start = f"The {number:,} tracks through {views} views do not decide what the scene is. {sentence(report.reason)}"
-        return start + " What follows is the best scene found, and not to be relied on." * report.solved
+        said = any(message in report.reason for _, _, message in report.warnings)  # then it is in the list that follows
+        start = f"The {number:,} tracks through {views} views do not decide what the scene is."
+        start += "" if said else f" {sentence(report.reason)}"
+        return start + " The numbers are those of the best scene found, and not to be relied on." * report.solved
     parts = [f"{counts[name]:,} {'are on ' if report.bodies > 1 else ''}{_verb(name)}" for name in list(counts)[:2] if counts[name]]
     if counts["outlier"]:
         parts.append(f"{counts['outlier']:,} do not fit")
@@ -61,7 +64,7 @@ def _headline(report: ReconstructionReport) -> list[Card]:
         return [*items, Card("Tracks", f"{number:,}", f"through {len(report.tracks.views)} views")]
     items += [Card(name.capitalize(), f"{counts[name]:,}", f"of {number:,} points") for name in list(counts)[:2] if counts[name]]
     single = int((np.isfinite(report.tracks.values).all(axis=-1) & ~report.inliers)[:, report.labels > 0].sum())
-    rest = f"of {number:,} points" + f", and {single:,} single observations left out" * bool(single)
+    rest = f"of {number:,} points" + f", and {single:,} single observation{'s' * (single > 1)} left out" * bool(single)
     rest += f"; {counts['missing']:,} seen too rarely" * bool(counts["missing"])
     items.append(Card("Outliers", f"{counts['outlier']:,}", rest))
     items.append(Card("Residual", f"{report.residual:.3g}", "rms distance from the tracks, in their unit"))
@@ -70,13 +73,14 @@ def _headline(report: ReconstructionReport) -> list[Card]:
 
 
 def _warnings(report: ReconstructionReport) -> str:
-    lines = [
-        f"<li><b>{escape(code.replace('_', ' ').capitalize())}.</b> {escape(sentence(text))}</li>"
-        for code, _, text in report.warnings
-    ]
+    lines = []
+    for code, _, text in report.warnings:
+        meant, refuses = MEANING.get(code, ""), text in report.reason
+        head = (
+            f'<b class="bad">Refused: {escape(heading(code))}.</b>' if refuses else f"<b>{escape(heading(code).capitalize())}.</b>"
+        )
+        lines.append(f"<li>{head} {escape(f'{sentence(text)} {meant}'.strip())}</li>")
     lines += [f"<li>{escape(sentence(note))}</li>" for note in report.notes]
-    if report.reason:
-        lines.insert(0, f'<li><b class="bad">Refused.</b> {escape(sentence(report.reason))}</li>')
     return section("Please note", f"<ul>{''.join(lines)}</ul>") if lines else ""
 
 
@@ -95,13 +99,13 @@ def _scene(report: ReconstructionReport, drawn: Drawn | None) -> str:
 
 
 def _tracks(report: ReconstructionReport, drawn: Drawn) -> str:
-    note = f"Every track{' by what it was found to be' * report.solved}, with a dot where it begins."
+    note = f"Every track{' by what it was found to be' * report.drawable}, with a dot where it begins."
     caption = (
         "On the right, the motion of the camera is taken out: what stands still is a dot, what moves keeps its own way."
-        if report.solved and report.velocities is not None
+        if report.drawable and report.velocities is not None
         else ""
     )
-    title = "The tracks" if report.solved else "The tracks as measured"
+    title = "The tracks" if report.drawable else "The tracks as measured"
     return section(title, picture(drawn[0], f"{len(report.tracks.ids)} tracks", dark=drawn[1], caption=caption), note)
 
 
@@ -111,11 +115,11 @@ def _models(report: ReconstructionReport) -> str:
     taken = ' <small class="none">taken</small>'
     rows = [
         [escape(name) + taken * (name == report.motion[0]), f"{score:.6g}", _figure(residual, ".3g", "")]
-        for name, score, residual in report.candidates
+        for name, score, residual, _ in report.candidates
         if np.isfinite(score)
     ]
-    failed = [name for name, score, _ in report.candidates if not np.isfinite(score)]
-    also = f" Too few views or tracks, or none that decide: {', '.join(failed)}." if failed else ""
+    failed = left_out(report.candidates)
+    also = f" {sentence(failed)}" if failed else ""
     columns = [Column("Model"), Column("Penalized cost", "number"), Column("Rms residual", "number")]
     note = "The model of least cost was taken. Unknowns cost, so that a model is not chosen for being able to bend more." + also
     return section("Which motion", table(columns, rows, caption="Models, best first"), note)

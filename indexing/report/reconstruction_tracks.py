@@ -23,7 +23,9 @@ def tracks_picture(report: ReconstructionReport, theme: Theme) -> bytes:
     kinds = kinds_of(report)
     measured = report.tracks.values[..., shown_axes(report.tracks.values)]
     still = as_first_camera(report)
-    panels: list[tuple[FloatArray, str]] = [(measured, f"as tracked, from {_named(report.tracks.views[0])} on")]
+    panels: list[tuple[FloatArray, str]] = [
+        (measured, f"as tracked, from {_named(report.tracks.views[0], report.tracks.by_time)} on")
+    ]
     if still is not None:
         panels.append((still[..., shown_axes(report.tracks.values)], "as the first camera would see it, standing still"))
     kept = [points[:, kinds != "missing"] for points, _ in panels]
@@ -38,8 +40,8 @@ def tracks_picture(report: ReconstructionReport, theme: Theme) -> bytes:
         return png(figure, tight=True)
 
 
-def _named(view: str) -> str:
-    return f"frame {view}" if view.lstrip("-").replace(".", "", 1).isdigit() else shorten(view, 40)
+def _named(view: str, by_time: bool) -> str:
+    return f"{'time' if by_time else 'frame'} {view}" if view.lstrip("-").replace(".", "", 1).isdigit() else shorten(view, 40)
 
 
 def shown_axes(values: FloatArray) -> list[int]:
@@ -53,8 +55,9 @@ def shown_axes(values: FloatArray) -> list[int]:
 
 
 def as_first_camera(report: ReconstructionReport) -> FloatArray | None:
-    """Where the first camera would have seen the points at the times of all views, ``(views, n, l)``; None for two bodies."""
-    if not report.solved or report.velocities is None:
+    """Where the first camera would have seen the points at the times of all views, ``(views, n, l)``; None for two bodies, or
+    where no scene was decided on."""
+    if not report.drawable or report.velocities is None:
         return None
     camera = report.cameras[0]
     rays = report.positions @ camera[:, :-1].T + camera[:, -1]

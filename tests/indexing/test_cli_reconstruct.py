@@ -18,12 +18,8 @@ import torch
 from dyntorch import metrics, motions, scenes
 from indexing.cli import main
 from indexing.cli.reconstruct import PURPOSE, REASONS, MotionName
-from indexing.readers.tracks import TrackSet
-from indexing.report.reconstruction import FILES, ReconstructionReport, as_json, points_csv, write_reconstruction
-from indexing.report.reconstruction_scene import nearest_frame
-from indexing.report.reconstruction_tracks import as_first_camera
+from indexing.report.reconstruction import FILES
 
-SCRIPT = "<script>alert(1)</script>"
 # torch's own, when it first loads its transforms; hidden outside of tests
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated")
 TIMES = [0.0, 1.0, 2.5, 3.0]
@@ -162,6 +158,8 @@ def test_the_model_is_chosen_and_the_others_listed(run, tmp_path):
     code, out, _ = run("t.csv --out out")
     assert code == 0 and re.search(r"static_2d +3 +40", out) and "penalized cost" in out
     tried = read()["candidates"]
+    assert read()["counts"] == {"static": 40, "moving": 0, "outlier": 0, "missing": 0}
+    assert "not tried: constant_acceleration_2d (needs 4 views)" in out
     assert tried[0]["motion"] == read()["motion"] == "static_2d" and "static_3d" in [one["motion"] for one in tried]
     assert "Which motion" in Path("out/report.html").read_text()
 
@@ -176,6 +174,23 @@ def test_missing_observations_and_tracks_seen_once(run, scene, tmp_path):
     arrays = np.load("out/reconstruction.npz")
     assert "p4" not in arrays["ids"] and len(arrays["ids"]) == 49
     assert np.isnan(arrays["residuals"][1, 3]) and np.isfinite(arrays["points"]).all()
+
+
+def test_times_of_day_are_counted_from_the_first_view_and_kept_in_full(run, scene, tmp_path):
+    rows = ["time,id,x,y"]
+    for time, view in zip(TIMES, scene.tracks.tolist(), strict=True):
+        rows += [f"{1700000000.25 + 0.1 * time!r},p{j},{x!r},{y!r}" for j, (x, y) in enumerate(view)]
+    (tmp_path / "t.csv").write_text("\n".join(rows))
+    code, out, _ = run("t.csv --motion constant_velocity_2d --threshold none --out out")
+    assert code in (0, 3) and "note: time 0 of the result is the first view, at 1700000000.25" in out
+    assert read()["first_time"] == np.load("out/reconstruction.npz")["first_time"] == 1700000000.25
+    assert read()["views"] == ["0", "0.1", "0.25", "0.3"]
+    np.testing.assert_allclose(read()["times"], 0.1 * np.array(TIMES), atol=1e-6)
+
+
+def test_known_static_points_have_no_velocity_at_all(run, scene):
+    run("@/plane.csv --motion constant_velocity_2d --threshold none --out out")
+    assert not np.load("out/reconstruction.npz")["velocities"][(scene.labels == 1).numpy()].any()
 
 
 # ---- what is refused -----------------------------------------------------------------------------------------------------
@@ -194,7 +209,8 @@ def test_data_that_cannot_decide_are_refused_with_code_3(run, tmp_path, monkeypa
     assert (code, err) == (3, "dyntorch: refused: nothing moves\n") and "warning: static scene: nothing moves" in out
     assert read()["status"] == "AMBIGUOUS" and read()["reason"] == "nothing moves"
     page = Path("out/report.html").read_text()
-    assert "Refused" in page and "not to be relied on" in page
+    assert "Refused: static scene." in page and page.count("othing moves") == 1 and "not to be relied on" in page
+    assert not Path("out/scene.png").exists()  # a scene that is not to be relied on would only mislead
 
 
 def test_equal_images_are_refused(run, tmp_path):
@@ -212,7 +228,7 @@ def test_equal_images_are_refused(run, tmp_path):
         ("no.csv", "no.csv: no such file; check the path"),
         ("@/plane.csv --motion sideways", "sideways"),
         ("@/plane.csv --threshold 0", "--threshold must be a positive distance"),
-        ("@/plane.csv --threshold x", "threshold"),
+        ("@/plane.csv --threshold x", "--threshold must be a positive distance in the unit of the tracks, auto or none, got x"),
         ("@/plane.csv --fps 0", "--fps must be a positive number"),
         ("@/plane.csv --fps 5 --times 0,1,2,3", "leave one away"),
         ("@/plane.csv --seed -1", "--seed must be a whole number"),
@@ -268,65 +284,3 @@ def test_every_model_and_status_is_named():
     from dyntorch import Status
 
     assert set(REASONS) == {status.name for status in Status} - {"OK"}
-
-
-# ---- the report ----------------------------------------------------------------------------------------------------------
-def report(dim: int = 2, **changes) -> ReconstructionReport:
-    """Five points that move by (1, 0, ...) per view, of which the last is missing, seen by two cameras."""
-    rng = np.random.default_rng(0)
-    points = rng.uniform(1, 5, size=(5, dim))
-    speed = np.eye(dim)[0]
-    positions = points + np.arange(2.0)[:, None, None] * speed
-    cameras = np.stack([np.eye(3, dim + 1), np.eye(3, dim + 1)])
-    cameras[:, 2] = np.eye(dim + 1)[-1] + 0.1 * np.eye(dim + 1)[-2]
-    rays = positions @ cameras[0, :, :-1].T + cameras[0, :, -1]
-    tracks = TrackSet("t.csv", rays[..., :2] / rays[..., 2:], (SCRIPT, "=1+1", "-2", "d", "e"), ("0", SCRIPT), np.arange(2.0))
-    points[4] = positions[:, 4] = tracks.values[1, 4] = np.nan
-    values = {
-        "title": SCRIPT, "motion": ("constant_velocity_2d", "Points."), "tracks": tracks, "cameras": cameras, "points": points,
-        "positions": positions, "velocities": np.tile(speed, (5, 1)), "labels": np.array([1, 2, 0, 2, 0]), "residual": 0.1,
-        "residuals": np.full((2, 5), 0.1), "inliers": np.ones((2, 5), dtype=bool), "structure": np.ones((5, 2 * dim + 1)),
-        "projections": np.ones((2, 3, 2 * dim + 1)), "sigma": 0.1, "warnings": [("weak_stack", 1.0, SCRIPT)],
-        "candidates": [("constant_velocity_2d", 1.0, 0.1), (SCRIPT, float("inf"), float("nan"))],
-    }  # fmt: skip
-    return ReconstructionReport(**{**values, **changes})
-
-
-def test_what_comes_from_files_is_escaped(tmp_path):
-    page = write_reconstruction(tmp_path, report()).read_text()
-    assert SCRIPT not in page and "&lt;script&gt;" in page
-    rows = list(csv.reader(points_csv(report()).splitlines()))
-    assert [row[0] for row in rows[1:]] == [SCRIPT, "'=1+1", "-2", "d", "e"]
-    assert [row[2] for row in rows[1:]] == ["static", "moving", "outlier", "moving", "missing"] and rows[5][3:5] == ["", ""]
-
-
-def test_every_kind_of_data_can_be_drawn(tmp_path):
-    nothing = np.full((5, 2), np.nan)
-    for i, made in enumerate((
-        report(3),
-        report(cameras=np.zeros((2, 3, 3)), points=nothing, positions=np.stack([nothing] * 2), status="DEGENERATE", reason="no"),
-        report(2, bodies=2, velocities=None),
-        report(3, bodies=2, velocities=None),
-        report(labels=np.zeros(5, dtype=int)),
-        report(velocities=np.zeros((5, 2)), positions=np.stack([report().points] * 2)),
-    )):  # fmt: skip
-        page = write_reconstruction(tmp_path / str(i), made).read_text()
-        assert "<img" in page and "nan" not in page.partition("<main>")[2].replace("data:image", "").split("base64")[0]
-        json.loads((tmp_path / str(i) / "reconstruction.json").read_text())
-
-
-def test_json_has_no_scene_where_there_is_none():
-    found = as_json(report(cameras=np.zeros((2, 3, 3)), status="DEGENERATE", reason="why"))
-    assert found["status"] == "DEGENERATE" and found["reason"] == "why" and found["cameras"] is None
-
-
-@pytest.mark.parametrize("dim", [2, 3])
-def test_what_the_pictures_show(dim):
-    made = report(dim, labels=np.full(5, 2))
-    seen = as_first_camera(made)
-    np.testing.assert_allclose(seen[:, :4], made.tracks.values[:, :4], atol=1e-12)  # both cameras are the same
-    assert np.isnan(seen[:, 4]).all() and as_first_camera(report(velocities=None)) is None
-    # an affinity of the positions: equal steps stay equal, and the plane comes near its image
-    shown = nearest_frame(report(dim, labels=np.array([2, 2, 2, 2, 0])))
-    steps = shown[1, :4] - shown[0, :4]
-    np.testing.assert_allclose(steps, np.broadcast_to(steps[0], steps.shape), atol=1e-9)

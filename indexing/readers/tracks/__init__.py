@@ -6,6 +6,6 @@ One table with a column of views or times, one file per view (as for alignments)
 from __future__ import annotations
 
 from indexing.readers.tracks.reading import read_tracks
-from indexing.readers.tracks.trackset import TrackSet
+from indexing.readers.tracks.trackset import TrackSet, exact
 
-__all__ = ["TrackSet", "read_tracks"]
+__all__ = ["TrackSet", "exact", "read_tracks"]

@@ -46,15 +46,24 @@ def read(path: Path, key: str | None) -> TrackSet:
 def _chosen(path: Path, names: list[str], key: str | None) -> tuple[str, str]:
     """What the names of the arrays begin with, and the name of the tracks."""
     several = [name[:-2] for name in names if name.endswith("/y")]
+    if key is not None and key in names:
+        return "", key
     if key is not None and key not in several:
-        raise error(path, f"has no sequence {key!r}", f"its sequences are {', '.join(several[:6]) or 'without names'}")
+        known = f"its sequences are {_listed(several)}" if several else f"its arrays are {_listed(names)}"
+        raise error(path, f"has no {'sequence' if several else 'array'} {key!r}", known)
     if key is None and several:
         raise error(path, f"holds {len(several)} sequences ({', '.join(several[:4])}, ...)", f"say which: --key {several[0]}")
     before = "" if key is None else f"{key}/"
     name = next((f"{before}{kind}" for kind in ("tracks", "y") if f"{before}{kind}" in names), None)
     if name is None:
-        raise error(path, f"its arrays are {', '.join(names[:8]) or 'none'}", KEYS)
+        others = [other for other in names if other not in EXTRA]
+        choice = f"; or say which array has the tracks: --key {others[0]}" if others else ""
+        raise error(path, f"its arrays are {_listed(names)}", KEYS + choice)
     return before, name
+
+
+def _listed(names: list[str]) -> str:
+    return ", ".join(names[:8]) + ", ..." * (len(names) > 8) or "none"
 
 
 def _reals(path: Path, extra: dict[str, Any], kind: str, least: float = -np.inf) -> FloatArray | None:
@@ -64,4 +73,4 @@ def _reals(path: Path, extra: dict[str, Any], kind: str, least: float = -np.inf)
     if values.dtype.kind not in "fiub" or not np.isfinite(values).all() or (values < least).any():
         of = "" if np.isinf(least) else f" of {least:g} or more"
         raise error(path, f"{kind} holds values that are no finite numbers{of}", "correct them")
-    return values.astype(np.float64)
+    return np.asarray(values, dtype=np.float64)

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from indexing.readers.points.pointset import BoolArray, FloatArray, error
-from indexing.readers.points.table import IDS, STATIC, WEIGHTS, Row, column_values, flags, number, read_rows
-from indexing.readers.tracks.trackset import TrackSet
+from indexing.readers.points.table import IDS, STATIC, WEIGHTS, Row, column_values, flags, is_data, read_rows
+from indexing.readers.tracks.trackset import TrackSet, exact
 
 IntArray = NDArray[np.intp]
 VIEWS = ("view", "frame", "image")
@@ -21,13 +21,25 @@ EXPECTED = "name the columns frame (or time), id, x, y, and z for 3D points"
 def header(path: Path) -> list[str]:
     """The headings of a table, in small letters; empty where its first row is data."""
     rows = read_rows(path)
-    cells = [cell.strip().lower() for cell in rows[0][1]] if rows else []
-    return [] if any(number(cell) is not None for cell in cells) else cells
+    return [cell.strip().lower() for cell in rows[0][1]] if rows and not is_data(rows[0][1]) else []
 
 
 def is_long(names: Sequence[str]) -> bool:
     """Whether these are headings of tracks, rather than of the points of one view."""
     return bool({*VIEWS, *TIMES} & set(names)) and {"x", "y"} <= set(names)
+
+
+def check_headings(path: Path) -> None:
+    """Raise on a table that is neither of tracks nor of the points of one view, with the columns that tracks need.
+
+    Raises:
+        ValueError: rows without headings, or headings without x and y.
+    """
+    names = header(path)
+    if not names and read_rows(path):
+        raise error(path, "row 1 holds numbers, and no row names the columns", EXPECTED)
+    if names and not ({"x", "y"} <= set(names) or {"x1", "y1"} <= set(names)):
+        raise error(path, f"its columns are {', '.join(name or '(unnamed)' for name in names)}", EXPECTED)
 
 
 def read(path: Path) -> TrackSet:
@@ -59,9 +71,10 @@ def read(path: Path) -> TrackSet:
     values = np.full((*shape, len(axes)), np.nan)
     values[views, columns] = xyz
     return TrackSet(
-        str(path), values, tuple(ids), tuple(f"{moment:.10g}" for moment in moments),
+        str(path), values, tuple(ids), tuple(exact(moment) for moment in moments),
         None if timed is None else moments if timed == viewed else _times(path, rows, names, timed, views, moments),
         _weights(path, rows, names, views, columns, shape), _static(path, rows, names, columns, len(ids)),
+        by_time=timed == viewed,
     )  # fmt: skip
 
 
@@ -84,9 +97,8 @@ def _once(path: Path, rows: Sequence[Row], point: str, views: IntArray, columns:
     before: dict[tuple[int, int], int] = {}
     for (line, cells), view, column in zip(rows, views.tolist(), columns.tolist(), strict=True):
         if (view, column) in before:
-            said = (
-                f"row {line}: point {column + 1} of the file was in frame {moments[view]:g} before, in row {before[view, column]}"
-            )
+            again = f"was in frame {exact(moments[view])} before, in row {before[view, column]}"
+            said = f"row {line}: point {column + 1} of the file {again}"
             raise error(path, f"{said} (row: {', '.join(cells)})", f"give each point one row per frame; column {point!r} names it")
         before[view, column] = line
 
@@ -97,7 +109,9 @@ def _times(path: Path, rows: Sequence[Row], names: Sequence[str], column: str, v
     wrong = np.flatnonzero(found != out[views])
     if len(wrong):
         line, view = rows[wrong[0]][0], views[wrong[0]]
-        said = f"row {line}: frame {moments[view]:g} has the {column} {found[wrong[0]]:g} here and {out[view]:g} before"
+        said = (
+            f"row {line}: frame {exact(moments[view])} has the {column} {exact(found[wrong[0]])} here and {exact(out[view])} before"
+        )
         raise error(path, said, "a view has one time")
     return out
 

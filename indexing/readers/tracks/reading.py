@@ -25,7 +25,7 @@ def read_tracks(
     Args:
         paths: a table with a column ``frame`` or ``time``, an ``.npz``, ``.npy`` or ``.c3d``; or a file of points for each view.
         frames: names of the views to take; all by default.
-        key: of an ``.npz`` with several sequences ``key/y``, the one to take.
+        key: of an ``.npz`` with several sequences ``key/y``, or several arrays, the one to take.
         static: a file that names the points known to stand still, in a column ``id``; where it has a column ``static``, those
             marked 1.
 
@@ -55,9 +55,11 @@ def _read(files: Several[Path], key: str | None) -> TrackSet:
     if len(files) == 1 and _start(files[0]).startswith(b"PK"):
         return arrays.read(files[0], key)
     if key is not None:
-        raise error(files[0], f"--key {key}: has no keys", "leave --key away; it is for .npz with several sequences")
-    if len(files) == 1 and _tabular(files[0]):
-        return longform.read(files[0])
+        raise error(files[0], f"--key {key}: has no keys", "leave --key away; it is for .npz with several sequences or arrays")
+    if len(files) == 1 and _is_text(files[0]):
+        if longform.is_long(longform.header(files[0])):
+            return longform.read(files[0])
+        longform.check_headings(files[0])
     opened = [open_points(path) for path in files]
     first = opened[0]
     if isinstance(first, Sequence) and len(opened) == 1:
@@ -83,12 +85,10 @@ def _start(path: Path) -> bytes:
         return file.read(512)
 
 
-def _tabular(path: Path) -> bool:
-    """Whether the file is a table with a column of views."""
+def _is_text(path: Path) -> bool:
+    """Whether the file is a table, rather than arrays or a cloud of points."""
     start = _start(path)
-    if not start or b"\0" in start or start.startswith(b"ply"):
-        return False
-    return longform.is_long(longform.header(path))
+    return bool(start) and b"\0" not in start and not start.startswith(b"ply")
 
 
 def _joined(views: Several[PointSet]) -> TrackSet:

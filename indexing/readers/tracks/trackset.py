@@ -23,6 +23,8 @@ class TrackSet:
         weights: ``(views, n)`` not negative; None = all equal.
         static: ``(n,)`` known to stand still; None = not known of any.
         notes: what a reader should know, a sentence each.
+        by_time: whether the views are named by their times.
+        start: the time from which ``times`` count, in full: that of the first view where they begin at 0.
     """
 
     path: str
@@ -33,6 +35,22 @@ class TrackSet:
     weights: FloatArray | None = None
     static: BoolArray | None = None
     notes: tuple[str, ...] = field(default=())
+    by_time: bool = False
+    start: float = 0.0
+
+    def since_first(self) -> TrackSet:
+        """The same with times that begin at 0; views that are named by their times are named by the new ones.
+
+        Example:
+            >>> tracks = TrackSet("t.csv", np.zeros((2, 1, 2)), ("a",), ("1e9", "1e9"), np.array([1e9, 1e9 + 0.2]), by_time=True)
+            >>> tracks.since_first().views, tracks.since_first().start
+            (('0', '0.2'), 1000000000.0)
+        """
+        if self.times is None:
+            return self
+        first = float(self.times[0])
+        views = since(self.times) if self.by_time else self.views
+        return replace(self, views=views, times=self.times - first, start=self.start + first)
 
     def select(self, frames: Sequence[str]) -> TrackSet:
         """The views of these names, in this order.
@@ -72,6 +90,28 @@ class TrackSet:
             static=None if self.static is None else self.static[kept],
             notes=(*self.notes, said),
         )
+
+
+def since(times: FloatArray) -> tuple[str, ...]:
+    """Times since the first, in as many decimals as they have; in full where that would give two the same name.
+
+    Example:
+        >>> since(np.array([1700000000.25, 1700000000.45, 1700000001.25]))
+        ('0', '0.2', '1')
+    """
+    finest = float(np.spacing(np.abs(times).max()))
+    short = tuple(f"{step:.10g}" for step in np.round(times - times[0], int(np.floor(-np.log10(finest)))))
+    return short if len(set(short)) == len(short) else tuple(exact(time - times[0]) for time in times)
+
+
+def exact(value: float) -> str:
+    """A number with all the digits that it has, and no more.
+
+    Example:
+        >>> exact(1700000000.25), exact(3.0)
+        ('1700000000.25', '3')
+    """
+    return repr(float(value)).removesuffix(".0")
 
 
 def numbered(count: int) -> tuple[str, ...]:

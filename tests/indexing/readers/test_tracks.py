@@ -37,6 +37,18 @@ def test_times_alone_are_the_views_and_unsorted_rows_are_sorted(write):
     np.testing.assert_array_equal(found.values[:, 0], [[3.5, 4], [1, 2]])
 
 
+def test_times_of_day_name_the_views_in_full_and_then_from_the_first(write):
+    found = read_tracks([write("time,id,x,y\n1700000000.25,a,1,2\n1700000000.45,a,3,4\n1700000001.25,a,3,4\n")])
+    assert found.views == ("1700000000.25", "1700000000.45", "1700000001.25")
+    short = found.select(found.views[1:]).since_first()
+    assert short.views == ("0", "0.8") and short.start == 1700000000.45 and short.times[0] == 0
+
+
+def test_an_index_without_a_heading_is_no_data(write):
+    found = read_tracks([write(",frame,id,x,y\n0,0,a,1,2\n1,1,a,3,4\n")])
+    np.testing.assert_array_equal(found.values[:, 0], [[1, 2], [3, 4]])
+
+
 def test_columns_of_static_points_weights_and_depth(write):
     rows = "view,id,x,y,z,static,weight\n0,a,1,2,3,1,1\n1,a,1,2,3,1,0.5\n0,b,4,5,6,0,1\n1,b,4,5,6,1,1\n"
     found = read_tracks([write(rows)])
@@ -99,6 +111,8 @@ def test_tracks_seen_once_are_left_out(write):
         ("frame,id,x,y\n0,a,1,2\n0,b,1,2\n", r"holds 1 view"),
         ("id,x,y\na,1,2\n", r"holds the points of one view; give a table with columns frame"),
         ("", r"the file is empty"),
+        ("0,a,1,2\n1,a,1,2\n", r"row 1 holds numbers, and no row names the columns; name the columns frame \(or time\), id, x, y"),
+        ("frame,id,x\n0,a,1\n", r"its columns are frame, id, x; name the columns frame \(or time\), id, x, y"),
     ],
 )
 def test_bad_tables(write, text, says):
@@ -112,7 +126,10 @@ def test_bad_arrays(tmp_path):
         with pytest.raises(ValueError, match=says):
             read_tracks([tmp_path / "t.npz"])
 
-    refused(r"its arrays are a; give 'tracks'", a=VALUES)
+    refused(r"its arrays are a, b; give 'tracks' .* which array has the tracks: --key a", a=VALUES, b=VALUES)
+    with pytest.raises(ValueError, match=r"has no array 'c'; its arrays are a, b"):
+        read_tracks([tmp_path / "t.npz"], key="c")
+    np.testing.assert_array_equal(read_tracks([tmp_path / "t.npz"], key="b").values, VALUES)
     refused(r"tracks has shape \(3, 2\)", tracks=VALUES[:, 0])
     refused(r"times has shape \(2,\), tracks has \(3, 2, 2\)", tracks=VALUES, times=[0, 1])
     refused(r"times holds values that are no finite numbers", tracks=VALUES, times=[0, 1, NAN])

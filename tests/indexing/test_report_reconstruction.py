@@ -1,0 +1,116 @@
+"""The report on a reconstruction: what is written, drawn and said."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from indexing.readers.tracks import TrackSet
+from indexing.report.reconstruction import ReconstructionReport, as_json, points_csv, write_reconstruction
+from indexing.report.reconstruction_look import around, sample
+from indexing.report.reconstruction_scene import nearest_frame
+from indexing.report.reconstruction_tracks import as_first_camera
+
+SCRIPT = "<script>alert(1)</script>"
+
+
+def report(dim: int = 2, **changes) -> ReconstructionReport:
+    """Five points that move by (1, 0, ...) per view, of which the last is missing, seen by two cameras."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform(1, 5, size=(5, dim))
+    speed = np.eye(dim)[0]
+    positions = points + np.arange(2.0)[:, None, None] * speed
+    cameras = np.stack([np.eye(3, dim + 1), np.eye(3, dim + 1)])
+    cameras[:, 2] = np.eye(dim + 1)[-1] + 0.1 * np.eye(dim + 1)[-2]
+    rays = positions @ cameras[0, :, :-1].T + cameras[0, :, -1]
+    tracks = TrackSet("t.csv", rays[..., :2] / rays[..., 2:], (SCRIPT, "=1+1", "-2", "d", "e"), ("0", SCRIPT), np.arange(2.0))
+    points[4] = positions[:, 4] = tracks.values[1, 4] = np.nan
+    values = {
+        "title": SCRIPT, "motion": ("constant_velocity_2d", "Points."), "tracks": tracks, "cameras": cameras, "points": points,
+        "positions": positions, "velocities": np.tile(speed, (5, 1)), "labels": np.array([1, 2, 0, 2, 0]), "residual": 0.1,
+        "residuals": np.full((2, 5), 0.1), "inliers": np.ones((2, 5), dtype=bool), "structure": np.ones((5, 2 * dim + 1)),
+        "projections": np.ones((2, 3, 2 * dim + 1)), "sigma": 0.1, "warnings": [("weak_stack", 1.0, SCRIPT)],
+        "candidates": [("constant_velocity_2d", 1.0, 0.1, ""), (SCRIPT, float("inf"), float("nan"), SCRIPT)],
+    }  # fmt: skip
+    return ReconstructionReport(**{**values, **changes})
+
+
+def test_what_comes_from_files_is_escaped(tmp_path):
+    page = write_reconstruction(tmp_path, report()).read_text()
+    assert SCRIPT not in page and "&lt;script&gt;" in page
+    rows = list(csv.reader(points_csv(report()).splitlines()))
+    assert [row[0] for row in rows[1:]] == [SCRIPT, "'=1+1", "-2", "d", "e"]
+    assert [row[2] for row in rows[1:]] == ["static", "moving", "outlier", "moving", "missing"] and rows[5][3:5] == ["", ""]
+
+
+def test_every_kind_of_data_can_be_drawn(tmp_path):
+    nothing = np.full((5, 2), np.nan)
+    for i, made in enumerate((
+        report(3),
+        report(cameras=np.zeros((2, 3, 3)), points=nothing, positions=np.stack([nothing] * 2), status="DEGENERATE", reason="no"),
+        report(2, bodies=2, velocities=None),
+        report(3, bodies=2, velocities=None),
+        report(labels=np.zeros(5, dtype=int)),
+        report(velocities=np.zeros((5, 2)), positions=np.stack([report().points] * 2)),
+    )):  # fmt: skip
+        page = write_reconstruction(tmp_path / str(i), made).read_text()
+        assert "<img" in page and "nan" not in page.partition("<main>")[2].replace("data:image", "").split("base64")[0]
+        json.loads((tmp_path / str(i) / "reconstruction.json").read_text())
+
+
+def test_json_has_no_scene_where_there_is_none():
+    found = as_json(report(cameras=np.zeros((2, 3, 3)), status="DEGENERATE", reason="why"))
+    assert found["status"] == "DEGENERATE" and found["reason"] == "why" and found["cameras"] is None
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_what_the_pictures_show(dim):
+    made = report(dim, labels=np.full(5, 2))
+    seen = as_first_camera(made)
+    np.testing.assert_allclose(seen[:, :4], made.tracks.values[:, :4], atol=1e-12)  # both cameras are the same
+    assert np.isnan(seen[:, 4]).all() and as_first_camera(report(velocities=None)) is None
+    # an affinity of the positions: equal steps stay equal, and the plane comes near its image
+    shown = nearest_frame(report(dim, labels=np.array([2, 2, 2, 2, 0])))
+    steps = shown[1, :4] - shown[0, :4]
+    np.testing.assert_allclose(steps, np.broadcast_to(steps[0], steps.shape), atol=1e-9)
+
+
+def test_a_point_without_a_position_is_missing_where_too_few_views_show_it_and_an_outlier_otherwise():
+    made = report()
+    values, points = np.repeat(report().tracks.values, 2, axis=0), made.points.copy()
+    values[2:, 3], points[2:] = np.nan, np.nan  # four coordinates for the four unknowns of a point, eight, and four
+    weights = np.ones((4, 5))
+    weights[1:, 2] = 0
+    for given, kind in ((None, "outlier"), (weights, "missing")):
+        tracks = dataclasses.replace(made.tracks, values=values, weights=given)
+        assert report(tracks=tracks, points=points).kinds == ["static", "moving", kind, "missing", "missing"]
+    assert ",0,missing,," in points_csv(report())
+
+
+def test_what_a_refused_report_says_and_does_not(tmp_path):
+    write_reconstruction(tmp_path, report())
+    assert (tmp_path / "scene.png").exists()
+    warnings = [("weak_stack", 1.0, "nearly one centre"), ("behind", 1.0, "1 point is behind a camera")]
+    page = write_reconstruction(
+        tmp_path, report(status="AMBIGUOUS", reason="nearly one centre", warnings=warnings, inliers=np.arange(10).reshape(2, 5) > 0)
+    ).read_text()
+    assert not (tmp_path / "scene.png").exists() and "The scene</h2>" not in page and page.count("early one centre") == 1
+    assert "Refused: views too alike." in page and "Points behind a camera." in page and "No camera sees what is behind it" in page
+    assert "1 single observation left out" in page
+
+
+def test_paths_fit_into_the_picture_and_long_ones_are_sampled():
+    rng = np.random.default_rng(0)
+    starts = rng.uniform(size=(200, 2))
+    paths = np.stack([starts, starts + rng.uniform(-0.3, 0.3, size=(200, 2))])
+    low, high = around(paths, 0.9)
+    assert (paths > low).all() and (paths < high).all()
+    paths[1, 0] = 100  # a stray
+    assert (around(paths, 0.9)[1] < 2).all()
+    assert len(sample(paths, (low, high))) == 60 and len(set(sample(paths, (low, high)).tolist())) == 60
+    assert len(sample(paths[:, :50], (low, high))) == 50
+    assert len(sample(paths[0] + 0.001 * np.arange(2.0)[:, None, None], (low, high))) == 200
