@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from indexing.cli.console import complain, count, names, progress, say, table
+from indexing.cli.console import count, ended, names, progress, say, table
 from indexing.cli.outputs import check_folder, keep
 
 if TYPE_CHECKING:
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from indexing.report.alignment import AlignmentReport
 
 Model = Literal["planar", "join", "minimal_join", "constant_velocity", "affine_constant_velocity", "rigid", "lines"]
-REFUSED = 3
 PURPOSE = {
     "planar": "Points of a plane stand still or move on straight lines before a moving camera.",
     "join": "Points stand still or move on straight lines before an uncalibrated 3D sensor.",
@@ -94,12 +93,7 @@ class Align:
             with progress("drawing the report", steps=False):
                 page = write_alignment(folder, report)
         show(report)
-        if page is not None:
-            say(f"report: {page}")
-        if report.status != "OK":
-            complain(f"refused: {report.reason}")
-            return REFUSED
-        return 0
+        return ended(page, None if report.status == "OK" else report.reason)
 
     def _check(self) -> None:
         """Raise on flags that make no sense by themselves, before any file is read."""

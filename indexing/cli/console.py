@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 PLAIN_WIDTH = 132  # columns where the output is no terminal
+REFUSED = 3  # exit code: the data cannot decide
 SHOWN = 3  # names listed before "and N more"
 
 Progress = Callable[[float], None]
@@ -33,6 +34,16 @@ def complain(text: str) -> None:
 def say(text: str = "") -> None:
     """One line on stdout, not wrapped."""
     print(one_line(text))
+
+
+def ended(page: object, refusal: str | None) -> int:
+    """Say where the report is, and why the data cannot decide, if so: the exit code."""
+    if page is not None:
+        say(f"report: {page}")
+    if refusal is None:
+        return 0
+    complain(f"refused: {refusal}")
+    return REFUSED
 
 
 def names(values: Sequence[object]) -> str:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from indexing.cli.console import complain, count, say, table
+from indexing.cli.console import count, ended, say, table
 from indexing.cli.console import progress as progress_of
 from indexing.cli.outputs import check_folder, keep
 
@@ -25,7 +25,6 @@ MotionName = Literal[
     "constant_direction_3d", "constant_velocity_planes_3d", "constant_velocity_3d", "constant_velocity_3d_sensors",
     "two_bodies_2d", "two_bodies_3d",
 ]  # fmt: skip
-REFUSED = 3
 PURPOSE = {
     "static_2d": "The points of a plane stand still.",
     "static_3d": "The points stand still.",
@@ -113,12 +112,7 @@ class Reconstruct:
             with progress_of("drawing the report", steps=False):
                 page = write_reconstruction(folder, report)
         show(report)
-        if page is not None:
-            say(f"report: {page}")
-        if report.status != "OK":
-            complain(f"refused: {report.reason}")
-            return REFUSED
-        return 0
+        return ended(page, None if report.status == "OK" else report.reason)
 
     def _check(self) -> None:
         """Raise on flags that make no sense by themselves, before any file is read."""
