@@ -22,8 +22,8 @@ import tyro
 
 import dyntorch as dyn
 from dyntorch import metrics, scenes
-from experiments.tables import Row, command, markdown, note
-from indexing.files import manifest, prepare, write_json
+from experiments.tables import Row, command, measured
+from indexing.files import prepare
 
 SIGMA, NEAR, KEPT, CLOSE, WRONG = 0.5, 3.0, 0.95, 2.0, 3.0
 SETTINGS: dict[str, tuple[tuple[int, int, int], ...]] = {
@@ -114,18 +114,7 @@ def run(config: Config) -> None:
     prepare(target.parent)
     if config.threads > 0:
         torch.set_num_threads(config.threads)
-    results, seconds = {}, {}
-    for motion in config.motions:
-        note(f"... {motion}")
-        clock = time.perf_counter()
-        results[motion] = table(motion, config)
-        seconds[motion] = time.perf_counter() - clock
-        print(markdown(results[motion], motion), flush=True)
-    goals = [row.reached for rows in results.values() for row in rows if row.reached is not None]
-    print(f"\n{sum(goals)} of {len(goals)} goals reached, {sum(seconds.values()):.0f} s")
-    tables = {name: [{**vars(row), "reached": row.reached} for row in rows] for name, rows in results.items()}
-    write_json(target, {"manifest": manifest(vars(config), [], seed=0, timings=seconds), "tables": tables})
-    note(f"written: {target}")
+    measured(config.motions, lambda motion: table(motion, config), target, vars(config))
 
 
 if __name__ == "__main__":

@@ -24,8 +24,8 @@ from dyntorch import scenes
 from dyntorch.invariant import Invariant
 from dyntorch.scenes.scene import OUTLIER, Scene
 from dyntorch.starts import chi
-from experiments.tables import Row, command, markdown, note
-from indexing.files import manifest, prepare, write_json
+from experiments.tables import Row, command, measured
+from indexing.files import prepare
 
 KEPT = 0.95
 
@@ -125,18 +125,7 @@ def run(config: Config) -> None:
     if config.threads > 0:
         torch.set_num_threads(config.threads)
     dyn.robust_fit(dyn.HomographyTensor, *scenes.planar(60, batch=4, sigma=0.5).views, threshold=1.5)  # first calls are slow
-    results, seconds = {}, {}
-    for name in TASKS:
-        note(f"... {name}")
-        clock = time.perf_counter()
-        results[name] = table(name, config)
-        seconds[name] = time.perf_counter() - clock
-        print(markdown(results[name], name), flush=True)
-    goals = [row.reached for rows in results.values() for row in rows if row.reached is not None]
-    print(f"\n{sum(goals)} of {len(goals)} goals reached, {sum(seconds.values()):.0f} s")
-    tables = {name: [{**vars(row), "reached": row.reached} for row in rows] for name, rows in results.items()}
-    write_json(target, {"manifest": manifest(vars(config), [], seed=0, timings=seconds), "tables": tables})
-    note(f"written: {target}")
+    measured(list(TASKS), lambda name: table(name, config), target, vars(config))
 
 
 if __name__ == "__main__":

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+
+from indexing.files import manifest, write_json
 
 
 @dataclass(frozen=True)
@@ -52,6 +56,29 @@ def _number(value: float) -> str:
 def note(message: str) -> None:
     """Progress, apart from the tables: on stderr."""
     print(message, file=sys.stderr, flush=True)
+
+
+def measured(names: Sequence[str], table: Callable[[str], list[Row]], target: Path, settings: Mapping[str, object]) -> None:
+    """Print the tables of all names, say how many goals were reached, and write everything to a JSON file.
+
+    Args:
+        names: of the tables, in order.
+        table: the rows of one.
+        target: the file.
+        settings: what the figures depend on, for its manifest.
+    """
+    results, seconds = {}, {}
+    for name in names:
+        note(f"... {name}")
+        clock = time.perf_counter()
+        results[name] = table(name)
+        seconds[name] = time.perf_counter() - clock
+        print(markdown(results[name], name), flush=True)
+    goals = [row.reached for rows in results.values() for row in rows if row.reached is not None]
+    print(f"\n{sum(goals)} of {len(goals)} goals reached, {sum(seconds.values()):.0f} s")
+    tables = {name: [{**vars(row), "reached": row.reached} for row in rows] for name, rows in results.items()}
+    write_json(target, {"manifest": manifest(settings, [], seed=0, timings=seconds), "tables": tables})
+    note(f"written: {target}")
 
 
 def command(run: Callable[[], None]) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from dyntorch.algebra.triangulation import unit_projections
 from dyntorch.nullspace import null_space
 
 DRAWS = 16
@@ -109,8 +110,7 @@ def upgrade(projections: Tensor, lifts: Tensor) -> tuple[Tensor, Tensor]:
     if not vectors.shape[-1]:
         T = torch.eye(size, dtype=lifts.dtype, device=lifts.device).expand(*batch, size, size)
         return T, projections @ torch.linalg.inv(lifts)
-    unit = projections / projections.flatten(-2).norm(dim=-1)[..., None, None].clamp(min=torch.finfo(lifts.dtype).tiny)
-    rows = torch.einsum("...vmi,vjr->...vmrij", unit, vectors).flatten(-5, -3).flatten(-2)
+    rows = torch.einsum("...vmi,vjr->...vmrij", unit_projections(projections), vectors).flatten(-5, -3).flatten(-2)
     dim = len(algebra)
     if rows.shape[-2] < size * size - dim:
         raise ValueError(f"{len(lifts)} views give {rows.shape[-2]} equations, {size * size - dim} are needed; add views")

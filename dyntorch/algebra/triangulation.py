@@ -33,6 +33,12 @@ def reproject(projections: Tensor, structure: Tensor) -> Tensor:
     return inhomogeneous(structure[..., None, :, :] @ projections.mT)
 
 
+def unit_projections(projections: Tensor) -> Tensor:
+    """Projections ``(..., l + 1, k + 1)`` of Frobenius norm 1; zero ones stay zero."""
+    norm = projections.flatten(-2).norm(dim=-1)[..., None, None]
+    return projections / norm.clamp(min=torch.finfo(projections.dtype).tiny)
+
+
 def triangulate(projections: Tensor, x: Tensor, weights: Tensor | None = None, *, steps: int = 0) -> Tensor:
     r"""Points seen by known projections: the null vector of the equations :math:`[I \mid -x_{ij}]\, M_i Y_j = 0` of all views.
 

@@ -10,10 +10,11 @@ from torch import Tensor
 
 from dyntorch.algebra.hyperplane_pair import hyperplane_pair
 from dyntorch.algebra.lift_frames import behind
+from dyntorch.algebra.triangulation import unit_projections
 from dyntorch.motions import MOTIONS, Motion, polynomial
 from dyntorch.solution import NOISY, Status, failed
 from dyntorch.tasks.lifted_bodies import bodies_of
-from dyntorch.tasks.lifted_projections import Tracks, projections_of_tracks
+from dyntorch.tasks.lifted_projections import Tracks, camera_unknowns, projections_of_tracks
 from dyntorch.tasks.lifted_scene import Lifting, Scene, distances, scene_of, wild
 from dyntorch.tasks.lifted_uncertainty import point_uncertainty
 from dyntorch.tasks.notices import Notice, NoticeCode, notices
@@ -170,7 +171,7 @@ def conditions(tracks: Tracks, scene: Scene, lifting: Lifting | None, noise: Ten
     moments = unit.mT @ unit / known.sum(-1).clamp(min=1)[:, None, None] + 1e-12 * eye
     spread = torch.linalg.cholesky_ex(moments)[0]
     projections = scene.cameras if lifting is None else scene.cameras @ lifting.lifts
-    white = _unit(projections @ spread[:, None]).nan_to_num()
+    white = unit_projections(projections @ spread[:, None]).nan_to_num()
     values = torch.linalg.svdvals(white.flatten(1, 2))
     stack = values[:, -1] / values[:, 0].clamp(min=torch.finfo(values.dtype).tiny)
     points = torch.linalg.solve_triangular(spread, unit.mT, upper=False).mT
@@ -182,7 +183,7 @@ def conditions(tracks: Tracks, scene: Scene, lifting: Lifting | None, noise: Ten
         below = lifting.lifts[:, -1].mean(0)
         world = (unit[:, None] @ lifting.lifts.mT).flatten(1, 2)
         axes = torch.linalg.cholesky_ex(world.mT @ world / world.shape[1] + 1e-12 * eye[: world.shape[-1], : world.shape[-1]])[0]
-        cameras = _unit(scene.cameras @ axes[:, None]).nan_to_num()
+        cameras = unit_projections(scene.cameras @ axes[:, None]).nan_to_num()
         lifts = torch.linalg.solve_triangular(axes[:, None], lifting.lifts @ spread[:, None], upper=False)
         depth, metric = (below @ spread)[:, None], spread
         gauge, extent = len(lifting.algebra) - 1, _extent(scene.structure.nan_to_num(), below, known)
@@ -214,10 +215,11 @@ def least_squares(tracks: Tracks, motion: Motion) -> tuple[Tensor, Tensor]:
 
 def spare(tracks: Tracks, counted: Tensor, motion: Motion) -> Tensor:
     """Observed coordinates less all unknowns, ``(b,)``; two bodies with their hyperplanes."""
-    views, size, wide = tracks.x.shape[1], motion.k + 1, motion.sensor + 1
-    cameras = views * (wide * size - 1) - (size * size - 1) + 2 * motion.k
-    if motion.lift is not None:
-        cameras = views * (wide * (motion.dim + 1) - 1) - motion.ambiguity(tracks.times)
+    views, wide = tracks.x.shape[1], motion.sensor + 1
+    if motion.lift is None:
+        cameras = camera_unknowns(views, wide, motion.k + 1) + 2 * motion.k
+    else:
+        cameras = camera_unknowns(views, wide, motion.dim + 1, motion.ambiguity(tracks.times))
     points = torch.where(counted.any(1), unknowns(tracks, motion), 0).sum(-1)
     return counted.flatten(1).sum(-1) * motion.sensor - points - cameras
 
@@ -292,7 +294,3 @@ def _bodies(scene: Scene, status: Tensor, noise: Tensor, solved: Tensor, note: N
     text = f"{{value:g}} points lie on the smaller body, {size - 1} determine it and others have to confirm it; add points on it"
     note(NoticeCode.ONE_BODY, text, least, few)
     return torch.where(few & (status == Status.OK), int(Status.AMBIGUOUS), status)
-
-
-def _unit(cameras: Tensor) -> Tensor:
-    return cameras / cameras.flatten(2).norm(dim=-1)[..., None, None].clamp(min=torch.finfo(cameras.dtype).tiny)

@@ -88,6 +88,16 @@ class Projections:
     """``(b,)`` of :class:`~dyntorch.solution.Status`."""
 
 
+def camera_unknowns(views: int, rows: int, columns: int, gauge: int | None = None) -> int:
+    """Entries of so many cameras up to scale, less the gauge: by default that of projections, the collineations of :math:`P^k`.
+
+    Example:
+        >>> camera_unknowns(3, 3, 5)  # constant velocity in a plane, 3 views
+        18
+    """
+    return views * (rows * columns - 1) - (columns**2 - 1 if gauge is None else gauge)
+
+
 def choices(tracks: Tracks, size: int) -> Tensor:
     """Indices ``(b, s, size)`` of views for the tensor: seen by many points in common, spread over the time."""
     views = tracks.weights.shape[1]

@@ -11,7 +11,7 @@ from dyntorch.invariants.grassmann_tensor import GrassmannTensor
 from dyntorch.solution import Status
 from dyntorch.tasks.lifted_agreement import EXACT, agreeing, bound, distance, freedom, noise, settled_noise
 from dyntorch.tasks.lifted_consensus import Consensus, consensus, doubtful
-from dyntorch.tasks.lifted_projections import Projections, Tracks
+from dyntorch.tasks.lifted_projections import Projections, Tracks, camera_unknowns
 from dyntorch.tasks.lifted_scene import Lifting, Scene, adjusted, distances, scene_of
 
 ALARMS, RARE = 0.05, 1e-4
@@ -49,16 +49,11 @@ def suspicious(tracks: Tracks, apart: Tensor, unknowns: Tensor | int, limit: flo
         unknowns: of every point, ``(b, n)`` or one number.
         limit: three standard deviations of the noise, None: judged by the residuals alone.
     """
-    seen, square = apart.isfinite(), apart.square().nansum(1)
-    free = (seen.sum(1) * tracks.x.shape[-1] - unknowns).clamp(min=0)
-    least = EXACT / tracks.scales.amin(1)
-    sigma = noise(square, free, free >= 1) if limit is None else torch.full_like(least, limit / 3)
-    sigma = torch.maximum(sigma, least)
-    views, wide = tracks.x.shape[1], tracks.x.shape[-1] + 1
+    square, free, sigma = _misfit(tracks, apart, unknowns, limit)
     if not len(apart):
         return apart.new_zeros(0, dtype=torch.bool)
     size = int(torch.as_tensor(unknowns).max()) + 1
-    used = views * (wide * size - 1) - (size * size - 1)
+    used = camera_unknowns(tracks.x.shape[1], tracks.x.shape[-1] + 1, size)
     plenty = size <= 5 and int(free.sum(-1).min()) >= PLENTY * used
     share = (RARE if plenty else ALARMS) / max(1, apart.shape[-1])
     loud = sigma * tracks.scales.amax(1) > LOUD
@@ -74,9 +69,7 @@ def unfounded(tracks: Tracks, apart: Tensor, unknowns: Tensor) -> Tensor:
         unknowns: of every point, ``(b, n)``.
     """
     assert tracks.static is not None
-    square = apart.square().nansum(1)
-    free = (apart.isfinite().sum(1) * tracks.x.shape[-1] - unknowns).clamp(min=0)
-    sigma = torch.maximum(noise(square, free, free >= 1), EXACT / tracks.scales.amin(1))
+    square, free, sigma = _misfit(tracks, apart, unknowns, None)
     excess = torch.where(
         tracks.static, square / (sigma.square()[:, None] * bound(free)).clamp(min=torch.finfo(sigma.dtype).tiny), 0.0
     )
@@ -97,16 +90,26 @@ def trimmed(tracks: Tracks, scene: Scene, lifting: Lifting, unknowns: Tensor, li
     fewer = tracks
     for _ in range(TRIMS):
         projections = scene.cameras @ lifting.lifts
-        apart = distances(fewer, projections, scene.structure)
-        free = (apart.isfinite().sum(1) * tracks.x.shape[-1] - unknowns).clamp(min=0)
-        sigma = noise(apart.square().nansum(1), free, free >= 1) if limit is None else torch.full_like(scene.cost, limit / 3)
-        sigma = torch.maximum(sigma, EXACT / tracks.scales.amin(1))
+        _, _, sigma = _misfit(fewer, distances(fewer, projections, scene.structure), unknowns, limit)
         fewer = tracks.only(agreeing(tracks, projections, sigma))
         structure = triangulate(projections, fewer.x, fewer.weights, steps=2)
         scene = adjusted(fewer, Scene(scene.cameras, structure, scene.cost), lifting)
     apart = distances(fewer, scene.cameras @ lifting.lifts, scene.structure)
-    kept = (fewer.weights > 0).flatten(1).sum(-1) / (tracks.weights > 0).flatten(1).sum(-1).clamp(min=1)
-    return scene, fewer, ~suspicious(fewer, apart, unknowns, limit) & (kept >= MOST)
+    return scene, fewer, ~suspicious(fewer, apart, unknowns, limit) & (_kept(fewer, tracks) >= MOST)
+
+
+def _misfit(tracks: Tracks, apart: Tensor, unknowns: Tensor | int, limit: float | None) -> tuple[Tensor, Tensor, Tensor]:
+    """Squared distance of every point, its conditions ``(b, n)``, and the noise ``(b,)``, a third of the limit or by the median."""
+    square = apart.square().nansum(1)
+    free = (apart.isfinite().sum(1) * tracks.x.shape[-1] - unknowns).clamp(min=0)
+    least = EXACT / tracks.scales.amin(1)
+    sigma = noise(square, free, free >= 1) if limit is None else torch.full_like(least, limit / 3)
+    return square, free, torch.maximum(sigma, least)
+
+
+def _kept(fewer: Tracks, tracks: Tracks) -> Tensor:
+    """Share ``(b,)`` of the observations that are left."""
+    return (fewer.weights > 0).flatten(1).sum(-1) / (tracks.weights > 0).flatten(1).sum(-1).clamp(min=1)
 
 
 def robust_projections(
@@ -130,9 +133,8 @@ def robust_projections(
         cameras = _structured(tracks, cameras, lifting, sigma, given)
         sigma = _level(tracks, cameras, sigma, given)
     fewer = tracks.only(agreeing(tracks, cameras, sigma))
-    kept = (fewer.weights > 0).flatten(1).sum(-1) / (tracks.weights > 0).flatten(1).sum(-1).clamp(min=1)
     ample = tracks.x.shape[1] * tracks.x.shape[-1] >= cameras.shape[-1] + TOLERANT
-    doubt = doubtful(tracks, distance(tracks, cameras), sigma, invariant) & ~((kept >= TRUSTED) & ample)
+    doubt = doubtful(tracks, distance(tracks, cameras), sigma, invariant) & ~((_kept(fewer, tracks) >= TRUSTED) & ample)
     status = torch.where(doubt, int(Status.NO_CONSENSUS), int(Status.OK))
     return Projections(cameras, triangulate(cameras, fewer.x, fewer.weights, steps=2), status), fewer
 
@@ -143,9 +145,7 @@ def _level(tracks: Tracks, cameras: Tensor, sigma: Tensor, given: Tensor | None)
         return given
     fewer = tracks.only(agreeing(tracks, cameras, sigma))
     free = freedom(fewer, cameras.shape[-1] - 1)
-    views, rows, size = cameras.shape[1:]
-    used = views * (rows * size - 1) - (size * size - 1)
-    return settled_noise(tracks, distance(fewer, cameras), free, free >= 1, used)
+    return settled_noise(tracks, distance(fewer, cameras), free, free >= 1, camera_unknowns(*cameras.shape[1:]))
 
 
 def _extended(tracks: Tracks, found: Consensus, sigma: Tensor) -> Tensor:

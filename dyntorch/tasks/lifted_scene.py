@@ -9,11 +9,11 @@ from torch import Tensor
 
 from dyntorch.algebra.lift import balanced, balanced_algebra, upgrade
 from dyntorch.algebra.lift_frames import behind, centred, finite, moved, steady
-from dyntorch.algebra.triangulation import reproject, resect, triangulate
+from dyntorch.algebra.triangulation import reproject, resect, triangulate, unit_projections
 from dyntorch.bundle_adjustment import bundle_adjust
 from dyntorch.motions import Motion
 from dyntorch.solution import Status, failed
-from dyntorch.tasks.lifted_projections import Projections, Tracks
+from dyntorch.tasks.lifted_projections import Projections, Tracks, camera_unknowns
 from dyntorch.tasks.lifted_starts import middle, resting, resting_constants, tilted
 
 STRUCTURED, FINE = 60, 1e-7
@@ -111,7 +111,8 @@ def scene_of(tracks: Tracks, found: Projections, lifting: Lifting, scale: Tensor
     spare = (coordinates * known).sum(-1) - (size - 1) * known.sum(-1)
     shaky = ~lost & (size >= SEVERAL) & (spare <= SPARE * known.sum(-1))
     shaky = shaky | (~lost & wild(tracks, _finite(tracks, scene, lifting), lifting))
-    unaided = (found.status == Status.TOO_FEW) & (spare > _unknown(lifting, tracks))
+    unknown = camera_unknowns(tracks.x.shape[1], tracks.x.shape[-1] + 1, lifting.lifts.shape[1], len(lifting.algebra) - 1)
+    unaided = (found.status == Status.TOO_FEW) & (spare > unknown)
     left = (shaky | unaided | aided).nonzero()[:, 0] if lifting.still.shape[-1] else lost.new_zeros(0, dtype=torch.long)
     return _confirmed(tracks, scene, left, known, lifting, scale) if len(left) else scene
 
@@ -136,12 +137,6 @@ def _aided(tracks: Tracks, lifting: Lifting) -> Tensor:
 def _upgraded(found: Projections, lost: Tensor, lifting: Lifting) -> Tensor:
     """Cameras; of lost problems anything finite."""
     return upgrade(torch.where(lost[:, None, None, None], 1.0, found.projections), lifting.lifts)[1]
-
-
-def _unknown(lifting: Lifting, tracks: Tracks) -> int:
-    """Number of unknowns of all cameras, less the ambiguity."""
-    views, rows, columns = tracks.x.shape[1], tracks.x.shape[-1] + 1, lifting.lifts.shape[1]
-    return views * (rows * columns - 1) - (len(lifting.algebra) - 1)
 
 
 def _scene(tracks: Tracks, cameras: Tensor, known: Tensor, lifting: Lifting, scale: Tensor | None) -> Scene:
@@ -228,10 +223,9 @@ def framed(tracks: Tracks, scene: Scene, lifting: Lifting) -> Scene:
     cameras, structure = moved(G, cameras, structure, lifts)
     G = centred(structure, lifts, known.to(structure.dtype))
     cameras, structure = moved(G, cameras, structure, lifts)
-    norm = cameras.flatten(-2).norm(dim=-1)[..., None, None]
     depth = structure @ lifts[0, -1]
     structure = structure / torch.where(depth.abs() > 1e-12, depth, 1.0)[..., None]
-    return Scene(cameras / norm.clamp(min=torch.finfo(norm.dtype).tiny), structure, scene.cost)
+    return Scene(unit_projections(cameras), structure, scene.cost)
 
 
 def _finite(tracks: Tracks, scene: Scene, lifting: Lifting) -> Scene:

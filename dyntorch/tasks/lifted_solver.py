@@ -8,7 +8,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from dyntorch.algebra.triangulation import triangulate
+from dyntorch.algebra.triangulation import triangulate, unit_projections
 from dyntorch.bundle_adjustment import bundle_adjust
 from dyntorch.motions import Motion
 from dyntorch.solution import Status, failed
@@ -148,7 +148,6 @@ def _result(
     number = counted.flatten(1).sum(-1)
     sigma = (total / spare(tracks, counted, motion).clamp(min=1)).sqrt()
     back = torch.linalg.inv(tracks.transforms)
-    bad = failed(status)
     status, warnings = diagnose(tracks, scene, lifting, motion, status, sigma, batch)
     if given is not None and tracks.static is not None:
         wrong = (given & ~tracks.static).sum(-1)
@@ -163,7 +162,7 @@ def _result(
     nan = float("nan")
     return Reconstruction(
         motion=motion,
-        cameras=shaped(_unit(back @ cameras)),
+        cameras=shaped(unit_projections(back @ cameras)),
         points=shaped(points, nan),
         velocities=None if speed is None else shaped(speed, nan),
         labels=shaped(labels),
@@ -172,35 +171,28 @@ def _result(
         sigma=shaped(sigma),
         status=status.reshape(batch),
         structure=shaped(structure),
-        projections=shaped(_unit(back @ (projections if lifting is None else projections @ lifting.root))),
+        projections=shaped(unit_projections(back @ (projections if lifting is None else projections @ lifting.root))),
         inliers=shaped(counted),
         times=tracks.times,
         ambiguity=_open(motion, tracks.times, tracks.static),
         warnings=warnings,
-        bodies=None if bodies is None else shaped(_unit(back[:, None] @ bodies)),
+        bodies=None if bodies is None else shaped(unit_projections(back[:, None] @ bodies)),
     )
 
 
 def _rests(tracks: Tracks, scene: Scene, lifting: Lifting, projections: Tensor) -> Tensor:
     """Which points ``(b, n)`` are explained as well, within the noise, by one position for all times."""
     still = lifting.still
-    moving = _cost(tracks, projections, scene.structure)
-    resting = _cost(tracks, projections @ still, triangulate(projections @ still, tracks.x, tracks.weights, steps=2))
-    free = spare(tracks, distances(tracks, projections, scene.structure).isfinite(), lifting.motion).clamp(min=1)
+    apart = distances(tracks, projections, scene.structure)
+    moving = apart.square().nansum(1)
+    places = triangulate(projections @ still, tracks.x, tracks.weights, steps=2)
+    resting = distances(tracks, projections @ still, places).square().nansum(1)
+    free = spare(tracks, apart.isfinite(), lifting.motion).clamp(min=1)
     # rounding is noise as well
     extent = (1 / tracks.scales.amin(-1, keepdim=True)).square()
     sigma = moving.sum(-1, keepdim=True) / free[:, None] + EXACT * extent
     extra = lifting.lifts.shape[-1] - lifting.lifts.shape[1]
     return resting - moving <= CHI_SQUARE.get(extra, 3.0 * extra + 4.0) * sigma
-
-
-def _cost(tracks: Tracks, projections: Tensor, structure: Tensor) -> Tensor:
-    """Squared reprojection error of each point, ``(b, n)``, measured units."""
-    return distances(tracks, projections, structure).square().nansum(1)
-
-
-def _unit(cameras: Tensor) -> Tensor:
-    return cameras / cameras.flatten(-2).norm(dim=-1)[..., None, None].clamp(min=torch.finfo(cameras.dtype).tiny)
 
 
 def _open(motion: Motion, times: Tensor, static: Tensor | None) -> str:

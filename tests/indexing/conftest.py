@@ -11,6 +11,7 @@ import torch
 
 from indexing import ActionIndexer, Clip, ClipSet
 from indexing.actors import ACTIONS, Person, dataset
+from indexing.cli import main
 from indexing.shape.bank import Windows
 from indexing.windows import ragged, whole
 
@@ -71,3 +72,17 @@ def random_clip() -> Callable[..., Clip]:
         return Clip(3 * still + size * np.sin(2 * np.pi * t + 3 * phase) + phase * np.cos(4 * np.pi * t), **known)
 
     return make
+
+
+@pytest.fixture
+def run(request, data, tmp_path, monkeypatch, capsys):
+    """Runs the module's ``COMMAND`` in an empty folder; ``@/`` in a word stands for the folder of the module's ``data``."""
+    monkeypatch.chdir(tmp_path)
+    capsys.readouterr()
+
+    def call(line: str) -> tuple[int, str, str]:
+        code = main([request.module.COMMAND, *(word.replace("@/", f"{data}/") for word in line.split())])
+        said = capsys.readouterr()
+        return code, said.out, said.err
+
+    return call

@@ -14,7 +14,6 @@ import pytest
 import torch
 
 from dyntorch import scenes
-from indexing.cli import main
 from indexing.report.alignment import FILES, AlignmentReport, as_json, labels_csv, write_alignment
 from indexing.report.alignment_page import display_scale, figures, turn_and_shift
 from indexing.report.alignment_picture import as_segments, carried
@@ -22,6 +21,8 @@ from indexing.report.alignment_picture import as_segments, carried
 SCRIPT = "<script>alert(1)</script>"
 # torch's own, when it first loads its transforms; hidden outside of tests
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated")
+
+COMMAND = "align"
 
 
 def draw(seed: int) -> torch.Generator:
@@ -56,20 +57,6 @@ def data(tmp_path_factory: pytest.TempPathFactory, planar) -> Path:
         table(folder / f"p{i}.csv", lines.extras[f"points{i}"].numpy())
     np.save(folder / "line_truth.npy", lines.motion[0].numpy())
     return folder
-
-
-@pytest.fixture
-def run(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
-    """Runs the command in an empty folder; ``@/`` in a word stands for the folder of the data."""
-    monkeypatch.chdir(tmp_path)
-    capsys.readouterr()
-
-    def call(line: str) -> tuple[int, str, str]:
-        code = main(["align", *(word.replace("@/", f"{data}/") for word in line.split())])
-        said = capsys.readouterr()
-        return code, said.out, said.err
-
-    return call
 
 
 def read(folder: str | Path = "out") -> dict:

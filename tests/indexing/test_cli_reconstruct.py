@@ -16,13 +16,14 @@ import pytest
 import torch
 
 from dyntorch import metrics, motions, scenes
-from indexing.cli import main
 from indexing.cli.reconstruct import PURPOSE, REASONS, MotionName
 from indexing.report.reconstruction import FILES
 
 # torch's own, when it first loads its transforms; hidden outside of tests
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated")
 TIMES = [0.0, 1.0, 2.5, 3.0]
+
+COMMAND = "reconstruct"
 
 
 def draw(seed: int) -> torch.Generator:
@@ -58,20 +59,6 @@ def data(tmp_path_factory: pytest.TempPathFactory, scene) -> Path:
     for i, view in enumerate(tracks):
         (folder / f"v{i}.csv").write_text("\n".join(["x,y", *(f"{x:.6f},{y:.6f}" for x, y in view)]))
     return folder
-
-
-@pytest.fixture
-def run(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
-    """Runs the command in an empty folder; ``@/`` in a word stands for the folder of the data."""
-    monkeypatch.chdir(tmp_path)
-    capsys.readouterr()
-
-    def call(line: str) -> tuple[int, str, str]:
-        code = main(["reconstruct", *(word.replace("@/", f"{data}/") for word in line.split())])
-        said = capsys.readouterr()
-        return code, said.out, said.err
-
-    return call
 
 
 def read(folder: str | Path = "out") -> dict:
