@@ -35,15 +35,19 @@ class Algebraic:
 
     def cost(self, theta: Tensor) -> Tensor:
         """``(b,)``."""
-        tensor = self.invariant.compose(*self.parts(theta)).flatten(1)
+        tensor = self._columns(self.invariant.compose(*self.parts(theta)).flatten(1))
         return ((self.gram @ tensor[..., None])[..., 0] * tensor).sum(-1)
 
     def normal_equations(self, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        tensor, slope = self.invariant.compose_derivative(self.parts(theta))
+        tensor, slope = (self._columns(x) for x in self.invariant.compose_derivative(self.parts(theta)))
         image = (self.gram @ tensor[..., None])[..., 0]
         cost = (image * tensor).sum(-1)
         bent = slope @ self.gram
         return torch.where(cost.isfinite(), cost, torch.inf), (slope @ image[..., None])[..., 0], bent @ slope.mT
+
+    def _columns(self, tensor: Tensor) -> Tensor:
+        """Flat tensors ``(b, ..., D)`` with their entries in the order of the columns of the estimation matrix."""
+        return self.invariant.basis_of(tensor.unflatten(-1, self.invariant.shape()))[..., 0, :]
 
 
 def constrain(solution: Solution, *, iterations: int = ITERATIONS) -> Solution:

@@ -28,7 +28,7 @@ def energy(solution, tensor, weights=None):
     total = rows[0]
     for u in rows[1:]:
         total = (total[..., :, None, :, None] * u[..., None, :, None, :]).flatten(-4, -3).flatten(-2)
-    value = (total @ tensor.flatten(1)[:, None, :, None])[..., 0].square().sum(-1)
+    value = (total @ invariant.basis_of(tensor)[:, :1, :, None])[..., 0].square().sum(-1)
     return value.sum(-1) if weights is None else (value * weights).sum(-1)
 
 
@@ -39,8 +39,10 @@ def energy(solution, tensor, weights=None):
         (P6, scene("constant_velocity_3d", (0, 2, 4, 7), 80, 0.5)[0]),
         (dyn.GrassmannTensor(5, (2, 2, 2)), scene("constant_velocity_planes_3d", (0, 2, 5), 60, 0.5)[0]),
         (dyn.HomographyTensor(), scenes.planar(80, sigma=1.0, batch=3, generator=torch.Generator().manual_seed(1)).views),
+        # the axes of its tensor are in another order than its views
+        (dyn.FundamentalMatrix(), scenes.two_view(40, sigma=1.0, batch=3, generator=torch.Generator().manual_seed(1)).views),
     ],
-    ids=["P4", "P6", "P5", "homography"],
+    ids=["P4", "P6", "P5", "homography", "fundamental"],
 )
 def test_least_error_of_all_motions(invariant, views):
     linear = dyn.fit(invariant, *views).check()
@@ -52,7 +54,8 @@ def test_least_error_of_all_motions(invariant, views):
     least = energy(linear, found.normalized)
     # more than the linear tensor, less than what that decomposes into, and nothing nearby is better
     parts = invariant.normalized(linear.normalization.transforms).decompose(linear.normalized)
-    assert (energy(linear, linear.normalized) <= least).all()
+    if type(invariant).constrain is dyn.Invariant.constrain:  # else the fit has left the null vector already
+        assert (energy(linear, linear.normalized) <= least).all()
     assert (least <= energy(linear, invariant.compose(*parts)) * (1 + 1e-9)).all()
     draw = torch.Generator().manual_seed(2)
     for size in (1e-2, 1e-3, 1e-4):
