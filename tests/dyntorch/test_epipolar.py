@@ -1,0 +1,207 @@
+"""Fundamental matrices of samples and weightings: against constructed scenes, SVDs and polynomial roots from numpy."""
+
+import numpy as np
+import pytest
+import torch
+
+from dyntorch.algebra.epipolar import affine_fundamental, eight_point, null_vector, sampson_squared
+from dyntorch.algebra.epipolar_samples import draw, sample_fundamentals, seven_point
+from dyntorch.algebra.homogeneous import homogeneous, unit
+from dyntorch.scenes import two_view
+
+CENTRE, SIZE = torch.tensor([320.0, 240.0], dtype=torch.float64), 300.0
+
+
+def random(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def scene(n=60, sigma=0.0, seed=0):
+    """Matches in a frame of unit size, and F there."""
+    made = two_view(n, sigma=sigma, generator=torch.Generator().manual_seed(seed))
+    change = torch.eye(3, dtype=torch.float64) * SIZE
+    change[:2, 2], change[2, 2] = CENTRE, 1.0
+    return *((view - CENTRE) / SIZE for view in made.views), unit(change.T @ made.motion[0] @ change)
+
+
+def products(x1, x2):
+    return (homogeneous(x2)[..., :, None] * homogeneous(x1)[..., None, :]).flatten(-2)
+
+
+def distance(F, G):
+    """Of matrices of norm 1, whatever their signs."""
+    return torch.minimum((F - G).flatten(-2).norm(dim=-1), (F + G).flatten(-2).norm(dim=-1))
+
+
+def rms(F, x1, x2):
+    return sampson_squared(F, x1, x2).mean(-1).sqrt()
+
+
+def test_seven_points_determine_a_singular_matrix_among_at_most_three():
+    x1, x2, truth = scene(400)
+    chosen = torch.rand(200, 400, generator=torch.Generator().manual_seed(1)).argsort(-1)[:, :7]
+    F, valid = seven_point(x1[chosen], x2[chosen])
+    assert F.shape == (200, 3, 3, 3)
+    assert set(valid.sum(-1).tolist()) == {1, 3}
+    assert (products(x1[chosen], x2[chosen])[:, None] @ F.flatten(-2)[..., None]).abs().max() < 1e-12
+    assert torch.linalg.det(F).abs().max() < 1e-13
+    torch.testing.assert_close(F.flatten(-2).norm(dim=-1), valid.double())
+    best = torch.where(valid, distance(F, truth), 2.0).amin(-1)
+    assert best.median() < 1e-12
+    assert best.max() < 1e-6
+
+
+def test_seven_point_finds_the_real_roots_that_numpy_finds():
+    x1, x2 = random(2, 300, 7, 2)
+    F, valid = seven_point(x1, x2)
+    for sample in range(0, 300, 5):
+        null = np.linalg.svd(products(x1, x2)[sample].numpy())[2][7:].reshape(2, 3, 3)
+        at = [-1.0, 0.0, 1.0, 2.0]
+        roots = np.roots(np.polyfit(at, [np.linalg.det(a * null[0] + null[1]) for a in at], 3))
+        real = roots[np.abs(roots.imag) < 1e-9].real
+        assert len(real) == valid[sample].sum()
+        for a in real:
+            expected = unit(torch.as_tensor(a * null[0] + null[1]))
+            assert distance(F[sample], expected).min() < 1e-6
+
+
+def test_seven_point_of_special_pencils():
+    # a pure translation, an affine scene and seven equal matches: roots at infinity, double roots, no equations at all
+    x1 = random(7, 2)
+    shifts = random(7, 1, seed=1)
+    for x2 in (
+        x1 + shifts * torch.tensor([1.0, 0.0]).double(),
+        x1 @ random(2, 2, seed=2) + shifts * random(2, seed=3),
+        x1[:1].expand(7, 2),
+    ):
+        F, valid = seven_point(x1[:1].expand(7, 2) if x2.stride(0) == 0 else x1, x2)
+        assert F.isfinite().all()
+        assert valid.any()
+        assert torch.linalg.det(F).abs().max() < 1e-10
+    with pytest.raises(ValueError, match=r"\(\*batch, 7, 2\)"):
+        seven_point(x1[:6], x1[:6])
+
+
+def test_sampson_distance_by_its_definition():
+    F, (x1, x2) = random(4, 5, 3, 3), random(2, 11, 2, seed=1)
+    p1, p2 = homogeneous(x1), homogeneous(x2)
+    for i in range(4):
+        for j in range(5):
+            value = torch.einsum("ni,ij,nj->n", p2, F[i, j], p1)
+            one, two = p1 @ F[i, j].T, p2 @ F[i, j]
+            expected = value**2 / (one[:, :2].square().sum(-1) + two[:, :2].square().sum(-1))
+            torch.testing.assert_close(sampson_squared(F, x1, x2)[i, j], expected)
+    assert (sampson_squared(torch.zeros(3, 3).double(), x1, x2) == 0).all()
+
+
+def reference_eight_point(x1, x2, w):
+    """Hartley's algorithm, one problem, by SVDs."""
+    changes = []
+    for x in (x1, x2):
+        centre = (w[:, None] * x).sum(0) / w.sum()
+        scale = (2 / ((w[:, None] * (x - centre) ** 2).sum() / w.sum())).sqrt()
+        change = torch.diag(torch.stack([scale, scale, torch.ones_like(scale)]))
+        change[:2, 2] = -scale * centre
+        changes.append(change)
+    y1, y2 = homogeneous(x1) @ changes[0].T, homogeneous(x2) @ changes[1].T
+    rows = (y2[:, :, None] * y1[:, None, :]).flatten(1) * w.sqrt()[:, None]
+    u, s, vt = torch.linalg.svd(torch.linalg.svd(rows)[2][-1].reshape(3, 3))
+    s[2] = 0
+    return unit(changes[1].T @ (u * s) @ vt @ changes[0])
+
+
+@pytest.mark.parametrize("sigma", [0.0, 1.0])
+def test_eight_point_is_hartleys_for_every_weighting(sigma):
+    x1, x2, truth = scene(60, sigma)
+    weights = torch.rand(6, 60, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    # a small body far from the centre has its own coordinates
+    weights[5] *= (x1 - x1[0]).norm(dim=-1) < 0.4
+    F = eight_point(x1, x2, weights)
+    for k in range(6):
+        assert distance(unit(F[k]), reference_eight_point(x1, x2, weights[k])) < (1e-5 if k == 5 else 1e-7)
+    assert torch.linalg.det(F).abs().max() < 1e-15
+    if sigma == 0.0:
+        assert distance(F, truth).max() < 1e-8
+
+
+def test_weighing_by_the_gradient_gets_nearer_to_the_least_sampson_distance():
+    gain = []
+    for seed in range(20):
+        x1, x2, _ = scene(50, 1.0, seed)
+        ones = torch.ones(1, 50, dtype=torch.float64)
+        gain.append(rms(eight_point(x1, x2, ones), x1, x2) - rms(eight_point(x1, x2, ones, rounds=3), x1, x2))
+    assert torch.stack(gain).mean() > 0
+    assert (torch.stack(gain) > -1e-4).all()
+
+
+def test_affine_fundamental_is_the_total_least_squares_hyperplane():
+    x1 = random(40, 2)
+    x2 = x1 @ random(2, 2, seed=1) + random(40, 1, seed=2) * random(2, seed=3) + 0.01 * random(40, 2, seed=4)
+    weights = torch.rand(3, 40, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    F = affine_fundamental(x1, x2, weights)
+    joint = torch.cat([x2, x1], dim=-1)
+    for k in range(3):
+        centred = joint - (weights[k][:, None] * joint).sum(0) / weights[k].sum()
+        least = torch.linalg.svd(weights[k].sqrt()[:, None] * centred)[1][-1] ** 2
+        torch.testing.assert_close((weights[k] * sampson_squared(F[k], x1, x2)).sum(), least)
+    assert (F[:, :2, :2] == 0).all()
+
+
+def test_matches_that_decide_nothing_still_give_finite_matrices():
+    x1, x2, _ = scene(20)
+    weights = torch.zeros(4, 20, dtype=torch.float64)
+    weights[1, 0], weights[2, :5], weights[3] = 1.0, 1.0, 1.0
+    for F in (eight_point(x1, x2, weights, 2), affine_fundamental(x1, x2, weights), eight_point(x1 * 0, x2 * 0, weights, 2)):
+        assert F.isfinite().all()
+        torch.testing.assert_close(F.flatten(1).norm(dim=-1), torch.ones(4, dtype=torch.float64))
+    # one bad problem leaves the others alone
+    torch.testing.assert_close(eight_point(x1, x2, weights)[3], eight_point(x1, x2, weights[3:])[0])
+
+
+def test_null_vector_is_the_smallest_eigenvector():
+    for size in (4, 9):
+        rows = random(50, 30, size)
+        gram = rows.mT @ rows
+        values = torch.linalg.eigvalsh(gram)
+        found = null_vector(gram)
+        excess = (found[:, None] @ gram @ found[..., None])[:, 0, 0] / values[:, 0] - 1
+        apart = values[:, 0] < 0.7 * values[:, 1]
+        assert apart.sum() > 5
+        assert excess.max() < 0.05
+        assert excess[apart].max() < 1e-5
+    assert null_vector(torch.zeros(2, 9, 9).double()).isfinite().all()
+
+
+def test_draws_are_without_replacement_and_by_weight():
+    weights = torch.tensor(
+        [[1.0] * 8 + [0.0] * 4, [0.0, 5.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.0, 3.0, 0.5]], dtype=torch.float64
+    )
+    chosen = draw(weights, 7, 4000, torch.Generator().manual_seed(0))
+    assert chosen.shape == (2, 4000, 7)
+    assert (chosen.sort(-1).values.diff(dim=-1) > 0).all()
+    assert (weights.gather(1, chosen.flatten(1)) > 0).all()
+    first = torch.stack([torch.bincount(c, minlength=12) for c in chosen[..., 0]]) / 4000
+    assert (first - weights / weights.sum(-1, keepdim=True)).abs().max() < 0.03
+    # of eight equal weights every one is left out equally often
+    assert (torch.bincount(chosen[0].flatten(), minlength=12)[:8] / 4000 - 7 / 8).abs().max() < 0.03
+    # the second of two draws follows the weights that are left
+    pair = draw(weights[1:], 2, 40000, torch.Generator().manual_seed(1))[0]
+    second = torch.bincount(pair[pair[:, 0] == 1, 1], minlength=12).double()
+    left = weights[1].clone()
+    left[1] = 0
+    assert (second / second.sum() - left / left.sum()).abs().max() < 0.02
+
+
+def test_samples_of_a_pool_fit_the_pool():
+    x1, x2, truth = scene(60)
+    other = scene(60, seed=5)
+    x1, x2 = torch.cat([x1, other[0]]), torch.cat([x2, other[1]])
+    weights = torch.zeros(3, 120, dtype=torch.float64)
+    weights[0, :60], weights[1, 60:], weights[2, :6] = 1.0, 1.0, 1.0
+    F, valid = sample_fundamentals(x1, x2, weights, 10, torch.Generator().manual_seed(0))
+    again, _ = sample_fundamentals(x1, x2, weights, 10, torch.Generator().manual_seed(0))
+    assert F.shape == (3, 30, 3, 3)
+    assert torch.equal(F, again)
+    assert not valid[2].any()
+    assert distance(F[0], truth).min() < 1e-8
+    assert distance(F[1], other[2]).min() < 1e-8
