@@ -20,6 +20,7 @@ _HOME = {
     "MinimalJoinTensor": "dyntorch.invariants.minimal_join_tensor",
     "ConstantVelocityTensor": "dyntorch.invariants.constant_velocity_tensor",
     "TranslatingLinesMatrix": "dyntorch.invariants.translating_lines_matrix",
+    "SegmentationMatrix": "dyntorch.invariants.segmentation_matrix",
     "GrassmannTensor": "dyntorch.invariants.grassmann_tensor",
     "Invariant": "dyntorch.invariant",
     # from matches to the tensor and its motion
@@ -36,6 +37,9 @@ _HOME = {
     "align_planar": "dyntorch.tasks.align_planar",
     "align_points": "dyntorch.tasks.align_points",
     "align_lines": "dyntorch.tasks.align_lines",
+    "segment": "dyntorch.tasks.bodies",
+    "Segmentation": "dyntorch.tasks.segmentation",
+    "BodyModel": "dyntorch.tasks.segmentation",
     "reconstruct": "dyntorch.tasks.reconstruct",
     "Motion": "dyntorch.motions",
     "triangulate_trajectories": "dyntorch.tasks.trajectories",
@@ -61,7 +65,7 @@ _HOME = {
     "affine_factorization": "dyntorch.algebra.factorization",
     "metric_upgrade": "dyntorch.algebra.factorization",
 }
-_MODULES = ("counting", "motions")
+_MODULES = ("counting", "metrics", "motions")
 __all__ = sorted([*_HOME, *_MODULES])
 
 

@@ -128,8 +128,8 @@ def tensor_is_the_null_space_of_the_brute_force_matrix(case: Case) -> None:
             least = torch.linalg.svdvals(matrix)[-case.nullity :].norm()
             if tolerance is not None:
                 assert left < tolerance
-            elif not isinstance(case.invariant, dyn.FundamentalMatrix):
-                # of all tensors the least residual; rank two costs a little
+            elif not isinstance(case.invariant, dyn.FundamentalMatrix | dyn.SegmentationMatrix):
+                # of all tensors the least residual; rank two, or a norm that rotations of the views preserve, costs a little
                 torch.testing.assert_close(left, least, rtol=1e-8, atol=1e-12)
 
 

@@ -16,6 +16,7 @@ from dyntorch.invariant import Invariant
 from dyntorch.primitives import Hyperplane, Line
 from dyntorch.scenes import Scene
 from tests.projections import collinear_images, lifted, on_image_lines, seen, tensor_error
+from tests.two_bodies import two_bodies
 
 Motion = tuple[Tensor, ...]
 PIXELS = (1 / 250.0, (320.0, 240.0))
@@ -172,8 +173,26 @@ def epipolar_truth(motion: Motion) -> Motion:
     return -cross(left) @ motion[0] + s[..., :1, None] * left[..., :, None] * right[..., None, :], left
 
 
+def two_epipolar_truths(motion: Motion) -> Motion:
+    """Those of two bodies, one after the other."""
+    return *epipolar_truth(motion[:1]), *epipolar_truth(motion[1:])
+
+
+def two_epipolar_errors(estimated: Motion, true: Motion) -> Tensor:
+    """The worse of both bodies, in the better order of them."""
+    orders = [
+        torch.maximum(epipolar_error(estimated[:2], true[a : a + 2]), epipolar_error(estimated[2:], true[2 - a : 4 - a]))
+        for a in (0, 2)
+    ]
+    return torch.minimum(*orders)
+
+
 def on_epipolar_line(motion: Motion, x1: Tensor, x2: Tensor) -> Tensor:
     return torch.stack([lift(x2) @ torch.linalg.cross(motion[1], motion[0] @ lift(x1))])
+
+
+def on_either_epipolar_line(motion: Motion, x1: Tensor, x2: Tensor) -> Tensor:
+    return on_epipolar_line(motion[:2], x1, x2) * on_epipolar_line(motion[2:], x1, x2)
 
 
 def agree(motion: Motion, x1: Tensor, *others: Tensor) -> Tensor:
@@ -245,6 +264,18 @@ CASES = (
         **SPACE,
     ),
     Case(dyn.TranslatingLinesMatrix(), scenes.translating_lines, 1, parts_error, coplanar, 35, moves=True),
+    Case(
+        dyn.SegmentationMatrix(),
+        two_bodies,
+        1,
+        two_epipolar_errors,
+        on_either_epipolar_line,
+        35,
+        noise=2e-4,
+        outliers=0.03,
+        units=PIXELS,
+        truth=two_epipolar_truths,
+    ),
     grassmann(3, (2, 2), lifted("static_3d", (0, 1), jitter=1.0), 8),
     grassmann(3, (2, 1, 1), lifted("static_3d", (0, 1, 2)), 7),
     grassmann(3, (1, 1, 1, 1), lifted("static_3d", (0, 1, 2, 3)), 6),

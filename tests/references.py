@@ -8,7 +8,7 @@ from itertools import combinations
 import torch
 from torch import Tensor
 
-from dyntorch.primitives import Hyperplane, HyperplanesThrough, Line, Primitive, Projected
+from dyntorch.primitives import Hyperplane, HyperplanesThrough, Line, Monomials, Primitive, Projected
 from tests.cases import Case, Motion, lift
 
 Views = tuple[Tensor, ...]
@@ -18,6 +18,18 @@ def plucker(ends: Tensor) -> Tensor:
     """The six minors of two points ``(..., 2, 3)``, in the order 01, 02, 03, 12, 13, 23."""
     p, q = lift(ends).unbind(-2)
     return torch.stack([p[..., i] * q[..., j] - p[..., j] * q[..., i] for i, j in combinations(range(4), 2)], dim=-1)
+
+
+def monomials(p: Tensor) -> Tensor:
+    """Of degree two, in the order 00, 01, 02, 11, 12, 22."""
+    return torch.stack([p[i] * p[j] for i in range(len(p)) for j in range(i, len(p))])
+
+
+def lifted_frame(frame: Tensor) -> Tensor:
+    """How a change of coordinates acts on the monomials of degree two: read off enough points."""
+    points = torch.randn(20, len(frame), generator=torch.Generator().manual_seed(0), dtype=frame.dtype)
+    before, after = (torch.stack([monomials(p) for p in q]) for q in (points, points @ frame.T))
+    return torch.linalg.lstsq(before, after).solution.T
 
 
 def subdeterminants(matrix: Tensor, order: int) -> Tensor:
@@ -32,6 +44,8 @@ def vectors(primitive: Primitive, x: Tensor) -> list[Tensor]:
         return [x / x[:-1].norm()]
     if isinstance(primitive, Line):
         return [plucker(x) / (x[1] - x[0]).norm().sqrt()]
+    if isinstance(primitive, Monomials):
+        return [monomials(lift(x))]
     if isinstance(primitive, HyperplanesThrough):
         planes = torch.cat([torch.eye(len(x), dtype=x.dtype), -x[:, None]], dim=1)
         return list(subdeterminants(planes, primitive.order))
@@ -181,6 +195,8 @@ def pulled_back(case: Case, tensor: Tensor, frames: Views) -> Tensor:
             frame = torch.linalg.inv(frame).mT
         if isinstance(primitives[v], HyperplanesThrough):
             frame = subdeterminants(frame, primitives[v].order)
+        if isinstance(primitives[v], Monomials):
+            frame = lifted_frame(frame)
         if isinstance(primitives[v], Line):
             frame = subdeterminants(frame, 2)
         tensor = torch.tensordot(tensor, frame, dims=([lead + axis], [0])).movedim(-1, lead + axis)

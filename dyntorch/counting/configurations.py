@@ -104,6 +104,31 @@ def fundamental(field: Field, *, static: int | None = None, coplanar: int = 0) -
     return _static_points(Views(field, 3, (2, 2), ("join", "join")), static, coplanar)
 
 
+def segmentation(
+    field: Field, *, second: int | None = None, first: int = 27, planar_first: int = 0, planar_second: int = 0
+) -> list[Step]:
+    """Points of two bodies, two views, nobody knows which: segmentation matrix, 6x6."""
+    bodies = [Views(field, 3, (2, 2), ("join", "join")) for _ in range(2)]
+    planes = [views.extensor(3) for views in bodies]
+
+    def monomials(point: IntArray) -> IntArray:
+        return np.outer(point, point)[np.triu_indices(3)]
+
+    def match(views: Views, within: IntArray) -> IntArray:
+        return field.kron(*(monomials(image[0]) for image in views.images([views.within(within)] * 2)))
+
+    def on(body: int, plane: bool) -> Callable[[], IntArray]:
+        views = bodies[body]
+        return lambda: match(views, planes[body] if plane else views.extensor(4))
+
+    return [
+        Step("planar first", planar_first, on(0, True)),
+        Step("first", first, on(0, False)),
+        Step("planar second", planar_second, on(1, True)),
+        Step("second", second, on(1, False)),
+    ]
+
+
 def trifocal(field: Field, *, static: int | None = None, coplanar: int = 0) -> list[Step]:
     """A point in one view, lines through it in two others: trifocal tensor, 3x3x3."""
     return _static_points(Views(field, 3, (2, 2, 2), ("join", "hyper", "hyper")), static, coplanar)
@@ -161,8 +186,8 @@ def by_numbers(
 
 
 _NAMED: tuple[Configuration, ...] = (
-    homography, dual_homography, join, minimal_join, constant_velocity, constant_velocity_3x4x4, lines, fundamental, trifocal,
-    quadrifocal, shape_tensor, *MOTIONS,
+    homography, dual_homography, join, minimal_join, constant_velocity, constant_velocity_3x4x4, lines, fundamental, segmentation,
+    trifocal, quadrifocal, shape_tensor, *MOTIONS,
 )  # fmt: skip
 CONFIGURATIONS: dict[str, Configuration] = {function.__name__: function for function in _NAMED}
 

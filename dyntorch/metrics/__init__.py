@@ -15,6 +15,7 @@ from dyntorch.metrics.matrices import (
     subspace_angle,
     translation_error,
 )
+from dyntorch.metrics.segmentation import misclassification
 
 __all__ = [
     "LabelScores",
@@ -24,6 +25,7 @@ __all__ = [
     "grid_transfer_error",
     "label_scores",
     "lifted_error",
+    "misclassification",
     "point_error",
     "relative_error",
     "rotation_error",

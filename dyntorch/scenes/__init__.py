@@ -3,13 +3,17 @@
 from dyntorch.scenes.lifts import LiftedScene, lifted
 from dyntorch.scenes.lines import translating_lines
 from dyntorch.scenes.plane import lines_concurrent, planar
+from dyntorch.scenes.rigid_bodies import bodies
 from dyntorch.scenes.scene import Scene
 from dyntorch.scenes.space import constant_velocity, moving_points
 from dyntorch.scenes.static import collineation, two_view
+from dyntorch.scenes.translation import TranslatingScene, translating_planes
 
 __all__ = [
     "LiftedScene",
     "Scene",
+    "TranslatingScene",
+    "bodies",
     "collineation",
     "constant_velocity",
     "lifted",
@@ -17,5 +21,6 @@ __all__ = [
     "moving_points",
     "planar",
     "translating_lines",
+    "translating_planes",
     "two_view",
 ]

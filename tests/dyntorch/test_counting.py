@@ -173,6 +173,8 @@ def ranks(counted: Count):
         ("lines", {"objects": [60, 60]}, 28, 36, 28),
         ("lines", {"objects": [60, 60, 60]}, 31, 36, 31),
         ("lines", {"objects": [60, 60, 60, 60]}, 31, 36, 31),
+        ("segmentation", {}, 35, 36, 35),
+        ("segmentation", {"first": 28, "second": 7}, 34, 36, 34),
         ("shape_tensor", {}, 80, 81, 6),
     ],
 )
@@ -183,6 +185,33 @@ def test_rank_of_named_configurations(name, options, rank, width, minimal):
     assert counted.agreed
     assert counted.full == {"join": 60}.get(name, width - 1)
     assert (counted.missing == 0) == (counted.rank == counted.full)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "rank", "useful"),
+    [
+        ({"first": 40, "second": 0}, 27, 27),  # the 9 products with another form vanish on a body
+        ({"first": 27, "second": 8}, 35, 35),
+        ({"first": 26, "second": 9}, 35, 35),
+        ({"first": 20, "second": 15}, 35, 35),
+        ({"first": 8, "second": 27}, 35, 35),
+        ({"first": 28, "second": 7}, 34, 34),
+        ({"first": 40, "second": 40}, 35, 35),
+        ({"first": 7, "second": 40}, 34, 34),
+        ({"first": 0, "planar_first": 40, "second": 0}, 15, 15),
+        ({"first": 0, "planar_first": 40, "second": 40}, 33, 33),  # F_2 times [e]xH, any e
+        ({"planar_second": 6, "second": 0}, 33, 33),
+        ({"planar_second": 5, "second": 0}, 32, 32),
+        ({"first": 0, "planar_first": 40, "planar_second": 40, "second": 0}, 27, 27),  # 3 x 3 products
+        ({"first": 0, "planar_first": 15, "planar_second": 12, "second": 0}, 27, 27),
+    ],
+)
+def test_rank_of_two_bodies(numbers, rank, useful):
+    counted = count("segmentation", **numbers)
+    assert (counted.rank, counted.width, counted.minimal) == (rank, 36, useful)
+    assert counted.agreed
+    other = count("segmentation", seed=1, **numbers)
+    assert other.rank == rank
 
 
 @pytest.mark.parametrize(

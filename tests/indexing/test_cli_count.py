@@ -95,7 +95,7 @@ def test_table_of_all(run):
     assert rows["constant_velocity_planes_3d"] == ["81", "80", "1", "20", "moving"]
     assert max(map(len, out.splitlines())) <= 132
     listed = json.loads(run("--json")[1])
-    assert {entry["name"] for entry in listed} <= rows.keys() and len(listed) == 22
+    assert {entry["name"] for entry in listed} <= rows.keys() and len(listed) == 23
 
 
 def test_json_has_the_profile(run):

@@ -1,0 +1,126 @@
+"""Monomials of the coordinates of a point: what polynomial constraints on points are linear in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations_with_replacement
+from math import comb
+
+import torch
+from torch import Tensor
+
+from dyntorch.algebra.homogeneous import homogeneous
+from dyntorch.constants import constant
+from dyntorch.primitives.base import Primitive
+
+
+@dataclass(frozen=True, repr=False)
+class Monomials(Primitive):
+    r"""The monomials :math:`\nu(p)` of one degree of a point p = (x, 1) of P^d, in lexicographic order: 00, 01, 02, 11, 12, 22.
+
+    A form :math:`\nu(p)^T c` is a curve (of degree 2 a conic) through the point.  A collineation T acts on them linearly,
+    :math:`\nu(T p) = T_\nu\, \nu(p)`.
+
+    Example:
+        >>> import torch
+        >>> Monomials().raw(torch.tensor([[2.0, 3.0]])).tolist()
+        [[4.0, 6.0, 2.0, 9.0, 3.0, 1.0]]
+    """
+
+    degree: int = 2
+    dim: int = 2
+    isometric: bool = False
+    r"""Whether each is scaled by the root of how often it occurs in :math:`p \otimes \dots \otimes p`, so that rotations of p
+    rotate them."""
+
+    @property
+    def width(self) -> int:  # type: ignore[override]
+        return comb(self.dim + self.degree, self.degree)
+
+    def shapes(self) -> tuple[tuple[int, ...], ...]:
+        return ((self.dim,),)
+
+    def raw(self, x: Tensor) -> Tensor:
+        return self.components(x).mT
+
+    def components(self, x: Tensor) -> Tensor:
+        p = torch.cat([x.mT, torch.ones_like(x.mT[..., :1, :])], dim=-2)
+        factors = self._factors(x.device).unbind(-1)
+        product = p.index_select(-2, factors[0])
+        for factor in factors[1:]:
+            product = product * p.index_select(-2, factor)
+        return product * self.scale(x.device).to(x.dtype)[:, None] if self.isometric else product
+
+    def normalized(self, transform: Tensor) -> Primitive:
+        """The isometric ones: what is least squares must not depend on how the axes lie."""
+        return Monomials(self.degree, self.dim, isometric=True)
+
+    def scale(self, device: torch.device) -> Tensor:
+        """The factors ``(width,)`` of the isometric ones."""
+        return multiplicity(self.degree, self.dim, device).sqrt()
+
+    def action(self, transform: Tensor) -> Tensor:
+        # row by row: the product of linear forms, whose coefficients add up by monomial
+        product = torch.ones_like(transform[..., :1, :1])
+        for factor in self._factors(transform.device).unbind(-1):
+            product = (product[..., :, None] * transform[..., factor, None, :]).flatten(-2)
+        lifted = product @ collecting(self.degree, self.dim, transform.device).to(transform.dtype).mT
+        if not self.isometric:
+            return lifted
+        scale = self.scale(transform.device).to(transform.dtype)
+        return scale[:, None] * lifted / scale
+
+    def pullback(self, x: Tensor, gradient: Tensor) -> Tensor:
+        return (gradient[..., None, :] @ self._derivative(x))[..., 0, :]
+
+    def pushforward(self, x: Tensor, change: Tensor) -> Tensor:
+        return (self._derivative(x) @ change[..., None])[..., 0]
+
+    def _derivative(self, x: Tensor) -> Tensor:
+        """``(*batch, n, width, dim)``: one factor at a time replaced by its derivative."""
+        factors = self._factors(x.device)
+        factors = self._factors(x.device)
+        p, eye = homogeneous(x), torch.eye(self.dim + 1, self.dim, dtype=x.dtype, device=x.device)
+        total = torch.zeros((), dtype=x.dtype, device=x.device)
+        for i in range(self.degree):
+            term = eye[factors[:, i]]
+            for j in range(self.degree):
+                term = term if j == i else term * p[..., factors[:, j], None]
+            total = total + term
+        return total * self.scale(x.device).to(x.dtype)[:, None] if self.isometric else total
+
+    def _factors(self, device: torch.device) -> Tensor:
+        return factors(self.degree, self.dim, device)
+
+
+@constant
+def symmetric(dim: int, device: torch.device) -> Tensor:
+    """Where the monomials of degree two are in a symmetric matrix, ``(dim + 1, dim + 1)``."""
+    table = torch.tensor(list(combinations_with_replacement(range(dim + 1), 2)))
+    place = torch.zeros(dim + 1, dim + 1, dtype=torch.long)
+    place[table[:, 0], table[:, 1]] = place[table[:, 1], table[:, 0]] = torch.arange(len(table))
+    return place.to(device)
+
+
+@constant
+def factors(degree: int, dim: int, device: torch.device) -> Tensor:
+    """The coordinates in each monomial, ``(width, degree)``, ascending."""
+    return torch.tensor(list(combinations_with_replacement(range(dim + 1), degree)), device=device)
+
+
+@constant
+def collecting(degree: int, dim: int, device: torch.device) -> Tensor:
+    r"""Which products of coordinates are which monomial: C with :math:`p \otimes \dots \otimes p = C^T \nu(p)`, 0 and 1.
+
+    The coefficients of a product of linear forms are :math:`C (a \otimes b \otimes \dots)`.  ``(width, (dim + 1)^degree)``.
+    """
+    grids = torch.meshgrid(*[torch.arange(dim + 1)] * degree, indexing="ij")
+    every = torch.stack([grid.flatten() for grid in grids], dim=-1).sort(-1).values
+    table = torch.tensor(list(combinations_with_replacement(range(dim + 1), degree)))
+    return (table[:, None] == every).all(-1).double().to(device)
+
+
+@constant
+def multiplicity(degree: int, dim: int, device: torch.device) -> Tensor:
+    """How many products of coordinates are each monomial, ``(width,)``."""
+    return collecting(degree, dim, torch.device("cpu")).sum(-1).to(device)

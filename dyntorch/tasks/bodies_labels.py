@@ -1,0 +1,100 @@
+"""Labels of all matches, outliers among them, given the bodies found among the coherent ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dyntorch.algebra.epipolar import sampson_squared
+from dyntorch.algebra.epipolar_descent import descend
+from dyntorch.tasks.bodies_energy import View
+from dyntorch.tasks.coherence import Links, conformity
+
+OUTLIER = 1.0
+"""Cost of an outlier: that of a match one threshold away from a body in which it moves like its neighbours."""
+STRANGE, CONFORMING = 2.5, 0.25
+"""Cost of a match that moves unlike all its neighbours of a body, and the conformity from which it costs nothing."""
+FOUND = 6.0
+"""What a match that the search assigned to a body gains there."""
+SHARPNESS = 4.0
+FAR = 9.0
+TURNS, ROUNDS = 20, 3
+FIT = 0.8
+"""Scale of the fits, in thresholds."""
+
+
+@dataclass(frozen=True)
+class Labelling:
+    """Labels of all matches.
+
+    Attributes:
+        probabilities: ``(K + 1, n)``, the first of an outlier.
+        fundamentals: ``(K, 3, 3)``.
+    """
+
+    probabilities: Tensor
+    fundamentals: Tensor
+
+    @property
+    def labels(self) -> Tensor:
+        """``(n,)``, 0 outlier."""
+        return self.probabilities.argmax(0)
+
+
+def label(view: View, found: Tensor, fundamentals: Tensor, weights: Tensor, threshold: float, scale: float | None) -> Labelling:
+    r"""Labels and geometries in turns: a mean field of the costs
+
+    .. math:: \min(r_{ik}^2 / T^2, 9) + s\,(1 - c_{ik} / c_0)_+ - b\,[i \text{ found in } k], \qquad \text{outlier: } 1,
+
+    with the conformity :math:`c_{ik}` of match i to body k, and of labels that differ from those of the neighbours.
+
+    Args:
+        view: all matches.
+        found: ``(n,)`` bodies 1..K of the search, 0 elsewhere.
+        fundamentals: ``(K, 3, 3)`` of the search.
+        weights: ``(n,)`` of the matches in the fits.
+        threshold: T, in the coordinates of ``view``.
+        scale: as of :func:`~dyntorch.tasks.coherence.coherence`; None: neighbours do not matter.
+    """
+    numbers = torch.arange(1, len(fundamentals) + 1, device=found.device)[:, None]
+    members = found == numbers
+    gain = FOUND * members.to(weights.dtype) if scale is not None else 0.0
+    strange = _strange(view, members, scale)
+    links = _normalized(view.links)
+
+    def probabilities(bodies: Tensor) -> Tensor:
+        square = sampson_squared(bodies, view.x1, view.x2) / threshold**2
+        return field(square.clamp(max=FAR) + strange - gain, links)
+
+    bodies = fundamentals
+    member = probabilities(bodies)
+    for turn in range(ROUNDS):
+        members = member.argmax(0) == numbers
+        # a descent never raises its own truncated cost, so geometries cannot drift away from their members
+        bodies = descend(bodies, view.x1, view.x2, members * weights, FIT * threshold)
+        strange = _strange(view, members, scale) if turn == 0 else strange
+        member = probabilities(bodies)
+    return Labelling(member, bodies)
+
+
+def field(cost: Tensor, links: Links) -> Tensor:
+    """Mean field ``(K + 1, n)`` of the costs ``(K, n)`` of bodies, the first of an outlier."""
+    cost = SHARPNESS * torch.cat([torch.full_like(cost[:1], OUTLIER), cost])
+    member = torch.softmax(-cost, 0)
+    for _ in range(TURNS):
+        member = 0.5 * (member + torch.softmax(SHARPNESS * links.pull(member) - cost, 0))
+    return member
+
+
+def _strange(view: View, members: Tensor, scale: float | None) -> Tensor:
+    """Cost ``(K, n)`` of moving unlike the neighbours."""
+    if scale is None:
+        return torch.zeros_like(members, dtype=view.x1.dtype)
+    return STRANGE * (1 - conformity(view.x1, view.x2, members, scale) / CONFORMING).clamp(min=0)
+
+
+def _normalized(links: Links) -> Links:
+    """Links whose sum is 1 for every match."""
+    return Links(links.index, links.weight / links.weight.sum(-1, keepdim=True).clamp(min=1e-9))

@@ -1,0 +1,127 @@
+"""Configurations of translating planes that are degenerate, or nearly so, by name."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dyntorch.tasks.notices import Notice, NoticeCode, notices
+
+EXACT = 1e-7
+"""Sine or ratio that is rounding error."""
+NEAR = 0.1
+"""Sine or ratio below which noise is asked whether it is zero; above, nothing is degenerate."""
+CHI_SQUARE = 9.2
+"""Squared distance in standard deviations, of two degrees of freedom, exceeded once in a hundred."""
+
+MESSAGES = {
+    NoticeCode.COLLINEAR_EPIPOLES: ("the epipoles are within {value:.1g} of one line: all motion is parallel to one plane"),
+    NoticeCode.COPLANAR_NORMALS: ("the normals are within {value:.1g} of one plane: all planes are parallel to one line"),
+    NoticeCode.SHARED_BODY: "{value:g} pairs of planes or bodies move alike, as of one body: three planes do not suffice then",
+    NoticeCode.STATIC_BODY: "{value:g} planes do not move, or are at infinity: no epipole, and three planes do not suffice",
+    NoticeCode.UNUSED_PLANE: "{value:g} matrices are not finite, singular, or have too few matches; they were left out",
+    NoticeCode.FEW_PLANES: "{value:g} planes and bodies are left: give 3 planes, 2 planes and 1 body, or 2 bodies",
+    NoticeCode.OTHER_SOLUTION: "a very different homography at infinity fits {value:g} planes and bodies as well; add others",
+    NoticeCode.UNCERTAIN: "the noise leaves a relative error of {value:.2g} in the homography at infinity; add larger planes",
+}
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What is known of the planes and bodies of a flat batch, in normalized coordinates.
+
+    Attributes:
+        epipoles: ``(b, c, 3)`` unit vectors.
+        epipole_covariance: ``(b, c, 3, 3)`` of them.
+        normals: ``(b, p, 3)`` unit vectors.
+        normal_covariance: ``(b, p, 3, 3)`` of them.
+        moving: ``(b, c)`` those that move, and count.
+        used: ``(b, c)`` those that count.
+    """
+
+    epipoles: Tensor
+    epipole_covariance: Tensor
+    normals: Tensor
+    normal_covariance: Tensor
+    moving: Tensor
+    used: Tensor
+
+    def line(self) -> tuple[Tensor, Tensor]:
+        """How far the epipoles are from one line ``(b,)``, and whether noise explains it."""
+        return _flatness(self.epipoles, self.epipole_covariance, self.moving)
+
+    def plane(self) -> tuple[Tensor, Tensor]:
+        """The same for the normals and one plane."""
+        return _flatness(self.normals, self.normal_covariance, self.moving[:, : self.normals.shape[1]])
+
+    def several(self) -> Tensor:
+        """Where more than one homography at infinity fits the planes, by their position ``(b,)``.
+
+        A static plane among three may as well be a second plane of another one's body, under a family of homographies at
+        infinity.  Four planes with collinear epipoles and coplanar normals have two solutions.
+        """
+        planes = self.normals.shape[1]
+        count, bodies = self.used[:, :planes].sum(-1), self.used[:, planes:].sum(-1)
+        still = (self.used & ~self.moving).any(-1)
+        return (bodies == 0) & ((still & (count <= 3)) | (self.line()[1] & self.plane()[1] & (count <= 4)))
+
+
+def planes_notices(
+    figures: Figures, enough: Tensor, uncertainty: Tensor, uncertain: Tensor, other: Tensor, batch: Sequence[int]
+) -> tuple[Notice, ...]:
+    """Notices on all problems, in their order.
+
+    Args:
+        figures: of the planes and bodies.
+        enough: ``(b,)`` whether there are enough of them.
+        uncertainty: ``(b,)`` relative error of the homography at infinity.
+        uncertain: ``(b,)`` where that says that it is not known.
+        other: ``(b,)`` where another one fits as well.
+        batch: shape that b comes from.
+    """
+    used, still = figures.used.sum(-1), (figures.used & ~figures.moving).sum(-1)
+    missing = figures.used.shape[1] - used
+    line, collinear = figures.line()
+    plane, coplanar = figures.plane()
+    pairs = _alike(figures)
+    rows = (
+        (NoticeCode.UNUSED_PLANE, missing, missing > 0),
+        (NoticeCode.FEW_PLANES, used, ~enough),
+        (NoticeCode.COLLINEAR_EPIPOLES, line, collinear & enough),
+        (NoticeCode.COPLANAR_NORMALS, plane, coplanar & enough),
+        (NoticeCode.SHARED_BODY, pairs, (pairs > 0) & enough),
+        (NoticeCode.STATIC_BODY, still, (still > 0) & enough),
+        (NoticeCode.UNCERTAIN, uncertainty, uncertain & enough),
+        (NoticeCode.OTHER_SOLUTION, used, other & enough),
+    )
+    found = [n for code, values, flagged in rows for n in notices(code, MESSAGES[code], values, flagged, tuple(batch))]
+    return tuple(sorted(found, key=lambda notice: notice.problem))
+
+
+def _flatness(vectors: Tensor, covariance: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
+    """Smallest over largest singular value ``(b,)`` of at least three vectors, and whether it is 0 within the noise."""
+    kept = torch.where(count[..., None], vectors, 0.0)
+    values, directions = torch.linalg.eigh(kept.mT @ kept)
+    ratio = (values[:, 0].clamp(min=0) / values[:, 2].clamp(min=1e-30)).sqrt()
+    across = directions[:, None, :, 0]
+    distance = (kept * across).sum(-1)
+    variance = (across[..., None, :] @ covariance @ across[..., :, None])[..., 0, 0]
+    square = (distance.square() / (variance + EXACT**2)).sum(-1)
+    spare = (count.sum(-1) - 2).clamp(min=1)
+    return ratio, (count.sum(-1) >= 3) & (ratio < NEAR) & (square <= CHI_SQUARE * spare)
+
+
+def _alike(figures: Figures) -> Tensor:
+    """How many pairs ``(b,)`` have one epipole within the noise."""
+    e, c = figures.epipoles, figures.epipole_covariance
+    e = torch.where(figures.moving[..., None], e, 0.0)
+    cosine = e @ e.mT
+    difference = e[:, :, None] - cosine.sign()[..., None] * e[:, None]
+    square = difference.square().sum(-1)
+    variance = (c.diagonal(dim1=-2, dim2=-1).sum(-1)[:, :, None] + c.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None]) / 2
+    both = figures.moving[:, :, None] & figures.moving[:, None]
+    near = both & (square < NEAR**2) & (square <= CHI_SQUARE * (variance + EXACT**2))
+    return near.triu(diagonal=1).sum((-2, -1))

@@ -1,0 +1,195 @@
+"""Segmentation matrix: product of two epipolar forms, both decompositions, labels, gradients, refinement, status."""
+
+import pytest
+import torch
+
+import dyntorch as dyn
+from dyntorch.scenes import bodies
+
+SM, FM = dyn.SegmentationMatrix, dyn.FundamentalMatrix
+
+
+def random(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def scene(n=80, seed=0, **options):
+    return bodies(n, options.pop("bodies", 2), interleaved=True, generator=torch.Generator().manual_seed(seed), **options)
+
+
+def lift(x):
+    return torch.cat([x, torch.ones_like(x[..., :1])], dim=-1)
+
+
+def epipolar(F, x1, x2):
+    return torch.einsum("...na,...ab,...nb->...n", lift(x2), F, lift(x1))
+
+
+def pair_error(found, true):
+    found, true = ([m / torch.linalg.matrix_norm(m, keepdim=True) for m in pair] for pair in (found, true))
+
+    def apart(a, b):
+        return torch.minimum(torch.linalg.matrix_norm(a - b), torch.linalg.matrix_norm(a + b))
+
+    orders = [torch.maximum(apart(found[0], true[k]), apart(found[1], true[1 - k])) for k in (0, 1)]
+    return torch.minimum(*orders)
+
+
+def wrong(labels, true):
+    """Share of wrong labels, in the better order of the bodies."""
+    share = (labels != true).double().mean(-1)
+    return torch.minimum(share, 1 - share)
+
+
+def test_counts_and_layout():
+    assert (SM.minimal(), SM.width(), SM.rows(), SM.shape(), SM.axes()) == (35, 36, 1, (6, 6), (1, 0))
+    assert SM().dof == 14
+
+
+def test_form_is_the_product_of_the_epipolar_forms():
+    F1, F2 = random(3, 3, 3), random(3, 3, 3, seed=1)
+    x1, x2 = random(3, 7, 2, seed=2), random(3, 7, 2, seed=3)
+    S = SM.compose(F1, F2)
+    product = epipolar(F1, x1, x2) * epipolar(F2, x1, x2)
+    found = dyn.algebraic(SM, S, x1, x2)
+    torch.testing.assert_close(found * (product[:, :1] / found[:, :1]), product)
+    torch.testing.assert_close(torch.linalg.matrix_norm(S), torch.ones(3).double())
+    # the first axis is of view 2: monomials 00, 01, 02, 11, 12, 22
+    nu1, nu2 = (torch.stack([lift(x)[..., i] * lift(x)[..., j] for i in range(3) for j in range(i, 3)], -1) for x in (x1, x2))
+    torch.testing.assert_close(torch.einsum("bna,bac,bnc->bn", nu2, S, nu1), found)
+
+
+def test_motion_of_four_parts_is_that_of_the_fundamental_matrices():
+    A1, A2, e1, e2 = random(4, 3, 3), random(4, 3, 3, seed=1), random(4, 3, seed=2), random(4, 3, seed=3)
+    S = SM.compose(A1, e1, A2, e2)
+    torch.testing.assert_close(S, SM.compose(FM.compose(A1, e1), FM.compose(A2, e2)))
+    parts = SM.decompose(S)
+    assert [tuple(p.shape) for p in parts] == [(4, 3, 3), (4, 3), (4, 3, 3), (4, 3)]
+    assert pair_error((FM.compose(*parts[:2]), FM.compose(*parts[2:])), (FM.compose(A1, e1), FM.compose(A2, e2))).max() < 1e-8
+    with pytest.raises(ValueError, match="compose takes F1, F2, or A1, e1, A2, e2, got 3 parts"):
+        SM.compose(A1, e1, A2)
+
+
+def test_both_decompositions_of_exact_matches_agree_and_label_them():
+    found = scene(80, batch=20)
+    solution = dyn.fit(SM, *found.views).check()
+    kernel = SM.fundamentals(solution.tensor)
+    derivative = SM.decompose_by_derivatives(solution.tensor, *found.views)
+    assert pair_error(kernel, found.motion).max() < 1e-6
+    assert pair_error(derivative, found.motion).median() < 1e-6
+    for pair in (kernel, derivative):
+        labels = SM.labels(*pair, *found.views)
+        assert labels.dtype == torch.int64 and set(labels.unique().tolist()) == {1, 2}
+        assert wrong(labels, found.labels).max() == 0
+        assert torch.linalg.det(torch.stack(pair)).abs().max() < 1e-12
+
+
+def test_missing_matches_have_no_label_and_take_no_part():
+    found = scene(60)
+    x1 = found.views[0].clone()
+    x1[[3, 9]] = torch.nan
+    S = dyn.fit(SM, x1, found.views[1]).tensor
+    labels = SM.labels(*SM.fundamentals(S), x1, found.views[1])
+    assert (labels == 0).nonzero().flatten().tolist() == [3, 9]
+    assert pair_error(SM.decompose_by_derivatives(S, x1, found.views[1]), found.motion) < 1e-6
+    weights = SM.reweighted(S, x1, found.views[1])
+    assert weights[[3, 9]].tolist() == [0, 0] and (weights >= 0).all()
+
+
+def test_labels_are_those_of_the_nearer_body():
+    found = scene(50, sigma=2.0)
+    F = torch.stack(found.motion)
+    x1, x2 = found.views
+    distances = []
+    for f in F:
+        line2, line1 = lift(x1) @ f.mT, lift(x2) @ f
+        size = line1[:, :2].square().sum(-1) + line2[:, :2].square().sum(-1)
+        distances.append(epipolar(f, x1, x2).abs() / size.sqrt())
+    torch.testing.assert_close(SM.labels(*F, x1, x2), 1 + torch.stack(distances).argmin(0))
+
+
+def test_distance_near_a_body_is_that_from_the_body():
+    """The gradient of the product, f2 grad f1 + f1 grad f2, is that of the nearer body scaled."""
+    found = scene(60, sigma=1e-3)
+    S = SM.compose(*found.motion)
+    own = torch.stack([dyn.sampson(FM, F, *found.views) for F in found.motion])
+    far = own.amax(0) > 2.0
+    torch.testing.assert_close(dyn.sampson(SM, S, *found.views)[far], own.amin(0)[far], rtol=5e-3, atol=1e-5)
+
+
+def test_reweighted_is_the_inverse_square_of_the_gradient():
+    found = scene(60, sigma=0.5)
+    S = dyn.fit(SM, *found.views).tensor
+    x = torch.cat(found.views, dim=-1)
+
+    def form(x):
+        return dyn.algebraic(SM, S, x[None, :2], x[None, 2:])[0]
+
+    square = torch.func.vmap(torch.func.grad(form))(x).square().sum(-1)
+    expected = 1 / (square / square.median()).clamp(min=1e-3)
+    torch.testing.assert_close(SM.reweighted(S, *found.views), expected, rtol=1e-6, atol=1e-9)
+
+
+def test_reweighted_fit_and_refinement_label_better():
+    found = scene(100, batch=12, sigma=0.3)
+    linear = dyn.fit(SM, *found.views)
+    refined = dyn.refine(linear, *found.views)
+    weighted = linear
+    for _ in range(4):
+        weighted = dyn.fit(SM, *found.views, weights=SM.reweighted(weighted.tensor, *found.views))
+
+    def share(S):
+        return wrong(SM.labels(*SM.fundamentals(S), *found.views), found.labels).mean()
+
+    assert share(weighted.tensor) < share(linear.tensor)
+    assert share(refined.tensor) < 0.3 * share(weighted.tensor)
+    assert pair_error(SM.fundamentals(refined.tensor), found.motion).median() < 0.05
+
+
+def test_refinement_varies_fourteen_parameters():
+    views = [x / 250 - 1 for x in scene(100, sigma=0.2).views]
+    refined = dyn.refine(dyn.fit(SM, *views), *views)
+    assert refined.covariance.shape == (24, 24)
+    values = torch.linalg.eigvalsh(refined.covariance)
+    assert values[-14] > 1e3 * values[-15].abs()
+    assert abs(250 * float(refined.sigma) / 0.2 - 1) < 0.25
+    pair = FM.compose(*refined.motion[:2]), FM.compose(*refined.motion[2:])
+    assert torch.linalg.det(torch.stack(pair)).abs().max() < 1e-15
+    torch.testing.assert_close(SM.compose(*pair).abs(), refined.tensor.abs(), rtol=1e-6, atol=1e-12)
+    # the derivative that it follows, against finite differences
+    motion = tuple(part[None] for part in refined.normalized_motion())
+    motion = tuple(part.reshape(1, *part.shape[-(1 + (k % 2 == 0)) :]) for k, part in enumerate(motion))
+    tensor, slope = SM().compose_derivative(motion)
+    theta = torch.cat([part.flatten(1) for part in motion], dim=-1)
+    shapes = [part.shape for part in motion]
+    for i in range(24):
+        step = torch.zeros_like(theta)
+        step[:, i] = 1e-6
+        ends = [
+            SM.compose(*(p.reshape(s) for p, s in zip((theta + sign * step).split([9, 3, 9, 3], -1), shapes, strict=True)))
+            for sign in (1, -1)
+        ]
+        torch.testing.assert_close(slope[:, i], (ends[0] - ends[1]).flatten(1) / 2e-6, rtol=1e-6, atol=1e-8)
+    assert tensor.shape == (1, 36)
+
+
+@pytest.mark.parametrize(("options", "nullity"), [({"planar": (1,)}, 3), ({"planar": (1, 2)}, 9), ({"bodies": 1}, 9)])
+def test_degenerate_bodies_are_never_ok(options, nullity):
+    exact = scene(80, batch=4, **options)
+    solution = dyn.fit(SM, *exact.views)
+    assert (solution.status == dyn.Status.DEGENERATE).all() and solution.tensor.abs().max() == 0
+    values = solution.singular_values
+    assert (values[:, 36 - nullity] < 1e-9 * values[:, 0]).all() and (values[:, 35 - nullity] > 1e-7 * values[:, 0]).all()
+    noisy = scene(80, batch=4, sigma=0.3, **options)
+    assert (dyn.fit(SM, *noisy.views).status == dyn.Status.AMBIGUOUS).all()
+
+
+def test_gradients_reach_both_fundamental_matrices():
+    found = scene(40)
+    views = [(x / 300 - 1).requires_grad_() for x in found.views]
+
+    def outer(x1, x2):
+        pair = SM.fundamentals(dyn.fit(SM, x1, x2).tensor)
+        return torch.stack([f.flatten()[:, None] * f.flatten()[None, :] for f in pair])
+
+    assert torch.autograd.gradcheck(outer, views, fast_mode=True, eps=1e-8, atol=1e-4, rtol=1e-3)
