@@ -21,6 +21,7 @@ _HOME = {
     "ConstantVelocityTensor": "dyntorch.invariants.constant_velocity_tensor",
     "TranslatingLinesMatrix": "dyntorch.invariants.translating_lines_matrix",
     "SegmentationMatrix": "dyntorch.invariants.segmentation_matrix",
+    "ConvergentMotionMatrix": "dyntorch.invariants.convergent_motion_matrix",
     "GrassmannTensor": "dyntorch.invariants.grassmann_tensor",
     "Invariant": "dyntorch.invariant",
     # from matches to the tensor and its motion
@@ -38,6 +39,8 @@ _HOME = {
     "align_points": "dyntorch.tasks.align_points",
     "align_lines": "dyntorch.tasks.align_lines",
     "segment": "dyntorch.tasks.bodies",
+    "translating_planes": "dyntorch.tasks.planes",
+    "TranslatingPlanes": "dyntorch.tasks.planes_result",
     "Segmentation": "dyntorch.tasks.segmentation",
     "BodyModel": "dyntorch.tasks.segmentation",
     "reconstruct": "dyntorch.tasks.reconstruct",
@@ -57,6 +60,8 @@ _HOME = {
     "joint_epipoles": "dyntorch.algebra.joint_epipoles",
     "hyperplane_pair": "dyntorch.algebra.hyperplane_pair",
     "two_bodies": "dyntorch.algebra.two_bodies",
+    "affine_segmentation": "dyntorch.algebra.affine_segmentation",
+    "multibody_matrix": "dyntorch.invariants.multibody",
     "projective_factorization": "dyntorch.algebra.projective_factorization",
     "velocity_factorization": "dyntorch.algebra.velocity_factorization",
     # subspaces and factorization

@@ -7,7 +7,8 @@ from torch import Tensor
 
 from dyntorch.invariants.fundamental_matrix import FundamentalMatrix
 from dyntorch.matches import matches
-from dyntorch.tasks.bodies_problem import LEAST, Outcome, solve
+from dyntorch.tasks.bodies_pool import LEAST
+from dyntorch.tasks.bodies_problem import solve
 from dyntorch.tasks.notices import check_threshold
 from dyntorch.tasks.segmentation import BodyModel, Segmentation, segmentation_notices
 

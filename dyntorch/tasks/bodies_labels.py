@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import log
 
 import torch
 from torch import Tensor
@@ -13,7 +14,9 @@ from dyntorch.tasks.bodies_energy import View
 from dyntorch.tasks.coherence import Links, conformity
 
 OUTLIER = 1.0
-"""Cost of an outlier: that of a match one threshold away from a body in which it moves like its neighbours."""
+"""Cost of an outlier where many are: that of a match a threshold away from a body in which it moves like its neighbours."""
+FEW, MANY = 0.005, 0.2
+"""Share of outliers below which they are no rarer, and above which they cost no less."""
 STRANGE, CONFORMING = 2.5, 0.25
 """Cost of a match that moves unlike all its neighbours of a body, and the conformity from which it costs nothing."""
 FOUND = 6.0
@@ -43,12 +46,15 @@ class Labelling:
         return self.probabilities.argmax(0)
 
 
-def label(view: View, found: Tensor, fundamentals: Tensor, weights: Tensor, threshold: float, scale: float | None) -> Labelling:
+def label(
+    view: View, found: Tensor, fundamentals: Tensor, weights: Tensor, threshold: float, scale: float | None, share: float
+) -> Labelling:
     r"""Labels and geometries in turns: a mean field of the costs
 
-    .. math:: \min(r_{ik}^2 / T^2, 9) + s\,(1 - c_{ik} / c_0)_+ - b\,[i \text{ found in } k], \qquad \text{outlier: } 1,
+    .. math:: \min(r_{ik}^2 / T^2, 9) + s\,(1 - c_{ik} / c_0)_+ - b\,[i \text{ found in } k], \qquad \text{outlier: } 1 + \tfrac14 \log \tfrac{1 - \pi}{4 \pi},
 
-    with the conformity :math:`c_{ik}` of match i to body k, and of labels that differ from those of the neighbours.
+    with the conformity :math:`c_{ik}` of match i to body k and the share :math:`\pi` of outliers
+    (at most a fifth), and of labels that differ from those of the neighbours.
 
     Args:
         view: all matches.
@@ -57,16 +63,19 @@ def label(view: View, found: Tensor, fundamentals: Tensor, weights: Tensor, thre
         weights: ``(n,)`` of the matches in the fits.
         threshold: T, in the coordinates of ``view``.
         scale: as of :func:`~dyntorch.tasks.coherence.coherence`; None: neighbours do not matter.
+        share: of outliers, roughly.
     """
     numbers = torch.arange(1, len(fundamentals) + 1, device=found.device)[:, None]
     members = found == numbers
     gain = FOUND * members.to(weights.dtype) if scale is not None else 0.0
     strange = _strange(view, members, scale)
     links = _normalized(view.links)
+    odds = [(1 - p) / p for p in (min(max(share, FEW), MANY), MANY)]
+    outlier = OUTLIER + log(odds[0] / odds[1]) / SHARPNESS
 
     def probabilities(bodies: Tensor) -> Tensor:
         square = sampson_squared(bodies, view.x1, view.x2) / threshold**2
-        return field(square.clamp(max=FAR) + strange - gain, links)
+        return field(square.clamp(max=FAR) + strange - gain, outlier, links)
 
     bodies = fundamentals
     member = probabilities(bodies)
@@ -79,9 +88,9 @@ def label(view: View, found: Tensor, fundamentals: Tensor, weights: Tensor, thre
     return Labelling(member, bodies)
 
 
-def field(cost: Tensor, links: Links) -> Tensor:
+def field(cost: Tensor, outlier: float, links: Links) -> Tensor:
     """Mean field ``(K + 1, n)`` of the costs ``(K, n)`` of bodies, the first of an outlier."""
-    cost = SHARPNESS * torch.cat([torch.full_like(cost[:1], OUTLIER), cost])
+    cost = SHARPNESS * torch.cat([torch.full_like(cost[:1], outlier), cost])
     member = torch.softmax(-cost, 0)
     for _ in range(TURNS):
         member = 0.5 * (member + torch.softmax(SHARPNESS * links.pull(member) - cost, 0))

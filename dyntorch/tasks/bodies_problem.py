@@ -11,11 +11,13 @@ from dyntorch.algebra.epipolar import sampson_squared
 from dyntorch.algebra.homogeneous import similarity, unit
 from dyntorch.algebra.plane_homography import homography_sampson_squared
 from dyntorch.solution import Status
+from dyntorch.tasks.bodies_descent import Candidate
 from dyntorch.tasks.bodies_energy import View
 from dyntorch.tasks.bodies_labels import Labelling, label
 from dyntorch.tasks.bodies_models import Models, choose
+from dyntorch.tasks.bodies_pool import LEAST, one_hot
 from dyntorch.tasks.bodies_samples import search_samples
-from dyntorch.tasks.bodies_search import LEAST, Candidate, one_hot, search
+from dyntorch.tasks.bodies_search import search
 from dyntorch.tasks.coherence import Links, coherence
 from dyntorch.tasks.segmentation import BodyModel
 
@@ -32,6 +34,8 @@ FIRST, NEXT = 4, 2
 MOST = 12
 PENALTY = 4.5
 """Of a body, in units of the root of the number of matches."""
+UNKNOWN = 0.3
+"""Share of outliers where nothing says what it is."""
 GUESS = 0.003
 """Threshold over the diagonal of the image, where it has to be estimated."""
 
@@ -71,7 +75,13 @@ class Outcome:
 
 
 def solve(
-    x1: Tensor, x2: Tensor, weights: Tensor, bodies: int | None, threshold: float | None, spatial: bool, generator: torch.Generator | None
+    x1: Tensor,
+    x2: Tensor,
+    weights: Tensor,
+    bodies: int | None,
+    threshold: float | None,
+    spatial: bool,
+    generator: torch.Generator | None,
 ) -> Outcome:
     """Segment one problem of matches ``(n, 2)`` with weights ``(n,)``, 0 = missing."""
     present = (weights > 0).nonzero().flatten()
@@ -100,7 +110,7 @@ def _solve(
 ) -> Outcome:
     first, second = x1[present], x2[present]
     distinct = len(torch.unique(torch.cat([first, second], dim=-1), dim=0))
-    repeated = 1 - distinct / max(1, len(present))
+    repeated = 1 - distinct / len(present) if len(present) else 0.0
     if distinct < LEAST + 1:
         return _nothing(x1, threshold, Status.TOO_FEW, repeated)
     one, two, scale = _normalizations(first, second)
@@ -121,7 +131,15 @@ def _solve(
         return _nothing(x1, threshold, Status.NO_CONSENSUS, repeated, linked)
     found = torch.zeros_like(present)
     found[keep] = best.labels + 1
-    labelled = label(view, found, best.fundamentals, weights[present], pixel * PIXELS, near if spatial else None)
+    labelled = label(
+        view,
+        found,
+        best.fundamentals,
+        weights[present],
+        pixel * PIXELS,
+        near if spatial else None,
+        1 - linked if spatial else UNKNOWN,
+    )
     return _outcome(view, labelled, values, (one, two, scale), present, weights, threshold, bodies, repeated, linked)
 
 
@@ -148,7 +166,9 @@ def _no_links(a: Tensor) -> Links:
     return Links(torch.zeros(len(a), 0, dtype=torch.long, device=a.device), a.new_zeros(len(a), 0))
 
 
-def _best(view: View, bodies: int | None, extra: list[Tensor], spatial: bool, generator: torch.Generator | None) -> Candidate | None:
+def _best(
+    view: View, bodies: int | None, extra: list[Tensor], spatial: bool, generator: torch.Generator | None
+) -> Candidate | None:
     """The best segmentation into so many bodies, or into the number of least penalized cost; fewer bodies where there are no more."""
     extra = [labels for labels in extra if int(labels.max()) < MOST]
 

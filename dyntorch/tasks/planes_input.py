@@ -148,11 +148,13 @@ def padded(name: str, views: tuple[Points, Points]) -> Pair:
 
 
 def _stacked(name: str, points: Sequence[Tensor]) -> Tensor:
-    shapes = [tuple(x.shape) if isinstance(x, Tensor) else type(x).__name__ for x in points]
-    if not points or any(isinstance(s, str) or len(s) < 2 or s[-1] != 2 or s[:-2] != shapes[0][:-2] for s in shapes):
+    shapes = [tuple(torch.as_tensor(x).shape) for x in points]
+    if not shapes or any(len(s) < 2 or s[-1] != 2 or s[:-2] != shapes[0][:-2] for s in shapes):
         raise ValueError(f"{name} must be lists of tensors (*batch, n, 2), one for each plane, got {shapes}")
-    longest = max(len_ for *_, len_, _ in shapes)
-    return torch.stack([pad(x, (0, 0, 0, longest - x.shape[-2]), value=float("nan")) for x in points], dim=-3)
+    longest = max(s[-2] for s in shapes)
+    return torch.stack(
+        [pad(torch.as_tensor(x), (0, 0, 0, longest - s[-2]), value=torch.nan) for x, s in zip(points, shapes, strict=True)], dim=-3
+    )
 
 
 def _sightings(name: str, views: Pair | None, batch: tuple[int, ...], count: int, least: int, home: torch.device) -> Sightings:

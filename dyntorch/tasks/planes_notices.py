@@ -24,7 +24,7 @@ MESSAGES = {
     NoticeCode.STATIC_BODY: "{value:g} planes do not move, or are at infinity: no epipole, and three planes do not suffice",
     NoticeCode.UNUSED_PLANE: "{value:g} matrices are not finite, singular, or have too few matches; they were left out",
     NoticeCode.FEW_PLANES: "{value:g} planes and bodies are left: give 3 planes, 2 planes and 1 body, or 2 bodies",
-    NoticeCode.OTHER_SOLUTION: "a very different homography at infinity fits {value:g} planes and bodies as well; add others",
+    NoticeCode.OTHER_SOLUTION: "another homography at infinity fits the {value:g} planes and bodies as well; add others",
     NoticeCode.UNCERTAIN: "the noise leaves a relative error of {value:.2g} in the homography at infinity; add larger planes",
 }
 
@@ -104,7 +104,7 @@ def planes_notices(
 def _flatness(vectors: Tensor, covariance: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
     """Smallest over largest singular value ``(b,)`` of at least three vectors, and whether it is 0 within the noise."""
     kept = torch.where(count[..., None], vectors, 0.0)
-    values, directions = torch.linalg.eigh(kept.mT @ kept)
+    values, directions = torch.linalg.eigh((kept.mT @ kept).nan_to_num())
     ratio = (values[:, 0].clamp(min=0) / values[:, 2].clamp(min=1e-30)).sqrt()
     across = directions[:, None, :, 0]
     distance = (kept * across).sum(-1)

@@ -8,9 +8,11 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from dyntorch.algebra.homogeneous import skew
-from dyntorch.forward import jacobian
+from dyntorch.constants import constant
+from dyntorch.forward import derivatives, jacobian
 from dyntorch.invariants.agreement import static_residual
 from dyntorch.invariants.fundamental_matrix import FundamentalMatrix
 from dyntorch.residual import multilinear_derivative
@@ -61,11 +63,15 @@ class Layout:
 
     def models(self, theta: Tensor) -> Tensor:
         """``(*, p + m, 3, 3)`` homographies of the planes, then fundamental matrices of the bodies."""
-        infinity, epipoles, planes = self.unpack(theta)
-        infinity = infinity[..., None, :, :]
-        along, moving = epipoles[..., : self.planes, :], epipoles[..., self.planes :, :]
-        homographies = planes[..., 3, None, None] * infinity + along[..., :, None] * planes[..., None, :3]
-        return torch.cat([homographies, skew(moving) @ infinity], dim=-3)
+        return self.models_of(pad(theta, (0, 1))[..., _own(self.planes, self.bodies, theta.device)])
+
+    def models_of(self, entries: Tensor) -> Tensor:
+        """The same from the parameters ``(*, p + m, 16)`` of each: homography at infinity, epipole, plane (0 for a body)."""
+        infinity, epipoles, planes = entries.split([9, 3, 4], dim=-1)
+        infinity, p = infinity.unflatten(-1, (3, 3)), self.planes
+        along, moving = epipoles[..., :p, :], epipoles[..., p:, :]
+        homographies = planes[..., :p, 3, None, None] * infinity[..., :p, :, :] + along[..., :, None] * planes[..., :p, None, :3]
+        return torch.cat([homographies, skew(moving) @ infinity[..., p:, :, :]], dim=-3)
 
 
 @dataclass(frozen=True)
@@ -179,14 +185,31 @@ class PlanesProblem:
         """All problems ``count`` times, one round after the other."""
         return replace(self, evidence=self.evidence.each(lambda x: x.repeat(count, *[1] * (x.ndim - 1))))
 
-    def blocks(self, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Cost ``(b, c)``, gradient ``(b, c, size)`` and Gauss-Newton matrix ``(b, c, size, size)`` of every plane and body."""
-        models, slope = jacobian(lambda t: self.layout.models(t).flatten(1), theta)
-        slope = slope.unflatten(-1, (-1, 9)).transpose(1, 2)  # (b, c, size, 9)
-        normal = self.evidence.normal(models.unflatten(-1, (-1, 3, 3)))
-        return normal.cost, (slope @ normal.gradient[..., None])[..., 0], slope @ normal.matrix @ slope.mT
-
     def normal_equations(self, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Cost ``(b,)``, gradient ``(b, size)`` and Gauss-Newton matrix ``(b, size, size)``."""
-        cost, gradient, matrix = (part.sum(1) for part in self.blocks(theta))
-        return torch.where(cost.isfinite(), cost, torch.inf), gradient, matrix
+        own, size = _own(self.layout.planes, self.layout.bodies, theta.device), self.layout.size
+        # a plane or body depends on 16 parameters: its share has that size, whatever their number
+        entries = pad(theta, (0, 1))[:, own]
+        tangents = torch.eye(16, dtype=theta.dtype, device=theta.device)[:, None, None].expand(16, *entries.shape)
+        models, slope = derivatives(self.layout.models_of, entries, tangents)
+        slope = slope.transpose(1, 2).flatten(-2)  # (b, c, 16, 9)
+        normal = self.evidence.normal(models)
+        gradient = theta.new_zeros(len(theta), size + 1)
+        gradient.index_add_(1, own.flatten(), (slope @ normal.gradient[..., None]).flatten(1))
+        matrix = theta.new_zeros(len(theta), (size + 1) ** 2)
+        place = own[:, :, None] * (size + 1) + own[:, None]
+        matrix.index_add_(1, place.flatten(), (slope @ normal.matrix @ slope.mT).flatten(1))
+        cost = normal.cost.sum(1)
+        square = matrix.unflatten(1, (size + 1, size + 1))[:, :size, :size]
+        return torch.where(cost.isfinite(), cost, torch.inf), gradient[:, :size], square
+
+
+@constant
+def _own(planes: int, bodies: int, device: torch.device) -> Tensor:
+    """Where the 16 parameters of every plane and body are, ``(p + m, 16)``; a body has no plane, and points behind the end."""
+    count = planes + bodies
+    shared = torch.arange(9, device=device).expand(count, 9)
+    epipoles = 9 + torch.arange(3 * count, device=device).reshape(count, 3)
+    own = 9 + 3 * count + torch.arange(4 * planes, device=device).reshape(planes, 4)
+    none = torch.full((bodies, 4), 9 + 3 * count + 4 * planes, device=device)
+    return torch.cat([shared, epipoles, torch.cat([own, none])], dim=1)

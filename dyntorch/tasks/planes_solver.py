@@ -11,7 +11,8 @@ from dyntorch.tasks.planes_problem import Layout, Matches, Matrices, PlanesProbl
 from dyntorch.tasks.planes_starts import parameters, starts
 
 ROUGH, FINE = 40, 100
-"""Steps on the matrices and on the matches, at most."""
+"""Steps on the matrices and on the matches, at most.  With 60 on the matches the median error of 3 to 5 planes at 0.5 px is the
+same, that of 8 at 1 px 0.031 instead of 0.027."""
 KEPT = 4
 """Results on the matrices, of different homographies at infinity, that are refined on the matches.  Of 4 planes at 0.5 px the best
 minimum is reached in 98 %; with 2 in 90 %."""
@@ -29,7 +30,8 @@ OPEN = 1e12
 """Variance of the homography at infinity over what it would be if all epipoles and planes were known, from which on it is open.
 Three planes: 1e3 to 1e9; with collinear epipoles and coplanar normals: 1e14 and more."""
 BODY_WEIGHT = 100.0
-"""Inverse variance of a fundamental matrix against that of a homography: a body with depth is seen larger than a plane's patch."""
+"""Inverse variance of a fundamental matrix against that of a homography: a body with depth is seen larger than a plane's patch.
+Of 5 planes and 2 bodies at 0.5 px the error without matches is 0.0112; with 1 it is 0.0174, with 10 or 10000 0.012."""
 
 
 def solve(

@@ -1,7 +1,7 @@
-"""The command line: ``dyntorch demo | index fit | index scan | index evaluate | align | reconstruct | count``, a file for each.
+"""The command line ``dyntorch demo | index fit | index scan | index evaluate | align | reconstruct | segment | count``.
 
-A command is a dataclass whose fields are its flags, with ``run() -> exit code``.  Only what parsing needs is imported here,
-so that ``--help`` answers at once; a command imports its tools when it runs.
+Each has a file of its own: a dataclass whose fields are its flags, with ``run() -> exit code``.  Only what parsing needs is
+imported here, so that ``--help`` answers at once; a command imports its tools when it runs.
 
 A new command is a new file, and a line in :data:`COMMANDS` (or :data:`INDEX` for a verb of ``dyntorch index``).
 """
@@ -26,6 +26,7 @@ from indexing.cli.evaluate import Evaluate
 from indexing.cli.fit import Fit
 from indexing.cli.reconstruct import Reconstruct
 from indexing.cli.scan import Scan
+from indexing.cli.segment import Segment
 
 DONE, BAD_INPUT, REFUSED, INTERRUPTED, BROKEN_PIPE = 0, 2, 3, 130, 141
 
@@ -36,12 +37,14 @@ COMMANDS: Any = (
     | Annotated[INDEX, Command("index", description="Learn actions from one clip each and find them elsewhere.")]
     | Annotated[Align, Command("align")]
     | Annotated[Reconstruct, Command("reconstruct")]
+    | Annotated[Segment, Command("segment")]
     | Annotated[Count, Command("count")]
-)  # next: sync, segment
+)  # next: sync
 GROUPS = ("index",)  # words that need another one behind them
 DESCRIPTION = """Geometry of scenes in which everything moves: learn actions from one clip each and find them in other clips, from
 other viewpoints (index); find how a camera or 3D sensor moved among things that move, and what stood still (align); find cameras,
-points and velocities from tracks through several views (reconstruct); count how many matches such a problem takes (count).
+points and velocities from tracks through several views (reconstruct); find which matches of two images move together (segment);
+count how many matches such a problem takes (count).
 
 dyntorch COMMAND --help explains a command, dyntorch --version says the version."""
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import re
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from indexing.cli import console
 from indexing.cli.console import count, ended, names, progress, say, table
-from indexing.cli.outputs import check_folder, keep
+from indexing.cli.outputs import check_report
 
 if TYPE_CHECKING:
     from indexing.readers.points import Matched
@@ -70,11 +70,9 @@ class Align:
         """Read, align, write, and say what was found."""
         inputs = [path.expanduser() for path in (*self.files, *self.static_points)]
         self._check()
-        folder = None if self.out is None else check_folder(self.out)
-        if folder is not None:
-            from indexing.report.alignment import FILES
+        from indexing.report.alignment import FILES
 
-            keep(inputs, [folder / name for name in FILES])
+        folder = check_report(self.out, inputs, FILES)
         started = time.perf_counter()
         with progress("reading", steps=False):
             from indexing.readers.points import read_matches
@@ -213,8 +211,8 @@ def in_flags(message: str) -> str:
         >>> in_flags("use model='rigid', or label static ones (static=)")
         'use --model rigid, or label static ones (a column static)'
     """
-    message = re.sub(r"\bmodel='(\w+)'", r"--model \1", message).replace("(static=)", "(a column static)")
-    return re.sub(r"\bstatic_points=", "--static-points", message).replace("(static=; then", "(a column static; then")
+    message = message.replace("(static=)", "(a column static)").replace("(static=; then", "(a column static; then")
+    return console.in_flags(message, "model", "static_points")
 
 
 def show(report: AlignmentReport) -> None:

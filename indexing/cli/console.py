@@ -5,6 +5,7 @@ Everything that comes from files (labels, names) is printed as plain text: rich'
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -44,6 +45,25 @@ def ended(page: object, refusal: str | None) -> int:
         return 0
     complain(f"refused: {refusal}")
     return REFUSED
+
+
+def in_flags(message: str, *flags: str) -> str:
+    """A message of the library in the words of the command line.
+
+    Args:
+        message: with arguments as ``name=`` or ``name=value``.
+        flags: names of the arguments that are flags.
+
+    Example:
+        >>> in_flags("give times=, or motion='auto'; threshold=None estimates it", "times", "motion", "threshold")
+        'give --times, or --motion auto; --threshold auto estimates it'
+    """
+
+    def flag(found: re.Match[str]) -> str:
+        name, value = found[1].replace("_", "-"), {"None": "auto", "True": ""}.get(found[2], found[2])
+        return f"--no-{name}" if value == "False" else f"--{name} {value or ''}".rstrip()
+
+    return re.sub(rf"\b({'|'.join(flags)})=(?:'?(\w[\w.]*\b)'?)?", flag, message)
 
 
 def names(values: Sequence[object]) -> str:

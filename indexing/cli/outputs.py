@@ -51,12 +51,12 @@ def check_file(path: Path, inputs: Iterable[Path]) -> Path:
     return path
 
 
-def check_report(folder: Path | None, inputs: Iterable[Path]) -> Path | None:
+def check_report(folder: Path | None, inputs: Iterable[Path], files: Iterable[str] = REPORT_FILES) -> Path | None:
     """The folder of a report, if it can be written and no file of the report would replace an input."""
     if folder is None:
         return None
     folder = check_folder(folder)
-    keep(inputs, [folder / name for name in REPORT_FILES])
+    keep(inputs, [folder / name for name in files])
     return folder
 
 

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from indexing.cli.console import count, ended, say, table
+from indexing.cli.console import count, ended, in_flags, say, table
 from indexing.cli.console import progress as progress_of
-from indexing.cli.outputs import check_folder, keep
+from indexing.cli.outputs import check_report
 
 if TYPE_CHECKING:
     from indexing.readers.tracks import TrackSet
@@ -44,7 +44,7 @@ REASONS = {
     "AMBIGUOUS": "other scenes fit as well; add views and tracks, let the camera move more, or take a smaller --motion",
     "NO_CONSENSUS": "no scene fits enough of the tracks; raise --threshold, take another --motion, or clean the tracks",
 }
-
+FLAGS = ("times", "static", "threshold", "motion")
 UNFIXED = (
     "no point is known to stand still, so that a motion common to all is open and none can be told to rest; "
     "--static names some that do"
@@ -89,11 +89,9 @@ class Reconstruct:
         """Read, reconstruct, write, and say what was found."""
         inputs = [path.expanduser() for path in (*self.files, *((self.static,) if self.static else ()))]
         self._check()
-        folder = None if self.out is None else check_folder(self.out)
-        if folder is not None:
-            from indexing.report.reconstruction import FILES
+        from indexing.report.reconstruction import FILES
 
-            keep(inputs, [folder / name for name in FILES])
+        folder = check_report(self.out, inputs, FILES)
         started = time.perf_counter()
         with progress_of("reading", steps=False):
             from indexing.readers.tracks import read_tracks
@@ -192,7 +190,7 @@ class Reconstruct:
                 generator=torch.Generator().manual_seed(self.seed),
             )
         except ValueError as problem:
-            raise ValueError(f"{tracks.path}: {in_flags(str(problem))}") from problem
+            raise ValueError(f"{tracks.path}: {in_flags(str(problem), *FLAGS)}") from problem
 
     def _report(self, tracks: TrackSet, result: Any, inputs: list[Path], timings: dict[str, float]) -> ReconstructionReport:
         import torch
@@ -203,7 +201,7 @@ class Reconstruct:
         from indexing.report.reconstruction_words import one
 
         status, name = Status(int(result.status)).name, result.motion.name
-        warnings = [(notice.code.value, notice.value, one(in_flags(notice.message))) for notice in result.warnings]
+        warnings = [(notice.code.value, notice.value, one(in_flags(notice.message, *FLAGS))) for notice in result.warnings]
         notes = list(tracks.notes)
         if (
             status == "OK"
@@ -230,7 +228,7 @@ class Reconstruct:
             sigma=float(result.sigma),
             status=status,
             reason="" if status == "OK" else because or REASONS[status],
-            ambiguity=in_flags(result.ambiguity),
+            ambiguity=in_flags(result.ambiguity, *FLAGS),
             warnings=warnings,
             notes=notes,
             candidates=[(tried.motion, tried.score, tried.residual, tried.reason) for tried in result.candidates],
@@ -257,17 +255,6 @@ def numbers(text: str, expected: int) -> Any:
     if len(found) != expected or not np.isfinite(found).all():
         raise ValueError(f"--times {text!r}: {len(found)} times for {expected} views; give one finite number per view")
     return found
-
-
-def in_flags(message: str) -> str:
-    """A message of the library in the words of the command line.
-
-    Example:
-        >>> in_flags("take 'static_2d'; give times=, or motion='auto'")
-        "take 'static_2d'; give --times, or --motion auto"
-    """
-    message = re.sub(r"\bmotion='(\w+)'", r"--motion \1", message)
-    return re.sub(r"\b(times|static|threshold|motion)=(None\b)?", lambda m: f"--{m[1]}{' auto' * bool(m[2])}", message)
 
 
 def show(report: ReconstructionReport) -> None:

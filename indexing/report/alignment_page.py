@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from indexing.report.page import Card, Column, cards, details, escape, picture, section, settings, table
+from indexing.report.page import Card, Column, cards, escape, listed, picture, provenance, section, sentence, table
 
 if TYPE_CHECKING:
     from indexing.report.alignment import AlignmentReport
@@ -26,9 +26,7 @@ def body(report: AlignmentReport, drawn: tuple[bytes, bytes]) -> str:
     if report.ambiguity:
         parts.append(section("What the data cannot tell", "", report.ambiguity))
     parts.append(_labels(report))
-    if report.manifest:
-        note = "What was run, with which versions and on which files: enough to run it again."
-        parts.append(section("How this was made", details("Settings, versions and inputs", settings(report.manifest)), note))
+    parts.append(provenance(report.manifest))
     return "\n".join(part for part in parts if part)
 
 
@@ -38,7 +36,7 @@ def describe(report: AlignmentReport) -> str:
     what = "lines" if report.views[0].ndim == 3 else "points"
     if report.status != "OK":
         start = f"The {number:,} {what} do not decide how the sensor moved."
-        return f"{start} {_sentence(report.reason)}" + (
+        return f"{start} {sentence(report.reason)}" + (
             " What follows is the best motion found, and not to be relied on." * report.solved
         )
     parts = [f"{counts['static']:,} stand still and {counts['moving']:,} move"]
@@ -114,18 +112,13 @@ def _headline(report: AlignmentReport) -> list[Card]:
 
 def _warnings(report: AlignmentReport) -> str:
     lines = [
-        f"<li><b>{escape(code.replace('_', ' ').capitalize())}.</b> {escape(_sentence(text))}</li>"
+        f"<li><b>{escape(code.replace('_', ' ').capitalize())}.</b> {escape(sentence(text))}</li>"
         for code, _, text in report.warnings
     ]
-    lines += [f"<li>{escape(_sentence(note))}</li>" for note in report.notes]
+    lines += [f"<li>{escape(sentence(note))}</li>" for note in report.notes]
     if report.reason:
-        lines.insert(0, f'<li><b class="bad">Refused.</b> {escape(_sentence(report.reason))}</li>')
+        lines.insert(0, f'<li><b class="bad">Refused.</b> {escape(sentence(report.reason))}</li>')
     return section("Please note", f"<ul>{''.join(lines)}</ul>") if lines else ""
-
-
-def _sentence(text: str) -> str:
-    text = text.strip()
-    return text[:1].upper() + text[1:] + ("" if text.endswith((".", "?", "!")) else ".") if text else ""
 
 
 def _picture(report: AlignmentReport, drawn: tuple[bytes, bytes]) -> str:
@@ -177,11 +170,5 @@ def _cell(value: str, spread: str) -> str:
 def _labels(report: AlignmentReport) -> str:
     if not report.solved:
         return ""
-    kinds = report.kinds
-    blocks = []
-    for kind in ("moving", "outlier", "missing", "static"):
-        mine = [report.ids[i] for i, other in enumerate(kinds) if other == kind]
-        if mine:
-            more = f" and {len(mine) - LISTED:,} more, in labels.csv" if len(mine) > LISTED else ""
-            blocks.append(details(f"{len(mine):,} {kind}", f"<p>{escape(', '.join(mine[:LISTED]) + more)}</p>"))
-    return section("Each match", "".join(blocks), "By the names of the file, or the numbers of its rows; labels.csv has them all.")
+    names = listed(report.ids, report.kinds, ("moving", "outlier", "missing", "static"), LISTED, "labels.csv")
+    return section("Each match", names, "By the names of the file, or the numbers of its rows; labels.csv has them all.")

@@ -76,6 +76,17 @@ def made_by(manifest: Mapping[str, Any]) -> str:
     return " ".join(["Made by dyntorch", *([str(version)] if version else []), *([f"at {when}"] if when else [])]) + "."
 
 
+def sentence(text: str) -> str:
+    """Text with a capital letter and a full stop.
+
+    Example:
+        >>> sentence("no motion fits ")
+        'No motion fits.'
+    """
+    text = text.strip()
+    return text[:1].upper() + text[1:] + ("" if text.endswith((".", "?", "!")) else ".") if text else ""
+
+
 def section(title: str, html: str, note: str = "") -> str:
     """A titled part of the page, with an optional sentence below the title."""
     lead = f'<p class="note">{escape(note)}</p>' if note else ""
@@ -141,6 +152,26 @@ def bar(fraction: float, mark: float | None = None) -> str:
 def details(title: str, html: str, *, open_: bool = False) -> str:
     """A block that opens on a click (and is open on paper)."""
     return f"<details{' open' if open_ else ''}><summary>{escape(title)}</summary><div>{html}</div></details>"
+
+
+def listed(ids: Sequence[str], kinds: Sequence[str], order: Sequence[str], limit: int, file: str) -> str:
+    """The names of each kind behind a click, at most ``limit`` of them; the rest is in a file."""
+    blocks = []
+    for kind in order:
+        mine = [name for name, other in zip(ids, kinds, strict=True) if other == kind]
+        if mine:
+            more = f" and {len(mine) - limit:,} more, in {file}" if len(mine) > limit else ""
+            count = f"{kind}: {len(mine):,}" if " " in kind else f"{len(mine):,} {kind}"
+            blocks.append(details(count, f"<p>{escape(', '.join(mine[:limit]) + more)}</p>"))
+    return "".join(blocks)
+
+
+def provenance(manifest: Mapping[str, Any]) -> str:
+    """The section on how the result was made; nothing without a manifest."""
+    if not manifest:
+        return ""
+    note = "What was run, with which versions and on which files: enough to run it again."
+    return section("How this was made", details("Settings, versions and inputs", settings(manifest)), note)
 
 
 def settings(values: Mapping[str, Any], limit: int = 200) -> str:

@@ -111,8 +111,13 @@ def legend(figure: Any, kinds: NDArray[Any], theme: Theme) -> None:
             name = f"{number:,} {kind}{'s' * (kind == 'outlier' and number > 1)}" if " " not in kind else f"{kind}: {number:,}"
             mark = "x" if kind == "outlier" else "o"
             handles.append(Line2D([], [], color=colour_of(kind, theme), marker=mark, linestyle="", markersize=5, label=name))
+    foot(figure, handles, theme)
+
+
+def foot(figure: Any, handles: list[Any], theme: Theme, columns: int = 4) -> None:
+    """The legend at the foot of the figure."""
     anchor = (0.5, 0.28 / figure.get_figheight())
-    figure.legend(handles=handles, loc="upper center", bbox_to_anchor=anchor, ncols=4, frameon=False, labelcolor=theme.ink)
+    figure.legend(handles=handles, loc="upper center", bbox_to_anchor=anchor, ncols=columns, frameon=False, labelcolor=theme.ink)
 
 
 def finish(panel: Any, low: FloatArray, high: FloatArray, down: bool, title: str) -> None:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from indexing.report.page import Card, Column, cards, details, escape, picture, section, settings, table
+from indexing.report.page import Card, Column, cards, details, escape, listed, picture, provenance, section, sentence, table
 from indexing.report.reconstruction_words import MEANING, heading, left_out
 
 if TYPE_CHECKING:
@@ -24,9 +24,7 @@ def body(report: ReconstructionReport, tracks: Drawn, scene: Drawn | None) -> st
     if report.ambiguity and report.solved:
         parts.append(section("What the tracks cannot tell", "", f"The scene is {report.ambiguity}."))
     parts.append(_points(report))
-    if report.manifest:
-        note = "What was run, with which versions and on which files: enough to run it again."
-        parts.append(section("How this was made", details("Settings, versions and inputs", settings(report.manifest)), note))
+    parts.append(provenance(report.manifest))
     return "\n".join(part for part in parts if part)
 
 
@@ -48,12 +46,6 @@ def describe(report: ReconstructionReport) -> str:
 
 def _verb(kind: str) -> str:
     return {"static": "stand still", "moving": "move"}.get(kind, kind)
-
-
-def sentence(text: str) -> str:
-    """Text with a capital letter and a full stop."""
-    text = text.strip()
-    return text[:1].upper() + text[1:] + ("" if text.endswith((".", "?", "!")) else ".") if text else ""
 
 
 def _headline(report: ReconstructionReport) -> list[Card]:
@@ -150,11 +142,7 @@ def _views(report: ReconstructionReport) -> str:
 def _points(report: ReconstructionReport) -> str:
     if not report.solved:
         return ""
-    kinds, blocks = report.kinds, []
-    for kind in ("moving", "body 1", "body 2", "outlier", "missing", "static"):
-        mine = [report.tracks.ids[i] for i, other in enumerate(kinds) if other == kind]
-        if mine:
-            more = f" and {len(mine) - LISTED:,} more, in points.csv" if len(mine) > LISTED else ""
-            blocks.append(details(f"{len(mine):,} {kind}", f"<p>{escape(', '.join(mine[:LISTED]) + more)}</p>"))
+    order = ("moving", "body 1", "body 2", "outlier", "missing", "static")
+    names = listed(report.tracks.ids, report.kinds, order, LISTED, "points.csv")
     note = "By the names of the file; points.csv has positions, velocities and residuals, reconstruction.npz all arrays."
-    return section("Each point", "".join(blocks), note)
+    return section("Each point", names, note)

@@ -21,7 +21,7 @@ def read_npy(path: Path) -> PointSet | Sequence:
     Raises:
         ValueError: no such array.
     """
-    array = _load(path)
+    array = load(path)
     if array.ndim == 3 and array.shape[1:] != (2, 3) and array.shape[-1] in (2, 3):
         return Sequence(str(path), as_view(array.reshape(-1, array.shape[-1]), path).reshape(array.shape))
     lines = array.ndim == 3 or array.shape[-1:] == (6,)
@@ -34,7 +34,7 @@ def read_npz(path: Path) -> tuple[list[PointSet], list[PointSet]]:
     Raises:
         ValueError: no known keys, a view is missing, or arrays that do not fit.
     """
-    archive = _load(path)
+    archive = load(path)
     names = list(archive.files)
     prefix = next((prefix for prefix in ("x", "P", "l") if f"{prefix}1" in names), None)
     if prefix is None:
@@ -46,11 +46,11 @@ def read_npz(path: Path) -> tuple[list[PointSet], list[PointSet]]:
     missing = [name for name in wanted if name not in names]
     if missing:
         raise error(path, f"has {wanted[0]} but no {missing[0]}", KEYS)
-    extra = {name: _array(path, archive, name) for name in EXTRA if name in names}
+    extra = {name: member(path, archive, name) for name in EXTRA if name in names}
     views = []
     for name in wanted:
         where = f"{path} {name}"
-        values = as_view(_array(path, archive, name), where, lines=prefix == "l")
+        values = as_view(member(path, archive, name), where, lines=prefix == "l")
         ids = tuple(map(str, extra["ids"].tolist())) if "ids" in extra else None
         for field in ("ids", "weights", "static"):
             if field in extra and extra[field].shape != (len(values),):
@@ -78,14 +78,24 @@ def _static(path: Path, extra: dict[str, Any]) -> Any:
     return extra["static"].astype(bool)
 
 
-def _load(path: Path) -> Any:
+def load(path: Path) -> Any:
+    """An array, or an archive of arrays, without pickle.
+
+    Raises:
+        ValueError: it cannot be read.
+    """
     try:
         return np.load(path, allow_pickle=False)
     except (ValueError, OSError, EOFError, zipfile.BadZipFile) as problem:
         raise error(path, f"cannot be read as numpy data ({problem})", "write it again with numpy.save or numpy.savez") from None
 
 
-def _array(path: Path, archive: Any, name: str) -> Any:
+def member(path: Path, archive: Any, name: str) -> Any:
+    """An array of an archive.
+
+    Raises:
+        ValueError: it cannot be read.
+    """
     try:
         return archive[name]
     except (ValueError, OSError, EOFError, zipfile.BadZipFile) as problem:

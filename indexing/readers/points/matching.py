@@ -100,7 +100,7 @@ def open_points(path: Path) -> PointSet | Sequence:
     Raises:
         ValueError: it does not exist, is empty, of no known format, or holds what it should not.
     """
-    head = _head(path)
+    head = opening(path)
     if head.startswith(b"ply"):
         return ply.read(path)
     if head.startswith(b"\x93NUMPY"):
@@ -112,7 +112,12 @@ def open_points(path: Path) -> PointSet | Sequence:
     return table.read(path)
 
 
-def _head(path: Path) -> bytes:
+def opening(path: Path) -> bytes:
+    """The first bytes of a file of points.
+
+    Raises:
+        ValueError: there is none, or nothing in it.
+    """
     if not path.is_file():
         what = "is a folder" if path.is_dir() else "no such file"
         raise error(path, what, "give a file of points" if path.is_dir() else "check the path")
@@ -125,13 +130,13 @@ def _head(path: Path) -> bytes:
 
 def _views(paths: Several[Path], frames: tuple[int, ...] | None) -> tuple[list[PointSet], list[PointSet]]:
     """The views, and the static points that came with them."""
-    if len(paths) == 1 and _head(paths[0]).startswith(b"PK"):
+    if len(paths) == 1 and opening(paths[0]).startswith(b"PK"):
         if frames is not None:
             raise error(paths[0], "an .npz has no frames", "leave --frames away")
         return arrays.read_npz(paths[0])
     views: list[PointSet] = []
     for path in paths:
-        if _head(path).startswith(b"PK"):
+        if opening(path).startswith(b"PK"):
             raise error(path, "an .npz holds all views", "give it alone")
         found = open_points(path)
         if isinstance(found, Sequence):

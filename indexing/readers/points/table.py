@@ -37,9 +37,7 @@ def read(path: Path) -> PointSet:
         names, rows = header, rows[1:]
         if not rows:
             raise error(path, "the file has a header but no rows", "export it again")
-    for line, cells in rows:
-        if len(cells) != len(names):
-            raise error(path, f"row {line} has {len(cells)} cells, the first row {len(names)}", "correct the row")
+    check_widths(path, rows, names)
     columns = next((shape for shape in SHAPES if set(shape) <= set(names)), None)
     if columns is None:
         raise error(path, f"its columns are {', '.join(name or '(unnamed)' for name in names)}", EXPECTED)
@@ -49,7 +47,7 @@ def read(path: Path) -> PointSet:
     values = column_values(path, rows, names, columns)
     values = values.reshape(-1, 2, 3) if columns == LINE else values
     return PointSet(
-        str(path), values, _ids(path, rows, names), optional_column(path, rows, names, WEIGHTS), flags(path, rows, names)
+        str(path), values, row_names(path, rows, names), optional_column(path, rows, names, WEIGHTS), flags(path, rows, names)
     )
 
 
@@ -65,6 +63,17 @@ def read_rows(path: Path) -> list[Row]:
         raise error(path, "is not a text file in UTF-8", "give points as CSV, npz, npy, PLY or C3D") from None
     # where ";" separates cells, the spreadsheet wrote decimal commas
     return [(line, [cell.replace(",", ".") for cell in cells]) for line, cells in found] if delimiter == ";" else found
+
+
+def check_widths(path: Path, rows: Sequence[Row], names: Sequence[str]) -> None:
+    """Raise on a row with other than a cell per column.
+
+    Raises:
+        ValueError: naming the row.
+    """
+    for line, cells in rows:
+        if len(cells) != len(names):
+            raise error(path, f"row {line} has {len(cells)} cells, the first row {len(names)}", "correct the row")
 
 
 def is_data(cells: Sequence[str]) -> bool:
@@ -104,8 +113,13 @@ def column_values(path: Path, rows: Sequence[Row], names: Sequence[str], columns
     return out
 
 
-def _ids(path: Path, rows: Sequence[Row], names: Sequence[str]) -> tuple[str, ...] | None:
-    column = next((names.index(name) for name in IDS if name in names), None)
+def row_names(path: Path, rows: Sequence[Row], names: Sequence[str], known: Sequence[str] = IDS) -> tuple[str, ...] | None:
+    """The names of the rows, from the first column that is known to hold such; None = no column does.
+
+    Raises:
+        ValueError: a row without a name, or two of the same.
+    """
+    column = next((names.index(name) for name in known if name in names), None)
     if column is None:
         return None
     found: dict[str, int] = {}

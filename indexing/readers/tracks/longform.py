@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from indexing.readers.points.pointset import BoolArray, FloatArray, error
-from indexing.readers.points.table import IDS, STATIC, WEIGHTS, Row, column_values, flags, is_data, read_rows
+from indexing.readers.points.table import IDS, STATIC, WEIGHTS, Row, check_widths, column_values, flags, is_data, read_rows
 from indexing.readers.tracks.trackset import TrackSet, exact
 
 IntArray = NDArray[np.intp]
@@ -51,9 +51,7 @@ def read(path: Path) -> TrackSet:
     rows, names = read_rows(path)[1:], header(path)
     if not rows:
         raise error(path, "the file has a header but no rows", "export it again")
-    for line, cells in rows:
-        if len(cells) != len(names):
-            raise error(path, f"row {line} has {len(cells)} cells, the first row {len(names)}", "correct the row")
+    check_widths(path, rows, names)
     point = next((names.index(name) for name in IDS if name in names), None)
     if point is None:
         raise error(path, f"no column names the points (its columns are {', '.join(names)})", EXPECTED)

@@ -1,0 +1,231 @@
+"""``dyntorch segment``: which matches of two images move together, and how each body moved."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from indexing.cli.console import count, ended, in_flags, progress, say, table
+from indexing.cli.outputs import check_report
+
+if TYPE_CHECKING:
+    from indexing.readers.images import Photograph
+    from indexing.readers.pairs import MatchedPair
+    from indexing.report.segmentation import SegmentationReport
+
+REASONS = {
+    "TOO_FEW": "too few matches are present in both images; give more",
+    "DEGENERATE": "several segmentations fit all matches exactly; add matches in general position",
+    "AMBIGUOUS": "other segmentations fit as well; add matches, or say how many --bodies there are",
+    "NO_CONSENSUS": "no body moves so that enough of the matches agree; raise --threshold, try --no-spatial, or clean the matches",
+}
+FLAGS = ("bodies", "threshold", "spatial", "weights")
+LEAST = 8  # matches
+SMALL = 50  # thresholds across the points, below which these are hardly pixels
+OUTSIDE = 0.02  # of the matches, beyond which an image is hardly the one they were found in
+
+
+@dataclass(frozen=True)
+class Segment:
+    """Find which matches of two images move together, which are wrong, and how each body moved.
+
+    dyntorch segment matches.npz --out out/
+
+    dyntorch segment matches.csv --images left.jpg right.jpg --out out/
+
+    dyntorch segment adelaidermf.npz --pair breadtoy --bodies 2 --threshold auto
+    """
+
+    file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MATCHES", help_behavior_hint="")]
+    """npz with x1, x2 (n, 2), or NAME/x1, NAME/x2 of several pairs; npy (n, 4); or CSV with columns x1,y1,x2,y2"""
+    bodies: Annotated[int | Literal["auto"], tyro.conf.arg(metavar="K|auto")] = "auto"
+    """how many bodies there are"""
+    threshold: Annotated[float | Literal["auto"], tyro.conf.arg(metavar="PX|auto")] = 2.5
+    """greatest distance of an inlier in pixels: three to five times the noise of a coordinate; auto estimates it"""
+    spatial: bool = True
+    """neighbours tend to move with one body; --no-spatial where bodies are transparent or interleaved"""
+    pair: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
+    """of an npz with several pairs, the one to take"""
+    images: Annotated[tuple[Path, Path] | None, tyro.conf.arg(metavar="LEFT RIGHT", help_behavior_hint="")] = None
+    """both images (png, jpg, ...), to draw the matches on"""
+    size: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="W H", help_behavior_hint="")] = None
+    """width and height of the images in pixels, for the picture without --images"""
+    out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
+    """where to write report.html, segmentation.npz, segmentation.json, labels.csv and segmentation.png; without it, print only"""
+    title: Annotated[str | None, tyro.conf.arg(metavar="TEXT", help_behavior_hint="")] = None
+    """heading of the report"""
+    seed: int = 0
+    """of the random samples"""
+
+    def run(self) -> int:
+        """Read, segment, write, and say what was found."""
+        inputs = [path.expanduser() for path in (self.file, *(self.images or ()))]
+        self._check()
+        from indexing.report.segmentation import FILES
+
+        folder = check_report(self.out, inputs, FILES)
+        started = time.perf_counter()
+        with progress("reading", steps=False):
+            from indexing.readers.images import read_image
+            from indexing.readers.pairs import read_pair
+
+            pair = read_pair(self.file, self.pair)
+            photographs = [read_image(path) for path in self.images or ()]
+        notes = self._notes(pair, photographs)
+        read = time.perf_counter()
+        with progress(f"segmenting {count(int(pair.seen.sum()), 'match').replace('matchs', 'matches')}", steps=False):
+            result = self._solve(pair)
+        timings = {"read": read - started, "segment": time.perf_counter() - read}
+        report = self._report(pair, photographs, result, notes, inputs, timings)
+        page = None
+        if folder is not None:
+            from indexing.report.segmentation import write_segmentation
+
+            with progress("drawing the report", steps=False):
+                page = write_segmentation(folder, report)
+        show(report)
+        return ended(page, None if report.status == "OK" else report.reason)
+
+    def _check(self) -> None:
+        """Raise on flags that make no sense by themselves, before any file is read."""
+        if self.bodies != "auto" and int(self.bodies) < 1:
+            raise ValueError(f"--bodies must be a whole number from 1, or auto, got {self.bodies}")
+        if self.threshold != "auto" and not 0 < float(self.threshold) < float("inf"):
+            raise ValueError(f"--threshold must be a positive distance in pixels or auto, got {self.threshold}")
+        if self.size is not None and not all(0 < side < float("inf") for side in self.size):
+            raise ValueError(f"--size must be width and height in pixels, such as 640 480, got {self.size[0]:g} {self.size[1]:g}")
+        if self.size is not None and self.images is not None:
+            raise ValueError("--size and --images both say how large the images are; leave one away")
+        if self.seed < 0:
+            raise ValueError(f"--seed must be a whole number from 0, got {self.seed}")
+
+    def _notes(self, pair: MatchedPair, photographs: list[Photograph]) -> list[str]:
+        """What to say about the input.
+
+        Raises:
+            ValueError: too few matches.
+        """
+        import numpy as np
+
+        seen = pair.seen
+        number, lost = int(seen.sum()), int((~seen).sum())
+        if number < LEAST:
+            said = f"{pair.path}: x1, x2 hold {number} complete matches{f' and {lost} with a missing coordinate' * (lost > 0)}"
+            raise ValueError(f"{said}, {LEAST} are needed; give more matches")
+        notes = []
+        if lost:
+            was = "match lacks a coordinate and was" if lost == 1 else "matches lack a coordinate and were"
+            notes.append(f"{lost:,} {was} left out")
+        reach = float(np.ptp(np.concatenate([pair.x1[seen], pair.x2[seen]]), axis=0).max())
+        if self.threshold != "auto" and reach < SMALL * float(self.threshold):
+            said = f"the points lie within {reach:.3g}, and --threshold is {self.threshold:g}"
+            notes.append(f"{said}; if they are not in pixels, give --threshold in their unit, or auto")
+        for photograph, points in zip(photographs, (pair.x1[seen], pair.x2[seen]), strict=False):
+            wide, tall = photograph.size
+            out = int(((points < -0.5) | (points > np.array([wide, tall]) - 0.5)).any(axis=1).sum())
+            if out > OUTSIDE * number:
+                said = f"{out:,} of {number:,} matches lie outside of {photograph.name} ({wide:g} by {tall:g})"
+                notes.append(f"{said}; give the images in the order and size in which the matches were found")
+        return notes
+
+    def _solve(self, pair: MatchedPair) -> Any:
+        """The segmentation, by the library.
+
+        Raises:
+            ValueError: naming the file.
+        """
+        import torch
+
+        import dyntorch
+
+        try:
+            return dyntorch.segment(
+                torch.from_numpy(pair.x1),
+                torch.from_numpy(pair.x2),
+                bodies=None if self.bodies == "auto" else int(self.bodies),
+                threshold=None if self.threshold == "auto" else float(self.threshold),
+                weights=None if pair.weights is None else torch.from_numpy(pair.weights),
+                spatial=self.spatial,
+                generator=torch.Generator().manual_seed(self.seed),
+            )
+        except ValueError as problem:
+            raise ValueError(f"{pair.path}: {in_flags(str(problem), *FLAGS)}") from problem
+
+    def _report(
+        self,
+        pair: MatchedPair,
+        photographs: list[Photograph],
+        result: Any,
+        notes: list[str],
+        inputs: list[Path],
+        timings: dict[str, float],
+    ) -> SegmentationReport:
+        from dyntorch import Status
+        from indexing.files import manifest
+        from indexing.report.reconstruction_words import one
+        from indexing.report.segmentation import SegmentationReport
+
+        found = int(result.bodies)
+        status = Status(int(result.status)).name
+        if status == "OK" and not found:
+            status = "NO_CONSENSUS"
+        if self.bodies != "auto" and 0 < found < self.bodies:
+            notes = [*notes, f"--bodies asks for {self.bodies}, the matches carry {found}"]
+        warnings = [(notice.code.value, notice.value, one(in_flags(notice.message, *FLAGS))) for notice in result.warnings]
+        reason = "; ".join(message for _, _, message in warnings[:2]) or REASONS[status] if status != "OK" else ""
+        arrays = ("labels", "residuals", "coherence")
+        return SegmentationReport(
+            title=self.title or ("What moves with what" if status == "OK" else "The matches do not decide"),
+            pair=pair,
+            fundamentals=result.fundamentals[:found].numpy(),
+            homographies=result.homographies[:found].numpy(),
+            models=[str(model) for model in result.models[:found]],
+            probabilities=result.probabilities[:, : found + 1].numpy(),
+            threshold=float(result.threshold),
+            status=status,
+            reason=reason,
+            warnings=warnings,
+            notes=notes,
+            misclassified=misclassified(pair, result.labels) if found else None,
+            photographs=photographs,
+            size=self.size or pair.size,
+            manifest=manifest({"command": "segment", **dataclasses.asdict(self)}, inputs, self.seed, timings),
+            **{name: getattr(result, name).numpy() for name in arrays},
+        )
+
+
+def misclassified(pair: MatchedPair, labels: Any) -> float | None:
+    """Share of the matches that are not labelled as the file says, whatever the bodies' numbers; None where it does not say."""
+    if pair.known is None:
+        return None
+    import torch
+
+    from dyntorch import metrics
+
+    seen = torch.from_numpy(pair.seen)
+    return float(metrics.misclassification(labels[seen], torch.from_numpy(pair.known)[seen]))
+
+
+def show(report: SegmentationReport) -> None:
+    """Print the result."""
+    number, counts = int(report.pair.seen.sum()), report.counts
+    rows: list[list[object]] = []
+    for label, model in enumerate(report.models, start=1):
+        mine = counts[f"body {label}"]
+        rows.append(
+            [f"body {label}", f"{mine:,}", f"{100 * mine / number:.1f} %", model, f"{report.rms(label):.3g}" if mine else ""]
+        )
+    rest = "outliers" if report.models else "unlabelled"
+    rows.append([rest, f"{counts['outlier']:,}", f"{100 * counts['outlier'] / number:.1f} %", "", ""])
+    table(["body", "matches ", "share ", "model", "noise rms px "], rows)
+    if report.misclassified is not None:
+        say(f"misclassified: {100 * report.misclassified:.2f} % against the labels of the file")
+    for note in report.notes:
+        say(f"note: {note}")
+    for code, _, message in report.warnings:
+        say(f"warning: {code.replace('_', ' ')}: {message}")

@@ -1,0 +1,212 @@
+"""Matches of two images, all in one file: ``.npz``, ``.npy`` or CSV -> arrays whose rows correspond."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from indexing.readers.points import table
+from indexing.readers.points.arrays import load, member
+from indexing.readers.points.matching import opening
+from indexing.readers.points.pointset import FloatArray, as_view, error
+
+COLUMNS = ("x1", "y1", "x2", "y2")
+IDS = ("id", "name", "match", "track")
+KNOWN = ("label", "labels")
+FORMATS = "give npz with x1, x2 (n, 2), or CSV with columns x1,y1,x2,y2 (and perhaps id, weight, label)"
+KEYS = "give x1 and x2 (n, 2), and perhaps label, weights, ids, wh; of several pairs NAME/x1 and NAME/x2"
+EXTRA = {"label": KNOWN, "weights": table.WEIGHTS, "ids": ("ids", "id"), "wh": ("wh", "size")}
+LISTED = 8  # names in a message
+
+
+@dataclass(frozen=True, eq=False)
+class MatchedPair:
+    """Matches of two images.
+
+    Attributes:
+        path: the file.
+        name: of the pair: its key in a file of several, otherwise the file's name.
+        x1: ``(n, 2)`` of image 1, NaN = missing.
+        x2: ``(n, 2)`` of image 2.
+        ids: ``n`` names; numbers of the rows, from 1, where the file has none.
+        weights: ``(n,)`` not negative; None = all equal.
+        known: ``(n,)`` known labels, 0 outlier, 1.. the bodies; None = not known.
+        size: width and height of the images; None = the file does not say.
+    """
+
+    path: str
+    name: str
+    x1: FloatArray
+    x2: FloatArray
+    ids: tuple[str, ...]
+    weights: FloatArray | None = None
+    known: NDArray[np.int64] | None = None
+    size: tuple[float, float] | None = None
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """``(n,)`` matches that are there in both images."""
+        return np.asarray(np.isfinite(np.concatenate([self.x1, self.x2], axis=1)).all(axis=1))
+
+
+def read_pair(path: str | Path, pair: str | None = None) -> MatchedPair:
+    """Read the matches of two images.
+
+    Args:
+        path: ``.npz`` with ``x1, x2`` (or ``NAME/x1, NAME/x2``), ``.npy (n, 4)``, or a table with columns ``x1,y1,x2,y2``.
+        pair: NAME, in an ``.npz`` of several.
+
+    Raises:
+        ValueError: one line with the file, the field, what is wrong and what to do.
+
+    Example:
+        >>> import pathlib, tempfile
+        >>> path = pathlib.Path(tempfile.mkdtemp()) / "m.csv"
+        >>> _ = path.write_text("1,2,3,4\\n5,6,7,\\n")
+        >>> found = read_pair(path)
+        >>> found.ids, found.x2.tolist(), found.seen.tolist()
+        (('1', '2'), [[3.0, 4.0], [7.0, nan]], [True, False])
+    """
+    path = Path(path).expanduser()
+    head = opening(path)
+    if head.startswith(b"PK"):
+        return _archive(path, pair)
+    if pair is not None:
+        raise error(path, f"--pair {pair}: holds one pair", "leave --pair away; it is for .npz with several")
+    if head.startswith(b"\x93NUMPY"):
+        values = load(path)
+        if values.ndim != 2 or values.shape[1] != 4:
+            raise error(path, f"the array has shape {values.shape}", "matches are (n, 4): x1, y1, x2, y2")
+        return _pair(path, path.name, _points(values[:, :2], path), _points(values[:, 2:], path))
+    if b"\0" in head:
+        raise error(path, "is a binary file of no known format", FORMATS)
+    return _table(path)
+
+
+def _pair(path: Path, name: str, x1: FloatArray, x2: FloatArray, ids: tuple[str, ...] | None = None, **known: Any) -> MatchedPair:
+    return MatchedPair(str(path), name, x1, x2, ids or tuple(str(i + 1) for i in range(len(x1))), **known)
+
+
+def _points(values: Any, where: str | Path) -> FloatArray:
+    """Points of one image; those of OpenCV have an axis between, ``(n, 1, 2)``."""
+    array = np.asarray(values)
+    if array.ndim == 3 and array.shape[1:] == (1, 2):
+        array = array[:, 0]
+    if array.ndim != 2 or array.shape[1] != 2:
+        raise error(where, f"the array has shape {array.shape}", "points of an image are (n, 2)")
+    return as_view(array, where)
+
+
+# ---- npz -----------------------------------------------------------------------------------------------------------------
+def _archive(path: Path, pair: str | None) -> MatchedPair:
+    archive = load(path)
+    before = _chosen(path, list(archive.files), pair)
+    x1, x2 = (_points(member(path, archive, before + name), f"{path} {before}{name}") for name in ("x1", "x2"))
+    if len(x1) != len(x2):
+        raise error(path, f"{before}x1 has {len(x1)} rows, {before}x2 {len(x2)}", "give a row per match in both")
+    extra = {}
+    for kind, names in EXTRA.items():
+        name = next((before + name for name in names if before + name in archive.files), None)
+        if name is not None:
+            extra[kind] = member(path, archive, name)
+            if kind != "wh" and extra[kind].shape != (len(x1),):
+                raise error(path, f"{name} has shape {extra[kind].shape}, {before}x1 has {len(x1)} rows", "give one per match")
+    ids = tuple(map(str, extra["ids"].tolist())) if "ids" in extra else None
+    if ids is not None and len(set(ids)) < len(ids):
+        twice = next(name for name in ids if ids.count(name) > 1)
+        raise error(path, f"{before}ids: {twice!r} names several matches", "give each match a name of its own, or leave ids out")
+    return _pair(path, pair or before.rstrip("/") or path.name, x1, x2, ids, **_marks(path, extra))
+
+
+def _chosen(path: Path, names: list[str], pair: str | None) -> str:
+    """What the names of the arrays of the pair begin with."""
+    several = [name.removesuffix("x1") for name in names if name.endswith("/x1")]
+    listed = ", ".join(name.rstrip("/") for name in several[:LISTED]) + ", ..." * (len(several) > LISTED)
+    if pair is not None and f"{pair}/x1" not in names:
+        raise error(path, f"has no pair {pair!r}", f"its pairs are {listed}" if several else "it holds one pair: leave --pair away")
+    if pair is None and "x1" not in names and len(several) > 1:
+        raise error(path, f"holds {len(several)} pairs ({listed})", f"say which: --pair {several[0].rstrip('/')}")
+    before = f"{pair}/" if pair is not None else "" if "x1" in names or not several else several[0]
+    missing = next((before + name for name in ("x1", "x2") if before + name not in names), None)
+    if missing is not None:
+        raise error(path, f"has no {missing} (its arrays are {', '.join(names[:LISTED]) or 'none'})", KEYS)
+    return before
+
+
+def _marks(path: Path, extra: Mapping[str, Any]) -> dict[str, Any]:
+    """Weights, known labels and size, where the file has them."""
+    for kind, values in extra.items():
+        if kind != "ids" and values.dtype.kind not in "fiub":
+            raise error(path, f"{kind} holds values of type {values.dtype}", "give numbers")
+    found: dict[str, Any] = {}
+    if "weights" in extra:
+        weights = np.nan_to_num(extra["weights"].astype(np.float64), posinf=-1)
+        if (weights < 0).any():
+            at = int(np.flatnonzero(weights < 0)[0])
+            raise error(path, f"match {at + 1}: the weight is {extra['weights'][at]:g}", "weights are 0 or more, and finite")
+        found["weights"] = weights
+    if "label" in extra:
+        labels = extra["label"].astype(np.float64)
+        odd = np.flatnonzero(~(np.isfinite(labels) & (labels >= 0) & (labels == np.round(labels))))
+        if len(odd):
+            said = f"match {odd[0] + 1}: the label is {labels[odd[0]]:g}"
+            raise error(path, said, "labels are 0 for an outlier, 1, 2, ... for the bodies; or leave them out")
+        found["known"] = labels.astype(np.int64)
+    if "wh" in extra:
+        size = extra["wh"].astype(np.float64).ravel()
+        if len(size) == 2 and np.isfinite(size).all() and (size > 0).all():
+            found["size"] = (float(size[0]), float(size[1]))
+    return found
+
+
+# ---- tables --------------------------------------------------------------------------------------------------------------
+def _table(path: Path) -> MatchedPair:
+    rows = [(line, _cells(cells)) for line, cells in table.read_rows(path)]
+    rows = [(line, cells) for line, cells in rows if cells]
+    if not rows:
+        raise error(path, "the file is empty", "export it again")
+    if table.is_data(rows[0][1]):
+        names = _unnamed(path, rows[0][1])
+    else:
+        names, rows = [cell.strip().lower() for cell in rows[0][1]], rows[1:]
+        if not rows:
+            raise error(path, "the file has a header but no rows", "export it again")
+    table.check_widths(path, rows, names)
+    absent = [name for name in COLUMNS if name not in names]
+    if absent:
+        said = f"has no column {absent[0]!r} (its columns are {', '.join(name or '(unnamed)' for name in names)})"
+        raise error(path, said, "name the columns x1,y1,x2,y2 (and perhaps id, weight, label)")
+    twice = next((name for name in names if names.count(name) > 1 and name in (*COLUMNS, *IDS, *table.WEIGHTS, *KNOWN)), None)
+    if twice is not None:
+        raise error(path, f"there are two columns {twice!r}", "leave one of them out")
+    values = table.column_values(path, rows, names, COLUMNS)
+    extra = {
+        "weights": table.optional_column(path, rows, names, table.WEIGHTS),
+        "label": table.optional_column(path, rows, names, KNOWN),
+    }
+    marks = _marks(path, {kind: column for kind, column in extra.items() if column is not None})
+    return _pair(path, path.name, values[:, :2], values[:, 2:], table.row_names(path, rows, names, IDS), **marks)
+
+
+def _cells(cells: list[str]) -> list[str]:
+    """The cells of a row; what numpy.savetxt writes has blanks between them, and # before the header."""
+    if len(cells) == 1:
+        cells = cells[0].split()
+    if cells and cells[0].startswith("#"):
+        cells = [cells[0][1:].strip(), *cells[1:]]
+        cells = cells if cells[0] else cells[1:]
+    return cells
+
+
+def _unnamed(path: Path, cells: list[str]) -> list[str]:
+    """Names of the columns of a table without a header: the four coordinates, and perhaps a name before them."""
+    named = table.number(cells[0]) is None
+    if len(cells) != len(COLUMNS) + named:
+        said = f"row 1 has {len(cells)} columns, and no row names them"
+        raise error(path, said, "matches without a header are x1,y1,x2,y2; name further columns (id, weight, label) in a header")
+    return [*(["id"] if named else []), *COLUMNS]

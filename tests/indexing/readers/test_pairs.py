@@ -1,0 +1,148 @@
+"""Matches of two images, and photographs, from files that the tests write, broken ones included."""
+
+import numpy as np
+import pytest
+
+from indexing.readers.images import SIDE, read_image
+from indexing.readers.pairs import read_pair
+
+X1, X2 = np.arange(20.0).reshape(10, 2), np.arange(20.0, 40.0).reshape(10, 2)
+
+
+def table(path, text):
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("text", "ids"),
+    [
+        ("1,2,3,4\n5,6,7,8", ("1", "2")),
+        ("1;2;3;4\n5,0;6;7;8", ("1", "2")),
+        ("1 2 3 4\n5 6 7 8", ("1", "2")),
+        ("# x1 y1 x2 y2\n1 2 3 4\n5 6 7 8", ("1", "2")),
+        ("#x1,y1,x2,y2\n1,2,3,4\n5,6,7,8", ("1", "2")),
+        ("a,1,2,3,4\nb,5,6,7,8", ("a", "b")),
+        ("x2,y2,score,X1,Y1,id\n3,4,9,1,2,a\n7,8,9,5,6,b", ("a", "b")),
+    ],
+)
+def test_tables(tmp_path, text, ids):
+    found = read_pair(table(tmp_path / "m.csv", text))
+    assert found.ids == ids and found.x1.tolist() == [[1, 2], [5, 6]] and found.x2.tolist() == [[3, 4], [7, 8]]
+    assert found.weights is None and found.known is None and found.name == "m.csv"
+
+
+def test_columns_that_are_known(tmp_path):
+    found = read_pair(table(tmp_path / "m.csv", "x1,y1,x2,y2,label,weight\n1,2,3,4,2,0.5\n5,,7,8,0,"))
+    assert found.known.tolist() == [2, 0] and found.weights.tolist() == [0.5, 0] and found.seen.tolist() == [True, False]
+
+
+def test_arrays(tmp_path):
+    np.savez(
+        tmp_path / "a.npz", x1=X1[:, None].astype(np.float32), x2=X2, labels=np.ones(10), size=[64, 48], ids=list("abcdefghij")
+    )
+    found = read_pair(tmp_path / "a.npz")
+    assert found.x1.tolist() == X1.tolist() and found.x1.dtype == np.float64 and found.size == (64, 48)
+    assert found.ids[0] == "a" and found.known.dtype == np.int64
+    np.savez(tmp_path / "b.npz", **{"one/x1": X1, "one/x2": X2})  # a single pair needs no name
+    assert read_pair(tmp_path / "b.npz").name == read_pair(tmp_path / "b.npz", "one").name == "one"
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        (",,,\n", "the file is empty; export it again"),
+        ("x1,y1,x2,y2\n", "has a header but no rows"),
+        ("x,y\n1,2", "has no column 'x1' (its columns are x, y); name the columns x1,y1,x2,y2"),
+        ("x1,y1,x2\n1,2,3", "has no column 'y2'"),
+        ("1,2,3\n4,5,6", "row 1 has 3 columns, and no row names them; matches without a header are x1,y1,x2,y2"),
+        ("1,2,3,4,1\n1,2,3,4,1", "row 1 has 5 columns"),
+        ("1,2,3,4\n1,2,3", "row 2 has 3 cells, the first row 4"),
+        ("1,2,3,4\n1,2,3,inf", "row 2, column 'y2': 'inf' is not finite"),
+        ("x1,y1,x2,y2\n1,2,3,abc", "row 2, column 'y2': 'abc' is not a number"),
+        ("x1,y1,x2,y2,x1\n1,2,3,4,5", "there are two columns 'x1'"),
+        ("x1,y1,x2,y2,label\n1,2,3,4,1.5", "match 1: the label is 1.5; labels are 0 for an outlier"),
+        ("x1,y1,x2,y2,label\n1,2,3,4,", "match 1: the label is nan"),
+        ("x1,y1,x2,y2,label\n1,2,3,4,cup", "row 2, column 'label': 'cup' is not a number"),
+        ("x1,y1,x2,y2,weight\n1,2,3,4,-1", "match 1: the weight is -1; weights are 0 or more"),
+        ("id,x1,y1,x2,y2\na,1,2,3,4\na,1,2,3,4", "row 3, column 'id': 'a' was in row 2, too"),
+    ],
+)
+def test_bad_tables_name_file_field_and_remedy(tmp_path, text, says):
+    with pytest.raises(ValueError, match=r"m\.csv: ") as caught:
+        read_pair(table(tmp_path / "m.csv", text))
+    assert says in str(caught.value) and "\n" not in str(caught.value) and "; " in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("arrays", "says"),
+    [
+        ({"a": X1}, "has no x1 (its arrays are a); give x1 and x2 (n, 2)"),
+        ({"x1": X1}, "has no x2"),
+        ({"x1": X1, "x2": X2[:9]}, "x1 has 10 rows, x2 9; give a row per match in both"),
+        ({"x1": X1.T, "x2": X2.T}, "x1: the array has shape (2, 10); points of an image are (n, 2)"),
+        ({"x1": X1[:0], "x2": X2[:0]}, "the array is empty"),
+        ({"x1": X1.astype(str), "x2": X2}, "holds values of type <U"),
+        ({"x1": np.where(X1 == 3, np.inf, X1), "x2": X2}, "x1: row 2, column 2: inf is not finite"),
+        ({"x1": X1, "x2": X2, "label": np.ones(9)}, "label has shape (9,), x1 has 10 rows; give one per match"),
+        ({"x1": X1, "x2": X2, "label": -np.ones(10)}, "match 1: the label is -1"),
+        ({"x1": X1, "x2": X2, "label": np.array(list("abcdefghij"))}, "label holds values of type <U1; give numbers"),
+        ({"x1": X1, "x2": X2, "weights": np.full(10, np.inf)}, "match 1: the weight is inf"),
+        ({"x1": X1, "x2": X2, "ids": np.ones(10)}, "ids: '1.0' names several matches"),
+        ({"x1": np.array([{}] * 10), "x2": X2}, "array 'x1' cannot be read"),
+    ],
+)
+def test_bad_arrays_name_file_field_and_remedy(tmp_path, arrays, says):
+    np.savez(tmp_path / "m.npz", **arrays)
+    with pytest.raises(ValueError, match=r"m\.npz") as caught:
+        read_pair(tmp_path / "m.npz")
+    assert says in str(caught.value) and "\n" not in str(caught.value) and "; " in str(caught.value)
+
+
+def test_an_array_of_another_shape_and_a_broken_archive(tmp_path):
+    np.save(tmp_path / "m.npy", X1)
+    with pytest.raises(ValueError, match=r"m\.npy: the array has shape \(10, 2\); matches are \(n, 4\)"):
+        read_pair(tmp_path / "m.npy")
+    np.savez(tmp_path / "m.npz", x1=X1, x2=X2)
+    (tmp_path / "cut.npz").write_bytes((tmp_path / "m.npz").read_bytes()[:300])
+    with pytest.raises(ValueError, match=r"cut\.npz: cannot be read as numpy data"):
+        read_pair(tmp_path / "cut.npz")
+
+
+def test_photographs_keep_the_size_of_the_file(tmp_path):
+    from PIL import Image
+
+    gray = np.tile(np.linspace(0, 255, 40).astype(np.uint8), (30, 1))
+    Image.fromarray(gray).save(tmp_path / "a.png")
+    found = read_image(tmp_path / "a.png")
+    assert found.size == (40, 30) and found.name == "a.png" and found.gray.shape == (30, 40)
+    np.testing.assert_allclose(found.gray, gray / 255, atol=1e-6)
+    Image.fromarray(gray.astype(np.uint16) * 100).save(tmp_path / "deep.png")
+    np.testing.assert_allclose(read_image(tmp_path / "deep.png").gray, gray / 255, atol=0.01)
+    Image.new("RGBA", (2 * SIDE, 10), "red").save(tmp_path / "large.png")
+    large = read_image(tmp_path / "large.png")
+    assert large.size == (2 * SIDE, 10) and large.gray.shape == (5, SIDE)
+
+
+def test_photographs_are_turned_as_their_file_says(tmp_path):
+    from PIL import Image
+
+    image = Image.fromarray(np.tile(np.linspace(0, 255, 40).astype(np.uint8), (30, 1)))
+    exif = Image.Exif()
+    exif[0x0112] = 6  # a quarter turn
+    image.save(tmp_path / "a.jpg", exif=exif)
+    found = read_image(tmp_path / "a.jpg")
+    assert found.size == (30, 40) and found.gray[0].mean() < 0.1 < 0.9 < found.gray[-1].mean()
+
+
+@pytest.mark.parametrize(
+    ("name", "says"), [("no.png", "no such file"), (".", "is a folder"), ("cut.png", "cannot be read as an image")]
+)
+def test_images_that_are_none(tmp_path, name, says):
+    from PIL import Image
+
+    Image.fromarray(np.random.default_rng(0).integers(0, 255, (50, 50), dtype=np.uint8)).save(tmp_path / "a.png")
+    (tmp_path / "cut.png").write_bytes((tmp_path / "a.png").read_bytes()[:900])
+    with pytest.raises(ValueError, match=says) as caught:
+        read_image(tmp_path / name)
+    assert "; " in str(caught.value) and "\n" not in str(caught.value)

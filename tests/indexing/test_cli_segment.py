@@ -1,0 +1,274 @@
+"""``dyntorch segment``: scenes whose truth is known from files to files, and what is refused and how."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import dyntorch
+from dyntorch.tasks.notices import Notice, NoticeCode
+from dyntorch.tasks.segmentation import BodyModel, Segmentation
+from indexing.cli.segment import REASONS
+from indexing.report.segmentation import FILES
+
+# torch's own, when it first loads its transforms; hidden outside of tests
+pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated")
+
+COMMAND = "segment"
+WIDE, TALL, FOCAL = 640.0, 480.0, 700.0
+COUNTS = (60, 40, 20)  # of two bodies and of wrong matches
+
+
+def skew(v: np.ndarray) -> np.ndarray:
+    return np.cross(np.eye(3), -v)
+
+
+def body(rng, count, low, high, shift, angle):
+    """Matches of a rigid body, and its fundamental matrix."""
+    inner = np.array([[FOCAL, 0, WIDE / 2], [0, FOCAL, TALL / 2], [0, 0, 1.0]])
+    turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    first = np.c_[rng.uniform(low, high, size=(count, 2)), np.ones(count)]
+    there = (first @ np.linalg.inv(inner).T * rng.uniform(4, 8, size=(count, 1))) @ turn.T + shift
+    second = there @ inner.T
+    back = np.linalg.inv(inner)
+    matrix = back.T @ skew(np.array(shift)) @ turn @ back
+    return first[:, :2], second[:, :2] / second[:, 2:], matrix / np.linalg.norm(matrix)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """x1, x2, labels and fundamentals: body 2 in front of body 1, wrong matches, and the fourth match missing."""
+    rng = np.random.default_rng(0)
+    bodies = [
+        body(rng, COUNTS[0], (30, 20), (560, 250), (0.3, 0.1, 0.0), 0.02),
+        body(rng, COUNTS[1], (200, 280), (420, 430), (-0.5, 0.2, 0.1), 0.0),
+    ]
+    wrong = rng.uniform((0, 0), (WIDE, TALL), size=(2, COUNTS[2], 2))
+    x1, x2 = (np.concatenate([*(parts[i] for parts in bodies), wrong[i]]) for i in (0, 1))
+    x2 = x2 + 0.2 * rng.normal(size=x2.shape)
+    labels = np.repeat([1, 2, 0], COUNTS)
+    order = rng.permutation(len(labels))
+    x1, x2, labels = x1[order], x2[order], labels[order]
+    x1[3] = np.nan
+    return x1, x2, labels, np.stack([parts[2] for parts in bodies])
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory, scene) -> Path:
+    """The scene as ``m.npz`` with labels, ``several.npz``, ``m.npy``, ``m.csv`` with a header, ``bare.csv`` and ``bare.txt``
+    without; ``left.png``, ``right.jpg``."""
+    from PIL import Image
+
+    folder = tmp_path_factory.mktemp("matches")
+    x1, x2, labels, _ = scene
+    np.savez(folder / "m.npz", x1=x1, x2=x2, label=labels.astype(np.uint8), wh=[640, 480])
+    np.savez(
+        folder / "several.npz", **{"desk/x1": x1[:, None], "desk/x2": x2, "desk/label": labels, "shelf/x1": x1, "names": ["desk"]}
+    )
+    np.save(folder / "m.npy", np.hstack([x1, x2]))
+    rows = [",".join("" if np.isnan(v) else repr(float(v)) for v in row) for row in np.hstack([x1, x2])]
+    (folder / "bare.csv").write_text("\n".join(rows))
+    named = [f"p{i},{row},{label},1" for i, (row, label) in enumerate(zip(rows, labels, strict=True))]
+    (folder / "m.csv").write_text("\n".join(["ID,x1,y1,x2,y2,label,weight", *named]))
+    np.savetxt(folder / "bare.txt", np.hstack([x1, x2]), header="x1 y1 x2 y2")
+    gray = np.random.default_rng(0).integers(0, 255, size=(480, 640), dtype=np.uint8)
+    Image.fromarray(gray).save(folder / "left.png")
+    Image.fromarray(gray).convert("RGB").save(folder / "right.jpg")
+    Image.fromarray(gray[:200, :200]).save(folder / "small.png")
+    return folder
+
+
+@pytest.fixture
+def solved(monkeypatch, scene):
+    """The library's answer, known: two matches of body 1 called outliers, body 2 a homography.  Records how it was asked."""
+    _, _, truth, fundamentals = scene
+    asked: dict = {}
+
+    def segment(x1, x2, **options):
+        asked.update(options, x1=x1, x2=x2)
+        seen = torch.isfinite(torch.cat([x1, x2], -1)).all(-1)
+        labels = torch.where(seen, torch.from_numpy(truth)[: len(x1)], 0)
+        labels[torch.nonzero(labels == 1)[:2]] = 0
+        probabilities = 0.9 * torch.eye(3, dtype=torch.float64)[labels] + 0.1 / 3
+        homographies = torch.zeros(2, 3, 3, dtype=torch.float64)
+        homographies[1] = torch.eye(3) / 3**0.5
+        residuals = torch.where(labels == 0, 9.0, 0.25 * labels).double()
+        limit = torch.tensor(float(options["threshold"] or 1.5))
+        return Segmentation(
+            labels, torch.tensor(2), torch.from_numpy(fundamentals), homographies, (BodyModel.FUNDAMENTAL, BodyModel.HOMOGRAPHY),
+            probabilities * seen[:, None], residuals, torch.ones(len(x1)), torch.tensor(0), limit, (),
+        )  # fmt: skip
+
+    monkeypatch.setattr(dyntorch, "segment", segment, raising=False)
+    return asked
+
+
+def read(folder: str | Path = "out") -> dict:
+    return json.loads((Path(folder) / "segmentation.json").read_text())
+
+
+# ---- what is found -------------------------------------------------------------------------------------------------------
+def test_an_archive_with_labels(run, solved, scene):
+    x1, _, truth, fundamentals = scene
+    code, out, err = run("@/m.npz --out out/")
+    assert (code, err) == (0, "") and "report: out/report.html" in out
+    assert sorted(path.name for path in Path("out").iterdir()) == sorted(FILES)
+    assert re.search(r"body 1 +58 +48\.7 % +fundamental +0\.25", out) and re.search(r"body 2 +39 +32\.8 % +homography +0\.5", out)
+    assert "outliers" in out and "misclassified: 1.68 %" in out and "note: 1 match lacks a coordinate and was left out" in out
+    assert solved["bodies"] is None and solved["threshold"] == 2.5 and solved["spatial"] and solved["weights"] is None
+    found, arrays = read(), np.load("out/segmentation.npz")
+    assert found["status"] == "OK" and found["counts"] == {"body 1": 58, "body 2": 39, "outlier": 22, "missing": 1}
+    assert found["misclassified"] == pytest.approx(2 / 119) and found["manifest"]["seed"] == 0
+    assert [part["model"] for part in found["bodies"]] == ["fundamental", "homography"] and found["bodies"][0]["homography"] is None
+    assert len(found["manifest"]["inputs"]) == 1 and found["threshold"] == 2.5
+    np.testing.assert_array_equal(arrays["fundamentals"], fundamentals)
+    np.testing.assert_array_equal(arrays["known"], truth)
+    assert arrays["models"].tolist() == ["fundamental", "homography"] and str(arrays["status"]) == "OK"
+    with Path("out/labels.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert list(rows[0]) == ["id", "x1", "y1", "x2", "y2", "label", "name", "probability", "residual"] and len(rows) == 120
+    assert rows[3] == {**rows[3], "id": "4", "x1": "", "label": "0", "name": "missing", "probability": "", "residual": ""}
+    assert [int(row["label"]) for row in rows] == arrays["labels"].tolist()
+    assert float(rows[0]["x1"]) == pytest.approx(x1[0, 0]) and float(rows[0]["probability"]) == pytest.approx(0.9333, abs=1e-4)
+    page = Path("out/report.html").read_text()
+    assert page.count("data:image/png;base64,") == 2 and "Compared with the labels of the file" in page and "1.7 %" in page
+
+
+def test_the_same_from_other_files(run, solved):
+    tables = []
+    for files in ("@/m.npz", "@/several.npz --pair desk", "@/m.npy", "@/m.csv", "@/bare.csv", "@/bare.txt"):
+        code, out, err = run(files)
+        assert (code, err) == (0, "")
+        assert ("misclassified" in out) == any(name in files for name in ("m.npz", "several", "m.csv"))
+        tables.append(out.split("misclassified")[0].split("note")[0])
+        assert (solved["weights"] is not None) == (files == "@/m.csv")
+    assert len(set(tables)) == 1
+
+
+def test_flags_reach_the_library(run, solved):
+    code, out, _ = run("@/m.npz --bodies 3 --threshold auto --no-spatial --seed 7")
+    assert code == 0 and "note: --bodies asks for 3, the matches carry 2" in out
+    assert solved["bodies"] == 3 and solved["threshold"] is None and not solved["spatial"]
+    assert solved["generator"].initial_seed() == 7 and solved["x1"].dtype == torch.float64
+
+
+def test_on_photographs(run, solved):
+    code, out, _ = run("@/m.npz --images @/left.png @/right.jpg --out out --title Desk")
+    assert code == 0 and "lie outside" not in out and "<h1>Desk</h1>" in Path("out/report.html").read_text()
+    assert len(read()["manifest"]["inputs"]) == 3
+    code, out, _ = run("@/m.npz --images @/small.png @/right.jpg")
+    assert code == 0 and re.search(r"note: \d+ of 119 matches lie outside of small\.png \(200 by 200\); give the images", out)
+
+
+def test_points_that_are_hardly_pixels_are_mentioned(run, solved, scene):
+    np.savez("unit.npz", x1=scene[0] / FOCAL, x2=scene[1] / FOCAL)
+    assert "if they are not in pixels, give --threshold in their unit, or auto" in run("unit.npz")[1]
+    assert "pixels" not in run("unit.npz --threshold 0.005")[1]
+
+
+@pytest.mark.skipif("segment" not in dyntorch.__all__, reason="the library has no segment")
+def test_the_library_itself(run):
+    code, out, _ = run("@/m.npz --bodies 2 --out out")
+    assert code == 0 and read()["misclassified"] < 0.06 and "body 2" in out
+
+
+# ---- what is refused -----------------------------------------------------------------------------------------------------
+def test_data_that_cannot_decide_are_refused_with_code_3(run, solved, monkeypatch):
+    solve = dyntorch.segment
+
+    def nothing(x1, x2, **options):
+        found = solve(x1, x2, **options)
+        zero = torch.zeros(0, 3, 3)
+        return dataclasses.replace(
+            found, labels=0 * found.labels, bodies=torch.tensor(0), fundamentals=zero, homographies=zero, models=(),
+            probabilities=found.probabilities[:, :1], residuals=0 * found.residuals,
+        )  # fmt: skip
+
+    monkeypatch.setattr(dyntorch, "segment", nothing)
+    code, out, err = run("@/m.npz --out out")
+    assert (code, err) == (3, f"dyntorch: refused: {REASONS['NO_CONSENSUS']}\n") and re.search(r"unlabelled +119", out)
+    assert read()["status"] == "NO_CONSENSUS" and read()["bodies"] == [] and read()["misclassified"] is None
+    page = Path("out/report.html").read_text()
+    assert "do not decide" in page and "How each body moved" not in page and "Refused." in page
+
+
+def test_a_doubtful_result_is_shown_and_refused(run, solved, monkeypatch):
+    solve = dyntorch.segment
+    notice = Notice(NoticeCode.UNCERTAIN, 1.0, "another segmentation fits as well; give bodies=2, or threshold=None estimates it")
+
+    monkeypatch.setattr(
+        dyntorch, "segment", lambda *x, **o: dataclasses.replace(solve(*x, **o), status=torch.tensor(3), warnings=(notice,))
+    )
+    code, out, err = run("@/m.npz --out out")
+    said = "another segmentation fits as well; give --bodies 2, or --threshold auto estimates it"
+    assert (code, err) == (3, f"dyntorch: refused: {said}\n") and f"warning: uncertain: {said}" in out
+    page = Path("out/report.html").read_text()
+    assert "not to be relied on" in page and "How each body moved" in page and read()["status"] == "AMBIGUOUS"
+
+
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        ("", "required"),
+        ("no.npz", "no.npz: no such file; check the path"),
+        ("@/", "is a folder; give a file of points"),
+        ("@/left.png", "left.png: is a binary file of no known format; give npz with x1, x2"),
+        ("@/m.npz --bodies 0", "--bodies must be a whole number from 1, or auto, got 0"),
+        ("@/m.npz --bodies two", "two"),
+        ("@/m.npz --threshold 0", "--threshold must be a positive distance in pixels or auto, got 0"),
+        ("@/m.npz --seed -1", "--seed must be a whole number"),
+        ("@/m.npz --size 0 480", "--size must be width and height in pixels"),
+        ("@/m.npz --size 640 480 --images @/left.png @/right.jpg", "--size and --images both say"),
+        ("@/m.npz --images @/left.png", "--images"),
+        ("@/m.npz --images @/left.png no.png", "no.png: no such file; give an image"),
+        ("@/m.npz --images @/m.csv @/left.png", "m.csv: cannot be read as an image"),
+        ("@/m.npz --pair desk", "m.npz: has no pair 'desk'; it holds one pair: leave --pair away"),
+        ("@/m.csv --pair desk", "m.csv: --pair desk: holds one pair; leave --pair away"),
+        ("@/several.npz", "several.npz: holds 2 pairs (desk, shelf); say which: --pair desk"),
+        ("@/several.npz --pair chair", "several.npz: has no pair 'chair'; its pairs are desk, shelf"),
+        ("@/several.npz --pair shelf", "several.npz: has no shelf/x2 (its arrays are desk/x1"),
+        ("@/m.npz --out @/m.npz", "is a file; choose another folder"),
+    ],
+)
+def test_bad_input_is_one_line_and_code_2(run, solved, tmp_path, line, says):
+    code, out, err = run(line)
+    assert (code, out) == (2, "") and list(tmp_path.iterdir()) == []
+    assert err.startswith("dyntorch: ") and err.count("\n") == 1 and says in err
+
+
+def test_what_the_library_refuses_names_the_file(run, monkeypatch):
+    def refuse(*x, **options):
+        raise ValueError("bodies=40 need 280 matches; lower bodies=")
+
+    monkeypatch.setattr(dyntorch, "segment", refuse, raising=False)
+    code, _, err = run("@/m.npz --bodies 40")
+    assert code == 2 and re.fullmatch(r"dyntorch: \S+m\.npz: --bodies 40 need 280 matches; lower --bodies\n", err)
+
+
+def test_an_input_is_not_overwritten(run, data, solved):
+    before = (data / "m.csv").read_text()
+    Path("labels.csv").write_text(before)
+    code, _, err = run("labels.csv --out .")
+    assert code == 2 and "labels.csv: is an input" in err and Path("labels.csv").read_text() == before
+
+
+def test_help_loads_nothing_heavy():
+    code = (
+        "import sys; from indexing.cli import main; main(['segment', '--help'])\n"
+        "print('loaded', *{'torch', 'numpy', 'sklearn', 'matplotlib', 'PIL'} & set(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1].strip() == "loaded" and "--no-spatial" in done.stdout
+
+
+def test_every_status_has_a_reason():
+    assert set(REASONS) == {status.name for status in dyntorch.Status} - {"OK"}

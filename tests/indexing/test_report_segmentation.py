@@ -1,0 +1,126 @@
+"""The report on a segmentation: what is written, drawn and said."""
+
+from __future__ import annotations
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+from indexing.readers.images import Photograph
+from indexing.readers.pairs import MatchedPair
+from indexing.report.canvas import DARK, LIGHT
+from indexing.report.segmentation import SegmentationReport, as_json, labels_csv, write_segmentation
+from indexing.report.segmentation_page import describe
+from indexing.report.segmentation_picture import colour_of, picture_of
+
+SCRIPT = "<script>alert(1)</script>"
+
+
+def report(bodies: int = 2, count: int = 8, **changes) -> SegmentationReport:
+    """Matches that belong to the bodies and the outliers in turn, of which the last is missing."""
+    rng = np.random.default_rng(0)
+    x1 = rng.uniform(0, 100, size=(count, 2))
+    x2 = x1 + 5
+    x2[-1] = np.nan
+    ids = (SCRIPT, "=1+1", "-2", *(f"m{i}" for i in range(3, count)))
+    labels = np.arange(count) % (bodies + 1)
+    labels[-1] = 0
+    probabilities = np.eye(bodies + 1)[labels] * 0.95 + 0.05 / (bodies + 1)
+    probabilities[-1] = 0
+    values = {
+        "title": SCRIPT, "pair": MatchedPair("m.csv", SCRIPT, x1, x2, ids), "labels": labels,
+        "fundamentals": np.tile(np.eye(3), (bodies, 1, 1)), "homographies": np.zeros((bodies, 3, 3)),
+        "models": ["fundamental"] * bodies, "probabilities": probabilities, "residuals": np.full(count, 0.5),
+        "coherence": np.ones(count), "threshold": 2.5, "warnings": [("uncertain", 1.0, SCRIPT)], "notes": [SCRIPT],
+    }  # fmt: skip
+    return SegmentationReport(**{**values, **changes})
+
+
+def photograph(wide: int = 100, tall: int = 80) -> Photograph:
+    return Photograph(SCRIPT, np.random.default_rng(1).random((tall, wide), dtype=np.float32), (float(wide), float(tall)))
+
+
+def test_what_comes_from_files_is_escaped(tmp_path):
+    page = write_segmentation(tmp_path, report(photographs=[photograph(), photograph()])).read_text()
+    assert SCRIPT not in page and "&lt;script&gt;" in page
+    rows = list(csv.reader(labels_csv(report()).splitlines()))
+    assert [row[0] for row in rows[1:4]] == [SCRIPT, "'=1+1", "-2"]
+    assert [row[6] for row in rows[1:]] == ["outlier", "body 1", "body 2", "outlier", "body 1", "body 2", "outlier", "missing"]
+    assert rows[2][7:] == ["0.9667", "0.5"] and rows[8][3:6] == ["", "", "0"] and rows[8][7:] == ["", ""]
+
+
+def test_every_kind_of_data_can_be_drawn(tmp_path):
+    for i, made in enumerate((
+        report(1, 12),
+        report(0),
+        report(0, status="NO_CONSENSUS", reason="no"),
+        report(11, 40),  # more bodies than colours
+        report(labels=np.zeros(8, dtype=int)),
+        report(models=["fundamental", "homography"], homographies=np.tile(np.eye(3), (2, 1, 1))),
+        report(size=(640.0, 200.0)),
+        report(photographs=[photograph(), photograph(60, 90)]),
+        report(photographs=[photograph(200, 40), photograph(200, 40)]),
+        report(pair=MatchedPair("m", "m", np.ones((8, 2)), np.ones((8, 2)), tuple("abcdefgh"))),
+    )):  # fmt: skip
+        page = write_segmentation(tmp_path / str(i), made).read_text()
+        assert "<img" in page and "nan" not in page.partition("<main>")[2].replace("data:image", "").split("base64")[0]
+        found = json.loads((tmp_path / str(i) / "segmentation.json").read_text())
+        assert len(found["bodies"]) == made.bodies
+        assert np.load(tmp_path / str(i) / "segmentation.npz")["labels"].tolist() == made.labels.tolist()
+
+
+def test_numbers_of_a_report():
+    made = report(residuals=np.array([9.0, 1.0, 3.0, 9.0, 2.0, 4.0, 9.0, 0.0]))
+    assert made.counts == {"body 1": 2, "body 2": 2, "outlier": 3, "missing": 1}
+    assert made.rms(1) == pytest.approx(np.sqrt(2.5)) and made.rms(2) == pytest.approx(np.sqrt(12.5))
+    assert made.rms() == pytest.approx(np.sqrt(7.5)) and np.isnan(report(0).rms())
+    found = as_json(made)
+    assert [part["share"] for part in found["bodies"]] == [2 / 7, 2 / 7] and found["doubtful"] == 0
+    doubtful = made.probabilities.copy()
+    doubtful[1] = [0.2, 0.5, 0.3]
+    assert report(probabilities=doubtful).doubtful.tolist() == [False, True, *[False] * 6]
+
+
+@pytest.mark.parametrize(
+    ("made", "says"),
+    [
+        (report(), "Of 7 matches of two images, 4 move with one of 2 bodies (2 and 2); 3 fit none. 1 more is missing in an image."),
+        (report(1), "Of 7 matches of two images, 3 move as one body; 4 fit none. 1 more is missing in an image."),
+        (report(status="AMBIGUOUS", reason="it is open"), "do not decide what moves with what. It is open. What follows is"),
+        (report(0, status="NO_CONSENSUS", reason="why"), "The 7 matches do not decide what moves with what. Why."),
+    ],
+)
+def test_the_summary(made, says):
+    assert says in describe(made)
+
+
+def test_what_is_known_is_compared_and_what_is_refused_is_said_once(tmp_path):
+    pair = report().pair
+    known = MatchedPair(pair.path, "m", pair.x1, pair.x2, pair.ids, known=np.array([0, 2, 1, 0, 2, 1, 1, 1]))
+    made = report(
+        pair=known, misclassified=1 / 7, status="AMBIGUOUS", reason="it is open", warnings=[("uncertain", 1.0, "it is open")]
+    )
+    page = write_segmentation(tmp_path, made).read_text()
+    assert "Compared with the labels of the file" in page and "14 %" in page and "<b>Uncertain." not in page
+    assert "Compared" not in write_segmentation(tmp_path, report()).read_text()
+
+
+def test_photographs_are_faded_and_wide_ones_stacked():
+    from io import BytesIO
+
+    from PIL import Image
+
+    def shape(made, theme=LIGHT):
+        image = Image.open(BytesIO(picture_of(made, theme)))
+        return image.size, np.asarray(image.convert("L")).mean()
+
+    (wide, tall), light = shape(report(photographs=[photograph(), photograph()]))
+    assert wide > 2 * tall and light > 190 and shape(report(photographs=[photograph(), photograph()]), DARK)[1] < 80
+    (wide, tall), _ = shape(report(photographs=[photograph(200, 60), photograph(200, 60)]))
+    assert tall > 0.5 * wide
+
+
+def test_neighbouring_bodies_have_different_colours():
+    assert len({colour_of(label) for label in range(1, 9)}) == 8
