@@ -8,7 +8,7 @@ from torch import Tensor
 from dyntorch.invariants.fundamental_matrix import FundamentalMatrix
 from dyntorch.matches import matches
 from dyntorch.tasks.bodies_pool import LEAST
-from dyntorch.tasks.bodies_problem import solve
+from dyntorch.tasks.bodies_problem import Request, solve
 from dyntorch.tasks.notices import check_threshold
 from dyntorch.tasks.segmentation import BodyModel, Segmentation, segmentation_notices
 
@@ -69,7 +69,7 @@ def segment(
     _check_counts(bodies, data.count)
     with torch.no_grad():
         found = [
-            solve(first, second, weight, bodies, threshold, spatial, generator)
+            solve(first, second, weight, Request(bodies, threshold, spatial, generator))
             for first, second, weight in zip(*data.views, data.weights, strict=True)
         ]
     width = max([outcome.count for outcome in found], default=0)
@@ -108,8 +108,8 @@ def _check_counts(bodies: int | None, count: int) -> None:
         raise ValueError(f"segment needs at least {MINIMAL} matches, got {count}: add {MINIMAL - count}")
     if bodies is not None and bodies * LEAST > count:
         raise ValueError(
-            f"bodies={bodies} take at least {LEAST} matches each, {bodies * LEAST} in all, got {count}: add {bodies * LEAST - count}, "
-            f"or ask for at most {count // LEAST}"
+            f"bodies={bodies} take at least {LEAST} matches each, {bodies * LEAST} in all, got {count}: "
+            f"add {bodies * LEAST - count}, or ask for at most {count // LEAST}"
         )
 
 

@@ -1,4 +1,4 @@
-"""What a segmentation of two views costs: distances from the epipolar geometries, links cut, and how smooth each body is in depth."""
+"""What a segmentation of two views costs: distances from the epipolar geometries, links cut, and the relief of each body."""
 
 from __future__ import annotations
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.nn.functional import one_hot
 
 from dyntorch.sampling import uniform
 from dyntorch.tasks.coherence import Links
@@ -84,8 +83,3 @@ def _patches(x: Tensor, motion: Tensor, bodies: Tensor, width: int, generator: t
 def _scaled_distances(x: Tensor) -> Tensor:
     square = torch.cdist(x, x).square()
     return square / square.median().clamp(min=1e-12)
-
-
-def members(labels: Tensor, width: int) -> Tensor:
-    """Labels ``(*batch, n)`` from 0 as ``(*batch, width, n)`` of 0 and 1."""
-    return one_hot(labels, width).to(torch.get_default_dtype()).transpose(-1, -2)

@@ -51,7 +51,8 @@ def label(
 ) -> Labelling:
     r"""Labels and geometries in turns: a mean field of the costs
 
-    .. math:: \min(r_{ik}^2 / T^2, 9) + s\,(1 - c_{ik} / c_0)_+ - b\,[i \text{ found in } k], \qquad \text{outlier: } 1 + \tfrac14 \log \tfrac{1 - \pi}{4 \pi},
+    .. math:: \min(r_{ik}^2 / T^2, 9) + s\,(1 - c_{ik} / c_0)_+ - b\,[i \text{ found in } k],
+        \qquad \text{outlier: } 1 + \tfrac14 \log \tfrac{1 - \pi}{4 \pi},
 
     with the conformity :math:`c_{ik}` of match i to body k and the share :math:`\pi` of outliers
     (at most a fifth), and of labels that differ from those of the neighbours.

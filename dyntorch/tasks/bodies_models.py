@@ -16,7 +16,7 @@ LEAST_NOISE = 0.1
 """Least standard deviation of a coordinate, pixels: no detector is better, and exact data shows none."""
 MEDIAN = 0.455
 """Of the square of a standard normal variable."""
-TRUNCATED, KEPT = 9.0, 0.995
+TRUNCATED, KEPT = 6.25, 0.978
 """Squares of it count up to the first in the mean, which is the second then."""
 ROUNDS = 10
 TINY = 1e-30
@@ -40,12 +40,13 @@ def choose(view: View, fundamentals: Tensor, members: Tensor) -> Models:
 
     .. math:: \sum_i \min\!\Big(\frac{e_i^2}{\sigma^2},\ 2 (4 - d)\Big) + n\,d \log 4 + k \log 4n,
 
-    with dimension d = 3 and k = 7 parameters of a fundamental matrix, d = 2 and k = 8 of a homography.
+    with dimension d = 3 and k = 7 parameters of a fundamental matrix, d = 2 and k = 8 of a homography.  The noise
+    :math:`\sigma` is that of all bodies.
 
     Args:
         view: matches.
         fundamentals: ``(K, 3, 3)``.
-        members: ``(K, n)`` weights.
+        members: ``(K, n)`` weights, of any scale.
 
     Source: Torr, Geometric motion segmentation and model selection, 1998.
     """

@@ -86,6 +86,8 @@ def best_sets(cost: Tensor, count: int, first: int | None = None) -> Tensor:
     size = len(single)
     sets = single.sum(-1).argsort(stable=True)[: size if first is None else first, None]
     for _ in range(1, count):
+        if not len(sets):  # fewer geometries than bodies
+            return sets.new_zeros(0, count)
         least = single[sets].amin(1)
         grown = torch.stack([torch.minimum(row, single).sum(-1) for row in least])
         place = grown.flatten().topk(min(5 * SETS, grown.numel()), largest=False).indices

@@ -13,16 +13,18 @@ from dyntorch.algebra.epipolar_samples import sample_fundamentals
 from dyntorch.fitting import fit
 from dyntorch.invariants.segmentation_matrix import SegmentationMatrix
 from dyntorch.tasks.bodies_descent import Candidate, descended
-from dyntorch.tasks.bodies_energy import View
-from dyntorch.tasks.bodies_pool import TRUNCATED, Starts, best_sets, rough_cost
+from dyntorch.tasks.bodies_energy import CAP, NOISE, View, energy
+from dyntorch.tasks.bodies_pool import LEAST, TRUNCATED, Starts, best_sets, one_hot, rough_cost
 
-SAMPLES = 8000
-"""Per round."""
+SAMPLES, MOST_SAMPLES = 6000, 24000
+"""At a time, and at most from the same matches."""
+PURE = 10.0
+"""Samples wanted all of whose matches are of the largest body."""
 BLOCK = 1024
 """Geometries scored at a time, which stay in the cache."""
 WIDE = 3.0
 """Distance up to which a match speaks for a sample, pixels: seven matches fix a geometry less well than all of a body."""
-BEST = 120
+BEST = 240
 """Samples of a round that descend."""
 SCALES = (3.0, 2.0)
 """Of these descents, pixels."""
@@ -34,7 +36,11 @@ ALIKE = 0.97
 """Overlap (intersection over union) of the matches that agree above which one of two geometries is enough."""
 STARTS = 30
 """Sets that descend, for each number of bodies."""
-MATRIX, REWEIGHTED = 35, 3
+BODY = 1.7
+"""Of a body, in units of the root of the number of matches, besides what it costs where neighbours have their say."""
+WORTH = 5.0
+"""What a body that is worth looking for further ones explains, in the same unit: by chance 2 to 5, small bodies 8."""
+MATRIX, REWEIGHTED = 40, 3
 """Matches that a segmentation matrix takes, and rounds of its weights."""
 
 
@@ -49,13 +55,31 @@ def search_samples(view: View, counts: Sequence[int], generator: torch.Generator
     Returns:
         Candidates for each number.
     """
-    pool = _pool(view, max(counts), generator)
+    pool = _pool(view, min(counts), max(counts), generator)
     cost = rough_cost(view, pool)
     starts = []
     for count in counts:
-        chosen = best_sets(cost, count, FIRST)[:STARTS]
-        starts.append(Starts(cost[chosen].argmin(1), pool[chosen]))
-    return descended(view, starts)
+        if count <= len(pool):
+            chosen = best_sets(cost, count, FIRST)[:STARTS]
+            starts.append(Starts(cost[chosen].argmin(1), pool[chosen]))
+    found = descended(view, starts) if starts else {}
+    return {count: _ranked(view, found.get(count, [])) for count in counts}
+
+
+def _ranked(view: View, candidates: list[Candidate]) -> list[Candidate]:
+    """The candidates with enough inliers in every body, by their cost if what is far from all bodies is in none."""
+    if not candidates:
+        return []
+    fundamentals = torch.stack([candidate.fundamentals for candidate in candidates])
+    square = _distances(view, fundamentals)
+    member = one_hot(square.argmin(1), square.shape[1]) * (square < CAP)
+    inliers = member.sum(-1)
+    total = energy(view, fundamentals, member) + CAP * (len(view.x1) - inliers.sum(-1))
+    # between numbers of bodies only distances count: parallax tells true bodies from spurious ones less well
+    total = total - total.min() + square.amin(1).sum(-1).min() + BODY * square.shape[1] * len(view.x1) ** 0.5
+    order = total.argsort(stable=True)
+    order = order[inliers[order].amin(-1) >= LEAST]
+    return [Candidate(float(total[i]), candidates[i].labels, candidates[i].fundamentals) for i in order.tolist()]
 
 
 def _different(view: View, pool: Tensor) -> Tensor:
@@ -68,51 +92,71 @@ def _different(view: View, pool: Tensor) -> Tensor:
     return pool[order[~alike.triu(1).any(0)]]
 
 
-def _pool(view: View, most: int, generator: torch.Generator | None) -> Tensor:
-    """Geometries ``(P, 3, 3)``: of samples from all matches, then from those that sets of one, two, ... leave unexplained."""
-    pool = matrix_pair(view) if most > 1 else view.x1.new_zeros(0, 3, 3)
-    weights = torch.ones_like(view.x1[None, :, 0])
+def _pool(view: View, least: int, most: int, generator: torch.Generator | None) -> Tensor:
+    """Geometries ``(P, 3, 3)``: of samples from all matches, then from those that sets of one, two, ... leave unexplained.
+
+    Beyond the least number of bodies there are no further samples once another body explains little.
+    """
+    left = torch.ones_like(view.x1[None, :, 0])
+    pool = matrix_pairs(view, left[: most - 1], REWEIGHTED)
+    last = CAP * len(view.x1)
     for count in range(1, most + 1):
-        pool = _different(view, torch.cat([pool, _sampled(view, weights, generator)]))
-        if count < most:
-            cost = rough_cost(view, pool)
-            sets = best_sets(cost, count, FIRST)[:PARTIAL]
-            left = (cost[sets].amin(1) >= cost.max()).double()
-            weights = left[left.sum(-1) >= 8]
-            if not len(weights):
-                break
+        pool = _different(view, torch.cat([pool, *(_sampled(view, open_, len(left), generator) for open_ in left)]))
+        if count == most or len(pool) < count:
+            break
+        cost = rough_cost(view, pool)
+        sets = best_sets(cost, count, FIRST)[:PARTIAL]
+        total = float(_distances(view, pool[sets]).amin(1).sum(-1).min())
+        if count > least and last - total < WORTH * len(view.x1) ** 0.5:
+            break
+        last = total
+        left = (cost[sets].amin(1) >= TRUNCATED).double()
+        left = left[left.sum(-1) > LEAST]
     return pool
 
 
-def _sampled(view: View, weights: Tensor, generator: torch.Generator | None) -> Tensor:
-    """Geometries of the best samples from each pool of matches ``(B, n)``, descended."""
-    count = len(weights)
-    found, valid = sample_fundamentals(view.x1, view.x2, weights, SAMPLES // count, generator)
-    x1, x2, single = view.x1.float(), view.x2.float(), weights.float()
-    starts, members = [], []
-    for F, exists, weight in zip(found, valid, single, strict=True):
-        F = F[exists]
-        total = torch.cat([_votes(part, x1, x2, weight, WIDE * view.pixel) for part in F.float().split(BLOCK)])
-        best = total.topk(min(BEST // count, len(total)), largest=False).indices
-        starts.append(F[best])
-        members.append(weight.double().expand(len(best), -1))
-    result, member = torch.cat(starts), torch.cat(members)
+def _distances(view: View, fundamentals: Tensor) -> Tensor:
+    """Truncated squared distances ``(*batch, n)`` as the energy counts them."""
+    return (sampson_squared(fundamentals, view.x1, view.x2) / (NOISE * view.pixel) ** 2).clamp(max=CAP)
+
+
+def _sampled(view: View, weight: Tensor, parts: int, generator: torch.Generator | None) -> Tensor:
+    """Geometries of the best samples of the matches with weights ``(n,)``, descended; this is one of several parts of the work."""
+    x1, x2, single = view.x1.float(), view.x2.float(), weight.float()
+    best, votes = view.x1.new_zeros(0, 3, 3), single.new_zeros(0)
+    drawn, needed = 0, 1.0
+    while drawn < min(needed, MOST_SAMPLES / parts):
+        found, valid = sample_fundamentals(view.x1, view.x2, weight[None], SAMPLES // parts, generator)
+        drawn += SAMPLES // parts
+        found = found[valid]
+        totals = [_votes(part, x1, x2, single, WIDE * view.pixel) for part in found.float().split(BLOCK)]
+        best, votes = torch.cat([best, found]), torch.cat([votes, *totals])
+        votes, place = votes.topk(min(BEST // parts, len(votes)))
+        best = best[place]
+        share = float(votes[0] / single.sum()) if len(votes) else 0.0
+        needed = PURE / max(share, 0.1) ** 7
     for scale in SCALES:
-        result = descend(result, view.x1, view.x2, member, scale * view.pixel)
-    return result
+        best = descend(best, view.x1, view.x2, weight.expand(len(best), -1), scale * view.pixel)
+    return best
 
 
 def _votes(F: Tensor, x1: Tensor, x2: Tensor, weight: Tensor, scale: float) -> Tensor:
-    """Truncated cost ``(p,)`` of geometries."""
-    return (sampson_squared(F, x1, x2) / scale**2).clamp_(max=1) @ weight
+    """What the matches ``(n,)`` near each geometry ``(p,)`` count together."""
+    return (1 - sampson_squared(F, x1, x2) / scale**2).clamp_(min=0) @ weight
 
 
-def matrix_pair(view: View) -> Tensor:
-    """Both geometries ``(2, 3, 3)`` of the segmentation matrix of all matches; none where there are too few."""
-    if len(view.x1) < MATRIX:
+def matrix_pairs(view: View, groups: Tensor, rounds: int) -> Tensor:
+    """Geometries ``(2 g, 3, 3)`` of the segmentation matrices of groups ``(b, n)``, 0 and 1; those too small are left out.
+
+    The linear fits are weighed again by their gradients so many times.
+    """
+    groups = groups[groups.sum(-1) >= MATRIX]
+    x1, x2 = (x.expand(len(groups), -1, -1) for x in (view.x1, view.x2))
+    weights = groups
+    for _ in range(rounds if len(groups) else 0):
+        tensor = fit(SegmentationMatrix, x1, x2, weights=weights).tensor
+        weights = groups * SegmentationMatrix.reweighted(tensor, x1, x2)
+    if not len(groups):
         return view.x1.new_zeros(0, 3, 3)
-    tensor = fit(SegmentationMatrix, view.x1, view.x2).tensor
-    for _ in range(REWEIGHTED):
-        weights = SegmentationMatrix.reweighted(tensor, view.x1, view.x2)
-        tensor = fit(SegmentationMatrix, view.x1, view.x2, weights=weights).tensor
-    return torch.stack(SegmentationMatrix.fundamentals(tensor))
+    found = torch.cat(SegmentationMatrix.fundamentals(fit(SegmentationMatrix, x1, x2, weights=weights).tensor))
+    return found[found.isfinite().all((-2, -1)) & (found != 0).any((-2, -1))]

@@ -167,8 +167,12 @@ def _links(row: Tensor, column: Tensor, weight: Tensor, count: int) -> Links:
 
 
 def _apart(x1: Tensor, x2: Tensor, least: float) -> Tensor:
-    """``(n, n)`` bool: whether two matches differ; a repeated match confirms nothing."""
-    return torch.cdist(torch.cat([x1, x2], -1), torch.cat([x1, x2], -1)) >= least
+    """``(n, n)`` bool: whether the second of two matches differs from the first, and from all before it.
+
+    A repeated match confirms nothing, neither itself nor, as several neighbours that agree, others.
+    """
+    apart = torch.cdist(torch.cat([x1, x2], -1), torch.cat([x1, x2], -1)) >= least
+    return apart & ~(~apart).tril(-1).any(-1)
 
 
 def _nearest(a: Tensor, apart: Tensor, count: int) -> tuple[Tensor, Tensor]:

@@ -70,6 +70,8 @@ class NoticeCode(StrEnum):
     """Another solution fits as well."""
     FEWER_BODIES = "fewer_bodies"
     """The matches carry fewer bodies than were asked for."""
+    SPARE_BODY = "spare_body"
+    """Fewer bodies than were asked for explain the matches as well."""
     REPEATED = "repeated"
     """Many matches are the same."""
     INCOHERENT = "incoherent"

@@ -13,7 +13,7 @@ from dyntorch.solution import REMEDY, Status
 from dyntorch.tasks.notices import Notice, NoticeCode, notices
 
 if TYPE_CHECKING:
-    from dyntorch.tasks.bodies_problem import Outcome
+    from dyntorch.tasks.bodies_outcome import Outcome
 
 OUTLIER = 0
 REPEATED = 0.1
@@ -107,6 +107,9 @@ def segmentation_notices(found: list[Outcome], bodies: int | None, batch: tuple[
     if bodies is not None:
         message = f"{bodies} bodies were asked for, the matches carry {{value:g}}; ask for fewer, or add matches of the others"
         said += notices(NoticeCode.FEWER_BODIES, message, count, tried & (count < bodies), batch)
+        spare = torch.tensor([outcome.spare for outcome in found])
+        message = f"{{value:g}} bodies explain the matches no worse than {bodies}: one may be a part of another; ask for fewer"
+        said += notices(NoticeCode.SPARE_BODY, message, count - 1, spare, batch)
     message = "a share of {value:.2g} of the matches repeats others and says nothing new; remove repeated matches"
     said += notices(NoticeCode.REPEATED, message, repeated, repeated > REPEATED, batch)
     message = "only a share of {value:.2g} of the matches moves like its neighbours; try spatial=False if bodies interleave"

@@ -62,11 +62,15 @@ def brute_force(x1, x2):
     n = len(x1)
     joint = torch.cat([x1, x2], dim=-1)
     values = [1.0] * n
+
+    def apart(i: int, j: int) -> bool:
+        return bool((joint[i] - joint[j]).norm() >= SCALE / 6)
+
     for _ in range(module.PASSES):
         trusted, values, links = values, [0.0] * n, torch.zeros(n, n, dtype=F64)
         for a, b in ((x1, x2), (x2, x1)):
             for i in range(n):
-                others = [j for j in range(n) if (joint[i] - joint[j]).norm() >= SCALE / 6 and trusted[j] > module.TRUSTED]
+                others = [j for j in range(n) if apart(i, j) and trusted[j] > module.TRUSTED and all(apart(j, k) for k in range(j))]
                 others = sorted(others, key=lambda j: float((a[i] - a[j]).norm()))[: module.NEIGHBOURS]
                 deviation = deviations(a, b, i, others)
                 values[i] += sum(math.exp(-((d / module.TOLERANCE) ** 2)) for d in deviation) / len(others) / 2
@@ -82,7 +86,7 @@ def dense(links: Links) -> torch.Tensor:
 
 
 def test_formula_one_match_at_a_time():
-    x1, x2 = mixed()
+    x1, x2 = mixed(26)
     found = coherence(x1, x2, SCALE)
     values, links = brute_force(x1, x2)
     torch.testing.assert_close(found.values, values)
@@ -96,7 +100,8 @@ def test_links_are_symmetric_and_gathered_alike(monkeypatch):
     for i in range(40):
         for j, weight in zip(links.index[i].tolist(), links.weight[i].tolist(), strict=True):
             full[i, j] += weight
-    assert torch.equal(full, full.mT) and bool((full.diagonal() == 0).all())
+    torch.testing.assert_close(full, full.mT)
+    assert bool((full.diagonal() == 0).all())
     values = torch.randn(2, 3, 40, generator=draw(1), dtype=F64)
     torch.testing.assert_close(links.pull(values), values @ full)
     monkeypatch.setattr(module, "DENSE", 10)
@@ -173,7 +178,8 @@ def test_affine_fields_are_coherent_and_random_matches_are_not():
     x1 = points(150)
     assert float(coherence(x1, affine(x1, 0.002), SCALE).values.min()) > 0.7
     found = coherence(x1, points(150, 1), SCALE)
-    assert float(found.values.mean()) < 0.1 and float(found.links.weight.max()) < 0.9
+    assert float(found.values.mean()) < 0.1
+    assert int(found.links.components(0.3, found.values > 0.2).unique(return_counts=True)[1].max()) < 7
     # wrong matches among right ones
     x2 = affine(x1, 0.002)
     x2[:75] = points(75, 2)
@@ -182,9 +188,11 @@ def test_affine_fields_are_coherent_and_random_matches_are_not():
 
 
 def test_repeated_matches_confirm_nothing():
-    x1, x2 = points(60), points(60, 1)
-    found = coherence(x1.repeat(6, 1), x2.repeat(6, 1), SCALE)
-    assert float(found.values.mean()) < 0.2
+    # not the copies of random matches each other, nor those of a neighbour the local motion towards it
+    for x1, x2 in ((points(60), points(60, 1)), mixed(60)):
+        alone = coherence(x1, x2, SCALE)
+        found = coherence(x1.repeat(6, 1), x2.repeat(6, 1), SCALE)
+        torch.testing.assert_close(found.values, alone.values.repeat(6), rtol=0, atol=1e-9)
     same = coherence(x1[:1].expand(30, 2), x2[:1].expand(30, 2), SCALE)
     assert bool((same.values == 0).all()) and bool((same.links.weight == 0).all())
 

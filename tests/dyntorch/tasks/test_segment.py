@@ -1,0 +1,218 @@
+"""segment: synthetic scenes of one to three bodies with outliers, and what the result must and must not depend on."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+import dyntorch as dyn
+from dyntorch import scenes
+from dyntorch.algebra.homogeneous import apply, homogeneous
+from dyntorch.metrics import misclassification, relative_error
+from dyntorch.solution import Status
+from dyntorch.tasks.notices import NoticeCode
+
+F64 = torch.float64
+NAMES = ("labels", "bodies", "fundamentals", "homographies", "probabilities", "residuals", "coherence", "status", "threshold")
+
+
+def draw(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def two_bodies(seed: int = 0, **options):
+    return scenes.bodies(120, 2, **{"sigma": 0.5, "outliers": 0.2, **options}, generator=draw(seed))
+
+
+def segmented(scene, seed: int = 9, **options):
+    return dyn.segment(*scene.views, generator=draw(seed), **options)
+
+
+def error(found, scene) -> float:
+    return float(misclassification(found.labels, scene.labels).max())
+
+
+@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize(
+    ("bodies", "outliers", "worst"), [(1, 0.5, 0.03), (2, 0.0, 0.0), (2, 0.3, 0.03), (2, 0.5, 0.04), (3, 0.2, 0.05)]
+)
+def test_bodies_and_outliers(bodies, outliers, worst, known):
+    for seed in range(2):
+        scene = scenes.bodies(80 * bodies, bodies, sigma=0.5, outliers=outliers, generator=draw(seed))
+        found = segmented(scene, bodies=bodies if known else None).check()
+        assert int(found.bodies) == bodies and int(found.status) == Status.OK
+        assert error(found, scene) <= worst
+        wrong = scene.labels == 0
+        if bool(wrong.any()):
+            assert float(found.coherence[~wrong].median()) > 0.35 > 0.2 > float(found.coherence[wrong].median())
+
+
+def test_interleaved_bodies_by_geometry_alone():
+    scene = two_bodies(1, interleaved=True, outliers=0.1)
+    found = segmented(scene, bodies=2, spatial=False).check()
+    assert error(found, scene) < 0.15  # matches near both epipolar lines are anyone's
+    assert bool((found.coherence == 0).all())
+
+
+def test_planes_and_rotations_have_homographies():
+    scene = scenes.bodies(240, 3, sigma=0.3, planar=(2,), rotating=(3,), generator=draw(2))
+    found = segmented(scene, bodies=3).check()
+    assert error(found, scene) < 0.02
+    assert sorted(found.models) == ["fundamental", "homography", "homography"]
+    for k, model in enumerate(found.models):
+        members = found.labels == k + 1
+        x1, x2 = (x[members] for x in scene.views)
+        flat = model == dyn.BodyModel.HOMOGRAPHY
+        assert flat == (int(scene.labels[members].mode().values) > 1)
+        if flat:
+            assert float((apply(found.homographies[k], x1) - x2).norm(dim=-1).median()) < 0.6
+            assert float(found.homographies[k].norm()) == pytest.approx(1.0)
+        else:
+            assert bool((found.homographies[k] == 0).all())
+
+
+def test_parts_of_the_result_fit_together():
+    scene = two_bodies(3, planar=(2,))
+    x1, x2 = scene.views
+    found = segmented(scene)
+    sizes = torch.bincount(found.labels)[1:].tolist()
+    assert sizes == sorted(sizes, reverse=True) and len(sizes) == int(found.bodies) == len(found.models) == 2
+    torch.testing.assert_close(found.fundamentals.flatten(1).norm(dim=-1), torch.ones(2, dtype=F64))
+    assert float(torch.linalg.det(found.fundamentals).abs().max()) < 1e-12
+    torch.testing.assert_close(found.probabilities.sum(-1), torch.ones(120, dtype=F64))
+    assert torch.equal(found.probabilities.argmax(-1), found.labels)
+    assert float(found.threshold) == 2.5
+    squares = []
+    for F, H, model in zip(found.fundamentals, found.homographies, found.models, strict=True):
+        one, two = homogeneous(x1), homogeneous(x2)
+        if model == dyn.BodyModel.FUNDAMENTAL:
+            line, other = one @ F.mT, two @ F
+            squares.append((two * line).sum(-1) ** 2 / (line[:, :2].square().sum(-1) + other[:, :2].square().sum(-1)))
+        else:
+            mapped = one @ H.mT
+            c = mapped[:, :2] - x2 * mapped[:, 2:]
+            third = -mapped[:, 2, None, None] * torch.eye(2, dtype=F64)
+            J = torch.cat([H[:2, :2] - x2[:, :, None] * H[2, :2], third], dim=-1)
+            squares.append((c * torch.linalg.solve(J @ J.mT, c)).sum(-1))
+    distance = torch.stack(squares).sqrt()
+    own = distance.gather(0, (found.labels - 1).clamp(min=0)[None])[0]
+    torch.testing.assert_close(found.residuals, torch.where(found.labels > 0, own, distance.amin(0)), rtol=1e-5, atol=1e-6)
+    assert float(found.residuals[found.labels > 0].max()) < 3 * 2.5
+
+
+def test_batches_are_loops():
+    scene = scenes.bodies(60, 2, batch=(2, 2), sigma=0.5, outliers=0.1, generator=draw(4))
+    x1, x2 = scene.views
+    found = dyn.segment(x1, x2, generator=draw(5))
+    assert found.labels.shape == (2, 2, 60) and found.status.shape == (2, 2) and found.fundamentals.shape[:2] == (2, 2)
+    generator = draw(5)
+    for i in range(2):
+        for j in range(2):
+            one = dyn.segment(x1[i, j], x2[i, j], generator=generator)
+            count = int(one.bodies)
+            assert torch.equal(found.labels[i, j], one.labels) and int(found.bodies[i, j]) == count
+            assert found.models[i][j] == one.models
+            torch.testing.assert_close(found.fundamentals[i, j, :count], one.fundamentals)
+            assert bool((found.fundamentals[i, j, count:] == 0).all())
+            torch.testing.assert_close(found.probabilities[i, j, :, : count + 1], one.probabilities)
+            torch.testing.assert_close(found.residuals[i, j], one.residuals)
+    assert "batch=(2, 2): 4 OK" in repr(found) and "bodies: 2 to 2" in repr(found)
+
+
+def test_generator_is_the_only_randomness():
+    scene = two_bodies(5)
+    first, second = segmented(scene, 1), segmented(scene, 1)
+    assert all(torch.equal(getattr(first, name), getattr(second, name)) for name in NAMES)
+
+
+def test_order_of_matches_and_of_views_do_not_matter():
+    scene = two_bodies(6)
+    x1, x2 = scene.views
+    found = segmented(scene)
+    order = torch.randperm(120, generator=draw(7))
+    mixed = dyn.segment(x1[order], x2[order], generator=draw(8))
+    assert float(misclassification(mixed.labels, found.labels[order])) <= 0.02
+    swapped = dyn.segment(x2, x1, generator=draw(8))
+    assert float(misclassification(swapped.labels, found.labels)) <= 0.02
+    # bodies of nearly the same size may change places
+    turned = swapped.fundamentals.mT
+    cross = relative_error(turned[:, None].expand(2, 2, 3, 3), found.fundamentals.expand(2, 2, 3, 3))
+    assert float(cross.amin(1).max()) < 0.02
+
+
+def test_unit_and_origin_of_the_coordinates_do_not_matter():
+    scene = two_bodies(7)
+    x1, x2 = scene.views
+    found = segmented(scene)
+    shift = torch.tensor([300.0, -200.0], dtype=F64)
+    for scale in (3.0, 1e-4, 1e5):
+        moved = dyn.segment(scale * (x1 + shift), scale * (x2 - shift), threshold=2.5 * scale, generator=draw(9))
+        assert torch.equal(moved.labels, found.labels) and moved.models == found.models
+        torch.testing.assert_close(moved.residuals / scale, found.residuals, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_dtype_of_the_input_is_that_of_the_result(dtype):
+    scene = two_bodies(8)
+    found = dyn.segment(*(x.to(dtype) for x in scene.views), generator=draw(9))
+    for name in ("fundamentals", "homographies", "probabilities", "residuals", "coherence", "threshold"):
+        assert getattr(found, name).dtype == dtype
+    assert found.labels.dtype == found.bodies.dtype == found.status.dtype == torch.int64
+    assert error(found, scene) <= 0.03
+    assert not any(getattr(found, name).requires_grad for name in NAMES)
+
+
+def test_missing_matches_and_those_without_weight_are_absent():
+    scene = two_bodies(9)
+    x1, x2 = scene.views
+    found = segmented(scene)
+    stray = torch.rand(20, 2, generator=draw(1), dtype=F64) * 300
+    wide1, wide2 = torch.cat([stray, x1]), torch.cat([stray.flip(0), x2])
+    weights = torch.ones(140, dtype=F64)
+    weights[:20] = 0.0
+    without = dyn.segment(wide1, wide2, weights=weights, generator=draw(9))
+    missing1, missing2 = wide1.clone(), wide2.clone()
+    missing1[:10], missing2[10:20] = torch.nan, torch.inf
+    missing = dyn.segment(missing1, missing2, generator=draw(9))
+    for result in (without, missing):
+        assert torch.equal(result.labels[20:], found.labels) and bool((result.labels[:20] == 0).all())
+        torch.testing.assert_close(result.fundamentals, found.fundamentals)
+        assert bool((result.probabilities[:20] == 0).all()) and bool((result.residuals[:20] == 0).all())
+        assert bool((result.coherence[:20] == 0).all())
+
+
+def test_weights_are_relative():
+    scene = two_bodies(10, planar=(1,))
+    found = segmented(scene)
+    for weight in (1e-6, 1e6):
+        scaled = segmented(scene, weights=torch.full((120,), weight, dtype=F64))
+        assert torch.equal(scaled.labels, found.labels) and scaled.models == found.models
+        torch.testing.assert_close(scaled.fundamentals, found.fundamentals, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("sigma", [0.2, 1.0])
+def test_threshold_is_estimated(sigma):
+    scene = two_bodies(11, sigma=sigma)
+    found = segmented(scene, threshold=None)
+    assert 3 * sigma < float(found.threshold) < 7.5 * sigma
+    assert error(found, scene) <= 0.05
+
+
+def test_check_repr_and_notices():
+    scene = two_bodies(12)
+    found = segmented(scene)
+    assert found.check() is found and found.warnings == ()
+    text = repr(found)
+    assert "matches=120" in text and "1 OK" in text and "body 2:" in text and "outliers:" in text
+    x1, x2 = scene.views
+    apart = torch.rand(120, 2, generator=draw(2), dtype=F64) * 400
+    failed = dyn.segment(torch.stack([x1, x1]), torch.stack([x2, apart]), bodies=2, generator=draw(9))
+    assert failed.status.tolist() == [Status.OK, Status.NO_CONSENSUS]
+    with pytest.raises(ValueError, match="problem 1: NO_CONSENSUS"):
+        failed.check()
+    assert {(notice.code, notice.problem) for notice in failed.warnings} == {
+        (NoticeCode.FEWER_BODIES, (1,)),
+        (NoticeCode.INCOHERENT, (1,)),
+    }
+    # the other problem is not touched
+    assert torch.equal(failed.labels[0], segmented(scene, bodies=2).labels)
