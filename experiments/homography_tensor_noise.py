@@ -22,8 +22,8 @@ from dyntorch.metrics import grid_transfer_error, label_scores, relative_error
 from dyntorch.normalize import normalize_motion
 from dyntorch.scenes import Scene, planar
 from dyntorch.tasks.align_planar import align_planar
-from experiments.tables import command, note
-from indexing.files import manifest, prepare, write_json
+from experiments.tables import NoiseConfig, aligned, command, note
+from indexing.files import manifest, write_json
 
 COLUMNS = ("linear", "refined", "static: linear", "static: refined", "static: segmented")
 STATIC = 0.4
@@ -47,15 +47,11 @@ GOALS: dict[tuple[int, float], tuple[Cell, ...]] = {
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(NoiseConfig):
     """Errors of the homography tensor over the number of matches and the noise."""
 
-    scenes: int = 100
-    """Scenes per cell."""
     quick: bool = False
     """Only the rows with up to 100 matches and 0.5 pixels, 60 scenes."""
-    seed: int = 0
-    """Of the scenes."""
     out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/homography_tensor_noise.json")
     """Where the results and this configuration are written as JSON."""
 
@@ -90,16 +86,13 @@ def row(n: int, sigma: float, scenes: int, seed: int) -> tuple[list[Cell], float
 def table(measured: dict[tuple[int, float], tuple[list[Cell], float]]) -> str:
     """Measured, in brackets the goal, and the ratio of the two, per cell."""
     head: tuple[str, ...] = ("N", "noise px", *COLUMNS, "recall of labels")
-    lines = [head]
+    lines = []
     for (n, sigma), (cells, recall) in measured.items():
         texts = []
         for (relative, grid), (goal, pixels) in zip(cells, GOALS[n, sigma], strict=True):
             texts.append(f"{relative:.2g}/{grid:.2g} ({goal:.2g}/{pixels:.2g}) x{relative / goal:.2f}/{grid / pixels:.2f}")
         lines.append((str(n), f"{sigma:g}", *texts, f"{recall:.3f}"))
-    widths = [max(len(line[k]) for line in lines) for k in range(len(head))]
-    out = ["| " + " | ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)) + " |" for line in lines]
-    out.insert(1, "|" + "|".join("-" * (width + 2) for width in widths) + "|")
-    return "\n".join(out)
+    return aligned(head, lines)
 
 
 def run(config: Config) -> None:
@@ -108,10 +101,7 @@ def run(config: Config) -> None:
     Raises:
         ValueError: no scenes, or a file that cannot be written.
     """
-    if config.scenes < 1:
-        raise ValueError(f"scenes must be at least 1, got {config.scenes}")
-    target = config.out.expanduser()
-    prepare(target.parent)
+    target = config.target()
     chosen = [key for key in GOALS if not config.quick or (key[0] <= 100 and key[1] == 0.5)]
     scenes = min(config.scenes, 60) if config.quick else config.scenes
     measured = {}

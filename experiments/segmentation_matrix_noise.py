@@ -34,8 +34,7 @@ from dyntorch import scenes
 from dyntorch.metrics import misclassification
 from dyntorch.normalize import normalize_motion
 from dyntorch.scenes import Scene
-from experiments.tables import Row, command, measured
-from indexing.files import prepare
+from experiments.tables import NoiseConfig, Row, command, measured
 
 NOISE = (0.1, 0.5, 1.0)
 """px."""
@@ -72,15 +71,11 @@ Pair = tuple[Tensor, Tensor]
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(NoiseConfig):
     """Two bodies under noise: ways to estimate and to split the segmentation matrix, and to do without it."""
 
-    scenes: int = 100
-    """Scenes per cell."""
     quick: bool = False
     """20 scenes, 50 matches per body."""
-    seed: int = 0
-    """Of the scenes."""
     out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/segmentation_matrix_noise.json")
     """Where the results and this configuration are written as JSON."""
 
@@ -177,10 +172,7 @@ def run(config: Config) -> None:
     Raises:
         ValueError: no scenes, or a file that cannot be written.
     """
-    if config.scenes < 1:
-        raise ValueError(f"scenes must be at least 1, got {config.scenes}")
-    target = config.out.expanduser()
-    prepare(target.parent)
+    target = config.target()
     titles = {f"{count} matches per body": count for count in ((50,) if config.quick else PROTOTYPE)}
     measured(list(titles), lambda name: table(titles[name], config), target, vars(config))
 

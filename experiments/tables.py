@@ -7,8 +7,11 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
-from indexing.files import manifest, write_json
+import tyro
+
+from indexing.files import manifest, prepare, write_json
 
 
 @dataclass(frozen=True)
@@ -31,14 +34,45 @@ class Row:
         return self.measured <= self.goal if self.at_most else self.measured >= self.goal
 
 
+@dataclass(frozen=True)
+class NoiseConfig:
+    """What the tables over scenes with noise have in common; each says what is ``quick``, and its file."""
+
+    scenes: int = 100
+    """Scenes per cell."""
+    quick: bool = False
+    """Fewer cells."""
+    seed: int = 0
+    """Of the scenes."""
+    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/noise.json")
+    """Where the results and this configuration are written as JSON."""
+
+    def target(self) -> Path:
+        """The file, after its folder was made.
+
+        Raises:
+            ValueError: no scenes, or a folder that cannot be written.
+        """
+        if self.scenes < 1:
+            raise ValueError(f"scenes must be at least 1, got {self.scenes}")
+        target = self.out.expanduser()
+        prepare(target.parent)
+        return target
+
+
 def markdown(rows: Sequence[Row], title: str = "") -> str:
     """The rows as a Markdown table, ready for the README."""
-    head = ("task", "setting", "measured", "goal", "reached")
-    lines = [head, *(_cells(row) for row in rows)]
-    widths = [max(len(line[k]) for line in lines) for k in range(len(head))]
-    text = ["| " + " | ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)) + " |" for line in lines]
+    text = aligned(("task", "setting", "measured", "goal", "reached"), [_cells(row) for row in rows])
+    return f"\n### {title}\n\n{text}" if title else text
+
+
+def aligned(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
+    """A Markdown table of any cells, columns aligned."""
+    every = [head, *lines]
+    widths = [max(len(line[k]) for line in every) for k in range(len(head))]
+    text = ["| " + " | ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)) + " |" for line in every]
     text.insert(1, "|" + "|".join("-" * (width + 2) for width in widths) + "|")
-    return "\n".join([f"\n### {title}\n", *text] if title else text)
+    return "\n".join(text)
 
 
 def _cells(row: Row) -> tuple[str, ...]:

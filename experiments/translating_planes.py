@@ -11,7 +11,6 @@ the latter at the true parameters.  The second table has bodies with depth, whos
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -29,8 +28,8 @@ from dyntorch.tasks.planes import translating_planes as solve
 from dyntorch.tasks.planes_input import Given
 from dyntorch.tasks.planes_problem import Layout, Matches, PlanesProblem
 from dyntorch.tasks.planes_starts import parameters
-from experiments.tables import command, note
-from indexing.files import manifest, prepare, write_json
+from experiments.tables import NoiseConfig, aligned, command, note
+from indexing.files import manifest, write_json
 
 COLUMNS = ("thesis", "linear", "closed form", "matrices", "matches", "from truth")
 NONE = float("nan")
@@ -71,15 +70,13 @@ KINDS: dict[str, dict[str, Any]] = {
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(NoiseConfig):
     """Error of the homography at infinity over the number of planes and the noise."""
 
     scenes: int = 60
     """Scenes per cell."""
     quick: bool = False
     """Only noise of 0.5 pixels, 30 scenes."""
-    seed: int = 0
-    """Of the scenes."""
     out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/translating_planes.json")
     """Where the results and this configuration are written as JSON."""
 
@@ -155,16 +152,6 @@ def degenerate(kind: str, planes: int, scenes: int, draw: torch.Generator) -> tu
     return f"{int(good.sum())} of {scenes}" + (f", error at most {worst:.0e}" if bool(good.any()) else ""), named
 
 
-def table(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
-    """Markdown."""
-    widths = [max(len(line[k]) for line in (head, *lines)) for k in range(len(head))]
-    text = [
-        "| " + " | ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)) + " |" for line in (head, *lines)
-    ]
-    text.insert(1, "|" + "|".join("-" * (width + 2) for width in widths) + "|")
-    return "\n".join(text)
-
-
 def cell(value: float | None, reference: float) -> str:
     """A figure and its reference."""
     shown = "" if value is None else f"{value:.2g}"
@@ -177,10 +164,7 @@ def run(config: Config) -> None:
     Raises:
         ValueError: no scenes, or a file that cannot be written.
     """
-    if config.scenes < 1:
-        raise ValueError(f"scenes must be at least 1, got {config.scenes}")
-    target = config.out.expanduser()
-    prepare(target.parent)
+    target = config.target()
     scenes = min(config.scenes, 30) if config.quick else config.scenes
     rows, lines = [], []
     for (n, sigma), reference in REFERENCE.items():
@@ -193,7 +177,7 @@ def run(config: Config) -> None:
         cells = [cell(measured.get(name), known) for name, known in zip(COLUMNS, reference, strict=True)]
         lines.append([str(n), f"{sigma:g}", *cells])
     print(f"\nrelative error of the homography at infinity (reference), medians of {scenes} scenes\n")
-    print(table(("planes", "noise px", *COLUMNS), lines), flush=True)
+    print(aligned(("planes", "noise px", *COLUMNS), lines), flush=True)
     lines = []
     for (n, m, sigma), linear in BODIES.items():
         if config.quick and sigma != 0.5:
@@ -202,14 +186,14 @@ def run(config: Config) -> None:
         rows.append({"planes": n, "bodies": m, "sigma": sigma, **measured})
         lines.append([str(n), str(m), f"{sigma:g}", cell(measured["matrices"], linear), cell(measured["matches"], NONE)])
     print("\nwith bodies of known fundamental matrix\n")
-    print(table(("planes", "bodies", "noise px", "matrices", "matches"), lines), flush=True)
+    print(aligned(("planes", "bodies", "noise px", "matrices", "matches"), lines), flush=True)
     lines = []
     for kind in KINDS:
         for n in (3, 4, 5):
             status, named = degenerate(kind, n, min(scenes, 20), torch.Generator().manual_seed(config.seed))
             lines.append([kind, str(n), status, named])
     print("\nexact homographies in special position\n")
-    print(table(("position", "planes", "status OK", "said"), lines), flush=True)
+    print(aligned(("position", "planes", "status OK", "said"), lines), flush=True)
     write_json(target, {"manifest": manifest(vars(config), seed=config.seed), "rows": rows})
     note(f"written: {target}")
 

@@ -15,10 +15,23 @@ from dyntorch import metrics, scenes
 from dyntorch.invariant import Invariant
 from dyntorch.primitives import Hyperplane, Line
 from dyntorch.scenes import Scene
+from tests.epipolar import (
+    Motion,
+    epipolar_error,
+    epipolar_truth,
+    lift,
+    on_either_epipolar_line,
+    on_either_line_in_plane,
+    on_epipolar_line,
+    parts_error,
+    traffic,
+    two_bodies,
+    two_centres_errors,
+    two_epipolar_errors,
+    two_epipolar_truths,
+)
 from tests.projections import collinear_images, lifted, on_image_lines, seen, tensor_error
-from tests.two_bodies import two_bodies
 
-Motion = tuple[Tensor, ...]
 PIXELS = (1 / 250.0, (320.0, 240.0))
 """Scale and centre that bring the pictures of the planar scenes to order 1."""
 
@@ -87,11 +100,6 @@ class Case:
         )
 
 
-def lift(x: Tensor) -> Tensor:
-    """Append the coordinate 1."""
-    return torch.cat([x, torch.ones_like(x[..., :1])], dim=-1)
-
-
 def project(p: Tensor) -> Tensor:
     """Divide by the last coordinate."""
     return p[..., :-1] / p[..., -1:]
@@ -131,22 +139,6 @@ def carried(invariant: Invariant, motion: Motion, frames: tuple[Tensor, ...]) ->
     return tuple(parts)
 
 
-def cross(v: Tensor) -> Tensor:
-    """The matrix of the cross product with a vector of space."""
-    eye = torch.eye(3, dtype=v.dtype, device=v.device)
-    return torch.linalg.cross(*torch.broadcast_tensors(v[..., None, :], eye)).mT
-
-
-def parts_error(estimated: Motion, true: Motion) -> Tensor:
-    """The worst relative error of the collineations, each up to scale and sign."""
-    return torch.stack([metrics.relative_error(e, t) for e, t in zip(estimated, true, strict=True)]).amax(0)
-
-
-def epipolar_error(estimated: Motion, true: Motion) -> Tensor:
-    """Any homography of a plane serves: only the product with the epipole counts."""
-    return metrics.relative_error(cross(estimated[1]) @ estimated[0], cross(true[1]) @ true[0])
-
-
 def affine_error(estimated: Motion, true: Motion) -> Tensor:
     """Up to an affinity of the world and a common velocity."""
     return metrics.affine_gauge(torch.stack(estimated, dim=-3), torch.stack(true, dim=-3))[1]
@@ -164,35 +156,6 @@ def predicted(motion: Motion, p0: Tensor, p1: Tensor) -> Tensor:
     """Where constant velocity puts a point in the third view."""
     y0, y1 = (times(torch.linalg.inv(m)[..., None, :, :], p) for m, p in zip(motion, (p0, p1), strict=False))
     return times(motion[2][..., None, :, :], 2 * y1 - y0)
-
-
-def epipolar_truth(motion: Motion) -> Motion:
-    """Homography of a plane and epipole of a fundamental matrix."""
-    u, s, vh = torch.linalg.svd(motion[0])
-    left, right = u[..., :, 2], vh[..., 2, :]
-    return -cross(left) @ motion[0] + s[..., :1, None] * left[..., :, None] * right[..., None, :], left
-
-
-def two_epipolar_truths(motion: Motion) -> Motion:
-    """Those of two bodies, one after the other."""
-    return *epipolar_truth(motion[:1]), *epipolar_truth(motion[1:])
-
-
-def two_epipolar_errors(estimated: Motion, true: Motion) -> Tensor:
-    """The worse of both bodies, in the better order of them."""
-    orders = [
-        torch.maximum(epipolar_error(estimated[:2], true[a : a + 2]), epipolar_error(estimated[2:], true[2 - a : 4 - a]))
-        for a in (0, 2)
-    ]
-    return torch.minimum(*orders)
-
-
-def on_epipolar_line(motion: Motion, x1: Tensor, x2: Tensor) -> Tensor:
-    return torch.stack([lift(x2) @ torch.linalg.cross(motion[1], motion[0] @ lift(x1))])
-
-
-def on_either_epipolar_line(motion: Motion, x1: Tensor, x2: Tensor) -> Tensor:
-    return on_epipolar_line(motion[:2], x1, x2) * on_epipolar_line(motion[2:], x1, x2)
 
 
 def agree(motion: Motion, x1: Tensor, *others: Tensor) -> Tensor:
@@ -275,6 +238,17 @@ CASES = (
         outliers=0.03,
         units=PIXELS,
         truth=two_epipolar_truths,
+    ),
+    Case(
+        dyn.ConvergentMotionMatrix(),
+        traffic,
+        1,
+        two_centres_errors,
+        on_either_line_in_plane,
+        35,
+        noise=2e-4,
+        outliers=0.03,
+        units=PIXELS,
     ),
     grassmann(3, (2, 2), lifted("static_3d", (0, 1), jitter=1.0), 8),
     grassmann(3, (2, 1, 1), lifted("static_3d", (0, 1, 2)), 7),

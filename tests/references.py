@@ -20,9 +20,9 @@ def plucker(ends: Tensor) -> Tensor:
     return torch.stack([p[..., i] * q[..., j] - p[..., j] * q[..., i] for i, j in combinations(range(4), 2)], dim=-1)
 
 
-def monomials(p: Tensor) -> Tensor:
-    """Of degree two, in the order 00, 01, 02, 11, 12, 22."""
-    return torch.stack([p[i] * p[j] for i in range(len(p)) for j in range(i, len(p))])
+def monomials(p: Tensor, mixed: float = 1.0) -> Tensor:
+    """Of degree two, in the order 00, 01, 02, 11, 12, 22, with a factor for those of two coordinates."""
+    return torch.stack([p[i] * p[j] * (1.0 if i == j else mixed) for i in range(len(p)) for j in range(i, len(p))])
 
 
 def lifted_frame(frame: Tensor) -> Tensor:
@@ -45,7 +45,7 @@ def vectors(primitive: Primitive, x: Tensor) -> list[Tensor]:
     if isinstance(primitive, Line):
         return [plucker(x) / (x[1] - x[0]).norm().sqrt()]
     if isinstance(primitive, Monomials):
-        return [monomials(lift(x))]
+        return [monomials(lift(x), 2**0.5 if primitive.isometric else 1.0)]
     if isinstance(primitive, HyperplanesThrough):
         planes = torch.cat([torch.eye(len(x), dtype=x.dtype), -x[:, None]], dim=1)
         return list(subdeterminants(planes, primitive.order))

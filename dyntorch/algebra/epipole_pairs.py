@@ -9,13 +9,12 @@ import torch
 from torch import Tensor
 
 from dyntorch.algebra.homogeneous import unit_vectors
+from dyntorch.algebra.rank_one_pencils import rank_one
 from dyntorch.algebra.rank_two import null_vectors
 from dyntorch.constants import constant
 from dyntorch.nullspace import null_space
 from dyntorch.primitives.monomials import collecting, factors, multiplicity, symmetric
 
-SQUARINGS = 5
-"""The leading pair of a nearly rank one matrix is then exact to (s_2 / s_1)^64."""
 STEPS = 12
 """Steps to the nearest product.  Without any, 1 of 40 noisy scenes (100 matches, .01 px, epipoles 2 degrees apart) is useless."""
 EXACT = 1e-10  # of the norm of the matrix: what rounding leaves of an exact product
@@ -23,24 +22,25 @@ FULL = 1e-12  # damping that is none
 RIDGE = 1e-15  # of the trace: leaves equations of coinciding epipoles solvable
 
 
-def product_matrix(first: Tensor, second: Tensor) -> Tensor:
-    r"""The matrix S of the product of two bilinear forms, :math:`S_{\{ac\}\{bd\}} = \sum F_{ab} G_{cd}`, not scaled.
+def product_matrix(*forms: Tensor) -> Tensor:
+    r"""The matrix S of the product of bilinear forms, for two of them :math:`S_{\{ac\}\{bd\}} = \sum F_{ab} G_{cd}`, not scaled.
 
     Args:
-        first: F ``(*batch, 3, 3)``.
-        second: G ``(*batch, 3, 3)``.
+        forms: K matrices ``(*batch, 3, 3)``.
 
     Returns:
-        ``(*batch, 6, 6)``.
+        ``(*batch, M, M)``, M the number of monomials of degree K; 6 for two forms.
 
     Example:
         >>> import torch
         >>> product_matrix(torch.eye(3), torch.eye(3)).diagonal().tolist()  # (p2 . p1)^2
         [1.0, 2.0, 2.0, 1.0, 2.0, 1.0]
     """
-    collect = collecting(2, 2, first.device).to(first.dtype)
-    both = (first[..., :, None, :, None] * second[..., None, :, None, :]).flatten(-4, -3).flatten(-2)
-    return collect @ both @ collect.mT
+    product = forms[0]
+    for form in forms[1:]:
+        product = (product[..., :, None, :, None] * form[..., None, :, None, :]).flatten(-4, -3).flatten(-2)
+    collect = collecting(len(forms), 2, product.device).to(product.dtype)
+    return collect @ product @ collect.mT
 
 
 def factor_product(matrix: Tensor) -> tuple[Tensor, Tensor]:
@@ -148,7 +148,7 @@ def _forms(matrix: Tensor, second: Tensor, first: Tensor) -> Tensor:
         inner = (torch.linalg.solve_ex(gram, pairs)[0] @ inner).mT
     # rows by the pairs of basis vectors of view 2, columns by those of view 1: (i j, k l) -> (i k, j l)
     kron = inner.unflatten(-1, (2, 2)).unflatten(-3, (2, 2)).transpose(-3, -2).flatten(-2).flatten(-3, -2)
-    left, right = _leading(kron)
+    left, right = rank_one(kron)
     forms = second.mT @ torch.stack([left, right], dim=1).unflatten(-1, (2, 2)) @ first
     return forms / torch.linalg.matrix_norm(forms, keepdim=True).clamp(min=1e-300)
 
@@ -227,17 +227,6 @@ def _product_table(device: torch.device) -> Tensor:
     collect = collecting(2, 2, torch.device("cpu"))
     collect = (collect / collect.norm(dim=-1, keepdim=True)).unflatten(-1, (3, 3))
     return torch.einsum("iac,jbd->cdijab", collect, collect).reshape(9, 36 * 9).to(device)
-
-
-def _leading(matrix: Tensor) -> tuple[Tensor, Tensor]:
-    """The leading left vector, of norm 1, and the right one with the singular value, by squaring."""
-    power = matrix @ matrix.mT
-    for _ in range(SQUARINGS):
-        power = power / power.detach().abs().amax((-2, -1), keepdim=True).clamp(min=1e-300)
-        power = power @ power
-    longest = power.detach().diagonal(dim1=-2, dim2=-1).argmax(-1)
-    left = unit_vectors(power.gather(-1, longest[:, None, None].expand(-1, 4, 1))[..., 0])
-    return left, (left[:, None] @ matrix)[:, 0]
 
 
 def _ordered(forms: Tensor) -> Tensor:

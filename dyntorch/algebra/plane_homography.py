@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dyntorch.algebra.epipolar import TINY, hartley, null_vector
 from dyntorch.algebra.epipolar_descent import CAP, DAMPING, LAST, marquardt
-from dyntorch.algebra.homogeneous import homogeneous
+from dyntorch.algebra.homogeneous import homogeneous, unit_vectors
 from dyntorch.blocks import map_blocks
 
 BLOCK = 1 << 15
@@ -81,7 +81,7 @@ def linear_homography(x1: Tensor, x2: Tensor, weights: Tensor) -> Tensor:
     # vec(T2^-1 H T1) = (T2^-1 (x) T1^T) vec(H)
     change = (there[:, :, None, :, None] * here.mT[:, None, :, None, :]).reshape(-1, 9, 9)
     vector = (change @ null_vector(change.mT @ gram.reshape(-1, 9, 9) @ change)[..., None])[..., 0]
-    return _unit(vector).unflatten(-1, (3, 3))
+    return unit_vectors(vector).unflatten(-1, (3, 3))
 
 
 def affine_homography(x1: Tensor, x2: Tensor, weights: Tensor) -> Tensor:
@@ -179,14 +179,14 @@ def descend_homography(
 
 
 def _descend(H: Tensor, x1: Tensor, x2: Tensor, weights: Tensor, inverse: float, cap: float, steps: int) -> tuple[Tensor, Tensor]:
-    H = _unit(H.flatten(1)).unflatten(-1, (3, 3))
+    H = unit_vectors(H.flatten(1)).unflatten(-1, (3, 3))
     terms = _terms(H, x1, x2)
     cost = _msac(terms, weights, inverse, cap)
     damping = torch.full_like(cost, DAMPING)
     for _ in range(steps):
         weighted = weights * (1 - terms.distance * (inverse / cap)).clamp(min=0)
         matrix, gradient = _normal_equations(H, terms, x1, x2, weighted)
-        trial = _unit(H.flatten(1) + marquardt(matrix, gradient, damping)).unflatten(-1, (3, 3))
+        trial = unit_vectors(H.flatten(1) + marquardt(matrix, gradient, damping)).unflatten(-1, (3, 3))
         fresh = _terms(trial, x1, x2)
         cost_ = _msac(fresh, weights, inverse, cap)
         better = cost_ < cost
@@ -266,7 +266,3 @@ def _normal_equations(H: Tensor, terms: _Terms, x1: Tensor, x2: Tensor, weights:
     # the scale of H is free
     gauge = matrix.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None] * h[:, :, None] * h[:, None, :]
     return matrix + gauge, gradient
-
-
-def _unit(vectors: Tensor) -> Tensor:
-    return vectors / torch.linalg.vector_norm(vectors, dim=-1, keepdim=True).clamp(min=TINY)

@@ -12,7 +12,7 @@ from dyntorch.algebra.homogeneous import homogeneous, unit, unit_vectors
 from dyntorch.invariants.fundamental_matrix import FundamentalMatrix
 from dyntorch.normalize import hartley
 from dyntorch.nullspace import null_space
-from dyntorch.primitives.monomials import Monomials, collecting, factors
+from dyntorch.primitives.monomials import Monomials, monomial_derivatives, monomials
 from dyntorch.residual import sampson
 
 ROUNDS = 4
@@ -96,39 +96,6 @@ def multibody_matrix(x1: Tensor, x2: Tensor, bodies: int, weights: Tensor | None
     return Multibody(matrix.to(dtype), fundamentals.to(dtype), labels, ~(single & enough))
 
 
-def multibody_product(fundamentals: Tensor) -> Tensor:
-    r"""The multibody fundamental matrix of given bodies: :math:`\nu(p_2)^T M\, \nu(p_1) = \prod_k p_2^T F_k\, p_1`.
-
-    Args:
-        fundamentals: ``(*batch, bodies, 3, 3)``.
-
-    Returns:
-        ``(*batch, M, M)``, of the scale of the product.
-
-    Example:
-        >>> import torch
-        >>> multibody_product(torch.eye(3).expand(2, 3, 3)).diagonal().tolist()  # (p2 . p1)^2
-        [1.0, 2.0, 2.0, 1.0, 2.0, 1.0]
-    """
-    forms = fundamentals.unbind(-3)
-    product = forms[0]
-    for form in forms[1:]:
-        product = (product[..., :, None, :, None] * form[..., None, :, None, :]).flatten(-4, -3).flatten(-2)
-    collect = collecting(len(forms), 2, product.device).to(product.dtype)
-    return collect @ product @ collect.mT
-
-
-def veronese(p: Tensor, degree: int) -> Tensor:
-    """All monomials ``(..., M)`` of one degree of vectors ``(..., 3)``, in lexicographic order.
-
-    Example:
-        >>> import torch
-        >>> veronese(torch.tensor([2.0, 3.0, 1.0]), 2).tolist()
-        [4.0, 6.0, 2.0, 9.0, 3.0, 1.0]
-    """
-    return p[..., factors(degree, 2, p.device)].prod(-1)
-
-
 def multibody_lines(matrix: Tensor, p1: Tensor, p2: Tensor, bodies: int) -> tuple[Tensor, Tensor]:
     r"""The epipolar lines of every match, each of its own body: the derivatives of :math:`\nu(p_2)^T M\, \nu(p_1)`.
 
@@ -149,26 +116,9 @@ def multibody_lines(matrix: Tensor, p1: Tensor, p2: Tensor, bodies: int) -> tupl
         >>> multibody_lines(torch.eye(3), p, p, 1)[1].tolist()
         [[1.0, 2.0, 1.0]]
     """
-    l1 = veronese_gradient(veronese(p2, bodies) @ matrix, p1, bodies)
-    l2 = veronese_gradient(veronese(p1, bodies) @ matrix.mT, p2, bodies)
+    l1 = _gradient(monomials(p2.mT, bodies).mT @ matrix, p1, bodies)
+    l2 = _gradient(monomials(p1.mT, bodies).mT @ matrix.mT, p2, bodies)
     return l1, l2
-
-
-def veronese_gradient(form: Tensor, p: Tensor, degree: int) -> Tensor:
-    r"""The gradient :math:`\nabla_p\, c \cdot \nu(p)` of forms: ``(..., M)`` and ``(..., 3)`` to ``(..., 3)``.
-
-    Example:
-        >>> import torch
-        >>> form = torch.tensor([0.0, 1.0, 0.0, 0.0, 0.0, 0.0])  # x y
-        >>> veronese_gradient(form, torch.tensor([2.0, 3.0, 1.0]), 2).tolist()
-        [3.0, 2.0, 0.0]
-    """
-    # the symmetric tensor of the form, contracted with all factors but one
-    collect = collecting(degree, 2, p.device).to(p.dtype)
-    gradient = degree * (form / collect.sum(-1)) @ collect
-    for _ in range(degree - 1):
-        gradient = (gradient.unflatten(-1, (3, -1)) * p[..., :, None]).sum(-2)
-    return gradient
 
 
 def _checked(x1: Tensor, x2: Tensor, bodies: int, weights: Tensor | None) -> Tensor:
@@ -192,7 +142,7 @@ def _checked(x1: Tensor, x2: Tensor, bodies: int, weights: Tensor | None) -> Ten
 
 def _fitted(first: Tensor, second: Tensor, bodies: int, weights: Tensor) -> tuple[Tensor, Tensor]:
     """The multibody matrix of normalized matches, and whether it is the only one."""
-    rows = veronese(second, bodies)[..., :, None] * veronese(first, bodies)[..., None, :]
+    rows = monomials(second.mT, bodies).mT[..., :, None] * monomials(first.mT, bodies).mT[..., None, :]
     size = rows.shape[-1]
     # every row of the same length: far points have monomials a hundred times larger
     rows = unit_vectors(rows.flatten(-2)) * weights.sqrt()[..., None]
@@ -224,11 +174,16 @@ def _bodies(matrix: Tensor, first: Tensor, second: Tensor, bodies: int, weights:
     return labels, fundamentals.take_along_dim(order[..., None, None], dim=-3), counts[..., -1] >= LEAST
 
 
+def _gradient(form: Tensor, p: Tensor, degree: int) -> Tensor:
+    """Of forms ``(..., n, M)`` in the monomials of vectors, at vectors ``(..., n, 3)``."""
+    return (form[..., None, :] @ monomial_derivatives(p, degree, 3))[..., 0, :]
+
+
 def _epipoles(lines: Tensor, trust: Tensor, bodies: int) -> Tensor:
     """The epipole ``(*batch, n, 3)`` of the body of every line: the gradient of the form of all epipoles."""
     lines = unit_vectors(lines)
-    form = null_space(veronese(lines, bodies) * trust[..., None])[..., 0, :]
-    return unit_vectors(veronese_gradient(form[..., None, :], lines, bodies))
+    form = null_space(monomials(lines.mT, bodies).mT * trust[..., None])[..., 0, :]
+    return unit_vectors(_gradient(form[..., None, :], lines, bodies))
 
 
 def _grouped(vectors: Tensor, trust: Tensor, groups: int) -> Tensor:

@@ -44,11 +44,7 @@ class Monomials(Primitive):
         return self.components(x).mT
 
     def components(self, x: Tensor) -> Tensor:
-        p = torch.cat([x.mT, torch.ones_like(x.mT[..., :1, :])], dim=-2)
-        factors = self._factors(x.device).unbind(-1)
-        product = p.index_select(-2, factors[0])
-        for factor in factors[1:]:
-            product = product * p.index_select(-2, factor)
+        product = monomials(torch.cat([x.mT, torch.ones_like(x.mT[..., :1, :])], dim=-2), self.degree)
         return product * self.scale(x.device).to(x.dtype)[:, None] if self.isometric else product
 
     def normalized(self, transform: Tensor) -> Primitive:
@@ -77,20 +73,47 @@ class Monomials(Primitive):
         return (self._derivative(x) @ change[..., None])[..., 0]
 
     def _derivative(self, x: Tensor) -> Tensor:
-        """``(*batch, n, width, dim)``: one factor at a time replaced by its derivative."""
-        factors = self._factors(x.device)
-        factors = self._factors(x.device)
-        p, eye = homogeneous(x), torch.eye(self.dim + 1, self.dim, dtype=x.dtype, device=x.device)
-        total = torch.zeros((), dtype=x.dtype, device=x.device)
-        for i in range(self.degree):
-            term = eye[factors[:, i]]
-            for j in range(self.degree):
-                term = term if j == i else term * p[..., factors[:, j], None]
-            total = total + term
+        """``(*batch, n, width, dim)``."""
+        total = monomial_derivatives(homogeneous(x), self.degree, self.dim)
         return total * self.scale(x.device).to(x.dtype)[:, None] if self.isometric else total
 
     def _factors(self, device: torch.device) -> Tensor:
         return factors(self.degree, self.dim, device)
+
+
+def monomials(p: Tensor, degree: int) -> Tensor:
+    """All monomials ``(*batch, width, n)`` of one degree of vectors ``(*batch, d + 1, n)``, which need not end in 1.
+
+    Example:
+        >>> import torch
+        >>> monomials(torch.tensor([[2.0], [3.0], [-1.0]]), 2).flatten().tolist()
+        [4.0, 6.0, -2.0, 9.0, -3.0, 1.0]
+    """
+    table = factors(degree, p.shape[-2] - 1, p.device).unbind(-1)
+    product = p.index_select(-2, table[0])
+    for factor in table[1:]:
+        product = product * p.index_select(-2, factor)
+    return product
+
+
+def monomial_derivatives(p: Tensor, degree: int, count: int) -> Tensor:
+    r"""Derivatives ``(*batch, n, width, count)`` of the monomials of vectors ``(*batch, n, d + 1)`` by their first coordinates.
+
+    Example:
+        >>> import torch
+        >>> monomial_derivatives(torch.tensor([[2.0, 3.0, -1.0]]), 2, 3)[0, 1].tolist()  # of x y
+        [3.0, 2.0, 0.0]
+    """
+    table = factors(degree, p.shape[-1] - 1, p.device)
+    eye = torch.eye(p.shape[-1], count, dtype=p.dtype, device=p.device)
+    total = torch.zeros_like(p[..., :1, None])
+    # one factor at a time replaced by its derivative
+    for i in range(degree):
+        term = eye[table[:, i]]
+        for j in range(degree):
+            term = term if j == i else term * p[..., table[:, j], None]
+        total = total + term
+    return total
 
 
 @constant

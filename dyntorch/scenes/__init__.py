@@ -1,5 +1,6 @@
 """Ground-truth scenes for tests, benchmarks and experiments: one function per kind of motion, all batched."""
 
+from dyntorch.scenes.convergent import convergent_motions
 from dyntorch.scenes.lifts import LiftedScene, lifted
 from dyntorch.scenes.lines import translating_lines
 from dyntorch.scenes.plane import lines_concurrent, planar
@@ -16,6 +17,7 @@ __all__ = [
     "bodies",
     "collineation",
     "constant_velocity",
+    "convergent_motions",
     "lifted",
     "lines_concurrent",
     "moving_points",

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch.nn.functional import normalize
 
-from dyntorch.algebra.homogeneous import apply
+from dyntorch.algebra.homogeneous import apply, homogeneous, skew
 from dyntorch.scenes.scene import Draw, Scene
 
 FOCAL, CENTRE = 700.0, (320.0, 240.0)
@@ -62,7 +62,7 @@ def convergent_motions(
     k = pixel.new_tensor([[FOCAL, 0.0, CENTRE[0]], [0.0, FOCAL, CENTRE[1]], [0.0, 0.0, 1.0]])
     inverse = torch.linalg.inv(k)
     depth = draw.uniform(n, 1, low=4.0, high=12.0)
-    still = torch.cat([apply(inverse, pixel), torch.ones_like(depth)], dim=-1) * depth
+    still = homogeneous(apply(inverse, pixel)) * depth
 
     normal = (draw.rotations(spread=0.05) @ pixel.new_tensor(NORMAL)[:, None])[..., 0]
     # on the ground n . X = HEIGHT: across and ahead are free
@@ -90,6 +90,6 @@ def convergent_motions(
     weight = torch.full_like(vertex[..., :1], 0.0 if parallel else 1.0)
     v2 = (image @ torch.cat([vertex, weight], dim=-1).mT)[..., 0]
     e2 = (k @ translation[..., None])[..., 0]
-    forms = [torch.linalg.cross(e[..., :, None].expand_as(homography), homography, dim=-2) for e in (e2, v2)]
+    forms = [skew(e) @ homography for e in (e2, v2)]
     truth = {"homography": homography, "epipole": e2, "vertex": v2, "calibration": k.expand_as(homography)}
     return draw.scene((apply(torch.nn.functional.pad(k, (0, 1)), first), apply(image, after)), forms, **truth)

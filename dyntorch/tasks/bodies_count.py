@@ -10,8 +10,9 @@ from dyntorch.tasks.bodies_pool import LEAST
 
 FIRST, NEXT, MOST = 4, 2, 12
 """Numbers of bodies tried at first, tried further each time that the largest was the best, and tried at all."""
-PENALTY = 4.5
-"""Of a body, in units of the root of the number of matches: what models leave unexplained grows with the matches."""
+PENALTY, ALONE = 4.5, 6.2
+"""Of a body, in units of the root of the number of matches: what models leave unexplained grows with the matches.  The second where
+geometry decides alone (spurious bodies explain up to 4.9, true ones 7.6 and more)."""
 
 Search = Callable[[Sequence[int]], dict[int, list[Candidate]]]
 
@@ -29,17 +30,17 @@ class Best:
     spare: bool = False
 
 
-def best(search: Search, matches: int, bodies: int | None) -> Best | None:
+def best(search: Search, matches: int, bodies: int | None, penalty: float) -> Best | None:
     """The best segmentation of so many matches into ``bodies``, or, for None, into the number of least penalized cost.
 
-    Fewer than were asked for where there are no segmentations into as many; None where there are none at all.
+    Fewer than were asked for where there are no segmentations into as many; None where there are none at all.  The penalty of a
+    body is in units of the root of the number of matches.
     """
     room = max(1, matches // LEAST)
-    penalty = PENALTY * matches**0.5
     known: dict[int, Candidate] = {}
 
     def penalized(count: int) -> float:
-        return known[count].energy + penalty * count
+        return known[count].energy + penalty * count * matches**0.5
 
     if bodies is not None:
         for count in range(min(bodies, room), 0, -1):

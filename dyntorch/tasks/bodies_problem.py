@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from dyntorch.algebra.homogeneous import similarity
+from dyntorch.sampling import uniform
 from dyntorch.solution import Status
-from dyntorch.tasks.bodies_count import MOST, best
+from dyntorch.tasks.bodies_count import ALONE, MOST, PENALTY, best
 from dyntorch.tasks.bodies_descent import Candidate
 from dyntorch.tasks.bodies_energy import View
 from dyntorch.tasks.bodies_labels import label
@@ -32,6 +33,8 @@ UNKNOWN = 0.3
 """Share of outliers where nothing says what it is."""
 FAR, FARTHEST = 20.0, 1e3
 """Distance from the middle of the matches, in units of the median one, from which a match is garbage, and where it is put then."""
+SEARCHED = 1500
+"""Matches that the search looks at; the others are labelled by what it finds."""
 GUESS = 0.003
 """Threshold over the diagonal of the image, where it has to be estimated."""
 
@@ -68,19 +71,21 @@ def _solve(x1: Tensor, x2: Tensor, weights: Tensor, request: Request, threshold:
     if distinct < LEAST + 1:
         return nothing(weights, threshold, Status.TOO_FEW, repeated)
     given = _given(x1[present], x2[present], weights, present, threshold, request.spatial, repeated)
-    part = given.view.subset(given.keep)
+    chosen_from, part = _part(given, request)
 
     def searched(counts: Sequence[int]) -> dict[int, list[Candidate]]:
         if not request.spatial:
             return search_samples(part, counts, request.generator)
-        groups = [given.groups] if int(given.groups.max()) < MOST else []
-        return search(part, counts, request.generator, groups)
+        groups = given.groups[chosen_from]
+        extra = [groups] if int(groups.max()) < MOST else []
+        return search(part, counts, request.generator, extra)
 
-    chosen = best(searched, len(given.keep), request.bodies) if len(given.keep) > LEAST else None
+    penalty = PENALTY if request.spatial else ALONE
+    chosen = best(searched, len(part.x1), request.bodies, penalty) if len(part.x1) > LEAST else None
     if chosen is None:
         return nothing(weights, threshold, Status.NO_CONSENSUS, repeated, given.linked)
     found = torch.zeros_like(present)
-    found[given.keep] = chosen.candidate.labels + 1
+    found[given.keep[chosen_from]] = chosen.candidate.labels + 1
     near = NEIGHBOURLY * given.view.pixel if request.spatial else None
     share = 1 - given.linked if request.spatial else UNKNOWN
     labelled = label(given.view, found, chosen.candidate.fundamentals, weights[present], PIXELS * given.view.pixel, near, share)
@@ -107,6 +112,20 @@ def _given(x1: Tensor, x2: Tensor, weights: Tensor, present: Tensor, threshold: 
         groups = keep[:0]
     view = View(a, b, pixel, links)
     return Given(weights, present, view, first, second, float(scale), values, keep, groups, repeated)
+
+
+def _part(given: Given, request: Request) -> tuple[Tensor, View]:
+    """The matches that the search looks at: those that may belong to a body (indices among them), some of very many."""
+    count = len(given.keep)
+    everything = torch.arange(count, device=given.keep.device)
+    if count <= SEARCHED:
+        return everything, given.view.subset(given.keep)
+    order = uniform(count, generator=request.generator, device=given.keep.device).argsort()
+    some = order[:SEARCHED].sort().values
+    view = given.view.subset(given.keep[some])
+    # what is left has other neighbours
+    links = coherence(view.x1, view.x2, NEIGHBOURLY * view.pixel).links if request.spatial else view.links
+    return everything[some], replace(view, links=links)
 
 
 def _groups(values: Tensor, links: Links) -> tuple[Tensor, Tensor]:

@@ -10,10 +10,9 @@ from torch import Tensor
 from dyntorch.algebra.epipolar import sampson_squared
 from dyntorch.algebra.epipolar_descent import descend
 from dyntorch.algebra.epipolar_samples import sample_fundamentals
-from dyntorch.fitting import fit
-from dyntorch.invariants.segmentation_matrix import SegmentationMatrix
 from dyntorch.tasks.bodies_descent import Candidate, descended
 from dyntorch.tasks.bodies_energy import CAP, NOISE, View, energy
+from dyntorch.tasks.bodies_matrix import matrix_pairs
 from dyntorch.tasks.bodies_pool import LEAST, TRUNCATED, Starts, best_sets, one_hot, rough_cost
 
 SAMPLES, MOST_SAMPLES = 6000, 24000
@@ -36,12 +35,11 @@ ALIKE = 0.97
 """Overlap (intersection over union) of the matches that agree above which one of two geometries is enough."""
 STARTS = 30
 """Sets that descend, for each number of bodies."""
-BODY = 1.7
-"""Of a body, in units of the root of the number of matches, besides what it costs where neighbours have their say."""
 WORTH = 5.0
-"""What a body that is worth looking for further ones explains, in the same unit: by chance 2 to 5, small bodies 8."""
-MATRIX, REWEIGHTED = 40, 3
-"""Matches that a segmentation matrix takes, and rounds of its weights."""
+"""What a body that is worth looking for further ones explains, in units of the root of the number of matches: by chance 2 to 5,
+small bodies 8."""
+REWEIGHTED = 3
+"""Rounds of the weights of the segmentation matrix."""
 
 
 def search_samples(view: View, counts: Sequence[int], generator: torch.Generator | None) -> dict[int, list[Candidate]]:
@@ -75,10 +73,12 @@ def _ranked(view: View, candidates: list[Candidate]) -> list[Candidate]:
     member = one_hot(square.argmin(1), square.shape[1]) * (square < CAP)
     inliers = member.sum(-1)
     total = energy(view, fundamentals, member) + CAP * (len(view.x1) - inliers.sum(-1))
-    # between numbers of bodies only distances count: parallax tells true bodies from spurious ones less well
-    total = total - total.min() + square.amin(1).sum(-1).min() + BODY * square.shape[1] * len(view.x1) ** 0.5
     order = total.argsort(stable=True)
     order = order[inliers[order].amin(-1) >= LEAST]
+    if not len(order):
+        return []
+    # between numbers of bodies only distances count: parallax tells true bodies from spurious ones less well
+    total = total - total[order[0]] + square[order].amin(1).sum(-1).min()
     return [Candidate(float(total[i]), candidates[i].labels, candidates[i].fundamentals) for i in order.tolist()]
 
 
@@ -98,7 +98,7 @@ def _pool(view: View, least: int, most: int, generator: torch.Generator | None) 
     Beyond the least number of bodies there are no further samples once another body explains little.
     """
     left = torch.ones_like(view.x1[None, :, 0])
-    pool = matrix_pairs(view, left[: most - 1], REWEIGHTED)
+    pool = matrix_pairs(view, left[: most - 1], REWEIGHTED)  # none for a single body
     last = CAP * len(view.x1)
     for count in range(1, most + 1):
         pool = _different(view, torch.cat([pool, *(_sampled(view, open_, len(left), generator) for open_ in left)]))
@@ -143,20 +143,3 @@ def _sampled(view: View, weight: Tensor, parts: int, generator: torch.Generator 
 def _votes(F: Tensor, x1: Tensor, x2: Tensor, weight: Tensor, scale: float) -> Tensor:
     """What the matches ``(n,)`` near each geometry ``(p,)`` count together."""
     return (1 - sampson_squared(F, x1, x2) / scale**2).clamp_(min=0) @ weight
-
-
-def matrix_pairs(view: View, groups: Tensor, rounds: int) -> Tensor:
-    """Geometries ``(2 g, 3, 3)`` of the segmentation matrices of groups ``(b, n)``, 0 and 1; those too small are left out.
-
-    The linear fits are weighed again by their gradients so many times.
-    """
-    groups = groups[groups.sum(-1) >= MATRIX]
-    x1, x2 = (x.expand(len(groups), -1, -1) for x in (view.x1, view.x2))
-    weights = groups
-    for _ in range(rounds if len(groups) else 0):
-        tensor = fit(SegmentationMatrix, x1, x2, weights=weights).tensor
-        weights = groups * SegmentationMatrix.reweighted(tensor, x1, x2)
-    if not len(groups):
-        return view.x1.new_zeros(0, 3, 3)
-    found = torch.cat(SegmentationMatrix.fundamentals(fit(SegmentationMatrix, x1, x2, weights=weights).tensor))
-    return found[found.isfinite().all((-2, -1)) & (found != 0).any((-2, -1))]

@@ -10,6 +10,7 @@ from torch import Tensor
 from dyntorch.tasks.bodies_descent import Candidate, descended
 from dyntorch.tasks.bodies_energy import View
 from dyntorch.tasks.bodies_flows import affine_flows
+from dyntorch.tasks.bodies_matrix import matrix_pairs
 from dyntorch.tasks.bodies_pool import best_sets, distinct, fitted, one_hot, pool_of, rough_cost, set_starts, smoothed
 
 RUNS = 16
@@ -37,6 +38,9 @@ def search(
     labels = affine_flows(view.x1, view.x2, view.links, plan, FLOW_NOISE * view.pixel, generator)
     widths = [(labels, int(plan.max())), *((x[None], int(x.max()) + 1) for x in extra), (torch.zeros_like(labels[:1]), 1)]
     pool = pool_of(view, torch.cat([one_hot(x, width).flatten(0, 1) for x, width in widths]))
+    if max(counts) > 1:
+        # linear: the search improves it, and its weights would take longer than all flows
+        pool = torch.cat([pool, matrix_pairs(view, torch.ones_like(view.x1[None, :, 0]), rounds=0)])
     cost = smoothed(rough_cost(view, pool), view)
     starts = []
     for count in counts:

@@ -15,6 +15,7 @@ TOLERANCE, EDGE_TOLERANCE = 0.7, 0.5
 RIDGE = 0.25
 PASSES, TRUSTED = 2, 0.02
 """Passes, and the coherence below which a match is no neighbour in the next one."""
+TABLE = 1 << 22  # distances held at a time
 RATIOS, MODES = 400, 16  # pairs of neighbours, and starts among them, by which the common motion is looked for
 DISTORTED = 0.35
 """Zoom and rotation, as the distance of the complex factor from 1, from which the local motions start from it."""
@@ -46,6 +47,8 @@ class Links:
 
     def pull(self, values: Tensor) -> Tensor:
         """Weighted sums over the neighbours: ``(*, n)`` to ``(*, n)``."""
+        if not self.index.shape[1]:
+            return torch.zeros_like(values)
         if len(self.index) <= DENSE:
             return values @ self._dense.to(values.dtype).mT  # row i holds the neighbours of i
         return torch.stack([(row[self.index] * self.weight).sum(-1) for row in values.flatten(0, -2)]).view(values.shape)
@@ -105,22 +108,22 @@ def coherence(x1: Tensor, x2: Tensor, scale: float) -> Coherence:
         x2: the same in view 2.
         scale: s, noise of differences of matches, in their unit.
     """
-    apart = _apart(x1, x2, scale / 6)
+    fresh = _first_of_copies(x1, x2, scale / 6)
     values = torch.ones_like(x1[:, 0])
     for _ in range(PASSES):
         # the first pass finds most wrong matches, which then no longer stand between the neighbours of the others
         trusted = values > TRUSTED
-        values, linked = _judged(x1, x2, apart & trusted, scale)
+        values, linked = _judged(x1, x2, fresh & trusted, scale)
     return Coherence(values, _links(*linked, len(x1)))
 
 
 def _judged(x1: Tensor, x2: Tensor, eligible: Tensor, scale: float) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
-    """Coherence of all matches with their nearest eligible ones ``(n, n)``; rows, columns and weights of the links."""
+    """Coherence of all matches with their nearest eligible ones ``(n,)``; rows, columns and weights of the links."""
     count = len(x1)
     values = torch.zeros_like(x1[:, 0])
     rows, columns, weights = [], [], []
     for a, b in ((x1, x2), (x2, x1)):
-        index, usable = _nearest(a, eligible, min(NEIGHBOURS, count - 1))
+        index, usable = _nearest(a, b, eligible.nonzero().flatten(), scale / 6)
         da, db = a[index] - a[:, None], b[index] - b[:, None]
         common = _common_motion(da, db, usable)
         deviation = _deviation(da, db, usable, common, scale)
@@ -145,8 +148,8 @@ def conformity(x1: Tensor, x2: Tensor, members: Tensor, scale: float) -> Tensor:
     Returns:
         ``(K, n)`` in [0, 1].
     """
-    apart = _apart(x1, x2, scale / 6)
-    return torch.stack([_judged(x1, x2, apart & body, scale)[0] for body in members])
+    fresh = _first_of_copies(x1, x2, scale / 6)
+    return torch.stack([_judged(x1, x2, fresh & body, scale)[0] for body in members])
 
 
 def _links(row: Tensor, column: Tensor, weight: Tensor, count: int) -> Links:
@@ -166,20 +169,37 @@ def _links(row: Tensor, column: Tensor, weight: Tensor, count: int) -> Links:
     return Links(index, weights)
 
 
-def _apart(x1: Tensor, x2: Tensor, least: float) -> Tensor:
-    """``(n, n)`` bool: whether the second of two matches differs from the first, and from all before it.
+def _blocks(count: int, width: int) -> list[slice]:
+    """The rows of a table of distances in slices that fit into memory, whatever their number."""
+    step = max(64, TABLE // max(1, width))
+    return [slice(start, start + step) for start in range(0, count, step)]
 
-    A repeated match confirms nothing, neither itself nor, as several neighbours that agree, others.
+
+def _first_of_copies(x1: Tensor, x2: Tensor, least: float) -> Tensor:
+    """``(n,)`` bool: whether no earlier match is the same; as neighbours that agree, repeated matches would confirm themselves."""
+    joint = torch.cat([x1, x2], dim=-1)
+    index = torch.arange(len(joint), device=joint.device)
+    found = [
+        ((torch.cdist(joint[rows], joint) < least) & (index < index[rows, None])).any(-1)
+        for rows in _blocks(len(joint), len(joint))
+    ]
+    return ~torch.cat(found)
+
+
+def _nearest(a: Tensor, b: Tensor, among: Tensor, least: float) -> tuple[Tensor, Tensor]:
+    """Indices ``(n, k)`` of the matches nearest in a, nearest first, of some of them (indices), and which of these exist.
+
+    A match that is the same, in both views, is no neighbour.
     """
-    apart = torch.cdist(torch.cat([x1, x2], -1), torch.cat([x1, x2], -1)) >= least
-    return apart & ~(~apart).tril(-1).any(-1)
-
-
-def _nearest(a: Tensor, apart: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Indices ``(n, k)`` of the nearest other matches, nearest first, and which of them exist."""
-    distance = torch.cdist(a, a).masked_fill(~apart, torch.inf)
-    nearest = distance.topk(count, dim=-1, largest=False)
-    return nearest.indices, nearest.values.isfinite()
+    near, joint = a[among], torch.cat([a, b], dim=-1)
+    count = min(NEIGHBOURS, len(among))
+    indices, exist = [], []
+    for rows in _blocks(len(a), len(among)):
+        distance = torch.cdist(a[rows], near).masked_fill_(torch.cdist(joint[rows], joint[among]) < least, torch.inf)
+        nearest = distance.topk(count, dim=-1, largest=False)
+        indices.append(among[nearest.indices])
+        exist.append(nearest.values.isfinite())
+    return torch.cat(indices), torch.cat(exist)
 
 
 def _common_motion(da: Tensor, db: Tensor, usable: Tensor) -> Tensor:

@@ -94,15 +94,18 @@ def test_sampson_distance_by_its_definition():
     assert (sampson_squared(torch.zeros(3, 3).double(), x1, x2) == 0).all()
 
 
+def hartley_of_one(x, w):
+    """Weighted mean at 0, root mean square distance sqrt(2)."""
+    centre = (w[:, None] * x).sum(0) / w.sum()
+    scale = (2 / ((w[:, None] * (x - centre) ** 2).sum() / w.sum())).sqrt()
+    change = torch.diag(torch.stack([scale, scale, torch.ones_like(scale)]))
+    change[:2, 2] = -scale * centre
+    return change
+
+
 def reference_eight_point(x1, x2, w):
     """Hartley's algorithm, one problem, by SVDs."""
-    changes = []
-    for x in (x1, x2):
-        centre = (w[:, None] * x).sum(0) / w.sum()
-        scale = (2 / ((w[:, None] * (x - centre) ** 2).sum() / w.sum())).sqrt()
-        change = torch.diag(torch.stack([scale, scale, torch.ones_like(scale)]))
-        change[:2, 2] = -scale * centre
-        changes.append(change)
+    changes = [hartley_of_one(x, w) for x in (x1, x2)]
     y1, y2 = homogeneous(x1) @ changes[0].T, homogeneous(x2) @ changes[1].T
     rows = (y2[:, :, None] * y1[:, None, :]).flatten(1) * w.sqrt()[:, None]
     u, s, vt = torch.linalg.svd(torch.linalg.svd(rows)[2][-1].reshape(3, 3))

@@ -1,5 +1,7 @@
 """Products of two forms of rank two: the product point by point, both factors again, units, noise, failures, gradients."""
 
+from itertools import combinations_with_replacement
+
 import pytest
 import torch
 
@@ -29,16 +31,17 @@ def pair_error(found, true):
     return torch.minimum(*orders)
 
 
-def nu(p):
-    return torch.stack([p[..., i] * p[..., j] for i in range(3) for j in range(i, 3)], dim=-1)
+def nu(p, degree=2):
+    return torch.stack([p[..., list(c)].prod(-1) for c in combinations_with_replacement(range(3), degree)], dim=-1)
 
 
-def test_product_is_the_product_at_every_pair_of_points():
-    f, g, p, q = random(4, 3, 3), random(4, 3, 3, seed=1), random(4, 3, seed=2), random(4, 3, seed=3)
-    expected = torch.einsum("ni,nij,nj->n", q, f, p) * torch.einsum("ni,nij,nj->n", q, g, p)
-    matrix = product_matrix(f, g)
-    torch.testing.assert_close(torch.einsum("na,nab,nb->n", nu(q), matrix, nu(p)), expected)
-    torch.testing.assert_close(matrix, product_matrix(g, f))
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_product_is_the_product_at_every_pair_of_points(count):
+    forms, p, q = random(count, 4, 3, 3), random(4, 3, seed=2), random(4, 3, seed=3)
+    expected = torch.einsum("ni,knij,nj->kn", q, forms, p).prod(0)
+    matrix = product_matrix(*forms)
+    torch.testing.assert_close(torch.einsum("na,nab,nb->n", nu(q, count), matrix, nu(p, count)), expected)
+    torch.testing.assert_close(matrix, product_matrix(*forms.flip(0)))
 
 
 def test_rank_and_null_spaces_of_the_product():

@@ -1,5 +1,8 @@
 """fit(): statuses, spectrum and uncertainty, hard conditioning, blocks; what holds for every invariant is in the battery."""
 
+from copy import copy
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -25,7 +28,11 @@ def test_singular_values_are_those_of_the_normalized_rows(case):
     assert found.shape[-1] == case.invariant.width() and (found.diff(dim=-1) <= 0).all()
     if case.invariant.copies:
         return  # the cameras of normalized points have been given orthonormal rows
-    matrix = matrices(case, moved_views(case.invariant, views, frames))[0]
+    moved = moved_views(case.invariant, views, frames)
+    invariant = copy(case.invariant)
+    # what is least squares is said by the primitives of normalized coordinates
+    vars(invariant)["primitives"] = tuple(p.normalized(t) for p, t in zip(invariant.primitives, frames, strict=True))
+    matrix = matrices(replace(case, invariant=invariant), moved)[0]
     values = torch.linalg.svdvals(matrix)
     values = torch.nn.functional.pad(values, (0, case.invariant.width() - len(values)))
     torch.testing.assert_close(found[0], values, rtol=1e-9, atol=1e-13 * float(values[0]))

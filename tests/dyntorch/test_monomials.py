@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from dyntorch.primitives import Monomials
-from dyntorch.primitives.monomials import collecting, multiplicity, symmetric
+from dyntorch.primitives.monomials import collecting, monomial_derivatives, monomials, multiplicity, symmetric
 
 ALL = [Monomials(d, k, isometric) for d in (1, 2, 3) for k in (1, 2, 4) for isometric in (False, True)]
 
@@ -72,6 +72,16 @@ def test_pullback_and_pushforward_are_the_derivative(primitive):
     torch.testing.assert_close(primitive.pushforward(x, change), along)
     torch.testing.assert_close(primitive.pullback(x, slope), torch.func.vjp(primitive.raw, x)[1](slope)[0])
     assert value.shape == slope.shape
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3, 4])
+def test_vectors_that_do_not_end_in_one(degree):
+    p = random(5, 3)
+    expected = torch.stack([p[:, list(c)].prod(-1) for c in combinations_with_replacement(range(3), degree)])
+    torch.testing.assert_close(monomials(p.mT, degree), expected)
+    slopes = torch.func.vmap(torch.func.jacrev(lambda v: monomials(v[:, None], degree)[:, 0]))(p)
+    torch.testing.assert_close(monomial_derivatives(p, degree, 3), slopes)
+    torch.testing.assert_close(monomial_derivatives(p, degree, 2), slopes[..., :2])
 
 
 def test_isometric_ones_turn_with_the_point():

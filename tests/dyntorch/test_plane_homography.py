@@ -14,6 +14,7 @@ from dyntorch.algebra.plane_homography import (
     linear_homography,
 )
 from dyntorch.scenes import collineation
+from tests.dyntorch.test_epipolar import hartley_of_one
 
 ONES = torch.ones(1, 50, dtype=torch.float64)
 
@@ -58,13 +59,7 @@ def test_sampson_distance_of_an_affine_map_is_the_distance_from_its_graph():
 
 def reference(x1, x2, w):
     """Normalized DLT of one problem by an SVD."""
-    changes = []
-    for x in (x1, x2):
-        centre = (w[:, None] * x).sum(0) / w.sum()
-        scale = (2 / ((w[:, None] * (x - centre) ** 2).sum() / w.sum())).sqrt()
-        change = torch.diag(torch.stack([scale, scale, torch.ones_like(scale)]))
-        change[:2, 2] = -scale * centre
-        changes.append(change)
+    changes = [hartley_of_one(x, w) for x in (x1, x2)]
     y1, y2 = homogeneous(x1) @ changes[0].T, apply(changes[1], x2)
     zero = torch.zeros_like(y1)
     rows = torch.cat([torch.cat([y1, zero, -y2[:, :1] * y1], -1), torch.cat([zero, y1, -y2[:, 1:] * y1], -1)])

@@ -1,10 +1,9 @@
-"""Members of rank one of pencils, the parts of planes, and what makes planes ambiguous."""
+"""Members of rank one of pencils, and the parts of planes."""
 
 import pytest
 import torch
 
 from dyntorch.algebra.homogeneous import skew
-from dyntorch.algebra.plane_degeneracy import flatness, pairwise_homology
 from dyntorch.algebra.rank_one_pencils import (
     plane_parts,
     rank_one,
@@ -123,49 +122,10 @@ def test_parts_have_gradients_and_no_nan():
     assert torch.autograd.gradcheck(outer, (noisy.requires_grad_(),), atol=1e-5)
 
 
-def test_homologies_are_planes_of_one_body():
-    for kind, expected in (("generic", set()), ("pair", {(0, 1)}), ("triple", {(0, 1), (0, 2), (1, 2)})):
-        ratio, residual = pairwise_homology(planes(10, n=5, kind=kind)[0])
-        for i in range(5):
-            for j in range(i + 1, 5):
-                assert (ratio[:, i, j] < 1e-6).all() == ((i, j) in expected)
-                assert (residual[:, i, j] < 1e-6).all() == ((i, j) in expected)
-        torch.testing.assert_close(ratio, ratio.mT)
-    ratio, _ = pairwise_homology(planes(10, n=4, kind="static")[0])
-    assert (ratio[:, 0] < 1e-6).all() and (ratio[:, 1:, 1:] > 1e-6).sum() == 10 * 6
-
-
-def test_homologies_of_bad_planes():
-    homographies = planes(2)[0]
-    homographies[0, 0] = torch.inf
-    homographies[1, 1] = homographies[1, 0]
-    ratio, residual = pairwise_homology(homographies)
-    assert ratio.isfinite().all() and residual.isfinite().all()
-    assert ratio[0, 0].tolist() == [0, 1, 1, 1]
-    assert residual[1, 0, 1] < 1e-12
-
-
-def test_flatness():
-    *_, e, v, _ = planes(20, n=6, kind="collinear")
-    ratio, line = flatness(e)
-    assert ratio.max() < 1e-7 and (e @ line[..., None]).abs().max() < 1e-7
-    assert flatness(v)[0].min() > 0.01
-    spheric = torch.eye(3).double()
-    torch.testing.assert_close(flatness(spheric)[0], torch.tensor(1.0).double())
-    weights = torch.tensor([1.0, 1, 0]).double()
-    assert flatness(spheric, weights)[0] < 1e-7
-    torch.testing.assert_close(flatness(torch.cat([spheric, torch.full((1, 3), torch.nan)]))[0], torch.tensor(1.0).double())
-    assert flatness(torch.zeros(3, 3))[0] == 0
-
-
 def test_refusals():
     with pytest.raises(ValueError, match="H must be a floating point tensor"):
         plane_parts(torch.eye(3), torch.eye(3))
     with pytest.raises(ValueError, match="infinity must be"):
         plane_parts(torch.rand(1, 3, 3), torch.rand(3))
     with pytest.raises(ValueError, match="H must be a floating point tensor"):
-        pairwise_homology(torch.ones(2, 3, 3, dtype=torch.int64))
-    with pytest.raises(ValueError, match="vectors must be"):
-        flatness(torch.rand(3, 2))
-    with pytest.raises(ValueError, match="weights must be"):
-        flatness(torch.rand(3, 3), torch.ones(2))
+        plane_parts(torch.ones(2, 3, 3, dtype=torch.int64), torch.eye(3))

@@ -117,7 +117,8 @@ def test_noise_is_estimated(invariant: Invariant, scene: Any, sigma: float) -> N
 @pytest.mark.parametrize("case", KNOWN, ids=repr)
 def test_estimated_threshold_for_every_invariant(case: Case) -> None:
     scale = case.units[0] if case.units else 1.0
-    made = case.scene(max(120, 5 * case.minimal), batch=2, seed=41, outliers=0.2, sigma=case.noise / scale)
+    share = min(0.2, case.outliers)
+    made = case.scene(max(120, 5 * case.minimal), batch=2, seed=41, outliers=share, sigma=case.noise / scale)
     solution = dyn.robust_fit(case.invariant, *made.views, generator=seeded())
     right = made.labels != OUTLIER
     assert solution.inliers is not None

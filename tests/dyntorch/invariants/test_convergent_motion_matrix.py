@@ -9,7 +9,7 @@ from dyntorch.invariants.convergent_motion_matrix import ConvergentMotionMatrix,
 from dyntorch.invariants.fundamental_matrix import FundamentalMatrix
 from dyntorch.invariants.segmentation_matrix import SegmentationMatrix
 from dyntorch.metrics import relative_error
-from dyntorch.scenes.convergent import convergent_motions
+from dyntorch.scenes import convergent_motions
 
 
 def generator(seed=0):
