@@ -18,11 +18,11 @@ checkerboards on turning and shifted boards (1R*).
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean, median, pstdev
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 import tyro
@@ -122,7 +122,7 @@ def _pair_row(pair: Pair, runs: Sequence[Outcome]) -> Row:
     return Row(pair.name, setting, fmean(errors), spread=pstdev(errors), unit=" %")
 
 
-def left_out(errors: dict[float, dict[str, float]]) -> float:
+def left_out(errors: Mapping[Any, Mapping[str, float]]) -> float:
     """Mean error over the pairs, each with the parameter that has the least mean error on the others.
 
     Args:

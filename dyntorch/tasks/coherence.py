@@ -13,6 +13,8 @@ NEIGHBOURS, EDGES = 15, 8
 TOLERANCE, EDGE_TOLERANCE = 0.7, 0.5
 """Relative deviation from the local affine motion at which coherence has fallen to 1/e."""
 RIDGE = 0.25
+REACH = 2.5
+"""Distance from which neighbours are far, in units of the median one."""
 PASSES, TRUSTED = 2, 0.02
 """Passes, and the coherence below which a match is no neighbour in the next one."""
 TABLE = 1 << 22  # distances held at a time
@@ -99,9 +101,11 @@ def coherence(x1: Tensor, x2: Tensor, scale: float) -> Coherence:
 
     For a match i and a neighbour j of it in image a, with the local motion :math:`L_i` from a to b,
 
-    .. math:: r_{ij} = \frac{|(b_j - b_i) - L_i (a_j - a_i)|}{|a_j - a_i| \sqrt{|\det G|} + s},\qquad w_{ij} = e^{-(r_{ij}/\tau)^2},
+    .. math:: r_{ij} = \frac{|(b_j - b_i) - L_i (a_j - a_i)|}{\min(|a_j - a_i|, d) \sqrt{|\det G|} + s},
+        \qquad w_{ij} = e^{-(r_{ij}/\tau)^2},
 
-    where G is the zoom and rotation common to most neighbours, and :math:`L_i` the weighted least squares towards it.
+    where d is a few times the usual distance of neighbours (far from all others, any motion would be small beside it), G is the
+    zoom and rotation common to most neighbours, and :math:`L_i` the weighted least squares towards it.
 
     Args:
         x1: ``(n, 2)`` matches.
@@ -126,7 +130,7 @@ def _judged(x1: Tensor, x2: Tensor, eligible: Tensor, scale: float) -> tuple[Ten
         index, usable = _nearest(a, b, eligible.nonzero().flatten(), scale / 6)
         da, db = a[index] - a[:, None], b[index] - b[:, None]
         common = _common_motion(da, db, usable)
-        deviation = _deviation(da, db, usable, common, scale)
+        deviation = _deviation(da, db, usable, common, _reach(da, usable, eligible), scale)
         agreed = torch.exp(-((deviation / TOLERANCE) ** 2)) * usable
         values = values + agreed.sum(-1) / usable.sum(-1).clamp(min=1) / 2
         linked = torch.exp(-((deviation[:, :EDGES] / EDGE_TOLERANCE) ** 2)) * usable[:, :EDGES]
@@ -228,9 +232,15 @@ def _common_motion(da: Tensor, db: Tensor, usable: Tensor) -> Tensor:
     return torch.stack([torch.stack([best[0], -best[1]]), torch.stack([best[1], best[0]])])
 
 
-def _deviation(da: Tensor, db: Tensor, usable: Tensor, common: Tensor, scale: float) -> Tensor:
+def _reach(da: Tensor, usable: Tensor, eligible: Tensor) -> Tensor:
+    """d ``()``, from the neighbours of those matches that are neighbours themselves."""
+    distance = da.norm(dim=-1)[usable & eligible[:, None]]
+    return REACH * distance.median() if len(distance) else da.new_tensor(torch.inf)
+
+
+def _deviation(da: Tensor, db: Tensor, usable: Tensor, common: Tensor, reach: Tensor, scale: float) -> Tensor:
     """r ``(n, k)`` after one weighted fit of the local motions."""
-    size = da.norm(dim=-1) * torch.linalg.det(common).abs().sqrt() + scale
+    size = da.norm(dim=-1).minimum(reach) * torch.linalg.det(common).abs().sqrt() + scale
     error = db - da @ common.mT
     weight = torch.exp(-((error.norm(dim=-1) / size / TOLERANCE) ** 2)) * usable
     moment = (da * weight[..., None]).mT @ da
