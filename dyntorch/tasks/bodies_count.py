@@ -28,6 +28,8 @@ class Best:
 
     candidate: Candidate
     spare: bool = False
+    further: Candidate | None = None
+    """The best segmentation into one body more, where their number was open."""
 
 
 def best(search: Search, matches: int, bodies: int | None, penalty: float) -> Best | None:
@@ -56,7 +58,10 @@ def best(search: Search, matches: int, bodies: int | None, penalty: float) -> Be
         chosen = min(known, key=penalized, default=0)
         if chosen < top:
             break
-    return Best(known[min(known, key=penalized)]) if known else None
+    if not known:
+        return None
+    count = min(known, key=penalized)
+    return Best(known[count], further=known.get(count + 1))
 
 
 def _cheapest(found: dict[int, list[Candidate]]) -> dict[int, Candidate]:

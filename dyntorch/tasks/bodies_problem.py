@@ -14,7 +14,7 @@ from dyntorch.solution import Status
 from dyntorch.tasks.bodies_count import ALONE, MOST, PENALTY, best
 from dyntorch.tasks.bodies_descent import Candidate
 from dyntorch.tasks.bodies_energy import View
-from dyntorch.tasks.bodies_labels import label
+from dyntorch.tasks.bodies_labels import Labelling, label
 from dyntorch.tasks.bodies_outcome import Given, Outcome, nothing, outcome
 from dyntorch.tasks.bodies_pool import LEAST
 from dyntorch.tasks.bodies_samples import search_samples
@@ -35,6 +35,8 @@ FAR, FARTHEST = 20.0, 1e3
 """Distance from the middle of the matches, in units of the median one, from which a match is garbage, and where it is put then."""
 SEARCHED = 1500
 """Matches that the search looks at; the others are labelled by what it finds."""
+LEFT, LEFT_SHARE = 10, 0.08
+"""Linked matches without a body, and their share of all linked ones, from which one body more is tried."""
 GUESS = 0.003
 """Threshold over the diagonal of the image, where it has to be estimated."""
 
@@ -84,12 +86,27 @@ def _solve(x1: Tensor, x2: Tensor, weights: Tensor, request: Request, threshold:
     chosen = best(searched, len(part.x1), request.bodies, penalty) if len(part.x1) > LEAST else None
     if chosen is None:
         return nothing(weights, threshold, Status.NO_CONSENSUS, repeated, given.linked)
-    found = torch.zeros_like(present)
-    found[given.keep[chosen_from]] = chosen.candidate.labels + 1
-    near = NEIGHBOURLY * given.view.pixel if request.spatial else None
-    share = 1 - given.linked if request.spatial else UNKNOWN
-    labelled = label(given.view, found, chosen.candidate.fundamentals, weights[present], PIXELS * given.view.pixel, near, share)
+    labelled = _labelled(given, chosen_from, chosen.candidate, request)
+    left = _left(given, labelled)
+    if chosen.further is not None and left >= max(LEFT, LEFT_SHARE * len(given.keep)):
+        # matches that move like their neighbours and fit no body: there is another one, which the truncated distances hid
+        other = _labelled(given, chosen_from, chosen.further, request)
+        labelled = other if _left(given, other) < 0.5 * left else labelled
     return outcome(given, labelled, threshold, request.bodies, chosen.spare)
+
+
+def _labelled(given: Given, searched: Tensor, candidate: Candidate, request: Request) -> Labelling:
+    """Labels of all matches by a segmentation of those that were searched (indices among the kept ones)."""
+    found = torch.zeros_like(given.present)
+    found[given.keep[searched]] = candidate.labels + 1
+    pixel = given.view.pixel
+    near, share = (NEIGHBOURLY * pixel, 1 - given.linked) if request.spatial else (None, UNKNOWN)
+    return label(given.view, found, candidate.fundamentals, given.weights[given.present], PIXELS * pixel, near, share)
+
+
+def _left(given: Given, labelled: Labelling) -> int:
+    """How many of the kept matches became outliers."""
+    return int((labelled.labels[given.keep] == 0).sum()) if len(given.groups) else 0
 
 
 def _given(x1: Tensor, x2: Tensor, weights: Tensor, present: Tensor, threshold: float, spatial: bool, repeated: float) -> Given:
