@@ -32,6 +32,7 @@ bench: install
 	$(BIN)/python -m experiments.benchmarks.fits
 	$(BIN)/python -m experiments.benchmarks.robust_peers
 	$(BIN)/python -m experiments.benchmarks.lifted
+	$(BIN)/python -m experiments.benchmarks.segmentation
 	$(BIN)/python -m experiments.benchmarks.action_indexer
 
 tables: install
@@ -42,6 +43,10 @@ tables: install
 	$(BIN)/python -m experiments.lifted_noise
 	$(BIN)/python -m experiments.lifted_outliers
 	$(BIN)/python -m experiments.trajectories
+	$(BIN)/python -m experiments.segmentation_matrix_noise
+	$(BIN)/python -m experiments.translating_planes
+	$(BIN)/python -m experiments.segmentation
+	$(BIN)/python -m experiments.segmentation_sensitivity
 	$(BIN)/python -m experiments.real_lifted
 	$(BIN)/python -m experiments.real_planar
 	$(BIN)/python -m experiments.real_space

@@ -219,7 +219,7 @@ def test_check_repr_and_notices():
 
 
 def test_linked_matches_without_a_body_are_one_body_more():
-    """Two geometries explain three bodies up to the cap of the distances; what then moves with its neighbours and fits none tells."""
+    """Two geometries explain three bodies up to the cap of the distances; what moves with its neighbours and fits none tells."""
     draw = torch.Generator().manual_seed(12)
     scene = scenes.bodies(200, bodies=3, sigma=1.0, outliers=0.3, generator=draw)
     found = dyn.segment(*scene.views, generator=torch.Generator().manual_seed(0))
