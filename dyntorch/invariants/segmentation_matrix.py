@@ -19,9 +19,11 @@ class SegmentationMatrix(RelationPair):
     Its motion has 14 degrees of freedom, those of two fundamental matrices: for each a homography :math:`A_k` of view 1 to view 2
     and the epipole :math:`e_k` of view 2, :math:`F_k = [e_k]_\times A_k`.  The order of the bodies means nothing.
 
-    S has 35 degrees of freedom for these 14, so noise bends it, and half a pixel often leaves it ``AMBIGUOUS``:
-    :func:`dyntorch.refine`, which varies the true parameters, is what labels noisy matches.  Outliers bend it as well (robust
-    estimation is not sure to stand 5 %); :func:`dyntorch.segment` is for those.
+    S has 35 degrees of freedom for these 14, so noise bends it, and half a pixel often leaves it ``AMBIGUOUS``.  ``OK`` says that
+    no other S fits as well, not that its labels are right: at 0.1 and 0.5 px, 100 and 200 matches, the labels of the fit were 20 %
+    wrong or more in 17 of 60 scenes.  :func:`dyntorch.refine`, which varies the true parameters, is what labels noisy matches: at
+    most 7 % wrong in these.  Outliers bend S as well (robust estimation is not sure to stand 5 %); :func:`dyntorch.segment` is
+    for those.
 
     Source: thesis chapter 6; Wolf and Shashua, CVPR 2001; Vidal, Ma, Soatto and Sastry, IJCV 2006.
 
@@ -32,6 +34,15 @@ class SegmentationMatrix(RelationPair):
         >>> S = dyn.fit(dyn.SegmentationMatrix, *scene.views).tensor
         >>> labels = dyn.SegmentationMatrix.labels(*dyn.SegmentationMatrix.fundamentals(S), *scene.views)
         >>> int((labels == scene.labels).sum()) in (0, 40)
+        True
+
+        Under noise, refine before labelling:
+
+        >>> scene = bodies(100, sigma=0.3, interleaved=True, generator=torch.Generator().manual_seed(0))
+        >>> S = dyn.refine(dyn.fit(dyn.SegmentationMatrix, *scene.views), *scene.views).tensor
+        >>> labels = dyn.SegmentationMatrix.labels(*dyn.SegmentationMatrix.fundamentals(S), *scene.views)
+        >>> wrong = int((labels != scene.labels).sum())
+        >>> min(wrong, 100 - wrong) < 5
         True
     """
 

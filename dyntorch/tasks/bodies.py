@@ -39,15 +39,17 @@ def segment(
         x1: ``(*batch, n, 2)`` points of view 1, pixels; NaN = missing.
         x2: the same points in view 2.
         bodies: how many; None finds out.
-        threshold: greatest Sampson distance of an inlier in the unit of the points, about five standard deviations of the noise
-            of a coordinate.  All scales follow it.  None estimates it from the matches.
-        weights: ``(*batch, n)`` not negative; 0 leaves a match out, others weigh it in the fits.
+        threshold: Sampson distance in the unit of the points, about five standard deviations of the noise of a coordinate, at which
+            a match may as well be an outlier; one that moves like its neighbours may be up to three times as far from its body.
+            All scales follow it.  None estimates it from the matches, in twice the time.
+        weights: ``(*batch, n)`` not negative; 0 leaves a match out, others weigh it in the last fits of the bodies, not in the
+            search for them.
         spatial: whether bodies are regions of the images.  False for bodies that interleave, such as transparent motions or
             sparse points of a crowd: then only the geometry decides, which takes more matches and bears fewer outliers.
-        generator: source of all randomness.
+        generator: source of all randomness; None is torch's global one.
 
     Returns:
-        A :class:`~dyntorch.tasks.segmentation.Segmentation`.
+        A :class:`~dyntorch.tasks.segmentation.Segmentation`, without gradients.
 
     Raises:
         ValueError: fewer than eight matches or than seven for each body, shapes, dtypes or devices that do not agree, a

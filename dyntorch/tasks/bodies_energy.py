@@ -12,6 +12,8 @@ from dyntorch.algebra.homogeneous import homogeneous, skew
 from dyntorch.algebra.rank_two import null_vectors
 from dyntorch.tasks.coherence import Links
 
+PIXELS = 2.5
+"""The default threshold: what figures in pixels refer to."""
 NOISE = 0.7
 """Standard deviation of a Sampson distance, pixels at the default threshold."""
 CAP = 4.0
@@ -31,7 +33,7 @@ class View:
 
     Attributes:
         x1, x2: ``(n, 2)``.
-        pixel: the threshold / 2.5, in these coordinates: a pixel at the default threshold.
+        pixel: the threshold / :data:`PIXELS`, in these coordinates: a pixel at the default threshold.
         links: between matches.
     """
 

@@ -10,8 +10,11 @@ from torch import Tensor
 
 from dyntorch.algebra.epipolar import sampson_squared
 from dyntorch.algebra.plane_homography import homography, homography_sampson_squared
-from dyntorch.tasks.bodies_energy import View
+from dyntorch.tasks.bodies_energy import PIXELS, View
 
+OFF, WIDE = 0.02, 1.5
+"""Share of a planar body that may be off the plane, wrong matches that lie on its epipolar lines; and from which distance they are,
+in thresholds (in two dimensions)."""
 LEAST_NOISE = 0.1
 """Least standard deviation of a coordinate, pixels: no detector is better, and exact data shows none."""
 MEDIAN = 0.455
@@ -41,7 +44,8 @@ def choose(view: View, fundamentals: Tensor, members: Tensor) -> Models:
     .. math:: \sum_i \min\!\Big(\frac{e_i^2}{\sigma^2},\ 2 (4 - d)\Big) + n\,d \log 4 + k \log 4n,
 
     with dimension d = 3 and k = 7 parameters of a fundamental matrix, d = 2 and k = 8 of a homography.  The noise
-    :math:`\sigma` is that of all bodies.
+    :math:`\sigma` is that of all bodies.  The sum bears a few matches off the plane; but a body is no plane if more than
+    :data:`OFF` of it are farther than :data:`WIDE` thresholds.
 
     Args:
         view: matches.
@@ -58,7 +62,8 @@ def choose(view: View, fundamentals: Tensor, members: Tensor) -> Models:
     planar = homography_sampson_squared(plane, view.x1, view.x2)
     first = _criterion(epipolar / noise, members, 3, 7)
     second = _criterion(planar / noise, members, 2, 8)
-    return Models(plane, second < first)
+    off = ((planar > (WIDE * PIXELS * view.pixel) ** 2) * members).sum(-1) / members.sum(-1).clamp(min=TINY)
+    return Models(plane, (second < first) & (off <= OFF))
 
 
 def _noise(square: Tensor, members: Tensor) -> Tensor:

@@ -74,34 +74,34 @@ def fitted(view: View, labels: Tensor, count: int) -> Starts:
     return Starts(labels, found.unflatten(0, member.shape[:2]))
 
 
-def best_sets(cost: Tensor, count: int, first: int | None = None) -> Tensor:
-    """Sets ``(s, count)`` of geometries of least total cost, :math:`\\sum_i \\min_{k \\in \\text{set}} c_{ki}`, the best first.
+def best_sets(cost: Tensor, most: int, first: int | None = None) -> list[Tensor]:
+    """Sets ``(s, K)`` of geometries of least total cost, :math:`\\sum_i \\min_{k \\in \\text{set}} c_{ki}`, the best first.
 
     Args:
         cost: ``(P, n)``.
-        count: geometries of a set; sets grow by one at a time.
+        most: geometries of the largest sets; sets grow by one at a time.
         first: how many of the best geometries the sets start from; None: all.
+
+    Returns:
+        The sets of one, two, ... ``most`` geometries; none where there are fewer.
     """
     single = cost.float()
     size = len(single)
     sets = single.sum(-1).argsort(stable=True)[: size if first is None else first, None]
-    for _ in range(1, count):
+    found = [sets]
+    for count in range(2, most + 1):
         if not len(sets):  # fewer geometries than bodies
-            return sets.new_zeros(0, count)
+            found.append(sets.new_zeros(0, count))
+            continue
         least = single[sets].amin(1)
         grown = torch.stack([torch.minimum(row, single).sum(-1) for row in least])
         place = grown.flatten().topk(min(5 * SETS, grown.numel()), largest=False).indices
         candidates = torch.cat([sets[place // size], (place % size)[:, None]], dim=-1).sort(-1).values
         candidates = candidates[(candidates.diff(dim=-1) > 0).all(-1)]
-        sets = candidates[_first_places(candidates)][:SETS]
-    return sets
-
-
-def _first_places(rows: Tensor) -> Tensor:
-    """Places of the first of all equal rows, in order."""
-    _, inverse = torch.unique(rows, dim=0, return_inverse=True)
-    first = torch.full_like(inverse, len(rows)).scatter_reduce(0, inverse, torch.arange(len(rows), device=rows.device), "amin")
-    return first[first < len(rows)].sort().values
+        different = list(dict.fromkeys(map(tuple, candidates.tolist())))[:SETS]
+        sets = torch.tensor(different, dtype=torch.long, device=cost.device).view(-1, count)
+        found.append(sets)
+    return found
 
 
 def distinct(view: View, starts: Starts) -> Starts:
@@ -112,14 +112,13 @@ def distinct(view: View, starts: Starts) -> Starts:
     cost = torch.where(member.sum(-1).amin(-1) >= LEAST, cost, torch.inf)
     order = cost.argsort(stable=True)
     order = order[cost[order].isfinite()]
-    member = member[order].float()
+    flat = member[order].float().flatten(0, 1)
+    shared = (flat @ flat.mT).unflatten(0, (-1, count)).unflatten(-1, (-1, count))
+    alike = (shared.amax(1).sum(-1) > DISTINCT * flat.shape[-1]).tolist()
     kept: list[int] = []
-    for index in range(len(member)):
-        shared = (member[kept] @ member[index].mT).amax(1).sum(-1)
-        if not bool((shared > DISTINCT * member.shape[-1]).any()):
+    for index in range(len(order)):
+        if len(kept) < KEPT and not any(alike[other][index] for other in kept):
             kept.append(index)
-        if len(kept) == KEPT:
-            break
     return Starts(starts.labels[order[kept]], starts.fundamentals[order[kept]])
 
 

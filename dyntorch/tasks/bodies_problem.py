@@ -20,6 +20,7 @@ from dyntorch.tasks.bodies_pool import LEAST
 from dyntorch.tasks.bodies_samples import search_samples
 from dyntorch.tasks.bodies_search import search
 from dyntorch.tasks.coherence import Links, coherence
+from dyntorch.tasks.segmentation import BodyModel
 
 SIGMAS = 5.0
 """Threshold over the noise of a coordinate."""
@@ -39,6 +40,8 @@ LEFT, LEFT_SHARE = 10, 0.08
 """Linked matches without a body, and their share of all linked ones, from which one body more is tried."""
 GUESS = 0.003
 """Threshold over the diagonal of the image, where it has to be estimated."""
+MEDIANS = {BodyModel.FUNDAMENTAL: 0.6745, BodyModel.HOMOGRAPHY: 1.1774}
+"""Median Sampson distance of inliers, in units of the noise of a coordinate."""
 
 
 @dataclass(frozen=True)
@@ -55,15 +58,23 @@ def solve(x1: Tensor, x2: Tensor, weights: Tensor, request: Request) -> Outcome:
     """Segment one problem of matches ``(n, 2)`` with weights ``(n,)``, 0 = missing."""
     if request.threshold is not None:
         return _solve(x1, x2, weights, request, request.threshold)
-    present = x1[weights > 0]
-    size = float((present.amax(0) - present.amin(0)).norm()) if len(present) else 0.0
+    size = _diagonal(x1[weights > 0])
     first = _solve(x1, x2, weights, request, GUESS * size if size > 0 else 1.0)
-    inliers = first.residuals[first.labels > 0]
-    if not len(inliers):
+    if not first.count:
         return first
-    # distances in one dimension: their median is 0.67 standard deviations
-    noise = float(inliers.median()) / 0.6745
+    # the median distance in standard deviations: in one dimension from epipolar lines, in two from the points of a plane
+    medians = first.labels.new_tensor([MEDIANS[model] for model in first.models], dtype=x1.dtype)
+    inlier = first.labels > 0
+    noise = float((first.residuals[inlier] / medians[first.labels[inlier] - 1]).median())
     return _solve(x1, x2, weights, request, max(SIGMAS * noise, 1e-6 * size))
+
+
+def _diagonal(x: Tensor) -> float:
+    """Of the image, by most of its points ``(n, 2)``: some may be garbage."""
+    if not len(x):
+        return 0.0
+    low, high = x.quantile(x.new_tensor([0.05, 0.95]), dim=0)
+    return float((high - low).norm()) / 0.9
 
 
 def _solve(x1: Tensor, x2: Tensor, weights: Tensor, request: Request, threshold: float) -> Outcome:
@@ -112,8 +123,10 @@ def _left(given: Given, labelled: Labelling) -> int:
 def _given(x1: Tensor, x2: Tensor, weights: Tensor, present: Tensor, threshold: float, spatial: bool, repeated: float) -> Given:
     """The present matches ``(m, 2)`` around 0 and of about unit size, by one scale: distances stay comparable."""
     centres = x1.median(0).values, x2.median(0).values
-    spread = torch.cat([x1 - centres[0], x2 - centres[1]]).norm(dim=-1).median()
-    scale = 1 / spread if bool(spread > 0) else torch.ones_like(spread)
+    distance = torch.cat([x1 - centres[0], x2 - centres[1]]).norm(dim=-1)
+    # copies of one match that are the majority have no spread
+    spread = distance[distance > 0].median() if bool(distance.any()) else torch.ones_like(distance[0])
+    scale = 1 / spread
     first, second = (similarity(scale, centre) for centre in centres)
     a, b = (((x - centre) * scale).clamp(-FARTHEST, FARTHEST) for x, centre in zip((x1, x2), centres, strict=True))
     pixel = threshold / PIXELS * float(scale)

@@ -55,10 +55,11 @@ def search_samples(view: View, counts: Sequence[int], generator: torch.Generator
     """
     pool = _pool(view, min(counts), max(counts), generator)
     cost = rough_cost(view, pool)
+    sets = best_sets(cost, max(counts), FIRST)
     starts = []
     for count in counts:
         if count <= len(pool):
-            chosen = best_sets(cost, count, FIRST)[:STARTS]
+            chosen = sets[count - 1][:STARTS]
             starts.append(Starts(cost[chosen].argmin(1), pool[chosen]))
     found = descended(view, starts) if starts else {}
     return {count: _ranked(view, found.get(count, [])) for count in counts}
@@ -105,7 +106,7 @@ def _pool(view: View, least: int, most: int, generator: torch.Generator | None) 
         if count == most or len(pool) < count:
             break
         cost = rough_cost(view, pool)
-        sets = best_sets(cost, count, FIRST)[:PARTIAL]
+        sets = best_sets(cost, count, FIRST)[-1][:PARTIAL]
         total = float(_distances(view, pool[sets]).amin(1).sum(-1).min())
         if count > least and last - total < WORTH * len(view.x1) ** 0.5:
             break

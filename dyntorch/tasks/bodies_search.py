@@ -42,9 +42,10 @@ def search(
         # linear: the search improves it, and its weights would take longer than all flows
         pool = torch.cat([pool, matrix_pairs(view, torch.ones_like(view.x1[None, :, 0]), rounds=0)])
     cost = smoothed(rough_cost(view, pool), view)
+    sets = best_sets(cost, max(counts))
     starts = []
     for count in counts:
-        starts.append(set_starts(pool, cost, best_sets(cost, count)))
+        starts.append(set_starts(pool, cost, sets[count - 1]))
         groups = [labels[plan == count], *(x[None] for x in extra if int(x.max()) + 1 == count)]
         starts += [fitted(view, x, count) for x in groups if len(x)]
     return descended(view, [distinct(view, start) for start in starts])

@@ -21,12 +21,16 @@ TABLE = 1 << 22  # distances held at a time
 RATIOS, MODES = 400, 16  # pairs of neighbours, and starts among them, by which the common motion is looked for
 DISTORTED = 0.35
 """Zoom and rotation, as the distance of the complex factor from 1, from which the local motions start from it."""
+APART, OTHERS = 0.7, 0.1
+"""Relative distance of a further factor from the first ones from which local motions start from either (a local fit does not get so
+far), and share of the pairs that must have it: wrong matches beside right ones agree on 0.05 to 0.08 by chance."""
 SHARED = 0.05
 """Share of the pairs that must have it: 0.02 to 0.04 of random matches agree by chance, 0.06 of 30 % right matches do."""
 
 
-DENSE = 1500
-"""Matches up to which links are one dense matrix: 2 ms against 9 ms per product with 40 columns at 1100 matches."""
+DENSE = 1000
+"""Matches up to which links are a dense matrix: milliseconds per product with 320 columns at 340, 550, 1100 matches 1.0, 2.2, 11;
+of a sparse one 1.2, 1.6, 4.8, but with two copies."""
 
 
 @dataclass(frozen=True)
@@ -42,18 +46,18 @@ class Links:
     weight: Tensor
 
     @cached_property
-    def _dense(self) -> Tensor:
-        count = len(self.index)
-        full = torch.zeros(count, count, dtype=self.weight.dtype, device=self.weight.device)
-        return full.scatter_add_(1, self.index, self.weight)
+    def _matrices(self) -> dict[torch.dtype, Tensor]:
+        """Column i holds the neighbours of i; of many matches, sparse."""
+        row, slot = self.weight.nonzero(as_tuple=True)
+        place, size = torch.stack([self.index[row, slot], row]), (len(self.index), len(self.index))
+        matrix = torch.sparse_coo_tensor(place, self.weight[row, slot], size, check_invariants=False).coalesce()
+        if len(self.index) <= DENSE:
+            matrix = matrix.to_dense()
+        return {dtype: matrix.to(dtype) for dtype in (torch.float32, torch.float64)}
 
     def pull(self, values: Tensor) -> Tensor:
         """Weighted sums over the neighbours: ``(*, n)`` to ``(*, n)``."""
-        if not self.index.shape[1]:
-            return torch.zeros_like(values)
-        if len(self.index) <= DENSE:
-            return values @ self._dense.to(values.dtype).mT  # row i holds the neighbours of i
-        return torch.stack([(row[self.index] * self.weight).sum(-1) for row in values.flatten(0, -2)]).view(values.shape)
+        return values @ self._matrices[values.dtype]
 
     def cut(self, members: Tensor) -> Tensor:
         """Sum of the links between different bodies: members ``(*batch, K, n)``, 0 or 1, to ``(*batch,)``."""
@@ -105,7 +109,8 @@ def coherence(x1: Tensor, x2: Tensor, scale: float) -> Coherence:
         \qquad w_{ij} = e^{-(r_{ij}/\tau)^2},
 
     where d is a few times the usual distance of neighbours (far from all others, any motion would be small beside it), G is the
-    zoom and rotation common to most neighbours, and :math:`L_i` the weighted least squares towards it.
+    zoom and rotation common to most neighbours, or to many others of which match i is one (a body that turns far), and
+    :math:`L_i` the weighted least squares towards it.
 
     Args:
         x1: ``(n, 2)`` matches.
@@ -129,10 +134,12 @@ def _judged(x1: Tensor, x2: Tensor, eligible: Tensor, scale: float) -> tuple[Ten
     for a, b in ((x1, x2), (x2, x1)):
         index, usable = _nearest(a, b, eligible.nonzero().flatten(), scale / 6)
         da, db = a[index] - a[:, None], b[index] - b[:, None]
-        common = _common_motion(da, db, usable)
-        deviation = _deviation(da, db, usable, common, _reach(da, usable, eligible), scale)
-        agreed = torch.exp(-((deviation / TOLERANCE) ** 2)) * usable
-        values = values + agreed.sum(-1) / usable.sum(-1).clamp(min=1) / 2
+        reach = _reach(da, usable, eligible)
+        each = torch.stack([_deviation(da, db, usable, common, reach, scale) for common in _common_motions(da, db, usable)])
+        # a match follows the one of the common motions by which it agrees most with its neighbours
+        agreed, best = (torch.exp(-((each / TOLERANCE) ** 2)) * usable).sum(-1).max(0)
+        deviation = each[best, torch.arange(count, device=x1.device)]
+        values = values + agreed / usable.sum(-1).clamp(min=1) / 2
         linked = torch.exp(-((deviation[:, :EDGES] / EDGE_TOLERANCE) ** 2)) * usable[:, :EDGES]
         rows.append(torch.arange(count, device=x1.device)[:, None].expand_as(linked).flatten())
         columns.append(index[:, :EDGES].flatten())
@@ -206,19 +213,19 @@ def _nearest(a: Tensor, b: Tensor, among: Tensor, least: float) -> tuple[Tensor,
     return torch.cat(indices), torch.cat(exist)
 
 
-def _common_motion(da: Tensor, db: Tensor, usable: Tensor) -> Tensor:
-    """The similarity ``(2, 2)`` that most neighbours share: the identity, unless zoom and rotation are far from it."""
+def _common_motions(da: Tensor, db: Tensor, usable: Tensor) -> Tensor:
+    """The similarities ``(m, 2, 2)`` that many neighbours share, those that differ much, the identity for all near it."""
     size = da.square().sum(-1)
     near = usable & (size > 0)
+    pair = near.flatten().nonzero().flatten()
+    pair = pair[:: max(1, len(pair) // RATIOS)]
+    da, db, size = da.flatten(0, 1)[pair], db.flatten(0, 1)[pair], size.flatten()[pair]
     # zoom and rotation as a complex number, db / da
-    real = ((da * db).sum(-1) / size)[near]
-    imaginary = ((da[..., 0] * db[..., 1] - da[..., 1] * db[..., 0]) / size)[near]
-    factor = torch.stack([real, imaginary], dim=-1)
-    factor = factor[:: max(1, len(factor) // RATIOS)]
-    identity = torch.eye(2, dtype=da.dtype, device=da.device)
+    turned = da[:, 0] * db[:, 1] - da[:, 1] * db[:, 0]
+    factor = torch.stack([(da * db).sum(-1), turned], dim=-1) / size[:, None]
     if not len(factor):
-        return identity
-    # the mode, by mean shift from some of them, with a window relative to their size
+        return torch.eye(2, dtype=da.dtype, device=da.device)[None]
+    # the modes, by mean shift from some of them, with a window relative to their size
     mode = factor[:: max(1, len(factor) // MODES)]
     score = torch.zeros_like(mode[:, 0])
     for _ in range(5):
@@ -226,10 +233,14 @@ def _common_motion(da: Tensor, db: Tensor, usable: Tensor) -> Tensor:
         weight = torch.exp(-((torch.cdist(mode, factor) / window) ** 2))
         score = weight.sum(-1)
         mode = weight @ factor / score.clamp(min=torch.finfo(da.dtype).tiny)[:, None]
-    best = mode[score.argmax()]
-    if float(score.max()) < SHARED * len(factor) or float((best - factor.new_tensor([1.0, 0.0])).norm()) <= DISTORTED:
-        return identity
-    return torch.stack([torch.stack([best[0], -best[1]]), torch.stack([best[1], best[0]])])
+    order = score.argsort(descending=True, stable=True)
+    kept: list[complex] = []
+    for (real, imaginary), share in zip(mode[order].tolist(), (score[order] / len(factor)).tolist(), strict=True):
+        found = complex(real, imaginary)
+        found = 1.0 if abs(found - 1) <= DISTORTED else found
+        if share >= (OTHERS if kept else SHARED) and all(abs(found - other) > APART * abs(other) for other in kept):
+            kept.append(found)
+    return torch.tensor([[[z.real, -z.imag], [z.imag, z.real]] for z in kept or [1.0]], dtype=da.dtype, device=da.device)
 
 
 def _reach(da: Tensor, usable: Tensor, eligible: Tensor) -> Tensor:

@@ -47,8 +47,8 @@ def translating_planes(
     on the Sampson distances of all of them, and the best is kept.  With matches the error is a third to a half of that without.
 
     Args:
-        H: ``(*batch, p, 3, 3)`` homographies of the planes, view 1 to view 2, each of any scale; NaN = missing.  None fits them
-            to the matches, or means no planes.
+        H: ``(*batch, p, 3, 3)`` homographies of the planes, view 1 to view 2, each of any scale; NaN = missing.  Those of OpenCV
+            go in as ``torch.as_tensor(numpy.stack(list_of_H))``.  None fits them to the matches, or means no planes.
         fundamentals: ``(*batch, m, 3, 3)`` of bodies with depth, :math:`x_2^T F x_1 = 0`; None fits them to ``body_matches``.  One
             of them is worth many planes.
         x1: matches of every plane in view 1, ``(*batch, p, n, 2)``, NaN = missing, or p tensors ``(*batch, n_i, 2)``; pixels.

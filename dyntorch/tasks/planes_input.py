@@ -138,12 +138,19 @@ def padded(name: str, views: tuple[Points, Points]) -> Pair:
     Raises:
         ValueError: shapes that do not fit each other.
     """
+    if len(views) != 2 or any(not isinstance(x, Tensor | Sequence) or isinstance(x, str) for x in views):
+        kinds = ", ".join(type(x).__name__ for x in views)
+        raise ValueError(f"{name} must be two views, each a tensor or a list of tensors, got {len(views)}: {kinds}")
     first, second = (x if isinstance(x, Tensor) else _stacked(name, x) for x in views)
     if first.shape != second.shape or first.ndim < 3 or first.shape[-1] != 2 or not first.is_floating_point():
         raise ValueError(
             f"{name} must be two views (*batch, planes, n, 2), or lists of (*batch, n, 2), of one floating point type, "
             f"got {tuple(first.shape)} {first.dtype} and {tuple(second.shape)} {second.dtype}"
         )
+    if not any(isinstance(x, Tensor) for x in views):
+        counts = [[torch.as_tensor(x).shape[-2] for x in view] for view in views]
+        if counts[0] != counts[1]:
+            raise ValueError(f"{name} must be the same points in both views, got {counts[0]} and {counts[1]}; NaN = missing")
     return first, second
 
 
@@ -227,9 +234,12 @@ def cameras(calibration: Tensor | Pair, batch: tuple[int, ...], like: Tensor) ->
     Raises:
         ValueError: neither one matrix nor two.
     """
-    pair = (calibration, calibration) if isinstance(calibration, Tensor) else tuple(calibration)
-    if len(pair) != 2 or any(not isinstance(k, Tensor) or k.shape[-2:] != (3, 3) for k in pair):
-        raise ValueError("calibration must be K (3, 3) or (*batch, 3, 3) of both views, or a pair (K1, K2) of them")
+    pair = (calibration, calibration) if not isinstance(calibration, Sequence) else tuple(calibration)
+    if len(pair) != 2 or any(not isinstance(k, Tensor) or k.shape not in ((3, 3), (*batch, 3, 3)) for k in pair):
+        got = " and ".join(str(tuple(k.shape)) if isinstance(k, Tensor) else type(k).__name__ for k in pair)
+        raise ValueError(
+            f"calibration must be K (3, 3) or (*batch, 3, 3) of both views, batch {batch}, or a pair (K1, K2) of them, got {got}"
+        )
     found = torch.stack([k.to(like).expand(*batch, 3, 3) for k in pair], dim=-3)
     if not bool(found.isfinite().all()) or bool((torch.linalg.det(found) == 0).any()):
         raise ValueError("calibration must be finite and invertible; a camera has K = [f 0 u; 0 f v; 0 0 1]")

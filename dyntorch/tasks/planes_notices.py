@@ -60,13 +60,38 @@ class Figures:
     def several(self) -> Tensor:
         """Where more than one homography at infinity fits the planes, by their position ``(b,)``.
 
-        A static plane among three may as well be a second plane of another one's body, under a family of homographies at
-        infinity.  Four planes with collinear epipoles and coplanar normals have two solutions.
+        All that moves alike is one body, and two planes of it are worth its fundamental matrix.  Three bodies are enough, two if
+        both fundamental matrices are known.  A static plane adds nothing: it may as well be one more plane of any of them.
+        Four planes with collinear epipoles and coplanar normals have two solutions.
         """
         planes = self.normals.shape[1]
         count, bodies = self.used[:, :planes].sum(-1), self.used[:, planes:].sum(-1)
-        still = (self.used & ~self.moving).any(-1)
-        return (bodies == 0) & ((still & (count <= 3)) | (self.line()[1] & self.plane()[1] & (count <= 4)))
+        groups, known = self.groups()
+        parallel = (bodies == 0) & self.line()[1] & self.plane()[1] & (count <= 4)
+        return (groups < 2) | ((groups == 2) & (known < 2)) | parallel
+
+    def alike(self) -> Tensor:
+        """Which pairs have one epipole within the noise, ``(b, c, c)`` bool; no pair with itself."""
+        e = torch.where(self.moving[..., None], self.epipoles, 0.0)
+        sign = (e @ e.mT).sign()
+        square = (e[:, :, None] - sign[..., None] * e[:, None]).square().sum(-1)
+        spread = self.epipole_covariance.diagonal(dim1=-2, dim2=-1).sum(-1)
+        variance = (spread[:, :, None] + spread[:, None]) / 2
+        near = (square < NEAR**2) & (square <= CHI_SQUARE * (variance + EXACT**2))
+        both = self.moving[:, :, None] & self.moving[:, None]
+        return near & both & ~torch.eye(e.shape[1], dtype=torch.bool, device=e.device)
+
+    def groups(self) -> tuple[Tensor, Tensor]:
+        """How many bodies move, and of how many the fundamental matrix is known, given or from two planes; ``(b,)`` each."""
+        count = self.epipoles.shape[1]
+        near = self.alike().double()
+        reach = near + torch.eye(count, dtype=near.dtype, device=near.device)
+        for _ in range(count.bit_length()):
+            reach = (reach @ reach).sign()
+        own = torch.arange(count, device=near.device) >= self.normals.shape[1]
+        known = near.any(-1) | (own & self.moving)
+        first = self.moving & ~reach.tril(diagonal=-1).any(-1)
+        return first.sum(-1), (first & (reach @ known.double()[..., None] > 0)[..., 0]).sum(-1)
 
 
 def planes_notices(
@@ -86,12 +111,14 @@ def planes_notices(
     missing = figures.used.shape[1] - used
     line, collinear = figures.line()
     plane, coplanar = figures.plane()
-    pairs = _alike(figures)
+    pairs = figures.alike().sum((-2, -1)) // 2
+    # one or two bodies are in one line and one plane by themselves
+    several = enough & (figures.groups()[0] >= 3)
     rows = (
         (NoticeCode.UNUSED_PLANE, missing, missing > 0),
         (NoticeCode.FEW_PLANES, used, ~enough),
-        (NoticeCode.COLLINEAR_EPIPOLES, line, collinear & enough),
-        (NoticeCode.COPLANAR_NORMALS, plane, coplanar & enough),
+        (NoticeCode.COLLINEAR_EPIPOLES, line, collinear & several),
+        (NoticeCode.COPLANAR_NORMALS, plane, coplanar & several),
         (NoticeCode.SHARED_BODY, pairs, (pairs > 0) & enough),
         (NoticeCode.STATIC_BODY, still, (still > 0) & enough),
         (NoticeCode.UNCERTAIN, uncertainty, uncertain & enough),
@@ -112,16 +139,3 @@ def _flatness(vectors: Tensor, covariance: Tensor, count: Tensor) -> tuple[Tenso
     square = (distance.square() / (variance + EXACT**2)).sum(-1)
     spare = (count.sum(-1) - 2).clamp(min=1)
     return ratio, (count.sum(-1) >= 3) & (ratio < NEAR) & (square <= CHI_SQUARE * spare)
-
-
-def _alike(figures: Figures) -> Tensor:
-    """How many pairs ``(b,)`` have one epipole within the noise."""
-    e, c = figures.epipoles, figures.epipole_covariance
-    e = torch.where(figures.moving[..., None], e, 0.0)
-    cosine = e @ e.mT
-    difference = e[:, :, None] - cosine.sign()[..., None] * e[:, None]
-    square = difference.square().sum(-1)
-    variance = (c.diagonal(dim1=-2, dim2=-1).sum(-1)[:, :, None] + c.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None]) / 2
-    both = figures.moving[:, :, None] & figures.moving[:, None]
-    near = both & (square < NEAR**2) & (square <= CHI_SQUARE * (variance + EXACT**2))
-    return near.triu(diagonal=1).sum((-2, -1))

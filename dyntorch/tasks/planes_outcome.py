@@ -12,7 +12,7 @@ from dyntorch.tasks.planes_input import Given, enough
 from dyntorch.tasks.planes_notices import EXACT, NEAR, Figures, planes_notices
 from dyntorch.tasks.planes_problem import Layout
 from dyntorch.tasks.planes_result import TranslatingPlanes
-from dyntorch.tasks.planes_solver import projected
+from dyntorch.tasks.planes_solver import noise_variance, projected
 
 UNCERTAIN = 0.5
 """Expected relative error of the homography at infinity, in normalized coordinates, from which on nothing is known of it."""
@@ -33,8 +33,7 @@ def outcome(given: Given, found: tuple[Tensor, ...], method: str) -> Translating
     used = given.used()
     planes, bodies = used[:, : layout.planes].sum(-1), used[:, layout.planes :].sum(-1)
     rows, spare = given.rows()
-    variance = torch.where(spare > 0, cost / spare.clamp(min=1), 0.0)
-    covariance = variance[:, None, None] * covariance
+    covariance = noise_variance(cost, spare)[:, None, None] * covariance
     uncertainty = projected(covariance[:, :9, :9], theta[:, :9]).diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
     right = enough(planes, bodies, method)
     figures = _figures(layout, theta, covariance, used)

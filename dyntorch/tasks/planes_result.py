@@ -34,7 +34,7 @@ class TranslatingPlanes:
         residual: ``(*batch,)`` rms Sampson distance of the matches (each coordinate counts), in their unit; without matches rms
             difference of the entries of matrices of norm 1 in normalized coordinates.
         covariance: ``(*batch, 9, 9)`` of the entries of the homography at infinity, row by row, from the noise that the residuals
-            show; 0 where nothing is left to judge by.
+            show, rather too large where few of them are to spare; 0 where nothing is left to judge by.
         uncertainty: ``(*batch,)`` expected relative error of the homography at infinity in normalized coordinates.
         status: ``(*batch,)`` of :class:`dyntorch.Status`.
         rotation: ``(*batch, 3, 3)`` camera 1 to camera 2, where the calibration was given.

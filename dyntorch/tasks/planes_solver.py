@@ -22,6 +22,8 @@ APART = 0.3
 """Sine of homographies at infinity that are two solutions: a camera that turns by 20 degrees moves them as far."""
 LIKELY = 4.0
 """Difference of costs in noise variances up to which a solution is as likely as the best."""
+QUARTILE = -0.6745
+"""Normal deviate that one in four falls short of."""
 EXACT = 1e-20
 """Cost that is rounding error."""
 FLOOR = 1e-15
@@ -98,8 +100,24 @@ def _others(infinity: Tensor, cost: Tensor, best: Tensor, spare: Tensor) -> Tens
     everyone = torch.arange(len(best), device=best.device)
     least = cost[best, everyone]
     sine = (1 - (directions * directions[best, everyone]).sum(-1).square()).clamp(min=0).sqrt()
-    limit = least + LIKELY * least / spare.clamp(min=1) + EXACT * (least + 1)
+    limit = least + LIKELY * noise_variance(least, spare) + EXACT * (least + 1)
     return ((cost <= limit) & (sine > APART)).any(0)
+
+
+def noise_variance(cost: Tensor, spare: Tensor) -> Tensor:
+    r"""Variance of the noise, :math:`c / q` with the lower quartile q of :math:`\chi^2`, which is near the number of residuals to
+    spare where that is large; 0 where none is.
+
+    Three planes have one to spare, which is often near 0 by chance: :math:`c / 1` would say so every time.
+
+    Args:
+        cost: c ``(b,)``.
+        spare: ``(b,)`` residuals beyond the degrees of freedom.
+
+    Source: Wilson and Hilferty 1931 (the distribution of chi-square): its cube root is about normal.
+    """
+    width = 2 / (9 * spare.clamp(min=1))
+    return torch.where(spare > 0, cost / (spare.clamp(min=1) * (1 - width + QUARTILE * width.sqrt()) ** 3), 0.0)
 
 
 def _covariance(problem: PlanesProblem, theta: Tensor) -> tuple[Tensor, Tensor]:

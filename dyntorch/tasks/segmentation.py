@@ -46,10 +46,12 @@ class Segmentation:
         models: for one problem a tuple of K :class:`BodyModel`, for a batch nested tuples.
         probabilities: ``(*batch, n, K + 1)``: column 0 outlier, then the bodies; rows sum to 1 (0 for missing matches).
         residuals: ``(*batch, n)`` Sampson distance from the own body's model, for outliers from the nearest body's, in the unit of
-            the points; 0 where there is no body.
+            the points; 0 where there is no body.  Labels are found by the fundamental matrices: where ``models`` says homography,
+            a few matches of the body may be far from its plane.
         coherence: ``(*batch, n)`` in [0, 1]: how well a match moves like its neighbours in both images; 0 where ``spatial=False``.
         status: ``(*batch,)`` of :class:`dyntorch.Status`.
-        threshold: ``(*batch,)`` greatest Sampson distance of an inlier, in the unit of the points.
+        threshold: ``(*batch,)`` Sampson distance that divides inliers from outliers where nothing else is known, as in
+            :func:`dyntorch.segment`, in the unit of the points.
         warnings: notices.
     """
 
@@ -107,7 +109,8 @@ def segmentation_notices(found: list[Outcome], bodies: int | None, batch: tuple[
     if bodies is not None:
         message = f"{bodies} bodies were asked for, the matches carry {{value:g}}; ask for fewer, or add matches of the others"
         said += notices(NoticeCode.FEWER_BODIES, message, count, tried & (count < bodies), batch)
-        spare = torch.tensor([outcome.spare for outcome in found])
+        # where a body got lost, the notice above says so
+        spare = torch.tensor([outcome.spare for outcome in found]) & (count == bodies)
         message = f"{{value:g}} bodies explain the matches no worse than {bodies}: one may be a part of another; ask for fewer"
         said += notices(NoticeCode.SPARE_BODY, message, count - 1, spare, batch)
     message = "a share of {value:.2g} of the matches repeats others and says nothing new; remove repeated matches"

@@ -46,7 +46,7 @@ class Segment:
     bodies: Annotated[int | Literal["auto"], tyro.conf.arg(metavar="K|auto")] = "auto"
     """how many bodies there are"""
     threshold: Annotated[float | Literal["auto"], tyro.conf.arg(metavar="PX|auto")] = 2.5
-    """greatest distance of an inlier in pixels: three to five times the noise of a coordinate; auto estimates it"""
+    """greatest distance of an inlier in pixels: about five times the noise of a coordinate; auto estimates it"""
     spatial: bool = True
     """neighbours tend to move with one body; --no-spatial where bodies are transparent or interleaved"""
     pair: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
@@ -108,7 +108,7 @@ class Segment:
         """What to say about the input.
 
         Raises:
-            ValueError: too few matches.
+            ValueError: too few matches, or a threshold larger than all that they cover.
         """
         import numpy as np
 
@@ -124,13 +124,18 @@ class Segment:
         reach = float(np.ptp(np.concatenate([pair.x1[seen], pair.x2[seen]]), axis=0).max())
         if self.threshold != "auto" and reach < SMALL * float(self.threshold):
             said = f"the points lie within {reach:.3g}, and --threshold is {self.threshold:g}"
+            if 0 < reach <= float(self.threshold):  # anything would fit anything
+                raise ValueError(f"{pair.path}: {said}: give --threshold in the unit of the points, or --threshold auto")
             notes.append(f"{said}; if they are not in pixels, give --threshold in their unit, or auto")
-        for photograph, points in zip(photographs, (pair.x1[seen], pair.x2[seen]), strict=False):
-            wide, tall = photograph.size
+        size = self.size or pair.size
+        frames = [(photograph.name, photograph.size) for photograph in photographs]
+        frames = frames or [(f"image {i}", size) for i in (1, 2) if size is not None]
+        for (name, (wide, tall)), points in zip(frames, (pair.x1[seen], pair.x2[seen]), strict=False):
             out = int(((points < -0.5) | (points > np.array([wide, tall]) - 0.5)).any(axis=1).sum())
             if out > OUTSIDE * number:
-                said = f"{out:,} of {number:,} matches lie outside of {photograph.name} ({wide:g} by {tall:g})"
-                notes.append(f"{said}; give the images in the order and size in which the matches were found")
+                said = f"{out:,} of {number:,} matches lie outside of {name} ({wide:g} by {tall:g})"
+                what = "images" if photographs else "size of the images"
+                notes.append(f"{said}; give the {what} in which the matches were found, in their order, and x before y")
         return notes
 
     def _solve(self, pair: MatchedPair) -> Any:

@@ -81,7 +81,7 @@ def read_pair(path: str | Path, pair: str | None = None) -> MatchedPair:
     if head.startswith(b"\x93NUMPY"):
         values = load(path)
         if values.ndim != 2 or values.shape[1] != 4:
-            raise error(path, f"the array has shape {values.shape}", "matches are (n, 4): x1, y1, x2, y2")
+            raise error(path, f"the array has shape {values.shape}", "matches are (n, 4): x1, y1, x2, y2; numpy.hstack([x1, x2])")
         return _pair(path, path.name, _points(values[:, :2], path), _points(values[:, 2:], path))
     if b"\0" in head:
         raise error(path, "is a binary file of no known format", FORMATS)
@@ -98,7 +98,12 @@ def _points(values: Any, where: str | Path) -> FloatArray:
     if array.ndim == 3 and array.shape[1:] == (1, 2):
         array = array[:, 0]
     if array.ndim != 2 or array.shape[1] != 2:
-        raise error(where, f"the array has shape {array.shape}", "points of an image are (n, 2)")
+        how = ""
+        if array.ndim == 2 and 3 in array.shape[1:]:
+            how = ": divide homogeneous ones by their third coordinate"
+        elif array.ndim == 2 and array.shape[0] == 2:
+            how = ": transpose it"
+        raise error(where, f"the array has shape {array.shape}", f"points of an image are (n, 2){how}")
     return as_view(array, where)
 
 
@@ -174,13 +179,14 @@ def _table(path: Path) -> MatchedPair:
         names = _unnamed(path, rows[0][1])
     else:
         names, rows = [cell.strip().lower() for cell in rows[0][1]], rows[1:]
-        if not rows:
-            raise error(path, "the file has a header but no rows", "export it again")
-    table.check_widths(path, rows, names)
     absent = [name for name in COLUMNS if name not in names]
     if absent:
-        said = f"has no column {absent[0]!r} (its columns are {', '.join(name or '(unnamed)' for name in names)})"
+        columns = ", ".join(name or "(unnamed)" for name in names[:LISTED]) + ", ..." * (len(names) > LISTED)
+        said = f"has no column {absent[0]!r} (its columns are {columns})"
         raise error(path, said, "name the columns x1,y1,x2,y2 (and perhaps id, weight, label)")
+    if not rows:
+        raise error(path, "the file has a header but no rows", "export it again")
+    table.check_widths(path, rows, names)
     twice = next((name for name in names if names.count(name) > 1 and name in (*COLUMNS, *IDS, *table.WEIGHTS, *KNOWN)), None)
     if twice is not None:
         raise error(path, f"there are two columns {twice!r}", "leave one of them out")

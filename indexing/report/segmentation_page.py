@@ -55,7 +55,7 @@ def _headline(report: SegmentationReport) -> list[Card]:
     items.append(Card("On a body", f"{number - counts['outlier']:,}", f"of {number:,} matches"))
     rest = f", and {counts['missing']:,} missing in an image" if counts["missing"] else ""
     items.append(Card("Outliers", f"{counts['outlier']:,}", f"{_share(counts['outlier'], number)} of the matches{rest}"))
-    items.append(Card("Residual", f"{_rms(report) or 'no'} px", f"rms; inliers are nearer than {report.threshold:.3g} px"))
+    items.append(Card("Residual", f"{_rms(report) or 'no'} px", f"rms; the threshold is {report.threshold:.3g} px"))
     if report.misclassified is not None:
         items.append(Card("Misclassified", f"{100 * report.misclassified:.2g} %", "against the labels of the file"))
     return items
@@ -67,7 +67,8 @@ def _rms(report: SegmentationReport, label: int | None = None) -> str:
 
 
 def _share(part: int, whole: int) -> str:
-    return f"{100 * part / max(1, whole):.0f} %"
+    share = 100 * part / max(1, whole)
+    return "under 1 %" if 0 < share < 1 else f"{share:.0f} %"
 
 
 def _warnings(report: SegmentationReport) -> str:
@@ -133,7 +134,10 @@ def _comparison(report: SegmentationReport) -> str:
 
 
 def _labels(report: SegmentationReport) -> str:
-    names = listed(report.pair.ids, report.kinds, (*report.names[1:], "outlier", "missing"), LISTED, "labels.csv")
+    several = report.counts["outlier"] > 1
+    kinds = ["outliers" if kind == "outlier" and several else kind for kind in report.kinds]
+    order = (*report.names[1:], "outliers" if several else "outlier", "missing")
+    names = listed(report.pair.ids, kinds, order, LISTED, "labels.csv")
     doubtful = ["doubtful" if odd else "" for odd in report.doubtful.tolist()]
     names += listed(report.pair.ids, doubtful, ("doubtful",), LISTED, "labels.csv")
     note = "By the names of the file, or the numbers of its rows; labels.csv has them all, segmentation.npz all arrays."

@@ -23,6 +23,7 @@ WIDTH, TALL, EDGE, GAP, HEAD, TICKS, FOOT = 10.2, 5.2, 0.45, 0.5, 0.32, 0.3, 0.5
 WIDE = 0.42  # height over width below which images are drawn one above the other
 FADE = (0.62, 0.78)  # how much of white and of dark paper is laid over a photograph
 STRAYS = 0.995  # of the matches, those that a panel without image shows
+SLIM = 0.2  # least ratio of the sides of such a panel
 
 
 def colour_of(label: int) -> str:
@@ -68,9 +69,11 @@ def _box(report: SegmentationReport, which: int) -> Box:
     places = np.stack([report.pair.x1, report.pair.x2])
     low, high = limits(places[:, report.labels > 0])
     every = limits(places[:, report.pair.seen], STRAYS)
-    if not (report.labels > 0).any():
-        return every
-    return np.minimum(low, every[0]), np.maximum(high, every[1])
+    if (report.labels > 0).any():
+        every = np.minimum(low, every[0]), np.maximum(high, every[1])
+    sides = every[1] - every[0]
+    room = np.maximum(0, SLIM * sides.max() - sides) / 2
+    return every[0] - room, every[1] + room
 
 
 def _panels(boxes: list[Box], bare: bool) -> tuple[Any, list[Any]]:

@@ -107,6 +107,25 @@ def test_what_is_known_is_compared_and_what_is_refused_is_said_once(tmp_path):
     assert "Compared" not in write_segmentation(tmp_path, report()).read_text()
 
 
+def test_outliers_are_counted_in_words(tmp_path):
+    page = write_segmentation(tmp_path, report(count=300)).read_text()
+    assert "100 outliers<" in page and "100 outlier<" not in page
+    labels = np.ones(300, dtype=int)
+    labels[7] = 0
+    page = write_segmentation(tmp_path / "one", report(count=300, labels=labels)).read_text()
+    assert "1 outlier<" in page and "1 outliers" not in page and "under 1 % of the matches" in page
+
+
+def test_panels_are_never_slim():
+    from io import BytesIO
+
+    from PIL import Image
+
+    line = np.linspace([0, 0], [1, 500], 8)
+    image = Image.open(BytesIO(picture_of(report(pair=MatchedPair("m", "m", line, line, tuple("abcdefgh"))), LIGHT)))
+    assert image.width > 0.4 * image.height
+
+
 def test_photographs_are_faded_and_wide_ones_stacked():
     from io import BytesIO
 

@@ -206,6 +206,17 @@ def test_common_zoom_and_rotation_are_recognized(zoom, angle):
     assert float((values[60:] > 0.35).double().mean()) > 0.97 and float((values[:60] < 0.2).double().mean()) > 0.9
 
 
+@pytest.mark.parametrize("angle", [math.pi / 2, 2.0, math.pi])
+def test_a_part_that_turns_far_is_as_coherent_as_the_rest(angle):
+    x1 = points(200)
+    right = x1[:, 0] > 0.7
+    noise = 0.002 * torch.randn(200, 2, generator=draw(7), dtype=F64)
+    x2 = torch.where(right[:, None], x1 @ similarity(1.0, angle).mT, x1 + 0.1) + noise
+    found = coherence(x1, x2, SCALE)
+    assert float(found.values[right].median()) > 0.7 and float(found.values[~right].median()) > 0.7
+    assert float(found.links.cut(torch.stack([right, ~right]).double())) < 0.1 * float(found.links.weight.sum()) / 2
+
+
 def test_conformity_asks_the_members_of_each_body_alone():
     x1 = points(120)
     right = x1[:, 0] > 0.5

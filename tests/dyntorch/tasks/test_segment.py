@@ -198,6 +198,16 @@ def test_threshold_is_estimated(sigma):
     assert error(found, scene) <= 0.05
 
 
+@pytest.mark.parametrize("sigma", [0.1, 1.0])
+def test_threshold_is_estimated_from_planes(sigma):
+    """The distance from a homography has two components, that from an epipolar line one."""
+    draw = torch.Generator().manual_seed(3)
+    scene = scenes.bodies(200, bodies=2, planar=(1, 2), sigma=sigma, generator=draw)
+    found = dyn.segment(*scene.views, threshold=None, generator=draw)
+    assert found.models == (dyn.BodyModel.HOMOGRAPHY,) * 2
+    assert float(found.threshold) == pytest.approx(5 * sigma, rel=0.25)
+
+
 def test_check_repr_and_notices():
     scene = two_bodies(12)
     found = segmented(scene)

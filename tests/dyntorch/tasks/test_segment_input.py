@@ -153,6 +153,32 @@ def test_copies_of_matches_change_nothing_but_a_notice():
     assert torch.equal(found.labels[:80], found.labels[80:160]) and codes(found) == {NoticeCode.REPEATED}
 
 
+@pytest.mark.parametrize("unit", [1.0, 50.0])
+def test_copies_of_one_match_may_be_the_majority(unit):
+    scene = scene_of(120, 2)
+    place = torch.cat([torch.zeros(300, dtype=torch.long), torch.arange(120)])
+    found = segmented(*(unit * x[place] for x in scene.views), threshold=2.5 * unit)
+    assert float(misclassification(found.labels[300:], scene.labels)) <= 0.03
+
+
+def test_a_body_that_got_lost_is_no_spare_one():
+    scene = scene_of(80, 1)
+    for bodies in range(2, 9):
+        found = segmented(*scene.views, bodies=bodies)
+        spare = [notice.value for notice in found.warnings if notice.code == NoticeCode.SPARE_BODY]
+        assert spare in ([], [bodies - 1])
+        assert not {NoticeCode.SPARE_BODY, NoticeCode.FEWER_BODIES} <= codes(found)
+
+
+def test_garbage_does_not_spoil_the_estimated_threshold():
+    scene = scene_of(80, 2)
+    y1, y2 = (x.clone() for x in scene.views)
+    y1[:3], y2[2:5] = 1e9 * torch.randn(3, 2, generator=draw(4), dtype=F64), -1e9
+    found = segmented(y1, y2, threshold=None)
+    assert 1.5 < float(found.threshold) < 3.5
+    assert float(misclassification(found.labels[5:], scene.labels[5:])) <= 0.02
+
+
 @pytest.mark.parametrize("batch", [(0,), (2, 0)])
 def test_empty_batches(batch):
     found = segmented(torch.zeros(*batch, 20, 2), torch.zeros(*batch, 20, 2))
