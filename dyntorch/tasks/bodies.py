@@ -68,6 +68,12 @@ def segment(
     """
     check_threshold(threshold)
     data = matches(FundamentalMatrix(), (x1, x2), weights)
+    if generator is not None and not isinstance(generator, torch.Generator):
+        raise ValueError(f"generator must be a torch.Generator or None, got {generator!r}; use torch.Generator().manual_seed(0)")
+    if data.count == 1 and len(x1) >= MINIMAL:
+        raise ValueError(
+            f"x1 is {tuple(x1.shape)}: problems of one match each; for points as OpenCV gives them, use x1[:, 0], x2[:, 0]"
+        )
     _check_counts(bodies, data.count)
     with torch.no_grad():
         found = [

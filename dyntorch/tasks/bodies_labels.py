@@ -17,8 +17,9 @@ OUTLIER = 1.0
 """Cost of an outlier where many are: that of a match a threshold away from a body in which it moves like its neighbours."""
 FEW, MANY = 0.005, 0.2
 """Share of outliers below which they are no rarer, and above which they cost no less."""
-STRANGE, CONFORMING = 2.5, 0.25
-"""Cost of a match that moves unlike all its neighbours of a body, and the conformity from which it costs nothing."""
+STRANGE, CONFORMING, LEAST = 2.5, 0.25, 0.02
+"""Cost of a match that moves unlike all its neighbours of a body; the conformity from which it costs nothing, over that of most
+members; and at least."""
 FOUND = 6.0
 """What a match that the search assigned to a body gains there."""
 SHARPNESS = 4.0
@@ -102,7 +103,10 @@ def _strange(view: View, members: Tensor, scale: float | None) -> Tensor:
     """Cost ``(K, n)`` of moving unlike the neighbours."""
     if scale is None:
         return torch.zeros_like(members, dtype=view.x1.dtype)
-    return STRANGE * (1 - conformity(view.x1, view.x2, members, scale) / CONFORMING).clamp(min=0)
+    value = conformity(view.x1, view.x2, members, scale)
+    # members of deep bodies move less like each other
+    usual = torch.where(members, value, torch.nan).nanmedian(-1, keepdim=True).values.nan_to_num(nan=1.0)
+    return STRANGE * (1 - value / (CONFORMING * usual).clamp(min=LEAST)).clamp(min=0)
 
 
 def _normalized(links: Links) -> Links:

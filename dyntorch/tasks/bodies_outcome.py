@@ -31,6 +31,7 @@ class Given:
         coherence: ``(m,)`` in [0, 1].
         keep: indices among the m of those that may belong to a body.
         groups: ``(k,)`` of the kept ones, linked groups from 0; empty where neighbours do not matter.
+        searched: indices among the kept ones of those that the search looks at.
         repeated: share of matches that repeat others.
     """
 
@@ -43,6 +44,7 @@ class Given:
     coherence: Tensor
     keep: Tensor
     groups: Tensor
+    searched: Tensor
     repeated: float
 
     @property
@@ -72,6 +74,7 @@ class Outcome:
         repeated: share of matches that repeat others.
         linked: share of matches that move like neighbours of theirs.
         spare: whether fewer bodies than were asked for explain the matches as well.
+        coarse: the threshold over the spread of the points, where it is too large to tell anything; else 0.
     """
 
     labels: Tensor
@@ -86,6 +89,7 @@ class Outcome:
     repeated: float
     linked: float
     spare: bool = False
+    coarse: float = 0.0
 
     @property
     def count(self) -> int:

@@ -19,6 +19,7 @@ from dyntorch.tasks.bodies_outcome import Given, Outcome, nothing, outcome
 from dyntorch.tasks.bodies_pool import LEAST
 from dyntorch.tasks.bodies_samples import search_samples
 from dyntorch.tasks.bodies_search import search
+from dyntorch.tasks.bodies_significance import significant
 from dyntorch.tasks.coherence import Links, coherence
 from dyntorch.tasks.segmentation import BodyModel
 
@@ -35,7 +36,9 @@ UNKNOWN = 0.3
 FAR, FARTHEST = 20.0, 1e3
 """Distance from the middle of the matches, in units of the median one, from which a match is garbage, and where it is put then."""
 SEARCHED = 1500
-"""Matches that the search looks at; the others are labelled by what it finds."""
+"""Matches that the search looks at, and that are neighbours; the others are labelled by what it finds."""
+COARSE = 0.2
+"""Threshold over the spread of the points from which everything is near everything."""
 LEFT, LEFT_SHARE = 10, 0.08
 """Linked matches without a body, and their share of all linked ones, from which one body more is tried."""
 GUESS = 0.003
@@ -83,13 +86,16 @@ def _solve(x1: Tensor, x2: Tensor, weights: Tensor, request: Request, threshold:
     repeated = 1 - distinct / len(present) if len(present) else 0.0
     if distinct < LEAST + 1:
         return nothing(weights, threshold, Status.TOO_FEW, repeated)
-    given = _given(x1[present], x2[present], weights, present, threshold, request.spatial, repeated)
-    chosen_from, part = _part(given, request)
+    given = _given(x1[present], x2[present], weights, present, threshold, request, repeated)
+    if PIXELS * given.view.pixel > COARSE:
+        refused = nothing(weights, threshold, Status.AMBIGUOUS, repeated, given.linked)
+        return replace(refused, coarse=PIXELS * given.view.pixel)
+    part = given.view.subset(given.keep[given.searched])
 
     def searched(counts: Sequence[int]) -> dict[int, list[Candidate]]:
         if not request.spatial:
             return search_samples(part, counts, request.generator)
-        groups = given.groups[chosen_from]
+        groups = given.groups[given.searched]
         extra = [groups] if int(groups.max()) < MOST else []
         return search(part, counts, request.generator, extra)
 
@@ -97,22 +103,29 @@ def _solve(x1: Tensor, x2: Tensor, weights: Tensor, request: Request, threshold:
     chosen = best(searched, len(part.x1), request.bodies, penalty) if len(part.x1) > LEAST else None
     if chosen is None:
         return nothing(weights, threshold, Status.NO_CONSENSUS, repeated, given.linked)
-    labelled = _labelled(given, chosen_from, chosen.candidate, request)
+    labelled = _labelled(given, chosen.candidate, request)
     left = _left(given, labelled)
     if chosen.further is not None and left >= max(LEFT, LEFT_SHARE * len(given.keep)):
         # matches that move like their neighbours and fit no body: there is another one, which the truncated distances hid
-        other = _labelled(given, chosen_from, chosen.further, request)
+        other = _labelled(given, chosen.further, request)
         labelled = other if _left(given, other) < 0.5 * left else labelled
     return outcome(given, labelled, threshold, request.bodies, chosen.spare)
 
 
-def _labelled(given: Given, searched: Tensor, candidate: Candidate, request: Request) -> Labelling:
-    """Labels of all matches by a segmentation of those that were searched (indices among the kept ones)."""
+def _labelled(given: Given, candidate: Candidate, request: Request) -> Labelling:
+    """Labels of all matches by a segmentation of those that were searched."""
     found = torch.zeros_like(given.present)
-    found[given.keep[searched]] = candidate.labels + 1
+    found[given.keep[given.searched]] = candidate.labels + 1
     pixel = given.view.pixel
     near, share = (NEIGHBOURLY * pixel, 1 - given.linked) if request.spatial else (None, UNKNOWN)
-    return label(given.view, found, candidate.fundamentals, given.weights[given.present], PIXELS * pixel, near, share)
+    labelled = label(given.view, found, candidate.fundamentals, given.weights[given.present], PIXELS * pixel, near, share)
+    if request.spatial:
+        return labelled
+    # nothing but the geometry speaks for these bodies: those that random matches would show as well are none
+    believed = significant(given.view, labelled.fundamentals, labelled.labels)
+    bodies = labelled.probabilities[1:][believed]
+    probabilities = torch.cat([1 - bodies.sum(0, keepdim=True), bodies]).clamp(min=0)
+    return Labelling(probabilities, labelled.fundamentals[believed])
 
 
 def _left(given: Given, labelled: Labelling) -> int:
@@ -120,7 +133,7 @@ def _left(given: Given, labelled: Labelling) -> int:
     return int((labelled.labels[given.keep] == 0).sum()) if len(given.groups) else 0
 
 
-def _given(x1: Tensor, x2: Tensor, weights: Tensor, present: Tensor, threshold: float, spatial: bool, repeated: float) -> Given:
+def _given(x1: Tensor, x2: Tensor, weights: Tensor, present: Tensor, threshold: float, request: Request, repeated: float) -> Given:
     """The present matches ``(m, 2)`` around 0 and of about unit size, by one scale: distances stay comparable."""
     centres = x1.median(0).values, x2.median(0).values
     distance = torch.cat([x1 - centres[0], x2 - centres[1]]).norm(dim=-1)
@@ -131,8 +144,9 @@ def _given(x1: Tensor, x2: Tensor, weights: Tensor, present: Tensor, threshold: 
     a, b = (((x - centre) * scale).clamp(-FARTHEST, FARTHEST) for x, centre in zip((x1, x2), centres, strict=True))
     pixel = threshold / PIXELS * float(scale)
     values = torch.zeros_like(a[:, 0])
-    if spatial:
-        graph = coherence(a, b, NEIGHBOURLY * pixel)
+    some = _some(len(a), request.generator, a.device)
+    if request.spatial:
+        graph = coherence(a, b, NEIGHBOURLY * pixel, some)
         values, links = graph.values, graph.links
         keep, groups = _groups(values, links)
     else:
@@ -141,21 +155,15 @@ def _given(x1: Tensor, x2: Tensor, weights: Tensor, present: Tensor, threshold: 
         keep = (torch.cat([a, b], dim=-1).norm(dim=-1) < FAR).nonzero().flatten()
         groups = keep[:0]
     view = View(a, b, pixel, links)
-    return Given(weights, present, view, first, second, float(scale), values, keep, groups, repeated)
+    searched = some[keep].nonzero().flatten()
+    return Given(weights, present, view, first, second, float(scale), values, keep, groups, searched, repeated)
 
 
-def _part(given: Given, request: Request) -> tuple[Tensor, View]:
-    """The matches that the search looks at: those that may belong to a body (indices among them), some of very many."""
-    count = len(given.keep)
-    everything = torch.arange(count, device=given.keep.device)
+def _some(count: int, generator: torch.Generator | None, device: torch.device) -> Tensor:
+    """``(m,)`` bool: all matches, or a random part of very many: what is dense beside the noise shows no motion of its own."""
     if count <= SEARCHED:
-        return everything, given.view.subset(given.keep)
-    order = uniform(count, generator=request.generator, device=given.keep.device).argsort()
-    some = order[:SEARCHED].sort().values
-    view = given.view.subset(given.keep[some])
-    # what is left has other neighbours
-    links = coherence(view.x1, view.x2, NEIGHBOURLY * view.pixel).links if request.spatial else view.links
-    return everything[some], replace(view, links=links)
+        return torch.ones(count, dtype=torch.bool, device=device)
+    return uniform(count, generator=generator, device=device).argsort().argsort() < SEARCHED
 
 
 def _groups(values: Tensor, links: Links) -> tuple[Tensor, Tensor]:

@@ -17,6 +17,7 @@ REACH = 2.5
 """Distance from which neighbours are far, in units of the median one."""
 PASSES, TRUSTED = 2, 0.02
 """Passes, and the coherence below which a match is no neighbour in the next one."""
+MEMBERS = 1500  # of a body, by which conformity is judged: closer ones have no other motion, only noise
 TABLE = 1 << 22  # distances held at a time
 RATIOS, MODES = 400, 16  # pairs of neighbours, and starts among them, by which the common motion is looked for
 DISTORTED = 0.35
@@ -100,7 +101,7 @@ class Coherence:
     links: Links
 
 
-def coherence(x1: Tensor, x2: Tensor, scale: float) -> Coherence:
+def coherence(x1: Tensor, x2: Tensor, scale: float, among: Tensor | None = None) -> Coherence:
     r"""Deviation of each match from the affine motion of its neighbours, in both directions.
 
     For a match i and a neighbour j of it in image a, with the local motion :math:`L_i` from a to b,
@@ -116,14 +117,16 @@ def coherence(x1: Tensor, x2: Tensor, scale: float) -> Coherence:
         x1: ``(n, 2)`` matches.
         x2: the same in view 2.
         scale: s, noise of differences of matches, in their unit.
+        among: ``(n,)`` bool, the matches that can be neighbours; None: all.
     """
-    fresh = _first_of_copies(x1, x2, scale / 6)
+    among = torch.ones_like(x1[:, 0], dtype=torch.bool) if among is None else among
+    fresh = _first_of_copies(x1, x2, among, scale / 6)
     values = torch.ones_like(x1[:, 0])
     for _ in range(PASSES):
         # the first pass finds most wrong matches, which then no longer stand between the neighbours of the others
         trusted = values > TRUSTED
         values, linked = _judged(x1, x2, fresh & trusted, scale)
-    return Coherence(values, _links(*linked, len(x1)))
+    return Coherence(values, _links(*linked, among))
 
 
 def _judged(x1: Tensor, x2: Tensor, eligible: Tensor, scale: float) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
@@ -159,17 +162,28 @@ def conformity(x1: Tensor, x2: Tensor, members: Tensor, scale: float) -> Tensor:
     Returns:
         ``(K, n)`` in [0, 1].
     """
-    fresh = _first_of_copies(x1, x2, scale / 6)
-    return torch.stack([_judged(x1, x2, fresh & body, scale)[0] for body in members])
+    some = [_thinned(body) for body in members]
+    fresh = _first_of_copies(x1, x2, torch.stack(some).any(0), scale / 6)
+    return torch.stack([_judged(x1, x2, fresh & body, scale)[0] for body in some])
 
 
-def _links(row: Tensor, column: Tensor, weight: Tensor, count: int) -> Links:
-    """Symmetric links of directed ones; four of these can join two matches: their mean over images and directions."""
-    key = torch.cat([row * count + column, column * count + row])
+def _thinned(body: Tensor) -> Tensor:
+    """About :data:`MEMBERS` of the members ``(n,)`` bool, evenly."""
+    rank = body.cumsum(-1)
+    return body & (rank % max(1, int(rank[-1]) // MEMBERS) == 0)
+
+
+def _links(row: Tensor, column: Tensor, weight: Tensor, among: Tensor) -> Links:
+    """Links of directed ones, symmetric among the matches that can be neighbours ``(n,)``; the others only see them."""
+    count = len(among)
+    back = among[row]
+    key = torch.cat([row * count + column, (column * count + row)[back]])
     pairs, place = torch.unique(key, return_inverse=True)
     total = torch.zeros(len(pairs), dtype=weight.dtype, device=weight.device)
-    total = total.index_add_(0, place, torch.cat([weight, weight])) / 4
+    total = total.index_add_(0, place, torch.cat([weight, weight[back]]))
     start = torch.div(pairs, count, rounding_mode="floor")
+    # four directed links can join two neighbours, two one that is none: their mean over images and directions
+    total = total / torch.where(among[start], 4.0, 2.0)
     degree = torch.bincount(start, minlength=count)
     first = degree.cumsum(0) - degree
     slot = torch.arange(len(pairs), device=row.device) - first[start]
@@ -186,15 +200,17 @@ def _blocks(count: int, width: int) -> list[slice]:
     return [slice(start, start + step) for start in range(0, count, step)]
 
 
-def _first_of_copies(x1: Tensor, x2: Tensor, least: float) -> Tensor:
-    """``(n,)`` bool: whether no earlier match is the same; as neighbours that agree, repeated matches would confirm themselves."""
-    joint = torch.cat([x1, x2], dim=-1)
+def _first_of_copies(x1: Tensor, x2: Tensor, among: Tensor, least: float) -> Tensor:
+    """Which of some matches ``(n,)`` bool repeat no earlier one: repeated matches would confirm themselves."""
+    joint = torch.cat([x1, x2], dim=-1)[among]
     index = torch.arange(len(joint), device=joint.device)
-    found = [
+    copies = [
         ((torch.cdist(joint[rows], joint) < least) & (index < index[rows, None])).any(-1)
         for rows in _blocks(len(joint), len(joint))
     ]
-    return ~torch.cat(found)
+    fresh = among.clone()
+    fresh[among] = ~torch.cat(copies) if copies else fresh[among]
+    return fresh
 
 
 def _nearest(a: Tensor, b: Tensor, among: Tensor, least: float) -> tuple[Tensor, Tensor]:

@@ -72,6 +72,8 @@ class NoticeCode(StrEnum):
     """The matches carry fewer bodies than were asked for."""
     SPARE_BODY = "spare_body"
     """Fewer bodies than were asked for explain the matches as well."""
+    COARSE = "coarse"
+    """The threshold is large beside the spread of the points."""
     REPEATED = "repeated"
     """Many matches are the same."""
     INCOHERENT = "incoherent"

@@ -106,6 +106,10 @@ def segmentation_notices(found: list[Outcome], bodies: int | None, batch: tuple[
     tried = torch.tensor([outcome.status != Status.TOO_FEW for outcome in found])
     spatial = linked < 1.0  # where neighbours do not matter, all matches count
     said = []
+    coarse = torch.tensor([outcome.coarse for outcome in found])
+    tried = tried & (coarse == 0)
+    message = "the threshold is {value:.2g} of the spread of the points, and everything is near everything; give it in their unit"
+    said += notices(NoticeCode.COARSE, message, coarse, coarse > 0, batch)
     if bodies is not None:
         message = f"{bodies} bodies were asked for, the matches carry {{value:g}}; ask for fewer, or add matches of the others"
         said += notices(NoticeCode.FEWER_BODIES, message, count, tried & (count < bodies), batch)
@@ -115,6 +119,6 @@ def segmentation_notices(found: list[Outcome], bodies: int | None, batch: tuple[
         said += notices(NoticeCode.SPARE_BODY, message, count - 1, spare, batch)
     message = "a share of {value:.2g} of the matches repeats others and says nothing new; remove repeated matches"
     said += notices(NoticeCode.REPEATED, message, repeated, repeated > REPEATED, batch)
-    message = "only a share of {value:.2g} of the matches moves like its neighbours; try spatial=False if bodies interleave"
+    message = "the share of matches that move like their neighbours is {value:.2g}; try spatial=False if bodies interleave"
     said += notices(NoticeCode.INCOHERENT, message, linked, tried & spatial & (linked < SPARSE), batch)
     return tuple(said)

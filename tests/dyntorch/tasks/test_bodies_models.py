@@ -10,7 +10,7 @@ import torch
 
 from dyntorch import scenes
 from dyntorch.algebra.epipolar_descent import fit_fundamental
-from dyntorch.algebra.homogeneous import apply, homogeneous
+from dyntorch.algebra.homogeneous import apply, homogeneous, inhomogeneous, skew
 from dyntorch.tasks import bodies_models as module
 from dyntorch.tasks.bodies_energy import View
 from dyntorch.tasks.bodies_models import choose
@@ -133,3 +133,20 @@ def test_no_and_few_matches():
     assert models.planar.shape == (1,) and bool(models.homographies.isfinite().all())
     nothing = choose(view, torch.zeros(1, 3, 3, dtype=F64), torch.zeros(1, 8, dtype=F64))
     assert bool(nothing.homographies.isfinite().all())
+
+
+@pytest.mark.parametrize(("off", "planar"), [(0, True), (1, True), (8, False)])
+def test_a_plane_with_more_than_a_few_matches_off_it_is_a_body_with_depth(off, planar):
+    """The robust criterion alone would bear 8 of 100."""
+    draw = torch.Generator().manual_seed(4)
+    H = torch.eye(3, dtype=torch.float64) + 0.05 * torch.randn(3, 3, generator=draw, dtype=torch.float64)
+    e = torch.tensor([1.0, 0.3, 0.1], dtype=torch.float64)
+    x1 = torch.rand(100, 2, generator=draw, dtype=torch.float64) * 2 - 1
+    depth = torch.zeros(100, 1, dtype=torch.float64)
+    depth[:off] = 0.1
+    x2 = inhomogeneous(homogeneous(x1) @ H.mT + depth * e)
+    pixel = 0.002
+    x2 = x2 + 0.3 * pixel * torch.randn(100, 2, generator=draw, dtype=torch.float64)
+    none = Links(torch.zeros(100, 0, dtype=torch.long), torch.zeros(100, 0, dtype=torch.float64))
+    found = choose(View(x1, x2, pixel, none), (skew(e) @ H)[None], torch.ones(1, 100, dtype=torch.float64))
+    assert found.planar.tolist() == [planar]

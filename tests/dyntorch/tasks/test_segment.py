@@ -235,3 +235,9 @@ def test_linked_matches_without_a_body_are_one_body_more():
     found = dyn.segment(*scene.views, generator=torch.Generator().manual_seed(0))
     assert int(found.bodies) == 3
     assert float(misclassification(found.labels, scene.labels)) < 0.03
+
+
+def test_very_many_matches_are_labelled_by_what_some_of_them_show():
+    scene = scenes.bodies(3000, sigma=0.5, outliers=0.2, generator=draw(3))
+    found = segmented(scene)
+    assert int(found.bodies) == 2 and error(found, scene) < 0.03

@@ -210,3 +210,23 @@ def test_far_origins_and_garbage(spatial):
     assert float(misclassification(found.labels[5:], scene.labels[5:])) <= (0.02 if spatial else 0.1)
     if spatial:
         assert found.labels[:5].tolist() == [0] * 5
+
+
+def test_a_threshold_in_another_unit_is_named():
+    scene = scenes.bodies(120, sigma=0.3, generator=torch.Generator().manual_seed(0))
+    found = dyn.segment(*(x / 640 for x in scene.views))
+    assert int(found.status) == Status.AMBIGUOUS and int(found.bodies) == 0
+    assert [notice.code for notice in found.warnings] == [NoticeCode.COARSE]
+    assert int(dyn.segment(*(x / 640 for x in scene.views), threshold=2.5 / 640).bodies) == 2
+
+
+def test_points_in_the_shape_of_opencv_are_named():
+    x = torch.rand(20, 1, 2)
+    with pytest.raises(ValueError, match=r"x1\[:, 0\]"):
+        dyn.segment(x, x)
+
+
+def test_a_seed_is_no_generator():
+    x = torch.rand(20, 2)
+    with pytest.raises(ValueError, match="manual_seed"):
+        dyn.segment(x, x, generator=0)
