@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from functools import cached_property
@@ -45,6 +46,28 @@ REMEDY = {
 def failed(status: Tensor) -> Tensor:
     """Where a status leaves no tensor, bool of the same shape."""
     return (status == Status.TOO_FEW) | (status == Status.DEGENERATE)
+
+
+def check_status(what: str, status: Tensor, said: Sequence[tuple[int, str]] = ()) -> None:
+    """Raise where any problem failed.
+
+    Args:
+        what: was tried.
+        status: ``(*batch,)`` of :class:`Status`.
+        said: what is known about single problems, with their flat index.
+
+    Raises:
+        ValueError: says which problems failed, how, and what to do.
+    """
+    flat = status.reshape(-1)
+    for state in Status:
+        where = (flat == state).nonzero().flatten().tolist()
+        if state != Status.OK and where:
+            shown = ", ".join(map(str, where[:8])) + (", ..." if len(where) > 8 else "")
+            problems = f"problem {shown} of {len(flat)}" if status.ndim else "the problem"
+            reasons = [text for place, text in said if place in where]
+            known = f" ({'; '.join(reasons[:3])})" if reasons else ""
+            raise ValueError(f"{what}: {problems}: {state.name}; {REMEDY[state]}{known}")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -135,13 +158,7 @@ class Solution:
         Raises:
             ValueError: says which problems of the batch failed, how, and what to do.
         """
-        status = self.status.reshape(-1)
-        for state in Status:
-            where = (status == state).nonzero().flatten().tolist()
-            if state != Status.OK and where:
-                shown = ", ".join(str(i) for i in where[:8]) + (", ..." if len(where) > 8 else "")
-                problems = f"problem {shown} of {len(status)}" if self.status.ndim else "the problem"
-                raise ValueError(f"{self.invariant!r}: {problems}: {state.name}; {REMEDY[state]}")
+        check_status(repr(self.invariant), self.status)
         return self
 
     def __repr__(self) -> str:

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from dyntorch.solution import REMEDY, Solution, Status
-from dyntorch.tasks.notices import Notice, NoticeCode
+from dyntorch.solution import Solution, Status
+from dyntorch.tasks.notices import Notice, NoticeCode, check_results
 
 OUTLIER, STATIC, MOVING = 0, 1, 2
 
@@ -70,10 +70,7 @@ class Alignment:
         """
         if self.solution is not None:
             self.solution.check()
-        for state in Status:
-            where = (self.status.reshape(-1) == state).nonzero().flatten().tolist()
-            if state != Status.OK and where:
-                raise ValueError(f"problem {', '.join(map(str, where[:8]))}: {state.name}; {REMEDY[state]}")
+        check_results("align", self.status, self.warnings)
         return self
 
     def __repr__(self) -> str:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
 import torch
 from torch import Tensor
+
+from dyntorch.solution import check_status
 
 
 class NoticeCode(StrEnum):
@@ -66,6 +69,10 @@ class NoticeCode(StrEnum):
     """Two planes or bodies that move alike."""
     STATIC_BODY = "static_body"
     """A plane that does not move against the cameras, or is infinitely far."""
+    NO_COMMON_INFINITY = "no_common_infinity"
+    """No homography at infinity is common to the planes, or they are too noisy to tell."""
+    CALIBRATION = "calibration"
+    """The homography at infinity and the calibration do not make a rotation."""
     OTHER_SOLUTION = "other_solution"
     """Another solution fits as well."""
     FEWER_BODIES = "fewer_bodies"
@@ -133,3 +140,9 @@ def notices(code: NoticeCode, message: str, values: Tensor, flagged: Tensor, bat
         place = tuple(int(i) for i in torch.unravel_index(torch.tensor(flat), batch)) if batch else ()
         found.append(Notice(code, value, message.format(value=value), place))
     return found
+
+
+def check_results(what: str, status: Tensor, warnings: Sequence[Notice]) -> None:
+    """Raise a ``ValueError`` where any problem failed, with what the notices say about it."""
+    places = torch.arange(status.numel()).reshape(status.shape)
+    check_status(what, status, [(int(places[notice.problem]), str(notice)) for notice in warnings])

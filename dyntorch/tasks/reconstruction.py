@@ -12,8 +12,8 @@ from torch import Tensor
 from dyntorch.algebra.homogeneous import inhomogeneous
 from dyntorch.algebra.triangulation import reproject
 from dyntorch.motions import Motion
-from dyntorch.solution import REMEDY, Status, failed
-from dyntorch.tasks.notices import Notice
+from dyntorch.solution import Status, failed
+from dyntorch.tasks.notices import Notice, check_results
 
 
 class Ranked(NamedTuple):
@@ -104,16 +104,7 @@ class Reconstruction:
         Raises:
             ValueError: says which problems failed, how, and what to do.
         """
-        status = self.status.reshape(-1)
-        places = torch.arange(len(status)).reshape(self.status.shape)
-        for state in Status:
-            where = (status == state).nonzero().flatten().tolist()
-            if state != Status.OK and where:
-                shown = ", ".join(str(i) for i in where[:8]) + (", ..." if len(where) > 8 else "")
-                problems = f"problem {shown} of {len(status)}" if self.status.ndim else "the problem"
-                reasons = [str(w) for w in self.warnings if int(places[w.problem]) in where]
-                known = f" ({'; '.join(reasons[:3])})" if reasons else ""
-                raise ValueError(f"{self.motion.name}: {problems}: {state.name}; {REMEDY[state]}{known}")
+        check_results(self.motion.name, self.status, self.warnings)
         return self
 
     def __repr__(self) -> str:

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from dyntorch.solution import REMEDY, Status
-from dyntorch.tasks.notices import Notice, NoticeCode, notices
+from dyntorch.solution import Status
+from dyntorch.tasks.notices import Notice, NoticeCode, check_results, notices
 
 if TYPE_CHECKING:
     from dyntorch.tasks.bodies_outcome import Outcome
@@ -73,10 +73,7 @@ class Segmentation:
         Raises:
             ValueError: says which problems failed, how, and what to do.
         """
-        for state in Status:
-            where = (self.status.reshape(-1) == state).nonzero().flatten().tolist()
-            if state != Status.OK and where:
-                raise ValueError(f"problem {', '.join(map(str, where[:8]))}: {state.name}; {REMEDY[state]}")
+        check_results("segment", self.status, self.warnings)
         return self
 
     def __repr__(self) -> str:

@@ -218,7 +218,7 @@ def test_check_repr_and_notices():
     apart = torch.rand(120, 2, generator=draw(2), dtype=F64) * 400
     failed = dyn.segment(torch.stack([x1, x1]), torch.stack([x2, apart]), bodies=2, generator=draw(9))
     assert failed.status.tolist() == [Status.OK, Status.NO_CONSENSUS]
-    with pytest.raises(ValueError, match="problem 1: NO_CONSENSUS"):
+    with pytest.raises(ValueError, match="problem 1 of 2: NO_CONSENSUS"):
         failed.check()
     assert {(notice.code, notice.problem) for notice in failed.warnings} == {
         (NoticeCode.FEWER_BODIES, (1,)),
