@@ -7,9 +7,20 @@ import pytest
 import torch
 
 from dyntorch import eigenspace, matrix
-from dyntorch.algebra import extensors, exterior, grassmann, grassmann_nearest, grassmann_recovery
+from dyntorch.algebra import (
+    epipolar,
+    epipolar_descent,
+    epipole_pairs,
+    extensors,
+    exterior,
+    grassmann,
+    grassmann_nearest,
+    grassmann_recovery,
+    infinity_extensors,
+)
 from dyntorch.constants import constant
-from dyntorch.primitives import base, plane
+from dyntorch.primitives import base, monomials, plane
+from dyntorch.tasks import planes_problem, planes_starts
 
 CPU = torch.device("cpu")
 TABLES = [
@@ -25,6 +36,19 @@ TABLES = [
     (base.triangle, (4, CPU)),
     (matrix._unpacking, ((3, 3), CPU)),
     (eigenspace._generic, (5, 2, CPU)),
+    (epipolar.polar, (torch.float64, CPU)),
+    (epipolar._places, (CPU,)),
+    (epipolar_descent._tables, (torch.float64, CPU)),
+    (epipolar_descent._pairs, (CPU,)),
+    (epipole_pairs._product_table, (CPU,)),
+    (infinity_extensors._joins, (3, 64, CPU)),
+    (infinity_extensors._invariant_basis, (CPU,)),
+    (monomials.symmetric, (2, CPU)),
+    (monomials.factors, (2, 2, CPU)),
+    (monomials.collecting, (2, 2, CPU)),
+    (monomials.multiplicity, (2, 2, CPU)),
+    (planes_problem._own, (3, 1, CPU)),
+    (planes_starts._frames, (CPU,)),
 ]
 """All of them: the last test says so."""
 
