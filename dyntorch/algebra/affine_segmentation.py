@@ -9,6 +9,7 @@ from torch import Tensor
 
 from dyntorch.algebra.homogeneous import homogeneous, unit
 from dyntorch.algebra.hyperplane_pair import hyperplane_pair
+from dyntorch.algebra.two_views import check_matches, described
 from dyntorch.nullspace import gram_null_space
 
 MATCHES = 14
@@ -18,7 +19,7 @@ TURNS = 5
 TINY = 1e-300
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class AffineSegmentation:
     """Two bodies under affine cameras; ``fundamentals`` and ``residuals`` carry gradients."""
 
@@ -31,6 +32,9 @@ class AffineSegmentation:
     degenerate: Tensor
     """``(*batch,)`` bool: the matches leave several pairs of bodies, exactly: fewer than 14 with weight or than 4 of one body,
     or a body that is a plane.  The labels are then those of one such pair."""
+
+    def __repr__(self) -> str:
+        return described(self, self.labels, self.degenerate, 2)
 
 
 def affine_segmentation(x1: Tensor, x2: Tensor, weights: Tensor | None = None) -> AffineSegmentation:
@@ -71,11 +75,7 @@ def affine_segmentation(x1: Tensor, x2: Tensor, weights: Tensor | None = None) -
         >>> found.labels.tolist(), bool(found.residuals.max() < 1e-10)
         ([1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 2, 2, 2, 2, 2, 2, 2, 2], True)
     """
-    if x1.shape != x2.shape or x1.ndim < 2 or x1.shape[-1] != 2 or not (x1.is_floating_point() and x2.is_floating_point()):
-        raise ValueError(
-            f"x1 and x2 must be floating point (*batch, n, 2) of one shape, got {tuple(x1.shape)} {x1.dtype} and "
-            f"{tuple(x2.shape)} {x2.dtype}"
-        )
+    check_matches(x1, x2, weights)
     if x1.shape[-2] < MATCHES:
         raise ValueError(
             f"two bodies under affine cameras take {MATCHES} matches, got {x1.shape[-2]}: add {MATCHES - x1.shape[-2]}"

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.algebra.homogeneous import homogeneous, unit, unit_vectors
+from dyntorch.algebra.two_views import check_matches, described
 from dyntorch.invariants.fundamental_matrix import FundamentalMatrix
 from dyntorch.normalize import hartley
 from dyntorch.nullspace import null_space
@@ -22,7 +23,7 @@ DEGENERATE = 1e-12
 LEAST = 8  # matches of a body
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Multibody:
     """Bodies of exact matches; nothing carries gradients but ``matrix``."""
 
@@ -35,6 +36,9 @@ class Multibody:
     degenerate: Tensor
     """``(*batch,)`` bool: another matrix vanishes on all matches as well (a planar body, too few matches), or a body was left
     with fewer than 8.  Labels and matrices then mean nothing."""
+
+    def __repr__(self) -> str:
+        return described(self, self.labels, self.degenerate, self.fundamentals.shape[-3])
 
 
 def multibody_matrix(x1: Tensor, x2: Tensor, bodies: int, weights: Tensor | None = None) -> Multibody:
@@ -70,7 +74,7 @@ def multibody_matrix(x1: Tensor, x2: Tensor, bodies: int, weights: Tensor | None
         matrix, fundamentals, labels and degenerate.  The epipoles of any two bodies must differ in both views.
 
     Raises:
-        ValueError: fewer matches than :math:`M_K^2 - 1`, ``bodies`` below 1, shapes that do not agree.
+        ValueError: fewer matches than :math:`M_K^2 - 1`, ``bodies`` no whole number from 1, shapes that do not agree.
 
     Source: thesis section 6 (two bodies); Vidal, Ma, Soatto and Sastry 2006 (multibody epipolar constraint).
 
@@ -123,13 +127,9 @@ def multibody_lines(matrix: Tensor, p1: Tensor, p2: Tensor, bodies: int) -> tupl
 
 def _checked(x1: Tensor, x2: Tensor, bodies: int, weights: Tensor | None) -> Tensor:
     """Weights in float64, 0 for what is not finite."""
-    if x1.shape != x2.shape or x1.ndim < 2 or x1.shape[-1] != 2 or not (x1.is_floating_point() and x2.is_floating_point()):
-        raise ValueError(
-            f"x1 and x2 must be floating point (*batch, n, 2) of one shape, got {tuple(x1.shape)} {x1.dtype} and "
-            f"{tuple(x2.shape)} {x2.dtype}"
-        )
-    if bodies < 1:
-        raise ValueError(f"bodies must be 1 or more, got {bodies}")
+    check_matches(x1, x2, weights)
+    if not isinstance(bodies, int) or isinstance(bodies, bool) or bodies < 1:
+        raise ValueError(f"bodies must be a whole number, 1 or more, got {bodies!r}")
     least, n = comb(bodies + 2, 2) ** 2 - 1, x1.shape[-2]
     if n < least:
         raise ValueError(f"the multibody matrix of {bodies} bodies takes {least} matches, got {n}: add {least - n}")

@@ -93,7 +93,7 @@ def translating_planes(
     camera = None if calibration is None else cameras(calibration, tuple(H.shape[:-3]), H)
     with torch.no_grad():
         given = Given.of(H, F, planes, bodies, camera)
-        result = outcome(given, _solved(given, method, refine), method)
+        result = outcome(given, _solved(given, method, refine), method, refine)
         shaped: dict[str, Any] = {name: given.back(value) for name, value in vars(result).items() if isinstance(value, Tensor)}
     return replace(result, **shaped)
 
@@ -107,14 +107,15 @@ def _views(x1: Points | None, x2: Points | None) -> Pair | None:
 
 
 def _solved(given: Given, method: str, refine: bool) -> tuple[Tensor, ...]:
-    """What :func:`~dyntorch.tasks.planes_solver.solve` says of all problems, block by block."""
+    """What :func:`~dyntorch.tasks.planes_solver.solve` says, block by block, and the cost under the given matrices."""
     seen, body = given.planes, given.bodies
     layout = Layout(given.homographies.shape[1], given.fundamentals.shape[1])
 
     def block(h: Tensor, f: Tensor, spare: Tensor, *parts: Tensor) -> tuple[Tensor, ...]:
         x1, x2, w, y1, y2, v, s1, s2 = parts
         matches = Matches((x1, x2), w, (y1, y2), v, (s1, s2)) if given.matched else None
-        return solve(h, f, matches, spare, method, refine)
+        separate = spare * 0 if matches is None else matches.normal(torch.cat([h, f], dim=1)).cost.nansum(1)
+        return *solve(h, f, matches, spare, method, refine), separate
 
     parts = (*seen.views, seen.weights, *body.views, body.weights, *(frame[:, 0, 0] for frame in given.frames))
     numbers = 18 * seen.weights.shape[1] * seen.weights.shape[2] + layout.size * (9 * (layout.planes + layout.bodies) + layout.size)

@@ -214,11 +214,17 @@ def check_counts(planes: int, bodies: int, method: str) -> None:
         raise ValueError(f"method must be 'auto' or one of {', '.join(LEAST)}, got {method!r}")
     if not bool(enough(torch.tensor(planes), torch.tensor(bodies), method)):
         least = {"auto": "3 planes, 2 planes and 1 fundamental matrix, or 2 fundamental matrices"}
-        least |= {name: f"{p} planes and {m} fundamental matrices" for name, (p, m) in LEAST.items()}
+        least |= {name: _counted(p, m) for name, (p, m) in LEAST.items()}
         raise ValueError(
-            f"H has {planes} planes, fundamentals {bodies} bodies; method {method!r} needs at least {least[method]}: "
+            f"H and fundamentals hold {_counted(planes, bodies)}; method {method!r} needs at least {least[method]}: "
             f"add some, each with a translation of its own"
         )
+
+
+def _counted(planes: int, bodies: int) -> str:
+    """As many planes and fundamental matrices as there are, such as ``"2 planes and 1 fundamental matrix"``."""
+    said = [f"{planes} plane{'s' * (planes != 1)}"] * bool(planes)
+    return " and ".join(said + [f"{bodies} fundamental matri{'x' if bodies == 1 else 'ces'}"] * bool(bodies)) or "none"
 
 
 def enough(planes: Tensor, bodies: Tensor, method: str) -> Tensor:
@@ -236,7 +242,8 @@ def cameras(calibration: Tensor | Pair, batch: tuple[int, ...], like: Tensor) ->
     """
     pair = (calibration, calibration) if not isinstance(calibration, Sequence) else tuple(calibration)
     if len(pair) != 2 or any(not isinstance(k, Tensor) or k.shape not in ((3, 3), (*batch, 3, 3)) for k in pair):
-        got = " and ".join(str(tuple(k.shape)) if isinstance(k, Tensor) else type(k).__name__ for k in pair)
+        given = pair if isinstance(calibration, Sequence) else pair[:1]
+        got = " and ".join(str(tuple(k.shape)) if isinstance(k, Tensor) else _kind(k) for k in given) or "nothing"
         raise ValueError(
             f"calibration must be K (3, 3) or (*batch, 3, 3) of both views, batch {batch}, or a pair (K1, K2) of them, got {got}"
         )
@@ -244,6 +251,12 @@ def cameras(calibration: Tensor | Pair, batch: tuple[int, ...], like: Tensor) ->
     if not bool(found.isfinite().all()) or bool((torch.linalg.det(found) == 0).any()):
         raise ValueError("calibration must be finite and invertible; a camera has K = [f 0 u; 0 f v; 0 0 1]")
     return found
+
+
+def _kind(value: object) -> str:
+    """A type, and what to do where it is an array of another library."""
+    remedy = " (use torch.as_tensor(...))" if hasattr(value, "__array__") or isinstance(value, list) else ""
+    return f"{type(value).__module__}.{type(value).__name__}{remedy}".removeprefix("builtins.")
 
 
 def _there(matrices: Tensor) -> Tensor:

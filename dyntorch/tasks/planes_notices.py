@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from dyntorch.tasks.notices import Notice, NoticeCode, notices
+from dyntorch.tasks.planes_input import Given
 
 EXACT = 1e-7
 """Sine or ratio that is rounding error."""
@@ -17,16 +18,39 @@ NEAR = 0.1
 CHI_SQUARE = 9.2
 """Squared distance in standard deviations, of two degrees of freedom, exceeded once in a hundred."""
 
-MESSAGES = {
-    NoticeCode.COLLINEAR_EPIPOLES: ("the epipoles are within {value:.1g} of one line: all motion is parallel to one plane"),
-    NoticeCode.COPLANAR_NORMALS: ("the normals are within {value:.1g} of one plane: all planes are parallel to one line"),
-    NoticeCode.SHARED_BODY: "{value:g} pairs of planes or bodies move alike, as of one body: three planes do not suffice then",
-    NoticeCode.STATIC_BODY: "{value:g} planes do not move, or are at infinity: no epipole, and three planes do not suffice",
-    NoticeCode.UNUSED_PLANE: "{value:g} matrices are not finite, singular, or have too few matches; they were left out",
-    NoticeCode.FEW_PLANES: "{value:g} planes and bodies are left: give 3 planes, 2 planes and 1 body, or 2 bodies",
+MESSAGES: dict[NoticeCode, str | tuple[str, str] | dict[bool, str]] = {
+    NoticeCode.COLLINEAR_EPIPOLES: "the epipoles are within {value:.1g} of one line: all motion is parallel to one plane",
+    NoticeCode.COPLANAR_NORMALS: "the normals are within {value:.1g} of one plane: all planes are parallel to one line",
+    NoticeCode.SHARED_BODY: (
+        "a pair of planes or bodies moves alike, as of one body",
+        "{value:g} pairs of planes or bodies move alike, as of one body",
+    ),
+    NoticeCode.STATIC_BODY: (
+        "a plane does not move, or is at infinity: it has no epipole",
+        "{value:g} planes do not move, or are at infinity: they have no epipole",
+    ),
+    NoticeCode.UNUSED_PLANE: (
+        "a matrix is not finite, singular, or has too few matches; it was left out",
+        "{value:g} matrices are not finite, singular, or have too few matches; they were left out",
+    ),
+    NoticeCode.FEW_PLANES: (
+        "1 plane or body is left: give 3 planes, 2 planes and 1 body, or 2 bodies",
+        "{value:g} planes and bodies are left: give 3 planes, 2 planes and 1 body, or 2 bodies",
+    ),
     NoticeCode.OTHER_SOLUTION: "another homography at infinity fits the {value:g} planes and bodies as well; add others",
     NoticeCode.UNCERTAIN: "the noise leaves a relative error of {value:.2g} in the homography at infinity; add larger planes",
+    NoticeCode.NO_COMMON_INFINITY: {
+        True: "the planes and bodies differ from what one homography at infinity allows by {value:.2g} times the noise "
+        "(variances): some rotate, or are no planes; leave them out",
+        False: "one homography at infinity leaves {value:.0%} of what the homographies differ by: some rotate, or the noise is "
+        "large; leave some out, or give larger planes",
+    },
+    NoticeCode.CALIBRATION: "the homography at infinity makes the calibration {value:.2g} from a rotation, more than the noise "
+    "does: check K, or the planes",
 }
+"""Of each code: where the figure is 1 and where it is not, or with matches and without, where these differ."""
+POSITIONS = (NoticeCode.SHARED_BODY, NoticeCode.STATIC_BODY)
+"""What three planes do not suffice with."""
 
 
 @dataclass(frozen=True)
@@ -95,17 +119,15 @@ class Figures:
 
 
 def planes_notices(
-    figures: Figures, enough: Tensor, uncertainty: Tensor, uncertain: Tensor, other: Tensor, batch: Sequence[int]
+    figures: Figures, enough: Tensor, said: Mapping[NoticeCode, tuple[Tensor, Tensor]], given: Given
 ) -> tuple[Notice, ...]:
     """Notices on all problems, in their order.
 
     Args:
         figures: of the planes and bodies.
         enough: ``(b,)`` whether there are enough of them.
-        uncertainty: ``(b,)`` relative error of the homography at infinity.
-        uncertain: ``(b,)`` where that says that it is not known.
-        other: ``(b,)`` where another one fits as well.
-        batch: shape that b comes from.
+        said: further figures ``(b,)`` of the fit, and where they are worth a notice ``(b,)``.
+        given: what was fitted.
     """
     used, still = figures.used.sum(-1), (figures.used & ~figures.moving).sum(-1)
     missing = figures.used.shape[1] - used
@@ -114,18 +136,32 @@ def planes_notices(
     pairs = figures.alike().sum((-2, -1)) // 2
     # one or two bodies are in one line and one plane by themselves
     several = enough & (figures.groups()[0] >= 3)
-    rows = (
-        (NoticeCode.UNUSED_PLANE, missing, missing > 0),
-        (NoticeCode.FEW_PLANES, used, ~enough),
-        (NoticeCode.COLLINEAR_EPIPOLES, line, collinear & several),
-        (NoticeCode.COPLANAR_NORMALS, plane, coplanar & several),
-        (NoticeCode.SHARED_BODY, pairs, (pairs > 0) & enough),
-        (NoticeCode.STATIC_BODY, still, (still > 0) & enough),
-        (NoticeCode.UNCERTAIN, uncertainty, uncertain & enough),
-        (NoticeCode.OTHER_SOLUTION, used, other & enough),
-    )
-    found = [n for code, values, flagged in rows for n in notices(code, MESSAGES[code], values, flagged, tuple(batch))]
+    rows = {
+        NoticeCode.UNUSED_PLANE: (missing, missing > 0),
+        NoticeCode.FEW_PLANES: (used, ~enough),
+        NoticeCode.COLLINEAR_EPIPOLES: (line, collinear & several),
+        NoticeCode.COPLANAR_NORMALS: (plane, coplanar & several),
+        NoticeCode.SHARED_BODY: (pairs, (pairs > 0) & enough),
+        NoticeCode.STATIC_BODY: (still, (still > 0) & enough),
+        **said,
+    }
+    found = []
+    for code, (values, flagged) in rows.items():
+        single, message = _message(code, given.matched)
+        three = "; three planes do not suffice then" if code in POSITIONS else ""
+        few = (used <= 3) & (figures.normals.shape[1] >= 3)
+        for text, one in ((single, values == 1), (message, values != 1)):
+            found += notices(code, text + three, values, flagged & one & few, given.batch)
+            found += notices(code, text, values, flagged & one & ~few, given.batch)
     return tuple(sorted(found, key=lambda notice: notice.problem))
+
+
+def _message(code: NoticeCode, matched: bool) -> tuple[str, str]:
+    """The sentence where the figure is 1, and where it is not."""
+    message = MESSAGES[code]
+    if isinstance(message, dict):
+        message = message[matched]
+    return message if isinstance(message, tuple) else (message, message)
 
 
 def _flatness(vectors: Tensor, covariance: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:

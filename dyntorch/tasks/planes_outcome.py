@@ -8,6 +8,8 @@ from torch import Tensor
 from dyntorch.algebra.homogeneous import homogeneous, nonzero_sign, skew, unit, unit_vectors
 from dyntorch.algebra.rigid import nearest_rotation
 from dyntorch.solution import Status, failed
+from dyntorch.tasks.notices import NoticeCode
+from dyntorch.tasks.planes_checks import misfit, turned
 from dyntorch.tasks.planes_input import Given, enough
 from dyntorch.tasks.planes_notices import EXACT, NEAR, Figures, planes_notices
 from dyntorch.tasks.planes_problem import Layout
@@ -20,15 +22,16 @@ STILL = 3.0
 """Standard deviations within which a plane does not move."""
 
 
-def outcome(given: Given, found: tuple[Tensor, ...], method: str) -> TranslatingPlanes:
+def outcome(given: Given, found: tuple[Tensor, ...], method: str, refined: bool) -> TranslatingPlanes:
     """The result with a flat batch.
 
     Args:
         given: what was fitted.
-        found: what :func:`~dyntorch.tasks.planes_solver.solve` returns, for all problems.
+        found: what :func:`~dyntorch.tasks.planes_solver.solve` returns, for all problems, and the cost under the given matrices.
         method: of the start.
+        refined: whether it was refined; a start as it is has a residual of its own.
     """
-    theta, cost, covariance, undetermined, other = found
+    theta, cost, covariance, undetermined, other, separate = found
     layout = Layout(given.homographies.shape[1], given.fundamentals.shape[1])
     used = given.used()
     planes, bodies = used[:, : layout.planes].sum(-1), used[:, layout.planes :].sum(-1)
@@ -37,11 +40,22 @@ def outcome(given: Given, found: tuple[Tensor, ...], method: str) -> Translating
     uncertainty = projected(covariance[:, :9, :9], theta[:, :9]).diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
     right = enough(planes, bodies, method)
     figures = _figures(layout, theta, covariance, used)
-    other = other | figures.several()
-    status = torch.where((uncertainty > UNCERTAIN) | other, Status.AMBIGUOUS, Status.OK)
+    several = figures.several()
+    ratio, apart = misfit(given, cost, separate)
+    # what moves alike, or not at all, differs by noise alone
+    apart = apart & ~several & ~undetermined & right & refined
+    status = torch.where((uncertainty > UNCERTAIN) | other | several, Status.AMBIGUOUS, Status.OK)
+    status = torch.where(apart, Status.NO_CONSENSUS, status)
     status = torch.where(undetermined, Status.DEGENERATE, status)
     status = torch.where(right, status, Status.TOO_FEW)
-    warnings = planes_notices(figures, right, uncertainty, uncertainty > UNCERTAIN, other, given.batch)
+    distance, bent = turned(given, theta[:, :9], covariance[:, :9, :9], status)
+    said = {
+        NoticeCode.NO_COMMON_INFINITY: (ratio, apart),
+        NoticeCode.CALIBRATION: (distance, bent),
+        NoticeCode.UNCERTAIN: (uncertainty, (uncertainty > UNCERTAIN) & right & ~apart),
+        NoticeCode.OTHER_SOLUTION: (used.sum(-1), (other | several) & right & ~apart),
+    }
+    warnings = planes_notices(figures, right, said, given)
     there = (~failed(status)).to(theta.dtype)
     infinity, epipoles, normals = _measured(given, layout, theta)
     infinity = infinity * there[:, None, None]
@@ -68,6 +82,7 @@ def outcome(given: Given, found: tuple[Tensor, ...], method: str) -> Translating
         rotation=rotation,
         calibration=given.calibration,
         warnings=warnings,
+        unit="px" if given.matched else "relative",
     )
 
 

@@ -11,8 +11,8 @@ from torch import Tensor
 from dyntorch.algebra.homogeneous import finite_depth, homogeneous, inhomogeneous
 from dyntorch.algebra.triangulation import triangulate
 from dyntorch.normalize import hartley
-from dyntorch.solution import REMEDY, Status, failed
-from dyntorch.tasks.notices import Notice
+from dyntorch.solution import Status, failed
+from dyntorch.tasks.notices import Notice, check_results
 
 STEPS = 5  # of Gauss and Newton on the reprojection error of a point
 
@@ -40,6 +40,7 @@ class TranslatingPlanes:
         rotation: ``(*batch, 3, 3)`` camera 1 to camera 2, where the calibration was given.
         calibration: ``(*batch, 2, 3, 3)`` of both cameras, where it was given.
         warnings: notices on single problems of the batch.
+        unit: of ``residual``: ``"px"``, as the matches, or ``"relative"`` without matches.
     """
 
     homography_at_infinity: Tensor
@@ -55,6 +56,7 @@ class TranslatingPlanes:
     rotation: Tensor | None = None
     calibration: Tensor | None = None
     warnings: tuple[Notice, ...] = ()
+    unit: str = "relative"
 
     @property
     def translations(self) -> Tensor | None:
@@ -153,15 +155,7 @@ class TranslatingPlanes:
         Raises:
             ValueError: says which problems failed, how, and what to do.
         """
-        status = self.status.reshape(-1)
-        places = torch.arange(len(status)).reshape(self.status.shape)
-        for state in Status:
-            where = (status == state).nonzero().flatten().tolist()
-            if state != Status.OK and where:
-                problems = f"problem {', '.join(map(str, where[:8]))} of {len(status)}" if self.status.ndim else "the problem"
-                reasons = [str(w) for w in self.warnings if int(places[w.problem]) in where]
-                known = f" ({'; '.join(reasons[:3])})" if reasons else ""
-                raise ValueError(f"translating_planes: {problems}: {state.name}; {REMEDY[state]}{known}")
+        check_results("translating_planes", self.status, self.warnings)
         return self
 
     def _check_body(self, body: int, count: int) -> None:
@@ -177,7 +171,7 @@ class TranslatingPlanes:
         if bool(good.any()):
             middle = " (median)" if self.status.ndim else ""
             error, residual = (float(v[good].double().median()) for v in (self.uncertainty, self.residual))
-            lines.append(f"  homography at infinity: relative error about {error:.2g}{middle}; residual {residual:.3g}")
+            lines.append(f"  homography at infinity: relative error about {error:.2g}{middle}; residual {residual:.3g} {self.unit}")
         if self.status.ndim:
             seen = Counter(notice.code.value for notice in self.warnings)
             lines += [f"  warning {code}: {count} of {self.status.numel()} problems" for code, count in sorted(seen.items())]

@@ -14,7 +14,7 @@ import os
 import sys
 import warnings
 from collections.abc import Iterator, Sequence
-from typing import Annotated, Any, Protocol, cast
+from typing import Annotated, Any, Protocol, cast, get_args
 
 import tyro
 
@@ -111,9 +111,21 @@ def parse(words: list[str]) -> Runnable | int:
     except SystemExit as stop:
         if stop.code in (None, 0):
             return DONE
-        complain(_unboxed(said.getvalue()))
+        complain(_unboxed(said.getvalue()).replace("see dyntorch --help", f"see {_asked(words)} --help"))
         return BAD_INPUT
     return cast("Runnable", parsed)
+
+
+def _asked(words: list[str]) -> str:
+    """The command that the words begin with, as far as there is one: whose help says what is wrong with the others."""
+    found, level = ["dyntorch"], COMMANDS
+    for word in words:
+        known = {choice.__metadata__[0].name: choice.__origin__ for choice in get_args(level)}
+        if word not in known:
+            break
+        found.append(word)
+        level = known[word]
+    return " ".join(found)
 
 
 def _unboxed(text: str) -> str:

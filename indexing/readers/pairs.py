@@ -21,6 +21,8 @@ KNOWN = ("label", "labels")
 FORMATS = "give npz with x1, x2 (n, 2), or CSV with columns x1,y1,x2,y2 (and perhaps id, weight, label)"
 KEYS = "give x1 and x2 (n, 2), and perhaps label, weights, ids, wh; of several pairs NAME/x1 and NAME/x2"
 EXTRA = {"label": KNOWN, "weights": table.WEIGHTS, "ids": ("ids", "id"), "wh": ("wh", "size")}
+TRACKS = ("y", "tracks")  # (frames, n, 2), as of Hopkins 155
+FRAMES = "it seems to hold tracks (frames, n, 2): save two frames as matches, numpy.savez('m.npz', x1=tracks[0], x2=tracks[-1])"
 LISTED = 8  # names in a message
 
 
@@ -132,14 +134,16 @@ def _chosen(path: Path, names: list[str], pair: str | None) -> str:
     """What the names of the arrays of the pair begin with."""
     several = [name.removesuffix("x1") for name in names if name.endswith("/x1")]
     listed = ", ".join(name.rstrip("/") for name in several[:LISTED]) + ", ..." * (len(several) > LISTED)
-    if pair is not None and f"{pair}/x1" not in names:
+    if pair is not None and f"{pair}/x1" not in names and (several or "x1" in names):
         raise error(path, f"has no pair {pair!r}", f"its pairs are {listed}" if several else "it holds one pair: leave --pair away")
     if pair is None and "x1" not in names and len(several) > 1:
         raise error(path, f"holds {len(several)} pairs ({listed})", f"say which: --pair {several[0].rstrip('/')}")
     before = f"{pair}/" if pair is not None else "" if "x1" in names or not several else several[0]
     missing = next((before + name for name in ("x1", "x2") if before + name not in names), None)
     if missing is not None:
-        raise error(path, f"has no {missing} (its arrays are {', '.join(names[:LISTED]) or 'none'})", KEYS)
+        tracks = not several and any(name.rpartition("/")[2] in TRACKS for name in names)
+        remedy = FRAMES if tracks else KEYS
+        raise error(path, f"has no {missing} (its arrays are {', '.join(names[:LISTED]) or 'none'})", remedy)
     return before
 
 

@@ -138,3 +138,16 @@ def test_misuse():
         affine_segmentation(x1, x2)
     with pytest.raises(ValueError, match="of one shape"):
         affine_segmentation(x1, x2[:-1])
+    with pytest.raises(ValueError, match=r"x1 must be a torch.Tensor, got ndarray; use torch.as_tensor"):
+        affine_segmentation(x1.numpy(), x2.numpy())
+    with pytest.raises(ValueError, match=r"weights must be a torch.Tensor, got list"):
+        affine_segmentation(x1, x2, [1.0] * 13)
+
+
+def test_results_print_in_two_lines():
+    x1, x2, _, _ = bodies(counts=(15, 12))
+    x1[0] = torch.nan
+    said = "AffineSegmentation(matches=27, bodies=2, batch=(): not degenerate)\n  labels: 14 of body 1, 12 of body 2, 1 unlabelled"
+    assert repr(affine_segmentation(x1, x2)) == said
+    both = affine_segmentation(torch.stack([x1, 0 * x1]), torch.stack([x2, 0 * x2]))
+    assert repr(both).startswith("AffineSegmentation(matches=27, bodies=2, batch=(2,): 1 of 2 degenerate)")

@@ -151,9 +151,18 @@ def test_misuse():
     x1, x2, _, _ = scene(counts=(20, 14))
     with pytest.raises(ValueError, match="2 bodies takes 35 matches, got 34: add 1"):
         multibody_matrix(x1, x2, 2)
-    with pytest.raises(ValueError, match="bodies must be 1 or more, got 0"):
-        multibody_matrix(x1, x2, 0)
+    for bodies, said in ((0, "0"), ("3", "'3'"), (2.0, "2.0"), (True, "True")):
+        with pytest.raises(ValueError, match=f"bodies must be a whole number, 1 or more, got {said}"):
+            multibody_matrix(x1, x2, bodies)
+    with pytest.raises(ValueError, match=r"got ndarray; use torch.as_tensor"):
+        multibody_matrix(x1.numpy(), x2.numpy(), 1)
     with pytest.raises(ValueError, match="of one shape"):
         multibody_matrix(x1, x2[1:], 1)
     with pytest.raises(ValueError, match="not negative"):
         multibody_matrix(x1, x2, 1, -torch.ones(34))
+
+
+def test_results_print_in_two_lines():
+    x1, x2, _, _ = scene(counts=(24, 16))
+    said = "Multibody(matches=40, bodies=2, batch=(): not degenerate)\n  labels: 24 of body 1, 16 of body 2"
+    assert repr(multibody_matrix(x1, x2, 2)) == said

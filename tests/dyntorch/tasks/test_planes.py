@@ -214,14 +214,14 @@ def test_repr_says_what_matters():
     [
         (
             {"H": torch.eye(3, dtype=F64).expand(2, 3, 3)},
-            "H has 2 planes, fundamentals 0 bodies; method 'auto' needs at least 3 planes",
+            "H and fundamentals hold 2 planes; method 'auto' needs at least 3 planes",
         ),
         ({"H": torch.eye(3, dtype=F64).expand(3, 3, 3), "method": "linear"}, "needs at least 4 planes"),
         ({"H": torch.eye(3, dtype=F64).expand(4, 3, 3), "method": "best"}, "method must be 'auto' or one of linear"),
         ({"H": torch.eye(4, dtype=F64).expand(4, 4, 4)}, "H must be a floating point tensor"),
         ({"H": torch.ones(4, 3, 3, dtype=torch.long)}, "H must be a floating point tensor"),
         ({"H": [[1.0]]}, "H must be a torch.Tensor"),
-        ({"fundamentals": torch.eye(3, dtype=F64)[None]}, "fundamentals 1 bodies"),
+        ({"fundamentals": torch.eye(3, dtype=F64)[None]}, "hold 1 fundamental matrix; method"),
         ({"H": torch.ones(1, 3, 3), "fundamentals": torch.ones(1, 3, 3)}, "2 planes and 1 fundamental matrix"),
         ({"H": torch.ones(4, 3, 3), "fundamentals": torch.ones(2, 1, 3, 3)}, "one batch and dtype"),
         ({"H": torch.ones(4, 3, 3), "x1": torch.ones(4, 9, 2)}, "x1 and x2 belong together, got only x1"),
@@ -232,6 +232,7 @@ def test_repr_says_what_matters():
         ({"H": torch.ones(4, 3, 3), "calibration": torch.ones(2, 2)}, "calibration must be K"),
         ({"H": torch.ones(4, 3, 3), "calibration": torch.ones(2, 3, 3)}, r"batch \(\), or a pair .* got \(2, 3, 3\)"),
         ({"H": torch.ones(4, 3, 3), "calibration": 800.0}, "calibration must be K .* got float"),
+        ({"H": torch.ones(4, 3, 3), "calibration": torch.eye(3).numpy()}, r"got numpy.ndarray \(use torch.as_tensor"),
         (
             {"H": torch.ones(1, 3, 3), "x1": [torch.ones(9, 2), torch.ones(5, 2)], "x2": [torch.ones(5, 2), torch.ones(9, 2)]},
             r"same points in both views, got \[9, 5\] and \[5, 9\]",

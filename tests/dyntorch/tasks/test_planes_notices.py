@@ -7,6 +7,7 @@ import torch
 
 import dyntorch as dyn
 from dyntorch import scenes
+from dyntorch.algebra.homogeneous import apply
 from dyntorch.metrics import relative_error
 from dyntorch.solution import Status
 from dyntorch.tasks.notices import NoticeCode
@@ -97,3 +98,89 @@ def test_one_residual_to_spare_does_not_vouch_for_three_planes():
 def test_few_noisy_planes_are_not_trusted():
     found, _, _ = solved(3, 8, 10, matched=True, sigma=2.0)
     assert int((found.status == Status.AMBIGUOUS).sum()) >= 6
+
+
+def unrelated(count, batch, seed, spread=0.3):
+    """Homographies near the identity in the image that have nothing in common, and matches of patches of 120 pixels."""
+    generator = torch.Generator().manual_seed(seed)
+    k = scenes.translating_planes(3).calibration
+    drawn = torch.randn(batch, count, 3, 3, generator=generator, dtype=k.dtype)
+    H = k @ (torch.eye(3, dtype=k.dtype) + spread * drawn) @ torch.linalg.inv(k)
+    centre = 100 + 600 * torch.rand(batch, count, 1, 2, generator=generator, dtype=k.dtype)
+    x1 = centre + 120 * (torch.rand(batch, count, 40, 2, generator=generator, dtype=k.dtype) - 0.5)
+    x1, x2 = (x + 0.5 * torch.randn(x.shape, generator=generator, dtype=k.dtype) for x in (x1, apply(H, x1)))
+    return H, x1, x2
+
+
+def test_matches_tell_homographies_that_have_nothing_in_common():
+    _, x1, x2 = unrelated(8, 4, 31)
+    found = translating_planes(x1=x1, x2=x2)
+    assert found.status.tolist() == [Status.NO_CONSENSUS] * 4
+    named = [notice for notice in found.warnings if notice.code == NoticeCode.NO_COMMON_INFINITY]
+    assert len(named) == 4 and all(notice.value > 6 for notice in named)
+    assert "times the noise" in str(named[0])
+    with pytest.raises(ValueError, match=r"NO_CONSENSUS; .* no_common_infinity"):
+        found.check()
+
+
+@pytest.mark.parametrize(("planes", "least"), [(5, 0.6), (8, 0.9)])
+def test_homographies_alone_tell_less_often(planes, least):
+    drawn = torch.randn(20, planes, 3, 3, generator=torch.Generator().manual_seed(32), dtype=torch.float64)
+    found = translating_planes(drawn)
+    named = {w.problem for w in found.warnings if w.code == NoticeCode.NO_COMMON_INFINITY}
+    assert len(named) >= 20 * least
+    assert int((found.status == Status.NO_CONSENSUS).sum()) == len(named)
+    assert translating_planes(drawn, refine=False, method="linear").status.eq(Status.NO_CONSENSUS).sum() == 0
+
+
+@pytest.mark.parametrize("matched", [False, True])
+@pytest.mark.parametrize(("planes", "sigma"), [(3, 1.0), (4, 0.5), (5, 1.0), (8, 1.0)])
+def test_noise_is_no_lack_of_a_common_homography(planes, sigma, matched):
+    found, _, codes = solved(planes, 8, 33, matched=matched, sigma=sigma)
+    assert NoticeCode.NO_COMMON_INFINITY not in codes and Status.NO_CONSENSUS not in found.status.tolist()
+
+
+def test_the_same_homography_many_times_is_not_said_to_differ():
+    scene = scenes.translating_planes(1, generator=torch.Generator().manual_seed(34))
+    H = scene.homographies.expand(6, 3, 3) + 1e-4 * torch.randn(6, 3, 3, generator=torch.Generator().manual_seed(35)).double()
+    assert NoticeCode.NO_COMMON_INFINITY not in {w.code for w in translating_planes(H).warnings}
+
+
+def test_a_calibration_that_contradicts_is_named():
+    scene = scenes.translating_planes(5, batch=6, generator=torch.Generator().manual_seed(36))
+    wrong = scene.calibration.clone()
+    wrong[0, 0] *= 3
+    found = translating_planes(scene.homographies, calibration=wrong)
+    named = [w for w in found.warnings if w.code == NoticeCode.CALIBRATION]
+    assert len(named) == 6 and bool((found.status == Status.OK).all())
+    # the figure, by the polar decomposition
+    moved = torch.linalg.inv(wrong) @ scene.infinity @ wrong
+    u, _, v = torch.linalg.svd(moved)
+    expected = torch.linalg.matrix_norm(moved / torch.linalg.det(moved)[:, None, None] ** (1 / 3) - u @ v)
+    assert torch.tensor([w.value for w in named]).double().sub(expected).abs().max() < 1e-5
+    assert "from a rotation" in str(named[0])
+    # halved pixels in the second view, and the right pair
+    pair = (scene.calibration, torch.diag(torch.tensor([0.5, 0.5, 1.0], dtype=wrong.dtype)) @ scene.calibration)
+    assert translating_planes(scene.homographies, calibration=scene.calibration).warnings == ()
+    assert {w.code for w in translating_planes(scene.homographies, calibration=pair).warnings} == {NoticeCode.CALIBRATION}
+
+
+@pytest.mark.parametrize("planes", [3, 4, 5, 8])
+def test_noise_does_not_contradict_the_calibration(planes):
+    scene = scenes.translating_planes(planes, batch=20, sigma=0.5, generator=torch.Generator().manual_seed(37))
+    H = dyn.fit(dyn.Collineation(2), scene.x2, scene.x1).tensor
+    found = translating_planes(H, calibration=scene.calibration)
+    assert NoticeCode.CALIBRATION not in {w.code for w in found.warnings}
+
+
+def test_messages_count_and_say_what_three_planes_lack_only_of_three():
+    generator = torch.Generator().manual_seed(38)
+    four = translating_planes(scenes.translating_planes(4, shared=2, generator=generator).homographies)
+    assert "warning shared_body: a pair of planes or bodies moves alike, as of one body" in repr(four)
+    assert "three planes" not in repr(four) and repr(four).splitlines()[1].endswith(" relative")
+    three = translating_planes(scenes.translating_planes(3, shared=3, generator=generator).homographies)
+    assert "three planes do not suffice then" in repr(three)
+    five = translating_planes(scenes.translating_planes(5, shared=3, generator=generator).homographies)
+    assert "3 pairs of planes or bodies move alike, as of one body" in repr(five)
+    scene = scenes.translating_planes(4, generator=generator)
+    assert repr(translating_planes(x1=scene.x1, x2=scene.x2)).splitlines()[1].endswith(" px")

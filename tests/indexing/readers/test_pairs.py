@@ -80,6 +80,7 @@ def test_bad_tables_name_file_field_and_remedy(tmp_path, text, says):
     ("arrays", "says"),
     [
         ({"a": X1}, "has no x1 (its arrays are a); give x1 and x2 (n, 2)"),
+        ({"car/y": np.stack([X1, X2]), "car/s": np.ones(10)}, "are car/y, car/s); it seems to hold tracks (frames, n, 2)"),
         ({"x1": X1}, "has no x2"),
         ({"x1": X1, "x2": X2[:9]}, "x1 has 10 rows, x2 9; give a row per match in both"),
         ({"x1": X1.T, "x2": X2.T}, "x1: the array has shape (2, 10); points of an image are (n, 2): transpose it"),
