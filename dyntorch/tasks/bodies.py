@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import prod
+
 import torch
 from torch import Tensor
 
@@ -125,7 +127,5 @@ def _nested(models: list[tuple[BodyModel, ...]], batch: tuple[int, ...]) -> tupl
     """Models of a flat batch in its shape."""
     if not batch:
         return models[0]
-    step = 1
-    for size in batch[1:]:
-        step *= size
+    step = prod(batch[1:])
     return tuple(_nested(models[i * step : (i + 1) * step], batch[1:]) for i in range(batch[0]))

@@ -11,7 +11,7 @@ from torch import Tensor
 from dyntorch.algebra.epipolar import sampson_squared
 from dyntorch.algebra.epipolar_descent import descend
 from dyntorch.tasks.bodies_energy import View, energy
-from dyntorch.tasks.bodies_flows import mean_field
+from dyntorch.tasks.bodies_field import mean_field
 from dyntorch.tasks.bodies_pool import LEAST, SMOOTH, TRUNCATED, Starts, one_hot
 
 SCHEDULE = (2.0, 2.0, 1.5, 1.0, 1.0, 1.0, 1.0, 1.0)

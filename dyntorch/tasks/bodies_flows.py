@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.sampling import uniform
+from dyntorch.tasks.bodies_field import mean_field
 from dyntorch.tasks.coherence import Links
 
 PATCHES = (12, 20, 30, 45)
@@ -55,14 +56,6 @@ def affine_flows(x1: Tensor, x2: Tensor, links: Links, bodies: Tensor, noise: fl
         member = mean_field(cost.masked_fill(absent, torch.inf), links, CUT, TURNS)
         weight = member * (FREEDOM + 2) / (FREEDOM + ratio)
     return member.argmax(1)
-
-
-def mean_field(cost: Tensor, links: Links, cut: float, turns: int, start: Tensor | None = None) -> Tensor:
-    """Probabilities of labels ``(*batch, K, n)`` that cost so much, with ``cut`` times the links between different labels."""
-    member = torch.softmax(-cost, -2) if start is None else start
-    for _ in range(turns):
-        member = 0.5 * (member + torch.softmax(cut * links.pull(member) - cost, -2))
-    return member
 
 
 def _patches(x: Tensor, motion: Tensor, bodies: Tensor, width: int, generator: torch.Generator | None) -> Tensor:

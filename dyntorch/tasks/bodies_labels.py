@@ -11,6 +11,7 @@ from torch import Tensor
 from dyntorch.algebra.epipolar import sampson_squared
 from dyntorch.algebra.epipolar_descent import descend
 from dyntorch.tasks.bodies_energy import View
+from dyntorch.tasks.bodies_field import mean_field
 from dyntorch.tasks.coherence import Links, conformity
 
 OUTLIER = 1.0
@@ -45,6 +46,11 @@ class Labelling:
     def labels(self) -> Tensor:
         """``(n,)``, 0 outlier."""
         return self.probabilities.argmax(0)
+
+    def of(self, bodies: Tensor) -> Labelling:
+        """With these bodies alone (indices or bool): what belonged to others belongs to none."""
+        kept = self.probabilities[1:][bodies]
+        return Labelling(torch.cat([1 - kept.sum(0, keepdim=True), kept]).clamp(min=0), self.fundamentals[bodies])
 
 
 def label(
@@ -92,11 +98,8 @@ def label(
 
 def field(cost: Tensor, outlier: float, links: Links) -> Tensor:
     """Mean field ``(K + 1, n)`` of the costs ``(K, n)`` of bodies, the first of an outlier."""
-    cost = SHARPNESS * torch.cat([torch.full_like(cost[:1], outlier), cost])
-    member = torch.softmax(-cost, 0)
-    for _ in range(TURNS):
-        member = 0.5 * (member + torch.softmax(SHARPNESS * links.pull(member) - cost, 0))
-    return member
+    every = torch.cat([torch.full_like(cost[:1], outlier), cost])
+    return mean_field(SHARPNESS * every, links, SHARPNESS, TURNS)
 
 
 def _strange(view: View, members: Tensor, scale: float | None) -> Tensor:

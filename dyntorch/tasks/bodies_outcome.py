@@ -117,7 +117,8 @@ def nothing(weights: Tensor, threshold: float, status: Status, repeated: float, 
 
 def outcome(given: Given, labelled: Labelling, threshold: float, bodies: int | None, spare: bool) -> Outcome:
     """The labels in order of size, with the model of every body."""
-    labels, probabilities, fundamentals = _sorted(labelled)
+    labelled = _sorted(labelled)
+    labels, fundamentals = labelled.labels, labelled.fundamentals
     count = len(fundamentals)
     if not count:
         return nothing(given.weights, threshold, Status.NO_CONSENSUS, given.repeated, given.linked)
@@ -125,7 +126,7 @@ def outcome(given: Given, labelled: Labelling, threshold: float, bodies: int | N
     planar = unit(torch.linalg.inv(given.second) @ models.homographies @ given.first)
     return Outcome(
         labels=given.spread(labels),
-        probabilities=given.spread(probabilities.mT),
+        probabilities=given.spread(labelled.probabilities.mT),
         fundamentals=unit(given.second.mT @ fundamentals @ given.first),
         homographies=torch.where(models.planar[:, None, None], planar, 0.0),
         models=tuple(BodyModel.HOMOGRAPHY if flat else BodyModel.FUNDAMENTAL for flat in models.planar.tolist()),
@@ -139,15 +140,11 @@ def outcome(given: Given, labelled: Labelling, threshold: float, bodies: int | N
     )
 
 
-def _sorted(labelled: Labelling) -> tuple[Tensor, Tensor, Tensor]:
-    """Labels, probabilities ``(K + 1, n)`` and fundamental matrices of the bodies that kept enough matches, the largest first."""
+def _sorted(labelled: Labelling) -> Labelling:
+    """The bodies that kept enough matches, the largest first."""
     size = torch.bincount(labelled.labels, minlength=len(labelled.fundamentals) + 1)[1:]
     order = size.argsort(descending=True, stable=True)
-    order = order[size[order] >= LEAST]
-    bodies = labelled.probabilities[1:][order]
-    # what belonged to a body that was given up belongs to none
-    probabilities = torch.cat([1 - bodies.sum(0, keepdim=True), bodies]).clamp(min=0)
-    return probabilities.argmax(0), probabilities, labelled.fundamentals[order]
+    return labelled.of(order[size[order] >= LEAST])
 
 
 def _residuals(view: View, labels: Tensor, fundamentals: Tensor, models: Models) -> Tensor:

@@ -122,10 +122,7 @@ def _labelled(given: Given, candidate: Candidate, request: Request) -> Labelling
     if request.spatial:
         return labelled
     # nothing but the geometry speaks for these bodies: those that random matches would show as well are none
-    believed = significant(given.view, labelled.fundamentals, labelled.labels)
-    bodies = labelled.probabilities[1:][believed]
-    probabilities = torch.cat([1 - bodies.sum(0, keepdim=True), bodies]).clamp(min=0)
-    return Labelling(probabilities, labelled.fundamentals[believed])
+    return labelled.of(significant(given.view, labelled.fundamentals, labelled.labels))
 
 
 def _left(given: Given, labelled: Labelling) -> int:

@@ -22,7 +22,7 @@ REASONS = {
     "TOO_FEW": "too few matches are present in both images; give more",
     "DEGENERATE": "several segmentations fit all matches exactly; add matches in general position",
     "AMBIGUOUS": "other segmentations fit as well; add matches, or say how many --bodies there are",
-    "NO_CONSENSUS": "no body moves so that enough of the matches agree; raise --threshold, try --no-spatial, or clean the matches",
+    "NO_CONSENSUS": "no body moves so that enough of the matches agree; raise --threshold, or clean the matches",
 }
 FLAGS = ("bodies", "threshold", "spatial", "weights")
 LEAST = 8  # matches

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from dyntorch.tasks.bodies_flows import affine_flows, mean_field
+from dyntorch.tasks.bodies_field import mean_field
+from dyntorch.tasks.bodies_flows import affine_flows
 from dyntorch.tasks.coherence import coherence
 
 F64 = torch.float64
