@@ -216,3 +216,22 @@ def hyperplanes_through(x: Tensor) -> Tensor:
     eye = torch.eye(x.shape[-1], dtype=x.dtype, device=x.device)
     outer = (x / s)[..., :, None] * (x / (s + 1))[..., None, :]
     return torch.cat([eye - outer, -(x / s)[..., None]], dim=-1)
+
+
+def two_sided(A: Tensor, B: Tensor) -> Tensor:
+    r"""The matrix of :math:`X \mapsto A X B` on entries row by row, :math:`A \otimes B^T`.
+
+    Args:
+        A: ``(*batch, i, j)``.
+        B: ``(*batch, l, k)``.
+
+    Returns:
+        ``(*batch, i k, j l)``.
+
+    Example:
+        >>> import torch
+        >>> A, X, B = torch.rand(3, 2, 2, generator=torch.Generator().manual_seed(0)).unbind()
+        >>> bool(torch.allclose(two_sided(A, B) @ X.flatten(), (A @ X @ B).flatten()))
+        True
+    """
+    return torch.einsum("...ij,...lk->...ikjl", A, B).flatten(-2).flatten(-3, -2)

@@ -131,7 +131,7 @@ def _general(planes: Tensor, present: Tensor) -> Tensor:
     outer = (left[..., :, None] * right[..., None, :]).flatten(-2)
     across = torch.eye(9, dtype=planes.dtype, device=planes.device) - outer[..., :, None] * outer[..., None, :]
     across = across * present[..., None, None]
-    found = _least_squares(across.sum(-3), (across @ planes.flatten(-2)[..., None]).sum(-3)[..., 0])
+    found = ridge_solution(across.sum(-3), (across @ planes.flatten(-2)[..., None]).sum(-3)[..., 0])
     return found.unflatten(-1, (3, 3))
 
 
@@ -151,7 +151,7 @@ def _collinear(planes: Tensor, present: Tensor) -> Tensor:
     equations = (equations - _mean(equations, present)[..., None, :, :]) * present[..., None, None]
     constants = (constants - _mean(constants, present)[..., None, :]) * present[..., None]
     equations, constants = equations.flatten(-3, -2), constants.flatten(-2)
-    found = _least_squares(equations.mT @ equations, (equations.mT @ constants[..., None])[..., 0]).unflatten(-1, (2, 3))
+    found = ridge_solution(equations.mT @ equations, (equations.mT @ constants[..., None])[..., 0]).unflatten(-1, (2, 3))
     return across.mT @ (found + centre) + line[..., :, None] * (line[..., None, :] @ _mean(planes, present))
 
 
@@ -183,8 +183,8 @@ def _leading(gram: Tensor) -> tuple[Tensor, Tensor]:
     return unit_vectors(torch.linalg.cross(across[..., 0, :], across[..., 1, :])), across
 
 
-def _least_squares(gram: Tensor, right: Tensor) -> Tensor:
-    """Solution of normal equations, finite for a singular matrix."""
+def ridge_solution(gram: Tensor, right: Tensor) -> Tensor:
+    """Solution ``(..., k)`` of normal equations ``(..., k, k)``, finite for a singular matrix, as of parallel planes."""
     trace = gram.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
     eye = torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device)
     inverse = torch.linalg.inv_ex(gram + (RIDGE * trace + torch.finfo(gram.dtype).tiny) * eye)[0]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from dyntorch.algebra.homogeneous import two_sided
 from dyntorch.algebra.rigid import nearest_rotation
 from dyntorch.solution import Status
 from dyntorch.tasks.planes_input import Given
@@ -81,11 +82,8 @@ def turned(given: Given, infinity: Tensor, covariance: Tensor, status: Tensor) -
     rotation = nearest_rotation(moved / scale)
     eye = torch.eye(3, dtype=moved.dtype, device=moved.device)
     distance = torch.linalg.matrix_norm(moved / scale - rotation)
-    # the symmetric part of R^T M, without its trace, is what no rotation and no scale takes up; row by row, A X B is (A kron B^T) x
-    lift = (
-        torch.einsum("bij,blk->bikjl", rotation.mT @ after, before.mT).flatten(3).flatten(1, 2).unflatten(1, (3, 3))
-        / scale[..., None]
-    )
+    # the symmetric part of R^T M, without its trace, is what no rotation and no scale takes up
+    lift = two_sided(rotation.mT @ after, before).unflatten(1, (3, 3)) / scale[..., None]
     lift = (lift + lift.transpose(1, 2)) / 2
     lift = lift - eye[:, :, None] * torch.einsum("biij->bj", lift)[:, None, None] / 3
     lift = lift.flatten(1, 2)

@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from dyntorch.algebra.homogeneous import apply, unit
+from dyntorch.algebra.rank_one_pencils import finite_matrices
 from dyntorch.tasks.planes_starts import LEAST, frames_of_calibration, frames_of_matches, frames_of_matrices
 
 Points = Tensor | Sequence[Tensor]
@@ -266,8 +267,7 @@ def _there(matrices: Tensor) -> Tensor:
 
 def _finite(matrices: Tensor) -> Tensor:
     """Zero in the place of matrices that are not finite; norm 1, as homographies in pixels may be of any size."""
-    there = matrices.isfinite().flatten(-2).all(-1)[..., None, None]
-    return unit(torch.where(there, matrices, 0.0))
+    return unit(finite_matrices(matrices)[0])
 
 
 def normalized(homographies: Tensor, frames: Pair) -> Tensor:

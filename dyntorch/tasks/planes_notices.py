@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -73,10 +74,12 @@ class Figures:
     moving: Tensor
     used: Tensor
 
+    @cached_property
     def line(self) -> tuple[Tensor, Tensor]:
         """How far the epipoles are from one line ``(b,)``, and whether noise explains it."""
         return _flatness(self.epipoles, self.epipole_covariance, self.moving)
 
+    @cached_property
     def plane(self) -> tuple[Tensor, Tensor]:
         """The same for the normals and one plane."""
         return _flatness(self.normals, self.normal_covariance, self.moving[:, : self.normals.shape[1]])
@@ -90,10 +93,11 @@ class Figures:
         """
         planes = self.normals.shape[1]
         count, bodies = self.used[:, :planes].sum(-1), self.used[:, planes:].sum(-1)
-        groups, known = self.groups()
-        parallel = (bodies == 0) & self.line()[1] & self.plane()[1] & (count <= 4)
+        groups, known = self.groups
+        parallel = (bodies == 0) & self.line[1] & self.plane[1] & (count <= 4)
         return (groups < 2) | ((groups == 2) & (known < 2)) | parallel
 
+    @cached_property
     def alike(self) -> Tensor:
         """Which pairs have one epipole within the noise, ``(b, c, c)`` bool; no pair with itself."""
         e = torch.where(self.moving[..., None], self.epipoles, 0.0)
@@ -105,10 +109,11 @@ class Figures:
         both = self.moving[:, :, None] & self.moving[:, None]
         return near & both & ~torch.eye(e.shape[1], dtype=torch.bool, device=e.device)
 
+    @cached_property
     def groups(self) -> tuple[Tensor, Tensor]:
         """How many bodies move, and of how many the fundamental matrix is known, given or from two planes; ``(b,)`` each."""
         count = self.epipoles.shape[1]
-        near = self.alike().double()
+        near = self.alike.double()
         reach = near + torch.eye(count, dtype=near.dtype, device=near.device)
         for _ in range(count.bit_length()):
             reach = (reach @ reach).sign()
@@ -131,11 +136,11 @@ def planes_notices(
     """
     used, still = figures.used.sum(-1), (figures.used & ~figures.moving).sum(-1)
     missing = figures.used.shape[1] - used
-    line, collinear = figures.line()
-    plane, coplanar = figures.plane()
-    pairs = figures.alike().sum((-2, -1)) // 2
+    line, collinear = figures.line
+    plane, coplanar = figures.plane
+    pairs = figures.alike.sum((-2, -1)) // 2
     # one or two bodies are in one line and one plane by themselves
-    several = enough & (figures.groups()[0] >= 3)
+    several = enough & (figures.groups[0] >= 3)
     rows = {
         NoticeCode.UNUSED_PLANE: (missing, missing > 0),
         NoticeCode.FEW_PLANES: (used, ~enough),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dyntorch.algebra.homogeneous import homogeneous, nonzero_sign, skew, unit, unit_vectors
+from dyntorch.algebra.homogeneous import homogeneous, nonzero_sign, skew, two_sided, unit, unit_vectors
 from dyntorch.algebra.rigid import nearest_rotation
 from dyntorch.solution import Status, failed
 from dyntorch.tasks.notices import NoticeCode
@@ -136,6 +136,5 @@ def _measured(given: Given, layout: Layout, theta: Tensor) -> tuple[Tensor, Tens
 def _carried(covariance: Tensor, entries: Tensor, frames: tuple[Tensor, Tensor]) -> Tensor:
     """Covariance ``(b, 9, 9)`` of the entries of the homography at infinity in measured coordinates, at norm 1."""
     back = torch.linalg.inv_ex(frames[1])[0]
-    # row by row, A X B has the entries (A kron B^T) x
-    lift = torch.einsum("bij,blk->bikjl", back, frames[0]).flatten(3).flatten(1, 2)
+    lift = two_sided(back, frames[0])
     return projected(lift @ covariance @ lift.mT, (lift @ entries[..., None])[..., 0])

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dyntorch.algebra.homogeneous import finite_depth, homogeneous, inhomogeneous
+from dyntorch.algebra.homogeneous import finite_depth, homogeneous, inhomogeneous, unit_vectors
 from dyntorch.algebra.triangulation import triangulate
 from dyntorch.normalize import hartley
 from dyntorch.solution import Status, failed
@@ -64,9 +64,7 @@ class TranslatingPlanes:
         if self.calibration is None:
             return None
         inverse = torch.linalg.inv_ex(self.calibration[..., 1, :, :])[0]
-        moved = self.epipoles @ inverse.mT
-        length = moved.norm(dim=-1, keepdim=True)
-        return moved / torch.where(length > 0, length, 1.0)
+        return unit_vectors(self.epipoles @ inverse.mT)
 
     def cameras(self) -> tuple[Tensor, Tensor]:
         r"""Affine cameras of every body, :math:`P = [I \mid 0]` and :math:`P'_i = [H_\infty \mid e_i]`.
@@ -87,10 +85,11 @@ class TranslatingPlanes:
         """
         infinity, epipoles = self.homography_at_infinity[..., None, :, :], self.epipoles
         eye = torch.eye(3, dtype=infinity.dtype, device=infinity.device).expand(self.homography_at_infinity.shape)
-        if self.calibration is not None and self.rotation is not None and self.translations is not None:
+        translations = self.translations
+        if self.calibration is not None and self.rotation is not None and translations is not None:
             eye, second = self.calibration.unbind(-3)
             infinity = (second @ self.rotation)[..., None, :, :]
-            epipoles = self.translations @ second.mT
+            epipoles = translations @ second.mT
         first = torch.cat([eye, torch.zeros_like(eye[..., :1])], dim=-1)
         infinity = infinity.expand(*epipoles.shape, 3)
         return first, torch.cat([infinity, epipoles[..., None]], dim=-1)

@@ -77,8 +77,10 @@ def solve(
     everyone = torch.arange(b, device=best.device)
     other = _others(theta[..., :9], cost, best, spare) if refine else torch.zeros_like(spare, dtype=torch.bool)
     theta, cost = theta[best, everyone], cost[best, everyone]
-    covariance, _ = _covariance(problem, theta)
-    return theta, cost, covariance, _covariance(matrices, theta)[1], other
+    covariance, undetermined = _covariance(problem, theta)
+    if matches is not None:
+        undetermined = _covariance(matrices, theta)[1]
+    return theta, cost, covariance, undetermined, other
 
 
 def _distinct(theta: Tensor, cost: Tensor) -> tuple[Tensor, Tensor]:

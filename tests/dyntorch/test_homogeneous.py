@@ -11,6 +11,7 @@ from dyntorch.algebra.homogeneous import (
     nonzero_sign,
     similarity,
     skew,
+    two_sided,
     unit,
     unit_vectors,
 )
@@ -166,3 +167,12 @@ def test_unit_vectors_and_signs_leave_zero_alone(dtype):
     assert (gradient * x).sum(-1).abs().max() < 10 * torch.finfo(dtype).eps
     sign = nonzero_sign(x.detach())
     assert sign.dtype == dtype and torch.equal(sign * x.abs(), x) and (sign[1] == 1).all()
+
+
+def test_a_product_from_both_sides_is_a_matrix_on_entries():
+    A, X, B = (
+        torch.randn(4, *size, dtype=torch.float64, generator=torch.Generator().manual_seed(5)) for size in ((3, 2), (2, 4), (4, 5))
+    )
+    found = two_sided(A, B)
+    assert found.shape == (4, 15, 8)
+    torch.testing.assert_close((found @ X.flatten(1)[..., None])[..., 0], (A @ X @ B).flatten(1))
