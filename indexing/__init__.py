@@ -10,8 +10,15 @@ if TYPE_CHECKING:
     from indexing.clip import ClipSet as ClipSet
     from indexing.indexer import ActionIndexer as ActionIndexer
     from indexing.scoring import Event as Event
+    from indexing.synchronization import synchronize as synchronize
 
-_HOME = {"Clip": "indexing.clip", "ClipSet": "indexing.clip", "ActionIndexer": "indexing.indexer", "Event": "indexing.scoring"}
+_HOME = {
+    "Clip": "indexing.clip",
+    "ClipSet": "indexing.clip",
+    "ActionIndexer": "indexing.indexer",
+    "Event": "indexing.scoring",
+    "synchronize": "indexing.synchronization",
+}
 __all__ = sorted(_HOME)
 
 

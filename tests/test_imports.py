@@ -51,7 +51,7 @@ def test_packages_do_not_import_what_stands_on_them(package):
 
 
 LAYERS = [
-    {"algebra", "blocks", "constants", "eigenspace", "forward", "nullspace", "primitives", "sampling"},
+    {"algebra", "blocks", "constants", "eigenspace", "forward", "lags", "nullspace", "primitives", "sampling"},
     {"invariant"},
     {"matches", "normalize", "matrix"},
     {"residual"},

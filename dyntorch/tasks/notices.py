@@ -85,6 +85,12 @@ class NoticeCode(StrEnum):
     """Many matches are the same."""
     INCOHERENT = "incoherent"
     """Few matches move like their neighbours."""
+    SHORT_OVERLAP = "short_overlap"
+    """Two cameras have too few frames in common."""
+    FEW_POINTS = "few_points"
+    """A camera shows too few points, long enough."""
+    FREE_PLACES = "free_places"
+    """The mean places of the points do not follow from their motions."""
     UNCERTAIN = "uncertain"
     """The noise leaves the motion so uncertain that it says little."""
 

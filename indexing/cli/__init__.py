@@ -1,4 +1,4 @@
-"""The command line ``dyntorch demo | index fit | index scan | index evaluate | align | reconstruct | segment | count``.
+"""The command line ``dyntorch demo | index fit | index scan | index evaluate | align | reconstruct | segment | sync | count``.
 
 Each has a file of its own: a dataclass whose fields are its flags, with ``run() -> exit code``.  Only what parsing needs is
 imported here, so that ``--help`` answers at once; a command imports its tools when it runs.
@@ -27,6 +27,7 @@ from indexing.cli.fit import Fit
 from indexing.cli.reconstruct import Reconstruct
 from indexing.cli.scan import Scan
 from indexing.cli.segment import Segment
+from indexing.cli.sync import Sync
 
 DONE, BAD_INPUT, REFUSED, INTERRUPTED, BROKEN_PIPE = 0, 2, 3, 130, 141
 
@@ -38,13 +39,14 @@ COMMANDS: Any = (
     | Annotated[Align, Command("align")]
     | Annotated[Reconstruct, Command("reconstruct")]
     | Annotated[Segment, Command("segment")]
+    | Annotated[Sync, Command("sync")]
     | Annotated[Count, Command("count")]
-)  # next: sync
+)
 GROUPS = ("index",)  # words that need another one behind them
 DESCRIPTION = """Geometry of scenes in which everything moves: learn actions from one clip each and find them in other clips, from
 other viewpoints (index); find how a camera or 3D sensor moved among things that move, and what stood still (align); find cameras,
 points and velocities from tracks through several views (reconstruct); find which matches of two images move together (segment);
-count how many matches such a problem takes (count).
+put cameras that nobody synchronized on one clock (sync); count how many matches such a problem takes (count).
 
 dyntorch COMMAND --help explains a command, dyntorch --version says the version."""
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from indexing.clip import Clip, ClipSet
 
 Format = Literal["clipset", "openpose", "coco", "mediapipe", "deeplabcut", "mmpose", "ultralytics", "sleap"]
-People = Literal["largest", "confident", "tracked", "all"]
+People = Literal["largest", "confident", "tracked", "all", "everyone"]
 TRIM = re.compile(r"(?P<path>.+)@(?P<start>\d+(\.\d*)?|\.\d+)?-(?P<end>\d+(\.\d*)?|\.\d+)?")
 KnownEvent = tuple[Hashable, float, float]
 

@@ -34,7 +34,8 @@ def read(
         format: one of :data:`FORMATS`; by default the content decides.
         fps: frames per second where the file has no times of its own; without it 30 is assumed (``Clip.fps_assumed``).
         person: who is followed where a frame shows several people: ``"largest"``, ``"confident"``, ``"tracked"``, or
-            ``"all"`` for one clip per tracked person; the rules are in :mod:`indexing.readers.people`.
+            ``"all"`` for one clip per tracked person (``"everyone"``: followed by position where the file has no ids); the
+            rules are in :mod:`indexing.readers.people`.
         min_confidence: joints below it become NaN; so do, in every pose file, joints with confidence 0.
         label: the action, given to every clip read.
         size: ``(width, height)`` in pixels of the image, for files with coordinates from 0 to 1 (MediaPipe, YOLO labels):

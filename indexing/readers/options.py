@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-PEOPLE = ("largest", "confident", "tracked", "all")
+PEOPLE = ("largest", "confident", "tracked", "all", "everyone")
 
 
 @dataclass(frozen=True)

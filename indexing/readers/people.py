@@ -10,6 +10,7 @@ them, otherwise people linked from frame to frame by position (:func:`link`).  O
 - ``"tracked"``: one identity only, and empty frames where it is absent: the id seen in most frames (of equals, the larger);
   without ids, the identity with the largest summed box.
 - ``"all"``: every tracked identity by itself; needs ids in the file.
+- ``"everyone"``: the same, with identities by position where the file has no ids.
 
 Ids that repeat within a frame are not identities (some tools write the same id for everybody) and are not used.
 Detections without an id, in a file that has ids, are used by ``"largest"`` and ``"confident"`` where no other is there.
@@ -48,13 +49,12 @@ def choose(path: Path, recording: Recording, person: str) -> list[tuple[Hashable
         ValueError: ``"all"`` without ids, or ``"confident"`` without confidences.
     """
     ids, names, repeated = _given(recording)
-    if person == "all":
-        if ids is None:
-            why = f"its person ids repeat in frame {repeated}" if repeated is not None else "it has no person ids"
-            raise error(
-                path, f"person='all' needs tracked people, but {why}", "run a tracker, or use person='largest' or 'tracked'"
-            )
-        return [(name, np.flatnonzero(ids == i)) for i, name in enumerate(names)]
+    if person == "all" and ids is None:
+        why = f"its person ids repeat in frame {repeated}" if repeated is not None else "it has no person ids"
+        raise error(path, f"person='all' needs tracked people, but {why}", "run a tracker, or use person='largest' or 'tracked'")
+    if person in ("all", "everyone"):
+        ids = link(recording.at, recording.joints) if ids is None else ids
+        return [(name, np.flatnonzero(ids == i)) for i, name in enumerate(names or range(int(ids.max()) + 1))]
     if person == "confident" and recording.confidence is None:
         raise error(path, "has no confidences, so person='confident' cannot be applied", "use person='largest' or 'tracked'")
     if ids is None and len(np.unique(recording.at)) == len(recording.at):

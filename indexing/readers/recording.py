@@ -153,10 +153,11 @@ def to_clips(path: Path, recording: Recording, options: Options) -> ClipSet:
     recording = _mask(path, _scale(path, recording, options), options.min_confidence)
     times, fps = _times(path, recording, options.fps)
     name = path.name or path.resolve().name
+    each = options.person in ("all", "everyone")
     clips = []
     for track, rows in choose(path, recording, options.person):
         frames = slice(0, len(times))
-        if options.person == "all":  # each person's clip spans what was seen of that person
+        if each:  # each person's clip spans what was seen of that person
             seen = recording.at[rows]
             frames = slice(int(seen.min()), int(seen.max()) + 1)
         joints, confidence = _fill(recording, rows)
@@ -167,10 +168,10 @@ def to_clips(path: Path, recording: Recording, options: Options) -> ClipSet:
                 confidence=None if confidence is None else confidence[frames],
                 fps=fps,
                 label=options.label,
-                name=name if options.person != "all" else f"{name}#{track}",
+                name=f"{name}#{track}" if each else name,
                 skeleton=recording.skeleton,
                 up=recording.up,
-                meta={} if options.person != "all" else {"person": track},
+                meta={"person": track} if each else {},
                 fps_assumed=recording.times is None and options.fps is None,
             )
         )

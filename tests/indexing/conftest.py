@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 import torch
 
+import dyntorch
 from indexing import ActionIndexer, Clip, ClipSet
 from indexing.actors import ACTIONS, Person, dataset
 from indexing.cli import main
 from indexing.shape.bank import Windows
 from indexing.windows import ragged, whole
+from tests.indexing.sync_scene import filmed, shift
 
 TEACHER, *STUDENTS = (Person.random(seed) for seed in range(3))
 
@@ -86,3 +88,22 @@ def run(request, data, tmp_path, monkeypatch, capsys):
         return code, said.out, said.err
 
     return call
+
+
+@pytest.fixture(scope="session")
+def cameras() -> list[Clip]:
+    """One scene, filmed by three cameras that begin at different times."""
+    return filmed()
+
+
+@pytest.fixture
+def library(monkeypatch):
+    """What dyntorch.synchronize says, known; records how it was asked."""
+    asked: list[dict] = []
+
+    def answer(a, b, correspondence=True, **options):
+        asked.append({"a": a, "b": b, "correspondence": correspondence, **options})
+        return shift(points=torch.ones(a.shape[1], dtype=torch.bool) if correspondence else None)
+
+    monkeypatch.setattr(dyntorch, "synchronize", answer, raising=False)
+    return asked

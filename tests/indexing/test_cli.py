@@ -120,7 +120,7 @@ def test_a_broken_pipe_is_quiet() -> None:
 
 @pytest.mark.parametrize(
     "words",
-    [["sync"], ["index", "foo"], ["index", "fit", "a=b", "--ouput", "m"], ["index", "scan", "x"], ["demo", "--people", "x"]],
+    [["synchronise"], ["index", "foo"], ["index", "fit", "a=b", "--ouput", "m"], ["index", "scan", "x"], ["demo", "--people", "x"]],
 )
 def test_what_does_not_exist_is_refused_in_one_line(refuse, words: list[str]) -> None:
     refuse(*words, says=("--help",))

@@ -1,0 +1,130 @@
+"""Synchronization by different points: common steps of time, then the shift at which the cameras share most information."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from dyntorch.tasks.shift import Shift
+from dyntorch.tasks.sync_subspace import SubspaceCurve, subspace_curve
+from dyntorch.tasks.sync_subspace_shift import SubspaceShift, subspace_shift
+from dyntorch.tasks.sync_tracks import Tracks, smoothed
+
+FINEST = 1 / 30
+"""Seconds per step at least: faster films say no more, and noise of neighbouring frames of real detectors is the same."""
+RATES = 0.02
+"""A frame rate as told is wrong by no more than this."""
+DRIFTING = 20.0
+"""Seconds of overlap from which clock rates are looked for."""
+NEAR = 1.0
+"""Seconds around the best shift in which rates are compared."""
+CONVINCING = 8.0
+"""Nats by which another clock rate has to be better."""
+
+
+def different_points(a: Tracks, b: Tracks, *, max_shift: float | None, rate: float | None) -> Shift:
+    """The shift of cameras that see different points of one motion.
+
+    Args:
+        rate: of b's clock, where it is known.
+    """
+    step = max(a.step, b.step, FINEST)
+    found = _Samples(a, b, step, rate or 1.0)
+    curve = found.curve(max_shift)
+    best = found.shift(curve)
+    rate_sigma = 0.0
+    span = min(float(t.times[-1] - t.times[0]) for t in (a, b))
+    if rate is None and span > DRIFTING and math.isfinite(best.sigma):
+        ratio, rate_sigma = _rate(a, b, step, span, found.lag(best.position))
+        if ratio != 1:
+            found = _Samples(a, b, step, ratio)
+            curve = found.curve(max_shift)
+            best = found.shift(curve)
+    return _result(a, b, found, curve, best, rate_sigma)
+
+
+class _Samples:
+    """Both cameras at equal steps of a's clock."""
+
+    def __init__(self, a: Tracks, b: Tracks, step: float, rate: float) -> None:
+        self.first, self.wa = _sampled(a, step)
+        self.second, self.wb = _sampled(b, step * rate)
+        self.start = float(b.times[0]) / rate - float(a.times[0])
+        self.step, self.rate = step, rate
+
+    def curve(self, max_shift: float | None, around: float = 0.0) -> SubspaceCurve:
+        """At all lags of a's clock within ``max_shift`` seconds of ``around``."""
+        lo, hi = 1 - len(self.first), len(self.second) - 1
+        if max_shift is not None:
+            low, high = (((around + sign * max_shift) / self.rate - self.start) / self.step for sign in (-1, 1))
+            lo, hi = min(max(lo, math.ceil(low - 1e-9)), hi), max(min(hi, math.floor(high + 1e-9)), lo)
+        return subspace_curve(self.first, self.second, self.wa, self.wb, (lo, max(lo, hi)), step=self.step)
+
+    def shift(self, curve: SubspaceCurve) -> SubspaceShift:
+        return subspace_shift(curve, start=self.start, step=self.step)
+
+    def lag(self, position: Tensor | float) -> Tensor | float:
+        """Seconds of b's clock at time 0 of a's."""
+        return (self.start + position * self.step) * self.rate
+
+
+def _sampled(tracks: Tracks, step: float) -> tuple[Tensor, Tensor]:
+    if abs(tracks.step / step - 1) < 1e-6 and float((tracks.times.diff() / step - 1).abs().max()) < 1e-3:
+        return tracks.x, tracks.weights  # its own frames: nothing to interpolate
+    start, end = float(tracks.times[0]), float(tracks.times[-1])
+    at = start + step * torch.arange(int((end - start) / step + 1e-6) + 1, dtype=torch.float64, device=tracks.x.device)
+    x, _, weights = smoothed(tracks, at, max(0.5 * step, 0.5 * tracks.step))
+    return x, weights
+
+
+def _rate(a: Tracks, b: Tracks, step: float, span: float, lag: Tensor | float) -> tuple[float, float]:
+    """The clock rate whose best score near a shift is highest, by the parabola over rates, and its sigma; 1 unless convincing."""
+    change = 4 * step / span  # moves the ends of the overlap by two steps
+    count = math.ceil(RATES / change)
+    rates = [1 + k * change for k in range(-count, count + 1)]
+    middle = span / 2
+    best = []
+    for rate in rates:
+        samples = _Samples(a, b, step, rate)
+        # the moment in the middle keeps its place: (t + lag) of the old rate is rate (t + lag') of the new
+        around = float(lag) - (rate - 1) * middle
+        best.append(float(samples.curve(NEAR, around).scores.nan_to_num(-math.inf).max()))
+    scores = torch.tensor(best, dtype=torch.float64)
+    top = int(scores.argmax())
+    bend = float(scores[top - 1] - 2 * scores[top] + scores[top + 1]) if 0 < top < len(rates) - 1 else 0.0
+    if not (math.isfinite(bend) and bend < 0):
+        return 1.0, 0.0
+    sigma = change / math.sqrt(-bend)
+    place = 0.5 * float(scores[top - 1] - scores[top + 1]) / bend
+    if best[top] - best[count] < CONVINCING:
+        return 1.0, sigma
+    return rates[top] + change * max(-0.5, min(0.5, place)), sigma
+
+
+def _result(a: Tracks, b: Tracks, samples: _Samples, curve: SubspaceCurve, best: SubspaceShift, rate_sigma: float) -> Shift:
+    offset = float(samples.lag(best.position))
+    rate = samples.rate
+    first = max(float(a.times[0]), (float(b.times[0]) - offset) / rate)
+    last = min(float(a.times[-1]), (float(b.times[-1]) - offset) / rate)
+    center = (first + last) / 2
+    drift = (rate - 1) * center
+    peaks = best.peaks.clone()
+    if len(peaks):
+        peaks[:, 0] = samples.lag(peaks[:, 0]) + drift
+    return Shift(
+        offset=offset,
+        sigma=best.sigma * samples.step,
+        rate=rate,
+        rate_sigma=rate_sigma if rate != 1 else 0.0,
+        confidence=best.probability,
+        peaks=peaks,
+        ok=best.ok,
+        reason=best.reason,
+        method="subspace",
+        fps=(1 / a.step, 1 / b.step),
+        center=center,
+        lags=torch.as_tensor(samples.lag(curve.lags)) + drift,
+        scores=curve.scores,
+    )

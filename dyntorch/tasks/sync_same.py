@@ -1,0 +1,172 @@
+"""Synchronization by points that both cameras see: plain first, then what may be wrong with the input, one thing at a time."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import torch
+from torch import Generator, Tensor
+
+from dyntorch.tasks.sync_attempt import APART, DRIFTING, Attempt, attempt
+from dyntorch.tasks.sync_consensus import consistent_points
+from dyntorch.tasks.sync_lens import fit_distortion
+from dyntorch.tasks.sync_scaled import frame_scaled
+from dyntorch.tasks.sync_tracks import Tracks, smoothed, without
+
+RATES = 0.02
+"""A frame rate as told is wrong by no more than this."""
+LONGEST = 4_000
+"""Steps of a take at most; longer takes are searched in coarser steps."""
+COARSE = 2_000
+"""Steps of a take for a search over rates, of a tenth of a second at least."""
+SUSPECT = 3.0
+"""Times the usual residual, beyond which a point is wrong."""
+FAR = 6.0
+"""Robust standard deviations from the fit at which a position counts as an outlier."""
+ROUGH = 1.25
+"""Residual over what the noise explains, from which lenses are looked at."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Result:
+    """The best attempt and what it took."""
+
+    found: Attempt
+    notes: tuple[str, ...]
+
+
+def same_points(
+    a: Tracks,
+    b: Tracks,
+    *,
+    max_shift: float | None,
+    rate: float | None,
+    camera: str,
+    lenses: bool,
+    generator: Generator | None,
+) -> Result:
+    """The shift of cameras that see the same points.
+
+    Args:
+        rate: of b's clock, where it is known.
+        camera: ``"perspective"``, ``"affine"`` or ``"auto"``.
+        lenses: whether nobody calibrated the cameras, and distortion may be looked for.
+    """
+    span = min(float(t.times[-1] - t.times[0]) for t in (a, b))
+    settings = {"step": span / LONGEST, "max_shift": max_shift, "free_rate": rate is None, "rates": (rate or 1.0,)}
+    if camera == "affine":
+        return Result(_affine(a, b, settings, generator), ())
+    found = _sorted_out(a, b, settings, generator)
+    if not found.decided and rate is None:
+        found = _better(found, _over_rates(a, b, settings, span, generator))
+    notes: tuple[str, ...] = ()
+    if lenses and found.fit is not None and _rough(found):
+        found, notes = _straightened(found, a, b, settings, generator)
+    if camera == "auto" and not found.decided:
+        scaled = _affine(a, b, settings, generator)
+        # without the place in the picture a gait repeats itself, so that affine cameras alone may be sure of a wrong period
+        if scaled.decided and _agree(scaled, found):
+            return Result(scaled, ("affine cameras: the points do not hold enough depth, or are too noisy, for perspective ones",))
+    return Result(found, notes)
+
+
+def _sorted_out(
+    a: Tracks, b: Tracks, settings: dict[str, object], generator: Generator | None, method: str = "epipolar"
+) -> Attempt:
+    """An attempt with all points, and one without those that do not fit, where that may be why it fails."""
+    found = attempt(a, b, method=method, **settings)  # type: ignore[arg-type]
+    pruned = _pruned(found)
+    if pruned is not None:
+        a, b = pruned
+        found = _better(found, attempt(a, b, method=method, **settings))  # type: ignore[arg-type]
+    if found.decided and not bool(_suspects(found).any()):
+        return found
+    points = consistent_points(a, b, found, generator)
+    if points is None or bool(points.all()):
+        return found
+    return _better(found, attempt(a, b, points=points, method=method, **settings))  # type: ignore[arg-type]
+
+
+def _pruned(found: Attempt) -> tuple[Tracks, Tracks] | None:
+    """Tracks without the positions far from the fit, of both cameras: who of the two is wrong is not known; None where all is well."""
+    fit = found.fit
+    if fit is None or len(fit.times) != len(found.a.times):
+        return None
+    far = fit.distances.abs() > FAR
+    share = float(far.sum()) / max(1, int(fit.distances.isfinite().sum()))
+    if not 1e-3 < share < 0.3:
+        return None
+    frames, joints = far.nonzero().unbind(1)
+    there = fit.times[frames] * fit.rate + fit.offset
+    nearest = (there[:, None] - found.b.times).abs().argmin(1)
+    other = torch.zeros_like(found.b.weights, dtype=torch.bool)
+    other[nearest, joints] = True
+    return without(found.a, far), without(found.b, other)
+
+
+def _over_rates(a: Tracks, b: Tracks, settings: dict[str, object], span: float, generator: Generator | None) -> Attempt | None:
+    """A search over clock rates too, where a wrong one would have smeared the motion."""
+    step = max(span / COARSE, 0.1)
+    change = 2 * step / span  # moves the ends of the overlap by a step
+    count = math.ceil(RATES / change)
+    if span < DRIFTING:
+        return None
+    rates = tuple(1 + k * change for k in range(-count, count + 1))
+    coarse = attempt(a, b, **{**settings, "step": step, "rates": rates})  # type: ignore[arg-type]
+    if coarse.fit is None:
+        return None
+    return _sorted_out(a, b, {**settings, "rates": (coarse.fit.rate,)}, generator)
+
+
+def _affine(a: Tracks, b: Tracks, settings: dict[str, object], generator: Generator | None) -> Attempt:
+    return _sorted_out(frame_scaled(a), frame_scaled(b), settings, generator, method="affine")
+
+
+def _better(one: Attempt, other: Attempt | None) -> Attempt:
+    """The decided one; of two, the one with the larger margin."""
+    if other is None or other.fit is None:
+        return one
+    if one.fit is None or one.decided != other.decided:
+        return other if one.fit is None or other.decided else one
+    return other if other.confidence > one.confidence else one
+
+
+def _agree(one: Attempt, other: Attempt) -> bool:
+    """Whether the best shifts are the same."""
+    return one.fit is not None and other.fit is not None and abs(one.fit.shift - other.fit.shift) <= APART * one.frame
+
+
+def _suspects(found: Attempt) -> Tensor:
+    """``(n,)`` of the points that took part: whether their residual is out of all proportion."""
+    assert found.fit is not None
+    own = found.fit.distances.abs().nanmedian(0).values * 1.4826
+    return own.nan_to_num(0.0) > SUSPECT
+
+
+def _rough(found: Attempt) -> bool:
+    """Whether the residual is larger than noise and smoothing leave."""
+    assert found.fit is not None
+    left = math.sqrt(0.5 / math.sqrt(math.pi))  # of white noise, by a Gaussian kernel of one frame
+    return found.fit.residual > ROUGH * left * max(found.a.noise, 1e-6 * found.a.scale)
+
+
+def _straightened(
+    found: Attempt, a: Tracks, b: Tracks, settings: dict[str, object], generator: Generator | None
+) -> tuple[Attempt, tuple[str, ...]]:
+    """Once more with lenses fitted at the shift found, where they are significant."""
+    assert found.fit is not None
+    fit = found.fit
+    x1, _, w1 = smoothed(found.a, fit.times, found.frame)
+    x2, _, w2 = smoothed(found.b, fit.times * fit.rate + fit.offset, found.frame)
+    lens = fit_distortion(x1.flatten(0, 1), x2.flatten(0, 1), (w1 * w2).flatten())
+    if not lens.significant:
+        return found, ()
+    straight = []
+    for tracks, one in zip((a, b), lens.lenses, strict=True):
+        x = one.undistort(tracks.x)
+        seen = x.isfinite().all(-1)
+        straight.append(dataclasses.replace(tracks, x=torch.where(seen[..., None], x, 0.0), weights=tracks.weights * seen))
+    again = attempt(straight[0], straight[1], points=found.points, **settings)  # type: ignore[arg-type]
+    chosen = _better(found, again)
+    return (again, (lens.note,)) if chosen is again else (found, ())

@@ -1,0 +1,160 @@
+"""Tracks of one camera on its own clock: checked, and smoothed to any moments."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dyntorch.algebra.homogeneous import similarity
+
+REACH = 4.0
+"""Standard deviations at which the smoothing kernel ends."""
+THIN = 0.4
+"""Share of the kernel's weight that must be seen; less is a gap."""
+PIECE = 1 << 21
+"""Numbers that one piece of a long take gathers at a time."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """Points of one camera.
+
+    Attributes:
+        x: ``(frames, n, 2)`` float64, 0 where missing.
+        weights: ``(frames, n)``, 0 where missing.
+        times: ``(frames,)`` seconds, increasing.
+        step: seconds from one frame to the next, the median.
+    """
+
+    x: Tensor
+    weights: Tensor
+    times: Tensor
+    step: float
+
+    @property
+    def noise(self) -> float:
+        r"""Standard deviation of a coordinate, from third differences :math:`\mathrm{med}|d_3| / (.6745 \sqrt{20})`: motion is smooth."""
+        seen = self.weights > 0
+        whole = seen[3:] & seen[2:-1] & seen[1:-2] & seen[:-3]
+        rough = self.x.diff(n=3, dim=0)[whole].abs()
+        return float(rough.median()) / (0.6745 * math.sqrt(20)) if rough.numel() else 0.0
+
+    @property
+    def scale(self) -> float:
+        """Root mean square distance of the points from their mean."""
+        return float(self.centred.square().sum(-1).mul(self.weights).sum().div(self.weights.sum().clamp(min=1e-300)).sqrt())
+
+    @property
+    def centred(self) -> Tensor:
+        """Points about their mean over the take; 0 where missing."""
+        share = (self.weights / self.weights.sum().clamp(min=1e-300))[..., None]
+        return torch.where(share > 0, self.x - (self.x * share).sum((0, 1)), 0.0)
+
+    @property
+    def change(self) -> Tensor:
+        """``(3, 3)`` similarity to mean 0 and root mean square distance sqrt(2)."""
+        share = (self.weights / self.weights.sum().clamp(min=1e-300))[..., None]
+        scale = math.sqrt(2) / self.scale if self.scale > 0 else 1.0
+        return similarity(torch.as_tensor(scale, dtype=torch.float64, device=self.x.device), (self.x * share).sum((0, 1)))
+
+    def only(self, points: Tensor) -> Tracks:
+        """These points ``(n,)`` bool alone."""
+        return dataclasses.replace(self, x=self.x[:, points], weights=self.weights[:, points])
+
+
+def read_tracks(name: str, x: Tensor, fps: float | None, times: Tensor | None, weights: Tensor | None) -> Tracks:
+    """Tracks of checked input.
+
+    Raises:
+        ValueError: naming a or b, what is wrong with it, and what to do.
+    """
+    if not isinstance(x, Tensor) or x.ndim != 3 or x.shape[-1] != 2:
+        got = tuple(x.shape) if isinstance(x, Tensor) else type(x).__name__
+        raise ValueError(f"{name} must be a tensor (frames, points, 2), got {got}")
+    if not x.is_floating_point():
+        raise ValueError(f"{name} must hold floating point numbers, got {x.dtype}; use {name}.double()")
+    if times is None:
+        if fps is None or not 0 < fps < math.inf:
+            raise ValueError(f"fps of {name} must be a positive number of frames per second, got {fps}; or give times=")
+        times = torch.arange(len(x), dtype=torch.float64, device=x.device) / fps
+    clock = torch.as_tensor(times, dtype=torch.float64, device=x.device)
+    if clock.shape != x.shape[:1] or not bool(clock.isfinite().all()):
+        raise ValueError(f"times of {name} must be {x.shape[0]} finite seconds, one per frame, got {tuple(clock.shape)}")
+    steps = clock.diff()
+    if bool((steps <= 0).any()):
+        at = int((steps <= 0).nonzero()[0, 0]) + 1
+        raise ValueError(f"times of {name} must increase, but frame {at} is not after the one before; sort or drop such frames")
+    seen = x.isfinite().all(-1)
+    if weights is None:
+        given = seen.double()
+    else:
+        given = torch.as_tensor(weights, dtype=torch.float64, device=x.device)
+        if given.shape != seen.shape or not bool((given.isfinite() & (given >= 0)).all()):
+            raise ValueError(f"weights of {name} must be {tuple(seen.shape)}, finite and not negative, got {tuple(given.shape)}")
+        given = given * seen
+    step = float(steps.median()) if len(steps) else math.nan
+    return Tracks(torch.where((given > 0)[..., None], x.double(), 0.0), given, clock, step)
+
+
+def without(tracks: Tracks, bad: Tensor) -> Tracks:
+    """Tracks without some positions ``(frames, n)`` bool."""
+    kept = torch.where(bad, 0.0, tracks.weights)
+    return dataclasses.replace(tracks, x=torch.where((kept > 0)[..., None], tracks.x, 0.0), weights=kept)
+
+
+def noise_ratio(a: Tracks, b: Tracks) -> float:
+    """Noise of b over that of a, no farther from the ratio of their sizes than a factor of 2."""
+    size = b.scale / a.scale if min(a.scale, b.scale) > 0 else 1.0
+    noise = b.noise / a.noise if a.noise > 1e-6 * a.scale and b.noise > 1e-6 * b.scale else size
+    return min(max(noise, size / 2), size * 2)
+
+
+def smoothed(tracks: Tracks, at: Tensor, width: float) -> tuple[Tensor, Tensor, Tensor]:
+    r"""Positions and velocities at any moments, by a line fitted to the frames around each, with Gaussian weights.
+
+    .. math:: \min_{p, v} \sum_k w_k\, e^{-(t_k - t)^2 / 2 \sigma^2}\; |x_k - p - v (t_k - t)|^2
+
+    The same kernel for both cameras, so that what it takes away is taken from both.  From a standard deviation of one frame on,
+    the noise that is left does not depend on where between frames a moment is: interpolation at fractions of frames would draw
+    an estimate of the shift to half frames.
+
+    Args:
+        at: ``(m,)`` seconds.
+        width: the standard deviation, seconds.
+
+    Returns:
+        positions and velocities per second ``(m, n, 2)``, 0 in gaps, and weights ``(m, n)``: the mean of those near, less where frames
+        on one side are missing, 0 in gaps.
+    """
+    taps = 2 * (math.ceil(REACH * width / tracks.step) + 1) + 1
+    rows = max(1, PIECE // max(1, taps * tracks.x.shape[1] * 2))
+    pieces = [_smoothed(tracks, piece, width, taps // 2) for piece in at.split(rows)] or [_smoothed(tracks, at, width, taps // 2)]
+    return tuple(torch.cat(parts) for parts in zip(*pieces, strict=True))  # type: ignore[return-value]
+
+
+def _smoothed(tracks: Tracks, at: Tensor, width: float, taps: int) -> tuple[Tensor, Tensor, Tensor]:
+    frames, points = tracks.weights.shape
+    near = torch.searchsorted(tracks.times, at.contiguous())[:, None] + torch.arange(-taps, taps + 1, device=at.device)
+    index = near.clamp(0, frames - 1)
+    u = (tracks.times[index] - at[:, None]) / width
+    kernel = torch.exp(-0.5 * u.square()) * (near == index)  # (m, taps)
+    w, x = tracks.weights[index], tracks.x[index].flatten(2)  # (m, taps, n), (m, taps, 2n)
+    powers = torch.stack([kernel, kernel * u, kernel * u * u], dim=1)  # (m, 3, taps)
+    s0, s1, s2 = torch.bmm(powers, w).unbind(1)
+    wx = (w[..., None] * x.unflatten(2, (points, 2))).flatten(2)
+    t0, t1 = torch.bmm(powers[:, :2], wx).unflatten(2, (points, 2)).unbind(1)
+    full = math.sqrt(2 * math.pi) * width / tracks.step
+    determinant = s0 * s2 - s1.square()
+    usual = torch.bmm(powers[:, :1], (w > 0).double())[:, 0]  # the kernel's weight on frames that show the point
+    # two-sided: a line through frames on one side only would extrapolate
+    seen = (usual > THIN * full) & (determinant > 0.15 * s0.square())
+    share = torch.where(seen, 1 / torch.where(seen, determinant, 1.0), 0.0)[..., None]
+    position = (s2[..., None] * t0 - s1[..., None] * t1) * share
+    velocity = (s0[..., None] * t1 - s1[..., None] * t0) * share / width
+    # at the edges of gaps the line hangs on one side, and its noise is several times as large
+    sure = (usual / full).clamp(max=1.0) * (determinant / s0.square().clamp(min=1e-300)).clamp(max=1.0)
+    return position, velocity, torch.where(seen, sure * s0 / usual.clamp(min=1e-300), 0.0)

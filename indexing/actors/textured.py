@@ -1,0 +1,158 @@
+"""Grey video of a synthetic person: textured capsules on a textured background, as a fixed camera sees them.
+
+Texture and background are drawn per camera, so two films of one performance share its motion and nothing else: the hard case of
+direct synchronization and indexing, and one in which the truth is known.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn.functional import grid_sample, interpolate
+
+from indexing.cameras import rotation, y_up
+from indexing.clip import Clip, FloatArray
+from indexing.skeleton import COCO17
+
+Frames = NDArray[np.uint8]
+DISTANCE = 2.9  # metres: a standing person fills about 60 % of the height of a 4:3 image
+FOCAL = 0.72  # image widths, as in `indexing.actors.detect`
+BLOCK = 32  # frames painted at once
+_HEAD, _NECK, _PELVIS = 17, 18, 19  # added to the COCO joints
+_LIMBS = ((5, 7), (7, 9), (6, 8), (8, 10), (11, 13), (13, 15), (12, 14), (14, 16))
+_BODY = (*_LIMBS, (5, 6), (11, 12), (5, 11), (6, 12), (_NECK, _PELVIS), (_NECK, _HEAD))
+
+
+def film(
+    clip: Clip,
+    *,
+    azimuth: float,
+    elevation: float = 0.1,
+    roll: float = 0.0,
+    distance: float = DISTANCE,
+    image: tuple[int, int] = (160, 120),
+    noise: float = 2.0,
+    rng: np.random.Generator | int = 0,
+) -> Frames:
+    """A grey video of a 3D clip: own texture, own background, perspective, sensor noise.
+
+    Every bone is a capsule (for COCO-17 also the trunk and the head), painted from the farthest to the nearest.
+
+    Args:
+        clip: 3D, metres.
+        azimuth, elevation, distance: of the camera, as in :func:`indexing.actors.detect`: degrees, radians, metres.
+        roll: degrees by which the camera is turned about its axis.
+        image: width and height in pixels.
+        noise: standard deviation in grey levels, per pixel and frame.
+        rng: of the textures and the noise.
+
+    Returns:
+        ``(frames, height, width)`` uint8.
+
+    Raises:
+        ValueError: not a 3D clip with bones, missing joints, a joint behind the camera, negative noise.
+
+    Example:
+        >>> from indexing.actors import Person, perform
+        >>> video = film(perform("wave", Person(), fps=10.0), azimuth=20.0, image=(40, 30))
+        >>> video.shape[1:], video.dtype.name
+        ((30, 40), 'uint8')
+    """
+    joints, bones = _figure(clip)
+    if not (noise >= 0 and distance > 0):
+        raise ValueError(f"noise must be at least 0 and distance positive (metres), got {noise!r} and {distance!r}")
+    rng = np.random.default_rng(rng)
+    generator = torch.Generator().manual_seed(int(rng.integers(2**31)))
+    pixels, depth = _project(joints, azimuth, elevation, roll, distance, image)
+    ends = np.asarray(bones).T
+    length = np.median(np.linalg.norm(joints[:, ends[0]] - joints[:, ends[1]], axis=2), axis=0)
+    radius = np.clip(0.22 * length, 0.03, 0.11)
+    if clip.skeleton == COCO17:
+        radius[-1] = 0.1  # the head
+    background = 40 + 175 * _texture(image[1], image[0], (4, 8, 16), generator)
+    skins = torch.stack([20 + 215 * _texture(24, 12, (3, 6), generator) for _ in bones])
+    out = np.empty((len(clip), image[1], image[0]), dtype=np.uint8)
+    for begin in range(0, len(clip), BLOCK):
+        part = slice(begin, begin + BLOCK)
+        canvas = background.expand(len(pixels[part]), -1, -1).clone()
+        _paint(canvas, pixels[part][:, ends], FOCAL * image[0] * radius / depth[part][:, ends], depth[part][:, ends].mean(1), skins)
+        canvas += noise * torch.randn(canvas.shape, generator=generator)
+        out[part] = canvas.round_().clamp_(0, 255).to(torch.uint8).numpy()
+    return out
+
+
+def _figure(clip: Clip) -> tuple[FloatArray, tuple[tuple[int, int], ...]]:
+    """Joints ``(frames, n, 3)``, y up, about their mean, and the bones to paint."""
+    if clip.dims != 3 or clip.skeleton is None or not clip.skeleton.bones:
+        raise ValueError(f"clip {clip.name!r}: a film needs 3D joints and a skeleton with bones, got {clip.dims}D joints")
+    joints = y_up(clip).astype(np.float64)
+    if not np.isfinite(joints).all():
+        raise ValueError(f"clip {clip.name!r}: joints are missing; cut the clip to frames that have all joints")
+    bones = clip.skeleton.bones
+    if clip.skeleton == COCO17:
+        middles = (joints[:, [3, 4]], joints[:, [5, 6]], joints[:, [11, 12]])
+        joints = np.concatenate([joints, np.stack([pair.mean(axis=1) for pair in middles], axis=1)], axis=1)
+        bones = _BODY
+    return joints - joints.mean(axis=(0, 1)), bones
+
+
+def _project(
+    joints: FloatArray, azimuth: float, elevation: float, roll: float, distance: float, image: tuple[int, int]
+) -> tuple[FloatArray, FloatArray]:
+    """Pixels ``(frames, n, 2)`` and depths ``(frames, n)``."""
+    turned = joints @ rotation(np.deg2rad(azimuth), elevation).T
+    depth = turned[..., 2] + distance
+    if (depth <= 0.2).any():
+        raise ValueError(f"a joint is {depth.min():.2f} m in front of the camera; increase distance={distance:g}")
+    # Looking along +z in a right-handed frame with y up, x grows to the left: both image axes run against the scene's.
+    flat = -FOCAL * image[0] * turned[..., :2] / depth[..., None]
+    c, s = np.cos(np.deg2rad(roll)), np.sin(np.deg2rad(roll))
+    return flat @ np.array([[c, s], [-s, c]]) + np.array(image) / 2, depth
+
+
+def _texture(height: int, width: int, cells: tuple[int, ...], generator: torch.Generator) -> Tensor:
+    """``(height, width)`` in [0, 1]: smooth noise at several scales."""
+    total = torch.zeros(1, 1, height, width)
+    for n in cells:
+        noise = torch.randn(1, 1, n, max(2, n * width // height), generator=generator)
+        total += interpolate(noise, size=(height, width), mode="bicubic", align_corners=True)
+    total = total[0, 0] - total.mean()
+    return (0.5 + total / (4 * total.std())).clamp(0, 1)
+
+
+def _paint(canvas: Tensor, ends: Any, radii: Any, depth: Any, skins: Tensor) -> None:
+    """Paint all capsules onto ``canvas (T, h, w)``: ends ``(T, 2, bones, 2)``, radii ``(T, 2, bones)``, depths ``(T, bones)``."""
+    a, b = (torch.from_numpy(ends[:, k]).float() for k in (0, 1))
+    ra, rb = (torch.from_numpy(radii[:, k]).float() for k in (0, 1))
+    order = torch.from_numpy(np.argsort(-depth, axis=1))
+    frames = torch.arange(len(canvas))
+    for rank in range(order.shape[1]):
+        bone = order[:, rank]
+        _capsule(canvas, a[frames, bone], b[frames, bone], ra[frames, bone], rb[frames, bone], skins[bone])
+
+
+def _capsule(canvas: Tensor, a: Tensor, b: Tensor, ra: Tensor, rb: Tensor, skin: Tensor) -> None:
+    """Blend one capsule per frame onto ``canvas``: axis from ``a`` to ``b (T, 2)``, radii ``(T,)``, texture ``(T, m, n)``."""
+    reach = torch.maximum(ra, rb)[:, None] + 1
+    low = (torch.minimum(a, b) - reach).amin(0).floor().long().clamp(min=0)
+    high = (torch.maximum(a, b) + reach).amax(0).ceil().long() + 1
+    window = canvas[:, int(low[1]) : max(int(high[1]), 0), int(low[0]) : max(int(high[0]), 0)]
+    if window.numel() == 0:
+        return
+    y = torch.arange(window.shape[1]).view(1, -1, 1) + low[1] + 0.5 - a[:, 1].view(-1, 1, 1)
+    x = torch.arange(window.shape[2]).view(1, 1, -1) + low[0] + 0.5 - a[:, 0].view(-1, 1, 1)
+    dx, dy = (b - a).view(-1, 2, 1, 1).unbind(1)
+    square = (dx * dx + dy * dy).clamp(min=1e-3)
+    along = (x * dx + y * dy) / square
+    across = (y * dx - x * dy) / square.sqrt()
+    near = along.clamp(0, 1)
+    radius = ra.view(-1, 1, 1) + near * (rb - ra).view(-1, 1, 1)
+    gap = ((x - near * dx) ** 2 + (y - near * dy) ** 2).sqrt()
+    cover = (radius - gap + 0.5).clamp_(0, 1)  # edges one pixel wide
+    where = torch.stack([across / radius, 2 * along - 1], dim=-1)
+    value = grid_sample(skin[:, None], where, padding_mode="reflection", align_corners=False)[:, 0]
+    window += cover * (value - window)

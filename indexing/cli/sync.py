@@ -1,0 +1,259 @@
+"""``dyntorch sync``: cameras that nobody synchronized, put on one clock."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from indexing.cli.console import count, ended, in_flags, names, progress, say, table
+from indexing.cli.inputs import Format
+from indexing.cli.outputs import check_report
+
+if TYPE_CHECKING:
+    from indexing.report.sync import SyncReport
+    from indexing.sync_files import Plan
+    from indexing.sync_people import Pairing
+    from indexing.sync_takes import Take
+
+FLAGS = ("fps", "person", "method", "max_shift", "calibration", "min_confidence", "format", "size", "rate")
+PPM = 1e6
+
+
+@dataclass(frozen=True)
+class Sync:
+    """Find how the clocks of cameras run that nobody synchronized, and write their keypoint files with common frame numbers.
+
+    dyntorch sync cam1/ cam2/ cam3/ --out sync/
+
+    dyntorch sync pose/ --fps 60 --calibration Calib.toml --out .
+
+    dyntorch sync left.mp4 right.mp4 --check --out sync/
+    """
+
+    cameras: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="CAMERA ...", help_behavior_hint="")]
+    """per camera a keypoint file, a folder with one file per frame, or a video; or one folder that holds those of all"""
+    out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
+    """where to write report.html, sync.json, curve.png and pose-sync/; without it, print only"""
+    method: Literal["auto", "keypoints", "tracks", "brightness"] = "auto"
+    """auto: keypoints where there are any; for videos tracks and brightness, which must agree"""
+    fps: Annotated[str | None, tyro.conf.arg(metavar="N|N,N,...", help_behavior_hint="")] = None
+    """frames per second of all cameras, or of each, for files that do not say (30 is assumed then, and the output says so)"""
+    max_shift: Annotated[float | None, tyro.conf.arg(metavar="S", help_behavior_hint="")] = None
+    """seconds, the largest offset that is searched; by default as far as the recordings overlap enough"""
+    calibration: Annotated[Path | None, tyro.conf.arg(metavar="TOML", help_behavior_hint="")] = None
+    """lenses of the cameras, as Pose2Sim writes them: matrix and distortions in a section for each"""
+    person: Literal["auto", "largest", "confident", "tracked"] = "auto"
+    """who is compared where several people are in view; auto tries the likely ones and says whom it took"""
+    rate: bool = True
+    """clocks may run at different rates; --no-rate where one clock drives all cameras"""
+    check: bool = False
+    """write check.mp4 as well (check-NAME.mp4 for more than two cameras), with the same moments side by side"""
+    min_confidence: Annotated[float, tyro.conf.arg(metavar="C")] = 0.0
+    """joints that the detector trusts less are taken as not seen"""
+    format: Annotated[Format | None, tyro.conf.arg(help_behavior_hint="")] = None
+    """of the keypoint files; by default their content decides"""
+    size: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="W H", help_behavior_hint="")] = None
+    """width and height of the image in pixels, for files with coordinates from 0 to 1"""
+    title: Annotated[str | None, tyro.conf.arg(metavar="TEXT", help_behavior_hint="")] = None
+    """heading of the report"""
+
+    def run(self) -> int:
+        """Read, synchronize, write, and say what was found."""
+        self._check()
+        from indexing.report.sync import FILES
+        from indexing.report.sync_check import names_of
+        from indexing.sync_files import check_target
+        from indexing.sync_takes import find_cameras
+
+        found = find_cameras([path.expanduser() for path in self.cameras])
+        inputs = [*found.values(), *([self.calibration.expanduser()] if self.calibration else [])]
+        folder = check_report(self.out, inputs, [*FILES, *names_of(list(found))])
+        if folder is not None:
+            check_target(folder, inputs)
+        started = time.perf_counter()
+        with progress("reading", steps=False):
+            takes = self._read(found)
+        read = time.perf_counter()
+        pairs = len(takes) * (len(takes) - 1) // 2
+        with progress(f"comparing {count(pairs, 'pair')} of cameras") as done:
+            report, compared = self._solve(takes, done)
+        timings = {"read": read - started, "synchronize": time.perf_counter() - read}
+        page = None
+        if folder is not None:
+            with progress("writing", steps=False):
+                report, page = self._write(folder, takes, report, compared, inputs, timings)
+        show(report)
+        return ended(page, None if report.ok else report.reason)
+
+    def _check(self) -> None:
+        """Raise on flags that make no sense by themselves, before any file is read."""
+        if self.max_shift is not None and not 0 < self.max_shift < math.inf:
+            raise ValueError(f"--max-shift must be a positive number of seconds, got {self.max_shift:g}")
+        if self.check and self.out is None:
+            raise ValueError("--check writes a video; say where with --out")
+        if self.check:
+            from indexing.video.extra import av, cv2
+
+            av(), cv2()  # said now rather than when all is done
+        self._rates(None)
+
+    def _rates(self, cameras: int | None) -> list[float | None]:
+        """Frames per second of each camera.
+
+        Raises:
+            ValueError: not positive numbers, or other than one per camera.
+        """
+        if self.fps is None:
+            return [None] * (cameras or 0)
+        try:
+            rates: list[float | None] = [float(word) for word in self.fps.split(",")]
+        except ValueError:
+            rates = []
+        if not rates or not all(rate is not None and 0 < rate < math.inf for rate in rates):
+            raise ValueError(f"--fps must be one positive number, or one per camera as in 60,59.94, got {self.fps}")
+        if cameras is not None and len(rates) not in (1, cameras):
+            raise ValueError(f"--fps gives {len(rates)} rates for {cameras} cameras; give one, or one per camera")
+        return rates * ((cameras or 1) if len(rates) == 1 else 1)
+
+    def _read(self, found: dict[str, Path]) -> list[Take]:
+        from indexing.sync_takes import take_of
+
+        rates = self._rates(len(found))
+        options: dict[str, Any] = {"person": self.person, "min_confidence": self.min_confidence}
+        options |= {"format": self.format, "size": self.size}
+        return [take_of(path, name=name, fps=rate, **options) for (name, path), rate in zip(found.items(), rates, strict=True)]
+
+    def _solve(self, takes: list[Take], done: Any) -> tuple[SyncReport, dict[tuple[int, int], Pairing]]:
+        """All pairs, and what they say together."""
+        import dyntorch
+        from indexing.report.sync_making import reported
+        from indexing.sync_calibration import read_calibration
+        from indexing.synchronization import pair, remarks
+
+        lenses = None if self.calibration is None else read_calibration(self.calibration)
+        options: dict[str, Any] = {"max_shift": self.max_shift, "calibration": lenses, "rate": None if self.rate else 1.0}
+        total = len(takes) * (len(takes) - 1) // 2
+        compared: dict[tuple[int, int], Pairing] = {}
+
+        def compare(a: Take, b: Take, *_: Any, **__: Any) -> Any:
+            try:
+                found = pair(a, b, self.method, **options)
+            except ValueError as problem:
+                raise ValueError(f"{a.name} and {b.name}: {problem}") from problem
+            compared[takes.index(a), takes.index(b)] = found
+            done(len(compared) / total)
+            return found.shift
+
+        try:
+            clocks = dyntorch.synchronize_cameras(takes, pair=compare) if len(takes) > 2 else None
+            if clocks is None:
+                compare(takes[0], takes[1])
+        except ValueError as problem:
+            said = re.sub(r"^cameras \d+ and \d+: ", "", str(problem))
+            raise ValueError(words(said)) from problem
+        report = reported(takes, compared, clocks, remarks(takes), self.title, words)
+        return report, compared
+
+    def _write(
+        self, folder: Path, takes: list[Take], report: SyncReport, compared: dict[tuple[int, int], Pairing], inputs: list[Path],
+        timings: dict[str, float],
+    ) -> tuple[SyncReport, Path]:  # fmt: skip
+        """The shifted files where the data decide, the check video where asked for, and the report."""
+        from indexing.files import manifest, prepare
+        from indexing.report.sync import write_sync
+        from indexing.sync_files import drop_poses, plan, write_poses
+
+        prepare(folder)
+        notes, clocks = list(report.notes), list(report.clocks)
+        poses = [i for i, take in enumerate(takes) if take.kind == "keypoints"]
+        if report.ok and poses:
+            plans = {i: plan(takes[i], clocks[i].offset, clocks[i].rate, clocks[0].fps) for i in poses}
+            write_poses(folder, list(plans.values()))
+            notes += early(list(plans.values()), takes[0].name)
+            clocks = [
+                dataclasses.replace(clock, shifted=_shifted(plans[i])) if i in plans else clock for i, clock in enumerate(clocks)
+            ]
+        elif drop_poses(folder):
+            notes.append("pose-sync of an earlier run was removed, because this one does not decide")
+        videos: list[str] = []
+        if self.check and any(len(found.shift.peaks) for found in compared.values()):  # of the best candidate, sure or not
+            from indexing.report.sync_check import write_checks
+
+            videos, failed = write_checks(folder, takes, report, compared)
+            notes += failed
+        settings = manifest({"command": "sync", **dataclasses.asdict(self)}, inputs, None, timings)
+        final = dataclasses.replace(report, notes=notes, clocks=clocks, manifest=settings)
+        return final, write_sync(folder, final, videos)
+
+
+def words(message: str) -> str:
+    """A message of the library in the words of the command line.
+
+    Example:
+        >>> words("an approximation; give calibration=((K, dist), (K, dist))"), words("narrow max_shift")
+        ('an approximation; give --calibration FILE.toml', 'narrow --max-shift')
+    """
+    said = in_flags(message.replace("calibration=((K, dist), (K, dist))", "calibration=FILE.toml"), *FLAGS)
+    return re.sub(r"(?<!-)\bmax_shift\b", "--max-shift", said)
+
+
+def early(plans: list[Plan], reference: str) -> list[str]:
+    """Notes on frames that have no number, because they were taken before the reference's first."""
+    said = [f"{count(one.before, 'frame')} of {one.take.name}" for one in plans if one.before]
+    return [f"{names(said)} left out of pose-sync: taken before number 0 of {reference}"] if said else []
+
+
+def _shifted(one: Plan) -> dict[str, Any]:
+    return {
+        "folder": f"pose-sync/{one.take.name}_json", "files": len(one.numbers), "shift": one.shift, "rest": one.rest,
+        "repeated": one.repeated, "left_out": one.before,
+    }  # fmt: skip
+
+
+def show(report: SyncReport) -> None:
+    """Print the result."""
+    rows: list[list[object]] = []
+    for pair in report.pairs:
+        shift, rival = pair.shift, pair.runner_up
+        drift = f"{PPM * (shift.rate - 1):+.0f} ± {PPM * shift.rate_sigma:.0f}" if shift.rate != 1 else "0"
+        numbers = [
+            f"{pair.apart:+.4f}",
+            f"{shift.sigma:.4f}",
+            f"{pair.apart * shift.fps[1]:+.2f}",
+            drift,
+            f"{shift.confidence:.3f}",
+        ]
+        rows.append([f"{pair.a} → {pair.b}", *numbers, f"{rival[0]:+.3f}" if rival else "none", "ok" if shift.ok else "refused"])
+    table(["pair", "offset s ", "± s ", "frames ", "rate ppm ", "confidence ", "next peak s ", "status"], rows)
+    if len(report.clocks) > 2:
+        rows = [
+            [
+                clock.name,
+                f"{clock.offset:+.4f}",
+                f"{clock.sigma:.4f}",
+                f"{clock.offset * clock.fps:+.2f}",
+                f"{PPM * (clock.rate - 1):+.0f}",
+            ]
+            for clock in report.clocks
+        ]
+        table([f"clock against {report.reference.name}", "offset s ", "± s ", "frames ", "rate ppm "], rows)
+        if report.cycle is not None and math.isfinite(report.cycle):
+            out = f"; {report.outlier[0]} - {report.outlier[1]} contradicts the others" if report.outlier else ""
+            say(f"cycle error: {1000 * report.cycle:.2f} ms{out}")
+    for pair in report.pairs:
+        if pair.wrong:
+            say(f"inconsistent joints of {pair.a} and {pair.b}: {', '.join(pair.wrong)}")
+    for note in report.notes:
+        say(f"note: {note}")
+    moved = [clock for clock in report.clocks if clock.shifted is not None]
+    if moved:
+        rest = 1000 * max(clock.shifted["rest"] for clock in moved if clock.shifted is not None)
+        written = ", ".join(clock.name for clock in moved)
+        say(f"shifted files: pose-sync/ ({written}), within {rest:.1f} ms of {report.reference.name}")

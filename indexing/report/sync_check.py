@@ -1,0 +1,52 @@
+"""Videos to check a synchronization by: the reference camera beside each of the others, at the same moments."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from indexing.clip import Clip
+from indexing.report.sync import SyncReport
+from indexing.sync_takes import Take
+
+if TYPE_CHECKING:
+    from indexing.sync_people import Pairing
+
+
+def names_of(cameras: Sequence[str]) -> list[str]:
+    """The files' names: ``check.mp4`` for two cameras, one for each but the reference for more.
+
+    Example:
+        >>> names_of(["left", "right"]), names_of(["cam1", "cam2", "cam3"])
+        (['check.mp4'], ['check-cam2.mp4', 'check-cam3.mp4'])
+    """
+    return ["check.mp4"] if len(cameras) == 2 else [f"check-{name}.mp4" for name in cameras[1:]]
+
+
+def write_checks(
+    folder: Path, takes: Sequence[Take], report: SyncReport, found: dict[tuple[int, int], Pairing]
+) -> tuple[list[str], list[str]]:
+    """Write the videos: the names of those written, and notes on those that could not be.
+
+    Keypoints are drawn as stick figures.
+    """
+    from indexing.video import write_check_video
+
+    written, notes = [], []
+    for i, name in enumerate(names_of([take.name for take in takes]), start=1):
+        people = found[0, i].people if (0, i) in found else (0, 0)
+        first, other = (_shown(take, person) for take, person in zip((takes[0], takes[i]), people, strict=True))
+        try:
+            write_check_video(folder / name, first, other, report.clocks[i], names=(takes[0].name, takes[i].name))
+            written.append(name)
+        except ValueError as problem:
+            notes.append(f"{name} was not written: {problem}")
+    return written, notes
+
+
+def _shown(take: Take, person: int) -> Path | Clip:
+    if take.kind == "keypoints":
+        return take.people[person]
+    assert take.path is not None  # the command line has no frames without a file
+    return take.path

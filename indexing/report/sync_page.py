@@ -1,0 +1,160 @@
+"""The sections of the report on a synchronization, as HTML."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from indexing.report.page import Card, Column, cards, escape, picture, provenance, section, sentence, table
+from indexing.report.sync_picture import DRAWN
+
+if TYPE_CHECKING:
+    from indexing.report.sync import Clock, Compared, SyncReport
+
+METHODS = {
+    "epipolar": "same points, epipolar",
+    "affine": "same points, affine",
+    "subspace": "different points, subspaces",
+    "brightness": "brightness",
+}
+PPM = 1e6
+
+
+def body(report: SyncReport, drawn: tuple[bytes, bytes], videos: Sequence[str] = ()) -> str:
+    """The page's sections: headline numbers, notes, curves, clocks, pairs, settings."""
+    parts = [cards(_headline(report)), _notes(report), _curves(report, drawn), _clocks(report, videos), _pairs(report)]
+    return "\n".join(part for part in [*parts, provenance(report.manifest)] if part)
+
+
+def describe(report: SyncReport) -> str:
+    """The result in plain words."""
+    others = report.clocks[1:]
+    if not report.ok:
+        start = f"The recordings do not decide how the clocks of the cameras run. {sentence(report.reason)}"
+        return f"{start} What follows is the best candidate, and not to be relied on."
+    if len(others) == 1:
+        first, other = report.reference, others[0]
+        pair = report.pairs[0]
+        way = "later" if pair.apart >= 0 else "earlier"
+        drift = f", and {drift_of(other)} s in an hour" if other.rate != 1 else ""
+        said = f"What {first.name} shows at a time, {other.name} shows {abs(pair.apart):.3f} ± {other.sigma:.3f} s {way}"
+        return f"{said} on its own clock ({abs(pair.apart) * other.fps:.2f} frames){drift}."
+    return (
+        f"The clocks of {len(report.clocks)} cameras, told on the clock of {report.reference.name}, from {len(report.pairs)} pairs."
+    )
+
+
+def drift_of(clock: Clock) -> str:
+    """Seconds that a clock gains on the reference in an hour.
+
+    Example:
+        >>> from indexing.report.sync import Clock
+        >>> drift_of(Clock("b", "b", 30.0, False, 9, 0.0, 1.0, 0.0, 0.0, rate=1.00001))
+        '+0.036'
+    """
+    return f"{3600 * (clock.rate - 1):+.3g}"
+
+
+def _headline(report: SyncReport) -> list[Card]:
+    items = [Card("Status", "Solved" if report.ok else "Refused", "the recordings decide" if report.ok else "they do not decide")]
+    if len(report.clocks) == 2:
+        clock, pair = report.clocks[1], report.pairs[0]
+        items.append(
+            Card(
+                "Offset" if report.ok else "Best candidate",
+                f"{pair.apart:+.4f} s",
+                f"± {clock.sigma:.4f} s; {pair.apart * clock.fps:+.2f} frames",
+            )
+        )
+        note = f"± {PPM * clock.rate_sigma:.0f}; {drift_of(clock)} s an hour" if clock.rate != 1 else "nothing speaks for a drift"
+        items.append(Card("Rate", f"{PPM * (clock.rate - 1):+.0f} ppm", note))
+        items.append(Card("Confidence", f"{pair.shift.confidence:.3g}", "that the offset is right to a frame"))
+        return items
+    items.append(Card("Cameras", str(len(report.clocks)), f"on the clock of {report.reference.name}"))
+    sure = sum(pair.shift.ok for pair in report.pairs)
+    items.append(Card("Pairs", f"{sure} of {len(report.pairs)}", "decide by themselves"))
+    if report.cycle is not None and np.isfinite(report.cycle):
+        note = f"between pairs; {' and '.join(report.outlier)} stands out" if report.outlier else "between pairs, root mean square"
+        items.append(Card("Cycle error", f"{1000 * report.cycle:.1f} ms", note))
+    return items
+
+
+def _notes(report: SyncReport) -> str:
+    lines = [f"<li>{escape(sentence(note))}</li>" for note in report.notes]
+    if report.reason:
+        lines.insert(0, f'<li><b class="bad">Refused.</b> {escape(sentence(report.reason))}</li>')
+    return section("Please note", f"<ul>{''.join(lines)}</ul>") if lines else ""
+
+
+def _curves(report: SyncReport, drawn: tuple[bytes, bytes]) -> str:
+    note = "How well two cameras agree at every shift: one peak that stands out decides, several of one height do not."
+    more = f" The first {DRAWN} of {len(report.pairs)} pairs." if len(report.pairs) > DRAWN else ""
+    caption = (
+        "Orange: the best shift, with its standard deviation in the close-up at the right; gray: the next best peaks. "
+        "Shifts are those in the middle of what both cameras recorded."
+    )
+    return section("Score over shift", picture(drawn[0], "Score over the shift", dark=drawn[1], caption=caption + more), note)
+
+
+def _clocks(report: SyncReport, videos: Sequence[str]) -> str:
+    rows = []
+    for clock in report.clocks:
+        first = clock is report.reference
+        rest = "" if clock.shifted is None else f"{1000 * clock.shifted['rest']:.1f} ms"
+        numbers = [
+            f"{clock.fps:.6g}{' (assumed)' if clock.fps_assumed else ''}",
+            "reference" if first else f"{clock.offset:+.4f} ± {clock.sigma:.4f}",
+            "" if first else f"{clock.offset * clock.fps:+.2f}",
+            "" if first else f"{PPM * (clock.rate - 1):+.0f} ± {PPM * clock.rate_sigma:.0f}",
+            _moved(clock),
+            rest,
+        ]
+        rows.append([f"{escape(clock.name)}<span class='quiet'>{escape(clock.path)}</span>", *map(escape, numbers)])
+    names = ("Frames/s", "Offset, s", "Offset, frames", "Rate, ppm", "Frame numbers", "Greatest rest")
+    shown = table([Column("Camera"), *(Column(name, "number") for name in names)], rows, caption="Clocks", css="stack")
+    note = (
+        "A camera's time is the reference's time multiplied by its rate, plus its offset. Files in pose-sync have equal frame "
+        "numbers for equal moments; what whole frames cannot say is the rest."
+    )
+    seen = f'<p class="note">The same moments side by side: {escape(", ".join(videos))}.</p>' if videos else ""
+    return section("Clocks", shown + seen, note)
+
+
+def _moved(clock: Clock) -> str:
+    if clock.shifted is None:
+        return ""
+    shift = clock.shifted["shift"]
+    return "nearest frames" if shift is None else f"{-shift:+d}" if shift else "unchanged"
+
+
+def _pairs(report: SyncReport) -> str:
+    rows = []
+    for pair in report.pairs:
+        shift, rival = pair.shift, pair.runner_up
+        state = '<span class="good">ok</span>' if shift.ok else f'<span class="bad">refused</span>: {escape(shift.reason)}'
+        figures = [
+            f"{pair.apart:+.4f} ± {shift.sigma:.4f}",
+            f"{PPM * (shift.rate - 1):+.0f}",
+            f"{shift.confidence:.3g}",
+            "none" if rival is None else f"{rival[0]:+.3f}",
+            "" if not np.isfinite(pair.residual) else f"{1000 * pair.residual:+.1f}",
+        ]
+        wrong = f"<span class='quiet'>inconsistent: {escape(', '.join(pair.wrong))}</span>" if pair.wrong else ""
+        name = f"{escape(pair.a)} → {escape(pair.b)}<span class='quiet'>{escape(METHODS.get(shift.method, shift.method))}</span>"
+        rows.append([name, *figures, state + _people(pair) + wrong])
+    heads = ["Offset, s", "Rate, ppm", "Confidence", "Next peak, s", "Residual, ms"]
+    columns = [Column("Pair"), *(Column(name, "number") for name in heads), Column("Status", "long")]
+    if len(report.clocks) == 2:  # there is nothing else that the pair could be off
+        columns.pop(5)
+        rows = [[*row[:5], row[6]] for row in rows]
+    note = "Every pair by itself, in the middle of what both cameras recorded."
+    note += " The residual is what it is off the clocks of all cameras." if len(report.clocks) > 2 else ""
+    return section("Pairs", table(columns, rows, caption="Pairs", css="stack"), note)
+
+
+def _people(pair: Compared) -> str:
+    if not any(pair.people):
+        return ""
+    return f"<span class='quiet'>compared: {escape(pair.people[0])} with {escape(pair.people[1])}</span>"

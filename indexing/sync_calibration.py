@@ -1,0 +1,131 @@
+"""Calibration files: the inner matrix and the lens distortion of every camera, as Pose2Sim, Caliscope and AniPose write them."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from indexing.readers.files import error
+
+REMEDY = "give a .toml with matrix (3, 3) and distortions for every camera, as Pose2Sim writes it"
+
+
+@dataclass(frozen=True, eq=False)
+class Lens:
+    """One camera of a calibration file.
+
+    Args:
+        name: its section.
+        matrix: ``(3, 3)``.
+        distortions: ``(k,)`` in OpenCV's order: k1, k2, p1, p2, k3, ...
+        fisheye: whether they are those of OpenCV's fisheye model.
+    """
+
+    name: str
+    matrix: Tensor
+    distortions: Tensor
+    fisheye: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Lenses:
+    """The lenses of the cameras asked for, as :func:`dyntorch.synchronize` takes them, and what to say about it."""
+
+    values: Any
+    notes: tuple[str, ...] = ()
+
+
+def lenses(calibration: Any, names: Sequence[str]) -> Lenses | None:
+    """The lens of each camera; None where nothing is given.
+
+    Args:
+        calibration: path of a file, cameras from :func:`read_calibration`, or what :func:`dyntorch.synchronize` takes.
+        names: of the cameras.
+
+    Raises:
+        ValueError: the file cannot be read, or has no section for a camera.
+    """
+    if calibration is None:
+        return None
+    path = Path(calibration) if isinstance(calibration, (str, Path)) else None
+    cameras = read_calibration(path) if path is not None else calibration
+    if not (isinstance(cameras, list) and all(isinstance(camera, Lens) for camera in cameras)):
+        return Lenses(calibration)
+    chosen, notes = match(cameras, names, path or "calibration")
+    fish = [lens.name for lens in chosen if lens.fisheye]
+    if fish:
+        raise error(path or "calibration", f"[{fish[0]}] has a fisheye lens, which is not modelled", "undistort the points first")
+    return Lenses(tuple((lens.matrix, lens.distortions if len(lens.distortions) else None) for lens in chosen), notes)
+
+
+def read_calibration(path: str | Path) -> list[Lens]:
+    """The cameras of a calibration file, in its order.
+
+    Raises:
+        ValueError: not a TOML file, or a camera without a sound matrix and distortions.
+
+    Example:
+        >>> import pathlib, tempfile
+        >>> file = pathlib.Path(tempfile.mkdtemp()) / "Calib.toml"
+        >>> _ = file.write_text("[cam01]\\nmatrix = [[900, 0, 320], [0, 900, 240], [0, 0, 1]]\\ndistortions = [-0.1, 0, 0, 0]\\n")
+        >>> [lens.name for lens in read_calibration(file)]
+        ['cam01']
+    """
+    path = Path(path).expanduser()
+    if not path.is_file():
+        raise error(path, "no such file", "check the path")
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as problem:
+        raise error(path, f"is not a TOML file ({problem})", REMEDY) from None
+    found = []
+    for section, values in content.items():
+        if isinstance(values, dict) and "matrix" in values:
+            matrix = _numbers(path, section, "matrix", values["matrix"])
+            if matrix.shape != (3, 3) or not bool(matrix[2, 2] != 0) or not float(matrix[0, 0]) > 0 < float(matrix[1, 1]):
+                raise error(path, f"[{section}] matrix: expected 3 x 3 with positive focal lengths", REMEDY)
+            distortions = _numbers(path, section, "distortions", values.get("distortions", values.get("dist", []))).flatten()
+            if len(distortions) not in (0, 4, 5, 8):
+                raise error(path, f"[{section}] distortions: expected 4, 5 or 8 numbers, got {len(distortions)}", REMEDY)
+            name = values.get("name", section)
+            found.append(Lens(str(name), matrix / matrix[2, 2], distortions, bool(values.get("fisheye", False))))
+    if not found:
+        raise error(path, "has no camera: no section with a 'matrix'", REMEDY)
+    return found
+
+
+def match(cameras: Sequence[Lens], names: Sequence[str], path: str | Path) -> tuple[list[Lens], tuple[str, ...]]:
+    """The lens of each name: the section of this name, else the only one whose name contains it, else by order.
+
+    Raises:
+        ValueError: names and sections do not fit.
+    """
+    chosen: list[Lens | None] = []
+    for name in names:
+        equal = [lens for lens in cameras if lens.name == name] or [lens for lens in cameras if name and name in lens.name]
+        equal = equal or [lens for lens in cameras if lens.name in name]
+        chosen.append(equal[0] if len(equal) == 1 else None)
+    known = [lens for lens in chosen if lens is not None]
+    if len(known) == len(names) and len({id(lens) for lens in known}) == len(names):
+        return known, ()
+    listed = ", ".join(lens.name for lens in cameras)
+    if len(cameras) == len(names):
+        return list(cameras), (f"calibration taken in the order of its file ({listed}), because names differ",)
+    raise error(path, f"its cameras are {listed}, and {', '.join(names)} are to be synchronized", "name sections as the cameras")
+
+
+def _numbers(path: Path, section: str, key: str, value: Any) -> Tensor:
+    try:
+        found = torch.tensor(value, dtype=torch.float64)
+    except (TypeError, ValueError):
+        found = torch.tensor([math.nan])
+    if not bool(torch.isfinite(found).all()):
+        raise error(path, f"[{section}] {key}: expected finite numbers", REMEDY)
+    return found

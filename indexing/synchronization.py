@@ -1,0 +1,203 @@
+"""How one camera's clock runs against another's: one verb over keypoints, point tracks and the brightness of videos."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from functools import partial
+from itertools import combinations
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from indexing.clip import Clip
+from indexing.sync_people import Pairing, common_joints, disagreements, jumps, match_people
+from indexing.sync_takes import Take, take_of
+
+if TYPE_CHECKING:
+    from dyntorch import Shift
+
+Method = Literal["auto", "keypoints", "tracks", "brightness"]
+METHODS = ("auto", "keypoints", "tracks", "brightness")
+LISTED = 3  # moments in a note
+
+
+def synchronize(
+    a: Clip | str | Path | ArrayLike | Take,
+    b: Clip | str | Path | ArrayLike | Take,
+    method: Method = "auto",
+    *,
+    fps: float | tuple[float, float] | None = None,
+    max_shift: float | None = None,
+    calibration: Any = None,
+    person: str = "auto",
+    min_confidence: float = 0.0,
+    **options: Any,
+) -> Shift:
+    """Synchronize two cameras that filmed the same scene from different places, neither of them calibrated.
+
+    A moment that camera a shows at its time :math:`t_a` is shown by b at
+
+    .. math:: t_b = \\text{rate}\\; t_a + \\text{offset}.
+
+    Keypoints of one skeleton are the same points in both: their epipolar constraint :math:`x_b^T F x_a = 0` holds at the right
+    shift alone.  Keypoints of different skeletons, and tracks of whatever can be followed in two videos, are different points of
+    the same moving things: their trajectories span subspaces that meet at the right shift.  Brightness needs no points at all.
+
+    Args:
+        a, b: a :class:`~indexing.Clip` with 2D joints; the path of keypoints in any format of :mod:`indexing.readers` (a file,
+            or a folder with one file per frame); the path of a video; keypoints ``(frames, joints, 2)``, pixels, NaN = missing;
+            or gray frames ``(frames, height, width)``.
+        method: ``"keypoints"``, ``"tracks"``, ``"brightness"``, or ``"auto"``: keypoints where both have them; for two videos
+            tracks and brightness, of which both must say the same.
+        fps: frames per second of arrays and of files that have no times, of both or of each (30 by default, and then a note
+            says so).
+        max_shift: seconds, the largest offset that is searched; by default as far as the takes overlap enough to tell.
+        calibration: lens and matrix of both cameras, as :func:`dyntorch.synchronize` takes it; or the path of a calibration
+            file (``.toml`` with ``matrix`` and ``distortions`` for every camera), cameras matched by name, or by order.
+        person: who is followed where several people are in view: ``"auto"`` tries the likely pairings and says which was taken;
+            ``"largest"``, ``"confident"``, ``"tracked"`` are the rules of :mod:`indexing.readers.people`.
+        min_confidence: joints that the detector trusts less are taken as not seen.
+        options: for the reader (``format=``, ``size=``) and for :func:`dyntorch.synchronize`.
+
+    Returns:
+        :class:`dyntorch.Shift`: offset and sigma in seconds, rate, confidence, all peaks, ``ok`` and the reason where it is
+        false.  Times are those of the files: frame number / fps where they have none of their own.
+
+    Raises:
+        ValueError: an input that cannot be read or shows nobody, or a method that does not fit it.
+
+    Source:
+        L. Wolf, thesis (2003), chapter 7; L. Wolf and A. Zomet, Sequence-to-sequence self calibration, ECCV 2002.
+
+    Example:
+        >>> import numpy as np
+        >>> from indexing import cameras
+        >>> from indexing.actors import Person, stream
+        >>> scene, _ = stream(["wave", "squat", "kick"], Person(), rng=1)
+        >>> left, right = (cameras.virtual(scene, azimuth) for azimuth in (0.0, 70.0))
+        >>> shift = synchronize(left.joints, right.joints[12:], fps=30.0)  # the second camera starts 12 frames later
+        >>> bool(shift.ok), round(shift.frames, 1)
+        (True, -12.0)
+    """
+    if method not in METHODS:
+        raise ValueError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
+    rates = fps if isinstance(fps, (tuple, list)) else (fps, fps)
+    if len(rates) != 2:
+        raise ValueError(f"fps must be one number, or one for each of two cameras, got {fps!r}")
+    how = {name: options.pop(name) for name in ("format", "size") if name in options}
+    takes = [
+        take_of(value, name="" if isinstance(value, (Clip, str, Path)) else name, fps=rate, person=person,
+                min_confidence=min_confidence, **how)
+        for value, name, rate in zip((a, b), "ab", rates, strict=True)
+    ]  # fmt: skip
+    shift = pair(takes[0], takes[1], method, max_shift=max_shift, calibration=calibration, **options).shift
+    return dataclasses.replace(shift, notes=(*remarks(takes), *shift.notes))
+
+
+def pair(a: Take, b: Take, method: Method = "auto", *, calibration: Any = None, **options: Any) -> Pairing:
+    """:func:`synchronize` for recordings that were read, and which person of each it is about."""
+    from indexing.sync_calibration import lenses
+
+    _check_method(a, b, method)
+    lens = lenses(calibration, [a.name, b.name])
+    notes = list(lens.notes) if lens else []
+    options = {**options, "calibration": lens.values if lens else None}
+    if a.kind == b.kind == "keypoints":
+        found = match_people(a, b, partial(_keypoints, **options), partial(_keypoints, quick=True, **options))
+        notes += _swapped(a, b, found)
+    else:
+        from indexing.sync_video import synchronize_videos
+
+        found = Pairing(synchronize_videos(a, b, method, **options), (0, 0))
+    shift = dataclasses.replace(found.shift, notes=tuple(dict.fromkeys([*notes, *found.shift.notes])))
+    return dataclasses.replace(found, shift=shift)
+
+
+def _check_method(a: Take, b: Take, method: Method) -> None:
+    for take in (a, b):
+        if method == "keypoints" and take.kind != "keypoints":
+            raise ValueError(
+                f"{take.path or take.name}: is a video, and method='keypoints' needs keypoints; run a pose estimator first, or use "
+                "method='tracks' or 'brightness'"
+            )
+        if method == "brightness" and take.kind == "keypoints":
+            raise ValueError(
+                f"{take.path or take.name}: holds keypoints, and method='brightness' needs videos; give the videos, or use "
+                "method='keypoints'"
+            )
+
+
+def _keypoints(a: Clip, b: Clip, correspondence: bool | None = None, quick: bool = False, **options: Any) -> Shift:
+    """Two people, or one seen twice; ``quick`` looks for no lens distortion, drift, or weak perspective: 5 to 10 times faster."""
+    import torch
+
+    import dyntorch
+
+    first, second, same, note = common_joints(a, b)
+    if correspondence is None:
+        correspondence = same
+    elif correspondence and not same:
+        raise ValueError(
+            f"correspondence=True needs the same joints in both, got {a.joints.shape[1]} and {b.joints.shape[1]}; leave it away"
+        )
+    if quick and correspondence:
+        options = {"camera": "perspective", **options, "rate": options.get("rate") or 1.0}
+        options["calibration"] = options.get("calibration") or (None, None)
+    clips = (first, second) if correspondence else (a, b)
+    places = [torch.from_numpy(np.array(clip.joints, dtype=np.float64)) for clip in clips]
+    trust = [
+        np.where(clip.seen, 1.0, 0.0) if clip.confidence is None else np.nan_to_num(np.clip(clip.confidence, 0.0, None))
+        for clip in clips
+    ]
+    known = any(clip.confidence is not None for clip in clips)
+    shift: Shift = dyntorch.synchronize(
+        places[0],
+        places[1],
+        correspondence=correspondence,
+        times=(torch.from_numpy(a.times.copy()), torch.from_numpy(b.times.copy())),
+        weights=(torch.from_numpy(trust[0]), torch.from_numpy(trust[1])) if known else None,
+        **options,
+    )
+    return dataclasses.replace(shift, notes=(*([note] if note else []), *shift.notes))
+
+
+def remarks(takes: Sequence[Take]) -> list[str]:
+    """What to say about the recordings themselves."""
+    notes = [note for take in takes for note in take.notes]
+    names = [take.name for take in takes if take.fps_assumed]
+    if names:
+        notes.append(f"30 frames per second assumed for {', '.join(names)}; fps= says otherwise")
+    same = [f"{a.name} and {b.name}" for a, b in combinations(takes, 2) if _same(a, b)]
+    return [*notes, *(f"{names} are the same recording" for names in same)]
+
+
+def _same(a: Take, b: Take) -> bool:
+    """Whether both are one recording: the best shift is then 0, and says nothing."""
+    if a.path is not None and b.path is not None and a.path.resolve() == b.path.resolve():
+        return True
+    first, second = (take.people[0].joints if take.people else take.frames for take in (a, b))
+    if first is None or second is None or first.shape != second.shape:
+        return False
+    return bool(np.array_equal(first, second, equal_nan=first.dtype.kind == "f"))
+
+
+def _swapped(a: Take, b: Take, found: Pairing) -> list[str]:
+    """Notes on moments at which somebody else is followed, and on stretches in which the two do not show the same person."""
+    people = [take.people[i] for take, i in zip((a, b), found.people, strict=True)]
+    notes = []
+    for take, clip in zip((a, b), people, strict=True):
+        moments = jumps(clip)
+        if moments:
+            listed = ", ".join(f"{moment:.2f}" for moment in moments[:LISTED]) + " and more" * (len(moments) > LISTED)
+            notes.append(f"{take.name}: whoever is followed jumps at {listed} s: people swapped, or a cut")
+    first, second, same, _ = common_joints(*people)
+    bad = disagreements(first, second, found.shift) if same and found.shift.ok else []
+    if bad:
+        listed = ", ".join(f"{start:.2f} to {end:.2f} s" for start, end, _ in bad[:LISTED]) + " and more" * (len(bad) > LISTED)
+        worst = max(times for *_, times in bad)
+        said = f"from {listed} on the clock of {a.name} the cameras fit each other {worst:.1f} times worse than otherwise"
+        notes.append(f"{said}: people swapped, tracking lost, or a camera moved")
+    return notes

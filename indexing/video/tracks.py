@@ -1,0 +1,238 @@
+"""Points that move, followed through a video: Kanade-Lucas-Tomasi with a forward-backward check."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from indexing.video.background import Background, Floats, shrinking, transform
+from indexing.video.extra import cv2
+from indexing.video.following import PATCH, MovingArea, extent, follow, patches
+from indexing.video.motion import CameraMotion, PathBuilder
+from indexing.video.reading import Source, chunks
+
+WORKING = 960  # pixels of the longest side: KLT is exact to a tenth of these
+CHECK = 5  # frames after which a point must still look like itself (correlation SAME of its surroundings):
+SAME = 0.6  # where somebody passes before the background, its points are dragged along, and there and back agree
+RENEW = 10  # frames after which new points replace lost ones
+APART = 90  # points are at least 1/APART of the width apart
+MOVING = 0.01  # of the diagonal: extent of a track that counts as moving
+DRAGGED = 0.15  # of that, extent of the middle half: background dragged along by a passer-by rests for the rest of its life
+REST = 0.25  # share of points on ground where nothing moves now: people who rest and move later
+SHORTEST = 10  # frames of a track that is worth keeping
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Tracks:
+    """Moving points of a video, those that live longest first.
+
+    Attributes:
+        points: ``(frames, n, 2)`` float64 pixels of the video as shown, y down; NaN before a point was found and after it was lost.
+            Where the camera moves: as the camera of the first frame would have seen them.
+        times: ``(frames,)`` seconds.
+        size: width and height of the video as shown.
+        camera: how the camera moved.
+        notes: what a user should know.
+    """
+
+    points: Tensor
+    times: Tensor
+    size: tuple[int, int]
+    camera: CameraMotion
+    notes: tuple[str, ...]
+
+    @property
+    def share(self) -> Tensor:
+        """``(n,)`` share of the frames in which each point is there."""
+        return self.points[..., 0].isfinite().to(torch.float64).mean(0)
+
+    def __repr__(self) -> str:
+        frames, points = self.points.shape[:2]
+        whole = int((self.share > 0.99).sum())
+        size = f"{self.size[0]} x {self.size[1]}"
+        head = f"Tracks({points} moving points, {whole} of them throughout, {frames} frames, {size}, {self.camera})"
+        return "\n".join([head, *(f"  note: {note}" for note in self.notes)])
+
+
+def track_points(
+    source: str | Path | Source, *, count: int = 200, keep: int = 40, complete: float = 0.7, motion: float | None = None
+) -> Tracks:
+    """Follow points that move against the background through a video.
+
+    Corners are detected where something moves, followed from frame to frame (KLT), given up where following them back does not end
+    where they came from, and replaced.  Of all tracks, those are kept that are there for at least ``complete`` of the frames and
+    that move, the longest first; fragments of one point are not joined.
+
+    Args:
+        source: a path, or chunks of grey frames (one pass over them).
+        count: points followed at a time.
+        keep: tracks returned at most.
+        complete: least share of the frames in which a track must be there, in [0, 1].
+        motion: least extent of a track in pixels (of the middle nine tenths of its positions); default: 1 % of the diagonal.
+
+    Returns:
+        the tracks; none of them (``n = 0``), and a note, where nothing that moves could be followed long enough.
+
+    Raises:
+        ValueError: the video cannot be read, has fewer than two frames, or an option makes no sense.
+
+    Source: Tomasi and Kanade 1991 (tracking), Shi and Tomasi 1994 (corners), Kalal et al. 2010 (forward-backward check).
+
+    Example:
+        >>> import numpy as np
+        >>> from indexing.video import Chunk
+        >>> squares = np.kron(np.random.default_rng(0).integers(0, 255, (15, 25)), np.ones((8, 8))).astype(np.uint8)
+        >>> frames = np.stack([squares[:, :160]] * 20)
+        >>> for i in range(20):  # a piece of cloth goes to the right
+        ...     frames[i, 48:88, 20 + 3 * i : 60 + 3 * i] = squares[:40, 160:]
+        >>> tracks = track_points([Chunk(frames, np.arange(20) / 10)], complete=1.0)
+        >>> (tracks.points[-1] - tracks.points[0]).median(0).values.round().tolist()
+        [57.0, 0.0]
+    """
+    if count < 1 or keep < 1:
+        raise ValueError(f"track_points: count and keep must be at least 1, got count={count!r}, keep={keep!r}")
+    if not 0 <= complete <= 1:
+        raise ValueError(f"track_points: complete is a share of the frames in [0, 1], got {complete!r}")
+    background, path, book = Background(), PathBuilder(), _Book(count)
+    previous: NDArray[np.uint8] | None = None
+    for chunk in (stream := chunks(source, size=WORKING)):
+        moved = [path.add(background, image) for image in chunk.frames]
+        path.times.extend(chunk.times.tolist())
+        where = MovingArea(chunk, moved)
+        for image, matrix in zip(chunk.frames, moved, strict=True):
+            book.step(previous, image, where(matrix), matrix)
+            previous = image
+    book.end()
+    if len(path.times) < 2:
+        raise ValueError(f"track_points: the video has {len(path.times)} frame(s); tracks need at least 2")
+    scale = getattr(stream, "scale", (1.0, 1.0)) if isinstance(source, (str, Path)) else (1.0, 1.0)
+    camera = path.finish(scale, None, getattr(stream, "notes", ()))
+    limit = MOVING * float(np.hypot(*camera.size)) if motion is None else motion
+    points, notes = _select(book, camera, scale, limit, complete, keep)
+    notes += [*camera.notes, *([f"{camera}; it is taken out"] if camera.moves else [])]
+    return Tracks(torch.from_numpy(points), torch.from_numpy(camera.times), camera.size, camera, tuple(notes))
+
+
+class _Book:
+    """Points being followed, and the histories of those that are worth it."""
+
+    def __init__(self, count: int):
+        self.count, self.frame = count, -1
+        self.alive = np.zeros((0, 2), np.float32)
+        self.ids = np.zeros(0, int)
+        self.histories: dict[int, tuple[int, list[NDArray[np.float32]]]] = {}  # id -> first frame, positions
+        self.done: list[tuple[int, NDArray[np.float32]]] = []
+        self.moved: list[Floats] = []
+        self.next = 0
+        self.looks = np.zeros((0, PATCH[0] * PATCH[1]), np.float32)
+
+    def step(self, previous: NDArray[np.uint8] | None, image: NDArray[np.uint8], where: NDArray[np.uint8], matrix: Floats) -> None:
+        """Follow all points into the next frame, and find new ones."""
+        self.frame += 1
+        self.moved.append(matrix)
+        if previous is not None and len(self.ids):
+            ahead, good = follow(previous, image, self.alive)
+            self.alive = ahead
+            self._keep(good)
+            if self.frame % CHECK == 0:
+                looks = patches(image, self.alive)
+                same = (looks * self.looks).sum(1) > SAME
+                self.looks = looks
+                self._keep(same)
+        for key, position in zip(self.ids.tolist(), self.alive, strict=True):
+            self.histories[key][1].append(position)
+        if self.frame % RENEW == 0:
+            self._replace(image, where)
+
+    def _replace(self, image: NDArray[np.uint8], where: NDArray[np.uint8]) -> None:
+        """New points where something moves, and a few where nothing does; points that rest elsewhere make room."""
+        x, y = np.rint(self.alive).astype(int).T.clip(0, [[image.shape[1] - 1], [image.shape[0] - 1]])
+        elsewhere = where[y, x] == 0
+        spare = elsewhere.sum() - int(REST * self.count)
+        if spare > 0:
+            old = [key for key in self.ids[elsewhere].tolist() if not self._moves(key)][:spare]
+            self._keep(~np.isin(self.ids, old))
+        self._detect(image, where, self.count - len(self.ids))
+        resting = int(REST * self.count) - max(0, int(elsewhere.sum()))
+        self._detect(image, 1 - (where > 0), min(resting, self.count - len(self.ids)))
+
+    def _detect(self, image: NDArray[np.uint8], mask: NDArray[Any], room: int) -> None:
+        if room <= 0 or not mask.any():
+            return
+        apart = max(4, image.shape[1] // APART)
+        free = (mask > 0).astype(np.uint8)
+        for x, y in self.alive.tolist():
+            cv2().circle(free, (round(x), round(y)), apart, 0, -1)
+        found = cv2().goodFeaturesToTrack(image, room, 0.01, apart, mask=free, blockSize=7)
+        if found is None:
+            return
+        found = found.reshape(-1, 2)
+        ids = np.arange(self.next, self.next + len(found))
+        self.next += len(found)
+        for key, position in zip(ids.tolist(), found, strict=True):
+            self.histories[key] = (self.frame, [position])
+        self.alive, self.ids = np.r_[self.alive, found], np.r_[self.ids, ids]
+        self.looks = np.r_[self.looks, patches(image, found)]
+
+    def _keep(self, good: NDArray[np.bool_]) -> None:
+        self._finish(self.ids[~good])
+        self.alive, self.ids, self.looks = self.alive[good], self.ids[good], self.looks[good]
+
+    def _moves(self, key: int) -> bool:
+        first, positions = self.histories[key]
+        image = transform(np.array(self.moved[first : first + len(positions)]), np.array(positions).astype(np.float64)[:, None])[
+            :, 0
+        ]
+        return extent(image) > 3.0
+
+    def _finish(self, keys: NDArray[np.int_]) -> None:
+        """Put tracks away, or forget those that are too short or do not move."""
+        for key in keys.tolist():
+            if len(self.histories[key][1]) >= SHORTEST and self._moves(key):
+                first, positions = self.histories[key]
+                self.done.append((first, np.array(positions)))
+            del self.histories[key]
+        if len(self.done) > 4 * self.count:  # bounded memory: the longest stay
+            self.done = sorted(self.done, key=lambda track: -len(track[1]))[: 2 * self.count]
+
+    def end(self) -> None:
+        """After the last frame."""
+        self._keep(np.zeros(len(self.ids), bool))
+
+
+def _select(
+    book: _Book, camera: CameraMotion, scale: tuple[float, float], limit: float, complete: float, keep: int
+) -> tuple[Floats, list[str]]:
+    """The tracks that live long enough and move, ``(frames, n, 2)``, and what to say about them."""
+    frames = len(camera.times)
+    grow = np.asarray(np.linalg.inv(shrinking(scale)), np.float64)
+    chosen: list[tuple[int, float, int, Floats]] = []
+    shorter = 0
+    for first, positions in book.done:
+        track = transform(grow, positions.astype(np.float64))
+        if camera.moves:
+            track = transform(camera.path[first : first + len(track)], track[:, None])[:, 0]
+        moves = extent(track)
+        if moves < limit or extent(track, 0.5) < DRAGGED * limit:
+            continue
+        if len(track) < complete * frames:
+            shorter += 1
+            continue
+        chosen.append((len(track), moves, first, track))
+    chosen = sorted(chosen, key=lambda item: item[:2], reverse=True)[:keep]
+    points = np.full((frames, len(chosen), 2), np.nan)
+    for i, (length, _, first, track) in enumerate(chosen):
+        points[first : first + length, i] = track
+    notes = []
+    if not chosen:
+        what = f"{shorter} were followed for less" if shorter else "nothing moves, or there is no texture on what moves"
+        notes.append(
+            f"no moving point could be followed for {complete:.0%} of the video ({what}); use keypoints, or a shorter stretch"
+        )
+    return points, notes

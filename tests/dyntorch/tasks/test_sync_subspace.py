@@ -1,0 +1,187 @@
+"""Two cameras that track different points: information against determinants, what must not matter, and what must be refused."""
+
+import math
+
+import pytest
+import torch
+
+from dyntorch.tasks.sync_subspace import SubspaceCurve, _shared, subspace_curve
+from dyntorch.tasks.sync_subspace_body import body_of, completed, smooth
+from dyntorch.tasks.sync_subspace_shift import subspace_shift
+
+
+def uniform(seed, *shape):
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def normal(seed, *shape):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def scene(frames, shift, n=7, m=9, noise=0.3, seed=0, modes=6):
+    """Points of a body that moves in ways which never repeat, in two affine cameras with different points; px."""
+    pace, phase, bend = 0.04 + 0.2 * uniform(seed, modes), 6.3 * uniform(seed + 1, modes), 1e-3 * normal(seed + 2, modes)
+
+    def film(times, points, key):
+        ways = torch.sin(pace * times[:, None] + bend * times[:, None] ** 2 + phase)
+        place = torch.cat([ways, 0.01 * times[:, None], torch.ones(len(times), 1, dtype=torch.float64)], dim=1)
+        mix = torch.cat(
+            [
+                8 * normal(key, modes, points, 2),
+                30 * normal(key + 1, 1, 1, 2).expand(1, points, 2),
+                60 * normal(key + 2, 1, points, 2),
+            ]
+        )
+        return torch.einsum("tk,knd->tnd", place, mix) + noise * normal(key + 3, len(times), points, 2)
+
+    times = torch.arange(frames, dtype=torch.float64)
+    return film(times, n, seed + 10), film(times - shift, m, seed + 20)
+
+
+def full(x):
+    return torch.ones(x.shape[:2], dtype=torch.float64)
+
+
+def curve_of(a, b, lags=(-40, 40)):
+    return subspace_curve(a, b, full(a), full(b), lags)
+
+
+def test_the_information_is_that_of_the_determinants():
+    x = normal(0, 40, 7)
+    c = torch.cov(x.T)
+    found = _shared(c[None, :3, :3], c[None, 3:, 3:], c[None, :3, 3:])
+    unit = torch.eye(7, dtype=torch.float64)
+    parts = torch.logdet(c[:3, :3] + unit[:3, :3]) + torch.logdet(c[3:, 3:] + unit[:4, :4]) - torch.logdet(c + unit)
+    assert abs(float(found[0] - 0.5 * parts)) < 1e-12
+
+
+def test_scores_are_those_of_every_overlap_by_itself():
+    a, b = scene(80, 5)
+    curve, one, two = curve_of(a, b, (-20, 20)), body_of(a, full(a)), body_of(b, full(b))
+    raw = []
+    for lag in (-20, -3, 5, 20):
+        start, end = max(0, -lag), min(76, 76 - lag)  # without the ends
+        both = torch.cat([one.rows[start:end], two.rows[start + lag : end + lag]], dim=1)
+        c, n = torch.cov(both.T, correction=0) + torch.eye(both.shape[1], dtype=torch.float64), one.rows.shape[1]
+        raw.append(0.5 * float(torch.logdet(c[:n, :n]) + torch.logdet(c[n:, n:]) - torch.logdet(c)))
+        assert curve.counts[lag + 20] == end - start
+    told = [float(curve.shape[lag + 20]) for lag in (-20, -3, 5, 20)]
+    chance = [before - after for before, after in zip(raw, told, strict=True)]
+    slope = (chance[0] - chance[1]) / (1 / 56 - 1 / 73)  # a line in 1 / count
+    assert chance[0] == pytest.approx(chance[3], abs=1e-9)
+    assert chance[2] == pytest.approx(chance[1] + slope * (1 / 71 - 1 / 73), abs=1e-9)
+
+
+@pytest.mark.parametrize("shift", [-17.0, -4.5, 0.0, 11.3, 23.75])
+def test_the_shift_of_different_points_is_found_between_frames(shift):
+    a, b = scene(120, shift)
+    found = subspace_shift(curve_of(a, b))
+    assert found.ok
+    assert not found.reason
+    assert found.position == pytest.approx(shift, abs=0.3)
+    assert found.probability > 0.95
+    assert abs(found.position - shift) < 4 * found.sigma
+
+
+def test_neither_unit_nor_place_nor_order_matter():
+    a, b = scene(90, 7)
+    curve = curve_of(a, b)
+    order = torch.randperm(9, generator=torch.Generator().manual_seed(3))
+    moved = curve_of(0.01 * a - 5, 40 * b[:, order] + torch.tensor([1000.0, -300.0]))
+    assert torch.allclose(curve.scores, moved.scores, atol=1e-6, equal_nan=True)
+
+
+def test_exchanged_cameras_mirror_the_motion():
+    a, b = scene(90, 7)
+    assert torch.allclose(curve_of(a, b).motion, curve_of(b, a).motion.flip(0), atol=1e-9)
+    assert subspace_shift(curve_of(b, a)).position == pytest.approx(-subspace_shift(curve_of(a, b)).position, abs=0.1)
+
+
+def test_missing_blocks_are_filled_from_the_other_points():
+    a, b = scene(120, 9.5)
+    wa, wb = full(a), full(b)
+    for j in range(7):
+        wa[10 * j : 10 * j + 25, j] = 0
+        wb[12 * j + 5 : 12 * j + 30, j] = 0
+    spoiled = torch.where(wa[..., None] > 0, a, torch.nan)
+    found = subspace_shift(subspace_curve(spoiled, b + 1e3 * (wb == 0)[..., None], wa, wb, (-40, 40)))
+    assert found.ok
+    assert found.position == pytest.approx(9.5, abs=0.4)
+
+
+def test_completed_positions_are_near_the_true_ones():
+    a, _ = scene(150, 0, n=10, noise=0.01)
+    seen = torch.ones(150, 10, dtype=torch.bool)
+    for j in range(10):
+        seen[14 * j : 14 * j + 12, j] = False
+    start = torch.where(seen[..., None], a, a.mean(0))
+    error = (completed(start, seen) - a)[~seen].norm(dim=-1)
+    assert float(error.median()) < 0.05 * float((start - a)[~seen].norm(dim=-1).median())
+
+
+def test_frames_that_nobody_is_seen_in_do_not_count():
+    a, b = scene(130, 6)
+    wa = full(a)
+    wa[50:70] = 0
+    curve = subspace_curve(a, b, wa, full(b), (-30, 30))
+    assert curve.counts[30] == 106
+    assert subspace_shift(curve).position == pytest.approx(6, abs=0.4)
+
+
+def repeated(period, frames, points, key, start=0.0):
+    turn = 2 * math.pi / period * (torch.arange(frames, dtype=torch.float64) + start)
+    waves = torch.stack(
+        [(k * turn).sin() for k in (1, 2, 3)] + [(k * turn).cos() for k in (1, 2, 3)] + [torch.ones_like(turn)], dim=1
+    )
+    return torch.einsum("tk,knd->tnd", waves, 20 * normal(key, 7, points, 2)) + normal(key + 1, frames, points, 2)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_motion_that_repeats_itself_is_refused(seed):
+    a, b = repeated(20 + 2 * seed, 120, 8, 100 + seed), repeated(20 + 2 * seed, 120, 8, 200 + seed, start=-9.3)
+    found = subspace_shift(curve_of(a, b, (-60, 60)))
+    assert not found.ok
+    assert "shifts" in found.reason or "motion" in found.reason
+    assert len(found.peaks) > 1
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_noise_without_motion_is_refused(seed):
+    a, b = (100 * normal(key, 1, 8, 2) + normal(key + 50, 100, 8, 2) for key in (seed, seed + 500))
+    found = subspace_shift(curve_of(a, b))
+    assert not found.ok
+    assert found.reason
+
+
+def test_too_short_an_overlap_is_refused_without_a_number_that_is_not():
+    a, b = scene(20, 0)
+    found = subspace_shift(curve_of(a, b, (-10, 10)))
+    assert (found.ok, found.position, len(found.peaks)) == (False, 0.0, 0)
+    assert "overlap" in found.reason
+
+
+@pytest.mark.parametrize("frames", [1, 2, 3, 30])
+def test_nothing_seen_is_refused(frames):
+    x = torch.full((frames, 3, 2), torch.nan, dtype=torch.float64)
+    found = subspace_shift(subspace_curve(x, x, full(x) * 0, full(x) * 0, (-5, 5)))
+    assert not found.ok
+
+
+def test_a_point_that_stands_still_is_no_evidence_and_no_trouble():
+    a = torch.zeros(100, 5, 2, dtype=torch.float64)
+    found = subspace_shift(curve_of(a, a))
+    assert not found.ok
+
+
+def test_the_parabola_and_the_posterior_of_a_known_curve():
+    lags = torch.arange(-30, 31).double()
+    scores, counts = 30 - 0.5 * (lags - 3.4) ** 2 / 0.2, torch.full((61,), 100.0, dtype=torch.float64)
+    found = subspace_shift(SubspaceCurve(lags, scores, counts, scores, scores, scores, (5.0, 5.0)))
+    assert found.position == pytest.approx(3.4, abs=1e-9)
+    weights = torch.softmax(scores, 0)
+    assert found.probability == pytest.approx(float(weights[32:35].sum()), abs=1e-9)
+    assert found.sigma == pytest.approx(math.hypot(0.2, math.sqrt(0.2)), abs=1e-9)
+
+
+def test_smoothing_keeps_what_is_constant():
+    assert torch.allclose(smooth(torch.full((9, 2), 3.0, dtype=torch.float64), 4.0), torch.tensor(3.0, dtype=torch.float64))

@@ -1,0 +1,52 @@
+"""Films of synthetic people: what moves in them is the person, and where geometry says."""
+
+import numpy as np
+import pytest
+import torch
+
+from indexing import Clip
+from indexing.actors import Person, perform
+from indexing.actors.textured import film
+from indexing.brightness.box import boxes, motion
+from indexing.skeleton import COCO17
+
+CLIP = perform("wave", Person(), fps=15.0)
+
+
+def test_films_are_reproducible_and_differ_between_cameras():
+    one, again, other = (film(CLIP, azimuth=0.0, image=(80, 60), rng=seed) for seed in (1, 1, 2))
+    assert one.shape == (len(CLIP), 60, 80) and one.dtype == np.uint8
+    assert np.array_equal(one, again)
+    assert np.corrcoef(one[0].ravel(), other[0].ravel())[0, 1] < 0.3
+    assert 30 < one.std() < 80
+
+
+def test_only_the_person_moves():
+    still = CLIP.replace(joints=np.repeat(CLIP.joints[:1], len(CLIP), axis=0))
+    frames = film(still, azimuth=0.0, noise=0.0)
+    assert (frames == frames[0]).all()
+    where, _ = boxes(motion(torch.from_numpy(film(CLIP, azimuth=0.0, noise=0.0))), 15.0)
+    assert where[0, 1] < 60  # the waving arm is above the middle
+
+
+def test_camera_roll_turns_the_picture():
+    standing = CLIP.replace(joints=np.repeat(CLIP.joints[:1], len(CLIP), axis=0))
+    pictures = [film(standing, azimuth=0.0, roll=roll, noise=0.0, image=(100, 100), rng=3)[0].astype(int) for roll in (0.0, 90.0)]
+    empty = film(standing.replace(joints=standing.joints * 1e-3), azimuth=0.0, noise=0.0, image=(100, 100), rng=3)[0].astype(int)
+    spans = [np.ptp(np.nonzero(np.abs(picture - empty) > 30), axis=1) for picture in pictures]
+    assert spans[0][0] > 1.5 * spans[0][1] and spans[1][1] > 1.5 * spans[1][0]
+
+
+BAD = {
+    "needs 3D joints": (Clip(np.zeros((5, 17, 2)), fps=10.0), {}),
+    "joints are missing": (Clip(np.full((5, 17, 3), np.nan), fps=10.0, skeleton=COCO17), {}),
+    "in front of the camera": (CLIP, {"distance": 0.3}),
+    "noise must be": (CLIP, {"noise": -1.0}),
+}
+
+
+@pytest.mark.parametrize("words", BAD)
+def test_what_cannot_be_filmed(words):
+    clip, options = BAD[words]
+    with pytest.raises(ValueError, match=words):
+        film(clip, azimuth=0.0, **options)

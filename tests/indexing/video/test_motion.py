@@ -1,0 +1,166 @@
+"""Whether the camera moves: scenes with a camera whose motion is known, and people-like blobs that must not count."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from indexing.video import Chunk, camera_motion, stabilize
+from indexing.video.background import robust_motion, shrinking, similarity, transform
+
+
+def shift(x, y):
+    return np.array([[1.0, 0, x], [0, 1, y], [0, 0, 1]])
+
+
+def turn(angle, focal=300.0, centre=(160, 120)):
+    """The homography of a camera that turns about the vertical axis."""
+    inner = np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1.0]])
+    c, s = np.cos(angle), np.sin(angle)
+    return inner @ np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]) @ np.linalg.inv(inner)
+
+
+def pan(i):
+    return shift(-40 * np.clip((i - 30) / 30, 0, 1), 0)
+
+
+def handheld(i):
+    t = i / 30
+    x, y = 6 * np.sin(5 * t) + 3 * np.sin(11 * t + 1), 5 * np.sin(4 * t + 2) + 2 * np.sin(9 * t)
+    a = 0.01 * np.sin(6 * t + 0.3)
+    first = 3 * np.sin(1), 5 * np.sin(2)
+    return (
+        shift(160 + x - first[0], 120 + y - first[1])
+        @ np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])
+        @ shift(-160, -120)
+    )
+
+
+def knock(i):
+    return shift(0, 12 if 31 <= i < 37 else 0)
+
+
+def test_a_camera_on_a_tripod_stands_still(scene):
+    chunks, _ = scene(90, noise=5.0)
+    camera = camera_motion(chunks)
+    assert not camera.moves and camera.kind == "still" and camera.share == 0 and camera.moments == ()
+    assert str(camera) == "camera stands still"
+    np.testing.assert_allclose(camera.path, np.broadcast_to(np.eye(3), (90, 3, 3)))
+
+
+@pytest.mark.parametrize(
+    ("path", "kind", "start", "stop", "pixels"),
+    [(pan, "pan", 1.0, 2.0, 40), (knock, "knock", 1.0, 1.25, 12)],
+)
+def test_when_and_by_how_much_it_moves(scene, path, kind, start, stop, pixels):
+    chunks, _ = scene(90, camera=path)
+    camera = camera_motion(chunks)
+    assert camera.moves and camera.kind == kind and len(camera.moments) == 1
+    assert camera.moments[0].start == pytest.approx(start, abs=0.1)
+    assert camera.moments[0].stop == pytest.approx(stop, abs=0.15)
+    assert camera.moments[0].pixels == pytest.approx(pixels, abs=1.5)
+    assert (
+        str(camera)
+        == f"camera moves between {camera.moments[0].start:.1f} and {camera.moments[0].stop:.1f} s by {pixels} px ({kind})"
+    )
+
+
+@pytest.mark.parametrize("path", [pan, handheld, lambda i: turn(0.004 * i)])
+def test_the_path_is_the_cameras(scene, path):
+    chunks, _ = scene(75, camera=path)
+    camera = camera_motion(chunks)
+    corners = np.array([[0.0, 0], [319, 0], [0, 239], [319, 239]])
+    truth = np.array([path(i) for i in range(75)])
+    back = transform(camera.path, transform(truth @ np.linalg.inv(truth[0]), corners))
+    off = np.linalg.norm(back - corners, axis=-1).max(1)
+    assert np.median(off) < 0.5 and off.max() < 2.5
+    assert camera.moves
+
+
+def test_a_hand_and_a_slow_slide_are_told_apart(scene):
+    assert camera_motion(scene(90, camera=handheld)[0]).kind == "handheld"
+    slow = camera_motion(scene(90, camera=lambda i: shift(0.035 * i, 0))[0])
+    assert slow.kind == "drift" and slow.moments[0].pixels == pytest.approx(3.1, abs=0.5)
+
+
+def test_stabilized_frames_stand_still(scene):
+    still, _ = scene(60, noise=0.0, blobs=0)
+    moving, _ = scene(60, camera=handheld, noise=0.0, blobs=0)
+    camera = camera_motion(moving)
+    inside = np.s_[:, 25:-25, 25:-25]
+    first = moving[0].frames[:1].astype(int)
+    before = max(np.abs(c.frames.astype(int) - first)[inside].mean() for c in moving)
+    after = max(np.abs(c.frames.astype(int) - first)[inside].mean() for c in stabilize(moving, camera))
+    assert after < 0.2 * before
+    assert [c.times.tolist() for c in stabilize(moving, camera)] == [c.times.tolist() for c in moving]
+    still_camera = camera_motion(still)
+    assert all((a.frames == b.frames).all() for a, b in zip(still, stabilize(still, still_camera), strict=True))
+
+
+def test_tracks_lose_the_cameras_motion(scene):
+    chunks, _ = scene(60, camera=pan)
+    camera = camera_motion(chunks)
+    wall = np.array([[200.0, 50], [250, 200]])
+    seen = transform(np.array([pan(i) for i in range(60)]), wall)
+    np.testing.assert_allclose(camera.still(seen), np.broadcast_to(wall, (60, 2, 2)), atol=0.7)
+    np.testing.assert_allclose(camera.still(seen[::2], camera.times[::2] + 0.001), camera.still(seen)[::2])
+
+
+def test_a_cut_is_named(scene):
+    (first, _), (second, _) = scene(30, chunk=30), scene(30, seed=7, chunk=30)
+    camera = camera_motion([*first, Chunk(second[0].frames, second[0].times + 1.0)])
+    assert camera.cuts == (1.0,) and "changes altogether at 1.0 s" in camera.notes[0]
+
+
+def test_without_texture_nothing_is_claimed():
+    flat = [Chunk(np.full((10, 120, 160), 128, np.uint8), np.arange(10) / 10)]
+    camera = camera_motion(flat)
+    assert not camera.moves and "too little background" in camera.notes[0] and np.isfinite(camera.path).all()
+
+
+def test_pixels_are_those_of_the_video(scene, write):
+    chunks, _ = scene(60, camera=pan, noise=0.0)
+    frames = np.concatenate([c.frames for c in chunks]).repeat(3, 1).repeat(3, 2)
+    camera = camera_motion(write("big.mp4", frames))
+    assert camera.size == (960, 720)
+    assert camera.moments[0].pixels == pytest.approx(3 * 40 * 29 / 30, abs=5)
+
+
+def test_bad_input(scene):
+    with pytest.raises(ValueError, match="no frames"):
+        camera_motion([])
+    colour = [Chunk(np.zeros((2, 20, 20, 3), np.uint8), np.arange(2.0))]
+    with pytest.raises(ValueError, match="gray=True"):
+        camera_motion(colour)
+
+
+def test_the_motion_of_most_points():
+    rng = np.random.default_rng(0)
+    source = rng.uniform(0, 300, (100, 2))
+    truth = np.array([[0.99, -0.05, 8], [0.05, 0.99, -3], [0, 0, 1]])
+    target = transform(truth, source) + 0.1 * rng.normal(size=(100, 2))
+    target[:35] = rng.uniform(0, 300, (35, 2))
+    motion, agree = robust_motion(source, target, np.eye(3), 300)
+    assert agree[35:].all() and agree[:35].sum() <= 1
+    np.testing.assert_allclose(transform(motion, source), transform(truth, source), atol=0.2)
+
+
+def test_similarity_against_least_squares():
+    rng = np.random.default_rng(1)
+    source, target = rng.normal(size=(2, 20, 2))
+    rows = np.concatenate(
+        [
+            np.stack([source[:, 0], -source[:, 1], np.ones(20), np.zeros(20)], 1),
+            np.stack([source[:, 1], source[:, 0], np.zeros(20), np.ones(20)], 1),
+        ]
+    )
+    a, b, c, d = np.linalg.lstsq(rows, np.concatenate([target[:, 0], target[:, 1]]), rcond=None)[0]
+    np.testing.assert_allclose(similarity(source, target), [[a, -b, c], [b, a, d], [0, 0, 1]], atol=1e-9)
+
+
+def test_resizing_keeps_pixel_centres():
+    cv2 = pytest.importorskip("cv2")
+    ramp = np.arange(40, dtype=np.float32)[None].repeat(40, 0)  # value = x
+    small = cv2.resize(ramp, (20, 10), interpolation=cv2.INTER_AREA)
+    x = transform(np.linalg.inv(shrinking((0.5, 0.25))), np.array([[3.0, 5.0]]))[0]
+    assert x[0] == pytest.approx(float(small[5, 3])) and x[1] == pytest.approx(21.5)
