@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from indexing.clip import Clip
-from indexing.sync_people import Pairing, common_joints, disagreements, jumps, match_people
-from indexing.sync_takes import Take, take_of
+from indexing.syncing.people import Pairing, common_joints, disagreements, jumps, match_people
+from indexing.syncing.takes import Take, take_of
+from indexing.syncing.words import in_names
 
 if TYPE_CHECKING:
     from dyntorch import Shift
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 Method = Literal["auto", "keypoints", "tracks", "brightness"]
 METHODS = ("auto", "keypoints", "tracks", "brightness")
 LISTED = 3  # moments in a note
+SHORTEST = 12  # frames of keypoints that dyntorch.synchronize takes
 
 
 def synchronize(
@@ -93,35 +95,47 @@ def synchronize(
                 min_confidence=min_confidence, **how)
         for value, name, rate in zip((a, b), "ab", rates, strict=True)
     ]  # fmt: skip
+    takes = [dataclasses.replace(take, name=take.name or letter) for take, letter in zip(takes, "ab", strict=True)]
     shift = pair(takes[0], takes[1], method, max_shift=max_shift, calibration=calibration, **options).shift
     return dataclasses.replace(shift, notes=(*remarks(takes), *shift.notes))
 
 
 def pair(a: Take, b: Take, method: Method = "auto", *, calibration: Any = None, **options: Any) -> Pairing:
     """:func:`synchronize` for recordings that were read, and which person of each it is about."""
-    from indexing.sync_calibration import lenses
+    from indexing.syncing.calibration import lenses
 
-    _check_method(a, b, method)
+    _check(a, b, method)
     lens = lenses(calibration, [a.name, b.name])
-    notes = list(lens.notes) if lens else []
     options = {**options, "calibration": lens.values if lens else None}
+    try:
+        found, notes = _compared(a, b, method, options)
+    except ValueError as problem:
+        raise ValueError(in_names(str(problem), a.name, b.name)) from problem
+    said = [in_names(note, a.name, b.name) for note in [*(lens.notes if lens else ()), *notes, *found.shift.notes]]
+    reason = in_names(found.shift.reason, a.name, b.name)
+    return dataclasses.replace(found, shift=dataclasses.replace(found.shift, reason=reason, notes=tuple(dict.fromkeys(said))))
+
+
+def _compared(a: Take, b: Take, method: Method, options: dict[str, Any]) -> tuple[Pairing, list[str]]:
+    """What the data say, and what is to be said about the people in them."""
     if a.kind == b.kind == "keypoints":
         found = match_people(a, b, partial(_keypoints, **options), partial(_keypoints, quick=True, **options))
-        notes += _swapped(a, b, found)
-    else:
-        from indexing.sync_video import synchronize_videos
+        return found, _swapped(a, b, found)
+    from indexing.syncing.video import synchronize_videos
 
-        found = Pairing(synchronize_videos(a, b, method, **options), (0, 0))
-    shift = dataclasses.replace(found.shift, notes=tuple(dict.fromkeys([*notes, *found.shift.notes])))
-    return dataclasses.replace(found, shift=shift)
+    return Pairing(synchronize_videos(a, b, method, **options), (0, 0)), []
 
 
-def _check_method(a: Take, b: Take, method: Method) -> None:
+def _check(a: Take, b: Take, method: Method) -> None:
     for take in (a, b):
+        if take.kind == "keypoints" and take.count < SHORTEST:
+            remedy = "give the folder that holds all frames" if take.count == 1 else "film longer"
+            frames = f"{take.count} frame{'' if take.count == 1 else 's'}"
+            raise ValueError(f"{take.path or take.name or 'recording'}: {frames}, {SHORTEST} are needed at least; {remedy}")
         if method == "keypoints" and take.kind != "keypoints":
             raise ValueError(
                 f"{take.path or take.name}: is a video, and method='keypoints' needs keypoints; run a pose estimator first, or use "
-                "method='tracks' or 'brightness'"
+                "method='tracks' or method='brightness'"
             )
         if method == "brightness" and take.kind == "keypoints":
             raise ValueError(

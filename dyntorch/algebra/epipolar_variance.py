@@ -1,4 +1,4 @@
-"""Epipolar residual variance from moment matrices: a fundamental matrix and its mean squared Sampson distance without the matches."""
+"""Epipolar residual variance from moment matrices: F and the mean squared Sampson distance, without the matches."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from dyntorch.constants import constant
 RIDGE = 1e-13
 """Relative to the trace, keeps exact moments positive definite; far below any measured noise."""
 ITERATIONS = 4
-"""Of inverse iteration.  The start is exact where one eigenvalue stands out; elsewhere the variance comes out larger by a few per cent,
-where nobody looks."""
+"""Of inverse iteration.  The start is exact where one eigenvalue stands out; elsewhere the variance comes out larger by a few
+per cent, where nobody looks."""
 
 
 def gradient_moments(moments: Tensor, noise: tuple[float, float] = (1.0, 1.0)) -> Tensor:
@@ -42,17 +42,18 @@ def epipolar_variance(moments: Tensor, noise: tuple[float, float] = (1.0, 1.0)) 
 
     .. math:: \lambda = \min_f \frac{f^T M f}{f^T N f}
 
-    With isotropic noise the residual's variance is :math:`f^T N f`, so that the ratio is about the variance of the noise in units of
-    ``noise``, whatever the scale and the place of the points; the plain smallest eigenvalue of M, which fixes :math:`|f| = 1` instead,
-    prefers where F costs little.  N has no entry for :math:`f_9`; it is eliminated, which centres the products.
+    With isotropic noise the residual's variance is :math:`f^T N f`, so that the ratio is about the variance of the noise in
+    units of
+    ``noise``, whatever the scale and the place of the points; the plain smallest eigenvalue of M, which fixes :math:`|f| = 1`
+    instead, prefers where F costs little.  N has no entry for :math:`f_9`; it is eliminated, which centres the products.
 
     Args:
         moments: ``(*batch, 9, 9)``, sums or means; coordinates should be normalized.
         noise: as in :func:`gradient_moments`.
 
     Returns:
-        ``(*batch,)`` variances, infinite where there are no moments, and ``(*batch, 3, 3)`` fundamental matrices of norm 1 (rank 2 is
-        not imposed), 0 there.
+        ``(*batch,)`` variances, infinite where there are no moments, and ``(*batch, 3, 3)`` fundamental matrices of norm 1
+        (rank 2 is not imposed), 0 there.
 
     Source: Taubin 1991, Estimation of planar curves, surfaces and nonplanar space curves.
 

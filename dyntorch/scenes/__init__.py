@@ -1,8 +1,10 @@
 """Ground-truth scenes for tests, benchmarks and experiments: one function per kind of motion, all batched."""
 
 from dyntorch.scenes.convergent import convergent_motions
+from dyntorch.scenes.filmed import FilmedScene, filmed
 from dyntorch.scenes.lifts import LiftedScene, lifted
 from dyntorch.scenes.lines import translating_lines
+from dyntorch.scenes.nonrigid import NonrigidScene, nonrigid_pair
 from dyntorch.scenes.plane import lines_concurrent, planar
 from dyntorch.scenes.rigid_bodies import bodies
 from dyntorch.scenes.scene import Scene
@@ -11,16 +13,20 @@ from dyntorch.scenes.static import collineation, two_view
 from dyntorch.scenes.translation import TranslatingScene, translating_planes
 
 __all__ = [
+    "FilmedScene",
     "LiftedScene",
+    "NonrigidScene",
     "Scene",
     "TranslatingScene",
     "bodies",
     "collineation",
     "constant_velocity",
     "convergent_motions",
+    "filmed",
     "lifted",
     "lines_concurrent",
     "moving_points",
+    "nonrigid_pair",
     "planar",
     "translating_lines",
     "translating_planes",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass, field
 
 import torch
@@ -67,6 +68,10 @@ class Shift:
     def inverse(self, times: Tensor | float) -> Tensor:
         """Times of a's clock, of the moments at ``times`` of b's clock."""
         return (torch.as_tensor(times, dtype=torch.float64) - self.offset) / self.rate
+
+    def since(self, origin: float) -> Shift:
+        """The same clocks, counted from another moment: both said ``origin`` at what was 0."""
+        return dataclasses.replace(self, offset=self.offset + (1 - self.rate) * origin, center=self.center + origin)
 
     def check(self) -> Shift:
         """Raise where the data do not decide.

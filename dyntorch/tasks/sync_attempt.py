@@ -1,4 +1,4 @@
-"""One attempt to synchronize corresponding points, and what speaks for and against its result."""
+"""An attempt to synchronize corresponding points: what was found in one way, and what speaks for and against it."""
 
 from __future__ import annotations
 
@@ -18,12 +18,11 @@ PEAKS = 6
 """Local maxima of the curve from which a descent may start."""
 FEW_ROWS = 3_000
 """Residuals that are enough to compare peaks."""
-CLEAR = 0.6
-"""Nats above the next peak from which on that one needs no descent of its own."""
 MARGIN = 0.2
-"""Nats above the next peak for a decision.  Motion capture, 120 frames: exactly periodic gaits stay below .17 in 95 of 100, true peaks
-above .31 with 30 mm of noise."""
+"""Nats above the next peak for a decision.  Motion capture, 120 frames: exactly periodic gaits stay below .17 in 95 of 100, true
+peaks are above .31 with 30 mm of noise."""
 AFFINE_MARGIN = 0.5
+"""The same for affine cameras: what they leave unexplained differs from period to period of a gait."""
 APART = 2.5
 """Frames within which peaks are one, and halves of a take agree."""
 HALF = 0.5
@@ -32,11 +31,9 @@ RIVALS = 3
 """Other peaks that are compared between frames."""
 FRACTIONS = 5
 """Places within a step of a peak."""
-SHARP = 0.25
-"""Frames: a larger sigma decides nothing: it is a lower bound where the motion is hardly above the noise."""
-DRIFTING = 10.0
-"""Seconds of overlap from which a clock rate is looked for: 1 % amounts to less than two frames of 30 at the ends of shorter takes,
-and what is wrong with a motion fits into a rate."""
+SHARP = 0.25, 1 / 30
+"""Frames, of a thirtieth of a second at least: a larger sigma decides nothing: where the motion is hardly above the noise, it is a
+lower bound."""
 WANDER = 1.35
 """Residual over what each half of the take has by itself, beyond which a camera may have moved."""
 
@@ -137,13 +134,16 @@ class Attempt:
     @cached_property
     def decided(self) -> bool:
         """Whether the shift is beyond doubt."""
-        if self.fit is None or self.edge or self.fit.sigma > SHARP * self.frame:
-            return False
-        return self.margin >= self.needed and self.agree
+        return self.fit is not None and self.sharp and not self.edge and self.margin >= self.needed and self.agree
+
+    @property
+    def sharp(self) -> bool:
+        """Whether the shift is known well enough to trust its sigma."""
+        return self.fit is not None and self.fit.sigma <= SHARP[0] * max(self.frame, SHARP[1])
 
     @property
     def needed(self) -> float:
-        """Nats above the next peak: what affine cameras leave unexplained differs from period to period of a gait."""
+        """Nats above the next peak, for a decision."""
         return MARGIN if self.method == "epipolar" else AFFINE_MARGIN
 
     @property
@@ -158,7 +158,7 @@ class Attempt:
             return 0.0
         own = math.erf(self.frame / max(math.sqrt(2) * self.fit.sigma, 1e-12))
         rival = 1 / (1 + math.exp(-(self.margin - 0.6 * self.needed) / 0.05)) if self.margin > -10 else 0.0
-        return own * rival * (0.995 if self.agree else 0.3)
+        return own * rival * (0.995 if self.agree else 0.3) * (1.0 if self.sharp and not self.edge else 0.5)
 
     def _shift(self, lag: float) -> float:
         """Of b's clock against a's at the center, of a lag of the curve."""
@@ -183,90 +183,3 @@ class Attempt:
         assert self.fit is not None
         best = curve.peaks(1)
         return (self._shift(best[0][0]) - self.fit.shift) / max(self.frame, self.step) if best else math.nan
-
-
-def attempt(
-    a: Tracks,
-    b: Tracks,
-    *,
-    points: Tensor | None = None,
-    step: float | None = None,
-    rates: tuple[float, ...] = (1.0,),
-    free_rate: bool = True,
-    max_shift: float | None = None,
-    method: str = "epipolar",
-) -> Attempt:
-    """Search all shifts at the given rates of b's clock, descend from the best, and settle the rate.
-
-    Args:
-        points: ``(n,)`` bool, who takes part; all by default.
-        step: seconds per lag of the search; the slower camera's frame by default.
-        rates: of b's clock, to search at.
-        free_rate: whether the descent may change the rate.
-        max_shift: seconds.
-    """
-    everyone = torch.ones(a.x.shape[1], dtype=torch.bool, device=a.x.device)
-    points = everyone if points is None else points
-    a, b = (a, b) if bool(points.all()) else (a.only(points), b.only(points))
-    frame = max(a.step, b.step)
-    step = max(frame, step or 0.0)
-    searched = []
-    for rate in rates:
-        samples = Samples.of(a, b, step, rate)
-        searched.append((samples, epipolar_curve(samples, max_shift)))
-    fit = _best(a, b, [curve for _, curve in searched], step, frame, free_rate)
-    samples, curve = min(searched, key=lambda found: abs(found[0].rate - (fit.rate if fit else 1.0)))
-    if fit is not None and abs(fit.rate - samples.rate) * (float(a.times[-1]) - float(a.times[0])) > 0.25 * step:
-        samples = Samples.of(a, b, step, fit.rate)
-        curve = epipolar_curve(samples, max_shift)
-    return Attempt(a, b, fit, curve, samples, step, max_shift, points, method)
-
-
-def _best(a: Tracks, b: Tracks, curves: list[Curve], step: float, frame: float, free_rate: bool) -> Fit | None:
-    """The likeliest minimum near the peaks of the curves."""
-    starts = sorted(((score, lag, curve.rate) for curve in curves for lag, score in curve.peaks(PEAKS)), reverse=True)
-    if not starts:
-        return None
-    apart = max(APART * frame, 1.5 * step)
-    rivals = [
-        start for start in starts if abs(start[1] * start[2] - starts[0][1] * starts[0][2]) > apart or start[2] != starts[0][2]
-    ]
-    several = len(curves) > 1 or not rivals or starts[0][0] - rivals[0][0] < CLEAR
-    widths = [step]
-    while widths[-1] > frame:
-        widths.append(max(frame, widths[-1] / 3))
-    coarse = Descent(a, b, widths[0])
-    fits = []
-    for _, lag, rate in starts[: PEAKS if several else 1]:
-        fit = coarse.run(lag * rate, rate, free_rate=free_rate and len(widths) > 1)
-        if fit is not None:
-            fits.append(fit)
-    if not fits:
-        return None
-    best = min(fits, key=lambda fit: math.log(max(fit.residual, 1e-300)) - 0.5 * math.log(fit.effective))
-    for width in widths[1:]:
-        best = Descent(a, b, width).run(best.offset, best.rate, free_rate=free_rate) or best
-    if free_rate and float(best.times[-1] - best.times[0]) > DRIFTING:
-        last = coarse if len(widths) == 1 else Descent(a, b, frame)
-        best = _settled(last, best)
-    return best
-
-
-SIGNIFICANT = 3.0
-"""Sigmas from 1 for a clock rate to be believed."""
-
-
-FASTEST = 0.022
-"""Clock rates off by more are none."""
-NEGLIGIBLE = 0.1
-"""Frames over the take that a rate must amount to."""
-
-
-def _settled(descent: Descent, fit: Fit) -> Fit:
-    """With its own rate where that differs from 1 beyond doubt, else with rate 1."""
-    free = descent.run(fit.offset, fit.rate, free_rate=True)
-    span = float(fit.times[-1] - fit.times[0])
-    if free is not None and FASTEST > abs(free.rate - 1) > max(SIGNIFICANT * free.rate_sigma, NEGLIGIBLE * descent.frame / span):
-        return free
-    fixed = descent.run(fit.shift, 1.0) if fit.rate != 1 else fit
-    return fixed or fit

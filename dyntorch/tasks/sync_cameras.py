@@ -34,7 +34,8 @@ def synchronize_cameras(
     pair: Callable[..., Shift] | None = None,
     **options: Any,
 ) -> Clocks:
-    """The clocks of several cameras that filmed the same motion: :func:`dyntorch.synchronize` on the pairs, then :func:`combine_shifts`.
+    """The clocks of several cameras that filmed the same motion: :func:`dyntorch.synchronize` on the pairs, then
+    :func:`combine_shifts`.
 
     Args:
         tracks: per camera ``(frames, n, 2)`` px, NaN = missing; frames may differ, n too without correspondence.  (Or whatever

@@ -23,7 +23,8 @@ ROUNDS = 8
 
 
 def cleaned(tracks: Tracks) -> Tracks:
-    r"""Without positions far from the median of their neighbours, then, one by one, without those far from a line through the others.
+    r"""Without positions far from the median of their neighbours, then, one by one, without those far from a line through the
+    others.
 
     .. math:: |x_t - m_t| > \tau\, 1.4826\, \mathrm{med}_{|k| \le K} |x_{t+k} - m_t|,\quad m_t = \mathrm{med}_{|k| \le K}\, x_{t+k}
 
@@ -66,7 +67,8 @@ def _peeled(tracks: Tracks) -> Tracks:
 
 
 def _from_line(x: Tensor, kept: Tensor) -> Tensor:
-    """``(frames, n)`` distances from a line in time through the neighbouring frames but not the own one; NaN where there is none."""
+    """``(frames, n)`` distances from a line in time through the neighbouring frames but not the own one; NaN where there is
+    none."""
     reach = int(3 * WIDTH)
     u = torch.arange(-reach, reach + 1, dtype=x.dtype, device=x.device) / WIDTH
     kernel = torch.exp(-0.5 * u.square())

@@ -34,9 +34,9 @@ def consistent_points(a: Tracks, b: Tracks, found: Attempt, generator: Generator
     Source: Fischler and Bolles 1981, Random sample consensus, over points instead of matches.
     """
     n = a.x.shape[1]
-    if n < FEW:
-        return None
     lo, hi = found.samples.lags(found.max_shift)
+    if n < FEW or lo > hi:
+        return None
     step = found.step * max(1, -(-(hi - lo) // LAGS))
     samples = Samples.of(a, b, step, found.samples.rate)
     moments, counts = epipolar_moments(

@@ -16,10 +16,14 @@ from dyntorch.least_squares import damped_step
 from dyntorch.tasks.sync_tracks import Tracks, noise_ratio, smoothed
 
 CALM = 0.75, 1.25, 2.5
-"""Velocities are smoothed more widely than positions: what noise they share with the residuals would pull the estimate and make it look
-surer than it is.  How much more: 1 + .75 times the noise over the movement from frame to frame, within bounds."""
+"""Velocities are smoothed more widely than positions: what noise they share with the residuals would pull the estimate and
+make it look surer than it is.  How much more: 1 + .75 times the noise over the movement from frame to frame, within bounds."""
 CUT = 4.0
 """Robust standard deviations of the residual at which Geman and McClure's weight is a quarter."""
+BLOCK = 30
+"""Frames that share a scale."""
+UNEQUAL = (0.4, 6.0)
+"""Least and largest scale of a point or a block, over that of all."""
 OPTIMISM = 1.6
 """Errors over the sigma that the residuals alone say: 1.5 to 1.8 on motion capture with 5 to 60 mm of noise."""
 ITERATIONS = 30
@@ -29,12 +33,14 @@ LEAP = 2.0
 """Frames: the largest step."""
 FASTEST = 0.03
 """Change of the rate at which a descent has gone astray."""
-ROWS = 60_000
-"""Residuals that a descent takes at most; from longer takes it takes moments at equal distances.  Beyond, only sigma would shrink."""
+ROWS = 200_000
+"""Residuals that a descent takes at most; from longer takes it takes moments at equal distances.  Beyond, only sigma would
+shrink."""
 FEWEST = 16
 """Pairs of positions."""
 MEMORY = 2.0, 6
-"""Residuals are taken to depend on each other over two seconds, but a sixth of the overlap at the most: detectors err for that long."""
+"""Residuals are taken to depend on each other over two seconds, but a sixth of the overlap at the most: detectors err for that
+long."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -276,12 +282,15 @@ class _Rows:
         return 1.4826 * float(self.residual.abs().median())
 
     def weights(self) -> Tensor:
-        """Of Geman and McClure, with each point's own scale, where that is larger than all points' together."""
+        """Of Geman and McClure, by the scale of each point and of each second or so: who is nearer errs by more pixels."""
         pooled = max(self.scale(), 1e-300)
         every = torch.full(self.both.shape, torch.nan, dtype=torch.float64, device=self.residual.device)
-        every[self.both] = self.residual.abs()
-        own = (1.4826 * every.nanmedian(0).values / pooled).nan_to_num(1.0).clamp(min=1.0)
-        own = own.expand(self.both.shape)[self.both]
+        every[self.both] = self.residual.abs() * (1.4826 / pooled)
+        point = every.nanmedian(0).values.nan_to_num(1.0).clamp(*UNEQUAL)
+        pad = -len(every) % BLOCK
+        blocks = torch.nn.functional.pad(every / point, (0, 0, 0, pad), value=torch.nan).unflatten(0, (-1, BLOCK)).flatten(1)
+        moment = blocks.nanmedian(1).values.nan_to_num(1.0).clamp(*UNEQUAL).repeat_interleave(BLOCK)[: len(every)]
+        own = (moment[:, None] * point)[self.both]
         return self.sure * (1 + (self.residual / (CUT * pooled * own)).square()).pow(-2) / own.square()
 
 

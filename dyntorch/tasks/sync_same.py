@@ -8,10 +8,11 @@ import math
 import torch
 from torch import Generator, Tensor
 
-from dyntorch.tasks.sync_attempt import APART, DRIFTING, Attempt, attempt
+from dyntorch.tasks.sync_attempt import APART, Attempt
 from dyntorch.tasks.sync_consensus import consistent_points
 from dyntorch.tasks.sync_lens import fit_distortion
 from dyntorch.tasks.sync_scaled import frame_scaled
+from dyntorch.tasks.sync_search import DRIFTING, Search, attempt
 from dyntorch.tasks.sync_tracks import Tracks, smoothed, without
 
 RATES = 0.02
@@ -54,42 +55,40 @@ def same_points(
         lenses: whether nobody calibrated the cameras, and distortion may be looked for.
     """
     span = min(float(t.times[-1] - t.times[0]) for t in (a, b))
-    settings = {"step": span / LONGEST, "max_shift": max_shift, "free_rate": rate is None, "rates": (rate or 1.0,)}
+    search = Search(step=span / LONGEST, max_shift=max_shift, rates=(rate or 1.0,), free_rate=rate is None)
     if camera == "affine":
-        return Result(_affine(a, b, settings, generator), ())
-    found = _sorted_out(a, b, settings, generator)
+        return Result(_affine(a, b, search, generator), ())
+    found = _sorted_out(a, b, search, generator)
     if not found.decided and rate is None:
-        found = _better(found, _over_rates(a, b, settings, span, generator))
+        found = _better(found, _over_rates(a, b, search, span, generator))
     notes: tuple[str, ...] = ()
     if lenses and found.fit is not None and _rough(found):
-        found, notes = _straightened(found, a, b, settings, generator)
+        found, notes = _straightened(found, a, b, search, generator)
     if camera == "auto" and not found.decided:
-        scaled = _affine(a, b, settings, generator)
+        scaled = _affine(a, b, search, generator)
         # without the place in the picture a gait repeats itself, so that affine cameras alone may be sure of a wrong period
         if scaled.decided and _agree(scaled, found):
             return Result(scaled, ("affine cameras: the points do not hold enough depth, or are too noisy, for perspective ones",))
     return Result(found, notes)
 
 
-def _sorted_out(
-    a: Tracks, b: Tracks, settings: dict[str, object], generator: Generator | None, method: str = "epipolar"
-) -> Attempt:
+def _sorted_out(a: Tracks, b: Tracks, search: Search, generator: Generator | None) -> Attempt:
     """An attempt with all points, and one without those that do not fit, where that may be why it fails."""
-    found = attempt(a, b, method=method, **settings)  # type: ignore[arg-type]
+    found = attempt(a, b, search)
     pruned = _pruned(found)
     if pruned is not None:
         a, b = pruned
-        found = _better(found, attempt(a, b, method=method, **settings))  # type: ignore[arg-type]
+        found = _better(found, attempt(a, b, search))
     if found.decided and not bool(_suspects(found).any()):
         return found
     points = consistent_points(a, b, found, generator)
     if points is None or bool(points.all()):
         return found
-    return _better(found, attempt(a, b, points=points, method=method, **settings))  # type: ignore[arg-type]
+    return _better(found, attempt(a, b, search, points))
 
 
 def _pruned(found: Attempt) -> tuple[Tracks, Tracks] | None:
-    """Tracks without the positions far from the fit, of both cameras: who of the two is wrong is not known; None where all is well."""
+    """Tracks without the positions far from the fit, in both cameras: whose is wrong is not known; None where all is well."""
     fit = found.fit
     if fit is None or len(fit.times) != len(found.a.times):
         return None
@@ -105,7 +104,7 @@ def _pruned(found: Attempt) -> tuple[Tracks, Tracks] | None:
     return without(found.a, far), without(found.b, other)
 
 
-def _over_rates(a: Tracks, b: Tracks, settings: dict[str, object], span: float, generator: Generator | None) -> Attempt | None:
+def _over_rates(a: Tracks, b: Tracks, search: Search, span: float, generator: Generator | None) -> Attempt | None:
     """A search over clock rates too, where a wrong one would have smeared the motion."""
     step = max(span / COARSE, 0.1)
     change = 2 * step / span  # moves the ends of the overlap by a step
@@ -113,23 +112,23 @@ def _over_rates(a: Tracks, b: Tracks, settings: dict[str, object], span: float, 
     if span < DRIFTING:
         return None
     rates = tuple(1 + k * change for k in range(-count, count + 1))
-    coarse = attempt(a, b, **{**settings, "step": step, "rates": rates})  # type: ignore[arg-type]
+    coarse = attempt(a, b, dataclasses.replace(search, step=step, rates=rates))
     if coarse.fit is None:
         return None
-    return _sorted_out(a, b, {**settings, "rates": (coarse.fit.rate,)}, generator)
+    return _sorted_out(a, b, dataclasses.replace(search, rates=(coarse.fit.rate,)), generator)
 
 
-def _affine(a: Tracks, b: Tracks, settings: dict[str, object], generator: Generator | None) -> Attempt:
-    return _sorted_out(frame_scaled(a), frame_scaled(b), settings, generator, method="affine")
+def _affine(a: Tracks, b: Tracks, search: Search, generator: Generator | None) -> Attempt:
+    return _sorted_out(frame_scaled(a), frame_scaled(b), dataclasses.replace(search, method="affine"), generator)
 
 
 def _better(one: Attempt, other: Attempt | None) -> Attempt:
-    """The decided one; of two, the one with the larger margin."""
+    """The decided one; where both are, the other, which had the more careful input; where none is, the one more likely right."""
     if other is None or other.fit is None:
         return one
-    if one.fit is None or one.decided != other.decided:
-        return other if one.fit is None or other.decided else one
-    return other if other.confidence > one.confidence else one
+    if one.fit is None or other.decided:
+        return other
+    return one if one.decided or one.confidence >= other.confidence else other
 
 
 def _agree(one: Attempt, other: Attempt) -> bool:
@@ -152,7 +151,7 @@ def _rough(found: Attempt) -> bool:
 
 
 def _straightened(
-    found: Attempt, a: Tracks, b: Tracks, settings: dict[str, object], generator: Generator | None
+    found: Attempt, a: Tracks, b: Tracks, search: Search, generator: Generator | None
 ) -> tuple[Attempt, tuple[str, ...]]:
     """Once more with lenses fitted at the shift found, where they are significant."""
     assert found.fit is not None
@@ -167,6 +166,6 @@ def _straightened(
         x = one.undistort(tracks.x)
         seen = x.isfinite().all(-1)
         straight.append(dataclasses.replace(tracks, x=torch.where(seen[..., None], x, 0.0), weights=tracks.weights * seen))
-    again = attempt(straight[0], straight[1], points=found.points, **settings)  # type: ignore[arg-type]
-    chosen = _better(found, again)
-    return (again, (lens.note,)) if chosen is again else (found, ())
+    again = attempt(straight[0], straight[1], search, found.points)
+    better = again.fit is not None and again.fit.residual < fit.residual and _better(found, again) is again
+    return (again, (lens.note,)) if better else (found, ())

@@ -16,7 +16,8 @@ SLOW = 0.5
 def frame_scaled(tracks: Tracks) -> Tracks:
     r"""Tracks with the strongest effects of perspective taken out.
 
-    .. math:: y_{ij} = \frac{x_{ij} - c_i}{\bar r_i}, \qquad c_i = \operatorname{med}_j x_{ij}, \quad r_i = \operatorname{med}_j |x_{ij} - c_i|,
+    .. math:: y_{ij} = \frac{x_{ij} - c_i}{\bar r_i}, \qquad c_i = \operatorname{med}_j x_{ij}, \quad r_i =
+    \operatorname{med}_j |x_{ij} - c_i|,
 
     with the size smoothed over half a second, and its mean over the take restored.  Medians, which single wrong points do not move.
 

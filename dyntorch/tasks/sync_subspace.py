@@ -32,7 +32,7 @@ class SubspaceCurve:
     Attributes:
         lags: ``(L,)`` frames.
         scores: ``(L,)`` nats, higher is better, NaN where the overlap is too short: logarithm of the posterior but for a constant.
-        counts: ``(L,)`` frames that overlap, but for two at either end of each take.
+        counts: ``(L,)`` frames that overlap, but for the ends of each take.
         shape: ``(L,)`` nats per frame that the shapes tell about each other, beyond chance.
         height: ``(L,)`` the same of vertical coordinates alone.
         motion: ``(L,)`` nats per frame that the motions of the whole tell.
@@ -140,6 +140,13 @@ def _chance(a: Body, b: Body, counts: Tensor, judged: Tensor, lags: tuple[int, i
         inverse.append([1.0, share])
     line = torch.linalg.lstsq(torch.tensor(inverse, dtype=torch.float64, device=counts.device), torch.stack(told)).solution
     return line[0] + line[1] / counts.clamp(min=1.0)[:, None]
+
+
+def information(shape: Tensor, n: int, motion: Tensor) -> Tensor:
+    """Evidence per second ``(L,)`` of joint covariances: of shapes, whose first n rows are a's, and of motions; chance is in it."""
+    parts = shape[:, :n, :n], shape[:, n:, n:], shape[:, :n, n:]
+    told = SHAPE * _shared(*parts) + HEIGHT * _shared(*_vertical(*parts))
+    return told + MOTION * _correlated(motion[:, :2, :2], motion[:, 2:, 2:], motion[:, :2, 2:])
 
 
 def _vertical(aa: Tensor, bb: Tensor, ab: Tensor) -> tuple[Tensor, Tensor, Tensor]:

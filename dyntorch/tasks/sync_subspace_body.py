@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -11,9 +11,11 @@ from torch import Tensor
 STEP = 1 / 30
 """Seconds from frame to frame, unless told."""
 SMOOTH = 1 / 30
-"""Seconds, standard deviation of the Gaussian that positions are smoothed by (15 mm of noise: twice that finds one to two percent less)."""
+"""Seconds, standard deviation of the Gaussian that positions are smoothed by (15 mm of noise: twice that finds one to two
+percent less)."""
 SLOW = 1 / 3
-"""Seconds, of the Gaussian for the size of the body in the image: the distance changes slowly (half to six times as much are alike to a percent)."""
+"""Seconds, of the Gaussian for the size of the body in the image: the distance changes slowly (half to six times as much are
+alike to a percent)."""
 WIDE = (1.0, 2.5, 6.0, 15.0, 40.0)
 """Frames, of ever wider Gaussians that look for what is missing."""
 NOISE = 2.0
@@ -23,8 +25,8 @@ NARROW = 0.7
 """Frames, the least smoothing: below, a sampled Gaussian is none."""
 ROUNDS = 12
 """Fills of what is missing from the other points."""
-EDGE = 2
-"""Frames left away at either end: there smoothing is one-sided, in both cameras at once, which would speak for lag 0."""
+EDGE = 2.0
+"""Widths of smoothing left away at either end, where it is one-sided, in both cameras at once: that would speak for lag 0."""
 STRAY = 3.0
 """Median distances from the middle beyond which a track takes no part in the middle and the size."""
 TINY = 1e-9
@@ -36,19 +38,33 @@ class Body:
     """One camera's points over time.
 
     Attributes:
-        rows: ``(T - 4, 2n)`` coordinates about the body's middle over its size, smoothed, complete, in units of noise.
-        motion: ``(T - 4, 2)`` px per frame, the median velocity of the points.
-        weights: ``(T - 4,)`` 1 where a frame is seen, else 0.
+        rows: ``(T', 2n)`` without the ends, coordinates about the body's middle over its size, smoothed, in units of noise.
+        motion: ``(T', 2)`` px per frame, the median velocity of the points.
+        weights: ``(T',)`` 1 where a frame is seen, else 0.
+        points: ``(T, n, 2)`` px, what is missing filled in.
+        seen: ``(T, n)`` bool.
+        step: seconds from frame to frame.
     """
 
     rows: Tensor
     motion: Tensor
     weights: Tensor
+    points: Tensor
+    seen: Tensor
+    step: float
 
     @property
     def reversed(self) -> Body:
         """The same played backwards: as smooth, and in step with nothing."""
-        return Body(self.rows.flip(0), self.motion.flip(0), self.weights.flip(0))
+        return replace(self, rows=self.rows.flip(0), motion=self.motion.flip(0), weights=self.weights.flip(0))
+
+    @property
+    def blurred(self) -> Body:
+        """Rows with as much more noise as a time that is known to a frame only makes."""
+        if len(self.rows) < 2:
+            return self
+        velocity = torch.gradient(self.rows, dim=0)[0].square().mean()
+        return replace(self, rows=self.rows / (1 + velocity / 12).sqrt())
 
     @property
     def signal(self) -> float:
@@ -61,22 +77,47 @@ class Body:
 
 
 def body_of(x: Tensor, weights: Tensor, step: float = STEP) -> Body:
-    """Rows, motion and weights of tracks ``(T, n, 2)`` with weights ``(T, n)``, 0 = missing; 2 frames less at each end."""
-    width = max(SMOOTH / step, NARROW)
+    """Rows, motion and weights of tracks ``(T, n, 2)`` with weights ``(T, n)``, 0 = missing; some frames less at each end."""
     seen = (weights > 0) & x.isfinite().all(-1)
     x = torch.where(seen[..., None], x, 0.0).double()
     whole = seen.sum(-1) >= min(2, seen.shape[1])
-    if not bool(whole.any()) or len(x) <= 2 * EDGE:
-        rest = max(len(x) - 2 * EDGE, 1)
-        return Body(x.new_zeros(rest, 2 * x.shape[1]), x.new_zeros(rest, 2), x.new_zeros(rest))
-    held = completed(filled(x, seen), seen)
+    edge = _edge(step)
+    if not bool(whole.any()) or len(x) <= 2 * edge:
+        rest = max(len(x) - 2 * edge, 1)
+        return Body(x.new_zeros(rest, 2 * x.shape[1]), x.new_zeros(rest, 2), x.new_zeros(rest), x, seen, step)
+    return _body(completed(filled(x, seen), seen), seen, whole, step)
+
+
+def halves(body: Body) -> tuple[Body, Body]:
+    """Bodies of either half of the points: their noise is independent."""
+    n = body.points.shape[1]
+    order = torch.randperm(n, generator=torch.Generator().manual_seed(0)).to(body.points.device)
+    whole = body.seen.sum(-1) >= min(2, n)
+    first, second = (
+        _body(body.points[:, part], body.seen[:, part], whole, body.step) for part in (order[: (n + 1) // 2], order[n // 2 :])
+    )
+    return first, second
+
+
+def _body(held: Tensor, seen: Tensor, whole: Tensor, step: float) -> Body:
+    """The body of complete points."""
+    width, edge = _width(step), _edge(step)
     size, middle = _frame(held, SLOW / step)
     shape = (held - middle) / size[:, None, None]
     variance = max(_noise(shape, seen), TINY**2) * NOISE / (2 * math.sqrt(math.pi) * width)
     rows = smooth(shape, width).flatten(1)
-    inside = slice(EDGE, -EDGE)
+    inside = slice(edge, -edge)
     rows = rows[inside]
-    return Body((rows - rows.mean(0)) / math.sqrt(variance), _motion(held, width)[inside], whole.double()[inside])
+    rows = (rows - rows.mean(0)) / math.sqrt(variance)
+    return Body(rows, _motion(held, width)[inside], whole.double()[inside], held, seen, step)
+
+
+def _width(step: float) -> float:
+    return max(SMOOTH / step, NARROW)
+
+
+def _edge(step: float) -> int:
+    return math.ceil(EDGE * _width(step) - 1e-9)
 
 
 def smooth(x: Tensor, width: float) -> Tensor:
@@ -121,7 +162,8 @@ def completed(x: Tensor, seen: Tensor) -> Tensor:
 
     .. math:: x_j \leftarrow x_j - K_{jj}^{-1} (K x)_j, \qquad K = (C + \sigma^2 I)^{-1}
 
-    is the regression of point j on the others under the covariance C of all coordinates.
+    is the regression of point j on the others under the covariance C of all coordinates.  What regression leaves of a point at
+    the nearest times that it is seen is added: half as much is wrong.
     """
     if bool(seen.all()):
         return x
@@ -133,7 +175,8 @@ def completed(x: Tensor, seen: Tensor) -> Tensor:
         inverse = torch.linalg.inv(rows.mT @ rows / len(rows) + noise * unit)
         own = inverse.unflatten(0, (n, 2)).unflatten(2, (n, 2)).diagonal(dim1=0, dim2=2).movedim(-1, 0)  # (n, 2, 2)
         change = torch.linalg.solve(own, (rows @ inverse).unflatten(1, (n, 2)).movedim(0, 2)).movedim(2, 0)
-        rows = rows - torch.where(seen[..., None], 0.0, change).flatten(1)
+        nearby = filled(torch.where(seen[..., None], change, 0.0), seen)
+        rows = rows - torch.where(seen[..., None], 0.0, change - nearby).flatten(1)
     return rows.unflatten(1, (n, 2)) + mean
 
 

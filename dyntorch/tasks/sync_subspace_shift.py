@@ -10,6 +10,7 @@ from torch import Tensor
 
 from dyntorch.tasks.sync_subspace import SubspaceCurve
 from dyntorch.tasks.sync_subspace_body import STEP
+from dyntorch.tasks.sync_subspace_doubt import resemblance, wobble
 
 PEAKS = 6
 """Local maxima that are returned."""
@@ -24,8 +25,10 @@ TELLING = 1.5
 """Nats per second below which nothing is shared."""
 SHARP = 0.6
 """Frames: a larger sigma decides nothing."""
-BLUR = 0.2
-"""Frames that the peak is off even where it is sharp, because cameras are not affine."""
+REPEATED = 0.68
+"""Resemblance of the motion to itself from which a peak may be another period."""
+BLUR = 1 / 150
+"""Seconds that the peak is off even where it is sharp, because cameras are not affine."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,9 +88,12 @@ def subspace_shift(curve: SubspaceCurve, *, start: float = 0.0, step: float = ST
     best = top[0]
     probability, margin = _probability(scores, best), _margin(curve, best, APART / step)
     probability = min(probability, 1 / (1 + math.exp(-max(min(margin, 700.0), -700.0))))
-    position, sigma = float(peaks[0, 0]), positions[0][1]
+    position = float(peaks[0, 0])
+    sigma = math.hypot(BLUR / step, max(positions[0][1], wobble(curve, round(position))))
     times = start + step * peaks[1:4, 0]
     reason = _reason(curve, best, probability, margin, times, step)
+    if not reason and resemblance(curve, best, APART / step) > REPEATED:
+        reason = "the motion repeats itself, and another shift fits as well: film something that does not"
     if not reason and sigma > SHARP:
         reason = f"the best shift is only known to {sigma * step:.3f} s: film longer, or a larger motion"
     return SubspaceShift(position, sigma, peaks, probability, margin, not reason, reason)
@@ -113,7 +119,7 @@ def _between(scores: Tensor, i: int) -> tuple[float, float]:
     if not (math.isfinite(bend) and bend < 0):
         return float(i), 1.0
     move = 0.5 * (around[0] - around[2]) / bend
-    return i + max(-0.5, min(0.5, move)), math.hypot(BLUR, math.sqrt(-1 / bend))
+    return i + max(-0.5, min(0.5, move)), math.sqrt(-1 / bend)
 
 
 def _probability(scores: Tensor, best: int) -> float:

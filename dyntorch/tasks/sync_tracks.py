@@ -37,7 +37,8 @@ class Tracks:
 
     @property
     def noise(self) -> float:
-        r"""Standard deviation of a coordinate, from third differences :math:`\mathrm{med}|d_3| / (.6745 \sqrt{20})`: motion is smooth."""
+        r"""Standard deviation of a coordinate, from third differences :math:`\mathrm{med}|d_3| / (.6745 \sqrt{20})`: motion is
+        smooth."""
         seen = self.weights > 0
         whole = seen[3:] & seen[2:-1] & seen[1:-2] & seen[:-3]
         rough = self.x.diff(n=3, dim=0)[whole].abs()
@@ -47,6 +48,14 @@ class Tracks:
     def scale(self) -> float:
         """Root mean square distance of the points from their mean."""
         return float(self.centred.square().sum(-1).mul(self.weights).sum().div(self.weights.sum().clamp(min=1e-300)).sqrt())
+
+    @property
+    def motion(self) -> float:
+        """Root mean square distance of the points from where each is in the mean."""
+        total = self.weights.sum(0).clamp(min=1e-300)
+        mean = (self.x * self.weights[..., None]).sum(0) / total[:, None]
+        away = (self.x - mean).square().sum(-1) * self.weights
+        return float((away.sum() / self.weights.sum().clamp(min=1e-300)).sqrt())
 
     @property
     def centred(self) -> Tensor:
@@ -127,8 +136,8 @@ def smoothed(tracks: Tracks, at: Tensor, width: float) -> tuple[Tensor, Tensor, 
         width: the standard deviation, seconds.
 
     Returns:
-        positions and velocities per second ``(m, n, 2)``, 0 in gaps, and weights ``(m, n)``: the mean of those near, less where frames
-        on one side are missing, 0 in gaps.
+        positions and velocities per second ``(m, n, 2)``, 0 in gaps, and weights ``(m, n)``: the mean of those near, less
+        where frames on one side are missing, 0 in gaps.
     """
     taps = 2 * (math.ceil(REACH * width / tracks.step) + 1) + 1
     rows = max(1, PIECE // max(1, taps * tracks.x.shape[1] * 2))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -11,13 +12,15 @@ from torch import Generator, Tensor
 
 from dyntorch.algebra.lens import undistorted
 from dyntorch.tasks.shift import Shift
-from dyntorch.tasks.sync_attempt import APART, SHARP, WANDER, Attempt
+from dyntorch.tasks.sync_attempt import APART, WANDER, Attempt
 from dyntorch.tasks.sync_cleaning import cleaned
 from dyntorch.tasks.sync_same import same_points
 from dyntorch.tasks.sync_tracks import Tracks, read_tracks
 
 SHORTEST = 12
 """Frames of a take at least."""
+BLIND = 10.0
+"""Frames of sigma from which no shift stands out at all."""
 CAMERAS = ("auto", "perspective", "affine")
 
 
@@ -42,8 +45,8 @@ def synchronize(
     .. math:: \min_{s, F} \frac{\sum_{ij} (x_{b,j}(t_i + s)^T F\, x_{a,j}(t_i))^2}{\sum_{ij} |\nabla|^2},
 
     at all shifts by FFT, then by least squares of the Sampson distance in offset, rate and F together.  With different points, the
-    shift at which the two cameras' coordinates share most information.  The result is refused (``ok`` false, with a reason) where the
-    motion repeats itself, is too small, or where parts of the take disagree.
+    shift at which the two cameras' coordinates share most information.  The result is refused (``ok`` false, with a reason)
+    where the motion repeats itself, is too small, or where parts of the take disagree.
 
     Args:
         a: ``(frames_a, n, 2)`` px, y down; NaN = missing.  Point k of a is point k of b.
@@ -52,7 +55,8 @@ def synchronize(
         fps: frames per second of both, or of each; frame 0 is at 0 s.
         times: instead, ``(frames,)`` seconds of each frame, increasing, for variable frame rates and dropped frames.
         max_shift: how far to search, seconds; None for all shifts with enough overlap.
-        calibration: per camera None or ``(K, dist)`` (OpenCV's order), whose distortion is removed.  Without, distortion is looked for
+        calibration: per camera None or ``(K, dist)`` (OpenCV's order), whose distortion is removed.  Without, distortion is
+        looked for
             where the points do not fit, and removed by one parameter per camera, with a note.
         weights: per camera ``(frames, n)``, such as a detector's confidences; 0 = ignore.
         rate: of b's clock, where known; by default 1 unless the takes say otherwise (up to 2 %).
@@ -76,8 +80,8 @@ def synchronize(
         >>> speeds, phases, sizes, base = 4 * wave().abs(), 6 * wave(), wave(), 3 * wave()
         >>> def film(t, turn):  # twelve points that wobble, from five metres away
         ...     p = base / 3 + 0.2 * sizes * torch.sin(speeds * t + phases)
-        ...     x, z = p[..., 0] * math.cos(turn) + p[..., 2] * math.sin(turn), p[..., 2] * math.cos(turn) - p[..., 0] * math.sin(turn)
-        ...     return 800 * torch.stack([x, p[..., 1]], -1) / (z + 5)[..., None]
+        ...     x, z = p[..., 0] * math.cos(turn) + p[..., 2] * math.sin(turn), p[..., 2] * math.cos(turn) - p[..., 0] *
+        math.sin(turn) ...     return 800 * torch.stack([x, p[..., 1]], -1) / (z + 5)[..., None]
         >>> shift = synchronize(film(t, 0.0), film(t - 0.42, 1.0), fps=30.0)
         >>> round(shift.offset, 3), shift.ok
         (0.42, True)
@@ -94,11 +98,13 @@ def synchronize(
             raise ValueError(f"{name} has {len(one.times)} frames, {SHORTEST} are needed at least")
     if calibration is not None:
         tracks = [_straight(name, one, lens) for name, one, lens in zip("ab", tracks, _pairwise(calibration), strict=True)]
-    first, second = (cleaned(one) for one in tracks)
+    # both clocks count from a's first frame: timestamps may be of any era, and products of rates with them lose digits
+    origin = float(tracks[0].times[0])
+    first, second = (cleaned(dataclasses.replace(one, times=one.times - origin)) for one in tracks)
     if not correspondence:
         from dyntorch.tasks.sync_different import different_points
 
-        return different_points(first, second, max_shift=max_shift, rate=rate)
+        return different_points(first, second, max_shift=max_shift, rate=rate).since(origin)
     if a.shape[1] != b.shape[1]:
         raise ValueError(
             f"a has {a.shape[1]} points and b {b.shape[1]}: corresponding points are as many; "
@@ -107,7 +113,7 @@ def synchronize(
     result = same_points(
         first, second, max_shift=max_shift, rate=rate, camera=camera, lenses=calibration is None, generator=generator
     )
-    return _shift(result.found, result.notes)
+    return _shift(result.found, result.notes).since(origin)
 
 
 def _check(
@@ -140,8 +146,6 @@ def _pairwise(calibration: Any) -> Sequence[Any]:
 
 
 def _straight(name: str, tracks: Tracks, lens: Any) -> Tracks:
-    import dataclasses
-
     try:
         x = undistorted(tracks.x, lens)
     except ValueError as problem:
@@ -201,24 +205,25 @@ def _shift(found: Attempt, notes: tuple[str, ...]) -> Shift:
 
 
 def _nothing(found: Attempt) -> str:
+    """Why no shift stands out."""
     for name, tracks in (("a", found.a), ("b", found.b)):
         if not bool((tracks.weights > 0).any()):
             return f"no point is seen in {name}; check the detections"
-        if tracks.scale <= 1e-9 * float(tracks.x.abs().max()):
+        if tracks.motion <= 1e-6 * tracks.scale:
             return f"nothing moves in {name}; film some movement"
-    return "there is no shift at which both cameras show enough points; film longer, or raise max_shift"
+    return "no shift stands out, or both cameras never show enough points at once; film longer, or raise max_shift"
 
 
 def _reason(found: Attempt) -> str:
     fit = found.fit
     assert fit is not None
-    if fit.sigma > SHARP * found.frame or not math.isfinite(fit.sigma):
-        wide = (
-            f"the shift is known to {fit.sigma / found.frame:.2g} frames only"
-            if math.isfinite(fit.sigma)
-            else "no shift stands out"
+    if fit.sigma > BLIND * found.frame or min(found.a.motion / found.a.scale, found.b.motion / found.b.scale) <= 1e-6:
+        return _nothing(found)
+    if not found.sharp:
+        return (
+            f"the motion is too small for its noise: the best shift, {fit.shift:+.3g} s, is uncertain by {fit.sigma:.2g} s or
+            more; " "film larger or faster movements"
         )
-        return f"the motion is too small for its noise: {wide}; film larger or faster movements"
     if found.edge:
         return f"the best shift, {fit.shift:+.3g} s, is at the end of the search; raise max_shift"
     if found.margin < found.needed and len(found.peaks) > 1:
@@ -233,8 +238,9 @@ def _reason(found: Attempt) -> str:
             "film something that happens once, or narrow max_shift"
         )
     first, second = found.halves
-    said = " and ".join("nothing" if math.isnan(x) else f"{fit.shift + x * found.frame:+.3g} s" for x in (first, second))
+    shifts = (f"{fit.shift + away * found.frame:+.3g} s" for away in (first, second))
+    said = " and ".join("nothing" if "nan" in shift else shift for shift in shifts)
     return (
-        f"the halves of the take say {said}, more than {APART:g} frames from {fit.shift:+.3g} s: the cameras may show different events, "
-        "overlap too little, or one of them moved"
+        f"the halves of the take say {said}, more than {APART:g} frames from {fit.shift:+.3g} s: "
+        "the cameras may show different events, overlap too little, or one of them moved"
     )

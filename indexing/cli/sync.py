@@ -12,18 +12,17 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from indexing.cli.console import count, ended, in_flags, names, progress, say, table
+from indexing.cli.console import SHOWN, count, ended, in_flags, names, progress, say, table
 from indexing.cli.inputs import Format
 from indexing.cli.outputs import check_report
 
 if TYPE_CHECKING:
     from indexing.report.sync import SyncReport
-    from indexing.sync_files import Plan
-    from indexing.sync_people import Pairing
-    from indexing.sync_takes import Take
+    from indexing.syncing.files import Plan
+    from indexing.syncing.people import Pairing
+    from indexing.syncing.takes import Take
 
 FLAGS = ("fps", "person", "method", "max_shift", "calibration", "min_confidence", "format", "size", "rate")
-PPM = 1e6
 
 
 @dataclass(frozen=True)
@@ -69,8 +68,8 @@ class Sync:
         self._check()
         from indexing.report.sync import FILES
         from indexing.report.sync_check import names_of
-        from indexing.sync_files import check_target
-        from indexing.sync_takes import find_cameras
+        from indexing.syncing.files import check_target
+        from indexing.syncing.takes import find_cameras
 
         found = find_cameras([path.expanduser() for path in self.cameras])
         inputs = [*found.values(), *([self.calibration.expanduser()] if self.calibration else [])]
@@ -123,19 +122,22 @@ class Sync:
         return rates * ((cameras or 1) if len(rates) == 1 else 1)
 
     def _read(self, found: dict[str, Path]) -> list[Take]:
-        from indexing.sync_takes import take_of
+        from indexing.syncing.takes import take_of
 
         rates = self._rates(len(found))
         options: dict[str, Any] = {"person": self.person, "min_confidence": self.min_confidence}
         options |= {"format": self.format, "size": self.size}
-        return [take_of(path, name=name, fps=rate, **options) for (name, path), rate in zip(found.items(), rates, strict=True)]
+        try:
+            return [take_of(path, name=name, fps=rate, **options) for (name, path), rate in zip(found.items(), rates, strict=True)]
+        except ValueError as problem:
+            raise ValueError(words(str(problem))) from problem
 
     def _solve(self, takes: list[Take], done: Any) -> tuple[SyncReport, dict[tuple[int, int], Pairing]]:
         """All pairs, and what they say together."""
         import dyntorch
         from indexing.report.sync_making import reported
-        from indexing.sync_calibration import read_calibration
         from indexing.synchronization import pair, remarks
+        from indexing.syncing.calibration import read_calibration
 
         lenses = None if self.calibration is None else read_calibration(self.calibration)
         options: dict[str, Any] = {"max_shift": self.max_shift, "calibration": lenses, "rate": None if self.rate else 1.0}
@@ -146,7 +148,8 @@ class Sync:
             try:
                 found = pair(a, b, self.method, **options)
             except ValueError as problem:
-                raise ValueError(f"{a.name} and {b.name}: {problem}") from problem
+                known = str(problem).startswith(tuple(str(word) for take in (a, b) for word in (take.name, take.path or take.name)))
+                raise ValueError(str(problem) if known else f"{a.name} and {b.name}: {problem}") from problem
             compared[takes.index(a), takes.index(b)] = found
             done(len(compared) / total)
             return found.shift
@@ -168,7 +171,7 @@ class Sync:
         """The shifted files where the data decide, the check video where asked for, and the report."""
         from indexing.files import manifest, prepare
         from indexing.report.sync import write_sync
-        from indexing.sync_files import drop_poses, plan, write_poses
+        from indexing.syncing.files import drop_poses, plan, write_poses
 
         prepare(folder)
         notes, clocks = list(report.notes), list(report.clocks)
@@ -200,8 +203,9 @@ def words(message: str) -> str:
         >>> words("an approximation; give calibration=((K, dist), (K, dist))"), words("narrow max_shift")
         ('an approximation; give --calibration FILE.toml', 'narrow --max-shift')
     """
-    said = in_flags(message.replace("calibration=((K, dist), (K, dist))", "calibration=FILE.toml"), *FLAGS)
-    return re.sub(r"(?<!-)\bmax_shift\b", "--max-shift", said)
+    said = message.replace("calibration=((K, dist), (K, dist))", "calibration=FILE.toml")
+    parts = [part if part.startswith("np.") else in_flags(part, *FLAGS) for part in re.split(r"(np\.\w+\([^)]*\))", said)]
+    return re.sub(r"(?<!-)\b(max|min)_(shift|confidence)\b", r"--\1-\2", "".join(parts))
 
 
 def early(plans: list[Plan], reference: str) -> list[str]:
@@ -219,37 +223,25 @@ def _shifted(one: Plan) -> dict[str, Any]:
 
 def show(report: SyncReport) -> None:
     """Print the result."""
-    rows: list[list[object]] = []
-    for pair in report.pairs:
-        shift, rival = pair.shift, pair.runner_up
-        drift = f"{PPM * (shift.rate - 1):+.0f} ± {PPM * shift.rate_sigma:.0f}" if shift.rate != 1 else "0"
-        numbers = [
-            f"{pair.apart:+.4f}",
-            f"{shift.sigma:.4f}",
-            f"{pair.apart * shift.fps[1]:+.2f}",
-            drift,
-            f"{shift.confidence:.3f}",
-        ]
-        rows.append([f"{pair.a} → {pair.b}", *numbers, f"{rival[0]:+.3f}" if rival else "none", "ok" if shift.ok else "refused"])
-    table(["pair", "offset s ", "± s ", "frames ", "rate ppm ", "confidence ", "next peak s ", "status"], rows)
+    _show_pairs(report)
     if len(report.clocks) > 2:
-        rows = [
-            [
-                clock.name,
-                f"{clock.offset:+.4f}",
-                f"{clock.sigma:.4f}",
-                f"{clock.offset * clock.fps:+.2f}",
-                f"{PPM * (clock.rate - 1):+.0f}",
-            ]
-            for clock in report.clocks
-        ]
-        table([f"clock against {report.reference.name}", "offset s ", "± s ", "frames ", "rate ppm "], rows)
-        if report.cycle is not None and math.isfinite(report.cycle):
-            out = f"; {report.outlier[0]} - {report.outlier[1]} contradicts the others" if report.outlier else ""
-            say(f"cycle error: {1000 * report.cycle:.2f} ms{out}")
+        _show_clocks(report)
+    elif report.ok:
+        first, other = report.clocks
+        began = float(other.inverse(other.start)) - first.start
+        factor = "" if other.rate == 1 else f" * {other.rate:.6f}"
+        when = f"{abs(began):.4f} s {'after' if began >= 0 else 'before'}"
+        sign = "-" if other.offset < 0 else "+"
+        clock = f"time of {other.name} = time of {first.name}{factor} {sign} {abs(other.offset):.4f} s"
+        say(f"{other.name} began {when} {first.name}: {clock}")
     for pair in report.pairs:
-        if pair.wrong:
+        if pair.wrong and pair.shift.ok:
             say(f"inconsistent joints of {pair.a} and {pair.b}: {', '.join(pair.wrong)}")
+    open_pairs = [pair for pair in report.pairs if not pair.shift.ok] if len(report.pairs) > 1 else []
+    for pair in open_pairs[:SHOWN]:
+        say(f"{pair.a} and {pair.b} refused: {pair.shift.reason}")
+    if len(open_pairs) > SHOWN:
+        say(f"and {len(open_pairs) - SHOWN} more pairs refused")
     for note in report.notes:
         say(f"note: {note}")
     moved = [clock for clock in report.clocks if clock.shifted is not None]
@@ -257,3 +249,41 @@ def show(report: SyncReport) -> None:
         rest = 1000 * max(clock.shifted["rest"] for clock in moved if clock.shifted is not None)
         written = ", ".join(clock.name for clock in moved)
         say(f"shifted files: pose-sync/ ({written}), within {rest:.1f} ms of {report.reference.name}")
+
+
+def _show_pairs(report: SyncReport) -> None:
+    from indexing.report.sync_page import PPM, UNKNOWN
+
+    rows: list[list[object]] = []
+    for pair in report.pairs:
+        shift, rival = pair.shift, pair.runner_up
+        drift = f"{PPM * (shift.rate - 1):+.0f} ± {PPM * shift.rate_sigma:.0f}" if shift.rate != 1 else "0"
+        numbers = [
+            f"{pair.apart:+.4f}" if len(shift.peaks) else "none",
+            f"{shift.sigma:.4f}" if shift.sigma < UNKNOWN else "unknown",
+            f"{pair.apart * shift.fps[1]:+.2f}" if len(shift.peaks) else "none",
+            drift,
+            f"{shift.confidence:.3f}",
+        ]
+        rows.append([f"{pair.a} → {pair.b}", *numbers, f"{rival[0]:+.3f}" if rival else "none", "ok" if shift.ok else "refused"])
+    where = "offset s (mid) " if any(pair.shift.rate != 1 for pair in report.pairs) else "offset s "
+    table(["pair", where, "± s ", "frames ", "rate ppm ", "confidence ", "next peak s ", "status"], rows)
+
+
+def _show_clocks(report: SyncReport) -> None:
+    from indexing.report.sync_page import PPM, UNKNOWN
+
+    rows = [
+        [
+            clock.name,
+            f"{clock.offset:+.4f}",
+            f"{clock.sigma:.4f}" if clock.sigma < UNKNOWN else "unknown",
+            f"{clock.offset * clock.fps:+.2f}",
+            f"{PPM * (clock.rate - 1):+.0f}",
+        ]
+        for clock in report.clocks
+    ]
+    table([f"clock against {report.reference.name}", "offset s ", "± s ", "frames ", "rate ppm "], rows)
+    if report.cycle is not None and math.isfinite(report.cycle):
+        out = f"; {report.outlier[0]} - {report.outlier[1]} contradicts the others" if report.outlier else ""
+        say(f"cycle error: {1000 * report.cycle:.2f} ms{out}")

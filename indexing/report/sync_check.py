@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 from indexing.clip import Clip
 from indexing.report.sync import SyncReport
-from indexing.sync_takes import Take
+from indexing.syncing.takes import Take
 
 if TYPE_CHECKING:
-    from indexing.sync_people import Pairing
+    from indexing.syncing.people import Pairing
 
 
 def names_of(cameras: Sequence[str]) -> list[str]:

@@ -9,8 +9,8 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from indexing.report.sync import Clock, Compared, SyncReport
-from indexing.sync_people import Pairing, joint_names, who
-from indexing.sync_takes import Take
+from indexing.syncing.people import Pairing, joint_names, who
+from indexing.syncing.takes import Take
 
 LEFT_OUT = "never agree with the others and were left out"  # of points: they are named beside their pair
 

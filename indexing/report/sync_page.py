@@ -20,6 +20,7 @@ METHODS = {
     "brightness": "brightness",
 }
 PPM = 1e6
+UNKNOWN = 1e3  # seconds of standard deviation that say nothing
 
 
 def body(report: SyncReport, drawn: tuple[bytes, bytes], videos: Sequence[str] = ()) -> str:
@@ -33,14 +34,15 @@ def describe(report: SyncReport) -> str:
     others = report.clocks[1:]
     if not report.ok:
         start = f"The recordings do not decide how the clocks of the cameras run. {sentence(report.reason)}"
-        return f"{start} What follows is the best candidate, and not to be relied on."
+        found = any(len(pair.shift.peaks) for pair in report.pairs)
+        return f"{start} What follows is the best candidate, and not to be relied on." if found else start
     if len(others) == 1:
         first, other = report.reference, others[0]
-        pair = report.pairs[0]
-        way = "later" if pair.apart >= 0 else "earlier"
-        drift = f", and {drift_of(other)} s in an hour" if other.rate != 1 else ""
-        said = f"What {first.name} shows at a time, {other.name} shows {abs(pair.apart):.3f} ± {other.sigma:.3f} s {way}"
-        return f"{said} on its own clock ({abs(pair.apart) * other.fps:.2f} frames){drift}."
+        began = float(other.inverse(other.start)) - first.start
+        way = "after" if began >= 0 else "before"
+        drift = f", and its clock gains {drift_of(other)} s in an hour" if other.rate != 1 else ""
+        frames = f"{abs(began) * first.fps:.2f} frames"
+        return f"{other.name} began {abs(began):.3f} ± {other.sigma:.3f} s {way} {first.name} ({frames}){drift}."
     return (
         f"The clocks of {len(report.clocks)} cameras, told on the clock of {report.reference.name}, from {len(report.pairs)} pairs."
     )
@@ -57,19 +59,23 @@ def drift_of(clock: Clock) -> str:
     return f"{3600 * (clock.rate - 1):+.3g}"
 
 
+def _sigma(seconds: float) -> str:
+    return f"{seconds:.4f}" if seconds < UNKNOWN else "unknown"
+
+
+def _ppm(rate: float, sigma: float | None = None) -> str:
+    return "0" if rate == 1 else f"{PPM * (rate - 1):+.0f}" + ("" if sigma is None else f" ± {PPM * sigma:.0f}")
+
+
 def _headline(report: SyncReport) -> list[Card]:
     items = [Card("Status", "Solved" if report.ok else "Refused", "the recordings decide" if report.ok else "they do not decide")]
     if len(report.clocks) == 2:
         clock, pair = report.clocks[1], report.pairs[0]
-        items.append(
-            Card(
-                "Offset" if report.ok else "Best candidate",
-                f"{pair.apart:+.4f} s",
-                f"± {clock.sigma:.4f} s; {pair.apart * clock.fps:+.2f} frames",
-            )
-        )
+        value, note = f"{pair.apart:+.4f} s", f"± {_sigma(clock.sigma)} s; {pair.apart * clock.fps:+.2f} frames"
+        value, note = (value, note) if len(pair.shift.peaks) else ("none", "there was nothing to compare")
+        items.append(Card("Offset" if report.ok else "Best candidate", value, note))
         note = f"± {PPM * clock.rate_sigma:.0f}; {drift_of(clock)} s an hour" if clock.rate != 1 else "nothing speaks for a drift"
-        items.append(Card("Rate", f"{PPM * (clock.rate - 1):+.0f} ppm", note))
+        items.append(Card("Rate", f"{_ppm(clock.rate)} ppm", note))
         items.append(Card("Confidence", f"{pair.shift.confidence:.3g}", "that the offset is right to a frame"))
         return items
     items.append(Card("Cameras", str(len(report.clocks)), f"on the clock of {report.reference.name}"))
@@ -82,13 +88,17 @@ def _headline(report: SyncReport) -> list[Card]:
 
 
 def _notes(report: SyncReport) -> str:
-    lines = [f"<li>{escape(sentence(note))}</li>" for note in report.notes]
+    names = tuple(clock.name for clock in report.clocks)
+    said = [note[:1] * note.startswith(names) + sentence(note)[note.startswith(names) :] for note in report.notes]  # names stay
+    lines = [f"<li>{escape(note)}</li>" for note in said]
     if report.reason:
         lines.insert(0, f'<li><b class="bad">Refused.</b> {escape(sentence(report.reason))}</li>')
     return section("Please note", f"<ul>{''.join(lines)}</ul>") if lines else ""
 
 
 def _curves(report: SyncReport, drawn: tuple[bytes, bytes]) -> str:
+    if not any(len(pair.shift.lags) for pair in report.pairs):
+        return ""
     note = "How well two cameras agree at every shift: one peak that stands out decides, several of one height do not."
     more = f" The first {DRAWN} of {len(report.pairs)} pairs." if len(report.pairs) > DRAWN else ""
     caption = (
@@ -99,25 +109,24 @@ def _curves(report: SyncReport, drawn: tuple[bytes, bytes]) -> str:
 
 
 def _clocks(report: SyncReport, videos: Sequence[str]) -> str:
-    rows = []
+    rows, shifted = [], any(clock.shifted is not None for clock in report.clocks)
     for clock in report.clocks:
         first = clock is report.reference
-        rest = "" if clock.shifted is None else f"{1000 * clock.shifted['rest']:.1f} ms"
+        offset = f"{clock.offset:+.4f} ± {_sigma(clock.sigma)}" if clock.sigma < UNKNOWN else "unknown"
         numbers = [
             f"{clock.fps:.6g}{' (assumed)' if clock.fps_assumed else ''}",
-            "reference" if first else f"{clock.offset:+.4f} ± {clock.sigma:.4f}",
-            "" if first else f"{clock.offset * clock.fps:+.2f}",
-            "" if first else f"{PPM * (clock.rate - 1):+.0f} ± {PPM * clock.rate_sigma:.0f}",
-            _moved(clock),
-            rest,
+            "reference" if first else offset,
+            "" if first or clock.sigma >= UNKNOWN else f"{clock.offset * clock.fps:+.2f}",
+            "" if first else _ppm(clock.rate, clock.rate_sigma),
         ]
+        rest = "" if clock.shifted is None else f"{1000 * clock.shifted['rest']:.1f} ms"
+        numbers += [_moved(clock), rest] if shifted else []
         rows.append([f"{escape(clock.name)}<span class='quiet'>{escape(clock.path)}</span>", *map(escape, numbers)])
-    names = ("Frames/s", "Offset, s", "Offset, frames", "Rate, ppm", "Frame numbers", "Greatest rest")
+    names = ("Frames/s", "Offset, s", "Offset, frames", "Rate, ppm", *(("Frame numbers", "Greatest rest") if shifted else ()))
     shown = table([Column("Camera"), *(Column(name, "number") for name in names)], rows, caption="Clocks", css="stack")
-    note = (
-        "A camera's time is the reference's time multiplied by its rate, plus its offset. Files in pose-sync have equal frame "
-        "numbers for equal moments; what whole frames cannot say is the rest."
-    )
+    note = "A camera's time is the reference's time multiplied by its rate, plus its offset."
+    if shifted:
+        note += " Files in pose-sync have equal frame numbers for equal moments; what whole frames cannot say is the rest."
     seen = f'<p class="note">The same moments side by side: {escape(", ".join(videos))}.</p>' if videos else ""
     return section("Clocks", shown + seen, note)
 
@@ -135,13 +144,13 @@ def _pairs(report: SyncReport) -> str:
         shift, rival = pair.shift, pair.runner_up
         state = '<span class="good">ok</span>' if shift.ok else f'<span class="bad">refused</span>: {escape(shift.reason)}'
         figures = [
-            f"{pair.apart:+.4f} ± {shift.sigma:.4f}",
-            f"{PPM * (shift.rate - 1):+.0f}",
+            f"{pair.apart:+.4f} ± {_sigma(shift.sigma)}" if len(shift.peaks) else "none",
+            _ppm(shift.rate),
             f"{shift.confidence:.3g}",
             "none" if rival is None else f"{rival[0]:+.3f}",
             "" if not np.isfinite(pair.residual) else f"{1000 * pair.residual:+.1f}",
         ]
-        wrong = f"<span class='quiet'>inconsistent: {escape(', '.join(pair.wrong))}</span>" if pair.wrong else ""
+        wrong = f"<span class='quiet'>inconsistent: {escape(', '.join(pair.wrong))}</span>" if pair.wrong and shift.ok else ""
         name = f"{escape(pair.a)} → {escape(pair.b)}<span class='quiet'>{escape(METHODS.get(shift.method, shift.method))}</span>"
         rows.append([name, *figures, state + _people(pair) + wrong])
     heads = ["Offset, s", "Rate, ppm", "Confidence", "Next peak, s", "Residual, ms"]

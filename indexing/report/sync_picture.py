@@ -48,6 +48,10 @@ def title_of(pair: Compared) -> str:
 
 def _draw_curve(panel: Any, pair: Compared, theme: Theme) -> None:
     lags, scores = _curve(pair)
+    if not len(lags):
+        panel.set_axis_off()
+        panel.set_title(f"{title_of(pair)}, nothing to compare", fontsize=9, loc="left", parse_math=False)
+        return
     panel.plot(lags, scores, color=CURVE, linewidth=1.0, zorder=3)
     peaks = np.array(pair.shift.peaks.tolist(), dtype=np.float64).reshape(-1, 2)[:LISTED]
     for rank, (offset, score) in reversed(list(enumerate(peaks.tolist()))):
@@ -56,12 +60,14 @@ def _draw_curve(panel: Any, pair: Compared, theme: Theme) -> None:
     panel.axvline(pair.apart, color=BEST, linewidth=0.8, alpha=0.6, zorder=2)
     _finish(panel, title_of(pair), theme)
     panel.set_ylabel("score", fontsize=8.5)
-    if len(lags):
-        panel.set_xlim(lags[0], lags[-1] if lags[-1] > lags[0] else lags[0] + 1)
+    panel.set_xlim(lags[0], lags[-1] if lags[-1] > lags[0] else lags[0] + 1)
 
 
 def _draw_close(panel: Any, pair: Compared, theme: Theme) -> None:
     lags, scores = _curve(pair)
+    if not len(lags):
+        panel.set_axis_off()
+        return
     frame = 1.0 / pair.shift.fps[1]
     at = (lags - pair.apart) / frame
     near = np.abs(at) <= NEAR

@@ -15,7 +15,7 @@ from indexing.actors import ACTIONS, Person, dataset
 from indexing.cli import main
 from indexing.shape.bank import Windows
 from indexing.windows import ragged, whole
-from tests.indexing.sync_scene import filmed, shift
+from tests.indexing.syncing.scene import filmed, shift
 
 TEACHER, *STUDENTS = (Person.random(seed) for seed in range(3))
 

@@ -16,7 +16,7 @@ import torch
 import dyntorch
 from dyntorch.tasks.sync_cameras import synchronize_cameras
 from indexing.clip import Clip, ClipSet
-from tests.indexing.sync_scene import FPS, SKIPPED, cut, filmed, shift, write_openpose
+from tests.indexing.syncing.scene import FPS, SKIPPED, cut, filmed, shift, write_openpose
 
 # torch's own, when it first loads its transforms; hidden outside of tests
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated")

@@ -13,7 +13,7 @@ from indexing.report.sync import Clock, Compared, SyncReport, as_json, write_syn
 from indexing.report.sync_making import named
 from indexing.report.sync_page import body, describe
 from indexing.report.sync_picture import picture_of, title_of
-from tests.indexing.sync_scene import shift
+from tests.indexing.syncing.scene import shift
 
 
 def report(cameras: int = 2, **changes) -> SyncReport:

@@ -10,10 +10,10 @@ import dyntorch
 import indexing
 from indexing.clip import Clip
 from indexing.skeleton import COCO17, HALPE26, Skeleton
-from indexing.sync_people import common_joints
-from indexing.sync_takes import take_of
 from indexing.synchronization import remarks, synchronize
-from tests.indexing.sync_scene import FPS, SKIPPED, cut, write_openpose
+from indexing.syncing.people import common_joints
+from indexing.syncing.takes import take_of
+from tests.indexing.syncing.scene import FPS, SKIPPED, cut, write_openpose
 
 # torch's own, when it first loads its transforms; hidden outside of tests
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated")

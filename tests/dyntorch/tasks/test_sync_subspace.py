@@ -1,12 +1,14 @@
 """Two cameras that track different points: information against determinants, what must not matter, and what must be refused."""
 
+import itertools
 import math
 
 import pytest
 import torch
 
-from dyntorch.tasks.sync_subspace import SubspaceCurve, _shared, subspace_curve
-from dyntorch.tasks.sync_subspace_body import body_of, completed, smooth
+from dyntorch.tasks.sync_subspace import HEIGHT, MOTION, SHAPE, SubspaceCurve, _correlated, _shared, _vertical, subspace_curve
+from dyntorch.tasks.sync_subspace_body import body_of, completed, halves, smooth
+from dyntorch.tasks.sync_subspace_doubt import BLOCKS, resemblance, wobble
 from dyntorch.tasks.sync_subspace_shift import subspace_shift
 
 
@@ -42,8 +44,8 @@ def full(x):
     return torch.ones(x.shape[:2], dtype=torch.float64)
 
 
-def curve_of(a, b, lags=(-40, 40)):
-    return subspace_curve(a, b, full(a), full(b), lags)
+def curve_of(a, b, lags=(-40, 40), step=1 / 30):
+    return subspace_curve(a, b, full(a), full(b), lags, step=step)
 
 
 def test_the_information_is_that_of_the_determinants():
@@ -97,6 +99,26 @@ def test_exchanged_cameras_mirror_the_motion():
     assert subspace_shift(curve_of(b, a)).position == pytest.approx(-subspace_shift(curve_of(a, b)).position, abs=0.1)
 
 
+@pytest.mark.parametrize("fps", [20, 24, 25, 60])
+def test_other_frame_rates_need_their_step(fps):
+    a, b = scene(120, 9)
+    times = torch.arange(4 * fps, dtype=torch.float64) * (30 / fps)
+    times = times[times < 118]
+    before, share = times.long(), (times % 1)[:, None, None]
+    coarse = [torch.lerp(x[before], x[before + 1], share) for x in (a, b)]
+    found = subspace_shift(curve_of(*coarse, (-fps, fps), step=1 / fps), step=1 / fps)
+    assert found.position / fps == pytest.approx(9 / 30, abs=0.5 / 30)
+    assert found.probability > 0.95
+
+
+def test_evidence_is_per_second():
+    a, b = scene(90, 7)
+    curve = curve_of(a, b)
+    counted = curve.counts / 30 * (SHAPE * curve.shape + HEIGHT * curve.height + MOTION * curve.motion)
+    judged = curve.scores.isfinite()
+    assert torch.allclose(curve.scores[judged], counted[judged], atol=1e-9)
+
+
 def test_missing_blocks_are_filled_from_the_other_points():
     a, b = scene(120, 9.5)
     wa, wb = full(a), full(b)
@@ -143,6 +165,61 @@ def test_motion_that_repeats_itself_is_refused(seed):
     assert not found.ok
     assert "shifts" in found.reason or "motion" in found.reason
     assert len(found.peaks) > 1
+
+
+@pytest.mark.parametrize("seed", [84, 113, 258])
+def test_repeated_motion_whose_periods_happen_to_differ_is_refused(seed):
+    period = 18 + (seed % 29) * 1.13
+    a, b = repeated(period, 120, 8, 100003 + 7 * seed), repeated(period, 120, 8, 500009 + 7 * seed, start=-9.3 + seed % 11)
+    assert not subspace_shift(curve_of(a, b, (-60, 60))).ok
+
+
+def test_repeated_motion_resembles_itself_and_other_motion_does_not():
+    moving, turning = curve_of(*scene(120, 5)), curve_of(repeated(30, 120, 8, 3), repeated(30, 120, 8, 4, start=-7))
+    assert resemblance(moving, 45, 3) < 0.6
+    assert resemblance(turning, 47, 3) > 0.8
+
+
+def test_halves_share_the_point_in_the_middle_only():
+    body = body_of(uniform(0, 40, 7, 2), full(uniform(0, 40, 7, 2)))
+    first, second = halves(body)
+    assert first.points.shape[1] + second.points.shape[1] == 8
+    assert len({tuple(p.tolist()) for half in (first, second) for p in half.points[0]}) == 7
+
+
+def test_the_jackknife_is_that_of_blocks_left_out():
+    a, b = scene(120, 5, noise=1.0)
+    curve = curve_of(a, b)
+    one, two = curve.bodies
+    edges = torch.linspace(0, 116 - 6, BLOCKS + 1).round().long().tolist()
+    slopes, bends = [], []
+    for start, end in itertools.pairwise(edges):
+        told = []
+        for lag in (4, 5, 6):
+            kept = torch.tensor([i for i in range(116 - 6) if not start <= i < end])
+            parts = [torch.cat([x[kept], y[kept + lag]], dim=1) for x, y in ((one.rows, two.rows), (one.motion, two.motion))]
+            shape, motion = (torch.cov(part.T, correction=0)[None] for part in parts)
+            blocks = shape[:, :14, :14], shape[:, 14:, 14:], shape[:, :14, 14:]
+            told.append(SHAPE * _shared(*blocks) + HEIGHT * _shared(*_vertical(*blocks)))
+            told[-1] = float(told[-1] + MOTION * _correlated(motion[:, :2, :2], motion[:, 2:, 2:], motion[:, :2, 2:]))
+        slopes.append((told[2] - told[0]) / 2)
+        bends.append(told[0] - 2 * told[1] + told[2])
+    places = torch.tensor(slopes).double() / (-sum(bends) / BLOCKS)
+    spread = math.sqrt((BLOCKS - 1) / BLOCKS * float((places - places.mean()).square().sum()))
+    assert wobble(curve, 5) == pytest.approx(spread, rel=1e-6)
+
+
+def test_noise_that_keeps_for_some_frames_is_told_by_sigma():
+    errors, sigmas = [], []
+    for seed in range(8):
+        a, b = scene(120, 6.4, seed=100 * seed)
+        slow = [3 * smooth(normal(7 + seed + k, *x.shape), 4.0) for k, x in enumerate((a, b))]
+        found = subspace_shift(curve_of(a + slow[0], b + slow[1], (-25, 25)))
+        errors.append(abs(found.position - 6.4))
+        sigmas.append(found.sigma)
+    ratio = torch.tensor(errors) / torch.tensor(sigmas)
+    assert float(ratio.median()) < 1.3
+    assert float(ratio.max()) < 4
 
 
 @pytest.mark.parametrize("seed", range(8))

@@ -9,9 +9,9 @@ import pytest
 
 from indexing.clip import Clip
 from indexing.readers import read
-from indexing.sync_files import openpose_frames, plan, renumbered, write_poses
-from indexing.sync_takes import find_cameras, take_of
-from tests.indexing.sync_scene import FPS, cut, moved, write_openpose
+from indexing.syncing.files import openpose_frames, plan, renumbered, write_poses
+from indexing.syncing.takes import find_cameras, take_of
+from tests.indexing.syncing.scene import FPS, cut, moved, write_openpose
 
 # torch's own, when it first loads its transforms; hidden outside of tests
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated")

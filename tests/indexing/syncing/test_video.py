@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from indexing.sync_video import agreed
 from indexing.synchronization import synchronize
-from tests.indexing.sync_scene import FPS, shift
+from indexing.syncing.video import agreed
+from tests.indexing.syncing.scene import FPS, shift
 
 # torch's own, when it first loads its transforms; hidden outside of tests
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated")

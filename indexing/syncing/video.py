@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from indexing.sync_takes import Take
+from indexing.syncing.takes import Take
 
 if TYPE_CHECKING:
     from dyntorch import Shift
@@ -61,6 +61,8 @@ def agreed(tracked: Shift, bright: Shift) -> Shift:
 
 
 def _told(shift: Shift) -> str:
+    if not len(shift.peaks):
+        return "nothing"
     return f"{_middle(shift):+.3f} s ({'sure' if shift.ok else 'not sure'})"
 
 
@@ -130,9 +132,7 @@ def _brightness(a: Take, b: Take, **options: Any) -> Shift:
 
     sources = [iter(source_of(take)) if take.path is None else read_video(take.path, size=SMALL) for take in (a, b)]
     shift: Shift = brightness_shift(*sources, **options)
-    named = [note.replace("a: ", f"{a.name}: ", 1) if note.startswith("a: ") else note for note in shift.notes]
-    named = [note.replace("b: ", f"{b.name}: ", 1) if note.startswith("b: ") else note for note in named]
-    return dataclasses.replace(shift, notes=tuple(named))
+    return shift
 
 
 def refused(a: Take, b: Take, reason: str, notes: list[str], method: str = "subspace") -> Shift:

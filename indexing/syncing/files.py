@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from indexing.clip import Clip
 from indexing.readers.detect import detect_json
 from indexing.readers.files import error, frame_number, load_json
-from indexing.sync_takes import Take
+from indexing.syncing.takes import Take
 
 FOLDER = "pose-sync"
 NEAR = 0.5 + 1e-6  # frames: no other frame is nearer
@@ -71,7 +71,7 @@ def plan(take: Take, offset: float, rate: float, fps: float) -> Plan:
 
     Example:
         >>> import numpy as np
-        >>> from indexing.sync_takes import take_of
+        >>> from indexing.syncing.takes import take_of
         >>> late = plan(take_of(np.ones((6, 3, 2)), fps=10.0), offset=0.21, rate=1.0, fps=10.0)
         >>> late.numbers.tolist(), late.rows.tolist(), round(late.rest, 3), late.before
         ([0, 1, 2, 3], [2, 3, 4, 5], 0.01, 2)
@@ -96,6 +96,9 @@ def check_target(folder: Path, inputs: Sequence[Path]) -> None:
         ValueError: naming what is in the way.
     """
     target = folder / FOLDER
+    same = [path for path in inputs if path.is_dir() and path.resolve() == folder.resolve()]
+    if same:
+        raise ValueError(f"{same[0]}: is an input, and files of the report among its frames would spoil it; choose another --out")
     inside = [path for path in inputs if target.resolve() in (path.resolve(), *path.resolve().parents)]
     if inside:
         raise ValueError(f"{inside[0]}: is an input, and {target} would be replaced; choose another folder for --out")

@@ -11,7 +11,7 @@ import numpy as np
 
 from indexing.clip import Clip
 from indexing.skeleton import Skeleton, known
-from indexing.sync_takes import FloatArray, Take
+from indexing.syncing.takes import FloatArray, Take
 
 if TYPE_CHECKING:
     from dyntorch import Shift

@@ -9,10 +9,10 @@ import torch
 import dyntorch
 from indexing.clip import Clip
 from indexing.readers import read
-from indexing.sync_people import Pairing, decide, disagreements, jumps, match_people
-from indexing.sync_takes import Take, take_of
 from indexing.synchronization import pair, synchronize
-from tests.indexing.sync_scene import FPS, cut, filmed, moved, shift, write_openpose
+from indexing.syncing.people import Pairing, decide, disagreements, jumps, match_people
+from indexing.syncing.takes import Take, take_of
+from tests.indexing.syncing.scene import FPS, cut, filmed, moved, shift, write_openpose
 
 # torch's own, when it first loads its transforms; hidden outside of tests
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated")

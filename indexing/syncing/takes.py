@@ -20,6 +20,7 @@ CHOICES = ("auto", "largest", "confident", "tracked")
 ASSUMED = 30.0  # frames per second where nobody says
 CANDIDATES = 3  # people of a camera that are tried, besides the largest one of each frame
 UNEVEN = 0.1  # of a frame, by which times of an even grid are off it at most
+EXACT = 1e-9  # by which a frame rate is one that was given
 EMPTY = 0.1  # share of frames without a person, above which it is said
 SHARE = 0.2  # of the longest person's frames, that a person must be seen in to be tried
 SAME = 0.9  # of the frames of a person in which the largest one is that person, from where on they are one
@@ -111,8 +112,20 @@ def _of_clips(name: str, path: Path | None, people: list[Clip]) -> Take:
         )
     first = people[0]
     times = np.unique(np.concatenate([clip.times for clip in people]))
-    seen, rate = tuple(people), float(first.fps or ASSUMED)
+    seen, rate = tuple(people), frame_rate(times, float(first.fps or ASSUMED))
     return Take(name, "keypoints", path, seen, seen, fps=rate, fps_assumed=first.fps_assumed, times=times, count=len(times))
+
+
+def frame_rate(times: FloatArray, about: float) -> float:
+    """Frames per second over all of a take: by the median step of rounded times, frame numbers would drift from their frames.
+
+    Example:
+        >>> round(frame_rate(np.round(np.delete(np.arange(300), 7) / 30, 4), 30.03), 3)
+        30.0
+    """
+    steps = np.rint(np.diff(times) * about).sum()
+    exact = float(steps / (times[-1] - times[0])) if steps > 0 else about
+    return exact if abs(exact / about - 1) > EXACT else about
 
 
 def _of_file(name: str, path: Path, fps: float | None, person: str, how: dict[str, Any]) -> Take:
@@ -203,8 +216,10 @@ def find_cameras(paths: Sequence[Path]) -> dict[str, Path]:
     if len(found) == 1:
         found = _inside(found[0])
     if len(found) < 2:
-        given = f"{paths[0]}: holds {len(found)} cameras" if paths else "no cameras given"
-        raise ValueError(f"{given}, two are needed; give a file or folder for each, or the folder that holds a folder for each")
+        raise ValueError(_too_few(paths, len(found)))
+    twice = [path for i, path in enumerate(found) if path.resolve() in [other.resolve() for other in found[:i]]]
+    if twice:
+        raise ValueError(f"{twice[0]}: given twice; name every camera once")
     names = [camera_name(path) for path in found]
     for depth in range(2):  # cam1/pose.json and cam2/pose.json are cam1 and cam2
         if len(set(names)) < len(names):
@@ -212,6 +227,16 @@ def find_cameras(paths: Sequence[Path]) -> dict[str, Path]:
     if len(set(names)) < len(names):
         names = [f"{name}-{i}" for i, name in enumerate((camera_name(path) for path in found), start=1)]
     return dict(zip(names, found, strict=True))
+
+
+def _too_few(paths: Sequence[Path], found: int) -> str:
+    remedy = "two are needed; give a file or folder for each, or the folder that holds a folder for each"
+    if not paths:
+        return f"no cameras given, {remedy}"
+    if not paths[0].exists():
+        return f"{paths[0]}: no such file or folder; check the path"
+    alone = paths[0].is_file() or any(_is_frame(file) for file in paths[0].iterdir())
+    return f"{paths[0]}: {'is one camera' if alone else f'holds {found} cameras'}, {remedy}"
 
 
 def _inside(folder: Path) -> list[Path]:

@@ -1,0 +1,190 @@
+"""A person before two static perspective cameras, each with its own clock, and what a detector makes of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dyntorch.algebra.homogeneous import homogeneous, inhomogeneous, skew
+from dyntorch.algebra.lens import Division
+from dyntorch.scenes.cameras import calibration, looking_at
+
+FOCAL, SIZE, DISTANCE = 1000.0, (1280.0, 960.0), 4.5
+BODY = (0.2, 0.45, 0.2)
+"""Metres, standard deviations of the points from the middle of the person: across, up, deep."""
+WAVES = 4
+BLOCK = 12
+"""Frames, about, for which a point is missing at a time."""
+FAR_OFF = 150.0
+"""Pixels, standard deviation of an outlier from where the point is."""
+
+
+@dataclass(frozen=True)
+class FilmedScene:
+    """Tracks of two cameras and the truth.
+
+    Attributes:
+        a, b: ``(frames, n, 2)`` px, y down, with noise, lens distortion, outliers and wrong points; NaN where missing.
+        exact: the same of ideal cameras, two of ``(frames, n, 2)``.
+        times: ``(frames,)`` seconds of each camera's own clock.
+        offset, rate: b's clock = a's clock * rate + offset.
+        fps: of both.
+        points: ``(frames, n, 3)`` metres, at a's moments.
+        cameras: ``(2, 3, 4)``.
+        fundamental: ``(3, 3)`` of norm 1, :math:`x_b^T F x_a = 0`.
+        outliers: ``(frames, n)`` bool of each camera: positions that are elsewhere.
+        wrong: ``(n,)`` bool: b shows another point.
+    """
+
+    a: Tensor
+    b: Tensor
+    exact: tuple[Tensor, Tensor]
+    times: tuple[Tensor, Tensor]
+    offset: float
+    rate: float
+    fps: tuple[float, float]
+    points: Tensor
+    cameras: Tensor
+    fundamental: Tensor
+    outliers: tuple[Tensor, Tensor]
+    wrong: Tensor
+
+
+def filmed(
+    n: int = 15,
+    seconds: float = 4.0,
+    *,
+    fps: tuple[float, float] = (30.0, 30.0),
+    times: tuple[Tensor, Tensor] | None = None,
+    offset: float = 0.0,
+    rate: float = 1.0,
+    noise: float = 0.0,
+    missing: float = 0.0,
+    outliers: float = 0.0,
+    wrong: int = 0,
+    lens: float = 0.0,
+    walk: float = 0.6,
+    period: float | None = None,
+    generator: torch.Generator | None = None,
+) -> FilmedScene:
+    r"""Points that wobble about a person who walks, as two cameras film them, 60 degrees apart.
+
+    .. math:: P_i(t) = B_i + W(t) + \sum_k A_{ik} \sin(\omega_{ik} t + \phi_{ik}), \qquad t_b = \text{rate}\; t_a + \text{offset}
+
+    Args:
+        n: points.
+        seconds: that each camera films, from 0 s of its own clock.
+        fps: frames per second of both.
+        times: seconds of each frame of each camera's own clock, instead of ``seconds`` and ``fps``.
+        offset: of b's clock, seconds.
+        rate: of b's clock.
+        noise: of a coordinate, px; the person is about 300 px tall.
+        missing: share of the positions, in blocks.
+        outliers: share of the positions that are elsewhere.
+        wrong: how many points b takes for others, all the time.
+        lens: the division model's parameter of both cameras; negative = barrel.
+        walk: metres, how far the person walks to and fro; 0 = stays.
+        period: seconds in which the wobbling repeats itself exactly; None = never.
+        generator: source of all randomness.
+
+    Example:
+        >>> scene = filmed(12, seconds=2.0, fps=(30.0, 25.0), offset=0.3, generator=torch.Generator().manual_seed(0))
+        >>> scene.a.shape, scene.b.shape
+        (torch.Size([60, 12, 2]), torch.Size([50, 12, 2]))
+    """
+    clocks = times or (_clock(seconds, fps[0]), _clock(seconds, fps[1]))
+    position = _motion(n, walk, period, generator)
+    cameras = _cameras(generator)
+    # b films a's moments (t_b - offset) / rate
+    points = position(clocks[0]), position((clocks[1] - offset) / rate)
+    exact = _image(cameras[0], points[0]), _image(cameras[1], points[1])
+    mistaken = torch.zeros(n, dtype=torch.bool).index_fill(0, torch.randperm(n, generator=generator)[:wrong], True)
+    own = torch.arange(n)
+    seen = exact[0], exact[1][:, torch.where(mistaken, (own + 1) % n, own)]
+    shown = [_detected(x, noise, missing, outliers, lens, generator) for x in seen]
+    return FilmedScene(
+        a=shown[0][0],
+        b=shown[1][0],
+        exact=exact,
+        times=clocks,
+        offset=offset,
+        rate=rate,
+        fps=fps,
+        points=points[0],
+        cameras=cameras,
+        fundamental=_fundamental(cameras),
+        outliers=(shown[0][1], shown[1][1]),
+        wrong=mistaken,
+    )
+
+
+def _clock(seconds: float, fps: float) -> Tensor:
+    return torch.arange(round(seconds * fps), dtype=torch.float64) / fps
+
+
+def _motion(n: int, walk: float, period: float | None, generator: torch.Generator | None) -> Callable[[Tensor], Tensor]:
+    """Positions ``(frames, n, 3)`` metres, of moments ``(frames,)`` seconds."""
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    rest = normal(n, 3) * torch.tensor(BODY, dtype=torch.float64)
+    share = torch.rand(WAVES, n, 3, generator=generator, dtype=torch.float64)
+    cycles = 0.3 + 1.5 * share if period is None else (1 + (WAVES * share).floor()) / period  # per second
+    speeds = 2 * math.pi * cycles
+    phases, sizes = 2 * math.pi * normal(WAVES, n, 3), 0.06 * normal(WAVES, n, 3)
+    # to and fro across the floor, slower than any limb
+    pace, start = 2 * math.pi * (0.05 + 0.1 * torch.rand(2, 3, generator=generator, dtype=torch.float64)), 6 * normal(2, 3)
+    floor = walk * torch.tensor([1.0, 0.0, 1.0], dtype=torch.float64)
+
+    def at(times: Tensor) -> Tensor:
+        t = times[:, None, None, None]
+        limbs = (sizes * (speeds * t + phases).sin()).sum(1)
+        walked = floor * (pace * times[:, None, None] + start).sin().mean(1)
+        return rest + limbs + walked[:, None]
+
+    return at
+
+
+def _cameras(generator: torch.Generator | None) -> Tensor:
+    """``(2, 3, 4)``, 60 degrees apart, at eye level."""
+    azimuth = torch.tensor([0.0, math.pi / 3], dtype=torch.float64) + 2 * math.pi * torch.rand((), generator=generator)
+    height = 0.4 * torch.randn(2, generator=generator, dtype=torch.float64)
+    eye = torch.stack([DISTANCE * azimuth.sin(), height, DISTANCE * azimuth.cos()], dim=-1)
+    K = calibration(torch.tensor([1.0, 0.9], dtype=torch.float64) * FOCAL, 0.0)
+    K[:, :2, 2] = torch.tensor(SIZE, dtype=torch.float64) / 2
+    up = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64).expand(2, 3)
+    return K @ looking_at(eye, torch.zeros_like(eye), up)
+
+
+def _image(camera: Tensor, points: Tensor) -> Tensor:
+    return inhomogeneous(homogeneous(points) @ camera.mT)
+
+
+def _fundamental(cameras: Tensor) -> Tensor:
+    """From the centre of the first camera and the map that takes its rays to the second picture."""
+    first, second = cameras
+    centre = torch.linalg.solve(first[:, :3], -first[:, 3:])[:, 0]
+    epipole = second[:, :3] @ centre + second[:, 3]
+    F = skew(epipole) @ second[:, :3] @ torch.linalg.inv(first[:, :3])
+    return F / F.norm()
+
+
+def _detected(
+    x: Tensor, noise: float, missing: float, outliers: float, lens: float, generator: torch.Generator | None
+) -> tuple[Tensor, Tensor]:
+    """What a detector makes of ideal pixels, and which positions are elsewhere."""
+    frames, n, _ = x.shape
+    if lens:
+        x = Division.of(x, SIZE, lens).distort(x)
+    x = x + noise * torch.randn(x.shape, generator=generator, dtype=torch.float64)
+    far = torch.rand(frames, n, generator=generator) < outliers
+    x = torch.where(far[..., None], x + FAR_OFF * torch.randn(x.shape, generator=generator, dtype=torch.float64), x)
+    blocks = torch.rand(frames // BLOCK + 2, n, generator=generator) < missing
+    begun = torch.randint(BLOCK, (n,), generator=generator)  # blocks of different points begin at different frames
+    gone = blocks[(torch.arange(frames)[:, None] + begun) // BLOCK, torch.arange(n)]
+    return torch.where(gone[..., None], torch.nan, x), far & ~gone

@@ -1,0 +1,184 @@
+"""The descent in offset, rate and F: against a general least squares solver, scans, repeated draws of noise and exact cameras."""
+
+import math
+
+import pytest
+import scipy.optimize
+import torch
+
+from dyntorch.algebra.homogeneous import homogeneous
+from dyntorch.scenes import filmed
+from dyntorch.tasks.sync_descent import Descent, Grid
+from dyntorch.tasks.sync_tracks import read_tracks, smoothed
+
+FRAME = 1 / 30
+
+
+def seeded(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def tracks_of(scene, noise=0.0, seed=0):
+    draw = seeded(seed)
+    parts = (x + noise * torch.randn(x.shape, generator=draw, dtype=torch.float64) for x in (scene.a, scene.b))
+    return [read_tracks(name, x, None, t, None) for name, x, t in zip("ab", parts, scene.times, strict=True)]
+
+
+def sampson(F, p, q):
+    """Signed distances, px."""
+    value = torch.einsum("ni,ij,nj->n", q, F, p)
+    return value / ((q @ F)[:, :2].square().sum(-1) + (p @ F.mT)[:, :2].square().sum(-1)).sqrt()
+
+
+def test_positions_between_the_steps_of_a_grid_are_those_of_smoothing():
+    scene = filmed(6, seconds=3.0, generator=seeded(1))
+    for noise in (0.0, 2.0):
+        tracks = tracks_of(scene, noise)[1]
+        grid = Grid.of(tracks, FRAME)
+        at = 0.2 + 2.5 * torch.rand(200, generator=seeded(2), dtype=torch.float64)
+        expected, _, sure = smoothed(tracks, at, FRAME)
+        x, v, weights = grid.at(at)
+        assert bool((sure > 0).all()) and torch.allclose(weights, sure, atol=0.01)
+        assert float((x - expected).abs().max()) < 0.01 + 0.02 * noise
+        assert float((x - expected).square().mean().sqrt()) < 0.002 + 0.005 * noise
+        # the velocity is smoothed more widely
+        ahead, behind = (grid.at(at + sign * 0.01)[0] for sign in (1, -1))
+        slope = (ahead - behind) / 0.02
+        assert float((v - slope).square().mean().sqrt()) < 10 + 40 * noise
+        if not noise:
+            assert float((v - slope).square().mean().sqrt() / slope.square().mean().sqrt()) < 0.1
+
+
+def test_noise_of_a_grid_does_not_depend_on_the_place_between_frames():
+    frames = 3000
+    tracks = read_tracks("b", torch.randn(frames, 3, 2, generator=seeded(), dtype=torch.float64), 30.0, None, None)
+    grid, middle = Grid.of(tracks, FRAME), torch.arange(10, frames - 10, dtype=torch.float64)
+    left = [float(grid.at((middle + phase) * FRAME)[0].square().mean()) for phase in torch.linspace(0, 1, 9).tolist()]
+    assert max(left) / min(left) < 1.015
+
+
+def test_grids_have_no_weight_in_gaps_and_beyond_the_take():
+    x = torch.zeros(60, 2, 2)
+    x[20:40, 1] = torch.nan
+    grid = Grid.of(read_tracks("b", x, 30.0, None, None), FRAME)
+    _, _, weights = grid.at(torch.tensor([-0.1, 0.3, 1.0, 1.7, 2.5], dtype=torch.float64))
+    assert (weights > 0).tolist() == [[False, False], [True, True], [True, False], [True, True], [False, False]]
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_the_minimum_is_that_of_a_general_solver(seed):
+    a, b = tracks_of(filmed(9, seconds=1.5, offset=0.113, generator=seeded(seed)), 1.0, seed)
+    fit = Descent(a, b, FRAME).run(0.113)
+    x1, _, w1 = smoothed(a, a.times, FRAME)
+    centre, size = torch.tensor([640.0, 480.0], dtype=torch.float64), 300.0
+    own = (w1 > 0.5) & (a.times > 0.25)[:, None] & (a.times < 1.25)[:, None]  # seen in both whatever the shift
+    p = homogeneous(((x1 - centre) / size)[own])
+
+    def residuals(theta):
+        x2, _, _ = smoothed(b, a.times + float(theta[0]), FRAME)
+        A, B = torch.from_numpy(theta[1:]).reshape(2, 3, 2)  # of rank 2
+        return (size * sampson(A @ B.mT, p, homogeneous(((x2 - centre) / size)[own]))).numpy()
+
+    change = torch.tensor([[size, 0, 640.0], [0, size, 480.0], [0, 0, 1]], dtype=torch.float64)
+    U, S, Vh = torch.linalg.svd(change.mT @ fit.fundamental @ change)
+    start = torch.cat([torch.tensor([0.12]), (U[:, :2] * S[:2]).flatten() / S[0], Vh[:2].mT.flatten()]).numpy()
+    found = scipy.optimize.least_squares(residuals, start, x_scale=[0.01] + [1.0] * 12)
+    assert fit.offset == pytest.approx(found.x[0], abs=0.6 * fit.sigma)  # weights and edges differ a little
+    assert (2 * found.cost / len(p)) ** 0.5 == pytest.approx(fit.residual, rel=0.15)
+
+
+def test_the_minimum_is_that_of_a_scan():
+    a, b = tracks_of(filmed(12, seconds=3.0, offset=-0.217, generator=seeded(3)), 1.5, 3)
+    descent = Descent(a, b, FRAME)
+    fit = descent.run(-0.2)
+    offsets = fit.offset + torch.linspace(-0.5, 0.5, 41, dtype=torch.float64) * FRAME
+    costs = [descent.variance(float(offset)) for offset in offsets]
+    assert float(offsets[costs.index(min(costs))]) == pytest.approx(fit.offset, abs=0.05 * FRAME)
+    assert descent.variance(5.0) == math.inf
+
+
+@pytest.mark.parametrize("start", [-1.4, -0.5, 0.0, 0.8, 1.5])
+def test_starts_within_a_frame_or_two_lead_to_the_same_minimum(start):
+    a, b = tracks_of(filmed(12, seconds=3.0, offset=0.4, generator=seeded(4)), 1.0)
+    fit = Descent(a, b, FRAME).run(0.4 + start * FRAME)
+    assert fit.offset == pytest.approx(0.4, abs=0.03 * FRAME)
+    again = Descent(a, b, FRAME).run(fit.offset)
+    assert again.offset == pytest.approx(fit.offset, abs=1e-4 * FRAME)
+
+
+def test_exact_cameras_give_the_fundamental_matrix_in_pixels():
+    scene = filmed(15, seconds=4.0, offset=0.3, generator=seeded(5))
+    fit = Descent(*tracks_of(scene), FRAME).run(0.3)
+    F = fit.fundamental
+    assert float(F.norm()) == pytest.approx(1.0)
+    assert float(torch.linalg.svdvals(F)[2]) < 1e-12
+    x2 = filmed(15, seconds=4.0, generator=seeded(5)).exact[1]  # b at a's moments
+    away = sampson(F, homogeneous(scene.exact[0].flatten(0, 1)), homogeneous(x2.flatten(0, 1)))
+    assert float(away.square().mean().sqrt()) < 0.2  # what smoothing leaves
+    assert fit.offset == pytest.approx(0.3, abs=0.005 * FRAME)
+
+
+def test_sigma_is_the_scatter_of_repeated_draws():
+    scene = filmed(12, seconds=2.5, offset=0.123, generator=seeded(6))
+    fits = [Descent(*tracks_of(scene, 1.5, seed), FRAME).run(0.123) for seed in range(30)]
+    errors = torch.tensor([fit.offset - 0.123 for fit in fits], dtype=torch.float64)
+    sigmas = torch.tensor([fit.sigma for fit in fits], dtype=torch.float64)
+    assert 0.4 < float((errors / sigmas).square().mean().sqrt()) < 1.7
+    assert abs(float(errors.mean())) < 0.02 * FRAME + 3 * float(errors.std()) / 30**0.5
+    assert float(sigmas.max() / sigmas.min()) < 4
+    smooth = (0.5 / math.sqrt(math.pi)) ** 0.5
+    assert torch.tensor([fit.residual for fit in fits]).mean().item() == pytest.approx(1.5 * smooth, rel=0.15)
+
+
+def test_fractions_of_a_frame_do_not_draw_the_estimate():
+    scenes = {phase: filmed(12, seconds=2.5, offset=phase * FRAME, generator=seeded(7)) for phase in (0.0, 0.25, 0.5, 0.75)}
+    for phase, scene in scenes.items():
+        fits = [Descent(*tracks_of(scene, 3.0, seed), FRAME).run(phase * FRAME) for seed in range(8)]
+        errors = torch.tensor([fit.offset / FRAME - phase for fit in fits])
+        assert abs(float(errors.mean())) < 3.5 * float(errors.std()) / 8**0.5 + 0.005  # splines: drawn by .1 to halves
+
+
+def test_the_rate_is_found_with_its_sigma():
+    scene = filmed(10, seconds=12.0, rate=1.004, offset=0.3, generator=seeded(8))
+    fit = Descent(*tracks_of(scene, 1.0), FRAME).run(0.32, 1.003, free_rate=True)
+    assert abs(fit.rate - 1.004) < 4 * fit.rate_sigma < 1e-3
+    assert fit.offset + fit.rate * fit.center == pytest.approx(0.3 + 1.004 * fit.center, abs=4 * fit.sigma)
+    assert fit.shift == pytest.approx(fit.offset + (fit.rate - 1) * fit.center)
+    held = Descent(*tracks_of(scene, 1.0), FRAME).run(0.32, 1.004)
+    assert held.rate == 1.004 and held.rate_sigma == 0
+
+
+def test_outliers_hardly_move_the_minimum():
+    clean = filmed(14, seconds=3.0, noise=1.0, offset=0.2, generator=seeded(9))
+    dirty = filmed(14, seconds=3.0, noise=1.0, offset=0.2, outliers=0.03, generator=seeded(9))
+    fits = [Descent(*tracks_of(scene), FRAME).run(0.2) for scene in (clean, dirty)]
+    assert fits[1].offset == pytest.approx(0.2, abs=5 * fits[0].sigma)
+
+
+def test_distances_are_those_of_each_frame_and_point():
+    scene = filmed(8, seconds=2.0, offset=0.2, missing=0.2, generator=seeded(10))
+    a, b = tracks_of(scene, 1.0)
+    fit = Descent(a, b, FRAME).run(0.2)
+    x1, _, w1 = smoothed(a, fit.times, FRAME)
+    x2, _, w2 = smoothed(b, fit.times + fit.offset, FRAME)
+    seen = fit.distances.isfinite()
+    assert int(seen.sum()) > 200
+    assert float((((w1 * w2) > 0) == seen).double().mean()) > 0.95
+    # in px of a: the noise of b is taken into its units
+    own = sampson(fit.fundamental, homogeneous(x1[seen]), homogeneous(x2[seen])) / fit.residual
+    assert float(torch.corrcoef(torch.stack([own, fit.distances[seen]]))[0, 1].abs()) > 0.99
+    assert 1.4826 * float(fit.distances[seen].abs().median()) == pytest.approx(1.0)
+
+
+def test_too_little_in_common_is_none():
+    a, b = tracks_of(filmed(12, seconds=2.0, generator=seeded()), 1.0)
+    assert Descent(a, b, FRAME).run(3.0) is None
+    assert Descent(a, b, FRAME).run(0.0).effective > 20
+
+
+def test_long_takes_are_thinned():
+    a, b = tracks_of(filmed(10, seconds=4.0, offset=0.2, generator=seeded(11)), 1.0)
+    whole, thin = Descent(a, b, FRAME).run(0.2), Descent(a, b, FRAME, rows=300).run(0.2)
+    assert len(thin.times) <= 31 < len(whole.times)
+    assert thin.offset == pytest.approx(whole.offset, abs=3 * (thin.sigma + whole.sigma))
+    assert thin.effective < whole.effective

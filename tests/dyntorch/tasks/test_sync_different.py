@@ -1,0 +1,164 @@
+"""Cameras that see different points: clocks, rates, refusal, and what must not matter."""
+
+import math
+
+import pytest
+import torch
+
+from dyntorch.tasks.synchronize import synchronize
+
+FRAME = 1 / 30
+
+
+def uniform(seed, *shape):
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def normal(seed, *shape):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+class Body:
+    """A body that moves in a few ways that never repeat; every point is a mix of them, in affine cameras."""
+
+    def __init__(self, seed=0, ways=6):
+        self.places = 0.3 * torch.arange(400, dtype=torch.float64) - 20
+        self.values = normal(seed, 400, ways)
+
+    def film(self, times, points, key, noise=0.5):
+        near = torch.exp(-0.5 * ((times[:, None] - self.places) / 0.25).square())  # smooth noise in time
+        ways = near @ self.values
+        place = 400 + 60 * normal(key, 1, points, 2)
+        mix = 12 * normal(key + 1, ways.shape[1], points, 2) + 20 * normal(key + 2, ways.shape[1], 1, 2)
+        return place + torch.einsum("tk,knd->tnd", ways, mix) + noise * normal(key + 3, len(times), points, 2)
+
+
+def clock(seconds, fps):
+    return torch.arange(round(seconds * fps), dtype=torch.float64) / fps
+
+
+def pair(offset, rate=1.0, seconds=8.0, fps=(30.0, 30.0), seed=0, **more):
+    """Tracks of eight points in a and six others in b."""
+    body, (ta, tb) = Body(seed), (clock(seconds, one) for one in fps)
+    return body.film(ta, 8, 10 + seed, **more), body.film((tb - offset) / rate, 6, 50 + seed, **more)
+
+
+def synced(a, b, **more):
+    return synchronize(a, b, correspondence=False, **{"fps": 30.0} | more)
+
+
+@pytest.mark.parametrize("offset", [0.0, 1.417, -0.75])
+def test_the_offset_is_found(offset):
+    shift = synced(*pair(offset))
+    assert shift.ok, shift.reason
+    assert shift.offset == pytest.approx(offset, abs=0.3 * FRAME)
+    assert shift.method == "subspace" and shift.points is None and shift.fundamental is None
+    assert shift.rate == 1 and shift.confidence > 0.9 and 0 < shift.sigma < FRAME
+    assert shift.peaks[0, 0] == pytest.approx(shift.offset, abs=1e-6)
+    assert shift.peaks[:, 1].tolist() == sorted(shift.peaks[:, 1].tolist(), reverse=True)
+    best = int(shift.scores.nan_to_num(-math.inf).argmax())
+    assert float(shift.lags[best]) == pytest.approx(offset, abs=FRAME)
+
+
+@pytest.mark.parametrize("fps", [(30.0, 25.0), (60.0, 30.0), (25.0, 50.0)])
+def test_frame_rates_differ(fps):
+    shift = synced(*pair(0.6, fps=fps), fps=fps)
+    assert shift.ok and shift.offset == pytest.approx(0.6, abs=0.4 * FRAME)
+    assert shift.fps == pytest.approx(fps)
+
+
+def test_times_since_1970_with_dropped_frames():
+    a, b = pair(0.4)
+    ta, tb = clock(8.0, 30.0) + 1.7e9, clock(8.0, 30.0) + 1.7e9 + 5
+    kept = uniform(3, 240) > 0.1
+    shift = synchronize(a[kept], b, correspondence=False, times=(ta[kept], tb), max_shift=8.0)
+    assert shift.ok and shift.offset == pytest.approx(5.4, abs=0.4 * FRAME)
+    assert 1.7e9 < shift.center < 1.7e9 + 8
+
+
+def test_later_clocks_shift_the_offset_and_nothing_else():
+    a, b = pair(0.4)
+    t = clock(8.0, 30.0)
+    one, two = synced(a, b), synchronize(a, b, correspondence=False, times=(t + 3, t - 4))
+    assert two.offset == pytest.approx(one.offset - 7, abs=1e-6) and two.sigma == pytest.approx(one.sigma)
+
+
+def test_exchanged_cameras_have_the_inverse_clock():
+    a, b = pair(-0.8)
+    assert synced(b, a).offset == pytest.approx(-synced(a, b).offset, abs=0.1 * FRAME)
+
+
+def test_neither_pixels_nor_order_nor_precision_matter():
+    a, b = pair(0.9)
+    shift = synced(a, b)
+    for other in (synced(0.5 * a + 30, b), synced(a.flip(1), b), synced(a.float(), b.float()), synced(a, b)):
+        assert other.ok and other.offset == pytest.approx(shift.offset, abs=0.02 * FRAME)
+
+
+def test_outliers_and_gaps():
+    a, b = pair(0.9)
+    a, b = a.clone(), b.clone()
+    a[uniform(1, 240, 8) < 0.03] += 120.0
+    a[60:85, 2], b[100:130, 4] = torch.nan, torch.nan
+    weights = torch.ones(240, 6)
+    b[150:170, 1], weights[150:170, 1] = 0.0, 0.0
+    shift = synced(a, b, weights=(None, weights))
+    assert shift.ok and shift.offset == pytest.approx(0.9, abs=0.4 * FRAME)
+
+
+def test_a_clock_rate_is_found():
+    shift = synced(*pair(0.5, rate=1.006, seconds=30.0), max_shift=2.0)
+    assert shift.ok and shift.rate == pytest.approx(1.006, abs=5e-4)
+    assert float(shift.at(15.0)) == pytest.approx(0.5 + 1.006 * 15, abs=FRAME)
+    assert abs(shift.rate - 1.006) < 5 * shift.rate_sigma
+
+
+def test_a_given_rate_is_held():
+    shift = synced(*pair(0.5, rate=0.95), rate=0.95)
+    assert shift.ok and shift.rate == 0.95 and shift.rate_sigma == 0
+    assert shift.offset == pytest.approx(0.5, abs=0.5 * FRAME)
+
+
+def test_the_search_ends_at_the_largest_shift():
+    shift = synced(*pair(0.5), max_shift=1.0)
+    assert shift.ok and float(shift.lags.abs().max()) < 1.0 + 1e-6
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_unrelated_motion_is_refused(seed):
+    a, b = pair(0.0, seed=seed)[0], pair(0.0, seed=seed + 100)[1]
+    shift = synced(a, b)
+    assert not shift.ok and shift.reason
+    with pytest.raises(ValueError, match="synchronize: "):
+        shift.check()
+
+
+def test_periodic_motion_is_refused():
+    body = Body(4)
+    t = clock(8.0, 30.0)
+    a, b = body.film(t % 1.2, 8, 1), body.film((t - 0.3) % 1.2, 6, 7)
+    shift = synced(a, b)
+    assert not shift.ok and shift.reason
+    away = (shift.peaks[:, 0] - 0.3) / 1.2
+    assert float((away - away.round()).abs().min()) < 0.05
+
+
+@pytest.mark.parametrize("more", [{"max_shift": 1.0}, {}])
+def test_nothing_to_go_by_is_refused(more):
+    a, b = pair(0.0)
+    for one, other in ((torch.full_like(a, torch.nan), b), (a, torch.full_like(b, torch.nan)), (torch.ones_like(a), b)):
+        shift = synced(one, other, **more)
+        assert not shift.ok and shift.reason and math.isfinite(shift.offset)
+
+
+def test_clocks_too_far_apart_for_the_search():
+    a, b = pair(0.0)
+    t = clock(8.0, 30.0)
+    shift = synchronize(a, b, correspondence=False, times=(t, t + 100), max_shift=1.0)
+    assert not shift.ok and shift.reason
+
+
+def test_numbers_of_points_may_differ_but_not_of_coordinates():
+    a, b = pair(0.3)
+    with pytest.raises(ValueError, match=r"b must be a tensor \(frames, points, 2\), got \(240, 12\)"):
+        synced(a, b.flatten(1))

@@ -1,0 +1,170 @@
+"""Tracks of one camera: smoothing against weighted least squares in numpy, noise against what was put in, and misuse."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from dyntorch.scenes import filmed
+from dyntorch.tasks.sync_tracks import noise_ratio, read_tracks, smoothed, without
+
+
+def seeded(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def tracks_of(x, fps=30.0, times=None, weights=None):
+    return read_tracks("a", x, None if times is not None else fps, times, weights)
+
+
+def irregular(frames, seed=0):
+    """Seconds of frames, some dropped, none where it should be, since 1970."""
+    place = torch.arange(frames, dtype=torch.float64) + 0.3 * torch.rand(frames, generator=seeded(seed), dtype=torch.float64)
+    return 1.7e9 + place[torch.rand(frames, generator=seeded(seed + 1)) > 0.1] / 30
+
+
+def line(tracks, j, moment, width):
+    """Position and velocity of point j by weighted least squares over all frames that show it."""
+    t = tracks.times.numpy() - moment
+    root = np.sqrt(tracks.weights[:, j].numpy() * np.exp(-0.5 * (t / width) ** 2))
+    found = np.linalg.lstsq(root[:, None] * np.stack([np.ones_like(t), t], 1), root[:, None] * tracks.x[:, j].numpy(), rcond=None)
+    return found[0]
+
+
+@pytest.mark.parametrize("width", [1 / 30, 0.1])
+def test_smoothing_is_weighted_least_squares_with_gaps_and_irregular_times(width):
+    times = irregular(60)
+    scene = filmed(5, times=(times, times), noise=2.0, missing=0.2, generator=seeded())
+    weights = torch.rand(len(times), 5, generator=seeded(3), dtype=torch.float64)
+    tracks = tracks_of(scene.a, times=times, weights=weights)
+    at = times[0] + (times[-1] - times[0]) * torch.rand(25, generator=seeded(4), dtype=torch.float64)
+    x, v, sure = smoothed(tracks, at, width)
+    known = (sure > 0).nonzero().tolist()
+    assert len(known) > 50
+    for i, j in known:
+        position, velocity = line(tracks, j, float(at[i]), width)
+        # the kernel ends at four standard deviations
+        assert np.abs(x[i, j].numpy() - position).max() < 0.05
+        assert np.abs(v[i, j].numpy() - velocity).max() < 0.05 / width
+    assert not x[sure == 0].any() and not v[sure == 0].any()
+
+
+def test_straight_motion_is_kept_exactly_everywhere():
+    t = torch.arange(40, dtype=torch.float64) / 25
+    x = torch.stack([100 + 30 * t, 50 - 80 * t], dim=-1)[:, None].clone()
+    x[10:13] = torch.nan
+    at = torch.linspace(0, 1.5, 33, dtype=torch.float64)
+    found, v, sure = smoothed(tracks_of(x, 25.0), at, 0.06)
+    seen = sure[:, 0] > 0
+    assert int(seen.sum()) > 25
+    assert torch.allclose(found[seen, 0], torch.stack([100 + 30 * at, 50 - 80 * at], dim=-1)[seen], atol=1e-9)
+    assert torch.allclose(v[seen, 0], torch.tensor([30.0, -80.0], dtype=torch.float64).expand(int(seen.sum()), 2), atol=1e-7)
+
+
+def test_gaps_and_places_beyond_the_take_have_no_weight():
+    x = torch.zeros(60, 2, 2)
+    x[20:40, 1] = torch.nan
+    at = torch.tensor([-0.5, 0.5, 1.0, 1.5, 2.5], dtype=torch.float64)
+    _, _, sure = smoothed(tracks_of(x), at, 1 / 30)
+    assert (sure > 0).tolist() == [[False, False], [True, True], [True, False], [True, True], [False, False]]
+    assert torch.allclose(sure[1], torch.ones(2, dtype=torch.float64), atol=0.01)
+
+
+def test_weights_are_those_of_the_frames_near_by():
+    weights = torch.full((40, 1), 0.25)
+    weights[20:] = 0.75
+    _, _, sure = smoothed(tracks_of(torch.zeros(40, 1, 2), weights=weights), torch.tensor([0.3, 1.0], dtype=torch.float64), 1 / 30)
+    assert sure[:, 0].tolist() == pytest.approx([0.25, 0.75], rel=0.02)
+
+
+def test_noise_that_is_left_does_not_depend_on_the_place_between_frames():
+    frames = 4000
+    x = torch.randn(frames, 3, 2, generator=seeded(), dtype=torch.float64)
+    phases = torch.linspace(0, 1, 9, dtype=torch.float64)
+    tracks, middle = tracks_of(x, 30.0), torch.arange(10, frames - 10, dtype=torch.float64)
+    left = torch.stack([smoothed(tracks, (middle + phase) / 30, 1 / 30)[0].square().mean() for phase in phases])
+    expected = 0.5 / math.sqrt(math.pi)  # of a Gaussian kernel of one frame
+    assert left.tolist() == pytest.approx([expected] * 9, rel=0.03)
+    assert float(left.max() / left.min()) < 1.01
+
+
+def test_the_noise_is_that_put_in_whatever_the_motion():
+    for sigma in (0.5, 2.0):
+        scene = filmed(15, seconds=6.0, noise=sigma, missing=0.1, generator=seeded(2))
+        assert tracks_of(scene.a).noise == pytest.approx(sigma, rel=0.15)
+        scene = filmed(15, seconds=6.0, noise=sigma, outliers=0.05, generator=seeded(2))
+        assert tracks_of(scene.a).noise == pytest.approx(1.25 * sigma, rel=0.15)  # four positions to a difference
+    assert tracks_of(filmed(15, generator=seeded(2)).a).noise < 0.1
+
+
+def test_the_change_of_coordinates_normalizes_what_is_seen():
+    scene = filmed(8, missing=0.2, generator=seeded())
+    tracks = tracks_of(scene.a)
+    seen = tracks.weights > 0
+    found = tracks.x[seen] @ tracks.change[:2, :2].mT + tracks.change[:2, 2]
+    assert torch.allclose(found.mean(0), torch.zeros(2, dtype=torch.float64), atol=1e-9)
+    assert float(found.square().sum(-1).mean()) == pytest.approx(2)
+    assert tracks.scale == pytest.approx(float((tracks.x[seen] - tracks.x[seen].mean(0)).square().sum(-1).mean().sqrt()))
+
+
+def test_noise_of_two_cameras_is_compared_within_bounds():
+    scene = filmed(12, seconds=6.0, generator=seeded(1))
+    noisy = [scene.exact[k] + torch.randn(scene.exact[k].shape, generator=seeded(k), dtype=torch.float64) for k in (0, 1)]
+    a, b, large = tracks_of(noisy[0]), tracks_of(noisy[1]), tracks_of(3 * noisy[1])
+    assert noise_ratio(a, b) == pytest.approx(1.0, rel=0.15)
+    assert noise_ratio(a, large) == pytest.approx(3.0, rel=0.15)
+    still = tracks_of(torch.zeros(30, 2, 2))
+    assert math.isfinite(noise_ratio(still, a)) and math.isfinite(noise_ratio(a, still))
+    straight = tracks_of(torch.arange(30.0, dtype=torch.float64)[:, None, None].expand(30, 2, 2))
+    assert noise_ratio(a, straight) == pytest.approx(straight.scale / a.scale)  # by size, where noise says nothing
+    wild = tracks_of(noisy[0] + 50 * torch.randn(noisy[0].shape, generator=seeded(5), dtype=torch.float64))
+    assert noise_ratio(a, wild) == pytest.approx(2 * wild.scale / a.scale)
+
+
+def test_missing_positions_and_weights_of_zero_are_the_same():
+    x = torch.rand(20, 3, 2, generator=seeded())
+    gone, weights = x.clone(), torch.ones(20, 3)
+    gone[4, 1], weights[4, 1] = torch.nan, 0
+    gone[7, 0, 1] = torch.inf
+    weights[7, 0] = 0
+    one, two = tracks_of(gone), tracks_of(x, weights=weights)
+    assert torch.equal(one.x, two.x) and torch.equal(one.weights, two.weights)
+    assert one.x.dtype == torch.float64
+    cut = without(tracks_of(x), weights == 0)
+    assert torch.equal(cut.x, one.x) and torch.equal(cut.weights, one.weights)
+    assert torch.equal(one.only(torch.tensor([True, False, True])).x, one.x[:, [0, 2]])
+
+
+def test_times_are_the_frames_or_those_given():
+    assert torch.allclose(tracks_of(torch.zeros(4, 1, 2), 25.0).times, torch.tensor([0, 0.04, 0.08, 0.12], dtype=torch.float64))
+    found = tracks_of(torch.zeros(4, 1, 2), times=torch.tensor([5.0, 5.1, 5.2, 5.5]))
+    assert found.step == pytest.approx(0.1, rel=1e-5) and found.times[0] == 5
+
+
+GOOD = torch.zeros(5, 2, 2)
+RISING = torch.arange(5.0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (([[1.0]], 30.0, None, None), r"a must be a tensor \(frames, points, 2\), got list"),
+        ((torch.zeros(5, 2, 3), 30.0, None, None), r"a must be a tensor \(frames, points, 2\), got \(5, 2, 3\)"),
+        ((torch.zeros(5, 2), 30.0, None, None), r"got \(5, 2\)"),
+        ((GOOD.int(), 30.0, None, None), r"a must hold floating point numbers, got torch.int32; use a.double\(\)"),
+        ((GOOD, None, None, None), r"fps of a must be a positive number of frames per second, got None; or give times="),
+        ((GOOD, 0.0, None, None), r"fps of a must be a positive number.*got 0.0"),
+        ((GOOD, math.inf, None, None), r"fps of a .*got inf"),
+        ((GOOD, math.nan, None, None), r"fps of a .*got nan"),
+        ((GOOD, None, RISING[:4], None), r"times of a must be 5 finite seconds, one per frame, got \(4,\)"),
+        ((GOOD, None, RISING.clone().index_fill(0, torch.tensor(2), math.nan), None), r"times of a must be 5 finite seconds"),
+        ((GOOD, None, RISING[[0, 1, 1, 2, 3]], None), r"times of a must increase, but frame 2 is not after .*; sort or drop"),
+        ((GOOD, 30.0, None, torch.ones(5)), r"weights of a must be \(5, 2\), finite and not negative, got \(5,\)"),
+        ((GOOD, 30.0, None, -torch.ones(5, 2)), r"weights of a must be \(5, 2\), finite and not negative"),
+        ((GOOD, 30.0, None, torch.full((5, 2), math.nan)), r"weights of a must be .* finite"),
+    ],
+)
+def test_misuse_names_the_field_and_the_remedy(arguments, words):
+    with pytest.raises(ValueError, match=words):
+        read_tracks("a", *arguments)

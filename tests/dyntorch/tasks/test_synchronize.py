@@ -1,0 +1,322 @@
+"""Two cameras with clocks of their own, end to end: known offsets and rates, what must not matter, and what is wrong with real tracks."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+
+from dyntorch.algebra.homogeneous import homogeneous
+from dyntorch.algebra.lens import distort
+from dyntorch.scenes import filmed
+from dyntorch.tasks.synchronize import synchronize
+
+FRAME = 1 / 30
+
+
+def seeded(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def film(seed=0, **more):
+    return filmed(**{"noise": 1.0, "generator": seeded(seed)} | more)
+
+
+def synced(scene, **more):
+    return synchronize(scene.a, scene.b, **{"fps": scene.fps} | more)
+
+
+def assert_found(shift, scene, within):
+    assert shift.ok, shift.reason
+    assert not shift.reason and shift.check() is shift
+    assert shift.offset == pytest.approx(scene.offset, abs=within)
+
+
+def same(one, other, tolerance=1e-6):
+    assert one.offset == pytest.approx(other.offset, abs=tolerance)
+    assert one.rate == pytest.approx(other.rate, abs=tolerance)
+    assert one.sigma == pytest.approx(other.sigma, rel=0.01)
+    assert one.ok == other.ok
+
+
+@pytest.mark.parametrize(("noise", "within"), [(0.0, 0.01), (1.0, 0.04), (4.0, 0.15)])
+@pytest.mark.parametrize("offset", [0.4217, -1.1, 0.0])
+def test_offsets_are_found_between_frames(noise, within, offset):
+    scene = film(1, noise=noise, offset=offset)
+    shift = synced(scene)
+    assert_found(shift, scene, within * FRAME)
+    assert shift.rate == 1 and shift.rate_sigma == 0 and shift.method == "epipolar" and shift.fps == pytest.approx((30, 30))
+    assert shift.confidence > 0.9 and 0 < shift.sigma < 0.1 * FRAME
+    assert shift.frames == pytest.approx(30 * shift.offset)
+    assert shift.points.all() and shift.points.shape == (15,) and not shift.notes
+    assert abs(shift.offset - offset) < 5 * math.hypot(shift.sigma, 0.001 * FRAME)
+
+
+def test_the_fundamental_matrix_is_that_of_the_cameras():
+    scene, still = film(2, offset=0.3, noise=0.3), film(2)
+    shift = synced(scene)
+    F, p, q = shift.fundamental, *(homogeneous(x.flatten(0, 1)) for x in (scene.exact[0], still.exact[1]))
+    value = ((q @ F) * p).sum(-1)
+    away = value / ((q @ F)[:, :2].square().sum(-1) + (p @ F.mT)[:, :2].square().sum(-1)).sqrt()
+    assert float(F.norm()) == pytest.approx(1) and float(torch.linalg.svdvals(F)[-1]) < 1e-10
+    assert float(away.square().mean().sqrt()) < 0.3
+
+
+def test_the_curve_and_its_peaks():
+    scene = film(3, offset=0.5)
+    shift = synced(scene)
+    assert shift.peaks.dtype == torch.float64 and shift.peaks.shape[1] == 2 and len(shift.peaks) > 1
+    assert shift.peaks[0, 0] == pytest.approx(shift.offset)
+    assert shift.peaks[:, 1].tolist() == sorted(shift.peaks[:, 1].tolist(), reverse=True)
+    best = int(shift.scores.nan_to_num(-math.inf).argmax())
+    assert float(shift.lags[best]) == pytest.approx(shift.offset, abs=0.51 * FRAME)
+    assert len(shift.lags) == len(shift.scores) == len(scene.a) + len(scene.b) - 1
+    assert shift.scores[0].isnan() and shift.scores[-1].isnan()
+
+
+@pytest.mark.parametrize("fps", [(30.0, 25.0), (60.0, 24.0), (29.97, 59.94)])
+def test_frame_rates_differ(fps):
+    scene = film(4, fps=fps, offset=-0.4)
+    shift = synced(scene)
+    assert_found(shift, scene, 0.05 * FRAME)
+    assert shift.fps == pytest.approx(fps) and shift.rate == 1
+
+
+def clock(frames, fps, seed, start):
+    """Seconds of frames, a tenth dropped, each somewhat late."""
+    place = torch.arange(frames, dtype=torch.float64) + 0.3 * torch.rand(frames, generator=seeded(seed), dtype=torch.float64)
+    return start + place[torch.rand(frames, generator=seeded(seed + 1)) > 0.1] / fps
+
+
+@pytest.mark.parametrize("start", [0.0, 1.7e9])
+def test_times_since_1970_of_irregular_frames(start):
+    times = clock(120, 30.0, 0, 0.0), clock(110, 25.0, 5, 0.5)
+    scene = film(5, times=times, offset=0.25)
+    shift = synchronize(scene.a, scene.b, times=(times[0] + start, times[1] + start + 7))
+    assert shift.ok and shift.offset == pytest.approx(7.25, abs=0.1 * FRAME)
+    assert start < shift.center < start + 5
+    assert float(shift.at(start + 2.0)) == pytest.approx(start + 9.25, abs=0.1 * FRAME)
+
+
+def test_later_clocks_shift_the_offset_and_nothing_else():
+    scene = film(6, offset=0.3)
+    shift = synchronize(scene.a, scene.b, times=scene.times)
+    same(shift, synced(scene), 1e-9)
+    later = synchronize(scene.a, scene.b, times=(scene.times[0] - 3, scene.times[1] + 5))
+    same(dataclasses.replace(later, offset=later.offset - 8), shift, 1e-7)
+    assert later.center == pytest.approx(shift.center - 3, abs=1e-6)
+    assert torch.allclose(later.lags, shift.lags + 8, atol=1e-6)
+
+
+@pytest.mark.parametrize("fps", [(30.0, 30.0), (30.0, 50.0)])
+def test_exchanged_cameras_have_the_inverse_clock(fps):
+    scene = film(7, offset=-0.37, fps=fps)
+    shift, back = synced(scene), synchronize(scene.b, scene.a, fps=fps[::-1])
+    assert back.offset == pytest.approx(-shift.offset, abs=2 * shift.sigma)
+    assert back.sigma == pytest.approx(shift.sigma, rel=0.5)
+    F = shift.fundamental
+    assert abs(float((back.fundamental.mT * F).sum())) == pytest.approx(1, abs=1e-3)
+
+
+def test_neither_pixels_nor_order_nor_precision_matter():
+    scene = film(8, offset=0.2)
+    shift = synced(scene)
+    turn = torch.tensor([[0.8, -0.6], [0.6, 0.8]], dtype=torch.float64)
+    same(synchronize(scene.a @ turn.mT * 0.25 + 7, scene.b * 0.25 - 100, fps=30.0), shift, 2e-4)
+    same(synchronize(2.0 * scene.a, scene.b, fps=30.0), shift, 2e-4)
+    same(synchronize(scene.a.flip(1), scene.b.flip(1), fps=30.0), shift, 1e-6)
+    same(synchronize(scene.a.float(), scene.b.float(), fps=30.0), shift, 1e-5)
+    assert torch.equal(synced(scene).scores.nan_to_num(0), shift.scores.nan_to_num(0))
+    assert synced(scene).offset == shift.offset
+
+
+def test_the_take_played_backwards_in_both_cameras():
+    scene = film(9, offset=0.3)
+    # frame i is at (T - i) / fps of clocks that run backwards
+    shift = synchronize(scene.a.flip(0), scene.b.flip(0), fps=30.0)
+    assert shift.ok and shift.offset == pytest.approx(-0.3, abs=0.05 * FRAME)
+
+
+def test_cameras_that_start_and_end_at_different_times():
+    scene = film(10, offset=0.3)
+    shift = synchronize(scene.a[20:], scene.b[:90], fps=30.0)
+    assert shift.ok and shift.offset == pytest.approx(0.3 + 20 * FRAME, abs=0.05 * FRAME)
+
+
+@pytest.mark.parametrize("rate", [30 / 29.83, 1.0002, 0.985])
+def test_clock_rates_are_found(rate):
+    scene = film(11, seconds=30.0, n=12, rate=rate, offset=0.7)
+    shift = synced(scene, max_shift=3.0)
+    assert_found(shift, scene, 0.1 * FRAME)
+    assert abs(shift.rate - rate) < max(4 * shift.rate_sigma, 1e-6) < 2e-4
+    moments = torch.tensor([1.0, 29.0], dtype=torch.float64)
+    assert torch.allclose(shift.at(moments), rate * moments + 0.7, atol=0.1 * FRAME)
+    assert torch.allclose(shift.inverse(shift.at(moments)), moments)
+    assert shift.peaks[0, 0] == pytest.approx(float(shift.at(shift.center)) - shift.center, abs=1e-6)
+    assert f"rate {1e6 * (shift.rate - 1):+.0f} ±" in repr(shift)
+
+
+def test_a_frame_rate_told_wrong_is_a_clock_rate():
+    scene = film(12, seconds=30.0, n=12, fps=(30.0, 29.83), offset=0.5)
+    shift = synced(scene, fps=30.0)
+    assert shift.ok and shift.rate == pytest.approx(29.83 / 30, abs=2e-5)
+    assert shift.offset == pytest.approx(0.5 * 29.83 / 30, abs=0.1 * FRAME)
+
+
+def test_clocks_of_rate_one_stay_so():
+    for seed in range(4):
+        assert synced(film(seed, seconds=15.0, n=12, offset=0.2), max_shift=1.0).rate == 1
+
+
+def test_a_given_rate_is_held():
+    scene = film(13, rate=0.9, offset=0.7)
+    shift = synced(scene, rate=0.9)
+    assert_found(shift, scene, 0.05 * FRAME)
+    assert shift.rate == 0.9 and shift.rate_sigma == 0
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_missing_blocks(seed):
+    scene = film(seed, missing=0.35, offset=-0.4)
+    assert_found(synced(scene), scene, 0.1 * FRAME)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_gross_outliers(seed):
+    scene = film(seed, outliers=0.15, offset=0.6)
+    assert_found(synced(scene), scene, 0.1 * FRAME)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_wrong_points_are_named_and_left_out(seed):
+    scene = film(seed, n=17, wrong=2, offset=-0.6)
+    shift = synced(scene)
+    assert_found(shift, scene, 0.1 * FRAME)
+    assert torch.equal(~shift.points, scene.wrong)
+    which = ", ".join(str(int(k)) for k in scene.wrong.nonzero())
+    assert shift.notes == (f"2 of 17 points never agree with the others and were left out: {which}",)
+
+
+def test_everything_at_once():
+    scene = film(3, n=17, seconds=6.0, noise=2.0, missing=0.2, outliers=0.08, wrong=1, offset=0.45, fps=(30.0, 25.0))
+    assert_found(synced(scene), scene, 0.2 * FRAME)
+
+
+def test_a_point_never_seen_changes_nothing():
+    scene = film(4, offset=0.3)
+    a = torch.cat([scene.a, torch.full_like(scene.a[:, :1], torch.nan)], dim=1)
+    b = torch.cat([scene.b, scene.b[:, :1]], dim=1)
+    same(synchronize(a, b, fps=30.0), synced(scene), 1e-4)
+
+
+def test_points_that_weigh_nothing_may_lie_anywhere():
+    scene = film(5, offset=0.3)
+    a, weights = scene.a.clone(), torch.ones(scene.a.shape[:2])
+    a[20:50, 3] = 7.0
+    weights[20:50, 3] = 0
+    gone = a.clone()
+    gone[20:50, 3] = torch.nan
+    same(synchronize(a, scene.b, fps=30.0, weights=(weights, None)), synchronize(gone, scene.b, fps=30.0), 1e-9)
+
+
+def test_one_point_on_a_long_path():
+    scene = film(6, n=1, seconds=20.0, noise=0.5, walk=1.5, offset=0.7)
+    shift = synced(scene, max_shift=3.0)
+    assert_found(shift, scene, 0.1 * FRAME)
+    assert shift.points.tolist() == [True]
+
+
+def test_affine_cameras_on_request():
+    scene = film(7, seconds=6.0, offset=0.3)
+    shift = synced(scene, camera="affine")
+    assert_found(shift, scene, 0.3 * FRAME)
+    assert shift.method == "affine" and shift.fundamental is None
+    assert synced(scene, camera="perspective").offset == synced(scene).offset
+
+
+def test_calibration_is_applied():
+    scene = film(8, noise=0.2, walk=1.2, offset=0.3)
+    K = torch.tensor([[1000.0, 0, 640], [0, 1000, 480], [0, 0, 1]], dtype=torch.float64)
+    dist = torch.tensor([-0.3, 0.1, 0.001, 0.0], dtype=torch.float64)
+    bent = distort(scene.a, K, dist), distort(scene.b, K, dist)
+    shift = synchronize(*bent, fps=30.0, calibration=((K, dist), (K.tolist(), dist.tolist())))
+    same(shift, synced(scene), 1e-5)
+    assert not shift.notes
+    one = synchronize(bent[0], scene.b, fps=30.0, calibration=((K, dist), None))
+    same(one, synced(scene), 1e-5)
+
+
+def test_lenses_that_nobody_calibrated_are_straightened_with_a_note():
+    scene = film(9, seconds=6.0, noise=0.3, walk=1.2, lens=-0.35, offset=0.7)
+    shift = synced(scene)
+    assert_found(shift, scene, 0.05 * FRAME)
+    assert len(shift.notes) == 1
+    assert shift.notes[0].startswith("lens distortion fitted, lambda = -0.")
+
+
+def test_a_camera_that_moves_in_between_is_noted():
+    scene = film(10, seconds=6.0, noise=0.5, offset=0.1)
+    b = scene.b.clone()
+    b[95:] += torch.tensor([4.0, 8.0], dtype=torch.float64)
+    shift = synchronize(scene.a, b, fps=30.0)
+    assert shift.offset == pytest.approx(0.1, abs=0.2 * FRAME)
+    assert any("a camera may have moved" in note for note in shift.notes)
+
+
+def test_the_generator_is_of_the_subsets_and_repeats():
+    scene = film(0, n=17, wrong=2, offset=-0.6)
+    one, two = (synced(scene, generator=seeded(5)) for _ in range(2))
+    assert one.offset == two.offset and torch.equal(one.points, two.points)
+    assert torch.equal(one.points, synced(scene, generator=seeded(6)).points)
+
+
+def test_the_input_stays_as_it_was():
+    scene = film(1, missing=0.2, outliers=0.1)
+    a, b = scene.a.clone(), scene.b.clone()
+    synced(scene)
+    assert torch.equal(a.nan_to_num(-1), scene.a.nan_to_num(-1)) and torch.equal(b.nan_to_num(-1), scene.b.nan_to_num(-1))
+
+
+A, TIMES = torch.rand(20, 4, 2, generator=seeded()), torch.arange(20.0)
+K = [[100.0, 0, 50], [0, 100, 50], [0, 0, 1]]
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        ({}, r"give either fps or times, got neither"),
+        ({"fps": 30.0, "times": (TIMES, TIMES)}, r"give either fps or times, got both"),
+        ({"fps": (30.0, 30.0, 25.0)}, r"fps must be a pair, one of a and one of b, got 3 values"),
+        ({"times": (TIMES,)}, r"times must be a pair, one of a and one of b, got 1 values"),
+        ({"fps": (30.0, -1.0)}, r"fps of b must be a positive number of frames per second, got -1.0"),
+        ({"times": (TIMES, TIMES[:19])}, r"times of b must be 20 finite seconds, one per frame, got \(19,\)"),
+        ({"times": (TIMES.flip(0), TIMES)}, r"times of a must increase, but frame 1 is not after the one before; sort or drop"),
+        ({"fps": 30.0, "max_shift": 0.0}, r"max_shift must be a positive number of seconds or None, got 0.0"),
+        ({"fps": 30.0, "max_shift": math.inf}, r"max_shift must be .* got inf"),
+        ({"fps": 30.0, "rate": 30.0}, r"rate must be about 1 .*, got 30.0; give fps for frame rates"),
+        ({"fps": 30.0, "camera": "pinhole"}, r"camera must be one of auto, perspective, affine, got 'pinhole'"),
+        ({"fps": 30.0, "camera": "affine", "correspondence": False}, r"camera='affine' is for corresponding points; leave it away"),
+        ({"fps": 30.0, "weights": (None, torch.ones(20, 3))}, r"weights of b must be \(20, 4\)"),
+        ({"fps": 30.0, "calibration": (K, None)}, r"calibration of a: calibration of a camera must be None or \(K, dist\)"),
+        ({"fps": 30.0, "calibration": ((K, None),)}, r"calibration must be a pair, of a and of b: each None or \(K, dist\)"),
+        ({"fps": 30.0, "calibration": (None, ([[1.0]], None))}, r"calibration of b: calibration: K must be"),
+    ],
+)
+def test_misuse_names_the_field_and_the_remedy(more, words):
+    with pytest.raises(ValueError, match=words):
+        synchronize(A, A, **more)
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "words"),
+    [
+        (A.numpy(), A, r"a must be a tensor \(frames, points, 2\), got ndarray"),
+        (A, A[..., :1], r"b must be a tensor \(frames, points, 2\), got \(20, 4, 1\)"),
+        (A, A.long(), r"b must hold floating point numbers, got torch.int64"),
+        (A[:11], A, r"a has 11 frames, 12 are needed at least"),
+        (A, A[:, :3], r"a has 4 points and b 3: corresponding points are as many; give the same ones .* correspondence=False"),
+    ],
+)
+def test_wrong_tracks_are_named(a, b, words):
+    with pytest.raises(ValueError, match=words):
+        synchronize(a, b, fps=30.0)
