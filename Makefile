@@ -33,6 +33,7 @@ bench: install
 	$(BIN)/python -m experiments.benchmarks.robust_peers
 	$(BIN)/python -m experiments.benchmarks.lifted
 	$(BIN)/python -m experiments.benchmarks.segmentation
+	$(BIN)/python -m experiments.benchmarks.synchronization
 	$(BIN)/python -m experiments.benchmarks.action_indexer
 
 tables: install
@@ -47,8 +48,12 @@ tables: install
 	$(BIN)/python -m experiments.translating_planes
 	$(BIN)/python -m experiments.segmentation
 	$(BIN)/python -m experiments.segmentation_sensitivity
+	$(BIN)/python -m experiments.synchronization
+	$(BIN)/python -m experiments.brightness_synchronization
+	$(BIN)/python -m experiments.pair_reconstruction
 	$(BIN)/python -m experiments.real_lifted
 	$(BIN)/python -m experiments.real_planar
+	$(BIN)/python -m experiments.real_synchronization
 	$(BIN)/python -m experiments.real_space
 	$(BIN)/python -m experiments.action_recognition
 	$(BIN)/python -m experiments.action_baselines

@@ -74,8 +74,9 @@ class Attempt:
             return []
         found = [(self._shift(lag), score) for lag, score in self.curve.peaks(4 * PEAKS)]
         here = [score for shift, score in found if self._near(shift)]
-        others = [(shift, score) for shift, score in found if not self._near(shift)]
         own = here[0] if here else self._score(self.fit.shift)
+        # a higher maximum of the curve that a descent found no better is none
+        others = [(shift, min(score, own)) for shift, score in found if not self._near(shift)]
         return [(self.fit.shift, own), *others[: PEAKS - 1]]
 
     @cached_property
@@ -110,9 +111,13 @@ class Attempt:
     def half_curves(self) -> list[Curve]:
         """Scores by a half of the overlap at a time."""
         assert self.fit is not None
-        frames = float(self.a.times[0]) + self.step * torch.arange(len(self.samples.w1), dtype=torch.float64)
-        early = (frames.to(self.samples.w1.device) < self.fit.center)[:, None]
-        parts = torch.where(early, self.samples.w1, 0.0), torch.where(early, 0.0, self.samples.w1)
+        w1 = self.samples.w1
+        times = float(self.a.times[0]) + self.step * torch.arange(len(w1), dtype=torch.float64, device=w1.device)
+        there = times * self.fit.rate + self.fit.offset
+        # what only a shows would have its largest overlap at another shift
+        shared = (there >= float(self.b.times[0]) - self.step) & (there <= float(self.b.times[-1]) + self.step)
+        early = times < self.fit.center
+        parts = [torch.where((shared & part)[:, None], w1, 0.0) for part in (early, ~early)]
         return [epipolar_curve(dataclasses.replace(self.samples, w1=part), self.max_shift, HALF) for part in parts]
 
     @cached_property

@@ -264,10 +264,10 @@ def _notes(table: Sequence[Pair], cameras: int, shifts: Mapping[tuple[int, int],
         i, j = row.cameras
         if row.outlier:
             own = row if row.peak < 0 else None
-            away = f" by {own.residual:+.3f} s" if own else f": the others confirm its peak {row.peak + 1} at {row.shift:+.3f} s"
+            away = f" by {own.residual:+.3f} s" if own else f": the others confirm its {_place(row.peak)} at {row.shift:+.3f} s"
             notes.append(f"pair {i}-{j} is sure of itself but contradicts the others{away}")
         elif row.used and not row.ok and cameras > 2:
-            notes.append(f"pair {i}-{j} refused on its own; the others confirm its peak {row.peak + 1} at {row.shift:+.3f} s")
+            notes.append(f"pair {i}-{j} refused on its own; the others confirm its {_place(row.peak)} at {row.shift:+.3f} s")
     notes += [f"pair {i}-{j}: {note}" for (i, j), shift in shifts.items() for note in shift.notes]
     return tuple(notes)
 
@@ -278,3 +278,7 @@ def _named(cameras: Sequence[int]) -> str:
 
 def _listed(pairs: Sequence[tuple[int, int]]) -> str:
     return ", ".join(f"{i}-{j}" for i, j in pairs)
+
+
+def _place(peak: int) -> str:
+    return "best peak" if peak == 0 else f"peak number {peak + 1}"

@@ -19,6 +19,9 @@ PEELED = 6.0
 """Robust standard deviations from that line."""
 ALONE = 2.0
 """Times the residual of the neighbours: a sudden movement bends several frames alike, a wrong position its own most."""
+FINE = 1e-3
+"""Of the distance of the points from their mean: a deviation below it is none, whatever the spread; points at rest have no
+spread."""
 ROUNDS = 8
 
 
@@ -28,7 +31,8 @@ def cleaned(tracks: Tracks) -> Tracks:
 
     .. math:: |x_t - m_t| > \tau\, 1.4826\, \mathrm{med}_{|k| \le K} |x_{t+k} - m_t|,\quad m_t = \mathrm{med}_{|k| \le K}\, x_{t+k}
 
-    The spread has a floor of the track's own usual one, without which a point at rest would lose good positions.  The median leaves
+    The spread has floors, the track's own usual one and that of most tracks, without which a point at rest would lose good
+    positions.  The median leaves
     5 of 100 outliers (of 15 mm of noise, 15 of 100 positions anywhere), often far away; the second pass leaves 2, near by.
 
     Source: Hampel 1974, The influence curve and its role in robust estimation.
@@ -47,6 +51,7 @@ def _far_from_median(tracks: Tracks) -> Tensor:
     far = (x - middle).abs()
     spread = 1.4826 * (window - middle[..., None]).abs().nanmedian(-1).values
     usual = 1.4826 * torch.where(seen[..., None], far, torch.nan).nanmedian(0).values
+    usual = torch.maximum(usual, torch.maximum(usual.nanmedian(0).values, usual.new_tensor(FINE * tracks.scale)))
     return (far > OUTLYING * torch.maximum(spread, usual)).any(-1)
 
 
@@ -56,6 +61,7 @@ def _peeled(tracks: Tracks) -> Tracks:
     for _ in range(ROUNDS):
         away = _from_line(tracks.x, kept)
         scale = 1.4826 * away.nanmedian(0).values
+        scale = scale.clamp(min=max(FINE * tracks.scale, float(scale.nanmedian().nan_to_num(0.0))))
         away = away.nan_to_num(0.0)
         rows = pad(away, (0, 0, 2, 2))
         near = torch.stack([rows[k : k + len(away)] for k in (0, 1, 3, 4)])

@@ -61,7 +61,8 @@ def consistent_points(a: Tracks, b: Tracks, found: Attempt, generator: Generator
     assert best is not None
     each = best[1]
     level = each[each <= best[0]].median()
-    return ~(each > WRONG**2 * level)
+    kept = ~(each > WRONG**2 * level)
+    return kept if int(kept.sum()) >= SHARE * n else None
 
 
 def _variances(moments: Tensor, forms: Tensor, F: Tensor) -> Tensor:

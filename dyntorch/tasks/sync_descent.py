@@ -13,11 +13,9 @@ from dyntorch.algebra.epipolar import rank_two
 from dyntorch.algebra.epipolar_variance import epipolar_variance
 from dyntorch.algebra.homogeneous import homogeneous
 from dyntorch.least_squares import damped_step
+from dyntorch.tasks.sync_grid import Grid
 from dyntorch.tasks.sync_tracks import Tracks, noise_ratio, smoothed
 
-CALM = 0.75, 1.25, 2.5
-"""Velocities are smoothed more widely than positions: what noise they share with the residuals would pull the estimate and
-make it look surer than it is.  How much more: 1 + .75 times the noise over the movement from frame to frame, within bounds."""
 CUT = 4.0
 """Robust standard deviations of the residual at which Geman and McClure's weight is a quarter."""
 BLOCK = 30
@@ -31,6 +29,8 @@ DONE = 1e-5
 """Frames: the descent ends with a step below it."""
 LEAP = 2.0
 """Frames: the largest step."""
+LEAST = 0.003
+"""Frames of error that smoothing leaves in exact data."""
 FASTEST = 0.03
 """Change of the rate at which a descent has gone astray."""
 ROWS = 200_000
@@ -41,45 +41,6 @@ FEWEST = 16
 MEMORY = 2.0, 6
 """Residuals are taken to depend on each other over two seconds, but a sixth of the overlap at the most: detectors err for that
 long."""
-
-
-@dataclass(frozen=True, eq=False)
-class Grid:
-    """Smoothed tracks of b at equal steps, for positions and velocities anywhere between by cubic Hermite polynomials."""
-
-    start: float
-    step: float
-    x: Tensor  # (m, n, 2)
-    v: Tensor
-    calm: Tensor  # velocities to differentiate by
-    weights: Tensor  # (m, n)
-
-    @staticmethod
-    def of(tracks: Tracks, width: float) -> Grid:
-        """With steps of half the kernel's width: between them the polynomial is exact to thousandths of the noise."""
-        step, start = width / 2, float(tracks.times[0])
-        count = max(2, math.ceil((float(tracks.times[-1]) - start) / step) + 1)
-        at = start + step * torch.arange(count, dtype=torch.float64, device=tracks.x.device)
-        x, v, weights = smoothed(tracks, at, width)
-        speed = float(torch.where(weights > 0, v.square().sum(-1), torch.nan).nanmedian()) ** 0.5
-        slope, least, most = CALM
-        wider = min(max(1 + slope * tracks.noise / max(speed * width, 1e-300), least), most)
-        _, calm, _ = smoothed(tracks, at, wider * width)
-        return Grid(start, step, x, v, calm, weights)
-
-    def at(self, times: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Positions, velocities ``(m, n, 2)`` and weights ``(m, n)``, 0 where not seen."""
-        place = (times - self.start) / self.step
-        left = place.floor().clamp(0, len(self.x) - 2).long()
-        u = (place - left)[:, None, None]
-        inside = (place >= 0) & (place <= len(self.x) - 1)
-        x0, x1 = self.x[left], self.x[left + 1]
-        v0, v1 = self.step * self.v[left], self.step * self.v[left + 1]
-        d, s = x1 - x0, v0 + v1
-        x = x0 + u * (v0 + u * (3 * d - s - v0 + u * (s - 2 * d)))
-        v = self.calm[left] + u * (self.calm[left + 1] - self.calm[left])
-        w0, w1 = self.weights[left], self.weights[left + 1]
-        return x, v, torch.where((w0 > 0) & (w1 > 0) & inside[:, None], w0 + u[..., 0] * (w1 - w0), 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,7 +198,7 @@ class Descent:
             offset=state.offset,
             rate=state.rate,
             center=state.center,
-            sigma=OPTIMISM * float(sigmas[0]),
+            sigma=math.hypot(OPTIMISM * float(sigmas[0]), LEAST * self.frame),
             rate_sigma=OPTIMISM * float(sigmas[1]) if free_rate else 0.0,
             residual=scale_of,
             fundamental=F / F.norm(),

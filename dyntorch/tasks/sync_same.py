@@ -25,16 +25,24 @@ SUSPECT = 3.0
 """Times the usual residual, beyond which a point is wrong."""
 FAR = 6.0
 """Robust standard deviations from the fit at which a position counts as an outlier."""
+LOST = 0.3
+"""Share of the positions of a point, or of a stretch of the take, that may be outliers."""
+STRETCHES = 8
 ROUGH = 1.25
 """Residual over what the noise explains, from which lenses are looked at."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Result:
-    """The best attempt and what it took."""
+    """The best attempt and what it took.
+
+    Attributes:
+        seen: ``(n,)`` bool, points that both cameras show at all.
+    """
 
     found: Attempt
     notes: tuple[str, ...]
+    seen: Tensor
 
 
 def same_points(
@@ -56,8 +64,11 @@ def same_points(
     """
     span = min(float(t.times[-1] - t.times[0]) for t in (a, b))
     search = Search(step=span / LONGEST, max_shift=max_shift, rates=(rate or 1.0,), free_rate=rate is None)
+    seen = (a.weights > 0).any(0) & (b.weights > 0).any(0)
+    if a.still or b.still:
+        return Result(dataclasses.replace(attempt(a, b, search), fit=None), (), seen)
     if camera == "affine":
-        return Result(_affine(a, b, search, generator), ())
+        return Result(_affine(a, b, search, generator), (), seen)
     found = _sorted_out(a, b, search, generator)
     if not found.decided and rate is None:
         found = _better(found, _over_rates(a, b, search, span, generator))
@@ -68,8 +79,9 @@ def same_points(
         scaled = _affine(a, b, search, generator)
         # without the place in the picture a gait repeats itself, so that affine cameras alone may be sure of a wrong period
         if scaled.decided and _agree(scaled, found):
-            return Result(scaled, ("affine cameras: the points do not hold enough depth, or are too noisy, for perspective ones",))
-    return Result(found, notes)
+            note = "affine cameras: the points do not hold enough depth, or are too noisy, for perspective ones"
+            return Result(scaled, (note,), seen)
+    return Result(found, notes if found.decided else (), seen)
 
 
 def _sorted_out(a: Tracks, b: Tracks, search: Search, generator: Generator | None) -> Attempt:
@@ -93,8 +105,12 @@ def _pruned(found: Attempt) -> tuple[Tracks, Tracks] | None:
     if fit is None or len(fit.times) != len(found.a.times):
         return None
     far = fit.distances.abs() > FAR
-    share = float(far.sum()) / max(1, int(fit.distances.isfinite().sum()))
-    if not 1e-3 < share < 0.3:
+    seen = fit.distances.isfinite()
+    # a point that is mostly elsewhere is another point, and is found as such
+    far = far & (far.sum(0) <= LOST * seen.sum(0))
+    parts = [(float(one.sum()), float(all_.sum())) for one, all_ in zip(far.chunk(STRETCHES), seen.chunk(STRETCHES), strict=True)]
+    # a stretch that does not fit is no outlier: it contradicts
+    if not bool(far.any()) or any(lost > LOST * whole for lost, whole in parts):
         return None
     frames, joints = far.nonzero().unbind(1)
     there = fit.times[frames] * fit.rate + fit.offset

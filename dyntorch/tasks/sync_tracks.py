@@ -50,12 +50,11 @@ class Tracks:
         return float(self.centred.square().sum(-1).mul(self.weights).sum().div(self.weights.sum().clamp(min=1e-300)).sqrt())
 
     @property
-    def motion(self) -> float:
-        """Root mean square distance of the points from where each is in the mean."""
-        total = self.weights.sum(0).clamp(min=1e-300)
-        mean = (self.x * self.weights[..., None]).sum(0) / total[:, None]
-        away = (self.x - mean).square().sum(-1) * self.weights
-        return float((away.sum() / self.weights.sum().clamp(min=1e-300)).sqrt())
+    def still(self) -> bool:
+        """Whether no point moves by more than a millionth of how far points lie apart."""
+        share = self.weights / self.weights.sum(0).clamp(min=1e-300)
+        away = (self.x - (self.x * share[..., None]).sum(0)).square().sum(-1)
+        return bool((torch.where(share > 0, away, 0.0).amax(0).sqrt() <= 1e-6 * self.scale).all())
 
     @property
     def centred(self) -> Tensor:

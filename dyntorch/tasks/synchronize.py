@@ -14,7 +14,7 @@ from dyntorch.algebra.lens import undistorted
 from dyntorch.tasks.shift import Shift
 from dyntorch.tasks.sync_attempt import APART, WANDER, Attempt
 from dyntorch.tasks.sync_cleaning import cleaned
-from dyntorch.tasks.sync_same import same_points
+from dyntorch.tasks.sync_same import Result, same_points
 from dyntorch.tasks.sync_tracks import Tracks, read_tracks
 
 SHORTEST = 12
@@ -113,7 +113,7 @@ def synchronize(
     result = same_points(
         first, second, max_shift=max_shift, rate=rate, camera=camera, lenses=calibration is None, generator=generator
     )
-    return _shift(result.found, result.notes).since(origin)
+    return _shift(result).since(origin)
 
 
 def _check(
@@ -154,33 +154,22 @@ def _straight(name: str, tracks: Tracks, lens: Any) -> Tracks:
     return dataclasses.replace(tracks, x=torch.where(seen[..., None], x, 0.0), weights=torch.where(seen, tracks.weights, 0.0))
 
 
-def _shift(found: Attempt, notes: tuple[str, ...]) -> Shift:
+def _shift(result: Result) -> Shift:
     """The result of an attempt."""
+    found, notes = result.found, result.notes
     fps = 1 / found.a.step, 1 / found.b.step
     fit = found.fit
+    points = found.points & result.seen
     if fit is None:
-        nothing = torch.zeros(0, dtype=torch.float64)
+        none = torch.zeros(0, dtype=torch.float64)
         reason = _nothing(found)
         return Shift(
-            0.0,
-            math.inf,
-            1.0,
-            0.0,
-            0.0,
-            nothing.reshape(0, 2),
-            False,
-            reason,
-            found.method,
-            fps,
-            0.0,
-            nothing,
-            nothing,
-            found.points,
+            0.0, math.inf, 1.0, 0.0, 0.0, none.reshape(0, 2), False, reason, found.method, fps, 0.0, none, none, result.seen
         )
-    wrong = int((~found.points).sum())
+    wrong = (result.seen & ~found.points).nonzero()[:, 0].tolist()
     if wrong:
-        which = ", ".join(str(int(i)) for i in (~found.points).nonzero()[:, 0])
-        notes = (*notes, f"{wrong} of {len(found.points)} points never agree with the others and were left out: {which}")
+        which = ", ".join(str(point) for point in wrong)
+        notes = (*notes, f"{len(wrong)} of {len(points)} points never agree with the others and were left out: {which}")
     if found.decided and found.wander > WANDER:
         notes = (*notes, "each half of the take fits much better by itself: a camera may have moved")
     lags = found.curve.rate * (found.curve.lags + fit.center) - fit.center
@@ -198,7 +187,7 @@ def _shift(found: Attempt, notes: tuple[str, ...]) -> Shift:
         center=fit.center,
         lags=lags,
         scores=found.curve.scores,
-        points=found.points,
+        points=points,
         fundamental=fit.fundamental if found.method == "epipolar" else None,
         notes=notes,
     )
@@ -209,7 +198,7 @@ def _nothing(found: Attempt) -> str:
     for name, tracks in (("a", found.a), ("b", found.b)):
         if not bool((tracks.weights > 0).any()):
             return f"no point is seen in {name}; check the detections"
-        if tracks.motion <= 1e-6 * tracks.scale:
+        if tracks.still:
             return f"nothing moves in {name}; film some movement"
     return "no shift stands out, or both cameras never show enough points at once; film longer, or raise max_shift"
 
@@ -217,22 +206,19 @@ def _nothing(found: Attempt) -> str:
 def _reason(found: Attempt) -> str:
     fit = found.fit
     assert fit is not None
-    if fit.sigma > BLIND * found.frame or min(found.a.motion / found.a.scale, found.b.motion / found.b.scale) <= 1e-6:
+    if fit.sigma > BLIND * found.frame:
         return _nothing(found)
     if not found.sharp:
         return (
-            f"the motion is too small for its noise: the best shift, {fit.shift:+.3g} s, is uncertain by {fit.sigma:.2g} s or
-            more; " "film larger or faster movements"
+            f"the motion is too small for its noise: the best shift, {fit.shift:+.3g} s, is uncertain by {fit.sigma:.2g} s "
+            "or more; film larger or faster movements"
         )
     if found.edge:
         return f"the best shift, {fit.shift:+.3g} s, is at the end of the search; raise max_shift"
     if found.margin < found.needed and len(found.peaks) > 1:
-        near = [
-            peak
-            for peak, misfit in zip(found.peaks[1:], found.misfits[1:], strict=True)
-            if found.misfits[0] - misfit < found.needed
-        ]
-        rivals = ", ".join(f"{shift:+.3g} s" for shift, _ in near[:3])
+        least = found.misfits[0] - found.needed
+        near = [shift for (shift, _), misfit in zip(found.peaks, found.misfits, strict=True) if misfit > least]
+        rivals = ", ".join(f"{shift:+.3g} s" for shift in near[1:4])
         return (
             f"the motion repeats itself or is too small: {found.peaks[0][0]:+.3g} s fits hardly better than {rivals}; "
             "film something that happens once, or narrow max_shift"

@@ -43,7 +43,10 @@ def test_files_are_written_and_parse(tmp_path):
 
 def test_what_two_cameras_say_in_words():
     said = describe(report())
-    assert "shows 0.400 ± 0.002 s later on its own clock (12.00 frames), and +0.072 s in an hour." in said
+    assert "cam1<b> began 0.400 ± 0.002 s before cam0<b> (12.00 frames), and its clock gains +0.072 s in an hour." in said
+    assert "began 0.400 ± 0.002 s after" in describe(
+        report(clocks=[report().clocks[0], Clock("b", "b", 30.0, False, 9, 0.0, 3.0, -0.4, 0.002)])
+    )
     assert "do not decide" in describe(report(ok=False, reason="too still"))
 
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-import dyntorch
 import indexing
 from indexing.clip import Clip
 from indexing.skeleton import COCO17, HALPE26, Skeleton
@@ -138,10 +137,6 @@ def test_remarks_are_about_recordings():
 
 
 # ---- the library itself --------------------------------------------------------------------------------------------------
-needs_library = pytest.mark.skipif("synchronize" not in dyntorch.__all__, reason="the library has no synchronize")
-
-
-@needs_library
 def test_two_cameras_of_one_scene(cameras):
     found = synchronize(cameras[0], cameras[1])
     assert found.ok and found.frames == pytest.approx(SKIPPED[0] - SKIPPED[1], abs=0.5), found

@@ -58,6 +58,19 @@ def test_a_point_at_rest_keeps_its_positions():
     assert not removed(tracks, cleaned(tracks))[:, 1].any()
 
 
+def test_positions_in_whole_pixels_stay():
+    x = (100 + 0.3 * torch.randn(100, 4, 2, generator=seeded(), dtype=torch.float64)).round()
+    tracks = tracks_of(x)
+    assert float(removed(tracks, cleaned(tracks)).float().mean()) < 0.02
+
+
+def test_movement_after_rest_stays():
+    t = torch.arange(120, dtype=torch.float64) / 30
+    x = (100 + 50 * torch.where(t > 2, (2 * torch.pi * t).sin(), 0.0))[:, None, None].expand(120, 1, 2)
+    tracks = tracks_of(x)
+    assert int(removed(tracks, cleaned(tracks)).sum()) <= 2
+
+
 def test_a_sudden_movement_stays():
     x = 0.5 * torch.randn(80, 1, 2, generator=seeded(2), dtype=torch.float64)
     x[40:] += 200.0  # and stays there

@@ -51,6 +51,7 @@ def test_repeated_motion_is_refused_with_its_peaks(films):
 def test_too_little_motion_and_flicker_are_said(films, rng):
     a, b = films
     still = np.clip(b[:1] + rng.normal(0, 2, b.shape), 0, 255).astype(np.uint8)
+    a, b, still = a[:40], b[:40], still[:40]
     assert "nothing moves in b" in brightness_shift(a, still, fps=FPS).reason
     flicker = (b * (0.2 + 0.4 * (np.arange(len(b)) % 3))[:, None, None]).astype(np.uint8)
     assert "light flickers" in brightness_shift(a, flicker, fps=FPS).reason
@@ -59,7 +60,7 @@ def test_too_little_motion_and_flicker_are_said(films, rng):
 
 
 def test_shaking_camera_is_said(films):
-    a, b = films
+    a, b = (video[:60] for video in films)
     rng = np.random.default_rng(1)
     path = np.cumsum(rng.integers(-1, 2, (len(b), 2)), axis=0).clip(-6, 6)
     shaken = np.stack([np.pad(f, 8, mode="edge")[8 + y : 68 + y, 8 + x : 88 + x] for f, (x, y) in zip(b, path, strict=True)])
@@ -67,15 +68,15 @@ def test_shaking_camera_is_said(films):
 
 
 def test_max_shift_and_region(films):
-    a, b = films
+    a, b = (video[:70] for video in films)
     shift = brightness_shift(a[25:], b, fps=FPS, max_shift=0.5, region=(0, 0, 80, 60))
     assert abs(shift.offset) <= 0.5 + 1 / 60
-    assert brightness_shift(a[25:], b, fps=FPS, region=None).lags.shape == (125 + 150 - 1,)
+    assert brightness_shift(a[25:], b, fps=FPS, region=None).lags.shape == (45 + 70 - 1,)
 
 
 BAD = {
     "max_shift must be": {"max_shift": -1.0},
-    "overlap by less than": {"times": (np.arange(150) / 30.0, 500 + np.arange(150) / 30.0), "max_shift": 2.0},
+    "overlap by less than": {"times": (np.arange(30) / 30.0, 500 + np.arange(30) / 30.0), "max_shift": 2.0},
     "region must be 'motion'": {"region": "person"},
     "region must be .x0": {"region": (5.0, 0.0, 2.0, 9.0)},
     "outside the image of a": {"region": (500.0, 0.0, 600.0, 9.0)},
@@ -87,4 +88,4 @@ BAD = {
 @pytest.mark.parametrize("words", BAD)
 def test_bad_input_is_named(films, words):
     with pytest.raises(ValueError, match=words):
-        brightness_shift(*films, **({"fps": FPS} | BAD[words]))
+        brightness_shift(*(video[:30] for video in films), **({"fps": FPS} | BAD[words]))

@@ -26,7 +26,9 @@ def test_cameras_are_found_and_named(tmp_path, cameras):
         (tmp_path / "videos" / name).touch()
     assert list(find_cameras([tmp_path / "videos"])) == ["l", "r"]
     files = [tmp_path / name / "pose.json" for name in ("left", "right")]
-    assert list(find_cameras(files)) == ["left", "right"] and list(find_cameras([one, one])) == ["cam01-1", "cam01-2"]
+    assert list(find_cameras(files)) == ["left", "right"]
+    with pytest.raises(ValueError, match=r"cam01_json: given twice"):
+        find_cameras([one, two, tmp_path / "pose" / ".." / "pose" / "cam01_json"])
     for paths in ([], [one]):
         with pytest.raises(ValueError, match=r"two are needed"):
             find_cameras(paths)

@@ -41,11 +41,11 @@ def knock(i):
 
 
 def test_a_camera_on_a_tripod_stands_still(scene):
-    chunks, _ = scene(90, noise=5.0)
+    chunks, _ = scene(45, noise=5.0)
     camera = camera_motion(chunks)
     assert not camera.moves and camera.kind == "still" and camera.share == 0 and camera.moments == ()
     assert str(camera) == "camera stands still"
-    np.testing.assert_allclose(camera.path, np.broadcast_to(np.eye(3), (90, 3, 3)))
+    np.testing.assert_allclose(camera.path, np.broadcast_to(np.eye(3), (45, 3, 3)))
 
 
 @pytest.mark.parametrize(
@@ -53,7 +53,7 @@ def test_a_camera_on_a_tripod_stands_still(scene):
     [(pan, "pan", 1.0, 2.0, 40), (knock, "knock", 1.0, 1.25, 12)],
 )
 def test_when_and_by_how_much_it_moves(scene, path, kind, start, stop, pixels):
-    chunks, _ = scene(90, camera=path)
+    chunks, _ = scene(75, camera=path)
     camera = camera_motion(chunks)
     assert camera.moves and camera.kind == kind and len(camera.moments) == 1
     assert camera.moments[0].start == pytest.approx(start, abs=0.1)
@@ -67,10 +67,10 @@ def test_when_and_by_how_much_it_moves(scene, path, kind, start, stop, pixels):
 
 @pytest.mark.parametrize("path", [pan, handheld, lambda i: turn(0.004 * i)])
 def test_the_path_is_the_cameras(scene, path):
-    chunks, _ = scene(75, camera=path)
+    chunks, _ = scene(50, camera=path)
     camera = camera_motion(chunks)
     corners = np.array([[0.0, 0], [319, 0], [0, 239], [319, 239]])
-    truth = np.array([path(i) for i in range(75)])
+    truth = np.array([path(i) for i in range(50)])
     back = transform(camera.path, transform(truth @ np.linalg.inv(truth[0]), corners))
     off = np.linalg.norm(back - corners, axis=-1).max(1)
     assert np.median(off) < 0.5 and off.max() < 2.5
@@ -78,14 +78,14 @@ def test_the_path_is_the_cameras(scene, path):
 
 
 def test_a_hand_and_a_slow_slide_are_told_apart(scene):
-    assert camera_motion(scene(90, camera=handheld)[0]).kind == "handheld"
+    assert camera_motion(scene(60, camera=handheld)[0]).kind == "handheld"
     slow = camera_motion(scene(90, camera=lambda i: shift(0.035 * i, 0))[0])
     assert slow.kind == "drift" and slow.moments[0].pixels == pytest.approx(3.1, abs=0.5)
 
 
 def test_stabilized_frames_stand_still(scene):
-    still, _ = scene(60, noise=0.0, blobs=0)
-    moving, _ = scene(60, camera=handheld, noise=0.0, blobs=0)
+    still, _ = scene(20, noise=0.0, blobs=0)
+    moving, _ = scene(30, camera=handheld, noise=0.0, blobs=0)
     camera = camera_motion(moving)
     inside = np.s_[:, 25:-25, 25:-25]
     first = moving[0].frames[:1].astype(int)
@@ -119,7 +119,7 @@ def test_without_texture_nothing_is_claimed():
 
 
 def test_pixels_are_those_of_the_video(scene, write):
-    chunks, _ = scene(60, camera=pan, noise=0.0)
+    chunks, _ = scene(30, camera=lambda i: pan(20 + 1.5 * i), noise=0.0)
     frames = np.concatenate([c.frames for c in chunks]).repeat(3, 1).repeat(3, 2)
     camera = camera_motion(write("big.mp4", frames))
     assert camera.size == (960, 720)

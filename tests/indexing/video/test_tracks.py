@@ -23,10 +23,10 @@ def riders(points, centres, radius=24.0):
 
 
 def test_tracks_ride_on_what_moves(scene):
-    chunks, centres = scene(90)
+    chunks, centres = scene(60)
     tracks = track_points(chunks)
     points = tracks.points.numpy()
-    assert points.dtype == np.float64 and points.shape[0] == 90 and points.shape[1] >= 12 and tracks.size == (320, 240)
+    assert points.dtype == np.float64 and points.shape[0] == 60 and points.shape[1] >= 12 and tracks.size == (320, 240)
     assert torch.equal(tracks.times, torch.from_numpy(np.concatenate([c.times for c in chunks])))
     blob, relative, on = riders(points, centres)
     assert on.mean() > 0.95 and set(blob) == {0, 1, 2}
@@ -37,7 +37,7 @@ def test_tracks_ride_on_what_moves(scene):
 
 
 def test_a_moving_camera_is_taken_out(scene):
-    chunks, centres = scene(75, camera=lambda i: shift(-0.5 * i, 4 * np.sin(i / 5)))
+    chunks, centres = scene(60, camera=lambda i: shift(-0.5 * i, 4 * np.sin(i / 5)))
     tracks = track_points(chunks)
     assert tracks.camera.moves and any("it is taken out" in note for note in tracks.notes)
     _, relative, on = riders(tracks.points.numpy(), centres)
@@ -46,12 +46,12 @@ def test_a_moving_camera_is_taken_out(scene):
 
 
 def test_complete_keep_and_motion_choose(scene):
-    chunks, _ = scene(60)
+    chunks, _ = scene(30)
     assert track_points(chunks, keep=5).points.shape[1] == 5
     whole = track_points(chunks, complete=1.0)
     assert whole.points.shape[1] > 0 and not whole.points.isnan().any()
     nothing = track_points(chunks, motion=500.0)
-    assert nothing.points.shape == (60, 0, 2) and "no moving point could be followed for 70% of the video" in nothing.notes[0]
+    assert nothing.points.shape == (30, 0, 2) and "no moving point could be followed for 70% of the video" in nothing.notes[0]
 
 
 def test_nothing_moves(scene):
@@ -61,7 +61,7 @@ def test_nothing_moves(scene):
 
 
 def test_points_that_come_late_are_found(scene):
-    chunks, centres = scene(60)
+    chunks, centres = scene(45)
     first = np.repeat(chunks[0].frames[:1], 40, 0)
     late = [Chunk(first, np.arange(40) / 30), *(Chunk(c.frames, c.times + 40 / 30) for c in chunks)]
     tracks = track_points(late, complete=0.5)
@@ -72,7 +72,7 @@ def test_points_that_come_late_are_found(scene):
 
 
 def test_pixels_are_those_of_the_video(scene, write):
-    chunks, centres = scene(30)
+    chunks, centres = scene(20)
     frames = np.concatenate([c.frames for c in chunks]).repeat(4, 1).repeat(4, 2)  # 1280 x 960: tracked at 960
     tracks = track_points(write("big.mp4", frames))
     assert tracks.size == (1280, 960)
