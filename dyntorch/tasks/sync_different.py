@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import torch
 from torch import Tensor
 
 from dyntorch.tasks.shift import Shift
-from dyntorch.tasks.sync_subspace import SubspaceCurve, subspace_curve
+from dyntorch.tasks.sync_subspace import SubspaceCurve, bodies_curve, subspace_curve
+from dyntorch.tasks.sync_subspace_body import Body
 from dyntorch.tasks.sync_subspace_shift import SubspaceShift, subspace_shift
 from dyntorch.tasks.sync_tracks import Tracks, smoothed
 
@@ -20,6 +22,14 @@ DRIFTING = 20.0
 """Seconds of overlap from which clock rates are looked for."""
 NEAR = 1.0
 """Seconds around the best shift in which rates are compared."""
+WINDOW = 10.0
+"""Seconds of a window that has a shift of its own."""
+LIKELY = 0.5
+"""Probability from which the shift of a window counts."""
+SPREAD = 0.3
+"""Frames that the shift of a window is uncertain by at least."""
+SIGNIFICANT = 3.0
+"""Sigmas from 1 for a rate to be believed."""
 CONVINCING = 8.0
 """Nats by which another clock rate has to be better."""
 
@@ -37,7 +47,9 @@ def different_points(a: Tracks, b: Tracks, *, max_shift: float | None, rate: flo
     rate_sigma = 0.0
     span = min(float(t.times[-1] - t.times[0]) for t in (a, b))
     if rate is None and span > DRIFTING and math.isfinite(best.sigma):
-        ratio, rate_sigma = _rate(a, b, step, span, found.lag(best.position))
+        # a shift that is sure of itself is near enough everywhere; one that is not may be smeared by a wrong rate
+        settled = _drift(curve, best, step) if best.ok else _rate(a, b, step, span, found.lag(best.position))
+        ratio, rate_sigma = settled
         if ratio != 1:
             found = _Samples(a, b, step, ratio)
             curve = found.curve(max_shift)
@@ -77,6 +89,42 @@ def _sampled(tracks: Tracks, step: float) -> tuple[Tensor, Tensor]:
     at = start + step * torch.arange(int((end - start) / step + 1e-6) + 1, dtype=torch.float64, device=tracks.x.device)
     x, _, weights = smoothed(tracks, at, max(0.5 * step, 0.5 * tracks.step))
     return x, weights
+
+
+def _drift(curve: SubspaceCurve, best: SubspaceShift, step: float) -> tuple[float, float]:
+    """The clock rate by a line through the shifts of windows, and its sigma; 1 unless it differs significantly."""
+    assert curve.bodies is not None
+    first, second = curve.bodies
+    lag, size, reach = round(best.position), round(WINDOW / step), round(NEAR / step)
+    found = []
+    for start in range(max(0, -lag), min(len(first.rows), len(second.rows) - lag) - size + 1, size):
+        there = start + lag - reach
+        if there < 0:
+            continue
+        parts = _cut(first, start, start + size), _cut(second, there, start + lag + size + reach)
+        local = subspace_shift(bodies_curve(*parts, (0, 2 * reach), step), step=1.0)
+        if math.isfinite(local.sigma) and local.probability > LIKELY and 1 < local.position < 2 * reach - 1:
+            found.append((start + size / 2, local.position, max(local.sigma, SPREAD)))
+    if len(found) < 3:
+        return 1.0, math.inf
+    times, shifts, sigmas = torch.tensor(found, dtype=torch.float64).unbind(1)
+    slopes = torch.combinations(shifts).diff(dim=1)[:, 0] / torch.combinations(times).diff(dim=1)[:, 0]
+    slope = slopes.median()
+    away = shifts - slope * times
+    kept = (away - away.median()).abs() < 4 * sigmas
+    w = torch.where(kept, sigmas.pow(-2), 0.0)
+    middle = (w * times).sum() / w.sum()
+    lever = w * (times - middle)
+    total = float((lever * (times - middle)).sum())
+    if total <= 0:
+        return 1.0, math.inf
+    drift, sigma = float((lever * shifts).sum()) / total, total**-0.5
+    return (1 + drift, sigma) if abs(drift) > SIGNIFICANT * sigma else (1.0, sigma)
+
+
+def _cut(body: Body, start: int, end: int) -> Body:
+    part = slice(start, min(end, len(body.rows)))
+    return dataclasses.replace(body, rows=body.rows[part], motion=body.motion[part], weights=body.weights[part])
 
 
 def _rate(a: Tracks, b: Tracks, step: float, span: float, lag: Tensor | float) -> tuple[float, float]:

@@ -20,7 +20,7 @@ def resemblance(curve: SubspaceCurve, best: int, apart: float) -> float:
     .. math:: \max_\delta \frac{r_a(\delta) + r_b(\delta)}{r_a(0) + r_b(0)}
 
     r is the evidence per frame between two halves of one camera's points, over the lags by which the best lag can be wrong.
-    Periodic motion reaches .7 to 1.3, of the answers that are right on motion capture 98 percent stay below .63.
+    Exactly periodic motion reaches .7 and more; of the answers that are right on motion capture 98 percent stay below .63.
 
     Args:
         curve: with its bodies.
@@ -69,7 +69,7 @@ def wobble(curve: SubspaceCurve, lag: int) -> float:
         return 0.0
     a, b = curve.bodies
     start, end = max(0, 1 - lag), min(len(a.rows), len(b.rows) - lag - 1)
-    if end - start < 2 * BLOCKS:
+    if end - start < BLOCKS:
         return math.inf
     edges = torch.linspace(start, end, BLOCKS + 1).round().long().tolist()
     sizes = torch.tensor(edges).diff().tolist()

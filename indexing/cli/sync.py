@@ -252,17 +252,16 @@ def show(report: SyncReport) -> None:
 
 
 def _show_pairs(report: SyncReport) -> None:
-    from indexing.report.sync_page import PPM, UNKNOWN
+    from indexing.report.sync_page import UNKNOWN, ppm
 
     rows: list[list[object]] = []
     for pair in report.pairs:
         shift, rival = pair.shift, pair.runner_up
-        drift = f"{PPM * (shift.rate - 1):+.0f} ± {PPM * shift.rate_sigma:.0f}" if shift.rate != 1 else "0"
         numbers = [
             f"{pair.apart:+.4f}" if len(shift.peaks) else "none",
             f"{shift.sigma:.4f}" if shift.sigma < UNKNOWN else "unknown",
             f"{pair.apart * shift.fps[1]:+.2f}" if len(shift.peaks) else "none",
-            drift,
+            ppm(shift.rate, shift.rate_sigma),
             f"{shift.confidence:.3f}",
         ]
         rows.append([f"{pair.a} → {pair.b}", *numbers, f"{rival[0]:+.3f}" if rival else "none", "ok" if shift.ok else "refused"])
@@ -271,7 +270,7 @@ def _show_pairs(report: SyncReport) -> None:
 
 
 def _show_clocks(report: SyncReport) -> None:
-    from indexing.report.sync_page import PPM, UNKNOWN
+    from indexing.report.sync_page import UNKNOWN, ppm
 
     rows = [
         [
@@ -279,7 +278,7 @@ def _show_clocks(report: SyncReport) -> None:
             f"{clock.offset:+.4f}",
             f"{clock.sigma:.4f}" if clock.sigma < UNKNOWN else "unknown",
             f"{clock.offset * clock.fps:+.2f}",
-            f"{PPM * (clock.rate - 1):+.0f}",
+            ppm(clock.rate),
         ]
         for clock in report.clocks
     ]

@@ -63,8 +63,15 @@ def _sigma(seconds: float) -> str:
     return f"{seconds:.4f}" if seconds < UNKNOWN else "unknown"
 
 
-def _ppm(rate: float, sigma: float | None = None) -> str:
-    return "0" if rate == 1 else f"{PPM * (rate - 1):+.0f}" + ("" if sigma is None else f" ± {PPM * sigma:.0f}")
+def ppm(rate: float, sigma: float | None = None) -> str:
+    """How much faster a clock runs than another, in millionths.
+
+    Example:
+        >>> ppm(1.00002, 3e-6), ppm(1.0), ppm(1 - 1e-12)
+        ('+20 ± 3', '0', '0')
+    """
+    much = round(PPM * (rate - 1))
+    return "0" if rate == 1 or not (much or sigma) else f"{much:+d}" + ("" if sigma is None else f" ± {PPM * sigma:.0f}")
 
 
 def _headline(report: SyncReport) -> list[Card]:
@@ -75,7 +82,7 @@ def _headline(report: SyncReport) -> list[Card]:
         value, note = (value, note) if len(pair.shift.peaks) else ("none", "there was nothing to compare")
         items.append(Card("Offset" if report.ok else "Best candidate", value, note))
         note = f"± {PPM * clock.rate_sigma:.0f}; {drift_of(clock)} s an hour" if clock.rate != 1 else "nothing speaks for a drift"
-        items.append(Card("Rate", f"{_ppm(clock.rate)} ppm", note))
+        items.append(Card("Rate", f"{ppm(clock.rate)} ppm", note))
         items.append(Card("Confidence", f"{pair.shift.confidence:.3g}", "that the offset is right to a frame"))
         return items
     items.append(Card("Cameras", str(len(report.clocks)), f"on the clock of {report.reference.name}"))
@@ -117,7 +124,7 @@ def _clocks(report: SyncReport, videos: Sequence[str]) -> str:
             f"{clock.fps:.6g}{' (assumed)' if clock.fps_assumed else ''}",
             "reference" if first else offset,
             "" if first or clock.sigma >= UNKNOWN else f"{clock.offset * clock.fps:+.2f}",
-            "" if first else _ppm(clock.rate, clock.rate_sigma),
+            "" if first else ppm(clock.rate, clock.rate_sigma),
         ]
         rest = "" if clock.shifted is None else f"{1000 * clock.shifted['rest']:.1f} ms"
         numbers += [_moved(clock), rest] if shifted else []
@@ -145,7 +152,7 @@ def _pairs(report: SyncReport) -> str:
         state = '<span class="good">ok</span>' if shift.ok else f'<span class="bad">refused</span>: {escape(shift.reason)}'
         figures = [
             f"{pair.apart:+.4f} ± {_sigma(shift.sigma)}" if len(shift.peaks) else "none",
-            _ppm(shift.rate),
+            ppm(shift.rate),
             f"{shift.confidence:.3g}",
             "none" if rival is None else f"{rival[0]:+.3f}",
             "" if not np.isfinite(pair.residual) else f"{1000 * pair.residual:+.1f}",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-LETTER = re.compile(r"(^|\b(?:in|of) |[;:] )([ab])(?=[:;]| (?:has \d|changes|fits|must|is)\b)")
+LETTER = re.compile(r"(^|\b(?:in|of) |[;:] )([ab])(?=[:;]|$| (?:has \d|changes|fits|must|is)\b)")
 
 
 def in_names(text: str, a: str, b: str) -> str:

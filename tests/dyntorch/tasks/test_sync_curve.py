@@ -55,7 +55,9 @@ def test_the_curve_is_a_loop_over_lags(more):
     assert curve.lags.diff().tolist() == pytest.approx([1 / 30] * (hi - lo))
 
 
-@pytest.mark.parametrize(("offset", "fps"), [(0.0, (30.0, 30.0)), (-0.415, (30.0, 30.0)), (0.37, (30.0, 24.0)), (0.2, (25.0, 60.0))])
+@pytest.mark.parametrize(
+    ("offset", "fps"), [(0.0, (30.0, 30.0)), (-0.415, (30.0, 30.0)), (0.37, (30.0, 24.0)), (0.2, (25.0, 60.0))]
+)
 def test_the_best_peak_is_the_shift(offset, fps):
     scene = scene_of(1, seconds=3.0, offset=offset, fps=fps)
     step = 1 / min(fps)
@@ -69,7 +71,9 @@ def test_the_best_peak_is_the_shift(offset, fps):
 
 def test_lags_are_those_of_the_clocks():
     scene = scene_of(2, offset=0.25)
-    later = tuple(read_tracks(n, x, None, t + s, None) for n, x, t, s in zip("ab", (scene.a, scene.b), scene.times, (3, 8), strict=True))
+    later = tuple(
+        read_tracks(n, x, None, t + s, None) for n, x, t, s in zip("ab", (scene.a, scene.b), scene.times, (3, 8), strict=True)
+    )
     here, there = epipolar_curve(samples_of(scene)), epipolar_curve(Samples.of(*later, 1 / 30))
     assert torch.allclose(there.lags, here.lags + 5, atol=1e-9)
     assert torch.allclose(there.scores, here.scores, atol=1e-6, equal_nan=True)

@@ -18,7 +18,7 @@ def seeded(seed=0):
 
 
 def film(seed=0, **more):
-    return filmed(**{"n": 12, "seconds": 3.0, "noise": 1.0, "generator": seeded(seed)} | more)
+    return filmed(**{"n": 10, "seconds": 2.5, "noise": 1.0, "generator": seeded(seed)} | more)
 
 
 def normal(seed, *shape):
@@ -38,18 +38,18 @@ def assert_refused(shift, *words):
         shift.check()
 
 
-@pytest.mark.parametrize(("noise", "seed", "calibration"), [(0.0, 0, STRAIGHT), (1.0, 0, STRAIGHT), (1.0, 1, None)])
+@pytest.mark.parametrize(("noise", "seed", "calibration"), [(0.0, 0, STRAIGHT), (1.0, 1, None)])
 def test_exactly_periodic_motion(noise, seed, calibration):
-    scene = film(seed, noise=noise, period=0.8, walk=0.0, offset=0.23)
-    shift = synchronize(scene.a, scene.b, fps=30.0, max_shift=1.2, calibration=calibration)
+    scene = film(seed, noise=noise, period=0.6, walk=0.0, offset=0.13)
+    shift = synchronize(scene.a, scene.b, fps=30.0, max_shift=0.8, calibration=calibration)
     assert_refused(shift, "repeats itself")
     assert shift.confidence < 0.5
     offsets = shift.peaks[:, 0]
     others = shift.peaks[1:, 1].tolist()
     assert float(offsets[0]) == pytest.approx(shift.offset, abs=1e-9) and others == sorted(others, reverse=True)
     # the true one is among the peaks, and so are the others
-    for period in (-0.8, 0.0, 0.8):
-        assert float((offsets - 0.23 - period).abs().min()) < 0.5 * FRAME
+    for period in (-0.6, 0.0, 0.6):
+        assert float((offsets - 0.13 - period).abs().min()) < 0.5 * FRAME
     assert f"{float(offsets[0]):+.3g} s fits hardly better than" in shift.reason
 
 
@@ -70,29 +70,24 @@ def test_a_gait_that_crosses_the_room_is_refused_or_right():
 @pytest.mark.parametrize("noise", [0.0, 1.0])
 def test_nothing_moves(noise):
     still = film(2).exact
-    a, b = (x[:1] + noise * normal(k, 60, 12, 2) for k, x in enumerate(still))
-    shift = synchronize(a, b, fps=30.0, max_shift=0.5, calibration=STRAIGHT)
+    a, b = (x[:1] + noise * normal(k, 50, 10, 2) for k, x in enumerate(still))
+    shift = synchronize(a, b, fps=30.0, max_shift=0.3, calibration=STRAIGHT)
     assert_refused(shift, "motion is too small", "nothing moves", "repeats itself or is too small", "halves of the take")
 
 
-@pytest.mark.parametrize(("seed", "calibration"), [(0, None), (1, STRAIGHT), (2, STRAIGHT)])
-def test_unrelated_motion(seed, calibration):
-    a, b = film(seed).a, film(seed + 50).b
-    shift = synchronize(a, b, fps=30.0, max_shift=0.6, calibration=calibration)
+def test_unrelated_motion():
+    a, b = film(0).a, film(50).b
+    shift = synchronize(a, b, fps=30.0, max_shift=0.4)
     assert_refused(shift, "motion is too small", "repeats itself or is too small", "halves of the take", "end of the search")
     assert shift.confidence < 0.7
 
 
-def test_motion_played_backwards():
-    scene = film(3)
-    shift = synchronize(scene.a, scene.b.flip(0), fps=30.0, max_shift=0.6, calibration=STRAIGHT)
-    assert_refused(shift, "motion is too small", "repeats itself or is too small", "halves of the take", "end of the search")
-
-
-def test_the_true_shift_lies_beyond_the_search():
-    scene = film(4, offset=1.0)
-    shift = synchronize(scene.a, scene.b, fps=30.0, max_shift=0.5, calibration=STRAIGHT)
-    assert_refused(shift, "motion is too small", "repeats itself or is too small", "halves of the take", "end of the search")
+@pytest.mark.parametrize(("seed", "offset", "backwards"), [(0, 1.5, False), (8, 0.0, True)])
+def test_wrong_shifts_are_not_made_to_fit_by_leaving_points_out(seed, offset, backwards):
+    scene = film(seed, n=12, seconds=4.0, offset=offset)
+    b = scene.b.flip(0) if backwards else scene.b
+    shift = synchronize(scene.a, b, fps=30.0, max_shift=None if backwards else 1.0, calibration=STRAIGHT, camera="perspective")
+    assert_refused(shift, "motion is too small", "repeats itself", "halves of the take", "fit", "end of the search")
 
 
 def test_the_best_shift_is_at_the_end_of_the_search():
@@ -114,7 +109,7 @@ def test_clocks_too_far_apart_for_the_search():
 def test_points_are_never_seen_in_both():
     scene = film(7)
     a, b = scene.a.clone(), scene.b.clone()
-    a[:60], b[50:] = torch.nan, torch.nan
+    a[:50], b[40:] = torch.nan, torch.nan
     assert_refused(synchronize(a, b, fps=30.0, max_shift=0.2), "enough points")
 
 
@@ -131,9 +126,8 @@ def test_nothing_is_seen(name):
 
 
 def test_the_halves_of_a_take_disagree():
-    one, other = (film(9, seconds=4.0, offset=offset) for offset in (0.2, 0.8))
-    b = torch.cat([one.b[:64], other.b[64:]])
-    shift = synchronize(one.a, b, fps=30.0, max_shift=1.5, calibration=STRAIGHT)
+    one, other = (film(9, seconds=3.0, offset=offset) for offset in (0.1, 0.5))
+    b = torch.cat([one.b[:48], other.b[48:]])
+    shift = synchronize(one.a, b, fps=30.0, max_shift=0.7, calibration=STRAIGHT)
     assert_refused(shift, "the halves of the take say", "repeats itself or is too small")
-    offsets = shift.peaks[:, 0]
-    assert max(float((offsets - value).abs().min()) for value in (0.2, 0.8)) < 3 * FRAME
+    assert min(abs(shift.offset - value) for value in (0.1, 0.5)) < 3 * FRAME

@@ -1,4 +1,4 @@
-"""Two cameras with clocks of their own, end to end: known offsets and rates, what must not matter, and what is wrong with real tracks."""
+"""Two cameras with clocks of their own: known offsets and rates, what must not matter, and what is wrong with real tracks."""
 
 import dataclasses
 import math
@@ -39,9 +39,10 @@ def same(one, other, tolerance=1e-6):
     assert one.ok == other.ok
 
 
-@pytest.mark.parametrize(("noise", "within"), [(0.0, 0.01), (1.0, 0.04), (4.0, 0.15)])
-@pytest.mark.parametrize("offset", [0.4217, -1.1, 0.0])
-def test_offsets_are_found_between_frames(noise, within, offset):
+@pytest.mark.parametrize(
+    ("offset", "noise", "within"), [(0.4217, 0.0, 0.01), (0.0, 0.0, 0.01), (-1.1, 1.0, 0.04), (0.7, 1.0, 0.04), (0.35, 4.0, 0.15)]
+)
+def test_offsets_are_found_between_frames(offset, noise, within):
     scene = film(1, noise=noise, offset=offset)
     shift = synced(scene)
     assert_found(shift, scene, within * FRAME)
@@ -181,16 +182,16 @@ def test_missing_blocks(seed):
     assert_found(synced(scene), scene, 0.1 * FRAME)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_gross_outliers(seed):
     scene = film(seed, outliers=0.15, offset=0.6)
     assert_found(synced(scene), scene, 0.1 * FRAME)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_wrong_points_are_named_and_left_out(seed):
     scene = film(seed, n=17, wrong=2, offset=-0.6)
-    shift = synced(scene)
+    shift = synced(scene, generator=seeded(seed))
     assert_found(shift, scene, 0.1 * FRAME)
     assert torch.equal(~shift.points, scene.wrong)
     which = ", ".join(str(int(k)) for k in scene.wrong.nonzero())
@@ -247,7 +248,7 @@ def test_calibration_is_applied():
 
 
 def test_lenses_that_nobody_calibrated_are_straightened_with_a_note():
-    scene = film(9, seconds=6.0, noise=0.3, walk=1.2, lens=-0.35, offset=0.7)
+    scene = film(9, n=10, seconds=5.0, noise=0.3, walk=1.2, lens=-0.35, offset=0.7)
     shift = synced(scene)
     assert_found(shift, scene, 0.05 * FRAME)
     assert len(shift.notes) == 1
@@ -263,61 +264,8 @@ def test_a_camera_that_moves_in_between_is_noted():
     assert any("a camera may have moved" in note for note in shift.notes)
 
 
-def test_the_generator_is_of_the_subsets_and_repeats():
-    scene = film(1, n=17, wrong=2, offset=-0.6)
-    one, two = (synced(scene, generator=seeded(5)) for _ in range(2))
-    assert one.offset == two.offset and torch.equal(one.points, two.points)
-
-
 def test_the_input_stays_as_it_was():
     scene = film(1, missing=0.2, outliers=0.1)
     a, b = scene.a.clone(), scene.b.clone()
     synced(scene)
     assert torch.equal(a.nan_to_num(-1), scene.a.nan_to_num(-1)) and torch.equal(b.nan_to_num(-1), scene.b.nan_to_num(-1))
-
-
-A, TIMES = torch.rand(20, 4, 2, generator=seeded()), torch.arange(20.0)
-K = [[100.0, 0, 50], [0, 100, 50], [0, 0, 1]]
-
-
-@pytest.mark.parametrize(
-    ("more", "words"),
-    [
-        ({}, r"give either fps or times, got neither"),
-        ({"fps": 30.0, "times": (TIMES, TIMES)}, r"give either fps or times, got both"),
-        ({"fps": (30.0, 30.0, 25.0)}, r"fps must be a pair, one of a and one of b, got 3 values"),
-        ({"times": (TIMES,)}, r"times must be a pair, one of a and one of b, got 1 values"),
-        ({"fps": (30.0, -1.0)}, r"fps of b must be a positive number of frames per second, got -1.0"),
-        ({"times": (TIMES, TIMES[:19])}, r"times of b must be 20 finite seconds, one per frame, got \(19,\)"),
-        ({"times": (TIMES.flip(0), TIMES)}, r"times of a must increase, but frame 1 is not after the one before; sort or drop"),
-        ({"fps": 30.0, "max_shift": 0.0}, r"max_shift must be a positive number of seconds or None, got 0.0"),
-        ({"fps": 30.0, "max_shift": math.inf}, r"max_shift must be .* got inf"),
-        ({"fps": 30.0, "rate": 30.0}, r"rate must be about 1 .*, got 30.0; give fps for frame rates"),
-        ({"fps": 30.0, "camera": "pinhole"}, r"camera must be one of auto, perspective, affine, got 'pinhole'"),
-        ({"fps": 30.0, "camera": "affine", "correspondence": False}, r"camera='affine' is for corresponding points; leave it away"),
-        ({"fps": 30.0, "weights": (torch.ones(20, 4),)}, r"weights must be a pair, one of a and one of b"),
-        ({"fps": 30.0, "weights": torch.ones(20, 4)}, r"weights must be a pair, one of a and one of b"),
-        ({"fps": 30.0, "weights": (None, torch.ones(20, 3))}, r"weights of b must be \(20, 4\)"),
-        ({"fps": 30.0, "calibration": (K, None)}, r"calibration of a: calibration of a camera must be None or \(K, dist\)"),
-        ({"fps": 30.0, "calibration": ((K, None),)}, r"calibration must be a pair, of a and of b: each None or \(K, dist\)"),
-        ({"fps": 30.0, "calibration": (None, ([[1.0]], None))}, r"calibration of b: calibration: K must be"),
-    ],
-)
-def test_misuse_names_the_field_and_the_remedy(more, words):
-    with pytest.raises(ValueError, match=words):
-        synchronize(A, A, **more)
-
-
-@pytest.mark.parametrize(
-    ("a", "b", "words"),
-    [
-        (A.numpy(), A, r"a must be a tensor \(frames, points, 2\), got ndarray"),
-        (A, A[..., :1], r"b must be a tensor \(frames, points, 2\), got \(20, 4, 1\)"),
-        (A, A.long(), r"b must hold floating point numbers, got torch.int64"),
-        (A[:11], A, r"a has 11 frames, 12 are needed at least"),
-        (A, A[:, :3], r"a has 4 points and b 3: corresponding points are as many; give the same ones .* correspondence=False"),
-    ],
-)
-def test_wrong_tracks_are_named(a, b, words):
-    with pytest.raises(ValueError, match=words):
-        synchronize(a, b, fps=30.0)

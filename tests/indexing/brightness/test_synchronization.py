@@ -22,11 +22,11 @@ def test_known_shift_is_found_and_believed(films):
 
 
 def test_streams_sizes_rates_and_clocks(films):
-    a, b = films
-    times = 100 + np.arange(0, 150, 2) / 30.0
-    stream = ((torch.from_numpy(b[2 * i : 2 * i + 8 : 2]), times[i : i + 4]) for i in range(0, 75, 4))
+    a, b = (video[:110] for video in films)
+    times = 100 + np.arange(0, 110, 2) / 30.0
+    stream = ((torch.from_numpy(b[2 * i : 2 * i + 8 : 2]), times[i : i + 4]) for i in range(0, 55, 4))
     large = np.repeat(np.repeat(a, 5, axis=1), 5, axis=2)
-    shift = brightness_shift(large, stream, fps=(30.0, 15.0), times=(np.arange(150) / 30.0, None))
+    shift = brightness_shift(large, stream, fps=(30.0, 15.0), times=(np.arange(110) / 30.0, None))
     assert abs(shift.offset - 100) < 1 / 15
     assert shift.fps == pytest.approx((30.0, 15.0))
 

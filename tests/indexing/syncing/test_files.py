@@ -84,3 +84,10 @@ def test_other_formats_are_written_as_openpose(tmp_path, cameras):
     again = read(target / "cam1_json", fps=FPS)[0]
     assert np.allclose(again.joints, clip.joints[2:], equal_nan=True) and len(again) == 4
     assert json.loads(openpose_frames(take)[0])["people"][0]["person_id"] == [-1]
+
+
+def test_frame_numbers_do_not_drift_from_rounded_times(cameras):
+    joints = np.ones((300, 3, 2))
+    take = take_of(Clip(joints, times=np.round(np.arange(300) / 30, 4)))  # steps of 0.0333 and 0.0334 s: 30.03 by their median
+    assert take.fps == pytest.approx(30, rel=1e-5) and plan(take, 0.0, 1.0, take.fps).rest < 2e-4
+    assert take_of(Clip(joints[::2], times=np.arange(0, 300, 2) / 29.97)).fps == pytest.approx(14.985)
