@@ -23,6 +23,9 @@ MARGIN = 0.2
 peaks are above .31 with 30 mm of noise."""
 AFFINE_MARGIN = 0.5
 """The same for affine cameras: what they leave unexplained differs from period to period of a gait."""
+CHOSEN = 0.5
+"""Nats more, where points or positions were left out and the residual is five times what the noise explains: shifts of takes that
+have nothing in common were made to fit with margins up to .42, and residuals of 7 to 13 times; true ones have margins above 1."""
 APART = 2.5
 """Frames within which peaks are one, and halves of a take agree."""
 HALF = 0.5
@@ -50,6 +53,7 @@ class Attempt:
         max_shift: of the search, seconds.
         points: ``(n,)`` bool, who takes part.
         method: ``"epipolar"`` or ``"affine"``.
+        pruned: whether positions that did not fit were left out.
     """
 
     a: Tracks
@@ -61,6 +65,7 @@ class Attempt:
     max_shift: float | None
     points: Tensor
     method: str
+    pruned: bool = False
 
     @property
     def frame(self) -> float:
@@ -107,6 +112,16 @@ class Attempt:
         """Shifts in which the first and the second half of the overlap are best, from the fit's, in frames; NaN where none."""
         return tuple(self._away(curve) for curve in self.half_curves)  # type: ignore[return-value]
 
+    @property
+    def sigma(self) -> float:
+        """Of the shift, seconds: the fit's, and what the halves of the take differ by, which sees errors as slow as a
+        detector's."""
+        if self.fit is None:
+            return math.inf
+        first, second = self.halves
+        apart = abs(first - second) / 2 * self.frame if self.agree and self.step <= self.frame else 0.0
+        return math.hypot(self.fit.sigma, apart)
+
     @cached_property
     def half_curves(self) -> list[Curve]:
         """Scores by a half of the overlap at a time."""
@@ -149,7 +164,18 @@ class Attempt:
     @property
     def needed(self) -> float:
         """Nats above the next peak, for a decision."""
-        return MARGIN if self.method == "epipolar" else AFFINE_MARGIN
+        least = MARGIN if self.method == "epipolar" else AFFINE_MARGIN
+        if not self.pruned and bool(self.points.all()):
+            return least
+        # what was left out was chosen to make something fit: with a residual far above the noise, a wrong shift
+        return least + CHOSEN * min(max(math.log(max(self.roughness, 1e-300) / 2), 0.0), 1.0)
+
+    @property
+    def roughness(self) -> float:
+        """Residual over what white noise and the smoothing kernel leave of it."""
+        assert self.fit is not None
+        left = math.sqrt(0.5 / math.sqrt(math.pi))  # by a Gaussian kernel of one frame
+        return self.fit.residual / (left * max(self.a.noise, 1e-6 * self.a.scale))
 
     @property
     def edge(self) -> bool:
@@ -161,7 +187,7 @@ class Attempt:
         """Probability that the shift is right to within a frame."""
         if self.fit is None:
             return 0.0
-        own = math.erf(self.frame / max(math.sqrt(2) * self.fit.sigma, 1e-12))
+        own = math.erf(self.frame / max(math.sqrt(2) * self.sigma, 1e-12))
         rival = 1 / (1 + math.exp(-(self.margin - 0.6 * self.needed) / 0.05)) if self.margin > -10 else 0.0
         return own * rival * (0.995 if self.agree else 0.3) * (1.0 if self.sharp and not self.edge else 0.5)
 

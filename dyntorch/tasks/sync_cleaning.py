@@ -50,8 +50,8 @@ def _far_from_median(tracks: Tracks) -> Tensor:
     middle = window.nanmedian(-1).values
     far = (x - middle).abs()
     spread = 1.4826 * (window - middle[..., None]).abs().nanmedian(-1).values
-    usual = 1.4826 * torch.where(seen[..., None], far, torch.nan).nanmedian(0).values
-    usual = torch.maximum(usual, torch.maximum(usual.nanmedian(0).values, usual.new_tensor(FINE * tracks.scale)))
+    usual = 1.4826 * _usual(torch.where(seen[..., None], far, torch.nan))
+    usual = torch.maximum(usual, usual.nanmedian(0).values).clamp(min=FINE * tracks.scale)
     return (far > OUTLYING * torch.maximum(spread, usual)).any(-1)
 
 
@@ -60,7 +60,7 @@ def _peeled(tracks: Tracks) -> Tracks:
     kept = tracks.weights > 0
     for _ in range(ROUNDS):
         away = _from_line(tracks.x, kept)
-        scale = 1.4826 * away.nanmedian(0).values
+        scale = 1.4826 * _usual(away)
         scale = scale.clamp(min=max(FINE * tracks.scale, float(scale.nanmedian().nan_to_num(0.0))))
         away = away.nan_to_num(0.0)
         rows = pad(away, (0, 0, 2, 2))
@@ -70,6 +70,13 @@ def _peeled(tracks: Tracks) -> Tracks:
             break
         kept = kept & ~bad
     return without(tracks, ~kept)
+
+
+def _usual(far: Tensor) -> Tensor:
+    """Medians over the frames; of what differs from 0 where most do not: points at rest, or rounded to whole pixels."""
+    usual = far.nanmedian(0).values
+    other = torch.where(far > 1e-9 * far.nan_to_num(0.0).amax(), far, torch.nan).nanmedian(0).values.nan_to_num(0.0)
+    return torch.where(usual > 0, usual, other)
 
 
 def _from_line(x: Tensor, kept: Tensor) -> Tensor:

@@ -73,7 +73,7 @@ def same_points(
     if not found.decided and rate is None:
         found = _better(found, _over_rates(a, b, search, span, generator))
     notes: tuple[str, ...] = ()
-    if lenses and found.fit is not None and _rough(found):
+    if lenses and found.fit is not None and found.roughness > ROUGH:
         found, notes = _straightened(found, a, b, search, generator)
     if camera == "auto" and not found.decided:
         scaled = _affine(a, b, search, generator)
@@ -90,13 +90,13 @@ def _sorted_out(a: Tracks, b: Tracks, search: Search, generator: Generator | Non
     pruned = _pruned(found)
     if pruned is not None:
         a, b = pruned
-        found = _better(found, attempt(a, b, search))
+        found = _better(found, dataclasses.replace(attempt(a, b, search), pruned=True))
     if found.decided and not bool(_suspects(found).any()):
         return found
     points = consistent_points(a, b, found, generator)
     if points is None or bool(points.all()):
         return found
-    return _better(found, attempt(a, b, search, points))
+    return _better(found, dataclasses.replace(attempt(a, b, search, points), pruned=pruned is not None))
 
 
 def _pruned(found: Attempt) -> tuple[Tracks, Tracks] | None:
@@ -157,13 +157,6 @@ def _suspects(found: Attempt) -> Tensor:
     assert found.fit is not None
     own = found.fit.distances.abs().nanmedian(0).values * 1.4826
     return own.nan_to_num(0.0) > SUSPECT
-
-
-def _rough(found: Attempt) -> bool:
-    """Whether the residual is larger than noise and smoothing leave."""
-    assert found.fit is not None
-    left = math.sqrt(0.5 / math.sqrt(math.pi))  # of white noise, by a Gaussian kernel of one frame
-    return found.fit.residual > ROUGH * left * max(found.a.noise, 1e-6 * found.a.scale)
 
 
 def _straightened(

@@ -80,15 +80,16 @@ def synchronize(
         >>> speeds, phases, sizes, base = 4 * wave().abs(), 6 * wave(), wave(), 3 * wave()
         >>> def film(t, turn):  # twelve points that wobble, from five metres away
         ...     p = base / 3 + 0.2 * sizes * torch.sin(speeds * t + phases)
-        ...     x, z = p[..., 0] * math.cos(turn) + p[..., 2] * math.sin(turn), p[..., 2] * math.cos(turn) - p[..., 0] *
-        math.sin(turn) ...     return 800 * torch.stack([x, p[..., 1]], -1) / (z + 5)[..., None]
+        ...     c, d = math.cos(turn), math.sin(turn)
+        ...     x, z = c * p[..., 0] + d * p[..., 2], c * p[..., 2] - d * p[..., 0]
+        ...     return 800 * torch.stack([x, p[..., 1]], -1) / (z + 5)[..., None]
         >>> shift = synchronize(film(t, 0.0), film(t - 0.42, 1.0), fps=30.0)
         >>> round(shift.offset, 3), shift.ok
         (0.42, True)
     """
-    _check(correspondence, fps, times, max_shift, rate, camera)
+    _check(correspondence, fps, times, weights, max_shift, rate, camera)
     pair = (float(fps), float(fps)) if isinstance(fps, (int, float)) else tuple(fps) if fps is not None else (None, None)
-    given = weights or (None, None)
+    given = (None, None) if weights is None else weights
     tracks = [
         read_tracks(name, x, one, None if times is None else times[i], given[i])
         for i, (name, x, one) in enumerate(zip("ab", (a, b), pair, strict=True))
@@ -120,15 +121,18 @@ def _check(
     correspondence: bool,
     fps: float | tuple[float, float] | None,
     times: tuple[Tensor, Tensor] | None,
+    weights: tuple[Tensor | None, Tensor | None] | None,
     max_shift: float | None,
     rate: float | None,
     camera: str,
 ) -> None:
     if (fps is None) == (times is None):
         raise ValueError(f"give either fps or times, got {'neither' if fps is None else 'both'}")
-    for name, value in (("fps", fps), ("times", times)):
-        if value is not None and not isinstance(value, (int, float)) and len(value) != 2:
-            raise ValueError(f"{name} must be a pair, one of a and one of b, got {len(value)} values")
+    for name, value in (("fps", fps), ("times", times), ("weights", weights)):
+        paired = isinstance(value, Sequence) and len(value) == 2
+        if value is not None and not isinstance(value, (int, float)) and not paired:
+            got = f"{len(value)} values" if isinstance(value, Sequence) else type(value).__name__
+            raise ValueError(f"{name} must be a pair, one of a and one of b, got {got}")
     if max_shift is not None and not 0 < max_shift < math.inf:
         raise ValueError(f"max_shift must be a positive number of seconds or None, got {max_shift}")
     if rate is not None and not 0.1 < rate < 10:
@@ -175,7 +179,7 @@ def _shift(result: Result) -> Shift:
     lags = found.curve.rate * (found.curve.lags + fit.center) - fit.center
     return Shift(
         offset=fit.offset,
-        sigma=fit.sigma,
+        sigma=found.sigma,
         rate=fit.rate,
         rate_sigma=fit.rate_sigma,
         confidence=found.confidence,

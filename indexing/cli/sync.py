@@ -137,9 +137,9 @@ class Sync:
         import dyntorch
         from indexing.report.sync_making import reported
         from indexing.synchronization import pair, remarks
-        from indexing.syncing.calibration import read_calibration
+        from indexing.syncing.calibration import named_lenses
 
-        lenses = None if self.calibration is None else read_calibration(self.calibration)
+        lenses, told = (None, ()) if self.calibration is None else named_lenses(self.calibration, [take.name for take in takes])
         options: dict[str, Any] = {"max_shift": self.max_shift, "calibration": lenses, "rate": None if self.rate else 1.0}
         total = len(takes) * (len(takes) - 1) // 2
         compared: dict[tuple[int, int], Pairing] = {}
@@ -161,7 +161,7 @@ class Sync:
         except ValueError as problem:
             said = re.sub(r"^cameras \d+ and \d+: ", "", str(problem))
             raise ValueError(words(said)) from problem
-        report = reported(takes, compared, clocks, remarks(takes), self.title, words)
+        report = reported(takes, compared, clocks, [*remarks(takes), *told], self.title, words)
         return report, compared
 
     def _write(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import tomllib
 from collections.abc import Sequence
@@ -99,6 +100,16 @@ def read_calibration(path: str | Path) -> list[Lens]:
     if not found:
         raise error(path, "has no camera: no section with a 'matrix'", REMEDY)
     return found
+
+
+def named_lenses(path: str | Path, names: Sequence[str]) -> tuple[list[Lens], tuple[str, ...]]:
+    """The lens of each camera by its own name, whatever its section is called, and what to say about it.
+
+    Raises:
+        ValueError: the file cannot be read, or names and sections do not fit.
+    """
+    chosen, notes = match(read_calibration(path), names, path)
+    return [dataclasses.replace(lens, name=name) for lens, name in zip(chosen, names, strict=True)], notes
 
 
 def match(cameras: Sequence[Lens], names: Sequence[str], path: str | Path) -> tuple[list[Lens], tuple[str, ...]]:

@@ -163,7 +163,7 @@ def test_the_third_camera_resolves_what_two_cannot():
     clocks = combine_shifts(pairs, 3)
     assert clocks.ok and clocks.outliers == []
     assert torch.allclose(clocks.offsets, torch.tensor(truth, dtype=torch.float64), atol=1e-6)
-    assert any("pair 1-2 refused on its own; the others confirm its peak 3" in note for note in clocks.notes)
+    assert any("pair 1-2 refused on its own; the others confirm its peak number 3" in note for note in clocks.notes)
     # the same pair, and only one sure one: a camera that nothing but periodic pairs ties
     pairs[0, 2] = shift(-0.7, -0.7 + period, -0.7 - period, center=20.0, ok=False, confidence=0.3)
     clocks = combine_shifts(pairs, 3)

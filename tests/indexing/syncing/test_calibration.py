@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from indexing.synchronization import synchronize
-from indexing.syncing.calibration import lenses, read_calibration
+from indexing.syncing.calibration import lenses, named_lenses, read_calibration
 
 # torch's own, when it first loads its transforms; hidden outside of tests
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated")
@@ -32,6 +32,17 @@ def test_calibration_files(tmp_path, cameras, library):
     by_order = lenses(path, ["left", "right"])
     assert by_order is not None and by_order.values[0][0][0, 0] == 1671.5 and "in the order of its file" in by_order.notes[0]
     assert lenses(None, ["a", "b"]) is None
+
+
+def test_lenses_of_many_cameras_by_order_have_their_names(tmp_path):
+    path = tmp_path / "Calib.toml"
+    path.write_text("".join(TOML.format(i).replace("1671.5", f"{900 + i}.0") for i in (1, 2, 3)))
+    found, notes = named_lenses(path, ["left", "mid", "right"])
+    assert "in the order of its file" in notes[0]
+    pair = lenses(found, ["left", "right"])  # two of three, known by name
+    assert pair is not None and [matrix[0, 0].item() for matrix, _ in pair.values] == [901, 903] and pair.notes == ()
+    with pytest.raises(ValueError, match=r"Calib\.toml: its cameras are int_cam1_img, int_cam2_img, int_cam3_img, and a, b"):
+        named_lenses(path, ["a", "b"])
 
 
 @pytest.mark.parametrize(
