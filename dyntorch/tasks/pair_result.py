@@ -57,7 +57,7 @@ class PairReconstruction:
         Example:
             >>> import torch
             >>> from dyntorch.scenes.nonrigid import nonrigid_pair
-        >>> from dyntorch.tasks.reconstruct_pair import reconstruct_pair
+            >>> from dyntorch.tasks.reconstruct_pair import reconstruct_pair
             >>> scene = nonrigid_pair(12, 10, 60, generator=torch.Generator().manual_seed(0))
             >>> found = reconstruct_pair(scene.a, scene.b, scene.offset, fps=scene.fps)
             >>> truth = scene.images[0, :, 12:]

@@ -24,8 +24,10 @@ peaks are above .31 with 30 mm of noise."""
 AFFINE_MARGIN = 0.5
 """The same for affine cameras: what they leave unexplained differs from period to period of a gait."""
 CHOSEN = 0.5
-"""Nats more, where points or positions were left out and the residual is five times what the noise explains: shifts of takes that
-have nothing in common were made to fit with margins up to .42, and residuals of 7 to 13 times; true ones have margins above 1."""
+"""Nats more, where the residual is e times the usual."""
+ROUGH = (4.0, 2.0)
+"""Usual residual over what the noise explains; where points or positions were left out.  Synthetic takes that have nothing in common
+were made to fit with margins up to .42 and residuals of 7 to 22 times; real detectors have 4 to 9 times and margins above 1.2."""
 APART = 2.5
 """Frames within which peaks are one, and halves of a take agree."""
 HALF = 0.5
@@ -120,7 +122,9 @@ class Attempt:
             return math.inf
         first, second = self.halves
         apart = abs(first - second) / 2 * self.frame if self.agree and self.step <= self.frame else 0.0
-        return math.hypot(self.fit.sigma, apart)
+        # as much is expected; short halves may differ by more than the whole is uncertain
+        beyond = math.sqrt(max(apart**2 - self.fit.sigma**2, 0.0))
+        return math.hypot(self.fit.sigma, min(beyond, 3 * self.fit.sigma))
 
     @cached_property
     def half_curves(self) -> list[Curve]:
@@ -165,10 +169,9 @@ class Attempt:
     def needed(self) -> float:
         """Nats above the next peak, for a decision."""
         least = MARGIN if self.method == "epipolar" else AFFINE_MARGIN
-        if not self.pruned and bool(self.points.all()):
-            return least
-        # what was left out was chosen to make something fit: with a residual far above the noise, a wrong shift
-        return least + CHOSEN * min(max(math.log(max(self.roughness, 1e-300) / 2), 0.0), 1.0)
+        # with a residual far above the noise something may have been made to fit, the more so by leaving out what does not
+        usual = ROUGH[1] if self.pruned or not bool(self.points.all()) else ROUGH[0]
+        return least + CHOSEN * min(max(math.log(max(self.roughness, 1e-300) / usual), 0.0), 1.0)
 
     @property
     def roughness(self) -> float:

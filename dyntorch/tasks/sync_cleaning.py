@@ -74,9 +74,9 @@ def _peeled(tracks: Tracks) -> Tracks:
 
 def _usual(far: Tensor) -> Tensor:
     """Medians over the frames; of what differs from 0 where most do not: points at rest, or rounded to whole pixels."""
-    usual = far.nanmedian(0).values
-    other = torch.where(far > 1e-9 * far.nan_to_num(0.0).amax(), far, torch.nan).nanmedian(0).values.nan_to_num(0.0)
-    return torch.where(usual > 0, usual, other)
+    usual, rounding = far.nanmedian(0).values, 1e-9 * far.nan_to_num(0.0).amax()
+    other = torch.where(far > rounding, far, torch.nan).nanmedian(0).values.nan_to_num(0.0)
+    return torch.where(usual > rounding, usual, other)
 
 
 def _from_line(x: Tensor, kept: Tensor) -> Tensor:

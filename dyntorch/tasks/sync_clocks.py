@@ -108,7 +108,7 @@ class Clocks:
         for camera, (offset, rate, sigma, rate_sigma) in enumerate(
             zip(self.offsets.tolist(), self.rates.tolist(), self.sigmas.tolist(), self.rate_sigmas.tolist(), strict=True)
         ):
-            drift = f", rate {1e6 * (rate - 1):+.0f} ± {1e6 * rate_sigma:.0f} ppm" if rate != 1 else ""
+            drift = f", rate {1e6 * (rate - 1):+.0f} ± {1e6 * rate_sigma:.0f} ppm" if abs(rate - 1) > 5e-7 else ""
             own = ", the reference" if camera == self.reference else ""
             lines.append(f"  camera {camera}: {offset:+.4f} ± {sigma:.4f} s{drift}{own}")
         lines += [f"  pair {row}" for row in map(_row, self.pairs)]

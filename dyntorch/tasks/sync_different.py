@@ -95,13 +95,12 @@ def _drift(curve: SubspaceCurve, best: SubspaceShift, step: float) -> tuple[floa
     """The clock rate by a line through the shifts of windows, and its sigma; 1 unless it differs significantly."""
     assert curve.bodies is not None
     first, second = curve.bodies
-    lag, size, reach = round(best.position), round(WINDOW / step), round(NEAR / step)
+    lag, reach = round(best.position), round(NEAR / step)
+    begin, end = max(0, reach - lag), min(len(first.rows), len(second.rows) - lag)
+    size = min(round(WINDOW / step), (end - begin) // 4)
     found = []
-    for start in range(max(0, -lag), min(len(first.rows), len(second.rows) - lag) - size + 1, size):
-        there = start + lag - reach
-        if there < 0:
-            continue
-        parts = _cut(first, start, start + size), _cut(second, there, start + lag + size + reach)
+    for start in range(begin, end - size + 1, size):
+        parts = _cut(first, start, start + size), _cut(second, start + lag - reach, start + lag + size + reach)
         local = subspace_shift(bodies_curve(*parts, (0, 2 * reach), step), step=1.0)
         if math.isfinite(local.sigma) and local.probability > LIKELY and 1 < local.position < 2 * reach - 1:
             found.append((start + size / 2, local.position, max(local.sigma, SPREAD)))

@@ -83,12 +83,15 @@ def read_tracks(name: str, x: Tensor, fps: float | None, times: Tensor | None, w
     if not isinstance(x, Tensor) or x.ndim != 3 or x.shape[-1] != 2:
         got = tuple(x.shape) if isinstance(x, Tensor) else type(x).__name__
         raise ValueError(f"{name} must be a tensor (frames, points, 2), got {got}")
+    if x.shape[1] == 0:
+        raise ValueError(f"{name} has no points: shape {tuple(x.shape)}; give (frames, points, 2)")
     if not x.is_floating_point():
         raise ValueError(f"{name} must hold floating point numbers, got {x.dtype}; use {name}.double()")
     if times is None:
         if fps is None or not 0 < fps < math.inf:
             raise ValueError(f"fps of {name} must be a positive number of frames per second, got {fps}; or give times=")
         times = torch.arange(len(x), dtype=torch.float64, device=x.device) / fps
+    x = x.detach()
     clock = torch.as_tensor(times, dtype=torch.float64, device=x.device)
     if clock.shape != x.shape[:1] or not bool(clock.isfinite().all()):
         raise ValueError(f"times of {name} must be {x.shape[0]} finite seconds, one per frame, got {tuple(clock.shape)}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
+from numbers import Real
 from typing import Any
 
 import torch
@@ -88,7 +89,9 @@ def synchronize(
         (0.42, True)
     """
     _check(correspondence, fps, times, weights, max_shift, rate, camera)
-    pair = (float(fps), float(fps)) if isinstance(fps, (int, float)) else tuple(fps) if fps is not None else (None, None)
+    pair: tuple[float | None, float | None] = (None, None)
+    if fps is not None:
+        pair = (float(fps[0]), float(fps[1])) if isinstance(fps, Sequence) else (float(fps), float(fps))
     given = (None, None) if weights is None else weights
     tracks = [
         read_tracks(name, x, one, None if times is None else times[i], given[i])
@@ -130,7 +133,7 @@ def _check(
         raise ValueError(f"give either fps or times, got {'neither' if fps is None else 'both'}")
     for name, value in (("fps", fps), ("times", times), ("weights", weights)):
         paired = isinstance(value, Sequence) and len(value) == 2
-        if value is not None and not isinstance(value, (int, float)) and not paired:
+        if value is not None and not isinstance(value, Real) and not paired:
             got = f"{len(value)} values" if isinstance(value, Sequence) else type(value).__name__
             raise ValueError(f"{name} must be a pair, one of a and one of b, got {got}")
     if max_shift is not None and not 0 < max_shift < math.inf:

@@ -126,7 +126,7 @@ def test_stretches_of_another_person_are_noticed():
 
 def test_the_right_people_among_several(tmp_path):
     scenes = filmed(seed=1, skipped=(0, 12)), filmed(seed=7, skipped=(0, 12), actions=("punch", "bow"))
-    first, second = ([cut(clip, 0, 110) for clip in scene] for scene in scenes)
+    first, second = ([cut(clip, 0, 95) for clip in scene] for scene in scenes)
     folders = [
         write_openpose(tmp_path / "cam1", [first[0], moved(second[0], 800.0)]),
         write_openpose(tmp_path / "cam2", [moved(second[1], 800.0), first[1]]),

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 from fractions import Fraction
+from importlib import import_module
 
 import numpy as np
 import pytest
@@ -10,6 +12,13 @@ import pytest
 from indexing.video import Chunk
 
 SIZE = (320, 240)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_thread():
+    """OpenCV's threads wait busily, which costs the tests beside these."""
+    with contextlib.suppress(ImportError):
+        import_module("cv2").setNumThreads(1)
 
 
 @pytest.fixture
@@ -44,7 +53,7 @@ def texture(rng, height, width, grain=4):
     return cv2.resize(fine, (width, height), interpolation=cv2.INTER_CUBIC).clip(0, 255).astype(np.uint8)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def scene():
     """A textured wall and blobs that move before it, seen by a camera that may move: chunks, and the blobs' centres.
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -40,6 +42,17 @@ def knock(i):
     return shift(0, 12 if 31 <= i < 37 else 0)
 
 
+@pytest.fixture(scope="module")
+def motion_of(scene):
+    """The motion found of a camera, worked out once for all tests that ask about it."""
+
+    @cache
+    def found(path, frames):
+        return camera_motion(scene(frames, camera=path)[0])
+
+    return found
+
+
 def test_a_camera_on_a_tripod_stands_still(scene):
     chunks, _ = scene(45, noise=5.0)
     camera = camera_motion(chunks)
@@ -52,9 +65,8 @@ def test_a_camera_on_a_tripod_stands_still(scene):
     ("path", "kind", "start", "stop", "pixels"),
     [(pan, "pan", 1.0, 2.0, 40), (knock, "knock", 1.0, 1.25, 12)],
 )
-def test_when_and_by_how_much_it_moves(scene, path, kind, start, stop, pixels):
-    chunks, _ = scene(75, camera=path)
-    camera = camera_motion(chunks)
+def test_when_and_by_how_much_it_moves(motion_of, path, kind, start, stop, pixels):
+    camera = motion_of(path, 75)
     assert camera.moves and camera.kind == kind and len(camera.moments) == 1
     assert camera.moments[0].start == pytest.approx(start, abs=0.1)
     assert camera.moments[0].stop == pytest.approx(stop, abs=0.15)
@@ -66,11 +78,10 @@ def test_when_and_by_how_much_it_moves(scene, path, kind, start, stop, pixels):
 
 
 @pytest.mark.parametrize(
-    ("path", "frames", "kind"), [(pan, 70, "pan"), (handheld, 50, "handheld"), (lambda i: turn(0.004 * i), 50, "pan")]
+    ("path", "frames", "kind"), [(pan, 75, "pan"), (handheld, 50, "handheld"), (lambda i: turn(0.004 * i), 50, "pan")]
 )
-def test_the_path_is_the_cameras(scene, path, frames, kind):
-    chunks, _ = scene(frames, camera=path)
-    camera = camera_motion(chunks)
+def test_the_path_is_the_cameras(motion_of, path, frames, kind):
+    camera = motion_of(path, frames)
     corners = np.array([[0.0, 0], [319, 0], [0, 239], [319, 239]])
     truth = np.array([path(i) for i in range(frames)])
     back = transform(camera.path, transform(truth @ np.linalg.inv(truth[0]), corners))
@@ -98,12 +109,11 @@ def test_stabilized_frames_stand_still(scene):
     assert all((a.frames == b.frames).all() for a, b in zip(still, stabilize(still, still_camera), strict=True))
 
 
-def test_tracks_lose_the_cameras_motion(scene):
-    chunks, _ = scene(60, camera=pan)
-    camera = camera_motion(chunks)
+def test_tracks_lose_the_cameras_motion(motion_of):
+    camera = motion_of(pan, 75)
     wall = np.array([[200.0, 50], [250, 200]])
-    seen = transform(np.array([pan(i) for i in range(60)]), wall)
-    np.testing.assert_allclose(camera.still(seen), np.broadcast_to(wall, (60, 2, 2)), atol=0.7)
+    seen = transform(np.array([pan(i) for i in range(75)]), wall)
+    np.testing.assert_allclose(camera.still(seen), np.broadcast_to(wall, (75, 2, 2)), atol=0.7)
     np.testing.assert_allclose(camera.still(seen[::2], camera.times[::2] + 0.001), camera.still(seen)[::2])
 
 
