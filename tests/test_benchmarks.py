@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from dyntorch import scenes
-from experiments.benchmarks import fits, null_space, robust_peers
+from experiments.benchmarks import fits, null_space, robust_peers, synchronization
 from experiments.benchmarks.interleaved import interleaved, threads
 
 
@@ -58,3 +58,10 @@ def test_robust_fits_are_as_accurate_as_the_peers():
 def test_null_spaces_are_as_accurate_as_the_goal_says(case):
     figure = null_space.on_one_thread(case, null_space.Config(batch=16, rounds=1, quick=True))
     assert figure.angle <= 1e-10 and figure.reference > 0 and figure.ours > 0
+
+
+def test_all_ways_to_evaluate_shifts_find_the_true_one():
+    config = synchronization.Config(quick=True)
+    rows = [*synchronization.same_points(config), *synchronization.different_points(config), *synchronization.long_takes(config)]
+    errors = figures(rows, "error")
+    assert errors and all(value == 0 for value in errors.values()), errors

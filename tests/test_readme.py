@@ -35,6 +35,17 @@ def test_the_python_example_runs_and_prints_what_it_says(tmp_path, monkeypatch, 
     assert {path.name for path in tmp_path.iterdir()} == {"moves.safetensors", "lesson.npz", "session.npz"}
 
 
+def test_the_synchronization_example_finds_what_it_says(tmp_path, monkeypatch, capsys):
+    (make,) = [block for block in blocks() if "keypoints.json" in block]
+    (use,) = [block for block in blocks() if "from indexing import synchronize" in block]
+    monkeypatch.chdir(tmp_path)
+    exec(compile(make, str(README), "exec"), {})
+    exec(compile(use, str(README), "exec"), {})
+    first = capsys.readouterr().out.splitlines()[0]
+    assert first in README.read_text(encoding="utf-8").splitlines()
+    assert float(re.search(r"= (\S+) frames", first)[1]) == pytest.approx(-17, abs=0.1)
+
+
 def test_every_file_the_readme_points_to_is_there():
     for target in re.findall(r"\]\(([^)#]+)\)", README.read_text(encoding="utf-8")):
         assert (README.parent / target).exists(), target

@@ -23,9 +23,11 @@ import torch
 import tyro
 from torch import Tensor
 
-from dyntorch import lags
+from dyntorch import lags, synchronize
 from dyntorch.algebra.correlation import Lags
+from dyntorch.algebra.epipolar_variance import epipolar_variance
 from dyntorch.algebra.homogeneous import homogeneous
+from dyntorch.tasks.sync_subspace import subspace_curve
 from experiments.benchmarks.interleaved import interleaved, threads
 from experiments.tables import Row, command, measured
 from indexing.files import prepare
@@ -96,11 +98,18 @@ def combinations(frames: int, rows: int, rank: int, shift: int, noise: float = 0
 
 
 def epipolar_scores(takes: Takes, window: Lags | None) -> Tensor:
-    """Minus the smallest eigenvalue of the mean moments at every shift."""
+    """Minus the variance of the epipolar residual at every shift."""
     moments, counts = lags.epipolar_moments(takes.a, takes.b, window)
     kept = enough(counts)
-    # 3.3 us per matrix; Laguerre's iteration along the batch took 1.9, and of all shifts 0.025 s remained 0.025 s
-    return _placed(-torch.linalg.eigvalsh(moments[kept] / counts[kept, None, None])[..., 0], kept)
+    return _placed(-epipolar_variance(moments[kept])[0], kept)
+
+
+def subspace_scores(takes: Takes, window: Lags | None) -> Tensor:
+    """The library's score of different points at every shift."""
+    a, b = takes.a.unflatten(1, (-1, 2)), takes.b.unflatten(1, (-1, 2))
+    window = window or (1 - len(a), len(b) - 1)
+    scores = subspace_curve(a, b, torch.ones(a.shape[:2]), torch.ones(b.shape[:2]), window).scores
+    return scores.nan_to_num(-torch.inf)
 
 
 def epipolar_by_svd(takes: Takes, window: Lags) -> Tensor:
@@ -170,6 +179,8 @@ def same_points(config: Config) -> list[Row]:
         title = f"same points, {frames} frames, 17 joints, {_number(takes, window)} shifts"
         rows.append(Row(f"{title}, time", name, seconds, None if config.quick else GOALS["same"], at_most=True, unit=" s"))
         rows.append(_error(title, name, run(), takes, window))
+    whole = interleaved({"synchronize": lambda: synchronize(takes.a, takes.b, fps=30.0)}, _rounds(config))["synchronize"]
+    rows.append(Row(f"same points, {frames} frames, 17 joints, the whole verb, time", "dyntorch.synchronize", whole, unit=" s"))
     reach = frames // 2
     reference = sampled(lambda near: epipolar_by_svd(takes, near), reach)
     rows.append(
@@ -180,6 +191,7 @@ def same_points(config: Config) -> list[Row]:
 
 DIFFERENT: dict[str, Callable[[Takes, Lags | None], Tensor]] = {
     "covariances by FFT, Cholesky": lambda takes, window: log_determinants(takes, window, 0.05),
+    "dyntorch's score": subspace_scores,
 }
 """Scores of all shifts of points that do not correspond: whatever is here is timed and has to find the shift."""
 
