@@ -26,8 +26,9 @@ AFFINE_MARGIN = 0.5
 CHOSEN = 0.5
 """Nats more, where the residual is e times the usual."""
 ROUGH = (4.0, 2.0)
-"""Usual residual over what the noise explains; where points or positions were left out.  Synthetic takes that have nothing in common
-were made to fit with margins up to .42 and residuals of 7 to 22 times; real detectors have 4 to 9 times and margins above 1.2."""
+"""Usual residual over what the noise explains; where points or positions were left out.  Synthetic takes that have nothing in
+common were made to fit with margins up to .42 and residuals of 7 to 22 times; real detectors have 4 to 9 times and margins above
+1.2."""
 APART = 2.5
 """Frames within which peaks are one, and halves of a take agree."""
 HALF = 0.5

@@ -6,10 +6,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from dyntorch import eigenspace, matrix
+from dyntorch import eigenspace, lags, matrix
 from dyntorch.algebra import (
+    covariances,
     epipolar,
     epipolar_descent,
+    epipolar_variance,
     epipole_pairs,
     extensors,
     exterior,
@@ -24,6 +26,10 @@ from dyntorch.tasks import planes_problem, planes_starts
 
 CPU = torch.device("cpu")
 TABLES = [
+    (lags._epipolar_places, (CPU,)),
+    (lags._affine_places, (CPU,)),
+    (epipolar_variance._plane, (CPU,)),
+    (covariances._packing, (3, CPU)),
     (extensors._levi_civita, (3, torch.float64, CPU)),
     (extensors._laplace, (4, 2, CPU)),
     (extensors._dual_signs, (4, 2, CPU)),
