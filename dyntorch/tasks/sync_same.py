@@ -28,6 +28,8 @@ FAR = 6.0
 LOST = 0.3
 """Share of the positions of a point, or of a stretch of the take, that may be outliers."""
 STRETCHES = 8
+RARE = 0.01
+"""Share of the positions that makes no difference to a fit that is sure."""
 ROUGH = 1.25
 """Residual over what the noise explains, from which lenses are looked at."""
 
@@ -109,6 +111,8 @@ def _pruned(found: Attempt) -> tuple[Tracks, Tracks] | None:
     # a point that is mostly elsewhere is another point, and is found as such
     far = far & (far.sum(0) <= LOST * seen.sum(0))
     parts = [(float(one.sum()), float(all_.sum())) for one, all_ in zip(far.chunk(STRETCHES), seen.chunk(STRETCHES), strict=True)]
+    if found.decided and float(far.double().mean()) < RARE:
+        return None  # the weights of the fit are enough
     # a stretch that does not fit is no outlier: it contradicts
     if not bool(far.any()) or any(lost > LOST * whole for lost, whole in parts):
         return None
