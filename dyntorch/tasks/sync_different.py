@@ -22,6 +22,8 @@ DRIFTING = 20.0
 """Seconds of overlap from which clock rates are looked for."""
 NEAR = 1.0
 """Seconds around the best shift in which rates are compared."""
+SHARP = 0.6
+"""Frames of the slower camera: a larger sigma decides nothing."""
 WINDOW = 10.0
 """Seconds of a window that has a shift of its own."""
 LIKELY = 0.5
@@ -54,7 +56,17 @@ def different_points(a: Tracks, b: Tracks, *, max_shift: float | None, rate: flo
             found = _Samples(a, b, step, ratio)
             curve = found.curve(max_shift)
             best = found.shift(curve)
-    return _result(a, b, found, curve, best, rate_sigma)
+    return _result(a, b, found, curve, _to_a_frame(best, step, max(a.step, b.step)), rate_sigma)
+
+
+def _to_a_frame(best: SubspaceShift, step: float, frame: float) -> SubspaceShift:
+    """Refused where the shift is not known to a frame of the slower camera, though it may be to a step of the search."""
+    if not best.ok or best.sigma * step <= SHARP * frame:
+        return best
+    reason = (
+        f"the best shift is uncertain by {best.sigma * step:.2g} s, frames are {frame:.2g} s apart: film longer, or larger motion"
+    )
+    return dataclasses.replace(best, ok=False, reason=reason)
 
 
 class _Samples:

@@ -5,6 +5,8 @@ import math
 import pytest
 import torch
 
+from dyntorch.tasks.sync_different import _to_a_frame
+from dyntorch.tasks.sync_subspace_shift import SubspaceShift
 from dyntorch.tasks.synchronize import synchronize
 
 FRAME = 1 / 30
@@ -162,3 +164,10 @@ def test_numbers_of_points_may_differ_but_not_of_coordinates():
     a, b = pair(0.3)
     with pytest.raises(ValueError, match=r"b must be a tensor \(frames, points, 2\), got \(240, 12\)"):
         synced(a, b.flatten(1))
+
+
+def test_a_shift_that_is_not_known_to_a_frame_of_fast_cameras_is_refused():
+    found = SubspaceShift(3.0, 0.5, torch.zeros(0, 2), 0.99, 9.0, True, "")
+    assert _to_a_frame(found, 1 / 30, 1 / 30) is found
+    fast = _to_a_frame(found, 1 / 30, 1 / 60)
+    assert not fast.ok and "uncertain by 0.017 s" in fast.reason and fast.position == found.position
