@@ -153,8 +153,6 @@ def _piece(samples: Samples, lo: int, hi: int) -> tuple[Tensor, Tensor]:
 
 
 def _sampled(tracks: Tracks, step: float, width: float) -> tuple[Tensor, Tensor]:
-    start, end = float(tracks.times[0]), float(tracks.times[-1])
-    at = start + step * torch.arange(int((end - start) / step + 1e-6) + 1, dtype=torch.float64, device=tracks.x.device)
-    x, _, weights = smoothed(tracks, at, width)
+    x, _, weights = smoothed(tracks, tracks.every(step), width)
     change = tracks.change
     return torch.where((weights > 0)[..., None], x @ change[:2, :2].mT + change[:2, 2], 0.0), weights

@@ -12,12 +12,10 @@ from dyntorch.tasks.shift import Shift
 from dyntorch.tasks.sync_subspace import SubspaceCurve, bodies_curve, subspace_curve
 from dyntorch.tasks.sync_subspace_body import Body
 from dyntorch.tasks.sync_subspace_shift import SubspaceShift, subspace_shift
-from dyntorch.tasks.sync_tracks import Tracks, smoothed
+from dyntorch.tasks.sync_tracks import RATES, Tracks, smoothed
 
 FINEST = 1 / 30
 """Seconds per step at least: faster films say no more, and noise of neighbouring frames of real detectors is the same."""
-RATES = 0.02
-"""A frame rate as told is wrong by no more than this."""
 DRIFTING = 20.0
 """Seconds of overlap from which clock rates are looked for."""
 NEAR = 1.0
@@ -97,9 +95,7 @@ class _Samples:
 def _sampled(tracks: Tracks, step: float) -> tuple[Tensor, Tensor]:
     if abs(tracks.step / step - 1) < 1e-6 and float((tracks.times.diff() / step - 1).abs().max()) < 1e-3:
         return tracks.x, tracks.weights  # its own frames: nothing to interpolate
-    start, end = float(tracks.times[0]), float(tracks.times[-1])
-    at = start + step * torch.arange(int((end - start) / step + 1e-6) + 1, dtype=torch.float64, device=tracks.x.device)
-    x, _, weights = smoothed(tracks, at, max(0.5 * step, 0.5 * tracks.step))
+    x, _, weights = smoothed(tracks, tracks.every(step), max(0.5 * step, 0.5 * tracks.step))
     return x, weights
 
 

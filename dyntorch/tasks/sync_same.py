@@ -13,10 +13,8 @@ from dyntorch.tasks.sync_consensus import consistent_points
 from dyntorch.tasks.sync_lens import fit_distortion
 from dyntorch.tasks.sync_scaled import frame_scaled
 from dyntorch.tasks.sync_search import DRIFTING, Search, attempt
-from dyntorch.tasks.sync_tracks import Tracks, smoothed, without
+from dyntorch.tasks.sync_tracks import RATES, Tracks, smoothed, without
 
-RATES = 0.02
-"""A frame rate as told is wrong by no more than this."""
 LONGEST = 4_000
 """Steps of a take at most; longer takes are searched in coarser steps."""
 COARSE = 2_000

@@ -5,12 +5,15 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from dyntorch.algebra.homogeneous import similarity
 
+RATES = 0.02
+"""A frame rate as told is wrong by no more than this share."""
 REACH = 4.0
 """Standard deviations at which the smoothing kernel ends."""
 THIN = 0.4
@@ -35,7 +38,7 @@ class Tracks:
     times: Tensor
     step: float
 
-    @property
+    @cached_property
     def noise(self) -> float:
         r"""Standard deviation of a coordinate, from third differences :math:`\mathrm{med}|d_3| / (.6745 \sqrt{20})`: motion is
         smooth."""
@@ -44,30 +47,35 @@ class Tracks:
         rough = self.x.diff(n=3, dim=0)[whole].abs()
         return float(rough.median()) / (0.6745 * math.sqrt(20)) if rough.numel() else 0.0
 
-    @property
+    @cached_property
     def scale(self) -> float:
         """Root mean square distance of the points from their mean."""
         return float(self.centred.square().sum(-1).mul(self.weights).sum().div(self.weights.sum().clamp(min=1e-300)).sqrt())
 
-    @property
+    @cached_property
     def still(self) -> bool:
         """Whether no point moves by more than a millionth of how far points lie apart."""
         share = self.weights / self.weights.sum(0).clamp(min=1e-300)
         away = (self.x - (self.x * share[..., None]).sum(0)).square().sum(-1)
         return bool((torch.where(share > 0, away, 0.0).amax(0).sqrt() <= 1e-6 * self.scale).all())
 
-    @property
+    @cached_property
     def centred(self) -> Tensor:
         """Points about their mean over the take; 0 where missing."""
         share = (self.weights / self.weights.sum().clamp(min=1e-300))[..., None]
         return torch.where(share > 0, self.x - (self.x * share).sum((0, 1)), 0.0)
 
-    @property
+    @cached_property
     def change(self) -> Tensor:
         """``(3, 3)`` similarity to mean 0 and root mean square distance sqrt(2)."""
         share = (self.weights / self.weights.sum().clamp(min=1e-300))[..., None]
         scale = math.sqrt(2) / self.scale if self.scale > 0 else 1.0
         return similarity(torch.as_tensor(scale, dtype=torch.float64, device=self.x.device), (self.x * share).sum((0, 1)))
+
+    def every(self, step: float) -> Tensor:
+        """Seconds from the first frame to the last, ``step`` apart."""
+        start, end = float(self.times[0]), float(self.times[-1])
+        return start + step * torch.arange(int((end - start) / step + 1e-6) + 1, dtype=torch.float64, device=self.x.device)
 
     def only(self, points: Tensor) -> Tracks:
         """These points ``(n,)`` bool alone."""
