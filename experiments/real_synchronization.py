@@ -31,12 +31,10 @@ from scipy.interpolate import CubicSpline  # type: ignore[import-untyped]
 from torch import Tensor
 
 import dyntorch as dyn
-from experiments.benchmarks.interleaved import threads
 from experiments.protocol import Array, data_folder
 from experiments.synchronization_baselines import pose2sim
 from experiments.synchronization_data import Pair
-from experiments.tables import Row, command, measured
-from indexing.files import prepare
+from experiments.tables import Row, command, measured_on_one_thread
 from indexing.synchronization import synchronize
 
 VARIABLE = "mate7"
@@ -227,10 +225,7 @@ def run(config: Config) -> None:
         ValueError: no data folder, or a file that cannot be written.
     """
     data_folder()
-    target = config.out.expanduser()
-    prepare(target.parent)
-    with threads(1):
-        measured(list(TABLES), lambda name: TABLES[name](config), target, vars(config))
+    measured_on_one_thread(TABLES, config, config.out)
 
 
 if __name__ == "__main__":

@@ -29,11 +29,9 @@ import tyro
 
 import dyntorch as dyn
 from dyntorch.metrics import misclassification
-from experiments.benchmarks.interleaved import threads
 from experiments.protocol import data_folder
 from experiments.segmentation_data import Pair, hopkins_pairs, motion_pairs
-from experiments.tables import Row, command, measured
-from indexing.files import prepare
+from experiments.tables import Row, command, measured_on_one_thread
 
 THRESHOLDS = (2.0, 2.5, 3.0)
 """px."""
@@ -176,10 +174,7 @@ def run(config: Config) -> None:
     if config.seeds < 1:
         raise ValueError(f"seeds must be at least 1, got {config.seeds}")
     data_folder()
-    target = config.out.expanduser()
-    prepare(target.parent)
-    with threads(1):
-        measured(list(TABLES), lambda name: TABLES[name](config), target, vars(config))
+    measured_on_one_thread(TABLES, config, config.out)
     print(PUBLISHED)
 
 

@@ -21,13 +21,11 @@ from typing import Annotated, Any, Protocol
 import tyro
 
 import dyntorch as dyn
-from experiments.benchmarks.interleaved import threads
 from experiments.protocol import data_folder
 from experiments.synchronization_baselines import activity, pose2sim, vertical
 from experiments.synchronization_data import Pair, cmu_pair, cmu_pairs, moving, seeded
 from experiments.synchronization_motions import long_take, periodic_pair, reversed_pair, still_pair, unrelated_pair
-from experiments.tables import Row, command, measured
-from indexing.files import prepare
+from experiments.tables import Row, command, measured_on_one_thread
 
 NOISE = (0.0, 15.0, 30.0, 60.0)
 """mm."""
@@ -264,10 +262,7 @@ def run(config: Config) -> None:
     if config.trials < 1:
         raise ValueError(f"trials must be at least 1, got {config.trials}")
     data_folder()
-    target = config.out.expanduser()
-    prepare(target.parent)
-    with threads(1):
-        measured(list(TABLES), lambda name: TABLES[name](config), target, vars(config))
+    measured_on_one_thread(TABLES, config, config.out)
 
 
 if __name__ == "__main__":

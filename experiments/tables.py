@@ -7,11 +7,14 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 import tyro
 
+from experiments.benchmarks.interleaved import threads
 from indexing.files import manifest, prepare, write_json
+
+C = TypeVar("C")
 
 
 @dataclass(frozen=True)
@@ -113,6 +116,18 @@ def measured(names: Sequence[str], table: Callable[[str], list[Row]], target: Pa
     tables = {name: [{**vars(row), "reached": row.reached} for row in rows] for name, rows in results.items()}
     write_json(target, {"manifest": manifest(settings, [], seed=0, timings=seconds), "tables": tables})
     note(f"written: {target}")
+
+
+def measured_on_one_thread(tables: Mapping[str, Callable[[C], list[Row]]], config: C, out: Path) -> None:
+    """:func:`measured` of named tables of one configuration, which goes into the file, without the noise of threads.
+
+    Raises:
+        ValueError: the file cannot be written; said before anything is measured.
+    """
+    target = out.expanduser()
+    prepare(target.parent)
+    with threads(1):
+        measured(list(tables), lambda name: tables[name](config), target, vars(config))
 
 
 def command(run: Callable[[], None]) -> None:

@@ -25,11 +25,10 @@ from torch import Tensor
 import dyntorch as dyn
 from dyntorch import scenes
 from dyntorch.metrics import misclassification
-from experiments.benchmarks.interleaved import interleaved, threads
+from experiments.benchmarks.interleaved import interleaved
 from experiments.protocol import DATA
 from experiments.segmentation_data import Pair, motion_pairs
-from experiments.tables import Row, command, measured, note
-from indexing.files import prepare
+from experiments.tables import Row, command, measured_on_one_thread, note
 
 MODEL, INLIER = 1.0, 2.5
 """px: what a peer fits at, and what it takes out."""
@@ -207,10 +206,7 @@ TABLES = {"Pairs of photographs": real, "Many matches": large, "Exact problems i
 
 def run(config: Config) -> None:
     """Print every table, then write the file."""
-    target = config.out.expanduser()
-    prepare(target.parent)
-    with threads(1):
-        measured(list(TABLES), lambda name: TABLES[name](config), target, vars(config))
+    measured_on_one_thread(TABLES, config, config.out)
 
 
 if __name__ == "__main__":

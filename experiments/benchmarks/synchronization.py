@@ -28,9 +28,8 @@ from dyntorch.algebra.correlation import Lags
 from dyntorch.algebra.epipolar_variance import epipolar_variance
 from dyntorch.algebra.homogeneous import homogeneous
 from dyntorch.tasks.sync_subspace import subspace_curve
-from experiments.benchmarks.interleaved import interleaved, threads
-from experiments.tables import Row, command, measured
-from indexing.files import prepare
+from experiments.benchmarks.interleaved import interleaved
+from experiments.tables import Row, command, measured_on_one_thread
 
 GOALS = {"same": 0.05, "different": 0.3, "ratio": 200.0}
 """Seconds, seconds, and times the speed of a decomposition per shift."""
@@ -268,11 +267,8 @@ def run(config: Config) -> None:
     """
     if config.rounds < 1:
         raise ValueError(f"rounds must be at least 1, got {config.rounds}")
-    target = config.out.expanduser()
-    prepare(target.parent)
     tables = {"same points": same_points, "different points": different_points, "long takes": long_takes}
-    with threads(1):
-        measured(list(tables), lambda name: tables[name](config), target, vars(config))
+    measured_on_one_thread(tables, config, config.out)
 
 
 if __name__ == "__main__":
