@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from indexing.checks import check_parameters
-from indexing.files import write_bytes
+from indexing.modelfile import AGAIN, labels_from_json, labels_to_json, read_model, write_model
 from indexing.shape.bank import NEAREST, Kernels, Windows
 from indexing.shape.channels import CHANNELS, JointMetric
 from indexing.shape.exemplars import Exemplars
@@ -25,7 +23,6 @@ if TYPE_CHECKING:
 FORMAT = "dyntorch.action-indexer"
 VERSION = 1
 PLAIN = ("labels", "symmetry", "mirrored", "weights", "hub", "moment_hub", "evidence_out")  # tensors as they are
-SAVED = "fit on the clips again and save with this version"
 
 Indexer = TypeVar("Indexer", bound="ActionIndexer")
 
@@ -36,56 +33,23 @@ def save(indexer: ActionIndexer, path: str | Path) -> None:
     Raises:
         ValueError: the file cannot be written, or the labels are neither text nor numbers.
     """
-    from safetensors.torch import save as to_bytes
-
-    classes = indexer.classes_
-    if classes.dtype.kind not in "Uiufb" and not (classes.dtype.kind == "O" and all(isinstance(c, str) for c in classes)):
-        raise ValueError(f"labels of type {classes.dtype} cannot be saved; use text or numbers")
-    parameters = _plain(indexer.get_params())
-    del parameters["device"]  # where to compute belongs to the machine, not to the model
     skeleton = indexer.skeleton_
-    metadata = {
-        "format": FORMAT,
-        "version": VERSION,
-        "parameters": parameters,
-        "classes": {"values": classes.tolist(), "dtype": classes.dtype.str},
+    about = {
+        "classes": labels_to_json(indexer.classes_),
         "joints": indexer.n_joints_,
         "view": indexer.model_.view,
         "scorer": indexer.model_.scorer,
         "skeleton": None if skeleton is None else [skeleton.name, list(skeleton.joints), [list(b) for b in skeleton.bones]],
     }
-    try:
-        header = json.dumps(metadata)
-    except TypeError as error:
-        bad = [name for name, value in parameters.items() if not _is_json(value)]
-        raise ValueError(
-            f"{', '.join(bad)}: a model file holds text, numbers and lists only ({error}); set it to one of these"
-        ) from None
-    data = to_bytes(_tensors(indexer.model_), metadata={"dyntorch": header})
-    write_bytes(Path(path), data)
+    write_model(path, FORMAT, VERSION, indexer.get_params(), about, _tensors(indexer.model_))
 
 
 def load(kind: type[Indexer], path: str | Path, device: str = "cpu") -> Indexer:
     """Read a fitted indexer; see :meth:`indexing.ActionIndexer.load`."""
-    from safetensors import SafetensorError, safe_open
-
-    path = Path(path)
-    if not path.is_file():
-        raise ValueError(f"{path}: no such model file; make one with 'dyntorch index fit ... -o {path.name}'")
+    metadata, tensors = read_model(path, FORMAT, VERSION)
     try:
-        with safe_open(path, framework="pt") as file:
-            header = (file.metadata() or {}).get("dyntorch")
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  (safe_open is no mapping)
-    except (SafetensorError, OSError) as error:
-        raise ValueError(f"{path}: not a model file (safetensors says: {error}); give the file that 'index fit' wrote") from None
-    try:
-        metadata = json.loads(header or "{}")
-        if not isinstance(metadata, dict) or metadata.get("format") != FORMAT:
-            raise ValueError("a safetensors file, but not an action indexer; give the file that 'index fit' wrote")
-        if metadata.get("version") != VERSION:
-            raise ValueError(f"model version {metadata.get('version')!r}, this program reads {VERSION}")
         indexer = kind(**metadata["parameters"], device=device)
-        indexer.classes_ = np.array(metadata["classes"]["values"], dtype=np.dtype(metadata["classes"]["dtype"]))
+        indexer.classes_ = labels_from_json(metadata["classes"])
         indexer.n_joints_ = int(metadata["joints"])
         name, joints, bones = metadata["skeleton"] or (None, (), ())
         indexer.skeleton_ = Skeleton(name, tuple(joints), tuple((a, b) for a, b in bones)) if name is not None else None
@@ -94,7 +58,7 @@ def load(kind: type[Indexer], path: str | Path, device: str = "cpu") -> Indexer:
         _check_fit(indexer)
         indexer._calibrate()
     except (KeyError, TypeError, IndexError, ValueError, RuntimeError, AttributeError) as error:
-        raise ValueError(f"{path}: not a model that can be used ({type(error).__name__}: {error}); {SAVED}") from None
+        raise ValueError(f"{path}: not a model that can be used ({type(error).__name__}: {error}); {AGAIN}") from None
     return indexer
 
 
@@ -138,14 +102,6 @@ def _check_fit(indexer: ActionIndexer) -> None:
         raise ValueError(f"{', '.join(wrong)} do not fit the rest")
 
 
-def _is_json(value: Any) -> bool:
-    try:
-        json.dumps(value)
-    except TypeError:
-        return False
-    return True
-
-
 def _tensors(model: ShapeModel) -> dict[str, Tensor]:
     exemplars = model.exemplars
     named: dict[str, Tensor | None] = {name: getattr(model, name) for name in PLAIN}
@@ -156,7 +112,7 @@ def _tensors(model: ShapeModel) -> dict[str, Tensor]:
         machine = model.machine
         named |= {"scales": model.kernels.scales, **_windows("support", model.support), "machine.support": machine.support}
         named |= {"machine.dual": machine.dual, "machine.intercept": machine.intercept, "machine.counts": machine.counts}
-    return {name: value.detach().cpu().contiguous().clone() for name, value in named.items() if value is not None}
+    return {name: value for name, value in named.items() if value is not None}
 
 
 def _windows(name: str, windows: Windows) -> dict[str, Tensor]:
@@ -184,11 +140,3 @@ def _model(tensors: dict[str, Tensor], classes: int, view: str, scorer: str) -> 
         machine=machine,
         **plain,
     )
-
-
-def _plain(parameters: dict[str, Any]) -> dict[str, Any]:
-    """Parameters as JSON has them: numpy scalars become Python's, tuples lists."""
-    return {
-        k: v.tolist() if isinstance(v, (np.generic, np.ndarray)) else list(v) if isinstance(v, tuple) else v
-        for k, v in parameters.items()
-    }

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from indexing.cli.console import Progress, progress, say, table
+from indexing.cli.films import Pixels, are_films
 from indexing.cli.inputs import Reading, assumed, usable
 from indexing.cli.outputs import check_report
 
@@ -19,8 +20,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from indexing.cli.protocol import Cameras, Fold
-    from indexing.clip import ClipSet
+    from indexing.cli.protocol import Fold, Viewing
+    from indexing.labelled import LabelledSet
     from indexing.report import EvaluationResult
 
 REJECTED = "(rejected)"
@@ -37,7 +38,7 @@ class Evaluate:
     """
 
     clips: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SET.npz")]
-    """a clip set with labels"""
+    """a clip set with labels: joints, or frames (then pixels are learned from)"""
     train: Criteria = ()
     """learn from the clips with these values, e.g. view=1,2 (repeat the option for further fields); by default all but --test"""
     test: Criteria = ()
@@ -65,6 +66,7 @@ class Evaluate:
     report: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
     """where to write report.html, confusion.png, metrics.json and manifest.json; without it, print only"""
     reading: Reading = field(default_factory=Reading)
+    pixels: Pixels = field(default_factory=Pixels)
 
     def run(self) -> int:
         """Read, split, learn and ask for every fold; write the report and print the numbers."""
@@ -72,11 +74,9 @@ class Evaluate:
         started = time.perf_counter()
         with progress("loading", steps=False):
             import indexing.indexer  # noqa: F401  (its import takes longer than the reading)
-            from indexing.cli.protocol import Cameras, check_classes, check_dims, splits, strangers
+            from indexing.cli.protocol import check_classes, splits, strangers
 
-            clips, notes = self._load()
-            cameras = Cameras(self.camera, self._azimuths(), self.exemplars == "3d", self.seed)
-            notes += check_dims(clips, cameras)
+            clips, cameras, notes = self._films() if are_films([self.clips]) else self._load()
             folds, warned = splits(clips, self.train, self.test, self.leave_out)
             labels = clips.labels.astype(str)
             check_classes(folds, labels, clips.name)
@@ -100,12 +100,21 @@ class Evaluate:
             say(f"report: {page}")
         return 0
 
-    def _load(self) -> tuple[ClipSet, list[str]]:
+    def _films(self) -> tuple[LabelledSet[Any], Viewing, list[str]]:
+        from indexing.cli import films
+
+        films.refuse_keypoint_flags(self, "camera", "azimuth", "exemplars", "view", "weights", "mirror")
+        return films.read_set(self.clips, self.reading), films.AsTheyAre(), []
+
+    def _load(self) -> tuple[LabelledSet[Any], Viewing, list[str]]:
+        from indexing.cli.protocol import Cameras, check_dims
+
         clips = self.reading.read(self.clips)
         if all(clip.label is None for clip in clips):
             raise ValueError(f"{self.clips}: says nothing of the actions; give a clip set with 'action' (and 'action_names')")
         clips, notes = usable(clips, self.clips)
-        return clips, notes + assumed(clips, self.clips)
+        cameras = Cameras(self.camera, self._azimuths(), self.exemplars == "3d", self.seed)
+        return clips, cameras, notes + assumed(clips, self.clips) + check_dims(clips, cameras)
 
     def _azimuths(self) -> tuple[float, ...]:
         if self.azimuth is None:
@@ -126,22 +135,18 @@ class Evaluate:
         return [fold for fold, _ in drawn], [note for _, few in drawn for note in few]
 
     def _measure(
-        self, clips: ClipSet, labels: NDArray[np.str_], folds: list[Fold], cameras: Cameras, timings: dict[str, float],
+        self, clips: LabelledSet[Any], labels: NDArray[np.str_], folds: list[Fold], cameras: Viewing, timings: dict[str, float],
         bar: Progress,
     ) -> list[tuple[str, EvaluationResult]]:  # fmt: skip
         """One result per fold and camera, each with the name of its fold."""
-        from indexing.indexer import ActionIndexer
         from indexing.report import EvaluationResult
 
         classes = sorted(set(labels))
         out = []
         for number, fold in enumerate(folds):
             started = time.perf_counter()
-            indexer = ActionIndexer(
-                view=self.view, weights=self.weights, reject=self.reject, none_label=REJECTED,
-                mirror="auto" if self.mirror else False, random_state=self.seed,
-            )  # fmt: skip
-            indexer.fit([cameras.exemplar(clips[i], int(i)) for i in fold.train], labels[fold.train])
+            examples = [cameras.exemplar(clips[i], int(i)) for i in fold.train]
+            indexer = self._indexer(examples).fit(examples, labels[fold.train])
             timings["learn"] += time.perf_counter() - started
             for view, setting in enumerate(cameras.settings):
                 queries = [cameras.query(clips[i], int(i), view) for i in fold.test]
@@ -151,6 +156,19 @@ class Evaluate:
                 out.append((fold.name, EvaluationResult(classes, labels[fold.test], predicted, setting or fold.name)))
                 bar((number + (view + 1) / len(cameras.settings)) / len(folds))
         return out
+
+    def _indexer(self, examples: list[Any]) -> Any:
+        """A new indexer of what the examples are."""
+        if are_films([self.clips]):
+            from indexing.cli.films import frame_rate
+
+            return self.pixels.indexer(frame_rate(examples), reject=self.reject, none_label=REJECTED)
+        from indexing.indexer import ActionIndexer
+
+        return ActionIndexer(
+            view=self.view, weights=self.weights, reject=self.reject, none_label=REJECTED,
+            mirror="auto" if self.mirror else False, random_state=self.seed,
+        )  # fmt: skip
 
     def _write(
         self, folder: Path, results: list[EvaluationResult], groups: dict[str, float], notes: list[str], timings: dict[str, float]

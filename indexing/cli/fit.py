@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -10,7 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from indexing.cli.console import count, names, progress, say, table
-from indexing.cli.inputs import Reading, parse_example, read_examples
+from indexing.cli.films import Pixels, are_films
+from indexing.cli.inputs import Example, Reading, parse_example, read_examples
 from indexing.cli.outputs import check_file
 
 if TYPE_CHECKING:
@@ -24,10 +26,13 @@ class Fit:
     dyntorch index fit squat=a.json "lunge left"=b.json@1.5-4 -o moves.safetensors
 
     dyntorch index fit clips.npz --select view=1,2 -o moves.safetensors
+
+    dyntorch index fit raise=a.mp4 wave=b.mp4@3-5 -o moves.safetensors      (videos: from pixels alone, no pose estimator)
     """
 
     examples: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="LABEL=FILE ...", help_behavior_hint="")]
-    """keypoint files or OpenPose folders, one or more per label; label=file@1.5-4 uses these seconds; a labelled set: SET.npz"""
+    """keypoint files or OpenPose folders, or videos, one or more per label; label=file@1.5-4 uses these seconds; a labelled set:
+    SET.npz"""
     output: Annotated[Path, tyro.conf.arg(aliases=("-o",), metavar="FILE")]
     """the model to write, usually *.safetensors"""
     select: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="FIELD=VALUES")] = ()
@@ -43,6 +48,7 @@ class Fit:
     seed: int = 0
     """of the virtual views"""
     reading: Reading = field(default_factory=Reading)
+    pixels: Pixels = field(default_factory=Pixels)
 
     def run(self) -> int:
         """Read, learn, write, and say what was learned."""
@@ -50,13 +56,11 @@ class Fit:
             raise ValueError("no examples; give at least two actions, such as squat=a.json lunge=b.json, or a clip set SET.npz")
         examples = [parse_example(text) for text in self.examples]
         output = check_file(self.output, [example.path for example in examples])
+        if are_films([example.path for example in examples]):
+            return self._from_pixels(examples, output)
         with progress("reading", steps=False):
             clips, notes = read_examples(examples, self.reading, self.select)
-        if len({str(clip.label) for clip in clips}) < 2:
-            files = names([str(example.path) for example in examples])
-            raise ValueError(
-                f"{files}: only one action ({clips[0].label}); give examples of two or more, such as ordinary movement"
-            )
+        _check_two([str(clip.label) for clip in clips], examples)
         started = time.perf_counter()
         with progress(f"learning from {count(len(clips), 'clip')}", steps=False):
             from indexing.files import prepare
@@ -67,14 +71,45 @@ class Fit:
                 random_state=self.seed,
             )  # fmt: skip
             indexer.fit(clips, [str(clip.label) for clip in clips])
-        seconds = time.perf_counter() - started
         prepare(output.parent)
         indexer.save(output)
         _show(clips)
         for note in notes:
             say(f"note: {note}")
-        say(f"learned in {seconds:.1f} s; model written to {output} ({max(1, round(output.stat().st_size / 1000)):,} kB)")
-        return 0
+        return _written(output, time.perf_counter() - started)
+
+    def _from_pixels(self, examples: list[Example], output: Path) -> int:
+        """The same for videos."""
+        from indexing.cli import films
+        from indexing.files import prepare
+
+        films.refuse_keypoint_flags(self, "view", "weights", "mirror", "seed")
+        with progress("reading", steps=False):
+            sources, labels, lengths = films.read_examples(examples, self.reading, self.select)
+        _check_two(labels, examples)
+        started = time.perf_counter()
+        with progress(f"learning from {count(len(sources), 'video')}", steps=False):
+            indexer = self.pixels.indexer(films.frame_rate(sources), reject=self.reject).fit(sources, labels)
+        prepare(output.parent)
+        indexer.save(output)
+        lines = []
+        for label in sorted(set(labels)):
+            mine = [seconds for name, seconds in zip(labels, lengths, strict=True) if name == label]
+            lines.append([label, len(mine), f"{sum(mine):.1f}"])
+        table(["action", "examples ", "seconds "], lines)
+        say(f"note: learned from pixels, at {indexer.fps:.3g} frames per second")
+        return _written(output, time.perf_counter() - started)
+
+
+def _check_two(labels: Sequence[str], examples: Sequence[Example]) -> None:
+    if len(set(labels)) < 2:
+        files = names([str(example.path) for example in examples])
+        raise ValueError(f"{files}: only one action ({labels[0]}); give examples of two or more, such as ordinary movement")
+
+
+def _written(output: Path, seconds: float) -> int:
+    say(f"learned in {seconds:.1f} s; model written to {output} ({max(1, round(output.stat().st_size / 1000)):,} kB)")
+    return 0
 
 
 def _show(clips: list[Clip]) -> None:

@@ -194,8 +194,11 @@ def read_recordings(paths: Sequence[Path], reading: Reading, joints: int, model:
     ]
 
 
-def read_truth(path: Path, recordings: Sequence[Clip]) -> tuple[list[list[KnownEvent]], list[str]]:
+def read_truth(path: Path, recordings: Sequence[str]) -> tuple[list[list[KnownEvent]], list[str]]:
     """Known events of each recording from a CSV with the columns ``label,start,end`` and, for several recordings, ``file``.
+
+    Args:
+        recordings: their names.
 
     Raises:
         ValueError: naming file, row and column.
@@ -208,7 +211,7 @@ def read_truth(path: Path, recordings: Sequence[Clip]) -> tuple[list[list[KnownE
     for line, row in rows:
         event = _event(path, line, row)
         file = row.get("file", "")
-        owner = [i for i, clip in enumerate(recordings) if not file or {file, Path(file).name} & {clip.name, Path(clip.name).name}]
+        owner = [i for i, name in enumerate(recordings) if not file or {file, Path(file).name} & {name, Path(name).name}]
         if owner:
             known[owner[0]].append(event)
         else:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,8 @@ from numpy.typing import NDArray
 from indexing.cameras import perspective, virtual
 from indexing.cli.console import count, names
 from indexing.cli.selection import choose, column, known
-from indexing.clip import Clip, ClipSet
+from indexing.clip import Clip
+from indexing.labelled import LabelledSet
 
 IntArray = NDArray[np.int64]
 ELEVATION, SPREAD = 0.1, 0.1  # radians: of virtual cameras, and how much a query's may differ either way
@@ -24,6 +26,20 @@ class Fold:
     name: str
     train: IntArray
     test: IntArray
+
+
+class Viewing(Protocol):
+    """How recordings become what is learned from and what is asked about; ``settings`` names the ways of asking."""
+
+    def exemplar(self, clip: Any, number: int) -> Any:
+        """A recording as it is learned from."""
+
+    def query(self, clip: Any, number: int, view: int) -> Any:
+        """A recording as it is asked about."""
+
+    @property
+    def settings(self) -> list[str]:
+        """What the ways of asking are called; one without a name where there is just one."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +90,9 @@ def check_dims(clips: Sequence[Clip], cameras: Cameras) -> list[str]:
     return []
 
 
-def splits(clips: ClipSet, train: Sequence[str], test: Sequence[str], leave_out: str | None) -> tuple[list[Fold], list[str]]:
+def splits(
+    clips: LabelledSet[Any], train: Sequence[str], test: Sequence[str], leave_out: str | None
+) -> tuple[list[Fold], list[str]]:
     """The folds that the options ask for, and what a person should know about them.
 
     Raises:
@@ -99,7 +117,7 @@ def splits(clips: ClipSet, train: Sequence[str], test: Sequence[str], leave_out:
     return [Fold("", learned, asked)], notes
 
 
-def _leave_out(clips: ClipSet, field: str) -> list[Fold]:
+def _leave_out(clips: LabelledSet[Any], field: str) -> list[Fold]:
     values = column(clips, field, "--leave-out")
     groups = np.unique(values)
     if len(groups) < 2:

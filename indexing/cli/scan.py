@@ -11,10 +11,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from indexing.cli.console import count, names, progress, say, table
+from indexing.cli.films import are_films
 from indexing.cli.inputs import KnownEvent, Reading, assumed, read_recordings, read_truth
 from indexing.cli.outputs import check_report
 
 if TYPE_CHECKING:
+    from indexing.brightness.indexer import BrightnessIndexer
+    from indexing.cli.films import Recording
     from indexing.clip import Clip
     from indexing.indexer import ActionIndexer
     from indexing.report import RecordingResult
@@ -25,10 +28,12 @@ class Scan:
     """Find the actions of a model in untrimmed recordings.
 
     dyntorch index scan session.json -m moves.safetensors --report out/
+
+    dyntorch index scan session.mp4 -m seen.safetensors --report out/       (a model that was learned from videos)
     """
 
     recordings: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="FILE ...", help_behavior_hint="")]
-    """keypoint files; a folder in OpenPose form is one recording"""
+    """keypoint files (a folder in OpenPose form is one recording), or videos, whichever the model was learned from"""
     model: Annotated[Path, tyro.conf.arg(aliases=("-m",), metavar="FILE")]
     """what 'dyntorch index fit' wrote"""
     report: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
@@ -47,16 +52,17 @@ class Scan:
         folder = check_report(self.report, inputs)
         started = time.perf_counter()
         with progress("loading", steps=False):
-            from indexing.indexer import ActionIndexer
-
-            indexer = ActionIndexer.load(self.model.expanduser())
-            clips = read_recordings(self.recordings, self.reading, indexer.n_joints_, self.model)
+            indexer, recordings, notes = self._films() if self._of_films() else self._clips()
         if self.reject is not None:
             indexer.set_params(reject=self.reject)
-        truth, notes = (None, []) if self.truth is None else read_truth(self.truth, clips)
-        notes = assumed(clips) + notes + _unknown(truth, indexer)
+        names = [recording.name for recording in recordings]
+        truth, unread = (None, []) if self.truth is None else read_truth(self.truth, names)
+        notes = notes + unread + _unknown(truth, indexer)
         loaded = time.perf_counter()
-        results = [self._scan(indexer, clip, None if truth is None else truth[i], i, len(clips)) for i, clip in enumerate(clips)]
+        results = [
+            self._scan(indexer, one, None if truth is None else truth[i], f" ({i + 1} of {len(names)})" if len(names) > 1 else "")
+            for i, one in enumerate(recordings)
+        ]
         timings = {"load": loaded - started, "scan": time.perf_counter() - loaded}
         page = None if folder is None else self._write(folder, indexer, results, notes, inputs, timings)
         _show(results)
@@ -69,17 +75,44 @@ class Scan:
             say(f"report: {page}")
         return 0
 
-    def _scan(self, indexer: ActionIndexer, clip: Clip, truth: list[KnownEvent] | None, index: int, total: int) -> RecordingResult:
+    def _of_films(self) -> bool:
+        """Whether the model was learned from videos; the recordings must be of the same kind."""
+        from indexing.modelfile import model_kind
+
+        of_films = model_kind(self.model) == "dyntorch.brightness-indexer"
+        if are_films(self.recordings) != of_films:
+            has, need = ("videos", "videos") if of_films else ("keypoints", "keypoint files")
+            raise ValueError(f"{self.recordings[0]}: the model {self.model} was learned from {has}; give {need} to search")
+        return of_films
+
+    def _clips(self) -> tuple[ActionIndexer, list[Clip], list[str]]:
+        from indexing.indexer import ActionIndexer
+
+        indexer = ActionIndexer.load(self.model.expanduser())
+        clips = read_recordings(self.recordings, self.reading, indexer.n_joints_, self.model)
+        return indexer, clips, assumed(clips)
+
+    def _films(self) -> tuple[BrightnessIndexer, list[Recording], list[str]]:
+        from indexing.brightness.indexer import BrightnessIndexer
+        from indexing.cli.films import read_films
+
+        return BrightnessIndexer.load(self.model.expanduser()), *read_films(self.recordings, self.reading)
+
+    def _scan(self, indexer: Any, recording: Any, truth: list[KnownEvent] | None, which: str) -> RecordingResult:
+        from indexing.clip import Clip
         from indexing.report import RecordingResult
 
-        which = f" ({index + 1} of {total})" if total > 1 else ""
-        with progress(f"scanning {clip.name}{which}") as bar:
-            scores, events = indexer.scan(clip, bar)
-        mine = [dataclasses.replace(event, exemplar=within_label(indexer, event.exemplar)) for event in events]
-        return RecordingResult(clip.name, clip, clip.times, [str(c) for c in indexer.classes_], scores, mine, truth)
+        classes = [str(label) for label in indexer.classes_]
+        with progress(f"scanning {recording.name}{which}") as bar:
+            if isinstance(recording, Clip):
+                scores, events = indexer.scan(recording, bar)
+                mine = [dataclasses.replace(event, exemplar=within_label(indexer, event.exemplar)) for event in events]
+                return RecordingResult(recording.name, recording, recording.times, classes, scores, mine, truth)
+            times, scores, events = indexer.scan(recording.source, bar)
+            return RecordingResult(recording.name, None, times, classes, scores, events, truth)
 
     def _write(
-        self, folder: Path, indexer: ActionIndexer, results: list[RecordingResult], notes: list[str], inputs: list[Path],
+        self, folder: Path, indexer: Any, results: list[RecordingResult], notes: list[str], inputs: list[Path],
         timings: dict[str, float],
     ) -> Path:  # fmt: skip
         from indexing.files import manifest
@@ -89,9 +122,9 @@ class Scan:
         report = RecognitionReport(
             f"Actions in {results[0].name}" if len(results) == 1 else f"Actions in {len(results)} recordings",
             recordings=results,
-            exemplars=exemplars(indexer),
+            exemplars=exemplars(indexer) if hasattr(indexer, "exemplar") else {},
             notes=notes,
-            manifest=manifest(arguments, [path.expanduser() for path in inputs], indexer.random_state, timings),
+            manifest=manifest(arguments, [path.expanduser() for path in inputs], getattr(indexer, "random_state", None), timings),
         )
         with progress("drawing the report", steps=False):
             return write_recognition(folder, report)
@@ -114,7 +147,7 @@ def exemplars(indexer: ActionIndexer) -> dict[Any, list[Clip]]:
     return found
 
 
-def _unknown(truth: list[list[KnownEvent]] | None, indexer: ActionIndexer) -> list[str]:
+def _unknown(truth: list[list[KnownEvent]] | None, indexer: Any) -> list[str]:
     known = {str(label) for label in indexer.classes_}
     strange = sorted({str(label) for events in truth or [] for label, _, _ in events} - known)
     return [f"the model does not know {names(strange)}, which the known events name"] if strange else []

@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from indexing.clip import ClipSet
+    from indexing.labelled import LabelledSet
 
 IntArray = NDArray[np.int64]
 LISTED = 20  # values named in a message
 
 
-def choose(clips: ClipSet, criteria: Sequence[str], flag: str) -> IntArray:
+def choose(clips: LabelledSet[Any], criteria: Sequence[str], flag: str) -> IntArray:
     """Indices of the clips that meet all criteria.
 
     Args:
@@ -48,7 +48,7 @@ def choose(clips: ClipSet, criteria: Sequence[str], flag: str) -> IntArray:
     return np.flatnonzero(keep)
 
 
-def column(clips: ClipSet, field: str, flag: str) -> NDArray[Any]:
+def column(clips: LabelledSet[Any], field: str, flag: str) -> NDArray[Any]:
     """One value per clip.
 
     Raises:
@@ -62,7 +62,7 @@ def column(clips: ClipSet, field: str, flag: str) -> NDArray[Any]:
     return values
 
 
-def known(clips: ClipSet) -> str:
+def known(clips: LabelledSet[Any]) -> str:
     """What may be asked for: the fields and their values."""
     parts = []
     for field in (*clips.fields, "action"):

@@ -278,12 +278,12 @@ def test_truth_of_several_recordings(tmp_path: Path) -> None:
     clips = [Clip(np.ones((9, 3, 2)), fps=3.0, name=name) for name in ("a.json", "b.json")]
     path = tmp_path / "truth.csv"
     path.write_text("\ufeffFile;Label;start;end\nb.json;wave;0;1\ntakes/a.json;kick;1;2\nc.json;kick;0;1\n\n")
-    known, notes = read_truth(path, clips)
+    known, notes = read_truth(path, [clip.name for clip in clips])
     assert known == [[("kick", 1.0, 2.0)], [("wave", 0.0, 1.0)]]
     assert len(notes) == 1 and "1 row" in notes[0] and "c.json" in notes[0]
     path.write_text("label,start,end\nkick,0,1\n")
     with pytest.raises(ValueError, match="no column 'file'"):
-        read_truth(path, clips)
+        read_truth(path, [clip.name for clip in clips])
 
 
 def test_hits_name_the_exemplar_within_its_label(data: Path) -> None:

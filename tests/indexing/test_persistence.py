@@ -160,9 +160,9 @@ def test_truncated_files_are_refused(saved, tmp_path):
 def test_safetensors_of_something_else_are_refused(tmp_path):
     path = tmp_path / "m.safetensors"
     save_file({"weight": torch.zeros(3)}, path)
-    refused(path, "not an action indexer")
+    refused(path, "action-indexer is expected")
     save_file({"weight": torch.zeros(3)}, path, metadata={"dyntorch": json.dumps({"format": "something"})})
-    refused(path, "not an action indexer")
+    refused(path, "action-indexer is expected")
 
 
 @pytest.mark.parametrize("header", ["", "not json", "[]", "3", "null", '"text"', "{"])
@@ -203,7 +203,7 @@ def test_missing_tensors_are_refused(saved, tmp_path):
         if name not in ("symmetry", "scales"):  # a model may do without these
             rest = {key: value for key, value in tensors.items() if key != name}
             save_file(rest, tmp_path / "m.safetensors", metadata={"dyntorch": json.dumps(metadata)})
-            refused(tmp_path / "m.safetensors", "fit on the clips again")
+            refused(tmp_path / "m.safetensors", "fit on the examples again")
 
 
 @pytest.mark.parametrize(

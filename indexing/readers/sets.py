@@ -1,0 +1,178 @@
+"""What all ``.npz`` sets of recordings share: offsets, labels, names, clocks and whatever else is known of each recording."""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from collections.abc import Hashable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from indexing.clip import FloatArray
+from indexing.readers.files import error
+
+Array = NDArray[Any]
+# keys that describe frames, joints or the whole set: never meta, whatever their length
+RESERVED = {"joints", "offsets", "action", "action_names", "times", "frame", "fps_assumed", "confidence", "up"}
+RESERVED |= {"bones", "parents", "joint_names", "skeleton_name"}
+FORMS = {"joints": "joints (F, n, 2 or 3)", "frames": "frames (F, height, width)"}
+
+
+def load_arrays(path: Path) -> dict[str, Array]:
+    """All arrays of the file; nothing in it is ever unpickled."""
+    if not path.is_file():
+        raise error(path, "no such file", "check the path")
+    key = ""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            data = {}
+            for key in file.files:
+                data[key] = file[key]
+    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error, NotImplementedError) as problem:
+        if "allow_pickle" in str(problem) and key:
+            raise error(
+                path,
+                f"{key} is an array of Python objects, which would need pickle",
+                "save numbers or text: np.asarray(values, dtype=...)",
+            ) from None
+        what = f"{key} cannot be read" if key else "is not an .npz file"
+        raise error(path, f"{what} (the file may be truncated)", "write or copy it again") from None
+    return {key: np.asarray(value) for key, value in data.items()}
+
+
+def need(path: Path, data: Mapping[str, Array], key: str, ndim: int) -> Array:
+    """One array with so many axes, or an error that names what the file holds."""
+    if key not in data:
+        keys = ", ".join(list(data)[:8]) or "nothing"
+        raise error(
+            path,
+            f"is not a clip set: it has no {key!r} (it has {keys})",
+            f"save {FORMS.get(key, key)}, offsets (N + 1), action (N)",
+        )
+    if data[key].ndim != ndim:
+        raise error(
+            path, f"{key} must have {ndim} dimensions, got shape {data[key].shape}", "see indexing.readers.clipset for the format"
+        )
+    return data[key]
+
+
+def clip_offsets(path: Path, data: Mapping[str, Array], key: str) -> NDArray[np.int64]:
+    """``(N + 1,)`` where each clip starts among the rows of ``key``, and the end."""
+    frames = len(data[key])
+    if "offsets" not in data:
+        actions = data.get("action", np.zeros(1))
+        if actions.size > 1:
+            raise error(
+                path, f"has {actions.size} actions but no offsets", "save offsets (N + 1): where each clip starts, and the end"
+            )
+        return np.array([0, frames])
+    offsets = need(path, data, "offsets", 1)
+    if offsets.dtype.kind not in "iu" or len(offsets) < 2:
+        raise error(
+            path,
+            f"offsets must be at least 2 integers, got {offsets.dtype} {offsets.shape}",
+            "save where each clip starts, and the end",
+        )
+    offsets = offsets.astype(np.int64)
+    if offsets[0] != 0 or offsets[-1] != frames:
+        raise error(
+            path,
+            f"offsets run from {offsets[0]} to {offsets[-1]}, but {key} has {frames} frames",
+            "offsets must run from 0 to that number",
+        )
+    stuck = np.flatnonzero(np.diff(offsets) <= 0)
+    if stuck.size:
+        i = int(stuck[0])
+        raise error(
+            path, f"offsets must increase, but offsets[{i}:{i + 2}] = {offsets[i : i + 2].tolist()}", "leave empty clips out"
+        )
+    return offsets
+
+
+def per_clip(path: Path, data: Mapping[str, Array], key: str, count: int, default: Any) -> Array:
+    """``(N,)`` from one value for all, one per clip, or the default."""
+    value = data.get(key, np.asarray(default))
+    if value.size == 1:
+        return np.broadcast_to(value.reshape(()), (count,))
+    if value.shape != (count,):
+        raise error(path, f"{key} must be one value or one per clip ({count}), got shape {value.shape}", "correct its length")
+    return value
+
+
+def clip_names(path: Path, data: Mapping[str, Array], count: int) -> list[str]:
+    """``(N,)`` names, or the file's name and a number."""
+    if "names" not in data:
+        return [f"{path.stem}[{i}]" for i in range(count)]
+    return [str(name) for name in per_clip(path, data, "names", count, "")]
+
+
+def clip_labels(path: Path, data: Mapping[str, Array], count: int) -> list[Hashable | None]:
+    """``(N,)`` labels; ``None`` where unknown."""
+    if "action" not in data:
+        return [None] * count
+    action = need(path, data, "action", 1)
+    if len(action) != count:
+        raise error(path, f"action has {len(action)} values for {count} clips", "save one action per clip")
+    if action.dtype.kind == "U":
+        return [str(value) for value in action]
+    # some tools keep missing labels as NaN, and all of them as floats then
+    whole = np.isnan(action) | ((np.abs(action) < 2**53) & (action == np.round(action))) if action.dtype.kind == "f" else None
+    if not (action.dtype.kind in "iu" or (whole is not None and whole.all())):
+        raise error(path, f"action must be integers or text, got {action.dtype}", "save indices into action_names")
+    index = np.nan_to_num(action, nan=-1).astype(np.int64).tolist()
+    if "action_names" not in data:
+        return [i if i >= 0 else None for i in index]
+    names = need(path, data, "action_names", 1)
+    if max(index) >= len(names):
+        raise error(
+            path, f"action[{int(np.argmax(index))}] = {max(index)}, but there are {len(names)} action_names", "add the name"
+        )
+    return [str(names[i]) if i >= 0 else None for i in index]
+
+
+def frame_times(
+    path: Path, data: Mapping[str, Array], offsets: NDArray[np.int64], rate: Array, names: Sequence[str]
+) -> FloatArray | None:
+    """``(F,)`` seconds, or None where neither times nor frame numbers are known."""
+    key = next((key for key in ("times", "frame") if key in data), None)
+    if rate.dtype.kind not in "fiu" or not (np.isfinite(rate).all() and (rate > 0).all()):
+        raise error(path, "fps must be positive", "save frames per second, one value or one per clip")
+    if key is None:
+        return None
+    stamps = data[key]
+    if stamps.shape != (offsets[-1],) or stamps.dtype.kind not in "fiu":
+        raise error(
+            path, f"{key} must be {offsets[-1]} numbers, one per frame, got {stamps.dtype} {stamps.shape}", "save one per frame"
+        )
+    stamps = stamps.astype(np.float64)  # before any difference: unsigned frame numbers would wrap around
+    forward = stamps[1:] > stamps[:-1]
+    forward[offsets[1:-1] - 1] = True  # a new clip may start anywhere
+    if not forward.all():
+        row = int(np.argmin(forward)) + 1
+        clip = int(np.searchsorted(offsets, row, side="right")) - 1
+        raise error(
+            path,
+            f"clip {names[clip]!r}: {key} must increase, but row {row} has {stamps[row]:g} after {stamps[row - 1]:g}",
+            "sort the frames and drop repeated ones",
+        )
+    return np.asarray(stamps if key == "times" else stamps / np.repeat(rate.astype(np.float64), np.diff(offsets)))
+
+
+def clip_meta(data: Mapping[str, Array], count: int) -> dict[str, Array]:
+    """What else is known of each clip, one entry per clip."""
+    meta: dict[str, Array] = {}
+    for key, values in data.items():
+        if key in RESERVED or values.ndim == 0 or len(values) != count:
+            continue
+        meta[key] = values
+        if values.ndim == 2:
+            meta.update({f"{key}{k}": values[:, k] for k in range(values.shape[1])})
+    return meta
+
+
+def plain(value: Any) -> Any:
+    """A Python number or text; rows of 2-D arrays stay arrays."""
+    return value.item() if isinstance(value, np.generic) else value
