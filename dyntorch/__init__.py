@@ -23,6 +23,8 @@ _HOME = {
     "SegmentationMatrix": "dyntorch.invariants.segmentation_matrix",
     "ConvergentMotionMatrix": "dyntorch.invariants.convergent_motion_matrix",
     "GrassmannTensor": "dyntorch.invariants.grassmann_tensor",
+    "ShapeTensor": "dyntorch.invariants.shape_tensor",
+    "DynamicShapeTensor": "dyntorch.invariants.dynamic_shape_tensor",
     "Invariant": "dyntorch.invariant",
     # from matches to the tensor and its motion
     "null_space": "dyntorch.nullspace",
@@ -74,6 +76,13 @@ _HOME = {
     "multibody_matrix": "dyntorch.invariants.multibody",
     "projective_factorization": "dyntorch.algebra.projective_factorization",
     "velocity_factorization": "dyntorch.algebra.velocity_factorization",
+    # shapes that move: every view from another affine camera
+    "fit_shapes": "dyntorch.algebra.dynamic_shape",
+    "MovingShapes": "dyntorch.algebra.dynamic_shape",
+    "recover_times": "dyntorch.algebra.dynamic_shape_time",
+    "Recovery": "dyntorch.algebra.dynamic_shape_time",
+    "Polynomial": "dyntorch.algebra.dynamic_shape_basis",
+    "Fourier": "dyntorch.algebra.dynamic_shape_basis",
     # subspaces and factorization
     "canonical_correlation": "dyntorch.algebra.subspaces",
     "orthonormal_basis": "dyntorch.algebra.subspaces",

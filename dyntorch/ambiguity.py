@@ -49,7 +49,8 @@ def within_noise(
     second = torch.linalg.eigh(g)[1][..., basis.shape[-2], None]
     # a generator of its own: the same matches get the same answer, and the caller's random numbers stay
     draw = torch.Generator(device=weights.device).manual_seed(0)
-    moved = [x + STEP * torch.randn(x.shape, generator=draw, dtype=x.dtype, device=x.device) for x in views]
+    shifts = [STEP * torch.randn(x.shape, generator=draw, dtype=x.dtype, device=x.device) for x in views]
+    moved = [p.disturbed(x, change) for p, x, change in zip(primitives, views, shifts, strict=True)]
     rows = estimation_matrix(primitives, views, weights, static)
     change = estimation_matrix(primitives, moved, weights, static) - rows
     first = basis.mT

@@ -9,9 +9,10 @@ from torch import Tensor
 
 from dyntorch.blocks import map_blocks
 from dyntorch.invariant import Invariant
-from dyntorch.least_squares import BLOCK, minimize, parts_of
+from dyntorch.least_squares import minimize
 from dyntorch.matches import Matches
 from dyntorch.matrix import gram
+from dyntorch.motion_problem import BLOCK, parts_of
 from dyntorch.normalize import denormalize
 from dyntorch.solution import Solution, copied, failed
 

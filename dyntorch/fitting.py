@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -36,6 +38,7 @@ def fit(
     weights: Tensor | None = None,
     static: Tensor | None = None,
     normalize: bool = True,
+    **given: Tensor,
 ) -> Solution:
     r"""Fit a multilinear invariant to matches: the null vector(s) of the estimation matrix, for a whole batch at once.
 
@@ -50,6 +53,7 @@ def fit(
         weights: ``(*batch, n)`` not negative; 0 leaves a match out.
         static: ``(*batch, n)`` bool: matches known not to move add all their rows (segmented configuration, thesis 8.1).
         normalize: False skips the similarity of every view (for matches that are of order 1 already).
+        **given: what else the invariant takes, by name.
 
     Returns:
         A :class:`Solution` with ``tensor``, ``status``, ``singular_values``, ``motion``; same dtype and device as the views.
@@ -70,7 +74,7 @@ def fit(
         >>> (solution.tensor / solution.tensor[2, 2]).mul(1000).round().div(1000).tolist()
         [[1.0, 0.1, 2.0], [-0.1, 1.0, 3.0], [0.1, 0.2, 1.0]]
     """
-    invariant = as_invariant(invariant)
+    invariant, views = as_invariant(invariant).prepared(views, weights, **given)
     return fit_matches(invariant, matches(invariant, views, weights, static), normalize=normalize)
 
 
@@ -82,6 +86,8 @@ def fit_matches(invariant: Invariant, data: Matches, *, normalize: bool = True) 
         few = few and data.count * sum(p.width for p in invariant.primitives) < invariant.width() - invariant.nullity
     if data.views[0].shape[0] and few:
         raise ValueError(f"{invariant!r} needs at least {invariant.minimal()} matches, got {data.count}; add matches")
+    whole, present = invariant.completed(data.views, data.weights)
+    data = replace(data, views=whole, weights=present)
     views, weights, static = copied(invariant, data)
     options = () if static is None else (static,)
 
@@ -105,6 +111,8 @@ def fit_matches(invariant: Invariant, data: Matches, *, normalize: bool = True) 
 
 def _largest(invariant: Invariant) -> int:
     """Numbers per match in the largest temporary of the Gram."""
+    if len(invariant.primitives) == 1:
+        return invariant.width() * invariant.rows()
     size = 1
     for primitive in invariant.primitives[1:]:
         size *= primitive.width * (primitive.width + 1) // 2
@@ -120,10 +128,16 @@ def _solve(
     views = tuple(x.mT.contiguous().mT for x in views)
     # weights of any unit: a problem that counts its matches in thousands is no different
     weights = weights / weights.amax(-1, keepdim=True).clamp(min=torch.finfo(weights.dtype).tiny)
-    norm = normalization(invariant, views, weights) if normalize else _identity(invariant, views)
+    fixed = invariant.intrinsic or not normalize
+    norm = _identity(invariant, views) if fixed else normalization(invariant, views, weights)
     moved = norm.apply(invariant, views)
-    basis, status, uncertainty = _null(invariant, norm.primitives, moved, weights, static)
-    tensor = invariant.normalized(norm.transforms).constrain(invariant.tensor_of(basis))
+    own = invariant.estimated(moved, weights)
+    if own is None:
+        basis, status, uncertainty = _null(invariant, norm.primitives, moved, weights, static)
+        tensor = invariant.normalized(norm.transforms).constrain(invariant.tensor_of(basis))
+    else:
+        tensor, uncertainty = own.tensor, own.uncertainty
+        status = _status(own.few, own.degenerate, own.ambiguous)
     if invariant.copies is not None:
         status, uncertainty = status.amax(-1), uncertainty.amax(-1)
     zero = failed(status)[(..., *([None] * (tensor.ndim - status.ndim)))]
@@ -155,16 +169,21 @@ def _null(
     if static is None:
         few = few | ((weights > 0).sum(-1) < invariant.minimal())
     ambiguous = square * present.clamp(min=1) > AMBIGUOUS
-    weak = (spare > 0) & ~found.degenerate & (g.diagonal(dim1=-2, dim2=-1).sum(-1) * found.competing > WEAK)
+    # frames of single matches, from points of theirs, may be all noise, and then nothing looks weak
+    limit = 0.0 if invariant.intrinsic else WEAK
+    weak = (spare > 0) & ~found.degenerate & (g.diagonal(dim1=-2, dim2=-1).sum(-1) * found.competing > limit)
     if not invariant.resolves_noise and g.device.type == "cpu" and bool(weak.any()):
         chosen = [x[weak] for x in views], weights[weak], None if static is None else static[weak], basis[weak]
         with torch.no_grad():
             ambiguous[weak] = ambiguous[weak] | within_noise(primitives, *chosen)
-    status = torch.full_like(present, int(Status.OK))
-    status = torch.where(ambiguous, int(Status.AMBIGUOUS), status)
-    status = torch.where(found.degenerate, int(Status.DEGENERATE), status)
-    status = torch.where(few, int(Status.TOO_FEW), status)
-    return basis, status, square.sqrt()
+    return basis, _status(few, found.degenerate, ambiguous), square.sqrt()
+
+
+def _status(few: Tensor, degenerate: Tensor, ambiguous: Tensor) -> Tensor:
+    """The first of these that holds."""
+    status = torch.where(ambiguous, int(Status.AMBIGUOUS), int(Status.OK))
+    status = torch.where(degenerate, int(Status.DEGENERATE), status)
+    return torch.where(few, int(Status.TOO_FEW), status)
 
 
 def _with_matrix(

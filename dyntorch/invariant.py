@@ -11,7 +11,7 @@ null space of that matrix.  Minimal counts, rows, normalization, robust estimati
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial, update_wrapper
 from typing import Any, Concatenate, Generic, ParamSpec, TypeVar, cast
@@ -51,6 +51,22 @@ class Frame:
     """Whether the images are hyperplanes of the target, which change by the inverse transposed."""
 
 
+@dataclass(frozen=True)
+class Estimate:
+    """Tensors of flat problems that an invariant finds in a way of its own, and how sure they are."""
+
+    tensor: Tensor
+    """``(b, *axes)``, ``(b, nullity, *axes)`` where the nullity is above 1."""
+    few: Tensor
+    """``(b,)`` bool: fewer matches than determine it."""
+    degenerate: Tensor
+    """``(b,)`` bool: others fulfil all matches exactly."""
+    ambiguous: Tensor
+    """``(b,)`` bool: others fit as well within the noise."""
+    uncertainty: Tensor
+    """``(b,)`` expected relative error."""
+
+
 class Invariant:
     """Base of all invariants.  A subclass sets the attributes and writes ``compose`` and ``decompose``.
 
@@ -80,11 +96,39 @@ class Invariant:
     """Whether robust estimation measures distances to the motions behind its tensors, which takes a decomposition each time."""
     labels_static: bool = False
     """Whether a match known to be static says more than one that may move (the argument ``static``)."""
+    intrinsic: bool = False
+    """Whether the tensor is free of the coordinates of the views, each match being brought into a frame of its own: matches are
+    then not normalized, and the tensor is the same in all coordinates."""
 
     compose: Callable[..., Tensor]
     """The tensor of a motion, ``(*batch, *axes)`` (with ``(*batch, nullity, *axes)`` where nullity > 1)."""
     decompose: Callable[..., Any]
     """The motion of a tensor: one part alone, or the tuple of the parts."""
+
+    def prepared(
+        self, views: Sequence[Tensor], weights: Tensor | None = None, **given: Tensor
+    ) -> tuple[Invariant, tuple[Tensor, ...]]:
+        """The invariant that the arguments of a call belong to, and what they measure in the slot of every primitive.
+
+        By default both as they are.  A family that infers parameters from its arguments, or takes them otherwise than by view,
+        says so here; all that follows sees the result.
+
+        Args:
+            views: positional arguments of ``fit``, ``refine``, ``sampson``.
+            weights: of ``fit``, as they were given: what matches of weight 0 say has no part in what is inferred.
+            **given: further ones by name.
+        """
+        if given:
+            raise TypeError(f"{self!r} takes no argument {next(iter(given))!r}; leave it out")
+        return self, tuple(views)
+
+    def completed(self, views: tuple[Tensor, ...], weights: Tensor) -> tuple[tuple[Tensor, ...], Tensor]:
+        """Measurements ``(b, n, ...)`` and weights ``(b, n)`` of a fit with what they lack filled in; by default as they are."""
+        return views, weights
+
+    def estimated(self, views: tuple[Tensor, ...], weights: Tensor) -> Estimate | None:
+        """Tensors of ``views (b, n, ...)``, ``weights (b, n)`` in a way of its own; by default None: the null space of the rows."""
+        return None
 
     def constrain(self, tensor: Tensor) -> Tensor:
         """The nearest tensor that fulfils the internal constraints, in normalized coordinates; by default the tensor itself."""
@@ -189,6 +233,10 @@ class Invariant:
     def minimal(self) -> int:
         """Fewest matches that determine the tensor linearly: (width - nullity) / rows, rounded up."""
         return -(-(self.width() - self.nullity) // self.rows())
+
+    def single(self) -> bool:
+        """Whether a match fulfils one condition, the multilinear form of its slots."""
+        return self.codim == 1 and self.rows() == 1 and not self.intrinsic
 
     def __repr__(self) -> str:
         return type(self).__name__

@@ -1,21 +1,11 @@
-"""The least squares problem that refinement solves: whitened residuals of all matches in the entries of a motion."""
+"""Nonlinear least squares by Levenberg-Marquardt, for a block of problems at once."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Protocol
 
 import torch
 from torch import Tensor
-
-from dyntorch.forward import jacobian
-from dyntorch.invariant import Invariant
-from dyntorch.residual import multilinear_derivative
-
-BLOCK = 1 << 18
-"""Entries of the Jacobian per block of the batch: larger ones leave the cache, smaller ones pay for the calls."""
-
 
 CONVERGED = 1e-9  # relative decrease of the cost
 
@@ -34,112 +24,6 @@ class Minimand(Protocol):
     def subset(self, keep: Tensor) -> Minimand:
         """Only some of the problems."""
         ...
-
-
-@dataclass(frozen=True)
-class Problem:
-    """Least squares in the entries of a motion, over a block of problems."""
-
-    invariant: Invariant
-    shapes: tuple[torch.Size, ...]
-    views: tuple[Tensor, ...]
-    scales: tuple[Tensor, ...]
-    weights: Tensor
-    static: Tensor | None
-
-    def parts(self, theta: Tensor) -> tuple[Tensor, ...]:
-        """The motion ``(b, *shape)`` of parameters ``(b, p)``."""
-        return parts_of(theta, self.shapes)
-
-    def subset(self, keep: Tensor) -> Problem:
-        """Only some of the problems."""
-        cut = [x[keep] for x in self.views], [s[keep] for s in self.scales], self.weights[keep]
-        static = None if self.static is None else self.static[keep]
-        invariant = self.invariant.subset(keep)
-        return Problem(invariant, self.shapes, tuple(cut[0]), tuple(cut[1]), cut[2], static)
-
-    def residual(self, theta: Tensor, piece: slice) -> tuple[Tensor, Tensor]:
-        """Weighted whitened residuals ``(b, rows)`` of some of the matches, and their derivative ``(b, p, rows)``."""
-        views, weights = tuple(x[:, piece] for x in self.views), self.weights[:, piece]
-        still = None if self.static is None else self.static[:, piece]
-        moving = weights if still is None else weights * ~still
-        value, derivative = self.moving(theta, views)
-        root = moving.sqrt()[..., None].expand(*moving.shape, value.shape[1] // moving.shape[1]).flatten(1)
-        value, derivative = value * root, derivative * root[:, None]
-        if still is None:
-            return value, derivative
-        resting = (weights * still).sqrt()[..., None]
-        more = self.resting(theta, views)
-        more = (
-            (more[0].unflatten(1, (views[0].shape[1], -1)) * resting).flatten(1),
-            more[1] * resting.expand(*resting.shape[:2], more[0].shape[1] // resting.shape[1]).flatten(1)[:, None],
-        )
-        return torch.cat([value, more[0]], dim=-1), torch.cat([derivative, more[1]], dim=-1)
-
-    def moving(self, theta: Tensor, views: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
-        """Unweighted residuals of matches that may move, and their derivative."""
-        known = self.invariant.linearized(self.parts(theta), views, self.scales)
-        if known is not None:
-            return known
-        empty = tuple(x[:0] for x in views), tuple(scale[:0] for scale in self.scales)
-        if self.invariant.whitened(self.parts(theta[:0]), *empty) is not None:
-            shared, slope = jacobian(lambda t: flattened(self.invariant.shared(self.parts(t))), theta)
-            value, derivative = self._by_match(self.invariant.whitened_shared, shared, views)
-            return value, slope @ derivative
-        # one row per match: by hand through the tensor, several times cheaper than forward mode through the matches
-        tensor, slope = self.invariant.compose_derivative(self.parts(theta))
-        shape = self.invariant.shape()
-        value, derivative = multilinear_derivative(self.invariant, tensor.unflatten(1, shape), views, self.scales)
-        return value, slope @ derivative.mT
-
-    def resting(self, theta: Tensor, views: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
-        """Unweighted residuals of matches that do not move, and their derivative."""
-        return self._by_match(self.invariant.whitened_static, theta, views)
-
-    def _by_match(self, function: Callable[..., Tensor], theta: Tensor, views: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
-        """Residuals ``(b, n c)`` and derivative ``(b, p, n c)`` in reverse mode: a few conditions per match, many parameters.
-
-        Every match gets its own copy of the parameters, so that one backward pass per condition serves all matches.
-        """
-        count = views[0].shape[1]
-        single = tuple(x.unsqueeze(2) for x in views)
-        scales = tuple(scale[:, None].expand(-1, count) for scale in self.scales)
-
-        def residual(copies: Tensor) -> Tensor:
-            return function(self.parts(copies), single, scales)[..., 0, :]
-
-        value, pull = torch.func.vjp(residual, theta[:, None].expand(-1, count, -1))[:2]
-        one = torch.eye(value.shape[-1], dtype=value.dtype, device=value.device)
-        rows = torch.stack([pull(unit.expand_as(value).contiguous())[0] for unit in one], dim=2)
-        return value.flatten(1), rows.flatten(1, 2).mT
-
-    def pieces(self, width: int) -> list[slice]:
-        """The matches in slices whose Jacobians fit into memory, whatever their number."""
-        n = self.weights.shape[-1]
-        step = max(256, 8 * BLOCK // (max(1, width) * max(1, self.weights.shape[0])))
-        return [slice(start, start + step) for start in range(0, max(n, 1), step)]
-
-    def normal_equations(self, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Cost ``(b,)``, gradient ``(b, p)`` and Gauss-Newton matrix ``(b, p, p)``."""
-        cost = torch.zeros(theta.shape[0], dtype=theta.dtype, device=theta.device)
-        gradient, matrix = torch.zeros_like(theta), theta.new_zeros(*theta.shape, theta.shape[-1])
-        for piece in self.pieces(theta.shape[-1]):
-            value, derivative = self.residual(theta, piece)
-            cost = cost + value.square().sum(-1)
-            gradient = gradient + (derivative @ value[..., None])[..., 0]
-            matrix = matrix + derivative @ derivative.mT
-        return torch.where(cost.isfinite(), cost, torch.inf), gradient, matrix
-
-
-def parts_of(theta: Tensor, shapes: Sequence[torch.Size]) -> tuple[Tensor, ...]:
-    """The inverse of :func:`flattened`."""
-    sizes = [shape.numel() for shape in shapes]
-    return tuple(part.unflatten(-1, shape) for part, shape in zip(theta.split(sizes, -1), shapes, strict=True))
-
-
-def flattened(parts: tuple[Tensor, ...]) -> Tensor:
-    """All entries of a motion, ``(b, p)``."""
-    return torch.cat([part.flatten(1) for part in parts], dim=-1)
 
 
 def damped_step(gradient: Tensor, matrix: Tensor, damping: Tensor, free: Tensor | None = None) -> Tensor:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.invariant import Invariant
+from dyntorch.primitives import Point, Primitive
 
 
 @dataclass(frozen=True)
@@ -61,11 +62,11 @@ def matches(invariant: Invariant, views: Sequence[Tensor], weights: Tensor | Non
     home = torch.device("cpu") if first.device.type == "mps" else first.device
     # not reshape(-1): without matches any batch would do
     flat = [x.to(home, torch.float64).reshape(math.prod(batch), *x.shape[axis:]) for x in views]
-    weight = _option("weights", weights, batch, n, first)
+    weight = option("weights", weights, batch, n, first)
     weight = torch.ones(flat[0].shape[:2], dtype=torch.float64, device=home) if weight is None else weight.to(home, torch.float64)
     if bool((weight < 0).any()) if weight.device.type == "cpu" else False:
         raise ValueError(f"weights must not be negative, got {float(weight.min()):g}; use 0 to leave a match out")
-    label = _option("static", static, batch, n, first)
+    label = option("static", static, batch, n, first)
     if home.type == "cpu" and bool(torch.stack([x.detach().sum() for x in (*flat, weight)]).isfinite().all()):
         # nothing is missing: one sum per view says so, and nothing is copied
         return Matches(tuple(flat), weight, _labels(label, home), batch, first.dtype, first.device)
@@ -92,26 +93,45 @@ def check_views(invariant: Invariant, views: Sequence[Tensor]) -> None:
     """Raise a ``ValueError`` for another number of views, shapes that do not agree, mixed dtypes or devices."""
     if len(views) != len(invariant.primitives):
         raise ValueError(f"{invariant!r} takes matches in {len(invariant.primitives)} views, got {len(views)}")
+    _check_measured(invariant, invariant.primitives, views, "view")
+
+
+def constellations(invariant: Invariant, points: Sequence[Tensor]) -> Tensor:
+    """Points p1, p2, ... ``(*batch, views, 2)``, each seen in the same views, as one measurement per view.
+
+    Returns:
+        ``(*batch, views, points, 3)``: (x, y, 1), and (0, 0, 0) where a point is missing (NaN or infinite).
+
+    Raises:
+        ValueError: shapes that do not agree, mixed dtypes or devices.
+    """
+    _check_measured(invariant, (Point(2),) * len(points), points, "point")
+    x = torch.stack(list(points), dim=-2)
+    seen = x.isfinite().all(-1, keepdim=True)
+    return torch.cat([torch.where(seen, x, 0.0), seen.to(x)], dim=-1)
+
+
+def _check_measured(invariant: Invariant, primitives: Sequence[Primitive], views: Sequence[Tensor], what: str) -> None:
     leading: list[tuple[int, ...]] = []
-    for v, (primitive, x) in enumerate(zip(invariant.primitives, views, strict=True), start=1):
+    for v, (primitive, x) in enumerate(zip(primitives, views, strict=True), start=1):
         if not isinstance(x, Tensor):
-            raise ValueError(f"view {v} must be a torch.Tensor, got {type(x).__name__}; use torch.as_tensor(...)")
+            raise ValueError(f"{what} {v} must be a torch.Tensor, got {type(x).__name__}; use torch.as_tensor(...)")
         if not x.is_floating_point():
-            raise ValueError(f"view {v} must be of floating point, got {x.dtype}; use .double()")
+            raise ValueError(f"{what} {v} must be of floating point, got {x.dtype}; use .double()")
         try:
             axis = primitive.match_axis(x)
         except ValueError as error:
-            raise ValueError(f"view {v} of {invariant!r}: {error}") from None
+            raise ValueError(f"{what} {v} of {invariant!r}: {error}") from None
         leading.append(tuple(x.shape[: axis + 1]))
     if len(set(leading)) > 1:
-        raise ValueError(f"all views need the same (*batch, n), got {leading}; expand the smaller ones")
+        raise ValueError(f"all {what}s need the same (*batch, n), got {leading}; expand the smaller ones")
     if len({x.dtype for x in views}) > 1:
-        raise ValueError(f"all views need one dtype, got {[str(x.dtype) for x in views]}; use .to(dtype)")
+        raise ValueError(f"all {what}s need one dtype, got {[str(x.dtype) for x in views]}; use .to(dtype)")
     if len({x.device for x in views}) > 1:
-        raise ValueError(f"all views need one device, got {[str(x.device) for x in views]}; use .to(device)")
+        raise ValueError(f"all {what}s need one device, got {[str(x.device) for x in views]}; use .to(device)")
 
 
-def _option(name: str, value: Tensor | None, batch: tuple[int, ...], n: int, like: Tensor) -> Tensor | None:
+def option(name: str, value: Tensor | None, batch: tuple[int, ...], n: int, like: Tensor) -> Tensor | None:
     """``weights`` or ``static`` with the batch of the views, flat."""
     if value is None:
         return None

@@ -66,6 +66,10 @@ def gram(primitives: Sequence[Primitive], views: Sequence[Tensor], weights: Tens
     Returns:
         ``(*batch, width, width)``.
     """
+    if len(primitives) == 1:
+        # nothing to multiply: a match gives its rows as they are
+        matrix = estimation_matrix(primitives, views, weights)
+        return matrix.mT @ matrix
     n, width = weights.shape[-1], math.prod(p.width * (p.width + 1) // 2 for p in primitives[1:])
     shapes = [x.shape[: p.match_axis(x)] for p, x in zip(primitives, views, strict=True)]
     lead = math.prod(torch.broadcast_shapes(*shapes, weights.shape[:-1]))

@@ -77,6 +77,11 @@ def denormalize(invariant: Invariant, tensor: Tensor, actions: Sequence[Tensor])
     Returns:
         The same shape; several tensors are orthonormal again.
     """
+    rank = len(invariant.shape())
+    return _unit_norm(tensor if invariant.intrinsic else _moved_axes(invariant, tensor, actions), rank, invariant.nullity)
+
+
+def _moved_axes(invariant: Invariant, tensor: Tensor, actions: Sequence[Tensor]) -> Tensor:
     axes = [int(v) for v in invariant.axes()]
     small = "".join(LETTERS[i] for i in range(len(axes)))
     large = small.upper()
@@ -84,9 +89,12 @@ def denormalize(invariant: Invariant, tensor: Tensor, actions: Sequence[Tensor])
     ordered = [actions[v] for v in axes]
     if invariant.nullity > 1:
         ordered = [a.unsqueeze(-3) for a in ordered]
-    result = torch.einsum(f"...{small},{maps}->...{large}", tensor, *ordered)
-    rank = len(axes)
-    if invariant.nullity == 1:
+    return torch.einsum(f"...{small},{maps}->...{large}", tensor, *ordered)
+
+
+def _unit_norm(result: Tensor, rank: int, nullity: int) -> Tensor:
+    """Tensors of so many axes at norm 1, several of them orthonormal; zero ones stay zero."""
+    if nullity == 1:
         norm = result.flatten(-rank).norm(dim=-1)[(..., *([None] * rank))]
         return result / torch.where(norm > 0, norm, 1.0)
     flat = result.flatten(-rank)

@@ -11,8 +11,9 @@ from dyntorch.blocks import map_blocks
 from dyntorch.constrained import algebraic_motion
 from dyntorch.forward import jacobian
 from dyntorch.invariant import Invariant
-from dyntorch.least_squares import BLOCK, Problem, flattened, minimize
+from dyntorch.least_squares import minimize
 from dyntorch.matches import Matches, matches
+from dyntorch.motion_problem import BLOCK, Problem, flattened
 from dyntorch.normalize import Normalization, denormalize, denormalize_motion
 from dyntorch.solution import Solution, failed
 
@@ -25,6 +26,7 @@ def refine(
     weights: Tensor | None = None,
     static: Tensor | None = None,
     iterations: int = ITERATIONS,
+    **given: Tensor,
 ) -> Solution:
     r"""Refine the motion of a solution: minimize :math:`\sum_n w_n d_n^2` over its entries by Levenberg-Marquardt.
 
@@ -39,6 +41,7 @@ def refine(
         weights: ``(*batch, n)``; default: the solution's inliers, else its weights.
         static: ``(*batch, n)`` bool, matches that do not move; default: those labelled in the fit.
         iterations: at most so many steps.
+        **given: what else the invariant takes.
 
     Returns:
         The solution with ``tensor``, ``motion``, ``sigma`` (noise per coordinate, in the unit of the matches, that the
@@ -59,7 +62,7 @@ def refine(
         >>> bool((refined.sigma - 0.5).abs() < 0.15)
         True
     """
-    invariant = solution.invariant
+    invariant, views = solution.invariant.prepared(views, **given)
     data = matches(invariant, views, weights, static)
     old = solution.matches
     if data.batch != old.batch or data.count != old.count:

@@ -14,13 +14,14 @@ SINGULAR = 1e-14  # squared gradient, in normalized units, added where value and
 LETTERS = "abcdefgh"
 
 
-def algebraic(invariant: Invariant | type[Invariant], tensor: Tensor, *views: Tensor) -> Tensor:
+def algebraic(invariant: Invariant | type[Invariant], tensor: Tensor, *views: Tensor, **given: Tensor) -> Tensor:
     r"""Algebraic residual :math:`T(u_1, u_2, \dots)` of each match, with points as (x, 1) and hyperplanes with unit normals.
 
     Args:
         invariant: one whose matches give one row each.
         tensor: ``(*batch, *axes)``.
         *views: matches, ``(*batch, n, ...)`` each.
+        **given: what else the invariant takes.
 
     Returns:
         ``(*batch, n)``.
@@ -34,12 +35,12 @@ def algebraic(invariant: Invariant | type[Invariant], tensor: Tensor, *views: Te
         >>> algebraic(dyn.FundamentalMatrix, F, torch.tensor([[0.0, 1.0]]), torch.tensor([[5.0, 3.0]])).tolist()
         [-2.0]
     """
-    invariant = as_invariant(invariant)
+    invariant, views = as_invariant(invariant).prepared(views, **given)
     _check(invariant, tensor, views)
     return _form(invariant, tensor, views)[0]
 
 
-def sampson(invariant: Invariant | type[Invariant], tensor: Tensor, *views: Tensor) -> Tensor:
+def sampson(invariant: Invariant | type[Invariant], tensor: Tensor, *views: Tensor, **given: Tensor) -> Tensor:
     r"""Sampson distance of each match: to first order, how far its measurements must move to fulfil the invariant.
 
     For one condition :math:`h = T(u_1, u_2, \dots)`,
@@ -54,6 +55,7 @@ def sampson(invariant: Invariant | type[Invariant], tensor: Tensor, *views: Tens
         invariant: an invariant class, or an instance of a parametric family.
         tensor: ``(*batch, *axes)``.
         *views: matches, ``(*batch, n, ...)`` each.
+        **given: what else the invariant takes.
 
     Returns:
         ``(*batch, n)`` distances, not negative, in the unit of the measurements.
@@ -69,10 +71,10 @@ def sampson(invariant: Invariant | type[Invariant], tensor: Tensor, *views: Tens
         >>> round(float(sampson(dyn.FundamentalMatrix, F, torch.tensor([[0.0, 1.0]]), torch.tensor([[5.0, 3.0]]))), 4)
         1.4142
     """
-    invariant = as_invariant(invariant)
+    invariant, views = as_invariant(invariant).prepared(views, **given)
     _check(invariant, tensor, views)
     ones = (torch.ones((), dtype=tensor.dtype, device=tensor.device),) * len(views)
-    if invariant.codim == 1 and invariant.rows() == 1:
+    if invariant.single():
         return multilinear(invariant, tensor, views, ones).abs()
     motion = invariant.decompose(tensor)
     return distance(invariant, motion if isinstance(motion, tuple) else (motion,), views, ones)
@@ -151,7 +153,7 @@ def _sampson_terms(
 
 def _form(invariant: Invariant, tensor: Tensor, views: Sequence[Tensor]) -> tuple[Tensor, list[Tensor]]:
     """The multilinear form at each match, and its derivative with respect to the vector of every view."""
-    if invariant.rows() != 1:
+    if invariant.rows() != 1 or invariant.intrinsic:
         raise ValueError(f"a match of {invariant!r} gives {invariant.rows()} rows; it has no single algebraic residual")
     vectors = [p.raw(x) for p, x in zip(invariant.primitives, views, strict=True)]
     letters = [LETTERS[v] for v in range(len(views))]

@@ -36,6 +36,7 @@ def robust_fit(
     generator: torch.Generator | None = None,
     starts: Sequence[int] = STARTS,
     polish: bool = True,
+    **given: Tensor,
 ) -> Solution:
     r"""Fit an invariant to matches of which some, or half, are wrong: graduated non-convexity, many starts where one is not enough.
 
@@ -63,6 +64,7 @@ def robust_fit(
         generator: source of all randomness.
         starts: numbers of starts, tried one after the other on the problems that are not settled; 1 is all matches.
         polish: False leaves out the refinement.
+        **given: what else the invariant takes.
 
     Returns:
         A :class:`~dyntorch.solution.Solution` with ``inliers`` ``(*batch, n)``, the matches within the threshold of its tensor,
@@ -86,7 +88,7 @@ def robust_fit(
         >>> bool(solution.inliers[right].double().mean() > 0.95), bool(solution.inliers[~right].double().mean() < 0.2)
         (True, True)
     """
-    invariant = as_invariant(invariant)
+    invariant, views = as_invariant(invariant).prepared(views, **given)
     with torch.no_grad():
         data = matches(invariant, views, weights)
         _check(invariant, data, starts)
@@ -105,6 +107,11 @@ def _empty(solution: Solution) -> Solution:
 
 
 def _check(invariant: Invariant, data: Matches, starts: Sequence[int]) -> None:
+    if invariant.intrinsic:
+        raise ValueError(
+            f"robust_fit compares views of matches, and a match of {invariant!r} stands alone; fit, see which matches "
+            "dyntorch.sampson finds far off, and fit again with weights= of 0 for them"
+        )
     if not starts or any(count < 1 for count in starts):
         raise ValueError(f"starts must be numbers of starts >= 1, tried one after the other, got {starts!r}")
     if data.views[0].shape[0] and data.count < invariant.minimal():
@@ -173,7 +180,7 @@ def _solution(search: Search, found: Found) -> Solution:
 def distances(solution: Solution) -> Tensor:
     """Sampson distances ``(b, n)`` in the unit of the matches, as :func:`dyntorch.sampson` has them."""
     invariant, data, norm = solution.invariant, solution.matches, solution.normalization
-    alone = invariant.codim == 1 and invariant.rows() == 1
+    alone = invariant.single()
     parts = (solution.normalized,) if alone else solution.normalized_motion()
     transforms = tuple(t[:, 0] for t in norm.transforms) if invariant.copies else norm.transforms
     count = len(data.views)

@@ -90,6 +90,18 @@ def gather_labels(clips: list[Clip], owners: list[int], labels: ArrayLike | None
     return np.asarray(check_labels(labels, owners[-1] + 1)[owners])
 
 
+def gather_groups(clips: list[Clip], owners: list[int], groups: ArrayLike | None) -> Array | None:
+    """``(clips,)`` names of who performs, as text; ``None`` where some clips do not say."""
+    if groups is not None:
+        values = np.asarray(groups)
+        if values.ndim != 1 or len(values) != owners[-1] + 1:
+            raise ValueError(f"groups: expected one per clip ({owners[-1] + 1}), got shape {values.shape}")
+        return values[owners].astype(str)
+    if any("subject" not in clip.meta for clip in clips):
+        return None
+    return np.array([str(clip.meta["subject"]) for clip in clips])
+
+
 def check_labels(labels: ArrayLike, items: int) -> Array:
     """``(items,)`` labels, one kind of thing and none missing."""
     given = labels.tolist() if isinstance(labels, np.ndarray) else labels
@@ -130,6 +142,7 @@ def _axes(value: Any) -> int:
 _CHOICES: dict[str, tuple[Any, ...]] = {
     "view": ("any", "same"),
     "weights": ("equal", "learned"),
+    "depth": ("auto", "synthetic", None),
     "scorer": ("both", "nearest", "kernel"),
     "mirror": ("auto", True, False),
 }

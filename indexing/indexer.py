@@ -13,12 +13,24 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.base import BaseEstimator, ClassifierMixin
 from sklearn.utils.validation import check_is_fitted
 
-from indexing.checks import check_common, check_labels, check_parameters, check_plan, check_queries, gather, gather_labels
+from indexing.checks import (
+    check_common,
+    check_labels,
+    check_parameters,
+    check_plan,
+    check_queries,
+    gather,
+    gather_groups,
+    gather_labels,
+)
 from indexing.clip import Clip
+from indexing.labels import joined, refuse, same_label
 from indexing.scoring import Event, probabilities, reject_threshold
 from indexing.shape.bank import Windows
+from indexing.shape.bodies import Layout, lifter_for, told_layout
 from indexing.shape.exemplars import CROPS, VIEWS, VIEWS_SOLID, Exemplars, Plan, cut
-from indexing.shape.model import ShapeModel, learn
+from indexing.shape.learning import Lesson, learn
+from indexing.shape.model import ShapeModel
 from indexing.shape.symmetry import mirror_permutation
 from indexing.skeleton import Skeleton
 from indexing.stream import Stream, find_events, frame_scores, scan
@@ -38,7 +50,11 @@ class ActionIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
     Args:
         view: ``"any"``: queries may be seen from elsewhere; ``"same"``: from about where the exemplars were.  Declared, never
             guessed: cross-validation inside one view always prefers what is bound to that view.
-        weights: of the channels of the nearest-exemplar score: ``"equal"``, or ``"learned"`` by leave-one-out.
+        weights: ``"equal"``, or ``"learned"``: how much each kind of evidence counts, and how sure it is, by what serves people
+            best who were left out (needs to know who performs: see :meth:`fit`).
+        depth: of 2D exemplars, for their virtual views and as evidence: ``"synthetic"``: guessed by a kernel ridge that learns
+            on the fly from synthetic actors of the same joints; ``None``: flat cards; ``"auto"``: synthetic where weights are
+            learned and the joints are of a known layout.
         reject: ``None``: closed set.  A number between 0 and 1: the rate at which clips of an unknown action may be taken
             for a known one, calibrated by leaving each class out of the training clips.  Any other number: the least
             :meth:`evidence` that is accepted.
@@ -50,7 +66,7 @@ class ActionIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
             always; ``False``: never.
         scorer: ``"both"``, ``"nearest"`` (no training, fastest) or ``"kernel"``; ``view="same"`` uses the kernel machine.
         virtual_views: copies of every exemplar for the kernel machine; by default 4, and 12 where exemplars have depth.
-        repair: replace joints that jump (Hampel filter): for bad detectors at a regular frame rate.
+        repair: replace joints that jump where their clip gives no reason to (:mod:`indexing.repair`); costs nothing on clean clips.
         window, stride, tempi, pool: of :meth:`score_frames`: seconds, seconds between exemplar windows, speed factors tried,
             and seconds over which scores are averaged.
         random_state: of the virtual views.
@@ -58,7 +74,7 @@ class ActionIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
 
     Attributes:
         classes_: ``(classes,)`` labels as given.  model_: the learned :class:`~indexing.shape.model.ShapeModel`.
-        n_joints_: joints per frame.  skeleton_: their names, where the clips had them.
+        n_joints_: joints per frame.  skeleton_: their names, where the clips had them.  groups_: who performed each exemplar.
         reject_threshold_: evidence below it is rejected, or ``None``.
 
     Example:
@@ -80,12 +96,13 @@ class ActionIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         none_label: Any = -1,
         fps: float = 30.0,
         *,
+        depth: str | None = "auto",
         length: int = 12,
         search: bool = True,
         mirror: str | bool = "auto",
         scorer: str = "both",
         virtual_views: int | None = None,
-        repair: bool = False,
+        repair: bool = True,
         window: float = 1.0,
         stride: float = 0.3,
         tempi: Sequence[float] = (0.7, 1.0, 1.4),
@@ -98,6 +115,7 @@ class ActionIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         self.reject = reject
         self.none_label = none_label
         self.fps = fps
+        self.depth = depth
         self.length = length
         self.search = search
         self.mirror = mirror
@@ -112,19 +130,21 @@ class ActionIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         self.device = device
 
     # ---- learning ----------------------------------------------------------------------------------------------------
-    def fit(self, clips: Iterable[Any], labels: ArrayLike | None = None) -> Self:
+    def fit(self, clips: Iterable[Any], labels: ArrayLike | None = None, groups: ArrayLike | None = None) -> Self:
         """Learn from clips.
 
         Args:
             clips: of :class:`Clip`, or ``(frames, joints, 2 | 3)`` arrays, or tuples of synchronized views of one
                 performance (an array ``(views, frames, joints, 2)`` too).  One 2D clip per action is enough.
             labels: ``(clips,)``; by default the clips' own.
+            groups: ``(clips,)`` who performs, for ``weights="learned"``; by default the clips' field ``subject``, if all have it.
 
         Raises:
             ValueError: naming the clip or the parameter, what is wrong and what to do.
         """
         check_parameters(self)
         found, owners = gather(clips, self.fps)
+        people = gather_groups(found, owners, groups)
         values = gather_labels(found, owners, labels)
         classes, numbers = np.unique(values, return_inverse=True)
         if len(classes) < 2:
@@ -133,29 +153,63 @@ class ActionIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
             )
         rng = np.random.default_rng(self.random_state)
         skeleton = next((clip.skeleton for clip in found if clip.skeleton is not None), None)
-        return self._learn(cut(found, self._plan(_default_views(found)), rng), classes, numbers, skeleton)
+        layout = self._layout(found, skeleton)
+        plan = self._plan(_default_views(found), layout)
+        return self._learn(cut(found, plan, rng), classes, numbers, skeleton, layout, people)
 
-    def partial_fit(self, clips: Iterable[Any], labels: ArrayLike | None = None, classes: ArrayLike | None = None) -> Self:
+    def partial_fit(
+        self,
+        clips: Iterable[Any],
+        labels: ArrayLike | None = None,
+        classes: ArrayLike | None = None,
+        groups: ArrayLike | None = None,
+    ) -> Self:
         """Learn from further clips, of known or new actions; the earlier ones stay.  Fits where nothing was fitted yet."""
         if not hasattr(self, "model_"):
-            return self.fit(clips, labels)
+            return self.fit(clips, labels, groups)
         check_parameters(self)
         found, owners = gather(clips, self.fps, self.n_joints_)
+        people = gather_groups(found, owners, groups)
+        both = None if people is None or self.groups_ is None else np.concatenate([self.groups_, people])
         values = gather_labels(found, owners, labels)
         old = self.classes_[self.model_.labels.numpy()]
-        merged = _joined(old, values)
+        merged = joined(old, values)
         known, numbers = np.unique(merged, return_inverse=True)
         check_plan(self, len(CROPS) if self.search else 1, self.model_.exemplars)
-        plan = self._plan(len(self.model_.exemplars.views) // len(old))
+        layout = self.layout_
+        plan = self._plan(len(self.model_.exemplars.views) // len(old), layout)
         seed = 0 if self.random_state is None else self.random_state
         rng = np.random.default_rng([seed, len(old)])
-        return self._learn(self.model_.exemplars.extended(cut(found, plan, rng)), known, numbers, self.skeleton_)
+        extended = self.model_.exemplars.extended(cut(found, plan, rng))
+        return self._learn(extended, known, numbers, self.skeleton_, layout, both)
 
-    def _plan(self, views: int) -> Plan:
+    def _plan(self, views: int, layout: Layout | None) -> Plan:
         views = views if self.virtual_views is None else self.virtual_views
-        return Plan(self.length, self.search, views, self.view == "any", self.repair, self.window, self.stride)
+        lifter = None if layout is None else lifter_for(layout, self.length)
+        return Plan(self.length, self.search, views, self.view == "any", self.repair, self.window, self.stride, lifter)
 
-    def _learn(self, exemplars: Exemplars, classes: Array, numbers: Array, skeleton: Skeleton | None) -> Self:
+    def _layout(self, clips: Sequence[Clip], skeleton: Skeleton | None) -> Layout | None:
+        """Whose joints a lifter must know; ``None`` where depth is not asked for, known already, or of no use."""
+        asked = self.depth == "synthetic" or (self.depth == "auto" and self.weights == "learned")
+        if not asked or self.view == "same" or any(clip.dims == 3 for clip in clips):
+            return None
+        found = told_layout(clips, skeleton)
+        if found is None and self.depth == "synthetic":
+            raise ValueError(
+                f"depth='synthetic': what the {clips[0].joints.shape[1]} joints are is not known; give clips a skeleton with names "
+                "such as left_knee, or depth=None"
+            )
+        return found
+
+    def _learn(
+        self,
+        exemplars: Exemplars,
+        classes: Array,
+        numbers: Array,
+        skeleton: Skeleton | None,
+        layout: Layout | None,
+        groups: Array | None,
+    ) -> Self:
         """Learn everything, and only then change anything."""
         symmetry = None
         if self.mirror:
@@ -164,19 +218,19 @@ class ActionIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
             raise ValueError(
                 "mirror=True: the joints' mirror images are not known; give clips a skeleton with names, or mirror='auto'"
             )
-        if self.reject is not None and any(_equal(value, self.none_label) for value in classes.tolist()):
+        if self.reject is not None and any(same_label(value, self.none_label) for value in classes.tolist()):
             raise ValueError(f"none_label={self.none_label!r} is one of the learned labels; choose another for rejected clips")
-        model = learn(
-            exemplars,
-            torch.from_numpy(numbers).long(),
-            len(classes),
+        lesson = Lesson(
             view=self.view,
             scorer="kernel" if self.view == "same" else self.scorer,
             learned=self.weights == "learned",
+            groups=None if groups is None else torch.from_numpy(np.unique(groups, return_inverse=True)[1]).long(),
             symmetry=symmetry,
             guard=self.mirror == "auto",
+            layout=layout,
         )
-        self.model_: ShapeModel = model
+        self.model_: ShapeModel = learn(exemplars, torch.from_numpy(numbers).long(), len(classes), lesson)
+        self.layout_, self.groups_ = layout, groups
         self.classes_ = classes
         self.n_joints_ = int(exemplars.crops.values.shape[2])
         self.skeleton_ = skeleton
@@ -195,6 +249,7 @@ class ActionIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         return Windows(whole(source, self.length), torch.from_numpy(source.seen)).to(self.device)
 
     def _model(self) -> ShapeModel:
+        check_is_fitted(self, "model_")
         return self.model_.to(self.device)
 
     def decision_function(self, clips: Iterable[Any]) -> Array:
@@ -202,12 +257,20 @@ class ActionIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         return np.asarray(self._model().scores(self._queries(clips)).cpu().numpy())
 
     def evidence(self, clips: Iterable[Any]) -> Array:
-        """``(clips,)`` how well the best class explains a clip: the nearest-exemplar score, comparable between clips."""
-        return np.asarray(self._model().nearest_scores(self._queries(clips)).max(dim=1).values.cpu().numpy())
+        """``(clips,)`` log odds that a clip shows a known action rather than another one, comparable between clips.
+
+        Learned by leaving each class, and each person (each clip, where nobody says who), out of the training clips; with fewer
+        than four classes it is the nearest-exemplar score of the best class.
+        """
+        return np.asarray(self._model().evidence(self._queries(clips)).cpu().numpy())
 
     def predict_proba(self, clips: Iterable[Any]) -> Array:
-        """``(clips, classes)`` probabilities of the known classes, rows sum to 1 (a softmax of the standardized scores)."""
-        return probabilities(self.decision_function(clips))
+        """``(clips, classes)`` probabilities of the known classes, rows sum to 1 (a softmax of the standardized scores).
+
+        With ``weights="learned"`` its sharpness is the one that made left-out people's answers most likely.
+        """
+        scores = self.decision_function(clips)
+        return probabilities(scores, self.model_.blend.sharpness)
 
     def predict(self, clips: Iterable[Any]) -> Array:
         """``(clips,)`` labels; ``none_label`` where ``reject`` is set and no class explains the clip."""
@@ -216,8 +279,8 @@ class ActionIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         labels = self.classes_[model.scores(query).argmax(dim=1).cpu().numpy()]
         if self.reject_threshold_ is None:
             return np.asarray(labels)
-        refused = (model.nearest_scores(query).max(dim=1).values < self.reject_threshold_).cpu().numpy()
-        return _refuse(labels, refused, self.none_label)
+        refused = (model.evidence(query) < self.reject_threshold_).cpu().numpy()
+        return refuse(labels, refused, self.none_label)
 
     def score(self, clips: Iterable[Any], labels: ArrayLike, sample_weight: ArrayLike | None = None) -> float:
         """Mean accuracy of :meth:`predict`; labels that were never learned count as wrong."""
@@ -294,27 +357,5 @@ class ActionIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         return hasattr(self, "model_")
 
 
-def _equal(a: Any, b: Any) -> bool:
-    return type(a) is type(b) and bool(a == b)
-
-
 def _default_views(clips: Sequence[Clip]) -> int:
     return VIEWS_SOLID if any(clip.dims == 3 for clip in clips) else VIEWS
-
-
-def _joined(first: Array, second: Array) -> Array:
-    """Labels of both, refusing to mix kinds that numpy would silently turn into strings."""
-    if first.dtype.kind != second.dtype.kind and {first.dtype.kind, second.dtype.kind} & {"U", "S", "O"}:
-        raise ValueError(
-            f"labels: the fitted labels are of type {first.dtype}, the new ones {second.dtype}; give one kind of label"
-        )
-    return np.concatenate([first, second])
-
-
-def _refuse(labels: Array, refused: NDArray[np.bool_], none_label: Any) -> Array:
-    if not refused.any():
-        return np.asarray(labels)
-    wide = np.asarray(none_label).dtype.kind == labels.dtype.kind
-    out = labels.astype(np.result_type(labels.dtype, np.asarray(none_label).dtype) if wide else object)
-    out[refused] = none_label
-    return np.asarray(out)

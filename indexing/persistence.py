@@ -2,27 +2,33 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from indexing.checks import check_parameters
 from indexing.modelfile import AGAIN, labels_from_json, labels_to_json, read_model, write_model
 from indexing.shape.bank import NEAREST, Kernels, Windows
+from indexing.shape.bodies import Bodies, Layout
 from indexing.shape.channels import CHANNELS, JointMetric
 from indexing.shape.exemplars import Exemplars
+from indexing.shape.joint_weights import JointWeights
+from indexing.shape.knowing import Known
+from indexing.shape.learning import KERNEL_WHITENING
 from indexing.shape.machine import PairwiseMachine
-from indexing.shape.model import KERNEL_WHITENING, ShapeModel
+from indexing.shape.model import Blend, ShapeModel
 from indexing.skeleton import Skeleton
 
 if TYPE_CHECKING:
     from indexing.indexer import ActionIndexer
 
 FORMAT = "dyntorch.action-indexer"
-VERSION = 1
-PLAIN = ("labels", "symmetry", "mirrored", "weights", "hub", "moment_hub", "evidence_out")  # tensors as they are
+VERSION = 2
+PLAIN = ("labels", "symmetry", "mirrored", "hub", "moment_hub", "evidence_out")  # tensors as they are
 
 Indexer = TypeVar("Indexer", bound="ActionIndexer")
 
@@ -39,6 +45,11 @@ def save(indexer: ActionIndexer, path: str | Path) -> None:
         "joints": indexer.n_joints_,
         "view": indexer.model_.view,
         "scorer": indexer.model_.scorer,
+        "blend": dataclasses.asdict(indexer.model_.blend),
+        "parts": [indexer.model_.parts.gain, indexer.model_.parts.sigma],
+        "known": dataclasses.asdict(indexer.model_.known),
+        "layout": None if indexer.layout_ is None else dataclasses.asdict(indexer.layout_),
+        "groups": None if indexer.groups_ is None else indexer.groups_.tolist(),
         "skeleton": None if skeleton is None else [skeleton.name, list(skeleton.joints), [list(b) for b in skeleton.bones]],
     }
     write_model(path, FORMAT, VERSION, indexer.get_params(), about, _tensors(indexer.model_))
@@ -53,7 +64,10 @@ def load(kind: type[Indexer], path: str | Path, device: str = "cpu") -> Indexer:
         indexer.n_joints_ = int(metadata["joints"])
         name, joints, bones = metadata["skeleton"] or (None, (), ())
         indexer.skeleton_ = Skeleton(name, tuple(joints), tuple((a, b) for a, b in bones)) if name is not None else None
-        indexer.model_ = _model(tensors, len(indexer.classes_), metadata["view"], metadata["scorer"])
+        layout = metadata["layout"]
+        indexer.layout_ = None if layout is None else Layout(tuple(layout["joints"]), bool(layout["photograph"]))
+        indexer.groups_ = None if metadata["groups"] is None else np.array(metadata["groups"], dtype=str)
+        indexer.model_ = _model(tensors, metadata, len(indexer.classes_), indexer.layout_)
         check_parameters(indexer)
         _check_fit(indexer)
         indexer._calibrate()
@@ -72,19 +86,22 @@ def _check_fit(indexer: ActionIndexer) -> None:
         "owner": len(parts.owner) == len(parts.moments) and len(parts.owner.unique()) == count,
         "joints": parts.crops.values.shape[2] == joints and (skeleton is None or len(skeleton.joints) == joints),
         "metric": model.metric.covariance.shape == (len(CHANNELS), joints, joints),
-        "weights": len(model.weights) == len(NEAREST),
+        "joints.weights": model.parts.joints.shape == (len(NEAREST), joints) and len(model.parts.channels) == len(NEAREST),
         "view": model.view == indexer.view,
         "scorer": model.scorer in ("nearest", "kernel", "both") and (model.machine is None) == (model.scorer == "nearest"),
     }
     for name, windows in (("crops", parts.crops), ("views", parts.views), ("moments", parts.moments)):
         fine[name] = len(windows.values) == len(windows.seen) and (name == "moments" or len(windows) % count == 0)
     fine |= {name: len(getattr(model, name)) == count for name in ("hub", "mirrored", "evidence_out")}
+    if model.bodies is not None:
+        solid = model.bodies.windows.values
+        fine["bodies"] = solid.ndim == 4 and len(solid) % count == 0 and bool(solid.isfinite().all())
     values = (parts.crops.values, parts.views.values, parts.moments.values)
     for name, value in (
         ("metric", model.metric.covariance),
         ("hub", model.hub),
         ("moment_hub", model.moment_hub),
-        ("weights", model.weights),
+        ("joints.weights", model.parts.joints),
     ):
         fine[name] = fine.get(name, True) and bool(value.isfinite().all())
     fine["windows"] = all(bool(value.isfinite().all()) for value in values)
@@ -106,12 +123,15 @@ def _tensors(model: ShapeModel) -> dict[str, Tensor]:
     exemplars = model.exemplars
     named: dict[str, Tensor | None] = {name: getattr(model, name) for name in PLAIN}
     named |= {"metric": model.metric.covariance, "metric_power": torch.tensor(model.metric.power)}
+    named |= {f"parts.{name}": getattr(model.parts, name) for name in ("joints", "channels", "by_class")}
     named |= {"owner": exemplars.owner, "solid": exemplars.solid}
     named |= {**_windows("crops", exemplars.crops), **_windows("views", exemplars.views), **_windows("moments", exemplars.moments)}
     if model.kernels is not None and model.support is not None and model.machine is not None:
         machine = model.machine
         named |= {"scales": model.kernels.scales, **_windows("support", model.support), "machine.support": machine.support}
         named |= {"machine.dual": machine.dual, "machine.intercept": machine.intercept, "machine.counts": machine.counts}
+    if model.bodies is not None:
+        named |= _windows("bodies", model.bodies.windows)
     return {name: value for name, value in named.items() if value is not None}
 
 
@@ -119,13 +139,18 @@ def _windows(name: str, windows: Windows) -> dict[str, Tensor]:
     return {f"{name}.values": windows.values, f"{name}.seen": windows.seen}
 
 
-def _model(tensors: dict[str, Tensor], classes: int, view: str, scorer: str) -> ShapeModel:
+def _model(tensors: dict[str, Tensor], metadata: dict[str, Any], classes: int, layout: Layout | None) -> ShapeModel:
+    view = metadata["view"]
+
     def windows(name: str) -> Windows:
         return Windows(tensors[f"{name}.values"], tensors[f"{name}.seen"])
 
     metric = JointMetric(tensors["metric"], float(tensors["metric_power"]))
     trained = "scales" in tensors
     kernels = Kernels(JointMetric(metric.covariance, KERNEL_WHITENING), view == "same", tensors["scales"]) if trained else None
+    bodies = Bodies(windows("bodies"), layout) if layout is not None else None
+    known, gain = metadata["known"], metadata["parts"]
+    parts = JointWeights(tensors["parts.joints"], tensors["parts.channels"], tensors.get("parts.by_class"), *gain)
     machine = PairwiseMachine(*(tensors[f"machine.{n}"] for n in ("support", "dual", "intercept", "counts"))) if trained else None
     exemplars = Exemplars(windows("crops"), windows("views"), windows("moments"), tensors["owner"], tensors["solid"])
     plain: dict[str, Any] = {name: None if name == "symmetry" and name not in tensors else tensors[name] for name in PLAIN}
@@ -133,10 +158,14 @@ def _model(tensors: dict[str, Tensor], classes: int, view: str, scorer: str) -> 
         exemplars=exemplars,
         classes=classes,
         view=view,
-        scorer=scorer,
+        scorer=metadata["scorer"],
         metric=metric,
         kernels=kernels,
         support=windows("support") if trained else None,
         machine=machine,
+        blend=Blend(**metadata["blend"]),
+        known=Known(tuple(float(w) for w in known["weights"]), float(known["offset"])),
+        bodies=bodies,
+        parts=parts,
         **plain,
     )

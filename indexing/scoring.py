@@ -33,8 +33,8 @@ class Event:
     exemplar: int | None = None
 
 
-def probabilities(scores: Array) -> Array:
-    """``(N, classes)`` softmax of the scores after standardizing each row.
+def probabilities(scores: Array, sharpness: float = SHARPNESS) -> Array:
+    """``(N, classes)`` softmax of ``sharpness`` times the scores, after standardizing each row.
 
     Example:
         >>> import numpy as np
@@ -43,7 +43,8 @@ def probabilities(scores: Array) -> Array:
     """
     centred = scores - scores.mean(axis=1, keepdims=True)
     spread = np.maximum(centred.std(axis=1, keepdims=True), 1e-9) if scores.shape[1] > 2 else 0.5
-    odds = np.exp(SHARPNESS * centred / spread - (SHARPNESS * centred / spread).max(axis=1, keepdims=True))
+    exponent = sharpness * centred / spread
+    odds = np.exp(exponent - exponent.max(axis=1, keepdims=True))
     return np.asarray(odds / odds.sum(axis=1, keepdims=True))
 
 

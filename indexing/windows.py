@@ -15,6 +15,7 @@ from torch import Tensor
 
 from indexing.cameras import y_up
 from indexing.clip import Clip, FloatArray
+from indexing.repair import wrong_joints
 
 SUBSAMPLES = 4  # box average per step: a cheap denoiser; 1 costs about 1 % accuracy at 15 mm noise
 CHUNK = 16_000_000  # numbers interpolated at once: bounds memory whatever the number of windows
@@ -38,15 +39,14 @@ def ragged(clips: Sequence[Clip], repair: bool = False) -> Ragged:
 
     Args:
         clips: checked by :func:`check_clips`.
-        repair: replace wrong joints first (:func:`hampel`).
+        repair: take out wrong joints first (:func:`~indexing.repair.wrong_joints`); joints that were right are left as they are.
     """
     joints = np.concatenate([y_up(clip) for clip in clips]).astype(np.float32)
     times = np.concatenate([clip.times for clip in clips])
     lengths = np.array([len(clip) for clip in clips])
     starts = np.concatenate([[0], np.cumsum(lengths)])
     if repair:
-        for i in range(len(clips)):
-            joints[starts[i] : starts[i + 1]] = hampel(joints[starts[i] : starts[i + 1]])
+        joints[wrong_joints(joints, times, starts)] = np.nan
     there: NDArray[np.bool_] = np.asarray(np.isfinite(joints).all(axis=2))
     seen = np.logical_or.reduceat(there, starts[:-1], axis=0)
     if not there.all():
@@ -70,32 +70,6 @@ def _fill(joints: FloatArray, there: NDArray[np.bool_], times: FloatArray, first
     filled = low + weight[..., None] * (high - low)
     filled[nothing] = 0.0
     return np.where(there[..., None], joints, filled)
-
-
-def hampel(joints: FloatArray, width: int = 9, limit: float = 6.0) -> FloatArray:
-    """Repair of wrong joints: a sample further than ``limit`` MAD (+ 1 % of the body) from the running median becomes NaN.
-
-    For bad detectors at a regular frame rate only: on clean data it costs about 1 %, and 5 to 8 % where half of the frames
-    are missing.
-
-    Args:
-        joints: ``(frames, joints, dims)``, NaN = missing.
-
-    Source: Hampel 1974; parameters from measurements on corrupted queries.
-    """
-    half = width // 2
-    padded = np.pad(joints, ((half, half), (0, 0), (0, 0)), constant_values=np.nan)
-    windows = np.lib.stride_tricks.sliding_window_view(padded, width, axis=0)
-    with np.errstate(all="ignore"):
-        import warnings
-
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # a joint missing in the whole window: the median is NaN, as meant
-            median = np.nanmedian(windows, axis=-1)
-            spread = 1.4826 * np.nanmedian(np.abs(windows - median[..., None]), axis=-1)
-            size = np.nanmedian(np.nanmax(joints, axis=1) - np.nanmin(joints, axis=1), axis=0).max()
-        wrong = (np.abs(joints - median) > limit * spread + 0.01 * size).any(axis=2)
-    return np.where(wrong[..., None], np.float32(np.nan), joints)
 
 
 def check_clips(clips: Sequence[Clip], joints: int | None = None, items: Sequence[int] | None = None) -> None:

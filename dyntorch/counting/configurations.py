@@ -139,18 +139,30 @@ def quadrifocal(field: Field, *, static: int | None = None, coplanar: int = 0) -
     return _static_points(Views(field, 3, (2, 2, 2, 2), ("hyper",) * 4), static, coplanar)
 
 
-def shape_tensor(field: Field, *, images: int | None = None, synthetic: bool = False) -> list[Step]:
-    """Images of 8 points, 4 of them coplanar; each is a match: shape tensor, 3x3x3x3."""
-    points = field.random(4, 4)
+def shape_tensor(
+    field: Field, *, images: int | None = None, synthetic: bool = False, points: int = 8, general: bool = False
+) -> list[Step]:
+    """Images of 6, 7 or 8 points, 4 of them coplanar (or general); each is a match: shape tensor, 3x3 to 3x3x3x3."""
+    if points not in (6, 7, 8):
+        raise ValueError(f"points must be 6, 7 or 8, got {points}")
+    shape = field.random(points - 4, 4)
+
+    def rows(seen: IntArray) -> IntArray:
+        # seven points measure one and lines through two, six measure two
+        measured = points - 4 if points < 7 else 8 - points
+        return field.kron(*(p[None] if i < measured else field.null(p) for i, p in enumerate(seen)))
 
     def image() -> IntArray:
-        *shift, scale = field.random(4).tolist()  # the camera is (scale I | shift) once the coplanar points are the basis
-        seen = scale * points[:, :3] % field.prime + points[:, 3:] * np.array(shift) % field.prime
-        return field.kron(*(field.null(point) for point in seen))
+        *shift, scale = field.random(4).tolist()
+        if general:  # the camera is (diag | scale 1) once the first four points are the basis
+            return rows(shape[:, :3] * np.array(shift) % field.prime + shape[:, 3:] * scale % field.prime)
+        # with coplanar ones it is (scale I | shift)
+        return rows(scale * shape[:, :3] % field.prime + shape[:, 3:] * np.array(shift) % field.prime)
 
     def concurrent() -> IntArray:
-        lines = (field.null(field.random(3)) for _ in range(81))
-        return np.vstack([field.kron(*field.product(field.random(4, 2), pencil)) for pencil in lines])
+        # a camera in a point of the basis, or in the plane, sees all others in one point, wherever it likes
+        shown = [*np.eye(3, dtype=np.int64), np.ones(3, dtype=np.int64)] if general else field.random(81, 3)
+        return np.vstack([rows(np.tile(point, (points - 4, 1))) for point in shown])
 
     return [Step("synthetic", int(synthetic), concurrent, constraint=True), Step("image", images, image)]
 

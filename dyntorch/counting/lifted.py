@@ -23,7 +23,7 @@ CAMERAS = {
 }
 PATIENCE = 4
 """Points in a row that add nothing before no more are drawn; one of each body tells."""
-SETTINGS = ("profile", "times", "camera")
+SETTINGS = ("profile", "times", "camera", "points")
 """Options that are no matches."""
 
 

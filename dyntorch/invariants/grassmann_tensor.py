@@ -164,16 +164,13 @@ class GrassmannTensor(Invariant):
 
     def whitened(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor | None:
         """The reprojection error that is left when the point is eliminated; None where one condition is all there is."""
-        return None if self._single() else reprojection.residual(motion, views, scales)
+        return None if self.single() else reprojection.residual(motion, views, scales)
 
     def linearized(
         self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]
     ) -> tuple[Tensor, Tensor] | None:
-        return None if self._single() else reprojection.residual_derivative(motion, views, scales)
+        return None if self.single() else reprojection.residual_derivative(motion, views, scales)
 
     def __repr__(self) -> str:
         dims = "" if set(self.dims) == {2} else f", l={self.l}"
         return f"GrassmannTensor({self.k}, {self.profile}{dims}{', dual=True' if self.dual else ''})"
-
-    def _single(self) -> bool:
-        return self.codim == 1 and self.rows() == 1

@@ -104,6 +104,10 @@ class Primitive(ABC):
         """The measurement after a similarity of its view (a scale and a shift), ``(*batch, d+1, d+1)``, in the same shape."""
         return torch.addcmul(transform[..., None, :-1, -1], x, transform[..., :1, :1])
 
+    def disturbed(self, x: Tensor, noise: Tensor) -> Tensor:
+        """The measurement with noise of the same shape, in units of normalized coordinates."""
+        return x + noise
+
     def normalized(self, transform: Tensor) -> Primitive:
         """The primitive that measures in normalized coordinates: the same one, unless it depends on the coordinates."""
         return self

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from dyntorch.invariant import Invariant
-from dyntorch.least_squares import Problem
 from dyntorch.matches import Matches
+from dyntorch.motion_problem import Problem
 from dyntorch.normalize import Normalization, normalization, normalize_motion
 from dyntorch.refinement import refine_matches
 from dyntorch.residual import whiten, whitened

@@ -1,4 +1,4 @@
-"""The body of an actor: proportions and habits of a person, and forward kinematics from joint angles to 17 COCO joints.
+"""The body of an actor: proportions and habits of a person, and forward kinematics from joint angles to the landmarks of a body.
 
 Frame: metres, y up, **right-handed**; at heading 0 a person faces -z, towards a camera at z = -distance that looks along +z.
 Facing -z with y up, the anatomical left is up x forward = -x.  Such a camera has its own right hand at -x too (x grows to the
@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from indexing.clip import FloatArray
+from indexing.skeleton import COCO17
 
 CENTRAL = ("turn", "hips", "list", "lean", "side", "twist", "nod", "look", "air")
 LIMBS = ("flex", "abd", "rot", "elbow", "hip", "spread", "out", "knee", "grip")
@@ -28,6 +29,7 @@ spread: straight-leg angle that puts the ankle as far outward; out: knee turned 
 grip: share of this foot in holding the body in place (both 0: the body stays and the feet slide, as on a treadmill).
 """
 INDEX: Mapping[str, int] = {name: i for i, name in enumerate(CHANNELS)}
+SIZES = ("height", "trunk", "arms", "legs", "shoulders", "hips")  # of a Person: what its landmarks depend on
 STYLES = 8  # numbers that describe the habits of a person
 _LIMITS = {
     "lean": (-35.0, 105.0), "side": (-35.0, 35.0), "twist": (-60.0, 60.0), "nod": (-45.0, 50.0), "look": (-70.0, 70.0),
@@ -35,6 +37,10 @@ _LIMITS = {
     "hip": (-35.0, 115.0), "spread": (0.0, 45.0), "out": (-10.0, 45.0), "knee": (0.0, 145.0), "grip": (0.0, 1.0),
 }  # fmt: skip
 _LOW, _HIGH = (np.array([_LIMITS.get(name.split("_")[-1], (-np.inf, np.inf))[end] for name in CHANNELS]) for end in (0, 1))
+LANDMARKS: tuple[str, ...] = (
+    *COCO17.joints, "neck", "crown", "pelvis", "left_hand", "right_hand", "left_toes", "right_toes", "left_heel", "right_heel",
+)  # fmt: skip
+"""Points of the body that :func:`landmarks` gives: neck between the shoulders, pelvis between the hips, the middle of each hand."""
 _ODD = ("turn", "hips", "list", "side", "twist", "look")  # change sign in the mirror
 
 
@@ -120,42 +126,57 @@ def joints(angles: FloatArray, person: Person) -> FloatArray:
 
     The lowest ankle of each frame is at height ``air`` (0 on the floor), the first frame's feet are about the origin.
     """
-    unit = person.height
+    out = landmarks(angles, np.array([getattr(person, name) for name in SIZES]))[:, :17]
+    grip = np.stack([angles[:, INDEX["l_grip"]], angles[:, INDEX["r_grip"]]], axis=1)
+    return out + root(out[:, 15:17], grip, angles[:, INDEX["air"]])[:, None]
+
+
+def landmarks(angles: FloatArray, sizes: FloatArray) -> FloatArray:
+    """``(frames, landmarks, 3)`` the points :data:`LANDMARKS` in metres, relative to the pelvis, of poses ``(frames, channels)``.
+
+    Args:
+        sizes: ``(6,)`` :data:`SIZES` of the person, or ``(frames, 6)`` where every pose is another person's.
+    """
+    height, size, arms, legs, shoulders, hips = np.reshape(sizes, (-1, len(SIZES), 1)).swapaxes(0, 1)
     col = {name: angles[:, i] for name, i in INDEX.items()}
     heading = _about("y", col["turn"])
     trunk = heading @ _about("y", col["twist"]) @ _about("z", col["side"]) @ _about("x", -col["lean"])
     pelvis = heading @ _about("y", col["hips"]) @ _about("z", col["list"])
-    neck = trunk @ np.array([0.0, 0.288 * person.trunk, 0.0])
+    neck = trunk[..., 1] * (0.288 * size)
     head = trunk @ _about("y", col["look"]) @ _about("x", -col["nod"])
-    out = np.empty((len(angles), 17, 3))
+    out = np.empty((len(angles), len(LANDMARKS), 3))
     for at, place in enumerate(_FACE):
         out[:, at] = neck + head @ place
-    for first, side, prefix in ((5, -1.0, "l_"), (6, 1.0, "r_")):  # anatomical left is -x
+    out[:, 17] = neck
+    out[:, 18] = neck + head @ _CROWN
+    out[:, 19] = 0.0
+    for left, side, prefix in ((0, -1.0, "l_"), (1, 1.0, "r_")):  # anatomical left is -x
         limb = {name: col[prefix + name] for name in LIMBS}
-        shoulder = neck + trunk @ np.array([side * 0.107 * person.shoulders, 0.0, 0.0])
-        hip = pelvis @ np.array([side * 0.072 * person.hips, 0.0, 0.0])
-        elbow, wrist = _arm(trunk, limb, side)
-        knee, ankle = _leg(limb, side)
-        out[:, first] = shoulder
-        out[:, first + 2] = shoulder + person.arms * elbow
-        out[:, first + 4] = shoulder + person.arms * wrist
-        out[:, first + 6] = hip
-        out[:, first + 8] = hip + person.legs * np.einsum("fij,fj->fi", heading, knee)
-        out[:, first + 10] = hip + person.legs * np.einsum("fij,fj->fi", heading, ankle)
-    out *= unit
-    return out + _root(out[:, 15:17], np.stack([col["l_grip"], col["r_grip"]], axis=1), col["air"])[:, None]
+        shoulder = neck + trunk[..., 0] * (side * 0.107 * shoulders)
+        hip = pelvis[..., 0] * (side * 0.072 * hips)
+        leg = _leg(limb, side)
+        out[:, 5 + left] = shoulder
+        for at, part in zip((7, 9, 20), _arm(trunk, limb, side), strict=True):
+            out[:, at + left] = shoulder + arms * part
+        out[:, 11 + left] = hip
+        for at, part in zip((13, 15, 22, 24), (*leg, *_foot(*leg)), strict=True):
+            out[:, at + left] = hip + legs * np.einsum("fij,fj->fi", heading, part)
+    return out * height[:, :, None]
 
 
 # Lengths as fractions of the body height (after the usual anthropometric tables), at relative size 1.
 _FACE = np.array([[0, 0.092, -0.068], [-0.019, 0.113, -0.054], [0.019, 0.113, -0.054], [-0.044, 0.105, 0.0], [0.044, 0.105, 0.0]])
-_UPPER_ARM, _FOREARM, _THIGH, _SHANK = 0.172, 0.150, 0.245, 0.243
+_CROWN = np.array([0.0, 0.182, 0.0])
+_UPPER_ARM, _FOREARM, _HAND, _THIGH, _SHANK = 0.172, 0.150, 0.050, 0.245, 0.243
+_TOES, _HEEL, _SOLE = 0.130, 0.030, 0.039  # along the foot from the ankle, and below it
 
 
-def _arm(trunk: FloatArray, limb: Mapping[str, FloatArray], side: float) -> tuple[FloatArray, FloatArray]:
-    """Elbow and wrist relative to the shoulder."""
+def _arm(trunk: FloatArray, limb: Mapping[str, FloatArray], side: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Elbow, wrist and middle of the hand relative to the shoulder."""
     upper = trunk @ _about("x", limb["flex"]) @ _about("z", side * limb["abd"]) @ _about("y", side * limb["rot"])
     elbow = upper @ np.array([0.0, -_UPPER_ARM, 0.0])
-    return elbow, elbow + upper @ _about("x", limb["elbow"]) @ np.array([0.0, -_FOREARM, 0.0])
+    wrist = elbow + upper @ _about("x", limb["elbow"]) @ np.array([0.0, -_FOREARM, 0.0])
+    return elbow, wrist, wrist + (wrist - elbow) * (_HAND / _FOREARM)
 
 
 def _leg(limb: Mapping[str, FloatArray], side: float) -> tuple[FloatArray, FloatArray]:
@@ -177,21 +198,37 @@ def _leg(limb: Mapping[str, FloatArray], side: float) -> tuple[FloatArray, Float
     return np.einsum("fij,fj->fi", tilt, knee), np.einsum("fij,fj->fi", tilt, ankle)
 
 
+def _foot(knee: FloatArray, ankle: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Toes and heel relative to the hip: the foot points between straight on and square to the shank, as feet do in the air."""
+    down = (ankle - knee) / _SHANK
+    ahead = np.broadcast_to(np.array([0.0, 0.0, -1.0]), down.shape)
+    square = ahead - (ahead * down).sum(axis=1, keepdims=True) * down
+    square += 0.05 * np.array([0.0, 1.0, 0.0])  # a shank raised straight forward lets the foot point up
+    along = square / np.linalg.norm(square, axis=1, keepdims=True) + 0.7 * ahead
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    return ankle + _TOES * along + _SOLE * down, ankle - _HEEL * along + _SOLE * down
+
+
 def _sagittal(length: float, degrees: FloatArray) -> FloatArray:
     """``(frames, 3)`` a segment that hangs down and is raised forward (towards -z) by an angle."""
     angle = np.deg2rad(degrees)
     return length * np.stack([np.zeros_like(angle), -np.cos(angle), -np.sin(angle)], axis=1)
 
 
-def _root(ankles: FloatArray, grip: FloatArray, air: FloatArray) -> FloatArray:
-    """``(frames, 3)`` where the pelvis is, given ankles relative to it: the feet that grip stay where they are."""
-    root = np.empty((len(ankles), 3))
-    root[:, 1] = air - ankles[..., 1].min(axis=1)
+def root(ankles: FloatArray, grip: FloatArray, air: FloatArray) -> FloatArray:
+    """``(*batch, frames, 3)`` where the pelvis is, given ankles relative to it: the feet that grip stay where they are.
+
+    Args:
+        ankles: ``(*batch, frames, 2, 3)``; grip: ``(*batch, frames, 2)`` share of each foot; air: ``(*batch, frames)`` metres.
+    """
+    out = np.empty((*ankles.shape[:-2], 3))
+    out[..., 1] = air - ankles[..., 1].min(axis=-1)
     flat = ankles[..., [0, 2]]
-    held = (grip[1:] + grip[:-1]) / 2
-    root[0, [0, 2]] = -flat[0].mean(axis=0)
-    root[1:, [0, 2]] = root[0, [0, 2]] - np.cumsum((held[..., None] * np.diff(flat, axis=0)).sum(axis=1), axis=0)
-    return root
+    held = (grip[..., 1:, :] + grip[..., :-1, :]) / 2
+    start = -flat[..., :1, :, :].mean(axis=-2)
+    out[..., :1, [0, 2]] = start
+    out[..., 1:, [0, 2]] = start - np.cumsum((held[..., None] * np.diff(flat, axis=-3)).sum(axis=-2), axis=-2)
+    return out
 
 
 def _about(axis: str, degrees: FloatArray) -> FloatArray:

@@ -56,7 +56,7 @@ class Evaluate:
     view: Literal["any", "same"] = "any"
     """from where queries are seen: from anywhere, or from about where the examples were"""
     weights: Literal["equal", "learned"] = "equal"
-    """of the channels that are compared"""
+    """of the kinds of evidence; learned: by what serves people best who are left out (clip sets with a field 'subject')"""
     reject: Annotated[float | None, tyro.conf.arg(metavar="R", help_behavior_hint="")] = None
     """share of clips of unknown actions that may be taken for a known one, 0 to 1; any other number is the least score"""
     mirror: bool = True

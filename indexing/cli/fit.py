@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -13,10 +14,11 @@ import tyro
 from indexing.cli.console import count, names, progress, say, table
 from indexing.cli.films import Pixels, are_films
 from indexing.cli.inputs import Example, Reading, parse_example, read_examples
-from indexing.cli.outputs import check_file
+from indexing.cli.outputs import check_file, check_report
 
 if TYPE_CHECKING:
     from indexing.clip import Clip
+    from indexing.indexer import ActionIndexer
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,9 @@ class Fit:
     reject: Annotated[float | None, tyro.conf.arg(metavar="R", help_behavior_hint="")] = None
     """share of clips of unknown actions that may be taken for a known one, 0 to 1; any other number is the least score"""
     weights: Literal["equal", "learned"] = "equal"
-    """of the channels that are compared"""
+    """of the kinds of evidence; learned: by what serves people best who are left out (clip sets with a field 'subject')"""
+    report: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
+    """where to write report.html and body_parts.png: which body parts tell the actions apart, and how the evidence is weighed"""
     mirror: bool = True
     """let examples count mirrored, too, where left and right are not different actions"""
     seed: int = 0
@@ -55,8 +59,9 @@ class Fit:
         if not self.examples:
             raise ValueError("no examples; give at least two actions, such as squat=a.json lunge=b.json, or a clip set SET.npz")
         examples = [parse_example(text) for text in self.examples]
-        output = check_file(self.output, [example.path for example in examples])
-        if are_films([example.path for example in examples]):
+        paths = [example.path for example in examples]
+        output, folder = check_file(self.output, paths), check_report(self.report, paths)
+        if are_films(paths):
             return self._from_pixels(examples, output)
         with progress("reading", steps=False):
             clips, notes = read_examples(examples, self.reading, self.select)
@@ -71,19 +76,32 @@ class Fit:
                 random_state=self.seed,
             )  # fmt: skip
             indexer.fit(clips, [str(clip.label) for clip in clips])
+        seconds = time.perf_counter() - started
         prepare(output.parent)
         indexer.save(output)
+        page = None if folder is None else self._write(folder, indexer, clips, notes, paths)
         _show(clips)
         for note in notes:
             say(f"note: {note}")
-        return _written(output, time.perf_counter() - started)
+        code = _written(output, seconds)
+        if page is not None:
+            say(f"report: {page}")
+        return code
+
+    def _write(self, folder: Path, indexer: ActionIndexer, clips: list[Clip], notes: list[str], paths: list[Path]) -> Path:
+        from indexing.files import manifest
+        from indexing.report.learned import write_learned
+
+        about = manifest({"command": "index fit", **dataclasses.asdict(self)}, [path.expanduser() for path in paths], self.seed)
+        with progress("drawing the report", steps=False):
+            return write_learned(folder, indexer, clips, notes, about)
 
     def _from_pixels(self, examples: list[Example], output: Path) -> int:
         """The same for videos."""
         from indexing.cli import films
         from indexing.files import prepare
 
-        films.refuse_keypoint_flags(self, "view", "weights", "mirror", "seed")
+        films.refuse_keypoint_flags(self, "view", "weights", "mirror", "seed", "report")
         with progress("reading", steps=False):
             sources, labels, lengths = films.read_examples(examples, self.reading, self.select)
         _check_two(labels, examples)

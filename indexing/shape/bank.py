@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -18,6 +19,7 @@ from indexing.shape.channels import CHANNELS, JointMetric, order_free
 NEAREST = ("clip", "frame", "motion")  # channels of the epipolar residual; velocity adds nothing there
 EPSILON = 1e-3  # added to residuals before the log: the noise floor (1e-4 gives the same accuracy)
 PAIRS_AT_ONCE = 2_000_000  # pairs of windows in flight: bounds memory, and keeps the intermediate matrices in cache
+TABLE = 25_000_000  # entries of a table with every copy of every exemplar: 100 MB
 
 
 @dataclass(frozen=True)
@@ -58,11 +60,37 @@ def stack(parts: list[Windows]) -> Windows:
 COMMON = 3  # joints that two windows must share: two always fit one another
 
 
-def between(query: Windows, bank: Windows, compare: Callable[[Tensor, Tensor, Tensor | slice], Tensor], worst: float) -> Tensor:
-    """Fill a ``(queries, bank)`` table from ``compare(query values, bank values, joints)``, on the joints both sides saw.
+@dataclass(frozen=True)
+class Described:
+    """Windows as they are compared, described once for all comparisons: tensors whose first axis is the windows'."""
+
+    parts: tuple[Tensor, ...]
+
+    def __len__(self) -> int:
+        return len(self.parts[0])
+
+    def __getitem__(self, index: slice) -> Described:
+        return Described(tuple(part[index] for part in self.parts))
+
+
+Side = TypeVar("Side", Tensor, Described)
+
+
+def between(
+    query: Windows,
+    bank: Windows,
+    compare: Callable[[Side, Side, Tensor | slice], Tensor],
+    worst: float,
+    describe: Callable[[Tensor, Tensor | slice], Side] | None = None,
+) -> Tensor:
+    """Fill a ``(queries, bank)`` table from ``compare(queries, bank, joints)``, on the joints both sides saw.
 
     Windows are grouped by which joints were seen, so that a comparison is always exact on the joints it has; pairs that
     share fewer than three joints get the value ``worst``.
+
+    Args:
+        describe: what is compared of ``(N, length, joints, dims)`` values among some joints; the values themselves by default.
+            It is called once for all comparisons of a group (a scan of 1000 exemplars takes 2.5 times as long otherwise).
     """
     groups = list(bank.patterns())
     out = query.values.new_empty(len(query), len(bank))
@@ -73,11 +101,13 @@ def between(query: Windows, bank: Windows, compare: Callable[[Tensor, Tensor, Te
                 out[rows[:, None], columns] = worst
                 continue
             joints: Tensor | slice = slice(None) if bool(both.all()) else both.nonzero()[:, 0]
-            right = bank.values[columns][:, :, joints]
+            left: Any = query.values[rows][:, :, joints]
+            right: Any = bank.values[columns][:, :, joints]
+            if describe is not None:
+                left, right = describe(left, joints), describe(right, joints)
             step = max(1, PAIRS_AT_ONCE // max(1, len(columns)))
             for at in range(0, len(rows), step):
-                part = rows[at : at + step]
-                out[part[:, None], columns] = compare(query.values[part][:, :, joints], right, joints)
+                out[rows[at : at + step, None], columns] = compare(left[at : at + step], right, joints)
     return out
 
 
@@ -95,7 +125,8 @@ def fused_residual(
 
     Terms: ``epi`` :math:`1 - s_1(U_q, U_e)`, the largest canonical correlation between the channel spaces under the joint
     metric (any viewpoint); ``up`` :math:`1 - \cos(y_q, y_e)`, heights only (upright cameras, turned about the vertical);
-    ``nn`` :math:`1 - \cos(X_q, X_e)`, the whole image (one viewpoint).
+    ``nn`` :math:`1 - \cos(X_q, X_e)`, the whole image (one viewpoint); ``turned``
+    :math:`1 - \max_R \cos(X_q R, X_e)` over turns R about the vertical, of bodies with depth, or of flat cards without.
 
     Args:
         query: ``Q`` windows of images; copies: each with the same ``E`` exemplars; weights: ``(channels,)``, 1 by default.
@@ -106,41 +137,65 @@ def fused_residual(
     Source: thesis chapter 7 (rank of stacked measurements).
     """
 
-    def product(left: Tensor, right: Tensor, joints: Tensor | slice) -> Tensor:
-        total = left.new_ones(len(left), len(right))
-        for i, name in enumerate(channels):
-            a, b = metric.apply(left, name, joints), metric.apply(right, name, joints)
-            for term in terms:
-                residual = _TERMS[term](a, b).add_(EPSILON)
-                if weights is not None and weights[i] != 1:
-                    residual = residual.pow_(float(weights[i]))
-                total.mul_(residual)
+    if not copies:
+        raise ValueError("no exemplar to compare with")
+    spelled = [(i, *_TERMS[term]) for i in range(len(channels)) for term in terms]
+
+    def describe(values: Tensor, joints: Tensor | slice) -> Described:
+        applied = [metric.apply(values, name, joints) for name in channels]
+        return Described(tuple(unit(applied[i]) for i, unit, _ in spelled))
+
+    def product(left: Described, right: Described, joints: Tensor | slice) -> Tensor:
+        total: Tensor | None = None
+        for (i, _, correlation), a, b in zip(spelled, left.parts, right.parts, strict=True):
+            residual = correlation(a, b).neg_().add_(1.0).clamp_(min=0.0).add_(EPSILON)
+            if weights is not None and weights[i] != 1:
+                residual = residual.pow_(float(weights[i]))
+            total = residual if total is None else total.mul_(residual)
+        if total is None:
+            raise ValueError("no channel to compare")
         return total
 
     total_weight = len(channels) if weights is None else float(weights.sum())
     worst = (1.0 + EPSILON) ** (len(terms) * total_weight)
-    best: Tensor | None = None
-    for copy in copies:
-        one = between(query, copy, product, worst)
-        best = one if best is None else torch.minimum(best, one)
-    if best is None:
-        raise ValueError("no exemplar to compare with")
-    return best.log_()
+    bank, step = stack(copies), max(1, TABLE // sum(len(copy) for copy in copies))
+    best = [
+        between(query[at : at + step], bank, product, worst, describe).unflatten(1, (len(copies), -1)).amin(dim=1)
+        for at in range(0, max(1, len(query)), step)
+    ]
+    return torch.cat(best).log_()
 
 
-def _epipolar(a: Tensor, b: Tensor) -> Tensor:
-    return canonical_correlation(orthonormal_basis(a), orthonormal_basis(b)).neg_().add_(1.0)
+Unit = Callable[[Tensor], Tensor]
 
 
-def _heights(a: Tensor, b: Tensor) -> Tensor:
-    return _cosine_distance(a[..., 1], b[..., 1])
+def _flat(x: Tensor) -> Tensor:
+    return torch.nn.functional.normalize(x.flatten(1), dim=1)
 
 
-def _images(a: Tensor, b: Tensor) -> Tensor:
-    return _cosine_distance(a.flatten(1), b.flatten(1))
+def _product(a: Tensor, b: Tensor) -> Tensor:
+    return a @ b.mT
 
 
-_TERMS: dict[str, Callable[[Tensor, Tensor], Tensor]] = {"epi": _epipolar, "up": _heights, "nn": _images}
+def _solid(x: Tensor) -> Tensor:
+    return x / x.flatten(1).norm(dim=1).clamp(min=1e-12)[:, None, None]
+
+
+def _turned(a: Tensor, b: Tensor) -> Tensor:
+    r"""With :math:`w = x + i z` a turn is :math:`w e^{i\phi}`: the best one makes :math:`|w_q^* w_e|` of the product."""
+    across = a[..., 0] @ b[..., 0].mT
+    if a.shape[2] == 3:
+        across = torch.hypot(across + a[..., 2] @ b[..., 2].mT, a[..., 2] @ b[..., 0].mT - a[..., 0] @ b[..., 2].mT)
+    return (a[..., 1] @ b[..., 1].mT).add_(across.abs_())
+
+
+# What is compared of a channel, and the correlation of two of them: 1 where they are the same.
+_TERMS: dict[str, tuple[Unit, Callable[[Tensor, Tensor], Tensor]]] = {
+    "epi": (orthonormal_basis, canonical_correlation),
+    "up": (lambda x: _flat(x[..., 1]), _product),
+    "nn": (_flat, _product),
+    "turned": (_solid, _turned),
+}
 
 
 @dataclass
@@ -160,15 +215,15 @@ class Kernels:
     def fit(self, windows: Windows) -> Tensor:
         """Set the scales from training windows and return their ``(N, N)`` kernel matrix."""
         chosen = windows[torch.arange(0, len(windows), max(1, len(windows) // SCALE_SAMPLE))]
-        off = ~torch.eye(len(chosen), dtype=torch.bool, device=chosen.values.device)
-        count = len(list(self._distances(chosen.values[:2], chosen.values[:2], slice(None))))
+        two = self._describe(chosen.values[:2], slice(None))
+        count = len(list(self._distances(two, two)))
         scales = []
         for k in range(count):
 
-            def one(left: Tensor, right: Tensor, joints: Tensor | slice, k: int = k) -> Tensor:
-                return next(d for i, d in enumerate(self._distances(left, right, joints)) if i == k)
+            def one(left: Described, right: Described, joints: Tensor | slice, k: int = k) -> Tensor:
+                return next(d for i, d in enumerate(self._distances(left, right)) if i == k)
 
-            scales.append(0.5 * between(chosen, chosen, one, worst=1.0)[off].median().clamp(min=1e-6))
+            scales.append(kernel_scale(between(chosen, chosen, one, 1.0, self._describe)))
         self.scales = torch.stack(scales)
         return self(windows, windows)
 
@@ -178,33 +233,44 @@ class Kernels:
         if scales is None:
             raise ValueError("the kernels have no scales yet; fit them first")
 
-        def total(left: Tensor, right: Tensor, joints: Tensor | slice) -> Tensor:
-            out = left.new_zeros(len(left), len(right))
-            for scale, distance in zip(scales, self._distances(left, right, joints), strict=True):
+        def total(left: Described, right: Described, joints: Tensor | slice) -> Tensor:
+            out = scales.new_zeros(len(left), len(right))
+            for scale, distance in zip(scales, self._distances(left, right), strict=True):
                 out.add_(distance.div_(-scale).exp_())
             return out.div_(len(scales))
 
-        return between(query, bank, total, worst=0.0)
+        return between(query, bank, total, 0.0, self._describe)
 
-    def _distances(self, left: Tensor, right: Tensor, joints: Tensor | slice) -> Iterator[Tensor]:
-        """``(Q, E)`` distances between windows restricted to some joints, one kernel after the other."""
+    def _describe(self, values: Tensor, joints: Tensor | slice) -> Described:
+        """Unit vectors, and where bases are compared those with three axes."""
+        parts = []
         for name in CHANNELS:
-            a, b = (self.metric.apply(x, name, joints) for x in (left, right))
-            yield _heights(a, b)
-            yield _images(a, b)
-            if self.one_side:
-                u, v = orthonormal_basis(a), orthonormal_basis(b)
-                yield 1 - canonical_correlation(u, v)
-                yield 1 - canonical_correlation(u, v, shared=2)
+            x = self.metric.apply(values, name, joints)
+            parts += [_flat(x[..., 1]), _flat(x), *([orthonormal_basis(x)] if self.one_side else [])]
         for whole_image in (False, True)[: 1 + self.one_side]:
-            for a, b in zip(order_free(left, whole_image), order_free(right, whole_image), strict=True):
-                yield _cosine_distance(a, b)
+            parts += [_flat(moment) for moment in order_free(values, whole_image)]
+        return Described(tuple(parts))
+
+    def _distances(self, left: Described, right: Described) -> Iterator[Tensor]:
+        """``(Q, E)`` distances, one kernel after the other."""
+        for a, b in zip(left.parts, right.parts, strict=True):
+            if a.ndim == 3:
+                yield 1 - canonical_correlation(a, b)
+                yield 1 - canonical_correlation(a, b, shared=2)
+            else:
+                yield _product(a, b).neg_().add_(1.0).clamp_(min=0.0)
 
 
+KERNEL_WIDTH = 0.5  # of the median distance; 1 costs 1-2 %
 SCALE_SAMPLE = 600  # windows whose distances set the kernel scales: their median is stable to 1 % from 300 on
 
 
-def _cosine_distance(a: Tensor, b: Tensor) -> Tensor:
+def kernel_scale(distances: Tensor, width: float = KERNEL_WIDTH) -> Tensor:
+    """The scale of a kernel from the ``(N, N)`` distances of its training rows: a share of the median between different rows."""
+    off = ~torch.eye(len(distances), dtype=torch.bool, device=distances.device)
+    return width * distances[off].median().clamp(min=1e-6 / width)
+
+
+def cosine_distance(a: Tensor, b: Tensor) -> Tensor:
     """``(Q, E)`` 1 - cosine of the angle between rows."""
-    unit = torch.nn.functional.normalize
-    return (unit(a, dim=1) @ unit(b, dim=1).mT).neg_().add_(1.0).clamp_(min=0.0)
+    return _product(_flat(a), _flat(b)).neg_().add_(1.0).clamp_(min=0.0)

@@ -207,7 +207,7 @@ def test_missing_tensors_are_refused(saved, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "name", ["labels", "crops.values", "crops.seen", "moments.seen", "owner", "metric", "hub", "weights", "machine.dual"]
+    "name", ["labels", "crops.values", "crops.seen", "moments.seen", "owner", "metric", "hub", "parts.joints", "machine.dual"]
 )
 def test_tensors_that_do_not_fit_together_are_refused(name, saved, tmp_path):
     tensors, metadata = contents(saved)

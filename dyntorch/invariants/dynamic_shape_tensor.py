@@ -1,0 +1,307 @@
+"""Dynamic shape tensors: what single affine views of a moving shape have in common, whatever the cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from dyntorch.algebra.dynamic_shape import AMBIGUOUS, fit_shapes
+from dyntorch.algebra.dynamic_shape_basis import Polynomial, Trajectory, extremes, times_of_views
+from dyntorch.algebra.dynamic_shape_descent import Projected, framed, project, shapes_at, slopes
+from dyntorch.algebra.dynamic_shape_rows import (
+    Base,
+    annihilator,
+    graph_of,
+    graph_rows,
+    shapes_of_graph,
+    span_rows,
+    unknowns_of,
+)
+from dyntorch.algebra.dynamic_shape_time import Recovery, recover_times
+from dyntorch.algebra.shape_rows import centred
+from dyntorch.invariant import Estimate, Frame, Invariant, on_class
+from dyntorch.matches import constellations, option
+from dyntorch.nullspace import null_space
+from dyntorch.primitives import Equations
+
+Form = Literal["joint", "basis", "span"]
+
+
+@dataclass(frozen=True, repr=False)
+class DynamicShapeTensor(Invariant):
+    r"""The shape and the motion of n points from single affine views, each by another camera.
+
+    The points move as :math:`P(t) = \sum_b c_b(t)\, P_b`, and a view at time t lies in the span of :math:`[1, P(t)]`, whatever
+    its camera.  A match is a view; the arguments of ``fit``, ``sampson`` and ``refine`` are the points :math:`p_1, \dots, p_n`,
+    each ``(*batch, views, 2)``, NaN = missing, with ``times (*batch, views)`` or ``(views,)``.
+
+    ==========  =========================================================================================================
+    form        tensor
+    ==========  =========================================================================================================
+    ``joint``   ``(n, 3 B)``: the shapes :math:`P_0, P_1, \dots` side by side, up to a constant affine frame, of least squares:
+                all points count alike.
+    ``basis``   ``(K, n, n - 4)``: coefficients of N(t) with :math:`N(t)^T x = 0`, from
+                :math:`D(t)\, x_j = \sum_{i \le 4} N_{ij}(t)\, x_i`: linear and differentiable; 1.2 to 10 times the error in t.
+    ``span``    ``(n - 1 - 3 B, n)``: what vanishes on all :math:`P_b` at once; linear, needs no times and tells none, n > 3 B + 1.
+    ==========  =========================================================================================================
+
+    Args:
+        trajectory: :class:`~dyntorch.algebra.dynamic_shape_basis.Polynomial` (constant velocity by default) or ``Fourier``.
+        form: ``joint``, ``basis`` or ``span``.
+        base: the four basis points of the form ``basis``.
+        points: n, which ``fit`` infers.
+        interval: ``(2,)`` or ``(*batch, 2)`` times that polynomials map to [-1, 1]; ``fit`` takes the first and last one, which
+            ``solution.invariant`` keeps: take it for ``sampson``, ``recover`` and ``score`` of other views.
+
+    Raises:
+        ValueError: another form, or basis points that are not four different ones.
+
+    Source: thesis chapter 4; Levin, Wolf and Shashua, "Time-varying shape tensors for scenes with multiply moving points", 2001.
+
+    Example:
+        >>> import torch, dyntorch as dyn
+        >>> g = torch.Generator().manual_seed(0)
+        >>> t = torch.linspace(0, 3, 20).double()
+        >>> start, velocity = torch.randn(2, 8, 3, generator=g).double()
+        >>> x = (start + t[:, None, None] * velocity) @ torch.randn(20, 3, 2, generator=g).double()
+        >>> solution = dyn.fit(DynamicShapeTensor, *x[:15].unbind(1), times=t[:15])
+        >>> solution
+        Solution(DynamicShapeTensor(Polynomial(degree=1)), matches=15, batch=(): 1 OK)
+        >>> found = solution.invariant.recover(solution.tensor, *x[15:].unbind(1), reach=2.0)
+        >>> bool((found.times - t[15:]).abs().max() < 1e-9)
+        True
+    """
+
+    trajectory: Trajectory = field(default_factory=Polynomial)
+    form: Form = "joint"
+    base: Base = (0, 1, 2, 3)
+    points: int = 5
+    interval: Tensor | None = field(default=None, compare=False)
+
+    intrinsic = True
+    motion = (Frame(None),)
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.trajectory, Trajectory):
+            raise ValueError(f"trajectory must be dyntorch.Polynomial or dyntorch.Fourier, got {self.trajectory!r}")
+        if self.form not in ("joint", "basis", "span"):
+            raise ValueError(f"form must be 'joint', 'basis' or 'span', got {self.form!r}")
+        if len(set(self.base)) != 4 or len(self.base) != 4 or min(self.base) < 0:
+            raise ValueError(f"base must be four different points, counted from 0, got {self.base!r}")
+
+    def prepared(
+        self, views: Sequence[Tensor], weights: Tensor | None = None, **given: Tensor
+    ) -> tuple[Invariant, tuple[Tensor, ...]]:
+        """The invariant of so many points and of this interval, and ``(*batch, views, n, 4)``: x, y, 1 (0 where missing), time."""
+        points = constellations(self, views)
+        n = points.shape[-2]
+        times = given.pop("times", None)
+        if given:
+            raise TypeError(f"{self!r} takes times=, not {next(iter(given))!r}; leave it out")
+        self._enough(n)
+        if times is None:
+            if self.form != "span":
+                raise ValueError(f"{self!r} needs times=, the time of each view (*batch, views); form='span' needs none")
+            times = points.new_zeros(points.shape[:-2])
+        times = times_of_views(times, points)
+        interval = self.interval
+        if interval is None:
+            weight = option("weights", weights, tuple(times.shape[:-1]), times.shape[-1], points)
+            interval = extremes(times if weight is None else torch.where(weight.reshape(times.shape) > 0, times, torch.nan))
+        unit = self.trajectory.unit(times, interval.to(times)).to(points)
+        unit = torch.where(self._telling(points[..., 2] > 0), unit, torch.nan)  # such a view is no match
+        measured = torch.cat([points, unit[..., None, None].expand(*points.shape[:-1], 1)], dim=-1)
+        return replace(self, points=n, interval=interval), (measured,)
+
+    def _enough(self, n: int) -> None:
+        least = 3 * self.trajectory.size + 2 if self.form == "span" else 5
+        if n < least:
+            raise ValueError(f"{self!r} needs at least {least} points, got {n}; add points, or use fewer functions of the time")
+        if max(self.base) >= n:
+            raise ValueError(f"base must name four of {n} points, counted from 0, got {self.base!r}")
+
+    def _telling(self, seen: Tensor) -> Tensor:
+        """Whether views that see these points say anything, ``(*batch, views)``."""
+        if self.form == "span":
+            return seen.all(-1)
+        basis = seen[..., list(self.base)].all(-1)
+        return (seen.sum(-1) > 4) & (basis if self.form == "basis" else True)
+
+    @property
+    def primitives(self) -> tuple[Equations, ...]:  # type: ignore[override]
+        """One slot: a whole view and its time."""
+        n, trajectory, base = self.points, self.trajectory, self.base
+        if self.form == "span":
+            return (Equations((n, 4), n - 1, span_rows, rows=2),)
+        width = trajectory.power(3).size * (1 + 3 * (n - 4))
+        return (Equations((n, 4), width, lambda x: graph_rows(x, trajectory, base), rows=2 * (n - 4)),)
+
+    @property
+    def nullity(self) -> int:  # type: ignore[override]
+        """Dimension of the null space of the rows: 1, or the codimension of the span of all positions."""
+        return self.points - 1 - 3 * self.trajectory.size if self.form == "span" else 1
+
+    @property
+    def dof(self) -> int:  # type: ignore[override]
+        """Numbers behind the tensor: positions of all functions up to translation, less what the gauge takes."""
+        size = 3 * self.trajectory.size
+        return size * (self.points - 1 - size) if self.form == "span" else size * (self.points - 1) - 9
+
+    @property
+    def codim(self) -> int:  # type: ignore[override]
+        """Conditions on one view."""
+        return 2 * (self.nullity if self.form == "span" else self.points - 4)
+
+    @on_class
+    def shape(self) -> tuple[int, ...]:
+        """Shape of one tensor (for ``span`` of one row of it)."""
+        n, size = self.points, self.trajectory
+        return {"joint": (n, 3 * size.size), "basis": (size.power(3).size, n, n - 4), "span": (n,)}[self.form]
+
+    def tensor_of(self, basis: Tensor) -> Tensor:
+        """The tensor of a null space of the rows."""
+        if self.form == "span":
+            rows = basis @ centred(self.points, basis.device)
+            return rows[..., 0, :] if self.nullity == 1 else rows
+        if self.form == "basis":
+            return annihilator(basis[..., 0, :], self.points, self.base)
+        return _framed(shapes_of_graph(basis[..., 0, :], self.points, self.trajectory, self.base))
+
+    def basis_of(self, tensor: Tensor) -> Tensor:
+        """The inverse of :meth:`tensor_of`."""
+        if self.form == "span":
+            return (tensor if self.nullity > 1 else tensor[..., None, :]) @ centred(self.points, tensor.device).mT
+        if self.form == "joint":
+            unknowns = graph_of(_apart(tensor), self.trajectory, self.base)
+            return (unknowns / unknowns.norm(dim=-1, keepdim=True).clamp(min=1e-300))[..., None, :]
+        return unknowns_of(tensor, self.base)[..., None, :]
+
+    def estimated(self, views: tuple[Tensor, ...], weights: Tensor) -> Estimate | None:
+        """The form ``joint`` by least squares over all points; the others are the null space of the rows."""
+        if self.form != "joint":
+            return None
+        with torch.no_grad():
+            measured = views[0]
+            rows = self.trajectory.rows(measured[..., 0, 3])
+            found = fit_shapes(measured[..., :2], rows, measured[..., 2], share=weights)
+        ambiguous = found.uncertainty > AMBIGUOUS
+        return Estimate(_beside(found.shapes), found.few, found.degenerate, ambiguous, found.uncertainty)
+
+    def compose(self, shapes: Tensor) -> Tensor:
+        r"""The tensor of known trajectories.
+
+        Args:
+            shapes: ``(*batch, n, 3 B)`` the shapes :math:`[P_0, P_1, \dots]` of the functions of the trajectory, at times in
+                [-1, 1] for polynomials.
+        """
+        apart = _apart(shapes)
+        if self.form == "span":
+            rows = (shapes - shapes.mean(-2, keepdim=True)).mT @ centred(shapes.shape[-2], shapes.device).mT
+            basis = null_space(rows, shapes.shape[-2] - 1 - shapes.shape[-1])
+            return replace(self, points=shapes.shape[-2]).tensor_of(basis)
+        if self.form == "joint":
+            return _framed(apart)
+        unknowns = graph_of(apart, self.trajectory, self.base)
+        return annihilator(unknowns / unknowns.norm(dim=-1, keepdim=True), shapes.shape[-2], self.base)
+
+    def decompose(self, tensor: Tensor) -> Tensor:
+        """The shapes ``(*batch, n, 3 B)`` of the trajectories up to a constant affine frame; for the span some basis of it."""
+        if self.form == "span":
+            rows = tensor if self.nullity > 1 else tensor[..., None, :]
+            return null_space(torch.cat([rows, torch.ones_like(rows[..., :1, :])], dim=-2), 3 * self.trajectory.size).mT
+        return tensor if self.form == "joint" else _framed(self.shapes(tensor))
+
+    def shapes(self, tensor: Tensor) -> Tensor:
+        """The shape of every function of the trajectory, ``(*batch, B, n, 3)``."""
+        if self.form == "span":
+            raise ValueError("form='span' knows the positions of all times together, no shape of any; use 'joint' or 'basis'")
+        if self.form == "joint":
+            return _apart(tensor)
+        return shapes_of_graph(unknowns_of(tensor, self.base), tensor.shape[-2], self.trajectory, self.base)
+
+    def whitened(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor | None:
+        """The distance of each view from the images of its shape, point by point: ``(*batch, views, 2 n)``."""
+        return self._projected(motion[0], views[0])[0].residual.flatten(-2) / scales[0][..., None, None]
+
+    def linearized(
+        self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]
+    ) -> tuple[Tensor, Tensor] | None:
+        """:meth:`whitened` and its derivative by the shapes."""
+        if self.form == "span":
+            return None
+        found, rows = self._projected(motion[0], views[0])
+        derivative = slopes(found, views[0][..., 2], rows).flatten(-2).flatten(-4, -2)  # (b, v, n 3 B, 2 n)
+        scale = scales[0][:, None]
+        return found.residual.flatten(1) / scale, derivative.transpose(1, 2).flatten(2) / scale[..., None]
+
+    def _projected(self, shapes: Tensor, measured: Tensor) -> tuple[Projected, Tensor]:
+        """Views ``(*batch, views, n, 4)`` beside their shapes, and the functions of the time."""
+        x, seen = measured[..., :2], measured[..., 2]
+        centre = (x * seen[..., None]).sum(-2, keepdim=True) / seen.sum(-1)[..., None, None].clamp(min=1.0)
+        rows = self.trajectory.rows(measured[..., 0, 3])
+        shape = shapes[..., None, :, :] if self.form == "span" else shapes_at(_apart(shapes), rows)
+        return project((x - centre) * seen[..., None], seen, shape), rows
+
+    @on_class
+    def recover(
+        self, tensor: Tensor, *points: Tensor, weights: Tensor | None = None, grid: int = 64, reach: float = 1.2
+    ) -> Recovery:
+        """When new views were taken, and what the shape at that time leaves unexplained.
+
+        Args:
+            tensor: of the form ``joint`` or ``basis``, ``(*batch, *shape)``.
+            *points: ``(*batch, views, 2)`` each.
+            weights: ``(*batch, views, n)``, 0 = ignore.
+            grid: times tried before refinement.
+            reach: polynomial trajectories: times tried, in half lengths of the interval of the training from its middle.
+
+        Returns:
+            :class:`~dyntorch.algebra.dynamic_shape_time.Recovery`, times in the unit and dtype of the training (without
+            ``interval``: in [-1, 1]).  The mean of its ``residual`` over 2 n - 9 is the square of the noise that ``sigma`` and
+            ``ambiguous`` ask for.
+        """
+        measured = constellations(self, points)
+        seen = measured[..., 2] if weights is None else measured[..., 2] * weights
+        shapes = self.shapes(tensor.double())
+        found = recover_times(shapes, self.trajectory, measured[..., :2], seen, grid=grid, interval=(-reach, reach))
+        if self.interval is None:
+            return found
+        # the times of the training say how many digits they need: seconds since 1970 have more than the points
+        interval = self.interval.to(found.times.device)
+        scale = 1.0 if self.trajectory.period is not None else (interval[..., 1:] - interval[..., :1]).clamp(min=0) / 2
+        times, second = (self.trajectory.time(t.to(interval), interval) for t in (found.times, found.second))
+        return replace(found, times=times, second=second, sigma=found.sigma * scale)
+
+    @on_class
+    def score(self, tensor: Tensor, *points: Tensor, weights: Tensor | None = None) -> Tensor:
+        """Part of the energy of each view that the tensor leaves unexplained at the best time, ``(*batch, views)`` in [0, 1]."""
+        if self.form != "span":
+            return self.recover(tensor, *points, weights=weights).residual
+        rows = span_rows(torch.nn.functional.pad(constellations(self, points).double(), (0, 1)))
+        basis = replace(self, points=len(points)).basis_of(tensor.double())
+        energy = rows.square().sum((-2, -1))
+        left = (rows @ basis.mT[..., None, :, :]).square().sum((-2, -1))
+        return torch.where(energy > 0, left / torch.where(energy > 0, energy, 1.0), 1.0).to(tensor.dtype)
+
+    def __repr__(self) -> str:
+        form = "" if self.form == "joint" else f", form={self.form!r}"
+        return f"DynamicShapeTensor({self.trajectory!r}{form})"
+
+
+def _framed(shapes: Tensor) -> Tensor:
+    """Shapes ``(*batch, B, n, 3)`` in their canonical frame, side by side."""
+    return _beside(framed(shapes.reshape(-1, *shapes.shape[-3:])).reshape(shapes.shape))
+
+
+def _beside(shapes: Tensor) -> Tensor:
+    """``(*batch, B, n, 3)`` to ``(*batch, n, 3 B)``."""
+    return shapes.transpose(-3, -2).flatten(-2)
+
+
+def _apart(shapes: Tensor) -> Tensor:
+    """``(*batch, n, 3 B)`` to ``(*batch, B, n, 3)``."""
+    return shapes.unflatten(-1, (shapes.shape[-1] // 3, 3)).transpose(-3, -2)

@@ -1,0 +1,300 @@
+"""Shape tensors: what one image says about the shape of n points, whatever the camera."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from dyntorch.algebra import shape_completion, shape_points, shape_rows
+from dyntorch.algebra.shape_points import AFFINE, GENERAL, PLANE
+from dyntorch.forward import jacobian
+from dyntorch.invariant import Frame, Invariant
+from dyntorch.invariants import shape_residual
+from dyntorch.matches import constellations
+from dyntorch.nullspace import null_space
+from dyntorch.primitives import Equations
+
+LEAST = {GENERAL: 6, PLANE: 6, AFFINE: 5}
+LARGEST = max(shape_rows.PROFILES)
+"""Points of the largest multilinear form: of more, four lines and four points already fulfil all conditions."""
+ROWS: dict[str, Callable[[Tensor], Tensor]] = {
+    GENERAL: shape_rows.general_rows,
+    PLANE: shape_rows.plane_rows,
+    AFFINE: shape_rows.affine_rows,
+}
+
+
+@dataclass(frozen=True, repr=False)
+class ShapeTensor(Invariant):
+    r"""The shape of n points from which the camera is eliminated; a match is one view of all of them.
+
+    The arguments of :func:`dyntorch.fit` are the points, ``p1, ..., pn``, each ``(*batch, views, 2)``.  Views are of uncalibrated
+    cameras, each its own; an own homography (affinity) of every view changes nothing.  Three frames:
+
+    - ``general``: p1 to p4 are the basis, any camera, n = 6, 7 or 8.  With lines l through a point, in the frame of the basis,
+
+      .. math:: T_{ab}\, p_5^a p_6^b = 0, \; T_a^{bc}\, p_5^a l_{6b} l_{7c} = 0, \; T^{abcd}\, l_{5a} l_{6b} l_{7c} l_{8d} = 0,
+
+      of 9, 27, 81 coefficients; 4, 16, 58 synthetic constraints, which hold for all shapes, are fulfilled exactly.
+    - ``plane``: P1 to P4 lie in a plane, any camera, n from 6 on.  Points :math:`v_i` beside the plane and the cameras
+      :math:`c` of all views are found at once from :math:`p_i \times (v_i + c) = 0`.  For n = 6, 7, 8 the tensor is the
+      multilinear form, a linear function of v that fulfils all 6, 21, 72 synthetic constraints; beyond it is v itself, of sum 0.
+    - ``affine``: affine cameras, n from 5 on, no basis points.  The tensor is the annihilator :math:`N x = 0, N 1 = 0` of all
+      coordinates x of any view, orthonormal, ``(n - 4, n)``.
+
+    A missing point (NaN) of the basis, or of the general forms, makes its view missing; any other loses only its own rows.
+    The tensor of noisy views is a start; :func:`dyntorch.refine` finds the one of least distances (8 general points, 20 views,
+    1 px of noise: new views 4.5 and 2.2 px off, 2.0 by the true shape).
+    The motion is the structure, homogeneous points ``(*batch, n, 4)`` in the frame of the basis (general: also P5 = (1, 1, 1, 1)),
+    up to a shift and a scale of v (plane) or an affinity (affine).  :func:`dyntorch.sampson` measures a new view: the least
+    distance (to first order) of its points to an image of the structure, NaN where it shows no more than its camera takes.
+
+    Args:
+        frame: ``"general"``, ``"plane"`` or ``"affine"``.
+        points: n; None takes it from the arguments.
+
+    Source: Carlsson and Weinshall 1998; Rother and Carlsson 2001; thesis sections 4 and 9.2 (72 is dim V(3, 4, 2)).
+
+    Example:
+        >>> import torch, dyntorch as dyn
+        >>> from dyntorch.invariants.shape_tensor import ShapeTensor
+        >>> draw = torch.Generator().manual_seed(0)
+        >>> P = torch.randn(7, 4, generator=draw, dtype=torch.float64)
+        >>> seen = P @ torch.randn(5, 4, 3, generator=draw, dtype=torch.float64)
+        >>> points = (seen[..., :2] / seen[..., 2:]).unbind(-2)
+        >>> solution = dyn.fit(ShapeTensor, *(p[:3] for p in points)).check()
+        >>> solution
+        Solution(ShapeTensor('general', 7), matches=3, batch=(): 1 OK)
+        >>> bool(dyn.sampson(ShapeTensor, solution.tensor, *(p[3:] for p in points)).max() < 1e-6)
+        True
+    """
+
+    frame: str = GENERAL
+    points: int | None = None
+
+    intrinsic = True
+    motion = (Frame(None),)
+
+    def __post_init__(self) -> None:
+        if self.frame not in LEAST:
+            raise ValueError(f"frame must be one of {', '.join(LEAST)}, got {self.frame!r}")
+        if self.points is not None:
+            self._check_points(self.points)
+
+    def _check_points(self, n: int) -> None:
+        if n < LEAST[self.frame]:
+            remedy = "add points" if self.frame == AFFINE else "add points, or take ShapeTensor('affine') from 5 points on"
+            raise ValueError(f"frame {self.frame!r} needs at least {LEAST[self.frame]} points, got {n}; {remedy}")
+        if self.frame == GENERAL and n > LARGEST:
+            raise ValueError(
+                f"frame 'general' takes 6, 7 or 8 points, got {n}; take eight of them, or ShapeTensor('plane') or ('affine')"
+            )
+
+    @property
+    def n(self) -> int:
+        """Points of one view."""
+        if self.points is None:
+            raise ValueError(f"{self!r} does not know its number of points; give it, ShapeTensor({self.frame!r}, points)")
+        return self.points
+
+    @property
+    def multilinear(self) -> bool:
+        """Whether the tensor is a multilinear form of the points of a view."""
+        return self.frame != AFFINE and self.n <= LARGEST
+
+    def prepared(
+        self, views: Sequence[Tensor], weights: Tensor | None = None, **given: Tensor
+    ) -> tuple[Invariant, tuple[Tensor, ...]]:
+        super().prepared(views, weights, **given)
+        if self.points not in (None, len(views)):
+            raise ValueError(f"{self!r} takes {self.points} points, each (*batch, views, 2), got {len(views)} arguments")
+        self._check_points(len(views))
+        x = constellations(self, views)
+        needed = x[..., 2] if self.frame == GENERAL else x[..., :4, 2]
+        if self.frame != AFFINE:
+            # a fit takes the view as missing, while the points that it shows can still be measured
+            gone = (needed == 0).any(-1)[..., None, None] & (x[..., 2:] == 0)
+            x = torch.cat([torch.where(gone, torch.nan, x[..., :2]), x[..., 2:]], dim=-1)
+        return replace(self, points=len(views)), (x,)
+
+    def completed(self, views: tuple[Tensor, ...], weights: Tensor) -> tuple[tuple[Tensor, ...], Tensor]:
+        """Affine views with their missing points filled in, which must show at least five; other frames leave out rows."""
+        x = views[0]
+        if self.frame != AFFINE or not len(x) or bool(((x[..., 2] > 0) | (weights <= 0)[..., None]).all()):
+            return views, weights
+        near, factor = shape_rows.local(x)
+        filled, whole = shape_completion.completed(near[..., :2], x[..., 2] > 0, weights)
+        back = (filled - near[..., :2]) / factor[..., None, None]
+        centre = (x[..., :2] * x[..., 2:]).sum(-2, keepdim=True) / x[..., 2:].sum(-2, keepdim=True).clamp(min=1.0)
+        missing = torch.where(x[..., 2:] > 0, x[..., :2], centre + back)
+        return (torch.cat([missing, x[..., 2:]], dim=-1),), weights * whole
+
+    @property
+    def primitives(self) -> tuple[Equations]:  # type: ignore[override]
+        m = self.n - 4
+        if self.frame == GENERAL:
+            width, rows = {2: (5, 1), 3: (11, 4), 4: (23, 12)}[m]
+        else:
+            width, rows = (3 * (m - 1), 2 * m - 3) if self.frame == PLANE else (self.n - 1, 2)
+        return (Equations((self.n, 3), width, ROWS[self.frame], rows),)
+
+    @property
+    def resolves_noise(self) -> bool:  # type: ignore[override]
+        """Not where three points of a basis nearly on a line make the frame of every view an accident."""
+        return self.frame == AFFINE
+
+    @property
+    def nullity(self) -> int:  # type: ignore[override]
+        return self.n - 4 if self.frame == AFFINE else 1
+
+    @property
+    def dof(self) -> int:  # type: ignore[override]
+        """Coordinates of the points less the collineations that keep the basis."""
+        return {GENERAL: 3 * (self.n - 5), PLANE: 3 * (self.n - 4) - 4, AFFINE: 3 * (self.n - 4)}[self.frame]
+
+    @property
+    def codim(self) -> int:  # type: ignore[override]
+        """Coordinates of a view less the freedom of its camera."""
+        return 2 * self.n - shape_residual.CAMERA[self.frame]
+
+    def shape(self) -> tuple[int, ...]:
+        if self.frame == AFFINE:
+            return (self.n,)
+        return (3,) * (self.n - 4) if self.multilinear else (self.n - 4, 3)
+
+    def tensor_of(self, basis: Tensor) -> Tensor:
+        """The tensor of a null space of the estimation matrix, whose columns are the coordinates that constraints leave free."""
+        device = basis.device
+        if self.frame == AFFINE:
+            tensor = basis @ shape_rows.centred(self.n, device)
+        elif self.frame == GENERAL:
+            tensor = basis @ shape_rows.free(self.n, device)
+        else:
+            v = (basis.unflatten(-1, (-1, 3)).mT @ shape_rows.centred(self.n - 4, device)).mT.flatten(-2)
+            tensor = v @ shape_rows.plane_map(self.n, device).mT if self.multilinear else v
+        tensor = tensor.unflatten(-1, self.shape())
+        return tensor.squeeze(-1 - len(self.shape())) if self.nullity == 1 else tensor
+
+    def basis_of(self, tensor: Tensor) -> Tensor:
+        device = tensor.device
+        flat = tensor.flatten(-len(self.shape()))
+        if self.frame == AFFINE:
+            basis = flat @ shape_rows.centred(self.n, device).mT
+        elif self.frame == GENERAL:
+            basis = flat @ shape_rows.free(self.n, device).mT
+        else:
+            basis = (self._beside(flat).mT @ shape_rows.centred(self.n - 4, device).mT).mT.flatten(-2)
+        return basis.unsqueeze(-2) if self.nullity == 1 else basis
+
+    def compose(self, points: Tensor) -> Tensor:
+        """The tensor of known points of space.
+
+        Args:
+            points: ``(*batch, n, 3)``, or ``(*batch, n, 4)`` homogeneous.  Of a plane the fourth is moved onto that of the first
+                three.
+
+        Returns:
+            ``(*batch, [n - 4,] *shape)`` of norm 1 (affine: orthonormal); zero where the basis points have no frame.
+
+        Example:
+            >>> import torch
+            >>> P = torch.eye(3, dtype=torch.float64)[[0, 0, 1, 1, 2]] * torch.tensor([1, -1, 1, -1, 1])[:, None]
+            >>> (ShapeTensor("affine").compose(P) * 2).abs().round(decimals=6).tolist()  # the diagonals of a square meet
+            [1.0, 1.0, 1.0, 1.0, 0.0]
+        """
+        own = replace(self, points=int(points.shape[-2]))
+        whole = points if points.shape[-1] == 4 else torch.nn.functional.pad(points, (0, 1), value=1.0)
+        whole = shape_points.standard(whole.double(), own.frame)
+        sound = whole.isfinite().flatten(-2).all(-1)[..., None, None]
+        whole = torch.where(sound, whole, shape_points.with_basis(torch.ones_like(whole[..., 4:, :]), own.frame))
+        tensor = own._composed(whole)
+        flat = tensor.flatten(-len(own.shape()))
+        norm = flat.norm(dim=-1, keepdim=True)
+        flat = torch.where(sound if own.nullity > 1 else sound[..., 0], flat / torch.where(norm > 0, norm, 1.0), 0.0)
+        return flat.unflatten(-1, own.shape()).to(points.dtype)
+
+    def _composed(self, points: Tensor) -> Tensor:
+        """The tensor, of any scale, of points ``(*batch, n, 4)`` in the standard frame."""
+        others = points[..., 4:, :]
+        if self.frame == AFFINE:
+            annihilator = null_space(points.mT, self.n - 4)
+            return annihilator.squeeze(-2) if self.nullity == 1 else annihilator
+        if self.multilinear:
+            cameras = (shape_points.dual_cameras if self.frame == GENERAL else shape_points.reference_cameras)(others)
+            return shape_rows.form(cameras).unflatten(-1, self.shape())
+        v = others[..., :3] / others[..., 3:]
+        return v - v.mean(-2, keepdim=True)
+
+    def decompose(self, tensor: Tensor) -> Tensor:
+        """The points behind a tensor, homogeneous ``(*batch, n, 4)``, in the frame that it leaves open; zero for a zero tensor.
+
+        Example:
+            >>> import torch
+            >>> P = torch.randn(7, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+            >>> family = ShapeTensor("general", 7)
+            >>> T = family.compose(P)
+            >>> bool(torch.allclose(family.compose(family.decompose(T)).abs(), T.abs()))
+            True
+        """
+        flat = tensor.double()
+        if self.frame == AFFINE:
+            points = shape_points.affine_points(flat[..., None, :] if self.nullity == 1 else flat)
+        elif self.frame == GENERAL:
+            points = shape_points.general_points(flat, self.n - 4)
+        else:
+            points = shape_points.plane_points(self._beside(flat.flatten(-len(self.shape()))))
+        return points.to(tensor.dtype)
+
+    def _beside(self, flat: Tensor) -> Tensor:
+        """The points v ``(*batch, n - 4, 3)``, of sum 0, of flat tensors of a reference plane."""
+        v = flat @ shape_points.plane_inverse(self.n, flat.device).mT if self.multilinear else flat
+        return v.unflatten(-1, (self.n - 4, 3))
+
+    def whitened(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
+        """Reprojection error ``(*batch, views, 2 n)`` of the points of each view, whose camera is found first."""
+        structure = shape_points.standard(motion[0].double(), self.frame)
+        return shape_residual.residual(structure, views[0].double(), scales[0].double(), self.frame).to(views[0].dtype)
+
+    def linearized(
+        self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]
+    ) -> tuple[Tensor, Tensor]:
+        value, slope = jacobian(
+            lambda t: shape_points.standard(t.unflatten(-1, (self.n, 4)), self.frame).flatten(-2), motion[0].flatten(-2)
+        )
+        structure = value.unflatten(-1, (self.n, 4))
+        error, derivative = shape_residual.residual_derivative(structure, views[0], scales[0], self.frame)
+        return error.flatten(-2), slope @ derivative.flatten(-2).flatten(-3, -2).mT
+
+    def score(self, tensor: Tensor, *points: Tensor) -> Tensor:
+        r"""Algebraic score of views: how nearly the equations of the camera, given the shape, are dependent.
+
+        :math:`\sigma_4 / \|E\|_F` of :math:`E = (l^T \hat P_i)` with two lines l through each point in the frame of the basis;
+        for affine cameras the share :math:`|N x| / |x|` of the centred coordinates.  It is no distance (see
+        :func:`dyntorch.sampson`), but takes no resection.
+
+        Args:
+            tensor: ``(*batch, ...)`` as fitted.
+            *points: p1, ..., pn, ``(*batch, views, 2)``.
+
+        Returns:
+            ``(*batch, views)`` in [0, 1], 0 for a view of the shape; NaN where the view says nothing.
+
+        Example:
+            >>> import torch
+            >>> draw = torch.Generator().manual_seed(0)
+            >>> P, A = (torch.randn(*size, generator=draw, dtype=torch.float64) for size in ((6, 3), (3, 2)))
+            >>> view = (P @ A)[:, None]
+            >>> family = ShapeTensor("affine")
+            >>> bool(family.score(family.compose(P), *view) < 1e-12), bool(family.score(family.compose(P), *view.flip(0)) > 0.1)
+            (True, True)
+        """
+        invariant, (x,) = self.prepared(points)
+        assert isinstance(invariant, ShapeTensor)
+        structure = shape_points.standard(invariant.decompose(tensor.double()), self.frame)
+        return shape_residual.score(structure, x.double(), self.frame).to(x.dtype)
+
+    def __repr__(self) -> str:
+        return f"ShapeTensor({self.frame!r}{'' if self.points is None else f', {self.points}'})"

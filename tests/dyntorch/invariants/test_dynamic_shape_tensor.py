@@ -1,0 +1,279 @@
+"""Dynamic shape tensors through ``fit``: forms, counts, invariance, missing points, times in the caller's unit."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+import dyntorch as dyn
+from dyntorch.algebra.dynamic_shape_basis import Fourier, Polynomial
+from dyntorch.invariants.dynamic_shape_tensor import DynamicShapeTensor
+from tests.dyntorch.moving_views import LINEAR, SQUARE, WAVE, draw, moving_views
+
+FORMS = ("joint", "basis", "span")
+TIMED = ("joint", "basis")
+
+
+def times(count, seed=1):
+    inner = 2 * torch.rand(count - 2, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) - 1
+    return torch.cat([torch.tensor([-1.0, 1.0]).double(), inner])
+
+
+def fitted(x, t, form="joint", trajectory=None, **options):
+    return dyn.fit(DynamicShapeTensor(trajectory or Polynomial(1), form=form), *x.unbind(-2), times=t, **options)
+
+
+def same_space(first, second):
+    """Largest difference of the projectors onto the column spaces ``(*batch, n, k)``."""
+    first, second = (torch.linalg.qr(m)[0] for m in (first, second))
+    return float((first @ first.mT - second @ second.mT).abs().max())
+
+
+def vanishing(tensor, trajectory, t, form):
+    """A matrix per view ``(v, n, m)`` that is orthogonal to its shape, from the definition of the tensor."""
+    if form == "basis":
+        return torch.einsum("vk,knm->vnm", trajectory.power(3).rows(t), tensor)
+    if form == "span":
+        return tensor.reshape(-1, tensor.shape[-1]).mT.expand(len(t), -1, -1)
+    n = len(tensor)
+    shape = torch.einsum("vb,nbk->vnk", trajectory.rows(t), tensor.unflatten(-1, (-1, 3)))
+    full = torch.cat([shape, torch.ones(len(t), n, 1).double()], dim=-1)
+    return torch.linalg.svd(full)[0][..., 4:]
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize(("functions", "trajectory"), [(LINEAR, Polynomial(1)), (WAVE, Fourier(1, period=torch.pi * 2))])
+def test_the_tensor_of_exact_views_vanishes_on_new_ones(form, functions, trajectory):
+    t = times(45)
+    x, shapes = moving_views(functions, t, n=12)
+    solution = fitted(x[:35], t[:35], form, trajectory).check()
+    assert solution.tensor.shape[-len(solution.invariant.shape()) :] == solution.invariant.shape()
+    matrix = vanishing(solution.tensor, trajectory, t[35:], form)
+    assert (matrix.mT @ x[35:]).abs().max() < 1e-7
+    assert (matrix.mT @ torch.ones(12, 1).double()).abs().max() < 1e-10
+    # the same tensor is that of the true shapes
+    true = replace(solution.invariant, points=12).compose(shapes.transpose(0, 1).flatten(1))
+    if form == "span":
+        assert same_space(solution.tensor.mT, true.mT) < 1e-8
+    elif form == "basis":
+        assert abs(float((solution.tensor * true).sum() / solution.tensor.norm() / true.norm())) > 1 - 1e-10
+    else:
+        assert same_space(vanishing(solution.tensor, trajectory, t, form), vanishing(true, trajectory, t, form)) < 1e-7
+
+
+@pytest.mark.parametrize(("form", "n", "count"), [("basis", 5, 8), ("basis", 8, 7), ("basis", 14, 7), ("joint", 14, 7)])
+def test_constant_velocity_needs_eight_or_seven_frames(form, n, count):
+    t = times(30)
+    x, _ = moving_views(LINEAR, t, n=n)
+    assert DynamicShapeTensor(form=form, points=n).minimal() == count
+    solution = fitted(x[:count], t[:count], form).check()
+    assert solution.singular_values[-2] > 1e-9 * solution.singular_values[0]
+    assert solution.invariant.score(solution.tensor, *x.unbind(-2)).max() < 1e-10
+    with pytest.raises(ValueError, match=rf"at least {count} matches, got {count - 1}"):
+        fitted(x[: count - 1], t[: count - 1], form)
+
+
+@pytest.mark.parametrize(("size", "count"), [(1, 2), (2, 3), (3, 5)])
+def test_the_span_of_all_positions_needs_two_three_five_frames(size, count):
+    n, t = 3 * size + 2, times(20)
+    x, _ = moving_views(SQUARE[:size], t, n=n)
+    invariant = DynamicShapeTensor(Polynomial(size - 1), form="span", points=n)
+    assert (invariant.minimal(), invariant.nullity) == (count, 1)
+    solution = dyn.fit(invariant, *x[:count].unbind(-2)).check()  # no times
+    assert solution.invariant.score(solution.tensor, *x.unbind(-2)).max() < 1e-12
+    assert solution.invariant.score(solution.tensor, *draw(9, n, 2, g=torch.Generator().manual_seed(3)).unbind(-2)).min() > 1e-4
+    with pytest.raises(ValueError, match=f"at least {n} points, got {n - 1}"):
+        dyn.fit(invariant, *x[:, 1:].unbind(-2))
+
+
+def test_too_high_a_degree_is_degenerate():
+    t = times(30)
+    x, _ = moving_views(LINEAR, t, n=8)
+    assert fitted(x, t, "basis", Polynomial(2)).status == dyn.Status.DEGENERATE
+
+
+@pytest.mark.parametrize("form", TIMED)
+def test_times_come_back_in_their_own_unit(form):
+    t = 100.0 + 7.0 * times(40)
+    x, _ = moving_views(LINEAR, (t - 100) / 7, n=8)
+    solution = fitted(x[:30], t[:30], form)
+    found = solution.invariant.recover(solution.tensor, *x[30:].unbind(-2))
+    torch.testing.assert_close(found.times, t[30:], atol=1e-6, rtol=0)
+    plain = fitted(x[:30], (t[:30] - 100) / 7, form)
+    # the unit and the origin of the times are no part of the tensor
+    torch.testing.assert_close(plain.tensor, solution.tensor, rtol=1e-6, atol=1e-8)
+    assert (dyn.sampson(solution.invariant, solution.tensor, *x.unbind(-2), times=t) < 1e-7).all()
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_the_camera_of_a_view_is_its_own_affair(form):
+    t, g = times(30), torch.Generator().manual_seed(5)
+    x, _ = moving_views(LINEAR, t, n=9)
+    moved = x @ draw(30, 2, 2, g=g) + draw(30, 1, 2, g=g)
+    first, second = fitted(x, t, form), fitted(moved, t, form)
+    if form == "span":
+        assert same_space(first.tensor.mT, second.tensor.mT) < 1e-7
+    elif form == "basis":
+        torch.testing.assert_close(first.tensor, second.tensor, rtol=1e-6, atol=1e-8)
+    else:
+        assert same_space(*(vanishing(s.tensor, Polynomial(1), t, form) for s in (first, second))) < 1e-6
+
+
+@pytest.mark.parametrize("form", TIMED)
+def test_decompose_gives_the_trajectories_up_to_an_affine_frame(form):
+    t = times(20)
+    _, shapes = moving_views(LINEAR, t, n=9)
+    invariant = DynamicShapeTensor(form=form, points=9)
+    found = invariant.decompose(invariant.compose(shapes.transpose(0, 1).flatten(1)))
+    both = [s - s.mean(-2, keepdim=True) for s in (found.unflatten(-1, (2, 3)).transpose(0, 1), shapes)]
+    known, wanted = (s.flatten(0, 1) for s in both)  # one 3 x 3 frame for position and velocity
+    torch.testing.assert_close(known @ torch.linalg.lstsq(known, wanted).solution, wanted, rtol=0, atol=1e-8)
+    torch.testing.assert_close(invariant.tensor_of(invariant.basis_of(invariant.compose(found))), invariant.compose(found))
+
+
+def test_joint_is_more_accurate_than_basis_and_refinement_keeps_it():
+    t = times(90)
+    x, _ = moving_views(LINEAR, t, n=14, batch=(6,), noise=0.01)
+
+    def error(solution):
+        return float((solution.invariant.recover(solution.tensor, *x[:, 40:].unbind(-2)).times - t[40:]).abs().median())
+
+    basis, joint = (fitted(x[:, :40], t[:40], form) for form in ("basis", "joint"))
+    assert not joint.status.any()
+    assert error(joint) < 0.004  # the prototype with four basis points: 0.005
+    assert error(joint) < 0.6 * error(basis)
+    assert (joint.uncertainty < 0.05).all()
+
+
+def test_refinement_brings_four_basis_points_to_the_least_distances():
+    t = times(40)
+    x, _ = moving_views(LINEAR, t, n=7, noise=0.01)
+    solutions = [fitted(x, t, form) for form in TIMED]
+    refined = [dyn.refine(solution, *x.unbind(-2), times=t) for solution in solutions]
+    before, after = (
+        [float(dyn.sampson(s.invariant, s.tensor, *x.unbind(-2), times=t).square().sum()) for s in group]
+        for group in (solutions, refined)
+    )
+    assert after[0] == pytest.approx(after[1], rel=1e-4)
+    assert after[1] < before[1]
+    assert after[0] < before[0]
+    # the noise is the same part of each view here, and it is that of the views together
+    extent = (x - x.mean(-2, keepdim=True)).square().mean((-2, -1)).mean().sqrt()
+    assert 0.005 < float(refined[0].sigma / extent) < 0.02
+
+
+@pytest.mark.parametrize("form", TIMED)
+def test_derivatives_of_distances_are_those_of_automatic_differentiation(form):
+    t, g = times(6), torch.Generator().manual_seed(1)
+    x, shapes = moving_views(LINEAR, t, n=6, batch=(2,), noise=0.1)
+    views = measured(x, t)
+    views[0, 2, 1, :3] = 0.0
+    invariant, motion = DynamicShapeTensor(form=form, points=6), shapes.transpose(1, 2).flatten(2)
+    scales = 1 + torch.rand(2, generator=g, dtype=torch.float64)
+    value, derivative = invariant.linearized((motion,), (views,), (scales,))
+    torch.testing.assert_close(value, invariant.whitened((motion,), (views,), (scales,)).flatten(1))
+    jacobian = torch.autograd.functional.jacobian(lambda m: invariant.whitened((m,), (views,), (scales,)).flatten(1), motion)
+    expected = torch.stack([jacobian[b, :, b].flatten(1).mT for b in range(2)])
+    torch.testing.assert_close(derivative, expected, rtol=1e-6, atol=1e-9)
+
+
+def measured(x, t):
+    wide = t[..., None].expand(x.shape[:-1])[..., None]
+    return torch.cat([x, torch.ones_like(wide), wide], dim=-1)
+
+
+def test_the_span_has_distances_too():
+    t = times(40)
+    x, _ = moving_views(LINEAR, t, n=10, noise=0.01)
+    solution = fitted(x, t, "span")
+    basis = solution.invariant.decompose(solution.tensor)
+    full = torch.cat([basis, torch.ones(10, 1).double()], dim=-1)
+    left = x - full @ torch.linalg.lstsq(full.expand(40, -1, -1), x).solution
+    found = dyn.sampson(solution.invariant, solution.tensor, *x.unbind(-2))
+    torch.testing.assert_close(found, left.flatten(1).norm(dim=-1), rtol=1e-6, atol=1e-9)
+    assert dyn.sampson(solution.invariant, dyn.refine(solution, *x.unbind(-2)).tensor, *x.unbind(-2)).norm() <= found.norm()
+    torch.testing.assert_close(
+        solution.invariant.score(solution.tensor, *x.unbind(-2)),
+        found.square() / (x - x.mean(-2, keepdim=True)).square().sum((-2, -1)),
+    )
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_batch_is_loop_and_a_bad_problem_stays_alone(form):
+    t = times(20)
+    x, _ = moving_views(LINEAR, t, n=8, batch=(2, 2))
+    x[1, 0] = torch.nan
+    solution = fitted(x, t, form)
+    assert solution.status.tolist() == [[0, 0], [dyn.Status.TOO_FEW, 0]]
+    assert solution.tensor.isfinite().all()
+    assert not solution.tensor[1, 0].any()
+    for i, j in ((0, 0), (1, 1)):
+        torch.testing.assert_close(solution.tensor[i, j], fitted(x[i, j], t, form).tensor, rtol=1e-5, atol=1e-7)
+    with pytest.raises(ValueError, match="TOO_FEW"):
+        solution.check()
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_missing_points_views_and_times_are_absent(form):
+    t = times(40)
+    x, _ = moving_views(LINEAR, t, n=9)
+    spoilt, when, weights = x.clone(), t.clone(), torch.ones(40).double()
+    spoilt[::5, 6] = torch.nan
+    spoilt[1] = torch.nan
+    spoilt[2], weights[2] = 50.0 * draw(9, 2, g=torch.Generator().manual_seed(2)), 0.0
+    if form != "span":
+        spoilt[3], when[3] = 70.0, torch.nan
+    else:
+        weights[3] = 0.0
+    solution = fitted(spoilt, when, form, weights=weights).check()
+    assert solution.invariant.score(solution.tensor, *x.unbind(-2)).max() < 1e-9
+
+
+@pytest.mark.parametrize("form", ["basis", "span"])
+def test_the_linear_forms_are_differentiable(form):
+    t = times(14)
+    x, _ = moving_views(LINEAR, t, n=8, noise=0.05)
+    weights = draw(*fitted(x, t, form).tensor.shape, g=torch.Generator().manual_seed(6))
+
+    def value(x):
+        tensor = fitted(x, t, form).tensor
+        tensor = tensor.mT @ tensor if form == "span" and tensor.ndim > 1 else tensor
+        return (weights * tensor).sum().square()  # blind to the sign
+
+    x = x.clone().requires_grad_()
+    (slope,) = torch.autograd.grad(value(x), x)
+    way = draw(*x.shape, g=torch.Generator().manual_seed(7))
+    step = 1e-6
+    with torch.no_grad():
+        difference = (value(x + step * way) - value(x - step * way)) / (2 * step)
+    torch.testing.assert_close((slope * way).sum(), difference, rtol=1e-4, atol=1e-8)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_float32_in_and_out(form):
+    t = times(30)
+    x, _ = moving_views(LINEAR, t, n=8)
+    solution = fitted(x.float(), t.float(), form)
+    assert solution.tensor.dtype == torch.float32
+    assert solution.invariant.score(solution.tensor, *x.float().unbind(-2)).max() < 1e-4
+
+
+def test_misuse():
+    t = times(10)
+    x, _ = moving_views(LINEAR, t, n=8)
+    with pytest.raises(ValueError, match="needs times="):
+        dyn.fit(DynamicShapeTensor, *x.unbind(-2))
+    with pytest.raises(ValueError, match=r"times must be \(\*batch, views\) = \(10,\)"):
+        fitted(x, t[:4])
+    with pytest.raises(TypeError, match="not 'phase'"):
+        dyn.fit(DynamicShapeTensor, *x.unbind(-2), times=t, phase=t)
+    with pytest.raises(ValueError, match="at least 5 points, got 4"):
+        fitted(x[:, :4], t)
+    with pytest.raises(ValueError, match="form must be"):
+        DynamicShapeTensor(form="all")
+    with pytest.raises(ValueError, match="four different points"):
+        DynamicShapeTensor(base=(0, 0, 1, 2))
+    with pytest.raises(ValueError, match="four of 8 points"):
+        dyn.fit(DynamicShapeTensor(form="basis", base=(0, 1, 2, 8)), *x.unbind(-2), times=t)
+    with pytest.raises(ValueError, match="no shape of any"):
+        DynamicShapeTensor(form="span", points=8).recover(torch.zeros(1, 8), *x.unbind(-2))

@@ -1,0 +1,266 @@
+"""Shape tensors: the properties that every invariant has, for all their forms; a match is a view."""
+
+import pytest
+import torch
+
+import dyntorch as dyn
+from dyntorch.invariants.shape_tensor import ShapeTensor
+from tests.references import rank
+from tests.shape_cases import SHAPE_CASES
+
+forms = pytest.mark.parametrize("case", SHAPE_CASES, ids=repr)
+some = pytest.mark.parametrize("case", [SHAPE_CASES[i] for i in (1, 2, 5, 6, 8)], ids=repr)
+MANY = 8
+
+
+def ok(solution):
+    assert (solution.status == dyn.Status.OK).all(), repr(solution)
+    return solution
+
+
+@forms
+def test_counts_are_ranks(case):
+    inv = case.invariant
+    assert (inv.minimal(), inv.width(), inv.dof, inv.codim) == (case.minimal, case.width, case.dof, case.conditions)
+    points, shape = case.scene(MANY, seed=1)
+    for views in (case.minimal, MANY):
+        matrix = inv.primitives[0].vectors(torch.stack([torch.nn.functional.pad(p[:views], (0, 1), value=1.0) for p in points], -2))
+        assert rank(matrix.flatten(0, -2)) == case.width - inv.nullity
+        if views == case.minimal:
+            assert rank(matrix[:-1].flatten(0, -2)) < case.width - inv.nullity
+            assert rank(matrix[0]) == inv.rows()
+
+    # the freedom of the shape, by central differences of the span of its tensor
+    steps = 1e-4 * torch.eye(3 * case.n, dtype=torch.float64).reshape(-1, case.n, 3)
+    spans = [t.reshape(-1, inv.nullity, case.size) for t in (inv.compose(shape + steps), inv.compose(shape - steps))]
+    values = torch.linalg.svdvals(((spans[0].mT @ spans[0] - spans[1].mT @ spans[1]) / 2e-4).flatten(1))
+    assert int((values > 1e-5 * values[0]).sum()) == case.dof
+
+
+@forms
+def test_minimal_views_suffice_and_one_fewer_is_refused(case):
+    for views in (case.minimal, MANY):
+        points, shape = case.scene(views, batch=(4,), seed=2)
+        solution = ok(dyn.fit(ShapeTensor(case.frame), *points))
+        assert solution.tensor.shape[1:] == ((case.invariant.nullity,) * (case.invariant.nullity > 1) + case.invariant.shape())
+        assert solution.singular_values.shape == (4, case.width)
+        assert case.apart(solution.tensor, case.invariant.compose(shape)) < 1e-8
+    points, _ = case.scene(case.minimal - 1, batch=(2,))
+    with pytest.raises(ValueError, match=rf"at least {case.minimal} matches, got {case.minimal - 1}; add matches"):
+        dyn.fit(ShapeTensor(case.frame), *points)
+
+
+@forms
+def test_coordinates_of_the_views_change_nothing(case):
+    points, shape = case.scene(MANY, batch=(3,), seed=3)
+    assert case.apart(ok(dyn.fit(case.invariant, *case.changed(points))).tensor, case.invariant.compose(shape)) < 1e-8
+    noisy, _ = case.scene(MANY, batch=(3,), seed=3, sigma=0.5)
+    before, after = (dyn.fit(case.invariant, *x) for x in (noisy, case.changed(noisy, similar=True)))
+    assert case.apart(before.tensor, after.tensor) < 1e-8
+    assert torch.equal(before.status, after.status)
+    torch.testing.assert_close(before.singular_values, after.singular_values)
+
+
+@forms
+def test_structure_of_a_composed_tensor_gives_it_back(case):
+    shape = case.scene(1, batch=(2, 3), seed=4)[1]
+    tensor = case.invariant.compose(shape)
+    points = case.invariant.decompose(-0.3 * tensor)
+    assert points.shape == (2, 3, case.n, 4)
+    assert case.apart(case.invariant.compose(points), tensor) < 1e-8
+    homogeneous = torch.nn.functional.pad(shape, (0, 1), value=1.0)
+    scaled = homogeneous * torch.linspace(0.5, 2, case.n).double()[:, None].mul(torch.tensor(-1.0)) ** 3
+    assert case.apart(case.invariant.compose(scaled), tensor) < 1e-10
+    # a collineation of space (affinity) is what is left open
+    moved = homogeneous @ (torch.eye(4) + 0.1 * torch.randn(4, 4, generator=torch.Generator().manual_seed(0))).double()
+    moved = moved if case.frame != "affine" else torch.cat([moved[..., :3], homogeneous[..., 3:]], -1)
+    assert case.apart(case.invariant.compose(moved), tensor) < 1e-10
+    assert case.invariant.decompose(torch.zeros_like(tensor)).abs().max() == 0
+
+
+@some
+def test_batch_is_loop_and_order_and_weights_of_views_are_what_they_should_be(case):
+    points, _ = case.scene(MANY, batch=(2, 2), seed=5, sigma=0.5)
+    whole = dyn.fit(case.invariant, *points)
+    alone = dyn.fit(case.invariant, *(p[1, 0] for p in points))
+    assert case.apart(whole.tensor[1, 0], alone.tensor) < 1e-10 and whole.status.shape == (2, 2)
+    torch.testing.assert_close(whole.singular_values[1, 0], alone.singular_values)
+    order = torch.randperm(MANY, generator=torch.Generator().manual_seed(0))
+    assert case.apart(dyn.fit(case.invariant, *(p[..., order, :] for p in points)).tensor, whole.tensor) < 1e-9
+    kept = dyn.fit(case.invariant, *(p[..., 2:, :] for p in points))
+    weights = torch.ones(MANY, dtype=torch.float64)
+    weights[:2] = 0
+    wild = tuple(torch.cat([1e3 * p[..., :2, :].flip(-1), p[..., 2:, :]], -2) for p in points)
+    missing = tuple(torch.cat([torch.full_like(p[..., :2, :], torch.nan), p[..., 2:, :]], -2) for p in points)
+    for given, weight in ((wild, weights), (missing, None), (wild, weights.masked_fill(weights == 0, torch.nan))):
+        found = dyn.fit(case.invariant, *given, weights=weight)
+        assert case.apart(found.tensor, kept.tensor) < 1e-10
+        assert torch.equal(found.status, kept.status)
+    twice = dyn.fit(case.invariant, *(torch.cat([p, p[..., :3, :]], -2) for p in points))
+    weights = torch.tensor([2.0] * 3 + [1.0] * (MANY - 3)).double()
+    assert case.apart(dyn.fit(case.invariant, *points, weights=weights).tensor, twice.tensor) < 1e-9
+    empty = dyn.fit(case.invariant, *(p[:0] for p in points)).check()
+    assert empty.tensor.shape[:2] == (0, 2) and empty.motion[0].shape[:2] == (0, 2)
+
+
+@some
+def test_one_bad_problem_leaves_the_others_alone(case):
+    points, _ = case.scene(MANY, batch=(3,), seed=6, sigma=0.2)
+    good = dyn.fit(case.invariant, *points)
+    bad = tuple(p.clone() for p in points)
+    for p in bad:
+        p[0] = torch.nan
+        p[2] = p[2, :1]  # one view, again and again
+    found = dyn.fit(case.invariant, *bad)
+    assert found.status.tolist() == [dyn.Status.TOO_FEW, dyn.Status.OK, dyn.Status.DEGENERATE]
+    assert case.apart(found.tensor[1], good.tensor[1]) < 1e-10
+    for x in (found.tensor, found.uncertainty, found.singular_values, *found.motion, dyn.refine(found, *bad).tensor):
+        assert x.isfinite().all()
+    with pytest.raises(ValueError, match="problem 0 of 3: TOO_FEW"):
+        found.check()
+
+
+@some
+def test_float32_in_and_out(case):
+    points, shape = case.scene(MANY, batch=(2,), seed=7)
+    solution = ok(dyn.fit(case.invariant, *(p.float() for p in points)))
+    assert solution.tensor.dtype == solution.motion[0].dtype == torch.float32
+    assert case.apart(solution.tensor.double(), case.invariant.compose(shape)) < 1e-3
+    assert dyn.sampson(case.invariant, solution.tensor, *(p.float() for p in points)).dtype == torch.float32
+    assert case.invariant.compose(shape.float()).dtype == torch.float32
+
+
+@pytest.mark.parametrize("case", [SHAPE_CASES[i] for i in (0, 5, 7)], ids=repr)
+def test_gradients(case):
+    for views in (case.minimal, case.minimal + 2):
+        points, _ = case.scene(views, seed=8, sigma=0.2)
+        x = ((torch.stack(points, -2) - 300) / 100).requires_grad_()
+        weight = torch.randn(case.size, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+        def gauge_free(x, case=case, weight=weight):
+            tensor = dyn.fit(case.invariant, *x.unbind(-2)).tensor.reshape(-1, case.size)
+            return (tensor @ weight).square().sum()
+
+        assert torch.autograd.gradcheck(gauge_free, x, atol=1e-5, rtol=1e-4, fast_mode=True)
+
+
+@forms
+def test_sampson_is_the_distance_to_the_nearest_image(case):
+    points, shape = case.scene(4, batch=(2,), seed=9, sigma=0.3)
+    tensor = case.invariant.compose(shape)
+    found = dyn.sampson(ShapeTensor(case.frame), tensor, *points)
+    exact, _ = case.scene(4, batch=(2,), seed=9)
+    assert dyn.sampson(case.invariant, tensor, *exact).max() < 1e-6
+    assert case.invariant.score(tensor, *exact).max() < 1e-9
+    assert (case.invariant.score(tensor, *points) > 1e-6).all()
+    # brute force: Gauss-Newton over all entries of the camera
+    x, world = torch.stack(points, -2)[1, 2], torch.nn.functional.pad(shape[1], (0, 1), value=1.0)
+    rows = 2 if case.frame == "affine" else 3
+    truth = torch.stack(exact, -2)[1, 2]
+
+    def error(camera):
+        image = world @ camera.reshape(rows, 4).T
+        return ((image if rows == 2 else image[:, :2] / image[:, 2:]) - x).flatten()
+
+    lifted = torch.nn.functional.pad(truth, (0, 1), value=1.0)
+    blocks = torch.stack(
+        [torch.kron(torch.linalg.cross(torch.eye(3).double(), p.expand(3, 3)), q[None]) for p, q in zip(lifted, world, strict=True)]
+    )
+    camera = torch.linalg.svd(blocks.reshape(-1, 12)).Vh[-1]
+    camera = (camera.reshape(3, 4) / camera[11])[:rows].flatten()
+    for _ in range(6):
+        camera = camera - torch.linalg.pinv(torch.func.jacrev(error)(camera), rtol=1e-10) @ error(camera)
+    torch.testing.assert_close(found[1, 2], error(camera).norm(), rtol=2e-2, atol=0)
+
+
+@some
+def test_refinement_lowers_the_distances(case):
+    points, _ = case.scene(MANY, batch=(6,), seed=10, sigma=0.5)
+    linear = dyn.fit(case.invariant, *points)
+    refined = dyn.refine(linear, *points)
+    cost = [dyn.sampson(case.invariant, s.tensor, *points).square().sum(-1) for s in (linear, refined)]
+    assert (cost[1] <= cost[0] * (1 + 1e-9)).all()
+    assert ((refined.sigma > 0.25) & (refined.sigma < 1)).all()
+    fresh, _ = case.scene(MANY, batch=(6,), seed=10)
+    assert dyn.sampson(case.invariant, refined.tensor, *fresh).median() < 1.5
+    residual, slope = case.invariant.linearized(
+        (refined.motion[0],),
+        (torch.stack([torch.nn.functional.pad(p, (0, 1), value=1.0) for p in points], -2),),
+        (torch.ones(6).double(),),
+    )
+    torch.testing.assert_close(
+        residual.unflatten(-1, (MANY, -1)).norm(dim=-1), dyn.sampson(case.invariant, refined.tensor, *points), rtol=1e-4, atol=1e-6
+    )
+    # at the minimum of the cost it does not change to first order
+    assert ((slope @ residual[..., None])[..., 0].norm(dim=-1) < 1e-3 * slope.flatten(1).norm(dim=-1)).all()
+
+
+@pytest.mark.parametrize("case", [SHAPE_CASES[i] for i in (5, 6, 8)], ids=repr)
+def test_missing_points_lose_their_own_rows_only(case):
+    points, shape = case.scene(12, batch=(4,), seed=11)
+    x = torch.stack(points, -2)
+    gone = torch.rand(x.shape[:-1], generator=torch.Generator().manual_seed(1)) < 0.15
+    if case.frame == "plane":
+        gone[..., :4] = False
+    assert (gone.any(-1).sum(-1) > 2).all()
+    seen = x.masked_fill(gone[..., None], torch.nan)
+    solution = ok(dyn.fit(case.invariant, *seen.unbind(-2)))
+    assert case.apart(solution.tensor, case.invariant.compose(shape)) < 1e-7
+    assert solution.singular_values.isfinite().all()
+    distance = dyn.sampson(case.invariant, solution.tensor, *seen.unbind(-2))
+    told = 2 * (~gone).sum(-1) > (8 if case.frame == "affine" else 11)
+    assert torch.equal(distance.isfinite(), told) and distance[told].max() < 1e-5
+    assert dyn.refine(solution, *seen.unbind(-2)).tensor.isfinite().all()
+
+
+@pytest.mark.parametrize("case", [SHAPE_CASES[i] for i in (0, 2, 5)], ids=repr)
+def test_a_basis_without_a_frame_is_degenerate(case):
+    _, shape = case.scene(1, batch=(2,), seed=12)
+    shape[0, 2] = 0.4 * shape[0, 0] + 0.6 * shape[0, 1]  # three points of a line
+    turn = torch.linalg.qr(torch.randn(2, MANY, 3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)).Q
+    seen = shape[:, None] @ turn.mT
+    points = (500 * seen[..., :2] / (6 + seen[..., 2:])).unbind(-2)
+    for given in (points, tuple(p.float() for p in points)):
+        assert dyn.fit(case.invariant, *given).status.tolist() == [dyn.Status.DEGENERATE, dyn.Status.OK]
+    assert case.invariant.compose(shape)[0].abs().max() == 0
+    if case.n == 8:  # nearly on a line: the frames of the views are what the noise makes of them
+        g = torch.Generator().manual_seed(1)
+        noisy = [p + torch.randn(p.shape, generator=g, dtype=torch.float64) for p in points]
+        assert dyn.fit(case.invariant, *noisy).status.tolist() == [dyn.Status.AMBIGUOUS, dyn.Status.OK]
+
+
+def test_misuse_is_a_value_error_with_its_remedy():
+    points, _ = SHAPE_CASES[2].scene(4)
+    tensor = dyn.fit(ShapeTensor, *points).tensor
+    for call, message in (
+        (lambda: dyn.fit(ShapeTensor, *points[:5]), r"'general' needs at least 6 points, got 5; .*'affine'"),
+        (lambda: dyn.fit(ShapeTensor("affine"), *points[:4]), "at least 5 points, got 4; add points"),
+        (lambda: dyn.fit(ShapeTensor, *points, *points), "takes 6, 7 or 8 points, got 16"),
+        (lambda: dyn.fit(ShapeTensor("general", 7), *points), "takes 7 points, .* got 8 arguments"),
+        (lambda: dyn.fit(ShapeTensor, *points[:7], points[7][:, :1]), r"point 8 .*expected \(\*batch, n, 2\)"),
+        (lambda: dyn.fit(ShapeTensor, *points[:7], points[7][:2]), "all points need the same"),
+        (lambda: dyn.fit(ShapeTensor, *points[:7], points[7].float()), "all points need one dtype"),
+        (lambda: dyn.fit(ShapeTensor, *points, static=torch.ones(4)), "no rows for labelled static"),
+        (lambda: dyn.robust_fit(ShapeTensor, *points), "fit again with weights"),
+        (lambda: dyn.algebraic(ShapeTensor, tensor, *points), "no single algebraic residual"),
+        (lambda: dyn.sampson(ShapeTensor, tensor[0], *points), r"must be \(\*batch, 3, 3, 3, 3\)"),
+        (lambda: ShapeTensor("metric"), "one of general, plane, affine, got 'metric'"),
+        (lambda: ShapeTensor.minimal(), "does not know its number of points"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            call()
+    with pytest.raises(TypeError, match="no argument 'times'"):
+        dyn.fit(ShapeTensor, *points, times=points[0])
+
+
+def test_affine_views_that_share_no_basis_stay_incomplete():
+    case = SHAPE_CASES[-1]
+    points, shape = case.scene(8, batch=(1,), seed=13)
+    x = torch.stack(points, -2)
+    x[:, ::2, 5:] = torch.nan
+    x[:, 1::2, :4] = torch.nan
+    apart = dyn.fit(case.invariant, *x.unbind(-2))
+    assert apart.status.tolist() == [dyn.Status.TOO_FEW] and apart.singular_values.isfinite().all()
+    # two whole views are enough, and what the others lack follows from them
+    whole = torch.cat([x, torch.stack(case.scene(8, batch=(1,), seed=13)[0], -2)[:, :2]], dim=1)
+    assert case.apart(ok(dyn.fit(case.invariant, *whole.unbind(-2))).tensor, case.invariant.compose(shape)) < 1e-8

@@ -1,0 +1,136 @@
+"""How scorers are weighed by people who were left out, and what tells known actions from unknown ones."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from indexing import ActionIndexer
+from indexing.actors import Person, dataset
+from indexing.scoring import probabilities
+from indexing.shape.bank import Windows, fused_residual
+from indexing.shape.blending import BLENDS, _fewest_mistakes, _sharpened, blended, leave_out
+from indexing.shape.channels import JointMetric
+from indexing.shape.knowing import Known, features, learn_known, without_own
+from indexing.shape.model import Blend
+
+ACTIONS = ("squat", "wave", "kick", "bow", "punch")
+
+
+@pytest.fixture(scope="module")
+def lesson():
+    return dataset([Person.random(i) for i in range(3)], ACTIONS, azimuth=0.0, rng=1)
+
+
+@pytest.fixture(scope="module")
+def learned(lesson):
+    return ActionIndexer(weights="learned", virtual_views=2).fit(lesson)
+
+
+def test_people_are_left_out_whole():
+    groups = torch.tensor([4, 4, 9, 1, 9, 7, 3, 3, 2, 5])
+    folds = leave_out(groups)
+    for person in groups.unique():
+        assert len(folds[groups == person].unique()) == 1
+    assert sorted(folds.unique().tolist()) == [0, 1, 2, 3, 4]
+
+
+def test_the_scorer_that_is_right_is_chosen():
+    draw = torch.Generator().manual_seed(0)
+    truth = torch.arange(5).repeat(20)
+    right = torch.nn.functional.one_hot(truth, 5).double() + 0.1 * torch.rand(100, 5, generator=draw, dtype=torch.float64)
+    wrong = 1.2 * right.roll(1, dims=1)
+    only_a = _fewest_mistakes(torch.stack([2 * wrong, right]), truth, Blend())
+    only_b = _fewest_mistakes(torch.stack([right, wrong]), truth, Blend())
+    assert (only_a.kernel, only_a.nearest) == (1.0, 3.0)
+    assert (only_b.kernel, only_b.nearest) == (1.0, 0.5)
+    same = _fewest_mistakes(torch.stack([right, right]), truth, Blend())
+    assert (same.kernel, same.nearest) == (1.0, Blend().nearest)  # nothing gained, nothing changed
+    assert (Blend().kernel, Blend().nearest) in BLENDS
+
+
+def test_sharpness_is_the_likeliest():
+    draw = torch.Generator().manual_seed(1)
+    truth = torch.arange(4).repeat(50)
+    scores = torch.nn.functional.one_hot(truth, 4).double() + torch.randn(200, 4, generator=draw, dtype=torch.float64)
+    found = _sharpened(Blend(), scores, truth).sharpness
+
+    def likelihood(sharpness):
+        chance = probabilities(scores.numpy(), sharpness)
+        return np.log(chance[np.arange(200), truth.numpy()]).mean()
+
+    assert likelihood(found) >= max(likelihood(found * 1.19), likelihood(found / 1.19))
+    assert likelihood(found) > likelihood(8.0)
+
+
+def test_blended_is_the_weighted_sum():
+    evidence = torch.rand(2, 3, 4, generator=torch.Generator().manual_seed(2))
+    assert torch.allclose(blended(evidence, Blend(2.0, 0.5)), 2 * evidence[0] + 0.5 * evidence[1])
+
+
+def test_a_learned_indexer_knows_who_performs(learned, lesson):
+    assert learned.groups_.tolist() == [str(clip.meta["subject"]) for clip in lesson]
+    alone = ActionIndexer(weights="learned", virtual_views=2).fit([clip.replace(meta={}) for clip in lesson])
+    assert alone.groups_ is None and alone.model_.blend == Blend()
+    told = ActionIndexer(weights="learned", virtual_views=2).fit(
+        [clip.replace(meta={}) for clip in lesson], groups=lesson.column("subject")
+    )
+    assert told.model_.blend == learned.model_.blend
+    with pytest.raises(ValueError, match=r"groups: expected one per clip \(15\)"):
+        ActionIndexer(weights="learned").fit(lesson, groups=[1, 2])
+
+
+def test_depth_is_asked_for_by_name(lesson):
+    assert ActionIndexer(virtual_views=2).fit(lesson).model_.bodies is None
+    assert ActionIndexer(virtual_views=2, depth="synthetic").fit(lesson).model_.bodies is not None
+    assert ActionIndexer(virtual_views=2, weights="learned", depth=None).fit(lesson).model_.bodies is None
+    odd = [clip.replace(joints=clip.joints[:, :4], confidence=None, skeleton=None) for clip in lesson]
+    with pytest.raises(ValueError, match="depth='synthetic': what the 4 joints are is not known"):
+        ActionIndexer(depth="synthetic").fit(odd)
+    assert ActionIndexer(weights="learned").fit(odd).model_.bodies is None
+    with pytest.raises(ValueError, match="depth must be one of"):
+        ActionIndexer(depth="deep").fit(lesson)
+
+
+def test_turned_bodies_fit_one_another():
+    draw = torch.Generator().manual_seed(3)
+    body = torch.rand(2, 6, 5, 3, generator=draw)
+    angle = torch.tensor(1.1)
+    c, s = torch.cos(angle), torch.sin(angle)
+    turn = torch.tensor([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+    metric = JointMetric.learn(body[..., :2], torch.ones(2, 5, dtype=torch.bool), 0.25)
+    seen = torch.ones(2, 5, dtype=torch.bool)
+    table = fused_residual(Windows(body @ turn.mT, seen), [Windows(body, seen)], metric, ("clip",), terms=("turned",)).exp()
+    assert table.diagonal().max() < 1e-3 + 1e-5 and table[0, 1] > 0.01
+    # brute force over turns
+    a, b = (metric.apply(x, "clip") for x in (body @ turn.mT, body))
+    a, b = a[0] / a[0].norm(), b[1] / b[1].norm()
+    best = -1.0
+    for phi in torch.linspace(0, 2 * torch.pi, 2000):
+        c, s = torch.cos(phi), torch.sin(phi)
+        best = max(best, float((a @ torch.tensor([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]]).mT * b).sum()))
+    assert float(table[0, 1]) == pytest.approx(1 - best + 1e-3, abs=1e-4)
+
+
+def test_known_from_unknown():
+    draw = torch.Generator().manual_seed(4)
+    labels = torch.arange(6).repeat(10)
+    scores = torch.randn(60, 6, generator=draw) + 4.0 * torch.nn.functional.one_hot(labels, 6)
+    foreign = without_own(scores, labels)
+    assert foreign.shape == (60, 5) and torch.equal(foreign[0], scores[0, 1:]) and torch.equal(foreign[5], scores[5, :5])
+    known, evidence = learn_known(scores, labels, foreign)
+    assert torch.allclose(evidence, known(foreign))
+    inside = known(scores)
+    assert float((inside[:, None] > evidence[None]).float().mean()) > 0.95  # AUROC
+    plain, _ = learn_known(scores[:, :3], labels % 3, without_own(scores[:, :3], labels % 3))
+    assert plain == Known() and torch.equal(plain(scores), scores.max(dim=1).values)
+    best, mean, second, median = features(torch.tensor([[1.0, 5.0, 3.0]]))[0].tolist()
+    assert (best, mean, second, median) == (5.0, 2.0, 2.0, 2.0)
+
+
+def test_evidence_is_what_rejection_stands_on(lesson):
+    evidence = ActionIndexer(virtual_views=2).fit(lesson).evidence(lesson)
+    threshold = 1.5 + float(np.abs(evidence).max())
+    assert (ActionIndexer(virtual_views=2, reject=threshold, none_label="none").fit(lesson).predict(lesson) == "none").all()
+    assert (ActionIndexer(virtual_views=2, reject=-threshold, none_label="none").fit(lesson).predict(lesson) != "none").all()
