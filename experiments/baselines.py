@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any, Literal, Self
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from indexing import Clip
 from indexing.shape.channels import channel
@@ -16,7 +18,39 @@ from indexing.windows import ragged, whole
 Array = NDArray[Any]
 
 
-class ImageNearest:
+class Nearest(ABC):
+    """A nearest neighbour among windows of joints: a description of windows, and distances between two of them."""
+
+    LENGTH: int  # steps that a clip is resampled to
+
+    @abstractmethod
+    def describe(self, windows: Tensor) -> Any:
+        """What is compared of windows ``(N, length, joints, 2)``."""
+
+    @abstractmethod
+    def between(self, queries: Any, bank: Any) -> Array:
+        """``(Q, E)`` distances between two descriptions."""
+
+    def fit(self, clips: Sequence[Clip], labels: Array) -> Self:
+        """Keep the exemplars."""
+        self.labels = np.asarray(labels)
+        self.bank = self.describe(whole(ragged(clips), self.LENGTH))
+        return self
+
+    def distances(self, clips: Sequence[Clip]) -> Array:
+        """``(clips, exemplars)``."""
+        return self.between(self.describe(whole(ragged(clips), self.LENGTH)), self.bank)
+
+    def predict(self, clips: Sequence[Clip]) -> Array:
+        """The label of the nearest exemplar."""
+        return np.asarray(self.labels[self.distances(clips).argmin(axis=1)])
+
+    def evidence(self, clips: Sequence[Clip]) -> Array:
+        """``(clips,)`` minus the distance to the nearest exemplar."""
+        return np.asarray(-self.distances(clips).min(axis=1))
+
+
+class ImageNearest(Nearest):
     r"""Nearest neighbour of whole images, bound to the view: :math:`\sum_c \log(1 - \cos(X_c, E_c) + \epsilon)`.
 
     The channels c (clip, frame, motion) and the way they are fused are those of the action indexer.
@@ -26,23 +60,18 @@ class ImageNearest:
     EPSILON = 1e-3
     LENGTH = 12
 
-    def fit(self, clips: Sequence[Clip], labels: Array) -> Self:
-        """Keep the exemplars."""
-        self.labels, self.bank = np.asarray(labels), self._unit(clips)
-        return self
-
-    def predict(self, clips: Sequence[Clip]) -> Array:
-        """The label of the nearest exemplar."""
-        pairs = zip(self._unit(clips), self.bank, strict=True)
-        total = sum((1 - query @ exemplar.mT + self.EPSILON).clamp(min=1e-9).log() for query, exemplar in pairs)
-        return np.asarray(self.labels[torch.as_tensor(total).argmin(dim=1).numpy()])
-
-    def _unit(self, clips: Sequence[Clip]) -> list[torch.Tensor]:
-        windows = whole(ragged(clips), self.LENGTH)
+    def describe(self, windows: Tensor) -> list[Tensor]:
+        """Unit vectors ``(N, length * joints * 2)`` of every channel."""
         return [torch.nn.functional.normalize(channel(windows, name).flatten(1), dim=1) for name in self.CHANNELS]
 
+    def between(self, queries: list[Tensor], bank: list[Tensor]) -> Array:
+        """``(Q, E)`` sum of log residuals."""
+        pairs = zip(queries, bank, strict=True)
+        total = sum((1 - query @ exemplar.mT + self.EPSILON).clamp(min=1e-9).log() for query, exemplar in pairs)
+        return torch.as_tensor(total).numpy()
 
-class WarpedNearest:
+
+class WarpedNearest(Nearest):
     """Nearest neighbour by dynamic time warping (aeon, compiled): every joint coordinate is a channel, warped together.
 
     Poses are centred on the clip's mean (``"clip"``: the path of the body counts) or on each frame's (``"frame"``: it does
@@ -57,22 +86,16 @@ class WarpedNearest:
 
         self.distance, self.centre, self.jobs = dtw_pairwise_distance, centre, jobs
 
-    def fit(self, clips: Sequence[Clip], labels: Array) -> Self:
-        """Keep the exemplars."""
-        self.labels, self.bank = np.asarray(labels), self._series(clips)
-        return self
-
-    def predict(self, clips: Sequence[Clip]) -> Array:
-        """The label of the nearest exemplar."""
-        series, threads = self._series(clips), torch.get_num_threads()
-        table = self.distance(series, self.bank, window=self.BAND, n_jobs=self.jobs)
-        torch.set_num_threads(threads)  # numba and torch share one OpenMP: aeon's call changes torch's number of threads
-        return np.asarray(self.labels[table.argmin(axis=1)])
-
-    def _series(self, clips: Sequence[Clip]) -> Array:
-        """``(clips, channels, steps)``."""
-        windows = whole(ragged(clips), self.LENGTH)
+    def describe(self, windows: Tensor) -> Array:
+        """``(N, channels, steps)``."""
         heights = windows[..., 1]
         tall = (heights.amax(dim=2) - heights.amin(dim=2)).median(dim=1).values.clamp(min=1e-9)
         poses = channel(windows, self.centre) / tall[:, None, None, None]
         return np.ascontiguousarray(poses.flatten(2).mT.double().numpy())
+
+    def between(self, queries: Array, bank: Array) -> Array:
+        """``(Q, E)`` warped distances."""
+        threads = torch.get_num_threads()
+        table = self.distance(queries, bank, window=self.BAND, n_jobs=self.jobs)
+        torch.set_num_threads(threads)  # numba and torch share one OpenMP: aeon's call changes torch's number of threads
+        return np.asarray(table)

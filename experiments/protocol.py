@@ -155,6 +155,12 @@ def leave_one_subject_out(subjects: Array) -> Iterator[tuple[Array, Array]]:
         yield np.flatnonzero(subjects != subject), np.flatnonzero(subjects == subject)
 
 
+def merged(subjects: Array, most: int) -> Array:
+    """Subjects as at most ``most`` groups of neighbours, of nearly the same number: fewer folds to leave out."""
+    names, number = np.unique(subjects, return_inverse=True)
+    return np.asarray(number * min(most, len(names)) // len(names))
+
+
 def few(labels: Array, count: int, rng: np.random.Generator) -> Array:
     """Indices of ``count`` examples of every class (all of them where there are fewer), drawn at random."""
     chosen = [rng.permutation(np.flatnonzero(labels == label))[:count] for label in np.unique(labels)]

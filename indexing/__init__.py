@@ -6,9 +6,12 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from indexing.brightness.indexer import BrightnessIndexer as BrightnessIndexer
     from indexing.clip import Clip as Clip
     from indexing.clip import ClipSet as ClipSet
+    from indexing.feature_indexer import FeatureIndexer as FeatureIndexer
     from indexing.indexer import ActionIndexer as ActionIndexer
+    from indexing.phase.indexer import PhaseIndexer as PhaseIndexer
     from indexing.scoring import Event as Event
     from indexing.synchronization import synchronize as synchronize
 
@@ -16,6 +19,9 @@ _HOME = {
     "Clip": "indexing.clip",
     "ClipSet": "indexing.clip",
     "ActionIndexer": "indexing.indexer",
+    "BrightnessIndexer": "indexing.brightness.indexer",
+    "FeatureIndexer": "indexing.feature_indexer",
+    "PhaseIndexer": "indexing.phase.indexer",
     "Event": "indexing.scoring",
     "synchronize": "indexing.synchronization",
 }

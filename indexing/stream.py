@@ -14,7 +14,7 @@ from torch import Tensor
 
 from indexing.clip import Clip
 from indexing.scoring import Event, events, smooth
-from indexing.shape.bank import Windows
+from indexing.shape.bank import Windows, stack
 from indexing.shape.channels import channel
 from indexing.shape.model import MOMENT_SAMPLE, ShapeModel
 from indexing.windows import Ragged, ragged, sample
@@ -73,14 +73,10 @@ def scan(model: ShapeModel, clip: Clip, stream: Stream, progress: Progress = Non
     for begin in range(0, len(at), BLOCK):
         part = slice(begin, begin + BLOCK)
         source = _around(clip, at[part][0], at[part][-1], stream)
-        best: Tensor | None = None
-        for tempo in stream.tempi:
-            query = _windows(source, at[part], stream.window * tempo, stream.length).to(stream.device)
-            one = model.moment_scores(query)
-            best = one if best is None else torch.maximum(best, one)
-        if best is None:
-            raise ValueError("tempi: give at least one speed factor")
-        scores[part] = best.cpu().numpy()
+        # all tempi at once: the exemplars are described once for all of them
+        queries = stack([_windows(source, at[part], stream.window * tempo, stream.length) for tempo in stream.tempi])
+        found = model.moment_scores(queries.to(stream.device)).unflatten(0, (len(stream.tempi), -1))
+        scores[part] = found.amax(dim=0).cpu().numpy()
         motion[part] = _motion(_windows(source, at[part], stream.window, stream.length))
         if progress is not None:
             progress(min(1.0, (begin + BLOCK) / len(at)))
@@ -154,14 +150,14 @@ def find_events(
     if not found:
         return []
     numbers = {label: i for i, label in enumerate(classes)}
-    out = []
-    for event in found:
-        middle = np.array([(event.start + event.end) / 2])
-        query = _windows(_around(clip, middle[0], middle[0], stream), middle, stream.window, stream.length).to(stream.device)
-        mine = model.labels[model.exemplars.owner] == numbers[event.label]
-        nearest = int(torch.where(mine, model.moment_residuals(query)[0], torch.inf).argmin())
-        out.append(dataclasses.replace(event, exemplar=int(model.exemplars.owner[nearest])))
-    return out
+    middles = np.array([(event.start + event.end) / 2 for event in found])
+    blocks = np.split(middles, np.flatnonzero(np.diff(middles // (BLOCK * STEP))) + 1)
+    queries = [_windows(_around(clip, some[0], some[-1], stream), some, stream.window, stream.length) for some in blocks]
+    residual = model.moment_residuals(stack(queries).to(stream.device))
+    owners = model.labels[model.exemplars.owner]
+    mine = torch.tensor([numbers[event.label] for event in found], device=owners.device)[:, None] == owners
+    nearest = model.exemplars.owner[torch.where(mine, residual, torch.inf).argmin(dim=1)].tolist()
+    return [dataclasses.replace(event, exemplar=exemplar) for event, exemplar in zip(found, nearest, strict=True)]
 
 
 def _motion(windows: Windows) -> Array:

@@ -1,20 +1,20 @@
-"""Scenes of shapes seen by uncalibrated cameras, and what the theory says of their tensors: one entry per form of ShapeTensor."""
+"""Scenes of shapes seen by uncalibrated cameras, and what the theory says of their tensors: one entry per form of them."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from dyntorch.invariants.shape_tensor import ShapeTensor
+import dyntorch as dyn
 
 
 @dataclass(frozen=True)
 class ShapeCase:
     """One form and its counts, by the theory."""
 
-    invariant: ShapeTensor
+    invariant: dyn.ShapeTensor | dyn.DynamicShapeTensor
     minimal: int
     """Fewest views."""
     width: int
@@ -22,21 +22,58 @@ class ShapeCase:
     dof: int
     conditions: int
     """What the exact coordinates of one view fulfil."""
+    exact: float = 1e-9
+    """Error of tensors that should be the same: descents stop where the cost does, at the root of its digits."""
 
     @property
     def frame(self) -> str:
-        return self.invariant.frame
+        return "affine" if self.timed else self.invariant.frame
+
+    @property
+    def timed(self) -> bool:
+        """Whether the points move; the times of the views then stand behind the points, ``(*batch, views, 1)``."""
+        return isinstance(self.invariant, dyn.DynamicShapeTensor)
 
     @property
     def n(self) -> int:
-        return self.invariant.n
+        return self.invariant.points
+
+    @property
+    def many(self) -> int:
+        """More views than needed."""
+        return max(8, 2 * self.minimal)
+
+    def arguments(self, views: tuple[Tensor, ...]) -> tuple[tuple[Tensor, ...], dict[str, Tensor]]:
+        """Positional and named ones."""
+        return (views[:-1], {"times": views[-1][..., 0]}) if self.timed else (views, {})
+
+    def fit(self, views: tuple[Tensor, ...], **options: Tensor) -> dyn.Solution:
+        """By an invariant that does not know the number of points."""
+        points, given = self.arguments(views)
+        return dyn.fit(replace(self.invariant, points=5 if self.timed else None), *points, **given, **options)
+
+    def refine(self, solution: dyn.Solution, views: tuple[Tensor, ...]) -> dyn.Solution:
+        points, given = self.arguments(views)
+        return dyn.refine(solution, *points, **given)
+
+    def sampson(self, tensor: Tensor, views: tuple[Tensor, ...]) -> Tensor:
+        points, given = self.arguments(views)
+        return dyn.sampson(self.invariant, tensor, *points, **given)
+
+    def rows(self, views: tuple[Tensor, ...]) -> Tensor:
+        """Of the estimation matrix, view by view."""
+        points, given = self.arguments(views)
+        invariant, measured = self.invariant.prepared(points, **given)
+        return invariant.primitives[0].vectors(measured[0])
 
     def scene(
         self, views: int, *, batch: tuple[int, ...] = (), seed: int = 0, sigma: float = 0.0
     ) -> tuple[tuple[Tensor, ...], Tensor]:
-        """Images ``(*batch, views, 2)`` of every point, in pixels, and the points of space ``(*batch, n, 3)``."""
+        """Images ``(*batch, views, 2)`` of every point, in pixels (and times), and the points of space ``(*batch, n, 3)``."""
         g = torch.Generator().manual_seed(seed)
         shape = spread(self.n, batch, g)
+        if self.timed:
+            return self._moving(shape, views, sigma, g)
         if self.frame == "plane":
             corners = shape[..., :3, :]
             shape[..., 3, :] = corners[..., 0, :] + corners[..., 1, :] - corners[..., 2, :]
@@ -47,10 +84,24 @@ class ShapeCase:
         x = x + sigma * torch.randn(x.shape, generator=g, dtype=torch.float64)
         return x.unbind(-2), shape
 
+    def _moving(self, shape: Tensor, views: int, sigma: float, g: torch.Generator) -> tuple[tuple[Tensor, ...], Tensor]:
+        """The same of points in motion, at times that reach from -1 to 1 however few the views are; shapes ``(*batch, n, 3 B)``."""
+        *batch, n, _ = shape.shape
+        trajectory = self.invariant.trajectory
+        ways = 0.6 * torch.randn(*batch, trajectory.size - 1, n, 3, generator=g, dtype=torch.float64)
+        shapes = torch.cat([shape[..., None, :, :], ways], dim=-3)
+        inner = 2 * torch.rand(*batch, max(0, views - 2), generator=g, dtype=torch.float64) - 1
+        ends = torch.tensor([-1.0, 1.0], dtype=torch.float64).expand(*batch, 2)
+        times = torch.cat([inner, ends], dim=-1)[..., -views:]
+        turn = torch.linalg.qr(torch.randn(*batch, views, 3, 3, generator=g, dtype=torch.float64)).Q
+        x = 300 + 800 * torch.einsum("...vb,...bnk,...vkd->...vnd", trajectory.rows(times), shapes, turn[..., :2])
+        x = x + sigma * torch.randn(x.shape, generator=g, dtype=torch.float64)
+        return (*x.unbind(-2), times[..., None]), shapes.movedim(-3, -2).flatten(-2)
+
     def changed(self, points: tuple[Tensor, ...], *, similar: bool = False, seed: int = 5) -> tuple[Tensor, ...]:
         """The same after a change of coordinates of every view, its own: a similarity, or what the cameras leave open."""
         g = torch.Generator().manual_seed(seed)
-        x = torch.stack(points, dim=-2)
+        x = torch.stack(points[: self.n], dim=-2)
         frame = torch.eye(3, dtype=torch.float64) + 0.25 * torch.randn(*x.shape[:-2], 3, 3, generator=g, dtype=torch.float64)
         frame[..., 2, :] = torch.tensor([0.0, 0.0, 1.0])
         if similar:
@@ -60,7 +111,7 @@ class ShapeCase:
         elif self.frame != "affine":
             frame[..., 2, :2] = 1e-4 * torch.randn(*x.shape[:-2], 2, generator=g, dtype=torch.float64)
         moved = torch.nn.functional.pad(x, (0, 1), value=1.0) @ frame.mT
-        return (moved[..., :2] / moved[..., 2:]).unbind(-2)
+        return (*(moved[..., :2] / moved[..., 2:]).unbind(-2), *points[self.n :])
 
     def apart(self, first: Tensor, second: Tensor) -> float:
         """How far two tensors are apart, up to sign or basis."""
@@ -74,7 +125,8 @@ class ShapeCase:
         return torch.Size(self.invariant.shape()).numel()
 
     def __repr__(self) -> str:
-        return f"{self.frame}{self.n}"
+        form = f"{self.invariant.form}-{type(self.invariant.trajectory).__name__}-" if self.timed else self.frame
+        return f"{form}{self.n}"
 
 
 def spread(n: int, batch: tuple[int, ...], generator: torch.Generator) -> Tensor:
@@ -85,13 +137,17 @@ def spread(n: int, batch: tuple[int, ...], generator: torch.Generator) -> Tensor
 
 
 SHAPE_CASES = [
-    ShapeCase(ShapeTensor("general", 6), 4, 5, 3, 1),
-    ShapeCase(ShapeTensor("general", 7), 3, 11, 6, 3),
-    ShapeCase(ShapeTensor("general", 8), 2, 23, 9, 5),
-    ShapeCase(ShapeTensor("plane", 6), 2, 3, 2, 1),
-    ShapeCase(ShapeTensor("plane", 7), 2, 6, 5, 3),
-    ShapeCase(ShapeTensor("plane", 8), 2, 9, 8, 5),
-    ShapeCase(ShapeTensor("plane", 11), 2, 18, 17, 11),
-    ShapeCase(ShapeTensor("affine", 5), 2, 4, 3, 2),
-    ShapeCase(ShapeTensor("affine", 9), 2, 8, 15, 10),
+    ShapeCase(dyn.ShapeTensor("general", 6), 4, 5, 3, 1),
+    ShapeCase(dyn.ShapeTensor("general", 7), 3, 11, 6, 3),
+    ShapeCase(dyn.ShapeTensor("general", 8), 2, 23, 9, 5),
+    ShapeCase(dyn.ShapeTensor("plane", 6), 2, 3, 2, 1),
+    ShapeCase(dyn.ShapeTensor("plane", 7), 2, 6, 5, 3),
+    ShapeCase(dyn.ShapeTensor("plane", 8), 2, 9, 8, 5),
+    ShapeCase(dyn.ShapeTensor("plane", 11), 2, 18, 17, 11),
+    ShapeCase(dyn.ShapeTensor("affine", 5), 2, 4, 3, 2),
+    ShapeCase(dyn.ShapeTensor("affine", 9), 2, 8, 15, 10),
+    ShapeCase(dyn.DynamicShapeTensor(form="basis", points=7), 7, 40, 27, 6),
+    ShapeCase(dyn.DynamicShapeTensor(form="span", points=9), 3, 8, 12, 4),
+    ShapeCase(dyn.DynamicShapeTensor(points=8), 7, 52, 33, 8, exact=1e-5),
+    ShapeCase(dyn.DynamicShapeTensor(dyn.Fourier(1), points=7), 12, 70, 45, 6, exact=1e-5),
 ]

@@ -81,7 +81,7 @@ def fit_shapes(
 
     Example:
         >>> import torch
-        >>> from dyntorch.algebra.dynamic_shape_basis import Polynomial
+        >>> from dyntorch import Polynomial
         >>> g = torch.Generator().manual_seed(0)
         >>> rows = Polynomial(1).rows(torch.linspace(-1, 1, 12).double())
         >>> points, cameras = torch.randn(2, 8, 3, generator=g).double(), torch.randn(12, 3, 2, generator=g).double()

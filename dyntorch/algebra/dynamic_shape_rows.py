@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.algebra.dynamic_shape_basis import Trajectory
-from dyntorch.algebra.dynamic_shape_descent import centred_views
+from dyntorch.algebra.dynamic_shape_descent import centred_views, framed
 from dyntorch.algebra.dynamic_shape_linear import shapes_through
 from dyntorch.algebra.shape_rows import centred
 from dyntorch.constants import constant
@@ -54,6 +54,14 @@ def span_rows(measured: Tensor) -> Tensor:
     n = measured.shape[-2]
     whole = (measured[..., 2] > 0).all(-1)[..., None, None]
     return torch.where(whole, centred_views(measured[..., :2]).x.mT @ centred(n, measured.device).mT, 0.0)
+
+
+def span_residual(measured: Tensor, basis: Tensor) -> Tensor:
+    """Part of the energy of each view ``(*batch, views, n, 3)`` in the directions ``basis (*batch, k, n - 1)``; 1 for no view."""
+    rows = span_rows(measured)
+    energy = rows.square().sum((-2, -1))
+    left = (rows @ basis.mT[..., None, :, :]).square().sum((-2, -1))
+    return torch.where(energy > 0, left / torch.where(energy > 0, energy, 1.0), 1.0)
 
 
 def annihilator(unknowns: Tensor, n: int, base: Base) -> Tensor:
@@ -119,6 +127,21 @@ def shapes_of_graph(unknowns: Tensor, n: int, trajectory: Trajectory, base: Base
     problems = len(points)
     found = shapes_through(helmert @ points, rows.expand(problems, *rows.shape), points.new_ones(problems, len(rows)))
     return (helmert.mT @ found).reshape(*unknowns.shape[:-1], trajectory.size, n, 3)
+
+
+def beside(shapes: Tensor) -> Tensor:
+    """``(*batch, B, n, 3)`` to ``(*batch, n, 3 B)``."""
+    return shapes.transpose(-3, -2).flatten(-2)
+
+
+def apart(shapes: Tensor) -> Tensor:
+    """``(*batch, n, 3 B)`` to ``(*batch, B, n, 3)``."""
+    return shapes.unflatten(-1, (shapes.shape[-1] // 3, 3)).transpose(-3, -2)
+
+
+def framed_beside(shapes: Tensor) -> Tensor:
+    """Shapes ``(*batch, B, n, 3)`` in their canonical frame, side by side."""
+    return beside(framed(shapes.reshape(-1, *shapes.shape[-3:])).reshape(shapes.shape))
 
 
 @constant

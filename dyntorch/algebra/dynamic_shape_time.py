@@ -80,7 +80,7 @@ def recover_times(
 
     Example:
         >>> import torch
-        >>> from dyntorch.algebra.dynamic_shape_basis import Polynomial
+        >>> from dyntorch import Polynomial
         >>> g = torch.Generator().manual_seed(0)
         >>> points, camera = torch.randn(2, 8, 3, generator=g).double(), torch.randn(3, 2, generator=g).double()
         >>> found = recover_times(points, Polynomial(1), ((points[0] + 0.3 * points[1]) @ camera)[None])

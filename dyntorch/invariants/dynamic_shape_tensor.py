@@ -4,23 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Literal
 
 import torch
 from torch import Tensor
 
+from dyntorch.algebra import dynamic_shape_rows as moving
 from dyntorch.algebra.dynamic_shape import AMBIGUOUS, fit_shapes
 from dyntorch.algebra.dynamic_shape_basis import Polynomial, Trajectory, extremes, times_of_views
-from dyntorch.algebra.dynamic_shape_descent import Projected, framed, project, shapes_at, slopes
-from dyntorch.algebra.dynamic_shape_rows import (
-    Base,
-    annihilator,
-    graph_of,
-    graph_rows,
-    shapes_of_graph,
-    span_rows,
-    unknowns_of,
-)
+from dyntorch.algebra.dynamic_shape_descent import Projected, project, shapes_at, slopes
+from dyntorch.algebra.dynamic_shape_rows import Base
 from dyntorch.algebra.dynamic_shape_time import Recovery, recover_times
 from dyntorch.algebra.shape_rows import centred
 from dyntorch.invariant import Estimate, Frame, Invariant, on_class
@@ -68,7 +62,7 @@ class DynamicShapeTensor(Invariant):
         >>> t = torch.linspace(0, 3, 20).double()
         >>> start, velocity = torch.randn(2, 8, 3, generator=g).double()
         >>> x = (start + t[:, None, None] * velocity) @ torch.randn(20, 3, 2, generator=g).double()
-        >>> solution = dyn.fit(DynamicShapeTensor, *x[:15].unbind(1), times=t[:15])
+        >>> solution = dyn.fit(dyn.DynamicShapeTensor, *x[:15].unbind(1), times=t[:15])
         >>> solution
         Solution(DynamicShapeTensor(Polynomial(degree=1)), matches=15, batch=(): 1 OK)
         >>> found = solution.invariant.recover(solution.tensor, *x[15:].unbind(1), reach=2.0)
@@ -136,9 +130,9 @@ class DynamicShapeTensor(Invariant):
         """One slot: a whole view and its time."""
         n, trajectory, base = self.points, self.trajectory, self.base
         if self.form == "span":
-            return (Equations((n, 4), n - 1, span_rows, rows=2),)
+            return (Equations((n, 4), n - 1, moving.span_rows, rows=2),)
         width = trajectory.power(3).size * (1 + 3 * (n - 4))
-        return (Equations((n, 4), width, lambda x: graph_rows(x, trajectory, base), rows=2 * (n - 4)),)
+        return (Equations((n, 4), width, partial(moving.graph_rows, trajectory=trajectory, base=base), rows=2 * (n - 4)),)
 
     @property
     def nullity(self) -> int:  # type: ignore[override]
@@ -168,17 +162,17 @@ class DynamicShapeTensor(Invariant):
             rows = basis @ centred(self.points, basis.device)
             return rows[..., 0, :] if self.nullity == 1 else rows
         if self.form == "basis":
-            return annihilator(basis[..., 0, :], self.points, self.base)
-        return _framed(shapes_of_graph(basis[..., 0, :], self.points, self.trajectory, self.base))
+            return moving.annihilator(basis[..., 0, :], self.points, self.base)
+        return moving.framed_beside(moving.shapes_of_graph(basis[..., 0, :], self.points, self.trajectory, self.base))
 
     def basis_of(self, tensor: Tensor) -> Tensor:
         """The inverse of :meth:`tensor_of`."""
         if self.form == "span":
             return (tensor if self.nullity > 1 else tensor[..., None, :]) @ centred(self.points, tensor.device).mT
         if self.form == "joint":
-            unknowns = graph_of(_apart(tensor), self.trajectory, self.base)
+            unknowns = moving.graph_of(moving.apart(tensor), self.trajectory, self.base)
             return (unknowns / unknowns.norm(dim=-1, keepdim=True).clamp(min=1e-300))[..., None, :]
-        return unknowns_of(tensor, self.base)[..., None, :]
+        return moving.unknowns_of(tensor, self.base)[..., None, :]
 
     def estimated(self, views: tuple[Tensor, ...], weights: Tensor) -> Estimate | None:
         """The form ``joint`` by least squares over all points; the others are the null space of the rows."""
@@ -189,43 +183,53 @@ class DynamicShapeTensor(Invariant):
             rows = self.trajectory.rows(measured[..., 0, 3])
             found = fit_shapes(measured[..., :2], rows, measured[..., 2], share=weights)
         ambiguous = found.uncertainty > AMBIGUOUS
-        return Estimate(_beside(found.shapes), found.few, found.degenerate, ambiguous, found.uncertainty)
+        return Estimate(moving.beside(found.shapes), found.few, found.degenerate, ambiguous, found.uncertainty)
 
+    @on_class
     def compose(self, shapes: Tensor) -> Tensor:
-        r"""The tensor of known trajectories.
+        r"""The tensor of known trajectories, of norm 1 (several rows of a span: orthonormal).
 
         Args:
             shapes: ``(*batch, n, 3 B)`` the shapes :math:`[P_0, P_1, \dots]` of the functions of the trajectory, at times in
                 [-1, 1] for polynomials.
         """
-        apart = _apart(shapes)
-        if self.form == "span":
-            rows = (shapes - shapes.mean(-2, keepdim=True)).mT @ centred(shapes.shape[-2], shapes.device).mT
-            basis = null_space(rows, shapes.shape[-2] - 1 - shapes.shape[-1])
-            return replace(self, points=shapes.shape[-2]).tensor_of(basis)
-        if self.form == "joint":
-            return _framed(apart)
-        unknowns = graph_of(apart, self.trajectory, self.base)
-        return annihilator(unknowns / unknowns.norm(dim=-1, keepdim=True), shapes.shape[-2], self.base)
+        return replace(self, points=shapes.shape[-2])._composed(shapes.double()).to(shapes.dtype)
 
+    def _composed(self, shapes: Tensor) -> Tensor:
+        n = self.points
+        if self.form == "span":
+            rows = (shapes - shapes.mean(-2, keepdim=True)).mT @ centred(n, shapes.device).mT
+            return self.tensor_of(null_space(rows, n - 1 - shapes.shape[-1]))
+        if self.form == "joint":
+            return moving.framed_beside(moving.apart(shapes)) * 3**-0.5  # of three orthonormal columns
+        tensor = moving.annihilator(moving.graph_of(moving.apart(shapes), self.trajectory, self.base), n, self.base)
+        size = tensor.flatten(-3).norm(dim=-1)[..., None, None, None]
+        return tensor / torch.where(size > 0, size, 1.0)
+
+    @on_class
     def decompose(self, tensor: Tensor) -> Tensor:
         """The shapes ``(*batch, n, 3 B)`` of the trajectories up to a constant affine frame; for the span some basis of it."""
-        if self.form == "span":
-            rows = tensor if self.nullity > 1 else tensor[..., None, :]
-            return null_space(torch.cat([rows, torch.ones_like(rows[..., :1, :])], dim=-2), 3 * self.trajectory.size).mT
-        return tensor if self.form == "joint" else _framed(self.shapes(tensor))
+        if self.form == "joint":
+            return tensor
+        whole = tensor.double()
+        if self.form == "basis":
+            return moving.framed_beside(self.shapes(whole)).to(tensor.dtype)
+        rows = whole if self.nullity > 1 else whole[..., None, :]
+        rows = torch.cat([rows, torch.ones_like(rows[..., :1, :])], dim=-2)
+        return null_space(rows, 3 * self.trajectory.size).mT.to(tensor.dtype)
 
     def shapes(self, tensor: Tensor) -> Tensor:
         """The shape of every function of the trajectory, ``(*batch, B, n, 3)``."""
         if self.form == "span":
             raise ValueError("form='span' knows the positions of all times together, no shape of any; use 'joint' or 'basis'")
         if self.form == "joint":
-            return _apart(tensor)
-        return shapes_of_graph(unknowns_of(tensor, self.base), tensor.shape[-2], self.trajectory, self.base)
+            return moving.apart(tensor)
+        return moving.shapes_of_graph(moving.unknowns_of(tensor, self.base), tensor.shape[-2], self.trajectory, self.base)
 
     def whitened(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor | None:
         """The distance of each view from the images of its shape, point by point: ``(*batch, views, 2 n)``."""
-        return self._projected(motion[0], views[0])[0].residual.flatten(-2) / scales[0][..., None, None]
+        residual = self._projected(motion[0].double(), views[0].double())[0].residual.flatten(-2)
+        return (residual / scales[0][..., None, None]).to(views[0].dtype)
 
     def linearized(
         self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]
@@ -243,7 +247,7 @@ class DynamicShapeTensor(Invariant):
         x, seen = measured[..., :2], measured[..., 2]
         centre = (x * seen[..., None]).sum(-2, keepdim=True) / seen.sum(-1)[..., None, None].clamp(min=1.0)
         rows = self.trajectory.rows(measured[..., 0, 3])
-        shape = shapes[..., None, :, :] if self.form == "span" else shapes_at(_apart(shapes), rows)
+        shape = shapes[..., None, :, :] if self.form == "span" else shapes_at(moving.apart(shapes), rows)
         return project((x - centre) * seen[..., None], seen, shape), rows
 
     @on_class
@@ -281,27 +285,9 @@ class DynamicShapeTensor(Invariant):
         """Part of the energy of each view that the tensor leaves unexplained at the best time, ``(*batch, views)`` in [0, 1]."""
         if self.form != "span":
             return self.recover(tensor, *points, weights=weights).residual
-        rows = span_rows(torch.nn.functional.pad(constellations(self, points).double(), (0, 1)))
         basis = replace(self, points=len(points)).basis_of(tensor.double())
-        energy = rows.square().sum((-2, -1))
-        left = (rows @ basis.mT[..., None, :, :]).square().sum((-2, -1))
-        return torch.where(energy > 0, left / torch.where(energy > 0, energy, 1.0), 1.0).to(tensor.dtype)
+        return moving.span_residual(constellations(self, points).double(), basis).to(tensor.dtype)
 
     def __repr__(self) -> str:
         form = "" if self.form == "joint" else f", form={self.form!r}"
         return f"DynamicShapeTensor({self.trajectory!r}{form})"
-
-
-def _framed(shapes: Tensor) -> Tensor:
-    """Shapes ``(*batch, B, n, 3)`` in their canonical frame, side by side."""
-    return _beside(framed(shapes.reshape(-1, *shapes.shape[-3:])).reshape(shapes.shape))
-
-
-def _beside(shapes: Tensor) -> Tensor:
-    """``(*batch, B, n, 3)`` to ``(*batch, n, 3 B)``."""
-    return shapes.transpose(-3, -2).flatten(-2)
-
-
-def _apart(shapes: Tensor) -> Tensor:
-    """``(*batch, n, 3 B)`` to ``(*batch, B, n, 3)``."""
-    return shapes.unflatten(-1, (shapes.shape[-1] // 3, 3)).transpose(-3, -2)

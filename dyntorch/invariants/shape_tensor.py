@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -11,7 +11,7 @@ from torch import Tensor
 from dyntorch.algebra import shape_completion, shape_points, shape_rows
 from dyntorch.algebra.shape_points import AFFINE, GENERAL, PLANE
 from dyntorch.forward import jacobian
-from dyntorch.invariant import Frame, Invariant
+from dyntorch.invariant import Frame, Invariant, on_class
 from dyntorch.invariants import shape_residual
 from dyntorch.matches import constellations
 from dyntorch.nullspace import null_space
@@ -20,11 +20,7 @@ from dyntorch.primitives import Equations
 LEAST = {GENERAL: 6, PLANE: 6, AFFINE: 5}
 LARGEST = max(shape_rows.PROFILES)
 """Points of the largest multilinear form: of more, four lines and four points already fulfil all conditions."""
-ROWS: dict[str, Callable[[Tensor], Tensor]] = {
-    GENERAL: shape_rows.general_rows,
-    PLANE: shape_rows.plane_rows,
-    AFFINE: shape_rows.affine_rows,
-}
+ROWS = dict(zip(LEAST, (shape_rows.general_rows, shape_rows.plane_rows, shape_rows.affine_rows), strict=True))
 
 
 @dataclass(frozen=True, repr=False)
@@ -60,15 +56,14 @@ class ShapeTensor(Invariant):
 
     Example:
         >>> import torch, dyntorch as dyn
-        >>> from dyntorch.invariants.shape_tensor import ShapeTensor
         >>> draw = torch.Generator().manual_seed(0)
         >>> P = torch.randn(7, 4, generator=draw, dtype=torch.float64)
         >>> seen = P @ torch.randn(5, 4, 3, generator=draw, dtype=torch.float64)
         >>> points = (seen[..., :2] / seen[..., 2:]).unbind(-2)
-        >>> solution = dyn.fit(ShapeTensor, *(p[:3] for p in points)).check()
+        >>> solution = dyn.fit(dyn.ShapeTensor, *(p[:3] for p in points)).check()
         >>> solution
         Solution(ShapeTensor('general', 7), matches=3, batch=(): 1 OK)
-        >>> bool(dyn.sampson(ShapeTensor, solution.tensor, *(p[3:] for p in points)).max() < 1e-6)
+        >>> bool(dyn.sampson(dyn.ShapeTensor, solution.tensor, *(p[3:] for p in points)).max() < 1e-6)
         True
     """
 
@@ -189,6 +184,7 @@ class ShapeTensor(Invariant):
             basis = (self._beside(flat).mT @ shape_rows.centred(self.n - 4, device).mT).mT.flatten(-2)
         return basis.unsqueeze(-2) if self.nullity == 1 else basis
 
+    @on_class
     def compose(self, points: Tensor) -> Tensor:
         """The tensor of known points of space.
 
@@ -228,6 +224,7 @@ class ShapeTensor(Invariant):
         v = others[..., :3] / others[..., 3:]
         return v - v.mean(-2, keepdim=True)
 
+    @on_class
     def decompose(self, tensor: Tensor) -> Tensor:
         """The points behind a tensor, homogeneous ``(*batch, n, 4)``, in the frame that it leaves open; zero for a zero tensor.
 

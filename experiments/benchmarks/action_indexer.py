@@ -28,6 +28,7 @@ from experiments.tables import Row, command, markdown, note
 from indexing.files import manifest, prepare, write_json
 
 PLAIN, SEARCH, WARPING, PART, SCAN = "plain", "search", "warping", "scan 20 minutes", "scan 1 hour"
+MANY, FIT, LEARNED = "scan 1 hour, 1000 exemplars", "fit 1000 clips", "fit 1000 clips, learned"
 TASK = f"{EXEMPLARS} exemplars x {QUERIES} queries"
 STARTS = {
     "import torch": [sys.executable, "-c", "import torch"],
@@ -110,6 +111,9 @@ def table(found: dict[str, list[dict[str, Any]]], starts: dict[str, float]) -> l
     rows.append(Row("scan 1 hour at 30 fps", "score_frames", seconds(SCAN), unit=" s"))
     rows.append(Row("scan 1 hour at 30 fps", "peak memory", most(SCAN), 1000.0, at_most=True, unit=" MB"))
     rows.append(Row("scan 20 minutes", "peak memory", most(PART), unit=" MB"))
+    for name, what in ((MANY, "score_frames"), (FIT, "default"), (LEARNED, 'weights="learned"')):
+        rows.append(Row(name, what, seconds(name), 60.0, at_most=True, unit=" s"))
+        rows.append(Row(name, f"{what}: peak memory", most(name), unit=" MB"))
     if {"import torch", "import dyntorch"} <= starts.keys():
         rows.append(Row("start", "import torch", starts["import torch"], unit=" s"))
         limit = starts["import torch"] + 0.3
@@ -136,7 +140,7 @@ def run(config: Config) -> None:
         raise ValueError(f"rounds and starts must be at least 1, got {config.rounds} and {config.starts}")
     target = config.out.expanduser()
     prepare(target.parent)
-    names = [PLAIN, SEARCH, *([WARPING] if has_aeon() else []), PART, SCAN]
+    names = [PLAIN, SEARCH, *([WARPING] if has_aeon() else []), PART, SCAN, MANY, FIT, LEARNED]
     found, starts = measure(names, config.rounds, config.threads), start_ups(config.starts)
     rows = table(found, starts)
     print(markdown(rows, "Speed and memory of the action indexer"), flush=True)

@@ -23,7 +23,7 @@ from indexing import ActionIndexer
 
 Array = NDArray[Any]
 EXEMPLARS, QUERIES, FRAMES, CLASSES = 1000, 500, 16, 10
-HOUR = 108_000  # frames at 30 per second
+CLIP, HOUR = 48, 108_000  # frames at 30 per second
 REPEATS = 3
 # Kinect's 20 joints: hip, spine, neck, head; left and right arm; left and right leg (metres, facing the camera)
 _RIGHT_LIMBS = [(0.18, 0.48), (0.24, 0.25), (0.27, 0.02), (0.28, -0.06), (0.10, -0.05), (0.11, -0.42), (0.12, -0.78), (0.13, -0.84)]
@@ -93,6 +93,24 @@ def scanning(frames: int) -> dict[str, Any]:
     return {"seconds": seconds, "megabytes": peak() - before}
 
 
+def crowded() -> dict[str, Any]:
+    """Score every frame of an hour of 20 joints against 1000 exemplars of 1.6 seconds."""
+    rng, before = np.random.default_rng(1), resident()
+    indexer = ActionIndexer().fit(list(movements(np.arange(EXEMPLARS) % CLASSES, CLIP, rng)), np.arange(EXEMPLARS) % CLASSES)
+    acts = movements(rng.integers(0, CLASSES, 100), CLIP, rng)
+    recording = np.resize(acts.reshape(-1, *BODY.shape), (HOUR, *BODY.shape))
+    forget_peak()
+    return {"seconds": timed(lambda: indexer.score_frames(recording), 1, warm=False), "megabytes": peak() - before}
+
+
+def learning(**options: Any) -> dict[str, Any]:
+    """Learn from 1000 clips of 1.6 seconds."""
+    labels, before = np.arange(EXEMPLARS) % CLASSES, resident()
+    clips = list(movements(labels, CLIP, np.random.default_rng(1)))
+    seconds = timed(lambda: ActionIndexer(**options).fit(clips, labels), 1, warm=False)
+    return {"seconds": seconds, "megabytes": peak() - before}
+
+
 def timed(run: Callable[[], Any], repeats: int, warm: bool = True) -> list[float]:
     """Seconds of every repeat, after one that does not count."""
     if warm:
@@ -138,6 +156,9 @@ WORKLOADS: dict[str, Callable[[], dict[str, Any]]] = {
     "warping": warping,
     "scan 20 minutes": lambda: scanning(HOUR // 3),
     "scan 1 hour": lambda: scanning(HOUR),
+    "scan 1 hour, 1000 exemplars": crowded,
+    "fit 1000 clips": learning,
+    "fit 1000 clips, learned": lambda: learning(weights="learned"),
 }
 
 if __name__ == "__main__":

@@ -49,6 +49,10 @@ class Matches:
     """of shape_tensor"""
     synthetic: tyro.conf.FlagCreatePairsOff[bool] = False
     """of shape_tensor: use the constraints that hold without any image"""
+    points: Number = None
+    """of shape_tensor: 6, 7 or 8 (without it 8) in each image"""
+    general: tyro.conf.FlagCreatePairsOff[bool] = False
+    """of shape_tensor: points in general position, in place of four in a plane"""
 
     def given(self) -> dict[str, Any]:
         """The options that were given."""

@@ -13,7 +13,7 @@ from torch import Tensor
 from indexing.shape.bank import Windows
 from indexing.shape.model import ShapeModel
 
-HALVES = 4  # random halves per joint: the ten actions of UTKinect then keep their first joint from seed to seed
+HALVES = 4  # random halves per joint: importances from two seeds then correlate by .83-.98 on UTKinect (clapping: .60)
 HALVES_AT_MOST = 200
 QUERIES = 120
 RIDGE = 1.0  # of the regression on 0/1 masks, in masks: matters only where there are more joints than halves

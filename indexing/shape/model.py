@@ -130,12 +130,15 @@ class ShapeModel:
 
 
 def class_scores(residuals: Tensor, labels: Tensor, classes: int) -> Tensor:
-    """``(Q, classes)`` minus the mean of the smallest residuals in each class; -inf where a class has no exemplar."""
+    """``(Q, classes)`` minus the mean of the smallest residuals in each class; -inf where a class has no (finite) exemplar."""
     out = residuals.new_full((len(residuals), classes), float("-inf"))
     for c in range(classes):
         mine = residuals[:, labels == c]
         if mine.shape[1]:
-            out[:, c] = -mine.topk(min(NEIGHBOURS, mine.shape[1]), dim=1, largest=False).values.mean(dim=1)
+            least = mine.topk(min(NEIGHBOURS, mine.shape[1]), dim=1, largest=False).values
+            there = least.isfinite()
+            mean = torch.where(there, least, 0.0).sum(dim=1) / there.sum(dim=1).clamp(min=1)
+            out[:, c] = torch.where(there.any(dim=1), -mean, out[:, c])
     return out
 
 

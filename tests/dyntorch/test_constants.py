@@ -9,6 +9,8 @@ import torch
 from dyntorch import eigenspace, lags, matrix
 from dyntorch.algebra import (
     covariances,
+    dynamic_shape_rows,
+    dynamic_shape_theory,
     epipolar,
     epipolar_descent,
     epipolar_variance,
@@ -19,8 +21,13 @@ from dyntorch.algebra import (
     grassmann_nearest,
     grassmann_recovery,
     infinity_extensors,
+    shape_completion,
+    shape_points,
+    shape_rows,
 )
+from dyntorch.algebra.dynamic_shape_basis import Polynomial
 from dyntorch.constants import constant
+from dyntorch.invariants import shape_residual
 from dyntorch.primitives import base, monomials, plane
 from dyntorch.tasks import planes_problem, planes_starts
 
@@ -55,6 +62,17 @@ TABLES = [
     (monomials.multiplicity, (2, 2, CPU)),
     (planes_problem._own, (3, 1, CPU)),
     (planes_starts._frames, (CPU,)),
+    (shape_completion._choices, (8, CPU)),
+    (shape_points._basis, ("plane", CPU)),
+    (shape_points.plane_inverse, (6, CPU)),
+    (shape_rows.centred, (5, CPU)),
+    (shape_rows.free, (6, CPU)),
+    (shape_rows.plane_map, (6, CPU)),
+    (shape_residual._maps, ("affine", CPU)),
+    (dynamic_shape_rows.arranged, (6, (0, 1, 2, 3), CPU)),
+    (dynamic_shape_rows._nodes, (Polynomial(1), CPU)),
+    (dynamic_shape_rows._samples, (Polynomial(1), CPU)),
+    (dynamic_shape_theory._to_powers, (3, CPU)),
 ]
 """All of them: the last test says so."""
 

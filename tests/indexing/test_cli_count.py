@@ -81,6 +81,20 @@ def test_motion_models_and_grassmann_tensors(run, words, expected):
     assert (code, err) == (0, "") and expected in out
 
 
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("--general --synthetic", "rank 80 of 81, nullity 1, from 2 matches\nenough"),
+        ("--points 7 --general --synthetic", "rank 26 of 27, nullity 1, from 3 matches\nenough"),
+        ("--points 6 --general --synthetic", "rank 8 of 9, nullity 1, from 4 matches\nenough"),
+        ("--points 6 --synthetic", "rank 8 of 9, nullity 1, from 2 matches\nenough"),
+    ],
+)
+def test_shape_tensors(run, words, expected):
+    code, out, err = run("shape-tensor", *words.split())
+    assert (code, err) == (0, "") and expected in out
+
+
 def test_dimension(run):
     assert run("--dim-v", "3", "3", "2") == (0, "dim V(3, 3, 2) = 26\n", "")
     assert json.loads(run("--dim-v", "3", "4", "2", "--json")[1]) == {"n": 3, "m": 4, "k": 2, "dim_v": 72}
@@ -130,6 +144,9 @@ def test_json_has_the_profile(run):
         ("--k 2 --views 2 2 --measure join join join", "measure must be join or hyper"),
         ("--k 9 --views 9 9 9 9", "10,000 unknowns are too many"),
         ("--dim-v 3 3", "--dim-v"),
+        ("shape_tensor --points 5", "points must be 6, 7 or 8, got 5"),
+        ("homography --general", "homography has no option general"),
+        ("--points 7", "--points needs a configuration before it"),
         ("--dim-v 0 3 1", "n must be an integer of at least 1, got 0"),
         ("homography --seed -1", "seed must be"),
     ],

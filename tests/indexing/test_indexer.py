@@ -174,29 +174,7 @@ def test_position_and_size_in_the_image_do_not_matter(indexer, others):
     np.testing.assert_allclose(indexer.decision_function(moved), indexer.decision_function(others[:20]), atol=0.05)
 
 
-def test_repair_helps_where_joints_jump(few):
-    train, test = few
-    rng = np.random.default_rng(0)
-    jumpy = [c.replace(joints=c.joints + 400 * (rng.random(c.joints.shape[:2]) < 0.04)[..., None]) for c in test]
-    assert ActionIndexer(repair=True).fit(train).score(jumpy, test.labels) >= 0.9
-
-
 # ---- forms of input ----------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize(
-    "labels",
-    [np.array([7, 3, -2, 10]), np.array(["s", "w", "kk", "bow"]), [1.5, 2.5, 0.5, 9.0], np.array(FEW, dtype=object), [3, 1, 2, 0]],
-    ids=["int", "str", "float", "object", "list"],
-)
-def test_labels_keep_their_type(few, labels):
-    train, _ = few
-    indexer = ActionIndexer().fit(train[:4], labels)
-    assert indexer.classes_.dtype == np.asarray(labels).dtype
-    assert indexer.classes_.tolist() == sorted(np.asarray(labels).tolist())
-    answer = indexer.predict(train[:4])
-    assert answer.dtype == np.asarray(labels).dtype
-    assert answer.tolist() == np.asarray(labels).tolist()
-
-
 def test_arrays_and_clips_give_the_same(few):
     train, test = few
     bare = [Clip(clip.joints, fps=30.0, up="-y") for clip in (*train, *test)]
@@ -215,27 +193,3 @@ def test_fps_is_that_of_arrays(few):
     clips = ActionIndexer().fit([Clip(x, fps=10.0) for x in arrays], FEW)
     assert len(slow.model_.exemplars.moments) == len(clips.model_.exemplars.moments)
     assert len(slow.model_.exemplars.moments) > len(ActionIndexer(fps=30.0).fit(arrays, FEW).model_.exemplars.moments)
-
-
-def test_a_batch_is_its_loop(indexer, others):
-    queries = list(others[:8])
-    scores = indexer.decision_function(queries)
-    assert scores.shape == (8, 13)
-    np.testing.assert_allclose(scores, np.concatenate([indexer.decision_function([one]) for one in queries]), atol=1e-3)
-    assert indexer.predict(queries).tolist() == [indexer.predict([one])[0] for one in queries]
-    assert indexer.predict(iter(queries)).tolist() == indexer.predict(queries).tolist()
-
-
-@pytest.mark.parametrize("options", [{}, {"scorer": "nearest"}, {"scorer": "kernel"}, {"view": "same"}], ids=str)
-@pytest.mark.parametrize("classes", [2, 4])
-def test_answers_agree_with_one_another(few, options, classes):
-    train, test = (clips.select(action=FEW[:classes]) for clips in few)
-    indexer = ActionIndexer(**options).fit(train)
-    scores, chances = indexer.decision_function(test), indexer.predict_proba(test)
-    assert scores.shape == chances.shape == (len(test), classes)
-    np.testing.assert_array_equal(indexer.predict(test), indexer.classes_[scores.argmax(axis=1)])
-    np.testing.assert_allclose(chances.sum(axis=1), 1.0, rtol=1e-6)
-    assert (chances >= 0).all()
-    np.testing.assert_array_equal(chances.argmax(axis=1), scores.argmax(axis=1))
-    assert (np.diff(np.take_along_axis(chances, scores.argsort(axis=1), axis=1), axis=1) >= 0).all()
-    assert indexer.evidence(test).shape == (len(test),)

@@ -11,7 +11,7 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from indexing import ActionIndexer
-from indexing.actors import Person, dataset, detect, stream
+from indexing.actors import Person, dataset
 
 FEW = ("squat", "wave", "kick", "bow")
 
@@ -27,11 +27,6 @@ def test():
 
 
 @pytest.fixture(scope="module")
-def recording():
-    return detect(stream(FEW, Person.random(2), rng=3)[0], azimuth=30.0, rng=4)
-
-
-@pytest.fixture(scope="module")
 def saved(train, tmp_path_factory):
     path = tmp_path_factory.mktemp("model") / "moves.safetensors"
     ActionIndexer(reject=0.2, none_label="none").fit(train).save(path)
@@ -41,32 +36,6 @@ def saved(train, tmp_path_factory):
 def contents(path):
     with safe_open(path, framework="pt") as file:
         return {name: file.get_tensor(name) for name in file.keys()}, json.loads(file.metadata()["dyntorch"])  # noqa: SIM118
-
-
-OPTIONS = {
-    "plain": {},
-    "nearest": {"scorer": "nearest"},
-    "same view": {"view": "same"},
-    "learned, refusing": {"weights": "learned", "reject": 0.3, "none_label": "none"},
-    "no mirror": {"mirror": False, "length": 8, "search": False, "virtual_views": 0, "tempi": (1.0,)},
-}
-
-
-@pytest.mark.parametrize("name", OPTIONS)
-def test_what_is_loaded_answers_the_same(name, train, test, recording, tmp_path):
-    indexer = ActionIndexer(**OPTIONS[name]).fit(train)
-    indexer.save(tmp_path / "m.safetensors")
-    loaded = ActionIndexer.load(tmp_path / "m.safetensors")
-    np.testing.assert_array_equal(loaded.decision_function(test), indexer.decision_function(test))
-    np.testing.assert_array_equal(loaded.evidence(test), indexer.evidence(test))
-    assert loaded.predict(test).tolist() == indexer.predict(test).tolist()
-    np.testing.assert_array_equal(loaded.score_frames(recording), indexer.score_frames(recording))
-    assert loaded.find(recording) == indexer.find(recording)
-    assert loaded.reject_threshold_ == indexer.reject_threshold_
-    assert loaded.skeleton_ == indexer.skeleton_ and loaded.n_joints_ == 17
-    expected = indexer.get_params() | {"tempi": list(indexer.tempi)}
-    assert loaded.get_params() | {"tempi": list(loaded.tempi)} == expected
-    np.testing.assert_array_equal(loaded.exemplar(3).joints, indexer.exemplar(3).joints)
 
 
 @pytest.mark.parametrize(

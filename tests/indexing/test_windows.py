@@ -1,11 +1,11 @@
-"""Windows against slow references: interpolation joint by joint with np.interp, repair, and what is refused."""
+"""Windows against slow references: interpolation joint by joint with np.interp, and what is refused."""
 
 import numpy as np
 import pytest
 import torch
 
 from indexing import Clip
-from indexing.windows import SUBSAMPLES, check_clips, hampel, ragged, sample, unusable, whole
+from indexing.windows import SUBSAMPLES, check_clips, ragged, sample, unusable, whole
 
 
 def irregular(seed, frames=17, joints=5, dims=2, start=0.0):
@@ -119,58 +119,6 @@ def test_frame_rate_changes_nothing_that_moves_linearly():
     slow, fast = (Clip(np.linspace(0, 1, n)[:, None, None] * direction, fps=n - 1) for n in (5, 81))
     got = whole(ragged([slow, fast]), 10)
     torch.testing.assert_close(got[0], got[1], atol=1e-6, rtol=0)
-
-
-# ---- repair ------------------------------------------------------------------------------------------------------------
-def smooth_walk(frames=80, joints=6):
-    t = np.linspace(0, 4 * np.pi, frames)[:, None]
-    phase, size = np.linspace(0, 3, joints), np.linspace(0.2, 1, joints)
-    return np.stack([np.sin(t + phase) * size + np.arange(joints), np.cos(t + phase) * size], axis=2).astype(np.float32)
-
-
-def test_hampel_finds_planted_jumps_and_only_those():
-    clean = smooth_walk()
-    joints = clean.copy()
-    jumps = [(10, 2), (11, 2), (40, 0), (41, 5), (70, 3)]
-    for frame, joint in jumps:
-        joints[frame, joint] += [4.0, -3.0]
-    repaired = hampel(joints)
-    lost = {tuple(at) for at in np.argwhere(np.isnan(repaired).any(axis=2))}
-    assert lost == set(jumps)
-    keep = ~np.isnan(repaired)
-    np.testing.assert_array_equal(repaired[keep], clean[keep])
-
-
-def test_hampel_leaves_clean_data_and_its_input_alone():
-    joints = smooth_walk()
-    before = joints.copy()
-    np.testing.assert_array_equal(hampel(joints), before)
-    np.testing.assert_array_equal(joints, before)
-    still = np.repeat(joints[:1], 30, axis=0)
-    np.testing.assert_array_equal(hampel(still), still)
-
-
-def test_hampel_does_not_depend_on_the_unit():
-    joints = smooth_walk()
-    joints[20, 1] += 5
-    for unit in (1e-3, 700.0):
-        np.testing.assert_array_equal(np.isnan(hampel(joints * np.float32(unit))), np.isnan(hampel(joints)))
-
-
-def test_hampel_keeps_missing_joints_missing():
-    joints = smooth_walk()
-    joints[:, 4] = np.nan
-    joints[5:30, 1] = np.nan
-    np.testing.assert_array_equal(np.isnan(hampel(joints)), np.isnan(joints))
-
-
-def test_repair_interpolates_what_was_wrong():
-    clean = smooth_walk()
-    joints = clean.copy()
-    joints[33, 2] = 50
-    source = ragged([Clip(joints), Clip(clean)], repair=True)
-    np.testing.assert_allclose(source.joints[:80], clean, atol=0.02)
-    assert np.abs(ragged([Clip(joints)]).joints - clean).max() > 40
 
 
 # ---- refusals ----------------------------------------------------------------------------------------------------------

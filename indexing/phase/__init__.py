@@ -1,0 +1,1 @@
+"""Actions from single frames: which action a frame is of, and how far the action has come."""

@@ -1,0 +1,212 @@
+"""PhaseIndexer: which action a single frame belongs to, and how far the action has come in it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from sklearn.base import BaseEstimator, ClassifierMixin
+from sklearn.utils.validation import check_is_fitted
+from torch import Tensor
+
+from indexing.checks import check_labels, check_queries, gather, gather_labels
+from indexing.clip import Clip
+from indexing.phase.checks import check_phase_parameters, check_phases
+from indexing.phase.frames import images, query_frames
+from indexing.phase.learning import learn_model
+from indexing.phase.model import PhaseModel
+from indexing.phase.smoothing import smooth_phases
+from indexing.scoring import Event, events, probabilities, smooth
+from indexing.shape.symmetry import mirror_permutation
+
+Array = NDArray[Any]
+FINDING = 1.0  # seconds that scores are averaged over before events are cut from them
+FLOOR, PEAK = (
+    0.0,
+    0.3,
+)  # of the mean score, throughout and somewhere in an event: 0 = as near to other actions' frames as to its own
+
+
+class PhaseIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
+    r"""Recognize actions in single frames, and say how far each of them has come.
+
+    The joints of an action at phase :math:`\phi` span, with all cameras, the subspace :math:`S(\phi) = \mathrm{span}[1, X(\phi)]`
+    in Gr(4, n): the dynamic shape tensor in its all-joint form.  X is a Fourier series for an action that repeats and a polynomial
+    for one that does not, learned from frames that may each come from another camera.  A frame's residual outside S, least over
+    the phases, is joined with its distance from the nearest training images at that phase and held against its distance from
+    the images of the other actions.
+
+    Args:
+        harmonics: of the series of an action that repeats; polynomials have twice the degree.
+        course: ``"auto"``: an action repeats where its clips do; ``"periodic"``; ``"once"``: from the start of a clip to its end.
+        mirror: ``"auto"``: where an action half a cycle later is its own mirror image (gait), frames also count mirrored;
+            ``True``: in every action that repeats; ``False``: never.
+        window: seconds of neighbours that a frame's score and phase are averaged over; 0: every frame from itself alone.
+        fps: frame rate of clips given as arrays.
+        device: where to compare, e.g. ``"cuda"``.
+
+    Attributes:
+        classes_: ``(classes,)`` labels as given.  periodic_: ``(classes,)`` which of them repeat.
+        mirrored_: ``(classes,)`` which of them are their own mirror image half a cycle later.
+        n_joints_: joints per frame.  model_: the learned :class:`~indexing.phase.model.PhaseModel`.
+
+    Example:
+        >>> from indexing.actors import dataset
+        >>> clips = dataset(2, ["walk", "squat"], azimuth=0, rng=0)
+        >>> indexer = PhaseIndexer(harmonics=3).fit(clips, clips.labels)
+        >>> scores, phase = indexer.score_frames(clips[0]), indexer.phase(clips[0])
+        >>> scores.shape == phase.shape == (len(clips[0]), 2), str(indexer.predict([clips[0]])[0])
+        (True, 'walk')
+
+    Source: Wolf 2003, chapter 4 (dynamic shape tensors) and section 10.1.
+    """
+
+    def __init__(
+        self,
+        harmonics: int = 4,
+        course: str = "auto",
+        *,
+        mirror: str | bool = "auto",
+        window: float = 0.0,
+        fps: float = 30.0,
+        device: str = "cpu",
+    ) -> None:
+        self.harmonics = harmonics
+        self.course = course
+        self.mirror = mirror
+        self.window = window
+        self.fps = fps
+        self.device = device
+
+    def fit(self, clips: Iterable[Any], labels: ArrayLike | None = None, phases: Sequence[Any] | None = None) -> Self:
+        """Learn from clips.
+
+        Args:
+            clips: of :class:`Clip`, or ``(frames, joints, 2 | 3)`` arrays, or tuples of synchronized views of one performance.
+            labels: ``(clips,)``; by default the clips' own.  One class alone is scored by how well it fits, not against others.
+            phases: for each clip ``(frames,)`` numbers, NaN = not known, of which whole cycles do not matter in an action that
+                repeats (0 to 1 in one that does not); or ``None`` for a clip, and all clips of its action are then measured.
+                By default they are found from the clips; where a cycle begins is then arbitrary.
+
+        Raises:
+            ValueError: naming the clip or the parameter, what is wrong and what to do.
+        """
+        check_phase_parameters(self)
+        items = list(clips) if isinstance(clips, Iterable) and not isinstance(clips, (Clip, str, bytes)) else clips
+        found, owners = gather(items, self.fps)
+        values = gather_labels(found, owners, labels)
+        given = check_phases(phases, found, owners)
+        classes, numbers = np.unique(values, return_inverse=True)
+        skeleton = next((clip.skeleton for clip in found if clip.skeleton is not None), None)
+        views, which = [], []
+        for k, clip in enumerate(found):
+            seen_as = images(clip)
+            views += seen_as
+            which += [k] * len(seen_as)
+        order = sorted(range(len(views)), key=lambda i: (str(numbers[which[i]]), views[i].joints.tobytes()))
+        model, mirrored = learn_model(
+            [views[i] for i in order],
+            torch.from_numpy(numbers[which])[order].long(),
+            [given[which[i]] for i in order],
+            harmonics=self.harmonics,
+            course=self.course,
+            mirror=self.mirror,
+            swap=lambda windows, seen: mirror_permutation(skeleton, windows, seen),
+        )
+        self.model_: PhaseModel = model
+        self.classes_ = classes
+        self.periodic_ = np.array([course.periodic for course in model.courses])
+        self.mirrored_ = np.array(mirrored)
+        self.n_joints_ = int(found[0].joints.shape[1])
+        self.skeleton_ = skeleton
+        return self
+
+    # ---- single frames -----------------------------------------------------------------------------------------------
+    def analyse(self, clip: Any) -> tuple[Array, Array]:
+        """:meth:`score_frames` and :meth:`phase` in one pass."""
+        check_is_fitted(self, "model_")
+        (found,) = check_queries([clip], self.fps, self.n_joints_)
+        scores, phase = (part.cpu().numpy() for part in self._evidence(found))
+        if self.window > 0:
+            phase = smooth_phases(phase, found.times, self.window, self.periodic_)
+            scores = smooth(scores, found.times, self.window)
+        return np.asarray(scores), np.asarray(phase)
+
+    def score_frames(self, clip: Any) -> Array:
+        """``(frames, classes)`` score of every frame, from itself alone unless ``window`` is set; larger is better.
+
+        0 means as near to the frames of the other actions as to those of this one; a frame that shows fewer than six joints scores
+        0 for every class.
+        """
+        return self.analyse(clip)[0]
+
+    def phase(self, clip: Any) -> Array:
+        """``(frames, classes)`` where in each action the frame would be, were it of that action.
+
+        In [0, 1) of the cycle of an action that repeats; from 0, its start, to 1, its end, in one that does not; NaN where fewer
+        than six joints are seen.
+        """
+        return self.analyse(clip)[1]
+
+    def _evidence(self, clip: Clip) -> tuple[Tensor, Tensor]:
+        return self.model_.to(self.device).evidence(query_frames(clip).to(self.device))
+
+    # ---- clips -------------------------------------------------------------------------------------------------------
+    def decision_function(self, clips: Iterable[Any]) -> Array:
+        """``(clips, classes)`` mean of the frames' scores; columns are ``classes_``."""
+        check_is_fitted(self, "model_")
+        found = check_queries(clips, self.fps, self.n_joints_)
+        return np.stack([self._evidence(clip)[0].mean(0).cpu().numpy() for clip in found])
+
+    def predict_proba(self, clips: Iterable[Any]) -> Array:
+        """``(clips, classes)`` probabilities, rows sum to 1 (a softmax of the standardized scores)."""
+        scores = self.decision_function(clips)
+        return probabilities(scores) if scores.shape[1] > 1 else np.ones_like(scores)
+
+    def predict(self, clips: Iterable[Any]) -> Array:
+        """``(clips,)`` labels."""
+        return np.asarray(self.classes_[self.decision_function(clips).argmax(axis=1)])
+
+    def score(self, clips: Iterable[Any], labels: ArrayLike, sample_weight: ArrayLike | None = None) -> float:
+        """Mean accuracy of :meth:`predict`."""
+        answers = self.predict(clips)
+        right = np.asarray([a == b for a, b in zip(answers.tolist(), check_labels(labels, len(answers)).tolist(), strict=True)])
+        return float(np.average(right, weights=None if sample_weight is None else np.asarray(sample_weight)))
+
+    def find(self, clip: Any) -> list[Event]:
+        """The actions in an untrimmed recording, in order of time: where the mean score of a second is above those of the rest.
+
+        An event is what is nearer to its own action's frames than to any other's; it needs at least two classes.
+        """
+        check_is_fitted(self, "model_")
+        (found,) = check_queries([clip], self.fps, self.n_joints_)
+        if len(self.classes_) < 2:
+            raise ValueError("find needs two classes at least to tell one from the other; fit clips of ordinary movement too")
+        scores = smooth(self._evidence(found)[0].cpu().numpy(), found.times, FINDING)
+        return events(scores, found.times, list(self.classes_), PEAK, FLOOR)
+
+    # ---- files -------------------------------------------------------------------------------------------------------
+    def save(self, path: str | Path) -> None:
+        """Write a ``.safetensors`` file with JSON metadata; atomically, and without pickle."""
+        from indexing.phase.persistence import save_phase
+
+        check_is_fitted(self, "model_")
+        save_phase(self, path)
+
+    @classmethod
+    def load(cls, path: str | Path, device: str = "cpu") -> Self:
+        """Read what :meth:`save` wrote, for computing on ``device``.
+
+        Raises:
+            ValueError: the file is missing, or is not such a model.
+        """
+        from indexing.phase.persistence import load_phase
+
+        return load_phase(cls, path, device)
+
+    def __sklearn_is_fitted__(self) -> bool:
+        return hasattr(self, "model_")

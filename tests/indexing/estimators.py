@@ -1,0 +1,364 @@
+"""What every indexer promises, each a function of a :class:`Case`; ``CHECKS`` lists them, ``CASES`` the indexers.
+
+scikit-learn's own battery feeds tables of floats; an estimator of lists of clips of different lengths can be tagged so that every
+check is skipped, which proves nothing.  What those checks are for is tested here instead, on what the indexers are made for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from copy import deepcopy
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from sklearn.base import clone, is_classifier
+from sklearn.exceptions import NotFittedError
+from sklearn.model_selection import GridSearchCV, LeaveOneGroupOut, cross_val_score
+
+from indexing import ActionIndexer
+from indexing.actors import Person, dataset, detect, stream
+from indexing.brightness.indexer import BrightnessIndexer
+from indexing.feature_indexer import FeatureIndexer
+
+FEW = ("kick", "squat", "wave")
+VERBS = ("predict", "decision_function", "predict_proba", "evidence")
+
+
+@dataclass(frozen=True)
+class Lesson:
+    """What is learned and what is asked: items in a list (or rows of a table), labels, who shows them, and a recording."""
+
+    items: Any
+    labels: np.ndarray
+    groups: np.ndarray
+    asked: Any
+    truth: np.ndarray
+    recording: Any = None
+
+
+@cache
+def keypoints() -> Lesson:
+    """Three actions by two people in one view, and by another also from a little further round."""
+    train = dataset([Person.random(seed) for seed in (20, 21)], FEW, azimuth=0.0, rng=1)
+    test = dataset([Person.random(24)], FEW, azimuth=(0.0, 15.0), rng=2)
+    recording = detect(stream(FEW[:2], Person.random(24), rng=3)[0], azimuth=30.0, rng=4)
+    return Lesson(list(train), train.labels, train.column("subject"), list(test), test.labels, recording)
+
+
+@cache
+def features() -> Lesson:
+    """Noisy directions of three kinds."""
+    rng = np.random.default_rng(0)
+    centres, numbers = rng.normal(size=(3, 6)), np.arange(12) % 3
+    rows, labels = centres[numbers] + 0.2 * rng.normal(size=(12, 6)), np.array(FEW)[numbers]
+    return Lesson(rows[:6], labels[:6], np.arange(6) // 3, rows[6:], labels[6:])
+
+
+@cache
+def videos() -> Lesson:
+    """A bright blob that moves along, across, or to and fro."""
+
+    def film(kind: str, seed: int) -> np.ndarray:
+        rng = np.random.default_rng(seed)
+        t = np.linspace(0.0, 1.0, 24)
+        travel = {"kick": 30 * t - 15, "squat": 0 * t, "wave": 12 * np.sin(4 * np.pi * t)}[kind], 24 * (kind == "squat") * (t - 0.5)
+        rows, columns = np.mgrid[:48, :64]
+        blob = [np.exp(-((columns - 32 - x) ** 2 + (rows - 24 - y) ** 2) / 20.0) for x, y in zip(*travel, strict=True)]
+        return np.clip(40 + 180 * np.array(blob) + rng.normal(scale=2.0, size=(24, 48, 64)), 0, 255).astype(np.uint8)
+
+    train = [film(kind, 10 * subject + i) for subject in range(2) for i, kind in enumerate(FEW)]
+    test = [film(kind, 90 + i) for i, kind in enumerate(FEW)]
+    return Lesson(train, np.array(FEW * 2), np.arange(6) // 3, test, np.array(FEW), np.concatenate(test))
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """An indexer, the lesson it is made for, parameter values that it must refuse, and values of one parameter to choose from
+    (none where another case of the same class stands for it).
+
+    apart: how far scores may be when the same is computed in another order; draws: whether anything is drawn at random.
+    """
+
+    name: str
+    kind: type
+    lesson: Callable[[], Lesson]
+    options: dict[str, Any] = field(default_factory=dict)
+    wrong: dict[str, Any] = field(default_factory=dict)
+    grid: dict[str, list[Any]] = field(default_factory=dict)
+    apart: float = 1e-9
+    draws: bool = False
+
+    def make(self, **options: Any) -> Any:
+        """A new one, unfitted."""
+        return self.kind(**{**self.options, **options})
+
+
+WRONG_KEYPOINTS = {
+    "view": "front", "weights": "odd", "scorer": "best", "mirror": "maybe", "reject": "often", "fps": 0.0, "length": 3, "tempi": (),
+    "pool": -1.0, "window": -1.0, "virtual_views": -1, "random_state": "x", "device": "abacus",
+}  # fmt: skip
+SMALL = {"length": 8, "search": False, "virtual_views": 1, "tempi": (1.0,)}
+CASES = [
+    Case("keypoints", ActionIndexer, keypoints, {"length": 8}, WRONG_KEYPOINTS, {"scorer": ["nearest", "both"]}, 1e-3, True),
+    *(
+        Case(name, ActionIndexer, keypoints, {**SMALL, **options}, apart=1e-3, draws=options.get("scorer") != "nearest")
+        for name, options in (
+            ("nearest, learned weights", {"scorer": "nearest", "weights": "learned"}),
+            ("kernel, refusing", {"scorer": "kernel", "reject": 0.05, "none_label": "none", "repair": True}),
+            ("same view, learned weights", {"view": "same", "weights": "learned"}),
+        )
+    ),
+    Case("features", FeatureIndexer, features, {}, {"width": 0.0}, {"width": [0.5, 1.0]}, 1e-3),
+    Case("videos", BrightnessIndexer, videos, {"size": 40}, {}, {"window": [0.3, 0.5]}, 1e-5),
+]
+
+Check = Callable[..., None]
+CHECKS: list[tuple[Check, Callable[[Case], bool]]] = []
+
+
+def promise(applies: Callable[[Case], bool] = lambda case: True) -> Callable[[Check], Check]:
+    """Put a promise on the list, for the cases it applies to."""
+
+    def add(check: Check) -> Check:
+        CHECKS.append((check, applies))
+        return check
+
+    return add
+
+
+def chooses(case: Case) -> bool:
+    return bool(case.grid)
+
+
+@cache
+def fitted(case: Case) -> Any:
+    """Fitted to the whole lesson; shared, so look but do not touch."""
+    lesson = case.lesson()
+    return case.make().fit(lesson.items, lesson.labels)
+
+
+def answers(case: Case, indexer: Any) -> dict[str, Any]:
+    """Everything that a fitted indexer says about the lesson's queries."""
+    return {verb: getattr(indexer, verb)(case.lesson().asked) for verb in VERBS if hasattr(indexer, verb)}
+
+
+def finds(case: Case, indexer: Any) -> dict[str, Any]:
+    """What it says about the recording."""
+    recording, verbs = case.lesson().recording, [verb for verb in ("score_frames", "find") if hasattr(indexer, verb)]
+    return {} if recording is None else {verb: getattr(indexer, verb)(recording) for verb in verbs}
+
+
+def same(one: dict[str, Any], other: dict[str, Any]) -> None:
+    assert one.keys() == other.keys()
+    for verb in one:
+        np.testing.assert_array_equal(np.asarray(one[verb], dtype=object), np.asarray(other[verb], dtype=object), err_msg=verb)
+
+
+def table(case: Case, indexer: Any, asked: Any) -> np.ndarray:
+    """Scores, one column per class also where there are two."""
+    scores = indexer.decision_function(asked)
+    return np.stack([-scores, scores], axis=1) / 2 if scores.ndim == 1 else scores
+
+
+def picked(items: Any, index: Any) -> Any:
+    return items[index] if isinstance(items, np.ndarray) else [items[i] for i in index]
+
+
+def first_of_each(lesson: Lesson) -> list[int]:
+    return [int(np.flatnonzero(lesson.labels == label)[0]) for label in FEW]
+
+
+# ---- parameters --------------------------------------------------------------------------------------------------------
+@promise()
+def parameters_go_in_and_come_out(case: Case) -> None:
+    made = case.make()
+    assert made.get_params().items() >= case.options.items()
+    twin = clone(made)
+    assert twin is not made and twin.get_params() == made.get_params()
+    other = {name: value for name, (*_, value) in case.grid.items()}
+    assert made.set_params(**other) is made and made.get_params() == {**twin.get_params(), **other}
+    assert is_classifier(made)
+    with pytest.raises(ValueError, match="Invalid parameter 'veiw'"):
+        made.set_params(veiw="any")
+
+
+@promise()
+def nothing_is_done_before_fit(case: Case) -> None:
+    odd = {name: object() for name in case.make().get_params()}
+    made = case.kind(**odd)
+    assert all(getattr(made, name) is value for name, value in odd.items())
+    assert set(vars(made)) == set(odd)
+
+
+@promise(lambda case: bool(case.wrong))
+def unknown_values_are_refused_by_name(case: Case) -> None:
+    lesson = case.lesson()
+    for name, value in case.wrong.items():
+        with pytest.raises(ValueError, match=name):
+            case.make(**{name: value}).fit(lesson.items, lesson.labels)
+
+
+@promise()
+def an_unfitted_one_says_so(case: Case, path: Path) -> None:
+    lesson, bare = case.lesson(), clone(fitted(case))
+    verbs = [verb for verb in (*VERBS, "score_frames", "find", "scan", "exemplar") if hasattr(bare, verb)]
+    for verb in verbs:
+        with pytest.raises(NotFittedError):
+            getattr(bare, verb)(lesson.asked)
+    if hasattr(bare, "save"):
+        with pytest.raises(NotFittedError):
+            bare.save(path / "m.safetensors")
+    assert list(path.iterdir()) == []
+
+
+# ---- fit ---------------------------------------------------------------------------------------------------------------
+@promise()
+def fit_returns_itself_adds_names_that_end_in_an_underscore_and_forgets(case: Case) -> None:
+    lesson, made = case.lesson(), case.make()
+    before, two = set(vars(made)), np.flatnonzero(lesson.labels != FEW[0])
+    assert made.fit(picked(lesson.items, two), lesson.labels[two]) is made
+    assert made.classes_.tolist() == list(FEW[1:])
+    added = set(vars(made.fit(lesson.items, lesson.labels))) - before
+    assert "classes_" in added
+    assert all(name.endswith("_") or name.startswith("_") for name in added - {"n_features_in_"}), added
+    assert made.get_params() == case.make().get_params()
+    same(answers(case, made), answers(case, fitted(case)))  # the same random_state, the same answers
+
+
+@promise()
+def what_is_handed_in_stays_as_it_was(case: Case) -> None:
+    lesson = case.lesson()
+    few = first_of_each(lesson)
+    given, asked, labels = deepcopy(picked(lesson.items, few)), deepcopy(lesson.asked), lesson.labels[few]
+    case.make().fit(given, labels).predict(asked)
+    np.testing.assert_array_equal(labels, lesson.labels[few])
+    for mine, theirs in ((given, picked(lesson.items, few)), (asked, lesson.asked)):
+        for one, other in zip(mine, theirs, strict=True):
+            np.testing.assert_array_equal(getattr(one, "joints", one), getattr(other, "joints", other))
+
+
+@promise()
+def the_order_of_examples_does_not_matter(case: Case) -> None:
+    lesson = case.lesson()
+    order = np.random.default_rng(0).permutation(len(lesson.labels))
+    turned = case.make().fit(picked(lesson.items, order), lesson.labels[order])
+    assert turned.classes_.tolist() == fitted(case).classes_.tolist()
+    if case.draws:  # virtual views are drawn in order: other views, the same answers
+        assert turned.predict(lesson.items).tolist() == fitted(case).predict(lesson.items).tolist()
+    else:
+        close = {"rtol": 0, "atol": max(case.apart, 1e-5)}
+        np.testing.assert_allclose(turned.decision_function(lesson.asked), fitted(case).decision_function(lesson.asked), **close)
+
+
+@promise()
+def one_example_of_each_class_is_enough_and_one_class_is_not(case: Case) -> None:
+    lesson = case.lesson()
+    few = picked(lesson.items, first_of_each(lesson))
+    indexer = case.make(**({"reject": None} if "reject" in case.options else {})).fit(few, FEW)
+    assert indexer.predict(few).tolist() == list(FEW)
+    alone = np.flatnonzero(lesson.labels == FEW[0])
+    with pytest.raises(ValueError, match=r"labels: only one class .*'kick'"):
+        case.make().fit(picked(lesson.items, alone), lesson.labels[alone])
+
+
+@promise()
+def labels_keep_their_type(case: Case) -> None:
+    lesson = case.lesson()
+    few = picked(lesson.items, first_of_each(lesson))
+    options = {"reject": None} if "reject" in case.options else {}
+    for labels in (np.array([7, -2, 3]), [5.0, 9.0, -1.0], np.array(FEW, dtype=object)):
+        indexer = case.make(**options).fit(few, labels)
+        said, kind = indexer.predict(few), np.asarray(labels).dtype
+        assert indexer.classes_.dtype == said.dtype == kind
+        assert said.tolist() == np.asarray(labels).tolist()
+        assert kind.kind != "i" or indexer.score(few, said.astype(float)) == 1.0
+        assert indexer.classes_.tolist() == sorted(said.tolist())
+
+
+# ---- answers -----------------------------------------------------------------------------------------------------------
+@promise()
+def answers_agree_with_one_another(case: Case) -> None:
+    lesson = case.lesson()
+    for count in (2, 3):
+        kept = np.isin(lesson.labels, FEW[:count])
+        part = picked(lesson.items, np.flatnonzero(kept))
+        indexer = fitted(case) if count == 3 else case.make().fit(part, lesson.labels[kept])
+        scores, chances, said = (
+            table(case, indexer, lesson.asked),
+            indexer.predict_proba(lesson.asked),
+            indexer.predict(lesson.asked),
+        )
+        assert scores.shape == chances.shape == (len(lesson.truth), count)
+        assert np.isfinite(scores).all() and (chances >= 0).all()
+        np.testing.assert_allclose(chances.sum(axis=1), 1.0, rtol=1e-6)
+        np.testing.assert_array_equal(chances.argmax(axis=1), scores.argmax(axis=1))
+        accepted = [i for i, label in enumerate(said) if label in FEW]
+        np.testing.assert_array_equal(said[accepted], indexer.classes_[scores.argmax(axis=1)][accepted])
+        if not getattr(indexer, "reject", None):
+            assert len(accepted) == len(said)
+
+
+@promise()
+def a_batch_is_its_loop(case: Case) -> None:
+    lesson, indexer = case.lesson(), fitted(case)
+    alone = np.concatenate([indexer.decision_function(picked(lesson.asked, [i])) for i in range(len(lesson.truth))])
+    np.testing.assert_allclose(indexer.decision_function(lesson.asked), alone, rtol=0, atol=case.apart)
+    if not isinstance(lesson.asked, np.ndarray):
+        assert indexer.predict(iter(lesson.asked)).tolist() == indexer.predict(lesson.asked).tolist()
+
+
+@promise()
+def score_is_the_mean_accuracy(case: Case) -> None:
+    lesson, indexer = case.lesson(), fitted(case)
+    right = indexer.predict(lesson.asked) == lesson.truth
+    assert indexer.score(lesson.asked, lesson.truth) == pytest.approx(right.mean())
+    weights = np.arange(len(right)) + 1.0
+    assert indexer.score(lesson.asked, lesson.truth, weights) == pytest.approx(np.average(right, weights=weights))
+    assert indexer.score(lesson.asked, ["never learned"] * len(right)) == 0.0
+    assert right.mean() > 0.6
+
+
+@promise(lambda case: hasattr(case.kind, "save"))
+def what_is_loaded_answers_the_same(case: Case, path: Path) -> None:
+    indexer = fitted(case)
+    indexer.save(path / "m.safetensors")
+    loaded = case.kind.load(path / "m.safetensors")
+    same(answers(case, loaded) | finds(case, loaded), answers(case, indexer) | finds(case, indexer))
+    for name, value in indexer.get_params().items():
+        np.testing.assert_array_equal(getattr(loaded, name), value)
+    loaded.save(path / "again.safetensors")
+    assert (path / "again.safetensors").read_bytes() == (path / "m.safetensors").read_bytes()
+
+
+@promise(lambda case: "device" in case.make().get_params())
+def a_graphics_card_answers_the_same(case: Case) -> None:
+    if not torch.cuda.is_available():
+        pytest.skip("no CUDA device")
+    lesson = case.lesson()
+    there = case.make(device="cuda").fit(lesson.items, lesson.labels)
+    np.testing.assert_allclose(there.decision_function(lesson.asked), fitted(case).decision_function(lesson.asked), atol=0.01)
+    assert there.predict(lesson.asked).tolist() == fitted(case).predict(lesson.asked).tolist()
+
+
+# ---- model selection ---------------------------------------------------------------------------------------------------
+@promise(chooses)
+def cross_validation_takes_lists_of_clips(case: Case) -> None:
+    lesson = case.lesson()
+    scores = cross_val_score(
+        case.make(), lesson.items, lesson.labels, groups=lesson.groups, cv=LeaveOneGroupOut(), error_score="raise"
+    )
+    assert scores.shape == (2,) and scores.mean() > 0.5
+
+
+@promise(chooses)
+def grid_search_chooses(case: Case) -> None:
+    lesson = case.lesson()
+    search = GridSearchCV(case.make(), case.grid, cv=LeaveOneGroupOut(), error_score="raise")
+    search.fit(lesson.items, lesson.labels, groups=lesson.groups)
+    assert set(search.best_params_) == set(case.grid) and search.classes_.tolist() == list(FEW)
+    assert search.score(lesson.asked, lesson.truth) > 0.6

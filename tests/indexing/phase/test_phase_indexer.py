@@ -1,0 +1,135 @@
+"""PhaseIndexer on synthetic people: what it says of frames, and the contract of an estimator."""
+
+import numpy as np
+import pytest
+from sklearn.base import clone
+
+from indexing import Clip
+from indexing.actors import Person, detect, perform
+from indexing.phase.indexer import PhaseIndexer
+
+ACTIONS = ("walk", "sit_down")
+TURNS = (0, 40, 80)
+
+
+def clips(seed, turns=TURNS, fps=10.0):
+    found = []
+    for k, turn in enumerate(turns):
+        for action in ACTIONS:
+            solid = perform(action, Person.random(seed + k), fps=fps, rng=seed + k)
+            found.append(detect(solid, azimuth=float(turn), rng=seed + k))
+    return found
+
+
+@pytest.fixture(scope="module")
+def train():
+    return clips(0)
+
+
+@pytest.fixture(scope="module")
+def fitted(train):
+    return PhaseIndexer(harmonics=2).fit(train)
+
+
+@pytest.fixture(scope="module")
+def asked():
+    return clips(20, turns=(20, 60))
+
+
+def test_single_frames_tell_the_action(fitted, asked):
+    assert fitted.predict(asked).tolist() == [clip.label for clip in asked]
+    assert fitted.score(asked, [clip.label for clip in asked]) == 1.0
+    assert np.allclose(fitted.predict_proba(asked).sum(1), 1.0)
+
+
+def test_a_cycle_repeats_and_a_course_goes_from_start_to_end(fitted, asked):
+    assert dict(zip(fitted.classes_.tolist(), fitted.periodic_.tolist(), strict=True)) == {"sit_down": False, "walk": True}
+    walk, sitting = (next(clip for clip in asked if clip.label == name) for name in ("walk", "sit_down"))
+    phase = fitted.phase(walk)[:, 1]
+    steps = (np.diff(phase) + 0.5) % 1 - 0.5
+    assert 0.05 < np.median(steps) < 0.2
+    assert ((phase >= 0) & (phase < 1)).all()
+    course = fitted.phase(sitting)[:, 0]
+    assert course[: len(course) // 4].mean() < 0.3
+    assert np.corrcoef(course, np.arange(len(course)))[0, 1] > 0.7
+
+
+def test_a_frame_is_judged_alone(fitted, asked):
+    clip = asked[0]
+    whole = fitted.score_frames(clip)
+    part = fitted.score_frames(clip.replace(joints=clip.joints[5:8], times=clip.times[5:8], confidence=None))
+    assert np.allclose(whole[5:8], part, atol=1e-9)
+    assert np.allclose(fitted.decision_function([clip])[0], whole.mean(0))
+
+
+def test_missing_joints(fitted, asked):
+    joints = asked[0].joints.copy()
+    joints[:, 3] = np.nan
+    joints[2, 5:] = np.nan
+    scores, phase = fitted.analyse(asked[0].replace(joints=joints, confidence=None))
+    assert np.isfinite(scores).all()
+    assert (scores[2] == 0).all()
+    assert np.isnan(phase[2]).all()
+    assert (scores.argmax(1) == 1).mean() > 0.7
+
+
+def test_neighbours(fitted, asked):
+    smooth = clone(fitted).set_params(window=0.5)
+    smooth.__dict__ |= {name: value for name, value in vars(fitted).items() if name.endswith("_")}
+    scores = smooth.score_frames(asked[0])
+    assert scores.std(0).max() < fitted.score_frames(asked[0]).std(0).max()
+    assert [event.label for event in fitted.find(asked[0])] == ["walk"]
+
+
+def test_files_keep_every_bit(fitted, asked, tmp_path):
+    fitted.save(tmp_path / "m.safetensors")
+    again = PhaseIndexer.load(tmp_path / "m.safetensors")
+    assert again.get_params() == fitted.get_params()
+    for name in ("classes_", "periodic_", "mirrored_"):
+        assert (getattr(again, name) == getattr(fitted, name)).all()
+    for a, b in zip(again.analyse(asked[1]), fitted.analyse(asked[1]), strict=True):
+        assert (a == b).all()
+    (tmp_path / "bad").write_bytes(b"nothing")
+    with pytest.raises(ValueError, match="not a model file"):
+        PhaseIndexer.load(tmp_path / "bad")
+
+
+def test_order_of_clips_changes_nothing_and_given_phases_are_kept(train, asked):
+    walks = [clip for clip in train if clip.label == "walk"]
+    phases = [1.1 * clip.times + 0.1 for clip in walks]
+    one, other = PhaseIndexer(harmonics=1, mirror=False), PhaseIndexer(harmonics=1, mirror=False)
+    one.fit(walks, phases=phases)
+    other.fit(walks[::-1], phases=phases[::-1])
+    assert one.periodic_.tolist() == [True]
+    assert np.allclose(one.score_frames(asked[0]), other.score_frames(asked[0]), atol=1e-9)
+    off = one.phase(walks[0])[:, 0] - phases[0]
+    assert np.median(np.abs((off + 0.5) % 1 - 0.5)) < 0.05
+
+
+def test_depth_is_used():
+    solid = [perform(action, Person.random(1), fps=8.0, rng=1) for action in ("squat", "kick")]
+    found = PhaseIndexer(harmonics=1).fit(solid)
+    assert found.predict([detect(clip, azimuth=70.0, rng=3) for clip in solid]).tolist() == ["squat", "kick"]
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ({"harmonics": 0}, "harmonics must be"),
+        ({"course": "often"}, "course must be"),
+        ({"window": -1.0}, "window must be"),
+        ({"device": "nowhere"}, "device 'nowhere'"),
+    ],
+)
+def test_bad_parameters(train, parameters, message):
+    with pytest.raises(ValueError, match=message):
+        PhaseIndexer(**parameters).fit(train)
+
+
+def test_bad_phases(train):
+    with pytest.raises(ValueError, match=r"one entry per clip \(6\), got 1"):
+        PhaseIndexer().fit(train, phases=[None])
+    with pytest.raises(ValueError, match="its phases have shape"):
+        PhaseIndexer().fit(train, phases=[np.zeros(3)] * 6)
+    with pytest.raises(ValueError, match="no period was found"):
+        PhaseIndexer(course="periodic").fit([Clip(np.random.default_rng(0).normal(size=(9, 17, 2)))] * 2, ["a", "b"])
