@@ -25,6 +25,7 @@ from indexing.checks import (
 )
 from indexing.clip import Clip
 from indexing.labels import joined, refuse, same_label
+from indexing.repair import mended
 from indexing.scoring import Event, probabilities, reject_threshold
 from indexing.shape.bank import Windows
 from indexing.shape.bodies import Layout, lifter_for, told_layout
@@ -291,7 +292,7 @@ class ActionIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
 
     # ---- long recordings ---------------------------------------------------------------------------------------------
     def _stream(self) -> Stream:
-        return Stream(self.length, self.window, tuple(self.tempi), self.pool, self.repair, self.device)
+        return Stream(self.length, self.window, tuple(self.tempi), self.pool, self.device)
 
     def scan(self, clip: Any, progress: Callable[[float], None] | None = None) -> tuple[Array, list[Event]]:
         """:meth:`score_frames` and :meth:`find` in one pass.
@@ -304,6 +305,7 @@ class ActionIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         model, stream = self._model(), self._stream()
         begin = float(found.times[0])
         found = found.replace(times=found.times - begin)  # rounding must not depend on what the clock shows
+        found = mended(found) if self.repair else found
         windows = scan(model, found, stream, progress)
         events = find_events(model, found, stream, windows, self.classes_, self.reject)
         events = [dataclasses.replace(event, start=event.start + begin, end=event.end + begin) for event in events]

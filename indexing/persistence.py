@@ -147,7 +147,8 @@ def _model(tensors: dict[str, Tensor], metadata: dict[str, Any], classes: int, l
 
     metric = JointMetric(tensors["metric"], float(tensors["metric_power"]))
     trained = "scales" in tensors
-    kernels = Kernels(JointMetric(metric.covariance, KERNEL_WHITENING), view == "same", tensors["scales"]) if trained else None
+    rich = view == "same" or layout is not None
+    kernels = Kernels(JointMetric(metric.covariance, KERNEL_WHITENING), rich, tensors["scales"]) if trained else None
     bodies = Bodies(windows("bodies"), layout) if layout is not None else None
     known, gain = metadata["known"], metadata["parts"]
     parts = JointWeights(tensors["parts.joints"], tensors["parts.channels"], tensors.get("parts.by_class"), *gain)

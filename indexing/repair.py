@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from indexing.clip import FloatArray
+from indexing.clip import Clip, FloatArray
 
 # How far windows are from those of uncorrupted clips, in % of their deviation, Florence3D at 90 degrees.  As they are: 5 % wrong
 # joints 33, 10 % 47, bursts of three 39, half the frames dropped 8.6.  Repaired so: 7.4, 14, 19, 8.9, and clean clips .09.
@@ -24,6 +24,7 @@ LIMIT = 4.0  # spreads of the neighbours: 6 finds less (8.6)
 USUAL, SHARE = 8.0, 0.8
 FLOOR = 0.01  # of the body: smaller steps are the noise of every detector
 LEAST = 5  # sightings: among fewer nobody can say which is wrong
+PART = 9000  # frames of a long recording that are judged together: 5 minutes at 30 per second
 PASSES = 2  # the second sees past what the first took out: bursts 21 -> 19; a third adds nothing
 CHUNK = 20_000  # sightings at once: bounds memory
 _A, _B = zip(*((a, b) for a, b in combinations(range(WIDTH), 2) if b - a > 1), strict=True)
@@ -76,6 +77,17 @@ def wrong_joints(joints: FloatArray, times: FloatArray, starts: NDArray[np.intp]
         asked = np.zeros_like(there)
         asked[frame[touched], joint[touched]] = True
     return wrong
+
+
+def mended(clip: Clip) -> Clip:
+    """A clip of any length without its wrong joints; judged in parts of :data:`PART` frames, which bounds memory."""
+    parts = np.append(np.arange(0, max(len(clip) - PART // 2, 1), PART), len(clip))
+    wrong = wrong_joints(clip.joints, clip.times, parts)
+    if not wrong.any():
+        return clip
+    joints = clip.joints.copy()
+    joints[wrong] = np.nan
+    return clip.replace(joints=joints)
 
 
 def _around(path: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from indexing.clip import Clip
 from indexing.scoring import Event, events, smooth
@@ -44,7 +43,6 @@ class Stream:
     window: float
     tempi: tuple[float, ...]
     pool: float
-    repair: bool
     device: str
 
 
@@ -101,7 +99,7 @@ def _around(clip: Clip, begin: float, end: float, stream: Stream) -> Ragged:
     margin = max(stream.tempi) * stream.window + MARGIN
     first = max(0, min(int(np.searchsorted(clip.times, begin - margin)), len(clip) - 2))
     last = max(int(np.searchsorted(clip.times, end + margin, side="right")), first + 2)
-    return ragged([clip.replace(joints=clip.joints[first:last], times=clip.times[first:last], confidence=None)], stream.repair)
+    return ragged([clip.replace(joints=clip.joints[first:last], times=clip.times[first:last], confidence=None)])
 
 
 def _windows(source: Ragged, middle: Array, seconds: float, length: int) -> Windows:

@@ -77,6 +77,10 @@ class Fit:
             )  # fmt: skip
             indexer.fit(clips, [str(clip.label) for clip in clips])
         seconds = time.perf_counter() - started
+        if self.weights == "learned" and (indexer.groups_ is None or len(set(indexer.groups_)) < 2):
+            notes.append(
+                "--weights learned: nobody could be left out (no field 'subject', or one person), so the usual weights stand"
+            )
         prepare(output.parent)
         indexer.save(output)
         page = None if folder is None else self._write(folder, indexer, clips, notes, paths)

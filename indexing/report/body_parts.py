@@ -85,7 +85,18 @@ def measure_body_parts(indexer: ActionIndexer, groups: ArrayLike | None = None) 
     numbers = None if groups is None else torch.from_numpy(np.unique(np.asarray(groups), return_inverse=True)[1])
     examples = [indexer.exemplar(int(i)) for i in typical(indexer.model_)]
     values = importance(indexer.model_, numbers).cpu().numpy()
-    return BodyParts(indexer.classes_.tolist(), values, examples, indexer.skeleton_)
+    return BodyParts(indexer.classes_.tolist(), values, examples, _named(indexer))
+
+
+def _named(indexer: ActionIndexer) -> Skeleton | None:
+    """The clips' skeleton, with the names of the layout that was told from the data where its own are numbers."""
+    own, layout = indexer.skeleton_, indexer.layout_
+    if layout is None or (own is not None and not all(name.isdigit() for name in own.joints)):
+        return own
+    if own is None:
+        usual = known(len(layout.joints))
+        return usual if usual is not None and usual.joints == layout.joints else Skeleton("told from the data", layout.joints)
+    return Skeleton(own.name, layout.joints, own.bones)
 
 
 def body_parts(parts: BodyParts, *, columns: int = COLUMNS, theme: Theme = LIGHT) -> bytes:
@@ -94,11 +105,11 @@ def body_parts(parts: BodyParts, *, columns: int = COLUMNS, theme: Theme = LIGHT
     Thin lines are the paths of the joints that matter most.  Without bones the joints are dots.
 
     Args:
-        columns: skeletons in a row.
+        columns: skeletons in a row at most.
     """
     number = len(parts.classes)
-    columns = max(1, min(columns, number))
-    rows = -(-number // columns)
+    rows = -(-number // max(1, columns))
+    columns = -(-number // rows)  # rows of about the same length
     width, height = PANEL[0] * columns + 0.2, PANEL[1] * rows + 0.42
     names = shorten_all(parts.classes, 20)
     with style(theme):
@@ -163,7 +174,8 @@ def _person(axes: Any, parts: BodyParts, index: int, theme: Theme) -> None:
     usual = np.nan_to_num(everyone).sum(axis=0) / np.maximum((~np.isnan(everyone)).sum(axis=0), 1)
     pose = points[telling_pose(in_body(points), usual, share)]
     colours = _colours(theme)
-    for joint in np.argsort(share)[-TRAIL:]:
+    paths = np.argsort(share)[-TRAIL:]
+    for joint in paths:
         axes.plot(*points[:, joint].T, color=colours(share[joint]), linewidth=0.9, alpha=0.55, zorder=1, solid_capstyle="round")
     face = _face(parts.skeleton, len(pose)) & ~np.isnan(pose).any(axis=1)
     _draw_bones(axes, pose, share, _bones(parts.skeleton), colours)
@@ -175,7 +187,7 @@ def _person(axes: Any, parts: BodyParts, index: int, theme: Theme) -> None:
     order = np.argsort(values)
     colour = colours(values[order])
     axes.scatter(*dots[order].T, s=np.square(size[order]), c=colour, edgecolors=theme.paper, linewidths=0.6, zorder=4)
-    _frame(axes, pose, points)
+    _frame(axes, np.concatenate([pose, points[:, paths].reshape(-1, 2)]), points)
 
 
 def _draw_bones(axes: Any, pose: Array, share: Array, bones: Sequence[tuple[int, int]], colours: Any) -> None:
@@ -200,10 +212,10 @@ def _points(clip: Clip) -> Array:
     return np.asarray(points[~np.isnan(points).all(axis=(1, 2))])
 
 
-def _frame(axes: Any, pose: Array, points: Array) -> None:
-    """Limits around the pose; the same margin for everyone, and paths that leave it are cut."""
+def _frame(axes: Any, shown: Array, points: Array) -> None:
+    """Limits around the pose and the paths; the same margin for everyone."""
     height = np.nanmedian(np.nanmax(points[..., 1], axis=1) - np.nanmin(points[..., 1], axis=1))
-    low, high = np.nanmin(pose, axis=0), np.nanmax(pose, axis=0)
+    low, high = np.nanmin(shown, axis=0), np.nanmax(shown, axis=0)
     middle = (low + high) / 2
     half = 0.58 * max(float(height), float(high[1] - low[1]), float(high[0] - low[0]) * PANEL[1] / PANEL[0], 1e-9)
     aspect = PANEL[0] / (PANEL[1] - 0.24)

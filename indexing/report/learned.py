@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from indexing import files
+from indexing.actors.layouts import LAYOUTS
 from indexing.report.body_parts import BodyParts, body_parts, body_parts_section, measure_body_parts
 from indexing.report.page import Card, Column, cards, details, escape, made_by, page, section, settings, table
 
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from indexing.indexer import ActionIndexer
 
 PICTURE = "body_parts.png"
+NOBODY = "Nobody could be left out (the clips have no field 'subject', or it is one person): the usual weights stand."
 
 
 def write_learned(
@@ -56,12 +58,18 @@ def _summary(indexer: ActionIndexer, clips: Sequence[Clip]) -> str:
     seconds = sum(clip.duration for clip in clips)
     words = [f"{len(indexer.classes_)} actions were learned from {len(clips)} clips ({seconds:.0f} s in all)."]
     if indexer.weights == "learned":
-        people = 0 if indexer.groups_ is None else len(set(indexer.groups_.tolist()))
-        if people > 1:
+        people = people_left_out(indexer)
+        if people:
             words.append(f"How the evidence is weighed was chosen by what serves people best who are left out ({people} people).")
         else:
-            words.append("Nobody could be left out (who performs is not known, or it is one person): the usual weights stand.")
+            words.append(NOBODY)
     return " ".join(words)
+
+
+def people_left_out(indexer: ActionIndexer) -> int:
+    """How many people the weights were learned from by leaving each out; 0 where nobody could be."""
+    people = 0 if indexer.groups_ is None else len(set(indexer.groups_.tolist()))
+    return people if people > 1 else 0
 
 
 def _headline(indexer: ActionIndexer, clips: Sequence[Clip]) -> list[Card]:
@@ -80,10 +88,14 @@ def _weighing(indexer: ActionIndexer) -> str:
     """What each kind of evidence weighs."""
     model, blend = indexer.model_, indexer.model_.blend
     total = blend.kernel + blend.nearest
-    depth = "guessed from synthetic people of the same joints" if model.bodies is not None else "none: flat cards"
+    depth = "none: flat cards"
+    if indexer.layout_ is not None:
+        name = next((name for name, joints in LAYOUTS.items() if joints == indexer.layout_.joints), "these names")
+        depth = f"guessed, from synthetic people with the joints of {name}"
     if bool(model.exemplars.solid.any()):
         depth = "of the 3D examples"
-    learned = "yes" if model.parts.learned else "no: equal weights serve people best who are left out"
+    equal = "no: equal weights serve people best who are left out" if people_left_out(indexer) else "no: nobody could be left out"
+    learned = "yes" if model.parts.learned else equal
     shares = {"nearest": blend.nearest / total, "kernel": blend.kernel / total}
     if model.scorer != "both":
         shares = {name: float(name == model.scorer) for name in shares}

@@ -15,14 +15,15 @@ import torch
 from torch import Tensor
 
 from indexing.shape.bank import Windows
-from indexing.shape.exemplars import Exemplars
+from indexing.shape.lifting import lift_views
 from indexing.shape.machine import PairwiseMachine
 from indexing.shape.model import Blend, ShapeModel, class_scores, standardized
+from indexing.shape.views import PITCH, turn
 
 BLENDS = ((1.0, 0.0), (1.0, 0.25), (1.0, 0.5), (1.0, 1.0), (1.0, 1.5), (1.0, 3.0), (0.0, 1.0))  # of B and A
 SHARPNESSES = tuple(float(2 ** (k / 4)) for k in range(-4, 17))  # .5 .. 16
 FOLDS = 5  # groups of people whose machines are trained
-VIEWS = 3  # virtual views asked per exemplar, besides the image itself
+VIEWS = 4  # virtual views asked per exemplar, besides the image itself
 NOISE = 0.01  # of the body height, on asked views: without it the kernel machine looks too good
 
 
@@ -60,7 +61,7 @@ def learn_blend(model: ShapeModel, groups: Tensor, trained: Trained | None) -> B
     usable = ((folds[:, None] != folds[None]) & (labels[:, None] == labels[None])).any(dim=1)
     if int(folds.max()) < 1 or not bool(usable.any()):
         return model.blend
-    asked = asked_views(model.exemplars)
+    asked = asked_views(model)
     views = []
     for windows in asked:
         found = []
@@ -85,17 +86,28 @@ def _out(residuals: Tensor, model: ShapeModel, folds: Tensor) -> Tensor:
     return torch.where(known, scores, least.nan_to_num(posinf=0.0))
 
 
-def asked_views(exemplars: Exemplars) -> list[Windows]:
-    """The exemplars as they are and in some virtual views, each a bit wrong, as a detector's are."""
-    count = len(exemplars)
-    views = [exemplars.view(i) for i in range(min(VIEWS, len(exemplars.views) // count))]
-    generator = torch.Generator().manual_seed(0)
-    asked = [exemplars.crop(0)]
-    for view in views:
-        heights = view.values[..., 1]
-        size = (heights.amax(dim=2) - heights.amin(dim=2)).median(dim=1).values
-        noise = torch.randn(view.values.shape, generator=generator, dtype=view.values.dtype)
-        asked.append(Windows(view.values + NOISE * size[:, None, None, None] * noise, view.seen))
+def asked_views(model: ShapeModel) -> list[Windows]:
+    """The exemplars as they are and in some virtual views, each a bit wrong, as a detector's are.
+
+    Whole exemplars, as queries are: asked of their crops, which the machine was trained on, it looks too good.
+    """
+    rng, whole = np.random.default_rng(0), model.exemplars.crop(0)
+    count = len(whole)
+    asked = [whole]
+    for i in range(VIEWS):
+        azimuth, pitch = rng.uniform(0, 2 * np.pi, count), rng.normal(scale=PITCH, size=count)
+        if bool(model.exemplars.solid.any()):
+            if i >= len(model.exemplars.views) // count:
+                break
+            values = model.exemplars.view(i).values
+        elif model.bodies is not None:
+            solid = model.bodies.windows.values[:count]
+            values = lift_views(solid[..., :2], solid[..., 2], azimuth, pitch)
+        else:
+            values = turn(whole.values, azimuth, pitch)
+        size = (values[..., 1].amax(dim=2) - values[..., 1].amin(dim=2)).median(dim=1).values
+        noise = torch.from_numpy(rng.normal(size=values.shape)).to(values)
+        asked.append(Windows(values + NOISE * size[:, None, None, None] * noise, whole.seen))
     return asked
 
 

@@ -68,13 +68,13 @@ def learn(exemplars: Exemplars, labels: Tensor, classes: int, lesson: Lesson) ->
         bodies = Bodies(stack([lifted(copy, lesson.layout) for copy in model.copies()]), lesson.layout)
         model = dataclasses.replace(model, bodies=bodies)
     model = _with_hubs(model, originals, lesson.groups)
-    if lesson.learned and lesson.view == "any":
+    if lesson.learned and lesson.view == "any" and lesson.groups is not None:
         parts = _parts(model, lesson)
         if parts.learned:
             model = _with_hubs(dataclasses.replace(model, parts=parts, hub=torch.zeros(len(labels))), originals, lesson.groups)
     trained = None
     if lesson.scorer != "nearest":
-        model, trained = _with_machine(model, rich=lesson.view == "same")
+        model, trained = _with_machine(model, rich=lesson.view == "same" or lesson.layout is not None)
     if lesson.learned and lesson.groups is not None:
         model = dataclasses.replace(model, blend=learn_blend(model, lesson.groups, trained))
     return model
@@ -82,7 +82,7 @@ def learn(exemplars: Exemplars, labels: Tensor, classes: int, lesson: Lesson) ->
 
 def _parts(model: ShapeModel, lesson: Lesson) -> JointWeights:
     """How much each joint counts, learned across virtual views that have depth: of turned cards nothing can be learned."""
-    asked = asked_views(model.exemplars)[1:]
+    asked = asked_views(model)[1:]
     if not asked or (lesson.layout is None and not bool(model.exemplars.solid.all())):
         return model.parts
     owner = torch.arange(len(model.labels)).repeat(len(asked))

@@ -12,6 +12,7 @@ from indexing.scoring import probabilities
 from indexing.shape.bank import Windows, fused_residual
 from indexing.shape.blending import BLENDS, _fewest_mistakes, _sharpened, blended, leave_out
 from indexing.shape.channels import JointMetric
+from indexing.shape.joint_weights import JointWeights
 from indexing.shape.knowing import Known, features, learn_known, without_own
 from indexing.shape.model import Blend
 
@@ -21,6 +22,16 @@ ACTIONS = ("squat", "wave", "kick", "bow", "punch")
 @pytest.fixture(scope="module")
 def lesson():
     return dataset([Person.random(i) for i in range(3)], ACTIONS, azimuth=0.0, rng=1)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def equal_joints():
+    """The weights of joints take seconds to learn, and have tests of their own."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            "indexing.shape.learning.learn_joint_weights", lambda query, *_, **__: JointWeights.equal(query.values.shape[2])
+        )
+        yield
 
 
 @pytest.fixture(scope="module")
