@@ -96,6 +96,9 @@ def gather_groups(clips: list[Clip], owners: list[int], groups: ArrayLike | None
         values = np.asarray(groups)
         if values.ndim != 1 or len(values) != owners[-1] + 1:
             raise ValueError(f"groups: expected one per clip ({owners[-1] + 1}), got shape {values.shape}")
+        nobody = [i for i, value in enumerate(values.tolist()) if _missing(value)]
+        if nobody:
+            raise ValueError(f"groups: who performs clip {nobody[0]} is missing; give every clip a group, or none of them")
         return values[owners].astype(str)
     if any("subject" not in clip.meta for clip in clips):
         return None
@@ -162,10 +165,15 @@ def check_parameters(indexer: Any) -> None:
         raise ValueError(
             f"random_state must be None, a whole number from 0, or a generator, got {indexer.random_state!r} ({error})"
         ) from None
+    check_device(indexer.device)
+
+
+def check_device(device: str) -> None:
+    """Raise where there is no such device."""
     try:
-        torch.empty(0, device=indexer.device)
+        torch.empty(0, device=device)
     except (RuntimeError, AssertionError) as error:
-        raise ValueError(f"device {indexer.device!r} is not there: {str(error).splitlines()[0]}; use device='cpu'") from None
+        raise ValueError(f"device {device!r} is not there: {str(error).splitlines()[0]}; use device='cpu'") from None
 
 
 def _check_numbers(indexer: Any) -> None:

@@ -171,6 +171,9 @@ class ActionIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         check_parameters(self)
         found, owners = gather(clips, self.fps, self.n_joints_)
         people = gather_groups(found, owners, groups)
+        if self.weights == "learned" and (people is None) != (self.groups_ is None):
+            here, there = ("these clips", "the earlier ones") if people is not None else ("the earlier clips", "these")
+            raise ValueError(f"groups: {here} say who performs, {there} do not; give groups=, or clips with the field 'subject'")
         both = None if people is None or self.groups_ is None else np.concatenate([self.groups_, people])
         values = gather_labels(found, owners, labels)
         old = self.classes_[self.model_.labels.numpy()]

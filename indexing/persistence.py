@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from indexing.checks import check_parameters
+from indexing.checks import check_device, check_parameters
 from indexing.modelfile import AGAIN, labels_from_json, labels_to_json, read_model, write_model
 from indexing.shape.bank import NEAREST, Kernels, Windows
 from indexing.shape.bodies import Bodies, Layout
@@ -57,9 +57,11 @@ def save(indexer: ActionIndexer, path: str | Path) -> None:
 
 def load(kind: type[Indexer], path: str | Path, device: str = "cpu") -> Indexer:
     """Read a fitted indexer; see :meth:`indexing.ActionIndexer.load`."""
+    check_device(device)
     metadata, tensors = read_model(path, FORMAT, VERSION)
     try:
-        indexer = kind(**metadata["parameters"], device=device)
+        parameters = metadata["parameters"]
+        indexer = kind(**{**parameters, "tempi": tuple(parameters["tempi"])}, device=device)
         indexer.classes_ = labels_from_json(metadata["classes"])
         indexer.n_joints_ = int(metadata["joints"])
         name, joints, bones = metadata["skeleton"] or (None, (), ())

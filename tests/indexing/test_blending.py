@@ -65,7 +65,7 @@ def test_sharpness_is_the_likeliest():
     draw = torch.Generator().manual_seed(1)
     truth = torch.arange(4).repeat(50)
     scores = torch.nn.functional.one_hot(truth, 4).double() + torch.randn(200, 4, generator=draw, dtype=torch.float64)
-    found = _sharpened(Blend(), scores, truth).sharpness
+    found = _sharpened(Blend(), scores, truth, 10**6).sharpness
 
     def likelihood(sharpness):
         chance = probabilities(scores.numpy(), sharpness)
@@ -73,6 +73,9 @@ def test_sharpness_is_the_likeliest():
 
     assert likelihood(found) >= max(likelihood(found * 1.19), likelihood(found / 1.19))
     assert likelihood(found) > likelihood(8.0)
+    certain = 5.0 * torch.nn.functional.one_hot(truth, 4).double()  # nobody was ever wrong: the fewer asked, the less it says
+    few, many = (_sharpened(Blend(), certain, truth, exemplars).sharpness for exemplars in (8, 800))
+    assert few < many < 16
 
 
 def test_blended_is_the_weighted_sum():
