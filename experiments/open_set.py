@@ -168,10 +168,12 @@ def run(config: Config) -> None:
     Raises:
         ValueError: no data folder, nothing held out or too much, a rate that is none, or a method that cannot be made.
     """
-    if config.draws < 1 or not 1 <= config.held_out <= 7 or not all(0 < rate < 1 for rate in config.rates):
-        raise ValueError(
-            f"draws at least 1, held-out 1 to 7 and rates between 0 and 1, got {config.draws}, {config.held_out}, {config.rates}"
-        )
+    if config.draws < 1 or not 1 <= config.held_out <= 7:
+        raise ValueError(f"draws must be at least 1 and held-out 1 to 7, got draws={config.draws}, held-out={config.held_out}")
+    if not config.rates or not all(0 < rate < 1 for rate in config.rates):
+        raise ValueError(f"rates must be between 0 and 1, at least one, got {config.rates}")
+    if not config.turns or not config.sets:
+        raise ValueError("turns and sets must name at least one each")
     check_methods(config.methods)
     folder = protocol.data_folder()
     book = Book(config.out)

@@ -60,7 +60,7 @@ class FeatureIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         classes, numbers = np.unique(labels, return_inverse=True)
         if len(classes) < 2:
             raise ValueError(f"labels: only one class ({classes[0]!r}); give clips of at least two actions")
-        if not self.width > 0:
+        if not (isinstance(self.width, (int, float, np.number)) and 0 < self.width < np.inf):
             raise ValueError(f"width must be a positive number, got {self.width!r}")
         vectors = torch.tensor(table)
         distances = cosine_distance(vectors, vectors)

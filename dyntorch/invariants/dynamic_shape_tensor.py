@@ -271,6 +271,8 @@ class DynamicShapeTensor(Invariant):
         measured = constellations(self, points)
         seen = measured[..., 2] if weights is None else measured[..., 2] * weights
         shapes = self.shapes(tensor.double())
+        if reach < 0:
+            raise ValueError(f"reach must be 0 or more half lengths of the interval, got {reach!r}")
         found = recover_times(shapes, self.trajectory, measured[..., :2], seen, grid=grid, interval=(-reach, reach))
         if self.interval is None:
             return found

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from indexing.cli.console import Progress, progress, say, table
-from indexing.cli.films import Pixels, are_films
+from indexing.cli.films import Pixels, are_films, refuse_film_flags
 from indexing.cli.inputs import Reading, assumed, usable
 from indexing.cli.outputs import check_report
 
@@ -109,6 +109,7 @@ class Evaluate:
     def _load(self) -> tuple[LabelledSet[Any], Viewing, list[str]]:
         from indexing.cli.protocol import Cameras, check_dims
 
+        refuse_film_flags(self.pixels)
         clips = self.reading.read(self.clips)
         if all(clip.label is None for clip in clips):
             raise ValueError(f"{self.clips}: says nothing of the actions; give a clip set with 'action' (and 'action_names')")

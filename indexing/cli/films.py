@@ -48,6 +48,14 @@ class Pixels:
         return (x0, y0, x1, y1)
 
 
+def refuse_film_flags(pixels: Pixels) -> None:
+    """Raise where a flag is set that says nothing of keypoints."""
+    given = [name for name, field in Pixels.__dataclass_fields__.items() if getattr(pixels, name) != field.default]
+    if given:
+        listed = names([f"--{name.replace('_', '-')}" for name in given])
+        raise ValueError(f"{listed}: of videos only, but the inputs are keypoints; leave it away")
+
+
 def are_films(paths: Sequence[Path]) -> bool:
     """Whether the inputs are videos or film sets, not keypoints.
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from indexing.cli.console import count, names, progress, say, table
-from indexing.cli.films import Pixels, are_films
+from indexing.cli.films import Pixels, are_films, refuse_film_flags
 from indexing.cli.inputs import Example, Reading, parse_example, read_examples
 from indexing.cli.outputs import check_file, check_report
 
@@ -63,6 +63,7 @@ class Fit:
         output, folder = check_file(self.output, paths), check_report(self.report, paths)
         if are_films(paths):
             return self._from_pixels(examples, output)
+        refuse_film_flags(self.pixels)
         with progress("reading", steps=False):
             clips, notes = read_examples(examples, self.reading, self.select)
         _check_two([str(clip.label) for clip in clips], examples)

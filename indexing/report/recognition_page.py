@@ -66,7 +66,10 @@ def describe(report: RecognitionReport, measured: Mapping[str, Any]) -> str:
         )
         if len(by_setting) > 1:
             best, worst = max(by_setting, key=by_setting.__getitem__), min(by_setting, key=by_setting.__getitem__)
-            words.append(f"Best setting: {best} ({_percent(by_setting[best])}); worst: {worst} ({_percent(by_setting[worst])}).")
+            if by_setting[best] > by_setting[worst]:
+                words.append(
+                    f"Best setting: {best} ({_percent(by_setting[best])}); worst: {worst} ({_percent(by_setting[worst])})."
+                )
     return " ".join(words)
 
 
