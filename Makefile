@@ -35,6 +35,7 @@ bench: install
 	$(BIN)/python -m experiments.benchmarks.segmentation
 	$(BIN)/python -m experiments.benchmarks.synchronization
 	$(BIN)/python -m experiments.benchmarks.action_indexer
+	$(BIN)/python -m experiments.benchmarks.brightness_indexer
 
 tables: install
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[experiments]'
@@ -57,6 +58,14 @@ tables: install
 	$(BIN)/python -m experiments.real_space
 	$(BIN)/python -m experiments.action_recognition
 	$(BIN)/python -m experiments.action_baselines
+	$(BIN)/python -m experiments.dynamic_shape
+	$(BIN)/python -m experiments.recognition_protocol
+	$(BIN)/python -m experiments.open_set
+	$(BIN)/python -m experiments.detection
+	$(BIN)/python -m experiments.robustness
+	$(BIN)/python -m experiments.gait
+	$(BIN)/python -m experiments.brightness_indexing
+	$(BIN)/python -m experiments.gestures
 
 docs: install
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs]'

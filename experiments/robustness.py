@@ -112,7 +112,9 @@ def run(config: Config) -> None:
     """
     unknown = [kind for kind in config.kinds if kind not in KINDS]
     if unknown or not config.kinds or config.seeds < 1:
-        raise ValueError(f"kinds must be some of {', '.join(map(repr, KINDS))} and seeds at least 1, got {config.kinds}, {config.seeds}")
+        raise ValueError(
+            f"kinds must be some of {', '.join(map(repr, KINDS))} and seeds at least 1, got {config.kinds}, {config.seeds}"
+        )
     check_methods(config.methods)
     book = Book(config.out)
     with threads(1):

@@ -72,8 +72,8 @@ def _fill(joints: FloatArray, there: NDArray[np.bool_], times: FloatArray, first
     return np.where(there[..., None], joints, filled)
 
 
-def check_clips(clips: Sequence[Clip], joints: int | None = None, items: Sequence[int] | None = None) -> None:
-    """Raise where a clip cannot be compared; ``items``: the numbers that the user knows the clips by.
+def check_clips(clips: Sequence[Clip], joints: int | None = None, items: Sequence[int] | None = None, fewest: int = 2) -> None:
+    """Raise where a clip cannot be compared; ``items``: the numbers that the user knows the clips by; ``fewest``: frames of each.
 
     Raises:
         ValueError: naming the clip: fewer than two frames, no joint ever seen, all joints at one place, or a number of
@@ -85,14 +85,14 @@ def check_clips(clips: Sequence[Clip], joints: int | None = None, items: Sequenc
         if clip.joints.shape[1] != expected:
             other = "the fitted clips have" if joints is not None else "clip 0 has"
             raise ValueError(f"{who}: joints: {clip.joints.shape[1]} joints, but {other} {expected}; use clips of one joint layout")
-        reason = unusable(clip)
+        reason = unusable(clip, fewest)
         if reason:
             raise ValueError(f"{who}: joints: {reason}; leave the clip out")
 
 
-def unusable(clip: Clip) -> str | None:
-    """Why a clip cannot be compared with others, or ``None``."""
-    if len(clip) < 2:
+def unusable(clip: Clip, fewest: int = 2) -> str | None:
+    """Why a clip cannot be compared with others, or ``None``; ``fewest``: frames it must have."""
+    if len(clip) < fewest:
         return "one frame only, but an action needs at least two"
     if np.isfinite(clip.joints[0]).all() and (clip.joints[0] != clip.joints[0, 0]).any():
         return None  # the common case, without looking at every frame

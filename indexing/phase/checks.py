@@ -9,7 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from indexing.checks import check_device
 from indexing.clip import Clip
+from indexing.labels import same_label
+from indexing.phase.calibration import FEWEST
 
 _CHOICES: dict[str, tuple[Any, ...]] = {"course": ("auto", "periodic", "once"), "mirror": ("auto", True, False)}
 
@@ -24,12 +27,28 @@ def check_phase_parameters(indexer: Any) -> None:
         raise ValueError(f"harmonics must be a whole number from 1 to 12, got {harmonics!r}")
     for name, least in (("fps", 1e-9), ("window", 0.0)):
         value = getattr(indexer, name)
-        if not (isinstance(value, (int, float, np.integer, np.floating)) and np.isfinite(value) and value >= least):
+        if not (_number(value) and value >= least):
             raise ValueError(f"{name} must be {'a positive number' if name == 'fps' else 'seconds, 0 or more'}, got {value!r}")
-    try:
-        torch.empty(0, device=indexer.device)
-    except (RuntimeError, AssertionError) as error:
-        raise ValueError(f"device {indexer.device!r} is not there: {str(error).splitlines()[0]}; use device='cpu'") from None
+    if indexer.reject is not None and not _number(indexer.reject):
+        raise ValueError(f"reject must be None, a rate between 0 and 1 or a threshold, got {indexer.reject!r}")
+    check_device(indexer.device)
+
+
+def _number(value: Any) -> bool:
+    return isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool) and bool(np.isfinite(value))
+
+
+def check_reject(indexer: Any, classes: list[Any]) -> None:
+    """Raise where a rate cannot be calibrated, or a refused clip would look like a known one."""
+    if indexer.reject is None:
+        return
+    if any(same_label(value, indexer.none_label) for value in classes):
+        raise ValueError(f"none_label={indexer.none_label!r} is one of the learned labels; choose another for rejected clips")
+    if 0 < indexer.reject < 1 and len(classes) < FEWEST:
+        raise ValueError(
+            f"reject={indexer.reject!r} is calibrated by leaving a class out, which takes {FEWEST} classes, got {len(classes)}; "
+            "give further ones, or a threshold outside 0..1"
+        )
 
 
 def check_phases(phases: Sequence[Any] | None, clips: list[Clip], owners: list[int]) -> list[Tensor | None]:

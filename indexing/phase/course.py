@@ -7,6 +7,7 @@ Maximum likelihood (:func:`dyntorch.fit_shapes`) has the least residual on the f
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -14,7 +15,7 @@ from torch import Tensor
 
 from dyntorch import Fourier, Polynomial
 from indexing.phase.frames import shape_distance, standardized
-from indexing.shape.bank import Windows
+from indexing.shape.bank import Windows, stack
 
 RIDGE = 1e-4  # of the mean diagonal of the normal matrix; 1e-5 is as good, 1e-3 costs .5 and 1e-2 4 degrees
 ROUNDS, AGAIN = 30, 8  # alternations from the mean shape, and after every change of styles
@@ -39,12 +40,19 @@ class Course:
     def bank(self, grid: int = GRID) -> Windows:
         """The shapes of all styles at all phases of the grid, style by style."""
         rows = basis_of(self.periodic, self.shapes.shape[1]).rows(_argument(phases(grid, self.periodic), self.periodic))
-        values = torch.einsum("gb,sbnk->sgnk", rows.to(self.shapes), self.shapes).flatten(0, 1)
+        values = torch.cat([_at(rows.to(self.shapes), shapes) for shapes in self.shapes])
         return Windows(values[:, None], self.seen.expand(len(values), -1))
 
     def curve(self, query: Windows, grid: int = GRID) -> Tensor:
         """``(Q, grid)`` what is left of every frame at every phase, in the style that leaves least."""
-        return shape_distance(query, self.bank(grid)).unflatten(1, (len(self.shapes), grid)).amin(1)
+        return curves(query, [self], grid)[0]
+
+
+def curves(query: Windows, courses: Sequence[Course], grid: int = GRID) -> list[Tensor]:
+    """:meth:`Course.curve` of several courses in one pass."""
+    left = shape_distance(query, stack([course.bank(grid) for course in courses]))
+    parts = left.split([grid * len(course.shapes) for course in courses], 1)
+    return [part.unflatten(1, (-1, grid)).amin(1) for part in parts]
 
 
 def basis_of(periodic: bool, size: int) -> Fourier | Polynomial:
@@ -114,7 +122,7 @@ def _cameras(x: Tensor, weight: Tensor, at: Tensor) -> Tensor:
 
 def _left(x: Tensor, weight: Tensor, rows: Tensor, shapes: Tensor) -> Tensor:
     """``(F,)`` weighted squared residual of every frame."""
-    at = torch.einsum("fb,bnk->fnk", rows, shapes)
+    at = _at(rows, shapes)
     cameras = _cameras(x, weight, at)
     return ((x - at @ cameras[:, :3] - cameras[:, 3:]).square() * weight[..., None]).sum((1, 2))
 
@@ -123,17 +131,21 @@ def _alternated(x: Tensor, weight: Tensor, rows: Tensor, shapes: Tensor, rounds:
     frames, n = weight.shape
     eye = torch.eye(3 * rows.shape[1], dtype=x.dtype)
     for _ in range(rounds):
-        at = torch.einsum("fb,bnk->fnk", rows, shapes)
-        cameras = _cameras(x, weight, at)
-        design = torch.einsum("fb,fkd->fdbk", rows, cameras[:, :3]).reshape(frames, 2, -1)
+        cameras = _cameras(x, weight, _at(rows, shapes))
+        design = (rows[:, None, :, None] * cameras[:, :3].mT[:, :, None]).flatten(2)  # (F, 2, 3 B)
         gram = (weight.mT @ (design.mT @ design).flatten(1)).unflatten(1, eye.shape)
-        right = torch.einsum("fn,fdp,fnd->np", weight, design, x - cameras[:, 3:])
+        right = ((x - cameras[:, 3:]) * weight[..., None]).permute(1, 0, 2).flatten(1) @ design.flatten(0, 1)
         gram = gram + RIDGE * gram.diagonal(dim1=1, dim2=2).mean(-1).clamp(min=1e-12)[:, None, None] * eye
         shapes = torch.linalg.solve(gram, right).reshape(n, -1, 3).transpose(0, 1)
         # the affine frame is free: unit covariance keeps the ridge meaningful
-        at = torch.einsum("fb,bnk->fnk", rows, shapes)
-        at = at - at.mean(1, keepdim=True)
-        spread = torch.einsum("fnk,fnl->kl", at, at) / frames
+        at = _at(rows, shapes)
+        at = (at - at.mean(1, keepdim=True)).flatten(0, 1)
+        spread = at.mT @ at / frames
         factor = torch.linalg.cholesky_ex(spread + 1e-9 * spread.trace() * torch.eye(3, dtype=x.dtype))[0]
         shapes = torch.linalg.solve_triangular(factor, shapes.mT, upper=False).mT
     return shapes
+
+
+def _at(rows: Tensor, shapes: Tensor) -> Tensor:
+    """``(F, n, 3)`` the shape of every frame."""
+    return (rows @ shapes.flatten(1)).unflatten(1, shapes.shape[1:])

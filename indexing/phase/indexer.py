@@ -15,20 +15,18 @@ from torch import Tensor
 
 from indexing.checks import check_labels, check_queries, gather, gather_labels
 from indexing.clip import Clip
-from indexing.phase.checks import check_phase_parameters, check_phases
-from indexing.phase.frames import images, query_frames
+from indexing.labels import refuse
+from indexing.phase.calibration import SECOND, event_levels
+from indexing.phase.checks import check_phase_parameters, check_phases, check_reject
+from indexing.phase.frames import LEAST, images, query_frames
 from indexing.phase.learning import learn_model
 from indexing.phase.model import PhaseModel
 from indexing.phase.smoothing import smooth_phases
-from indexing.scoring import Event, events, probabilities, smooth
+from indexing.scoring import Event, events, probabilities, reject_threshold, smooth
+from indexing.shape.bank import stack
 from indexing.shape.symmetry import mirror_permutation
 
 Array = NDArray[Any]
-FINDING = 1.0  # seconds that scores are averaged over before events are cut from them
-FLOOR, PEAK = (
-    0.0,
-    0.3,
-)  # of the mean score, throughout and somewhere in an event: 0 = as near to other actions' frames as to its own
 
 
 class PhaseIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
@@ -43,16 +41,21 @@ class PhaseIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
     Args:
         harmonics: of the series of an action that repeats; polynomials have twice the degree.
         course: ``"auto"``: an action repeats where its clips do; ``"periodic"``; ``"once"``: from the start of a clip to its end.
+        reject: ``None``: closed set.  A number between 0 and 1: the rate at which a second of an unknown action may be taken for a
+            known one, calibrated by leaving each class out (three classes at least).  Any other number: the least
+            :meth:`evidence` that is accepted.
+        none_label: what :meth:`predict` answers for a rejected clip.
+        fps: frame rate of clips given as arrays.
         mirror: ``"auto"``: where an action half a cycle later is its own mirror image (gait), frames also count mirrored;
             ``True``: in every action that repeats; ``False``: never.
         window: seconds of neighbours that a frame's score and phase are averaged over; 0: every frame from itself alone.
-        fps: frame rate of clips given as arrays.
         device: where to compare, e.g. ``"cuda"``.
 
     Attributes:
         classes_: ``(classes,)`` labels as given.  periodic_: ``(classes,)`` which of them repeat.
         mirrored_: ``(classes,)`` which of them are their own mirror image half a cycle later.
         n_joints_: joints per frame.  model_: the learned :class:`~indexing.phase.model.PhaseModel`.
+        reject_threshold_: evidence below it is rejected, or ``None``.
 
     Example:
         >>> from indexing.actors import dataset
@@ -69,17 +72,21 @@ class PhaseIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         self,
         harmonics: int = 4,
         course: str = "auto",
+        reject: float | None = None,
+        none_label: Any = -1,
+        fps: float = 30.0,
         *,
         mirror: str | bool = "auto",
         window: float = 0.0,
-        fps: float = 30.0,
         device: str = "cpu",
     ) -> None:
         self.harmonics = harmonics
         self.course = course
+        self.reject = reject
+        self.none_label = none_label
+        self.fps = fps
         self.mirror = mirror
         self.window = window
-        self.fps = fps
         self.device = device
 
     def fit(self, clips: Iterable[Any], labels: ArrayLike | None = None, phases: Sequence[Any] | None = None) -> Self:
@@ -99,8 +106,13 @@ class PhaseIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         items = list(clips) if isinstance(clips, Iterable) and not isinstance(clips, (Clip, str, bytes)) else clips
         found, owners = gather(items, self.fps)
         values = gather_labels(found, owners, labels)
+        if found[0].joints.shape[1] < LEAST:
+            raise ValueError(
+                f"clips: {found[0].joints.shape[1]} joints, but a frame needs {LEAST} to tell its phase; give more joints"
+            )
         given = check_phases(phases, found, owners)
         classes, numbers = np.unique(values, return_inverse=True)
+        check_reject(self, classes.tolist())
         skeleton = next((clip.skeleton for clip in found if clip.skeleton is not None), None)
         views, which = [], []
         for k, clip in enumerate(found):
@@ -123,14 +135,15 @@ class PhaseIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         self.mirrored_ = np.array(mirrored)
         self.n_joints_ = int(found[0].joints.shape[1])
         self.skeleton_ = skeleton
+        self.reject_threshold_ = reject_threshold(self.reject, model.wrong)
         return self
 
     # ---- single frames -----------------------------------------------------------------------------------------------
     def analyse(self, clip: Any) -> tuple[Array, Array]:
         """:meth:`score_frames` and :meth:`phase` in one pass."""
         check_is_fitted(self, "model_")
-        (found,) = check_queries([clip], self.fps, self.n_joints_)
-        scores, phase = (part.cpu().numpy() for part in self._evidence(found))
+        (found,) = check_queries([clip], self.fps, self.n_joints_, fewest=1)
+        scores, phase = (part.cpu().numpy() for part in self._evidence([found]))
         if self.window > 0:
             phase = smooth_phases(phase, found.times, self.window, self.periodic_)
             scores = smooth(scores, found.times, self.window)
@@ -148,28 +161,38 @@ class PhaseIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         """``(frames, classes)`` where in each action the frame would be, were it of that action.
 
         In [0, 1) of the cycle of an action that repeats; from 0, its start, to 1, its end, in one that does not; NaN where fewer
-        than six joints are seen.
+        than six joints are seen.  Where an action goes the same way back (a squat), one frame cannot tell down from up.
         """
         return self.analyse(clip)[1]
 
-    def _evidence(self, clip: Clip) -> tuple[Tensor, Tensor]:
-        return self.model_.to(self.device).evidence(query_frames(clip).to(self.device))
+    def _evidence(self, clips: Sequence[Clip]) -> tuple[Tensor, Tensor]:
+        """Scores and phases of all frames, end to end."""
+        return self.model_.to(self.device).evidence(stack([query_frames(clip) for clip in clips]).to(self.device))
 
     # ---- clips -------------------------------------------------------------------------------------------------------
     def decision_function(self, clips: Iterable[Any]) -> Array:
         """``(clips, classes)`` mean of the frames' scores; columns are ``classes_``."""
         check_is_fitted(self, "model_")
-        found = check_queries(clips, self.fps, self.n_joints_)
-        return np.stack([self._evidence(clip)[0].mean(0).cpu().numpy() for clip in found])
+        found = check_queries(clips, self.fps, self.n_joints_, fewest=1)
+        scores = self._evidence(found)[0].split([len(clip) for clip in found])
+        return np.stack([part.mean(0).cpu().numpy() for part in scores])
 
     def predict_proba(self, clips: Iterable[Any]) -> Array:
         """``(clips, classes)`` probabilities, rows sum to 1 (a softmax of the standardized scores)."""
         scores = self.decision_function(clips)
         return probabilities(scores) if scores.shape[1] > 1 else np.ones_like(scores)
 
+    def evidence(self, clips: Iterable[Any]) -> Array:
+        """``(clips,)`` score of the best class: how much nearer a clip is to an action's frames than to those of the others."""
+        return np.asarray(self.decision_function(clips).max(axis=1))
+
     def predict(self, clips: Iterable[Any]) -> Array:
-        """``(clips,)`` labels."""
-        return np.asarray(self.classes_[self.decision_function(clips).argmax(axis=1)])
+        """``(clips,)`` labels; ``none_label`` where ``reject`` is set and no class explains the clip."""
+        scores = self.decision_function(clips)
+        labels = self.classes_[scores.argmax(axis=1)]
+        if self.reject_threshold_ is None:
+            return np.asarray(labels)
+        return refuse(labels, scores.max(axis=1) < self.reject_threshold_, self.none_label)
 
     def score(self, clips: Iterable[Any], labels: ArrayLike, sample_weight: ArrayLike | None = None) -> float:
         """Mean accuracy of :meth:`predict`."""
@@ -178,16 +201,18 @@ class PhaseIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         return float(np.average(right, weights=None if sample_weight is None else np.asarray(sample_weight)))
 
     def find(self, clip: Any) -> list[Event]:
-        """The actions in an untrimmed recording, in order of time: where the mean score of a second is above those of the rest.
+        """The actions in an untrimmed recording, in order of time: where the mean score of a second stands out.
 
-        An event is what is nearer to its own action's frames than to any other's; it needs at least two classes.
+        An event needs a class to score further than wrong actions do, at a rate calibrated by leaving classes out: ``reject``,
+        else 0.1 (outside 0..1 it is the least score an event needs).  Two classes have little to stand out from: add a class of
+        ordinary movement.
         """
         check_is_fitted(self, "model_")
-        (found,) = check_queries([clip], self.fps, self.n_joints_)
+        (found,) = check_queries([clip], self.fps, self.n_joints_, fewest=1)
         if len(self.classes_) < 2:
             raise ValueError("find needs two classes at least to tell one from the other; fit clips of ordinary movement too")
-        scores = smooth(self._evidence(found)[0].cpu().numpy(), found.times, FINDING)
-        return events(scores, found.times, list(self.classes_), PEAK, FLOOR)
+        scores = smooth(self._evidence([found])[0].cpu().numpy(), found.times, SECOND)
+        return events(scores, found.times, list(self.classes_), *event_levels(self.model_.wrong, self.reject))
 
     # ---- files -------------------------------------------------------------------------------------------------------
     def save(self, path: str | Path) -> None:

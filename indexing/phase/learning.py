@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from indexing.clip import Clip
+from indexing.phase.calibration import wrong_scores
 from indexing.phase.course import Course, learn_course
 from indexing.phase.cycle import followed, in_step
-from indexing.phase.frames import Learned, shape_distance, training_frames
+from indexing.phase.frames import Learned, training_frames
 from indexing.phase.model import PhaseModel
 from indexing.shape.bank import Windows, stack
 
@@ -64,7 +66,8 @@ def learn_model(
         banks += [_card(part[0].frames, width) for width in CARDS]
         kept += [part[1]] * len(CARDS)
         labels.append(torch.full((len(CARDS) * len(part[1]),), c))
-    return PhaseModel(stack(banks), torch.cat(labels), torch.cat(kept), tuple(courses)), mirrored
+    model = PhaseModel(stack(banks), torch.cat(labels), torch.cat(kept), tuple(courses), torch.zeros(0))
+    return replace(model, wrong=wrong_scores(model, learned, label)), mirrored
 
 
 Phased = tuple[Learned, Tensor]
@@ -145,11 +148,10 @@ def _own_mirror(one: Phased, swap: Tensor) -> bool:
     """Whether the mirrored frames fit the course half a cycle later."""
     learned, phase = _spread(one, FIRST)
     found = _course((learned, phase), FIRST, ROUNDS[1], True)
-    grid = found.bank().values
-    count = len(grid) // len(found.shapes)
 
     def left(frames: Windows, at: Tensor) -> tuple[Tensor, Tensor]:
-        curve = shape_distance(frames, found.bank()).unflatten(1, (-1, count)).amin(1)
+        curve = found.curve(frames)
+        count = curve.shape[1]
         return curve.gather(1, (at * count).round().long().remainder(count)[:, None]).mean().log(), curve.mean().log()
 
     own, _ = left(learned.frames, phase)

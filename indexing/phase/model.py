@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from indexing.phase.course import GRID, Course, phases
+from indexing.phase.course import GRID, Course, curves
 from indexing.phase.frames import LEAST, image_distance
 from indexing.shape.bank import EPSILON, Windows
 
 NEAREST = 5  # frames of other actions that an action is held against: 1 costs .004 of the AUC
-WIDTH = 0.04  # of the course: frames this near in phase stand for a phase; .08 costs .3 degrees
+NEAR = 4  # steps of the grid, .04 of the course: frames this near in phase stand for a phase; twice as many cost .3 degrees
 MIX = 0.5  # weight of the shape beside the nearest images: 0 / .5 / 1 give .867 / .957 / .946 AUC from one view per take
 
 PAIRS = 4_000_000  # of frames compared at once: bounds memory whatever the length of a recording
@@ -22,18 +22,32 @@ PAIRS = 4_000_000  # of frames compared at once: bounds memory whatever the leng
 class PhaseModel:
     """Training frames of all classes and the courses of their shapes.
 
-    bank: frames ``(E, 1, n, 2)``; label ``(E,)``; phase ``(E,)`` in [0, 1]; courses: one per class.
+    bank: frames ``(E, 1, n, 2)``; label ``(E,)``; phase ``(E,)`` in [0, 1]; courses: one per class; wrong: ``(seconds,)`` the best
+    score of training seconds whose class was left out, empty where there are fewer than three classes.
     """
 
     bank: Windows
     label: Tensor
     phase: Tensor
     courses: tuple[Course, ...]
+    wrong: Tensor
 
     def to(self, device: torch.device | str) -> PhaseModel:
         """The same on another device."""
         courses = tuple(Course(c.shapes.to(device), c.periodic, c.seen.to(device)) for c in self.courses)
-        return PhaseModel(self.bank.to(device), self.label.to(device), self.phase.to(device), courses)
+        return PhaseModel(self.bank.to(device), self.label.to(device), self.phase.to(device), courses, self.wrong)
+
+    def without(self, c: int) -> PhaseModel:
+        """As if a class had never been learned."""
+        kept = self.label != c
+        label = self.label[kept]
+        return replace(
+            self,
+            bank=self.bank[kept],
+            label=label - (label > c).long(),
+            phase=self.phase[kept],
+            courses=(*self.courses[:c], *self.courses[c + 1 :]),
+        )
 
     def evidence(self, query: Windows) -> tuple[Tensor, Tensor]:
         r"""Score and phase of every frame for every class, ``(Q, classes)`` each.
@@ -51,11 +65,10 @@ class PhaseModel:
     def _evidence(self, query: Windows) -> tuple[Tensor, Tensor]:
         distance = image_distance(query, self.bank)
         scores, found = [], []
-        for c, course in enumerate(self.courses):
+        for c, (course, shapes) in enumerate(zip(self.courses, curves(query, self.courses), strict=True)):
             mine = self.label == c
-            curve = MIX * _log(course.curve(query)) + (1 - MIX) * _log(
-                _by_phase(distance[:, mine], self.phase[mine], course.periodic)
-            )
+            images = _by_phase(distance[:, mine], self.phase[mine], course.periodic)
+            curve = MIX * _log(shapes) + (1 - MIX) * _log(images)
             best, phase = _lowest(curve, course.periodic)
             others = distance[:, ~mine]
             rival = _log(others.topk(min(NEAREST, others.shape[1]), largest=False).values.mean(1)) if others.shape[1] else 0.0
@@ -70,12 +83,13 @@ def _log(residual: Tensor) -> Tensor:
 
 
 def _by_phase(distance: Tensor, phase: Tensor, periodic: bool) -> Tensor:
-    """``(Q, GRID)`` distance from the nearest frame within ``WIDTH`` of every phase, 1 where there is none."""
-    near = phases(GRID, periodic).to(phase)[:, None] - phase
-    if periodic:
-        near = (near + 0.5).remainder(1.0) - 0.5
-    near = near.abs() < WIDTH
-    return torch.stack([distance[:, at].amin(1) if bool(at.any()) else torch.ones_like(distance[:, 0]) for at in near], 1)
+    """``(Q, GRID)`` distance from the nearest frame within ``NEAR`` steps of every phase, 1 where there is none."""
+    at = (phase * (GRID if periodic else GRID - 1)).round().long().remainder(GRID)
+    nearest = distance.new_ones(len(distance), GRID).scatter_reduce(1, at.expand(distance.shape), distance, "amin")
+    sides = nearest[:, -NEAR:], nearest[:, :NEAR]
+    if not periodic:
+        sides = torch.ones_like(sides[0]), torch.ones_like(sides[1])
+    return torch.cat([sides[0], nearest, sides[1]], 1).unfold(1, 2 * NEAR + 1, 1).amin(2)
 
 
 def _lowest(curve: Tensor, periodic: bool) -> tuple[Tensor, Tensor]:

@@ -13,6 +13,7 @@ from indexing.modelfile import AGAIN, labels_from_json, labels_to_json, read_mod
 from indexing.phase.checks import check_phase_parameters
 from indexing.phase.course import Course
 from indexing.phase.model import PhaseModel
+from indexing.scoring import reject_threshold
 from indexing.shape.bank import Windows
 from indexing.skeleton import Skeleton
 
@@ -40,6 +41,7 @@ def save_phase(indexer: PhaseIndexer, path: str | Path) -> None:
         "skeleton": None if skeleton is None else [skeleton.name, list(skeleton.joints), [list(b) for b in skeleton.bones]],
     }
     tensors = {"bank.values": model.bank.values, "bank.seen": model.bank.seen, "label": model.label, "phase": model.phase}
+    tensors["wrong"] = model.wrong
     for c, course in enumerate(model.courses):
         tensors |= {f"course.{c}.shapes": course.shapes, f"course.{c}.seen": course.seen}
     write_model(path, FORMAT, VERSION, indexer.get_params(), about, tensors)
@@ -69,20 +71,21 @@ def _restore(indexer: PhaseIndexer, metadata: dict[str, Any], tensors: dict[str,
         Course(tensors[f"course.{c}.shapes"], bool(periodic[c]), tensors[f"course.{c}.seen"]) for c in range(len(classes))
     )
     bank = Windows(tensors["bank.values"], tensors["bank.seen"])
-    label, phase, joints = tensors["label"], tensors["phase"], int(metadata["joints"])
+    label, phase, wrong, joints = tensors["label"], tensors["phase"], tensors["wrong"], int(metadata["joints"])
     fine = {
         "bank": bank.values.shape[1:] == (1, joints, 2) and bank.seen.shape == (len(bank), joints),
         "label": label.shape == (len(bank),) and int(label.min()) >= 0 and int(label.max()) < len(classes),
         "phase": phase.shape == (len(bank),),
         "course": all(c.shapes.ndim == 4 and c.shapes.shape[2:] == (joints, 3) and c.seen.shape == (joints,) for c in courses),
-        "values": all(bool(t.isfinite().all()) for t in (bank.values, phase, *(c.shapes for c in courses))),
+        "values": all(bool(t.isfinite().all()) for t in (bank.values, phase, wrong, *(c.shapes for c in courses))),
         "mirrored": len(metadata["mirrored"]) == len(periodic) == len(classes),
     }
-    wrong = [name for name, good in fine.items() if not good]
-    if wrong:
-        raise ValueError(f"{', '.join(wrong)} do not fit the rest")
-    name, names, bones = metadata["skeleton"] or (None, (), ())
-    indexer.skeleton_ = Skeleton(name, tuple(names), tuple((a, b) for a, b in bones)) if name is not None else None
-    indexer.model_ = PhaseModel(bank, label, phase.to(torch.float64), courses)
+    misfits = [part for part, good in fine.items() if not good]
+    if misfits:
+        raise ValueError(f"{', '.join(misfits)} do not fit the rest")
+    name, joint_names, bones = metadata["skeleton"] or (None, (), ())
+    indexer.skeleton_ = Skeleton(name, tuple(joint_names), tuple((a, b) for a, b in bones)) if name is not None else None
+    indexer.model_ = PhaseModel(bank, label, phase.to(torch.float64), courses, wrong)
     indexer.classes_, indexer.periodic_, indexer.n_joints_ = classes, periodic, joints
     indexer.mirrored_ = np.array(metadata["mirrored"], dtype=bool)
+    indexer.reject_threshold_ = reject_threshold(indexer.reject, wrong)

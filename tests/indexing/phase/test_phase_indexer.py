@@ -2,10 +2,13 @@
 
 import numpy as np
 import pytest
+import torch
 from sklearn.base import clone
 
 from indexing import Clip
-from indexing.actors import Person, detect, perform
+from indexing.actors import Person, dataset, detect, perform
+from indexing.phase.calibration import event_levels
+from indexing.phase.frames import query_frames
 from indexing.phase.indexer import PhaseIndexer
 
 ACTIONS = ("walk", "sit_down")
@@ -127,6 +130,47 @@ def test_bad_parameters(train, parameters, message):
         PhaseIndexer(**parameters).fit(train)
 
 
+def test_what_was_never_learned_is_refused_and_not_found():
+    people = [Person.random(seed) for seed in (1, 2)]
+    train = dataset(people, ("squat", "wave", "lunge"), azimuth=(0.0, 40.0), fps=8.0, rng=0)
+    indexer = PhaseIndexer(harmonics=1, reject=0.05, none_label="none").fit(train)
+    other = detect(perform("jumping_jack", Person.random(5), fps=8.0, rng=1), azimuth=20.0, rng=2)
+    assert indexer.predict([other]).tolist() == ["none"]
+    assert indexer.find(other) == []
+    assert indexer.predict([train[0]]).tolist() == ["squat"]
+    assert indexer.model_.wrong.quantile(0.95) == pytest.approx(indexer.reject_threshold_)
+    assert indexer.set_params(reject=-9.0).find(other)
+
+
+def test_seconds_of_a_class_left_out_are_scored_by_the_others_alone(train):
+    more = [clip.replace(label="stand") for clip in train[:2]]
+    model = PhaseIndexer(harmonics=1).fit([*train, *more]).model_
+    frames = query_frames(train[1])
+    for c in range(3):
+        rest = model.without(c)
+        assert len(rest.courses) == 2
+        keep = [k for k in range(3) if k != c]
+        assert (rest.bank.values == model.bank.values[model.label != c]).all()
+        assert rest.label.tolist() == [keep.index(k) for k in model.label.tolist() if k != c]
+        assert rest.evidence(frames)[0].shape == (len(train[1]), 2)
+    assert len(model.wrong) > 3
+
+
+def test_levels_of_events():
+    wrong = torch.linspace(0, 1, 101, dtype=torch.float64)
+    assert event_levels(wrong, 0.2) == pytest.approx((0.8, 0.66))
+    assert event_levels(wrong, None) == pytest.approx((0.9, 0.83))
+    assert event_levels(wrong[:0], None) == event_levels(wrong - 9, None) == (0.3, 0.0)
+    assert event_levels(wrong, 1.5) == (1.5, 1.5)
+
+
+def test_a_rate_needs_three_classes_and_none_is_not_a_label(train):
+    with pytest.raises(ValueError, match="which takes 3 classes, got 2"):
+        PhaseIndexer(reject=0.1).fit(train)
+    with pytest.raises(ValueError, match="none_label='walk' is one of the learned labels"):
+        PhaseIndexer(reject=1.1, none_label="walk").fit(train)
+
+
 def test_bad_phases(train):
     with pytest.raises(ValueError, match=r"one entry per clip \(6\), got 1"):
         PhaseIndexer().fit(train, phases=[None])
@@ -134,3 +178,16 @@ def test_bad_phases(train):
         PhaseIndexer().fit(train, phases=[np.zeros(3)] * 6)
     with pytest.raises(ValueError, match="no period was found"):
         PhaseIndexer(course="periodic").fit([Clip(np.random.default_rng(0).normal(size=(9, 17, 2)))] * 2, ["a", "b"])
+
+
+def test_a_clip_may_be_a_single_frame(fitted, asked):
+    clip = asked[0]
+    one = clip.replace(joints=clip.joints[3:4], times=clip.times[3:4], confidence=None)
+    assert np.allclose(fitted.score_frames(one), fitted.score_frames(clip)[3:4], atol=1e-4)
+    assert np.allclose(fitted.phase(one), fitted.phase(clip)[3:4], atol=1e-4)
+
+
+def test_five_joints_tell_no_phase(train):
+    few = [clip.replace(joints=clip.joints[:, :5], confidence=None, skeleton=None) for clip in train]
+    with pytest.raises(ValueError, match="5 joints, but a frame needs 6"):
+        PhaseIndexer().fit(few)
