@@ -242,7 +242,7 @@ class ActionIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         return self
 
     def _calibrate(self) -> None:
-        self.reject_threshold_ = reject_threshold(self.reject, self.model_.evidence_out)
+        self.reject_threshold_ = reject_threshold(self.reject, self.model_.evidence_out, len(self.classes_))
 
     # ---- recognition -------------------------------------------------------------------------------------------------
     def _queries(self, clips: Iterable[Any]) -> Windows:
@@ -261,10 +261,9 @@ class ActionIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         return np.asarray(self._model().scores(self._queries(clips)).cpu().numpy())
 
     def evidence(self, clips: Iterable[Any]) -> Array:
-        """``(clips,)`` log odds that a clip shows a known action rather than another one, comparable between clips.
+        """``(clips,)`` how well a clip shows a known action rather than another one, comparable between clips.
 
-        Learned by leaving each class, and each person (each clip, where nobody says who), out of the training clips; with fewer
-        than four classes it is the nearest-exemplar score of the best class.
+        The nearest-exemplar score of the best class, and how far it stands above the next and above the mean of all.
         """
         return np.asarray(self._model().evidence(self._queries(clips)).cpu().numpy())
 

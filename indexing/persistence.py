@@ -17,7 +17,6 @@ from indexing.shape.bodies import Bodies, Layout
 from indexing.shape.channels import CHANNELS, JointMetric
 from indexing.shape.exemplars import Exemplars
 from indexing.shape.joint_weights import JointWeights
-from indexing.shape.knowing import Known
 from indexing.shape.learning import KERNEL_WHITENING
 from indexing.shape.machine import PairwiseMachine
 from indexing.shape.model import Blend, ShapeModel
@@ -47,7 +46,6 @@ def save(indexer: ActionIndexer, path: str | Path) -> None:
         "scorer": indexer.model_.scorer,
         "blend": dataclasses.asdict(indexer.model_.blend),
         "parts": [indexer.model_.parts.gain, indexer.model_.parts.sigma],
-        "known": dataclasses.asdict(indexer.model_.known),
         "layout": None if indexer.layout_ is None else dataclasses.asdict(indexer.layout_),
         "groups": None if indexer.groups_ is None else indexer.groups_.tolist(),
         "skeleton": None if skeleton is None else [skeleton.name, list(skeleton.joints), [list(b) for b in skeleton.bones]],
@@ -152,7 +150,7 @@ def _model(tensors: dict[str, Tensor], metadata: dict[str, Any], classes: int, l
     rich = view == "same" or layout is not None
     kernels = Kernels(JointMetric(metric.covariance, KERNEL_WHITENING), rich, tensors["scales"]) if trained else None
     bodies = Bodies(windows("bodies"), layout) if layout is not None else None
-    known, gain = metadata["known"], metadata["parts"]
+    gain = metadata["parts"]
     parts = JointWeights(tensors["parts.joints"], tensors["parts.channels"], tensors.get("parts.by_class"), *gain)
     machine = PairwiseMachine(*(tensors[f"machine.{n}"] for n in ("support", "dual", "intercept", "counts"))) if trained else None
     exemplars = Exemplars(windows("crops"), windows("views"), windows("moments"), tensors["owner"], tensors["solid"])
@@ -167,7 +165,6 @@ def _model(tensors: dict[str, Tensor], metadata: dict[str, Any], classes: int, l
         support=windows("support") if trained else None,
         machine=machine,
         blend=Blend(**metadata["blend"]),
-        known=Known(tuple(float(w) for w in known["weights"]), float(known["offset"])),
         bodies=bodies,
         parts=parts,
         **plain,

@@ -48,16 +48,19 @@ def probabilities(scores: Array, sharpness: float = SHARPNESS) -> Array:
     return np.asarray(odds / odds.sum(axis=1, keepdims=True))
 
 
-def reject_threshold(reject: float | None, wrong: Tensor) -> float | None:
+def reject_threshold(reject: float | None, wrong: Tensor, classes: int | None = None) -> float | None:
     """The least evidence that is accepted.
 
     Args:
         reject: ``None``; a false-alarm rate in (0, 1); or, outside that interval, the threshold itself.
         wrong: ``(N,)`` the evidence that clips of one class find in the other classes.
+        classes: from how many classes they come.  The next unknown action is one more draw of a class, not of a clip: as in
+            conformal prediction the level rises by 1 / classes; rates below 1 / (classes + 1) nobody can promise.
     """
     if reject is None or not 0 < reject < 1:
         return reject
-    return float(np.quantile(wrong.cpu().numpy(), 1 - reject))
+    level = (1 - reject) * (1 if classes is None else (classes + 1) / classes)
+    return float(np.quantile(wrong.cpu().numpy(), min(1.0, level)))
 
 
 def smooth(scores: Array, times: Array, seconds: float) -> Array:

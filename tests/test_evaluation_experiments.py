@@ -222,9 +222,9 @@ def test_the_rate_asked_for_is_that_of_a_new_fit(people: ClipSet) -> None:
 @pytest.mark.parametrize(
     ("run", "config", "message"),
     [
-        (robustness.run, robustness.Config(kinds=("rain",)), "kinds must be some of noise, .*rain"),
+        (robustness.run, robustness.Config(kinds=("rain",)), "kinds must be some of .noise., .*rain"),
         (robustness.run, robustness.Config(seeds=0), "seeds at least 1"),
-        (open_set.run, open_set.Config(rates=(1.5,)), "rates between 0 and 1"),
+        (open_set.run, open_set.Config(rates=(1.5,)), "rates must be between 0 and 1"),
         (recognition_protocol.run, recognition_protocol.Config(examples=(0,)), "at least 1"),
     ],
 )

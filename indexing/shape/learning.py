@@ -15,7 +15,7 @@ from indexing.shape.bodies import Bodies, Layout, lifted
 from indexing.shape.channels import JointMetric
 from indexing.shape.exemplars import Exemplars
 from indexing.shape.joint_weights import JointWeights, learn_joint_weights
-from indexing.shape.knowing import learn_known, without_own
+from indexing.shape.knowing import evidence, without_own
 from indexing.shape.machine import PairwiseMachine
 from indexing.shape.model import BALANCE, BALANCE_SOLID, MOMENT_SAMPLE, Blend, ShapeModel, class_scores, mirror_some
 
@@ -67,11 +67,11 @@ def learn(exemplars: Exemplars, labels: Tensor, classes: int, lesson: Lesson) ->
     if lesson.layout is not None:
         bodies = Bodies(stack([lifted(copy, lesson.layout) for copy in model.copies()]), lesson.layout)
         model = dataclasses.replace(model, bodies=bodies)
-    model = _with_hubs(model, originals, lesson.groups)
+    model = _with_hubs(model, originals)
     if lesson.learned and lesson.view == "any" and lesson.groups is not None:
         parts = _parts(model, lesson)
         if parts.learned:
-            model = _with_hubs(dataclasses.replace(model, parts=parts, hub=torch.zeros(len(labels))), originals, lesson.groups)
+            model = _with_hubs(dataclasses.replace(model, parts=parts, hub=torch.zeros(len(labels))), originals)
     trained = None
     if lesson.scorer != "nearest":
         model, trained = _with_machine(model, rich=lesson.view == "same" or lesson.layout is not None)
@@ -109,15 +109,12 @@ def _mirror_is_same_action(model: ShapeModel, originals: Windows) -> Tensor:
     return ~mutual.any(dim=1)[model.labels]
 
 
-def _with_hubs(model: ShapeModel, originals: Windows, groups: Tensor | None) -> ShapeModel:
-    """Measure, among the exemplars, how close each is to other classes, and what tells known actions from unknown ones."""
+def _with_hubs(model: ShapeModel, originals: Windows) -> ShapeModel:
+    """Measure, among the exemplars, how close each is to other classes, and the evidence were its own class unknown."""
     residual, labels = model.residuals(originals), model.labels
-    hub = _hub(residual, labels, labels)
-    own = torch.arange(len(labels)) if groups is None else groups
-    apart = (residual - hub).masked_fill(own[:, None] == own[None], torch.inf)
-    scores = class_scores(apart, labels, model.classes)
-    known, evidence = learn_known(scores, labels, _foreign_scores(residual, model))
-    model = dataclasses.replace(model, hub=hub, known=known, evidence_out=evidence)
+    model = dataclasses.replace(
+        model, hub=_hub(residual, labels, labels), evidence_out=evidence(_foreign_scores(residual, model), model.classes)
+    )
     sample = torch.arange(0, len(model.exemplars.moments), max(1, len(model.exemplars.moments) // MOMENT_SAMPLE))
     labels = labels[model.exemplars.owner]
     residual = model.moment_residuals(model.exemplars.moments[sample])

@@ -21,7 +21,7 @@ from indexing.shape.bodies import Bodies, lifted
 from indexing.shape.channels import JointMetric
 from indexing.shape.exemplars import Exemplars
 from indexing.shape.joint_weights import JointWeights
-from indexing.shape.knowing import Known
+from indexing.shape.knowing import evidence
 from indexing.shape.machine import PairwiseMachine
 from indexing.shape.views import mirror
 
@@ -63,7 +63,6 @@ class ShapeModel:
     kernels: Kernels | None
     support: Windows | None  # windows behind the machine's support rows
     machine: PairwiseMachine | None
-    known: Known = field(default_factory=Known)
     evidence_out: Tensor = field(default_factory=lambda: torch.zeros(0))  # (N,) evidence of exemplars whose class was left out
     blend: Blend = field(default_factory=lambda: Blend())
     bodies: Bodies | None = None  # the exemplars with depth, where it was guessed
@@ -125,8 +124,8 @@ class ShapeModel:
         return total + self.blend.nearest * standardized(self.nearest_scores(query))
 
     def evidence(self, query: Windows) -> Tensor:
-        """``(Q,)`` log odds that a query shows one of the known actions rather than another one."""
-        return self.known(self.nearest_scores(query))
+        """``(Q,)`` how well a query shows one of the known actions rather than another one."""
+        return evidence(self.nearest_scores(query), self.classes)
 
 
 def class_scores(residuals: Tensor, labels: Tensor, classes: int) -> Tensor:

@@ -8,12 +8,12 @@ import torch
 
 from indexing import ActionIndexer
 from indexing.actors import Person, dataset
-from indexing.scoring import probabilities
+from indexing.scoring import probabilities, reject_threshold
 from indexing.shape.bank import Windows, fused_residual
 from indexing.shape.blending import BLENDS, _fewest_mistakes, _sharpened, blended, leave_out
 from indexing.shape.channels import JointMetric
 from indexing.shape.joint_weights import JointWeights
-from indexing.shape.knowing import Known, features, learn_known, without_own
+from indexing.shape.knowing import evidence, without_own
 from indexing.shape.model import Blend
 
 ACTIONS = ("squat", "wave", "kick", "bow", "punch")
@@ -130,17 +130,24 @@ def test_turned_bodies_fit_one_another():
 def test_known_from_unknown():
     draw = torch.Generator().manual_seed(4)
     labels = torch.arange(6).repeat(10)
-    scores = torch.randn(60, 6, generator=draw) + 4.0 * torch.nn.functional.one_hot(labels, 6)
+    clips = 2.0 * torch.randn(60, 1, generator=draw)  # some are near to every exemplar
+    scores = clips + torch.randn(60, 6, generator=draw) + 2.0 * torch.nn.functional.one_hot(labels, 6)
     foreign = without_own(scores, labels)
     assert foreign.shape == (60, 5) and torch.equal(foreign[0], scores[0, 1:]) and torch.equal(foreign[5], scores[5, :5])
-    known, evidence = learn_known(scores, labels, foreign)
-    assert torch.allclose(evidence, known(foreign))
-    inside = known(scores)
-    assert float((inside[:, None] > evidence[None]).float().mean()) > 0.95  # AUROC
-    plain, _ = learn_known(scores[:, :3], labels % 3, without_own(scores[:, :3], labels % 3))
-    assert plain == Known() and torch.equal(plain(scores), scores.max(dim=1).values)
-    best, mean, second, median = features(torch.tensor([[1.0, 5.0, 3.0]]))[0].tolist()
-    assert (best, mean, second, median) == (5.0, 2.0, 2.0, 2.0)
+
+    def auroc(measure):
+        return float((measure(scores)[:, None] > measure(foreign)[None]).float().mean())
+
+    assert auroc(lambda x: evidence(x, 6)) > auroc(lambda x: x.max(dim=1).values) > 0.6
+    few = scores[:, :2]
+    assert torch.equal(evidence(few, 2), few.max(dim=1).values)
+
+
+def test_the_rate_of_the_next_unknown_action_counts_classes():
+    wrong = torch.arange(100.0)
+    assert reject_threshold(0.1, wrong) == pytest.approx(89.1)
+    assert reject_threshold(0.1, wrong, 19) == pytest.approx(99 * 0.9 * 20 / 19)
+    assert reject_threshold(0.1, wrong, 5) == 99.0 and reject_threshold(-2.0, wrong, 5) == -2.0
 
 
 def test_evidence_is_what_rejection_stands_on(lesson):

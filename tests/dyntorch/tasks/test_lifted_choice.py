@@ -17,7 +17,7 @@ from dyntorch.tasks.reconstruct import normalized
 
 @pytest.mark.parametrize("name", ["static_3d", "constant_velocity_2d", "constant_direction_3d", "two_bodies_3d"])
 def test_the_model_of_the_scene(name: str) -> None:
-    scene = scenes.lifted(name, 50, views=4, sigma=0.5, generator=torch.Generator().manual_seed(7))
+    scene = scenes.lifted(name, 80, views=4, sigma=0.5, generator=torch.Generator().manual_seed(7))
     found = dyn.reconstruct(scene.tracks, "auto", threshold=math.inf)
     assert found.motion.name == name and found.status == Status.OK
     scores = [one.score for one in found.candidates]

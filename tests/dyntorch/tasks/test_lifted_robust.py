@@ -79,7 +79,7 @@ def test_an_outlier_in_one_of_many_views_costs_that_observation_only():
 
 
 def test_no_consensus_among_mixed_tracks():
-    scene, _, invariant, lifting = problem("constant_velocity_2d", 20, batch=1)
+    scene, _, invariant, lifting = problem("constant_velocity_2d", 30, batch=1)
     mixed = torch.stack([scene.tracks[:, v].roll(7 * v, 1) for v in range(3)], dim=1)
     for limit in (1.5, None):
         found, _ = robust_projections(tracks_of(mixed, scene.times), invariant, lifting, limit, generator(1))

@@ -60,7 +60,7 @@ def test_what_several_solutions_fit_is_refused(options, planes):
         found.check()
 
 
-@pytest.mark.parametrize(("planes", "shared"), [(4, 3), (5, 5), (8, 8)])
+@pytest.mark.parametrize(("planes", "shared"), [(4, 3), (8, 8)])
 @pytest.mark.parametrize("matched", [False, True])
 def test_noise_does_not_hide_a_single_body(planes, shared, matched):
     found, _, codes = solved(planes, 8, 21, matched=matched, sigma=0.05, patch=240.0, shared=shared)
@@ -134,7 +134,7 @@ def test_homographies_alone_tell_less_often(planes, least):
 
 
 @pytest.mark.parametrize("matched", [False, True])
-@pytest.mark.parametrize(("planes", "sigma"), [(3, 1.0), (4, 0.5), (5, 1.0), (8, 1.0)])
+@pytest.mark.parametrize(("planes", "sigma"), [(3, 1.0), (4, 0.5), (8, 1.0)])
 def test_noise_is_no_lack_of_a_common_homography(planes, sigma, matched):
     found, _, codes = solved(planes, 8, 33, matched=matched, sigma=sigma)
     assert NoticeCode.NO_COMMON_INFINITY not in codes and Status.NO_CONSENSUS not in found.status.tolist()

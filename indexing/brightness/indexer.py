@@ -1,0 +1,267 @@
+"""BrightnessIndexer: learn actions from one to a few videos each and recognize them in others, from pixels alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from sklearn.base import BaseEstimator, ClassifierMixin
+from sklearn.utils.validation import check_is_fitted
+
+from indexing.brightness.calibration import found_events, mirrors_matter, wrong_evidence
+from indexing.brightness.footage import Footage, footage, gather
+from indexing.brightness.library import Exemplars, Matcher, library
+from indexing.brightness.live import BrightnessStream, Recognizer, learned, recognize
+from indexing.brightness.parameters import check_parameters
+from indexing.brightness.sight import Optics
+from indexing.checks import check_labels
+from indexing.labels import joined, refuse
+from indexing.scoring import Event, probabilities, reject_threshold
+
+Array = NDArray[Any]
+
+FEWEST = 5.0  # frames of the window: of exercises at 15 per second, 0 / 60 degrees, 3 name .816 / .690 of the frames, 5 .821 / .751
+
+
+class BrightnessIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
+    r"""Recognize actions in videos without tracks or keypoints.
+
+    Brightness differences weighted by image gradients, :math:`h = I_t \nabla I` (the rows of the thesis's direct measure), are
+    rectified and kept where they are: pooled in the cells of a box about what moves, and in rows across the body.  An online
+    warping compares them with every exemplar frame and remembers a fraction of a second.
+
+    **What of this is the thesis.**  Its own measure, the rank of the rows of h over a short window, keeps no image position;
+    alone (``temporal_weight=1``) it names 12 of 18 arm-raise videos of another person, .54 of their moving frames, and .39 / .37
+    of the frames of exercises, camera turned by 0 / 60 degrees.  The rows h, rectified, with their position kept, and followed by
+    a box about what moves, name 18, .963 and .82 / .75.  Mixing .6 of the measure in costs more than it gives, here (12, .61,
+    .59 / .56).  ``python -m experiments.brightness_indexing`` measures all of these.
+
+    Args:
+        fps: frame rate of videos given as arrays, and at which everything is compared.
+        window: seconds that the warping remembers, at least 5 frames.
+        region: ``"motion"``: about what has moved, followed causally, and a little of the whole image; ``None``: the whole image
+            alone, which knows a turned camera better (.81 / .78) and a person who stands elsewhere, or at another size, not at
+            all; ``(x0, y0, x1, y1)``: that part of it alone, in pixels.
+        flip: exemplars also count mirrored: ``"auto"``: unless left and right are different actions here; ``True``; ``False``.
+        temporal_weight: share of the thesis's rank-type window kernel, 0 to 1.
+        reject: ``None``: closed set.  A number between 0 and 1: the rate at which a video may find the evidence that
+            exemplars find in wrong actions; any other number: the least :meth:`evidence` that is accepted.
+        none_label: what :meth:`predict` answers for a rejected video.
+        pool: seconds over which :meth:`score_frames` averages, backwards from each frame.
+        size: px of the longer side of the image that is worked on.
+        device: where to compute, e.g. ``"cuda"``.
+
+    Attributes:
+        classes_: ``(classes,)`` labels as given.  exemplars_: what is kept of the videos.  flip_: whether mirrored exemplars
+            count.  reject_threshold_: evidence below it is rejected, or ``None``.
+
+    Example:
+        >>> from indexing.actors import Person, perform
+        >>> from indexing.actors.textured import film
+        >>> def video(action, who):
+        ...     return film(perform(action, Person.random(who), rng=who), azimuth=0, image=(80, 60), rng=who)
+        >>> indexer = BrightnessIndexer().fit([video("wave", 0), video("squat", 0)], ["wave", "squat"])
+        >>> [str(label) for label in indexer.predict([video("squat", 1), video("wave", 1)])]
+        ['squat', 'wave']
+
+    Source: Wolf 2003, chapter 7 and section 10.1 (direct measure, after Irani 1999); rectified channels after Efros et al. 2003.
+    """
+
+    def __init__(
+        self,
+        fps: float = 30.0,
+        window: float = 0.18,
+        region: Any = "motion",
+        flip: bool | str = "auto",
+        temporal_weight: float = 0.0,
+        reject: float | None = None,
+        none_label: Any = -1,
+        *,
+        pool: float = 0.33,
+        size: int = 80,
+        device: str = "cpu",
+    ) -> None:
+        self.fps = fps
+        self.window = window
+        self.region = region
+        self.flip = flip
+        self.temporal_weight = temporal_weight
+        self.reject = reject
+        self.none_label = none_label
+        self.pool = pool
+        self.size = size
+        self.device = device
+
+    # ---- learning ----------------------------------------------------------------------------------------------------
+    def fit(self, videos: Iterable[Any], labels: ArrayLike) -> Self:
+        """Learn from videos; one per action is enough.
+
+        Args:
+            videos: list of ``(frames, height, width)`` uint8 or float arrays (colour: ``(..., 3)``), of paths of files, which
+                are read chunk by chunk (twice), of :class:`indexing.video.Video`, or of lists of :class:`indexing.video.Chunk`.
+            labels: ``(videos,)``.
+
+        Raises:
+            ValueError: naming the video or the parameter, what is wrong and what to do.
+        """
+        check_parameters(self)
+        found = gather(videos, float(self.fps))
+        classes, numbers = np.unique(check_labels(labels, len(found)), return_inverse=True)
+        if len(classes) < 2:
+            raise ValueError(f"labels: only one class ({classes.tolist()[0]!r}); give videos of two or more actions")
+        return self._learn(self._exemplars(found, numbers), classes)
+
+    def partial_fit(self, videos: Iterable[Any], labels: ArrayLike, classes: ArrayLike | None = None) -> Self:
+        """Learn from further videos, of known or new actions.  Fits where nothing was fitted yet.
+
+        What was learned of the earlier ones stays; of where people stand, the further videos tell each other alone, so scores
+        may differ by some thousandths from those of one :meth:`fit` to all.
+        """
+        if not hasattr(self, "exemplars_"):
+            return self.fit(videos, labels)
+        check_parameters(self)
+        if self._optics() != self._learned_optics:
+            raise ValueError("fps, region, size or temporal_weight were changed since fit; set them back, or fit all videos again")
+        found = gather(videos, float(self.fps))
+        values = joined(self.classes_[self.exemplars_.labels.numpy()], check_labels(labels, len(found)))
+        known, numbers = np.unique(values, return_inverse=True)
+        old = len(self.exemplars_.labels)
+        more = self._exemplars(found, numbers[old:])
+        labels = torch.cat([torch.from_numpy(numbers[:old]), more.labels])
+        return self._learn(self.exemplars_.extended(more, labels), known)
+
+    def _exemplars(self, videos: list[Footage], numbers: Array) -> Exemplars:
+        views = learned(videos, self._optics())
+        labels = np.repeat(numbers, [len(each) for each in views])
+        return Exemplars.of([one for each in views for one in each], torch.from_numpy(labels))
+
+    def _learn(self, exemplars: Exemplars, classes: Array) -> Self:
+        """Learn everything, and only then change anything."""
+        if self.reject is not None and self.none_label in classes.tolist():
+            raise ValueError(f"none_label={self.none_label!r} is one of the learned labels; choose another for rejected videos")
+        matcher = Matcher.of(exemplars, float(self.temporal_weight))
+        flip = self.flip is True
+        if self.flip == "auto":
+            flip = not mirrors_matter(self._recognizer(exemplars, matcher, len(classes), False), exemplars)
+        self.recognizer_ = self._recognizer(exemplars, matcher, len(classes), flip)
+        self.exemplars_, self.classes_, self.flip_ = exemplars, classes, flip
+        self._learned_optics = self._optics()
+        self._calibrate()
+        return self
+
+    def _recognizer(self, exemplars: Exemplars, matcher: Matcher, classes: int, flip: bool) -> Recognizer:
+        window, pool = max(FEWEST, self.window * self.fps), max(1.0, self.pool * self.fps)
+        placed = library(exemplars.to(self.device), matcher, classes, flip)
+        return Recognizer(self._optics(), matcher, placed, window, pool)
+
+    def _optics(self) -> Optics:
+        region = self.region
+        if region is not None and not isinstance(region, str):
+            x0, y0, x1, y1 = (float(v) for v in region)
+            region = (x0, y0, x1, y1)
+        return Optics(float(self.fps), int(self.size), region, self.temporal_weight > 0, self.device)
+
+    def _calibrate(self) -> None:
+        wrong = torch.zeros(0)
+        if self.reject is not None and 0 < self.reject < 1:
+            wrong = wrong_evidence(self.recognizer_, self.exemplars_)[0]
+        self.reject_threshold_ = reject_threshold(self.reject, wrong)
+
+    # ---- recognition -------------------------------------------------------------------------------------------------
+    def decision_function(self, videos: Iterable[Any]) -> Array:
+        """``(videos, classes)`` scores from 0 to about 1, larger is better; 0 where nothing moves."""
+        check_is_fitted(self, "exemplars_")
+        found = gather(videos, float(self.fps))
+        return np.stack([recognize(self._stream(video.own_rate, video.name), video) for video in found])
+
+    def evidence(self, videos: Iterable[Any]) -> Array:
+        """``(videos,)`` score of the best class: how well an exemplar explains the video."""
+        return np.asarray(self.decision_function(videos).max(axis=1))
+
+    def predict_proba(self, videos: Iterable[Any]) -> Array:
+        """``(videos, classes)`` probabilities of the known classes, rows sum to 1 (a softmax of the standardized scores)."""
+        return probabilities(self.decision_function(videos))
+
+    def predict(self, videos: Iterable[Any]) -> Array:
+        """``(videos,)`` labels; ``none_label`` where ``reject`` is set and no class explains the video."""
+        scores = self.decision_function(videos)
+        labels = self.classes_[scores.argmax(axis=1)]
+        if self.reject_threshold_ is None:
+            return np.asarray(labels)
+        return refuse(labels, scores.max(axis=1) < self.reject_threshold_, self.none_label)
+
+    # ---- long recordings ---------------------------------------------------------------------------------------------
+    def stream(self, fps: float | None = None) -> BrightnessStream:
+        """A stream to push frames into as they come: ``stream.push(frame)`` gives ``(classes,)`` scores.
+
+        Args:
+            fps: frame rate of the stream, where it is another than the indexer's.
+        """
+        check_is_fitted(self, "exemplars_")
+        if fps is not None and not (np.isfinite(fps) and fps > 0):
+            raise ValueError(f"fps must be a positive number of frames per second, got {fps!r}")
+        return self._stream(fps, "stream")
+
+    def _stream(self, fps: float | None, name: str) -> BrightnessStream:
+        return BrightnessStream(self.recognizer_, len(self.classes_), name, fps)
+
+    def score_frames(self, video: Any) -> Array:
+        """``(frames, classes)`` score of every frame of an untrimmed video; that of frame t needs the frames up to t alone."""
+        return self._scan(video, None)[1]
+
+    def find(self, video: Any) -> list[Event]:
+        """The actions in an untrimmed video, in order of time: label, start, end (seconds), score and margin.
+
+        An event needs a class to stand out from the mean of all further than wrong actions do among the exemplars, at a rate
+        of ``reject`` (0.3 by default).  Nothing is found where nothing moves.
+        """
+        return self.scan(video)[2]
+
+    def scan(self, video: Any, progress: Callable[[float], None] | None = None) -> tuple[Array, Array, list[Event]]:
+        """Times ``(frames,)`` in seconds, :meth:`score_frames` and :meth:`find` in one pass.
+
+        Args:
+            progress: called with the share done, 0..1.
+        """
+        times, scores, energy = self._scan(video, progress)
+        wrong = wrong_evidence(self.recognizer_, self.exemplars_)[1]
+        return times, scores, found_events(scores, times, energy, self.classes_, wrong, self.reject)
+
+    def _scan(self, video: Any, progress: Callable[[float], None] | None) -> tuple[Array, Array, Array]:
+        check_is_fitted(self, "exemplars_")
+        source = footage(video, "video", float(self.fps))
+        stream = self._stream(source.own_rate, source.name)
+        begin, end = (0.0, 1.0) if progress is None else source.span
+        parts = []
+        for frames, times in source:
+            parts.append((times, *stream.scan(frames, times)))
+            if progress is not None:
+                progress(min(1.0, (float(times[-1]) - begin) / max(end - begin, 1e-9)))
+        times, scores, energy = (np.concatenate(part) for part in zip(*parts, strict=True))
+        return times, scores, energy
+
+    # ---- files -------------------------------------------------------------------------------------------------------
+    def save(self, path: str | Path) -> None:
+        """Write a ``.safetensors`` file with JSON metadata; atomically, and without pickle."""
+        from indexing.brightness.saving import save
+
+        check_is_fitted(self, "exemplars_")
+        save(self, path)
+
+    @classmethod
+    def load(cls, path: str | Path, device: str = "cpu") -> Self:
+        """Read what :meth:`save` wrote, for computing on ``device`` (the file does not say where).
+
+        Raises:
+            ValueError: the file is missing, or is not such a model.
+        """
+        from indexing.brightness.saving import load
+
+        return load(cls, path, device)
+
+    def __sklearn_is_fitted__(self) -> bool:
+        return hasattr(self, "exemplars_")

@@ -1,0 +1,168 @@
+"""One video against the library, as its frames come in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from indexing.brightness.footage import Footage, Resampler
+from indexing.brightness.library import Library, Matcher
+from indexing.brightness.matching import Warping
+from indexing.brightness.motion_box import together
+from indexing.brightness.sight import Optics, Seen, Sight
+
+SHARP = 20.0
+"""Of the mean over frames: moments that fit an exemplar well count more than many that fit somewhat.
+Frames named rightly in exercise streams, camera turned 0 / 60: the mean itself .76 / .59, sharpness 12 .80 / .62 (cells alone)."""
+FEWEST = 3  # frames of an exemplar
+MOVES = 0.1  # energy of a frame in which anything moves
+COLD = 1e-3  # weight of a video's first window in its score: the warping has seen too little, but a short video has nothing else
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class Recognizer:
+    """All that scoring needs: how to look, what to compare with, how long to remember (frames)."""
+
+    optics: Optics
+    matcher: Matcher
+    library: Library
+    window: float
+    pool: float
+
+
+class Pool:
+    r"""Running mean of scores over frames in which something moves.
+
+    .. math:: P_c(t) = \frac{1}{20} \log \frac{\sum_\tau g^{t-\tau}\,|f_\tau|^2\,e^{20 s_c(\tau)}}{\sum_\tau g^{t-\tau}\,|f_\tau|^2}
+
+    with g = 1 - 1/pool.
+
+    Args:
+        frames: memory; infinite for the mean over a whole video.
+    """
+
+    def __init__(self, classes: int, frames: float) -> None:
+        self.keep = 1 - 1 / max(frames, 1.0)
+        self.total, self.weight = np.zeros(classes), 0.0
+
+    def push(self, scores: Array, energy: Array) -> Array:
+        """``(n, classes)`` means after each of ``n`` more frames; 0 before anything has moved."""
+        totals, weights = energy[:, None] * np.exp(SHARP * scores), energy.copy()
+        for t in range(len(totals)):
+            totals[t] += self.keep * self.total
+            weights[t] += self.keep * self.weight
+            self.total, self.weight = totals[t], weights[t]
+        return _mean(totals, weights[:, None])
+
+    def mean(self) -> Array:
+        """``(classes,)`` the mean now."""
+        return _mean(self.total, self.weight)
+
+
+def _mean(total: Array, weight: Any) -> Array:
+    return np.asarray(np.log(np.maximum(total / np.maximum(weight, 1e-12), 1.0)) / SHARP)
+
+
+class BrightnessStream:
+    """Scores of one video, as its frames come in.  Made by :meth:`indexing.BrightnessIndexer.stream`.
+
+    Memory is one number per library frame and a few small images, whatever the length of the stream.
+    """
+
+    def __init__(self, source: Recognizer, classes: int, name: str, fps: float | None) -> None:
+        self.source, self.fps = source, fps
+        self.sight = Sight(source.optics, name)
+        self.resample = Resampler(source.optics.fps, fps)
+        self.warping = Warping(source.library, source.window)
+        self.pool = Pool(classes, source.pool)
+        self.whole = Pool(classes, float("inf"))
+        self.pushed = self.compared = 0
+        self.latest = np.zeros(classes)
+        self.energy = 0.0
+
+    def push(self, frames: Any, times: Any = None) -> Array:
+        """Scores of one more frame, or of several.
+
+        Args:
+            frames: ``(height, width)`` or ``(height, width, 3)``: one frame; with a leading axis: several.
+                Several at once are several times as fast.
+            times: ``(n,)`` seconds; by default the stream's frame rate says them.
+
+        Returns:
+            ``(classes,)``, or ``(n, classes)`` for several: larger is better, from the frames up to each alone.
+
+        Raises:
+            ValueError: frames of another size or kind than before.
+        """
+        frames = torch.as_tensor(frames)
+        single = frames.ndim == 2 or (frames.ndim == 3 and frames.shape[-1] == 3)
+        scores, _ = self.scan(frames[None] if single else frames, times)
+        return scores[0] if single else scores
+
+    def scan(self, frames: Any, times: Any = None) -> tuple[Array, Array]:
+        """Scores ``(n, classes)`` and energies ``(n,)`` (0 where nothing moves, else below 1) after each of n more frames."""
+        with torch.inference_mode():  # a seventh of the time of single frames
+            return self._scan(frames, times)
+
+    def _scan(self, frames: Any, times: Any) -> tuple[Array, Array]:
+        small = self.sight.small(frames)
+        if times is None:
+            times = (self.pushed + np.arange(len(small))) / (self.fps or self.source.optics.fps)
+        self.pushed += len(small)
+        grid, counts = self.resample.push(small, times)
+        scores, energy = self.compare(self.sight.push(grid))
+        scores, energy = np.concatenate([self.latest[None], scores]), np.concatenate([[self.energy], energy])
+        self.latest, self.energy = scores[-1], float(energy[-1])
+        return scores[counts], energy[counts]
+
+    def compare(self, seen: Seen) -> tuple[Array, Array]:
+        """Scores ``(n, classes)`` and energies ``(n,)``, float64, of more frames of the grid."""
+        scores = self.warping.push(self.source.matcher.rows(seen)).cpu().numpy().astype(float)
+        energy = seen.motion.square().sum(1).cpu().numpy().astype(float)
+        warm = np.arange(self.compared, self.compared + len(seen)) >= self.source.window
+        self.compared += len(seen)
+        self.whole.push(scores, energy * np.where(warm, 1.0, COLD))
+        return self.pool.push(scores, energy), energy
+
+
+def recognize(stream: BrightnessStream, video: Footage) -> Array:
+    """``(classes,)`` scores of a whole video, read chunk by chunk."""
+    for frames, times in video:
+        stream.push(torch.as_tensor(frames), times)
+    return stream.whole.mean()
+
+
+def learned(videos: list[Footage], optics: Optics) -> list[list[Seen]]:
+    """Descriptors of videos to learn from: what a stream of each would give, and what a stream would give that began earlier.
+
+    Where only an arm moves, a stream that has just begun knows the arm's place alone.  One that has seen the same person do other
+    things knows the person's: there, the box starts from what moved in all the videos that were taken at the same place.
+
+    Raises:
+        ValueError: fewer than three frames, or nothing moves.
+    """
+    first = [_looked_at(video, optics, None) for video in videos]
+    moved = [seen for _, seen in first if seen is not None]
+    if not moved:
+        return [[one] for one, _ in first]
+    again = [_looked_at(video, optics, seen)[0] for video, seen in zip(videos, together(moved), strict=True)]
+    return [[one, other] for (one, _), other in zip(first, again, strict=True)]
+
+
+def _looked_at(video: Footage, optics: Optics, seen: Tensor | None) -> tuple[Seen, Tensor | None]:
+    """Descriptors of a whole video, and where something has moved in the end."""
+    sight, resample = Sight(optics, video.name, seen), Resampler(optics.fps, video.own_rate)
+    parts = [sight.push(resample.push(sight.small(frames), times)[0]) for frames, times in video]
+    found = Seen(torch.cat([part.motion for part in parts]).cpu(), torch.cat([part.kernels for part in parts]).cpu())
+    if len(found) < FEWEST:
+        raise ValueError(f"{video.name}: {len(found)} frames; motion needs at least {FEWEST}")
+    if not bool((found.motion.square().sum(1) > MOVES).any()):
+        raise ValueError(f"{video.name}: nothing moves in it; leave it out, or give a video in which the action is seen")
+    return found, sight.box.seen
