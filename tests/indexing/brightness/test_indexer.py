@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 from sklearn.base import clone
-from sklearn.model_selection import GridSearchCV, LeaveOneGroupOut, cross_val_score
 
 from indexing.actors import Person, perform
 from indexing.actors.textured import film
@@ -142,14 +141,6 @@ def test_mirrored_exemplars_count_unless_sides_matter(indexer, learned):
     assert not sided.flip_
     mirrored = wave[:, :, ::-1].copy()
     assert clone(indexer).set_params(flip=True).fit([mirrored, learned[0]], ["wave", "squat"]).predict([wave]) == ["wave"]
-
-
-def test_scikit_learn_selects(learned):
-    labels, who = np.array(ACTIONS * 2), [1, 1, 1, 2, 2, 2]
-    short = [video[10:40] for video in learned]
-    search = GridSearchCV(BrightnessIndexer(fps=15.0), {"window": [0.1, 0.2]}, cv=LeaveOneGroupOut()).fit(short, labels, groups=who)
-    assert search.best_params_["window"] in (0.1, 0.2)
-    assert len(cross_val_score(BrightnessIndexer(fps=15.0, region=None), short, labels, groups=who, cv=LeaveOneGroupOut())) == 2
 
 
 BAD = {
