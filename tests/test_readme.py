@@ -14,7 +14,9 @@ def blocks() -> list[str]:
     return re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
 
 
-@pytest.mark.parametrize("name", ["align_planar", "dyn.segment", "dyn.reconstruct", "dyn.DynamicShapeTensor", "PhaseIndexer", "= BrightnessIndexer("])
+@pytest.mark.parametrize(
+    "name", ["align_planar", "dyn.segment", "dyn.reconstruct", "dyn.DynamicShapeTensor", "PhaseIndexer", "= BrightnessIndexer("]
+)
 def test_the_examples_print_what_they_say(name, capsys):
     (source,) = [block for block in blocks() if name in block]
     exec(compile(source, str(README), "exec"), {})
