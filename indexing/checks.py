@@ -157,8 +157,7 @@ def check_parameters(indexer: Any) -> None:
         if getattr(indexer, name) not in accepted:
             raise ValueError(f"{name} must be one of {', '.join(map(repr, accepted))}, got {getattr(indexer, name)!r}")
     _check_numbers(indexer)
-    if indexer.reject is not None and not (isinstance(indexer.reject, (int, float, np.floating)) and np.isfinite(indexer.reject)):
-        raise ValueError(f"reject must be None, a rate between 0 and 1 or a threshold, got {indexer.reject!r}")
+    check_reject(indexer.reject)
     try:
         np.random.default_rng(indexer.random_state)
     except (TypeError, ValueError) as error:
@@ -166,6 +165,12 @@ def check_parameters(indexer: Any) -> None:
             f"random_state must be None, a whole number from 0, or a generator, got {indexer.random_state!r} ({error})"
         ) from None
     check_device(indexer.device)
+
+
+def check_reject(reject: Any) -> None:
+    """Raise where ``reject`` is neither ``None`` nor a number."""
+    if reject is not None and not is_number(reject):
+        raise ValueError(f"reject must be None, a rate between 0 and 1 or a threshold, got {reject!r}")
 
 
 def check_device(device: str) -> None:
@@ -180,7 +185,7 @@ def _check_numbers(indexer: Any) -> None:
     for name in ("fps", "window", "stride"):
         if not _positive(getattr(indexer, name)):
             raise ValueError(f"{name} must be a positive number, got {getattr(indexer, name)!r}")
-    if not (_number(indexer.pool) and indexer.pool >= 0):
+    if not (is_number(indexer.pool) and indexer.pool >= 0):
         raise ValueError(f"pool must be seconds, 0 or more, got {indexer.pool!r}")
     tempi = list(indexer.tempi) if isinstance(indexer.tempi, Iterable) else []
     if not tempi or not all(_positive(tempo) for tempo in tempi):
@@ -194,11 +199,12 @@ def _check_numbers(indexer: Any) -> None:
 
 
 def _positive(value: Any) -> bool:
-    return _number(value) and bool(value > 0)
+    return is_number(value) and bool(value > 0)
 
 
-def _number(value: Any) -> bool:
-    return isinstance(value, (int, float, np.integer, np.floating)) and bool(np.isfinite(value))
+def is_number(value: Any) -> bool:
+    """Whether a value is a finite number, and not a truth value."""
+    return isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool) and bool(np.isfinite(value))
 
 
 def check_plan(indexer: Any, crops: int, exemplars: Any) -> None:

@@ -63,6 +63,26 @@ def reject_threshold(reject: float | None, wrong: Tensor, classes: int | None = 
     return float(np.quantile(wrong.cpu().numpy(), min(1.0, level)))
 
 
+def event_levels(wrong: Array, rate: float, extent: float, least: tuple[float, float]) -> tuple[float, float]:
+    """What an event must reach somewhere, and throughout.
+
+    Args:
+        wrong: what moments of one class reach in the others.
+        rate: at which these may reach the first level; outside 0..1 it is both levels itself.
+        extent: times that rate for the second; least: of both.
+
+    Example:
+        >>> event_levels(np.arange(101.0), 0.1, 2.0, (0.0, 85.0))
+        (90.0, 85.0)
+    """
+    if not 0 < rate < 1:
+        return float(rate), float(rate)
+    if not len(wrong):
+        return least
+    peak, floor = np.quantile(wrong, [1 - rate, 1 - min(1.0, extent * rate)])
+    return max(least[0], float(peak)), max(least[1], float(floor))
+
+
 def smooth(scores: Array, times: Array, seconds: float) -> Array:
     """``(T, classes)`` mean of the scores over a centred interval of time.
 

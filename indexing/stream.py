@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from indexing.clip import Clip
-from indexing.scoring import Event, events, smooth
+from indexing.scoring import Event, event_levels, events, smooth
 from indexing.shape.bank import Windows, stack
 from indexing.shape.channels import channel
 from indexing.shape.model import MOMENT_SAMPLE, ShapeModel
@@ -138,13 +138,8 @@ def find_events(
     resting = smooth(windows.motion[:, None], at, stream.window)[:, 0] < moving
     resting &= contrast.max(axis=1) < np.quantile(wrong, CONVINCING)
     resting |= ~windows.present
-    wanted = FALSE_ALARMS if rate is None else rate
-    if 0 < wanted < 1:
-        levels = np.quantile(wrong, [1 - wanted, 1 - min(1.0, EXTENT * wanted)])
-        peak, floor = np.maximum(levels, LEAST)
-    else:
-        peak = floor = wanted
-    found = events(contrast, np.minimum(at, clip.times[-1]), list(classes), float(peak), float(floor), resting)
+    peak, floor = event_levels(wrong, FALSE_ALARMS if rate is None else rate, EXTENT, LEAST)
+    found = events(contrast, np.minimum(at, clip.times[-1]), list(classes), peak, floor, resting)
     if not found:
         return []
     numbers = {label: i for i, label in enumerate(classes)}

@@ -13,7 +13,7 @@ from indexing.brightness.library import Exemplars
 from indexing.brightness.live import BrightnessStream, Recognizer
 from indexing.brightness.pooling import mirrored
 from indexing.brightness.sight import Seen
-from indexing.scoring import Event, events
+from indexing.scoring import Event, event_levels, events
 from indexing.stream import EXTENT, FALSE_ALARMS
 
 MOST = 64  # exemplars asked: bounds the time of calibration
@@ -56,12 +56,7 @@ def mirrors_matter(source: Recognizer, exemplars: Exemplars) -> bool:
 def found_events(scores: Array, times: Array, energy: Array, classes: Array, wrong: Array, rate: float | None) -> list[Event]:
     """Events of scored frames: where the contrast of the best class exceeds what wrong actions reach at a rate."""
     contrast = scores - scores.mean(axis=1, keepdims=True)
-    wanted = FALSE_ALARMS if rate is None else rate
-    if 0 < wanted < 1:
-        levels = np.quantile(wrong, [1 - wanted, 1 - min(1.0, EXTENT * wanted)]) if len(wrong) else np.zeros(2)
-        peak, floor = (max(LEAST, float(level)) for level in levels)
-    else:
-        peak = floor = float(wanted)
+    peak, floor = event_levels(wrong, FALSE_ALARMS if rate is None else rate, EXTENT, (LEAST, LEAST))
     return events(contrast, times, classes.tolist(), peak, floor, energy < QUIET)
 
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from indexing import scoring
 from indexing.phase.frames import Learned
 from indexing.phase.model import PhaseModel
 from indexing.stream import EXTENT
@@ -55,10 +55,4 @@ def event_levels(wrong: Tensor, rate: float | None) -> tuple[float, float]:
     Args:
         rate: 0.1 by default; a number outside 0..1 is the level itself.
     """
-    wanted = FALSE_ALARMS if rate is None else rate
-    if not 0 < wanted < 1:
-        return wanted, wanted
-    if not len(wrong):
-        return LEAST
-    peak, ends = np.quantile(wrong.cpu().numpy(), [1 - wanted, 1 - min(1.0, EXTENT * wanted)])
-    return max(LEAST[0], float(peak)), max(LEAST[1], float(ends))
+    return scoring.event_levels(wrong.cpu().numpy(), FALSE_ALARMS if rate is None else rate, EXTENT, LEAST)

@@ -9,7 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from indexing.checks import check_device
+from indexing.checks import check_device, is_number
+from indexing.checks import check_reject as check_reject_number
 from indexing.clip import Clip
 from indexing.labels import same_label
 from indexing.phase.calibration import FEWEST
@@ -27,15 +28,10 @@ def check_phase_parameters(indexer: Any) -> None:
         raise ValueError(f"harmonics must be a whole number from 1 to 12, got {harmonics!r}")
     for name, least in (("fps", 1e-9), ("window", 0.0)):
         value = getattr(indexer, name)
-        if not (_number(value) and value >= least):
+        if not (is_number(value) and value >= least):
             raise ValueError(f"{name} must be {'a positive number' if name == 'fps' else 'seconds, 0 or more'}, got {value!r}")
-    if indexer.reject is not None and not _number(indexer.reject):
-        raise ValueError(f"reject must be None, a rate between 0 and 1 or a threshold, got {indexer.reject!r}")
+    check_reject_number(indexer.reject)
     check_device(indexer.device)
-
-
-def _number(value: Any) -> bool:
-    return isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool) and bool(np.isfinite(value))
 
 
 def check_reject(indexer: Any, classes: list[Any]) -> None:
