@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterable, Sequence
-from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
-from sklearn.base import BaseEstimator, ClassifierMixin
 from sklearn.utils.validation import check_is_fitted
 
 from indexing.checks import (
     check_common,
-    check_labels,
     check_parameters,
     check_plan,
     check_queries,
@@ -24,6 +21,7 @@ from indexing.checks import (
     gather_labels,
 )
 from indexing.clip import Clip
+from indexing.estimator import SavedClassifier
 from indexing.labels import joined, refuse, same_label
 from indexing.repair import mended
 from indexing.scoring import Event, probabilities, reject_threshold
@@ -40,7 +38,7 @@ from indexing.windows import ragged, whole
 Array = NDArray[Any]
 
 
-class ActionIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
+class ActionIndexer(SavedClassifier):
     r"""Recognize actions from keypoints, from other viewpoints than they were learned from.
 
     Two affine images of one space-time shape (all joints over all frames) obey one linear relation, so the largest canonical
@@ -88,6 +86,8 @@ class ActionIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
 
     Source: Wolf 2003, chapters 4 and 7 and section 10.1.
     """
+
+    FITTED, FILES = "model_", "indexing.persistence"
 
     def __init__(
         self,
@@ -285,13 +285,6 @@ class ActionIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         refused = (model.evidence(query) < self.reject_threshold_).cpu().numpy()
         return refuse(labels, refused, self.none_label)
 
-    def score(self, clips: Iterable[Any], labels: ArrayLike, sample_weight: ArrayLike | None = None) -> float:
-        """Mean accuracy of :meth:`predict`; labels that were never learned count as wrong."""
-        answers = self.predict(clips)
-        truth = check_labels(labels, len(answers))
-        right = np.asarray([a == b for a, b in zip(answers.tolist(), truth.tolist(), strict=True)], dtype=float)
-        return float(np.average(right, weights=None if sample_weight is None else np.asarray(sample_weight)))
-
     # ---- long recordings ---------------------------------------------------------------------------------------------
     def _stream(self) -> Stream:
         return Stream(self.length, self.window, tuple(self.tempi), self.pool, self.device)
@@ -330,25 +323,6 @@ class ActionIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         """
         return self.scan(clip, progress)[1]
 
-    # ---- files -------------------------------------------------------------------------------------------------------
-    def save(self, path: str | Path) -> None:
-        """Write a ``.safetensors`` file with JSON metadata; atomically, and without pickle."""
-        from indexing.persistence import save
-
-        check_is_fitted(self, "model_")
-        save(self, path)
-
-    @classmethod
-    def load(cls, path: str | Path, device: str = "cpu") -> Self:
-        """Read what :meth:`save` wrote, for computing on ``device`` (the file does not say where).
-
-        Raises:
-            ValueError: the file is missing, or is not such a model.
-        """
-        from indexing.persistence import load
-
-        return load(cls, path, device)
-
     def exemplar(self, index: int) -> Clip:
         """Exemplar number ``index`` as it is compared: resampled, y up (for pictures)."""
         check_is_fitted(self, "model_")
@@ -356,9 +330,6 @@ class ActionIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         joints = windows.values[index].numpy().copy()
         joints[:, ~windows.seen[index].numpy()] = np.nan
         return Clip(joints, label=self.classes_[int(self.model_.labels[index])], skeleton=self.skeleton_, name=f"exemplar {index}")
-
-    def __sklearn_is_fitted__(self) -> bool:
-        return hasattr(self, "model_")
 
 
 def _default_views(clips: Sequence[Clip]) -> int:

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
-from sklearn.base import BaseEstimator, ClassifierMixin
 from sklearn.utils.validation import check_is_fitted
 
 from indexing.brightness.calibration import found_events, mirrors_matter, wrong_evidence
@@ -19,6 +17,7 @@ from indexing.brightness.live import BrightnessStream, Recognizer, learned, reco
 from indexing.brightness.parameters import check_parameters
 from indexing.brightness.sight import Optics
 from indexing.checks import check_labels
+from indexing.estimator import SavedClassifier
 from indexing.labels import joined, refuse
 from indexing.scoring import Event, probabilities, reject_threshold
 
@@ -27,7 +26,7 @@ Array = NDArray[Any]
 FEWEST = 5.0  # frames of the window: of exercises at 15 per second, 0 / 60 degrees, 3 name .816 / .690 of the frames, 5 .821 / .751
 
 
-class BrightnessIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
+class BrightnessIndexer(SavedClassifier):
     r"""Recognize actions in videos without tracks or keypoints.
 
     Brightness differences weighted by image gradients, :math:`h = I_t \nabla I` (the rows of the thesis's direct measure), are
@@ -70,6 +69,8 @@ class BrightnessIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
 
     Source: Wolf 2003, chapter 7 and section 10.1 (direct measure, after Irani 1999); rectified channels after Efros et al. 2003.
     """
+
+    FITTED, FILES = "exemplars_", "indexing.brightness.saving"
 
     def __init__(
         self,
@@ -243,25 +244,3 @@ class BrightnessIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
                 progress(min(1.0, (float(times[-1]) - begin) / max(end - begin, 1e-9)))
         times, scores, energy = (np.concatenate(part) for part in zip(*parts, strict=True))
         return times, scores, energy
-
-    # ---- files -------------------------------------------------------------------------------------------------------
-    def save(self, path: str | Path) -> None:
-        """Write a ``.safetensors`` file with JSON metadata; atomically, and without pickle."""
-        from indexing.brightness.saving import save
-
-        check_is_fitted(self, "exemplars_")
-        save(self, path)
-
-    @classmethod
-    def load(cls, path: str | Path, device: str = "cpu") -> Self:
-        """Read what :meth:`save` wrote, for computing on ``device`` (the file does not say where).
-
-        Raises:
-            ValueError: the file is missing, or is not such a model.
-        """
-        from indexing.brightness.saving import load
-
-        return load(cls, path, device)
-
-    def __sklearn_is_fitted__(self) -> bool:
-        return hasattr(self, "exemplars_")

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
-from sklearn.base import BaseEstimator, ClassifierMixin
 from sklearn.utils.validation import check_is_fitted
 from torch import Tensor
 
-from indexing.checks import check_labels, check_queries, gather, gather_labels
+from indexing.checks import check_queries, gather, gather_labels
 from indexing.clip import Clip
+from indexing.estimator import SavedClassifier
 from indexing.labels import refuse
 from indexing.phase.calibration import SECOND, event_levels
 from indexing.phase.checks import check_phase_parameters, check_phases, check_reject
@@ -29,7 +28,7 @@ from indexing.shape.symmetry import mirror_permutation
 Array = NDArray[Any]
 
 
-class PhaseIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
+class PhaseIndexer(SavedClassifier):
     r"""Recognize actions in single frames, and say how far each of them has come.
 
     The joints of an action at phase :math:`\phi` span, with all cameras, the subspace :math:`S(\phi) = \mathrm{span}[1, X(\phi)]`
@@ -67,6 +66,8 @@ class PhaseIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
 
     Source: Wolf 2003, chapter 4 (dynamic shape tensors) and section 10.1.
     """
+
+    FITTED, FILES = "model_", "indexing.phase.persistence"
 
     def __init__(
         self,
@@ -194,12 +195,6 @@ class PhaseIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
             return np.asarray(labels)
         return refuse(labels, scores.max(axis=1) < self.reject_threshold_, self.none_label)
 
-    def score(self, clips: Iterable[Any], labels: ArrayLike, sample_weight: ArrayLike | None = None) -> float:
-        """Mean accuracy of :meth:`predict`."""
-        answers = self.predict(clips)
-        right = np.asarray([a == b for a, b in zip(answers.tolist(), check_labels(labels, len(answers)).tolist(), strict=True)])
-        return float(np.average(right, weights=None if sample_weight is None else np.asarray(sample_weight)))
-
     def find(self, clip: Any) -> list[Event]:
         """The actions in an untrimmed recording, in order of time: where the mean score of a second stands out.
 
@@ -213,25 +208,3 @@ class PhaseIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
             raise ValueError("find needs two classes at least to tell one from the other; fit clips of ordinary movement too")
         scores = smooth(self._evidence([found])[0].cpu().numpy(), found.times, SECOND)
         return events(scores, found.times, list(self.classes_), *event_levels(self.model_.wrong, self.reject))
-
-    # ---- files -------------------------------------------------------------------------------------------------------
-    def save(self, path: str | Path) -> None:
-        """Write a ``.safetensors`` file with JSON metadata; atomically, and without pickle."""
-        from indexing.phase.persistence import save_phase
-
-        check_is_fitted(self, "model_")
-        save_phase(self, path)
-
-    @classmethod
-    def load(cls, path: str | Path, device: str = "cpu") -> Self:
-        """Read what :meth:`save` wrote, for computing on ``device``.
-
-        Raises:
-            ValueError: the file is missing, or is not such a model.
-        """
-        from indexing.phase.persistence import load_phase
-
-        return load_phase(cls, path, device)
-
-    def __sklearn_is_fitted__(self) -> bool:
-        return hasattr(self, "model_")

@@ -26,7 +26,7 @@ VERSION = 1
 Indexer = TypeVar("Indexer", bound="PhaseIndexer")
 
 
-def save_phase(indexer: PhaseIndexer, path: str | Path) -> None:
+def save(indexer: PhaseIndexer, path: str | Path) -> None:
     """Write a fitted indexer.
 
     Raises:
@@ -47,7 +47,7 @@ def save_phase(indexer: PhaseIndexer, path: str | Path) -> None:
     write_model(path, FORMAT, VERSION, indexer.get_params(), about, tensors)
 
 
-def load_phase(kind: type[Indexer], path: str | Path, device: str = "cpu") -> Indexer:
+def load(kind: type[Indexer], path: str | Path, device: str = "cpu") -> Indexer:
     """Read a fitted indexer; see :meth:`indexing.phase.indexer.PhaseIndexer.load`."""
     metadata, tensors = read_model(path, FORMAT, VERSION)
     try:
