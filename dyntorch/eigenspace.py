@@ -248,6 +248,43 @@ def resolvent(gram: Tensor, vectors: Tensor, gradient: Tensor) -> Tensor:
     return found - vectors @ (vectors.mT @ found)
 
 
+def turned(gram: Tensor, vectors: Tensor, image: Tensor) -> Tensor:
+    r"""How an eigenspace turns, :math:`dV = -W` where G changes by dG: the solution of a Sylvester equation.
+
+    .. math:: G W - W V^T G V = (I - V V^T)\, dG\, V, \qquad V^T W = 0
+
+    For Ritz vectors these are the columns of :func:`resolvent`.  Here nothing is decided and nothing is written in place, so
+    that every derivative of it exists; a rotation R of the vectors makes W R of W, so that the derivative of a function that is
+    blind to rotations inside the eigenspace stays blind to them.
+
+    Args:
+        gram: ``(b, D, D)``; where it is not finite the result is 0.
+        vectors: ``(b, D, k)`` orthonormal.
+        image: ``(b, D, k)``, dG V.
+    """
+    size, dim = vectors.shape[-2:]
+    trace = gram.detach().diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
+    usable = torch.isfinite(gram.detach().sum((-2, -1), keepdim=True)) & (trace > 1e-300)
+    scale = torch.where(usable, trace, 1.0).reciprocal()
+    eye = torch.eye(size, dtype=gram.dtype, device=gram.device)
+    scaled = torch.where(usable, gram, eye) * scale
+    right = image - vectors @ (vectors.mT @ image)
+    deflated = scaled + vectors @ vectors.mT + size * EPS * eye
+    small = vectors.mT @ scaled @ vectors
+    within = torch.eye(dim, dtype=gram.dtype, device=gram.device)
+    operator = torch.einsum("...ij,kl->...ikjl", deflated, within) - torch.einsum("ij,...lk->...ikjl", eye, small)
+    flat = operator.flatten(-4, -3).flatten(-2, -1)
+    found = torch.linalg.solve_ex(flat, right.flatten(-2)[..., None])[0][..., 0].unflatten(-1, (size, dim))
+    found = torch.where(usable, found, 0.0) * -scale
+    return found - vectors @ (vectors.mT @ found)
+
+
+def gram_gradient(gram: Tensor, vectors: Tensor, gradient: Tensor) -> Tensor:
+    """Gradient ``(b, D, D)`` by a Gram of a function of its eigenvectors with this gradient ``(b, D, k)``; differentiable."""
+    product = turned(gram, vectors, gradient) @ vectors.mT
+    return 0.5 * (product + product.mT)
+
+
 def _regularized_factor(matrix: Tensor) -> Tensor:
     """Cholesky factors; a matrix of trace about 1 that is singular to rounding gets a small multiple of the identity."""
     factor: Tensor

@@ -8,8 +8,8 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
+from dyntorch.arguments import check_tensor
 from dyntorch.blocks import map_blocks
 from dyntorch.eigenspace import (
     NULL,
@@ -19,10 +19,12 @@ from dyntorch.eigenspace import (
     by_squaring,
     competing_sum,
     fix_signs,
+    gram_gradient,
     on_host,
     orthonormal,
     resolvent,
     solve,
+    turned,
     unit_trace,
 )
 
@@ -52,14 +54,15 @@ class GramNullSpace:
 def null_space(matrix: Tensor, dim: int = 1) -> Tensor:
     r"""Orthonormal basis of the right null space: :math:`A v_j \approx 0`, least squares where no exact one exists.
 
-    The rows span what ``torch.linalg.svd(A).Vh[-dim:]`` spans.
+    The rows span what ``torch.linalg.svd(A).Vh[-dim:]`` spans.  All derivatives of a function that does not depend on the choice
+    of the basis are right, also the second (``create_graph=True``, ``torch.func``), at minimal rows, and for ``dim`` above one.
 
     Args:
         matrix: ``(*batch, rows, D)`` with ``rows >= D - dim``.
         dim: dimension of the null space.
 
     Returns:
-        ``(*batch, dim, D)`` in the dtype and on the device of the input, NaN where the input is not finite.
+        ``(*batch, dim, D)`` in the dtype and on the device of the input; zero where a matrix holds a number that is not finite.
 
     Raises:
         ValueError: fewer rows than D - dim, ``dim`` outside 1..D, or no floating point matrix.
@@ -79,7 +82,8 @@ def null_space(matrix: Tensor, dim: int = 1) -> Tensor:
         )
     if matrix.device.type == "mps":  # no float64
         return null_space(matrix.cpu(), dim).to(matrix.device)
-    basis: Tensor = _OfRows.apply(_flat(matrix), dim)  # type: ignore[no-untyped-call]
+    keep = torch.is_grad_enabled() and matrix.requires_grad
+    basis: Tensor = _OfRows.apply(_flat(matrix), dim, keep)[0]  # type: ignore[no-untyped-call]
     return basis.reshape(*matrix.shape[:-2], dim, size)
 
 
@@ -117,8 +121,9 @@ def gram_null_space(gram: Tensor, dim: int = 1) -> GramNullSpace:
 
 
 def _check(matrix: Tensor, name: str, dim: int) -> None:
-    if matrix.ndim < 2 or not matrix.is_floating_point():
-        raise ValueError(f"{name} must be a floating point tensor (*batch, rows, D), got {tuple(matrix.shape)} {matrix.dtype}")
+    check_tensor(name, matrix, "rows", "D", precise=False)
+    if isinstance(dim, bool) or not isinstance(dim, int):
+        raise ValueError(f"dim must be a whole number, got {dim!r}")
     if not 1 <= dim <= matrix.shape[-1]:
         raise ValueError(f"dim must be from 1 to D = {matrix.shape[-1]}, got {dim}")
 
@@ -158,18 +163,25 @@ def _few(gram: Tensor) -> bool:
 
 
 class _OfGram(torch.autograd.Function):
+    """``dim`` smallest eigenvectors of ``(b, D, D)``; derivatives of every order, reverse and forward, and a rule for vmap."""
+
     @staticmethod
-    def forward(ctx: Any, gram: Tensor, dim: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def forward(gram: Tensor, dim: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         found = map_blocks(lambda block: _solve_gram(block.double(), dim), gram, size=_size(gram))
         basis, residual, competing = (part.to(gram.dtype) for part in found[:3])
-        ctx.save_for_backward(gram, basis)
-        ctx.mark_non_differentiable(residual, competing, found[3])
         return basis, residual, competing, found[3]
 
     @staticmethod
-    @once_differentiable
+    def setup_context(ctx: Any, inputs: tuple[Tensor, int], output: tuple[Tensor, ...]) -> None:
+        ctx.save_for_backward(inputs[0], output[0])
+        ctx.save_for_forward(inputs[0], output[0])
+        ctx.mark_non_differentiable(*output[1:])
+
+    @staticmethod
     def backward(ctx: Any, grad: Tensor, *_: Tensor) -> tuple[Tensor, None]:
         gram, basis = ctx.saved_tensors
+        if torch.is_grad_enabled():  # somebody wants the derivative of this one
+            return gram_gradient(gram.double(), basis.double().mT, grad.double().mT).to(gram.dtype), None
 
         def block(gram: Tensor, basis: Tensor, grad: Tensor) -> Tensor:
             scaled, scale, finite = unit_trace(gram.double())
@@ -179,13 +191,24 @@ class _OfGram(torch.autograd.Function):
 
         return map_blocks(block, gram, basis, grad, size=_size(gram)), None
 
+    @staticmethod
+    def jvp(ctx: Any, tangent: Tensor, *_: None) -> tuple[Tensor, None, None, None]:
+        gram, basis = ctx.saved_tensors
+        moved = turned(gram.double(), basis.double().mT, tangent.double() @ basis.double().mT)
+        return moved.mT.to(gram.dtype), None, None, None
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[int | None, None], gram: Tensor, dim: int) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
+        parts = _OfGram.apply(_merged(info, in_dims[0], gram), dim)  # type: ignore[no-untyped-call]
+        return tuple(_split(info, part) for part in parts), (0, 0, 0, 0)
+
 
 class _OfRows(torch.autograd.Function):
+    """The same for rows ``(b, rows, D)``: the basis, and the Gram where ``keep`` saves the backward from forming it again."""
+
     @staticmethod
-    def forward(ctx: Any, matrix: Tensor, dim: int) -> Tensor:
+    def forward(matrix: Tensor, dim: int, keep: bool) -> tuple[Tensor, Tensor]:
         minimal = matrix.shape[-2] == matrix.shape[-1] - dim
-        # half of the backward would be to form the Gram again
-        keep = ctx.needs_input_grad[0]
         tiny = on_host(matrix) and matrix.numel() * matrix.shape[-1] <= TINY
 
         def block(matrix: Tensor) -> tuple[Tensor, Tensor]:
@@ -198,14 +221,20 @@ class _OfRows(torch.autograd.Function):
             gram = _gram(a)
             return fix_signs(_solve_rows(a, gram, dim)).mT.to(matrix.dtype), gram if keep else none
 
-        basis, gram = map_blocks(block, matrix, size=_size(matrix))
-        ctx.save_for_backward(matrix, gram, basis)
-        return basis
+        return map_blocks(block, matrix, size=_size(matrix))
 
     @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
+    def setup_context(ctx: Any, inputs: tuple[Tensor, int, bool], output: tuple[Tensor, Tensor]) -> None:
+        ctx.save_for_backward(inputs[0], output[1], output[0])
+        ctx.save_for_forward(inputs[0], output[0])
+        ctx.mark_non_differentiable(output[1])
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor, *_: Tensor) -> tuple[Tensor, None, None]:
         matrix, gram, basis = ctx.saved_tensors
+        if torch.is_grad_enabled():  # somebody wants the derivative of this one
+            a = _or_zero(matrix.double())
+            return (2 * a @ gram_gradient(a.mT @ a, basis.double().mT, grad.double().mT)).to(matrix.dtype), None, None
         result = torch.empty_like(matrix, memory_format=torch.contiguous_format)
 
         def block(matrix: Tensor, gram: Tensor, basis: Tensor, grad: Tensor, result: Tensor) -> Tensor:
@@ -213,7 +242,7 @@ class _OfRows(torch.autograd.Function):
             scaled, scale, finite = unit_trace(gram if gram.numel() else _gram(a))
             if not on_host(a) or not bool(finite.all()):
                 a = torch.where(finite[:, None, None], a, 0.0)
-            vectors = torch.nan_to_num(basis.double()).mT
+            vectors = basis.double().mT
             w = resolvent(scaled, vectors, grad.double().mT) * -scale[:, None, None]
             left, right = a @ torch.cat([w, vectors], -1), torch.cat([vectors, w], -1).mT
             # written in place: fresh memory for arrays of this size costs as much as the products
@@ -224,7 +253,36 @@ class _OfRows(torch.autograd.Function):
             return finite
 
         map_blocks(block, matrix, gram, basis, grad, result, size=_size(matrix))
-        return result, None
+        return result, None, None
+
+    @staticmethod
+    def jvp(ctx: Any, tangent: Tensor, *_: None) -> tuple[Tensor, None]:
+        matrix, basis = ctx.saved_tensors
+        a, vectors = _or_zero(matrix.double()), basis.double().mT
+        change = a.mT @ (tangent.double() @ vectors) + tangent.double().mT @ (a @ vectors)
+        return turned(a.mT @ a, vectors, change).mT.to(matrix.dtype), None
+
+    @staticmethod
+    def vmap(
+        info: Any, in_dims: tuple[int | None, None, None], matrix: Tensor, dim: int, keep: bool
+    ) -> tuple[tuple[Tensor, Tensor], tuple[int, int]]:
+        basis, gram = _OfRows.apply(_merged(info, in_dims[0], matrix), dim, keep)  # type: ignore[no-untyped-call]
+        return (_split(info, basis), _split(info, gram)), (0, 0)
+
+
+def _merged(info: Any, axis: int | None, matrix: Tensor) -> Tensor:
+    """The dimension that vmap maps over as part of the batch."""
+    whole = matrix.expand(info.batch_size, *matrix.shape) if axis is None else matrix.movedim(axis, 0)
+    return whole.flatten(0, 1)
+
+
+def _split(info: Any, part: Tensor) -> Tensor:
+    return part.reshape(info.batch_size, len(part) // max(1, info.batch_size), *part.shape[1:])
+
+
+def _or_zero(matrix: Tensor) -> Tensor:
+    """Matrices with a number that is not finite replaced by zero ones."""
+    return torch.where(torch.isfinite(matrix).flatten(1).all(-1)[:, None, None], matrix, 0.0)
 
 
 def _solve_gram(gram: Tensor, dim: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -253,14 +311,14 @@ def _solve_rows(matrix: Tensor, gram: Tensor, dim: int) -> Tensor:
     """Null spaces ``(b, D, dim)`` through the Gram, where it carries them; corrected with the rows; SVD for the rest."""
     scaled, scale, finite = unit_trace(gram)
     if dim == matrix.shape[-1]:
-        return torch.where(finite[:, None, None], by_eigh(scaled, dim)[0], torch.nan)
+        return torch.where(finite[:, None, None], by_eigh(scaled, dim)[0], 0.0)
     if _few(gram):
         values, vectors = torch.linalg.eigh(scaled)
         return _with_svd(matrix, vectors[..., :dim].contiguous(), ~finite | (values[:, dim] < ACCURATE))
     found = by_inverse_iteration(scaled, dim)
     vectors = found.vectors
     if not on_host(matrix):
-        return torch.where(finite[:, None, None], _corrected(matrix, scale, vectors, found.deflated), torch.nan)
+        return torch.where(finite[:, None, None], _corrected(matrix, scale, vectors, found.deflated), 0.0)
     slow = (finite & ~found.certified & (found.competing > ACCURATE)).nonzero()[:, 0]
     if len(slow):
         vectors[slow] = by_eigh(scaled[slow], dim)[0]
@@ -293,9 +351,7 @@ def _solve_minimal(matrix: Tensor, dim: int) -> Tensor:
     error = (matrix @ vectors).square().sum((-2, -1))
     sound = error <= STABLE**2 * matrix.square().sum((-2, -1))
     return (
-        _with_svd(matrix, vectors, ~sound)
-        if on_host(matrix)
-        else torch.where(torch.isfinite(error)[:, None, None], vectors, torch.nan)
+        _with_svd(matrix, vectors, ~sound) if on_host(matrix) else torch.where(torch.isfinite(error)[:, None, None], vectors, 0.0)
     )
 
 
@@ -313,4 +369,4 @@ def _by_svd(matrix: Tensor, dim: int) -> Tensor:
     sound = bool(finite.all())  # the SVD raises for the whole batch
     vh = torch.linalg.svd(matrix if sound else torch.where(finite, matrix, 0.0), full_matrices=rows < size).Vh
     vectors = vh[:, size - dim :].flip(-2).mT
-    return vectors if sound else torch.where(finite, vectors, torch.nan)
+    return vectors if sound else torch.where(finite, vectors, 0.0)

@@ -64,6 +64,27 @@ def gradient_of_motion_is_right(case: Case) -> None:
 
 
 @prop()
+def second_derivatives_are_right(case: Case) -> None:
+    """Along a direction of the data, from the values of the gradient: through the normalization, the null space and the constraint."""
+    for n in (case.minimal, many(case)):
+        views = example(case, n, batch=())
+        g = torch.Generator().manual_seed(3)
+        along = [torch.randn(x.shape, generator=g, dtype=x.dtype) for x in views]
+
+        def slope(s: float, create: bool, views: tuple[Tensor, ...] = views, along: list[Tensor] = along) -> tuple[Tensor, Tensor]:
+            q = torch.tensor(s, dtype=torch.float64, requires_grad=True)
+            tensor = dyn.fit(case.invariant, *(x + q * e for x, e in zip(views, along, strict=True))).tensor
+            value = projector(case, tensor)[0, 0, :3].sum()
+            return torch.autograd.grad(value, q, create_graph=create)[0], q
+
+        first, q = slope(0.0, True)
+        (second,) = torch.autograd.grad(first, q)
+        h = 1e-6
+        expected = (slope(h, False)[0] - slope(-h, False)[0]).detach() / (2 * h)
+        torch.testing.assert_close(second, expected, rtol=1e-3, atol=1e-4 * float(first.detach().abs()) + 1e-3)
+
+
+@prop()
 def failed_problems_leave_gradients_of_the_others_alone(case: Case) -> None:
     views = example(case, batch=(3,))
     alone = [x[:1].clone().requires_grad_() for x in views]
