@@ -33,6 +33,15 @@ def check_precision(name: str, dtype: torch.dtype, *, precise: bool = True) -> N
         raise ValueError(f"{name} must be float32 or float64, got {dtype}, which has too few digits; use .float()")
 
 
+def refuse_vmap(name: str, value: Tensor) -> None:
+    """Raise a ``ValueError`` for a tensor inside of ``torch.func.vmap``: which way to go depends on values."""
+    functorch = torch._C._functorch
+    while functorch.is_functorch_wrapped_tensor(value):
+        if functorch.is_batchedtensor(value):
+            raise ValueError(f"{name} is mapped over by torch.func.vmap; give all problems at once, in leading dimensions")
+        value = functorch.get_unwrapped(value)
+
+
 def check_together(**tensors: tuple[Tensor, int]) -> torch.Size:
     """The batch of several tensors: raise a ``ValueError`` unless they have one dtype, one device and batches that agree.
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from dyntorch.arguments import check_tensor, refuse_vmap
 from dyntorch.invariant import Invariant
 from dyntorch.primitives import Point, Primitive
 
@@ -62,16 +63,12 @@ def matches(invariant: Invariant, views: Sequence[Tensor], weights: Tensor | Non
     home = torch.device("cpu") if first.device.type == "mps" else first.device
     # not reshape(-1): without matches any batch would do
     flat = [x.to(home, torch.float64).reshape(math.prod(batch), *x.shape[axis:]) for x in views]
-    weight = option("weights", weights, batch, n, first)
-    weight = torch.ones(flat[0].shape[:2], dtype=torch.float64, device=home) if weight is None else weight.to(home, torch.float64)
-    if bool((weight < 0).any()) if weight.device.type == "cpu" else False:
-        raise ValueError(f"weights must not be negative, got {float(weight.min()):g}; use 0 to leave a match out")
+    weight = _weights(option("weights", weights, batch, n, first), flat[0])
     label = option("static", static, batch, n, first)
     if home.type == "cpu" and bool(torch.stack([x.detach().sum() for x in (*flat, weight)]).isfinite().all()):
         # nothing is missing: one sum per view says so, and nothing is copied
         return Matches(tuple(flat), weight, _labels(label, home), batch, first.dtype, first.device)
-    # an accelerator does not wait for the check of the sign above: there a negative weight is a missing match
-    present = weight.isfinite() & (weight >= 0)
+    present = weight.isfinite()
     for x in flat:
         present = present & x.isfinite().flatten(2).all(-1)
     clean = [torch.where(present[(..., *([None] * (x.ndim - 2)))], x, torch.zeros_like(x)) for x in flat]
@@ -83,6 +80,15 @@ def matches(invariant: Invariant, views: Sequence[Tensor], weights: Tensor | Non
         first.dtype,
         first.device,
     )
+
+
+def _weights(given: Tensor | None, like: Tensor) -> Tensor:
+    """``(b, n)`` float64."""
+    if given is None:
+        return torch.ones(like.shape[:2], dtype=like.dtype, device=like.device)
+    if bool((given < 0).any()):
+        raise ValueError(f"weights must not be negative, got {float(given.nan_to_num().min()):g}; use 0 to leave a match out")
+    return given.to(like)
 
 
 def _labels(label: Tensor | None, home: torch.device) -> Tensor | None:
@@ -114,10 +120,8 @@ def constellations(invariant: Invariant, points: Sequence[Tensor]) -> Tensor:
 def _check_measured(invariant: Invariant, primitives: Sequence[Primitive], views: Sequence[Tensor], what: str) -> None:
     leading: list[tuple[int, ...]] = []
     for v, (primitive, x) in enumerate(zip(primitives, views, strict=True), start=1):
-        if not isinstance(x, Tensor):
-            raise ValueError(f"{what} {v} must be a torch.Tensor, got {type(x).__name__}; use torch.as_tensor(...)")
-        if not x.is_floating_point():
-            raise ValueError(f"{what} {v} must be of floating point, got {x.dtype}; use .double()")
+        check_tensor(f"{what} {v}", x)
+        refuse_vmap(f"{what} {v}", x)
         try:
             axis = primitive.match_axis(x)
         except ValueError as error:

@@ -221,7 +221,8 @@ class _OfRows(torch.autograd.Function):
             gram = _gram(a)
             return fix_signs(_solve_rows(a, gram, dim)).mT.to(matrix.dtype), gram if keep else none
 
-        return map_blocks(block, matrix, size=_size(matrix))
+        basis, gram = map_blocks(block, matrix, size=_size(matrix))
+        return basis, gram
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, int, bool], output: tuple[Tensor, Tensor]) -> None:

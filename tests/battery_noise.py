@@ -65,7 +65,7 @@ def gradient_of_motion_is_right(case: Case) -> None:
 
 @prop()
 def second_derivatives_are_right(case: Case) -> None:
-    """Along a direction of the data, from the values of the gradient: through the normalization, the null space and the constraint."""
+    """Along a direction of the data, from values of the gradient: through normalization, null space and constraint."""
     for n in (case.minimal, many(case)):
         views = example(case, n, batch=())
         g = torch.Generator().manual_seed(3)

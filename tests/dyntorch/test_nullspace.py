@@ -305,7 +305,7 @@ def test_misuse_is_refused():
         gram_null_space(random(9, 9), dim=10)
     with pytest.raises(ValueError, match="matrix must be of floating point"):
         null_space(torch.ones(9, 9, dtype=torch.int64))
-    with pytest.raises(ValueError, match=r"gram must be a floating point tensor .*\(9,\)"):
+    with pytest.raises(ValueError, match=r"gram must be .*\(9,\)"):
         gram_null_space(random(9))
     with pytest.raises(ValueError, match=r"gram must be square .*\(8, 9\)"):
         gram_null_space(random(8, 9))
@@ -401,8 +401,8 @@ def test_gradient_in_single_precision(rows):
 
 def gauge_free(basis):
     """Three numbers that do not depend on the choice of the basis."""
-    size = basis.shape[-1]
-    return (projector(basis) @ random(size, 3, seed=20)).square().sum(-2)
+    fixed = torch.linspace(-1, 1, 3 * basis.shape[-1], dtype=basis.dtype).sin().reshape(-1, 3)
+    return (projector(basis) @ fixed).square().sum(-2)
 
 
 @pytest.mark.parametrize("batch", [1, 4])
@@ -475,7 +475,7 @@ def test_nothing_waits_for_an_accelerator(accelerator, rows, dim):
         found.basis.sum().backward()
     for result in (basis, found.basis):
         assert angle(result[keep], expected[keep, -dim:]).max() < 1e-10
-    assert basis[3].isnan().all() and (found.basis[3] == 0).all()
+    assert (basis[3] == 0).all() and (found.basis[3] == 0).all()
     assert found.degenerate.tolist() == (~keep).tolist()
     assert leaf.grad.isfinite().all() and gram.grad.isfinite().all()
 
