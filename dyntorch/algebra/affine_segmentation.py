@@ -9,6 +9,7 @@ from torch import Tensor
 
 from dyntorch.algebra.homogeneous import homogeneous, unit
 from dyntorch.algebra.hyperplane_pair import hyperplane_pair
+from dyntorch.algebra.partition import order_of_bodies
 from dyntorch.algebra.two_views import check_matches, described
 from dyntorch.nullspace import gram_null_space
 
@@ -95,8 +96,7 @@ def affine_segmentation(x1: Tensor, x2: Tensor, weights: Tensor | None = None) -
     planes = _turn(match, weight, planes)
     distances = (planes @ homogeneous(match).mT).abs()
     label = distances.detach().argmin(dim=-2)
-    members = torch.stack([((label == k) & present).sum(-1) for k in range(2)], dim=-1)
-    swap = members[..., 1] > members[..., 0]
+    swap = order_of_bodies(torch.stack([(label == k) & present for k in range(2)], dim=-2))[..., 0] == 1
     planes = torch.where(swap[..., None, None], planes.flip(-2), planes)
     labels = torch.where(present, 1 + (label ^ swap[..., None]), 0)
     residuals = torch.where(present, distances.amin(-2), 0.0)

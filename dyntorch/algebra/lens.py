@@ -42,7 +42,7 @@ def distort(x: Tensor, K: Tensor, dist: Tensor) -> Tensor:
     Example:
         >>> import torch
         >>> K = torch.tensor([[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]])
-        >>> distort(torch.tensor([[820.0, 240.0]]), K, torch.tensor([-0.25, 0.0, 0.0, 0.0])).tolist()
+        >>> distort(torch.tensor([[820.0, 240.0]]), K, torch.tensor([-0.25, 0.0, 0.0, 0.0])).round(decimals=2).tolist()
         [[695.0, 240.0]]
     """
     _check(x, K, dist)

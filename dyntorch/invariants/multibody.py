@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.algebra.homogeneous import homogeneous, unit, unit_vectors
+from dyntorch.algebra.partition import order_of_bodies
 from dyntorch.algebra.two_views import check_matches, described
 from dyntorch.invariants.fundamental_matrix import FundamentalMatrix
 from dyntorch.normalize import hartley
@@ -169,9 +170,9 @@ def _bodies(matrix: Tensor, first: Tensor, second: Tensor, bodies: int, weights:
         label = torch.stack(distances).argmin(dim=0)
         share = (weights > 0).to(trust.dtype)
     member = (label[..., None, :] == torch.arange(bodies, device=label.device)[:, None]) & (weights > 0)[..., None, :]
-    counts, order = member.sum(-1).sort(dim=-1, descending=True, stable=True)
+    order = order_of_bodies(member)
     labels = torch.where(weights > 0, 1 + order.argsort(dim=-1).gather(-1, label), 0)
-    return labels, fundamentals.take_along_dim(order[..., None, None], dim=-3), counts[..., -1] >= LEAST
+    return labels, fundamentals.take_along_dim(order[..., None, None], dim=-3), member.sum(-1).amin(-1) >= LEAST
 
 
 def _gradient(form: Tensor, p: Tensor, degree: int) -> Tensor:

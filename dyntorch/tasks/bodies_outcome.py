@@ -9,6 +9,7 @@ from torch import Tensor
 
 from dyntorch.algebra.epipolar import sampson_squared
 from dyntorch.algebra.homogeneous import unit
+from dyntorch.algebra.partition import order_of_bodies
 from dyntorch.algebra.plane_homography import homography_sampson_squared
 from dyntorch.solution import Status
 from dyntorch.tasks.bodies_energy import View
@@ -141,10 +142,10 @@ def outcome(given: Given, labelled: Labelling, threshold: float, bodies: int | N
 
 
 def _sorted(labelled: Labelling) -> Labelling:
-    """The bodies that kept enough matches, the largest first."""
-    size = torch.bincount(labelled.labels, minlength=len(labelled.fundamentals) + 1)[1:]
-    order = size.argsort(descending=True, stable=True)
-    return labelled.of(order[size[order] >= LEAST])
+    """The bodies that kept enough matches, numbered by the rule."""
+    members = one_hot(labelled.labels - 1, len(labelled.fundamentals)) > 0
+    order = order_of_bodies(members)
+    return labelled.of(order[members.sum(-1)[order] >= LEAST])
 
 
 def _residuals(view: View, labels: Tensor, fundamentals: Tensor, models: Models) -> Tensor:

@@ -38,7 +38,8 @@ class Segmentation:
     Where problems of a batch have different numbers of bodies, K is the largest; what is behind ``bodies`` is 0.
 
     Attributes:
-        labels: ``(*batch, n)`` int64, 0 outlier, 1..K the bodies, those with more matches first.
+        labels: ``(*batch, n)`` int64, 0 outlier, 1..K the bodies: the larger first, of equally large ones that of
+            the earliest match.
         bodies: ``(*batch,)`` int64, how many bodies.
         fundamentals: ``(*batch, K, 3, 3)`` of norm 1, :math:`x_2^T F x_1 = 0`.  Where ``models`` says homography, F is one of the
             family :math:`[e]_\\times H` that fit the matches alike.

@@ -89,7 +89,9 @@ def test_conditioning_does_not_matter(motion, unit):
     structure[..., scene.points.shape[-1]] /= unit
     estimate = structure @ gauges(scene.lifts, 5).mT
     error = lifted_error(estimate @ shift.mT, structure @ shift.mT, later.lifts)
-    assert error.position.max() < 1e-8 and error.velocity.max() < 1e-7
+    # both structures are rounded after the change of the lifted space, which magnifies that by its condition number
+    lost = 10 * torch.linalg.cond(shift) * torch.finfo(torch.float64).eps
+    assert error.position.max() < max(1e-8, lost) and error.velocity.max() < max(1e-7, lost)
 
 
 @pytest.mark.parametrize("motion", DIMENSIONS)

@@ -63,9 +63,11 @@ def test_noisy_tracks_lead_to_the_minimum_near_the_truth(name, n, views):
 
 
 def test_weak_acceleration_is_lost_by_the_tensor_alone(monkeypatch):
+    # neither a second start nor the look at what lies behind cameras: costs are 40 to 100,000 times the least one
     monkeypatch.setattr(lifted_scene, "SEVERAL", 99)
+    monkeypatch.setattr(lifted_scene, "wild", lambda tracks, scene, lifting: torch.zeros_like(scene.cost, dtype=torch.bool))
     truth, tracks, lifting, _, scene = solved("constant_acceleration_2d", 60, seed=1, views=4, sigma=1.0, batch=(4,))
-    assert bool((scene.cost > 2 * from_truth(truth, tracks, lifting).cost).any())
+    assert (scene.cost > 2 * from_truth(truth, tracks, lifting).cost).sum() >= 3
 
 
 @pytest.mark.parametrize("name", ["constant_velocity_3d", "constant_acceleration_2d"])
