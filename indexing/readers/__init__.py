@@ -10,8 +10,9 @@ from importlib import import_module
 from pathlib import Path
 
 from indexing.clip import Clip, ClipSet
+from indexing.opening import error, shown
 from indexing.readers.detect import detect
-from indexing.readers.files import error, open_source
+from indexing.readers.files import open_source
 from indexing.readers.options import Options
 
 FORMATS = ("clipset", "openpose", "coco", "mediapipe", "deeplabcut", "mmpose", "ultralytics", "sleap")
@@ -59,7 +60,7 @@ def read(
     """
     options = Options(fps=fps, person=person, min_confidence=min_confidence, label=label, size=size)
     if format is not None and format not in FORMATS:
-        raise ValueError(f"{path}: unknown format={format!r}; use one of {', '.join(FORMATS)}, or leave it away to detect it")
+        raise ValueError(f"{path}: unknown format={shown(format)}; use one of {', '.join(FORMATS)}, or leave it away to detect it")
     source = open_source(path)
     module = import_module(f"{__name__}.{format or detect(source)}")
     clips: ClipSet = module.read(source, options)

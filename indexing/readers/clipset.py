@@ -26,10 +26,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from indexing.clip import Clip, ClipSet
+from indexing.opening import error
 from indexing.readers.clipset_write import write_clip_set
-from indexing.readers.files import Source, error
+from indexing.readers.files import Source
+from indexing.readers.npz import Archive
 from indexing.readers.options import Options
-from indexing.readers.sets import clip_labels, clip_meta, clip_names, clip_offsets, frame_times, load_arrays, need, per_clip, plain
+from indexing.readers.sets import clip_labels, clip_meta, clip_names, clip_offsets, frame_times, need, per_clip, plain
 from indexing.skeleton import Skeleton
 
 __all__ = ["read", "read_clip_set", "write_clip_set"]
@@ -67,7 +69,7 @@ def read_clip_set(
         (['run', 'sit'], 0.4)
     """
     path = Path(path)
-    data = load_arrays(path)
+    data = Archive(path)
     joints = need(path, data, "joints", 3)
     if joints.shape[2] not in (2, 3) or joints.dtype.kind not in "fiu":
         raise error(
@@ -82,7 +84,7 @@ def read_clip_set(
     assumed = per_clip(path, data, "fps_assumed", count, "fps" not in data and "times" not in data and fps is None)
     times = frame_times(path, data, offsets, rate, names)
     up = per_clip(path, data, "up", count, "y")
-    meta, skeleton = clip_meta(data, count), _skeleton(path, data, joints.shape[1])
+    meta, skeleton = clip_meta(data, count, "joints"), _skeleton(path, data, joints.shape[1])
     clips = []
     for i, (start, end) in enumerate(pairwise(offsets.tolist())):
         known = None if confidence is None or np.isnan(confidence[start:end]).all() else confidence[start:end]

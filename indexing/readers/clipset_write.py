@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from indexing.clip import Clip
-from indexing.readers.files import error
+from indexing.opening import error, shown
 from indexing.skeleton import Skeleton
 
 Array = NDArray[Any]
@@ -72,7 +72,7 @@ def _actions(path: Path, labels: list[Hashable | None]) -> dict[str, Array]:
     if not whole:
         odd = next(label for label in given if not isinstance(label, (int, np.integer)) or isinstance(label, bool) or label < 0)
         raise error(
-            path, f"the label {odd!r} cannot be written with the others", "use text for all labels, or integers from 0 for all"
+            path, f"the label {shown(odd)} cannot be written with the others", "use text for all labels, or integers from 0 for all"
         )
     return {"action": np.array([-1 if label is None else label for label in labels])}
 
@@ -97,13 +97,15 @@ def _bones(path: Path, clips: list[Clip]) -> dict[str, Array]:
 def _column(path: Path, clips: list[Clip], key: str) -> Array:
     lacking = [clip.name or str(i) for i, clip in enumerate(clips) if key not in clip.meta]
     if lacking:
-        raise error(path, f"the clip {lacking[0]!r} has no field {key!r}, other clips have", "give it to every clip, or to none")
+        raise error(
+            path, f"the clip {shown(lacking[0])} has no field {shown(key)}, other clips have", "give it to every clip, or to none"
+        )
     try:
         column = np.asarray([clip.meta[key] for clip in clips])
     except ValueError:
         column = np.empty(0, dtype=object)
     if column.dtype.kind not in "biufU":
-        raise error(path, f"the field {key!r} is not numbers or text of one shape", "convert it, or drop it from Clip.meta")
+        raise error(path, f"the field {shown(key)} is not numbers or text of one shape", "convert it, or drop it from Clip.meta")
     return column
 
 

@@ -12,7 +12,8 @@ from dataclasses import replace
 from typing import Any
 
 from indexing.clip import ClipSet
-from indexing.readers.files import Source, error, frame_number
+from indexing.opening import error, shown
+from indexing.readers.files import Source, frame_number
 from indexing.readers.options import Options
 from indexing.readers.recording import Detection, flat, gather, to_clips, track_id
 from indexing.skeleton import Skeleton, known
@@ -35,8 +36,8 @@ def read(source: Source, options: Options) -> ClipSet:
             raise error(source.path, f"{where}: needs image_id and keypoints", REMEDY)
         image = person["image_id"]
         if not isinstance(image, (int, str)):
-            raise error(source.path, f"{where}: image_id must be a number or a file name, got {image!r}", REMEDY)
-        where = f"{where} (image_id {image!r}), keypoints"
+            raise error(source.path, f"{where}: image_id must be a number or a file name, got {shown(image)}", REMEDY)
+        where = f"{where} (image_id {shown(image)}), keypoints"
         detections = frames.setdefault(image, [])
         if person["keypoints"]:
             detections.append(Detection(*flat(source.path, where, person["keypoints"]), _track(person)))
@@ -78,12 +79,12 @@ def _numbers(source: Source, images: dict[Hashable, Any]) -> dict[Hashable, int]
         number = name if isinstance(name, int) else frame_number(str(name))
         if number is None:
             raise error(
-                source.path, f"image {name!r} has no number in its name", "name the images by frame number, e.g. 000012.jpg"
+                source.path, f"image {shown(name)} has no number in its name", "name the images by frame number, e.g. 000012.jpg"
             )
         if number in owner:
             raise error(
                 source.path,
-                f"images {owner[number]!r} and {name!r} are both frame {number}",
+                f"images {shown(owner[number])} and {shown(name)} are both frame {number}",
                 "give one recording per file, with images numbered by frame",
             )
         numbers[image], owner[number] = number, name

@@ -10,7 +10,8 @@ from __future__ import annotations
 import numpy as np
 
 from indexing.clip import ClipSet
-from indexing.readers.files import Source, error, frame_number, read_columns
+from indexing.opening import error, shown
+from indexing.readers.files import Source, frame_number, read_columns
 from indexing.readers.options import Options
 from indexing.readers.recording import IntArray, Recording, to_clips
 from indexing.skeleton import Skeleton
@@ -29,7 +30,7 @@ def read(source: Source, options: Options) -> ClipSet:
     header = {row[0].strip().lower(): [cell.strip() for cell in row] for row in source.data[:4]}
     lacking = [name for name in ("bodyparts", "coords") if name not in header]
     if lacking:
-        raise error(source.path, f"has no header row {lacking[0]!r} among the first four rows", REMEDY)
+        raise error(source.path, f"has no header row {shown(lacking[0])} among the first four rows", REMEDY)
     if len({len(row) for row in header.values()}) > 1:
         raise error(source.path, "the header rows have different lengths", REMEDY)
     individuals = header.get("individuals")
@@ -73,7 +74,9 @@ def _layout(source: Source, parts: list[str], coords: list[str], individuals: li
                 raise error(source.path, f"{who} has the columns {', '.join(columns)}, not x, y, likelihood", REMEDY)
         if its.keys() != first.keys():
             raise error(
-                source.path, f"the individual {animal!r} has other body parts than the first", "export animals of one kind per file"
+                source.path,
+                f"the individual {shown(animal)} has other body parts than the first",
+                "export animals of one kind per file",
             )
     return layout
 
@@ -82,5 +85,7 @@ def _frames(source: Source, keys: list[str]) -> IntArray:
     """Frame numbers from the index column: numbers, or names of images."""
     numbers = [frame_number(key) for key in keys]
     if None in numbers:
-        raise error(source.path, f"frame {keys[numbers.index(None)]!r} has no number", "number the frames, or the images by frame")
+        raise error(
+            source.path, f"frame {shown(keys[numbers.index(None)])} has no number", "number the frames, or the images by frame"
+        )
     return np.array(numbers, dtype=np.int64)

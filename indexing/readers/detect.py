@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from indexing.readers.files import Source, error
+from indexing.opening import error, listed
+from indexing.readers.files import Source
 
 REMEDY = "export one of the formats in indexing.readers.FORMATS, or name it with format="
 
@@ -84,8 +85,7 @@ def _detect_csv(source: Source) -> str:
     from indexing.readers.mediapipe import find_columns
 
     if find_columns(rows[0]) is None:
-        shown = ", ".join(rows[0][:6]) + (", ..." if len(rows[0]) > 6 else "")
-        raise error(source.path, f"text without keypoint columns that a reader knows (first row: {shown[:120]})", REMEDY)
+        raise error(source.path, f"text without keypoint columns that a reader knows (first row: {listed(rows[0], 6)})", REMEDY)
     return "mediapipe"
 
 
@@ -95,7 +95,7 @@ def _only_empty_lists(data: Any) -> bool:
 
 def _describe(data: Any) -> str:
     if isinstance(data, dict):
-        return f"an object with {', '.join(list(map(str, data))[:5]) or 'nothing in it'}"
+        return f"an object with {listed(data, 5)}"
     if isinstance(data, list) and data and isinstance(data[0], dict):
-        return f"a list of objects with {', '.join(list(map(str, data[0]))[:5])}"
+        return f"a list of objects with {listed(data[0], 5)}"
     return f"a {type(data).__name__}"

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import csv
-import json
+import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -14,8 +13,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from indexing.clip import FloatArray
+from indexing.opening import VALUE, clipped, entries, error, head_of, listed, parse_json, read_rows, read_text, shown, size_of
 
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv")
+KEYPOINTS = "give keypoints as JSON, CSV or a clip-set .npz"
 HEADER_ROWS = 5  # enough to tell every CSV format apart
 
 
@@ -51,11 +52,6 @@ class Source:
             )
 
 
-def error(path: str | Path, what: str, remedy: str) -> ValueError:
-    """The one shape of every message: file, what is wrong, what to do."""
-    return ValueError(f"{path}: {' '.join(what.split())}; {remedy}")  # what is quoted from a file may hold line breaks
-
-
 def open_source(path: str | Path) -> Source:
     """Look at what a path holds, without deciding on a format.
 
@@ -63,10 +59,9 @@ def open_source(path: str | Path) -> Source:
         ValueError: it does not exist, is empty, or cannot hold keypoints (a video, a model, a pickle, HDF5).
     """
     path = Path(path).expanduser()
-    if path.is_dir():
+    if os.path.isdir(path):
         return _open_folder(path)
-    if not path.is_file():
-        raise error(path, "no such file or folder", "check the path")
+    size_of(path, what="file or folder")
     suffix = path.suffix.lower()
     if suffix in VIDEOS:
         raise error(
@@ -74,16 +69,13 @@ def open_source(path: str | Path) -> Source:
             "is a video, but keypoints are expected, and no pose estimator ships here",
             "run one first (RTMPose/MMPose, Ultralytics, OpenPose, MediaPipe, DeepLabCut) and give its keypoint file",
         )
-    with path.open("rb") as file:
-        head = file.read(512)
-    if not head.strip():
-        raise error(path, "the file is empty", "export it again")
+    head = head_of(path)
     _refuse_binary(path, suffix, head)
     if head.startswith(b"PK") or suffix == ".npz":
         return Source(path, "npz")
     if head.removeprefix(b"\xef\xbb\xbf").lstrip()[:1] in (b"{", b"["):
         return Source(path, "json", load_json(path))
-    rows = [cells for _, cells in islice(_rows(path), HEADER_ROWS)]
+    rows = [cells for _, cells in islice(read_rows(path, KEYPOINTS), HEADER_ROWS)]
     if not rows:
         raise error(path, "the file is empty", "export it again")
     return Source(path, "csv", rows)
@@ -103,11 +95,11 @@ def _refuse_binary(path: Path, suffix: str, head: bytes) -> None:
     if head.startswith(b"\x93NUMPY"):
         raise error(path, "is a bare .npy array", "save it as a clip set: np.savez(file, joints=array, fps=...)")
     if b"\0" in head and not head.startswith(b"PK") and suffix != ".npz":
-        raise error(path, "is a binary file that no reader knows", "give keypoints as JSON, CSV or a clip-set .npz")
+        raise error(path, "is a binary file that no reader knows", KEYPOINTS)
 
 
 def _open_folder(folder: Path) -> Source:
-    visible = sorted(entry for entry in folder.iterdir() if not entry.name.startswith("."))
+    visible = entries(folder)
     for suffix in (".json", ".txt"):
         files = [entry for entry in visible if entry.suffix.lower() == suffix and entry.name != "classes.txt"]
         if not files:
@@ -124,13 +116,15 @@ def _open_folder(folder: Path) -> Source:
             if number in numbered:
                 raise error(
                     folder,
-                    f"{numbered[number].name} and {file.name} are both frame {number}",
+                    f"{clipped(numbered[number].name, VALUE)} and {clipped(file.name, VALUE)} are both frame {number}",
                     "a folder holds one recording: put each recording in a folder of its own",
                 )
             numbered[number] = file
+        for file in files:
+            size_of(file)  # a folder or a pipe among them is named before any of them is read
         read = load_json if suffix == ".json" else _nothing
         return Source(folder, f"{suffix[1:]} folder", [FrameFile(n, f, read(f)) for n, f in sorted(numbered.items())])
-    inside = ", ".join(entry.name for entry in visible[:5]) or "nothing"
+    inside = listed((entry.name for entry in visible), 5) if visible else "nothing"
     raise error(folder, f"the folder has no .json or .txt keypoint files (it has {inside})", "give the folder of one recording")
 
 
@@ -156,26 +150,10 @@ def load_json(path: Path) -> Any:
     Raises:
         ValueError: empty, not text, or not JSON; the message has line and column.
     """
-    text = _text(path)
+    text = read_text(path, KEYPOINTS)
     if not text.strip():
         raise error(path, "the file is empty", "export it again")
-    try:
-        return json.loads(text)
-    except json.JSONDecodeError as problem:
-        raise error(
-            path,
-            f"not valid JSON at line {problem.lineno}, column {problem.colno} ({problem.msg})",
-            "the file may be truncated: export it again",
-        ) from None
-    except RecursionError:
-        raise error(path, "the JSON is nested too deeply for keypoints", "export it again") from None
-
-
-def _text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError:
-        raise error(path, "is not a text file in UTF-8", "give keypoints as JSON, CSV or a clip-set .npz") from None
+    return parse_json(path, text, "the file may be truncated: export it again")
 
 
 def read_columns(path: Path, skip: int, numeric: Sequence[int], text: Sequence[int] = ()) -> tuple[FloatArray, list[list[str]]]:
@@ -195,7 +173,7 @@ def read_columns(path: Path, skip: int, numeric: Sequence[int], text: Sequence[i
     header: list[str] = []
     values: list[FloatArray] = []
     words: list[list[str]] = [[] for _ in text]
-    for index, (line, cells) in enumerate(_rows(path)):
+    for index, (line, cells) in enumerate(read_rows(path, KEYPOINTS)):
         if index < skip:
             header = cells
             continue
@@ -221,20 +199,5 @@ def _number(path: Path, line: int, column: str, cell: str) -> float:
         return float(cell)
     except ValueError:
         raise error(
-            path, f"row {line}, column {column!r}: {cell!r} is not a number", "correct the cell or leave it empty"
+            path, f"row {line}, column {shown(column)}: {shown(cell)} is not a number", "correct the cell or leave it empty"
         ) from None
-
-
-def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Line number (1-based) and cells of every row that is not blank."""
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            first = file.readline()
-            file.seek(0)
-            delimiter = max(",;\t", key=first.count)
-            for line, cells in enumerate(csv.reader(file, delimiter=delimiter), start=1):
-                if any(cells):
-                    # where ";" separates cells, the spreadsheet wrote decimal commas
-                    yield line, [cell.replace(",", ".") for cell in cells] if delimiter == ";" else cells
-    except (UnicodeDecodeError, csv.Error):
-        raise error(path, "is not a text file in UTF-8", "give keypoints as JSON, CSV or a clip-set .npz") from None

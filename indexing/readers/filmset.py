@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -17,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from indexing.labelled import LabelledSet
-from indexing.readers.files import error
-from indexing.readers.sets import clip_labels, clip_meta, clip_names, clip_offsets, frame_times, load_arrays, need, per_clip, plain
+from indexing.opening import error
+from indexing.readers.npz import Archive
+from indexing.readers.sets import clip_labels, clip_meta, clip_names, clip_offsets, frame_times, need, per_clip, plain
 
 __all__ = ["Film", "FilmSet", "holds_frames", "read_film_set"]
 
@@ -53,14 +53,13 @@ class FilmSet(LabelledSet[Film]):
 def holds_frames(path: str | Path) -> bool:
     """Whether a file is an ``.npz`` of frames, not of joints; looks at its table of contents only."""
     path = Path(path).expanduser()
-    if path.suffix.lower() != ".npz" or not path.is_file():
+    if path.suffix.lower() != ".npz":
         return False
     try:
-        with zipfile.ZipFile(path) as file:
-            names = set(file.namelist())
-    except (zipfile.BadZipFile, OSError):
+        names = set(Archive(path))
+    except ValueError:
         return False  # whoever reads it says what is wrong
-    return "frames.npy" in names and "joints.npy" not in names
+    return "frames" in names and "joints" not in names
 
 
 def read_film_set(path: str | Path, *, fps: float | None = None) -> FilmSet:
@@ -82,7 +81,7 @@ def read_film_set(path: str | Path, *, fps: float | None = None) -> FilmSet:
         (True, ['run', 'sit'], 5)
     """
     path = Path(path).expanduser()
-    data = load_arrays(path)
+    data = Archive(path)
     frames = need(path, data, "frames", 3)
     if frames.dtype != np.uint8:
         raise error(path, f"frames must be uint8 grey, got {frames.dtype}", "save grey values from 0 to 255")
@@ -91,7 +90,7 @@ def read_film_set(path: str | Path, *, fps: float | None = None) -> FilmSet:
     labels, names = clip_labels(path, data, count), clip_names(path, data, count)
     rate = per_clip(path, data, "fps", count, 30.0 if fps is None else fps)
     times = frame_times(path, data, offsets, rate, names)
-    meta = clip_meta({key: values for key, values in data.items() if key != "frames"}, count)
+    meta = clip_meta(data, count, "frames")
     films = []
     for i, (start, end) in enumerate(pairwise(offsets.tolist())):
         clock = np.arange(end - start) / float(rate[i]) if times is None else times[start:end] - times[start]

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from indexing.readers.points.pointset import error
+from indexing.opening import error, size_of
 
 SIDE = 1600  # pixels kept along the longer side: a panel of a report shows fewer
 
@@ -38,8 +38,7 @@ def read_image(path: str | Path) -> Photograph:
     from PIL import Image, ImageOps
 
     path = Path(path).expanduser()
-    if not path.is_file():
-        raise error(path, "is a folder" if path.is_dir() else "no such file", "give an image, such as png or jpg")
+    size_of(path, "give an image, such as png or jpg")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # that it is large is no reason to worry: it is made smaller

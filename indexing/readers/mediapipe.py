@@ -17,7 +17,8 @@ from typing import NamedTuple
 import numpy as np
 
 from indexing.clip import ClipSet, FloatArray
-from indexing.readers.files import Source, error, read_columns
+from indexing.opening import error, shown
+from indexing.readers.files import Source, read_columns
 from indexing.readers.options import Options
 from indexing.readers.recording import IntArray, Recording, frame_numbers, to_clips
 from indexing.skeleton import HAND21, MEDIAPIPE33, Skeleton
@@ -164,7 +165,7 @@ def _widen(
     cells, counts = np.unique(person * len(names) + joint, return_counts=True)
     if (counts > 1).any():
         twice = names[int(cells[np.argmax(counts > 1)]) % len(names)]
-        raise error(source.path, f"landmark {twice!r} comes twice in a frame", "drop repeated rows, or add a column 'person'")
+        raise error(source.path, f"landmark {shown(twice)} comes twice in a frame", "drop repeated rows, or add a column 'person'")
     table = np.full((len(keys), len(names), rows.shape[1]), np.nan)
     table[person, joint] = rows
     if rows.shape[1] == 3:

@@ -11,7 +11,8 @@ from typing import Any
 
 from indexing import skeleton
 from indexing.clip import ClipSet
-from indexing.readers.files import Source, error, frame_number
+from indexing.opening import error
+from indexing.readers.files import Source, frame_number
 from indexing.readers.options import Options
 from indexing.readers.recording import Detection, flat, gather, to_clips, track_id
 

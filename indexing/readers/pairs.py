@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from indexing.opening import VALUE, clipped, error, listed, repeated, shown
+from indexing.readers.npz import Archive, read_npy
 from indexing.readers.points import table
-from indexing.readers.points.arrays import load, member
 from indexing.readers.points.matching import opening
-from indexing.readers.points.pointset import FloatArray, as_view, error
+from indexing.readers.points.pointset import FloatArray, as_view
 
 COLUMNS = ("x1", "y1", "x2", "y2")
 IDS = ("id", "name", "match", "track")
@@ -21,9 +22,9 @@ KNOWN = ("label", "labels")
 FORMATS = "give npz with x1, x2 (n, 2), or CSV with columns x1,y1,x2,y2 (and perhaps id, weight, label)"
 KEYS = "give x1 and x2 (n, 2), and perhaps label, weights, ids, wh; of several pairs NAME/x1 and NAME/x2"
 EXTRA = {"label": KNOWN, "weights": table.WEIGHTS, "ids": ("ids", "id"), "wh": ("wh", "size")}
+MOST = 2**31  # labels
 TRACKS = ("y", "tracks")  # (frames, n, 2), as of Hopkins 155
 FRAMES = "it seems to hold tracks (frames, n, 2): save two frames as matches, numpy.savez('m.npz', x1=tracks[0], x2=tracks[-1])"
-LISTED = 8  # names in a message
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +82,7 @@ def read_pair(path: str | Path, pair: str | None = None) -> MatchedPair:
     if pair is not None:
         raise error(path, f"--pair {pair}: holds one pair", "leave --pair away; it is for .npz with several")
     if head.startswith(b"\x93NUMPY"):
-        values = load(path)
+        values = read_npy(path)
         if values.ndim != 2 or values.shape[1] != 4:
             raise error(path, f"the array has shape {values.shape}", "matches are (n, 4): x1, y1, x2, y2; numpy.hstack([x1, x2])")
         return _pair(path, path.name, _points(values[:, :2], path), _points(values[:, 2:], path))
@@ -111,39 +112,43 @@ def _points(values: Any, where: str | Path) -> FloatArray:
 
 # ---- npz -----------------------------------------------------------------------------------------------------------------
 def _archive(path: Path, pair: str | None) -> MatchedPair:
-    archive = load(path)
-    before = _chosen(path, list(archive.files), pair)
-    x1, x2 = (_points(member(path, archive, before + name), f"{path} {before}{name}") for name in ("x1", "x2"))
+    archive = Archive(path)
+    before = _chosen(path, list(archive), pair)
+    x1, x2 = (_points(archive[before + name], f"{path} {before}{name}") for name in ("x1", "x2"))
     if len(x1) != len(x2):
         raise error(path, f"{before}x1 has {len(x1)} rows, {before}x2 {len(x2)}", "give a row per match in both")
     extra = {}
     for kind, names in EXTRA.items():
-        name = next((before + name for name in names if before + name in archive.files), None)
+        name = next((before + name for name in names if before + name in archive), None)
         if name is not None:
-            extra[kind] = member(path, archive, name)
+            extra[kind] = archive[name]
             if kind != "wh" and extra[kind].shape != (len(x1),):
                 raise error(path, f"{name} has shape {extra[kind].shape}, {before}x1 has {len(x1)} rows", "give one per match")
     ids = tuple(map(str, extra["ids"].tolist())) if "ids" in extra else None
-    if ids is not None and len(set(ids)) < len(ids):
-        twice = next(name for name in ids if ids.count(name) > 1)
-        raise error(path, f"{before}ids: {twice!r} names several matches", "give each match a name of its own, or leave ids out")
+    twice = repeated(ids or ())
+    if twice is not None:
+        raise error(
+            path, f"{before}ids: {shown(twice)} names several matches", "give each match a name of its own, or leave ids out"
+        )
     return _pair(path, pair or before.rstrip("/") or path.name, x1, x2, ids, **_marks(path, extra))
 
 
 def _chosen(path: Path, names: list[str], pair: str | None) -> str:
     """What the names of the arrays of the pair begin with."""
     several = [name.removesuffix("x1") for name in names if name.endswith("/x1")]
-    listed = ", ".join(name.rstrip("/") for name in several[:LISTED]) + ", ..." * (len(several) > LISTED)
+    pairs = listed(name.rstrip("/") for name in several)
     if pair is not None and f"{pair}/x1" not in names and (several or "x1" in names):
-        raise error(path, f"has no pair {pair!r}", f"its pairs are {listed}" if several else "it holds one pair: leave --pair away")
+        raise error(
+            path, f"has no pair {shown(pair)}", f"its pairs are {pairs}" if several else "it holds one pair: leave --pair away"
+        )
     if pair is None and "x1" not in names and len(several) > 1:
-        raise error(path, f"holds {len(several)} pairs ({listed})", f"say which: --pair {several[0].rstrip('/')}")
+        raise error(path, f"holds {len(several)} pairs ({pairs})", f"say which: --pair {clipped(several[0].rstrip('/'), VALUE)}")
     before = f"{pair}/" if pair is not None else "" if "x1" in names or not several else several[0]
     missing = next((before + name for name in ("x1", "x2") if before + name not in names), None)
     if missing is not None:
         tracks = not several and any(name.rpartition("/")[2] in TRACKS for name in names)
         remedy = FRAMES if tracks else KEYS
-        raise error(path, f"has no {missing} (its arrays are {', '.join(names[:LISTED]) or 'none'})", remedy)
+        raise error(path, f"has no {missing} (its arrays are {listed(names)})", remedy)
     return before
 
 
@@ -161,7 +166,7 @@ def _marks(path: Path, extra: Mapping[str, Any]) -> dict[str, Any]:
         found["weights"] = weights
     if "label" in extra:
         labels = extra["label"].astype(np.float64)
-        odd = np.flatnonzero(~(np.isfinite(labels) & (labels >= 0) & (labels == np.round(labels))))
+        odd = np.flatnonzero(~(np.isfinite(labels) & (labels >= 0) & (labels < MOST) & (labels == np.round(labels))))
         if len(odd):
             said = f"match {odd[0] + 1}: the label is {labels[odd[0]]:g}"
             raise error(path, said, "labels are 0 for an outlier, 1, 2, ... for the bodies; or leave them out")
@@ -185,15 +190,14 @@ def _table(path: Path) -> MatchedPair:
         names, rows = [cell.strip().lower() for cell in rows[0][1]], rows[1:]
     absent = [name for name in COLUMNS if name not in names]
     if absent:
-        columns = ", ".join(name or "(unnamed)" for name in names[:LISTED]) + ", ..." * (len(names) > LISTED)
-        said = f"has no column {absent[0]!r} (its columns are {columns})"
+        said = f"has no column {shown(absent[0])} (its columns are {listed(names)})"
         raise error(path, said, "name the columns x1,y1,x2,y2 (and perhaps id, weight, label)")
     if not rows:
         raise error(path, "the file has a header but no rows", "export it again")
     table.check_widths(path, rows, names)
-    twice = next((name for name in names if names.count(name) > 1 and name in (*COLUMNS, *IDS, *table.WEIGHTS, *KNOWN)), None)
+    twice = repeated(name for name in names if name in (*COLUMNS, *IDS, *table.WEIGHTS, *KNOWN))
     if twice is not None:
-        raise error(path, f"there are two columns {twice!r}", "leave one of them out")
+        raise error(path, f"there are two columns {shown(twice)}", "leave one of them out")
     values = table.column_values(path, rows, names, COLUMNS)
     extra = {
         "weights": table.optional_column(path, rows, names, table.WEIGHTS),

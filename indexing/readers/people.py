@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from indexing.clip import FloatArray
-from indexing.readers.files import error
+from indexing.opening import error
 
 if TYPE_CHECKING:
     from indexing.readers.recording import Recording

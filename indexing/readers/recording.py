@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from indexing.clip import Clip, ClipSet, FloatArray
-from indexing.readers.files import error
+from indexing.opening import error, shown
 from indexing.readers.options import Options
 from indexing.readers.people import choose
 from indexing.skeleton import Skeleton
@@ -65,8 +65,8 @@ def numbers(path: Path, where: str, value: Any) -> FloatArray:
     """
     try:
         return np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise error(path, f"{where}: expected numbers, got {str(value)[:60]}", "export the file again") from None
+    except (TypeError, ValueError, OverflowError):  # of whole numbers of hundreds of digits
+        raise error(path, f"{where}: expected numbers, got {shown(value)}", "export the file again") from None
 
 
 def frame_numbers(path: Path, values: FloatArray) -> IntArray:
@@ -120,7 +120,7 @@ def gather(path: Path, frames: Sequence[tuple[int, Sequence[Detection]]]) -> Rec
     """
     frames = sorted(frames, key=lambda frame: frame[0])
     if frames and max(abs(frames[0][0]), abs(frames[-1][0])) >= LAST_FRAME:
-        raise error(path, f"frame number {frames[-1][0]} is beyond any recording", "number images by frame")
+        raise error(path, f"frame number {shown(frames[-1][0])} is beyond any recording", "number images by frame")
     found = [(i, number, person) for i, (number, people) in enumerate(frames) for person in people]
     if not found:
         raise nobody(path, len(frames))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from collections.abc import Hashable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from indexing.clip import FloatArray
-from indexing.readers.files import error
+from indexing.opening import error, listed, shown
+from indexing.readers.npz import Archive
 
 Array = NDArray[Any]
 # keys that describe frames, joints or the whole set: never meta, whatever their length
@@ -21,35 +20,12 @@ RESERVED |= {"bones", "parents", "joint_names", "skeleton_name"}
 FORMS = {"joints": "joints (F, n, 2 or 3)", "frames": "frames (F, height, width)"}
 
 
-def load_arrays(path: Path) -> dict[str, Array]:
-    """All arrays of the file; nothing in it is ever unpickled."""
-    if not path.is_file():
-        raise error(path, "no such file", "check the path")
-    key = ""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            data = {}
-            for key in file.files:
-                data[key] = file[key]
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error, NotImplementedError) as problem:
-        if "allow_pickle" in str(problem) and key:
-            raise error(
-                path,
-                f"{key} is an array of Python objects, which would need pickle",
-                "save numbers or text: np.asarray(values, dtype=...)",
-            ) from None
-        what = f"{key} cannot be read" if key else "is not an .npz file"
-        raise error(path, f"{what} (the file may be truncated)", "write or copy it again") from None
-    return {key: np.asarray(value) for key, value in data.items()}
-
-
 def need(path: Path, data: Mapping[str, Array], key: str, ndim: int) -> Array:
     """One array with so many axes, or an error that names what the file holds."""
     if key not in data:
-        keys = ", ".join(list(data)[:8]) or "nothing"
         raise error(
             path,
-            f"is not a clip set: it has no {key!r} (it has {keys})",
+            f"is not a clip set: it has no {shown(key)} (it has {listed(data)})",
             f"save {FORMS.get(key, key)}, offsets (N + 1), action (N)",
         )
     if data[key].ndim != ndim:
@@ -155,19 +131,19 @@ def frame_times(
         clip = int(np.searchsorted(offsets, row, side="right")) - 1
         raise error(
             path,
-            f"clip {names[clip]!r}: {key} must increase, but row {row} has {stamps[row]:g} after {stamps[row - 1]:g}",
+            f"clip {shown(names[clip])}: {key} must increase, but row {row} has {stamps[row]:g} after {stamps[row - 1]:g}",
             "sort the frames and drop repeated ones",
         )
     return np.asarray(stamps if key == "times" else stamps / np.repeat(rate.astype(np.float64), np.diff(offsets)))
 
 
-def clip_meta(data: Mapping[str, Array], count: int) -> dict[str, Array]:
-    """What else is known of each clip, one entry per clip."""
+def clip_meta(data: Archive, count: int, rows: str) -> dict[str, Array]:
+    """What else is known of each clip, one entry per clip; ``rows`` is the key of what all of them consist of."""
     meta: dict[str, Array] = {}
-    for key, values in data.items():
-        if key in RESERVED or values.ndim == 0 or len(values) != count:
+    for key in data:
+        if key in RESERVED or key == rows or data.shape(key)[:1] != (count,):
             continue
-        meta[key] = values
+        values = meta[key] = data[key]
         if values.ndim == 2:
             meta.update({f"{key}{k}": values[:, k] for k in range(values.shape[1])})
     return meta

@@ -9,7 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from indexing.clip import ClipSet
-from indexing.readers.files import Source, error, read_columns
+from indexing.opening import error, shown
+from indexing.readers.files import Source, read_columns
 from indexing.readers.options import Options
 from indexing.readers.recording import Recording, frame_numbers, to_clips
 from indexing.skeleton import Skeleton
@@ -28,7 +29,7 @@ def read(source: Source, options: Options) -> ClipSet:
     lacking = ["frame_idx"] * ("frame_idx" not in index) + [f"{node}.y" for node in nodes if f"{node}.y" not in index]
     if lacking or not nodes:
         raise error(
-            source.path, f"has no column {(lacking or ['<node>.x'])[0]!r}", "export with SLEAP's File > Export Analysis CSV"
+            source.path, f"has no column {shown((lacking or ['<node>.x'])[0])}", "export with SLEAP's File > Export Analysis CSV"
         )
     scored = all(f"{node}.score" in index for node in nodes)
     kinds = ("x", "y", "score") if scored else ("x", "y")

@@ -8,14 +8,14 @@ from 0 to 1.  A line does not say whether it has v, confidence or id; what fits 
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from indexing.clip import ClipSet, FloatArray
-from indexing.readers.files import FrameFile, Source, error
+from indexing.opening import error, parse_json, read_text
+from indexing.readers.files import FrameFile, Source
 from indexing.readers.options import Options
 from indexing.readers.recording import Detection, gather, numbers, to_clips, track_id
 from indexing.skeleton import known
@@ -55,10 +55,7 @@ def _json_frames(source: Source) -> list[tuple[int, list[Any]]]:
 
 def _people(source: Source, number: int, frame: Any) -> list[Any]:
     if isinstance(frame, str):
-        try:
-            frame = json.loads(frame)
-        except json.JSONDecodeError as problem:
-            raise error(source.path, f"frame {number}: not valid JSON ({problem.msg})", REMEDY) from None
+        frame = parse_json(source.path, frame, REMEDY, f"frame {number}")
     if not isinstance(frame, list):
         raise error(source.path, f"frame {number}: no list of people", REMEDY)
     return frame
@@ -110,10 +107,7 @@ def _labels(source: Source) -> list[tuple[int, list[Detection]]]:
 
 
 def _words(file: FrameFile) -> list[list[str]]:
-    try:
-        return [line.split() for line in file.path.read_text(encoding="utf-8-sig").splitlines() if line.strip()]
-    except UnicodeDecodeError:
-        raise error(file.path, "is not a text file in UTF-8", TEXT_REMEDY) from None
+    return [line.split() for line in read_text(file.path, TEXT_REMEDY).splitlines() if line.strip()]
 
 
 def _last_is_id(table: FloatArray, extras: int) -> bool:

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from indexing.readers.files import error
+from indexing.opening import error
 
 REMEDY = "give a .toml with matrix (3, 3) and distortions for every camera, as Pose2Sim writes it"
 

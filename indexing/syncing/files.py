@@ -20,8 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from indexing.clip import Clip
+from indexing.opening import error
 from indexing.readers.detect import detect_json
-from indexing.readers.files import error, frame_number, load_json
+from indexing.readers.files import frame_number, load_json
 from indexing.syncing.takes import Take
 
 FOLDER = "pose-sync"

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-import zipfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from indexing.readers.points.pointset import PointSet, as_view, error
+from indexing.opening import error, listed, shown
+from indexing.readers.npz import Archive
+from indexing.readers.npz import read_npy as read_npy_file
+from indexing.readers.points.pointset import PointSet, as_view
 from indexing.readers.points.sequence import Sequence
 
 KEYS = "keys are x1, x2, x3 (2D), P1, P2, P3 (3D) or l1, l2 (lines), also ids, weights, static, and with lines static1, static2"
@@ -21,7 +23,7 @@ def read_npy(path: Path) -> PointSet | Sequence:
     Raises:
         ValueError: no such array.
     """
-    array = load(path)
+    array = read_npy_file(path)
     if array.ndim == 3 and array.shape[1:] != (2, 3) and array.shape[-1] in (2, 3):
         return Sequence(str(path), as_view(array.reshape(-1, array.shape[-1]), path).reshape(array.shape))
     lines = array.ndim == 3 or array.shape[-1:] == (6,)
@@ -34,23 +36,23 @@ def read_npz(path: Path) -> tuple[list[PointSet], list[PointSet]]:
     Raises:
         ValueError: no known keys, a view is missing, or arrays that do not fit.
     """
-    archive = load(path)
-    names = list(archive.files)
+    archive = Archive(path)
+    names = list(archive)
     prefix = next((prefix for prefix in ("x", "P", "l") if f"{prefix}1" in names), None)
     if prefix is None:
-        raise error(path, f"its arrays are {', '.join(names[:8]) or 'none'}", KEYS)
+        raise error(path, f"its arrays are {listed(names)}", KEYS)
     unknown = [name for name in names if name not in EXTRA and not (name[:1] == prefix and name[1:] in ("1", "2", "3"))]
     if unknown:
-        raise error(path, f"has an array {unknown[0]!r}, which is not known", KEYS)
+        raise error(path, f"has an array {shown(unknown[0])}, which is not known", KEYS)
     wanted = [f"{prefix}{i}" for i in ((1, 2) if prefix == "l" else (1, 2, 3))]
     missing = [name for name in wanted if name not in names]
     if missing:
         raise error(path, f"has {wanted[0]} but no {missing[0]}", KEYS)
-    extra = {name: member(path, archive, name) for name in EXTRA if name in names}
+    extra = {name: archive[name] for name in EXTRA if name in names}
     views = []
     for name in wanted:
         where = f"{path} {name}"
-        values = as_view(member(path, archive, name), where, lines=prefix == "l")
+        values = as_view(archive[name], where, lines=prefix == "l")
         ids = tuple(map(str, extra["ids"].tolist())) if "ids" in extra else None
         for field in ("ids", "weights", "static"):
             if field in extra and extra[field].shape != (len(values),):
@@ -76,27 +78,3 @@ def _static(path: Path, extra: dict[str, Any]) -> Any:
     if not np.isin(extra["static"], (0, 1)).all():
         raise error(path, "static holds other values than 0 and 1", "use 1 for matches known to be static")
     return extra["static"].astype(bool)
-
-
-def load(path: Path) -> Any:
-    """An array, or an archive of arrays, without pickle.
-
-    Raises:
-        ValueError: it cannot be read.
-    """
-    try:
-        return np.load(path, allow_pickle=False)
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile) as problem:
-        raise error(path, f"cannot be read as numpy data ({problem})", "write it again with numpy.save or numpy.savez") from None
-
-
-def member(path: Path, archive: Any, name: str) -> Any:
-    """An array of an archive.
-
-    Raises:
-        ValueError: it cannot be read.
-    """
-    try:
-        return archive[name]
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile) as problem:
-        raise error(path, f"array {name!r} cannot be read ({problem})", "write it again with numpy.savez") from None

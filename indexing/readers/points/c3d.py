@@ -5,19 +5,23 @@ Analog channels, events and force plates are left where they are.  The layout is
 
 from __future__ import annotations
 
+import math
 import struct
+from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from indexing.readers.points.pointset import FloatArray, error
+from indexing.opening import error, read_bytes
+from indexing.readers.points.pointset import FloatArray
 from indexing.readers.points.sequence import Sequence
 
 BLOCK = 512
 INTEL, DEC, MIPS = 84, 85, 86
 SIZES = {-1: 1, 1: 1, 2: 2, 4: 4}  # bytes of a value by the type code: text, bytes, integers, reals
+MOST = 2**31  # frames
 WORD = 65535  # frame numbers beyond it do not fit the header
 
 
@@ -36,18 +40,19 @@ class Parameters:
         """32-bit reals; those of DEC have their halves swapped and are four times as large."""
         if self.processor == DEC:
             swapped = np.frombuffer(data, "<u2").reshape(-1, 2)[:, ::-1].tobytes()
-            return np.frombuffer(swapped, "<f4").astype(np.float64) / 4
-        return np.frombuffer(data, f"{self.order}f4").astype(np.float64)
+            return _reals(swapped, "<f4") / 4
+        return _reals(data, f"{self.order}f4")
 
     def labels(self, count: int) -> tuple[str, ...]:
         """Names of the markers; those without one, or with that of another, are numbered."""
-        names = list(self.values.get("POINT:LABELS", []))
+        names = _texts(self.values.get("POINT:LABELS"))
         more = 2
         while f"POINT:LABELS{more}" in self.values:  # a parameter holds 255 names
-            names += self.values[f"POINT:LABELS{more}"]
+            names += _texts(self.values[f"POINT:LABELS{more}"])
             more += 1
-        names = [names[i] if i < len(names) else "" for i in range(count)]
-        return tuple(name if name and names.count(name) == 1 else f"{name or 'marker'}#{i + 1}" for i, name in enumerate(names))
+        names = [str(names[i]) if i < len(names) else "" for i in range(count)]
+        times = Counter(names)
+        return tuple(name if name and times[name] == 1 else f"{name or 'marker'}#{i + 1}" for i, name in enumerate(names))
 
 
 def read(path: Path) -> Sequence:
@@ -56,7 +61,7 @@ def read(path: Path) -> Sequence:
     Raises:
         ValueError: it is no C3D file, is cut short, or has no markers.
     """
-    data = path.read_bytes()
+    data = read_bytes(path)
     if len(data) < 2 * BLOCK or data[1] != 0x50 or not data[0]:
         raise error(path, "has no C3D header", "the file may be truncated: export it again")
     at = (data[0] - 1) * BLOCK
@@ -77,7 +82,7 @@ def read(path: Path) -> Sequence:
     body = data[(start - 1) * BLOCK :]
     frames = last - first + 1
     if last == WORD or last < first:  # longer than the header can say
-        frames = max(frames, int(np.ravel(parameters.values.get("POINT:FRAMES", [0]))[0]), 0)
+        frames = max(frames, _whole(parameters.values.get("POINT:FRAMES")))
     frames = min(frames, len(body) // width) if last == WORD else frames
     if frames < 1 or len(body) < frames * width:
         raise error(path, f"has {len(body) // width} of {frames} frames", "the file may be truncated: export it again")
@@ -88,6 +93,11 @@ def read(path: Path) -> Sequence:
     places[points[..., 3] < 0] = np.nan  # a negative residual: not seen
     places[~np.isfinite(places).all(axis=-1)] = np.nan
     return Sequence(str(path), places, parameters.labels(count), int(first))
+
+
+def _reals(data: bytes, kind: str) -> FloatArray:
+    with np.errstate(invalid="ignore"):  # of bytes that are no number of any kind, but NaN
+        return np.frombuffer(data, kind).astype(np.float64)
 
 
 def _parameters(data: bytes, at: int) -> Parameters:
@@ -114,12 +124,24 @@ def _parameters(data: bytes, at: int) -> Parameters:
     return found
 
 
+def _texts(value: Any) -> list[str]:
+    return [text for text in value if isinstance(text, str)] if isinstance(value, list) else []
+
+
+def _whole(value: Any) -> int:
+    """A parameter that is one number; 0 where it is none."""
+    number = value.ravel()[0] if isinstance(value, np.ndarray) and value.size else 0
+    return int(number) if 0 <= number < MOST else 0
+
+
 def _value(parameters: Parameters, data: bytes, at: int) -> Any:
     code, dimensions = struct.unpack_from("bB", data, at)
     shape = list(data[at + 2 : at + 2 + dimensions])
     size = SIZES.get(code, 1)
-    total = int(np.prod(shape, dtype=np.int64)) if shape else 1
+    total = math.prod(shape)
     raw = data[at + 2 + dimensions :][: total * size]
+    if len(raw) < total * size:
+        raise ValueError("a parameter is longer than the file")
     if code == -1:
         letters = shape[0] if shape else 1
         return [raw[i : i + letters].decode("utf-8", "replace").strip(" \0") for i in range(0, total, max(1, letters))]

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence as Several
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from indexing.opening import VALUE, clipped, error, head_of, shown
 from indexing.readers.points import arrays, c3d, ply, table
-from indexing.readers.points.pointset import BoolArray, FloatArray, PointSet, error
+from indexing.readers.points.pointset import BoolArray, FloatArray, PointSet
 from indexing.readers.points.sequence import Sequence
 
 SHOWN = 5  # names listed in a message
@@ -118,14 +120,9 @@ def opening(path: Path) -> bytes:
     Raises:
         ValueError: there is none, or nothing in it.
     """
-    if not path.is_file():
-        what = "is a folder" if path.is_dir() else "no such file"
-        raise error(path, what, "give a file of points" if path.is_dir() else "check the path")
-    with path.open("rb") as file:
-        head = file.read(512)
-    if not head.strip():
-        raise error(path, "the file is empty", "export it again")
-    return head
+    if os.path.isdir(path):
+        raise error(path, "is a folder", "give a file of points")
+    return head_of(path)
 
 
 def _views(paths: Several[Path], frames: tuple[int, ...] | None) -> tuple[list[PointSet], list[PointSet]]:
@@ -182,14 +179,14 @@ def _by_name(views: Several[PointSet], names: tuple[str, ...]) -> Matched:
     shared = [name for name in places[0] if all(name in place for place in places[1:])]
     if not shared:
         mine, theirs = next(iter(places[0])), next(iter(places[1]))
-        said = f"no name is in all of {', '.join(names)} (it has {mine!r}, where {names[1]} has {theirs!r})"
+        said = f"no name is in all of {', '.join(names)} (it has {shown(mine)}, where {names[1]} has {shown(theirs)})"
         raise error(names[0], said, "name the same match the same, or leave the column out to match rows by their order")
     notes = []
     lost = sorted({name for place in places for name in place} - set(shared))
     if lost:
         more = f" and {len(lost) - SHOWN} more" if len(lost) > SHOWN else ""
         left = "name is not in every view and was" if len(lost) == 1 else "names are not in every view and were"
-        notes.append(f"{len(lost)} {left} left out: {', '.join(lost[:SHOWN])}{more}")
+        notes.append(f"{len(lost)} {left} left out: {', '.join(clipped(name, VALUE) for name in lost[:SHOWN])}{more}")
     order = [np.array([place[name] for name in shared]) for place in places]
     sorted_views = [
         PointSet(

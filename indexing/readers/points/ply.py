@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from indexing.readers.points.pointset import FloatArray, PointSet, as_view, error
+from indexing.opening import error, listed, read_bytes, repeated, shown
+from indexing.readers.points.pointset import FloatArray, PointSet, as_view
 
 TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
@@ -32,7 +33,7 @@ def read(path: Path) -> PointSet:
     Raises:
         ValueError: no PLY header, no vertices with x, y, z, or fewer of them than the header says.
     """
-    data = path.read_bytes()
+    data = read_bytes(path)
     order, elements, start = _header(path, data)
     before: list[Element] = []
     for element in elements:
@@ -47,7 +48,7 @@ def read(path: Path) -> PointSet:
     names = [name for name, _ in kinds]
     missing = [name for name in "xyz" if name not in names]
     if missing:
-        raise error(path, f"its vertices have no property {missing[0]!r} (they have {', '.join(names)})", "export x, y, z")
+        raise error(path, f"its vertices have no property {shown(missing[0])} (they have {listed(names)})", "export x, y, z")
     if not element.rows:
         raise error(path, "has no vertices", "export a point cloud")
     read_rows = _text if order == "" else _binary
@@ -55,8 +56,8 @@ def read(path: Path) -> PointSet:
     ids = None
     if "id" in columns:
         ids = tuple(f"{value:g}" for value in columns["id"])
-        if len(set(ids)) < len(ids):
-            twice = next(value for value in ids if ids.count(value) > 1)
+        twice = repeated(ids)
+        if twice is not None:
             raise error(path, f"property 'id': {twice} names several vertices", "give each vertex an id of its own")
     return PointSet(str(path), as_view(np.stack([columns[name] for name in "xyz"], axis=-1), path), ids)
 
@@ -75,12 +76,14 @@ def _header(path: Path, data: bytes) -> tuple[str, list[Element], int]:
                 order = ORDERS[words[1]]
             elif words[:1] == ["element"]:
                 elements.append(Element(words[1], int(words[2]), []))
+                if not 0 <= elements[-1].rows <= len(data):
+                    raise ValueError(words[2])
             elif words[:2] == ["property", "list"]:
                 elements[-1].properties = None
             elif words[:1] == ["property"] and elements[-1].properties is not None:
                 elements[-1].properties.append((words[2], TYPES[words[1]]))
         except (IndexError, KeyError, ValueError):
-            raise error(path, f"the PLY header has the line {line!r}, which makes no sense", "export it again") from None
+            raise error(path, f"the PLY header has the line {shown(line)}, which makes no sense", "export it again") from None
     if order is None:
         raise error(path, "the PLY header has no format", "export it again")
     return order, elements, newline + 1
@@ -100,7 +103,7 @@ def _text(path: Path, data: bytes, order: str, before: list[Element], element: E
             try:
                 columns[name][i] = float(word)
             except ValueError:
-                raise error(path, f"vertex {i + 1}, {name!r}: {word!r} is not a number", "correct the value") from None
+                raise error(path, f"vertex {i + 1}, {shown(name)}: {shown(word)} is not a number", "correct the value") from None
     return columns
 
 
@@ -108,14 +111,15 @@ def _binary(path: Path, data: bytes, order: str, before: list[Element], element:
     skip = 0
     for other in before:
         if other.properties is None:
-            raise error(path, f"the lists of {other.name!r} come before the vertices", "export a point cloud only")
+            raise error(path, f"the lists of {shown(other.name)} come before the vertices", "export a point cloud only")
         skip += other.rows * _type(order, other).itemsize
     kind = _type(order, element)
     if len(data) < skip + element.rows * kind.itemsize:
         rows = max(0, len(data) - skip) // kind.itemsize
         raise error(path, f"has {rows} of {element.rows} vertices", "the file may be truncated: export it again")
     table = np.frombuffer(data, kind, count=element.rows, offset=skip)
-    return {name: table[f"{i}"].astype(np.float64) for i, (name, _) in enumerate(element.properties or [])}
+    with np.errstate(invalid="ignore"):  # of bytes that are no number of any kind, but NaN
+        return {name: table[f"{i}"].astype(np.float64) for i, (name, _) in enumerate(element.properties or [])}
 
 
 def _type(order: str, element: Element) -> np.dtype[np.void]:

@@ -9,13 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from indexing.opening import error
+
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
-
-
-def error(path: str | Path, what: str, remedy: str) -> ValueError:
-    """The one shape of every message: file, what is wrong, what to do."""
-    return ValueError(f"{path}: {' '.join(what.split())}; {remedy}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,4 +59,5 @@ def as_view(values: Any, path: str | Path, lines: bool = False) -> FloatArray:
     if len(infinite):
         at = tuple(int(i) for i in infinite[0])
         raise error(path, f"row {at[0] + 1}, column {at[-1] + 1}: {array[at]} is not finite", "correct it, or use NaN for missing")
-    return array.astype(np.float64)
+    with np.errstate(invalid="ignore"):  # of bytes that are no number of any kind, but NaN
+        return array.astype(np.float64)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from indexing.readers.points.pointset import FloatArray, PointSet, error
+from indexing.opening import error
+from indexing.readers.points.pointset import FloatArray, PointSet
 
 
 @dataclass(frozen=True, eq=False)

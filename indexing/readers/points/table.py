@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from indexing.readers.points.pointset import FloatArray, PointSet, error
+from indexing.opening import Row, error, listed, repeated, shown
+from indexing.opening import read_rows as rows_of
+from indexing.readers.points.pointset import FloatArray, PointSet
 
 IDS = ("id", "name", "marker", "point", "track", "label")  # headings of the column that names a row, the best one first
 WEIGHTS, STATIC = ("weight", "weights"), ("static",)
@@ -17,8 +18,6 @@ LINE = ("x1", "y1", "z1", "x2", "y2", "z2")
 SHAPES = (LINE, ("x", "y", "z"), ("x", "y"))
 MISSING = ("", "na", "n/a", "nan", "none", "null")
 EXPECTED = "name the columns x,y or x,y,z, of lines x1,y1,z1,x2,y2,z2, and a column of names id"
-
-Row = tuple[int, list[str]]
 
 
 def read(path: Path) -> PointSet:
@@ -40,10 +39,10 @@ def read(path: Path) -> PointSet:
     check_widths(path, rows, names)
     columns = next((shape for shape in SHAPES if set(shape) <= set(names)), None)
     if columns is None:
-        raise error(path, f"its columns are {', '.join(name or '(unnamed)' for name in names)}", EXPECTED)
-    twice = [name for name in names if names.count(name) > 1 and name in (*columns, *IDS)]
-    if twice:
-        raise error(path, f"there are two columns {twice[0]!r}", "leave one of them out")
+        raise error(path, f"its columns are {listed(names)}", EXPECTED)
+    twice = repeated(name for name in names if name in (*columns, *IDS))
+    if twice is not None:
+        raise error(path, f"there are two columns {shown(twice)}", "leave one of them out")
     values = column_values(path, rows, names, columns)
     values = values.reshape(-1, 2, 3) if columns == LINE else values
     return PointSet(
@@ -53,16 +52,7 @@ def read(path: Path) -> PointSet:
 
 def read_rows(path: Path) -> list[Row]:
     """Line number (1-based) and cells of every row that is not blank."""
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            first = file.readline()
-            file.seek(0)
-            delimiter = max(",;\t", key=first.count)
-            found = [(line, cells) for line, cells in enumerate(csv.reader(file, delimiter=delimiter), start=1) if any(cells)]
-    except (UnicodeDecodeError, csv.Error):
-        raise error(path, "is not a text file in UTF-8", "give points as CSV, npz, npy, PLY or C3D") from None
-    # where ";" separates cells, the spreadsheet wrote decimal commas
-    return [(line, [cell.replace(",", ".") for cell in cells]) for line, cells in found] if delimiter == ";" else found
+    return list(rows_of(path, "give points as CSV, npz, npy, PLY or C3D"))
 
 
 def check_widths(path: Path, rows: Sequence[Row], names: Sequence[str]) -> None:
@@ -108,7 +98,9 @@ def column_values(path: Path, rows: Sequence[Row], names: Sequence[str], columns
             value = number(cells[place])
             if value is None or math.isinf(value):
                 what = "is not a number" if value is None else "is not finite"
-                raise error(path, f"row {line}, column {name!r}: {cells[place]!r} {what}", "correct the cell or leave it empty")
+                raise error(
+                    path, f"row {line}, column {shown(name)}: {shown(cells[place])} {what}", "correct the cell or leave it empty"
+                )
             out[i, j] = value
     return out
 
@@ -126,9 +118,9 @@ def row_names(path: Path, rows: Sequence[Row], names: Sequence[str], known: Sequ
     for line, cells in rows:
         name = cells[column].strip()
         if not name:
-            raise error(path, f"row {line}, column {names[column]!r}: is empty", "name the row, or leave the column out")
+            raise error(path, f"row {line}, column {shown(names[column])}: is empty", "name the row, or leave the column out")
         if name in found:
-            said = f"row {line}, column {names[column]!r}: {name!r} was in row {found[name]}, too"
+            said = f"row {line}, column {shown(names[column])}: {shown(name)} was in row {found[name]}, too"
             raise error(path, said, "give each row a name of its own")
         found[name] = line
     return tuple(found)

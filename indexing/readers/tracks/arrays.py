@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import zipfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from indexing.readers.points.pointset import FloatArray, as_view, error
+from indexing.opening import VALUE, clipped, error, listed, shown
+from indexing.readers.npz import Archive
+from indexing.readers.points.pointset import FloatArray, as_view
 from indexing.readers.tracks.trackset import TrackSet, numbered
 
 KEYS = "give 'tracks' (views, n, 2 or 3) or 'y' (frames, points, 2), and perhaps 'times', 'ids', 'static', 'weights'"
@@ -21,14 +22,9 @@ def read(path: Path, key: str | None) -> TrackSet:
     Raises:
         ValueError: no tracks in it, several without a key, arrays that do not fit.
     """
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            before, name = _chosen(path, list(archive.files), key)
-            values, extra = archive[name], {kind: archive[before + kind] for kind in EXTRA if before + kind in archive.files}
-    except (OSError, EOFError, zipfile.BadZipFile, ValueError) as problem:
-        if str(problem).startswith(str(path)):
-            raise
-        raise error(path, f"cannot be read as numpy data ({problem})", "write it again with numpy.savez") from None
+    archive = Archive(path)
+    before, name = _chosen(path, list(archive), key)
+    values, extra = archive[name], {kind: archive[before + kind] for kind in EXTRA if before + kind in archive}
     if values.ndim != 3 or values.shape[-1] not in (2, 3):
         raise error(path, f"{name} has shape {values.shape}", KEYS)
     flat = as_view(values.reshape(-1, values.shape[-1]), f"{path} {name}")
@@ -49,21 +45,19 @@ def _chosen(path: Path, names: list[str], key: str | None) -> tuple[str, str]:
     if key is not None and key in names:
         return "", key
     if key is not None and key not in several:
-        known = f"its sequences are {_listed(several)}" if several else f"its arrays are {_listed(names)}"
-        raise error(path, f"has no {'sequence' if several else 'array'} {key!r}", known)
+        known = f"its sequences are {listed(several)}" if several else f"its arrays are {listed(names)}"
+        raise error(path, f"has no {'sequence' if several else 'array'} {shown(key)}", known)
     if key is None and several:
-        raise error(path, f"holds {len(several)} sequences ({', '.join(several[:4])}, ...)", f"say which: --key {several[0]}")
+        raise error(
+            path, f"holds {len(several)} sequences ({listed(several, 4)})", f"say which: --key {clipped(several[0], VALUE)}"
+        )
     before = "" if key is None else f"{key}/"
     name = next((f"{before}{kind}" for kind in ("tracks", "y") if f"{before}{kind}" in names), None)
     if name is None:
         others = [other for other in names if other not in EXTRA]
-        choice = f"; or say which array has the tracks: --key {others[0]}" if others else ""
-        raise error(path, f"its arrays are {_listed(names)}", KEYS + choice)
+        choice = f"; or say which array has the tracks: --key {clipped(others[0], VALUE)}" if others else ""
+        raise error(path, f"its arrays are {listed(names)}", KEYS + choice)
     return before, name
-
-
-def _listed(names: list[str]) -> str:
-    return ", ".join(names[:8]) + ", ..." * (len(names) > 8) or "none"
 
 
 def _reals(path: Path, extra: dict[str, Any], kind: str, least: float = -np.inf) -> FloatArray | None:

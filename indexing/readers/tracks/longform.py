@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from indexing.readers.points.pointset import BoolArray, FloatArray, error
-from indexing.readers.points.table import IDS, STATIC, WEIGHTS, Row, check_widths, column_values, flags, is_data, read_rows
+from indexing.opening import VALUE, Row, check_dense, clipped, error, listed, shown
+from indexing.readers.points.pointset import BoolArray, FloatArray
+from indexing.readers.points.table import IDS, STATIC, WEIGHTS, check_widths, column_values, flags, is_data, read_rows
 from indexing.readers.tracks.trackset import TrackSet, exact
 
 IntArray = NDArray[np.intp]
@@ -39,7 +40,7 @@ def check_headings(path: Path) -> None:
     if not names and read_rows(path):
         raise error(path, "row 1 holds numbers, and no row names the columns", EXPECTED)
     if names and not ({"x", "y"} <= set(names) or {"x1", "y1"} <= set(names)):
-        raise error(path, f"its columns are {', '.join(name or '(unnamed)' for name in names)}", EXPECTED)
+        raise error(path, f"its columns are {listed(names)}", EXPECTED)
 
 
 def read(path: Path) -> TrackSet:
@@ -54,7 +55,7 @@ def read(path: Path) -> TrackSet:
     check_widths(path, rows, names)
     point = next((names.index(name) for name in IDS if name in names), None)
     if point is None:
-        raise error(path, f"no column names the points (its columns are {', '.join(names)})", EXPECTED)
+        raise error(path, f"no column names the points (its columns are {listed(names)})", EXPECTED)
     timed = next((name for name in TIMES if name in names), None)
     viewed = next((name for name in VIEWS if name in names), timed)
     assert viewed is not None  # is_long
@@ -66,6 +67,8 @@ def read(path: Path) -> TrackSet:
     columns = np.array([ids.setdefault(_named(path, line, cells[point], names[point]), len(ids)) for line, cells in rows])
     _once(path, rows, names[point], views, columns, moments)
     shape = (len(moments), len(ids))
+    same = "give a point the same name, and a frame the same number, in all of its rows"
+    check_dense(path, len(moments) * len(ids), len(rows), f"{len(moments)} views and {len(ids)} points", same)
     values = np.full((*shape, len(axes)), np.nan)
     values[views, columns] = xyz
     return TrackSet(
@@ -81,13 +84,13 @@ def _present(path: Path, rows: Sequence[Row], names: Sequence[str], column: str)
     found = column_values(path, rows, names, [column])[:, 0]
     if np.isnan(found).any():
         line = rows[int(np.flatnonzero(np.isnan(found))[0])][0]
-        raise error(path, f"row {line}, column {column!r}: is empty", "every row needs the view that it belongs to")
+        raise error(path, f"row {line}, column {shown(column)}: is empty", "every row needs the view that it belongs to")
     return found
 
 
 def _named(path: Path, line: int, cell: str, column: str) -> str:
     if not cell.strip():
-        raise error(path, f"row {line}, column {column!r}: is empty", "name the point")
+        raise error(path, f"row {line}, column {shown(column)}: is empty", "name the point")
     return cell.strip()
 
 
@@ -97,13 +100,17 @@ def _once(path: Path, rows: Sequence[Row], point: str, views: IntArray, columns:
         if (view, column) in before:
             again = f"was in frame {exact(moments[view])} before, in row {before[view, column]}"
             said = f"row {line}: point {column + 1} of the file {again}"
-            raise error(path, f"{said} (row: {', '.join(cells)})", f"give each point one row per frame; column {point!r} names it")
+            raise error(
+                path,
+                f"{said} (row: {clipped(', '.join(cells), VALUE)})",
+                f"give each point one row per frame; column {shown(point)} names it",
+            )
         before[view, column] = line
 
 
 def _times(path: Path, rows: Sequence[Row], names: Sequence[str], column: str, views: IntArray, moments: FloatArray) -> FloatArray:
     found = _present(path, rows, names, column)
-    out = np.array([found[views == i][0] for i in range(len(moments))])
+    out = found[np.unique(views, return_index=True)[1]]
     wrong = np.flatnonzero(found != out[views])
     if len(wrong):
         line, view = rows[wrong[0]][0], views[wrong[0]]
@@ -123,7 +130,7 @@ def _weights(
     found = np.nan_to_num(column_values(path, rows, names, [column])[:, 0])
     if (found < 0).any():
         at = int(np.flatnonzero(found < 0)[0])
-        raise error(path, f"row {rows[at][0]}, column {column!r}: the weight is {found[at]:g}", "weights are 0 or more")
+        raise error(path, f"row {rows[at][0]}, column {shown(column)}: the weight is {found[at]:g}", "weights are 0 or more")
     out = np.zeros(shape)
     out[views, columns] = found
     return out

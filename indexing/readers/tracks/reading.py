@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from indexing.opening import error, head_of, is_regular, listed, shown, size_of
 from indexing.readers.points import PointSet, Sequence, open_points
-from indexing.readers.points.pointset import BoolArray, error
+from indexing.readers.points.pointset import BoolArray
 from indexing.readers.points.table import IDS, STATIC, flags, read_rows
 from indexing.readers.tracks import arrays, longform
 from indexing.readers.tracks.trackset import TrackSet, numbered
@@ -79,10 +80,7 @@ def _read(files: Several[Path], key: str | None) -> TrackSet:
 
 def _start(path: Path) -> bytes:
     """The first bytes of a file; none where there is no file."""
-    if not path.is_file():
-        return b""
-    with path.open("rb") as file:
-        return file.read(512)
+    return head_of(path) if is_regular(path) else b""
 
 
 def _is_text(path: Path) -> bool:
@@ -128,8 +126,7 @@ def _joined(views: Several[PointSet]) -> TrackSet:
 
 def _marked(path: Path, ids: Several[str]) -> BoolArray:
     """Points that a file names: those of the column ``id``, or of its only column."""
-    if not path.is_file():
-        raise error(path, "no such file", "check the path; --static is a CSV with a column id")
+    size_of(path, "check the path; --static is a CSV with a column id")
     rows = read_rows(path)
     names = [cell.strip().lower() for cell in rows[0][1]] if rows else []
     column = next((names.index(name) for name in IDS if name in names), None)
@@ -143,5 +140,5 @@ def _marked(path: Path, ids: Several[str]) -> BoolArray:
     named = {cells[column].strip(): line for i, (line, cells) in enumerate(rows) if marks is None or marks[i]}
     stranger = next((name for name in named if name not in set(ids)), None)
     if stranger is not None:
-        raise error(path, f"row {named[stranger]}: no track is named {stranger!r}", f"the tracks are {', '.join(ids[:4])}, ...")
+        raise error(path, f"row {named[stranger]}: no track is named {shown(stranger)}", f"the tracks are {listed(ids, 4)}")
     return np.array([name in named for name in ids])

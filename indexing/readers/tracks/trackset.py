@@ -7,7 +7,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from indexing.readers.points.pointset import BoolArray, FloatArray, error
+from indexing.opening import error
+from indexing.readers.points.pointset import BoolArray, FloatArray
 
 
 @dataclass(frozen=True, eq=False)

@@ -180,7 +180,7 @@ def test_damaged_data_is_refused(tmp_path: Path) -> None:
     raw = bytearray(path.read_bytes())
     raw[120:200] = bytes(80)
     path.write_bytes(bytes(raw))
-    with pytest.raises(ValueError, match=r"moves\.npz: joints cannot be read"):
+    with pytest.raises(ValueError, match=r"moves\.npz: array 'joints' cannot be read"):
         read(path)
 
 

@@ -134,7 +134,7 @@ def test_bad_arrays(tmp_path):
     refused(r"times has shape \(2,\), tracks has \(3, 2, 2\)", tracks=VALUES, times=[0, 1])
     refused(r"times holds values that are no finite numbers", tracks=VALUES, times=[0, 1, NAN])
     refused(r"weights holds values that are no finite numbers of 0 or more", tracks=VALUES, weights=-np.ones((3, 2)))
-    refused(r"holds 2 sequences \(a, b, \.\.\.\); say which: --key a", **{"a/y": VALUES, "b/y": VALUES})
+    refused(r"holds 2 sequences \(a, b\); say which: --key a", **{"a/y": VALUES, "b/y": VALUES})
     with pytest.raises(ValueError, match=r"has no sequence 'c'; its sequences are a, b"):
         read_tracks([tmp_path / "t.npz"], key="c")
     (tmp_path / "t.npz").write_bytes(b"PK\3\4 broken")
