@@ -50,14 +50,18 @@ def gather(clips: Iterable[Any], fps: float, joints: int | None = None) -> tuple
     return found, owners
 
 
-def check_queries(clips: Iterable[Any], fps: float, joints: int, fewest: int = 2) -> list[Clip]:
-    """Checked query clips of at least ``fewest`` frames, as images; 3D queries are seen along z."""
+def check_queries(clips: Iterable[Any], fps: float, joints: int, fewest: int = 2, recordings: bool = False) -> list[Clip]:
+    """Checked query clips of at least ``fewest`` frames, as images; 3D queries are seen along z.
+
+    Args:
+        recordings: they are untrimmed, or looked at frame by frame, and may have gaps.
+    """
     found = []
     for i, item in enumerate(as_clips(clips, fps)):
         if isinstance(item, tuple):
             raise ValueError(f"clips: item {i} holds {len(item)} views; a query is one view, so predict each view and compare")
         found.append(item)
-    check_clips(found, joints, fewest=fewest)
+    check_clips(found, joints, fewest=fewest, recordings=recordings)
     return [virtual(clip, 0.0, 0.1) if clip.dims == 3 else clip for clip in found]
 
 

@@ -21,6 +21,10 @@ from indexing.skeleton import Skeleton
 
 FloatArray = NDArray[np.floating[Any]]
 LARGEST = 1e9  # of a coordinate: pixels, millimetres and map metres stay far below; float32 arithmetic needs a bound
+GAP = 1.0  # seconds without frames, after which what follows is another stretch: no window that holds frames of both lasts longer
+RARE = 4.0  # times the usual step between frames, which a gap is longer than, too: few frames per second are no gaps
+FINEST, COARSEST = 1e6, 1e-3  # frames per second of any recording: outside these a rate is a slip
+EXACT = 0.01  # of the step between frames, that neighbouring numbers may be apart where the clock is
 UP_AXES = ("y", "-y", "z", "-z")
 
 
@@ -77,9 +81,7 @@ class Clip:
         if cast("FloatArray | None", self.times) is None:
             fps = 30.0 if self.fps is None else self.fps
             assumed = assumed or self.fps is None
-            if not (isinstance(fps, (int, float, np.integer, np.floating)) and np.isfinite(fps) and fps > 0):
-                raise ValueError(f"{who}: fps must be a positive number of frames per second, got {self.fps!r}")
-            times = np.arange(len(joints)) / float(fps)
+            times = np.arange(len(joints)) / check_fps(fps, f"{who}: ")
         else:
             times = np.array(_float_array(self.times, f"{who}: times"), dtype=np.float64)
             _check_times(times, len(joints), who)
@@ -192,6 +194,40 @@ def as_clip(value: Clip | ArrayLike, fps: float = 30.0, name: str = "") -> Clip:
     return Clip(_float_array(value, f"clip {name!r}" if name else "clip"), fps=fps, name=name)
 
 
+def stretches(times: FloatArray, gap: float = GAP) -> NDArray[np.intp]:
+    """A recording cut where it has no frames for long: the one place where gaps of a clock are told from its steps.
+
+    Args:
+        times: ``(frames,)`` seconds, increasing.
+        gap: seconds; shorter ones are bridged by interpolation.
+
+    Returns:
+        ``(stretches, 2)`` first frame of each, and the one after its last.
+
+    Example:
+        >>> stretches(np.array([0.0, 0.1, 0.2, 86400.0, 86400.1])).tolist()
+        [[0, 3], [3, 5]]
+    """
+    steps = np.diff(times)
+    usual = float(np.median(steps)) if len(steps) else 0.0
+    cuts = np.flatnonzero(steps > max(gap, RARE * usual)) + 1
+    return np.stack([np.concatenate([[0], cuts]), np.concatenate([cuts, [len(times)]])], axis=1).astype(np.intp)
+
+
+def check_fps(fps: Any, who: str = "") -> float:
+    """A frame rate that a recording can have.
+
+    Raises:
+        ValueError: no number, or one that no camera has.
+    """
+    number = isinstance(fps, (int, float, np.integer, np.floating)) and not isinstance(fps, bool) and np.isfinite(fps)
+    if not (number and fps > 0):
+        raise ValueError(f"{who}fps must be a positive number of frames per second, got {fps!r}")
+    if not COARSEST <= fps <= FINEST:
+        raise ValueError(f"{who}fps must be frames per second, from {COARSEST:g} to {FINEST:,.0f}, got {fps:g}")
+    return float(fps)
+
+
 def _float_array(value: Any, what: str) -> FloatArray:
     """A real array of float32 or float64 that nobody else can change."""
     try:
@@ -218,6 +254,12 @@ def _check_times(times: FloatArray, frames: int, who: str) -> None:
         raise ValueError(
             f"{who}: times must increase, but frame {at} is at {times[at]:g} s after {times[at - 1]:g} s; "
             "sort the frames by time and drop repeated ones"
+        )
+    usual, coarse = float(np.median(steps)) if len(steps) else np.inf, float(np.spacing(np.abs(times).max()))
+    if coarse > EXACT * usual:
+        raise ValueError(
+            f"{who}: times reach {times[np.abs(times).argmax()]:.3g} s, where numbers are {coarse:.2g} s apart, but frames "
+            f"{usual:.2g} s; number frames, or count seconds, from the start of the recording"
         )
 
 

@@ -296,7 +296,7 @@ class ActionIndexer(SavedClassifier):
             progress: called with the share done, 0..1.
         """
         check_is_fitted(self, "model_")
-        (found,) = check_queries([clip], self.fps, self.n_joints_)
+        (found,) = check_queries([clip], self.fps, self.n_joints_, recordings=True)
         model, stream = self._model(), self._stream()
         begin = float(found.times[0])
         found = found.replace(times=found.times - begin)  # rounding must not depend on what the clock shows

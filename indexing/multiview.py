@@ -9,7 +9,7 @@ import torch
 
 from dyntorch import affine_factorization, metric_upgrade
 from indexing.clip import Clip
-from indexing.windows import ragged, sample
+from indexing.windows import ragged, sample, torn
 
 # Share of the energy that one rigid space-time shape may leave unexplained.  On synthetic people a detector's noise leaves
 # .002-.005, views that lag by .3 s .006-.04, views of another action .01-.05.
@@ -32,6 +32,9 @@ def combine(views: tuple[Clip, ...]) -> list[Clip]:
                 "views of one performance must be 2D with the same joints: "
                 f"view 0 is {first.joints.shape[1:]}, view {i} {view.joints.shape[1:]}"
             )
+        reason = torn(view)
+        if reason:
+            raise ValueError(f"view {i} of {first.name!r}: times: {reason}")
     start, end = max(view.times[0] for view in views), min(view.times[-1] for view in views)
     if not end > start:
         raise ValueError(f"the views of {first.name!r} share no time: the last starts at {start:g} s, the first ends at {end:g} s")

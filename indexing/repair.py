@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from indexing.clip import Clip, FloatArray
+from indexing.clip import Clip, FloatArray, stretches
 
 # How far windows are from those of uncorrupted clips, in % of their deviation, Florence3D at 90 degrees.  As they are: 5 % wrong
 # joints 33, 10 % 47, bursts of three 39, half the frames dropped 8.6.  Repaired so: 7.4, 14, 19, 8.9, and clean clips .09.
@@ -80,8 +80,9 @@ def wrong_joints(joints: FloatArray, times: FloatArray, starts: NDArray[np.intp]
 
 
 def mended(clip: Clip) -> Clip:
-    """A clip of any length without its wrong joints; judged in parts of :data:`PART` frames, which bounds memory."""
-    parts = np.append(np.arange(0, max(len(clip) - PART // 2, 1), PART), len(clip))
+    """A clip of any length without its wrong joints; judged in parts of :data:`PART` frames, which bounds memory, between gaps."""
+    pieces = [np.arange(begin, max(end - PART // 2, begin + 1), PART) for begin, end in stretches(clip.times).tolist()]
+    parts = np.append(np.concatenate(pieces), len(clip))
     wrong = wrong_joints(clip.joints, clip.times, parts)
     if not wrong.any():
         return clip

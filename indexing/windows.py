@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from indexing.cameras import y_up
-from indexing.clip import Clip, FloatArray
+from indexing.clip import GAP, RARE, Clip, FloatArray
 from indexing.repair import wrong_joints
 
 SUBSAMPLES = 4  # box average per step: a cheap denoiser; 1 costs about 1 % accuracy at 15 mm noise
 CHUNK = 16_000_000  # numbers interpolated at once: bounds memory whatever the number of windows
+SLOWEST = 10.0  # seconds between the frames of a clip: farther apart, times are not seconds
 
 
 @dataclass(frozen=True)
@@ -72,12 +73,22 @@ def _fill(joints: FloatArray, there: NDArray[np.bool_], times: FloatArray, first
     return np.where(there[..., None], joints, filled)
 
 
-def check_clips(clips: Sequence[Clip], joints: int | None = None, items: Sequence[int] | None = None, fewest: int = 2) -> None:
-    """Raise where a clip cannot be compared; ``items``: the numbers that the user knows the clips by; ``fewest``: frames of each.
+def check_clips(
+    clips: Sequence[Clip],
+    joints: int | None = None,
+    items: Sequence[int] | None = None,
+    fewest: int = 2,
+    recordings: bool = False,
+) -> None:
+    """Raise where a clip cannot be compared.
+
+    Args:
+        items: the numbers that the user knows the clips by; fewest: frames of each.
+        recordings: these are not one performance each: they may have gaps of any length.
 
     Raises:
         ValueError: naming the clip: fewer than two frames, no joint ever seen, all joints at one place, or a number of
-            joints other than that of the others (or ``joints``).
+            joints other than that of the others (or ``joints``), a gap that is longer than the rest, or times that are no seconds.
     """
     for i, clip in enumerate(clips):
         who = f"clip {i if items is None else items[i]}" + (f" ({clip.name!r})" if clip.name else "")
@@ -88,6 +99,25 @@ def check_clips(clips: Sequence[Clip], joints: int | None = None, items: Sequenc
         reason = unusable(clip, fewest)
         if reason:
             raise ValueError(f"{who}: joints: {reason}; leave the clip out")
+        reason = None if recordings else torn(clip)
+        if reason:
+            raise ValueError(f"{who}: times: {reason}")
+
+
+def torn(clip: Clip) -> str | None:
+    """Why a clip's times are not those of one performance, and what to do, or ``None``."""
+    steps = np.diff(clip.times)
+    if len(steps) == 0 or steps.max() <= GAP:
+        return None
+    usual, longest = float(np.median(steps)), int(steps.argmax())
+    if usual > SLOWEST:
+        return f"its frames are {usual:.3g} s apart; times are seconds: correct them, or fps"
+    if steps[longest] > RARE * usual and steps[longest] > clip.duration / 2:
+        return (
+            f"no frames for {steps[longest]:.3g} s after {clip.times[longest]:.6g} s, which is most of the clip; a clip is one "
+            "performance: cut it there"
+        )
+    return None
 
 
 def unusable(clip: Clip, fewest: int = 2) -> str | None:

@@ -12,7 +12,7 @@ from sklearn.utils.validation import check_is_fitted
 from torch import Tensor
 
 from indexing.checks import check_queries, gather, gather_labels
-from indexing.clip import Clip
+from indexing.clip import Clip, stretches
 from indexing.estimator import SavedClassifier
 from indexing.labels import refuse
 from indexing.phase.calibration import SECOND, event_levels
@@ -143,7 +143,7 @@ class PhaseIndexer(SavedClassifier):
     def analyse(self, clip: Any) -> tuple[Array, Array]:
         """:meth:`score_frames` and :meth:`phase` in one pass."""
         check_is_fitted(self, "model_")
-        (found,) = check_queries([clip], self.fps, self.n_joints_, fewest=1)
+        (found,) = check_queries([clip], self.fps, self.n_joints_, fewest=1, recordings=True)
         scores, phase = (part.cpu().numpy() for part in self._evidence([found]))
         if self.window > 0:
             phase = smooth_phases(phase, found.times, self.window, self.periodic_)
@@ -174,7 +174,7 @@ class PhaseIndexer(SavedClassifier):
     def decision_function(self, clips: Iterable[Any]) -> Array:
         """``(clips, classes)`` mean of the frames' scores; columns are ``classes_``."""
         check_is_fitted(self, "model_")
-        found = check_queries(clips, self.fps, self.n_joints_, fewest=1)
+        found = check_queries(clips, self.fps, self.n_joints_, fewest=1, recordings=True)
         scores = self._evidence(found)[0].split([len(clip) for clip in found])
         return np.stack([part.mean(0).cpu().numpy() for part in scores])
 
@@ -203,8 +203,14 @@ class PhaseIndexer(SavedClassifier):
         ordinary movement.
         """
         check_is_fitted(self, "model_")
-        (found,) = check_queries([clip], self.fps, self.n_joints_, fewest=1)
+        (found,) = check_queries([clip], self.fps, self.n_joints_, fewest=1, recordings=True)
         if len(self.classes_) < 2:
             raise ValueError("find needs two classes at least to tell one from the other; fit clips of ordinary movement too")
-        scores = smooth(self._evidence([found])[0].cpu().numpy(), found.times, SECOND)
-        return events(scores, found.times, list(self.classes_), *event_levels(self.model_.wrong, self.reject))
+        scores = self._evidence([found])[0].cpu().numpy()
+        levels = event_levels(self.model_.wrong, self.reject)
+        parts = [slice(first, end) for first, end in stretches(found.times, SECOND).tolist()]  # no event reaches across a gap
+        return [
+            event
+            for part in parts
+            for event in events(smooth(scores[part], found.times[part], SECOND), found.times[part], list(self.classes_), *levels)
+        ]

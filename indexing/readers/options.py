@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from indexing.clip import check_fps
+
 PEOPLE = ("largest", "confident", "tracked", "all", "everyone")
 
 
@@ -26,8 +28,8 @@ class Options:
     size: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
-        if self.fps is not None and not (_is_number(self.fps) and self.fps > 0):
-            raise ValueError(f"fps must be a positive number of frames per second, got {self.fps!r}")
+        if self.fps is not None:
+            check_fps(self.fps)
         if self.person not in PEOPLE:
             raise ValueError(f"unknown person={self.person!r}; use one of {', '.join(PEOPLE)}")
         if not _is_number(self.min_confidence):

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from indexing.cameras import virtual
-from indexing.clip import Clip
+from indexing.clip import Clip, stretches
 from indexing.shape.bank import Windows, stack
 from indexing.shape.lifting import Lifter, lift_views
 from indexing.shape.views import PITCH, turn
@@ -124,13 +126,28 @@ def _view(clips: Sequence[Clip], source: Ragged, plan: Plan, random_state: np.ra
 
 
 def slide(source: Ragged, length: int, window: float, stride: float) -> tuple[Windows, torch.Tensor]:
-    """Short windows every ``stride`` seconds inside each clip (the whole clip where it is shorter), and whose they are."""
-    begin, end = source.times[source.starts[:-1]], source.times[source.starts[1:] - 1]
+    """Short windows every ``stride`` seconds inside each clip, or each part of one that gaps leave (all of it where that is shorter
+    than a window), and whose they are."""
+    clip, first, last = _parts(source, window)
+    begin, end = source.times[first], source.times[last]
     counts = np.maximum(1, np.floor((end - begin - window) / stride + 1e-9).astype(int) + 1)
-    owner = np.repeat(np.arange(len(counts)), counts)
-    step = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
+    part = np.repeat(np.arange(len(counts)), counts)
+    step = np.arange(len(part)) - np.repeat(np.cumsum(counts) - counts, counts)
     # spread over the clip, so that its end is covered too
     room = np.maximum(end - begin - window, 0.0)
-    start = begin[owner] + room[owner] * step / np.maximum(counts[owner] - 1, 1)
-    values = sample(source, owner, start, np.minimum(start + window, end[owner]), length)
+    start = begin[part] + room[part] * step / np.maximum(counts[part] - 1, 1)
+    owner = clip[part]
+    values = sample(source, owner, start, np.minimum(start + window, end[part]), length)
     return Windows(values, torch.from_numpy(source.seen[owner])), torch.from_numpy(owner)
+
+
+def _parts(source: Ragged, window: float) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+    """For each part of a clip between gaps: its clip, and its first and last frame.  A frame by itself is none."""
+    clips, cuts = [], []
+    for i, (begin, end) in enumerate(pairwise(source.starts.tolist())):
+        found = begin + stretches(source.times[begin:end], window)
+        found = found[found[:, 1] - found[:, 0] > 1] if len(found) > 1 else found
+        clips += [i] * len(found)
+        cuts.append(found)
+    joined = np.concatenate(cuts)
+    return np.array(clips, dtype=np.intp), joined[:, 0], joined[:, 1] - 1

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from indexing.clip import Clip
+from indexing.clip import Clip, check_fps
 from indexing.readers.files import VIDEOS
 
 FloatArray = NDArray[np.float64]
@@ -75,8 +75,8 @@ def take_of(
     """
     if isinstance(value, Take):
         return value
-    if fps is not None and not (np.isfinite(fps) and fps > 0):
-        raise ValueError(f"fps must be a positive number of frames per second, got {fps!r}")
+    if fps is not None:
+        check_fps(fps)
     if person not in CHOICES:
         raise ValueError(f"person must be one of {', '.join(CHOICES)}, got {person!r}")
     if isinstance(value, Clip):

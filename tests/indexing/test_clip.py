@@ -196,3 +196,16 @@ def test_labels_keep_their_type(labels, kind):
 def test_labels_that_are_tuples_stay_one_per_clip():
     labels = ClipSet([Clip(JOINTS, label=("arm", side)) for side in ("left", "right")]).labels
     assert labels.shape == (2,)
+
+
+@pytest.mark.parametrize("fps", [1e-300, 1e300, 1e-310])
+def test_rates_that_no_camera_has_are_refused(fps):
+    with pytest.raises(ValueError, match=r"fps must be frames per second, from 0.001 to 1,000,000, got"):
+        Clip(np.zeros((4, 3, 2)), fps=fps)
+
+
+def test_times_beyond_the_precision_of_numbers_are_refused():
+    times = np.append(np.arange(39), 9e15) / 30
+    with pytest.raises(ValueError, match=r"clip 'a': times reach 3e\+14 s, where numbers are 0.062 s apart, but frames 0.033 s"):
+        Clip(np.zeros((40, 3, 2)), times=times, name="a")
+    Clip(np.zeros((40, 3, 2)), times=np.arange(40) / 30 + 1.8e9)  # a date

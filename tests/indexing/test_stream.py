@@ -1,13 +1,17 @@
 """Untrimmed recordings: a score for every frame, and the events they form."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
-from indexing import ActionIndexer, Event
+from indexing import ActionIndexer, Event, PhaseIndexer
 from indexing.actors import ACTIONS, Person, dataset, detect, stream
 from indexing.scoring import events, probabilities, reject_threshold, smooth
+from indexing.shape.exemplars import slide
+from indexing.stream import at_rest
+from indexing.windows import ragged
 
 KNOWN = ("squat", "wave", "bow", "jumping_jack", "kick", "walk")
 ORDER = ("squat", "wave", "bow", "kick", "jumping_jack", "squat", "walk", "wave")
@@ -215,3 +219,73 @@ def test_a_resting_person_is_mostly_left_alone():
     idle = [e for e in found if all(e.end <= start or e.start >= end for _, start, end in truth)]
     assert sum(e.end - e.start for e in idle) < 0.15 * solid.duration
     assert np.mean(hits(found, truth)) >= 0.75
+
+
+def test_an_action_calmer_than_the_others_is_not_taken_for_rest():
+    contrast, calm = np.array([[2.5, -2.5], [-2.5, 2.5], [2.5, -2.5]]), np.array([0.05, 0.3])
+    motion = np.array([0.06, 0.06, 0.03])  # of the calm action as it is, of the other one, and of a person who stands
+    assert at_rest(contrast, motion, 0.1, calm, (1.0, 4.0)).tolist() == [False, True, True]
+
+
+# ---- gaps: what a recording costs is told by its frames, not by its clock ------------------------------------------------------
+@pytest.mark.parametrize("gap", [20.0, 86400.0, 2.6e6, 1e9, 1e12])
+def test_gaps_of_any_length_part_a_recording(indexer, recordings, gap):
+    clip = recordings[0][0]
+    half = len(clip) // 2
+    early, late = clip.between(-1.0, clip.times[half - 1]), clip.between(clip.times[half], 1e3)
+    torn = clip.replace(times=np.concatenate([early.times, late.times + gap]), fps=None)
+    scores, found = indexer.scan(torn)
+    (first, a), (second, b) = indexer.scan(early), indexer.scan(late)
+    parts = a + [replace(event, start=event.start + gap, end=event.end + gap) for event in b]
+    assert [event.label for event in found] == [event.label for event in parts]
+    close = 1e-3 + 1e-15 * gap
+    for one, other in zip(found, parts, strict=True):
+        assert (one.start, one.end) == (pytest.approx(other.start, abs=close), pytest.approx(other.end, abs=close))
+    np.testing.assert_allclose(scores, np.concatenate([first, second]), atol=0.05)
+
+
+def test_frames_by_themselves_say_nothing_and_cost_nothing(indexer, recordings):
+    clip = recordings[0][0]
+    stray = np.array([1e5, 1e7, 1e9])
+    more = clip.replace(
+        joints=np.concatenate([clip.joints, clip.joints[:3]]), times=np.concatenate([clip.times, stray]), confidence=None, fps=None
+    )
+    scores, found = indexer.scan(more)
+    assert [(e.label, e.start, e.end) for e in found] == [(e.label, e.start, e.end) for e in indexer.find(clip)]
+    assert len(scores) == len(more) and (scores[-3:] == scores[-1, 0]).all()
+
+
+def test_recordings_whose_frames_are_too_far_apart_are_refused(indexer, recordings):
+    clip = recordings[0][0]
+    with pytest.raises(ValueError, match=r"33.3 s apart, and a window lasts 1 s; times are seconds"):
+        indexer.find(clip.replace(times=clip.times * 1000, fps=None))  # milliseconds
+
+
+@pytest.mark.parametrize("gap", [60.0, 1e9])
+def test_an_example_with_a_gap_is_no_single_performance(gap):
+    clips = list(dataset([Person.random(0)], KNOWN[:3], azimuth=0.0, rng=0))
+    jump = clips[0].replace(times=clips[0].times + np.where(np.arange(len(clips[0])) > 9, gap, 0.0), fps=None)
+    for indexer in (ActionIndexer(scorer="nearest"), PhaseIndexer()):
+        with pytest.raises(ValueError, match=r"no frames for .* s after 0.3 s, which is most of the clip; .* cut it there"):
+            indexer.fit([jump, *clips[1:]], list(KNOWN[:3]))
+    indexer = ActionIndexer(scorer="nearest").fit(clips, list(KNOWN[:3]))
+    with pytest.raises(ValueError, match="no frames for"):
+        indexer.predict([jump])
+
+
+def test_phases_of_recordings_with_gaps():
+    clips = dataset(1, KNOWN[:3], azimuth=0.0, rng=0)
+    indexer = PhaseIndexer(harmonics=2).fit(clips, clips.labels)
+    jump = clips[0].replace(times=clips[0].times + np.where(np.arange(len(clips[0])) > 30, 1e9, 0.0), fps=None)
+    assert all(event.end - event.start < 60 for event in indexer.find(jump))
+
+
+def test_short_windows_of_an_example_stay_inside_its_parts():
+    clip = dataset([Person.random(0)], KNOWN[:1], azimuth=0.0, rng=0)[0]
+    held = clip.replace(times=clip.times + np.where(clip.times > clip.duration / 2, 1.4, 0.0), fps=None)
+    source = ragged([held])
+    moments, owner = slide(source, 12, 0.5, 0.1)
+    whole, _ = slide(ragged([clip]), 12, 0.5, 0.1)
+    assert (owner == 0).all() and len(moments) < len(whole)
+    speed = moments.values.diff(dim=1).square().sum((1, 2, 3))
+    assert speed.min() > 0.1 * whole.values.diff(dim=1).square().sum((1, 2, 3)).min()  # none is a frozen pose
