@@ -18,6 +18,8 @@ REACH = 4.0
 """Standard deviations at which the smoothing kernel ends."""
 THIN = 0.4
 """Share of the kernel's weight that must be seen; less is a gap."""
+SPARSE = 20, 20_000
+"""Times the frames there are, and at least how many, that a clock may run over: it is searched frame by frame."""
 PIECE = 1 << 21
 """Numbers that one piece of a long take gathers at a time."""
 
@@ -107,6 +109,7 @@ def read_tracks(name: str, x: Tensor, fps: float | None, times: Tensor | None, w
     if bool((steps <= 0).any()):
         at = int((steps <= 0).nonzero()[0, 0]) + 1
         raise ValueError(f"times of {name} must increase, but frame {at} is not after the one before; sort or drop such frames")
+    _check_dense(name, clock)
     seen = x.isfinite().all(-1)
     if weights is None:
         given = seen.double()
@@ -117,6 +120,21 @@ def read_tracks(name: str, x: Tensor, fps: float | None, times: Tensor | None, w
         given = given * seen
     step = float(steps.median()) if len(steps) else math.nan
     return Tracks(torch.where((given > 0)[..., None], x.double(), 0.0), given, clock, step)
+
+
+def _check_dense(name: str, times: Tensor) -> None:
+    """Raise where a take is nearly all gap."""
+    steps = times.diff()
+    if len(steps) == 0:
+        return
+    span, step = float(times[-1] - times[0]), float(steps.median())
+    if span <= step * max(SPARSE[0] * len(times), SPARSE[1]):
+        return
+    at = int(steps.argmax())
+    raise ValueError(
+        f"times of {name} run over {span:.3g} s, but it has {len(times)} frames {step:.3g} s apart, and none for "
+        f"{float(steps[at]):.3g} s after {float(times[at]):.6g} s; give the frames on one side of that gap"
+    )
 
 
 def without(tracks: Tracks, bad: Tensor) -> Tracks:

@@ -57,8 +57,7 @@ def synchronize(
         times: instead, ``(frames,)`` seconds of each frame, increasing, for variable frame rates and dropped frames.
         max_shift: how far to search, seconds; None for all shifts with enough overlap.
         calibration: per camera None or ``(K, dist)`` (OpenCV's order), whose distortion is removed.  Without, distortion is
-        looked for
-            where the points do not fit, and removed by one parameter per camera, with a note.
+            looked for where the points do not fit, and removed by one parameter per camera, with a note.
         weights: per camera ``(frames, n)``, such as a detector's confidences; 0 = ignore.
         rate: of b's clock, where known; by default 1 unless the takes say otherwise (up to 2 %).
         camera: ``"perspective"``, ``"affine"`` (points about their middle in each frame), or ``"auto"``: perspective unless that
@@ -69,7 +68,7 @@ def synchronize(
         offset, sigma, rate, confidence, all peaks, and whether it is ok.
 
     Raises:
-        ValueError: input of the wrong shape, fewer than 12 frames, or settings that make no sense.
+        ValueError: input of the wrong shape, fewer than 12 frames, a take that is nearly all gap, or settings that make no sense.
 
     Source: thesis, chapter 7 (Wolf and Zomet 2002); theory of moments at all lags by FFT.
 
@@ -221,7 +220,7 @@ def _reason(found: Attempt) -> str:
             "or more; film larger or faster movements"
         )
     if found.edge:
-        return f"the best shift, {fit.shift:+.3g} s, is at the end of the search; raise max_shift"
+        return f"the best shift, about {fit.shift:+.3g} s, lies at the end of the search or beyond; raise max_shift"
     if found.margin < found.needed and len(found.peaks) > 1:
         least = found.misfits[0] - found.needed
         near = [shift for (shift, _), misfit in zip(found.peaks, found.misfits, strict=True) if misfit > least]

@@ -88,7 +88,7 @@ class Sync:
         if folder is not None:
             with progress("writing", steps=False):
                 report, page = self._write(folder, takes, report, compared, inputs, timings)
-        show(report)
+        show(report, folder)
         return ended(page, None if report.ok else report.reason)
 
     def _check(self) -> None:
@@ -171,6 +171,7 @@ class Sync:
         """The shifted files where the data decide, the check video where asked for, and the report."""
         from indexing.files import manifest, prepare
         from indexing.report.sync import write_sync
+        from indexing.report.sync_check import drop_checks
         from indexing.syncing.files import drop_poses, plan, write_poses
 
         prepare(folder)
@@ -191,6 +192,7 @@ class Sync:
 
             videos, failed = write_checks(folder, takes, report, compared)
             notes += failed
+        drop_checks(folder, videos)
         settings = manifest({"command": "sync", **dataclasses.asdict(self)}, inputs, None, timings)
         final = dataclasses.replace(report, notes=notes, clocks=clocks, manifest=settings)
         return final, write_sync(folder, final, videos)
@@ -221,8 +223,12 @@ def _shifted(one: Plan) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def show(report: SyncReport) -> None:
-    """Print the result."""
+def show(report: SyncReport, folder: Path | None = None) -> None:
+    """Print the result.
+
+    Args:
+        folder: that it was written to.
+    """
     _show_pairs(report)
     if len(report.clocks) > 2:
         _show_clocks(report)
@@ -248,7 +254,8 @@ def show(report: SyncReport) -> None:
     if moved:
         rest = 1000 * max(clock.shifted["rest"] for clock in moved if clock.shifted is not None)
         written = ", ".join(clock.name for clock in moved)
-        say(f"shifted files: pose-sync/ ({written}), within {rest:.1f} ms of {report.reference.name}")
+        where = Path("pose-sync") if folder is None else folder / "pose-sync"
+        say(f"shifted files: {where}/ ({written}), within {rest:.1f} ms of {report.reference.name}")
 
 
 def _show_pairs(report: SyncReport) -> None:

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from indexing.readers.recording import Recording
 
 IntArray = NDArray[np.int64]
+POINT = 0.2  # of the scene, that counts as the box of a person of whom there is only one point
 REACH = 0.5  # box diagonals: a joint moves less from one detection of a person to the next, another person is farther away
 
 
@@ -97,7 +98,7 @@ def link(at: IntArray, joints: FloatArray) -> IntArray:
 
     An identity is expected one step farther along its last movement (people who cross would swap otherwise), and waits there
     for as long as it is gone.  Distance is the mean over the joints that both show, in units of the larger box's diagonal;
-    beyond :data:`REACH` a new identity begins.
+    beyond :data:`REACH` a new identity begins.  Tracked points have no box: one alone in every frame is always the same one.
 
     Args:
         at: ``(m,)`` frame of each detection.
@@ -116,6 +117,10 @@ def link(at: IntArray, joints: FloatArray) -> IntArray:
     last: list[int] = []  # per identity, its latest detection,
     step: list[FloatArray] = []  # and how far it had moved since the one before
     diagonal = np.linalg.norm(_extents(joints), axis=1)
+    if len(at) and not (diagonal > 0).any():
+        if len(np.unique(at)) == len(at):
+            return np.zeros(len(at), dtype=np.int64)
+        diagonal[:] = POINT * np.linalg.norm(_extents(joints.reshape(1, -1, joints.shape[2])))
     for rows in np.split(np.argsort(at, kind="stable"), np.flatnonzero(np.diff(np.sort(at))) + 1):
         awaited = joints[last] + np.reshape(step, (len(last), 1, joints.shape[2]))
         cost = _distances(awaited, joints[rows], np.maximum.outer(diagonal[last], diagonal[rows]))

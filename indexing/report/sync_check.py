@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -43,6 +45,21 @@ def write_checks(
         except ValueError as problem:
             notes.append(f"{name} was not written: {problem}")
     return written, notes
+
+
+def drop_checks(folder: Path, written: Sequence[str]) -> None:
+    """Remove the check videos of an earlier run that this one did not write again: they show cameras of other files."""
+    try:
+        known = json.loads((folder / "sync.json").read_text(encoding="utf-8"))
+        asked = known["manifest"]["arguments"]
+        ours = asked["command"] == "sync" and asked["check"]
+        names = names_of([str(camera["name"]) for camera in known["cameras"]]) if ours else []
+    except (OSError, ValueError, KeyError, TypeError):
+        return
+    for name in set(names) - set(written):
+        if Path(name).name == name:
+            with contextlib.suppress(OSError):
+                (folder / name).unlink()
 
 
 def _shown(take: Take, person: int) -> Path | Clip:

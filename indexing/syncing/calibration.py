@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -115,13 +116,19 @@ def named_lenses(path: str | Path, names: Sequence[str]) -> tuple[list[Lens], tu
 def match(cameras: Sequence[Lens], names: Sequence[str], path: str | Path) -> tuple[list[Lens], tuple[str, ...]]:
     """The lens of each name: the section of this name, else the only one whose name contains it, else by order.
 
+    Names are compared without case, punctuation and leading zeros: the folder cam01 is the section Cam_1.  By order only where
+    there are as many sections as names.
+
     Raises:
         ValueError: names and sections do not fit.
     """
     chosen: list[Lens | None] = []
     for name in names:
-        equal = [lens for lens in cameras if lens.name == name] or [lens for lens in cameras if name and name in lens.name]
-        equal = equal or [lens for lens in cameras if lens.name in name]
+        sections = [(lens, _plain(lens.name)) for lens in cameras]
+        plain = _plain(name)
+        equal = [lens for lens in cameras if lens.name == name] or [lens for lens, said in sections if said == plain]
+        equal = equal or [lens for lens, said in sections if plain and plain in said]
+        equal = equal or [lens for lens, said in sections if said and said in plain]
         chosen.append(equal[0] if len(equal) == 1 else None)
     known = [lens for lens in chosen if lens is not None]
     if len(known) == len(names) and len({id(lens) for lens in known}) == len(names):
@@ -130,6 +137,17 @@ def match(cameras: Sequence[Lens], names: Sequence[str], path: str | Path) -> tu
     if len(cameras) == len(names):
         return list(cameras), (f"calibration taken in the order of its file ({listed}), because names differ",)
     raise error(path, f"its cameras are {listed}, and {', '.join(names)} are to be synchronized", "name sections as the cameras")
+
+
+def _plain(name: str) -> str:
+    """A name without what people write in two ways.
+
+    Example:
+        >>> _plain("Cam_01"), _plain("cam-10.json")
+        ('cam 1', 'cam 10 json')
+    """
+    words = re.findall(r"[^\W\d_]+|\d+", name.lower())
+    return " ".join(word.lstrip("0") or "0" if word.isdigit() else word for word in words)
 
 
 def _numbers(path: Path, section: str, key: str, value: Any) -> Tensor:

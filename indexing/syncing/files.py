@@ -78,8 +78,10 @@ def plan(take: Take, offset: float, rate: float, fps: float) -> Plan:
         ([0, 1, 2, 3], [2, 3, 4, 5], 0.01, 2)
     """
     times = take.times
-    first, last = (int(np.floor((moment - offset) / rate * fps)) for moment in (times[0], times[-1]))
-    numbers = np.arange(max(first, 0), max(last + 2, 0))
+    nearest = np.floor((times - offset) / rate * fps).astype(np.int64)
+    reach = int(np.ceil(NEAR * fps / (rate * take.fps)))  # numbers on either side that one frame may stand for
+    numbers = np.unique(nearest[:, None] + np.arange(-reach, reach + 2))
+    numbers = numbers[numbers >= 0]
     wanted = rate * numbers / fps + offset
     after = np.clip(np.searchsorted(times, wanted), 0, len(times) - 1)
     before = np.maximum(after - 1, 0)

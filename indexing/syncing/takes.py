@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from indexing.clip import Clip, check_fps
+from indexing.clip import Clip, check_fps, stretches
 from indexing.readers.files import VIDEOS
 
 FloatArray = NDArray[np.float64]
@@ -22,6 +22,8 @@ CANDIDATES = 3  # people of a camera that are tried, besides the largest one of 
 UNEVEN = 0.1  # of a frame, by which times of an even grid are off it at most
 EXACT = 1e-9  # by which a frame rate is one that was given
 EMPTY = 0.1  # share of frames without a person, above which it is said
+SPARSE = 20, 20_000  # times its frames, and at least how many, that a take's clock may run over, for its frames to be compared
+PAUSES = 60.0, 10.0, 1.0  # seconds without frames, at which a take that is nearly all gap is cut: as few as will do
 SHARE = 0.2  # of the longest person's frames, that a person must be seen in to be tried
 SAME = 0.9  # of the frames of a person in which the largest one is that person, from where on they are one
 
@@ -77,6 +79,11 @@ def take_of(
         return value
     if fps is not None:
         check_fps(fps)
+    how = {"min_confidence": min_confidence, "format": format, "size": size}
+    return _without_pauses(_taken(value, name, fps, person, how))
+
+
+def _taken(value: Any, name: str, fps: float | None, person: str, how: dict[str, Any]) -> Take:
     if person not in CHOICES:
         raise ValueError(f"person must be one of {', '.join(CHOICES)}, got {person!r}")
     if isinstance(value, Clip):
@@ -88,8 +95,30 @@ def take_of(
         name = name or camera_name(path)
         if path.suffix.lower() in VIDEOS and not path.is_dir():
             return _of_video(name, path, fps)
-        return _of_file(name, path, fps, person, {"min_confidence": min_confidence, "format": format, "size": size})
+        return _of_file(name, path, fps, person, how)
     return _of_array(name, value, fps)
+
+
+def _without_pauses(take: Take) -> Take:
+    """The take with its people cut to the longest stretch of frames, where it is nearly all gap.
+
+    Clocks are searched frame by frame, which takes time and memory for every frame that is not there.
+    """
+    if take.kind != "keypoints" or take.count < 2:
+        return take
+    most = max(SPARSE[0] * take.count, SPARSE[1]) / take.fps
+    first, end = 0, take.count
+    for pause in PAUSES:
+        if take.times[end - 1] - take.times[first] <= most:
+            break
+        cuts = stretches(take.times, pause)
+        first, end = cuts[(cuts[:, 1] - cuts[:, 0]).argmax()].tolist()
+    if end - first == take.count:
+        return take
+    begin, last = float(take.times[first]), float(take.times[end - 1])
+    people = [clip.between(begin, last) for clip in take.people if ((clip.times >= begin) & (clip.times <= last)).any()]
+    said = f"{take.name}: nearly all gap: only its {end - first} frames from {begin:.6g} to {last:.6g} s are compared"
+    return dataclasses.replace(take, people=tuple(people), notes=(*take.notes, said))
 
 
 def camera_name(path: Path) -> str:

@@ -79,7 +79,7 @@ def test_two_folders(run, library, data):
     assert "cam02 began 0.3900 s after cam01: time of cam02 = time of cam01 - 0.3900 s" in out
     assert re.search(r"cam01 → cam02 +-0\.3900 +0\.0020 +-11\.70 +0 +0\.990 +\+0\.710 +ok", out)
     assert "inconsistent joints of cam01 and cam02: right_wrist (joint 10)" in out and "assumed" not in out
-    assert "shifted files: pose-sync/ (cam01, cam02), within 10.0 ms of cam01" in out
+    assert "shifted files: out/pose-sync/ (cam01, cam02), within 10.0 ms of cam01" in out
     found = read()
     assert found["ok"] and found["reason"] is None and found["reference"] == "cam01" and found["cycle_error"] is None
     assert [camera["offset"] for camera in found["cameras"]] == [0.0, pytest.approx(-0.39)]
@@ -226,3 +226,12 @@ def test_three_cameras_from_files_to_files(run):
     code, _, err = run("pose --fps 30 --out out")
     assert (code, err) == (0, "") and [camera["shifted"]["shift"] for camera in read()["cameras"]] == [0, -12, -25]
     assert Path("out/curve.png").stat().st_size > 10_000
+
+
+def test_check_videos_of_an_earlier_run_are_removed(run, library):
+    pytest.importorskip("av")
+    code, _, _ = run("@/pose --fps 30 --check --out out")
+    assert code == 0 and {"check-cam02.mp4", "check-cam03.mp4"} <= set(listed("out"))
+    Path("out/check-mine.mp4").write_text("of somebody else")
+    code, _, _ = run("@/pose/cam01_json @/pose/cam02_json --fps 30 --out out")
+    assert code == 0 and [name for name in listed("out") if name.startswith("check")] == ["check-mine.mp4"]

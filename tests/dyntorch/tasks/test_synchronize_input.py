@@ -52,3 +52,13 @@ def test_misuse_names_the_field_and_the_remedy(more, words):
 def test_wrong_tracks_are_named(a, b, words):
     with pytest.raises(ValueError, match=words):
         synchronize(a, b, fps=30.0)
+
+
+@pytest.mark.parametrize("gap", [864000.0, 1e12])
+def test_takes_that_are_nearly_all_gap_are_refused(gap):
+    points, clock = A.double().repeat(2, 1, 1), torch.arange(40, dtype=torch.float64) / 30
+    torn = clock + gap * (torch.arange(40) > 29)
+    with pytest.raises(
+        ValueError, match=r"times of b run over .* it has 40 frames 0.0333 s apart, and none for .* one side of that gap"
+    ):
+        synchronize(points, points, times=(clock, torn))

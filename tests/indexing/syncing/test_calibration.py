@@ -61,3 +61,13 @@ def test_calibration_files_that_do_not_fit(tmp_path, text, says):
     (tmp_path / "c.toml").write_text(text)
     with pytest.raises(ValueError, match=says):
         lenses(tmp_path / "c.toml", ["cam1", "cam2"])
+
+
+def test_names_are_one_whoever_writes_them(tmp_path):
+    path = tmp_path / "Calib.toml"
+    path.write_text(
+        "".join(TOML.format(i).replace(f"int_cam{i}_img", f"Cam_{i:02d}").replace("1671.5", f"{900 + i}.0") for i in (1, 2, 10))
+    )
+    found, notes = named_lenses(path, ["cam10", "cam1"])  # some of them, and in another order
+    assert [lens.matrix[0, 0].item() for lens in found] == [910, 901] and notes == ()
+    assert named_lenses(path, ["cam2", "cam10", "cam1"])[1] == ()
