@@ -1,5 +1,20 @@
 """Geometry of scenes in which everything moves, batched in PyTorch.
 
+Views of points, lines, planes and bodies that all move, from cameras or 3D sensors that move, too; nobody says what stands still.
+What a view measures fulfils multilinear invariants; every one of them is estimated on the same path:
+
+- :func:`fit`, :func:`robust_fit`, :func:`refine` and :func:`sampson` take an invariant (:class:`HomographyTensor`,
+  :class:`JoinTensor`, :class:`GrassmannTensor`, :class:`ShapeTensor`, ...) and the matches, and give a :class:`Solution`;
+- :func:`align_planar`, :func:`align_points`, :func:`align_lines` find the motion of the camera or sensor, and what stood still;
+- :func:`segment`, :func:`translating_planes` find which matches move together, and how;
+- :func:`reconstruct`, :func:`triangulate_trajectories` find cameras, points and velocities from tracks;
+- :func:`synchronize`, :func:`synchronize_cameras`, :func:`reconstruct_pair` put cameras on one clock, and the scene in space.
+
+Points are ``(*batch, n, d)``, as measured; a batch gives what a loop would; NaN is missing; a failed problem has a
+:class:`Status` and never spoils its batch.  ``dyntorch.scenes`` makes scenes with known truth to try things on,
+``dyntorch.metrics`` measures errors, ``dyntorch.counting`` counts how many matches anything takes, ``dyntorch.motions`` holds the
+motion models of :func:`reconstruct`.
+
 The public names are imported lazily, so that ``import dyntorch`` costs nothing before one of them is used.
 """
 
@@ -89,7 +104,7 @@ _HOME = {
     "affine_factorization": "dyntorch.algebra.factorization",
     "metric_upgrade": "dyntorch.algebra.factorization",
 }
-_MODULES = ("counting", "metrics", "motions")
+_MODULES = ("counting", "metrics", "motions", "scenes")
 __all__ = sorted([*_HOME, *_MODULES])
 
 

@@ -10,6 +10,7 @@ null space of that matrix.  Minimal counts, rows, normalization, robust estimati
 
 from __future__ import annotations
 
+import difflib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -24,6 +25,9 @@ from dyntorch.primitives import Primitive
 
 P = ParamSpec("P")
 R = TypeVar("R")
+
+ARGUMENTS = ("weights", "static", "normalize", "threshold", "generator", "starts", "polish", "iterations")
+"""What ``fit``, ``robust_fit``, ``refine`` and ``sampson`` take by name for every invariant."""
 
 
 class on_class(Generic[P, R]):
@@ -118,8 +122,8 @@ class Invariant:
             weights: of ``fit``, as they were given: what matches of weight 0 say has no part in what is inferred.
             **given: further ones by name.
         """
-        if given:
-            raise TypeError(f"{self!r} takes no argument {next(iter(given))!r}; leave it out")
+        for name in given:
+            raise unknown_argument(self, name)
         return self, tuple(views)
 
     def completed(self, views: tuple[Tensor, ...], weights: Tensor) -> tuple[tuple[Tensor, ...], Tensor]:
@@ -258,3 +262,18 @@ def as_invariant(invariant: Invariant | type[Invariant]) -> Invariant:
                 f"{invariant.__name__} is a family: give its parameters, {invariant.__name__}(...) ({error})"
             ) from None
     raise ValueError(f"expected an invariant such as dyntorch.HomographyTensor, got {invariant!r}")
+
+
+def unknown_argument(invariant: Invariant, name: str, *also: str) -> TypeError:
+    """The complaint about an argument that nothing takes, with the one that was probably meant.
+
+    Args:
+        also: arguments that this invariant takes beside those of every one.
+
+    Example:
+        >>> from dyntorch.invariants.collineation import Collineation
+        >>> print(unknown_argument(Collineation(2), "weigths"))
+        Collineation(n=2) takes no argument 'weigths'; did you mean 'weights'?
+    """
+    near = difflib.get_close_matches(name, {*ARGUMENTS, *also} - {name}, 1)
+    return TypeError(f"{invariant!r} takes no argument {name!r}; " + (f"did you mean {near[0]!r}?" if near else "leave it out"))

@@ -1,4 +1,13 @@
-"""Learn actions from one to a few example clips and find them in other clips, from other viewpoints, by other people."""
+"""Learn actions from one to a few example clips and find them in other clips, from other viewpoints, by other people.
+
+- :class:`Clip`, :class:`ClipSet`: joints over time, read from what pose estimators write (``Clip.load``, ``ClipSet.load``);
+- :class:`ActionIndexer`: learns from clips, recognizes clips, finds actions in long recordings; :class:`Event` is what it finds;
+- :class:`PhaseIndexer`: the same from single frames, and how far the action has got;
+- :class:`BrightnessIndexer`: the same from pixels alone;
+- :func:`synchronize`: how far two cameras' clocks are apart.
+
+The indexers follow scikit-learn.  Times are seconds.  The public names are imported lazily, as in ``dyntorch``.
+"""
 
 from __future__ import annotations
 

@@ -155,7 +155,7 @@ def _keypoints(a: Clip, b: Clip, correspondence: bool | None = None, quick: bool
         correspondence = same
     elif correspondence and not same:
         raise ValueError(
-            f"correspondence=True needs the same joints in both, got {a.joints.shape[1]} and {b.joints.shape[1]}; leave it away"
+            f"correspondence=True needs the same joints in both, got {a.joints.shape[1]} and {b.joints.shape[1]}; leave it out"
         )
     if quick and correspondence:
         options = {"camera": "perspective", **options, "rate": options.get("rate") or 1.0}

@@ -17,7 +17,7 @@ from dyntorch.algebra.dynamic_shape_descent import Projected, project, shapes_at
 from dyntorch.algebra.dynamic_shape_rows import Base
 from dyntorch.algebra.dynamic_shape_time import Recovery, recover_times
 from dyntorch.algebra.shape_rows import centred
-from dyntorch.invariant import Estimate, Frame, Invariant, on_class
+from dyntorch.invariant import Estimate, Frame, Invariant, on_class, unknown_argument
 from dyntorch.matches import constellations, option
 from dyntorch.nullspace import null_space
 from dyntorch.primitives import Equations
@@ -94,8 +94,8 @@ class DynamicShapeTensor(Invariant):
         points = constellations(self, views)
         n = points.shape[-2]
         times = given.pop("times", None)
-        if given:
-            raise TypeError(f"{self!r} takes times=, not {next(iter(given))!r}; leave it out")
+        for name in given:
+            raise unknown_argument(self, name, "times")
         self._enough(n)
         if times is None:
             if self.form != "span":

@@ -26,7 +26,7 @@ NARROW = 0.7
 ROUNDS = 12
 """Fills of what is missing from the other points."""
 EDGE = 2.0
-"""Widths of smoothing left away at either end, where it is one-sided, in both cameras at once: that would speak for lag 0."""
+"""Widths of smoothing left out at either end, where it is one-sided, in both cameras at once: that would speak for lag 0."""
 STRAY = 3.0
 """Median distances from the middle beyond which a track takes no part in the middle and the size."""
 TINY = 1e-9

@@ -142,7 +142,7 @@ def _check(
     if camera not in CAMERAS:
         raise ValueError(f"camera must be one of {', '.join(CAMERAS)}, got {camera!r}")
     if camera != "auto" and not correspondence:
-        raise ValueError(f"camera={camera!r} is for corresponding points; leave it away with correspondence=False")
+        raise ValueError(f"camera={camera!r} is for corresponding points; leave it out with correspondence=False")
 
 
 def _pairwise(calibration: Any) -> Sequence[Any]:

@@ -19,7 +19,7 @@ from typing import Annotated, Any, Protocol, cast, get_args
 import tyro
 
 from indexing.cli.align import Align
-from indexing.cli.console import complain, one_line
+from indexing.cli.console import complain
 from indexing.cli.count import Count
 from indexing.cli.demo import Demo
 from indexing.cli.evaluate import Evaluate
@@ -28,6 +28,7 @@ from indexing.cli.reconstruct import Reconstruct
 from indexing.cli.scan import Scan
 from indexing.cli.segment import Segment
 from indexing.cli.sync import Sync
+from indexing.cli.wording import reworded
 
 DONE, BAD_INPUT, REFUSED, INTERRUPTED, BROKEN_PIPE = 0, 2, 3, 130, 141
 
@@ -113,7 +114,7 @@ def parse(words: list[str]) -> Runnable | int:
     except SystemExit as stop:
         if stop.code in (None, 0):
             return DONE
-        complain(_unboxed(said.getvalue()).replace("see dyntorch --help", f"see {_asked(words)} --help"))
+        complain(reworded(said.getvalue()).replace("see dyntorch --help", f"see {_asked(words)} --help"))
         return BAD_INPUT
     return cast("Runnable", parsed)
 
@@ -128,25 +129,6 @@ def _asked(words: list[str]) -> str:
         found.append(word)
         level = known[word]
     return " ".join(found)
-
-
-def _unboxed(text: str) -> str:
-    """The parser's message, which it draws in a box with rules between the parts, as one line."""
-    parts = [""]
-    for line in text.splitlines():
-        words = line.strip().strip("│|").strip()
-        if not words.strip("─-╰╯+"):
-            parts.append("")
-        elif not words.startswith(("╭", "+")):  # the box's title says what its text says
-            parts[-1] += f" {words}"
-    kept = [part.strip().removesuffix(".") for part in parts if part.strip() and "Argument helptext:" not in part]
-    said = (
-        one_line("; ".join(kept))
-        .replace("For full helptext, run:", "see")
-        .replace("For full helptext, run", "see")
-        .replace("For full helptext, see", "see")
-    )
-    return said.replace("[bold]", "").replace("[/bold]", "") or "the command line makes no sense; see dyntorch --help"
 
 
 def _version() -> str:

@@ -207,7 +207,7 @@ def _show(measured: Mapping[str, Any], groups: dict[str, float]) -> None:
         taken = f"{wrong[0]} ({wrong[1]})" if wrong else ""
         if row["clips"]:
             rows.append([name, row["clips"], f"{row['recall']:.3f}", f"{row['precision']:.3f}", taken])
-    table(["action", "clips ", "accuracy ", "precision ", "most often taken for"], rows)
+    table(["action", "clips ", "recall ", "precision ", "most often taken for"], rows)
     settings = measured["accuracy_by_setting"]
     shown = settings | {name: value for name, value in groups.items() if name not in settings}
     if set(shown) != {""}:

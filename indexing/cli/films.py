@@ -53,7 +53,7 @@ def refuse_film_flags(pixels: Pixels) -> None:
     given = [name for name, field in Pixels.__dataclass_fields__.items() if getattr(pixels, name) != field.default]
     if given:
         listed = names([f"--{name.replace('_', '-')}" for name in given])
-        raise ValueError(f"{listed}: of videos only, but the inputs are keypoints; leave it away")
+        raise ValueError(f"{listed}: of videos only, but the inputs are keypoints; leave it out")
 
 
 def are_films(paths: Sequence[Path]) -> bool:
@@ -78,7 +78,7 @@ def refuse_keypoint_flags(command: Any, *flags: str) -> None:
     given = [flag for flag in flags if getattr(command, flag) != defaults[flag].default]
     if given:
         listed = names([f"--{flag.replace('_', '-')}" for flag in given])
-        raise ValueError(f"{listed}: of keypoints only, but the inputs are videos; leave it away")
+        raise ValueError(f"{listed}: of keypoints only, but the inputs are videos; leave it out")
 
 
 class AsTheyAre:

@@ -76,12 +76,19 @@ def parse_example(text: str) -> Example:
     if not label.strip() or not rest:
         raise ValueError(f"example {text!r}: expected label=file, such as squat=a.json; give both the label and the file")
     found = _trimmed(rest)
+    if "=" in rest and not found.path.expanduser().exists() and Path(file := rest.rpartition("=")[2]).expanduser().exists():
+        raise ValueError(f"example {text!r}: two labels for {file}; give one, as in {label.strip()}={file}")
     return Example(found.path, label.strip(), found.start, found.end)
 
 
 def _trimmed(text: str) -> Example:
     match = TRIM.fullmatch(text)
-    if match is None or Path(text).expanduser().exists() or match["start"] == match["end"] is None:
+    if Path(text).expanduser().exists():
+        return Example(Path(text))
+    if match is None or match["start"] == match["end"] is None:
+        file, at, seconds = text.rpartition("@")
+        if at and Path(file).expanduser().exists():
+            raise ValueError(f"example {text!r}: @{seconds} is no range; write @start-end in seconds, such as @1.5-4, @1.5- or @-4")
         return Example(Path(text))
     start, end = (None if value is None else float(value) for value in (match["start"], match["end"]))
     if start is not None and end is not None and not start < end:
@@ -140,6 +147,10 @@ def _checked(clips: Sequence[Clip], path: Path) -> list[Clip]:
 
     for clip in clips:
         reason = unusable(clip)
+        if reason and len(clip) == 1 and path.suffix.lower() == ".json" and path.is_file():
+            raise ValueError(
+                f"{path}: {reason}; leave it out, or give the folder {path.parent} if every frame is a file of its own"
+            )
         if reason:
             raise ValueError(f"{path}: {reason}; leave it out or record it again")
     return list(clips)
@@ -184,7 +195,7 @@ def read_recordings(paths: Sequence[Path], reading: Reading, joints: int, model:
             if clip.joints.shape[1] != joints:
                 raise ValueError(
                     f"{path}: has {clip.joints.shape[1]} joints, but the model {model} was learned from clips with {joints}; "
-                    "use the same pose estimator and joint layout for both"
+                    "actions are compared joint by joint: use the same pose estimator and joint layout for both"
                 )
             found += [(path, clip) for clip in _checked([clip], path)]
     twice = [clip.name for _, clip in found]

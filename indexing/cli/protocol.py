@@ -84,9 +84,9 @@ def check_dims(clips: Sequence[Clip], cameras: Cameras) -> list[str]:
     if flat is None:
         return ["3D joints without --camera: learned from all around, asked as seen along z"] if cameras.kind == "none" else []
     if cameras.kind != "none":
-        raise ValueError(f"--camera {cameras.kind}: needs 3D joints, but clip {flat.name!r} is 2D; leave --camera away")
+        raise ValueError(f"--camera {cameras.kind}: needs 3D joints, but clip {flat.name!r} is 2D; leave --camera out")
     if cameras.solid:
-        raise ValueError(f"--exemplars 3d: clip {flat.name!r} is 2D; leave --exemplars away")
+        raise ValueError(f"--exemplars 3d: clip {flat.name!r} is 2D; leave --exemplars out")
     return []
 
 
@@ -100,7 +100,7 @@ def splits(
     """
     if leave_out is not None:
         if train or test:
-            raise ValueError("--leave-out makes its own training and test sets; leave --train and --test away")
+            raise ValueError("--leave-out makes its own training and test sets; leave --train and --test out")
         return _leave_out(clips, leave_out), []
     if not train and not test:
         raise ValueError(

@@ -120,7 +120,7 @@ class Reconstruct:
         if self.fps is not None and not 0 < self.fps < float("inf"):
             raise ValueError(f"--fps must be a positive number of frames per second, got {self.fps:g}")
         if self.fps is not None and self.times is not None:
-            raise ValueError("--fps and --times both give times; leave one away")
+            raise ValueError("--fps and --times both give times; leave one out")
         if self.seed < 0:
             raise ValueError(f"--seed must be a whole number from 0, got {self.seed}")
 

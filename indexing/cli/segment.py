@@ -100,7 +100,7 @@ class Segment:
         if self.size is not None and not all(0 < side < float("inf") for side in self.size):
             raise ValueError(f"--size must be width and height in pixels, such as 640 480, got {self.size[0]:g} {self.size[1]:g}")
         if self.size is not None and self.images is not None:
-            raise ValueError("--size and --images both say how large the images are; leave one away")
+            raise ValueError("--size and --images both say how large the images are; leave one out")
         if self.seed < 0:
             raise ValueError(f"--seed must be a whole number from 0, got {self.seed}")
 

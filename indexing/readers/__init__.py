@@ -60,7 +60,7 @@ def read(
     """
     options = Options(fps=fps, person=person, min_confidence=min_confidence, label=label, size=size)
     if format is not None and format not in FORMATS:
-        raise ValueError(f"{path}: unknown format={shown(format)}; use one of {', '.join(FORMATS)}, or leave it away to detect it")
+        raise ValueError(f"{path}: unknown format={shown(format)}; use one of {', '.join(FORMATS)}, or leave it out to detect it")
     source = open_source(path)
     module = import_module(f"{__name__}.{format or detect(source)}")
     clips: ClipSet = module.read(source, options)

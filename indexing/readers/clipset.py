@@ -43,7 +43,7 @@ def read(source: Source, options: Options) -> ClipSet:
     """Read a clip set; ``person`` does not matter, since a clip is one person already."""
     source.need("clipset", "npz")
     if options.size is not None:
-        raise error(source.path, "size= does not apply to a clip set", "leave size away")
+        raise error(source.path, "size= does not apply to a clip set", "leave size out")
     return read_clip_set(source.path, fps=options.fps, label=options.label, min_confidence=options.min_confidence)
 
 

@@ -7,7 +7,10 @@ from typing import Any
 from indexing.opening import error, listed
 from indexing.readers.files import Source
 
-REMEDY = "export one of the formats in indexing.readers.FORMATS, or name it with format="
+REMEDY = (
+    "export what OpenPose, COCO, MediaPipe, DeepLabCut, MMPose, Ultralytics or SLEAP write, or a clip set, or say the format "
+    "(--format, format=)"
+)
 
 
 def detect(source: Source) -> str:

@@ -48,7 +48,7 @@ class Source:
             raise error(
                 self.path,
                 f"is a {self.kind}, but the format {name!r} is a {' or a '.join(kinds)}",
-                "leave format= away to detect it",
+                "leave format= out to detect it",
             )
 
 

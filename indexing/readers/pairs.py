@@ -80,7 +80,7 @@ def read_pair(path: str | Path, pair: str | None = None) -> MatchedPair:
     if head.startswith(b"PK"):
         return _archive(path, pair)
     if pair is not None:
-        raise error(path, f"--pair {pair}: holds one pair", "leave --pair away; it is for .npz with several")
+        raise error(path, f"--pair {pair}: holds one pair", "leave --pair out; it is for .npz with several")
     if head.startswith(b"\x93NUMPY"):
         values = read_npy(path)
         if values.ndim != 2 or values.shape[1] != 4:
@@ -139,7 +139,7 @@ def _chosen(path: Path, names: list[str], pair: str | None) -> str:
     pairs = listed(name.rstrip("/") for name in several)
     if pair is not None and f"{pair}/x1" not in names and (several or "x1" in names):
         raise error(
-            path, f"has no pair {shown(pair)}", f"its pairs are {pairs}" if several else "it holds one pair: leave --pair away"
+            path, f"has no pair {shown(pair)}", f"its pairs are {pairs}" if several else "it holds one pair: leave --pair out"
         )
     if pair is None and "x1" not in names and len(several) > 1:
         raise error(path, f"holds {len(several)} pairs ({pairs})", f"say which: --pair {clipped(several[0].rstrip('/'), VALUE)}")

@@ -191,7 +191,7 @@ def _scale(path: Path, recording: Recording, options: Options) -> Recording:
         return recording
     finite = np.abs(recording.joints[np.isfinite(recording.joints)])
     if recording.joints.shape[2] != 2 or (finite.size and np.median(finite) > NORMALIZED):
-        raise error(path, "size= is for 2D coordinates from 0 to 1, and these are not", "leave size away")
+        raise error(path, "size= is for 2D coordinates from 0 to 1, and these are not", "leave size out")
     return replace(recording, joints=recording.joints * np.asarray(options.size, dtype=float))
 
 

@@ -88,7 +88,7 @@ def _weighing(indexer: ActionIndexer) -> str:
     """What each kind of evidence weighs."""
     model, blend = indexer.model_, indexer.model_.blend
     total = blend.kernel + blend.nearest
-    depth = "none: flat cards"
+    depth = "none: bodies stay flat, as in the image"
     if indexer.layout_ is not None:
         name = next((name for name, joints in LAYOUTS.items() if joints == indexer.layout_.joints), "these names")
         depth = f"guessed, from synthetic people with the joints of {name}"

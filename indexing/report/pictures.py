@@ -188,7 +188,7 @@ def _draw_bars(axes: Any, spans: Sequence[tuple[str, list[list[Bar]]]], view: _V
 
 
 def _write(axes: Any, text: str, x: float, y: float, room: float) -> None:
-    """Text centred in a bar of ``room`` pixels; cut, or left away, where it does not fit."""
+    """Text centred in a bar of ``room`` pixels; cut, or left out, where it does not fit."""
     written = axes.text(x, y, text, color="#ffffff", fontsize=8, ha="center", va="center", parse_math=False, clip_on=True)
     if written.get_window_extent().width + 8 > room:
         written.set_fontsize(7)

@@ -1,12 +1,13 @@
 """The contract of an invariant: what follows from a declaration, and use of the class in place of its default instance."""
 
+import inspect
 from dataclasses import dataclass
 
 import pytest
 import torch
 
 import dyntorch as dyn
-from dyntorch.invariant import Frame, Invariant, as_invariant, on_class
+from dyntorch.invariant import ARGUMENTS, Frame, Invariant, as_invariant, on_class
 from dyntorch.primitives import HyperplanesThrough, Line, Point
 
 
@@ -85,3 +86,28 @@ def test_as_invariant():
 def test_frames_say_what_they_map():
     assert Frame(0, 1) == Frame(target=0, source=1, vector=False)
     assert [f.target for f in dyn.ConstantVelocityTensor.motion] == [0, 1, 2]
+
+
+def test_the_arguments_that_a_misspelt_one_is_compared_with_are_those_of_the_verbs():
+    taken = {
+        name
+        for verb in (dyn.fit, dyn.robust_fit, dyn.refine, dyn.sampson)
+        for name, parameter in inspect.signature(verb).parameters.items()
+        if parameter.kind is parameter.KEYWORD_ONLY
+    }
+    assert taken == set(ARGUMENTS)
+
+
+@pytest.mark.parametrize(
+    ("invariant", "given", "said"),
+    [
+        (dyn.Collineation(2), "weigths", "takes no argument 'weigths'; did you mean 'weights'"),
+        (dyn.Collineation(2), "threshold", "takes no argument 'threshold'; leave it out"),
+        (dyn.Collineation(2), "colour", "takes no argument 'colour'; leave it out"),
+        (dyn.DynamicShapeTensor(dyn.Fourier(1)), "time", "takes no argument 'time'; did you mean 'times'"),
+    ],
+)
+def test_a_misspelt_argument_is_named_with_the_one_that_was_meant(invariant, given, said):
+    x = torch.rand(20, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    with pytest.raises(TypeError, match=said):
+        dyn.fit(invariant, x, x, x, x, x, x, **{given: 1.0})

@@ -217,7 +217,7 @@ def test_equal_images_are_refused(run, tmp_path):
         ("@/plane.csv --threshold 0", "--threshold must be a positive distance"),
         ("@/plane.csv --threshold x", "--threshold must be a positive distance in the unit of the tracks, auto or none, got x"),
         ("@/plane.csv --fps 0", "--fps must be a positive number"),
-        ("@/plane.csv --fps 5 --times 0,1,2,3", "leave one away"),
+        ("@/plane.csv --fps 5 --times 0,1,2,3", "leave one out"),
         ("@/plane.csv --seed -1", "--seed must be a whole number"),
         ("@/plane.csv --times 0,1", "--times '0,1': 2 times for 4 views; give one finite number per view"),
         ("@/plane.csv --times 0,1,2,x", "expected numbers with commas between them"),

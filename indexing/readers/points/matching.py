@@ -77,7 +77,7 @@ def read_matches(
     views, resting = _views([Path(path).expanduser() for path in paths], frames)
     if static_points:
         if resting:
-            raise error(paths[0], "holds static points, too", "leave --static-points away")
+            raise error(paths[0], "holds static points, too", "leave --static-points out")
         resting, _ = _views([Path(path).expanduser() for path in static_points], None)
     matched = match(views)
     if not resting:
@@ -129,7 +129,7 @@ def _views(paths: Several[Path], frames: tuple[int, ...] | None) -> tuple[list[P
     """The views, and the static points that came with them."""
     if len(paths) == 1 and opening(paths[0]).startswith(b"PK"):
         if frames is not None:
-            raise error(paths[0], "an .npz has no frames", "leave --frames away")
+            raise error(paths[0], "an .npz has no frames", "leave --frames out")
         return arrays.read_npz(paths[0])
     views: list[PointSet] = []
     for path in paths:
@@ -142,7 +142,7 @@ def _views(paths: Several[Path], frames: tuple[int, ...] | None) -> tuple[list[P
             return found.views(frames), []
         views.append(found)
     if frames is not None:
-        raise error(paths[0], "has no frames", "leave --frames away; it is for .c3d, and .npy of shape (frames, n, d)")
+        raise error(paths[0], "has no frames", "leave --frames out; it is for .c3d, and .npy of shape (frames, n, d)")
     return views, []
 
 

@@ -56,7 +56,7 @@ def _read(files: Several[Path], key: str | None) -> TrackSet:
     if len(files) == 1 and _start(files[0]).startswith(b"PK"):
         return arrays.read(files[0], key)
     if key is not None:
-        raise error(files[0], f"--key {key}: has no keys", "leave --key away; it is for .npz with several sequences or arrays")
+        raise error(files[0], f"--key {key}: has no keys", "leave --key out; it is for .npz with several sequences or arrays")
     if len(files) == 1 and _is_text(files[0]):
         if longform.is_long(longform.header(files[0])):
             return longform.read(files[0])

@@ -186,7 +186,7 @@ def test_damaged_data_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("options", "words"),
-    [({"min_confidence": 0.5}, ("no confidence", "at 0")), ({"size": (640, 480)}, ("size", "leave size away"))],
+    [({"min_confidence": 0.5}, ("no confidence", "at 0")), ({"size": (640, 480)}, ("size", "leave size out"))],
 )
 def test_options_that_a_set_cannot_take(save, options: dict[str, Any], words: tuple[str, ...]) -> None:  # type: ignore[no-untyped-def]
     with pytest.raises(ValueError, match=r"moves\.npz: ") as caught:

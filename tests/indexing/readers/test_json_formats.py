@@ -193,7 +193,7 @@ def test_size_undoes_normalized_coordinates_and_refuses_pixels(write_json: Write
     small[..., :2] /= [640, 480]
     clip = read_clip(write_json([[yolo_person(one)] for one in small]), size=(640, 480))
     np.testing.assert_allclose(clip.joints, expected)
-    with pytest.raises(ValueError, match=r"take\.json: size= .*leave size away"):
+    with pytest.raises(ValueError, match=r"take\.json: size= .*leave size out"):
         read(write_json(coco_results(person)), size=(640, 480))
 
 

@@ -305,7 +305,7 @@ def test_what_cannot_be_matched_is_refused(tmp_path):
         assert says in str(caught.value)
     with pytest.raises(ValueError, match="no files; give"):
         read_matches([])
-    with pytest.raises(ValueError, match="has no frames; leave --frames away"):
+    with pytest.raises(ValueError, match="has no frames; leave --frames out"):
         read_matches(files(tmp_path, "1,2\n", "1,2\n"), frames=(1, 2))
 
 

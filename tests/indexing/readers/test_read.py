@@ -111,7 +111,7 @@ def test_unknown_options_are_refused(tmp_path: Path, options: dict[str, object],
 def test_naming_the_wrong_format_says_what_the_file_is(tmp_path: Path, name: str) -> None:
     path = tmp_path / "set.npz"
     np.savez(path, joints=np.ones((3, 2, 2)))
-    refused(path, "is a npz", name, "leave format= away", format=name)
+    refused(path, "is a npz", name, "leave format= out", format=name)
 
 
 def test_read_clip_wants_one_clip(tmp_path: Path) -> None:
