@@ -3,22 +3,38 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+# The CPU build of torch is 190 MB; on Linux the usual one brings CUDA along, 2.5 GB with its fifteen packages.  Where no GPU is seen
+# the CPU build is taken if pip finds one.  TORCH_INDEX: the package index that PyTorch's "Get Started" page names for pip and CPU.
+TORCH ?= $(if $(shell command -v nvidia-smi 2>/dev/null),gpu,cpu)
+TORCH_INDEX ?=
+TORCH_VERSION := $(shell sed -n 's/^torch==//p' constraints.txt)
+PIP = $(BIN)/python -m pip install --quiet
 
 .PHONY: install demo test lint bench tables docs clean
 
 install: $(STAMP)
 
 $(STAMP): pyproject.toml constraints.txt
-	$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "dyntorch needs Python 3.11 or newer; try: make PYTHON=python3.12 ...")'
-	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
-	touch $(STAMP)
+	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "dyntorch needs Python 3.11 or newer; try: make PYTHON=python3.12 ...")'
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+ifeq ($(TORCH)-$(shell uname -s),cpu-Linux)
+	@echo "Looking for torch without CUDA (190 MB) ..."
+	@$(PIP) --retries 1 --timeout 20 --no-deps $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) 'torch==$(TORCH_VERSION)+cpu' 2>$(VENV)/torch.log \
+	  || { tail -n 1 $(VENV)/torch.log; echo 'pip finds none here: it takes torch with CUDA (2.5 GB). To avoid that, stop, and give the index that the' \
+	  '"Get Started" page of PyTorch names for pip and CPU: make install TORCH_INDEX=...'; }
+endif
+	@echo "Installing dyntorch and its packages into $(VENV): about a minute in which pip says nothing, longer if much is to be fetched ..."
+	@$(PIP) --constraint constraints.txt --editable '.[dev]'
+	@touch $(STAMP)
+	@echo "Installed."
 
 demo: install
+	@echo "The demo takes 10 to 20 seconds."
 	$(BIN)/dyntorch demo --out demo-report
 
-# one worker per core, one thread each: two minutes instead of six on two cores
+# one worker per core, one thread each
 test: install
+	@echo "All tests: TESTTIME on two quiet cores; dots and percents show how far they are."
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto
 
 lint: install
@@ -27,7 +43,7 @@ lint: install
 	$(BIN)/mypy
 
 bench: install
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[experiments]'
+	$(PIP) --constraint constraints.txt --editable '.[experiments]'
 	$(BIN)/python -m experiments.benchmarks.null_space
 	$(BIN)/python -m experiments.benchmarks.fits
 	$(BIN)/python -m experiments.benchmarks.robust_peers
@@ -38,7 +54,7 @@ bench: install
 	$(BIN)/python -m experiments.benchmarks.brightness_indexer
 
 tables: install
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[experiments]'
+	$(PIP) --constraint constraints.txt --editable '.[experiments]'
 	$(BIN)/python -m experiments.homography_tensor_noise
 	$(BIN)/python -m experiments.tensor_noise_3d
 	$(BIN)/python -m experiments.robust_estimation
@@ -68,8 +84,8 @@ tables: install
 	$(BIN)/python -m experiments.gestures
 
 docs: install
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs]'
-	$(BIN)/pdoc --math --output-directory site dyntorch indexing
+	$(PIP) --constraint constraints.txt --editable '.[docs]'
+	$(BIN)/python docs/build.py
 
 clean:
 	rm -rf $(VENV) site build dist demo-report results

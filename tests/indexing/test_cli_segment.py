@@ -230,7 +230,7 @@ def test_a_doubtful_result_is_shown_and_refused(run, solved, monkeypatch):
 @pytest.mark.parametrize(
     ("line", "says"),
     [
-        ("", "required"),
+        ("", "missing: MATCHES"),
         ("no.npz", "no.npz: no such file; check the path"),
         ("@/", "is a folder; give a file of points"),
         ("@/left.png", "left.png: is a binary file of no known format; give npz with x1, x2"),
