@@ -172,10 +172,10 @@ def _null(
     # frames of single matches, from points of theirs, may be all noise, and then nothing looks weak
     limit = 0.0 if invariant.intrinsic else WEAK
     weak = (spare > 0) & ~found.degenerate & (g.diagonal(dim1=-2, dim2=-1).sum(-1) * found.competing > limit)
-    if not invariant.resolves_noise and g.device.type == "cpu" and bool(weak.any()):
+    if invariant.copies is None and g.device.type == "cpu" and bool(weak.any()):
         chosen = [x[weak] for x in views], weights[weak], None if static is None else static[weak], basis[weak]
         with torch.no_grad():
-            ambiguous[weak] = ambiguous[weak] | within_noise(primitives, *chosen)
+            ambiguous[weak] = ambiguous[weak] | within_noise(primitives, *chosen, invariant.resolves_noise)
     return basis, _status(few, found.degenerate, ambiguous), square.sqrt()
 
 

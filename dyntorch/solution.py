@@ -48,6 +48,11 @@ def failed(status: Tensor) -> Tensor:
     return (status == Status.TOO_FEW) | (status == Status.DEGENERATE)
 
 
+def agreed(status: Tensor) -> Tensor:
+    """Where matches agree with what was found, bool of the same shape; elsewhere no match is an inlier of anything."""
+    return (status == Status.OK) | (status == Status.AMBIGUOUS)
+
+
 def check_status(what: str, status: Tensor, said: Sequence[tuple[int, str]] = ()) -> None:
     """Raise where any problem failed.
 

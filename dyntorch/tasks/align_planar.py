@@ -15,7 +15,7 @@ from dyntorch.solution import NOISY, Solution, Status, failed
 from dyntorch.tasks.alignment import MOVING, OUTLIER, STATIC, Alignment
 from dyntorch.tasks.labelling import CHI_SQUARE, ROUGH, SIGMAS, Evidence, Labelled, joined
 from dyntorch.tasks.notices import check_threshold
-from dyntorch.tasks.planar_notices import planar_notices, unverified
+from dyntorch.tasks.planar_notices import planar_notices, tensor_rank, undecided, unverified
 from dyntorch.tasks.static_consensus import static_consensus
 
 SAMPLES = 1000
@@ -109,7 +109,7 @@ def align_planar(
 
 def _align(data: Matches, threshold: float | None, generator: torch.Generator | None) -> Alignment:
     evidence = Evidence.of(HomographyTensor(), data)
-    solution, best = _solved(evidence, _search(evidence, threshold, generator))
+    solution, best, tensor = _solved(evidence, _search(evidence, threshold, generator))
     outcome = solution.back(data)
     A, B = outcome.motion
     assert outcome.sigma is not None and outcome.covariance is not None
@@ -121,7 +121,7 @@ def _align(data: Matches, threshold: float | None, generator: torch.Generator | 
         sigma=outcome.sigma,
         covariance=outcome.covariance,
         ambiguity=AMBIGUITY,
-        warnings=planar_notices(evidence, best, solution.status, data.batch),
+        warnings=planar_notices(evidence, best, tensor, solution.status, data.batch),
         unverified=data.back(unverified(evidence, best) & (best.labels == MOVING)),
         solution=outcome,
     )
@@ -201,8 +201,8 @@ def _usable(evidence: Evidence, found: Solution) -> tuple[Tensor, Tensor]:
     return torch.where(usable[:, None], theta, identity), usable
 
 
-def _solved(evidence: Evidence, best: Labelled) -> tuple[Solution, Labelled]:
-    """The solution with its status, and the final labels: none where there is no motion."""
+def _solved(evidence: Evidence, best: Labelled) -> tuple[Solution, Labelled, tuple[Tensor, Tensor]]:
+    """The solution with its status, the final labels, none where there is no motion, and what the tensor alone rests on."""
     refined = evidence.refined(best.theta, best.labels, STEPS)
     theta = joined(refined)
     values, spread = evidence.information(theta, best.labels)
@@ -210,7 +210,9 @@ def _solved(evidence: Evidence, best: Labelled) -> tuple[Solution, Labelled]:
     worst = best.sigma * values[:, 0].clamp(min=torch.finfo(values.dtype).tiny).rsqrt()
     assert refined.sigma is not None and refined.covariance is not None
     best = Labelled(theta, labels, best.sigma)
-    status = _status(evidence, best, refined.sigma, worst, values[:, 0] <= INDETERMINATE * values[:, -1])
+    tensor = tensor_rank(evidence.data.restricted(labels != OUTLIER), evidence, best.sigma)
+    free = (worst > AMBIGUOUS) | undecided(evidence, best, tensor)
+    status = _status(evidence, best, refined.sigma, free, values[:, 0] <= INDETERMINATE * values[:, -1])
     none = failed(status)
     labels = torch.where(none[:, None], OUTLIER, labels)
     zero = none[:, None, None]
@@ -224,11 +226,11 @@ def _solved(evidence: Evidence, best: Labelled) -> tuple[Solution, Labelled]:
         uncertainty=torch.where(none, 0.0, worst),
         inliers=labels != OUTLIER,
     )
-    return solution, replace(best, labels=labels)
+    return solution, replace(best, labels=labels), tensor
 
 
-def _status(evidence: Evidence, best: Labelled, shown: Tensor, worst: Tensor, undetermined: Tensor) -> Tensor:
-    """``(b,)`` from the inliers, the noise they show, the uncertainty of the motion, and whether a part of it is free."""
+def _status(evidence: Evidence, best: Labelled, shown: Tensor, free: Tensor, undetermined: Tensor) -> Tensor:
+    """``(b,)`` from the inliers, the noise they show, and whether a part of the motion is free by the noise, or exactly."""
     usable = evidence.data.weights > 0
     present = usable.sum(-1)
     known = torch.zeros_like(present) if evidence.data.static is None else (usable & evidence.data.static).sum(-1)
@@ -241,7 +243,7 @@ def _status(evidence: Evidence, best: Labelled, shown: Tensor, worst: Tensor, un
     )
     accident = accident | (best.sigma * torch.stack(evidence.norm.scales).amax(0) > NOISY)
     status = torch.full_like(present, int(Status.OK))
-    status = torch.where(worst > AMBIGUOUS, int(Status.AMBIGUOUS), status)
+    status = torch.where(free, int(Status.AMBIGUOUS), status)
     status = torch.where(accident, int(Status.NO_CONSENSUS), status)
     status = torch.where(undetermined, int(Status.DEGENERATE), status)
     return torch.where((present < MINIMAL) & (known < 4), int(Status.TOO_FEW), status)

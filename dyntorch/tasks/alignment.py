@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from dyntorch.solution import Solution, Status
+from dyntorch.solution import Solution, Status, agreed
 from dyntorch.tasks.notices import Notice, NoticeCode, check_results
 
 OUTLIER, STATIC, MOVING = 0, 1, 2
@@ -21,11 +21,11 @@ class Alignment:
 
     Attributes:
         A: ``(*batch, d + 1, d + 1)`` motion of the sensor, view 2 to view 1, :math:`p_1 \\sim A\\,p_2` for static points;
-            Frobenius norm 1; zero where the status says that there is none.
+            Frobenius norm 1; zero where the status says that there is none, the best one found for ``NO_CONSENSUS``.
         B: the same for view 3; None with two views.
-        labels: ``(*batch, n)`` 0 outlier, 1 static, 2 moving.
+        labels: ``(*batch, n)`` 0 outlier, 1 static, 2 moving; all 0 where the status is neither OK nor AMBIGUOUS.
         status: ``(*batch,)`` of :class:`dyntorch.Status`.
-        sigma: ``(*batch,)`` noise of one coordinate that the inliers show, in the unit of the matches.
+        sigma: ``(*batch,)`` noise of one coordinate that the inliers show, in the unit of the matches; 0 where there are none.
         covariance: ``(*batch, p, p)`` of the entries of A, then those of B, row by row.
         ambiguity: a sentence: what the data cannot tell, even without noise.
         warnings: notices on single problems of the batch, in its order.
@@ -46,6 +46,15 @@ class Alignment:
     velocities: Tensor | None = None
     unverified: Tensor | None = None
     solution: Solution | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        """Where the matches do not agree, no label, velocity or noise says otherwise."""
+        good = agreed(self.status)
+        for name in ("labels", "sigma", "velocities", "unverified"):
+            value = getattr(self, name)
+            if value is not None:
+                kept = good[(..., *[None] * (value.ndim - good.ndim))]
+                object.__setattr__(self, name, torch.where(kept, value, torch.zeros_like(value)))
 
     def flagged(self, code: NoticeCode | str) -> Tensor:
         """Which problems have a notice of this code, ``(*batch,)`` bool.

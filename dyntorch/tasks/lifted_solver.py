@@ -11,7 +11,7 @@ from torch import Tensor
 from dyntorch.algebra.triangulation import triangulate, unit_projections
 from dyntorch.bundle_adjustment import bundle_adjust
 from dyntorch.motions import Motion
-from dyntorch.solution import Status, failed
+from dyntorch.solution import Status, agreed, failed
 from dyntorch.tasks.lifted_bodies import bodies_of
 from dyntorch.tasks.lifted_diagnosis import diagnose, spare, unknowns
 from dyntorch.tasks.lifted_projections import Projections, Tracks, projections_of_tracks
@@ -165,7 +165,7 @@ def _result(
         cameras=shaped(unit_projections(back @ cameras)),
         points=shaped(points, nan),
         velocities=None if speed is None else shaped(speed, nan),
-        labels=shaped(labels),
+        labels=shaped(torch.where(agreed(status)[:, None], labels, 0)),
         residual=shaped((total / number.clamp(min=1)).sqrt()),
         residuals=shaped(apart, nan),
         sigma=shaped(sigma),

@@ -11,8 +11,8 @@ from dyntorch.fitting import fit_matches
 from dyntorch.invariants.agreement import static_residual
 from dyntorch.invariants.homography_tensor import HomographyTensor
 from dyntorch.matches import Matches
-from dyntorch.solution import failed
-from dyntorch.tasks.alignment import MOVING, OUTLIER
+from dyntorch.solution import Status, failed
+from dyntorch.tasks.alignment import MOVING, OUTLIER, STATIC
 from dyntorch.tasks.labelling import CHI_SQUARE, Evidence, Labelled
 from dyntorch.tasks.notices import Notice, NoticeCode, notices
 
@@ -21,17 +21,31 @@ RANK = 1e-9
 NEAR = 2.0
 """Strength of the weakest equation of the tensor: 0.4 to 0.7 where all stands still, 1.3 to 1.6 where points move by 1 to 5 pixels
 at 0.5 pixels of noise, 15 to 25 where they move by 25 to 80 (100 matches)."""
+UNDECIDED = 1.2
+"""The same, corrected for the matches that 26 equations use up, below which moving matches alone leave a family of motions.  0.7 to
+0.9 where all make equal steps (80 matches), 0.5 where all stands still, 1.3 and more where all move by 3 px at changing speed."""
+SUPPORT, CHANCE = 10, 3.0
+"""Static matches that settle such a family: so many, and so many for each that is expected by chance.  A motion of the family that
+is off makes 0 to 6 of 80 matches static at steps of 10 to 40 px, and up to 16 at 3 px, where 3 to 5 are expected."""
+WIDER = 3.0
+"""Times the limit of static matches within which those that are static by chance spread evenly, over a plane of velocities."""
 THIN = 3.0
 """Standard deviations of the noise across a line of points, below which they may as well lie on it."""
 ROOM = 3.0
 """Standard deviations of the noise within which a match belongs to a trajectory line."""
 LINES, FEWEST = 4, 16
 """Trajectory lines, and moving matches, that the tensor needs where nothing stands still (thesis chapter 2)."""
+MINIMAL = 4
+"""Static matches that determine the motion."""
 
 
-def planar_notices(evidence: Evidence, best: Labelled, status: Tensor, batch: tuple[int, ...]) -> tuple[Notice, ...]:
-    """All notices on a flat batch of problems with final labels, in the order of the problems."""
+def planar_notices(
+    evidence: Evidence, best: Labelled, tensor: tuple[Tensor, Tensor], status: Tensor, batch: tuple[int, ...]
+) -> tuple[Notice, ...]:
+    """All notices on a flat batch of problems with final labels, in the order of the problems; ``tensor`` from
+    :func:`tensor_rank`."""
     data, sigma = evidence.data, best.sigma
+    rank, strength = tensor
     solved = ~failed(status)
     moving = best.labels == MOVING
     count = moving.sum(-1)
@@ -40,11 +54,13 @@ def planar_notices(evidence: Evidence, best: Labelled, status: Tensor, batch: tu
     def note(code: NoticeCode, message: str, values: Tensor, flagged: Tensor) -> None:
         found.extend(notices(code, message, values, flagged, batch))
 
-    rank, strength = tensor_rank(data.restricted(best.labels != OUTLIER), evidence, sigma)
     text = "the matches leave {value:g} of 26 equations on the tensor; the motion rests on its static matches"
     note(NoticeCode.DEGENERATE, text, rank, solved & (rank < HomographyTensor.width() - 1))
     text = "the weakest equation on the tensor is only {value:.2g} times the noise; the motion rests on its static matches"
     note(NoticeCode.NEAR_STATIC, text, strength, solved & (rank >= HomographyTensor.width() - 1) & (strength < NEAR))
+    text = "the moving matches fit a family of motions, and only {value:g} static ones choose among them; give more static matches"
+    family = (status == Status.AMBIGUOUS) & undecided(evidence, best, tensor)
+    note(NoticeCode.OTHER_SOLUTION, text, (best.labels == STATIC).sum(-1), family)
     text = f"{{value:g}} matches move, {FEWEST} would determine the motion without static ones"
     note(NoticeCode.FEW_MOVING, text, count, solved & (count < FEWEST))
     lines = trajectory_lines(evidence, best, moving)
@@ -67,6 +83,26 @@ def tensor_rank(inliers: Matches, evidence: Evidence, sigma: Tensor) -> tuple[Te
     # a row of unit length changes by about the noise of the normalized coordinates
     noise = sigma * torch.stack(evidence.norm.scales).square().mean(0).sqrt() * inliers.weights.square().sum(-1).sqrt()
     return rank, values[:, -2] / noise.clamp(min=torch.finfo(values.dtype).tiny)
+
+
+def undecided(evidence: Evidence, best: Labelled, tensor: tuple[Tensor, Tensor]) -> Tensor:
+    """Where the moving matches leave a family of motions ``(b,)``, and no more are static than some motion of it makes by chance.
+
+    Points that make equal steps move as straight if the camera moves along at any velocity common to all.  The motion that makes
+    most of them static is the true one if these are many; else some happen to have about that velocity.
+    """
+    rank, strength = tensor
+    used = (best.labels != OUTLIER).sum(-1)
+    equations = HomographyTensor.width() - 1
+    spare = ((used - equations).clamp(min=1) / used.clamp(min=1)).sqrt()
+    family = (rank >= equations) & (strength < UNDECIDED * spare)
+    still = (best.labels == STATIC) & (evidence.data.weights > 0)
+    if evidence.data.static is not None:
+        family = family & ((still & evidence.data.static).sum(-1) < MINIMAL)
+    square = evidence.residuals(best.theta)[1].square().sum(-1)
+    limit = WIDER**2 * CHI_SQUARE[4] * best.sigma.square()[:, None]
+    beside = ((square <= limit) & ~still & (evidence.data.weights > 0)).sum(-1)
+    return family & (still.sum(-1) < SUPPORT + CHANCE * beside / (WIDER**2 - 1))
 
 
 def unverified(evidence: Evidence, best: Labelled) -> Tensor:

@@ -40,7 +40,7 @@ class Reconstruction:
             own body.
         velocities: ``(*batch, n, d)`` per unit of the times, at time 0; None for two bodies.
         labels: ``(*batch, n)`` 0 outlier or not found, 1 static (known only where static points were given), 2 moving; of two
-            bodies 1 and 2.
+            bodies 1 and 2.  All 0 where the status is neither OK nor AMBIGUOUS.
         residual: ``(*batch,)`` rms reprojection error of the observations that count, in the unit of the tracks.
         residuals: ``(*batch, views, n)`` reprojection distances; NaN where missing or not found.
         sigma: ``(*batch,)`` noise of one coordinate that the residuals show.

@@ -8,6 +8,7 @@ import torch
 import dyntorch as dyn
 from dyntorch import scenes
 from dyntorch.metrics import relative_error
+from tests.steps import equal_steps
 
 
 def fitted(motion: str, **options: int) -> tuple[dyn.Solution, torch.Tensor]:
@@ -48,3 +49,18 @@ def test_nothing_depends_on_the_global_generator_or_changes_it():
 def test_very_many_matches_are_judged_by_a_part_of_them():
     scene = scenes.constant_velocity(5000, sigma=1e-3, velocities="planar", generator=torch.Generator().manual_seed(2))
     assert dyn.fit(dyn.ConstantVelocityTensor, *scene.views).status == dyn.Status.AMBIGUOUS
+
+
+@pytest.mark.parametrize("still", [0.0, 0.1])
+def test_equal_steps_leave_a_family_of_cameras(still):
+    # at constant velocity all is as straight from a camera that moves along at any velocity: four tensors, not one
+    views = equal_steps(80, still=still, generator=torch.Generator().manual_seed(3))
+    assert dyn.fit(dyn.HomographyTensor, *views).status == dyn.Status.AMBIGUOUS
+    draw = torch.Generator().manual_seed(4)
+    assert dyn.robust_fit(dyn.HomographyTensor, *views, threshold=1.5, generator=draw).status == dyn.Status.AMBIGUOUS
+
+
+@pytest.mark.parametrize("still", [0.0, 0.4, 1.0])
+def test_changing_speeds_and_points_that_stand_still_are_certain(still):
+    scene = scenes.planar(80, batch=4, sigma=0.5, static=still, generator=torch.Generator().manual_seed(5))
+    assert (dyn.fit(dyn.HomographyTensor, *scene.views).status == dyn.Status.OK).all()

@@ -9,6 +9,7 @@ from dyntorch.metrics import grid_transfer_error, label_scores
 from dyntorch.solution import Status
 from dyntorch.tasks.align_planar import align_planar
 from dyntorch.tasks.notices import Notice, NoticeCode
+from tests.steps import equal_steps
 
 
 def generator(seed=0):
@@ -290,3 +291,17 @@ def test_what_is_no_distance_is_refused(threshold):
     views = scenes.planar(30, generator=torch.Generator().manual_seed(0)).views
     with pytest.raises(ValueError, match=r"threshold must be a positive distance .*, got .*; None estimates it"):
         align_planar(*views, threshold=threshold)
+
+
+@pytest.mark.parametrize("threshold", [1.5, None])
+def test_equal_steps_without_static_points_are_never_ok(threshold):
+    draw = torch.Generator().manual_seed(0)
+    result = dyn.align_planar(*equal_steps(60, still=0.0, generator=draw), threshold=threshold, generator=draw)
+    assert result.status == dyn.Status.AMBIGUOUS and result.flagged("other_solution")
+
+
+def test_static_points_choose_among_the_cameras_that_equal_steps_leave():
+    draw = torch.Generator().manual_seed(1)
+    result = dyn.align_planar(*equal_steps(60, still=0.4, generator=draw), generator=draw)
+    assert result.status == dyn.Status.OK and (result.labels[:24] == 1).double().mean() > 0.9
+    torch.testing.assert_close(result.A / result.A[2, 2], torch.eye(3, dtype=torch.float64), atol=2.0, rtol=0)
