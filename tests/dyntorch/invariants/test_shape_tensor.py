@@ -147,7 +147,9 @@ def test_gradients(case):
             tensor = case.fit((*x.unbind(-2), *times)).tensor.reshape(-1, case.size)
             return (tensor @ weight).square().sum()
 
-        assert torch.autograd.gradcheck(gauge_free, x, eps=1e-5, atol=1e-5, rtol=1e-4, fast_mode=True)
+        # the basis of a moving shape is found by a descent, to nine digits here: differences over 1e-4 leave it five
+        rtol = 1e-3 if "basis" in repr(case) else 1e-6
+        assert torch.autograd.gradcheck(gauge_free, x, eps=1e-4, atol=1e-7, rtol=rtol, fast_mode=True)
 
 
 @forms
