@@ -12,13 +12,15 @@ from sklearn.base import BaseEstimator, ClassifierMixin
 from sklearn.utils.multiclass import check_classification_targets
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from indexing.modelfile import AGAIN, labels_from_json, labels_to_json, read_model, write_model
+from indexing.modelfile import labels_from_json, labels_to_json, number, read_model, usable, write_model
 from indexing.scoring import probabilities
 from indexing.shape.bank import KERNEL_WIDTH, cosine_distance, kernel_scale
-from indexing.shape.machine import PairwiseMachine
+from indexing.shape.machine import PairwiseMachine, read_machine
 
 Array = NDArray[Any]
 KIND, VERSION = "dyntorch.feature-indexer", 1
+LONGEST = 1e150  # of a feature: its square is a number
+LEAST_SCALE = 1e-12  # of a kernel
 PARTS = ("support", "dual", "intercept", "counts")  # of the machine, as tensors
 
 
@@ -60,8 +62,7 @@ class FeatureIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         classes, numbers = np.unique(labels, return_inverse=True)
         if len(classes) < 2:
             raise ValueError(f"labels: only one class ({classes[0]!r}); give clips of at least two actions")
-        if not (isinstance(self.width, (int, float, np.number)) and 0 < self.width < np.inf):
-            raise ValueError(f"width must be a positive number, got {self.width!r}")
+        self._check_width()
         vectors = torch.tensor(table)
         distances = cosine_distance(vectors, vectors)
         self.classes_ = classes
@@ -69,6 +70,10 @@ class FeatureIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         self.machine_ = PairwiseMachine.fit((-distances / self.scale_).exp(), numbers)
         self.support_ = table[self.machine_.support.numpy()]
         return self
+
+    def _check_width(self) -> None:
+        if not (isinstance(self.width, (int, float, np.number)) and 0 < self.width < np.inf):
+            raise ValueError(f"width must be a positive number, got {self.width!r}")
 
     def _votes(self, X: ArrayLike) -> Array:
         check_is_fitted(self)
@@ -108,14 +113,15 @@ class FeatureIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         Raises:
             ValueError: the file is missing, or is not such a model.
         """
-        header, tensors = read_model(path, KIND, VERSION)
-        try:
+        header, parts = read_model(path, KIND, VERSION)
+        with usable(path):
             indexer = cls(**header["parameters"])
-            indexer.classes_, indexer.scale_ = labels_from_json(header["classes"]), float(header["scale"])
-            indexer.machine_ = PairwiseMachine(*(tensors[name] for name in PARTS))
-            indexer.support_ = tensors["vectors"].numpy()
+            indexer._check_width()
+            indexer.classes_, indexer.scale_ = labels_from_json(header["classes"]), number(header["scale"], "scale", LEAST_SCALE)
+            vectors = parts.real("vectors", None, None, least=-LONGEST, most=LONGEST)
+            indexer.machine_ = read_machine(parts, len(indexer.classes_), len(vectors))
+            indexer.support_ = vectors.double().numpy()
             indexer.n_features_in_ = int(indexer.support_.shape[1])
-            indexer._votes(indexer.support_)  # parts that do not belong together cannot answer
-        except (KeyError, TypeError, ValueError, IndexError, RuntimeError) as error:
-            raise ValueError(f"{path}: not a model that can be used ({type(error).__name__}: {error}); {AGAIN}") from None
+            if len(indexer.classes_) < 2 or not indexer.support_.size:
+                raise ValueError(f"{len(indexer.classes_)} classes, {indexer.n_features_in_} features")
         return indexer

@@ -1,20 +1,32 @@
-"""The container of every model file: safetensors, with what is no tensor as JSON in its header.  Nothing in it can run."""
+"""The container of every model file: safetensors, with what is no tensor as JSON in its header.  Nothing in it can run.
+
+A file is believed where its parts have the types, shapes and ranges that a fitted estimator has: :class:`Parts` takes each of them
+so, and :func:`usable` says in one line that the rest cannot be.  What is loaded can be used.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from indexing.files import write_bytes
+from indexing.opening import VALUE, clipped, error, parse_json, shown, size_of
+from indexing.skeleton import Skeleton
 
 HEADER = "dyntorch"  # the metadata entry that holds the JSON
 AGAIN = "fit on the examples again and save with this version"
+LARGE = 1e10  # of a number in a model: coordinates are at most a tenth of it, and squares of it still fit 32 bits
+LETTERS = 1000  # of a label
+# whatever values of the wrong kind, or that do not belong together, may raise on the way to an estimator
+MISFITS = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RuntimeError, AssertionError, MemoryError)
 
 
 def write_model(
@@ -48,7 +60,7 @@ def write_model(
     write_bytes(Path(path), to_bytes(alone, metadata={HEADER: header}))
 
 
-def read_model(path: str | Path, kind: str, version: int) -> tuple[dict[str, Any], dict[str, Tensor]]:
+def read_model(path: str | Path, kind: str, version: int) -> tuple[dict[str, Any], Parts]:
     """What :func:`write_model` wrote: the header, and the tensors.
 
     Raises:
@@ -57,10 +69,11 @@ def read_model(path: str | Path, kind: str, version: int) -> tuple[dict[str, Any
     header, tensors = _opened(Path(path), with_tensors=True)
     if header.get("format") != kind:
         found = header.get("format", "nothing that dyntorch wrote")
-        raise ValueError(f"{path}: is {found}, but {kind} is expected; give the file that was saved from such an indexer")
+        said = f"is {found if isinstance(found, str) and len(found) < VALUE else shown(found)}, but {kind} is expected"
+        raise error(path, said, "give the file that was saved from such an indexer")
     if header.get("version") != version:
-        raise ValueError(f"{path}: model version {header.get('version')!r}, this program reads {version}; {AGAIN}")
-    return header, tensors
+        raise error(path, f"model version {shown(header.get('version'))}, this program reads {version}", AGAIN)
+    return header, Parts(tensors)
 
 
 def model_kind(path: str | Path) -> str:
@@ -84,29 +97,153 @@ def labels_to_json(classes: NDArray[Any]) -> dict[str, Any]:
 
 
 def labels_from_json(found: Mapping[str, Any]) -> NDArray[Any]:
-    """What :func:`labels_to_json` made, in the dtype it had."""
-    return np.array(found["values"], dtype=np.dtype(found["dtype"]))
+    """What :func:`labels_to_json` made, in the dtype it had.
+
+    Raises:
+        ValueError: they are no different labels, of one kind.
+    """
+    values, dtype = found["values"], np.dtype(found["dtype"])
+    text = dtype.kind in "UO"
+    one_kind = all(isinstance(v, str) if text else isinstance(v, (int, float)) and abs(v) < np.inf for v in values)
+    if dtype.kind not in "UiufbO" or dtype.itemsize > 4 * LETTERS or not one_kind or len(set(values)) < len(values) or not values:
+        raise ValueError(f"classes: {shown(values)} of type {dtype} are no labels")
+    classes = np.array(values, dtype=dtype)
+    if classes.tolist() != values:
+        raise ValueError(f"classes: {shown(values)} do not fit their type {dtype}")
+    return classes
+
+
+def skeleton_to_json(skeleton: Skeleton | None) -> list[Any] | None:
+    """A skeleton for the header."""
+    return None if skeleton is None else [skeleton.name, list(skeleton.joints), [list(bone) for bone in skeleton.bones]]
+
+
+def skeleton_from_json(found: Any, joints: int) -> Skeleton | None:
+    """What :func:`skeleton_to_json` made.
+
+    Raises:
+        ValueError: it has other joints than the model.
+    """
+    if found is None:
+        return None
+    name, names, bones = found
+    if not isinstance(name, str) or len(names) != joints or not all(isinstance(joint, str) for joint in names):
+        raise ValueError(f"skeleton: {len(names)} names for {joints} joints")
+    return Skeleton(name, tuple(names), tuple((int(a), int(b)) for a, b in bones))
+
+
+def number(value: Any, name: str, least: float = -LARGE, most: float = LARGE) -> float:
+    """A number of the header.
+
+    Raises:
+        ValueError: it is none, or out of its range.
+    """
+    if not isinstance(value, (int, float)) or isinstance(value, bool) or not least <= value <= most:
+        raise ValueError(f"{name}: expected a number from {least:g} to {most:g}, got {shown(value)}")
+    return float(value)
+
+
+def whole(value: Any, name: str, least: int, most: int) -> int:
+    """A whole number of the header.
+
+    Raises:
+        ValueError: it is none, or out of its range.
+    """
+    if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= most:
+        raise ValueError(f"{name}: expected a whole number from {least} to {most}, got {shown(value)}")
+    return value
+
+
+@contextmanager
+def usable(path: str | Path) -> Iterator[None]:
+    """Whatever does not belong together in a file is said in one line.
+
+    Raises:
+        ValueError: naming the file, and what does not fit.
+    """
+    try:
+        yield
+    except MISFITS as problem:
+        said = f"not a model that can be used ({type(problem).__name__}: {clipped(problem, 3 * VALUE)})"
+        raise error(path, said, AGAIN) from None
+
+
+class Parts:
+    """The tensors of a model file, taken with the type, the shape and the range that each must have."""
+
+    def __init__(self, tensors: Mapping[str, Tensor]) -> None:
+        self.tensors = tensors
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.tensors
+
+    def real(self, name: str, *shape: int | None, least: float = -LARGE, most: float = LARGE) -> Tensor:
+        """Finite numbers of 32 or 64 bits; ``None`` in ``shape`` stands for any number.
+
+        Raises:
+            ValueError: other values, or another shape.
+        """
+        found = self._shaped(name, shape, torch.float32, torch.float64)
+        if not bool(((found >= least) & (found <= most)).all()):
+            raise ValueError(f"{name}: expected numbers from {least:g} to {most:g}")
+        return found
+
+    def whole(self, name: str, *shape: int | None, below: int = 2**62) -> Tensor:
+        """Whole numbers from 0, and below a limit.
+
+        Raises:
+            ValueError: other values, or another shape.
+        """
+        found = self._shaped(name, shape, torch.int64)
+        if not bool(((found >= 0) & (found < below)).all()):
+            raise ValueError(f"{name}: expected whole numbers from 0 to {below - 1}")
+        return found
+
+    def every(self, name: str, *shape: int | None, below: int) -> Tensor:
+        """Whole numbers below a limit, each of which comes.
+
+        Raises:
+            ValueError: other values, or another shape.
+        """
+        found = self.whole(name, *shape, below=below)
+        if len(found.unique()) != below:
+            raise ValueError(f"{name}: expected each of the numbers from 0 to {below - 1}")
+        return found
+
+    def truth(self, name: str, *shape: int | None) -> Tensor:
+        """Truth values.
+
+        Raises:
+            ValueError: other values, or another shape.
+        """
+        return self._shaped(name, shape, torch.bool).view(torch.uint8) != 0  # a file may hold other bytes than 0 and 1
+
+    def _shaped(self, name: str, shape: tuple[int | None, ...], *kinds: torch.dtype) -> Tensor:
+        found = self.tensors[name]
+        fits = found.ndim == len(shape) and all(side in (None, n) for side, n in zip(shape, found.shape, strict=False))
+        if not fits or found.dtype not in kinds:
+            wanted = ", ".join("any" if side is None else str(side) for side in shape)
+            got = f"{found.dtype} {tuple(found.shape)}".replace("torch.", "")
+            raise ValueError(f"{name}: expected {str(kinds[0]).removeprefix('torch.')} ({wanted}), got {got}")
+        return found
 
 
 def _opened(path: Path, with_tensors: bool) -> tuple[dict[str, Any], dict[str, Tensor]]:
     from safetensors import SafetensorError, safe_open
 
     path = path.expanduser()
-    if not path.is_file():
-        raise ValueError(f"{path}: no such model file; make one with 'dyntorch index fit ... -o {path.name}'")
+    size_of(path, f"make one with 'dyntorch index fit ... -o {path.name}'", "model file")
     try:
         with safe_open(path, framework="pt") as file:
             text = (file.metadata() or {}).get(HEADER)
             # cloned, since tensors of the file lie at odd addresses, where products may be rounded otherwise in the last bit
             tensors = {name: file.get_tensor(name).clone() for name in file.keys()} if with_tensors else {}  # noqa: SIM118
-    except (SafetensorError, OSError) as error:
-        raise ValueError(f"{path}: not a model file (safetensors says: {error}); give the file that 'index fit' wrote") from None
-    try:
-        header = json.loads(text or "{}")
-    except json.JSONDecodeError as error:
-        raise ValueError(f"{path}: its header is damaged ({error}); {AGAIN}") from None
+    except (SafetensorError, OSError, *MISFITS) as problem:
+        said = f"not a model file (safetensors says: {clipped(problem, 2 * VALUE)})"
+        raise error(path, said, "give the file that 'index fit' wrote") from None
+    header = parse_json(path, text or "{}", AGAIN, "its header is damaged")
     if not isinstance(header, dict):
-        raise ValueError(f"{path}: its header is damaged (no table of values); {AGAIN}")
+        raise error(path, "its header is damaged (no table of values)", AGAIN)
     return header, tensors
 
 

@@ -8,6 +8,7 @@ import io
 import json
 import os
 import re
+import reprlib
 import stat
 import tomllib
 from collections import Counter
@@ -18,6 +19,8 @@ from typing import Any, BinaryIO
 
 VALUE = 60  # characters of a received value that a message quotes
 SAID = 240  # characters of what is wrong, and of what to do
+SHORT = reprlib.Repr()  # knows where to stop in a list of a million, or in one that is a thousand deep
+SHORT.maxstring = SHORT.maxother = SHORT.maxlong = VALUE
 LISTED = 8  # names that a message lists
 LARGEST = 2**31  # bytes of a file that is read as a whole: an hour of poses is a tenth of it
 WIDEST = 20_000  # cells of a row: the largest set of landmarks takes a tenth of them
@@ -61,13 +64,11 @@ def shown(value: Any) -> str:
 
     Example:
         >>> shown("12"), shown(10**99)
-        ("'12'", '10000000000000000000000000000...0000000000000000000000000000')
+        ("'12'", '1000000000000000000000000000...00000000000000000000000000000')
     """
     if isinstance(value, int) and value.bit_length() > 1000:  # Python refuses to print some thousand digits
         return f"a whole number of about {int(value.bit_length() * 0.30103)} digits"
-    if isinstance(value, str) and len(value) > 2 * VALUE:  # the repr of a gigabyte takes four
-        value = value[:VALUE] + value[-VALUE:]
-    return clipped(repr(value), VALUE)
+    return clipped(SHORT.repr(value), VALUE)
 
 
 def listed(names: Iterable[object], most: int = LISTED) -> str:
@@ -255,8 +256,11 @@ def _depth(text: str) -> int:
 
 
 # ---- tables --------------------------------------------------------------------------------------------------------------
-def read_rows(path: str | Path, remedy: str = TABLE_REMEDY, missing: str = "check the path") -> Iterator[Row]:
+def read_rows(path: str | Path, remedy: str = TABLE_REMEDY, missing: str = "check the path", numbers: bool = True) -> Iterator[Row]:
     """Line number (1-based) and cells of every row of a table that is not blank; commas, semicolons or tabs separate cells.
+
+    Args:
+        numbers: whether a comma within a cell is a decimal one, as spreadsheets write it where semicolons separate.
 
     Raises:
         ValueError: it cannot be read, is no text in UTF-8, or is no table.
@@ -273,8 +277,7 @@ def read_rows(path: str | Path, remedy: str = TABLE_REMEDY, missing: str = "chec
                 if len(cells) > WIDEST:
                     raise error(path, f"row {line} has {len(cells)} cells", remedy)
                 if any(cells):
-                    # where ";" separates cells, the spreadsheet wrote decimal commas
-                    yield line, [cell.replace(",", ".") for cell in cells] if delimiter == ";" else cells
+                    yield line, [cell.replace(",", ".") for cell in cells] if numbers and delimiter == ";" else cells
         except UnicodeDecodeError:
             raise error(path, "is not a text file in UTF-8", remedy) from None
         except csv.Error as problem:

@@ -1,32 +1,50 @@
-"""Model files: safetensors with JSON metadata.  Nothing in them can run."""
+"""Model files of action indexers: safetensors with JSON metadata.  Nothing in them can run."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from indexing.checks import check_device, check_parameters
-from indexing.modelfile import AGAIN, labels_from_json, labels_to_json, read_model, write_model
+from indexing.modelfile import (
+    Parts,
+    labels_from_json,
+    labels_to_json,
+    number,
+    read_model,
+    skeleton_from_json,
+    skeleton_to_json,
+    usable,
+    whole,
+    write_model,
+)  # fmt: skip
+from indexing.opening import shown
 from indexing.shape.bank import NEAREST, Kernels, Windows
 from indexing.shape.bodies import Bodies, Layout
 from indexing.shape.channels import CHANNELS, JointMetric
-from indexing.shape.exemplars import Exemplars
+from indexing.shape.exemplars import CROPS, Exemplars
 from indexing.shape.joint_weights import JointWeights
 from indexing.shape.learning import KERNEL_WHITENING
-from indexing.shape.machine import PairwiseMachine
+from indexing.shape.lifting import understood
+from indexing.shape.machine import read_machine
 from indexing.shape.model import Blend, ShapeModel
-from indexing.skeleton import Skeleton
 
 if TYPE_CHECKING:
     from indexing.indexer import ActionIndexer
 
 FORMAT = "dyntorch.action-indexer"
 VERSION = 2
+SCORERS = ("nearest", "kernel", "both")
+JOINTS = 10_000  # at most; the largest layouts have some hundred
+MOST_WEIGHT = 1e6  # of a joint or a scorer, the mean being 1
+LEAST_SCALE = 1e-7  # of a kernel, over distances from 0 to 2
 PLAIN = ("labels", "symmetry", "mirrored", "hub", "moment_hub", "evidence_out")  # tensors as they are
 
 Indexer = TypeVar("Indexer", bound="ActionIndexer")
@@ -38,7 +56,6 @@ def save(indexer: ActionIndexer, path: str | Path) -> None:
     Raises:
         ValueError: the file cannot be written, or the labels are neither text nor numbers.
     """
-    skeleton = indexer.skeleton_
     about = {
         "classes": labels_to_json(indexer.classes_),
         "joints": indexer.n_joints_,
@@ -48,7 +65,7 @@ def save(indexer: ActionIndexer, path: str | Path) -> None:
         "parts": [indexer.model_.parts.gain, indexer.model_.parts.sigma],
         "layout": None if indexer.layout_ is None else dataclasses.asdict(indexer.layout_),
         "groups": None if indexer.groups_ is None else indexer.groups_.tolist(),
-        "skeleton": None if skeleton is None else [skeleton.name, list(skeleton.joints), [list(b) for b in skeleton.bones]],
+        "skeleton": skeleton_to_json(indexer.skeleton_),
     }
     write_model(path, FORMAT, VERSION, indexer.get_params(), about, _tensors(indexer.model_))
 
@@ -56,67 +73,60 @@ def save(indexer: ActionIndexer, path: str | Path) -> None:
 def load(kind: type[Indexer], path: str | Path, device: str = "cpu") -> Indexer:
     """Read a fitted indexer; see :meth:`indexing.ActionIndexer.load`."""
     check_device(device)
-    metadata, tensors = read_model(path, FORMAT, VERSION)
-    try:
-        parameters = metadata["parameters"]
+    header, parts = read_model(path, FORMAT, VERSION)
+    with usable(path):
+        parameters = header["parameters"]
         indexer = kind(**{**parameters, "tempi": tuple(parameters["tempi"])}, device=device)
-        indexer.classes_ = labels_from_json(metadata["classes"])
-        indexer.n_joints_ = int(metadata["joints"])
-        name, joints, bones = metadata["skeleton"] or (None, (), ())
-        indexer.skeleton_ = Skeleton(name, tuple(joints), tuple((a, b) for a, b in bones)) if name is not None else None
-        layout = metadata["layout"]
-        indexer.layout_ = None if layout is None else Layout(tuple(layout["joints"]), bool(layout["photograph"]))
-        indexer.groups_ = None if metadata["groups"] is None else np.array(metadata["groups"], dtype=str)
-        indexer.model_ = _model(tensors, metadata, len(indexer.classes_), indexer.layout_)
         check_parameters(indexer)
-        _check_fit(indexer)
+        indexer.classes_ = labels_from_json(header["classes"])
+        indexer.n_joints_ = whole(header["joints"], "joints", 1, JOINTS)
+        indexer.skeleton_ = skeleton_from_json(header["skeleton"], indexer.n_joints_)
+        indexer.layout_ = _layout(header["layout"], indexer.n_joints_)
+        indexer.model_ = _model(parts, header, Sizes.of(parts, indexer), indexer.layout_)
+        indexer.groups_ = _groups(header["groups"], len(indexer.model_.labels))
         indexer._calibrate()
-    except (KeyError, TypeError, IndexError, ValueError, RuntimeError, AttributeError) as error:
-        raise ValueError(f"{path}: not a model that can be used ({type(error).__name__}: {error}); {AGAIN}") from None
     return indexer
 
 
-def _check_fit(indexer: ActionIndexer) -> None:
-    """Raise where the parts of a file do not belong together."""
-    model, parts = indexer.model_, indexer.model_.exemplars
-    count, joints = len(model.labels), indexer.n_joints_
-    skeleton = indexer.skeleton_
-    fine = {
-        "labels": len(parts) == count and int(model.labels.max()) + 1 == model.classes,
-        "owner": len(parts.owner) == len(parts.moments) and len(parts.owner.unique()) == count,
-        "joints": parts.crops.values.shape[2] == joints and (skeleton is None or len(skeleton.joints) == joints),
-        "metric": model.metric.covariance.shape == (len(CHANNELS), joints, joints),
-        "joints.weights": model.parts.joints.shape == (len(NEAREST), joints) and len(model.parts.channels) == len(NEAREST),
-        "view": model.view == indexer.view,
-        "scorer": model.scorer in ("nearest", "kernel", "both") and (model.machine is None) == (model.scorer == "nearest"),
-    }
-    for name, windows in (("crops", parts.crops), ("views", parts.views), ("moments", parts.moments)):
-        fine[name] = len(windows.values) == len(windows.seen) and (name == "moments" or len(windows) % count == 0)
-    fine |= {name: len(getattr(model, name)) == count for name in ("hub", "mirrored", "evidence_out")}
-    if model.bodies is not None:
-        solid = model.bodies.windows.values
-        fine["bodies"] = solid.ndim == 4 and len(solid) % count == 0 and bool(solid.isfinite().all())
-    values = (parts.crops.values, parts.views.values, parts.moments.values)
-    for name, value in (
-        ("metric", model.metric.covariance),
-        ("hub", model.hub),
-        ("moment_hub", model.moment_hub),
-        ("joints.weights", model.parts.joints),
-    ):
-        fine[name] = fine.get(name, True) and bool(value.isfinite().all())
-    fine["windows"] = all(bool(value.isfinite().all()) for value in values)
-    fine["evidence"] = not bool(model.evidence_out.isnan().any())
-    if model.machine is not None:
-        machine, pairs = model.machine, model.classes * (model.classes - 1) // 2
-        fine["machine.counts"] = len(machine.counts) == model.classes and int(machine.counts.sum()) == len(machine.support)
-        fine["machine.intercept"] = len(machine.intercept) == pairs and bool(machine.intercept.isfinite().all())
-        fine["machine.dual"] = (
-            bool(machine.dual.isfinite().all()) and model.support is not None and len(model.support) == len(machine.support)
-        )
-        fine["machine"] = model.machine.dual.shape == (model.classes - 1, len(model.machine.support))
-    wrong = [name for name, good in fine.items() if not good]
-    if wrong:
-        raise ValueError(f"{', '.join(wrong)} do not fit the rest")
+@dataclasses.dataclass(frozen=True)
+class Sizes:
+    """How many there are of what the tensors of a model are about."""
+
+    classes: int
+    exemplars: int
+    crops: int
+    length: int
+    joints: int
+
+    @classmethod
+    def of(cls, parts: Parts, indexer: ActionIndexer) -> Sizes:
+        """As the parameters and the first tensors say.
+
+        Raises:
+            ValueError: these contradict each other.
+        """
+        exemplars = len(parts.truth("solid", None))
+        crops = len(CROPS) if indexer.search else 1
+        if len(indexer.classes_) < 2 or exemplars < len(indexer.classes_):
+            raise ValueError(f"{exemplars} exemplars of {len(indexer.classes_)} classes")
+        return cls(len(indexer.classes_), exemplars, crops, int(indexer.length), indexer.n_joints_)
+
+
+def _layout(found: Any, joints: int) -> Layout | None:
+    if found is None:
+        return None
+    names = tuple(found["joints"])
+    if len(names) != joints or not understood(names):
+        raise ValueError(f"layout: {len(names)} names that are no body of {joints} joints")
+    return Layout(names, bool(found["photograph"]))
+
+
+def _groups(found: Any, exemplars: int) -> NDArray[Any] | None:
+    if found is None:
+        return None
+    if len(found) != exemplars or not all(isinstance(name, str) for name in found):
+        raise ValueError(f"groups: {len(found)} names for {exemplars} exemplars")
+    return np.array(found, dtype=str)
 
 
 def _tensors(model: ShapeModel) -> dict[str, Tensor]:
@@ -139,33 +149,61 @@ def _windows(name: str, windows: Windows) -> dict[str, Tensor]:
     return {f"{name}.values": windows.values, f"{name}.seen": windows.seen}
 
 
-def _model(tensors: dict[str, Tensor], metadata: dict[str, Any], classes: int, layout: Layout | None) -> ShapeModel:
-    view = metadata["view"]
-
-    def windows(name: str) -> Windows:
-        return Windows(tensors[f"{name}.values"], tensors[f"{name}.seen"])
-
-    metric = JointMetric(tensors["metric"], float(tensors["metric_power"]))
-    trained = "scales" in tensors
+def _model(parts: Parts, header: dict[str, Any], sizes: Sizes, layout: Layout | None) -> ShapeModel:
+    n, joints = sizes.exemplars, sizes.joints
+    view, scorer, trained = header["view"], header["scorer"], "scales" in parts
+    if view != header["parameters"]["view"] or scorer not in SCORERS or trained != (scorer != "nearest"):
+        raise ValueError(f"view, scorer: {shown(view)} and {shown(scorer)} do not fit the rest")
+    moments = _read_windows(parts, "moments", sizes, None)
+    owner = parts.every("owner", len(moments), below=n)
+    crops = _read_windows(parts, "crops", sizes, sizes.crops * n)
+    views = _read_windows(parts, "views", sizes, None)
+    if len(views) % n:
+        raise ValueError(f"views: {len(views)} windows of {n} exemplars")
+    power = float(parts.real("metric_power", least=0, most=10))
+    metric = JointMetric(parts.real("metric", len(CHANNELS), joints, joints), power)
     rich = view == "same" or layout is not None
-    kernels = Kernels(JointMetric(metric.covariance, KERNEL_WHITENING), rich, tensors["scales"]) if trained else None
-    bodies = Bodies(windows("bodies"), layout) if layout is not None else None
-    gain = metadata["parts"]
-    parts = JointWeights(tensors["parts.joints"], tensors["parts.channels"], tensors.get("parts.by_class"), *gain)
-    machine = PairwiseMachine(*(tensors[f"machine.{n}"] for n in ("support", "dual", "intercept", "counts"))) if trained else None
-    exemplars = Exemplars(windows("crops"), windows("views"), windows("moments"), tensors["owner"], tensors["solid"])
-    plain: dict[str, Any] = {name: None if name == "symmetry" and name not in tensors else tensors[name] for name in PLAIN}
+    kernels = Kernels(JointMetric(metric.covariance, KERNEL_WHITENING), rich) if trained else None
+    if kernels is not None:
+        kernels.scales = parts.real("scales", kernels.count, least=LEAST_SCALE)
+    support = _read_windows(parts, "support", sizes, None) if trained else None
+    bodies = Bodies(_read_windows(parts, "bodies", sizes, sizes.crops * n, 3), layout) if layout is not None else None
+    symmetry = parts.every("symmetry", joints, below=joints) if "symmetry" in parts else None
+    blend = {name: number(value, name, 0, MOST_WEIGHT) for name, value in header["blend"].items()}
     return ShapeModel(
-        exemplars=exemplars,
-        classes=classes,
+        exemplars=Exemplars(crops, views, moments, owner, parts.truth("solid", n)),
+        labels=parts.every("labels", n, below=sizes.classes),
+        classes=sizes.classes,
         view=view,
-        scorer=metadata["scorer"],
+        scorer=scorer,
         metric=metric,
+        symmetry=symmetry,
+        mirrored=parts.truth("mirrored", n),
+        parts=_joint_weights(parts, header["parts"], sizes),
+        hub=parts.real("hub", n),
+        moment_hub=parts.real("moment_hub", len(moments)),
         kernels=kernels,
-        support=windows("support") if trained else None,
-        machine=machine,
-        blend=Blend(**metadata["blend"]),
+        support=support,
+        machine=read_machine(parts, sizes.classes, len(support), "machine.") if support is not None else None,
+        evidence_out=parts.real("evidence_out", None, least=-math.inf, most=math.inf),
+        blend=Blend(**blend),
         bodies=bodies,
-        parts=parts,
-        **plain,
     )
+
+
+def _read_windows(parts: Parts, name: str, sizes: Sizes, count: int | None, dims: int = 2) -> Windows:
+    values = parts.real(f"{name}.values", count, sizes.length, sizes.joints, dims)
+    seen = parts.truth(f"{name}.seen", len(values), sizes.joints)
+    return Windows(values, seen)
+
+
+def _joint_weights(parts: Parts, learned: Any, sizes: Sizes) -> JointWeights:
+    joints = parts.real("parts.joints", len(NEAREST), sizes.joints, least=0, most=MOST_WEIGHT)
+    channels = parts.real("parts.channels", len(NEAREST), least=0, most=MOST_WEIGHT)
+    named = "parts.by_class"
+    by_class = parts.real(named, sizes.classes, sizes.joints, least=0, most=MOST_WEIGHT) if named in parts else None
+    weights = joints if by_class is None else joints[:, None] * by_class
+    if not bool((weights.sum(-1) > 0).all()) or not bool(channels.sum() > 0):
+        raise ValueError("parts: no joint or no channel counts")
+    gain, sigma = (number(value, "parts") for value in learned)
+    return JointWeights(joints, channels, by_class, gain, sigma)

@@ -5,19 +5,19 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-import torch
-from torch import Tensor
-
 from indexing.brightness.library import Exemplars
 from indexing.brightness.parameters import check_parameters
 from indexing.brightness.sight import HALF, LENGTH
-from indexing.modelfile import AGAIN, labels_from_json, labels_to_json, read_model, write_model
+from indexing.checks import check_device
+from indexing.modelfile import Parts, labels_from_json, labels_to_json, read_model, usable, write_model
 
 if TYPE_CHECKING:
     from indexing.brightness.indexer import BrightnessIndexer
 
 KIND = "dyntorch.brightness-indexer"
 VERSION = 1
+FRAMES = 2**31  # of a video, at most
+ROUNDING = 1e-3  # of a unit vector
 PARTS = ("motion", "kernels", "lengths", "labels")
 
 Indexer = TypeVar("Indexer", bound="BrightnessIndexer")
@@ -35,26 +35,22 @@ def save(indexer: BrightnessIndexer, path: str | Path) -> None:
 
 def load(kind: type[Indexer], path: str | Path, device: str = "cpu") -> Indexer:
     """Read a fitted indexer; see :meth:`indexing.BrightnessIndexer.load`."""
-    header, tensors = read_model(path, KIND, VERSION)
-    try:
+    check_device(device)
+    header, parts = read_model(path, KIND, VERSION)
+    with usable(path):
         indexer = kind(**header["parameters"], device=device)
         check_parameters(indexer)
         classes = labels_from_json(header["classes"])
-        return indexer._learn(_exemplars(tensors, len(classes), indexer.temporal_weight > 0), classes)
-    except (KeyError, TypeError, IndexError, ValueError, RuntimeError, AttributeError) as error:
-        raise ValueError(f"{path}: not a model that can be used ({type(error).__name__}: {error}); {AGAIN}") from None
+        return indexer._learn(_exemplars(parts, len(classes), indexer.temporal_weight > 0), classes)
 
 
-def _exemplars(tensors: dict[str, Tensor], classes: int, kernels: bool) -> Exemplars:
-    found = Exemplars(*(tensors[name] for name in PARTS))
-    total, flat = int(found.lengths.sum()), (2 * HALF + 1) ** 2 if kernels else 0
-    fine = {
-        "motion": found.motion.shape == (total, LENGTH) and bool(found.motion.isfinite().all()),
-        "kernels": found.kernels.shape == (total, flat) and bool(found.kernels.isfinite().all()),
-        "lengths": bool((found.lengths > 0).all()),
-        "labels": len(found.labels) == len(found.lengths) and torch.equal(found.labels.unique(), torch.arange(classes)),
-    }
-    wrong = [name for name, good in fine.items() if not good]
-    if wrong:
-        raise ValueError(f"{', '.join(wrong)} do not fit the rest")
-    return found
+def _exemplars(parts: Parts, classes: int, kernels: bool) -> Exemplars:
+    if classes < 2:
+        raise ValueError(f"{classes} class")
+    lengths = parts.whole("lengths", None, below=FRAMES)
+    total, flat = int(lengths.sum()), (2 * HALF + 1) ** 2 if kernels else 0
+    motion = parts.real("motion", total, LENGTH, least=-1 - ROUNDING, most=1 + ROUNDING)
+    labels = parts.every("labels", len(lengths), below=classes)
+    if not bool((lengths > 0).all()):
+        raise ValueError("lengths: a video without frames")
+    return Exemplars(motion.float(), parts.real("kernels", total, flat).float(), lengths, labels)

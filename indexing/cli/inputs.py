@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 import re
 from collections.abc import Hashable, Sequence
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from indexing.cli.console import count, names
+from indexing.opening import clipped, read_rows, shown
 
 if TYPE_CHECKING:
     from indexing.clip import Clip, ClipSet
@@ -228,25 +228,22 @@ def read_truth(path: Path, recordings: Sequence[str]) -> tuple[list[list[KnownEv
         else:
             elsewhere.append(file)
     if rows and len(elsewhere) == len(rows):
-        raise ValueError(f"{path}: column 'file' names {names(sorted(set(elsewhere)))}, none of the recordings; correct the names")
-    left = [f"{count(len(elsewhere), 'row')} of {path} left out: of other recordings ({names(sorted(set(elsewhere)))})"]
+        raise ValueError(
+            f"{path}: column 'file' names {clipped(names(sorted(set(elsewhere))))}, none of the recordings; correct the names"
+        )
+    left = [f"{count(len(elsewhere), 'row')} of {path} left out: of other recordings ({clipped(names(sorted(set(elsewhere))))})"]
     return known, left if elsewhere else []
 
 
 def _rows(path: Path) -> list[tuple[int, dict[str, str]]]:
     """Line number and cells by column name."""
-    if not path.expanduser().is_file():
-        raise ValueError(f"{path}: no such file; give the known events as CSV with the columns label,start,end")
-    try:
-        text = path.expanduser().read_text(encoding="utf-8-sig")
-        lines = list(csv.reader(text.splitlines(), delimiter=max(",;\t", key=text.partition("\n")[0].count)))
-    except (UnicodeDecodeError, csv.Error):
-        raise ValueError(f"{path}: is not a CSV file in UTF-8; write one with the columns label,start,end") from None
-    head = [name.strip().lower() for name in lines[0]] if lines else []
+    form = "as CSV in UTF-8 with the columns label,start,end"
+    lines = list(read_rows(path.expanduser(), f"write it {form}", f"give the known events {form}", numbers=False))
+    head = [name.strip().lower() for name in lines[0][1]] if lines else []
     missing = [name for name in ("label", "start", "end") if name not in head]
     if missing:
         raise ValueError(f"{path}: has no column {missing[0]!r}; the first line must name the columns label,start,end")
-    cells = [(i, [cell.strip() for cell in row]) for i, row in enumerate(lines, 1) if i > 1 and any(row)]
+    cells = [(i, [cell.strip() for cell in row]) for i, row in lines[1:]]
     return [(i, dict(zip(head, row + [""] * len(head), strict=False))) for i, row in cells]
 
 
@@ -258,7 +255,7 @@ def _event(path: Path, line: int, row: dict[str, str]) -> KnownEvent:
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
-            raise ValueError(f"{path}: line {line}, column {column!r}: {row[column]!r} is no number; give seconds")
+            raise ValueError(f"{path}: line {line}, column {column!r}: {shown(row[column])} is no number; give seconds")
         seconds.append(value)
     if not seconds[0] <= seconds[1]:
         raise ValueError(f"{path}: line {line}: ends at {seconds[1]:g} s, but starts at {seconds[0]:g} s; give start first")

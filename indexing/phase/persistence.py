@@ -6,22 +6,34 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
-import torch
-from torch import Tensor
+from numpy.typing import NDArray
 
-from indexing.modelfile import AGAIN, labels_from_json, labels_to_json, read_model, write_model
+from indexing.checks import check_device
+from indexing.modelfile import (
+    Parts,
+    labels_from_json,
+    labels_to_json,
+    read_model,
+    skeleton_from_json,
+    skeleton_to_json,
+    usable,
+    whole,
+    write_model,
+)  # fmt: skip
+from indexing.opening import shown
 from indexing.phase.checks import check_phase_parameters
 from indexing.phase.course import Course
+from indexing.phase.frames import LEAST
 from indexing.phase.model import PhaseModel
 from indexing.scoring import reject_threshold
 from indexing.shape.bank import Windows
-from indexing.skeleton import Skeleton
 
 if TYPE_CHECKING:
     from indexing.phase.indexer import PhaseIndexer
 
 FORMAT = "dyntorch.phase-indexer"
 VERSION = 1
+JOINTS = 10_000  # at most; the largest layouts have some hundred
 
 Indexer = TypeVar("Indexer", bound="PhaseIndexer")
 
@@ -32,13 +44,13 @@ def save(indexer: PhaseIndexer, path: str | Path) -> None:
     Raises:
         ValueError: the file cannot be written, or the labels are neither text nor numbers.
     """
-    skeleton, model = indexer.skeleton_, indexer.model_
+    model = indexer.model_
     about = {
         "classes": labels_to_json(indexer.classes_),
         "joints": indexer.n_joints_,
         "mirrored": indexer.mirrored_.tolist(),
         "periodic": indexer.periodic_.tolist(),
-        "skeleton": None if skeleton is None else [skeleton.name, list(skeleton.joints), [list(b) for b in skeleton.bones]],
+        "skeleton": skeleton_to_json(indexer.skeleton_),
     }
     tensors = {"bank.values": model.bank.values, "bank.seen": model.bank.seen, "label": model.label, "phase": model.phase}
     tensors["wrong"] = model.wrong
@@ -49,43 +61,44 @@ def save(indexer: PhaseIndexer, path: str | Path) -> None:
 
 def load(kind: type[Indexer], path: str | Path, device: str = "cpu") -> Indexer:
     """Read a fitted indexer; see :meth:`indexing.phase.indexer.PhaseIndexer.load`."""
-    metadata, tensors = read_model(path, FORMAT, VERSION)
-    try:
-        indexer = kind(**metadata["parameters"], device=device)
+    check_device(device)
+    header, parts = read_model(path, FORMAT, VERSION)
+    with usable(path):
+        indexer = kind(**header["parameters"], device=device)
         check_phase_parameters(indexer)
-        _restore(indexer, metadata, tensors)
-    except (KeyError, TypeError, IndexError, ValueError, RuntimeError, AttributeError) as error:
-        raise ValueError(f"{path}: not a model that can be used ({type(error).__name__}: {error}); {AGAIN}") from None
+        _restore(indexer, header, parts)
     return indexer
 
 
-def _restore(indexer: PhaseIndexer, metadata: dict[str, Any], tensors: dict[str, Tensor]) -> None:
+def _restore(indexer: PhaseIndexer, header: dict[str, Any], parts: Parts) -> None:
     """The fitted attributes.
 
     Raises:
         ValueError: parts that do not belong together.
     """
-    classes = labels_from_json(metadata["classes"])
-    periodic = np.array(metadata["periodic"], dtype=bool)
+    classes, joints = labels_from_json(header["classes"]), whole(header["joints"], "joints", LEAST, JOINTS)
+    periodic, mirrored = (_flags(header[name], name, len(classes)) for name in ("periodic", "mirrored"))
     courses = tuple(
-        Course(tensors[f"course.{c}.shapes"], bool(periodic[c]), tensors[f"course.{c}.seen"]) for c in range(len(classes))
+        Course(
+            parts.real(f"course.{c}.shapes", None, 2 * indexer.harmonics + 1, joints, 3).double(),
+            bool(periodic[c]),
+            parts.truth(f"course.{c}.seen", joints),
+        )
+        for c in range(len(classes))
     )
-    bank = Windows(tensors["bank.values"], tensors["bank.seen"])
-    label, phase, wrong, joints = tensors["label"], tensors["phase"], tensors["wrong"], int(metadata["joints"])
-    fine = {
-        "bank": bank.values.shape[1:] == (1, joints, 2) and bank.seen.shape == (len(bank), joints),
-        "label": label.shape == (len(bank),) and int(label.min()) >= 0 and int(label.max()) < len(classes),
-        "phase": phase.shape == (len(bank),),
-        "course": all(c.shapes.ndim == 4 and c.shapes.shape[2:] == (joints, 3) and c.seen.shape == (joints,) for c in courses),
-        "values": all(bool(t.isfinite().all()) for t in (bank.values, phase, wrong, *(c.shapes for c in courses))),
-        "mirrored": len(metadata["mirrored"]) == len(periodic) == len(classes),
-    }
-    misfits = [part for part, good in fine.items() if not good]
-    if misfits:
-        raise ValueError(f"{', '.join(misfits)} do not fit the rest")
-    name, joint_names, bones = metadata["skeleton"] or (None, (), ())
-    indexer.skeleton_ = Skeleton(name, tuple(joint_names), tuple((a, b) for a, b in bones)) if name is not None else None
-    indexer.model_ = PhaseModel(bank, label, phase.to(torch.float64), courses, wrong)
-    indexer.classes_, indexer.periodic_, indexer.n_joints_ = classes, periodic, joints
-    indexer.mirrored_ = np.array(metadata["mirrored"], dtype=bool)
+    if not all(len(course.shapes) for course in courses):
+        raise ValueError("course: an action without a shape")
+    values = parts.real("bank.values", None, 1, joints, 2).double()
+    bank = Windows(values, parts.truth("bank.seen", len(values), joints))
+    label = parts.every("label", len(bank), below=len(classes))
+    phase, wrong = parts.real("phase", len(bank), least=0, most=1).double(), parts.real("wrong", None)
+    indexer.skeleton_ = skeleton_from_json(header["skeleton"], joints)
+    indexer.model_ = PhaseModel(bank, label, phase, courses, wrong)
+    indexer.classes_, indexer.periodic_, indexer.n_joints_, indexer.mirrored_ = classes, periodic, joints, mirrored
     indexer.reject_threshold_ = reject_threshold(indexer.reject, wrong)
+
+
+def _flags(found: Any, name: str, count: int) -> NDArray[np.bool_]:
+    if not isinstance(found, list) or len(found) != count or not all(isinstance(value, bool) for value in found):
+        raise ValueError(f"{name}: expected {count} truth values, got {shown(found)}")
+    return np.array(found, dtype=bool)

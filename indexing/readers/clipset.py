@@ -25,8 +25,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from indexing.clip import Clip, ClipSet
-from indexing.opening import error
+from indexing.clip import UP_AXES, Clip, ClipSet
+from indexing.opening import error, shown
 from indexing.readers.clipset_write import write_clip_set
 from indexing.readers.files import Source
 from indexing.readers.npz import Archive
@@ -75,6 +75,9 @@ def read_clip_set(
         raise error(
             path, f"joints must be numbers (F, n, 2 or 3), got {joints.dtype} {joints.shape}", "save x, y or x, y, z per joint"
         )
+    dims = joints.shape[2]
+    if not joints.shape[1] or not len(joints):
+        raise error(path, f"joints has shape {joints.shape}", "a clip needs at least one frame and one joint")
     offsets = clip_offsets(path, data, "joints")
     count = len(offsets) - 1
     labels = [label] * count if label is not None else clip_labels(path, data, count)
@@ -84,6 +87,9 @@ def read_clip_set(
     assumed = per_clip(path, data, "fps_assumed", count, "fps" not in data and "times" not in data and fps is None)
     times = frame_times(path, data, offsets, rate, names)
     up = per_clip(path, data, "up", count, "y")
+    wrong = next((axis for axis in dict.fromkeys(map(str, up)) if axis not in UP_AXES or (axis.endswith("z") and dims == 2)), None)
+    if wrong is not None:
+        raise error(path, f"up is {shown(wrong)} for {dims}D joints", f"save one of {', '.join(UP_AXES)} (z only for 3D joints)")
     meta, skeleton = clip_meta(data, count, "joints"), _skeleton(path, data, joints.shape[1])
     clips = []
     for i, (start, end) in enumerate(pairwise(offsets.tolist())):
@@ -104,7 +110,8 @@ def read_clip_set(
                 )
             )
         except ValueError as problem:
-            raise ValueError(f"{path}: {problem}") from None
+            what, _, remedy = str(problem).partition("; ")
+            raise error(path, what, remedy or "correct it, and save the clip set again") from None
     return ClipSet(clips, path.name)
 
 
@@ -131,9 +138,15 @@ def _skeleton(path: Path, data: Mapping[str, Array], joints: int) -> Skeleton | 
         raise error(path, f"joint_names has {len(names)} names for {joints} joints", "save one name per joint")
     try:
         if "bones" in data:
-            bones = [(int(a), int(b)) for a, b in data["bones"]]
+            bones = [(a, b) for a, b in _whole(data["bones"], 2).tolist()]
         else:
-            bones = [(int(parent), i) for i, parent in enumerate(data.get("parents", [])) if parent >= 0]
+            bones = [(parent, i) for i, parent in enumerate(_whole(data.get("parents", np.zeros(0)), 1).tolist()) if parent >= 0]
         return Skeleton(str(data.get("skeleton_name", path.stem)), names, tuple(bones))
     except (TypeError, ValueError, OverflowError) as problem:
         raise error(path, f"bones or parents do not fit the joints ({problem})", "save bones (m, 2) or parents (n)") from None
+
+
+def _whole(values: Array, ndim: int) -> NDArray[np.int64]:
+    if values.ndim != ndim or values.dtype.kind not in "fiu" or not (np.abs(values) < 2**31).all():
+        raise ValueError(f"{values.dtype} of shape {values.shape}")
+    return values.astype(np.int64)

@@ -7,6 +7,7 @@ from typing import Any
 from indexing.opening import error, listed
 from indexing.readers.files import Source
 
+DEEPEST = 3  # lists of people inside each other
 REMEDY = (
     "export what OpenPose, COCO, MediaPipe, DeepLabCut, MMPose, Ultralytics or SLEAP write, or a clip set, or say the format "
     "(--format, format=)"
@@ -61,10 +62,10 @@ def detect_json(data: Any) -> str | None:
     return next((name for item in data if (name := _detect_item(item))), None)
 
 
-def _detect_item(item: Any) -> str | None:
+def _detect_item(item: Any, depth: int = 0) -> str | None:
     """The format of a list, from one of its elements."""
     if isinstance(item, list):  # a frame: a list of people
-        return next((name for person in item if (name := _detect_item(person))), None)
+        return next((name for person in item if (name := _detect_item(person, depth + 1))), None) if depth < DEEPEST else None
     if isinstance(item, str):  # Ultralytics' to_json() gives text: one string per frame
         return "ultralytics" if item.lstrip().startswith("[") else None
     if not isinstance(item, dict):

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from indexing.clip import ClipSet, FloatArray
-from indexing.opening import error, shown
+from indexing.opening import VALUE, check_dense, error, shown
 from indexing.readers.files import Source, read_columns
 from indexing.readers.options import Options
 from indexing.readers.recording import IntArray, Recording, frame_numbers, to_clips
@@ -29,6 +29,7 @@ TIME = re.compile(r"(?:time|timestamp|t|seconds|sec)(?:[ _(\[]*(s|sec|seconds|ms
 UNITS = {"ms": 1e-3, "msec": 1e-3, "us": 1e-6, "ns": 1e-9}
 PERSON = ("person", "person_id", "pose", "pose_id", "pose_index", "track", "track_id")
 LANDMARK = ("landmark", "landmark_id", "landmark_index", "landmark_idx", "landmark_name", "joint", "keypoint", "id", "name")
+ONE_NAME = "give a landmark the same name in every frame"
 MOST = 1000  # MediaPipe's largest set, pose with face and hands, has 543 landmarks
 SUFFIX = re.compile(r"(.+?)[ _.\-:](" + "|".join(KINDS) + ")")
 PREFIX = re.compile("(" + "|".join(KINDS) + r")(?:[ _.\-:](.+)|(\d+))")
@@ -150,12 +151,14 @@ def _widen(
     names = list(dict.fromkeys(name.lower() for name in landmarks))
     if set(names) <= set(MEDIAPIPE33.joints):  # in its order, whatever that of the rows
         names = [joint for joint in MEDIAPIPE33.joints if joint in names]
-    if all(name.isdigit() for name in names):  # numbered from 0 or from 1
+    if all(name.isdecimal() and len(name) < VALUE for name in names):  # numbered from 0 or from 1
         landmarks = [str(int(name)) for name in landmarks]
         highest = max(map(int, names))
         if highest > MOST:
             raise error(
-                source.path, f"landmark {highest} is beyond any MediaPipe model", f"number landmarks from 0 or 1 to at most {MOST}"
+                source.path,
+                f"landmark {shown(highest)} is beyond any MediaPipe model",
+                f"number landmarks from 0 or 1 to at most {MOST}",
             )
         names = [str(i) for i in range(min(1, *map(int, names)), highest + 1)]
     column = {name: i for i, name in enumerate(names)}
@@ -166,6 +169,7 @@ def _widen(
     if (counts > 1).any():
         twice = names[int(cells[np.argmax(counts > 1)]) % len(names)]
         raise error(source.path, f"landmark {shown(twice)} comes twice in a frame", "drop repeated rows, or add a column 'person'")
+    check_dense(source.path, len(keys) * len(names), len(rows), f"{len(keys)} people and {len(names)} landmarks", ONE_NAME)
     table = np.full((len(keys), len(names), rows.shape[1]), np.nan)
     table[person, joint] = rows
     if rows.shape[1] == 3:

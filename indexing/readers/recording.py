@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from indexing.clip import Clip, ClipSet, FloatArray
+from indexing.clip import LARGEST, Clip, ClipSet, FloatArray
 from indexing.opening import error, shown
 from indexing.readers.options import Options
 from indexing.readers.people import choose
@@ -160,12 +160,12 @@ def to_clips(path: Path, recording: Recording, options: Options) -> ClipSet:
         if each:  # each person's clip spans what was seen of that person
             seen = recording.at[rows]
             frames = slice(int(seen.min()), int(seen.max()) + 1)
-        joints, confidence = _fill(recording, rows)
+        joints, confidence = _fill(recording, rows, frames)
         clips.append(
             Clip(
-                joints=joints[frames],
+                joints=joints,
                 times=times[frames],
-                confidence=None if confidence is None else confidence[frames],
+                confidence=confidence,
                 fps=fps,
                 label=options.label,
                 name=f"{name}#{track}" if each else name,
@@ -190,9 +190,10 @@ def _scale(path: Path, recording: Recording, options: Options) -> Recording:
     if options.size is None:
         return recording
     finite = np.abs(recording.joints[np.isfinite(recording.joints)])
-    if recording.joints.shape[2] != 2 or (finite.size and np.median(finite) > NORMALIZED):
-        raise error(path, "size= is for 2D coordinates from 0 to 1, and these are not", "leave size out")
-    return replace(recording, joints=recording.joints * np.asarray(options.size, dtype=float))
+    with np.errstate(over="ignore"):  # what is too large is refused when it is known which joints count
+        if recording.joints.shape[2] != 2 or (finite.size and np.median(finite) > NORMALIZED):
+            raise error(path, "size= is for 2D coordinates from 0 to 1, and these are not", "leave size out")
+        return replace(recording, joints=recording.joints * np.asarray(options.size, dtype=float))
 
 
 def _mask(path: Path, recording: Recording, min_confidence: float) -> Recording:
@@ -213,9 +214,10 @@ def _mask(path: Path, recording: Recording, min_confidence: float) -> Recording:
         missing |= ~(confidence > 0) | (confidence < min_confidence)
     elif min_confidence > 0:
         raise error(path, "has no confidences, so min_confidence cannot be applied", "leave min_confidence at 0")
-    if np.isinf(joints[~missing]).any():
-        row, joint = np.argwhere(np.isinf(joints).any(axis=2) & ~missing)[0]
-        raise error(path, f"frame {recording.frames[recording.at[row]]}, joint {joint}: infinite coordinates", "leave them empty")
+    if (np.abs(joints[~missing]) > LARGEST).any():
+        row, joint = np.argwhere((np.abs(joints) > LARGEST).any(axis=2) & ~missing)[0]
+        said = f"frame {recording.frames[recording.at[row]]}, joint {joint}: infinite coordinates, or beyond {LARGEST:g}"
+        raise error(path, said, "leave them empty")
     joints[missing] = np.nan
     keep = np.asarray(~missing.all(axis=1))
     if not keep.any():
@@ -238,9 +240,10 @@ def _times(path: Path, recording: Recording, fps: float | None) -> tuple[FloatAr
     if recording.times is None:
         rate = 30.0 if fps is None else float(fps)
         return recording.frames / rate, rate
-    bad = np.flatnonzero(~np.isfinite(recording.times))
+    bad = np.flatnonzero(~(np.abs(recording.times) < LAST_FRAME))
     if bad.size:
-        raise error(path, f"frame {recording.frames[bad[0]]} has no time", "give every row a time, or drop the column and use fps=")
+        said = f"frame {recording.frames[bad[0]]} has no time, or one beyond any recording"
+        raise error(path, said, "give every row a time, or drop the column and use fps=")
     back = np.flatnonzero(np.diff(recording.times) <= 0)
     if back.size:
         a, b = recording.times[back[0] : back[0] + 2]
@@ -252,10 +255,10 @@ def _times(path: Path, recording: Recording, fps: float | None) -> tuple[FloatAr
     return recording.times, None
 
 
-def _fill(recording: Recording, rows: IntArray) -> tuple[FloatArray, FloatArray | None]:
+def _fill(recording: Recording, rows: IntArray, frames: slice) -> tuple[FloatArray, FloatArray | None]:
     """``(f, n, d)`` and ``(f, n)``: the chosen detections in their frames, NaN (confidence 0) in the others."""
-    f, (_, n, d) = len(recording.frames), recording.joints.shape
-    at = recording.at[rows]
+    f, (_, n, d) = frames.stop - frames.start, recording.joints.shape
+    at = recording.at[rows] - frames.start
     joints = np.full((f, n, d), np.nan)
     joints[at] = recording.joints[rows]
     if recording.confidence is None:

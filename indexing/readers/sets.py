@@ -17,6 +17,8 @@ Array = NDArray[Any]
 # keys that describe frames, joints or the whole set: never meta, whatever their length
 RESERVED = {"joints", "offsets", "action", "action_names", "times", "frame", "fps_assumed", "confidence", "up"}
 RESERVED |= {"bones", "parents", "joint_names", "skeleton_name"}
+SLOWEST, FASTEST = 1e-6, 1e6  # frames per second: two a month, and the fastest cameras there are
+LAST = 2**53  # whole numbers are exact below it
 FORMS = {"joints": "joints (F, n, 2 or 3)", "frames": "frames (F, height, width)"}
 
 
@@ -114,8 +116,9 @@ def frame_times(
 ) -> FloatArray | None:
     """``(F,)`` seconds, or None where neither times nor frame numbers are known."""
     key = next((key for key in ("times", "frame") if key in data), None)
-    if rate.dtype.kind not in "fiu" or not (np.isfinite(rate).all() and (rate > 0).all()):
-        raise error(path, "fps must be positive", "save frames per second, one value or one per clip")
+    if rate.dtype.kind not in "fiu" or not ((rate >= SLOWEST).all() and (rate <= FASTEST).all()):
+        said = f"fps must be positive, from {SLOWEST:g} to {FASTEST:g}"
+        raise error(path, said, "save frames per second, one value or one per clip")
     if key is None:
         return None
     stamps = data[key]
@@ -124,6 +127,11 @@ def frame_times(
             path, f"{key} must be {offsets[-1]} numbers, one per frame, got {stamps.dtype} {stamps.shape}", "save one per frame"
         )
     stamps = stamps.astype(np.float64)  # before any difference: unsigned frame numbers would wrap around
+    odd = np.flatnonzero(~(np.abs(stamps) < LAST))
+    if odd.size:
+        owner = int(np.searchsorted(offsets, odd[0], side="right")) - 1
+        said = f"clip {shown(names[owner])}: {key} must increase, but row {odd[0]} has {stamps[odd[0]]:g}"
+        raise error(path, said, "save seconds, or numbers of frames, of a recording")
     forward = stamps[1:] > stamps[:-1]
     forward[offsets[1:-1] - 1] = True  # a new clip may start anywhere
     if not forward.all():

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from indexing.clip import ClipSet, FloatArray
-from indexing.opening import error, parse_json, read_text
+from indexing.clip import LARGEST, ClipSet, FloatArray
+from indexing.opening import VALUE, clipped, error, parse_json, read_text, shown
 from indexing.readers.files import FrameFile, Source
 from indexing.readers.options import Options
 from indexing.readers.recording import Detection, gather, numbers, to_clips, track_id
@@ -82,12 +82,12 @@ def _labels(source: Source) -> list[tuple[int, list[Detection]]]:
             source.path, f"no person was detected in any of {len(files)} frames", "check the video or the model's threshold"
         )
     width = len(lines[0][2])
-    rows = []
+    rows: list[list[float]] = []
     for file, n, words in lines:
         try:
             rows.append([float(word) for word in words])
         except ValueError:
-            raise error(file.path, f"line {n} is not a list of numbers: {' '.join(words)[:60]}", TEXT_REMEDY) from None
+            raise error(file.path, f"line {n} is not a list of numbers: {clipped(' '.join(words), VALUE)}", TEXT_REMEDY) from None
         if len(words) != width:
             raise error(
                 file.path,
@@ -95,6 +95,10 @@ def _labels(source: Source) -> list[tuple[int, list[Detection]]]:
                 "export all frames with the same model and options",
             )
     table = np.array(rows)
+    odd = np.argwhere(~(np.abs(table) < LARGEST))
+    if len(odd):
+        file, n, words = lines[odd[0][0]]
+        raise error(file.path, f"line {n} holds {shown(words[odd[0][1]])}", TEXT_REMEDY)
     dims, extras = _layout(source, table)
     joints = table[:, 5 : width - extras].reshape(len(table), -1, dims)
     tracks = table[:, -1].astype(int).tolist() if _last_is_id(table, extras) else [None] * len(table)

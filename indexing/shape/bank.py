@@ -212,13 +212,17 @@ class Kernels:
     one_side: bool = False
     scales: Tensor | None = None
 
+    @property
+    def count(self) -> int:
+        """How many distances there are."""
+        one_side, moments = self.one_side, 3
+        return len(CHANNELS) * (4 if one_side else 2) + moments * (2 if one_side else 1)
+
     def fit(self, windows: Windows) -> Tensor:
         """Set the scales from training windows and return their ``(N, N)`` kernel matrix."""
         chosen = windows[torch.arange(0, len(windows), max(1, len(windows) // SCALE_SAMPLE))]
-        two = self._describe(chosen.values[:2], slice(None))
-        count = len(list(self._distances(two, two)))
         scales = []
-        for k in range(count):
+        for k in range(self.count):
 
             def one(left: Described, right: Described, joints: Tensor | slice, k: int = k) -> Tensor:
                 return next(d for i, d in enumerate(self._distances(left, right)) if i == k)

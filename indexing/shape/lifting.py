@@ -201,6 +201,11 @@ def layout_of(skeleton: Skeleton | None, windows: Tensor, seen: Tensor | None = 
     return skeleton.joints if skeleton is not None and layout_map(skeleton.joints) is not None else None
 
 
+def understood(names: tuple[str, ...]) -> bool:
+    """Whether a lifter can be made for joints with these names."""
+    return layout_map(names) is not None and from_names(names) is not None
+
+
 def standardized(windows: Tensor) -> tuple[Tensor, Tensor]:
     """Windows about their mean in units of the standard deviation of their heights, and ``(N, 1, 1, 1)`` that deviation."""
     x = windows - windows.mean(dim=(1, 2), keepdim=True)

@@ -9,6 +9,8 @@ import torch
 from sklearn.svm import SVC
 from torch import Tensor
 
+from indexing.modelfile import Parts
+
 
 @dataclass(frozen=True)
 class PairwiseMachine:
@@ -63,3 +65,23 @@ class PairwiseMachine:
                 margins[:, j] -= value
                 pair += 1
         return votes + margins / (3 * (margins.abs() + 1))
+
+
+def read_machine(parts: Parts, classes: int, rows: int, before: str = "") -> PairwiseMachine:
+    """The machine of a model file, whose tensors are named ``before + support``, ``dual``, ``intercept`` and ``counts``.
+
+    Args:
+        rows: of the training windows that are kept.
+
+    Raises:
+        ValueError: its parts do not belong together.
+    """
+    counts = parts.whole(f"{before}counts", classes, below=rows + 1)
+    if int(counts.sum()) != rows:
+        raise ValueError(f"{before}counts: {int(counts.sum())} support vectors, and {rows} are there")
+    return PairwiseMachine(
+        parts.whole(f"{before}support", rows),
+        parts.real(f"{before}dual", classes - 1, rows),
+        parts.real(f"{before}intercept", classes * (classes - 1) // 2),
+        counts,
+    )

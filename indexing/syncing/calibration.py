@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
-import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from indexing.opening import error
+from indexing.opening import VALUE, clipped, error, listed, parse_toml, read_text, shown
 
 REMEDY = "give a .toml with matrix (3, 3) and distortions for every camera, as Pose2Sim writes it"
 
@@ -81,14 +80,10 @@ def read_calibration(path: str | Path) -> list[Lens]:
         ['cam01']
     """
     path = Path(path).expanduser()
-    if not path.is_file():
-        raise error(path, "no such file", "check the path")
-    try:
-        content = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as problem:
-        raise error(path, f"is not a TOML file ({problem})", REMEDY) from None
+    content = parse_toml(path, read_text(path, REMEDY), REMEDY)
     found = []
-    for section, values in content.items():
+    for key, values in content.items():
+        section = clipped(key, VALUE)
         if isinstance(values, dict) and "matrix" in values:
             matrix = _numbers(path, section, "matrix", values["matrix"])
             if matrix.shape != (3, 3) or not bool(matrix[2, 2] != 0) or not float(matrix[0, 0]) > 0 < float(matrix[1, 1]):
@@ -96,8 +91,9 @@ def read_calibration(path: str | Path) -> list[Lens]:
             distortions = _numbers(path, section, "distortions", values.get("distortions", values.get("dist", []))).flatten()
             if len(distortions) not in (0, 4, 5, 8):
                 raise error(path, f"[{section}] distortions: expected 4, 5 or 8 numbers, got {len(distortions)}", REMEDY)
-            name = values.get("name", section)
-            found.append(Lens(str(name), matrix / matrix[2, 2], distortions, bool(values.get("fisheye", False))))
+            name = values.get("name", key)
+            name = name if isinstance(name, str) else shown(name)
+            found.append(Lens(name, matrix / matrix[2, 2], distortions, bool(values.get("fisheye", False))))
     if not found:
         raise error(path, "has no camera: no section with a 'matrix'", REMEDY)
     return found
@@ -133,10 +129,10 @@ def match(cameras: Sequence[Lens], names: Sequence[str], path: str | Path) -> tu
     known = [lens for lens in chosen if lens is not None]
     if len(known) == len(names) and len({id(lens) for lens in known}) == len(names):
         return known, ()
-    listed = ", ".join(lens.name for lens in cameras)
+    known_names = listed(lens.name for lens in cameras)
     if len(cameras) == len(names):
-        return list(cameras), (f"calibration taken in the order of its file ({listed}), because names differ",)
-    raise error(path, f"its cameras are {listed}, and {', '.join(names)} are to be synchronized", "name sections as the cameras")
+        return list(cameras), (f"calibration taken in the order of its file ({known_names}), because names differ",)
+    raise error(path, f"its cameras are {known_names}, and {listed(names)} are to be synchronized", "name sections as the cameras")
 
 
 def _plain(name: str) -> str:
@@ -153,7 +149,7 @@ def _plain(name: str) -> str:
 def _numbers(path: Path, section: str, key: str, value: Any) -> Tensor:
     try:
         found = torch.tensor(value, dtype=torch.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError, RuntimeError, RecursionError):
         found = torch.tensor([math.nan])
     if not bool(torch.isfinite(found).all()):
         raise error(path, f"[{section}] {key}: expected finite numbers", REMEDY)

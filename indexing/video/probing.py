@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -12,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from indexing.opening import size_of
 from indexing.video.extra import av
 
 REMEDY = "copy it again from the camera, or convert it: ffmpeg -i IN -c:v libx264 OUT.mp4"
@@ -110,16 +110,15 @@ def opened(path: str | Path) -> Iterator[tuple[Any, Any]]:
         ValueError: there is no such file, it is no video, or nothing can be read of it.
     """
     name = repr(str(path))
-    if not os.path.exists(path):
-        raise ValueError(f"video {name}: no such file; check the path")
-    if os.path.isdir(path):
-        raise ValueError(f"video {name}: is a folder; give the video file in it")
     try:
-        container = av().open(str(path))
-    except (av().FFmpegError, OSError) as error:
-        cause = (
-            "is empty" if os.path.getsize(path) == 0 else f"cannot be read as video ({_said(error)}): cut off, damaged, or no video"
-        )
+        size = size_of(path)
+    except ValueError as problem:
+        raise ValueError(f"video {name}: {str(problem).removeprefix(f'{path}: ')}") from None
+    try:
+        # tags may hold other bytes than text, and a playlist may name other files, or what is on the net
+        container = av().open(f"file:{path}", metadata_errors="replace", options={"protocol_whitelist": "file"})
+    except (av().FFmpegError, OSError, ValueError) as error:
+        cause = "is empty" if size == 0 else f"cannot be read as video ({_said(error)}): cut off, damaged, or no video"
         raise ValueError(f"video {name}: the file {cause}; {REMEDY}") from error
     with container:
         # cover pictures of audio files are video streams, too; and FFmpeg draws text files as pictures of themselves
@@ -127,7 +126,10 @@ def opened(path: str | Path) -> Iterator[tuple[Any, Any]]:
         if not streams:
             has = ", ".join(sorted({s.type for s in container.streams})) if container.format.name != "tty" else "text"
             raise ValueError(f"video {name}: has no video stream (it has: {has or 'nothing'}); give a video file, or {REMEDY}")
-        stream = max(streams, key=lambda s: (s.width or 0) * (s.height or 0))
+        known = [s for s in streams if s.codec_context is not None]
+        if not known:
+            raise ValueError(f"video {name}: is packed by a codec that is not known here; {REMEDY}")
+        stream = max(known, key=lambda s: (s.width or 0) * (s.height or 0))
         stream.thread_type = "AUTO"
         yield container, stream
 
