@@ -11,8 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from indexing.cameras import virtual
 from indexing.clip import Clip, as_clip
+from indexing.joints import layout_of, matched_all
 from indexing.multiview import combine
 from indexing.shape.bank import COMMON
+from indexing.skeleton import Skeleton
 from indexing.windows import check_clips
 
 Array = NDArray[Any]
@@ -38,11 +40,21 @@ def as_clips(clips: Iterable[Any], fps: float) -> list[Clip | tuple[Clip, ...]]:
     return found
 
 
-def gather(clips: Iterable[Any], fps: float, joints: int | None = None) -> tuple[list[Clip], list[int]]:
-    """Checked training clips and, for each, the item it came from (views that do not decide the shape stay apart)."""
+def gather(
+    clips: Iterable[Any], fps: float, joints: int | None = None, skeleton: Skeleton | None = None
+) -> tuple[list[Clip], list[int]]:
+    """Checked training clips and, for each, the item it came from (views that do not decide the shape stay apart).
+
+    Args:
+        joints, skeleton: how many, and which, those of clips are that were learned before.
+    """
     found: list[Clip] = []
     owners: list[int] = []
-    for i, item in enumerate(as_clips(clips, fps)):
+    items = as_clips(clips, fps)
+    skeleton = skeleton or layout_of([view for item in items for view in (item if isinstance(item, tuple) else [item])])
+    for i, given in enumerate(items):
+        views = matched_all(given if isinstance(given, tuple) else [given], skeleton)
+        item = tuple(views) if isinstance(given, tuple) else views[0]
         parts = combine(item) if isinstance(item, tuple) else [item]
         found += parts
         owners += [i] * len(parts)
@@ -50,10 +62,18 @@ def gather(clips: Iterable[Any], fps: float, joints: int | None = None) -> tuple
     return found, owners
 
 
-def check_queries(clips: Iterable[Any], fps: float, joints: int, fewest: int = 2, recordings: bool = False) -> list[Clip]:
+def check_queries(
+    clips: Iterable[Any],
+    fps: float,
+    joints: int,
+    skeleton: Skeleton | None = None,
+    fewest: int = 2,
+    recordings: bool = False,
+) -> list[Clip]:
     """Checked query clips of at least ``fewest`` frames, as images; 3D queries are seen along z.
 
     Args:
+        joints, skeleton: how many were learned, and which; by these the queries' are matched.
         recordings: they are untrimmed, or looked at frame by frame, and may have gaps.
     """
     found = []
@@ -61,6 +81,7 @@ def check_queries(clips: Iterable[Any], fps: float, joints: int, fewest: int = 2
         if isinstance(item, tuple):
             raise ValueError(f"clips: item {i} holds {len(item)} views; a query is one view, so predict each view and compare")
         found.append(item)
+    found = matched_all(found, skeleton)
     check_clips(found, joints, fewest=fewest, recordings=recordings)
     return [virtual(clip, 0.0, 0.1) if clip.dims == 3 else clip for clip in found]
 

@@ -22,6 +22,7 @@ from indexing.checks import (
 )
 from indexing.clip import Clip
 from indexing.estimator import SavedClassifier
+from indexing.joints import layout_of
 from indexing.labels import joined, refuse, same_label
 from indexing.repair import mended
 from indexing.scoring import Event, probabilities, reject_threshold
@@ -153,7 +154,7 @@ class ActionIndexer(SavedClassifier):
                 f"labels: only one class ({classes[0]!r}); give clips of at least two actions, for example one of ordinary movement"
             )
         rng = np.random.default_rng(self.random_state)
-        skeleton = next((clip.skeleton for clip in found if clip.skeleton is not None), None)
+        skeleton = layout_of(found)
         layout = self._layout(found, skeleton)
         plan = self._plan(_default_views(found), layout)
         return self._learn(cut(found, plan, rng), classes, numbers, skeleton, layout, people)
@@ -169,7 +170,7 @@ class ActionIndexer(SavedClassifier):
         if not hasattr(self, "model_"):
             return self.fit(clips, labels, groups)
         check_parameters(self)
-        found, owners = gather(clips, self.fps, self.n_joints_)
+        found, owners = gather(clips, self.fps, self.n_joints_, self.skeleton_)
         people = gather_groups(found, owners, groups)
         if self.weights == "learned" and (people is None) != (self.groups_ is None):
             here, there = ("these clips", "the earlier ones") if people is not None else ("the earlier clips", "these")
@@ -247,7 +248,7 @@ class ActionIndexer(SavedClassifier):
     # ---- recognition -------------------------------------------------------------------------------------------------
     def _queries(self, clips: Iterable[Any]) -> Windows:
         check_is_fitted(self, "model_")
-        found = check_queries(clips, self.fps, self.n_joints_)
+        found = check_queries(clips, self.fps, self.n_joints_, self.skeleton_)
         source = ragged(found, self.repair)
         check_common(found, source.seen, self.model_.exemplars.crop(0).seen.numpy())
         return Windows(whole(source, self.length), torch.from_numpy(source.seen)).to(self.device)
@@ -296,7 +297,7 @@ class ActionIndexer(SavedClassifier):
             progress: called with the share done, 0..1.
         """
         check_is_fitted(self, "model_")
-        (found,) = check_queries([clip], self.fps, self.n_joints_, recordings=True)
+        (found,) = check_queries([clip], self.fps, self.n_joints_, self.skeleton_, recordings=True)
         model, stream = self._model(), self._stream()
         begin = float(found.times[0])
         found = found.replace(times=found.times - begin)  # rounding must not depend on what the clock shows

@@ -16,6 +16,7 @@ from indexing.opening import clipped, read_rows, shown
 
 if TYPE_CHECKING:
     from indexing.clip import Clip, ClipSet
+    from indexing.skeleton import Skeleton
 
 Format = Literal["clipset", "openpose", "coco", "mediapipe", "deeplabcut", "mmpose", "ultralytics", "sleap"]
 People = Literal["largest", "confident", "tracked", "all", "everyone"]
@@ -103,6 +104,7 @@ def read_examples(examples: Sequence[Example], reading: Reading, select: Sequenc
         ValueError: naming the file: it cannot be read, has no labels, or its clip cannot be learned from.
     """
     from indexing.cli.selection import choose
+    from indexing.joints import layout_of
 
     clips: list[Clip] = []
     notes: list[str] = []
@@ -126,13 +128,23 @@ def read_examples(examples: Sequence[Example], reading: Reading, select: Sequenc
             notes += assumed(found, example.path)
         else:
             guessed += found
-        clips += _checked(found, example.path)
+        own, said = of_layout(_checked(found, example.path), layout_of([*clips, *found]), example.path)
+        notes += said
+        clips += own
         first, last = clips[0].joints.shape[1], clips[-1].joints.shape[1]
         if first != last:
             raise ValueError(
                 f"{example.path}: has {last} joints, but {examples[0].path} has {first}; use one pose estimator and joint layout"
             )
     return clips, notes + assumed(guessed)
+
+
+def of_layout(clips: Sequence[Clip], known: Skeleton | None, path: Path) -> tuple[list[Clip], list[str]]:
+    """Clips with their joints in the order of those known, and a note where not all are used or nobody knows which is which."""
+    from indexing.joints import matched
+
+    found = [matched(clip, known, str(path)) for clip in clips]
+    return [clip for clip, _ in found], list(dict.fromkeys(note for _, note in found if note))
 
 
 def _cut(clips: ClipSet, example: Example) -> ClipSet:
@@ -183,15 +195,23 @@ def assumed(clips: Sequence[Clip], path: Path | None = None) -> list[str]:
     return [f"30 frames per second assumed for {who}; --fps says otherwise"] if found else []
 
 
-def read_recordings(paths: Sequence[Path], reading: Reading, joints: int, model: Path) -> list[Clip]:
-    """Recordings with names that differ, checked against the model.
+def read_recordings(
+    paths: Sequence[Path], reading: Reading, joints: int, model: Path, skeleton: Skeleton | None = None
+) -> tuple[list[Clip], list[str]]:
+    """Recordings with names that differ, checked against the model, and what a person should know about them.
+
+    Args:
+        joints, skeleton: how many the model knows, and which.
 
     Raises:
         ValueError: naming the file: unreadable, unusable, or with other joints than the model.
     """
     found: list[tuple[Path, Clip]] = []
+    notes: list[str] = []
     for path in paths:
-        for clip in reading.read(path):
+        clips, said = of_layout(reading.read(path), skeleton, path)
+        notes += said
+        for clip in clips:
             if clip.joints.shape[1] != joints:
                 raise ValueError(
                     f"{path}: has {clip.joints.shape[1]} joints, but the model {model} was learned from clips with {joints}; "
@@ -202,7 +222,7 @@ def read_recordings(paths: Sequence[Path], reading: Reading, joints: int, model:
     return [
         clip if twice.count(clip.name) == 1 else clip.replace(name=f"{path}" if len(paths) == len(found) else f"{path} {clip.name}")
         for path, clip in found
-    ]
+    ], notes
 
 
 def read_truth(path: Path, recordings: Sequence[str]) -> tuple[list[list[KnownEvent]], list[str]]:

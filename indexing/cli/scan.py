@@ -89,8 +89,8 @@ class Scan:
         from indexing.indexer import ActionIndexer
 
         indexer = ActionIndexer.load(self.model.expanduser())
-        clips = read_recordings(self.recordings, self.reading, indexer.n_joints_, self.model)
-        return indexer, clips, assumed(clips)
+        clips, notes = read_recordings(self.recordings, self.reading, indexer.n_joints_, self.model, indexer.skeleton_)
+        return indexer, clips, notes + assumed(clips)
 
     def _films(self) -> tuple[BrightnessIndexer, list[Recording], list[str]]:
         from indexing.brightness.indexer import BrightnessIndexer

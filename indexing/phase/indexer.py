@@ -14,6 +14,7 @@ from torch import Tensor
 from indexing.checks import check_queries, gather, gather_labels
 from indexing.clip import Clip, stretches
 from indexing.estimator import SavedClassifier
+from indexing.joints import layout_of
 from indexing.labels import refuse
 from indexing.phase.calibration import SECOND, event_levels
 from indexing.phase.checks import check_phase_parameters, check_phases, check_reject
@@ -114,7 +115,7 @@ class PhaseIndexer(SavedClassifier):
         given = check_phases(phases, found, owners)
         classes, numbers = np.unique(values, return_inverse=True)
         check_reject(self, classes.tolist())
-        skeleton = next((clip.skeleton for clip in found if clip.skeleton is not None), None)
+        skeleton = layout_of(found)
         views, which = [], []
         for k, clip in enumerate(found):
             seen_as = images(clip)
@@ -143,7 +144,7 @@ class PhaseIndexer(SavedClassifier):
     def analyse(self, clip: Any) -> tuple[Array, Array]:
         """:meth:`score_frames` and :meth:`phase` in one pass."""
         check_is_fitted(self, "model_")
-        (found,) = check_queries([clip], self.fps, self.n_joints_, fewest=1, recordings=True)
+        (found,) = check_queries([clip], self.fps, self.n_joints_, self.skeleton_, fewest=1, recordings=True)
         scores, phase = (part.cpu().numpy() for part in self._evidence([found]))
         if self.window > 0:
             phase = smooth_phases(phase, found.times, self.window, self.periodic_)
@@ -174,7 +175,7 @@ class PhaseIndexer(SavedClassifier):
     def decision_function(self, clips: Iterable[Any]) -> Array:
         """``(clips, classes)`` mean of the frames' scores; columns are ``classes_``."""
         check_is_fitted(self, "model_")
-        found = check_queries(clips, self.fps, self.n_joints_, fewest=1, recordings=True)
+        found = check_queries(clips, self.fps, self.n_joints_, self.skeleton_, fewest=1, recordings=True)
         scores = self._evidence(found)[0].split([len(clip) for clip in found])
         return np.stack([part.mean(0).cpu().numpy() for part in scores])
 
@@ -203,7 +204,7 @@ class PhaseIndexer(SavedClassifier):
         ordinary movement.
         """
         check_is_fitted(self, "model_")
-        (found,) = check_queries([clip], self.fps, self.n_joints_, fewest=1, recordings=True)
+        (found,) = check_queries([clip], self.fps, self.n_joints_, self.skeleton_, fewest=1, recordings=True)
         if len(self.classes_) < 2:
             raise ValueError("find needs two classes at least to tell one from the other; fit clips of ordinary movement too")
         scores = self._evidence([found])[0].cpu().numpy()

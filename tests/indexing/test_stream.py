@@ -222,7 +222,7 @@ def test_a_resting_person_is_mostly_left_alone():
 
 
 def test_an_action_calmer_than_the_others_is_not_taken_for_rest():
-    contrast, calm = np.array([[2.5, -2.5], [-2.5, 2.5], [2.5, -2.5]]), np.array([0.05, 0.3])
+    contrast, calm = np.array([[2.8, -2.8], [-2.8, 2.8], [2.8, -2.8]]), np.array([0.05, 0.3])
     motion = np.array([0.06, 0.06, 0.03])  # of the calm action as it is, of the other one, and of a person who stands
     assert at_rest(contrast, motion, 0.1, calm, (1.0, 4.0)).tolist() == [False, True, True]
 
