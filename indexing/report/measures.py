@@ -20,7 +20,7 @@ def measure(report: RecognitionReport) -> dict[str, Any]:
         the report's own ``metrics``, and
         for evaluations ``clips, accuracy, accuracy_interval, macro_f1, accuracy_by_setting, per_class, confusion``;
         for recordings ``recordings, seconds, events, events_by_class``, and where some are known ``known_events, missed_events,
-        frame_accuracy, frame_agreement``.
+        false_events`` (finds of which nothing of their name is known there), ``frame_accuracy, frame_agreement``.
     """
     out = dict(report.metrics)
     if report.notes:
@@ -161,6 +161,9 @@ def _search(recordings: Sequence[RecordingResult]) -> dict[str, Any]:
     known = [recording for recording in recordings if recording.truth is not None]
     if known:
         out["known_events"] = sum(len(recording.truth or ()) for recording in known)
+        out["false_events"] = sum(
+            overlapping(event, recording.truth or ()) != str(event.label) for recording in known for event in recording.events
+        )
         out["missed_events"] = sum(len(missed(recording)) for recording in known)
         inside = np.array([(_known_frames(recording) != "").sum() for recording in known], dtype=float)
         shares = np.array([frame_accuracy(recording) for recording in known])

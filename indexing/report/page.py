@@ -7,6 +7,7 @@ is loaded from outside; the content security policy in its head makes the browse
 from __future__ import annotations
 
 import base64
+import hashlib
 import html as _html
 import math
 import re
@@ -36,6 +37,17 @@ class Column:
 
     name: str
     css: str = ""
+
+
+@dataclass(frozen=True)
+class Tip:
+    """A place on a picture and the words that belong to it; all as shares of the picture's width and height, from its top left."""
+
+    left: float
+    top: float
+    width: float
+    height: float
+    text: str
 
 
 def escape(value: object) -> str:
@@ -126,8 +138,12 @@ def table(columns: Sequence[Column], rows: Sequence[Sequence[str]], *, caption: 
     return f'<div class="scroll"><table class="{css}">{title}<thead><tr>{head}</tr></thead><tbody>\n{body}\n</tbody></table></div>'
 
 
-def picture(light: bytes, alt: str, *, dark: bytes | None = None, caption: str = "") -> str:
-    """A PNG inside the page, with another one for dark screens where given; wide ones scroll rather than shrink to dust."""
+def picture(light: bytes, alt: str, *, dark: bytes | None = None, caption: str = "", tips: Sequence[Tip] = ()) -> str:
+    """A PNG inside the page, with another one for dark screens where given; wide ones scroll rather than shrink to dust.
+
+    Args:
+        tips: places on the picture that say something when pointed at.
+    """
     width, height = (round(side / PIXEL_RATIO) for side in struct.unpack(">II", light[16:24]))
     least = min(width, 680) if width <= 1100 else round(0.85 * width)  # pixels, below which its small print is lost
     shape = f'alt="{escape(alt)}" width="{width}" height="{height}" style="min-width:{least}px"'
@@ -136,7 +152,19 @@ def picture(light: bytes, alt: str, *, dark: bytes | None = None, caption: str =
     shown = "".join(f'<img class="{theme}" src="{_data(png)}" {shape}>' for theme, png in images)
     text = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
     scroll = f'<div class="scroll" tabindex="0" role="group" aria-label="{escape(alt)}">'  # reachable by keyboard where it scrolls
-    return f"<figure>{scroll}{shown}</div>{text}</figure>"
+    if tips:
+        shown = f'<div class="tipped" style="min-width:{least}px;max-width:{width}px">{shown}{_tips(tips)}</div>'
+    hint = '<p class="swipe" aria-hidden="true">wider than this screen: move it sideways</p>' if least > 340 else ""
+    return f"<figure>{scroll}{shown}</div>{hint}{text}</figure>"
+
+
+def _tips(tips: Sequence[Tip]) -> str:
+    places = ""
+    for tip in tips:
+        x, y, width, height = (f"{100 * share:.2f}" for share in (tip.left, tip.top, tip.width, tip.height))
+        rect = f'<rect x="{x}" y="{y}" width="{width}" height="{height}"/>'
+        places += f"<g><title>{escape(tip.text)}</title>{rect}</g>"
+    return f'<svg class="tips" viewBox="0 0 100 100" preserveAspectRatio="none" aria-hidden="true">{places}</svg>'
 
 
 def bar(fraction: float, mark: float | None = None) -> str:
@@ -175,7 +203,10 @@ def provenance(manifest: Mapping[str, Any]) -> str:
 
 
 def settings(values: Mapping[str, Any], limit: int = 200) -> str:
-    """Nested settings as a two-column table, ``a.b`` for ``b`` in ``a``; at most ``limit`` lines, and the rest counted."""
+    """Nested settings as a two-column table, ``a.b`` for ``b`` in ``a``; at most ``limit`` lines, and the rest counted.
+
+    A folder's files and their hashes are one line: a recording may have a file for each of its frames.
+    """
     lines = list(_flat(values))
     rows = [[f"<code>{escape(name)}</code>", f"<code>{escape(value)}</code>"] for name, value in lines[:limit]]
     more = f'<p class="note">{len(lines) - limit} more lines are in manifest.json.</p>' if len(lines) > limit else ""
@@ -186,13 +217,20 @@ def _flat(values: Mapping[str, Any], before: str = "") -> list[tuple[str, object
     lines: list[tuple[str, object]] = []
     for name, value in values.items():
         path = f"{before}{name}"
-        if isinstance(value, Mapping) and value:
+        if isinstance(value, Mapping) and len(value) > 3 and all(_is_hash(item) for item in value.values()):
+            together = hashlib.sha256("".join(f"{file}:{value[file]}\n" for file in sorted(value)).encode()).hexdigest()
+            lines.append((path, f"{len(value):,} files, each in manifest.json; sha256 of their names and hashes: {together}"))
+        elif isinstance(value, Mapping) and value:
             lines += _flat(value, f"{path}.")
         elif isinstance(value, (list, tuple)):
             lines.append((path, " ".join(str(item) for item in value) or "none"))
         elif value is not None and not isinstance(value, Mapping):
             lines.append((path, value))
     return lines
+
+
+def _is_hash(value: object) -> bool:
+    return isinstance(value, str) and re.fullmatch(r"[0-9a-f]{64}", value) is not None
 
 
 def _data(png: bytes) -> str:

@@ -6,6 +6,7 @@ matplotlib is imported when a picture is drawn, not before.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -13,16 +14,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from indexing.report.canvas import DARK, LIGHT, Theme, cmap, new_figure, png, shorten, shorten_all, style
+from indexing.report.canvas import DARK, LIGHT, Theme, cmap, columns, new_figure, png, shorten, shorten_all, style
+from indexing.report.page import Tip
 from indexing.report.results import Event, Truth
 
-__all__ = ["DARK", "LIGHT", "Theme", "confusion", "downsample", "timeline"]
+__all__ = ["DARK", "LIGHT", "Theme", "confusion", "downsample", "timeline", "timeline_tips"]
 
 COLUMNS = 1400  # score values drawn along the time axis: about one per pixel
-# White text on these reads at 4.4:1 or better.
-PALETTE = ("#2a76aa", "#a84573", "#2f8253", "#6d5bb3", "#8a6d14", "#1d8079", "#b8433c", "#5d6f7c", "#64801f", "#8c5a3c")
+# White text on these reads at 4.5:1 or better; any two are at least 13 apart in CIELAB, as are no more than about 18 such colours.
+PALETTE = (
+    "#2a76aa", "#a84573", "#2f8253", "#6d5bb3", "#8a6d14", "#1d8079", "#b8433c", "#5d6f7c", "#64801f", "#8c5a3c", "#1f4a8c",
+    "#7a1f55", "#1d5a2c", "#9b3fb0", "#c2410c", "#6b1a1a", "#3c3f46", "#35277a",
+)  # fmt: skip
 STEPS = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 14400)  # seconds between ticks
 FRAME = "#e8741e"  # around found actions: stands out from the heat colours of both themes
+WIDTH, ABOVE, BESIDE = 10.2, 0.12, 0.85  # inches: of a timeline, above its bars, and for the scale on its right
 Bar = tuple[str, float, float]  # label, start, end
 
 
@@ -47,6 +53,61 @@ class _View:
     def thin(self, start: float, end: float) -> bool:
         """Whether a full frame would cover what it frames."""
         return end - start < 0.006 * (self.high - self.low)
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """Where things are on a timeline, in inches."""
+
+    names: Sequence[str]
+    found: Sequence[Bar]
+    spans: Sequence[tuple[str, list[list[Bar]]]]
+    low: float
+    high: float
+    left: float
+    bars: float
+    heat: float
+    foot: float
+
+    @property
+    def height(self) -> float:
+        return ABOVE + self.bars + ABOVE + self.heat + self.foot
+
+    @property
+    def width(self) -> float:
+        return WIDTH - self.left - BESIDE
+
+
+def _layout(
+    seconds: NDArray[np.float64], classes: Sequence[object], events: Sequence[Event], truth: Sequence[Truth] | None
+) -> _Layout:
+    found = [(str(event.label), float(event.start), float(event.end)) for event in events]
+    known = None if truth is None else [(str(label), float(start), float(end)) for label, start, end in truth]
+    names = list(dict.fromkeys([str(name) for name in classes] + [bar[0] for bar in found + (known or [])]))
+    spans = [("found", _lanes(found))] + ([] if known is None else [("known", _lanes(known))])
+    bounds = [float(seconds[0]), float(seconds[-1])] + [t for _, start, end in found + (known or []) for t in (start, end)]
+    low, high = min(bounds), max(bounds)
+    high = high if high > low else low + 1.0
+    left = 0.45 + 0.075 * max([5] + [columns(name) for name in shorten_all(classes, 22)])
+    bars, heat = 0.29 * sum(len(lanes) for _, lanes in spans), 0.25 * len(classes)
+    return _Layout(names, found, spans, low, high, left, bars, heat, 0.62 if high > 120 else 0.47)
+
+
+def timeline_tips(
+    times: ArrayLike, classes: Sequence[object], events: Sequence[Event] = (), truth: Sequence[Truth] | None = None
+) -> list[Tip]:
+    """What :func:`timeline` draws as bars, and where: for names that do not fit."""
+    at = _layout(np.asarray(times, dtype=np.float64), classes, events, truth)
+    lanes = [(title, lane) for title, several in at.spans for lane in several]
+    tips = []
+    for row, (title, lane) in enumerate(lanes):
+        for label, start, end in lane:
+            left = at.left + at.width * (start - at.low) / (at.high - at.low)
+            wide = max(at.width * (end - start) / (at.high - at.low), 0.06)
+            top, tall = ABOVE + at.bars * (row + 0.1) / len(lanes), 0.8 * at.bars / len(lanes)
+            text = f"{title}: {label}, {start:.2f} to {end:.2f} s"
+            tips.append(Tip(left / WIDTH, top / at.height, wide / WIDTH, tall / at.height, text))
+    return tips
 
 
 def confusion(counts: ArrayLike, classes: Sequence[object], *, theme: Theme = LIGHT) -> bytes:
@@ -115,29 +176,20 @@ def timeline(
     seconds, values = np.asarray(times, dtype=np.float64), np.asarray(scores, dtype=np.float64)
     if values.shape != (len(seconds), len(classes)) or not len(seconds):
         raise ValueError(f"scores must be (frames, classes) = ({len(seconds)}, {len(classes)}), not empty, got {values.shape}")
-    found = [(str(event.label), float(event.start), float(event.end)) for event in events]
-    known = None if truth is None else [(str(label), float(start), float(end)) for label, start, end in truth]
-    names = list(dict.fromkeys([str(name) for name in classes] + [bar[0] for bar in found + (known or [])]))
-    spans = [("found", _lanes(found))] + ([] if known is None else [("known", _lanes(known))])
-    bounds = [float(seconds[0]), float(seconds[-1])] + [t for _, start, end in found + (known or []) for t in (start, end)]
-    low, high = min(bounds), max(bounds)
-    high = high if high > low else low + 1.0
-    view = _View(low, high, {name: PALETTE[i % len(PALETTE)] for i, name in enumerate(names)}, theme)
-    bars, heat = 0.29 * sum(len(lanes) for _, lanes in spans), 0.25 * len(classes)
-    foot = 0.62 if view.minutes else 0.47
-    height = 0.12 + bars + 0.12 + heat + foot
+    at = _layout(seconds, classes, events, truth)
+    height, low, high = at.height, at.low, at.high
+    view = _View(low, high, {name: PALETTE[i % len(PALETTE)] for i, name in enumerate(at.names)}, theme)
     with style(theme):
-        figure = new_figure(10.2, height)
-        left = 0.45 + 0.075 * max([5] + [len(name) for name in shorten_all(classes, 22)])
-        box = (left / 10.2, (10.2 - left - 0.85) / 10.2)
-        top = figure.add_axes((box[0], 1 - (0.12 + bars) / height, box[1], bars / height))
-        _draw_bars(top, spans, view)
+        figure = new_figure(WIDTH, height)
+        box = (at.left / WIDTH, at.width / WIDTH)
+        top = figure.add_axes((box[0], 1 - (ABOVE + at.bars) / height, box[1], at.bars / height))
+        _draw_bars(top, at.spans, view)
         below = top
         if len(classes):
-            below = figure.add_axes((box[0], foot / height, box[1], heat / height))
-            image = _draw_heat(below, downsample(seconds, values, np.linspace(low, high, COLUMNS + 1)), classes, found, view)
+            below = figure.add_axes((box[0], at.foot / height, box[1], at.heat / height))
+            image = _draw_heat(below, downsample(seconds, values, np.linspace(low, high, COLUMNS + 1)), classes, at.found, view)
             if image is not None:
-                _draw_scale(figure, image, (1 - 0.72 / 10.2, foot / height, 0.1 / 10.2, min(heat, 1.6) / height))
+                _draw_scale(figure, image, (1 - 0.72 / WIDTH, at.foot / height, 0.1 / WIDTH, min(at.heat, 1.6) / height))
             top.tick_params(labelbottom=False, bottom=False)
         _time_axis(below, view)
         return png(figure)
@@ -188,16 +240,34 @@ def _draw_bars(axes: Any, spans: Sequence[tuple[str, list[list[Bar]]]], view: _V
 
 
 def _write(axes: Any, text: str, x: float, y: float, room: float) -> None:
-    """Text centred in a bar of ``room`` pixels; cut, or left out, where it does not fit."""
-    written = axes.text(x, y, text, color="#ffffff", fontsize=8, ha="center", va="center", parse_math=False, clip_on=True)
-    if written.get_window_extent().width + 8 > room:
-        written.set_fontsize(7)
+    """Text centred in a bar of ``room`` pixels, in one line or two; cut, or left out, where it does not fit."""
+    written = axes.text(
+        x, y, text, color="#ffffff", fontsize=8, ha="center", va="center", parse_math=False, clip_on=True, linespacing=0.95
+    )
+    for several, size in ((text, 7), (_in_two(text), 6.5), (_in_two(text), 5.8)):
+        if written.get_window_extent().width + 8 > room:
+            written.set(text=several, fontsize=size)
+    if written.get_window_extent().width + 4 <= room:
+        return
+    written.set(text=text, fontsize=7)
     keep = len(text)
     while keep >= 3 and (need := written.get_window_extent().width + 6) > room:
         keep = min(keep - 1, int(keep * room / need))
         written.set_text(f"{text[:keep].rstrip()}…")
     if keep < min(3, len(text)):
         written.remove()
+
+
+def _in_two(text: str) -> str:
+    """A name in two lines of about the same length, parted where its words are.
+
+    Example:
+        >>> _in_two("jumping_jack")
+        'jumping_\\njack'
+    """
+    places = [match.end() for match in re.finditer(r"[ _\-/]", text[:-1])] or [len(text)]
+    at = min(places, key=lambda place: max(place, len(text) - place))
+    return f"{text[:at].rstrip()}\n{text[at:]}" if at < len(text) else text
 
 
 def _draw_heat(axes: Any, cells: NDArray[np.float64], classes: Sequence[object], found: Sequence[Bar], view: _View) -> Any:

@@ -9,13 +9,21 @@ from typing import Any
 import numpy as np
 
 from indexing.clip import Clip
+from indexing.report.canvas import letters_without_font
 from indexing.report.measures import confused_with, missed, overlapping
 from indexing.report.page import Card, Column, bar, cards, details, escape, picture, section, settings, table
+from indexing.report.pictures import timeline_tips
 from indexing.report.results import Event, RecognitionReport, RecordingResult
 from indexing.report.thumbnails import strip
 
 TIMELINES = 12  # recordings whose timeline is drawn
 STRIPS = 60  # events that are shown as stick figures, over all recordings
+TIPS = 2000  # bars of a timeline that say what they are when pointed at
+SCORES = (
+    "Score: the evidence for the action, averaged over the time it lasts; higher is better. "
+    "Margin: how far that is above the next best action; near 0 it might as well be that one."
+)
+NO_FONT = "No font of this computer has {}: boxes stand for them in the picture; with Noto Sans CJK installed they are drawn."
 NONE = "n/a"  # shown where a number does not exist
 ROWS = 1000  # events that are listed, over all recordings
 Pictures = Mapping[str, tuple[bytes, bytes]]  # file name -> PNG for light and for dark screens
@@ -84,7 +92,10 @@ def _headline(report: RecognitionReport, measured: Mapping[str, Any]) -> list[Ca
             Card("Mean F1", f"{measured['macro_f1']:.2f}", "over actions; 1 is perfect"),
         ]
     if report.recordings:
-        items.append(Card("Actions found", f"{measured['events']:,}", f"of {_count(len(measured['events_by_class']), 'kind')}"))
+        kinds = f"of {_count(len(measured['events_by_class']), 'kind')}"
+        if "false_events" in measured:
+            kinds += f"; {measured['false_events']:,} of them false: something else, or nothing known there"
+        items.append(Card("Actions found", f"{measured['events']:,}", kinds))
         if measured.get("known_events"):
             got = measured["known_events"] - measured["missed_events"]
             items.append(Card("Known actions hit", f"{got} of {measured['known_events']}", "overlap a find of the same name"))
@@ -110,7 +121,11 @@ def _recording(report: RecognitionReport, recording: RecordingResult, drawn: tup
         what = "Each row is an action: the stronger its colour, the better it fits at that moment; frames mark what was reported. "
         known = "" if recording.truth is None else "Known actions are below the found ones."
         alt = f"Timeline of {recording.name}: {_count(number, 'found action')} over {_duration(recording.duration)}"
-        parts.append(picture(drawn[0], alt, dark=drawn[1], caption=what + known))
+        tips = timeline_tips(recording.times, recording.classes, recording.events, recording.truth)
+        parts.append(picture(drawn[0], alt, dark=drawn[1], caption=what + known, tips=tips[:TIPS]))
+        boxes = letters_without_font([*recording.classes, *(event.label for event in recording.events)])
+        if boxes:
+            parts.append(f'<p class="note">{escape(NO_FONT.format(boxes[:12]))}</p>')
     else:
         parts.append(f'<p class="note">No timeline: only those of the first {TIMELINES} recordings are drawn.</p>')
     lost = missed(recording)
@@ -142,6 +157,7 @@ def _events(report: RecognitionReport, recording: RecordingResult, before: int) 
     html = table(columns, shown[:draw], caption=f"Actions found in {recording.name}", css="stack") if draw else ""
     if draw:
         html += _legend(html)
+    html = f'<p class="note">{escape(SCORES)}</p>{html}'
     if listed > draw:
         rest = table(plain, shown[draw:], caption=f"Further actions found in {recording.name}", css="stack")
         left = f"{listed - draw} more without pictures (figures are drawn for {STRIPS} at most)"
@@ -193,12 +209,15 @@ def _by_setting(report: RecognitionReport, measured: Mapping[str, Any]) -> str:
             share = plain["accuracy_by_setting"].get(setting, np.nan)
             row += [NONE, ""] if np.isnan(share) else [_percent(share), bar(share, guess)]
         note += f" {name}, for comparison: {how}." if how else ""
-    return section("Accuracy by setting", table(columns, rows), note) if len(values) > 1 or "" not in values else ""
+    return section("Accuracy by setting", table(columns, rows, css="stack"), note) if len(values) > 1 or "" not in values else ""
 
 
 def _by_class(measured: Mapping[str, Any]) -> str:
-    rows = []
+    rows, perfect = [], []
     for name, row in measured["per_class"].items():
+        if row["precision"] == row["recall"] == 1:
+            perfect.append(f"{name} ({row['clips']:,})")
+            continue
         wrong = confused_with(measured["confusion"], name)
         taken = f"{escape(wrong[0])} ({wrong[1]})" if wrong else '<span class="none">none</span>'
         values = [_share(row[key]) for key in ("precision", "recall", "f1")]
@@ -206,11 +225,17 @@ def _by_class(measured: Mapping[str, Any]) -> str:
     columns = [Column("Action"), *(Column(name, "number") for name in ("Clips", "Precision", "Recall", "F1"))]
     columns += [Column("F1, 0 to 1", "wide"), Column("Most often taken for", "name")]
     note = "Precision: how many of the clips given this name deserve it. Recall: how many of the action's clips got its name."
-    return section("Each action", table(columns, rows), f"{note} F1: their harmonic mean.")
+    html = table(columns, rows, css="stack") if rows else ""
+    if perfect:
+        which = "Always recognized, and nothing else taken for them (clips in brackets): "
+        html += f'<p class="note">{escape(which + ", ".join(perfect))}.</p>'
+    return section("Each action", html, f"{note} F1: their harmonic mean." if rows else "")
 
 
 def _confusion(measured: Mapping[str, Any], drawn: tuple[bytes, bytes]) -> str:
     number = _count(len(measured["confusion"]["labels"]), "action")
+    if measured["accuracy"] == 1:
+        return section("What is taken for what", "", "No action was taken for another one. The matrix is in confusion.png.")
     note = "A row per performed action, a column per answer. Numbers count clips, colour is the share of the row."
     alt = f"Confusion matrix of {number}; overall {_percent(measured['accuracy'])} are on the diagonal"
     return section("What is taken for what", picture(drawn[0], alt, dark=drawn[1]), note)

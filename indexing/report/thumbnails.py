@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from indexing.report.page import escape
 from indexing.skeleton import known
 
 FRAMES = 5  # key frames of a strip
+AROUND = 9  # frames before and after the shown ones that say where a joint should be
 FACE = {"nose", "eye", "ear", "mouth"}
 WIDTH, HEIGHT = 40.0, 64.0  # of one key frame, in SVG units
 
@@ -21,7 +23,8 @@ def strip(clip: Clip, start: float | None = None, end: float | None = None, *, f
     """A row of key frames of a clip, evenly spaced in time, as one inline ``<svg>``.
 
     Every frame is centred on the person and all share one scale, so walking does not shrink the figures and a jump stays
-    visible.  3D joints are shown from the front.  Joints that were not seen, and stray ones, are left out with their bones.
+    visible.  3D joints are shown from the front.  Joints that were not seen, and those that a detector put in the wrong place,
+    are left out with their bones.
 
     Args:
         clip: the recording.
@@ -36,7 +39,7 @@ def strip(clip: Clip, start: float | None = None, end: float | None = None, *, f
     last = clip.times[-1] if end is None else end
     wanted = np.linspace(first, last, frames)
     at = np.unique(np.abs(clip.times[None, :] - wanted[:, None]).argmin(axis=1))
-    points = y_up(clip.replace(joints=clip.joints[at], times=clip.times[at], confidence=None))[..., :2].astype(np.float64)
+    points = y_up(clip.replace(joints=_right(clip, at), times=clip.times[at], confidence=None))[..., :2].astype(np.float64)
     points[np.isnan(points).any(axis=2)] = np.nan
     seen = ~np.isnan(points[..., 0])
     drawn = seen.any(axis=1)
@@ -56,6 +59,16 @@ def strip(clip: Clip, start: float | None = None, end: float | None = None, *, f
     width = WIDTH * len(points)
     drawing = "".join(f'<path class="{css}" d="{path}"/>' for css, path in paths.items() if path)
     return f'<svg class="strip" viewBox="0 0 {width:g} {HEIGHT:g}" role="img" aria-label="{escape(alt)}">{drawing}</svg>'
+
+
+def _right(clip: Clip, at: NDArray[np.intp]) -> NDArray[Any]:
+    """The joints of some frames; those that do not lie on their own path through the frames around them are NaN."""
+    from indexing.repair import wrong_joints  # brings torch, which a report without figures does not need
+
+    first, last = max(0, int(at[0]) - AROUND), min(len(clip), int(at[-1]) + AROUND + 1)
+    joints = np.array(clip.joints[first:last], dtype=np.float32)
+    joints[wrong_joints(joints, clip.times[first:last], np.array([0, last - first]))] = np.nan
+    return joints[at - first]
 
 
 def _paths(clip: Clip, places: NDArray[np.float64], seen: NDArray[np.bool_]) -> dict[str, str]:

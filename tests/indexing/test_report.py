@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import re
 import struct
@@ -28,7 +29,7 @@ from indexing.report import (
     write_json,
     write_text,
 )
-from indexing.report.canvas import shorten_all
+from indexing.report.canvas import letters_without_font, shorten_all
 from indexing.report.measures import measure, overlapping
 from indexing.report.thumbnails import strip
 from indexing.skeleton import from_names
@@ -289,3 +290,57 @@ def test_overlap_with_what_is_known():
 def test_misuse_is_named(make, words):
     with pytest.raises(ValueError, match=words):
         make()
+
+
+def lab(colour):
+    """CIELAB of ``#rrggbb``, and its relative luminance."""
+    srgb = np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)]) / 255
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    to_xyz = [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
+    x, y, z = np.cbrt(to_xyz @ linear / [0.9505, 1, 1.089])
+    return np.array([116 * y - 16, 500 * (x - y), 200 * (y - z)]), float(y**3)
+
+
+def test_sixteen_actions_have_sixteen_colours_that_white_text_reads_on():
+    colours, luminances = zip(*map(lab, pictures.PALETTE), strict=True)
+    apart = np.linalg.norm(np.subtract.outer(np.array(colours), np.array(colours))[:, [0, 1, 2], :, [0, 1, 2]], axis=0)
+    assert len(colours) >= 16 and apart[~np.eye(len(colours), dtype=bool)].min() > 13
+    assert 1.05 / (max(luminances) + 0.05) > 4.5
+
+
+def test_bars_of_a_timeline_say_what_they_are():
+    times, events, truth = np.arange(100) / 10, [Hit("stand_up", 2, 2.1), Hit("squat", 4, 6)], [("squat", 4.5, 6.0)]
+    tips = pictures.timeline_tips(times, ["squat", "stand_up"], events, truth)
+    assert [tip.text for tip in tips] == [
+        "found: stand_up, 2.00 to 2.10 s",
+        "found: squat, 4.00 to 6.00 s",
+        "known: squat, 4.50 to 6.00 s",
+    ]
+    assert all(0 < tip.left < tip.left + tip.width < 1 and 0 < tip.top < tip.top + tip.height < 1 for tip in tips)
+    assert tips[2].top > tips[1].top + tips[1].height
+    image = matplotlib.image.imread(io.BytesIO(pictures.timeline(times, np.zeros((100, 2)), ["squat", "stand_up"], events, truth)))
+    found = tips[1]
+    x, y = found.left + 0.1 * found.width, found.top + 0.15 * found.height  # inside the bar, beside its name
+    pixel = image[int(y * image.shape[0]), int(x * image.shape[1]), :3]
+    assert np.abs(pixel - [int(pictures.PALETTE[0][i : i + 2], 16) / 255 for i in (1, 3, 5)]).max() < 0.02
+
+
+def test_names_are_as_wide_as_their_letters():
+    assert shorten_all(["深蹲深蹲深蹲深蹲深蹲深蹲深蹲"], 10) == ["深蹲…深蹲"]
+    assert letters_without_font(["\U00013000 squat приседание"]) == "\U00013000"  # a hieroglyph, which none of the fonts has
+
+
+def test_what_a_detector_put_in_the_wrong_place_is_not_drawn():
+    clip = person()
+    joints = clip.joints.copy()
+    joints[30, 1] += [0.9, -0.8]  # a hand across the body in one frame: not far enough to be stray
+    spoiled = clip.replace(joints=joints)
+    at = (float(clip.times[30]), float(clip.times[30]))
+    assert len(bones(strip(clip, *at, frames=1))) == 5 and len(bones(strip(spoiled, *at, frames=1))) == 4
+
+
+def test_false_finds_are_counted():
+    events = [Hit("a", 0, 1), Hit("a", 3, 4), Hit("b", 6, 7)]
+    out = measure(RecognitionReport("t", recordings=[recording(events, [("a", 0.5, 2.0), ("b", 3.0, 4.0)])]))
+    assert out["false_events"] == 2 and out["missed_events"] == 1
+    assert "false_events" not in measure(RecognitionReport("t", recordings=[recording(events)]))

@@ -213,3 +213,33 @@ def test_page_parts_escape_and_nest():
     assert not re.search(r"<(n|i|s|k|f|t)>", text)
     assert "5 more lines" in page.settings({str(i): i for i in range(205)})
     assert 'width="100.0"' in page.bar(1.7) and 'width="0.0"' in page.bar(-1)
+
+
+def test_what_is_always_right_takes_one_line(tmp_path):
+    names = ["squat", "lunge", "kick"]
+    right = EvaluationResult(names, names * 2, names * 2, "azimuth 0")
+    text = write(tmp_path / "right", RecognitionReport("All right", evaluations=[right]))
+    assert "Always recognized, and nothing else taken for them (clips in brackets): squat (2), lunge (2), kick (2)." in text
+    assert "No action was taken for another one" in text and "Confusion matrix" not in text
+    assert (tmp_path / "right" / "confusion.png").exists()
+    wrong = EvaluationResult(names, names * 2, [*names, "lunge", "lunge", "kick"], "azimuth 0")
+    text = write(tmp_path / "wrong", RecognitionReport("Two alike", evaluations=[wrong]))
+    assert "for them (clips in brackets): kick (2)." in text and "Most often taken for" in text and "Confusion matrix" in text
+
+
+def test_a_folder_of_frames_is_one_line_of_the_settings():
+    inputs = {"op": {f"op_{i:012d}_keypoints.json": f"{i:064x}" for i in range(1164)}, "moves.safetensors": "f" * 64}
+    html = page.settings({"inputs": inputs})
+    assert html.count("<tr>") == 3 and "1,164 files, each in manifest.json; sha256 of their names and hashes: " in html
+    assert "more lines" not in html and "f" * 64 in html
+
+
+def test_finds_are_explained_and_the_comparison_stacks_on_narrow_screens(tmp_path):
+    events = [Hit("squat", 1, 3), Hit("lunge", 5, 6.5)]
+    plain = EvaluationResult(["squat"], ["squat"], ["lunge"], "azimuth 0", baseline=["squat"])
+    other = EvaluationResult(["squat"], ["squat"], ["squat"], "azimuth 90", baseline=["lunge"])
+    report = RecognitionReport("t", recordings=[recording(events, [("squat", 1.0, 3.0)])], evaluations=[plain, other])
+    text = write(tmp_path, report)
+    assert "Score: the evidence for the action" in text and "Margin: how far that is above the next best" in text
+    assert "1 of them false" in text and "<title>found: lunge, 5.00 to 6.50 s</title>" in text
+    assert '<table class="stack"><thead><tr><th scope="col" class="">Setting' in text
