@@ -8,6 +8,9 @@ from torch import Tensor
 PRECISE = (torch.float32, torch.float64)
 """Types of numbers with the digits that measurements have; three digits (float16) or two (bfloat16) are fewer than pixels need."""
 
+FARTHEST = 1e60
+"""Largest coordinate that is taken for a measurement, larger ones are as infinite: their products leave the range of float64."""
+
 
 def check_tensor(name: str, value: object, *shape: int | str, precise: bool = True) -> None:
     """Raise a ``ValueError`` unless ``value`` is a real floating point tensor ``(*batch, *shape)``.

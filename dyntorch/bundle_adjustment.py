@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from dyntorch.algebra.triangulation import observed
+from dyntorch.arguments import check_tensor, check_together
 from dyntorch.blocks import map_blocks
 from dyntorch.bundle_problem import BundleProblem
 
@@ -72,7 +73,8 @@ def bundle_adjust(
         subspace: ``(k + 1, r)`` orthonormal columns that span it.
 
     Returns:
-        Adjusted, in the dtype of ``x``, without gradients.  A problem whose start is not finite keeps it and has cost infinity.
+        Adjusted, in the dtype of ``x``, without gradients.  A problem whose start is not finite is not adjusted and has cost
+        infinity; what of it is not finite comes back as 0.
 
     Raises:
         ValueError: shapes that do not fit each other, another loss, or a scale that is not positive.
@@ -122,8 +124,8 @@ def bundle_adjust(
     sound = (start[0].isfinite().flatten(2).all(-1) | ~seen).all(-1) & (start[1].isfinite().all(-1) | ~moves).all(-1)
     sound = (sound & found[2].isfinite())[:, None]
     return Adjusted(
-        torch.where((sound & seen)[..., None, None], found[0], start[0]).reshape(*batch, *cameras.shape[-3:]).to(x.dtype),
-        torch.where((sound & moves)[..., None], found[1], start[1]).reshape(*batch, *structure.shape[-2:]).to(x.dtype),
+        torch.where((sound & seen)[..., None, None], found[0], clean[0]).reshape(*batch, *cameras.shape[-3:]).to(x.dtype),
+        torch.where((sound & moves)[..., None], found[1], clean[1]).reshape(*batch, *structure.shape[-2:]).to(x.dtype),
         torch.where(sound[:, 0], found[2], torch.inf).reshape(batch).to(x.dtype),
         found[3].reshape(batch),
     )
@@ -203,12 +205,15 @@ def _scales(scale: Tensor | float, batch: torch.Size, device: torch.device) -> T
 
 def check(x: Tensor, weights: Tensor | None, cameras: Tensor, structure: Tensor, lifts: Tensor | None, loss: str) -> torch.Size:
     """The batch."""
-    if x.ndim < 3:
-        raise ValueError(f"x must be (*batch, views, n, l), got {tuple(x.shape)}; unsqueeze a single view")
+    check_tensor("x", x, "views", "n", "l")
+    check_tensor("cameras", cameras, "views", "l + 1", "a + 1")
+    check_tensor("structure", structure, "n", "k + 1")
+    if lifts is not None:
+        check_tensor("lifts", lifts, "views", "a + 1", "k + 1")
     *batch, views, n, size = x.shape
-    if cameras.ndim < 3 or cameras.shape[-3:-1] != (views, size + 1):
+    if cameras.shape[-3:-1] != (views, size + 1):
         raise ValueError(f"cameras must be (*batch, {views}, {size + 1}, a + 1) for x {tuple(x.shape)}, got {tuple(cameras.shape)}")
-    if structure.ndim < 2 or structure.shape[-2] != n:
+    if structure.shape[-2] != n:
         raise ValueError(f"structure must be (*batch, {n}, k + 1) for x {tuple(x.shape)}, got {tuple(structure.shape)}")
     if weights is not None and weights.shape != x.shape[:-1]:
         raise ValueError(f"weights must be (*batch, views, n) = {tuple(x.shape[:-1])}, got {tuple(weights.shape)}")
@@ -219,4 +224,7 @@ def check(x: Tensor, weights: Tensor | None, cameras: Tensor, structure: Tensor,
         raise ValueError(f"lifts must be {wide} or (*batch, {wide[0]}, {wide[1]}, {wide[2]}), got {tuple(lifts.shape)}")
     if loss not in LOSSES:
         raise ValueError(f"loss must be one of {', '.join(LOSSES)}, got {loss!r}")
+    for name, part, last in (("cameras", cameras, 3), ("structure", structure, 2)):
+        if check_together(x=(x.double(), 3), **{name: (part.double(), last)}) != x.shape[:-3]:
+            raise ValueError(f"{name} have batch {tuple(part.shape[:-last])}, x has {tuple(batch)}; expand x")
     return torch.Size(batch)

@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from dyntorch.algebra.triangulation import observed
+from dyntorch.arguments import check_tensor
 from dyntorch.bundle_adjustment import LOSSES, check
 from dyntorch.bundle_problem import BundleProblem
 
@@ -37,6 +38,10 @@ def point_information(cameras: Tensor, structure: Tensor, weights: Tensor | None
         >>> point_information(torch.eye(3)[None], torch.tensor([[0.0, 0.0, 2.0]]))[0].diagonal().tolist()
         [1.0, 1.0, 0.0]
     """
+    check_tensor("cameras", cameras, "views", "l + 1", "a + 1")
+    check_tensor("structure", structure, "n", "k + 1")
+    if not cameras.shape[-2]:
+        raise ValueError(f"cameras must be (*batch, views, l + 1, a + 1), got {tuple(cameras.shape)}")
     batch, views, n = cameras.shape[:-3], cameras.shape[-3], structure.shape[-2]
     x = cameras.new_zeros(*batch, views, n, cameras.shape[-2] - 1)
     check(x, weights, cameras, structure, lifts, LOSSES[0])

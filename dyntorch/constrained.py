@@ -10,13 +10,14 @@ from torch import Tensor
 from dyntorch.blocks import map_blocks
 from dyntorch.invariant import Invariant
 from dyntorch.least_squares import minimize
-from dyntorch.matches import Matches
+from dyntorch.matches import Matches, relative_weights
 from dyntorch.matrix import gram
 from dyntorch.motion_problem import BLOCK, parts_of
 from dyntorch.normalize import denormalize
 from dyntorch.solution import Solution, copied, failed
 
 ITERATIONS = 30
+FREE = 1e-8  # least damping: leaves the gauge of the motions where it is to 1e-10
 
 
 @dataclass(frozen=True)
@@ -109,7 +110,7 @@ def algebraic_motion(solution: Solution, data: Matches, iterations: int = ITERAT
     invariant, norm = solution.invariant, solution.normalization
     views, weights, static = copied(invariant, data)
     views = tuple(x.detach() for x in norm.apply(invariant, views))
-    weights = weights / weights.amax(-1, keepdim=True).clamp(min=torch.finfo(weights.dtype).tiny)
+    weights = relative_weights(weights)
     base = invariant.normalized(tuple(t.detach() for t in norm.transforms))
     starts = base.starts(solution.normalized.detach())
     shapes = tuple(part.shape[2:] for part in starts)
@@ -122,7 +123,7 @@ def algebraic_motion(solution: Solution, data: Matches, iterations: int = ITERAT
         costs = torch.stack([problem.cost(theta) for theta in tensors.unbind(1)])
         best = costs.nan_to_num(nan=torch.inf).argmin(0)
         theta = tensors.gather(1, best[:, None, None].expand(-1, 1, tensors.shape[-1]))[:, 0]
-        return minimize(problem, theta, iterations)[:2]
+        return minimize(problem, theta, iterations, settle=2, least=FREE)[:2]
 
     theta = torch.cat([part.flatten(2) for part in starts], dim=-1).transpose(0, 1)
     options = () if static is None else (static,)

@@ -10,7 +10,7 @@ from torch import Tensor
 from dyntorch.ambiguity import within_noise
 from dyntorch.blocks import map_blocks
 from dyntorch.invariant import Invariant, as_invariant
-from dyntorch.matches import Matches, matches
+from dyntorch.matches import Matches, matches, relative_weights
 from dyntorch.matrix import estimation_matrix, gram
 from dyntorch.normalize import Normalization, denormalize, normalization
 from dyntorch.nullspace import gram_null_space, null_space
@@ -127,7 +127,7 @@ def _solve(
     # components first in memory: every later pass then runs along the matches
     views = tuple(x.mT.contiguous().mT for x in views)
     # weights of any unit: a problem that counts its matches in thousands is no different
-    weights = weights / weights.amax(-1, keepdim=True).clamp(min=torch.finfo(weights.dtype).tiny)
+    weights = relative_weights(weights)
     fixed = invariant.intrinsic or not normalize
     norm = _identity(invariant, views) if fixed else normalization(invariant, views, weights)
     moved = norm.apply(invariant, views)
@@ -135,15 +135,27 @@ def _solve(
     if own is None:
         basis, status, uncertainty = _null(invariant, norm.primitives, moved, weights, static)
         tensor = invariant.normalized(norm.transforms).constrain(invariant.tensor_of(basis))
+        if invariant.nullity == 1:
+            status = torch.where(invariant.singular(tensor) & (status != int(Status.TOO_FEW)), int(Status.DEGENERATE), status)
     else:
         tensor, uncertainty = own.tensor, own.uncertainty
         status = _status(own.few, own.degenerate, own.ambiguous)
     if invariant.copies is not None:
         status, uncertainty = status.amax(-1), uncertainty.amax(-1)
-    zero = failed(status)[(..., *([None] * (tensor.ndim - status.ndim)))]
-    tensor = torch.where(zero, torch.zeros_like(tensor), tensor)
+    tensor = _zero_where_failed(status, tensor)
+    # coordinates may be so large or small that float64 holds no tensor of theirs
     back = denormalize(invariant, tensor, norm.actions)
-    return (tensor, torch.where(zero, torch.zeros_like(back), back), status, uncertainty, *norm.transforms, *norm.actions)
+    flat = back.detach().flatten(status.ndim)
+    held = flat.isfinite().all(-1) & (flat != 0).any(-1)
+    status = torch.where(held | failed(status), status, int(Status.DEGENERATE))
+    tensor, back = _zero_where_failed(status, tensor), _zero_where_failed(status, back)
+    return (tensor, back, status, uncertainty, *norm.transforms, *norm.actions)
+
+
+def _zero_where_failed(status: Tensor, tensor: Tensor) -> Tensor:
+    """The tensor, zero where the status says that there is none."""
+    zero = failed(status)[(..., *([None] * (tensor.ndim - status.ndim)))]
+    return torch.where(zero, torch.zeros_like(tensor), tensor)
 
 
 def _null(

@@ -35,7 +35,7 @@ class Bundle:
     views: tuple[Tensor, ...]
     """``(b, 1, n, ...)``."""
     scales: tuple[Tensor, ...]
-    """``(b,)`` size, in these coordinates, of one unit of the measurements."""
+    """``(b,)`` size, in these coordinates, of one unit of the search."""
     weights: Tensor
     """``(b, n)``."""
     moments: Tensor

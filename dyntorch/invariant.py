@@ -171,6 +171,10 @@ class Invariant:
 
         return jacobian(tensor, torch.cat([part.flatten(1) for part in motion], dim=-1))
 
+    def singular(self, tensor: Tensor) -> Tensor:
+        """Which normalized tensors ``(*batch, *axes)`` are those of no motion: ``(*batch,)`` bool, by default none."""
+        return torch.zeros(tensor.shape[: tensor.ndim - len(self.shape())], dtype=torch.bool, device=tensor.device)
+
     def starts(self, tensor: Tensor) -> tuple[Tensor, ...]:
         """Motions ``(tries, *batch, ...)`` from which to look for the one of a noisy tensor; by default what it decomposes into."""
         found = self.decompose(tensor)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dyntorch.arguments import check_tensor, refuse_vmap
+from dyntorch.arguments import FARTHEST, check_tensor, refuse_vmap
 from dyntorch.invariant import Invariant
 from dyntorch.primitives import Point, Primitive
 
@@ -47,7 +47,7 @@ class Matches:
 def matches(invariant: Invariant, views: Sequence[Tensor], weights: Tensor | None = None, static: Tensor | None = None) -> Matches:
     """Check the views of one invariant and put them into float64.
 
-    A match with a coordinate that is NaN or infinite in any view, or a weight that is, weighs nothing.
+    A match with a coordinate that is NaN or infinite in any view (beyond 1e60 is infinite), or a weight that is, weighs nothing.
 
     Raises:
         ValueError: another number of views, shapes that do not agree, mixed dtypes or devices, negative weights, or ``static``
@@ -65,12 +65,12 @@ def matches(invariant: Invariant, views: Sequence[Tensor], weights: Tensor | Non
     flat = [x.to(home, torch.float64).reshape(math.prod(batch), *x.shape[axis:]) for x in views]
     weight = _weights(option("weights", weights, batch, n, first), flat[0])
     label = option("static", static, batch, n, first)
-    if home.type == "cpu" and bool(torch.stack([x.detach().sum() for x in (*flat, weight)]).isfinite().all()):
-        # nothing is missing: one sum per view says so, and nothing is copied
+    if home.type == "cpu" and bool(weight.detach().sum().isfinite()) and all(bool(_near(x.detach())) for x in flat):
+        # nothing is missing: one norm per view says so, and nothing is copied
         return Matches(tuple(flat), weight, _labels(label, home), batch, first.dtype, first.device)
     present = weight.isfinite()
     for x in flat:
-        present = present & x.isfinite().flatten(2).all(-1)
+        present = present & (x.abs() <= FARTHEST).flatten(2).all(-1)
     clean = [torch.where(present[(..., *([None] * (x.ndim - 2)))], x, torch.zeros_like(x)) for x in flat]
     return Matches(
         tuple(clean),
@@ -82,6 +82,10 @@ def matches(invariant: Invariant, views: Sequence[Tensor], weights: Tensor | Non
     )
 
 
+def _near(x: Tensor) -> Tensor:
+    return torch.linalg.vector_norm(x, torch.inf) <= FARTHEST if x.numel() else torch.tensor(True)
+
+
 def _weights(given: Tensor | None, like: Tensor) -> Tensor:
     """``(b, n)`` float64."""
     if given is None:
@@ -89,6 +93,16 @@ def _weights(given: Tensor | None, like: Tensor) -> Tensor:
     if bool((given < 0).any()):
         raise ValueError(f"weights must not be negative, got {float(given.nan_to_num().min()):g}; use 0 to leave a match out")
     return given.to(like)
+
+
+def relative_weights(weights: Tensor) -> Tensor:
+    """Weights ``(*batch, n)`` over the largest of each problem."""
+    return weights / largest_weights(weights)[..., None].clamp(min=torch.finfo(weights.dtype).tiny)
+
+
+def largest_weights(weights: Tensor) -> Tensor:
+    """``(*batch,)``, 0 without matches."""
+    return weights.amax(-1) if weights.shape[-1] else weights.sum(-1)
 
 
 def _labels(label: Tensor | None, home: torch.device) -> Tensor | None:

@@ -44,7 +44,7 @@ class Problem:
         still = None if self.static is None else self.static[:, piece]
         moving = weights if still is None else weights * ~still
         value, derivative = self.moving(theta, views)
-        root = moving.sqrt()[..., None].expand(*moving.shape, value.shape[1] // moving.shape[1]).flatten(1)
+        root = moving.sqrt()[..., None].expand(*moving.shape, value.shape[1] // max(1, moving.shape[1])).flatten(1)
         value, derivative = value * root, derivative * root[:, None]
         if still is None:
             return value, derivative
@@ -52,7 +52,7 @@ class Problem:
         more = self.resting(theta, views)
         more = (
             (more[0].unflatten(1, (views[0].shape[1], -1)) * resting).flatten(1),
-            more[1] * resting.expand(*resting.shape[:2], more[0].shape[1] // resting.shape[1]).flatten(1)[:, None],
+            more[1] * resting.expand(*resting.shape[:2], more[0].shape[1] // max(1, resting.shape[1])).flatten(1)[:, None],
         )
         return torch.cat([value, more[0]], dim=-1), torch.cat([derivative, more[1]], dim=-1)
 

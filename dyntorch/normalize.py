@@ -13,6 +13,8 @@ from dyntorch.invariant import Frame, Invariant
 from dyntorch.primitives import Primitive
 
 LETTERS = "abcdefgh"
+SPREAD = 1e-120
+"""Mean square distance below which points are one: squares of lesser distances leave the range of float64."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +53,12 @@ def normalization(invariant: Invariant, views: Sequence[Tensor], weights: Tensor
     return Normalization(transforms, primitives, actions, tuple(t[..., 0, 0] for t in transforms))
 
 
+def relative(scales: Sequence[Tensor]) -> tuple[tuple[Tensor, ...], Tensor]:
+    """Scales ``(*batch,)`` of the views over the largest of them, and that one: distances then do not depend on the unit."""
+    unit = torch.stack(list(scales)).amax(0)
+    return tuple(s / unit for s in scales), unit
+
+
 def hartley(points: Tensor, weights: Tensor) -> Tensor:
     """Similarity of points ``(*batch, n, k, d)``; k points of one match share its weight."""
     d = points.shape[-1]
@@ -61,7 +69,7 @@ def hartley(points: Tensor, weights: Tensor) -> Tensor:
     shifted = flat - centre.repeat(*([1] * (centre.ndim - 1)), points.shape[-2])[..., None, :]
     spread = (shifted.square() * share).sum((-2, -1))
     # points that are equal to rounding have no scale: 1 keeps everything finite, and the rank says that they decide nothing
-    extended = spread > 1e-28 * centre.detach().square().sum(-1)
+    extended = spread > (1e-28 * centre.detach().square().sum(-1)).clamp(min=SPREAD)
     scale = torch.where(extended, (d / torch.where(extended, spread, 1.0)).sqrt(), 1.0)
     return similarity(scale, centre)
 
@@ -86,7 +94,8 @@ def _moved_axes(invariant: Invariant, tensor: Tensor, actions: Sequence[Tensor])
     small = "".join(LETTERS[i] for i in range(len(axes)))
     large = small.upper()
     maps = ",".join(f"...{small[i]}{large[i]}" for i in range(len(axes)))
-    ordered = [actions[v] for v in axes]
+    # only ratios count, and products of so many entries must not leave the range
+    ordered = [actions[v] / actions[v].detach().abs().amax((-2, -1), keepdim=True) for v in axes]
     if invariant.nullity > 1:
         ordered = [a.unsqueeze(-3) for a in ordered]
     return torch.einsum(f"...{small},{maps}->...{large}", tensor, *ordered)
@@ -94,6 +103,9 @@ def _moved_axes(invariant: Invariant, tensor: Tensor, actions: Sequence[Tensor])
 
 def _unit_norm(result: Tensor, rank: int, nullity: int) -> Tensor:
     """Tensors of so many axes at norm 1, several of them orthonormal; zero ones stay zero."""
+    largest = result.detach().flatten(-rank).abs().amax(-1)
+    largest = largest.amax(-1, keepdim=True) if nullity > 1 else largest
+    result = result / torch.where(largest > 0, largest, 1.0)[(..., *([None] * rank))]
     if nullity == 1:
         norm = result.flatten(-rank).norm(dim=-1)[(..., *([None] * rank))]
         return result / torch.where(norm > 0, norm, 1.0)

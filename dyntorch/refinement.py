@@ -12,9 +12,9 @@ from dyntorch.constrained import algebraic_motion
 from dyntorch.forward import jacobian
 from dyntorch.invariant import Invariant
 from dyntorch.least_squares import minimize
-from dyntorch.matches import Matches, matches
+from dyntorch.matches import Matches, largest_weights, matches
 from dyntorch.motion_problem import BLOCK, Problem, flattened
-from dyntorch.normalize import Normalization, denormalize, denormalize_motion
+from dyntorch.normalize import Normalization, denormalize, denormalize_motion, relative
 from dyntorch.solution import Solution, failed
 
 ITERATIONS = 30
@@ -107,7 +107,9 @@ def refine_matches(solution: Solution, data: Matches, iterations: int = ITERATIO
     size = max(1, min(BLOCK // max(1, data.count * theta.shape[-1]), -(-len(theta) // torch.get_num_threads())))
     with torch.no_grad():
         start = torch.where(theta.isfinite(), theta, torch.zeros_like(theta))
-        best, cost, matrix = map_blocks(run, start, *moved, *norm.scales, data.weights, *flags, size=size)
+        scales, unit = relative(norm.scales)
+        best, cost, matrix = map_blocks(run, start, *moved, *scales, data.weights, *flags, size=size)
+        cost, matrix = cost / unit.square(), matrix / unit.square()[:, None, None]
         return _refined(solution, data, norm, frames, shapes, best, cost, matrix)
 
 
@@ -140,7 +142,7 @@ def _refined(
         still = sum(p.freedom() for p in invariant.primitives[1:])
         conditions = torch.where(data.static, float(still), conditions)
     spare = ((data.weights > 0) * conditions).sum(-1) - invariant.dof
-    mean = cost / data.weights.amax(-1).clamp(min=torch.finfo(cost.dtype).tiny)
+    mean = cost / largest_weights(data.weights).clamp(min=torch.finfo(cost.dtype).tiny)
     sigma = torch.where(spare > 0, (mean / spare.clamp(min=1)).sqrt(), torch.inf)
     covariance = _covariance(invariant, problem, frames, theta, matrix, sigma, data.weights)
     return replace(
@@ -173,7 +175,7 @@ def _covariance(
 
     _, derivative = jacobian(moved, theta)
     spread = derivative.mT @ root
-    scale = sigma * weights.amax(-1).sqrt()
+    scale = sigma * largest_weights(weights).sqrt()
     covariance = (spread @ spread.mT) * scale.square()[:, None, None]
     # a motion without a matrix in the coordinates of the matches (singular) is not known at all, like one without spare matches
     known = scale.isfinite() & covariance.isfinite().flatten(1).all(-1)

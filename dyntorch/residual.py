@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from dyntorch.arguments import FARTHEST
 from dyntorch.invariant import Invariant, as_invariant
 from dyntorch.matches import check_views
 
@@ -24,10 +25,11 @@ def algebraic(invariant: Invariant | type[Invariant], tensor: Tensor, *views: Te
         **given: what else the invariant takes.
 
     Returns:
-        ``(*batch, n)``.
+        ``(*batch, n)``, infinite where a coordinate is missing (NaN or infinite).
 
     Raises:
-        ValueError: an invariant whose matches give several rows; shapes, dtypes or devices that do not fit.
+        ValueError: an invariant whose matches give several rows, or of several tensors; shapes, dtypes or devices that do not
+            fit.
 
     Example:
         >>> import torch, dyntorch as dyn
@@ -37,7 +39,10 @@ def algebraic(invariant: Invariant | type[Invariant], tensor: Tensor, *views: Te
     """
     invariant, views = as_invariant(invariant).prepared(views, **given)
     _check(invariant, tensor, views)
-    return _form(invariant, tensor, views)[0]
+    if invariant.nullity > 1 or invariant.copies is not None:
+        raise ValueError(f"the tensors of {invariant!r} do not stand alone: a match has no single algebraic residual; use sampson")
+    views, missing = _whole(invariant, views)
+    return _infinite(_form(invariant, tensor, views)[0], missing)
 
 
 def sampson(invariant: Invariant | type[Invariant], tensor: Tensor, *views: Tensor, **given: Tensor) -> Tensor:
@@ -58,7 +63,8 @@ def sampson(invariant: Invariant | type[Invariant], tensor: Tensor, *views: Tens
         **given: what else the invariant takes.
 
     Returns:
-        ``(*batch, n)`` distances, not negative, in the unit of the measurements.
+        ``(*batch, n)`` distances, not negative, in the unit of the measurements; infinite where a coordinate is missing (NaN or
+        infinite) or the tensor belongs to no motion.
 
     Raises:
         ValueError: shapes, dtypes or devices that do not fit.
@@ -73,11 +79,24 @@ def sampson(invariant: Invariant | type[Invariant], tensor: Tensor, *views: Tens
     """
     invariant, views = as_invariant(invariant).prepared(views, **given)
     _check(invariant, tensor, views)
+    views, missing = _whole(invariant, views)
     ones = (torch.ones((), dtype=tensor.dtype, device=tensor.device),) * len(views)
     if invariant.single():
-        return multilinear(invariant, tensor, views, ones).abs()
+        return _infinite(multilinear(invariant, tensor, views, ones).abs(), missing)
     motion = invariant.decompose(tensor)
-    return distance(invariant, motion if isinstance(motion, tuple) else (motion,), views, ones)
+    return _infinite(distance(invariant, motion if isinstance(motion, tuple) else (motion,), views, ones), missing)
+
+
+def _whole(invariant: Invariant, views: Sequence[Tensor]) -> tuple[tuple[Tensor, ...], Tensor]:
+    """The views with 0 for matches that are missing in any of them, and which these are, ``(*batch, n)``."""
+    present = [(x.abs() <= FARTHEST).flatten(p.match_axis(x) + 1).all(-1) for p, x in zip(invariant.primitives, views, strict=True)]
+    missing = ~torch.stack(present).all(0)
+    return tuple(torch.where(missing[(..., *[None] * (x.ndim - missing.ndim))], 0.0, x) for x in views), missing
+
+
+def _infinite(residual: Tensor, missing: Tensor) -> Tensor:
+    """The residual, infinite where there is none."""
+    return torch.where(missing | residual.isnan(), torch.inf, residual)
 
 
 def _check(invariant: Invariant, tensor: Tensor, views: Sequence[Tensor]) -> None:

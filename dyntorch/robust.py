@@ -12,7 +12,7 @@ from dyntorch.blocks import map_blocks
 from dyntorch.fitting import fit_matches
 from dyntorch.invariant import Invariant, as_invariant
 from dyntorch.matches import Matches, matches
-from dyntorch.normalize import denormalize
+from dyntorch.normalize import denormalize, relative
 from dyntorch.refinement import refine_matches
 from dyntorch.residual import multilinear, whitened
 from dyntorch.solution import NOISY, Solution, Status, failed
@@ -83,7 +83,7 @@ def robust_fit(
         >>> scene = scenes.planar(n=200, sigma=0.5, outliers=0.3, generator=torch.Generator().manual_seed(0))
         >>> solution = dyn.robust_fit(dyn.HomographyTensor, *scene.views, threshold=1.5)
         >>> solution
-        Solution(HomographyTensor, matches=200, batch=(): 1 OK)
+        Solution(HomographyTensor, matches=200, batch=(): 1 OK, sigma 0.51)
         >>> right = scene.labels != 0
         >>> bool(solution.inliers[right].double().mean() > 0.95), bool(solution.inliers[~right].double().mean() < 0.2)
         (True, True)
@@ -188,10 +188,10 @@ def distances(solution: Solution) -> Tensor:
     def block(*tensors: Tensor) -> Tensor:
         frames, x, motion = tensors[:count], tensors[count : 2 * count], tensors[2 * count :]
         views = tuple(p.move(v, t) for p, v, t in zip(invariant.primitives, x, frames, strict=True))
-        scales = tuple(t[:, 0, 0] for t in frames)
+        scales, unit = relative([t[:, 0, 0] for t in frames])
         if alone:
-            return multilinear(invariant, motion[0], views, scales).abs()
-        return whitened(invariant, motion, views, scales).norm(dim=-1)
+            return multilinear(invariant, motion[0], views, scales).abs() / unit[:, None]
+        return whitened(invariant, motion, views, scales).norm(dim=-1) / unit[:, None]
 
     size = max(1, min(BLOCK // max(1, data.count), -(-len(data.weights) // torch.get_num_threads())))
     return map_blocks(block, *transforms, *data.views, *parts, size=size).nan_to_num(nan=torch.inf)

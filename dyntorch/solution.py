@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from functools import cached_property
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from dyntorch.arguments import check_precision
 from dyntorch.invariant import Invariant
 from dyntorch.matches import Matches
 from dyntorch.matrix import CHUNK, estimation_matrix
@@ -157,6 +160,66 @@ class Solution:
             matches=data,
         )
 
+    def __getitem__(self, key: Any) -> Solution:
+        """The solution of some problems of the batch: an index, a slice, a mask or several of them, as a tensor takes them."""
+        batch = self.matches.batch
+        if not batch:
+            raise IndexError("the solution is that of one problem; there is no batch to index")
+        chosen = torch.arange(math.prod(batch)).reshape(batch)[key]
+        flat = chosen.reshape(-1).to(self.normalized.device)
+
+        def some(part: Tensor) -> Tensor:
+            return part.flatten(0, len(batch) - 1)[flat.to(part.device)].reshape((*chosen.shape, *part.shape[len(batch) :]))
+
+        data = self.matches
+        static = None if data.static is None else data.static[flat]
+        views, weights = tuple(x[flat] for x in data.views), data.weights[flat]
+        data = replace(data, views=views, weights=weights, static=static, batch=tuple(chosen.shape))
+        return self._each(some, lambda part: part[flat], data)
+
+    def to(self, *target: torch.device | torch.dtype | str) -> Solution:
+        """The solution on another device, in another dtype, or both, as ``torch.Tensor.to`` takes them.
+
+        What is computed inside stays float64; devices without it get results computed on the CPU.
+
+        Raises:
+            ValueError: a dtype that is neither float32 nor float64.
+        """
+        data = self.matches
+        dtype = next((t for t in target if isinstance(t, torch.dtype)), data.dtype)
+        device = next((torch.device(t) for t in target if not isinstance(t, torch.dtype)), data.device)
+        check_precision("a solution", dtype)
+        home = torch.device("cpu") if device.type == "mps" else device
+
+        def there(part: Tensor) -> Tensor:
+            return part.to(device=device, dtype=dtype if part.is_floating_point() else part.dtype)
+
+        static = None if data.static is None else data.static.to(home)
+        views, weights = tuple(x.to(home) for x in data.views), data.weights.to(home)
+        data = replace(data, views=views, weights=weights, static=static, dtype=dtype, device=device)
+        return self._each(there, lambda part: part.to(home), data)
+
+    def _each(self, outer: Callable[[Tensor], Tensor], inner: Callable[[Tensor], Tensor], data: Matches) -> Solution:
+        """Another solution: ``outer`` of what the caller sees, ``inner`` of flat float64 tensors, and these matches."""
+        transforms = tuple(map(inner, self.normalization.transforms))
+        pairs = tuple(zip(self.invariant.primitives, transforms, strict=True))
+        return Solution(
+            self.invariant,
+            outer(self.tensor),
+            outer(self.status),
+            outer(self.uncertainty),
+            data,
+            Normalization(
+                transforms,
+                tuple(p.normalized(t) for p, t in pairs),
+                tuple(map(inner, self.normalization.actions)),
+                tuple(map(inner, self.normalization.scales)),
+            ),
+            inner(self.normalized),
+            *(None if part is None else outer(part) for part in (self.inliers, self.covariance, self.sigma)),
+            None if self.refined is None else tuple(map(inner, self.refined)),
+        )
+
     def check(self) -> Solution:
         """Raise where any problem failed.
 
@@ -170,7 +233,8 @@ class Solution:
         counted = Counter(Status(s).name for s in self.status.reshape(-1).tolist())
         states = ", ".join(f"{count} {name}" for name, count in sorted(counted.items(), key=lambda item: Status[item[0]]))
         shape = tuple(self.status.shape)
-        return f"Solution({self.invariant!r}, matches={self.matches.count}, batch={shape}: {states or 'empty'})"
+        noise = "" if self.sigma is None else _shown(self.sigma[self.status == Status.OK])
+        return f"Solution({self.invariant!r}, matches={self.matches.count}, batch={shape}: {states or 'empty'}{noise})"
 
     def _frames(self) -> tuple[Tensor, ...]:
         """Transforms without the dimension of copies."""
@@ -179,6 +243,11 @@ class Solution:
     def _or_zero(self, part: Tensor) -> Tensor:
         none = failed(self.status.reshape(-1).to(part.device))
         return torch.where(none[(..., *([None] * (part.ndim - 1)))], torch.zeros_like(part), part)
+
+
+def _shown(sigma: Tensor) -> str:
+    """The noise for a repr: of a batch the median."""
+    return f", sigma {'about ' if sigma.numel() > 1 else ''}{float(sigma.median()):.2g}" if sigma.numel() else ""
 
 
 def copied(invariant: Invariant, matches: Matches) -> tuple[tuple[Tensor, ...], Tensor, Tensor | None]:

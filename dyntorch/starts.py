@@ -14,8 +14,8 @@ from dyntorch.blocks import Result, map_blocks
 from dyntorch.hypotheses import Bundle, anneal, bundle, concentrate, median, msac
 from dyntorch.invariant import Invariant
 from dyntorch.matches import Matches
-from dyntorch.normalize import Normalization, normalization
-from dyntorch.sampling import uniform
+from dyntorch.normalize import Normalization, normalization, relative
+from dyntorch.sampling import Draws
 from dyntorch.solution import copied
 
 SMALL = 8
@@ -63,9 +63,13 @@ class Search:
     """The search for the tensors of a batch, among at most so many matches that memory stays bounded."""
 
     def __init__(self, invariant: Invariant, data: Matches, generator: torch.Generator | None) -> None:
-        self.invariant, self.data, self.generator = invariant, data, generator
+        self.invariant, self.data = invariant, data
+        self.draws = Draws(len(data.weights), generator, data.weights.device)
+        self.everyone = torch.arange(len(data.weights), device=data.weights.device)
         views, weights, _ = copied(invariant, replace(data, weights=data.weights * _near(invariant, data)))
         self.norm: Normalization = normalization(invariant, views, weights)
+        # the search measures in this unit, so that no limit of it depends on that of the matches
+        self.unit = relative([t.flatten(1)[:, 0] for t in self.norm.transforms])[1]
         self.some = some = self._some()
         moved = self.norm.apply(invariant, copied(invariant, some)[0])
         self.views = moved if invariant.copies else tuple(x[:, None] for x in moved)
@@ -78,7 +82,8 @@ class Search:
             cut: ``(b,)`` threshold.
             starts: numbers of starts, one after the other.
         """
-        found = self._solve(torch.arange(len(cut), device=cut.device), cut, starts[0])
+        cut = cut * self.unit
+        found = self._solve(self.everyone, cut, starts[0])
         enough = (self.weights > 0).sum(-1) >= self.invariant.minimal()
         for count in starts[1:]:
             left = (found.doubt & enough).nonzero()[:, 0]
@@ -92,8 +97,7 @@ class Search:
 
     def scale(self) -> Tensor:
         """Threshold ``(b,)`` from the data: least median of squares (annealed), and what 99 % of the inliers then keep."""
-        inv = self.invariant
-        everyone = torch.arange(len(self.weights), device=self.weights.device)
+        inv, everyone = self.invariant, self.everyone
         chosen = torch.cat([self.weights[:, None], self._samples(everyone, 16)], dim=1)
 
         def block(chosen: Tensor, *rest: Tensor) -> Tensor:
@@ -106,20 +110,19 @@ class Search:
         middle = self._map(block, everyone, chosen)
         # Rousseeuw and Leroy 1987: the median of so few is too small
         few = 1 + 5 / ((self.weights > 0).sum(-1) - inv.minimal()).clamp(min=1)
-        return threshold_of(inv, middle.sqrt() * few / chi(inv.codim, 0.5))
+        return threshold_of(inv, middle.sqrt() * few / chi(inv.codim, 0.5)) / self.unit
 
     def evidence(self, tensor: Tensor, cut: Tensor) -> Tensor:
         """Evidence ``(b,)``, see :class:`Found`, of normalized tensors as a solution holds them, with another threshold."""
         inv = self.invariant
         tensors = inv.basis_of(tensor)
-        everyone = torch.arange(len(cut), device=cut.device)
 
         def block(basis: Tensor, cut: Tensor, *rest: Tensor) -> Tensor:
             work = self._bundle(rest)
             square = work.distances(basis[:, :, None])[0][:, 0]
             return judge(work, basis[:, :, None], square, cut.square())[0]
 
-        return self._map(block, everyone, tensors if inv.copies else tensors[:, None], cut)
+        return self._map(block, self.everyone, tensors if inv.copies else tensors[:, None], cut * self.unit)
 
     def _solve(self, where: Tensor, cut: Tensor, count: int) -> Found:
         chosen = self.weights[where, None] if count == 1 else self._samples(where, count)
@@ -150,7 +153,7 @@ class Search:
         minimal = self.invariant.minimal()
         size, count = (minimal, count * DRAWN) if minimal <= SMALL else (-(-5 * minimal // 2), count)
         present = self.weights[where, None] > 0
-        drawn = self._random(len(where), count, self.weights.shape[-1]).masked_fill(~present, 2.0)
+        drawn = self.draws(where, count, self.weights.shape[-1]).masked_fill(~present, 2.0)
         last = drawn.kthvalue(min(size, drawn.shape[-1]), dim=-1, keepdim=True).values
         return ((drawn <= last) & present).to(torch.float64)
 
@@ -159,12 +162,9 @@ class Search:
         data, limit = self.data, max(SEARCHED, 10 * self.invariant.width())
         if data.count <= limit:
             return data
-        order = (self._random(*data.weights.shape) * (data.weights > 0)).topk(limit).indices
+        order = (self.draws(self.everyone, data.count) * (data.weights > 0)).topk(limit).indices
         rows = torch.arange(len(order), device=order.device)[:, None]
         return replace(data, views=tuple(x[rows, order] for x in data.views), weights=data.weights[rows, order])
-
-    def _random(self, *shape: int) -> Tensor:
-        return uniform(*shape, generator=self.generator, device=self.data.weights.device)
 
     def _map(self, function: Callable[..., Result], where: Tensor, starts: Tensor, *more: Tensor) -> Result:
         inv, n = self.invariant, self.weights.shape[-1]
@@ -183,7 +183,7 @@ class Search:
             self.invariant.normalized(tuple(t[:, None] for t in transforms)),
             primitives,
             views,
-            tuple(t.flatten(1)[:, 0] for t in transforms),
+            relative([t.flatten(1)[:, 0] for t in transforms])[0],
             weights,
         )
 

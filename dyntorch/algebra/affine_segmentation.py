@@ -11,6 +11,7 @@ from dyntorch.algebra.homogeneous import homogeneous, unit
 from dyntorch.algebra.hyperplane_pair import hyperplane_pair
 from dyntorch.algebra.partition import order_of_bodies
 from dyntorch.algebra.two_views import check_matches, described
+from dyntorch.arguments import FARTHEST
 from dyntorch.nullspace import gram_null_space
 
 MATCHES = 14
@@ -77,11 +78,13 @@ def affine_segmentation(x1: Tensor, x2: Tensor, weights: Tensor | None = None) -
         ([1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 2, 2, 2, 2, 2, 2, 2, 2], True)
     """
     check_matches(x1, x2, weights)
+    weights = None if weights is None else torch.where(weights.isinf(), 0.0, weights)
     if x1.shape[-2] < MATCHES:
         raise ValueError(
             f"two bodies under affine cameras take {MATCHES} matches, got {x1.shape[-2]}: add {MATCHES - x1.shape[-2]}"
         )
     match = torch.cat([x2, x1], dim=-1).double()
+    match = torch.where(match.abs() <= FARTHEST, match, torch.nan)
     # the information of the inhomogeneous z at unit noise, J^T J with the Jacobian J = [I | -z] of the division
     across = torch.cat([torch.eye(4, dtype=match.dtype, device=match.device).expand(*match.shape, 4), -match[..., None]], dim=-1)
     pair = hyperplane_pair(homogeneous(match), weights, information=across.mT @ across)

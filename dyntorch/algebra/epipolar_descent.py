@@ -19,6 +19,7 @@ BLOCK = 1 << 17
 """Matches times fits per block: the weights stay in the cache."""
 DAMPING = 1e-3
 LAST = 1e-8
+LEAST = 1e-100  # scale, whose square still has an inverse
 
 
 @dataclass(frozen=True)
@@ -150,7 +151,7 @@ def _descend_block(tables: Products, F: Tensor, weights: Tensor, scales: Sequenc
     f = frames.matrix()
     value, square = tables.data.flat_terms(f)
     for scale in scales:
-        inverse = 1 / scale**2
+        inverse = 1 / max(scale, LEAST) ** 2
         cost = _msac(value, square, weights, inverse)
         damping = torch.full_like(cost, DAMPING)
         for _ in range(steps):

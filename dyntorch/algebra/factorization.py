@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from dyntorch.arguments import check_tensor
+
 
 def affine_factorization(views: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     r"""Best rank-3 fit of centred affine views: :math:`x_v - \bar x_v \approx X A_v`.
@@ -17,12 +19,15 @@ def affine_factorization(views: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         that the fit leaves unexplained ``(*batch,)``, from 0 (exact) to 1.
 
     Raises:
-        ValueError: fewer than two views.
+        ValueError: fewer than two views or three points, or coordinates that are not finite.
 
     Source: Tomasi and Kanade 1992.
     """
-    if views.ndim < 3 or views.shape[-3] < 2 or views.shape[-1] != 2:
-        raise ValueError(f"views must be (*batch, views >= 2, points, 2), got {tuple(views.shape)}")
+    check_tensor("views", views, "views", "points", 2)
+    if views.shape[-3] < 2 or min(views.shape[-2], 2 * views.shape[-3]) < 3:
+        raise ValueError(f"views must be (*batch, views >= 2, points >= 3, 2), got {tuple(views.shape)}")
+    if not bool(views.isfinite().all()):
+        raise ValueError("views hold coordinates that are NaN or infinite; leave those points out, or fill them in")
     centred = views - views.mean(dim=-2, keepdim=True)
     count, points = views.shape[-3], views.shape[-2]
     stacked = centred.movedim(-3, -2).reshape(*views.shape[:-3], points, 2 * count)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from dyntorch.arguments import check_tensor, check_together
+
 RIDGE = 1e-6  # of the squared norm: a flat direction gets a harmless basis vector instead of amplified noise
 
 
@@ -18,7 +20,10 @@ def orthonormal_basis(matrix: Tensor) -> Tensor:
         matrix: ``(*batch, rows, columns)`` with few columns.
 
     Returns:
-        ``(*batch, rows, columns)``.
+        ``(*batch, rows, columns)``; zero where a matrix holds a number that is not finite.
+
+    Raises:
+        ValueError: no floating point tensor of that shape, or one of half precision.
 
     Example:
         >>> import torch
@@ -26,6 +31,11 @@ def orthonormal_basis(matrix: Tensor) -> Tensor:
         >>> bool(torch.allclose(u.mT @ u, torch.eye(2, dtype=torch.float64), atol=1e-5))
         True
     """
+    check_tensor("matrix", matrix, "rows", "columns")
+    # the unit is that of the largest entry: no square of it leaves the range
+    largest = matrix.detach().abs().amax((-2, -1), keepdim=True) if matrix.shape[-2:].numel() else matrix.new_ones(1, 1)
+    usable = largest.isfinite()
+    matrix = torch.where(usable, matrix, 0.0) / torch.where(usable & (largest > 0), largest, 1.0)
     gram = matrix.mT @ matrix
     energy = gram.diagonal(dim1=-2, dim2=-1).sum(-1)
     # normalizing first keeps the ridge meaningful for any unit of the data
@@ -66,8 +76,11 @@ def canonical_correlation(first: Tensor, second: Tensor, *, shared: int = 1) -> 
         >>> round(float(canonical_correlation(u, v)), 3), round(float(canonical_correlation(u, v, shared=2)), 3)
         (1.0, 0.707)
     """
+    check_tensor("first", first)
+    check_tensor("second", second)
     if first.ndim != 3 or second.ndim != 3 or first.shape[-1] != 2 or second.shape[-1] != 2 or first.shape[1] != second.shape[1]:
         raise ValueError(f"expected bases (m, rows, 2) and (k, rows, 2), got {tuple(first.shape)} and {tuple(second.shape)}")
+    check_together(first=(first, 3), second=(second, 3))
     # planes of coordinates, so that the four entries of every product are contiguous (m, k) matrices
     left, right = first.permute(2, 0, 1), second.permute(2, 1, 0)
     c00, c01, c10, c11 = (left[i] @ right[j] for i in (0, 1) for j in (0, 1))

@@ -7,6 +7,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from dyntorch.algebra.homogeneous import finite_depth, inhomogeneous
+from dyntorch.arguments import check_tensor, check_together
 from dyntorch.nullspace import gram_null_space
 
 
@@ -18,11 +19,11 @@ def reproject(projections: Tensor, structure: Tensor) -> Tensor:
         structure: ``(*batch, n, k + 1)`` homogeneous points of any scale.
 
     Returns:
-        ``(*batch, views, n, l)``; images at infinity as in :func:`~dyntorch.algebra.homogeneous.inhomogeneous`, the zero point
-        gives 0.
+        ``(*batch, views, n, l)``; images at infinity as in :func:`~dyntorch.algebra.homogeneous.inhomogeneous`; the zero point
+        and one that is not finite, or seen by a projection that is not, give 0.
 
     Raises:
-        ValueError: projections of another width than the points have coordinates.
+        ValueError: projections of another width than the points have coordinates, dtypes, devices or batches that do not agree.
 
     Example:
         >>> import torch
@@ -30,7 +31,20 @@ def reproject(projections: Tensor, structure: Tensor) -> Tensor:
         [[[2.0, 3.0]]]
     """
     _check_width("projections", projections, structure)
-    return inhomogeneous(structure[..., None, :, :] @ projections.mT)
+    check_together(projections=(projections, 3), structure=(structure, 2))
+    image = inhomogeneous(_scaled(structure, 1)[..., None, :, :] @ _scaled(projections, 2).mT)
+    return torch.where(image.isfinite(), image, 0.0)
+
+
+def _scaled(values: Tensor, last: int) -> Tensor:
+    """Homogeneous quantities in the last dimensions with their largest entry 1 where it is extreme; 0 where one is not finite."""
+    axes = tuple(range(-last, 0))
+    if not values.shape[-last:].numel():
+        return values
+    largest = values.detach().abs().amax(axes, keepdim=True)
+    extreme = (largest > 1e60) | (largest < 1e-60)
+    values = torch.where(largest.isfinite(), values, 0.0)
+    return torch.where(extreme & (largest > 0) & largest.isfinite(), values / torch.where(largest > 0, largest, 1.0), values)
 
 
 def unit_projections(projections: Tensor) -> Tensor:
@@ -67,9 +81,9 @@ def triangulate(projections: Tensor, x: Tensor, weights: Tensor | None = None, *
         >>> (found / found[2]).round(decimals=6).tolist()
         [1.0, 2.0, 1.0, 0.5, -1.0]
     """
-    dtype = x.dtype
-    x, weights = observed(x, weights)
+    x, weights, dtype = *observed(x, weights), x.dtype
     rows, width = _check_views(projections, x)
+    check_together(projections=(projections.to(x.dtype), 3), x=(x, 3))
     sound = projections.isfinite().flatten(-2).all(-1)[..., None]
     flat = torch.where(sound, projections.to(x.dtype).flatten(-2), 0.0)
     matrices = normalize(flat, dim=-1).unflatten(-1, (rows, width))[..., None, :, :]
@@ -112,14 +126,15 @@ def resect(structure: Tensor, x: Tensor, weights: Tensor | None = None, *, lifts
         >>> bool(torch.allclose(found * M.norm() * torch.sign(found[0, 0, 0]), M))
         True
     """
-    dtype = x.dtype
-    x, weights = observed(x, weights)
+    x, weights, dtype = *observed(x, weights), x.dtype
     _check_points(structure, x)
+    batch = check_together(structure=(structure.to(x.dtype), 2), x=(x, 3))
+    x, weights = x.expand(*batch, *x.shape[-3:]), weights.expand(*batch, *weights.shape[-2:])
     points = normalize(structure.to(x.dtype), dim=-1)[..., None, :, :]
     if lifts is not None:
         _check_width("lifts", lifts, structure)
         points = points @ lifts.to(x.dtype).mT
-    points, width = points.expand(*x.shape[:-1], points.shape[-1]), points.shape[-1]
+    points, width = points.expand((*x.shape[:-1], points.shape[-1])), points.shape[-1]
     seen = (weights > 0) & points.isfinite().all(-1) & (points != 0).any(-1)
     points, weight = torch.where(seen[..., None], points, 0.0), torch.where(seen, weights, 0.0)[..., None]
     # the Gram consists of the second moments of the points with three kinds of weights: w, -w x and w |x|^2
@@ -150,8 +165,9 @@ def observed(x: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor]:
         >>> observed(torch.tensor([[[1.0, 2.0], [float("nan"), 0.0]]]), None)[1].tolist()
         [[1.0, 0.0]]
     """
-    if x.ndim < 3:
-        raise ValueError(f"x must be (*batch, views, n, l), got {tuple(x.shape)}; unsqueeze a single view")
+    check_tensor("x", x, "views", "n", "l")
+    if weights is not None and not isinstance(weights, Tensor):
+        raise ValueError(f"weights must be a torch.Tensor, got {type(weights).__name__}; use torch.as_tensor(...)")
     if weights is not None and weights.shape != x.shape[:-1]:
         raise ValueError(f"weights must be (*batch, views, n) = {tuple(x.shape[:-1])}, got {tuple(weights.shape)}")
     x = x.double()
@@ -190,7 +206,9 @@ def _gauss_newton(structure: Tensor, matrices: Tensor, x: Tensor, weights: Tenso
 
 
 def _check_width(name: str, matrices: Tensor, structure: Tensor) -> None:
-    if matrices.ndim < 3 or structure.ndim < 2 or matrices.shape[-1] != structure.shape[-1]:
+    check_tensor(name, matrices, "views", "rows", "k + 1")
+    check_tensor("structure", structure, "n", "k + 1")
+    if not structure.shape[-1] or matrices.shape[-1] != structure.shape[-1]:
         raise ValueError(
             f"{name} must be (*batch, views, rows, k + 1) for structure (*batch, n, k + 1), "
             f"got {tuple(matrices.shape)} for {tuple(structure.shape)}"
@@ -198,8 +216,9 @@ def _check_width(name: str, matrices: Tensor, structure: Tensor) -> None:
 
 
 def _check_views(projections: Tensor, x: Tensor) -> tuple[int, int]:
+    check_tensor("projections", projections, "views", "l + 1", "k + 1")
     views, rows = x.shape[-3], x.shape[-1] + 1
-    if projections.ndim < 3 or projections.shape[-3:-1] != (views, rows):
+    if projections.shape[-3:-1] != (views, rows):
         raise ValueError(
             f"projections must be (*batch, {views}, {rows}, k + 1) for x {tuple(x.shape)}, got {tuple(projections.shape)}"
         )
@@ -207,7 +226,8 @@ def _check_views(projections: Tensor, x: Tensor) -> tuple[int, int]:
 
 
 def _check_points(structure: Tensor, x: Tensor) -> None:
-    if structure.ndim < 2 or structure.shape[-2] != x.shape[-2]:
+    check_tensor("structure", structure, "n", "k + 1")
+    if structure.shape[-2] != x.shape[-2]:
         raise ValueError(
             f"structure must be (*batch, n, k + 1) with n = {x.shape[-2]} points as in x {tuple(x.shape)}, "
             f"got {tuple(structure.shape)}"

@@ -12,6 +12,9 @@ from dyntorch.invariant import Frame, Invariant
 from dyntorch.invariants.agreement import static_residual
 from dyntorch.primitives import HyperplanesThrough, Point, Primitive
 
+SINGULAR = 1e-12
+"""Determinant of a matrix of norm 1, in normalized coordinates, below which it maps space onto a part of it, to rounding."""
+
 
 @dataclass(frozen=True)
 class Collineation(Invariant):
@@ -88,6 +91,10 @@ class Collineation(Invariant):
             [0.5, 0.5, 0.5, 0.5]
         """
         return unit(tensor)
+
+    def singular(self, tensor: Tensor) -> Tensor:
+        """Matrices that map everything onto less than the space: what coinciding points of view 1 leave."""
+        return torch.linalg.det(tensor.detach()).abs() <= SINGULAR * torch.linalg.matrix_norm(tensor.detach()) ** (self.n + 1)
 
     @staticmethod
     def transfer(tensor: Tensor, x2: Tensor) -> Tensor:

@@ -11,6 +11,7 @@ from torch import Tensor
 from dyntorch.algebra.homogeneous import homogeneous, unit, unit_vectors
 from dyntorch.algebra.partition import order_of_bodies
 from dyntorch.algebra.two_views import check_matches, described
+from dyntorch.arguments import FARTHEST
 from dyntorch.invariants.fundamental_matrix import FundamentalMatrix
 from dyntorch.normalize import hartley
 from dyntorch.nullspace import null_space
@@ -134,11 +135,11 @@ def _checked(x1: Tensor, x2: Tensor, bodies: int, weights: Tensor | None) -> Ten
     least, n = comb(bodies + 2, 2) ** 2 - 1, x1.shape[-2]
     if n < least:
         raise ValueError(f"the multibody matrix of {bodies} bodies takes {least} matches, got {n}: add {least - n}")
-    finite = (x1.isfinite() & x2.isfinite()).all(-1)
+    finite = ((x1.abs() <= FARTHEST) & (x2.abs() <= FARTHEST)).all(-1)
     given = finite.double() if weights is None else weights.double()
     if given.shape != finite.shape or not bool((given >= 0).all()):
         raise ValueError(f"weights must be {tuple(finite.shape)} and not negative or NaN, got {tuple(given.shape)}")
-    return given * finite
+    return torch.where(finite & given.isfinite(), given, 0.0)
 
 
 def _fitted(first: Tensor, second: Tensor, bodies: int, weights: Tensor) -> tuple[Tensor, Tensor]:

@@ -76,7 +76,9 @@ def _result(data: Matches, sightings: Sightings, found: Rigid, centres: list[Ten
     none = failed(status)
     labels = torch.where(none[:, None], OUTLIER, labels)
     matrices, entries = _measured(found.motions, covariance * found.sigma.square()[:, None, None], centres, scale)
-    entries = torch.where(torch.isfinite(found.sigma)[:, None, None], entries, torch.inf)
+    # a noise beyond the range of the numbers is not known, and nor is the covariance
+    known = found.sigma.isfinite() & entries.isfinite().flatten(1).all(-1)
+    entries = torch.where(known[:, None, None], entries, torch.inf)
     u, _, _, _ = combinations(found.motions, sightings)
     velocity = torch.where((labels == OUTLIER)[..., None], 0.0, -u / 2**0.5 / scale[:, None, None])
     zero = none[:, None, None]
@@ -104,7 +106,7 @@ def _labels(data: Sightings, found: Rigid) -> Tensor:
 
 def _inverse(information: Tensor, dof: Tensor) -> tuple[Tensor, Tensor]:
     """Least eigenvalue ``(b,)`` of the degrees of freedom, and the pseudo-inverse ``(b, 12, 12)`` on them."""
-    values, vectors = torch.linalg.eigh(information)
+    values, vectors = torch.linalg.eigh(torch.where(information.isfinite().flatten(1).all(-1)[:, None, None], information, 0.0))
     used = torch.arange(12, device=dof.device) >= 12 - dof[:, None]
     least = values.gather(-1, 12 - dof[:, None])[:, 0]
     floor = 1e-14 * values[:, -1:].clamp(min=torch.finfo(values.dtype).tiny)

@@ -76,8 +76,8 @@ def outcome(given: Given, found: tuple[Tensor, ...], method: str, refined: bool)
         scales=scales * mask[:, : layout.planes, 0],
         used=used,
         residual=(cost / rows.clamp(min=1)).sqrt() * there,
-        covariance=_carried(covariance[:, :9, :9], theta[:, :9], given.frames) * there[:, None, None],
-        uncertainty=uncertainty * there,
+        covariance=_known(_carried(covariance[:, :9, :9], theta[:, :9], given.frames), there),
+        uncertainty=_known(uncertainty, there),
         status=status,
         rotation=rotation,
         calibration=given.calibration,
@@ -131,6 +131,13 @@ def _measured(given: Given, layout: Layout, theta: Tensor) -> tuple[Tensor, Tens
     e = unit_vectors(e)
     bodies = unit(e[:, layout.planes :, :, None])[..., 0]
     return found, torch.cat([e[:, : layout.planes] * sign, bodies], dim=1), normals * sign
+
+
+def _known(value: Tensor, there: Tensor) -> Tensor:
+    """Zero where there is no result, infinite where a number of it is beyond the range."""
+    wide = (..., *[None] * (value.ndim - 1))
+    finite = value.isfinite().flatten(1).all(-1) if value.ndim > 1 else value.isfinite()
+    return torch.where(there.bool()[wide], torch.where(finite[wide], value, torch.inf), 0.0)
 
 
 def _carried(covariance: Tensor, entries: Tensor, frames: tuple[Tensor, Tensor]) -> Tensor:

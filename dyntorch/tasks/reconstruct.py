@@ -79,8 +79,8 @@ def reconstruct(
         remaining ``ambiguity`` in words.
 
     Raises:
-        ValueError: fewer views or tracks than the model needs, times that are equal or that the precision does not resolve, tracks
-            of another shape, an unknown model, a lift that is not finite or of too low a rank.
+        ValueError: fewer views or tracks than the model needs, fewer different times (some views may share one), times that the
+            precision does not resolve, tracks of another shape, an unknown model, a lift that is not finite or of too low a rank.
 
     Source: thesis chapter 3 and section 8.3; Wolf and Shashua 2002; Hartley and Schaffalitzky 2004.
 
@@ -144,7 +144,9 @@ def _times(times: Tensor | Sequence[float] | None, views: int, n: int) -> Tensor
         moment = torch.empty(0)
     if moment.shape != (views,) or not bool(moment.isfinite().all()):
         swapped = "; tracks are (*batch, views, n, 2); yours look transposed" if moment.shape == (n,) and n != views else ""
-        raise ValueError(f"times must be {views} finite numbers, one per view, got {times!r}{swapped}")
+        shape = getattr(times, "shape", None)
+        got = repr(times) if shape is None else f"shape {tuple(shape)}" if tuple(shape) != (views,) else "NaN or infinite ones"
+        raise ValueError(f"times must be {views} finite numbers, one per view, got {got}{swapped}")
     return moment.double()
 
 

@@ -151,7 +151,7 @@ def test_several_slots_of_hyperplanes_have_distances_right_in_the_mean() -> None
     search = Search(invariant, matches(invariant, made.views), seeded())
     work = search._bundle((search.weights, *search.views, *search.norm.transforms))
     basis = work.first(search.weights[:, None])
-    square = work.distances(basis)[0][0, 0]
+    square = work.distances(basis)[0][0, 0] / search.unit**2
     assert float(square.mean()) == pytest.approx(4 * 0.3**2, rel=0.1)
     exact = dyn.sampson(invariant, invariant.compose(*made.motion), *made.views).square()
     assert float(torch.corrcoef(torch.stack([square, exact]))[0, 1]) > 0.8
@@ -182,7 +182,7 @@ def test_evidence_is_the_expected_number_of_chance_finds() -> None:
     data = matches(dyn.HomographyTensor(), scene.views)
     search = Search(dyn.HomographyTensor(), data, None)
     work = search._bundle((search.weights, *search.views, *search.norm.transforms))
-    limit = torch.tensor([1.5**2], dtype=torch.float64)
+    limit = (1.5 * search.unit).square()
     basis = anneal(work, work.first(search.weights[:, None]), limit, 30)
     square = work.distances(basis)[0][:, 0]
     evidence, _ = judge(work, basis, square, limit)
@@ -191,7 +191,7 @@ def test_evidence_is_the_expected_number_of_chance_finds() -> None:
     for j in range(4):
         shift = (2 * j + 1) * n // 24
         mixed = search.norm.apply(work.invariant, [x.roll(v * shift, -2) for v, x in enumerate(scene.views)])
-        hits, trials = hits + int((_sampson(basis, mixed, work.scales) <= 1.5).sum()), trials + n
+        hits, trials = hits + int((_sampson(basis, mixed, work.scales).square() <= limit).sum()), trials + n
     expected = log(n - m) + log(comb(n, k)) + log(comb(k, m)) + (k - m) * log((hits + 1) / (trials + 1))
     assert float(evidence) == pytest.approx(expected, rel=1e-9)
 
@@ -238,7 +238,7 @@ def test_starts_are_linear_fits_and_distances_are_sampson(invariant: Invariant, 
     for k in range(3):
         tensor = basis[:, 0, k, 0].unflatten(-1, widths).permute(0, *(1 + v for v in invariant.axes()))
         there = dyn.sampson(invariant, denormalize(invariant, tensor, search.norm.actions), *scene.views)
-        assert torch.allclose(square[:, k].sqrt(), there, rtol=1e-6, atol=1e-8)
+        assert torch.allclose(square[:, k].sqrt() / search.unit[:, None], there, rtol=1e-6, atol=1e-8)
         points = [x[:, 0] for x, p in zip(search.views, invariant.primitives, strict=True) if p.rows == 1]
         unit = math.prod((1 + x.square().sum(-1) for x in points), start=torch.ones(()))
         rows = estimation_matrix(search.norm.primitives, [x[:, 0] for x in search.views], chosen[:, k] / unit)
