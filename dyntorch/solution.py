@@ -216,7 +216,9 @@ class Solution:
                 tuple(map(inner, self.normalization.scales)),
             ),
             inner(self.normalized),
-            *(None if part is None else outer(part) for part in (self.inliers, self.covariance, self.sigma)),
+            None if self.inliers is None else outer(self.inliers),
+            None if self.covariance is None else outer(self.covariance),
+            None if self.sigma is None else outer(self.sigma),
             None if self.refined is None else tuple(map(inner, self.refined)),
         )
 

@@ -51,7 +51,19 @@ def test_packages_do_not_import_what_stands_on_them(package):
 
 
 LAYERS = [
-    {"algebra", "blocks", "constants", "eigenspace", "forward", "lags", "least_squares", "nullspace", "primitives", "sampling"},
+    {
+        "algebra",
+        "arguments",
+        "blocks",
+        "constants",
+        "eigenspace",
+        "forward",
+        "lags",
+        "least_squares",
+        "nullspace",
+        "primitives",
+        "sampling",
+    },
     {"invariant"},
     {"matches", "normalize", "matrix"},
     {"residual"},

@@ -57,7 +57,7 @@ def shorten(value: object, limit: int) -> str:
     text = " ".join(text.split())
     if columns(text) <= limit:
         return text
-    first, last = list(text), []
+    first, last = list(text), list[str]()
     while first and columns("".join(first)) > limit // 2:
         first.pop()
     for letter in reversed(text):
