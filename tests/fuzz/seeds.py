@@ -1,0 +1,405 @@
+"""A sound file of every format that the readers know, small, and how it is read and used."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+FRAMES, JOINTS = 8, 17
+
+
+@dataclass(frozen=True)
+class Seed:
+    """A sound file.
+
+    Args:
+        read: what reads it, and uses what was read.
+        words: of ``dyntorch`` that read it, ``{}`` in place of the path; None where no command does.
+        slow: how many other files are read in the time of this one.
+    """
+
+    name: str
+    path: Path
+    read: Callable[[Path], Any]
+    words: tuple[str, ...] | None = None
+    slow: int = 1
+
+
+def make(folder: Path) -> list[Seed]:
+    """Write all seeds."""
+    folder.mkdir(parents=True, exist_ok=True)
+    people = person(2)
+    found = [*_json(folder, people), *_tables(folder, people), *_models(folder), *_sets(folder), *_points(folder), *_pairs(folder)]
+    found += [*_tracks(folder), *_settings(folder), *_pictures(folder)]
+    return found
+
+
+def person(seed: int, frames: int = FRAMES) -> np.ndarray:
+    """``(frames, 17, 3)``: x, y in pixels, confidence; somebody who moves."""
+    rng = np.random.default_rng(seed)
+    xy = rng.uniform(100, 400, (1, JOINTS, 2)) + 20 * np.sin(
+        np.arange(frames)[:, None, None] * rng.uniform(0.1, 0.7, (1, JOINTS, 2))
+    )
+    return np.concatenate([xy, rng.uniform(0.5, 1, (frames, JOINTS, 1))], axis=2).round(2)
+
+
+def written(path: Path, value: Any) -> Path:
+    """A file of JSON, text or bytes."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    data = value if isinstance(value, bytes) else (value if isinstance(value, str) else json.dumps(value)).encode()
+    path.write_bytes(data)
+    return path
+
+
+# ---- keypoints -----------------------------------------------------------------------------------------------------------
+def keypoints(path: Path) -> None:
+    """Read as a command does, and look at every clip."""
+    from indexing.readers import read
+
+    for clip in read(path, person="largest"):
+        assert np.isfinite(clip.times).all()
+        _ = clip.duration, clip.seen.any(), repr(clip)
+
+
+def _scan(folder: Path) -> tuple[str, ...]:
+    return ("index", "scan", "{}", "-m", str(folder / "action_small.safetensors"))
+
+
+def _json(folder: Path, people: np.ndarray) -> list[Seed]:
+    flat = [frame.ravel().tolist() for frame in people]
+    coco = [{"image_id": i, "category_id": 1, "keypoints": row, "score": 0.9} for i, row in enumerate(flat)]
+    names = [f"j{i}" for i in range(JOINTS)]
+    dataset = {
+        "images": [{"id": i, "file_name": f"{i:06d}.jpg"} for i in range(FRAMES)],
+        "annotations": [{**one, "id": i, "track_id": 1} for i, one in enumerate(coco)],
+        "categories": [{"id": 1, "name": "person", "keypoints": names, "skeleton": [[1, 2], [2, 3]]}],
+    }
+    instances = [[{"keypoints": f[:, :2].tolist(), "keypoint_scores": f[:, 2].tolist(), "bbox": [[0, 0, 1, 1]]}] for f in people]
+    demo = {
+        "meta_info": {
+            "dataset_name": "c",
+            "keypoint_id2name": {str(i): n for i, n in enumerate(names)},
+            "skeleton_links": [[0, 1]],
+        },
+        "instance_info": [{"frame_id": i + 1, "instances": one} for i, one in enumerate(instances)],
+    }
+    yolo = [
+        [{"name": "person", "class": 0, "confidence": 0.9, "box": {"x1": 0, "y1": 0, "x2": 9, "y2": 9}, "track_id": 1,
+          "keypoints": {"x": f[:, 0].tolist(), "y": f[:, 1].tolist(), "visible": f[:, 2].tolist()}}] for f in people
+    ]  # fmt: skip
+    single = [{"version": 1.3, "people": [{"person_id": [-1], "pose_keypoints_2d": row}]} for row in flat]
+    for i, one in enumerate(single):
+        written(folder / "openpose" / f"cam_{i:012d}_keypoints.json", one)
+    box = people[..., :2] / 640
+    for i, frame in enumerate(box):
+        low, high = frame.min(0), frame.max(0)
+        written(
+            folder / "yolo" / f"vid_{i + 1}.txt",
+            " ".join(f"{v:.5f}" for v in [0, *(low + high) / 2, *(high - low), *frame.ravel(), 0.9]),
+        )
+    files: dict[str, Any] = {
+        "coco.json": coco, "coco_set.json": dataset, "mmpose.json": instances, "mmpose_demo.json": demo, "ultralytics.json": yolo,
+        "ultralytics_str.json": [json.dumps(frame) for frame in yolo], "openpose_list.json": single,
+        "alphapose.json": {f"{i}.jpg": {"version": "a", "bodies": [{"joints": row}]} for i, row in enumerate(flat)},
+    }  # fmt: skip
+    seeds = [Seed(name, written(folder / name, value), keypoints, _scan(folder)) for name, value in files.items()]
+    return [*seeds, *(Seed(name, folder / name, keypoints, _scan(folder)) for name in ("openpose", "yolo"))]
+
+
+def _tables(folder: Path, people: np.ndarray) -> list[Seed]:
+    names = [f"p{i}" for i in range(JOINTS)]
+    wide = [["frame", "time_s", *(f"{n}_{k}" for n in names for k in ("x", "y", "visibility"))]]
+    wide += [[i, i / 30, *frame.ravel()] for i, frame in enumerate(people)]
+    long = [["frame", "landmark", "x", "y", "z", "visibility"]]
+    long += [[i, k, *frame[k, :2], 0, frame[k, 2]] for i, frame in enumerate(people) for k in range(JOINTS)]
+    dlc = [["scorer", *["net"] * 3 * JOINTS], ["bodyparts", *(n for n in names for _ in range(3))]]
+    dlc += [["coords", *["x", "y", "likelihood"] * JOINTS], *([i, *frame.ravel()] for i, frame in enumerate(people))]
+    several = [["scorer", *["net"] * 6 * JOINTS], ["individuals", *(a for a in ("m1", "m2") for _ in range(3 * JOINTS))]]
+    several += [
+        ["bodyparts", *(n for _ in range(2) for n in names for _ in range(3))],
+        ["coords", *["x", "y", "likelihood"] * 2 * JOINTS],
+    ]
+    several += [[i, *frame.ravel(), *(frame.ravel() + 1)] for i, frame in enumerate(people)]
+    sleap = [["track", "frame_idx", "instance.score", *(f"{n}.{k}" for n in names for k in ("x", "y", "score"))]]
+    sleap += [["t1", i, 0.9, *frame.ravel()] for i, frame in enumerate(people)]
+    tables = {"mediapipe.csv": wide, "mediapipe_long.csv": long, "dlc.csv": dlc, "dlc_multi.csv": several, "sleap.csv": sleap}
+    return [
+        Seed(name, written(folder / name, "\n".join(",".join(map(str, row)) for row in rows) + "\n"), keypoints, _scan(folder))
+        for name, rows in tables.items()
+    ]
+
+
+def _sets(folder: Path) -> list[Seed]:
+    clips = np.concatenate([person(i)[..., :2] for i in range(4)])
+    about = {
+        "offsets": np.arange(5) * FRAMES,
+        "action": [0, 1, 0, 1],
+        "action_names": ["run", "sit"],
+        "fps": 30.0,
+        "names": list("abcd"),
+    }
+    arrays = {**about, "joints": clips, "subject": [1, 2, 3, 4], "split": np.arange(12).reshape(4, 3), "up": ["-y"] * 4}
+    arrays |= {"bones": [[0, 1], [1, 2]], "joint_names": [f"j{i}" for i in range(JOINTS)], "confidence": np.ones(clips.shape[:2])}
+    np.savez_compressed(folder / "clipset.npz", **arrays)
+    np.savez(
+        folder / "clipset_raw.npz",
+        **{**arrays, "frame": np.tile(np.arange(FRAMES), 4), "when": np.array(["2020-01-01"] * 4, "M8[D]")},
+    )
+    films = np.random.default_rng(0).integers(0, 255, (4 * FRAMES, 24, 32), dtype=np.uint8)
+    np.savez(folder / "films.npz", frames=films, subject=[1, 1, 2, 2], **about)
+    evaluated = ("index", "evaluate", "{}", "--leave-out", "subject", "--scorer", "nearest")
+    return [
+        *(Seed(name, folder / name, keypoints, evaluated) for name in ("clipset.npz", "clipset_raw.npz")),
+        Seed("films.npz", folder / "films.npz", films_read),
+    ]
+
+
+def films_read(path: Path) -> None:
+    """Read a film set, and look at every film."""
+    from indexing.readers.filmset import holds_frames, read_film_set
+
+    holds_frames(path)
+    for film in read_film_set(path):
+        _ = film.duration, len(film), film.label, film.frames.max()
+
+
+# ---- models --------------------------------------------------------------------------------------------------------------
+def _models(folder: Path) -> list[Seed]:
+    import torch
+
+    from indexing import ActionIndexer, Clip, FeatureIndexer, PhaseIndexer
+
+    def clips(count: int, frames: int = 40) -> list[Clip]:
+        return [Clip(person(i, frames)[..., :2], fps=30.0, label=["a", "b", "c"][i % 3], name=f"q{i}") for i in range(count)]
+
+    few, query = clips(6), clips(2)
+    ActionIndexer(scorer="nearest", search=False, reject=0.2).fit(few).save(folder / "action_small.safetensors")
+    ActionIndexer(search=False, virtual_views=1).fit(few).save(folder / "action.safetensors")
+    PhaseIndexer(harmonics=1, course="once", mirror=False).fit(clips(3, 8)).save(folder / "phase.safetensors")
+    features = np.random.default_rng(0).normal(size=(12, 3)) + np.repeat(np.eye(3), 4, 0) * 3
+    FeatureIndexer().fit(features, np.repeat(["a", "b", "c"], 4)).save(folder / "feature.safetensors")
+    films = [np.uint8(40 * np.random.default_rng(i % 2).random((12, 24, 32)).cumsum(0) % 255) for i in range(4)]
+
+    def bright(path: Path) -> None:
+        from indexing import BrightnessIndexer
+
+        torch.manual_seed(0)
+        _finite(BrightnessIndexer.load(path).decision_function(films[:1]))
+
+    def action(path: Path) -> None:
+        indexer = ActionIndexer.load(path)
+        with _other_joints(indexer.n_joints_):
+            _finite(indexer.decision_function(query))
+            indexer.predict(query)
+            _finite(indexer.predict_proba(query))
+            indexer.find(query[0])
+
+    def phase(path: Path) -> None:
+        indexer = PhaseIndexer.load(path)
+        with _other_joints(indexer.n_joints_):
+            _finite(indexer.decision_function(query))
+            indexer.predict(query)
+
+    def feature(path: Path) -> None:
+        indexer = FeatureIndexer.load(path)
+        _finite(indexer.decision_function(features[:, : indexer.n_features_in_])) if indexer.n_features_in_ <= 3 else None
+
+    from indexing import BrightnessIndexer
+
+    BrightnessIndexer(size=24, flip=False).fit(films, ["a", "b", "a", "b"]).save(folder / "bright.safetensors")
+    session = written(folder / "session.json", [
+        {"image_id": i, "category_id": 1, "keypoints": row.ravel().tolist(), "score": 1.0} for i, row in enumerate(person(1, 40))
+    ])  # fmt: skip
+    scan = ("index", "scan", str(session), "-m", "{}")
+    reads: dict[str, tuple[Callable[[Path], None], int]] = {
+        "action_small": (action, 4), "action": (action, 6), "phase": (phase, 8), "feature": (feature, 1), "bright": (bright, 12),
+    }  # fmt: skip
+    return [
+        Seed(f"{name}.safetensors", folder / f"{name}.safetensors", read, scan if name != "bright" else None, slow)
+        for name, (read, slow) in reads.items()
+    ]
+
+
+def _finite(values: Any) -> None:
+    assert np.isfinite(values).all(), "NaN in the answer of a loaded model"
+
+
+@contextlib.contextmanager
+def _other_joints(joints: int) -> Any:
+    """A model of other joints than the query's refuses it, rightly."""
+    try:
+        yield
+    except ValueError as problem:
+        if joints == JOINTS and "shares" not in str(problem):
+            raise RuntimeError(f"a loaded model cannot be used: {problem}") from problem
+
+
+# ---- points, pairs, tracks -----------------------------------------------------------------------------------------------
+def points(path: Path) -> None:
+    """Read the views of an alignment."""
+    from indexing.readers.points import open_points, read_matches
+
+    if path.suffix == ".npz":
+        read_matches([path])
+    else:
+        read_matches([path], frames=(1, 2, 3)) if path.suffix == ".c3d" else open_points(path)
+
+
+def c3d(frames: int = 5, count: int = 4) -> bytes:
+    """A C3D file of reals, with names of its markers."""
+
+    def parameter(name: str, code: int, sides: tuple[int, ...], raw: bytes, last: bool = False) -> bytes:
+        body = struct.pack("bB", code, len(sides)) + bytes(sides) + raw + b"\0"
+        return struct.pack("bb", len(name), 1) + name.encode() + struct.pack("<h", 0 if last else 2 + len(body)) + body
+
+    group = struct.pack("bb", 5, -1) + b"POINT" + struct.pack("<h", 3) + b"\0"
+    names = b"".join(f"mk{i}".encode().ljust(4) for i in range(count))
+    section = group + parameter("LABELS", -1, (4, count), names) + parameter("FRAMES", 2, (), struct.pack("<h", frames), last=True)
+    section = (bytes([1, 80, 2, 84]) + section).ljust(1024, b"\0")
+    head = struct.pack("<BB4HHfHH", 2, 80, count, 0, 1, frames, 0, -1.0, 4, 0).ljust(512, b"\0")
+    rng = np.random.default_rng(0)
+    values = np.concatenate([rng.normal(size=(frames, count, 3)) * 100, np.zeros((frames, count, 1))], 2)
+    return head + section + values.astype("<f4").tobytes()
+
+
+def _points(folder: Path) -> list[Seed]:
+    rng = np.random.default_rng(1)
+    xy, xyz = rng.uniform(0, 500, (12, 2)).round(2), rng.normal(size=(12, 3)).round(3)
+    lines = "id,x1,y1,z1,x2,y2,z2\n" + "".join(
+        f"l{i},{','.join(map(str, row))}\n" for i, row in enumerate(np.hstack([xyz, xyz + 1]))
+    )
+    table = "id,x,y,weight,static\n" + "".join(f"p{i},{x},{y},1,{i % 2}\n" for i, (x, y) in enumerate(xy))
+    np.save(folder / "points.npy", xyz)
+    np.savez(
+        folder / "views.npz",
+        x1=xy,
+        x2=xy + 1,
+        x3=xy + 2,
+        ids=[f"p{i}" for i in range(12)],
+        weights=np.ones(12),
+        static=np.arange(12) % 2,
+    )
+    head = "ply\nformat {}\nelement vertex 12\nproperty {} x\nproperty {} y\nproperty {} z\nend_header\n"
+    ascii_ply = head.format("ascii 1.0", *["float"] * 3) + "".join(" ".join(map(str, row)) + "\n" for row in xyz)
+    binary = head.format("binary_little_endian 1.0", *["double"] * 3).encode() + xyz.astype("<f8").tobytes()
+    files: dict[str, Any] = {
+        "points.csv": table,
+        "lines.csv": lines,
+        "ascii.ply": ascii_ply,
+        "binary.ply": binary,
+        "marks.c3d": c3d(),
+    }
+    for name, value in files.items():
+        written(folder / name, value)
+    alone = {"views.npz": ("align", "{}"), "marks.c3d": ("align", "{}", "--frames", "1", "2", "3")}
+    return [
+        Seed(name, folder / name, points, alone.get(name, ("align", "{}", str(folder / name), str(folder / name))))
+        for name in (*files, "points.npy", "views.npz")
+    ]
+
+
+def _pairs(folder: Path) -> list[Seed]:
+    from indexing.readers.pairs import read_pair
+
+    rng = np.random.default_rng(2)
+    x1 = rng.uniform(0, 600, (20, 2)).round(2)
+    both = np.hstack([x1, x1 + rng.normal(size=(20, 2)).round(2) + 5])
+    rows = "".join(f"m{i},{','.join(map(str, row))},1,{i % 3}\n" for i, row in enumerate(both))
+    written(folder / "pair.csv", "id,x1,y1,x2,y2,weight,label\n" + rows)
+    np.save(folder / "pair.npy", both)
+    np.savez_compressed(
+        folder / "pair.npz", x1=both[:, :2], x2=both[:, 2:], label=np.arange(20) % 3, ids=np.arange(20).astype(str), wh=[640, 480]
+    )
+    return [Seed(name, folder / name, read_pair, ("segment", "{}"), 2) for name in ("pair.csv", "pair.npy", "pair.npz")]
+
+
+def _tracks(folder: Path) -> list[Seed]:
+    from indexing.readers.tracks.reading import read_tracks
+
+    rng = np.random.default_rng(3)
+    start, speed = rng.uniform(0, 500, (9, 2)), rng.normal(size=(9, 2))
+    views = [np.array([[1, 0.01 * v], [-0.01 * v, 1]]) for v in range(5)]
+    tracks = np.stack([(start + v * speed) @ view + 3 * v for v, view in enumerate(views)]).round(3)
+    rows = [f"{v},{v / 5},p{i},{x},{y},1,{int(i < 3)}" for v, view in enumerate(tracks) for i, (x, y) in enumerate(view)]
+    written(folder / "tracks.csv", "frame,time,id,x,y,weight,static\n" + "\n".join(rows) + "\n")
+    np.save(folder / "tracks.npy", tracks)
+    extra = {"times": np.arange(5) / 5, "ids": [f"p{i}" for i in range(9)], "static": np.arange(9) < 3, "weights": np.ones((5, 9))}
+    np.savez(folder / "tracks.npz", tracks=tracks, **extra)
+    np.savez_compressed(folder / "tracks_c.npz", **{"a/y": tracks, "b/y": tracks})
+
+    def read(path: Path) -> None:
+        found = read_tracks([path], key="a" if path.name == "tracks_c.npz" else None)
+        _ = found.since_first().seen(), found.views
+
+    def marked(path: Path) -> None:
+        read_tracks([folder / "tracks.csv"], static=path)
+
+    written(folder / "static.csv", "id\np0\np1\n")
+    quick = ("reconstruct", "{}", "--motion", "static_2d")
+    seeds = [Seed(name, folder / name, read, quick, 3) for name in ("tracks.csv", "tracks.npy", "tracks.npz")]
+    return [
+        *seeds,
+        Seed("tracks_c.npz", folder / "tracks_c.npz", read, (*quick, "--key", "a"), 3),
+        Seed("static.csv", folder / "static.csv", marked),
+    ]
+
+
+# ---- settings and pictures -----------------------------------------------------------------------------------------------
+def _settings(folder: Path) -> list[Seed]:
+    from indexing.cli.inputs import read_truth
+    from indexing.syncing.calibration import read_calibration
+
+    written(folder / "truth.csv", "label,start,end,file\na,0.1,0.5,session.json\nb,0.6,0.9,session.json\n")
+    lens = "matrix = [[900.0, 0.0, 320.0], [0.0, 900.0, 240.0], [0.0, 0.0, 1.0]]\ndistortions = [-0.1, 0.0, 0.0, 0.0]\n"
+    written(folder / "Calib.toml", "".join(f'[cam0{i}]\nname = "cam0{i}"\nsize = [640.0, 480.0]\n{lens}' for i in (1, 2)))
+    for camera in (1, 2):
+        for i, frame in enumerate(person(camera, 14)):
+            one = {"people": [{"person_id": [-1], "pose_keypoints_2d": frame.ravel().tolist()}]}
+            written(folder / "pose" / f"cam0{camera}_json" / f"cam_{i:06d}_keypoints.json", one)
+    truth = (*_scan(folder), "--truth", "{}")
+    scan = tuple(word if word != "{}" or i > 2 else str(folder / "session.json") for i, word in enumerate(truth))
+    return [
+        Seed("truth.csv", folder / "truth.csv", partial(read_truth, recordings=["session.json"]), scan),
+        Seed("Calib.toml", folder / "Calib.toml", read_calibration, ("sync", str(folder / "pose"), "--calibration", "{}")),
+    ]
+
+
+def _pictures(folder: Path) -> list[Seed]:
+    from PIL import Image
+
+    from indexing.readers.images import read_image
+
+    image = np.random.default_rng(0).integers(0, 255, (24, 32), dtype=np.uint8)
+    Image.fromarray(image).save(folder / "image.png")
+    seeds = [Seed("image.png", folder / "image.png", read_image)]
+    try:
+        import av
+    except ImportError:
+        return seeds
+    path = folder / "video.mp4"
+    with av.open(str(path), "w") as container:
+        container.metadata["title"] = "a film"
+        stream = container.add_stream("libx264", rate=30, options={"preset": "ultrafast"})
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        for i in range(10):
+            picture = np.roll(np.tile(np.arange(64, dtype=np.uint8) * 4, (48, 1)), 3 * i, axis=1)
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="gray")))
+        container.mux(stream.encode())
+    return [*seeds, Seed("video.mp4", path, video, ("index", "fit", "a={}", f"b={path}", "-o", str(folder / "out.safetensors")), 3)]
+
+
+def video(path: Path) -> None:
+    """Probe a video, and read its frames."""
+    from indexing.video import probe, read_video
+
+    probe(path)
+    for chunk in read_video(path):
+        assert np.isfinite(chunk.times).all()
