@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import datetime
+import errno
 import hashlib
 import json
 import math
@@ -12,14 +13,18 @@ import os
 import platform
 import re
 import secrets
-from collections.abc import Iterable, Mapping, Sequence
+import shutil
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
+from indexing.opening import is_regular, parse_json, read_text
+
 PACKAGES = ("dyntorch", "torch", "numpy", "scikit-learn")
 MANIFEST = "manifest.json"
+ATTEMPTS = 20  # of putting a folder where others put theirs
 
 
 def prepare(folder: str | Path) -> Path:
@@ -45,29 +50,86 @@ def prepare(folder: str | Path) -> Path:
     return path
 
 
-def write_bytes(path: str | Path, data: bytes) -> Path:
-    """Write a file whole or not at all: under a temporary name in the same folder, then renamed.
+@contextlib.contextmanager
+def replacing(path: str | Path) -> Iterator[IO[bytes]]:
+    """A stream to a file that appears whole or not at all: under a temporary name beside it, then renamed.
+
+    Whoever is killed while writing leaves the older file of this name as it was; of several who write at once one is the last, and
+    the file is whole in any case.
 
     Raises:
-        ValueError: the file cannot be written; an older file of this name is then still as it was.
+        ValueError: the file cannot be written (no such folder, no rights, a full disk); the older one is then still as it was.
     """
     target = Path(path)
     temporary = _temporary(target.parent)
     try:
         # os.open rather than tempfile: mkstemp's mode 0600 would keep colleagues from opening the report.
-        descriptor = os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY | getattr(os, "O_BINARY", 0), 0o666)
-        with os.fdopen(descriptor, "wb") as stream:
-            stream.write(data)
+        descriptor = os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_RDWR | getattr(os, "O_BINARY", 0), 0o666)
+        with os.fdopen(descriptor, "w+b") as stream:
+            yield stream
         os.replace(temporary, target)
     except BaseException as error:
         with contextlib.suppress(OSError):
             temporary.unlink()
         if isinstance(error, OSError):
-            raise ValueError(
-                f"cannot write {str(target)!r} ({error.strerror or error}); free the name or the disk, or choose another folder"
-            ) from error
+            raise _unwritten(target, error) from error
         raise
-    return target
+
+
+def replace_folder(building: Path, target: Path) -> None:
+    """Put a finished folder in the place of another one, of this file system.
+
+    Of several who do so at once one is the last; whoever is killed between the two renames leaves the older folder beside it, which
+    :func:`recover_folder` brings back.
+
+    Raises:
+        ValueError: it cannot be put there; the older one is then still as it was.
+    """
+    old = target.with_name(f".{target.name}-{secrets.token_hex(8)}.old")
+    try:
+        for _ in range(ATTEMPTS):
+            with contextlib.suppress(FileNotFoundError):  # none is there, or somebody else was quicker
+                target.rename(old)
+            try:
+                building.rename(target)
+                break
+            except OSError as problem:
+                if problem.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+                    if old.exists():
+                        old.rename(target)
+                    raise
+                shutil.rmtree(old, ignore_errors=True)  # another finished folder has come into its place
+        else:
+            raise OSError(errno.EBUSY, "others write it all the time")
+    except OSError as error:
+        raise _unwritten(target, error) from error
+    finally:
+        shutil.rmtree(building, ignore_errors=True)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def recover_folder(target: Path) -> None:
+    """Bring back what :func:`replace_folder` had put aside when it was killed."""
+    aside = sorted(target.parent.glob(f".{target.name}-*.old")) if target.parent.is_dir() and not target.exists() else []
+    if aside:
+        with contextlib.suppress(OSError):
+            aside[-1].rename(target)
+
+
+def _unwritten(target: Path, problem: OSError) -> ValueError:
+    what = problem.strerror or problem
+    return ValueError(f"cannot write {str(target)!r} ({what}); free the name or the disk, or choose another folder")
+
+
+def write_bytes(path: str | Path, data: bytes) -> Path:
+    """Write a file whole or not at all; see :func:`replacing`.
+
+    Raises:
+        ValueError: the file cannot be written; an older file of this name is then still as it was.
+    """
+    with replacing(path) as stream:
+        stream.write(data)
+    return Path(path)
 
 
 def write_text(path: str | Path, text: str) -> Path:
@@ -153,9 +215,9 @@ def remove_stale(folder: Path, written: Iterable[str], ours: str) -> None:
     Only files that the folder's own manifest lists under ``files``, and whose name matches the pattern ``ours``, are touched.
     """
     try:
-        listed = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))["files"]
+        listed = parse_json(folder, read_text(folder / MANIFEST), "")["files"]
         stale = {str(name) for name in listed} - set(written)
-    except (OSError, ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError):
         return  # no manifest, or not one of ours: then nothing here is known to be ours
     for name in stale:
         if re.fullmatch(ours, name):
@@ -170,7 +232,7 @@ def _temporary(folder: Path) -> Path:
 def _hashes(path: Path) -> str | dict[str, str]:
     try:
         if path.is_dir():
-            files = sorted(child for child in path.rglob("*") if child.is_file())
+            files = sorted(child for child in path.rglob("*") if is_regular(child))
             return {child.relative_to(path).as_posix(): _sha256(child) for child in files}
         return _sha256(path)
     except OSError as error:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -185,7 +184,7 @@ def _model(parts: Parts, header: dict[str, Any], sizes: Sizes, layout: Layout | 
         kernels=kernels,
         support=support,
         machine=read_machine(parts, sizes.classes, len(support), "machine.") if support is not None else None,
-        evidence_out=parts.real("evidence_out", None, least=-math.inf, most=math.inf),
+        evidence_out=parts.real("evidence_out", None),
         blend=Blend(**blend),
         bodies=bodies,
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Hashable, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from indexing.clip import Clip
+from indexing.files import replacing
 from indexing.opening import error, shown
 from indexing.skeleton import Skeleton
 
@@ -112,10 +112,5 @@ def _column(path: Path, clips: list[Clip], key: str) -> Array:
 def _write(path: Path, data: dict[str, Array]) -> None:
     if not path.parent.is_dir():
         raise error(path, f"the folder {path.parent} does not exist", "create it first")
-    draft = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        with draft.open("wb") as file:
-            np.savez_compressed(file, **data)  # type: ignore[arg-type]
-        draft.replace(path)
-    finally:
-        draft.unlink(missing_ok=True)
+    with replacing(path) as stream:
+        np.savez_compressed(stream, **data)  # type: ignore[arg-type]

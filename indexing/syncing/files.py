@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from indexing.clip import Clip
-from indexing.opening import error
+from indexing.files import recover_folder, replace_folder
+from indexing.opening import error, parse_json, read_text
 from indexing.readers.detect import detect_json
 from indexing.readers.files import frame_number, load_json
 from indexing.syncing.takes import Take
@@ -112,9 +113,9 @@ def check_target(folder: Path, inputs: Sequence[Path]) -> None:
 def ours(folder: Path) -> bool:
     """Whether an earlier run of this command wrote the folder's shifted files."""
     try:
-        known = json.loads((folder / "sync.json").read_text(encoding="utf-8"))
+        known = parse_json(folder, read_text(folder / "sync.json"), "")
         return str(known["manifest"]["arguments"]["command"]) == "sync"
-    except (OSError, ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError):
         return False
 
 
@@ -124,15 +125,12 @@ def write_poses(folder: Path, plans: Sequence[Plan]) -> Path:
     Frames of an OpenPose folder are copied as they are, under their new numbers; other formats are written as OpenPose JSON.
     """
     target = folder / FOLDER
+    recover_folder(target)
     building = folder / f".{FOLDER}-{secrets.token_hex(8)}.tmp"
     try:
         for one in (one for one in plans if len(one.rows)):
             _write_camera(building / f"{one.take.name}_json", one)
-        old = folder / f".{FOLDER}-{secrets.token_hex(8)}.old"
-        if target.exists():
-            target.rename(old)
-        building.rename(target)
-        shutil.rmtree(old, ignore_errors=True)
+        replace_folder(building, target)
     except OSError as problem:
         raise ValueError(
             f"cannot write {str(target)!r} ({problem.strerror or problem}); free the name or the disk, or choose another folder"

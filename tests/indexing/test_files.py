@@ -1,0 +1,126 @@
+"""Files are written whole or not at all: whoever is killed, whoever writes at the same time, and where the disk is full."""
+
+from __future__ import annotations
+
+import resource
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from indexing import Clip, ClipSet, FeatureIndexer
+from indexing.files import recover_folder, replace_folder, replacing, write_bytes, write_text
+
+CLIPS = ClipSet([Clip(np.random.default_rng(0).normal(size=(50, 17, 2)), label="a", name="a")])
+
+
+@contextmanager
+def small_disk(size: int = 1000) -> Iterator[None]:
+    """Files may not grow beyond so many bytes, as on a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def save_clips(path: Path) -> None:
+    CLIPS.save(path)
+
+
+def save_model(path: Path) -> None:
+    features = np.random.default_rng(0).normal(size=(20, 8))
+    FeatureIndexer().fit(features, np.arange(20) % 2).save(path)
+
+
+def save_table(path: Path) -> None:
+    write_text(path, "label,start,end\n" * 1000)
+
+
+@pytest.mark.parametrize("save", [save_clips, save_model, save_table])
+def test_a_full_disk_is_said_and_keeps_the_old_file(save, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    path = tmp_path / "out.file"
+    path.write_text("the old one")
+    with small_disk(), pytest.raises(ValueError, match=r"cannot write .*out\.file.* \(File too large\); free the name or the disk"):
+        save(path)
+    assert path.read_text() == "the old one"
+    assert [entry.name for entry in tmp_path.iterdir()] == ["out.file"]
+
+
+@pytest.mark.parametrize("save", [save_clips, save_model, save_table])
+def test_a_folder_that_is_not_there_is_said(save, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(ValueError, match=r"no.*out"):
+        save(tmp_path / "no" / "out.file")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_killed_write_leaves_the_old_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("the old one")
+    code = (
+        "import os, signal, sys\nfrom indexing.files import replacing\n"
+        "with replacing(sys.argv[1]) as stream:\n    stream.write(b'half of the new')\n    stream.flush()\n"
+        "    os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(path)], check=False)
+    assert done.returncode == -signal.SIGKILL
+    assert path.read_text() == "the old one"
+
+
+def test_an_exception_while_writing_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(KeyError), replacing(tmp_path / "a.csv") as stream:  # noqa: PT012
+        stream.write(b"half")
+        raise KeyError
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_several_who_write_one_file_leave_one_whole_file(tmp_path: Path) -> None:
+    path, texts = tmp_path / "a.csv", [bytes([65 + i]) * 100_000 for i in range(4)]
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(lambda i: write_bytes(path, texts[i % 4]), range(40)))
+    assert path.read_bytes() in texts
+    assert [entry.name for entry in tmp_path.iterdir()] == ["a.csv"]
+
+
+def folder(path: Path, text: str) -> Path:
+    path.mkdir()
+    for name in "abc":
+        (path / name).write_text(text)
+    return path
+
+
+def contents(path: Path) -> set[str]:
+    return {file.read_text() for file in path.iterdir()}
+
+
+def test_several_who_replace_one_folder_leave_one_whole_folder(tmp_path: Path) -> None:
+    target = tmp_path / "pose-sync"
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(lambda i: replace_folder(folder(tmp_path / f"new{i}", f"{i}"), target), range(24)))
+    assert len(contents(target)) == 1
+    assert len(list(target.iterdir())) == 3
+    assert [entry.name for entry in tmp_path.iterdir()] == ["pose-sync"]
+
+
+def test_a_folder_that_cannot_be_put_there_leaves_the_old_one(tmp_path: Path) -> None:
+    target = folder(tmp_path / "pose-sync", "old")
+    with pytest.raises(ValueError, match=r"cannot write .*pose-sync.* \(No such file or directory\)"):
+        replace_folder(tmp_path / "none", target)
+    assert contents(target) == {"old"}
+
+
+def test_a_folder_put_aside_by_whoever_was_killed_comes_back(tmp_path: Path) -> None:
+    target = tmp_path / "pose-sync"
+    folder(tmp_path / ".pose-sync-0123.old", "old")
+    recover_folder(target)
+    assert contents(target) == {"old"}
+    folder(tmp_path / ".pose-sync-4567.old", "older")
+    recover_folder(target)  # there is one: it stays
+    assert contents(target) == {"old"}
