@@ -1,0 +1,287 @@
+"""Files made to do harm: sizes declared and not there, archives that unpack to gigabytes, pipes, devices, endless brackets."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import re
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from indexing.cli.inputs import read_truth
+from indexing.opening import clipped, parse_json, read_text, shown
+from indexing.readers import npz as npz_gate
+from indexing.readers import read
+from indexing.readers.filmset import read_film_set
+from indexing.readers.images import read_image
+from indexing.readers.pairs import read_pair
+from indexing.readers.points import open_points, read_matches
+from indexing.readers.tracks.reading import read_tracks
+from indexing.syncing.calibration import read_calibration
+
+JOINTS = np.random.default_rng(0).uniform(0, 100, (6, 17, 2))
+PEOPLE = [{"image_id": i, "category_id": 1, "keypoints": [10.5, 20.0, 1.0] * 17} for i in range(5)]
+HUGE = (10**12, 17, 2)
+
+
+def npy(shape: Any, kind: str = "<f8", data: bytes = b"", text: str | None = None) -> bytes:
+    """An array of the format that declares what it likes."""
+    head = (text or f"{{'descr': {kind!r}, 'fortran_order': False, 'shape': {shape!r}, }}").encode() + b"\n"
+    return b"\x93NUMPY\x01\x00" + len(head).to_bytes(2, "little") + head + data
+
+
+def npz(path: Path, packing: int = zipfile.ZIP_STORED, **members: Any) -> Path:
+    """An archive of arrays, or of bytes that say they are."""
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, value in members.items():
+            stream = io.BytesIO()
+            np.save(stream, value) if not isinstance(value, bytes) else stream.write(value)
+            archive.writestr(f"{name}.npy", stream.getvalue(), packing)
+    return path
+
+
+def refused(path: Path, action: Callable[[Path], Any], *words: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(path.name)) as caught:
+        action(path)
+    said = str(caught.value)
+    assert type(caught.value) is ValueError
+    assert "\n" not in said
+    assert "; " in said
+    assert len(said.replace(str(path), "")) < 400
+    assert all(word in said for word in words), said
+
+
+def directory(path: Path, field: int, value: int) -> Path:
+    """A byte of every entry of an archive's directory."""
+    data = bytearray(path.read_bytes())
+    for found in re.finditer(rb"PK\x01\x02", bytes(data)):
+        data[found.start() + field] = value
+    path.write_bytes(bytes(data))
+    return path
+
+
+def tracks(path: Path) -> Any:
+    return read_tracks([path])
+
+
+def views(path: Path) -> Any:
+    return read_matches([path])
+
+
+# ---- arrays --------------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    "members",
+    [
+        {"joints": npy(HUGE)},
+        {"joints": npy((10**9, 17, 2))},
+        {"joints": JOINTS, "names": npy((100,), "<U99999999")},
+        {"joints": JOINTS, "extra": npy((10**12,))},
+        {"joints": JOINTS, "names": npy((10**12,), "<U0")},
+        {"joints": npy((10**12, 0, 2))},
+        {"joints": npy((-1, 17, 2), data=JOINTS.tobytes())},
+    ],
+)
+def test_declared_sizes_are_checked_before_anything_is_made(members: dict[str, Any], tmp_path: Path) -> None:
+    refused(npz(tmp_path / "a.npz", **members), read)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("((((", ("header is damaged",)), ("'a", ("header is damaged",)), ("{'shape': (3, ", ("header is damaged",)),
+        ("-" * 9000, ("header is damaged",)), ("x" * 30_000, ("header is damaged",)), ("__import__('os')", ("header is damaged",)),
+        ("{'descr': '|O', 'fortran_order': False, 'shape': (1,)}", ("Python objects", "pickle")),
+        ("{'descr': [('a', '<f8')], 'fortran_order': False, 'shape': (10**12,)}", ("header is damaged",)),
+        ("{'descr': [('a', '<f8')], 'fortran_order': False, 'shape': (1000000000000,)}", ("records",)),
+        ("{'descr': '(1000000,)f8', 'fortran_order': False, 'shape': (1000000,)}", ("records",)),
+        ("{'descr': '<f8', 'fortran_order': False, 'shape': [3, 2]}", ("header is damaged",)),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("action", [read_pair, tracks])
+def test_headers_that_are_none_are_refused(
+    text: str, words: tuple[str, ...], action: Callable[[Path], Any], tmp_path: Path
+) -> None:
+    (tmp_path / "a.npy").write_bytes(npy((), text=text))
+    refused(tmp_path / "a.npy", action, *words)
+    refused(npz(tmp_path / "a.npz", x1=npy((), text=text), x2=JOINTS[0], tracks=npy((), text=text)), action, *words)
+
+
+def test_an_archive_that_unpacks_to_far_more_than_it_has_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(npz_gate, "PLENTY", (2**20, 250))
+    bomb = np.zeros((10_000, 17, 2))
+    refused(npz(tmp_path / "a.npz", zipfile.ZIP_DEFLATED, joints=bomb), read, "would unpack to", "numpy.savez instead")
+    assert len(read(npz(tmp_path / "b.npz", joints=bomb + 1))[0]) == len(bomb)  # nothing is packed: it is what it is
+    # what nobody asks for is not unpacked
+    assert len(read(npz(tmp_path / "c.npz", zipfile.ZIP_DEFLATED, joints=JOINTS, junk=bomb))[0]) == len(JOINTS)
+
+
+@pytest.mark.parametrize("action", [read, read_film_set, read_pair, views, tracks])
+def test_encrypted_and_strangely_packed_members_are_named(action: Callable[[Path], Any], tmp_path: Path) -> None:
+    arrays = {"joints": JOINTS, "frames": JOINTS, "x1": JOINTS[0], "x2": JOINTS[0], "x3": JOINTS[0], "tracks": JOINTS}
+    arrays = {"x": {n: arrays[n] for n in ("x1", "x2", "x3")}, "other": arrays}["x" if action is views else "other"]
+    path = npz(tmp_path / "a.npz", **arrays)
+    refused(directory(path, 8, 1), action, "is encrypted")
+    directory(path, 8, 0)
+    refused(directory(path, 10, 99), action, "packed by AES")
+    refused(npz(path, zipfile.ZIP_BZIP2, **arrays), action, "packed by bzip2")
+    data = bytearray(npz(path, zipfile.ZIP_DEFLATED, **arrays).read_bytes())
+    for found in re.finditer(rb"PK\x03\x04", bytes(data)):
+        data[found.start() + 60 : found.start() + 100] = b"\xa5" * 40
+    path.write_bytes(bytes(data))
+    refused(path, action)
+
+
+def test_text_members_and_letters_that_do_not_exist_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("tracks", b"not an array")
+    refused(path, tracks, "is no array of numpy")
+    refused(npz(path, joints=JOINTS, names=npy((1,), "<U1", b"\xff\xff\xff\x7f")), read, "letters that do not exist")
+
+
+def test_what_numpy_writes_is_read_as_numpy_reads_it(tmp_path: Path) -> None:
+    arrays = {
+        "a": np.asfortranarray(JOINTS), "b": JOINTS.astype(">f4"), "c": np.array(["a", "bcd"]), "d": np.zeros((0, 2), np.int64),
+        "e": np.array(True), "f": np.array(["2020-01-01"], "M8[D]"), "g": np.array([b"x"]), "h": np.arange(5, dtype=np.uint8),
+    }  # fmt: skip
+    for save in (np.savez, np.savez_compressed):
+        save(tmp_path / "a.npz", **arrays)
+        archive = npz_gate.Archive(tmp_path / "a.npz")
+        assert list(archive) == list(arrays)
+        for name, value in arrays.items():
+            np.testing.assert_array_equal(archive[name], value)
+            assert archive.shape(name) == value.shape
+    np.save(tmp_path / "a.npy", arrays["a"])
+    np.testing.assert_array_equal(npz_gate.read_npy(tmp_path / "a.npy"), JOINTS)
+    (tmp_path / "old.npy").write_bytes(
+        npy((), data=JOINTS[0].tobytes(), text="{'descr': '<f8', 'fortran_order': False, 'shape': (17L, 2L)}")
+    )
+    np.testing.assert_array_equal(npz_gate.read_npy(tmp_path / "old.npy"), JOINTS[0])
+
+
+# ---- things that are no files --------------------------------------------------------------------------------------------
+ACTIONS = [
+    ("a.json", read), ("a.csv", read), ("a.npz", read), ("a.npz", read_film_set), ("a.csv", read_pair), ("a.npz", read_pair),
+    ("a.csv", open_points), ("a.csv", tracks), ("a.npz", tracks), ("a.toml", read_calibration), ("a.png", read_image),
+    ("a.csv", lambda path: read_truth(path, ["a"])),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("way", ["pipe", "device", "loop", "nothing"])
+@pytest.mark.parametrize(("name", "action"), ACTIONS)
+def test_pipes_devices_and_broken_links_are_refused(way: str, name: str, action: Callable[[Path], Any], tmp_path: Path) -> None:
+    path = tmp_path / name
+    {
+        "pipe": lambda: os.mkfifo(path),
+        "device": lambda: path.symlink_to("/dev/zero"),
+        "loop": lambda: path.symlink_to(name),
+        "nothing": lambda: path.symlink_to("nowhere"),
+    }[way]()
+    words = {"pipe": "is a pipe", "device": "is a device", "loop": "leads back to itself", "nothing": "that is not there"}
+    refused(path, action, words[way])
+
+
+@pytest.mark.parametrize("suffix", ["json", "txt"])
+@pytest.mark.parametrize("way", ["folder", "pipe", "device"])
+def test_a_folder_of_frames_names_the_one_that_is_no_file(suffix: str, way: str, tmp_path: Path) -> None:
+    for i in range(3):
+        (tmp_path / f"a_{i}.{suffix}").write_text('{"people": []}')
+    odd = tmp_path / f"a_7.{suffix}"
+    odd.mkdir() if way == "folder" else os.mkfifo(odd) if way == "pipe" else odd.symlink_to("/dev/zero")
+    refused(odd, lambda path: read(path.parent), f"is a {way}")
+
+
+def test_a_file_larger_than_any_of_its_kind_is_not_read(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    with path.open("wb") as file:
+        file.write(b"{" * 1000)
+        file.truncate(3 * 2**30)  # takes no room on the disk
+    refused(path, read, "3.0 GB", "split the recording")
+
+
+# ---- JSON, TOML, tables --------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("new", "words"),
+    [
+        ("9" * 400, ("annotation 0", "expected numbers")), ("9" * 5000, ("thousands of digits",)),
+        ("[" * 100_000, ("nested too deeply",)),
+        ("1e400", ("infinite coordinates", "leave them empty")), ('"' + "x" * 10**5 + '"', ("expected numbers, got ['xxx",)),
+    ],
+)  # fmt: skip
+def test_json_of_numbers_and_brackets_without_end(new: str, words: tuple[str, ...], tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text(json.dumps(PEOPLE).replace("10.5", new))
+    refused(tmp_path / "a.json", read, *words)
+
+
+@pytest.mark.parametrize("data", ["[" * 900 + "]" * 900, "[" * 100_000, '{"a":' * 400 + "1" + "}" * 400])
+def test_json_that_is_nothing_but_brackets(data: str, tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text(data)
+    refused(tmp_path / "a.json", read)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "a = " + "[" * 5000 + "]" * 5000, "a = " + "{a=" * 5000, "[" + ".".join("a" * 5000) + "]", ".".join("a" * 5000) + " = 1",
+        "a = " + "9" * 5000, "[c]\nmatrix = [[" + "9" * 400 + ", 0, 1], [0, 1, 1], [0, 0, 1]]", "#" * 2**21,
+        "[c]\nmatrix = [[[[]]]]",
+    ],
+)  # fmt: skip
+def test_toml_that_goes_deep_or_holds_no_camera(text: str, tmp_path: Path) -> None:
+    (tmp_path / "a.toml").write_text(text)
+    refused(tmp_path / "a.toml", read_calibration, "Pose2Sim")
+
+
+def test_a_table_that_names_everything_differently_is_not_laid_out(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("frame,id,x,y\n" + "".join(f"{i},p{i},1,2\n" for i in range(5000)))
+    refused(path, tracks, "5000 views and 5000 points", "same name")
+    path.write_text("frame,landmark,x,y\n" + "".join(f"{i},p{i},1,2\n" for i in range(5000)))
+    refused(path, read, "5000 landmarks", "same name")
+
+
+@pytest.mark.parametrize("action", [read, read_pair, open_points, tracks])
+def test_a_row_of_a_million_cells_is_refused(action: Callable[[Path], Any], tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("x," * 100_000 + "\n1,2\n")
+    refused(tmp_path / "a.csv", action, "100001 cells")
+
+
+# ---- counts of C3D and PLY -----------------------------------------------------------------------------------------------
+def test_counts_of_ply_are_held_against_the_file(tmp_path: Path) -> None:
+    head = "ply\nformat binary_little_endian 1.0\nelement camera {}\nproperty float x\nelement vertex {}\n"
+    head += "property float x\nproperty float y\nproperty float z\nend_header\n"
+    for first, count in ((0, 10**12), (10**12, 2), (-5, 2), (0, -1)):
+        (tmp_path / "a.ply").write_bytes(head.format(first, count).encode() + bytes(24))
+        refused(tmp_path / "a.ply", open_points, "makes no sense")
+
+
+def test_parameters_of_c3d_are_held_against_the_file(tmp_path: Path) -> None:
+    from tests.fuzz.seeds import c3d
+
+    sound = c3d()
+    (tmp_path / "a.c3d").write_bytes(sound)
+    assert open_points(tmp_path / "a.c3d").values.shape == (5, 4, 3)
+    at = sound.index(b"LABELS") + 6 + 2
+    (tmp_path / "a.c3d").write_bytes(sound[:at] + bytes([255, 7, *[255] * 7]) + sound[at + 9 :])  # 255^7 letters
+    refused(tmp_path / "a.c3d", open_points, "make no sense")
+
+
+# ---- messages ------------------------------------------------------------------------------------------------------------
+def test_messages_are_short_and_of_one_line() -> None:
+    assert clipped("a\x1b[31m\nb") == "a?[31m b"
+    assert len(shown(10**4000)) < 60
+    assert len(shown([[["x" * 10**6]]] * 10**5)) <= 60
+    deep: Any = []
+    for _ in range(10_000):
+        deep = [deep]
+    assert len(shown(deep)) <= 60
+    with pytest.raises(ValueError, match=r"a\.json: frame 3: not valid JSON at line 1, column 1 \(Expecting value\); again"):
+        parse_json("a.json", "", "again", "frame 3")
+    with pytest.raises(ValueError, match="no file can have this name; check the path"):
+        read_text("a\0b")
