@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterable
 from typing import Any
 
@@ -111,8 +112,28 @@ def gather_labels(clips: list[Clip], owners: list[int], labels: ArrayLike | None
                 f"labels: none given, and clip {owners[missing[0]]} ({clips[missing[0]].name!r}) has no label; "
                 "pass fit(clips, labels)"
             )
-        return np.asarray([clip.label for clip in clips])
-    return np.asarray(check_labels(labels, owners[-1] + 1)[owners])
+        values = np.asarray([clip.label for clip in clips])
+    else:
+        values = np.asarray(check_labels(labels, owners[-1] + 1)[owners])
+    check_contradictions(clips, owners, values)
+    return values
+
+
+def check_contradictions(clips: list[Clip], owners: list[int], labels: Array) -> None:
+    """Raise where one recording has two labels.
+
+    Raises:
+        ValueError: naming both clips and their labels.
+    """
+    first: dict[tuple[Any, bytes], int] = {}
+    for i, clip in enumerate(clips):
+        other = first.setdefault((clip.joints.shape, hashlib.sha256(clip.joints.tobytes()).digest()), i)
+        if labels[other] != labels[i]:
+            both = f"{owners[other]} ({clips[other].name!r}) and {owners[i]} ({clip.name!r})"
+            raise ValueError(
+                f"labels: clips {both} are the same recording, but one is {labels[other]!s} and the other {labels[i]!s}; correct a "
+                "label, or leave one out"
+            )
 
 
 def gather_groups(clips: list[Clip], owners: list[int], groups: ArrayLike | None) -> Array | None:

@@ -23,6 +23,7 @@ FloatArray = NDArray[np.floating[Any]]
 LARGEST = 1e9  # of a coordinate: pixels, millimetres and map metres stay far below; float32 arithmetic needs a bound
 GAP = 1.0  # seconds without frames, after which what follows is another stretch: no window that holds frames of both lasts longer
 RARE = 4.0  # times the usual step between frames, which a gap is longer than, too: few frames per second are no gaps
+PIXELS = 50.0  # units that x and y of a body go over where the unit is no metre
 FINEST, COARSEST = 1e6, 1e-3  # frames per second of any recording: outside these a rate is a slip
 EXACT = 0.01  # of the step between frames, that neighbouring numbers may be apart where the clock is
 UP_AXES = ("y", "-y", "z", "-z")
@@ -86,6 +87,7 @@ class Clip:
             times = np.array(_float_array(self.times, f"{who}: times"), dtype=np.float64)
             _check_times(times, len(joints), who)
             fps = self.fps if self.fps is not None else _rate(times)
+        _check_depth(joints, who)
         confidence = self.confidence
         if confidence is not None:
             confidence = _float_array(confidence, f"{who}: confidence")
@@ -239,6 +241,22 @@ def _float_array(value: Any, what: str) -> FloatArray:
         raise ValueError(f"{what}: expected an array of numbers, got {type(value).__name__} ({error})") from None
     array.flags.writeable = False
     return array
+
+
+def _check_depth(joints: FloatArray, who: str) -> None:
+    """Raise where what should be depth is the confidence of pixels."""
+    if joints.shape[2] != 3:
+        return
+    x, third = joints[..., :2], joints[..., 2]
+    known = ~np.isnan(third)
+    if not known.any() or third[known].min() < 0 or not 0 < third[known].max() <= 1 or np.isnan(x).all():
+        return
+    span = float(np.nanmax(x) - np.nanmin(x))
+    if span > PIXELS:
+        raise ValueError(
+            f"{who}: joints: x and y go over {span:.3g}, and z from {third[known].min():.2g} to {third[known].max():.2g}, which is "
+            "the confidence of pixels, not depth; give joints[..., :2] and confidence=joints[..., 2]"
+        )
 
 
 def _check_times(times: FloatArray, frames: int, who: str) -> None:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from indexing.cli.console import count, names
+from indexing.cli.remarks import on_examples, remarks
 from indexing.opening import clipped, read_rows, shown
 
 if TYPE_CHECKING:
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 Format = Literal["clipset", "openpose", "coco", "mediapipe", "deeplabcut", "mmpose", "ultralytics", "sleap"]
 People = Literal["largest", "confident", "tracked", "all", "everyone"]
 TRIM = re.compile(r"(?P<path>.+)@(?P<start>\d+(\.\d*)?|\.\d+)?-(?P<end>\d+(\.\d*)?|\.\d+)?")
+CUT = 0.1  # seconds that an example may end before it was said to: nobody counts frames
 KnownEvent = tuple[Hashable, float, float]
 
 
@@ -120,7 +122,8 @@ def read_examples(examples: Sequence[Example], reading: Reading, select: Sequenc
         if is_set and select:
             found = found[choose(found, select, "--select")]
         if example.start is not None or example.end is not None:
-            found = _cut(found, example)
+            found, cut = _cut(found, example)
+            notes += cut
         if is_set or len(found) > 1:
             found, left_out = usable(found, example.path)
             notes += left_out
@@ -136,7 +139,7 @@ def read_examples(examples: Sequence[Example], reading: Reading, select: Sequenc
             raise ValueError(
                 f"{example.path}: has {last} joints, but {examples[0].path} has {first}; use one pose estimator and joint layout"
             )
-    return clips, notes + assumed(guessed)
+    return clips, notes + assumed(guessed) + remarks(clips, reading) + on_examples(clips)
 
 
 def of_layout(clips: Sequence[Clip], known: Skeleton | None, path: Path) -> tuple[list[Clip], list[str]]:
@@ -147,11 +150,19 @@ def of_layout(clips: Sequence[Clip], known: Skeleton | None, path: Path) -> tupl
     return [clip for clip, _ in found], list(dict.fromkeys(note for _, note in found if note))
 
 
-def _cut(clips: ClipSet, example: Example) -> ClipSet:
+def _cut(clips: ClipSet, example: Example) -> tuple[ClipSet, list[str]]:
+    """The seconds that count, and a note where the recording does not have all of them."""
     from indexing.clip import ClipSet
 
     start, end = example.start if example.start is not None else -math.inf, example.end if example.end is not None else math.inf
-    return ClipSet((clip.between(start, end) for clip in clips), clips.name)
+    found = ClipSet((clip.between(start, end) for clip in clips), clips.name)
+    short = [clip for clip in clips if -math.inf < start < clip.times[0] - CUT or clip.times[-1] + CUT < end < math.inf]
+    if not short:
+        return found, []
+    first, last = short[0].times[0], short[0].times[-1]
+    left = f"{found[0].duration:.3g} s of it" if len(clips) == 1 else "the rest of it"
+    wanted = f"{example.start or 0:g}-{'' if example.end is None else format(example.end, 'g')}"
+    return found, [f"{example.path}@{wanted}: the recording runs from {first:.6g} to {last:.6g} s; {left} is used"]
 
 
 def _checked(clips: Sequence[Clip], path: Path) -> list[Clip]:
@@ -209,7 +220,10 @@ def read_recordings(
     found: list[tuple[Path, Clip]] = []
     notes: list[str] = []
     for path in paths:
-        clips, said = of_layout(reading.read(path), skeleton, path)
+        read = list(reading.read(path))
+        if len(read) == 1:  # a recording goes by its file, not by what a set calls its only clip
+            read = [read[0].replace(name=path.name or path.resolve().name)]
+        clips, said = of_layout(read, skeleton, path)
         notes += said
         for clip in clips:
             if clip.joints.shape[1] != joints:

@@ -14,6 +14,7 @@ from indexing.cli.console import count, names, progress, say, table
 from indexing.cli.films import are_films
 from indexing.cli.inputs import KnownEvent, Reading, assumed, read_recordings, read_truth
 from indexing.cli.outputs import check_report
+from indexing.cli.remarks import on_classes, on_gaps, on_truth, remarks
 
 if TYPE_CHECKING:
     from indexing.brightness.indexer import BrightnessIndexer
@@ -58,6 +59,8 @@ class Scan:
         names = [recording.name for recording in recordings]
         truth, unread = (None, []) if self.truth is None else read_truth(self.truth, names)
         notes = notes + unread + _unknown(truth, indexer)
+        if truth is not None:
+            notes += on_truth(truth, recordings)
         loaded = time.perf_counter()
         results = [
             self._scan(indexer, one, None if truth is None else truth[i], f" ({i + 1} of {len(names)})" if len(names) > 1 else "")
@@ -90,6 +93,7 @@ class Scan:
 
         indexer = ActionIndexer.load(self.model.expanduser())
         clips, notes = read_recordings(self.recordings, self.reading, indexer.n_joints_, self.model, indexer.skeleton_)
+        notes += [*remarks(clips, self.reading), *on_gaps(clips), *on_classes([str(label) for label in indexer.classes_])]
         return indexer, clips, notes + assumed(clips)
 
     def _films(self) -> tuple[BrightnessIndexer, list[Recording], list[str]]:

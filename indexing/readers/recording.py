@@ -22,6 +22,7 @@ from indexing.skeleton import Skeleton
 
 IntArray = NDArray[np.int64]
 LAST_FRAME = 2**53  # whole numbers are exact below it
+CROWDED = 0.05  # share of the frames with somebody, that show several people, from where on a clip says how many
 NORMALIZED = 4.0  # coordinates from 0 to 1 stay below it even for joints guessed outside the image; pixels do not
 
 
@@ -154,6 +155,8 @@ def to_clips(path: Path, recording: Recording, options: Options) -> ClipSet:
     times, fps = _times(path, recording, options.fps)
     name = path.name or path.resolve().name
     each = options.person in ("all", "everyone")
+    crowd = np.bincount(recording.at)
+    others = {"people": int(crowd.max())} if (crowd > 1).mean() > CROWDED else {}
     clips = []
     for track, rows in choose(path, recording, options.person):
         frames = slice(0, len(times))
@@ -171,7 +174,7 @@ def to_clips(path: Path, recording: Recording, options: Options) -> ClipSet:
                 name=f"{name}#{track}" if each else name,
                 skeleton=recording.skeleton,
                 up=recording.up,
-                meta={"person": track} if each else {},
+                meta={"person": track} if each else others,
                 fps_assumed=recording.times is None and options.fps is None,
             )
         )

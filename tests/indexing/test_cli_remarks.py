@@ -1,0 +1,117 @@
+"""What commands say of recordings that are read without an error and still are not what they seem."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from indexing import ActionIndexer, Clip, ClipSet
+from indexing.actors import Person, dataset
+from indexing.cli import main
+from indexing.skeleton import BODY25, COCO17, Skeleton
+
+ORDER = np.random.default_rng(0).permutation(17)
+
+
+@pytest.fixture(scope="module")
+def clips():
+    return {clip.label: clip for clip in dataset([Person.random(0)], ("squat", "wave", "kick"), azimuth=0.0, rng=0)}
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch, capsys, clips):
+    monkeypatch.chdir(tmp_path)
+    for name, clip in clips.items():
+        openpose(Path(name), [clip])
+
+    def call(words):
+        code = main(words.split())
+        said = capsys.readouterr()
+        return code, " ".join(said.out.split()), said.err
+
+    return call
+
+
+def openpose(folder, people, numbers=None, scale=1.0):
+    folder.mkdir()
+    for i in range(max(len(clip) for clip in people)):
+        found = []
+        for clip in people:
+            row = np.zeros((25, 3))
+            if i < len(clip):
+                for k, name in enumerate(COCO17.joints):
+                    row[BODY25.joints.index(name)] = [*np.nan_to_num(clip.joints[i, k] * scale), clip.seen[i, k]]
+            found.append({"pose_keypoints_2d": row.ravel().tolist()})
+        number = i if numbers is None else numbers[i]
+        (folder / f"{folder.name}_{number:012d}_keypoints.json").write_text(json.dumps({"version": 1.3, "people": found}))
+    return folder
+
+
+def test_examples(run, clips):
+    openpose(Path("still"), [clips["wave"].replace(joints=np.repeat(clips["wave"].joints[:1], len(clips["wave"]), axis=0))])
+    code, out, _ = run("index fit squat=squat@0.5-99 wave=wave still=still --fps 30 -o m.safetensors")
+    end = clips["squat"].times[-1]
+    assert code == 0 and f"note: squat@0.5-99: the recording runs from 0 to {end:.6g} s; {end - 0.5:.3g} s of it is used" in out
+    assert "still: nobody moves there; a pose is learned, not an action" in out
+    assert "8 of 25 joints are never seen in squat, wave; what they do is not learned" in out
+    assert "add examples" not in out and "people in view" not in out and "coordinates" not in out
+    code, out, _ = run("index fit squat=squat wave=wave --fps 30 -o two.safetensors")
+    assert "squat and wave are all that is known" in out and "add examples of ordinary movement" in out
+    code, _, err = run("index fit a=squat b=squat -o m.safetensors")
+    assert code == 2 and "clips 0 ('squat') and 1 ('squat') are the same recording, but one is a and the other b" in err
+    code, out, _ = run("index fit a=squat@0-1 b=squat@1-9 --fps 30 -o m.safetensors")  # two parts of one recording may differ
+    assert code == 0
+
+
+def test_recordings(run, clips):
+    assert run("index fit squat=squat wave=wave kick=kick --fps 30 -o m.safetensors")[0] == 0
+    wave = clips["wave"]
+    openpose(Path("two"), [wave, clips["kick"].replace(joints=clips["kick"].joints + np.array([900.0, 0.0]))])
+    openpose(Path("small"), [wave], scale=1 / 2000)
+    openpose(Path("gap"), [wave], numbers=[i if i < 40 else i + 2_600_000_000 for i in range(len(wave))])
+    Path("truth.csv").write_text("label,start,end\nwave,0,1\nkick,50,60\n")
+    scan = "index scan {} -m m.safetensors --fps 30"
+    code, out, _ = run(scan.format("wave --truth truth.csv"))
+    assert (
+        code == 0 and f"wave runs from 0 to {wave.times[-1]:.6g} s: 1 known event outside of it cannot be found (kick at 50" in out
+    )
+    assert out.count("note:") == 1
+    assert "two: 2 people in view; followed is the largest; --person says otherwise" in run(scan.format("two"))[1]
+    assert "small: coordinates from 0 to 1, so the shape of the image is not known" in run(scan.format("small"))[1]
+    assert "coordinates" not in run(scan.format("small --size 2000 2000"))[1]
+    code, out, _ = run(scan.format("gap"))
+    assert code == 0 and "gap: no frames for a while after 1.3 s; its 2 parts are searched by themselves" in out
+    assert "--fps 1000: the longest clip lasts" in run("index scan wave -m m.safetensors --fps 1000")[1]
+    for fps in ("1e-300", "1e300"):
+        code, _, err = run(f"index scan wave -m m.safetensors --fps {fps}")
+        assert code == 2 and "fps must be frames per second, from 0.001 to 1,000,000" in err
+    openpose(Path("far"), [wave], numbers=[*range(len(wave) - 1), 9_000_000_000_000_000])
+    code, _, err = run(scan.format("far"))
+    assert code == 2 and "clip 'far': times reach 3e+14 s, where numbers are" in err and err.count("\n") == 1
+
+
+def test_joints_by_name_and_a_recording_by_its_file(run, clips):
+    ClipSet([clip.replace(name=name) for name, clip in clips.items()]).save("all.npz")
+    assert run("index fit all.npz -o m.safetensors")[0] == 0
+    wave = clips["wave"].replace(label=None, meta={}, name="stream", confidence=None)
+    ClipSet([wave]).save("plain.npz")
+    mixed = Skeleton("mine", tuple(COCO17.joints[i] for i in ORDER))
+    ClipSet([wave.replace(joints=wave.joints[:, ORDER], skeleton=mixed)]).save("mixed.npz")
+    ClipSet([wave.replace(skeleton=None)]).save("bare.npz")
+    code, plain, _ = run("index scan plain.npz -m m.safetensors --report out")
+    assert code == 0 and "plain.npz" in Path("out/events.csv").read_text() and "stream" not in Path("out/events.csv").read_text()
+    code, again, _ = run("index scan mixed.npz -m m.safetensors")
+    rows = [text.split(" in 1 recording")[0] for text in (plain, again)]
+    assert code == 0 and rows[0] == rows[1]
+    code, out, _ = run("index scan wave -m m.safetensors --fps 30")
+    assert code == 0 and "wave: of its 25 joints (BODY_25) the 17 learned (COCO-17) are used" in out
+
+
+def test_confidence_is_no_depth():
+    x = np.random.default_rng(0).uniform(0, 1, (9, 17, 3)) * [1280, 720, 1]
+    with pytest.raises(ValueError, match=r"which is the confidence of pixels, not depth; give joints\[..., :2\]"):
+        ActionIndexer().fit([x, x + 1], ["a", "b"])
+    Clip(x * [1, 1, 700])
+    Clip(x * [1 / 720, 1 / 720, 1])
+    Clip(x * [1, 1, 0])
