@@ -214,13 +214,13 @@ def _reason(found: Attempt) -> str:
     assert fit is not None
     if fit.sigma > BLIND * found.frame:
         return _nothing(found)
+    if found.edge:
+        return f"the best shift, about {fit.shift:+.3g} s, lies at the end of the search or beyond; raise max_shift"
     if not found.sharp:
         return (
             f"the motion is too small for its noise: the best shift, {fit.shift:+.3g} s, is uncertain by {fit.sigma:.2g} s "
             "or more; film larger or faster movements"
         )
-    if found.edge:
-        return f"the best shift, about {fit.shift:+.3g} s, lies at the end of the search or beyond; raise max_shift"
     if found.margin < found.needed and len(found.peaks) > 1:
         least = found.misfits[0] - found.needed
         near = [shift for (shift, _), misfit in zip(found.peaks, found.misfits, strict=True) if misfit > least]
