@@ -17,6 +17,7 @@ from torch import Tensor
 BLOCK = 32  # frames at once: memory is that of one block
 FILE_BLOCK = 8  # of files: frames of 4K take 8 MB each
 UNEVEN = 0.2  # of the median step, between the shortest and the longest: as for files, a tenth of a frame to either side
+PAUSE = 10.0  # seconds without a frame, for which none are interpolated: what a video costs is told by its frames
 SAME_RATE = 0.01  # relative difference of frame rates that is none (29.97 and 30)
 
 Times = NDArray[np.float64]
@@ -152,6 +153,8 @@ class Resampler:
             self.begin = float(times[0])
         for frame, time in zip(frames, (times - self.begin).tolist(), strict=True):
             before, start = self.last or (frame, time - self.step)
+            if time - start > PAUSE:  # nothing is made up for it, whatever its length
+                before, start, self.made = frame, time - self.step, math.ceil(time / self.step - 1e-9)
             while self.made * self.step <= time + 1e-9:
                 share = (self.made * self.step - start) / (time - start)
                 out.append(torch.lerp(before, frame, min(1.0, share)))

@@ -1,8 +1,12 @@
 """Takes on a common grid: rates, blends, gaps."""
 
+import math
+
+import numpy as np
 import pytest
 import torch
 
+from indexing.brightness.footage import Resampler
 from indexing.brightness.sampling import common_rate, sampled
 from indexing.brightness.takes import take
 from indexing.brightness.window_kernel import HALF
@@ -52,3 +56,13 @@ def test_backwards_twice_is_forwards(films):
     found = sampled(source, whole(source), 30.0)
     twice = found.backwards().backwards()
     assert torch.equal(twice.profile, found.profile) and torch.equal(twice.kernels, found.kernels)
+
+
+@pytest.mark.parametrize("gap", [60.0, 2.6e6, 1e9])
+def test_nothing_is_made_up_for_a_pause_of_any_length(gap):
+    frames = torch.arange(20.0)[:, None, None].expand(20, 2, 2)
+    times = np.arange(20) / 25 + np.where(np.arange(20) < 10, 0.0, gap)
+    grid, counts = Resampler(10.0, math.nan).push(frames, times)
+    assert len(grid) <= 10 and counts[-1] == len(grid)
+    before = grid[grid[:, 0, 0] < 9.5]
+    assert len(before) == 4 and grid.max() <= 19 and not ((grid > 9.01) & (grid < 9.99)).any()
