@@ -114,7 +114,7 @@ def parse(words: list[str]) -> Runnable | int:
     except SystemExit as stop:
         if stop.code in (None, 0):
             return DONE
-        complain(reworded(said.getvalue()).replace("see dyntorch --help", f"see {_asked(words)} --help"))
+        complain(reworded(said.getvalue(), f"{_asked(words)} --help"))
         return BAD_INPUT
     return cast("Runnable", parsed)
 

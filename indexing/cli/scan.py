@@ -28,6 +28,9 @@ if TYPE_CHECKING:
 class Scan:
     """Find the actions of a model in untrimmed recordings.
 
+    Score: the evidence for the action, averaged over the time it lasts; higher is better.  Margin: how far that is above the next
+    best action; near 0 it might as well be that one.
+
     dyntorch index scan session.json -m moves.safetensors --report out/
 
     dyntorch index scan session.mp4 -m seen.safetensors --report out/       (a model that was learned from videos)
@@ -159,11 +162,14 @@ def _unknown(truth: list[list[KnownEvent]] | None, indexer: Any) -> list[str]:
 
 def _show(results: list[RecordingResult]) -> None:
     several = len(results) > 1
+    from indexing.report.page import even
+
+    found = [(result.name, event) for result in results for event in result.events]
+    scores, margins = even([event.score for _, event in found]), even([event.margin for _, event in found])
     rows = []
-    for result in results:
-        for event in result.events:
-            cells = [str(event.label), f"{event.start:.2f}", f"{event.end:.2f}", f"{event.score:.3g}", f"{event.margin:.3g}"]
-            rows.append([result.name, *cells] if several else cells)
+    for (name, event), score, margin in zip(found, scores, margins, strict=True):
+        cells = [str(event.label), f"{event.start:.2f}", f"{event.end:.2f}", score, margin]
+        rows.append([name, *cells] if several else cells)
     columns = ["action", "start (s) ", "end (s) ", "score ", "margin "]
     if rows:
         table(["recording", *columns] if several else columns, rows)

@@ -218,13 +218,14 @@ def misclassified(pair: MatchedPair, labels: Any) -> float | None:
 
 def show(report: SegmentationReport) -> None:
     """Print the result."""
+    from indexing.report.page import even
+
     number, counts = int(report.pair.seen.sum()), report.counts
+    noise = even([report.rms(label) for label in range(1, len(report.models) + 1)])
     rows: list[list[object]] = []
     for label, model in enumerate(report.models, start=1):
         mine = counts[f"body {label}"]
-        rows.append(
-            [f"body {label}", f"{mine:,}", f"{100 * mine / number:.1f} %", model, f"{report.rms(label):.3g}" if mine else ""]
-        )
+        rows.append([f"body {label}", f"{mine:,}", f"{100 * mine / number:.1f} %", model, noise[label - 1] if mine else ""])
     rest = "outliers" if report.models else "unlabelled"
     rows.append([rest, f"{counts['outlier']:,}", f"{100 * counts['outlier'] / number:.1f} %", "", ""])
     table(["body", "matches ", "share ", "model", "noise rms px "], rows)

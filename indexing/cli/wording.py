@@ -9,8 +9,12 @@ from collections.abc import Callable
 from indexing.cli.console import one_line
 
 
-def reworded(text: str) -> str:
-    """The parser's message, which it draws in a box with rules between the parts, as one line in our words."""
+def reworded(text: str, command: str) -> str:
+    """The parser's message, which it draws in a box with rules between the parts, as one line in our words.
+
+    Args:
+        command: that explains more.
+    """
     parts = [""]
     lines = text.splitlines()
     if len(lines) > 1 and lines[1].strip() and not lines[1].strip().strip("-"):  # no box, but a title above a rule: drop it, too
@@ -23,10 +27,10 @@ def reworded(text: str) -> str:
             parts[-1] += f" {words}"
     kept = [part.strip().removesuffix(".") for part in parts if part.strip() and "Argument helptext:" not in part]
     said = one_line("; ".join(kept)).replace("[bold]", "").replace("[/bold]", "")
-    said = re.sub(r"For full helptext,? (see|run):?", "see", said)
+    said = re.sub(r"(; )?For full helptext,? .*", "", said)
     for pattern, reword in REWORDED:
         said = re.sub(pattern, reword, said)
-    return said.replace("?; see", "? see") or "the command line makes no sense; see dyntorch --help"
+    return f"{said or 'the command line makes no sense'}; see {command}".replace("?; see", "? see")
 
 
 def _kind(types: str) -> str:
@@ -70,7 +74,7 @@ def _no_option(found: re.Match[str]) -> str:
 
 
 def _no_value(found: re.Match[str]) -> str:
-    return f"{found['flag']}: its value is missing"
+    return f"{found['flag']}: " + ("its value is missing" if found["number"] == "1" else f"expected {found['number']} values")
 
 
 def _missing(found: re.Match[str]) -> str:
@@ -81,7 +85,7 @@ def _missing(found: re.Match[str]) -> str:
 REWORDED: tuple[tuple[str, Callable[[re.Match[str]], str]], ...] = (
     (
         r"Error parsing (?P<flag>\S+): no type matching (?P<types>.*?) could be instantiated from \[(?P<given>.*?)\]; Got errors:"
-        r".*?(?=; see |$)",
+        r".*",
         _no_such_type,
     ),
     (
@@ -93,8 +97,8 @@ REWORDED: tuple[tuple[str, Callable[[re.Match[str]], str]], ...] = (
         r"invalid choice '(?P<given>.*?)' for argument '(?P<flag>.*?)'\. Expected one of (?P<choices>\(.*?\))",
         _no_choice,
     ),
-    (r"Unrecognized options: (?P<given>[^;]*)(?P<more>;.*?)??(?=; see dyntorch[^;]*$|$)", _no_option),
-    (r"Missing value for argument '(?P<flag>.*?)'\. Expected 1 values", _no_value),
+    (r"Unrecognized options: (?P<given>[^;]*)(?P<more>;.*)?", _no_option),
+    (r"Missing value for argument '(?:\(')?(?P<flag>[^',]*).*?'\. Expected (?P<number>\d+) values", _no_value),
     (r"Missing from dyntorch[^:]*: (?:-\w [A-Z]+, )?(?P<what>.*?) \(required\)", _missing),
 )
 """What the parser says -> what we say."""

@@ -99,6 +99,18 @@ def sentence(text: str) -> str:
     return text[:1].upper() + text[1:] + ("" if text.endswith((".", "?", "!")) else ".") if text else ""
 
 
+def even(values: Sequence[float]) -> list[str]:
+    """Numbers of one column with the same number of decimals: two, or more where all are small; n/a for what is no number.
+
+    Example:
+        >>> even([4.34, 3.4, 12.0]), even([0.0213, 0.4]), even([0.00123])
+        (['4.34', '3.40', '12.00'], ['0.021', '0.400'], ['0.00123'])
+    """
+    largest = max((abs(value) for value in values if math.isfinite(value)), default=1.0)
+    decimals = 2 if largest == 0 else min(max(2, 2 - math.floor(math.log10(largest))), 9)
+    return [f"{value:,.{decimals if abs(value) < 1000 else 0}f}" if math.isfinite(value) else "n/a" for value in values]
+
+
 def section(title: str, html: str, note: str = "") -> str:
     """A titled part of the page, with an optional sentence below the title."""
     lead = f'<p class="note">{escape(note)}</p>' if note else ""

@@ -11,7 +11,7 @@ import numpy as np
 from indexing.clip import Clip
 from indexing.report.canvas import letters_without_font
 from indexing.report.measures import confused_with, missed, overlapping
-from indexing.report.page import Card, Column, bar, cards, details, escape, picture, section, settings, table
+from indexing.report.page import Card, Column, bar, cards, details, escape, even, picture, section, settings, table
 from indexing.report.pictures import timeline_tips
 from indexing.report.results import Event, RecognitionReport, RecordingResult
 from indexing.report.thumbnails import strip
@@ -146,8 +146,9 @@ def _events(report: RecognitionReport, recording: RecordingResult, before: int) 
     if recording.truth is not None:
         columns.append(Column("Known", "name"))
     plain, shown = list(columns), []
-    for event in events[:listed]:
-        shown.append([escape(event.label), _when(event), _plain(event.score), _plain(event.margin)])
+    scores, margins = even([event.score for event in events[:listed]]), even([event.margin for event in events[:listed]])
+    for event, score, margin in zip(events[:listed], scores, margins, strict=True):
+        shown.append([escape(event.label), _when(event), score, margin])
         if recording.truth is not None:
             shown[-1].append(_verdict(event, overlapping(event, recording.truth)))
     if draw and recording.clip is not None:

@@ -18,7 +18,7 @@ from indexing.cli import main
         ("segment x.npz --bodies two", "--bodies 'two': expected a whole number or auto; see dyntorch segment --help"),
         ("align a b c --threshold x", "--threshold 'x': expected a number or auto; see dyntorch align --help"),
         ("demo --seed 1.5", "--seed '1.5': expected a whole number; see dyntorch demo --help"),
-        ("index fit a=b -o m --size 640", "--size '640': expected 2 numbers; see dyntorch index fit --help"),
+        ("index fit a=b -o m --size 6 x", "--size '6', 'x': expected 2 numbers; see dyntorch index fit --help"),
         ("demo --people", "--people: its value is missing; see dyntorch demo --help"),
         (
             "index scan x -m m --format openpos",
