@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from indexing.cli.console import count, progress, say, table
-from indexing.cli.outputs import check_report
+from indexing.cli.outputs import check_folder, check_report
 
 if TYPE_CHECKING:
     from indexing.demo import Demonstration
@@ -31,8 +31,13 @@ class Demo:
     people: Annotated[int, tyro.conf.arg(metavar="N")] = 12
     """how many other people are recognized"""
 
+    examples: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
+    """instead, write files to try all other commands on, and print these commands"""
+
     def run(self) -> int:
         """Perform, learn, recognize, search, report."""
+        if self.examples is not None:
+            return _examples(self.examples)
         started = time.perf_counter()
         folder = check_report(self.out, [])
         assert folder is not None
@@ -49,6 +54,19 @@ class Demo:
         say(f"Report: {page}")
         say(f"Everything took {time.perf_counter() - started:.1f} s. Next: dyntorch index fit --help")
         return 0
+
+
+def _examples(folder: Path) -> int:
+    """Write the example files and print the commands that use them."""
+    folder = check_folder(folder)
+    with progress("making the examples", steps=False):
+        from indexing.examples import write_examples
+
+        commands = write_examples(folder)
+    say(f"Examples: {folder}. Try there (commands.txt has these lines, too):")
+    for command in commands:
+        say(f"  {command}")
+    return 0
 
 
 def _show(shown: Demonstration) -> None:

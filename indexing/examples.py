@@ -1,0 +1,112 @@
+"""Files to try the commands on: ``dyntorch demo --examples FOLDER`` writes them, with the commands that use them.
+
+They are what the README's examples show: synthetic scenes and people, from fixed random numbers.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from dyntorch import scenes
+from indexing import files
+from indexing.actors import Person, dataset, detect, stream
+from indexing.clip import Clip, ClipSet
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+COMMANDS = """\
+dyntorch align a.csv b.csv c.csv --out align/
+dyntorch segment matches.npz --out segment/
+dyntorch reconstruct tracks.csv --motion constant_velocity_3d --static parked.csv --fps 25 --out reconstruct/
+dyntorch sync cam1/ cam2/ cam3/ --fps 30 --out sync/
+dyntorch index fit squat=squat.json lunge=lunge.json kick=kick.json@0.2-1.4 -o three.safetensors
+dyntorch index fit lesson.npz -o moves.safetensors
+dyntorch index scan session.npz -m moves.safetensors --truth truth.csv --report scan/
+dyntorch index evaluate people.npz --train azimuth=0 --test azimuth=90 --report evaluate/
+dyntorch index evaluate solid.npz --camera virtual --azimuth 0,90 --leave-out subject
+"""
+ACTIONS = ("squat", "lunge", "jumping_jack", "kick")
+
+
+def write_examples(folder: str | Path) -> list[str]:
+    """Write all example files into a folder.
+
+    Returns:
+        the commands that use them, to be typed in that folder; they are in ``commands.txt``, too.
+
+    Raises:
+        ValueError: the folder or a file in it cannot be written.
+    """
+    where = files.prepare(folder)
+    _geometry(where)
+    _cameras(where)
+    _people(where)
+    files.write_text(where / "commands.txt", COMMANDS)
+    return COMMANDS.splitlines()
+
+
+def _geometry(where: Path) -> None:
+    """Three views of a road, matches of two images, tracks of six views."""
+    road = scenes.planar(n=120, sigma=0.5, static=0.4, outliers=0.15, generator=torch.Generator().manual_seed(4))
+    for name, view in zip("abc", road.views, strict=True):
+        _table(where / f"{name}.csv", ("x", "y"), view.tolist())
+    draw = torch.Generator().manual_seed(4)
+    bodies = scenes.bodies((110, 80, 50), bodies=3, sigma=0.4, outliers=0.2, generator=draw)
+    np.savez(where / "matches.npz", x1=bodies.views[0].numpy(), x2=bodies.views[1].numpy())
+    draw = torch.Generator().manual_seed(7)
+    scene = scenes.lifted("constant_velocity_3d", 120, views=6, static=0.4, sigma=0.5, outliers=0.05, generator=draw)
+    known = (scene.labels == 1) & (torch.rand(120, generator=draw) < 0.5)
+    rows = [(view, point, *xy.tolist()) for view, points in enumerate(scene.tracks) for point, xy in enumerate(points)]
+    _table(where / "tracks.csv", ("frame", "id", "x", "y"), [row for row in rows if np.isfinite(row[2])])
+    _table(where / "parked.csv", ("id",), [(int(point),) for point in torch.nonzero(known)])
+
+
+def _cameras(where: Path) -> None:
+    """Three cameras, started one after the other, as OpenPose writes them."""
+    scene, _ = stream(["squat", "kick", "wave"], Person(), fps=30, rng=1)
+    for name, azimuth, late in (("cam1", 0, 0), ("cam2", 60, 17), ("cam3", 130, 8)):
+        clip = detect(scene, azimuth=azimuth, rng=late)
+        frames = files.prepare(where / name)
+        for i, triples in enumerate(_triples(clip)[late:]):
+            people = [{"pose_keypoints_2d": triples.ravel().tolist()}]
+            files.write_text(frames / f"{name}_{i:012d}_keypoints.json", json.dumps({"people": people}))
+
+
+def _people(where: Path) -> None:
+    """A lesson and a session, single clips, and labelled sets in 2D and 3D."""
+    teacher, other = Person.random(1), Person.random(2)
+    lesson = dataset([teacher], ACTIONS, azimuth=0, rng=0)
+    ClipSet(lesson).save(where / "lesson.npz")
+    solid, truth = stream(["lunge", "squat", "kick", "jumping_jack", "squat"], other, rng=3)
+    ClipSet([detect(solid, azimuth=70, rng=3)]).save(where / "session.npz")
+    _table(where / "truth.csv", ("label", "start", "end"), [(label, round(start, 2), round(end, 2)) for label, start, end in truth])
+    for clip in lesson:
+        if clip.label != "jumping_jack":
+            people = [
+                {"image_id": i, "category_id": 1, "keypoints": triples.ravel().round(2).tolist(), "score": 0.9}
+                for i, triples in enumerate(_triples(clip))
+            ]
+            files.write_text(where / f"{clip.label}.json", json.dumps(people))
+    ClipSet(dataset(4, ACTIONS, azimuth=(0.0, 90.0), rng=2)).save(where / "people.npz")
+    ClipSet(dataset(4, ACTIONS, azimuth=None, rng=2)).save(where / "solid.npz")
+
+
+def _triples(clip: Clip) -> NDArray[np.float64]:
+    """``(frames, joints, 3)`` x, y and confidence; zeros where a joint was not seen, as detectors write it."""
+    confidence = np.ones(clip.joints.shape[:2]) if clip.confidence is None else clip.confidence
+    return np.nan_to_num(np.concatenate([clip.joints, confidence[..., None]], axis=2))
+
+
+def _table(path: Path, head: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    with open(path, "w", newline="", encoding="utf-8") as stream_:
+        writer = csv.writer(stream_, lineterminator="\n")
+        writer.writerow(head)
+        writer.writerows(rows)
