@@ -10,7 +10,7 @@ TORCH_INDEX ?=
 TORCH_VERSION := $(shell sed -n 's/^torch==//p' constraints.txt)
 PIP = $(BIN)/python -m pip install --quiet
 
-.PHONY: install demo test lint bench tables docs clean
+.PHONY: install demo test lint bench fuzz tables docs clean
 
 install: $(STAMP)
 
@@ -34,7 +34,7 @@ demo: install
 
 # one worker per core, one thread each
 test: install
-	@echo "All tests: TESTTIME on two quiet cores; dots and percents show how far they are."
+	@echo "All tests: a few minutes on two quiet cores, a quarter of an hour on busy ones; dots and percents show how far they are."
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto
 
 lint: install
@@ -42,7 +42,12 @@ lint: install
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+# every format's files, mutated, through every reader: a long run with a table of outcomes
+fuzz: install
+	$(BIN)/python -m tests.fuzz
+
 bench: install
+	@echo "All benchmarks: about half an hour on quiet cores, longer on busy ones; each says what it does and prints its table as it ends."
 	$(PIP) --constraint constraints.txt --editable '.[experiments]'
 	$(BIN)/python -m experiments.benchmarks.null_space
 	$(BIN)/python -m experiments.benchmarks.fits
@@ -54,6 +59,7 @@ bench: install
 	$(BIN)/python -m experiments.benchmarks.brightness_indexer
 
 tables: install
+	@echo "All tables: hours.  Each is a command of its own, below, and prints its table as it ends."
 	$(PIP) --constraint constraints.txt --editable '.[experiments]'
 	$(BIN)/python -m experiments.homography_tensor_noise
 	$(BIN)/python -m experiments.tensor_noise_3d

@@ -186,9 +186,9 @@ def test_an_hour_is_drawn_in_time():
     times, scores = np.arange(108_000) / 30, rng.normal(size=(108_000, 12))
     events = [Hit(f"action {i % 12}", 18.0 * i, 18.0 * i + 2) for i in range(200)]
     pictures.timeline([0.0, 1.0], np.zeros((2, 1)), ["warm up: imports and fonts"])
-    begin = time.perf_counter()
+    begin = time.process_time()
     png = pictures.timeline(times, scores, [f"action {i}" for i in range(12)], events, [("other", 5, 9)])
-    assert time.perf_counter() - begin < 3.0 and len(png) < 1_000_000
+    assert time.process_time() - begin < 3.0 and len(png) < 1_000_000
 
 
 def test_events_and_truth_change_what_is_drawn(tmp_path):
