@@ -13,6 +13,9 @@ from dyntorch.arguments import FARTHEST, check_tensor, refuse_vmap
 from dyntorch.invariant import Invariant
 from dyntorch.primitives import Point, Primitive
 
+WIDEST = 4096
+"""Unknowns of a tensor; the Gram of one problem then takes 134 MB."""
+
 
 @dataclass(frozen=True)
 class Matches:
@@ -54,6 +57,8 @@ def matches(invariant: Invariant, views: Sequence[Tensor], weights: Tensor | Non
             for an invariant that knows no labelled static matches.
     """
     check_views(invariant, views)
+    if invariant.width() > WIDEST:
+        raise ValueError(f"{invariant!r} has {invariant.width():,} unknowns; up to {WIDEST:,} are estimated")
     first = views[0]
     axis = invariant.primitives[0].match_axis(first)
     batch, n = tuple(first.shape[:axis]), int(first.shape[axis])

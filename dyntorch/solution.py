@@ -216,10 +216,10 @@ class Solution:
                 tuple(map(inner, self.normalization.scales)),
             ),
             inner(self.normalized),
-            None if self.inliers is None else outer(self.inliers),
-            None if self.covariance is None else outer(self.covariance),
-            None if self.sigma is None else outer(self.sigma),
-            None if self.refined is None else tuple(map(inner, self.refined)),
+            inliers=None if self.inliers is None else outer(self.inliers),
+            covariance=None if self.covariance is None else outer(self.covariance),
+            sigma=None if self.sigma is None else outer(self.sigma),
+            refined=None if self.refined is None else tuple(map(inner, self.refined)),
         )
 
     def check(self) -> Solution:

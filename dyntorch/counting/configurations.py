@@ -193,7 +193,7 @@ def by_numbers(
             )
         if not isinstance(kind, int) and m > size + (kind == "join"):
             raise ValueError(f"{m} points have no {kind} in a view of dimension {size}; views must be larger or m smaller")
-    space = Views(field, k, sizes, kinds)
+    space = Views(field, k, sizes, kinds, points=m)
     return [Step("general", matches, lambda: space.moving(space.extensor(r), m))]
 
 

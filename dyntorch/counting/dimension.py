@@ -6,6 +6,9 @@ from collections.abc import Iterator, Sequence
 from fractions import Fraction
 from math import comb, factorial, prod
 
+DIGITS, HOOKS = 1_000_000, 10_000_000
+"""Bits of a dimension, and hooks (m for each partition) multiplied within half a minute, at most."""
+
 
 def dim_v(n: int, m: int, k: int) -> int:
     r"""Dimension of :math:`V(n,m,k) = \mathrm{Span}\{v_1\otimes\cdots\otimes v_m : \dim\mathrm{Span}\{v_i\} \le k\}`.
@@ -27,7 +30,7 @@ def dim_v(n: int, m: int, k: int) -> int:
         The dimension.
 
     Raises:
-        ValueError: a number that is too small or not an integer.
+        ValueError: a number that is too small or not an integer, or numbers so large that the sum would not end.
 
     Source: thesis sections 9.1 and 9.4 (claim 1, where "s_lambda" must read d_lambda(n)).
 
@@ -36,6 +39,14 @@ def dim_v(n: int, m: int, k: int) -> int:
         (26, 60, 72)
     """
     _check(n=(n, 1), m=(m, 1), k=(k, 0))
+    if n.bit_length() * m > DIGITS:
+        raise ValueError(f"the dimension of V({n}, {m}, {k}) may have more than {DIGITS:,} bits; take a smaller n or m")
+    if k >= m:
+        return int(n**m)
+    if _many(m, min(k, n)):
+        raise ValueError(
+            f"{m} has too many partitions into up to {min(k, n)} parts, more than {HOOKS // m:,}; take a smaller m, or n or k"
+        )
     # more than n parts have no semi-standard tableau: left out, m = 100 takes no time in small spaces
     return sum(standard_tableaux(shape) * semistandard_tableaux(shape, n) for shape in partitions(m, min(k, n)))
 
@@ -65,9 +76,11 @@ def dim_v_closed_form(n: int, m: int, codim: int) -> int:
         >>> dim_v_closed_form(3, 3, 1), dim_v_closed_form(3, 4, 2), dim_v_closed_form(4, 3, 2)
         (26, 72, 20)
     """
-    if codim not in (1, 2, 3):
+    if isinstance(codim, bool) or codim not in (1, 2, 3):
         raise ValueError(f"codim must be 1, 2 or 3, got {codim!r}; dim_v(n, m, k) takes any k")
     _check(n=(n, 1), m=(m, codim))
+    if n.bit_length() * m > DIGITS:
+        raise ValueError(f"n**m has more than {DIGITS:,} bits for n = {n}, m = {m}; take a smaller n or m")
     missing = Fraction(comb(n, m))
     if codim >= 2:
         missing += (m - 1) ** 2 * comb(n + 1, m)
@@ -89,6 +102,17 @@ def partitions(m: int, parts: int | None = None, largest: int | None = None) -> 
         for first in range(m if largest is None else min(m, largest), 0, -1):
             for rest in partitions(m - first, None if parts is None else parts - 1, first):
                 yield (first, *rest)
+
+
+def _many(m: int, parts: int) -> bool:
+    """Whether the partitions of m into so many parts have more than HOOKS hooks."""
+    ways = [1] + [0] * m  # by parts of sizes up to the current one, as many as of up to so many parts
+    for size in range(1, min(parts, m) + 1):
+        for total in range(size, m + 1):
+            ways[total] += ways[total - size]
+        if ways[m] * m > HOOKS:
+            return True
+    return False
 
 
 def standard_tableaux(shape: Sequence[int]) -> int:

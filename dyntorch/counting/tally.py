@@ -9,9 +9,9 @@ import numpy as np
 
 from dyntorch.counting.field import Echelon, Field, IntArray
 from dyntorch.counting.step import Step
+from dyntorch.counting.views import LARGEST
 
 BLOCK = 32  # rows eliminated together: 728 of width 729 take 0.6 s, as with 16 or 64; one by one they take 8 s
-LARGEST = 4096  # unknowns
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import combinations
+from math import comb
 from typing import Literal
 
 import numpy as np
@@ -11,6 +12,8 @@ import numpy as np
 from dyntorch.counting.field import Field, IntArray
 
 Measure = Literal["join", "hyper"]
+
+LARGEST = 4096  # unknowns
 
 
 class Views:
@@ -26,6 +29,7 @@ class Views:
         views: projective dimensions ``l_v`` of the views.
         measure: ``"join"``, ``"hyper"`` or a number of hyperplanes, per view.
         cameras: the projections ``(l_v + 1, k + 1)``, where they are not random.
+        points: that span a primitive.
     """
 
     def __init__(
@@ -35,7 +39,9 @@ class Views:
         views: Sequence[int],
         measure: Sequence[Measure | int],
         cameras: Sequence[IntArray] | None = None,
+        points: int = 1,
     ) -> None:
+        check_size(k, views, measure, points)
         self.field, self.k, self.measure = field, k, tuple(measure)
         self.cameras = [field.random(size + 1, k + 1) for size in views] if cameras is None else list(cameras)
 
@@ -80,3 +86,22 @@ class Views:
     def filled(self, extensor: IntArray) -> IntArray:
         """Rows of an extensor, any point of which matches any other."""
         return self.field.kron(*(self.field.product(extensor, camera.T) for camera in self.cameras))
+
+
+def check_size(k: int, views: Sequence[int], measure: Sequence[Measure | int], points: int) -> None:
+    """Refuse numbers whose rows would not fit, before any is drawn."""
+    if max((k, *views)) >= LARGEST or len(views) > LARGEST:
+        raise ValueError(f"{max(k, len(views), *views):,} dimensions or views are too many; give fewer than {LARGEST:,}")
+    width = rows = 1
+    for size, kind in zip(views, measure, strict=True):
+        used = points if kind == "join" else 1 if kind == "hyper" else int(kind)
+        width *= comb(size + 1, used)
+        rows *= 1 if kind == "join" else comb(size + 1 - points, used)
+        if width > LARGEST:
+            break
+    if width > LARGEST or rows > LARGEST:
+        least = "at least " if width > LARGEST else ""
+        raise ValueError(
+            f"{least}{max(width, rows):,} unknowns are too many; up to {LARGEST:,} are counted within a minute or so: "
+            "take fewer or smaller views"
+        )
