@@ -71,6 +71,8 @@ class NoticeCode(StrEnum):
     """A plane that does not move against the cameras, or is infinitely far."""
     NO_COMMON_INFINITY = "no_common_infinity"
     """No homography at infinity is common to the planes, or they are too noisy to tell."""
+    CHANCE = "chance"
+    """Random data of the kind would fit as well."""
     CALIBRATION = "calibration"
     """The homography at infinity and the calibration do not make a rotation."""
     OTHER_SOLUTION = "other_solution"

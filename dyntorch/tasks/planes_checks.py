@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
@@ -13,12 +15,20 @@ from dyntorch.tasks.planes_input import Given
 SPREAD = 0.4
 """Noise that the residuals show, over what it would be without epipoles and normals, from which on no homography at infinity is
 common to the planes.  Of 1200 scenes of 4, 5 and 8 planes, 40 matches in 120 pixels each, the largest is 0.37 at 0.5 and 1 px."""
+CHANCE, NARROW = 0.43, 0.62
+"""The same, from which on random homographies near any common one would do as well: the first less the second over the root of the
+residuals to spare.  Of such random ones a twentieth stays below 0.15, 0.20, 0.24, 0.28 and 0.34 (4, 5, 6, 8 and 12 planes; 150 times
+each); of the scenes nine in ten below 0.18, 0.18, 0.16, 0.15 at 0.5 px and 0.23, 0.24, 0.25, 0.24 at 1 px (4, 5, 6, 8 planes)."""
 ENTRIES = 0.065
 """Noise of the entries of homographies of norm 1 in normalized coordinates, the same; there it is 0.059 at most."""
-WORSE = 6.0
-"""Square of the deviations that one homography at infinity forces on the matrices, in noise variances (1 is expected), from which
-on it is not common to them.  Of 360 scenes of 4, 5 and 8 planes up to 1 px the largest is 3.9; of 60 times 8 random homographies
-near the identity, seen with 0.5 px, the smallest is 8.1."""
+UNLIKELY = 3.09
+"""Normal deviate of the F ratio, exceeded once in a thousand, from which on one homography at infinity is not common to matched
+planes.  The largest of 60 scenes of 4, 6 and 8 planes at 0.5 px: 1.6.  Planes that turn by themselves by 3 degrees: 1 to 12."""
+DOUBTFUL = 1.64
+"""The same, exceeded one time in twenty, from which on the ratio is taken for an error of the model."""
+VAGUE = 0.25
+"""Noise of the matches over the extent of their planes and bodies from which on they are no matches: 0.03 at 1 px in 120 pixels,
+0.4 to 0.5 where they are random."""
 LEAST = 8
 """Residuals of the separate matrices to spare from which on these say what the noise is."""
 ROUNDING = 1e-5
@@ -31,20 +41,36 @@ DEVIATIONS = 8.0
 """Standard deviations of that distance that noise is believed to reach."""
 
 
-def misfit(given: Given, cost: Tensor, separate: Tensor) -> tuple[Tensor, Tensor]:
-    r"""How far the planes and bodies are from one homography at infinity, and whether noise does not explain it.
+@dataclass(frozen=True)
+class Misfit:
+    """What speaks against one homography at infinity for all, ``(b,)`` each.
 
-    With matches, the F ratio: what the cost grows by over that of their own matrices, per parameter less, over the variance of
-    the noise that is left under these.  With homographies alone, the noise that the residuals show over that which a single
-    homography for all would leave; three of them have one residual to spare, which says nothing.
+    Attributes:
+        ratio: with matches, the F ratio: what the cost grows by over that of their own matrices, per parameter less, over the
+            variance of the noise left under these.  With homographies alone, the noise that the residuals show over that which a
+            single homography for all would leave.
+        excess: variance of what one homography at infinity leaves over that of the noise, 1 where these may be the same.
+        apart: whether noise does not explain the ratio.
+        chance: whether random homographies would have it as well.  Three have one residual to spare, which says nothing.
+        vagueness: noise of the matches over the extent of what they are of; 0 without matches.
+        vague: whether they agree with any homographies and fundamental matrices as badly.
+    """
+
+    ratio: Tensor
+    excess: Tensor
+    apart: Tensor
+    chance: Tensor
+    vagueness: Tensor
+    vague: Tensor
+
+
+def misfit(given: Given, cost: Tensor, separate: Tensor) -> Misfit:
+    r"""How far the planes and bodies are from one homography at infinity, and whether noise does not explain it.
 
     Args:
         given: what was fitted.
         cost: ``(b,)`` of the fit.
         separate: ``(b,)`` cost of the matches under the given matrices; zero without matches.
-
-    Returns:
-        The ratio ``(b,)``, and bool ``(b,)``.
     """
     rows, spare = given.rows()
     sigma, used = (cost / spare.clamp(min=1)).sqrt(), given.used()
@@ -53,13 +79,46 @@ def misfit(given: Given, cost: Tensor, separate: Tensor) -> tuple[Tensor, Tensor
         planes, bodies = used[:, :p].sum(-1), used[:, p:].sum(-1)
         free = rows - 8 * planes - 7 * bodies
         variance = (separate / free.clamp(min=1)).clamp(min=(ROUNDING / given.frames[1][:, 0, 0]) ** 2)
-        ratio = (cost - separate) / (spare - free).clamp(min=1) / variance
-        return ratio, (ratio > WORSE) & (free >= LEAST) & (spare > free)
+        more = (spare - free).clamp(min=1)
+        ratio = (cost - separate) / more / variance
+        told, unusual = (free >= LEAST) & (spare > free), deviate(ratio, more, free.clamp(min=1))
+        excess = torch.where(told & (unusual > DOUBTFUL), ratio, 1.0)
+        apart = told & (unusual > UNLIKELY)
+        # the given matrices may fit badly where they are linear, and the common ones where none is common
+        vagueness = sigma.minimum(variance.sqrt()) / _extent(given).clamp(min=torch.finfo(sigma.dtype).tiny)
+        return Misfit(ratio, excess, apart, torch.zeros_like(apart), vagueness, (vagueness > VAGUE) & (spare > 0))
     entries = given.homographies.flatten(-2)
-    apart = used[:, :p].sum(-1) - torch.linalg.eigvalsh(entries.mT @ entries)[:, -1]
-    ratio = sigma / (apart / (rows - 8).clamp(min=1)).clamp(min=torch.finfo(sigma.dtype).tiny).sqrt()
-    told = (spare > 1) & (used[:, p:].sum(-1) == 0)
-    return ratio, told & (sigma > ROUNDING) & ((ratio > SPREAD) | (sigma > ENTRIES))
+    different = used[:, :p].sum(-1) - torch.linalg.eigvalsh(entries.mT @ entries)[:, -1]
+    ratio = sigma / (different / (rows - 8).clamp(min=1)).clamp(min=torch.finfo(sigma.dtype).tiny).sqrt()
+    told = (spare > 1) & (used[:, p:].sum(-1) == 0) & (sigma > ROUNDING)
+    chance = told & (ratio > CHANCE - NARROW / spare.clamp(min=1).sqrt())
+    apart = told & ((ratio > SPREAD) | (sigma > ENTRIES))
+    return Misfit(ratio, torch.ones_like(ratio), apart, chance, torch.zeros_like(ratio), torch.zeros_like(told))
+
+
+def deviate(ratio: Tensor, above: Tensor, below: Tensor) -> Tensor:
+    """Normal deviate that an F ratio is exceeded as often as, by its degrees of freedom above and below.
+
+    Source: Paulson 1942, An approximate normalization of the analysis of variance distribution.
+    """
+    a, b = 2 / (9 * above), 2 / (9 * below)
+    root = ratio.clamp(min=0).pow(1 / 3)
+    return ((1 - b) * root - (1 - a)) / (b * root.square() + a).sqrt()
+
+
+def _extent(given: Given) -> Tensor:
+    """Root mean square distance per coordinate ``(b,)`` of matches from the middle of their plane or body, in the view where it is
+    less, in the unit of the matches."""
+    found = []
+    for view, frame in enumerate(given.frames):
+        square, count = torch.zeros_like(frame[:, 0, 0]), torch.zeros_like(frame[:, 0, 0])
+        for seen in (given.planes, given.bodies):
+            w = seen.weights[..., None]
+            middle = (w * seen.views[view]).sum(-2, keepdim=True) / w.sum(-2, keepdim=True).clamp(min=1)
+            square = square + (w * (seen.views[view] - middle).square()).flatten(1).sum(-1)
+            count = count + 2 * w.flatten(1).sum(-1)
+        found.append((square / count.clamp(min=1)).sqrt() / frame[:, 0, 0])
+    return torch.stack(found).amin(0)
 
 
 def turned(given: Given, infinity: Tensor, covariance: Tensor, status: Tensor) -> tuple[Tensor, Tensor]:

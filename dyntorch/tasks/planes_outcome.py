@@ -37,20 +37,27 @@ def outcome(given: Given, found: tuple[Tensor, ...], method: str, refined: bool)
     planes, bodies = used[:, : layout.planes].sum(-1), used[:, layout.planes :].sum(-1)
     rows, spare = given.rows()
     covariance = noise_variance(cost, spare)[:, None, None] * covariance
+    figures = _figures(layout, theta, covariance, used)
+    against = misfit(given, cost, separate)
+    # what one homography at infinity leaves beyond the noise is an error as well
+    covariance = against.excess[:, None, None] * covariance
     uncertainty = projected(covariance[:, :9, :9], theta[:, :9]).diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
     right = enough(planes, bodies, method)
-    figures = _figures(layout, theta, covariance, used)
     several = figures.several()
-    ratio, apart = misfit(given, cost, separate)
     # what moves alike, or not at all, differs by noise alone
-    apart = apart & ~several & ~undetermined & right & refined
-    status = torch.where((uncertainty > UNCERTAIN) | other | several, Status.AMBIGUOUS, Status.OK)
+    told = ~several & ~undetermined & right & refined
+    vague = against.vague & told
+    apart = (against.apart & told) | vague
+    chance = against.chance & told & ~apart
+    status = torch.where((uncertainty > UNCERTAIN) | other | several | chance, Status.AMBIGUOUS, Status.OK)
     status = torch.where(apart, Status.NO_CONSENSUS, status)
     status = torch.where(undetermined, Status.DEGENERATE, status)
     status = torch.where(right, status, Status.TOO_FEW)
     distance, bent = turned(given, theta[:, :9], covariance[:, :9, :9], status)
     said = {
-        NoticeCode.NO_COMMON_INFINITY: (ratio, apart),
+        NoticeCode.NO_COMMON_INFINITY: (against.ratio, apart & ~vague),
+        NoticeCode.CHANCE: (against.ratio, chance),
+        NoticeCode.INCOHERENT: (against.vagueness, vague),
         NoticeCode.CALIBRATION: (distance, bent),
         NoticeCode.UNCERTAIN: (uncertainty, (uncertainty > UNCERTAIN) & right & ~apart),
         NoticeCode.OTHER_SOLUTION: (used.sum(-1), (other | several) & right & ~apart),

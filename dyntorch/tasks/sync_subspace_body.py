@@ -29,6 +29,8 @@ EDGE = 2.0
 """Widths of smoothing left out at either end, where it is one-sided, in both cameras at once: that would speak for lag 0."""
 STRAY = 3.0
 """Median distances from the middle beyond which a track takes no part in the middle and the size."""
+ROUNDING = 1e-6
+"""Of the extent of the points: what a track is off a line by that says nothing."""
 TINY = 1e-9
 """Of the size of the body: the least standard deviation of noise that is believed."""
 
@@ -52,6 +54,21 @@ class Body:
     points: Tensor
     seen: Tensor
     step: float
+
+    @property
+    def bend(self) -> float:
+        """Variance of the points about straight lines at constant velocity, one each, over that of their noise."""
+        time = torch.linspace(-1, 1, len(self.points), dtype=self.points.dtype, device=self.points.device)[:, None, None]
+        w = self.seen.to(self.points)[..., None]
+        # two parameters a track are to spare: one seen less often is on its line by itself
+        spare = (w.sum(0) - 2).clamp(min=0)
+        count = w.sum(0).clamp(min=1)
+        x, t = self.points - (w * self.points).sum(0) / count, time - (w * time).sum(0) / count
+        square = (w * t * t).sum(0)
+        x = x - t * (w * t * x).sum(0) / torch.where(square > 0, square, 1.0)
+        extent = float(self.points.flatten(0, 1).std(0).norm())
+        noise = max(_noise(self.points, self.seen), (ROUNDING * extent) ** 2, 1e-300)
+        return float((w * x.square()).sum() / (2 * spare.sum()).clamp(min=1)) / noise
 
     @property
     def reversed(self) -> Body:

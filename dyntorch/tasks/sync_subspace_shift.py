@@ -30,6 +30,9 @@ ALONE = 0.7
 motions all stay below .6."""
 REPEATED = 0.68
 """Resemblance of the motion to itself from which a peak may be another period."""
+BENT = 1.5
+"""Variance about straight lines at constant velocity over that of the noise, of either camera, below which only such lines are seen:
+1 where they are; perspective and the growing size of the whole bend them alike at every shift."""
 BLUR = 1 / 150
 """Seconds that the peak is off even where it is sharp, because cameras are not affine."""
 
@@ -143,6 +146,8 @@ def _reason(curve: SubspaceCurve, best: int, probability: float, margin: float, 
     """Why the data do not decide; empty where they do."""
     if min(curve.signal) < 1 or float(curve.rates[best]) < TELLING * step:
         return "the motion is too small against the noise, or the cameras do not show the same event: film a larger motion"
+    if curve.bodies is not None and min(body.bend for body in curve.bodies) < BENT:
+        return "all points move on straight lines at constant velocity, as at any other shift: film a motion that turns or stops"
     if probability >= SURE and margin >= CLEAR:
         return ""
     others = ", ".join(f"{time:+.2f}" for time in times.tolist())

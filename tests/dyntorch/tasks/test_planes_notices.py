@@ -184,3 +184,41 @@ def test_messages_count_and_say_what_three_planes_lack_only_of_three():
     assert "3 pairs of planes or bodies move alike, as of one body" in repr(five)
     scene = scenes.translating_planes(4, generator=generator)
     assert repr(translating_planes(x1=scene.x1, x2=scene.x2)).splitlines()[1].endswith(" px")
+
+
+@pytest.mark.parametrize("size", [0.1, 10.0])
+def test_random_homographies_decide_nothing(size):
+    draw = torch.Generator().manual_seed(40)
+    H = torch.eye(3, dtype=torch.float64) + size * torch.randn(6, 6, 3, 3, generator=draw, dtype=torch.float64)
+    found = translating_planes(H)
+    assert Status.OK not in found.status.tolist()
+    named = {w.code for w in found.warnings}
+    assert named & {NoticeCode.NO_COMMON_INFINITY, NoticeCode.CHANCE}
+
+
+def test_random_matches_decide_nothing():
+    draw = torch.Generator().manual_seed(41)
+    x1, x2 = 500 * torch.rand(2, 3, 6, 30, 2, generator=draw, dtype=torch.float64)
+    found = translating_planes(x1=x1, x2=x2)
+    assert Status.OK not in found.status.tolist()
+    assert NoticeCode.INCOHERENT in {w.code for w in found.warnings}
+
+
+def test_planes_that_turn_by_themselves_are_refused():
+    scene = scenes.translating_planes(6, batch=3, generator=torch.Generator().manual_seed(42))
+    # a turn of the picture by 3 degrees about the middle of every patch, each the other way round
+    middle = scene.x2.mean(-2, keepdim=True)
+    angle = torch.tensor([1.0, -1.0], dtype=torch.float64).repeat(3) * torch.pi / 60
+    turn = torch.stack([torch.stack([angle.cos(), -angle.sin()], -1), torch.stack([angle.sin(), angle.cos()], -1)], -2)
+    x2 = (scene.x2 - middle) @ turn.mT + middle
+    noise = torch.randn(2, *x2.shape, generator=torch.Generator().manual_seed(43), dtype=torch.float64)
+    x1, x2 = scene.x1 + 0.5 * noise[0], x2 + 0.5 * noise[1]
+    assert Status.OK not in translating_planes(x1=x1, x2=x2).status.tolist()
+
+
+@pytest.mark.parametrize("planes", [6, 8])
+def test_planes_that_only_translate_stay_certain(planes):
+    scene = scenes.translating_planes(planes, batch=4, sigma=0.5, generator=torch.Generator().manual_seed(44))
+    alone = translating_planes(dyn.fit(dyn.Collineation(2), scene.x2, scene.x1).tensor)
+    matched = translating_planes(x1=scene.x1, x2=scene.x2)
+    assert alone.status.eq(Status.OK).all() and matched.status.eq(Status.OK).all()

@@ -171,3 +171,18 @@ def test_a_shift_that_is_not_known_to_a_frame_of_fast_cameras_is_refused():
     assert _to_a_frame(found, 1 / 30, 1 / 30) is found
     fast = _to_a_frame(found, 1 / 30, 1 / 60)
     assert not fast.ok and "uncertain by 0.017 s" in fast.reason and fast.position == found.position
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.5])
+def test_straight_lines_at_constant_velocity_carry_no_time(sigma):
+    # the size of the whole grows and shrinks about the middle of either take, which looked like one event
+    generator = torch.Generator().manual_seed(9010)
+    frames = torch.arange(120, dtype=torch.float64)[:, None, None]
+
+    def tracks(n):
+        places, velocity = (torch.randn(1, n, 2, generator=generator, dtype=torch.float64) for _ in range(2))
+        return 100 * places + 2 * velocity * frames + sigma * torch.randn(120, n, 2, generator=generator, dtype=torch.float64)
+
+    for _ in range(4):
+        found = synchronize(tracks(12), tracks(14), correspondence=False, fps=30.0)
+        assert not found.ok and "straight lines" in found.reason
