@@ -1,18 +1,110 @@
-"""Work on a batch block by block, so that each block stays in the cache of a core, and all cores have one."""
+"""Work on a batch block by block, so that each block stays in the cache of a core, and all cores have one.
+
+Small matrices never wait for a team of threads: whatever is public runs on one thread (:func:`one_thread`), and blocks go to a pool
+of workers of one thread each (:func:`map_blocks`).  Beside a busy neighbour a team waits for its slowest member at every operation:
+five to twenty times longer than one thread takes for the whole.
+"""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache
-from threading import Barrier
-from typing import TypeVar
+from contextlib import contextmanager
+from functools import lru_cache, wraps
+from threading import Barrier, local
+from typing import Any, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
 
 Result = TypeVar("Result", Tensor, tuple[Tensor, ...])
+P = ParamSpec("P")
+R = TypeVar("R")
+LARGE = 1 << 20
+"""Numbers in one problem from which its own operations may use all threads."""
+
+
+class _Caller(local):
+    """What each Python thread had set before it entered :func:`one_thread`."""
+
+    threads: int | None = None
+
+
+_caller = _Caller()
+
+
+def one_thread(function: Callable[P, R]) -> Callable[P, R]:
+    """Decorate a public function: its small operations run on one thread, its blocks on as many workers as torch has threads.
+
+    The setting of the caller (``torch.set_num_threads``) holds again after the call, also after an exception, and all the time
+    in other threads.  Within ``torch.inference_mode`` the function runs without gradients instead, on copies of the tensors made
+    there: what it differentiates inside needs tensors that may be saved.
+
+    Example:
+        >>> import torch
+        >>> one_thread(torch.get_num_threads)(), workers() == torch.get_num_threads()
+        (1, True)
+    """
+
+    @wraps(function)
+    def run(*args: P.args, **kwargs: P.kwargs) -> R:
+        if torch.is_inference_mode_enabled():
+            with torch.inference_mode(False), torch.no_grad():
+                return run(*(_outside(x) for x in args), **{name: _outside(x) for name, x in kwargs.items()})
+        threads = torch.get_num_threads()
+        if threads == 1 or _caller.threads is not None:
+            return function(*args, **kwargs)
+        _caller.threads = threads
+        _set_threads(1, others=threads)
+        try:
+            return function(*args, **kwargs)
+        finally:
+            _caller.threads = None
+            torch.set_num_threads(threads)
+
+    run.__dict__["one_thread"] = True
+    return run
+
+
+def workers() -> int:
+    """Workers that blocks are spread over: the number of threads that torch has, or had before :func:`one_thread`."""
+    return _caller.threads or torch.get_num_threads()
+
+
+def _outside(x: Any) -> Any:
+    """Arguments without tensors made in inference mode, which autograd cannot save."""
+    if isinstance(x, Tensor):
+        return x.clone() if x.is_inference() else x
+    if isinstance(x, (tuple, list)) and type(x) in (tuple, list):
+        return type(x)(_outside(item) for item in x)
+    return x
+
+
+def _set_threads(count: int, others: int) -> None:
+    """Threads for the operations of this Python thread; those that start later get ``others``."""
+    torch.set_num_threads(count)
+    # the setting holds per thread, but new threads inherit the last one, whoever set it
+    _keeper().submit(torch.set_num_threads, others).result()
+
+
+@lru_cache(maxsize=1)
+def _keeper() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(1, thread_name_prefix="dyntorch-keeper")
+
+
+@contextmanager
+def _all_threads(tensors: tuple[Tensor, ...]) -> Iterator[None]:
+    """The threads of the caller for a single problem that is large."""
+    threads = _caller.threads
+    if threads is None or sum(x.numel() for x in tensors) < LARGE:
+        yield
+        return
+    torch.set_num_threads(threads)
+    try:
+        yield
+    finally:
+        _set_threads(1, others=threads)
 
 
 def map_blocks(function: Callable[..., Result], *tensors: Tensor, size: int) -> Result:
@@ -20,7 +112,7 @@ def map_blocks(function: Callable[..., Result], *tensors: Tensor, size: int) -> 
 
     On the CPU torch factorizes a batch of matrices one after the other on one core (``svd``, ``eigh``, ``cholesky`` and
     the triangular solves), and releases the interpreter meanwhile; threads over blocks give the other cores their share.
-    The pool has ``torch.get_num_threads()`` workers, whose own operations run on one thread each: also a single block of many
+    The pool has :func:`workers` workers, whose own operations run on one thread each: also a single block of many
     small problems goes there, because teams of threads on small operations cost ten times what they gain.  A single problem,
     one thread or an accelerator needs no pool.  The caller's grad mode holds in the workers.
 
@@ -45,9 +137,10 @@ def map_blocks(function: Callable[..., Result], *tensors: Tensor, size: int) -> 
         raise ValueError(f"map_blocks needs tensors of the same leading dimension, got {[tuple(t.shape) for t in tensors]}")
     if size < 1:
         raise ValueError(f"size must be at least 1 problem per block, got {size}")
-    threads = torch.get_num_threads() if tensors[0].device.type == "cpu" else 1
+    threads = workers() if tensors[0].device.type == "cpu" else 1
     if len(tensors[0]) <= min(size, 1) or (threads == 1 and len(tensors[0]) <= size):
-        return function(*tensors)  # one large problem may use all cores in its operations
+        with _all_threads(tensors):
+            return function(*tensors)
     blocks = list(zip(*(tensor.split(size) for tensor in tensors), strict=True))
     if threads == 1:
         return _concatenate([function(*block) for block in blocks])
@@ -75,14 +168,16 @@ def _one_thread() -> None:
 @lru_cache(maxsize=1)
 def _pool(threads: int) -> ThreadPoolExecutor:
     """Workers whose torch operations do not start teams of their own: ten times slower, with more threads than cores."""
-    pool = ThreadPoolExecutor(threads, thread_name_prefix="dyntorch", initializer=_one_thread)
-    # every worker has to start before the setting is put right: it holds per thread, but new threads inherit the last one
+    pool, own = ThreadPoolExecutor(threads, thread_name_prefix="dyntorch", initializer=_one_thread), torch.get_num_threads()
+    # every worker has to start before the setting is put right
     started = Barrier(threads)
     for _ in pool.map(lambda _: started.wait(), range(threads)):
         pass
-    torch.set_num_threads(threads)
+    _set_threads(own, others=threads)
     return pool
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_pool.cache_clear)  # threads do not survive a fork
+    # threads do not survive a fork
+    os.register_at_fork(after_in_child=_pool.cache_clear)
+    os.register_at_fork(after_in_child=_keeper.cache_clear)

@@ -11,7 +11,7 @@ from torch.nn.functional import normalize
 
 from dyntorch.algebra.triangulation import observed
 from dyntorch.arguments import check_tensor, check_together
-from dyntorch.blocks import map_blocks
+from dyntorch.blocks import map_blocks, one_thread, workers
 from dyntorch.bundle_problem import BundleProblem
 
 BLOCK = 1 << 20
@@ -34,6 +34,7 @@ class Adjusted:
     """``(*batch,)`` steps tried."""
 
 
+@one_thread
 def bundle_adjust(
     x: Tensor,
     weights: Tensor | None,
@@ -116,7 +117,7 @@ def bundle_adjust(
 
     a, k = cameras.shape[-1], structure.shape[-1]
     width = n * (views**2 * ((size + 1) ** 2 + a**2) + (k + views * size) * k)
-    problems = max(1, min(BLOCK // max(1, width), -(-count // torch.get_num_threads())))
+    problems = max(1, min(BLOCK // max(1, width), -(-count // workers())))
     clean = tuple(torch.where(part.isfinite(), part, 0.0) for part in start)
     with torch.no_grad():
         found = map_blocks(run, flat(images, views, n, size), w, *clean, *extra, size=problems)

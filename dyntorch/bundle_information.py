@@ -10,6 +10,7 @@ from torch.nn.functional import normalize
 
 from dyntorch.algebra.triangulation import observed
 from dyntorch.arguments import check_tensor
+from dyntorch.blocks import one_thread
 from dyntorch.bundle_adjustment import LOSSES, check
 from dyntorch.bundle_problem import BundleProblem
 
@@ -59,6 +60,7 @@ def point_information(cameras: Tensor, structure: Tensor, weights: Tensor | None
     return found.permute(0, 3, 1, 2).reshape(*batch, n, *found.shape[1:3]).to(cameras.dtype)
 
 
+@one_thread
 def structure_covariance(
     cameras: Tensor,
     structure: Tensor,

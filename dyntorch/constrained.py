@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from dyntorch.blocks import map_blocks
+from dyntorch.blocks import map_blocks, one_thread, workers
 from dyntorch.invariant import Invariant
 from dyntorch.least_squares import minimize
 from dyntorch.matches import Matches, relative_weights
@@ -52,6 +52,7 @@ class Algebraic:
         return self.invariant.basis_of(tensor.unflatten(-1, self.invariant.shape()))[..., 0, :]
 
 
+@one_thread
 def constrain(solution: Solution, *, iterations: int = ITERATIONS) -> Solution:
     r"""Replace the tensor of a linear fit by that of a motion: minimize :math:`|E\,A(M)| / |A(M)|` over the motion M.
 
@@ -127,6 +128,6 @@ def algebraic_motion(solution: Solution, data: Matches, iterations: int = ITERAT
 
     theta = torch.cat([part.flatten(2) for part in starts], dim=-1).transpose(0, 1)
     options = () if static is None else (static,)
-    size = max(1, min(BLOCK // (invariant.width() * theta.shape[-1]), -(-len(theta) // torch.get_num_threads())))
+    size = max(1, min(BLOCK // (invariant.width() * theta.shape[-1]), -(-len(theta) // workers())))
     found = map_blocks(run, theta, *views, weights, *options, size=size)[0]
     return parts_of(found, shapes)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.ambiguity import within_noise
-from dyntorch.blocks import map_blocks
+from dyntorch.blocks import map_blocks, one_thread, workers
 from dyntorch.invariant import Invariant, as_invariant
 from dyntorch.matches import Matches, matches, relative_weights
 from dyntorch.matrix import estimation_matrix, gram
@@ -32,6 +32,7 @@ BLOCK, LEAST = 5 << 19, 16
 is cut for the sake of another core.  Measured best: 364 problems of 200 points of the plane (47 us each; 128: 59), 131 of space."""
 
 
+@one_thread
 def fit(
     invariant: Invariant | type[Invariant],
     *views: Tensor,
@@ -95,7 +96,7 @@ def fit_matches(invariant: Invariant, data: Matches, *, normalize: bool = True) 
         return _solve(invariant, block[: len(views)], block[len(views)], block[len(views) + 1 :], normalize)
 
     per_problem = data.count * max(1, invariant.copies or 1) * _largest(invariant)
-    size = min(max(1, BLOCK // max(1, per_problem)), max(LEAST, -(-len(weights) // torch.get_num_threads())))
+    size = min(max(1, BLOCK // max(1, per_problem)), max(LEAST, -(-len(weights) // workers())))
     parts = map_blocks(solve, *views, weights, *options, size=size)
     normalized, tensor, status, uncertainty = parts[:4]
     count = len(invariant.primitives)

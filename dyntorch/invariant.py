@@ -167,7 +167,8 @@ class Invariant:
 
         def tensor(theta: Tensor) -> Tensor:
             parts = zip(theta.split(sizes, -1), shapes, strict=True)
-            return self.compose(*(part.unflatten(-1, shape) for part, shape in parts)).flatten(1)
+            composed = self.compose(*(part.unflatten(-1, shape) for part, shape in parts))
+            return composed.flatten(theta.ndim - 1)
 
         return jacobian(tensor, torch.cat([part.flatten(1) for part in motion], dim=-1))
 
@@ -183,6 +184,10 @@ class Invariant:
     def shared(self, motion: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
         """Functions of the motion that the residuals of all matches share (inverses): refinement computes them once per motion."""
         return motion
+
+    def shared_derivative(self, motion: tuple[Tensor, ...]) -> tuple[tuple[Tensor, ...], Tensor | None]:
+        """:meth:`shared` and its derivative ``(b, p, q)`` by all entries of the motion; None where it is the motion."""
+        return motion, None
 
     def whitened_shared(self, shared: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
         """:meth:`whitened` from :meth:`shared`."""

@@ -7,6 +7,7 @@ grow with the length.
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -257,7 +258,7 @@ def _span(a: Tensor, b: Tensor, lags: Lags | None, dims: int) -> Lags:
 
 def _flat(a: Tensor, b: Tensor, dims: int) -> tuple[tuple[int, ...], Tensor, Tensor]:
     """The common batch shape, and both sequences in float64 with one batch dimension."""
-    shape = torch.broadcast_shapes(a.shape[:-dims], b.shape[:-dims])
+    shape = np.broadcast_shapes(a.shape[:-dims], b.shape[:-dims])
     first, second = (x.double().expand(*shape, *x.shape[-dims:]).reshape(-1, *x.shape[-dims:]) for x in (a, b))
     return tuple(shape), first, second
 

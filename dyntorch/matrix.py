@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -38,7 +39,7 @@ def estimation_matrix(
     for v, (primitive, x) in enumerate(zip(primitives, views, strict=True)):
         # a projector is its own Gram, so its rows serve as the vectors
         blocks.append(_kronecker([*vectors[:v], primitive.free(x), *vectors[v + 1 :]], weights * static))
-    lead = torch.broadcast_shapes(*(block.shape[:-2] for block in blocks))
+    lead = np.broadcast_shapes(*(block.shape[:-2] for block in blocks))
     return torch.cat([block.expand(*lead, -1, -1) for block in blocks], dim=-2)
 
 
@@ -72,7 +73,7 @@ def gram(primitives: Sequence[Primitive], views: Sequence[Tensor], weights: Tens
         return matrix.mT @ matrix
     n, width = weights.shape[-1], math.prod(p.width * (p.width + 1) // 2 for p in primitives[1:])
     shapes = [x.shape[: p.match_axis(x)] for p, x in zip(primitives, views, strict=True)]
-    lead = math.prod(torch.broadcast_shapes(*shapes, weights.shape[:-1]))
+    lead = math.prod(np.broadcast_shapes(*shapes, weights.shape[:-1]))
     if weights.ndim == 2 and lead * n * width > CHUNK and len(weights) > 1:
         # a few problems at a time, so that their products stay in the cache (copies have primitives of each problem)
         size = max(1, CHUNK * len(weights) // max(1, lead * n * width))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dyntorch.forward import jacobian
+from dyntorch.forward import by_match
 from dyntorch.invariant import Invariant
 from dyntorch.residual import multilinear_derivative
 
@@ -63,9 +63,9 @@ class Problem:
             return known
         empty = tuple(x[:0] for x in views), tuple(scale[:0] for scale in self.scales)
         if self.invariant.whitened(self.parts(theta[:0]), *empty) is not None:
-            shared, slope = jacobian(lambda t: flattened(self.invariant.shared(self.parts(t))), theta)
-            value, derivative = self._by_match(self.invariant.whitened_shared, shared, views)
-            return value, slope @ derivative
+            shared, slope = self.invariant.shared_derivative(self.parts(theta))
+            value, derivative = self._by_match(self.invariant.whitened_shared, flattened(shared), views)
+            return value, derivative if slope is None else slope @ derivative
         # one row per match: by hand through the tensor, several times cheaper than forward mode through the matches
         tensor, slope = self.invariant.compose_derivative(self.parts(theta))
         shape = self.invariant.shape()
@@ -77,21 +77,12 @@ class Problem:
         return self._by_match(self.invariant.whitened_static, theta, views)
 
     def _by_match(self, function: Callable[..., Tensor], theta: Tensor, views: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
-        """Residuals ``(b, n c)`` and derivative ``(b, p, n c)`` in reverse mode: a few conditions per match, many parameters.
+        """Residuals ``(b, n c)`` and derivative ``(b, p, n c)``."""
 
-        Every match gets its own copy of the parameters, so that one backward pass per condition serves all matches.
-        """
-        count = views[0].shape[1]
-        single = tuple(x.unsqueeze(2) for x in views)
-        scales = tuple(scale[:, None].expand(-1, count) for scale in self.scales)
+        def residual(copies: Tensor, scales: tuple[Tensor, ...], single: tuple[Tensor, ...]) -> Tensor:
+            return function(self.parts(copies), single, scales)
 
-        def residual(copies: Tensor) -> Tensor:
-            return function(self.parts(copies), single, scales)[..., 0, :]
-
-        value, pull = torch.func.vjp(residual, theta[:, None].expand(-1, count, -1))[:2]
-        one = torch.eye(value.shape[-1], dtype=value.dtype, device=value.device)
-        rows = torch.stack([pull(unit.expand_as(value).contiguous())[0] for unit in one], dim=2)
-        return value.flatten(1), rows.flatten(1, 2).mT
+        return by_match(residual, theta, self.scales, views)
 
     def pieces(self, width: int) -> list[slice]:
         """The matches in slices whose Jacobians fit into memory, whatever their number."""

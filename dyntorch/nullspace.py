@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.arguments import check_tensor
-from dyntorch.blocks import map_blocks
+from dyntorch.blocks import map_blocks, one_thread, workers
 from dyntorch.eigenspace import (
     NULL,
     RESOLVED,
@@ -51,6 +51,7 @@ class GramNullSpace:
     """``(*batch,)`` bool: the null space is larger than asked for, or the input not finite, or (accelerators) not converged."""
 
 
+@one_thread
 def null_space(matrix: Tensor, dim: int = 1) -> Tensor:
     r"""Orthonormal basis of the right null space: :math:`A v_j \approx 0`, least squares where no exact one exists.
 
@@ -153,7 +154,7 @@ def _size(matrix: Tensor) -> int:
     if not on_host(matrix):
         return 256 * problems  # an accelerator wants everything at once: there the block only bounds the memory
     # as many blocks for every thread, unless that leaves too little to be worth a thread
-    threads = torch.get_num_threads()
+    threads = workers()
     blocks = threads * ceil(batch / (problems * threads))
     return max(min(8, problems), ceil(batch / max(blocks, 1)))
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from dyntorch.blocks import map_blocks
+from dyntorch.blocks import map_blocks, one_thread, workers
 from dyntorch.constrained import algebraic_motion
 from dyntorch.forward import jacobian
 from dyntorch.invariant import Invariant
@@ -20,6 +20,7 @@ from dyntorch.solution import Solution, failed
 ITERATIONS = 30
 
 
+@one_thread
 def refine(
     solution: Solution,
     *views: Tensor,
@@ -104,7 +105,7 @@ def refine_matches(solution: Solution, data: Matches, iterations: int = ITERATIO
 
     # a block for every thread at least: threads inside of small operations cost more than they bring
     theta = torch.stack(thetas, dim=1)
-    size = max(1, min(BLOCK // max(1, data.count * theta.shape[-1]), -(-len(theta) // torch.get_num_threads())))
+    size = max(1, min(BLOCK // max(1, data.count * theta.shape[-1]), -(-len(theta) // workers())))
     with torch.no_grad():
         start = torch.where(theta.isfinite(), theta, torch.zeros_like(theta))
         scales, unit = relative(norm.scales)
@@ -171,7 +172,7 @@ def _covariance(
     root = vectors * values.clamp(min=1e-12 * values[..., -1:].clamp(min=torch.finfo(values.dtype).tiny)).rsqrt()[..., None, :]
 
     def moved(t: Tensor) -> Tensor:
-        return flattened(denormalize_motion(invariant, problem.parts(t), frames))
+        return torch.cat([part.flatten(t.ndim - 1) for part in denormalize_motion(invariant, problem.parts(t), frames)], dim=-1)
 
     _, derivative = jacobian(moved, theta)
     spread = derivative.mT @ root

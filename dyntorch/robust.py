@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from dyntorch.blocks import map_blocks
+from dyntorch.blocks import map_blocks, one_thread, workers
 from dyntorch.fitting import fit_matches
 from dyntorch.invariant import Invariant, as_invariant
 from dyntorch.matches import Matches, matches
@@ -28,6 +28,7 @@ ROUNDS = (3, 8)
 BLOCK = 1 << 16  # matches per block of the distances
 
 
+@one_thread
 def robust_fit(
     invariant: Invariant | type[Invariant],
     *views: Tensor,
@@ -193,7 +194,7 @@ def distances(solution: Solution) -> Tensor:
             return multilinear(invariant, motion[0], views, scales).abs() / unit[:, None]
         return whitened(invariant, motion, views, scales).norm(dim=-1) / unit[:, None]
 
-    size = max(1, min(BLOCK // max(1, data.count), -(-len(data.weights) // torch.get_num_threads())))
+    size = max(1, min(BLOCK // max(1, data.count), -(-len(data.weights) // workers())))
     return map_blocks(block, *transforms, *data.views, *parts, size=size).nan_to_num(nan=torch.inf)
 
 

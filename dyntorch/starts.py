@@ -10,7 +10,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from dyntorch.blocks import Result, map_blocks
+from dyntorch.blocks import Result, map_blocks, workers
 from dyntorch.hypotheses import Bundle, anneal, bundle, concentrate, median, msac
 from dyntorch.invariant import Invariant
 from dyntorch.matches import Matches
@@ -171,7 +171,7 @@ class Search:
         packed = math.prod(p.width * (p.width + 1) // 2 for p in inv.primitives)
         per_start = 2 * inv.width() ** 2 + n * inv.nullity * sum(p.width for p in inv.primitives)
         per_problem = (inv.copies or 1) * (n * packed + starts.shape[1] * per_start)
-        size = min(BLOCK // per_problem, -(-len(where) // torch.get_num_threads()))
+        size = min(BLOCK // per_problem, -(-len(where) // workers()))
         rest = (self.weights, *self.views, *self.norm.transforms)
         return map_blocks(function, starts, *more, *(x[where] for x in rest), size=max(1, size))
 

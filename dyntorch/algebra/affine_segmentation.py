@@ -12,6 +12,7 @@ from dyntorch.algebra.hyperplane_pair import hyperplane_pair
 from dyntorch.algebra.partition import order_of_bodies
 from dyntorch.algebra.two_views import check_matches, described
 from dyntorch.arguments import FARTHEST
+from dyntorch.blocks import one_thread
 from dyntorch.nullspace import gram_null_space
 
 MATCHES = 14
@@ -39,6 +40,7 @@ class AffineSegmentation:
         return described(self, self.labels, self.degenerate, 2)
 
 
+@one_thread
 def affine_segmentation(x1: Tensor, x2: Tensor, weights: Tensor | None = None) -> AffineSegmentation:
     r"""Segment the matches of two bodies between affine views: :math:`(f_1 \cdot z)(f_2 \cdot z) = z^T S z = 0`.
 

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from dyntorch.algebra.dynamic_shape_descent import Descent, Views, centred_views, descend, framed, project, shapes_at
 from dyntorch.algebra.dynamic_shape_linear import complete, graph_start, leading, pooled_start, window_start
+from dyntorch.blocks import one_thread
 
 GAUGE = 9
 """Parameters of the shapes that no view can tell: a constant affine frame of the world."""
@@ -51,6 +52,7 @@ class MovingShapes:
     degenerate: Tensor
 
 
+@one_thread
 def fit_shapes(
     x: Tensor, rows: Tensor, weights: Tensor | None = None, *, share: Tensor | None = None, iterations: int = 50
 ) -> MovingShapes:

@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import prod
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from dyntorch.algebra.dynamic_shape_basis import Trajectory
 from dyntorch.algebra.dynamic_shape_descent import centred_views, project, shapes_at
+from dyntorch.blocks import one_thread
 
 PEAKS = 3
 """Minima of the grid that are refined."""
@@ -47,6 +49,7 @@ class Recovery:
         return self.rise < 2 * torch.as_tensor(noise)[..., None] ** 2 * torch.tensor(odds).log()
 
 
+@one_thread
 def recover_times(
     shapes: Tensor,
     basis: Trajectory,
@@ -95,7 +98,7 @@ def recover_times(
         raise ValueError(f"{basis!r} has {basis.size} functions, shapes {tuple(shapes.shape)} have {shapes.shape[-3]}")
     if grid < 3:
         raise ValueError(f"grid must be at least 3 times, got {grid}")
-    batch = torch.broadcast_shapes(shapes.shape[:-3], x.shape[:-3])
+    batch = np.broadcast_shapes(shapes.shape[:-3], x.shape[:-3])
     flat = prod(batch)
     wide = shapes.double().expand(*batch, *shapes.shape[-3:]).reshape(flat, *shapes.shape[-3:])
     seen = x.double().expand(*batch, *x.shape[-3:]).reshape(flat, *x.shape[-3:])

@@ -6,8 +6,10 @@ import torch
 from torch import Tensor
 
 from dyntorch.arguments import check_tensor
+from dyntorch.blocks import one_thread
 
 
+@one_thread
 def affine_factorization(views: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     r"""Best rank-3 fit of centred affine views: :math:`x_v - \bar x_v \approx X A_v`.
 
@@ -39,6 +41,7 @@ def affine_factorization(views: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return shape.to(views.dtype), cameras.to(views.dtype), left.to(views.dtype)
 
 
+@one_thread
 def metric_upgrade(shape: Tensor, cameras: Tensor) -> tuple[Tensor, Tensor]:
     r"""Turn an affine shape into a metric one for scaled-orthographic cameras, with y along the mean vertical of the images.
 

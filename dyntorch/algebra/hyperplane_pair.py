@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.algebra.homogeneous import unit_vectors
+from dyntorch.blocks import one_thread
 from dyntorch.nullspace import gram_null_space
 
 REWEIGHTINGS, CANDIDATES = 3, 4
@@ -35,6 +36,7 @@ class HyperplanePair:
     fit exactly."""
 
 
+@one_thread
 def hyperplane_pair(structure: Tensor, weights: Tensor | None = None, *, information: Tensor | None = None) -> HyperplanePair:
     r"""Two hyperplanes through points: :math:`(h_1 \cdot Y)(h_2 \cdot Y) = Y^T Q\, Y = 0`.
 

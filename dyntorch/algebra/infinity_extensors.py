@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from math import prod
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -112,7 +113,7 @@ def _solve(planes: Tensor, weights: Tensor | None, fundamentals: Tensor | None, 
     known = extensors.new_zeros(*planes.shape[:-3], 0, 9)
     if fundamentals is not None:
         known = unit_vectors(finite_matrices(fundamentals)[0].flatten(-2))
-    batch, device = torch.broadcast_shapes(extensors.shape[:-2], known.shape[:-2]), planes.device
+    batch, device = np.broadcast_shapes(extensors.shape[:-2], known.shape[:-2]), planes.device
     tables = _joins(3, unknowns, device), _joins(1, unknowns, device)
 
     def block(*parts: Tensor) -> tuple[Tensor, Tensor]:

@@ -12,6 +12,7 @@ from torch.nn.functional import one_hot
 from dyntorch.algebra.extensors import compound, dual, meet
 from dyntorch.algebra.homogeneous import unit, unit_vectors
 from dyntorch.algebra.rank_two import cofactors, null_vectors
+from dyntorch.blocks import one_thread
 
 FLAT = 1e-12
 """Sine of the angle between two lines below which their intersection is rounding."""
@@ -63,6 +64,7 @@ def epipoles(projections: Sequence[Tensor]) -> Tensor:
     return _oriented(images.masked_fill(own, 0.0)).to(views.dtype)
 
 
+@one_thread
 def joint_epipoles(projections: Sequence[Tensor]) -> JointEpipoles:
     r"""Where the images of the other two centres meet: :math:`e_i \sim M_i L_j \times M_i L_k`.
 

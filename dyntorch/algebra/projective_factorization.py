@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.algebra.homogeneous import homogeneous, similarity
-from dyntorch.blocks import map_blocks
+from dyntorch.blocks import map_blocks, one_thread
 
 # earlier steps that are mixed; planar constant velocity, 8 views, exact: 100 iterations leave 2e-12 px, with 5 steps 2e-7 px,
 # and 300 iterations without mixing 2e-2 px
@@ -33,6 +33,7 @@ class ProjectiveFactorization(NamedTuple):
     """``(*batch,)`` bool: the depths no longer change."""
 
 
+@one_thread
 def projective_factorization(
     tracks: Tensor, rank: int, weights: Tensor | None = None, *, iterations: int = 300, tolerance: float = 1e-6
 ) -> ProjectiveFactorization:

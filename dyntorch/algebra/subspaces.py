@@ -6,10 +6,12 @@ import torch
 from torch import Tensor
 
 from dyntorch.arguments import check_tensor, check_together
+from dyntorch.blocks import one_thread
 
 RIDGE = 1e-6  # of the squared norm: a flat direction gets a harmless basis vector instead of amplified noise
 
 
+@one_thread
 def orthonormal_basis(matrix: Tensor) -> Tensor:
     r"""Orthonormal basis of each column space: :math:`U = X L^{-T}` with :math:`L L^T = X^T X + \epsilon \|X\|^2 I`.
 
@@ -47,6 +49,7 @@ def orthonormal_basis(matrix: Tensor) -> Tensor:
     return matrix @ (inverse * scale).mT
 
 
+@one_thread
 def canonical_correlation(first: Tensor, second: Tensor, *, shared: int = 1) -> Tensor:
     r"""Correlation between the planes of all pairs: large where they share a direction (``shared=1``) or coincide (``2``).
 

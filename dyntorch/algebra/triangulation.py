@@ -8,6 +8,7 @@ from torch.nn.functional import normalize
 
 from dyntorch.algebra.homogeneous import finite_depth, inhomogeneous
 from dyntorch.arguments import check_tensor, check_together
+from dyntorch.blocks import one_thread
 from dyntorch.nullspace import gram_null_space
 
 
@@ -53,6 +54,7 @@ def unit_projections(projections: Tensor) -> Tensor:
     return projections / norm.clamp(min=torch.finfo(projections.dtype).tiny)
 
 
+@one_thread
 def triangulate(projections: Tensor, x: Tensor, weights: Tensor | None = None, *, steps: int = 0) -> Tensor:
     r"""Points seen by known projections: the null vector of the equations :math:`[I \mid -x_{ij}]\, M_i Y_j = 0` of all views.
 
@@ -98,6 +100,7 @@ def triangulate(projections: Tensor, x: Tensor, weights: Tensor | None = None, *
     return structure.to(dtype)
 
 
+@one_thread
 def resect(structure: Tensor, x: Tensor, weights: Tensor | None = None, *, lifts: Tensor | None = None) -> Tensor:
     r"""Projections of known points: per view the null vector of the equations :math:`[I \mid -x_{ij}]\, M_i Y_j = 0` of all points.
 

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from dyntorch.algebra.extensors import meet
 from dyntorch.algebra.homogeneous import inhomogeneous, nonzero_sign, unit_vectors
+from dyntorch.blocks import one_thread
 from dyntorch.nullspace import gram_null_space, null_space
 
 PARALLEL = 1e-12
@@ -29,6 +30,7 @@ class TwoBodies:
     """``(*batch, 2)`` bool: the body has K - 1 points, so that its hyperplane is known, and the hyperplanes differ."""
 
 
+@one_thread
 def two_bodies(projections: Tensor, structure: Tensor, hyperplanes: Tensor, labels: Tensor) -> TwoBodies:
     r"""The collineation that makes two hyperplanes those of two translating bodies, and with it the bodies.
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dyntorch.blocks import map_blocks
+from dyntorch.blocks import map_blocks, one_thread
 from dyntorch.nullspace import gram_null_space, null_space
 
 FLAT = 1e-9  # of the largest singular value: below it the measurements have no further dimension
@@ -32,6 +32,7 @@ class VelocityFactorization(NamedTuple):
     """``(*batch,)`` bool: the tracks do not decide the result (see Args of the function), which then means nothing."""
 
 
+@one_thread
 def velocity_factorization(
     tracks: Tensor, times: Tensor, dim: int = 3, weights: Tensor | None = None, *, iterations: int = 100, tolerance: float = 1e-8
 ) -> VelocityFactorization:

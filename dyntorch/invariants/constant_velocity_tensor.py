@@ -8,6 +8,7 @@ from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from dyntorch.algebra.constant_velocity import (
     balanced,
@@ -21,6 +22,7 @@ from dyntorch.algebra.constant_velocity_p6 import constant_velocity_maps_p6
 from dyntorch.algebra.extensors import compound, dual, join
 from dyntorch.algebra.homogeneous import homogeneous, inhomogeneous, unit
 from dyntorch.algebra.projection import adjugate, back_project
+from dyntorch.forward import jacobian
 from dyntorch.invariant import Frame, Invariant
 from dyntorch.invariants.constant_velocity_residual import inverses, moving_residual, resting_residual
 from dyntorch.primitives import HyperplanesThrough, Point, Primitive
@@ -280,6 +282,18 @@ class ConstantVelocityTensor(Invariant):
 
     def shared(self, motion: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
         return inverses(motion)
+
+    def shared_derivative(self, motion: tuple[Tensor, ...]) -> tuple[tuple[Tensor, ...], Tensor | None]:
+        square = [part for part in motion if part.shape[-2] == part.shape[-1]]
+        b, count = len(motion[0]), len(square)
+        # every inverse depends on its own matrix: the derivatives of all of them in one pass
+        value, slope = jacobian(lambda t: adjugate(t.unflatten(-1, (4, 4))).flatten(-2), torch.cat(square).flatten(1))
+        blocks = list(slope.unflatten(0, (count, b)))
+        if count < len(motion):  # a camera stays as it is
+            blocks.append(torch.eye(12, dtype=value.dtype, device=value.device).expand(b, 12, 12))
+        sizes = [block.shape[-1] for block in blocks]
+        rows = [pad(block, (sum(sizes[:i]), sum(sizes[i + 1 :]))) for i, block in enumerate(blocks)]
+        return (*value.unflatten(-1, (4, 4)).unflatten(0, (count, b)), *motion[count:]), torch.cat(rows, dim=-2)
 
     def whitened_shared(self, shared: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
         return moving_residual(shared, views, scales)

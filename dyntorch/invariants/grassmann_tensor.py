@@ -10,6 +10,7 @@ from torch import Tensor
 from dyntorch.algebra.grassmann import grassmann_derivative, grassmann_tensor
 from dyntorch.algebra.grassmann_nearest import projections_of
 from dyntorch.algebra.grassmann_recovery import candidates
+from dyntorch.forward import normalized_derivative
 from dyntorch.invariant import Frame, Invariant
 from dyntorch.invariants import reprojection
 from dyntorch.primitives import HyperplanesThrough, Point, Primitive
@@ -155,12 +156,7 @@ class GrassmannTensor(Invariant):
         return candidates(tensor, self.profile, self.sizes)
 
     def compose_derivative(self, motion: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
-        value, slope = grassmann_derivative(motion, self.profile)
-        norm = value.norm(dim=-1, keepdim=True)
-        value = value / norm.where(norm > 0, 1.0)
-        # across the tensor: along it only the scale changes
-        slope = slope - (slope @ value[..., None]) * value[..., None, :]
-        return value, slope / norm.where(norm > 0, 1.0)[..., None]
+        return normalized_derivative(*grassmann_derivative(motion, self.profile))
 
     def whitened(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor | None:
         """The reprojection error that is left when the point is eliminated; None where one condition is all there is."""

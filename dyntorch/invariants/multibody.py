@@ -12,6 +12,7 @@ from dyntorch.algebra.homogeneous import homogeneous, unit, unit_vectors
 from dyntorch.algebra.partition import order_of_bodies
 from dyntorch.algebra.two_views import check_matches, described
 from dyntorch.arguments import FARTHEST
+from dyntorch.blocks import one_thread
 from dyntorch.invariants.fundamental_matrix import FundamentalMatrix
 from dyntorch.normalize import hartley
 from dyntorch.nullspace import null_space
@@ -43,6 +44,7 @@ class Multibody:
         return described(self, self.labels, self.degenerate, self.fundamentals.shape[-3])
 
 
+@one_thread
 def multibody_matrix(x1: Tensor, x2: Tensor, bodies: int, weights: Tensor | None = None) -> Multibody:
     r"""The multibody fundamental matrix of exact matches: :math:`\nu(p_2)^T M\, \nu(p_1) = \prod_k p_2^T F_k\, p_1 = 0`.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
@@ -61,7 +62,7 @@ def lifted_error(structure: Tensor, true: Tensor, lifts: Tensor, mask: Tensor | 
         raise ValueError(
             f"structure and true must be (*batch, n, {size}) for these lifts, got {tuple(structure.shape)} and {tuple(true.shape)}"
         )
-    batch = torch.broadcast_shapes(structure.shape[:-2], true.shape[:-2])
+    batch = torch.Size(np.broadcast_shapes(structure.shape[:-2], true.shape[:-2]))
     n = true.shape[-2]
     y, z = (x.double().expand(*batch, n, size).reshape(-1, n, size) for x in (structure, true))
     counts = torch.ones_like(y[..., 0], dtype=torch.bool) if mask is None else mask.expand(*batch, n).reshape(-1, n)
@@ -193,7 +194,7 @@ def body_error(points: Tensor, true: Tensor, labels: Tensor, bodies: int = 2) ->
             f"and {tuple(labels.shape)}"
         )
     n, d = true.shape[-2:]
-    batch = torch.broadcast_shapes(points.shape[:-2], true.shape[:-2], labels.shape[:-1])
+    batch = torch.Size(np.broadcast_shapes(points.shape[:-2], true.shape[:-2], labels.shape[:-1]))
     x, z = (p.double().expand(*batch, n, d)[..., None, :, :].expand(*batch, bodies, n, d).reshape(-1, n, d) for p in (points, true))
     kinds = torch.arange(1, bodies + 1, device=labels.device)[:, None]
     counts = (labels.expand(*batch, n)[..., None, :] == kinds).reshape(-1, n)

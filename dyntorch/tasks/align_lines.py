@@ -7,6 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from dyntorch.blocks import one_thread
 from dyntorch.fitting import fit_matches
 from dyntorch.invariants.translating_lines_matrix import TranslatingLinesMatrix
 from dyntorch.matches import Matches, matches
@@ -41,6 +42,7 @@ AMBIGUITY = (
 )
 
 
+@one_thread
 def align_lines(
     l1: Tensor,
     l2: Tensor,

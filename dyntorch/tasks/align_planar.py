@@ -7,6 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from dyntorch.blocks import one_thread
 from dyntorch.fitting import fit_matches
 from dyntorch.invariants.homography_tensor import HomographyTensor
 from dyntorch.matches import Matches, matches
@@ -46,6 +47,7 @@ AMBIGUITY = (
 )
 
 
+@one_thread
 def align_planar(
     x1: Tensor,
     x2: Tensor,

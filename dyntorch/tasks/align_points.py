@@ -7,6 +7,7 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
+from dyntorch.blocks import one_thread
 from dyntorch.invariants.join_tensor import JoinTensor
 from dyntorch.matches import Matches, matches
 from dyntorch.tasks import align_join, align_rigid, align_velocity
@@ -26,6 +27,7 @@ LABELLED = {**LEAST, "join": align_join.LABELLED, "minimal_join": align_join.LAB
 """Fewest matches where some are labelled static."""
 
 
+@one_thread
 def align_points(
     P1: Tensor,
     P2: Tensor,

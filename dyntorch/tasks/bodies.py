@@ -7,6 +7,7 @@ from math import prod
 import torch
 from torch import Tensor
 
+from dyntorch.blocks import one_thread
 from dyntorch.invariants.fundamental_matrix import FundamentalMatrix
 from dyntorch.matches import matches
 from dyntorch.tasks.bodies_pool import LEAST
@@ -18,6 +19,7 @@ MINIMAL = 8
 """Fewest matches: seven determine a fundamental matrix, and one has to agree with it."""
 
 
+@one_thread
 def segment(
     x1: Tensor,
     x2: Tensor,

@@ -9,14 +9,14 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from dyntorch.algebra.homogeneous import homogeneous, unit
-from dyntorch.forward import derivatives, jacobian
+from dyntorch.forward import by_match, derivatives
 from dyntorch.invariants.agreement import point_error, static_residual
 from dyntorch.invariants.translating_lines_matrix import TranslatingLinesMatrix
 from dyntorch.least_squares import damped_step
 from dyntorch.matches import Matches
 from dyntorch.normalize import Normalization, denormalize_motion
 from dyntorch.primitives import Line, direction
-from dyntorch.residual import multilinear
+from dyntorch.residual import multilinear, multilinear_derivative
 from dyntorch.tasks.alignment import MOVING, OUTLIER, STATIC
 from dyntorch.tasks.labelling import CHI_SQUARE
 
@@ -59,32 +59,56 @@ class Lines:
 
     def still(self, theta: Tensor) -> Tensor:
         """Distances ``(b, n, 6)`` of both points of a line in view 2, carried into view 1, from the line there; 4 conditions."""
-        first, second = self.views[0].unbind(-2)
-        along = second - first
-        square = along.square().sum(-1, keepdim=True).clamp(min=torch.finfo(theta.dtype).tiny)
-        s1, s2 = (s[:, None, None] for s in self.norm.scales)
-        matrix = theta.unflatten(-1, (4, 4))
-        parts = []
-        for point in self.views[1].unbind(-2):
-            error, slope = point_error(homogeneous(point) @ matrix.mT, matrix[:, None], first)
-            place = (error * along).sum(-1, keepdim=True) / square
-            across = error - place * along
-            # isotropic: the noise of the line at this place, and that of the point, averaged over the plane across
-            other = (slope.square().sum((-1, -2)) / 3)[..., None]
-            variance = s1.square() * ((1 - place).square() + place.square()) + s2.square() * other
-            parts.append(across * variance.rsqrt())
-        return torch.cat(parts, dim=-1)
+        return _still(theta, self.norm.scales, self.views)
 
     def at_points(self, theta: Tensor) -> Tensor:
         """Disagreement ``(b, k, 3)`` of static points."""
-        return static_residual([theta.unflatten(-1, (4, 4))], self.points, self.norm.scales)
+        return _at_points(theta, self.norm.scales, self.points)
 
     def residual(self, theta: Tensor, labels: Tensor) -> Tensor:
         """All weighted residuals ``(b, rows)`` of the labelled lines and the static points, in the unit of the points."""
+        moving, still = self._roots(labels)
+        return torch.cat(
+            [self.moving(theta) * moving, self.still(theta).flatten(1) * still, self.at_points(theta).flatten(1)], dim=-1
+        )
+
+    def linearized(self, theta: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
+        """:meth:`residual` and its derivative ``(b, 16, rows)``."""
+        model, scales = TranslatingLinesMatrix(), self.norm.scales
+        tensor, slope = model.compose_derivative((theta.unflatten(-1, (4, 4)),))
+        path, by_tensor = multilinear_derivative(model, tensor.unflatten(1, model.shape()), self.views, scales)
+        parts = [(path, slope @ by_tensor.mT), by_match(_still, theta, scales, self.views)]
+        roots = self._roots(labels)
+        parts = [(value * root, slope * root[:, None]) for (value, slope), root in zip(parts, roots, strict=True)]
+        parts.append(by_match(_at_points, theta, scales, self.points))
+        return torch.cat([value for value, _ in parts], dim=-1), torch.cat([derivative for _, derivative in parts], dim=-1)
+
+    def _roots(self, labels: Tensor) -> tuple[Tensor, Tensor]:
+        """Roots of the weights of the moving lines ``(b, n)`` and of the static ones, six for each, ``(b, 6 n)``."""
         root = self.data.weights.sqrt()
-        moving = self.moving(theta) * torch.where(labels == MOVING, root, 0.0)
-        still = self.still(theta) * torch.where(labels == STATIC, root, 0.0)[..., None]
-        return torch.cat([moving, still.flatten(1), self.at_points(theta).flatten(1)], dim=-1)
+        return torch.where(labels == MOVING, root, 0.0), torch.where(labels == STATIC, root, 0.0).repeat_interleave(6, dim=-1)
+
+
+def _still(theta: Tensor, scales: tuple[Tensor, ...], views: tuple[Tensor, ...]) -> Tensor:
+    first, second = views[0].unbind(-2)
+    along = second - first
+    square = along.square().sum(-1, keepdim=True).clamp(min=torch.finfo(theta.dtype).tiny)
+    s1, s2 = (s[..., None, None] for s in scales)
+    matrix = theta.unflatten(-1, (4, 4))
+    parts = []
+    for point in views[1].unbind(-2):
+        error, slope = point_error(homogeneous(point) @ matrix.mT, matrix[..., None, :, :], first)
+        place = (error * along).sum(-1, keepdim=True) / square
+        across = error - place * along
+        # isotropic: the noise of the line at this place, and that of the point, averaged over the plane across
+        other = (slope.square().sum((-1, -2)) / 3)[..., None]
+        variance = s1.square() * ((1 - place).square() + place.square()) + s2.square() * other
+        parts.append(across * variance.rsqrt())
+    return torch.cat(parts, dim=-1)
+
+
+def _at_points(theta: Tensor, scales: tuple[Tensor, ...], points: tuple[Tensor, ...]) -> Tensor:
+    return static_residual([theta.unflatten(-1, (4, 4))], points, scales)
 
 
 def as_points(views: tuple[Tensor, ...], weights: Tensor) -> tuple[Tensor, ...]:
@@ -154,7 +178,7 @@ def spread(lines: Lines, theta: Tensor, labels: Tensor) -> tuple[Tensor, Tensor,
 
     def measured(t: Tensor) -> Tensor:
         part = denormalize_motion(TranslatingLinesMatrix(), (t.unflatten(-1, (4, 4)),), lines.norm.transforms)[0]
-        return unit(part).flatten(1)
+        return unit(part).flatten(-2)
 
     place, moved = derivatives(measured, theta, root.movedim(-1, 0))
     return values[:, [0, -1]], place.unflatten(-1, (4, 4)), moved.mT @ moved
@@ -162,7 +186,7 @@ def spread(lines: Lines, theta: Tensor, labels: Tensor) -> tuple[Tensor, Tensor,
 
 def _equations(lines: Lines, theta: Tensor, labels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Cost ``(b,)``, gradient ``(b, 16)`` and Gauss-Newton matrix."""
-    value, slope = jacobian(lambda t: lines.residual(t, labels), theta)
+    value, slope = lines.linearized(theta, labels)
     cost = value.square().sum(-1)
     return torch.where(cost.isfinite(), cost, torch.inf), (slope @ value[..., None])[..., 0], slope @ slope.mT
 

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dyntorch.blocks import map_blocks
+from dyntorch.blocks import map_blocks, one_thread
 from dyntorch.fitting import fit
 from dyntorch.invariants.collineation import Collineation
 from dyntorch.invariants.fundamental_matrix import FundamentalMatrix
@@ -22,6 +22,7 @@ BLOCK, STARTS = 1 << 21, 4
 """Numbers in the derivatives of one block of problems, and how many starts a problem has at most of the time."""
 
 
+@one_thread
 def translating_planes(
     H: Tensor | None = None,
     *,

@@ -12,7 +12,7 @@ from torch.nn.functional import pad
 
 from dyntorch.algebra.homogeneous import skew
 from dyntorch.constants import constant
-from dyntorch.forward import derivatives, jacobian
+from dyntorch.forward import by_match, jacobian
 from dyntorch.invariants.agreement import static_residual
 from dyntorch.invariants.fundamental_matrix import FundamentalMatrix
 from dyntorch.residual import multilinear_derivative
@@ -142,10 +142,10 @@ class Matches:
         views = x2.flatten(0, 1), x1.flatten(0, 1)
         scales = s2.repeat_interleave(p), s1.repeat_interleave(p)
 
-        def residual(entries: Tensor) -> Tensor:
-            return static_residual([entries.unflatten(-1, (3, 3))], views, scales).flatten(1)
+        def residual(entries: Tensor, scales: tuple[Tensor, ...], views: tuple[Tensor, ...]) -> Tensor:
+            return static_residual([entries.unflatten(-1, (3, 3))], views, scales)
 
-        value, slope = jacobian(residual, models.reshape(b * p, 9))
+        value, slope = by_match(residual, models.reshape(b * p, 9), scales, views)
         root = self.plane_weights.sqrt().repeat_interleave(2, dim=-1)
         return value.reshape(b, p, 2 * n) * root, slope.reshape(b, p, 9, 2 * n) * root[..., None, :]
 
@@ -190,9 +190,8 @@ class PlanesProblem:
         own, size = _own(self.layout.planes, self.layout.bodies, theta.device), self.layout.size
         # a plane or body depends on 16 parameters: its share has that size, whatever their number
         entries = pad(theta, (0, 1))[:, own]
-        tangents = torch.eye(16, dtype=theta.dtype, device=theta.device)[:, None, None].expand(16, *entries.shape)
-        models, slope = derivatives(self.layout.models_of, entries, tangents)
-        slope = slope.transpose(1, 2).flatten(-2)  # (b, c, 16, 9)
+        flat, slopes = jacobian(lambda each: self.layout.models_of(each).flatten(-2), entries)
+        models, slope = flat.unflatten(-1, (3, 3)), slopes  # (b, c, 16, 9)
         normal = self.evidence.normal(models)
         gradient = theta.new_zeros(len(theta), size + 1)
         gradient.index_add_(1, own.flatten(), (slope @ normal.gradient[..., None]).flatten(1))

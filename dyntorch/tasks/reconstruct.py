@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.algebra.triangulation import observed
+from dyntorch.blocks import one_thread
 from dyntorch.motions import Motion, as_motion
 from dyntorch.normalize import hartley
 from dyntorch.solution import failed
@@ -27,6 +28,7 @@ FAR = (1e4, 1e9)
 """Distance of the times from 0 over their span from which the points at time 0 are noise: float32 tracks, float64."""
 
 
+@one_thread
 def reconstruct(
     tracks: Tensor,
     motion: str | Motion,

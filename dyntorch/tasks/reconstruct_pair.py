@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dyntorch.blocks import one_thread
 from dyntorch.solution import Status
 from dyntorch.tasks.notices import Notice, NoticeCode, check_threshold
 from dyntorch.tasks.pair_affine import FEWEST, Transfer, solve
@@ -30,6 +31,7 @@ EXACT = 1e-7
 """Of the extent: motion that is rounding."""
 
 
+@one_thread
 def reconstruct_pair(
     a: Tensor,
     b: Tensor,

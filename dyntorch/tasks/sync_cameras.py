@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dyntorch.blocks import one_thread
 from dyntorch.tasks.shift import Shift
 from dyntorch.tasks.sync_clocks import Clocks, Pair
 from dyntorch.tasks.sync_network import Network, network
@@ -20,6 +21,7 @@ DECIDED, CONFIRMED = log(10), log(300)
 sure pairs tie to the reference, and in others.  Refused pairs often fail together, all of one camera."""
 
 
+@one_thread
 def synchronize_cameras(
     tracks: Sequence[Any],
     correspondence: bool = True,

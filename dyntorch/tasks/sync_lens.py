@@ -17,6 +17,7 @@ from torch import Tensor
 from dyntorch.algebra.epipolar import TINY, eight_point
 from dyntorch.algebra.epipolar_descent import Frames
 from dyntorch.algebra.lens import Division
+from dyntorch.blocks import one_thread
 from dyntorch.least_squares import damped_step
 
 RANGE = (-0.8, 0.4)
@@ -70,6 +71,7 @@ class LensFit:
         )
 
 
+@one_thread
 def fit_distortion(
     a: Tensor, b: Tensor, weights: Tensor | None = None, sizes: Sequence[Sequence[float] | None] | None = None
 ) -> LensFit:

@@ -12,6 +12,7 @@ import torch
 from torch import Generator, Tensor
 
 from dyntorch.algebra.lens import undistorted
+from dyntorch.blocks import one_thread
 from dyntorch.tasks.shift import Shift
 from dyntorch.tasks.sync_attempt import APART, WANDER, Attempt
 from dyntorch.tasks.sync_cleaning import cleaned
@@ -25,6 +26,7 @@ BLIND = 10.0
 CAMERAS = ("auto", "perspective", "affine")
 
 
+@one_thread
 def synchronize(
     a: Tensor,
     b: Tensor,

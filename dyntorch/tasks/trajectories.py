@@ -14,6 +14,7 @@ from dyntorch.algebra.homogeneous import inhomogeneous, unit
 from dyntorch.algebra.klein_quadric import lines_of_pencil, nearest_line
 from dyntorch.algebra.line_cameras import line_camera
 from dyntorch.algebra.line_collineation import skew_line
+from dyntorch.blocks import one_thread
 from dyntorch.nullspace import gram_null_space
 from dyntorch.tasks.line_descent import Found, Sightings, best_lines, best_points, normalized
 
@@ -67,6 +68,7 @@ class Trajectories:
     status: Tensor
 
 
+@one_thread
 def triangulate_trajectories(
     cameras: Tensor, x: Tensor, weights: Tensor | None = None, *, sigma: float | None = None
 ) -> Trajectories:

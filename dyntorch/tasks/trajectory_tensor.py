@@ -9,6 +9,7 @@ from torch import Tensor
 
 from dyntorch.algebra.homogeneous import unit
 from dyntorch.algebra.line_cameras import cameras_of_lines
+from dyntorch.blocks import one_thread
 from dyntorch.fitting import fit
 from dyntorch.invariants.grassmann_tensor import GrassmannTensor
 from dyntorch.solution import failed
@@ -35,6 +36,7 @@ class TrajectoryCameras:
     status: Tensor
 
 
+@one_thread
 def trajectory_cameras(
     x: Tensor, weights: Tensor | None = None, *, bundle: bool = True, sigma: float | None = None
 ) -> TrajectoryCameras:

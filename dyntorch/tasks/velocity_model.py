@@ -108,7 +108,7 @@ def information(evidence: Evidence, state: Velocities, affine: bool) -> tuple[Te
     least = values.gather(-1, 48 - dof[:, None])[:, 0]
     floor = 1e-12 * values[:, -1:].clamp(min=torch.finfo(values.dtype).tiny)
     root = vectors * torch.where(used, values.clamp(min=floor).rsqrt(), 0.0)[:, None]
-    motions, spread = derivatives(lambda t: _between(evidence, t).flatten(1), state.theta, root.movedim(-1, 0))
+    motions, spread = derivatives(lambda t: _between(evidence, t).flatten(-3), state.theta, root.movedim(-1, 0))
     return torch.stack([least, values[:, -1]], dim=-1), motions.unflatten(-1, (2, 4, 4)), spread.mT @ spread
 
 
@@ -197,7 +197,7 @@ def _maps(evidence: Evidence, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 def _between(evidence: Evidence, theta: Tensor) -> Tensor:
     """A and B ``(b, 2, 4, 4)`` in the coordinates of the matches, of norm 1."""
     first, second, third = denormalize_motion(evidence.invariant, _maps(evidence, theta), evidence.norm.transforms)
-    return torch.stack([unit(first @ torch.linalg.inv_ex(other)[0]) for other in (second, third)], dim=1)
+    return torch.stack([unit(first @ torch.linalg.inv_ex(other)[0]) for other in (second, third)], dim=-3)
 
 
 def _free(theta: Tensor, affine: bool) -> Tensor:

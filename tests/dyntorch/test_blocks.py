@@ -3,11 +3,14 @@
 import os
 import threading
 import time
+import types
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
 
-from dyntorch.blocks import map_blocks
+import dyntorch as dyn
+from dyntorch.blocks import LARGE, map_blocks, one_thread, workers
 
 
 @pytest.fixture
@@ -121,3 +124,102 @@ def test_misuse_is_refused():
         map_blocks(torch.neg, size=1)
     with pytest.raises(ValueError, match="size must be at least 1"):
         map_blocks(torch.neg, torch.zeros(2), size=0)
+
+
+def threads_seen(seen):
+    seen.append(torch.get_num_threads())
+    return torch.get_num_threads()
+
+
+def test_public_functions_run_on_one_thread_and_their_blocks_on_those_of_the_caller(two_threads):
+    inside = one_thread(lambda: (torch.get_num_threads(), workers()))
+    assert inside() == (1, 2) and (torch.get_num_threads(), workers()) == (2, 2)
+    nested = one_thread(lambda: (inside(), torch.get_num_threads()))
+    assert nested() == ((1, 2), 1) and torch.get_num_threads() == 2
+    # the blocks of a decorated function still get two workers, which start no teams
+    names, seen = set(), []
+
+    def block(x):
+        names.add(threading.current_thread().name)
+        seen.append(torch.get_num_threads())
+        started.wait(10)
+        return x
+
+    started = threading.Barrier(2)
+    one_thread(lambda: map_blocks(block, torch.zeros(2), size=1))()
+    assert len(names) == 2 and seen == [1, 1] and torch.get_num_threads() == 2
+
+
+def test_the_setting_comes_back_after_an_error(two_threads):
+    def fail():
+        raise KeyError
+
+    with pytest.raises(KeyError):
+        one_thread(fail)()
+    assert torch.get_num_threads() == 2 and workers() == 2
+
+
+def test_threads_that_start_meanwhile_get_the_setting_of_the_caller(two_threads):
+    seen = []
+
+    def body():
+        other = threading.Thread(target=threads_seen, args=(seen,))
+        other.start()
+        other.join()
+
+    one_thread(body)()
+    other = threading.Thread(target=threads_seen, args=(seen,))
+    other.start()
+    other.join()
+    assert seen == [2, 2]
+
+
+def test_callers_in_several_threads_do_not_disturb_each_other(two_threads):
+    meet = threading.Barrier(3)
+
+    def body():
+        meet.wait(10)
+        found = torch.get_num_threads()
+        meet.wait(10)
+        return found
+
+    def caller(_):
+        torch.set_num_threads(2)
+        return one_thread(body)(), torch.get_num_threads(), workers()
+
+    with ThreadPoolExecutor(3) as pool:
+        assert list(pool.map(caller, range(3))) == [(1, 2, 2)] * 3
+    assert torch.get_num_threads() == 2
+
+
+def test_one_large_problem_may_use_the_threads_of_the_caller(two_threads):
+    def run(count):
+        return one_thread(lambda: map_blocks(lambda x: torch.full_like(x[:, 0], threads_seen([])), torch.zeros(1, count), size=1))()
+
+    assert run(10).item() == 1 and run(LARGE).item() == 2 and torch.get_num_threads() == 2
+
+
+def test_public_functions_leave_inference_mode():
+    with torch.inference_mode():
+        x = torch.ones(3)
+        found, inside = one_thread(lambda x, several: (x * several[0], torch.is_inference_mode_enabled()))(x, several=[x])
+        assert x.is_inference() and not found.is_inference() and not inside and not found.requires_grad
+
+
+ELEMENTWISE = {
+    "undistort",
+    "distort",
+    "reproject",
+    "sampson",
+    "algebraic",
+    "grassmann_tensor",
+    "line_camera",
+    "points_on_lines",
+    "combine_shifts",
+}
+"""Without a search or a factorization: torch starts threads for them only above 32,768 numbers, where they pay."""
+
+
+def test_every_public_verb_runs_on_one_thread():
+    functions = {name for name in dyn.__all__ if isinstance(getattr(dyn, name), types.FunctionType)}
+    assert {name for name in functions if not hasattr(getattr(dyn, name), "one_thread")} == ELEMENTWISE
