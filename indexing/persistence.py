@@ -166,8 +166,10 @@ def _model(parts: Parts, header: dict[str, Any], sizes: Sizes, layout: Layout | 
     if kernels is not None:
         kernels.scales = parts.real("scales", kernels.count, least=LEAST_SCALE)
     support = _read_windows(parts, "support", sizes, None) if trained else None
-    bodies = Bodies(_read_windows(parts, "bodies", sizes, sizes.crops * n, 3), layout) if layout is not None else None
     symmetry = parts.every("symmetry", joints, below=joints) if "symmetry" in parts else None
+    mirrored = parts.truth("mirrored", n)
+    copies = sizes.crops * (1 if symmetry is None or not bool(mirrored.any()) else 2)  # as ShapeModel.copies gives them
+    bodies = Bodies(_read_windows(parts, "bodies", sizes, copies * n, 3), layout) if layout is not None else None
     blend = {name: number(value, name, 0, MOST_WEIGHT) for name, value in header["blend"].items()}
     return ShapeModel(
         exemplars=Exemplars(crops, views, moments, owner, parts.truth("solid", n)),
@@ -177,7 +179,7 @@ def _model(parts: Parts, header: dict[str, Any], sizes: Sizes, layout: Layout | 
         scorer=scorer,
         metric=metric,
         symmetry=symmetry,
-        mirrored=parts.truth("mirrored", n),
+        mirrored=mirrored,
         parts=_joint_weights(parts, header["parts"], sizes),
         hub=parts.real("hub", n),
         moment_hub=parts.real("moment_hub", len(moments)),
