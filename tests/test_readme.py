@@ -73,7 +73,7 @@ def test_the_python_example_runs_and_prints_what_it_says(tmp_path, monkeypatch, 
     shown = re.findall(r"^ (\w+) +([\d.]+) +([\d.]+) +[\d.]+ +[\d.]+$", README.read_text(encoding="utf-8"), re.MULTILINE)
     assert [line.split()[0] for line in events] == [label for label, _, _ in shown]
     for line, (_, start, end) in zip(events, shown, strict=True):
-        assert abs(float(line.split()[1]) - float(start)) <= 0.1 and abs(float(line.split()[2]) - float(end)) <= 0.1
+        assert [float(second) for second in line.split()[1:]] == pytest.approx([float(start), float(end)], abs=0.1)
     assert {path.name for path in tmp_path.iterdir()} == {"moves.safetensors", "lesson.npz", "session.npz"}
 
 
