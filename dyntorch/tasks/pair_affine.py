@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from dyntorch.tasks.pair_normals import Motions, along, direction, peaks, refined
+from dyntorch.tasks.pair_normals import Motions, along, direction, likelihood, peaks, refined
 from dyntorch.tasks.pair_prior import Prior, cosines, frames_of, motion_spectrum
 from dyntorch.tasks.pair_regression import Ridge, Rows, combinations, predicted_apart, regress, ridges_apart
 
@@ -23,6 +24,8 @@ AFFINE = 3.0
 """Times the residual variance that the mean places may cost before they are taken for free."""
 ROUNDING = 1e-11
 """Of the power of the motion: a residual that says nothing."""
+DRAWS = 5
+"""Unrelated motions, of the same spectrum in time and joint covariance of the points, that the cameras are compared with."""
 MISSED = 3.0
 """Times the noise up to which what a prediction misses speaks against no point: it hardly moves across the epipolar lines."""
 
@@ -42,6 +45,7 @@ class Transfer:
         good: ``(n + m,)`` bool.
         residual: pixels, rms difference of the epipolar coordinate from what the other camera predicts.
         noise: ``(2,)`` pixels, of a coordinate of a and of b.
+        beyond: how far the likelihood is above those of unrelated motions, in units of the range of these.
     """
 
     normals: Tensor
@@ -56,6 +60,7 @@ class Transfer:
     good: Tensor
     residual: float
     noise: tuple[float, float]
+    beyond: float = math.inf
 
 
 def solve(x: Tensor, y: Tensor, noise: tuple[float, float], explained: float) -> Transfer | Tensor:
@@ -83,16 +88,26 @@ def solve(x: Tensor, y: Tensor, noise: tuple[float, float], explained: float) ->
     good = strange == 0
     if min(int(good[:n].sum()), int(good[n:].sum())) < FEWEST:
         return good
+    beyond = _beyond_chance(_motions(x[:, good[:n]], y[:, good[n:]], noise), angles)
     found = _transferred(x, y, noise, angles, r2, good)
-    if not found.affine:
-        return found
-    # the mean places tell the directions better than the motions alone
-    angles = _directions(x[:, good[:n]], y[:, good[n:]], noise, angles)
-    return _transferred(x, y, noise, angles, r2, good)
+    if found.affine:
+        # the mean places tell the directions better than the motions alone
+        angles = _directions(x[:, good[:n]], y[:, good[n:]], noise, angles)
+        found = _transferred(x, y, noise, angles, r2, good)
+    return replace(found, beyond=beyond)
 
 
 def _directions(x: Tensor, y: Tensor, noise: tuple[float, float], start: Tensor | None = None) -> Tensor:
     """Angles ``(2,)`` of the epipolar normals; from a start, those that the mean places agree with as well."""
+    motions = _motions(x, y, noise).compressed()
+    if start is not None:
+        return refined(motions, start, step=2 * COARSE, affine=True)[0]
+    found = [refined(motions, start, COARSE) for start in peaks(motions)]
+    return refined(motions, max(found, key=lambda one: one[1])[0], step=2 * COARSE)[0]
+
+
+def _motions(x: Tensor, y: Tensor, noise: tuple[float, float]) -> Motions:
+    """The motions of both cameras, weighted by how much of each frequency is no noise."""
     z = [cosines(part - part.mean(0)) for part in (x, y)]
     sizes = [float(part.square().mean().sqrt()) for part in z]
     variance = 0.5 * sum((one / size) ** 2 for one, size in zip(noise, sizes, strict=True))
@@ -101,11 +116,24 @@ def _directions(x: Tensor, y: Tensor, noise: tuple[float, float], start: Tensor 
     share = power / (power + variance)
     root = share.sqrt()[:, None, None]
     places = [(part.mean(0) - part.mean((0, 1))) / size for part, size in zip((x, y), sizes, strict=True)]
-    motions = Motions(z[0] * root, z[1] * root, variance, float(share.sum()), (places[0], places[1])).compressed()
-    if start is not None:
-        return refined(motions, start, step=2 * COARSE, affine=True)[0]
-    found = [refined(motions, start, COARSE) for start in peaks(motions)]
-    return refined(motions, max(found, key=lambda one: one[1])[0], step=2 * COARSE)[0]
+    return Motions(z[0] * root, z[1] * root, variance, float(share.sum()), (places[0], places[1]))
+
+
+def _beyond_chance(motions: Motions, angles: Tensor) -> float:
+    """How far the likelihood of what was found is above the highest of unrelated motions, over the range of theirs.
+
+    Smooth motions of many points explain any other smooth motion.  With a random sign for each frequency b's points move as
+    smoothly and as much together as before, but unrelated to a's; the same search is run on them.
+    """
+    # a generator of its own: the same tracks get the same answer
+    generator = torch.Generator().manual_seed(0)
+    levels = []
+    for _ in range(DRAWS):
+        signs = torch.randint(0, 2, (len(motions.y),), generator=generator).to(motions.y) * 2 - 1
+        other = replace(motions, y=motions.y * signs[:, None, None]).compressed()
+        levels.append(refined(other, peaks(other)[0], COARSE)[1])
+    level = float(likelihood(motions.compressed(), angles[None])[0])
+    return (level - max(levels)) / max(max(levels) - min(levels), 1e-9 * abs(level), 1e-300)
 
 
 def judged(

@@ -48,8 +48,8 @@ MESSAGES: dict[NoticeCode, str | tuple[str, str] | dict[bool, str]] = {
     },
     NoticeCode.CHANCE: "one homography at infinity leaves {value:.0%} of what the homographies differ by, as of random ones: give "
     "more planes, larger ones, or their matches",
-    NoticeCode.INCOHERENT: "the matches are off any homographies and fundamental matrices by {value:.0%} of the extent of the planes "
-    "and bodies: check that x1 and x2 are the same points in the same order",
+    NoticeCode.INCOHERENT: "the matches are off any homographies and fundamental matrices by {value:.0%} of the extent of the "
+    "planes and bodies: check that x1 and x2 are the same points in the same order",
     NoticeCode.CALIBRATION: "the homography at infinity makes the calibration {value:.2g} from a rotation, more than the noise "
     "does: check K, or the planes",
 }

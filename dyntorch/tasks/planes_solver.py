@@ -23,10 +23,10 @@ APART = 0.3
 LIKELY = 4.0
 """Difference of costs in noise variances up to which a solution is as likely as the best."""
 LOW = 0.1
-"""Share of problems whose noise is underestimated.  With a quarter instead, 7 of 109 answers to 3 to 8 planes without matches at
+"""Share of problems whose noise is underestimated.  With a quarter instead, 8 of 109 answers to 3 to 8 planes without matches at
 0.5 px are off by more than 0.2 and three standard deviations; so 3 of 97."""
 DEVIATE, POLISH = -1.2816, 6
-"""Its normal deviate, and Newton steps from there to the quantile of chi-square: exact to rounding with 1 residual to spare or more."""
+"""Its normal deviate, and Newton steps from there to the quantile of chi-square."""
 EXACT = 1e-20
 """Cost that is rounding error."""
 FLOOR = 1e-15
@@ -110,7 +110,7 @@ def _others(infinity: Tensor, cost: Tensor, best: Tensor, spare: Tensor) -> Tens
 
 
 def noise_variance(cost: Tensor, spare: Tensor) -> Tensor:
-    r"""Variance of the noise, :math:`c / q` with the lower tenth q of :math:`\chi^2`, which is near the number of residuals to
+    r"""Variance of the noise, :math:`c / q` with the lower quantile q of :math:`\chi^2`, which is near the number of residuals to
     spare where that is large; 0 where none is.
 
     Three planes have one to spare, which is often near 0 by chance: :math:`c / 1` would say so every time.

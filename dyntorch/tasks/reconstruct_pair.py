@@ -27,6 +27,10 @@ SEEN = 0.5
 """Share of the frames in which a track must be seen; more gaps are guessed, not interpolated."""
 STILL = 3.0
 """Times the noise up to which nothing moves."""
+BEYOND = 1.0
+"""Ranges of the likelihoods of unrelated motions that the one found is above the highest of them.  Two views of one scene: 2 to 16
+(3 px of noise and less, 60 frames and more); 4 points over 40 frames at 1 px: 0.6 and 1.8.  Of 12 pairs of unrelated bodies that
+wander for 4 s, all of which explain each other, one is above 1."""
 EXACT = 1e-7
 """Of the extent: motion that is rounding."""
 
@@ -157,6 +161,9 @@ def _affine(seen: Overlap, explained: float) -> PairReconstruction:
             "check the shift, or that both show one scene"
         )
         return failure((n, m), seen.times, Status.NO_CONSENSUS, [Notice(NoticeCode.FEW_POINTS, float(min(counts)), text)], 3)
+    if found.beyond < BEYOND:
+        text = "unrelated motions explain each other about as well: film longer, motion that changes faster, or check the shift"
+        return failure((n, m), seen.times, Status.NO_CONSENSUS, [Notice(NoticeCode.CHANCE, found.beyond, text)], 3)
     return _assembled(seen, found, tracks, centres, torch.cat(often))
 
 

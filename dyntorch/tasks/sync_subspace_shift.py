@@ -31,8 +31,9 @@ motions all stay below .6."""
 REPEATED = 0.68
 """Resemblance of the motion to itself from which a peak may be another period."""
 BENT = 1.5
-"""Variance about straight lines at constant velocity over that of the noise, of either camera, below which only such lines are seen:
-1 where they are; perspective and the growing size of the whole bend them alike at every shift."""
+"""Variance about straight lines at constant velocity over that of the noise, of either camera, below which only such lines are
+seen: 1.0 to 1.1 where they are, 16 and more for bodies that bend and turn, at 6 px of noise.  The growing size of the whole bends
+them alike at every shift."""
 BLUR = 1 / 150
 """Seconds that the peak is off even where it is sharp, because cameras are not affine."""
 

@@ -64,3 +64,20 @@ def test_equal_steps_leave_a_family_of_cameras(still):
 def test_changing_speeds_and_points_that_stand_still_are_certain(still):
     scene = scenes.planar(80, batch=4, sigma=0.5, static=still, generator=torch.Generator().manual_seed(5))
     assert (dyn.fit(dyn.HomographyTensor, *scene.views).status == dyn.Status.OK).all()
+
+
+@pytest.mark.parametrize(("depth", "shift"), [(0.01, 0.5), (1.0, 1e-3)])
+def test_nearly_degenerate_views_are_certain_without_noise_and_not_with_it(depth, shift):
+    # exact numbers decide: nearly a plane, or hardly a translation, is not a plane or a rotation
+    draw = torch.Generator().manual_seed(6)
+    points = torch.randn(40, 3, generator=draw, dtype=torch.float64) * torch.tensor([1.0, 1.0, depth], dtype=torch.float64)
+    points = points + torch.tensor([0.0, 0.0, 5.0], dtype=torch.float64)
+    angle = torch.tensor(0.1, dtype=torch.float64)
+    turn = torch.eye(3, dtype=torch.float64)
+    turn[0, 0], turn[0, 2], turn[2, 0], turn[2, 2] = angle.cos(), angle.sin(), -angle.sin(), angle.cos()
+    moved = points @ turn.mT + shift * torch.tensor([1.0, 0.3, 0.2], dtype=torch.float64)
+    x1, x2 = (800 * x[:, :2] / x[:, 2:] for x in (points, moved))
+    exact = dyn.fit(dyn.FundamentalMatrix, x1, x2)
+    assert exact.status == dyn.Status.OK and dyn.sampson(dyn.FundamentalMatrix, exact.tensor, x1, x2).abs().max() < 1e-6
+    noise = 0.5 * torch.randn(2, 40, 2, generator=draw, dtype=torch.float64)
+    assert dyn.fit(dyn.FundamentalMatrix, x1 + noise[0], x2 + noise[1]).status == dyn.Status.AMBIGUOUS

@@ -301,3 +301,10 @@ def test_empty_batch_and_float32() -> None:
     single = align_points(*scene.views, model="rigid", threshold=0.03, generator=draw(22))
     assert single.A.dtype == torch.float32
     assert bool(rotation_error(single.A, scene.motion[0]) < 1.5)
+
+
+def test_random_clouds_leave_no_labels_and_no_noise():
+    clouds = torch.randn(3, 60, 3, generator=torch.Generator().manual_seed(50), dtype=torch.float64)
+    found = align_points(*clouds, generator=torch.Generator().manual_seed(51))
+    assert found.status == Status.NO_CONSENSUS
+    assert not found.labels.any() and found.sigma == 0 and "0 static, 0 moving, 60 outlier" in repr(found)

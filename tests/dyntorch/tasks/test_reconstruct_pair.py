@@ -279,3 +279,20 @@ def test_failed_results_are_frozen_and_short():
     found = reconstruct_pair(scene.a, scene.b, 0.0, fps=30.0)
     assert len(repr(found).splitlines()) == 2
     assert replace(found, status=Status.OK).status == Status.OK
+
+
+def test_unrelated_bodies_are_not_explained_by_each_other():
+    # smooth motions of many points explain any smooth motion: all but one in a hundred of it, in stretches that were left out
+    def wandering(points, generator):
+        draw = torch.randn(180, points + 1, 2, generator=generator, dtype=torch.float64).cumsum(0)
+        window = torch.exp(-0.5 * (torch.arange(-30, 31, dtype=torch.float64) / 8) ** 2)
+        smooth = (draw.unfold(0, 61, 1) * window / window.sum()).sum(-1)
+        places = 100 * torch.randn(1, points, 2, generator=generator, dtype=torch.float64)
+        noise = 0.5 * torch.randn(120, points, 2, generator=generator, dtype=torch.float64)
+        return places + 4 * smooth[:, :1] + 1.2 * smooth[:, 1:] + noise
+
+    for seed in (7000, 7003):
+        generator = torch.Generator().manual_seed(seed)
+        found = reconstruct_pair(wandering(12, generator), wandering(14, generator), 0.0, fps=30.0)
+        assert found.status == Status.NO_CONSENSUS and not found.labels.any()
+        assert found.warnings[0].code == NoticeCode.CHANCE
