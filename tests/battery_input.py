@@ -7,6 +7,8 @@ import torch
 from torch import Tensor
 
 import dyntorch as dyn
+from dyntorch.constrained import constrain
+from dyntorch.primitives import Hyperplane
 from dyntorch.solution import failed
 from tests.battery import example, finite, many, ok, prop, worst
 from tests.cases import Case
@@ -150,6 +152,61 @@ def a_bad_problem_leaves_the_others_untouched(case: Case) -> None:
         assert torch.equal(found.status[rest], clean.status[rest])
         for one, other in zip(found.motion, clean.motion, strict=True):
             torch.testing.assert_close(one[rest], other[rest], rtol=1e-9, atol=1e-9)
+
+
+@prop()
+def hostile_scales_stay_finite(case: Case) -> None:
+    """The unit of the coordinates does not matter, and what is beyond the range of float64 is a status, without a NaN."""
+    views = example(case, batch=())
+    scales = [1.0, 1e300, 1e160, 1e50, 1e-50, 1e-160, 1e-300, 1.7e308, 1e-310]
+    problems = [tuple(x * scale for x in views) for scale in scales]
+    hostile = tuple(x.clone() for x in views)
+    hostile[0][0] *= 1e300
+    problems.append(hostile)
+    stacked = tuple(torch.stack(xs) for xs in zip(*problems, strict=True))
+    found = dyn.fit(case.invariant, *stacked)
+    sound = [i for i, scale in enumerate(scales) if scale in (1.0, 1e50, 1e-50)] + [len(scales)]
+    # homogeneous coordinates of hyperplanes have no unit
+    measured = not any(isinstance(p, Hyperplane) for p in case.invariant.primitives)
+    for solution in (found, dyn.refine(found, *stacked, iterations=2)):
+        finite(solution)
+        assert not measured or [int(s) for s in failed(solution.status).logical_not().nonzero()] == sound
+        assert torch.equal(solution.tensor.flatten(1).abs().amax(-1) > 0, ~failed(solution.status))
+    assert not measured or found.status[sound].eq(found.status[0]).all()
+    assert not measured or worst((found.singular_values[[3, 4]] / found.singular_values[0] - 1)[..., 0].abs()) < 1e-9
+    few = tuple(x[[0, 1, 3]] for x in stacked)
+    if not case.invariant.intrinsic:
+        tried = dyn.robust_fit(case.invariant, *few, starts=(1,), generator=torch.Generator().manual_seed(0))
+        assert tried.tensor.isfinite().all() and tried.sigma is not None and tried.sigma.isfinite().all()
+        assert tried.covariance is not None and not tried.covariance.isnan().any()
+        assert not measured or tried.status[0] == tried.status[2]
+
+
+@prop()
+def neighbours_do_not_matter(case: Case) -> None:
+    """Robust estimation and constrained fits of a problem are the same whatever stands beside it."""
+    views = example(case, max(60, many(case)), batch=(3,))
+    alone = case.nullity == 1 and case.invariant.copies is None
+
+    def run(views: Views) -> tuple[dyn.Solution, dyn.Solution | None]:
+        draw = torch.Generator().manual_seed(0)
+        robust = dyn.robust_fit(case.invariant, *views, starts=(1, 4), generator=draw)
+        return robust, constrain(dyn.fit(case.invariant, *views)) if alone else None
+
+    expected = run(views)
+    for kind in ("noise", "nan"):
+        other = tuple(x.clone() for x in views)
+        draw = torch.Generator().manual_seed(1)
+        for x in other:
+            x[1] = torch.nan if kind == "nan" else torch.randn(x[1].shape, generator=draw, dtype=x.dtype)
+        found = run(other)
+        rest = [0, 2]
+        for one, two in zip(found, expected, strict=True):
+            if one is not None and two is not None:
+                assert torch.equal(one.status[rest], two.status[rest])
+                assert apart(case, one.tensor[rest], two.tensor[rest]) < 1e-9
+        assert found[0].inliers is not None and expected[0].inliers is not None
+        assert torch.equal(found[0].inliers[rest], expected[0].inliers[rest])
 
 
 # ------------------------------------------------------------------ misuse

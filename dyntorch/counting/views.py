@@ -14,6 +14,7 @@ from dyntorch.counting.field import Field, IntArray
 Measure = Literal["join", "hyper"]
 
 LARGEST = 4096  # unknowns
+CAMERAS = 1 << 17  # entries of all projections
 
 
 class Views:
@@ -92,6 +93,9 @@ def check_size(k: int, views: Sequence[int], measure: Sequence[Measure | int], p
     """Refuse numbers whose rows would not fit, before any is drawn."""
     if max((k, *views)) >= LARGEST or len(views) > LARGEST:
         raise ValueError(f"{max(k, len(views), *views):,} dimensions or views are too many; give fewer than {LARGEST:,}")
+    cameras = sum((size + 1) * (k + 1) for size in views)
+    if cameras > CAMERAS:
+        raise ValueError(f"the projections have {cameras:,} entries; up to {CAMERAS:,} are counted within a minute or so")
     width = rows = 1
     for size, kind in zip(views, measure, strict=True):
         used = points if kind == "join" else 1 if kind == "hyper" else int(kind)
