@@ -41,8 +41,8 @@ def point_information(cameras: Tensor, structure: Tensor, weights: Tensor | None
     """
     check_tensor("cameras", cameras, "views", "l + 1", "a + 1")
     check_tensor("structure", structure, "n", "k + 1")
-    if not cameras.shape[-2]:
-        raise ValueError(f"cameras must be (*batch, views, l + 1, a + 1), got {tuple(cameras.shape)}")
+    if not cameras.shape[-3] or cameras.shape[-2] < 2:
+        raise ValueError(f"cameras must be (*batch, views >= 1, l + 1 >= 2, a + 1), got {tuple(cameras.shape)}")
     batch, views, n = cameras.shape[:-3], cameras.shape[-3], structure.shape[-2]
     x = cameras.new_zeros(*batch, views, n, cameras.shape[-2] - 1)
     check(x, weights, cameras, structure, lifts, LOSSES[0])

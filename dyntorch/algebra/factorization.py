@@ -30,11 +30,13 @@ def affine_factorization(views: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         raise ValueError(f"views must be (*batch, views >= 2, points >= 3, 2), got {tuple(views.shape)}")
     if not bool(views.isfinite().all()):
         raise ValueError("views hold coordinates that are NaN or infinite; leave those points out, or fill them in")
-    centred = views - views.mean(dim=-2, keepdim=True)
+    largest = views.double().abs().amax((-3, -2, -1))[..., None, None]  # no square leaves the range
+    scaled = views.double() / torch.where(largest > 0, largest, 1.0)[..., None]
+    centred = scaled - scaled.mean(dim=-2, keepdim=True)
     count, points = views.shape[-3], views.shape[-2]
     stacked = centred.movedim(-3, -2).reshape(*views.shape[:-3], points, 2 * count)
-    u, s, vt = torch.linalg.svd(stacked.double(), full_matrices=False)
-    shape = u[..., :3] * s[..., None, :3]
+    u, s, vt = torch.linalg.svd(stacked, full_matrices=False)
+    shape = u[..., :3] * s[..., None, :3] * largest
     cameras = vt[..., :3, :].reshape(*views.shape[:-3], 3, count, 2).movedim(-3, -2)
     energy = s.square().sum(-1)
     left = torch.where(energy > 0, s[..., 3:].square().sum(-1) / energy.clamp(min=1e-300), torch.ones_like(energy))

@@ -65,7 +65,7 @@ def canonical_correlation(first: Tensor, second: Tensor, *, shared: int = 1) -> 
         shared: 1 for :math:`s_1`; 2 for :math:`\sqrt{(s_1^2 + s_2^2) / 2}`, which asks the planes to coincide.
 
     Returns:
-        ``(m, k)`` in [0, 1]; the product is one GEMM.
+        ``(m, k)`` in [0, 1]; the product is one GEMM.  What is not finite counts as 0.
 
     Raises:
         ValueError: bases that are not planes, of different lengths, or another ``shared``.
@@ -85,7 +85,9 @@ def canonical_correlation(first: Tensor, second: Tensor, *, shared: int = 1) -> 
         raise ValueError(f"expected bases (m, rows, 2) and (k, rows, 2), got {tuple(first.shape)} and {tuple(second.shape)}")
     check_together(first=(first, 3), second=(second, 3))
     # planes of coordinates, so that the four entries of every product are contiguous (m, k) matrices
-    left, right = first.permute(2, 0, 1), second.permute(2, 1, 0)
+    left, right = (
+        torch.nan_to_num(basis).clamp(-1.0, 1.0).permute(order) for basis, order in ((first, (2, 0, 1)), (second, (2, 1, 0)))
+    )
     c00, c01, c10, c11 = (left[i] @ right[j] for i in (0, 1) for j in (0, 1))
     norm = c00.square().addcmul_(c01, c01).addcmul_(c10, c10).addcmul_(c11, c11)
     if shared == 2:

@@ -211,7 +211,7 @@ def _gauss_newton(structure: Tensor, matrices: Tensor, x: Tensor, weights: Tenso
 def _check_width(name: str, matrices: Tensor, structure: Tensor) -> None:
     check_tensor(name, matrices, "views", "rows", "k + 1")
     check_tensor("structure", structure, "n", "k + 1")
-    if not structure.shape[-1] or matrices.shape[-1] != structure.shape[-1]:
+    if not structure.shape[-1] or not matrices.shape[-2] or matrices.shape[-1] != structure.shape[-1]:
         raise ValueError(
             f"{name} must be (*batch, views, rows, k + 1) for structure (*batch, n, k + 1), "
             f"got {tuple(matrices.shape)} for {tuple(structure.shape)}"
