@@ -1,0 +1,199 @@
+"""Hostile numbers and types: a ValueError that names the argument, or an honest status, and never a NaN."""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+import dyntorch as dyn
+from dyntorch import scenes
+from dyntorch.algebra.affine_segmentation import affine_segmentation
+from dyntorch.algebra.factorization import affine_factorization
+from dyntorch.algebra.subspaces import canonical_correlation, orthonormal_basis
+from dyntorch.algebra.triangulation import reproject, resect, triangulate
+from dyntorch.bundle_adjustment import bundle_adjust
+from dyntorch.bundle_information import structure_covariance
+from dyntorch.counting import count, dim_v
+from dyntorch.invariants.multibody import multibody_matrix
+from dyntorch.nullspace import null_space
+from dyntorch.sampling import Draws
+
+F64 = torch.float64
+
+
+def seeded(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def numbers(*shape: int, seed: int = 0) -> Tensor:
+    return torch.rand(*shape, generator=seeded(seed), dtype=F64)
+
+
+CAMERAS, POINTS = numbers(5, 3, 4), numbers(20, 4, seed=1)
+IMAGES = reproject(CAMERAS, POINTS)
+FUNCTIONS: dict[str, tuple[Callable[..., Any], tuple[Tensor, ...]]] = {
+    "null_space": (null_space, (numbers(10, 4),)),
+    "orthonormal_basis": (orthonormal_basis, (numbers(10, 3),)),
+    "canonical_correlation": (canonical_correlation, (numbers(3, 9, 2), numbers(4, 9, 2))),
+    "affine_factorization": (affine_factorization, (numbers(3, 10, 2),)),
+    "triangulate": (triangulate, (CAMERAS, IMAGES)),
+    "resect": (resect, (POINTS, IMAGES)),
+    "reproject": (reproject, (CAMERAS, POINTS)),
+    "bundle_adjust": (lambda x, p, y: bundle_adjust(x, None, p, y, iterations=2), (IMAGES, CAMERAS, POINTS)),
+    "structure_covariance": (structure_covariance, (CAMERAS, POINTS)),
+    "affine_segmentation": (affine_segmentation, (numbers(40, 2), numbers(40, 2, seed=1))),
+    "multibody_matrix": (lambda a, b: multibody_matrix(a, b, 2), (numbers(60, 2), numbers(60, 2, seed=1))),
+}
+
+
+def hostile(x: Tensor) -> Iterator[Any]:
+    """Other types, other shapes, other numbers."""
+    yield from (x.numpy(), x.tolist(), None, "x", x.long(), x > 0, x.half(), x.bfloat16(), x.to(torch.complex128), x.float())
+    yield from (x * torch.nan, x * torch.inf, x * 1e300, x * 1e-300)
+    for value in (torch.nan, 1e300):
+        one = x.clone()
+        one.view(-1)[0] = value
+        yield one
+    yield from (x.sum(), x.flatten(), x.expand(3, *x.shape), x[None][:0], x[..., :0, :], x[:0], x[..., :1, :])
+    yield x.expand(2, 1, *x.shape)
+
+
+def tensors(value: Any) -> Iterator[Tensor]:
+    if isinstance(value, Tensor):
+        yield value
+    elif isinstance(value, tuple):
+        for part in value:
+            yield from tensors(part)
+    elif hasattr(value, "__dict__"):
+        yield from tensors(tuple(vars(value).values()))
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_anything_gives_a_value_error_or_numbers(name):
+    function, arguments = FUNCTIONS[name]
+
+    def tried(*given: Any) -> Any:
+        try:
+            return function(*given)
+        except ValueError as error:
+            return str(error)
+
+    for i, argument in enumerate(arguments):
+        for bad in hostile(argument):
+            found = tried(*arguments[:i], bad, *arguments[i + 1 :])
+            assert not isinstance(found, str) or (len(found) < 300 and "\n" not in found)
+            assert not any(x.is_floating_point() and x.isnan().any() for x in tensors(found))
+
+
+def test_infinite_weights_are_missing_matches():
+    x1, x2 = numbers(60, 2), numbers(60, 2, seed=1)
+    weights = torch.ones(60, dtype=F64)
+    weights[3] = torch.inf
+    for found in (affine_segmentation(x1, x2, weights), multibody_matrix(x1, x2, 2, weights=weights)):
+        assert all(x.isfinite().all() for x in tensors(found))
+        assert found.labels[3] == 0
+
+
+def test_random_matches_of_a_line_are_not_taken_for_a_collineation():
+    noise = [torch.randn(400, 12, 1, generator=seeded(v), dtype=F64) for v in range(2)]
+    assert (dyn.fit(dyn.Collineation(1), *noise).status == dyn.Status.OK).double().mean() < 0.01
+    for n, sigma in ((8, 0.01), (12, 0.03), (20, 0.1)):
+        x2 = 2 * torch.rand(400, n, 1, generator=seeded(3), dtype=F64) - 1
+        x1 = (x2 + 0.3) / (0.2 * x2 + 1) + sigma * torch.randn(x2.shape, generator=seeded(4), dtype=F64)
+        assert (dyn.fit(dyn.Collineation(1), x1, x2).status == dyn.Status.OK).double().mean() > 0.97
+
+
+def test_a_singular_collineation_is_degenerate():
+    # all points of view 1 but one are the same: the only matrix that fulfils all matches maps onto that point
+    x1, x2 = torch.zeros(12, 1, dtype=F64), torch.randn(12, 1, generator=seeded(), dtype=F64)
+    x1[3] = 1.0
+    assert dyn.fit(dyn.Collineation(1), x1, x2).status == dyn.Status.DEGENERATE
+
+
+def test_half_precision_complex_and_mapped_matches_are_refused():
+    views = scenes.planar(40, generator=seeded()).views
+    for dtype, words in ((torch.float16, r"too few digits; use .float\(\)"), (torch.complex64, r"use .double\(\)")):
+        with pytest.raises(ValueError, match=words):
+            dyn.fit(dyn.HomographyTensor, *(x.to(dtype) for x in views))
+    with pytest.raises(ValueError, match=r"mapped over by torch.func.vmap; give all problems at once"):
+        torch.func.vmap(lambda *v: dyn.fit(dyn.HomographyTensor, *v).tensor)(*(x.expand(2, *x.shape) for x in views))
+
+
+def test_fit_takes_the_derivatives_of_torch_func():
+    views = scenes.planar(40, sigma=0.5, generator=seeded()).views
+
+    def value(*views: Tensor) -> Tensor:
+        return dyn.fit(dyn.HomographyTensor, *views).tensor.flatten()[:4].square().sum()
+
+    leaves = [x.clone().requires_grad_() for x in views]
+    expected = torch.autograd.grad(value(*leaves), leaves)
+    found = torch.func.grad(value, argnums=(0, 1, 2))(*views)
+    tangents = tuple(torch.randn(x.shape, generator=seeded(5), dtype=F64) for x in views)
+    change = torch.func.jvp(value, views, tangents)[1]
+    for one, two in zip(found, expected, strict=True):
+        torch.testing.assert_close(one, two, rtol=1e-6, atol=1e-12)
+    torch.testing.assert_close(change, sum((a * b).sum() for a, b in zip(found, tangents, strict=True)), rtol=1e-6, atol=1e-12)
+
+
+def test_a_solution_is_indexed_and_moved_like_a_tensor():
+    scene = scenes.planar(40, batch=6, sigma=0.5, generator=seeded())
+    views = [x.unflatten(0, (2, 3)) for x in scene.views]
+    whole = dyn.refine(dyn.fit(dyn.HomographyTensor, *views), *views, iterations=3)
+    for key in (1, slice(0, 1), (1, 2), torch.tensor([[True, False, True], [False, True, False]])):
+        part = whole[key]
+        for one, two in zip((part.tensor, part.sigma, *part.motion), (whole.tensor, whole.sigma, *whole.motion), strict=True):
+            torch.testing.assert_close(one, two[key])
+        torch.testing.assert_close(part.singular_values, whole.singular_values[key])
+    dyn.refine(whole[1], *(x[1] for x in views), iterations=1)
+    assert whole.to(torch.float32).motion[0].dtype == torch.float32 and whole.to("cpu").tensor.equal(whole.tensor)
+    assert ", sigma about " in repr(whole) and ", sigma 0." in repr(whole[0, 0])
+    with pytest.raises(IndexError, match="one problem"):
+        whole[0, 0][0]
+    with pytest.raises(ValueError, match="float32 or float64"):
+        whole.to(torch.float16)
+
+
+def test_draws_of_a_problem_do_not_depend_on_the_others():
+    both, one = Draws(2, seeded(), torch.device("cpu")), Draws(2, seeded(), torch.device("cpu"))
+    both(torch.arange(2), 5)
+    first, second = both(torch.arange(2), 3), (one(torch.tensor([1]), 5), one(torch.tensor([1]), 3))[1]
+    assert torch.equal(first[1], second[0])
+
+
+def test_sizes_that_would_not_fit_are_refused_before_anything_is_drawn():
+    for views, words in (([2] * 30, "unknowns are too many"), ([10**6] * 2, "are too many"), ([3000], "projections have")):
+        with pytest.raises(ValueError, match=words):
+            count(max(3, len(views), views[0]) if len(views) == 1 else 50, views=views)
+    for n, m, k in ((3, 5000, 2), (2, 10**9, 1), (60, 60, 59)):
+        with pytest.raises(ValueError, match="take a smaller"):
+            dim_v(n, m, k)
+    assert dim_v(3, 500, 500) == 3**500
+    x = torch.zeros(1, 3, 2, dtype=F64)
+    with pytest.raises(ValueError, match="unknowns; up to 4,096 are estimated"):
+        dyn.fit(dyn.GrassmannTensor(50, (2,) * 25 + (1,)), *([x] * 26))
+
+
+def test_negative_weights_are_named():
+    views = scenes.planar(40, generator=seeded()).views
+    weights = torch.ones(40, dtype=F64)
+    weights[2] = -1
+    weights[3] = torch.nan
+    with pytest.raises(ValueError, match="weights must not be negative, got -1"):
+        dyn.fit(dyn.HomographyTensor, *views, weights=weights)
+
+
+def test_tasks_take_thresholds_beyond_the_range():
+    views = tuple(numbers(30, 3, seed=v) for v in range(3))
+    for threshold in (1e300, 1e-300):
+        found = dyn.align_points(*views, model="rigid", threshold=threshold, generator=seeded())
+        assert not any(x.is_floating_point() and x.isnan().any() for x in (found.A, found.sigma, found.covariance))
+    one = tuple(x.clone() for x in views)
+    one[0][0, 0] = 1e300
+    assert dyn.align_points(*one, model="rigid", generator=seeded()).A.isfinite().all()
+
+
+def test_times_of_another_shape_are_named_in_one_line():
+    with pytest.raises(ValueError, match=r"times must be 4 finite numbers, one per view, got shape \(4, 2\)"):
+        dyn.reconstruct(numbers(4, 30, 2), motion="constant_velocity_2d", times=torch.zeros(4, 2))
