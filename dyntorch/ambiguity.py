@@ -56,9 +56,10 @@ def within_noise(
     views, weights = [x[:, ::step] for x in views], weights[:, ::step]
     static = None if static is None else static[:, ::step]
     second = torch.linalg.eigh(g)[1][..., basis.shape[-2], None]
-    # a generator of its own: the same matches get the same answer, and the caller's random numbers stay
-    draw = torch.Generator(device=weights.device).manual_seed(0)
-    shifts = [STEP * torch.randn(x.shape, generator=draw, dtype=x.dtype, device=x.device) for x in views]
+    # a generator of its own: the same matches get the same answer, on any device and beside any others, and the caller's random
+    # numbers stay
+    draw = torch.Generator().manual_seed(0)
+    shifts = [STEP * torch.randn(x.shape[1:], generator=draw, dtype=x.dtype).to(x.device).expand_as(x) for x in views]
     moved = [p.disturbed(x, change) for p, x, change in zip(primitives, views, shifts, strict=True)]
     rows = estimation_matrix(primitives, views, weights, static)
     change = estimation_matrix(primitives, moved, weights, static) - rows

@@ -13,7 +13,7 @@ from dyntorch.invariant import Invariant, as_invariant
 from dyntorch.matches import Matches, matches, relative_weights
 from dyntorch.matrix import estimation_matrix, gram
 from dyntorch.normalize import Normalization, denormalize, normalization
-from dyntorch.nullspace import gram_null_space, null_space
+from dyntorch.nullspace import decided_null_space, null_space
 from dyntorch.primitives import Primitive
 from dyntorch.solution import Solution, Status, copied, failed
 
@@ -173,7 +173,7 @@ def _null(
     if static is not None:
         present = present + ((weights > 0) & static).sum(-1) * (sum(p.width for p in primitives) - invariant.rows())
     g = gram(primitives, views, weights, static)
-    found = gram_null_space(g, nullity)
+    found = decided_null_space(g, nullity)
     basis = found.basis
     spare = (present - (width - nullity)).clamp(min=0)
     # the noise that the solution leaves, per row, against what every other direction has
@@ -181,16 +181,20 @@ def _null(
     square = torch.where(spare > 0, noise * found.competing, torch.zeros_like(noise)).detach()
     rounding = torch.finfo(g.dtype).eps * (g.diagonal(dim1=-2, dim2=-1).sum(-1) * found.competing).detach()
     exact = (rounding > ILL_CONDITIONED) & (rounding > 1e-3 * square) & ~found.degenerate
-    if g.device.type == "cpu" and bool(exact.any()):
+    # frames of single matches, from points of theirs, may be all noise, and then nothing looks weak
+    limit = 0.0 if invariant.intrinsic else WEAK
+    weak = (spare > 0) & ~found.degenerate & (g.diagonal(dim1=-2, dim2=-1).sum(-1) * found.competing > limit)
+    if invariant.copies is not None:
+        weak = torch.zeros_like(weak)
+    # an accelerator waits once per block for both answers: what a tensor and its status are must not depend on where it lives
+    asked = int(exact.any().long() + 2 * weak.any())
+    if asked & 1:
         basis = _with_matrix(basis, exact, primitives, views, weights, static, nullity)
     few = present < width - nullity
     if static is None:
         few = few | ((weights > 0).sum(-1) < invariant.minimal())
     ambiguous = square * present.clamp(min=1) > _limit(spare, width)
-    # frames of single matches, from points of theirs, may be all noise, and then nothing looks weak
-    limit = 0.0 if invariant.intrinsic else WEAK
-    weak = (spare > 0) & ~found.degenerate & (g.diagonal(dim1=-2, dim2=-1).sum(-1) * found.competing > limit)
-    if invariant.copies is None and g.device.type == "cpu" and bool(weak.any()):
+    if asked & 2:
         chosen = [x[weak] for x in views], weights[weak], None if static is None else static[weak], basis[weak]
         with torch.no_grad():
             ambiguous[weak] = ambiguous[weak] | within_noise(primitives, *chosen, invariant.resolves_noise)

@@ -70,10 +70,8 @@ def minimize(
     state, current = result, problem
     for _ in range(iterations):
         state, damping, done = _step(current, state, damping, least)
-        if theta.device.type != "cpu":
-            result = state
-            continue
-        # problems that are done leave: the slow ones do not make the others wait
+        # problems that are done leave: the slow ones do not make the others wait.  An accelerator is asked once per step, which
+        # launches hundreds of kernels
         result = tuple(whole.index_copy(0, left, part) for whole, part in zip(result, state, strict=True))
         keep = (~done).nonzero().flatten()
         if not len(keep):

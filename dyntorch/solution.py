@@ -27,8 +27,7 @@ class Status(IntEnum):
     TOO_FEW = 1
     """Fewer matches with weight than determine the tensor.  The tensor is zero."""
     DEGENERATE = 2
-    """The matches leave more than the invariant's null space, exactly: several tensors fulfil all of them.  The tensor is zero.
-    (On accelerators, which never wait to try another solver, also where the solver's own certificate fails.)"""
+    """The matches leave more than the invariant's null space, exactly: several tensors fulfil all of them.  The tensor is zero."""
     AMBIGUOUS = 3
     """Other tensors fit the matches as well as this one, within the noise.  The tensor is one of them."""
     NO_CONSENSUS = 4

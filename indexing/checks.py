@@ -223,7 +223,7 @@ def check_device(device: str) -> None:
     """Raise where there is no such device."""
     try:
         torch.empty(0, device=device)
-    except (RuntimeError, AssertionError) as error:
+    except (RuntimeError, AssertionError, TypeError) as error:
         raise ValueError(f"device {device!r} is not there: {str(error).splitlines()[0]}; use device='cpu'") from None
 
 

@@ -70,7 +70,7 @@ class ActionIndexer(SavedClassifier):
         window, stride, tempi, pool: of :meth:`score_frames`: seconds, seconds between exemplar windows, speed factors tried,
             and seconds over which scores are averaged.
         random_state: of the virtual views.
-        device: where to compute, e.g. ``"cuda"``.
+        device: where clips are compared with the exemplars, e.g. ``"cuda"``; ``fit`` computes on the CPU.
 
     Attributes:
         classes_: ``(classes,)`` labels as given.  model_: the learned :class:`~indexing.shape.model.ShapeModel`.

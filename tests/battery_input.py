@@ -12,6 +12,7 @@ from dyntorch.primitives import Hyperplane
 from dyntorch.solution import failed
 from tests.battery import example, finite, many, ok, prop, worst
 from tests.cases import Case
+from tests.pretend_device import accelerators, moved
 from tests.references import apart, matrices, rank
 
 Views = tuple[Tensor, ...]
@@ -268,15 +269,14 @@ def single_precision_is_solved_in_double(case: Case) -> None:
 
 
 @prop()
-def cuda_agrees(case: Case) -> None:
-    if not torch.cuda.is_available():
-        pytest.skip("no CUDA device")
-    views = example(case)
-    there = dyn.fit(case.invariant, *(x.cuda() for x in views))
+def an_accelerator_agrees(case: Case) -> None:
+    views = tuple(x[:1] for x in example(case))
     here = dyn.fit(case.invariant, *views)
-    assert there.tensor.is_cuda and there.status.is_cuda and all(m.is_cuda for m in there.motion)
-    assert apart(case, there.tensor.cpu(), here.tensor) < 1e-8
-    assert torch.equal(there.status.cpu(), here.status)
-    refined = dyn.refine(there, *(x.cuda() for x in views))
-    same = tuple(m.cpu() for m in refined.motion), dyn.refine(here, *views).motion
-    assert worst(case.error(*same)) < 1e-5
+    motion = dyn.refine(here, *views).motion
+    for device in accelerators():
+        away = moved(views, device)
+        there = dyn.fit(case.invariant, *away)
+        assert {x.device.type for x in (there.tensor, there.status, *there.motion)} == {device}
+        assert apart(case, there.tensor.cpu(), here.tensor) < 1e-8
+        assert torch.equal(there.status.cpu(), here.status)
+        assert worst(case.error(moved(dyn.refine(there, *away).motion, "cpu"), motion)) < 1e-5

@@ -62,7 +62,7 @@ def metric_upgrade(shape: Tensor, cameras: Tensor) -> tuple[Tensor, Tensor]:
     extent = shape.double().norm(dim=0)
     # a flat shape leaves the third row of the cameras to chance
     if len(cameras) < 3 or not extent.min() > 1e-6 * extent.max():
-        return shape, torch.tensor(False)
+        return shape, torch.tensor(False, device=shape.device)
     rows = torch.cat([_quadratic(a, b), _quadratic(a, a) - _quadratic(b, b)])
     _, s, vt = torch.linalg.svd(rows, full_matrices=True)
     q = vt[-1]
@@ -71,16 +71,16 @@ def metric_upgrade(shape: Tensor, cameras: Tensor) -> tuple[Tensor, Tensor]:
     values, vectors = torch.linalg.eigh(matrix)
     # one solution only where the fifth singular value stands clear of the noise floor
     if not (values[0] > 1e-3 * values[-1] and s[4] > 1e-3 * s[0]):
-        return shape, torch.tensor(False)
+        return shape, torch.tensor(False, device=shape.device)
     half = vectors * values.sqrt()
     upright = _vertical(cameras.double().transpose(-1, -2) @ half)
     metric = shape.double() @ torch.linalg.inv(half).mT @ upright
-    return metric.to(shape.dtype), torch.tensor(True)
+    return metric.to(shape.dtype), torch.tensor(True, device=shape.device)
 
 
 def _quadratic(a: Tensor, b: Tensor) -> Tensor:
     """``(views, 6)`` coefficients of a^T Q b in the entries 00, 01, 02, 11, 12, 22 of the symmetric Q."""
-    i, j = torch.triu_indices(3, 3).unbind()
+    i, j = torch.triu_indices(3, 3, device=a.device).unbind()
     return torch.where(i == j, a[:, i] * b[:, i], a[:, i] * b[:, j] + a[:, j] * b[:, i])
 
 

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.blocks import one_thread
+from dyntorch.devices import on_cpu
 from dyntorch.invariants.fundamental_matrix import FundamentalMatrix
 from dyntorch.matches import matches
 from dyntorch.tasks.bodies_pool import LEAST
@@ -20,6 +21,7 @@ MINIMAL = 8
 
 
 @one_thread
+@on_cpu
 def segment(
     x1: Tensor,
     x2: Tensor,
@@ -38,6 +40,8 @@ def segment(
     the epipolar geometries of which form a pool that bodies are chosen from; the best starts descend to maximum likelihood
     fits and labels in turns.  The number of bodies is the one of least cost with a penalty for each body.  Then all matches are
     labelled, the outliers among them.
+
+    A search: it computes on the CPU wherever its tensors are, and the result returns to their device.
 
     Args:
         x1: ``(*batch, n, 2)`` points of view 1, pixels; NaN = missing.

@@ -111,7 +111,7 @@ def choices(tracks: Tracks, size: int) -> Tensor:
         options = torch.cat([even[None], options]).unique(dim=0)
     seen = (tracks.weights > 0).to(tracks.x.dtype)[:, options].prod(2).sum(-1)  # (b, options)
     span = (tracks.times.amax() - tracks.times.amin()).clamp(min=torch.finfo(tracks.x.dtype).tiny)
-    ordered = (tracks.times[options].sort(-1).values / span).to(tracks.x)
+    ordered = (tracks.times.to(device)[options].sort(-1).values / span).to(tracks.x)
     gap = ordered.diff(dim=-1).amin(-1) * (size - 1)
     score = seen * gap.clamp(min=1e-6).sqrt()
     best = score.topk(min(SUBSETS, len(options)), dim=-1).indices

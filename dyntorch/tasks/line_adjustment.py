@@ -49,7 +49,7 @@ def adjust(data: Sightings, lines: Tensor) -> Sightings:
         lines = torch.where(better[..., None, None], ends, lines)
         cost, damping = torch.where(better, found, cost), torch.where(better, damping / 10, damping * 10).clamp(min=1e-12)
         done = done | settled
-        if done.device.type == "cpu" and bool(done.all()):
+        if bool(done.all()):
             break
     return data
 

@@ -164,7 +164,7 @@ def refined(lines: Lines, theta: Tensor, labels: Tensor) -> Tensor:
         theta, gradient = torch.where(better[:, None], trial, theta), torch.where(better[:, None], fresh[1], gradient)
         matrix, cost = torch.where(better[:, None, None], fresh[2], matrix), torch.where(better, fresh[0], cost)
         damping = torch.where(better, (damping * 0.1).clamp(min=1e-12), damping * 8)
-        if theta.device.type == "cpu" and bool(done.all()):
+        if bool(done.all()):
             break
     return theta
 

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from dyntorch.algebra.triangulation import observed
 from dyntorch.blocks import one_thread
+from dyntorch.devices import on_cpu
 from dyntorch.motions import Motion, as_motion
 from dyntorch.normalize import hartley
 from dyntorch.solution import failed
@@ -29,6 +30,7 @@ FAR = (1e4, 1e9)
 
 
 @one_thread
+@on_cpu
 def reconstruct(
     tracks: Tensor,
     motion: str | Motion,
@@ -46,6 +48,8 @@ def reconstruct(
     estimated linearly and constrained, the projections follow from it in closed form, all other views by resection; the known
     B(t) then fix the frame of :math:`P^k` up to an ambiguity of the scene, linearly, and bundle adjustment over all views ends
     it.  Where matches disagree, all of this is done robustly.  The results carry no gradients.
+
+    A search: it computes on the CPU wherever its tensors are, and the result returns to their device.
 
     Args:
         tracks: ``(*batch, views, n, 2)`` pixels (3D sensors: ``(*batch, views, n, 3)``), NaN or infinite = missing.
@@ -283,7 +287,7 @@ def _noted(found: Reconstruction, static: Tensor | None, used: Tensor) -> Recons
 
 
 def _returned(found: Reconstruction, tracks: Tensor) -> Reconstruction:
-    """Floating point results in the dtype and on the device of the tracks."""
+    """Floating point results in the dtype and on the device of the tracks; times keep their own precision."""
     changed = {
         f.name: getattr(found, f.name).to(device=tracks.device, dtype=tracks.dtype)
         for f in fields(found)

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.blocks import one_thread
+from dyntorch.devices import on_cpu
 from dyntorch.solution import Status
 from dyntorch.tasks.notices import Notice, NoticeCode, check_threshold
 from dyntorch.tasks.pair_affine import FEWEST, Transfer, solve
@@ -36,6 +37,7 @@ EXACT = 1e-7
 
 
 @one_thread
+@on_cpu
 def reconstruct_pair(
     a: Tensor,
     b: Tensor,
@@ -61,6 +63,8 @@ def reconstruct_pair(
     search over all directions, the :math:`q_{ij}` come from the ridge regression of most evidence, out of tracks whose noise is
     told from motion by their own spectrum in time and by their correlations.  With ``correspondence=True`` point i of a is
     point i of b, the cameras are projective, and one fundamental matrix of all frames gives the structure of each.
+
+    A search: it computes on the CPU wherever its tensors are, and the result returns to their device.
 
     Args:
         a: ``(frames_a, n, 2)`` pixels, NaN = missing.

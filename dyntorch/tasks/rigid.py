@@ -168,7 +168,7 @@ def descend(
         pose, r = torch.where(better[:, None, None, None], trial, pose), torch.where(better[:, None], fresh, r)
         cost = torch.where(better, new, cost)
         damping = torch.where(better, (damping * 0.1).clamp(min=1e-10), damping * 8)
-        if pose.device.type == "cpu" and bool(done.all()):
+        if bool(done.all()):
             break
     return pose.reshape(motions.shape), cost.reshape(lead)
 

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.blocks import one_thread
+from dyntorch.devices import on_cpu
 from dyntorch.tasks.shift import Shift
 from dyntorch.tasks.sync_clocks import Clocks, Pair
 from dyntorch.tasks.sync_network import Network, network
@@ -22,6 +23,7 @@ sure pairs tie to the reference, and in others.  Refused pairs often fail togeth
 
 
 @one_thread
+@on_cpu
 def synchronize_cameras(
     tracks: Sequence[Any],
     correspondence: bool = True,
@@ -38,6 +40,8 @@ def synchronize_cameras(
 ) -> Clocks:
     """The clocks of several cameras that filmed the same motion: :func:`dyntorch.synchronize` on the pairs, then
     :func:`combine_shifts`.
+
+    A search: it computes on the CPU wherever its tensors are, and the result returns to their device.
 
     Args:
         tracks: per camera ``(frames, n, 2)`` px, NaN = missing; frames may differ, n too without correspondence.  (Or whatever
@@ -98,6 +102,7 @@ def synchronize_cameras(
     return combine_shifts(shifts, count, reference)
 
 
+@on_cpu
 def combine_shifts(shifts: Mapping[tuple[int, int], Shift], cameras: int, reference: int = 0) -> Clocks:
     r"""All cameras' clocks from the shifts of pairs: weighted least squares over the peaks that agree.
 

@@ -18,6 +18,7 @@ from dyntorch.algebra.epipolar import TINY, eight_point
 from dyntorch.algebra.epipolar_descent import Frames
 from dyntorch.algebra.lens import Division
 from dyntorch.blocks import one_thread
+from dyntorch.devices import on_cpu
 from dyntorch.least_squares import damped_step
 
 RANGE = (-0.8, 0.4)
@@ -72,6 +73,7 @@ class LensFit:
 
 
 @one_thread
+@on_cpu
 def fit_distortion(
     a: Tensor, b: Tensor, weights: Tensor | None = None, sizes: Sequence[Sequence[float] | None] | None = None
 ) -> LensFit:
@@ -82,6 +84,8 @@ def fit_distortion(
 
     with the robust scale s.  Distortion is significant where an F-test says so, and where lenses fitted without a quarter of the
     matches (in the order given: time) explain that quarter better than no lenses do, for each of the four.
+
+    A search: it computes on the CPU wherever its tensors are, and the result returns to their device.
 
     Args:
         a, b: ``(N, 2)`` px, matches in the order of time; NaN = none.

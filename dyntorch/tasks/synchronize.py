@@ -13,6 +13,7 @@ from torch import Generator, Tensor
 
 from dyntorch.algebra.lens import undistorted
 from dyntorch.blocks import one_thread
+from dyntorch.devices import on_cpu
 from dyntorch.tasks.shift import Shift
 from dyntorch.tasks.sync_attempt import APART, WANDER, Attempt
 from dyntorch.tasks.sync_cleaning import cleaned
@@ -27,6 +28,7 @@ CAMERAS = ("auto", "perspective", "affine")
 
 
 @one_thread
+@on_cpu
 def synchronize(
     a: Tensor,
     b: Tensor,
@@ -50,6 +52,8 @@ def synchronize(
     at all shifts by FFT, then by least squares of the Sampson distance in offset, rate and F together.  With different points, the
     shift at which the two cameras' coordinates share most information.  The result is refused (``ok`` false, with a reason)
     where the motion repeats itself, is too small, or where parts of the take disagree.
+
+    A search: it computes on the CPU wherever its tensors are, and the result returns to their device.
 
     Args:
         a: ``(frames_a, n, 2)`` px, y down; NaN = missing.  Point k of a is point k of b.

@@ -61,7 +61,7 @@ def refined(evidence: Evidence, theta: Tensor, labels: Tensor, affine: bool) -> 
         matrix, cost = torch.where(better[:, None, None], fresh[2], matrix), torch.where(better, fresh[0], cost)
         finished = small & (better | (damping > 1e5))
         damping = torch.where(better, (damping * 0.1).clamp(min=1e-12), damping * 8)
-        if theta.device.type == "cpu" and bool(finished.all()):
+        if bool(finished.all()):
             break
     return theta
 

@@ -64,7 +64,7 @@ def motion(frames: Tensor, region: Region | None = None) -> Motion:
         change = (change - max(QUIET, NOISE * float(change.median()))).clamp(min=0)
         if region is not None:
             x0, y0, x1, y1 = (round(v) for v in region)
-            mask = torch.zeros(change.shape[1:])
+            mask = change.new_zeros(change.shape[1:])
             mask[max(y0, 0) : max(y1, 0), max(x0, 0) : max(x1, 0)] = 1
             change = change * mask
         rows.append(change.sum(2).double())
@@ -81,7 +81,7 @@ def boxes(found: Motion, fps: float) -> tuple[Tensor, bool]:
     One box for the take, or, where a person crosses the image, one of constant size that follows the person smoothly.
     """
     height = found.rows.shape[1]
-    path = found.drift.path if found.drift.moves else torch.zeros(len(found.rows), 2, dtype=torch.float64)
+    path = found.drift.path if found.drift.moves else found.rows.new_zeros(len(found.rows), 2)
     across, along = (_quantiles(_smooth(m, FOLLOW * fps)) for m in (found.columns, found.rows))
     following = _square(across, along, height)
     seen = _smooth(found.lively.double()[:, None], FOLLOW * fps)[:, 0] > 0
@@ -109,15 +109,15 @@ def _square(across: Tensor, along: Tensor, height: int) -> Tensor:
 def _smooth(values: Tensor, sigma: float) -> Tensor:
     """Gaussian mean over time of ``(T, n)``, renormalized at the ends."""
     reach = max(1, int(3 * sigma))
-    kernel = torch.exp(-0.5 * (torch.arange(-reach, reach + 1, dtype=values.dtype) / sigma) ** 2)[None, None]
-    weight = conv1d(torch.ones(1, 1, len(values), dtype=values.dtype), kernel, padding=reach)[0].T
+    kernel = torch.exp(-0.5 * (torch.arange(-reach, reach + 1, dtype=values.dtype, device=values.device) / sigma) ** 2)[None, None]
+    weight = conv1d(values.new_ones(1, 1, len(values)), kernel, padding=reach)[0].T
     return conv1d(values.T[:, None], kernel, padding=reach)[:, 0].T / weight
 
 
 def crop(frames: Tensor, where: Tensor, side: int = SIDE) -> Tensor:
     """``(n, side, side)`` float32 crops of frames ``(n, h, w)`` in boxes ``(n, 3)``; the border is repeated outside the image."""
     height, width = frames.shape[1:]
-    steps = (torch.arange(side) + 0.5) / side - 0.5
+    steps = (torch.arange(side, device=where.device) + 0.5) / side - 0.5
     x, y, size = where.float().T[..., None]
     gx = 2 * (x + steps * size) / width - 1
     gy = 2 * (y + steps * size) / height - 1

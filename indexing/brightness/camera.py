@@ -56,13 +56,13 @@ def drift(gx: Tensor, gy: Tensor, gt: Tensor) -> Drift:
     Returns:
         The motion per frame where one translation explains the change.
     """
-    inside = torch.ones(gt.shape[1:], dtype=torch.bool)
+    inside = torch.ones(gt.shape[1:], dtype=torch.bool, device=gt.device)
     rows, columns = (max(2, round(BORDER * n)) for n in gt.shape[1:])
     inside[rows:-rows, columns:-columns] = False
-    design = torch.stack([g[:, inside] for g in (gx, gy)] + [torch.ones(len(gt), int(inside.sum()))], dim=2).double()
     change = gt[:, inside].double()
+    design = torch.stack([*(g[:, inside].double() for g in (gx, gy)), torch.ones_like(change)], dim=2)
     gram = design.mT @ design
-    gram = gram + 1e-6 * torch.eye(3, dtype=torch.float64) * gram.diagonal(dim1=1, dim2=2).amax(1)[:, None, None]
+    gram = gram + 1e-6 * torch.eye(3, dtype=torch.float64, device=gt.device) * gram.diagonal(dim1=1, dim2=2).amax(1)[:, None, None]
     found = torch.linalg.solve(gram, -(design.mT @ change[..., None]))
     left = change + (design @ found)[..., 0]
     step = found[:, :2, 0]

@@ -21,7 +21,7 @@ def lag_sums(a: Tensor, b: Tensor) -> Tensor:
     """``(n + m - 1,)`` sums of :math:`<a_i, b_{i+s}>` over i, for lags s from -(n - 1) to m - 1, of ``(n, D)`` and ``(m, D)``."""
     n, m = len(a), len(b)
     size = 1 << (n + m - 2).bit_length()
-    spectrum = torch.zeros(size // 2 + 1, dtype=torch.complex128)
+    spectrum = torch.zeros(size // 2 + 1, dtype=torch.complex128, device=a.device)
     for first in range(0, a.shape[1], CHUNK):
         left, right = (torch.fft.rfft(x[:, first : first + CHUNK].double(), size, dim=0) for x in (a, b))
         spectrum += (left.conj() * right).sum(1)
@@ -88,7 +88,7 @@ def score_curve(a: Tensor, b: Tensor, least: float) -> Curve:
     known = counts >= max(least, 1.0)
     mean = lag_sums(a, b) / counts.clamp(min=1.0)
     scores = mean * (counts / counts.max().clamp(min=1.0)) ** POWER
-    lags = torch.arange(-(len(a) - 1), len(b))
+    lags = torch.arange(-(len(a) - 1), len(b), device=a.device)
     return Curve(lags, scores.masked_fill(~known, -torch.inf), counts)
 
 

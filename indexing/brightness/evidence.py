@@ -20,8 +20,8 @@ OUTLIER = 0.05  # share of windows that may say anything
 def windows(a: Tensor, b: Tensor, lag: int) -> Tensor:
     """``(windows, 2 REACH + 1)`` mean cosines in windows of the overlap at lags about ``lag``; NaN: less than 3/4 known."""
     low, high = max(0, -lag), min(len(a), len(b) - lag)
-    rows = torch.arange(low, max(high, low))
-    columns = rows[:, None] + lag + torch.arange(-REACH, REACH + 1)
+    rows = torch.arange(low, max(high, low), device=a.device)
+    columns = rows[:, None] + lag + torch.arange(-REACH, REACH + 1, device=a.device)
     inside = (columns >= 0) & (columns < len(b))
     seen_a, seen_b = (x.abs().sum(1) > 0 for x in (a, b))
     columns = columns.clamp(0, len(b) - 1)

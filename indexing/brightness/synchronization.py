@@ -8,6 +8,7 @@ from typing import Any
 import torch
 
 from dyntorch import Shift
+from dyntorch.devices import on_cpu
 from indexing.brightness.box import Region, boxes, motion
 from indexing.brightness.decision import APART, LEAST, Verdict, judge
 from indexing.brightness.sampling import Sampled, common_rate, sampled
@@ -20,6 +21,7 @@ FLOOR = 0.35
 four pairs of rates: the parabola is hardly better than whole frames (.29)."""
 
 
+@on_cpu
 def brightness_shift(
     a: Any,
     b: Any,
@@ -40,6 +42,8 @@ def brightness_shift(
     both halves of the overlap choose it, the thesis's window kernel chooses it, no other peak comes near, short windows ask for it
     one by one, and it leads b played backwards clearly: takes of similar motion fail there.  Cameras should stand upright and
     still; the more their views differ (90 degrees is worst), the longer a take is needed.
+
+    A search: it computes on the CPU wherever its tensors are, and the result returns to their device.
 
     Args:
         a: grey video ``(frames, h, w)``, uint8 or float (0..1 or 0..255), array or tensor (colour: ``(frames, h, w, 3)``); or an

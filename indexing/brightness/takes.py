@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dyntorch.devices import CPU, moved
 from indexing.brightness.shrinking import BLOCK, Shrinker
 
 LARGEST = 320  # px of the longer side kept: a person a quarter as tall as a 1080p image keeps 45 px
@@ -85,7 +86,7 @@ class _Spool(Shrinker):
 
     def add(self, part: Any, file: Any) -> Any:
         """Write a chunk to a file; its times, where it has any."""
-        stamps = None
+        stamps, part = None, moved(part, CPU)
         if isinstance(part, tuple) and len(part) == 2:
             part, stamps = part
             stamps = np.atleast_1d(np.asarray(stamps, dtype=np.float64))

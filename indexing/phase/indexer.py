@@ -49,7 +49,7 @@ class PhaseIndexer(SavedClassifier):
         mirror: ``"auto"``: where an action half a cycle later is its own mirror image (gait), frames also count mirrored;
             ``True``: in every action that repeats; ``False``: never.
         window: seconds of neighbours that a frame's score and phase are averaged over; 0: every frame from itself alone.
-        device: where to compare, e.g. ``"cuda"``.
+        device: where frames are compared with the exemplars, e.g. ``"cuda"``; ``fit`` computes on the CPU.
 
     Attributes:
         classes_: ``(classes,)`` labels as given.  periodic_: ``(classes,)`` which of them repeat.

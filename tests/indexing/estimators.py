@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from sklearn.base import clone, is_classifier
 from sklearn.exceptions import NotFittedError
 from sklearn.model_selection import GridSearchCV, LeaveOneGroupOut
@@ -25,6 +24,7 @@ from indexing.actors import Person, dataset, detect, stream
 from indexing.brightness.indexer import BrightnessIndexer
 from indexing.feature_indexer import FeatureIndexer
 from indexing.phase.indexer import PhaseIndexer
+from tests.pretend_device import accelerators
 
 FEW = ("kick", "squat", "wave")
 VERBS = ("predict", "decision_function", "predict_proba", "evidence")
@@ -350,13 +350,12 @@ def what_is_loaded_answers_the_same(case: Case, path: Path) -> None:
 
 
 @promise(lambda case: "device" in case.make().get_params())
-def a_graphics_card_answers_the_same(case: Case) -> None:
-    if not torch.cuda.is_available():
-        pytest.skip("no CUDA device")
+def an_accelerator_answers_the_same(case: Case) -> None:
     lesson = case.lesson()
-    there = case.make(device="cuda").fit(lesson.items, lesson.labels)
-    np.testing.assert_allclose(there.decision_function(lesson.asked), fitted(case).decision_function(lesson.asked), atol=0.01)
-    assert there.predict(lesson.asked).tolist() == fitted(case).predict(lesson.asked).tolist()
+    for device in accelerators():
+        there = case.make(device=device).fit(lesson.items, lesson.labels)
+        np.testing.assert_allclose(there.decision_function(lesson.asked), fitted(case).decision_function(lesson.asked), atol=0.01)
+        assert there.predict(lesson.asked).tolist() == fitted(case).predict(lesson.asked).tolist()
 
 
 # ---- model selection ---------------------------------------------------------------------------------------------------

@@ -229,6 +229,7 @@ def test_score_needs_one_label_per_clip(labels, unchanged):
         ("tempi", ()), ("tempi", (1.0, 0.0)), ("tempi", (np.nan,)), ("tempi", 1.0), ("tempi", None), ("tempi", "fast"),
         ("length", 3), ("length", 12.0), ("length", True), ("length", None), ("virtual_views", -1), ("virtual_views", 1.5),
         ("reject", np.nan), ("reject", "0.1"), ("reject", (0.1,)), ("device", "moon"), ("device", "cuda:99"),
+        ("device", 1.5),
         ("random_state", "seed"), ("random_state", -1), ("random_state", 1.5),
     ],
     ids=str,

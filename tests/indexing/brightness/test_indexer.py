@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-import torch
 from sklearn.base import clone
 
 from indexing.actors import Person, perform
 from indexing.actors.textured import film
 from indexing.brightness.indexer import BrightnessIndexer
 from indexing.video import Chunk
+from tests.pretend_device import accelerators
 
 ACTIONS = ("squat", "jumping_jack", "bow")
 
@@ -183,7 +183,7 @@ def test_bad_queries_are_named(indexer):
         stream.push(np.zeros((40, 48), np.uint8))
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
-def test_cuda_says_the_same(indexer, learned, asked):
-    there = clone(indexer).set_params(device="cuda").fit(learned, ACTIONS * 2)
-    np.testing.assert_allclose(there.decision_function(asked), indexer.decision_function(asked), atol=1e-3)
+def test_an_accelerator_says_the_same(indexer, learned, asked):
+    for device in accelerators():
+        there = clone(indexer).set_params(device=device).fit(learned, ACTIONS * 2)
+        np.testing.assert_allclose(there.decision_function(asked), indexer.decision_function(asked), atol=1e-3)
