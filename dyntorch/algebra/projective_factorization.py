@@ -10,6 +10,7 @@ from torch import Tensor
 
 from dyntorch.algebra.homogeneous import homogeneous, similarity
 from dyntorch.blocks import map_blocks, one_thread
+from dyntorch.devices import on_cpu
 
 # earlier steps that are mixed; planar constant velocity, 8 views, exact: 100 iterations leave 2e-12 px, with 5 steps 2e-7 px,
 # and 300 iterations without mixing 2e-2 px
@@ -34,6 +35,7 @@ class ProjectiveFactorization(NamedTuple):
 
 
 @one_thread
+@on_cpu
 def projective_factorization(
     tracks: Tensor, rank: int, weights: Tensor | None = None, *, iterations: int = 300, tolerance: float = 1e-6
 ) -> ProjectiveFactorization:
@@ -44,6 +46,8 @@ def projective_factorization(
     an algebraic error, and a local minimum of it: a start or a cross-check for bundle adjustment, not its substitute.  Planar
     points at constant velocity, seen obliquely from near (depths differ by a factor of 2 to 3), end in a wrong minimum in 10
     to 20 % of scenes, as they do without mixing; the residual then stands out (1e-2 instead of 3e-3 at one pixel of noise).
+
+    A search: it computes on the CPU wherever its tensors are, and the result returns to their device.
 
     Args:
         tracks: ``(*batch, views, n, l)`` in any unit.  **Only points measured in every view are used.**

@@ -10,6 +10,7 @@ from torch import Tensor
 from dyntorch.algebra.homogeneous import unit
 from dyntorch.algebra.line_cameras import cameras_of_lines
 from dyntorch.blocks import one_thread
+from dyntorch.devices import on_cpu
 from dyntorch.fitting import fit
 from dyntorch.invariants.grassmann_tensor import GrassmannTensor
 from dyntorch.solution import failed
@@ -37,6 +38,7 @@ class TrajectoryCameras:
 
 
 @one_thread
+@on_cpu
 def trajectory_cameras(
     x: Tensor, weights: Tensor | None = None, *, bundle: bool = True, sigma: float | None = None
 ) -> TrajectoryCameras:
@@ -49,6 +51,8 @@ def trajectory_cameras(
     cameras and lines are then adjusted together, which brings them down to the noise.
 
     Static points are of no use here: alone they give the tensor rank 78.
+
+    A search: it computes on the CPU wherever its tensors are, and the result returns to their device.
 
     Args:
         x: ``(*batch, 6, n, 2)`` px, 728 or more points on lines in general position; NaN = missing, which drops the point.
