@@ -247,7 +247,8 @@ def _enough(model: Motion, times: Tensor, x: Tensor) -> None:
     views, n, dim = x.shape[1:]
     if dim != model.sensor:
         kind = "3D sensors" if model.sensor == 3 else "images"
-        raise ValueError(f"{model.name!r} takes tracks of {kind}, (*batch, views, n, {model.sensor}), got {tuple(x.shape[1:])}")
+        takes = f"{model.name!r} takes tracks of {kind}, (*batch, views, n, {model.sensor}), got {tuple(x.shape[1:])}"
+        raise ValueError(f"{takes}; choose a motion for tracks of {dim} coordinates, or motion='auto'")
     moves, different = _moves(model), len(times.unique())
     if moves and views > 1 and different == 1:
         raise ValueError(f"all times are {float(times[0]):g}: views at different times are needed to see a motion; give times=")
