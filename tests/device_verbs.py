@@ -348,6 +348,7 @@ WAITS = {
     "bundle_adjust": (50, STEPS),
     "fit_shapes": (60, STEPS),
     "velocity_factorization": (8, ASKED),
+    "affine_factorization": (1, ASKED),
     "metric_upgrade": (4, ASKED),
     "recover_times": (3, ASKED),
     **dict.fromkeys(("triangulate_trajectories", "hyperplane_pair", "two_bodies"), (1, ASKED)),
@@ -365,7 +366,7 @@ WAITS = {
 23 to 75, 22 and 58 to 86; before they were lent to the CPU: synchronize 300 to 9,000, reconstruct 33 to 1,000."""
 
 NOT_VERBS = {
-    **dict.fromkeys(("counting", "metrics", "motions"), "modules"),
+    **dict.fromkeys(("counting", "metrics", "motions", "scenes"), "modules"),
     **dict.fromkeys(("BodyModel", "LineStatus", "Status", "Motion", "Polynomial", "Fourier", "Invariant"), "names and numbers"),
     **dict.fromkeys(
         ("Clocks", "MovingShapes", "PairReconstruction", "Recovery", "Segmentation", "Shift", "Solution", "TranslatingPlanes"),
