@@ -157,18 +157,10 @@ VERBS: tuple[Verb, ...] = (
     *(
         Verb(
             f"align_points {model}",
-            lambda: scenes.moving_points(80, static=0.4, sigma=1e-3, generator=draw(1)).views,
-            lambda *x, model=model: dyn.align_points(*x, model=model, threshold=0.02, generator=draw()),
-        )
-        for model in ("join",)
-    ),
-    *(
-        Verb(
-            f"align_points {model}",
             lambda sensors=sensors: scenes.constant_velocity(30, static=0.4, sigma=1e-3, generator=draw(1), sensors=sensors).views,
             lambda *x, model=model: dyn.align_points(*x, model=model, threshold=0.02, generator=draw()),
         )
-        for model, sensors in (("constant_velocity", "projective"), ("affine_constant_velocity", "affine"))
+        for model, sensors in (("affine_constant_velocity", "affine"),)
     ),
     *(
         Verb(
@@ -194,7 +186,6 @@ VERBS: tuple[Verb, ...] = (
         lambda *x: dyn.segment(*x, generator=draw()),
     ),
     Verb("translating_planes", lambda: (planes().homographies,), dyn.translating_planes),
-    Verb("translating_planes points", lambda: (planes().x1, planes().x2), lambda x1, x2: dyn.translating_planes(x1=x1, x2=x2)),
     Verb(
         "translating_planes bodies",
         lambda: (planes(2, 1).homographies, planes(2, 1).body_fundamentals),
