@@ -98,6 +98,8 @@ _HOME = {
     "Recovery": "dyntorch.algebra.dynamic_shape_time",
     "Polynomial": "dyntorch.algebra.dynamic_shape_basis",
     "Fourier": "dyntorch.algebra.dynamic_shape_basis",
+    # one thread for small operations, the caller's setting untouched
+    "one_thread": "dyntorch.blocks",
     # subspaces and factorization
     "canonical_correlation": "dyntorch.algebra.subspaces",
     "orthonormal_basis": "dyntorch.algebra.subspaces",

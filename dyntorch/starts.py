@@ -41,6 +41,9 @@ MIXED = 4
 DOUBT = 0.15
 """Matches between one and three thresholds away, per inlier, above which the search goes on: a wrong model has many (constant
 velocity tensors, 20 % outliers: wrong 0.7 and more, right 0.03 at most; right homography tensors reach 0.15 at 60 %)."""
+MANY, AGREEING, SAME = 16, 0.25, 0.01
+"""So many starts decide when to stop where there is doubt: when this share of them end at the best score so far, up to this
+relative difference.  Whatever attracts one start in five, and is better, is then missed once in thirty times."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +60,8 @@ class Found:
     """``(b,)`` bool: to be searched on."""
     inliers: Tensor
     """``(b, searched)`` bool: by the tensor itself, before its motion is known."""
+    agreeing: Tensor
+    """``(b,)`` share of the starts that ended there, of so many that it says something, else 0."""
 
 
 class Search:
@@ -84,15 +89,18 @@ class Search:
         """
         cut = cut * self.unit
         found = self._solve(self.everyone, cut, starts[0])
+        settled = torch.zeros_like(found.doubt)
         enough = (self.weights > 0).sum(-1) >= self.invariant.minimal()
         for count in starts[1:]:
-            left = (found.doubt & enough).nonzero()[:, 0]
+            left = (found.doubt & enough & ~settled).nonzero()[:, 0]
             if not len(left):
                 break
             new = self._solve(left, cut, count)
             better = new.score < found.score[left]
             for old, part in zip(vars(found).values(), vars(new).values(), strict=True):
                 old[left[better]] = part[better]
+            # more starts would find it again
+            settled[left] = (new.agreeing >= AGREEING) & (new.score <= _same(found.score[left]))
         return found
 
     def scale(self) -> Tensor:
@@ -142,9 +150,12 @@ class Search:
                 basis = torch.cat([anneal(work, free, limit, steps), led], dim=2)
             else:
                 basis = anneal(work, basis, limit, steps)
-            basis = concentrate(work, _best(work, basis, score, 1), limit, 5)
+            lost = score(work.distances(basis)[0])
+            agreeing = (lost <= _same(lost.amin(-1, keepdim=True))).double().mean(-1) * (lost.shape[-1] >= MANY)
+            basis = concentrate(work, _chosen(basis, lost.argmin(-1, keepdim=True)), limit, 5)
             square = work.distances(basis)[0]
-            return basis[:, :, 0], score(square)[:, 0], *judge(work, basis, square[:, 0], limit), square[:, 0] <= limit[:, None]
+            evidence, doubt = judge(work, basis, square[:, 0], limit)
+            return basis[:, :, 0], score(square)[:, 0], evidence, doubt, square[:, 0] <= limit[:, None], agreeing
 
         return Found(*self._map(block, where, chosen, cut[where]))
 
@@ -237,8 +248,17 @@ def _best(work: Bundle, basis: Tensor, score: Callable[[Tensor], Tensor], count:
     """The ``count`` starts with the least score."""
     if basis.shape[2] <= count:
         return basis
-    order = score(work.distances(basis)[0]).topk(count, largest=False).indices
-    return basis.gather(2, order[:, None, :, None, None].expand(*basis.shape[:2], count, *basis.shape[3:]))
+    return _chosen(basis, score(work.distances(basis)[0]).topk(count, largest=False).indices)
+
+
+def _chosen(basis: Tensor, order: Tensor) -> Tensor:
+    """The starts ``(b, count)`` of ``(b, c, K, a, D)``."""
+    return basis.gather(2, order[:, None, :, None, None].expand(*basis.shape[:2], order.shape[-1], *basis.shape[3:]))
+
+
+def _same(score: Tensor) -> Tensor:
+    """The score up to which two finds are the same one: the weight of a hundredth of a match is no difference."""
+    return score * (1 + SAME) + SAME
 
 
 def _near(invariant: Invariant, data: Matches) -> Tensor:

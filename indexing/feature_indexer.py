@@ -12,6 +12,7 @@ from sklearn.base import BaseEstimator, ClassifierMixin
 from sklearn.utils.multiclass import check_classification_targets
 from sklearn.utils.validation import check_is_fitted, validate_data
 
+from indexing.estimator import one_thread
 from indexing.modelfile import labels_from_json, labels_to_json, number, read_model, usable, write_model
 from indexing.scoring import probabilities
 from indexing.shape.bank import KERNEL_WIDTH, cosine_distance, kernel_scale
@@ -51,6 +52,7 @@ class FeatureIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
     def __init__(self, width: float = KERNEL_WIDTH) -> None:
         self.width = width
 
+    @one_thread
     def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
         """Learn from a ``(clips, features)`` table and ``(clips,)`` labels.
 
@@ -81,15 +83,18 @@ class FeatureIndexer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         distances = cosine_distance(torch.tensor(table), torch.from_numpy(self.support_))
         return np.asarray(self.machine_((-distances / self.scale_).exp()).numpy())
 
+    @one_thread
     def decision_function(self, X: ArrayLike) -> Array:
         """``(clips, classes)`` votes, larger is better; as in scikit-learn ``(clips,)`` for two classes, positive = the second."""
         votes = self._votes(X)
         return votes[:, 1] - votes[:, 0] if len(self.classes_) == 2 else votes
 
+    @one_thread
     def predict_proba(self, X: ArrayLike) -> Array:
         """``(clips, classes)`` probabilities, rows sum to 1."""
         return probabilities(self._votes(X))
 
+    @one_thread
     def predict(self, X: ArrayLike) -> Array:
         """``(clips,)`` labels."""
         best = self._votes(X).argmax(axis=1)

@@ -21,7 +21,7 @@ from indexing.checks import (
     gather_labels,
 )
 from indexing.clip import Clip
-from indexing.estimator import SavedClassifier
+from indexing.estimator import SavedClassifier, one_thread
 from indexing.joints import layout_of
 from indexing.labels import joined, refuse, same_label
 from indexing.repair import mended
@@ -132,6 +132,7 @@ class ActionIndexer(SavedClassifier):
         self.device = device
 
     # ---- learning ----------------------------------------------------------------------------------------------------
+    @one_thread
     def fit(self, clips: Iterable[Any], labels: ArrayLike | None = None, groups: ArrayLike | None = None) -> Self:
         """Learn from clips.
 
@@ -159,6 +160,7 @@ class ActionIndexer(SavedClassifier):
         plan = self._plan(_default_views(found), layout)
         return self._learn(cut(found, plan, rng), classes, numbers, skeleton, layout, people)
 
+    @one_thread
     def partial_fit(
         self,
         clips: Iterable[Any],
@@ -257,10 +259,12 @@ class ActionIndexer(SavedClassifier):
         check_is_fitted(self, "model_")
         return self.model_.to(self.device)
 
+    @one_thread
     def decision_function(self, clips: Iterable[Any]) -> Array:
         """``(clips, classes)`` scores, larger is better; columns are ``classes_``."""
         return np.asarray(self._model().scores(self._queries(clips)).cpu().numpy())
 
+    @one_thread
     def evidence(self, clips: Iterable[Any]) -> Array:
         """``(clips,)`` how well a clip shows a known action rather than another one, comparable between clips.
 
@@ -268,6 +272,7 @@ class ActionIndexer(SavedClassifier):
         """
         return np.asarray(self._model().evidence(self._queries(clips)).cpu().numpy())
 
+    @one_thread
     def predict_proba(self, clips: Iterable[Any]) -> Array:
         """``(clips, classes)`` probabilities of the known classes, rows sum to 1 (a softmax of the standardized scores).
 
@@ -276,6 +281,7 @@ class ActionIndexer(SavedClassifier):
         scores = self.decision_function(clips)
         return probabilities(scores, self.model_.blend.sharpness)
 
+    @one_thread
     def predict(self, clips: Iterable[Any]) -> Array:
         """``(clips,)`` labels; ``none_label`` where ``reject`` is set and no class explains the clip."""
         query = self._queries(clips)
@@ -290,6 +296,7 @@ class ActionIndexer(SavedClassifier):
     def _stream(self) -> Stream:
         return Stream(self.length, self.window, tuple(self.tempi), self.pool, self.device)
 
+    @one_thread
     def scan(self, clip: Any, progress: Callable[[float], None] | None = None) -> tuple[Array, list[Event]]:
         """:meth:`score_frames` and :meth:`find` in one pass.
 
@@ -307,6 +314,7 @@ class ActionIndexer(SavedClassifier):
         events = [dataclasses.replace(event, start=event.start + begin, end=event.end + begin) for event in events]
         return frame_scores(found, stream, windows), events
 
+    @one_thread
     def score_frames(self, clip: Any, progress: Callable[[float], None] | None = None) -> Array:
         """``(frames, classes)`` score of every frame of an untrimmed recording, larger is better.
 
@@ -314,6 +322,7 @@ class ActionIndexer(SavedClassifier):
         """
         return self.scan(clip, progress)[0]
 
+    @one_thread
     def find(self, clip: Any, progress: Callable[[float], None] | None = None) -> list[Event]:
         """The actions in an untrimmed recording, in order of time: label, start, end (seconds), score and margin.
 

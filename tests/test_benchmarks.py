@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
+
 import pytest
 import torch
 
 from dyntorch import scenes
-from experiments.benchmarks import fits, null_space, robust_peers, synchronization
+from experiments.benchmarks import first_answers, fits, neighbours, null_space, robust_peers, synchronization
 from experiments.benchmarks.interleaved import interleaved, threads
 
 
@@ -65,3 +67,11 @@ def test_all_ways_to_evaluate_shifts_find_the_true_one():
     rows = [*synchronization.same_points(config), *synchronization.different_points(config), *synchronization.long_takes(config)]
     errors = figures(rows, "error")
     assert errors and all(value == 0 for value in errors.values()), errors
+
+
+def test_first_answers_and_busy_neighbours_are_measured(capsys):
+    first_answers.answer("fit")
+    first, warm = json.loads(capsys.readouterr().out)
+    assert first > 0 and warm > 0
+    row = neighbours.table(neighbours.Config(rounds=1, only="robust_fit"))[0]
+    assert row.measured > 0 and row.task == "robust_fit"

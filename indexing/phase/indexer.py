@@ -13,7 +13,7 @@ from torch import Tensor
 
 from indexing.checks import check_queries, gather, gather_labels
 from indexing.clip import Clip, stretches
-from indexing.estimator import SavedClassifier
+from indexing.estimator import SavedClassifier, one_thread
 from indexing.joints import layout_of
 from indexing.labels import refuse
 from indexing.phase.calibration import SECOND, event_levels
@@ -91,6 +91,7 @@ class PhaseIndexer(SavedClassifier):
         self.window = window
         self.device = device
 
+    @one_thread
     def fit(self, clips: Iterable[Any], labels: ArrayLike | None = None, phases: Sequence[Any] | None = None) -> Self:
         """Learn from clips.
 
@@ -141,6 +142,7 @@ class PhaseIndexer(SavedClassifier):
         return self
 
     # ---- single frames -----------------------------------------------------------------------------------------------
+    @one_thread
     def analyse(self, clip: Any) -> tuple[Array, Array]:
         """:meth:`score_frames` and :meth:`phase` in one pass."""
         check_is_fitted(self, "model_")
@@ -151,6 +153,7 @@ class PhaseIndexer(SavedClassifier):
             scores = smooth(scores, found.times, self.window)
         return np.asarray(scores), np.asarray(phase)
 
+    @one_thread
     def score_frames(self, clip: Any) -> Array:
         """``(frames, classes)`` score of every frame, from itself alone unless ``window`` is set; larger is better.
 
@@ -172,6 +175,7 @@ class PhaseIndexer(SavedClassifier):
         return self.model_.to(self.device).evidence(stack([query_frames(clip) for clip in clips]).to(self.device))
 
     # ---- clips -------------------------------------------------------------------------------------------------------
+    @one_thread
     def decision_function(self, clips: Iterable[Any]) -> Array:
         """``(clips, classes)`` mean of the frames' scores; columns are ``classes_``."""
         check_is_fitted(self, "model_")
@@ -179,15 +183,18 @@ class PhaseIndexer(SavedClassifier):
         scores = self._evidence(found)[0].split([len(clip) for clip in found])
         return np.stack([part.mean(0).cpu().numpy() for part in scores])
 
+    @one_thread
     def predict_proba(self, clips: Iterable[Any]) -> Array:
         """``(clips, classes)`` probabilities, rows sum to 1 (a softmax of the standardized scores)."""
         scores = self.decision_function(clips)
         return probabilities(scores) if scores.shape[1] > 1 else np.ones_like(scores)
 
+    @one_thread
     def evidence(self, clips: Iterable[Any]) -> Array:
         """``(clips,)`` score of the best class: how much nearer a clip is to an action's frames than to those of the others."""
         return np.asarray(self.decision_function(clips).max(axis=1))
 
+    @one_thread
     def predict(self, clips: Iterable[Any]) -> Array:
         """``(clips,)`` labels; ``none_label`` where ``reject`` is set and no class explains the clip."""
         scores = self.decision_function(clips)
@@ -196,6 +203,7 @@ class PhaseIndexer(SavedClassifier):
             return np.asarray(labels)
         return refuse(labels, scores.max(axis=1) < self.reject_threshold_, self.none_label)
 
+    @one_thread
     def find(self, clip: Any) -> list[Event]:
         """The actions in an untrimmed recording, in order of time: where the mean score of a second stands out.
 

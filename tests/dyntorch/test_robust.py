@@ -372,3 +372,21 @@ def test_an_infinite_threshold_is_refused() -> None:
     views = scenes.planar(30, generator=torch.Generator().manual_seed(0)).views
     with pytest.raises(ValueError, match=r"threshold must be a distance > 0 .*, got inf"):
         dyn.robust_fit(dyn.HomographyTensor, *views, threshold=math.inf)
+
+
+def test_more_starts_are_not_tried_where_a_quarter_of_them_agree(monkeypatch):
+    """A tight bound leaves doubt whatever is found; what most of 16 starts find, 256 would find again."""
+    counts, solve = [], Search._solve
+
+    def counted(self, where, cut, count):
+        counts.append(count)
+        return solve(self, where, cut, count)
+
+    monkeypatch.setattr(Search, "_solve", counted)
+    monkeypatch.setattr("dyntorch.starts.DOUBT", -1.0)
+    scene = scenes.planar(n=100, sigma=0.5, static=0.3, outliers=0.1, generator=seeded(1))
+    views = tuple(x[None] for x in scene.views)
+    search = Search(dyn.HomographyTensor(), matches(dyn.HomographyTensor(), views, None), torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        found = search.run(torch.tensor([1.5], dtype=torch.float64), (1, 4, 16, 64, 256))
+    assert bool(found.doubt) and counts == [1, 4, 16]
