@@ -14,11 +14,13 @@ from indexing.cameras import virtual
 from indexing.clip import Clip, as_clip
 from indexing.joints import layout_of, matched_all
 from indexing.multiview import combine
+from indexing.opening import shown
 from indexing.shape.bank import COMMON
 from indexing.skeleton import Skeleton
 from indexing.windows import check_clips
 
 Array = NDArray[Any]
+TEMPI = 100  # at most: a recording is compared once for each of them
 
 
 def as_clips(clips: Iterable[Any], fps: float) -> list[Clip | tuple[Clip, ...]]:
@@ -234,8 +236,8 @@ def _check_numbers(indexer: Any) -> None:
     if not (is_number(indexer.pool) and indexer.pool >= 0):
         raise ValueError(f"pool must be seconds, 0 or more, got {indexer.pool!r}")
     tempi = list(indexer.tempi) if isinstance(indexer.tempi, Iterable) else []
-    if not tempi or not all(_positive(tempo) for tempo in tempi):
-        raise ValueError(f"tempi must be positive speed factors such as (0.7, 1.0, 1.4), got {indexer.tempi!r}")
+    if not tempi or len(tempi) > TEMPI or not all(_positive(tempo) for tempo in tempi):
+        raise ValueError(f"tempi must be 1 to {TEMPI} positive speed factors such as (0.7, 1.0, 1.4), got {shown(indexer.tempi)}")
     for name, least in (("length", 4), ("virtual_views", 0)):
         value = getattr(indexer, name)
         if name == "virtual_views" and value is None:

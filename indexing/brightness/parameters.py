@@ -9,6 +9,9 @@ import numpy as np
 
 from indexing.brightness.sight import SMALLEST
 from indexing.checks import check_device, check_reject, is_number
+from indexing.opening import shown
+
+LARGEST = 100_000  # px of the shorter side: films have some thousand
 
 
 def check_parameters(indexer: Any) -> None:
@@ -25,8 +28,9 @@ def check_parameters(indexer: Any) -> None:
     if not (is_number(indexer.temporal_weight) and 0 <= indexer.temporal_weight <= 1):
         raise ValueError(f"temporal_weight must be a share from 0 to 1, got {indexer.temporal_weight!r}")
     check_reject(indexer.reject)
-    if not isinstance(indexer.size, (int, np.integer)) or isinstance(indexer.size, bool) or indexer.size < SMALLEST:
-        raise ValueError(f"size must be a whole number of pixels from {SMALLEST}, got {indexer.size!r}")
+    size = indexer.size
+    if not isinstance(size, (int, np.integer)) or isinstance(size, bool) or not SMALLEST <= size <= LARGEST:
+        raise ValueError(f"size must be a whole number of pixels from {SMALLEST} to {LARGEST}, got {shown(size)}")
     check_device(indexer.device)
 
 

@@ -45,9 +45,7 @@ CASES = {
     "times must be 4 finite numbers": {"times": [0.0, 1.0]},
     "times must be 4 finite": {"times": [0.0, 1.0, NAN, 2.0]},
     "motion must be 'auto', a dyntorch.Motion or one of": {"motion": "walk"},
-    "takes tracks of 3D sensors.*; choose a motion for tracks of 2 coordinates, or motion='auto'": {
-        "motion": "constant_velocity_3d_sensors"
-    },
+    "3D sensors.*; choose a motion for tracks of 2 coordinates, or motion='auto'": {"motion": "constant_velocity_3d_sensors"},
     "no number of views determines 'half'": {"motion": Motion(half_lift, "half")},
     "needs at least 40 tracks through 4 views, got 30": {"motion": "constant_velocity_3d"},
     "threshold must be a positive number in the unit of the tracks, got -1": {"threshold": -1.0},

@@ -223,3 +223,27 @@ def test_evenness():
     assert off > 0.4 and dropped == 1
     assert evenness(np.cumsum(rng.uniform(0.02, 0.05, 100)))[0] > 0.1
     assert evenness(np.array([0.0, 1.0])) == (0.0, 0)
+
+
+def test_tags_that_are_no_text_and_codecs_that_nobody_knows(write, tmp_path):
+    film = np.tile(np.arange(64, dtype=np.uint8), (10, 48, 1))
+    data = write("a.mp4", film).read_bytes()
+    assert data.count(b"Lavf") and data.count(b"avc1")
+    path = tmp_path / "tags.mp4"
+    path.write_bytes(data.replace(b"Lavf", b"\xdf\xff\xfe\xc3"))
+    assert probe(path).frames == 10
+    path.write_bytes(data.replace(b"avc1", b"xxxx").replace(b"avcC", b"xxxC"))
+    with pytest.raises(ValueError, match=r"tags\.mp4': .*; copy it again"):
+        probe(path)
+
+
+def test_a_playlist_opens_no_other_file(write, tmp_path):
+    film = write("a.mp4", np.tile(np.arange(64, dtype=np.uint8), (10, 48, 1)))
+    for text in (
+        f"ffconcat version 1.0\nfile {film}\n",
+        f"#EXTM3U\n#EXT-X-TARGETDURATION:9\n#EXTINF:9,\nhttp://127.0.0.1:9/{film}\n",
+    ):
+        path = tmp_path / "list.mp4"
+        path.write_text(text)
+        with pytest.raises(ValueError, match=r"list\.mp4'"):
+            probe(path)

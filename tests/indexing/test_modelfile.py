@@ -1,0 +1,221 @@
+"""Model files made to do harm: whatever a part of them says, loading refuses it in one line, or what is loaded can be used."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
+
+from indexing import ActionIndexer, BrightnessIndexer, Clip, FeatureIndexer, PhaseIndexer
+from indexing.modelfile import Parts, labels_from_json, model_kind, number, skeleton_from_json, usable, whole
+
+FEATURES = np.random.default_rng(0).normal(size=(12, 3)) + np.repeat(np.eye(3), 4, 0) * 3
+
+
+def clip(seed: int, frames: int = 30) -> Clip:
+    rng = np.random.default_rng(seed)
+    rest, swing = rng.uniform(100, 400, (1, 17, 2)), rng.uniform(0.1, 0.7, (1, 17, 2))
+    return Clip(rest + 20 * np.sin(np.arange(frames)[:, None, None] * swing), label="abc"[seed % 3], name=f"q{seed}")
+
+
+@pytest.fixture(scope="module")
+def models(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    folder, clips = tmp_path_factory.mktemp("models"), [clip(i) for i in range(6)]
+    films = [np.uint8(40 * np.random.default_rng(i % 2).random((12, 24, 32)).cumsum(0) % 255) for i in range(4)]
+    fitted = {
+        "action": ActionIndexer(search=False, virtual_views=1, reject=0.2).fit(clips),
+        "phase": PhaseIndexer(harmonics=1, course="once", mirror=False).fit([clip(i, 8) for i in range(3)]),
+        "bright": BrightnessIndexer(size=24, flip=False).fit(films, ["a", "b", "a", "b"]),
+        "feature": FeatureIndexer().fit(FEATURES, np.repeat(["a", "b", "c"], 4)),
+    }
+    for name, indexer in fitted.items():
+        indexer.save(folder / f"{name}.safetensors")
+    return {name: folder / f"{name}.safetensors" for name in fitted}
+
+
+KINDS: dict[str, Any] = {"action": ActionIndexer, "phase": PhaseIndexer, "bright": BrightnessIndexer, "feature": FeatureIndexer}
+
+
+def changed(path: Path, target: Path, tensor: str = "", value: Any = None, **header: Any) -> Path:
+    """The model with another tensor, or with other entries of its header; a dict is put into what is there."""
+    with safe_open(path, framework="pt") as file:
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        known = json.loads(file.metadata()["dyntorch"])
+    if tensor:
+        tensors[tensor] = value(tensors[tensor])
+    for key, new in header.items():
+        known[key] = known[key] | new if isinstance(new, dict) and isinstance(known.get(key), dict) else new
+    save_file(tensors, target, metadata={"dyntorch": json.dumps(known)})
+    return target
+
+
+def refused(name: str, path: Path, *words: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(str(path))) as caught:
+        KINDS[name].load(path)
+    said = str(caught.value)
+    assert type(caught.value) is ValueError
+    assert "\n" not in said
+    assert "; " in said
+    assert len(said) < 400 + len(str(path))
+    assert all(word in said for word in words), said
+
+
+def all_of(value: float) -> Any:
+    return lambda tensor: torch.full_like(tensor, value)
+
+
+TENSORS = {
+    "action": (
+        "crops.values",
+        "views.values",
+        "moments.values",
+        "metric",
+        "hub",
+        "parts.joints",
+        "machine.dual",
+        "scales",
+        "evidence_out",
+    ),
+    "phase": ("bank.values", "phase", "wrong", "course.0.shapes"),
+    "bright": ("motion",),
+    "feature": ("vectors", "dual", "intercept"),
+}
+
+
+@pytest.mark.parametrize(("name", "tensor"), [(name, tensor) for name, tensors in TENSORS.items() for tensor in tensors])
+def test_no_number_of_a_model_is_missing_or_beyond_what_can_be_computed(name: str, tensor: str, models, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    path = tmp_path / "m.safetensors"
+    for value in (float("nan"), float("inf"), -float("inf")):
+        refused(name, changed(models[name], path, tensor, all_of(value)), tensor, "expected numbers")
+    if tensor != "vectors":
+        refused(name, changed(models[name], path, tensor, all_of(3e38)), tensor, "expected numbers")
+    for kind in (torch.int64, torch.float16, torch.uint8, torch.float8_e4m3fn):
+        refused(name, changed(models[name], path, tensor, lambda t, kind=kind: t.float().to(kind)), tensor, "expected float32")
+    refused(name, changed(models[name], path, tensor, lambda t: t[None]), tensor)
+
+
+@pytest.mark.parametrize(
+    ("name", "tensor", "value"),
+    [
+        ("action", "labels", all_of(0)),
+        ("action", "labels", all_of(9)),
+        ("action", "labels", all_of(-1)),
+        ("action", "owner", all_of(0)),
+        ("action", "crops.seen", lambda t: t.to(torch.uint8)),
+        ("action", "machine.counts", all_of(0)),
+        ("action", "machine.counts", all_of(2**40)),
+        ("action", "parts.channels", all_of(0)),
+        ("action", "parts.joints", all_of(-1)),
+        ("action", "solid", lambda t: t[:1]),
+        ("action", "metric_power", all_of(1e6)),
+        ("phase", "label", all_of(1)),
+        ("phase", "phase", all_of(2)),
+        ("phase", "course.1.seen", lambda t: t[:-1]),
+        ("bright", "lengths", all_of(0)),
+        ("bright", "lengths", all_of(2**40)),
+        ("bright", "labels", all_of(0)),
+        ("feature", "counts", all_of(3)),
+        ("feature", "support", all_of(-5)),
+        ("feature", "vectors", lambda t: t[:, :0]),
+        ("feature", "vectors", all_of(1e200)),
+    ],
+)
+def test_parts_that_do_not_belong_together_are_refused(name: str, tensor: str, value: Any, models, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    refused(name, changed(models[name], tmp_path / "m.safetensors", tensor, value), "not a model that can be used")
+
+
+@pytest.mark.parametrize(
+    ("name", "header"),
+    [
+        ("action", {"parameters": {"tempi": [0.5] * 10**6}}),
+        ("action", {"parameters": {"length": 10**9}}),
+        ("action", {"parameters": {"length": 7}}),
+        ("action", {"parameters": {"random_state": 1e308}}),
+        ("action", {"parameters": {"search": True}}),
+        ("action", {"joints": 1e308}),
+        ("action", {"joints": 10**400}),
+        ("action", {"joints": 0}),
+        ("action", {"scorer": "nearest"}),
+        ("action", {"view": []}),
+        ("action", {"blend": {"kernel": float("nan")}}),
+        ("action", {"blend": {"more": 1}}),
+        ("action", {"parts": [1e308, "x"]}),
+        ("action", {"layout": {"joints": ["a"] * 17, "photograph": 0}}),
+        ("action", {"groups": ["a"]}),
+        ("action", {"skeleton": ["s", ["a"] * 3, []]}),
+        ("action", {"skeleton": ["s", ["a"] * 17, [[0, 10**400]]]}),
+        ("action", {"classes": {"values": ["a", "a", "b"]}}),
+        ("action", {"classes": {"values": ["a", "b", ["c"]]}}),
+        ("action", {"classes": {"dtype": "<U999999999"}}),
+        ("action", {"classes": {"values": [0, 1, float("nan")], "dtype": "<f8"}}),
+        ("phase", {"joints": 3}),
+        ("phase", {"periodic": [1, 0, 0]}),
+        ("phase", {"parameters": {"harmonics": 10**9}}),
+        ("bright", {"parameters": {"size": 10**400}}),
+        ("bright", {"parameters": {"region": [10**400, 0, 1, 1]}}),
+        ("bright", {"classes": {"values": ["a"]}}),
+        ("feature", {"scale": 0}),
+        ("feature", {"scale": 10**400}),
+        ("feature", {"scale": None}),
+        ("feature", {"parameters": {"width": [1e308] * 1000}}),
+        ("feature", {"parameters": {"more": 1}}),
+        ("feature", {"version": 10**400}),
+        ("feature", {"format": [[1e308] * 1000]}),
+        ("feature", {"classes": 7}),
+    ],
+)
+def test_headers_that_lie_are_refused(name: str, header: dict[str, Any], models, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    refused(name, changed(models[name], tmp_path / "m.safetensors", **header))
+
+
+@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("text", ["[" * 100_000, "9" * 5000, '{"a":' * 5000, "{"])
+def test_headers_without_end_are_refused(name: str, text: str, tmp_path: Path) -> None:
+    path = tmp_path / "m.safetensors"
+    save_file({"a": torch.zeros(1)}, path, metadata={"dyntorch": text})
+    refused(name, path, "its header is damaged")
+    with pytest.raises(ValueError, match="its header is damaged"):
+        model_kind(path)
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_pipes_and_devices_are_no_models(name: str, tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    refused(name, tmp_path / "pipe", "is a pipe")
+    refused(name, Path("/dev/zero"), "is a device")
+    refused(name, tmp_path, "is a folder")
+
+
+def test_truth_values_of_other_bytes_than_0_and_1_are_true() -> None:
+    odd = torch.tensor([0, 1, 2, 255], dtype=torch.uint8).view(torch.bool)
+    assert Parts({"a": odd}).truth("a", 4).tolist() == [False, True, True, True]
+
+
+def test_parts_and_values_say_what_they_expect() -> None:
+    parts = Parts({"a": torch.arange(6).reshape(2, 3), "b": torch.ones(2)})
+    assert parts.whole("a", None, 3).shape == (2, 3)
+    assert parts.every("a", 2, 3, below=6).numel() == 6
+    with pytest.raises(ValueError, match=r"a: expected int64 \(any, 4\), got int64 \(2, 3\)"):
+        parts.whole("a", None, 4)
+    with pytest.raises(ValueError, match=r"b: expected numbers from 2 to 3"):
+        parts.real("b", 2, least=2, most=3)
+    with pytest.raises(ValueError, match="a: expected each of the numbers from 0 to 9"):
+        parts.every("a", 2, 3, below=10)
+    with pytest.raises(ValueError, match="x: expected a number from 0 to 1, got True"):
+        number(True, "x", 0, 1)
+    with pytest.raises(ValueError, match=r"x: expected a whole number from 0 to 1, got 1\.0"):
+        whole(1.0, "x", 0, 1)
+    with pytest.raises(ValueError, match="skeleton: 1 names for 2 joints"):
+        skeleton_from_json(["s", ["a"], []], 2)
+    with pytest.raises(ValueError, match="are no labels"):
+        labels_from_json({"values": [], "dtype": "<i8"})
+    with pytest.raises(ValueError, match=r"m: not a model that can be used \(KeyError: 'a'\); fit"), usable("m"):
+        raise KeyError("a")
