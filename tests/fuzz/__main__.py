@@ -13,23 +13,24 @@ import tempfile
 import time
 import traceback
 from collections import Counter, defaultdict
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-from tests.fuzz.running import BAD, GOOD, Outcome, capped, command, damaged, tried
+from tests.fuzz.running import BAD, GOOD, Outcome, capped, command, damaged, process, tried
 from tests.fuzz.seeds import Seed, make
 
 
 def drawn(seeds: list[Seed], count: int) -> list[tuple[Seed, int]]:
     """So many files, fewer of the formats that take long; the numbers of a format count from 0."""
-    total = sum(1 / seed.slow for seed in seeds)
+    total = sum(1 / seed.slow for seed in seeds)  # such as 33 for all formats
     return [(seed, number) for seed in seeds for number in range(round(count / seed.slow / total))]
 
 
-def table(found: list[Outcome], seeds: list[Seed]) -> str:
+def table(found: list[Outcome]) -> str:
     """Outcomes by format."""
     counts = defaultdict(Counter)
     for one in found:
@@ -63,6 +64,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
     parser.add_argument("--files", type=int, default=20_000, help="how many are read")
     parser.add_argument("--commands", type=int, default=0, help="how many besides go through the command line, in this process")
+    parser.add_argument("--processes", type=int, default=0, help="how many besides, each by a process of its own")
     parser.add_argument("--only", default="", help="formats whose name holds this")
     parser.add_argument("--number", type=int, help="read this one file of --only, and show what happens")
     parser.add_argument("--first", type=int, default=0, help="number of the first file of each format")
@@ -75,37 +77,33 @@ def main() -> int:
         if asked.number is not None:
             return again(seeds[0], asked.number, folder)
         capped()
-        found = run(drawn(seeds, asked.files), asked.first, folder, False)
-        if asked.commands:
-            print(table(found, seeds), places(found), "through the command line:", sep="\n", flush=True)
-            spoken = [seed for seed in seeds if seed.words]
-            found = run(drawn(spoken, asked.commands), asked.first, folder, True)
-        print(table(found, seeds), places(found), sep="\n")
-    return int(any(one.kind in BAD for one in found))
+        found = [run(drawn(seeds, asked.files), asked.first, folder, None)]
+        talking = [seed for seed in seeds if seed.words]
+        for title, count, how in (("in this process", asked.commands, command), ("as processes", asked.processes, process)):
+            if count:
+                print(table(found[-1]), places(found[-1]), f"through the command line, {title}:", sep="\n", flush=True)
+                found.append(run(drawn(talking, count), asked.first, folder, how))
+        print(table(found[-1]), places(found[-1]), sep="\n")
+    return int(any(one.kind in BAD for ones in found for one in ones))
 
 
-def run(files: list[tuple[Seed, int]], first: int, folder: Path, commanded: bool) -> list[Outcome]:
+def run(files: list[tuple[Seed, int]], first: int, folder: Path, how: Callable[[list[str]], str | None] | None) -> list[Outcome]:
     """Read all, format by format, and say how far it is."""
     found, begun, said = [], time.time(), time.time()
     os.chdir(folder)
     with contextlib.suppress(KeyboardInterrupt):  # what was read until then is reported
         for seed, number in files:
-            action = partial(spoken, seed) if commanded else None
-            found.append(tried(seed, first + number, folder / "in", action))
+            found.append(tried(seed, first + number, folder / "in", None if how is None else partial(spoken, seed, how)))
             if time.time() - said > 60:
                 said = time.time()
-                bad = Counter(one.kind for one in found if one.kind in BAD)
-                print(
-                    f"{len(found)} of {len(files)} in {said - begun:.0f} s: {dict(bad)}, at {seed.name}",
-                    file=sys.stderr,
-                    flush=True,
-                )
+                bad = dict(Counter(one.kind for one in found if one.kind in BAD))
+                print(f"{len(found)} of {len(files)} in {said - begun:.0f} s: {bad}, at {seed.name}", file=sys.stderr, flush=True)
     return found
 
 
-def spoken(seed: Seed, path: Path) -> str | None:
+def spoken(seed: Seed, how: Callable[[list[str]], str | None], path: Path) -> str | None:
     """What is wrong with the answer of the command line."""
-    return command([word.replace("{}", str(path)) for word in seed.words or ()])
+    return how([word.replace("{}", str(path)) for word in seed.words or ()])
 
 
 def again(seed: Seed, number: int, folder: Path) -> int:

@@ -9,6 +9,8 @@ import re
 import resource
 import shutil
 import signal
+import subprocess
+import sys
 import time
 import traceback
 import warnings
@@ -176,6 +178,14 @@ def command(argv: list[str]) -> str | None:
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         code = main(argv)
     return judged(code, err.getvalue())
+
+
+def process(argv: list[str]) -> str | None:
+    """The same in a process of its own."""
+    here = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
+    words = [sys.executable, "-m", "indexing.cli", *argv]
+    done = subprocess.run(words, capture_output=True, text=True, errors="replace", check=False, timeout=STUCK, env=here)
+    return judged(done.returncode, done.stderr)
 
 
 def judged(code: int, said: str) -> str | None:
