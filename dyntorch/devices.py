@@ -19,7 +19,7 @@ def on_cpu(verb: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
     """Let a verb compute on the CPU wherever its tensors are, and return its result to their device.
 
     For searches: hundreds of small problems one after the other, each of which depends on what the one before has found.  An
-    accelerator would be asked after every one of them (``synchronize`` on one: 300 to 9,000 waits a call) and could not be
+    accelerator would be asked after every one of them (``synchronize`` on one: 300 to 900 waits a call) and could not be
     kept busy in between.  What gains from an accelerator - batches of problems, as in ``fit`` - stays beside its tensors.
 
     Tensors are looked for in sequences, mappings and dataclasses too.  Gradients pass.  A ``torch.Generator`` of an accelerator

@@ -354,7 +354,7 @@ WAITS = {
     "fit_distortion": (2, LENT),
 }
 """Public names that wait for the device, how often a call of the table does at most, and why.  Measured: 2 (fit), 17, 27, 5, 59,
-23 to 75, 22 and 58 to 86; before they were lent to the CPU: synchronize 300 to 9,000, reconstruct 33 to 1,000."""
+23 to 75, 22 and 58 to 86; before they were lent to the CPU: synchronize 300 to 900, reconstruct 33 to 1,000."""
 
 NOT_VERBS = {
     **dict.fromkeys(("counting", "metrics", "motions", "scenes"), "modules"),
