@@ -10,7 +10,11 @@ TORCH_INDEX ?=
 TORCH_VERSION := $(shell sed -n 's/^torch==//p' constraints.txt)
 PIP = $(BIN)/python -m pip install --quiet
 
-.PHONY: install demo test lint bench fuzz tables docs clean
+# what computes, apart from reading, drawing and the command line
+NUMERICAL := tests/dyntorch tests/test_readme.py tests/indexing/brightness tests/indexing/phase tests/indexing/test_indexer.py \
+  tests/indexing/test_estimators.py tests/indexing/test_shape.py tests/indexing/test_stream.py dyntorch
+
+.PHONY: install demo test portable lint bench fuzz tables docs clean
 
 install: $(STAMP)
 
@@ -36,6 +40,12 @@ demo: install
 test: install
 	@echo "All tests: a few minutes on two quiet cores, a quarter of an hour on busy ones; dots and percents show how far they are."
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto
+
+# the numerical tests with the arithmetic of another processor, then with two threads in each worker
+portable: install
+	ATEN_CPU_CAPABILITY=default MKL_ENABLE_INSTRUCTIONS=SSE4_2 MKL_CBWR=COMPATIBLE OMP_NUM_THREADS=1 \
+	  $(BIN)/python -m pytest -n auto $(NUMERICAL)
+	OMP_NUM_THREADS=2 $(BIN)/python -m pytest -n auto $(NUMERICAL)
 
 lint: install
 	$(BIN)/ruff check .
