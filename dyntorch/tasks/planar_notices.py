@@ -23,7 +23,7 @@ NEAR = 2.0
 at 0.5 pixels of noise, 15 to 25 where they move by 25 to 80 (100 matches)."""
 UNDECIDED = 1.2
 """The same, corrected for the matches that 26 equations use up, below which moving matches alone leave a family of motions.  0.7 to
-0.9 where all make equal steps (80 matches), 0.5 where all stands still; at about 3 px of motion at changing speed on either side."""
+0.9 where all make equal steps (80 matches), 0.5 where all stands still; at 3 px of motion at changing speed on either side."""
 SUPPORT, CHANCE = 10, 3.0
 """Static matches that settle such a family: so many, and so many for each that is expected by chance.  A motion of the family that
 is off makes 0 to 6 of 80 matches static at steps of 10 to 40 px, and up to 16 at 3 px, where 3 to 5 are expected."""
