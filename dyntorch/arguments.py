@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -60,6 +61,7 @@ def check_together(**tensors: tuple[Tensor, int]) -> torch.Size:
             raise ValueError(f"{names} need one {what}, got {', '.join(map(str, kinds))}; use .to({what})")
     batches = [x.shape[: x.ndim - trailing] for x, trailing in tensors.values()]
     try:
-        return torch.broadcast_shapes(*batches)
-    except RuntimeError:
+        # not torch's, which imports sympy (0.5 s)
+        return torch.Size(np.broadcast_shapes(*batches))
+    except ValueError:
         raise ValueError(f"{names} need the same *batch, got {', '.join(str(tuple(b)) for b in batches)}") from None

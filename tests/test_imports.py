@@ -56,6 +56,7 @@ LAYERS = [
         "arguments",
         "blocks",
         "constants",
+        "devices",
         "eigenspace",
         "forward",
         "lags",
