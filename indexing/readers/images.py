@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +12,9 @@ from numpy.typing import NDArray
 
 from indexing.opening import error, size_of
 
+PLENTY = 2**24, 10_000  # pixels from which on there must not be so many in a byte: of one colour, a photograph has a hundred
+# what Pillow raises over a file that is damaged
+DAMAGED = (OSError, ValueError, SyntaxError, TypeError, LookupError, ArithmeticError, MemoryError, struct.error, EOFError)
 SIDE = 1600  # pixels kept along the longer side: a panel of a report shows fewer
 
 
@@ -38,15 +42,17 @@ def read_image(path: str | Path) -> Photograph:
     from PIL import Image, ImageOps
 
     path = Path(path).expanduser()
-    size_of(path, "give an image, such as png or jpg")
+    length = size_of(path, "give an image, such as png or jpg")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # that it is large is no reason to worry: it is made smaller
             with Image.open(path) as opened:
+                if opened.width * opened.height > max(PLENTY[0], PLENTY[1] * length):
+                    raise ValueError(f"{opened.width} x {opened.height} pixels in {length} bytes")
                 turned = ImageOps.exif_transpose(opened)
                 size = (float(turned.width), float(turned.height))
                 gray = _gray(turned)
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as problem:
+    except (*DAMAGED, Image.DecompressionBombError) as problem:
         said = f"cannot be read as an image ({type(problem).__name__})"
         raise error(path, said, "save it again as png or jpg") from None
     return Photograph(path.name, gray, size)

@@ -198,6 +198,6 @@ def _values(path: Path, where: str, take: Take, header: Header) -> Array:
         return np.asarray(values.view(np.uint8) != 0)  # other bytes than 0 and 1 are neither true nor false
     if dtype.kind == "U" and int(buffer.view(np.dtype(np.uint32).newbyteorder(dtype.byteorder)).max()) > LAST_LETTER:
         raise error(path, f"{where} holds text with letters that do not exist", AGAIN)
-    kind = np.dtype(np.float64) if dtype.kind == "f" and dtype.itemsize > 8 else dtype.newbyteorder("=")
+    kind = np.dtype(np.float64) if dtype.kind == "f" and dtype.itemsize not in (4, 8) else dtype.newbyteorder("=")
     with np.errstate(over="ignore", invalid="ignore"):  # what is beyond float64 is infinite, and refused where that matters
         return np.asarray(values.astype(kind, copy=False))

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from indexing.opening import VALUE, clipped, error, listed, parse_toml, read_text, shown
 
+LARGEST = 1e7  # pixels: focal lengths and centres have some thousand
 REMEDY = "give a .toml with matrix (3, 3) and distortions for every camera, as Pose2Sim writes it"
 
 
@@ -86,8 +87,9 @@ def read_calibration(path: str | Path) -> list[Lens]:
         section = clipped(key, VALUE)
         if isinstance(values, dict) and "matrix" in values:
             matrix = _numbers(path, section, "matrix", values["matrix"])
-            if matrix.shape != (3, 3) or not bool(matrix[2, 2] != 0) or not float(matrix[0, 0]) > 0 < float(matrix[1, 1]):
-                raise error(path, f"[{section}] matrix: expected 3 x 3 with positive focal lengths", REMEDY)
+            if not _is_inner(matrix):
+                said = f"[{section}] matrix: expected 3 x 3 with positive focal lengths, [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels"
+                raise error(path, said, REMEDY)
             distortions = _numbers(path, section, "distortions", values.get("distortions", values.get("dist", []))).flatten()
             if len(distortions) not in (0, 4, 5, 8):
                 raise error(path, f"[{section}] distortions: expected 4, 5 or 8 numbers, got {len(distortions)}", REMEDY)
@@ -144,6 +146,14 @@ def _plain(name: str) -> str:
     """
     words = re.findall(r"[^\W\d_]+|\d+", name.lower())
     return " ".join(word.lstrip("0") or "0" if word.isdigit() else word for word in words)
+
+
+def _is_inner(matrix: Tensor) -> bool:
+    """Whether a matrix can be that of a camera."""
+    if matrix.shape != (3, 3):
+        return False
+    scaled = matrix / matrix[2, 2]
+    return bool((scaled.abs() < LARGEST).all() and (scaled.diagonal() > 0).all() and (scaled[2, :2] == 0).all())
 
 
 def _numbers(path: Path, section: str, key: str, value: Any) -> Tensor:

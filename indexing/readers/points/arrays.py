@@ -53,10 +53,10 @@ def read_npz(path: Path) -> tuple[list[PointSet], list[PointSet]]:
     for name in wanted:
         where = f"{path} {name}"
         values = as_view(archive[name], where, lines=prefix == "l")
-        ids = tuple(map(str, extra["ids"].tolist())) if "ids" in extra else None
         for field in ("ids", "weights", "static"):
             if field in extra and extra[field].shape != (len(values),):
                 raise error(path, f"{field} has shape {extra[field].shape}, {name} has {len(values)} rows", "give one per row")
+        ids = tuple(map(str, extra["ids"].tolist())) if "ids" in extra else None
         views.append(PointSet(where, values, ids, _weights(path, extra), _static(path, extra)))
     resting = [
         PointSet(f"{path} {name}", as_view(extra[name], f"{path} {name}")) for name in ("static1", "static2") if name in extra

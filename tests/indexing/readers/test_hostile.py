@@ -165,6 +165,11 @@ def test_what_numpy_writes_is_read_as_numpy_reads_it(tmp_path: Path) -> None:
     np.testing.assert_array_equal(npz_gate.read_npy(tmp_path / "old.npy"), JOINTS[0])
 
 
+def test_arrays_of_other_shapes_and_types_than_usual(tmp_path: Path) -> None:
+    refused(npz(tmp_path / "a.npz", x1=JOINTS[0], x2=JOINTS[0], x3=JOINTS[0], ids=np.array(1.5)), views, "ids has shape ()")
+    assert read(npz(tmp_path / "b.npz", joints=JOINTS, fps=np.float16(30)))[0].fps == 30.0  # 1e6 is no number of 16 bits
+
+
 # ---- things that are no files --------------------------------------------------------------------------------------------
 ACTIONS = [
     ("a.json", read), ("a.csv", read), ("a.npz", read), ("a.npz", read_film_set), ("a.csv", read_pair), ("a.npz", read_pair),
@@ -231,6 +236,7 @@ def test_json_that_is_nothing_but_brackets(data: str, tmp_path: Path) -> None:
         "a = " + "[" * 5000 + "]" * 5000, "a = " + "{a=" * 5000, "[" + ".".join("a" * 5000) + "]", ".".join("a" * 5000) + " = 1",
         "a = " + "9" * 5000, "[c]\nmatrix = [[" + "9" * 400 + ", 0, 1], [0, 1, 1], [0, 0, 1]]", "#" * 2**21,
         "[c]\nmatrix = [[[[]]]]",
+        "[c]\nmatrix = [[900, 0, 1], [0, 900, 1], [0, 0, 1e-320]]",
     ],
 )  # fmt: skip
 def test_toml_that_goes_deep_or_holds_no_camera(text: str, tmp_path: Path) -> None:
