@@ -88,8 +88,8 @@ def read_calibration(path: str | Path) -> list[Lens]:
         if isinstance(values, dict) and "matrix" in values:
             matrix = _numbers(path, section, "matrix", values["matrix"])
             if not _is_inner(matrix):
-                said = f"[{section}] matrix: expected 3 x 3 with positive focal lengths, [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels"
-                raise error(path, said, REMEDY)
+                form = "3 x 3 with positive focal lengths, [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels"
+                raise error(path, f"[{section}] matrix: expected {form}", REMEDY)
             distortions = _numbers(path, section, "distortions", values.get("distortions", values.get("dist", []))).flatten()
             if len(distortions) not in (0, 4, 5, 8):
                 raise error(path, f"[{section}] distortions: expected 4, 5 or 8 numbers, got {len(distortions)}", REMEDY)
