@@ -21,7 +21,11 @@ The public names are imported lazily, so that ``import dyntorch`` costs nothing 
 from __future__ import annotations
 
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:  # decorators keep the types of what they decorate only if theirs are known
+    from dyntorch.blocks import one_thread as one_thread
+    from dyntorch.devices import on_cpu as on_cpu
 
 __version__ = "0.1.0"
 
@@ -98,8 +102,9 @@ _HOME = {
     "Recovery": "dyntorch.algebra.dynamic_shape_time",
     "Polynomial": "dyntorch.algebra.dynamic_shape_basis",
     "Fourier": "dyntorch.algebra.dynamic_shape_basis",
-    # one thread for small operations, the caller's setting untouched
+    # how a verb computes: on one thread, the caller's setting untouched; on the CPU, wherever its tensors are
     "one_thread": "dyntorch.blocks",
+    "on_cpu": "dyntorch.devices",
     # subspaces and factorization
     "canonical_correlation": "dyntorch.algebra.subspaces",
     "orthonormal_basis": "dyntorch.algebra.subspaces",

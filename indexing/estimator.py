@@ -2,26 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from importlib import import_module
 from pathlib import Path
-from typing import Any, ClassVar, ParamSpec, Self, TypeVar, cast
+from typing import Any, ClassVar, Self, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
 from sklearn.base import BaseEstimator, ClassifierMixin
 from sklearn.utils.validation import check_is_fitted
 
-import dyntorch as dyn
 from indexing.checks import check_labels
-
-P = ParamSpec("P")
-R = TypeVar("R")
-
-
-def one_thread(function: Callable[P, R]) -> Callable[P, R]:
-    """:func:`dyntorch.one_thread`: windows are small, and beside a busy neighbour a team of threads waits at every operation."""
-    return cast("Callable[P, R]", dyn.one_thread(function))
 
 
 class SavedClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]

@@ -12,7 +12,7 @@ from sklearn.base import BaseEstimator, ClassifierMixin
 from sklearn.utils.multiclass import check_classification_targets
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from indexing.estimator import one_thread
+from dyntorch import one_thread
 from indexing.modelfile import labels_from_json, labels_to_json, number, read_model, usable, write_model
 from indexing.scoring import probabilities
 from indexing.shape.bank import KERNEL_WIDTH, cosine_distance, kernel_scale

@@ -11,6 +11,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from sklearn.utils.validation import check_is_fitted
 
+from dyntorch import one_thread
 from indexing.checks import (
     check_common,
     check_parameters,
@@ -21,7 +22,7 @@ from indexing.checks import (
     gather_labels,
 )
 from indexing.clip import Clip
-from indexing.estimator import SavedClassifier, one_thread
+from indexing.estimator import SavedClassifier
 from indexing.joints import layout_of
 from indexing.labels import joined, refuse, same_label
 from indexing.repair import mended

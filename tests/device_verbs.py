@@ -358,6 +358,7 @@ WAITS = {
 
 NOT_VERBS = {
     **dict.fromkeys(("counting", "metrics", "motions", "scenes"), "modules"),
+    **dict.fromkeys(("on_cpu", "one_thread"), "decorators of verbs"),
     **dict.fromkeys(("BodyModel", "LineStatus", "Status", "Motion", "Polynomial", "Fourier", "Invariant"), "names and numbers"),
     **dict.fromkeys(
         ("Clocks", "MovingShapes", "PairReconstruction", "Recovery", "Segmentation", "Shift", "Solution", "TranslatingPlanes"),

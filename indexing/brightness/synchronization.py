@@ -7,8 +7,7 @@ from typing import Any
 
 import torch
 
-from dyntorch import Shift
-from dyntorch.devices import on_cpu
+from dyntorch import Shift, on_cpu
 from indexing.brightness.box import Region, boxes, motion
 from indexing.brightness.decision import APART, LEAST, Verdict, judge
 from indexing.brightness.sampling import Sampled, common_rate, sampled

@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyntorch.devices import CPU, moved
 from indexing.brightness.shrinking import BLOCK, Shrinker
 
 LARGEST = 320  # px of the longer side kept: a person a quarter as tall as a 1080p image keeps 45 px
@@ -86,11 +85,11 @@ class _Spool(Shrinker):
 
     def add(self, part: Any, file: Any) -> Any:
         """Write a chunk to a file; its times, where it has any."""
-        stamps, part = None, moved(part, CPU)
+        stamps = None
         if isinstance(part, tuple) and len(part) == 2:
             part, stamps = part
-            stamps = np.atleast_1d(np.asarray(stamps, dtype=np.float64))
-        chunk = torch.as_tensor(part)
+            stamps = np.atleast_1d(torch.as_tensor(stamps, dtype=torch.float64).numpy(force=True))
+        chunk = torch.as_tensor(part).cpu()
         chunk = chunk[None] if chunk.ndim == 2 else chunk
         if stamps is not None and len(stamps) != len(chunk):
             raise ValueError(f"{self.name}: a chunk of {len(chunk)} frames has {len(stamps)} times; give one per frame")

@@ -11,9 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.utils.validation import check_is_fitted
 from torch import Tensor
 
+from dyntorch import one_thread
 from indexing.checks import check_queries, gather, gather_labels
 from indexing.clip import Clip, stretches
-from indexing.estimator import SavedClassifier, one_thread
+from indexing.estimator import SavedClassifier
 from indexing.joints import layout_of
 from indexing.labels import refuse
 from indexing.phase.calibration import SECOND, event_levels
