@@ -57,6 +57,8 @@ def matches(invariant: Invariant, views: Sequence[Tensor], weights: Tensor | Non
             for an invariant that knows no labelled static matches.
     """
     check_views(invariant, views)
+    for v, x in enumerate(views, start=1):
+        refuse_vmap(f"view {v}", x)
     if invariant.width() > WIDEST:
         raise ValueError(f"{invariant!r} has {invariant.width():,} unknowns; up to {WIDEST:,} are estimated")
     first = views[0]
@@ -140,7 +142,6 @@ def _check_measured(invariant: Invariant, primitives: Sequence[Primitive], views
     leading: list[tuple[int, ...]] = []
     for v, (primitive, x) in enumerate(zip(primitives, views, strict=True), start=1):
         check_tensor(f"{what} {v}", x)
-        refuse_vmap(f"{what} {v}", x)
         try:
             axis = primitive.match_axis(x)
         except ValueError as error:

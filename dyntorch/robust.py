@@ -85,7 +85,7 @@ def robust_fit(
         >>> scene = scenes.planar(n=200, sigma=0.5, outliers=0.3, generator=torch.Generator().manual_seed(0))
         >>> solution = dyn.robust_fit(dyn.HomographyTensor, *scene.views, threshold=1.5)
         >>> solution
-        Solution(HomographyTensor, matches=200, batch=(): 1 OK, sigma 0.51)
+        Solution(HomographyTensor, matches=200, batch=(): 1 OK, sigma 0.48)
         >>> right = scene.labels != 0
         >>> bool(solution.inliers[right].double().mean() > 0.95), bool(solution.inliers[~right].double().mean() < 0.2)
         (True, True)

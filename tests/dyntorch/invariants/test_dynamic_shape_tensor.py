@@ -209,7 +209,7 @@ def test_misuse():
         dyn.fit(DynamicShapeTensor, *x.unbind(-2))
     with pytest.raises(ValueError, match=r"times must be \(\*batch, views\) = \(10,\)"):
         fitted(x, t[:4])
-    with pytest.raises(TypeError, match="not 'phase'"):
+    with pytest.raises(TypeError, match="takes no argument 'phase'"):
         dyn.fit(DynamicShapeTensor, *x.unbind(-2), times=t, phase=t)
     with pytest.raises(ValueError, match="at least 5 points, got 4"):
         fitted(x[:, :4], t)
