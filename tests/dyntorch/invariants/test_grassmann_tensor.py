@@ -98,8 +98,8 @@ def test_degrees_of_freedom_and_conditions_are_ranks(k, profile, dims):
     sizes = [m.numel() for m in motion]
 
     def tensor(theta):
-        parts = (part.reshape(-1, *m.shape[1:]) for part, m in zip(theta.split(sizes, -1), motion, strict=True))
-        return invariant.compose(*parts).flatten(1)
+        parts = (part.reshape(*theta.shape[:-1], *m.shape[1:]) for part, m in zip(theta.split(sizes, -1), motion, strict=True))
+        return invariant.compose(*parts).flatten(theta.ndim - 1)
 
     expected = jacobian(tensor, torch.cat([m.flatten(1) for m in motion], dim=-1))
     torch.testing.assert_close((value, slope), tuple(expected), rtol=1e-8, atol=1e-9)
