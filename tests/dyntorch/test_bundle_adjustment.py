@@ -172,12 +172,17 @@ def test_missing_images_are_like_absent_ones():
     torch.testing.assert_close(found.structure[keep], other.structure, rtol=1e-5, atol=1e-5)
 
 
+def finite(start):
+    """A start as it comes back where it is not adjusted: 0 where it was not finite."""
+    return torch.where(start.isfinite(), start, 0.0)
+
+
 def test_a_view_without_images_stays():
     x, cameras, structure, lifts = scene("static", noise=0.005)
     x, cameras = torch.cat([x, x[:1]]), torch.cat([cameras, 7 * cameras[:1]])
     x[-1], cameras[-1, 0, 0] = torch.nan, torch.inf
     found = bundle_adjust(x, None, cameras, structure, lifts)
-    assert (found.cameras[-1] == cameras[-1]).all()
+    assert (found.cameras[-1] == finite(cameras[-1])).all()
     torch.testing.assert_close(found.cost, bundle_adjust(x[:-1], None, cameras[:-1], structure, lifts).cost)
 
 
@@ -191,9 +196,9 @@ def test_batch_is_loop_and_a_bad_start_is_kept():
         for j in range(3):
             one = bundle_adjust(x[i, j], None, cameras[i, j], structure[i, j], lifts, scale=float(scale[i, j]))
             torch.testing.assert_close(found.cost[i, j], one.cost, rtol=1e-6, atol=0)
-            torch.testing.assert_close(found.cameras[i, j], one.cameras, equal_nan=True, rtol=1e-4, atol=1e-5)
-    assert torch.equal(found.structure[1, 2], structure[1, 2])
-    assert torch.equal(found.cameras[0, 1].nan_to_num(5.0), cameras[0, 1].nan_to_num(5.0))
+            torch.testing.assert_close(found.cameras[i, j], one.cameras, rtol=1e-4, atol=1e-5)
+    assert torch.equal(found.structure[1, 2], finite(structure[1, 2]))
+    assert torch.equal(found.cameras[0, 1], finite(cameras[0, 1]))
 
 
 def test_the_cost_never_rises_and_no_step_is_the_start():

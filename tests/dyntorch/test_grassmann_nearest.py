@@ -35,6 +35,11 @@ def test_exact_tensors_give_the_true_projections(profile, sizes):
     assert all(part.shape == view.shape for part, view in zip(found, views, strict=True))
 
 
+def each(function):
+    """A function of parameters ``(b, p)``, for copies of them ``(k, b, p)``."""
+    return lambda copies: torch.stack([function(theta) for theta in copies])
+
+
 @pytest.mark.parametrize(("profile", "sizes"), [*CASES, *FULL])
 def test_nothing_is_nearer(profile, sizes):
     views = scene(profile, sizes, 4)
@@ -51,7 +56,7 @@ def test_nothing_is_nearer(profile, sizes):
         value = grassmann_tensor(problem.parts(theta), profile).flatten(1)
         return ((value / value.norm(dim=-1, keepdim=True)) * unit).sum(-1, keepdim=True)
 
-    assert jacobian(cosine, problem.joined(found))[1].abs().max() < 1e-12
+    assert jacobian(each(cosine), problem.joined(found))[1].abs().max() < 1e-12
 
 
 def test_the_hessian_is_the_second_derivative_at_a_minimum():
@@ -64,7 +69,7 @@ def test_the_hessian_is_the_second_derivative_at_a_minimum():
     hessian = problem.hessian(theta, aim, u, matrix)
     for k in range(theta.shape[1]):
         step = 1e-5 * torch.eye(theta.shape[1], dtype=theta.dtype)[k]
-        ahead, behind = (jacobian(lambda t: problem.cost(t, aim)[:, None], theta + s)[1][..., 0] for s in (step, -step))
+        ahead, behind = (jacobian(each(lambda t: problem.cost(t, aim)[:, None]), theta + s)[1][..., 0] for s in (step, -step))
         torch.testing.assert_close((ahead - behind) / 2e-5, hessian[:, k], rtol=1e-6, atol=1e-8)
     # the free directions are all that it leaves open
     free = problem.free(theta)
@@ -133,9 +138,8 @@ def test_the_gradient_at_an_exact_tensor_is_the_projector_on_the_tangents():
     tensor = noisy(profile, sizes, 1, sigma=0.0)
     derivative = torch.autograd.functional.jacobian(lambda t: composed(t, profile, sizes), tensor).reshape(27, 27)
     problem = _Nearest(profile, sizes)
-    slope = jacobian(lambda t: grassmann_tensor(problem.parts(t), profile).flatten(1), problem.joined(scene(profile, sizes, 1)))[1][
-        0
-    ]
+    tensors = each(lambda t: grassmann_tensor(problem.parts(t), profile).flatten(1))
+    slope = jacobian(tensors, problem.joined(scene(profile, sizes, 1)))[1][0]
     u = tensor.flatten()
     basis = torch.linalg.svd(slope - (slope @ u)[:, None] * u).Vh[:18]
     torch.testing.assert_close(derivative * derivative.trace().sign(), basis.T @ basis, rtol=0, atol=1e-9)

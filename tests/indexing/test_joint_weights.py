@@ -109,7 +109,8 @@ def test_classes_are_compared_under_their_own_weights():
     found = weights.residual(windows, [windows], metric, labels)
     for action in range(3):
         alone = fused_residual(windows, [windows], weights.metric(metric, action))
-        torch.testing.assert_close(found[:, labels == action], alone[:, labels == action])
+        # float32, and the terms are added in another order
+        torch.testing.assert_close(found[:, labels == action], alone[:, labels == action], rtol=2e-5, atol=1e-4)
 
 
 def test_a_planted_joint_is_found_and_pays_with_new_people(plain):
