@@ -54,7 +54,7 @@ lint: install
 
 # every format's files, mutated, through every reader: a long run with a table of outcomes
 fuzz: install
-	$(BIN)/python -m tests.fuzz
+	$(BIN)/python -m tests.fuzz --files 100000 --commands 2000
 
 bench: install
 	@echo "All benchmarks: about half an hour on quiet cores, longer on busy ones; each says what it does and prints its table as it ends."
