@@ -15,6 +15,7 @@ from torch import Tensor
 from dyntorch.constants import constant
 
 EPS = torch.finfo(torch.float64).eps
+UNDERFLOW = 1e-250  # of the order of the entries: squares and products of what is smaller are no normal numbers
 ANGLE = 1e-11  # that an accepted eigenspace may be off by, rounding of the Gram apart
 NULL = 1e-14  # of the largest eigenvalue: below it a Gram holds rounding only (rank defects below 9e-16, kappa 1e6 1e-12)
 SQUARINGS = 5  # of the inverse at most: enough for a ratio of the last two singular values of 0.67
@@ -217,9 +218,23 @@ def competing_sum(factor: Tensor, vectors: Tensor) -> Tensor:
     return total
 
 
+def eigh(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """Eigenvalues, ascending, and vectors of symmetric matrices whose entries are of the order of 1.
+
+    Entries that underflow stop the iteration of some builds of LAPACK, and the error is that of the whole batch: they count as 0.
+
+    Example:
+        >>> import torch
+        >>> eigh(torch.tensor([[1.0, 1e-310], [1e-310, 2.0]], dtype=torch.float64))[0].tolist()
+        [1.0, 2.0]
+    """
+    values, vectors = torch.linalg.eigh(torch.where(matrix.abs() < UNDERFLOW, 0.0, matrix))
+    return values, vectors
+
+
 def by_eigh(gram: Tensor, dim: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Vectors, values, sum of 1 / eigenvalue over the others, and whether the next eigenvalue is numerically zero as well."""
-    every, vectors = torch.linalg.eigh(gram)
+    every, vectors = eigh(gram)
     others = every[:, dim:]
     degenerate = (others <= NULL * every[:, -1:].clamp(min=EPS)).any(-1)
     competing = others.clamp(min=EPS / gram.shape[-1]).reciprocal().sum(-1)

@@ -18,6 +18,7 @@ from dyntorch.eigenspace import (
     by_inverse_iteration,
     by_squaring,
     competing_sum,
+    eigh,
     fix_signs,
     gram_gradient,
     on_host,
@@ -329,7 +330,7 @@ def _solve_rows(matrix: Tensor, gram: Tensor, dim: int) -> Tensor:
     if dim == matrix.shape[-1]:
         return torch.where(finite[:, None, None], by_eigh(scaled, dim)[0], 0.0)
     if _few(gram):
-        values, vectors = torch.linalg.eigh(scaled)
+        values, vectors = eigh(scaled)
         return _with_svd(matrix, vectors[..., :dim].contiguous(), ~finite | (values[:, dim] < ACCURATE))
     found = by_inverse_iteration(scaled, dim)
     vectors = found.vectors
