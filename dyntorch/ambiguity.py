@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from dyntorch.eigenspace import eigh
 from dyntorch.matrix import estimation_matrix, gram
 from dyntorch.primitives import Primitive
 
@@ -55,7 +56,7 @@ def within_noise(
     step = -(-weights.shape[1] // ENOUGH)
     views, weights = [x[:, ::step] for x in views], weights[:, ::step]
     static = None if static is None else static[:, ::step]
-    second = torch.linalg.eigh(g)[1][..., basis.shape[-2], None]
+    second = eigh(g)[1][..., basis.shape[-2], None]
     # a generator of its own: the same matches get the same answer, on any device and beside any others, and the caller's random
     # numbers stay
     draw = torch.Generator().manual_seed(0)
