@@ -145,7 +145,12 @@ class BundleProblem:
         """Derivative of the weighted images by the points, ``(b, v l, k + 1, n)``."""
         projections = cameras if self.lifts is None else cameras @ self.lifts
         rows = push(projections[..., None], images[:, :, :, None], slope[:, :, :, None]).flatten(1, 2)
-        return rows if self.outside is None else rows - torch.einsum("brkn,bkjn->brjn", rows, self.outside)
+        if self.outside is None:
+            return rows
+        inside = rows.clone()
+        for k in range(rows.shape[2]):
+            inside.addcmul_(rows[:, :, k, None], self.outside[:, None, k], value=-1)
+        return inside
 
 
 @dataclass(frozen=True)

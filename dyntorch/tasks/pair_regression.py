@@ -86,25 +86,26 @@ def regress(rows: Rows, *, means: bool) -> Ridge:
     energies = s.square()
     ridge = energies.amax(-1).clamp(min=1e-300)[:, None] * _grid(s)
     share = 1 / (energies[:, None] / ridge[..., None] + 1)  # (g, L, n)
+    # c and o are common to all columns: what they change of squares summed over columns is the mean of the columns
+    columns = rows.y.shape[2]
+    inner, outer = inside.mean(-1), outside.mean(-1)
+    spread, apart = (inside - inner[..., None]).square().sum(-1), (outside - outer[..., None]).square().sum((-2, -1))
     gauge = rows.x.new_zeros(*ridge.shape, 2)
     precision = gauge.new_zeros(*ridge.shape, 2, 2)
     if means:
         precision = free.mT[:, None] @ (share[..., None] * free[:, None]) + (beyond.mT @ beyond)[:, None]
-        target = (share * free[:, None, :, 0]) @ inside + (beyond.mT @ outside)[:, None, 0]
-        other = (share * free[:, None, :, 1]) @ inside + (beyond.mT @ outside)[:, None, 1]
-        moment = torch.stack([target.mean(-1), other.mean(-1)], dim=-1)
+        moment = (share * inner[:, None]) @ free + outer[:, None] @ beyond
         gauge = torch.linalg.solve_ex(precision, moment[..., None])[0][..., 0]
-    left = inside[:, None] - free[:, None] @ gauge[..., None]
-    rest = outside[:, None] - beyond[:, None] @ gauge[..., None]
-    cost = (share[..., None] * left.square()).sum((-2, -1)) + rest.square().sum((-2, -1))
-    count = (rows.y.shape[1] + rows.dropped) * rows.y.shape[2] - (2 if means else 0)
+    left, rest = inner[:, None] - gauge @ free.mT, outer[:, None] - gauge @ beyond.mT
+    cost = (share * (spread[:, None] + columns * left.square())).sum(-1) + apart[:, None] + columns * rest.square().sum(-1)
+    count = (rows.y.shape[1] + rows.dropped) * columns - (2 if means else 0)
     variance = (cost / count).clamp(min=1e-300)
-    level = -0.5 * count * variance.log() + 0.5 * rows.y.shape[2] * share.log().sum(-1)
+    level = -0.5 * count * variance.log() + 0.5 * columns * share.log().sum(-1)
     if means:
         level = level - 0.5 * torch.linalg.slogdet(precision + 1e-300).logabsdet
     best = level.nan_to_num(nan=-torch.inf).argmax(-1)
     pick = torch.arange(len(best), device=best.device), best
-    scaled = precision[pick] * (rows.y.shape[2] / variance[pick])[:, None, None]
+    scaled = precision[pick] * (columns / variance[pick])[:, None, None]
     return Ridge(level[pick], ridge[pick], variance[pick], gauge[pick], scaled)
 
 
