@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -148,7 +149,7 @@ def notices(code: NoticeCode, message: str, values: Tensor, flagged: Tensor, bat
     for flat, (value, counts) in enumerate(zip(*torch.stack(figures).tolist(), strict=True)):
         if not counts:
             continue
-        place = tuple(int(i) for i in torch.unravel_index(torch.tensor(flat), batch)) if batch else ()
+        place = tuple(int(i) for i in np.unravel_index(flat, batch)) if batch else ()
         found.append(Notice(code, value, message.format(value=value), place))
     return found
 

@@ -10,6 +10,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from sklearn.utils.validation import check_is_fitted
 
+from dyntorch import one_thread
 from indexing.brightness.calibration import found_events, mirrors_matter, wrong_evidence
 from indexing.brightness.footage import Footage, footage, gather
 from indexing.brightness.library import Exemplars, Matcher, library
@@ -98,6 +99,7 @@ class BrightnessIndexer(SavedClassifier):
         self.device = device
 
     # ---- learning ----------------------------------------------------------------------------------------------------
+    @one_thread
     def fit(self, videos: Iterable[Any], labels: ArrayLike) -> Self:
         """Learn from videos; one per action is enough.
 
@@ -116,6 +118,7 @@ class BrightnessIndexer(SavedClassifier):
             raise ValueError(f"labels: only one class ({classes.tolist()[0]!r}); give videos of two or more actions")
         return self._learn(self._exemplars(found, numbers), classes)
 
+    @one_thread
     def partial_fit(self, videos: Iterable[Any], labels: ArrayLike, classes: ArrayLike | None = None) -> Self:
         """Learn from further videos, of known or new actions.  Fits where nothing was fitted yet.
 
@@ -173,6 +176,7 @@ class BrightnessIndexer(SavedClassifier):
         self.reject_threshold_ = reject_threshold(self.reject, wrong)
 
     # ---- recognition -------------------------------------------------------------------------------------------------
+    @one_thread
     def decision_function(self, videos: Iterable[Any]) -> Array:
         """``(videos, classes)`` scores from 0 to about 1, larger is better; 0 where nothing moves."""
         check_is_fitted(self, "exemplars_")
@@ -222,6 +226,7 @@ class BrightnessIndexer(SavedClassifier):
         """
         return self.scan(video)[2]
 
+    @one_thread
     def scan(self, video: Any, progress: Callable[[float], None] | None = None) -> tuple[Array, Array, list[Event]]:
         """Times ``(frames,)`` in seconds, :meth:`score_frames` and :meth:`find` in one pass.
 
@@ -232,6 +237,7 @@ class BrightnessIndexer(SavedClassifier):
         wrong = wrong_evidence(self.recognizer_, self.exemplars_)[1]
         return times, scores, found_events(scores, times, energy, self.classes_, wrong, self.reject)
 
+    @one_thread
     def _scan(self, video: Any, progress: Callable[[float], None] | None) -> tuple[Array, Array, Array]:
         check_is_fitted(self, "exemplars_")
         source = footage(video, "video", float(self.fps))

@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from dyntorch import one_thread
 from indexing.brightness.footage import Footage, Resampler
 from indexing.brightness.library import Library, Matcher
 from indexing.brightness.matching import Warping
@@ -87,6 +88,7 @@ class BrightnessStream:
         self.latest = np.zeros(classes)
         self.energy = 0.0
 
+    @one_thread
     def push(self, frames: Any, times: Any = None) -> Array:
         """Scores of one more frame, or of several.
 
@@ -106,6 +108,7 @@ class BrightnessStream:
         scores, _ = self.scan(frames[None] if single else frames, times)
         return scores[0] if single else scores
 
+    @one_thread
     def scan(self, frames: Any, times: Any = None) -> tuple[Array, Array]:
         """Scores ``(n, classes)`` and energies ``(n,)`` (0 where nothing moves, else below 1) after each of n more frames."""
         with torch.inference_mode():  # a seventh of the time of single frames

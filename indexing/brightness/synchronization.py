@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from dyntorch import Shift, on_cpu
+from dyntorch import Shift, on_cpu, one_thread
 from indexing.brightness.box import Region, boxes, motion
 from indexing.brightness.decision import APART, LEAST, Verdict, judge
 from indexing.brightness.sampling import Sampled, common_rate, sampled
@@ -21,6 +21,7 @@ four pairs of rates: the parabola is hardly better than whole frames (.29)."""
 
 
 @on_cpu
+@one_thread
 def brightness_shift(
     a: Any,
     b: Any,
