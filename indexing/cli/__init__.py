@@ -134,7 +134,10 @@ def _asked(words: list[str]) -> str:
 def _version() -> str:
     from importlib import metadata
 
-    return metadata.version("dyntorch")
+    try:
+        return metadata.version("dyntorch")
+    except metadata.PackageNotFoundError:
+        return "(its source, not installed: pip install .)"
 
 
 @contextlib.contextmanager
