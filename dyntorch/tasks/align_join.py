@@ -72,7 +72,10 @@ def _search(evidence: Evidence, threshold: float | None, model: str, generator: 
     if evidence.data.count >= MINIMAL[model]:
         starts.append(_from_tensor(MinimalJoinTensor(), evidence, given, generator))
         if model == "join" and evidence.data.count >= FULL:
-            starts.append(_from_tensor(JoinTensor(), evidence, given, generator))
+            # where the noise is known, so is whether a motion is the right one
+            doubt = torch.ones_like(evidence.floor) if given is None else _doubt(evidence, starts[1][0], given)
+            if bool(doubt.any()):
+                starts.append(_from_tensor(JoinTensor(), evidence.weighted(doubt), given, generator))
     count, size = len(starts), len(evidence.floor)
     # the least estimate is that of a motion most matches agree with; it may still be low, for static matches show half the noise
     sigma = given if given is not None else 2 * torch.stack([noise for _, noise in starts]).amin(0).maximum(evidence.floor)
@@ -82,6 +85,16 @@ def _search(evidence: Evidence, threshold: float | None, model: str, generator: 
     best = several.cost(theta, noise).unflatten(0, (count, size)).argmin(0)
     chosen = theta[best * size + torch.arange(size, device=best.device)]
     return evidence.settled(chosen, sigma, estimate=given is None)
+
+
+def _doubt(evidence: Evidence, theta: Tensor, sigma: Tensor) -> Tensor:
+    """1 for problems ``(b,)`` whose motion fewer than half of the matches agree with, or fewer moving ones than determine one.
+
+    For the others a further start can only lead to the same motion: one that as many matches agree with shares some with it.
+    """
+    labels = evidence.labels(evidence.improved(theta, sigma, torch.zeros_like(sigma, dtype=torch.bool)), sigma)
+    moving, agreeing, present = ((labels == MOVING).sum(-1), (labels != OUTLIER).sum(-1), (evidence.data.weights > 0).sum(-1))
+    return ((2 * agreeing <= present) | (moving * JoinTensor.codim <= JoinTensor.dof)).to(theta)
 
 
 def _from_static(evidence: Evidence, given: Tensor | None, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:

@@ -85,6 +85,10 @@ class Evidence:
         data = replace(data, batch=data.weights.shape[:1])
         return Evidence(self.invariant, data, again_norm, tuple(map(again, self.views)), again(self.floor))
 
+    def weighted(self, weights: Tensor) -> Evidence:
+        """With the matches of each problem weighted by ``(b,)``; 0 leaves a problem out."""
+        return replace(self, data=replace(self.data, weights=self.data.weights * weights[:, None]))
+
     def parameters(self, motion: tuple[Tensor, ...]) -> Tensor:
         """``(b, p)`` from motions ``(b, ...)`` in the coordinates of the matches."""
         parts = normalize_motion(self.invariant, motion, self.norm.transforms)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -11,7 +12,9 @@ from torch import Tensor
 from dyntorch import scenes
 from dyntorch.algebra.rigid import moved_by, nearest_rotation, rigid_alignment, rigid_motion, rotation_exponential
 from dyntorch.metrics import label_scores, point_error, relative_error, rotation_error, translation_error
+from dyntorch.robust import robust_fit
 from dyntorch.solution import Status
+from dyntorch.tasks import align_join
 from dyntorch.tasks.align_points import Model, align_points
 from dyntorch.tasks.alignment import MOVING, OUTLIER, STATIC
 from dyntorch.tasks.rigid import Sightings, normal_equations, squares
@@ -301,6 +304,24 @@ def test_empty_batch_and_float32() -> None:
     single = align_points(*scene.views, model="rigid", threshold=0.03, generator=draw(22))
     assert single.A.dtype == torch.float32
     assert bool(rotation_error(single.A, scene.motion[0]) < 1.5)
+
+
+def test_the_full_tensor_is_only_searched_for_where_the_minimal_one_leaves_doubt(monkeypatch: pytest.MonkeyPatch) -> None:
+    searched: list[tuple[str, Tensor]] = []
+
+    def noted(invariant: Any, *views: Tensor, **options: Any) -> Any:
+        searched.append((repr(invariant), (options["weights"] > 0).any(-1)))
+        return robust_fit(invariant, *views, **options)
+
+    monkeypatch.setattr(align_join, "robust_fit", noted)
+    still, moving = (
+        scenes.moving_points(70, sigma=0.01, static=share, generator=torch.Generator().manual_seed(0)).views for share in (1.0, 0.3)
+    )
+    views = [torch.stack(pair) for pair in zip(still, moving, strict=True)]
+    found = align_points(*views, model="join", threshold=0.03, generator=torch.Generator().manual_seed(1))
+    asked = [(name, where.tolist()) for name, where in searched]
+    assert asked == [("MinimalJoinTensor", [True, True]), ("JoinTensor", [True, False])]
+    assert (found.status == Status.OK).all() and ((found.labels != OUTLIER).sum(-1) > 65).all()
 
 
 def test_random_clouds_leave_no_labels_and_no_noise():
