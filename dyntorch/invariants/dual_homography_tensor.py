@@ -285,7 +285,9 @@ def _line_error(image: Tensor, derivative: Tensor, source: Tensor, line: Tensor)
     along = (reference[..., :2] * unit_line[..., :2]).sum(-1)
     # lines have no orientation
     sign = torch.where(along < 0, -1.0, 1.0).to(image.dtype)
-    error = torch.stack([torch.atan2(sign * across, along.abs()), sign * unit_line[..., 2] - reference[..., 2]], dim=-1)
+    # some versions of torch differentiate atan2(0, 0) to NaN
+    nearby = torch.where((across == 0) & (along == 0), torch.ones_like(along), along.abs())
+    error = torch.stack([torch.atan2(sign * across, nearby), sign * unit_line[..., 2] - reference[..., 2]], dim=-1)
     columns = []
     for tangent in (_turned(start), start.new_tensor([0.0, 0.0, 1.0]).expand_as(start)):
         change = (derivative @ tangent[..., None])[..., 0]

@@ -165,6 +165,8 @@ def _widen(
     joint = np.array([column[name.lower()] for name in landmarks])
     who = np.unique(people, return_inverse=True)[1] if people is not None else np.zeros(len(at), dtype=np.int64)
     keys, first, person = np.unique(np.stack([at, who], axis=1), axis=0, return_index=True, return_inverse=True)
+    # numpy 2.0.0 gives it as a column
+    person = person.reshape(-1)
     cells, counts = np.unique(person * len(names) + joint, return_counts=True)
     if (counts > 1).any():
         twice = names[int(cells[np.argmax(counts > 1)]) % len(names)]

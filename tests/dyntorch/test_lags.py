@@ -198,7 +198,7 @@ def covariances(a, b, window, weights=None):
             found.append(torch.zeros(p + b.shape[1], p + b.shape[1], dtype=torch.float64))
             continue
         joint = torch.cat([a[pair[0]][seen], b[pair[1]][seen]], dim=-1)
-        found.append(torch.from_numpy(np.cov(joint.numpy(), rowvar=False, ddof=0, aweights=shared[seen].numpy())))
+        found.append(torch.from_numpy(np.cov(joint.mT.numpy(), ddof=0, aweights=shared[seen].numpy())))
     joint = torch.stack(found)
     return joint[:, :p, :p], joint[:, p:, p:], joint[:, :p, p:], torch.tensor(counts, dtype=torch.float64)
 
