@@ -147,6 +147,9 @@ def _output() -> Iterator[None]:
         if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
             stream.reconfigure(errors="backslashreplace")
     with warnings.catch_warnings():
+        # what libraries tell programmers is nothing that a user of the command could act on
+        for kind in (DeprecationWarning, PendingDeprecationWarning, FutureWarning):
+            warnings.simplefilter("ignore", kind)
         warnings.showwarning = lambda message, *_, **__: complain(f"warning: {message}")
         yield
 

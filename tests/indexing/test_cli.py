@@ -6,6 +6,7 @@ import csv
 import json
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 from typing import get_args
 
@@ -92,6 +93,7 @@ def refuse(run, tmp_path: Path):
 def test_help_starts_without_the_heavy_libraries() -> None:
     code = """
 import sys
+import warnings
 from indexing.cli import main
 codes = [main(line.split()) for line in ("", "--help", "index", "index --help", "index fit --help", "--version")]
 heavy = {"torch", "sklearn", "matplotlib", "scipy"} & set(sys.modules)
@@ -426,3 +428,14 @@ def test_demo_refuses_bad_input(refuse, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     refuse("demo", "--people", "0", says=("people", "1 or more"))
     refuse("demo", "--out", "file", says=("'file' is a file",))
+
+
+def test_what_libraries_tell_programmers_is_not_shown(run, monkeypatch: pytest.MonkeyPatch) -> None:
+    def warn(*_: object) -> str:
+        warnings.warn("old", DeprecationWarning, stacklevel=1)
+        warnings.warn("this matters", UserWarning, stacklevel=1)
+        return "1"
+
+    monkeypatch.setattr("indexing.cli._version", warn)
+    code, _, err = run("--version")
+    assert (code, err) == (0, "dyntorch: warning: this matters\n")
