@@ -58,7 +58,8 @@ def motion_of_forms(forms: Tensor) -> tuple[Tensor, Tensor]:
         >>> bool(torch.allclose(found, unit(A)))
         True
     """
-    return _skew_partner(forms.movedim(-1, -3)), _skew_partner(forms.movedim(-2, -3))
+    A, B = _skew_partner(torch.stack([forms.movedim(-1, -3), forms.movedim(-2, -3)])).unbind(0)
+    return A, B
 
 
 def _skew_partner(slices: Tensor) -> Tensor:
