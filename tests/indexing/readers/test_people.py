@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from indexing.readers import read, read_clip
-from indexing.readers.people import link
+from indexing.readers import people, read, read_clip
+from indexing.readers.people import WAITING, link
 
 Write = Callable[..., Path]
 FRAMES = 8
@@ -146,3 +146,36 @@ def test_identities_do_not_depend_on_the_order_within_frames(seed: int) -> None:
     ids = link(at, joints[order])
     truth = np.tile(np.arange(5), 20)[order]
     assert len(set(zip(ids.tolist(), truth.tolist(), strict=True))) == len(set(ids.tolist())) == 5
+
+
+def test_strangers_in_every_frame_are_compared_with_the_latest_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    compared: list[int] = []
+    distances = people._distances
+
+    def counted(awaited: np.ndarray, found: np.ndarray, size: np.ndarray) -> np.ndarray:
+        compared.append(len(awaited) * len(found))
+        return distances(awaited, found, size)
+
+    monkeypatch.setattr(people, "_distances", counted)
+    box = np.array([[0.0, 0.0], [10.0, 20.0]])
+    at = np.repeat(np.arange(4 * WAITING), 2)
+    joints = box + 1000.0 * np.arange(len(at))[:, None, None]
+    assert link(at, joints).tolist() == list(range(len(at)))
+    assert max(compared) == 2 * WAITING and sum(compared) <= len(at) * WAITING
+
+
+def test_who_was_seen_lately_is_waited_for_however_many_come_and_go() -> None:
+    box = np.array([[0.0, 0.0], [10.0, 20.0]])
+    frames = 3 * WAITING
+    strangers = box + 1000.0 * np.arange(1, frames + 1)[:, None, None]
+    at = np.concatenate([np.arange(frames), np.arange(0, frames, WAITING // 2)])
+    ids = link(at, np.concatenate([strangers, np.repeat(box[None], 6, axis=0)]))
+    assert len(set(ids[frames:].tolist())) == 1 and len(set(ids.tolist())) == frames + 1
+
+
+def test_a_crowd_larger_than_what_is_waited_for_is_followed() -> None:
+    box = np.array([[0.0, 0.0], [10.0, 20.0]])
+    crowd = box + 100.0 * np.arange(WAITING + 40)[:, None, None]
+    ids = link(np.repeat(np.arange(3), len(crowd)), np.concatenate([crowd, crowd + 1, crowd[::-1] + 2]))
+    first, second, third = ids.reshape(3, -1)
+    assert (first == second).all() and (first == third[::-1]).all()
