@@ -133,10 +133,11 @@ def _left(given: Given, labelled: Labelling) -> int:
 def _given(x1: Tensor, x2: Tensor, weights: Tensor, present: Tensor, threshold: float, request: Request, repeated: float) -> Given:
     """The present matches ``(m, 2)`` around 0 and of about unit size, by one scale: distances stay comparable."""
     centres = x1.median(0).values, x2.median(0).values
-    distance = torch.cat([x1 - centres[0], x2 - centres[1]]).norm(dim=-1)
+    # squares of tiny coordinates would underflow: a view without extent would not count
+    distance = torch.hypot(*torch.cat([x1 - centres[0], x2 - centres[1]]).unbind(-1))
     # copies of one match that are the majority have no spread
     spread = distance[distance > 0].median() if bool(distance.any()) else torch.ones_like(distance[0])
-    scale = 1 / spread
+    scale = 1 / spread.clamp(min=torch.finfo(spread.dtype).tiny)
     first, second = (similarity(scale, centre) for centre in centres)
     a, b = (((x - centre) * scale).clamp(-FARTHEST, FARTHEST) for x, centre in zip((x1, x2), centres, strict=True))
     pixel = threshold / PIXELS * float(scale)

@@ -272,7 +272,7 @@ def _finite(matrices: Tensor) -> Tensor:
 
 def normalized(homographies: Tensor, frames: Pair) -> Tensor:
     """Homographies ``(b, p, 3, 3)`` of norm 1 in new coordinates; zero where one is missing or singular."""
-    moved = unit(frames[1][:, None] @ homographies @ torch.linalg.inv_ex(frames[0])[0][:, None])
+    moved = _finite(frames[1][:, None] @ homographies @ torch.linalg.inv_ex(frames[0])[0][:, None])
     values = torch.linalg.svdvals(moved)
     return torch.where((values[..., 2] > SINGULAR * values[..., 0])[..., None, None], moved, 0.0)
 
@@ -280,6 +280,6 @@ def normalized(homographies: Tensor, frames: Pair) -> Tensor:
 def normalized_fundamentals(fundamentals: Tensor, frames: Pair) -> Tensor:
     """Fundamental matrices ``(b, m, 3, 3)`` of norm 1 in new coordinates; zero where one is missing or has rank one."""
     inverse = [torch.linalg.inv_ex(frame)[0][:, None] for frame in frames]
-    moved = unit(inverse[1].mT @ fundamentals @ inverse[0])
+    moved = _finite(inverse[1].mT @ fundamentals @ inverse[0])
     values = torch.linalg.svdvals(moved)
     return torch.where((values[..., 1] > SINGULAR * values[..., 0])[..., None, None], moved, 0.0)

@@ -122,6 +122,21 @@ def test_batch_equals_loop_and_order_is_no_matter():
     assert torch.allclose(one.epipoles, turned.epipoles.flip(0), atol=1e-5)
 
 
+@pytest.mark.parametrize("scale", [1e-300, 1e300])
+@pytest.mark.parametrize("given", ["matrices", "matches", "both"])
+def test_tiny_and_huge_problems_leave_their_neighbours_alone(given, scale):
+    scene = scenes.translating_planes(4, sigma=0.1, generator=draw(11))
+    H = {} if given == "matches" else {"H": scene.homographies}
+    views = {} if given == "matrices" else {"x1": scene.x1, "x2": scene.x2}
+    alone = translating_planes(**H, **views)
+    factor = {"H": 1.0 if views else scale, "x1": scale, "x2": scale}
+    found = translating_planes(**{name: torch.stack([x, x * factor[name]]) for name, x in (H | views).items()})
+    assert int(found.status[0]) == int(alone.status) == Status.OK
+    assert torch.allclose(found.homography_at_infinity[0], alone.homography_at_infinity, rtol=0, atol=1e-9)
+    assert torch.allclose(found.epipoles[0], alone.epipoles, rtol=0, atol=1e-9)
+    assert int(found.status[1]) != Status.OK and bool(found.homography_at_infinity.isfinite().all())
+
+
 def test_units_of_the_image_are_no_matter():
     scene = scenes.translating_planes(5, sigma=0.1, generator=draw(12))
     H = measured(scene)

@@ -119,6 +119,23 @@ def test_batches_are_loops():
     assert "batch=(2, 2): 4 OK" in repr(found) and "bodies: 2 to 2" in repr(found)
 
 
+@pytest.mark.parametrize("scale", [1e-300, 1e-150, 1e300])
+@pytest.mark.parametrize("views", [(0,), (0, 1)])
+def test_tiny_and_huge_matches_fail_alone(views, scale):
+    scene = scenes.bodies(60, 2, sigma=0.5, outliers=0.1, generator=draw(4))
+    alone = dyn.segment(*scene.views, generator=draw(5))
+    both = [torch.stack([x, x * scale if i in views else x]) for i, x in enumerate(scene.views)]
+    found = dyn.segment(*both, generator=draw(5))
+    assert int(found.status[0]) == int(alone.status) == Status.OK
+    assert torch.equal(found.labels[0], alone.labels)
+    torch.testing.assert_close(found.fundamentals[0], alone.fundamentals, rtol=0, atol=1e-9)
+    torch.testing.assert_close(found.probabilities[0], alone.probabilities, rtol=0, atol=1e-9)
+    # what is tiny beside the threshold is near everything; what overflows is missing
+    assert int(found.status[1]) == (Status.AMBIGUOUS if scale < 1 else Status.TOO_FEW)
+    assert int(found.bodies[1]) == 0 and not bool(found.labels[1].any())
+    assert all(bool(getattr(found, name).isfinite().all()) for name in NAMES)
+
+
 def test_generator_is_the_only_randomness():
     scene = two_bodies(5)
     first, second = segmented(scene, 1), segmented(scene, 1)
