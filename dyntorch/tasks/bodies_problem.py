@@ -82,7 +82,9 @@ def _diagonal(x: Tensor) -> float:
 
 def _solve(x1: Tensor, x2: Tensor, weights: Tensor, request: Request, threshold: float) -> Outcome:
     present = (weights > 0).nonzero().flatten()
-    distinct = len(torch.unique(torch.cat([x1[present], x2[present]], dim=-1), dim=0))
+    distinct, *places = (len(torch.unique(x[present], dim=0)) for x in (torch.cat([x1, x2], dim=-1), x1, x2))
+    # points that are all in one place of a view fit any motion of that place
+    distinct = min(places) if min(places) < LEAST + 1 else distinct
     repeated = 1 - distinct / len(present) if len(present) else 0.0
     if distinct < LEAST + 1:
         return nothing(weights, threshold, Status.TOO_FEW, repeated)
