@@ -195,9 +195,10 @@ def _null(
         few = few | ((weights > 0).sum(-1) < invariant.minimal())
     ambiguous = square * present.clamp(min=1) > _limit(spare, width)
     if asked & 2:
-        chosen = [x[weak] for x in views], weights[weak], None if static is None else static[weak], basis[weak]
+        place = weak.nonzero(as_tuple=True)  # an accelerator waits here, and for every mask that is an index
+        chosen = [x[place] for x in views], weights[place], None if static is None else static[place], basis[place]
         with torch.no_grad():
-            ambiguous[weak] = ambiguous[weak] | within_noise(primitives, *chosen, invariant.resolves_noise)
+            ambiguous[place] |= within_noise(primitives, *chosen, invariant.resolves_noise)
     return basis, _status(few, found.degenerate, ambiguous), square.sqrt()
 
 
@@ -228,7 +229,8 @@ def _with_matrix(
 ) -> Tensor:
     """Replace the null spaces of the chosen problems by those of their estimation matrices, which are not squared."""
     matrix = estimation_matrix(primitives, views, weights, static)
-    return basis.index_put(tuple(exact.nonzero().T), null_space(matrix[exact], nullity))
+    place = exact.nonzero(as_tuple=True)
+    return basis.index_put(place, null_space(matrix[place], nullity))
 
 
 def _identity(invariant: Invariant, views: tuple[Tensor, ...]) -> Normalization:

@@ -96,7 +96,7 @@ class Search:
             if not len(left):
                 break
             new = self._solve(left, cut, count)
-            better = new.score < found.score[left]
+            better = (new.score < found.score[left]).nonzero()[:, 0]
             for old, part in zip(vars(found).values(), vars(new).values(), strict=True):
                 old[left[better]] = part[better]
             # more starts would find it again

@@ -97,6 +97,29 @@ def moving_shapes() -> tuple[Tensor, Tensor, Tensor]:
     return torch.einsum("vb,bnk,vkd->vnd", rows, points, cameras), rows, points
 
 
+def still_shape(frame: str) -> tuple[Tensor, ...]:
+    """Six points (affine: five, whose tensor is one row), ``(6, 2)`` each: what six cameras see of them."""
+    structure, cameras = randn(5 if frame == "affine" else 6, 4), randn(6, 4, 3, seed=1)
+    if frame == "plane":
+        structure[:4, 2] = 0.0
+    if frame == "affine":
+        structure[:, 3], cameras[:, :3, 2], cameras[:, 3, 2] = 1.0, 0.0, 1.0
+    x = inhomogeneous(structure @ cameras)
+    return (x + 1e-4 * randn(*x.shape, seed=2)).unbind(-2)
+
+
+def timed_shape() -> tuple[Tensor, ...]:
+    """Twelve times, and eight points ``(12, 2)`` at constant velocity."""
+    x = moving_shapes()[0]
+    return (torch.linspace(0, 3, 12, dtype=F64), *(x + 1e-4 * randn(*x.shape, seed=2)).unbind(-2))
+
+
+def labelled_points() -> tuple[Tensor, ...]:
+    """Three views ``(12, 3)`` of points of space, and which of them are known to stand still."""
+    scene = scenes.moving_points(12, static=0.7, sigma=0.0, generator=draw(1))
+    return (*scene.views, scene.labels == 1)
+
+
 def affine_tracks() -> tuple[Tensor]:
     """``(5, 20, 2)`` orthographic images of one rigid body."""
     turn, _ = torch.linalg.qr(randn(5, 3, 3, seed=4))
@@ -130,6 +153,28 @@ def shift(offset: float) -> dyn.Shift:
     return dyn.Shift(offset, 0.01, 1.0, 0.0, 0.9, peaks, True, "", "epipolar", (30.0, 30.0), 0.0, none, none)
 
 
+# ---- calls that take several steps -------------------------------------------------------------------------------------
+def shape_tensor(frame: str, points: tuple[Tensor, ...]) -> tuple[Any, ...]:
+    """A shape tensor from fit to use."""
+    found = dyn.refine(dyn.fit(dyn.ShapeTensor(frame), *points), *points)
+    family = found.invariant
+    return found, family.score(found.tensor, *points), dyn.sampson(family, found.tensor, *points)
+
+
+def dynamic_shape_tensor(form: Any, times: Tensor, points: tuple[Tensor, ...]) -> tuple[Any, ...]:
+    """A dynamic one from fit to use; the form "span" tells no times."""
+    found = dyn.refine(dyn.fit(dyn.DynamicShapeTensor(form=form), *points, times=times), *points, times=times)
+    family = found.invariant
+    recovered = () if form == "span" else (family.recover(found.tensor, *points),)
+    return found, family.score(found.tensor, *points), *recovered
+
+
+def without_frame(result: tuple[Any, ...]) -> tuple[Any, ...]:
+    """What a shape tensor gave, without its refined structure, whose frame is free."""
+    found, *rest = result
+    return found.tensor, found.status, found.singular_values, *rest
+
+
 # ---- the table ---------------------------------------------------------------------------------------------------------
 H = dyn.HomographyTensor
 VERBS: tuple[Verb, ...] = (
@@ -157,10 +202,20 @@ VERBS: tuple[Verb, ...] = (
     *(
         Verb(
             f"align_points {model}",
-            lambda sensors=sensors: scenes.constant_velocity(30, static=0.4, sigma=1e-3, generator=draw(1), sensors=sensors).views,
+            lambda n=n, static=static, sensors=sensors: (
+                scenes.constant_velocity(n, static=static, sigma=1e-3, generator=draw(2), sensors=sensors).views
+            ),
             lambda *x, model=model: dyn.align_points(*x, model=model, threshold=0.02, generator=draw()),
         )
-        for model, sensors in (("affine_constant_velocity", "affine"),)
+        for model, sensors, n, static in (
+            ("constant_velocity", "projective", 24, 0.0),
+            ("affine_constant_velocity", "affine", 30, 0.4),
+        )
+    ),
+    Verb(
+        "align_points join labelled",
+        labelled_points,
+        lambda *x: dyn.align_points(*x[:3], static=x[3], threshold=0.02, generator=draw()),
     ),
     *(
         Verb(
@@ -319,6 +374,26 @@ VERBS: tuple[Verb, ...] = (
         lambda a, b: dyn.canonical_correlation(dyn.orthonormal_basis(a), dyn.orthonormal_basis(b)),
     ),
     Verb("orthonormal_basis", lambda: (randn(2, 20, 2),), dyn.orthonormal_basis),
+    *(
+        Verb(
+            f"ShapeTensor {frame}",
+            lambda frame=frame: still_shape(frame),
+            lambda *p, frame=frame: shape_tensor(frame, p),
+            compare=without_frame,
+            tolerance=1e-4,  # of distances and of times: descents stop where the cost does, at the root of its digits
+        )
+        for frame in ("general", "plane", "affine")
+    ),
+    *(
+        Verb(
+            f"DynamicShapeTensor {form}",
+            timed_shape,
+            lambda t, *p, form=form: dynamic_shape_tensor(form, t, p),
+            compare=without_frame,
+            tolerance=1e-4,
+        )
+        for form in ("joint", "basis", "span")
+    ),
     Verb("affine_factorization", affine_tracks, dyn.affine_factorization),
     Verb("metric_upgrade", lambda: dyn.affine_factorization(*affine_tracks())[:2], dyn.metric_upgrade),
 )
@@ -338,10 +413,12 @@ WAITS = {
     "translating_planes": (150, f"{FITS}; {STEPS}; one for every notice"),
     "bundle_adjust": (50, STEPS),
     "fit_shapes": (60, STEPS),
+    "ShapeTensor": (40, f"{FITS}; {STEPS}"),
+    "DynamicShapeTensor": (60, f"{FITS}; {STEPS}"),
     "velocity_factorization": (8, ASKED),
     "affine_factorization": (1, ASKED),
     "metric_upgrade": (4, ASKED),
-    "recover_times": (3, ASKED),
+    "recover_times": (1, ASKED),
     **dict.fromkeys(("triangulate_trajectories", "hyperplane_pair", "two_bodies"), (1, ASKED)),
     **dict.fromkeys(("affine_segmentation", "multibody_matrix"), (1, ASKED)),
     **dict.fromkeys(("trajectory_cameras", "projective_factorization"), (1, LENT)),
@@ -353,8 +430,9 @@ WAITS = {
     "reconstruct_pair": (2, LENT),
     "fit_distortion": (2, LENT),
 }
-"""Public names that wait for the device, how often a call of the table does at most, and why.  Measured: 2 (fit), 17, 27, 5, 59,
-23 to 75, 22 and 58 to 86; before they were lent to the CPU: synchronize 300 to 900, reconstruct 33 to 1,000."""
+"""Public names that wait for the device, how often a call of the table does at most, and why.  Measured: 2 (fit), 17, 27, 5, 64,
+7 to 75, 22 and 58 to 86, 34 (fit_shapes), 7 to 24 (ShapeTensor), 7 to 41; before they were lent to the CPU: synchronize 300 to 900,
+reconstruct 33 to 1,000."""
 
 NOT_VERBS = {
     **dict.fromkeys(("counting", "metrics", "motions", "scenes"), "modules"),
@@ -366,9 +444,9 @@ NOT_VERBS = {
     ),
     **dict.fromkeys(
         (
-            *("Collineation", "ConstantVelocityTensor", "ConvergentMotionMatrix", "DualHomographyTensor", "DynamicShapeTensor"),
+            *("Collineation", "ConstantVelocityTensor", "ConvergentMotionMatrix", "DualHomographyTensor"),
             *("FundamentalMatrix", "GrassmannTensor", "HomographyTensor", "JoinTensor", "MinimalJoinTensor", "SegmentationMatrix"),
-            *("ShapeTensor", "TranslatingLinesMatrix"),
+            "TranslatingLinesMatrix",
         ),
         "invariants: tests/battery_input.py takes each of them to a device",
     ),

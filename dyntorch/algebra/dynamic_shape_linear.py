@@ -106,7 +106,7 @@ def leading(x: Tensor, share: Tensor, count: int = 3) -> Tensor:
 def products(rows: Tensor) -> Tensor:
     """Orthonormal basis ``(b, views, K)`` of all products of three of the functions ``(b, views, B)``, as seen at the views."""
     size = rows.shape[-1]
-    places = torch.combinations(torch.arange(size, device=rows.device), 3, with_replacement=True)
+    places = torch.combinations(torch.arange(size), 3, with_replacement=True).to(rows.device)
     cubes = rows[..., places].prod(-1)
     u, s, _ = torch.linalg.svd(cubes, full_matrices=False)
     # one width for the whole batch: a function more than a problem can tell is one it cannot tell either

@@ -178,7 +178,7 @@ def _refined(
     """Times, residuals and curvatures ``(b, views, peaks)`` at the minima next to ``start``; not more than a step away."""
     low, high = start - step, start + step
     if within is not None:
-        low, high = low.clamp(min=float(within[0])), high.clamp(max=float(within[-1]))
+        low, high = low.clamp(min=within[0]), high.clamp(max=within[-1])
     x, weights = x[:, :, None], weights[:, :, None]
 
     def at(t: Tensor) -> tuple[Tensor, Tensor, Tensor]:

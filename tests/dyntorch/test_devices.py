@@ -13,7 +13,7 @@ from torch import Tensor
 import dyntorch as dyn
 from dyntorch import scenes
 from dyntorch.devices import on_cpu
-from tests.device_verbs import NOT_VERBS, VERBS, WAITS, Verb
+from tests.device_verbs import NOT_VERBS, VERBS, WAITS, Verb, still_shape
 from tests.pretend_device import counted, moved, pretend_device
 
 DEVICES = ("pretend", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")))
@@ -85,6 +85,14 @@ def test_status_does_not_depend_on_the_device(invariant, views):
     assert there.status.tolist() == here.status.tolist()
     # nor on the neighbours in the batch
     assert dyn.fit(invariant, *(x[5:] for x in views)).status.tolist() == here.status[5:].tolist()
+
+
+def test_what_looks_weak_costs_one_wait_more():
+    """Certificate, what looks weak, and where: not one for every tensor that is looked at there."""
+    views = moved(still_shape("plane"), pretend_device())
+    with counted() as traffic:
+        dyn.fit(dyn.ShapeTensor("plane"), *views)
+    assert traffic.count <= 3, str(traffic)
 
 
 def test_a_negative_weight_is_refused_there():

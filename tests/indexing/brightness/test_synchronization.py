@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from indexing.brightness.synchronization import brightness_shift
+from tests.pretend_device import counted, moved, pretend_device
 
 FPS = (30.0, 30.0)
 
@@ -29,6 +30,18 @@ def test_streams_sizes_rates_and_clocks(films):
     shift = brightness_shift(large, stream, fps=(30.0, 15.0), times=(np.arange(110) / 30.0, None))
     assert abs(shift.offset - 100) < 1 / 15
     assert shift.fps == pytest.approx((30.0, 15.0))
+
+
+def test_videos_on_an_accelerator(films):
+    a, b = (torch.from_numpy(video) for video in films)
+    pair, home = (a[10:60], b[:50]), pretend_device()
+    here = brightness_shift(*pair, fps=FPS)
+    with counted() as traffic:
+        there = brightness_shift(*moved(pair, home), fps=FPS)
+    assert traffic.count <= 2, str(traffic)  # one copy for each video
+    assert {there.peaks.device, there.lags.device, there.scores.device} == {home}
+    assert (there.offset, there.sigma, there.ok, there.reason) == (here.offset, here.sigma, here.ok, here.reason)
+    assert torch.equal(there.peaks.cpu(), here.peaks)
 
 
 def test_unrelated_and_reversed_videos_are_refused(films, other):
