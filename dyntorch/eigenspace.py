@@ -232,6 +232,51 @@ def eigh(matrix: Tensor) -> tuple[Tensor, Tensor]:
     return values, vectors
 
 
+def spectrum(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """:func:`eigh` of symmetric matrices of any size; entries that are not finite, which stop the batch as well, count as 0.
+
+    Example:
+        >>> import torch
+        >>> matrices = torch.tensor([[[3e-280, 0.0], [0.0, 1e-280]], [[1.0, torch.nan], [torch.nan, 1.0]]], dtype=torch.float64)
+        >>> spectrum(matrices)[0].tolist()
+        [[1e-280, 3e-280], [1.0, 1.0]]
+    """
+    even, size = _even(matrix)
+    values, vectors = eigh(even)
+    return values * size, vectors
+
+
+def eigenvalues(matrix: Tensor) -> Tensor:
+    """The eigenvalues of :func:`spectrum`."""
+    even, size = _even(matrix)
+    values: Tensor = torch.linalg.eigvalsh(torch.where(even.abs() < UNDERFLOW, 0.0, even))
+    return values * size
+
+
+def real_eigenvalues(matrix: Tensor) -> Tensor:
+    """Real parts of the eigenvalues of square matrices of any size, not symmetric; entries that are not finite count as 0.
+
+    Entries as far apart as 1e150 stop that iteration in every build of LAPACK: against the largest, 1e-100 counts as 0.
+
+    Example:
+        >>> import torch
+        >>> matrices = torch.tensor([[[1e200, 1.0], [0.0, 3e200]], [[1.0, torch.inf], [0.0, 1.0]]], dtype=torch.float64)
+        >>> real_eigenvalues(matrices).tolist()
+        [[1e+200, 3e+200], [1.0, 1.0]]
+    """
+    even, size = _even(matrix)
+    values: Tensor = torch.linalg.eigvals(torch.where(even.abs() < 1e-100, 0.0, even)).real
+    return values * size
+
+
+def _even(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """Matrices whose largest entry is 1, and its size ``(..., 1)``; entries that are not finite are 0."""
+    known = torch.where(matrix.isfinite(), matrix, 0.0)
+    size = known.detach().abs().amax((-2, -1), keepdim=True)
+    size = torch.where(size > 0, size, 1.0)
+    return known / size, size[..., 0]
+
+
 def by_eigh(gram: Tensor, dim: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Vectors, values, sum of 1 / eigenvalue over the others, and whether the next eigenvalue is numerically zero as well."""
     every, vectors = eigh(gram)

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from dyntorch.blocks import map_blocks, one_thread, workers
 from dyntorch.constrained import algebraic_motion
+from dyntorch.eigenspace import spectrum
 from dyntorch.forward import jacobian
 from dyntorch.invariant import Invariant
 from dyntorch.least_squares import minimize
@@ -166,7 +167,7 @@ def _covariance(
     weights: Tensor,
 ) -> Tensor:
     r"""Covariance ``(b, p, p)`` of the motion in the coordinates of the matches: :math:`\sigma^2 D H^+ D^T`, H of rank dof."""
-    values, vectors = torch.linalg.eigh(torch.where(matrix.isfinite(), matrix, torch.zeros_like(matrix)))
+    values, vectors = spectrum(matrix)
     count = min(invariant.dof, values.shape[-1])
     values, vectors = values[..., -count:], vectors[..., -count:]
     root = vectors * values.clamp(min=1e-12 * values[..., -1:].clamp(min=torch.finfo(values.dtype).tiny)).rsqrt()[..., None, :]

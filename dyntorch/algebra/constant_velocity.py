@@ -18,6 +18,7 @@ from torch.nn.functional import normalize
 
 from dyntorch.algebra.homogeneous import unit
 from dyntorch.algebra.projection import adjugate
+from dyntorch.eigenspace import spectrum
 from dyntorch.nullspace import null_space
 
 # 300 scenes each: with 24 matches and noise of 2e-3 of the scene the global minimum is found always (camera: always), with 21
@@ -78,7 +79,7 @@ def infinity_planes(tensor: Tensor) -> tuple[Tensor, Tensor]:
     """
     with torch.no_grad():
         alpha = _common_column(tensor)
-        beta = torch.linalg.eigh(_gram(tensor.transpose(-2, -3), alpha)).eigenvectors[..., -1]
+        beta = spectrum(_gram(tensor.transpose(-2, -3), alpha))[1][..., -1]
         for _ in range(ALTERNATIONS):
             alpha = _step(_gram(tensor, beta), alpha)
             beta = _step(_gram(tensor.transpose(-2, -3), alpha), beta)
@@ -206,8 +207,8 @@ def complement_frame(plane: Tensor) -> Tensor:
 def _common_column(tensor: Tensor) -> Tensor:
     """The vector that all slices of the third axis, of rank 2, have in their column space."""
     slices = tensor.movedim(-1, -3)
-    complement = torch.linalg.eigh(slices @ slices.mT).eigenvectors[..., :2]
-    return torch.linalg.eigh((complement @ complement.mT).sum(-3)).eigenvectors[..., 0]
+    complement = spectrum(slices @ slices.mT)[1][..., :2]
+    return spectrum((complement @ complement.mT).sum(-3))[1][..., 0]
 
 
 def _gram(tensor: Tensor, plane: Tensor) -> Tensor:

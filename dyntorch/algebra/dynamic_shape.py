@@ -11,6 +11,7 @@ from torch import Tensor
 from dyntorch.algebra.dynamic_shape_descent import Descent, Views, centred_views, descend, framed, project, shapes_at
 from dyntorch.algebra.dynamic_shape_linear import complete, graph_start, leading, pooled_start, window_start
 from dyntorch.blocks import one_thread
+from dyntorch.eigenspace import eigenvalues
 
 GAUGE = 9
 """Parameters of the shapes that no view can tell: a constant affine frame of the world."""
@@ -120,7 +121,10 @@ def _checked(x: Tensor, rows: Tensor, weights: Tensor | None, share: Tensor | No
     if weight is not None and bool((weight < 0).any()):
         raise ValueError(f"weights must not be negative, got {float(weight.min()):g}; use 0 to leave a point out")
     views = centred_views(x.double().reshape(flat, count, n, 2), weight, part)
-    return batch, views, torch.where(known[..., None], wide, 0.0)
+    wide = torch.where(known[..., None], wide, 0.0)
+    # shapes have no size: in the unit of the largest function no product of three leaves the range
+    largest = wide.abs().flatten(1).amax(-1)[:, None, None] if wide.numel() else wide.new_ones(())
+    return batch, views, wide / torch.where(largest > 0, largest, 1.0)
 
 
 def _few(views: Views, rows: Tensor) -> Tensor:
@@ -174,4 +178,4 @@ def _uncertainty(views: Views, rows: Tensor, shapes: Tensor, cost: Tensor) -> tu
 def _eigenvalues(views: Views, rows: Tensor, shapes: Tensor) -> Tensor:
     """Of the normal matrix, ascending ``(b, 3 n B)``."""
     matrix = Descent(views, rows).normal_equations(shapes.flatten(1))[2]
-    return torch.linalg.eigvalsh(torch.where(matrix.isfinite(), matrix, 0.0))
+    return eigenvalues(matrix)

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.algebra.homogeneous import nonzero_sign
+from dyntorch.eigenspace import eigh
 from dyntorch.least_squares import minimize
 
 FLAT = 1e-12
@@ -130,7 +131,7 @@ def framed(shapes: Tensor) -> Tensor:
     """:func:`canonical` with the columns of :math:`X_0` orthogonal, the longest first: one representative of each family."""
     moved = canonical(shapes)
     first = moved[:, 0]
-    axes = torch.linalg.eigh(first.mT @ first)[1].flip(-1)
+    axes = eigh(first.mT @ first)[1].flip(-1)
     turned = moved @ axes[:, None]
     flat = turned.flatten(1, 2)
     return turned * nonzero_sign(flat.take_along_dim(flat.abs().argmax(1, keepdim=True), 1))[:, None]

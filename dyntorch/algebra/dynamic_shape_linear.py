@@ -9,6 +9,7 @@ from torch import Tensor
 
 from dyntorch.algebra.dynamic_shape_descent import Views, canonical
 from dyntorch.algebra.shape_rows import centred
+from dyntorch.eigenspace import spectrum
 from dyntorch.nullspace import gram_null_space, null_space
 
 RANK = 1e-9
@@ -100,7 +101,7 @@ def _regressed(basis: Tensor, x: Tensor) -> Tensor:
 def leading(x: Tensor, share: Tensor, count: int = 3) -> Tensor:
     """The directions ``(..., n, count)`` with the most energy in views ``(..., views, n, 2)``."""
     scatter = (x * share[..., None, None]).movedim(-3, -2).flatten(-2) @ x.movedim(-3, -2).flatten(-2).mT
-    return torch.linalg.eigh(torch.where(scatter.isfinite(), scatter, 0.0))[1][..., -count:].flip(-1)
+    return spectrum(scatter)[1][..., -count:].flip(-1)
 
 
 def products(rows: Tensor) -> Tensor:
@@ -110,7 +111,7 @@ def products(rows: Tensor) -> Tensor:
     cubes = rows[..., places].prod(-1)
     u, s, _ = torch.linalg.svd(cubes, full_matrices=False)
     # one width for the whole batch: a function more than a problem can tell is one it cannot tell either
-    return u[..., : max((s > RANK * s[..., :1]).sum(-1).tolist(), default=size)]
+    return u[..., : max((s > RANK * s[..., :1]).sum(-1).clamp(min=1).tolist(), default=size)]
 
 
 def shapes_through(bases: Tensor, rows: Tensor, share: Tensor) -> Tensor:

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from dyntorch.arguments import check_tensor
 from dyntorch.blocks import one_thread
+from dyntorch.eigenspace import eigh
 
 
 @one_thread
@@ -58,22 +59,24 @@ def metric_upgrade(shape: Tensor, cameras: Tensor) -> tuple[Tensor, Tensor]:
         metric shape ``(points, 3)``, and whether the cameras decide it (``False``: Q is not positive definite, or the
         views are too few or too alike; the shape returned is then the affine one, unchanged).
     """
-    a, b = cameras[..., 0].double(), cameras[..., 1].double()
+    largest = cameras.double().abs().amax() if cameras.numel() else torch.ones((), device=cameras.device)
+    scaled = cameras.double() / torch.where(largest > 0, largest, 1.0)  # no square leaves the range
+    a, b = scaled.unbind(-1)
     extent = shape.double().norm(dim=0)
     # a flat shape leaves the third row of the cameras to chance
-    if len(cameras) < 3 or not extent.min() > 1e-6 * extent.max():
+    if len(cameras) < 3 or not (extent.min() > 1e-6 * extent.max()) & extent.max().isfinite() & largest.isfinite():
         return shape, torch.tensor(False, device=shape.device)
     rows = torch.cat([_quadratic(a, b), _quadratic(a, a) - _quadratic(b, b)])
     _, s, vt = torch.linalg.svd(rows, full_matrices=True)
     q = vt[-1]
     matrix = torch.stack([q[[0, 1, 2]], q[[1, 3, 4]], q[[2, 4, 5]]])
     matrix = matrix * torch.sign(torch.trace(matrix))
-    values, vectors = torch.linalg.eigh(matrix)
+    values, vectors = eigh(matrix)
     # one solution only where the fifth singular value stands clear of the noise floor
     if not (values[0] > 1e-3 * values[-1] and s[4] > 1e-3 * s[0]):
         return shape, torch.tensor(False, device=shape.device)
     half = vectors * values.sqrt()
-    upright = _vertical(cameras.double().transpose(-1, -2) @ half)
+    upright = _vertical(scaled.mT @ half)
     metric = shape.double() @ torch.linalg.inv(half).mT @ upright
     return metric.to(shape.dtype), torch.tensor(True, device=shape.device)
 

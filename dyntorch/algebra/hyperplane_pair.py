@@ -9,6 +9,7 @@ from torch import Tensor
 
 from dyntorch.algebra.homogeneous import unit_vectors
 from dyntorch.blocks import one_thread
+from dyntorch.eigenspace import spectrum
 from dyntorch.nullspace import gram_null_space
 
 REWEIGHTINGS, CANDIDATES = 3, 4
@@ -181,7 +182,7 @@ def _quadrics(unit: Tensor, weights: Tensor, covariance: Tensor | None) -> tuple
 
 def _split(quadric: Tensor) -> Tensor:
     """The pairs ``(*batch, 2, K)`` of quadrics of rank two and mixed signs."""
-    values, vectors = torch.linalg.eigh(quadric)
+    values, vectors = spectrum(quadric)
     plus = vectors[..., -1] * values[..., -1:].clamp(min=0).sqrt()
     # noise can make it definite; a pair that is one plane would never part
     minus = vectors[..., 0] * (-values[..., :1]).clamp(min=0).sqrt()

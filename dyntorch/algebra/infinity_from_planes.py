@@ -23,6 +23,7 @@ from dyntorch.algebra.rank_one_pencils import (
     unit_determinant,
 )
 from dyntorch.algebra.rank_two import cofactors, null_vectors
+from dyntorch.eigenspace import real_eigenvalues
 from dyntorch.nullspace import gram_null_space
 
 BEAM = 243
@@ -92,7 +93,7 @@ def _scaled_candidates(planes: Tensor) -> Tensor:
     H_1 - t H_j is singular for the eigenvalues t of H_j^-1 H_1; real parts serve where noise made a pair complex.
     """
     inverse = cofactors(planes[:, 1:]).mT  # determinant 1
-    ratios = torch.linalg.eigvals(inverse @ planes[:, :1]).real
+    ratios = real_eigenvalues(inverse @ planes[:, :1])
     ratios = torch.cat([torch.ones_like(planes[:, :1, 0]), ratios], dim=1)
     return ratios[..., None, None] * planes[:, :, None]
 

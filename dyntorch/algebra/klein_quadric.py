@@ -9,6 +9,7 @@ from torch import Tensor
 
 from dyntorch.algebra.extensors import plucker_form
 from dyntorch.algebra.line_collineation import common_point, skew_line
+from dyntorch.eigenspace import eigh
 from dyntorch.nullspace import null_space
 
 VIEWS = 5
@@ -114,7 +115,7 @@ def klein_frame(projections: Tensor) -> Tensor:
         )
     stack, upper, good = _balanced(projections.double())
     symmetric = _quadric(stack)
-    values, vectors = torch.linalg.eigh(symmetric)
+    values, vectors = eigh(symmetric)
     form = plucker_form(device=projections.device)
     # the eigenvectors of J, ascending as those of S: the isometry between them is one of many, and any will do
     turn = torch.linalg.eigh(form).eigenvectors

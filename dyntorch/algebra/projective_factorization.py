@@ -11,6 +11,7 @@ from torch import Tensor
 from dyntorch.algebra.homogeneous import homogeneous, similarity
 from dyntorch.blocks import map_blocks, one_thread
 from dyntorch.devices import on_cpu
+from dyntorch.eigenspace import spectrum
 
 # earlier steps that are mixed; planar constant velocity, 8 views, exact: 100 iterations leave 2e-12 px, with 5 steps 2e-7 px,
 # and 300 iterations without mixing 2e-2 px
@@ -57,8 +58,8 @@ def projective_factorization(
         tolerance: of the change of the depths in one step, as a part of the residual.
 
     Returns:
-        projections, structure, residual, converged; without gradients.  A problem with too few complete points has
-        projections and structure 0, residual 1 and ``converged`` False.
+        projections, structure, residual, converged; without gradients.  A problem with too few complete points, or whose squared
+        coordinates leave the range of float64, has projections and structure 0, residual 1 and ``converged`` False.
 
     Raises:
         ValueError: shapes that do not fit, or fewer views or points than a reconstruction of this rank needs.
@@ -124,7 +125,9 @@ def _factorize(x: Tensor, complete: Tensor, rank: int, iterations: int, toleranc
     projections = back @ basis.unflatten(-2, (x.shape[1], x.shape[3] + 1))
     projections = projections / torch.linalg.matrix_norm(projections, keepdim=True)
     structure = torch.nn.functional.normalize(scaled.mT @ basis, dim=-1)
-    known = complete.any(-1)
+    # squares of coordinates may leave the range
+    finite = projections.flatten(1).isfinite().all(-1) & structure.flatten(1).isfinite().all(-1) & residual.isfinite()
+    known = complete.any(-1) & finite
     found = [torch.where(known[:, *[None] * (part.ndim - 1)], part, 0.0) for part in (projections, structure)]
     return found[0], found[1], torch.where(known, residual, 1.0), converged & known
 
@@ -170,7 +173,7 @@ def _next(depths: Tensor, rays: Tensor, columns: Tensor, rank: int) -> tuple[Ten
     _, basis, residual = _subspace(depths, rays, rank)
     seen = rays.transpose(1, 2)[..., None, :] @ basis.unflatten(-2, rays.shape[1::2])[:, None]  # (b, n, views, 1, K)
     seen = seen.squeeze(-2)
-    new = torch.linalg.eigh(seen @ seen.mT)[1][..., -1].mT
+    new = spectrum(seen @ seen.mT)[1][..., -1].mT
     new = new * torch.where((new * depths).sum(1, keepdim=True) < 0, -1.0, 1.0)
     return _balanced(new, columns), residual
 
@@ -178,7 +181,7 @@ def _next(depths: Tensor, rays: Tensor, columns: Tensor, rank: int) -> tuple[Ten
 def _subspace(depths: Tensor, rays: Tensor, rank: int) -> tuple[Tensor, Tensor, Tensor]:
     """Scaled measurements ``(b, views (l + 1), n)``, the basis ``(b, views (l + 1), K)`` of their best subspace, the residual."""
     scaled = (depths[..., None] * rays).mT.flatten(1, 2)
-    basis = torch.linalg.eigh(scaled @ scaled.mT)[1][..., -rank:]
+    basis = spectrum(scaled @ scaled.mT)[1][..., -rank:]
     # from the difference itself: the Gram matrix only knows it to half the digits
     rest = torch.linalg.matrix_norm(scaled - basis @ (basis.mT @ scaled))
     return scaled, basis, rest / torch.linalg.matrix_norm(scaled).clamp(min=1e-300)

@@ -85,8 +85,9 @@ def score(structure: Tensor, x: Tensor, frame: str) -> Tensor:
     cameras = torch.stack(dual_cameras(others) if frame == GENERAL else reference_cameras(others), dim=-3)
     q = canonical(x)[0] * seen[..., :4].amin(-1)[..., None, None]
     equations = (lines_through(q) @ cameras[..., None, :, :, :]).flatten(-3, -2)
-    values = torch.linalg.svdvals(equations)
-    known = (q != 0).any(-1).sum(-1) > 1
+    finite = equations.isfinite().flatten(-2).all(-1)  # a shape that could not be fitted has no cameras
+    values = torch.linalg.svdvals(torch.where(finite[..., None, None], equations, 0.0))
+    known = finite & ((q != 0).any(-1).sum(-1) > 1)
     return torch.where(known, values[..., 3] / values.norm(dim=-1).clamp(min=1e-300), torch.nan)
 
 

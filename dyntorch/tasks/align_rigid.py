@@ -7,6 +7,7 @@ from torch import Tensor
 
 from dyntorch.algebra.homogeneous import similarity
 from dyntorch.algebra.rigid import rigid_alignment
+from dyntorch.eigenspace import spectrum
 from dyntorch.matches import Matches
 from dyntorch.solution import NOISY, Status, failed
 from dyntorch.tasks.alignment import MOVING, OUTLIER, STATIC, Alignment
@@ -106,7 +107,7 @@ def _labels(data: Sightings, found: Rigid) -> Tensor:
 
 def _inverse(information: Tensor, dof: Tensor) -> tuple[Tensor, Tensor]:
     """Least eigenvalue ``(b,)`` of the degrees of freedom, and the pseudo-inverse ``(b, 12, 12)`` on them."""
-    values, vectors = torch.linalg.eigh(torch.where(information.isfinite().flatten(1).all(-1)[:, None, None], information, 0.0))
+    values, vectors = spectrum(torch.where(information.isfinite().flatten(1).all(-1)[:, None, None], information, 0.0))
     used = torch.arange(12, device=dof.device) >= 12 - dof[:, None]
     least = values.gather(-1, 12 - dof[:, None])[:, 0]
     floor = 1e-14 * values[:, -1:].clamp(min=torch.finfo(values.dtype).tiny)

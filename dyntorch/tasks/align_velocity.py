@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.blocks import map_blocks
+from dyntorch.eigenspace import spectrum
 from dyntorch.fitting import fit_matches
 from dyntorch.invariants.constant_velocity_tensor import ConstantVelocityTensor
 from dyntorch.matches import Matches
@@ -136,8 +137,7 @@ def _conditions(points: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor
     total = weights.sum(-1, keepdim=True).clamp(min=torch.finfo(weights.dtype).tiny)
     mean = (weights[..., None] * points).sum(-2) / total
     centred = (points - mean[..., None, :]) * weights.sqrt()[..., None]
-    gram = centred.mT @ centred
-    values, vectors = torch.linalg.eigh(gram)
+    values, vectors = spectrum(centred.mT @ centred)
     ok = (values[..., 3] > HELD * values[..., 8]) & ((weights > 0).sum(-1) >= MINIMAL[True])
     return vectors[..., :3].mT, mean, ok
 

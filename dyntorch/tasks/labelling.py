@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from dyntorch.eigenspace import spectrum
 from dyntorch.invariant import Invariant
 from dyntorch.matches import Matches
 from dyntorch.motion_problem import Problem
@@ -161,7 +162,7 @@ class Evidence:
         and the covariance ``(b, p, p)`` of theta for noise 1."""
         _, _, matrix = self.problem(labels).normal_equations(theta)
         finite = matrix.isfinite().flatten(1).all(-1)
-        values, vectors = torch.linalg.eigh(torch.where(finite[:, None, None], matrix, 0.0))
+        values, vectors = spectrum(torch.where(finite[:, None, None], matrix, 0.0))
         values, vectors = values[:, -self.invariant.dof :], vectors[..., -self.invariant.dof :]
         floor = 1e-12 * values[:, -1:].clamp(min=torch.finfo(values.dtype).tiny)
         root = vectors * values.clamp(min=floor).rsqrt()[:, None, :]

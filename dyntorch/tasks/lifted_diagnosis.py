@@ -11,6 +11,7 @@ from torch import Tensor
 from dyntorch.algebra.hyperplane_pair import hyperplane_pair
 from dyntorch.algebra.lift_frames import behind
 from dyntorch.algebra.triangulation import unit_projections
+from dyntorch.eigenspace import eigenvalues
 from dyntorch.motions import MOTIONS, Motion, polynomial
 from dyntorch.solution import NOISY, Status, failed
 from dyntorch.tasks.lifted_bodies import bodies_of
@@ -272,7 +273,7 @@ def _images(tracks: Tracks, scene: Scene, lifting: Lifting | None, noise: Tensor
     seen = (tracks.weights > 0).to(tracks.x.dtype)
     number = seen.sum(-1).clamp(min=1)[..., None]
     off = (tracks.x - (seen[..., None] * tracks.x).sum(2, keepdim=True) / number[..., None]) * seen[..., None]
-    across = torch.linalg.eigvalsh(off.mT @ off / number[..., None])[..., -2].clamp(min=0).sqrt()
+    across = eigenvalues(off.mT @ off / number[..., None])[..., -2].clamp(min=0).sqrt()
     across = torch.where(seen.sum(-1) > 2, across, torch.inf).amin(1)
     thin = across / noise.nan_to_num(posinf=0.0).clamp(min=EXACT)
     text = "the images of a view lie on a line, to {value:.2g} standard deviations; points off it are needed"

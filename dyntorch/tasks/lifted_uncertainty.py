@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.blocks import map_blocks
+from dyntorch.eigenspace import spectrum
 
 BLOCK = 1 << 17
 """Entries of the largest array per block of the batch: 200 problems of 3 views and 60 points of P^4 take 0.10 s, 2^21 0.17 s."""
@@ -73,7 +74,7 @@ def _uncertainty(block: tuple[Tensor, ...], gauge: int, step: int) -> Tensor:
     blocks = torch.einsum("bvnlp,bvnlq->bvpq", by_camera, by_camera)
     whole = torch.diag_embed(blocks.permute(0, 2, 3, 1)).permute(0, 3, 1, 4, 2).flatten(3).flatten(1, 2)
     reduced = whole - whitened.flatten(1, 2).mT @ whitened.flatten(1, 2)
-    values, vectors = torch.linalg.eigh(reduced.nan_to_num(0.0, 0.0, 0.0))
+    values, vectors = spectrum(reduced)
     seen = (weights > 0).any(-1).sum(-1)
     open_ = seen + gauge + (weights.shape[1] - seen) * cameras.shape[-2] * cameras.shape[-1]
     free = torch.arange(values.shape[-1], device=values.device) >= open_[:, None]

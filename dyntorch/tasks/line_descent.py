@@ -13,6 +13,7 @@ from dyntorch.algebra.extensors import plucker_form
 from dyntorch.algebra.homogeneous import apply, finite_depth, homogeneous, similarity
 from dyntorch.algebra.klein_quadric import nearest_line
 from dyntorch.algebra.line_cameras import line_camera
+from dyntorch.eigenspace import eigenvalues
 from dyntorch.least_squares import damped_step
 
 STEPS = 15
@@ -194,6 +195,6 @@ def _spread(matrix: Tensor, size: Tensor, constraints: int) -> Tensor:
     """Trace of the inverse along the surface; infinite where a direction is free."""
     sound = matrix.isfinite().flatten(-2).all(-1) & size.isfinite()
     eye = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
-    values = torch.linalg.eigvalsh(torch.where(sound[..., None, None], matrix / size[..., None, None], eye))
+    values = eigenvalues(torch.where(sound[..., None, None], matrix / size[..., None, None], eye))
     free = ~sound | (values[..., 0] < FREE)
     return torch.where(free, torch.inf, (values.clamp(min=FREE).reciprocal().sum(-1) - constraints).clamp(min=0) / size)

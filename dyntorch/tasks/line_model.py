@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from dyntorch.algebra.homogeneous import homogeneous, unit
+from dyntorch.eigenspace import spectrum
 from dyntorch.forward import by_match, derivatives
 from dyntorch.invariants.agreement import point_error, static_residual
 from dyntorch.invariants.translating_lines_matrix import TranslatingLinesMatrix
@@ -172,7 +173,7 @@ def refined(lines: Lines, theta: Tensor, labels: Tensor) -> Tensor:
 def spread(lines: Lines, theta: Tensor, labels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Extreme information ``(b, 2)`` on A, A ``(b, 4, 4)`` as measured, and its covariance ``(b, 16, 16)`` for noise 1."""
     _, _, matrix = _equations(lines, theta, labels)
-    values, vectors = torch.linalg.eigh(torch.where(matrix.isfinite(), matrix, 0.0))
+    values, vectors = spectrum(matrix)
     values, vectors = values[:, -DOF:], vectors[..., -DOF:]
     root = vectors * values.clamp(min=1e-12 * values[:, -1:].clamp(min=1e-300)).rsqrt()[:, None]
 

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from dyntorch.algebra.homogeneous import two_sided
 from dyntorch.algebra.rigid import nearest_rotation
+from dyntorch.eigenspace import eigenvalues
 from dyntorch.solution import Status
 from dyntorch.tasks.planes_input import Given
 
@@ -89,7 +90,7 @@ def misfit(given: Given, cost: Tensor, separate: Tensor) -> Misfit:
         vagueness = sigma.minimum(variance.sqrt()) / _extent(given).clamp(min=torch.finfo(sigma.dtype).tiny)
         return Misfit(ratio, excess, apart, torch.zeros_like(apart), vagueness, (vagueness > VAGUE) & (spare > 0))
     entries = given.homographies.flatten(-2)
-    different = used[:, :p].sum(-1) - torch.linalg.eigvalsh(entries.mT @ entries)[:, -1]
+    different = used[:, :p].sum(-1) - eigenvalues(entries.mT @ entries)[:, -1]
     ratio = sigma / (different / (rows - 8).clamp(min=1)).clamp(min=torch.finfo(sigma.dtype).tiny).sqrt()
     told = (spare > 1) & (used[:, p:].sum(-1) == 0) & (sigma > ROUNDING)
     chance = told & (ratio > CHANCE - NARROW / spare.clamp(min=1).sqrt())

@@ -9,6 +9,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from dyntorch.eigenspace import spectrum
 from dyntorch.tasks.notices import Notice, NoticeCode, notices
 from dyntorch.tasks.planes_input import Given
 
@@ -176,7 +177,7 @@ def _message(code: NoticeCode, matched: bool) -> tuple[str, str]:
 def _flatness(vectors: Tensor, covariance: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
     """Smallest over largest singular value ``(b,)`` of at least three vectors, and whether it is 0 within the noise."""
     kept = torch.where(count[..., None], vectors, 0.0)
-    values, directions = torch.linalg.eigh((kept.mT @ kept).nan_to_num())
+    values, directions = spectrum(kept.mT @ kept)
     ratio = (values[:, 0].clamp(min=0) / values[:, 2].clamp(min=1e-30)).sqrt()
     across = directions[:, None, :, 0]
     distance = (kept * across).sum(-1)

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.algebra.homogeneous import unit_vectors
+from dyntorch.eigenspace import spectrum
 from dyntorch.least_squares import minimize
 from dyntorch.tasks.planes_problem import Layout, Matches, Matrices, PlanesProblem
 from dyntorch.tasks.planes_starts import parameters, starts
@@ -140,7 +141,7 @@ def _covariance(problem: PlanesProblem, theta: Tensor) -> tuple[Tensor, Tensor]:
     unit = torch.where(none, torch.inf, size)
     gauges = unit_vectors(_gauges(problem.layout, theta) * torch.where(none, 0.0, size)[:, None]).mT
     scaled = matrix / (unit[:, :, None] * unit[:, None]) + gauges @ gauges.mT + torch.diag_embed(none.to(matrix.dtype))
-    values, vectors = torch.linalg.eigh(scaled.nan_to_num())
+    values, vectors = spectrum(scaled)
     inverse = (vectors / values.clamp(min=FLOOR)[:, None, :]) @ vectors.mT / (unit[:, :, None] * unit[:, None])
     spread = projected(inverse[:, :9, :9], theta[:, :9]).diagonal(dim1=-2, dim2=-1).sum(-1)
     least = 1 / matrix[:, :9, :9].diagonal(dim1=-2, dim2=-1).mean(-1).clamp(min=torch.finfo(matrix.dtype).tiny)

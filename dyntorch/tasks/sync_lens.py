@@ -239,6 +239,8 @@ class Fit:
     def sigmas(self, data: Matches, scale: Tensor) -> Tensor:
         """Standard deviations ``(2,)`` of lambda for errors of one ``scale``."""
         matrix = self._normal(data, scale)[1][0]
+        if not bool(matrix.isfinite().all()):
+            return matrix.new_full((2,), torch.inf)
         return torch.linalg.pinv(matrix, hermitian=True).diagonal()[7:].clamp(min=0).sqrt()
 
 

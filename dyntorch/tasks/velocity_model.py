@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.algebra.homogeneous import apply, unit
+from dyntorch.eigenspace import spectrum
 from dyntorch.forward import derivatives
 from dyntorch.invariants.constant_velocity_tensor import ConstantVelocityTensor
 from dyntorch.least_squares import damped_step
@@ -101,8 +102,7 @@ def information(evidence: Evidence, state: Velocities, affine: bool) -> tuple[Te
     """
     _, _, matrix = evidence.problem(state.labels).normal_equations(state.theta)
     free = _free(state.theta, affine)
-    matrix = torch.where(matrix.isfinite(), matrix, 0.0) * free * free[:, None]
-    values, vectors = torch.linalg.eigh(matrix)
+    values, vectors = spectrum(matrix * free * free[:, None])
     dof = DOF[affine] + GAUGE * state.grounded.long()
     used = torch.arange(48, device=dof.device) >= 48 - dof[:, None]
     least = values.gather(-1, 48 - dof[:, None])[:, 0]

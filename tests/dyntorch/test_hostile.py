@@ -1,5 +1,6 @@
 """Hostile numbers and types: a ValueError that names the argument, or an honest status, and never a NaN."""
 
+import math
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -11,11 +12,13 @@ import dyntorch as dyn
 from dyntorch import scenes
 from dyntorch.algebra.affine_segmentation import affine_segmentation
 from dyntorch.algebra.factorization import affine_factorization
+from dyntorch.algebra.infinity_from_planes import infinity_closed_form
 from dyntorch.algebra.subspaces import canonical_correlation, orthonormal_basis
 from dyntorch.algebra.triangulation import reproject, resect, triangulate
 from dyntorch.bundle_adjustment import bundle_adjust
 from dyntorch.bundle_information import structure_covariance
 from dyntorch.counting import count, dim_v
+from dyntorch.eigenspace import eigenvalues, real_eigenvalues, spectrum
 from dyntorch.invariants.multibody import multibody_matrix
 from dyntorch.nullspace import null_space
 from dyntorch.sampling import Draws
@@ -85,6 +88,81 @@ def test_anything_gives_a_value_error_or_numbers(name):
             found = tried(*arguments[:i], bad, *arguments[i + 1 :])
             assert not isinstance(found, str) or (len(found) < 300 and "\n" not in found)
             assert not any(x.is_floating_point() and x.isnan().any() for x in tensors(found))
+
+
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf, 1e300, 1e-310])
+def test_eigenvalues_of_a_hostile_matrix_leave_its_neighbours_alone(bad):
+    matrices = numbers(3, 4, 4)
+    matrices = matrices + matrices.mT
+    hostile = matrices.clone()
+    hostile[1] = bad
+    values, vectors = spectrum(hostile)
+    expected = spectrum(matrices)
+    for found in (values, eigenvalues(hostile)):
+        assert torch.allclose(found[::2], expected[0][::2], rtol=0, atol=1e-12) and found.isfinite().all()
+    assert torch.equal(vectors[::2], expected[1][::2])
+    held = bad if math.isfinite(bad) else 0.0
+    assert values[1, -1] == pytest.approx(4 * held, rel=1e-9)
+    assert real_eigenvalues(hostile).amax(-1)[0] == pytest.approx(float(values[0, -1]))
+
+
+@pytest.mark.parametrize("frame", ["general", "plane"])
+def test_a_failed_shape_leaves_the_scores_of_others_alone(frame):
+    structure = numbers(6, 4)
+    if frame == "plane":
+        structure[:4, 2] = 0.0
+    points = reproject(numbers(4, 3, 4, seed=2), structure).unbind(-2)
+    family = dyn.ShapeTensor(frame, 6)
+    tensor = family.compose(structure)
+    found = family.score(torch.stack([torch.zeros_like(tensor), tensor]), *(x.expand(2, -1, -1) for x in points))
+    assert found[0].isnan().all() and found[1].max() < 1e-9
+
+
+@pytest.mark.parametrize("scale", [1e160, 1e300, 0.0])
+def test_times_out_of_range_leave_other_moving_shapes_alone(scale):
+    rows = dyn.Polynomial(1).rows(torch.linspace(-1, 1, 12, dtype=F64))
+    x = torch.einsum("vb,bnk,vkd->vnd", rows, numbers(2, 8, 3), numbers(12, 3, 2, seed=1)).expand(2, -1, -1, -1)
+    both = dyn.fit_shapes(x, torch.stack([rows, scale * rows]))
+    alone = dyn.fit_shapes(x[:1], rows[None])
+    assert torch.allclose(both.residual[0], alone.residual[0], rtol=0, atol=1e-9) and both.residual[0].max() < 1e-9
+    assert not any(part.is_floating_point() and part.isnan().any() for part in tensors(both))
+
+
+@pytest.mark.parametrize("scale", [1e-160, 1e300, torch.nan])
+def test_images_out_of_range_leave_other_factorizations_alone(scale):
+    both = dyn.projective_factorization(torch.stack([IMAGES, scale * IMAGES]), 4)
+    alone = dyn.projective_factorization(IMAGES, 4)
+    assert both.converged[0] and both.residual[0] < 1e-9 and alone.residual < 1e-9
+    assert not any(part.is_floating_point() and part.isnan().any() for part in tensors(both))
+
+
+def test_cameras_of_any_unit_and_such_that_are_not_finite():
+    turn = torch.linalg.qr(torch.randn(5, 3, 3, generator=seeded(4), dtype=F64))[0]
+    shape, cameras, _ = affine_factorization(numbers(20, 3) @ turn[:, :2].mT)
+    expected, known = dyn.metric_upgrade(shape, cameras)
+    assert known
+    for scale in (1e-200, 1e200):
+        found, known = dyn.metric_upgrade(shape, scale * cameras)
+        assert known and torch.allclose(found / found.norm(), expected / expected.norm(), atol=1e-9)
+    for bad in (torch.nan, torch.inf):
+        found, known = dyn.metric_upgrade(shape, bad * cameras)
+        assert not known and torch.equal(found, shape)
+
+
+def test_planes_whose_entries_lie_far_apart_leave_others_alone():
+    draw = seeded()
+    exponents = -300 * torch.rand(300, 4, 3, 3, generator=draw, dtype=F64)
+    planes = torch.randn(300, 4, 3, 3, generator=draw, dtype=F64) * 10**exponents
+    e, n = torch.rand(2, 4, 3, generator=draw, dtype=F64)
+    planes[7] = torch.eye(3, dtype=F64) + e[:, :, None] * n[:, None, :]
+    found, residual = infinity_closed_form(planes)
+    assert residual[7] < 1e-9 and torch.allclose(found[7].abs(), torch.eye(3, dtype=F64), atol=1e-7) and found.isfinite().all()
+
+
+def test_a_lens_is_not_believed_where_points_leave_the_range():
+    views = scenes.two_view(60, sigma=0.1, generator=seeded()).views
+    found = dyn.fit_distortion(1e160 * views[0], views[1], sizes=((640, 480),) * 2)
+    assert not found.significant
 
 
 def test_infinite_weights_are_missing_matches():
