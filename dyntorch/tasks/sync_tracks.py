@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.algebra.homogeneous import similarity
+from dyntorch.arguments import FARTHEST
 
 RATES = 0.02
 """A frame rate as told is wrong by no more than this share."""
@@ -110,7 +111,7 @@ def read_tracks(name: str, x: Tensor, fps: float | None, times: Tensor | None, w
         at = int((steps <= 0).nonzero()[0, 0]) + 1
         raise ValueError(f"times of {name} must increase, but frame {at} is not after the one before; sort or drop such frames")
     _check_dense(name, clock)
-    seen = x.isfinite().all(-1)
+    seen = (x.double().abs() <= FARTHEST).all(-1)
     if weights is None:
         given = seen.double()
     else:

@@ -296,3 +296,13 @@ def test_unrelated_bodies_are_not_explained_by_each_other():
         found = reconstruct_pair(wandering(12, generator), wandering(14, generator), 0.0, fps=30.0)
         assert found.status == Status.NO_CONSENSUS and not found.labels.any()
         assert found.warnings[0].code == NoticeCode.CHANCE
+
+
+@pytest.mark.parametrize("scale", [1e-160, 1e70, 1e160, 1e300])
+@pytest.mark.parametrize("camera", [0, 1])
+def test_coordinates_of_any_size_are_a_status(scale: float, camera: int) -> None:
+    scene = nonrigid_pair(8, 8, 40, sigma=0.3, generator=torch.Generator().manual_seed(0))
+    tracks = [x * scale if i == camera else x for i, x in enumerate((scene.a, scene.b))]
+    found = reconstruct_pair(*tracks, scene.offset, fps=scene.fps)
+    assert found.status == (Status.TOO_FEW if scale > 1 else Status.NO_CONSENSUS)
+    assert [notice.code for notice in found.warnings] == [NoticeCode.FEW_POINTS]
