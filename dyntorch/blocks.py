@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import lru_cache, wraps
 from threading import Barrier, local
@@ -56,12 +56,10 @@ def one_thread(function: Callable[P, R]) -> Callable[P, R]:
         if threads == 1 or _caller.threads is not None:
             return function(*args, **kwargs)
         _caller.threads = threads
-        kept = _set_threads(1, others=threads)
+        _set_threads(1, others=threads)
         try:
             return function(*args, **kwargs)
         finally:
-            # only here: a busy machine takes as long to wake a thread as a small problem takes to solve
-            kept.result()
             _caller.threads = None
             torch.set_num_threads(threads)
 
@@ -83,11 +81,11 @@ def _outside(x: Any) -> Any:
     return x
 
 
-def _set_threads(count: int, others: int) -> Future[None]:
-    """Threads for the operations of this Python thread; those that start later, when the future is done, get ``others``."""
+def _set_threads(count: int, others: int) -> None:
+    """Threads for the operations of this Python thread; those that start later get ``others``."""
     torch.set_num_threads(count)
     # the setting holds per thread, but new threads inherit the last one, whoever set it
-    return _keeper().submit(torch.set_num_threads, others)
+    _keeper().submit(torch.set_num_threads, others).result()
 
 
 @lru_cache(maxsize=1)
@@ -106,7 +104,7 @@ def _all_threads(tensors: tuple[Tensor, ...]) -> Iterator[None]:
     try:
         yield
     finally:
-        _set_threads(1, others=threads).result()
+        _set_threads(1, others=threads)
 
 
 def map_blocks(function: Callable[..., Result], *tensors: Tensor, size: int) -> Result:
@@ -175,7 +173,7 @@ def _pool(threads: int) -> ThreadPoolExecutor:
     started = Barrier(threads)
     for _ in pool.map(lambda _: started.wait(), range(threads)):
         pass
-    _set_threads(own, others=threads).result()
+    _set_threads(own, others=threads)
     return pool
 
 
