@@ -113,8 +113,8 @@ def map_blocks(function: Callable[..., Result], *tensors: Tensor, size: int) -> 
     On the CPU torch factorizes a batch of matrices one after the other on one core (``svd``, ``eigh``, ``cholesky`` and
     the triangular solves), and releases the interpreter meanwhile; threads over blocks give the other cores their share.
     The pool has :func:`workers` workers, whose own operations run on one thread each: also a single block of many
-    small problems goes there, because teams of threads on small operations cost ten times what they gain.  A single problem,
-    one thread or an accelerator needs no pool.  The caller's grad mode holds in the workers.
+    small problems goes there from a caller with several threads, because teams of threads on small operations cost ten times what
+    they gain.  A single problem, one thread or an accelerator needs no pool.  The caller's grad mode holds in the workers.
 
     Args:
         function: takes one block per tensor and returns a tensor, or a tuple of tensors, with the same leading dimension.
@@ -141,6 +141,8 @@ def map_blocks(function: Callable[..., Result], *tensors: Tensor, size: int) -> 
     if len(tensors[0]) <= min(size, 1) or (threads == 1 and len(tensors[0]) <= size):
         with _all_threads(tensors):
             return function(*tensors)
+    if len(tensors[0]) <= size and torch.get_num_threads() == 1:
+        return function(*tensors)
     blocks = list(zip(*(tensor.split(size) for tensor in tensors), strict=True))
     if threads == 1:
         return _concatenate([function(*block) for block in blocks])

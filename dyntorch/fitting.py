@@ -32,9 +32,10 @@ the noise outweighs it a thousandfold anyway."""
 WEAK = 5e5
 """Trace of the Gram times the harmonic sum of its other eigenvalues above which noise may reach the last of them.  General motion
 has 1e4 (lines) to 3e5 (constant velocity, 60 matches), data of lower rank 1e6 at noise of 1 % of the scene and 1e9 at 0.03 %."""
-BLOCK, LEAST = 5 << 19, 16
-"""Numbers in the largest temporary of one block of the batch, summed in pieces by the Gram, and fewest problems in a block that
-is cut for the sake of another core.  Measured best: 364 problems of 200 points of the plane (47 us each; 128: 59), 131 of space."""
+BLOCK, LEAST = 5 << 19, 1 << 20
+"""Numbers in the largest temporary of one block of the batch, summed in pieces by the Gram, and fewest in a block that is cut for
+the sake of another core.  Measured best: 364 problems of 200 points of the plane (47 us each; 128: 59), 131 of space.  100 problems
+of 100 points take 3.9 ms on one core; cut for two they take 5.5."""
 
 
 @one_thread
@@ -101,7 +102,8 @@ def fit_matches(invariant: Invariant, data: Matches, *, normalize: bool = True) 
         return _solve(invariant, block[: len(views)], block[len(views)], block[len(views) + 1 :], normalize)
 
     per_problem = data.count * max(1, invariant.copies or 1) * _largest(invariant)
-    size = min(max(1, BLOCK // max(1, per_problem)), max(LEAST, -(-len(weights) // workers())))
+    most, least = (max(1, number // max(1, per_problem)) for number in (BLOCK, LEAST))
+    size = min(most, max(least, -(-len(weights) // workers())))
     parts = map_blocks(solve, *views, weights, *options, size=size)
     normalized, tensor, status, uncertainty = parts[:4]
     count = len(invariant.primitives)
