@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
 
 import dyntorch as dyn
 from dyntorch import scenes
-from dyntorch.motions import MOTIONS
+from dyntorch.motions import MOTIONS, Motion
 from dyntorch.solution import Status
+from dyntorch.tasks import lifted_choice
 from dyntorch.tasks.lifted_choice import LABEL, OUTLIER, Fit, _lacks, least, penalized
+from dyntorch.tasks.lifted_projections import Tracks
 from dyntorch.tasks.reconstruct import normalized
+from dyntorch.tasks.reconstruction import Reconstruction
 
 
 @pytest.mark.parametrize("name", ["static_3d", "constant_velocity_2d", "constant_direction_3d", "two_bodies_3d"])
@@ -54,3 +59,26 @@ def test_models_that_were_not_tried_say_why() -> None:
 
 def test_fewest_tracks_of_two_bodies() -> None:
     assert least(MOTIONS["two_bodies_3d"], torch.arange(5.0)) == (3, 14)
+
+
+@pytest.mark.parametrize(("wrong", "all_tried"), [(0, False), (1, False), (3, True)])
+def test_models_are_all_fitted_robustly_only_where_outliers_mislead_least_squares(
+    monkeypatch: pytest.MonkeyPatch, wrong: int, all_tried: bool
+) -> None:
+    tried: list[Reconstruction] = []
+    solve = lifted_choice.solve
+
+    def noted(tracks: Tracks, motion: Motion, *rest: Any) -> Reconstruction:
+        # the others need not be solved: only whether they are asked for matters
+        tried.append(replace(tried[0], motion=motion) if tried else solve(tracks, motion, *rest))
+        return tried[-1]
+
+    monkeypatch.setattr(lifted_choice, "solve", noted)
+    scene = scenes.lifted("constant_velocity_2d", 80, views=4, sigma=0.5, generator=torch.Generator().manual_seed(7))
+    tracks, draw = scene.tracks.clone(), torch.Generator().manual_seed(1)
+    # 2.5 px is no gross error
+    off = 2.5 * torch.ones(1, 2) if wrong == 1 else 100 * torch.randn(wrong, 2, generator=draw)
+    tracks[2, :wrong] += off.double()
+    found = dyn.reconstruct(tracks, "auto", generator=draw)
+    assert (len(tried) > 5) is all_tried
+    assert all_tried or (found.status == Status.OK and found.motion.name == "constant_velocity_2d")
