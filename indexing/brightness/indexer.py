@@ -214,6 +214,7 @@ class BrightnessIndexer(SavedClassifier):
     def _stream(self, fps: float | None, name: str) -> BrightnessStream:
         return BrightnessStream(self.recognizer_, len(self.classes_), name, fps)
 
+    @one_thread
     def score_frames(self, video: Any) -> Array:
         """``(frames, classes)`` score of every frame of an untrimmed video; that of frame t needs the frames up to t alone."""
         return self._scan(video, None)[1]
@@ -237,7 +238,6 @@ class BrightnessIndexer(SavedClassifier):
         wrong = wrong_evidence(self.recognizer_, self.exemplars_)[1]
         return times, scores, found_events(scores, times, energy, self.classes_, wrong, self.reject)
 
-    @one_thread
     def _scan(self, video: Any, progress: Callable[[float], None] | None) -> tuple[Array, Array, Array]:
         check_is_fitted(self, "exemplars_")
         source = footage(video, "video", float(self.fps))

@@ -88,7 +88,6 @@ class BrightnessStream:
         self.latest = np.zeros(classes)
         self.energy = 0.0
 
-    @one_thread
     def push(self, frames: Any, times: Any = None) -> Array:
         """Scores of one more frame, or of several.
 
