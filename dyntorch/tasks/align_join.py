@@ -71,20 +71,31 @@ def _search(evidence: Evidence, threshold: float | None, model: str, generator: 
     starts = [_from_static(evidence, given, generator)]
     if evidence.data.count >= MINIMAL[model]:
         starts.append(_from_tensor(MinimalJoinTensor(), evidence, given, generator))
-        if model == "join" and evidence.data.count >= FULL:
-            # where the noise is known, so is whether a motion is the right one
-            doubt = torch.ones_like(evidence.floor) if given is None else _doubt(evidence, starts[1][0], given)
-            if bool(doubt.any()):
-                starts.append(_from_tensor(JoinTensor(), evidence.weighted(doubt), given, generator))
-    count, size = len(starts), len(evidence.floor)
-    # the least estimate is that of a motion most matches agree with; it may still be low, for static matches show half the noise
-    sigma = given if given is not None else 2 * torch.stack([noise for _, noise in starts]).amin(0).maximum(evidence.floor)
-    several, noise = evidence.repeated(count), sigma.repeat(count)
-    rough = torch.arange(count, device=sigma.device).repeat_interleave(size) == 0
-    theta = several.improved(torch.cat([start for start, _ in starts]), noise, rough)
-    best = several.cost(theta, noise).unflatten(0, (count, size)).argmin(0)
+    full, size = model == "join" and evidence.data.count >= FULL, len(evidence.floor)
+    if given is None:
+        if full:
+            starts.append(_from_tensor(JoinTensor(), evidence, None, generator))
+        # the least estimate is that of a motion most matches agree with; it may be low, for static matches show half the noise
+        sigma = 2 * torch.stack([noise for _, noise in starts]).amin(0).maximum(evidence.floor)
+        theta = _improved(evidence, [start for start, _ in starts], sigma, sampled=True)
+    else:
+        sigma, theta = given, _improved(evidence, [start for start, _ in starts], given, sampled=True)
+        # where the noise is known, so is whether the motion of the minimal tensor is the right one
+        doubt = _doubt(evidence, theta[-size:], given) if full else torch.zeros_like(given)
+        if bool(doubt.any()):
+            last, _ = _from_tensor(JoinTensor(), evidence.weighted(doubt), given, generator)
+            theta = torch.cat([theta, _improved(evidence, [last], given, sampled=False)])
+    count = len(theta) // size if size else 1
+    best = evidence.repeated(count).cost(theta, sigma.repeat(count)).unflatten(0, (count, size)).argmin(0)
     chosen = theta[best * size + torch.arange(size, device=best.device)]
     return evidence.settled(chosen, sigma, estimate=given is None)
+
+
+def _improved(evidence: Evidence, starts: list[Tensor], sigma: Tensor, *, sampled: bool) -> Tensor:
+    """All starts after :meth:`Evidence.improved`, ``(starts b, p)``; ``sampled``: the first is from a minimal sample."""
+    count, size = len(starts), len(sigma)
+    rough = (torch.arange(count, device=sigma.device).repeat_interleave(size) == 0) & sampled
+    return evidence.repeated(count).improved(torch.cat(starts), sigma.repeat(count), rough)
 
 
 def _doubt(evidence: Evidence, theta: Tensor, sigma: Tensor) -> Tensor:
@@ -92,7 +103,7 @@ def _doubt(evidence: Evidence, theta: Tensor, sigma: Tensor) -> Tensor:
 
     For the others a further start can only lead to the same motion: one that as many matches agree with shares some with it.
     """
-    labels = evidence.labels(evidence.improved(theta, sigma, torch.zeros_like(sigma, dtype=torch.bool)), sigma)
+    labels = evidence.labels(theta, sigma)
     moving, agreeing, present = ((labels == MOVING).sum(-1), (labels != OUTLIER).sum(-1), (evidence.data.weights > 0).sum(-1))
     return ((2 * agreeing <= present) | (moving * JoinTensor.codim <= JoinTensor.dof)).to(theta)
 
