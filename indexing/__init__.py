@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from indexing.brightness.indexer import BrightnessIndexer as BrightnessIndexer
     from indexing.clip import Clip as Clip
     from indexing.clip import ClipSet as ClipSet
-    from indexing.feature_indexer import FeatureIndexer as FeatureIndexer
     from indexing.indexer import ActionIndexer as ActionIndexer
     from indexing.phase.indexer import PhaseIndexer as PhaseIndexer
     from indexing.scoring import Event as Event
@@ -29,7 +28,6 @@ _HOME = {
     "ClipSet": "indexing.clip",
     "ActionIndexer": "indexing.indexer",
     "BrightnessIndexer": "indexing.brightness.indexer",
-    "FeatureIndexer": "indexing.feature_indexer",
     "PhaseIndexer": "indexing.phase.indexer",
     "Event": "indexing.scoring",
     "synchronize": "indexing.synchronization",

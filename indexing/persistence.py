@@ -185,7 +185,7 @@ def _model(parts: Parts, header: dict[str, Any], sizes: Sizes, layout: Layout | 
         moment_hub=parts.real("moment_hub", len(moments)),
         kernels=kernels,
         support=support,
-        machine=read_machine(parts, sizes.classes, len(support), "machine.") if support is not None else None,
+        machine=read_machine(parts, sizes.classes, len(support)) if support is not None else None,
         evidence_out=parts.real("evidence_out", None),
         blend=Blend(**blend),
         bodies=bodies,

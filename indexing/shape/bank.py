@@ -269,10 +269,10 @@ KERNEL_WIDTH = 0.5  # of the median distance; 1 costs 1-2 %
 SCALE_SAMPLE = 600  # windows whose distances set the kernel scales: their median is stable to 1 % from 300 on
 
 
-def kernel_scale(distances: Tensor, width: float = KERNEL_WIDTH) -> Tensor:
+def kernel_scale(distances: Tensor) -> Tensor:
     """The scale of a kernel from the ``(N, N)`` distances of its training rows: a share of the median between different rows."""
     off = ~torch.eye(len(distances), dtype=torch.bool, device=distances.device)
-    return width * distances[off].median().clamp(min=1e-6 / width)
+    return KERNEL_WIDTH * distances[off].median().clamp(min=1e-6 / KERNEL_WIDTH)
 
 
 def cosine_distance(a: Tensor, b: Tensor) -> Tensor:

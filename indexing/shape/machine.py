@@ -67,8 +67,8 @@ class PairwiseMachine:
         return votes + margins / (3 * (margins.abs() + 1))
 
 
-def read_machine(parts: Parts, classes: int, rows: int, before: str = "") -> PairwiseMachine:
-    """The machine of a model file, whose tensors are named ``before + support``, ``dual``, ``intercept`` and ``counts``.
+def read_machine(parts: Parts, classes: int, rows: int) -> PairwiseMachine:
+    """The machine of a model file, whose tensors are named ``machine.support``, ``dual``, ``intercept`` and ``counts``.
 
     Args:
         rows: of the training windows that are kept.
@@ -76,12 +76,12 @@ def read_machine(parts: Parts, classes: int, rows: int, before: str = "") -> Pai
     Raises:
         ValueError: its parts do not belong together.
     """
-    counts = parts.whole(f"{before}counts", classes, below=rows + 1)
+    counts = parts.whole("machine.counts", classes, below=rows + 1)
     if int(counts.sum()) != rows:
-        raise ValueError(f"{before}counts: {int(counts.sum())} support vectors, and {rows} are there")
+        raise ValueError(f"machine.counts: {int(counts.sum())} support vectors, and {rows} are there")
     return PairwiseMachine(
-        parts.whole(f"{before}support", rows),
-        parts.real(f"{before}dual", classes - 1, rows),
-        parts.real(f"{before}intercept", classes * (classes - 1) // 2),
+        parts.whole("machine.support", rows),
+        parts.real("machine.dual", classes - 1, rows),
+        parts.real("machine.intercept", classes * (classes - 1) // 2),
         counts,
     )

@@ -175,7 +175,7 @@ def films_read(path: Path) -> None:
 def _models(folder: Path) -> list[Seed]:
     import torch
 
-    from indexing import ActionIndexer, Clip, FeatureIndexer, PhaseIndexer
+    from indexing import ActionIndexer, Clip, PhaseIndexer
 
     def clips(count: int, frames: int = 40) -> list[Clip]:
         return [Clip(person(i, frames)[..., :2], fps=30.0, label=["a", "b", "c"][i % 3], name=f"q{i}") for i in range(count)]
@@ -184,8 +184,6 @@ def _models(folder: Path) -> list[Seed]:
     ActionIndexer(scorer="nearest", search=False, reject=0.2).fit(few).save(folder / "action_small.safetensors")
     ActionIndexer(search=False, virtual_views=1).fit(few).save(folder / "action.safetensors")
     PhaseIndexer(harmonics=1, course="once", mirror=False).fit(clips(3, 8)).save(folder / "phase.safetensors")
-    features = np.random.default_rng(0).normal(size=(12, 3)) + np.repeat(np.eye(3), 4, 0) * 3
-    FeatureIndexer().fit(features, np.repeat(["a", "b", "c"], 4)).save(folder / "feature.safetensors")
     films = [np.uint8(40 * np.random.default_rng(i % 2).random((12, 24, 32)).cumsum(0) % 255) for i in range(4)]
 
     def bright(path: Path) -> None:
@@ -208,10 +206,6 @@ def _models(folder: Path) -> list[Seed]:
             _finite(indexer.decision_function(query))
             indexer.predict(query)
 
-    def feature(path: Path) -> None:
-        indexer = FeatureIndexer.load(path)
-        _finite(indexer.decision_function(features[:, : indexer.n_features_in_])) if indexer.n_features_in_ <= 3 else None
-
     from indexing import BrightnessIndexer
 
     BrightnessIndexer(size=24, flip=False).fit(films, ["a", "b", "a", "b"]).save(folder / "bright.safetensors")
@@ -220,7 +214,7 @@ def _models(folder: Path) -> list[Seed]:
     ])  # fmt: skip
     scan = ("index", "scan", str(session), "-m", "{}")
     reads: dict[str, tuple[Callable[[Path], None], int]] = {
-        "action_small": (action, 4), "action": (action, 6), "phase": (phase, 8), "feature": (feature, 1), "bright": (bright, 12),
+        "action_small": (action, 4), "action": (action, 6), "phase": (phase, 8), "bright": (bright, 12),
     }  # fmt: skip
     return [
         Seed(f"{name}.safetensors", folder / f"{name}.safetensors", read, scan if name != "bright" else None, slow)

@@ -1,14 +1,11 @@
-"""The promises of :mod:`tests.indexing.estimators` for every indexer, and scikit-learn's own battery where it truly runs."""
+"""The promises of :mod:`tests.indexing.estimators` for every indexer."""
 
 from __future__ import annotations
 
 import inspect
-from collections import Counter
 
 import pytest
-from sklearn.utils.estimator_checks import check_estimator
 
-from indexing.feature_indexer import FeatureIndexer
 from tests.indexing.estimators import CASES, CHECKS
 
 
@@ -19,13 +16,3 @@ from tests.indexing.estimators import CASES, CHECKS
 def test_promise(case, check, tmp_path):
     needs_a_folder = "path" in inspect.signature(check).parameters
     check(case, tmp_path) if needs_a_folder else check(case)
-
-
-def test_the_table_form_passes_the_checks_of_scikit_learn():
-    results = check_estimator(FeatureIndexer(), on_skip=None)
-    ran = Counter(result["status"] for result in results)
-    assert ran["passed"] > 40
-    assert {r["status"] for r in results} <= {"passed", "skipped"}
-    # these need an opt-in of scipy, and pandas
-    optional = {"check_array_api_input", "check_classifier_data_not_an_array"}
-    assert {r["check_name"] for r in results if r["status"] == "skipped"} <= optional

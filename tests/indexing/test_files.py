@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from indexing import Clip, ClipSet, FeatureIndexer
+from indexing import ActionIndexer, Clip, ClipSet
 from indexing.files import recover_folder, replace_folder, replacing, write_bytes, write_text
 
 CLIPS = ClipSet([Clip(np.random.default_rng(0).normal(size=(50, 17, 2)), label="a", name="a")])
@@ -36,8 +36,8 @@ def save_clips(path: Path) -> None:
 
 
 def save_model(path: Path) -> None:
-    features = np.random.default_rng(0).normal(size=(20, 8))
-    FeatureIndexer().fit(features, np.arange(20) % 2).save(path)
+    joints = np.random.default_rng(0).normal(size=(2, 20, 17, 2))
+    ActionIndexer(scorer="nearest", search=False).fit(list(joints), ["a", "b"]).save(path)
 
 
 def save_table(path: Path) -> None:

@@ -14,10 +14,8 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-from indexing import ActionIndexer, BrightnessIndexer, Clip, FeatureIndexer, PhaseIndexer
+from indexing import ActionIndexer, BrightnessIndexer, Clip, PhaseIndexer
 from indexing.modelfile import Parts, labels_from_json, model_kind, number, skeleton_from_json, usable, whole
-
-FEATURES = np.random.default_rng(0).normal(size=(12, 3)) + np.repeat(np.eye(3), 4, 0) * 3
 
 
 def clip(seed: int, frames: int = 30) -> Clip:
@@ -34,14 +32,13 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         "action": ActionIndexer(search=False, virtual_views=1, reject=0.2).fit(clips),
         "phase": PhaseIndexer(harmonics=1, course="once", mirror=False).fit([clip(i, 8) for i in range(3)]),
         "bright": BrightnessIndexer(size=24, flip=False).fit(films, ["a", "b", "a", "b"]),
-        "feature": FeatureIndexer().fit(FEATURES, np.repeat(["a", "b", "c"], 4)),
     }
     for name, indexer in fitted.items():
         indexer.save(folder / f"{name}.safetensors")
     return {name: folder / f"{name}.safetensors" for name in fitted}
 
 
-KINDS: dict[str, Any] = {"action": ActionIndexer, "phase": PhaseIndexer, "bright": BrightnessIndexer, "feature": FeatureIndexer}
+KINDS: dict[str, Any] = {"action": ActionIndexer, "phase": PhaseIndexer, "bright": BrightnessIndexer}
 
 
 def changed(path: Path, target: Path, tensor: str = "", value: Any = None, **header: Any) -> Path:
@@ -86,7 +83,6 @@ TENSORS = {
     ),
     "phase": ("bank.values", "phase", "wrong", "course.0.shapes"),
     "bright": ("motion",),
-    "feature": ("vectors", "dual", "intercept"),
 }
 
 
@@ -95,8 +91,7 @@ def test_no_number_of_a_model_is_missing_or_beyond_what_can_be_computed(name: st
     path = tmp_path / "m.safetensors"
     for value in (float("nan"), float("inf"), -float("inf")):
         refused(name, changed(models[name], path, tensor, all_of(value)), tensor, "expected numbers")
-    if tensor != "vectors":
-        refused(name, changed(models[name], path, tensor, all_of(3e38)), tensor, "expected numbers")
+    refused(name, changed(models[name], path, tensor, all_of(3e38)), tensor, "expected numbers")
     for kind in (torch.int64, torch.float16, torch.uint8, torch.float8_e4m3fn):
         refused(name, changed(models[name], path, tensor, lambda t, kind=kind: t.float().to(kind)), tensor, "expected float32")
     refused(name, changed(models[name], path, tensor, lambda t: t[None]), tensor)
@@ -122,10 +117,6 @@ def test_no_number_of_a_model_is_missing_or_beyond_what_can_be_computed(name: st
         ("bright", "lengths", all_of(0)),
         ("bright", "lengths", all_of(2**40)),
         ("bright", "labels", all_of(0)),
-        ("feature", "counts", all_of(3)),
-        ("feature", "support", all_of(-5)),
-        ("feature", "vectors", lambda t: t[:, :0]),
-        ("feature", "vectors", all_of(1e200)),
     ],
 )
 def test_parts_that_do_not_belong_together_are_refused(name: str, tensor: str, value: Any, models, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
@@ -162,14 +153,10 @@ def test_parts_that_do_not_belong_together_are_refused(name: str, tensor: str, v
         ("bright", {"parameters": {"size": 10**400}}),
         ("bright", {"parameters": {"region": [10**400, 0, 1, 1]}}),
         ("bright", {"classes": {"values": ["a"]}}),
-        ("feature", {"scale": 0}),
-        ("feature", {"scale": 10**400}),
-        ("feature", {"scale": None}),
-        ("feature", {"parameters": {"width": [1e308] * 1000}}),
-        ("feature", {"parameters": {"more": 1}}),
-        ("feature", {"version": 10**400}),
-        ("feature", {"format": [[1e308] * 1000]}),
-        ("feature", {"classes": 7}),
+        ("action", {"parameters": {"more": 1}}),
+        ("action", {"version": 10**400}),
+        ("action", {"format": [[1e308] * 1000]}),
+        ("action", {"classes": 7}),
     ],
 )
 def test_headers_that_lie_are_refused(name: str, header: dict[str, Any], models, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
