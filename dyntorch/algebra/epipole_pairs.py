@@ -9,11 +9,10 @@ import torch
 from torch import Tensor
 
 from dyntorch.algebra.homogeneous import unit_vectors
-from dyntorch.algebra.rank_one_pencils import rank_one
-from dyntorch.algebra.rank_two import null_vectors
+from dyntorch.algebra.monomials import collecting, factors, multiplicity, symmetric
+from dyntorch.algebra.rank_two import null_vectors, rank_one
 from dyntorch.constants import constant
 from dyntorch.nullspace import null_space
-from dyntorch.primitives.monomials import collecting, factors, multiplicity, symmetric
 
 STEPS = 12
 """Steps to the nearest product.  Without any, 1 of 40 noisy scenes (100 matches, .01 px, epipoles 2 degrees apart) is useless."""

@@ -11,11 +11,10 @@ from dyntorch.algebra.rank_one_pencils import (
     check_homographies,
     finite_matrices,
     plane_parts,
-    rank_one,
     rank_one_scale,
     unit_determinant,
 )
-from dyntorch.algebra.rank_two import null_vectors
+from dyntorch.algebra.rank_two import null_vectors, rank_one
 from dyntorch.nullspace import null_space
 
 REWEIGHTINGS = 1

@@ -8,10 +8,9 @@ import torch
 from torch import Tensor
 
 from dyntorch.algebra.extensors import compound
-from dyntorch.algebra.homogeneous import nonzero_sign, unit_vectors
+from dyntorch.algebra.homogeneous import nonzero_sign
+from dyntorch.algebra.rank_two import rank_one, unit_size
 
-SQUARINGS = 5
-"""Of the Gram of a matrix of rank about one: its leading vector is then exact to (s_2 / s_1)^64."""
 SINGULAR = 1e-12  # |det| / |H|^3 below which a homography cannot be scaled to determinant 1
 
 
@@ -74,8 +73,8 @@ def rank_one_scale(first: Tensor, second: Tensor) -> Tensor:
         >>> round(float(rank_one_scale(A, B)), 9)
         3.0
     """
-    a, size_a = _unit(first)
-    b, size_b = _unit(second)
+    a, size_a = unit_size(first)
+    b, size_b = unit_size(second)
     a, b = torch.broadcast_tensors(a, b)
     constant, quadratic = compound(a, 2).flatten(-2), compound(b, 2).flatten(-2)
     linear = constant + quadratic - compound(a - b, 2).flatten(-2)
@@ -120,28 +119,6 @@ def second_singular_value(matrix: Tensor) -> Tensor:
     """
     size = torch.linalg.matrix_norm(matrix)
     return torch.linalg.matrix_norm(compound(matrix, 2)) / torch.where(size > 0, size, 1.0)
-
-
-def rank_one(matrix: Tensor) -> tuple[Tensor, Tensor]:
-    """Unit vector u ``(*batch, r)`` and v ``(*batch, c)`` for which u v^T is nearest to a matrix; v = 0 for the zero matrix.
-
-    Example:
-        >>> import torch
-        >>> left, right = rank_one(torch.tensor([[0.0, 0.0], [3.0, 4.0]]))
-        >>> (left[:, None] * right).tolist()
-        [[0.0, 0.0], [3.0, 4.0]]
-    """
-    scaled, _ = _unit(matrix)
-    power = scaled @ scaled.mT
-    for _ in range(SQUARINGS):
-        power, _ = _unit(power)
-        power = power @ power
-    pick = power.detach().diagonal(dim1=-2, dim2=-1).argmax(dim=-1, keepdim=True)[..., None].expand(*power.shape[:-1], 1)
-    left = power.gather(-1, pick)[..., 0]
-    first = torch.zeros_like(left)
-    first[..., 0] = 1.0
-    left = unit_vectors(torch.where((left == 0).all(-1, keepdim=True), first, left))
-    return left, (matrix.mT @ left[..., None])[..., 0]
 
 
 def plane_parts(homographies: Tensor, infinity: Tensor) -> PlaneParts:
@@ -202,9 +179,3 @@ def finite_matrices(matrices: Tensor) -> tuple[Tensor, Tensor]:
     """Matrices in float64 with zeros for those that are not finite, and which are finite ``(*batch,)``."""
     finite = matrices.isfinite().flatten(-2).all(-1)
     return torch.where(finite[..., None, None], matrices, 0.0).double(), finite
-
-
-def _unit(matrix: Tensor) -> tuple[Tensor, Tensor]:
-    """Frobenius norm 1, and the norm ``(*batch, 1, 1)``; zero stays."""
-    norm = torch.linalg.matrix_norm(matrix, keepdim=True)
-    return matrix / torch.where(norm > 0, norm, 1.0), norm

@@ -1,12 +1,15 @@
-"""3 x 3 matrices of rank two in closed form: cofactors and null vectors, for hundreds of thousands of them at a time."""
+"""Matrices of rank two and one in closed form: cofactors, null vectors, nearest products of vectors, for many at a time."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
+from dyntorch.algebra.homogeneous import unit_vectors
+
 SQUARINGS = 5
-"""A null vector of a noisy matrix is then exact to (s_3 / s_2)^64: 1e-10 even at s_3 = 0.7 s_2."""
+"""A null vector of a noisy matrix is then exact to (s_3 / s_2)^64: 1e-10 even at s_3 = 0.7 s_2;
+the leading vector of a matrix of rank about one to (s_2 / s_1)^64."""
 
 
 def cofactors(matrix: Tensor) -> Tensor:
@@ -79,3 +82,31 @@ def _scaled(matrix: Tensor) -> Tensor:
 def _nonzero(size: Tensor) -> Tensor:
     """A divisor that leaves zero, and its gradient, alone."""
     return torch.where(size > 0, size, torch.ones_like(size))
+
+
+def rank_one(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """Unit vector u ``(*batch, r)`` and v ``(*batch, c)`` for which u v^T is nearest to a matrix; v = 0 for the zero matrix.
+
+    Example:
+        >>> import torch
+        >>> left, right = rank_one(torch.tensor([[0.0, 0.0], [3.0, 4.0]]))
+        >>> (left[:, None] * right).tolist()
+        [[0.0, 0.0], [3.0, 4.0]]
+    """
+    scaled, _ = unit_size(matrix)
+    power = scaled @ scaled.mT
+    for _ in range(SQUARINGS):
+        power, _ = unit_size(power)
+        power = power @ power
+    pick = power.detach().diagonal(dim1=-2, dim2=-1).argmax(dim=-1, keepdim=True)[..., None].expand(*power.shape[:-1], 1)
+    left = power.gather(-1, pick)[..., 0]
+    first = torch.zeros_like(left)
+    first[..., 0] = 1.0
+    left = unit_vectors(torch.where((left == 0).all(-1, keepdim=True), first, left))
+    return left, (matrix.mT @ left[..., None])[..., 0]
+
+
+def unit_size(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """Frobenius norm 1, and the norm ``(*batch, 1, 1)``; zero stays."""
+    norm = torch.linalg.matrix_norm(matrix, keepdim=True)
+    return matrix / torch.where(norm > 0, norm, 1.0), norm

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.algebra.homogeneous import homogeneous, unit, unit_vectors
+from dyntorch.algebra.monomials import monomial_derivatives, monomials
 from dyntorch.algebra.partition import order_of_bodies
 from dyntorch.algebra.two_views import check_matches, described
 from dyntorch.arguments import FARTHEST
@@ -16,7 +17,7 @@ from dyntorch.blocks import one_thread
 from dyntorch.invariants.fundamental_matrix import FundamentalMatrix
 from dyntorch.normalize import hartley
 from dyntorch.nullspace import null_space
-from dyntorch.primitives.monomials import Monomials, monomial_derivatives, monomials
+from dyntorch.primitives.monomials import Monomials
 from dyntorch.residual import sampson
 
 ROUNDS = 4

@@ -8,13 +8,13 @@ from torch import Tensor
 from dyntorch.algebra.epipole_pairs import factor_product, product_matrix
 from dyntorch.algebra.homogeneous import homogeneous, unit
 from dyntorch.algebra.hyperplane_pair import hyperplane_pair
+from dyntorch.algebra.monomials import symmetric
 from dyntorch.invariant import Invariant
 from dyntorch.invariants.fundamental_matrix import FundamentalMatrix
 from dyntorch.matrix import gram
 from dyntorch.normalize import hartley
 from dyntorch.nullspace import gram_null_space
 from dyntorch.primitives import Monomials, Point
-from dyntorch.primitives.monomials import symmetric
 from dyntorch.residual import algebraic, sampson
 
 FLOOR = 1e-3

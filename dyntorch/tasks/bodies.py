@@ -11,10 +11,11 @@ from dyntorch.blocks import one_thread
 from dyntorch.devices import on_cpu
 from dyntorch.invariants.fundamental_matrix import FundamentalMatrix
 from dyntorch.matches import matches
+from dyntorch.tasks.bodies_outcome import segmentation_notices
 from dyntorch.tasks.bodies_pool import LEAST
 from dyntorch.tasks.bodies_problem import Request, solve
 from dyntorch.tasks.notices import check_threshold
-from dyntorch.tasks.segmentation import BodyModel, Segmentation, segmentation_notices
+from dyntorch.tasks.segmentation import BodyModel, Segmentation
 
 MINIMAL = 8
 """Fewest matches: seven determine a fundamental matrix, and one has to agree with it."""

@@ -16,7 +16,13 @@ from dyntorch.tasks.bodies_energy import View
 from dyntorch.tasks.bodies_labels import Labelling
 from dyntorch.tasks.bodies_models import Models, choose
 from dyntorch.tasks.bodies_pool import LEAST, one_hot
+from dyntorch.tasks.notices import Notice, NoticeCode, notices
 from dyntorch.tasks.segmentation import BodyModel
+
+REPEATED = 0.1
+"""Share of repeated matches that deserves a notice."""
+SPARSE = 0.3
+"""Share of matches that move like their neighbours below which geometry alone may do better."""
 
 
 @dataclass(frozen=True)
@@ -155,3 +161,31 @@ def _residuals(view: View, labels: Tensor, fundamentals: Tensor, models: Models)
     square = torch.where(models.planar[:, None], planar, epipolar)
     own = square.gather(0, (labels - 1).clamp(min=0)[None])[0]
     return torch.where(labels > 0, own, square.amin(0)).sqrt()
+
+
+def segmentation_notices(found: list[Outcome], bodies: int | None, batch: tuple[int, ...]) -> tuple[Notice, ...]:
+    """What limits the results of a batch."""
+    if not found:
+        return ()
+    count = torch.tensor([float(outcome.count) for outcome in found])
+    repeated = torch.tensor([outcome.repeated for outcome in found])
+    linked = torch.tensor([outcome.linked for outcome in found])
+    tried = torch.tensor([outcome.status != Status.TOO_FEW for outcome in found])
+    spatial = linked < 1.0  # where neighbours do not matter, all matches count
+    said = []
+    coarse = torch.tensor([outcome.coarse for outcome in found])
+    tried = tried & (coarse == 0)
+    message = "the threshold is {value:.2g} of the spread of the points, and everything is near everything; give it in their unit"
+    said += notices(NoticeCode.COARSE, message, coarse, coarse > 0, batch)
+    if bodies is not None:
+        message = f"{bodies} bodies were asked for, the matches carry {{value:g}}; ask for fewer, or add matches of the others"
+        said += notices(NoticeCode.FEWER_BODIES, message, count, tried & (count < bodies), batch)
+        # where a body got lost, the notice above says so
+        spare = torch.tensor([outcome.spare for outcome in found]) & (count == bodies)
+        message = f"{{value:g}} bodies explain the matches no worse than {bodies}: one may be a part of another; ask for fewer"
+        said += notices(NoticeCode.SPARE_BODY, message, count - 1, spare, batch)
+    message = "a share of {value:.2g} of the matches repeats others and says nothing new; remove repeated matches"
+    said += notices(NoticeCode.REPEATED, message, repeated, repeated > REPEATED, batch)
+    message = "the share of matches that move like their neighbours is {value:.2g}; try spatial=False if bodies interleave"
+    said += notices(NoticeCode.INCOHERENT, message, linked, tried & spatial & (linked < SPARSE), batch)
+    return tuple(said)

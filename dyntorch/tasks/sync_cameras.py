@@ -16,6 +16,7 @@ from dyntorch.tasks.shift import Shift
 from dyntorch.tasks.sync_clocks import Clocks, Pair
 from dyntorch.tasks.sync_network import Network, network
 from dyntorch.tasks.sync_readings import Reading, differing, readings
+from dyntorch.tasks.synchronize import synchronize
 
 DECIDED, CONFIRMED = log(10), log(300)
 """Odds of the best reading to another, as logarithms, from which it counts as the answer: where the two differ in cameras that
@@ -88,8 +89,6 @@ def synchronize_cameras(
         if values is not None and len(values) != count:
             raise ValueError(f"{name}: {len(values)} values for {count} cameras; give one per camera")
     if pair is None:
-        from dyntorch.tasks.synchronize import synchronize
-
         pair = synchronize
     shifts = {}
     for i, j in combinations(range(count), 2) if pairs is None else pairs:

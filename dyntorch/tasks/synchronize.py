@@ -17,6 +17,7 @@ from dyntorch.devices import on_cpu
 from dyntorch.tasks.shift import Shift
 from dyntorch.tasks.sync_attempt import APART, WANDER, Attempt
 from dyntorch.tasks.sync_cleaning import cleaned
+from dyntorch.tasks.sync_different import different_points
 from dyntorch.tasks.sync_same import Result, same_points
 from dyntorch.tasks.sync_tracks import Tracks, read_tracks
 
@@ -111,8 +112,6 @@ def synchronize(
     origin = float(tracks[0].times[0])
     first, second = (cleaned(dataclasses.replace(one, times=one.times - origin)) for one in tracks)
     if not correspondence:
-        from dyntorch.tasks.sync_different import different_points
-
         return different_points(first, second, max_shift=max_shift, rate=rate).since(origin)
     if a.shape[1] != b.shape[1]:
         raise ValueError(

@@ -6,11 +6,11 @@ import torch
 from dyntorch.algebra.homogeneous import skew
 from dyntorch.algebra.rank_one_pencils import (
     plane_parts,
-    rank_one,
     rank_one_scale,
     second_singular_value,
     unit_determinant,
 )
+from dyntorch.algebra.rank_two import rank_one
 
 
 def normal(*shape, seed=0):
