@@ -177,7 +177,7 @@ class ClipSet(LabelledSet[Clip]):
 
     def save(self, path: str | Path) -> None:
         """Write a clip-set ``.npz`` (the format that :meth:`load` reads)."""
-        from indexing.readers.clipset import write_clip_set
+        from indexing.readers.clipset_write import write_clip_set
 
         write_clip_set(self, path)
 

@@ -10,11 +10,22 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from dyntorch.algebra import dynamic_shape_rows as moving
 from dyntorch.algebra.dynamic_shape import AMBIGUOUS, fit_shapes
 from dyntorch.algebra.dynamic_shape_basis import Polynomial, Trajectory, extremes, times_of_views
 from dyntorch.algebra.dynamic_shape_descent import Projected, project, shapes_at, slopes
-from dyntorch.algebra.dynamic_shape_rows import Base
+from dyntorch.algebra.dynamic_shape_rows import (
+    Base,
+    annihilator,
+    apart,
+    beside,
+    framed_beside,
+    graph_of,
+    graph_rows,
+    shapes_of_graph,
+    span_residual,
+    span_rows,
+    unknowns_of,
+)
 from dyntorch.algebra.dynamic_shape_time import Recovery, recover_times
 from dyntorch.algebra.shape_rows import centred
 from dyntorch.invariant import Estimate, Frame, Invariant, on_class, unknown_argument
@@ -130,9 +141,9 @@ class DynamicShapeTensor(Invariant):
         """One slot: a whole view and its time."""
         n, trajectory, base = self.points, self.trajectory, self.base
         if self.form == "span":
-            return (Equations((n, 4), n - 1, moving.span_rows, rows=2),)
+            return (Equations((n, 4), n - 1, span_rows, rows=2),)
         width = trajectory.power(3).size * (1 + 3 * (n - 4))
-        return (Equations((n, 4), width, partial(moving.graph_rows, trajectory=trajectory, base=base), rows=2 * (n - 4)),)
+        return (Equations((n, 4), width, partial(graph_rows, trajectory=trajectory, base=base), rows=2 * (n - 4)),)
 
     @property
     def nullity(self) -> int:  # type: ignore[override]
@@ -162,17 +173,17 @@ class DynamicShapeTensor(Invariant):
             rows = basis @ centred(self.points, basis.device)
             return rows[..., 0, :] if self.nullity == 1 else rows
         if self.form == "basis":
-            return moving.annihilator(basis[..., 0, :], self.points, self.base)
-        return moving.framed_beside(moving.shapes_of_graph(basis[..., 0, :], self.points, self.trajectory, self.base))
+            return annihilator(basis[..., 0, :], self.points, self.base)
+        return framed_beside(shapes_of_graph(basis[..., 0, :], self.points, self.trajectory, self.base))
 
     def basis_of(self, tensor: Tensor) -> Tensor:
         """The inverse of :meth:`tensor_of`."""
         if self.form == "span":
             return (tensor if self.nullity > 1 else tensor[..., None, :]) @ centred(self.points, tensor.device).mT
         if self.form == "joint":
-            unknowns = moving.graph_of(moving.apart(tensor), self.trajectory, self.base)
+            unknowns = graph_of(apart(tensor), self.trajectory, self.base)
             return (unknowns / unknowns.norm(dim=-1, keepdim=True).clamp(min=1e-300))[..., None, :]
-        return moving.unknowns_of(tensor, self.base)[..., None, :]
+        return unknowns_of(tensor, self.base)[..., None, :]
 
     def estimated(self, views: tuple[Tensor, ...], weights: Tensor) -> Estimate | None:
         """The form ``joint`` by least squares over all points; the others are the null space of the rows."""
@@ -183,7 +194,7 @@ class DynamicShapeTensor(Invariant):
             rows = self.trajectory.rows(measured[..., 0, 3])
             found = fit_shapes(measured[..., :2], rows, measured[..., 2], share=weights)
         ambiguous = found.uncertainty > AMBIGUOUS
-        return Estimate(moving.beside(found.shapes), found.few, found.degenerate, ambiguous, found.uncertainty)
+        return Estimate(beside(found.shapes), found.few, found.degenerate, ambiguous, found.uncertainty)
 
     @on_class
     def compose(self, shapes: Tensor) -> Tensor:
@@ -201,8 +212,8 @@ class DynamicShapeTensor(Invariant):
             rows = (shapes - shapes.mean(-2, keepdim=True)).mT @ centred(n, shapes.device).mT
             return self.tensor_of(null_space(rows, n - 1 - shapes.shape[-1]))
         if self.form == "joint":
-            return moving.framed_beside(moving.apart(shapes)) * 3**-0.5  # of three orthonormal columns
-        tensor = moving.annihilator(moving.graph_of(moving.apart(shapes), self.trajectory, self.base), n, self.base)
+            return framed_beside(apart(shapes)) * 3**-0.5  # of three orthonormal columns
+        tensor = annihilator(graph_of(apart(shapes), self.trajectory, self.base), n, self.base)
         size = tensor.flatten(-3).norm(dim=-1)[..., None, None, None]
         return tensor / torch.where(size > 0, size, 1.0)
 
@@ -213,7 +224,7 @@ class DynamicShapeTensor(Invariant):
             return tensor
         whole = tensor.double()
         if self.form == "basis":
-            return moving.framed_beside(self.shapes(whole)).to(tensor.dtype)
+            return framed_beside(self.shapes(whole)).to(tensor.dtype)
         rows = whole if self.nullity > 1 else whole[..., None, :]
         rows = torch.cat([rows, torch.ones_like(rows[..., :1, :])], dim=-2)
         return null_space(rows, 3 * self.trajectory.size).mT.to(tensor.dtype)
@@ -223,8 +234,8 @@ class DynamicShapeTensor(Invariant):
         if self.form == "span":
             raise ValueError("form='span' knows the positions of all times together, no shape of any; use 'joint' or 'basis'")
         if self.form == "joint":
-            return moving.apart(tensor)
-        return moving.shapes_of_graph(moving.unknowns_of(tensor, self.base), tensor.shape[-2], self.trajectory, self.base)
+            return apart(tensor)
+        return shapes_of_graph(unknowns_of(tensor, self.base), tensor.shape[-2], self.trajectory, self.base)
 
     def whitened(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor | None:
         """The distance of each view from the images of its shape, point by point: ``(*batch, views, 2 n)``."""
@@ -247,7 +258,7 @@ class DynamicShapeTensor(Invariant):
         x, seen = measured[..., :2], measured[..., 2]
         centre = (x * seen[..., None]).sum(-2, keepdim=True) / seen.sum(-1)[..., None, None].clamp(min=1.0)
         rows = self.trajectory.rows(measured[..., 0, 3])
-        shape = shapes[..., None, :, :] if self.form == "span" else shapes_at(moving.apart(shapes), rows)
+        shape = shapes[..., None, :, :] if self.form == "span" else shapes_at(apart(shapes), rows)
         return project((x - centre) * seen[..., None], seen, shape), rows
 
     @on_class
@@ -288,7 +299,7 @@ class DynamicShapeTensor(Invariant):
         if self.form != "span":
             return self.recover(tensor, *points, weights=weights).residual
         basis = replace(self, points=len(points)).basis_of(tensor.double())
-        return moving.span_residual(constellations(self, points).double(), basis).to(tensor.dtype)
+        return span_residual(constellations(self, points).double(), basis).to(tensor.dtype)
 
     def __repr__(self) -> str:
         form = "" if self.form == "joint" else f", form={self.form!r}"

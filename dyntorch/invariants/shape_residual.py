@@ -15,7 +15,7 @@ CAMERA = {"general": 11, "plane": 11, "affine": 8}
 """Degrees of freedom of the camera that each frame leaves open."""
 
 
-def residual(structure: Tensor, x: Tensor, scale: Tensor, frame: str) -> Tensor:
+def reprojection_residual(structure: Tensor, x: Tensor, scale: Tensor, frame: str) -> Tensor:
     r"""Reprojection error that no camera takes away, in standard deviations of noise, to first order.
 
     A camera is to the points of a view what a point is to the cameras of several views, so it is eliminated in the same way:
@@ -36,7 +36,7 @@ def residual(structure: Tensor, x: Tensor, scale: Tensor, frame: str) -> Tensor:
     return torch.where(known[..., None], error[..., 0, :], torch.nan)
 
 
-def residual_derivative(structure: Tensor, x: Tensor, scale: Tensor, frame: str) -> tuple[Tensor, Tensor]:
+def reprojection_derivative(structure: Tensor, x: Tensor, scale: Tensor, frame: str) -> tuple[Tensor, Tensor]:
     """:func:`residual` and its derivative ``(*batch, views, 2 n, n, 4)`` by the points; both 0 where a view says nothing.
 
     The camera follows the points (Kaufman's form of variable projection), as the points follow the cameras in reconstruction.
@@ -62,7 +62,7 @@ def looked_at(x: Tensor) -> Tensor:
     return x[..., 2] > 0
 
 
-def score(structure: Tensor, x: Tensor, frame: str) -> Tensor:
+def view_score(structure: Tensor, x: Tensor, frame: str) -> Tensor:
     r"""How nearly the equations of the camera of each view are dependent, ``(*batch, views)`` in [0, 1].
 
     :math:`\sigma_4 / \|E\|_F`, E the equations :math:`l^T \hat P_i m = 0` of the points in the frame of the basis; for affine
@@ -80,7 +80,7 @@ def score(structure: Tensor, x: Tensor, frame: str) -> Tensor:
     x = torch.cat([torch.where(seen[..., None] > 0, x[..., :2], 0.0), seen[..., None]], dim=-1)
     if frame == AFFINE:
         factor, ones = local(x)[1], torch.ones_like(structure[..., 0, 0])
-        return residual(structure, x, ones, frame).norm(dim=-1) * factor / seen.sum(-1).clamp(min=1.0).sqrt()
+        return reprojection_residual(structure, x, ones, frame).norm(dim=-1) * factor / seen.sum(-1).clamp(min=1.0).sqrt()
     others = unit_vectors(structure[..., 4:, :])
     cameras = torch.stack(dual_cameras(others) if frame == GENERAL else reference_cameras(others), dim=-3)
     q = canonical(x)[0] * seen[..., :4].amin(-1)[..., None, None]

@@ -12,7 +12,7 @@ from dyntorch.algebra import shape_completion, shape_points, shape_rows
 from dyntorch.algebra.shape_points import AFFINE, GENERAL, PLANE
 from dyntorch.forward import jacobian
 from dyntorch.invariant import Frame, Invariant, on_class
-from dyntorch.invariants import shape_residual
+from dyntorch.invariants.shape_residual import CAMERA, reprojection_derivative, reprojection_residual, view_score
 from dyntorch.matches import constellations
 from dyntorch.nullspace import null_space
 from dyntorch.primitives import Equations
@@ -153,7 +153,7 @@ class ShapeTensor(Invariant):
     @property
     def codim(self) -> int:  # type: ignore[override]
         """Coordinates of a view less the freedom of its camera."""
-        return 2 * self.n - shape_residual.CAMERA[self.frame]
+        return 2 * self.n - CAMERA[self.frame]
 
     def shape(self) -> tuple[int, ...]:
         if self.frame == AFFINE:
@@ -253,7 +253,7 @@ class ShapeTensor(Invariant):
     def whitened(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
         """Reprojection error ``(*batch, views, 2 n)`` of the points of each view, whose camera is found first."""
         structure = shape_points.standard(motion[0].double(), self.frame)
-        return shape_residual.residual(structure, views[0].double(), scales[0].double(), self.frame).to(views[0].dtype)
+        return reprojection_residual(structure, views[0].double(), scales[0].double(), self.frame).to(views[0].dtype)
 
     def linearized(
         self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]
@@ -262,7 +262,7 @@ class ShapeTensor(Invariant):
             lambda t: shape_points.standard(t.unflatten(-1, (self.n, 4)), self.frame).flatten(-2), motion[0].flatten(-2)
         )
         structure = value.unflatten(-1, (self.n, 4))
-        error, derivative = shape_residual.residual_derivative(structure, views[0], scales[0], self.frame)
+        error, derivative = reprojection_derivative(structure, views[0], scales[0], self.frame)
         return error.flatten(-2), slope @ derivative.flatten(-2).flatten(-3, -2).mT
 
     def score(self, tensor: Tensor, *points: Tensor) -> Tensor:
@@ -291,7 +291,7 @@ class ShapeTensor(Invariant):
         invariant, (x,) = self.prepared(points)
         assert isinstance(invariant, ShapeTensor)
         structure = shape_points.standard(invariant.decompose(tensor.double()), self.frame)
-        return shape_residual.score(structure, x.double(), self.frame).to(x.dtype)
+        return view_score(structure, x.double(), self.frame).to(x.dtype)
 
     def __repr__(self) -> str:
         return f"ShapeTensor({self.frame!r}{'' if self.points is None else f', {self.points}'})"

@@ -27,14 +27,11 @@ from numpy.typing import NDArray
 
 from indexing.clip import UP_AXES, Clip, ClipSet
 from indexing.opening import error, shown
-from indexing.readers.clipset_write import write_clip_set
 from indexing.readers.files import Source
 from indexing.readers.npz import Archive
 from indexing.readers.options import Options
 from indexing.readers.sets import clip_labels, clip_meta, clip_names, clip_offsets, frame_times, need, per_clip, plain
 from indexing.skeleton import Skeleton
-
-__all__ = ["read", "read_clip_set", "write_clip_set"]
 
 Array = NDArray[Any]
 

@@ -20,8 +20,6 @@ from indexing.opening import error
 from indexing.readers.npz import Archive
 from indexing.readers.sets import clip_labels, clip_meta, clip_names, clip_offsets, frame_times, need, per_clip, plain
 
-__all__ = ["Film", "FilmSet", "holds_frames", "read_film_set"]
-
 
 @dataclass(frozen=True, eq=False)
 class Film:

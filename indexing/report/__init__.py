@@ -4,7 +4,8 @@ Importing this package loads neither matplotlib nor scikit-learn nor torch; they
 """
 
 from indexing.files import manifest, prepare, write_bytes, write_json, write_text
-from indexing.report.recognition import EvaluationResult, Event, RecognitionReport, RecordingResult, write_recognition
+from indexing.report.recognition import write_recognition
+from indexing.report.results import EvaluationResult, Event, RecognitionReport, RecordingResult
 
 __all__ = [
     "EvaluationResult",

@@ -14,11 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from indexing.report.canvas import DARK, LIGHT, Theme, cmap, columns, new_figure, png, shorten, shorten_all, style
+from indexing.report.canvas import LIGHT, Theme, cmap, columns, new_figure, png, shorten, shorten_all, style
 from indexing.report.page import Tip
 from indexing.report.results import Event, Truth
-
-__all__ = ["DARK", "LIGHT", "Theme", "confusion", "downsample", "timeline", "timeline_tips"]
 
 COLUMNS = 1400  # score values drawn along the time axis: about one per pixel
 # White text on these reads at 4.5:1 or better; any two are at least 13 apart in CIELAB, as are no more than about 18 such colours.

@@ -12,12 +12,11 @@ import numpy as np
 
 from indexing import files
 from indexing.report import pictures
+from indexing.report.canvas import DARK, LIGHT
 from indexing.report.measures import measure
 from indexing.report.page import made_by, page
 from indexing.report.recognition_page import TIMELINES, body, describe
-from indexing.report.results import EvaluationResult, Event, RecognitionReport, RecordingResult
-
-__all__ = ["EvaluationResult", "Event", "RecognitionReport", "RecordingResult", "events_csv", "write_recognition"]
+from indexing.report.results import RecognitionReport, RecordingResult
 
 OURS = r"confusion\.png|timeline(-\d+)?\.png|events\.csv"
 
@@ -46,7 +45,7 @@ def write_recognition(folder: str | Path, report: RecognitionReport) -> Path:
     measured = measure(report)
     drawn: dict[str, bytes] = {}
     dark: dict[str, bytes] = {}
-    for theme, shelf in ((pictures.LIGHT, drawn), (pictures.DARK, dark)):
+    for theme, shelf in ((LIGHT, drawn), (DARK, dark)):
         for index, recording in enumerate(report.recordings[:TIMELINES]):
             shelf[timeline_name(index)] = pictures.timeline(
                 recording.times, recording.scores, recording.classes, recording.events, recording.truth, theme=theme

@@ -21,6 +21,7 @@ from dyntorch.algebra import (
     grassmann_nearest,
     grassmann_recovery,
     infinity_extensors,
+    monomials,
     shape_completion,
     shape_points,
     shape_rows,
@@ -28,7 +29,7 @@ from dyntorch.algebra import (
 from dyntorch.algebra.dynamic_shape_basis import Polynomial
 from dyntorch.constants import constant
 from dyntorch.invariants import shape_residual
-from dyntorch.primitives import base, monomials, plane
+from dyntorch.primitives import base, plane
 from dyntorch.tasks import planes_problem, planes_starts
 
 CPU = torch.device("cpu")

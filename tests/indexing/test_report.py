@@ -23,6 +23,7 @@ from indexing.report import (
     EvaluationResult,
     RecognitionReport,
     RecordingResult,
+    canvas,
     manifest,
     pictures,
     prepare,
@@ -155,7 +156,7 @@ def test_confusion_draws_any_number_of_classes(number):
     counts = np.eye(number, dtype=int) * 1234
     counts[0, -1] = 7
     names = [f"a very long name of an action, number {i}" for i in range(number - 1)] + ["$\\frac"]
-    width, height = size(pictures.confusion(counts, names, theme=pictures.DARK))
+    width, height = size(pictures.confusion(counts, names, theme=canvas.DARK))
     assert 300 < width < 3200 and 300 < height < 3200
     with pytest.raises(ValueError, match="counts must be"):
         pictures.confusion(counts, [*names, "more"])

@@ -16,7 +16,7 @@ KEYS = "give 'tracks' (views, n, 2 or 3) or 'y' (frames, points, 2), and perhaps
 EXTRA = ("times", "ids", "static", "weights")
 
 
-def read(path: Path, key: str | None) -> TrackSet:
+def read_arrays(path: Path, key: str | None) -> TrackSet:
     """Tracks of an ``.npz``.
 
     Raises:

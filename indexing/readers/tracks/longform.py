@@ -19,7 +19,7 @@ TIMES = ("time", "t", "seconds", "timestamp")
 EXPECTED = "name the columns frame (or time), id, x, y, and z for 3D points"
 
 
-def header(path: Path) -> list[str]:
+def heading(path: Path) -> list[str]:
     """The headings of a table, in small letters; empty where its first row is data."""
     rows = read_rows(path)
     return [cell.strip().lower() for cell in rows[0][1]] if rows and not is_data(rows[0][1]) else []
@@ -36,20 +36,20 @@ def check_headings(path: Path) -> None:
     Raises:
         ValueError: rows without headings, or headings without x and y.
     """
-    names = header(path)
+    names = heading(path)
     if not names and read_rows(path):
         raise error(path, "row 1 holds numbers, and no row names the columns", EXPECTED)
     if names and not ({"x", "y"} <= set(names) or {"x1", "y1"} <= set(names)):
         raise error(path, f"its columns are {listed(names)}", EXPECTED)
 
 
-def read(path: Path) -> TrackSet:
+def read_long(path: Path) -> TrackSet:
     """The tracks of a table; rows that are absent and cells that are empty are missing observations.
 
     Raises:
         ValueError: columns that are absent, cells that are no numbers, a point twice in a view, a view with several times.
     """
-    rows, names = read_rows(path)[1:], header(path)
+    rows, names = read_rows(path)[1:], heading(path)
     if not rows:
         raise error(path, "the file has a header but no rows", "export it again")
     check_widths(path, rows, names)

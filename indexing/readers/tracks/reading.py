@@ -12,7 +12,8 @@ from indexing.opening import error, head_of, is_regular, listed, shown, size_of
 from indexing.readers.points import PointSet, Sequence, open_points
 from indexing.readers.points.pointset import BoolArray
 from indexing.readers.points.table import IDS, STATIC, flags, read_rows
-from indexing.readers.tracks import arrays, longform
+from indexing.readers.tracks.arrays import read_arrays
+from indexing.readers.tracks.longform import check_headings, heading, is_long, read_long
 from indexing.readers.tracks.trackset import TrackSet, numbered
 
 FORMATS = "give a table with columns frame, id, x, y, an array (views, n, 2 or 3), or a file of points for each view"
@@ -54,13 +55,13 @@ def read_tracks(
 
 def _read(files: Several[Path], key: str | None) -> TrackSet:
     if len(files) == 1 and _start(files[0]).startswith(b"PK"):
-        return arrays.read(files[0], key)
+        return read_arrays(files[0], key)
     if key is not None:
         raise error(files[0], f"--key {key}: has no keys", "leave --key out; it is for .npz with several sequences or arrays")
     if len(files) == 1 and _is_text(files[0]):
-        if longform.is_long(longform.header(files[0])):
-            return longform.read(files[0])
-        longform.check_headings(files[0])
+        if is_long(heading(files[0])):
+            return read_long(files[0])
+        check_headings(files[0])
     opened = [open_points(path) for path in files]
     first = opened[0]
     if isinstance(first, Sequence) and len(opened) == 1:
