@@ -5,6 +5,7 @@ All look at the crop about what moves in the whole take (:mod:`indexing.brightne
 *activity*: how much changes, in the second before: a curve, compared by correlation.
 *energy grid*: how much changes in each of 8 x 8 cells.  *HOG*: histograms of oriented gradients of what is not background.
 *tracks*: where points that are followed (KLT) move which way.
+*thesis kernel*: the rank-type kernel of brightness differences over short windows of the whole image, which knows no places.
 """
 
 from __future__ import annotations
@@ -21,9 +22,13 @@ from torch.nn.functional import avg_pool2d, normalize
 from experiments.protocol import Array
 from indexing.brightness.box import boxes, crop, motion
 from indexing.brightness.features import blur, gradients
-from indexing.brightness.library import Exemplars, Matcher, library
+from indexing.brightness.library import Exemplars, library
 from indexing.brightness.matching import Warping
 from indexing.brightness.pooling import described
+from indexing.brightness.profile import inverse_root
+from indexing.brightness.shrinking import Shrinker
+from indexing.brightness.sight import SMALLEST
+from indexing.brightness.window_kernel import window_kernels
 from indexing.video import Chunk, track_points
 
 Frames = NDArray[np.uint8]
@@ -31,6 +36,8 @@ Look = Callable[[Frames, float], Tensor]
 CELLS, DIRECTIONS = 8, 8
 SIGMA = 1.5
 QUIET = 0.006  # grey 0..1 per frame
+SIZE, HALF, PATCH = 80, 5, 5  # of the thesis kernel: px of the longer side, frames on either side, px (theory: 10 px at 160 px)
+RIDGE = 0.02  # of its whitening
 CEILING = 1.05  # of scores in the log: as for the brightness indexer
 
 
@@ -113,8 +120,8 @@ class FrameNearest:
         rows = [self.look(video, self.fps) for video in videos]
         lengths = torch.tensor([len(one) for one in rows])
         every = torch.cat(rows)
-        kept = Exemplars(every, every.new_zeros(len(every), 0), lengths, torch.from_numpy(numbers))
-        self.library = library(kept, Matcher.of(kept, 0.0), len(self.classes_), flip=False)
+        kept = Exemplars(every, lengths, torch.from_numpy(numbers))
+        self.library = library(kept, len(self.classes_), flip=False)
         return self
 
     def answer(self, video: Frames) -> tuple[Array, Array]:
@@ -125,3 +132,30 @@ class FrameNearest:
         weight[: min(int(self.window * self.fps), len(rows) // 2)] = 0
         total = (weight * -torch.log((CEILING - scores).clamp(min=1e-3))).sum(0)
         return total.numpy(), scores.numpy()
+
+
+class WindowKernels(FrameNearest):
+    """The thesis's measure alone: window kernels, about the mean of the exemplars' and whitened by it."""
+
+    def __init__(self, fps: float, window: float = 0.5) -> None:
+        super().__init__(self._look, fps, window)
+
+    def fit(self, videos: Sequence[Frames], labels: Any) -> Self:
+        """Learn mean and whitening from the frames in which something moves, then keep the exemplars' descriptors."""
+        kernels = torch.cat([self._kernels(video) for video in videos])
+        kernels = kernels[kernels.diagonal(dim1=1, dim2=2).sum(1) > 0]
+        self.root = inverse_root(kernels.mean(0), RIDGE)
+        self.mean = (self.root @ kernels @ self.root).mean(0)
+        return super().fit(videos, labels)
+
+    def _look(self, frames: Frames, fps: float) -> Tensor:
+        """``(F, 121)`` of unit length, 0 where nothing moves."""
+        kernels = self._kernels(frames)
+        still = kernels.abs().amax((1, 2)) == 0
+        white = (self.root @ kernels @ self.root - self.mean).flatten(1)
+        return normalize(white, dim=1).masked_fill(still[:, None], 0.0).float()
+
+    def _kernels(self, frames: Frames) -> Tensor:
+        """``(F, 11, 11)`` about frame t - 5; 0 before frame 10."""
+        found = window_kernels(Shrinker("video", SIZE, SMALLEST)(frames) / 255, HALF, PATCH)
+        return torch.cat([found.new_zeros(len(frames) - len(found), *found.shape[1:]), found])

@@ -8,9 +8,9 @@ frames* are those in which more than noise changes, after the first 8 frames of 
 labels, seen at azimuth 0, and asked at 0 and 60, each film with its own texture and background.  Frames of exercises that were
 never learned are left out.  The scores of a frame know nothing of later frames.
 
-The thesis's own measure, the kernel of brightness differences without where they are, is among the baselines (alone) and may be
-mixed into the indexer's scores (``temporal_weight``).  The indexer's constants were chosen on these two people (18 videos: one is
-.056) and on films of these streams: read the figures as those of the training set of whoever chose them.
+The thesis's own measure, the kernel of brightness differences without where they are, is among the baselines.  The indexer's
+constants were chosen on these two people (18 videos: one is .056) and on films of these streams: read the figures as those of the
+training set of whoever chose them.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ import tyro
 from experiments import protocol
 from experiments.benchmarks.interleaved import threads
 from experiments.book import Book
-from experiments.brightness_baselines import BASELINES, FrameNearest, Frames
+from experiments.brightness_baselines import BASELINES, FrameNearest, Frames, WindowKernels
 from experiments.plots import bars
 from experiments.protocol import Array
 from experiments.tables import Row, command, note
@@ -40,18 +40,14 @@ from indexing.brightness.box import motion
 from indexing.brightness.indexer import BrightnessIndexer
 from indexing.skeleton import COCO17
 
-Method = Literal["ours", "whole image", "mixed", "thesis kernel", "activity correlation", "energy grid", "HOG"]
+Method = Literal["ours", "whole image", "thesis kernel", "activity correlation", "energy grid", "HOG"]
 NAMES = {
     "ours": "brightness indexer",
     "whole image": "brightness indexer, no motion box",
-    "mixed": "brightness indexer, thesis kernel mixed in",
-    "thesis kernel": "thesis kernel alone",
 }
 OPTIONS: dict[str, dict[str, Any]] = {
     "ours": {},
     "whole image": {"region": None},
-    "mixed": {"temporal_weight": 0.6},
-    "thesis kernel": {"temporal_weight": 1.0},
 }
 ARMS_FPS, FILM_FPS = 30.0, 15.0
 WARM = 8  # frames at the start of a clip that are not counted
@@ -100,7 +96,7 @@ class Config:
 
     sets: tuple[Literal["arms", "exercises"], ...] = ("arms", "exercises")
     """Which recordings."""
-    methods: tuple[Method, ...] = ("ours", "whole image", "mixed", "thesis kernel", "activity correlation", "energy grid", "HOG")
+    methods: tuple[Method, ...] = ("ours", "whole image", "thesis kernel", "activity correlation", "energy grid", "HOG")
     """Which methods; goals are those of the first."""
     seed: int = 0
     """Of textures, backgrounds and sensor noise of the films."""
@@ -112,6 +108,8 @@ def contender(method: Method, fps: float) -> Callable[[], Recognizer]:
     """A way to make a new one."""
     if method in OPTIONS:
         return partial(Pixels, fps=fps, **OPTIONS[method])
+    if method == "thesis kernel":
+        return partial(WindowKernels, fps)
     return partial(FrameNearest, BASELINES[method], fps)
 
 

@@ -64,7 +64,7 @@ def learned(frames: int) -> BrightnessIndexer:
     generator = torch.Generator().manual_seed(0)
     rows = torch.nn.functional.normalize(torch.rand(2 * frames, LENGTH, generator=generator), dim=1)
     tracks = 2 * frames // TRACK
-    parts = Exemplars(rows, rows[:, :0], torch.full((tracks,), TRACK), torch.arange(tracks) % CLASSES)
+    parts = Exemplars(rows, torch.full((tracks,), TRACK), torch.arange(tracks) % CLASSES)
     return BrightnessIndexer(flip=False)._learn(parts, np.arange(CLASSES))
 
 

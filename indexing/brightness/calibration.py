@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,6 @@ from numpy.typing import NDArray
 from indexing.brightness.library import Exemplars
 from indexing.brightness.live import BrightnessStream, Recognizer
 from indexing.brightness.pooling import mirrored
-from indexing.brightness.sight import Seen
 from indexing.scoring import Event, event_levels, events
 from indexing.stream import EXTENT, FALSE_ALARMS
 
@@ -30,7 +28,7 @@ def wrong_evidence(source: Recognizer, exemplars: Exemplars) -> tuple[torch.Tens
     for i in _asked(exemplars):
         stream, seen = _fresh(source), exemplars.videos()[i]
         label = int(exemplars.labels[i])
-        scores, energy = stream.compare(_on(seen, source))
+        scores, energy = stream.compare(seen.to(source.optics.device))
         others = np.delete(scores, label, axis=1)[energy >= QUIET]
         contrasts.append(others.max(axis=1) - others.mean(axis=1))
         best.append(float(np.delete(stream.whole.mean(), label).max()))
@@ -45,7 +43,7 @@ def mirrors_matter(source: Recognizer, exemplars: Exemplars) -> bool:
     """
     for i in _asked(exemplars):
         stream, seen = _fresh(source), exemplars.videos()[i]
-        stream.compare(_on(replace(seen, motion=mirrored(seen.motion)), source))
+        stream.compare(mirrored(seen).to(source.optics.device))
         scores = stream.whole.mean()
         label = int(exemplars.labels[i])
         if float(scores.max() - scores[label]) > CLEAR:
@@ -68,7 +66,3 @@ def _asked(exemplars: Exemplars) -> list[int]:
 
 def _fresh(source: Recognizer) -> BrightnessStream:
     return BrightnessStream(source, len(source.library.bounds) - 1, "exemplar", None)
-
-
-def _on(seen: Seen, source: Recognizer) -> Seen:
-    return Seen(seen.motion.to(source.optics.device), seen.kernels.to(source.optics.device))

@@ -13,7 +13,7 @@ from sklearn.utils.validation import check_is_fitted
 from dyntorch import one_thread
 from indexing.brightness.calibration import found_events, mirrors_matter, wrong_evidence
 from indexing.brightness.footage import Footage, footage, gather
-from indexing.brightness.library import Exemplars, Matcher, library
+from indexing.brightness.library import Exemplars, library
 from indexing.brightness.live import BrightnessStream, Recognizer, learned, recognize
 from indexing.brightness.parameters import check_parameters
 from indexing.brightness.sight import Optics
@@ -35,10 +35,10 @@ class BrightnessIndexer(SavedClassifier):
     warping compares them with every exemplar frame and remembers a fraction of a second.
 
     **What of this is the thesis.**  Its own measure, the rank of the rows of h over a short window, keeps no image position;
-    alone (``temporal_weight=1``) it names 12 of 18 arm-raise videos of another person, .54 of their moving frames, and .39 / .37
-    of the frames of exercises, camera turned by 0 / 60 degrees.  The rows h, rectified, with their position kept, and followed by
-    a box about what moves, name 18, .963 and .82 / .75.  Mixing .6 of the measure in costs more than it gives, here (12, .61,
-    .59 / .56).  ``python -m experiments.brightness_indexing`` measures all of these.
+    alone it names 12 of 18 arm-raise videos of another person, .54 of their moving frames, and .37 / .37 of the frames of
+    exercises, camera turned by 0 / 60 degrees.  The rows h, rectified, with their position kept, and followed by a box about what
+    moves, name 18, .963 and .82 / .75.  ``python -m experiments.brightness_indexing`` measures both.  Mixed into these scores at .6
+    the measure cost more than it gave (12, .61, .59 / .56), so it no longer is.
 
     Args:
         fps: frame rate of videos given as arrays, and at which everything is compared.
@@ -47,7 +47,6 @@ class BrightnessIndexer(SavedClassifier):
             alone, which knows a turned camera better (.81 / .78) and a person who stands elsewhere, or at another size, not at
             all; ``(x0, y0, x1, y1)``: that part of it alone, in pixels.
         flip: exemplars also count mirrored: ``"auto"``: unless left and right are different actions here; ``True``; ``False``.
-        temporal_weight: share of the thesis's rank-type window kernel, 0 to 1.
         reject: ``None``: closed set.  A number between 0 and 1: the rate at which a video may find the evidence that
             exemplars find in wrong actions; any other number: the least :meth:`evidence` that is accepted.
         none_label: what :meth:`predict` answers for a rejected video.
@@ -79,7 +78,6 @@ class BrightnessIndexer(SavedClassifier):
         window: float = 0.18,
         region: Any = "motion",
         flip: bool | str = "auto",
-        temporal_weight: float = 0.0,
         reject: float | None = None,
         none_label: Any = -1,
         *,
@@ -91,7 +89,6 @@ class BrightnessIndexer(SavedClassifier):
         self.window = window
         self.region = region
         self.flip = flip
-        self.temporal_weight = temporal_weight
         self.reject = reject
         self.none_label = none_label
         self.pool = pool
@@ -129,7 +126,7 @@ class BrightnessIndexer(SavedClassifier):
             return self.fit(videos, labels)
         check_parameters(self)
         if self._optics() != self._learned_optics:
-            raise ValueError("fps, region, size or temporal_weight were changed since fit; set them back, or fit all videos again")
+            raise ValueError("fps, region or size were changed since fit; set them back, or fit all videos again")
         found = gather(videos, float(self.fps))
         values = joined(self.classes_[self.exemplars_.labels.numpy()], check_labels(labels, len(found)))
         known, numbers = np.unique(values, return_inverse=True)
@@ -147,27 +144,26 @@ class BrightnessIndexer(SavedClassifier):
         """Learn everything, and only then change anything."""
         if self.reject is not None and self.none_label in classes.tolist():
             raise ValueError(f"none_label={self.none_label!r} is one of the learned labels; choose another for rejected videos")
-        matcher = Matcher.of(exemplars, float(self.temporal_weight))
         flip = self.flip is True
         if self.flip == "auto":
-            flip = not mirrors_matter(self._recognizer(exemplars, matcher, len(classes), False), exemplars)
-        self.recognizer_ = self._recognizer(exemplars, matcher, len(classes), flip)
+            flip = not mirrors_matter(self._recognizer(exemplars, len(classes), False), exemplars)
+        self.recognizer_ = self._recognizer(exemplars, len(classes), flip)
         self.exemplars_, self.classes_, self.flip_ = exemplars, classes, flip
         self._learned_optics = self._optics()
         self._calibrate()
         return self
 
-    def _recognizer(self, exemplars: Exemplars, matcher: Matcher, classes: int, flip: bool) -> Recognizer:
+    def _recognizer(self, exemplars: Exemplars, classes: int, flip: bool) -> Recognizer:
         window, pool = max(FEWEST, self.window * self.fps), max(1.0, self.pool * self.fps)
-        placed = library(exemplars.to(self.device), matcher, classes, flip)
-        return Recognizer(self._optics(), matcher, placed, window, pool)
+        placed = library(exemplars.to(self.device), classes, flip)
+        return Recognizer(self._optics(), placed, window, pool)
 
     def _optics(self) -> Optics:
         region = self.region
         if region is not None and not isinstance(region, str):
             x0, y0, x1, y1 = (float(v) for v in region)
             region = (x0, y0, x1, y1)
-        return Optics(float(self.fps), int(self.size), region, self.temporal_weight > 0, self.device)
+        return Optics(float(self.fps), int(self.size), region, self.device)
 
     def _calibrate(self) -> None:
         wrong = torch.zeros(0)

@@ -12,10 +12,10 @@ from torch import Tensor
 
 from dyntorch import one_thread
 from indexing.brightness.footage import Footage, Resampler
-from indexing.brightness.library import Library, Matcher
+from indexing.brightness.library import Library
 from indexing.brightness.matching import Warping
 from indexing.brightness.motion_box import together
-from indexing.brightness.sight import Optics, Seen, Sight
+from indexing.brightness.sight import Optics, Sight
 
 SHARP = 20.0
 """Of the mean over frames: moments that fit an exemplar well count more than many that fit somewhat.
@@ -32,7 +32,6 @@ class Recognizer:
     """All that scoring needs: how to look, what to compare with, how long to remember (frames)."""
 
     optics: Optics
-    matcher: Matcher
     library: Library
     window: float
     pool: float
@@ -124,10 +123,10 @@ class BrightnessStream:
         self.latest, self.energy = scores[-1], float(energy[-1])
         return scores[counts], energy[counts]
 
-    def compare(self, seen: Seen) -> tuple[Array, Array]:
-        """Scores ``(n, classes)`` and energies ``(n,)``, float64, of more frames of the grid."""
-        scores = self.warping.push(self.source.matcher.rows(seen)).cpu().numpy().astype(float)
-        energy = seen.motion.square().sum(1).cpu().numpy().astype(float)
+    def compare(self, seen: Tensor) -> tuple[Array, Array]:
+        """Scores ``(n, classes)`` and energies ``(n,)``, float64, of more frames of the grid, given their descriptors."""
+        scores = self.warping.push(seen).cpu().numpy().astype(float)
+        energy = seen.square().sum(1).cpu().numpy().astype(float)
         warm = np.arange(self.compared, self.compared + len(seen)) >= self.source.window
         self.compared += len(seen)
         self.whole.push(scores, energy * np.where(warm, 1.0, COLD))
@@ -141,7 +140,7 @@ def recognize(stream: BrightnessStream, video: Footage) -> Array:
     return stream.whole.mean()
 
 
-def learned(videos: list[Footage], optics: Optics) -> list[list[Seen]]:
+def learned(videos: list[Footage], optics: Optics) -> list[list[Tensor]]:
     """Descriptors of videos to learn from: what a stream of each would give, and what a stream would give that began earlier.
 
     Where only an arm moves, a stream that has just begun knows the arm's place alone.  One that has seen the same person do other
@@ -158,13 +157,12 @@ def learned(videos: list[Footage], optics: Optics) -> list[list[Seen]]:
     return [[one, other] for (one, _), other in zip(first, again, strict=True)]
 
 
-def _looked_at(video: Footage, optics: Optics, seen: Tensor | None) -> tuple[Seen, Tensor | None]:
+def _looked_at(video: Footage, optics: Optics, seen: Tensor | None) -> tuple[Tensor, Tensor | None]:
     """Descriptors of a whole video, and where something has moved in the end."""
     sight, resample = Sight(optics, video.name, seen), Resampler(optics.fps, video.own_rate)
-    parts = [sight.push(resample.push(sight.small(frames), times)[0]) for frames, times in video]
-    found = Seen(torch.cat([part.motion for part in parts]).cpu(), torch.cat([part.kernels for part in parts]).cpu())
+    found = torch.cat([sight.push(resample.push(sight.small(frames), times)[0]) for frames, times in video]).cpu()
     if len(found) < FEWEST:
         raise ValueError(f"{video.name}: {len(found)} frames; motion needs at least {FEWEST}")
-    if not bool((found.motion.square().sum(1) > MOVES).any()):
+    if not bool((found.square().sum(1) > MOVES).any()):
         raise ValueError(f"{video.name}: nothing moves in it; leave it out, or give a video in which the action is seen")
     return found, sight.box.seen

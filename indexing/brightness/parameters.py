@@ -25,8 +25,6 @@ def check_parameters(indexer: Any) -> None:
     _check_region(indexer.region)
     if indexer.flip not in (True, False, "auto"):
         raise ValueError(f"flip must be 'auto', True or False, got {indexer.flip!r}")
-    if not (is_number(indexer.temporal_weight) and 0 <= indexer.temporal_weight <= 1):
-        raise ValueError(f"temporal_weight must be a share from 0 to 1, got {indexer.temporal_weight!r}")
     check_reject(indexer.reject)
     size = indexer.size
     if not isinstance(size, (int, np.integer)) or isinstance(size, bool) or not SMALLEST <= size <= LARGEST:

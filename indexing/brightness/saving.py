@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from indexing.brightness.library import Exemplars
 from indexing.brightness.parameters import check_parameters
-from indexing.brightness.sight import HALF, LENGTH
+from indexing.brightness.sight import LENGTH
 from indexing.checks import check_device
 from indexing.modelfile import Parts, labels_from_json, labels_to_json, read_model, usable, write_model
+from indexing.opening import shown
 
 if TYPE_CHECKING:
     from indexing.brightness.indexer import BrightnessIndexer
@@ -18,7 +19,7 @@ KIND = "dyntorch.brightness-indexer"
 VERSION = 1
 FRAMES = 2**31  # of a video, at most
 ROUNDING = 1e-3  # of a unit vector
-PARTS = ("motion", "kernels", "lengths", "labels")
+PARTS = ("motion", "lengths", "labels")
 
 Indexer = TypeVar("Indexer", bound="BrightnessIndexer")
 
@@ -38,19 +39,31 @@ def load(kind: type[Indexer], path: str | Path, device: str = "cpu") -> Indexer:
     check_device(device)
     header, parts = read_model(path, KIND, VERSION)
     with usable(path):
-        indexer = kind(**header["parameters"], device=device)
+        indexer = kind(**_known(header["parameters"]), device=device)
         check_parameters(indexer)
         classes = labels_from_json(header["classes"])
-        return indexer._learn(_exemplars(parts, len(classes), indexer.temporal_weight > 0), classes)
+        return indexer._learn(_exemplars(parts, len(classes)), classes)
 
 
-def _exemplars(parts: Parts, classes: int, kernels: bool) -> Exemplars:
+def _known(parameters: dict[str, Any]) -> dict[str, Any]:
+    """The parameters of a model file, of which older ones hold one more.
+
+    Raises:
+        ValueError: it mixed window kernels into the scores, which is no longer done.
+    """
+    known = {name: value for name, value in parameters.items() if name != "temporal_weight"}
+    weight = parameters.get("temporal_weight", 0.0)
+    if weight != 0.0:
+        raise ValueError(f"temporal_weight={shown(weight)}: window kernels are no longer mixed into scores")
+    return known
+
+
+def _exemplars(parts: Parts, classes: int) -> Exemplars:
     if classes < 2:
         raise ValueError(f"{classes} class")
     lengths = parts.whole("lengths", None, below=FRAMES)
-    total, flat = int(lengths.sum()), (2 * HALF + 1) ** 2 if kernels else 0
-    motion = parts.real("motion", total, LENGTH, least=-1 - ROUNDING, most=1 + ROUNDING)
+    motion = parts.real("motion", int(lengths.sum()), LENGTH, least=-1 - ROUNDING, most=1 + ROUNDING)
     labels = parts.every("labels", len(lengths), below=classes)
     if not bool((lengths > 0).all()):
         raise ValueError("lengths: a video without frames")
-    return Exemplars(motion.float(), parts.real("kernels", total, flat).float(), lengths, labels)
+    return Exemplars(motion.float(), lengths, labels)

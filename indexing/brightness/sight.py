@@ -13,7 +13,6 @@ from indexing.brightness.motion_box import MEMORY, MotionBox
 from indexing.brightness.motion_maps import MotionMaps
 from indexing.brightness.pooling import CELLS, described, pooled, profile
 from indexing.brightness.shrinking import Shrinker
-from indexing.brightness.window_kernel import window_kernels
 
 SMALLEST = 16  # px of the shorter side
 NEAR = 0.35  # of the image's height: the smallest box about what moves
@@ -25,7 +24,6 @@ and on arm raises of another person (moving frames; videos of 126 recognized whe
 .2 .1 .6 .1: .811 .823 .829 / .756 .746 .786, .967, 120; with nothing of the image, .35 0 .65 0: .821 / .719 (seed 0), .964, 125;
 the image alone: .812 / .779 (seed 0), .939, 100."""
 LENGTH = 2 * (4 * CELLS**2 + 3 * CELLS)  # of a descriptor
-HALF, PATCH = 5, 5  # of the window kernel: frames on either side, px of the work image (theory: 10 px at 160 px)
 
 Region = tuple[float, float, float, float]
 
@@ -38,26 +36,13 @@ class Optics:
         fps: frames per second at which everything is compared.
         size: px of the longer side of the work image.
         region: ``"motion"``, ``None`` (the whole image) or ``(x0, y0, x1, y1)`` in pixels of the video.
-        kernels: whether the thesis's window kernels are wanted, too.
         device: where to compute.
     """
 
     fps: float
     size: int
     region: str | Region | None
-    kernels: bool
     device: str
-
-
-@dataclass(frozen=True)
-class Seen:
-    """Of n frames: ``motion (n, 560)`` descriptors, and flat window kernels ``(n, 121)`` or ``(n, 0)``."""
-
-    motion: Tensor
-    kernels: Tensor
-
-    def __len__(self) -> int:
-        return len(self.motion)
 
 
 class Sight:
@@ -72,22 +57,14 @@ class Sight:
         self.optics = optics
         self.shrink = Shrinker(name, optics.size, SMALLEST)
         self.maps, self.box = MotionMaps(), MotionBox(MEMORY * optics.fps, seen)
-        self.past: Tensor | None = None
 
-    def push(self, frames: Tensor) -> Seen:
-        """Descriptors of more small frames ``(n, h, w)``, grey 0..1, at the rate of the optics."""
-        if not len(frames):
-            return Seen(frames.new_zeros(0, LENGTH), frames.new_zeros(0, self._flat))
-        maps, change = self.maps.push(frames)
-        return Seen(self._described(maps, change), self._kernels(frames))
+    def push(self, frames: Tensor) -> Tensor:
+        """Descriptors ``(n, 560)`` of more small frames ``(n, h, w)``, grey 0..1, at the rate of the optics."""
+        return self._described(*self.maps.push(frames)) if len(frames) else frames.new_zeros(0, LENGTH)
 
     def small(self, frames: Any) -> Tensor:
         """Small grey frames ``(n, h, w)`` in 0..1 of frames as given."""
         return self.shrink(frames).to(self.optics.device) / 255
-
-    @property
-    def _flat(self) -> int:
-        return (2 * HALF + 1) ** 2 if self.optics.kernels else 0
 
     def _described(self, maps: Tensor, change: Tensor) -> Tensor:
         n, height, width = change.shape
@@ -101,15 +78,6 @@ class Sight:
         cells = pooled(maps, boxes)
         grids, rows = described(cells[:, :2]), described(profile(cells.flip(1)[:, :2]))
         return torch.cat([grids.flatten(1), rows.flatten(1)], dim=1).mul_(_weights(maps.dtype, maps.device))
-
-    def _kernels(self, frames: Tensor) -> Tensor:
-        """Window kernels about frame t - 5, of the whole image: they do not tell places; 0 before frame 10."""
-        if not self.optics.kernels:
-            return frames.new_zeros(len(frames), 0)
-        known = frames if self.past is None else torch.cat([self.past, frames])
-        self.past = known[-2 * HALF :]
-        found = window_kernels(known, HALF, PATCH).flatten(1).to(frames)
-        return torch.cat([found.new_zeros(len(frames) - len(found), self._flat), found])
 
 
 @lru_cache(maxsize=64)

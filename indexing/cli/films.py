@@ -25,8 +25,6 @@ class Pixels:
 
     region: Annotated[str, tyro.conf.arg(metavar="REGION")] = "motion"
     """of videos: motion (the box about what moves), all (the whole image), or x0,y0,x1,y1 in pixels"""
-    temporal_weight: Annotated[float, tyro.conf.arg(metavar="W")] = 0.0
-    """of videos: share of the temporal window kernel, which does not mind a turned camera; 0.3 to 0.6 for other viewpoints"""
 
     def indexer(self, fps: float, **options: Any) -> BrightnessIndexer:
         """A new indexer of videos.
@@ -36,7 +34,7 @@ class Pixels:
         """
         from indexing.brightness.indexer import BrightnessIndexer
 
-        return BrightnessIndexer(fps=fps, region=self._region(), temporal_weight=self.temporal_weight, **options)
+        return BrightnessIndexer(fps=fps, region=self._region(), **options)
 
     def _region(self) -> Any:
         if self.region in ("motion", "all"):

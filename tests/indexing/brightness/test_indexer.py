@@ -1,7 +1,12 @@
 """The brightness indexer: what it recognizes, and that a stream, a file and an array say the same."""
 
+import json
+
 import numpy as np
 import pytest
+import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
 from sklearn.base import clone
 
 from indexing.actors import Person, perform
@@ -102,7 +107,7 @@ def test_events_are_found(indexer, asked):
 
 def test_files_of_models_are_exact(indexer, asked, tmp_path):
     path = tmp_path / "model.safetensors"
-    fitted = clone(indexer).set_params(reject=0.2, region=(2, 0, 46, 36), temporal_weight=0.2).fit(asked, [3, 1, 2])
+    fitted = clone(indexer).set_params(reject=0.2, region=(2, 0, 46, 36)).fit(asked, [3, 1, 2])
     for model in (indexer, fitted):
         model.save(path)
         again = BrightnessIndexer.load(path)
@@ -112,6 +117,23 @@ def test_files_of_models_are_exact(indexer, asked, tmp_path):
         assert np.array_equal(again.decision_function(asked), model.decision_function(asked))
     path.write_bytes(b"nothing")
     with pytest.raises(ValueError, match="not a model file"):
+        BrightnessIndexer.load(path)
+
+
+def test_files_from_before_the_window_kernel_went_are_read_where_it_had_no_weight(indexer, asked, tmp_path):
+    indexer.save(tmp_path / "model.safetensors")
+    with safe_open(tmp_path / "model.safetensors", framework="pt") as file:
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        header = json.loads(file.metadata()["dyntorch"])
+    path, tensors["kernels"] = tmp_path / "old.safetensors", torch.zeros(len(tensors["motion"]), 0)
+    for weight in (0.0, 0.6):
+        header["parameters"]["temporal_weight"] = weight
+        save_file(tensors, path, metadata={"dyntorch": json.dumps(header)})
+        if weight == 0:
+            assert np.array_equal(BrightnessIndexer.load(path).decision_function(asked), indexer.decision_function(asked))
+    with pytest.raises(
+        ValueError, match=r"old\.safetensors.*temporal_weight=0\.6: window kernels are no longer mixed into scores.*fit on"
+    ):
         BrightnessIndexer.load(path)
 
 
@@ -158,7 +180,6 @@ BAD = {
     "2 frames; motion needs": ([np.eye(32)[None] * np.ones((2, 1, 1))] * 2, ["a", "b"], {}),
     "region must be": ([], [], {"region": (5, 0, 2, 9)}),
     "flip must be": ([], [], {"flip": "no"}),
-    "temporal_weight must be": ([], [], {"temporal_weight": 1.5}),
     "window must be": ([], [], {"window": 0}),
     "pool must be": ([], [], {"pool": -1}),
     "size must be": ([], [], {"size": 8}),

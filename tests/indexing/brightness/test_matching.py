@@ -3,24 +3,24 @@
 import numpy as np
 import torch
 
-from indexing.brightness.library import Exemplars, Matcher, library
+from indexing.brightness.library import Exemplars, library
 from indexing.brightness.live import SHARP, Pool
 from indexing.brightness.matching import SLACK, Warping
 from indexing.brightness.sight import LENGTH
 
 
-def exemplars(lengths=(5, 3, 7), labels=(1, 0, 1), kernels=0):
+def exemplars(lengths=(5, 3, 7), labels=(1, 0, 1)):
     rows = torch.rand(sum(lengths), LENGTH, generator=torch.Generator().manual_seed(0)) / 20
-    return Exemplars(rows, torch.zeros(len(rows), kernels), torch.tensor(lengths), torch.tensor(labels))
+    return Exemplars(rows, torch.tensor(lengths), torch.tensor(labels))
 
 
 def test_warping_is_the_loop_of_its_definition():
     parts = exemplars()
     queries = torch.rand(9, LENGTH, generator=torch.Generator().manual_seed(1)) / 20
     window = 4.0
-    found = Warping(library(parts, Matcher.of(parts, 0.0), 2, False), window).push(queries)
+    found = Warping(library(parts, 2, False), window).push(queries)
     keep = 1 - 1 / window
-    tracks = [one.motion.numpy() for one in parts.videos()]
+    tracks = [one.numpy() for one in parts.videos()]
     states = [np.zeros(len(track)) for track in tracks]
     for t, query in enumerate(queries.numpy()):
         for i, track in enumerate(tracks):
@@ -38,7 +38,7 @@ def test_warping_is_the_loop_of_its_definition():
 
 def test_chunks_do_not_matter():
     parts = exemplars()
-    placed = library(parts, Matcher.of(parts, 0.0), 2, True)
+    placed = library(parts, 2, True)
     queries = torch.rand(50, LENGTH, generator=torch.Generator().manual_seed(2)) / 20
     stream = Warping(placed, 5.0)
     chunked = torch.cat([stream.push(part) for part in queries.split([1, 0, 16, 33])])
