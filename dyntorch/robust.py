@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.blocks import map_blocks, one_thread, workers
+from dyntorch.chi_square import quantile
 from dyntorch.fitting import fit_matches
 from dyntorch.invariant import Invariant, as_invariant
 from dyntorch.matches import Matches, matches
@@ -16,7 +17,7 @@ from dyntorch.normalize import denormalize, relative
 from dyntorch.refinement import refine_matches
 from dyntorch.residual import multilinear, whitened
 from dyntorch.solution import NOISY, Solution, Status, failed
-from dyntorch.starts import Found, Search, chi, threshold_of
+from dyntorch.starts import Found, Search, threshold_of
 
 STARTS = (1, 4, 16, 64, 256)
 SETTLING = 4  # updates of an estimated threshold per round
@@ -208,7 +209,7 @@ def _sigma(invariant: Invariant, data: Matches, distance: Tensor, cut: Tensor) -
     inliers = _within(data, distance, cut)
     middle = distance.masked_fill(~inliers, torch.nan).nanmedian(-1).values.nan_to_num(nan=0.0)
     rows = inliers.sum(-1) * invariant.codim
-    return middle / chi(invariant.codim, 0.5) * (rows / (rows - invariant.dof).clamp(min=1)).clamp(min=1.0).sqrt()
+    return middle / quantile(0.5, invariant.codim) ** 0.5 * (rows / (rows - invariant.dof).clamp(min=1)).clamp(min=1.0).sqrt()
 
 
 def _where(mask: Tensor, new: Tensor, old: Tensor) -> Tensor:

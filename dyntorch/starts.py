@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import torch
 from torch import Tensor
 
 from dyntorch.blocks import Result, map_blocks, workers
+from dyntorch.chi_square import quantile
 from dyntorch.hypotheses import Bundle, anneal, bundle, concentrate, median, msac
 from dyntorch.invariant import Invariant
 from dyntorch.matches import Matches
@@ -118,7 +118,7 @@ class Search:
         middle = self._map(block, everyone, chosen)
         # Rousseeuw and Leroy 1987: the median of so few is too small
         few = 1 + 5 / ((self.weights > 0).sum(-1) - inv.minimal()).clamp(min=1)
-        return threshold_of(inv, middle.sqrt() * few / chi(inv.codim, 0.5)) / self.unit
+        return threshold_of(inv, middle.sqrt() * few / quantile(0.5, inv.codim) ** 0.5) / self.unit
 
     def evidence(self, tensor: Tensor, cut: Tensor) -> Tensor:
         """Evidence ``(b,)``, see :class:`Found`, of normalized tensors as a solution holds them, with another threshold."""
@@ -272,17 +272,6 @@ def _near(invariant: Invariant, data: Matches) -> Tensor:
     return keep
 
 
-@lru_cache(maxsize=64)
-def chi(freedom: int, share: float) -> float:
-    """Quantile of the chi distribution: the length that a vector of so many standard normal numbers keeps with this chance."""
-    low, high = 0.0, 10.0 + 2 * freedom
-    for _ in range(60):
-        middle = (low + high) / 2
-        below = float(torch.special.gammainc(torch.tensor(freedom / 2), torch.tensor(middle**2 / 2).double())) < share
-        low, high = (middle, high) if below else (low, middle)
-    return low
-
-
 def threshold_of(invariant: Invariant, sigma: Tensor) -> Tensor:
     """The distance that 99 % of the inliers keep, with noise of standard deviation ``sigma``."""
-    return (sigma * chi(invariant.codim, 0.99)).clamp(min=torch.finfo(sigma.dtype).tiny ** 0.25)
+    return (sigma * quantile(0.99, invariant.codim) ** 0.5).clamp(min=torch.finfo(sigma.dtype).tiny ** 0.25)

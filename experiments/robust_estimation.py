@@ -21,9 +21,9 @@ import tyro
 
 import dyntorch as dyn
 from dyntorch import scenes
+from dyntorch.chi_square import quantile
 from dyntorch.invariant import Invariant
 from dyntorch.scenes.scene import OUTLIER, Scene
-from dyntorch.starts import chi
 from experiments.tables import Row, command, measured
 from indexing.files import prepare
 
@@ -75,7 +75,7 @@ class Config:
 def measure(task: Task, share: float, config: Config, count: int) -> tuple[float, float, float]:
     """Share of successes, median RMS distance of the exact true matches in units of the noise, milliseconds per scene."""
     found, errors, times = [], [], []
-    threshold = None if config.estimate else task.sigma * chi(task.invariant.codim, 0.995)
+    threshold = None if config.estimate else task.sigma * quantile(0.995, task.invariant.codim) ** 0.5
     for seed, start in enumerate(range(0, count, task.batch)):
         size = min(task.batch, count - start)
         made = task.scene(

@@ -55,6 +55,7 @@ LAYERS = [
         "algebra",
         "arguments",
         "blocks",
+        "chi_square",
         "constants",
         "devices",
         "eigenspace",

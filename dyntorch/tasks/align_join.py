@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.algebra.homogeneous import homogeneous, inhomogeneous
+from dyntorch.chi_square import median, three_sigma
 from dyntorch.fitting import fit_matches
 from dyntorch.invariant import Invariant
 from dyntorch.invariants.join_tensor import JoinTensor
@@ -16,7 +17,7 @@ from dyntorch.matches import Matches
 from dyntorch.robust import robust_fit
 from dyntorch.solution import NOISY, Solution, Status, failed
 from dyntorch.tasks.alignment import MOVING, OUTLIER, STATIC, Alignment
-from dyntorch.tasks.labelling import CHI_SQUARE, MEDIAN, ROUGH, SIGMAS, Evidence, Labelled, joined
+from dyntorch.tasks.labelling import ROUGH, SIGMAS, Evidence, Labelled, joined
 from dyntorch.tasks.notices import Notice, NoticeCode, notices
 from dyntorch.tasks.static_consensus import static_consensus
 
@@ -117,13 +118,13 @@ def _from_static(evidence: Evidence, given: Tensor | None, generator: torch.Gene
         pool = torch.where((known.sum(-1) >= ENOUGH)[:, None], known, pool)
     scale = evidence.norm.scales[0]
     # each distance has the noise of two views
-    limit = None if given is None else 2 * CHI_SQUARE[6] * (ROUGH * scale * given).square()
+    limit = None if given is None else 2 * three_sigma(6) * (ROUGH * scale * given).square()
     motion, variance = static_consensus(evidence.views, pool, limit, SAMPLES, generator)
     theta = torch.cat([part.flatten(1) for part in motion], dim=-1)
     if given is not None:
         return theta, given
     # static_consensus divides by the median of 4 conditions; three views of space have 6
-    return theta, (variance * MEDIAN[4] / MEDIAN[6]).nan_to_num(posinf=1.0).sqrt() / scale
+    return theta, (variance * median(4) / median(6)).nan_to_num(posinf=1.0).sqrt() / scale
 
 
 def _from_tensor(
@@ -151,7 +152,7 @@ def _from_tensor(
     else:
         motion = evidence.problem(torch.zeros_like(data.weights)).parts(theta)
         moving = JoinTensor().whitened(motion, evidence.views, evidence.norm.scales).square().sum(-1)
-        noise = (torch.where(data.weights > 0, moving, torch.nan).nanmedian(dim=-1).values / MEDIAN[JoinTensor.codim]).sqrt()
+        noise = (torch.where(data.weights > 0, moving, torch.nan).nanmedian(dim=-1).values / median(JoinTensor.codim)).sqrt()
     return theta, torch.where(usable & noise.isfinite(), noise, torch.inf)
 
 

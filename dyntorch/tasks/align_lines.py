@@ -8,13 +8,14 @@ import torch
 from torch import Tensor
 
 from dyntorch.blocks import one_thread
+from dyntorch.chi_square import median
 from dyntorch.fitting import fit_matches
 from dyntorch.invariants.translating_lines_matrix import TranslatingLinesMatrix
 from dyntorch.matches import Matches, matches
 from dyntorch.robust import robust_fit
 from dyntorch.solution import Solution, Status, failed
 from dyntorch.tasks.alignment import OUTLIER, STATIC, Alignment
-from dyntorch.tasks.labelling import MEDIAN, SIGMAS
+from dyntorch.tasks.labelling import SIGMAS
 from dyntorch.tasks.line_model import Lines, as_points, settle, spread
 from dyntorch.tasks.notices import Notice, NoticeCode, check_threshold, notices
 
@@ -162,7 +163,7 @@ def _noise(lines: Lines, theta: Tensor, plain: bool) -> Tensor:
     if plain:
         return (torch.where(present, square, 0.0).sum(-1) / present.sum(-1).clamp(min=1)).sqrt().maximum(lines.floor)
     middle = torch.where(present, square, torch.nan).nanmedian(dim=-1).values.nan_to_num()
-    return 1.5 * (middle / MEDIAN[1]).sqrt().maximum(lines.floor)
+    return 1.5 * (middle / median(1)).sqrt().maximum(lines.floor)
 
 
 def _result(

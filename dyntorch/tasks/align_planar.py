@@ -8,13 +8,14 @@ import torch
 from torch import Tensor
 
 from dyntorch.blocks import one_thread
+from dyntorch.chi_square import three_sigma
 from dyntorch.fitting import fit_matches
 from dyntorch.invariants.homography_tensor import HomographyTensor
 from dyntorch.matches import Matches, matches
 from dyntorch.robust import robust_fit
 from dyntorch.solution import NOISY, Solution, Status, failed
 from dyntorch.tasks.alignment import MOVING, OUTLIER, STATIC, Alignment
-from dyntorch.tasks.labelling import CHI_SQUARE, ROUGH, SIGMAS, Evidence, Labelled, joined
+from dyntorch.tasks.labelling import ROUGH, SIGMAS, Evidence, Labelled, joined
 from dyntorch.tasks.notices import check_threshold
 from dyntorch.tasks.planar_notices import planar_notices, tensor_rank, undecided, unverified
 from dyntorch.tasks.static_consensus import static_consensus
@@ -165,7 +166,7 @@ def _from_static(evidence: Evidence, given: Tensor | None, generator: torch.Gene
         pool = torch.where((known.sum(-1) >= 4)[:, None], known, pool)
     scale = evidence.norm.scales[0]
     # each distance has the noise of two views
-    limit = None if given is None else 2 * CHI_SQUARE[4] * (ROUGH * scale * given).square()
+    limit = None if given is None else 2 * three_sigma(4) * (ROUGH * scale * given).square()
     motion, variance = static_consensus(evidence.views, pool, limit, SAMPLES, generator)
     theta = torch.cat([part.flatten(1) for part in motion], dim=-1)
     return theta, variance.nan_to_num(posinf=1.0).sqrt() / scale if given is None else given

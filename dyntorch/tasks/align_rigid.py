@@ -7,11 +7,12 @@ from torch import Tensor
 
 from dyntorch.algebra.homogeneous import similarity
 from dyntorch.algebra.rigid import rigid_alignment
+from dyntorch.chi_square import three_sigma
 from dyntorch.eigenspace import spectrum
 from dyntorch.matches import Matches
 from dyntorch.solution import NOISY, Status, failed
 from dyntorch.tasks.alignment import MOVING, OUTLIER, STATIC, Alignment
-from dyntorch.tasks.labelling import CHI_SQUARE, SIGMAS
+from dyntorch.tasks.labelling import SIGMAS
 from dyntorch.tasks.notices import Notice, NoticeCode, notices
 from dyntorch.tasks.rigid import MOTIONS, Sightings, combinations, squares
 from dyntorch.tasks.rigid_search import Rigid, search
@@ -100,8 +101,8 @@ def _result(data: Matches, sightings: Sightings, found: Rigid, centres: list[Ten
 def _labels(data: Sightings, found: Rigid) -> Tensor:
     moving, static = squares(found.motions, data)
     square = found.sigma.square()[:, None]
-    still = found.still & (static <= CHI_SQUARE[6] * square)
-    path = found.inliers & (moving <= CHI_SQUARE[data.conditions] * square)
+    still = found.still & (static <= three_sigma(6) * square)
+    path = found.inliers & (moving <= three_sigma(data.conditions) * square)
     return torch.where(still, STATIC, torch.where(path, MOVING, OUTLIER))
 
 

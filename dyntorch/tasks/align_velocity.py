@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.blocks import map_blocks
+from dyntorch.chi_square import median, three_sigma
 from dyntorch.eigenspace import spectrum
 from dyntorch.fitting import fit_matches
 from dyntorch.invariants.constant_velocity_tensor import ConstantVelocityTensor
@@ -14,7 +15,7 @@ from dyntorch.robust import robust_fit
 from dyntorch.sampling import uniform
 from dyntorch.solution import NOISY, Status, failed
 from dyntorch.tasks.alignment import OUTLIER, STATIC, Alignment
-from dyntorch.tasks.labelling import CHI_SQUARE, MEDIAN, SIGMAS, Evidence
+from dyntorch.tasks.labelling import SIGMAS, Evidence
 from dyntorch.tasks.notices import Notice, NoticeCode, notices
 from dyntorch.tasks.velocity_model import DOF, GAUGE, Velocities, information, residuals, settle, world_velocities
 
@@ -120,9 +121,9 @@ def _affine_consensus(points: Tensor, weights: Tensor, index: Tensor, sigma: Ten
         middle = ((count - 1) // 2).clamp(min=0)[:, None, None].expand(-1, square.shape[1], 1)
         score = ranked.gather(-1, middle)[..., 0]
         spare = (1 - DOF[True] / (3 * count).clamp(min=22)).clamp(min=0.1)
-        limit = CHI_SQUARE[3] * score.amin(-1) / (MEDIAN[3] * spare)
+        limit = three_sigma(3) * score.amin(-1) / (median(3) * spare)
     else:
-        limit = CHI_SQUARE[3] * sigma.square()
+        limit = three_sigma(3) * sigma.square()
         score = (square.minimum(limit[:, None, None]) * present[:, None]).sum(-1)
     best = score.argmin(-1)
     first = torch.arange(len(best), device=best.device)
@@ -158,7 +159,7 @@ def _starting_noise(evidence: Evidence, theta: Tensor, given: Tensor | None) -> 
         return given
     moving, _ = residuals(evidence, theta)
     middle = torch.where(evidence.data.weights > 0, moving, torch.nan).nanmedian(dim=-1).values.nan_to_num()
-    return (middle / MEDIAN[3]).sqrt().maximum(evidence.floor)
+    return (middle / median(3)).sqrt().maximum(evidence.floor)
 
 
 def _identity(theta: Tensor) -> Tensor:

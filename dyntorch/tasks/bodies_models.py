@@ -10,6 +10,7 @@ from torch import Tensor
 
 from dyntorch.algebra.epipolar import sampson_squared
 from dyntorch.algebra.plane_homography import homography, homography_sampson_squared
+from dyntorch.chi_square import median
 from dyntorch.tasks.bodies_energy import PIXELS, View
 
 OFF, WIDE = 0.02, 1.5
@@ -17,8 +18,6 @@ OFF, WIDE = 0.02, 1.5
 in thresholds (in two dimensions)."""
 LEAST_NOISE = 0.1
 """Least standard deviation of a coordinate, pixels: no detector is better, and exact data shows none."""
-MEDIAN = 0.455
-"""Of the square of a standard normal variable."""
 TRUNCATED, KEPT = 6.25, 0.978
 """Squares of it count up to the first in the mean, which is the second then."""
 ROUNDS = 10
@@ -76,7 +75,7 @@ def _noise(square: Tensor, members: Tensor) -> Tensor:
     order = every.argsort()
     share = weight[order].cumsum(0)
     total = share[-1].clamp(min=TINY)
-    variance = every[order[(share >= 0.5 * total).to(torch.int8).argmax()]] / MEDIAN
+    variance = every[order[(share >= 0.5 * total).to(torch.int8).argmax()]] / median(1)
     for _ in range(ROUNDS):
         variance = (every.minimum(TRUNCATED * variance) * weight).sum() / (KEPT * total)
     count = members.sum(-1)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.algebra.homogeneous import similarity
+from dyntorch.chi_square import median
 from dyntorch.sampling import uniform
 from dyntorch.solution import Status
 from dyntorch.tasks.bodies_count import ALONE, MOST, PENALTY, best
@@ -43,7 +44,7 @@ LEFT, LEFT_SHARE = 10, 0.08
 """Linked matches without a body, and their share of all linked ones, from which one body more is tried."""
 GUESS = 0.003
 """Threshold over the diagonal of the image, where it has to be estimated."""
-MEDIANS = {BodyModel.FUNDAMENTAL: 0.6745, BodyModel.HOMOGRAPHY: 1.1774}
+MEDIANS = {BodyModel.FUNDAMENTAL: median(1) ** 0.5, BodyModel.HOMOGRAPHY: median(2) ** 0.5}
 """Median Sampson distance of inliers, in units of the noise of a coordinate."""
 
 

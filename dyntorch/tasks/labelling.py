@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from dyntorch.chi_square import three_sigma
 from dyntorch.eigenspace import spectrum
 from dyntorch.invariant import Invariant
 from dyntorch.matches import Matches
@@ -17,10 +18,6 @@ from dyntorch.residual import whiten, whitened
 from dyntorch.solution import Solution
 from dyntorch.tasks.alignment import MOVING, OUTLIER, STATIC
 
-CHI_SQUARE = {1: 9.0, 2: 11.829, 3: 14.156, 4: 16.251, 6: 20.062}
-"""Quantiles of chi^2 at 99.73 %: what three standard deviations are for one condition, for several."""
-MEDIAN = {1: 0.4549, 2: 1.386, 3: 2.366, 4: 3.357, 6: 5.348}
-"""Medians of chi^2."""
 SIGMAS = 3.0
 """The threshold in standard deviations of the noise."""
 ROUNDS, ESTIMATING = 3, 6
@@ -118,7 +115,7 @@ class Evidence:
         """
         moving, resting = self.residuals(theta)
         variance = sigma.square()[:, None]
-        still, path = CHI_SQUARE[resting.shape[-1]], CHI_SQUARE[self.invariant.codim]
+        still, path = three_sigma(resting.shape[-1]), three_sigma(self.invariant.codim)
         other = still + (moving.square().sum(-1) / variance).clamp(max=path)
         if self.data.static is not None:
             other = torch.where(self.data.static, still + path, other)
@@ -130,7 +127,7 @@ class Evidence:
         moving, resting = self.residuals(theta)
         variance = sigma.square()[:, None]
         path, still = moving.square().sum(-1), resting.square().sum(-1)
-        limits = [CHI_SQUARE[c] * variance for c in (self.invariant.codim, resting.shape[-1])]
+        limits = [three_sigma(c) * variance for c in (self.invariant.codim, resting.shape[-1])]
         agree = [path <= limits[0], still <= limits[1]]
         if spread is not None:
             pieces = [self._widened(theta, spread, piece) for piece in self._pieces(theta)]

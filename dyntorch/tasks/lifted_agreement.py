@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.algebra.triangulation import reproject, triangulate
-from dyntorch.starts import chi
+from dyntorch.chi_square import quantile
 from dyntorch.tasks.lifted_projections import Tracks
 
 SHARE = 0.997
@@ -50,7 +50,7 @@ def bound(free: Tensor, share: float = SHARE) -> Tensor:
 
 @lru_cache(maxsize=64)
 def _bounds(top: int, share: float) -> tuple[float, ...]:
-    return (0.0, *(chi(free, share) ** 2 for free in range(1, top + 1)))
+    return (0.0, *(quantile(share, free) for free in range(1, top + 1)))
 
 
 def noise(square: Tensor, free: Tensor, chosen: Tensor, part: float = 0.5) -> Tensor:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from dyntorch.algebra.triangulation import triangulate, unit_projections
 from dyntorch.bundle_adjustment import bundle_adjust
+from dyntorch.chi_square import quantile
 from dyntorch.motions import Motion
 from dyntorch.solution import Status, agreed, failed
 from dyntorch.tasks.lifted_bodies import bodies_of
@@ -22,8 +23,6 @@ from dyntorch.tasks.reconstruction import Reconstruction
 
 Part = TypeVar("Part", Projections, Scene)
 
-CHI_SQUARE = {2: 9.210, 3: 11.345, 4: 13.277}
-"""99 % quantiles."""
 CORRECTIONS = 4
 """Times that points said to stand still are looked at."""
 EXACT = 1e-18
@@ -192,7 +191,7 @@ def _rests(tracks: Tracks, scene: Scene, lifting: Lifting, projections: Tensor) 
     extent = (1 / tracks.scales.amin(-1, keepdim=True)).square()
     sigma = moving.sum(-1, keepdim=True) / free[:, None] + EXACT * extent
     extra = lifting.lifts.shape[-1] - lifting.lifts.shape[1]
-    return resting - moving <= CHI_SQUARE.get(extra, 3.0 * extra + 4.0) * sigma
+    return resting - moving <= quantile(0.99, extra) * sigma
 
 
 def _open(motion: Motion, times: Tensor, static: Tensor | None) -> str:

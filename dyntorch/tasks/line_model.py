@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from dyntorch.algebra.homogeneous import homogeneous, unit
+from dyntorch.chi_square import three_sigma
 from dyntorch.eigenspace import spectrum
 from dyntorch.forward import by_match, derivatives
 from dyntorch.invariants.agreement import point_error, static_residual
@@ -19,7 +20,6 @@ from dyntorch.normalize import Normalization, denormalize_motion
 from dyntorch.primitives import Line, direction
 from dyntorch.residual import multilinear, multilinear_derivative
 from dyntorch.tasks.alignment import MOVING, OUTLIER, STATIC
-from dyntorch.tasks.labelling import CHI_SQUARE
 
 ROUNDS, STEPS = 4, 12
 CONVERGED = 1e-10  # relative decrease of the cost
@@ -194,8 +194,8 @@ def _equations(lines: Lines, theta: Tensor, labels: Tensor) -> tuple[Tensor, Ten
 
 def _labels(lines: Lines, theta: Tensor, sigma: Tensor) -> Tensor:
     square, known = sigma.square()[:, None], lines.data.static
-    still = lines.still(theta).square().sum(-1) <= CHI_SQUARE[4] * square
-    path = lines.moving(theta).square() <= CHI_SQUARE[1] * square
+    still = lines.still(theta).square().sum(-1) <= three_sigma(4) * square
+    path = lines.moving(theta).square() <= three_sigma(1) * square
     path = path if known is None else path & ~known
     labels = torch.where(still, STATIC, torch.where(path, MOVING, OUTLIER))
     return torch.where(lines.data.weights > 0, labels, OUTLIER)

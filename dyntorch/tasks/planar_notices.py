@@ -7,13 +7,14 @@ from torch import Tensor
 
 from dyntorch.algebra.homogeneous import homogeneous, inhomogeneous
 from dyntorch.algebra.rank_two import cofactors
+from dyntorch.chi_square import three_sigma
 from dyntorch.fitting import fit_matches
 from dyntorch.invariants.agreement import static_residual
 from dyntorch.invariants.homography_tensor import HomographyTensor
 from dyntorch.matches import Matches
 from dyntorch.solution import Status, failed
 from dyntorch.tasks.alignment import MOVING, OUTLIER, STATIC
-from dyntorch.tasks.labelling import CHI_SQUARE, Evidence, Labelled
+from dyntorch.tasks.labelling import Evidence, Labelled
 from dyntorch.tasks.notices import Notice, NoticeCode, notices
 
 RANK = 1e-9
@@ -100,7 +101,7 @@ def undecided(evidence: Evidence, best: Labelled, tensor: tuple[Tensor, Tensor])
     if evidence.data.static is not None:
         family = family & ((still & evidence.data.static).sum(-1) < MINIMAL)
     square = evidence.residuals(best.theta)[1].square().sum(-1)
-    limit = WIDER**2 * CHI_SQUARE[4] * best.sigma.square()[:, None]
+    limit = WIDER**2 * three_sigma(4) * best.sigma.square()[:, None]
     beside = ((square <= limit) & ~still & (evidence.data.weights > 0)).sum(-1)
     return family & (still.sum(-1) < SUPPORT + CHANCE * beside / (WIDER**2 - 1))
 
@@ -116,7 +117,7 @@ def unverified(evidence: Evidence, best: Labelled) -> Tensor:
         static_residual([parts[1]], (first, third), (s1, s3)),
         static_residual([between], (second, third), (s2, s3)),
     )
-    limit = CHI_SQUARE[2] * best.sigma.square()[:, None]
+    limit = three_sigma(2) * best.sigma.square()[:, None]
     agree = torch.stack([pair.square().sum(-1) <= limit for pair in pairs])
     return agree.any(0) & (evidence.data.weights > 0)
 

@@ -9,6 +9,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from dyntorch.chi_square import quantile
 from dyntorch.eigenspace import spectrum
 from dyntorch.tasks.notices import Notice, NoticeCode, notices
 from dyntorch.tasks.planes_input import Given
@@ -17,7 +18,7 @@ EXACT = 1e-7
 """Sine or ratio that is rounding error."""
 NEAR = 0.1
 """Sine or ratio below which noise is asked whether it is zero; above, nothing is degenerate."""
-CHI_SQUARE = 9.2
+CHI_SQUARE = quantile(0.99, 2)
 """Squared distance in standard deviations, of two degrees of freedom, exceeded once in a hundred."""
 
 MESSAGES: dict[NoticeCode, str | tuple[str, str] | dict[bool, str]] = {

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.algebra.homogeneous import unit_vectors
+from dyntorch.chi_square import quantile
 from dyntorch.eigenspace import spectrum
 from dyntorch.least_squares import minimize
 from dyntorch.tasks.planes_problem import Layout, Matches, Matrices, PlanesProblem
@@ -26,8 +27,6 @@ LIKELY = 4.0
 LOW = 0.1
 """Share of problems whose noise is underestimated.  With a quarter instead, 8 of 109 answers to 3 to 8 planes without matches at
 0.5 px are off by more than 0.2 and three standard deviations; so 3 of 97."""
-DEVIATE, POLISH = -1.2816, 6
-"""Its normal deviate, and Newton steps from there to the quantile of chi-square."""
 EXACT = 1e-20
 """Cost that is rounding error."""
 FLOOR = 1e-15
@@ -119,17 +118,9 @@ def noise_variance(cost: Tensor, spare: Tensor) -> Tensor:
     Args:
         cost: c ``(b,)``.
         spare: ``(b,)`` residuals beyond the degrees of freedom.
-
-    Source: Wilson and Hilferty 1931 (the distribution of chi-square): its cube root is about normal.
     """
-    freedom = spare.clamp(min=1)
-    width = 2 / (9 * freedom)
-    half, middle = freedom / 2, freedom * (1 - width + DEVIATE * width.sqrt()).clamp(min=0.1) ** 3 / 2
-    for _ in range(POLISH):
-        # Newton's method in the logarithm of the quantile
-        density = (half * middle.log() - middle - torch.lgamma(half)).exp()
-        middle = middle * ((LOW - torch.special.gammainc(half, middle)) / density).clamp(-1, 1).exp()
-    return torch.where(spare > 0, cost / (2 * middle), 0.0)
+    limits = spare.new_tensor([quantile(LOW, degrees) for degrees in spare.clamp(min=1).flatten().tolist()]).reshape(spare.shape)
+    return torch.where(spare > 0, cost / limits, 0.0)
 
 
 def _covariance(problem: PlanesProblem, theta: Tensor) -> tuple[Tensor, Tensor]:

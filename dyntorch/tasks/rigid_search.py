@@ -9,8 +9,8 @@ from torch import Tensor
 
 from dyntorch.algebra.rigid import rigid_alignment
 from dyntorch.blocks import map_blocks
+from dyntorch.chi_square import median, three_sigma
 from dyntorch.sampling import uniform
-from dyntorch.tasks.labelling import CHI_SQUARE, MEDIAN
 from dyntorch.tasks.rigid import Sightings, combinations, descend, normal_equations, squares
 
 STATIC_STARTS = 60
@@ -19,7 +19,7 @@ MOVING_STARTS = 60
 SAMPLE = {"straight": 7, "constant_velocity": 5}
 """Matches per moving sample, one or two above the minimum (6 and 3): at the minimum itself local minima abound."""
 FINALISTS = 5
-BITS = CHI_SQUARE[2] / 2
+BITS = three_sigma(2) / 2
 """Cost, in units of 2 log likelihood, of one free coordinate: a match is an outlier (6 free ones) rather than a point on a
 straight line (4) above the limit of chi-square with 2 degrees of freedom."""
 ROUNDS = 4  # of labelling and least squares
@@ -97,7 +97,7 @@ def _search(data: Sightings, sigma: Tensor | None, held: Tensor, order: Tensor, 
     noise = noise.gather(1, chosen)
     noise = noise if sigma is not None else noise.amin(1, keepdim=True).expand_as(noise)
     for stretch in (8.0, 3.0, 1.0):
-        motions, _ = descend(motions, data, scale=noise * stretch * CHI_SQUARE[data.conditions] ** 0.5, iterations=12)
+        motions, _ = descend(motions, data, scale=noise * stretch * three_sigma(data.conditions) ** 0.5, iterations=12)
         noise = noise if sigma is not None else _scales(squares(motions, data)[0], data, floor)
     # one noise for all, or the worse motion would be forgiven more
     noise = noise if sigma is not None else noise.amin(1, keepdim=True).expand_as(noise)
@@ -140,7 +140,7 @@ def _scales(moving: Tensor, data: Sightings, floor: float) -> Tensor:
     ranked = torch.where(present, moving, torch.inf).sort(-1).values
     middle = ranked.gather(-1, ((count - 1) // 2).clamp(min=0).expand(ranked.shape[:-1])[..., None])[..., 0]
     middle = torch.where(middle.isfinite(), middle, 0.0)
-    return (middle / (MEDIAN[data.conditions] * spare)).sqrt().clamp(min=floor)
+    return (middle / (median(data.conditions) * spare)).sqrt().clamp(min=floor)
 
 
 def _score(moving: Tensor, static: Tensor, held: Tensor, data: Sightings, sigma: Tensor) -> Tensor:
@@ -160,9 +160,9 @@ def _settle(motions: Tensor, data: Sightings, sigma: Tensor, estimate: bool, hel
     for _ in range(ROUNDS):
         moving, static = squares(motions, data)
         square = sigma.square()[:, None]
-        resting = static <= CHI_SQUARE[6] * square
+        resting = static <= three_sigma(6) * square
         still = resting & (held | grounded[:, None]) & present
-        inliers = (still | (~held & (moving <= CHI_SQUARE[data.conditions] * square))) & present
+        inliers = (still | (~held & (moving <= three_sigma(data.conditions) * square))) & present
         subset = replace(data, weights=data.weights * inliers)
         motions, _ = descend(motions, subset, still=still, iterations=15)
         if estimate:
@@ -197,7 +197,7 @@ def common_velocity(found: Rigid, data: Sightings) -> tuple[Tensor, Tensor]:
     velocity = -u / 2**0.5
     step = max(1, velocity.shape[-2] // SEEDS)
     # of a static point |u|^2 + |v|^2 is within the limit, with u counted from the common velocity
-    room = (CHI_SQUARE[6] * found.sigma.square()[:, None] - v.square().sum(-1)).clamp(min=0.0) / 2
+    room = (three_sigma(6) * found.sigma.square()[:, None] - v.square().sum(-1)).clamp(min=0.0) / 2
     near = (torch.cdist(velocity[:, ::step], velocity).square() <= 2 * room[:, None]) & found.inliers[:, None]
     best = (near.sum(-1) * found.inliers[:, ::step]).argmax(-1)
     members = near[torch.arange(len(best), device=best.device), best]

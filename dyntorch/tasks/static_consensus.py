@@ -7,8 +7,8 @@ from torch import Tensor
 
 from dyntorch.algebra.homogeneous import apply, homogeneous
 from dyntorch.blocks import map_blocks
+from dyntorch.chi_square import median
 from dyntorch.sampling import uniform
-from dyntorch.tasks.labelling import MEDIAN
 
 BLOCK = 1 << 19
 """Numbers in the largest temporary of one block of the batch (4 MB)."""
@@ -84,7 +84,7 @@ def _search(
         score = torch.where(valid[:, None], torch.minimum(square, limit[:, None, None]), 0.0).sum(-1)
     best = score.argmin(-1)
     chosen_square = ordered[problem, best].sort(dim=-1).values.gather(-1, middle[:, :1])[:, 0]
-    return (*(matrix[problem, best] for matrix in maps), chosen_square / (2 * MEDIAN[4]))
+    return (*(matrix[problem, best] for matrix in maps), chosen_square / (2 * median(4)))
 
 
 def _collineation(target: Tensor, source: Tensor) -> Tensor:

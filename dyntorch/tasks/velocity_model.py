@@ -8,13 +8,14 @@ import torch
 from torch import Tensor
 
 from dyntorch.algebra.homogeneous import apply, unit
+from dyntorch.chi_square import three_sigma
 from dyntorch.eigenspace import spectrum
 from dyntorch.forward import derivatives
 from dyntorch.invariants.constant_velocity_tensor import ConstantVelocityTensor
 from dyntorch.least_squares import damped_step
 from dyntorch.normalize import denormalize_motion
 from dyntorch.tasks.alignment import MOVING, OUTLIER, STATIC
-from dyntorch.tasks.labelling import CHI_SQUARE, ROUGH, Evidence
+from dyntorch.tasks.labelling import ROUGH, Evidence
 
 ROUNDS = 4
 STEPS = 15
@@ -144,8 +145,8 @@ def _rounds(evidence: Evidence, state: Velocities, affine: bool, estimate: bool)
 def _labels(evidence: Evidence, theta: Tensor, sigma: Tensor, grounded: Tensor) -> Tensor:
     moving, resting = residuals(evidence, theta)
     variance, known = sigma.square()[:, None], evidence.data.static
-    still = (resting <= CHI_SQUARE[6] * variance) & grounded[:, None]
-    path = moving <= CHI_SQUARE[3] * variance
+    still = (resting <= three_sigma(6) * variance) & grounded[:, None]
+    path = moving <= three_sigma(3) * variance
     path = path if known is None else path & ~known
     labels = torch.where(still, STATIC, torch.where(path, MOVING, OUTLIER))
     return torch.where(evidence.data.weights > 0, labels, OUTLIER)
@@ -162,7 +163,7 @@ def _noise(evidence: Evidence, theta: Tensor, labels: Tensor, before: Tensor, do
 def _ground(evidence: Evidence, state: Velocities) -> tuple[Tensor, Tensor]:
     """Maps in the gauge in which the most matches stand still, and where these are enough; else the mean velocity is 0."""
     inliers = state.labels != OUTLIER
-    limit = CHI_SQUARE[6] * state.sigma.square()[:, None]
+    limit = three_sigma(6) * state.sigma.square()[:, None]
     n = inliers.shape[-1]
     chosen = torch.arange(0, n, max(1, -(-n // SEEDS)), device=inliers.device)
     motion, views = _maps(evidence, state.theta), evidence.views

@@ -107,7 +107,7 @@ def test_choice_is_the_smaller_criterion_with_the_noise_of_a_loop():
             c = (H @ one)[:2] - two[:2] * (H @ one)[2]
             J = torch.cat([H[:2, :2] - two[:2, None] * H[2, :2], -(H @ one)[2] * torch.eye(2, dtype=F64)], dim=-1)
             planar.append(float(c @ torch.linalg.solve(J @ J.mT, c)))
-        noise = statistics.median_low(epipolar) / module.MEDIAN
+        noise = statistics.median_low(epipolar) / statistics.NormalDist().inv_cdf(0.75) ** 2
         for _ in range(module.ROUNDS):
             noise = sum(min(s, module.TRUNCATED * noise) for s in epipolar) / (module.KEPT * 50)
         noise *= 50 / (50 - 7 - math.sqrt(100))
