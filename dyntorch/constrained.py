@@ -33,7 +33,7 @@ class Algebraic:
         return parts_of(theta, self.shapes)
 
     def subset(self, keep: Tensor) -> Algebraic:
-        return Algebraic(self.invariant.subset(keep), self.shapes, self.gram[keep])
+        return Algebraic(self.invariant, self.shapes, self.gram[keep])
 
     def cost(self, theta: Tensor) -> Tensor:
         """``(b,)``."""

@@ -203,10 +203,6 @@ class Invariant:
         """The invariant that the tensor of normalized matches belongs to: the same one, unless it depends on coordinates."""
         return self
 
-    def subset(self, keep: Tensor) -> Invariant:
-        """The invariant of some problems of a batch (indices): the same one, unless it holds coordinates of each problem."""
-        return self
-
     @on_class
     def shape(self) -> tuple[int, ...]:
         """Shape of one tensor."""

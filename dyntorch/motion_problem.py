@@ -35,8 +35,7 @@ class Problem:
         """Only some of the problems."""
         cut = [x[keep] for x in self.views], [s[keep] for s in self.scales], self.weights[keep]
         static = None if self.static is None else self.static[keep]
-        invariant = self.invariant.subset(keep)
-        return Problem(invariant, self.shapes, tuple(cut[0]), tuple(cut[1]), cut[2], static)
+        return Problem(self.invariant, self.shapes, tuple(cut[0]), tuple(cut[1]), cut[2], static)
 
     def residual(self, theta: Tensor, piece: slice) -> tuple[Tensor, Tensor]:
         """Weighted whitened residuals ``(b, rows)`` of some of the matches, and their derivative ``(b, p, rows)``."""

@@ -47,7 +47,6 @@ def test_defaults_leave_everything_as_it_is():
     invariant, tensor = Invariant(), torch.rand(2, 3)
     assert invariant.constrain(tensor) is tensor
     assert invariant.normalized((tensor,)) is invariant
-    assert invariant.subset(torch.tensor([0])) is invariant
     assert invariant.whitened((), (), ()) is None
     with pytest.raises(ValueError, match="Invariant has no separate residual for static matches; leave out static="):
         invariant.whitened_static((), (), ())
