@@ -193,7 +193,6 @@ def _axes(value: Any) -> int:
 _CHOICES: dict[str, tuple[Any, ...]] = {
     "view": ("any", "same"),
     "weights": ("equal", "learned"),
-    "depth": ("auto", "synthetic", None),
     "scorer": ("both", "nearest", "kernel"),
     "mirror": ("auto", True, False),
 }

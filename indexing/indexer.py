@@ -28,7 +28,6 @@ from indexing.labels import joined, refuse, same_label
 from indexing.repair import mended
 from indexing.scoring import Event, probabilities, reject_threshold
 from indexing.shape.bank import Windows
-from indexing.shape.bodies import Layout, lifter_for, told_layout
 from indexing.shape.exemplars import CROPS, VIEWS, VIEWS_SOLID, Exemplars, Plan, cut
 from indexing.shape.learning import Lesson, learn
 from indexing.shape.model import ShapeModel
@@ -53,9 +52,6 @@ class ActionIndexer(SavedClassifier):
             guessed: cross-validation inside one view always prefers what is bound to that view.
         weights: ``"equal"``, or ``"learned"``: how much each kind of evidence counts, and how sure it is, by what serves people
             best who were left out (needs to know who performs: see :meth:`fit`).
-        depth: of 2D exemplars, for their virtual views and as evidence: ``"synthetic"``: guessed by a kernel ridge that learns
-            on the fly from synthetic actors of the same joints; ``None``: flat cards; ``"auto"``: synthetic where weights are
-            learned and the joints are of a known layout.
         reject: ``None``: closed set.  A number between 0 and 1: the rate at which clips of an unknown action may be taken
             for a known one, calibrated by leaving each class out of the training clips.  Any other number: the least
             :meth:`evidence` that is accepted.
@@ -99,7 +95,6 @@ class ActionIndexer(SavedClassifier):
         none_label: Any = -1,
         fps: float = 30.0,
         *,
-        depth: str | None = "auto",
         length: int = 12,
         search: bool = True,
         mirror: str | bool = "auto",
@@ -118,7 +113,6 @@ class ActionIndexer(SavedClassifier):
         self.reject = reject
         self.none_label = none_label
         self.fps = fps
-        self.depth = depth
         self.length = length
         self.search = search
         self.mirror = mirror
@@ -156,10 +150,8 @@ class ActionIndexer(SavedClassifier):
                 f"labels: only one class ({classes[0]!r}); give clips of at least two actions, for example one of ordinary movement"
             )
         rng = np.random.default_rng(self.random_state)
-        skeleton = layout_of(found)
-        layout = self._layout(found, skeleton)
-        plan = self._plan(_default_views(found), layout)
-        return self._learn(cut(found, plan, rng), classes, numbers, skeleton, layout, people)
+        plan = self._plan(_default_views(found))
+        return self._learn(cut(found, plan, rng), classes, numbers, layout_of(found), people)
 
     @one_thread
     def partial_fit(
@@ -184,30 +176,15 @@ class ActionIndexer(SavedClassifier):
         merged = joined(old, values)
         known, numbers = np.unique(merged, return_inverse=True)
         check_plan(self, len(CROPS) if self.search else 1, self.model_.exemplars)
-        layout = self.layout_
-        plan = self._plan(len(self.model_.exemplars.views) // len(old), layout)
+        plan = self._plan(len(self.model_.exemplars.views) // len(old))
         seed = 0 if self.random_state is None else self.random_state
         rng = np.random.default_rng([seed, len(old)])
         extended = self.model_.exemplars.extended(cut(found, plan, rng))
-        return self._learn(extended, known, numbers, self.skeleton_, layout, both)
+        return self._learn(extended, known, numbers, self.skeleton_, both)
 
-    def _plan(self, views: int, layout: Layout | None) -> Plan:
+    def _plan(self, views: int) -> Plan:
         views = views if self.virtual_views is None else self.virtual_views
-        lifter = None if layout is None else lifter_for(layout, self.length)
-        return Plan(self.length, self.search, views, self.view == "any", self.repair, self.window, self.stride, lifter)
-
-    def _layout(self, clips: Sequence[Clip], skeleton: Skeleton | None) -> Layout | None:
-        """Whose joints a lifter must know; ``None`` where depth is not asked for, known already, or of no use."""
-        asked = self.depth == "synthetic" or (self.depth == "auto" and self.weights == "learned")
-        if not asked or self.view == "same" or any(clip.dims == 3 for clip in clips):
-            return None
-        found = told_layout(clips, skeleton)
-        if found is None and self.depth == "synthetic":
-            raise ValueError(
-                f"depth='synthetic': what the {clips[0].joints.shape[1]} joints are is not known; give clips a skeleton with names "
-                "such as left_knee, or depth=None"
-            )
-        return found
+        return Plan(self.length, self.search, views, self.view == "any", self.repair, self.window, self.stride)
 
     def _learn(
         self,
@@ -215,7 +192,6 @@ class ActionIndexer(SavedClassifier):
         classes: Array,
         numbers: Array,
         skeleton: Skeleton | None,
-        layout: Layout | None,
         groups: Array | None,
     ) -> Self:
         """Learn everything, and only then change anything."""
@@ -235,10 +211,9 @@ class ActionIndexer(SavedClassifier):
             groups=None if groups is None else torch.from_numpy(np.unique(groups, return_inverse=True)[1]).long(),
             symmetry=symmetry,
             guard=self.mirror == "auto",
-            layout=layout,
         )
         self.model_: ShapeModel = learn(exemplars, torch.from_numpy(numbers).long(), len(classes), lesson)
-        self.layout_, self.groups_ = layout, groups
+        self.groups_ = groups
         self.classes_ = classes
         self.n_joints_ = int(exemplars.crops.values.shape[2])
         self.skeleton_ = skeleton

@@ -26,12 +26,10 @@ from indexing.modelfile import (
 )  # fmt: skip
 from indexing.opening import shown
 from indexing.shape.bank import NEAREST, Kernels, Windows
-from indexing.shape.bodies import Bodies, Layout
 from indexing.shape.channels import CHANNELS, JointMetric
 from indexing.shape.exemplars import CROPS, Exemplars
 from indexing.shape.joint_weights import JointWeights
 from indexing.shape.learning import KERNEL_WHITENING
-from indexing.shape.lifting import understood
 from indexing.shape.machine import read_machine
 from indexing.shape.model import Blend, ShapeModel
 
@@ -62,7 +60,6 @@ def save(indexer: ActionIndexer, path: str | Path) -> None:
         "scorer": indexer.model_.scorer,
         "blend": dataclasses.asdict(indexer.model_.blend),
         "parts": [indexer.model_.parts.gain, indexer.model_.parts.sigma],
-        "layout": None if indexer.layout_ is None else dataclasses.asdict(indexer.layout_),
         "groups": None if indexer.groups_ is None else indexer.groups_.tolist(),
         "skeleton": skeleton_to_json(indexer.skeleton_),
     }
@@ -74,14 +71,13 @@ def load(kind: type[Indexer], path: str | Path, device: str = "cpu") -> Indexer:
     check_device(device)
     header, parts = read_model(path, FORMAT, VERSION)
     with usable(path):
-        parameters = header["parameters"]
+        parameters = _known(header)
         indexer = kind(**{**parameters, "tempi": tuple(parameters["tempi"])}, device=device)
         check_parameters(indexer)
         indexer.classes_ = labels_from_json(header["classes"])
         indexer.n_joints_ = whole(header["joints"], "joints", 1, JOINTS)
         indexer.skeleton_ = skeleton_from_json(header["skeleton"], indexer.n_joints_)
-        indexer.layout_ = _layout(header["layout"], indexer.n_joints_)
-        indexer.model_ = _model(parts, header, Sizes.of(parts, indexer), indexer.layout_)
+        indexer.model_ = _model(parts, header, Sizes.of(parts, indexer))
         indexer.groups_ = _groups(header["groups"], len(indexer.model_.labels))
         indexer._calibrate()
     return indexer
@@ -111,13 +107,15 @@ class Sizes:
         return cls(len(indexer.classes_), exemplars, crops, int(indexer.length), indexer.n_joints_)
 
 
-def _layout(found: Any, joints: int) -> Layout | None:
-    if found is None:
-        return None
-    names = tuple(found["joints"])
-    if len(names) != joints or not understood(names):
-        raise ValueError(f"layout: {len(names)} names that are no body of {joints} joints")
-    return Layout(names, bool(found["photograph"]))
+def _known(header: dict[str, Any]) -> dict[str, Any]:
+    """The parameters of a model file, of which older ones hold one more.
+
+    Raises:
+        ValueError: its exemplars were given a guessed depth, which is no longer done.
+    """
+    if header.get("layout") is not None:
+        raise ValueError("layout: depth of 2D examples is no longer guessed")
+    return {name: value for name, value in header["parameters"].items() if name != "depth"}
 
 
 def _groups(found: Any, exemplars: int) -> NDArray[Any] | None:
@@ -139,8 +137,6 @@ def _tensors(model: ShapeModel) -> dict[str, Tensor]:
         machine = model.machine
         named |= {"scales": model.kernels.scales, **_windows("support", model.support), "machine.support": machine.support}
         named |= {"machine.dual": machine.dual, "machine.intercept": machine.intercept, "machine.counts": machine.counts}
-    if model.bodies is not None:
-        named |= _windows("bodies", model.bodies.windows)
     return {name: value for name, value in named.items() if value is not None}
 
 
@@ -148,7 +144,7 @@ def _windows(name: str, windows: Windows) -> dict[str, Tensor]:
     return {f"{name}.values": windows.values, f"{name}.seen": windows.seen}
 
 
-def _model(parts: Parts, header: dict[str, Any], sizes: Sizes, layout: Layout | None) -> ShapeModel:
+def _model(parts: Parts, header: dict[str, Any], sizes: Sizes) -> ShapeModel:
     n, joints = sizes.exemplars, sizes.joints
     view, scorer, trained = header["view"], header["scorer"], "scales" in parts
     if view != header["parameters"]["view"] or scorer not in SCORERS or trained != (scorer != "nearest"):
@@ -161,15 +157,11 @@ def _model(parts: Parts, header: dict[str, Any], sizes: Sizes, layout: Layout | 
         raise ValueError(f"views: {len(views)} windows of {n} exemplars")
     power = float(parts.real("metric_power", least=0, most=10))
     metric = JointMetric(parts.real("metric", len(CHANNELS), joints, joints), power)
-    rich = view == "same" or layout is not None
-    kernels = Kernels(JointMetric(metric.covariance, KERNEL_WHITENING), rich) if trained else None
+    kernels = Kernels(JointMetric(metric.covariance, KERNEL_WHITENING), view == "same") if trained else None
     if kernels is not None:
         kernels.scales = parts.real("scales", kernels.count, least=LEAST_SCALE)
     support = _read_windows(parts, "support", sizes, None) if trained else None
     symmetry = parts.every("symmetry", joints, below=joints) if "symmetry" in parts else None
-    mirrored = parts.truth("mirrored", n)
-    copies = sizes.crops * (1 if symmetry is None or not bool(mirrored.any()) else 2)  # as ShapeModel.copies gives them
-    bodies = Bodies(_read_windows(parts, "bodies", sizes, copies * n, 3), layout) if layout is not None else None
     blend = {name: number(value, name, 0, MOST_WEIGHT) for name, value in header["blend"].items()}
     return ShapeModel(
         exemplars=Exemplars(crops, views, moments, owner, parts.truth("solid", n)),
@@ -179,7 +171,7 @@ def _model(parts: Parts, header: dict[str, Any], sizes: Sizes, layout: Layout | 
         scorer=scorer,
         metric=metric,
         symmetry=symmetry,
-        mirrored=mirrored,
+        mirrored=parts.truth("mirrored", n),
         parts=_joint_weights(parts, header["parts"], sizes),
         hub=parts.real("hub", n),
         moment_hub=parts.real("moment_hub", len(moments)),
@@ -188,12 +180,11 @@ def _model(parts: Parts, header: dict[str, Any], sizes: Sizes, layout: Layout | 
         machine=read_machine(parts, sizes.classes, len(support)) if support is not None else None,
         evidence_out=parts.real("evidence_out", None),
         blend=Blend(**blend),
-        bodies=bodies,
     )
 
 
-def _read_windows(parts: Parts, name: str, sizes: Sizes, count: int | None, dims: int = 2) -> Windows:
-    values = parts.real(f"{name}.values", count, sizes.length, sizes.joints, dims)
+def _read_windows(parts: Parts, name: str, sizes: Sizes, count: int | None) -> Windows:
+    values = parts.real(f"{name}.values", count, sizes.length, sizes.joints, 2)
     seen = parts.truth(f"{name}.seen", len(values), sizes.joints)
     return Windows(values, seen)
 

@@ -119,14 +119,12 @@ def test_indexing_uses_only_public_names_of_dyntorch():
     assert offenders("indexing", wrong) == []
 
 
-def test_only_the_demo_and_the_lifter_use_the_actors():
+def test_only_the_demo_uses_the_actors():
     inside = (
         "indexing/actors/",
         "indexing/cli/",
         "indexing/demo",
         "indexing/examples",
-        "indexing/shape/lifting",
-        "indexing/report/learned",
     )
     found = offenders("indexing", lambda module, names: within(module, "indexing.actors") or (names and "actors" in names))
     assert [line for line in found if not line.startswith(inside)] == []

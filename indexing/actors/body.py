@@ -15,7 +15,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from indexing.clip import FloatArray
-from indexing.skeleton import COCO17
 
 CENTRAL = ("turn", "hips", "list", "lean", "side", "twist", "nod", "look", "air")
 LIMBS = ("flex", "abd", "rot", "elbow", "hip", "spread", "out", "knee", "grip")
@@ -29,7 +28,6 @@ spread: straight-leg angle that puts the ankle as far outward; out: knee turned 
 grip: share of this foot in holding the body in place (both 0: the body stays and the feet slide, as on a treadmill).
 """
 INDEX: Mapping[str, int] = {name: i for i, name in enumerate(CHANNELS)}
-SIZES = ("height", "trunk", "arms", "legs", "shoulders", "hips")  # of a Person: what its landmarks depend on
 STYLES = 8  # numbers that describe the habits of a person
 _LIMITS = {
     "lean": (-35.0, 105.0), "side": (-35.0, 35.0), "twist": (-60.0, 60.0), "nod": (-45.0, 50.0), "look": (-70.0, 70.0),
@@ -37,10 +35,6 @@ _LIMITS = {
     "hip": (-35.0, 115.0), "spread": (0.0, 45.0), "out": (-10.0, 45.0), "knee": (0.0, 145.0), "grip": (0.0, 1.0),
 }  # fmt: skip
 _LOW, _HIGH = (np.array([_LIMITS.get(name.split("_")[-1], (-np.inf, np.inf))[end] for name in CHANNELS]) for end in (0, 1))
-LANDMARKS: tuple[str, ...] = (
-    *COCO17.joints, "neck", "crown", "pelvis", "left_hand", "right_hand", "left_toes", "right_toes", "left_heel", "right_heel",
-)  # fmt: skip
-"""Points of the body that :func:`landmarks` gives: neck between the shoulders, pelvis between the hips, the middle of each hand."""
 _ODD = ("turn", "hips", "list", "side", "twist", "look")  # change sign in the mirror
 
 
@@ -126,57 +120,40 @@ def joints(angles: FloatArray, person: Person) -> FloatArray:
 
     The lowest ankle of each frame is at height ``air`` (0 on the floor), the first frame's feet are about the origin.
     """
-    out = landmarks(angles, np.array([getattr(person, name) for name in SIZES]))[:, :17]
-    grip = np.stack([angles[:, INDEX["l_grip"]], angles[:, INDEX["r_grip"]]], axis=1)
-    return out + root(out[:, 15:17], grip, angles[:, INDEX["air"]])[:, None]
-
-
-def landmarks(angles: FloatArray, sizes: FloatArray) -> FloatArray:
-    """``(frames, landmarks, 3)`` the points :data:`LANDMARKS` in metres, relative to the pelvis, of poses ``(frames, channels)``.
-
-    Args:
-        sizes: ``(6,)`` :data:`SIZES` of the person, or ``(frames, 6)`` where every pose is another person's.
-    """
-    height, size, arms, legs, shoulders, hips = np.reshape(sizes, (-1, len(SIZES), 1)).swapaxes(0, 1)
     col = {name: angles[:, i] for name, i in INDEX.items()}
     heading = _about("y", col["turn"])
     trunk = heading @ _about("y", col["twist"]) @ _about("z", col["side"]) @ _about("x", -col["lean"])
     pelvis = heading @ _about("y", col["hips"]) @ _about("z", col["list"])
-    neck = trunk[..., 1] * (0.288 * size)
+    neck = trunk[..., 1] * (0.288 * person.trunk)
     head = trunk @ _about("y", col["look"]) @ _about("x", -col["nod"])
-    out = np.empty((len(angles), len(LANDMARKS), 3))
+    out = np.empty((len(angles), 17, 3))
     for at, place in enumerate(_FACE):
         out[:, at] = neck + head @ place
-    out[:, 17] = neck
-    out[:, 18] = neck + head @ _CROWN
-    out[:, 19] = 0.0
     for left, side, prefix in ((0, -1.0, "l_"), (1, 1.0, "r_")):  # anatomical left is -x
         limb = {name: col[prefix + name] for name in LIMBS}
-        shoulder = neck + trunk[..., 0] * (side * 0.107 * shoulders)
-        hip = pelvis[..., 0] * (side * 0.072 * hips)
-        leg = _leg(limb, side)
+        shoulder = neck + trunk[..., 0] * (side * 0.107 * person.shoulders)
+        hip = pelvis[..., 0] * (side * 0.072 * person.hips)
         out[:, 5 + left] = shoulder
-        for at, part in zip((7, 9, 20), _arm(trunk, limb, side), strict=True):
-            out[:, at + left] = shoulder + arms * part
+        for at, part in zip((7, 9), _arm(trunk, limb, side), strict=True):
+            out[:, at + left] = shoulder + person.arms * part
         out[:, 11 + left] = hip
-        for at, part in zip((13, 15, 22, 24), (*leg, *_foot(*leg)), strict=True):
-            out[:, at + left] = hip + legs * np.einsum("fij,fj->fi", heading, part)
-    return out * height[:, :, None]
+        for at, part in zip((13, 15), _leg(limb, side), strict=True):
+            out[:, at + left] = hip + person.legs * np.einsum("fij,fj->fi", heading, part)
+    out *= person.height
+    grip = np.stack([angles[:, INDEX["l_grip"]], angles[:, INDEX["r_grip"]]], axis=1)
+    return out + root(out[:, 15:17], grip, angles[:, INDEX["air"]])[:, None]
 
 
 # Lengths as fractions of the body height (after the usual anthropometric tables), at relative size 1.
 _FACE = np.array([[0, 0.092, -0.068], [-0.019, 0.113, -0.054], [0.019, 0.113, -0.054], [-0.044, 0.105, 0.0], [0.044, 0.105, 0.0]])
-_CROWN = np.array([0.0, 0.182, 0.0])
-_UPPER_ARM, _FOREARM, _HAND, _THIGH, _SHANK = 0.172, 0.150, 0.050, 0.245, 0.243
-_TOES, _HEEL, _SOLE = 0.130, 0.030, 0.039  # along the foot from the ankle, and below it
+_UPPER_ARM, _FOREARM, _THIGH, _SHANK = 0.172, 0.150, 0.245, 0.243
 
 
-def _arm(trunk: FloatArray, limb: Mapping[str, FloatArray], side: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Elbow, wrist and middle of the hand relative to the shoulder."""
+def _arm(trunk: FloatArray, limb: Mapping[str, FloatArray], side: float) -> tuple[FloatArray, FloatArray]:
+    """Elbow and wrist relative to the shoulder."""
     upper = trunk @ _about("x", limb["flex"]) @ _about("z", side * limb["abd"]) @ _about("y", side * limb["rot"])
     elbow = upper @ np.array([0.0, -_UPPER_ARM, 0.0])
-    wrist = elbow + upper @ _about("x", limb["elbow"]) @ np.array([0.0, -_FOREARM, 0.0])
-    return elbow, wrist, wrist + (wrist - elbow) * (_HAND / _FOREARM)
+    return elbow, elbow + upper @ _about("x", limb["elbow"]) @ np.array([0.0, -_FOREARM, 0.0])
 
 
 def _leg(limb: Mapping[str, FloatArray], side: float) -> tuple[FloatArray, FloatArray]:
@@ -196,17 +173,6 @@ def _leg(limb: Mapping[str, FloatArray], side: float) -> tuple[FloatArray, Float
     sine = np.clip(length * np.sin(np.deg2rad(limb["spread"])) / drop, -0.9, 0.9)
     tilt = _about("z", side * np.rad2deg(np.arcsin(sine)))
     return np.einsum("fij,fj->fi", tilt, knee), np.einsum("fij,fj->fi", tilt, ankle)
-
-
-def _foot(knee: FloatArray, ankle: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Toes and heel relative to the hip: the foot points between straight on and square to the shank, as feet do in the air."""
-    down = (ankle - knee) / _SHANK
-    ahead = np.broadcast_to(np.array([0.0, 0.0, -1.0]), down.shape)
-    square = ahead - (ahead * down).sum(axis=1, keepdims=True) * down
-    square += 0.05 * np.array([0.0, 1.0, 0.0])  # a shank raised straight forward lets the foot point up
-    along = square / np.linalg.norm(square, axis=1, keepdims=True) + 0.7 * ahead
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
-    return ankle + _TOES * along + _SOLE * down, ankle - _HEEL * along + _SOLE * down
 
 
 def _sagittal(length: float, degrees: FloatArray) -> FloatArray:

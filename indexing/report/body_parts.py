@@ -85,18 +85,7 @@ def measure_body_parts(indexer: ActionIndexer, groups: ArrayLike | None = None) 
     numbers = None if groups is None else torch.from_numpy(np.unique(np.asarray(groups), return_inverse=True)[1])
     examples = [indexer.exemplar(int(i)) for i in typical(indexer.model_)]
     values = importance(indexer.model_, numbers).cpu().numpy()
-    return BodyParts(indexer.classes_.tolist(), values, examples, _named(indexer))
-
-
-def _named(indexer: ActionIndexer) -> Skeleton | None:
-    """The clips' skeleton, with the names of the layout that was told from the data where its own are numbers."""
-    own, layout = indexer.skeleton_, indexer.layout_
-    if layout is None or (own is not None and not all(name.isdigit() for name in own.joints)):
-        return own
-    if own is None:
-        usual = known(len(layout.joints))
-        return usual if usual is not None and usual.joints == layout.joints else Skeleton("told from the data", layout.joints)
-    return Skeleton(own.name, layout.joints, own.bones)
+    return BodyParts(indexer.classes_.tolist(), values, examples, indexer.skeleton_)
 
 
 def body_parts(parts: BodyParts, *, columns: int = COLUMNS, theme: Theme = LIGHT) -> bytes:

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from indexing import files
-from indexing.actors.layouts import LAYOUTS
 from indexing.report.body_parts import BodyParts, body_parts, body_parts_section, measure_body_parts
 from indexing.report.page import Card, Column, cards, details, escape, made_by, page, section, settings, table
 
@@ -88,12 +87,7 @@ def _weighing(indexer: ActionIndexer) -> str:
     """What each kind of evidence weighs."""
     model, blend = indexer.model_, indexer.model_.blend
     total = blend.kernel + blend.nearest
-    depth = "none: bodies stay flat, as in the image"
-    if indexer.layout_ is not None:
-        name = next((name for name, joints in LAYOUTS.items() if joints == indexer.layout_.joints), "these names")
-        depth = f"guessed, from synthetic people with the joints of {name}"
-    if bool(model.exemplars.solid.any()):
-        depth = "of the 3D examples"
+    depth = "of the 3D examples" if bool(model.exemplars.solid.any()) else "none: bodies stay flat, as in the image"
     equal = "no: equal weights serve people best who are left out" if people_left_out(indexer) else "no: nobody could be left out"
     learned = "yes" if model.parts.learned else equal
     shares = {"nearest": blend.nearest / total, "kernel": blend.kernel / total}
@@ -102,7 +96,7 @@ def _weighing(indexer: ActionIndexer) -> str:
     rows = [
         ["Nearest example, whatever the viewpoint", f"{shares['nearest']:.0%}"],
         ["Kernel machine over virtual views", f"{shares['kernel']:.0%}"],
-        ["Depth for virtual views and turned bodies", depth],
+        ["Depth for virtual views", depth],
         ["Joints weighed differently", learned if indexer.weights == "learned" else "no: weights were not learned"],
     ]
     return section("How the evidence is weighed", table([Column("Evidence"), Column("Share", "long")], rows))

@@ -126,7 +126,7 @@ def fused_residual(
     Terms: ``epi`` :math:`1 - s_1(U_q, U_e)`, the largest canonical correlation between the channel spaces under the joint
     metric (any viewpoint); ``up`` :math:`1 - \cos(y_q, y_e)`, heights only (upright cameras, turned about the vertical);
     ``nn`` :math:`1 - \cos(X_q, X_e)`, the whole image (one viewpoint); ``turned``
-    :math:`1 - \max_R \cos(X_q R, X_e)` over turns R about the vertical, of bodies with depth, or of flat cards without.
+    :math:`1 - \max_R \cos(X_q R, X_e)` over turns R of flat cards about the vertical.
 
     Args:
         query: ``Q`` windows of images; copies: each with the same ``E`` exemplars; weights: ``(channels,)``, 1 by default.
@@ -182,11 +182,8 @@ def _solid(x: Tensor) -> Tensor:
 
 
 def _turned(a: Tensor, b: Tensor) -> Tensor:
-    r"""With :math:`w = x + i z` a turn is :math:`w e^{i\phi}`: the best one makes :math:`|w_q^* w_e|` of the product."""
-    across = a[..., 0] @ b[..., 0].mT
-    if a.shape[2] == 3:
-        across = torch.hypot(across + a[..., 2] @ b[..., 2].mT, a[..., 2] @ b[..., 0].mT - a[..., 0] @ b[..., 2].mT)
-    return (a[..., 1] @ b[..., 1].mT).add_(across.abs_())
+    """A turn of a flat card scales its x by -1 to 1: the best one takes the product of the x without its sign."""
+    return (a[..., 1] @ b[..., 1].mT).add_((a[..., 0] @ b[..., 0].mT).abs_())
 
 
 # What is compared of a channel, and the correlation of two of them: 1 where they are the same.

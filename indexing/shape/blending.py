@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 
 from indexing.shape.bank import Windows
-from indexing.shape.lifting import lift_views
 from indexing.shape.machine import PairwiseMachine
 from indexing.shape.model import Blend, ShapeModel, class_scores, standardized
 from indexing.shape.views import PITCH, turn
@@ -102,9 +101,6 @@ def asked_views(model: ShapeModel) -> list[Windows]:
             if i >= len(model.exemplars.views) // count:
                 break
             values = model.exemplars.view(i).values
-        elif model.bodies is not None:
-            solid = model.bodies.windows.values[:count]
-            values = lift_views(solid[..., :2], solid[..., 2], azimuth, pitch)
         else:
             values = turn(whole.values, azimuth, pitch)
         size = (values[..., 1].amax(dim=2) - values[..., 1].amin(dim=2)).median(dim=1).values

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from indexing.cameras import virtual
 from indexing.clip import Clip, stretches
 from indexing.shape.bank import Windows, stack
-from indexing.shape.lifting import Lifter, lift_views
 from indexing.shape.views import PITCH, turn
 from indexing.windows import Ragged, ragged, sample, whole
 
@@ -34,7 +33,6 @@ class Plan:
     repair: bool = False
     window: float = 1.0
     stride: float = 0.3
-    lifter: Lifter | None = None  # gives images depth before they are turned; without it they turn as flat cards
 
 
 @dataclass(frozen=True)
@@ -116,12 +114,8 @@ def _view(clips: Sequence[Clip], source: Ragged, plan: Plan, random_state: np.ra
     begin, end = source.times[source.starts[:-1]], source.times[source.starts[1:] - 1]
     values = sample(source, np.arange(count), begin + low * (end - begin), begin + high * (end - begin), plan.length)
     if plan.turned and not solid.all():
-        flat, joints = torch.from_numpy(~solid), torch.from_numpy(source.seen)
-        if plan.lifter is None:
-            values[flat] = turn(values[flat], azimuth[~solid], pitch[~solid])
-        else:
-            depth = plan.lifter.depth(values[flat], joints[flat])
-            values[flat] = lift_views(values[flat], depth, azimuth[~solid], pitch[~solid])
+        flat = torch.from_numpy(~solid)
+        values[flat] = turn(values[flat], azimuth[~solid], pitch[~solid])
     return Windows(values, torch.from_numpy(source.seen))
 
 

@@ -3,7 +3,7 @@ r"""Which joints and channels tell actions apart: weights learned by gradient th
 Weights are first learned for all actions together, then for each action on top; both are pulled towards equal ones as hard as
 held-out groups of exemplars ask for, and are equal where these do not gain from learning.  Queries and the exemplars they
 are compared with come from different groups (people), and queries should be seen from elsewhere: a turned flat card is an
-affine image of itself, from which this residual learns nothing about other viewpoints, so give rendered or lifted views.
+affine image of itself, from which this residual learns nothing about other viewpoints, so give rendered views.
 """
 
 from __future__ import annotations

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from indexing.shape.bank import Kernels, Windows, stack
 from indexing.shape.blending import Trained, asked_views, learn_blend
-from indexing.shape.bodies import Bodies, Layout, lifted
 from indexing.shape.channels import JointMetric
 from indexing.shape.exemplars import Exemplars
 from indexing.shape.joint_weights import JointWeights, learn_joint_weights
@@ -35,7 +34,6 @@ class Lesson:
         groups: ``(N,)`` number of the person who performs each exemplar; ``None`` = not known, and nothing can be left out.
         symmetry: joint permutation of the mirror image, or ``None`` to go without mirror images.
         guard: leave out mirror images of classes that they would turn into one another.
-        layout: whose joints these are, for the lifter; ``None`` = no depth.
     """
 
     view: str = "any"
@@ -44,7 +42,6 @@ class Lesson:
     groups: Tensor | None = None
     symmetry: Tensor | None = None
     guard: bool = True
-    layout: Layout | None = None
 
 
 def learn(exemplars: Exemplars, labels: Tensor, classes: int, lesson: Lesson) -> ShapeModel:
@@ -64,9 +61,6 @@ def learn(exemplars: Exemplars, labels: Tensor, classes: int, lesson: Lesson) ->
     )  # fmt: skip
     if lesson.symmetry is not None:
         model = dataclasses.replace(model, mirrored=_mirror_is_same_action(model, originals) if lesson.guard else ~none)
-    if lesson.layout is not None:
-        bodies = Bodies(stack([lifted(copy, lesson.layout) for copy in model.copies()]), lesson.layout)
-        model = dataclasses.replace(model, bodies=bodies)
     model = _with_hubs(model, originals)
     if lesson.learned and lesson.view == "any" and lesson.groups is not None:
         parts = _parts(model, lesson)
@@ -74,16 +68,16 @@ def learn(exemplars: Exemplars, labels: Tensor, classes: int, lesson: Lesson) ->
             model = _with_hubs(dataclasses.replace(model, parts=parts, hub=torch.zeros(len(labels))), originals)
     trained = None
     if lesson.scorer != "nearest":
-        model, trained = _with_machine(model, rich=lesson.view == "same" or lesson.layout is not None)
+        model, trained = _with_machine(model, one_side=lesson.view == "same")
     if lesson.learned and lesson.groups is not None:
         model = dataclasses.replace(model, blend=learn_blend(model, lesson.groups, trained))
     return model
 
 
 def _parts(model: ShapeModel, lesson: Lesson) -> JointWeights:
-    """How much each joint counts, learned across virtual views that have depth: of turned cards nothing can be learned."""
+    """How much each joint counts, learned across views of 3D exemplars: of turned cards nothing can be learned."""
     asked = asked_views(model)[1:]
-    if not asked or (lesson.layout is None and not bool(model.exemplars.solid.all())):
+    if not asked or not bool(model.exemplars.solid.all()):
         return model.parts
     owner = torch.arange(len(model.labels)).repeat(len(asked))
     groups, symmetry = lesson.groups, lesson.symmetry
@@ -145,11 +139,8 @@ def _hub(residual: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
     return HUB_SHARE * torch.where(known, foreign, foreign[known].mean() if known.any() else foreign.new_tensor(0.0))
 
 
-def _with_machine(model: ShapeModel, rich: bool) -> tuple[ShapeModel, Trained]:
-    """Train scorer B on the exemplars, their virtual views and mirror images, as many as the budget of rows allows.
-
-    rich: add the kernels of what no viewpoint changes, where depth or one side of the person is known (Florence3D +1 %).
-    """
+def _with_machine(model: ShapeModel, one_side: bool) -> tuple[ShapeModel, Trained]:
+    """Train scorer B on the exemplars, their virtual views and mirror images, as many as the budget of rows allows."""
     exemplars, count = model.exemplars, len(model.exemplars)
     both = model.symmetry is not None and bool(model.mirrored.any())
     rows_at_most = ROWS_SOLID if bool(exemplars.solid.any()) else ROWS
@@ -160,7 +151,7 @@ def _with_machine(model: ShapeModel, rich: bool) -> tuple[ShapeModel, Trained]:
         chosen = model.mirrored[owner]
         rows = stack([rows, mirror_some(rows[chosen], model.symmetry, chosen[chosen])])
         owner = torch.cat([owner, owner[chosen]])
-    kernels = Kernels(JointMetric(model.metric.covariance, KERNEL_WHITENING), one_side=rich)
+    kernels = Kernels(JointMetric(model.metric.covariance, KERNEL_WHITENING), one_side=one_side)
     gram = kernels.fit(rows)
     machine = PairwiseMachine.fit(gram, model.labels[owner].numpy().astype(np.int64))
     trained = Trained(rows, owner, gram)

@@ -1,7 +1,7 @@
 """What is learned from exemplars, and how a query scores against it.  Tensors only; the estimator is in indexer.py.
 
-Scorer A is the nearest exemplar under the fused epipolar residual, helped by comparing bodies that may turn about the vertical
-(flat cards, or with a guessed depth): it needs no training and no common viewpoint.  Scorer B is a kernel machine over virtual
+Scorer A is the nearest exemplar under the fused epipolar residual, helped by comparing flat cards that may turn about the
+vertical: it needs no training and no common viewpoint.  Scorer B is a kernel machine over virtual
 views of the exemplars: it learns what tells the classes apart.  Viewpoint free (``any``) they are added as :class:`Blend` says;
 on one side (``same``) B works alone.
 """
@@ -17,7 +17,6 @@ from torch import Tensor
 
 from indexing.scoring import SHARPNESS
 from indexing.shape.bank import Kernels, Windows, fused_residual
-from indexing.shape.bodies import Bodies, lifted
 from indexing.shape.channels import JointMetric
 from indexing.shape.exemplars import Exemplars
 from indexing.shape.joint_weights import JointWeights
@@ -28,7 +27,7 @@ from indexing.shape.views import mirror
 NEIGHBOURS = 2  # exemplars per class that score A averages (1: -1 %)
 MOMENT_TERMS = ("epi", "nn")  # on short windows what is bound to the view helps even at 90 degrees: .83/.82 -> .93/.85
 MOMENT_SAMPLE = 500  # short windows whose closeness to others sets the hub shares
-TURNED = 0.3  # weight of turned bodies in A: cards one shot +1.3 %, Florence3D +.8 %; lifted UTKinect +.5 %; .6 is too much
+TURNED = 0.3  # weight of turned cards in A: one shot +1.3 %, Florence3D +.8 %; .6 is too much
 BALANCE = 1.5  # weight of A against B after standardizing over classes; 1 .. 2 differ by 1 %
 BALANCE_SOLID = 0.5  # the same for exemplars with depth: B then sees true views (1.5: -1.5 % on Florence3D, UTKinect +-0)
 
@@ -65,7 +64,6 @@ class ShapeModel:
     machine: PairwiseMachine | None
     evidence_out: Tensor = field(default_factory=lambda: torch.zeros(0))  # (N,) evidence of exemplars whose class was left out
     blend: Blend = field(default_factory=lambda: Blend())
-    bodies: Bodies | None = None  # the exemplars with depth, where it was guessed
 
     def to(self, device: str | torch.device) -> ShapeModel:
         """The model on another device."""
@@ -83,13 +81,9 @@ class ShapeModel:
         return plain + [mirror_some(one, self.symmetry, self.mirrored) for one in plain]
 
     def residuals(self, query: Windows) -> Tensor:
-        """``(Q, N)`` fused epipolar residual to every exemplar, and that of turned bodies, less the exemplar's hub share."""
+        """``(Q, N)`` fused epipolar residual to every exemplar, and that of turned cards, less the exemplar's hub share."""
         copies = self.copies()
         epipolar = self.parts.residual(query, copies, self.metric, self.labels)
-        if self.bodies is not None:
-            count = len(self.exemplars)
-            copies = [self.bodies.windows[i * count : (i + 1) * count] for i in range(len(copies))]
-            query = lifted(query, self.bodies.layout)
         return epipolar + TURNED * fused_residual(query, copies, self.metric, terms=("turned",)) - self.hub
 
     def moment_residuals(self, query: Windows) -> Tensor:

@@ -59,7 +59,6 @@ def test_same_view(lesson):
 def test_learned_weights(few):
     train, test = few
     learned = ActionIndexer(weights="learned").fit(train)
-    assert learned.model_.bodies is not None and learned.layout_.photograph
     assert float(learned.model_.parts.joints.mean()) == pytest.approx(1.0, abs=1e-5)
     assert learned.score(test, test.labels) == 1.0
     single = ActionIndexer(weights="learned").fit(train[:4])  # one example per class: nobody can be left out

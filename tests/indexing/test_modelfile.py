@@ -139,7 +139,7 @@ def test_parts_that_do_not_belong_together_are_refused(name: str, tensor: str, v
         ("action", {"blend": {"kernel": float("nan")}}),
         ("action", {"blend": {"more": 1}}),
         ("action", {"parts": [1e308, "x"]}),
-        ("action", {"layout": {"joints": ["a"] * 17, "photograph": 0}}),
+        ("action", {"layout": {"joints": ["a"] * 17, "photograph": False}}),
         ("action", {"groups": ["a"]}),
         ("action", {"skeleton": ["s", ["a"] * 3, []]}),
         ("action", {"skeleton": ["s", ["a"] * 17, [[0, 10**400]]]}),

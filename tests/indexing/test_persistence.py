@@ -166,6 +166,16 @@ def test_wrong_values_are_refused(key, value, saved, tmp_path):
     refused(tmp_path / "m.safetensors")
 
 
+def test_files_from_before_depth_went_are_read_where_none_was_guessed(saved, tmp_path):
+    tensors, metadata = contents(saved)
+    old = metadata | {"layout": None, "parameters": metadata["parameters"] | {"depth": "auto"}}
+    save_file(tensors, tmp_path / "m.safetensors", metadata={"dyntorch": json.dumps(old)})
+    assert ActionIndexer.load(tmp_path / "m.safetensors").get_params() == ActionIndexer.load(saved).get_params()
+    old["layout"] = {"joints": ["nose"], "photograph": True}
+    save_file(tensors, tmp_path / "m.safetensors", metadata={"dyntorch": json.dumps(old)})
+    refused(tmp_path / "m.safetensors", "depth of 2D examples is no longer guessed")
+
+
 def test_missing_tensors_are_refused(saved, tmp_path):
     tensors, metadata = contents(saved)
     for name in tensors:
