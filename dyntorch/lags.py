@@ -13,7 +13,6 @@ from torch import Tensor
 
 from dyntorch.algebra.correlation import ROUNDING, Lags, correlate
 from dyntorch.algebra.covariances import compress as compress
-from dyntorch.algebra.covariances import covariance_of as covariance_of
 from dyntorch.algebra.covariances import window_covariances
 from dyntorch.constants import constant
 
@@ -84,38 +83,6 @@ def epipolar_moments(
     """
     found, counts = _camera_moments(x1, x2, lags, weights, per_point)
     return _places(found, _epipolar_places(found.device)), counts
-
-
-def affine_moments(
-    x1: Tensor, x2: Tensor, lags: Lags | None = None, weights: tuple[Tensor, Tensor] | None = None, per_point: bool = False
-) -> tuple[Tensor, Tensor]:
-    r"""Moment matrices of the joint image coordinates of the same points in two cameras, at all lags.
-
-    .. math:: M(s) = \sum_{ij} w_{1,ij}\, w_{2,(i+s)j}\; u u^T, \qquad u = (x_1, y_1, x_2, y_2, 1)
-
-    Affine cameras confine :math:`(x_1, y_1, x_2, y_2)` to a hyperplane where the lag is right: the covariance about the mean of
-    the overlap, :func:`covariance_of`, has rank 3.
-
-    Args:
-        x1, x2, lags, weights, per_point: as in :func:`epipolar_moments`.
-
-    Returns:
-        Moments ``(*batch, [n,] L, 5, 5)`` float64, not divided by the counts, and counts ``(*batch, [n,] L)``.
-
-    Raises:
-        ValueError: as in :func:`epipolar_moments`.
-
-    Source: Tomasi and Kanade 1992, Shape and motion from image streams; Shapiro, Zisserman and Brady 1995.
-
-    Example:
-        >>> import torch
-        >>> x = torch.tensor([[[1.0, 2.0]], [[3.0, 4.0]]])
-        >>> moments, counts = affine_moments(x, x, (0, 0))
-        >>> moments[0, 0].round().tolist(), counts.tolist()
-        ([10.0, 14.0, 10.0, 14.0, 4.0], [2.0])
-    """
-    found, counts = _camera_moments(x1, x2, lags, weights, per_point)
-    return _places(found, _affine_places(found.device)), counts
 
 
 def lag_covariances(
@@ -237,14 +204,6 @@ def _epipolar_places(device: torch.device) -> Tensor:
     """Which of the 6 x 6 sums each entry of a ``(9, 9)`` moment matrix is: row and column are 3 (entry of x2~) + entry of x1~."""
     entry = torch.tensor([[0, 1, 3], [1, 2, 4], [3, 4, 5]])  # of xx, xy, yy, x, y, 1
     return (6 * entry[None, :, None, :] + entry[:, None, :, None]).reshape(9, 9).to(device)
-
-
-@constant
-def _affine_places(device: torch.device) -> Tensor:
-    """Which of the 6 x 6 sums each entry of the ``(5, 5)`` moments of (x1, y1, x2, y2, 1) is."""
-    entry = torch.tensor([[0, 1, 3], [1, 2, 4], [3, 4, 5]])
-    one = torch.tensor([0, 1, 2, 2, 2]), torch.tensor([2, 2, 0, 1, 2])  # the factor of each camera in each coordinate
-    return (6 * entry[one[0][:, None], one[0]] + entry[one[1][:, None], one[1]]).to(device)
 
 
 def _span(a: Tensor, b: Tensor, lags: Lags | None, dims: int) -> Lags:

@@ -1,4 +1,4 @@
-"""Covariances of sequences: of windows by running sums, from homogeneous moments, and compressed to their leading directions."""
+"""Covariances of sequences: of windows by running sums, and compressed to their leading directions."""
 
 from __future__ import annotations
 
@@ -9,28 +9,6 @@ from dyntorch.algebra.correlation import ELEMENTS
 from dyntorch.constants import constant
 
 LEAST = 64  # frames in one piece of running sums
-
-
-def covariance_of(moments: Tensor) -> Tensor:
-    r"""Covariances about the mean from moments of :math:`(u, 1)`.
-
-    .. math:: C = M_{uu} / m - \mu \mu^T, \qquad \mu = M_{u1} / m, \quad m = M_{11}
-
-    Args:
-        moments: ``(*batch, d + 1, d + 1)``.
-
-    Returns:
-        ``(*batch, d, d)``; 0 where m is 0.
-
-    Example:
-        >>> import torch
-        >>> covariance_of(torch.tensor([[10.0, 4.0], [4.0, 2.0]])).tolist()
-        [[1.0]]
-    """
-    total = moments[..., -1:, -1:]
-    scaled = moments[..., :-1, :] / torch.where(total > 0, total, 1.0)
-    mean = scaled[..., -1:]
-    return scaled[..., :-1] - mean * mean.mT
 
 
 def compress(rows: Tensor, rank: int | None = None, noise: float | None = None) -> Tensor:

@@ -35,7 +35,6 @@ from dyntorch.tasks import planes_problem, planes_starts
 CPU = torch.device("cpu")
 TABLES = [
     (lags._epipolar_places, (CPU,)),
-    (lags._affine_places, (CPU,)),
     (epipolar_variance._plane, (CPU,)),
     (covariances._packing, (3, CPU)),
     (extensors._levi_civita, (3, torch.float64, CPU)),

@@ -99,17 +99,17 @@ def points(frames1, frames2, n, seed=0):
     return x1, x2, tuple(pairs)
 
 
-def moments(x1, x2, weights, window, vector):
+def moments(x1, x2, weights, window):
     """``(n, L, d, d)`` and ``(n, L)``, frame by frame."""
     n, found, counts = x1.shape[1], [], []
     for j in range(n):
         for pair in overlaps(len(x1), len(x2), window):
-            d = len(vector(torch.zeros(2), torch.zeros(2)))
+            d = len(epipolar(torch.zeros(2), torch.zeros(2)))
             total, count = torch.zeros(d, d, dtype=torch.float64), 0.0
             for i, k in zip(*(range(s.start, s.stop) for s in pair), strict=True) if pair else ():
                 w = float(weights[0][i, j] * weights[1][k, j])
                 if w > 0:
-                    z = vector(x1[i, j], x2[k, j])
+                    z = epipolar(x1[i, j], x2[k, j])
                     total, count = total + w * torch.outer(z, z), count + w
             found.append(total)
             counts.append(count)
@@ -124,17 +124,12 @@ def epipolar(x1, x2):
     return torch.outer(one(x2), one(x1)).flatten()
 
 
-def affine(x1, x2):
-    return torch.cat([x1, x2, x1.new_ones(1)])
-
-
-@pytest.mark.parametrize(("function", "vector"), [(lags.epipolar_moments, epipolar), (lags.affine_moments, affine)])
 @pytest.mark.parametrize(("frames1", "frames2", "window"), WINDOWS)
-def test_moments_equal_the_loop(function, vector, frames1, frames2, window):
+def test_moments_equal_the_loop(frames1, frames2, window):
     x1, x2, weights = points(frames1, frames2, 3)
-    expected, counts = moments(x1, x2, weights, window, vector)
+    expected, counts = moments(x1, x2, weights, window)
     for per_point, combine in ((True, lambda t: t), (False, lambda t: t.sum(0))):
-        found, number = function(x1, x2, window, weights, per_point=per_point)
+        found, number = lags.epipolar_moments(x1, x2, window, weights, per_point=per_point)
         assert_same(found, combine(expected))
         assert_same(number, combine(counts))
         # nothing seen in common is exactly zero, not rounding
@@ -176,14 +171,6 @@ def test_moments_of_long_takes_equal_those_of_the_whole(monkeypatch):
     expected, number = lags.epipolar_moments(x1, x2, (-20, 20), weights)
     assert_same(found, expected)
     assert_same(counts, number)
-
-
-def test_affine_covariance_has_rank_three_at_the_right_lag():
-    shape, cameras = normal(0, 40, 5, 3), normal(1, 2, 2, 3)
-    x1, x2 = ((shape @ camera.T) + 100.0 for camera in cameras)
-    found, _ = lags.affine_moments(x1[:30], x2[4:], (-8, 8))
-    values = torch.linalg.eigvalsh(lags.covariance_of(found))[:, 0]
-    assert int(values.argmin()) == 4 and values[4].abs() < 1e-9 and values.sort().values[1] > 0.01
 
 
 def covariances(a, b, window, weights=None):
@@ -251,7 +238,7 @@ X = torch.zeros(4, 3, 2)
         (lambda: lags.lag_products(torch.zeros(3, 2), torch.zeros(3, 2), (2, 1)), r"first <= last, got \(2, 1\)"),
         (lambda: lags.epipolar_moments(X, X[:, :2]), r"same points in both cameras"),
         (lambda: lags.epipolar_moments(X, X, weights=(torch.ones(4, 3), torch.ones(3, 3))), r"weights must be \(4, 3\)"),
-        (lambda: lags.affine_moments(X, X, weights=(torch.ones(4, 3), -torch.ones(4, 3))), r"not negative"),
+        (lambda: lags.epipolar_moments(X, X, weights=(torch.ones(4, 3), -torch.ones(4, 3))), r"not negative"),
         (lambda: lags.lag_covariances(X[0], X[0], weights=(torch.ones(2), torch.ones(3))), r"weights must be .*one per frame"),
         (lambda: lags.compress(X), r"either rank or noise"),
         (lambda: lags.compress(X, rank=3), r"rank must be from 1 to the 2 rows, got 3"),
