@@ -12,6 +12,7 @@ from typing import Annotated, TypeVar
 import tyro
 
 from experiments.benchmarks.interleaved import threads
+from experiments.results import published
 from indexing.files import manifest, prepare, write_json
 
 C = TypeVar("C")
@@ -131,9 +132,11 @@ def measured_on_one_thread(tables: Mapping[str, Callable[[C], list[Row]]], confi
 
 
 def command(run: Callable[[], None]) -> None:
-    """Run a script; bad input ends in one line on stderr and exit code 2."""
+    """Run a script and put what it prints into its page of results; bad input ends in one line on stderr and exit code 2."""
+    about = getattr(sys.modules["__main__"], "__spec__", None)
     try:
-        run()
+        with published(about.name if about else "", sys.argv[1:]):
+            run()
     except ValueError as problem:
         print(f"error: {problem}", file=sys.stderr)
         raise SystemExit(2) from None

@@ -1,4 +1,4 @@
-"""What the README shows is what happens: the same words, and the same numbers within what is printed of them."""
+"""What the README shows is what happens: every command, every Python block, its exit code and what it prints."""
 
 from __future__ import annotations
 
@@ -7,33 +7,10 @@ from pathlib import Path
 
 import pytest
 
-README = Path(__file__).parent.parent / "README.md"
+from tests.documents import difference, excerpt, run, steps
 
-
-def blocks() -> list[str]:
-    return re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
-
-
-def difference(shown: str, printed: str) -> str:
-    """Where two outputs differ; empty where they say the same.
-
-    Spaces do not count.  Whole numbers are equal; decimal numbers and percentages may differ by one in the last digit printed,
-    as the last digits of a computation differ between processors.
-    """
-    ours, theirs = (re.findall(r"[-+]?\d+(?:\.\d*)?(?: ?%)?|[^\s\d]+", text) for text in (shown, printed))
-    if len(ours) != len(theirs):
-        return f"{len(ours)} words shown, {len(theirs)} printed: {printed}"
-    for a, b in zip(ours, theirs, strict=True):
-        if a == b:
-            continue
-        try:
-            x, y = float(a.rstrip(" %")), float(b.rstrip(" %"))
-        except ValueError:
-            return f"shown {a!r}, printed {b!r}"
-        digits = max(len(number.rstrip(" %").partition(".")[2]) for number in (a, b))
-        if not (digits or a.endswith("%")) or abs(x - y) > 1.001 * 10.0**-digits:
-            return f"shown {a}, printed {b}"
-    return ""
+ROOT = Path(__file__).parent.parent
+README = ROOT / "README.md"
 
 
 @pytest.mark.parametrize(
@@ -53,40 +30,34 @@ def test_outputs_are_compared_as_words_and_numbers(shown, printed, same):
     assert (difference(shown, printed) == "") == same
 
 
-@pytest.mark.parametrize(
-    "name", ["align_planar", "dyn.segment", "dyn.reconstruct", "dyn.DynamicShapeTensor", "PhaseIndexer", "= BrightnessIndexer("]
-)
-def test_the_examples_print_what_they_say(name, capsys):
-    (source,) = [block for block in blocks() if name in block]
-    exec(compile(source, str(README), "exec"), {})
-    (_, following) = README.read_text(encoding="utf-8").split(source)
-    shown = re.search(r"```\n(.*?)```", following.removeprefix("```"), re.DOTALL)[1]
-    assert difference(shown, capsys.readouterr().out) == ""
+def test_an_excerpt_keeps_the_order():
+    printed = "head\n ────\nfirst 1.00\nsecond 2.00\n"
+    assert excerpt("head\nsecond 2.01\n", printed) == ""
+    assert "second" not in excerpt("second 2.00\nfirst 1.00\n", printed).splitlines()[0]
+    assert excerpt("third 3.00\n", printed).startswith("not printed")
 
 
-def test_the_python_example_runs_and_prints_what_it_says(tmp_path, monkeypatch, capsys):
-    (source,) = [block for block in blocks() if "ActionIndexer" in block]
-    monkeypatch.chdir(tmp_path)
-    exec(compile(source, str(README), "exec"), {})
-    first, *events = capsys.readouterr().out.splitlines()
-    assert first == re.search(r"print\(indexer\.predict\(queries\)\) +# (.*)", source)[1]
-    shown = re.findall(r"^ (\w+) +([\d.]+) +([\d.]+) +[\d.]+ +[\d.]+$", README.read_text(encoding="utf-8"), re.MULTILINE)
-    assert [line.split()[0] for line in events] == [label for label, _, _ in shown]
-    for line, (_, start, end) in zip(events, shown, strict=True):
-        assert [float(second) for second in line.split()[1:]] == pytest.approx([float(start), float(end)], abs=0.1)
-    assert {path.name for path in tmp_path.iterdir()} == {"moves.safetensors", "lesson.npz", "session.npz"}
+def test_steps_of_a_document():
+    text = "```\n$ dyntorch a  # exit code 3\nout\n$ cd b/\n```\n```python\nprint(1)\n```\n```\n1\n```\n```\nmake demo\n```\n"
+    command, folder, code = steps(text.replace("  # exit", " # exit"))
+    assert (command.typed, command.shown, command.code) == ("dyntorch a", "out\n", 3)
+    assert folder.typed == "cd b/"
+    assert (code.python, code.typed, code.shown) == (True, "print(1)\n", "1\n")
 
 
-def test_the_synchronization_example_finds_what_it_says(tmp_path, monkeypatch, capsys):
-    (make,) = [block for block in blocks() if "keypoints.json" in block]
-    (use,) = [block for block in blocks() if "from indexing import synchronize" in block]
-    monkeypatch.chdir(tmp_path)
-    exec(compile(make, str(README), "exec"), {})
-    exec(compile(use, str(README), "exec"), {})
-    first = capsys.readouterr().out.splitlines()[0]
-    shown = next(line for line in README.read_text(encoding="utf-8").splitlines() if line.startswith("Shift("))
-    assert difference(shown, first) == ""
-    assert float(re.search(r"= (\S+) frames", first)[1]) == pytest.approx(-17, abs=0.1)
+def test_everything_the_readme_shows_happens(tmp_path):
+    pytest.importorskip("av")  # the README's videos
+    assert run(README, tmp_path) == []
+
+
+def test_the_readme_is_read_in_one_sitting():
+    assert len(README.read_text(encoding="utf-8").splitlines()) <= 250
+
+
+def test_the_make_targets_of_the_readme_are_there():
+    targets = re.findall(r"^(\w+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+    named = re.findall(r"^make (\w+)|`make (\w+)", README.read_text(encoding="utf-8"), re.MULTILINE)
+    assert {"demo", "test", "docs"} <= {first or second for first, second in named} <= set(targets)
 
 
 def test_every_file_the_readme_points_to_is_there():
