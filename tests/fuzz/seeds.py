@@ -60,13 +60,15 @@ def written(path: Path, value: Any) -> Path:
 
 
 # ---- keypoints -----------------------------------------------------------------------------------------------------------
-def keypoints(path: Path) -> None:
+def keypoints(path: Path) -> Any:
     """Read as a command does, and look at every clip."""
     from indexing.readers import read
 
-    for clip in read(path, person="largest"):
+    clips = read(path, person="largest")
+    for clip in clips:
         assert np.isfinite(clip.times).all()
         _ = clip.duration, clip.seen.any(), repr(clip)
+    return list(clips)
 
 
 def _scan(folder: Path) -> tuple[str, ...]:
@@ -155,20 +157,19 @@ def _sets(folder: Path) -> list[Seed]:
     )
     films = np.random.default_rng(0).integers(0, 255, (4 * FRAMES, 24, 32), dtype=np.uint8)
     np.savez(folder / "films.npz", frames=films, subject=[1, 1, 2, 2], **about)
-    evaluated = ("index", "evaluate", "{}", "--leave-out", "subject", "--scorer", "nearest")
+    evaluated = ("index", "evaluate", "{}", "--leave-out", "subject")
     return [
         *(Seed(name, folder / name, keypoints, evaluated) for name in ("clipset.npz", "clipset_raw.npz")),
         Seed("films.npz", folder / "films.npz", films_read),
     ]
 
 
-def films_read(path: Path) -> None:
+def films_read(path: Path) -> Any:
     """Read a film set, and look at every film."""
     from indexing.readers.filmset import holds_frames, read_film_set
 
     holds_frames(path)
-    for film in read_film_set(path):
-        _ = film.duration, len(film), film.label, film.frames.max()
+    return [(film.duration, len(film), film.label, film.frames) for film in read_film_set(path)]
 
 
 # ---- models --------------------------------------------------------------------------------------------------------------
@@ -237,14 +238,13 @@ def _other_joints(joints: int) -> Any:
 
 
 # ---- points, pairs, tracks -----------------------------------------------------------------------------------------------
-def points(path: Path) -> None:
+def points(path: Path) -> Any:
     """Read the views of an alignment."""
     from indexing.readers.points import open_points, read_matches
 
     if path.suffix == ".npz":
-        read_matches([path])
-    else:
-        read_matches([path], frames=(1, 2, 3)) if path.suffix == ".c3d" else open_points(path)
+        return read_matches([path])
+    return read_matches([path], frames=(1, 2, 3)) if path.suffix == ".c3d" else open_points(path)
 
 
 def c3d(frames: int = 5, count: int = 4) -> bytes:
@@ -293,7 +293,8 @@ def _points(folder: Path) -> list[Seed]:
     }
     for name, value in files.items():
         written(folder / name, value)
-    alone = {"views.npz": ("align", "{}"), "marks.c3d": ("align", "{}", "--frames", "1", "2", "3")}
+    two = ("align", "{}", str(folder / "lines.csv"))
+    alone = {"lines.csv": two, "views.npz": ("align", "{}"), "marks.c3d": ("align", "{}", "--frames", "1,2,3")}
     return [
         Seed(name, folder / name, points, alone.get(name, ("align", "{}", str(folder / name), str(folder / name))))
         for name in (*files, "points.npy", "views.npz")
@@ -329,12 +330,13 @@ def _tracks(folder: Path) -> list[Seed]:
     np.savez(folder / "tracks.npz", tracks=tracks, **extra)
     np.savez_compressed(folder / "tracks_c.npz", **{"a/y": tracks, "b/y": tracks})
 
-    def read(path: Path) -> None:
+    def read(path: Path) -> Any:
         found = read_tracks([path], key="a" if path.name == "tracks_c.npz" else None)
         _ = found.since_first().seen(), found.views
+        return found
 
-    def marked(path: Path) -> None:
-        read_tracks([folder / "tracks.csv"], static=path)
+    def marked(path: Path) -> Any:
+        return read_tracks([folder / "tracks.csv"], static=path)
 
     written(folder / "static.csv", "id\np0\np1\n")
     quick = ("reconstruct", "{}", "--motion", "static_2d")
@@ -390,10 +392,11 @@ def _pictures(folder: Path) -> list[Seed]:
     return [*seeds, Seed("video.mp4", path, video, ("index", "fit", "a={}", f"b={path}", "-o", str(folder / "out.safetensors")), 3)]
 
 
-def video(path: Path) -> None:
+def video(path: Path) -> Any:
     """Probe a video, and read its frames."""
     from indexing.video import probe, read_video
 
-    probe(path)
-    for chunk in read_video(path):
+    found, chunks = probe(path), list(read_video(path))
+    for chunk in chunks:
         assert np.isfinite(chunk.times).all()
+    return found, chunks

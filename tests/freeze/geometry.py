@@ -1,0 +1,397 @@
+"""What every verb of ``dyntorch`` answers on fixed scenes: name -> function that returns a result."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache, partial
+from typing import Any
+
+import torch
+from torch import Tensor
+
+import dyntorch as dyn
+from dyntorch import counting, metrics, scenes
+from tests.cases import CASES as INVARIANTS
+from tests.cases import Case
+from tests.shape_cases import SHAPE_CASES, ShapeCase
+
+Table = dict[str, Callable[[], Any]]
+
+
+def seed(number: int = 0) -> torch.Generator:
+    """Random numbers, the same every time."""
+    return torch.Generator().manual_seed(number)
+
+
+def normal(*shape: int, number: int = 0) -> Tensor:
+    """Normal random numbers."""
+    return torch.randn(*shape, generator=seed(number), dtype=torch.float64)
+
+
+def tried(function: Callable[[], Any]) -> Any:
+    """A result, or what was said instead."""
+    try:
+        return function()
+    except (ValueError, TypeError, NotImplementedError, RuntimeError) as problem:
+        return f"{type(problem).__name__}: {problem}"
+
+
+def shown(result: Any) -> dict[str, Any]:
+    """A result, and its repr where its class has one of its own."""
+    made = hasattr(type(result).__repr__, "__wrapped__")  # by dataclass: all digits of all fields
+    return {"result": result} if made else {"result": result, "repr": repr(result)}
+
+
+OWN = (
+    "transfer", "transfer_points", "trajectory", "trajectory_planes", "epipolar_lines", "concurrency", "diagnose", "epipoles",
+    "fundamentals", "pure_translation_family", "positions", "velocities", "swept_plane", "labels",
+)  # fmt: skip
+
+
+# ---- invariants ------------------------------------------------------------------------------------------------------------
+def own(invariant: Any, name: str, found: dyn.Solution, views: tuple[Tensor, ...]) -> Any:
+    """What an invariant alone answers of its tensor."""
+    method, tensor, motion = getattr(invariant, name), found.tensor, found.motion
+    if name in ("diagnose", "epipoles", "fundamentals", "pure_translation_family"):
+        return method(tensor)
+    if name in ("positions", "velocities"):
+        return method(motion, *views)
+    if name == "labels":
+        return method(*invariant.fundamentals(tensor), *views)
+    if name == "swept_plane":
+        return method(tensor, *views)
+    if name == "trajectory" and isinstance(invariant, dyn.ConstantVelocityTensor):
+        return method(motion, *views)
+    if name in ("trajectory", "trajectory_planes", "concurrency") or isinstance(invariant, dyn.ConstantVelocityTensor):
+        return method(tensor, *views[:2])
+    if name == "transfer" and not isinstance(invariant, (dyn.Collineation, dyn.TranslatingLinesMatrix)):
+        return {f"{source} {target}": method(tensor, views[source - 1], source, target) for source, target in ((2, 1), (1, 3))}
+    return method(tensor, views[-1] if name == "transfer" else views[0])
+
+
+def linear(case: Case) -> dict[str, Any]:
+    """Fit, and all that stands on a fit, of noisy matches."""
+    invariant, sigma = case.invariant, case.noise / (case.units[0] if case.units else 1.0)
+    kinds = {"static": 0.3} if case.moves else {}
+    scene = case.raw(2 * case.minimal + 6, seed=1, batch=(2,), sigma=sigma, **kinds)
+    found = dyn.fit(invariant, *scene.views)
+    weights = torch.rand(scene.labels.shape, generator=seed(3), dtype=torch.float64)
+    single = tuple(x.float() for x in scene.views)
+    answer = {
+        "fit": shown(found), "weighted": dyn.fit(invariant, *scene.views, weights=weights),
+        "plain": dyn.fit(invariant, *scene.views, normalize=False).tensor, "float32": dyn.fit(invariant, *single).tensor,
+        "refine": shown(dyn.refine(found, *scene.views)), "constrain": tried(lambda: dyn.constrain(found)),
+        "sampson": dyn.sampson(invariant, found.tensor, *scene.views), "minimal": tried(lambda: invariant.minimal()),
+        "algebraic": tried(lambda: dyn.algebraic(invariant, found.tensor, *scene.views)),
+        "few": tried(lambda: dyn.fit(invariant, *(x[:, :3] for x in scene.views))),
+        "compose": tried(lambda: invariant.compose(*found.motion)), "decompose": tried(lambda: invariant.decompose(found.tensor)),
+        "exact": dyn.fit(invariant, *scene.exact).status,
+    }  # fmt: skip
+    if case.moves:
+        answer["labelled"] = tried(lambda: dyn.fit(invariant, *scene.views, static=scene.labels == 1))
+    answer |= {name: tried(partial(own, invariant, name, found, scene.views)) for name in OWN if hasattr(invariant, name)}
+    return answer
+
+
+def robust(case: Case) -> Any:
+    """Robust fit of matches of which some are wrong."""
+    sigma = 0.5 * case.noise / (case.units[0] if case.units else 1.0)
+    scene = case.raw(min(160, max(60, 4 * case.minimal)), seed=31, sigma=sigma, outliers=case.outliers)
+    return shown(dyn.robust_fit(case.invariant, *scene.views, threshold=3 * sigma, starts=(1, 4, 16), generator=seed(case.draw)))
+
+
+def shapes(case: ShapeCase) -> dict[str, Any]:
+    """The same of shapes."""
+    views, truth = case.scene(case.many, sigma=0.5, seed=2)
+    points, given = case.arguments(views)
+    found = case.fit(views)
+    return {
+        "fit": shown(found), "refine": case.refine(found, views), "sampson": case.sampson(found.tensor, views),
+        "decompose": tried(lambda: case.invariant.decompose(found.tensor)), "constrain": tried(lambda: dyn.constrain(found)),
+        "compose": tried(lambda: case.invariant.compose(truth)), "minimal": tried(lambda: case.invariant.minimal()),
+        "robust": tried(lambda: dyn.robust_fit(case.invariant, *points, threshold=3.0, starts=(1, 4), generator=seed(0), **given)),
+    }  # fmt: skip
+
+
+# ---- alignment, segmentation, planes ---------------------------------------------------------------------------------------
+def points_3d(model: str, **options: Any) -> Any:
+    """Align three views of points of space as a model has them."""
+    sensors = {"join": "projective", "minimal_join": "projective", "constant_velocity": "projective", "rigid": "rigid"}
+    kind = scenes.constant_velocity if "velocity" in model else scenes.moving_points
+    scene = kind(120, sensors=sensors.get(model, "affine"), sigma=2e-3, static=0.5, outliers=0.1, generator=seed(5))
+    return shown(dyn.align_points(*scene.views, model=model, generator=seed(0), **options))  # type: ignore[arg-type]
+
+
+def planar(threshold: float | None = 1.5, **options: Any) -> Any:
+    scene = scenes.planar(90, sigma=0.5, static=0.4, outliers=0.15, batch=2, generator=seed(4))
+    return shown(dyn.align_planar(*scene.views, threshold=threshold, generator=seed(0), **options))
+
+
+def lines(**options: Any) -> Any:
+    scene = scenes.translating_lines(100, sigma=1e-3, motion="in_plane", static=0.2, outliers=0.05, generator=seed(6))
+    return shown(dyn.align_lines(*scene.views, generator=seed(0), **options))
+
+
+def lines_and_points() -> Any:
+    scene = scenes.translating_lines(60, sigma=1e-3, motion="objects", static_points=6, generator=seed(6))
+    given = tuple(value for name, value in sorted(scene.extras.items()) if "point" in name)
+    return {
+        "extras": scene.extras,
+        "found": tried(lambda: shown(dyn.align_lines(*scene.views, static_points=given, generator=seed(0)))),
+    }
+
+
+def bodies(*counts: int, **options: Any) -> Any:
+    scene = scenes.bodies(counts, bodies=len(counts), sigma=0.4, outliers=0.15, generator=seed(4))
+    return shown(dyn.segment(*scene.views, generator=seed(0), **options))
+
+
+def planes(kind: str) -> Any:
+    """Translating planes from each kind of input."""
+    scene = scenes.translating_planes(5, bodies=2, n=40, sigma=0.2, generator=seed(1))
+    given: dict[str, Any] = {
+        "homographies": {"H": scene.homographies}, "matches": {"x1": scene.x1, "x2": scene.x2},
+        "both": {"H": scene.homographies, "fundamentals": scene.body_fundamentals},
+        "bodies": {"x1": scene.x1, "x2": scene.x2, "body_matches": (scene.body_x1, scene.body_x2)},
+        "calibrated": {"x1": scene.x1, "x2": scene.x2, "calibration": scene.calibration}, "two": {"H": scene.homographies[:2]},
+    }  # fmt: skip
+    return tried(lambda: shown(dyn.translating_planes(**given[kind])))
+
+
+# ---- reconstruction --------------------------------------------------------------------------------------------------------
+MOTIONS = {
+    "static_2d": 30, "static_3d": 30, "constant_direction_2d": 40, "constant_velocity_2d": 40, "constant_acceleration_2d": 60,
+    "constant_direction_3d": 40, "constant_velocity_planes_3d": 60, "constant_velocity_3d": 80, "constant_velocity_3d_sensors": 60,
+    "two_bodies_2d": 60, "two_bodies_3d": 60,
+}  # fmt: skip
+
+
+def tracks(motion: str, **options: Any) -> Any:
+    given: dict[str, Any] = {"sigma": 2e-3 if motion.endswith("sensors") else 0.3, "outliers": 0.0, "generator": seed(7), **options}
+    return scenes.lifted(motion, MOTIONS[motion], **given)
+
+
+def reconstructed(motion: str, **options: Any) -> Any:
+    scene = tracks(motion, outliers=0.05 if options else 0.0)
+    given: dict[str, Any] = {"times": None if scene.lifts is None else scene.times, "generator": seed(0), **options}
+    return shown(dyn.reconstruct(scene.tracks, motion, **given))
+
+
+def automatic() -> Any:
+    scene = scenes.lifted("constant_velocity_2d", 40, views=5, sigma=0.3, generator=seed(3))
+    return shown(dyn.reconstruct(scene.tracks, "auto", scene.times, generator=seed(0)))
+
+
+def falling(t: Tensor) -> Tensor:
+    """In a plane, one direction of acceleration."""
+    lift = torch.eye(3, 4, dtype=torch.float64)
+    lift[1, 3] = t**2
+    return lift
+
+
+def own_motion() -> Any:
+    motion, times = dyn.Motion(falling, "falling"), torch.arange(5.0, dtype=torch.float64)
+    cameras = torch.eye(3, dtype=torch.float64) + 0.2 * normal(5, 3, 3)
+    world = torch.cat([normal(30, 2, number=1), torch.ones(30, 1), 0.3 * normal(30, 1, number=2)], dim=1)
+    seen = torch.stack([world @ falling(t).mT @ camera.mT for t, camera in zip(times, cameras, strict=True)])
+    x = seen[..., :2] / (seen[..., 2:] + 4) + 1e-3 * normal(5, 30, 2, number=3)
+    return {"views": motion.minimal(times), "found": tried(lambda: shown(dyn.reconstruct(x, motion, times, generator=seed(0))))}
+
+
+def trajectories() -> Any:
+    cameras = torch.cat([torch.eye(3, dtype=torch.float64).expand(7, 3, 3), normal(7, 3, 1)], dim=-1)
+    start, way = normal(12, 3, number=1) + torch.tensor([0.0, 0.0, 8.0]), normal(12, 3, number=2)
+    world = start + torch.linspace(0, 2, 7, dtype=torch.float64)[:, None, None] * way
+    image = torch.nn.functional.pad(world, (0, 1), value=1.0) @ cameras.mT
+    x = image[..., :2] / image[..., 2:] + 1e-3 * normal(7, 12, 2, number=3)
+    found = dyn.triangulate_trajectories(cameras, x, sigma=1e-3)
+    return {
+        **shown(found),
+        "points": dyn.points_on_lines(cameras, x, found.lines),
+        "exact": dyn.triangulate_trajectories(cameras, x),
+    }
+
+
+def line_cameras() -> Any:
+    turns = torch.linalg.qr(torch.eye(3, dtype=torch.float64) + 0.3 * normal(6, 3, 3)).Q
+    cameras = torch.cat([turns * turns.diagonal(dim1=1, dim2=2).sign()[:, None], normal(6, 3, 1, number=1)], dim=-1)
+    start, way = normal(800, 3, number=2) + torch.tensor([0.0, 0.0, 9.0]), normal(800, 3, number=3)
+    world = start + normal(6, 800, 1, number=4) * way
+    image = torch.nn.functional.pad(world, (0, 1), value=1.0) @ cameras.mT
+    found = dyn.trajectory_cameras(image[..., :2] / image[..., 2:] + 1e-7 * normal(6, 800, 2, number=5), bundle=False)
+    return {"cameras": dyn.line_camera(cameras), "found": shown(found)}
+
+
+# ---- synchronization -------------------------------------------------------------------------------------------------------
+def shifted(correspondence: bool, **options: Any) -> Any:
+    if not correspondence:
+        pair = scenes.nonrigid_pair(10, 8, 90, sigma=0.3, offset=0.2, generator=seed(1))
+        return shown(dyn.synchronize(pair.a, pair.b, False, fps=pair.fps, generator=seed(0), **options))
+    scene = scenes.filmed(12, 3.0, offset=0.37, noise=0.7, missing=0.05, fps=(30.0, 25.0), generator=seed(1))
+    return shown(dyn.synchronize(scene.a, scene.b, True, times=scene.times, generator=seed(0), **options))
+
+
+@cache
+def clocks() -> Any:
+    """Three cameras: a with b, b with a camera that saw a's picture late, and a with that."""
+    scene = scenes.filmed(12, 4.0, offset=0.2, noise=0.5, fps=(30.0, 30.0), generator=seed(2))
+    return dyn.synchronize_cameras([scene.a, scene.b, scene.a[9:]], fps=30.0, max_shift=1.0, generator=seed(0))
+
+
+def combined() -> Any:
+    a, b = (shift["result"] for shift in (shifted(True, rate=1.0), shifted(True, rate=1.0, max_shift=0.6)))
+    return shown(dyn.combine_shifts({(0, 1): a, (1, 2): b}, 3))
+
+
+def pair_scene() -> Any:
+    pair = scenes.nonrigid_pair(10, 8, 70, sigma=0.2, generator=seed(1))
+    found = dyn.reconstruct_pair(pair.a, pair.b, 0.0, fps=pair.fps, generator=seed(0))
+    return {**shown(found), "same": tried(lambda: dyn.reconstruct_pair(pair.a, pair.a, 0.0, True, fps=pair.fps, generator=seed(0)))}
+
+
+def lens() -> Any:
+    K = torch.tensor([[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    dist = torch.tensor([-0.2, 0.05, 0.001, 0.0], dtype=torch.float64)
+    seen = [dyn.distort(x, K, dist) for x in scenes.two_view(120, sigma=0.2, generator=seed(0)).views]
+    found = dyn.fit_distortion(*seen, sizes=((640, 480), (640, 480)))
+    return {**shown(found), "seen": seen, "straight": [dyn.undistort(x, K, dist) for x in seen]}
+
+
+# ---- shapes, bundles, factorizations ---------------------------------------------------------------------------------------
+def moving_shapes(basis: Any) -> Any:
+    rows = basis.rows(torch.linspace(-1, 1, 24, dtype=torch.float64))
+    points, cameras = normal(rows.shape[1], 9, 3), normal(24, 3, 2, number=1)
+    x = torch.einsum("vb,bnk,vkd->vnd", rows, points, cameras) + 1e-3 * normal(24, 9, 2, number=2)
+    found = dyn.fit_shapes(x, rows)
+    return {**shown(found), "times": shown(dyn.recover_times(found.shapes, basis, x[::4]))}
+
+
+def bundle() -> Any:
+    P = torch.eye(3, 4, dtype=torch.float64) + normal(4, 3, 4) / 8
+    Y = torch.cat([normal(16, 2, number=1), normal(16, 1, number=2) + 5, torch.ones(16, 1)], dim=1).double()
+    x = dyn.reproject(P, Y) + 1e-3 * normal(4, 16, 2, number=3)
+    start = P + 0.01 * normal(4, 3, 4, number=4), Y + 0.01 * normal(16, 4, number=5)
+    return {
+        "adjusted": dyn.bundle_adjust(x, None, *start), "robust": dyn.bundle_adjust(x, None, *start, scale=1e-3),
+        "triangulated": dyn.triangulate(P, x), "steps": dyn.triangulate(P, x, steps=3), "resected": dyn.resect(Y, x),
+        "covariance": dyn.structure_covariance(P, Y, sigma=1e-3), "grassmann": dyn.grassmann_tensor(list(P[:2]), (2, 2)),
+        "epipoles": tried(lambda: dyn.joint_epipoles(list(normal(3, 3, 5)))), "projective": dyn.projective_factorization(x, 4),
+    }  # fmt: skip
+
+
+def factors() -> Any:
+    A, X, V = normal(6, 2, 3), normal(12, 3, number=1), normal(12, 3, number=2)
+    times = torch.tensor([0.0, 1.0, 2.0, 4.0, 5.0, 7.0], dtype=torch.float64)
+    still, moving = X @ A.mT + 1e-3 * normal(6, 12, 2, number=3), (X + times[:, None, None] * V) @ A.mT
+    shape, cameras, part = dyn.affine_factorization(still)
+    two = torch.rand(24, 4, generator=seed(1), dtype=torch.float64)
+    two[:14, 3], two[14:, 3] = 0.0, two[14:, 2]
+    halves = dyn.hyperplane_pair(two)
+    scene = scenes.two_view(24, batch=2, generator=seed(0))
+    x1, x2 = (x.flatten(0, 1)[:40] for x in scene.views)
+    second = torch.cat([X @ A[0].mT, X[:8] @ A[1].mT + 0.3])
+    return {
+        "affine": (shape, cameras, part), "metric": dyn.metric_upgrade(shape, cameras), "halves": halves,
+        "velocity": dyn.velocity_factorization(moving + 1e-3 * normal(6, 12, 2, number=4), times),
+        "bodies": dyn.two_bodies(normal(3, 3, 4, number=5), two, halves.hyperplanes, halves.labels),
+        "two affine": tried(lambda: dyn.affine_segmentation(torch.cat([X[:, :2], X[:8, :2]]), second)),
+        "multibody": dyn.multibody_matrix(x1, x2, 2), "basis": dyn.orthonormal_basis(normal(3, 5, 2)),
+        "correlation": dyn.canonical_correlation(normal(3, 6, 2), normal(3, 6, 2, number=1)),
+        "null": [dyn.null_space(normal(2, 40, 12), dim) for dim in (1, 3)], "wide": dyn.null_space(normal(5, 12), 7),
+    }  # fmt: skip
+
+
+def counts() -> Any:
+    names = sorted(counting.CONFIGURATIONS)
+    small = [name for name in names if not name.startswith("shape")]
+    return {
+        "dim_v": {f"{n} {m} {k}": counting.dim_v(n, m, k) for n in range(1, 6) for m in range(1, 5) for k in range(1, 4)},
+        "closed": [counting.dim_v_closed_form(4, 3, codim) for codim in (1, 2, 3)], "names": names,
+        "options": {name: sorted(counting.options_of(name)) for name in names},
+        "count": {name: tried(partial(counting.count, name)) for name in [*small, *MOTIONS]},
+        "tableaux": (counting.standard_tableaux((3, 2, 1)), counting.semistandard_tableaux((2, 1), 4)),
+    }  # fmt: skip
+
+
+def errors() -> Any:
+    a, b = normal(2, 3, 3), normal(2, 3, 3, number=1)
+    rigid = [torch.block_diag(torch.linalg.qr(x[0]).Q, torch.ones(1, 1, dtype=x.dtype)) for x in (a, b)]
+    labels, truth = torch.arange(20) % 3, torch.arange(20) % 4
+    return {
+        "relative": metrics.relative_error(a, b), "grid": metrics.grid_transfer_error(a, b, 640, 480),
+        "rotation": metrics.rotation_error(*rigid), "translation": metrics.translation_error(*rigid),
+        "angle": metrics.subspace_angle(a[..., :2], b[..., :2]),
+        "labels": metrics.label_scores(labels, truth), "wrong": metrics.misclassification(labels, truth),
+        "gauge": tried(lambda: metrics.affine_gauge(normal(3, 4, 4), normal(3, 4, 4, number=1))),
+    }  # fmt: skip
+
+
+# ---- refusals --------------------------------------------------------------------------------------------------------------
+def refusals() -> Any:
+    """What is said to bad input, and what of data that cannot decide."""
+    x1, x2, x3 = scenes.planar(40, static=1.0, sigma=0.5, generator=seed(0)).views
+    still = torch.zeros(40, 6, 2, dtype=torch.float64) + normal(6, 2)
+    calls: dict[str, Callable[[], Any]] = {
+        "views": lambda: dyn.fit(dyn.HomographyTensor, x1, x2),
+        "name": lambda: dyn.fit("homography", x1, x2, x3),  # type: ignore[arg-type]
+        "size": lambda: dyn.fit(dyn.FundamentalMatrix, x1, x2[:-1]), "dims": lambda: dyn.fit(dyn.JoinTensor, x1, x2, x3),
+        "weights": lambda: dyn.fit(dyn.FundamentalMatrix, x1, x2, weights=-torch.ones(40)),
+        "matrix": lambda: dyn.null_space(normal(3), 1),
+        "threshold": lambda: dyn.align_planar(x1, x2, x3, threshold=-1.0),
+        "model": lambda: dyn.align_points(x1, x2, x3, model="bent"),  # type: ignore[arg-type]
+        "flat": lambda: dyn.align_points(x1, x2, x3), "bodies": lambda: dyn.segment(x1, x2, bodies=0),
+        "few": lambda: dyn.segment(x1[:4], x2[:4]),
+        "motion": lambda: dyn.reconstruct(torch.stack([x1, x2]), "curved"),
+        "two views": lambda: dyn.reconstruct(torch.stack([x1, x2]), "constant_velocity_3d"),
+        "clock": lambda: dyn.synchronize(still, still, fps=-1.0),
+        "nothing moves": lambda: shown(dyn.synchronize(still, still, fps=30.0)),
+        "planes": lambda: dyn.translating_planes(), "still": lambda: shown(dyn.fit(dyn.HomographyTensor, x1, x2, x3)),
+        "check": lambda: dyn.fit(dyn.HomographyTensor, x1[:9], x2[:9], x3[:9]).check(), "dim": lambda: counting.dim_v(0, 1, 1),
+        "count": lambda: counting.count("fundamentals"), "profile": lambda: dyn.GrassmannTensor(4, (2, 2, 2)),
+        "lone camera": lambda: dyn.synchronize_cameras([still], fps=30.0), "lift": lambda: dyn.Motion(),
+    }  # fmt: skip
+    return {name: tried(call) for name, call in calls.items()}
+
+
+def table() -> Table:
+    """All cases."""
+    found: Table = {f"linear {case!r} {i}": partial(linear, case) for i, case in enumerate(INVARIANTS)}
+    found |= {f"robust {case!r} {i}": partial(robust, case) for i, case in enumerate(INVARIANTS)}
+    found |= {f"shape {case!r}": partial(shapes, case) for case in SHAPE_CASES}
+    found |= {
+        f"align_points {model}": partial(points_3d, model)
+        for model in ("join", "minimal_join", "constant_velocity", "affine_constant_velocity", "rigid")
+    }
+    found |= {"align_points rigid velocity": partial(points_3d, "rigid", motion="constant_velocity"), "align_planar": planar}
+    found |= {"align_planar auto": partial(planar, None), "align_lines": lines, "align_lines points": lines_and_points}
+    found |= {"align_lines threshold": partial(lines, threshold=3e-3), "segment": partial(bodies, 90, 60, 40)}
+    found |= {
+        "segment known": partial(bodies, 70, 50, bodies=2, spatial=False),
+        "segment auto": partial(bodies, 80, 50, threshold=None),
+    }
+    found |= {
+        f"planes {kind}": partial(planes, kind) for kind in ("homographies", "matches", "both", "bodies", "calibrated", "two")
+    }
+    found |= {f"reconstruct {motion}": partial(reconstructed, motion, threshold=None) for motion in MOTIONS}
+    found |= {
+        f"reconstruct robust {motion}": partial(reconstructed, motion, threshold=1.0)
+        for motion in ("static_3d", "constant_velocity_2d")
+    }
+    found |= {
+        "reconstruct auto": automatic,
+        "reconstruct own": own_motion,
+        "trajectories": trajectories,
+        "trajectory_cameras": line_cameras,
+    }
+    found |= {
+        "synchronize same": partial(shifted, True),
+        "synchronize different": partial(shifted, False),
+        "combine_shifts": combined,
+    }
+    found |= {"synchronize rate": partial(shifted, True, rate=1.0, max_shift=1.0), "synchronize_cameras": lambda: shown(clocks())}
+    found |= {"reconstruct_pair": pair_scene, "lens": lens, "bundle": bundle, "factorizations": factors, "counting": counts}
+    found |= {
+        "shapes polynomial": partial(moving_shapes, dyn.Polynomial(1)),
+        "shapes fourier": partial(moving_shapes, dyn.Fourier(1)),
+    }
+    return found | {"metrics": errors, "refusals": refusals}
