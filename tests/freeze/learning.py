@@ -131,7 +131,8 @@ def read_file(path: Path) -> Any:
         with safe_open(path, "numpy") as file:
             about = {key: json.loads(text) for key, text in (file.metadata() or {}).items()}
             return {"tensors": {key: file.get_tensor(key) for key in sorted(file.keys())}, "about": about}
-    return path.read_text(encoding="utf-8")
+    data = path.read_bytes()
+    return data.decode() if path.suffix == ".txt" else hashlib.sha256(data).hexdigest()
 
 
 def numbers(column: tuple[str, ...]) -> Any:
@@ -189,13 +190,18 @@ segment matches.npz --out segment
 segment matches.npz --bodies 3 --threshold 2
 reconstruct tracks.csv --motion constant_velocity_3d --static parked.csv --fps 25 --out reconstruct
 sync cam1 cam2 cam3 --fps 30 --out sync
+sync cam1 another-take --fps 30
 index fit squat=squat.json lunge=lunge.json kick=kick.json@0.2-1.4 -o three.safetensors
 index fit lesson.npz -o moves.safetensors
 index scan session.npz -m moves.safetensors --truth truth.csv --report scan
 index scan session.npz -m moves.safetensors --reject 0.1
+index fit people.npz --weights learned -o learned.safetensors --report learned
+index fit squat=squat.mp4 jumping_jack=jumping_jack.mp4 kick=kick.mp4@0-2 -o seen.safetensors
+index scan filmed.mp4 -m seen.safetensors --report filmed
 index evaluate people.npz --train azimuth=0 --test azimuth=90 --report evaluate
 index evaluate solid.npz --camera virtual --azimuth 0,90 --leave-out subject
-index evaluate people.npz --leave-out subject --scorer nearest
+index evaluate people.npz --leave-out subject
+index evaluate films.npz --leave-out subject
 demo --people 2 --out demo
 count
 count homography --moving 30 --static 2
@@ -246,7 +252,7 @@ def table(folder: Path) -> Table:
         "action mirror": partial(actions, work, mirror=True, repair=False, virtual_views=2, random_state=3),
         "phase": partial(phases, work), "phase once": partial(phases, work, course="once", window=0.2, reject=0.1),
         "brightness": partial(pixels, work),
-        "brightness temporal": partial(pixels, work, temporal_weight=0.4, flip=False, region=None, reject=0.2),
+        "brightness all": partial(pixels, work, flip=False, region=None, reject=0.2),
     }  # fmt: skip
     found |= {
         f"indexing.synchronize {method}": partial(clocks, method)
@@ -259,9 +265,6 @@ def table(folder: Path) -> Table:
     found["command demo"] = shown
     found |= {f"command {words}": lambda words=words: shown() and command(examples, pages, *words.split()) for words in COMMANDS}
     found["seed commands"] = lambda: {seed.name: tried(partial(of_seed, work, pages, seed)) for seed in made() if seed.words}
-    found["film set"] = lambda: [made(), command(work, pages, "index", "evaluate", "../seeds/films.npz", "--leave-out", "subject")][
-        1
-    ]
     found["pages"] = lambda: dict(pages)
     return found
 
