@@ -24,8 +24,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # decorators keep the types of what they decorate only if theirs are known
-    from dyntorch.blocks import one_thread as one_thread
-    from dyntorch.devices import on_cpu as on_cpu
+    from dyntorch.numerics.arguments import on_cpu as on_cpu
+    from dyntorch.numerics.blocks import one_thread as one_thread
 
 __version__ = "0.1.0"
 
@@ -44,74 +44,79 @@ _HOME = {
     "GrassmannTensor": "dyntorch.invariants.grassmann_tensor",
     "ShapeTensor": "dyntorch.invariants.shape_tensor",
     "DynamicShapeTensor": "dyntorch.invariants.dynamic_shape_tensor",
-    "Invariant": "dyntorch.invariant",
+    "Invariant": "dyntorch.core.invariant",
     # from matches to the tensor and its motion
-    "null_space": "dyntorch.nullspace",
-    "fit": "dyntorch.fitting",
-    "robust_fit": "dyntorch.robust",
-    "constrain": "dyntorch.constrained",
-    "refine": "dyntorch.refinement",
-    "sampson": "dyntorch.residual",
-    "algebraic": "dyntorch.residual",
-    "Solution": "dyntorch.solution",
-    "Status": "dyntorch.solution",
+    "null_space": "dyntorch.numerics.nullspace",
+    "fit": "dyntorch.core.fit",
+    "robust_fit": "dyntorch.core.robust",
+    "constrain": "dyntorch.core.refine",
+    "refine": "dyntorch.core.refine",
+    "sampson": "dyntorch.core.residual",
+    "algebraic": "dyntorch.core.residual",
+    "Solution": "dyntorch.core.solution",
+    "Status": "dyntorch.core.solution",
     # tasks
-    "align_planar": "dyntorch.tasks.align_planar",
-    "align_points": "dyntorch.tasks.align_points",
-    "align_lines": "dyntorch.tasks.align_lines",
-    "segment": "dyntorch.tasks.bodies",
-    "translating_planes": "dyntorch.tasks.planes",
-    "TranslatingPlanes": "dyntorch.tasks.planes_result",
-    "Segmentation": "dyntorch.tasks.segmentation",
-    "BodyModel": "dyntorch.tasks.segmentation",
-    "reconstruct": "dyntorch.tasks.reconstruct",
-    "synchronize": "dyntorch.tasks.synchronize",
-    "Shift": "dyntorch.tasks.shift",
-    "synchronize_cameras": "dyntorch.tasks.sync_cameras",
-    "combine_shifts": "dyntorch.tasks.sync_cameras",
-    "Clocks": "dyntorch.tasks.sync_clocks",
-    "reconstruct_pair": "dyntorch.tasks.reconstruct_pair",
-    "PairReconstruction": "dyntorch.tasks.pair_result",
-    "undistort": "dyntorch.algebra.lens",
-    "distort": "dyntorch.algebra.lens",
-    "fit_distortion": "dyntorch.tasks.sync_lens",
-    "Motion": "dyntorch.motions",
-    "triangulate_trajectories": "dyntorch.tasks.trajectories",
-    "LineStatus": "dyntorch.tasks.trajectories",
-    "points_on_lines": "dyntorch.tasks.trajectories",
-    "trajectory_cameras": "dyntorch.tasks.trajectory_tensor",
-    "line_camera": "dyntorch.algebra.line_cameras",
+    "align_planar": "dyntorch.tasks.align.planar",
+    "align_points": "dyntorch.tasks.align.points",
+    "align_lines": "dyntorch.tasks.align.lines",
+    "segment": "dyntorch.tasks.segment.segment",
+    "translating_planes": "dyntorch.tasks.planes.planes",
+    "TranslatingPlanes": "dyntorch.tasks.planes.planes",
+    "Segmentation": "dyntorch.tasks.segment.result",
+    "BodyModel": "dyntorch.tasks.segment.result",
+    "reconstruct": "dyntorch.tasks.reconstruct.reconstruct",
+    "synchronize": "dyntorch.tasks.synchronize.synchronize",
+    "Shift": "dyntorch.tasks.synchronize.result",
+    "synchronize_cameras": "dyntorch.tasks.synchronize.cameras",
+    "combine_shifts": "dyntorch.tasks.synchronize.cameras",
+    "Clocks": "dyntorch.tasks.synchronize.result",
+    "reconstruct_pair": "dyntorch.tasks.pair.pair",
+    "PairReconstruction": "dyntorch.tasks.pair.result",
+    "undistort": "dyntorch.geometry.lens",
+    "distort": "dyntorch.geometry.lens",
+    "fit_distortion": "dyntorch.geometry.lens",
+    "Motion": "dyntorch.tasks.reconstruct.motions",
+    "triangulate_trajectories": "dyntorch.tasks.trajectories.trajectories",
+    "LineStatus": "dyntorch.tasks.trajectories.trajectories",
+    "points_on_lines": "dyntorch.tasks.trajectories.trajectories",
+    "trajectory_cameras": "dyntorch.tasks.trajectories.trajectories",
+    "line_camera": "dyntorch.geometry.lines",
     # projections P^k -> P^l of any k and l
-    "triangulate": "dyntorch.algebra.triangulation",
-    "resect": "dyntorch.algebra.triangulation",
-    "reproject": "dyntorch.algebra.triangulation",
-    "bundle_adjust": "dyntorch.bundle_adjustment",
-    "structure_covariance": "dyntorch.bundle_information",
-    "grassmann_tensor": "dyntorch.algebra.grassmann",
-    "joint_epipoles": "dyntorch.algebra.joint_epipoles",
-    "hyperplane_pair": "dyntorch.algebra.hyperplane_pair",
-    "two_bodies": "dyntorch.algebra.two_bodies",
-    "affine_segmentation": "dyntorch.algebra.affine_segmentation",
+    "triangulate": "dyntorch.geometry.triangulation",
+    "resect": "dyntorch.geometry.triangulation",
+    "reproject": "dyntorch.geometry.triangulation",
+    "bundle_adjust": "dyntorch.geometry.bundle",
+    "structure_covariance": "dyntorch.geometry.bundle",
+    "grassmann_tensor": "dyntorch.geometry.grassmann",
+    "joint_epipoles": "dyntorch.geometry.joint_epipoles",
+    "hyperplane_pair": "dyntorch.geometry.pairs",
+    "two_bodies": "dyntorch.geometry.pairs",
+    "affine_segmentation": "dyntorch.tasks.segment.affine",
     "multibody_matrix": "dyntorch.invariants.multibody",
-    "projective_factorization": "dyntorch.algebra.projective_factorization",
-    "velocity_factorization": "dyntorch.algebra.velocity_factorization",
+    "projective_factorization": "dyntorch.tasks.reconstruct.factorization",
+    "velocity_factorization": "dyntorch.tasks.reconstruct.factorization",
     # shapes that move: every view from another affine camera
-    "fit_shapes": "dyntorch.algebra.dynamic_shape",
-    "MovingShapes": "dyntorch.algebra.dynamic_shape",
-    "recover_times": "dyntorch.algebra.dynamic_shape_time",
-    "Recovery": "dyntorch.algebra.dynamic_shape_time",
-    "Polynomial": "dyntorch.algebra.dynamic_shape_basis",
-    "Fourier": "dyntorch.algebra.dynamic_shape_basis",
+    "fit_shapes": "dyntorch.shapes.moving",
+    "MovingShapes": "dyntorch.shapes.moving",
+    "recover_times": "dyntorch.shapes.times",
+    "Recovery": "dyntorch.shapes.times",
+    "Polynomial": "dyntorch.shapes.basis",
+    "Fourier": "dyntorch.shapes.basis",
     # how a verb computes: on one thread, the caller's setting untouched; on the CPU, wherever its tensors are
-    "one_thread": "dyntorch.blocks",
-    "on_cpu": "dyntorch.devices",
+    "one_thread": "dyntorch.numerics.blocks",
+    "on_cpu": "dyntorch.numerics.arguments",
     # subspaces and factorization
-    "canonical_correlation": "dyntorch.algebra.subspaces",
-    "orthonormal_basis": "dyntorch.algebra.subspaces",
-    "affine_factorization": "dyntorch.algebra.factorization",
-    "metric_upgrade": "dyntorch.algebra.factorization",
+    "canonical_correlation": "dyntorch.numerics.subspaces",
+    "orthonormal_basis": "dyntorch.numerics.subspaces",
+    "affine_factorization": "dyntorch.numerics.subspaces",
+    "metric_upgrade": "dyntorch.numerics.subspaces",
 }
-_MODULES = ("counting", "metrics", "motions", "scenes")
+_MODULES = {
+    "counting": "dyntorch.counting",
+    "metrics": "dyntorch.metrics",
+    "motions": "dyntorch.tasks.reconstruct.motions",
+    "scenes": "dyntorch.scenes",
+}
 __all__ = sorted([*_HOME, *_MODULES])
 
 
@@ -119,7 +124,7 @@ def __getattr__(name: str) -> Any:
     if name in _HOME:
         return getattr(import_module(_HOME[name]), name)
     if name in _MODULES:
-        return import_module(f"dyntorch.{name}")
+        return import_module(_MODULES[name])
     raise AttributeError(f"module 'dyntorch' has no attribute {name!r}")
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from indexing import Clip
-from indexing.shape.channels import channel
+from indexing.action.bank import channel
 from indexing.windows import ragged, whole
 
 Array = NDArray[Any]

@@ -1,6 +1,6 @@
 """What else can be read off a video frame by frame: the same online warping, with other descriptors.  For comparison only.
 
-All look at the crop about what moves in the whole take (:mod:`indexing.brightness.box`; not causal, which favours them).
+All look at the crop about what moves in the whole take (:mod:`indexing.sync.gray`; not causal, which favours them).
 
 *activity*: how much changes, in the second before: a curve, compared by correlation.
 *energy grid*: how much changes in each of 8 x 8 cells.  *HOG*: histograms of oriented gradients of what is not background.
@@ -20,15 +20,12 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, normalize
 
 from experiments.protocol import Array
-from indexing.brightness.box import boxes, crop, motion
 from indexing.brightness.features import blur, gradients
+from indexing.brightness.footage import Shrinker
 from indexing.brightness.library import Exemplars, library
-from indexing.brightness.matching import Warping
-from indexing.brightness.pooling import described
-from indexing.brightness.profile import inverse_root
-from indexing.brightness.shrinking import Shrinker
-from indexing.brightness.sight import SMALLEST
-from indexing.brightness.window_kernel import window_kernels
+from indexing.brightness.sight import SMALLEST, described
+from indexing.brightness.stream import Warping
+from indexing.sync.gray import boxes, crop, inverse_root, motion, window_kernels
 from indexing.video import Chunk, track_points
 
 Frames = NDArray[np.uint8]

@@ -36,9 +36,9 @@ from experiments.protocol import Array
 from experiments.tables import Row, command, note
 from indexing import Clip
 from indexing.actors.textured import film
-from indexing.brightness.box import motion
 from indexing.brightness.indexer import BrightnessIndexer
 from indexing.skeleton import COCO17
+from indexing.sync.gray import motion
 
 Method = Literal["ours", "whole image", "thesis kernel", "activity correlation", "energy grid", "HOG"]
 NAMES = {

@@ -31,9 +31,9 @@ from experiments.tables import NoiseConfig, Row, aligned, command, measured, not
 from indexing import Clip
 from indexing.actors import ACTIONS, Person, stream
 from indexing.actors.textured import Frames, film
-from indexing.brightness.box import motion
-from indexing.brightness.synchronization import brightness_shift
 from indexing.skeleton import Skeleton
+from indexing.sync.brightness import brightness_shift
+from indexing.sync.gray import motion
 
 FPS = 30.0
 EARLIER = 0.4  # of a take, at most, between the starts

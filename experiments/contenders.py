@@ -13,9 +13,9 @@ from torch import Tensor
 from experiments.baselines import Array, ImageNearest, Nearest, WarpedNearest
 from experiments.protocol import Classifier
 from indexing import ActionIndexer, Clip
+from indexing.action.bank import Windows
+from indexing.action.model import ShapeModel
 from indexing.scoring import Event
-from indexing.shape.bank import Windows
-from indexing.shape.model import ShapeModel
 
 Method = Literal["equal", "learned", "unrepaired", "image", "dtw"]
 NAMES: dict[Method, str] = {

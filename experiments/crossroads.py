@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dyntorch.algebra.homogeneous import apply, homogeneous, inhomogeneous
-from dyntorch.scenes.cameras import looking_at
+from dyntorch.geometry.homogeneous import apply, homogeneous, inhomogeneous
+from dyntorch.scenes.scene import looking_at
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 330.0  # pixels
 SAMPLES = 2  # per pixel and axis: what a lens does against aliasing

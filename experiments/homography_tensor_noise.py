@@ -18,10 +18,10 @@ import tyro
 from torch import Tensor
 
 import dyntorch as dyn
+from dyntorch.core.normalize import normalize_motion
 from dyntorch.metrics import grid_transfer_error, label_scores, relative_error
-from dyntorch.normalize import normalize_motion
 from dyntorch.scenes import Scene, planar
-from dyntorch.tasks.align_planar import align_planar
+from dyntorch.tasks.align.planar import align_planar
 from experiments.tables import NoiseConfig, aligned, command, note
 from indexing.files import manifest, write_json
 

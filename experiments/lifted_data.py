@@ -11,14 +11,14 @@ from torch import Tensor
 
 import dyntorch as dyn
 from dyntorch import metrics
-from dyntorch.algebra.homogeneous import homogeneous, inhomogeneous
-from dyntorch.algebra.lift import balanced
-from dyntorch.algebra.triangulation import reproject, resect
-from dyntorch.bundle_adjustment import bundle_adjust
-from dyntorch.motions import as_motion
-from dyntorch.scenes.cameras import calibration, looking_at
-from dyntorch.tasks.reconstruct import normalized
-from dyntorch.tasks.reconstruction import Reconstruction
+from dyntorch.geometry.bundle import bundle_adjust
+from dyntorch.geometry.homogeneous import homogeneous, inhomogeneous
+from dyntorch.geometry.lift import balanced
+from dyntorch.geometry.triangulation import reproject, resect
+from dyntorch.scenes.scene import calibration, looking_at
+from dyntorch.tasks.reconstruct.motions import as_motion
+from dyntorch.tasks.reconstruct.reconstruct import normalized
+from dyntorch.tasks.reconstruct.result import Reconstruction
 from experiments.protocol import data_folder
 from experiments.real_data import Take, Traffic, rotation
 

@@ -24,12 +24,12 @@ from torch import Tensor
 
 import dyntorch as dyn
 from dyntorch import metrics, scenes
-from dyntorch.algebra.lift import upgrade
-from dyntorch.algebra.triangulation import resect, triangulate
-from dyntorch.motions import MOTIONS, Motion
-from dyntorch.tasks.lifted_projections import Tracks
-from dyntorch.tasks.lifted_scene import Lifting, Scene, adjusted, distances
-from dyntorch.tasks.reconstruct import normalized
+from dyntorch.geometry.lift import upgrade
+from dyntorch.geometry.triangulation import resect, triangulate
+from dyntorch.tasks.reconstruct.motions import MOTIONS, Motion
+from dyntorch.tasks.reconstruct.projections import Tracks
+from dyntorch.tasks.reconstruct.reconstruct import normalized
+from dyntorch.tasks.reconstruct.scene import Lifting, Scene, adjusted, distances
 from experiments.tables import command, note
 
 SCENES, QUICK = 40, 8

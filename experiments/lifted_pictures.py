@@ -16,11 +16,11 @@ from matplotlib.tri import Triangulation
 from torch import Tensor
 
 import dyntorch as dyn
-from dyntorch.algebra.homogeneous import homogeneous, inhomogeneous
-from dyntorch.algebra.lift import gauge_algebra
-from dyntorch.nullspace import null_space
-from dyntorch.scenes.cameras import calibration, looking_at
-from dyntorch.tasks.reconstruction import Reconstruction
+from dyntorch.geometry.homogeneous import homogeneous, inhomogeneous
+from dyntorch.geometry.lift import gauge_algebra
+from dyntorch.numerics.nullspace import null_space
+from dyntorch.scenes.scene import calibration, looking_at
+from dyntorch.tasks.reconstruct.result import Reconstruction
 from experiments.lifted_data import CENTRE, World
 from experiments.real_pictures import LINES, MARKS, save
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 import dyntorch as dyn
-from dyntorch.algebra.homogeneous import apply, homogeneous
+from dyntorch.geometry.homogeneous import apply, homogeneous
 from experiments.lifted_data import declared, predicted
 from experiments.real_data import Traffic
 from experiments.real_solvers import listed, median

@@ -24,7 +24,7 @@ import torch
 import tyro
 from torch import Tensor
 
-from dyntorch.tasks.reconstruct_pair import reconstruct_pair
+from dyntorch.tasks.pair.pair import reconstruct_pair
 from experiments.real_data import takes
 from experiments.synchronization_data import DIFFERENT, SAME, Filming, image, seeded
 from experiments.tables import NoiseConfig, Row, command, measured

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 import dyntorch as dyn
-from dyntorch.algebra.homogeneous import apply
-from dyntorch.algebra.rigid import rigid_alignment
+from dyntorch.geometry.homogeneous import apply
+from dyntorch.geometry.rigid import rigid_alignment
 from dyntorch.scenes.scene import Draw
 from experiments.real_data import Take
 from experiments.real_solvers import Matrices, Solver, aligned, gap, listed, median, tensor

@@ -37,11 +37,10 @@ import tyro
 
 import dyntorch as dyn
 from dyntorch import metrics
-from dyntorch.algebra.homogeneous import homogeneous, inhomogeneous
-from dyntorch.algebra.projective_factorization import projective_factorization
-from dyntorch.algebra.velocity_factorization import velocity_factorization
-from dyntorch.motions import MOTIONS, polynomial
-from dyntorch.tasks.reconstruction import Reconstruction
+from dyntorch.geometry.homogeneous import homogeneous, inhomogeneous
+from dyntorch.tasks.reconstruct.factorization import projective_factorization, velocity_factorization
+from dyntorch.tasks.reconstruct.motions import MOTIONS, polynomial
+from dyntorch.tasks.reconstruct.result import Reconstruction
 from experiments.lifted_data import Boxes, World, boxes, crowd, declared, drone, minimum, pairs, predicted, scene_error, seen
 from experiments.lifted_pictures import drive_picture, people_picture, traffic_picture
 from experiments.lifted_traffic import asked, auto_rows, bodies_rows, threshold_rows, traffic_rows

@@ -13,8 +13,8 @@ import matplotlib.pyplot as plt
 import torch
 from torch import Tensor
 
-from dyntorch.algebra.homogeneous import apply
-from dyntorch.tasks.alignment import MOVING, OUTLIER, STATIC, Alignment
+from dyntorch.geometry.homogeneous import apply
+from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment
 from experiments.real_data import Board
 
 COLOURS = {STATIC: "#5a7d9a", MOVING: "#e07b39", OUTLIER: "#b3123a"}

@@ -42,8 +42,8 @@ import tyro
 from torch import Tensor
 
 import dyntorch as dyn
-from dyntorch.algebra.homogeneous import apply
-from dyntorch.tasks.alignment import MOVING, OUTLIER, STATIC, Alignment
+from dyntorch.geometry.homogeneous import apply
+from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment
 from experiments.protocol import data_folder
 from experiments.real_data import Board, Traffic, board, traffic
 from experiments.real_pictures import board_picture, shares_picture, traffic_picture

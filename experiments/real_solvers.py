@@ -10,8 +10,8 @@ from torch import Tensor
 
 import dyntorch as dyn
 from dyntorch import metrics
-from dyntorch.algebra.homogeneous import apply
-from dyntorch.algebra.rigid import rigid_alignment
+from dyntorch.geometry.homogeneous import apply
+from dyntorch.geometry.rigid import rigid_alignment
 
 Matrices = tuple[Tensor, Tensor]
 Solver = Callable[[list[Tensor], Matrices], tuple[Matrices, str]]

@@ -34,7 +34,7 @@ from torch import Tensor
 
 import dyntorch as dyn
 from dyntorch import metrics
-from dyntorch.algebra.homogeneous import apply
+from dyntorch.geometry.homogeneous import apply
 from experiments.protocol import data_folder
 from experiments.real_bodies import SPACINGS, bodies_rows
 from experiments.real_data import Drive, drives, takes

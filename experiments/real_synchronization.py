@@ -27,7 +27,7 @@ from typing import Annotated, Literal
 import numpy as np
 import torch
 import tyro
-from scipy.interpolate import CubicSpline  # type: ignore[import-untyped]
+from scipy.interpolate import CubicSpline
 from torch import Tensor
 
 import dyntorch as dyn
@@ -35,7 +35,7 @@ from experiments.protocol import Array, data_folder
 from experiments.synchronization_baselines import pose2sim
 from experiments.synchronization_data import Pair
 from experiments.tables import Row, command, measured_on_one_thread
-from indexing.synchronization import synchronize
+from indexing.sync.synchronize import synchronize
 
 VARIABLE = "mate7"
 """The camera without a constant frame rate."""

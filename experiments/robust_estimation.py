@@ -21,8 +21,8 @@ import tyro
 
 import dyntorch as dyn
 from dyntorch import scenes
-from dyntorch.chi_square import quantile
-from dyntorch.invariant import Invariant
+from dyntorch.core.invariant import Invariant
+from dyntorch.numerics.chi_square import quantile
 from dyntorch.scenes.scene import OUTLIER, Scene
 from experiments.tables import Row, command, measured
 from indexing.files import prepare

@@ -31,8 +31,8 @@ from torch import Tensor
 
 import dyntorch as dyn
 from dyntorch import scenes
+from dyntorch.core.normalize import normalize_motion
 from dyntorch.metrics import misclassification
-from dyntorch.normalize import normalize_motion
 from dyntorch.scenes import Scene
 from experiments.tables import NoiseConfig, Row, command, measured
 

@@ -20,7 +20,13 @@ from unittest.mock import patch
 
 import tyro
 
-from dyntorch.tasks import bodies_count, bodies_descent, bodies_energy, bodies_labels, bodies_pool, bodies_problem, coherence
+from dyntorch.tasks.segment import coherence
+from dyntorch.tasks.segment import energy as bodies_energy
+from dyntorch.tasks.segment import labels as bodies_labels
+from dyntorch.tasks.segment import search as bodies_descent
+from dyntorch.tasks.segment import search as bodies_pool
+from dyntorch.tasks.segment import segment as bodies_count
+from dyntorch.tasks.segment import segment as bodies_problem
 from experiments.benchmarks.interleaved import threads
 from experiments.protocol import data_folder
 from experiments.segmentation import left_out, segmented

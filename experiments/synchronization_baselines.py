@@ -13,7 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import butter, filtfilt  # type: ignore[import-untyped]
+from scipy.signal import butter, filtfilt
 from torch import Tensor
 
 from experiments.protocol import Array

@@ -18,9 +18,9 @@ from torch import Tensor
 
 import dyntorch as dyn
 from dyntorch import scenes
-from dyntorch.algebra.homogeneous import apply
+from dyntorch.core.normalize import normalize_motion
+from dyntorch.geometry.homogeneous import apply
 from dyntorch.metrics import point_error
-from dyntorch.normalize import normalize_motion
 from experiments.tables import Row, command, markdown, note
 
 SCENES = 60

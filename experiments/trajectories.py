@@ -24,10 +24,9 @@ import tyro
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dyntorch.algebra.extensors import plucker
-from dyntorch.algebra.homogeneous import apply
-from dyntorch.tasks.trajectories import LineStatus, points_on_lines, triangulate_trajectories
-from dyntorch.tasks.trajectory_tensor import trajectory_cameras
+from dyntorch.geometry.extensors import plucker
+from dyntorch.geometry.homogeneous import apply
+from dyntorch.tasks.trajectories.trajectories import LineStatus, points_on_lines, trajectory_cameras, triangulate_trajectories
 from experiments.protocol import data_folder
 from experiments.tables import command, note
 from indexing.files import manifest, prepare, write_json

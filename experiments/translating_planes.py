@@ -20,14 +20,13 @@ import tyro
 from torch import Tensor
 
 import dyntorch as dyn
-from dyntorch.algebra.homogeneous import unit
-from dyntorch.least_squares import minimize
+from dyntorch.geometry.homogeneous import unit
 from dyntorch.metrics import relative_error
+from dyntorch.numerics.least_squares import minimize
 from dyntorch.scenes import TranslatingScene, translating_planes
-from dyntorch.tasks.planes import translating_planes as solve
-from dyntorch.tasks.planes_input import Given
-from dyntorch.tasks.planes_problem import Layout, Matches, PlanesProblem
-from dyntorch.tasks.planes_starts import parameters
+from dyntorch.tasks.planes.input import Given
+from dyntorch.tasks.planes.planes import translating_planes as solve
+from dyntorch.tasks.planes.problem import Layout, Matches, PlanesProblem, parameters
 from experiments.tables import NoiseConfig, aligned, command, note
 from indexing.files import manifest, write_json
 

@@ -25,8 +25,8 @@ from kornia.geometry.transform import warp_perspective
 from torch import Tensor
 
 import dyntorch as dyn
-from dyntorch.algebra.homogeneous import apply
-from dyntorch.tasks.reconstruction import Reconstruction
+from dyntorch.geometry.homogeneous import apply
+from dyntorch.tasks.reconstruct.result import Reconstruction
 from experiments.crossroads import CARS, HEIGHT, SAMPLES, WIDTH, camera, observe, render
 from experiments.tables import command, note
 from indexing.files import manifest, prepare, write_json

@@ -15,22 +15,22 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from indexing.action.indexer import ActionIndexer as ActionIndexer
     from indexing.brightness.indexer import BrightnessIndexer as BrightnessIndexer
     from indexing.clip import Clip as Clip
     from indexing.clip import ClipSet as ClipSet
-    from indexing.indexer import ActionIndexer as ActionIndexer
     from indexing.phase.indexer import PhaseIndexer as PhaseIndexer
     from indexing.scoring import Event as Event
-    from indexing.synchronization import synchronize as synchronize
+    from indexing.sync.synchronize import synchronize as synchronize
 
 _HOME = {
     "Clip": "indexing.clip",
     "ClipSet": "indexing.clip",
-    "ActionIndexer": "indexing.indexer",
+    "ActionIndexer": "indexing.action.indexer",
     "BrightnessIndexer": "indexing.brightness.indexer",
     "PhaseIndexer": "indexing.phase.indexer",
     "Event": "indexing.scoring",
-    "synchronize": "indexing.synchronization",
+    "synchronize": "indexing.sync.synchronize",
 }
 __all__ = sorted(_HOME)
 

@@ -14,9 +14,9 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from indexing.action.indexer import ActionIndexer
 from indexing.actors import ACTIONS, Person, dataset, detect, stream
 from indexing.clip import Clip
-from indexing.indexer import ActionIndexer
 from indexing.report import EvaluationResult, RecognitionReport, RecordingResult
 from indexing.skeleton import COCO17
 from indexing.windows import ragged, whole

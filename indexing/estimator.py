@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from sklearn.base import BaseEstimator, ClassifierMixin
 from sklearn.utils.validation import check_is_fitted
 
-from indexing.checks import check_labels
+from indexing.action.inputs import check_labels
 
 
 class SavedClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]

@@ -20,7 +20,7 @@ from indexing import files
 from indexing.actors import Person, dataset, detect, perform, stream
 from indexing.actors.textured import film
 from indexing.clip import Clip, ClipSet
-from indexing.video.extra import av
+from indexing.video.reading import av
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

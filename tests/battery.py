@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 import dyntorch as dyn
-from dyntorch.invariants.relation_pair import RelationPair
-from dyntorch.solution import Solution
+from dyntorch.core.solution import Solution
+from dyntorch.invariants.base_pairs import RelationPair
 from tests.cases import Case, carried, moved_views
 from tests.references import apart, matrices, noisy, pulled_back, rank, spans
 

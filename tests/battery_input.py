@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 import dyntorch as dyn
-from dyntorch.constrained import constrain
-from dyntorch.primitives import Hyperplane
-from dyntorch.solution import failed
+from dyntorch.core.primitives import Hyperplane
+from dyntorch.core.refine import constrain
+from dyntorch.core.solution import failed
 from tests.battery import example, finite, many, ok, prop, worst
 from tests.cases import Case
 from tests.pretend_device import accelerators, moved

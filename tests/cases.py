@@ -12,8 +12,8 @@ from torch import Tensor
 
 import dyntorch as dyn
 from dyntorch import metrics, scenes
-from dyntorch.invariant import Invariant
-from dyntorch.primitives import Hyperplane, Line
+from dyntorch.core.invariant import Invariant
+from dyntorch.core.primitives import Hyperplane, Line
 from dyntorch.scenes import Scene
 from tests.epipolar import (
     Motion,

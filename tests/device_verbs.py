@@ -399,7 +399,7 @@ VERBS: tuple[Verb, ...] = (
 )
 
 ASKED = "one for every question on values: what is given, what decides"
-LENT = "computes on the CPU (dyntorch.devices.on_cpu): one copy for every tensor that comes in"
+LENT = "computes on the CPU (dyntorch.numerics.arguments.on_cpu): one copy for every tensor that comes in"
 FITS = "for every fit one for the certificates of the null space and one for what looks weak; one where weights are given"
 STEPS = "one for every step of a descent, on whether all problems are done, beside hundreds of kernels"
 WAITS = {

@@ -33,7 +33,7 @@ import torch
 from torch import Tensor
 from torch.utils import backend_registration
 
-from dyntorch import devices
+from dyntorch.numerics import arguments as devices
 
 NAME, KEY = "pretend", "PrivateUse1"
 CPU = torch.device("cpu")

@@ -8,7 +8,7 @@ from itertools import combinations
 import torch
 from torch import Tensor
 
-from dyntorch.primitives import Hyperplane, HyperplanesThrough, Line, Monomials, Primitive, Projected
+from dyntorch.core.primitives import Hyperplane, HyperplanesThrough, Line, Monomials, Primitive, Projected
 from tests.cases import Case, Motion, lift
 
 Views = tuple[Tensor, ...]

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from dyntorch.algebra.dynamic_shape_basis import Polynomial
+from dyntorch.shapes.basis import Polynomial
 from experiments import dynamic_shape
 
 

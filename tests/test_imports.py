@@ -50,42 +50,18 @@ def test_packages_do_not_import_what_stands_on_them(package):
     assert offenders(package, lambda module, names: any(within(module, p) for p in ("experiments", "tests", "benchmarks"))) == []
 
 
-LAYERS = [
-    {
-        "algebra",
-        "arguments",
-        "blocks",
-        "chi_square",
-        "constants",
-        "devices",
-        "eigenspace",
-        "forward",
-        "lags",
-        "least_squares",
-        "nullspace",
-        "primitives",
-        "sampling",
-    },
-    {"invariant"},
-    {"matches", "normalize", "matrix"},
-    {"residual"},
-    {"invariants"},
-    {"solution", "ambiguity", "fitting"},
-    {"motion_problem", "constrained", "refinement"},
-    {"hypotheses", "starts", "robust", "bundle_problem", "bundle_adjustment", "bundle_information"},
-    {"motions"},
-    {"tasks"},
-]
+LAYERS = [{"numerics"}, {"geometry"}, {"core"}, {"shapes"}, {"invariants"}, {"tasks"}]
+"""The rooms of dyntorch, from the ground up; each imports those below it."""
 ASIDE = {"counting", "scenes", "metrics"}
 """Nothing of the library stands on these: counting is alone, the others serve tests, experiments and the demo."""
 
 
-def rooms_of(module):
+def room_of(module):
     parts = module.split(".")
     return parts[1] if parts[0] == "dyntorch" and len(parts) > 1 else None
 
 
-def test_the_layers_of_dyntorch_import_downwards():
+def test_the_rooms_of_dyntorch_import_downwards():
     level = {room: number for number, rooms in enumerate(LAYERS) for room in rooms}
     wrong, seen = [], set()
     for path in files("dyntorch"):
@@ -94,14 +70,50 @@ def test_the_layers_of_dyntorch_import_downwards():
             continue
         seen.add(here)
         for module, _ in imported(path):
-            room = rooms_of(module)
+            room = room_of(module)
             if room and (room in ASIDE or level[room] > level[here]):
-                wrong.append(f"{path.relative_to(ROOT)}: {module}")
-            # one path for all invariants: what fits them does not know them by name
-            if room == "invariants" and here in {"solution", "fitting", "refinement", "hypotheses", "starts", "robust"}:
                 wrong.append(f"{path.relative_to(ROOT)}: {module}")
     assert wrong == []
     assert seen == set(level)
+
+
+def test_no_imports_run_in_a_circle():
+    """Imports anywhere in a file count, those inside functions too; what only the type checker reads does not."""
+    for package in ("dyntorch", "indexing"):
+        graph = {module_of(path): arrows(path) for path in files(package) if path.name != "__init__.py"}
+        assert circles(graph) == CIRCLES[package]
+
+
+CIRCLES = {"dyntorch": [], "indexing": [["indexing.clip", "indexing.readers.clipset", "indexing.readers.files"]]}
+"""The one that is: ``Clip.load`` and ``ClipSet.load`` stand where people look for them, and what they call makes clips."""
+
+
+def module_of(path):
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts)
+
+
+def arrows(path):
+    """The modules that a file imports, or imports names from; not those under ``if TYPE_CHECKING``."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    for node in ast.walk(tree):
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+            node.body = []
+    found = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            found |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
+    return found
+
+
+def circles(graph):
+    """Groups of modules that import each other, by what each reaches."""
+    reach = {module: set(graph[module]) & set(graph) for module in graph}
+    for middle in graph:
+        for module in graph:
+            if middle in reach[module]:
+                reach[module] |= reach[middle]
+    groups = {frozenset(other for other in reach[module] if module in reach[other]) for module in graph if module in reach[module]}
+    return sorted(sorted(group) for group in groups)
 
 
 def test_counting_stands_alone():

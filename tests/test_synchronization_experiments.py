@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import dyntorch as dyn
-from dyntorch.nullspace import null_space
+from dyntorch.numerics.nullspace import null_space
 from experiments import protocol, real_synchronization, synchronization
 from experiments import synchronization_baselines as baselines
 from experiments import synchronization_data as data

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from dyntorch.algebra.homogeneous import apply
+from dyntorch.geometry.homogeneous import apply
 from experiments import crossroads, view_synthesis
 from experiments.crossroads import CARS, HEIGHT, WIDTH, camera, observe, render
 from experiments.view_synthesis import Scene, psnr, synthesize

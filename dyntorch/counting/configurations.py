@@ -10,10 +10,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from dyntorch.counting.field import Field, IntArray
+from dyntorch.counting.exact import Configuration, Field, IntArray, Measure, Step, Views
 from dyntorch.counting.lifted import MOTIONS
-from dyntorch.counting.step import Configuration, Step
-from dyntorch.counting.views import Measure, Views
 
 
 def homography(

@@ -11,9 +11,7 @@ from itertools import cycle
 
 import numpy as np
 
-from dyntorch.counting.field import Field, IntArray
-from dyntorch.counting.step import Configuration, Step
-from dyntorch.counting.views import Views
+from dyntorch.counting.exact import Configuration, Field, IntArray, Step, Views
 
 CAMERAS = {
     "generic": "anywhere in each view",

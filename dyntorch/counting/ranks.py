@@ -11,11 +11,8 @@ from typing import Any, overload
 import numpy as np
 
 from dyntorch.counting.configurations import CONFIGURATIONS, by_numbers
-from dyntorch.counting.field import Field, IntArray
+from dyntorch.counting.exact import Configuration, Field, IntArray, Kind, Measure, Step, Tally
 from dyntorch.counting.lifted import SETTINGS
-from dyntorch.counting.step import Configuration, Step
-from dyntorch.counting.tally import Kind, Tally
-from dyntorch.counting.views import Measure
 
 PRIMES = (2**31 - 1, 2**31 - 19)  # the second one rules out a rank that only the first one lowers
 SAMPLER_PATIENCE = 1000  # a sampler's matches need not be in general position: many on one line may add nothing

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from dyntorch.algebra.projection import dehomogenized
-from dyntorch.residual import whiten, whiten_entries
+from dyntorch.core.residual import whiten, whiten_entries
+from dyntorch.geometry.extensors import dehomogenized, levi_civita
+from dyntorch.geometry.homogeneous import cofactors, homogeneous, null_vectors, unit
+from dyntorch.numerics.nullspace import gram_null_space, null_space
 
 
 def static_residual(motion: Sequence[Tensor], views: Sequence[Tensor], scales: Sequence[Tensor]) -> Tensor:
@@ -107,3 +111,306 @@ def whitened_agreement(parts: Sequence[tuple[Tensor, Tensor]], scales: Sequence[
 def _outer(jacobian: Tensor) -> Tensor:
     """J J^T entry by entry: one pass, where a product of matrices would loop over them."""
     return (jacobian[..., :, None, :] * jacobian[..., None, :, :]).sum(-1)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# What a three-view tensor of the form eps(A, B) tells by contraction alone: static maps between views, and the third vector.
+
+
+AXES = "ijk"
+
+
+def static_map(tensor: Tensor, vectors: Tensor, source: int, target: int) -> Tensor:
+    """Static homogeneous vectors ``(*batch, n, 3)`` of one view carried to another, in float64."""
+    return null_vectors(_contraction(tensor, vectors, source, target))[0]
+
+
+def static_map_derivative(tensor: Tensor, vectors: Tensor, source: int, target: int) -> tuple[Tensor, Tensor]:
+    r"""Image y of :func:`static_map` and its derivative ``(*batch, n, 3, 3)`` by the source vector, up to multiples of y.
+
+    From :math:`y^T M = 0`: :math:`dy^T M = -y^T dM`, solved with M completed to full rank by its null vectors.
+    """
+    matrix = _contraction(tensor, vectors, source, target)
+    left, right = null_vectors(matrix)
+    size = torch.linalg.matrix_norm(matrix, keepdim=True)
+    full = matrix + size * left[..., :, None] * right[..., None, :]
+    cofactor = cofactors(full)
+    det = (cofactor[..., 0] * full[..., 0]).sum(-1)[..., None, None]
+    # a determinant of zero means a tensor of zeros, or of lower rank: it maps nothing
+    inverse = cofactor / torch.where(det == 0, torch.ones_like(det), det)
+    other = AXES[6 - source - target - 1]
+    change = torch.einsum(f"...{AXES},...n{AXES[target - 1]}->...n{other}{AXES[source - 1]}", tensor.double(), left)
+    return left, -inverse @ change
+
+
+def third_vector(tensor: Tensor, a: Tensor, b: Tensor, view: int) -> Tensor:
+    """Contract the two views other than ``view`` with vectors ``(*batch, n, 3)``, in float64."""
+    if view not in (1, 2, 3):
+        raise ValueError(f"view must be 1, 2 or 3, got {view}")
+    first, second = (axis for axis in AXES if axis != AXES[view - 1])
+    return torch.einsum(f"...{AXES},...n{first},...n{second}->...n{AXES[view - 1]}", tensor.double(), a.double(), b.double())
+
+
+def _contraction(tensor: Tensor, vectors: Tensor, source: int, target: int) -> Tensor:
+    """``(*batch, n, 3, 3)``: axes of the target view and of the remaining one, in float64."""
+    if {source, target} - {1, 2, 3} or source == target:
+        raise ValueError(f"source and target must be two different views of 1, 2, 3, got {source} and {target}")
+    to, other = AXES[target - 1], AXES[6 - source - target - 1]
+    return torch.einsum(f"...{AXES},...n{AXES[source - 1]}->...n{to}{other}", tensor.double(), vectors.double())
+
+
+def unit_normal(line: Tensor) -> Tensor:
+    """The line with a unit normal; the line at infinity, which has none, is kept finite, and zero stays zero."""
+    floor = torch.finfo(line.dtype).eps * line.detach().abs().amax(dim=-1, keepdim=True)
+    size = torch.maximum(torch.linalg.vector_norm(line[..., :2], dim=-1, keepdim=True), floor)
+    return line / torch.where(size > 0, size, torch.ones_like(size))
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Three points on one straight line of space, seen from three poses: the mathematics that all join tensors share.
+
+
+def join_forms(a: Tensor, b: Tensor, v: Tensor) -> Tensor:
+    r"""The forms :math:`J_{ijk} = \epsilon_{ilmu} A_{lj} B_{mk} V_u`, that is :math:`J(p, q, r) = \det[p, A q, B r, V]`.
+
+    Args:
+        a: ``(*batch, 4, columns of A)``.
+        b: ``(*batch, 4, columns of B)``.
+        v: ``(*batch, 4)``; all batch dimensions broadcast.
+
+    Returns:
+        ``(*batch, 4, columns of A, columns of B)``.
+
+    Source: thesis section 8.2 (join tensors).
+
+    Example:
+        >>> eye = torch.eye(4, dtype=torch.float64)
+        >>> float(join_forms(eye, eye, eye[3])[0, 1, 2])
+        1.0
+    """
+    epsilon = levi_civita(4, dtype=a.dtype, device=a.device)
+    return torch.einsum("ilmu,...u,...lj,...mk->...ijk", epsilon, v, a, b)
+
+
+def motion_of_forms(forms: Tensor) -> tuple[Tensor, Tensor]:
+    r"""The motion (A, B) behind several forms :math:`\det[p, A q, B r, V_c]`, linearly and uniquely.
+
+    A slice :math:`S = J_c(\cdot, \cdot, e_k)` is a skew matrix times A, and :math:`J_c(\cdot, e_j, \cdot)` one times B, so that
+
+    .. math:: A^T S + S^T A = 0
+
+    is 10 linear equations on A for each slice.  Two points :math:`V_c` suffice; one leaves A + V w^T for every w.
+
+    Args:
+        forms: ``(*batch, c, 4, 4, 4)``, two or more of about equal norm.
+
+    Returns:
+        (A, B), each ``(*batch, 4, 4)``, Frobenius norm 1, canonical sign.
+
+    Source: thesis section 8.2.
+
+    Example:
+        >>> A, B = torch.randn(2, 4, 4, dtype=torch.float64)
+        >>> found, _ = motion_of_forms(join_forms(A, B, torch.eye(4, dtype=torch.float64)))
+        >>> bool(torch.allclose(found, unit(A)))
+        True
+    """
+    A, B = _skew_partner(torch.stack([forms.movedim(-1, -3), forms.movedim(-2, -3)])).unbind(0)
+    return A, B
+
+
+def _skew_partner(slices: Tensor) -> Tensor:
+    """The matrix X for which X^T S is skew, for all slices S in ``(*batch, c, 4, 4, 4)``."""
+    rows, columns = torch.triu_indices(4, 4, device=slices.device)
+    s = slices.flatten(-4, -3).mT  # column n of S is s[n]
+    eye = torch.eye(4, dtype=slices.dtype, device=slices.device)
+    # entry (m, n) of X^T S + S^T X as a function of X[l, x]: S[l, n] where x = m, and S[l, m] where x = n
+    system = s[..., columns, :, None] * eye[rows, None, :] + s[..., rows, :, None] * eye[columns, None, :]
+    # an equation off the diagonal stands for two: with its weight a rotation of the coordinates changes nothing
+    system = system * torch.where(rows == columns, 1.0, 2**0.5).to(s)[:, None, None]
+    return unit(null_space(system.flatten(-2).flatten(-3, -2))[..., 0, :].unflatten(-1, (4, 4)))
+
+
+def collinearity(motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
+    r"""Whitened distance of each match from lying on one straight line: 3 coordinates of a vector normal to that line.
+
+    With :math:`x_1, x_2, x_3` carried into view 1, the combinations :math:`u = (x_1 - x_3) / \sqrt 2` and
+    :math:`v = (x_1 - 2 x_2 + x_3) / \sqrt 6` are turned until they are orthogonal: the longer one is along the line (unit
+    vector d), the shorter one is the error :math:`e = \sum_v w_v x_v`.  To first order its noise is
+    :math:`K = \sum_v w_v^2 s_v^2 J_v J_v^T`, of which the plane normal to d sees :math:`Q = P K P`, and
+
+    .. math:: Q^{-1/2} e = \frac{(\operatorname{tr} Q + \delta)\,e - P K e}{\delta \sqrt{\operatorname{tr} Q + 2 \delta}},
+              \qquad \delta^2 = \det Q = d^T \operatorname{adj}(K)\, d .
+
+    The symmetric root needs no basis of the plane, so the residual is smooth in motion and matches but for its sign (which
+    turns over where a point comes back to where it was) and where the three points have no direction at all.
+
+    Args:
+        motion: (A, B), each ``(*batch, 4, 4)``.
+        views: three ``(*batch, n, 3)``.
+        scales: three ``(*batch,)`` standard deviations of the noise.
+
+    Returns:
+        ``(*batch, n, 3)``; the square sum follows :math:`\chi^2_2` for moving points and has half its mean for static ones.
+
+    Example:
+        >>> eye, one = torch.eye(4), torch.ones(())
+        >>> x = torch.tensor([[0.0, 0.0, 0.0]])
+        >>> collinearity((eye, eye), (x, x + 1, x + 2), (one, one, one)).abs().max().item() < 1e-6
+        True
+    """
+    # x2 - x1 and x3 - x1 in view 1, with their derivatives by the coordinates of view 2 and 3
+    (two, ja), (three, jb) = (
+        point_error(homogeneous(x) @ matrix.mT, matrix[..., None, :, :], views[0])
+        for matrix, x in zip(motion, views[1:], strict=True)
+    )
+    u, v = -three / math.sqrt(2), (three - 2 * two) / math.sqrt(6)
+    cos, sin = _principal(u, v)
+    along, error = cos * u + sin * v, cos * v - sin * u
+    weights = (cos / math.sqrt(6) - sin / math.sqrt(2), -2 * cos / math.sqrt(6), cos / math.sqrt(6) + sin / math.sqrt(2))
+    w1, w2, w3 = ((w * s[..., None, None]).square()[..., None] for w, s in zip(weights, scales, strict=True))
+    eye = torch.eye(3, dtype=ja.dtype, device=ja.device)
+    return _whiten_normal(error, _direction(along), w1 * eye + w2 * (ja @ ja.mT) + w3 * (jb @ jb.mT))
+
+
+def _principal(u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+    """Cosine and sine of the turn that makes two vectors orthogonal, the first one the longer; no turn if both are 0."""
+    double = torch.stack([u.square().sum(-1) - v.square().sum(-1), 2 * (u * v).sum(-1)], dim=-1)
+    none = (double == 0).all(-1)
+    angle = 0.5 * torch.atan2(torch.where(none, 0.0, double[..., 1]), torch.where(none, 1.0, double[..., 0]))[..., None]
+    return angle.cos(), angle.sin()
+
+
+def _direction(vector: Tensor) -> Tensor:
+    """Unit vector; the first axis for the zero vector."""
+    square = vector.square().sum(-1, keepdim=True)
+    none = square < torch.finfo(vector.dtype).tiny
+    axis = torch.eye(3, dtype=vector.dtype, device=vector.device)[0]
+    return torch.where(none, axis, vector * torch.where(none, 1.0, square).rsqrt())
+
+
+def _whiten_normal(error: Tensor, direction: Tensor, covariance: Tensor) -> Tensor:
+    """The symmetric root of the inverse covariance within the plane normal to the direction, times an error in that plane."""
+
+    def apply(x: Tensor) -> Tensor:
+        return (covariance @ x[..., None])[..., 0]
+
+    def dot(x: Tensor, y: Tensor) -> Tensor:
+        return (x * y).sum(-1, keepdim=True)
+
+    r0, r1, r2 = covariance.unbind(-2)
+    adjugate = torch.stack([torch.linalg.cross(r1, r2), torch.linalg.cross(r2, r0), torch.linalg.cross(r0, r1)], dim=-2)
+    # not negative but for rounding, where the line passes through infinity
+    trace = (covariance.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True) - dot(direction, apply(direction))).clamp(min=0.0)
+    det = dot(direction, (adjugate @ direction[..., None])[..., 0]).clamp(min=0.0)
+    info = torch.finfo(error.dtype)
+    root = (det + (info.eps * trace).square() + info.tiny).sqrt()  # a singular motion leaves a large residual, not an infinite one
+    moved = apply(error)
+    moved = moved - dot(direction, moved) * direction
+    return ((trace + root) * error - moved) / (root * (trace + 2 * root).sqrt())
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Reprojection residuals of matches under projections P^k -> P^l, with the point that is seen eliminated.
+
+
+STEPS = 2
+"""Gauss-Newton steps from the algebraic point to the one of least reprojection error."""
+SPREAD = 1e-12
+"""Of the trace: what keeps the inverse of a point's information finite where its views do not determine it."""
+FLOOR = 1e-15
+"""Of the last coordinate of an image, with point and projections of norm 1: points at infinity stay finite."""
+TINY = 1e-100
+
+
+class Linearization(NamedTuple):
+    """Residuals of matches at the points that they show, and their first derivatives."""
+
+    error: Tensor
+    """``(*batch, n, c)`` measurement minus image over the noise; c the coordinates of all views."""
+    structure: Tensor
+    """``(*batch, n, K)`` points of norm 1."""
+    slope: Tensor
+    """``(*batch, n, c, K)`` of the images (not of the error) by the points."""
+    inverse: Tensor
+    """``(*batch, n, K, K)`` inverse of the information on each point, its scale fixed."""
+    depth: Tensor
+    """``(*batch, n, c)`` last coordinate of the image that each coordinate belongs to."""
+    image: Tensor
+    """``(*batch, n, c)`` coordinates of the images."""
+    weight: Tensor
+    """``(*batch, 1, c)`` one over the noise of each coordinate."""
+
+
+def linearize(projections: Sequence[Tensor], views: Sequence[Tensor], scales: Sequence[Tensor]) -> Linearization:
+    r"""Triangulate every match and linearize its images :math:`\pi(M_v Y)`.
+
+    Args:
+        projections: :math:`M_v`, ``(*batch, l_v + 1, K)``.
+        views: ``(*batch, n, l_v)``.
+        scales: ``(*batch,)`` noise of each view.
+    """
+    x = torch.cat(list(views), dim=-1)
+    top = torch.cat([m[..., :-1, :] for m in projections], dim=-2)[..., None, :, :]
+    sizes = [m.shape[-2] - 1 for m in projections]
+    last = torch.cat([m[..., -1:, :].expand(*m.shape[:-2], c, -1) for m, c in zip(projections, sizes, strict=True)], dim=-2)
+    last = last[..., None, :, :]
+    weight = torch.stack([1 / s for s, c in zip(scales, sizes, strict=True) for _ in range(c)], dim=-1)[..., None, :]
+    incidence = (top - x[..., None] * last) * weight[..., None]
+    y = gram_null_space(incidence.mT @ incidence).basis[..., 0, :]
+    for step in range(STEPS + 1):
+        depth = (last @ y[..., None])[..., 0]
+        depth = torch.where(depth.abs() < FLOOR, torch.copysign(torch.full_like(depth, FLOOR), depth), depth)
+        image = (top @ y[..., None])[..., 0] / depth
+        slope = (top - image[..., None] * last) * (weight / depth)[..., None]
+        information = slope.mT @ slope
+        # projections that see nothing have no information, but an inverse
+        trace = information.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None].clamp(min=TINY)
+        fixed = information + trace * (y[..., :, None] * y[..., None, :] + SPREAD * _eye(information))
+        inverse = torch.linalg.inv_ex(fixed)[0]
+        error = (x - image) * weight
+        if step < STEPS:
+            y = y + (inverse @ (slope.mT @ error[..., None]))[..., 0]
+            y = y / y.norm(dim=-1, keepdim=True).clamp(min=TINY)
+    return Linearization(error, y, slope, inverse, depth, image, weight)
+
+
+def residual(projections: Sequence[Tensor], views: Sequence[Tensor], scales: Sequence[Tensor]) -> Tensor:
+    r"""The error that no displacement of the point takes away, :math:`(I - J V^{-1} J^T)\, e`, ``(*batch, n, c)``.
+
+    To first order the least reprojection error in standard deviations; its square sum follows :math:`\chi^2` with
+    :math:`\sum_v l_v - k` degrees of freedom.
+    """
+    at = linearize(projections, views, scales)
+    return at.error - (at.slope @ (at.inverse @ (at.slope.mT @ at.error[..., None])))[..., 0]
+
+
+def residual_derivative(projections: Sequence[Tensor], views: Sequence[Tensor], scales: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+    r""":func:`residual`, flat ``(b, n c)``, and its derivative ``(b, p, n c)`` by all entries of the projections.
+
+    With the points following the projections, :math:`\partial r = (I - J V^{-1} J^T)\, \partial e` (Kaufman's form of
+    variable projection), the Schur complement of bundle adjustment.
+    """
+    at = linearize(projections, views, scales)
+    root = at.inverse @ at.slope.mT
+    value = at.error - (at.slope @ (root @ at.error[..., None]))[..., 0]
+    n, c = value.shape[-2:]
+    factor = (at.weight / at.depth)[..., None] * at.structure[..., None, :]  # (b, n, c, K)
+    columns, start = [], 0
+    for m in projections:
+        size = m.shape[-2] - 1
+        piece = slice(start, start + size)
+        # the images by the rows of this projection: each coordinate by its own row, and all by the last one
+        own = factor.new_zeros(*factor.shape[:-2], c, size + 1, factor.shape[-1])
+        for j in range(size):
+            own[..., start + j, j, :] = factor[..., start + j, :]
+        own[..., piece, size, :] = -at.image[..., piece, None] * factor[..., piece, :]
+        columns.append(own.flatten(-2))
+        start += size
+    moved = torch.cat(columns, dim=-1)  # (b, n, c, p)
+    derivative = -(moved - at.slope @ (root @ moved))
+    return value.flatten(-2), derivative.movedim(-1, -3).reshape(*value.shape[:-2], moved.shape[-1], n * c)
+
+
+def _eye(like: Tensor) -> Tensor:
+    return torch.eye(like.shape[-1], dtype=like.dtype, device=like.device)

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dyntorch.algebra.homogeneous import apply, unit
-from dyntorch.invariant import Frame, Invariant
+from dyntorch.core.invariant import Frame, Invariant
+from dyntorch.core.primitives import HyperplanesThrough, Point, Primitive
+from dyntorch.geometry.homogeneous import apply, unit
 from dyntorch.invariants.agreement import static_residual
-from dyntorch.primitives import HyperplanesThrough, Point, Primitive
 
 SINGULAR = 1e-12
 """Determinant of a matrix of norm 1, in normalized coordinates, below which it maps space onto a part of it, to rounding."""
@@ -77,7 +77,7 @@ class Collineation(Invariant):
 
     @staticmethod
     def decompose(tensor: Tensor) -> Tensor:
-        r"""The collineation of a tensor: canonical scale and sign, see :func:`dyntorch.algebra.homogeneous.unit`.
+        r"""The collineation of a tensor: canonical scale and sign, see :func:`dyntorch.geometry.homogeneous.unit`.
 
         Args:
             tensor: ``(*batch, n + 1, n + 1)``.

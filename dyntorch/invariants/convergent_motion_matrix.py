@@ -5,11 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dyntorch.algebra.homogeneous import skew, unit, unit_vectors
-from dyntorch.algebra.projection import adjugate
-from dyntorch.invariant import Frame
+from dyntorch.core.invariant import Frame
+from dyntorch.geometry.extensors import adjugate
+from dyntorch.geometry.homogeneous import skew, unit, unit_vectors
+from dyntorch.invariants.base_pairs import RelationPair
 from dyntorch.invariants.fundamental_matrix import FundamentalMatrix
-from dyntorch.invariants.relation_pair import RelationPair
 
 
 class ConvergentMotionMatrix(RelationPair):
@@ -199,7 +199,7 @@ def plane_of(first: Tensor, second: Tensor) -> Tensor:
     r"""The homography that two fundamental matrices share, :math:`F = [e]_\times H,\ G = [v]_\times H`: of a plane, or at infinity.
 
     Exact, and in coordinates of any unit, for matrices that share one; for others
-    :func:`~dyntorch.algebra.infinity_epipoles.infinity_from_fundamentals` has the one of least squares.
+    :func:`~dyntorch.tasks.planes.closed_forms.infinity_from_fundamentals` has the one of least squares.
 
     Args:
         first: F ``(*batch, 3, 3)`` of any scale.

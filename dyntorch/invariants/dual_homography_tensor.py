@@ -7,14 +7,19 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dyntorch.algebra.extensors import join, plucker_form
-from dyntorch.algebra.homogeneous import inhomogeneous, unit
-from dyntorch.algebra.rank_two import cofactors
-from dyntorch.invariant import Frame, Invariant
-from dyntorch.invariants.agreement import static_residual, whitened_agreement
-from dyntorch.invariants.contraction import static_map, static_map_derivative, third_vector, unit_normal
+from dyntorch.core.invariant import Frame, Invariant
+from dyntorch.core.primitives import Hyperplane, HyperplanesThrough, Primitive
+from dyntorch.geometry.extensors import join, plucker_form
+from dyntorch.geometry.homogeneous import cofactors, inhomogeneous, unit
+from dyntorch.invariants.agreement import (
+    static_map,
+    static_map_derivative,
+    static_residual,
+    third_vector,
+    unit_normal,
+    whitened_agreement,
+)
 from dyntorch.invariants.homography_tensor import HomographyTensor
-from dyntorch.primitives import Hyperplane, HyperplanesThrough, Primitive
 
 
 @dataclass(frozen=True)

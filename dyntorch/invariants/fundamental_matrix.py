@@ -5,10 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dyntorch.algebra.homogeneous import homogeneous, skew, unit
-from dyntorch.algebra.rank_two import null_vectors
-from dyntorch.invariant import Frame, Invariant
-from dyntorch.primitives import Hyperplane, Point
+from dyntorch.core.invariant import Frame, Invariant
+from dyntorch.core.primitives import Hyperplane, Point
+from dyntorch.geometry.homogeneous import homogeneous, null_vectors, skew, unit
 
 
 class FundamentalMatrix(Invariant):

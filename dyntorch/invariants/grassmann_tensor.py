@@ -7,13 +7,12 @@ from math import comb, prod
 
 from torch import Tensor
 
-from dyntorch.algebra.grassmann import grassmann_derivative, grassmann_tensor
-from dyntorch.algebra.grassmann_nearest import projections_of
-from dyntorch.algebra.grassmann_recovery import candidates
-from dyntorch.forward import normalized_derivative
-from dyntorch.invariant import Frame, Invariant
-from dyntorch.invariants import reprojection
-from dyntorch.primitives import HyperplanesThrough, Point, Primitive
+from dyntorch.core.invariant import Frame, Invariant
+from dyntorch.core.primitives import HyperplanesThrough, Point, Primitive
+from dyntorch.geometry.grassmann import candidates, grassmann_derivative, grassmann_tensor
+from dyntorch.geometry.grassmann_nearest import projections_of
+from dyntorch.invariants import agreement
+from dyntorch.numerics.least_squares import normalized_derivative
 
 
 @dataclass(frozen=True, repr=False)
@@ -25,7 +24,7 @@ class GrassmannTensor(Invariant):
     .. math:: \det(S_1 M_1; \dots; S_n M_n) = \langle A, C_{\alpha_1}(S_1) \otimes \dots \otimes C_{\alpha_n}(S_n) \rangle = 0,
 
     where A holds the determinants of :math:`\alpha_i` rows of each :math:`M_i`
-    (:func:`~dyntorch.algebra.grassmann.grassmann_tensor`).
+    (:func:`~dyntorch.geometry.grassmann.grassmann_tensor`).
     A moving point whose position is linear in some parameters is a static point of a higher space: ``(4, (2, 2, 1))`` are
     points of a plane at constant velocity, ``(6, (2, 2, 2, 1))`` points of space at constant velocity, ``(3, (2, 1, 1))`` is
     the trifocal and ``(3, (2, 2))`` the fundamental tensor; :func:`dyntorch.reconstruct` goes on to the scene.
@@ -160,12 +159,12 @@ class GrassmannTensor(Invariant):
 
     def whitened(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor | None:
         """The reprojection error that is left when the point is eliminated; None where one condition is all there is."""
-        return None if self.single() else reprojection.residual(motion, views, scales)
+        return None if self.single() else agreement.residual(motion, views, scales)
 
     def linearized(
         self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]
     ) -> tuple[Tensor, Tensor] | None:
-        return None if self.single() else reprojection.residual_derivative(motion, views, scales)
+        return None if self.single() else agreement.residual_derivative(motion, views, scales)
 
     def __repr__(self) -> str:
         dims = "" if set(self.dims) == {2} else f", l={self.l}"

@@ -7,15 +7,21 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dyntorch.algebra.extensors import levi_civita
-from dyntorch.algebra.homogeneous import homogeneous, inhomogeneous, unit
-from dyntorch.algebra.rank_two import cofactors
-from dyntorch.forward import normalized_derivative
-from dyntorch.invariant import Frame, Invariant
-from dyntorch.invariants.agreement import point_error, static_residual, whitened_agreement
-from dyntorch.invariants.contraction import static_map, static_map_derivative, third_vector, unit_normal
-from dyntorch.nullspace import null_space
-from dyntorch.primitives import Point
+from dyntorch.core.invariant import Frame, Invariant
+from dyntorch.core.primitives import Point
+from dyntorch.geometry.extensors import levi_civita
+from dyntorch.geometry.homogeneous import cofactors, homogeneous, inhomogeneous, unit
+from dyntorch.invariants.agreement import (
+    point_error,
+    static_map,
+    static_map_derivative,
+    static_residual,
+    third_vector,
+    unit_normal,
+    whitened_agreement,
+)
+from dyntorch.numerics.least_squares import normalized_derivative
+from dyntorch.numerics.nullspace import null_space
 
 
 class Diagnosis(NamedTuple):

@@ -5,13 +5,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dyntorch.algebra.extensors import join
-from dyntorch.algebra.homogeneous import homogeneous, inhomogeneous
-from dyntorch.invariant import Frame, Invariant, on_class
-from dyntorch.invariants.agreement import static_residual
-from dyntorch.invariants.collinearity import collinearity, join_forms, motion_of_forms
-from dyntorch.nullspace import null_space
-from dyntorch.primitives import Point
+from dyntorch.core.invariant import Frame, Invariant, on_class
+from dyntorch.core.primitives import Point
+from dyntorch.geometry.extensors import join
+from dyntorch.geometry.homogeneous import homogeneous, inhomogeneous
+from dyntorch.invariants.agreement import collinearity, join_forms, motion_of_forms, static_residual
+from dyntorch.numerics.nullspace import null_space
 
 LETTERS = "ijk"  # indices of the three views
 

@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from dyntorch.algebra.extensors import meet
-from dyntorch.invariant import Invariant, on_class
-from dyntorch.invariants.collinearity import join_forms, motion_of_forms
+from dyntorch.core.invariant import Invariant, on_class
+from dyntorch.core.primitives import Point, Primitive, Projected
+from dyntorch.geometry.extensors import meet
+from dyntorch.invariants.agreement import join_forms, motion_of_forms
 from dyntorch.invariants.join_tensor import CollinearPoints, check_motion
-from dyntorch.primitives import Point, Primitive, Projected
 
 SAME_CENTRE = 1e-6  # sine of the angle between homogeneous centres; below, single precision cannot tell the cameras apart
 

@@ -8,17 +8,16 @@ from math import comb
 import torch
 from torch import Tensor
 
-from dyntorch.algebra.homogeneous import homogeneous, unit, unit_vectors
-from dyntorch.algebra.monomials import monomial_derivatives, monomials
-from dyntorch.algebra.partition import order_of_bodies
-from dyntorch.algebra.two_views import check_matches, described
-from dyntorch.arguments import FARTHEST
-from dyntorch.blocks import one_thread
+from dyntorch.core.normalize import hartley
+from dyntorch.core.primitives import Monomials
+from dyntorch.core.residual import sampson
+from dyntorch.geometry.epipolar import check_matches, described
+from dyntorch.geometry.homogeneous import homogeneous, monomial_derivatives, monomials, unit, unit_vectors
+from dyntorch.geometry.pairs import order_of_bodies
 from dyntorch.invariants.fundamental_matrix import FundamentalMatrix
-from dyntorch.normalize import hartley
-from dyntorch.nullspace import null_space
-from dyntorch.primitives.monomials import Monomials
-from dyntorch.residual import sampson
+from dyntorch.numerics.arguments import FARTHEST
+from dyntorch.numerics.blocks import one_thread
+from dyntorch.numerics.nullspace import null_space
 
 ROUNDS = 4
 """Turns of labels and fundamental matrices after the first labels; exact matches are right after one or two."""

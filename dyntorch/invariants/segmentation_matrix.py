@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from dyntorch.invariant import Frame
+from dyntorch.core.invariant import Frame
+from dyntorch.invariants.base_pairs import RelationPair
 from dyntorch.invariants.fundamental_matrix import FundamentalMatrix
-from dyntorch.invariants.relation_pair import RelationPair
 
 
 class SegmentationMatrix(RelationPair):

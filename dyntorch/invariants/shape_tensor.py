@@ -8,19 +8,129 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from dyntorch.algebra import shape_completion, shape_points, shape_rows
-from dyntorch.algebra.shape_points import AFFINE, GENERAL, PLANE
-from dyntorch.forward import jacobian
-from dyntorch.invariant import Frame, Invariant, on_class
-from dyntorch.invariants.shape_residual import CAMERA, reprojection_derivative, reprojection_residual, view_score
-from dyntorch.matches import constellations
-from dyntorch.nullspace import null_space
-from dyntorch.primitives import Equations
+from dyntorch.core.invariant import Frame, Invariant, on_class
+from dyntorch.core.matches import constellations
+from dyntorch.core.primitives import Equations
+from dyntorch.geometry.homogeneous import unit_vectors
+from dyntorch.invariants.agreement import Linearization, linearize
+from dyntorch.numerics.blocks import constant
+from dyntorch.numerics.least_squares import jacobian
+from dyntorch.numerics.nullspace import null_space
+from dyntorch.shapes import static
+from dyntorch.shapes.static import AFFINE, GENERAL, PLANE, canonical, dual_cameras, lines_through, local, reference_cameras
+
+# ----------------------------------------------------------------------------------------------------------------------
+# How far the points of each view are from the nearest image of a known shape, with the camera of the view eliminated.
+
+
+CAMERA = {"general": 11, "plane": 11, "affine": 8}
+"""Degrees of freedom of the camera that each frame leaves open."""
+
+
+def reprojection_residual(structure: Tensor, x: Tensor, scale: Tensor, frame: str) -> Tensor:
+    r"""Reprojection error that no camera takes away, in standard deviations of noise, to first order.
+
+    A camera is to the points of a view what a point is to the cameras of several views, so it is eliminated in the same way:
+    point i sees the unknown camera through :math:`X_i^T \otimes I`.
+
+    Args:
+        structure: ``(*batch, n, 4)`` homogeneous points.
+        x: ``(*batch, views, n, 3)`` measurements; third coordinate 0 where missing.
+        scale: ``(*batch,)`` standard deviation of the noise of one coordinate.
+        frame: which cameras there are.
+
+    Returns:
+        ``(*batch, views, 2 n)``, whose square sum follows chi squared with 2 n - 11 (8) degrees of freedom; NaN where a view
+        shows no more than its camera takes.
+    """
+    at, known, _ = _linearized(structure, x, scale, frame)
+    error = at.error - (at.slope @ (at.inverse @ (at.slope.mT @ at.error[..., None])))[..., 0]
+    return torch.where(known[..., None], error[..., 0, :], torch.nan)
+
+
+def reprojection_derivative(structure: Tensor, x: Tensor, scale: Tensor, frame: str) -> tuple[Tensor, Tensor]:
+    """:func:`residual` and its derivative ``(*batch, views, 2 n, n, 4)`` by the points; both 0 where a view says nothing.
+
+    The camera follows the points (Kaufman's form of variable projection), as the points follow the cameras in reconstruction.
+    """
+    at, known, length = _linearized(structure, x, scale, frame)
+    known = known[..., None, None]
+    project = torch.eye(at.error.shape[-1], dtype=x.dtype, device=x.device) - (at.slope @ at.inverse @ at.slope.mT)[..., 0, :, :]
+    error = (project @ at.error.mT)[..., 0]
+    n = x.shape[-2]
+    maps = _maps(frame, x.device)  # (4, 3, K)
+    # the image of each point by its own four coordinates
+    moved = torch.einsum("...k,ark->...ra", at.structure[..., 0, :], maps)  # (.., 3, 4): the camera
+    image, depth, weight = (part[..., 0, :].unflatten(-1, (n, 2)) for part in (at.image, at.depth, at.weight.expand_as(at.image)))
+    own = (moved[..., None, :2, :] - image[..., None] * moved[..., None, 2:, :]) * (weight / depth)[..., None]
+    seen = looked_at(x)[..., None, None]
+    own = torch.where(seen, own / length[..., None, :, None, None], 0.0)
+    derivative = -torch.einsum("...cni,...nia->...cna", project.unflatten(-1, (n, 2)), own)
+    return torch.where(known[..., 0], error, 0.0), torch.where(known[..., None], derivative, 0.0)
+
+
+def looked_at(x: Tensor) -> Tensor:
+    """Which points of measurements ``(..., n, 3)`` are seen."""
+    return x[..., 2] > 0
+
+
+def view_score(structure: Tensor, x: Tensor, frame: str) -> Tensor:
+    r"""How nearly the equations of the camera of each view are dependent, ``(*batch, views)`` in [0, 1].
+
+    :math:`\sigma_4 / \|E\|_F`, E the equations :math:`l^T \hat P_i m = 0` of the points in the frame of the basis; for affine
+    cameras the error of the centred points over their size.
+
+    Args:
+        structure: ``(*batch, n, 4)`` in the standard frame.
+        x: ``(*batch, views, n, 3)`` measurements.
+        frame: which cameras there are.
+
+    Returns:
+        NaN where a view shows no more than its camera takes.
+    """
+    seen = looked_at(x).to(x)
+    x = torch.cat([torch.where(seen[..., None] > 0, x[..., :2], 0.0), seen[..., None]], dim=-1)
+    if frame == AFFINE:
+        factor, ones = local(x)[1], torch.ones_like(structure[..., 0, 0])
+        return reprojection_residual(structure, x, ones, frame).norm(dim=-1) * factor / seen.sum(-1).clamp(min=1.0).sqrt()
+    others = unit_vectors(structure[..., 4:, :])
+    cameras = torch.stack(dual_cameras(others) if frame == GENERAL else reference_cameras(others), dim=-3)
+    q = canonical(x)[0] * seen[..., :4].amin(-1)[..., None, None]
+    equations = (lines_through(q) @ cameras[..., None, :, :, :]).flatten(-3, -2)
+    finite = equations.isfinite().flatten(-2).all(-1)  # a shape that could not be fitted has no cameras
+    values = torch.linalg.svdvals(torch.where(finite[..., None, None], equations, 0.0))
+    known = finite & ((q != 0).any(-1).sum(-1) > 1)
+    return torch.where(known, values[..., 3] / values.norm(dim=-1).clamp(min=1e-300), torch.nan)
+
+
+def _linearized(structure: Tensor, x: Tensor, scale: Tensor, frame: str) -> tuple[Linearization, Tensor, Tensor]:
+    """Cameras and images of all views; which views say something; the lengths ``(*batch, n)`` of the points."""
+    seen = looked_at(x)
+    # zero measurements where missing, and zero points there, give zero equations
+    p, factor = local(torch.cat([torch.where(seen[..., None], x[..., :2], 0.0), seen[..., None].to(x)], dim=-1))
+    noise = scale[..., None] * factor
+    length = structure.norm(dim=-1)
+    points = unit_vectors(structure)[..., None, :, :] * seen[..., None]
+    looks = torch.einsum("...na,ark->...nrk", points, _maps(frame, x.device))
+    n = x.shape[-2]
+    at = linearize(looks.unbind(-3), [p[..., i, None, :2] for i in range(n)], [noise] * n)
+    return at, 2 * seen.sum(-1) > CAMERA[frame], torch.where(length > 0, length, 1.0)
+
+
+@constant
+def _maps(frame: str, device: torch.device) -> Tensor:
+    """What point coordinate a shows of camera entry k in image coordinate r: ``(4, 3, 12)``, affine cameras ``(4, 3, 9)``."""
+    maps = torch.einsum("ab,rs->arsb", torch.eye(4), torch.eye(3)).flatten(-2).double()
+    if frame == AFFINE:
+        # the last row of the camera is (0, 0, 0, s)
+        maps = maps[..., [*range(8), 11]]
+    return maps.to(device)
+
 
 LEAST = {GENERAL: 6, PLANE: 6, AFFINE: 5}
-LARGEST = max(shape_rows.PROFILES)
+LARGEST = max(static.PROFILES)
 """Points of the largest multilinear form: of more, four lines and four points already fulfil all conditions."""
-ROWS = dict(zip(LEAST, (shape_rows.general_rows, shape_rows.plane_rows, shape_rows.affine_rows), strict=True))
+ROWS = dict(zip(LEAST, (static.general_rows, static.plane_rows, static.affine_rows), strict=True))
 
 
 @dataclass(frozen=True, repr=False)
@@ -120,8 +230,8 @@ class ShapeTensor(Invariant):
         x = views[0]
         if self.frame != AFFINE or not len(x) or bool(((x[..., 2] > 0) | (weights <= 0)[..., None]).all()):
             return views, weights
-        near, factor = shape_rows.local(x)
-        filled, whole = shape_completion.completed(near[..., :2], x[..., 2] > 0, weights)
+        near, factor = static.local(x)
+        filled, whole = static.completed(near[..., :2], x[..., 2] > 0, weights)
         back = (filled - near[..., :2]) / factor[..., None, None]
         centre = (x[..., :2] * x[..., 2:]).sum(-2, keepdim=True) / x[..., 2:].sum(-2, keepdim=True).clamp(min=1.0)
         missing = torch.where(x[..., 2:] > 0, x[..., :2], centre + back)
@@ -164,12 +274,12 @@ class ShapeTensor(Invariant):
         """The tensor of a null space of the estimation matrix, whose columns are the coordinates that constraints leave free."""
         device = basis.device
         if self.frame == AFFINE:
-            tensor = basis @ shape_rows.centred(self.n, device)
+            tensor = basis @ static.centred(self.n, device)
         elif self.frame == GENERAL:
-            tensor = basis @ shape_rows.free(self.n, device)
+            tensor = basis @ static.free(self.n, device)
         else:
-            v = (basis.unflatten(-1, (-1, 3)).mT @ shape_rows.centred(self.n - 4, device)).mT.flatten(-2)
-            tensor = v @ shape_rows.plane_map(self.n, device).mT if self.multilinear else v
+            v = (basis.unflatten(-1, (-1, 3)).mT @ static.centred(self.n - 4, device)).mT.flatten(-2)
+            tensor = v @ static.plane_map(self.n, device).mT if self.multilinear else v
         tensor = tensor.unflatten(-1, self.shape())
         return tensor.squeeze(-1 - len(self.shape())) if self.nullity == 1 else tensor
 
@@ -177,11 +287,11 @@ class ShapeTensor(Invariant):
         device = tensor.device
         flat = tensor.flatten(-len(self.shape()))
         if self.frame == AFFINE:
-            basis = flat @ shape_rows.centred(self.n, device).mT
+            basis = flat @ static.centred(self.n, device).mT
         elif self.frame == GENERAL:
-            basis = flat @ shape_rows.free(self.n, device).mT
+            basis = flat @ static.free(self.n, device).mT
         else:
-            basis = (self._beside(flat).mT @ shape_rows.centred(self.n - 4, device).mT).mT.flatten(-2)
+            basis = (self._beside(flat).mT @ static.centred(self.n - 4, device).mT).mT.flatten(-2)
         return basis.unsqueeze(-2) if self.nullity == 1 else basis
 
     @on_class
@@ -203,9 +313,9 @@ class ShapeTensor(Invariant):
         """
         own = replace(self, points=int(points.shape[-2]))
         whole = points if points.shape[-1] == 4 else torch.nn.functional.pad(points, (0, 1), value=1.0)
-        whole = shape_points.standard(whole.double(), own.frame)
+        whole = static.standard(whole.double(), own.frame)
         sound = whole.isfinite().flatten(-2).all(-1)[..., None, None]
-        whole = torch.where(sound, whole, shape_points.with_basis(torch.ones_like(whole[..., 4:, :]), own.frame))
+        whole = torch.where(sound, whole, static.with_basis(torch.ones_like(whole[..., 4:, :]), own.frame))
         tensor = own._composed(whole)
         flat = tensor.flatten(-len(own.shape()))
         norm = flat.norm(dim=-1, keepdim=True)
@@ -219,8 +329,8 @@ class ShapeTensor(Invariant):
             annihilator = null_space(points.mT, self.n - 4)
             return annihilator.squeeze(-2) if self.nullity == 1 else annihilator
         if self.multilinear:
-            cameras = (shape_points.dual_cameras if self.frame == GENERAL else shape_points.reference_cameras)(others)
-            return shape_rows.form(cameras).unflatten(-1, self.shape())
+            cameras = (static.dual_cameras if self.frame == GENERAL else static.reference_cameras)(others)
+            return static.form(cameras).unflatten(-1, self.shape())
         v = others[..., :3] / others[..., 3:]
         return v - v.mean(-2, keepdim=True)
 
@@ -238,28 +348,28 @@ class ShapeTensor(Invariant):
         """
         flat = tensor.double()
         if self.frame == AFFINE:
-            points = shape_points.affine_points(flat[..., None, :] if self.nullity == 1 else flat)
+            points = static.affine_points(flat[..., None, :] if self.nullity == 1 else flat)
         elif self.frame == GENERAL:
-            points = shape_points.general_points(flat, self.n - 4)
+            points = static.general_points(flat, self.n - 4)
         else:
-            points = shape_points.plane_points(self._beside(flat.flatten(-len(self.shape()))))
+            points = static.plane_points(self._beside(flat.flatten(-len(self.shape()))))
         return points.to(tensor.dtype)
 
     def _beside(self, flat: Tensor) -> Tensor:
         """The points v ``(*batch, n - 4, 3)``, of sum 0, of flat tensors of a reference plane."""
-        v = flat @ shape_points.plane_inverse(self.n, flat.device).mT if self.multilinear else flat
+        v = flat @ static.plane_inverse(self.n, flat.device).mT if self.multilinear else flat
         return v.unflatten(-1, (self.n - 4, 3))
 
     def whitened(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
         """Reprojection error ``(*batch, views, 2 n)`` of the points of each view, whose camera is found first."""
-        structure = shape_points.standard(motion[0].double(), self.frame)
+        structure = static.standard(motion[0].double(), self.frame)
         return reprojection_residual(structure, views[0].double(), scales[0].double(), self.frame).to(views[0].dtype)
 
     def linearized(
         self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]
     ) -> tuple[Tensor, Tensor]:
         value, slope = jacobian(
-            lambda t: shape_points.standard(t.unflatten(-1, (self.n, 4)), self.frame).flatten(-2), motion[0].flatten(-2)
+            lambda t: static.standard(t.unflatten(-1, (self.n, 4)), self.frame).flatten(-2), motion[0].flatten(-2)
         )
         structure = value.unflatten(-1, (self.n, 4))
         error, derivative = reprojection_derivative(structure, views[0], scales[0], self.frame)
@@ -290,7 +400,7 @@ class ShapeTensor(Invariant):
         """
         invariant, (x,) = self.prepared(points)
         assert isinstance(invariant, ShapeTensor)
-        structure = shape_points.standard(invariant.decompose(tensor.double()), self.frame)
+        structure = static.standard(invariant.decompose(tensor.double()), self.frame)
         return view_score(structure, x.double(), self.frame).to(x.dtype)
 
     def __repr__(self) -> str:

@@ -6,14 +6,12 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from dyntorch.algebra.extensors import compound, join, plucker_form
-from dyntorch.algebra.homogeneous import hyperplanes_through, inhomogeneous
-from dyntorch.algebra.line_collineation import common_point, compound_root, skew_line
-from dyntorch.algebra.projection import project
-from dyntorch.invariant import Frame, Invariant
-from dyntorch.nullspace import null_space
-from dyntorch.primitives import Line, direction
-from dyntorch.residual import whiten
+from dyntorch.core.invariant import Frame, Invariant
+from dyntorch.core.primitives import Line, direction
+from dyntorch.core.residual import whiten
+from dyntorch.geometry.extensors import common_point, compound, compound_root, join, plucker_form, project, skew_line
+from dyntorch.geometry.homogeneous import hyperplanes_through, inhomogeneous
+from dyntorch.numerics.nullspace import null_space
 
 
 class TranslatingLinesMatrix(Invariant):
@@ -62,7 +60,7 @@ class TranslatingLinesMatrix(Invariant):
 
     @staticmethod
     def decompose(matrix: Tensor) -> Tensor:
-        r"""The collineation of a matrix, :math:`C_2(A) \sim J F^T`; see :func:`~dyntorch.algebra.line_collineation.compound_root`.
+        r"""The collineation of a matrix, :math:`C_2(A) \sim J F^T`; see :func:`~dyntorch.geometry.extensors.compound_root`.
 
         Args:
             matrix: ``(*batch, 6, 6)`` of any scale and sign.

@@ -3,19 +3,21 @@
 A failed estimate (NaN, or no solution at all) has the worst error, not NaN, so that medians over a batch count it.
 """
 
-from dyntorch.metrics.lifted import LiftedError, body_error, lifted_error
-from dyntorch.metrics.matrices import (
+from dyntorch.metrics.errors import (
     LabelScores,
+    LiftedError,
     affine_gauge,
+    body_error,
     grid_transfer_error,
     label_scores,
+    lifted_error,
+    misclassification,
     point_error,
     relative_error,
     rotation_error,
     subspace_angle,
     translation_error,
 )
-from dyntorch.metrics.segmentation import misclassification
 
 __all__ = [
     "LabelScores",

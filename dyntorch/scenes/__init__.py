@@ -1,15 +1,11 @@
 """Ground-truth scenes for tests, benchmarks and experiments: one function per kind of motion, all batched."""
 
-from dyntorch.scenes.convergent import convergent_motions
-from dyntorch.scenes.filmed import FilmedScene, filmed
+from dyntorch.scenes.bodies import bodies, convergent_motions
+from dyntorch.scenes.filmed import FilmedScene, NonrigidScene, filmed, nonrigid_pair
 from dyntorch.scenes.lifts import LiftedScene, lifted
-from dyntorch.scenes.lines import translating_lines
-from dyntorch.scenes.nonrigid import NonrigidScene, nonrigid_pair
-from dyntorch.scenes.plane import lines_concurrent, planar
-from dyntorch.scenes.rigid_bodies import bodies
+from dyntorch.scenes.plane import lines_concurrent, planar, translating_lines
 from dyntorch.scenes.scene import Scene
-from dyntorch.scenes.space import constant_velocity, moving_points
-from dyntorch.scenes.static import collineation, two_view
+from dyntorch.scenes.space import collineation, constant_velocity, moving_points, two_view
 from dyntorch.scenes.translation import TranslatingScene, translating_planes
 
 __all__ = [

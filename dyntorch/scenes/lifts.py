@@ -9,9 +9,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from dyntorch.algebra.homogeneous import homogeneous, inhomogeneous
-from dyntorch.scenes.cameras import calibration, looking_at
-from dyntorch.scenes.scene import OUTLIER, Draw
+from dyntorch.geometry.homogeneous import homogeneous, inhomogeneous
+from dyntorch.scenes.scene import OUTLIER, Draw, calibration, looking_at
 
 CENTRE, FOCAL, DISTANCE = 500.0, 1300.0, 4.0
 SPEED, ACCELERATION = 0.12, 0.03  # rms, scene units (the rms radius is 1) per unit of time and per its square

@@ -10,9 +10,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from dyntorch.algebra.homogeneous import apply, homogeneous, inhomogeneous, skew, unit
-from dyntorch.scenes.cameras import calibration
-from dyntorch.scenes.scene import Draw
+from dyntorch.geometry.homogeneous import apply, homogeneous, inhomogeneous, skew, unit
+from dyntorch.scenes.scene import Draw, calibration
 
 SIZE, FOCAL = 800.0, 800.0
 MARGIN = 100.0  # from the border of view 1 to the centres of the patches

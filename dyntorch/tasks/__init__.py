@@ -1,1 +1,1 @@
-"""The tasks a person comes with: each a verb that returns a frozen result."""
+"""The tasks a person comes with: a room for each verb, which returns a frozen result; what results share is in ``outcome``."""

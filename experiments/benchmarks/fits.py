@@ -23,9 +23,9 @@ from torch import Tensor
 
 import dyntorch as dyn
 from dyntorch import scenes
-from dyntorch.algebra.homogeneous import homogeneous
-from dyntorch.invariant import as_invariant
-from dyntorch.matrix import estimation_matrix
+from dyntorch.core.invariant import as_invariant
+from dyntorch.core.matrix import estimation_matrix
+from dyntorch.geometry.homogeneous import homogeneous
 from dyntorch.scenes import Scene
 from experiments.benchmarks.interleaved import interleaved, threads
 from experiments.tables import Row, command, markdown, note

@@ -27,7 +27,7 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
-from dyntorch.nullspace import gram_null_space, null_space
+from dyntorch.numerics.nullspace import gram_null_space, null_space
 from experiments.tables import command, note
 from indexing.files import manifest, prepare, write_json
 

@@ -20,7 +20,7 @@ from torch import Tensor
 
 import dyntorch as dyn
 from dyntorch import scenes
-from dyntorch.algebra.homogeneous import homogeneous
+from dyntorch.geometry.homogeneous import homogeneous
 from experiments.benchmarks.interleaved import interleaved
 from experiments.tables import Row, command, markdown, note
 from indexing.files import manifest, prepare, write_json

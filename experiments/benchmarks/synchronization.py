@@ -23,11 +23,12 @@ import torch
 import tyro
 from torch import Tensor
 
-from dyntorch import lags, synchronize
-from dyntorch.algebra.correlation import Lags
-from dyntorch.algebra.epipolar_variance import epipolar_variance
-from dyntorch.algebra.homogeneous import homogeneous
-from dyntorch.tasks.sync_subspace import subspace_curve
+from dyntorch import synchronize
+from dyntorch.geometry.epipolar import epipolar_variance
+from dyntorch.geometry.homogeneous import homogeneous
+from dyntorch.numerics import lags
+from dyntorch.numerics.lags import Lags
+from dyntorch.tasks.synchronize.subspace import subspace_curve
 from experiments.benchmarks.interleaved import interleaved
 from experiments.tables import Row, command, measured_on_one_thread
 

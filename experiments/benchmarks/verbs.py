@@ -103,7 +103,7 @@ def reconstruct() -> Verb:
 
 def reconstruct_pair() -> Verb:
     """A body that bends, before two cameras."""
-    from dyntorch.scenes.nonrigid import nonrigid_pair
+    from dyntorch.scenes.filmed import nonrigid_pair
 
     scene = nonrigid_pair(12, 10, 90, sigma=0.3, offset=0.41, generator=draw())
     return lambda: dyn.reconstruct_pair(scene.a, scene.b, scene.offset, fps=scene.fps)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from typing import Any, Self
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any, Self, TypeVar
 
 import numpy as np
 import torch
@@ -11,16 +12,56 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.utils.validation import check_is_fitted
 
 from dyntorch import one_thread
-from indexing.brightness.calibration import found_events, mirrors_matter, wrong_evidence
+from indexing.action.inputs import check_device, check_labels, check_reject, is_number
 from indexing.brightness.footage import Footage, footage, gather
 from indexing.brightness.library import Exemplars, library
-from indexing.brightness.live import BrightnessStream, Recognizer, learned, recognize
-from indexing.brightness.parameters import check_parameters
-from indexing.brightness.sight import Optics
-from indexing.checks import check_labels
+from indexing.brightness.sight import LENGTH, SMALLEST, Optics
+from indexing.brightness.stream import (
+    BrightnessStream,
+    Recognizer,
+    found_events,
+    learned,
+    mirrors_matter,
+    recognize,
+    wrong_evidence,
+)
 from indexing.estimator import SavedClassifier
-from indexing.labels import joined, refuse
-from indexing.scoring import Event, probabilities, reject_threshold
+from indexing.modelfile import Parts, labels_from_json, labels_to_json, read_model, usable, write_model
+from indexing.opening import shown
+from indexing.scoring import Event, joined, probabilities, refuse, reject_threshold
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Parameters of the brightness indexer, checked once.
+
+
+LARGEST = 100_000  # px of the shorter side: films have some thousand
+
+
+def check_parameters(indexer: Any) -> None:
+    """Raise on parameters that make no sense, naming the parameter and what it accepts."""
+    for name in ("fps", "window"):
+        value = getattr(indexer, name)
+        if not is_number(value) or value <= 0:
+            raise ValueError(f"{name} must be a positive number, got {value!r}")
+    if not is_number(indexer.pool) or indexer.pool < 0:
+        raise ValueError(f"pool must be seconds, 0 or more, got {indexer.pool!r}")
+    _check_region(indexer.region)
+    if indexer.flip not in (True, False, "auto"):
+        raise ValueError(f"flip must be 'auto', True or False, got {indexer.flip!r}")
+    check_reject(indexer.reject)
+    size = indexer.size
+    if not isinstance(size, (int, np.integer)) or isinstance(size, bool) or not SMALLEST <= size <= LARGEST:
+        raise ValueError(f"size must be a whole number of pixels from {SMALLEST} to {LARGEST}, got {shown(size)}")
+    check_device(indexer.device)
+
+
+def _check_region(region: Any) -> None:
+    if region is None or (isinstance(region, str) and region == "motion"):
+        return
+    fine = isinstance(region, (Sequence, np.ndarray)) and not isinstance(region, str) and len(region) == 4
+    if not (fine and all(is_number(v) for v in region) and region[2] > region[0] and region[3] > region[1]):
+        raise ValueError(f"region must be 'motion', None or (x0, y0, x1, y1) in pixels with x0 < x1 and y0 < y1, got {region!r}")
+
 
 Array = NDArray[Any]
 
@@ -70,7 +111,7 @@ class BrightnessIndexer(SavedClassifier):
     Source: Wolf 2003, chapter 7 and section 10.1 (direct measure, after Irani 1999); rectified channels after Efros et al. 2003.
     """
 
-    FITTED, FILES = "exemplars_", "indexing.brightness.saving"
+    FITTED, FILES = "exemplars_", "indexing.brightness.indexer"
 
     def __init__(
         self,
@@ -246,3 +287,61 @@ class BrightnessIndexer(SavedClassifier):
                 progress(min(1.0, (float(times[-1]) - begin) / max(end - begin, 1e-9)))
         times, scores, energy = (np.concatenate(part) for part in zip(*parts, strict=True))
         return times, scores, energy
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Model files of the brightness indexer: safetensors with JSON metadata.  Nothing in them can run.
+
+
+KIND = "dyntorch.brightness-indexer"
+VERSION = 1
+FRAMES = 2**31  # of a video, at most
+ROUNDING = 1e-3  # of a unit vector
+PARTS = ("motion", "lengths", "labels")
+
+Indexer = TypeVar("Indexer", bound="BrightnessIndexer")
+
+
+def save(indexer: BrightnessIndexer, path: str | Path) -> None:
+    """Write a fitted indexer.
+
+    Raises:
+        ValueError: the file cannot be written, or labels or parameters are neither text nor numbers.
+    """
+    tensors = {name: getattr(indexer.exemplars_, name) for name in PARTS}
+    write_model(path, KIND, VERSION, indexer.get_params(), {"classes": labels_to_json(indexer.classes_)}, tensors)
+
+
+def load(kind: type[Indexer], path: str | Path, device: str = "cpu") -> Indexer:
+    """Read a fitted indexer; see :meth:`indexing.BrightnessIndexer.load`."""
+    check_device(device)
+    header, parts = read_model(path, KIND, VERSION)
+    with usable(path):
+        indexer = kind(**_known(header["parameters"]), device=device)
+        check_parameters(indexer)
+        classes = labels_from_json(header["classes"])
+        return indexer._learn(_exemplars(parts, len(classes)), classes)
+
+
+def _known(parameters: dict[str, Any]) -> dict[str, Any]:
+    """The parameters of a model file, of which older ones hold one more.
+
+    Raises:
+        ValueError: it mixed window kernels into the scores, which is no longer done.
+    """
+    known = {name: value for name, value in parameters.items() if name != "temporal_weight"}
+    weight = parameters.get("temporal_weight", 0.0)
+    if weight != 0.0:
+        raise ValueError(f"temporal_weight={shown(weight)}: window kernels are no longer mixed into scores")
+    return known
+
+
+def _exemplars(parts: Parts, classes: int) -> Exemplars:
+    if classes < 2:
+        raise ValueError(f"{classes} class")
+    lengths = parts.whole("lengths", None, below=FRAMES)
+    motion = parts.real("motion", int(lengths.sum()), LENGTH, least=-1 - ROUNDING, most=1 + ROUNDING)
+    labels = parts.every("labels", len(lengths), below=classes)
+    if not bool((lengths > 0).all()):
+        raise ValueError("lengths: a video without frames")
+    return Exemplars(motion.float(), lengths, labels)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from indexing.brightness.pooling import mirrored
+from indexing.brightness.sight import mirrored
 
 GAP = 2  # empty rows before each track: no step leads from one track into the next
 KEPT = 96

@@ -9,10 +9,190 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from indexing.brightness.motion_box import MEMORY, MotionBox
-from indexing.brightness.motion_maps import MotionMaps
-from indexing.brightness.pooling import CELLS, described, pooled, profile
-from indexing.brightness.shrinking import Shrinker
+from indexing.brightness.features import blurred, inner_gradients, weighted_differences
+from indexing.brightness.footage import Shrinker
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Rectified motion maps of a stream: how much moves right, left, down and up, pixel by pixel, as fast as frames come in.
+
+
+SIGMA = 1.2  # px of the work image (80 px wide)
+QUIET = 0.004  # grey 0..1 per frame: below, brightness change is noise (theory: .004; .008 at sensor noise 3/255)
+
+
+class MotionMaps:
+    """Keeps the last two blurred frames of a stream; gives ``(n, 4, h, w)`` maps for ``n`` more frames.
+
+    The maps of frame t need the frames up to t alone: brightness changes from t - 2 to t about frame t - 1.
+
+    Args:
+        sigma: pixels.
+        quiet: grey 0..1 per frame.
+    """
+
+    def __init__(self, sigma: float = SIGMA, quiet: float = QUIET) -> None:
+        self.sigma, self.quiet = sigma, quiet
+        self.last: Tensor | None = None
+
+    def push(self, frames: Tensor) -> tuple[Tensor, Tensor]:
+        """Maps ``(n, 4, h, w)`` (right, left, down, up) and brightness change ``(n, h, w)`` of frames ``(n, h, w)`` in 0..1."""
+        smooth = blurred(frames, self.sigma)
+        known = torch.cat([smooth[:1].expand(2, -1, -1) if self.last is None else self.last, smooth])
+        self.last = known[-2:]
+        gx, gy, gt = inner_gradients(known)
+        change = gt.abs()
+        u, v = weighted_differences(gx, gy, gt.sign() * (change - self.quiet).clamp(min=0))
+        return rectified(u, v), change
+
+
+def rectified(u: Tensor, v: Tensor) -> Tensor:
+    """``(n, 4, h, w)`` what moves right, left, down and up: pooled apart, so that opposite motions do not cancel."""
+    return torch.stack([u, -u, v, -v], dim=1).clamp_(min=0)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# The causal motion box: where somebody has moved of late, known while the frames come in.
+
+
+MEMORY = 20.0  # seconds over which motion is forgotten; 10: .007 fewer of the frames of exercises
+LIVELY = 0.006  # grey 0..1 per frame: less does not widen the box
+INSIDE = (0.02, 0.98)  # quantiles of the motion that a box encloses
+NOTHING = 1e-12  # brightness change of every pixel in a box: where nothing has moved, it is about the whole image
+PAD = 0.15  # of the box, on each side
+
+
+class MotionBox:
+    r"""Square box about what has moved, frame by frame.
+
+    .. math:: A_t = \max\bigl((1 - \tfrac{1}{m}) A_{t-1},\; \max(|I_t| - .006, 0)\bigr)
+
+    and the box encloses the 2 % to 98 % quantiles of the marginals of A.  It knows the frames up to t alone.
+
+    Args:
+        memory: m, frames.
+        seen: ``(h, w)`` A before the first frame; nothing by default.
+    """
+
+    def __init__(self, memory: float, seen: Tensor | None = None) -> None:
+        self.decay, self.seen = 1 - 1 / memory, seen
+
+    def push(self, change: Tensor) -> Tensor:
+        """``(n, 4)`` centre x, centre y, width and height in pixels for brightness changes ``(n, h, w)``."""
+        n = len(change)
+        age = self.decay ** torch.arange(1, n + 1, dtype=change.dtype, device=change.device)[:, None, None]
+        fresh = (change - LIVELY).clamp_(min=NOTHING) / age
+        if self.seen is not None:
+            fresh[0] = torch.maximum(fresh[0], self.seen)
+        seen = fresh.cummax(0).values * age
+        self.seen = seen[-1]
+        return boxes_about(seen)
+
+
+def boxes_about(seen: Tensor) -> Tensor:
+    """Square boxes ``(n, 4)`` about most of what is in maps ``(n, h, w)``."""
+    n, height, width = seen.shape
+    sums = seen.new_zeros(n, 2, max(height, width))
+    torch.sum(seen, 1, out=sums[:, 0, :width])
+    torch.sum(seen, 2, out=sums[:, 1, :height])
+    total = sums.cumsum(2)
+    ends = (total[:, None] < torch.stack([q * total[:, :, -1:] for q in INSIDE], dim=1)).sum(3).to(seen)  # (n, low or high, x or y)
+    low, high = ends[:, 0], ends[:, 1] + 1
+    size = (high - low).amax(1, keepdim=True) * (1 + 2 * PAD)
+    return torch.cat([(low + high) / 2, size, size], dim=1)
+
+
+def together(seen: list[Tensor]) -> list[Tensor]:
+    """Of each video, what moved in it and in all videos of its size that were taken at its place.
+
+    Where the box about one holds at least half of the other's, somebody stands at one place in both.
+
+    Args:
+        seen: ``(h, w)`` what moved in each video.
+
+    Example:
+        >>> arm, legs = torch.zeros(2, 20, 20)
+        >>> arm[4:8, 4:8], legs[6:16, 6:10] = 1.0, 2.0
+        >>> [int(one.sum()) for one in together([arm, legs, torch.ones(5, 5)])]
+        [92, 92, 25]
+    """
+    out = list(seen)
+    for shape in {one.shape for one in seen}:
+        of = [i for i, one in enumerate(seen) if one.shape == shape]
+        maps = torch.stack([seen[i] for i in of])
+        boxes = boxes_about(maps)
+        low, high = boxes[:, :2] - boxes[:, 2:] / 2, boxes[:, :2] + boxes[:, 2:] / 2
+        common = (torch.minimum(high[:, None], high) - torch.maximum(low[:, None], low)).clamp(min=0).prod(2)
+        area = boxes[:, 2:].prod(1)
+        near = common >= torch.minimum(area[:, None], area) / 2
+        for i, row in zip(of, near, strict=True):
+            out[i] = maps[row].amax(0)
+    return out
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Pooling of motion maps in the cells of a box, and the unit of a frame's descriptor.
+
+
+CELLS = 8
+SOFT = 0.005  # added to the norm: noise frames stay near 0 instead of being blown up
+
+
+def overlaps(centre: Tensor, side: Tensor, pixels: int, cells: int = CELLS) -> Tensor:
+    """``(..., cells, pixels)`` share of each cell's interval that lies in each pixel; neighbouring cells overlap by half.
+
+    Args:
+        centre, side: ``(...)`` of the interval that the cells divide, in pixels.
+    """
+    places, pixel, after = _positions(cells, pixels, side.dtype, side.device)
+    step = (side / cells)[..., None, None]
+    middle = centre[..., None, None] + step * places
+    shared = torch.minimum(middle + step, after).sub_(torch.maximum(middle - step, pixel))
+    return shared.clamp_(min=0).div_(2 * step)
+
+
+@lru_cache(maxsize=64)
+def _positions(cells: int, pixels: int, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+    """Middles of cells about the centre, in cells; where pixels begin and end."""
+    edges = torch.arange(pixels + 1, dtype=dtype, device=device)
+    return (torch.arange(cells, dtype=dtype, device=device) + 0.5 - cells / 2)[:, None], edges[:-1], edges[1:]
+
+
+def pooled(maps: Tensor, boxes: Tensor, cells: int = CELLS) -> Tensor:
+    """``(n, b, c * cells * cells)`` mean of maps ``(n, c, h, w)`` in the cells of boxes ``(n, b, 4)``; 0 outside the image."""
+    (n, b, _), (height, width) = boxes.shape, maps.shape[2:]
+    across, along = overlaps(boxes[..., :2], boxes[..., 2:], max(height, width), cells).unbind(2)
+    columns = across[..., :width].reshape(n, 1, b * cells, width)
+    bands = (maps @ columns.mT).unflatten(3, (b, cells)).movedim(3, 1)
+    return (along[:, :, None, :, :height] @ bands).flatten(2)
+
+
+def described(cells: Tensor, soft: float = SOFT) -> Tensor:
+    r"""Descriptor :math:`f = s / (\|s\| + .005)` with :math:`s = \sqrt{cells}`: shorter than 1, and near 0 where nothing moves."""
+    root = cells.sqrt()
+    return root / (root.norm(dim=-1, keepdim=True) + soft)
+
+
+def profile(cells: Tensor, count: int = CELLS) -> Tensor:
+    """``(..., 3 * count)`` motion sideways, down and up in each row of cells ``(..., 4 * count * count)``.
+
+    Cameras that stand upright share the height of what they see, not its place across, and the sign of sideways motion depends
+    on the side from which a camera looks.
+
+    Example:
+        >>> profile(torch.arange(1.0, 17.0).view(1, 16), 2).tolist()
+        [[14.0, 22.0, 19.0, 23.0, 27.0, 31.0]]
+    """
+    right, left, down, up = cells.unflatten(-1, (4, count, count)).sum(-1).unbind(-2)
+    return torch.cat([right + left, down, up], dim=-1)
+
+
+def mirrored(rows: Tensor, count: int = CELLS) -> Tensor:
+    """Descriptors of the same video seen in a mirror: right and left change places; a row profile at the end stays."""
+    size = 4 * count**2
+    grids, rest = rows.split([rows.shape[1] // size * size, rows.shape[1] % size], dim=1)
+    maps = grids.unflatten(1, (-1, 4, count, count)).flip(4)
+    return torch.cat([maps[:, :, [1, 0, 2, 3]].flatten(1), rest], dim=1)
+
 
 SMALLEST = 16  # px of the shorter side
 NEAR = 0.35  # of the image's height: the smallest box about what moves

@@ -19,16 +19,14 @@ from typing import Annotated, Any, Protocol, cast, get_args
 import tyro
 
 from indexing.cli.align import Align
-from indexing.cli.console import complain
+from indexing.cli.console import complain, reworded
 from indexing.cli.count import Count
 from indexing.cli.demo import Demo
 from indexing.cli.evaluate import Evaluate
-from indexing.cli.fit import Fit
+from indexing.cli.index import Fit, Scan
 from indexing.cli.reconstruct import Reconstruct
-from indexing.cli.scan import Scan
 from indexing.cli.segment import Segment
 from indexing.cli.sync import Sync
-from indexing.cli.wording import reworded
 
 DONE, BAD_INPUT, REFUSED, INTERRUPTED, BROKEN_PIPE = 0, 2, 3, 130, 141
 

@@ -11,11 +11,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from indexing.cli import console
-from indexing.cli.console import count, ended, names, progress, say, table
-from indexing.cli.outputs import check_report
+from indexing.cli.console import check_report, count, ended, names, progress, say, table
 
 if TYPE_CHECKING:
-    from indexing.readers.points import Matched
+    from indexing.readers.matches import Matched
     from indexing.report.alignment import AlignmentReport
 
 Model = Literal["planar", "join", "minimal_join", "constant_velocity", "affine_constant_velocity", "rigid", "lines"]
@@ -75,7 +74,7 @@ class Align:
         folder = check_report(self.out, inputs, FILES)
         started = time.perf_counter()
         with progress("reading", steps=False):
-            from indexing.readers.points import read_matches
+            from indexing.readers.matches import read_matches
 
             matched = read_matches(self.files, frames=frame_numbers(self.frames), static_points=self.static_points)
         model, notes = self._model(matched)
@@ -162,8 +161,7 @@ class Align:
     ) -> AlignmentReport:
         from dyntorch import Status
         from indexing.files import manifest
-        from indexing.report.alignment import AlignmentReport
-        from indexing.report.alignment_picture import as_segments
+        from indexing.report.alignment import AlignmentReport, as_segments
 
         status = Status(int(result.status)).name
         parts = [part for part in (result.A, result.B) if part is not None]
@@ -217,7 +215,7 @@ def in_flags(message: str) -> str:
 
 def show(report: AlignmentReport) -> None:
     """Print the result."""
-    from indexing.report.alignment_page import display_scale, figures
+    from indexing.report.alignment import display_scale, figures
 
     counts = report.counts
     known = report.solved

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from indexing.cli.console import count, progress, say, table
-from indexing.cli.outputs import check_folder, check_report
+from indexing.cli.console import check_folder, check_report, count, progress, say, table
 
 if TYPE_CHECKING:
     from indexing.demo import Demonstration
@@ -70,7 +69,7 @@ def _examples(folder: Path) -> int:
 
 
 def _show(shown: Demonstration) -> None:
-    from indexing.report.measures import frame_accuracy, missed
+    from indexing.report.results import frame_accuracy, missed
 
     say(f"Learned {count(len(shown.classes), 'action')} from ONE 2D clip each: one person, one camera, noisy keypoints.")
     others = "one other person" if shown.people == 1 else f"{shown.people} other people"

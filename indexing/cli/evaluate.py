@@ -11,17 +11,16 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from indexing.cli.console import Progress, progress, say, table
+from indexing.cli.console import Progress, check_report, progress, say, table
 from indexing.cli.films import Pixels, are_films, refuse_film_flags
 from indexing.cli.inputs import Reading, assumed, usable
-from indexing.cli.outputs import check_report
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
     from indexing.cli.protocol import Fold, Viewing
-    from indexing.labelled import LabelledSet
+    from indexing.clip import LabelledSet
     from indexing.report import EvaluationResult
 
 REJECTED = "(rejected)"
@@ -73,7 +72,7 @@ class Evaluate:
         folder = check_report(self.report, [self.clips])
         started = time.perf_counter()
         with progress("loading", steps=False):
-            import indexing.indexer  # noqa: F401  (its import takes longer than the reading)
+            import indexing.action.indexer  # noqa: F401  (its import takes longer than the reading)
             from indexing.cli.protocol import check_classes, splits, strangers
 
             clips, cameras, notes = self._films() if are_films([self.clips]) else self._load()
@@ -85,7 +84,7 @@ class Evaluate:
         timings = {"load": time.perf_counter() - started, "learn": 0.0, "recognize": 0.0}
         with progress("learning and recognizing") as bar:
             results = self._measure(clips, labels, folds, cameras, timings, bar)
-        from indexing.report.measures import recognition
+        from indexing.report.results import recognition
 
         measured = recognition([result for _, result in results])
         groups = _by_group(results) if self.leave_out is not None else {}
@@ -164,7 +163,7 @@ class Evaluate:
             from indexing.cli.films import frame_rate
 
             return self.pixels.indexer(frame_rate(examples), reject=self.reject, none_label=REJECTED)
-        from indexing.indexer import ActionIndexer
+        from indexing.action.indexer import ActionIndexer
 
         return ActionIndexer(
             view=self.view, weights=self.weights, reject=self.reject, none_label=REJECTED,
@@ -199,7 +198,7 @@ def _by_group(results: list[tuple[str, EvaluationResult]]) -> dict[str, float]:
 
 
 def _show(measured: Mapping[str, Any], groups: dict[str, float]) -> None:
-    from indexing.report.measures import confused_with
+    from indexing.report.results import confused_with
 
     rows = []
     for name, row in measured["per_class"].items():

@@ -14,7 +14,7 @@ from indexing.cli.console import names
 if TYPE_CHECKING:
     from indexing.brightness.indexer import BrightnessIndexer
     from indexing.cli.inputs import Example, Reading
-    from indexing.readers.filmset import Film, FilmSet
+    from indexing.readers.clipset import Film, FilmSet
 
 FASTEST = 30.0  # frames per second that are compared at most: the window of the method was chosen at 15 and 30
 
@@ -60,8 +60,8 @@ def are_films(paths: Sequence[Path]) -> bool:
     Raises:
         ValueError: some are and some are not.
     """
+    from indexing.readers.clipset import holds_frames
     from indexing.readers.files import VIDEOS
-    from indexing.readers.filmset import holds_frames
 
     kinds = [path.suffix.lower() in VIDEOS or holds_frames(path) for path in paths]
     if any(kinds) and not all(kinds):
@@ -101,7 +101,7 @@ def read_examples(examples: Sequence[Example], reading: Reading, select: Sequenc
     Raises:
         ValueError: naming the file: it cannot be read, or has no label.
     """
-    from indexing.readers.filmset import holds_frames
+    from indexing.readers.clipset import holds_frames
 
     sources: list[Any] = []
     labels: list[str] = []
@@ -130,8 +130,8 @@ def read_set(path: Path, reading: Reading, select: Sequence[str] = ()) -> FilmSe
     Raises:
         ValueError: no film has a label, or none meets them.
     """
-    from indexing.cli.selection import choose
-    from indexing.readers.filmset import read_film_set
+    from indexing.cli.protocol import choose
+    from indexing.readers.clipset import read_film_set
 
     films = read_film_set(path, fps=reading.fps)
     known = films[[i for i, film in enumerate(films) if film.label is not None]]
@@ -160,7 +160,7 @@ class Recording:
 
 def read_films(paths: Sequence[Path], reading: Reading) -> tuple[list[Recording], list[str]]:
     """Videos, and the films of sets, with names that differ, and what a person should know about them."""
-    from indexing.readers.filmset import holds_frames
+    from indexing.readers.clipset import holds_frames
     from indexing.video import read_video
 
     found: list[Recording] = []

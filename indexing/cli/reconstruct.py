@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from indexing.cli.console import count, ended, in_flags, say, table
+from indexing.cli.console import check_report, count, ended, in_flags, say, table
 from indexing.cli.console import progress as progress_of
-from indexing.cli.outputs import check_report
 
 if TYPE_CHECKING:
     from indexing.readers.tracks import TrackSet
@@ -197,8 +196,7 @@ class Reconstruct:
 
         from dyntorch import Status
         from indexing.files import manifest
-        from indexing.report.reconstruction import ReconstructionReport, rested
-        from indexing.report.reconstruction_words import one
+        from indexing.report.reconstruction import ReconstructionReport, one, rested
 
         status, name = Status(int(result.status)).name, result.motion.name
         warnings = [(notice.code.value, notice.value, one(in_flags(notice.message, *FLAGS))) for notice in result.warnings]
@@ -259,7 +257,7 @@ def numbers(text: str, expected: int) -> Any:
 
 def show(report: ReconstructionReport) -> None:
     """Print the result."""
-    from indexing.report.reconstruction_words import heading, left_out
+    from indexing.report.reconstruction import heading, left_out
 
     counts = report.counts
     known = report.solved

@@ -10,12 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from indexing.cli.console import count, ended, in_flags, progress, say, table
-from indexing.cli.outputs import check_report
+from indexing.cli.console import check_report, count, ended, in_flags, progress, say, table
 
 if TYPE_CHECKING:
-    from indexing.readers.images import Photograph
-    from indexing.readers.pairs import MatchedPair
+    from indexing.readers.pairs import MatchedPair, Photograph
     from indexing.report.segmentation import SegmentationReport
 
 REASONS = {
@@ -71,8 +69,7 @@ class Segment:
         folder = check_report(self.out, inputs, FILES)
         started = time.perf_counter()
         with progress("reading", steps=False):
-            from indexing.readers.images import read_image
-            from indexing.readers.pairs import read_pair
+            from indexing.readers.pairs import read_image, read_pair
 
             pair = read_pair(self.file, self.pair)
             photographs = [read_image(path) for path in self.images or ()]
@@ -172,7 +169,7 @@ class Segment:
     ) -> SegmentationReport:
         from dyntorch import Status
         from indexing.files import manifest
-        from indexing.report.reconstruction_words import one
+        from indexing.report.reconstruction import one
         from indexing.report.segmentation import SegmentationReport
 
         found = int(result.bodies)

@@ -12,15 +12,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from indexing.cli.console import SHOWN, count, ended, in_flags, names, progress, say, table
+from indexing.cli.console import SHOWN, check_report, count, ended, in_flags, names, progress, say, table
 from indexing.cli.inputs import Format
-from indexing.cli.outputs import check_report
 
 if TYPE_CHECKING:
     from indexing.report.sync import SyncReport
-    from indexing.syncing.files import Plan
-    from indexing.syncing.people import Pairing
-    from indexing.syncing.takes import Take
+    from indexing.sync.files import Plan
+    from indexing.sync.people import Pairing
+    from indexing.sync.takes import Take
 
 FLAGS = ("fps", "person", "method", "max_shift", "calibration", "min_confidence", "format", "size", "rate")
 
@@ -66,10 +65,9 @@ class Sync:
     def run(self) -> int:
         """Read, synchronize, write, and say what was found."""
         self._check()
-        from indexing.report.sync import FILES
-        from indexing.report.sync_check import names_of
-        from indexing.syncing.files import check_target
-        from indexing.syncing.takes import find_cameras
+        from indexing.report.sync import FILES, names_of
+        from indexing.sync.files import check_target
+        from indexing.sync.takes import find_cameras
 
         found = find_cameras([path.expanduser() for path in self.cameras])
         inputs = [*found.values(), *([self.calibration.expanduser()] if self.calibration else [])]
@@ -98,7 +96,7 @@ class Sync:
         if self.check and self.out is None:
             raise ValueError("--check writes a video; say where with --out")
         if self.check:
-            from indexing.video.extra import av, cv2
+            from indexing.video.reading import av, cv2
 
             av(), cv2()  # said now rather than when all is done
         self._rates(None)
@@ -122,7 +120,7 @@ class Sync:
         return rates * ((cameras or 1) if len(rates) == 1 else 1)
 
     def _read(self, found: dict[str, Path]) -> list[Take]:
-        from indexing.syncing.takes import take_of
+        from indexing.sync.takes import take_of
 
         rates = self._rates(len(found))
         options: dict[str, Any] = {"person": self.person, "min_confidence": self.min_confidence}
@@ -135,9 +133,9 @@ class Sync:
     def _solve(self, takes: list[Take], done: Any) -> tuple[SyncReport, dict[tuple[int, int], Pairing]]:
         """All pairs, and what they say together."""
         import dyntorch
-        from indexing.report.sync_making import reported
-        from indexing.synchronization import pair, remarks
-        from indexing.syncing.calibration import named_lenses
+        from indexing.report.sync import reported
+        from indexing.sync.calibration import named_lenses
+        from indexing.sync.synchronize import pair, remarks
 
         lenses, told = (None, ()) if self.calibration is None else named_lenses(self.calibration, [take.name for take in takes])
         options: dict[str, Any] = {"max_shift": self.max_shift, "calibration": lenses, "rate": None if self.rate else 1.0}
@@ -170,9 +168,8 @@ class Sync:
     ) -> tuple[SyncReport, Path]:  # fmt: skip
         """The shifted files where the data decide, the check video where asked for, and the report."""
         from indexing.files import manifest, prepare
-        from indexing.report.sync import write_sync
-        from indexing.report.sync_check import drop_checks
-        from indexing.syncing.files import drop_poses, plan, write_poses
+        from indexing.report.sync import drop_checks, write_sync
+        from indexing.sync.files import drop_poses, plan, write_poses
 
         prepare(folder)
         notes, clocks = list(report.notes), list(report.clocks)
@@ -188,7 +185,7 @@ class Sync:
             notes.append("pose-sync of an earlier run was removed, because this one does not decide")
         videos: list[str] = []
         if self.check and any(len(found.shift.peaks) for found in compared.values()):  # of the best candidate, sure or not
-            from indexing.report.sync_check import write_checks
+            from indexing.report.sync import write_checks
 
             videos, failed = write_checks(folder, takes, report, compared)
             notes += failed
@@ -259,7 +256,7 @@ def show(report: SyncReport, folder: Path | None = None) -> None:
 
 
 def _show_pairs(report: SyncReport) -> None:
-    from indexing.report.sync_page import UNKNOWN, ppm
+    from indexing.report.sync import UNKNOWN, ppm
 
     rows: list[list[object]] = []
     for pair in report.pairs:
@@ -277,7 +274,7 @@ def _show_pairs(report: SyncReport) -> None:
 
 
 def _show_clocks(report: SyncReport) -> None:
-    from indexing.report.sync_page import UNKNOWN, ppm
+    from indexing.report.sync import UNKNOWN, ppm
 
     rows = [
         [

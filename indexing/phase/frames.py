@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from dyntorch import orthonormal_basis
+from indexing.action.bank import Windows, between, cosine_distance
 from indexing.cameras import virtual, y_up
 from indexing.clip import Clip
-from indexing.shape.bank import Windows, between, cosine_distance
 from indexing.windows import ragged
 
 LEAST = 6  # joints: an affine camera takes any four anywhere, so five leave two numbers to judge by

@@ -12,22 +12,114 @@ from sklearn.utils.validation import check_is_fitted
 from torch import Tensor
 
 from dyntorch import one_thread
-from indexing.checks import check_queries, gather, gather_labels
+from indexing.action.bank import stack
+from indexing.action.inputs import check_device, check_queries, gather, gather_labels, is_number
+from indexing.action.inputs import check_reject as check_reject_number
+from indexing.action.symmetry import mirror_permutation
 from indexing.clip import Clip, stretches
 from indexing.estimator import SavedClassifier
 from indexing.joints import layout_of
-from indexing.labels import refuse
-from indexing.phase.calibration import SECOND, event_levels
-from indexing.phase.checks import check_phase_parameters, check_phases, check_reject
 from indexing.phase.frames import LEAST, images, query_frames
 from indexing.phase.learning import learn_model
-from indexing.phase.model import PhaseModel
-from indexing.phase.smoothing import smooth_phases
-from indexing.scoring import Event, events, probabilities, reject_threshold, smooth
-from indexing.shape.bank import stack
-from indexing.shape.symmetry import mirror_permutation
+from indexing.phase.model import FEWEST, SECOND, PhaseModel, event_levels
+from indexing.scoring import Event, events, probabilities, refuse, reject_threshold, same_label, smooth
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Parameters and phases that users hand in, checked once.
+
+
+_CHOICES: dict[str, tuple[Any, ...]] = {"course": ("auto", "periodic", "once"), "mirror": ("auto", True, False)}
+
+
+def check_phase_parameters(indexer: Any) -> None:
+    """Raise on parameters that make no sense, naming the parameter and what it accepts."""
+    for name, accepted in _CHOICES.items():
+        if getattr(indexer, name) not in accepted:
+            raise ValueError(f"{name} must be one of {', '.join(map(repr, accepted))}, got {getattr(indexer, name)!r}")
+    harmonics = indexer.harmonics
+    if not isinstance(harmonics, (int, np.integer)) or isinstance(harmonics, bool) or not 1 <= harmonics <= 12:
+        raise ValueError(f"harmonics must be a whole number from 1 to 12, got {harmonics!r}")
+    for name, least in (("fps", 1e-9), ("window", 0.0)):
+        value = getattr(indexer, name)
+        if not (is_number(value) and value >= least):
+            raise ValueError(f"{name} must be {'a positive number' if name == 'fps' else 'seconds, 0 or more'}, got {value!r}")
+    check_reject_number(indexer.reject)
+    check_device(indexer.device)
+
+
+def check_reject(indexer: Any, classes: list[Any]) -> None:
+    """Raise where a rate cannot be calibrated, or a refused clip would look like a known one."""
+    if indexer.reject is None:
+        return
+    if any(same_label(value, indexer.none_label) for value in classes):
+        raise ValueError(f"none_label={indexer.none_label!r} is one of the learned labels; choose another for rejected clips")
+    if 0 < indexer.reject < 1 and len(classes) < FEWEST:
+        raise ValueError(
+            f"reject={indexer.reject!r} is calibrated by leaving a class out, which takes {FEWEST} classes, got {len(classes)}; "
+            "give further ones, or a threshold outside 0..1"
+        )
+
+
+def check_phases(phases: Sequence[Any] | None, clips: list[Clip], owners: list[int]) -> list[Tensor | None]:
+    """For each clip its phases ``(frames,)`` float64, or ``None``."""
+    if phases is None:
+        return [None] * len(clips)
+    if len(phases) != owners[-1] + 1:
+        raise ValueError(f"phases: expected one entry per clip ({owners[-1] + 1}), got {len(phases)}; give None for a clip without")
+    out: list[Tensor | None] = []
+    for clip, owner in zip(clips, owners, strict=True):
+        if phases[owner] is None:
+            out.append(None)
+            continue
+        values = np.asarray(phases[owner], dtype=np.float64)
+        if values.shape != (len(clip),):
+            raise ValueError(f"phases: clip {owner} has {len(clip)} frames, but its phases have shape {values.shape}")
+        if not np.isfinite(values).any():
+            raise ValueError(f"phases: no phase of clip {owner} is known; give None to have them found")
+        out.append(torch.from_numpy(values))
+    return out
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Phases of neighbouring frames agree on a rate: what a window adds to single frames.
+
 
 Array = NDArray[Any]
+FASTEST = 3.0  # cycles per second
+RATES = 61  # tried, from backwards to forwards
+
+
+def smooth_phases(phase: Array, times: Array, seconds: float, periodic: Array) -> Array:
+    r"""``(T, classes)`` phases, each from its neighbours too.
+
+    A cycle's: the argument of :math:`\sum_j e^{2\pi i(\phi_j - \rho(t_j - t))}` at the rate with the largest modulus; a course's:
+    the median.
+
+    Args:
+        phase: ``(T, classes)``, NaN = not known; times: ``(T,)`` seconds; periodic: ``(classes,)``.
+
+    Example:
+        >>> import numpy as np
+        >>> t = np.arange(20) / 10
+        >>> noisy = ((t + 0.02 * (-1.0) ** np.arange(20)) % 1)[:, None]
+        >>> bool(abs(smooth_phases(noisy, t, 1.0, np.array([True]))[15, 0] - 0.5) < 0.01)
+        True
+    """
+    out = np.full_like(phase, np.nan)
+    rates = np.linspace(-FASTEST, FASTEST, RATES)
+    for i, time in enumerate(times):
+        near = np.abs(times - time) <= seconds / 2
+        for c, turns in enumerate(periodic):
+            known = near & np.isfinite(phase[:, c])
+            if not known.any():
+                continue
+            if not turns:
+                out[i, c] = np.median(phase[known, c])
+                continue
+            total = np.exp(2j * np.pi * (phase[known, c] - rates[:, None] * (times[known] - time))).sum(1)
+            best = total[np.abs(total).argmax()]
+            out[i, c] = (np.angle(best) / (2 * np.pi)) % 1.0 % 1.0
+    return out
 
 
 class PhaseIndexer(SavedClassifier):
@@ -69,7 +161,7 @@ class PhaseIndexer(SavedClassifier):
     Source: Wolf 2003, chapter 4 (dynamic shape tensors) and section 10.1.
     """
 
-    FITTED, FILES = "model_", "indexing.phase.persistence"
+    FITTED, FILES = "model_", "indexing.phase.saving"
 
     def __init__(
         self,

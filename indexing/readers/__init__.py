@@ -12,8 +12,7 @@ from pathlib import Path
 from indexing.clip import Clip, ClipSet
 from indexing.opening import error, shown
 from indexing.readers.detect import detect
-from indexing.readers.files import open_source
-from indexing.readers.options import Options
+from indexing.readers.files import Options, open_source
 
 FORMATS = ("clipset", "openpose", "coco", "mediapipe", "deeplabcut", "mmpose", "ultralytics", "sleap")
 
@@ -36,7 +35,7 @@ def read(
         fps: frames per second where the file has no times of its own; without it 30 is assumed (``Clip.fps_assumed``).
         person: who is followed where a frame shows several people: ``"largest"``, ``"confident"``, ``"tracked"``, or
             ``"all"`` for one clip per tracked person (``"everyone"``: followed by position where the file has no ids); the
-            rules are in :mod:`indexing.readers.people`.
+            rules are in :mod:`indexing.readers.recording`.
         min_confidence: joints below it become NaN; so do, in every pose file, joints with confidence 0.
         label: the action, given to every clip read.
         size: ``(width, height)`` in pixels of the image, for files with coordinates from 0 to 1 (MediaPipe, YOLO labels):

@@ -13,8 +13,7 @@ from typing import Any
 
 from indexing.clip import ClipSet
 from indexing.opening import error, shown
-from indexing.readers.files import Source, frame_number
-from indexing.readers.options import Options
+from indexing.readers.files import Options, Source, frame_number
 from indexing.readers.recording import Detection, flat, gather, to_clips, track_id
 from indexing.skeleton import Skeleton, known
 

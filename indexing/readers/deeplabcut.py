@@ -11,8 +11,7 @@ import numpy as np
 
 from indexing.clip import ClipSet
 from indexing.opening import error, shown
-from indexing.readers.files import Source, frame_number, read_columns
-from indexing.readers.options import Options
+from indexing.readers.files import Options, Source, frame_number, read_columns
 from indexing.readers.recording import IntArray, Recording, to_clips
 from indexing.skeleton import Skeleton
 

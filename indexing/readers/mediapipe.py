@@ -18,8 +18,7 @@ import numpy as np
 
 from indexing.clip import ClipSet, FloatArray
 from indexing.opening import VALUE, check_dense, error, shown
-from indexing.readers.files import Source, read_columns
-from indexing.readers.options import Options
+from indexing.readers.files import Options, Source, read_columns
 from indexing.readers.recording import IntArray, Recording, frame_numbers, to_clips
 from indexing.skeleton import HAND21, MEDIAPIPE33, Skeleton
 

@@ -14,8 +14,7 @@ import numpy as np
 
 from indexing.clip import ClipSet
 from indexing.opening import error
-from indexing.readers.files import Source
-from indexing.readers.options import Options
+from indexing.readers.files import Options, Source
 from indexing.readers.recording import Detection, gather, numbers, to_clips, track_id
 from indexing.skeleton import Skeleton, known
 

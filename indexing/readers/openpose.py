@@ -12,8 +12,7 @@ from typing import Any
 from indexing import skeleton
 from indexing.clip import ClipSet
 from indexing.opening import error
-from indexing.readers.files import Source, frame_number
-from indexing.readers.options import Options
+from indexing.readers.files import Options, Source, frame_number
 from indexing.readers.recording import Detection, flat, gather, to_clips, track_id
 
 # layouts by number of joints: with OpenPose, unlike in general, these numbers have one meaning

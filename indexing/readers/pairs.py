@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,18 +12,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from indexing.opening import VALUE, clipped, error, listed, repeated, shown
+from indexing.opening import VALUE, clipped, error, listed, repeated, shown, size_of
+from indexing.readers import points
+from indexing.readers.matches import opening
 from indexing.readers.npz import Archive, read_npy
-from indexing.readers.points import table
-from indexing.readers.points.matching import opening
-from indexing.readers.points.pointset import FloatArray, as_view
+from indexing.readers.points import FloatArray, as_view
 
 COLUMNS = ("x1", "y1", "x2", "y2")
 IDS = ("id", "name", "match", "track")
 KNOWN = ("label", "labels")
 FORMATS = "give npz with x1, x2 (n, 2), or CSV with columns x1,y1,x2,y2 (and perhaps id, weight, label)"
 KEYS = "give x1 and x2 (n, 2), and perhaps label, weights, ids, wh; of several pairs NAME/x1 and NAME/x2"
-EXTRA = {"label": KNOWN, "weights": table.WEIGHTS, "ids": ("ids", "id"), "wh": ("wh", "size")}
+EXTRA = {"label": KNOWN, "weights": points.WEIGHTS, "ids": ("ids", "id"), "wh": ("wh", "size")}
 MOST = 2**31  # labels
 TRACKS = ("y", "tracks")  # (frames, n, 2), as of Hopkins 155
 FRAMES = "it seems to hold tracks (frames, n, 2): save two frames as matches, numpy.savez('m.npz', x1=tracks[0], x2=tracks[-1])"
@@ -180,11 +182,11 @@ def _marks(path: Path, extra: Mapping[str, Any]) -> dict[str, Any]:
 
 # ---- tables --------------------------------------------------------------------------------------------------------------
 def _table(path: Path) -> MatchedPair:
-    rows = [(line, _cells(cells)) for line, cells in table.read_rows(path)]
+    rows = [(line, _cells(cells)) for line, cells in points.read_rows(path)]
     rows = [(line, cells) for line, cells in rows if cells]
     if not rows:
         raise error(path, "the file is empty", "export it again")
-    if table.is_data(rows[0][1]):
+    if points.is_data(rows[0][1]):
         names = _unnamed(path, rows[0][1])
     else:
         names, rows = [cell.strip().lower() for cell in rows[0][1]], rows[1:]
@@ -194,17 +196,17 @@ def _table(path: Path) -> MatchedPair:
         raise error(path, said, "name the columns x1,y1,x2,y2 (and perhaps id, weight, label)")
     if not rows:
         raise error(path, "the file has a header but no rows", "export it again")
-    table.check_widths(path, rows, names)
-    twice = repeated(name for name in names if name in (*COLUMNS, *IDS, *table.WEIGHTS, *KNOWN))
+    points.check_widths(path, rows, names)
+    twice = repeated(name for name in names if name in (*COLUMNS, *IDS, *points.WEIGHTS, *KNOWN))
     if twice is not None:
         raise error(path, f"there are two columns {shown(twice)}", "leave one of them out")
-    values = table.column_values(path, rows, names, COLUMNS)
+    values = points.column_values(path, rows, names, COLUMNS)
     extra = {
-        "weights": table.optional_column(path, rows, names, table.WEIGHTS),
-        "label": table.optional_column(path, rows, names, KNOWN),
+        "weights": points.optional_column(path, rows, names, points.WEIGHTS),
+        "label": points.optional_column(path, rows, names, KNOWN),
     }
     marks = _marks(path, {kind: column for kind, column in extra.items() if column is not None})
-    return _pair(path, path.name, values[:, :2], values[:, 2:], table.row_names(path, rows, names, IDS), **marks)
+    return _pair(path, path.name, values[:, :2], values[:, 2:], points.row_names(path, rows, names, IDS), **marks)
 
 
 def _cells(cells: list[str]) -> list[str]:
@@ -219,8 +221,71 @@ def _cells(cells: list[str]) -> list[str]:
 
 def _unnamed(path: Path, cells: list[str]) -> list[str]:
     """Names of the columns of a table without a header: the four coordinates, and perhaps a name before them."""
-    named = table.number(cells[0]) is None
+    named = points.number(cells[0]) is None
     if len(cells) != len(COLUMNS) + named:
         said = f"row 1 has {len(cells)} columns, and no row names them"
         raise error(path, said, "matches without a header are x1,y1,x2,y2; name further columns (id, weight, label) in a header")
     return [*(["id"] if named else []), *COLUMNS]
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Photographs behind a picture: any file that Pillow reads -> gray values.
+
+
+PLENTY = 2**24, 10_000  # pixels from which on there must not be so many in a byte: of one colour, a photograph has a hundred
+# what Pillow raises over a file that is damaged
+DAMAGED = (OSError, ValueError, SyntaxError, TypeError, LookupError, ArithmeticError, MemoryError, struct.error, EOFError)
+SIDE = 1600  # pixels kept along the longer side: a panel of a report shows fewer
+
+
+@dataclass(frozen=True, eq=False)
+class Photograph:
+    """A photograph.
+
+    Attributes:
+        name: of the file.
+        gray: ``(h, w)`` in [0, 1], perhaps smaller than the file's.
+        size: width and height in pixels of the file, in which points are measured.
+    """
+
+    name: str
+    gray: NDArray[np.float32]
+    size: tuple[float, float]
+
+
+def read_image(path: str | Path) -> Photograph:
+    """Read a photograph, turned as its EXIF entry says (as OpenCV does).
+
+    Raises:
+        ValueError: no such file, or none that can be read.
+    """
+    from PIL import Image, ImageOps
+
+    path = Path(path).expanduser()
+    length = size_of(path, "give an image, such as png or jpg")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # that it is large is no reason to worry: it is made smaller
+            with Image.open(path) as opened:
+                if opened.width * opened.height > max(PLENTY[0], PLENTY[1] * length):
+                    raise ValueError(f"{opened.width} x {opened.height} pixels in {length} bytes")
+                turned = ImageOps.exif_transpose(opened)
+                size = (float(turned.width), float(turned.height))
+                gray = _gray(turned)
+    except (*DAMAGED, Image.DecompressionBombError) as problem:
+        said = f"cannot be read as an image ({type(problem).__name__})"
+        raise error(path, said, "save it again as png or jpg") from None
+    return Photograph(path.name, gray, size)
+
+
+def _gray(image: object) -> NDArray[np.float32]:
+    from PIL import Image
+
+    assert isinstance(image, Image.Image)
+    if image.mode.startswith(("I", "F")):  # 16 bits and more: from the least value to the greatest
+        deep = np.asarray(image, dtype=np.float32)
+        low, high = float(np.nanmin(deep)), float(np.nanmax(deep))
+        image = Image.fromarray(np.uint8(255 * np.nan_to_num((deep - low) / max(high - low, 1e-9))))
+    image = image.convert("L")
+    image.thumbnail((SIDE, SIDE))
+    return np.asarray(image, dtype=np.float32) / np.float32(255)

@@ -10,8 +10,7 @@ import numpy as np
 
 from indexing.clip import ClipSet
 from indexing.opening import error, shown
-from indexing.readers.files import Source, read_columns
-from indexing.readers.options import Options
+from indexing.readers.files import Options, Source, read_columns
 from indexing.readers.recording import Recording, frame_numbers, to_clips
 from indexing.skeleton import Skeleton
 

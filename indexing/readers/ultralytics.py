@@ -15,8 +15,7 @@ import numpy as np
 
 from indexing.clip import LARGEST, ClipSet, FloatArray
 from indexing.opening import VALUE, clipped, error, parse_json, read_text, shown
-from indexing.readers.files import FrameFile, Source
-from indexing.readers.options import Options
+from indexing.readers.files import FrameFile, Options, Source
 from indexing.readers.recording import Detection, gather, numbers, to_clips, track_id
 from indexing.skeleton import known
 

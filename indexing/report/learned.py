@@ -2,18 +2,258 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
 from indexing import files
-from indexing.report.body_parts import BodyParts, body_parts, body_parts_section, measure_body_parts
-from indexing.report.page import Card, Column, cards, details, escape, made_by, page, section, settings, table
+from indexing.cameras import y_up
+from indexing.clip import Clip
+from indexing.report.canvas import DARK, FACE, LIGHT, Theme, new_figure, png, shorten_all, style
+from indexing.report.page import Card, Column, cards, details, escape, made_by, page, picture, section, settings, table
+from indexing.skeleton import Skeleton, known
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Which body parts tell the actions apart: a skeleton per action, its joints and bones coloured by how much they matter.
+
 
 if TYPE_CHECKING:
+    from indexing.action.indexer import ActionIndexer
+
+Array = NDArray[np.float64]
+COLUMNS = 5  # skeletons in a row
+PANEL = 1.62, 1.95  # inches
+PIECES = 16  # of a bone, each in its own colour
+HOT = {LIGHT.paper: ("#f2a65a", "#dd4f0e"), DARK.paper: ("#a8501c", "#ff9a45")}  # some, and most; the theme's line colour = none
+THIN, THICK, DOT = 1.6, 4.6, 2.2  # points: bones that matter least and most, and how much wider joints are than bones
+HEAD = 15.0  # points across, where the joints of a face stand for it
+TRAIL = 2  # joints per action whose path is drawn
+NAMED = 3  # joints per action that the table names
+
+
+@dataclass(frozen=True, eq=False)
+class BodyParts:
+    """How much every joint matters for every action, and a clip that shows each.
+
+    Args:
+        classes: ``C`` labels.
+        importance: ``(C, joints)`` share of the joint in the margin of the action (any unit); negative = it misleads.
+        examples: ``C`` clips; skeleton: names and bones, by default the clips' own.
+
+    Raises:
+        ValueError: shapes do not fit.
+    """
+
+    classes: Sequence[Hashable]
+    importance: Array
+    examples: Sequence[Clip]
+    skeleton: Skeleton | None = None
+
+    def __post_init__(self) -> None:
+        values = np.asarray(self.importance, dtype=np.float64)
+        joints = {clip.joints.shape[1] for clip in self.examples}
+        if not len(self.classes) == len(values) == len(self.examples) or joints != {values.shape[1]}:
+            raise ValueError(
+                f"importance {values.shape} must be (classes, joints), with a class and an example in each row: got "
+                f"{len(self.classes)} classes and {len(self.examples)} examples with {sorted(joints)} joints"
+            )
+        own = self.examples[0].skeleton if self.skeleton is None else self.skeleton
+        object.__setattr__(self, "importance", values)
+        object.__setattr__(self, "skeleton", known(values.shape[1]) if own is None else own)
+
+    @property
+    def shares(self) -> Array:
+        """``(C, joints)`` importance between 0 (none, or misleading) and 1 (the joint that matters most for the action)."""
+        positive = self.importance.clip(min=0)
+        return np.asarray(positive / np.maximum(positive.max(axis=1, keepdims=True), 1e-12))
+
+
+def measure_body_parts(indexer: ActionIndexer, groups: ArrayLike | None = None) -> BodyParts:
+    """What a fitted indexer says: how much the margin of an action grows when a joint is seen.
+
+    Measured on the model, not read from its weights (see :mod:`indexing.action.learning`), so it holds for any fit.
+
+    Args:
+        groups: ``(exemplars,)`` who performed each, by default what the indexer knows; exemplars of the same person are not
+            compared.
+    """
+    import torch
+
+    from indexing.action.learning import importance, typical
+
+    groups = getattr(indexer, "groups_", None) if groups is None else groups
+    numbers = None if groups is None else torch.from_numpy(np.unique(np.asarray(groups), return_inverse=True)[1])
+    examples = [indexer.exemplar(int(i)) for i in typical(indexer.model_)]
+    values = importance(indexer.model_, numbers).cpu().numpy()
+    return BodyParts(indexer.classes_.tolist(), values, examples, indexer.skeleton_)
+
+
+def body_parts(parts: BodyParts, *, columns: int = COLUMNS, theme: Theme = LIGHT) -> bytes:
+    """PNG: a skeleton per action, in its most telling pose; strong colour and thick lines where a joint matters.
+
+    Thin lines are the paths of the joints that matter most.  Without bones the joints are dots.
+
+    Args:
+        columns: skeletons in a row at most.
+    """
+    number = len(parts.classes)
+    rows = -(-number // max(1, columns))
+    columns = -(-number // rows)  # rows of about the same length
+    width, height = PANEL[0] * columns + 0.2, PANEL[1] * rows + 0.42
+    names = shorten_all(parts.classes, 20)
+    with style(theme):
+        figure = new_figure(width, height)
+        for i in range(number):
+            row, column = divmod(i, columns)
+            box = (0.1 + PANEL[0] * column, 0.42 + PANEL[1] * (rows - 1 - row), PANEL[0], PANEL[1] - 0.24)
+            axes = figure.add_axes((box[0] / width, box[1] / height, box[2] / width, box[3] / height))
+            axes.set_axis_off()
+            _person(axes, parts, i, theme)
+            centre = ((box[0] + box[2] / 2) / width, (box[1] + box[3] + 0.05) / height)
+            figure.text(*centre, names[i], ha="center", va="bottom", fontsize=9, fontweight="bold", parse_math=False)
+        _key(figure, width, height, theme)
+        return png(figure)
+
+
+def body_parts_section(parts: BodyParts) -> str:
+    """HTML section of the recognition report: the picture, and the joints that matter most by name."""
+    light, dark = (body_parts(parts, theme=theme) for theme in (LIGHT, DARK))
+    names = parts.skeleton.joints if parts.skeleton is not None else tuple(f"joint {i}" for i in range(parts.shares.shape[1]))
+    rows = []
+    for label, share in zip(parts.classes, parts.shares, strict=True):
+        first = [f"{escape(_plain(names[j]))} ({share[j]:.0%})" for j in np.argsort(-share)[:NAMED] if share[j] > 0]
+        rows.append([escape(label), ", ".join(first) or '<span class="none">none stands out</span>'])
+    note = "How much the evidence for an action grows when a joint is seen, whatever else is seen: strong colour = most."
+    alt = f"A skeleton for each of {len(parts.classes)} actions, coloured by how much each joint matters"
+    caption = "Each action in a telling pose of one of its examples; thin lines are the paths of the joints that matter most."
+    html = picture(light, alt, dark=dark, caption=caption)
+    return section(
+        "Which body parts matter", html + table([Column("Action"), Column("Joints that matter most", "long")], rows), note
+    )
+
+
+def telling_pose(points: Array, usual: Array, share: Array) -> int:
+    """Index of the frame in which the joints that matter are furthest from where they usually are.
+
+    Args:
+        points: ``(frames, joints, 2)`` in body coordinates (see :func:`in_body`); usual: ``(joints, 2)``, the same, of all
+            actions; share: ``(joints,)`` how much each joint matters.
+
+    Example:
+        >>> raised = np.zeros((3, 4, 2))
+        >>> raised[1, 2, 1] = 1.0  # joint 2 is up in frame 1
+        >>> telling_pose(raised, np.zeros((4, 2)), np.array([0.0, 0.0, 1.0, 0.0]))
+        1
+    """
+    return int((np.nan_to_num(np.square(points - usual)).sum(axis=2) @ (share + 1e-3)).argmax())
+
+
+def in_body(points: Array) -> Array:
+    """``(frames, joints, 2)`` about the middle of the joints seen in each frame, in units of the person's usual height."""
+    middle = np.nanmean(points, axis=1, keepdims=True)
+    height = np.nanmedian(np.nanmax(points[..., 1], axis=1) - np.nanmin(points[..., 1], axis=1))
+    return np.asarray((points - middle) / max(float(height), 1e-9))
+
+
+def _person(axes: Any, parts: BodyParts, index: int, theme: Theme) -> None:
+    """One skeleton, and the paths of its most telling joints."""
+    share = parts.shares[index]
+    points = _points(parts.examples[index])
+    everyone = np.concatenate([in_body(_points(clip)) for clip in parts.examples])
+    usual = np.nan_to_num(everyone).sum(axis=0) / np.maximum((~np.isnan(everyone)).sum(axis=0), 1)
+    pose = points[telling_pose(in_body(points), usual, share)]
+    colours = _colours(theme)
+    paths = np.argsort(share)[-TRAIL:]
+    for joint in paths:
+        axes.plot(*points[:, joint].T, color=colours(share[joint]), linewidth=0.9, alpha=0.55, zorder=1, solid_capstyle="round")
+    face = _face(parts.skeleton, len(pose)) & ~np.isnan(pose).any(axis=1)
+    _draw_bones(axes, pose, share, _bones(parts.skeleton), colours)
+    dots, values = pose[~face], share[~face]
+    size = (THIN + DOT + (THICK - THIN + DOT) * values) * (1.0 if len(pose) <= 40 else 0.5)
+    if face.any():  # a head in place of eyes and ears
+        dots, values = np.vstack([dots, pose[face].mean(axis=0)]), np.append(values, share[face].max())
+        size = np.append(size, HEAD)
+    order = np.argsort(values)
+    colour = colours(values[order])
+    axes.scatter(*dots[order].T, s=np.square(size[order]), c=colour, edgecolors=theme.paper, linewidths=0.6, zorder=4)
+    _frame(axes, np.concatenate([pose, points[:, paths].reshape(-1, 2)]), points)
+
+
+def _draw_bones(axes: Any, pose: Array, share: Array, bones: Sequence[tuple[int, int]], colours: Any) -> None:
+    """Bones whose colour and width run from one end's share to the other's; what matters lies on top."""
+    from matplotlib.collections import LineCollection
+
+    along = np.linspace(0, 1, PIECES + 1)
+    for a, b in sorted(bones, key=lambda bone: share[list(bone)].max()):
+        if np.isnan(pose[[a, b]]).any():
+            continue
+        line = pose[a] + along[:, None] * (pose[b] - pose[a])
+        value = share[a] + (along[1:] + along[:-1]) / 2 * (share[b] - share[a])
+        pieces = list(np.stack([line[:-1], line[1:]], axis=1))
+        widths = THIN + (THICK - THIN) * value
+        axes.add_collection(LineCollection(pieces, colors=colours(value), linewidths=widths, capstyle="round", zorder=2))
+
+
+def _points(clip: Clip) -> Array:
+    """``(frames, joints, 2)`` of frames in which something was seen, y up."""
+    points = y_up(clip)[..., :2].astype(np.float64)
+    points[np.isnan(points).any(axis=2)] = np.nan
+    return np.asarray(points[~np.isnan(points).all(axis=(1, 2))])
+
+
+def _frame(axes: Any, shown: Array, points: Array) -> None:
+    """Limits around the pose and the paths; the same margin for everyone."""
+    height = np.nanmedian(np.nanmax(points[..., 1], axis=1) - np.nanmin(points[..., 1], axis=1))
+    low, high = np.nanmin(shown, axis=0), np.nanmax(shown, axis=0)
+    middle = (low + high) / 2
+    half = 0.58 * max(float(height), float(high[1] - low[1]), float(high[0] - low[0]) * PANEL[1] / PANEL[0], 1e-9)
+    aspect = PANEL[0] / (PANEL[1] - 0.24)
+    axes.set(xlim=(middle[0] - aspect * half, middle[0] + aspect * half), ylim=(middle[1] - half, middle[1] + half))
+
+
+def _key(figure: Any, width: float, height: float, theme: Theme) -> None:
+    """What the colours mean, below the skeletons."""
+    middle, y = 0.5, 0.2 / height
+    axes = figure.add_axes((middle - 0.45 / width, y - 0.045 / height, 0.9 / width, 0.09 / height))
+    axes.imshow(np.linspace(0, 1, 64)[None], cmap=_colours(theme), aspect="auto")
+    axes.set_axis_off()
+    figure.text(middle - 0.53 / width, y, "tells little", ha="right", va="center", fontsize=8, color=theme.muted)
+    figure.text(middle + 0.53 / width, y, "tells most", ha="left", va="center", fontsize=8, color=theme.muted)
+
+
+def _face(skeleton: Skeleton | None, joints: int) -> NDArray[np.bool_]:
+    """``(joints,)`` which belong to the face."""
+    names = skeleton.joints if skeleton is not None else ("",) * joints
+    return np.array([bool(set(re.split(r"[^a-z]+", name.lower())) & FACE) for name in names])
+
+
+def _bones(skeleton: Skeleton | None) -> list[tuple[int, int]]:
+    """Bones to draw: none of the face's, which would look like a mask."""
+    if skeleton is None:
+        return []
+    face = _face(skeleton, len(skeleton.joints))
+    return [(a, b) for a, b in skeleton.bones if not (face[a] or face[b])]
+
+
+def _plain(name: str) -> str:
+    return name.replace("_", " ")
+
+
+def _colours(theme: Theme) -> Any:
+    from matplotlib.colors import LinearSegmentedColormap
+
+    return LinearSegmentedColormap.from_list("parts", (theme.line, *HOT.get(theme.paper, HOT[LIGHT.paper])))
+
+
+if TYPE_CHECKING:
+    from indexing.action.indexer import ActionIndexer
     from indexing.clip import Clip
-    from indexing.indexer import ActionIndexer
 
 PICTURE = "body_parts.png"
 NOBODY = "Nobody could be left out (the clips have no field 'subject', or it is one person): the usual weights stand."

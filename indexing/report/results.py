@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+import warnings
+from collections import Counter
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -140,3 +143,167 @@ class RecognitionReport:
             return known
         index = getattr(event, "exemplar", None)
         return (known[index] if index is not None and 0 <= index < len(known) else known[0]) if len(known) else None
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# The numbers of a recognition report, from labels and intervals; scikit-learn does the arithmetic of recognition.
+
+
+def measure(report: RecognitionReport) -> dict[str, Any]:
+    """All numbers of a report, in JSON types (NaN where a number does not exist).
+
+    Returns:
+        the report's own ``metrics``, and
+        for evaluations ``clips, accuracy, accuracy_interval, macro_f1, accuracy_by_setting, per_class, confusion``;
+        for recordings ``recordings, seconds, events, events_by_class``, and where some are known ``known_events, missed_events,
+        false_events`` (finds of which nothing of their name is known there), ``frame_accuracy, frame_agreement``.
+    """
+    out = dict(report.metrics)
+    if report.notes:
+        out["notes"] = list(report.notes)
+    if report.evaluations:
+        out.update(recognition(report.evaluations))
+        plain = _baseline(report)
+        if plain:
+            out["baseline"] = plain
+    if report.recordings:
+        out.update(_search(report.recordings))
+    return out
+
+
+def recognition(evaluations: Sequence[EvaluationResult]) -> dict[str, Any]:
+    """Accuracy per setting and over all clips, and precision, recall, F1 per class over all clips."""
+    from sklearn.metrics import accuracy_score, confusion_matrix, f1_score, precision_recall_fscore_support
+
+    settings: dict[str, list[tuple[str, str]]] = {}
+    names: dict[str, None] = dict.fromkeys(str(name) for evaluation in evaluations for name in evaluation.classes)
+    for evaluation in evaluations:
+        pairs = [(str(true), str(guess)) for true, guess in zip(evaluation.truth, evaluation.predicted, strict=True)]
+        settings.setdefault(evaluation.setting, []).extend(pairs)
+        names.update(dict.fromkeys(sorted({label for pair in pairs for label in pair} - set(names))))
+    labels = list(names)
+    true, guess = (list(column) for column in zip(*(pair for pairs in settings.values() for pair in pairs), strict=True))
+    precision, recall, f1, support = precision_recall_fscore_support(true, guess, labels=labels, zero_division=np.nan)
+    performed = [name for name in labels if name in set(true)]
+    accuracy = float(accuracy_score(true, guess))
+    with warnings.catch_warnings():  # that there is just one class is no mistake
+        warnings.filterwarnings("ignore", message="A single label was found")
+        counts = confusion_matrix(true, guess, labels=labels)
+    return {
+        "clips": len(true),
+        "accuracy": accuracy,
+        "accuracy_interval": wilson(accuracy, len(true)),
+        # Over the actions that were performed: a class without a clip has no recall to average.
+        "macro_f1": float(f1_score(true, guess, labels=performed, average="macro", zero_division=0)),
+        "accuracy_by_setting": {
+            name: float(accuracy_score(*(list(column) for column in zip(*pairs, strict=True)))) for name, pairs in settings.items()
+        },
+        "clips_by_setting": {name: len(pairs) for name, pairs in settings.items()},
+        "per_class": {
+            name: {"precision": float(p), "recall": float(r), "f1": float(f), "clips": int(n)}
+            for name, p, r, f, n in zip(labels, precision, recall, f1, support, strict=True)
+        },
+        "confusion": {"labels": labels, "counts": counts.tolist()},
+    }
+
+
+def _baseline(report: RecognitionReport) -> dict[str, Any]:
+    """Name, accuracy and accuracy per setting of the plain method that the evaluations were compared with; empty without one."""
+    right: dict[str, list[bool]] = {}
+    for evaluation in report.evaluations:
+        if evaluation.baseline is not None:
+            pairs = zip(evaluation.truth, evaluation.baseline, strict=True)
+            right.setdefault(evaluation.setting, []).extend(str(true) == str(guess) for true, guess in pairs)
+    if not right:
+        return {}
+    together = [value for values in right.values() for value in values]
+    by_setting = {name: float(np.mean(values)) for name, values in right.items()}
+    return {"name": report.baseline[0], "accuracy": float(np.mean(together)), "accuracy_by_setting": by_setting}
+
+
+def wilson(share: float, number: int) -> tuple[float, float]:
+    """95 % interval of a proportion (Wilson's; it also holds near 0 and 1, where the usual one is empty).
+
+    Example:
+        >>> [round(end, 3) for end in wilson(1.0, 10)]
+        [0.722, 1.0]
+    """
+    z = 1.959964
+    middle = (share + z * z / (2 * number)) / (1 + z * z / number)
+    half = z / (1 + z * z / number) * math.sqrt(share * (1 - share) / number + z * z / (4 * number * number))
+    return max(0.0, middle - half), min(1.0, middle + half)
+
+
+def overlapping(event: Event, truth: Sequence[Truth]) -> str | None:
+    """The known action that shares most time with an event; of equals, the one with the event's own label.  None = no one."""
+    own = str(event.label)
+    shared = [(min(event.end, end) - max(event.start, start), str(label) == own, str(label)) for label, start, end in truth]
+    best = max(shared, default=None)
+    return best[2] if best is not None and best[0] > 0 else None
+
+
+def missed(recording: RecordingResult) -> list[Truth]:
+    """Known actions that no event of the same label overlaps."""
+    by_label: dict[str, list[Event]] = {}
+    for event in recording.events:
+        by_label.setdefault(str(event.label), []).append(event)
+    return [
+        (label, start, end)
+        for label, start, end in recording.truth or ()
+        if not any(event.start < end and event.end > start for event in by_label.get(str(label), ()))
+    ]
+
+
+def frame_accuracy(recording: RecordingResult) -> float:
+    """Share of the frames inside known actions whose best-scoring action is the known one; NaN without such frames."""
+    known = _known_frames(recording)
+    inside = known != ""
+    names = np.array([str(name) for name in recording.classes], dtype=object)
+    best = names[np.nan_to_num(recording.scores, nan=-np.inf).argmax(axis=1)]
+    return float((best[inside] == known[inside]).mean()) if inside.any() else math.nan
+
+
+def frame_agreement(recording: RecordingResult) -> float:
+    """Share of all frames for which the reported events say what is known: the same action, or none."""
+    said = np.full(len(recording.times), "", dtype=object)
+    for event in recording.events:
+        said[(recording.times >= event.start) & (recording.times <= event.end)] = str(event.label)
+    return float((said == _known_frames(recording)).mean())
+
+
+def _known_frames(recording: RecordingResult) -> Any:
+    """``(F,)`` the known action of each frame; empty text where none is known."""
+    known = np.full(len(recording.times), "", dtype=object)
+    for label, start, end in recording.truth or ():
+        known[(recording.times >= start) & (recording.times <= end)] = str(label)
+    return known
+
+
+def confused_with(confusion: Mapping[str, Any], label: str) -> tuple[str, int] | None:
+    """What a class is most often mistaken for, and how often."""
+    labels, counts = confusion["labels"], confusion["counts"]
+    row = Counter({name: count for name, count in zip(labels, counts[labels.index(label)], strict=True) if name != label and count})
+    return row.most_common(1)[0] if row else None
+
+
+def _search(recordings: Sequence[RecordingResult]) -> dict[str, Any]:
+    events = Counter(str(event.label) for recording in recordings for event in recording.events)
+    out: dict[str, Any] = {
+        "recordings": len(recordings),
+        "seconds": float(sum(recording.duration for recording in recordings)),
+        "events": sum(events.values()),
+        "events_by_class": dict(events.most_common()),
+    }
+    known = [recording for recording in recordings if recording.truth is not None]
+    if known:
+        out["known_events"] = sum(len(recording.truth or ()) for recording in known)
+        out["false_events"] = sum(
+            overlapping(event, recording.truth or ()) != str(event.label) for recording in known for event in recording.events
+        )
+        out["missed_events"] = sum(len(missed(recording)) for recording in known)
+        inside = np.array([(_known_frames(recording) != "").sum() for recording in known], dtype=float)
+        shares = np.array([frame_accuracy(recording) for recording in known])
+        out["frame_accuracy"] = float(np.nansum(shares * inside) / inside.sum()) if inside.any() else math.nan
+        frames = [len(recording.times) for recording in known]
+        out["frame_agreement"] = float(np.average([frame_agreement(recording) for recording in known], weights=frames))
+    return out

@@ -7,10 +7,10 @@ from indexing.video.motion import CameraMotion as CameraMotion
 from indexing.video.motion import Move as Move
 from indexing.video.motion import camera_motion as camera_motion
 from indexing.video.motion import stabilize as stabilize
-from indexing.video.probing import VideoInfo as VideoInfo
-from indexing.video.probing import probe as probe
 from indexing.video.reading import Chunk as Chunk
 from indexing.video.reading import Video as Video
+from indexing.video.reading import VideoInfo as VideoInfo
+from indexing.video.reading import probe as probe
 from indexing.video.reading import read_video as read_video
 from indexing.video.tracks import Tracks as Tracks
 from indexing.video.tracks import track_points as track_points

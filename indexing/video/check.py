@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from indexing.clip import Clip
 from indexing.files import write_bytes
 from indexing.skeleton import known
-from indexing.video.extra import av, cv2
-from indexing.video.reading import read_video
+from indexing.video.reading import av, cv2, read_video
 
 Image = NDArray[np.uint8]
 

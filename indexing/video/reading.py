@@ -4,27 +4,299 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from functools import cached_property
+from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from indexing.video.extra import av
-from indexing.video.probing import (
-    REMEDY,
-    UNTIMED_FPS,
-    Orientation,
-    VideoInfo,
-    cut_off,
-    nothing_decoded,
-    opened,
-    orientation,
-    packets,
-    probe,
-    untimed,
-)
+from indexing.opening import size_of
+
+# ----------------------------------------------------------------------------------------------------------------------
+# The two packages of the extra ``video``, imported when they are needed and not before.
+
+
+def av() -> Any:
+    """PyAV: reads and writes video files.
+
+    Raises:
+        ValueError: it is not installed.
+    """
+    return _load("av", "PyAV")
+
+
+def cv2() -> Any:
+    """OpenCV: finds points, follows them, warps pictures.
+
+    Raises:
+        ValueError: it is not installed.
+    """
+    return _load("cv2", "OpenCV")
+
+
+def _load(module: str, name: str) -> Any:
+    try:
+        return import_module(module)
+    except ImportError as error:
+        raise ValueError(f"video: {name} ({module}) cannot be imported ({error}); install 'dyntorch[video]'") from error
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# What a video file holds: size as shown, frames and their exact times; and opening one with errors that a person understands.
+
+
+REMEDY = "copy it again from the camera, or convert it: ffmpeg -i IN -c:v libx264 OUT.mp4"
+UNTIMED_FPS = 30.0  # of files without times, where nobody says otherwise
+UNEVEN = 0.1  # frames that a time may be off the even grid before we call the rate variable: a tenth shows in a sub-frame shift
+MISSING_END = (0.5, 0.02)  # seconds, and share of the length, that pictures may end before the file says they do
+
+
+@dataclass(frozen=True)
+class VideoInfo:
+    """What a video file holds.
+
+    Attributes:
+        path: the file.
+        width: pixels, as shown (after rotation).
+        height: pixels, as shown.
+        frames: how many there are; of several with one and the same time, one counts.
+        duration: seconds from the first frame to the last.
+        fps: frames per second by the timestamps: :math:`(\\text{frames} - 1) / \\text{duration}`.
+        nominal: frames per second that the file claims; 0 where it claims none.
+        variable: whether the frames lie off an even grid by more than a tenth of a frame somewhere: then only times tell when
+            a frame was taken, and frame number / fps does not.
+        rotation: degrees clockwise by which frames are turned for showing (phones): 0, 90, 180 or 270.
+        mirrored: whether they are mirrored as well (left-right, before turning).
+        start: time of the first frame on the file's own clock, in seconds.  Times on this package's clock start there at 0.
+        repeated: frames left out because they are not later than the frame before them.
+        dropped: frames missing in gaps of the timestamps (of the median interval).
+        codec: as FFmpeg calls it.
+        notes: what a user should know.
+    """
+
+    path: Path
+    width: int
+    height: int
+    frames: int
+    duration: float
+    fps: float
+    nominal: float
+    variable: bool
+    rotation: int
+    mirrored: bool
+    start: float
+    repeated: int
+    dropped: int
+    codec: str
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Orientation:
+    """How a stored frame is brought upright: transpose, then flip; covers all eight ways to hold (and mirror) a camera."""
+
+    transpose: bool = False
+    flip_x: bool = False
+    flip_y: bool = False
+
+    @property
+    def mirrored(self) -> bool:
+        """Whether no rotation alone does it."""
+        return self.transpose ^ self.flip_x ^ self.flip_y
+
+    @property
+    def rotation(self) -> int:
+        """Degrees clockwise, of what is done after the mirroring (left-right), if there is one."""
+        # what a left-right mirror before the turn leaves: x flips along the stored x, which is the shown y after a transposition
+        flip_x = self.flip_x ^ (self.mirrored and not self.transpose)
+        return (90 if flip_x else 270) if self.transpose else (180 if flip_x else 0)
+
+    def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The image ``(h, w, ...)`` upright."""
+        if self.transpose:
+            image = image.swapaxes(0, 1)
+        return image[:: -1 if self.flip_y else 1, :: -1 if self.flip_x else 1]
+
+    def size(self, width: int, height: int) -> tuple[int, int]:
+        """(width, height) as shown of (width, height) as stored, and back."""
+        return (height, width) if self.transpose else (width, height)
+
+
+def orientation(frame: Any) -> Orientation:
+    """How to bring PyAV's frame upright, by its display matrix (x' = a x + c y, y' = b x + d y in pixels, y down)."""
+    for data in frame.side_data:
+        if data.type.name == "DISPLAYMATRIX":
+            a, b, _, c, d = np.frombuffer(bytes(data), np.int32)[:5].tolist()
+            if abs(c) > abs(a):
+                return Orientation(True, c < 0, b < 0)
+            return Orientation(False, a < 0, d < 0)
+    return Orientation()
+
+
+@contextmanager
+def opened(path: str | Path) -> Iterator[tuple[Any, Any]]:
+    """PyAV's container and its video stream.
+
+    Raises:
+        ValueError: there is no such file, it is no video, or nothing can be read of it.
+    """
+    name = repr(str(path))
+    try:
+        size = size_of(path)
+    except ValueError as problem:
+        raise ValueError(f"video {name}: {str(problem).removeprefix(f'{path}: ')}") from None
+    try:
+        # tags may hold other bytes than text, and a playlist may name other files, or what is on the net
+        container = av().open(f"file:{path}", metadata_errors="replace", options={"protocol_whitelist": "file"})
+    except (av().FFmpegError, OSError, ValueError) as error:
+        cause = "is empty" if size == 0 else f"cannot be read as video ({_said(error)}): cut off, damaged, or no video"
+        raise ValueError(f"video {name}: the file {cause}; {REMEDY}") from error
+    with container:
+        # cover pictures of audio files are video streams, too; and FFmpeg draws text files as pictures of themselves
+        streams = [s for s in container.streams.video if not _is_cover(s)] if container.format.name != "tty" else []
+        if not streams:
+            has = ", ".join(sorted({s.type for s in container.streams})) if container.format.name != "tty" else "text"
+            raise ValueError(f"video {name}: has no video stream (it has: {has or 'nothing'}); give a video file, or {REMEDY}")
+        known = [s for s in streams if s.codec_context is not None]
+        if not known:
+            raise ValueError(f"video {name}: is packed by a codec that is not known here; {REMEDY}")
+        stream = max(known, key=lambda s: (s.width or 0) * (s.height or 0))
+        stream.thread_type = "AUTO"
+        yield container, stream
+
+
+def packets(container: Any, stream: Any, failed: list[str]) -> Iterator[Any]:
+    """The stream's packets up to the end, or up to where the file cannot be read; then ``failed`` says why."""
+    source = container.demux(stream)
+    while True:
+        try:
+            yield next(source)
+        except StopIteration:
+            return
+        except av().FFmpegError as error:
+            failed.append(_said(error))
+            return
+
+
+def probe(path: str | Path, *, fps: float | None = None) -> VideoInfo:
+    """Size, frames, times and orientation of a video file; reads the file once, and decodes its first frame only.
+
+    Args:
+        path: of the file.
+        fps: frames per second of a file without timestamps (raw H.264); default 30, and a note says so.
+
+    Raises:
+        ValueError: the file cannot be read, or has no frame that can be decoded.
+
+    Example:
+        >>> probe("nothing.mp4")
+        Traceback (most recent call last):
+        ...
+        ValueError: video 'nothing.mp4': no such file; check the path
+    """
+    failed: list[str] = []
+    stamps: list[int | None] = []
+    first = None
+    with opened(path) as (container, stream):
+        for packet in packets(container, stream, failed):
+            if packet.size and not packet.is_discard:
+                stamps.append(packet.pts)
+            if first is None:
+                with suppress(av().FFmpegError):
+                    first = next(iter(packet.decode()), None)
+        if first is None:
+            raise nothing_decoded(path, len(stamps))
+        upright = orientation(first)
+        width, height = upright.size(first.width, first.height)
+        base, zero = float(stream.time_base), stream.start_time
+        nominal = float(stream.average_rate or stream.guessed_rate or 0)
+        claimed = stream.duration * base if stream.duration else None
+        codec = stream.codec_context.name
+    timed = np.sort(np.array([s for s in stamps if s is not None], np.float64)) * base
+    notes = [f"reading stopped early: {text}" for text in failed]
+    if len(timed) < 0.5 * len(stamps):
+        notes.append(untimed(fps))
+        timed, zero, nominal = np.arange(len(stamps)) / (fps or UNTIMED_FPS), 0, 0.0
+    start = timed[0] if zero is None else zero * base
+    times = np.unique(timed)
+    uneven, dropped = evenness(times, base)
+    duration = float(times[-1] - times[0])
+    repeated = len(timed) - len(times)
+    notes += _notes(uneven, dropped, repeated, claimed, times[-1] - start, upright)
+    return VideoInfo(
+        path=Path(path), width=width, height=height, frames=len(times), duration=duration,
+        fps=(len(times) - 1) / duration if duration else nominal, nominal=nominal, variable=uneven > UNEVEN,
+        rotation=upright.rotation, mirrored=upright.mirrored, start=float(start), repeated=repeated, dropped=dropped, codec=codec,
+        notes=tuple(notes),
+    )  # fmt: skip
+
+
+def evenness(times: NDArray[np.float64], tick: float = 0.0) -> tuple[float, int]:
+    """How far times lie off the even grid from first to last, in frames, and how many frames are missing in gaps.
+
+    Args:
+        times: ``(frames,)`` seconds, increasing.
+        tick: seconds to which they were rounded; up to that much is not held against them.
+
+    Example:
+        >>> import numpy as np
+        >>> evenness(np.array([0.0, 1, 2, 3, 5, 6, 7, 8]))[1]
+        1
+        >>> evenness(np.arange(10) / 30)[0] < 1e-9
+        True
+    """
+    if len(times) < 3:
+        return 0.0, 0
+    grid = np.linspace(times[0], times[-1], len(times))
+    off = np.clip(np.abs(times - grid) - tick, 0, None).max() * (len(times) - 1) / (times[-1] - times[0])
+    steps = np.diff(times)
+    usual = np.median(steps)
+    missing = np.rint(steps / usual)[steps > 1.5 * usual + tick] - 1
+    return float(off), int(missing.clip(0).sum())
+
+
+def untimed(fps: float | None) -> str:
+    """The note for files without times."""
+    return (
+        f"the file has no timestamps: {fps:g} fps as given" if fps else f"the file has no timestamps: {UNTIMED_FPS:g} fps assumed"
+    )
+
+
+def nothing_decoded(path: str | Path, received: int) -> ValueError:
+    """The error for files with not one frame."""
+    cause = f"none of its {received} frames can be decoded" if received else "it has a video stream, but no frames: cut off?"
+    return ValueError(f"video {str(path)!r}: {cause}; {REMEDY}")
+
+
+def cut_off(claimed: float | None, end: float) -> list[str]:
+    """A note where pictures end (``end`` seconds) well before the file says they do, else none."""
+    if claimed is None or claimed - end < max(MISSING_END[0], MISSING_END[1] * claimed):
+        return []
+    return [f"the file says {claimed:.2f} s, but its pictures end at {end:.2f} s: cut off or damaged; what is there is used"]
+
+
+def _notes(uneven: float, dropped: int, repeated: int, claimed: float | None, end: float, upright: Orientation) -> list[str]:
+    notes = []
+    if uneven > UNEVEN:
+        gaps = f", {dropped} frames dropped" if dropped else ""
+        notes.append(f"variable frame rate (frames up to {uneven:.1f} frames off an even grid{gaps}): timestamps are used")
+    if repeated:
+        notes.append(f"{repeated} frames repeat the time of another one and are left out")
+    if upright.mirrored:
+        notes.append("the file asks for mirrored pictures (selfie camera): shown mirrored, as the file says")
+    return notes + cut_off(claimed, end)
+
+
+def _is_cover(stream: Any) -> bool:
+    return "attached_pic" in str(stream.disposition).lower()
+
+
+def _said(error: BaseException) -> str:
+    return str(getattr(error, "strerror", None) or error)
 
 
 class Chunk(NamedTuple):

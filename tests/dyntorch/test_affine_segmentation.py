@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from dyntorch.algebra.affine_segmentation import affine_segmentation
-from dyntorch.algebra.homogeneous import homogeneous
+from dyntorch.geometry.homogeneous import homogeneous
 from dyntorch.metrics import relative_error
+from dyntorch.tasks.segment.affine import affine_segmentation
 
 
 def bodies(*batch, counts=(20, 20), sigma=0.0, planar=False, seed=0):

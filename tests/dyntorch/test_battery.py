@@ -3,7 +3,7 @@
 import pytest
 
 import dyntorch as dyn
-from dyntorch.invariant import Invariant
+from dyntorch.core.invariant import Invariant
 from tests import battery_input, battery_noise  # noqa: F401 - they add to the list
 from tests.battery import CHECKS
 from tests.cases import CASES

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import dyntorch as dyn
-from dyntorch.blocks import LARGE, map_blocks, one_thread, workers
+from dyntorch.numerics.blocks import LARGE, map_blocks, one_thread, workers
 
 
 @pytest.fixture

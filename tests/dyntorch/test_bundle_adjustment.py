@@ -5,10 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from dyntorch.algebra.triangulation import reproject
-from dyntorch.bundle_adjustment import bundle_adjust
-from dyntorch.bundle_information import point_information, structure_covariance
-from dyntorch.bundle_problem import BundleProblem
+from dyntorch.geometry.bundle import BundleProblem, bundle_adjust, point_information, structure_covariance
+from dyntorch.geometry.triangulation import reproject
 from dyntorch.scenes import lifted
 
 

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from dyntorch.chi_square import median, quantile, three_sigma
+from dyntorch.numerics.chi_square import median, quantile, three_sigma
 
 
 @pytest.mark.parametrize("probability", [1e-6, 0.1, 0.5, 0.99, 1 - 1e-6])

@@ -6,31 +6,30 @@ from pathlib import Path
 import pytest
 import torch
 
-from dyntorch import eigenspace, lags, matrix
-from dyntorch.algebra import (
-    covariances,
-    dynamic_shape_rows,
-    dynamic_shape_theory,
-    epipolar,
-    epipolar_descent,
-    epipolar_variance,
-    epipole_pairs,
-    extensors,
-    exterior,
-    grassmann,
-    grassmann_nearest,
-    grassmann_recovery,
-    infinity_extensors,
-    monomials,
-    shape_completion,
-    shape_points,
-    shape_rows,
-)
-from dyntorch.algebra.dynamic_shape_basis import Polynomial
-from dyntorch.constants import constant
-from dyntorch.invariants import shape_residual
-from dyntorch.primitives import base, plane
-from dyntorch.tasks import planes_problem, planes_starts
+from dyntorch.core import matrix
+from dyntorch.core import primitives as base
+from dyntorch.core import primitives as plane
+from dyntorch.geometry import epipolar, extensors, grassmann, grassmann_nearest
+from dyntorch.geometry import epipolar as epipolar_variance
+from dyntorch.geometry import epipolar_fit as epipolar_descent
+from dyntorch.geometry import extensors as exterior
+from dyntorch.geometry import grassmann as grassmann_recovery
+from dyntorch.geometry import homogeneous as monomials
+from dyntorch.geometry import pairs as epipole_pairs
+from dyntorch.invariants import dynamic_shape_tensor as dynamic_shape_rows
+from dyntorch.invariants import shape_tensor as shape_residual
+from dyntorch.numerics import lags
+from dyntorch.numerics import lags as covariances
+from dyntorch.numerics import nullspace as eigenspace
+from dyntorch.numerics.blocks import constant
+from dyntorch.shapes import static as shape_completion
+from dyntorch.shapes import static as shape_points
+from dyntorch.shapes import static as shape_rows
+from dyntorch.shapes import theory as dynamic_shape_theory
+from dyntorch.shapes.basis import Polynomial
+from dyntorch.tasks.planes import closed_forms as infinity_extensors
+from dyntorch.tasks.planes import problem as planes_problem
+from dyntorch.tasks.planes import problem as planes_starts
 
 CPU = torch.device("cpu")
 TABLES = [

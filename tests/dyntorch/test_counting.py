@@ -10,7 +10,7 @@ from math import comb, prod
 import numpy as np
 import pytest
 
-from dyntorch.counting import (
+from dyntorch.counting import (  # fmt: skip
     CONFIGURATIONS,
     Count,
     Field,
@@ -21,10 +21,9 @@ from dyntorch.counting import (
     partitions,
     semistandard_tableaux,
     standard_tableaux,
-)  # fmt: skip
-from dyntorch.counting.field import Echelon
+)
+from dyntorch.counting.exact import LARGEST, Echelon
 from dyntorch.counting.ranks import PRIMES
-from dyntorch.counting.tally import LARGEST
 
 # ---------------------------------------------------------------------------------------------------- dim V
 

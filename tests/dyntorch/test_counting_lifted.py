@@ -9,7 +9,7 @@ import pytest
 
 from dyntorch.counting import CONFIGURATIONS, count, options_of
 from dyntorch.invariants.grassmann_tensor import GrassmannTensor
-from dyntorch.motions import MOTIONS
+from dyntorch.tasks.reconstruct.motions import MOTIONS
 
 TABLE = [  # of all applications: profile, unknowns, matches and equations per match, dof of the tensor; ranks are one less
     ("constant_direction_2d", (2, 2), 9, 8, 1, 7),

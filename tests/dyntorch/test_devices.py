@@ -12,7 +12,7 @@ from torch import Tensor
 
 import dyntorch as dyn
 from dyntorch import scenes
-from dyntorch.devices import on_cpu
+from dyntorch.numerics.arguments import on_cpu
 from tests.device_verbs import NOT_VERBS, VERBS, WAITS, Verb, still_shape
 from tests.pretend_device import counted, moved, pretend_device
 

@@ -5,11 +5,20 @@ import math
 import pytest
 import torch
 
-from dyntorch.algebra.dynamic_shape import fit_shapes
-from dyntorch.algebra.dynamic_shape_basis import Fourier, Polynomial
-from dyntorch.algebra.dynamic_shape_descent import Descent, canonical, centred_views, cost_of, framed
-from dyntorch.algebra.dynamic_shape_linear import complete, graph_start, pooled_start, window_start
-from dyntorch.algebra.dynamic_shape_time import recover_times
+from dyntorch.shapes.basis import Fourier, Polynomial
+from dyntorch.shapes.moving import (
+    Descent,
+    canonical,
+    centred_views,
+    complete,
+    cost_of,
+    fit_shapes,
+    framed,
+    graph_start,
+    pooled_start,
+    window_start,
+)
+from dyntorch.shapes.times import recover_times
 from tests.dyntorch.moving_views import LINEAR, SQUARE, WAVE, draw, moving_views
 
 

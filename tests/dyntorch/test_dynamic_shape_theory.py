@@ -3,10 +3,10 @@
 import pytest
 import torch
 
-from dyntorch.algebra.dynamic_shape_basis import Polynomial
-from dyntorch.algebra.dynamic_shape_rows import annihilator, graph_of
-from dyntorch.algebra.dynamic_shape_theory import moving_point, reference_plane_rows, resultant, six_point_rows
-from dyntorch.nullspace import null_space
+from dyntorch.invariants.dynamic_shape_tensor import annihilator, graph_of
+from dyntorch.numerics.nullspace import null_space
+from dyntorch.shapes.basis import Polynomial
+from dyntorch.shapes.theory import moving_point, reference_plane_rows, resultant, six_point_rows
 from tests.dyntorch.moving_views import LINEAR, SQUARE, draw, moving_views
 
 

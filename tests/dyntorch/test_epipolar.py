@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from dyntorch.algebra.epipolar import affine_fundamental, eight_point, null_vector, sampson_squared
-from dyntorch.algebra.epipolar_samples import draw, sample_fundamentals, seven_point
-from dyntorch.algebra.homogeneous import homogeneous, unit
+from dyntorch.geometry.epipolar import affine_fundamental, eight_point, null_vector, sampson_squared
+from dyntorch.geometry.epipolar_fit import draw, sample_fundamentals, seven_point
+from dyntorch.geometry.homogeneous import homogeneous, unit
 from dyntorch.scenes import two_view
 
 CENTRE, SIZE = torch.tensor([320.0, 240.0], dtype=torch.float64), 300.0

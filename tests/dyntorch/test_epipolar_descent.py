@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from dyntorch.algebra.epipolar import Monomials, affine_fundamental, eight_point, sampson_squared
-from dyntorch.algebra.epipolar_descent import Frames, Products, _normal_equations, descend, fit_fundamental
-from dyntorch.algebra.homogeneous import skew, unit
+from dyntorch.geometry.epipolar import Monomials, affine_fundamental, eight_point, sampson_squared
+from dyntorch.geometry.epipolar_fit import Frames, Products, _normal_equations, descend, fit_fundamental
+from dyntorch.geometry.homogeneous import skew, unit
 from tests.dyntorch.test_epipolar import distance, random, rms, scene
 
 ONES = torch.ones(1, 60, dtype=torch.float64)

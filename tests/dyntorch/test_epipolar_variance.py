@@ -5,9 +5,8 @@ import pytest
 import scipy.linalg
 import torch
 
-from dyntorch.algebra.epipolar import sampson_squared
-from dyntorch.algebra.epipolar_variance import epipolar_variance, gradient_moments
-from dyntorch.algebra.homogeneous import homogeneous
+from dyntorch.geometry.epipolar import epipolar_variance, gradient_moments, sampson_squared
+from dyntorch.geometry.homogeneous import homogeneous
 from dyntorch.scenes import filmed
 
 

@@ -5,7 +5,7 @@ from itertools import combinations_with_replacement
 import pytest
 import torch
 
-from dyntorch.algebra.epipole_pairs import factor_product, product_matrix
+from dyntorch.geometry.pairs import factor_product, product_matrix
 from dyntorch.scenes import bodies
 
 

@@ -5,8 +5,8 @@ from itertools import combinations, permutations
 import pytest
 import torch
 
-from dyntorch.algebra.extensors import compound, dual, join, levi_civita, meet, plucker, plucker_form
-from dyntorch.algebra.homogeneous import apply, homogeneous, inhomogeneous
+from dyntorch.geometry.extensors import compound, dual, join, levi_civita, meet, plucker, plucker_form
+from dyntorch.geometry.homogeneous import apply, homogeneous, inhomogeneous
 
 
 def random(*shape, seed=0, dtype=torch.float64):

@@ -6,8 +6,7 @@ from math import comb
 import pytest
 import torch
 
-from dyntorch.algebra.extensors import compound, dual, join, meet
-from dyntorch.algebra.exterior import check_extensor, extensor_of, regressive, subspace_of, wedge
+from dyntorch.geometry.extensors import check_extensor, compound, dual, extensor_of, join, meet, regressive, subspace_of, wedge
 
 STEPS = [(n, a, b) for n in range(4, 10) for a in range(1, n) for b in sorted({1, 2, n // 2, n - 2, n - 1})]
 

@@ -7,8 +7,9 @@ import pytest
 import torch
 
 import dyntorch as dyn
-from dyntorch import fitting, metrics, scenes
-from dyntorch.solution import Solution, Status
+from dyntorch import metrics, scenes
+from dyntorch.core import fit as fitting
+from dyntorch.core.solution import Solution, Status
 from tests.cases import CASES, moved_views
 from tests.references import apart, matrices, noisy, spans
 

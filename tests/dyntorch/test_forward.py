@@ -8,9 +8,9 @@ import pytest
 import torch
 
 import dyntorch as dyn
-from dyntorch.forward import by_match, derivatives, jacobian, normalized_derivative
-from dyntorch.invariant import Invariant
-from dyntorch.invariants.constant_velocity_residual import inverses
+from dyntorch.core.invariant import Invariant
+from dyntorch.invariants.constant_velocity_tensor import inverses
+from dyntorch.numerics.least_squares import by_match, derivatives, jacobian, normalized_derivative
 
 THETA = torch.randn(3, 48, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
 

@@ -6,9 +6,9 @@ from math import comb
 import pytest
 import torch
 
-from dyntorch.algebra.extensors import compound
-from dyntorch.algebra.grassmann import grassmann_derivative, grassmann_tensor
-from dyntorch.algebra.homogeneous import hyperplanes_through, inhomogeneous
+from dyntorch.geometry.extensors import compound
+from dyntorch.geometry.grassmann import grassmann_derivative, grassmann_tensor
+from dyntorch.geometry.homogeneous import hyperplanes_through, inhomogeneous
 
 # profile, rows of each view
 PROFILES = [

@@ -3,10 +3,10 @@
 import pytest
 import torch
 
-from dyntorch.algebra.extensors import compound
-from dyntorch.algebra.grassmann import grassmann_tensor
-from dyntorch.algebra.grassmann_nearest import _Nearest, projections_of
-from dyntorch.forward import jacobian
+from dyntorch.geometry.extensors import compound
+from dyntorch.geometry.grassmann import grassmann_tensor
+from dyntorch.geometry.grassmann_nearest import _Nearest, projections_of
+from dyntorch.numerics.least_squares import jacobian
 from tests.dyntorch.test_grassmann_recovery import CASES, distance, random, relative, scene
 
 FULL = [((3, 1), (3, 3)), ((2, 2, 2), (3, 2, 3))]

@@ -3,9 +3,8 @@
 import pytest
 import torch
 
-from dyntorch.algebra.extensors import compound
-from dyntorch.algebra.grassmann import grassmann_tensor
-from dyntorch.algebra.grassmann_recovery import balanced, candidates, rotated, tables
+from dyntorch.geometry.extensors import compound
+from dyntorch.geometry.grassmann import balanced, candidates, grassmann_tensor, rotated, tables
 
 CASES = [
     ((2, 1), (3, 3)),

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from dyntorch.algebra.homogeneous import (
+from dyntorch.geometry.homogeneous import (
     apply,
     homogeneous,
     hyperplanes_through,

@@ -10,18 +10,15 @@ from torch import Tensor
 
 import dyntorch as dyn
 from dyntorch import scenes
-from dyntorch.algebra.affine_segmentation import affine_segmentation
-from dyntorch.algebra.factorization import affine_factorization
-from dyntorch.algebra.infinity_from_planes import infinity_closed_form
-from dyntorch.algebra.subspaces import canonical_correlation, orthonormal_basis
-from dyntorch.algebra.triangulation import reproject, resect, triangulate
-from dyntorch.bundle_adjustment import bundle_adjust
-from dyntorch.bundle_information import structure_covariance
 from dyntorch.counting import count, dim_v
-from dyntorch.eigenspace import eigenvalues, real_eigenvalues, spectrum
+from dyntorch.geometry.bundle import bundle_adjust, structure_covariance
+from dyntorch.geometry.triangulation import reproject, resect, triangulate
 from dyntorch.invariants.multibody import multibody_matrix
-from dyntorch.nullspace import null_space
-from dyntorch.sampling import Draws
+from dyntorch.numerics.blocks import Draws
+from dyntorch.numerics.nullspace import eigenvalues, null_space, real_eigenvalues, spectrum
+from dyntorch.numerics.subspaces import affine_factorization, canonical_correlation, orthonormal_basis
+from dyntorch.tasks.planes.closed_forms import infinity_closed_form
+from dyntorch.tasks.segment.affine import affine_segmentation
 
 F64 = torch.float64
 

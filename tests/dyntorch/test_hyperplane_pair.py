@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from dyntorch.algebra.hyperplane_pair import hyperplane_pair
+from dyntorch.geometry.pairs import hyperplane_pair
 
 
 def random(*shape, seed=0):

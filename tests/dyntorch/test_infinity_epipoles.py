@@ -3,9 +3,8 @@
 import pytest
 import torch
 
-from dyntorch.algebra.homogeneous import skew
-from dyntorch.algebra.infinity_epipoles import infinity_from_fundamentals, infinity_from_mixed
-from dyntorch.algebra.infinity_extensors import infinity_linear
+from dyntorch.geometry.homogeneous import skew
+from dyntorch.tasks.planes.closed_forms import infinity_from_fundamentals, infinity_from_mixed, infinity_linear
 from tests.dyntorch.test_rank_one_pencils import error, normal, planes
 
 

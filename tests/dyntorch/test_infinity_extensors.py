@@ -3,10 +3,10 @@
 import pytest
 import torch
 
-from dyntorch.algebra import infinity_extensors
-from dyntorch.algebra.exterior import extensor_of, wedge
-from dyntorch.algebra.homogeneous import skew
-from dyntorch.algebra.infinity_extensors import infinity_linear, infinity_thesis
+from dyntorch.geometry.extensors import extensor_of, wedge
+from dyntorch.geometry.homogeneous import skew
+from dyntorch.tasks.planes import closed_forms as infinity_extensors
+from dyntorch.tasks.planes.closed_forms import infinity_linear, infinity_thesis
 from tests.dyntorch.test_rank_one_pencils import error, normal, planes
 
 KINDS = ["generic", "collinear", "coplanar", "both", "pair", "triple", "static"]

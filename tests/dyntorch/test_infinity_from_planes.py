@@ -3,9 +3,8 @@
 import pytest
 import torch
 
-from dyntorch.algebra.homogeneous import skew
-from dyntorch.algebra.infinity_extensors import infinity_linear
-from dyntorch.algebra.infinity_from_planes import infinity_closed_form
+from dyntorch.geometry.homogeneous import skew
+from dyntorch.tasks.planes.closed_forms import infinity_closed_form, infinity_linear
 from tests.dyntorch.test_rank_one_pencils import error, normal, planes
 
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 import dyntorch as dyn
-from dyntorch.invariant import ARGUMENTS, Frame, Invariant, as_invariant, on_class
-from dyntorch.primitives import HyperplanesThrough, Line, Point
+from dyntorch.core.invariant import ARGUMENTS, Frame, Invariant, as_invariant, on_class
+from dyntorch.core.primitives import HyperplanesThrough, Line, Point
 
 
 @pytest.mark.parametrize(

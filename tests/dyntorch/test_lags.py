@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from dyntorch import lags
-from dyntorch.algebra import correlation
-from dyntorch.algebra.correlation import correlate
+from dyntorch.numerics import lags
+from dyntorch.numerics import lags as correlation
+from dyntorch.numerics.lags import correlate
 
 WINDOWS = [
     (6, 6, None),
@@ -69,8 +69,8 @@ def test_pieces_for_memory_change_nothing(monkeypatch):
     a, b = normal(0, 2, 50, 7), normal(1, 2, 60, 5)
     expected = lags.lag_products(a, b, (-9, 9)), *lags.lag_covariances(a, b, (-9, 9))
     monkeypatch.setattr(correlation, "ELEMENTS", 5 * 80 * 2)
-    monkeypatch.setattr("dyntorch.algebra.covariances.ELEMENTS", 1)
-    monkeypatch.setattr("dyntorch.algebra.covariances.LEAST", 4)
+    monkeypatch.setattr("dyntorch.numerics.lags.ELEMENTS", 1)
+    monkeypatch.setattr("dyntorch.numerics.lags.LEAST", 4)
     found = lags.lag_products(a, b, (-9, 9)), *lags.lag_covariances(a, b, (-9, 9))
     for x, y in zip(found, expected, strict=True):
         assert_same(x, y)

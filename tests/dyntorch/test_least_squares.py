@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from dyntorch.least_squares import damped_step
+from dyntorch.numerics.least_squares import damped_step
 
 
 def problem(b=3, p=5):

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from dyntorch.algebra.lens import Division, distort, undistort, undistorted
+from dyntorch.geometry.lens import Division, distort, undistort, undistorted
 
 K = torch.tensor([[1100.0, 0.0, 950.0], [0.0, 1080.0, 530.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
 LENSES = {

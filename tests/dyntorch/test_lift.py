@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from dyntorch.algebra.lift import balanced, gauge_algebra, kernel, least_views, upgrade
+from dyntorch.geometry.lift import balanced, gauge_algebra, kernel, least_views, upgrade
 
 
 def random(*shape, seed=0):

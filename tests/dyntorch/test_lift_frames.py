@@ -7,10 +7,9 @@ import torch
 from torch import Tensor
 
 from dyntorch import scenes
-from dyntorch.algebra.lift import balanced, gauge_algebra
-from dyntorch.algebra.lift_frames import centred, finite, moved, steady
-from dyntorch.algebra.triangulation import reproject
-from dyntorch.motions import MOTIONS
+from dyntorch.geometry.lift import balanced, centred, finite, gauge_algebra, moved, steady
+from dyntorch.geometry.triangulation import reproject
+from dyntorch.tasks.reconstruct.motions import MOTIONS
 
 F64 = torch.float64
 LIFTED = [name for name, motion in MOTIONS.items() if motion.lift is not None]

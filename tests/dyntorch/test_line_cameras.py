@@ -3,9 +3,8 @@
 import pytest
 import torch
 
-from dyntorch.algebra.extensors import join, plucker_form
-from dyntorch.algebra.klein_quadric import klein_frame, lines_of_pencil, nearest_line
-from dyntorch.algebra.line_cameras import camera_of_lines, cameras_of_lines, line_camera
+from dyntorch.geometry.extensors import join, plucker_form
+from dyntorch.geometry.lines import camera_of_lines, cameras_of_lines, klein_frame, line_camera, lines_of_pencil, nearest_line
 
 J = plucker_form()
 

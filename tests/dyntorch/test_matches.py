@@ -4,7 +4,7 @@ import pytest
 import torch
 
 import dyntorch as dyn
-from dyntorch.matches import Matches, matches
+from dyntorch.core.matches import Matches, matches
 
 H = dyn.HomographyTensor()
 

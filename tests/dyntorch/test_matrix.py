@@ -4,8 +4,9 @@ import pytest
 import torch
 
 import dyntorch as dyn
-from dyntorch import matrix, primitives
-from dyntorch.matrix import estimation_matrix, gram
+from dyntorch import primitives
+from dyntorch.core import matrix
+from dyntorch.core.matrix import estimation_matrix, gram
 from tests.cases import CASES
 from tests.references import matrices
 

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from dyntorch.algebra.homogeneous import apply, similarity, skew
+from dyntorch.geometry.homogeneous import apply, similarity, skew
 from dyntorch.metrics import (
     affine_gauge,
     grid_transfer_error,

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from dyntorch.algebra.lift import gauge_algebra
+from dyntorch.geometry.lift import gauge_algebra
 from dyntorch.metrics import body_error, lifted_error
 from dyntorch.scenes import lifted
 

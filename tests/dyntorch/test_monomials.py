@@ -5,8 +5,8 @@ from itertools import combinations_with_replacement
 import pytest
 import torch
 
-from dyntorch.algebra.monomials import collecting, monomial_derivatives, monomials, multiplicity, symmetric
-from dyntorch.primitives import Monomials
+from dyntorch.core.primitives import Monomials
+from dyntorch.geometry.homogeneous import collecting, monomial_derivatives, monomials, multiplicity, symmetric
 
 ALL = [Monomials(d, k, isometric) for d in (1, 2, 3) for k in (1, 2, 4) for isometric in (False, True)]
 

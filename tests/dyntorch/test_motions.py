@@ -7,7 +7,7 @@ import torch
 
 import dyntorch as dyn
 from dyntorch import scenes
-from dyntorch.motions import MOTIONS, Motion, as_motion, polynomial
+from dyntorch.tasks.reconstruct.motions import MOTIONS, Motion, as_motion, polynomial
 
 # k, profile of the fewest views that determine the scene, those views and matches, dimension of the ambiguity
 TABLE = {

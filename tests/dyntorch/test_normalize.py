@@ -4,9 +4,9 @@ import pytest
 import torch
 
 import dyntorch as dyn
-from dyntorch.invariant import Frame, Invariant
-from dyntorch.normalize import denormalize, denormalize_motion, normalization, normalize_motion
-from dyntorch.primitives import Point
+from dyntorch.core.invariant import Frame, Invariant
+from dyntorch.core.normalize import denormalize, denormalize_motion, normalization, normalize_motion
+from dyntorch.core.primitives import Point
 from tests.cases import CASES
 
 SIMPLE = [case for case in CASES if case.invariant.copies is None]

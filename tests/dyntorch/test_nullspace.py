@@ -4,8 +4,9 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from dyntorch import eigenspace, nullspace
-from dyntorch.nullspace import gram_null_space, null_space
+from dyntorch.numerics import nullspace
+from dyntorch.numerics import nullspace as eigenspace
+from dyntorch.numerics.nullspace import gram_null_space, null_space
 
 aten = torch.ops.aten
 

@@ -4,7 +4,7 @@ import itertools
 
 import torch
 
-from dyntorch.algebra.partition import order_of_bodies
+from dyntorch.geometry.pairs import order_of_bodies
 
 
 def by_hand(labels, count):

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from dyntorch.algebra.homogeneous import apply, homogeneous, unit
-from dyntorch.algebra.plane_homography import (
+from dyntorch.geometry.homogeneous import apply, homogeneous, unit
+from dyntorch.geometry.homography import (
     _normal_equations,
     _terms,
     affine_homography,

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from dyntorch.primitives import Hyperplane, HyperplanesThrough, Line, Point, Projected
+from dyntorch.core.primitives import Hyperplane, HyperplanesThrough, Line, Point, Projected
 from tests.references import free_vectors, plucker, subdeterminants
 
 G = torch.Generator()

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from dyntorch.algebra.projective_factorization import projective_factorization
+from dyntorch.tasks.reconstruct.factorization import projective_factorization
 
 CALIBRATION = torch.tensor([[1300.0, 0.0, 500.0], [0.0, 1300.0, 500.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
 

@@ -3,14 +3,8 @@
 import pytest
 import torch
 
-from dyntorch.algebra.homogeneous import skew
-from dyntorch.algebra.rank_one_pencils import (
-    plane_parts,
-    rank_one_scale,
-    second_singular_value,
-    unit_determinant,
-)
-from dyntorch.algebra.rank_two import rank_one
+from dyntorch.geometry.homogeneous import rank_one, skew
+from dyntorch.tasks.planes.closed_forms import plane_parts, rank_one_scale, second_singular_value, unit_determinant
 
 
 def normal(*shape, seed=0):

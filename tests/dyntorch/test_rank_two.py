@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from dyntorch.algebra.rank_two import cofactors, null_vectors
+from dyntorch.geometry.homogeneous import cofactors, null_vectors
 
 
 def random(*shape, seed=0, dtype=torch.float64):

@@ -4,7 +4,8 @@ import pytest
 import torch
 
 import dyntorch as dyn
-from dyntorch import metrics, refinement, scenes
+from dyntorch import metrics, scenes
+from dyntorch.core import refine as refinement
 from tests.cases import CASES
 from tests.references import first_order, noisy
 

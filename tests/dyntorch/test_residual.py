@@ -7,7 +7,7 @@ import torch
 
 import dyntorch as dyn
 from dyntorch import scenes
-from dyntorch.residual import distance, multilinear, multilinear_derivative, whiten
+from dyntorch.core.residual import distance, multilinear, multilinear_derivative, whiten
 from tests.cases import CASES
 from tests.references import noisy
 

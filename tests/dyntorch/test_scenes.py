@@ -4,8 +4,8 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from dyntorch.algebra.extensors import compound, plucker, plucker_form
-from dyntorch.algebra.homogeneous import apply, homogeneous, hyperplanes_through, unit
+from dyntorch.geometry.extensors import compound, plucker, plucker_form
+from dyntorch.geometry.homogeneous import apply, homogeneous, hyperplanes_through, unit
 from dyntorch.scenes import collineation, constant_velocity, lines_concurrent, moving_points, planar, translating_lines, two_view
 
 THREE_VIEWS = [planar, lines_concurrent, moving_points, constant_velocity]

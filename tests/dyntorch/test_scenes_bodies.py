@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from dyntorch.algebra.homogeneous import apply, homogeneous, skew, unit
+from dyntorch.geometry.homogeneous import apply, homogeneous, skew, unit
 from dyntorch.scenes import bodies
 
 K = torch.tensor([[800.0, 0.0, 320.0], [0.0, 800.0, 240.0], [0.0, 0.0, 1.0]], dtype=torch.float64)

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from dyntorch.algebra.homogeneous import homogeneous, inhomogeneous
-from dyntorch.algebra.lens import Division
+from dyntorch.geometry.homogeneous import homogeneous, inhomogeneous
+from dyntorch.geometry.lens import Division
 from dyntorch.scenes import filmed
 
 

@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from dyntorch.scenes import lifted
-from dyntorch.scenes.lifts import KINDS, OUTLIER
+from dyntorch.scenes.lifts import KINDS
+from dyntorch.scenes.scene import OUTLIER
 
 DIRECTION_2D, VELOCITY_2D, ACCELERATION_2D = "constant_direction_2d", "constant_velocity_2d", "constant_acceleration_2d"
 DIRECTION_3D, PLANES_3D, VELOCITY_3D = "constant_direction_3d", "constant_velocity_planes_3d", "constant_velocity_3d"

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from dyntorch.algebra.homogeneous import apply, homogeneous, skew
+from dyntorch.geometry.homogeneous import apply, homogeneous, skew
 from dyntorch.metrics import relative_error
 from dyntorch.scenes import translating_planes
 

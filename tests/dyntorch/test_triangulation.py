@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from dyntorch.algebra.triangulation import observed, reproject, resect, triangulate
+from dyntorch.geometry.triangulation import observed, reproject, resect, triangulate
 
 CASES = [(3, 2, 3), (4, 2, 3), (5, 2, 4), (6, 2, 5), (6, 3, 3), (2, 1, 4), (3, 1, 5)]  # k, dim, views
 

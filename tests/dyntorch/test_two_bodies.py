@@ -3,9 +3,8 @@
 import pytest
 import torch
 
-from dyntorch.algebra.homogeneous import homogeneous, inhomogeneous
-from dyntorch.algebra.hyperplane_pair import hyperplane_pair
-from dyntorch.algebra.two_bodies import two_bodies
+from dyntorch.geometry.homogeneous import homogeneous, inhomogeneous
+from dyntorch.geometry.pairs import hyperplane_pair, two_bodies
 
 N, FIRST = 20, 12
 LABELS = torch.where(torch.arange(N) < FIRST, 1, 2)

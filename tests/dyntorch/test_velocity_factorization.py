@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from dyntorch.algebra.velocity_factorization import velocity_factorization
+from dyntorch.tasks.reconstruct.factorization import velocity_factorization
 
 TIMES = torch.tensor([3.0, 3.5, 4.5, 5.0, 6.5, 7.0, 8.5, 9.0], dtype=torch.float64)
 

@@ -166,7 +166,7 @@ def _sets(folder: Path) -> list[Seed]:
 
 def films_read(path: Path) -> Any:
     """Read a film set, and look at every film."""
-    from indexing.readers.filmset import holds_frames, read_film_set
+    from indexing.readers.clipset import holds_frames, read_film_set
 
     holds_frames(path)
     return [(film.duration, len(film), film.label, film.frames) for film in read_film_set(path)]
@@ -240,7 +240,7 @@ def _other_joints(joints: int) -> Any:
 # ---- points, pairs, tracks -----------------------------------------------------------------------------------------------
 def points(path: Path) -> Any:
     """Read the views of an alignment."""
-    from indexing.readers.points import open_points, read_matches
+    from indexing.readers.matches import open_points, read_matches
 
     if path.suffix == ".npz":
         return read_matches([path])
@@ -317,7 +317,7 @@ def _pairs(folder: Path) -> list[Seed]:
 
 
 def _tracks(folder: Path) -> list[Seed]:
-    from indexing.readers.tracks.reading import read_tracks
+    from indexing.readers.tracks import read_tracks
 
     rng = np.random.default_rng(3)
     start, speed = rng.uniform(0, 500, (9, 2)), rng.normal(size=(9, 2))
@@ -351,7 +351,7 @@ def _tracks(folder: Path) -> list[Seed]:
 # ---- settings and pictures -----------------------------------------------------------------------------------------------
 def _settings(folder: Path) -> list[Seed]:
     from indexing.cli.inputs import read_truth
-    from indexing.syncing.calibration import read_calibration
+    from indexing.sync.calibration import read_calibration
 
     written(folder / "truth.csv", "label,start,end,file\na,0.1,0.5,session.json\nb,0.6,0.9,session.json\n")
     lens = "matrix = [[900.0, 0.0, 320.0], [0.0, 900.0, 240.0], [0.0, 0.0, 1.0]]\ndistortions = [-0.1, 0.0, 0.0, 0.0]\n"
@@ -371,7 +371,7 @@ def _settings(folder: Path) -> list[Seed]:
 def _pictures(folder: Path) -> list[Seed]:
     from PIL import Image
 
-    from indexing.readers.images import read_image
+    from indexing.readers.pairs import read_image
 
     image = np.random.default_rng(0).integers(0, 255, (24, 32), dtype=np.uint8)
     Image.fromarray(image).save(folder / "image.png")

@@ -11,9 +11,9 @@ import torch
 
 import dyntorch
 from indexing import ActionIndexer, Clip, ClipSet
+from indexing.action.bank import Windows
 from indexing.actors import ACTIONS, Person, dataset
 from indexing.cli import main
-from indexing.shape.bank import Windows
 from indexing.windows import ragged, whole
 from tests.indexing.syncing.scene import filmed, shift
 

@@ -162,7 +162,7 @@ def test_a_crash_in_learning_changes_nothing(unchanged, monkeypatch):
     def crash(*args, **kwargs):
         raise RuntimeError("out of memory")
 
-    monkeypatch.setattr("indexing.indexer.learn", crash)
+    monkeypatch.setattr("indexing.action.indexer.learn", crash)
     with pytest.raises(RuntimeError):
         unchanged.fit([Clip(good(s).joints[:, :5]) for s in range(2)], ["a", "b"])
     with pytest.raises(RuntimeError):

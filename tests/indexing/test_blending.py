@@ -7,14 +7,12 @@ import pytest
 import torch
 
 from indexing import ActionIndexer
+from indexing.action.bank import JointMetric, Windows, fused_residual
+from indexing.action.joint_weights import JointWeights
+from indexing.action.learning import BLENDS, _fewest_mistakes, _sharpened, blended, leave_out
+from indexing.action.model import Blend, evidence, without_own
 from indexing.actors import Person, dataset
 from indexing.scoring import probabilities, reject_threshold
-from indexing.shape.bank import Windows, fused_residual
-from indexing.shape.blending import BLENDS, _fewest_mistakes, _sharpened, blended, leave_out
-from indexing.shape.channels import JointMetric
-from indexing.shape.joint_weights import JointWeights
-from indexing.shape.knowing import evidence, without_own
-from indexing.shape.model import Blend
 
 ACTIONS = ("squat", "wave", "kick", "bow", "punch")
 
@@ -29,7 +27,7 @@ def equal_joints():
     """The weights of joints take seconds to learn, and have tests of their own."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(
-            "indexing.shape.learning.learn_joint_weights", lambda query, *_, **__: JointWeights.equal(query.values.shape[2])
+            "indexing.action.learning.learn_joint_weights", lambda query, *_, **__: JointWeights.equal(query.values.shape[2])
         )
         yield
 

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from indexing import ActionIndexer, Clip
-from indexing.report.body_parts import BodyParts, body_parts, body_parts_section, in_body, measure_body_parts
-from indexing.shape.bank import Windows
-from indexing.shape.importance import halves, importance
+from indexing.action.bank import Windows
+from indexing.action.learning import halves, importance
+from indexing.report.learned import BodyParts, body_parts, body_parts_section, in_body, measure_body_parts
 from indexing.skeleton import COCO17
 
 JOINTS, TELLING = 6, 2

@@ -13,16 +13,15 @@ from typing import get_args
 import numpy as np
 import pytest
 
+from indexing.action.indexer import ActionIndexer
 from indexing.actors import Person, dataset, detect, perform, stream
 from indexing.cli import main
+from indexing.cli.index import exemplars, within_label
 from indexing.cli.inputs import Example, Format, People, parse_example, read_truth
-from indexing.cli.protocol import Cameras, draw_shots, splits
-from indexing.cli.scan import exemplars, within_label
-from indexing.cli.selection import choose
+from indexing.cli.protocol import Cameras, choose, draw_shots, splits
 from indexing.clip import Clip, ClipSet
-from indexing.indexer import ActionIndexer
 from indexing.readers import FORMATS
-from indexing.readers.options import PEOPLE
+from indexing.readers.files import PEOPLE
 
 ACTIONS = ("squat", "wave", "kick")
 SCRIPT = "<script>alert(1)</script>"

@@ -14,9 +14,18 @@ import pytest
 import torch
 
 from dyntorch import scenes
-from indexing.report.alignment import FILES, AlignmentReport, as_json, labels_csv, write_alignment
-from indexing.report.alignment_page import display_scale, figures, turn_and_shift
-from indexing.report.alignment_picture import as_segments, carried
+from indexing.report.alignment import (
+    FILES,
+    AlignmentReport,
+    as_json,
+    as_segments,
+    carried,
+    display_scale,
+    figures,
+    labels_csv,
+    turn_and_shift,
+    write_alignment,
+)
 
 SCRIPT = "<script>alert(1)</script>"
 # torch's own, when it first loads its transforms; hidden outside of tests

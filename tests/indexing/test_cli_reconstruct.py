@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 import torch
 
-from dyntorch import metrics, motions, scenes
+from dyntorch import metrics, scenes
+from dyntorch.tasks.reconstruct import motions
 from indexing.cli.reconstruct import PURPOSE, REASONS, MotionName
 from indexing.report.reconstruction import FILES
 

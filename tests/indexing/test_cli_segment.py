@@ -15,8 +15,8 @@ import pytest
 import torch
 
 import dyntorch
-from dyntorch.tasks.notices import Notice, NoticeCode
-from dyntorch.tasks.segmentation import BodyModel, Segmentation
+from dyntorch.tasks.outcome import Notice, NoticeCode
+from dyntorch.tasks.segment.result import BodyModel, Segmentation
 from indexing.cli.segment import REASONS
 from indexing.report.segmentation import FILES
 

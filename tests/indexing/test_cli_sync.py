@@ -14,7 +14,7 @@ import pytest
 import torch
 
 import dyntorch
-from dyntorch.tasks.sync_cameras import synchronize_cameras
+from dyntorch.tasks.synchronize.cameras import synchronize_cameras
 from indexing.clip import Clip, ClipSet
 from tests.indexing.syncing.scene import FPS, SKIPPED, cut, filmed, shift, write_openpose
 

@@ -5,9 +5,9 @@ import pytest
 import torch
 
 from indexing import ActionIndexer, Clip
+from indexing.action.bank import fused_residual
 from indexing.actors import ACTIONS, Person, dataset, perform
 from indexing.cameras import virtual
-from indexing.shape.bank import fused_residual
 
 FEW = ("squat", "wave", "kick", "bow")
 
@@ -29,7 +29,7 @@ def test_one_example_recognizes_other_people_from_other_viewpoints(indexer, less
 
 
 def test_each_scorer_is_what_it_says(lesson, others):
-    from indexing.shape.bank import Windows
+    from indexing.action.bank import Windows
 
     both = ActionIndexer().fit(lesson)
     for name, scores in (("nearest", both.model_.nearest_scores), ("kernel", both.model_.machine_scores)):

@@ -5,10 +5,8 @@ import dataclasses
 import pytest
 import torch
 
-from indexing.shape.bank import NEAREST, Windows, fused_residual
-from indexing.shape.channels import JointMetric
-from indexing.shape.evidence import epipolar, gather
-from indexing.shape.joint_weights import JointWeights, WeightedMetric, learn_joint_weights
+from indexing.action.bank import NEAREST, JointMetric, Windows, fused_residual
+from indexing.action.joint_weights import JointWeights, WeightedMetric, epipolar, gather, learn_joint_weights
 
 JOINTS, LENGTH = 6, 8
 TELLING = 4
@@ -16,7 +14,7 @@ TELLING = 4
 
 @pytest.fixture
 def one_round(monkeypatch):
-    monkeypatch.setattr("indexing.shape.joint_weights.ROUNDS", 1)
+    monkeypatch.setattr("indexing.action.joint_weights.ROUNDS", 1)
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +22,7 @@ def plain():
     """Planted windows of five people, and what is learned from them."""
     bank, labels, groups = planted(5)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("indexing.shape.joint_weights.ROUNDS", 1)
+        patch.setattr("indexing.action.joint_weights.ROUNDS", 1)
         return bank, labels, groups, learn_joint_weights(bank, torch.arange(15), [bank], a_metric(bank), labels, groups=groups)
 
 

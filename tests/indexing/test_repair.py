@@ -7,8 +7,7 @@ import pytest
 
 from indexing import ActionIndexer, Clip
 from indexing.actors import Person, dataset
-from indexing.repair import FLOOR, LEAST, LIMIT, SHARE, USUAL, WIDTH, wrong_joints
-from indexing.windows import ragged
+from indexing.windows import FLOOR, LEAST, LIMIT, SHARE, USUAL, WIDTH, ragged, wrong_joints
 
 
 def walk(frames=80, joints=6, seed=0):
@@ -54,7 +53,7 @@ def places(mask):
 
 @pytest.mark.parametrize("frames", [7, 30])
 def test_one_pass_against_the_definition(frames, monkeypatch):
-    monkeypatch.setattr("indexing.repair.PASSES", 1)
+    monkeypatch.setattr("indexing.windows.PASSES", 1)
     rng = np.random.default_rng(frames)
     joints, times = walk(frames)
     joints += rng.normal(scale=0.02, size=joints.shape).astype(np.float32)
@@ -122,7 +121,7 @@ def test_repair_helps_where_joints_jump():
 
 def test_long_recordings_are_mended_in_parts(monkeypatch):
     from indexing.clip import Clip
-    from indexing.repair import mended
+    from indexing.windows import mended
 
     rng = np.random.default_rng(5)
     walk = np.linspace(0, 3, 400)[:, None, None] + np.arange(4.0)[:, None] + 0.005 * rng.normal(size=(400, 4, 2))
@@ -132,5 +131,5 @@ def test_long_recordings_are_mended_in_parts(monkeypatch):
     broken = Clip(walk, fps=30.0)
     whole = mended(broken)
     assert np.argwhere(~whole.seen).tolist() == [[30, 0], [199, 1], [200, 2], [350, 3]]
-    monkeypatch.setattr("indexing.repair.PART", 100)
+    monkeypatch.setattr("indexing.windows.PART", 100)
     assert np.array_equal(mended(broken).seen, whole.seen)

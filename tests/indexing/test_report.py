@@ -30,9 +30,8 @@ from indexing.report import (
     write_json,
     write_text,
 )
-from indexing.report.canvas import letters_without_font, shorten_all
-from indexing.report.measures import measure, overlapping
-from indexing.report.thumbnails import strip
+from indexing.report.canvas import letters_without_font, shorten_all, strip
+from indexing.report.results import measure, overlapping
 from indexing.skeleton import from_names
 
 STICK = from_names(

@@ -11,9 +11,7 @@ import pytest
 
 from indexing.readers.tracks import TrackSet
 from indexing.report.reconstruction import ReconstructionReport, as_json, points_csv, write_reconstruction
-from indexing.report.reconstruction_look import around, sample
-from indexing.report.reconstruction_scene import nearest_frame
-from indexing.report.reconstruction_tracks import as_first_camera
+from indexing.report.reconstruction_picture import around, as_first_camera, nearest_frame, sample
 
 SCRIPT = "<script>alert(1)</script>"
 

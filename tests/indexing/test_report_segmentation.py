@@ -8,12 +8,17 @@ import json
 import numpy as np
 import pytest
 
-from indexing.readers.images import Photograph
-from indexing.readers.pairs import MatchedPair
+from indexing.readers.pairs import MatchedPair, Photograph
 from indexing.report.canvas import DARK, LIGHT
-from indexing.report.segmentation import SegmentationReport, as_json, labels_csv, write_segmentation
-from indexing.report.segmentation_page import describe
-from indexing.report.segmentation_picture import colour_of, picture_of
+from indexing.report.segmentation import (
+    SegmentationReport,
+    as_json,
+    colour_of,
+    describe,
+    labels_csv,
+    picture_of,
+    write_segmentation,
+)
 
 SCRIPT = "<script>alert(1)</script>"
 

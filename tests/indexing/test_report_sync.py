@@ -9,10 +9,7 @@ import pytest
 import torch
 
 from indexing.report.canvas import DARK, LIGHT
-from indexing.report.sync import Clock, Compared, SyncReport, as_json, write_sync
-from indexing.report.sync_making import named
-from indexing.report.sync_page import body, describe
-from indexing.report.sync_picture import picture_of, title_of
+from indexing.report.sync import Clock, Compared, SyncReport, as_json, body, describe, named, picture_of, title_of, write_sync
 from tests.indexing.syncing.scene import shift
 
 

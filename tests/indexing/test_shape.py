@@ -6,10 +6,9 @@ import torch
 from sklearn.svm import SVC
 
 from dyntorch import canonical_correlation
-from indexing.shape.bank import EPSILON, Kernels, Windows, fused_residual
-from indexing.shape.channels import CHANNELS, JointMetric, channel, order_free
-from indexing.shape.machine import PairwiseMachine
-from indexing.shape.views import mirror, turn
+from indexing.action.bank import CHANNELS, EPSILON, JointMetric, Kernels, Windows, channel, fused_residual, order_free
+from indexing.action.model import PairwiseMachine
+from indexing.action.symmetry import mirror, turn
 
 LENGTH, JOINTS = 8, 6
 
@@ -146,7 +145,7 @@ def test_residuals_do_not_depend_on_the_chunk(monkeypatch):
     query, bank = random_windows(6, 13, holes=True), random_windows(5, 14, holes=True)
     metric = metric_of(bank)
     expected = fused_residual(query, [bank], metric)
-    monkeypatch.setattr("indexing.shape.bank.PAIRS_AT_ONCE", 4)
+    monkeypatch.setattr("indexing.action.bank.PAIRS_AT_ONCE", 4)
     torch.testing.assert_close(fused_residual(query, [bank], metric), expected, atol=1e-5, rtol=0)
 
 

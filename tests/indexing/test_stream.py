@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from indexing import ActionIndexer, Event, PhaseIndexer
+from indexing.action.exemplars import slide
+from indexing.action.stream import at_rest
 from indexing.actors import ACTIONS, Person, dataset, detect, stream
 from indexing.scoring import events, probabilities, reject_threshold, smooth
-from indexing.shape.exemplars import slide
-from indexing.stream import at_rest
 from indexing.windows import ragged
 
 KNOWN = ("squat", "wave", "bow", "jumping_jack", "kick", "walk")
@@ -120,7 +120,7 @@ def test_joints_lost_for_a_while_do_not_break_the_scan(indexer, recordings):
 
 
 def test_progress_grows_to_one(indexer, recordings, monkeypatch):
-    monkeypatch.setattr("indexing.stream.BLOCK", 50)
+    monkeypatch.setattr("indexing.action.stream.BLOCK", 50)
     told = []
     blocks = indexer.score_frames(recordings[0][0], progress=told.append)
     assert len(told) > 1 and told == sorted(told)

@@ -5,9 +5,8 @@ import pytest
 import torch
 
 from indexing import ActionIndexer, Clip
+from indexing.action.symmetry import from_data, from_names, mirror, mirror_permutation
 from indexing.actors import Person, dataset
-from indexing.shape.symmetry import from_data, from_names, mirror_permutation
-from indexing.shape.views import mirror
 from indexing.skeleton import BODY25, COCO17, HALPE26, MEDIAPIPE33, OPENPOSE18, Skeleton
 
 COCO = [0, 2, 1, 4, 3, 6, 5, 8, 7, 10, 9, 12, 11, 14, 13, 16, 15]

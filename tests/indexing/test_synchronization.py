@@ -9,9 +9,9 @@ import torch
 import indexing
 from indexing.clip import Clip
 from indexing.skeleton import COCO17, HALPE26, Skeleton
-from indexing.synchronization import remarks, synchronize
-from indexing.syncing.people import common_joints
-from indexing.syncing.takes import take_of
+from indexing.sync.people import common_joints
+from indexing.sync.synchronize import remarks, synchronize
+from indexing.sync.takes import take_of
 from tests.indexing.syncing.scene import FPS, SKIPPED, cut, write_openpose
 
 # torch's own, when it first loads its transforms; hidden outside of tests

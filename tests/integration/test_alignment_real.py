@@ -12,7 +12,7 @@ import torch
 
 import dyntorch as dyn
 from dyntorch import metrics
-from dyntorch.tasks.alignment import MOVING, OUTLIER, STATIC
+from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC
 from experiments import real_data, real_planar, real_space
 from experiments.real_bodies import Crowd, crowd
 from experiments.real_solvers import aligned, gap, rigid_ransac

@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from dyntorch.algebra.homogeneous import apply
+from dyntorch.core.residual import whiten
+from dyntorch.geometry.homogeneous import apply
 from dyntorch.invariants.agreement import static_residual
-from dyntorch.residual import whiten
 
 
 def random(*shape, seed=0):

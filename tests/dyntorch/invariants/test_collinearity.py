@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from dyntorch.algebra.homogeneous import apply, homogeneous, unit
-from dyntorch.invariants.collinearity import collinearity, join_forms, motion_of_forms
+from dyntorch.geometry.homogeneous import apply, homogeneous, unit
+from dyntorch.invariants.agreement import collinearity, join_forms, motion_of_forms
 from dyntorch.scenes import moving_points
 
 ONE = torch.ones((), dtype=torch.float64)

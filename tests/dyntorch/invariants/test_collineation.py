@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from dyntorch import scenes
-from dyntorch.algebra.homogeneous import apply
+from dyntorch.geometry.homogeneous import apply
 from dyntorch.invariants.collineation import Collineation
 
 

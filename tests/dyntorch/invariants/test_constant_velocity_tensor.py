@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from dyntorch.algebra.constant_velocity import infinity_planes
-from dyntorch.algebra.homogeneous import apply, homogeneous, unit
-from dyntorch.algebra.projection import adjugate
+from dyntorch.geometry.extensors import adjugate
+from dyntorch.geometry.homogeneous import apply, homogeneous, unit
+from dyntorch.invariants.constant_velocity_algebra import infinity_planes
 from dyntorch.invariants.constant_velocity_tensor import ConstantVelocityTensor
 from dyntorch.scenes import constant_velocity
 

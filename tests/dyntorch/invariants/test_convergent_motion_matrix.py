@@ -4,7 +4,7 @@ import pytest
 import torch
 
 import dyntorch as dyn
-from dyntorch.algebra.homogeneous import apply, homogeneous, skew
+from dyntorch.geometry.homogeneous import apply, homogeneous, skew
 from dyntorch.invariants.convergent_motion_matrix import ConvergentMotionMatrix, plane_of
 from dyntorch.invariants.fundamental_matrix import FundamentalMatrix
 from dyntorch.invariants.segmentation_matrix import SegmentationMatrix

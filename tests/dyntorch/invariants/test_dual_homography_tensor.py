@@ -5,9 +5,9 @@ import torch
 from torch.nn.functional import normalize
 
 from dyntorch import scenes
-from dyntorch.algebra.homogeneous import apply, homogeneous, unit
+from dyntorch.core.residual import multilinear, whiten
+from dyntorch.geometry.homogeneous import apply, homogeneous, unit
 from dyntorch.invariants.dual_homography_tensor import DualHomographyTensor, quadrifocal
-from dyntorch.residual import multilinear, whiten
 
 LINES, POINTS = DualHomographyTensor("lines"), DualHomographyTensor("points")
 ONES = (torch.ones(()).double(),) * 3

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 import dyntorch as dyn
-from dyntorch.algebra.dynamic_shape_basis import Fourier, Polynomial
 from dyntorch.invariants.dynamic_shape_tensor import DynamicShapeTensor
+from dyntorch.shapes.basis import Fourier, Polynomial
 from tests.dyntorch.moving_views import LINEAR, SQUARE, WAVE, draw, moving_views
 
 FORMS = ("joint", "basis", "span")

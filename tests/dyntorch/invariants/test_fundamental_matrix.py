@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from dyntorch import scenes
-from dyntorch.algebra.homogeneous import homogeneous
+from dyntorch.geometry.homogeneous import homogeneous
 from dyntorch.invariants.fundamental_matrix import FundamentalMatrix
 
 

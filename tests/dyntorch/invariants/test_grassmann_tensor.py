@@ -7,8 +7,8 @@ import torch
 
 import dyntorch as dyn
 from dyntorch import scenes
-from dyntorch.algebra.homogeneous import apply, homogeneous, inhomogeneous
-from dyntorch.forward import jacobian
+from dyntorch.geometry.homogeneous import apply, homogeneous, inhomogeneous
+from dyntorch.numerics.least_squares import jacobian
 from tests.projections import minors, tensor_error
 from tests.references import subdeterminants
 

@@ -5,9 +5,9 @@ import torch
 from torch.nn.functional import normalize
 
 from dyntorch import scenes
-from dyntorch.algebra.homogeneous import apply, homogeneous, unit
+from dyntorch.core.residual import multilinear
+from dyntorch.geometry.homogeneous import apply, homogeneous, unit
 from dyntorch.invariants.homography_tensor import HomographyTensor
-from dyntorch.residual import multilinear
 
 ONES = (torch.ones(()).double(),) * 3
 

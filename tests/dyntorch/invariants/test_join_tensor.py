@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from dyntorch.algebra.homogeneous import apply, homogeneous, similarity, unit
-from dyntorch.invariant import as_invariant
+from dyntorch.core.invariant import as_invariant
+from dyntorch.geometry.homogeneous import apply, homogeneous, similarity, unit
 from dyntorch.invariants.join_tensor import JoinTensor
 from dyntorch.metrics import point_error
 from dyntorch.scenes import moving_points

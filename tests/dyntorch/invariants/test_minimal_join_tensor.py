@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from dyntorch.algebra.extensors import levi_civita
-from dyntorch.algebra.homogeneous import apply, homogeneous, similarity, unit
-from dyntorch.invariant import as_invariant
+from dyntorch.core.invariant import as_invariant
+from dyntorch.geometry.extensors import levi_civita
+from dyntorch.geometry.homogeneous import apply, homogeneous, similarity, unit
 from dyntorch.invariants.join_tensor import JoinTensor
 from dyntorch.invariants.minimal_join_tensor import MinimalJoinTensor
 from dyntorch.metrics import point_error, relative_error

@@ -5,14 +5,11 @@ from itertools import combinations_with_replacement, permutations
 import pytest
 import torch
 
-from dyntorch.algebra.epipole_pairs import product_matrix
-from dyntorch.algebra.homogeneous import homogeneous, unit
-from dyntorch.invariants.multibody import (
-    multibody_lines,
-    multibody_matrix,
-)
+from dyntorch.core.primitives import Monomials
+from dyntorch.geometry.homogeneous import homogeneous, unit
+from dyntorch.geometry.pairs import product_matrix
+from dyntorch.invariants.multibody import multibody_lines, multibody_matrix
 from dyntorch.metrics import relative_error
-from dyntorch.primitives.monomials import Monomials
 from dyntorch.scenes import two_view
 
 

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 import dyntorch as dyn
-from dyntorch.algebra.homogeneous import homogeneous, inhomogeneous
-from dyntorch.invariants.reprojection import linearize, residual, residual_derivative
+from dyntorch.geometry.homogeneous import homogeneous, inhomogeneous
+from dyntorch.invariants.agreement import linearize, residual, residual_derivative
 
 PROFILES = [
     dyn.GrassmannTensor(3, (2, 1, 1)),

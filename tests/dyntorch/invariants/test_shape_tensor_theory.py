@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from dyntorch import counting
-from dyntorch.algebra import shape_rows
-from dyntorch.algebra.shape_points import dual_cameras, reference_cameras
 from dyntorch.invariants.shape_tensor import ShapeTensor
+from dyntorch.shapes import static as shape_rows
+from dyntorch.shapes.static import dual_cameras, reference_cameras
 from tests.references import rank
 from tests.shape_cases import SHAPE_CASES
 

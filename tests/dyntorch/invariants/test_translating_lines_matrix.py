@@ -3,11 +3,11 @@
 import pytest
 import torch
 
-from dyntorch.algebra.extensors import compound, plucker, plucker_form
-from dyntorch.algebra.homogeneous import apply, homogeneous, unit
+from dyntorch.core.primitives import Line
+from dyntorch.core.residual import multilinear
+from dyntorch.geometry.extensors import compound, plucker, plucker_form
+from dyntorch.geometry.homogeneous import apply, homogeneous, unit
 from dyntorch.invariants.translating_lines_matrix import TranslatingLinesMatrix
-from dyntorch.primitives import Line
-from dyntorch.residual import multilinear
 from dyntorch.scenes import translating_lines
 
 TL = TranslatingLinesMatrix

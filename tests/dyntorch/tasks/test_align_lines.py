@@ -8,12 +8,11 @@ import pytest
 import torch
 
 from dyntorch import scenes
-from dyntorch.algebra.extensors import plucker
+from dyntorch.core.solution import Status
+from dyntorch.geometry.extensors import plucker
 from dyntorch.metrics import relative_error
-from dyntorch.solution import Status
-from dyntorch.tasks.align_lines import align_lines
-from dyntorch.tasks.alignment import MOVING, OUTLIER, STATIC
-from dyntorch.tasks.line_model import as_points
+from dyntorch.tasks.align.lines import align_lines, as_points
+from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC
 
 F64 = torch.float64
 

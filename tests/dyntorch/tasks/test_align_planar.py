@@ -5,10 +5,10 @@ import torch
 
 import dyntorch as dyn
 from dyntorch import scenes
+from dyntorch.core.solution import Status
 from dyntorch.metrics import grid_transfer_error, label_scores
-from dyntorch.solution import Status
-from dyntorch.tasks.align_planar import align_planar
-from dyntorch.tasks.notices import Notice, NoticeCode
+from dyntorch.tasks.align.planar import align_planar
+from dyntorch.tasks.outcome import Notice, NoticeCode
 from tests.steps import equal_steps
 
 

@@ -10,14 +10,14 @@ import torch
 from torch import Tensor
 
 from dyntorch import scenes
-from dyntorch.algebra.rigid import moved_by, nearest_rotation, rigid_alignment, rigid_motion, rotation_exponential
+from dyntorch.core.robust import robust_fit
+from dyntorch.core.solution import Status
+from dyntorch.geometry.rigid import moved_by, nearest_rotation, rigid_alignment, rigid_motion, rotation_exponential
 from dyntorch.metrics import label_scores, point_error, relative_error, rotation_error, translation_error
-from dyntorch.robust import robust_fit
-from dyntorch.solution import Status
-from dyntorch.tasks import align_join
-from dyntorch.tasks.align_points import Model, align_points
-from dyntorch.tasks.alignment import MOVING, OUTLIER, STATIC
-from dyntorch.tasks.rigid import Sightings, normal_equations, squares
+from dyntorch.tasks.align import join as align_join
+from dyntorch.tasks.align.points import Model, align_points
+from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC
+from dyntorch.tasks.align.rigid import Sightings, normal_equations, squares
 
 F64 = torch.float64
 

@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from dyntorch import scenes
-from dyntorch.algebra.homogeneous import apply, homogeneous, skew, unit
-from dyntorch.tasks import bodies_energy as module
-from dyntorch.tasks.bodies_energy import View, energy, parallax
-from dyntorch.tasks.coherence import coherence
+from dyntorch.geometry.homogeneous import apply, homogeneous, skew, unit
+from dyntorch.tasks.segment import energy as module
+from dyntorch.tasks.segment.coherence import coherence
+from dyntorch.tasks.segment.energy import View, energy, parallax
 
 F64 = torch.float64
 PIXEL = 1 / 200

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from dyntorch.tasks.bodies_field import mean_field
-from dyntorch.tasks.bodies_flows import affine_flows
-from dyntorch.tasks.coherence import coherence
+from dyntorch.tasks.segment.coherence import coherence
+from dyntorch.tasks.segment.energy import mean_field
+from dyntorch.tasks.segment.search import affine_flows
 
 F64 = torch.float64
 NOISE = 0.005

@@ -6,13 +6,13 @@ import pytest
 import torch
 
 from dyntorch import scenes
-from dyntorch.algebra.epipolar import sampson_squared
-from dyntorch.algebra.homogeneous import unit
+from dyntorch.geometry.epipolar import sampson_squared
+from dyntorch.geometry.homogeneous import unit
 from dyntorch.metrics import misclassification
-from dyntorch.tasks import bodies_labels as module
-from dyntorch.tasks.bodies_energy import View
-from dyntorch.tasks.bodies_labels import field, label
-from dyntorch.tasks.coherence import Links, coherence
+from dyntorch.tasks.segment import labels as module
+from dyntorch.tasks.segment.coherence import Links, coherence
+from dyntorch.tasks.segment.energy import View
+from dyntorch.tasks.segment.labels import field, label
 
 F64 = torch.float64
 SCALE = 1 / 200

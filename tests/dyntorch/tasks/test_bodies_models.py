@@ -9,12 +9,12 @@ import pytest
 import torch
 
 from dyntorch import scenes
-from dyntorch.algebra.epipolar_descent import fit_fundamental
-from dyntorch.algebra.homogeneous import apply, homogeneous, inhomogeneous, skew
-from dyntorch.tasks import bodies_models as module
-from dyntorch.tasks.bodies_energy import View
-from dyntorch.tasks.bodies_models import choose
-from dyntorch.tasks.coherence import Links
+from dyntorch.geometry.epipolar_fit import fit_fundamental
+from dyntorch.geometry.homogeneous import apply, homogeneous, inhomogeneous, skew
+from dyntorch.tasks.segment import labels as module
+from dyntorch.tasks.segment.coherence import Links
+from dyntorch.tasks.segment.energy import View
+from dyntorch.tasks.segment.labels import choose
 
 F64 = torch.float64
 SCALE = 1 / 200

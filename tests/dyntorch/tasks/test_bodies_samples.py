@@ -5,12 +5,11 @@ import torch
 
 import dyntorch as dyn
 from dyntorch import scenes
-from dyntorch.algebra.epipolar import sampson_squared
+from dyntorch.geometry.epipolar import sampson_squared
 from dyntorch.metrics import misclassification
-from dyntorch.tasks.bodies_energy import CAP, NOISE, View
-from dyntorch.tasks.bodies_matrix import matrix_pairs
-from dyntorch.tasks.bodies_samples import LEAST, search_samples
-from dyntorch.tasks.coherence import Links
+from dyntorch.tasks.segment.coherence import Links
+from dyntorch.tasks.segment.energy import CAP, NOISE, View
+from dyntorch.tasks.segment.search import LEAST, matrix_pairs, search_samples
 
 
 def generator(seed=0):

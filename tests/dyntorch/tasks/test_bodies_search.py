@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from dyntorch import scenes
-from dyntorch.algebra.epipolar import sampson_squared
+from dyntorch.geometry.epipolar import sampson_squared
 from dyntorch.metrics import misclassification
-from dyntorch.tasks.bodies_energy import View, energy
-from dyntorch.tasks.bodies_search import search
-from dyntorch.tasks.coherence import coherence
+from dyntorch.tasks.segment.coherence import coherence
+from dyntorch.tasks.segment.energy import View, energy
+from dyntorch.tasks.segment.search import search
 
 F64 = torch.float64
 SCALE = 1 / 200

@@ -9,10 +9,10 @@ import torch
 
 import dyntorch as dyn
 from dyntorch import scenes
-from dyntorch.solution import Status
-from dyntorch.tasks.bodies_energy import PIXELS, View
-from dyntorch.tasks.bodies_significance import _alarms, _chance, significant
-from dyntorch.tasks.coherence import Links
+from dyntorch.core.solution import Status
+from dyntorch.tasks.segment.coherence import Links
+from dyntorch.tasks.segment.energy import PIXELS, View
+from dyntorch.tasks.segment.labels import _alarms, _chance, significant
 
 
 def draw(seed: int = 0) -> torch.Generator:

@@ -9,8 +9,8 @@ import torch
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from dyntorch.tasks import coherence as module
-from dyntorch.tasks.coherence import Links, coherence, conformity
+from dyntorch.tasks.segment import coherence as module
+from dyntorch.tasks.segment.coherence import Links, coherence, conformity
 
 F64 = torch.float64
 SCALE = 0.01

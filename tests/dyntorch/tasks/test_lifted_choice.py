@@ -11,13 +11,13 @@ import torch
 
 import dyntorch as dyn
 from dyntorch import scenes
-from dyntorch.motions import MOTIONS, Motion
-from dyntorch.solution import Status
-from dyntorch.tasks import lifted_choice
-from dyntorch.tasks.lifted_choice import LABEL, OUTLIER, Fit, _lacks, least, penalized
-from dyntorch.tasks.lifted_projections import Tracks
-from dyntorch.tasks.reconstruct import normalized
-from dyntorch.tasks.reconstruction import Reconstruction
+from dyntorch.core.solution import Status
+from dyntorch.tasks.reconstruct import solver as lifted_choice
+from dyntorch.tasks.reconstruct.motions import MOTIONS, Motion
+from dyntorch.tasks.reconstruct.projections import Tracks
+from dyntorch.tasks.reconstruct.reconstruct import normalized
+from dyntorch.tasks.reconstruct.result import Reconstruction
+from dyntorch.tasks.reconstruct.solver import LABEL, OUTLIER, Fit, _lacks, least, penalized
 
 
 @pytest.mark.parametrize("name", ["static_3d", "constant_velocity_2d", "constant_direction_3d", "two_bodies_3d"])

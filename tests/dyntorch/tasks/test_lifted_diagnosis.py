@@ -9,10 +9,10 @@ import torch
 
 import dyntorch as dyn
 from dyntorch import scenes
+from dyntorch.core.solution import Status
 from dyntorch.scenes.lifts import KINDS
-from dyntorch.solution import Status
-from dyntorch.tasks.notices import NoticeCode
-from dyntorch.tasks.reconstruction import Reconstruction
+from dyntorch.tasks.outcome import NoticeCode
+from dyntorch.tasks.reconstruct.result import Reconstruction
 
 
 def solved(name: str, sigma: float = 0.5, **options: object) -> Reconstruction:

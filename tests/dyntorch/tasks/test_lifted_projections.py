@@ -4,11 +4,11 @@ import pytest
 import torch
 
 from dyntorch import scenes
-from dyntorch.algebra.triangulation import reproject
-from dyntorch.motions import MOTIONS
-from dyntorch.solution import Status
-from dyntorch.tasks.lifted_projections import Projections, Tracks, choices, mean_error, projections_of_tracks
-from dyntorch.tasks.reconstruct import normalized
+from dyntorch.core.solution import Status
+from dyntorch.geometry.triangulation import reproject
+from dyntorch.tasks.reconstruct.motions import MOTIONS
+from dyntorch.tasks.reconstruct.projections import Projections, Tracks, choices, mean_error, projections_of_tracks
+from dyntorch.tasks.reconstruct.reconstruct import normalized
 
 
 def tracks_of(name, n=60, seed=0, **options):

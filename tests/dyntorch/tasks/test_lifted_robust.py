@@ -6,14 +6,13 @@ import pytest
 import torch
 
 from dyntorch import scenes
-from dyntorch.algebra.triangulation import observed, triangulate
-from dyntorch.motions import MOTIONS
-from dyntorch.normalize import hartley
-from dyntorch.solution import Status
-from dyntorch.tasks.lifted_agreement import agreeing, bound, distance, freedom, noise
-from dyntorch.tasks.lifted_projections import Tracks, projections_of_tracks
-from dyntorch.tasks.lifted_robust import robust_projections, suspicious
-from dyntorch.tasks.lifted_scene import Lifting, distances
+from dyntorch.core.normalize import hartley
+from dyntorch.core.solution import Status
+from dyntorch.geometry.triangulation import observed, triangulate
+from dyntorch.tasks.reconstruct.motions import MOTIONS
+from dyntorch.tasks.reconstruct.projections import Tracks, projections_of_tracks
+from dyntorch.tasks.reconstruct.robust import agreeing, bound, distance, freedom, noise, robust_projections, suspicious
+from dyntorch.tasks.reconstruct.scene import Lifting, distances
 
 
 def generator(seed=0):

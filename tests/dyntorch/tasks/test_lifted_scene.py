@@ -6,12 +6,12 @@ import pytest
 import torch
 
 from dyntorch import metrics, scenes
-from dyntorch.motions import MOTIONS
-from dyntorch.solution import Status
-from dyntorch.tasks import lifted_scene
-from dyntorch.tasks.lifted_projections import projections_of_tracks
-from dyntorch.tasks.lifted_scene import Lifting, Scene, adjusted, distances, framed, positions, scene_of, velocities
-from dyntorch.tasks.reconstruct import normalized
+from dyntorch.core.solution import Status
+from dyntorch.tasks.reconstruct import scene as lifted_scene
+from dyntorch.tasks.reconstruct.motions import MOTIONS
+from dyntorch.tasks.reconstruct.projections import projections_of_tracks
+from dyntorch.tasks.reconstruct.reconstruct import normalized
+from dyntorch.tasks.reconstruct.scene import Lifting, Scene, adjusted, distances, framed, positions, scene_of, velocities
 
 MOVING = [name for name, motion in MOTIONS.items() if motion.lift is not None and not motion.static]
 

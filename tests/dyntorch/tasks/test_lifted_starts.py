@@ -4,10 +4,10 @@ import pytest
 import torch
 
 from dyntorch import scenes
-from dyntorch.algebra.triangulation import reproject, triangulate
-from dyntorch.motions import MOTIONS
-from dyntorch.tasks.lifted_starts import middle, resting, resting_constants, tilted
-from dyntorch.tasks.reconstruct import normalized
+from dyntorch.geometry.triangulation import reproject, triangulate
+from dyntorch.tasks.reconstruct.motions import MOTIONS
+from dyntorch.tasks.reconstruct.reconstruct import normalized
+from dyntorch.tasks.reconstruct.scene import middle, resting, resting_constants, tilted
 
 
 @pytest.mark.parametrize("dim", [2, 3])

@@ -4,9 +4,20 @@ import math
 
 import torch
 
-from dyntorch.tasks.pair_matching import match_tracks
-from dyntorch.tasks.pair_normals import Motions, information, likelihood, peaks, refined
-from dyntorch.tasks.pair_regression import BLOCKS, Rows, combinations, predicted_apart, regress, ridges_apart
+from dyntorch.tasks.pair.affine import (
+    BLOCKS,
+    Motions,
+    Rows,
+    combinations,
+    information,
+    likelihood,
+    peaks,
+    predicted_apart,
+    refined,
+    regress,
+    ridges_apart,
+)
+from dyntorch.tasks.pair.tracks import match_tracks
 
 
 def normal(*shape, seed=0):

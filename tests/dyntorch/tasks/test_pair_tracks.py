@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from dyntorch.tasks.pair_tracks import interpolated, overlap
+from dyntorch.tasks.pair.tracks import interpolated, overlap
 
 NAN = math.nan
 

@@ -7,11 +7,11 @@ import torch
 
 import dyntorch as dyn
 from dyntorch import scenes
-from dyntorch.algebra.homogeneous import apply, skew, unit
+from dyntorch.core.solution import Status
+from dyntorch.geometry.homogeneous import apply, skew, unit
 from dyntorch.metrics import relative_error
-from dyntorch.solution import Status
-from dyntorch.tasks.notices import NoticeCode
-from dyntorch.tasks.planes import translating_planes
+from dyntorch.tasks.outcome import NoticeCode
+from dyntorch.tasks.planes.planes import translating_planes
 
 F64 = torch.float64
 

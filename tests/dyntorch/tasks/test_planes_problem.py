@@ -6,13 +6,21 @@ import pytest
 import torch
 
 from dyntorch import scenes
-from dyntorch.algebra.homogeneous import apply, unit
-from dyntorch.algebra.projection import project
+from dyntorch.geometry.extensors import project
+from dyntorch.geometry.homogeneous import apply, unit
 from dyntorch.metrics import relative_error
-from dyntorch.tasks.planes_input import Given
-from dyntorch.tasks.planes_problem import Layout, Matches, Matrices, PlanesProblem
-from dyntorch.tasks.planes_solver import projected
-from dyntorch.tasks.planes_starts import frames_of_calibration, frames_of_matrices, parameters, starts
+from dyntorch.tasks.planes.input import Given
+from dyntorch.tasks.planes.problem import (
+    Layout,
+    Matches,
+    Matrices,
+    PlanesProblem,
+    frames_of_calibration,
+    frames_of_matrices,
+    parameters,
+    projected,
+    starts,
+)
 
 F64 = torch.float64
 LAYOUT = Layout(3, 2)

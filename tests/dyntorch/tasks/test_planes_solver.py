@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from dyntorch.tasks.planes_solver import noise_variance
+from dyntorch.tasks.planes.problem import noise_variance
 
 F64 = torch.float64
 

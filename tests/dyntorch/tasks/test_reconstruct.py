@@ -10,10 +10,10 @@ from torch import Tensor
 
 import dyntorch as dyn
 from dyntorch import metrics, scenes
-from dyntorch.motions import MOTIONS, Motion
+from dyntorch.core.solution import Status
 from dyntorch.scenes.lifts import KINDS
-from dyntorch.solution import Status
-from dyntorch.tasks.reconstruction import Reconstruction
+from dyntorch.tasks.reconstruct.motions import MOTIONS, Motion
+from dyntorch.tasks.reconstruct.result import Reconstruction
 
 F64 = torch.float64
 NAMES = list(KINDS)

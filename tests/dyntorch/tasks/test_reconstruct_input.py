@@ -8,9 +8,9 @@ from torch import Tensor
 
 import dyntorch as dyn
 from dyntorch import scenes
-from dyntorch.motions import Motion
-from dyntorch.solution import Status
-from dyntorch.tasks.notices import NoticeCode
+from dyntorch.core.solution import Status
+from dyntorch.tasks.outcome import NoticeCode
+from dyntorch.tasks.reconstruct.motions import Motion
 
 NAN = float("nan")
 CV = "constant_velocity_2d"

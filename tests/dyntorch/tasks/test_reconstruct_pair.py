@@ -5,12 +5,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from dyntorch.algebra.homogeneous import skew
-from dyntorch.scenes.nonrigid import nonrigid_pair
-from dyntorch.solution import Status
-from dyntorch.tasks.notices import NoticeCode
-from dyntorch.tasks.reconstruct_pair import reconstruct_pair
-from dyntorch.tasks.shift import Shift
+from dyntorch.core.solution import Status
+from dyntorch.geometry.homogeneous import skew
+from dyntorch.scenes.filmed import nonrigid_pair
+from dyntorch.tasks.outcome import NoticeCode
+from dyntorch.tasks.pair.pair import reconstruct_pair
+from dyntorch.tasks.synchronize.result import Shift
 
 N, M, FRAMES = 10, 8, 70
 

@@ -7,10 +7,10 @@ import torch
 
 import dyntorch as dyn
 from dyntorch import scenes
-from dyntorch.algebra.homogeneous import apply, homogeneous
+from dyntorch.core.solution import Status
+from dyntorch.geometry.homogeneous import apply, homogeneous
 from dyntorch.metrics import misclassification, relative_error
-from dyntorch.solution import Status
-from dyntorch.tasks.notices import NoticeCode
+from dyntorch.tasks.outcome import NoticeCode
 
 F64 = torch.float64
 NAMES = ("labels", "bodies", "fundamentals", "homographies", "probabilities", "residuals", "coherence", "status", "threshold")

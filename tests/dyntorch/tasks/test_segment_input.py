@@ -7,9 +7,9 @@ import torch
 
 import dyntorch as dyn
 from dyntorch import scenes
+from dyntorch.core.solution import Status
 from dyntorch.metrics import misclassification
-from dyntorch.solution import Status
-from dyntorch.tasks.notices import NoticeCode
+from dyntorch.tasks.outcome import NoticeCode
 
 F64 = torch.float64
 

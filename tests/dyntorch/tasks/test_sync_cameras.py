@@ -5,8 +5,8 @@ from itertools import combinations
 import pytest
 import torch
 
-from dyntorch.tasks.shift import Shift
-from dyntorch.tasks.sync_cameras import combine_shifts, synchronize_cameras
+from dyntorch.tasks.synchronize.cameras import combine_shifts, synchronize_cameras
+from dyntorch.tasks.synchronize.result import Shift
 
 NONE = torch.zeros(0)
 LAGS = torch.linspace(-5, 5, 301, dtype=torch.float64)

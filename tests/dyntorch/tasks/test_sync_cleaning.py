@@ -4,8 +4,7 @@ import pytest
 import torch
 
 from dyntorch.scenes import filmed
-from dyntorch.tasks.sync_cleaning import cleaned
-from dyntorch.tasks.sync_tracks import read_tracks
+from dyntorch.tasks.synchronize.tracks import cleaned, read_tracks
 
 
 def seeded(seed=0):

@@ -5,11 +5,11 @@ import math
 import pytest
 import torch
 
-from dyntorch.algebra.epipolar_variance import epipolar_variance
-from dyntorch.algebra.homogeneous import homogeneous
+from dyntorch.geometry.epipolar import epipolar_variance
+from dyntorch.geometry.homogeneous import homogeneous
 from dyntorch.scenes import filmed
-from dyntorch.tasks.sync_curve import Samples, epipolar_curve
-from dyntorch.tasks.sync_tracks import read_tracks, smoothed
+from dyntorch.tasks.synchronize.epipolar import Samples, epipolar_curve
+from dyntorch.tasks.synchronize.tracks import read_tracks, smoothed
 
 
 def scene_of(seed=0, **more):
@@ -105,7 +105,7 @@ def test_no_lag_within_the_largest_shift_gives_an_empty_curve():
 def test_a_take_longer_than_a_piece_is_the_same(monkeypatch):
     samples = samples_of(scene_of(4))
     whole = epipolar_curve(samples)
-    monkeypatch.setattr("dyntorch.tasks.sync_curve.PIECE", 17)
+    monkeypatch.setattr("dyntorch.tasks.synchronize.epipolar.PIECE", 17)
     assert torch.allclose(epipolar_curve(samples).scores, whole.scores, atol=1e-6, equal_nan=True)
 
 

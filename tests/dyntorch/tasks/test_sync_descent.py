@@ -6,10 +6,10 @@ import pytest
 import scipy.optimize
 import torch
 
-from dyntorch.algebra.homogeneous import homogeneous
+from dyntorch.geometry.homogeneous import homogeneous
 from dyntorch.scenes import filmed
-from dyntorch.tasks.sync_descent import Descent, Grid
-from dyntorch.tasks.sync_tracks import read_tracks, smoothed
+from dyntorch.tasks.synchronize.epipolar import Descent, Grid
+from dyntorch.tasks.synchronize.tracks import read_tracks, smoothed
 
 FRAME = 1 / 30
 

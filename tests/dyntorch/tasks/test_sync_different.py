@@ -5,9 +5,8 @@ import math
 import pytest
 import torch
 
-from dyntorch.tasks.sync_different import _to_a_frame
-from dyntorch.tasks.sync_subspace_shift import SubspaceShift
-from dyntorch.tasks.synchronize import synchronize
+from dyntorch.tasks.synchronize.different import SubspaceShift, _to_a_frame
+from dyntorch.tasks.synchronize.synchronize import synchronize
 
 FRAME = 1 / 30
 

@@ -3,10 +3,9 @@
 import pytest
 import torch
 
-from dyntorch.algebra.epipolar_descent import Frames
-from dyntorch.algebra.lens import Division, distort
+from dyntorch.geometry.epipolar_fit import Frames
+from dyntorch.geometry.lens import Division, Fit, Matches, distort, fit_distortion
 from dyntorch.scenes import two_view
-from dyntorch.tasks.sync_lens import Fit, Matches, fit_distortion
 
 SIZE = (640.0, 480.0)
 

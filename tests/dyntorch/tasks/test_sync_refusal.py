@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from dyntorch.scenes import filmed
-from dyntorch.tasks.synchronize import synchronize
+from dyntorch.tasks.synchronize.synchronize import synchronize
 
 FRAME = 1 / 30
 STRAIGHT = (None, None)

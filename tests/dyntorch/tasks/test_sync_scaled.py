@@ -4,8 +4,7 @@ import pytest
 import torch
 
 from dyntorch.scenes import filmed
-from dyntorch.tasks.sync_scaled import frame_scaled
-from dyntorch.tasks.sync_tracks import read_tracks
+from dyntorch.tasks.synchronize.tracks import frame_scaled, read_tracks
 
 
 def tracks_of(x, fps=30.0):

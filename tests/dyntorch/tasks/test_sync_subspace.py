@@ -6,10 +6,21 @@ import math
 import pytest
 import torch
 
-from dyntorch.tasks.sync_subspace import HEIGHT, MOTION, SHAPE, SubspaceCurve, _correlated, _shared, _vertical, subspace_curve
-from dyntorch.tasks.sync_subspace_body import body_of, completed, halves, smooth
-from dyntorch.tasks.sync_subspace_doubt import BLOCKS, resemblance, wobble
-from dyntorch.tasks.sync_subspace_shift import subspace_shift
+from dyntorch.tasks.synchronize.different import BLOCKS, resemblance, subspace_shift, wobble
+from dyntorch.tasks.synchronize.subspace import (
+    HEIGHT,
+    MOTION,
+    SHAPE,
+    SubspaceCurve,
+    _correlated,
+    _shared,
+    _vertical,
+    body_of,
+    completed,
+    halves,
+    smooth,
+    subspace_curve,
+)
 
 
 def uniform(seed, *shape):

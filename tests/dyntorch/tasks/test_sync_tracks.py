@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from dyntorch.scenes import filmed
-from dyntorch.tasks.sync_tracks import noise_ratio, read_tracks, smoothed, without
+from dyntorch.tasks.synchronize.tracks import noise_ratio, read_tracks, smoothed, without
 
 
 def seeded(seed=0):

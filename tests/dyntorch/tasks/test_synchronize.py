@@ -6,10 +6,10 @@ import math
 import pytest
 import torch
 
-from dyntorch.algebra.homogeneous import homogeneous
-from dyntorch.algebra.lens import distort
+from dyntorch.geometry.homogeneous import homogeneous
+from dyntorch.geometry.lens import distort
 from dyntorch.scenes import filmed
-from dyntorch.tasks.synchronize import synchronize
+from dyntorch.tasks.synchronize.synchronize import synchronize
 
 FRAME = 1 / 30
 

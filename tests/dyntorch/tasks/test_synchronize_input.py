@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from dyntorch.tasks.synchronize import synchronize
+from dyntorch.tasks.synchronize.synchronize import synchronize
 
 A, TIMES = torch.rand(20, 4, 2, generator=torch.Generator().manual_seed(0)), torch.arange(20.0)
 K = [[100.0, 0, 50], [0, 100, 50], [0, 0, 1]]

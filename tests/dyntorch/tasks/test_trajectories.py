@@ -3,10 +3,9 @@
 import pytest
 import torch
 
-from dyntorch.algebra.extensors import plucker
-from dyntorch.algebra.homogeneous import apply, homogeneous, inhomogeneous
-from dyntorch.tasks.trajectories import LineStatus, points_on_lines, triangulate_trajectories
-from dyntorch.tasks.trajectory_tensor import trajectory_cameras
+from dyntorch.geometry.extensors import plucker
+from dyntorch.geometry.homogeneous import apply, homogeneous, inhomogeneous
+from dyntorch.tasks.trajectories.trajectories import LineStatus, points_on_lines, trajectory_cameras, triangulate_trajectories
 
 
 def scene(views, n, batch=(), *, sigma=0.0, centres=None, seed=0):

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from torch.nn.functional import interpolate
 
-from indexing.brightness.box import SIDE, boxes, crop, motion
+from indexing.sync.gray import SIDE, boxes, crop, motion
 
 
 def wall(generator, height=60, width=90):

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from indexing.brightness.curves import POWER, Curve, lag_sums, part_curve, score_curve
+from indexing.sync.brightness import POWER, Curve, lag_sums, part_curve, score_curve
 
 
 def unit(rows, seed):

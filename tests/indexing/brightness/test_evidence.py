@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from indexing.brightness.evidence import OUTLIER, REACH, SHARPNESS, WINDOW, evidence, windows
+from indexing.sync.brightness import OUTLIER, REACH, SHARPNESS, WINDOW, evidence, windows
 
 
 def walk(rows, seed):

@@ -4,9 +4,8 @@ import numpy as np
 import torch
 
 from indexing.brightness.library import Exemplars, library
-from indexing.brightness.live import SHARP, Pool
-from indexing.brightness.matching import SLACK, Warping
 from indexing.brightness.sight import LENGTH
+from indexing.brightness.stream import SHARP, SLACK, Pool, Warping
 
 
 def exemplars(lengths=(5, 3, 7), labels=(1, 0, 1)):

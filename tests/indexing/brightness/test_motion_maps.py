@@ -4,11 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from indexing.brightness import motion_box
+from indexing.brightness import sight as motion_box
 from indexing.brightness.features import blur, blurred, gradients, inner_gradients
-from indexing.brightness.motion_box import MotionBox
-from indexing.brightness.motion_maps import QUIET, SIGMA, MotionMaps
-from indexing.brightness.pooling import SOFT, described, mirrored, pooled, profile
+from indexing.brightness.sight import QUIET, SIGMA, SOFT, MotionBox, MotionMaps, described, mirrored, pooled, profile
 
 
 def video(frames=9, height=18, width=24, seed=0):

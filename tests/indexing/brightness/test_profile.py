@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from indexing.brightness.features import blur, gradients, weighted_differences
-from indexing.brightness.profile import BANDS, QUIET, SIGMA, inverse_root, reversed_profile, row_profile, whitened
+from indexing.sync.gray import BANDS, QUIET, SIGMA, inverse_root, reversed_profile, row_profile, whitened
 
 
 def test_profile_is_the_mean_motion_per_band(films):

@@ -7,9 +7,7 @@ import pytest
 import torch
 
 from indexing.brightness.footage import Resampler
-from indexing.brightness.sampling import common_rate, sampled
-from indexing.brightness.takes import take
-from indexing.brightness.window_kernel import HALF
+from indexing.sync.gray import HALF, common_rate, sampled, take
 
 
 def whole(source):
@@ -28,7 +26,7 @@ def test_blocks_do_not_show(films, monkeypatch):
     source = take(films[0][:80], "a", fps=30.0)
     found = sampled(source, whole(source), 30.0)
     assert found.profile.shape == (80, 18) and found.kernels.shape[0] == 80 - 2 * HALF
-    monkeypatch.setattr("indexing.brightness.sampling.BLOCK", 1000)
+    monkeypatch.setattr("indexing.sync.gray.PROFILE_BLOCK", 1000)
     once = sampled(source, whole(source), 30.0)
     assert torch.allclose(found.kernels, once.kernels, atol=1e-5)
     cosine = torch.nn.functional.cosine_similarity(found.profile, once.profile)

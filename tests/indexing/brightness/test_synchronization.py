@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from indexing.brightness.synchronization import brightness_shift
+from indexing.sync.brightness import brightness_shift
 from tests.pretend_device import counted, moved, pretend_device
 
 FPS = (30.0, 30.0)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from indexing.brightness.takes import LARGEST, take
+from indexing.sync.gray import LARGEST, take
 
 FRAMES = np.random.default_rng(0).integers(0, 256, (50, 24, 32), dtype=np.uint8)
 

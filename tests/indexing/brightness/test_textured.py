@@ -7,8 +7,8 @@ import torch
 from indexing import Clip
 from indexing.actors import Person, perform
 from indexing.actors.textured import film
-from indexing.brightness.box import boxes, motion
 from indexing.skeleton import COCO17
+from indexing.sync.gray import boxes, motion
 
 CLIP = perform("wave", Person(), fps=15.0)
 

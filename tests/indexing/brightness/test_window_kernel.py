@@ -4,7 +4,8 @@ import numpy as np
 import torch
 
 from indexing.brightness.features import blur
-from indexing.brightness.window_kernel import SIGMA, kernel_descriptors, window_kernels
+from indexing.sync.gray import KERNEL_SIGMA as SIGMA
+from indexing.sync.gray import kernel_descriptors, window_kernels
 
 
 def by_loops(crops, tau, half, patch, rows):

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from indexing.phase.course import learn_course
-from indexing.phase.cycle import in_step, period
-from indexing.phase.smoothing import smooth_phases
-from indexing.shape.bank import Windows
+from indexing.action.bank import Windows
+from indexing.phase.indexer import smooth_phases
+from indexing.phase.learning import in_step, period
+from indexing.phase.model import learn_course
 
 
 def moving(phase, seed=0, periodic=True):

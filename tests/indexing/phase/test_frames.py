@@ -3,8 +3,8 @@
 import numpy as np
 import torch
 
+from indexing.action.bank import Windows
 from indexing.phase.frames import image_distance, shape_distance, standardized
-from indexing.shape.bank import Windows
 
 
 def frames(count, joints, dims, seed):

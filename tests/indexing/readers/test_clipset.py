@@ -10,8 +10,7 @@ import pytest
 
 from indexing.clip import Clip, ClipSet
 from indexing.readers import read
-from indexing.readers.clipset import read_clip_set
-from indexing.readers.clipset_write import write_clip_set
+from indexing.readers.clipset import read_clip_set, write_clip_set
 from indexing.skeleton import COCO17, Skeleton
 
 

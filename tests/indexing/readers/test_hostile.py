@@ -18,12 +18,11 @@ from indexing.cli.inputs import read_truth
 from indexing.opening import clipped, parse_json, read_text, shown
 from indexing.readers import npz as npz_gate
 from indexing.readers import read
-from indexing.readers.filmset import read_film_set
-from indexing.readers.images import read_image
-from indexing.readers.pairs import read_pair
-from indexing.readers.points import open_points, read_matches
-from indexing.readers.tracks.reading import read_tracks
-from indexing.syncing.calibration import read_calibration
+from indexing.readers.clipset import read_film_set
+from indexing.readers.matches import open_points, read_matches
+from indexing.readers.pairs import read_image, read_pair
+from indexing.readers.tracks import read_tracks
+from indexing.sync.calibration import read_calibration
 
 JOINTS = np.random.default_rng(0).uniform(0, 100, (6, 17, 2))
 PEOPLE = [{"image_id": i, "category_id": 1, "keypoints": [10.5, 20.0, 1.0] * 17} for i in range(5)]

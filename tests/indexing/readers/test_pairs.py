@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from indexing.readers.images import SIDE, read_image
-from indexing.readers.pairs import read_pair
+from indexing.readers.pairs import SIDE, read_image, read_pair
 
 X1, X2 = np.arange(20.0).reshape(10, 2), np.arange(20.0, 40.0).reshape(10, 2)
 

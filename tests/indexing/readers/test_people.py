@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from indexing.readers import people, read, read_clip
-from indexing.readers.people import WAITING, link
+from indexing.readers import read, read_clip
+from indexing.readers import recording as people
+from indexing.readers.recording import WAITING, link
 
 Write = Callable[..., Path]
 FRAMES = 8

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from indexing.readers.points import Matched, open_points, read_matches
-from indexing.readers.points.sequence import Sequence
+from indexing.readers.matches import Matched, open_points, read_matches
+from indexing.readers.points import PointSequence
 
 XYZ = np.array([[1.0, 2.0, 3.0], [-4.5, 5.0, 6.25], [7.0, 8.0, -9.0]])
 
@@ -172,7 +172,7 @@ def test_c3d(tmp_path, order, scale, analog):
     places[2, 1] = np.nan
     path = c3d(tmp_path / "walk.c3d", places, ["LKNE", "head", "head"], order=order, scale=scale, first=11, analog=analog)
     found = open_points(path)
-    assert isinstance(found, Sequence) and found.ids == ("LKNE", "head#2", "head#3") and found.first == 11
+    assert isinstance(found, PointSequence) and found.ids == ("LKNE", "head#2", "head#3") and found.first == 11
     np.testing.assert_allclose(found.values, places, atol=abs(scale) / 2 if scale > 0 else 0)
     matched = read_matches([path], frames=(11, 13, 15))
     np.testing.assert_array_equal(matched.views[1], found.values[2])

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from dyntorch.tasks.shift import Shift
+from dyntorch.tasks.synchronize.result import Shift
 from indexing.actors import Person, detect, stream
 from indexing.clip import Clip
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from indexing.synchronization import synchronize
-from indexing.syncing.calibration import lenses, named_lenses, read_calibration
+from indexing.sync.calibration import lenses, named_lenses, read_calibration
+from indexing.sync.synchronize import synchronize
 
 # torch's own, when it first loads its transforms; hidden outside of tests
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated")

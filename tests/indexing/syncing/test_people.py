@@ -9,9 +9,9 @@ import torch
 import dyntorch
 from indexing.clip import Clip
 from indexing.readers import read
-from indexing.synchronization import pair, synchronize
-from indexing.syncing.people import Pairing, decide, disagreements, jumps, match_people
-from indexing.syncing.takes import Take, take_of
+from indexing.sync.people import Pairing, decide, disagreements, jumps, match_people
+from indexing.sync.synchronize import pair, synchronize
+from indexing.sync.takes import Take, take_of
 from tests.indexing.syncing.scene import FPS, cut, filmed, moved, shift, write_openpose
 
 # torch's own, when it first loads its transforms; hidden outside of tests

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from indexing.clip import Clip
-from indexing.readers.people import link
-from indexing.syncing.files import plan
-from indexing.syncing.takes import find_cameras, take_of
+from indexing.readers.recording import link
+from indexing.sync.files import plan
+from indexing.sync.takes import find_cameras, take_of
 from tests.indexing.syncing.scene import cut, write_openpose
 
 # torch's own, when it first loads its transforms; hidden outside of tests

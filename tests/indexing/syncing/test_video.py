@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from indexing.synchronization import synchronize
-from indexing.syncing.video import agreed
+from indexing.sync.synchronize import agreed, synchronize
 from tests.indexing.syncing.scene import FPS, shift
 
 # torch's own, when it first loads its transforms; hidden outside of tests
@@ -34,7 +33,7 @@ def test_two_methods_that_agree_decide_and_two_that_do_not_refuse():
 @pytest.fixture
 def methods(monkeypatch, library):
     """Tracks and brightness, known: tracks of the values' first ``n`` points, brightness at +0.5 s."""
-    import indexing.brightness
+    import indexing.sync.brightness
     import indexing.video
 
     asked: dict = {"tracks": [], "brightness": [], "count": 12}
@@ -51,7 +50,7 @@ def methods(monkeypatch, library):
         return shift(-0.41, method="brightness", notes=("b: dark",), ok=not asked.get("dark"), reason="halves differ")
 
     monkeypatch.setattr(indexing.video, "track_points", tracks, raising=False)
-    monkeypatch.setattr(indexing.brightness, "brightness_shift", bright, raising=False)
+    monkeypatch.setattr(indexing.sync.brightness, "brightness_shift", bright, raising=False)
     return asked
 
 

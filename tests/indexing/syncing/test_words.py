@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from indexing.syncing.words import in_names
+from indexing.sync.synchronize import in_names
 
 
 @pytest.mark.parametrize(

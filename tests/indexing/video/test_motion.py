@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from indexing.video import Chunk, camera_motion, stabilize
-from indexing.video.background import robust_motion, shrinking, similarity, transform
+from indexing.video.motion import robust_motion, shrinking, similarity, transform
 
 
 def shift(x, y):

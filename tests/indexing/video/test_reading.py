@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from indexing.video import probe, read_video
-from indexing.video.probing import Orientation, evenness
+from indexing.video.reading import Orientation, evenness
 
 
 def gather(video):

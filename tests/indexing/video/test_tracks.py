@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from indexing.video import Chunk, track_points
-from indexing.video.following import extent, follow, patches
+from indexing.video.tracks import extent, follow, patches
 
 
 def shift(x, y):

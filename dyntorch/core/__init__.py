@@ -1,0 +1,6 @@
+"""The one path from matches to a tensor and its motion, the same for every invariant.
+
+In the order in which data passes: ``primitives`` (what a view measures), ``invariant`` (the contract), ``matches`` and
+``normalize`` (what was given, checked, at unit size), ``matrix`` (the estimation matrix and its Gram), ``residual``, ``fit``,
+``refine``, ``robust``; what all of them return is in ``solution``.  Nothing here knows an invariant by name.
+"""

@@ -1,0 +1,244 @@
+"""fit(): matches -> normalization -> estimation matrix or Gram -> null space -> tensor, for every invariant."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from dyntorch.core.invariant import Invariant, as_invariant
+from dyntorch.core.matches import Matches, matches, relative_weights
+from dyntorch.core.matrix import estimation_matrix, gram, within_noise
+from dyntorch.core.normalize import Normalization, denormalize, normalization
+from dyntorch.core.primitives import Primitive
+from dyntorch.core.solution import Solution, Status, copied, failed
+from dyntorch.numerics.blocks import map_blocks, one_thread, workers
+from dyntorch.numerics.nullspace import decided_null_space, null_space
+
+AMBIGUOUS = 0.5
+"""Residual energy of the solution times the harmonic sum of that of all other directions: above it another tensor fits as well.
+Measured: 0.02 for the homography tensor at 2 px and 0.1 at 5 px (100 matches), 0.01 to 0.1 for the tensors of space at usual noise;
+1 to 5 for scenes of lower rank with noise (velocities in a plane, lines that only translate), 3 % of them below 0.5."""
+NARROW, JUDGED, CHANCE, QUANTILE = 9, 5, 1.3, -2.576
+"""A tensor of up to 9 entries has few other directions, and from few matches one is small by chance: random matches passed
+AMBIGUOUS in 5 % of 1500 problems for 12 in one dimension (16 % for 8) and in 1.4 % for a fundamental matrix of 16.  There the limit
+is the 0.5 % quantile of chi-square over the rows to spare, times what random matches showed it to be off (1.1 to 2); true
+collineations of a line keep it at noise of 3 % of the scene (8 matches) to 10 % (12).  Fewer than 5 rows to spare judge nothing."""
+ILL_CONDITIONED = 1e-10
+"""Rounding error of a null vector from a float64 Gram, eps * (s_1 / s_{D-1})^2, above which the matrix itself is decomposed, unless
+the noise outweighs it a thousandfold anyway."""
+WEAK = 5e5
+"""Trace of the Gram times the harmonic sum of its other eigenvalues above which noise may reach the last of them.  General motion
+has 1e4 (lines) to 3e5 (constant velocity, 60 matches), data of lower rank 1e6 at noise of 1 % of the scene and 1e9 at 0.03 %."""
+BLOCK, LEAST = 5 << 19, 1 << 20
+"""Numbers in the largest temporary of one block of the batch, summed in pieces by the Gram, and fewest in a block that is cut for
+the sake of another core.  Measured best: 364 problems of 200 points of the plane (47 us each; 128: 59), 131 of space.  100 problems
+of 100 points take 3.9 ms on one core; cut for two they take 5.5."""
+
+
+@one_thread
+def fit(
+    invariant: Invariant | type[Invariant],
+    *views: Tensor,
+    weights: Tensor | None = None,
+    static: Tensor | None = None,
+    normalize: bool = True,
+    **given: Tensor,
+) -> Solution:
+    r"""Fit a multilinear invariant to matches: the null vector(s) of the estimation matrix, for a whole batch at once.
+
+    Every match puts rows :math:`u_1 \otimes u_2 \otimes \dots` into a matrix whose null space holds the tensor.  The matches
+    are normalized, the Gram of the matrix is summed up without building the matrix, its null space is found with a
+    certificate (problems that are ill-conditioned take the matrix itself), and the tensor is carried back.  Differentiable
+    with respect to matches and weights.
+
+    Args:
+        invariant: an invariant class such as ``dyntorch.HomographyTensor``, or an instance of a family: ``Collineation(3)``.
+        *views: matches, one argument per view, ``(*batch, n, ...)``; NaN = missing.
+        weights: ``(*batch, n)`` not negative; 0 leaves a match out.
+        static: ``(*batch, n)`` bool: matches known not to move add all their rows (segmented configuration, thesis 8.1).
+        normalize: False skips the similarity of every view (for matches that are of order 1 already).
+        **given: what else the invariant takes, by name.
+
+    Returns:
+        A :class:`Solution` with ``tensor``, ``status``, ``singular_values``, ``motion``; same dtype and device as the views.
+
+    Raises:
+        ValueError: misuse - too few matches per problem, shapes, dtypes or devices that do not agree.
+
+    Source: thesis chapters 2, 3, 8; Hartley 1997 (normalization).
+
+    Example:
+        >>> import torch, dyntorch as dyn
+        >>> x2 = torch.rand(20, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        >>> A = torch.tensor([[1.0, 0.1, 2.0], [-0.1, 1.0, 3.0], [0.1, 0.2, 1.0]], dtype=torch.float64)
+        >>> p1 = torch.cat([x2, torch.ones(20, 1, dtype=torch.float64)], dim=-1) @ A.T
+        >>> solution = dyn.fit(dyn.Collineation(2), p1[:, :2] / p1[:, 2:], x2)
+        >>> solution
+        Solution(Collineation(n=2), matches=20, batch=(): 1 OK)
+        >>> (solution.tensor / solution.tensor[2, 2]).mul(1000).round().div(1000).tolist()
+        [[1.0, 0.1, 2.0], [-0.1, 1.0, 3.0], [0.1, 0.2, 1.0]]
+    """
+    invariant, views = as_invariant(invariant).prepared(views, weights, **given)
+    return fit_matches(invariant, matches(invariant, views, weights, static), normalize=normalize)
+
+
+def fit_matches(invariant: Invariant, data: Matches, *, normalize: bool = True) -> Solution:
+    """:func:`fit` for checked matches."""
+    few = data.count < invariant.minimal()
+    if data.static is not None:
+        # a static match frees one slot at a time; how many of its rows are new the rank will say
+        few = few and data.count * sum(p.width for p in invariant.primitives) < invariant.width() - invariant.nullity
+    if data.views[0].shape[0] and few:
+        raise ValueError(f"{invariant!r} needs at least {invariant.minimal()} matches, got {data.count}; add matches")
+    whole, present = invariant.completed(data.views, data.weights)
+    data = replace(data, views=whole, weights=present)
+    views, weights, static = copied(invariant, data)
+    options = () if static is None else (static,)
+
+    def solve(*block: Tensor) -> tuple[Tensor, ...]:
+        return _solve(invariant, block[: len(views)], block[len(views)], block[len(views) + 1 :], normalize)
+
+    per_problem = data.count * max(1, invariant.copies or 1) * _largest(invariant)
+    most, least = (max(1, number // max(1, per_problem)) for number in (BLOCK, LEAST))
+    size = min(most, max(least, -(-len(weights) // workers())))
+    parts = map_blocks(solve, *views, weights, *options, size=size)
+    normalized, tensor, status, uncertainty = parts[:4]
+    count = len(invariant.primitives)
+    frames = parts[4 : 4 + count]
+    norm = Normalization(
+        frames,
+        tuple(p.normalized(t) for p, t in zip(invariant.primitives, frames, strict=True)),
+        parts[4 + count :],
+        tuple(t[..., 0, 0] for t in frames),
+    )
+    return Solution(invariant, data.back(tensor), data.back(status), data.back(uncertainty), data, norm, normalized)
+
+
+def _largest(invariant: Invariant) -> int:
+    """Numbers per match in the largest temporary of the Gram."""
+    if len(invariant.primitives) == 1:
+        return invariant.width() * invariant.rows()
+    size = 1
+    for primitive in invariant.primitives[1:]:
+        size *= primitive.width * (primitive.width + 1) // 2
+    return size
+
+
+def _solve(
+    invariant: Invariant, views: tuple[Tensor, ...], weights: Tensor, options: tuple[Tensor, ...], normalize: bool
+) -> tuple[Tensor, ...]:
+    """One block: normalized tensor, tensor, status, uncertainty, transforms and actions."""
+    static = options[0] if options else None
+    # components first in memory: every later pass then runs along the matches
+    views = tuple(x.mT.contiguous().mT for x in views)
+    # weights of any unit: a problem that counts its matches in thousands is no different
+    weights = relative_weights(weights)
+    fixed = invariant.intrinsic or not normalize
+    norm = _identity(invariant, views) if fixed else normalization(invariant, views, weights)
+    moved = norm.apply(invariant, views)
+    own = invariant.estimated(moved, weights)
+    if own is None:
+        basis, status, uncertainty = _null(invariant, norm.primitives, moved, weights, static)
+        tensor = invariant.normalized(norm.transforms).constrain(invariant.tensor_of(basis))
+        if invariant.nullity == 1:
+            status = torch.where(invariant.singular(tensor) & (status != int(Status.TOO_FEW)), int(Status.DEGENERATE), status)
+    else:
+        tensor, uncertainty = own.tensor, own.uncertainty
+        status = _status(own.few, own.degenerate, own.ambiguous)
+    if invariant.copies is not None:
+        status, uncertainty = status.amax(-1), uncertainty.amax(-1)
+    tensor = _zero_where_failed(status, tensor)
+    # coordinates may be so large or small that float64 holds no tensor of theirs
+    back = denormalize(invariant, tensor, norm.actions)
+    flat = back.detach().flatten(status.ndim)
+    held = flat.isfinite().all(-1) & (flat != 0).any(-1)
+    status = torch.where(held | failed(status), status, int(Status.DEGENERATE))
+    tensor, back = _zero_where_failed(status, tensor), _zero_where_failed(status, back)
+    return (tensor, back, status, uncertainty, *norm.transforms, *norm.actions)
+
+
+def _zero_where_failed(status: Tensor, tensor: Tensor) -> Tensor:
+    """The tensor, zero where the status says that there is none."""
+    zero = failed(status)[(..., *([None] * (tensor.ndim - status.ndim)))]
+    return torch.where(zero, torch.zeros_like(tensor), tensor)
+
+
+def _null(
+    invariant: Invariant, primitives: tuple[Primitive, ...], views: tuple[Tensor, ...], weights: Tensor, static: Tensor | None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Null space ``(*batch, nullity, D)``, status and uncertainty ``(*batch,)`` of normalized matches."""
+    nullity, width = invariant.nullity, invariant.width()
+    present = (weights > 0).sum(-1) * invariant.rows()
+    if static is not None:
+        present = present + ((weights > 0) & static).sum(-1) * (sum(p.width for p in primitives) - invariant.rows())
+    g = gram(primitives, views, weights, static)
+    found = decided_null_space(g, nullity)
+    basis = found.basis
+    spare = (present - (width - nullity)).clamp(min=0)
+    # the noise that the solution leaves, per row, against what every other direction has
+    noise = found.residual.clamp(min=0).mean(-1) / spare.clamp(min=1)
+    square = torch.where(spare > 0, noise * found.competing, torch.zeros_like(noise)).detach()
+    rounding = torch.finfo(g.dtype).eps * (g.diagonal(dim1=-2, dim2=-1).sum(-1) * found.competing).detach()
+    exact = (rounding > ILL_CONDITIONED) & (rounding > 1e-3 * square) & ~found.degenerate
+    # frames of single matches, from points of theirs, may be all noise, and then nothing looks weak
+    limit = 0.0 if invariant.intrinsic else WEAK
+    weak = (spare > 0) & ~found.degenerate & (g.diagonal(dim1=-2, dim2=-1).sum(-1) * found.competing > limit)
+    if invariant.copies is not None:
+        weak = torch.zeros_like(weak)
+    # an accelerator waits once per block for both answers: what a tensor and its status are must not depend on where it lives
+    asked = int(exact.any().long() + 2 * weak.any())
+    if asked & 1:
+        basis = _with_matrix(basis, exact, primitives, views, weights, static, nullity)
+    few = present < width - nullity
+    if static is None:
+        few = few | ((weights > 0).sum(-1) < invariant.minimal())
+    ambiguous = square * present.clamp(min=1) > _limit(spare, width)
+    if asked & 2:
+        place = weak.nonzero(as_tuple=True)  # an accelerator waits here, and for every mask that is an index
+        chosen = [x[place] for x in views], weights[place], None if static is None else static[place], basis[place]
+        with torch.no_grad():
+            ambiguous[place] |= within_noise(primitives, *chosen, invariant.resolves_noise)
+    return basis, _status(few, found.degenerate, ambiguous), square.sqrt()
+
+
+def _limit(spare: Tensor, width: int) -> Tensor:
+    """Of :data:`AMBIGUOUS` for so many rows to spare ``(*batch,)``, such that matches by chance stay above it."""
+    if width > NARROW:
+        return torch.full_like(spare, AMBIGUOUS, dtype=torch.float64)
+    # the quantile of chi-square over its mean (Wilson and Hilferty)
+    part = 2 / (9 * spare.clamp(min=JUDGED).double())
+    return torch.where(spare >= JUDGED, (CHANCE * (1 - part + QUANTILE * part.sqrt()) ** 3).clamp(max=AMBIGUOUS), AMBIGUOUS)
+
+
+def _status(few: Tensor, degenerate: Tensor, ambiguous: Tensor) -> Tensor:
+    """The first of these that holds."""
+    status = torch.where(ambiguous, int(Status.AMBIGUOUS), int(Status.OK))
+    status = torch.where(degenerate, int(Status.DEGENERATE), status)
+    return torch.where(few, int(Status.TOO_FEW), status)
+
+
+def _with_matrix(
+    basis: Tensor,
+    exact: Tensor,
+    primitives: tuple[Primitive, ...],
+    views: tuple[Tensor, ...],
+    weights: Tensor,
+    static: Tensor | None,
+    nullity: int,
+) -> Tensor:
+    """Replace the null spaces of the chosen problems by those of their estimation matrices, which are not squared."""
+    matrix = estimation_matrix(primitives, views, weights, static)
+    place = exact.nonzero(as_tuple=True)
+    return basis.index_put(place, null_space(matrix[place], nullity))
+
+
+def _identity(invariant: Invariant, views: tuple[Tensor, ...]) -> Normalization:
+    transforms = []
+    for primitive, x in zip(invariant.primitives, views, strict=True):
+        eye = torch.eye(primitive.dim + 1, dtype=x.dtype, device=x.device)
+        transforms.append(eye.expand(*x.shape[: primitive.match_axis(x)], -1, -1))
+    actions = tuple(p.action(t) for p, t in zip(invariant.primitives, transforms, strict=True))
+    primitives = tuple(p.normalized(t) for p, t in zip(invariant.primitives, transforms, strict=True))
+    return Normalization(tuple(transforms), primitives, actions, tuple(t[..., 0, 0] for t in transforms))

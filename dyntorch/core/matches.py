@@ -1,0 +1,169 @@
+"""What comes in: matches of several views, checked once, in float64, with missing ones weighing nothing."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dyntorch.core.invariant import Invariant
+from dyntorch.core.primitives import Point, Primitive
+from dyntorch.numerics.arguments import FARTHEST, check_tensor, refuse_vmap
+
+WIDEST = 4096
+"""Unknowns of a tensor; the Gram of one problem then takes 134 MB."""
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Checked matches with one flat batch dimension, ready to be cut into blocks."""
+
+    views: tuple[Tensor, ...]
+    """``(b, n, ...)`` float64 and finite, one per view."""
+    weights: Tensor
+    """``(b, n)``, 0 where the match is missing in any view."""
+    static: Tensor | None
+    """``(b, n)`` bool."""
+    batch: tuple[int, ...]
+    """The leading dimensions that came in."""
+    dtype: torch.dtype
+    device: torch.device
+
+    @property
+    def count(self) -> int:
+        """Matches per problem."""
+        return int(self.weights.shape[-1])
+
+    def back(self, result: Tensor) -> Tensor:
+        """A float64 result with a flat batch, in the caller's shape, dtype and device."""
+        result = result.reshape((*self.batch, *result.shape[1:]))
+        return result.to(device=self.device, dtype=self.dtype if result.is_floating_point() else result.dtype)
+
+    def restricted(self, keep: Tensor) -> Matches:
+        """The same matches with weight 0 where ``keep (b, n)`` is False."""
+        return Matches(self.views, self.weights * keep, self.static, self.batch, self.dtype, self.device)
+
+
+def matches(invariant: Invariant, views: Sequence[Tensor], weights: Tensor | None = None, static: Tensor | None = None) -> Matches:
+    """Check the views of one invariant and put them into float64.
+
+    A match with a coordinate that is NaN or infinite in any view (beyond 1e60 is infinite), or a weight that is, weighs nothing.
+
+    Raises:
+        ValueError: another number of views, shapes that do not agree, mixed dtypes or devices, negative weights, or ``static``
+            for an invariant that knows no labelled static matches.
+    """
+    check_views(invariant, views)
+    for v, x in enumerate(views, start=1):
+        refuse_vmap(f"view {v}", x)
+    if invariant.width() > WIDEST:
+        raise ValueError(f"{invariant!r} has {invariant.width():,} unknowns; up to {WIDEST:,} are estimated")
+    first = views[0]
+    axis = invariant.primitives[0].match_axis(first)
+    batch, n = tuple(first.shape[:axis]), int(first.shape[axis])
+    if static is not None and not invariant.labels_static:
+        raise ValueError(f"{invariant!r} has no rows for labelled static matches; leave out static=")
+    # a device without float64 lends its data to the CPU and gets the result back
+    home = torch.device("cpu") if first.device.type == "mps" else first.device
+    # not reshape(-1): without matches any batch would do
+    flat = [x.to(home, torch.float64).reshape(math.prod(batch), *x.shape[axis:]) for x in views]
+    weight = _weights(option("weights", weights, batch, n, first), flat[0])
+    label = option("static", static, batch, n, first)
+    if home.type == "cpu" and bool(weight.detach().sum().isfinite()) and all(bool(_near(x.detach())) for x in flat):
+        # nothing is missing: one norm per view says so, and nothing is copied
+        return Matches(tuple(flat), weight, _labels(label, home), batch, first.dtype, first.device)
+    present = weight.isfinite()
+    for x in flat:
+        present = present & (x.abs() <= FARTHEST).flatten(2).all(-1)
+    clean = [torch.where(present[(..., *([None] * (x.ndim - 2)))], x, torch.zeros_like(x)) for x in flat]
+    return Matches(
+        tuple(clean),
+        torch.where(present, weight, torch.zeros_like(weight)),
+        _labels(label, home),
+        batch,
+        first.dtype,
+        first.device,
+    )
+
+
+def _near(x: Tensor) -> Tensor:
+    return torch.linalg.vector_norm(x, torch.inf) <= FARTHEST if x.numel() else torch.tensor(True)
+
+
+def _weights(given: Tensor | None, like: Tensor) -> Tensor:
+    """``(b, n)`` float64."""
+    if given is None:
+        return torch.ones(like.shape[:2], dtype=like.dtype, device=like.device)
+    if bool((given < 0).any()):
+        raise ValueError(f"weights must not be negative, got {float(given.nan_to_num().min()):g}; use 0 to leave a match out")
+    return given.to(like)
+
+
+def relative_weights(weights: Tensor) -> Tensor:
+    """Weights ``(*batch, n)`` over the largest of each problem."""
+    return weights / largest_weights(weights)[..., None].clamp(min=torch.finfo(weights.dtype).tiny)
+
+
+def largest_weights(weights: Tensor) -> Tensor:
+    """``(*batch,)``, 0 without matches."""
+    return weights.amax(-1) if weights.shape[-1] else weights.sum(-1)
+
+
+def _labels(label: Tensor | None, home: torch.device) -> Tensor | None:
+    return None if label is None else label.to(home).bool()
+
+
+def check_views(invariant: Invariant, views: Sequence[Tensor]) -> None:
+    """Raise a ``ValueError`` for another number of views, shapes that do not agree, mixed dtypes or devices."""
+    if len(views) != len(invariant.primitives):
+        raise ValueError(f"{invariant!r} takes matches in {len(invariant.primitives)} views, got {len(views)}")
+    _check_measured(invariant, invariant.primitives, views, "view")
+
+
+def constellations(invariant: Invariant, points: Sequence[Tensor]) -> Tensor:
+    """Points p1, p2, ... ``(*batch, views, 2)``, each seen in the same views, as one measurement per view.
+
+    Returns:
+        ``(*batch, views, points, 3)``: (x, y, 1), and (0, 0, 0) where a point is missing (NaN or infinite).
+
+    Raises:
+        ValueError: shapes that do not agree, mixed dtypes or devices.
+    """
+    _check_measured(invariant, (Point(2),) * len(points), points, "point")
+    x = torch.stack(list(points), dim=-2)
+    seen = x.isfinite().all(-1, keepdim=True)
+    return torch.cat([torch.where(seen, x, 0.0), seen.to(x)], dim=-1)
+
+
+def _check_measured(invariant: Invariant, primitives: Sequence[Primitive], views: Sequence[Tensor], what: str) -> None:
+    leading: list[tuple[int, ...]] = []
+    for v, (primitive, x) in enumerate(zip(primitives, views, strict=True), start=1):
+        check_tensor(f"{what} {v}", x)
+        try:
+            axis = primitive.match_axis(x)
+        except ValueError as error:
+            raise ValueError(f"{what} {v} of {invariant!r}: {error}") from None
+        leading.append(tuple(x.shape[: axis + 1]))
+    if len(set(leading)) > 1:
+        raise ValueError(f"all {what}s need the same (*batch, n), got {leading}; expand the smaller ones")
+    if len({x.dtype for x in views}) > 1:
+        raise ValueError(f"all {what}s need one dtype, got {[str(x.dtype) for x in views]}; use .to(dtype)")
+    if len({x.device for x in views}) > 1:
+        raise ValueError(f"all {what}s need one device, got {[str(x.device) for x in views]}; use .to(device)")
+
+
+def option(name: str, value: Tensor | None, batch: tuple[int, ...], n: int, like: Tensor) -> Tensor | None:
+    """``weights`` or ``static`` with the batch of the views, flat."""
+    if value is None:
+        return None
+    if not isinstance(value, Tensor):
+        raise ValueError(f"{name} must be a torch.Tensor, got {type(value).__name__}; use torch.as_tensor(...)")
+    if value.device != like.device:
+        raise ValueError(f"{name} is on {value.device}, the matches on {like.device}; use .to(device)")
+    try:
+        return value.expand(*batch, n).reshape(math.prod(batch), n) if batch else value.expand(1, n)
+    except RuntimeError:
+        raise ValueError(f"{name} must be (*batch, n) = {(*batch, n)}, got {tuple(value.shape)}") from None

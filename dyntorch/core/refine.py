@@ -1,0 +1,426 @@
+"""Batched Levenberg-Marquardt: the motion that minimizes the Sampson distances of all matches."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from dyntorch.core.invariant import Invariant
+from dyntorch.core.matches import Matches, largest_weights, matches, relative_weights
+from dyntorch.core.matrix import gram
+from dyntorch.core.normalize import Normalization, denormalize, denormalize_motion, relative
+from dyntorch.core.residual import multilinear_derivative
+from dyntorch.core.solution import Solution, copied, failed
+from dyntorch.numerics.blocks import map_blocks, one_thread, workers
+from dyntorch.numerics.least_squares import by_match, jacobian, minimize
+from dyntorch.numerics.nullspace import spectrum
+
+# ----------------------------------------------------------------------------------------------------------------------
+# The least squares problem that refinement solves: whitened residuals of all matches in the entries of a motion.
+
+
+BLOCK = 1 << 18
+"""Entries of the Jacobian per block of the batch: larger ones leave the cache, smaller ones pay for the calls."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Least squares in the entries of a motion, over a block of problems."""
+
+    invariant: Invariant
+    shapes: tuple[torch.Size, ...]
+    views: tuple[Tensor, ...]
+    scales: tuple[Tensor, ...]
+    weights: Tensor
+    static: Tensor | None
+
+    def parts(self, theta: Tensor) -> tuple[Tensor, ...]:
+        """The motion ``(b, *shape)`` of parameters ``(b, p)``."""
+        return parts_of(theta, self.shapes)
+
+    def subset(self, keep: Tensor) -> Problem:
+        """Only some of the problems."""
+        cut = [x[keep] for x in self.views], [s[keep] for s in self.scales], self.weights[keep]
+        static = None if self.static is None else self.static[keep]
+        return Problem(self.invariant, self.shapes, tuple(cut[0]), tuple(cut[1]), cut[2], static)
+
+    def residual(self, theta: Tensor, piece: slice) -> tuple[Tensor, Tensor]:
+        """Weighted whitened residuals ``(b, rows)`` of some of the matches, and their derivative ``(b, p, rows)``."""
+        views, weights = tuple(x[:, piece] for x in self.views), self.weights[:, piece]
+        still = None if self.static is None else self.static[:, piece]
+        moving = weights if still is None else weights * ~still
+        value, derivative = self.moving(theta, views)
+        root = moving.sqrt()[..., None].expand(*moving.shape, value.shape[1] // max(1, moving.shape[1])).flatten(1)
+        value, derivative = value * root, derivative * root[:, None]
+        if still is None:
+            return value, derivative
+        resting = (weights * still).sqrt()[..., None]
+        more = self.resting(theta, views)
+        more = (
+            (more[0].unflatten(1, (views[0].shape[1], -1)) * resting).flatten(1),
+            more[1] * resting.expand(*resting.shape[:2], more[0].shape[1] // max(1, resting.shape[1])).flatten(1)[:, None],
+        )
+        return torch.cat([value, more[0]], dim=-1), torch.cat([derivative, more[1]], dim=-1)
+
+    def moving(self, theta: Tensor, views: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+        """Unweighted residuals of matches that may move, and their derivative."""
+        known = self.invariant.linearized(self.parts(theta), views, self.scales)
+        if known is not None:
+            return known
+        empty = tuple(x[:0] for x in views), tuple(scale[:0] for scale in self.scales)
+        if self.invariant.whitened(self.parts(theta[:0]), *empty) is not None:
+            shared, slope = self.invariant.shared_derivative(self.parts(theta))
+            value, derivative = self._by_match(self.invariant.whitened_shared, flattened(shared), views)
+            return value, derivative if slope is None else slope @ derivative
+        # one row per match: by hand through the tensor, several times cheaper than forward mode through the matches
+        tensor, slope = self.invariant.compose_derivative(self.parts(theta))
+        shape = self.invariant.shape()
+        value, derivative = multilinear_derivative(self.invariant, tensor.unflatten(1, shape), views, self.scales)
+        return value, slope @ derivative.mT
+
+    def resting(self, theta: Tensor, views: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+        """Unweighted residuals of matches that do not move, and their derivative."""
+        return self._by_match(self.invariant.whitened_static, theta, views)
+
+    def _by_match(self, function: Callable[..., Tensor], theta: Tensor, views: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+        """Residuals ``(b, n c)`` and derivative ``(b, p, n c)``."""
+
+        def residual(copies: Tensor, scales: tuple[Tensor, ...], single: tuple[Tensor, ...]) -> Tensor:
+            return function(self.parts(copies), single, scales)
+
+        return by_match(residual, theta, self.scales, views)
+
+    def pieces(self, width: int) -> list[slice]:
+        """The matches in slices whose Jacobians fit into memory, whatever their number."""
+        n = self.weights.shape[-1]
+        step = max(256, 8 * BLOCK // (max(1, width) * max(1, self.weights.shape[0])))
+        return [slice(start, start + step) for start in range(0, max(n, 1), step)]
+
+    def normal_equations(self, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Cost ``(b,)``, gradient ``(b, p)`` and Gauss-Newton matrix ``(b, p, p)``."""
+        cost = torch.zeros(theta.shape[0], dtype=theta.dtype, device=theta.device)
+        gradient, matrix = torch.zeros_like(theta), theta.new_zeros(*theta.shape, theta.shape[-1])
+        for piece in self.pieces(theta.shape[-1]):
+            value, derivative = self.residual(theta, piece)
+            cost = cost + value.square().sum(-1)
+            gradient = gradient + (derivative @ value[..., None])[..., 0]
+            matrix = matrix + derivative @ derivative.mT
+        return torch.where(cost.isfinite(), cost, torch.inf), gradient, matrix
+
+
+def parts_of(theta: Tensor, shapes: Sequence[torch.Size]) -> tuple[Tensor, ...]:
+    """The inverse of :func:`flattened`."""
+    sizes = [shape.numel() for shape in shapes]
+    return tuple(part.unflatten(-1, shape) for part, shape in zip(theta.split(sizes, -1), shapes, strict=True))
+
+
+def flattened(parts: tuple[Tensor, ...]) -> Tensor:
+    """All entries of a motion, ``(b, p)``."""
+    return torch.cat([part.flatten(1) for part in parts], dim=-1)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# constrain(): the tensor of a motion with the least algebraic error, between the linear fit and refinement.
+
+
+CONSTRAINED_ITERATIONS = 30
+FREE = 1e-8  # least damping: leaves the gauge of the motions where it is to 1e-10
+
+
+@dataclass(frozen=True)
+class Algebraic:
+    r"""The algebraic error :math:`u^T G u` of tensors :math:`u = A(M) / |A(M)|`, with the Gram G of the matches."""
+
+    invariant: Invariant
+    shapes: tuple[torch.Size, ...]
+    gram: Tensor
+    """``(b, D, D)``."""
+
+    def parts(self, theta: Tensor) -> tuple[Tensor, ...]:
+        return parts_of(theta, self.shapes)
+
+    def subset(self, keep: Tensor) -> Algebraic:
+        return Algebraic(self.invariant, self.shapes, self.gram[keep])
+
+    def cost(self, theta: Tensor) -> Tensor:
+        """``(b,)``."""
+        tensor = self._columns(self.invariant.compose(*self.parts(theta)).flatten(1))
+        return ((self.gram @ tensor[..., None])[..., 0] * tensor).sum(-1)
+
+    def normal_equations(self, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        tensor, slope = (self._columns(x) for x in self.invariant.compose_derivative(self.parts(theta)))
+        image = (self.gram @ tensor[..., None])[..., 0]
+        cost = (image * tensor).sum(-1)
+        bent = slope @ self.gram
+        return torch.where(cost.isfinite(), cost, torch.inf), (slope @ image[..., None])[..., 0], bent @ slope.mT
+
+    def _columns(self, tensor: Tensor) -> Tensor:
+        """Flat tensors ``(b, ..., D)`` with their entries in the order of the columns of the estimation matrix."""
+        return self.invariant.basis_of(tensor.unflatten(-1, self.invariant.shape()))[..., 0, :]
+
+
+@one_thread
+def constrain(solution: Solution, *, iterations: int = CONSTRAINED_ITERATIONS) -> Solution:
+    r"""Replace the tensor of a linear fit by that of a motion: minimize :math:`|E\,A(M)| / |A(M)|` over the motion M.
+
+    The null vector of noisy matches is the tensor of no motion, and what it decomposes into may be far from the best one
+    (projections from :math:`P^6` at one pixel of noise: useless).  This stage searches among the tensors of motions, from
+    several starts, by Levenberg-Marquardt; :func:`dyntorch.refine`, which minimizes distances in the images, does it first
+    where an invariant needs it.
+
+    Args:
+        solution: of :func:`dyntorch.fit`, for an invariant of nullity one.
+        iterations: at most so many steps.
+
+    Returns:
+        The solution with the new tensor and motion; failed problems stay as they are.
+
+    Raises:
+        ValueError: an invariant of nullity above one or with copies, whose tensors do not stand alone.
+
+    Source: Hartley and Zisserman, sections 11.3 and 16.3 (algebraic minimization), for the motion of any invariant.
+
+    Example:
+        >>> import torch, dyntorch as dyn
+        >>> draw = torch.Generator().manual_seed(0)
+        >>> M, Y = (torch.randn(*size, generator=draw, dtype=torch.float64) for size in ((3, 3, 5), (60, 5)))
+        >>> seen = torch.einsum("vij,nj->vni", M, Y)
+        >>> views = seen[..., :2] / seen[..., 2:] + 1e-3 * torch.randn(3, 60, 2, generator=draw, dtype=torch.float64)
+        >>> found = constrain(dyn.fit(dyn.GrassmannTensor(4, (2, 2, 1)), *views))
+        >>> bool(torch.allclose(found.invariant.compose(*found.motion).abs(), found.tensor.abs()))
+        True
+    """
+    return constrain_matches(solution, solution.matches, iterations)
+
+
+def constrain_matches(solution: Solution, data: Matches, iterations: int = CONSTRAINED_ITERATIONS) -> Solution:
+    """:func:`constrain` by other weights of the same matches."""
+    invariant = solution.invariant
+    if invariant.nullity > 1 or invariant.copies is not None:
+        raise ValueError(f"the tensors of {invariant!r} do not stand alone; use refine")
+    with torch.no_grad():
+        motion = algebraic_motion(solution, data, iterations)
+        base = invariant.normalized(solution.normalization.transforms)
+        normalized = base.compose(*motion)
+        tensor = data.back(denormalize(invariant, normalized, solution.normalization.actions))
+        bad = failed(solution.status.reshape(-1))
+        wide = bad[(..., *[None] * (normalized.ndim - 1))]
+        return replace(
+            solution,
+            tensor=torch.where(data.back(wide), solution.tensor, tensor),
+            normalized=torch.where(wide.to(normalized.device), solution.normalized, normalized),
+            refined=motion,
+        )
+
+
+def algebraic_motion(solution: Solution, data: Matches, iterations: int = CONSTRAINED_ITERATIONS) -> tuple[Tensor, ...]:
+    """The motion of least algebraic error in normalized coordinates, from the best start of each problem."""
+    invariant, norm = solution.invariant, solution.normalization
+    views, weights, static = copied(invariant, data)
+    views = tuple(x.detach() for x in norm.apply(invariant, views))
+    weights = relative_weights(weights)
+    base = invariant.normalized(tuple(t.detach() for t in norm.transforms))
+    starts = base.starts(solution.normalized.detach())
+    shapes = tuple(part.shape[2:] for part in starts)
+
+    def run(tensors: Tensor, *block: Tensor) -> tuple[Tensor, Tensor]:
+        rest = block[1 + len(views) :]
+        matrix = gram(norm.primitives, block[: len(views)], block[len(views)], rest[0] if rest else None)
+        trace = matrix.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None]
+        problem = Algebraic(base, shapes, matrix / trace.clamp(min=torch.finfo(trace.dtype).tiny))
+        costs = torch.stack([problem.cost(theta) for theta in tensors.unbind(1)])
+        best = costs.nan_to_num(nan=torch.inf).argmin(0)
+        theta = tensors.gather(1, best[:, None, None].expand(-1, 1, tensors.shape[-1]))[:, 0]
+        return minimize(problem, theta, iterations, settle=2, least=FREE)[:2]
+
+    theta = torch.cat([part.flatten(2) for part in starts], dim=-1).transpose(0, 1)
+    options = () if static is None else (static,)
+    size = max(1, min(BLOCK // (invariant.width() * theta.shape[-1]), -(-len(theta) // workers())))
+    found = map_blocks(run, theta, *views, weights, *options, size=size)[0]
+    return parts_of(found, shapes)
+
+
+ITERATIONS = 30
+
+
+@one_thread
+def refine(
+    solution: Solution,
+    *views: Tensor,
+    weights: Tensor | None = None,
+    static: Tensor | None = None,
+    iterations: int = ITERATIONS,
+    **given: Tensor,
+) -> Solution:
+    r"""Refine the motion of a solution: minimize :math:`\sum_n w_n d_n^2` over its entries by Levenberg-Marquardt.
+
+    :math:`d_n` is the Sampson distance of match n, for several conditions per match its vector form
+    :math:`Q^{-1/2} e`.  The internal constraints of the tensor hold exactly, because its motion is what is varied.  Matches
+    labelled static are held to agree in all views (the segmented refinement).  The cost never rises; where the solution had
+    failed it is returned as it was.
+
+    Args:
+        solution: from :func:`dyntorch.fit` or :func:`dyntorch.robust_fit`.
+        *views: the same matches.
+        weights: ``(*batch, n)``; default: the solution's inliers, else its weights.
+        static: ``(*batch, n)`` bool, matches that do not move; default: those labelled in the fit.
+        iterations: at most so many steps.
+        **given: what else the invariant takes.
+
+    Returns:
+        The solution with ``tensor``, ``motion``, ``sigma`` (noise per coordinate, in the unit of the matches, that the
+        residuals show) and ``covariance`` of the entries of the motion (rank ``invariant.dof``: its scale is fixed; infinite
+        where no match is left to estimate the noise).
+
+    Raises:
+        ValueError: matches that do not fit the solution.
+
+    Source: theory of nonlinear estimation as in Hartley and Zisserman, appendix A6.
+
+    Example:
+        >>> import torch, dyntorch as dyn
+        >>> from dyntorch import scenes
+        >>> scene = scenes.planar(n=60, sigma=0.5, generator=torch.Generator().manual_seed(0))
+        >>> solution = dyn.fit(dyn.HomographyTensor, *scene.views)
+        >>> refined = dyn.refine(solution, *scene.views)
+        >>> bool((refined.sigma - 0.5).abs() < 0.15)
+        True
+    """
+    invariant, views = solution.invariant.prepared(views, **given)
+    data = matches(invariant, views, weights, static)
+    old = solution.matches
+    if data.batch != old.batch or data.count != old.count:
+        raise ValueError(
+            f"these matches have batch {data.batch} and {data.count} matches, the solution was fitted to batch {old.batch} and "
+            f"{old.count}; give the same ones"
+        )
+    if weights is None:
+        keep = old.weights if solution.inliers is None else solution.inliers.reshape(old.weights.shape).to(old.weights)
+        data = replace(data, weights=data.weights * (keep > 0 if solution.inliers is not None else keep))
+    if static is None and old.static is not None:
+        data = replace(data, static=old.static)
+    return refine_matches(solution, data, iterations)
+
+
+def refine_matches(solution: Solution, data: Matches, iterations: int = ITERATIONS) -> Solution:
+    """:func:`refine` for checked matches."""
+    invariant, norm = solution.invariant, _plain(solution)
+    parts = solution.normalized_motion()
+    shapes = tuple(part.shape[1:] for part in parts)
+    thetas = [flattened(parts).detach()]
+    if invariant.staged and solution.refined is None:
+        thetas.append(flattened(algebraic_motion(solution, data)))
+    moved = tuple(x.detach() for x in norm.apply(invariant, data.views))
+    frames = tuple(t.detach() for t in norm.transforms)
+    base = invariant.normalized(tuple(t.detach() for t in solution.normalization.transforms))
+    flags = () if data.static is None else (data.static,)
+    count = len(moved)
+
+    def run(*block: Tensor) -> tuple[Tensor, ...]:
+        views, scales, rest = block[1 : 1 + count], block[1 + count : 1 + 2 * count], block[1 + 2 * count :]
+        problem = Problem(base, shapes, views, scales, rest[0], rest[1] if len(rest) > 1 else None)
+        starts = block[0]
+        if starts.shape[1] == 1:
+            return minimize(problem, starts[:, 0], iterations)
+        costs = torch.stack([problem.normal_equations(theta)[0] for theta in starts.unbind(1)], dim=1)
+        best = costs.argmin(1)[:, None, None].expand(-1, 1, starts.shape[-1])
+        return minimize(problem, starts.gather(1, best)[:, 0], iterations)
+
+    # a block for every thread at least: threads inside of small operations cost more than they bring
+    theta = torch.stack(thetas, dim=1)
+    size = max(1, min(BLOCK // max(1, data.count * theta.shape[-1]), -(-len(theta) // workers())))
+    with torch.no_grad():
+        start = torch.where(theta.isfinite(), theta, torch.zeros_like(theta))
+        scales, unit = relative(norm.scales)
+        best, cost, matrix = map_blocks(run, start, *moved, *scales, data.weights, *flags, size=size)
+        cost, matrix = cost / unit.square(), matrix / unit.square()[:, None, None]
+        return _refined(solution, data, norm, frames, shapes, best, cost, matrix)
+
+
+def _refined(
+    solution: Solution,
+    data: Matches,
+    norm: Normalization,
+    frames: tuple[Tensor, ...],
+    shapes: tuple[torch.Size, ...],
+    theta: Tensor,
+    cost: Tensor,
+    matrix: Tensor,
+) -> Solution:
+    """The solution with the refined motion, where refinement was possible."""
+    invariant = solution.invariant
+    problem = Problem(invariant, shapes, (), (), data.weights, None)
+    status = solution.status.reshape(-1).to(theta.device)
+    good = cost.isfinite() & ~failed(status)
+    motion = tuple(
+        torch.where(good[(..., *([None] * (part.ndim - 1)))], part, old)
+        for part, old in zip(problem.parts(theta), solution.normalized_motion(), strict=True)
+    )
+    safe = tuple(torch.where(good[(..., *([None] * (part.ndim - 1)))], part, _any(part)) for part in motion)
+    # tensors of copies have the axis of the copies behind the batch, like the transforms of the solution
+    normalized = invariant.normalized(solution.normalization.transforms).compose(*safe)
+    tensor = denormalize(invariant, normalized, solution.normalization.actions)
+    keep = good[(..., *([None] * (tensor.ndim - 1)))]
+    conditions = torch.full_like(data.weights, float(invariant.codim))
+    if data.static is not None:
+        still = sum(p.freedom() for p in invariant.primitives[1:])
+        conditions = torch.where(data.static, float(still), conditions)
+    spare = ((data.weights > 0) * conditions).sum(-1) - invariant.dof
+    mean = cost / largest_weights(data.weights).clamp(min=torch.finfo(cost.dtype).tiny)
+    sigma = torch.where(spare > 0, (mean / spare.clamp(min=1)).sqrt(), torch.inf)
+    covariance = _covariance(invariant, problem, frames, theta, matrix, sigma, data.weights)
+    return replace(
+        solution,
+        tensor=torch.where(data.back(keep), data.back(tensor), solution.tensor),
+        normalized=torch.where(keep, normalized, solution.normalized),
+        refined=motion,
+        sigma=data.back(torch.where(good, sigma, torch.zeros_like(sigma))),
+        covariance=data.back(torch.where(good[:, None, None], covariance, torch.zeros_like(covariance))),
+    )
+
+
+def _covariance(
+    invariant: Invariant,
+    problem: Problem,
+    frames: tuple[Tensor, ...],
+    theta: Tensor,
+    matrix: Tensor,
+    sigma: Tensor,
+    weights: Tensor,
+) -> Tensor:
+    r"""Covariance ``(b, p, p)`` of the motion in the coordinates of the matches: :math:`\sigma^2 D H^+ D^T`, H of rank dof."""
+    values, vectors = spectrum(matrix)
+    count = min(invariant.dof, values.shape[-1])
+    values, vectors = values[..., -count:], vectors[..., -count:]
+    root = vectors * values.clamp(min=1e-12 * values[..., -1:].clamp(min=torch.finfo(values.dtype).tiny)).rsqrt()[..., None, :]
+
+    def moved(t: Tensor) -> Tensor:
+        return torch.cat([part.flatten(t.ndim - 1) for part in denormalize_motion(invariant, problem.parts(t), frames)], dim=-1)
+
+    _, derivative = jacobian(moved, theta)
+    spread = derivative.mT @ root
+    scale = sigma * largest_weights(weights).sqrt()
+    covariance = (spread @ spread.mT) * scale.square()[:, None, None]
+    # a motion without a matrix in the coordinates of the matches (singular) is not known at all, like one without spare matches
+    known = scale.isfinite() & covariance.isfinite().flatten(1).all(-1)
+    return torch.where(known[:, None, None], covariance, torch.inf)
+
+
+def _any(part: Tensor) -> Tensor:
+    """A harmless motion in place of one that failed."""
+    if part.ndim == 3:
+        return torch.eye(part.shape[-2], part.shape[-1], dtype=part.dtype, device=part.device).expand_as(part)
+    return torch.ones_like(part)
+
+
+def _plain(solution: Solution) -> Normalization:
+    """The normalization of one problem each, without the dimension of copies."""
+    norm = solution.normalization
+    if solution.invariant.copies is None:
+        return norm
+    return Normalization(
+        tuple(t[:, 0] for t in norm.transforms), norm.primitives, norm.actions, tuple(s[:, 0] for s in norm.scales)
+    )

@@ -1,0 +1,751 @@
+"""robust_fit(): tensors from matches of which many are wrong, for every invariant and whole batches at once."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from dyntorch.core.fit import fit_matches
+from dyntorch.core.invariant import Invariant, as_invariant
+from dyntorch.core.matches import Matches, matches
+from dyntorch.core.matrix import unpack
+from dyntorch.core.normalize import Normalization, denormalize, normalization, relative
+from dyntorch.core.primitives import HyperplanesThrough, Point, Primitive, triangle
+from dyntorch.core.refine import refine_matches
+from dyntorch.core.residual import SINGULAR, multilinear, whiten, whitened
+from dyntorch.core.solution import NOISY, Solution, Status, copied, failed
+from dyntorch.numerics.blocks import Draws, Result, map_blocks, one_thread, workers
+from dyntorch.numerics.chi_square import quantile
+from dyntorch.numerics.nullspace import gram_null_space, orthonormal
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Many weightings of the same matches: tensors, distances and annealed reweighting for a whole bundle of starts at once.
+
+
+STEPS = 2
+"""Inverse iterations per reweighting: the weights change more than what is left of the null vector's error."""
+SHIFT = 1e-14  # of the trace: keeps the factor of an exactly singular Gram finite
+FAR = 1e30  # squared distance in place of one that is no number
+HOLD = 0.7  # share of the reweightings during which the scale shrinks
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """Matches of a block of problems in normalized coordinates, with everything that does not depend on their weights.
+
+    Axes: problems b, copies c (1 where the invariant has none), starts K, tensors of one null space a, matches n.
+    """
+
+    invariant: Invariant
+    """In these coordinates, for tensors ``(b, K, ..)``."""
+    primitives: tuple[Primitive, ...]
+    views: tuple[Tensor, ...]
+    """``(b, 1, n, ...)``."""
+    scales: tuple[Tensor, ...]
+    """``(b,)`` size, in these coordinates, of one unit of the search."""
+    weights: Tensor
+    """``(b, n)``."""
+    moments: Tensor
+    """``(b, c, n, m)`` packed outer squares of the rows of each match."""
+    vectors: tuple[Tensor, ...]
+    """``(b, c, width, rows, n)`` per view, of the length that the derivatives of the primitives suppose."""
+
+    def first(self, weights: Tensor) -> Tensor:
+        """Null spaces ``(b, c, K, a, D)`` of the weightings ``(b, K, n)`` of rows of unit length."""
+        gram = self._gram(weights[:, None] / self.lengths()[:, :, None])
+        return gram_null_space(gram, self.invariant.nullity).basis
+
+    def lengths(self) -> Tensor:
+        """Squared lengths ``(b, c, n)`` of the rows."""
+        norms = torch.ones_like(self.weights[:, None])
+        for primitive, u in zip(self.primitives, self.vectors, strict=True):
+            norms = norms * u[..., 0, :].square().sum(-2) if primitive.rows == 1 else norms
+        return norms.clamp(min=1e-300)
+
+    def constrained(self, basis: Tensor) -> Tensor:
+        """The tensors of the motions that tensors ``(b, c, K, a, D)`` decompose into; where no motion guides, the tensors."""
+        if not self.invariant.guides:
+            return basis
+        inv, own = self.invariant, basis.transpose(1, 2)
+        motion = inv.decompose(inv.tensor_of(own if inv.copies else own[:, :, 0]))
+        made = inv.compose(*motion) if isinstance(motion, tuple) else inv.compose(motion)
+        made = inv.basis_of(made).reshape(own.shape).transpose(1, 2)
+        sound = made.isfinite().all(-1, keepdim=True) & (made.abs().amax(-1, keepdim=True) > 0)
+        return torch.where(sound.all(-2, keepdim=True).all(1, keepdim=True), made, basis)
+
+    def next(self, weights: Tensor, basis: Tensor) -> Tensor:
+        """The same for weightings ``(b, c, K, n)`` of unscaled rows, by inverse iteration from the null spaces before."""
+        gram = self._gram(weights)
+        diagonal = gram.diagonal(dim1=-2, dim2=-1)
+        diagonal += diagonal.sum(-1, keepdim=True) * SHIFT + 1e-300
+        factor, _ = torch.linalg.cholesky_ex(gram)
+        columns = basis.mT
+        for _ in range(STEPS):
+            columns = orthonormal(torch.cholesky_solve(columns, factor))
+        found = columns.mT
+        return torch.where(found.isfinite().all(-1, keepdim=True).all(-2, keepdim=True), found, basis)
+
+    def _gram(self, weights: Tensor) -> Tensor:
+        # all starts in one product: the matches are read once, however many weightings there are
+        return unpack(weights @ self.moments, tuple(p.width for p in self.primitives))
+
+    def distances(self, basis: Tensor) -> tuple[Tensor, Tensor]:
+        r"""Squared Sampson distances ``(b, K, n)`` in the unit of the measurements, and row weights ``(b, c, K, n)``.
+
+        Of several tensors, rows or copies, :math:`d^2 = k \sum h^2 / \sum \|\nabla h\|^2` with k conditions per match: right in
+        the mean, without the motion behind the tensors.
+        """
+        slot = transfer_slot(self.primitives)
+        square, rows = self._form(basis) if slot is None else self._transfer(basis, slot)
+        return square.nan_to_num(nan=FAR, posinf=FAR).clamp(max=FAR), rows.nan_to_num(nan=0.0, posinf=0.0)
+
+    def _form(self, basis: Tensor) -> tuple[Tensor, Tensor]:
+        """Values of the multilinear form on all rows of a match over the length of their gradients."""
+        widths = [p.width for p in self.primitives]
+        cube = basis.unflatten(-1, widths)
+        square = torch.zeros((), dtype=basis.dtype, device=basis.device)
+        value = torch.zeros((), dtype=basis.dtype, device=basis.device)
+        for v, scale in enumerate(self.scales):
+            others = _products([u for w, u in enumerate(self.vectors) if w != v])
+            flat = cube.movedim(4 + v, 4).flatten(2, 4).flatten(3) @ others.flatten(3)
+            gradient = flat.unflatten(2, (*basis.shape[2:4], widths[v])).unflatten(-1, others.shape[3:]).movedim(-2, 4)
+            if v == 0:
+                for u in self.vectors[v][:, :, None, None, None].unbind(-2):
+                    value = value + (gradient * u).sum(-2).square().sum((3, 4))
+            square = square + scale.square()[:, None, None, None] * self._slopes(v, gradient).square().sum((3, 4, 5))
+        return (value / (square + SINGULAR)).mean(1) * self.invariant.codim, 1 / (square + SINGULAR)
+
+    def _transfer(self, basis: Tensor, slot: int) -> tuple[Tensor, Tensor]:
+        """Rows that say where the point of one view lies: how far it is from where the others predict it."""
+        widths = [p.width for p in self.primitives]
+        d = widths[slot] - 1
+        cube = basis[:, :, :, 0].unflatten(-1, widths).movedim(3 + slot, 3)
+        rest = [v for v in range(len(widths)) if v != slot]
+        lead = cube.shape[:2]
+        image = cube.reshape(*lead, cube.shape[2] * (d + 1), -1) @ _products([self.vectors[v] for v in rest])[..., 0, :]
+        image = image.unflatten(2, (-1, d + 1))
+        depth, floor = image[..., d, :], 1e-12 * image.abs().amax(-2)
+        depth = torch.where(depth.abs() > floor, depth, floor.clamp(min=1e-300))
+        place = image[..., :d, :] / depth[..., None, :]
+        eye = torch.eye(d, dtype=basis.dtype, device=basis.device)
+        covariance = self.scales[slot].square()[:, None, None, None, None, None] * eye
+        for i, v in enumerate(rest):
+            others = _products([self.vectors[w] for w in rest if w != v] or [torch.ones_like(self.vectors[v][:, :, :1])])[..., 0, :]
+            rows = cube.movedim(4 + i, 4).reshape(*lead, cube.shape[2] * (d + 1) * widths[v], -1)
+            moved = self._slopes(v, (rows @ others).unflatten(2, (-1, d + 1, widths[v])))
+            jacobian = (moved[:, :, :, :d] - place[..., None, :] * moved[:, :, :, d:]) / depth[..., None, None, :]
+            jacobian = (self.scales[v][:, None, None, None, None, None] * jacobian).movedim(-1, 3)
+            covariance = covariance + (jacobian[..., :, None, :] * jacobian[..., None, :, :]).sum(-1)
+        error = place.mT - self.views[slot][:, :, None]
+        size = covariance.diagonal(dim1=-2, dim2=-1).sum(-1) / d * depth.square()
+        return whiten(error, covariance).square().sum(-1)[:, 0], 1 / (size + SINGULAR)
+
+    def _slopes(self, view: int, gradient: Tensor) -> Tensor:
+        """Derivatives by the measured coordinates ``(b, c, .., d, n)`` from those by the vectors ``(b, c, .., width, n)``.
+
+        Of several hyperplanes [I | -x] each moves with some coordinates only: these are all of their derivatives.
+        """
+        primitive = self.primitives[view]
+        if isinstance(primitive, HyperplanesThrough):
+            return primitive.slopes(gradient)
+        if isinstance(primitive, Point):
+            return gradient[..., :-1, :]
+        x = self.views[view]
+        columns = gradient.mT
+        item = x.shape[3:]
+        # one long axis of matches, because the primitive knows only one
+        spread = x[(slice(None), slice(None), *[None] * (gradient.ndim - 4))].expand(*x.shape[:2], *columns.shape[2:-1], *item)
+        flat = primitive.pullback(spread.reshape(*x.shape[:2], -1, *item), columns.flatten(2, -2))
+        return flat.unflatten(2, columns.shape[2:-1]).mT
+
+
+def bundle(
+    invariant: Invariant, primitives: tuple[Primitive, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...], weights: Tensor
+) -> Bundle:
+    """Prepare matches ``(b, 1, n, ...)`` in normalized coordinates, with weights ``(b, n)``."""
+    packed, vectors = [], []
+    for primitive, x in zip(primitives, views, strict=True):
+        rows, columns = triangle(primitive.width, x.device)
+        if primitive.rows > 1:
+            vectors.append(primitive.vectors(x).permute(0, 1, 4, 3, 2).contiguous())
+            packed.append(primitive.packed(x).mT)
+        else:
+            # not the components of the estimation matrix, which may be scaled: distances need the length that is measured
+            vectors.append(primitive.raw(x).mT.contiguous()[..., None, :])
+            packed.append((vectors[-1][..., rows, 0, :] * vectors[-1][..., columns, 0, :]).mT)
+    moments = packed[0]
+    for factor in packed[1:]:
+        moments = (moments[..., :, None] * factor[..., None, :]).flatten(-2)
+    return Bundle(invariant, primitives, views, scales, weights, moments, tuple(vectors))
+
+
+def transfer_slot(primitives: Sequence[Primitive]) -> int | None:
+    """The only view measured through all hyperplanes of its points, which the other views then predict."""
+    slots = [v for v, p in enumerate(primitives) if isinstance(p, HyperplanesThrough) and p.order == 1]
+    return slots[0] if len(slots) == 1 and all(p.rows == 1 for v, p in enumerate(primitives) if v not in slots) else None
+
+
+def anneal(data: Bundle, basis: Tensor, end: Tensor | None, iterations: int, *, guided: bool = False) -> Tensor:
+    r"""Graduated non-convexity: weights :math:`(a / (a + d^2))^2` (Geman-McClure) with a scale a that shrinks to ``end``.
+
+    The scale starts at four times the median squared distance of each start (a mean would be that of the outliers).
+
+    Args:
+        data: matches.
+        basis: ``(b, c, K, a, D)``.
+        end: ``(b,)`` squared scale at the end; None: the scale is the median squared distance itself, all the time.
+        iterations: reweightings; the last 30 % are at the final scale.
+        guided: measure the distances, until the scale is final, to the tensor of a motion, which has fewer degrees of freedom,
+            so that fewer outliers can bend it; costs a decomposition per reweighting.
+
+    Returns:
+        The tensors, same shape.
+
+    Source: Black and Rangarajan 1996; Yang, Antonante, Tzoumas and Carlone 2020.
+    """
+    start: Tensor | None = None
+    for i in range(iterations):
+        square, rows = data.distances(data.constrained(basis) if guided and i < HOLD * iterations else basis)
+        if guided and 2 * i < iterations:
+            # the gradients of a wrong tensor mislead: half their say doubles the successes of lines (175, 30 % outliers)
+            rows = (rows / data.lengths()[:, :, None]).sqrt()
+        if end is None:
+            scale = median(square, data.weights)[:, None, :, None].clamp(min=torch.finfo(square.dtype).tiny)
+        else:
+            stop = end[:, None, None, None]
+            start = torch.maximum(4 * median(square, data.weights)[:, None, :, None], stop) if start is None else start
+            scale = start * (stop / start) ** min(1.0, i / (HOLD * iterations))
+        weights = (scale / (scale + square[:, None])).square() * data.weights[:, None, None] * rows
+        basis = data.next(weights, basis)
+    return basis
+
+
+def concentrate(data: Bundle, basis: Tensor, cut: Tensor | None, iterations: int) -> Tensor:
+    """Refit to the matches with a squared distance up to ``cut (b,)``, or (None) to the nearer half of them."""
+    for _ in range(iterations):
+        square, rows = data.distances(basis)
+        limit = median(square, data.weights)[:, :, None] if cut is None else cut[:, None, None]
+        basis = data.next((square <= limit)[:, None] * data.weights[:, None, None] * rows, basis)
+    return basis
+
+
+def msac(square: Tensor, weights: Tensor, cut: Tensor) -> Tensor:
+    """Truncated squares in units of the cut, ``(b, K)``: the matches' weight lost, less is better."""
+    return ((square / cut[:, None, None]).clamp(max=1.0) * weights[:, None]).sum(-1)
+
+
+def median(square: Tensor, weights: Tensor) -> Tensor:
+    """Median ``(b, K)`` over the matches with weight."""
+    order = square.masked_fill(weights[:, None] <= 0, torch.inf).sort(-1).values
+    middle = ((weights > 0).sum(-1) // 2).clamp(max=order.shape[-1] - 1)
+    return order.gather(-1, middle[:, None, None].expand(*order.shape[:2], 1))[..., 0].clamp(max=FAR)
+
+
+def _products(vectors: list[Tensor]) -> Tensor:
+    """Kronecker products of the vectors of each match, and of their rows: ``(b, c, w1 w2 .., r1 r2 .., n)``."""
+    total = vectors[0]
+    for u in vectors[1:]:
+        total = (total[..., :, None, :, None, :] * u[..., None, :, None, :, :]).flatten(-5, -4).flatten(-3, -2)
+    return total
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# The search of robust estimation: which weightings to start from, when to stop, and whether what was found beats chance.
+
+
+SMALL = 8
+"""Largest minimal sample for which samples of that size are drawn; other starts take 2.5 times the minimal number."""
+DRAWN, KEPT = 32, 4
+"""Minimal samples per start, and starts per sample that is annealed: the best samples are near already."""
+ANNEALED = {"all": 30, "many": 20, "guided": 60, "minimal": 10}
+"""Reweightings of a start: from all matches; from 2.5 times the minimal number, without and with a motion as guide; from a minimal
+sample."""
+FREE = 4
+"""One start of so many is not guided by a motion.  Successes per start, not guided and guided: homography tensor (100 matches, 50 %
+outliers) 0.48 and 0.70, translating lines (175, 30 %) 0.01 and 0.20, constant velocity tensor (150, 35 %) 0.53 and 0.52, but in
+one scene of eight 0.9 and 0."""
+
+STARTS_BLOCK = 1 << 20
+"""Numbers in one block of the batch (8 MB)."""
+SEARCHED = 1000
+"""Matches among which is searched, at least 10 for every column; of more, a random part (all are used for the final fit)."""
+NEAR = 5.0
+"""Matches farther from the median than so many median distances have no say in the normalization."""
+MIXED = 4
+"""Random sets of matches, made by mixing up the views, on which the chance of an inlier is measured."""
+DOUBT = 0.15
+"""Matches between one and three thresholds away, per inlier, above which the search goes on: a wrong model has many (constant
+velocity tensors, 20 % outliers: wrong 0.7 and more, right 0.03 at most; right homography tensors reach 0.15 at 60 %)."""
+MANY, AGREEING, SAME = 16, 0.25, 0.01
+"""So many starts decide when to stop where there is doubt: when this share of them end at the best score so far, up to this
+relative difference.  Whatever attracts one start in five, and is better, is then missed once in thirty times."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """The best tensor of each problem."""
+
+    basis: Tensor
+    """``(b, c, a, D)``, axes of the tensor in the order of the views."""
+    score: Tensor
+    """``(b,)`` weight of the matches lost; less is better."""
+    evidence: Tensor
+    """``(b,)`` log of the expected number of such finds among random matches; negative: not by chance."""
+    doubt: Tensor
+    """``(b,)`` bool: to be searched on."""
+    inliers: Tensor
+    """``(b, searched)`` bool: by the tensor itself, before its motion is known."""
+    agreeing: Tensor
+    """``(b,)`` share of the starts that ended there, of so many that it says something, else 0."""
+
+
+class Search:
+    """The search for the tensors of a batch, among at most so many matches that memory stays bounded."""
+
+    def __init__(self, invariant: Invariant, data: Matches, generator: torch.Generator | None) -> None:
+        self.invariant, self.data = invariant, data
+        self.draws = Draws(len(data.weights), generator, data.weights.device)
+        self.everyone = torch.arange(len(data.weights), device=data.weights.device)
+        views, weights, _ = copied(invariant, replace(data, weights=data.weights * _near(invariant, data)))
+        self.norm: Normalization = normalization(invariant, views, weights)
+        # the search measures in this unit, so that no limit of it depends on that of the matches
+        self.unit = relative([t.flatten(1)[:, 0] for t in self.norm.transforms])[1]
+        self.some = some = self._some()
+        moved = self.norm.apply(invariant, copied(invariant, some)[0])
+        self.views = moved if invariant.copies else tuple(x[:, None] for x in moved)
+        self.weights = some.weights / some.weights.amax(-1, keepdim=True).clamp(min=1e-300)
+
+    def run(self, cut: Tensor, starts: Sequence[int]) -> Found:
+        """Best tensors: more and more starts for the problems that need them.
+
+        Args:
+            cut: ``(b,)`` threshold.
+            starts: numbers of starts, one after the other.
+        """
+        cut = cut * self.unit
+        found = self._solve(self.everyone, cut, starts[0])
+        settled = torch.zeros_like(found.doubt)
+        enough = (self.weights > 0).sum(-1) >= self.invariant.minimal()
+        for count in starts[1:]:
+            left = (found.doubt & enough & ~settled).nonzero()[:, 0]
+            if not len(left):
+                break
+            new = self._solve(left, cut, count)
+            better = (new.score < found.score[left]).nonzero()[:, 0]
+            for old, part in zip(vars(found).values(), vars(new).values(), strict=True):
+                old[left[better]] = part[better]
+            # more starts would find it again
+            settled[left] = (new.agreeing >= AGREEING) & (new.score <= _same(found.score[left]))
+        return found
+
+    def scale(self) -> Tensor:
+        """Threshold ``(b,)`` from the data: least median of squares (annealed), and what 99 % of the inliers then keep."""
+        inv, everyone = self.invariant, self.everyone
+        chosen = torch.cat([self.weights[:, None], self._samples(everyone, 16)], dim=1)
+
+        def block(chosen: Tensor, *rest: Tensor) -> Tensor:
+            work = self._bundle(rest)
+            basis = _best(work, work.first(chosen), lambda square: median(square, work.weights), 17)
+            # guided and soft: hard halves alone are 40 to 70 times off for lines (175, 20 % outliers), this 0.6 to 1.6 times
+            basis = concentrate(work, anneal(work, basis, None, 20, guided=True), None, 5)
+            return median(work.distances(basis)[0], work.weights).amin(1)
+
+        middle = self._map(block, everyone, chosen)
+        # Rousseeuw and Leroy 1987: the median of so few is too small
+        few = 1 + 5 / ((self.weights > 0).sum(-1) - inv.minimal()).clamp(min=1)
+        return threshold_of(inv, middle.sqrt() * few / quantile(0.5, inv.codim) ** 0.5) / self.unit
+
+    def evidence(self, tensor: Tensor, cut: Tensor) -> Tensor:
+        """Evidence ``(b,)``, see :class:`Found`, of normalized tensors as a solution holds them, with another threshold."""
+        inv = self.invariant
+        tensors = inv.basis_of(tensor)
+
+        def block(basis: Tensor, cut: Tensor, *rest: Tensor) -> Tensor:
+            work = self._bundle(rest)
+            square = work.distances(basis[:, :, None])[0][:, 0]
+            return judge(work, basis[:, :, None], square, cut.square())[0]
+
+        return self._map(block, self.everyone, tensors if inv.copies else tensors[:, None], cut * self.unit)
+
+    def _solve(self, where: Tensor, cut: Tensor, count: int) -> Found:
+        chosen = self.weights[where, None] if count == 1 else self._samples(where, count)
+        kind = "all" if count == 1 else "many" if chosen.shape[1] == count else "minimal"
+        keep, steps = max(1, count // KEPT) if kind == "minimal" else count, ANNEALED[kind]
+
+        def block(chosen: Tensor, cut: Tensor, *rest: Tensor) -> tuple[Tensor, ...]:
+            work, limit = self._bundle(rest), cut.square()
+
+            def score(square: Tensor) -> Tensor:
+                return msac(square, work.weights, limit)
+
+            basis = _best(work, work.first(chosen), score, keep)
+            free, led = basis[:, :, : -(-keep // FREE)], basis[:, :, -(-keep // FREE) :]
+            if kind == "many":
+                led = anneal(work, led, limit, ANNEALED["guided"], guided=True)
+                basis = torch.cat([anneal(work, free, limit, steps), led], dim=2)
+            else:
+                basis = anneal(work, basis, limit, steps)
+            lost = score(work.distances(basis)[0])
+            agreeing = (lost <= _same(lost.amin(-1, keepdim=True))).double().mean(-1) * (lost.shape[-1] >= MANY)
+            basis = concentrate(work, _chosen(basis, lost.argmin(-1, keepdim=True)), limit, 5)
+            square = work.distances(basis)[0]
+            evidence, doubt = judge(work, basis, square[:, 0], limit)
+            return basis[:, :, 0], score(square)[:, 0], evidence, doubt, square[:, 0] <= limit[:, None], agreeing
+
+        return Found(*self._map(block, where, chosen, cut[where]))
+
+    def _samples(self, where: Tensor, count: int) -> Tensor:
+        """Starts ``(problems, K, n)``: 1 for so many random matches with weight."""
+        minimal = self.invariant.minimal()
+        size, count = (minimal, count * DRAWN) if minimal <= SMALL else (-(-5 * minimal // 2), count)
+        present = self.weights[where, None] > 0
+        drawn = self.draws(where, count, self.weights.shape[-1]).masked_fill(~present, 2.0)
+        last = drawn.kthvalue(min(size, drawn.shape[-1]), dim=-1, keepdim=True).values
+        return ((drawn <= last) & present).to(torch.float64)
+
+    def _some(self) -> Matches:
+        """The matches to search among."""
+        data, limit = self.data, max(SEARCHED, 10 * self.invariant.width())
+        if data.count <= limit:
+            return data
+        order = (self.draws(self.everyone, data.count) * (data.weights > 0)).topk(limit).indices
+        rows = torch.arange(len(order), device=order.device)[:, None]
+        return replace(data, views=tuple(x[rows, order] for x in data.views), weights=data.weights[rows, order])
+
+    def _map(self, function: Callable[..., Result], where: Tensor, starts: Tensor, *more: Tensor) -> Result:
+        inv, n = self.invariant, self.weights.shape[-1]
+        packed = math.prod(p.width * (p.width + 1) // 2 for p in inv.primitives)
+        per_start = 2 * inv.width() ** 2 + n * inv.nullity * sum(p.width for p in inv.primitives)
+        per_problem = (inv.copies or 1) * (n * packed + starts.shape[1] * per_start)
+        size = min(STARTS_BLOCK // per_problem, -(-len(where) // workers()))
+        rest = (self.weights, *self.views, *self.norm.transforms)
+        return map_blocks(function, starts, *more, *(x[where] for x in rest), size=max(1, size))
+
+    def _bundle(self, rest: tuple[Tensor, ...]) -> Bundle:
+        count = len(self.invariant.primitives)
+        weights, views, transforms = rest[0], rest[1 : 1 + count], rest[1 + count :]
+        primitives = tuple(p.normalized(t) for p, t in zip(self.invariant.primitives, transforms, strict=True))
+        return bundle(
+            self.invariant.normalized(tuple(t[:, None] for t in transforms)),
+            primitives,
+            views,
+            relative([t.flatten(1)[:, 0] for t in transforms])[0],
+            weights,
+        )
+
+
+def judge(work: Bundle, basis: Tensor, square: Tensor, limit: Tensor) -> tuple[Tensor, Tensor]:
+    r"""Evidence and doubt ``(b,)`` of one tensor per problem.
+
+    Among n random matches, each an inlier with chance p, the expected number of tensors through m matches with k inliers is
+
+    .. math:: (n - m) \binom{n}{k} \binom{k}{m} p^{k - m} ,
+
+    with p measured on matches whose views were mixed up.
+
+    Source: Moisan and Stival 2004 (a contrario detection).
+    """
+    present = work.weights > 0
+    n, k = present.sum(-1).to(square), ((square <= limit[:, None]) & present).sum(-1).to(square)
+    m = torch.full_like(n, float(work.invariant.minimal()))
+    hits, trials = torch.zeros_like(n), torch.zeros_like(n)
+    for mixed in _mixed(work):
+        real = mixed.weights > 0
+        hits = hits + ((mixed.distances(basis)[0][:, 0] <= limit[:, None]) & real).sum(-1)
+        trials = trials + real.sum(-1)
+    chance = (hits + 1) / (trials + 1)
+    evidence = (n - m).clamp(min=1).log() + _choose(n, k) + _choose(k, m) + (k - m) * chance.log()
+    near = ((square > limit[:, None]) & (square <= 9 * limit[:, None]) & present).sum(-1)
+    return torch.where(k > m, evidence, torch.inf), (k <= m) | (evidence >= 0) | (near > DOUBT * k)
+
+
+def _mixed(work: Bundle) -> list[Bundle]:
+    """Random matches: view v shifted against the first one by v steps of several sizes."""
+    n, count = work.weights.shape[-1], len(work.views)
+    steps = sorted({max(1, (2 * j + 1) * n // (2 * MIXED * count)) for j in range(MIXED)})
+    mixed = []
+    for step in steps:
+        weights = work.weights
+        for v in range(1, count):
+            weights = weights * work.weights.roll(v * step, -1)
+        views = tuple(x.roll(v * step, 2) for v, x in enumerate(work.views))
+        vectors = tuple(u.roll(v * step, -1) for v, u in enumerate(work.vectors))
+        mixed.append(replace(work, views=views, vectors=vectors, weights=weights))
+    return mixed
+
+
+def _choose(n: Tensor, k: Tensor) -> Tensor:
+    k = torch.minimum(k, n)
+    return torch.lgamma(n + 1) - torch.lgamma(k + 1) - torch.lgamma(n - k + 1)
+
+
+def _best(work: Bundle, basis: Tensor, score: Callable[[Tensor], Tensor], count: int) -> Tensor:
+    """The ``count`` starts with the least score."""
+    if basis.shape[2] <= count:
+        return basis
+    return _chosen(basis, score(work.distances(basis)[0]).topk(count, largest=False).indices)
+
+
+def _chosen(basis: Tensor, order: Tensor) -> Tensor:
+    """The starts ``(b, count)`` of ``(b, c, K, a, D)``."""
+    return basis.gather(2, order[:, None, :, None, None].expand(*basis.shape[:2], order.shape[-1], *basis.shape[3:]))
+
+
+def _same(score: Tensor) -> Tensor:
+    """The score up to which two finds are the same one: the weight of a hundredth of a match is no difference."""
+    return score * (1 + SAME) + SAME
+
+
+def _near(invariant: Invariant, data: Matches) -> Tensor:
+    """Matches ``(b, n)`` without gross outliers, which would make the others small."""
+    keep = data.weights > 0
+    for primitive, x in zip(invariant.primitives, data.views, strict=True):
+        points = primitive.points(x, data.weights).flatten(2).masked_fill((data.weights <= 0)[..., None], torch.nan)
+        far = (points - points.nanmedian(1, keepdim=True).values).norm(dim=-1)
+        middle = far.nanmedian(-1, keepdim=True).values
+        keep = keep & ((far <= NEAR * middle) | ~(middle > 0))
+    return keep
+
+
+def threshold_of(invariant: Invariant, sigma: Tensor) -> Tensor:
+    """The distance that 99 % of the inliers keep, with noise of standard deviation ``sigma``."""
+    return (sigma * quantile(0.99, invariant.codim) ** 0.5).clamp(min=torch.finfo(sigma.dtype).tiny ** 0.25)
+
+
+STARTS = (1, 4, 16, 64, 256)
+SETTLING = 4  # updates of an estimated threshold per round
+WIDE = 1.5
+"""Times the threshold up to which distances count when it is estimated: cut at the threshold itself the noise comes out 14 % too
+small (homography tensors, 200 matches, no outliers)."""
+ROUNDS = (3, 8)
+"""Steps of refinement after each choice of the inliers."""
+BLOCK = 1 << 16  # matches per block of the distances
+
+
+@one_thread
+def robust_fit(
+    invariant: Invariant | type[Invariant],
+    *views: Tensor,
+    threshold: float | Tensor | None = None,
+    weights: Tensor | None = None,
+    generator: torch.Generator | None = None,
+    starts: Sequence[int] = STARTS,
+    polish: bool = True,
+    **given: Tensor,
+) -> Solution:
+    r"""Fit an invariant to matches of which some, or half, are wrong: graduated non-convexity, many starts where one is not enough.
+
+    Each tensor comes from matches weighted by :math:`w_n / \|\nabla h_n\|^2 \cdot (a / (a + d_n^2))^2`, with the Sampson distance
+    :math:`d_n` and a scale a that shrinks to the threshold (Geman-McClure loss, annealed).  The first start weighs all matches
+    alike.  Where what it finds could be chance, or leaves many matches just beyond the threshold, 4, 16, then 64 random
+    subsets are the starts (2.5 times the minimal number of matches; for minimal samples of 8 or fewer those themselves, 32 per
+    start); no more where a quarter of 16 or more starts end at the best answer: others would find it again.  The least truncated
+    square sum (MSAC) wins, and is refined on its inliers by :func:`dyntorch.refine`.
+
+    The status is ``NO_CONSENSUS`` where random matches would do as well: with n matches, k of them inliers, m the minimal
+    number and p the chance of an inlier (measured on matches whose views are mixed up), the expected number of such finds
+    :math:`(n - m) \binom{n}{k} \binom{k}{m} p^{k-m}` is not below 1.
+
+    No gradient passes; refit with ``weights=solution.inliers.to(x.dtype)`` for one.  On the CPU the result depends, to
+    rounding, on nothing but the arguments and the state of the generator.
+
+    Args:
+        invariant: an invariant class such as ``dyntorch.HomographyTensor``, or an instance of a family.
+        *views: matches, one argument per view, ``(*batch, n, ...)``; NaN = missing.
+        threshold: largest distance of an inlier, a number or ``(*batch,)``, in the unit of the measurements.  The distance of a
+            match is that of :func:`dyntorch.sampson`: over the noise of one coordinate it follows the chi distribution with
+            ``invariant.codim`` degrees of freedom, so 99 % of the inliers need 2.6 sigma (codim 1), 3.0 (2), 3.4 (3).  None:
+            estimated (least median of squares, then the median of the inliers; less than half of the matches may be wrong).
+        weights: ``(*batch, n)`` not negative; 0 leaves a match out.
+        generator: source of all randomness.
+        starts: numbers of starts, tried one after the other on the problems that are not settled; 1 is all matches.
+        polish: False leaves out the refinement.
+        **given: what else the invariant takes.
+
+    Returns:
+        A :class:`~dyntorch.core.solution.Solution` with ``inliers`` ``(*batch, n)``, the matches within the threshold of its
+        tensor, and ``sigma`` ``(*batch,)``, the noise of one coordinate by the median of their distances.
+
+    Raises:
+        ValueError: misuse - fewer matches than the minimal number, a threshold that is not positive, shapes, dtypes or devices
+            that do not agree.
+
+    Source: Yang, Antonante, Tzoumas and Carlone 2020 (graduated non-convexity); Torr and Zisserman 2000 (MSAC); Moisan and
+    Stival 2004 (when to believe it).
+
+    Example:
+        >>> import torch, dyntorch as dyn
+        >>> from dyntorch import scenes
+        >>> scene = scenes.planar(n=200, sigma=0.5, outliers=0.3, generator=torch.Generator().manual_seed(0))
+        >>> solution = dyn.robust_fit(dyn.HomographyTensor, *scene.views, threshold=1.5)
+        >>> solution
+        Solution(HomographyTensor, matches=200, batch=(): 1 OK, sigma 0.48)
+        >>> right = scene.labels != 0
+        >>> bool(solution.inliers[right].double().mean() > 0.95), bool(solution.inliers[~right].double().mean() < 0.2)
+        (True, True)
+    """
+    invariant, views = as_invariant(invariant).prepared(views, **given)
+    with torch.no_grad():
+        data = matches(invariant, views, weights)
+        _check(invariant, data, starts)
+        cut = None if threshold is None else _threshold(threshold, data)
+        if not len(data.weights):
+            return _empty(fit_matches(invariant, data))
+        search = Search(invariant, data, generator)
+        limit = search.scale() if cut is None else cut
+        return _finish(search, search.run(limit, starts), limit, ROUNDS if polish else (), estimate=cut is None)
+
+
+def _empty(solution: Solution) -> Solution:
+    """The robust fit of no problem."""
+    data = solution.matches
+    return replace(solution, inliers=data.back(data.weights > 0), sigma=data.back(data.weights.new_zeros(0)))
+
+
+def _check(invariant: Invariant, data: Matches, starts: Sequence[int]) -> None:
+    if invariant.intrinsic:
+        raise ValueError(
+            f"robust_fit compares views of matches, and a match of {invariant!r} stands alone; fit, see which matches "
+            "dyntorch.sampson finds far off, and fit again with weights= of 0 for them"
+        )
+    if not starts or any(count < 1 for count in starts):
+        raise ValueError(f"starts must be numbers of starts >= 1, tried one after the other, got {starts!r}")
+    if data.views[0].shape[0] and data.count < invariant.minimal():
+        raise ValueError(f"{invariant!r} needs at least {invariant.minimal()} matches, got {data.count}; add matches")
+
+
+def _threshold(threshold: float | Tensor, data: Matches) -> Tensor:
+    """``(b,)``."""
+    try:
+        value = torch.as_tensor(threshold, dtype=torch.float64, device=data.weights.device).expand(data.batch).reshape(-1)
+    except (RuntimeError, TypeError, ValueError):
+        got = tuple(threshold.shape) if isinstance(threshold, Tensor) else repr(threshold)
+        raise ValueError(f"threshold must be a number or (*batch,) = {data.batch}, got {got}; None estimates it") from None
+    if not bool(((value > 0) & value.isfinite()).all()):
+        raise ValueError(f"threshold must be a distance > 0 in the unit of the matches, got {threshold}; None estimates it")
+    return value
+
+
+def _finish(search: Search, found: Found, cut: Tensor, rounds: Sequence[int], *, estimate: bool) -> Solution:
+    """Refine on the inliers, choose them again, and say how it ended."""
+    invariant, data = search.invariant, search.data
+    solution = _solution(search, found)
+    distance = distances(solution)
+    for i, steps in enumerate(rounds):
+        if estimate:
+            cut = _settled(invariant, data, distance, cut) * (WIDE if i + 1 < len(rounds) else 1.0)
+        refined = refine_matches(solution, data.restricted(_within(data, distance, cut)), iterations=steps)
+        new = distances(refined)
+        # the tensor found has more freedom than the motion, so the first motion may well cost more
+        better = (_score(data, new, cut) < _score(data, distance, cut)) | (i == 0)
+        solution, distance = _pick(better, refined, solution), torch.where(better[:, None], new, distance)
+    cut = _settled(invariant, data, distance, cut) if estimate else cut
+    evidence = search.evidence(solution.normalized, cut)
+    # a tensor that the matches leave open has no motion, and so no inliers by it
+    exact = fit_matches(invariant, search.some.restricted(found.inliers)).status.reshape(-1).to(cut.device)
+    degenerate = (exact == int(Status.DEGENERATE)) & (found.evidence < 0)
+    sigma = _sigma(invariant, data, distance, cut)
+    if estimate:
+        # with the noise unknown, a tensor whose inliers fill the scene has found nothing
+        extent = torch.stack([t.reshape(len(cut), -1, *t.shape[-2:])[:, 0, 0, 0] for t in search.norm.transforms]).amax(0)
+        evidence = torch.where(sigma * extent > NOISY, 1.0, evidence)
+    return _judged(solution, evidence, degenerate, _within(data, distance, cut), sigma)
+
+
+def _settled(invariant: Invariant, data: Matches, distance: Tensor, cut: Tensor) -> Tensor:
+    """The threshold that the noise of its own inliers calls for."""
+    for _ in range(SETTLING):
+        cut = threshold_of(invariant, _sigma(invariant, data, distance, WIDE * cut))
+    return cut
+
+
+def _within(data: Matches, distance: Tensor, cut: Tensor) -> Tensor:
+    return (distance <= cut[:, None]) & (data.weights > 0)
+
+
+def _solution(search: Search, found: Found) -> Solution:
+    """The tensors found, as a solution in the coordinates of the search."""
+    invariant, norm, data = search.invariant, search.norm, search.data
+    tensor = invariant.tensor_of(found.basis if invariant.copies else found.basis[:, 0])
+    tensor = invariant.normalized(norm.transforms).constrain(tensor)
+    status = torch.full(tensor.shape[:1], int(Status.OK), device=tensor.device)
+    back = data.back(denormalize(invariant, tensor, norm.actions))
+    return Solution(invariant, back, data.back(status), data.back(torch.zeros_like(found.score)), data, norm, tensor)
+
+
+def distances(solution: Solution) -> Tensor:
+    """Sampson distances ``(b, n)`` in the unit of the matches, as :func:`dyntorch.sampson` has them."""
+    invariant, data, norm = solution.invariant, solution.matches, solution.normalization
+    alone = invariant.single()
+    parts = (solution.normalized,) if alone else solution.normalized_motion()
+    transforms = tuple(t[:, 0] for t in norm.transforms) if invariant.copies else norm.transforms
+    count = len(data.views)
+
+    def block(*tensors: Tensor) -> Tensor:
+        frames, x, motion = tensors[:count], tensors[count : 2 * count], tensors[2 * count :]
+        views = tuple(p.move(v, t) for p, v, t in zip(invariant.primitives, x, frames, strict=True))
+        scales, unit = relative([t[:, 0, 0] for t in frames])
+        if alone:
+            return multilinear(invariant, motion[0], views, scales).abs() / unit[:, None]
+        return whitened(invariant, motion, views, scales).norm(dim=-1) / unit[:, None]
+
+    size = max(1, min(BLOCK // max(1, data.count), -(-len(data.weights) // workers())))
+    return map_blocks(block, *transforms, *data.views, *parts, size=size).nan_to_num(nan=torch.inf)
+
+
+def _score(data: Matches, distance: Tensor, cut: Tensor) -> Tensor:
+    return ((distance / cut[:, None]).square().clamp(max=1.0) * data.weights).sum(-1)
+
+
+def _sigma(invariant: Invariant, data: Matches, distance: Tensor, cut: Tensor) -> Tensor:
+    """Noise ``(b,)`` of one coordinate from the median distance of the inliers."""
+    inliers = _within(data, distance, cut)
+    middle = distance.masked_fill(~inliers, torch.nan).nanmedian(-1).values.nan_to_num(nan=0.0)
+    rows = inliers.sum(-1) * invariant.codim
+    return middle / quantile(0.5, invariant.codim) ** 0.5 * (rows / (rows - invariant.dof).clamp(min=1)).clamp(min=1.0).sqrt()
+
+
+def _where(mask: Tensor, new: Tensor, old: Tensor) -> Tensor:
+    """``new`` where the mask, which has the leading dimensions, is true."""
+    return torch.where(mask[(..., *[None] * (new.ndim - mask.ndim))], new, old)
+
+
+def _pick(better: Tensor, new: Solution, old: Solution) -> Solution:
+    """The better one of two solutions of every problem."""
+    caller = old.matches.back(better)
+    motion = new.normalized_motion(), old.normalized_motion()
+    covariance = (
+        new.covariance if old.covariance is None or new.covariance is None else _where(caller, new.covariance, old.covariance)
+    )
+    return replace(
+        new,
+        tensor=_where(caller, new.tensor, old.tensor),
+        normalized=_where(better, new.normalized, old.normalized),
+        refined=tuple(_where(better, a, b) for a, b in zip(*motion, strict=True)),
+        covariance=covariance,
+    )
+
+
+def _judged(solution: Solution, evidence: Tensor, degenerate: Tensor, inliers: Tensor, sigma: Tensor) -> Solution:
+    """The solution with its status, inliers and noise."""
+    invariant, data = solution.invariant, solution.matches
+    linear = fit_matches(invariant, data.restricted(inliers))
+    status = torch.where(evidence < 0, linear.status.reshape(-1).to(evidence.device), int(Status.NO_CONSENSUS))
+    status = torch.where(degenerate, int(Status.DEGENERATE), status)
+    few = (data.weights > 0).sum(-1) < invariant.minimal()
+    status = torch.where(few, int(Status.TOO_FEW), status)
+    good, covariance = ~failed(status), solution.covariance
+    return replace(
+        solution,
+        tensor=_where(data.back(good), solution.tensor, torch.zeros_like(solution.tensor)),
+        normalized=_where(good, solution.normalized, torch.zeros_like(solution.normalized)),
+        status=data.back(status),
+        uncertainty=linear.uncertainty,
+        covariance=None if covariance is None else _where(data.back(good), covariance, torch.zeros_like(covariance)),
+        inliers=data.back(inliers & good[:, None]),
+        sigma=data.back(torch.where(good, sigma, torch.zeros_like(sigma))),
+    )

@@ -1,0 +1,259 @@
+"""What a fit returns: the tensor, an honest status per problem, and what later steps need."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from enum import IntEnum
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dyntorch.core.invariant import Invariant
+from dyntorch.core.matches import Matches
+from dyntorch.core.matrix import CHUNK, estimation_matrix
+from dyntorch.core.normalize import Normalization, denormalize_motion
+from dyntorch.numerics.arguments import check_precision
+
+
+class Status(IntEnum):
+    """How one problem of a batch ended."""
+
+    OK = 0
+    TOO_FEW = 1
+    """Fewer matches with weight than determine the tensor.  The tensor is zero."""
+    DEGENERATE = 2
+    """The matches leave more than the invariant's null space, exactly: several tensors fulfil all of them.  The tensor is zero."""
+    AMBIGUOUS = 3
+    """Other tensors fit the matches as well as this one, within the noise.  The tensor is one of them."""
+    NO_CONSENSUS = 4
+    """Robust estimation found no tensor that enough matches agree with.  The tensor is the best one found."""
+
+
+NOISY = 0.05
+"""Estimated noise over the extent of the points above which agreement with a tensor is an accident: random matches of space, with
+the noise estimated, agreed with every model, at 0.29 to 1.0."""
+REMEDY = {
+    Status.TOO_FEW: "give more matches, or weigh fewer of them 0",
+    Status.DEGENERATE: "add matches in general position (other trajectories, other directions of motion), or use a smaller model",
+    Status.AMBIGUOUS: "add matches that differ more, lower the noise, or use a model with fewer degrees of freedom",
+    Status.NO_CONSENSUS: "raise the threshold, or give matches of which more belong to the model",
+}
+
+
+def failed(status: Tensor) -> Tensor:
+    """Where a status leaves no tensor, bool of the same shape."""
+    return (status == Status.TOO_FEW) | (status == Status.DEGENERATE)
+
+
+def agreed(status: Tensor) -> Tensor:
+    """Where matches agree with what was found, bool of the same shape; elsewhere no match is an inlier of anything."""
+    return (status == Status.OK) | (status == Status.AMBIGUOUS)
+
+
+def check_status(what: str, status: Tensor, said: Sequence[tuple[int, str]] = ()) -> None:
+    """Raise where any problem failed.
+
+    Args:
+        what: was tried.
+        status: ``(*batch,)`` of :class:`Status`.
+        said: what is known about single problems, with their flat index.
+
+    Raises:
+        ValueError: says which problems failed, how, and what to do.
+    """
+    flat = status.reshape(-1)
+    for state in Status:
+        where = (flat == state).nonzero().flatten().tolist()
+        if state != Status.OK and where:
+            shown = ", ".join(map(str, where[:8])) + (", ..." if len(where) > 8 else "")
+            problems = f"problem {shown} of {len(flat)}" if status.ndim else "the problem"
+            reasons = [text for place, text in said if place in where]
+            known = f" ({'; '.join(reasons[:3])})" if reasons else ""
+            raise ValueError(f"{what}: {problems}: {state.name}; {REMEDY[state]}{known}")
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Solution:
+    """Result of :func:`dyntorch.fit`, :func:`dyntorch.robust_fit` and :func:`dyntorch.refine`.
+
+    It refers to the matches it was given, without a copy: what is computed on first use (``singular_values``) follows them.
+
+    Attributes:
+        invariant: what was fitted.
+        tensor: ``(*batch, *axes)``, ``(*batch, nullity, *axes)`` where the nullity is above 1; Frobenius norm 1, zero where
+            the status says that there is none.
+        status: ``(*batch,)`` of :class:`Status` values.
+        uncertainty: ``(*batch,)`` expected relative error of the tensor from the noise that the residuals show; 0 where the
+            matches are as few as can be (nothing is left to judge by).
+        inliers: ``(*batch, n)`` bool, after robust estimation.
+        covariance: ``(*batch, p, p)`` of the entries of all parts of ``motion``, one after the other, after refinement.
+        sigma: ``(*batch,)`` noise of one coordinate that the residuals show, after robust estimation or refinement.
+    """
+
+    invariant: Invariant
+    tensor: Tensor
+    status: Tensor
+    uncertainty: Tensor
+    matches: Matches = field(repr=False)
+    normalization: Normalization = field(repr=False)
+    normalized: Tensor = field(repr=False)
+    """The tensor of the normalized matches, flat batch, float64."""
+    inliers: Tensor | None = None
+    covariance: Tensor | None = None
+    sigma: Tensor | None = None
+    refined: tuple[Tensor, ...] | None = field(default=None, repr=False)
+    """Motion in normalized coordinates, flat batch, where it does not come from the tensor."""
+
+    @cached_property
+    def motion(self) -> tuple[Tensor, ...]:
+        """The parts of the motion in the coordinates of the matches; decomposed in normalized ones, which is more accurate."""
+        parts = self.normalized_motion()
+        moved = denormalize_motion(self.invariant, parts, self._frames())
+        return tuple(self.matches.back(self._or_zero(part)) for part in moved)
+
+    @cached_property
+    def singular_values(self) -> Tensor:
+        """``(*batch, D)`` of the estimation matrix of the normalized, weighted matches, descending.
+
+        Computed on first use from the matrix itself, so that they are accurate down to the rounding of the largest one.
+        """
+        m = self.matches
+        views, weights, static = copied(self.invariant, m)
+        moved = self.normalization.apply(self.invariant, views)
+        width, rows = self.invariant.width(), self.invariant.rows()
+        step = max(2 * width, CHUNK // (width * rows * max(1, weights.numel() // max(1, weights.shape[-1]))))
+        factor: Tensor | None = None
+        for start in range(0, max(1, weights.shape[-1]), step):
+            piece = slice(start, start + step)
+            part = [x.narrow(2 if self.invariant.copies else 1, start, min(step, weights.shape[-1] - start)) for x in moved]
+            label = None if static is None else static[..., piece]
+            matrix = estimation_matrix(self.normalization.primitives, part, weights[..., piece], label)
+            stacked = matrix if factor is None else torch.cat([factor, matrix], dim=-2)
+            factor = torch.linalg.qr(stacked, mode="r")[1] if stacked.shape[-2] > width else stacked
+        assert factor is not None
+        values = torch.linalg.svdvals(factor)
+        return self.matches.back(torch.nn.functional.pad(values, (0, width - values.shape[-1])))
+
+    def normalized_motion(self) -> tuple[Tensor, ...]:
+        """Parts of the motion in normalized coordinates, flat batch, float64."""
+        if self.refined is not None:
+            return self.refined
+        parts = self.invariant.normalized(self.normalization.transforms).decompose(self.normalized)
+        return parts if isinstance(parts, tuple) else (parts,)
+
+    def back(self, data: Matches) -> Solution:
+        """This solution of flat float64 problems in the batch, dtype and device of the caller's matches."""
+        return replace(
+            self,
+            tensor=data.back(self.tensor),
+            status=data.back(self.status),
+            uncertainty=data.back(self.uncertainty),
+            inliers=None if self.inliers is None else data.back(self.inliers),
+            sigma=None if self.sigma is None else data.back(self.sigma),
+            covariance=None if self.covariance is None else data.back(self.covariance),
+            matches=data,
+        )
+
+    def __getitem__(self, key: Any) -> Solution:
+        """The solution of some problems of the batch: an index, a slice, a mask or several of them, as a tensor takes them."""
+        batch = self.matches.batch
+        if not batch:
+            raise IndexError("the solution is that of one problem; there is no batch to index")
+        chosen = torch.arange(math.prod(batch)).reshape(batch)[key]
+        flat = chosen.reshape(-1).to(self.normalized.device)
+
+        def some(part: Tensor) -> Tensor:
+            return part.flatten(0, len(batch) - 1)[flat.to(part.device)].reshape((*chosen.shape, *part.shape[len(batch) :]))
+
+        data = self.matches
+        static = None if data.static is None else data.static[flat]
+        views, weights = tuple(x[flat] for x in data.views), data.weights[flat]
+        data = replace(data, views=views, weights=weights, static=static, batch=tuple(chosen.shape))
+        return self._each(some, lambda part: part[flat], data)
+
+    def to(self, *target: torch.device | torch.dtype | str) -> Solution:
+        """The solution on another device, in another dtype, or both, as ``torch.Tensor.to`` takes them.
+
+        What is computed inside stays float64; devices without it get results computed on the CPU.
+
+        Raises:
+            ValueError: a dtype that is neither float32 nor float64.
+        """
+        data = self.matches
+        dtype = next((t for t in target if isinstance(t, torch.dtype)), data.dtype)
+        device = next((torch.device(t) for t in target if not isinstance(t, torch.dtype)), data.device)
+        check_precision("a solution", dtype)
+        home = torch.device("cpu") if device.type == "mps" else device
+
+        def there(part: Tensor) -> Tensor:
+            return part.to(device=device, dtype=dtype if part.is_floating_point() else part.dtype)
+
+        static = None if data.static is None else data.static.to(home)
+        views, weights = tuple(x.to(home) for x in data.views), data.weights.to(home)
+        data = replace(data, views=views, weights=weights, static=static, dtype=dtype, device=device)
+        return self._each(there, lambda part: part.to(home), data)
+
+    def _each(self, outer: Callable[[Tensor], Tensor], inner: Callable[[Tensor], Tensor], data: Matches) -> Solution:
+        """Another solution: ``outer`` of what the caller sees, ``inner`` of flat float64 tensors, and these matches."""
+        transforms = tuple(map(inner, self.normalization.transforms))
+        pairs = tuple(zip(self.invariant.primitives, transforms, strict=True))
+        return Solution(
+            self.invariant,
+            outer(self.tensor),
+            outer(self.status),
+            outer(self.uncertainty),
+            data,
+            Normalization(
+                transforms,
+                tuple(p.normalized(t) for p, t in pairs),
+                tuple(map(inner, self.normalization.actions)),
+                tuple(map(inner, self.normalization.scales)),
+            ),
+            inner(self.normalized),
+            inliers=None if self.inliers is None else outer(self.inliers),
+            covariance=None if self.covariance is None else outer(self.covariance),
+            sigma=None if self.sigma is None else outer(self.sigma),
+            refined=None if self.refined is None else tuple(map(inner, self.refined)),
+        )
+
+    def check(self) -> Solution:
+        """Raise where any problem failed.
+
+        Raises:
+            ValueError: says which problems of the batch failed, how, and what to do.
+        """
+        check_status(repr(self.invariant), self.status)
+        return self
+
+    def __repr__(self) -> str:
+        counted = Counter(Status(s).name for s in self.status.reshape(-1).tolist())
+        states = ", ".join(f"{count} {name}" for name, count in sorted(counted.items(), key=lambda item: Status[item[0]]))
+        shape = tuple(self.status.shape)
+        noise = "" if self.sigma is None else _shown(self.sigma[self.status == Status.OK])
+        return f"Solution({self.invariant!r}, matches={self.matches.count}, batch={shape}: {states or 'empty'}{noise})"
+
+    def _frames(self) -> tuple[Tensor, ...]:
+        """Transforms without the dimension of copies."""
+        return tuple(t[:, 0] for t in self.normalization.transforms) if self.invariant.copies else self.normalization.transforms
+
+    def _or_zero(self, part: Tensor) -> Tensor:
+        none = failed(self.status.reshape(-1).to(part.device))
+        return torch.where(none[(..., *([None] * (part.ndim - 1)))], torch.zeros_like(part), part)
+
+
+def _shown(sigma: Tensor) -> str:
+    """The noise for a repr: of a batch the median."""
+    return f", sigma {'about ' if sigma.numel() > 1 else ''}{float(sigma.median()):.2g}" if sigma.numel() else ""
+
+
+def copied(invariant: Invariant, matches: Matches) -> tuple[tuple[Tensor, ...], Tensor, Tensor | None]:
+    """Views, weights and labels with the dimension of copies behind the batch, for an invariant that has it."""
+    if invariant.copies is None:
+        return matches.views, matches.weights, matches.static
+    static = None if matches.static is None else matches.static[:, None]
+    return tuple(x[:, None] for x in matches.views), matches.weights[:, None], static

@@ -1,0 +1,556 @@
+"""Batched bundle adjustment for projections P^k -> P^l: cameras and points that minimize the reprojection error."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import prod
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from dyntorch.geometry.triangulation import observed
+from dyntorch.numerics.arguments import check_tensor, check_together
+from dyntorch.numerics.blocks import map_blocks, one_thread, workers
+from dyntorch.numerics.least_squares import damped_step
+
+# ----------------------------------------------------------------------------------------------------------------------
+# The least squares problem of bundle adjustment: reprojection errors in cameras and points, and its damped step.
+#
+# The points are eliminated first, each by the Cholesky factorization of its :math:`K \times K` block, column by column for all
+# points at once: their index is the last one of every array here.  (64 problems of 60 points of P^4: 0.09 us per point, LAPACK on
+# one matrix after the other 0.28 us; a single problem loses 0.08 ms that way.)
+
+
+TINY = 1e-300
+
+
+@dataclass(frozen=True)
+class BundleProblem:
+    r"""Minimize :math:`\sum_{ij} w_{ij}\, \rho(|x_{ij} - \pi(P_i B_i Y_j)|^2)` over a block of problems.
+
+    Cameras are ``(b, v, l + 1, a + 1)`` and points ``(b, k + 1, n)``.
+    """
+
+    x: Tensor
+    """``(b, v, l, n)``, any finite value where the weight is 0."""
+    weights: Tensor
+    """``(b, v, n)``."""
+    lifts: Tensor | None
+    """``(b, v, a + 1, k + 1)``, or None for the identity."""
+    scale: Tensor | None
+    """``(b,)`` the error beyond which one counts as an outlier, or None for least squares."""
+    loss: str
+    """How outliers count: ``"geman_mcclure"`` or ``"huber"``."""
+    outside: Tensor | None = None
+    """``(b, k + 1, k + 1, n)`` projector onto what is forbidden to each point, 0 for free points; None where all are free."""
+
+    def subset(self, keep: Tensor) -> BundleProblem:
+        """Only some of the problems."""
+        lifts = None if self.lifts is None else self.lifts[keep]
+        scale = None if self.scale is None else self.scale[keep]
+        outside = None if self.outside is None else self.outside[keep]
+        return BundleProblem(self.x[keep], self.weights[keep], lifts, scale, self.loss, outside)
+
+    def world(self, points: Tensor) -> Tensor:
+        """The points :math:`B_i Y_j` that the cameras see, ``(b, v, a + 1, n)``."""
+        if self.lifts is None:
+            return points[:, None].expand(-1, self.x.shape[1], -1, -1)
+        return self.lifts @ points[:, None]
+
+    def images(self, cameras: Tensor, world: Tensor) -> tuple[Tensor, Tensor]:
+        """Images ``(b, v, l, n)`` and depths ``(b, v, n)``, which are 1 where a point is missing."""
+        image = cameras @ world
+        depth = torch.where(self.weights > 0, image[:, :, -1], 1.0)
+        return image[:, :, :-1] / depth[:, :, None], depth
+
+    def costs(self, cameras: Tensor, points: Tensor) -> Tensor:
+        """The cost of each point, ``(b, n)``, infinite where it is not finite."""
+        return self.robust(self.images(cameras, self.world(points))[0])[0]
+
+    def robust(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        r"""The cost ``(b, n)`` of images, and their weights :math:`w \rho'` ``(b, v, n)`` in the quadratic model of it."""
+        square = (images - self.x).square().sum(2)
+        if self.scale is None:
+            value, slope = square * self.weights, self.weights
+        elif self.loss == "huber":
+            c = self.scale[:, None, None]
+            inside = c / square.clamp(min=TINY).sqrt()  # below 1 beyond the scale
+            value = torch.where(inside < 1, c * (2 * square.sqrt() - c), square) * self.weights
+            slope = inside.clamp(max=1) * self.weights
+        else:
+            c = self.scale.square()[:, None, None]
+            share = c / (c + square)
+            value, slope = square * share * self.weights, share.square() * self.weights
+        total = value.sum(1)
+        return torch.where(total.isfinite(), total, torch.inf), slope
+
+    def step(self, cameras: Tensor, points: Tensor, damping: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        r"""The step of Levenberg and Marquardt, to be subtracted, by the Schur complement.
+
+        With :math:`V_j = J_j^T J_j + \mu\,\mathrm{diag} = L_j L_j^T` of each point and :math:`E_j = J_j L_j^{-T}` the cameras solve
+
+        .. math:: \Big(\sum_j J_P^T (I - E_j E_j^T) J_P\Big)\, \delta_P = \sum_j J_P^T (I - E_j E_j^T)\, e_j, \qquad
+            L_j^T \delta_j = E_j^T (e_j - J_P \delta_P),
+
+        in which nothing cancels that is larger than the result.
+
+        Args:
+            cameras: ``(b, v, l + 1, a + 1)``.
+            points: ``(b, k + 1, n)`` of norm 1 or 0.
+            damping: ``(b,)``.
+
+        Returns:
+            the steps of the cameras and of the points, and ``(b,)`` by how much they lower the quadratic model of the cost.
+        """
+        at = self._linear(cameras, points)
+        images, slope, error = at.images, at.slope, at.error
+        panel, pivots = _eliminated(_damped(_gram(at.by_point), points, damping, self.outside), at.by_point)
+        reduced = panel[:, points.shape[1] :]
+        whitened = (reduced * error.flatten(1, 2)[:, :, None]).sum(1)
+        rest = error - (reduced * whitened[:, None]).sum(2).view_as(error)
+        gradient = pull(rest, images, slope, 2) @ at.world.mT
+        matrix = _schur(reduced.unflatten(1, error.shape[1:3]), images, slope, at.world)
+        camera_step = damped_step(gradient.flatten(1), matrix, damping).view_as(cameras)
+
+        moved = push(camera_step @ at.world, images, slope)
+        whitened = whitened - (reduced * moved.flatten(1, 2)[:, :, None]).sum(1)
+        point_step = _back_substituted(panel, pivots, whitened)
+        moved = moved + (at.by_point * point_step[:, None]).sum(2).view_as(moved)
+        return camera_step, point_step, (moved * (2 * error - moved)).sum((1, 2, 3))
+
+    def settled(self, cameras: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
+        """The points after a step each, where it lowers their cost, and the cost ``(b,)`` of all.
+
+        After a step of cameras and points it follows their curved valley.  100 problems of 3 views and 60 points (P^4), 12 of 4
+        views and 200 points (P^6), noise of 0.5 % of the image: 100 % and 100 % reach the minimum within 50 steps, 10 and 12 on
+        average; without it 96 % and 83 %, 13 and 18 on average, in the same time.
+        """
+        at = self._linear(cameras, points)
+        gradient = (at.by_point * at.error.flatten(1, 2)[:, :, None]).sum(1, keepdim=True)
+        blocks = _damped(_gram(at.by_point), points, torch.full_like(points[:, 0, 0], 1e-9), self.outside)
+        panel, pivots = _eliminated(blocks, gradient)
+        moved = normalize(points - _back_substituted(panel, pivots, panel[:, -1]), dim=1)
+        costs = self.costs(cameras, moved)
+        better = costs < at.costs
+        return torch.where(better[:, None], moved, points), torch.where(better, costs, at.costs).sum(-1)
+
+    def _linear(self, cameras: Tensor, points: Tensor) -> _Linear:
+        world = self.world(points)
+        images, depth = self.images(cameras, world)
+        costs, weights = self.robust(images)
+        root = weights.sqrt()[:, :, None]
+        slope = root / depth[:, :, None]
+        return _Linear(costs, world, images, slope, (images - self.x) * root, self._by_point(cameras, images, slope))
+
+    def information(self, cameras: Tensor, points: Tensor) -> Tensor:
+        r"""The information :math:`J_j^T J_j` of the images about each point, ``(b, k + 1, k + 1, n)``."""
+        images, depth = self.images(cameras, self.world(points))
+        return _gram(self._by_point(cameras, images, (self.robust(images)[1].sqrt() / depth)[:, :, None]))
+
+    def _by_point(self, cameras: Tensor, images: Tensor, slope: Tensor) -> Tensor:
+        """Derivative of the weighted images by the points, ``(b, v l, k + 1, n)``."""
+        projections = cameras if self.lifts is None else cameras @ self.lifts
+        rows = push(projections[..., None], images[:, :, :, None], slope[:, :, :, None]).flatten(1, 2)
+        if self.outside is None:
+            return rows
+        inside = rows.clone()
+        for k in range(rows.shape[2]):
+            inside.addcmul_(rows[:, :, k, None], self.outside[:, None, k], value=-1)
+        return inside
+
+
+@dataclass(frozen=True)
+class _Linear:
+    """The problem about cameras and points."""
+
+    costs: Tensor  # (b, n)
+    world: Tensor  # (b, v, a + 1, n)
+    images: Tensor  # (b, v, l, n)
+    slope: Tensor  # (b, v, 1, n) root of the weight / depth
+    error: Tensor  # (b, v, l, n) weighted
+    by_point: Tensor  # (b, v l, k + 1, n) its derivative
+
+
+def push(value: Tensor, images: Tensor, slope: Tensor) -> Tensor:
+    r"""What a change ``(b, v, l + 1, ..., n)`` of homogeneous images does to weighted ones: :math:`s\, [I \mid -x]\, \delta`."""
+    return (value[:, :, :-1] - images * value[:, :, -1:]) * slope
+
+
+def pull(value: Tensor, images: Tensor, slope: Tensor, dim: int) -> Tensor:
+    r"""The transpose of :func:`push`: :math:`s\, [I \mid -x]^T v`, along the dimension ``dim`` of length l."""
+    head = value * slope
+    return torch.cat([head, -(head * images).sum(dim, keepdim=True)], dim)
+
+
+def _gram(rows: Tensor) -> Tensor:
+    """``(b, K, K, n)`` of rows ``(b, r, K, n)``."""
+    total = rows[:, 0, :, None] * rows[:, 0, None]
+    for r in range(1, rows.shape[1]):
+        total.addcmul_(rows[:, r, :, None], rows[:, r, None])
+    return total
+
+
+def _damped(gram: Tensor, points: Tensor, damping: Tensor, outside: Tensor | None) -> Tensor:
+    """The point blocks with damping, the free scale and the forbidden directions of every point held, and regular where nothing is
+    known."""
+    diagonal = gram.diagonal(dim1=1, dim2=2)
+    extra, trace = diagonal * damping[:, None, None], diagonal.sum(-1)
+    gram.addcmul_((points * trace[:, None])[:, :, None], points[:, None])
+    if outside is not None:
+        gram.addcmul_(outside, trace[:, None, None])
+    gram.diagonal(dim1=1, dim2=2).add_(extra + (trace == 0)[..., None])
+    return gram
+
+
+def _eliminated(gram: Tensor, rows: Tensor) -> tuple[Tensor, list[Tensor]]:
+    r"""The panel :math:`(L; J L^{-T})` of :math:`V = L L^T`, ``(b, K + r, K, n)``, and the reciprocal diagonal of L."""
+    panel, pivots = torch.cat([gram, rows], dim=1), []
+    size = gram.shape[1]
+    for k in range(size):
+        pivots.append(panel[:, k, k].clamp(min=TINY).rsqrt())
+        panel[:, k:, k].mul_(pivots[-1][:, None])
+        if k + 1 < size:
+            panel[:, k + 1 :, k + 1 :].addcmul_(panel[:, k + 1 :, k, None], panel[:, None, k + 1 : size, k], value=-1)
+    return panel, pivots
+
+
+def _back_substituted(panel: Tensor, pivots: list[Tensor], right: Tensor) -> Tensor:
+    r"""The solution of :math:`L^T \delta = h`, ``(b, K, n)``, in place of h."""
+    for k in reversed(range(len(pivots))):
+        right[:, k].mul_(pivots[k])
+        if k:
+            right[:, :k].addcmul_(panel[:, k, :k], right[:, k : k + 1], value=-1)
+    return right
+
+
+def _schur(reduced: Tensor, images: Tensor, slope: Tensor, world: Tensor) -> Tensor:
+    r"""The matrix :math:`\sum_j J_P^T (I - E_j E_j^T) J_P`, ``(b, p, p)``, of ``reduced`` E ``(b, v, l, k + 1, n)``.
+
+    :math:`J_P = D \otimes (B_i Y_j)^T`, so each pair of views is one product of ``(l + 1)^2`` by ``(a + 1)^2`` over the points.
+    """
+    batch, v, size, columns, n = reduced.shape
+    inner = torch.eye(v * size, dtype=reduced.dtype, device=reduced.device).view(v, size, v, size).transpose(1, 2)[..., None]
+    inner = inner.expand(batch, v, v, size, size, n).contiguous()
+    for k in range(columns):
+        column = reduced[:, :, :, k]
+        inner.addcmul_(column[:, :, None, :, None], column[:, None, :, None], value=-1)
+    inner = pull(inner, images[:, :, None, :, None], slope[:, :, None, :, None], 3)
+    inner = pull(inner, images[:, None, :, None], slope[:, None, :, None], 4)
+    pairs = world[:, :, None, :, None] * world[:, None, :, None]
+    blocks = inner.flatten(3, 4) @ pairs.flatten(3, 4).mT
+    blocks = blocks.unflatten(4, (world.shape[2], -1)).unflatten(3, (size + 1, -1)).permute(0, 1, 3, 5, 2, 4, 6)
+    matrix: Tensor = blocks.flatten(4).flatten(1, 3)
+    return matrix
+
+
+BLOCK = 1 << 20
+"""Entries of the largest arrays per block of the batch.  1000 problems of 3 views and 60 points take 0.15 ms per step each with
+2^20, 0.21 ms with 2^18 (a few slow problems at the end of a block cost as many calls as all of them) and 0.19 ms with 2^21."""
+LOSSES = ("geman_mcclure", "huber")
+
+
+@dataclass(frozen=True)
+class Adjusted:
+    """Cameras and points at a minimum of the reprojection error."""
+
+    cameras: Tensor
+    """``(*batch, views, l + 1, a + 1)`` of norm 1; as they were where a view has no image that counts."""
+    structure: Tensor
+    """``(*batch, n, k + 1)`` of norm 1; as it was where a point is seen in too few views."""
+    cost: Tensor
+    """``(*batch,)`` sum of the weighted squared (or robust) errors; infinite where the start was not finite."""
+    iterations: Tensor
+    """``(*batch,)`` steps tried."""
+
+
+@one_thread
+def bundle_adjust(
+    x: Tensor,
+    weights: Tensor | None,
+    cameras: Tensor,
+    structure: Tensor,
+    lifts: Tensor | None = None,
+    *,
+    iterations: int = 50,
+    scale: Tensor | float | None = None,
+    loss: str = "geman_mcclure",
+    tolerance: float = 1e-9,
+    confined: Tensor | None = None,
+    subspace: Tensor | None = None,
+) -> Adjusted:
+    r"""Cameras and points that minimize the reprojection error :math:`\sum_{ij} w_{ij}\, \rho(|x_{ij} - \pi(P_i B_i Y_j)|^2)`.
+
+    Batched Levenberg-Marquardt; the points are eliminated by the Schur complement.  Every camera and point is kept at norm 1;
+    the gauge (collineations of P^k, or what the lifts leave of them) is free, and damping handles it.  The cost never rises.
+    :math:`\rho(s) = s`, or with a scale c
+
+    .. math:: \rho(s) = \frac{c^2 s}{c^2 + s} \quad \text{(Geman-McClure)}, \qquad
+        \rho(s) = \min(s,\; 2 c \sqrt{s} - c^2 \text{ where } s > c^2) \quad \text{(Huber)}.
+
+    Points seen in too few views (fewer than k equations), zero points and views without an image that counts stay as they are.
+
+    Args:
+        x: ``(*batch, views, n, l)`` images, best normalized; NaN = missing.
+        weights: ``(*batch, views, n)``, 0 = missing, or None.
+        cameras: ``(*batch, views, l + 1, a + 1)`` start :math:`P_i`, of any scale.
+        structure: ``(*batch, n, k + 1)`` start :math:`Y_j`, of any scale; 0 where unknown.
+        lifts: :math:`B_i`, ``(views, a + 1, k + 1)`` or ``(*batch, views, a + 1, k + 1)``; None: the identity (a = k).
+        iterations: at most so many steps.
+        scale: error beyond which an image counts as an outlier, in the unit of ``x``, one or ``(*batch,)``; None: none does.
+        loss: ``"geman_mcclure"`` or ``"huber"``, used with a scale.
+        tolerance: done where a step lowers the cost by less than this fraction.
+        confined: ``(*batch, n)`` bool: points kept within a subspace of the constants, such as those known to stand still.
+        subspace: ``(k + 1, r)`` orthonormal columns that span it.
+
+    Returns:
+        Adjusted, in the dtype of ``x``, without gradients.  A problem whose start is not finite is not adjusted and has cost
+        infinity; what of it is not finite comes back as 0.
+
+    Raises:
+        ValueError: shapes that do not fit each other, another loss, or a scale that is not positive.
+
+    Source: Triggs et al. 2000, Bundle adjustment, a modern synthesis; cameras P^k -> P^l of thesis chapter 3.
+
+    Example:
+        >>> import torch
+        >>> from dyntorch.geometry.triangulation import reproject
+        >>> g = torch.Generator().manual_seed(0)
+        >>> P, Y = torch.eye(3, 4) + torch.rand(3, 3, 4, generator=g).double() / 4, torch.rand(12, 4, generator=g).double() + 1
+        >>> x = reproject(P, Y)
+        >>> start = P + 0.01 * torch.rand(P.shape, generator=g), Y + 0.01 * torch.rand(Y.shape, generator=g)
+        >>> bool(bundle_adjust(x, None, *start).cost < 1e-20)
+        True
+    """
+    batch = check(x, weights, cameras, structure, lifts, loss)
+    count, (views, n, size) = prod(batch), x.shape[-3:]
+
+    def flat(tensor: Tensor, *shape: int) -> Tensor:
+        return tensor.detach().double().expand(*batch, *shape).reshape(count, *shape)
+
+    images, w = observed(x, weights)
+    start = flat(cameras, *cameras.shape[-3:]), flat(structure, *structure.shape[-2:])
+    w, moves, seen = _counted(flat(w, views, n), start[1], size)
+    extra: tuple[Tensor, ...] = () if lifts is None else (flat(lifts, *lifts.shape[-3:]),)
+    extra += () if scale is None else (_scales(scale, batch, x.device),)
+    if confined is not None:
+        start, outside = _inside(*start, confined.expand(*batch, n).reshape(count, n), subspace)
+        extra += (outside,)
+
+    def run(*block: Tensor) -> tuple[Tensor, ...]:
+        rest = list(block[4:])
+        lift = None if lifts is None else rest.pop(0)
+        limit = None if scale is None else rest.pop(0)
+        outside = rest.pop(0).permute(0, 2, 3, 1) if rest else None
+        problem = BundleProblem(block[0].mT.contiguous(), block[1], lift, limit, loss, outside)
+        return _minimize(problem, block[2], block[3].mT.contiguous(), iterations, tolerance)
+
+    a, k = cameras.shape[-1], structure.shape[-1]
+    width = n * (views**2 * ((size + 1) ** 2 + a**2) + (k + views * size) * k)
+    problems = max(1, min(BLOCK // max(1, width), -(-count // workers())))
+    clean = tuple(torch.where(part.isfinite(), part, 0.0) for part in start)
+    with torch.no_grad():
+        found = map_blocks(run, flat(images, views, n, size), w, *clean, *extra, size=problems)
+    # what counts has to be finite; the rest stays as it is
+    sound = (start[0].isfinite().flatten(2).all(-1) | ~seen).all(-1) & (start[1].isfinite().all(-1) | ~moves).all(-1)
+    sound = (sound & found[2].isfinite())[:, None]
+    return Adjusted(
+        torch.where((sound & seen)[..., None, None], found[0], clean[0]).reshape(*batch, *cameras.shape[-3:]).to(x.dtype),
+        torch.where((sound & moves)[..., None], found[1], clean[1]).reshape(*batch, *structure.shape[-2:]).to(x.dtype),
+        torch.where(sound[:, 0], found[2], torch.inf).reshape(batch).to(x.dtype),
+        found[3].reshape(batch),
+    )
+
+
+def _counted(weights: Tensor, structure: Tensor, size: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Weights of what counts, the points ``(b, n)`` that are seen often enough, and the views ``(b, v)`` that see any of them."""
+    moves = ((weights > 0).sum(1) * size >= structure.shape[-1] - 1) & (structure != 0).any(-1)
+    weights = weights * moves[:, None]
+    return weights, moves, (weights > 0).any(-1)
+
+
+def _minimize(
+    problem: BundleProblem, cameras: Tensor, points: Tensor, iterations: int, tolerance: float
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Cameras, points ``(b, n, k + 1)``, cost and steps tried at the minimum of every problem of a block."""
+    cameras, points = _unit_cameras(cameras), normalize(points, dim=1)
+    state = [cameras, points, problem.costs(cameras, points).sum(-1), torch.full_like(cameras[:, 0, 0, 0], 1e-3)]
+    # errors of the size of the rounding of the images are no errors
+    floor = 1e-30 * (problem.x.square().sum(2) * problem.weights).sum((1, 2))
+    result = [*state[:3], torch.zeros_like(state[2], dtype=torch.long)]
+    left = torch.arange(len(cameras), device=cameras.device)
+    done = ~state[2].isfinite()
+    for count in range(1, iterations + 1):
+        keep = (~done).nonzero().flatten()
+        if not len(keep):
+            break
+        if len(keep) < len(left):
+            left, floor, problem, state = left[keep], floor[keep], problem.subset(keep), [part[keep] for part in state]
+        state, done = _step(problem, state, tolerance, floor)
+        # problems that are done leave: the slow ones do not make the others wait
+        for whole, part in zip(result[:3], state[:3], strict=True):
+            whole[left] = part
+        result[3][left] = count
+    return result[0], result[1].mT, result[2], result[3]
+
+
+def _step(problem: BundleProblem, state: list[Tensor], tolerance: float, floor: Tensor) -> tuple[list[Tensor], Tensor]:
+    """One damped step of every problem: the new state, and which problems are done."""
+    cameras, points, cost, damping = state
+    camera_step, point_step, gain = problem.step(cameras, points, damping)
+    cameras_, points_ = _unit_cameras(cameras - camera_step), normalize(points - point_step, dim=1)
+    points_, fresh = problem.settled(cameras_, points_)
+    better = fresh < cost
+    # done: hardly a gain any more, none expected, or no way down even by the shortest steps
+    small = tolerance * cost
+    done = torch.where(better, (cost - fresh <= small) | (fresh <= floor), (gain <= small) | (damping > 1e6))
+    damping = torch.where(better, (damping * 0.1).clamp(min=1e-12), damping * 8)
+    chosen = better[:, None, None]
+    cameras, points = torch.where(chosen[..., None], cameras_, cameras), torch.where(chosen, points_, points)
+    return [cameras, points, torch.where(better, fresh, cost), damping], done
+
+
+def _inside(cameras: Tensor, structure: Tensor, confined: Tensor, subspace: Tensor | None) -> tuple[tuple[Tensor, Tensor], Tensor]:
+    """The start with the confined points within the subspace, and the projectors ``(b, n, K, K)`` onto what is forbidden."""
+    size = structure.shape[-1]
+    if subspace is None or subspace.shape[0] != size:
+        got = None if subspace is None else tuple(subspace.shape)
+        raise ValueError(f"confined points need a subspace ({size}, r) of orthonormal columns, got {got}")
+    basis = subspace.to(structure)
+    away = torch.eye(size, dtype=basis.dtype, device=basis.device) - basis @ basis.mT
+    outside = away * confined[..., None, None]
+    return (cameras, structure - (structure[..., None, :] @ outside)[..., 0, :]), outside
+
+
+def _unit_cameras(cameras: Tensor) -> Tensor:
+    return normalize(cameras.flatten(2), dim=-1).view_as(cameras)
+
+
+def _scales(scale: Tensor | float, batch: torch.Size, device: torch.device) -> Tensor:
+    """``(b,)``."""
+    given = torch.as_tensor(scale, dtype=torch.float64, device=device)
+    if not bool((given > 0).all()):
+        raise ValueError(f"scale must be positive, in the unit of x, got {given.min().item():g}; give None for least squares")
+    return given.expand(batch).reshape(prod(batch))
+
+
+def check(x: Tensor, weights: Tensor | None, cameras: Tensor, structure: Tensor, lifts: Tensor | None, loss: str) -> torch.Size:
+    """The batch."""
+    check_tensor("x", x, "views", "n", "l")
+    check_tensor("cameras", cameras, "views", "l + 1", "a + 1")
+    check_tensor("structure", structure, "n", "k + 1")
+    if lifts is not None:
+        check_tensor("lifts", lifts, "views", "a + 1", "k + 1")
+    *batch, views, n, size = x.shape
+    if cameras.shape[-3:-1] != (views, size + 1):
+        raise ValueError(f"cameras must be (*batch, {views}, {size + 1}, a + 1) for x {tuple(x.shape)}, got {tuple(cameras.shape)}")
+    if structure.shape[-2] != n:
+        raise ValueError(f"structure must be (*batch, {n}, k + 1) for x {tuple(x.shape)}, got {tuple(structure.shape)}")
+    if weights is not None and weights.shape != x.shape[:-1]:
+        raise ValueError(f"weights must be (*batch, views, n) = {tuple(x.shape[:-1])}, got {tuple(weights.shape)}")
+    wide = (views, cameras.shape[-1], structure.shape[-1])
+    if lifts is None and wide[1] != wide[2]:
+        raise ValueError(f"cameras have {wide[1]} columns for points of {wide[2]} coordinates; give lifts {wide}")
+    if lifts is not None and lifts.shape[-3:] != wide:
+        raise ValueError(f"lifts must be {wide} or (*batch, {wide[0]}, {wide[1]}, {wide[2]}), got {tuple(lifts.shape)}")
+    if loss not in LOSSES:
+        raise ValueError(f"loss must be one of {', '.join(LOSSES)}, got {loss!r}")
+    for name, part, last in (("cameras", cameras, 3), ("structure", structure, 2)):
+        if check_together(x=(x.double(), 3), **{name: (part.double(), last)}) != x.shape[:-3]:
+            raise ValueError(f"{name} have batch {tuple(part.shape[:-last])}, x has {tuple(batch)}; expand x")
+    return torch.Size(batch)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# What images tell about each point of a bundle adjustment, and its covariance.
+
+
+def point_information(cameras: Tensor, structure: Tensor, weights: Tensor | None = None, lifts: Tensor | None = None) -> Tensor:
+    r"""What the images tell about each point, given the cameras.
+
+    .. math:: V_j = \sum_i w_{ij}\, J_{ij}^T J_{ij}, \qquad J_{ij} = \partial \pi(P_i B_i Y_j) / \partial Y_j
+
+    It refers to the point at norm 1, and has it as a null vector.
+
+    Args:
+        cameras: ``(*batch, views, l + 1, a + 1)``.
+        structure: ``(*batch, n, k + 1)``.
+        weights: ``(*batch, views, n)``, 0 = missing, or None.
+        lifts: as in :func:`dyntorch.bundle_adjust`.
+
+    Returns:
+        ``(*batch, n, k + 1, k + 1)``, in the unit of 1 / images squared.
+
+    Raises:
+        ValueError: shapes that do not fit each other.
+
+    Example:
+        >>> import torch
+        >>> point_information(torch.eye(3)[None], torch.tensor([[0.0, 0.0, 2.0]]))[0].diagonal().tolist()
+        [1.0, 1.0, 0.0]
+    """
+    check_tensor("cameras", cameras, "views", "l + 1", "a + 1")
+    check_tensor("structure", structure, "n", "k + 1")
+    if not cameras.shape[-3] or cameras.shape[-2] < 2:
+        raise ValueError(f"cameras must be (*batch, views >= 1, l + 1 >= 2, a + 1), got {tuple(cameras.shape)}")
+    batch, views, n = cameras.shape[:-3], cameras.shape[-3], structure.shape[-2]
+    x = cameras.new_zeros(*batch, views, n, cameras.shape[-2] - 1)
+    check(x, weights, cameras, structure, lifts, LOSSES[0])
+    count = prod(batch)
+
+    def flat(tensor: Tensor, *shape: int) -> Tensor:
+        return tensor.double().expand(*batch, *shape).reshape(count, *shape)
+
+    w = flat(observed(x, weights)[1], views, n)
+    points = normalize(flat(structure, *structure.shape[-2:]), dim=-1).mT
+    w = w * (points != 0).any(1)[:, None]
+    lift = None if lifts is None else flat(lifts, *lifts.shape[-3:])
+    problem = BundleProblem(flat(x, views, n, x.shape[-1]).mT, w, lift, None, LOSSES[0])
+    found = problem.information(flat(cameras, *cameras.shape[-3:]), points)
+    return found.permute(0, 3, 1, 2).reshape(*batch, n, *found.shape[1:3]).to(cameras.dtype)
+
+
+@one_thread
+def structure_covariance(
+    cameras: Tensor,
+    structure: Tensor,
+    weights: Tensor | None = None,
+    lifts: Tensor | None = None,
+    *,
+    sigma: Tensor | float = 1.0,
+) -> Tensor:
+    r"""Covariance of each point, given the cameras: :math:`\sigma^2 V_j^+`, tangent to the unit sphere at the point of norm 1.
+
+    Args:
+        cameras: ``(*batch, views, l + 1, a + 1)``.
+        structure: ``(*batch, n, k + 1)``.
+        weights: ``(*batch, views, n)``, 0 = missing, or None.
+        lifts: as in :func:`dyntorch.bundle_adjust`.
+        sigma: noise per coordinate of an image of weight 1, one or ``(*batch,)``.
+
+    Returns:
+        ``(*batch, n, k + 1, k + 1)`` of rank k; infinite where the images do not determine the point.
+
+    Raises:
+        ValueError: shapes that do not fit each other.
+
+    Source: Hartley and Zisserman, chapter 5 and appendix A6.
+
+    Example:
+        >>> import torch
+        >>> structure_covariance(torch.eye(3)[None], torch.tensor([[0.0, 0.0, 2.0]]), sigma=0.5)[0].diagonal().tolist()
+        [0.25, 0.25, 0.0]
+    """
+    information = point_information(cameras, structure, weights, lifts).double()
+    points = normalize(structure.double(), dim=-1)
+    along = points[..., :, None] * points[..., None, :]
+    # of trace 1, so that the point, its null vector, gets an eigenvalue of the same size as the others
+    trace = information.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
+    held = torch.nan_to_num(information / trace, 0.0, 0.0, 0.0) + along
+    factor, failed = torch.linalg.cholesky_ex(held)
+    factor = torch.where(failed[..., None, None] > 0, torch.eye(held.shape[-1], dtype=held.dtype, device=held.device), factor)
+    inverse = torch.cholesky_inverse(factor)
+    # the eigenvalues of what is not determined are rounding
+    open_ = (failed > 0) | (inverse.diagonal(dim1=-2, dim2=-1).amax(-1) > 1e13) | (trace[..., 0, 0] == 0)
+    noise = torch.as_tensor(sigma, dtype=held.dtype, device=held.device)[..., None, None, None].square()
+    return torch.where(open_[..., None, None], torch.inf, (inverse - along) / trace * noise).to(cameras.dtype)

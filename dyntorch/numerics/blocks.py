@@ -1,0 +1,271 @@
+"""Work on a batch block by block, so that each block stays in the cache of a core, and all cores have one.
+
+Small matrices never wait for a team of threads: whatever is public runs on one thread (:func:`one_thread`), and blocks go to a pool
+of workers of one thread each (:func:`map_blocks`).  Beside a busy neighbour a team waits for its slowest member at every operation:
+five to twenty times longer than one thread takes for the whole.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from functools import _lru_cache_wrapper, lru_cache, wraps
+from threading import Barrier, local
+from typing import Any, ParamSpec, TypeVar
+
+import torch
+from torch import Tensor
+
+Result = TypeVar("Result", Tensor, tuple[Tensor, ...])
+P = ParamSpec("P")
+R = TypeVar("R")
+LARGE = 1 << 20
+"""Numbers in one problem from which its own operations may use all threads."""
+
+
+class _Caller(local):
+    """What each Python thread had set before it entered :func:`one_thread`."""
+
+    threads: int | None = None
+
+
+_caller = _Caller()
+
+
+def one_thread(function: Callable[P, R]) -> Callable[P, R]:
+    """Decorate a public function: its small operations run on one thread, its blocks on as many workers as torch has threads.
+
+    The setting of the caller (``torch.set_num_threads``) holds again after the call, also after an exception, and all the time
+    in other threads.  Within ``torch.inference_mode`` the function runs without gradients instead, on copies of the tensors made
+    there: what it differentiates inside needs tensors that may be saved.
+
+    Example:
+        >>> import torch
+        >>> one_thread(torch.get_num_threads)(), workers() == torch.get_num_threads()
+        (1, True)
+    """
+
+    @wraps(function)
+    def run(*args: P.args, **kwargs: P.kwargs) -> R:
+        if torch.is_inference_mode_enabled():
+            with torch.inference_mode(False), torch.no_grad():
+                return run(*(_outside(x) for x in args), **{name: _outside(x) for name, x in kwargs.items()})
+        threads = torch.get_num_threads()
+        if threads == 1 or _caller.threads is not None:
+            return function(*args, **kwargs)
+        _caller.threads = threads
+        _set_threads(1, others=threads)
+        try:
+            return function(*args, **kwargs)
+        finally:
+            _caller.threads = None
+            torch.set_num_threads(threads)
+
+    run.__dict__["one_thread"] = True
+    return run
+
+
+def workers() -> int:
+    """Workers that blocks are spread over: the number of threads that torch has, or had before :func:`one_thread`."""
+    return _caller.threads or torch.get_num_threads()
+
+
+def _outside(x: Any) -> Any:
+    """Arguments without tensors made in inference mode, which autograd cannot save."""
+    if isinstance(x, Tensor):
+        return x.clone() if x.is_inference() else x
+    if isinstance(x, (tuple, list)) and type(x) in (tuple, list):
+        return type(x)(_outside(item) for item in x)
+    return x
+
+
+def _set_threads(count: int, others: int) -> None:
+    """Threads for the operations of this Python thread; those that start later get ``others``."""
+    torch.set_num_threads(count)
+    # the setting holds per thread, but new threads inherit the last one, whoever set it
+    _keeper().submit(torch.set_num_threads, others).result()
+
+
+@lru_cache(maxsize=1)
+def _keeper() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(1, thread_name_prefix="dyntorch-keeper")
+
+
+@contextmanager
+def _all_threads(tensors: tuple[Tensor, ...]) -> Iterator[None]:
+    """The threads of the caller for a single problem that is large."""
+    threads = _caller.threads
+    if threads is None or sum(x.numel() for x in tensors) < LARGE:
+        yield
+        return
+    torch.set_num_threads(threads)
+    try:
+        yield
+    finally:
+        _set_threads(1, others=threads)
+
+
+def map_blocks(function: Callable[..., Result], *tensors: Tensor, size: int) -> Result:
+    r"""Apply ``function`` to blocks of the leading dimension of all tensors, on a thread pool, and concatenate the results.
+
+    On the CPU torch factorizes a batch of matrices one after the other on one core (``svd``, ``eigh``, ``cholesky`` and
+    the triangular solves), and releases the interpreter meanwhile; threads over blocks give the other cores their share.
+    The pool has :func:`workers` workers, whose own operations run on one thread each: also a single block of many
+    small problems goes there from a caller with several threads, because teams of threads on small operations cost ten times what
+    they gain.  A single problem, one thread or an accelerator needs no pool.  The caller's grad mode holds in the workers.
+
+    Args:
+        function: takes one block per tensor and returns a tensor, or a tuple of tensors, with the same leading dimension.
+        tensors: ``(batch, ...)``, all with the same ``batch``; zero is one empty block.
+        size: problems per block.
+
+    Returns:
+        what ``function`` returns for the whole batch.
+
+    Raises:
+        ValueError: no tensor, different leading dimensions, or a size below 1.
+
+    Example:
+        >>> import torch
+        >>> map_blocks(lambda a, b: a + b, torch.arange(5), torch.ones(5, dtype=torch.int64), size=2)
+        tensor([1, 2, 3, 4, 5])
+    """
+    lengths = {tensor.shape[0] if tensor.ndim else None for tensor in tensors}
+    if len(lengths) != 1 or None in lengths:
+        raise ValueError(f"map_blocks needs tensors of the same leading dimension, got {[tuple(t.shape) for t in tensors]}")
+    if size < 1:
+        raise ValueError(f"size must be at least 1 problem per block, got {size}")
+    threads = workers() if tensors[0].device.type == "cpu" else 1
+    if len(tensors[0]) <= min(size, 1) or (threads == 1 and len(tensors[0]) <= size):
+        with _all_threads(tensors):
+            return function(*tensors)
+    if len(tensors[0]) <= size and torch.get_num_threads() == 1:
+        return function(*tensors)
+    blocks = list(zip(*(tensor.split(size) for tensor in tensors), strict=True))
+    if threads == 1:
+        return _concatenate([function(*block) for block in blocks])
+    grad, inference = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
+
+    def run(block: tuple[Tensor, ...]) -> Result:
+        # grad mode belongs to a thread; a worker starts with the default
+        with torch.inference_mode(inference), torch.set_grad_enabled(grad):
+            return function(*block)
+
+    return _concatenate(list(_pool(threads).map(run, blocks)))
+
+
+def _concatenate(results: list[Result]) -> Result:
+    if isinstance(results[0], Tensor):
+        return torch.cat(results)
+    return tuple(torch.cat(parts) for parts in zip(*results, strict=True))
+
+
+def _one_thread() -> None:
+    torch.get_num_threads()  # a thread's first call takes the global setting over, and would undo the next line later
+    torch.set_num_threads(1)
+
+
+@lru_cache(maxsize=1)
+def _pool(threads: int) -> ThreadPoolExecutor:
+    """Workers whose torch operations do not start teams of their own: ten times slower, with more threads than cores."""
+    pool, own = ThreadPoolExecutor(threads, thread_name_prefix="dyntorch", initializer=_one_thread), torch.get_num_threads()
+    # every worker has to start before the setting is put right
+    started = Barrier(threads)
+    for _ in pool.map(lambda _: started.wait(), range(threads)):
+        pass
+    _set_threads(own, others=threads)
+    return pool
+
+
+if hasattr(os, "register_at_fork"):
+    # threads do not survive a fork
+    os.register_at_fork(after_in_child=_pool.cache_clear)
+    os.register_at_fork(after_in_child=_keeper.cache_clear)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Tables of numbers that depend on sizes alone, made once and shared.
+
+
+Sizes = ParamSpec("Sizes")
+Table = TypeVar("Table")
+
+
+def constant(make: Callable[Sizes, Table]) -> _lru_cache_wrapper[Table]:
+    """Cache the tensors that a function of sizes, and of the device, makes; whoever gets them must not write into them.
+
+    The first call may come from anywhere, but a tensor made within ``torch.inference_mode``, a transformation of ``torch.func``,
+    a fake mode or for another default device belongs there, and in the cache it would break later calls.  All of these hold for
+    one thread: a thread of its own makes the tensors.
+
+    Example:
+        >>> import torch
+        >>> @constant
+        ... def steps(n, device):
+        ...     return torch.arange(n, device=device)
+        >>> with torch.inference_mode():
+        ...     first = steps(3, torch.device("cpu"))
+        >>> first.is_inference(), steps(3, torch.device("cpu")) is first
+        (False, True)
+    """
+
+    @lru_cache(maxsize=256)
+    @wraps(make)
+    def made(*args: Sizes.args, **kwargs: Sizes.kwargs) -> Table:
+        with ThreadPoolExecutor(1) as alone:
+            return alone.submit(make, *args, **kwargs).result()
+
+    return made
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Random numbers from the caller's generator, wherever it lives.
+
+
+class Draws:
+    """A stream of random numbers for each problem of a batch: what one gets does not depend on how the others fare.
+
+    Args:
+        count: problems.
+        generator: source of the seeds, one for each problem in their order; None is torch's global one.
+        device: of the results.
+
+    Example:
+        >>> import torch
+        >>> def draws():
+        ...     return Draws(3, torch.Generator().manual_seed(0), torch.device("cpu"))
+        >>> bool(torch.equal(draws()(torch.arange(3), 4)[2], draws()(torch.tensor([2]), 4)[0]))
+        True
+    """
+
+    def __init__(self, count: int, generator: torch.Generator | None, device: torch.device) -> None:
+        home, self.device = device if generator is None else generator.device, device
+        seeds = torch.randint(2**62, (count,), generator=generator, device=home).tolist()
+        self.streams = [torch.Generator(device=home).manual_seed(seed) for seed in seeds]
+
+    def __call__(self, where: Tensor, *shape: int) -> Tensor:
+        """The next numbers in [0, 1) of some problems, ``(problems, *shape)`` float64."""
+        drawn = [
+            torch.rand(*shape, generator=self.streams[i], dtype=torch.float64, device=self.streams[i].device)
+            for i in where.tolist()
+        ]
+        return torch.stack(drawn).to(self.device) if drawn else torch.zeros(0, *shape, dtype=torch.float64, device=self.device)
+
+
+def uniform(*shape: int, generator: torch.Generator | None, device: torch.device) -> Tensor:
+    """Numbers in [0, 1), float64, drawn on the device of the generator (None: on ``device``) and moved to ``device``.
+
+    Args:
+        *shape: of the result.
+        generator: source of the numbers; None is torch's global one.
+        device: of the result.
+
+    Example:
+        >>> import torch
+        >>> uniform(2, 3, generator=torch.Generator().manual_seed(0), device=torch.device("cpu")).shape
+        torch.Size([2, 3])
+    """
+    home = device if generator is None else generator.device
+    return torch.rand(*shape, generator=generator, dtype=torch.float64, device=home).to(device)

@@ -1,0 +1,480 @@
+"""Moments, correlations and Grams of two sequences at all time lags, by FFT.
+
+Lag s pairs frame i of the first sequence with frame i + s of the second.  Missing data have weight 0, so all sums are exact
+whatever is missing.  Where the lags span much less than the sequences, these go through in blocks, whose memory does not
+grow with the length.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dyntorch.numerics.blocks import constant
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Correlations of two sequences by FFT: exact at the lags asked for, in memory that does not grow with the length.
+
+
+Lags = tuple[int, int]
+Lift = Callable[[Tensor], Tensor]
+
+ROUNDING = 64 * torch.finfo(torch.float64).eps  # of the product of the norms: what an FFT leaves of a sum that is zero
+ELEMENTS = 2**24  # numbers in one piece of work: 128 MB
+
+
+def correlate(a: Tensor, b: Tensor, lags: Lags, lift: Lift, per_point: bool = False) -> Tensor:
+    r"""Products of two lifted sequences, summed over the frames that overlap and over points, at all lags.
+
+    .. math:: C_{pq}(s) = \sum_{ij} u_{jp}(a_i)\, u_{jq}(b_{i+s})
+
+    Frames of one block of the first sequence meet the frames of the second within the lags; the transforms of the blocks add up
+    before the one way back.
+
+    Args:
+        a: ``(b, T1, n, c)`` float64.
+        b: ``(b, T2, n, c')``.
+        lags: first and last lag, in frames.
+        lift: takes frames ``(b, t, n, c)`` to what is multiplied, ``(b, n, p, t)``: of one block at a time.
+        per_point: no sum over the points.
+
+    Returns:
+        ``(b, [n,] p, q, L)``, 0 where nothing overlaps.  Rounding is relative to the norms of whole sequences.
+
+    Source: the correlation theorem; overlap-save for long sequences.
+
+    Example:
+        >>> import torch
+        >>> a = torch.tensor([1.0, 2.0], dtype=torch.float64)[None, :, None, None]
+        >>> correlate(a, a, (-1, 2), lambda x: x.movedim(1, -1)).flatten().abs().round(decimals=9).tolist()
+        [2.0, 5.0, 2.0, 0.0]
+    """
+    frames1, frames2 = a.shape[1], b.shape[1]
+    lo, hi = max(lags[0], 1 - frames1), min(lags[1], frames2 - 1)
+    p, q = lift(a[:1, :1]).shape[2], lift(b[:1, :1]).shape[2]
+    points = a.shape[2] if per_point else 1
+    result = a.new_zeros(len(a), points, p, q, lags[1] - lags[0] + 1)
+    if lo <= hi:
+        # frames that no lag pairs with anything are left out
+        early, late = max(0, -hi), max(0, lo)
+        first, second = a[:, early : frames2 - lo], b[:, late : frames1 + hi]
+        found = result[..., lo - lags[0] : hi - lags[0] + 1]
+        _fill(found, first, second, lo + early - late, lift, per_point)
+    return result if per_point else result[:, 0]
+
+
+def _fill(found: Tensor, a: Tensor, b: Tensor, lo: int, lift: Lift, per_point: bool) -> None:
+    """Problems, and rows of the first sequence, in pieces that fit into memory."""
+    count, points, p, q, lags = found.shape
+    length, block = _lengths(a.shape[1], b.shape[1], lo, lo + lags - 1)
+    for problem in range(count):
+        rows = max(1, ELEMENTS // (points * q * length))
+        for row in range(0, p, rows):
+            chosen = slice(row, row + rows)
+            upper = partial(_rows_of, lift, chosen)
+            spectrum = _spectrum(a[problem], b[problem], (lo, lo + lags - 1), (length, block), (upper, lift), per_point)
+            whole = torch.fft.irfft(spectrum, n=length)
+            # in one block the lags count from the first frame, and negative ones from the end; in several from the first lag
+            negative = -lo if block >= a.shape[1] else 0
+            found[problem, :, chosen, :, :negative] = whole[..., length - negative :]
+            found[problem, :, chosen, :, negative:] = whole[..., : lags - negative]
+
+
+def _rows_of(lift: Lift, chosen: slice, x: Tensor) -> Tensor:
+    return lift(x)[:, :, chosen]
+
+
+def _spectrum(a: Tensor, b: Tensor, lags: Lags, sizes: tuple[int, int], lifts: tuple[Lift, Lift], per_point: bool) -> Tensor:
+    """Transform of the correlations, ``(n or 1, p, q, frequencies)``: the blocks add up before the way back."""
+    (lo, hi), (length, block) = lags, sizes
+    single = block >= len(a)
+    total = a.new_zeros(0, dtype=torch.complex128)
+    for begin in range(0, len(a), block):
+        first = torch.fft.rfft(lifts[0](a[None, begin : begin + block])[0], n=length).conj()
+        early = 0 if single else begin + lo
+        other = lifts[1](b[None, max(early, 0) : begin + block + hi])[0]
+        second = torch.fft.rfft(other if early >= 0 else torch.nn.functional.pad(other, (-early, 0)), n=length)
+        if begin == 0:
+            points, p, frequencies = first.shape
+            total = second.new_zeros(points if per_point else 1, p, second.shape[1], frequencies)
+        for point in range(len(first)):
+            total[point if per_point else 0].addcmul_(first[point, :, None], second[point, None])
+    return total
+
+
+def _lengths(frames1: int, frames2: int, lo: int, hi: int) -> tuple[int, int]:
+    """Length of the transforms, and of the blocks of the first sequence."""
+    # milliseconds for 2001 lags by transforms of 2, 3, 4, 8 times as many frames, and of all: 10,000 frames of 20 + 20 rows
+    # 22, 33, 52, 93, 65; 100,000 frames of 4 + 4 rows 16, 9, 8, 9, 24
+    whole = max(frames2 - lo, frames1 + hi)
+    width = hi - lo
+    length = max(3 * (width + 1), 2048)
+    if 2 * whole <= 3 * length:
+        return _good(whole), frames1
+    length = _good(length)
+    return length, length - width
+
+
+def _good(least: int) -> int:
+    """The next length of the form 2^a 3^b 5^c, even."""
+    best = 2 ** max((least - 1).bit_length(), 1)
+    five = 1
+    while five < best:
+        three = five
+        while three < best:
+            two = three * 2 ** max((-(-least // three) - 1).bit_length(), 1)
+            best = min(best, two)
+            three *= 3
+        five *= 5
+    return best
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Covariances of sequences: of windows by running sums, and compressed to their leading directions.
+
+
+LEAST = 64  # frames in one piece of running sums
+
+
+def compress(rows: Tensor, rank: int | None = None, noise: float | None = None) -> Tensor:
+    r"""Coordinates of frames in the leading principal directions of their rows: fewer and uncorrelated.
+
+    Args:
+        rows: ``(*batch, T, p)`` finite.
+        rank: how many directions; None to count those whose standard deviation is above ``noise``.
+        noise: standard deviation of the noise in each row, in the unit of ``rows``.
+
+    Returns:
+        ``(*batch, T, r)`` float64 of mean 0; r is the largest count of the batch, at least 1.
+
+    Raises:
+        ValueError: neither or both of rank and noise, or a rank outside 1 to p.
+
+    Example:
+        >>> import torch
+        >>> time = torch.linspace(0, 1, 20)[:, None]
+        >>> compress(torch.cat([time, 2 * time, 3 * time + 1], dim=-1), noise=1e-3).shape
+        torch.Size([20, 1])
+    """
+    p = rows.shape[-1]
+    if (rank is None) == (noise is None):
+        raise ValueError(f"compress needs either rank or noise, got rank {rank} and noise {noise}: give one")
+    if rank is not None and not 1 <= rank <= p:
+        raise ValueError(f"rank must be from 1 to the {p} rows, got {rank}")
+    centred = rows.double() - rows.double().mean(-2, keepdim=True)
+    values, directions = torch.linalg.eigh(centred.mT @ centred / rows.shape[-2])
+    if noise is not None:
+        rank = max(int((values > noise**2).sum(-1).max()), 1)
+    return centred @ directions[..., p - (rank or 1) :].flip(-1)
+
+
+def window_covariances(x: Tensor, start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
+    r"""Covariances and means of the frames of a window, for many windows, by running sums.
+
+    .. math:: C = \frac1m \sum_{start \le i < end} x_i x_i^T - \mu \mu^T, \qquad \mu = \frac1m \sum_{start \le i < end} x_i
+
+    Args:
+        x: ``(b, T, p)`` float64, best of mean 0: what lies before a window cancels.
+        start: ``(L,)`` first frames.
+        end: ``(L,)`` the frames past the last.
+
+    Returns:
+        ``(b, L, p, p)`` and ``(b, L, p)``, windows last in memory; 0 where a window is empty.
+
+    Example:
+        >>> import torch
+        >>> x = torch.tensor([[[1.0], [3.0], [7.0]]])
+        >>> window_covariances(x, torch.tensor([0, 1]), torch.tensor([2, 3]))[0].flatten().tolist()
+        [1.0, 4.0]
+    """
+    p = x.shape[-1]
+    both = _sums_before(torch.cat([x.new_ones(*x.shape[:-1], 1), x], dim=-1), torch.cat([start, end]))
+    sums = both[..., len(start) :] - both[..., : len(start)]
+    sums *= 1 / sums[:, :1].clone().round().clamp(min=1.0)
+    mean, packed = sums[:, 1 : p + 1], sums[:, p + 1 :]
+    row = 0
+    for i in range(p):  # row by row: the cache holds what is read again
+        packed[:, row : row + p - i] -= mean[:, i : i + 1] * mean[:, i:]
+        row += p - i
+    whole = packed.index_select(1, _packing(p, x.device).flatten())
+    return whole.unflatten(1, (p, p)).movedim(-1, 1), mean.mT
+
+
+def _sums_before(x: Tensor, at: Tensor) -> Tensor:
+    """Products of the coordinates j >= i, added up over the frames before each of ``at``: ``(b, pairs, len(at))``."""
+    b, frames, p = x.shape
+    pairs = p * (p + 1) // 2
+    result = x.new_zeros(b, pairs, len(at))
+    carry = x.new_zeros(b, pairs, 1)
+    rows, columns = torch.triu_indices(p, p, device=x.device).unbind()
+    size = max(ELEMENTS // (8 * b * pairs), LEAST)
+    at = at.to(x.device).clamp(max=frames)
+    for begin in range(0, frames, size):
+        block = x[:, begin : begin + size]
+        asked = ((at > begin) & (at <= begin + size)).nonzero()[:, 0]
+        if len(asked):
+            sums = _products(block).cumsum_(-1).add_(carry)
+            result[..., asked] = sums.index_select(-1, at[asked] - begin - 1)
+            carry = sums[..., -1:]
+        else:
+            carry = carry + (block.mT @ block)[:, rows, columns, None]
+    return result
+
+
+def _products(x: Tensor) -> Tensor:
+    """Products ``(b, pairs, t)`` of the coordinates j >= i of frames ``(b, t, p)``."""
+    channels = x.mT.contiguous()
+    return torch.cat([channels[:, i : i + 1] * channels[:, i:] for i in range(x.shape[-1])], dim=1)
+
+
+@constant
+def _packing(size: int, device: torch.device) -> Tensor:
+    """Which pair j >= i each entry of a symmetric matrix is."""
+    rows, columns = torch.triu_indices(size, size)
+    table = torch.zeros(size, size, dtype=torch.long)
+    table[rows, columns] = table[columns, rows] = torch.arange(len(rows))
+    return table.to(device)
+
+
+def lag_products(a: Tensor, b: Tensor, lags: Lags | None = None) -> Tensor:
+    r"""Products of two sequences of vectors, summed over the frames that overlap, at all lags.
+
+    .. math:: C_{pq}(s) = \sum_i a_{ip}\, b_{i+s,q}
+
+    Args:
+        a: ``(*batch, T1, p)`` finite.
+        b: ``(*batch, T2, q)`` finite.
+        lags: first and last lag, in frames; None for all from -(T1 - 1) to T2 - 1.
+
+    Returns:
+        ``(*batch, L, p, q)`` float64, 0 where nothing overlaps.  Rounding is relative to the energies of whole sequences.
+
+    Raises:
+        ValueError: shapes that do not match, no frames, or lags in the wrong order.
+
+    Source: the correlation theorem; overlap-save for long sequences.
+
+    Example:
+        >>> import torch
+        >>> a, b = torch.tensor([[1.0], [2.0]]), torch.tensor([[3.0], [4.0], [5.0]])
+        >>> [round(value, 9) + 0.0 for value in lag_products(a, b)[:, 0, 0].tolist()]
+        [6.0, 11.0, 14.0, 5.0]
+    """
+    span = _span(a, b, lags, 2)
+    shape, first, second = _flat(a, b, 2)
+    return _batched(correlate(first[:, :, None], second[:, :, None], span, _channels).movedim(-1, 1), shape)
+
+
+def epipolar_moments(
+    x1: Tensor, x2: Tensor, lags: Lags | None = None, weights: tuple[Tensor, Tensor] | None = None, per_point: bool = False
+) -> tuple[Tensor, Tensor]:
+    r"""Moment matrices of the epipolar constraint of the same points in two cameras, at all lags.
+
+    .. math:: M(s) = \sum_{ij} w_{1,ij}\, w_{2,(i+s)j}\; z z^T, \qquad z = \tilde x_{2,(i+s)j} \otimes \tilde x_{1,ij},
+
+    with :math:`\tilde x = (x, y, 1)`, so that :math:`z \cdot \mathrm{vec} F = \tilde x_2^T F \tilde x_1` for F by rows.  The 81
+    entries are sums of 6 x 6 products of a monomial of each camera, added up over the points before the inverse transform.
+
+    Args:
+        x1: ``(*batch, T1, n, 2)``, best normalized (mean 0, size 1: fourth powers of pixels lose digits); NaN where weight is 0.
+        x2: ``(*batch, T2, n, 2)``.
+        lags: first and last lag, in frames; None for all.
+        weights: ``(*batch, T1, n)`` and ``(*batch, T2, n)``, not negative, 0 = missing; None for 1.  Where a
+            coordinate is not finite it counts as 0.
+        per_point: moments of each point rather than of all together.
+
+    Returns:
+        Moments ``(*batch, [n,] L, 9, 9)`` float64, not divided by the counts, and counts ``(*batch, [n,] L)``, the sums of the
+        products of weights.  Both 0 where nothing overlaps.
+
+    Raises:
+        ValueError: shapes that do not match, or a weight that is negative or not finite.
+
+    Source: thesis, chapter 7; Hartley 1997, In defense of the eight-point algorithm.
+
+    Example:
+        >>> import torch
+        >>> x1 = torch.rand(30, 4, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        >>> x2 = torch.cat([torch.zeros(5, 4, 2, dtype=torch.float64), x1 + 1.0])  # b shows a's frame i at i + 5
+        >>> moments, counts = epipolar_moments(x1, x2, (0, 9))
+        >>> int((torch.linalg.eigvalsh(moments)[:, 0] / counts).argmin())
+        5
+    """
+    found, counts = _camera_moments(x1, x2, lags, weights, per_point)
+    return _places(found, _epipolar_places(found.device)), counts
+
+
+def lag_covariances(
+    a: Tensor, b: Tensor, lags: Lags | None = None, weights: tuple[Tensor, Tensor] | None = None
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    r"""Covariances of two sequences of vectors over the frames that overlap, about the means there, at all lags.
+
+    .. math:: C_{ab}(s) = \frac{1}{m} \sum_i (a_i - \bar a(s)) (b_{i+s} - \bar b(s))^T
+
+    Args:
+        a: ``(*batch, T1, p)`` finite (where the weight is not 0).
+        b: ``(*batch, T2, q)``.
+        lags: first and last lag, in frames; None for all.
+        weights: ``(*batch, T1)`` and ``(*batch, T2)``, not negative, 0 = the frame is absent; None for 1.
+
+    Returns:
+        C_aa ``(*batch, L, p, p)``, C_bb ``(*batch, L, q, q)``, C_ab ``(*batch, L, p, q)`` and the counts m, ``(L,)``, with weights
+        ``(*batch, L)``; float64, 0 where nothing overlaps.
+
+    Raises:
+        ValueError: shapes that do not match, no frames, lags in the wrong order, or a bad weight.
+
+    Source: Wolf and Zomet 2006, Wide baseline matching between unsynchronized video sequences.
+
+    Example:
+        >>> import torch
+        >>> a = torch.rand(50, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        >>> aa, bb, ab, counts = lag_covariances(a, a, (-1, 1))
+        >>> bool((ab[1] - torch.cov(a.T, correction=0)).abs().max() < 1e-15), counts.tolist()
+        (True, [49.0, 50.0, 49.0])
+    """
+    lo, hi = _span(a, b, lags, 2)
+    shape, first, second = _flat(a, b, 2)
+    if weights is not None:
+        w1, w2 = (_frame_weights(w, x, shape) for w, x in zip(weights, (first, second), strict=True))
+        aa, bb, ab, counts = _weighted_covariances(first, second, (lo, hi), w1, w2)
+        return _batched(aa, shape), _batched(bb, shape), _batched(ab, shape), _batched(counts, shape)
+    first, second = first - first.mean(1, keepdim=True), second - second.mean(1, keepdim=True)
+    start, end = _overlap(a.shape[-2], b.shape[-2], (lo, hi))
+    lag = torch.arange(lo, hi + 1)
+    counts = (end - start).double().to(a.device)
+    aa, mean_a = window_covariances(first, start, end)
+    bb, mean_b = window_covariances(second, start + lag, end + lag)
+    ab = lag_products(first, second, (lo, hi)) / counts.clamp(min=1.0)[:, None, None]
+    ab -= mean_a[..., :, None] * mean_b[..., None, :]
+    return _batched(aa, shape), _batched(bb, shape), _batched(ab, shape), counts
+
+
+def _channels(x: Tensor) -> Tensor:
+    """``(b, t, n, p)`` to ``(b, n, p, t)``."""
+    return x.movedim(1, -1)
+
+
+def _monomials(x: Tensor) -> Tensor:
+    """Points with weights ``(b, t, n, 3)`` to w xx, w xy, w yy, w x, w y, w: ``(b, n, 6, t)``."""
+    x, y, w = x.movedim(1, -1).unbind(2)
+    x, y = (torch.where(w > 0, value, 0.0) for value in (x, y))
+    wx, wy = w * x, w * y
+    return torch.stack([wx * x, wx * y, wy * y, wx, wy, w], dim=2)
+
+
+def _camera_moments(
+    x1: Tensor, x2: Tensor, lags: Lags | None, weights: tuple[Tensor, Tensor] | None, per_point: bool
+) -> tuple[Tensor, Tensor]:
+    """Sums of products of a monomial of each camera ``(*b, [n,] 36, L)``, and counts ``(*b, [n,] L)``."""
+    if x1.ndim < 3 or x2.ndim < 3 or x1.shape[-2:] != x2.shape[-2:] or x1.shape[-1] != 2:
+        raise ValueError(
+            f"the same points in both cameras are (*batch, frames, n, 2) each, got {tuple(x1.shape)} and {tuple(x2.shape)}"
+        )
+    span = _span(x1, x2, lags, 3)
+    given: tuple[Tensor | None, Tensor | None] = weights or (None, None)
+    x1, x2 = (torch.cat([x.double(), _point_weights(x, w)[..., None]], dim=-1) for x, w in zip((x1, x2), given, strict=True))
+    shape, first, second = _flat(x1, x2, 3)
+    found = correlate(first, second, span, _monomials, per_point).flatten(-3, -2)
+    one, two = (x[..., 2] if per_point else x[..., 2].flatten(1)[..., None] for x in (first, second))
+    counts = _counts(found[..., 35, :], one, two, per_point)
+    found = torch.where(counts[..., None, :] > 0, found, 0.0)
+    return _batched(found, shape), _batched(counts, shape)
+
+
+def _counts(sums: Tensor, w1: Tensor, w2: Tensor, per_point: bool) -> Tensor:
+    """Correlations ``(b, [n,] L)`` of weights ``(b, frames, n or 1)`` without the rounding that FFT leaves."""
+    # what has no overlap sums to rounding, and has to be 0
+    norms = w1.square().sum(1).sqrt() * w2.square().sum(1).sqrt()
+    counts = torch.where(sums > ROUNDING * (norms[..., None] if per_point else norms), sums, 0.0)
+    whole = all(bool(((w == 0) | (w == 1)).all()) for w in (w1, w2))
+    return counts.round() if whole else counts
+
+
+def _point_weights(x: Tensor, weights: Tensor | None) -> Tensor:
+    seen = x.isfinite().all(-1).double()
+    if weights is None:
+        return seen
+    if weights.shape != x.shape[:-1]:
+        raise ValueError(f"weights must be {tuple(x.shape[:-1])} for points {tuple(x.shape)}, got {tuple(weights.shape)}")
+    _check_weights(weights)
+    return weights.double() * seen
+
+
+def _frame_weights(weights: Tensor, x: Tensor, shape: tuple[int, ...]) -> Tensor:
+    if weights.ndim < 1 or weights.shape[-1] != x.shape[1]:
+        raise ValueError(f"weights must be (*batch, {x.shape[1]}), one per frame, got {tuple(weights.shape)}")
+    _check_weights(weights)
+    return weights.double().expand(*shape, -1).reshape(-1, x.shape[1], 1)
+
+
+def _check_weights(weights: Tensor) -> None:
+    if not bool((weights.isfinite() & (weights >= 0)).all()):
+        raise ValueError("weights must be finite and not negative: give 0 where a point is missing")
+
+
+def _places(found: Tensor, place: Tensor) -> Tensor:
+    """Matrices ``(*, L, d, d)`` of the sums ``(*, 36, L)``; the lags stay last in memory."""
+    return found.index_select(-2, place.flatten()).unflatten(-2, place.shape).movedim(-1, -3)
+
+
+@constant
+def _epipolar_places(device: torch.device) -> Tensor:
+    """Which of the 6 x 6 sums each entry of a ``(9, 9)`` moment matrix is: row and column are 3 (entry of x2~) + entry of x1~."""
+    entry = torch.tensor([[0, 1, 3], [1, 2, 4], [3, 4, 5]])  # of xx, xy, yy, x, y, 1
+    return (6 * entry[None, :, None, :] + entry[:, None, :, None]).reshape(9, 9).to(device)
+
+
+def _span(a: Tensor, b: Tensor, lags: Lags | None, dims: int) -> Lags:
+    if a.ndim < dims or b.ndim < dims or a.shape[-dims] == 0 or b.shape[-dims] == 0:
+        raise ValueError(f"sequences need at least one frame each, got {tuple(a.shape)} and {tuple(b.shape)}")
+    lo, hi = (1 - a.shape[-dims], b.shape[-dims] - 1) if lags is None else lags
+    if lo > hi:
+        raise ValueError(f"lags must be (first, last) with first <= last, got {lags}")
+    return lo, hi
+
+
+def _flat(a: Tensor, b: Tensor, dims: int) -> tuple[tuple[int, ...], Tensor, Tensor]:
+    """The common batch shape, and both sequences in float64 with one batch dimension."""
+    shape = np.broadcast_shapes(a.shape[:-dims], b.shape[:-dims])
+    first, second = (x.double().expand(*shape, *x.shape[-dims:]).reshape(-1, *x.shape[-dims:]) for x in (a, b))
+    return tuple(shape), first, second
+
+
+def _batched(x: Tensor, shape: tuple[int, ...]) -> Tensor:
+    return x.reshape(*shape, *x.shape[1:])
+
+
+def _overlap(frames1: int, frames2: int, lags: Lags) -> tuple[Tensor, Tensor]:
+    """First frame of the first sequence in the overlap, and the one past the last."""
+    lag = torch.arange(lags[0], lags[1] + 1)
+    start = (-lag).clamp(min=0, max=frames1)
+    return start, torch.maximum((frames2 - lag).clamp(max=frames1), start)
+
+
+def _weighted_covariances(a: Tensor, b: Tensor, span: Lags, w1: Tensor, w2: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Everything is a product of a weighted monomial of one sequence with one of the other; weights are ``(b, frames, 1)``."""
+    a, b = _centred(a, w1), _centred(b, w2)
+    sums = lag_products(torch.cat([w1 * a, w1], dim=-1), torch.cat([w2 * b, w2], dim=-1), span)
+    counts = _counts(sums[..., -1, -1], w1, w2, per_point=False)
+    share = torch.where(counts > 0, 1 / torch.where(counts > 0, counts, 1.0), 0.0)[..., None, None]
+    mean_a, mean_b = sums[..., :-1, -1:] * share, sums[..., -1:, :-1].mT * share
+    aa = lag_products(_squares(a, w1), w2, span).unflatten(2, (a.shape[-1], -1))[..., 0]
+    bb = lag_products(w1, _squares(b, w2), span).unflatten(3, (b.shape[-1], -1))[:, :, 0]
+    ab = sums[..., :-1, :-1]
+    return aa * share - mean_a * mean_a.mT, bb * share - mean_b * mean_b.mT, ab * share - mean_a * mean_b.mT, counts
+
+
+def _squares(x: Tensor, weights: Tensor) -> Tensor:
+    return ((weights * x)[..., :, None] * x[..., None, :]).flatten(-2)
+
+
+def _centred(x: Tensor, weights: Tensor) -> Tensor:
+    x = torch.where(weights > 0, x, 0.0)
+    total = weights.sum(1, keepdim=True)
+    mean = (weights * x).sum(1, keepdim=True) / torch.where(total > 0, total, 1.0)
+    return torch.where(weights > 0, x - mean, 0.0)

@@ -1,0 +1,202 @@
+r"""When a single view of a moving shape was taken: the residual over a grid of times, its minima refined, the second one kept."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import prod
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dyntorch.numerics.blocks import one_thread
+from dyntorch.shapes.basis import Trajectory
+from dyntorch.shapes.moving import centred_views, project, shapes_at
+
+PEAKS = 3
+"""Minima of the grid that are refined."""
+STEPS = 8
+"""Gauss-Newton steps in the time; exact data need 4 from a grid of 64, noise of 3 % 6."""
+CHUNK = 1 << 22
+"""Numbers in the largest temporary."""
+RIDGE = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class Recovery:
+    """Result of :func:`recover_times`: one entry per view.
+
+    Attributes:
+        residual: ``(*batch, views)`` part of the energy of the view that the shape at its best time leaves, in [0, 1]; 1 where
+            the view says nothing.
+        times: ``(*batch, views)`` that time; the middle of the grid where the view says nothing.
+        sigma: ``(*batch, views)`` expected error of the time for noise 1 of the normalized view: times the noise of the shapes.
+        second: ``(*batch, views)`` the time of the next minimum; the same time where there is none.
+        rise: ``(*batch, views)`` how much more it leaves; infinite where there is none.
+    """
+
+    residual: Tensor
+    times: Tensor
+    sigma: Tensor
+    second: Tensor
+    rise: Tensor
+
+    def ambiguous(self, noise: Tensor | float, odds: float = 20.0) -> Tensor:
+        """Whether noise of this standard deviation could exchange the two times, ``(*batch, views)`` bool.
+
+        The likelihoods of two times differ by the factor exp(rise / 2 noise^2); below ``odds`` the view does not decide.
+        """
+        return self.rise < 2 * torch.as_tensor(noise)[..., None] ** 2 * torch.tensor(odds).log()
+
+
+@one_thread
+def recover_times(
+    shapes: Tensor,
+    basis: Trajectory,
+    x: Tensor,
+    weights: Tensor | None = None,
+    *,
+    grid: int = 64,
+    interval: tuple[float, float] = (-1.0, 1.0),
+) -> Recovery:
+    r"""Find the time at which a moving shape looks most like each of some new views, and what it leaves unexplained.
+
+    .. math:: f(t) = \|(I - \Pi(t))\,\bar x\|^2, \qquad \Pi(t) \text{ onto } \mathrm{span}[1, X(t)]
+
+    on a grid for all views by one product with precomputed projectors, then by Gauss-Newton from its three deepest minima.
+
+    Args:
+        shapes: ``(*batch, B, n, 3)`` of :func:`~dyntorch.shapes.moving.fit_shapes`.
+        basis: of the trajectories.
+        x: ``(*batch, views, n, 2)`` image points in any unit; NaN = missing.
+        weights: ``(*batch, views, n)``, 0 = ignore.
+        grid: times tried.
+        interval: polynomial trajectories: times tried from and to.  Periodic ones are tried over the period.
+
+    Returns:
+        :class:`Recovery` in the dtype of x.
+
+    Raises:
+        ValueError: shapes that do not agree, or a grid of fewer than 3 times.
+
+    Source: thesis chapter 4: one view of enough points determines the time; a grid in the place of resultants.
+
+    Example:
+        >>> import torch
+        >>> from dyntorch import Polynomial
+        >>> g = torch.Generator().manual_seed(0)
+        >>> points, camera = torch.randn(2, 8, 3, generator=g).double(), torch.randn(3, 2, generator=g).double()
+        >>> found = recover_times(points, Polynomial(1), ((points[0] + 0.3 * points[1]) @ camera)[None])
+        >>> bool(found.residual < 1e-12), round(float(found.times), 6)
+        (True, 0.3)
+    """
+    if x.ndim < 3 or x.shape[-1] != 2 or shapes.ndim < 3 or shapes.shape[-1] != 3 or shapes.shape[-2] != x.shape[-2]:
+        raise ValueError(
+            f"expected shapes (*batch, B, n, 3) and x (*batch, views, n, 2), got {tuple(shapes.shape)}, {tuple(x.shape)}"
+        )
+    if shapes.shape[-3] != basis.size:
+        raise ValueError(f"{basis!r} has {basis.size} functions, shapes {tuple(shapes.shape)} have {shapes.shape[-3]}")
+    if grid < 3:
+        raise ValueError(f"grid must be at least 3 times, got {grid}")
+    batch = np.broadcast_shapes(shapes.shape[:-3], x.shape[:-3])
+    flat = prod(batch)
+    wide = shapes.double().expand(*batch, *shapes.shape[-3:]).reshape(flat, *shapes.shape[-3:])
+    seen = x.double().expand(*batch, *x.shape[-3:]).reshape(flat, *x.shape[-3:])
+    weight = None if weights is None else weights.double().expand(*batch, *x.shape[-3:-1]).reshape(flat, *x.shape[-3:-1])
+    views = centred_views(seen, weight)
+    times = _grid(basis, grid, interval, wide)
+    step = max(1, CHUNK // (grid * 16 * max(1, flat)))
+    pieces = [slice(i, i + step) for i in range(0, max(1, views.x.shape[1]), step)]
+    parts = [_recovered(wide, basis, times, views.x[:, p], views.weights[:, p]) for p in pieces]
+    found = [torch.cat(part, dim=1) for part in zip(*parts, strict=True)]
+    known, middle = views.share > 0, times[len(times) // 2]
+    none = (middle.new_tensor(1.0), middle, middle.new_tensor(torch.inf), middle, middle.new_tensor(0.0))
+    done = [
+        torch.where(known, part, value).reshape(*batch, known.shape[-1]).to(x.dtype)
+        for part, value in zip(found, none, strict=True)
+    ]
+    return Recovery(*(part.reshape(*batch, known.shape[-1]).to(x.dtype) for part in done))
+
+
+def _grid(basis: Trajectory, count: int, interval: tuple[float, float], like: Tensor) -> Tensor:
+    if basis.period is None:
+        return torch.linspace(*interval, count, dtype=like.dtype, device=like.device)
+    return torch.arange(count, dtype=like.dtype, device=like.device) * (basis.period / count)
+
+
+def _recovered(shapes: Tensor, basis: Trajectory, times: Tensor, x: Tensor, weights: Tensor) -> tuple[Tensor, ...]:
+    """Residual, time, sigma, second and rise of one piece of the views, ``(b, views)`` each."""
+    curve = residuals_at(shapes, basis.rows(times), x, weights)
+    start, lone = _minima(curve, basis.period is not None)
+    step = times[1] - times[0]
+    t, f, h = _refined(shapes, basis, times[start], step, x, weights, times if basis.period is None else None)
+    f = torch.where(lone, torch.inf, f)
+    order = f.argsort(-1)
+    t, f, h = (part.gather(-1, order) for part in (t, f, h))
+    second = torch.where(f[..., 1].isfinite(), t[..., 1], t[..., 0])
+    return f[..., 0].clamp(0, 1), t[..., 0], h[..., 0].clamp(min=1e-300).rsqrt(), second, f[..., 1] - f[..., 0]
+
+
+def residuals_at(shapes: Tensor, rows: Tensor, x: Tensor, weights: Tensor) -> Tensor:
+    """Residuals ``(b, views, times)`` of centred views of norm 1 at all times ``rows (times, B)``, by one product."""
+    b, views = weights.shape[:2]
+    every = shapes_at(shapes, rows.expand(b, *rows.shape))
+    q = torch.linalg.qr(every - every.mean(-2, keepdim=True))[0]  # (b, g, n, 3)
+    grid = q.shape[1]
+    flat = (x * weights[..., None]).mT.flatten(1, 2) @ q.permute(0, 2, 1, 3).flatten(2)
+    inner = flat.reshape(b, views, 2, grid, 3)
+    if bool((weights == 1).all()):
+        return 1 - inner.square().sum((2, 4))
+    # missing points: the columns are orthonormal no more, every view has a Gram of its own
+    inner = inner.permute(0, 1, 3, 4, 2)
+    pairs = (q[..., :, None] * q[..., None, :]).permute(0, 2, 1, 3, 4).flatten(2)
+    gram = (weights @ pairs).reshape(b, views, grid, 3, 3)
+    mean = (weights @ q.permute(0, 2, 1, 3).flatten(2)).reshape(b, views, grid, 3)
+    total = weights.sum(-1)[..., None, None, None].clamp(min=1e-300)
+    gram = gram - mean[..., :, None] * mean[..., None, :] / total
+    factor, _ = torch.linalg.cholesky_ex(gram + RIDGE * torch.eye(3, dtype=x.dtype, device=x.device))
+    return 1 - torch.linalg.solve_triangular(factor, inner, upper=False).square().sum((-2, -1))
+
+
+def _minima(curve: Tensor, periodic: bool) -> tuple[Tensor, Tensor]:
+    """Places ``(b, views, PEAKS)`` of the deepest local minima of curves, and which of them are none."""
+    if periodic:
+        before, after = curve.roll(1, -1), curve.roll(-1, -1)
+    else:
+        edge = torch.full_like(curve[..., :1], torch.inf)
+        before, after = torch.cat([edge, curve[..., :-1]], -1), torch.cat([curve[..., 1:], edge], -1)
+    low = (curve <= before) & (curve < after)
+    # a constant curve has no minimum: its first time stands in
+    low[..., 0] |= ~low.any(-1)
+    depth, place = torch.where(low, curve, torch.inf).topk(min(PEAKS, curve.shape[-1]), dim=-1, largest=False)
+    return place, ~depth.isfinite()
+
+
+def _refined(
+    shapes: Tensor, basis: Trajectory, start: Tensor, step: Tensor, x: Tensor, weights: Tensor, within: Tensor | None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Times, residuals and curvatures ``(b, views, peaks)`` at the minima next to ``start``; not more than a step away."""
+    low, high = start - step, start + step
+    if within is not None:
+        low, high = low.clamp(min=within[0]), high.clamp(max=within[-1])
+    x, weights = x[:, :, None], weights[:, :, None]
+
+    def at(t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        rows, slopes = (f(t).flatten(1, 2) for f in (basis.rows, basis.slopes))
+        shape, speed = (shapes_at(shapes, c).unflatten(1, t.shape[1:]) for c in (rows, slopes))
+        found = project(x, weights.expand(*t.shape, -1), shape)
+        seen = weights.sqrt()[..., None] * (speed - (speed * weights[..., None]).mean(-2, keepdim=True)) @ found.cameras
+        slope = seen - found.basis @ (found.basis.mT @ seen)
+        gain = (found.residual * slope).sum((-2, -1))
+        return found.residual.square().sum((-2, -1)), gain, slope.square().sum((-2, -1))
+
+    t, size = start, torch.ones_like(start)
+    f, gain, curvature = at(t)
+    for _ in range(STEPS):
+        trial = (t + size * gain / curvature.clamp(min=1e-300)).clamp(low, high)
+        fresh = at(trial)
+        better = fresh[0] < f
+        t = torch.where(better, trial, t)
+        f, gain, curvature = (torch.where(better, new, old) for new, old in zip(fresh, (f, gain, curvature), strict=True))
+        size = torch.where(better, 1.0, size / 4)
+    return t, f, curvature

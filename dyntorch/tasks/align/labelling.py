@@ -1,0 +1,298 @@
+"""Static, moving or outlier: labels from a motion, and the motion from the labels, in turns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from dyntorch.core.invariant import Invariant
+from dyntorch.core.matches import Matches
+from dyntorch.core.normalize import Normalization, normalization, normalize_motion
+from dyntorch.core.refine import Problem, refine_matches
+from dyntorch.core.residual import whiten, whitened
+from dyntorch.core.solution import Solution
+from dyntorch.geometry.homogeneous import apply, homogeneous
+from dyntorch.numerics.blocks import map_blocks, uniform
+from dyntorch.numerics.chi_square import median, three_sigma
+from dyntorch.numerics.nullspace import spectrum
+from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC
+
+SIGMAS = 3.0
+"""The threshold in standard deviations of the noise."""
+ROUNDS, ESTIMATING = 3, 6
+"""Turns of labelling and refining, with the noise known and with the noise to be found as well."""
+ROUGH = 3.0
+"""How much wider than the noise the first labels are where the motion comes from a minimal sample."""
+STEADY = 0.02
+"""Relative change of the noise that needs no further turn."""
+WIDEST = 4.0
+"""No uncertainty of the motion widens a limit more than so many times: calling a static match moving costs some accuracy, calling
+a moving one static gives a wrong motion."""
+STEPS = 6
+"""Levenberg-Marquardt steps between two labellings."""
+
+
+@dataclass(frozen=True)
+class Labelled:
+    """Motions with the labels they give, flat batch."""
+
+    theta: Tensor
+    """``(b, p)`` motion in normalized coordinates, all parts one after the other, of norm 1 each."""
+    labels: Tensor
+    """``(b, n)``."""
+    sigma: Tensor
+    """``(b,)`` standard deviation of the noise that the labels assume, in the unit of the matches."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Matches whose labels are sought, prepared: residuals of any motion in the unit of the matches."""
+
+    invariant: Invariant
+    data: Matches
+    norm: Normalization
+    views: tuple[Tensor, ...]
+    """Normalized."""
+    floor: Tensor
+    """``(b,)`` the least noise that the numbers allow, in the unit of the matches."""
+
+    @classmethod
+    def of(cls, invariant: Invariant, data: Matches) -> Evidence:
+        """From checked matches; those with ``data.static`` are known not to move."""
+        largest = data.weights.amax(-1, keepdim=True).clamp(min=torch.finfo(torch.float64).tiny)
+        flat = replace(
+            data, weights=data.weights / largest, batch=data.weights.shape[:1], dtype=torch.float64, device=data.weights.device
+        )
+        norm = normalization(invariant, flat.views, flat.weights)
+        floor = 100 * torch.finfo(data.dtype).eps / torch.stack(norm.scales).amin(0)
+        return cls(invariant, flat, norm, norm.apply(invariant, flat.views), floor)
+
+    def repeated(self, count: int) -> Evidence:
+        """The same problems several times, one block after the other."""
+
+        def again(x: Tensor) -> Tensor:
+            return x.repeat(count, *([1] * (x.ndim - 1)))
+
+        static = None if self.data.static is None else again(self.data.static)
+        data = replace(self.data, views=tuple(map(again, self.data.views)), weights=again(self.data.weights), static=static)
+        norm = self.norm
+        again_norm = Normalization(
+            tuple(map(again, norm.transforms)), norm.primitives, tuple(map(again, norm.actions)), tuple(map(again, norm.scales))
+        )
+        data = replace(data, batch=data.weights.shape[:1])
+        return Evidence(self.invariant, data, again_norm, tuple(map(again, self.views)), again(self.floor))
+
+    def weighted(self, weights: Tensor) -> Evidence:
+        """With the matches of each problem weighted by ``(b,)``; 0 leaves a problem out."""
+        return replace(self, data=replace(self.data, weights=self.data.weights * weights[:, None]))
+
+    def parameters(self, motion: tuple[Tensor, ...]) -> Tensor:
+        """``(b, p)`` from motions ``(b, ...)`` in the coordinates of the matches."""
+        parts = normalize_motion(self.invariant, motion, self.norm.transforms)
+        return torch.cat([part.flatten(1) for part in parts], dim=-1)
+
+    def problem(self, labels: Tensor) -> Problem:
+        """Least squares over the inliers, as refinement sees it."""
+        shapes = tuple(
+            torch.Size((self.norm.transforms[frame.target or 0].shape[-1],) * (1 if frame.vector else 2))
+            for frame in self.invariant.motion
+        )
+        weights = self.data.weights * (labels != OUTLIER)
+        return Problem(self.invariant, shapes, self.views, self.norm.scales, weights, labels == STATIC)
+
+    def residuals(self, theta: Tensor) -> tuple[Tensor, Tensor]:
+        """Whitened residual ``(b, n, c)`` of every match if it moves, and if it stands still."""
+        motion = self.problem(torch.zeros_like(self.data.weights)).parts(theta)
+        moving = whitened(self.invariant, motion, self.views, self.norm.scales)
+        return moving, self.invariant.whitened_static(motion, self.views, self.norm.scales)
+
+    def cost(self, theta: Tensor, sigma: Tensor) -> Tensor:
+        """How badly the motion explains the matches, ``(b,)``.
+
+        A static match costs its chi^2; a moving one as much as the worst static match, plus its chi^2; an outlier as much as
+        the worst moving one.  So every match takes the simplest explanation that fits.
+        """
+        moving, resting = self.residuals(theta)
+        variance = sigma.square()[:, None]
+        still, path = three_sigma(resting.shape[-1]), three_sigma(self.invariant.codim)
+        other = still + (moving.square().sum(-1) / variance).clamp(max=path)
+        if self.data.static is not None:
+            other = torch.where(self.data.static, still + path, other)
+        cost = torch.minimum(resting.square().sum(-1) / variance, other)
+        return (self.data.weights * cost.nan_to_num(nan=still + path)).sum(-1)
+
+    def labels(self, theta: Tensor, sigma: Tensor, spread: Tensor | None = None) -> Tensor:
+        """``(b, n)``; ``spread (b, p, p)`` is the covariance of theta for noise 1, which widens the limits."""
+        moving, resting = self.residuals(theta)
+        variance = sigma.square()[:, None]
+        path, still = moving.square().sum(-1), resting.square().sum(-1)
+        limits = [three_sigma(c) * variance for c in (self.invariant.codim, resting.shape[-1])]
+        agree = [path <= limits[0], still <= limits[1]]
+        if spread is not None:
+            pieces = [self._widened(theta, spread, piece) for piece in self._pieces(theta)]
+            for k, (plain, limit) in enumerate(zip((path, still), limits, strict=True)):
+                widened = torch.cat([piece[k] for piece in pieces], dim=-1)
+                agree[k] = agree[k] | ((widened <= limit) & (plain <= WIDEST**2 * limit))
+        if self.data.static is not None:
+            agree[0] = agree[0] & ~self.data.static
+        labels = torch.where(agree[1], STATIC, torch.where(agree[0], MOVING, OUTLIER))
+        return torch.where(self.data.weights > 0, labels, OUTLIER)
+
+    def _pieces(self, theta: Tensor) -> list[slice]:
+        return self.problem(torch.zeros_like(self.data.weights)).pieces(theta.shape[-1])
+
+    def _widened(self, theta: Tensor, spread: Tensor, piece: slice) -> tuple[Tensor, Tensor]:
+        """Squares ``(b, piece)`` of the two residuals whitened by the uncertainty of the motion as well."""
+        views = tuple(x[:, piece] for x in self.views)
+        problem = self.problem(torch.zeros_like(self.data.weights))
+        squares = []
+        for value, derivative in (problem.moving(theta, views), problem.resting(theta, views)):
+            e = value.unflatten(1, (views[0].shape[1], -1))
+            j = derivative.mT.unflatten(1, e.shape[1:])  # (b, n, c, p)
+            eye = torch.eye(j.shape[-2], dtype=theta.dtype, device=theta.device)
+            squares.append(whiten(e, eye + (j @ spread[:, None]) @ j.mT).square().sum(-1))
+        return squares[0], squares[1]
+
+    def information(self, theta: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
+        """Eigenvalues ``(b, dof)``, ascending, of the information that the labelled matches hold on theta per unit of variance,
+        and the covariance ``(b, p, p)`` of theta for noise 1."""
+        _, _, matrix = self.problem(labels).normal_equations(theta)
+        finite = matrix.isfinite().flatten(1).all(-1)
+        values, vectors = spectrum(torch.where(finite[:, None, None], matrix, 0.0))
+        values, vectors = values[:, -self.invariant.dof :], vectors[..., -self.invariant.dof :]
+        floor = 1e-12 * values[:, -1:].clamp(min=torch.finfo(values.dtype).tiny)
+        root = vectors * values.clamp(min=floor).rsqrt()[:, None, :]
+        return values, root @ root.mT
+
+    def refined(self, theta: Tensor, labels: Tensor, steps: int) -> Solution:
+        """Segmented refinement: moving matches by their Sampson distance, static ones by their disagreement."""
+        problem = self.problem(labels)
+        zero = torch.zeros(len(theta), dtype=torch.long, device=theta.device)
+        parts = problem.parts(theta)
+        tensor = self.invariant.compose(*parts)
+        data = replace(self.data, weights=problem.weights, static=problem.static)
+        start = Solution(self.invariant, tensor, zero, torch.zeros_like(theta[:, 0]), data, self.norm, tensor, refined=parts)
+        return refine_matches(start, data, steps)
+
+    def improved(self, theta: Tensor, sigma: Tensor, rough: Tensor) -> Tensor:
+        """One labelling and refinement; where ``rough (b,)``, the motion comes from a minimal sample of static matches."""
+        labels = self.labels(theta, torch.where(rough, ROUGH * sigma, sigma))
+        # what a rough motion says about moving matches is left to chance
+        labels = torch.where(rough[:, None] & (labels == MOVING), OUTLIER, labels)
+        return joined(self.refined(theta, labels, STEPS))
+
+    def settled(self, theta: Tensor, sigma: Tensor, *, estimate: bool) -> Labelled:
+        """Label and refine in turns, until the labels stay; ``estimate``: and the noise with them."""
+        labels, steady = self.labels(theta, sigma), not estimate
+        for _ in range(ESTIMATING if estimate else ROUNDS):
+            _, spread = self.information(theta, labels)
+            new = self.labels(theta, sigma, spread)
+            if bool((new == labels).all()) and steady:
+                break
+            labels = new
+            found = self.refined(theta, labels, STEPS)
+            theta = joined(found)
+            if estimate and found.sigma is not None:
+                old, sigma = sigma, torch.where(found.sigma.isfinite() & (found.sigma > 0), found.sigma, sigma).maximum(self.floor)
+                steady = bool(((sigma - old).abs() <= STEADY * old).all())
+        return Labelled(theta, labels, sigma)
+
+
+def joined(solution: Solution) -> Tensor:
+    """``(b, p)`` normalized motion of a solution."""
+    return torch.cat([part.flatten(1) for part in solution.normalized_motion()], dim=-1)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Random sampling for scenes in which some points stand still: collineations from d + 2 matches, judged by their consensus.
+
+
+BLOCK = 1 << 19
+"""Numbers in the largest temporary of one block of the batch (4 MB)."""
+JUDGES = 256
+"""Matches that judge a hypothesis: enough to tell 5 % of agreement from none."""
+
+
+def static_consensus(
+    views: tuple[Tensor, ...], pool: Tensor, limit: Tensor | None, samples: int, generator: torch.Generator | None
+) -> tuple[tuple[Tensor, ...], Tensor]:
+    r"""Collineations of view 2, 3, ... to view 1 on which the most matches agree, from samples of d + 2 matches.
+
+    A collineation that takes the points :math:`q_k` to :math:`p_k` is :math:`P\, \mathrm{diag}(c_k / e_k)\, Q^{-1}` where the
+    columns of P, Q are the first d + 1 of them and c, e the coordinates of the last one in these bases.
+
+    Args:
+        views: ``(b, n, d)`` each, of about unit size.
+        pool: ``(b, n)`` bool, matches to sample from and to count.
+        limit: ``(b,)`` square distance in view 1, summed over the other views, that is as bad as any larger one; None: least
+            median of squares.
+        samples: hypotheses per problem.
+        generator: source of the samples.
+
+    Returns:
+        One ``(b, d + 1, d + 1)`` per view after the first, and ``(b,)`` the median square distance of the pool, halved for the
+        noise of the two views that each distance has and divided by the median of :math:`\chi^2_4`: an estimate of the
+        variance of the noise where more than half of the pool stands still.
+
+    Source: Fischler and Bolles 1981; Rousseeuw 1984 (least median of squares); Hartley and Zisserman, section 4.7.
+    """
+    b, n, d = views[0].shape
+    device = views[0].device
+    shuffled = (uniform(b, n, generator=generator, device=device) + 2.0 * ~pool).argsort(dim=-1)
+    count = pool.sum(-1)
+    # distinct places: draw from ever fewer, and step over those already taken
+    draws = uniform(b, samples, d + 2, generator=generator, device=device)
+    taken: list[Tensor] = []
+    for k in range(d + 2):
+        place = (draws[..., k] * (count - k).clamp(min=1)[:, None]).long()
+        for other in torch.stack(taken, -1).sort(dim=-1).values.unbind(-1) if taken else ():
+            place = place + (place >= other)
+        taken.append(place)
+    chosen = torch.stack(taken, -1).clamp(max=n - 1)
+    judges = shuffled[:, :JUDGES]
+    limits = torch.full_like(views[0][:, 0, 0], torch.inf) if limit is None else limit
+
+    def search(*block: Tensor) -> tuple[Tensor, ...]:
+        return _search(block[: len(views)], *block[len(views) :], robust=limit is None)
+
+    size = max(1, BLOCK // max(1, samples * judges.shape[-1] * (d + 1)))
+    *found, variance = map_blocks(search, *views, shuffled, chosen, judges, count, limits, size=size)
+    return tuple(found), variance
+
+
+def _search(
+    views: tuple[Tensor, ...], shuffled: Tensor, chosen: Tensor, judges: Tensor, count: Tensor, limit: Tensor, *, robust: bool
+) -> tuple[Tensor, ...]:
+    index = shuffled.gather(1, chosen.flatten(1)).unflatten(1, chosen.shape[1:])
+    problem = torch.arange(len(index), device=index.device)
+    sampled = [homogeneous(x[problem[:, None, None], index]) for x in views]
+    maps = [_collineation(sampled[0], p) for p in sampled[1:]]
+    seen = [x[problem[:, None], judges] for x in views]
+    square = sum(
+        ((apply(matrix, x[:, None]) - seen[0][:, None]).square().sum(-1) for matrix, x in zip(maps, seen[1:], strict=True)),
+        start=torch.zeros((), dtype=seen[0].dtype, device=seen[0].device),
+    )
+    valid = torch.arange(judges.shape[-1], device=judges.device) < count[:, None]
+    ordered = torch.where(valid[:, None], square, torch.inf)
+    middle = ((valid.sum(-1) - 1) // 2).clamp(min=0)[:, None].expand(-1, square.shape[1])
+    if robust:
+        score = ordered.sort(dim=-1).values.gather(-1, middle[..., None])[..., 0]
+    else:
+        score = torch.where(valid[:, None], torch.minimum(square, limit[:, None, None]), 0.0).sum(-1)
+    best = score.argmin(-1)
+    chosen_square = ordered[problem, best].sort(dim=-1).values.gather(-1, middle[:, :1])[:, 0]
+    return (*(matrix[problem, best] for matrix in maps), chosen_square / (2 * median(4)))
+
+
+def _collineation(target: Tensor, source: Tensor) -> Tensor:
+    """``(..., d + 1, d + 1)`` from d + 2 points ``(..., d + 2, d + 1)`` each; any matrix where three are on a line."""
+    bases, coordinates = [], []
+    for points in (target, source):
+        inverse, _ = torch.linalg.inv_ex(points[..., :-1, :].mT)
+        bases.append(inverse)
+        coordinates.append((inverse @ points[..., -1, :, None])[..., 0])
+    scaled = target[..., :-1, :].mT * (coordinates[0] / coordinates[1])[..., None, :]
+    found = (scaled @ bases[1]).nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
+    return found / torch.linalg.matrix_norm(found, keepdim=True).clamp(min=torch.finfo(found.dtype).tiny)

@@ -1,0 +1,419 @@
+"""align_lines(): the motion of a 3D sensor between two views of lines, each of which moves within a plane."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from dyntorch.core.fit import fit_matches
+from dyntorch.core.matches import Matches, matches
+from dyntorch.core.normalize import Normalization, denormalize_motion
+from dyntorch.core.primitives import Line, direction
+from dyntorch.core.residual import multilinear, multilinear_derivative
+from dyntorch.core.robust import robust_fit
+from dyntorch.core.solution import Solution, Status, failed
+from dyntorch.geometry.homogeneous import homogeneous, unit
+from dyntorch.invariants.agreement import point_error, static_residual
+from dyntorch.invariants.translating_lines_matrix import TranslatingLinesMatrix
+from dyntorch.numerics.blocks import one_thread
+from dyntorch.numerics.chi_square import median, three_sigma
+from dyntorch.numerics.least_squares import by_match, damped_step, derivatives
+from dyntorch.numerics.nullspace import spectrum
+from dyntorch.tasks.align.labelling import SIGMAS
+from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment
+from dyntorch.tasks.outcome import Notice, NoticeCode, check_threshold, notices
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Lines that move in planes, static lines and static points between two views: residuals, refinement, labels.
+
+
+ROUNDS, STEPS = 4, 12
+CONVERGED = 1e-10  # relative decrease of the cost
+DOF = TranslatingLinesMatrix.dof
+
+
+@dataclass(frozen=True)
+class Lines:
+    """Lines as two points each, and static points, in normalized coordinates; flat batch.
+
+    Attributes:
+        data: lines ``(b, n, 2, 3)`` as measured.
+        views: normalized.
+        points: normalized static points ``(b, k, 3)`` of both views, k may be 0.
+        norm: the similarities of both views.
+        floor: ``(b,)`` the least noise that the numbers allow, in the unit of the points.
+    """
+
+    data: Matches
+    views: tuple[Tensor, ...]
+    points: tuple[Tensor, ...]
+    norm: Normalization
+    floor: Tensor
+
+    @classmethod
+    def of(cls, data: Matches, points: tuple[Tensor, Tensor] | None, norm: Normalization) -> Lines:
+        """From measured lines and points."""
+        empty = data.views[0][:, :0, 0]
+        pair = (empty, empty) if points is None else points
+        moved = tuple(x @ t[:, :3, :3].mT + t[:, None, :3, 3] for x, t in zip(pair, norm.transforms, strict=True))
+        floor = 100 * torch.finfo(torch.float64).eps / torch.stack(norm.scales).amin(0)
+        return cls(data, norm.apply(TranslatingLinesMatrix(), data.views), moved, norm, floor)
+
+    def moving(self, theta: Tensor) -> Tensor:
+        """Signed Sampson residual ``(b, n)`` of each line that may move, in the unit of the points."""
+        tensor = TranslatingLinesMatrix.compose(theta.unflatten(-1, (4, 4)))
+        return multilinear(TranslatingLinesMatrix(), tensor, self.views, self.norm.scales)
+
+    def still(self, theta: Tensor) -> Tensor:
+        """Distances ``(b, n, 6)`` of both points of a line in view 2, carried into view 1, from the line there; 4 conditions."""
+        return _still(theta, self.norm.scales, self.views)
+
+    def at_points(self, theta: Tensor) -> Tensor:
+        """Disagreement ``(b, k, 3)`` of static points."""
+        return _at_points(theta, self.norm.scales, self.points)
+
+    def residual(self, theta: Tensor, labels: Tensor) -> Tensor:
+        """All weighted residuals ``(b, rows)`` of the labelled lines and the static points, in the unit of the points."""
+        moving, still = self._roots(labels)
+        return torch.cat(
+            [self.moving(theta) * moving, self.still(theta).flatten(1) * still, self.at_points(theta).flatten(1)], dim=-1
+        )
+
+    def linearized(self, theta: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
+        """:meth:`residual` and its derivative ``(b, 16, rows)``."""
+        model, scales = TranslatingLinesMatrix(), self.norm.scales
+        tensor, slope = model.compose_derivative((theta.unflatten(-1, (4, 4)),))
+        path, by_tensor = multilinear_derivative(model, tensor.unflatten(1, model.shape()), self.views, scales)
+        parts = [(path, slope @ by_tensor.mT), by_match(_still, theta, scales, self.views)]
+        roots = self._roots(labels)
+        parts = [(value * root, slope * root[:, None]) for (value, slope), root in zip(parts, roots, strict=True)]
+        parts.append(by_match(_at_points, theta, scales, self.points))
+        return torch.cat([value for value, _ in parts], dim=-1), torch.cat([derivative for _, derivative in parts], dim=-1)
+
+    def _roots(self, labels: Tensor) -> tuple[Tensor, Tensor]:
+        """Roots of the weights of the moving lines ``(b, n)`` and of the static ones, six for each, ``(b, 6 n)``."""
+        root = self.data.weights.sqrt()
+        return torch.where(labels == MOVING, root, 0.0), torch.where(labels == STATIC, root, 0.0).repeat_interleave(6, dim=-1)
+
+
+def _still(theta: Tensor, scales: tuple[Tensor, ...], views: tuple[Tensor, ...]) -> Tensor:
+    first, second = views[0].unbind(-2)
+    along = second - first
+    square = along.square().sum(-1, keepdim=True).clamp(min=torch.finfo(theta.dtype).tiny)
+    s1, s2 = (s[..., None, None] for s in scales)
+    matrix = theta.unflatten(-1, (4, 4))
+    parts = []
+    for point in views[1].unbind(-2):
+        error, slope = point_error(homogeneous(point) @ matrix.mT, matrix[..., None, :, :], first)
+        place = (error * along).sum(-1, keepdim=True) / square
+        across = error - place * along
+        # isotropic: the noise of the line at this place, and that of the point, averaged over the plane across
+        other = (slope.square().sum((-1, -2)) / 3)[..., None]
+        variance = s1.square() * ((1 - place).square() + place.square()) + s2.square() * other
+        parts.append(across * variance.rsqrt())
+    return torch.cat(parts, dim=-1)
+
+
+def _at_points(theta: Tensor, scales: tuple[Tensor, ...], points: tuple[Tensor, ...]) -> Tensor:
+    return static_residual([theta.unflatten(-1, (4, 4))], points, scales)
+
+
+def as_points(views: tuple[Tensor, ...], weights: Tensor) -> tuple[Tensor, ...]:
+    """Lines ``(b, n, 2 3)`` or ``(b, n, 6)`` as two points each, of Pluecker lines near the centre of the scene."""
+    return tuple(x if x.ndim == 4 else _two_points(x, (weights > 0).to(x)) for x in views)
+
+
+def _two_points(line: Tensor, present: Tensor) -> Tensor:
+    along = normalize(direction(line), dim=-1)
+    foot = Line().points(line)[..., 0, :]
+    share = (present / present.sum(-1, keepdim=True).clamp(min=1.0))[..., None]
+    centre = (share * foot).sum(-2, keepdim=True)
+    nearest = foot + along * (along * (centre - foot)).sum(-1, keepdim=True)
+    size = ((nearest - centre).square() * share).sum((-2, -1)).sqrt()[:, None, None]
+    size = torch.where(size > 0, size, 1.0)
+    return torch.stack([nearest - size / 2 * along, nearest + size / 2 * along], dim=-2)
+
+
+def settle(lines: Lines, theta: Tensor, sigma: Tensor, *, estimate: bool, plain: bool) -> tuple[Tensor, Tensor, Tensor]:
+    """Label and refine in turns: A ``(b, 16)`` in normalized coordinates, labels ``(b, n)``, noise ``(b,)``.
+
+    Args:
+        lines: the matches.
+        theta: ``(b, 16)`` to start from.
+        sigma: ``(b,)`` noise.
+        estimate: whether the noise is estimated anew in every round.
+        plain: whether no line is called an outlier before the first refinement.
+    """
+    present = lines.data.weights > 0
+    labels = torch.where(present, MOVING, OUTLIER) if plain else _labels(lines, theta, sigma)
+    for _ in range(ROUNDS):
+        theta = refined(lines, theta, labels)
+        if estimate:
+            left = lines.residual(theta, labels).square().sum(-1)
+            spare = (labels == MOVING).sum(-1) + 4 * (labels == STATIC).sum(-1) + 3 * lines.points[0].shape[1] - DOF
+            sigma = torch.where(spare >= 4, (left / spare.clamp(min=1)).sqrt(), sigma).maximum(lines.floor)
+        new = _labels(lines, theta, sigma)
+        if bool((new == labels).all()):
+            break
+        labels = new
+    return theta, labels, sigma
+
+
+def refined(lines: Lines, theta: Tensor, labels: Tensor) -> Tensor:
+    """A that minimizes the residuals of all labelled matches, by Levenberg-Marquardt."""
+    cost, gradient, matrix = _equations(lines, theta, labels)
+    damping = torch.full_like(cost, 1e-3)
+    for _ in range(STEPS):
+        trial = normalize(theta - damped_step(gradient, matrix, damping), dim=-1)
+        fresh = _equations(lines, trial, labels)
+        better = fresh[0] < cost
+        done = (better & (cost - fresh[0] <= CONVERGED * cost)) | (~better & (damping > 1e5))
+        theta, gradient = torch.where(better[:, None], trial, theta), torch.where(better[:, None], fresh[1], gradient)
+        matrix, cost = torch.where(better[:, None, None], fresh[2], matrix), torch.where(better, fresh[0], cost)
+        damping = torch.where(better, (damping * 0.1).clamp(min=1e-12), damping * 8)
+        if bool(done.all()):
+            break
+    return theta
+
+
+def spread(lines: Lines, theta: Tensor, labels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Extreme information ``(b, 2)`` on A, A ``(b, 4, 4)`` as measured, and its covariance ``(b, 16, 16)`` for noise 1."""
+    _, _, matrix = _equations(lines, theta, labels)
+    values, vectors = spectrum(matrix)
+    values, vectors = values[:, -DOF:], vectors[..., -DOF:]
+    root = vectors * values.clamp(min=1e-12 * values[:, -1:].clamp(min=1e-300)).rsqrt()[:, None]
+
+    def measured(t: Tensor) -> Tensor:
+        part = denormalize_motion(TranslatingLinesMatrix(), (t.unflatten(-1, (4, 4)),), lines.norm.transforms)[0]
+        return unit(part).flatten(-2)
+
+    place, moved = derivatives(measured, theta, root.movedim(-1, 0))
+    return values[:, [0, -1]], place.unflatten(-1, (4, 4)), moved.mT @ moved
+
+
+def _equations(lines: Lines, theta: Tensor, labels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Cost ``(b,)``, gradient ``(b, 16)`` and Gauss-Newton matrix."""
+    value, slope = lines.linearized(theta, labels)
+    cost = value.square().sum(-1)
+    return torch.where(cost.isfinite(), cost, torch.inf), (slope @ value[..., None])[..., 0], slope @ slope.mT
+
+
+def _labels(lines: Lines, theta: Tensor, sigma: Tensor) -> Tensor:
+    square, known = sigma.square()[:, None], lines.data.static
+    still = lines.still(theta).square().sum(-1) <= three_sigma(4) * square
+    path = lines.moving(theta).square() <= three_sigma(1) * square
+    path = path if known is None else path & ~known
+    labels = torch.where(still, STATIC, torch.where(path, MOVING, OUTLIER))
+    return torch.where(lines.data.weights > 0, labels, OUTLIER)
+
+
+MINIMAL = TranslatingLinesMatrix.minimal()
+PER_POINT = 9  # matches of lines that one static point gives
+CERTAIN = 45
+"""Lines (three times the degrees of freedom) below which noise of unknown size cannot be told from outliers."""
+ABOVE = 2.0
+"""A singular value counts from so many times the noise on: those that the model lacks reach 1.7, those of 45 lines in general
+position at a noise of a two-hundredth of the scene begin at 2.4 (measured)."""
+AMBIGUOUS, UNCERTAIN = 0.5, 0.05
+"""Standard deviation of the worst direction of A, of norm 1, above which it is not known at all; or hardly."""
+INDETERMINATE = 1e-13  # information on the worst direction over that on the best: rounding error below it
+CONSENSUS, SPARE = 0.4, 6
+RANKS = (
+    (20, "all lines stand still"),
+    (28, "the lines belong to two rigid bodies that translate"),
+    (31, "the lines only translate: the position and the scale of view 2 remain unknown, four degrees of freedom"),
+)
+"""Ranks of the estimation matrix (of 35) for special motions (thesis section 8.4, counted exactly)."""
+
+AMBIGUITY = (
+    "A is unique up to its scale where points of one line move at different speeds, or with two static points. Lines that only "
+    "translate leave a family of four degrees of freedom: the position and the scale of view 2."
+)
+
+
+@one_thread
+def align_lines(
+    l1: Tensor,
+    l2: Tensor,
+    static_points: tuple[Tensor, Tensor] | None = None,
+    static: Tensor | None = None,
+    threshold: float | None = None,
+    weights: Tensor | None = None,
+    generator: torch.Generator | None = None,
+) -> Alignment:
+    r"""Motion of a 3D sensor from two views of lines, with a label for every line: static, moving or outlier.
+
+    A line that moves within a plane meets itself as it was before, as do two points of a body that translates:
+
+    .. math:: l_2^T F\, l_1 = 0, \qquad F \sim C_2(A)^T J .
+
+    Args:
+        l1: ``(*batch, n, 2, 3)`` two points of each line, or ``(*batch, n, 6)`` Pluecker coordinates (01, 02, 03, 12, 13, 23),
+            in view 1; NaN = missing.  Pairs of points of a translating body do as well.
+        l2: the same lines in view 2 (other points of them, as they come).
+        static_points: points ``(*batch, k, 3)`` in view 1 and in view 2 that are known to stand still.  Two of them make the
+            solution unique where lines only translate.
+        static: ``(*batch, n)`` bool, lines known not to move.
+        threshold: three standard deviations of the noise of one coordinate of the points, in their unit (of Pluecker
+            coordinates: of two points on the line, as far apart as the lines are from their centre).  None estimates the noise
+            of every problem (at least half of the lines must be inliers; fewer than 45 lines are all taken as such).
+        weights: ``(*batch, n)`` not negative; 0 leaves a line out.
+        generator: source of the random samples.
+
+    Returns:
+        An :class:`~dyntorch.tasks.align.result.Alignment` with A only.
+
+    Raises:
+        ValueError: fewer than 35 lines (9 less for each static point), shapes, dtypes or devices that do not agree, a threshold
+            that is not positive.
+
+    Source: thesis section 8.4.
+
+    Example:
+        >>> import torch, dyntorch as dyn
+        >>> from dyntorch import scenes
+        >>> draw = torch.Generator().manual_seed(0)
+        >>> scene = scenes.translating_lines(60, sigma=0.002, generator=draw)
+        >>> result = dyn.align_lines(*scene.views, threshold=0.006, generator=draw)
+        >>> bool((result.A - scene.motion[0]).norm() < 0.02)
+        True
+    """
+    check_threshold(threshold)
+    data = matches(TranslatingLinesMatrix(), (l1, l2), weights, static)
+    points = _points(static_points, data, l1)
+    extra = 0 if points is None else points[0].shape[1]
+    if data.count + PER_POINT * extra < MINIMAL:
+        raise ValueError(
+            f"align_lines needs at least {MINIMAL} lines, got {data.count} and {extra} static points, which count "
+            f"{PER_POINT} each; add lines, or give static_points=(P1, P2)"
+        )
+    with torch.no_grad():
+        return _align(data, points, threshold, generator)
+
+
+def _points(pair: tuple[Tensor, Tensor] | None, data: Matches, like: Tensor) -> tuple[Tensor, Tensor] | None:
+    """Static points ``(b, k, 3)`` of both views, in float64."""
+    if pair is None:
+        return None
+    if len(pair) != 2 or pair[0].shape != pair[1].shape or tuple(pair[0].shape[:-2]) != data.batch or pair[0].shape[-1] != 3:
+        shapes = [tuple(x.shape) for x in pair]
+        raise ValueError(f"static_points must be two (*batch, k, 3) with batch {data.batch}, got {shapes}")
+    if any(x.dtype != like.dtype or x.device != like.device for x in pair):
+        raise ValueError(f"static_points must be {like.dtype} on {like.device} as the lines are, got {[x.dtype for x in pair]}")
+    first, second = (x.to(data.weights).reshape(-1, *x.shape[-2:]) for x in pair)
+    if not bool(first.isfinite().all() and second.isfinite().all()):
+        raise ValueError("static_points must be finite; leave missing ones out")
+    return first, second
+
+
+def _align(
+    data: Matches, points: tuple[Tensor, Tensor] | None, threshold: float | None, generator: torch.Generator | None
+) -> Alignment:
+    flat = replace(data, views=as_points(data.views, data.weights), batch=data.weights.shape[:1], dtype=torch.float64)
+    flat = replace(flat, weights=flat.weights / flat.weights.amax(-1, keepdim=True).clamp(min=1e-300), device=flat.weights.device)
+    joined = _joined(flat, points)
+    given = None if threshold is None else torch.full_like(flat.weights[:, 0], threshold / SIGMAS)
+    plain = (given is None and joined.count < CERTAIN) or not len(flat.weights)
+    start = (
+        fit_matches(TranslatingLinesMatrix(), joined)
+        if plain
+        else robust_fit(
+            TranslatingLinesMatrix,
+            *joined.views,
+            threshold=None if given is None else (SIGMAS * given),
+            weights=joined.weights,
+            generator=generator,
+        )
+    )
+    usable = ~failed(start.status)
+    lines = Lines.of(flat, points, start.normalization)
+    theta = torch.where(usable[:, None], start.normalized_motion()[0].flatten(1), torch.eye(4).to(flat.weights).flatten() / 2)
+    sigma = _noise(lines, theta, plain) if given is None else given.maximum(lines.floor)
+    theta, labels, sigma = settle(lines, theta, sigma, estimate=given is None, plain=plain)
+    return _result(data, lines, start, theta, labels, sigma, usable, points)
+
+
+def _joined(data: Matches, points: tuple[Tensor, Tensor] | None) -> Matches:
+    """Lines and static points as matches of lines."""
+    if points is None:
+        return replace(data, static=None)
+    length = float(points[0].std()) if points[0].shape[1] > 1 else 1.0
+    stars = TranslatingLinesMatrix.static_point_lines(*points, length=max(length, 1e-12))
+    views = tuple(torch.cat([x, star], dim=1) for x, star in zip(data.views, stars, strict=True))
+    weights = torch.cat([data.weights, torch.ones_like(stars[0][..., 0, 0])], dim=1)
+    return replace(data, views=views, weights=weights, static=None)
+
+
+def _noise(lines: Lines, theta: Tensor, plain: bool) -> Tensor:
+    """Standard deviation of the noise ``(b,)`` that the start shows: of all lines, or by their median."""
+    square = lines.moving(theta).square()
+    present = lines.data.weights > 0
+    if plain:
+        return (torch.where(present, square, 0.0).sum(-1) / present.sum(-1).clamp(min=1)).sqrt().maximum(lines.floor)
+    middle = torch.where(present, square, torch.nan).nanmedian(dim=-1).values.nan_to_num()
+    return 1.5 * (middle / median(1)).sqrt().maximum(lines.floor)
+
+
+def _result(
+    data: Matches,
+    lines: Lines,
+    start: Solution,
+    theta: Tensor,
+    labels: Tensor,
+    sigma: Tensor,
+    usable: Tensor,
+    points: tuple[Tensor, Tensor] | None,
+) -> Alignment:
+    extent, A, covariance = spread(lines, theta, labels)
+    worst = sigma * extent[:, 0].clamp(min=torch.finfo(theta.dtype).tiny).rsqrt()
+    present = (data.weights > 0).sum(-1)
+    conditions = (labels != OUTLIER).sum(-1) + 3 * (labels == STATIC).sum(-1) + (0 if points is None else 3 * points[0].shape[1])
+    accident = ((labels != OUTLIER).sum(-1) < CONSENSUS * present) | (
+        (conditions < TranslatingLinesMatrix.dof + SPARE) & (present > MINIMAL)
+    )
+    status = torch.where(worst > AMBIGUOUS, int(Status.AMBIGUOUS), torch.zeros_like(present))
+    status = torch.where(accident, int(Status.NO_CONSENSUS), status)
+    rank = _rank(lines, labels, sigma, usable, points)
+    status = torch.where((rank <= RANKS[-1][0]) & (status == Status.OK), int(Status.AMBIGUOUS), status)
+    status = torch.where(extent[:, 0] <= INDETERMINATE * extent[:, 1], int(Status.DEGENERATE), status)
+    status = torch.where(usable, status, start.status.to(status))
+    none = failed(status)
+    labels = torch.where(none[:, None], OUTLIER, labels)
+    zero = none[:, None, None]
+    return Alignment(
+        A=data.back(torch.where(zero, 0.0, A)),
+        B=None,
+        labels=data.back(labels),
+        status=data.back(status),
+        sigma=data.back(torch.where(none, 0.0, sigma)),
+        covariance=data.back(torch.where(zero, 0.0, covariance * sigma.square()[:, None, None])),
+        ambiguity=AMBIGUITY,
+        warnings=_notices(rank, worst, none, status != Status.TOO_FEW, data.batch),
+    )
+
+
+def _rank(lines: Lines, labels: Tensor, sigma: Tensor, usable: Tensor, points: tuple[Tensor, Tensor] | None) -> Tensor:
+    """Singular values ``(b,)`` of the estimation matrix above the noise: of the inliers, of all lines where there is no motion."""
+    kept = lines.data.restricted((labels != OUTLIER) | ~usable[:, None])
+    joined = _joined(kept, points)
+    if joined.count < MINIMAL:
+        return torch.full_like(labels[:, 0], MINIMAL)
+    values = fit_matches(TranslatingLinesMatrix(), joined).singular_values
+    noise = torch.where(usable, sigma, lines.floor) * torch.stack(lines.norm.scales).mean(0)
+    noise = noise * joined.weights.square().sum(-1).sqrt()
+    return (values > torch.maximum(ABOVE * noise[:, None], 1e-9 * values[:, :1])).sum(-1)
+
+
+def _notices(rank: Tensor, worst: Tensor, none: Tensor, enough: Tensor, batch: tuple[int, ...]) -> tuple[Notice, ...]:
+    found: list[Notice] = []
+    least = 0
+    for most, kind in RANKS:
+        text = f"the estimation matrix has rank {{value:g}} of {MINIMAL} above the noise: {kind}; give two static points"
+        found += notices(NoticeCode.PURE_TRANSLATION, text, rank, enough & (rank > least) & (rank <= most), batch)
+        least = most
+    text = "the worst direction of the motion, of norm 1, has a standard deviation of {value:.2g}; add lines or static points"
+    found += notices(NoticeCode.UNCERTAIN, text, worst, ~none & (worst > UNCERTAIN), batch)
+    return tuple(sorted(found, key=lambda notice: notice.problem))

@@ -1,0 +1,405 @@
+"""align_planar(): the motion of a camera over a plane on which points stand still, move, or are mismatched."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from dyntorch.core.fit import fit_matches
+from dyntorch.core.matches import Matches, matches
+from dyntorch.core.robust import robust_fit
+from dyntorch.core.solution import NOISY, Solution, Status, failed
+from dyntorch.geometry.homogeneous import cofactors, homogeneous, inhomogeneous
+from dyntorch.invariants.agreement import static_residual
+from dyntorch.invariants.homography_tensor import HomographyTensor
+from dyntorch.numerics.blocks import one_thread
+from dyntorch.numerics.chi_square import three_sigma
+from dyntorch.tasks.align.labelling import ROUGH, SIGMAS, Evidence, Labelled, joined, static_consensus
+from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment
+from dyntorch.tasks.outcome import Notice, NoticeCode, check_threshold, notices
+
+# ----------------------------------------------------------------------------------------------------------------------
+# What should be known about the matches of a plane before its result is trusted.
+
+
+RANK = 1e-9
+"""Singular value of the estimation matrix, over the largest, that rounding alone leaves."""
+NEAR = 2.0
+"""Strength of the weakest equation of the tensor: 0.4 to 0.7 where all stands still, 1.3 to 1.6 where points move by 1 to 5 pixels
+at 0.5 pixels of noise, 15 to 25 where they move by 25 to 80 (100 matches)."""
+UNDECIDED = 1.2
+"""The same, corrected for the matches that 26 equations use up, below which moving matches alone leave a family of motions.  0.7 to
+0.9 where all make equal steps (80 matches), 0.5 where all stands still; at 3 px of motion at changing speed on either side."""
+SUPPORT, CHANCE = 10, 3.0
+"""Static matches that settle such a family: so many, and so many for each that is expected by chance.  A motion of the family that
+is off makes 0 to 6 of 80 matches static at steps of 10 to 40 px, and up to 16 at 3 px, where 3 to 5 are expected."""
+WIDER = 3.0
+"""Times the limit of static matches within which those that are static by chance spread evenly, over a plane of velocities."""
+THIN = 3.0
+"""Standard deviations of the noise across a line of points, below which they may as well lie on it."""
+ROOM = 3.0
+"""Standard deviations of the noise within which a match belongs to a trajectory line."""
+LINES, FEWEST = 4, 16
+"""Trajectory lines, and moving matches, that the tensor needs where nothing stands still (thesis chapter 2)."""
+NOTICES_MINIMAL = 4
+"""Static matches that determine the motion."""
+
+
+def planar_notices(
+    evidence: Evidence, best: Labelled, tensor: tuple[Tensor, Tensor], status: Tensor, batch: tuple[int, ...]
+) -> tuple[Notice, ...]:
+    """All notices on a flat batch of problems with final labels, in the order of the problems; ``tensor`` from
+    :func:`tensor_rank`."""
+    data, sigma = evidence.data, best.sigma
+    rank, strength = tensor
+    solved = ~failed(status)
+    moving = best.labels == MOVING
+    count = moving.sum(-1)
+    found: list[Notice] = []
+
+    def note(code: NoticeCode, message: str, values: Tensor, flagged: Tensor) -> None:
+        found.extend(notices(code, message, values, flagged, batch))
+
+    text = "the matches leave {value:g} of 26 equations on the tensor; the motion rests on its static matches"
+    note(NoticeCode.DEGENERATE, text, rank, solved & (rank < HomographyTensor.width() - 1))
+    text = "the weakest equation on the tensor is only {value:.2g} times the noise; the motion rests on its static matches"
+    note(NoticeCode.NEAR_STATIC, text, strength, solved & (rank >= HomographyTensor.width() - 1) & (strength < NEAR))
+    text = "the moving matches fit a family of motions, and only {value:g} static ones choose among them; give more static matches"
+    family = (status == Status.AMBIGUOUS) & undecided(evidence, best, tensor)
+    note(NoticeCode.OTHER_SOLUTION, text, (best.labels == STATIC).sum(-1), family)
+    text = f"{{value:g}} matches move, {FEWEST} would determine the motion without static ones"
+    note(NoticeCode.FEW_MOVING, text, count, solved & (count < FEWEST))
+    lines = trajectory_lines(evidence, best, moving)
+    text = f"the moving matches lie on {{value:g}} lines, {LINES} would determine the motion without static ones"
+    note(NoticeCode.FEW_LINES, text, lines, solved & (lines > 0) & (lines < LINES))
+    note(NoticeCode.ONE_LINE, "all moving matches lie on one line", lines, solved & (lines == 1))
+    thin = thinness(evidence, sigma)
+    text = "the points of a view lie on a line, to {value:.2g} standard deviations; a plane needs points off it"
+    note(NoticeCode.COLLINEAR, text, thin, (data.weights > 0).any(-1) & (thin < THIN))
+    doubtful = (best.labels == MOVING) & unverified(evidence, best)
+    text = "{value:g} matches stand still between two views only: a point that paused, or a static one mismatched in one view"
+    note(NoticeCode.UNVERIFIED, text, doubtful.sum(-1), solved & doubtful.any(-1))
+    return tuple(sorted(found, key=lambda notice: notice.problem))
+
+
+def tensor_rank(inliers: Matches, evidence: Evidence, sigma: Tensor) -> tuple[Tensor, Tensor]:
+    """Numeric rank ``(b,)`` of the estimation matrix, and how far its 26th singular value is above the noise."""
+    values = fit_matches(HomographyTensor(), inliers).singular_values
+    rank = (values > RANK * values[:, :1]).sum(-1)
+    # a row of unit length changes by about the noise of the normalized coordinates
+    noise = sigma * torch.stack(evidence.norm.scales).square().mean(0).sqrt() * inliers.weights.square().sum(-1).sqrt()
+    return rank, values[:, -2] / noise.clamp(min=torch.finfo(values.dtype).tiny)
+
+
+def undecided(evidence: Evidence, best: Labelled, tensor: tuple[Tensor, Tensor]) -> Tensor:
+    """Where the moving matches leave a family of motions ``(b,)``, and no more are static than some motion of it makes by chance.
+
+    Points that make equal steps move as straight if the camera moves along at any velocity common to all.  The motion that makes
+    most of them static is the true one if these are many; else some happen to have about that velocity.
+    """
+    rank, strength = tensor
+    used = (best.labels != OUTLIER).sum(-1)
+    equations = HomographyTensor.width() - 1
+    spare = ((used - equations).clamp(min=1) / used.clamp(min=1)).sqrt()
+    family = (rank >= equations) & (strength < UNDECIDED * spare)
+    still = (best.labels == STATIC) & (evidence.data.weights > 0)
+    if evidence.data.static is not None:
+        family = family & ((still & evidence.data.static).sum(-1) < NOTICES_MINIMAL)
+    square = evidence.residuals(best.theta)[1].square().sum(-1)
+    limit = WIDER**2 * three_sigma(4) * best.sigma.square()[:, None]
+    beside = ((square <= limit) & ~still & (evidence.data.weights > 0)).sum(-1)
+    return family & (still.sum(-1) < SUPPORT + CHANCE * beside / (WIDER**2 - 1))
+
+
+def unverified(evidence: Evidence, best: Labelled) -> Tensor:
+    """Matches ``(b, n)`` that two views agree on as static, whatever the third says."""
+    parts = evidence.problem(best.labels).parts(best.theta)
+    first, second, third = evidence.views
+    s1, s2, s3 = evidence.norm.scales
+    between = cofactors(parts[0]).mT @ parts[1]  # view 3 to view 2
+    pairs = (
+        static_residual([parts[0]], (first, second), (s1, s2)),
+        static_residual([parts[1]], (first, third), (s1, s3)),
+        static_residual([between], (second, third), (s2, s3)),
+    )
+    limit = three_sigma(2) * best.sigma.square()[:, None]
+    agree = torch.stack([pair.square().sum(-1) <= limit for pair in pairs])
+    return agree.any(0) & (evidence.data.weights > 0)
+
+
+def trajectory_lines(evidence: Evidence, best: Labelled, moving: Tensor) -> Tensor:
+    """How many lines hold the paths of all moving matches ``(b,)``, counted up to LINES.
+
+    Greedy: the longest path determines its line best; all matches on that line go, and so on.
+    """
+    parts = evidence.problem(best.labels).parts(best.theta)
+    places = torch.stack(
+        [evidence.views[0], *(inhomogeneous(homogeneous(x) @ m.mT) for m, x in zip(parts, evidence.views[1:], strict=True))]
+    )
+    ends = torch.stack([places[1] - places[0], places[2] - places[0], places[2] - places[1]])
+    length, widest = ends.norm(dim=-1).max(dim=0)
+    along = ends.gather(0, widest[None, ..., None].expand(1, -1, -1, 2))[0] / length[..., None].clamp(min=1e-12)
+    normal = torch.stack([-along[..., 1], along[..., 0]], dim=-1)
+    problem = torch.arange(len(length), device=length.device)
+    left, count = moving, torch.zeros(len(length), dtype=torch.long, device=length.device)
+    noise = ROOM * (evidence.norm.scales[0] * best.sigma)[:, None]
+    for _ in range(LINES):
+        longest = torch.where(left, length, -1.0).argmax(-1)
+        centre, across, base = places[:, problem, longest].mean(0), normal[problem, longest], length[problem, longest]
+        offset = places - centre[:, None]
+        distance = (offset * across[:, None]).sum(-1).abs()
+        # away from the path its line is known by angle only
+        reach = 1 + offset.norm(dim=-1) / base[:, None].clamp(min=1e-12)
+        count = count + left.any(-1)
+        left = left & ~(distance <= noise * reach).all(0)
+        left = left.index_put((problem, longest), torch.zeros_like(problem, dtype=torch.bool))
+    return count
+
+
+def thinness(evidence: Evidence, sigma: Tensor) -> Tensor:
+    """Least standard deviation of the points across their main direction, over the views, in standard deviations of the noise."""
+    weights = (evidence.data.weights > 0).double()
+    share = weights / weights.sum(-1, keepdim=True).clamp(min=1.0)
+    found = []
+    for x, scale in zip(evidence.views, evidence.norm.scales, strict=True):
+        centred = x - (share[..., None] * x).sum(-2, keepdim=True)
+        covariance = (share[..., None] * centred).mT @ centred
+        # the smaller eigenvalue of a symmetric 2 x 2 matrix
+        mean, det = covariance.diagonal(dim1=-2, dim2=-1).sum(-1) / 2, torch.linalg.det(covariance)
+        across = det / (mean + (mean.square() - det).clamp(min=0).sqrt()).clamp(min=torch.finfo(mean.dtype).tiny)
+        found.append(across.clamp(min=0).sqrt() / (scale * sigma.maximum(evidence.floor)))
+    return torch.stack(found).amin(0)
+
+
+SAMPLES = 1000
+"""Samples of four matches: 96 % to draw four static ones where they are 24 % of all (30 % static, 20 % outliers)."""
+STEPS = 30
+MINIMAL = HomographyTensor.minimal()
+FEW = 3 * HomographyTensor.dof
+"""Matches below which half of them do not determine a motion with certainty: noise and outliers cannot be told apart by it."""
+LABELLED = 9
+"""Fewest matches where some are labelled static: nine rows each for 26 equations, and room to tell static from moving."""
+INDETERMINATE = 1e-13
+"""Information on the worst direction of the motion over that on the best, below which it is rounding error."""
+AMBIGUOUS = 0.5
+"""Standard deviation of the worst direction of the motion, of norm 1, above which the motion is not known at all."""
+SINGULAR = 1e-3
+"""Ratio of the singular values of a homography in normalized coordinates (usually above 0.1) that no camera gives a plane."""
+CONSENSUS = 0.4
+"""Share of inliers below which the best motion may be an accident."""
+UNIFORM, DOUBTFUL = 1.3, 0.7
+"""Noise that the inliers show over the assumed noise, above which they fill the limits evenly as random matches do (1.7), where
+their share is below the second figure."""
+SPARE = 8
+"""Conditions beyond the 16 degrees of freedom that inliers must fulfil: a minimal set fulfils 16 whatever it is."""
+
+AMBIGUITY = (
+    "A and B are unique, each up to its scale. A match that agrees in two views only counts as moving: a point that paused and a "
+    "static point mismatched in the third view look the same."
+)
+
+
+@one_thread
+def align_planar(
+    x1: Tensor,
+    x2: Tensor,
+    x3: Tensor,
+    *,
+    threshold: float | None = 1.5,
+    weights: Tensor | None = None,
+    static: Tensor | None = None,
+    generator: torch.Generator | None = None,
+) -> Alignment:
+    r"""Motion of a camera from three views of a plane, with a label for every match: static, moving or outlier.
+
+    Points of the plane stand still or move on straight lines, at any speed; none has to be known to do either:
+
+    .. math:: \det[p_1, A p_2, B p_3] = 0, \qquad p_1 \sim A p_2 \sim B p_3 \text{ for static points.}
+
+    Two searches start it: :func:`dyntorch.robust_fit` of the homography tensor, which needs no static point, and samples of
+    four matches, which need no moving one.  From the best motion of each, labels and motion are refined in turns: static
+    matches by their disagreement (four conditions each), moving ones by their Sampson distance.  The motion that explains the
+    matches better is returned.
+
+    Args:
+        x1: ``(*batch, n, 2)`` points of view 1; NaN = missing.
+        x2: the same points in view 2.
+        x3: the same points in view 3.
+        threshold: greatest Sampson distance of a moving inlier, in the unit of the points: three standard deviations of the
+            noise of one coordinate.  None estimates the noise of every problem (at least half of the matches must be inliers).
+        weights: ``(*batch, n)`` not negative; 0 leaves a match out.
+        static: ``(*batch, n)`` bool, matches known not to move (they may still be outliers).
+        generator: source of the random samples.
+
+    Returns:
+        An :class:`~dyntorch.tasks.align.result.Alignment`.
+
+    Raises:
+        ValueError: fewer than 26 matches (9 with ``static``), shapes, dtypes or devices that do not agree, a threshold that is
+            not positive.
+
+    Source: thesis chapter 2 and section 8.1; Shashua and Wolf, ECCV 2000.
+
+    Example:
+        >>> import torch, dyntorch as dyn
+        >>> from dyntorch import scenes
+        >>> draw = torch.Generator().manual_seed(0)
+        >>> scene = scenes.planar(n=80, sigma=0.5, static=0.3, outliers=0.1, generator=draw)
+        >>> result = dyn.align_planar(*scene.views, threshold=1.5, generator=draw)
+        >>> bool((result.A - scene.motion[0]).norm() < 0.01)
+        True
+        >>> float((result.labels == scene.labels).double().mean()) > 0.9
+        True
+    """
+    check_threshold(threshold)
+    data = matches(HomographyTensor(), (x1, x2, x3), weights, static)
+    least = MINIMAL if static is None else LABELLED
+    if data.count < least:
+        remedy = "add matches" if static is not None else f"add matches, or label static ones (static=; then {LABELLED} suffice)"
+        raise ValueError(f"align_planar needs at least {least} matches, got {data.count}; {remedy}")
+    with torch.no_grad():
+        return _align(data, threshold, generator)
+
+
+def _align(data: Matches, threshold: float | None, generator: torch.Generator | None) -> Alignment:
+    evidence = Evidence.of(HomographyTensor(), data)
+    solution, best, tensor = _solved(evidence, _search(evidence, threshold, generator))
+    outcome = solution.back(data)
+    A, B = outcome.motion
+    assert outcome.sigma is not None and outcome.covariance is not None
+    return Alignment(
+        A=A,
+        B=B,
+        labels=data.back(best.labels),
+        status=outcome.status,
+        sigma=outcome.sigma,
+        covariance=outcome.covariance,
+        ambiguity=AMBIGUITY,
+        warnings=planar_notices(evidence, best, tensor, solution.status, data.batch),
+        unverified=data.back(unverified(evidence, best) & (best.labels == MOVING)),
+        solution=outcome,
+    )
+
+
+def _search(evidence: Evidence, threshold: float | None, generator: torch.Generator | None) -> Labelled:
+    """The better one of the motions that the two searches start from, with its labels."""
+    size = len(evidence.floor)
+    given = None if threshold is None else torch.full_like(evidence.floor, threshold / SIGMAS).maximum(evidence.floor)
+    starts = [_from_static(evidence, given, generator)]
+    if MINIMAL <= evidence.data.count < FEW:
+        starts.append(_from_all(evidence, given))
+    if size and evidence.data.count >= (MINIMAL if given is not None else FEW):
+        starts.append(_from_tensor(evidence, given, generator))
+    count = len(starts)
+    # the smaller estimate is that of a motion most matches agree with; it may still be low, for static matches show half the noise
+    sigma = given if given is not None else 1.5 * torch.stack([noise for _, noise in starts]).amin(0).maximum(evidence.floor)
+    several, noise = evidence.repeated(count), sigma.repeat(count)
+    rough = torch.arange(count, device=sigma.device).repeat_interleave(size) == 0
+    theta = several.improved(torch.cat([start for start, _ in starts]), noise, rough)
+    cost = torch.where(_singular(theta), torch.inf, several.cost(theta, noise))
+    best = cost.unflatten(0, (count, size)).argmin(0)
+    chosen = theta[best * size + torch.arange(size, device=best.device)]
+    return evidence.settled(chosen, sigma, estimate=given is None)
+
+
+def _singular(theta: Tensor) -> Tensor:
+    """Whether a motion ``(b, 18)`` maps the plane into a line or a point, which fulfils every match and explains none."""
+    values = torch.linalg.svdvals(theta.nan_to_num().unflatten(-1, (2, 3, 3)))
+    return (values[..., 2] < SINGULAR * values[..., 0]).any(-1)
+
+
+def _from_static(evidence: Evidence, given: Tensor | None, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
+    """Motion on which the most matches agree that they stand still, and the noise by their median."""
+    data = evidence.data
+    pool = data.weights > 0
+    if data.static is not None:
+        known = pool & data.static
+        pool = torch.where((known.sum(-1) >= 4)[:, None], known, pool)
+    scale = evidence.norm.scales[0]
+    # each distance has the noise of two views
+    limit = None if given is None else 2 * three_sigma(4) * (ROUGH * scale * given).square()
+    motion, variance = static_consensus(evidence.views, pool, limit, SAMPLES, generator)
+    theta = torch.cat([part.flatten(1) for part in motion], dim=-1)
+    return theta, variance.nan_to_num(posinf=1.0).sqrt() / scale if given is None else given
+
+
+def _from_tensor(evidence: Evidence, given: Tensor | None, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
+    """Motion of the homography tensor by robust estimation, and the noise by the median distance from it."""
+    data = evidence.data
+    found = robust_fit(HomographyTensor, *data.views, threshold=given, weights=data.weights, generator=generator)
+    theta, usable = _usable(evidence, found)
+    if given is not None:
+        return theta, given
+    moving, _ = evidence.residuals(theta)
+    noise = torch.where(data.weights > 0, moving[..., 0].abs(), torch.nan).nanmedian(dim=-1).values / 0.6745
+    if found.sigma is not None:
+        # what its inliers show is less than the median, where there are many outliers
+        noise = torch.where((found.status == Status.OK) & (found.sigma > 0), torch.minimum(found.sigma, noise), noise)
+    return theta, torch.where(usable & noise.isfinite(), noise, torch.inf)
+
+
+def _from_all(evidence: Evidence, given: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Motion as if all matches were moving inliers, and the noise that they then show."""
+    data = evidence.data
+    theta, usable = _usable(evidence, fit_matches(HomographyTensor(), replace(data, static=None)))
+    refined = evidence.refined(theta, torch.where(data.weights > 0, MOVING, OUTLIER), STEPS)
+    assert refined.sigma is not None
+    return joined(refined), torch.where(usable, refined.sigma, torch.inf) if given is None else given
+
+
+def _usable(evidence: Evidence, found: Solution) -> tuple[Tensor, Tensor]:
+    """The motion of a solution, the identity where it failed, and where it did not."""
+    theta = evidence.parameters(tuple(part.reshape(-1, 3, 3) for part in found.motion))
+    usable = theta.isfinite().all(-1) & ~failed(found.status)
+    identity = torch.eye(3, dtype=theta.dtype, device=theta.device).flatten().repeat(2)
+    return torch.where(usable[:, None], theta, identity), usable
+
+
+def _solved(evidence: Evidence, best: Labelled) -> tuple[Solution, Labelled, tuple[Tensor, Tensor]]:
+    """The solution with its status, the final labels, none where there is no motion, and what the tensor alone rests on."""
+    refined = evidence.refined(best.theta, best.labels, STEPS)
+    theta = joined(refined)
+    values, spread = evidence.information(theta, best.labels)
+    labels = evidence.labels(theta, best.sigma, spread)
+    worst = best.sigma * values[:, 0].clamp(min=torch.finfo(values.dtype).tiny).rsqrt()
+    assert refined.sigma is not None and refined.covariance is not None
+    best = Labelled(theta, labels, best.sigma)
+    tensor = tensor_rank(evidence.data.restricted(labels != OUTLIER), evidence, best.sigma)
+    free = (worst > AMBIGUOUS) | undecided(evidence, best, tensor)
+    status = _status(evidence, best, refined.sigma, free, values[:, 0] <= INDETERMINATE * values[:, -1])
+    none = failed(status)
+    labels = torch.where(none[:, None], OUTLIER, labels)
+    zero = none[:, None, None]
+    solution = replace(
+        refined,
+        status=status,
+        tensor=torch.where(zero[..., None], 0.0, refined.tensor),
+        normalized=torch.where(zero[..., None], 0.0, refined.normalized),
+        covariance=torch.where(zero, 0.0, refined.covariance),
+        sigma=torch.where(none, 0.0, refined.sigma),
+        uncertainty=torch.where(none, 0.0, worst),
+        inliers=labels != OUTLIER,
+    )
+    return solution, replace(best, labels=labels), tensor
+
+
+def _status(evidence: Evidence, best: Labelled, shown: Tensor, free: Tensor, undetermined: Tensor) -> Tensor:
+    """``(b,)`` from the inliers, the noise they show, and whether a part of the motion is free by the noise, or exactly."""
+    usable = evidence.data.weights > 0
+    present = usable.sum(-1)
+    known = torch.zeros_like(present) if evidence.data.static is None else (usable & evidence.data.static).sum(-1)
+    still, moving = (best.labels == STATIC).sum(-1), (best.labels == MOVING).sum(-1)
+    share = (still + moving) / present.clamp(min=1)
+    accident = (
+        (share < CONSENSUS)
+        | ((share < DOUBTFUL) & (shown > UNIFORM * best.sigma))
+        | (4 * still + moving < HomographyTensor.dof + SPARE)
+    )
+    accident = accident | (best.sigma * torch.stack(evidence.norm.scales).amax(0) > NOISY)
+    status = torch.full_like(present, int(Status.OK))
+    status = torch.where(free, int(Status.AMBIGUOUS), status)
+    status = torch.where(accident, int(Status.NO_CONSENSUS), status)
+    status = torch.where(undetermined, int(Status.DEGENERATE), status)
+    return torch.where((present < MINIMAL) & (known < 4), int(Status.TOO_FEW), status)

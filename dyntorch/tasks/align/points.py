@@ -1,0 +1,115 @@
+"""align_points(): the motion of a 3D sensor among points of space that stand still, move, or are mismatched."""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor
+
+from dyntorch.core.matches import Matches, matches
+from dyntorch.invariants.join_tensor import JoinTensor
+from dyntorch.numerics.blocks import one_thread
+from dyntorch.tasks.align import join, rigid, velocity
+from dyntorch.tasks.align.result import Alignment
+from dyntorch.tasks.outcome import check_threshold
+
+Model = Literal["join", "minimal_join", "constant_velocity", "affine_constant_velocity", "rigid"]
+Motion = Literal["straight", "constant_velocity"]
+LEAST = {
+    "join": join.MINIMAL["join"],
+    "minimal_join": join.MINIMAL["minimal_join"],
+    "constant_velocity": velocity.MINIMAL[False],
+    "affine_constant_velocity": velocity.MINIMAL[True],
+    "rigid": 3,
+}
+LABELLED = {**LEAST, "join": join.LABELLED, "minimal_join": join.LABELLED}
+"""Fewest matches where some are labelled static."""
+
+
+@one_thread
+def align_points(
+    P1: Tensor,
+    P2: Tensor,
+    P3: Tensor,
+    model: Model = "join",
+    threshold: float | None = None,
+    weights: Tensor | None = None,
+    static: Tensor | None = None,
+    motion: Motion = "straight",
+    generator: torch.Generator | None = None,
+) -> Alignment:
+    r"""Motion of a 3D sensor from three views of points, with a label for every match: static, moving or outlier.
+
+    ============================  =========================  ===================================  ==========================
+    model                         sensor                     points move                          matches
+    ============================  =========================  ===================================  ==========================
+    ``join``                      projective                 on straight lines, at any speed      47 (9 with ``static``)
+    ``minimal_join``              projective                 the same; starts from 4 x 4 x 3      47 (9 with ``static``)
+    ``constant_velocity``         projective                 at constant velocity                 21
+    ``affine_constant_velocity``  affine                     at constant velocity                 7
+    ``rigid``                     metric, A, B in SE(3)      as ``motion`` says                   6 moving, or 3 static
+    ============================  =========================  ===================================  ==========================
+
+    All three positions of a point, carried into view 1, lie on one line, or at equal steps on it:
+
+    .. math:: P_1, A P_2, B P_3 \text{ collinear}, \qquad P_t \sim A_t\,(x + t\,v), \quad A = A_0 A_1^{-1},\ B = A_0 A_2^{-1} .
+
+    No static point is needed, nor outliers be known.  The robust estimate is refined to least whitened residuals (Sampson
+    distances), static matches by their disagreement, moving ones by what their model demands, and matches are labelled in
+    turns with it.
+
+    Args:
+        P1: ``(*batch, n, 3)`` points of view 1; NaN = missing.
+        P2: the same points in view 2.
+        P3: the same points in view 3; for constant velocity the three views are at equal steps of time.
+        model: see the table.
+        threshold: three standard deviations of the noise of one coordinate, in the unit of the points.  None estimates the
+            noise of every problem (at least half of the matches must be inliers).
+        weights: ``(*batch, n)`` not negative; 0 leaves a match out.
+        static: ``(*batch, n)`` bool, matches known not to move (they may still be outliers).
+        motion: of the points before a rigid sensor: ``"straight"``, at any speed, or ``"constant_velocity"``.
+        generator: source of the random samples.
+
+    Returns:
+        An :class:`~dyntorch.tasks.align.result.Alignment`.  Rigid A and B have 1 as last entry, all others norm 1.  With constant
+        velocity ``velocities`` ``(*batch, n, 3)`` are the displacements per step in the frame of view 1 (0 for outliers), and
+        static matches fix the velocity common to all points; ``ambiguity`` says what is chosen where there are none.
+
+    Raises:
+        ValueError: unknown model or motion, fewer matches than in the table, shapes, dtypes or devices that do not agree, a
+            threshold that is not positive.
+
+    Source: thesis sections 8.2 and 8.3.
+
+    Example:
+        >>> import torch, dyntorch as dyn
+        >>> from dyntorch import scenes
+        >>> draw = torch.Generator().manual_seed(0)
+        >>> scene = scenes.moving_points(20, sigma=0.01, sensors="rigid", generator=draw)  # everything moves
+        >>> result = dyn.align_points(*scene.views, model="rigid", threshold=0.03, generator=draw)
+        >>> A = scene.motion[0] / scene.motion[0][3, 3]
+        >>> bool((result.A - A).abs().max() < 0.05), bool((result.labels == 2).all())
+        (True, True)
+    """
+    if model not in get_args(Model):
+        raise ValueError(f"model must be one of {', '.join(get_args(Model))}, got {model!r}")
+    if motion not in get_args(Motion):
+        raise ValueError(f"motion must be one of {', '.join(get_args(Motion))}, got {motion!r}")
+    if motion != "straight" and model != "rigid":
+        raise ValueError(f"motion={motion!r} belongs to model='rigid', got model={model!r}; use model='constant_velocity'")
+    check_threshold(threshold)
+    data = matches(JoinTensor(), (P1, P2, P3), weights, static)
+    least = (LEAST if static is None else LABELLED)[model]
+    if data.count < least:
+        raise ValueError(f"align_points with model={model!r} needs at least {least} matches, got {data.count}; add matches")
+    with torch.no_grad():
+        return _dispatch(data, model, threshold, motion, generator)
+
+
+def _dispatch(data: Matches, model: str, threshold: float | None, motion: str, generator: torch.Generator | None) -> Alignment:
+    if model == "rigid":
+        return rigid.align_rigid(data, threshold, motion, generator)
+    if model in ("join", "minimal_join"):
+        return join.align_join(data, threshold, model, generator)
+    return velocity.align_velocity(data, threshold, model == "affine_constant_velocity", generator)

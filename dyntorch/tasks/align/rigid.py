@@ -1,0 +1,548 @@
+"""Rigid motions of a metric sensor among points that move, as few as there are, up to all of them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from dyntorch.core.matches import Matches
+from dyntorch.core.solution import NOISY, Status, failed
+from dyntorch.geometry.homogeneous import similarity, skew
+from dyntorch.geometry.rigid import moved_by, rigid_alignment
+from dyntorch.numerics.blocks import map_blocks, uniform
+from dyntorch.numerics.chi_square import median, three_sigma
+from dyntorch.numerics.least_squares import damped_step
+from dyntorch.numerics.nullspace import spectrum
+from dyntorch.tasks.align.labelling import SIGMAS
+from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment
+from dyntorch.tasks.outcome import Notice, NoticeCode, notices
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Two rigid motions from points that move: :math:`x_1, A x_2, B x_3` on a straight line, or at equal steps on it.
+#
+# With equal noise in all coordinates, and :math:`y_1 = x_1, y_2 = A x_2, y_3 = B x_3`, the two orthonormal combinations
+#
+# .. math:: u = (y_1 - y_3) / \sqrt 2, \qquad v = (y_1 - 2 y_2 + y_3) / \sqrt 6
+#
+# hold everything: a static point has :math:`\|u\|^2 + \|v\|^2 = \chi^2_6 \sigma^2`, one of constant velocity
+# :math:`\|v\|^2 = \chi^2_3 \sigma^2`, and one on a straight line the smaller eigenvalue of the Gram matrix of u and v,
+# :math:`\chi^2_2 \sigma^2`.  No covariance is needed, because a rigid motion leaves noise as it is.
+
+
+MOTIONS = {"straight": 2, "constant_velocity": 3}
+"""Conditions that a moving point fulfils."""
+CONVERGED = 1e-9  # relative decrease of the cost
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """Points of three poses in one common unit; leading dimensions broadcast against those of the motions.
+
+    Attributes:
+        x1, x2, x3: ``(..., n, 3)``.
+        weights: ``(..., n)``.
+        motion: one of :data:`MOTIONS`.
+    """
+
+    x1: Tensor
+    x2: Tensor
+    x3: Tensor
+    weights: Tensor
+    motion: str
+
+    @property
+    def conditions(self) -> int:
+        """Degrees of freedom of the residual of one moving point."""
+        return MOTIONS[self.motion]
+
+    def sample(self, index: Tensor) -> Sightings:
+        """The matches ``index (b, k, m)`` of sightings ``(b, 1, n, 3)``: k small problems for each."""
+        k = index.shape[1]
+
+        def pick(x: Tensor) -> Tensor:
+            return x.expand(-1, k, -1, -1).gather(2, index[..., None].expand(-1, -1, -1, 3))
+
+        weights = self.weights.expand(-1, k, -1).gather(2, index)
+        return Sightings(pick(self.x1), pick(self.x2), pick(self.x3), weights, self.motion)
+
+    def flat(self, lead: torch.Size) -> Sightings:
+        """Expanded to the leading dimensions and flattened to one."""
+
+        def spread(x: Tensor, tail: int) -> Tensor:
+            return x.expand(*lead, *x.shape[-tail:]).reshape(-1, *x.shape[-tail:])
+
+        return Sightings(spread(self.x1, 2), spread(self.x2, 2), spread(self.x3, 2), spread(self.weights, 1), self.motion)
+
+
+def combinations(motions: Tensor, data: Sightings) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The combinations u and v of each match, and the points y2 and y3 in the frame of view 1, ``(..., n, 3)`` each.
+
+    Args:
+        motions: ``(..., 2, 4, 4)``, A and B.
+        data: the matches.
+    """
+    y2, y3 = (x @ motions[..., i, :3, :3].mT + motions[..., i, None, :3, 3] for i, x in ((0, data.x2), (1, data.x3)))
+    return (data.x1 - y3) / math.sqrt(2), (data.x1 - 2 * y2 + y3) / math.sqrt(6), y2, y3
+
+
+def turn(u: Tensor, v: Tensor, motion: str) -> tuple[Tensor, Tensor]:
+    """Cosine and sine ``(..., n, 1)`` of the turn after which the second combination is the residual of a moving point."""
+    if motion == "constant_velocity":
+        return torch.ones_like(u[..., :1]), torch.zeros_like(u[..., :1])
+    double = torch.stack([u.square().sum(-1) - v.square().sum(-1), 2 * (u * v).sum(-1)], dim=-1)
+    angle = 0.5 * torch.atan2(double[..., 1], double[..., 0])[..., None]
+    return angle.cos(), angle.sin()
+
+
+def squares(motions: Tensor, data: Sightings) -> tuple[Tensor, Tensor]:
+    """Squared residuals ``(..., n)`` of each match as a moving point, and as a static one."""
+    u, v, _, _ = combinations(motions, data)
+    cos, sin = turn(u, v, data.motion)
+    return (cos * v - sin * u).square().sum(-1), u.square().sum(-1) + v.square().sum(-1)
+
+
+def normal_equations(motions: Tensor, data: Sightings, weights: Tensor, still: Tensor | None) -> tuple[Tensor, Tensor]:
+    r"""Gradient ``(..., 12)`` and Gauss-Newton matrix in the tangents :math:`(\omega_A, \tau_A, \omega_B, \tau_B)`.
+
+    The turn of u and v is held (variable projection): the gradient stays exact, because the residual is normal to the line.
+
+    Args:
+        motions: ``(..., 2, 4, 4)``.
+        data: the matches.
+        weights: ``(..., n)`` in place of those of the data.
+        still: ``(..., n)`` bool, static points.
+    """
+    u, v, y2, y3 = combinations(motions, data)
+    cos, sin = turn(u, v, data.motion)
+    error, along = cos * v - sin * u, cos * u + sin * v
+    eye = torch.eye(3, dtype=u.dtype, device=u.device)
+    d2, d3 = (torch.cat([-skew(y), eye.expand(*y.shape, 3)], dim=-1) for y in (y2, y3))
+    one, two, three = 1 / math.sqrt(2), 2 / math.sqrt(6), 1 / math.sqrt(6)
+    jacobian = torch.cat([(-two * cos)[..., None] * d2, (three * cos + one * sin)[..., None] * d3], dim=-1)
+    rest = None if still is None else torch.cat([(-two * sin)[..., None] * d2, (three * sin - one * cos)[..., None] * d3], dim=-1)
+    root = weights.sqrt()[..., None]
+    if data.motion == "straight":
+        free = root if still is None else torch.where(still[..., None], 0.0, root)
+        direction = torch.nn.functional.normalize(along, dim=-1, eps=torch.finfo(u.dtype).tiny)
+        normal = jacobian - direction[..., :, None] * (direction[..., None, :] @ jacobian)
+        jacobian = torch.where((free > 0)[..., None], normal, jacobian)
+    rows, values = (root[..., None] * jacobian).flatten(-3, -2), (root * error).flatten(-2)
+    if rest is not None and still is not None:
+        held = torch.where(still[..., None], root, 0.0)
+        rows = torch.cat([rows, (held[..., None] * rest).flatten(-3, -2)], dim=-2)
+        values = torch.cat([values, (held * along).flatten(-2)], dim=-1)
+    return (rows.mT @ values[..., None])[..., 0], rows.mT @ rows
+
+
+def descend(
+    motions: Tensor, data: Sightings, *, scale: Tensor | None = None, still: Tensor | None = None, iterations: int = 20
+) -> tuple[Tensor, Tensor]:
+    r"""Levenberg-Marquardt over two rigid motions, for a whole batch of problems.
+
+    Args:
+        motions: ``(*lead, 2, 4, 4)`` to start from.
+        data: matches with leading dimensions that broadcast to ``lead``.
+        scale: ``(*lead,)``: residuals r count :math:`r^2 / (1 + r^2 / c^2)` (Geman and McClure); None: :math:`r^2`.
+        still: ``(*lead, n)`` bool, points held static.
+        iterations: steps.
+
+    Returns:
+        motions of a cost that is not higher, and the cost ``(*lead,)``.
+    """
+    lead = motions.shape[:-3]
+    flat = data.flat(lead)
+    pose = motions.reshape(-1, 2, 4, 4)
+    square = None if scale is None else scale.expand(lead).reshape(-1, 1).square()
+    held = None if still is None else still.expand(*lead, -1).reshape(flat.weights.shape)
+
+    def residual(at: Tensor) -> Tensor:
+        moving, static = squares(at, flat)
+        return moving if held is None else torch.where(held, static, moving)
+
+    def cost_of(r: Tensor) -> Tensor:
+        return (flat.weights * (r if square is None else r * square / (square + r))).sum(-1)
+
+    r = residual(pose)
+    cost, damping = cost_of(r), torch.full(pose.shape[:1], 1e-3, dtype=pose.dtype, device=pose.device)
+    done = torch.zeros_like(cost, dtype=torch.bool)
+    for _ in range(iterations):
+        weights = flat.weights if square is None else flat.weights * (square / (square + r)).square()
+        gradient, matrix = normal_equations(pose, flat, weights, held)
+        trial = _step(pose, gradient, matrix, damping)
+        fresh = residual(trial)
+        new = cost_of(fresh)
+        better = (new < cost) & ~done
+        done = done | (better & (cost - new <= CONVERGED * cost)) | (~better & (damping > 1e5))
+        pose, r = torch.where(better[:, None, None, None], trial, pose), torch.where(better[:, None], fresh, r)
+        cost = torch.where(better, new, cost)
+        damping = torch.where(better, (damping * 0.1).clamp(min=1e-10), damping * 8)
+        if bool(done.all()):
+            break
+    return pose.reshape(motions.shape), cost.reshape(lead)
+
+
+def _step(pose: Tensor, gradient: Tensor, matrix: Tensor, damping: Tensor) -> Tensor:
+    """The motions after a damped Gauss-Newton step."""
+    step = damped_step(gradient, matrix, damping)
+    # half a radian is as far as the linearization of a rotation can be trusted
+    length = step.unflatten(-1, (2, 2, 3))[:, :, 0].norm(dim=-1).amax(-1)
+    step = step / (2 * length).clamp(min=1.0)[:, None]
+    return moved_by(pose, -step.unflatten(-1, (2, 6)))
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Robust estimation of two rigid motions: many starts from small samples, the best few annealed over all matches.
+
+
+STATIC_STARTS = 60
+"""Samples of 3 matches taken as static: 40 % static points without outliers are met by 98 % of 60 such samples."""
+MOVING_STARTS = 60
+SAMPLE = {"straight": 7, "constant_velocity": 5}
+"""Matches per moving sample, one or two above the minimum (6 and 3): at the minimum itself local minima abound."""
+FINALISTS = 5
+BITS = three_sigma(2) / 2
+"""Cost, in units of 2 log likelihood, of one free coordinate: a match is an outlier (6 free ones) rather than a point on a
+straight line (4) above the limit of chi-square with 2 degrees of freedom."""
+ROUNDS = 4  # of labelling and least squares
+PROBLEMS = 16  # of a batch solved together
+SEEDS = 512  # velocities tried as the common one
+STANDING = 0.1
+"""Least share of the matches that must have one velocity before they are taken for the static background (and at least 3)."""
+
+
+@dataclass(frozen=True)
+class Rigid:
+    """What the search found, in the coordinates it was given.
+
+    Attributes:
+        motions: ``(b, 2, 4, 4)``.
+        sigma: ``(b,)`` noise of one coordinate.
+        information: ``(b, 12, 12)`` Gauss-Newton matrix of the matches that belong to the model, per unit of noise.
+        inliers: ``(b, n)`` bool.
+        still: ``(b, n)`` bool.
+    """
+
+    motions: Tensor
+    sigma: Tensor
+    information: Tensor
+    inliers: Tensor
+    still: Tensor
+    grounded: Tensor
+    """``(b,)`` bool: whether static matches fix the common velocity (always, for straight lines)."""
+
+
+def search(
+    data: Sightings,
+    sigma: Tensor | None,
+    still: Tensor | None,
+    starts: Tensor,
+    generator: torch.Generator | None,
+    floor: float = 1e-13,
+) -> Rigid:
+    """The two rigid motions that most matches agree with.
+
+    Args:
+        data: ``(b, n, 3)`` matches of size about 1, centred.
+        sigma: ``(b,)`` noise of one coordinate; None estimates it (least median of squares).
+        still: ``(b, n)`` bool, matches known to be static.
+        starts: ``(b, k, 2, 4, 4)`` motions to begin with, besides those of samples.
+        generator: of the samples.
+        floor: least noise that is believed.
+    """
+    b, n = data.weights.shape
+    draws = uniform(b, STATIC_STARTS + MOVING_STARTS, n, generator=generator, device=data.x1.device)
+    # matches of weight 0 come last, so that they are drawn only where there is nothing else
+    order = (draws + 2.0 * (data.weights <= 0)[:, None]).argsort(-1)[..., : SAMPLE[data.motion]]
+    known = torch.zeros(b, dtype=data.x1.dtype, device=data.x1.device) if sigma is None else sigma
+    flags = torch.zeros(b, n, dtype=torch.bool, device=data.x1.device) if still is None else still
+
+    def run(*block: Tensor) -> tuple[Tensor, ...]:
+        x1, x2, x3, weights, held, noise, picked, given = block
+        part = Sightings(x1[:, None], x2[:, None], x3[:, None], weights[:, None], data.motion)
+        found = _search(part, None if sigma is None else noise, held, picked, given, floor)
+        return found.motions, found.sigma, found.information, found.inliers, found.still, found.grounded
+
+    return Rigid(*map_blocks(run, data.x1, data.x2, data.x3, data.weights, flags, known, order, starts, size=PROBLEMS))
+
+
+def _search(data: Sightings, sigma: Tensor | None, held: Tensor, order: Tensor, given: Tensor, floor: float) -> Rigid:
+    """One block: sightings ``(b, 1, n, 3)``."""
+    candidates = torch.cat([given, _all(data)[:, None], *_samples(data, order)], dim=1)
+    moving, static = squares(candidates, data)
+    noise = _scales(moving, data, floor) if sigma is None else sigma[:, None].expand(candidates.shape[:2]).clamp(min=floor)
+    score = noise if sigma is None else _score(moving, static, held, data, noise)
+    best = score.topk(min(FINALISTS, score.shape[1]), dim=1, largest=False).indices
+    # the given starts run as well: they rest on all matches, which no small sample does
+    chosen = torch.cat([torch.arange(given.shape[1] + 1, device=best.device).expand(len(best), -1), best], dim=1)
+    motions = candidates.gather(1, chosen[..., None, None, None].expand(-1, -1, 2, 4, 4))
+    noise = noise.gather(1, chosen)
+    noise = noise if sigma is not None else noise.amin(1, keepdim=True).expand_as(noise)
+    for stretch in (8.0, 3.0, 1.0):
+        motions, _ = descend(motions, data, scale=noise * stretch * three_sigma(data.conditions) ** 0.5, iterations=12)
+        noise = noise if sigma is not None else _scales(squares(motions, data)[0], data, floor)
+    # one noise for all, or the worse motion would be forgiven more
+    noise = noise if sigma is not None else noise.amin(1, keepdim=True).expand_as(noise)
+    winner = _score(*squares(motions, data), held, data, noise).argmin(1)
+    first = torch.arange(len(winner), device=winner.device)
+    flat = Sightings(data.x1[:, 0], data.x2[:, 0], data.x3[:, 0], data.weights[:, 0], data.motion)
+    grounded = held.any(-1) if data.motion == "constant_velocity" else torch.ones_like(held[:, 0])
+    found = _settle(motions[first, winner], flat, noise[first, winner], sigma is None, held, grounded, floor)
+    if data.motion == "straight":
+        return found
+    common, members, present = *common_velocity(found, flat), (flat.weights > 0).sum(-1)
+    standing = ~grounded & (members >= 3) & (members >= STANDING * present)
+    found = replace(found, motions=drifted(found.motions, torch.where(grounded[:, None], 0.0, common)))
+    if not bool(standing.any()):
+        return found
+    return _settle(found.motions, flat, found.sigma, sigma is None, held, grounded | standing, floor)
+
+
+def _all(data: Sightings) -> Tensor:
+    """The motions that carry all matches onto each other, as if none moved, ``(b, 2, 4, 4)``."""
+    x1, w = data.x1[:, 0], data.weights[:, 0]
+    return torch.stack([rigid_alignment(x1, data.x2[:, 0], w), rigid_alignment(x1, data.x3[:, 0], w)], dim=1)
+
+
+def _samples(data: Sightings, order: Tensor) -> tuple[Tensor, Tensor]:
+    """Motions from samples of 3 static matches, and of a few moving ones."""
+    found = []
+    for index, still in ((order[:, :STATIC_STARTS, :3], True), (order[:, STATIC_STARTS:], False)):
+        sample = data.sample(index)
+        start = torch.stack([rigid_alignment(sample.x1, x, sample.weights) for x in (sample.x2, sample.x3)], dim=2)
+        found.append(start if still else descend(start, sample, iterations=12)[0])
+    return found[0], found[1]
+
+
+def _scales(moving: Tensor, data: Sightings, floor: float) -> Tensor:
+    """Noise ``(b, k)`` from the median of squared residuals, less the parameters that these have absorbed."""
+    present = data.weights > 0
+    count = present.sum(-1)
+    spare = (1 - 12 / (data.conditions * count).clamp(min=13)).clamp(min=0.1)
+    ranked = torch.where(present, moving, torch.inf).sort(-1).values
+    middle = ranked.gather(-1, ((count - 1) // 2).clamp(min=0).expand(ranked.shape[:-1])[..., None])[..., 0]
+    middle = torch.where(middle.isfinite(), middle, 0.0)
+    return (middle / (median(data.conditions) * spare)).sqrt().clamp(min=floor)
+
+
+def _score(moving: Tensor, static: Tensor, held: Tensor, data: Sightings, sigma: Tensor) -> Tensor:
+    """Description length ``(b, k)``: every match is static, moving or an outlier, whichever is cheapest."""
+    square = sigma.square()[..., None]
+    free = 6 - data.conditions
+    cost = (moving / square + BITS * free).clamp(max=BITS * 6)
+    # the common velocity is still open in the other model, so that nothing stands still yet
+    resting = static / square if data.motion == "straight" else torch.full_like(cost, torch.inf)
+    cost = torch.where(held[:, None], (static / square).clamp(max=BITS * 6), torch.minimum(cost, resting))
+    return (cost * (data.weights > 0)).sum(-1)
+
+
+def _settle(motions: Tensor, data: Sightings, sigma: Tensor, estimate: bool, held: Tensor, grounded: Tensor, floor: float) -> Rigid:
+    """Least squares over the matches that belong to the model, static ones as such, until they do not change."""
+    present = data.weights > 0
+    for _ in range(ROUNDS):
+        moving, static = squares(motions, data)
+        square = sigma.square()[:, None]
+        resting = static <= three_sigma(6) * square
+        still = resting & (held | grounded[:, None]) & present
+        inliers = (still | (~held & (moving <= three_sigma(data.conditions) * square))) & present
+        subset = replace(data, weights=data.weights * inliers)
+        motions, _ = descend(motions, subset, still=still, iterations=15)
+        if estimate:
+            sigma = _noise(motions, subset, inliers, still, grounded, sigma).clamp(min=floor)
+    _, information = normal_equations(motions, subset, subset.weights, still)
+    return Rigid(motions, sigma, information, inliers, still, grounded)
+
+
+def _noise(motions: Tensor, data: Sightings, inliers: Tensor, still: Tensor, grounded: Tensor, before: Tensor) -> Tensor:
+    """Noise of one coordinate from the residuals of the inliers; as before where too few are left."""
+    moving, static = squares(motions, data)
+    total = torch.where(inliers, torch.where(still, static, moving), 0.0).sum(-1)
+    conditions = torch.where(still, 6, data.conditions) * inliers
+    spare = conditions.sum(-1) - torch.where(grounded, 12, 9)
+    return torch.where(spare >= 4, (total / spare.clamp(min=1)).sqrt(), before)
+
+
+def drifted(motions: Tensor, velocity: Tensor) -> Tensor:
+    """Motions ``(b, 2, 4, 4)`` in the gauge in which points of this velocity ``(b, 3)`` stand still."""
+    steps = torch.tensor([1.0, 2.0], dtype=motions.dtype, device=motions.device)
+    shift = torch.zeros_like(motions)
+    shift[..., :3, 3] = steps[:, None] * velocity[:, None]
+    return motions - shift
+
+
+def common_velocity(found: Rigid, data: Sightings) -> tuple[Tensor, Tensor]:
+    """The velocity ``(b, 3)`` that most matches share, in the frame of view 1 and per step, and how many do, ``(b,)``.
+
+    Where fewer than 3 share one it is the mean velocity of the inliers.
+    """
+    u, v, _, _ = combinations(found.motions, data)
+    velocity = -u / 2**0.5
+    step = max(1, velocity.shape[-2] // SEEDS)
+    # of a static point |u|^2 + |v|^2 is within the limit, with u counted from the common velocity
+    room = (three_sigma(6) * found.sigma.square()[:, None] - v.square().sum(-1)).clamp(min=0.0) / 2
+    near = (torch.cdist(velocity[:, ::step], velocity).square() <= 2 * room[:, None]) & found.inliers[:, None]
+    best = (near.sum(-1) * found.inliers[:, ::step]).argmax(-1)
+    members = near[torch.arange(len(best), device=best.device), best]
+    mean = _mean(velocity, members)
+    members = ((velocity - mean[:, None]).square().sum(-1) <= room) & found.inliers
+    count = members.sum(-1)
+    enough = (count >= 3) & (count >= STANDING * found.inliers.sum(-1))
+    return _mean(velocity, torch.where(enough[:, None], members, found.inliers)), count
+
+
+def _mean(x: Tensor, members: Tensor) -> Tensor:
+    return torch.where(members[..., None], x, 0.0).sum(-2) / members.sum(-1, keepdim=True).clamp(min=1)
+
+
+MINIMAL = {"straight": 6, "constant_velocity": 3}
+"""Moving matches for the 12 (9) degrees of freedom, at 2 (3) conditions each; static ones give 6."""
+INDETERMINATE = 1e-10  # information on the worst direction over that on the best: rounding error below it
+AMBIGUOUS = 0.3
+"""Standard deviation of the worst direction, in radians or sizes of the scene, above which the motion is not known at all."""
+UNCERTAIN = 0.05
+"""The same, from where a notice says so: 3 degrees."""
+CONSENSUS = 0.4  # share of inliers below which the best motion may be an accident
+SPARE = 4  # conditions beyond the degrees of freedom: a minimal set fulfils those whatever it is
+
+AMBIGUITY = {
+    "straight": (
+        "A and B are unique with their scale, unless all points keep one ratio of their two steps (constant velocity): then the "
+        "translations are known up to a velocity common to all points."
+    ),
+    "constant_velocity": (
+        "A velocity common to all points cannot be told from a motion of the sensor: the largest group of matches of one velocity "
+        "(at least 3 and a tenth of all) is taken as static; without it the mean velocity is taken as zero."
+    ),
+}
+
+
+def align_rigid(data: Matches, threshold: float | None, motion: str, generator: torch.Generator | None) -> Alignment:
+    """:func:`dyntorch.align_points` with ``model="rigid"``, for checked matches."""
+    weights = data.weights / data.weights.amax(-1, keepdim=True).clamp(min=torch.finfo(torch.float64).tiny)
+    centres, scale = _frame(data.views, weights)
+    x1, x2, x3 = ((x - c[:, None]) * scale[:, None, None] for x, c in zip(data.views, centres, strict=True))
+    sightings = Sightings(x1, x2, x3, weights, motion)
+    sigma = None if threshold is None else threshold / SIGMAS * scale
+    none = x1.new_zeros(len(x1), 0, 2, 4, 4)
+    starts = none if data.static is None else _from_static(sightings, data.static & (weights > 0))
+    found = search(sightings, sigma, data.static, starts, generator, floor=100 * torch.finfo(data.dtype).eps)
+    return _result(data, sightings, found, centres, scale)
+
+
+def _frame(views: tuple[Tensor, ...], weights: Tensor) -> tuple[list[Tensor], Tensor]:
+    """Medians of each view ``(b, 3)``, and one scale ``(b,)`` for all views that makes their spread about 1."""
+    hidden = torch.where(weights[..., None] > 0, torch.stack(views), torch.nan)
+    centres = hidden.nanmedian(dim=-2, keepdim=True).values.nan_to_num()
+    spread = (hidden - centres).abs().amax(-1).nanmedian(dim=-1).values.nan_to_num().amax(0)
+    return list(centres[..., 0, :]), torch.where(spread > 0, 1 / torch.where(spread > 0, spread, 1.0), 1.0)
+
+
+def _from_static(data: Sightings, known: Tensor) -> Tensor:
+    """``(b, 1, 2, 4, 4)`` motions of the labelled static matches, of all where there are fewer than three."""
+    weights = torch.where((known.sum(-1) >= 3)[:, None], data.weights * known, data.weights)
+    return torch.stack([rigid_alignment(data.x1, x, weights) for x in (data.x2, data.x3)], dim=1)[:, None]
+
+
+def _result(data: Matches, sightings: Sightings, found: Rigid, centres: list[Tensor], scale: Tensor) -> Alignment:
+    motion = sightings.motion
+    labels = _labels(sightings, found)
+    dof = torch.where(found.grounded, 12, 9)
+    values, covariance = _inverse(found.information, dof)
+    worst = found.sigma * values.clamp(min=torch.finfo(values.dtype).tiny).rsqrt()
+    top = found.information.diagonal(dim1=-2, dim2=-1).amax(-1)
+    noisy = found.sigma.isfinite() & (found.sigma > NOISY)
+    status = _status(labels, sightings.weights, worst, noisy, values <= INDETERMINATE * top, dof, MOTIONS[motion])
+    none = failed(status)
+    labels = torch.where(none[:, None], OUTLIER, labels)
+    matrices, entries = _measured(found.motions, covariance * found.sigma.square()[:, None, None], centres, scale)
+    # a noise beyond the range of the numbers is not known, and nor is the covariance
+    known = found.sigma.isfinite() & entries.isfinite().flatten(1).all(-1)
+    entries = torch.where(known[:, None, None], entries, torch.inf)
+    u, _, _, _ = combinations(found.motions, sightings)
+    velocity = torch.where((labels == OUTLIER)[..., None], 0.0, -u / 2**0.5 / scale[:, None, None])
+    zero = none[:, None, None]
+    warnings = _notices(labels, worst, found.grounded, none, motion, data.batch)
+    return Alignment(
+        A=data.back(torch.where(zero, 0.0, matrices[:, 0])),
+        B=data.back(torch.where(zero, 0.0, matrices[:, 1])),
+        labels=data.back(labels),
+        status=data.back(status),
+        sigma=data.back(torch.where(none, 0.0, found.sigma / scale)),
+        covariance=data.back(torch.where(zero, 0.0, entries)),
+        ambiguity=AMBIGUITY[motion],
+        warnings=warnings,
+        velocities=data.back(torch.where(zero, 0.0, velocity)) if motion == "constant_velocity" else None,
+    )
+
+
+def _labels(data: Sightings, found: Rigid) -> Tensor:
+    moving, static = squares(found.motions, data)
+    square = found.sigma.square()[:, None]
+    still = found.still & (static <= three_sigma(6) * square)
+    path = found.inliers & (moving <= three_sigma(data.conditions) * square)
+    return torch.where(still, STATIC, torch.where(path, MOVING, OUTLIER))
+
+
+def _inverse(information: Tensor, dof: Tensor) -> tuple[Tensor, Tensor]:
+    """Least eigenvalue ``(b,)`` of the degrees of freedom, and the pseudo-inverse ``(b, 12, 12)`` on them."""
+    values, vectors = spectrum(torch.where(information.isfinite().flatten(1).all(-1)[:, None, None], information, 0.0))
+    used = torch.arange(12, device=dof.device) >= 12 - dof[:, None]
+    least = values.gather(-1, 12 - dof[:, None])[:, 0]
+    floor = 1e-14 * values[:, -1:].clamp(min=torch.finfo(values.dtype).tiny)
+    inverse = torch.where(used, 1 / values.clamp(min=floor), 0.0)
+    return least, (vectors * inverse[:, None]) @ vectors.mT
+
+
+def _status(
+    labels: Tensor, weights: Tensor, worst: Tensor, noisy: Tensor, undetermined: Tensor, dof: Tensor, conditions: int
+) -> Tensor:
+    present = (weights > 0).sum(-1)
+    still, moving = (labels == STATIC).sum(-1), (labels == MOVING).sum(-1)
+    accident = (still + moving < CONSENSUS * present) | (6 * still + conditions * moving < dof + SPARE) | noisy
+    status = torch.full_like(present, int(Status.OK))
+    status = torch.where(worst > AMBIGUOUS, int(Status.AMBIGUOUS), status)
+    status = torch.where(accident, int(Status.NO_CONSENSUS), status)
+    status = torch.where(undetermined & ~accident, int(Status.DEGENERATE), status)
+    return torch.where(present < 3, int(Status.TOO_FEW), status)
+
+
+def _measured(motions: Tensor, covariance: Tensor, centres: list[Tensor], scale: Tensor) -> tuple[Tensor, Tensor]:
+    """Motions ``(b, 2, 4, 4)`` in the unit of the points, and the covariance ``(b, 32, 32)`` of their entries."""
+    first, *others = centres
+    result = motions.clone()
+    back = torch.stack(others, dim=1)
+    result[..., :3, 3] = motions[..., :3, 3] / scale[:, None, None] + first[:, None]
+    result[..., :3, 3] -= (motions[..., :3, :3] @ back[..., None])[..., 0]
+    # a tangent turns and shifts about the centre of view 1, in normalized size
+    basis = torch.zeros(6, 4, 4, dtype=motions.dtype, device=motions.device)
+    for k, (i, j) in enumerate(((2, 1), (0, 2), (1, 0))):
+        basis[k, i, j], basis[k, j, i], basis[3 + k, k, 3] = 1.0, -1.0, 1.0
+    outward, inward = similarity(1 / scale, -first * scale[:, None]), similarity(scale, first)
+    moved = outward[:, None] @ basis @ inward[:, None]  # (b, 6, 4, 4)
+    derivative = motions.new_zeros(len(scale), 2, 16, 12)
+    for part in range(2):
+        derivative[:, part, :, 6 * part : 6 * part + 6] = (moved @ result[:, part, None]).flatten(2).mT
+    derivative = derivative.flatten(1, 2)
+    return result, derivative @ covariance @ derivative.mT
+
+
+def _notices(
+    labels: Tensor, worst: Tensor, grounded: Tensor, none: Tensor, motion: str, batch: tuple[int, ...]
+) -> tuple[Notice, ...]:
+    moving, solved = (labels == MOVING).sum(-1), ~none
+    found = notices(
+        NoticeCode.UNCERTAIN,
+        "the worst direction of the motion has a standard deviation of {value:.2g} radians or sizes of the scene; add matches, "
+        "static ones or movers that change their speed",
+        worst,
+        solved & (worst > UNCERTAIN),
+        batch,
+    )
+    text = "no static match fixes the velocity common to all points, so their mean is taken as zero; label static ones (static=)"
+    found += notices(NoticeCode.COMMON_VELOCITY, text, worst, solved & ~grounded, batch)
+    few = solved & (moving < MINIMAL[motion]) & ((labels == STATIC).sum(-1) < 3)
+    text = f"{{value:g}} matches move, {MINIMAL[motion]} would determine the motion without static ones"
+    found += notices(NoticeCode.FEW_MOVING, text, moving, few, batch)
+    return tuple(sorted(found, key=lambda notice: notice.problem))

@@ -1,0 +1,415 @@
+"""Motions of a sensor, projective or affine, among points at constant velocity."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from dyntorch.core.fit import fit_matches
+from dyntorch.core.matches import Matches
+from dyntorch.core.normalize import denormalize_motion
+from dyntorch.core.robust import robust_fit
+from dyntorch.core.solution import NOISY, Status, failed
+from dyntorch.geometry.homogeneous import apply, unit
+from dyntorch.invariants.constant_velocity_tensor import ConstantVelocityTensor
+from dyntorch.numerics.blocks import map_blocks, uniform
+from dyntorch.numerics.chi_square import median, three_sigma
+from dyntorch.numerics.least_squares import damped_step, derivatives
+from dyntorch.numerics.nullspace import spectrum
+from dyntorch.tasks.align.labelling import ROUGH, SIGMAS, Evidence
+from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment
+from dyntorch.tasks.outcome import Notice, NoticeCode, notices
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Points at constant velocity before projective or affine sensors: refinement, the static gauge, labels, the sensor's motion.
+
+
+ROUNDS = 4
+STEPS = 15
+CONVERGED = 1e-10  # relative decrease of the cost
+SEEDS = 64
+"""Velocities tried as the common one: of 10 % static matches six or seven are among them."""
+STANDING = 0.1
+"""Least share of the inliers that must have one velocity before they are taken for the static background (and at least 3)."""
+GAUGE = 3  # degrees of freedom of the common velocity
+DOF = {False: 30, True: 21}
+"""Of three projective (affine) maps up to an affinity of the world and the common velocity."""
+ENTRIES = (12, 13, 14)  # of a 4 x 4 matrix: zero for an affine map
+
+
+@dataclass(frozen=True)
+class Velocities:
+    """Maps, labels and noise of a flat batch.
+
+    Attributes:
+        theta: ``(b, 48)`` the three maps in normalized coordinates.
+        labels: ``(b, n)``.
+        sigma: ``(b,)`` in the unit of the matches.
+        grounded: ``(b,)`` bool, whether static matches fix the common velocity.
+    """
+
+    theta: Tensor
+    labels: Tensor
+    sigma: Tensor
+    grounded: Tensor
+
+
+def refined(evidence: Evidence, theta: Tensor, labels: Tensor, affine: bool) -> Tensor:
+    """The maps ``(b, 48)`` that minimize the residuals of the labelled matches, by Levenberg-Marquardt; affine maps stay affine."""
+    problem, free = evidence.problem(labels), _free(theta, affine)
+    if not bool((labels == STATIC).any()):
+        problem = replace(problem, static=None)  # half of the work
+    cost, gradient, matrix = problem.normal_equations(theta)
+    damping = torch.full_like(cost, 1e-3)
+    for _ in range(STEPS):
+        trial = _scaled(theta - damped_step(gradient, matrix, damping, free))
+        fresh = problem.normal_equations(trial)
+        better = fresh[0] < cost
+        small = ~better | (cost - fresh[0] <= CONVERGED * cost)
+        theta, gradient = torch.where(better[:, None], trial, theta), torch.where(better[:, None], fresh[1], gradient)
+        matrix, cost = torch.where(better[:, None, None], fresh[2], matrix), torch.where(better, fresh[0], cost)
+        finished = small & (better | (damping > 1e5))
+        damping = torch.where(better, (damping * 0.1).clamp(min=1e-12), damping * 8)
+        if bool(finished.all()):
+            break
+    return theta
+
+
+def settle(evidence: Evidence, theta: Tensor, sigma: Tensor, affine: bool, estimate: bool) -> Velocities:
+    """Label and refine in turns: first without a gauge, then with the static matches, if there are such.
+
+    Args:
+        evidence: the matches.
+        theta: ``(b, 48)`` first maps.
+        sigma: ``(b,)`` noise.
+        affine: whether the maps are affine.
+        estimate: whether the noise is estimated anew in every round.
+    """
+    known = evidence.data.static
+    grounded = torch.zeros_like(sigma, dtype=torch.bool) if known is None else (known & (evidence.data.weights > 0)).any(-1)
+    if known is not None:
+        theta = _fixed(evidence, theta, known & (evidence.data.weights > 0))
+    state = _rounds(evidence, Velocities(theta, _labels(evidence, theta, sigma, grounded), sigma, grounded), affine, estimate)
+    theta, standing = _ground(evidence, state)
+    standing = standing & ~grounded
+    state = replace(state, theta=theta)
+    if not bool(standing.any()):
+        return state
+    grounded = grounded | standing
+    labels = _labels(evidence, theta, state.sigma, grounded)
+    return _rounds(evidence, Velocities(theta, labels, state.sigma, grounded), affine, estimate)
+
+
+def information(evidence: Evidence, state: Velocities, affine: bool) -> tuple[Tensor, Tensor, Tensor]:
+    """What the inliers tell about the sensor.
+
+    Returns:
+        the eigenvalues ``(b, 2)`` least and greatest of the information on theta, per unit of variance; the motions A and B
+        ``(b, 2, 4, 4)`` of the normalized matches, of norm 1; the covariance ``(b, 32, 32)`` of the entries of A and B in the
+        coordinates of the matches, for noise 1.
+    """
+    _, _, matrix = evidence.problem(state.labels).normal_equations(state.theta)
+    free = _free(state.theta, affine)
+    values, vectors = spectrum(matrix * free * free[:, None])
+    dof = DOF[affine] + GAUGE * state.grounded.long()
+    used = torch.arange(48, device=dof.device) >= 48 - dof[:, None]
+    least = values.gather(-1, 48 - dof[:, None])[:, 0]
+    floor = 1e-12 * values[:, -1:].clamp(min=torch.finfo(values.dtype).tiny)
+    root = vectors * torch.where(used, values.clamp(min=floor).rsqrt(), 0.0)[:, None]
+    motions, spread = derivatives(lambda t: _between(evidence, t).flatten(-3), state.theta, root.movedim(-1, 0))
+    return torch.stack([least, values[:, -1]], dim=-1), motions.unflatten(-1, (2, 4, 4)), spread.mT @ spread
+
+
+def world_velocities(evidence: Evidence, theta: Tensor) -> Tensor:
+    r"""Velocity ``(b, n, 3)`` of each match as sensor 1 would see its next step, :math:`\pi(A_0 (y + v)) - \pi(A_0 y)`."""
+    motion = _maps(evidence, theta)
+    y = ConstantVelocityTensor.positions(motion, *evidence.views)
+    v = (y[..., 2, :] - y[..., 0, :]) / 2
+    start = y.mean(-2) - v
+    return (apply(motion[0], start + v) - apply(motion[0], start)) / evidence.norm.scales[0][:, None, None]
+
+
+def residuals(evidence: Evidence, theta: Tensor) -> tuple[Tensor, Tensor]:
+    """Squared residuals ``(b, n)`` of each match as a moving point and as a static one, in the unit of the matches."""
+    model, motion, scales = ConstantVelocityTensor(), _maps(evidence, theta), evidence.norm.scales
+    moving = model.whitened(motion, evidence.views, scales).square().sum(-1)
+    return moving, model.whitened_static(motion, evidence.views, scales).square().sum(-1)
+
+
+def _rounds(evidence: Evidence, state: Velocities, affine: bool, estimate: bool) -> Velocities:
+    theta, labels, sigma = state.theta, state.labels, state.sigma
+    for _ in range(ROUNDS):
+        theta = refined(evidence, theta, labels, affine)
+        if estimate:
+            sigma = _noise(evidence, theta, labels, sigma, DOF[affine] + GAUGE * state.grounded.long())
+        new = _labels(evidence, theta, sigma, state.grounded)
+        if bool((new == labels).all()):
+            break
+        labels = new
+    return Velocities(theta, labels, sigma, state.grounded)
+
+
+def _labels(evidence: Evidence, theta: Tensor, sigma: Tensor, grounded: Tensor) -> Tensor:
+    moving, resting = residuals(evidence, theta)
+    variance, known = sigma.square()[:, None], evidence.data.static
+    still = (resting <= three_sigma(6) * variance) & grounded[:, None]
+    path = moving <= three_sigma(3) * variance
+    path = path if known is None else path & ~known
+    labels = torch.where(still, STATIC, torch.where(path, MOVING, OUTLIER))
+    return torch.where(evidence.data.weights > 0, labels, OUTLIER)
+
+
+def _noise(evidence: Evidence, theta: Tensor, labels: Tensor, before: Tensor, dof: Tensor) -> Tensor:
+    moving, resting = residuals(evidence, theta)
+    square = torch.where(labels == STATIC, resting, moving)
+    spare = (6 * (labels == STATIC) + 3 * (labels == MOVING)).sum(-1) - dof
+    shown = (torch.where(labels == OUTLIER, 0.0, square).sum(-1) / spare.clamp(min=1)).sqrt()
+    return torch.where(spare >= 6, shown, before).maximum(evidence.floor)
+
+
+def _ground(evidence: Evidence, state: Velocities) -> tuple[Tensor, Tensor]:
+    """Maps in the gauge in which the most matches stand still, and where these are enough; else the mean velocity is 0."""
+    inliers = state.labels != OUTLIER
+    limit = three_sigma(6) * state.sigma.square()[:, None]
+    n = inliers.shape[-1]
+    chosen = torch.arange(0, n, max(1, -(-n // SEEDS)), device=inliers.device)
+    motion, views = _maps(evidence, state.theta), evidence.views
+    several = tuple(m[:, None].expand(-1, len(chosen), -1, -1) for m in motion)
+    one = tuple(x[:, chosen, None] for x in views)
+    tried = ConstantVelocityTensor.fix_gauge((several[0], several[1], several[2]), *one)
+    scales = tuple(s[:, None] for s in evidence.norm.scales)
+    resting = ConstantVelocityTensor().whitened_static(tried, tuple(x[:, None] for x in views), scales).square().sum(-1)
+    # the noise of the one match that chose the velocity is in these residuals, too
+    near = (resting <= ROUGH**2 * limit[:, None]) & inliers[:, None]
+    best = (near.sum(-1) * inliers[:, chosen]).argmax(-1)
+    members = near[torch.arange(len(best), device=best.device), best]
+    theta = _fixed(evidence, state.theta, members)
+    members = (residuals(evidence, theta)[1] <= limit) & inliers
+    count = members.sum(-1)
+    enough = (count >= 3) & (count >= STANDING * inliers.sum(-1))
+    free = torch.where(state.grounded[:, None], False, torch.where(enough[:, None], members, inliers))
+    return _fixed(evidence, state.theta, free), enough
+
+
+def _fixed(evidence: Evidence, theta: Tensor, members: Tensor) -> Tensor:
+    x1, x2, x3 = evidence.views
+    motion = ConstantVelocityTensor.fix_gauge(_maps(evidence, theta), x1, x2, x3, weights=members.to(theta))
+    return torch.cat([part.flatten(1) for part in motion], dim=-1)
+
+
+def _maps(evidence: Evidence, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    first, second, third = theta.unflatten(-1, (3, 4, 4)).unbind(-3)
+    return first, second, third
+
+
+def _between(evidence: Evidence, theta: Tensor) -> Tensor:
+    """A and B ``(b, 2, 4, 4)`` in the coordinates of the matches, of norm 1."""
+    first, second, third = denormalize_motion(evidence.invariant, _maps(evidence, theta), evidence.norm.transforms)
+    return torch.stack([unit(first @ torch.linalg.inv_ex(other)[0]) for other in (second, third)], dim=-3)
+
+
+def _free(theta: Tensor, affine: bool) -> Tensor:
+    """``(48,)``, 0 for the entries that affine maps do not vary."""
+    free = torch.ones_like(theta[0]) if len(theta) else theta.new_ones(48)
+    if affine:
+        free[[16 * part + entry for part in range(3) for entry in ENTRIES]] = 0.0
+    return free
+
+
+def _scaled(theta: Tensor) -> Tensor:
+    parts = theta.unflatten(-1, (3, 16))
+    return (parts / parts.norm(dim=-1, keepdim=True).clamp(min=1e-30)).flatten(1)
+
+
+MINIMAL = {False: 21, True: 7}
+SAMPLES, SAMPLE = 150, 8
+"""Affine samples, one match above the minimum: 40 % outliers leave 1.7 % of such samples clean, 92 % to draw one."""
+HELD = 1e-9  # eigenvalue over the largest: 3e-5 of the size of the data, far below any real noise
+INDETERMINATE = 1e-13  # information on the worst direction over that on the best: rounding error below it
+AMBIGUOUS, UNCERTAIN = 0.5, 0.05
+"""Standard deviation of the worst direction of the maps, of norm 1, above which they are not known at all; or hardly."""
+CONSENSUS, SPARE = 0.4, 6
+PROBLEMS = 8
+RANKS = ((36, NoticeCode.EQUAL_VELOCITIES), (49, NoticeCode.LINEAR_VELOCITIES), (58, NoticeCode.PLANAR_VELOCITIES))
+"""Ranks of the estimation matrix for degenerate velocities (of 63)."""
+ABOVE = 3.0  # a singular value counts from so many times the noise on
+
+AMBIGUITY = (
+    "A velocity common to all points cannot be told from a motion of the sensor: the largest group of matches of one velocity (at "
+    "least 3 and a tenth of all) is taken as static; without it the mean velocity is taken as zero, in a world that is known up to "
+    "an affinity. A and B are known up to scale."
+)
+
+
+def align_velocity(data: Matches, threshold: float | None, affine: bool, generator: torch.Generator | None) -> Alignment:
+    """:func:`dyntorch.align_points` with a model of constant velocity, for checked matches."""
+    evidence = Evidence.of(ConstantVelocityTensor(), data)
+    given = None if threshold is None else torch.full_like(evidence.floor, threshold / SIGMAS).maximum(evidence.floor)
+    start = _affine_start(evidence, given, generator) if affine else _projective_start(evidence, given, threshold, generator)
+    theta, sigma, found = start
+    state = settle(evidence, theta, sigma, affine, given is None)
+    extent, motions, covariance = information(evidence, state, affine)
+    covariance = covariance * state.sigma.square()[:, None, None]
+    # singular maps have no motion between them to be known
+    covariance = torch.where(covariance.isfinite().flatten(1).all(-1)[:, None, None], covariance, torch.inf)
+    worst = state.sigma * extent[:, 0].clamp(min=torch.finfo(theta.dtype).tiny).rsqrt()
+    status = _status(evidence, state, worst, extent[:, 0] <= INDETERMINATE * extent[:, 1], found, affine)
+    none = failed(status)
+    labels = torch.where(none[:, None], OUTLIER, state.labels)
+    zero = none[:, None, None]
+    velocities = world_velocities(evidence, state.theta)
+    velocities = torch.where((labels == OUTLIER)[..., None], 0.0, velocities)
+    return Alignment(
+        A=data.back(torch.where(zero, 0.0, motions[:, 0])),
+        B=data.back(torch.where(zero, 0.0, motions[:, 1])),
+        labels=data.back(labels),
+        status=data.back(status),
+        sigma=data.back(torch.where(none, 0.0, state.sigma)),
+        covariance=data.back(torch.where(zero, 0.0, covariance)),
+        ambiguity=AMBIGUITY,
+        warnings=_notices(evidence, state, worst, none, affine, data.batch),
+        velocities=data.back(velocities),
+    )
+
+
+def _projective_start(
+    evidence: Evidence, given: Tensor | None, threshold: float | None, generator: torch.Generator | None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Maps ``(b, 48)`` of the tensor by robust estimation, the noise, and the status of those that failed."""
+    data = evidence.data
+    found = robust_fit(ConstantVelocityTensor(), *data.views, threshold=threshold, weights=data.weights, generator=generator)
+    theta = evidence.parameters(tuple(part.reshape(-1, 4, 4) for part in found.motion))
+    usable = theta.isfinite().all(-1) & ~failed(found.status)
+    theta = torch.where(usable[:, None], theta, _identity(theta))
+    return theta, _starting_noise(evidence, theta, given), torch.where(usable, int(Status.OK), found.status)
+
+
+def _affine_start(evidence: Evidence, given: Tensor | None, generator: torch.Generator | None) -> tuple[Tensor, Tensor, Tensor]:
+    """The same for affine maps: the consensus of small samples in the 9 coordinates of a match, which lie in a space of 6."""
+    data = evidence.data
+    # the normalization may stretch the views differently; a common one leaves the noise alike in all nine coordinates
+    scale = torch.stack(evidence.norm.scales)
+    nine = torch.cat([x / s[:, None, None] for x, s in zip(evidence.views, scale / scale.mean(0), strict=True)], dim=-1)
+    size = scale.mean(0)
+    present = data.weights > 0
+    draws = uniform(len(nine), SAMPLES, nine.shape[1], generator=generator, device=nine.device)
+    order = (draws + 2.0 * ~present[:, None]).argsort(-1)[..., :SAMPLE]
+    noise = torch.zeros_like(size) if given is None else given * size
+
+    def run(points: Tensor, weights: Tensor, index: Tensor, sigma: Tensor) -> tuple[Tensor, ...]:
+        return _affine_consensus(points, weights, index, None if given is None else sigma)
+
+    null, mean, ok = map_blocks(run, nine, data.weights, order, noise, size=PROBLEMS)
+    theta = _affine_maps(null, mean, ok)
+    parts = theta.unflatten(-1, (3, 4, 4)).clone()
+    parts[..., :3, :] *= (scale / size).mT[..., None, None]
+    theta = (parts.flatten(-2) / parts.flatten(-2).norm(dim=-1, keepdim=True)).flatten(1)
+    status = torch.where(ok, int(Status.OK), int(Status.DEGENERATE))
+    return theta, _starting_noise(evidence, theta, given), status
+
+
+def _affine_consensus(points: Tensor, weights: Tensor, index: Tensor, sigma: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    """Conditions ``(b, 3, 9)`` on the centred coordinates, their centre ``(b, 9)``, and whether the matches decide."""
+    present = weights > 0
+    sample = points[:, None].expand(-1, index.shape[1], -1, -1).gather(2, index[..., None].expand(-1, -1, -1, 9))
+    null, mean, _ = _conditions(sample, torch.ones_like(sample[..., 0]))
+    # the last start is of all matches, which is the best one where there are no outliers
+    own, centre, _ = _conditions(points, weights)
+    null, mean = torch.cat([null, own[:, None]], dim=1), torch.cat([mean, centre[:, None]], dim=1)
+    square = ((points[:, None] - mean[:, :, None]) @ null.mT).square().sum(-1)
+    if sigma is None:
+        count = present.sum(-1)
+        ranked = torch.where(present[:, None], square, torch.inf).sort(-1).values
+        middle = ((count - 1) // 2).clamp(min=0)[:, None, None].expand(-1, square.shape[1], 1)
+        score = ranked.gather(-1, middle)[..., 0]
+        spare = (1 - DOF[True] / (3 * count).clamp(min=22)).clamp(min=0.1)
+        limit = three_sigma(3) * score.amin(-1) / (median(3) * spare)
+    else:
+        limit = three_sigma(3) * sigma.square()
+        score = (square.minimum(limit[:, None, None]) * present[:, None]).sum(-1)
+    best = score.argmin(-1)
+    first = torch.arange(len(best), device=best.device)
+    # as much again for the noise of the sample
+    inside = (square[first, best] <= 4 * limit[:, None]) & present
+    floor = torch.finfo(points.dtype).eps
+    inside = inside | ((square[first, best] <= floor) & present)
+    return _conditions(points, weights * inside)
+
+
+def _conditions(points: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    total = weights.sum(-1, keepdim=True).clamp(min=torch.finfo(weights.dtype).tiny)
+    mean = (weights[..., None] * points).sum(-2) / total
+    centred = (points - mean[..., None, :]) * weights.sqrt()[..., None]
+    values, vectors = spectrum(centred.mT @ centred)
+    ok = (values[..., 3] > HELD * values[..., 8]) & ((weights > 0).sum(-1) >= MINIMAL[True])
+    return vectors[..., :3].mT, mean, ok
+
+
+def _affine_maps(null: Tensor, mean: Tensor, ok: Tensor) -> Tensor:
+    """Maps ``(b, 48)`` with N (L_0, L_1, L_2) v = 0 for all moving points: (N_0, N_1, N_2) = G (L_0^-1, -2 L_1^-1, L_2^-1)."""
+    blocks = null.unflatten(-1, (3, 3)).movedim(-2, -3) * torch.tensor([1.0, -0.5, 1.0]).to(null)[:, None, None]
+    eye = torch.eye(3, dtype=null.dtype, device=null.device)
+    linear, _ = torch.linalg.inv_ex(torch.where(ok[:, None, None, None], blocks, eye))
+    linear = torch.where(linear.isfinite(), linear, 0.0)
+    upper = torch.cat([linear / linear.flatten(1).norm(dim=-1)[:, None, None, None], mean.unflatten(-1, (3, 3))[..., None]], dim=-1)
+    last = torch.eye(4, dtype=null.dtype, device=null.device)[3:].expand(len(null), 3, 1, 4)
+    return torch.cat([upper, last], dim=-2).flatten(1)
+
+
+def _starting_noise(evidence: Evidence, theta: Tensor, given: Tensor | None) -> Tensor:
+    if given is not None:
+        return given
+    moving, _ = residuals(evidence, theta)
+    middle = torch.where(evidence.data.weights > 0, moving, torch.nan).nanmedian(dim=-1).values.nan_to_num()
+    return (middle / median(3)).sqrt().maximum(evidence.floor)
+
+
+def _identity(theta: Tensor) -> Tensor:
+    return torch.eye(4, dtype=theta.dtype, device=theta.device).flatten().repeat(3) / 2
+
+
+def _status(evidence: Evidence, state: Velocities, worst: Tensor, undetermined: Tensor, found: Tensor, affine: bool) -> Tensor:
+    present = (evidence.data.weights > 0).sum(-1)
+    still = (state.labels == STATIC).sum(-1)
+    moving = (state.labels != OUTLIER).sum(-1) - still
+    dof = DOF[affine] + GAUGE * state.grounded.long()
+    accident = (still + moving < CONSENSUS * present) | (6 * still + 3 * moving < dof + SPARE * (present > MINIMAL[affine] + 1))
+    accident = accident | (state.sigma * torch.stack(evidence.norm.scales).amax(0) > NOISY)
+    status = torch.where(worst > AMBIGUOUS, int(Status.AMBIGUOUS), torch.zeros_like(present))
+    status = torch.where(accident, int(Status.NO_CONSENSUS), status)
+    status = torch.where(undetermined & ~accident, int(Status.DEGENERATE), status)
+    status = torch.where(found != Status.OK, found.to(status), status)
+    return torch.where(present < MINIMAL[affine], int(Status.TOO_FEW), status)
+
+
+def _notices(
+    evidence: Evidence, state: Velocities, worst: Tensor, none: Tensor, affine: bool, batch: tuple[int, ...]
+) -> tuple[Notice, ...]:
+    found: list[Notice] = []
+    enough = (evidence.data.weights > 0).sum(-1) >= MINIMAL[affine]
+    if evidence.data.count >= MINIMAL[False]:
+        rank = _rank(evidence, state, none)
+        least = 0
+        for most, code in RANKS:
+            text = f"the estimation matrix has rank {{value:g}} of 63 above the noise, {most} for velocities that are "
+            kind = code.removesuffix("_velocities") if code != NoticeCode.LINEAR_VELOCITIES else "along a line"
+            kind = "in a plane" if code == NoticeCode.PLANAR_VELOCITIES else kind
+            text += f"{kind}; add points that move in other directions, or use model='rigid'"
+            found += notices(code, text, rank, enough & (rank > least) & (rank <= most), batch)
+            least = most
+    text = "no static match fixes the velocity common to all points, so their mean is taken as zero; label static ones (static=)"
+    found += notices(NoticeCode.COMMON_VELOCITY, text, worst, ~none & ~state.grounded, batch)
+    text = "the worst direction of the maps, of norm 1, has a standard deviation of {value:.2g}; add matches or lower the noise"
+    found += notices(NoticeCode.UNCERTAIN, text, worst, ~none & (worst > UNCERTAIN), batch)
+    return tuple(sorted(found, key=lambda notice: notice.problem))
+
+
+def _rank(evidence: Evidence, state: Velocities, none: Tensor) -> Tensor:
+    """Singular values ``(b,)`` of the estimation matrix of the inliers (of all matches where there is no motion) above noise."""
+    inliers = torch.where(none[:, None], torch.ones_like(state.labels, dtype=torch.bool), state.labels != OUTLIER)
+    kept = evidence.data.restricted(inliers)
+    values = fit_matches(ConstantVelocityTensor(), kept).singular_values
+    noise = state.sigma * torch.stack(evidence.norm.scales).mean(0) * kept.weights.square().sum(-1).sqrt()
+    return (values > torch.maximum(ABOVE * noise[:, None], 1e-9 * values[:, :1])).sum(-1)

@@ -1,0 +1,343 @@
+"""reconstruct_pair(): a moving, bending scene in space from two static cameras that nobody calibrated."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import fields, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dyntorch.core.normalize import hartley
+from dyntorch.core.residual import sampson
+from dyntorch.core.robust import robust_fit
+from dyntorch.core.solution import Status, failed
+from dyntorch.geometry.triangulation import triangulate
+from dyntorch.invariants.fundamental_matrix import FundamentalMatrix
+from dyntorch.numerics.arguments import on_cpu
+from dyntorch.numerics.blocks import one_thread
+from dyntorch.tasks.outcome import Notice, NoticeCode, check_threshold
+from dyntorch.tasks.pair.affine import FEWEST, Transfer, filled, solve
+from dyntorch.tasks.pair.result import PairReconstruction, failure
+from dyntorch.tasks.pair.tracks import Overlap, match_tracks, overlap
+from dyntorch.tasks.synchronize.result import Shift
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Two static cameras that see the same points: one fundamental matrix for the whole take, and projective structure per frame.
+
+
+SAMPLED = 4000
+"""Positions that the fundamental matrix is searched from; its accuracy is then that of the noise's correlations."""
+STEPS = 3
+"""Gauss-Newton steps of the triangulation: the reprojection error no longer falls."""
+LEAST = 12
+"""Positions in both cameras: with fewer, agreement with some fundamental matrix is no evidence."""
+
+
+def projective(seen: Overlap, threshold: float | None, explained: float, generator: torch.Generator | None) -> PairReconstruction:
+    """The reconstruction of corresponding points.
+
+    Args:
+        seen: tracks of both cameras at the same moments.
+        threshold: pixels, of the Sampson distance; None estimates it.
+        explained: share of a point's frames that must be within it.
+        generator: of the random samples.
+    """
+    frames, n = seen.a.shape[:2]
+    both = (seen.a.isfinite() & seen.b.isfinite()).all(-1)
+    if int(both.sum()) < LEAST or int(both.any(0).sum()) < 1:
+        text = f"{int(both.sum())} positions are seen by both cameras, {LEAST} are needed; give more frames or points, check shift"
+        notice = Notice(NoticeCode.FEW_OBSERVED, float(both.sum()), text)
+        return failure((n, n), seen.times, Status.TOO_FEW, [notice], 4)
+    # of unit size: neither the solver's nor the triangulation's precision depends on the unit
+    x1, x2 = seen.a.nan_to_num(), seen.b.nan_to_num()
+    chosen = both.flatten().nonzero()[:, 0]
+    stride = -(-len(chosen) // SAMPLED)
+    part = chosen[::stride]
+    fitted = robust_fit(FundamentalMatrix, x1.flatten(0, 1)[part], x2.flatten(0, 1)[part], threshold=threshold, generator=generator)
+    status = Status(int(fitted.status))
+    if bool(failed(fitted.status)):
+        text = (
+            "the positions leave several fundamental matrices: the points stay in one plane, or hardly move; add points or motion"
+        )
+        return failure((n, n), seen.times, status, [Notice(NoticeCode.DEGENERATE, float(len(part)), text)], 4)
+    F = fitted.tensor
+    distance = sampson(FundamentalMatrix, F, x1.flatten(0, 1), x2.flatten(0, 1)).unflatten(0, (frames, n))
+    distance = torch.where(both, distance.abs(), torch.nan)
+    sigma = 0.0 if fitted.sigma is None else float(fitted.sigma)
+    limit = threshold if threshold is not None else max(2.6 * sigma, 1e-9 * float(x1.abs().max()))
+    share = torch.where(both, distance <= limit, False).sum(0) / both.sum(0).clamp(min=1)
+    good = (share >= explained) & (both.sum(0) > 0)
+    cameras, points = _structure(F, x1, x2, both, fitted.motion)
+    points = torch.where((good & both)[..., None], points, torch.nan)
+    residuals = distance.square().nanmean(0).sqrt()
+    residual = float(distance[:, good].square().nanmean().sqrt())
+    index = torch.arange(n, device=F.device)
+    return PairReconstruction(
+        cameras=cameras,
+        points=points,
+        times=seen.times,
+        source=torch.zeros_like(index),
+        labels=good.long(),
+        r2=torch.where(both.any(0), share.double(), torch.nan),
+        matches=torch.where(good, index, -1),
+        distances=F.new_full((n, n), torch.nan),
+        normals=F.new_full((2, 2), torch.nan),
+        fundamental=F,
+        residuals=residuals,
+        residual=residual,
+        status=status,
+    )
+
+
+def _structure(F: Tensor, x1: Tensor, x2: Tensor, both: Tensor, motion: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+    """Cameras ``(2, 3, 4)`` and points ``(frames, n, 4)``: the frame of :math:`[I \\mid 0],\\ [A \\mid e_2]`, of unit size."""
+    views = torch.stack([x1.flatten(0, 1), x2.flatten(0, 1)])
+    weights = both.flatten().to(views)
+    T = hartley(views[..., None, :], weights.expand(2, -1))
+    A, e2 = motion
+    homography, epipole = T[1] @ A @ torch.linalg.inv(T[0]), T[1] @ e2
+    second = torch.cat([homography / homography.norm(), (epipole / epipole.norm())[:, None]], dim=-1)
+    first = torch.eye(3, 4, dtype=F.dtype, device=F.device)
+    normal = torch.stack([first, second])
+    moved = views * T[:, None, :1, 0] + T[:, None, :2, 2]
+    points = triangulate(normal, moved, weights.expand(2, -1), steps=STEPS)
+    cameras = torch.linalg.inv(T) @ normal
+    return cameras / torch.linalg.matrix_norm(cameras, keepdim=True), points.unflatten(0, both.shape)
+
+
+SHORTEST, SPARE = 12, 6
+"""Frames in common, and more than points of either camera: fewer are explained by any tracks."""
+SEEN = 0.5
+"""Share of the frames in which a track must be seen; more gaps are guessed, not interpolated."""
+STILL = 3.0
+"""Times the noise up to which nothing moves."""
+BEYOND = 1.0
+"""Ranges of the likelihoods of unrelated motions that the one found is above the highest of them.  Two views of one scene: 2 to 16
+(3 px of noise and less, 60 frames and more); 4 points over 40 frames at 1 px: 0.6 and 1.8.  Of 12 pairs of unrelated bodies that
+wander for 4 s, all of which explain each other, one is above 1."""
+EXACT = 1e-7
+"""Of the extent: motion that is rounding."""
+
+
+@one_thread
+@on_cpu
+def reconstruct_pair(
+    a: Tensor,
+    b: Tensor,
+    shift: Shift | float,
+    correspondence: bool = False,
+    *,
+    fps: float | Sequence[float] | None = None,
+    times: Sequence[Any] | None = None,
+    explained: float = 0.8,
+    threshold: float | None = None,
+    generator: torch.Generator | None = None,
+) -> PairReconstruction:
+    r"""Trajectories in space of points that two static, uncalibrated cameras see, even where each camera tracks other points.
+
+    With ``correspondence=False`` the cameras are affine, and the points of either camera move as constant affine combinations
+    of those of the other: joints and what is between them, points of a few bodies, of a face.  Across the epipolar lines, along
+    :math:`m_a, m_b`, both see the same coordinate of space; in both directions of sight
+
+    .. math:: m_b \cdot y_j(t) = c \sum_i q_{ij}\, m_a \cdot x_i(t) + o
+       \quad\Rightarrow\quad x_j(t) = \sum_i q_{ij}\, x_i(t), \qquad \sum_i q_{ij} = 1,
+
+    which transfers every track to the other camera and so gives its depth.  :math:`m_a, m_b` maximize the likelihood from a
+    search over all directions, the :math:`q_{ij}` come from the ridge regression of most evidence, out of tracks whose noise is
+    told from motion by their own spectrum in time and by their correlations.  With ``correspondence=True`` point i of a is
+    point i of b, the cameras are projective, and one fundamental matrix of all frames gives the structure of each.
+
+    A search: it computes on the CPU wherever its tensors are, and the result returns to their device.
+
+    Args:
+        a: ``(frames_a, n, 2)`` pixels, NaN = missing.
+        b: ``(frames_b, m, 2)`` pixels; m = n where points correspond.
+        shift: b's clock against a's, of :func:`dyntorch.synchronize`; or its offset in seconds (then with ``fps`` or ``times``).
+        correspondence: whether point i of a is point i of b.
+        fps: frames per second, one number or (of a, of b); default: those of the shift.
+        times: (seconds of a's frames, of b's frames) instead of ``fps``.
+        explained: share of a point's motion that the other camera must predict for the point to be transferred (affine), share of
+            its frames within the threshold (corresponding points).
+        threshold: pixels, Sampson distance of corresponding points; three standard deviations of the noise.  None estimates it.
+        generator: of the random samples for corresponding points.
+
+    Returns:
+        A :class:`~dyntorch.tasks.pair.result.PairReconstruction` in the frames of a that both cameras show, in the dtype and on the
+        device of a: ``cameras (2, 3, 4)``, ``points (frames, n + m, 3)`` up to one affinity (corresponding points: ``(frames, n,
+        4)`` homogeneous, up to one collineation), ``labels`` (0 = outlier), ``r2``, ``matches``, ``residual``, ``status``.
+
+    Raises:
+        ValueError: misuse - shapes, types, a shift that is no shift, times that do not increase.
+
+    Source: Wolf and Zomet 2002, Correspondence-free synchronization and reconstruction in a non-rigid scene; thesis chapter 7.
+
+    Example:
+        >>> import torch
+        >>> from dyntorch.scenes.filmed import nonrigid_pair
+        >>> from dyntorch.tasks.pair.pair import reconstruct_pair
+        >>> scene = nonrigid_pair(12, 10, 90, sigma=0.3, offset=0.41, generator=torch.Generator().manual_seed(0))
+        >>> found = reconstruct_pair(scene.a, scene.b, scene.offset, fps=scene.fps)
+        >>> found.points.shape, found.status.name, int(found.labels.sum())
+        (torch.Size([77, 22, 3]), 'OK', 22)
+    """
+    _check(a, b, correspondence, explained)
+    check_threshold(threshold)
+    with torch.no_grad():
+        seen = overlap(a, b, shift, fps=fps, times=times)
+        short = _short(seen)
+        if short is not None:
+            found = failure((a.shape[1], b.shape[1]), seen.times, Status.TOO_FEW, [short], 4 if correspondence else 3)
+        elif correspondence:
+            found = projective(seen, threshold, explained, generator)
+        else:
+            found = _affine(seen, explained)
+    changed = {
+        f.name: getattr(found, f.name).to(dtype=a.dtype)
+        for f in fields(found)
+        if isinstance(getattr(found, f.name), Tensor) and getattr(found, f.name).is_floating_point() and f.name != "times"
+    }
+    return replace(found, **changed)
+
+
+def _check(a: Tensor, b: Tensor, correspondence: bool, explained: float) -> None:
+    if not isinstance(correspondence, bool):
+        raise ValueError(f"correspondence must be True or False, got {correspondence!r}")
+    for name, x in (("a", a), ("b", b)):
+        if not isinstance(x, Tensor) or x.ndim != 3 or x.shape[-1] != 2 or not x.is_floating_point():
+            got = f"{tuple(x.shape)} {x.dtype}" if isinstance(x, Tensor) else type(x).__name__
+            raise ValueError(f"{name} must be a floating point tensor (frames, points, 2), got {got}")
+    if correspondence and a.shape[1] != b.shape[1]:
+        raise ValueError(
+            f"corresponding points need as many in a as in b, got {a.shape[1]} and {b.shape[1]}; correspondence=False?"
+        )
+    if isinstance(explained, bool) or not isinstance(explained, float | int) or not 0 <= explained < 1:
+        raise ValueError(f"explained must be a share from 0 to below 1, got {explained!r}")
+
+
+def _short(seen: Overlap, needed: int = SHORTEST) -> Notice | None:
+    frames = len(seen.times)
+    if frames >= needed:
+        return None
+    text = (
+        f"the cameras have {frames} frames in common, {needed} are needed; check shift and fps, film longer, or take fewer points"
+    )
+    return Notice(NoticeCode.SHORT_OVERLAP, float(frames), text)
+
+
+def _affine(seen: Overlap, explained: float) -> PairReconstruction:
+    """The reconstruction of different points."""
+    n, m = seen.a.shape[1], seen.b.shape[1]
+    often = [x.isfinite().all(-1).double().mean(0) >= SEEN for x in (seen.a, seen.b)]
+    for name, kept in zip("ab", often, strict=True):
+        if int(kept.sum()) < FEWEST:
+            text = f"camera {name} shows {int(kept.sum())} points in half of the frames, {FEWEST} are needed; track more, or longer"
+            return failure((n, m), seen.times, Status.TOO_FEW, [Notice(NoticeCode.FEW_POINTS, float(kept.sum()), text)], 3)
+    tracks = [filled(x[:, kept], s * s) for x, kept, s in zip((seen.a, seen.b), often, seen.noise, strict=True)]
+    most = max(x.shape[1] for x in tracks)
+    wrong = _short(seen, most + SPARE) or _unusable(tracks, seen.noise)
+    if wrong is not None:
+        status = Status.TOO_FEW if wrong.code == NoticeCode.SHORT_OVERLAP else Status.DEGENERATE
+        return failure((n, m), seen.times, status, [wrong], 3)
+    centres = [x.mean((0, 1)) for x in tracks]
+    found = solve(tracks[0] - centres[0], tracks[1] - centres[1], seen.noise, explained)
+    split = int(often[0].sum())
+    if isinstance(found, Tensor):
+        counts = int(found[:split].sum()), int(found[split:].sum())
+        text = (
+            f"the cameras explain {counts[0]} points of a and {counts[1]} of b of each other; "
+            "check the shift, or that both show one scene"
+        )
+        return failure((n, m), seen.times, Status.NO_CONSENSUS, [Notice(NoticeCode.FEW_POINTS, float(min(counts)), text)], 3)
+    if found.beyond < BEYOND:
+        text = "unrelated motions explain each other about as well: film longer, motion that changes faster, or check the shift"
+        return failure((n, m), seen.times, Status.NO_CONSENSUS, [Notice(NoticeCode.CHANCE, found.beyond, text)], 3)
+    return _assembled(seen, found, tracks, centres, torch.cat(often))
+
+
+def _unusable(tracks: list[Tensor], noise: tuple[float, float]) -> Notice | None:
+    """Why the motion of one camera cannot be used, if so."""
+    for name, x, sigma in zip("ab", tracks, noise, strict=True):
+        moved = (x - x.mean(0)).flatten(0, 1)
+        least, most = torch.linalg.eigvalsh(moved.mT @ moved / len(moved)).clamp(min=0).sqrt().tolist()
+        extent = float((x - x.mean((0, 1))).square().mean().sqrt())
+        # third differences of a fast motion are no noise: it is at least seven times as large
+        if most <= max(EXACT * extent, math.sqrt(2) * sigma):
+            text = f"nothing moves in camera {name}: {most:.2g} px beside a noise of {sigma:.2g}; film more motion"
+            return Notice(NoticeCode.STATIC_SCENE, most, text)
+        if least <= max(EXACT * extent, min(STILL * sigma, 0.01 * most)):
+            text = f"all points of camera {name} move along one line of the image ({least:.2g} px across it); film from elsewhere"
+            return Notice(NoticeCode.COLLINEAR, least, text)
+    return None
+
+
+def _assembled(seen: Overlap, found: Transfer, tracks: list[Tensor], centres: list[Tensor], often: Tensor) -> PairReconstruction:
+    """Cameras, trajectories, matches in the frame (u, w_a, w_b): along the common normal, and along the epipolar lines of each."""
+    n, split = seen.a.shape[1], tracks[0].shape[1]
+    kept = often.clone()
+    kept[often] = found.good
+    u, v = (_turned(normal) for normal in found.normals)
+    first = (found.x + tracks[0].mean(0) - centres[0]) @ u.mT
+    second = ((found.y + tracks[1].mean(0) - centres[1]) @ v.mT - found.normals.new_tensor([found.offset, 0.0])) / found.scale
+    whole = torch.cat(
+        [
+            torch.cat([first, (second[..., 1] @ found.backward)[..., None]], dim=-1),
+            torch.stack([second[..., 0], first[..., 1] @ found.forward, second[..., 1]], dim=-1),
+        ],
+        dim=1,
+    )
+    points = seen.a.new_full((len(first), len(often), 3), torch.nan)
+    points[:, often] = torch.where(found.good[:, None], whole, torch.nan)
+    cameras = seen.a.new_zeros(2, 3, 4)
+    cameras[0, :2, 0], cameras[0, :2, 1] = u[0], u[1]
+    cameras[1, :2, 0], cameras[1, :2, 2] = found.scale * v[0], found.scale * v[1]
+    cameras[0, :2, 3], cameras[1, :2, 3] = centres[0], centres[1] + found.offset * v[0]
+    cameras[:, 2, 3] = 1.0
+    missed = torch.cat(
+        [first[..., 0] - second[..., 0] @ found.backward, found.scale * (second[..., 0] - first[..., 0] @ found.forward)], dim=1
+    )
+    residuals, r2 = (points.new_full(often.shape, torch.nan) for _ in range(2))
+    residuals[often] = torch.where(found.good, missed.square().mean(0).sqrt(), torch.nan)
+    r2[often] = found.r2
+    matches, distances = match_tracks(points, n, found.residual)
+    return PairReconstruction(
+        cameras=cameras,
+        points=points,
+        times=seen.times,
+        source=(torch.arange(len(often), device=points.device) >= n).long(),
+        labels=kept.long(),
+        r2=r2,
+        matches=matches,
+        distances=distances,
+        normals=found.normals,
+        fundamental=_fundamental(cameras),
+        residuals=residuals,
+        residual=found.residual,
+        status=Status.OK,
+        warnings=() if found.affine else (_free(found, split),),
+    )
+
+
+def _turned(normal: Tensor) -> Tensor:
+    """Rows: the normal, and the direction of the epipolar lines."""
+    return torch.stack([normal, torch.stack([-normal[1], normal[0]])])
+
+
+def _fundamental(cameras: Tensor) -> Tensor:
+    """Of affine cameras in the frame of the normals: :math:`m_b \\cdot y - o = c\\, m_a \\cdot x`."""
+    normal, other = cameras[0, :2, 0], cameras[1, :2, 0]
+    scale = other.square().sum()
+    F = cameras.new_zeros(3, 3)
+    F[:2, 2], F[2, :2] = other / scale, -normal
+    F[2, 2] = normal @ cameras[0, :2, 3] - other @ cameras[1, :2, 3] / scale
+    return F / torch.linalg.matrix_norm(F)
+
+
+def _free(found: Transfer, split: int) -> Notice:
+    text = (
+        f"the mean places of the {split} and {len(found.good) - split} points do not follow from their motions (residual "
+        f"{found.residual:.2g} px without them): motions are right, places along the lines of sight are a guess"
+    )
+    return Notice(NoticeCode.FREE_PLACES, found.residual, text)

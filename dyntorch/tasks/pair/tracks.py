@@ -1,0 +1,205 @@
+"""Tracks of two cameras brought to the frame times of one of them, by local polynomials between the frames."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dyntorch.tasks.synchronize.result import Shift
+from dyntorch.tasks.synchronize.tracks import Tracks, read_tracks
+
+ORDERS = (6, 4, 2)
+"""Frames around a moment that one position is interpolated from: as many as are seen of these.  At half a frame six multiply the
+variance of white noise by .71, two by .5, but two also lose what moves within a tenth of the frame rate."""
+ROUNDING = 1e-6
+"""Of a frame."""
+GAP = 2.5
+"""Frame intervals between two neighbouring frames from which on nothing is interpolated between them."""
+
+
+@dataclass(frozen=True)
+class Overlap:
+    """What both cameras saw in the frames of a within the overlap, NaN = missing.
+
+    Attributes:
+        a: ``(frames, n, 2)`` float64.
+        b: ``(frames, m, 2)`` float64, at the same moments.
+        times: ``(frames,)`` of a's clock.
+        noise: pixels, of a coordinate of a and of b, as third differences show it; an upper bound where the motion is fast.
+    """
+
+    a: Tensor
+    b: Tensor
+    times: Tensor
+    noise: tuple[float, float]
+
+
+def overlap(
+    a: Tensor,
+    b: Tensor,
+    shift: Shift | float,
+    *,
+    fps: float | Sequence[float] | None = None,
+    times: Sequence[Any] | None = None,
+) -> Overlap:
+    """Both cameras at a's frame times.
+
+    Args:
+        a: ``(frames, n, 2)`` pixels, NaN = missing.
+        b: ``(frames, m, 2)``.
+        shift: of b's clock against a's; or its offset in seconds.
+        fps: frames per second of both or of each; None: the shift's.
+        times: seconds of a's and of b's frames, instead of ``fps``.
+
+    Raises:
+        ValueError: misuse, naming the field.
+    """
+    rates, clocks = _clocks(shift, fps, times)
+    tracks = [read_tracks(name, x, rate, clock, None) for name, x, rate, clock in zip("ab", (a, b), rates, clocks, strict=True)]
+    if a.device != b.device:
+        raise ValueError(f"a and b must be on one device, got {a.device} and {b.device}; use b.to(a.device)")
+    first, second = tracks
+    wanted = shift.at(first.times) if isinstance(shift, Shift) else first.times + shift
+    if not len(second.times):
+        return Overlap(_unfilled(first)[:0], _unfilled(second), first.times[:0], (first.noise, second.noise))
+    start, end = second.times[0], second.times[-1]
+    # rounding moves no frame out of the overlap
+    inside = (wanted - wanted.clamp(start, end)).abs() <= ROUNDING * second.step if len(second.times) > 1 else wanted == start
+    wanted = wanted.clamp(start, end)
+    return Overlap(
+        _unfilled(first)[inside],
+        interpolated(_unfilled(second), second.times, wanted[inside]),
+        first.times[inside],
+        (first.noise, second.noise),
+    )
+
+
+def _clocks(
+    shift: Shift | float, fps: float | Sequence[float] | None, times: Sequence[Any] | None
+) -> tuple[tuple[float | None, float | None], tuple[Tensor | None, Tensor | None]]:
+    if not isinstance(shift, Shift | float | int) or isinstance(shift, bool):
+        raise ValueError(f"shift must be a Shift or an offset in seconds, got {shift!r}; use dyntorch.synchronize(a, b, ...)")
+    if isinstance(shift, float | int) and not -1e12 < shift < 1e12:
+        raise ValueError(f"shift must be finite seconds, got {shift}")
+    if times is not None:
+        if fps is not None or len(times) != 2:
+            raise ValueError(f"give either fps or times=(times of a, times of b), got fps={fps} and {len(times)} times")
+        return (None, None), (times[0], times[1])
+    if fps is None:
+        if not isinstance(shift, Shift):
+            raise ValueError("an offset in seconds needs fps= or times=; or give the Shift of dyntorch.synchronize")
+        fps = shift.fps
+    pair = (fps, fps) if isinstance(fps, float | int) else tuple(fps)
+    if len(pair) != 2:
+        raise ValueError(f"fps must be one number or two, of a and of b, got {fps}")
+    return (float(pair[0]), float(pair[1])), (None, None)
+
+
+def _unfilled(tracks: Tracks) -> Tensor:
+    return torch.where((tracks.weights > 0)[..., None], tracks.x, torch.nan)
+
+
+def interpolated(x: Tensor, times: Tensor, at: Tensor) -> Tensor:
+    r"""Positions at any moments by Lagrange's polynomial through the frames around each: six where all are seen, else four or two.
+
+    .. math:: x(t) = \sum_k x_k \prod_{l \ne k} \frac{t - t_l}{t_k - t_l}
+
+    Args:
+        x: ``(frames, n, 2)``, NaN = missing.
+        times: ``(frames,)`` increasing.
+        at: ``(m,)``.
+
+    Returns:
+        ``(m, n, 2)``; NaN outside the frames, in gaps, and where a neighbouring frame does not show the point.
+
+    Example:
+        >>> import torch
+        >>> t = torch.arange(8.0, dtype=torch.float64)
+        >>> interpolated(t.square()[:, None, None].expand(-1, 1, 2), t, torch.tensor([2.5], dtype=torch.float64)).tolist()
+        [[[6.25, 6.25]]]
+    """
+    frames = len(times)
+    result = torch.full((len(at), *x.shape[1:]), torch.nan, dtype=x.dtype, device=x.device)
+    if not len(at) or not frames:
+        return result
+    after = torch.searchsorted(times, at.contiguous(), right=True).clamp(1, max(frames - 1, 1))
+    step = times.diff().median() if frames > 1 else times.new_tensor(1.0)
+    for order in reversed(ORDERS):
+        if frames < order:
+            continue
+        start = (after - order // 2).clamp(0, frames - order)
+        index = start[:, None] + torch.arange(order, device=x.device)
+        found = _lagrange(x, times, at, index, step)
+        result = torch.where(found.isnan(), result, found)
+    return result
+
+
+def _lagrange(x: Tensor, times: Tensor, at: Tensor, index: Tensor, step: Tensor) -> Tensor:
+    t = times[index]
+    apart = t[:, :, None] - t[:, None, :]
+    eye = torch.eye(index.shape[1], dtype=torch.bool, device=x.device)
+    share = torch.where(eye, 1.0, (at[:, None, None] - t[:, None, :]) / torch.where(eye, 1.0, apart))
+    weights = share.prod(-1)
+    # a frame that the moment falls on needs no neighbours
+    needed = weights.abs() > 1e-9
+    whole = (t.diff(dim=1) < GAP * step).all(-1) | (needed.sum(-1) == 1)
+    seen = torch.where(needed[:, :, None, None], x[index], 0.0)
+    found = (weights[:, :, None, None] * seen).sum(1)
+    return torch.where(whole[:, None, None] & (at >= times[0])[:, None, None] & (at <= times[-1])[:, None, None], found, torch.nan)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Which track of one camera is which of the other, once both are transferred into one frame.
+
+
+AMBIGUOUS = 0.5
+"""Of the distance to the second nearest track, above which the nearest one is not taken."""
+SAME, NEAR = 4.0, 12.0
+"""Times the residual that one point seen twice may differ along the coordinate that both cameras see, and in all: transfer
+amplifies noise three to five times."""
+SMALL, CLOSE = 0.005, 0.03
+"""The same, as shares of the extent of the points: mean places are known less well than motions."""
+
+
+def match_tracks(points: Tensor, n: int, residual: float) -> tuple[Tensor, Tensor]:
+    """Mutually nearest tracks that no other comes near to.
+
+    Args:
+        points: ``(frames, n + m, 3)``, the first coordinate seen by both cameras; NaN for points that were not found.
+        n: tracks of the first camera.
+        residual: rms difference of the first coordinate.
+
+    Returns:
+        ``(m,)`` the track of the first camera, -1 = none, and rms distances ``(n, m)``.
+
+    Example:
+        >>> import torch
+        >>> walk = torch.randn(50, 4, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        >>> match_tracks(torch.cat([walk, walk[:, [2, 0]]], dim=1), 4, 0.01)[0].tolist()
+        [2, 0]
+    """
+    first, second = points[:, :n], points[:, n:]
+    # track by track: all pairs of a long take at once do not fit into memory
+    squares = [(first - track[:, None]).square().mean(0) for track in second.unbind(1)]
+    apart = torch.stack(squares, dim=1) if squares else points.new_zeros(n, 0, 3)
+    distances, along = apart.sum(-1).sqrt(), apart[..., 0].sqrt()
+    none = torch.full((points.shape[1] - n,), -1, dtype=torch.long, device=points.device)
+    known = distances.isfinite()
+    if not bool(known.any()):
+        return none, distances
+    place = points.nanmean(0)
+    extent = float((place - place.nanmean(0)).square().sum(-1).nanmean().sqrt())
+    ranked = torch.where(known, distances, torch.inf)
+    best, track = ranked.min(0)
+    nearest = ranked.argmin(1)
+    mutual = nearest[track] == torch.arange(len(track), device=points.device)
+    other = ranked.clone()
+    other[track, torch.arange(len(track), device=points.device)] = torch.inf
+    second_best = torch.minimum(other.amin(0), other[track].amin(1))
+    same = along.nan_to_num(nan=torch.inf).gather(0, track[None])[0] <= max(SAME * residual, SMALL * extent)
+    near = best <= max(NEAR * residual, CLOSE * extent)
+    return torch.where(mutual & same & near & (best <= AMBIGUOUS * second_best), track, none), distances

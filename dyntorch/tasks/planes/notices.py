@@ -1,0 +1,339 @@
+"""Configurations of translating planes that are degenerate, or nearly so, by name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from dyntorch.core.solution import Status
+from dyntorch.geometry.homogeneous import two_sided
+from dyntorch.geometry.rigid import nearest_rotation
+from dyntorch.numerics.chi_square import quantile
+from dyntorch.numerics.nullspace import eigenvalues, spectrum
+from dyntorch.tasks.outcome import Notice, NoticeCode, notices
+from dyntorch.tasks.planes.input import Given
+
+EXACT = 1e-7
+"""Sine or ratio that is rounding error."""
+NEAR = 0.1
+"""Sine or ratio below which noise is asked whether it is zero; above, nothing is degenerate."""
+CHI_SQUARE = quantile(0.99, 2)
+"""Squared distance in standard deviations, of two degrees of freedom, exceeded once in a hundred."""
+
+MESSAGES: dict[NoticeCode, str | tuple[str, str] | dict[bool, str]] = {
+    NoticeCode.COLLINEAR_EPIPOLES: "the epipoles are within {value:.1g} of one line: all motion is parallel to one plane",
+    NoticeCode.COPLANAR_NORMALS: "the normals are within {value:.1g} of one plane: all planes are parallel to one line",
+    NoticeCode.SHARED_BODY: (
+        "a pair of planes or bodies moves alike, as of one body",
+        "{value:g} pairs of planes or bodies move alike, as of one body",
+    ),
+    NoticeCode.STATIC_BODY: (
+        "a plane does not move, or is at infinity: it has no epipole",
+        "{value:g} planes do not move, or are at infinity: they have no epipole",
+    ),
+    NoticeCode.UNUSED_PLANE: (
+        "a matrix is not finite, singular, or has too few matches; it was left out",
+        "{value:g} matrices are not finite, singular, or have too few matches; they were left out",
+    ),
+    NoticeCode.FEW_PLANES: (
+        "1 plane or body is left: give 3 planes, 2 planes and 1 body, or 2 bodies",
+        "{value:g} planes and bodies are left: give 3 planes, 2 planes and 1 body, or 2 bodies",
+    ),
+    NoticeCode.OTHER_SOLUTION: "another homography at infinity fits the {value:g} planes and bodies as well; add others",
+    NoticeCode.UNCERTAIN: "the noise leaves a relative error of {value:.2g} in the homography at infinity; add larger planes",
+    NoticeCode.NO_COMMON_INFINITY: {
+        True: "the planes and bodies differ from what one homography at infinity allows by {value:.2g} times the noise "
+        "(variances): some rotate, or are no planes; leave them out",
+        False: "one homography at infinity leaves {value:.0%} of what the homographies differ by: some rotate, or the noise is "
+        "large; leave some out, or give larger planes",
+    },
+    NoticeCode.CHANCE: "one homography at infinity leaves {value:.0%} of what the homographies differ by, as of random ones: give "
+    "more planes, larger ones, or their matches",
+    NoticeCode.INCOHERENT: "the matches are off any homographies and fundamental matrices by {value:.0%} of the extent of the "
+    "planes and bodies: check that x1 and x2 are the same points in the same order",
+    NoticeCode.CALIBRATION: "the homography at infinity makes the calibration {value:.2g} from a rotation, more than the noise "
+    "does: check K, or the planes",
+}
+"""Of each code: where the figure is 1 and where it is not, or with matches and without, where these differ."""
+POSITIONS = (NoticeCode.SHARED_BODY, NoticeCode.STATIC_BODY)
+"""What three planes do not suffice with."""
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What is known of the planes and bodies of a flat batch, in normalized coordinates.
+
+    Attributes:
+        epipoles: ``(b, c, 3)`` unit vectors.
+        epipole_covariance: ``(b, c, 3, 3)`` of them.
+        normals: ``(b, p, 3)`` unit vectors.
+        normal_covariance: ``(b, p, 3, 3)`` of them.
+        moving: ``(b, c)`` those that move, and count.
+        used: ``(b, c)`` those that count.
+    """
+
+    epipoles: Tensor
+    epipole_covariance: Tensor
+    normals: Tensor
+    normal_covariance: Tensor
+    moving: Tensor
+    used: Tensor
+
+    @cached_property
+    def line(self) -> tuple[Tensor, Tensor]:
+        """How far the epipoles are from one line ``(b,)``, and whether noise explains it."""
+        return _flatness(self.epipoles, self.epipole_covariance, self.moving)
+
+    @cached_property
+    def plane(self) -> tuple[Tensor, Tensor]:
+        """The same for the normals and one plane."""
+        return _flatness(self.normals, self.normal_covariance, self.moving[:, : self.normals.shape[1]])
+
+    def several(self) -> Tensor:
+        """Where more than one homography at infinity fits the planes, by their position ``(b,)``.
+
+        All that moves alike is one body, and two planes of it are worth its fundamental matrix.  Three bodies are enough, two if
+        both fundamental matrices are known.  A static plane adds nothing: it may as well be one more plane of any of them.
+        Four planes with collinear epipoles and coplanar normals have two solutions.
+        """
+        planes = self.normals.shape[1]
+        count, bodies = self.used[:, :planes].sum(-1), self.used[:, planes:].sum(-1)
+        groups, known = self.groups
+        parallel = (bodies == 0) & self.line[1] & self.plane[1] & (count <= 4)
+        return (groups < 2) | ((groups == 2) & (known < 2)) | parallel
+
+    @cached_property
+    def alike(self) -> Tensor:
+        """Which pairs have one epipole within the noise, ``(b, c, c)`` bool; no pair with itself."""
+        e = torch.where(self.moving[..., None], self.epipoles, 0.0)
+        sign = (e @ e.mT).sign()
+        square = (e[:, :, None] - sign[..., None] * e[:, None]).square().sum(-1)
+        spread = self.epipole_covariance.diagonal(dim1=-2, dim2=-1).sum(-1)
+        variance = (spread[:, :, None] + spread[:, None]) / 2
+        near = (square < NEAR**2) & (square <= CHI_SQUARE * (variance + EXACT**2))
+        both = self.moving[:, :, None] & self.moving[:, None]
+        return near & both & ~torch.eye(e.shape[1], dtype=torch.bool, device=e.device)
+
+    @cached_property
+    def groups(self) -> tuple[Tensor, Tensor]:
+        """How many bodies move, and of how many the fundamental matrix is known, given or from two planes; ``(b,)`` each."""
+        count = self.epipoles.shape[1]
+        near = self.alike.double()
+        reach = near + torch.eye(count, dtype=near.dtype, device=near.device)
+        for _ in range(count.bit_length()):
+            reach = (reach @ reach).sign()
+        own = torch.arange(count, device=near.device) >= self.normals.shape[1]
+        known = near.any(-1) | (own & self.moving)
+        first = self.moving & ~reach.tril(diagonal=-1).any(-1)
+        return first.sum(-1), (first & (reach @ known.double()[..., None] > 0)[..., 0]).sum(-1)
+
+
+def planes_notices(
+    figures: Figures, enough: Tensor, said: Mapping[NoticeCode, tuple[Tensor, Tensor]], given: Given
+) -> tuple[Notice, ...]:
+    """Notices on all problems, in their order.
+
+    Args:
+        figures: of the planes and bodies.
+        enough: ``(b,)`` whether there are enough of them.
+        said: further figures ``(b,)`` of the fit, and where they are worth a notice ``(b,)``.
+        given: what was fitted.
+    """
+    used, still = figures.used.sum(-1), (figures.used & ~figures.moving).sum(-1)
+    missing = figures.used.shape[1] - used
+    line, collinear = figures.line
+    plane, coplanar = figures.plane
+    pairs = figures.alike.sum((-2, -1)) // 2
+    # one or two bodies are in one line and one plane by themselves
+    several = enough & (figures.groups[0] >= 3)
+    rows = {
+        NoticeCode.UNUSED_PLANE: (missing, missing > 0),
+        NoticeCode.FEW_PLANES: (used, ~enough),
+        NoticeCode.COLLINEAR_EPIPOLES: (line, collinear & several),
+        NoticeCode.COPLANAR_NORMALS: (plane, coplanar & several),
+        NoticeCode.SHARED_BODY: (pairs, (pairs > 0) & enough),
+        NoticeCode.STATIC_BODY: (still, (still > 0) & enough),
+        **said,
+    }
+    found = []
+    for code, (values, flagged) in rows.items():
+        single, message = _message(code, given.matched)
+        three = "; three planes do not suffice then" if code in POSITIONS else ""
+        few = (used <= 3) & (figures.normals.shape[1] >= 3)
+        for text, one in ((single, values == 1), (message, values != 1)):
+            found += notices(code, text + three, values, flagged & one & few, given.batch)
+            found += notices(code, text, values, flagged & one & ~few, given.batch)
+    return tuple(sorted(found, key=lambda notice: notice.problem))
+
+
+def _message(code: NoticeCode, matched: bool) -> tuple[str, str]:
+    """The sentence where the figure is 1, and where it is not."""
+    message = MESSAGES[code]
+    if isinstance(message, dict):
+        message = message[matched]
+    return message if isinstance(message, tuple) else (message, message)
+
+
+def _flatness(vectors: Tensor, covariance: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
+    """Smallest over largest singular value ``(b,)`` of at least three vectors, and whether it is 0 within the noise."""
+    kept = torch.where(count[..., None], vectors, 0.0)
+    values, directions = spectrum(kept.mT @ kept)
+    ratio = (values[:, 0].clamp(min=0) / values[:, 2].clamp(min=1e-30)).sqrt()
+    across = directions[:, None, :, 0]
+    distance = (kept * across).sum(-1)
+    variance = (across[..., None, :] @ covariance @ across[..., :, None])[..., 0, 0]
+    square = (distance.square() / (variance + EXACT**2)).sum(-1)
+    spare = (count.sum(-1) - 2).clamp(min=1)
+    return ratio, (count.sum(-1) >= 3) & (ratio < NEAR) & (square <= CHI_SQUARE * spare)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# What speaks against a fit of translating planes: a residual that noise does not explain, and a calibration that does not fit.
+
+
+SPREAD = 0.4
+"""Noise that the residuals show, over what it would be without epipoles and normals, from which on no homography at infinity is
+common to the planes.  Of 1200 scenes of 4, 5 and 8 planes, 40 matches in 120 pixels each, the largest is 0.37 at 0.5 and 1 px."""
+CHANCE, NARROW = 0.43, 0.62
+"""The same, from which on random homographies near any common one would do as well: the first less the second over the root of the
+residuals to spare.  Of such random ones a twentieth stays below 0.15, 0.20, 0.24, 0.28 and 0.34 (4, 5, 6, 8 and 12 planes; 150
+times each); of the scenes nine in ten below 0.18, 0.18, 0.16, 0.15 at 0.5 px and 0.23, 0.24, 0.25, 0.24 at 1 px (4, 5, 6, 8 of
+them)."""
+ENTRIES = 0.065
+"""Noise of the entries of homographies of norm 1 in normalized coordinates, the same; there it is 0.059 at most."""
+UNLIKELY = 3.09
+"""Normal deviate of the F ratio, exceeded once in a thousand, from which on one homography at infinity is not common to matched
+planes.  The largest of 60 scenes of 4, 6 and 8 planes at 0.5 px: 1.6.  Planes that turn by themselves by 3 degrees: 1 to 12."""
+DOUBTFUL = 2.33
+"""The same, exceeded once in a hundred, from which on the ratio is taken for an error of the model."""
+VAGUE = 0.25
+"""Noise of the matches over the extent of their planes and bodies from which on they are no matches: 0.03 at 1 px in 120 pixels,
+0.4 to 0.5 where they are random."""
+LEAST = 8
+"""Residuals of the separate matrices to spare from which on these say what the noise is."""
+ROUNDING = 1e-5
+"""Residual in normalized coordinates that single precision may leave."""
+TURNED = 0.01
+"""Distance from a rotation that a calibration to two or three digits leaves."""
+SMALL = 0.01
+"""Deviation from which on four planes do not tell."""
+DEVIATIONS = 8.0
+"""Standard deviations of that distance that noise is believed to reach."""
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """What speaks against one homography at infinity for all, ``(b,)`` each.
+
+    Attributes:
+        ratio: with matches, the F ratio: what the cost grows by over that of their own matrices, per parameter less, over the
+            variance of the noise left under these.  With homographies alone, the noise that the residuals show over that which a
+            single homography for all would leave.
+        excess: variance of what one homography at infinity leaves over that of the noise, 1 where these may be the same.
+        apart: whether noise does not explain the ratio.
+        chance: whether random homographies would have it as well.  Three have one residual to spare, which says nothing.
+        vagueness: noise of the matches over the extent of what they are of; 0 without matches.
+        vague: whether they agree with any homographies and fundamental matrices as badly.
+    """
+
+    ratio: Tensor
+    excess: Tensor
+    apart: Tensor
+    chance: Tensor
+    vagueness: Tensor
+    vague: Tensor
+
+
+def misfit(given: Given, cost: Tensor, separate: Tensor) -> Misfit:
+    r"""How far the planes and bodies are from one homography at infinity, and whether noise does not explain it.
+
+    Args:
+        given: what was fitted.
+        cost: ``(b,)`` of the fit.
+        separate: ``(b,)`` cost of the matches under the given matrices; zero without matches.
+    """
+    rows, spare = given.rows()
+    sigma, used = (cost / spare.clamp(min=1)).sqrt(), given.used()
+    p = given.homographies.shape[1]
+    if given.matched:
+        planes, bodies = used[:, :p].sum(-1), used[:, p:].sum(-1)
+        free = rows - 8 * planes - 7 * bodies
+        variance = (separate / free.clamp(min=1)).clamp(min=(ROUNDING / given.frames[1][:, 0, 0]) ** 2)
+        more = (spare - free).clamp(min=1)
+        ratio = (cost - separate) / more / variance
+        told, unusual = (free >= LEAST) & (spare > free), deviate(ratio, more, free.clamp(min=1))
+        excess = torch.where(told & (unusual > DOUBTFUL), ratio, 1.0)
+        apart = told & (unusual > UNLIKELY)
+        # the given matrices may fit badly where they are linear, and the common ones where none is common
+        vagueness = sigma.minimum(variance.sqrt()) / _extent(given).clamp(min=torch.finfo(sigma.dtype).tiny)
+        return Misfit(ratio, excess, apart, torch.zeros_like(apart), vagueness, (vagueness > VAGUE) & (spare > 0))
+    entries = given.homographies.flatten(-2)
+    different = used[:, :p].sum(-1) - eigenvalues(entries.mT @ entries)[:, -1]
+    ratio = sigma / (different / (rows - 8).clamp(min=1)).clamp(min=torch.finfo(sigma.dtype).tiny).sqrt()
+    told = (spare > 1) & (used[:, p:].sum(-1) == 0) & (sigma > ROUNDING)
+    chance = told & (ratio > CHANCE - NARROW / spare.clamp(min=1).sqrt())
+    apart = told & ((ratio > SPREAD) | (sigma > ENTRIES))
+    return Misfit(ratio, torch.ones_like(ratio), apart, chance, torch.zeros_like(ratio), torch.zeros_like(told))
+
+
+def deviate(ratio: Tensor, above: Tensor, below: Tensor) -> Tensor:
+    """Normal deviate that an F ratio is exceeded as often as, by its degrees of freedom above and below.
+
+    Source: Paulson 1942, An approximate normalization of the analysis of variance distribution.
+    """
+    a, b = 2 / (9 * above), 2 / (9 * below)
+    root = ratio.clamp(min=0).pow(1 / 3)
+    return ((1 - b) * root - (1 - a)) / (b * root.square() + a).sqrt()
+
+
+def _extent(given: Given) -> Tensor:
+    """Root mean square distance per coordinate ``(b,)`` of matches from the middle of their plane or body, in the view where it is
+    less, in the unit of the matches."""
+    found = []
+    for view, frame in enumerate(given.frames):
+        square, count = torch.zeros_like(frame[:, 0, 0]), torch.zeros_like(frame[:, 0, 0])
+        for seen in (given.planes, given.bodies):
+            w = seen.weights[..., None]
+            middle = (w * seen.views[view]).sum(-2, keepdim=True) / w.sum(-2, keepdim=True).clamp(min=1)
+            square = square + (w * (seen.views[view] - middle).square()).flatten(1).sum(-1)
+            count = count + 2 * w.flatten(1).sum(-1)
+        found.append((square / count.clamp(min=1)).sqrt() / frame[:, 0, 0])
+    return torch.stack(found).amin(0)
+
+
+def turned(given: Given, infinity: Tensor, covariance: Tensor, status: Tensor) -> tuple[Tensor, Tensor]:
+    r"""Distance ``(b,)`` of :math:`K_2^{-1} H_\infty K_1`, of determinant 1, from a rotation, and whether noise is no reason.
+
+    Args:
+        given: with the calibration, or without one.
+        infinity: ``(b, 9)`` homography at infinity in normalized coordinates, of any scale.
+        covariance: ``(b, 9, 9)`` of it, its scale held.
+        status: ``(b,)``; only where it is OK anything is said.
+    """
+    if given.calibration is None:
+        return torch.zeros_like(infinity[:, 0]), torch.zeros_like(status, dtype=torch.bool)
+    first, second = given.calibration.unbind(1)
+    before = given.frames[0] @ first
+    after = torch.linalg.inv_ex(given.frames[1] @ second)[0]
+    moved = after @ infinity.unflatten(-1, (3, 3)) @ before
+    det = torch.linalg.det(moved)
+    scale = (det.sign() * det.abs().clamp(min=torch.finfo(det.dtype).tiny).pow(1 / 3))[:, None, None]
+    rotation = nearest_rotation(moved / scale)
+    eye = torch.eye(3, dtype=moved.dtype, device=moved.device)
+    distance = torch.linalg.matrix_norm(moved / scale - rotation)
+    # the symmetric part of R^T M, without its trace, is what no rotation and no scale takes up
+    lift = two_sided(rotation.mT @ after, before).unflatten(1, (3, 3)) / scale[..., None]
+    lift = (lift + lift.transpose(1, 2)) / 2
+    lift = lift - eye[:, :, None] * torch.einsum("biij->bj", lift)[:, None, None] / 3
+    lift = lift.flatten(1, 2)
+    deviation = (lift @ covariance @ lift.mT).diagonal(dim1=-2, dim2=-1).sum(-1).clamp(min=0).sqrt()
+    # from one residual, as of three planes, nobody knows the noise
+    known = (status == Status.OK) & (given.rows()[1] > 1)
+    # the fit of four small planes may be another minimum, far from what its covariance says
+    used, p = given.used(), given.homographies.shape[1]
+    known = known & ((used[:, :p].sum(-1) >= 5) | used[:, p:].any(-1) | (deviation < SMALL))
+    return distance, known & (distance > TURNED) & (distance > DEVIATIONS * deviation)

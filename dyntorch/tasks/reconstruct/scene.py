@@ -1,0 +1,359 @@
+"""From projections of P^k to the scene: the upgrade by the lifts, structured bundle adjustment, and the frame that is shown."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from dyntorch.core.solution import Status, failed
+from dyntorch.geometry.bundle import bundle_adjust, point_information
+from dyntorch.geometry.lift import balanced, balanced_algebra, behind, centred, finite, gauge_algebra, moved, steady, upgrade
+from dyntorch.geometry.pairs import hyperplane_pair, two_bodies
+from dyntorch.geometry.triangulation import reproject, resect, triangulate, unit_projections
+from dyntorch.tasks.reconstruct.motions import Motion
+from dyntorch.tasks.reconstruct.projections import Projections, Tracks, camera_unknowns, choices, projections_of_tracks
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Starts of structured bundle adjustment that need no tensor: the scene as if it stood still, in several frames.
+
+
+REST = 1e-8
+"""Of the lifts: below it constants of a point do not change its position."""
+VIEWS = 4
+"""Of the tensor of the scene at rest."""
+WINDOWS = (6, 5)
+"""Views that are taken at once, in turn.  Of 30 scenes of constant velocity, 8, 9 and 12 views with gaps of 20 to 25 %, most with
+too few points common to any four views, 28 are found and 2 given up."""
+TILT = 0.25
+"""Standard deviation of the hyperplane at infinity of further frames, for points of unit variance."""
+
+
+def middle(times: Tensor, number: int = 0) -> Tensor:
+    """Indices of the views in the middle of the time, during which nothing moves far; all, where they are few."""
+    count = len(times) if len(times) <= WINDOWS[0] else WINDOWS[number % len(WINDOWS)]
+    first = (len(times) - count) // 2
+    return times.argsort()[first : first + count].sort().values
+
+
+def resting_constants(lifts: Tensor) -> Tensor:
+    """Orthonormal ``(K, a + 1)`` constants of the points that do not move; of no columns where not all positions are theirs."""
+    change = (lifts - lifts.mean(0)).flatten(0, 1)
+    _, values, vh = torch.linalg.svd(change, full_matrices=True)
+    still = vh[int((values > REST * lifts.norm()).sum()) :].mT
+    return still if still.shape[-1] >= lifts.shape[-2] else still[:, :0]
+
+
+def resting(tracks: Tracks, sensor: int, dim: int) -> Tensor:
+    """The cameras ``(b, views, l + 1, dim + 1)`` that explain tracks best if no point moves, points finite and of unit variance.
+
+    Where motion is slow against the extent of the scene they are near the truth, whatever the motion model.
+
+    Args:
+        tracks: flat batch.
+        sensor: dimension l of the views.
+        dim: dimension of the world.
+    """
+    eye = torch.eye(dim + 1, dtype=tracks.x.dtype, device=tracks.x.device)
+    views = tracks.x.shape[1]
+    still = Motion(lambda time: torch.eye(dim + 1, dtype=torch.float64), sensor=sensor, static=True)
+    invariant = still.tensor(min(views, VIEWS if dim + 1 > sensor + 1 else 2))
+    found = projections_of_tracks(tracks, invariant, choices(tracks, len(invariant.profile))[:, :1])
+    lifts = eye.expand(views, -1, -1)
+    known = (found.structure != 0).any(-1).to(tracks.x.dtype)
+    G, cameras, structure = finite(found.projections, found.structure, lifts, gauge_algebra(lifts), tracks.weights)
+    cameras, structure = moved(G, cameras, structure, lifts)
+    cameras, _ = moved(centred(structure, lifts, known), cameras, structure, lifts)
+    return cameras
+
+
+def tilted(cameras: Tensor, number: int) -> Tensor:
+    """Cameras of the resting scene in one of many frames: the first as nearly affine as it can be, the others with the infinite
+    tilted."""
+    size = cameras.shape[-1]
+    frame = torch.eye(size, dtype=torch.float64)
+    if number:
+        frame[-1, :-1] = TILT * torch.randn(size - 1, generator=torch.Generator().manual_seed(number), dtype=torch.float64)
+    return cameras @ frame.to(cameras)
+
+
+STRUCTURED, FINE = 60, 1e-7
+"""At most so many steps of structured bundle adjustment, and the share of the cost that the last one gains."""
+SEVERAL = 7
+"""Size K of the space of the constants from which on one start is not enough.  Of 20 scenes, 4 views of 60 points, the start from
+the tensor misses the minimum in 5 (constant velocity, 0.5 px) and 20 (weak constant acceleration in a plane, 1 px), that of the
+scene at rest in 1 and 0, and both together in none; below P^6 the first reaches it in all."""
+SPARE = 6
+"""Spare coordinates per point beyond which the start from the tensor is enough in those spaces as well: of 20 scenes it misses the
+minimum in up to 18 with 5 views and 1 with 6, in none with 7, 8 and 12."""
+FRAMES, UNAIDED = 3, 6
+"""Starts from the scene at rest, at most: next to that from the tensor, and without one."""
+BEHIND = 0.05
+"""Share of points behind cameras from which on a scene is not believed: wrong minima have a tenth to a half of them there."""
+AIDED = {2: 6, 3: 12}
+"""Points known to stand still and seen by all views, half as many more as determine the cameras, from which on they do: in a plane
+and in space."""
+SAME, EXACT = 1e-2, 1e-22
+"""Relative difference of the costs of the same minimum, and of costs that are only rounding, per observation."""
+
+
+@dataclass(frozen=True)
+class Lifting:
+    """A motion model at the times of the views, in coordinates of :math:`P^k` in which neither the unit nor the origin of time
+    matters."""
+
+    motion: Motion
+    lifts: Tensor
+    """``(views, a + 1, K)`` with orthonormal columns in all."""
+    root: Tensor
+    """``(K, K)``: Y in these coordinates is root times Y of the model."""
+    back: Tensor
+    """``(K, K)`` its inverse."""
+    start: Tensor
+    """``(a + 1, K)`` the lift at time 0 in these coordinates."""
+    slope: Tensor
+    """``(a + 1, K)`` its derivative."""
+    middle: Tensor
+    """``(a + 1, K)`` the lift at the mean time of the views."""
+    algebra: Tensor
+    """``(dim, K, K)`` the ambiguity."""
+    still: Tensor
+    """``(K, a + 1)`` orthonormal: the constants of points that stand still; of no columns where none can."""
+
+    @classmethod
+    def of(cls, motion: Motion, times: Tensor, like: Tensor) -> Lifting:
+        """The motion at these times, on the device of ``like``."""
+        span = float(times.max() - times.min()) / max(1, len(times) - 1)
+        even, shift, origin = motion.centred(times)
+        lifts, root = balanced(even)
+        inverse = torch.linalg.inv(root)
+        start, slope = motion.lifts([-origin])[0] @ inverse, motion.slope(-origin, span or 1.0) @ inverse
+        middle = motion.lifts([float(times.mean()) - origin])[0] @ inverse
+        # a shift is inverted exactly by the opposite one, however far
+        back = (torch.eye(len(root), dtype=root.dtype) if motion.shift is None else motion.shift(-origin)) @ inverse
+        parts = (lifts, root @ shift, back, start, slope, middle, balanced_algebra(lifts), resting_constants(lifts))
+        return cls(motion, *(part.to(like) for part in parts))
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Cameras and points of a scene, normalized images."""
+
+    cameras: Tensor
+    """``(b, views, l + 1, a + 1)``."""
+    structure: Tensor
+    """``(b, n, K)``, zero where a point is not determined."""
+    cost: Tensor
+    """``(b,)``."""
+
+
+def scene_of(tracks: Tracks, found: Projections, lifting: Lifting, scale: Tensor | None = None) -> Scene:
+    """Cameras and points from projections in a projective frame, and from the scene as if it stood still where that is safer.
+
+    The second start is taken in high spaces with few spare images (:data:`SEVERAL`, :data:`SPARE`), and where no views have
+    enough points in common for the tensor.
+
+    Args:
+        tracks: flat batch.
+        found: projections and points.
+        lifting: the model.
+        scale: ``(b,)`` robust scale of normalized, weighted images; None: least squares.
+
+    Returns:
+        Scene, of infinite cost where none was found.
+    """
+    lost = failed(found.status)
+    aided = _aided(tracks, lifting)
+    coordinates = (tracks.weights > 0).sum(1) * tracks.x.shape[-1]
+    size = lifting.lifts.shape[-1]
+    known = torch.where(lost[:, None], coordinates >= size - 1, (found.structure != 0).any(-1))
+    scene = _scene(tracks, _upgraded(found, lost, lifting), known & ~lost[:, None], lifting, scale)
+    scene = Scene(scene.cameras, scene.structure, torch.where(lost, torch.inf, scene.cost))
+    spare = (coordinates * known).sum(-1) - (size - 1) * known.sum(-1)
+    shaky = ~lost & (size >= SEVERAL) & (spare <= SPARE * known.sum(-1))
+    shaky = shaky | (~lost & wild(tracks, _finite(tracks, scene, lifting), lifting))
+    unknown = camera_unknowns(tracks.x.shape[1], tracks.x.shape[-1] + 1, lifting.lifts.shape[1], len(lifting.algebra) - 1)
+    unaided = (found.status == Status.TOO_FEW) & (spare > unknown)
+    left = (shaky | unaided | aided).nonzero()[:, 0] if lifting.still.shape[-1] else lost.new_zeros(0, dtype=torch.long)
+    return _confirmed(tracks, scene, left, known, lifting, scale) if len(left) else scene
+
+
+def wild(tracks: Tracks, scene: Scene, lifting: Lifting) -> Tensor:
+    """Problems ``(b,)`` with so many points behind cameras that the scene, in a finite frame, is that of a wrong minimum."""
+    if tracks.x.shape[-1] != 2:
+        return torch.zeros_like(scene.cost, dtype=torch.bool)
+    known = (scene.structure != 0).any(-1)
+    count = (behind(scene.cameras, scene.structure, lifting.lifts, tracks.weights) & known).sum(-1)
+    return count > (BEHIND * known.sum(-1)).clamp(min=2)
+
+
+def _aided(tracks: Tracks, lifting: Lifting) -> Tensor:
+    """Problems ``(b,)`` whose cameras follow from the points known to stand still."""
+    if tracks.static is None or lifting.motion.static or not lifting.still.shape[-1]:
+        return torch.zeros_like(tracks.x[:, 0, 0, 0], dtype=torch.bool)
+    resting = (tracks.weights > 0) & tracks.static[:, None]
+    return resting.all(1).sum(-1) >= AIDED[min(lifting.motion.dim, 3)]
+
+
+def _upgraded(found: Projections, lost: Tensor, lifting: Lifting) -> Tensor:
+    """Cameras; of lost problems anything finite."""
+    return upgrade(torch.where(lost[:, None, None, None], 1.0, found.projections), lifting.lifts)[1]
+
+
+def _scene(tracks: Tracks, cameras: Tensor, known: Tensor, lifting: Lifting, scale: Tensor | None) -> Scene:
+    """The scene that adjustment finds from some cameras, with the known points ``(b, n)``."""
+    structure = triangulate(cameras @ lifting.lifts, tracks.x, tracks.weights)
+    start = Scene(cameras, torch.where(known[..., None], structure, 0.0), torch.zeros_like(tracks.x[:, 0, 0, 0]))
+    done = adjusted(tracks, start, lifting, scale)
+    # a point that was lost costs the extent of the image
+    gone = known & (done.structure == 0).all(-1)
+    return Scene(done.cameras, done.structure, done.cost + (tracks.weights * gone[:, None]).flatten(1).sum(-1))
+
+
+def _confirmed(tracks: Tracks, scene: Scene, left: Tensor, known: Tensor, lifting: Lifting, scale: Tensor | None) -> Scene:
+    """The scenes of least cost among those of several starts: further ones until two of them end in the same minimum."""
+    cameras, structure, cost = scene.cameras.clone(), scene.structure.clone(), scene.cost.clone()
+    seen = cost[left].isfinite().long()
+    alone = left[seen == 0]
+    floor = EXACT * (tracks.weights > 0).flatten(1).sum(-1)
+    for number in range(UNAIDED):
+        some = None if scale is None else scale[left]
+        fresh = _scene(tracks.subset(left), _started(tracks.subset(left), number, lifting, some), known[left], lifting, some)
+        least = cost[left]
+        near = fresh.cost <= least * (1 + SAME) + floor[left]
+        seen = torch.where(fresh.cost * (1 + SAME) + floor[left] < least, 1, seen + near)
+        better = fresh.cost < least
+        taken = left[better]
+        cameras[taken], structure[taken], cost[taken] = fresh.cameras[better], fresh.structure[better], fresh.cost[better]
+        doubt = (seen < 2) & (torch.isin(left, alone) | (number + 1 < FRAMES))
+        left, seen = left[doubt], seen[doubt]
+        if not len(left):
+            break
+    # without a tensor and without points known to stand still only what was found twice counts
+    cost[left[torch.isin(left, alone) & ~_aided(tracks, lifting)[left]]] = torch.inf
+    return Scene(cameras, structure, cost)
+
+
+def _started(tracks: Tracks, number: int, lifting: Lifting, scale: Tensor | None) -> Tensor:
+    """Cameras of all views from those of the scene at rest; of a part of many views: adjusted, the others by resection."""
+    aided = bool(_aided(tracks, lifting).all())
+    window = middle(tracks.times, number)
+    near = tracks.at(window)
+    near = near.resting() if aided else near
+    cameras = tilted(resting(near, lifting.motion.sensor, lifting.motion.dim), number)
+    if len(window) == tracks.x.shape[1]:
+        return cameras
+    some = replace(lifting, lifts=lifting.lifts[window])
+    part = _scene(tracks.at(window), cameras, torch.ones_like(tracks.weights[:, 0], dtype=torch.bool), some, scale)
+    whole = resect(part.structure, tracks.x, tracks.weights, lifts=lifting.lifts)
+    return whole.index_copy(1, window.to(whole.device), part.cameras)
+
+
+def adjusted(tracks: Tracks, scene: Scene, lifting: Lifting, scale: Tensor | None = None) -> Scene:
+    """Structured bundle adjustment."""
+    confined = tracks.static if lifting.still.shape[-1] else None
+    done = bundle_adjust(
+        tracks.x,
+        tracks.weights,
+        scene.cameras,
+        scene.structure,
+        lifting.lifts,
+        iterations=STRUCTURED,
+        scale=scale,
+        tolerance=FINE,
+        confined=confined,
+        subspace=None if confined is None else lifting.still,
+    )
+    return Scene(done.cameras, done.structure, done.cost)
+
+
+def framed(tracks: Tracks, scene: Scene, lifting: Lifting) -> Scene:
+    """The scene in its frame: finite, with no motion common to all points (to the static ones), centred, of unit size.
+
+    Args:
+        tracks: flat batch.
+        scene: of :func:`scene_of`.
+        lifting: the model.
+    """
+    lifts, static = lifting.lifts, tracks.static
+    known = (scene.structure != 0).any(-1)
+    scene = _finite(tracks, scene, lifting)
+    cameras, structure = scene.cameras, scene.structure
+    weights = known if static is None else torch.where((known & static).any(-1, keepdim=True), known & static, known)
+    G = steady(structure, lifts, lifting.middle, lifting.algebra, weights.to(structure.dtype))
+    cameras, structure = moved(G, cameras, structure, lifts)
+    G = centred(structure, lifts, known.to(structure.dtype))
+    cameras, structure = moved(G, cameras, structure, lifts)
+    depth = structure @ lifts[0, -1]
+    structure = structure / torch.where(depth.abs() > 1e-12, depth, 1.0)[..., None]
+    return Scene(unit_projections(cameras), structure, scene.cost)
+
+
+def _finite(tracks: Tracks, scene: Scene, lifting: Lifting) -> Scene:
+    """The scene in a frame in which all points are finite, if there is one."""
+    G, cameras, structure = finite(scene.cameras, scene.structure, lifting.lifts, lifting.algebra, tracks.weights)
+    return Scene(*moved(G, cameras, structure, lifting.lifts), scene.cost)
+
+
+def positions(structure: Tensor, lift: Tensor) -> Tensor:
+    """Inhomogeneous positions ``(b, n, d)`` under one lift; NaN where a point is not determined."""
+    homogeneous = structure @ lift.mT
+    known = (structure != 0).any(-1, keepdim=True)
+    return torch.where(known, homogeneous[..., :-1] / homogeneous[..., -1:], torch.nan)
+
+
+def velocities(structure: Tensor, lift: Tensor, slope: Tensor) -> Tensor:
+    """Their derivative by the time, by the quotient rule, ``(b, n, d)``."""
+    place, change = structure @ lift.mT, structure @ slope.mT
+    known = (structure != 0).any(-1, keepdim=True)
+    moving = (change[..., :-1] - place[..., :-1] / place[..., -1:] * change[..., -1:]) / place[..., -1:]
+    return torch.where(known, moving, torch.nan)
+
+
+def distances(tracks: Tracks, projections: Tensor, structure: Tensor) -> Tensor:
+    """Reprojection distances ``(b, views, n)`` in the unit of the measurements; NaN where missing or not determined."""
+    error = (tracks.x - reproject(projections, structure)).norm(dim=-1) / tracks.scales[..., None]
+    known = (structure != 0).any(-1)[:, None] & (tracks.weights > 0)
+    return torch.where(known, error, torch.nan)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Two bodies in relative translation: labels, cameras of each, and their points.
+
+
+STEPS = 60
+"""Of bundle adjustment."""
+
+
+def bodies_of(tracks: Tracks, scene: Scene) -> tuple[Tensor, Tensor, Tensor, Scene]:
+    """Labels by the two hyperplanes of the points, and the affine structure of each body.
+
+    Args:
+        tracks: flat batch.
+        scene: projections (as cameras) and points in any projective frame.
+
+    Returns:
+        cameras of both bodies ``(b, 2, views, m, d + 1)``, points ``(b, n, d)``, labels ``(b, n)``, and the adjusted scene with
+        every point on the hyperplane of its body.
+    """
+    done = bundle_adjust(tracks.x, tracks.weights, scene.cameras, scene.structure, iterations=STEPS)
+    known = (done.structure != 0).any(-1)
+    information = point_information(done.cameras, done.structure, tracks.weights)
+    pair = hyperplane_pair(done.structure, known.to(done.structure.dtype), information=information)
+    structure = _on_hyperplanes(tracks, done.cameras, pair.hyperplanes, pair.labels)
+    bodies = two_bodies(done.cameras, structure, pair.hyperplanes, pair.labels)
+    points = torch.where(known[..., None], bodies.points, torch.nan)
+    return bodies.cameras, points, pair.labels, Scene(done.cameras, structure, done.cost)
+
+
+def _on_hyperplanes(tracks: Tracks, cameras: Tensor, hyperplanes: Tensor, labels: Tensor) -> Tensor:
+    """The points, each triangulated within the hyperplane of its body."""
+    total = torch.zeros_like(labels[..., None] * hyperplanes[:, :1, :])
+    for body in (1, 2):
+        # an orthonormal basis of the hyperplane: the last columns of a complete QR
+        basis = torch.linalg.qr(hyperplanes[:, body - 1, :, None], mode="complete")[0][..., 1:]
+        mine = (labels == body)[..., None]
+        inside = triangulate(cameras @ basis[:, None], tracks.x, tracks.weights * mine.mT, steps=2)
+        total = torch.where(mine, inside @ basis.mT, total)
+    return total

@@ -1,0 +1,373 @@
+"""The steps of a reconstruction: projections, scene, outliers, frame, labels, notices."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import NamedTuple, TypeVar
+
+import torch
+from torch import Tensor
+
+from dyntorch.core.solution import Status, agreed, failed
+from dyntorch.geometry.bundle import bundle_adjust
+from dyntorch.geometry.triangulation import triangulate, unit_projections
+from dyntorch.numerics.chi_square import quantile
+from dyntorch.tasks.outcome import NoticeCode, notices
+from dyntorch.tasks.reconstruct.diagnosis import diagnose, least_squares, spare, unknowns
+from dyntorch.tasks.reconstruct.motions import MOTIONS, Motion
+from dyntorch.tasks.reconstruct.projections import Projections, Tracks, projections_of_tracks
+from dyntorch.tasks.reconstruct.result import Ranked, Reconstruction
+from dyntorch.tasks.reconstruct.robust import robust_projections, suspicious, trimmed, unfounded
+from dyntorch.tasks.reconstruct.scene import Lifting, Scene, adjusted, bodies_of, distances, framed, positions, scene_of, velocities
+
+Part = TypeVar("Part", Projections, Scene)
+
+CORRECTIONS = 4
+"""Times that points said to stand still are looked at."""
+EXACT = 1e-18
+"""Square of the noise, over that of the extent of the image, that exact data are taken to have."""
+
+
+def solve(
+    tracks: Tracks,
+    motion: Motion,
+    static: Tensor | None,
+    limit: float | None,
+    generator: torch.Generator | None,
+    batch: tuple[int, ...],
+) -> Reconstruction:
+    """Reconstruct a flat batch of checked problems.
+
+    Args:
+        tracks: flat batch.
+        motion: the model.
+        static: ``(b, n)`` bool.
+        limit: three standard deviations of the noise; None: estimated; infinite: no outliers.
+        generator: of random samples.
+        batch: the shape that the flat dimension comes from.
+    """
+    lifting = None if motion.lift is None else Lifting.of(motion, tracks.times, tracks.x)
+    tracks = replace(tracks, static=static)
+    views = motion.views(tracks.times)
+    invariant = motion.tensor(min(views, motion.k + 1))
+    found = projections_of_tracks(tracks, invariant)
+    found, scene = _scene(tracks, found, lifting)
+    if lifting is not None and static is not None and not motion.static:
+        tracks, scene = _corrected(tracks, scene, lifting)
+    free = unknowns(tracks, motion)
+    doubt = suspicious(tracks, _distances(tracks, scene, lifting), free, limit) | failed(found.status)
+    chosen = doubt.nonzero()[:, 0] if limit != float("inf") else doubt.nonzero()[:0, 0]
+    if lifting is not None and len(chosen):
+        again, fewer, fine = trimmed(tracks.subset(chosen), _part(scene, chosen), lifting, free[chosen], limit)
+        fine = fine & ~failed(found.status[chosen])
+        tracks = tracks.only(tracks.weights.index_copy(0, chosen[fine], fewer.weights[fine]))
+        scene = _merged(scene, _part(again, fine), chosen[fine])
+        chosen = chosen[~fine]
+    if len(chosen):
+        some, fewer = robust_projections(tracks.subset(chosen), invariant, lifting, limit, generator)
+        some, again = _scene(fewer, some, lifting)
+        tracks = tracks.only(tracks.weights.index_copy(0, chosen, fewer.weights))
+        found = _merged(found, some, chosen)
+        scene = _merged(scene, again, chosen)
+    return _result(tracks, motion, lifting, found, scene, static, batch)
+
+
+def _corrected(tracks: Tracks, scene: Scene, lifting: Lifting) -> tuple[Tracks, Scene]:
+    """The scene without points said to stand still that move, a few at a time, and the tracks with the others."""
+    for _ in range(CORRECTIONS):
+        assert tracks.static is not None
+        wrong = unfounded(tracks, _distances(tracks, scene, lifting), unknowns(tracks, lifting.motion))
+        left = (wrong.any(-1) & scene.cost.isfinite()).nonzero()[:, 0]
+        if not len(left):
+            break
+        tracks = replace(tracks, static=tracks.static & ~wrong)
+        some = tracks.subset(left)
+        structure = triangulate(scene.cameras[left] @ lifting.lifts, some.x, some.weights)
+        again = adjusted(some, Scene(scene.cameras[left], structure, scene.cost[left]), lifting)
+        scene = _merged(scene, again, left)
+    return tracks, scene
+
+
+def _scene(tracks: Tracks, found: Projections, lifting: Lifting | None) -> tuple[Projections, Scene]:
+    """With a lift the scene in any of its frames; bodies stay in the projective one, with their projections for cameras."""
+    if lifting is not None:
+        scene = scene_of(tracks, found, lifting)
+        # no tensor: too few points in common, or too like each other; but a scene was found without it
+        status = torch.where(failed(found.status) & scene.cost.isfinite(), int(Status.OK), found.status)
+        return Projections(found.projections, found.structure, status), scene
+    done = bundle_adjust(tracks.x, tracks.weights, found.projections, found.structure)
+    return found, Scene(done.cameras, done.structure, done.cost)
+
+
+def _merged(old: Part, new: Part, chosen: Tensor) -> Part:
+    """Results of some problems in their places."""
+    return type(old)(*(a.index_copy(0, chosen, b) for a, b in zip(vars(old).values(), vars(new).values(), strict=True)))
+
+
+def _part(whole: Part, keep: Tensor) -> Part:
+    """Some problems."""
+    return type(whole)(*(part[keep] for part in vars(whole).values()))
+
+
+def _distances(tracks: Tracks, scene: Scene, lifting: Lifting | None) -> Tensor:
+    return distances(tracks, scene.cameras if lifting is None else scene.cameras @ lifting.lifts, scene.structure)
+
+
+def _result(
+    tracks: Tracks,
+    motion: Motion,
+    lifting: Lifting | None,
+    found: Projections,
+    scene: Scene,
+    given: Tensor | None,
+    batch: tuple[int, ...],
+) -> Reconstruction:
+    """Frame, labels, residuals and notices of solved problems, in the caller's batch."""
+    bodies = None
+    if lifting is None:
+        bodies, points, labels, scene = bodies_of(tracks, scene)
+        cameras, speed, projections = bodies[:, 0], None, scene.cameras
+        structure, status = scene.structure, found.status
+    else:
+        scene = framed(tracks, scene, lifting)
+        projections = scene.cameras @ lifting.lifts
+        known = (scene.structure != 0).any(-1)
+        labels = torch.where(known, 2, 0)
+        if tracks.static is not None:
+            rests = tracks.static.any(-1, keepdim=True) & _rests(tracks, scene, lifting, projections)
+            labels = torch.where(known & (tracks.static | rests), 1, labels)
+        status = found.status
+        cameras, structure = scene.cameras, scene.structure @ lifting.back.mT
+        points = positions(scene.structure, lifting.start)
+        speed = velocities(scene.structure, lifting.start, lifting.slope)
+    apart = distances(tracks, projections, scene.structure)
+    counted = apart.isfinite()
+    total = torch.where(counted, apart.square(), 0.0).flatten(1).sum(-1)
+    number = counted.flatten(1).sum(-1)
+    sigma = (total / spare(tracks, counted, motion).clamp(min=1)).sqrt()
+    back = torch.linalg.inv(tracks.transforms)
+    status, warnings = diagnose(tracks, scene, lifting, motion, status, sigma, batch)
+    if given is not None and tracks.static is not None:
+        wrong = (given & ~tracks.static).sum(-1)
+        text = "{value:g} points given as static move, and are taken as moving; take them off static="
+        warnings += tuple(notices(NoticeCode.STATIC_MOVES, text, wrong, wrong > 0, batch))
+    bad = failed(status)
+
+    def shaped(value: Tensor, none: float = 0.0) -> Tensor:
+        wide = bad[(..., *[None] * (value.ndim - 1))]
+        return torch.where(wide, torch.full_like(value, none), value).reshape((*batch, *value.shape[1:]))
+
+    nan = float("nan")
+    return Reconstruction(
+        motion=motion,
+        cameras=shaped(unit_projections(back @ cameras)),
+        points=shaped(points, nan),
+        velocities=None if speed is None else shaped(speed, nan),
+        labels=shaped(torch.where(agreed(status)[:, None], labels, 0)),
+        residual=shaped((total / number.clamp(min=1)).sqrt()),
+        residuals=shaped(apart, nan),
+        sigma=shaped(sigma),
+        status=status.reshape(batch),
+        structure=shaped(structure),
+        projections=shaped(unit_projections(back @ (projections if lifting is None else projections @ lifting.root))),
+        inliers=shaped(counted),
+        times=tracks.times,
+        ambiguity=_open(motion, tracks.times, tracks.static),
+        warnings=warnings,
+        bodies=None if bodies is None else shaped(unit_projections(back[:, None] @ bodies)),
+    )
+
+
+def _rests(tracks: Tracks, scene: Scene, lifting: Lifting, projections: Tensor) -> Tensor:
+    """Which points ``(b, n)`` are explained as well, within the noise, by one position for all times."""
+    still = lifting.still
+    apart = distances(tracks, projections, scene.structure)
+    moving = apart.square().nansum(1)
+    places = triangulate(projections @ still, tracks.x, tracks.weights, steps=2)
+    resting = distances(tracks, projections @ still, places).square().nansum(1)
+    free = spare(tracks, apart.isfinite(), lifting.motion).clamp(min=1)
+    # rounding is noise as well
+    extent = (1 / tracks.scales.amin(-1, keepdim=True)).square()
+    sigma = moving.sum(-1, keepdim=True) / free[:, None] + EXACT * extent
+    extra = lifting.lifts.shape[-1] - lifting.lifts.shape[1]
+    return resting - moving <= quantile(0.99, extra) * sigma
+
+
+def _open(motion: Motion, times: Tensor, static: Tensor | None) -> str:
+    """What the tracks cannot tell."""
+    text = motion.open_text(times)
+    if motion.lift is None or motion.static or motion.k == motion.dim:
+        return f"known up to {text}" if text else ""
+    if static is not None:
+        return f"known up to {text}; the given static points fix the common motion"
+    return f"known up to {text}; without static points the frame is the one in which the points move least"
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# The choice of a motion model by penalized cost.
+
+
+OUTLIER = 2.0
+"""Cost of a coordinate too many that does not fit, in variances of the noise: Torr's lambda 3."""
+LABEL = 0.2
+"""Cost of the label of a point of two bodies, which is free to take the better one.  4 views of 80 points: 0 takes two bodies for
+one plane once in 5 scenes (by 5), log 2 = 0.7 takes a static scene for two planes (by 30)."""
+AGREED = 0.6
+"""Share of observations that have to fit a model before the noise is taken from it."""
+SIMILAR = 1.8
+"""Noise over the least that any model leaves, up to which a model fits.  A model with too many unknowns may leave 0.6 times the
+noise that is there (constant_velocity_3d of points moving along one direction in a plane, 4 views of 80 points)."""
+MILD = 1.1
+"""Noise that least squares leaves, over that of the robust fit, up to which the models are not all fitted robustly: single false
+outliers among 720 observations raise it by .5 %, one of 100 px by 800 %."""
+CLEAR = 0.02
+"""Noise over the extent of the images up to which that holds: much noise may hide outliers, and a failed fit says nothing."""
+FLOOR = 1e-9
+"""Least noise over the extent of the images: rounding."""
+
+
+def choose(
+    tracks: Tracks, static: Tensor | None, limit: float | None, generator: torch.Generator | None, batch: tuple[int, ...]
+) -> Reconstruction:
+    r"""Reconstruct with the declared model of least penalized cost; the others are listed in ``candidates``.
+
+    .. math:: \mathrm{GRIC} = \sum_j \min\Big(\frac{|e_j|^2}{\sigma^2},\; \lambda_3 (r_j - d)\Big)
+        + \sum_j d \log r_j + c \log \sum_j r_j
+
+    with the residual :math:`e_j` of the :math:`r_j` observed coordinates of a point, d unknowns of a point and c of the cameras
+    less the ambiguity (the label of a point of two bodies counts as well, a little).  The noise :math:`\sigma` is what the models
+    leave that most observations agree with and that fit about equally well.  One model is chosen for a whole batch.  All are
+    fitted by least squares, robustly only where the best of these finds outliers.
+
+    Two planar bodies are also two planes of a static scene; the smaller of the two models that say so wins, two bodies.
+
+    Args:
+        tracks: flat batch.
+        static: ``(b, n)`` bool, or None.
+        limit: three standard deviations of the noise; None: estimated; infinite: no outliers.
+        generator: of random samples.
+        batch: the shape that the flat dimension comes from.
+
+    Raises:
+        ValueError: too few views or tracks for any model.
+
+    Source: Torr 2002, Bayesian model estimation and selection for epipolar geometry and generic manifold fitting (GRIC).
+    """
+    views, n = tracks.weights.shape[1:]
+    reasons = {m.name: _lacks(m, tracks.times, views, n) for m in MOTIONS.values() if m.sensor == tracks.x.shape[-1]}
+    models = [MOTIONS[name] for name, reason in reasons.items() if not reason]
+    untried = tuple(Ranked(name, math.inf, math.nan, reason) for name, reason in reasons.items() if reason)
+    if not models:
+        first = MOTIONS[next(iter(reasons))]
+        need = least(first, tracks.times)
+        raise ValueError(
+            f"no declared motion takes {views} views of {n} tracks; {first.name!r} needs {need[0]} views and {need[1]} tracks"
+        )
+    plain = [Fit.of(tracks, model, *least_squares(tracks, model)) for model in models]
+    listed = ranked(tracks, plain, limit)
+    best = solve(tracks, MOTIONS[listed[0].motion], static, limit, generator, batch)
+    fit = next(fit for fit in plain if fit.motion is best.motion)
+    whole = (best.inliers.reshape(fit.apart.shape) >= fit.apart.isfinite()).flatten(1).all(1)
+    # what was left out did not mislead least squares where it hardly made the noise larger
+    noise = best.sigma.reshape(-1)
+    harmless = (fit.sigma <= MILD * noise) & (noise * tracks.scales.amax(1) <= CLEAR)
+    if bool((whole | harmless).all()):
+        return replace(best, candidates=listed + untried)
+    others = [model for model in models if model is not best.motion]
+    robust = {best.motion.name: best} | {model.name: solve(tracks, model, static, limit, generator, batch) for model in others}
+    fits = [
+        Fit.of(tracks, one.motion, one.residuals.reshape(tracks.weights.shape), one.status.reshape(-1)) for one in robust.values()
+    ]
+    listed = ranked(tracks, fits, limit)
+    return replace(robust[listed[0].motion], candidates=listed + untried)
+
+
+class Fit(NamedTuple):
+    """How a model fits the problems of a batch."""
+
+    motion: Motion
+    apart: Tensor
+    """``(b, views, n)`` reprojection distances, NaN where an observation does not count."""
+    lost: Tensor
+    """``(b,)`` whether it failed."""
+    sigma: Tensor
+    """``(b,)`` noise that it leaves."""
+
+    @classmethod
+    def of(cls, tracks: Tracks, motion: Motion, apart: Tensor, status: Tensor) -> Fit:
+        """With the noise from the distances."""
+        counted = apart.isfinite()
+        sigma = (apart.square().nansum((1, 2)) / spare(tracks, counted, motion).clamp(min=1)).sqrt()
+        return cls(motion, apart, failed(status), sigma)
+
+
+def least(motion: Motion, times: Tensor) -> tuple[int, int]:
+    """Fewest views and tracks that a model can be fitted to.
+
+    Example:
+        >>> import torch
+        >>> least(MOTIONS["two_bodies_2d"], torch.arange(3.0))
+        (2, 9)
+    """
+    views = motion.views(times)
+    bodies = (motion.k + 1) * (motion.k + 2) // 2 - 1 if motion.bodies > 1 else 0
+    return views, max(motion.tensor(min(views, motion.k + 1)).minimal(), bodies)
+
+
+def _lacks(motion: Motion, times: Tensor, views: int, n: int) -> str:
+    """What is missing of views, tracks, and observations to spare; empty where nothing is."""
+    usual = motion.views(range(12))
+    if views < usual:
+        return f"needs {usual} views"
+    need = least(motion, times)
+    if need[0] > views or (motion.lift is not None and motion.ambiguity(times) > motion.ambiguity(range(12))):
+        return f"needs views at {usual} different times"
+    if need[1] > n:
+        return f"needs {need[1]} tracks"
+    if views * motion.sensor <= motion.k - (motion.bodies > 1):
+        return "needs more views: a point has no observation to spare"
+    return ""
+
+
+def ranked(tracks: Tracks, fits: list[Fit], limit: float | None) -> tuple[Ranked, ...]:
+    """The models by their penalized costs over the whole batch, the least first."""
+    sigma = _noise(tracks, fits, limit)
+    found = []
+    for fit in fits:
+        score = float("inf") if bool(fit.lost.all()) else float(penalized(tracks, fit, sigma).sum())
+        rest = fit.apart[~fit.lost]
+        found.append(Ranked(fit.motion.name, score, float(rest.square().nanmean().sqrt())))
+    return tuple(sorted(found, key=lambda one: one.score))
+
+
+def _noise(tracks: Tracks, fits: list[Fit], limit: float | None) -> Tensor:
+    """The noise of every problem, ``(b,)``: a third of the limit, or what the models that fit leave in the middle."""
+    floor = FLOOR / tracks.scales.square().mean(-1).sqrt()
+    if limit is not None and math.isfinite(limit):
+        return floor.clamp(min=limit / 3)
+    count = (tracks.weights > 0).flatten(1).sum(-1)
+    sound = [(fit.apart.isfinite().flatten(1).sum(-1) >= AGREED * count) & ~fit.lost for fit in fits]
+    sigma = torch.stack([torch.where(ok, fit.sigma, torch.nan) for ok, fit in zip(sound, fits, strict=True)])
+    near = sigma <= SIMILAR * sigma.nan_to_num(nan=torch.inf).amin(0)
+    return torch.where(near, sigma, torch.nan).nanmedian(0).values.nan_to_num(nan=1.0).maximum(floor)
+
+
+def penalized(tracks: Tracks, fit: Fit, sigma: Tensor) -> Tensor:
+    """The penalized cost ``(b,)`` of one model; where it failed, that of outliers only.
+
+    Args:
+        tracks: flat batch, all observations with weight.
+        fit: of the same problems.
+        sigma: ``(b,)`` noise in the unit of the tracks.
+    """
+    motion, seen = fit.motion, tracks.weights > 0
+    r = seen.sum(1).to(sigma.dtype) * motion.sensor
+    free = motion.k - (motion.bodies > 1)
+    square = (fit.apart / sigma[:, None, None]).square()
+    # an observation that was left out costs as much as one can
+    square = torch.where(seen & square.isfinite(), square, torch.where(seen, OUTLIER * motion.sensor, 0.0)).sum(1)
+    misfit = square.minimum(OUTLIER * (r - free).clamp(min=0)).sum(-1)
+    cameras = r.sum(-1) - (r > 0).sum(-1) * free - spare(tracks, seen, motion)
+    points = free * r.clamp(min=1).log() + LABEL * (motion.bodies - 1) * (r > 0)
+    return misfit + points.sum(-1) + cameras * r.sum(-1).clamp(min=1).log()

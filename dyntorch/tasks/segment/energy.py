@@ -1,0 +1,128 @@
+"""What a segmentation of two views costs: distances from the epipolar geometries, links cut, and the relief of each body."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dyntorch.geometry.epipolar import sampson_squared
+from dyntorch.geometry.homogeneous import homogeneous, null_vectors, skew
+from dyntorch.tasks.segment.coherence import Links
+
+PIXELS = 2.5
+"""The default threshold: what figures in pixels refer to."""
+NOISE = 0.7
+"""Standard deviation of a Sampson distance, pixels at the default threshold."""
+CAP = 4.0
+"""Squared distances in units of the noise count up to this."""
+CUT = 4.0
+"""Weight of the links between different bodies."""
+PARALLAX = 0.2
+"""Weight of the parallax: motion along the epipolar lines beside that of the body's mean plane."""
+FREEDOM, FLAT = 2.0, 2.0
+"""Of Student's distribution of the parallax, and its least scale, pixels at the default threshold."""
+ROUNDS, SCALES = 6, 2
+
+
+@dataclass(frozen=True)
+class View:
+    """The matches of one problem, centred and scaled alike in both views.
+
+    Attributes:
+        x1, x2: ``(n, 2)``.
+        pixel: the threshold / :data:`PIXELS`, in these coordinates: a pixel at the default threshold.
+        links: between matches.
+    """
+
+    x1: Tensor
+    x2: Tensor
+    pixel: float
+    links: Links
+
+    def subset(self, keep: Tensor) -> View:
+        """Some of the matches (indices)."""
+        return View(self.x1[keep], self.x2[keep], self.pixel, self.links.subset(keep))
+
+
+def energy(view: View, fundamentals: Tensor, member: Tensor) -> Tensor:
+    r"""Cost of labellings with their fundamental matrices:
+
+    .. math:: \sum_i \min(r_i^2 / \sigma^2, c) + \lambda \sum_{ij \text{ cut}} S_{ij}
+        + \mu \sum_i \Big[(\nu + 1) \log\big(1 + \tfrac{p_i^2}{\nu t_k^2}\big) + \log t_k^2\Big],
+
+    with the Sampson distance r and the parallax p from a plane of body k, whose scale :math:`t_k` is estimated.
+
+    Args:
+        view: matches.
+        fundamentals: ``(B, K, 3, 3)``.
+        member: ``(B, K, n)``, 0 or 1; empty bodies cost nothing.
+
+    Returns:
+        ``(B,)``.
+    """
+    square = sampson_squared(fundamentals, view.x1, view.x2) / (NOISE * view.pixel) ** 2
+    distances = (square.clamp(max=CAP) * member).sum((-2, -1))
+    value, scale = parallax(view, fundamentals, member)
+    relief = (FREEDOM + 1) * torch.log1p(value.square() / (FREEDOM * scale[..., None])) + scale.log()[..., None]
+    return distances + CUT * view.links.cut(member) + PARALLAX * (relief * member).sum((-2, -1))
+
+
+def parallax(view: View, fundamentals: Tensor, member: Tensor) -> tuple[Tensor, Tensor]:
+    r"""Distances along the epipolar lines from the robust mean plane of each body, and their squared scale, in pixels.
+
+    With :math:`A = [e_2]_\times F` every match is :math:`x_2 \sim A x_1 + \rho\, e_2`, and a plane of the body makes
+    :math:`\rho = v^T x_1`, which is linear in v (Hartley and Zisserman, section 13.1).
+
+    Args:
+        view: matches.
+        fundamentals: ``(B, K, 3, 3)``.
+        member: ``(B, K, n)`` weights.
+
+    Returns:
+        ``(B, K, n)`` and ``(B, K)``.
+    """
+    first, second = homogeneous(view.x1), homogeneous(view.x2)
+    epipole = null_vectors(fundamentals)[0]
+    mapped = first @ (skew(epipole) @ fundamentals).mT
+    other = torch.linalg.cross(second.expand_as(mapped), epipole[..., None, :].expand_as(mapped))
+    this = torch.linalg.cross(second.expand_as(mapped), mapped)
+    depth = -(this * other).sum(-1) / other.square().sum(-1).clamp(min=1e-20)
+    # how far the image moves with depth
+    across = epipole[..., None, :2] * mapped[..., 2:] - mapped[..., :2] * epipole[..., None, 2:]
+    lever = across.norm(dim=-1) / (mapped[..., 2] + depth * epipole[..., None, 2]).square().clamp(min=1e-12) / view.pixel
+    lever = lever.clamp(max=1e6)
+    moments = (first[:, :, None] * first[:, None, :]).flatten(1)
+    total = member.sum(-1) + 1e-9
+    eye = torch.eye(3, dtype=first.dtype, device=first.device)
+    weight, scale, value = member, torch.zeros_like(total), depth
+    for turn in range(ROUNDS):
+        heavy = weight * lever.square()
+        inner = (heavy @ moments).unflatten(-1, (3, 3))
+        ridge = 1e-9 * inner.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None] + 1e-20
+        plane = torch.linalg.solve_ex(inner + ridge * eye, ((heavy * depth) @ first)[..., None])[0]
+        value = (depth - (first @ plane)[..., 0]) * lever
+        square = value.square()
+        if turn == 0:
+            scale = ((member * value.abs()).sum(-1) / total).square()
+        for _ in range(SCALES):
+            share = (FREEDOM + 1) / (FREEDOM + square / scale.clamp(min=FLAT * FLAT)[..., None])
+            scale = ((member * share * square).sum(-1) / total).clamp(min=FLAT * FLAT)
+        weight = member * (FREEDOM + 1) / (FREEDOM + square / scale[..., None])
+    return value, scale
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Probabilities of labels that neighbours share: the mean field of costs and links.
+
+
+def mean_field(cost: Tensor, links: Links, cut: float, turns: int, start: Tensor | None = None) -> Tensor:
+    """Probabilities of labels ``(*batch, K, n)`` that cost so much, with ``cut`` times the links between different labels.
+
+    Turns are damped by half, from ``start`` or from the labels of each match alone.
+    """
+    member = torch.softmax(-cost, -2) if start is None else start
+    for _ in range(turns):
+        member = 0.5 * (member + torch.softmax(cut * links.pull(member) - cost, -2))
+    return member

@@ -1,0 +1,542 @@
+"""segment(): which matches of two views move together, which are wrong, and how each body moved."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from math import prod
+
+import torch
+from torch import Tensor
+
+from dyntorch.core.matches import matches
+from dyntorch.core.solution import Status
+from dyntorch.geometry.epipolar import sampson_squared
+from dyntorch.geometry.homogeneous import similarity, unit
+from dyntorch.geometry.homography import homography_sampson_squared
+from dyntorch.geometry.pairs import order_of_bodies
+from dyntorch.invariants.fundamental_matrix import FundamentalMatrix
+from dyntorch.numerics.arguments import on_cpu
+from dyntorch.numerics.blocks import one_thread, uniform
+from dyntorch.numerics.chi_square import median
+from dyntorch.tasks.outcome import Notice, NoticeCode, check_threshold, notices
+from dyntorch.tasks.segment.coherence import Links, coherence
+from dyntorch.tasks.segment.energy import View
+from dyntorch.tasks.segment.labels import Labelling, Models, choose, label, significant
+from dyntorch.tasks.segment.result import BodyModel, Segmentation
+from dyntorch.tasks.segment.search import LEAST, Candidate, one_hot, search, search_samples
+
+# ----------------------------------------------------------------------------------------------------------------------
+# How many bodies: the segmentation of least cost with a penalty for each body, or with the number that was asked for.
+
+
+FIRST, NEXT, MOST = 4, 2, 12
+"""Numbers of bodies tried at first, tried further each time that the largest was the best, and tried at all."""
+PENALTY, ALONE = 4.5, 6.2
+"""Of a body, in units of the root of the number of matches: what models leave unexplained grows with the matches.  The second where
+geometry decides alone (spurious bodies explain up to 4.9, true ones 7.6 and more)."""
+
+Search = Callable[[Sequence[int]], dict[int, list[Candidate]]]
+
+
+@dataclass(frozen=True)
+class Best:
+    """The segmentation that was chosen.
+
+    Attributes:
+        candidate: itself.
+        spare: whether fewer bodies than were asked for cost less, penalties included.
+    """
+
+    candidate: Candidate
+    spare: bool = False
+    further: Candidate | None = None
+    """The best segmentation into one body more, where their number was open."""
+
+
+def best(search: Search, matches: int, bodies: int | None, penalty: float) -> Best | None:
+    """The best segmentation of so many matches into ``bodies``, or, for None, into the number of least penalized cost.
+
+    Fewer than were asked for where there are no segmentations into as many; None where there are none at all.  The penalty of a
+    body is in units of the root of the number of matches.
+    """
+    room = max(1, matches // LEAST)
+    known: dict[int, Candidate] = {}
+
+    def penalized(count: int) -> float:
+        return known[count].energy + penalty * count * matches**0.5
+
+    if bodies is not None:
+        for count in range(min(bodies, room), 0, -1):
+            # one body fewer tells whether so many were needed
+            known |= _cheapest(search(range(max(1, count - 1), count + 1)))
+            if count in known:
+                return Best(known[count], count > 1 and count - 1 in known and penalized(count - 1) < penalized(count))
+        return None
+    top = 0
+    while top < min(room, MOST):
+        last, top = top, min(top + (NEXT if top else FIRST), room, MOST)
+        known |= _cheapest(search(range(last + 1, top + 1)))
+        chosen = min(known, key=penalized, default=0)
+        if chosen < top:
+            break
+    if not known:
+        return None
+    count = min(known, key=penalized)
+    return Best(known[count], further=known.get(count + 1))
+
+
+def _cheapest(found: dict[int, list[Candidate]]) -> dict[int, Candidate]:
+    return {count: candidates[0] for count, candidates in found.items() if candidates}
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# What one problem of segment() gives, in the coordinates and the order of its input.
+
+
+REPEATED = 0.1
+"""Share of repeated matches that deserves a notice."""
+SPARSE = 0.3
+"""Share of matches that move like their neighbours below which geometry alone may do better."""
+
+
+@dataclass(frozen=True)
+class Given:
+    """The matches of one problem, ready for the search.
+
+    Attributes:
+        weights: ``(n,)`` of all matches, 0 = missing.
+        present: ``(m,)`` indices of those that are there.
+        view: these, normalized.
+        first, second: the similarities that did it, from the input.
+        scale: of both.
+        coherence: ``(m,)`` in [0, 1].
+        keep: indices among the m of those that may belong to a body.
+        groups: ``(k,)`` of the kept ones, linked groups from 0; empty where neighbours do not matter.
+        searched: indices among the kept ones of those that the search looks at.
+        repeated: share of matches that repeat others.
+    """
+
+    weights: Tensor
+    present: Tensor
+    view: View
+    first: Tensor
+    second: Tensor
+    scale: float
+    coherence: Tensor
+    keep: Tensor
+    groups: Tensor
+    searched: Tensor
+    repeated: float
+
+    @property
+    def linked(self) -> float:
+        """Share of the matches that may belong to a body."""
+        return len(self.keep) / max(1, len(self.present))
+
+    def spread(self, values: Tensor) -> Tensor:
+        """Values of the present matches among all, 0 elsewhere."""
+        full = values.new_zeros(len(self.weights), *values.shape[1:])
+        full[self.present] = values
+        return full
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Result of one problem of n matches with K = ``count`` bodies.
+
+    Attributes:
+        labels: ``(n,)``.
+        probabilities: ``(n, K + 1)``.
+        fundamentals, homographies: ``(K, 3, 3)``.
+        models: K of them.
+        residuals, coherence: ``(n,)``.
+        threshold: ``()``.
+        status: of the problem.
+        repeated: share of matches that repeat others.
+        linked: share of matches that move like neighbours of theirs.
+        spare: whether fewer bodies than were asked for explain the matches as well.
+        coarse: the threshold over the spread of the points, where it is too large to tell anything; else 0.
+    """
+
+    labels: Tensor
+    probabilities: Tensor
+    fundamentals: Tensor
+    homographies: Tensor
+    models: tuple[BodyModel, ...]
+    residuals: Tensor
+    coherence: Tensor
+    threshold: Tensor
+    status: Status
+    repeated: float
+    linked: float
+    spare: bool = False
+    coarse: float = 0.0
+
+    @property
+    def count(self) -> int:
+        """Bodies."""
+        return len(self.models)
+
+
+def nothing(weights: Tensor, threshold: float, status: Status, repeated: float, linked: float = 0.0) -> Outcome:
+    """No bodies: all matches ``(n,)`` are outliers, those with weight surely."""
+    none = torch.zeros(0, 3, 3, dtype=torch.float64, device=weights.device)
+    return Outcome(
+        labels=torch.zeros_like(weights, dtype=torch.long),
+        probabilities=(weights > 0).double()[:, None],
+        fundamentals=none,
+        homographies=none,
+        models=(),
+        residuals=torch.zeros_like(weights),
+        coherence=torch.zeros_like(weights),
+        threshold=weights.new_tensor(threshold),
+        status=status,
+        repeated=repeated,
+        linked=linked,
+    )
+
+
+def outcome(given: Given, labelled: Labelling, threshold: float, bodies: int | None, spare: bool) -> Outcome:
+    """The labels in order of size, with the model of every body."""
+    labelled = _sorted(labelled)
+    labels, fundamentals = labelled.labels, labelled.fundamentals
+    count = len(fundamentals)
+    if not count:
+        return nothing(given.weights, threshold, Status.NO_CONSENSUS, given.repeated, given.linked)
+    models = choose(given.view, fundamentals, one_hot(labels - 1, count) * given.weights[given.present])
+    planar = unit(torch.linalg.inv(given.second) @ models.homographies @ given.first)
+    return Outcome(
+        labels=given.spread(labels),
+        probabilities=given.spread(labelled.probabilities.mT),
+        fundamentals=unit(given.second.mT @ fundamentals @ given.first),
+        homographies=torch.where(models.planar[:, None, None], planar, 0.0),
+        models=tuple(BodyModel.HOMOGRAPHY if flat else BodyModel.FUNDAMENTAL for flat in models.planar.tolist()),
+        residuals=given.spread(_residuals(given.view, labels, fundamentals, models) / given.scale),
+        coherence=given.spread(given.coherence),
+        threshold=given.weights.new_tensor(threshold),
+        status=Status.OK if bodies is None or count == bodies else Status.NO_CONSENSUS,
+        repeated=given.repeated,
+        linked=given.linked,
+        spare=spare,
+    )
+
+
+def _sorted(labelled: Labelling) -> Labelling:
+    """The bodies that kept enough matches, numbered by the rule."""
+    members = one_hot(labelled.labels - 1, len(labelled.fundamentals)) > 0
+    order = order_of_bodies(members)
+    return labelled.of(order[members.sum(-1)[order] >= LEAST])
+
+
+def _residuals(view: View, labels: Tensor, fundamentals: Tensor, models: Models) -> Tensor:
+    """Distances ``(n,)`` from the own body, of outliers from the nearest one."""
+    epipolar = sampson_squared(fundamentals, view.x1, view.x2)
+    planar = homography_sampson_squared(models.homographies, view.x1, view.x2)
+    square = torch.where(models.planar[:, None], planar, epipolar)
+    own = square.gather(0, (labels - 1).clamp(min=0)[None])[0]
+    return torch.where(labels > 0, own, square.amin(0)).sqrt()
+
+
+def segmentation_notices(found: list[Outcome], bodies: int | None, batch: tuple[int, ...]) -> tuple[Notice, ...]:
+    """What limits the results of a batch."""
+    if not found:
+        return ()
+    count = torch.tensor([float(outcome.count) for outcome in found])
+    repeated = torch.tensor([outcome.repeated for outcome in found])
+    linked = torch.tensor([outcome.linked for outcome in found])
+    tried = torch.tensor([outcome.status != Status.TOO_FEW for outcome in found])
+    spatial = linked < 1.0  # where neighbours do not matter, all matches count
+    said = []
+    coarse = torch.tensor([outcome.coarse for outcome in found])
+    tried = tried & (coarse == 0)
+    message = "the threshold is {value:.2g} of the spread of the points, and everything is near everything; give it in their unit"
+    said += notices(NoticeCode.COARSE, message, coarse, coarse > 0, batch)
+    if bodies is not None:
+        message = f"{bodies} bodies were asked for, the matches carry {{value:g}}; ask for fewer, or add matches of the others"
+        said += notices(NoticeCode.FEWER_BODIES, message, count, tried & (count < bodies), batch)
+        # where a body got lost, the notice above says so
+        spare = torch.tensor([outcome.spare for outcome in found]) & (count == bodies)
+        message = f"{{value:g}} bodies explain the matches no worse than {bodies}: one may be a part of another; ask for fewer"
+        said += notices(NoticeCode.SPARE_BODY, message, count - 1, spare, batch)
+    message = "a share of {value:.2g} of the matches repeats others and says nothing new; remove repeated matches"
+    said += notices(NoticeCode.REPEATED, message, repeated, repeated > REPEATED, batch)
+    message = "the share of matches that move like their neighbours is {value:.2g}; try spatial=False if bodies interleave"
+    said += notices(NoticeCode.INCOHERENT, message, linked, tried & spatial & (linked < SPARSE), batch)
+    return tuple(said)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# One problem of segment(): from matches of two views to labelled bodies, through what moves alike.
+
+
+SIGMAS = 5.0
+"""Threshold over the noise of a coordinate."""
+PIXELS = 2.5
+"""The default threshold: what the figures in pixels refer to."""
+NEIGHBOURLY = 3.0
+"""Noise of the differences of matches, pixels."""
+COHERENT, LINKED = 0.2, 0.3
+"""Coherence of a match, and strength of a link, that put it into a group."""
+UNKNOWN = 0.3
+"""Share of outliers where nothing says what it is."""
+FAR, FARTHEST = 20.0, 1e3
+"""Distance from the middle of the matches, in units of the median one, from which a match is garbage, and where it is put then."""
+SEARCHED = 1500
+"""Matches that the search looks at, and that are neighbours; the others are labelled by what it finds."""
+COARSE = 0.2
+"""Threshold over the spread of the points from which everything is near everything."""
+LEFT, LEFT_SHARE = 10, 0.08
+"""Linked matches without a body, and their share of all linked ones, from which one body more is tried."""
+GUESS = 0.003
+"""Threshold over the diagonal of the image, where it has to be estimated."""
+MEDIANS = {BodyModel.FUNDAMENTAL: median(1) ** 0.5, BodyModel.HOMOGRAPHY: median(2) ** 0.5}
+"""Median Sampson distance of inliers, in units of the noise of a coordinate."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """What was asked for, as in :func:`dyntorch.segment`."""
+
+    bodies: int | None
+    threshold: float | None
+    spatial: bool
+    generator: torch.Generator | None
+
+
+def solve(x1: Tensor, x2: Tensor, weights: Tensor, request: Request) -> Outcome:
+    """Segment one problem of matches ``(n, 2)`` with weights ``(n,)``, 0 = missing."""
+    if request.threshold is not None:
+        return _solve(x1, x2, weights, request, request.threshold)
+    size = _diagonal(x1[weights > 0])
+    first = _solve(x1, x2, weights, request, GUESS * size if size > 0 else 1.0)
+    if not first.count:
+        return first
+    # the median distance in standard deviations: in one dimension from epipolar lines, in two from the points of a plane
+    medians = first.labels.new_tensor([MEDIANS[model] for model in first.models], dtype=x1.dtype)
+    inlier = first.labels > 0
+    noise = float((first.residuals[inlier] / medians[first.labels[inlier] - 1]).median())
+    return _solve(x1, x2, weights, request, max(SIGMAS * noise, 1e-6 * size))
+
+
+def _diagonal(x: Tensor) -> float:
+    """Of the image, by most of its points ``(n, 2)``: some may be garbage."""
+    if not len(x):
+        return 0.0
+    low, high = x.quantile(x.new_tensor([0.05, 0.95]), dim=0)
+    return float((high - low).norm()) / 0.9
+
+
+def _solve(x1: Tensor, x2: Tensor, weights: Tensor, request: Request, threshold: float) -> Outcome:
+    present = (weights > 0).nonzero().flatten()
+    distinct, *places = (len(torch.unique(x[present], dim=0)) for x in (torch.cat([x1, x2], dim=-1), x1, x2))
+    # points that are all in one place of a view fit any motion of that place
+    distinct = min(places) if min(places) < LEAST + 1 else distinct
+    repeated = 1 - distinct / len(present) if len(present) else 0.0
+    if distinct < LEAST + 1:
+        return nothing(weights, threshold, Status.TOO_FEW, repeated)
+    given = _given(x1[present], x2[present], weights, present, threshold, request, repeated)
+    if PIXELS * given.view.pixel > COARSE:
+        refused = nothing(weights, threshold, Status.AMBIGUOUS, repeated, given.linked)
+        return replace(refused, coarse=PIXELS * given.view.pixel)
+    part = given.view.subset(given.keep[given.searched])
+
+    def searched(counts: Sequence[int]) -> dict[int, list[Candidate]]:
+        if not request.spatial:
+            return search_samples(part, counts, request.generator)
+        groups = given.groups[given.searched]
+        extra = [groups] if int(groups.max()) < MOST else []
+        return search(part, counts, request.generator, extra)
+
+    penalty = PENALTY if request.spatial else ALONE
+    chosen = best(searched, len(part.x1), request.bodies, penalty) if len(part.x1) > LEAST else None
+    if chosen is None:
+        return nothing(weights, threshold, Status.NO_CONSENSUS, repeated, given.linked)
+    labelled = _labelled(given, chosen.candidate, request)
+    left = _left(given, labelled)
+    if chosen.further is not None and left >= max(LEFT, LEFT_SHARE * len(given.keep)):
+        # matches that move like their neighbours and fit no body: there is another one, which the truncated distances hid
+        other = _labelled(given, chosen.further, request)
+        labelled = other if _left(given, other) < 0.5 * left else labelled
+    return outcome(given, labelled, threshold, request.bodies, chosen.spare)
+
+
+def _labelled(given: Given, candidate: Candidate, request: Request) -> Labelling:
+    """Labels of all matches by a segmentation of those that were searched."""
+    found = torch.zeros_like(given.present)
+    found[given.keep[given.searched]] = candidate.labels + 1
+    pixel = given.view.pixel
+    near, share = (NEIGHBOURLY * pixel, 1 - given.linked) if request.spatial else (None, UNKNOWN)
+    labelled = label(given.view, found, candidate.fundamentals, given.weights[given.present], PIXELS * pixel, near, share)
+    if request.spatial:
+        return labelled
+    # nothing but the geometry speaks for these bodies: those that random matches would show as well are none
+    return labelled.of(significant(given.view, labelled.fundamentals, labelled.labels))
+
+
+def _left(given: Given, labelled: Labelling) -> int:
+    """How many of the kept matches became outliers."""
+    return int((labelled.labels[given.keep] == 0).sum()) if len(given.groups) else 0
+
+
+def _given(x1: Tensor, x2: Tensor, weights: Tensor, present: Tensor, threshold: float, request: Request, repeated: float) -> Given:
+    """The present matches ``(m, 2)`` around 0 and of about unit size, by one scale: distances stay comparable."""
+    centres = x1.median(0).values, x2.median(0).values
+    # squares of tiny coordinates would underflow: a view without extent would not count
+    distance = torch.hypot(*torch.cat([x1 - centres[0], x2 - centres[1]]).unbind(-1))
+    # copies of one match that are the majority have no spread
+    spread = distance[distance > 0].median() if bool(distance.any()) else torch.ones_like(distance[0])
+    scale = 1 / spread.clamp(min=torch.finfo(spread.dtype).tiny)
+    first, second = (similarity(scale, centre) for centre in centres)
+    a, b = (((x - centre) * scale).clamp(-FARTHEST, FARTHEST) for x, centre in zip((x1, x2), centres, strict=True))
+    pixel = threshold / PIXELS * float(scale)
+    values = torch.zeros_like(a[:, 0])
+    some = _some(len(a), request.generator, a.device)
+    if request.spatial:
+        graph = coherence(a, b, NEIGHBOURLY * pixel, some)
+        values, links = graph.values, graph.links
+        keep, groups = _groups(values, links)
+    else:
+        links = Links(torch.zeros(len(a), 0, dtype=torch.long, device=a.device), a.new_zeros(len(a), 0))
+        # without neighbours nothing but the place tells garbage, one of which can spoil the depth of a whole body
+        keep = (torch.cat([a, b], dim=-1).norm(dim=-1) < FAR).nonzero().flatten()
+        groups = keep[:0]
+    view = View(a, b, pixel, links)
+    searched = some[keep].nonzero().flatten()
+    return Given(weights, present, view, first, second, float(scale), values, keep, groups, searched, repeated)
+
+
+def _some(count: int, generator: torch.Generator | None, device: torch.device) -> Tensor:
+    """``(m,)`` bool: all matches, or a random part of very many: what is dense beside the noise shows no motion of its own."""
+    if count <= SEARCHED:
+        return torch.ones(count, dtype=torch.bool, device=device)
+    return uniform(count, generator=generator, device=device).argsort().argsort() < SEARCHED
+
+
+def _groups(values: Tensor, links: Links) -> tuple[Tensor, Tensor]:
+    """The matches in linked groups large enough for a body, and these groups, from 0."""
+    component = links.components(LINKED, values > COHERENT)
+    _, group, size = component.unique(return_inverse=True, return_counts=True)
+    keep = (size[group] >= LEAST).nonzero().flatten()
+    return keep, torch.unique(group[keep], return_inverse=True)[1]
+
+
+MINIMAL = 8
+"""Fewest matches: seven determine a fundamental matrix, and one has to agree with it."""
+
+
+@one_thread
+@on_cpu
+def segment(
+    x1: Tensor,
+    x2: Tensor,
+    bodies: int | None = None,
+    threshold: float | None = 2.5,
+    *,
+    weights: Tensor | None = None,
+    spatial: bool = True,
+    generator: torch.Generator | None = None,
+) -> Segmentation:
+    r"""Bodies that moved independently between two views, and the matches that belong to none.
+
+    Each body has a fundamental matrix of its own, :math:`x_2^T F_k\, x_1 = 0` (a plane, or a body seen under a pure rotation, a
+    homography).  Matches that move like their neighbours in both images are linked; the linked ones are divided among bodies by
+    least cost: truncated Sampson distances, links cut, and the smoothness of each body's depth.  Starts are robust affine flows,
+    the epipolar geometries of which form a pool that bodies are chosen from; the best starts descend to maximum likelihood
+    fits and labels in turns.  The number of bodies is the one of least cost with a penalty for each body.  Then all matches are
+    labelled, the outliers among them.
+
+    A search: it computes on the CPU wherever its tensors are, and the result returns to their device.
+
+    Args:
+        x1: ``(*batch, n, 2)`` points of view 1, pixels; NaN = missing.
+        x2: the same points in view 2.
+        bodies: how many; None finds out.
+        threshold: Sampson distance in the unit of the points, about five standard deviations of the noise of a coordinate, at which
+            a match may as well be an outlier; one that moves like its neighbours may be up to three times as far from its body.
+            All scales follow it.  None estimates it from the matches, in twice the time.
+        weights: ``(*batch, n)`` not negative; 0 leaves a match out, others weigh it in the last fits of the bodies, not in the
+            search for them.
+        spatial: whether bodies are regions of the images.  False for bodies that interleave, such as transparent motions or
+            sparse points of a crowd: then only the geometry decides, which takes more matches and bears fewer outliers.
+        generator: source of all randomness; None is torch's global one.
+
+    Returns:
+        A :class:`~dyntorch.tasks.segment.result.Segmentation`, without gradients.
+
+    Raises:
+        ValueError: fewer than eight matches or than seven for each body, shapes, dtypes or devices that do not agree, a
+            threshold or a number of bodies that is not positive.
+
+    Source: thesis chapter 6; Torr 1998 (models); Isack and Boykov, Energy-based geometric multi-model fitting, 2012.
+
+    Example:
+        >>> import torch, dyntorch as dyn
+        >>> from dyntorch import scenes
+        >>> draw = torch.Generator().manual_seed(0)
+        >>> scene = scenes.bodies(160, bodies=2, sigma=0.5, outliers=0.2, generator=draw)
+        >>> result = dyn.segment(*scene.views, generator=draw)
+        >>> int(result.bodies), tuple(result.fundamentals.shape)
+        (2, (2, 3, 3))
+    """
+    check_threshold(threshold)
+    data = matches(FundamentalMatrix(), (x1, x2), weights)
+    if generator is not None and not isinstance(generator, torch.Generator):
+        raise ValueError(f"generator must be a torch.Generator or None, got {generator!r}; use torch.Generator().manual_seed(0)")
+    if data.count == 1 and len(x1) >= MINIMAL:
+        raise ValueError(
+            f"x1 is {tuple(x1.shape)}: problems of one match each; for points as OpenCV gives them, use x1[:, 0], x2[:, 0]"
+        )
+    _check_counts(bodies, data.count)
+    with torch.no_grad():
+        found = [
+            solve(first, second, weight, Request(bodies, threshold, spatial, generator))
+            for first, second, weight in zip(*data.views, data.weights, strict=True)
+        ]
+    width = max([outcome.count for outcome in found], default=0)
+
+    def stacked(name: str, shape: tuple[int, ...]) -> Tensor:
+        """One part of all outcomes, bodies padded with 0."""
+        parts = [getattr(outcome, name) for outcome in found]
+        result = torch.zeros(len(parts), *shape, dtype=torch.float64, device=data.weights.device)
+        for row, part in zip(result, parts, strict=True):
+            row[tuple(slice(0, size) for size in part.shape)] = part
+        return data.back(result)
+
+    def numbers(values: list[int]) -> Tensor:
+        return data.back(torch.tensor(values, dtype=torch.long, device=data.weights.device))
+
+    n = data.count
+    return Segmentation(
+        labels=data.back(torch.stack([x.labels for x in found]) if found else torch.zeros(0, n, dtype=torch.long)),
+        bodies=numbers([outcome.count for outcome in found]),
+        fundamentals=stacked("fundamentals", (width, 3, 3)),
+        homographies=stacked("homographies", (width, 3, 3)),
+        models=_nested([outcome.models for outcome in found], data.batch),
+        probabilities=stacked("probabilities", (n, width + 1)),
+        residuals=stacked("residuals", (n,)),
+        coherence=stacked("coherence", (n,)),
+        status=numbers([int(outcome.status) for outcome in found]),
+        threshold=stacked("threshold", ()),
+        warnings=segmentation_notices(found, bodies, data.batch),
+    )
+
+
+def _check_counts(bodies: int | None, count: int) -> None:
+    if bodies is not None and (isinstance(bodies, bool) or not isinstance(bodies, int) or bodies < 1):
+        raise ValueError(f"bodies must be a positive whole number, or None to find out, got {bodies!r}")
+    if count < MINIMAL:
+        raise ValueError(f"segment needs at least {MINIMAL} matches, got {count}: add {MINIMAL - count}")
+    if bodies is not None and bodies * LEAST > count:
+        raise ValueError(
+            f"bodies={bodies} take at least {LEAST} matches each, {bodies * LEAST} in all, got {count}: "
+            f"add {bodies * LEAST - count}, or ask for at most {count // LEAST}"
+        )
+
+
+def _nested(models: list[tuple[BodyModel, ...]], batch: tuple[int, ...]) -> tuple[object, ...]:
+    """Models of a flat batch in its shape."""
+    if not batch:
+        return models[0]
+    step = prod(batch[1:])
+    return tuple(_nested(models[i * step : (i + 1) * step], batch[1:]) for i in range(batch[0]))

@@ -1,0 +1,474 @@
+"""How well the same points fit together at every shift: the variance of the epipolar residual over lags."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from dyntorch.geometry.epipolar import epipolar_variance, rank_two
+from dyntorch.geometry.homogeneous import homogeneous
+from dyntorch.numerics.lags import epipolar_moments
+from dyntorch.numerics.least_squares import damped_step
+from dyntorch.tasks.synchronize.tracks import Tracks, noise_ratio, smoothed
+
+OVERLAP = 0.25
+"""Share of the largest overlap below which a shift is not judged: little data fit anything."""
+FEWEST = 24
+"""Pairs of positions below which a shift is not judged: three times the unknowns of F."""
+PIECE = 4096
+"""Lags at a time: bounds the memory on long takes."""
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Smoothed, normalized points of both cameras at equal steps of a's clock.
+
+    Attributes:
+        x1, x2: ``(m1, n, 2)`` and ``(m2, n, 2)``, 0 where missing.
+        w1, w2: weights.
+        step: seconds.
+        start: lag of the first of b against the first of a, seconds.
+        rate: of b's clock that was taken out.
+        noise: of both cameras in normalized coordinates, in px of a.
+    """
+
+    x1: Tensor
+    x2: Tensor
+    w1: Tensor
+    w2: Tensor
+    step: float
+    start: float
+    rate: float
+    noise: tuple[float, float]
+
+    @staticmethod
+    def of(a: Tracks, b: Tracks, step: float, rate: float = 1.0) -> Samples:
+        """b's clock goes ``rate`` seconds in one of a's.  The kernel is as wide as a step."""
+        first, w1 = _sampled(a, step, step)
+        second, w2 = _sampled(b, step * rate, step * rate)
+        noise = float(a.change[0, 0]), float(b.change[0, 0]) * noise_ratio(a, b)
+        start = float(b.times[0]) / rate - float(a.times[0])
+        return Samples(first, second, w1, w2, step, start, rate, noise)
+
+    def lags(self, max_shift: float | None) -> tuple[int, int]:
+        """First and last lag, in steps, with some overlap and shifts within ``max_shift`` seconds."""
+        lo, hi = 1 - len(self.x1), len(self.x2) - 1
+        if max_shift is not None:
+            lo = max(lo, math.ceil((-max_shift / self.rate - self.start) / self.step - 1e-9))
+            hi = min(hi, math.floor((max_shift / self.rate - self.start) / self.step + 1e-9))
+        return lo, hi
+
+    def only(self, points: Tensor) -> Samples:
+        """These points ``(n,)`` bool alone."""
+        x1, x2, w1, w2 = (part[:, points] for part in (self.x1, self.x2, self.w1, self.w2))
+        return dataclasses.replace(self, x1=x1, x2=x2, w1=w1, w2=w2)
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """Scores over lags.
+
+    Attributes:
+        lags: ``(L,)`` seconds of a's clock: a moment t of a is at rate (t + lag) of b.
+        scores: ``(L,)`` nats, higher is better, NaN where not judged.
+        variance: ``(L,)`` of the residual, px^2 of a.
+        counts: ``(L,)`` pairs of positions.
+        rate: of b's clock.
+        level: the median of the variance where judged.
+    """
+
+    lags: Tensor
+    scores: Tensor
+    variance: Tensor
+    counts: Tensor
+    rate: float
+    level: float
+
+    @property
+    def offsets(self) -> Tensor:
+        """``(L,)`` seconds of b's clock at time 0 of a's."""
+        return self.lags * self.rate
+
+    def misfit(self, lag: float) -> float:
+        """Nats by which the residual is smaller than usual where it is least near a lag, whatever the overlap."""
+        place = int((self.lags - lag).abs().argmin())
+        near = self.variance[max(0, place - 1) : place + 2]
+        least = float(near[near.isfinite()].min()) if bool(near.isfinite().any()) else math.inf
+        return -0.5 * math.log(max(least, 1e-300) / max(self.level, 1e-300)) if least < math.inf else -math.inf
+
+    def peaks(self, count: int) -> list[tuple[float, float]]:
+        """Lag (between steps by the parabola through the variance) and score of local maxima, best first."""
+        scores = self.scores.nan_to_num(-math.inf)
+        padded = torch.nn.functional.pad(scores, (1, 1), value=-math.inf)
+        top = ((scores > padded[:-2]) & (scores >= padded[2:])).nonzero()[:, 0]
+        best = top[scores[top].argsort(descending=True)][:count].tolist()
+        return [(self._between(i), float(scores[i])) for i in best]
+
+    def _between(self, i: int) -> float:
+        lag = float(self.lags[i])
+        if not 0 < i < len(self.lags) - 1:
+            return lag
+        before, here, after = self.variance[i - 1 : i + 2].tolist()
+        bend = before - 2 * here + after
+        step = float(self.lags[1] - self.lags[0])
+        if not (math.isfinite(bend) and bend > 0):
+            return lag
+        return lag + step * max(-0.5, min(0.5, 0.5 * (before - after) / bend))
+
+
+def epipolar_curve(samples: Samples, max_shift: float | None = None, overlap: float = OVERLAP) -> Curve:
+    r"""Scores at all lags.
+
+    .. math:: \text{score}(s) = -\tfrac12 \log \frac{\lambda(s)}{\operatorname{med} \lambda}
+              + \tfrac12 \log \frac{c(s)}{\max c},
+
+    with the residual's variance :math:`\lambda` of :func:`dyntorch.geometry.epipolar.epipolar_variance` over c(s) pairs of
+    positions.  The second term keeps short overlaps, whose variance scatters, from winning by chance: a shift by a period of a gait
+    with half the overlap has to fit with half the variance.
+
+    Args:
+        overlap: share of the largest overlap below which a lag is not judged.
+
+    Source: thesis, chapter 7; Taubin 1991 for the normalization.
+    """
+    lo, hi = samples.lags(max_shift)
+    found = [_piece(samples, first, min(first + PIECE - 1, hi)) for first in range(lo, hi + 1, PIECE)]
+    if not found:
+        empty = samples.x1.new_zeros(0)
+        return Curve(empty, empty, empty, empty, samples.rate, 1.0)
+    variance, counts = (torch.cat(parts) for parts in zip(*found, strict=True))
+    judged = (counts >= overlap * counts.max()) & (counts >= FEWEST) & variance.isfinite()
+    level = variance[judged].median() if bool(judged.any()) else variance.new_ones(())
+    tiny = torch.finfo(variance.dtype).tiny
+    scores = -0.5 * (variance / level.clamp(min=tiny)).clamp(min=tiny).log() + 0.5 * (counts / counts.max()).clamp(min=tiny).log()
+    lags = samples.start + samples.step * torch.arange(lo, hi + 1, dtype=torch.float64, device=variance.device)
+    return Curve(lags, torch.where(judged, scores, torch.nan), variance, counts, samples.rate, float(level))
+
+
+def _piece(samples: Samples, lo: int, hi: int) -> tuple[Tensor, Tensor]:
+    moments, counts = epipolar_moments(samples.x1, samples.x2, (lo, hi), (samples.w1, samples.w2))
+    return epipolar_variance(moments, samples.noise)[0], counts
+
+
+def _sampled(tracks: Tracks, step: float, width: float) -> tuple[Tensor, Tensor]:
+    x, _, weights = smoothed(tracks, tracks.every(step), width)
+    change = tracks.change
+    return torch.where((weights > 0)[..., None], x @ change[:2, :2].mT + change[:2, 2], 0.0), weights
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Smoothed tracks at equal steps, for positions and velocities at any moment between.
+
+
+CALM = 0.75, 1.25, 2.5
+"""Velocities are smoothed more widely than positions: what noise they share with the residuals would pull the estimate and
+make it look surer than it is.  How much more: 1 + .75 times the noise over the movement from frame to frame, within bounds."""
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Smoothed tracks of b at equal steps, for positions and velocities anywhere between by cubic Hermite polynomials."""
+
+    start: float
+    step: float
+    x: Tensor  # (m, n, 2)
+    v: Tensor
+    calm: Tensor  # velocities to differentiate by
+    weights: Tensor  # (m, n)
+
+    @staticmethod
+    def of(tracks: Tracks, width: float) -> Grid:
+        """With steps of half the kernel's width: between them the polynomial is exact to thousandths of the noise."""
+        step, start = width / 2, float(tracks.times[0])
+        count = max(2, math.ceil((float(tracks.times[-1]) - start) / step) + 1)
+        at = start + step * torch.arange(count, dtype=torch.float64, device=tracks.x.device)
+        x, v, weights = smoothed(tracks, at, width)
+        speed = float(torch.where(weights > 0, v.square().sum(-1), torch.nan).nanmedian()) ** 0.5
+        slope, least, most = CALM
+        wider = min(max(1 + slope * tracks.noise / max(speed * width, 1e-300), least), most)
+        _, calm, _ = smoothed(tracks, at, wider * width)
+        return Grid(start, step, x, v, calm, weights)
+
+    def at(self, times: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Positions, velocities ``(m, n, 2)`` and weights ``(m, n)``, 0 where not seen."""
+        place = (times - self.start) / self.step
+        left = place.floor().clamp(0, len(self.x) - 2).long()
+        u = (place - left)[:, None, None]
+        inside = (place >= 0) & (place <= len(self.x) - 1)
+        x0, x1 = self.x[left], self.x[left + 1]
+        v0, v1 = self.step * self.v[left], self.step * self.v[left + 1]
+        d, s = x1 - x0, v0 + v1
+        x = x0 + u * (v0 + u * (3 * d - s - v0 + u * (s - 2 * d)))
+        v = self.calm[left] + u * (self.calm[left + 1] - self.calm[left])
+        w0, w1 = self.weights[left], self.weights[left + 1]
+        return x, v, torch.where((w0 > 0) & (w1 > 0) & inside[:, None], w0 + u[..., 0] * (w1 - w0), 0.0)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Offset, clock rate and fundamental matrix at once: robust least squares of the Sampson distance from a start near by.
+
+
+CUT = 4.0
+"""Robust standard deviations of the residual at which Geman and McClure's weight is a quarter."""
+BLOCK = 30
+"""Frames that share a scale."""
+UNEQUAL = (0.4, 6.0)
+"""Least and largest scale of a point or a block, over that of all."""
+OPTIMISM = 1.6
+"""Errors over the sigma that the residuals alone say: 1.5 to 1.8 on motion capture with 5 to 60 mm of noise."""
+ITERATIONS = 30
+DONE = 1e-5
+"""Frames: the descent ends with a step below it."""
+NEARLY = 1e-3
+"""Frames: the same before the last rows come in."""
+ENOUGH = 4_000
+"""Rows for most of the way."""
+LEAP = 2.0
+"""Frames: the largest step."""
+LEAST = 0.003
+"""Frames of error that smoothing leaves in exact data."""
+FASTEST = 0.03
+"""Change of the rate at which a descent has gone astray."""
+ROWS = 200_000
+"""Residuals that a descent takes at most; from longer takes it takes moments at equal distances.  Beyond, only sigma would
+shrink."""
+DESCENT_FEWEST = 16
+"""Pairs of positions."""
+MEMORY = 2.0, 6
+"""Residuals are taken to depend on each other over two seconds, but a sixth of the overlap at the most: detectors err for that
+long."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A minimum.
+
+    Attributes:
+        offset, rate: b's clock = a's clock * rate + offset.
+        center: a's time in the middle of the residuals.
+        sigma: of the shift there, seconds; robust against what residuals have in common over time.
+        rate_sigma: of the rate.
+        residual: robust standard deviation of the Sampson distance, px of a.
+        fundamental: ``(3, 3)`` of norm 1, of the coordinates given.
+        distances: ``(frames, n)`` signed Sampson distances over ``residual``; NaN where not both are seen.
+        times: ``(frames,)`` of a's clock.
+        effective: how many independent residuals there are.
+    """
+
+    offset: float
+    rate: float
+    center: float
+    sigma: float
+    rate_sigma: float
+    residual: float
+    fundamental: Tensor
+    distances: Tensor
+    times: Tensor
+    effective: float
+
+    @property
+    def shift(self) -> float:
+        """Of b's clock against a's, at the center, seconds."""
+        return self.offset + (self.rate - 1) * self.center
+
+
+class Descent:
+    """The problem for two cameras: what does not depend on the start is smoothed once."""
+
+    def __init__(self, a: Tracks, b: Tracks, width: float, rows: int = ROWS) -> None:
+        stride = max(1, math.ceil(len(a.times) * a.x.shape[1] / rows))
+        step = max(a.step, b.step) * stride
+        span = float(a.times[-1] - a.times[0])
+        self.times = a.times[0] + step * torch.arange(int(span / step) + 1, dtype=torch.float64, device=a.x.device)
+        self.x, _, self.weights = smoothed(a, self.times, width)
+        self.grid = Grid.of(b, width)
+        self.frame = max(a.step, b.step)
+        self.width = width
+        self.changes = (a.change, b.change)
+        self.noise = (float(a.change[0, 0]), float(b.change[0, 0]) * noise_ratio(a, b))  # one px of a, in normalized coordinates
+
+    def run(self, offset: float, rate: float = 1.0, *, free_rate: bool = False, start: Tensor | None = None) -> Fit | None:
+        """Descend from a start; None where too little is seen there, or the rate runs away.
+
+        Args:
+            start: F of the normalized coordinates; by default the best for the start.
+        """
+        state = _State(offset, rate, start)
+        stride = max(1, self.weights.numel() // ENOUGH)
+        # most of the way on some of the rows, the rest on all
+        for every in (stride, 1) if stride > 1 else (1,):
+            for _ in range(ITERATIONS):
+                rows = self._rows(state, every)
+                if rows is None:
+                    return None
+                moved = self._step(state, rows, free_rate)
+                if abs(state.rate / rate - 1) > FASTEST:
+                    return None
+                if moved < (DONE if every == 1 else NEARLY) * self.frame:
+                    break
+        rows = self._rows(state)
+        return None if rows is None else self._fit(state, rows, free_rate)
+
+    def variance(self, offset: float, rate: float = 1.0) -> float:
+        """Of the residual at a state, as on the curve, by the F that is best there; infinite where too little is seen."""
+        matched = self._matched(offset, rate)
+        return math.inf if matched is None else float(self._moment_fit(matched)[0])
+
+    def _matched(self, offset: float, rate: float, every: int = 1) -> _Matched | None:
+        """Normalized positions of both cameras at the same moments, or at some of them; None where too few."""
+        x2, v2, w2 = self.grid.at(self.times[::every] * rate + offset)
+        sure = self.weights[::every] * w2
+        both = sure > 0
+        if int(both.sum()) < DESCENT_FEWEST:
+            return None
+        first, second = self.changes
+        p, q = homogeneous(self.x[::every][both]) @ first.mT, homogeneous(x2[both]) @ second.mT
+        return _Matched(p, q, torch.nn.functional.pad(v2[both], (0, 1)) @ second.mT, both, sure[both])
+
+    def _moment_fit(self, matched: _Matched) -> tuple[Tensor, Tensor]:
+        """Variance and F by the moments alone."""
+        products = matched.products
+        return epipolar_variance(products.mT @ (matched.sure[:, None] * products), self.noise)
+
+    def _rows(self, state: _State, every: int = 1) -> _Rows | None:
+        """Residuals and their derivatives at a state; a first F where there is none."""
+        matched = self._matched(state.offset, state.rate, every)
+        if matched is None:
+            return None
+        times = self.times[::every, None].expand_as(matched.both)[matched.both]
+        if state.center is None:
+            state.center = float(times.mean())
+        if state.F is None:
+            state.F = rank_two(self._moment_fit(matched)[1])
+        Fp, Fq = matched.p @ state.F.mT, matched.q @ state.F
+        s1, s2 = self.noise
+        gradient = (s1**2 * Fq[:, :2].square().sum(-1) + s2**2 * Fp[:, :2].square().sum(-1)).clamp(min=1e-300).sqrt()
+        residual = (matched.q * Fp).sum(-1) / gradient
+        along = (matched.speed * Fp).sum(-1) / gradient
+        return _Rows(residual, matched.products / gradient[:, None], along, times, matched.both, matched.sure)
+
+    def _step(self, state: _State, rows: _Rows, free_rate: bool) -> float:
+        """One step of iteratively reweighted least squares; its length in seconds, at the ends of the overlap."""
+        assert state.F is not None
+        assert state.center is not None
+        tangent = _tangent(state.F)
+        columns = [rows.products @ tangent.mT, rows.along[:, None]]
+        lever = float((rows.times - state.center).abs().max())
+        if free_rate:
+            columns.append((rows.along * (rows.times - state.center) / max(lever, 1e-9))[:, None])
+        J = torch.cat(columns, dim=1)
+        w = rows.weights()
+        damping = torch.full((1,), 1e-6, dtype=J.dtype, device=J.device)
+        step = damped_step((J.mT @ (w * rows.residual))[None], (J.mT @ (J * w[:, None]))[None], damping)[0]
+        turns = len(tangent)
+        moves = -step[turns:]
+        limit = LEAP * self.frame
+        share = min(1.0, limit / max(float(moves.abs().max()), 1e-300))
+        state.F = rank_two(state.F - share * (step[:turns] @ tangent).unflatten(0, (3, 3)))
+        shift = share * float(moves[0])
+        change = share * float(moves[1]) / max(lever, 1e-9) if free_rate else 0.0
+        state.rate += change
+        state.offset += shift - change * state.center
+        return abs(shift) + abs(change) * lever
+
+    def _fit(self, state: _State, rows: _Rows, free_rate: bool) -> Fit:
+        """What is found, and how sure: each frame's influence on the estimate, with what neighbouring frames have in common."""
+        assert state.F is not None
+        assert state.center is not None
+        tangent = _tangent(state.F)
+        J = torch.cat([rows.products @ tangent.mT, rows.along[:, None], (rows.along * (rows.times - state.center))[:, None]], 1)
+        J = J if free_rate else J[:, :-1]
+        w = rows.weights()
+        scale = J.square().mul(w[:, None]).sum(0).sqrt().clamp(min=1e-300)
+        H = (J / scale).mT @ (J / scale * w[:, None])
+        inverse = torch.linalg.pinv(H, hermitian=True, rtol=1e-12) / scale[:, None] / scale
+        influence = (J * (w * rows.residual)[:, None]) @ inverse[:, len(tangent) :]
+        frames = torch.zeros(len(self.times), influence.shape[1], dtype=J.dtype, device=J.device)
+        frames.index_add_(0, rows.both.nonzero()[:, 0], influence)
+        step = float(self.times[1] - self.times[0]) if len(self.times) > 1 else self.frame
+        sigmas = _long_run(frames, round(min(MEMORY[0], float(rows.times[-1] - rows.times[0]) / MEMORY[1]) / step))
+        scale_of = rows.scale()
+        first, second = self.changes
+        F = second.mT @ state.F @ first
+        distances = torch.full(rows.both.shape, torch.nan, dtype=J.dtype, device=J.device)
+        distances[rows.both] = rows.residual / max(scale_of, 1e-300)
+        correlated = 2 * math.sqrt(math.pi) * self.width / step  # frames that the kernel makes into one
+        return Fit(
+            offset=state.offset,
+            rate=state.rate,
+            center=state.center,
+            sigma=math.hypot(OPTIMISM * float(sigmas[0]), LEAST * self.frame),
+            rate_sigma=OPTIMISM * float(sigmas[1]) if free_rate else 0.0,
+            residual=scale_of,
+            fundamental=F / F.norm(),
+            distances=distances,
+            times=self.times,
+            effective=float(rows.sure.sum() / rows.sure.max()) / max(1.0, correlated),
+        )
+
+
+@dataclass
+class _State:
+    offset: float
+    rate: float
+    F: Tensor | None = None
+    center: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class _Matched:
+    p: Tensor  # (m, 3) of a
+    q: Tensor  # (m, 3) of b
+    speed: Tensor  # (m, 3) derivative of q by b's clock
+    both: Tensor  # (frames, n) bool
+    sure: Tensor  # (m,) weights
+
+    @cached_property
+    def products(self) -> Tensor:
+        """``(m, 9)``: by the entries of F."""
+        return torch.einsum("ni,nj->nij", self.q, self.p).flatten(1)
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    residual: Tensor  # (m,) px of a
+    products: Tensor  # (m, 9): by the entries of F
+    along: Tensor  # (m,): by the shift
+    times: Tensor  # (m,)
+    both: Tensor  # (frames, n) bool
+    sure: Tensor  # (m,): weights of the positions
+
+    def scale(self) -> float:
+        return 1.4826 * float(self.residual.abs().median())
+
+    def weights(self) -> Tensor:
+        """Of Geman and McClure, by the scale of each point and of each second or so: who is nearer errs by more pixels."""
+        pooled = max(self.scale(), 1e-300)
+        every = torch.full(self.both.shape, torch.nan, dtype=torch.float64, device=self.residual.device)
+        every[self.both] = self.residual.abs() * (1.4826 / pooled)
+        point = every.nanmedian(0).values.nan_to_num(1.0).clamp(*UNEQUAL)
+        pad = -len(every) % BLOCK
+        blocks = torch.nn.functional.pad(every / point, (0, 0, 0, pad), value=torch.nan).unflatten(0, (-1, BLOCK)).flatten(1)
+        moment = blocks.nanmedian(1).values.nan_to_num(1.0).clamp(*UNEQUAL).repeat_interleave(BLOCK)[: len(every)]
+        own = (moment[:, None] * point)[self.both]
+        return self.sure * (1 + (self.residual / (CUT * pooled * own)).square()).pow(-2) / own.square()
+
+
+def _tangent(F: Tensor) -> Tensor:
+    """``(7, 9)`` orthonormal directions that keep the norm and, to first order, the rank of F."""
+    cofactors = torch.linalg.cross(F[[1, 2, 0]], F[[2, 0, 1]], dim=-1)
+    normals = torch.stack([F.flatten(), cofactors.flatten() / cofactors.norm().clamp(min=1e-300)])
+    return torch.linalg.qr(normals.mT, mode="complete")[0][:, 2:].mT
+
+
+def _long_run(influence: Tensor, memory: int) -> Tensor:
+    """Standard deviations of sums ``(frames, k)`` of what neighbouring frames have in common (Newey and West)."""
+    variance = influence.square().sum(0)
+    for lag in range(1, min(memory, len(influence) - 1) + 1):
+        variance = variance + 2 * (1 - lag / (memory + 1)) * (influence[lag:] * influence[:-lag]).sum(0)
+    return variance.clamp(min=0).sqrt()

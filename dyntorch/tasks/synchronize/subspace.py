@@ -1,0 +1,384 @@
+"""Two cameras that track different points of one motion: how much either tells about the other, over all time lags."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from dyntorch.numerics.lags import lag_covariances
+
+# ----------------------------------------------------------------------------------------------------------------------
+# What the points of one camera tell about time, whichever points they are: how the body changes and how it moves on the whole.
+
+
+STEP = 1 / 30
+"""Seconds from frame to frame, unless told."""
+SMOOTH = 1 / 30
+"""Seconds, standard deviation of the Gaussian that positions are smoothed by (15 mm of noise: twice that finds one to two
+percent less)."""
+SLOW = 1 / 3
+"""Seconds, of the Gaussian for the size of the body in the image: the distance changes slowly (half to six times as much are
+alike to a percent)."""
+WIDE = (1.0, 2.5, 6.0, 15.0, 40.0)
+"""Frames, of ever wider Gaussians that look for what is missing."""
+NOISE = 2.0
+"""Noise variance of the rows over that of third differences: cameras are not affine (1 to 4 are alike, 8 is 4 percent
+worse)."""
+NARROW = 0.7
+"""Frames, the least smoothing: below, a sampled Gaussian is none."""
+ROUNDS = 12
+"""Fills of what is missing from the other points."""
+EDGE = 2.0
+"""Widths of smoothing left out at either end, where it is one-sided, in both cameras at once: that would speak for lag 0."""
+STRAY = 3.0
+"""Median distances from the middle beyond which a track takes no part in the middle and the size."""
+ROUNDING = 1e-6
+"""Of the extent of the points: what a track is off a line by that says nothing."""
+TINY = 1e-9
+"""Of the size of the body: the least standard deviation of noise that is believed."""
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """One camera's points over time.
+
+    Attributes:
+        rows: ``(T', 2n)`` without the ends, coordinates about the body's middle over its size, smoothed, in units of noise.
+        motion: ``(T', 2)`` px per frame, the median velocity of the points.
+        weights: ``(T',)`` 1 where a frame is seen, else 0.
+        points: ``(T, n, 2)`` px, what is missing filled in.
+        seen: ``(T, n)`` bool.
+        step: seconds from frame to frame.
+    """
+
+    rows: Tensor
+    motion: Tensor
+    weights: Tensor
+    points: Tensor
+    seen: Tensor
+    step: float
+
+    @property
+    def bend(self) -> float:
+        """Variance of the points about straight lines at constant velocity, one each, over that of their noise."""
+        time = torch.linspace(-1, 1, len(self.points), dtype=self.points.dtype, device=self.points.device)[:, None, None]
+        w = self.seen.to(self.points)[..., None]
+        # two parameters a track are to spare: one seen less often is on its line by itself
+        spare = (w.sum(0) - 2).clamp(min=0)
+        count = w.sum(0).clamp(min=1)
+        x, t = self.points - (w * self.points).sum(0) / count, time - (w * time).sum(0) / count
+        square = (w * t * t).sum(0)
+        x = x - t * (w * t * x).sum(0) / torch.where(square > 0, square, 1.0)
+        extent = float(self.points.flatten(0, 1).std(0).norm())
+        noise = max(_noise(self.points, self.seen), (ROUNDING * extent) ** 2, 1e-300)
+        return float((w * x.square()).sum() / (2 * spare.sum()).clamp(min=1)) / noise
+
+    @property
+    def reversed(self) -> Body:
+        """The same played backwards: as smooth, and in step with nothing."""
+        return replace(self, rows=self.rows.flip(0), motion=self.motion.flip(0), weights=self.weights.flip(0))
+
+    @property
+    def blurred(self) -> Body:
+        """Rows with as much more noise as a time that is known to a frame only makes."""
+        if len(self.rows) < 2:
+            return self
+        velocity = torch.gradient(self.rows, dim=0)[0].square().mean()
+        return replace(self, rows=self.rows / (1 + velocity / 12).sqrt())
+
+    @property
+    def signal(self) -> float:
+        """Directions in which the body's shape moves by more than noise."""
+        x = self.rows[self.weights > 0]
+        if len(x) < 2:
+            return 0.0
+        values = torch.linalg.eigvalsh(torch.cov(x.mT, correction=0).reshape(x.shape[1], x.shape[1])).clamp(min=0.0)
+        return float((values / (values + 1)).sum())
+
+
+def body_of(x: Tensor, weights: Tensor, step: float = STEP) -> Body:
+    """Rows, motion and weights of tracks ``(T, n, 2)`` with weights ``(T, n)``, 0 = missing; some frames less at each end."""
+    seen = (weights > 0) & x.isfinite().all(-1)
+    x = torch.where(seen[..., None], x, 0.0).double()
+    whole = seen.sum(-1) >= min(2, seen.shape[1])
+    edge = _edge(step)
+    if not bool(whole.any()) or len(x) <= 2 * edge:
+        rest = max(len(x) - 2 * edge, 1)
+        return Body(x.new_zeros(rest, 2 * x.shape[1]), x.new_zeros(rest, 2), x.new_zeros(rest), x, seen, step)
+    return _body(completed(filled(x, seen), seen), seen, whole, step)
+
+
+def halves(body: Body) -> tuple[Body, Body]:
+    """Bodies of either half of the points: their noise is independent."""
+    n = body.points.shape[1]
+    order = torch.randperm(n, generator=torch.Generator().manual_seed(0)).to(body.points.device)
+    whole = body.seen.sum(-1) >= min(2, n)
+    first, second = (
+        _body(body.points[:, part], body.seen[:, part], whole, body.step) for part in (order[: (n + 1) // 2], order[n // 2 :])
+    )
+    return first, second
+
+
+def _body(held: Tensor, seen: Tensor, whole: Tensor, step: float) -> Body:
+    """The body of complete points."""
+    width, edge = _width(step), _edge(step)
+    size, middle = _frame(held, SLOW / step)
+    shape = (held - middle) / size[:, None, None]
+    variance = max(_noise(shape, seen), TINY**2) * NOISE / (2 * math.sqrt(math.pi) * width)
+    rows = smooth(shape, width).flatten(1)
+    inside = slice(edge, -edge)
+    rows = rows[inside]
+    rows = (rows - rows.mean(0)) / math.sqrt(variance)
+    return Body(rows, _motion(held, width)[inside], whole.double()[inside], held, seen, step)
+
+
+def _width(step: float) -> float:
+    return max(SMOOTH / step, NARROW)
+
+
+def _edge(step: float) -> int:
+    return math.ceil(EDGE * _width(step) - 1e-9)
+
+
+def smooth(x: Tensor, width: float) -> Tensor:
+    """Gaussian means along the first dimension, of what there is at the ends."""
+    return _convolved(x, width) / _convolved(x.new_ones(len(x), *[1] * (x.ndim - 1)), width)
+
+
+def filled(x: Tensor, seen: Tensor) -> Tensor:
+    """Missing positions ``(T, n)`` from the same track's nearest times, by the narrowest Gaussian that sees some."""
+    result, open_ = x, ~seen
+    for width in WIDE:
+        if not bool(open_.any()):
+            return result
+        share = _convolved(seen.double(), width)
+        found = _convolved(torch.where(seen[..., None], x, 0.0), width) / share.clamp(min=1e-12)[..., None]
+        take = open_ & (share > 0.1)
+        result, open_ = torch.where(take[..., None], found, result), open_ & ~take
+    count = seen.sum(0).clamp(min=1)[:, None]
+    mean = torch.where(seen[..., None], x, 0.0).sum(0) / count
+    return torch.where(open_[..., None], mean, result)
+
+
+def _frame(x: Tensor, slow: float) -> tuple[Tensor, Tensor]:
+    """Size ``(T,)`` and middle ``(T, 1, 2)`` of the body, of tracks that stay with it."""
+    far = (x - x.median(1, keepdim=True).values).norm(dim=-1)
+    ratio = (far / far.median(1, keepdim=True).values.clamp(min=1e-300)).median(0).values
+    kept = (ratio <= max(STRAY, float(ratio.min())))[None, :, None]
+    middle = (x * kept).sum(1, keepdim=True) / kept.sum()
+    spread = ((x - middle).square() * kept).sum((1, 2)) / kept.sum()
+    size = smooth(spread.sqrt(), slow)
+    return size.clamp(min=1e-9 * float(size.max()) + 1e-300), middle
+
+
+def _noise(x: Tensor, seen: Tensor) -> float:
+    r"""Variance of a coordinate from third differences :math:`(\mathrm{med}|d_3| / .6745)^2 / 20`: motion is smooth."""
+    rough = x.diff(n=3, dim=0)[seen[3:] & seen[2:-1] & seen[1:-2] & seen[:-3]].abs()
+    return (float(rough.median()) / 0.6745) ** 2 / 20 if rough.numel() else 0.0
+
+
+def completed(x: Tensor, seen: Tensor) -> Tensor:
+    r"""Positions ``(T, n, 2)``, those missing by regression on the other points of their frame, over and over.
+
+    .. math:: x_j \leftarrow x_j - K_{jj}^{-1} (K x)_j, \qquad K = (C + \sigma^2 I)^{-1}
+
+    is the regression of point j on the others under the covariance C of all coordinates.  What regression leaves of a point at
+    the nearest times that it is seen is added: half as much is wrong.
+    """
+    if bool(seen.all()):
+        return x
+    mean = x.mean(0)
+    rows, n = (x - mean).flatten(1), x.shape[1]
+    noise = max(_noise(x, seen), 1e-6 * float(rows.square().mean()), 1e-300)
+    unit = torch.eye(2 * n, dtype=x.dtype, device=x.device)
+    for _ in range(ROUNDS):
+        inverse = torch.linalg.inv(rows.mT @ rows / len(rows) + noise * unit)
+        own = inverse.unflatten(0, (n, 2)).unflatten(2, (n, 2)).diagonal(dim1=0, dim2=2).movedim(-1, 0)  # (n, 2, 2)
+        change = torch.linalg.solve(own, (rows @ inverse).unflatten(1, (n, 2)).movedim(0, 2)).movedim(2, 0)
+        nearby = filled(torch.where(seen[..., None], change, 0.0), seen)
+        rows = rows - torch.where(seen[..., None], 0.0, change - nearby).flatten(1)
+    return rows.unflatten(1, (n, 2)) + mean
+
+
+def _motion(x: Tensor, width: float) -> Tensor:
+    """Median velocity ``(T, 2)`` of the points: a few that go elsewhere do not matter."""
+    velocity = torch.gradient(smooth(x, width), dim=0)[0]
+    return 0.5 * (velocity.median(1).values - (-velocity).median(1).values)  # of both middle ones
+
+
+def _convolved(x: Tensor, width: float) -> Tensor:
+    """Sums under a Gaussian of sum 1 along the first dimension."""
+    reach = min(math.ceil(4 * width), max(len(x) - 1, 1))
+    u = torch.arange(-reach, reach + 1, dtype=x.dtype, device=x.device) / width
+    kernel = torch.exp(-0.5 * u.square())
+    flat = x.reshape(len(x), -1).mT[:, None]
+    return torch.nn.functional.conv1d(flat, (kernel / kernel.sum())[None, None], padding=reach)[:, 0].mT.reshape(x.shape)
+
+
+OVERLAP = 0.35
+"""Share of the shorter take below which a lag is not judged."""
+FEWEST = 0.8
+"""Seconds of overlap below which a lag is not judged."""
+SHAPE, HEIGHT, MOTION = 2.4, 2.25, 5.7
+"""Independent samples per second of the shape, of its vertical part and of the motion: neighbouring frames repeat each other.
+Fitted as weights to the posterior of the true lag (30 frames per second, half of the motion capture takes, 15 mm)."""
+LOADING = 0.02
+"""Share of its own variance that a velocity is blurred by: no two medians of different points are the same."""
+BACKWARDS = 40
+"""Lags at which chance is measured."""
+PIECE = 2048
+"""Lags at a time: bounds the memory on long takes."""
+
+
+@dataclass(frozen=True, eq=False)
+class SubspaceCurve:
+    """Evidence over lags; frame i of a goes with frame i + lag of b.
+
+    Attributes:
+        lags: ``(L,)`` frames.
+        scores: ``(L,)`` nats, higher is better, NaN where the overlap is too short: logarithm of the posterior but for a constant.
+        counts: ``(L,)`` frames that overlap, but for the ends of each take.
+        shape: ``(L,)`` nats per frame that the shapes tell about each other, beyond chance.
+        height: ``(L,)`` the same of vertical coordinates alone.
+        motion: ``(L,)`` nats per frame that the motions of the whole tell.
+        signal: of either camera, directions in which the shape moves by more than noise.
+    """
+
+    lags: Tensor
+    scores: Tensor
+    counts: Tensor
+    shape: Tensor
+    height: Tensor
+    motion: Tensor
+    signal: tuple[float, float]
+    bodies: tuple[Body, Body] | None = None
+
+    @property
+    def rates(self) -> Tensor:
+        """``(L,)`` nats per frame: what does not grow with the overlap."""
+        return self.scores / self.counts.clamp(min=1.0)
+
+
+def subspace_curve(a: Tensor, b: Tensor, wa: Tensor, wb: Tensor, lags: tuple[int, int], *, step: float = STEP) -> SubspaceCurve:
+    r"""Evidence for every lag between the tracks of two static cameras that need not have a point in common.
+
+    .. math:: S(s) = m(s)\, [\, 2.4\, (J - J_0) + 2.25\, (J_y - J_{y0}) + 5.7\, J_v\, ],\qquad
+              J = \tfrac12 \log \frac{|C_{aa} + I|\, |C_{bb} + I|}{|C + I|}
+
+    J is the mutual information of Gaussian rows, coordinates of all points about the body's middle over its size in units of noise:
+    a scale-free count of the directions that row spaces share (Wolf and Zomet ask for the least rank of :math:`[A; B]`).
+    :math:`J_y` is that of the image's y alone, which upright cameras share most: half the rows, a quarter of the ways to agree by
+    chance.  What b played backwards tells, a line in 1/m, is subtracted from both.  :math:`J_v` is the information of the median
+    velocities, and m the seconds that overlap.
+
+    Args:
+        a: ``(Ta, n, 2)`` px, frames ``step`` apart.
+        b: ``(Tb, m, 2)``, the same step.
+        wa: ``(Ta, n)``, 0 = missing.
+        wb: ``(Tb, m)``.
+        lags: first and last, frames.
+        step: seconds from frame to frame.
+
+    Returns:
+        The curve.
+
+    Raises:
+        ValueError: lags in the wrong order.
+
+    Source: thesis, chapter 7; Wolf and Zomet 2006, Wide baseline matching between unsynchronized video sequences.
+
+    Example:
+        >>> import torch
+        >>> generator = torch.Generator().manual_seed(0)
+        >>> time = torch.arange(100, dtype=torch.float64)[:, None]
+        >>> pace = 0.05 + 0.15 * torch.rand(4, generator=generator, dtype=torch.float64)
+        >>> waves = torch.cat([(pace * time).sin(), (pace * time + 0.004 * time**2).cos()], dim=1)
+        >>> mix = lambda n: 50 * torch.randn(8, n, 2, generator=generator, dtype=torch.float64)
+        >>> a, b = (torch.einsum("tk,knd->tnd", part, mix(6)) for part in (waves[:90], waves[7:]))
+        >>> curve = subspace_curve(a, b, torch.ones(90, 6), torch.ones(93, 6), (-40, 40))
+        >>> int(curve.lags[curve.scores.nan_to_num(-torch.inf).argmax()])
+        -7
+    """
+    return bodies_curve(body_of(a, wa, step), body_of(b, wb, step), lags, step)
+
+
+def bodies_curve(first: Body, second: Body, lags: tuple[int, int], step: float = STEP) -> SubspaceCurve:
+    """The same of what is prepared."""
+    shape, height, motion, counts = _curves(first, second, lags)
+    judged = counts >= max(OVERLAP * min(float(first.weights.sum()), float(second.weights.sum())), FEWEST / step - 1e-9)
+    if bool(judged.any()):
+        chance = _chance(first, second.reversed, counts, judged, lags)
+        shape, height = shape - chance[:, 0], height - chance[:, 1]
+    scores = counts * step * (SHAPE * shape + HEIGHT * height + MOTION * motion)
+    span = torch.arange(lags[0], lags[1] + 1, dtype=torch.float64, device=counts.device)
+    return SubspaceCurve(
+        span, torch.where(judged, scores, torch.nan), counts, shape, height, motion, (first.signal, second.signal), (first, second)
+    )
+
+
+def _curves(a: Body, b: Body, lags: tuple[int, int]) -> list[Tensor]:
+    """Information of shapes, of heights and of motions, and counts, at all lags."""
+    weights = None if bool((a.weights > 0).all() and (b.weights > 0).all()) else (a.weights, b.weights)
+    found = []
+    for lo in range(lags[0], lags[1] + 1, PIECE):
+        span = lo, min(lo + PIECE - 1, lags[1])
+        aa, bb, ab, counts = lag_covariances(a.rows, b.rows, span, weights)
+        *motion, _ = lag_covariances(a.motion, b.motion, span, weights)
+        found.append((_shared(aa, bb, ab), _shared(*_vertical(aa, bb, ab)), _correlated(*motion), counts))
+    return [torch.cat(parts) for parts in zip(*found, strict=True)]
+
+
+def _chance(a: Body, b: Body, counts: Tensor, judged: Tensor, lags: tuple[int, int]) -> Tensor:
+    """What shapes and heights ``(L, 2)`` of different events tell about each other: a line in 1 / count, through some lags."""
+    at = judged.nonzero()[:, 0]
+    at = at[torch.linspace(0, len(at) - 1, min(BACKWARDS, len(at))).round().long().to(at.device)]
+    told, inverse, n = [], [], a.rows.shape[1]
+    for lag in (at + lags[0]).tolist():
+        start, end = max(0, -lag), min(len(a.rows), len(b.rows) - lag)
+        seen = a.weights[start:end] * b.weights[start + lag : end + lag] > 0
+        both = torch.cat([a.rows[start:end], b.rows[start + lag : end + lag]], dim=1)[seen]
+        both = both - both.mean(0)
+        share = 1 / max(len(both), 1)
+        c = (share * both.mT @ both)[None]
+        parts = c[:, :n, :n], c[:, n:, n:], c[:, :n, n:]
+        told.append(torch.cat([_shared(*parts), _shared(*_vertical(*parts))]))
+        inverse.append([1.0, share])
+    line = torch.linalg.lstsq(torch.tensor(inverse, dtype=torch.float64, device=counts.device), torch.stack(told)).solution
+    return line[0] + line[1] / counts.clamp(min=1.0)[:, None]
+
+
+def information(shape: Tensor, n: int, motion: Tensor) -> Tensor:
+    """Evidence per second ``(L,)`` of joint covariances: of shapes, whose first n rows are a's, and of motions; chance is in it."""
+    parts = shape[:, :n, :n], shape[:, n:, n:], shape[:, :n, n:]
+    told = SHAPE * _shared(*parts) + HEIGHT * _shared(*_vertical(*parts))
+    return told + MOTION * _correlated(motion[:, :2, :2], motion[:, 2:, 2:], motion[:, :2, 2:])
+
+
+def _vertical(aa: Tensor, bb: Tensor, ab: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Covariances of the y of points alone."""
+    return aa[..., 1::2, 1::2], bb[..., 1::2, 1::2], ab[..., 1::2, 1::2]
+
+
+def _shared(aa: Tensor, bb: Tensor, ab: Tensor) -> Tensor:
+    """Mutual information ``(L,)`` of rows with noise of variance 1."""
+    aa, bb = (c + torch.eye(c.shape[-1], dtype=c.dtype, device=c.device) for c in (aa, bb))
+    low_a, low_b = _factor(aa), _factor(bb)
+    white = torch.linalg.solve_triangular(low_a, ab, upper=False)
+    white = torch.linalg.solve_triangular(low_b, white.mT, upper=False)
+    left = torch.eye(white.shape[-2], dtype=aa.dtype, device=aa.device) - white @ white.mT
+    return -_factor(left).diagonal(dim1=-2, dim2=-1).log().sum(-1)
+
+
+def _correlated(aa: Tensor, bb: Tensor, ab: Tensor) -> Tensor:
+    """Mutual information ``(L,)`` where each coordinate has noise in proportion to itself."""
+    one, two = (LOADING * c.diagonal(dim1=-2, dim2=-1) for c in (aa, bb))
+    one, two = (v.clamp(min=1e-12 * float(v.max()) + 1e-300).rsqrt()[..., None] for v in (one, two))
+    return _shared(one * aa * one.mT, two * bb * two.mT, one * ab * two.mT)
+
+
+def _factor(c: Tensor) -> Tensor:
+    low: Tensor = torch.linalg.cholesky_ex(c).L
+    return low

@@ -1,0 +1,509 @@
+"""Synchronize two cameras that nobody synchronized."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from numbers import Real
+from typing import Any
+
+import torch
+from torch import Generator, Tensor
+
+from dyntorch.geometry.lens import fit_distortion, undistorted
+from dyntorch.numerics.arguments import on_cpu
+from dyntorch.numerics.blocks import one_thread
+from dyntorch.tasks.synchronize.different import different_points
+from dyntorch.tasks.synchronize.epipolar import Curve, Descent, Fit, Samples, epipolar_curve
+from dyntorch.tasks.synchronize.evidence import APART, PEAKS, WANDER, Attempt, consistent_points
+from dyntorch.tasks.synchronize.result import Shift
+from dyntorch.tasks.synchronize.tracks import RATES, Tracks, cleaned, frame_scaled, read_tracks, smoothed, without
+
+# ----------------------------------------------------------------------------------------------------------------------
+# The search for the best shift of corresponding points: all lags at some clock rates, then descents from the best of them.
+
+
+CLEAR = 0.6
+"""Nats above the next peak from which on that one needs no descent of its own."""
+DRIFTING = 10.0
+"""Seconds of overlap from which a clock rate is looked for: 1 % amounts to less than two frames of 30 at the ends of shorter takes,
+and what is wrong with a motion fits into a rate."""
+SIGNIFICANT = 3.0
+"""Sigmas from 1 for a clock rate to be believed."""
+FASTEST = 0.022
+"""Clock rates off by more are none."""
+NEGLIGIBLE = 0.1
+"""Frames over the take that a rate must amount to."""
+
+
+@dataclass(frozen=True)
+class Search:
+    """How to search.
+
+    Attributes:
+        step: seconds per lag; the slower camera's frame at least.
+        max_shift: seconds, None for all shifts with some overlap.
+        rates: of b's clock, to search at.
+        free_rate: whether the descent may change the rate.
+        method: ``"epipolar"`` or ``"affine"``: what the tracks were made for.
+    """
+
+    step: float = 0.0
+    max_shift: float | None = None
+    rates: tuple[float, ...] = (1.0,)
+    free_rate: bool = True
+    method: str = "epipolar"
+
+
+def attempt(a: Tracks, b: Tracks, search: Search, points: Tensor | None = None) -> Attempt:
+    """Search all shifts at the given rates of b's clock, descend from the best, and settle the rate.
+
+    Args:
+        points: ``(n,)`` bool, who takes part; all by default.
+    """
+    points = torch.ones(a.x.shape[1], dtype=torch.bool, device=a.x.device) if points is None else points
+    a, b = (a, b) if bool(points.all()) else (a.only(points), b.only(points))
+    step = max(a.step, b.step, search.step)
+    searched = [
+        (samples, epipolar_curve(samples, search.max_shift)) for samples in (Samples.of(a, b, step, r) for r in search.rates)
+    ]
+    fit = _best(a, b, [curve for _, curve in searched], step, search.free_rate)
+    samples, curve = min(searched, key=lambda found: abs(found[0].rate - (fit.rate if fit else 1.0)))
+    if fit is not None and abs(fit.rate - samples.rate) * (float(a.times[-1]) - float(a.times[0])) > 0.25 * step:
+        samples = Samples.of(a, b, step, fit.rate)
+        curve = epipolar_curve(samples, search.max_shift)
+    return Attempt(a, b, fit, curve, samples, step, search.max_shift, points, search.method)
+
+
+def _best(a: Tracks, b: Tracks, curves: list[Curve], step: float, free_rate: bool) -> Fit | None:
+    """The likeliest minimum near the peaks of the curves."""
+    frame = max(a.step, b.step)
+    starts = sorted(((score, lag * curve.rate, curve.rate) for curve in curves for lag, score in curve.peaks(PEAKS)), reverse=True)
+    if not starts:
+        return None
+    apart = max(APART * frame, 1.5 * step)
+    rivals = [start for start in starts if abs(start[1] - starts[0][1]) > apart or start[2] != starts[0][2]]
+    several = len(curves) > 1 or not rivals or starts[0][0] - rivals[0][0] < CLEAR
+    widths = [step]
+    while widths[-1] > frame:
+        widths.append(max(frame, widths[-1] / 3))
+    descent = Descent(a, b, step)
+    found = []
+    for score, offset, rate in starts[: PEAKS if several else 1]:
+        fit = descent.run(offset, rate, free_rate=free_rate and step > frame)
+        if fit is not None:
+            # the curve's variance counts everything, the fit's robust residual nothing that is far: both have a say
+            found.append((score - math.log(max(fit.residual, 1e-300)) + 0.5 * math.log(fit.effective), fit))
+    if not found:
+        return None
+    best = max(found, key=lambda pair: pair[0])[1]
+    for width in widths[1:]:
+        descent = Descent(a, b, width)
+        best = descent.run(best.offset, best.rate, free_rate=free_rate) or best
+    long = float(best.times[-1] - best.times[0]) > DRIFTING
+    return _settled(descent, best) if free_rate and long else best
+
+
+def _settled(descent: Descent, fit: Fit) -> Fit:
+    """With its own rate where that differs from 1 beyond doubt, else with rate 1."""
+    free = descent.run(fit.offset, fit.rate, free_rate=True)
+    span = float(fit.times[-1] - fit.times[0])
+    if free is not None and FASTEST > abs(free.rate - 1) > max(SIGNIFICANT * free.rate_sigma, NEGLIGIBLE * descent.frame / span):
+        return free
+    fixed = descent.run(fit.shift, 1.0) if fit.rate != 1 else fit
+    return fixed or fit
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Synchronization by points that both cameras see: plain first, then what may be wrong with the input, one thing at a time.
+
+
+LONGEST = 4_000
+"""Steps of a take at most; longer takes are searched in coarser steps."""
+COARSE = 2_000
+"""Steps of a take for a search over rates, of a tenth of a second at least."""
+SUSPECT = 3.0
+"""Times the usual residual, beyond which a point is wrong."""
+FAR = 6.0
+"""Robust standard deviations from the fit at which a position counts as an outlier."""
+LOST = 0.3
+"""Share of the positions of a point, or of a stretch of the take, that may be outliers."""
+STRETCHES = 8
+RARE = 0.01
+"""Share of the positions that makes no difference to a fit that is sure."""
+ROUGH = 1.25
+"""Residual over what the noise explains, from which lenses are looked at."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Result:
+    """The best attempt and what it took.
+
+    Attributes:
+        seen: ``(n,)`` bool, points that both cameras show at all.
+    """
+
+    found: Attempt
+    notes: tuple[str, ...]
+    seen: Tensor
+
+
+def same_points(
+    a: Tracks,
+    b: Tracks,
+    *,
+    max_shift: float | None,
+    rate: float | None,
+    camera: str,
+    lenses: bool,
+    generator: Generator | None,
+) -> Result:
+    """The shift of cameras that see the same points.
+
+    Args:
+        rate: of b's clock, where it is known.
+        camera: ``"perspective"``, ``"affine"`` or ``"auto"``.
+        lenses: whether nobody calibrated the cameras, and distortion may be looked for.
+    """
+    span = min(float(t.times[-1] - t.times[0]) for t in (a, b))
+    search = Search(step=span / LONGEST, max_shift=max_shift, rates=(rate or 1.0,), free_rate=rate is None)
+    seen = (a.weights > 0).any(0) & (b.weights > 0).any(0)
+    if a.still or b.still:
+        return Result(dataclasses.replace(attempt(a, b, search), fit=None), (), seen)
+    if camera == "affine":
+        return Result(_affine(a, b, search, generator), (), seen)
+    found = _sorted_out(a, b, search, generator)
+    if not found.decided and rate is None:
+        found = _better(found, _over_rates(a, b, search, span, generator))
+    notes: tuple[str, ...] = ()
+    if lenses and found.fit is not None and found.roughness > ROUGH:
+        found, notes = _straightened(found, a, b, search, generator)
+    if camera == "auto" and not found.decided:
+        scaled = _affine(a, b, search, generator)
+        # without the place in the picture a gait repeats itself, so that affine cameras alone may be sure of a wrong period
+        if scaled.decided and _agree(scaled, found):
+            note = "affine cameras: the points do not hold enough depth, or are too noisy, for perspective ones"
+            return Result(scaled, (note,), seen)
+    return Result(found, notes if found.decided else (), seen)
+
+
+def _sorted_out(a: Tracks, b: Tracks, search: Search, generator: Generator | None) -> Attempt:
+    """An attempt with all points, and one without those that do not fit, where that may be why it fails."""
+    found = attempt(a, b, search)
+    pruned = _pruned(found)
+    if pruned is not None:
+        a, b = pruned
+        found = _better(found, dataclasses.replace(attempt(a, b, search), pruned=True))
+    if found.decided and not bool(_suspects(found).any()):
+        return found
+    points = consistent_points(a, b, found, generator)
+    if points is None or bool(points.all()):
+        return found
+    return _better(found, dataclasses.replace(attempt(a, b, search, points), pruned=pruned is not None))
+
+
+def _pruned(found: Attempt) -> tuple[Tracks, Tracks] | None:
+    """Tracks without the positions far from the fit, in both cameras: whose is wrong is not known; None where all is well."""
+    fit = found.fit
+    if fit is None or len(fit.times) != len(found.a.times):
+        return None
+    far = fit.distances.abs() > FAR
+    seen = fit.distances.isfinite()
+    # a point that is mostly elsewhere is another point, and is found as such
+    far = far & (far.sum(0) <= LOST * seen.sum(0))
+    parts = [(float(one.sum()), float(all_.sum())) for one, all_ in zip(far.chunk(STRETCHES), seen.chunk(STRETCHES), strict=True)]
+    if found.decided and float(far.double().mean()) < RARE:
+        return None  # the weights of the fit are enough
+    # a stretch that does not fit is no outlier: it contradicts
+    if not bool(far.any()) or any(lost > LOST * whole for lost, whole in parts):
+        return None
+    frames, joints = far.nonzero().unbind(1)
+    there = fit.times[frames] * fit.rate + fit.offset
+    nearest = (there[:, None] - found.b.times).abs().argmin(1)
+    other = torch.zeros_like(found.b.weights, dtype=torch.bool)
+    other[nearest, joints] = True
+    return without(found.a, far), without(found.b, other)
+
+
+def _over_rates(a: Tracks, b: Tracks, search: Search, span: float, generator: Generator | None) -> Attempt | None:
+    """A search over clock rates too, where a wrong one would have smeared the motion."""
+    step = max(span / COARSE, 0.1)
+    change = 2 * step / span  # moves the ends of the overlap by a step
+    count = math.ceil(RATES / change)
+    if span < DRIFTING:
+        return None
+    rates = tuple(1 + k * change for k in range(-count, count + 1))
+    coarse = attempt(a, b, dataclasses.replace(search, step=step, rates=rates))
+    if coarse.fit is None:
+        return None
+    return _sorted_out(a, b, dataclasses.replace(search, rates=(coarse.fit.rate,)), generator)
+
+
+def _affine(a: Tracks, b: Tracks, search: Search, generator: Generator | None) -> Attempt:
+    return _sorted_out(frame_scaled(a), frame_scaled(b), dataclasses.replace(search, method="affine"), generator)
+
+
+def _better(one: Attempt, other: Attempt | None) -> Attempt:
+    """The decided one; where both are, the other, which had the more careful input; where none is, the one more likely right."""
+    if other is None or other.fit is None:
+        return one
+    if one.fit is None or other.decided:
+        return other
+    return one if one.decided or one.confidence >= other.confidence else other
+
+
+def _agree(one: Attempt, other: Attempt) -> bool:
+    """Whether the best shifts are the same."""
+    return one.fit is not None and other.fit is not None and abs(one.fit.shift - other.fit.shift) <= APART * one.frame
+
+
+def _suspects(found: Attempt) -> Tensor:
+    """``(n,)`` of the points that took part: whether their residual is out of all proportion."""
+    assert found.fit is not None
+    own = found.fit.distances.abs().nanmedian(0).values * 1.4826
+    return own.nan_to_num(0.0) > SUSPECT
+
+
+def _straightened(
+    found: Attempt, a: Tracks, b: Tracks, search: Search, generator: Generator | None
+) -> tuple[Attempt, tuple[str, ...]]:
+    """Once more with lenses fitted at the shift found, where they are significant."""
+    assert found.fit is not None
+    fit = found.fit
+    x1, _, w1 = smoothed(found.a, fit.times, found.frame)
+    x2, _, w2 = smoothed(found.b, fit.times * fit.rate + fit.offset, found.frame)
+    lens = fit_distortion(x1.flatten(0, 1), x2.flatten(0, 1), (w1 * w2).flatten())
+    if not lens.significant:
+        return found, ()
+    straight = []
+    for tracks, one in zip((a, b), lens.lenses, strict=True):
+        x = one.undistort(tracks.x)
+        seen = x.isfinite().all(-1)
+        straight.append(dataclasses.replace(tracks, x=torch.where(seen[..., None], x, 0.0), weights=tracks.weights * seen))
+    again = attempt(straight[0], straight[1], search, found.points)
+    better = again.fit is not None and again.fit.residual < fit.residual and _better(found, again) is again
+    return (again, (lens.note,)) if better else (found, ())
+
+
+SHORTEST = 12
+"""Frames of a take at least."""
+BLIND = 10.0
+"""Frames of sigma from which no shift stands out at all."""
+CAMERAS = ("auto", "perspective", "affine")
+
+
+@one_thread
+@on_cpu
+def synchronize(
+    a: Tensor,
+    b: Tensor,
+    correspondence: bool = True,
+    *,
+    fps: float | tuple[float, float] | None = None,
+    times: tuple[Tensor, Tensor] | None = None,
+    max_shift: float | None = None,
+    calibration: tuple[Any, Any] | None = None,
+    weights: tuple[Tensor | None, Tensor | None] | None = None,
+    rate: float | None = None,
+    camera: str = "auto",
+    generator: Generator | None = None,
+) -> Shift:
+    r"""How b's clock runs against a's, from what two static cameras saw move: :math:`t_b = \text{rate}\; t_a + \text{offset}`.
+
+    With corresponding points, the shift at which one fundamental matrix explains all frames:
+
+    .. math:: \min_{s, F} \frac{\sum_{ij} (x_{b,j}(t_i + s)^T F\, x_{a,j}(t_i))^2}{\sum_{ij} |\nabla|^2},
+
+    at all shifts by FFT, then by least squares of the Sampson distance in offset, rate and F together.  With different points, the
+    shift at which the two cameras' coordinates share most information.  The result is refused (``ok`` false, with a reason)
+    where the motion repeats itself, is too small, or where parts of the take disagree.
+
+    A search: it computes on the CPU wherever its tensors are, and the result returns to their device.
+
+    Args:
+        a: ``(frames_a, n, 2)`` px, y down; NaN = missing.  Point k of a is point k of b.
+        b: ``(frames_b, n, 2)``; without correspondence ``(frames_b, m, 2)``.
+        correspondence: whether points correspond.
+        fps: frames per second of both, or of each; frame 0 is at 0 s.
+        times: instead, ``(frames,)`` seconds of each frame, increasing, for variable frame rates and dropped frames.
+        max_shift: how far to search, seconds; None for all shifts with enough overlap.
+        calibration: per camera None or ``(K, dist)`` (OpenCV's order), whose distortion is removed.  Without, distortion is
+            looked for where the points do not fit, and removed by one parameter per camera, with a note.
+        weights: per camera ``(frames, n)``, such as a detector's confidences; 0 = ignore.
+        rate: of b's clock, where known; by default 1 unless the takes say otherwise (up to 2 %).
+        camera: ``"perspective"``, ``"affine"`` (points about their middle in each frame), or ``"auto"``: perspective unless that
+            cannot decide and affine can.  Of corresponding points only.
+        generator: of the subsets that look for wrong points; a fixed one by default.
+
+    Returns:
+        offset, sigma, rate, confidence, all peaks, and whether it is ok.
+
+    Raises:
+        ValueError: input of the wrong shape, fewer than 12 frames, a take that is nearly all gap, or settings that make no sense.
+
+    Source: thesis, chapter 7 (Wolf and Zomet 2002); theory of moments at all lags by FFT.
+
+    Example:
+        >>> import torch
+        >>> g = torch.Generator().manual_seed(0)
+        >>> t = torch.arange(150, dtype=torch.float64)[:, None, None] / 30
+        >>> wave = lambda: torch.randn(12, 3, generator=g, dtype=torch.float64)
+        >>> speeds, phases, sizes, base = 4 * wave().abs(), 6 * wave(), wave(), 3 * wave()
+        >>> def film(t, turn):  # twelve points that wobble, from five metres away
+        ...     p = base / 3 + 0.2 * sizes * torch.sin(speeds * t + phases)
+        ...     c, d = math.cos(turn), math.sin(turn)
+        ...     x, z = c * p[..., 0] + d * p[..., 2], c * p[..., 2] - d * p[..., 0]
+        ...     return 800 * torch.stack([x, p[..., 1]], -1) / (z + 5)[..., None]
+        >>> shift = synchronize(film(t, 0.0), film(t - 0.42, 1.0), fps=30.0)
+        >>> round(shift.offset, 3), shift.ok
+        (0.42, True)
+    """
+    _check(correspondence, fps, times, weights, max_shift, rate, camera)
+    pair: tuple[float | None, float | None] = (None, None)
+    if fps is not None:
+        pair = (float(fps[0]), float(fps[1])) if isinstance(fps, Sequence) else (float(fps), float(fps))
+    given = (None, None) if weights is None else weights
+    tracks = [
+        read_tracks(name, x, one, None if times is None else times[i], given[i])
+        for i, (name, x, one) in enumerate(zip("ab", (a, b), pair, strict=True))
+    ]
+    for name, one in zip("ab", tracks, strict=True):
+        if len(one.times) < SHORTEST:
+            raise ValueError(f"{name} has {len(one.times)} frames, {SHORTEST} are needed at least")
+    if calibration is not None:
+        tracks = [_straight(name, one, lens) for name, one, lens in zip("ab", tracks, _pairwise(calibration), strict=True)]
+    # both clocks count from a's first frame: timestamps may be of any era, and products of rates with them lose digits
+    origin = float(tracks[0].times[0])
+    first, second = (cleaned(dataclasses.replace(one, times=one.times - origin)) for one in tracks)
+    if not correspondence:
+        return different_points(first, second, max_shift=max_shift, rate=rate).since(origin)
+    if a.shape[1] != b.shape[1]:
+        raise ValueError(
+            f"a has {a.shape[1]} points and b {b.shape[1]}: corresponding points are as many; "
+            "give the same ones in the same order, or correspondence=False"
+        )
+    result = same_points(
+        first, second, max_shift=max_shift, rate=rate, camera=camera, lenses=calibration is None, generator=generator
+    )
+    return _shift(result).since(origin)
+
+
+def _check(
+    correspondence: bool,
+    fps: float | tuple[float, float] | None,
+    times: tuple[Tensor, Tensor] | None,
+    weights: tuple[Tensor | None, Tensor | None] | None,
+    max_shift: float | None,
+    rate: float | None,
+    camera: str,
+) -> None:
+    if (fps is None) == (times is None):
+        raise ValueError(f"give either fps or times, got {'neither' if fps is None else 'both'}")
+    for name, value in (("fps", fps), ("times", times), ("weights", weights)):
+        paired = isinstance(value, Sequence) and len(value) == 2
+        if value is not None and not isinstance(value, Real) and not paired:
+            got = f"{len(value)} values" if isinstance(value, Sequence) else type(value).__name__
+            raise ValueError(f"{name} must be a pair, one of a and one of b, got {got}")
+    if max_shift is not None and not 0 < max_shift < math.inf:
+        raise ValueError(f"max_shift must be a positive number of seconds or None, got {max_shift}")
+    if rate is not None and not 0.1 < rate < 10:
+        raise ValueError(f"rate must be about 1 (seconds of b's clock per second of a's), got {rate}; give fps for frame rates")
+    if camera not in CAMERAS:
+        raise ValueError(f"camera must be one of {', '.join(CAMERAS)}, got {camera!r}")
+    if camera != "auto" and not correspondence:
+        raise ValueError(f"camera={camera!r} is for corresponding points; leave it out with correspondence=False")
+
+
+def _pairwise(calibration: Any) -> Sequence[Any]:
+    if not isinstance(calibration, Sequence) or len(calibration) != 2:
+        raise ValueError("calibration must be a pair, of a and of b: each None or (K, dist)")
+    return calibration
+
+
+def _straight(name: str, tracks: Tracks, lens: Any) -> Tracks:
+    try:
+        x = undistorted(tracks.x, lens)
+    except ValueError as problem:
+        raise ValueError(f"calibration of {name}: {problem}") from problem
+    seen = (tracks.weights > 0) & x.isfinite().all(-1)
+    return dataclasses.replace(tracks, x=torch.where(seen[..., None], x, 0.0), weights=torch.where(seen, tracks.weights, 0.0))
+
+
+def _shift(result: Result) -> Shift:
+    """The result of an attempt."""
+    found, notes = result.found, result.notes
+    fps = 1 / found.a.step, 1 / found.b.step
+    fit = found.fit
+    points = found.points & result.seen
+    if fit is None:
+        none = torch.zeros(0, dtype=torch.float64)
+        reason = _nothing(found)
+        return Shift(
+            0.0, math.inf, 1.0, 0.0, 0.0, none.reshape(0, 2), False, reason, found.method, fps, 0.0, none, none, result.seen
+        )
+    wrong = (result.seen & ~found.points).nonzero()[:, 0].tolist()
+    if wrong:
+        which = ", ".join(str(point) for point in wrong)
+        notes = (*notes, f"{len(wrong)} of {len(points)} points never agree with the others and were left out: {which}")
+    if found.decided and found.wander > WANDER:
+        notes = (*notes, "each half of the take fits much better by itself: a camera may have moved")
+    lags = found.curve.rate * (found.curve.lags + fit.center) - fit.center
+    return Shift(
+        offset=fit.offset,
+        sigma=found.sigma,
+        rate=fit.rate,
+        rate_sigma=fit.rate_sigma,
+        confidence=found.confidence,
+        peaks=torch.tensor(found.peaks, dtype=torch.float64),
+        ok=found.decided,
+        reason="" if found.decided else _reason(found),
+        method=found.method,
+        fps=fps,
+        center=fit.center,
+        lags=lags,
+        scores=found.curve.scores,
+        points=points,
+        fundamental=fit.fundamental if found.method == "epipolar" else None,
+        notes=notes,
+    )
+
+
+def _nothing(found: Attempt) -> str:
+    """Why no shift stands out."""
+    for name, tracks in (("a", found.a), ("b", found.b)):
+        if not bool((tracks.weights > 0).any()):
+            return f"no point is seen in {name}; check the detections"
+        if tracks.still:
+            return f"nothing moves in {name}; film some movement"
+    return "no shift stands out, or both cameras never show enough points at once; film longer, or raise max_shift"
+
+
+def _reason(found: Attempt) -> str:
+    fit = found.fit
+    assert fit is not None
+    if fit.sigma > BLIND * found.frame:
+        return _nothing(found)
+    if found.edge:
+        return f"the best shift, about {fit.shift:+.3g} s, lies at the end of the search or beyond; raise max_shift"
+    if not found.sharp:
+        return (
+            f"the motion is too small for its noise: the best shift, {fit.shift:+.3g} s, is uncertain by {fit.sigma:.2g} s "
+            "or more; film larger or faster movements"
+        )
+    if found.margin < found.needed and len(found.peaks) > 1:
+        least = found.misfits[0] - found.needed
+        near = [shift for (shift, _), misfit in zip(found.peaks, found.misfits, strict=True) if misfit > least]
+        rivals = ", ".join(f"{shift:+.3g} s" for shift in near[1:4])
+        return (
+            f"the motion repeats itself or is too small: {found.peaks[0][0]:+.3g} s fits hardly better than {rivals}; "
+            "film something that happens once, or narrow max_shift"
+        )
+    first, second = found.halves
+    shifts = (f"{fit.shift + away * found.frame:+.3g} s" for away in (first, second))
+    said = " and ".join("nothing" if "nan" in shift else shift for shift in shifts)
+    return (
+        f"the halves of the take say {said}, more than {APART:g} frames from {fit.shift:+.3g} s: "
+        "the cameras may show different events, overlap too little, or one of them moved"
+    )

@@ -1,0 +1,337 @@
+"""Tracks of one camera on its own clock: checked, and smoothed to any moments."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+from torch.nn.functional import conv1d, pad
+
+from dyntorch.geometry.homogeneous import similarity
+from dyntorch.numerics.arguments import FARTHEST
+
+RATES = 0.02
+"""A frame rate as told is wrong by no more than this share."""
+REACH = 4.0
+"""Standard deviations at which the smoothing kernel ends."""
+THIN = 0.4
+"""Share of the kernel's weight that must be seen; less is a gap."""
+SPARSE = 20, 20_000
+"""Times the frames there are, and at least how many, that a clock may run over: it is searched frame by frame."""
+PIECE = 1 << 21
+"""Numbers that one piece of a long take gathers at a time."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """Points of one camera.
+
+    Attributes:
+        x: ``(frames, n, 2)`` float64, 0 where missing.
+        weights: ``(frames, n)``, 0 where missing.
+        times: ``(frames,)`` seconds, increasing.
+        step: seconds from one frame to the next, the median.
+    """
+
+    x: Tensor
+    weights: Tensor
+    times: Tensor
+    step: float
+
+    @cached_property
+    def noise(self) -> float:
+        r"""Standard deviation of a coordinate, from third differences :math:`\mathrm{med}|d_3| / (.6745 \sqrt{20})`: motion is
+        smooth."""
+        seen = self.weights > 0
+        whole = seen[3:] & seen[2:-1] & seen[1:-2] & seen[:-3]
+        rough = self.x.diff(n=3, dim=0)[whole].abs()
+        return float(rough.median()) / (0.6745 * math.sqrt(20)) if rough.numel() else 0.0
+
+    @cached_property
+    def scale(self) -> float:
+        """Root mean square distance of the points from their mean."""
+        return float(self.centred.square().sum(-1).mul(self.weights).sum().div(self.weights.sum().clamp(min=1e-300)).sqrt())
+
+    @cached_property
+    def still(self) -> bool:
+        """Whether no point moves by more than a millionth of how far points lie apart."""
+        share = self.weights / self.weights.sum(0).clamp(min=1e-300)
+        away = (self.x - (self.x * share[..., None]).sum(0)).square().sum(-1)
+        return bool((torch.where(share > 0, away, 0.0).amax(0).sqrt() <= 1e-6 * self.scale).all())
+
+    @cached_property
+    def centred(self) -> Tensor:
+        """Points about their mean over the take; 0 where missing."""
+        share = (self.weights / self.weights.sum().clamp(min=1e-300))[..., None]
+        return torch.where(share > 0, self.x - (self.x * share).sum((0, 1)), 0.0)
+
+    @cached_property
+    def change(self) -> Tensor:
+        """``(3, 3)`` similarity to mean 0 and root mean square distance sqrt(2)."""
+        share = (self.weights / self.weights.sum().clamp(min=1e-300))[..., None]
+        scale = math.sqrt(2) / self.scale if self.scale > 0 else 1.0
+        return similarity(torch.as_tensor(scale, dtype=torch.float64, device=self.x.device), (self.x * share).sum((0, 1)))
+
+    def every(self, step: float) -> Tensor:
+        """Seconds from the first frame to the last, ``step`` apart."""
+        start, end = float(self.times[0]), float(self.times[-1])
+        return start + step * torch.arange(int((end - start) / step + 1e-6) + 1, dtype=torch.float64, device=self.x.device)
+
+    def only(self, points: Tensor) -> Tracks:
+        """These points ``(n,)`` bool alone."""
+        return dataclasses.replace(self, x=self.x[:, points], weights=self.weights[:, points])
+
+
+def read_tracks(name: str, x: Tensor, fps: float | None, times: Tensor | None, weights: Tensor | None) -> Tracks:
+    """Tracks of checked input.
+
+    Raises:
+        ValueError: naming a or b, what is wrong with it, and what to do.
+    """
+    if not isinstance(x, Tensor) or x.ndim != 3 or x.shape[-1] != 2:
+        got = tuple(x.shape) if isinstance(x, Tensor) else type(x).__name__
+        raise ValueError(f"{name} must be a tensor (frames, points, 2), got {got}")
+    if x.shape[1] == 0:
+        raise ValueError(f"{name} has no points: shape {tuple(x.shape)}; give (frames, points, 2)")
+    if not x.is_floating_point():
+        raise ValueError(f"{name} must hold floating point numbers, got {x.dtype}; use {name}.double()")
+    if times is None:
+        if fps is None or not 0 < fps < math.inf:
+            raise ValueError(f"fps of {name} must be a positive number of frames per second, got {fps}; or give times=")
+        times = torch.arange(len(x), dtype=torch.float64, device=x.device) / fps
+    x = x.detach()
+    clock = torch.as_tensor(times, dtype=torch.float64, device=x.device)
+    if clock.shape != x.shape[:1] or not bool(clock.isfinite().all()):
+        raise ValueError(f"times of {name} must be {x.shape[0]} finite seconds, one per frame, got {tuple(clock.shape)}")
+    steps = clock.diff()
+    if bool((steps <= 0).any()):
+        at = int((steps <= 0).nonzero()[0, 0]) + 1
+        raise ValueError(f"times of {name} must increase, but frame {at} is not after the one before; sort or drop such frames")
+    _check_dense(name, clock)
+    seen = (x.double().abs() <= FARTHEST).all(-1)
+    if weights is None:
+        given = seen.double()
+    else:
+        given = torch.as_tensor(weights, dtype=torch.float64, device=x.device)
+        if given.shape != seen.shape or not bool((given.isfinite() & (given >= 0)).all()):
+            raise ValueError(f"weights of {name} must be {tuple(seen.shape)}, finite and not negative, got {tuple(given.shape)}")
+        given = given * seen
+    step = float(steps.median()) if len(steps) else math.nan
+    return Tracks(torch.where((given > 0)[..., None], x.double(), 0.0), given, clock, step)
+
+
+def _check_dense(name: str, times: Tensor) -> None:
+    """Raise where a take is nearly all gap."""
+    steps = times.diff()
+    if len(steps) == 0:
+        return
+    span, step = float(times[-1] - times[0]), float(steps.median())
+    if span <= step * max(SPARSE[0] * len(times), SPARSE[1]):
+        return
+    at = int(steps.argmax())
+    raise ValueError(
+        f"times of {name} run over {span:.3g} s, but it has {len(times)} frames {step:.3g} s apart, and none for "
+        f"{float(steps[at]):.3g} s after {float(times[at]):.6g} s; give the frames on one side of that gap"
+    )
+
+
+def without(tracks: Tracks, bad: Tensor) -> Tracks:
+    """Tracks without some positions ``(frames, n)`` bool."""
+    kept = torch.where(bad, 0.0, tracks.weights)
+    return dataclasses.replace(tracks, x=torch.where((kept > 0)[..., None], tracks.x, 0.0), weights=kept)
+
+
+def noise_ratio(a: Tracks, b: Tracks) -> float:
+    """Noise of b over that of a, no farther from the ratio of their sizes than a factor of 2."""
+    size = b.scale / a.scale if min(a.scale, b.scale) > 0 else 1.0
+    noise = b.noise / a.noise if a.noise > 1e-6 * a.scale and b.noise > 1e-6 * b.scale else size
+    return min(max(noise, size / 2), size * 2)
+
+
+def smoothed(tracks: Tracks, at: Tensor, width: float) -> tuple[Tensor, Tensor, Tensor]:
+    r"""Positions and velocities at any moments, by a line fitted to the frames around each, with Gaussian weights.
+
+    .. math:: \min_{p, v} \sum_k w_k\, e^{-(t_k - t)^2 / 2 \sigma^2}\; |x_k - p - v (t_k - t)|^2
+
+    The same kernel for both cameras, so that what it takes away is taken from both.  From a standard deviation of one frame on,
+    the noise that is left does not depend on where between frames a moment is: interpolation at fractions of frames would draw
+    an estimate of the shift to half frames.
+
+    Args:
+        at: ``(m,)`` seconds.
+        width: the standard deviation, seconds.
+
+    Returns:
+        positions and velocities per second ``(m, n, 2)``, 0 in gaps, and weights ``(m, n)``: the mean of those near, less
+        where frames on one side are missing, 0 in gaps.
+    """
+    taps = 2 * (math.ceil(REACH * width / tracks.step) + 1) + 1
+    rows = max(1, PIECE // max(1, taps * tracks.x.shape[1] * 2))
+    pieces = [_smoothed(tracks, piece, width, taps // 2) for piece in at.split(rows)] or [_smoothed(tracks, at, width, taps // 2)]
+    return tuple(torch.cat(parts) for parts in zip(*pieces, strict=True))  # type: ignore[return-value]
+
+
+def _smoothed(tracks: Tracks, at: Tensor, width: float, taps: int) -> tuple[Tensor, Tensor, Tensor]:
+    frames, points = tracks.weights.shape
+    near = torch.searchsorted(tracks.times, at.contiguous())[:, None] + torch.arange(-taps, taps + 1, device=at.device)
+    index = near.clamp(0, frames - 1)
+    u = (tracks.times[index] - at[:, None]) / width
+    kernel = torch.exp(-0.5 * u.square()) * (near == index)  # (m, taps)
+    w, x = tracks.weights[index], tracks.x[index].flatten(2)  # (m, taps, n), (m, taps, 2n)
+    powers = torch.stack([kernel, kernel * u, kernel * u * u], dim=1)  # (m, 3, taps)
+    s0, s1, s2 = torch.bmm(powers, w).unbind(1)
+    wx = (w[..., None] * x.unflatten(2, (points, 2))).flatten(2)
+    t0, t1 = torch.bmm(powers[:, :2], wx).unflatten(2, (points, 2)).unbind(1)
+    full = math.sqrt(2 * math.pi) * width / tracks.step
+    determinant = s0 * s2 - s1.square()
+    usual = torch.bmm(powers[:, :1], (w > 0).double())[:, 0]  # the kernel's weight on frames that show the point
+    # two-sided: a line through frames on one side only would extrapolate
+    seen = (usual > THIN * full) & (determinant > 0.15 * s0.square())
+    share = torch.where(seen, 1 / torch.where(seen, determinant, 1.0), 0.0)[..., None]
+    position = (s2[..., None] * t0 - s1[..., None] * t1) * share
+    velocity = (s0[..., None] * t1 - s1[..., None] * t0) * share / width
+    # at the edges of gaps the line hangs on one side, and its noise is several times as large
+    sure = (usual / full).clamp(max=1.0) * (determinant / s0.square().clamp(min=1e-300)).clamp(max=1.0)
+    return position, velocity, torch.where(seen, sure * s0 / usual.clamp(min=1e-300), 0.0)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Positions that are elsewhere for a frame or a few: found by the track's own neighbouring frames.
+
+
+OUTLYING = 4.0
+"""Robust standard deviations from the median of the neighbouring frames beyond which a position is an outlier (Hampel's 3 takes
+more good positions at turns of the motion)."""
+NEIGHBOURS = 3
+"""Frames on each side that an outlier is judged by."""
+WIDTH = 1.5
+"""Frames, standard deviation of the line's kernel in the second pass."""
+PEELED = 6.0
+"""Robust standard deviations from that line."""
+ALONE = 2.0
+"""Times the residual of the neighbours: a sudden movement bends several frames alike, a wrong position its own most."""
+FINE = 1e-3
+"""Of the distance of the points from their mean: a deviation below it is none, whatever the spread; points at rest have no
+spread."""
+ROUNDS = 8
+
+
+def cleaned(tracks: Tracks) -> Tracks:
+    r"""Without positions far from the median of their neighbours, then, one by one, without those far from a line through the
+    others.
+
+    .. math:: |x_t - m_t| > \tau\, 1.4826\, \mathrm{med}_{|k| \le K} |x_{t+k} - m_t|,\quad m_t = \mathrm{med}_{|k| \le K}\, x_{t+k}
+
+    The spread has floors, the track's own usual one and that of most tracks, without which a point at rest would lose good
+    positions.  The median leaves
+    5 of 100 outliers (of 15 mm of noise, 15 of 100 positions anywhere), often far away; the second pass leaves 2, near by.
+
+    Source: Hampel 1974, The influence curve and its role in robust estimation.
+    """
+    if len(tracks.x) < 2 * NEIGHBOURS + 1:
+        return tracks
+    return _peeled(without(tracks, _far_from_median(tracks)))
+
+
+def _far_from_median(tracks: Tracks) -> Tensor:
+    seen = tracks.weights > 0
+    x = torch.where(seen[..., None], tracks.x, torch.nan)
+    ends = [x[:NEIGHBOURS].flip(0), x[-NEIGHBOURS:].flip(0)]
+    window = torch.cat([ends[0], x, ends[1]]).unfold(0, 2 * NEIGHBOURS + 1, 1)  # (frames, n, 2, width)
+    middle = window.nanmedian(-1).values
+    far = (x - middle).abs()
+    spread = 1.4826 * (window - middle[..., None]).abs().nanmedian(-1).values
+    usual = 1.4826 * _usual(torch.where(seen[..., None], far, torch.nan))
+    usual = torch.maximum(usual, usual.nanmedian(0).values).clamp(min=FINE * tracks.scale)
+    return (far > OUTLYING * torch.maximum(spread, usual)).any(-1)
+
+
+def _peeled(tracks: Tracks) -> Tracks:
+    """The worst position of its neighbourhood goes first, then the line through what is left is fitted again."""
+    kept = tracks.weights > 0
+    for _ in range(ROUNDS):
+        away = _from_line(tracks.x, kept)
+        scale = 1.4826 * _usual(away)
+        scale = scale.clamp(min=max(FINE * tracks.scale, float(scale.nanmedian().nan_to_num(0.0))))
+        away = away.nan_to_num(0.0)
+        rows = pad(away, (0, 0, 2, 2))
+        near = torch.stack([rows[k : k + len(away)] for k in (0, 1, 3, 4)])
+        bad = (away > PEELED * scale / 1.18) & (away > ALONE * near.median(0).values) & (away >= near.amax(0))
+        if not bool(bad.any()):
+            break
+        kept = kept & ~bad
+    return without(tracks, ~kept)
+
+
+def _usual(far: Tensor) -> Tensor:
+    """Medians over the frames; of what differs from 0 where most do not: points at rest, or rounded to whole pixels."""
+    usual, rounding = far.nanmedian(0).values, 1e-9 * far.nan_to_num(0.0).amax()
+    other = torch.where(far > rounding, far, torch.nan).nanmedian(0).values.nan_to_num(0.0)
+    return torch.where(usual > rounding, usual, other)
+
+
+def _from_line(x: Tensor, kept: Tensor) -> Tensor:
+    """``(frames, n)`` distances from a line in time through the neighbouring frames but not the own one; NaN where there is
+    none."""
+    reach = int(3 * WIDTH)
+    u = torch.arange(-reach, reach + 1, dtype=x.dtype, device=x.device) / WIDTH
+    kernel = torch.exp(-0.5 * u.square())
+    kernel[reach] = 0.0
+    w = kept.to(x.dtype)
+    s0, s1, s2 = (_correlated(w, kernel * u**power) for power in range(3))
+    weighted = torch.where(kept[..., None], x, 0.0)
+    t0, t1 = (_correlated(weighted.flatten(1), kernel * u**power).unflatten(1, x.shape[1:]) for power in range(2))
+    determinant = s0 * s2 - s1.square()
+    known = kept & (determinant > 0.1 * s0.square()) & (s0 > 0.3)
+    line = (s2[..., None] * t0 - s1[..., None] * t1) / torch.where(known, determinant, 1.0)[..., None]
+    return torch.where(known, (x - line).norm(dim=-1), torch.nan)
+
+
+def _correlated(rows: Tensor, kernel: Tensor) -> Tensor:
+    """``(frames, channels)`` with a kernel in time."""
+    return conv1d(rows.mT[:, None], kernel[None, None], padding=len(kernel) // 2)[:, 0].mT
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Tracks about the middle of each frame, in units of how large they are there: what affine cameras would have seen.
+
+
+SLOW = 0.5
+"""Seconds: how slowly the distance of a person changes."""
+
+
+def frame_scaled(tracks: Tracks) -> Tracks:
+    r"""Tracks with the strongest effects of perspective taken out.
+
+    .. math:: y_{ij} = \frac{x_{ij} - c_i}{\bar r_i}, \qquad c_i = \operatorname{med}_j x_{ij}, \quad r_i =
+    \operatorname{med}_j |x_{ij} - c_i|,
+
+    with the size smoothed over half a second, and its mean over the take restored.  Medians, which single wrong points do not move.
+
+    Source: Wolf and Zomet 2002 for affine cameras; Zelnik-Manor and Irani 2003.
+    """
+    seen = tracks.weights > 0
+    shown = torch.where(seen[..., None], tracks.x, torch.nan)
+    middle = shown.nanmedian(1).values  # (frames, 2)
+    away = shown - middle[:, None]
+    size = away.norm(dim=-1).nanmedian(1).values
+    slow = _slow(size, tracks.times)
+    level = slow[slow > 0].median() if bool((slow > 0).any()) else slow.new_ones(())
+    scaled = away / torch.where(slow > 0, slow / level, 1.0)[:, None, None]
+    return dataclasses.replace(tracks, x=torch.where(seen[..., None], scaled, 0.0))
+
+
+def _slow(size: Tensor, times: Tensor) -> Tensor:
+    """Gaussian means over time of what is known."""
+    known = size.isfinite()
+    reach = max(1, int(3 * SLOW / float(times.diff().median())) if len(times) > 1 else 1)
+    values = torch.where(known, size, 0.0)
+    offsets = torch.arange(-reach, reach + 1, dtype=torch.float64, device=size.device)
+    step = float(times.diff().median()) if len(times) > 1 else 1.0
+    kernel = torch.exp(-0.5 * (offsets * step / SLOW).square())[None, None]
+    total, share = (torch.nn.functional.conv1d(row[None, None], kernel, padding=reach)[0, 0] for row in (values, known.double()))
+    return torch.where(share > 1e-9, total / share.clamp(min=1e-9), 0.0)

@@ -1,0 +1,274 @@
+r"""Points and straight trajectories of least reprojection distance, as unit vectors under quadratic constraints."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from dyntorch.geometry.extensors import plucker_form, skew_line
+from dyntorch.geometry.homogeneous import apply, finite_depth, homogeneous, similarity, skew
+from dyntorch.geometry.lines import line_camera, nearest_line
+from dyntorch.numerics.least_squares import damped_step
+from dyntorch.numerics.nullspace import eigenvalues
+
+STEPS = 15
+FOLLOWED, NEAR = 5, 1e-4
+"""Steps that carry derivatives, where they are as small as at a minimum."""
+FREE = 1e-13  # eigenvalue of a Gauss-Newton matrix of trace 1 that is rounding
+FLAT = 1e-12  # relative size of an image line, or a depth, below which an image is no measurement
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """Points seen by cameras, each at its own time.
+
+    Attributes:
+        cameras: ``(*batch, views, 3, 4)``.
+        x: ``(*batch, views, n, 2)`` finite.
+        weights: ``(*batch, views, n)``.
+        unit: ``(*batch, views, n)``, the coordinates of x per pixel.
+    """
+
+    cameras: Tensor
+    x: Tensor
+    weights: Tensor
+    unit: Tensor
+
+    def rays(self) -> Tensor:
+        """The rows :math:`x^T M` that a line through the ray of x fulfils, of norm 1 times the root of the weight,
+        ``(*batch, n, views, 6)``."""
+        rows = torch.einsum("...vni,...vik->...nvk", homogeneous(self.x), line_camera(self.cameras))
+        size = rows.norm(dim=-1, keepdim=True)
+        return rows / torch.where(size > 0, size, 1.0) * self.weights.mT.sqrt()[..., None]
+
+    def sides(self) -> Tensor:
+        """Two planes through each ray, weighted: what a point on all rays fulfils, ``(*batch, n, 2 views, 4)``."""
+        top, last = self.cameras[..., :2, :], self.cameras[..., 2, :]
+        rows = self.x[..., None] * last[..., None, None, :] - top[..., None, :, :]
+        rows = rows / rows.norm(dim=-1, keepdim=True).clamp(min=torch.finfo(rows.dtype).tiny)
+        return (rows * self.weights.sqrt()[..., None, None]).transpose(-4, -3).flatten(-3, -2)
+
+
+def normalized(cameras: Tensor, x: Tensor, weights: Tensor) -> tuple[Sightings, Tensor, Tensor]:
+    """Images about 0 and of size 1, in a world in which the stacked cameras are orthonormal.
+
+    Returns:
+        the sightings, the similarities of the images ``(*batch, views, 3, 3)``, and the way back to the world ``(*batch, 4, 4)``.
+    """
+    known = (weights > 0)[..., None]
+    x = torch.where(known, x, 0.0)
+    cameras = torch.where(cameras.isfinite().flatten(-2).all(-1)[..., None, None], cameras, 0.0)
+    total = weights.sum(-1, keepdim=True)
+    centre = (x * weights[..., None]).sum(-2) / torch.where(total > 0, total, 1.0)
+    common = (x * weights[..., None]).sum((-3, -2)) / weights.sum((-2, -1)).clamp(min=1e-300)[..., None]
+    square = ((x - common[..., None, None, :]).square().sum(-1) * weights).sum((-2, -1))
+    spread = (square / weights.sum((-2, -1)).clamp(min=1e-300)).sqrt()
+    scale = torch.where(spread > 0, math.sqrt(2) / torch.where(spread > 0, spread, 1.0), 1.0)[..., None].expand(centre.shape[:-1])
+    transform = similarity(scale, centre)
+    moved = transform @ cameras
+    size = torch.linalg.matrix_norm(moved, keepdim=True)
+    moved = moved / torch.where(size > 0, size, 1.0)
+    # only a gauge: where it lies makes no difference to the result, nor to its derivatives
+    upper = torch.linalg.qr(moved.detach().flatten(-3, -2), mode="r")[1]
+    diagonal = upper.diagonal(dim1=-2, dim2=-1).abs()
+    eye = torch.eye(4, dtype=x.dtype, device=x.device)
+    # cameras of one centre only leave the world as it is: nothing can be triangulated
+    upper = torch.where((diagonal.amin(-1) > 1e-12 * diagonal.amax(-1))[..., None, None], upper, eye)
+    back = torch.linalg.solve_triangular(upper, eye.expand_as(upper), upper=True)
+    data = Sightings(moved @ back[..., None, :, :], apply(transform, x), weights, scale[..., None].expand(weights.shape))
+    return data, transform, back
+
+
+@dataclass(frozen=True)
+class Found:
+    """Unit vectors ``(*batch, n, k)``, their cost ``(*batch, n)`` in px^2, and the trace of the inverse Gauss-Newton matrix along
+    the surface, ``(*batch, n)``: the squared uncertainty at a noise of 1 px."""
+
+    vectors: Tensor
+    cost: Tensor
+    spread: Tensor
+
+
+def image_distances(data: Sightings, lines: Tensor) -> tuple[Tensor, Tensor]:
+    r"""Weighted distances of the points from the image lines, px, and their derivatives in the image lines.
+
+    .. math:: r = x^T l / \|l_{1:2}\|, \qquad l = M L.
+
+    Args:
+        data: ``n`` points.
+        lines: ``(*batch, n, 6)``.
+
+    Returns:
+        ``(*batch, views, n)`` and ``(*batch, views, n, 3)``.
+    """
+    image = torch.einsum("...vik,...nk->...vni", line_camera(data.cameras), lines)
+    # a line through the centre of a camera has no image there
+    size = image[..., :2].norm(dim=-1).clamp(min=FLAT)
+    distance = (homogeneous(data.x) * image).sum(-1) / size
+    normal = homogeneous(data.x - (distance / size)[..., None] * image[..., :2])
+    factor = data.weights.sqrt() / data.unit
+    return distance * factor, normal * (factor / size)[..., None]
+
+
+def to_lines(data: Sightings, lines: Tensor) -> tuple[Tensor, Tensor]:
+    """The distances ``(*batch, n, views)`` and their derivatives in the lines, ``(*batch, n, views, 6)``."""
+    distance, slope = image_distances(data, lines)
+    return distance.mT, torch.einsum("...vni,...vik->...nvk", slope, line_camera(data.cameras))
+
+
+def to_points(data: Sightings, points: Tensor) -> tuple[Tensor, Tensor]:
+    """Weighted reprojection errors of points ``(*batch, n, 4)``, px: ``(*batch, n, 2 views)`` and ``(*batch, n, 2 views, 4)``."""
+    image = torch.einsum("...vik,...nk->...vni", data.cameras, points)
+    depth = finite_depth(image)
+    seen = image[..., :2] / depth
+    top, last = data.cameras[..., None, :2, :], data.cameras[..., None, 2:, :]
+    slope = (top - seen[..., None] * last) / depth[..., None]
+    factor = (data.weights.sqrt() / data.unit)[..., None]
+    error, slope = (seen - data.x) * factor, slope * factor[..., None]
+    return error.transpose(-3, -2).flatten(-2), slope.transpose(-4, -3).flatten(-3, -2)
+
+
+def best_lines(data: Sightings, starts: Tensor) -> Found:
+    """Lines ``(*batch, n, 6)`` of least distance, from starts on the Klein quadric; leading dimensions of the starts broadcast."""
+    form = plucker_form(device=starts.device)
+    return _descend(starts, lambda v: to_lines(data, v), lambda v: torch.stack([v, v @ form], dim=-2), nearest_line)
+
+
+def best_points(data: Sightings, starts: Tensor) -> Found:
+    """Points ``(*batch, n, 4)`` of least reprojection error."""
+    return _descend(
+        starts, lambda p: to_points(data, p), lambda p: p[..., None, :], lambda p: torch.nn.functional.normalize(p, dim=-1)
+    )
+
+
+def _descend(
+    vectors: Tensor,
+    measure: Callable[[Tensor], tuple[Tensor, Tensor]],
+    normals: Callable[[Tensor], Tensor],
+    retract: Callable[[Tensor], Tensor],
+) -> Found:
+    """Levenberg-Marquardt on a surface of unit vectors: steps along it, then back to the nearest of its points."""
+
+    def system(at: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        value, slope = measure(at)
+        across = normals(at)
+        along = torch.eye(at.shape[-1], dtype=at.dtype, device=at.device) - across.mT @ across
+        slope = slope @ along
+        matrix = slope.mT @ slope
+        # an equation of their own for the directions off the surface, of the size of the others
+        size = matrix.diagonal(dim1=-2, dim2=-1).sum(-1) + torch.finfo(at.dtype).tiny
+        matrix = matrix + size[..., None, None] * (across.mT @ across)
+        return value.square().sum(-1), (slope.mT @ value[..., None])[..., 0], matrix, size
+
+    with torch.no_grad():
+        vectors = vectors.detach()
+        cost, gradient, matrix, size = system(vectors)
+        damping = torch.full_like(cost, 1e-4)
+        for _ in range(STEPS):
+            trial = retract(vectors - _solved(gradient, matrix, damping))
+            found = system(trial)
+            better = found[0] < cost
+            vectors = torch.where(better[..., None], trial, vectors)
+            gradient = torch.where(better[..., None], found[1], gradient)
+            matrix = torch.where(better[..., None, None], found[2], matrix)
+            cost, size = torch.where(better, found[0], cost), torch.where(better, found[3], size)
+            damping = torch.where(better, damping / 10, damping * 10).clamp(1e-15, 1e6)
+    # at the minimum the derivatives are those of the last steps: each brings them nearer by what Gauss-Newton leaves out
+    for _ in range(FOLLOWED if torch.is_grad_enabled() else 0):
+        cost, gradient, matrix, size = system(vectors)
+        step = _solved(gradient, matrix, torch.zeros_like(cost))
+        vectors = retract(vectors - torch.where(step.detach().norm(dim=-1, keepdim=True) < NEAR, step, 0.0))
+    return Found(vectors, system(vectors)[0], _spread(matrix.detach(), size.detach(), normals(vectors).shape[-2]))
+
+
+def _solved(gradient: Tensor, matrix: Tensor, damping: Tensor) -> Tensor:
+    """The damped steps ``(*batch, k)``."""
+    return damped_step(gradient.flatten(0, -2), matrix.flatten(0, -3), damping.flatten()).view(gradient.shape)
+
+
+def _spread(matrix: Tensor, size: Tensor, constraints: int) -> Tensor:
+    """Trace of the inverse along the surface; infinite where a direction is free."""
+    sound = matrix.isfinite().flatten(-2).all(-1) & size.isfinite()
+    eye = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
+    values = eigenvalues(torch.where(sound[..., None, None], matrix / size[..., None, None], eye))
+    free = ~sound | (values[..., 0] < FREE)
+    return torch.where(free, torch.inf, (values.clamp(min=FREE).reciprocal().sum(-1) - constraints).clamp(min=0) / size)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Bundle adjustment of cameras and straight trajectories: all distances of points from the images of their lines at once.
+
+
+ADJUSTMENT_STEPS, SETTLED = 25, 1e-6
+"""At most so many steps, and the relative decrease of the cost below which a problem has converged."""
+STUCK = 1e8  # damping at which no step is left to take
+
+
+def adjust(data: Sightings, lines: Tensor) -> Sightings:
+    r"""Levenberg-Marquardt over cameras and lines, the lines eliminated (Schur complement).
+
+    With :math:`l = M(P) L` and :math:`g = \partial r / \partial l` the derivative of a distance in the camera is
+    :math:`[g]_\times P [L]`; along the collineations of space and the scales of the cameras, which change nothing, the damping
+    holds it.
+
+    Args:
+        data: normalized sightings, cameras to start from.
+        lines: ``(*batch, n, 6)`` on the Klein quadric.
+
+    Returns:
+        The sightings with the best cameras, each of norm 1.
+    """
+    damping = torch.full_like(lines[..., 0, 0], 1e-3)
+    cost = _cost(data, lines)
+    done = torch.zeros_like(cost, dtype=torch.bool)
+    for _ in range(ADJUSTMENT_STEPS):
+        shift, turn = _step(data, lines, damping)
+        moved = data.cameras - shift
+        trial = replace(data, cameras=moved / torch.linalg.matrix_norm(moved, keepdim=True))
+        ends = nearest_line(lines - turn)
+        found = _cost(trial, ends)
+        better = (found < cost) & ~done
+        settled = (better & (cost - found <= SETTLED * cost)) | (damping > STUCK)
+        data = replace(data, cameras=torch.where(better[..., None, None, None], trial.cameras, data.cameras))
+        lines = torch.where(better[..., None, None], ends, lines)
+        cost, damping = torch.where(better, found, cost), torch.where(better, damping / 10, damping * 10).clamp(min=1e-12)
+        done = done | settled
+        if bool(done.all()):
+            break
+    return data
+
+
+def _cost(data: Sightings, lines: Tensor) -> Tensor:
+    """Sum of squared weighted distances, ``(*batch,)`` px^2."""
+    return image_distances(data, lines)[0].square().sum((-2, -1))
+
+
+def _step(data: Sightings, lines: Tensor, damping: Tensor) -> tuple[Tensor, Tensor]:
+    """Steps of the cameras ``(*batch, views, 3, 4)`` and the lines ``(*batch, n, 6)``, to be subtracted."""
+    distance, slope = image_distances(data, lines)  # (*batch, views, n), (*batch, views, n, 3)
+    by_line = torch.einsum("...vni,...vik->...nvk", slope, line_camera(data.cameras))
+    across = torch.stack([lines, lines @ plucker_form(device=lines.device)], dim=-2)
+    by_line = by_line - (by_line @ across.mT) @ across
+    by_camera = (skew(slope) @ data.cameras[..., None, :, :] @ skew_line(lines)[..., None, :, :, :]).flatten(-2)
+    views = distance.shape[-2]
+    own = by_line.mT @ by_line
+    size = own.diagonal(dim1=-2, dim2=-1).sum(-1) + torch.finfo(own.dtype).tiny
+    own = own + torch.diag_embed(own.diagonal(dim1=-2, dim2=-1) * damping[..., None, None])
+    factor, _ = torch.linalg.cholesky_ex(
+        own + size[..., None, None] * (across.mT @ across + 1e-12 * torch.eye(6, dtype=own.dtype, device=own.device))
+    )
+    pull = torch.einsum("...nvk,...vn->...nk", by_line, distance)
+    mixed = (by_camera.transpose(-3, -2)[..., None] * by_line[..., None, :]).flatten(-3, -2)  # (*batch, n, 12 views, 6)
+    solved = torch.cholesky_solve(mixed.mT, factor).mT
+    whole = torch.einsum("...vnp,...vnq->...vpq", by_camera, by_camera)
+    blocks = torch.eye(views, dtype=whole.dtype, device=whole.device)[:, None, :, None] * whole[..., :, :, None, :]
+    reduced = blocks.flatten(-4, -3).flatten(-2) - (mixed.transpose(-3, -2).flatten(-2) @ solved.transpose(-3, -2).flatten(-2).mT)
+    gradient = torch.einsum("...vnp,...vn->...vp", by_camera, distance).flatten(-2) - (solved @ pull[..., None])[..., 0].sum(-2)
+    shift = damped_step(gradient.flatten(0, -2), reduced.flatten(0, -3), damping.flatten()).view(gradient.shape)
+    rest = pull - (mixed.mT @ shift[..., None, :, None])[..., 0]
+    turn = torch.cholesky_solve(rest[..., None], factor)[..., 0]
+    return shift.unflatten(-1, (views, 3, 4)), torch.where(turn.isfinite(), turn, 0.0)

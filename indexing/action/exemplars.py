@@ -1,0 +1,147 @@
+"""What is kept of the clips an indexer learns from: windows cut, cropped and seen from elsewhere, ready to compare."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from indexing.action.bank import Windows, stack
+from indexing.action.symmetry import PITCH, turn
+from indexing.cameras import virtual
+from indexing.clip import Clip, stretches
+from indexing.windows import Ragged, ragged, sample, whole
+
+CROPS = ((0.0, 1.0), (0.0, 0.85), (0.15, 1.0), (0.1, 0.9), (0.0, 0.7), (0.3, 1.0))  # of exemplars: extent and tempo search
+VIEWS, VIEWS_SOLID = 4, 12  # virtual views per exemplar: of cards 8 give no more than 4, of 3D 12 give +1 % over 4
+EDGE = 0.12  # a virtual view also loses up to this part of its duration at each end
+ELEVATION, SPREAD = 0.1, 0.15  # radians: virtual cameras around 3D exemplars
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How windows are cut: steps per window, copies, and the stream's window and stride in seconds."""
+
+    length: int = 12
+    search: bool = True
+    views: int = VIEWS
+    turned: bool = True  # virtual views turn about the vertical; otherwise they are only cropped
+    repair: bool = False
+    window: float = 1.0
+    stride: float = 0.3
+
+
+@dataclass(frozen=True)
+class Exemplars:
+    """Windows of ``N`` exemplars.
+
+    crops: ``C * N`` windows, crop by crop; views: ``V * N``, view by view; moments: short windows of all exemplars, with
+    ``owner`` telling whose they are; solid: ``(N,)`` which exemplars had depth.
+    """
+
+    crops: Windows
+    views: Windows
+    moments: Windows
+    owner: torch.Tensor
+    solid: torch.Tensor
+
+    def __len__(self) -> int:
+        return len(self.solid)
+
+    def crop(self, index: int) -> Windows:
+        """``N`` windows of one crop; 0 is the whole exemplar."""
+        count = len(self)
+        return self.crops[slice(index * count, (index + 1) * count)]
+
+    def view(self, index: int) -> Windows:
+        """``N`` windows of one virtual view."""
+        count = len(self)
+        return self.views[slice(index * count, (index + 1) * count)]
+
+    def extended(self, other: Exemplars) -> Exemplars:
+        """These and then the others."""
+        mine, theirs = len(self), len(other)
+
+        def interleave(a: Windows, b: Windows) -> Windows:
+            copies = len(a) // mine
+            return stack([part for i in range(copies) for part in (a[i * mine : (i + 1) * mine], b[i * theirs : (i + 1) * theirs])])
+
+        return Exemplars(
+            interleave(self.crops, other.crops),
+            interleave(self.views, other.views) if len(self.views) else self.views,
+            stack([self.moments, other.moments]),
+            torch.cat([self.owner, other.owner + mine]),
+            torch.cat([self.solid, other.solid]),
+        )
+
+
+def cut(clips: Sequence[Clip], plan: Plan, random_state: np.random.Generator) -> Exemplars:
+    """Cut everything that is kept of the clips; 3D clips are rendered, first as seen along z, then from around."""
+    images = [_render(clip, 0.0, ELEVATION, random_state) for clip in clips]
+    source = ragged(images, plan.repair)
+    seen = torch.from_numpy(source.seen)
+    crops = CROPS if plan.search else CROPS[:1]
+    cropped = stack([Windows(whole(source, plan.length, crop), seen) for crop in crops])
+    views = [_view(clips, source, plan, random_state) for _ in range(plan.views)]
+    moments, owner = slide(source, plan.length, plan.window, plan.stride)
+    solid = torch.tensor([clip.dims == 3 for clip in clips])
+    return Exemplars(cropped, stack(views) if views else cropped[:0], moments, owner, solid)
+
+
+def _render(clip: Clip, azimuth: float, elevation: float, random_state: np.random.Generator) -> Clip:
+    return virtual(clip, azimuth, elevation, random_state=random_state) if clip.dims == 3 else clip
+
+
+def _view(clips: Sequence[Clip], source: Ragged, plan: Plan, random_state: np.random.Generator) -> Windows:
+    """One virtual view of every exemplar: rendered where it is 3D, the turned card where it is an image."""
+    count = len(clips)
+    azimuth = random_state.uniform(0, 2 * np.pi, count)
+    pitch = random_state.normal(scale=PITCH, size=count)
+    low, high = random_state.uniform(0, EDGE, count), 1 - random_state.uniform(0, EDGE, count)
+    solid = np.array([clip.dims == 3 for clip in clips])
+    if solid.any() and plan.turned:
+        lifted = [
+            _render(clip, float(np.rad2deg(azimuth[i])), ELEVATION + SPREAD * float(random_state.normal()), random_state)
+            if solid[i]
+            else clip
+            for i, clip in enumerate(clips)
+        ]
+        source = ragged(lifted, plan.repair)
+    begin, end = source.times[source.starts[:-1]], source.times[source.starts[1:] - 1]
+    values = sample(source, np.arange(count), begin + low * (end - begin), begin + high * (end - begin), plan.length)
+    if plan.turned and not solid.all():
+        flat = torch.from_numpy(~solid)
+        values[flat] = turn(values[flat], azimuth[~solid], pitch[~solid])
+    return Windows(values, torch.from_numpy(source.seen))
+
+
+def slide(source: Ragged, length: int, window: float, stride: float) -> tuple[Windows, torch.Tensor]:
+    """Short windows every ``stride`` seconds inside each clip, or each part of one that gaps leave (all of it where that is shorter
+    than a window), and whose they are."""
+    clip, first, last = _parts(source, window)
+    begin, end = source.times[first], source.times[last]
+    counts = np.maximum(1, np.floor((end - begin - window) / stride + 1e-9).astype(int) + 1)
+    part = np.repeat(np.arange(len(counts)), counts)
+    step = np.arange(len(part)) - np.repeat(np.cumsum(counts) - counts, counts)
+    # spread over the clip, so that its end is covered too
+    room = np.maximum(end - begin - window, 0.0)
+    start = begin[part] + room[part] * step / np.maximum(counts[part] - 1, 1)
+    owner = clip[part]
+    values = sample(source, owner, start, np.minimum(start + window, end[part]), length)
+    return Windows(values, torch.from_numpy(source.seen[owner])), torch.from_numpy(owner)
+
+
+def _parts(source: Ragged, window: float) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+    """For each part of a clip between gaps: its clip, and its first and last frame.  A frame by itself is none."""
+    clips, cuts = [], []
+    for i, (begin, end) in enumerate(pairwise(source.starts.tolist())):
+        found = begin + stretches(source.times[begin:end], window)
+        found = found[found[:, 1] - found[:, 0] > 1] if len(found) > 1 else found
+        clips += [i] * len(found)
+        cuts.append(found)
+    joined = np.concatenate(cuts)
+    return np.array(clips, dtype=np.intp), joined[:, 0], joined[:, 1] - 1

@@ -1,0 +1,313 @@
+"""ActionIndexer: learn actions from one to a few clips each, recognize them in others, find them in long recordings."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, Self
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from sklearn.utils.validation import check_is_fitted
+
+from dyntorch import one_thread
+from indexing.action.bank import Windows
+from indexing.action.exemplars import CROPS, VIEWS, VIEWS_SOLID, Exemplars, Plan, cut
+from indexing.action.inputs import check_common, check_parameters, check_plan, check_queries, gather, gather_groups, gather_labels
+from indexing.action.learning import Lesson, learn
+from indexing.action.model import ShapeModel
+from indexing.action.stream import Stream, find_events, frame_scores, scan
+from indexing.action.symmetry import mirror_permutation
+from indexing.clip import Clip
+from indexing.estimator import SavedClassifier
+from indexing.joints import layout_of
+from indexing.scoring import Event, joined, probabilities, refuse, reject_threshold, same_label
+from indexing.skeleton import Skeleton
+from indexing.windows import mended, ragged, whole
+
+Array = NDArray[Any]
+
+
+class ActionIndexer(SavedClassifier):
+    r"""Recognize actions from keypoints, from other viewpoints than they were learned from.
+
+    Two affine images of one space-time shape (all joints over all frames) obey one linear relation, so the largest canonical
+    correlation between their coordinate spaces is 1 whatever the two viewpoints are (thesis chapter 7, rank conditions).
+    The distance of that correlation from 1, fused over three ways of centring, finds the nearest exemplar; a kernel machine
+    over virtual views of the exemplars is added to it.
+
+    Args:
+        view: ``"any"``: queries may be seen from elsewhere; ``"same"``: from about where the exemplars were.  Declared, never
+            guessed: cross-validation inside one view always prefers what is bound to that view.
+        weights: ``"equal"``, or ``"learned"``: how much each kind of evidence counts, and how sure it is, by what serves people
+            best who were left out (needs to know who performs: see :meth:`fit`).
+        reject: ``None``: closed set.  A number between 0 and 1: the rate at which clips of an unknown action may be taken
+            for a known one, calibrated by leaving each class out of the training clips.  Any other number: the least
+            :meth:`evidence` that is accepted.
+        none_label: what :meth:`predict` answers for a rejected clip.
+        fps: frame rate of clips given as arrays.
+        length: steps that a window is resampled to.
+        search: also compare with crops of the exemplars (extent and tempo).
+        mirror: ``"auto"``: exemplars also count mirrored, unless left and right are different actions here; ``True``:
+            always; ``False``: never.
+        scorer: ``"both"``, ``"nearest"`` (no training, fastest) or ``"kernel"``; ``view="same"`` uses the kernel machine.
+        virtual_views: copies of every exemplar for the kernel machine; by default 4, and 12 where exemplars have depth.
+        repair: replace joints that jump where their clip gives no reason to (:mod:`indexing.windows`);
+            costs nothing on clean clips.
+        window, stride, tempi, pool: of :meth:`score_frames`: seconds, seconds between exemplar windows, speed factors tried,
+            and seconds over which scores are averaged.
+        random_state: of the virtual views.
+        device: where clips are compared with the exemplars, e.g. ``"cuda"``; ``fit`` computes on the CPU.
+
+    Attributes:
+        classes_: ``(classes,)`` labels as given.  model_: the learned :class:`~indexing.action.model.ShapeModel`.
+        n_joints_: joints per frame.  skeleton_: their names, where the clips had them.  groups_: who performed each exemplar.
+        reject_threshold_: evidence below it is rejected, or ``None``.
+
+    Example:
+        >>> from indexing.actors import Person, dataset
+        >>> actors = dataset(3, ["squat", "wave", "kick"], azimuth=0, rng=0)
+        >>> indexer = ActionIndexer().fit(actors.select(subject=0), actors.select(subject=0).labels)
+        >>> turned = dataset(3, ["squat", "wave", "kick"], azimuth=60, rng=1).select(subject=1)
+        >>> [str(label) for label in indexer.predict(turned)]
+        ['squat', 'wave', 'kick']
+
+    Source: Wolf 2003, chapters 4 and 7 and section 10.1.
+    """
+
+    FITTED, FILES = "model_", "indexing.action.saving"
+
+    def __init__(
+        self,
+        view: str = "any",
+        weights: str = "equal",
+        reject: float | None = None,
+        none_label: Any = -1,
+        fps: float = 30.0,
+        *,
+        length: int = 12,
+        search: bool = True,
+        mirror: str | bool = "auto",
+        scorer: str = "both",
+        virtual_views: int | None = None,
+        repair: bool = True,
+        window: float = 1.0,
+        stride: float = 0.3,
+        tempi: Sequence[float] = (0.7, 1.0, 1.4),
+        pool: float = 2.1,
+        random_state: int = 0,
+        device: str = "cpu",
+    ) -> None:
+        self.view = view
+        self.weights = weights
+        self.reject = reject
+        self.none_label = none_label
+        self.fps = fps
+        self.length = length
+        self.search = search
+        self.mirror = mirror
+        self.scorer = scorer
+        self.virtual_views = virtual_views
+        self.repair = repair
+        self.window = window
+        self.stride = stride
+        self.tempi = tempi
+        self.pool = pool
+        self.random_state = random_state
+        self.device = device
+
+    # ---- learning ----------------------------------------------------------------------------------------------------
+    @one_thread
+    def fit(self, clips: Iterable[Any], labels: ArrayLike | None = None, groups: ArrayLike | None = None) -> Self:
+        """Learn from clips.
+
+        Args:
+            clips: of :class:`Clip`, or ``(frames, joints, 2 | 3)`` arrays, or tuples of synchronized views of one
+                performance (an array ``(views, frames, joints, 2)`` too).  One 2D clip per action is enough.
+            labels: ``(clips,)``; by default the clips' own.
+            groups: ``(clips,)`` who performs, for ``weights="learned"``; by default the clips' field ``subject``, if all have it.
+
+        Raises:
+            ValueError: naming the clip or the parameter, what is wrong and what to do.
+        """
+        check_parameters(self)
+        found, owners = gather(clips, self.fps)
+        people = gather_groups(found, owners, groups)
+        values = gather_labels(found, owners, labels)
+        classes, numbers = np.unique(values, return_inverse=True)
+        if len(classes) < 2:
+            raise ValueError(
+                f"labels: only one class ({classes[0]!r}); give clips of at least two actions, for example one of ordinary movement"
+            )
+        rng = np.random.default_rng(self.random_state)
+        plan = self._plan(_default_views(found))
+        return self._learn(cut(found, plan, rng), classes, numbers, layout_of(found), people)
+
+    @one_thread
+    def partial_fit(
+        self,
+        clips: Iterable[Any],
+        labels: ArrayLike | None = None,
+        classes: ArrayLike | None = None,
+        groups: ArrayLike | None = None,
+    ) -> Self:
+        """Learn from further clips, of known or new actions; the earlier ones stay.  Fits where nothing was fitted yet."""
+        if not hasattr(self, "model_"):
+            return self.fit(clips, labels, groups)
+        check_parameters(self)
+        found, owners = gather(clips, self.fps, self.n_joints_, self.skeleton_)
+        people = gather_groups(found, owners, groups)
+        if self.weights == "learned" and (people is None) != (self.groups_ is None):
+            here, there = ("these clips", "the earlier ones") if people is not None else ("the earlier clips", "these")
+            raise ValueError(f"groups: {here} say who performs, {there} do not; give groups=, or clips with the field 'subject'")
+        both = None if people is None or self.groups_ is None else np.concatenate([self.groups_, people])
+        values = gather_labels(found, owners, labels)
+        old = self.classes_[self.model_.labels.numpy()]
+        merged = joined(old, values)
+        known, numbers = np.unique(merged, return_inverse=True)
+        check_plan(self, len(CROPS) if self.search else 1, self.model_.exemplars)
+        plan = self._plan(len(self.model_.exemplars.views) // len(old))
+        seed = 0 if self.random_state is None else self.random_state
+        rng = np.random.default_rng([seed, len(old)])
+        extended = self.model_.exemplars.extended(cut(found, plan, rng))
+        return self._learn(extended, known, numbers, self.skeleton_, both)
+
+    def _plan(self, views: int) -> Plan:
+        views = views if self.virtual_views is None else self.virtual_views
+        return Plan(self.length, self.search, views, self.view == "any", self.repair, self.window, self.stride)
+
+    def _learn(
+        self,
+        exemplars: Exemplars,
+        classes: Array,
+        numbers: Array,
+        skeleton: Skeleton | None,
+        groups: Array | None,
+    ) -> Self:
+        """Learn everything, and only then change anything."""
+        symmetry = None
+        if self.mirror:
+            symmetry = mirror_permutation(skeleton, exemplars.crop(0).values[:500], exemplars.crop(0).seen[:500])
+        if self.mirror is True and symmetry is None:
+            raise ValueError(
+                "mirror=True: the joints' mirror images are not known; give clips a skeleton with names, or mirror='auto'"
+            )
+        if self.reject is not None and any(same_label(value, self.none_label) for value in classes.tolist()):
+            raise ValueError(f"none_label={self.none_label!r} is one of the learned labels; choose another for rejected clips")
+        lesson = Lesson(
+            view=self.view,
+            scorer="kernel" if self.view == "same" else self.scorer,
+            learned=self.weights == "learned",
+            groups=None if groups is None else torch.from_numpy(np.unique(groups, return_inverse=True)[1]).long(),
+            symmetry=symmetry,
+            guard=self.mirror == "auto",
+        )
+        self.model_: ShapeModel = learn(exemplars, torch.from_numpy(numbers).long(), len(classes), lesson)
+        self.groups_ = groups
+        self.classes_ = classes
+        self.n_joints_ = int(exemplars.crops.values.shape[2])
+        self.skeleton_ = skeleton
+        self._calibrate()
+        return self
+
+    def _calibrate(self) -> None:
+        self.reject_threshold_ = reject_threshold(self.reject, self.model_.evidence_out, len(self.classes_))
+
+    # ---- recognition -------------------------------------------------------------------------------------------------
+    def _queries(self, clips: Iterable[Any]) -> Windows:
+        check_is_fitted(self, "model_")
+        found = check_queries(clips, self.fps, self.n_joints_, self.skeleton_)
+        source = ragged(found, self.repair)
+        check_common(found, source.seen, self.model_.exemplars.crop(0).seen.numpy())
+        return Windows(whole(source, self.length), torch.from_numpy(source.seen)).to(self.device)
+
+    def _model(self) -> ShapeModel:
+        check_is_fitted(self, "model_")
+        return self.model_.to(self.device)
+
+    @one_thread
+    def decision_function(self, clips: Iterable[Any]) -> Array:
+        """``(clips, classes)`` scores, larger is better; columns are ``classes_``."""
+        return np.asarray(self._model().scores(self._queries(clips)).cpu().numpy())
+
+    @one_thread
+    def evidence(self, clips: Iterable[Any]) -> Array:
+        """``(clips,)`` how well a clip shows a known action rather than another one, comparable between clips.
+
+        The nearest-exemplar score of the best class, and how far it stands above the next and above the mean of all.
+        """
+        return np.asarray(self._model().evidence(self._queries(clips)).cpu().numpy())
+
+    @one_thread
+    def predict_proba(self, clips: Iterable[Any]) -> Array:
+        """``(clips, classes)`` probabilities of the known classes, rows sum to 1 (a softmax of the standardized scores).
+
+        With ``weights="learned"`` its sharpness is the one that made left-out people's answers most likely.
+        """
+        scores = self.decision_function(clips)
+        return probabilities(scores, self.model_.blend.sharpness)
+
+    @one_thread
+    def predict(self, clips: Iterable[Any]) -> Array:
+        """``(clips,)`` labels; ``none_label`` where ``reject`` is set and no class explains the clip."""
+        query = self._queries(clips)
+        model = self._model()
+        labels = self.classes_[model.scores(query).argmax(dim=1).cpu().numpy()]
+        if self.reject_threshold_ is None:
+            return np.asarray(labels)
+        refused = (model.evidence(query) < self.reject_threshold_).cpu().numpy()
+        return refuse(labels, refused, self.none_label)
+
+    # ---- long recordings ---------------------------------------------------------------------------------------------
+    def _stream(self) -> Stream:
+        return Stream(self.length, self.window, tuple(self.tempi), self.pool, self.device)
+
+    @one_thread
+    def scan(self, clip: Any, progress: Callable[[float], None] | None = None) -> tuple[Array, list[Event]]:
+        """:meth:`score_frames` and :meth:`find` in one pass.
+
+        Args:
+            progress: called with the share done, 0..1.
+        """
+        check_is_fitted(self, "model_")
+        (found,) = check_queries([clip], self.fps, self.n_joints_, self.skeleton_, recordings=True)
+        model, stream = self._model(), self._stream()
+        begin = float(found.times[0])
+        found = found.replace(times=found.times - begin)  # rounding must not depend on what the clock shows
+        found = mended(found) if self.repair else found
+        windows = scan(model, found, stream, progress)
+        events = find_events(model, found, stream, windows, self.classes_, self.reject)
+        events = [dataclasses.replace(event, start=event.start + begin, end=event.end + begin) for event in events]
+        return frame_scores(found, stream, windows), events
+
+    @one_thread
+    def score_frames(self, clip: Any, progress: Callable[[float], None] | None = None) -> Array:
+        """``(frames, classes)`` score of every frame of an untrimmed recording, larger is better.
+
+        Short windows at several tempi are compared with short windows of the exemplars, and averaged over ``pool`` seconds.
+        """
+        return self.scan(clip, progress)[0]
+
+    @one_thread
+    def find(self, clip: Any, progress: Callable[[float], None] | None = None) -> list[Event]:
+        """The actions in an untrimmed recording, in order of time: label, start, end (seconds), score and margin.
+
+        An event needs a class to stand out from the others further than wrong actions do, at a rate calibrated by leaving
+        classes out: ``reject``, else 0.3 (outside 0..1 it is the least score an event needs).  Nothing is found where nobody
+        is seen, and hardly anything while the person rests.  Two or three classes have little to stand out from: add a class
+        of ordinary movement.
+        """
+        return self.scan(clip, progress)[1]
+
+    def exemplar(self, index: int) -> Clip:
+        """Exemplar number ``index`` as it is compared: resampled, y up (for pictures)."""
+        check_is_fitted(self, "model_")
+        windows = self.model_.exemplars.crop(0)
+        joints = windows.values[index].numpy().copy()
+        joints[:, ~windows.seen[index].numpy()] = np.nan
+        return Clip(joints, label=self.classes_[int(self.model_.labels[index])], skeleton=self.skeleton_, name=f"exemplar {index}")
+
+
+def _default_views(clips: Sequence[Clip]) -> int:
+    return VIEWS_SOLID if any(clip.dims == 3 for clip in clips) else VIEWS

@@ -1,0 +1,431 @@
+r"""Which joints and channels tell actions apart: weights learned by gradient through the epipolar residual.
+
+Weights are first learned for all actions together, then for each action on top; both are pulled towards equal ones as hard as
+held-out groups of exemplars ask for, and are equal where these do not gain from learning.  Queries and the exemplars they
+are compared with come from different groups (people), and queries should be seen from elsewhere: a turned flat card is an
+affine image of itself, from which this residual learns nothing about other viewpoints, so give rendered views.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import cast
+
+import torch
+from torch import Tensor
+
+from indexing.action.bank import CHANNELS, EPSILON, NEAREST, JointMetric, Windows, fused_residual
+
+# ----------------------------------------------------------------------------------------------------------------------
+# The epipolar residual as a function of joint weights: everything it needs, tabled once for the pairs that matter.
+#
+# A joint's weight multiplies its squared coordinates after the joint metric's whitening, so every 2x2 product that the largest
+# canonical correlation is made of is *linear* in the weights: with the products of every joint at hand, another set of weights
+# costs one matrix product and a closed form, whatever the length of the clips.
+
+
+CANDIDATES = 2  # nearest exemplars per class that a query is compared with: as many as the scorer averages
+ABSENT = -100.0  # score of a class with no exemplar in another group
+RIDGE = 1e-6  # of a 2x2 Gram, relative to its trace: as in dyntorch.orthonormal_basis
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Products of every joint's coordinates, for queries and the exemplars nearest to them.
+
+    cross, left, right: ``(channels, classes, Q, K, 2, 2, joints)``: of query with exemplar, and of each with itself; hub:
+    ``(classes, Q, K)``, taken off each residual; valid: the same shape, which exist; labels, groups: ``(Q,)``.
+    """
+
+    cross: Tensor
+    left: Tensor
+    right: Tensor
+    hub: Tensor
+    valid: Tensor
+    labels: Tensor
+    groups: Tensor
+
+    def scores(self, joints: Tensor, channels: Tensor) -> Tensor:
+        """Minus the mean log residual to the nearest exemplars, for ``B`` sets of weights at once.
+
+        Args:
+            joints: ``(B, channels, classes or 1, joints)``; channels: ``(B, channels)``.
+
+        Returns:
+            ``(B, Q, classes)``.
+        """
+        weights = joints.expand(-1, -1, self.cross.shape[1], -1).permute(1, 2, 3, 0)
+        shape = (*self.cross.shape[:-1], len(joints))
+        tables = (self.cross, self.left, self.right)
+        # a GEMM each; nothing is copied
+        products = ((table.flatten(2, 5) @ weights).view(shape).flatten(4, 5).unbind(4) for table in tables)
+        cross, left, right = (cast("Entries", entries) for entries in products)
+        logs = (epipolar(cross, left, right) + EPSILON).log()
+        total = torch.einsum("xcqkn,nx->ncqk", logs, channels) - self.hub
+        count = self.valid.sum(2)
+        mean = torch.where(self.valid, total, 0.0).sum(3) / count.clamp(min=1)
+        return torch.where(count > 0, -mean, ABSENT).mT
+
+
+Entries = tuple[Tensor, Tensor, Tensor, Tensor]  # 00, 01, 10, 11 of 2x2 matrices
+
+
+def epipolar(cross: Entries, left: Entries, right: Entries) -> Tensor:
+    r"""Residual :math:`1 - s_1` of two images from their products: differentiable, closed form.
+
+    .. math:: s_1^2 = \tfrac12\bigl(t + \sqrt{t^2 - 4d}\bigr),\quad t = \operatorname{tr}(L^{-1} C R^{-1} C^T),
+        \quad d = \frac{\det(C)^2}{\det L \det R}
+
+    Args:
+        cross, left, right: entries of the 2x2 matrices :math:`C = X^T Y`, :math:`L = X^T X`, :math:`R = Y^T Y`, any shape.
+
+    Returns:
+        as one entry, in [0, 1].
+
+    Source: thesis chapter 7 (rank of stacked measurements); canonical correlation.
+
+    Example:
+        >>> x = torch.tensor([[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]])
+        >>> y = torch.tensor([[0.0, 1.0], [0.6, 0.0], [0.8, 0.0]])
+        >>> one, other, both = (m.flatten().unbind() for m in (x.mT @ x, y.mT @ y, x.mT @ y))
+        >>> round(float(epipolar(both, one, other)), 2), round(float(epipolar(one, one, one)), 2)
+        (0.0, 0.0)
+    """
+    c00, c01, c10, c11 = cross
+    l00, l01, l11, left_det = _ridged(left)
+    r00, r01, r11, right_det = _ridged(right)
+    # D = adj(L) C, then tr(D adj(R) C^T), whose entries are products of these
+    d00, d01 = l11 * c00 - l01 * c10, l11 * c01 - l01 * c11
+    d10, d11 = l00 * c10 - l01 * c00, l00 * c11 - l01 * c01
+    trace = (
+        d00 * (r11 * c00 - r01 * c01) + d01 * (r00 * c01 - r01 * c00)
+        + d10 * (r11 * c10 - r01 * c11) + d11 * (r00 * c11 - r01 * c10)
+    ) / (left_det * right_det)  # fmt: skip
+    det = (c00 * c11 - c01 * c10).square() / (left_det * right_det)
+    # where both correlations are the same the root has no derivative; a floor far below the noise gives it the value 0
+    root = (trace.square() - 4 * det).clamp(min=1e-10).sqrt()
+    return 1 - ((trace + root) / 2).clamp(min=1e-10, max=1.0).sqrt()
+
+
+def _ridged(gram: Entries) -> Entries:
+    """Entries 00, 01, 11 and the determinant of symmetric 2x2 matrices, with a ridge."""
+    scale = (gram[0] + gram[3]).clamp(min=1e-30)
+    a, b, d = gram[0] + RIDGE * scale, gram[1], gram[3] + RIDGE * scale
+    return a, b, d, (a * d - b * b).clamp(min=1e-30)
+
+
+def gather(
+    query: Windows,
+    owner: Tensor,
+    copies: list[Windows],
+    metrics: tuple[JointMetric, JointMetric],
+    channels: Tensor,
+    labels: Tensor,
+    groups: Tensor,
+    hub: Tensor,
+) -> Evidence:
+    """The tables of queries and, of each class, the exemplars of other groups that are nearest to them.
+
+    Args:
+        metrics: of the tables, and by which the nearest exemplars are found; channels: weights by which these are found.
+        others: as in :func:`~indexing.action.joint_weights.learn_joint_weights`.
+    """
+    metric, found_by = metrics
+    table = fused_residual(query, copies[:1], found_by, NEAREST, channels)
+    which = torch.zeros(table.shape, dtype=torch.long)
+    for number, copy in enumerate(copies[1:], 1):
+        other = fused_residual(query, [copy], found_by, NEAREST, channels)
+        which[other < table] = number
+        table = torch.minimum(table, other)
+    table = torch.where(groups[owner][:, None] == groups[None], torch.inf, table - hub)
+    chosen, valid = [], []
+    for action in range(int(labels.max()) + 1):
+        mine = (labels == action).nonzero()[:, 0]
+        value, place = table[:, mine].topk(min(CANDIDATES, len(mine)), dim=1, largest=False)
+        room = (0, CANDIDATES - place.shape[1])
+        chosen.append(torch.nn.functional.pad(mine[place], room))
+        valid.append(torch.nn.functional.pad(value.isfinite(), room))
+    index = torch.stack(chosen)  # (classes, Q, K)
+    place = which.gather(1, index.transpose(0, 1).flatten(1)).view_as(index.transpose(0, 1)).transpose(0, 1) * len(labels) + index
+    every = Windows(torch.cat([copy.values for copy in copies]), torch.cat([copy.seen for copy in copies]))
+    nearest = every[place.flatten()]
+    tables = torch.stack([_products(query, nearest, metric, name, index.shape) for name in NEAREST], dim=1)
+    cross, left, right = tables.unbind(0)
+    return Evidence(cross, left, right, hub[index], torch.stack(valid), labels[owner], groups[owner])
+
+
+def _products(query: Windows, nearest: Windows, metric: JointMetric, name: str, shape: torch.Size) -> Tensor:
+    """``(3, *shape, 2, 2, joints)`` tables of one channel; a joint that either side has not seen counts for nothing."""
+    count = query.values.shape[2]
+    x, y = (metric.apply(_filled(part), name).unflatten(1, (-1, count)) for part in (query, nearest))
+    y = y.unflatten(0, shape)
+    own = torch.einsum("qtja,qtjb->qabj", x, x)[None, :, None].expand(*shape, 2, 2, count)
+    pairs = torch.einsum("qtja,cqktjb->cqkabj", x, y), own, torch.einsum("cqktja,cqktjb->cqkabj", y, y)
+    both = query.seen[None, :, None] & nearest.seen.unflatten(0, shape)
+    return torch.stack(pairs) * both[..., None, None, :]
+
+
+def _filled(windows: Windows) -> Tensor:
+    """Joints never seen moved to the middle of the others, where they change no mean."""
+    known = windows.seen[:, None, :, None].to(windows.values)
+    middle = (windows.values * known).sum(dim=2, keepdim=True) / known.sum(dim=2, keepdim=True).clamp(min=1.0)
+    return torch.where(known > 0, windows.values, middle)
+
+
+PATH = (1.0, 0.3, 0.1, 0.03)  # pulls towards equal weights that are tried, strongest first
+STEPS, RATE = 40, 0.1  # of Adam, the rate falling to 0; stopping early pulls, too: with junk joints 80 steps win .27, 40 win .34
+SHARP = 1.0  # log of the sharpness at the start
+FOLDS = 4  # parts of the groups, each held out once
+SIGMAS = 1.0  # standard errors over groups by which learning must beat equal weights where it has not seen the people
+ROUNDS = 2  # of finding the nearest exemplars and learning the weights
+QUERIES = 200  # queries at most, and QUERIES x classes x joints at most ENTRIES: 3.5 s of one core, 7 s where it learns
+ENTRIES = 60_000
+
+
+@dataclass(frozen=True)
+class WeightedMetric(JointMetric):
+    """A joint metric whose whitened joints are then weighted.
+
+    roots: ``(CHANNELS, joints)`` square roots of the weights.
+    """
+
+    roots: Tensor
+
+    def weights(self, name: str, joints: Tensor | slice = slice(None)) -> Tensor | None:
+        """``(joints, joints)`` weighted W of one channel among the chosen joints."""
+        roots = self.roots[CHANNELS.index(name)][joints].float()
+        whitening = super().weights(name, joints)
+        return torch.diag(roots) if whitening is None else roots[:, None] * whitening
+
+
+@dataclass(frozen=True)
+class JointWeights:
+    """What was learned; everything is 1 where learning did not pay.
+
+    joints: ``(channels, joints)``, mean 1 in each channel; channels: ``(channels,)``, mean 1; by_class: ``(classes, joints)``
+    factors on top, or ``None``; gain, sigma: held-out log likelihood per query won over equal weights, and its standard error.
+    """
+
+    joints: Tensor
+    channels: Tensor
+    by_class: Tensor | None = None
+    gain: float = 0.0
+    sigma: float = 0.0
+
+    @classmethod
+    def equal(cls, joints: int, gain: float = 0.0, sigma: float = 0.0) -> JointWeights:
+        """All ones."""
+        return cls(torch.ones(len(NEAREST), joints), torch.ones(len(NEAREST)), None, gain, sigma)
+
+    @property
+    def learned(self) -> bool:
+        """Whether anything differs from equal weights."""
+        return self.by_class is not None or bool((self.joints != 1).any()) or bool((self.channels != 1).any())
+
+    def metric(self, metric: JointMetric, action: int | None = None) -> JointMetric:
+        """The joint metric with these weights, of one class where there are weights by class."""
+        if not self.learned:
+            return metric
+        weights = self.joints if action is None or self.by_class is None else _mean_one(self.joints * self.by_class[action])
+        roots = weights.mean(dim=0).sqrt().repeat(len(CHANNELS), 1)  # of channels that were not learned, too
+        for name, row in zip(NEAREST, weights, strict=True):
+            roots[CHANNELS.index(name)] = row.sqrt()
+        return WeightedMetric(metric.covariance, metric.power, roots)
+
+    def residual(self, query: Windows, copies: list[Windows], metric: JointMetric, labels: Tensor) -> Tensor:
+        """``(Q, N)`` :func:`~indexing.action.bank.fused_residual` under these weights; each class's exemplars under its own."""
+        if self.by_class is None:
+            return fused_residual(query, copies, self.metric(metric), NEAREST, self.channels)
+        out = query.values.new_empty(len(query), len(labels))
+        for action in labels.unique().tolist():
+            mine = (labels == action).nonzero()[:, 0]
+            part = [copy[mine] for copy in copies]
+            out[:, mine] = fused_residual(query, part, self.metric(metric, action), NEAREST, self.channels)
+        return out
+
+
+def learn_joint_weights(
+    query: Windows,
+    owner: Tensor,
+    copies: list[Windows],
+    metric: JointMetric,
+    labels: Tensor,
+    *,
+    groups: Tensor | None = None,
+    hub: Tensor | None = None,
+    symmetry: Tensor | None = None,
+    seed: int = 0,
+) -> JointWeights:
+    r"""Weights :math:`w \ge 0` of joints and channels under which exemplars of other groups name the queries best.
+
+    .. math:: \max_w \sum_i \log p(c_i | i) - \lambda\|\log w\|^2, \quad p(c|i) \propto \exp(\beta S_{ic}),
+        \quad S_{ic} = -\operatorname*{mean}_{e \in N_c(i)} \Bigl[\sum_x v_x \log(1 - s_1^x(i, e; w_x) + \epsilon) - h_e\Bigr]
+
+    :math:`N_c(i)`: the nearest exemplars of class c outside the query's group.  :math:`\lambda` and whether to learn at all
+    are decided on held-out groups: the strongest pull within a standard error of the best, and equal weights unless the
+    likelihood grows by more than that error.
+
+    Args:
+        query: ``Q`` windows, virtual views of the exemplars; owner: ``(Q,)`` whose view each is.
+        copies: each the same ``N`` exemplars; metric: their joint metric; labels: ``(N,)`` class numbers.
+        groups: ``(N,)`` who performed each exemplar (by default each exemplar is its own group).
+        hub: ``(N,)`` taken off the residuals (0).
+        symmetry: ``(joints,)`` mirror image of every joint; both get the same weight.
+        seed: of the choice of queries where there are too many.
+
+    Returns:
+        Equal weights where fewer than two classes have exemplars in two groups, or learning does not pay.
+
+    Raises:
+        ValueError: lengths that do not fit.
+
+    Source: Wolf 2003, section 10.1 (use the examples twice); neighbourhood components analysis, Goldberger et al. 2004.
+
+    Example:
+        >>> x = Windows(torch.rand(2, 6, 5, 2), torch.ones(2, 5, dtype=torch.bool))
+        >>> metric = JointMetric.learn(x.values, x.seen, 0.25)
+        >>> learn_joint_weights(x, torch.arange(2), [x], metric, torch.tensor([0, 1])).learned  # one example per class
+        False
+    """
+    groups = torch.arange(len(labels)) if groups is None else groups
+    hub = torch.zeros(len(labels)) if hub is None else hub
+    if not len(owner) == len(query) or not len(groups) == len(hub) == len(labels) == len(copies[0]):
+        raise ValueError(
+            f"owner ({len(owner)}) needs one entry per query ({len(query)}); labels ({len(labels)}), groups ({len(groups)}) and "
+            f"hub ({len(hub)}) one per exemplar ({len(copies[0])})"
+        )
+    count, classes = query.values.shape[2], int(labels.max()) + 1
+    usable = _usable(labels, groups)[owner].nonzero()[:, 0]
+    if len(labels[owner[usable]].unique()) < 2:
+        return JointWeights.equal(count)
+    limit = max(1, min(QUERIES, ENTRIES // (count * classes)))
+    rows = usable[torch.randperm(len(usable), generator=torch.Generator().manual_seed(seed))[:limit]]
+    query, owner, tied = query[rows], owner[rows], torch.arange(count) if symmetry is None else symmetry
+    found = JointWeights.equal(count)
+    for _ in range(ROUNDS):  # the nearest exemplars, by what was learned before
+        metrics = metric, found.metric(metric)
+        evidence = gather(query, owner, copies, metrics, found.channels, labels, groups, hub)
+        found = _from_evidence(evidence, tied, classes, seed)
+        if not found.learned:
+            break
+    return found
+
+
+def _from_evidence(evidence: Evidence, tied: Tensor, classes: int, seed: int) -> JointWeights:
+    """For all actions together, and then for each."""
+    equal = torch.ones(len(NEAREST), 1, len(tied)), torch.ones(len(NEAREST))
+    together = _choose(evidence, _Together(tied, *equal), seed)
+    each = _choose(evidence, _Each(tied, together.joints, together.channels, classes), seed)
+    by_class = None if each.joints.shape[1] == 1 else _mean_one((each.joints / together.joints)[0])
+    gain, sigma = together.gain + each.gain, (together.sigma**2 + each.sigma**2) ** 0.5
+    return JointWeights(together.joints[:, 0], together.channels, by_class, gain, sigma)
+
+
+def _usable(labels: Tensor, groups: Tensor) -> Tensor:
+    """``(N,)`` which exemplars have another of their class in another group."""
+    return ((labels[:, None] == labels[None]) & (groups[:, None] != groups[None])).any(dim=1)
+
+
+# ---- how hard to pull --------------------------------------------------------------------------------------------------
+Weights = tuple[Tensor, Tensor]  # (B, channels, classes or 1, joints) and (B, channels), for B problems at once
+
+
+@dataclass(frozen=True)
+class _Together:
+    """Weights of all actions together: logarithms of each joint's, of each joint's in each channel, and of the channels'.
+
+    Mirror joints are ``tied``; ``joints`` ``(channels, 1, joints)`` and ``channels`` ``(channels,)`` are where learning starts.
+    """
+
+    tied: Tensor
+    joints: Tensor
+    channels: Tensor
+
+    def start(self) -> list[Tensor]:
+        return [torch.zeros_like(self.joints[:1]), torch.zeros_like(self.joints), torch.zeros_like(self.channels)]
+
+    def weights(self, logs: list[Tensor]) -> Weights:
+        joints = logs[0] + logs[1]
+        return _mean_one(self.joints * (joints + joints[..., self.tied]).div(2).exp()), _mean_one(logs[2].exp())
+
+
+@dataclass(frozen=True)
+class _Each(_Together):
+    """A factor per class and joint on top of weights that stay."""
+
+    classes: int
+
+    def start(self) -> list[Tensor]:
+        return [self.joints.new_zeros(1, self.classes, self.joints.shape[2])]
+
+    def weights(self, logs: list[Tensor]) -> Weights:
+        joints = _mean_one(self.joints * (logs[0] + logs[0][..., self.tied]).div(2).exp())
+        return joints, self.channels.expand(len(joints), -1)
+
+
+@dataclass(frozen=True)
+class _Choice:
+    """Weights ``(channels, classes or 1, joints)`` and ``(channels,)``, and what they gain."""
+
+    joints: Tensor
+    channels: Tensor
+    gain: float = 0.0
+    sigma: float = 0.0
+
+
+def _choose(evidence: Evidence, stage: _Together, seed: int) -> _Choice:
+    """Learn with the strongest pull that held-out groups cannot tell from the best; not at all where they gain nothing."""
+    before = _Choice(stage.joints, stage.channels)
+    names, group = evidence.groups.unique(return_inverse=True)
+    if len(names) < 3:
+        return before
+    folds = min(FOLDS, len(names))
+    part = torch.randperm(len(names), generator=torch.Generator().manual_seed(seed))[group] % folds
+    held = part == torch.arange(folds + 1)[:, None]  # in the last problem nothing is held out
+    losses, (joints, channels) = _descend(evidence, stage, ~held)
+    here = losses[part, :, torch.arange(len(part))]  # (Q, pulls) where a query was held out
+    won = here[:, :1] - here[:, 1:]
+    by_group = torch.stack([won[group == number].mean(dim=0) for number in range(len(names))])
+    gain, sigma = by_group.mean(dim=0), by_group.std(dim=0) / len(names) ** 0.5
+    best = int(gain.argmax())
+    if gain[best] <= SIGMAS * sigma[best]:
+        return before
+    chosen = int((gain >= gain[best] - sigma[best]).nonzero()[0, 0])
+    return _Choice(joints[-1, 1 + chosen], channels[-1, 1 + chosen], float(gain[chosen]), float(sigma[chosen]))
+
+
+def _descend(evidence: Evidence, stage: _Together, train: Tensor) -> tuple[Tensor, Weights]:
+    """Every pull on every part of the queries at once: ``(parts, 1 + PATH, Q)`` losses, and the weights; first without learning.
+
+    Args:
+        train: ``(parts, Q)`` bool, which queries each part learns from.
+    """
+    pulls = evidence.hub.new_tensor(PATH)
+    shape = len(train), 1 + len(pulls)
+    learning = torch.ones(shape).index_fill_(1, torch.tensor(0), 0.0).flatten()
+    pull = torch.cat([pulls[:1], pulls]).repeat(len(train))
+    share = (train.to(evidence.hub) / train.sum(dim=1, keepdim=True)).repeat_interleave(shape[1], dim=0)
+    logs = [value.to(evidence.hub).expand(len(pull), *value.shape).clone().requires_grad_() for value in stage.start()]
+    sharp = torch.full((len(pull),), SHARP).to(evidence.hub).requires_grad_()
+    optimizer = torch.optim.Adam([sharp, *logs], lr=RATE)
+
+    def losses() -> tuple[Tensor, list[Tensor], Weights]:
+        free = [value * learning.view(-1, *(1 for _ in value.shape[1:])) for value in logs]
+        weights = stage.weights(free)
+        scores = sharp.exp()[:, None, None] * evidence.scores(*weights)
+        return torch.nn.functional.cross_entropy(scores.mT, evidence.labels.expand(len(pull), -1), reduction="none"), free, weights
+
+    for step in range(STEPS):
+        optimizer.param_groups[0]["lr"] = RATE * (1 - step / STEPS)
+        optimizer.zero_grad()
+        loss, free, _ = losses()
+        penalty = sum(value.square().flatten(1).mean(dim=1) for value in free)
+        ((loss * share).sum(dim=1) + pull * penalty).sum().backward()
+        optimizer.step()
+    with torch.no_grad():
+        loss, _, (joints, channels) = losses()
+    return loss.unflatten(0, shape), (joints.unflatten(0, shape), channels.unflatten(0, shape))
+
+
+def _mean_one(weights: Tensor) -> Tensor:
+    return weights / weights.mean(dim=-1, keepdim=True)

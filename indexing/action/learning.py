@@ -1,0 +1,401 @@
+"""Learning a shape model from its exemplars: metric, mirror images, hubs, the kernel machine, and how the evidence is weighed."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from indexing.action.bank import JointMetric, Kernels, Windows, stack
+from indexing.action.exemplars import Exemplars
+from indexing.action.joint_weights import JointWeights, learn_joint_weights
+from indexing.action.model import (
+    BALANCE,
+    BALANCE_SOLID,
+    MOMENT_SAMPLE,
+    Blend,
+    PairwiseMachine,
+    ShapeModel,
+    class_scores,
+    evidence,
+    mirror_some,
+    standardized,
+    without_own,
+)
+from indexing.action.symmetry import PITCH, turn
+
+# ----------------------------------------------------------------------------------------------------------------------
+# How the scorers are weighed, learned from people who were left out: once over the whole set, whatever its actions are.
+#
+# Every exemplar, as it was seen and in its virtual views, is asked of what was learned from the other people.  The blend with the
+# fewest mistakes is taken, and the sharpness that makes the answers most likely.  Asked of other clips of the same person, every
+# scorer looks perfect and nothing is learned (UTKinect .939 against .953 without): so groups must be known.
+
+
+BLENDS = ((1.0, 0.0), (1.0, 0.25), (1.0, 0.5), (1.0, 1.0), (1.0, 1.5), (1.0, 3.0), (0.0, 1.0))  # of B and A
+ENOUGH = 8  # examples per class from which the blend is learned: chosen from 5 on UTKinect it costs 1 to 2 % (.90 to .91 for .92)
+SHARPNESSES = tuple(float(2 ** (k / 4)) for k in range(-4, 17))  # .5 .. 16
+FOLDS = 5  # groups of people whose machines are trained
+VIEWS = 4  # virtual views asked per exemplar, besides the image itself
+NOISE = 0.01  # of the body height, on asked views: without it the kernel machine looks too good
+
+
+def leave_out(groups: Tensor) -> Tensor:
+    """``(N,)`` number of the fold of each exemplar: people are dealt to at most five folds."""
+    _, number = groups.unique(return_inverse=True)
+    return number % min(FOLDS, int(number.max()) + 1)
+
+
+@dataclass(frozen=True)
+class Trained:
+    """What a kernel machine was trained on.
+
+    rows: the exemplars, their virtual views and mirror images; owner: ``(rows,)`` whose they are; gram: ``(rows, rows)``.
+    """
+
+    rows: Windows
+    owner: Tensor
+    gram: Tensor
+
+
+def learn_blend(model: ShapeModel, groups: Tensor, trained: Trained | None) -> Blend:
+    """The blend that serves people best who were left out.
+
+    Args:
+        model: with every scorer learned from all exemplars.
+        groups: ``(N,)`` who performs each exemplar.
+        trained: what the kernel machine was trained on; ``None`` without one.
+
+    Returns:
+        the model's own blend where nothing can be left out.
+    """
+    labels, folds = model.labels, leave_out(groups)
+    # only those are asked whose action somebody in another fold performs, too
+    usable = ((folds[:, None] != folds[None]) & (labels[:, None] == labels[None])).any(dim=1)
+    if int(folds.max()) < 1 or not bool(usable.any()):
+        return model.blend
+    asked = asked_views(model)
+    views = []
+    for windows in asked:
+        found = []
+        if trained is not None:
+            found.append(_machine_out(model, trained, windows, folds))
+        if model.scorer != "kernel":
+            found.append(_out(model.residuals(windows), model, folds))
+        views.append(torch.stack([standardized(scores) for scores in found]))
+    evidence = torch.cat([view[:, usable] for view in views], dim=1).double()
+    truth = labels[usable].repeat(len(asked))
+    if model.scorer != "both":
+        return _sharpened(model.blend, evidence[0], truth, int(usable.sum()))
+    few = int(torch.bincount(labels).median()) < ENOUGH
+    blend = model.blend if few else _fewest_mistakes(evidence, truth, model.blend)
+    return _sharpened(blend, blended(evidence, blend), truth, int(usable.sum()))
+
+
+def _out(residuals: Tensor, model: ShapeModel, folds: Tensor) -> Tensor:
+    """``(N, classes)`` scores of every exemplar among those of the other folds."""
+    scores = class_scores(residuals.masked_fill(folds[:, None] == folds[None], torch.inf), model.labels, model.classes)
+    known = scores.isfinite()
+    least = torch.where(known, scores, torch.inf).amin(dim=1, keepdim=True)
+    return torch.where(known, scores, least.nan_to_num(posinf=0.0))
+
+
+def asked_views(model: ShapeModel) -> list[Windows]:
+    """The exemplars as they are and in some virtual views, each a bit wrong, as a detector's are.
+
+    Whole exemplars, as queries are: asked of their crops, which the machine was trained on, it looks too good.
+    """
+    rng, whole = np.random.default_rng(0), model.exemplars.crop(0)
+    count = len(whole)
+    asked = [whole]
+    for i in range(VIEWS):
+        azimuth, pitch = rng.uniform(0, 2 * np.pi, count), rng.normal(scale=PITCH, size=count)
+        if bool(model.exemplars.solid.any()):
+            if i >= len(model.exemplars.views) // count:
+                break
+            values = model.exemplars.view(i).values
+        else:
+            values = turn(whole.values, azimuth, pitch)
+        size = (values[..., 1].amax(dim=2) - values[..., 1].amin(dim=2)).median(dim=1).values
+        noise = torch.from_numpy(rng.normal(size=values.shape)).to(values)
+        asked.append(Windows(values + NOISE * size[:, None, None, None] * noise, whole.seen))
+    return asked
+
+
+def _machine_out(model: ShapeModel, trained: Trained, asked: Windows, folds: Tensor) -> Tensor:
+    """The same of the kernel machine, trained once per fold; actions that nobody else performs get the least."""
+    out = torch.full((len(folds), model.classes), -1.0)
+    if model.kernels is None:
+        return out
+    owner, against = trained.owner, model.kernels(asked, trained.rows)
+    for fold in folds.unique():
+        kept = (folds[owner] != fold).nonzero()[:, 0]
+        mine = (folds == fold).nonzero()[:, 0]
+        known, numbers = np.unique(model.labels[owner[kept]].numpy(), return_inverse=True)
+        if len(known) < 2:
+            continue
+        machine = PairwiseMachine.fit(trained.gram[kept][:, kept], numbers)
+        scores = machine(against[mine][:, kept[machine.support]])
+        out[mine[:, None], torch.from_numpy(known)[None]] = scores
+    return out
+
+
+def blended(evidence: Tensor, blend: Blend) -> Tensor:
+    """``(N, classes)`` sum of the standardized scores ``(2, N, classes)`` of B and A."""
+    return blend.kernel * evidence[0] + blend.nearest * evidence[1]
+
+
+def _fewest_mistakes(evidence: Tensor, truth: Tensor, prior: Blend) -> Blend:
+    """Among blends with the same number of mistakes, that next to the one that is used where nothing was learned."""
+    best, chosen = (float("inf"), 0.0), prior
+    for kernel, nearest in BLENDS:
+        blend = dataclasses.replace(prior, kernel=kernel, nearest=nearest)
+        wrong = float((blended(evidence, blend).argmax(dim=1) != truth).sum())
+        far = abs(nearest / (kernel + nearest) - prior.nearest / (prior.kernel + prior.nearest))
+        if (wrong, far) < best:
+            best, chosen = (wrong, far), blend
+    return chosen
+
+
+def _sharpened(blend: Blend, scores: Tensor, truth: Tensor, exemplars: int) -> Blend:
+    """The blend with the sharpness that makes the answers most likely, were one more of the exemplars asked a mistake.
+
+    Without that mistake, people who are all recognized would make every answer certain.
+    """
+    even, count = standardized(scores), scores.shape[1]
+    doubt = 1 / (exemplars + 2)
+    losses = []
+    for sharp in SHARPNESSES:
+        chance = torch.log_softmax(sharp * even, dim=1)
+        right = chance.gather(1, truth[:, None])[:, 0]
+        losses.append(-float((1 - doubt) * right.mean() + doubt * chance.mean() * count / max(count - 1, 1)))
+    return dataclasses.replace(blend, sharpness=SHARPNESSES[int(np.argmin(losses))])
+
+
+WHITENING = 0.25  # power of the joint metric: UTKinect A .909 -> .919, few shots +3 %; .5 whitens too much
+HUB_SHARE, HUB_NEIGHBOURS = 0.5, 5  # of an exemplar's closeness to other classes, taken off: +2..3 %, one shot +4 %
+KERNEL_WHITENING = 0.0  # power of the joint metric of B: .15 gives UTKinect +1 %, takes 1 % from Florence3D
+ROWS, ROWS_SOLID = 3000, 5000  # training rows of B at most (its fit grows with their square); true views are worth more
+
+
+@dataclass(frozen=True)
+class Lesson:
+    """How to learn.
+
+    Args:
+        view: ``"any"`` or ``"same"``; scorer: ``"nearest"``, ``"kernel"`` or ``"both"``.
+        learned: weigh the scorers by what serves people who were left out (else by fixed weights).
+        groups: ``(N,)`` number of the person who performs each exemplar; ``None`` = not known, and nothing can be left out.
+        symmetry: joint permutation of the mirror image, or ``None`` to go without mirror images.
+        guard: leave out mirror images of classes that they would turn into one another.
+    """
+
+    view: str = "any"
+    scorer: str = "both"
+    learned: bool = False
+    groups: Tensor | None = None
+    symmetry: Tensor | None = None
+    guard: bool = True
+
+
+def learn(exemplars: Exemplars, labels: Tensor, classes: int, lesson: Lesson) -> ShapeModel:
+    """Learn everything from the exemplars' windows.
+
+    Args:
+        labels: ``(N,)`` class numbers.
+    """
+    originals = exemplars.crop(0)
+    metric = JointMetric.learn(originals.values, originals.seen, WHITENING)
+    none, share = torch.zeros(len(labels), dtype=torch.bool), float(exemplars.solid.float().mean())
+    model = ShapeModel(
+        exemplars, labels, classes, lesson.view, lesson.scorer, metric, lesson.symmetry, none,
+        JointWeights.equal(originals.values.shape[2]),
+        torch.zeros(len(labels)), torch.zeros(len(exemplars.owner)), None, None, None,
+        blend=Blend(nearest=share * BALANCE_SOLID + (1 - share) * BALANCE),
+    )  # fmt: skip
+    if lesson.symmetry is not None:
+        model = dataclasses.replace(model, mirrored=_mirror_is_same_action(model, originals) if lesson.guard else ~none)
+    model = _with_hubs(model, originals)
+    if lesson.learned and lesson.view == "any" and lesson.groups is not None:
+        parts = _parts(model, lesson)
+        if parts.learned:
+            model = _with_hubs(dataclasses.replace(model, parts=parts, hub=torch.zeros(len(labels))), originals)
+    trained = None
+    if lesson.scorer != "nearest":
+        model, trained = _with_machine(model, one_side=lesson.view == "same")
+    if lesson.learned and lesson.groups is not None:
+        model = dataclasses.replace(model, blend=learn_blend(model, lesson.groups, trained))
+    return model
+
+
+def _parts(model: ShapeModel, lesson: Lesson) -> JointWeights:
+    """How much each joint counts, learned across views of 3D exemplars: of turned cards nothing can be learned."""
+    asked = asked_views(model)[1:]
+    if not asked or not bool(model.exemplars.solid.all()):
+        return model.parts
+    owner = torch.arange(len(model.labels)).repeat(len(asked))
+    groups, symmetry = lesson.groups, lesson.symmetry
+    return learn_joint_weights(
+        stack(asked), owner, model.copies(), model.metric, model.labels, groups=groups, hub=model.hub, symmetry=symmetry
+    )
+
+
+def _mirror_is_same_action(model: ShapeModel, originals: Windows) -> Tensor:
+    """``(N,)`` whether the mirror image of an exemplar is still the same action.
+
+    Where left and right are different actions, the mirror images of each look like the other: two classes most of whose
+    mirror images are nearest to one another are not mirrored.  (One direction alone is ordinary confusion.)
+    """
+    if model.symmetry is None:
+        return model.mirrored
+    flipped = mirror_some(originals, model.symmetry, torch.ones_like(model.mirrored))
+    nearest = model.labels[model.residuals(flipped).argmin(dim=1)]
+    own = torch.nn.functional.one_hot(model.labels, model.classes).float()
+    lands = own.mT @ torch.nn.functional.one_hot(nearest, model.classes).float() / own.sum(dim=0).clamp(min=1)[:, None]
+    mutual = (lands > 0.5) & (lands.mT > 0.5)
+    mutual.fill_diagonal_(False)
+    return ~mutual.any(dim=1)[model.labels]
+
+
+def _with_hubs(model: ShapeModel, originals: Windows) -> ShapeModel:
+    """Measure, among the exemplars, how close each is to other classes, and the evidence were its own class unknown."""
+    residual, labels = model.residuals(originals), model.labels
+    model = dataclasses.replace(
+        model, hub=_hub(residual, labels, labels), evidence_out=evidence(_foreign_scores(residual, model), model.classes)
+    )
+    sample = torch.arange(0, len(model.exemplars.moments), max(1, len(model.exemplars.moments) // MOMENT_SAMPLE))
+    labels = labels[model.exemplars.owner]
+    residual = model.moment_residuals(model.exemplars.moments[sample])
+    return dataclasses.replace(model, moment_hub=_hub(residual, labels[sample], labels))
+
+
+def _foreign_scores(residual: Tensor, model: ShapeModel) -> Tensor:
+    """``(N, classes - 1)`` the scores of each exemplar for the other classes, were its own class unknown.
+
+    The hubs must not know the class either: with it in them, 10 % asked for were 18 to 21 % (14 % so; 30 %: 53, now 35).
+    """
+    out = residual.new_empty(len(model.labels), model.classes - 1)
+    for c in range(model.classes):
+        mine, rest = model.labels == c, model.labels != c
+        hub = _hub(residual[rest][:, rest], model.labels[rest], model.labels[rest])
+        scores = class_scores(residual[mine][:, rest] - hub, model.labels[rest], model.classes)
+        out[mine] = without_own(scores, model.labels[mine])
+    return out
+
+
+def _hub(residual: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
+    """``(columns,)`` half the mean residual from the nearest windows of other classes: near to everything = little evidence."""
+    other = rows[:, None] != columns[None]
+    count = max(1, min(HUB_NEIGHBOURS, int(other.sum(dim=0).min())))
+    foreign = torch.where(other, residual, torch.inf).topk(count, dim=0, largest=False).values.mean(dim=0)
+    # a class that the sampled rows hold alone has nothing to compare with: it gets the usual share
+    known = foreign.isfinite()
+    return HUB_SHARE * torch.where(known, foreign, foreign[known].mean() if known.any() else foreign.new_tensor(0.0))
+
+
+def _with_machine(model: ShapeModel, one_side: bool) -> tuple[ShapeModel, Trained]:
+    """Train scorer B on the exemplars, their virtual views and mirror images, as many as the budget of rows allows."""
+    exemplars, count = model.exemplars, len(model.exemplars)
+    both = model.symmetry is not None and bool(model.mirrored.any())
+    rows_at_most = ROWS_SOLID if bool(exemplars.solid.any()) else ROWS
+    copies = max(1, rows_at_most // (count * (1 + both)))
+    parts = [exemplars.crop(0)] + [exemplars.view(i) for i in range(min(copies - 1, len(exemplars.views) // count))]
+    rows, owner = stack(parts), torch.arange(count).repeat(len(parts))
+    if both and model.symmetry is not None:
+        chosen = model.mirrored[owner]
+        rows = stack([rows, mirror_some(rows[chosen], model.symmetry, chosen[chosen])])
+        owner = torch.cat([owner, owner[chosen]])
+    kernels = Kernels(JointMetric(model.metric.covariance, KERNEL_WHITENING), one_side=one_side)
+    gram = kernels.fit(rows)
+    machine = PairwiseMachine.fit(gram, model.labels[owner].numpy().astype(np.int64))
+    trained = Trained(rows, owner, gram)
+    return dataclasses.replace(model, kernels=kernels, support=rows[machine.support], machine=machine), trained
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Which joints matter for which action: how much the evidence for an action grows when a joint is seen.
+#
+# Read off any fitted model, whatever its weights: weights tell how joints are treated, not what they tell; and leaving one
+# joint out tells nothing where its neighbours say the same.  So random halves of the joints are hidden from the queries, and a
+# joint's importance is its linear share in the margin of the true action, over all that can be seen beside it.
+
+
+HALVES = 4  # random halves per joint: importances from two seeds then correlate by .83-.98 on UTKinect (clapping: .60)
+HALVES_AT_MOST = 200
+QUERIES = 120
+RIDGE = 1.0  # of the regression on 0/1 masks, in masks: matters only where there are more joints than halves
+
+
+def importance(model: ShapeModel, groups: Tensor | None = None, seed: int = 0) -> Tensor:
+    r"""Linear share of every joint in the margin of every action.
+
+    .. math:: \operatorname{margin}_c(m) \approx a_c + \sum_j b_{cj} m_j, \quad m \in \{0, 1\}^n \text{, half of it 1}
+
+    The margin, in nats of the residual, is how much nearer the nearest exemplar of the true class is than that of any other,
+    averaged over the exemplars of the class, none compared with exemplars of its own group.  An action that only this group
+    shows keeps its exemplars: then joints matter by how well they set it apart from the others.
+
+    Args:
+        model: fitted; groups: ``(N,)`` who performed each exemplar (by default each exemplar is its own group).
+        seed: of the halves and of the exemplars that are asked, where there are many.
+
+    Returns:
+        ``(classes, joints)`` b, float64; negative where a joint misleads.
+
+    Source: Banzhaf value of cooperative games, fitted by least squares (Hammer and Holzman 1992).
+    """
+    originals, labels = model.exemplars.crop(0), model.labels
+    groups = torch.arange(len(labels), device=labels.device) if groups is None else groups.to(labels.device)
+    generator = torch.Generator().manual_seed(seed)
+    asked = _asked(labels, generator)
+    query, truth = originals[asked], labels[asked]
+    hidden = groups[asked][:, None] == groups[None]
+    member = torch.nn.functional.one_hot(labels, model.classes).double()
+    hidden &= ((~hidden).double() @ member > 0)[:, labels]
+    masks = halves(originals.seen.shape[1], generator).to(labels.device)
+    margins = torch.stack([_margins(model, query, truth, hidden, mask) for mask in masks])  # (masks, queries)
+    by_class = margins @ (member[asked] / member[asked].sum(dim=0).clamp(min=1))
+    design = masks.double() - masks.double().mean(dim=0)
+    gram = design.mT @ design
+    gram.diagonal().add_(RIDGE)
+    return torch.linalg.solve(gram, design.mT @ (by_class - by_class.mean(dim=0))).mT
+
+
+def typical(model: ShapeModel) -> Tensor:
+    """``(classes,)`` the exemplar of every class that is nearest to the others of its class."""
+    originals, labels = model.exemplars.crop(0), model.labels
+    out = torch.zeros(model.classes, dtype=torch.long)
+    for action in range(model.classes):
+        mine = (labels == action).nonzero()[:, 0]
+        out[action] = mine[model.residuals(originals[mine[:QUERIES]])[:, mine].mean(dim=0).argmin()]
+    return out
+
+
+def halves(joints: int, generator: torch.Generator) -> Tensor:
+    """``(masks, joints)`` bool: random halves of the joints and, after each, the other half; of at least three joints."""
+    size = max(min(3, joints), joints // 2)
+    out = []
+    for _ in range(min(HALVES_AT_MOST, max(32, HALVES * joints)) // 2):
+        order = torch.randperm(joints, generator=generator)
+        for part in (order[:size], order[joints - size :]):
+            out.append(torch.zeros(joints, dtype=torch.bool).index_fill_(0, part, True))
+    return torch.stack(out)
+
+
+def _asked(labels: Tensor, generator: torch.Generator) -> Tensor:
+    """At most :data:`QUERIES` exemplars, as many of every class as there are or as fit."""
+    each = max(1, QUERIES // int(labels.max() + 1))
+    order = torch.randperm(len(labels), generator=generator).to(labels.device)
+    kept = [order[labels[order] == action][:each] for action in range(int(labels.max()) + 1)]
+    return torch.cat(kept)
+
+
+def _margins(model: ShapeModel, query: Windows, truth: Tensor, hidden: Tensor, mask: Tensor) -> Tensor:
+    residual = model.residuals(Windows(query.values, query.seen & mask)).masked_fill(hidden, torch.inf)
+    nearest = residual.new_full((len(query), model.classes), torch.inf)
+    nearest.scatter_reduce_(1, model.labels.expand(len(query), -1), residual, "amin")
+    own = nearest.gather(1, truth[:, None])[:, 0]
+    return (nearest.scatter(1, truth[:, None], torch.inf).min(dim=1).values - own).double()

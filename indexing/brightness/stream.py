@@ -1,0 +1,279 @@
+"""One video against the library, as its frames come in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from dyntorch import one_thread
+from indexing.action.stream import EXTENT, FALSE_ALARMS
+from indexing.brightness.footage import Footage, Resampler
+from indexing.brightness.library import Exemplars, Library
+from indexing.brightness.sight import Optics, Sight, mirrored, together
+from indexing.scoring import Event, event_levels, events
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Leaky online warping: every exemplar frame holds how well the last half second fits what led up to it.
+#
+# .. math:: a_j(t) = g\,\max(a_{j-1},\; a_j - s,\; a_{j-2} - s)(t-1) + (1 - g)\,\langle f_t, f_j\rangle,\qquad g = 1 - 1/window
+#
+# One float per library frame is all the memory; steps of 0, 1 and 2 library frames allow for half to double tempo.
+
+
+SLACK = 0.02  # price of a step other than 1
+BLOCK = 32  # frames compared at once: library rows are read once per block
+
+
+class Warping:
+    """The state of one stream against a library.
+
+    Args:
+        window: frames of memory.
+    """
+
+    def __init__(self, source: Library, window: float) -> None:
+        self.source, self.keep = source, 1 - 1 / window
+        self.state = source.rows.new_zeros(len(source.rows))
+        self.held = 1.0
+
+    def push(self, rows: Tensor) -> Tensor:
+        """``(n, classes)`` scores after each of ``n`` more frames ``(n, D)``: the best exemplar frame's, cold start corrected."""
+        rows = rows @ self.source.basis
+        return torch.cat([self._block(part) for part in rows.split(BLOCK)]) if len(rows) else self._tops(rows @ self.source.rows.T)
+
+    def _block(self, rows: Tensor) -> Tensor:
+        states = rows @ self.source.rows.T
+        states *= 1 - self.keep
+        slower = torch.empty_like(self.state)
+        before = self.state
+        known = []
+        for state in states:
+            torch.sub(before, SLACK, out=slower)
+            best = slower.clone()
+            torch.maximum(best[2:], slower[:-2], out=best[2:])
+            torch.maximum(best[1:], before[:-1], out=best[1:])
+            state.add_(best, alpha=self.keep)
+            state[self.source.gaps] = 0
+            before = state
+            self.held *= self.keep
+            known.append([1 - self.held])
+        self.state = before.clone()
+        return self._tops(states) / states.new_tensor(known)
+
+    def _tops(self, states: Tensor) -> Tensor:
+        """``(n, classes)`` largest state of each class."""
+        sizes = [b - a for a, b in pairwise(self.source.bounds)]
+        return torch.stack([part.amax(1) for part in states.split(sizes, dim=1)], dim=1)
+
+
+SHARP = 20.0
+"""Of the mean over frames: moments that fit an exemplar well count more than many that fit somewhat.
+Frames named rightly in exercise streams, camera turned 0 / 60: the mean itself .76 / .59, sharpness 12 .80 / .62 (cells alone)."""
+FEWEST = 3  # frames of an exemplar
+MOVES = 0.1  # energy of a frame in which anything moves
+COLD = 1e-3  # weight of a video's first window in its score: the warping has seen too little, but a short video has nothing else
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class Recognizer:
+    """All that scoring needs: how to look, what to compare with, how long to remember (frames)."""
+
+    optics: Optics
+    library: Library
+    window: float
+    pool: float
+
+
+class Pool:
+    r"""Running mean of scores over frames in which something moves.
+
+    .. math:: P_c(t) = \frac{1}{20} \log \frac{\sum_\tau g^{t-\tau}\,|f_\tau|^2\,e^{20 s_c(\tau)}}{\sum_\tau g^{t-\tau}\,|f_\tau|^2}
+
+    with g = 1 - 1/pool.
+
+    Args:
+        frames: memory; infinite for the mean over a whole video.
+    """
+
+    def __init__(self, classes: int, frames: float) -> None:
+        self.keep = 1 - 1 / max(frames, 1.0)
+        self.total, self.weight = np.zeros(classes), 0.0
+
+    def push(self, scores: Array, energy: Array) -> Array:
+        """``(n, classes)`` means after each of ``n`` more frames; 0 before anything has moved."""
+        totals, weights = energy[:, None] * np.exp(SHARP * scores), energy.copy()
+        for t in range(len(totals)):
+            totals[t] += self.keep * self.total
+            weights[t] += self.keep * self.weight
+            self.total, self.weight = totals[t], weights[t]
+        return _mean(totals, weights[:, None])
+
+    def mean(self) -> Array:
+        """``(classes,)`` the mean now."""
+        return _mean(self.total, self.weight)
+
+
+def _mean(total: Array, weight: Any) -> Array:
+    return np.asarray(np.log(np.maximum(total / np.maximum(weight, 1e-12), 1.0)) / SHARP)
+
+
+class BrightnessStream:
+    """Scores of one video, as its frames come in.  Made by :meth:`indexing.BrightnessIndexer.stream`.
+
+    Memory is one number per library frame and a few small images, whatever the length of the stream.
+    """
+
+    def __init__(self, source: Recognizer, classes: int, name: str, fps: float | None) -> None:
+        self.source, self.fps = source, fps
+        self.sight = Sight(source.optics, name)
+        self.resample = Resampler(source.optics.fps, fps)
+        self.warping = Warping(source.library, source.window)
+        self.pool = Pool(classes, source.pool)
+        self.whole = Pool(classes, float("inf"))
+        self.pushed = self.compared = 0
+        self.latest = np.zeros(classes)
+        self.energy = 0.0
+
+    def push(self, frames: Any, times: Any = None) -> Array:
+        """Scores of one more frame, or of several.
+
+        Args:
+            frames: ``(height, width)`` or ``(height, width, 3)``: one frame; with a leading axis: several.
+                Several at once are several times as fast.
+            times: ``(n,)`` seconds; by default the stream's frame rate says them.
+
+        Returns:
+            ``(classes,)``, or ``(n, classes)`` for several: larger is better, from the frames up to each alone.
+
+        Raises:
+            ValueError: frames of another size or kind than before.
+        """
+        frames = torch.as_tensor(frames)
+        single = frames.ndim == 2 or (frames.ndim == 3 and frames.shape[-1] == 3)
+        scores, _ = self.scan(frames[None] if single else frames, times)
+        return scores[0] if single else scores
+
+    @one_thread
+    def scan(self, frames: Any, times: Any = None) -> tuple[Array, Array]:
+        """Scores ``(n, classes)`` and energies ``(n,)`` (0 where nothing moves, else below 1) after each of n more frames."""
+        with torch.inference_mode():  # a seventh of the time of single frames
+            return self._scan(frames, times)
+
+    def _scan(self, frames: Any, times: Any) -> tuple[Array, Array]:
+        small = self.sight.small(frames)
+        if times is None:
+            times = (self.pushed + np.arange(len(small))) / (self.fps or self.source.optics.fps)
+        self.pushed += len(small)
+        grid, counts = self.resample.push(small, times)
+        scores, energy = self.compare(self.sight.push(grid))
+        scores, energy = np.concatenate([self.latest[None], scores]), np.concatenate([[self.energy], energy])
+        self.latest, self.energy = scores[-1], float(energy[-1])
+        return scores[counts], energy[counts]
+
+    def compare(self, seen: Tensor) -> tuple[Array, Array]:
+        """Scores ``(n, classes)`` and energies ``(n,)``, float64, of more frames of the grid, given their descriptors."""
+        scores = self.warping.push(seen).cpu().numpy().astype(float)
+        energy = seen.square().sum(1).cpu().numpy().astype(float)
+        warm = np.arange(self.compared, self.compared + len(seen)) >= self.source.window
+        self.compared += len(seen)
+        self.whole.push(scores, energy * np.where(warm, 1.0, COLD))
+        return self.pool.push(scores, energy), energy
+
+
+def recognize(stream: BrightnessStream, video: Footage) -> Array:
+    """``(classes,)`` scores of a whole video, read chunk by chunk."""
+    for frames, times in video:
+        stream.push(torch.as_tensor(frames), times)
+    return stream.whole.mean()
+
+
+def learned(videos: list[Footage], optics: Optics) -> list[list[Tensor]]:
+    """Descriptors of videos to learn from: what a stream of each would give, and what a stream would give that began earlier.
+
+    Where only an arm moves, a stream that has just begun knows the arm's place alone.  One that has seen the same person do other
+    things knows the person's: there, the box starts from what moved in all the videos that were taken at the same place.
+
+    Raises:
+        ValueError: fewer than three frames, or nothing moves.
+    """
+    first = [_looked_at(video, optics, None) for video in videos]
+    moved = [seen for _, seen in first if seen is not None]
+    if not moved:
+        return [[one] for one, _ in first]
+    again = [_looked_at(video, optics, seen)[0] for video, seen in zip(videos, together(moved), strict=True)]
+    return [[one, other] for (one, _), other in zip(first, again, strict=True)]
+
+
+def _looked_at(video: Footage, optics: Optics, seen: Tensor | None) -> tuple[Tensor, Tensor | None]:
+    """Descriptors of a whole video, and where something has moved in the end."""
+    sight, resample = Sight(optics, video.name, seen), Resampler(optics.fps, video.own_rate)
+    found = torch.cat([sight.push(resample.push(sight.small(frames), times)[0]) for frames, times in video]).cpu()
+    if len(found) < FEWEST:
+        raise ValueError(f"{video.name}: {len(found)} frames; motion needs at least {FEWEST}")
+    if not bool((found.square().sum(1) > MOVES).any()):
+        raise ValueError(f"{video.name}: nothing moves in it; leave it out, or give a video in which the action is seen")
+    return found, sight.box.seen
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# What exemplars find in wrong actions: levels for rejecting and for events, and whether left and right are different here.
+
+
+MOST = 64  # exemplars asked: bounds the time of calibration
+QUIET = 0.7  # of a frame's energy: below, nothing moves
+LEAST = 0.02  # contrast that an event needs: two or three classes have little to stand out from
+CLEAR = 0.02  # of the score: mirrored exemplars that look that much more like another action make left and right matter
+
+
+def wrong_evidence(source: Recognizer, exemplars: Exemplars) -> tuple[torch.Tensor, Array]:
+    """What exemplars find in other actions: the evidence of each ``(videos,)``, the contrast of moving frames ``(frames,)``."""
+    best, contrasts = [], []
+    for i in _asked(exemplars):
+        stream, seen = _fresh(source), exemplars.videos()[i]
+        label = int(exemplars.labels[i])
+        scores, energy = stream.compare(seen.to(source.optics.device))
+        others = np.delete(scores, label, axis=1)[energy >= QUIET]
+        contrasts.append(others.max(axis=1) - others.mean(axis=1))
+        best.append(float(np.delete(stream.whole.mean(), label).max()))
+    return torch.tensor(best), np.concatenate(contrasts)
+
+
+def mirrors_matter(source: Recognizer, exemplars: Exemplars) -> bool:
+    """Whether some exemplar's mirror image looks clearly more like another action than like its own.
+
+    Args:
+        source: without mirrored exemplars.
+    """
+    for i in _asked(exemplars):
+        stream, seen = _fresh(source), exemplars.videos()[i]
+        stream.compare(mirrored(seen).to(source.optics.device))
+        scores = stream.whole.mean()
+        label = int(exemplars.labels[i])
+        if float(scores.max() - scores[label]) > CLEAR:
+            return True
+    return False
+
+
+def found_events(scores: Array, times: Array, energy: Array, classes: Array, wrong: Array, rate: float | None) -> list[Event]:
+    """Events of scored frames: where the contrast of the best class exceeds what wrong actions reach at a rate."""
+    contrast = scores - scores.mean(axis=1, keepdims=True)
+    peak, floor = event_levels(wrong, FALSE_ALARMS if rate is None else rate, EXTENT, (LEAST, LEAST))
+    return events(contrast, times, classes.tolist(), peak, floor, energy < QUIET)
+
+
+def _asked(exemplars: Exemplars) -> list[int]:
+    """Exemplars to ask, spread over all of them."""
+    count = len(exemplars.labels)
+    return sorted({round(i) for i in np.linspace(0, count - 1, min(count, MOST))})
+
+
+def _fresh(source: Recognizer) -> BrightnessStream:
+    return BrightnessStream(source, len(source.library.bounds) - 1, "exemplar", None)

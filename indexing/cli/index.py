@@ -1,0 +1,338 @@
+"""``dyntorch index fit``: learn actions from example clips."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from indexing.cli.console import check_file, check_report, count, names, progress, say, table
+from indexing.cli.films import Pixels, are_films, refuse_film_flags
+from indexing.cli.inputs import (
+    Example,
+    KnownEvent,
+    Reading,
+    assumed,
+    on_classes,
+    on_gaps,
+    on_truth,
+    parse_example,
+    read_examples,
+    read_recordings,
+    read_truth,
+    remarks,
+)
+
+if TYPE_CHECKING:
+    from indexing.action.indexer import ActionIndexer
+    from indexing.clip import Clip
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Learn actions from example clips and write a model file.
+
+    dyntorch index fit squat=a.json "lunge left"=b.json@1.5-4 -o moves.safetensors
+
+    dyntorch index fit clips.npz --select view=1,2 -o moves.safetensors
+
+    dyntorch index fit raise=a.mp4 wave=b.mp4@3-5 -o moves.safetensors      (videos: from pixels alone, no pose estimator)
+    """
+
+    examples: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="LABEL=FILE ...", help_behavior_hint="")]
+    """keypoint files or OpenPose folders, or videos, one or more per label; label=file@1.5-4 uses these seconds; a labelled set:
+    SET.npz"""
+    output: Annotated[Path, tyro.conf.arg(aliases=("-o",), metavar="FILE")]
+    """the model to write, usually *.safetensors"""
+    select: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="FIELD=VALUES")] = ()
+    """of clip sets, learn only from clips with these values, e.g. view=1,2"""
+    view: Literal["any", "same"] = "any"
+    """from where recordings will be seen: from anywhere, or from about where the examples were"""
+    reject: Annotated[float | None, tyro.conf.arg(metavar="R", help_behavior_hint="")] = None
+    """share of clips of unknown actions that may be taken for a known one, 0 to 1; any other number is the least score"""
+    weights: Literal["equal", "learned"] = "equal"
+    """of the kinds of evidence; learned: by what serves people best who are left out (clip sets with a field 'subject')"""
+    report: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
+    """where to write report.html and body_parts.png: which body parts tell the actions apart, and how the evidence is weighed"""
+    mirror: bool = True
+    """let examples count mirrored, too, where left and right are not different actions"""
+    seed: int = 0
+    """of the virtual views"""
+    reading: Reading = field(default_factory=Reading)
+    pixels: Pixels = field(default_factory=Pixels)
+
+    def run(self) -> int:
+        """Read, learn, write, and say what was learned."""
+        if not self.examples:
+            raise ValueError("no examples; give at least two actions, such as squat=a.json lunge=b.json, or a clip set SET.npz")
+        examples = [parse_example(text) for text in self.examples]
+        paths = [example.path for example in examples]
+        output, folder = check_file(self.output, paths), check_report(self.report, paths)
+        if are_films(paths):
+            return self._from_pixels(examples, output)
+        refuse_film_flags(self.pixels)
+        with progress("reading", steps=False):
+            clips, notes = read_examples(examples, self.reading, self.select)
+        _check_two([str(clip.label) for clip in clips], examples)
+        started = time.perf_counter()
+        with progress(f"learning from {count(len(clips), 'clip')}", steps=False):
+            from indexing.action.indexer import ActionIndexer
+            from indexing.files import prepare
+
+            indexer = ActionIndexer(
+                view=self.view, weights=self.weights, reject=self.reject, mirror="auto" if self.mirror else False,
+                random_state=self.seed,
+            )  # fmt: skip
+            indexer.fit(clips, [str(clip.label) for clip in clips])
+        seconds = time.perf_counter() - started
+        if self.weights == "learned" and (indexer.groups_ is None or len(set(indexer.groups_)) < 2):
+            notes.append(
+                "--weights learned: nobody could be left out (no field 'subject', or one person), so the usual weights stand"
+            )
+        prepare(output.parent)
+        indexer.save(output)
+        page = None if folder is None else self._write(folder, indexer, clips, notes, paths)
+        _show(clips)
+        for note in notes:
+            say(f"note: {note}")
+        code = _written(output, seconds)
+        if page is not None:
+            say(f"report: {page}")
+        return code
+
+    def _write(self, folder: Path, indexer: ActionIndexer, clips: list[Clip], notes: list[str], paths: list[Path]) -> Path:
+        from indexing.files import manifest
+        from indexing.report.learned import write_learned
+
+        about = manifest({"command": "index fit", **dataclasses.asdict(self)}, [path.expanduser() for path in paths], self.seed)
+        with progress("drawing the report", steps=False):
+            return write_learned(folder, indexer, clips, notes, about)
+
+    def _from_pixels(self, examples: list[Example], output: Path) -> int:
+        """The same for videos."""
+        from indexing.cli import films
+        from indexing.files import prepare
+
+        films.refuse_keypoint_flags(self, "view", "weights", "mirror", "seed", "report")
+        with progress("reading", steps=False):
+            sources, labels, lengths = films.read_examples(examples, self.reading, self.select)
+        _check_two(labels, examples)
+        started = time.perf_counter()
+        with progress(f"learning from {count(len(sources), 'video')}", steps=False):
+            indexer = self.pixels.indexer(films.frame_rate(sources), reject=self.reject).fit(sources, labels)
+        prepare(output.parent)
+        indexer.save(output)
+        lines = []
+        for label in sorted(set(labels)):
+            mine = [seconds for name, seconds in zip(labels, lengths, strict=True) if name == label]
+            lines.append([label, len(mine), f"{sum(mine):.1f}"])
+        table(["action", "examples ", "seconds "], lines)
+        say(f"note: learned from pixels, at {indexer.fps:.3g} frames per second")
+        return _written(output, time.perf_counter() - started)
+
+
+def _check_two(labels: Sequence[str], examples: Sequence[Example]) -> None:
+    if len(set(labels)) < 2:
+        files = names([str(example.path) for example in examples])
+        raise ValueError(f"{files}: only one action ({labels[0]}); give examples of two or more, such as ordinary movement")
+
+
+def _written(output: Path, seconds: float) -> int:
+    say(f"learned in {seconds:.1f} s; model written to {output} ({max(1, round(output.stat().st_size / 1000)):,} kB)")
+    return 0
+
+
+def _show(clips: list[Clip]) -> None:
+    groups: dict[str, list[Clip]] = {}
+    for clip in clips:
+        groups.setdefault(str(clip.label), []).append(clip)
+    rows = []
+    for label, mine in sorted(groups.items()):
+        kinds = sorted({f"{clip.joints.shape[1]} in {clip.dims}D" for clip in mine})
+        rows.append([label, len(mine), f"{sum(clip.duration for clip in mine):.1f}", ", ".join(kinds)])
+    table(["action", "examples ", "seconds ", "joints "], rows)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# ``dyntorch index scan``: find learned actions in long recordings.
+
+
+if TYPE_CHECKING:
+    from indexing.action.indexer import ActionIndexer
+    from indexing.brightness.indexer import BrightnessIndexer
+    from indexing.cli.films import Recording
+    from indexing.clip import Clip
+    from indexing.report import RecordingResult
+
+
+@dataclass(frozen=True)
+class Scan:
+    """Find the actions of a model in untrimmed recordings.
+
+    Score: the evidence for the action, averaged over the time it lasts; higher is better.  Margin: how far that is above the next
+    best action; near 0 it might as well be that one.
+
+    dyntorch index scan session.json -m moves.safetensors --report out/
+
+    dyntorch index scan session.mp4 -m seen.safetensors --report out/       (a model that was learned from videos)
+    """
+
+    recordings: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="FILE ...", help_behavior_hint="")]
+    """keypoint files (a folder in OpenPose form is one recording), or videos, whichever the model was learned from"""
+    model: Annotated[Path, tyro.conf.arg(aliases=("-m",), metavar="FILE")]
+    """what 'dyntorch index fit' wrote"""
+    report: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
+    """where to write report.html, events.csv, timeline.png, metrics.json and manifest.json; without it, print only"""
+    truth: Annotated[Path | None, tyro.conf.arg(metavar="CSV", help_behavior_hint="")] = None
+    """what is known to have happened: columns label,start,end in seconds (and file, where there are several recordings)"""
+    reject: Annotated[float | None, tyro.conf.arg(metavar="R", help_behavior_hint="")] = None
+    """rate of false alarms that is accepted, 0 to 1, or else the least score; by default that of the model"""
+    reading: Reading = field(default_factory=Reading)
+
+    def run(self) -> int:
+        """Read all, scan all, write the report, print the hits."""
+        if not self.recordings:
+            raise ValueError("no recordings; give at least one keypoint file or folder to search")
+        inputs = [*self.recordings, self.model, *([self.truth] if self.truth is not None else [])]
+        folder = check_report(self.report, inputs)
+        started = time.perf_counter()
+        with progress("loading", steps=False):
+            indexer, recordings, notes = self._films() if self._of_films() else self._clips()
+        if self.reject is not None:
+            indexer.set_params(reject=self.reject)
+        names = [recording.name for recording in recordings]
+        truth, unread = (None, []) if self.truth is None else read_truth(self.truth, names)
+        notes = notes + unread + _unknown(truth, indexer)
+        if truth is not None:
+            notes += on_truth(truth, recordings)
+        loaded = time.perf_counter()
+        results = [
+            self._scan(indexer, one, None if truth is None else truth[i], f" ({i + 1} of {len(names)})" if len(names) > 1 else "")
+            for i, one in enumerate(recordings)
+        ]
+        timings = {"load": loaded - started, "scan": time.perf_counter() - loaded}
+        page = None if folder is None else self._write(folder, indexer, results, notes, inputs, timings)
+        _scan_show(results)
+        for note in notes:
+            say(f"note: {note}")
+        say(_summary(results, timings["scan"]))
+        if truth is not None:
+            say(_against_truth(results))
+        if page is not None:
+            say(f"report: {page}")
+        return 0
+
+    def _of_films(self) -> bool:
+        """Whether the model was learned from videos; the recordings must be of the same kind."""
+        from indexing.modelfile import model_kind
+
+        of_films = model_kind(self.model) == "dyntorch.brightness-indexer"
+        if are_films(self.recordings) != of_films:
+            has, need = ("videos", "videos") if of_films else ("keypoints", "keypoint files")
+            raise ValueError(f"{self.recordings[0]}: the model {self.model} was learned from {has}; give {need} to search")
+        return of_films
+
+    def _clips(self) -> tuple[ActionIndexer, list[Clip], list[str]]:
+        from indexing.action.indexer import ActionIndexer
+
+        indexer = ActionIndexer.load(self.model.expanduser())
+        clips, notes = read_recordings(self.recordings, self.reading, indexer.n_joints_, self.model, indexer.skeleton_)
+        notes += [*remarks(clips, self.reading), *on_gaps(clips), *on_classes([str(label) for label in indexer.classes_])]
+        return indexer, clips, notes + assumed(clips)
+
+    def _films(self) -> tuple[BrightnessIndexer, list[Recording], list[str]]:
+        from indexing.brightness.indexer import BrightnessIndexer
+        from indexing.cli.films import read_films
+
+        return BrightnessIndexer.load(self.model.expanduser()), *read_films(self.recordings, self.reading)
+
+    def _scan(self, indexer: Any, recording: Any, truth: list[KnownEvent] | None, which: str) -> RecordingResult:
+        from indexing.clip import Clip
+        from indexing.report import RecordingResult
+
+        classes = [str(label) for label in indexer.classes_]
+        with progress(f"scanning {recording.name}{which}") as bar:
+            if isinstance(recording, Clip):
+                scores, events = indexer.scan(recording, bar)
+                mine = [dataclasses.replace(event, exemplar=within_label(indexer, event.exemplar)) for event in events]
+                return RecordingResult(recording.name, recording, recording.times, classes, scores, mine, truth)
+            times, scores, events = indexer.scan(recording.source, bar)
+            return RecordingResult(recording.name, None, times, classes, scores, events, truth)
+
+    def _write(
+        self, folder: Path, indexer: Any, results: list[RecordingResult], notes: list[str], inputs: list[Path],
+        timings: dict[str, float],
+    ) -> Path:  # fmt: skip
+        from indexing.files import manifest
+        from indexing.report import RecognitionReport, write_recognition
+
+        arguments = {"command": "index scan", **dataclasses.asdict(self)}
+        report = RecognitionReport(
+            f"Actions in {results[0].name}" if len(results) == 1 else f"Actions in {len(results)} recordings",
+            recordings=results,
+            exemplars=exemplars(indexer) if hasattr(indexer, "exemplar") else {},
+            notes=notes,
+            manifest=manifest(arguments, [path.expanduser() for path in inputs], getattr(indexer, "random_state", None), timings),
+        )
+        with progress("drawing the report", steps=False):
+            return write_recognition(folder, report)
+
+
+def within_label(indexer: ActionIndexer, exemplar: int | None) -> int | None:
+    """An exemplar's number among those of its label, from its number in the model."""
+    if exemplar is None:
+        return None
+    labels = indexer.model_.labels
+    return int((labels[:exemplar] == labels[exemplar]).sum())
+
+
+def exemplars(indexer: ActionIndexer) -> dict[Any, list[Clip]]:
+    """Label -> the clips it was learned from."""
+    found: dict[Any, list[Clip]] = {}
+    for index in range(len(indexer.model_.labels)):
+        clip = indexer.exemplar(index)
+        found.setdefault(clip.label, []).append(clip)
+    return found
+
+
+def _unknown(truth: list[list[KnownEvent]] | None, indexer: Any) -> list[str]:
+    known = {str(label) for label in indexer.classes_}
+    strange = sorted({str(label) for events in truth or [] for label, _, _ in events} - known)
+    return [f"the model does not know {names(strange)}, which the known events name"] if strange else []
+
+
+def _scan_show(results: list[RecordingResult]) -> None:
+    several = len(results) > 1
+    from indexing.report.page import even
+
+    found = [(result.name, event) for result in results for event in result.events]
+    scores, margins = even([event.score for _, event in found]), even([event.margin for _, event in found])
+    rows = []
+    for (name, event), score, margin in zip(found, scores, margins, strict=True):
+        cells = [str(event.label), f"{event.start:.2f}", f"{event.end:.2f}", score, margin]
+        rows.append([name, *cells] if several else cells)
+    columns = ["action", "start (s) ", "end (s) ", "score ", "margin "]
+    if rows:
+        table(["recording", *columns] if several else columns, rows)
+
+
+def _summary(results: list[RecordingResult], seconds: float) -> str:
+    found, length = sum(len(result.events) for result in results), sum(result.duration for result in results)
+    where = f"{count(len(results), 'recording')} ({length:.1f} s long)"
+    return f"{count(found, 'action') if found else 'no action'} found in {where} in {seconds:.1f} s"
+
+
+def _against_truth(results: list[RecordingResult]) -> str:
+    """How many of the known actions an event of the same name overlaps, and which are missed."""
+    from indexing.report.results import missed
+
+    lost = [(result, event) for result in results for event in missed(result)]
+    known = sum(len(result.truth or ()) for result in results)
+    named = ", ".join(f"{label} at {start:.2f} to {end:.2f} s" for _, (label, start, end) in lost[:5])
+    more = f" and {len(lost) - 5} more" if len(lost) > 5 else ""
+    return f"{known - len(lost)} of {count(known, 'known action')} found" + (f"; missed: {named}{more}" if lost else "")

@@ -1,0 +1,103 @@
+"""Files of phase indexers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from indexing.action.bank import Windows
+from indexing.action.inputs import check_device
+from indexing.modelfile import (
+    Parts,
+    labels_from_json,
+    labels_to_json,
+    read_model,
+    skeleton_from_json,
+    skeleton_to_json,
+    usable,
+    whole,
+    write_model,
+)
+from indexing.opening import shown
+from indexing.phase.frames import LEAST
+from indexing.phase.indexer import check_phase_parameters
+from indexing.phase.model import Course, PhaseModel
+from indexing.scoring import reject_threshold
+
+if TYPE_CHECKING:
+    from indexing.phase.indexer import PhaseIndexer
+
+FORMAT = "dyntorch.phase-indexer"
+VERSION = 1
+JOINTS = 10_000  # at most; the largest layouts have some hundred
+
+Indexer = TypeVar("Indexer", bound="PhaseIndexer")
+
+
+def save(indexer: PhaseIndexer, path: str | Path) -> None:
+    """Write a fitted indexer.
+
+    Raises:
+        ValueError: the file cannot be written, or the labels are neither text nor numbers.
+    """
+    model = indexer.model_
+    about = {
+        "classes": labels_to_json(indexer.classes_),
+        "joints": indexer.n_joints_,
+        "mirrored": indexer.mirrored_.tolist(),
+        "periodic": indexer.periodic_.tolist(),
+        "skeleton": skeleton_to_json(indexer.skeleton_),
+    }
+    tensors = {"bank.values": model.bank.values, "bank.seen": model.bank.seen, "label": model.label, "phase": model.phase}
+    tensors["wrong"] = model.wrong
+    for c, course in enumerate(model.courses):
+        tensors |= {f"course.{c}.shapes": course.shapes, f"course.{c}.seen": course.seen}
+    write_model(path, FORMAT, VERSION, indexer.get_params(), about, tensors)
+
+
+def load(kind: type[Indexer], path: str | Path, device: str = "cpu") -> Indexer:
+    """Read a fitted indexer; see :meth:`indexing.phase.indexer.PhaseIndexer.load`."""
+    check_device(device)
+    header, parts = read_model(path, FORMAT, VERSION)
+    with usable(path):
+        indexer = kind(**header["parameters"], device=device)
+        check_phase_parameters(indexer)
+        _restore(indexer, header, parts)
+    return indexer
+
+
+def _restore(indexer: PhaseIndexer, header: dict[str, Any], parts: Parts) -> None:
+    """The fitted attributes.
+
+    Raises:
+        ValueError: parts that do not belong together.
+    """
+    classes, joints = labels_from_json(header["classes"]), whole(header["joints"], "joints", LEAST, JOINTS)
+    periodic, mirrored = (_flags(header[name], name, len(classes)) for name in ("periodic", "mirrored"))
+    courses = tuple(
+        Course(
+            parts.real(f"course.{c}.shapes", None, 2 * indexer.harmonics + 1, joints, 3).double(),
+            bool(periodic[c]),
+            parts.truth(f"course.{c}.seen", joints),
+        )
+        for c in range(len(classes))
+    )
+    if not all(len(course.shapes) for course in courses):
+        raise ValueError("course: an action without a shape")
+    values = parts.real("bank.values", None, 1, joints, 2).double()
+    bank = Windows(values, parts.truth("bank.seen", len(values), joints))
+    label = parts.every("label", len(bank), below=len(classes))
+    phase, wrong = parts.real("phase", len(bank), least=0, most=1).double(), parts.real("wrong", None)
+    indexer.skeleton_ = skeleton_from_json(header["skeleton"], joints)
+    indexer.model_ = PhaseModel(bank, label, phase, courses, wrong)
+    indexer.classes_, indexer.periodic_, indexer.n_joints_, indexer.mirrored_ = classes, periodic, joints, mirrored
+    indexer.reject_threshold_ = reject_threshold(indexer.reject, wrong)
+
+
+def _flags(found: Any, name: str, count: int) -> NDArray[np.bool_]:
+    if not isinstance(found, list) or len(found) != count or not all(isinstance(value, bool) for value in found):
+        raise ValueError(f"{name}: expected {count} truth values, got {shown(found)}")
+    return np.array(found, dtype=bool)

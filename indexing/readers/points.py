@@ -1,0 +1,312 @@
+"""The points of one view, as every format gives them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from indexing.opening import Row, error, listed, repeated, shown
+from indexing.opening import read_rows as rows_of
+from indexing.readers.npz import Archive
+from indexing.readers.npz import read_npy as read_npy_file
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class PointSet:
+    """Points or lines of one view.
+
+    Attributes:
+        path: where they come from, with the frame or the key where the file holds several views.
+        values: ``(n, d)`` points, ``(n, 2, 3)`` lines by two points each, or ``(n, 6)`` lines in Pluecker coordinates; NaN =
+            missing.
+        ids: a name for each; None = they have none.
+        weights: ``(n,)`` not negative; None = all equal.
+        static: ``(n,)`` known not to move; None = not known of any.
+    """
+
+    path: str
+    values: FloatArray
+    ids: tuple[str, ...] | None = None
+    weights: FloatArray | None = None
+    static: BoolArray | None = None
+
+    @property
+    def lines(self) -> bool:
+        """Whether these are lines."""
+        return self.values.ndim == 3 or self.values.shape[-1] == 6
+
+
+def as_view(values: Any, path: str | Path, lines: bool = False) -> FloatArray:
+    """An array of a file as points ``(n, 2 | 3)`` or lines ``(n, 2, 3)`` or ``(n, 6)``, float64.
+
+    Raises:
+        ValueError: another shape, no rows, values that are no real numbers, or infinite.
+    """
+    array = np.asarray(values)
+    expected = "lines are (n, 2, 3), two points each, or (n, 6), Pluecker" if lines else "points are (n, 2) or (n, 3)"
+    if array.dtype.kind not in "fiu":
+        raise error(path, f"holds values of type {array.dtype}", "give real numbers")
+    fits = array.shape[1:] in ((2, 3), (6,)) if lines else array.shape[1:] in ((2,), (3,))
+    if array.ndim < 2 or not fits:
+        raise error(path, f"the array has shape {array.shape}", expected)
+    if not len(array):
+        raise error(path, "the array is empty", "give at least one row")
+    infinite = np.argwhere(np.isinf(array))
+    if len(infinite):
+        at = tuple(int(i) for i in infinite[0])
+        raise error(path, f"row {at[0] + 1}, column {at[-1] + 1}: {array[at]} is not finite", "correct it, or use NaN for missing")
+    with np.errstate(invalid="ignore"):  # of bytes that are no number of any kind, but NaN
+        return array.astype(np.float64)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Points over time: files of which two or three frames are the views.
+
+
+@dataclass(frozen=True, eq=False)
+class PointSequence:
+    """Points over time.
+
+    Attributes:
+        path: the file.
+        values: ``(frames, n, d)``, NaN = missing.
+        ids: ``n`` names; None = none.
+        first: number of the first frame.
+    """
+
+    path: str
+    values: FloatArray
+    ids: tuple[str, ...] | None = None
+    first: int = 0
+
+    def views(self, frames: tuple[int, ...] | None) -> list[PointSet]:
+        """The frames of these numbers; without numbers, all, where there are two or three.
+
+        Raises:
+            ValueError: no numbers and more than three frames, or a frame that is not there.
+        """
+        count = len(self.values)
+        last = self.first + count - 1
+        if frames is None:
+            if count not in (2, 3):
+                middle = (self.first + last) // 2
+                example = f"--frames {self.first},{middle},{last}"
+                raise error(self.path, f"has {count} frames ({self.first} to {last})", f"say which are the views: {example}")
+            frames = tuple(range(self.first, last + 1))
+        for frame in frames:
+            if not self.first <= frame <= last:
+                raise error(self.path, f"has no frame {frame}", f"its frames are {self.first} to {last}")
+        return [PointSet(f"{self.path} frame {frame}", self.values[frame - self.first], self.ids) for frame in frames]
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Points and lines as CSV: a row each, columns ``x,y``, ``x,y,z`` or ``x1,y1,z1,x2,y2,z2``, with or without a header.
+
+
+IDS = ("id", "name", "marker", "point", "track", "label")  # headings of the column that names a row, the best one first
+WEIGHTS, STATIC = ("weight", "weights"), ("static",)
+LINE = ("x1", "y1", "z1", "x2", "y2", "z2")
+SHAPES = (LINE, ("x", "y", "z"), ("x", "y"))
+MISSING = ("", "na", "n/a", "nan", "none", "null")
+EXPECTED = "name the columns x,y or x,y,z, of lines x1,y1,z1,x2,y2,z2, and a column of names id"
+
+
+def read(path: Path) -> PointSet:
+    """The points of a CSV file; ``;`` and tabs separate, too.
+
+    Raises:
+        ValueError: no rows, unknown columns, a short row, or a cell that is not a number: with row, column and value.
+    """
+    rows = read_rows(path)
+    if not rows:
+        raise error(path, "the file is empty", "export it again")
+    header = None if is_data(rows[0][1]) else [cell.strip().lower() for cell in rows[0][1]]
+    if header is None:
+        names = _unnamed(path, rows[0][1])
+    else:
+        names, rows = header, rows[1:]
+        if not rows:
+            raise error(path, "the file has a header but no rows", "export it again")
+    check_widths(path, rows, names)
+    columns = next((shape for shape in SHAPES if set(shape) <= set(names)), None)
+    if columns is None:
+        raise error(path, f"its columns are {listed(names)}", EXPECTED)
+    twice = repeated(name for name in names if name in (*columns, *IDS))
+    if twice is not None:
+        raise error(path, f"there are two columns {shown(twice)}", "leave one of them out")
+    values = column_values(path, rows, names, columns)
+    values = values.reshape(-1, 2, 3) if columns == LINE else values
+    return PointSet(
+        str(path), values, row_names(path, rows, names), optional_column(path, rows, names, WEIGHTS), flags(path, rows, names)
+    )
+
+
+def read_rows(path: Path) -> list[Row]:
+    """Line number (1-based) and cells of every row that is not blank."""
+    return list(rows_of(path, "give points as CSV, npz, npy, PLY or C3D"))
+
+
+def check_widths(path: Path, rows: Sequence[Row], names: Sequence[str]) -> None:
+    """Raise on a row with other than a cell per column.
+
+    Raises:
+        ValueError: naming the row.
+    """
+    for line, cells in rows:
+        if len(cells) != len(names):
+            raise error(path, f"row {line} has {len(cells)} cells, the first row {len(names)}", "correct the row")
+
+
+def is_data(cells: Sequence[str]) -> bool:
+    """Whether a row is one of numbers (and perhaps a name before them) rather than a header."""
+    return any(number(cell) is not None and cell.strip().lower() not in MISSING for cell in cells)
+
+
+def _unnamed(path: Path, cells: Sequence[str]) -> list[str]:
+    """Names of the columns of a file without a header."""
+    named = number(cells[0]) is None  # words before numbers name the rows
+    size = len(cells) - named
+    shape = next((shape for shape in SHAPES if len(shape) == size), None)
+    if shape is None:
+        raise error(path, f"row 1 has {len(cells)} columns and there is no header", EXPECTED)
+    return [*(["id"] if named else []), *shape]
+
+
+def number(cell: str) -> float | None:
+    if cell.strip().lower() in MISSING:
+        return math.nan
+    try:
+        return float(cell)
+    except ValueError:
+        return None
+
+
+def column_values(path: Path, rows: Sequence[Row], names: Sequence[str], columns: Sequence[str]) -> FloatArray:
+    places = [names.index(name) for name in columns]
+    out = np.empty((len(rows), len(columns)))
+    for i, (line, cells) in enumerate(rows):
+        for j, (name, place) in enumerate(zip(columns, places, strict=True)):
+            value = number(cells[place])
+            if value is None or math.isinf(value):
+                what = "is not a number" if value is None else "is not finite"
+                raise error(
+                    path, f"row {line}, column {shown(name)}: {shown(cells[place])} {what}", "correct the cell or leave it empty"
+                )
+            out[i, j] = value
+    return out
+
+
+def row_names(path: Path, rows: Sequence[Row], names: Sequence[str], known: Sequence[str] = IDS) -> tuple[str, ...] | None:
+    """The names of the rows, from the first column that is known to hold such; None = no column does.
+
+    Raises:
+        ValueError: a row without a name, or two of the same.
+    """
+    column = next((names.index(name) for name in known if name in names), None)
+    if column is None:
+        return None
+    found: dict[str, int] = {}
+    for line, cells in rows:
+        name = cells[column].strip()
+        if not name:
+            raise error(path, f"row {line}, column {shown(names[column])}: is empty", "name the row, or leave the column out")
+        if name in found:
+            said = f"row {line}, column {shown(names[column])}: {shown(name)} was in row {found[name]}, too"
+            raise error(path, said, "give each row a name of its own")
+        found[name] = line
+    return tuple(found)
+
+
+def optional_column(path: Path, rows: Sequence[Row], names: Sequence[str], known: Sequence[str]) -> FloatArray | None:
+    name = next((name for name in known if name in names), None)
+    return None if name is None else column_values(path, rows, names, [name])[:, 0]
+
+
+def flags(path: Path, rows: Sequence[Row], names: Sequence[str]) -> np.ndarray | None:
+    words = {"true": "1", "yes": "1", "false": "0", "no": "0", "": "0"}
+    plain = [(line, [words.get(cell.strip().lower(), cell) for cell in cells]) for line, cells in rows]
+    values = optional_column(path, plain, names, STATIC)
+    if values is not None and not np.isin(values, (0, 1)).all():
+        at = int(np.flatnonzero(~np.isin(values, (0, 1)))[0])
+        raise error(path, f"row {rows[at][0]}, column 'static': {values[at]:g} is neither 0 nor 1", "use 1 for known static")
+    return None if values is None else values == 1
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Points and lines as numpy arrays: ``.npy`` with one view or several, ``.npz`` with all views of the matches.
+
+
+KEYS = "keys are x1, x2, x3 (2D), P1, P2, P3 (3D) or l1, l2 (lines), also ids, weights, static, and with lines static1, static2"
+EXTRA = ("ids", "weights", "static", "static1", "static2")
+
+
+def read_npy(path: Path) -> PointSet | PointSequence:
+    """One view ``(n, d)``, lines ``(n, 2, 3)`` or ``(n, 6)``, or several views ``(views, n, d)``.
+
+    Raises:
+        ValueError: no such array.
+    """
+    array = read_npy_file(path)
+    if array.ndim == 3 and array.shape[1:] != (2, 3) and array.shape[-1] in (2, 3):
+        return PointSequence(str(path), as_view(array.reshape(-1, array.shape[-1]), path).reshape(array.shape))
+    lines = array.ndim == 3 or array.shape[-1:] == (6,)
+    return PointSet(str(path), as_view(array, path, lines))
+
+
+def read_npz(path: Path) -> tuple[list[PointSet], list[PointSet]]:
+    """All views, and for lines the static points of both.
+
+    Raises:
+        ValueError: no known keys, a view is missing, or arrays that do not fit.
+    """
+    archive = Archive(path)
+    names = list(archive)
+    prefix = next((prefix for prefix in ("x", "P", "l") if f"{prefix}1" in names), None)
+    if prefix is None:
+        raise error(path, f"its arrays are {listed(names)}", KEYS)
+    unknown = [name for name in names if name not in EXTRA and not (name[:1] == prefix and name[1:] in ("1", "2", "3"))]
+    if unknown:
+        raise error(path, f"has an array {shown(unknown[0])}, which is not known", KEYS)
+    wanted = [f"{prefix}{i}" for i in ((1, 2) if prefix == "l" else (1, 2, 3))]
+    missing = [name for name in wanted if name not in names]
+    if missing:
+        raise error(path, f"has {wanted[0]} but no {missing[0]}", KEYS)
+    extra = {name: archive[name] for name in EXTRA if name in names}
+    views = []
+    for name in wanted:
+        where = f"{path} {name}"
+        values = as_view(archive[name], where, lines=prefix == "l")
+        for field in ("ids", "weights", "static"):
+            if field in extra and extra[field].shape != (len(values),):
+                raise error(path, f"{field} has shape {extra[field].shape}, {name} has {len(values)} rows", "give one per row")
+        ids = tuple(map(str, extra["ids"].tolist())) if "ids" in extra else None
+        views.append(PointSet(where, values, ids, _weights(path, extra), _static(path, extra)))
+    resting = [
+        PointSet(f"{path} {name}", as_view(extra[name], f"{path} {name}")) for name in ("static1", "static2") if name in extra
+    ]
+    return views, resting
+
+
+def _weights(path: Path, extra: dict[str, Any]) -> Any:
+    if "weights" not in extra:
+        return None
+    if extra["weights"].dtype.kind not in "fiub":
+        raise error(path, f"weights are of type {extra['weights'].dtype}", "give real numbers")
+    return extra["weights"].astype(np.float64)
+
+
+def _static(path: Path, extra: dict[str, Any]) -> Any:
+    if "static" not in extra:
+        return None
+    if not np.isin(extra["static"], (0, 1)).all():
+        raise error(path, "static holds other values than 0 and 1", "use 1 for matches known to be static")
+    return extra["static"].astype(bool)

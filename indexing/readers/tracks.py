@@ -1,0 +1,475 @@
+"""Files -> tracks, whatever their format."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from indexing.opening import VALUE, Row, check_dense, clipped, error, head_of, is_regular, listed, shown, size_of
+from indexing.readers.matches import open_points
+from indexing.readers.npz import Archive
+from indexing.readers.points import (
+    IDS,
+    STATIC,
+    WEIGHTS,
+    BoolArray,
+    FloatArray,
+    PointSequence,
+    PointSet,
+    as_view,
+    check_widths,
+    column_values,
+    flags,
+    is_data,
+    read_rows,
+)
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Tracks of points through views, as every format gives them.
+
+
+@dataclass(frozen=True, eq=False)
+class TrackSet:
+    """Points followed through views.
+
+    Attributes:
+        path: the file, or the first of several.
+        values: ``(views, n, 2 | 3)``, NaN = missing.
+        ids: ``n`` names.
+        views: names of the views: frame numbers, times, or files.
+        times: ``(views,)``; None = the files say nothing of time.
+        weights: ``(views, n)`` not negative; None = all equal.
+        static: ``(n,)`` known to stand still; None = not known of any.
+        notes: what a reader should know, a sentence each.
+        by_time: whether the views are named by their times.
+        start: the time from which ``times`` count, in full: that of the first view where they begin at 0.
+    """
+
+    path: str
+    values: FloatArray
+    ids: tuple[str, ...]
+    views: tuple[str, ...]
+    times: FloatArray | None = None
+    weights: FloatArray | None = None
+    static: BoolArray | None = None
+    notes: tuple[str, ...] = field(default=())
+    by_time: bool = False
+    start: float = 0.0
+
+    def since_first(self) -> TrackSet:
+        """The same with times that begin at 0; views that are named by their times are named by the new ones.
+
+        Example:
+            >>> tracks = TrackSet("t.csv", np.zeros((2, 1, 2)), ("a",), ("1e9", "1e9"), np.array([1e9, 1e9 + 0.2]), by_time=True)
+            >>> tracks.since_first().views, tracks.since_first().start
+            (('0', '0.2'), 1000000000.0)
+        """
+        if self.times is None:
+            return self
+        first = float(self.times[0])
+        views = since(self.times) if self.by_time else self.views
+        return replace(self, views=views, times=self.times - first, start=self.start + first)
+
+    def select(self, frames: Sequence[str]) -> TrackSet:
+        """The views of these names, in this order.
+
+        Raises:
+            ValueError: no view has such a name, or one is asked for twice.
+        """
+        twice = next((frame for i, frame in enumerate(frames) if frame in frames[:i]), None)
+        if twice is not None:
+            raise error(self.path, f"frame {twice} is asked for twice", "name each view once")
+        lost = next((frame for frame in frames if frame not in self.views), None)
+        if lost is not None:
+            raise error(self.path, f"has no frame {lost}", f"its {len(self.views)} frames are {self.views[0]} to {self.views[-1]}")
+        at = np.array([self.views.index(frame) for frame in frames])
+        return replace(
+            self,
+            values=self.values[at],
+            views=tuple(frames),
+            times=None if self.times is None else self.times[at],
+            weights=None if self.weights is None else self.weights[at],
+        )
+
+    def seen(self, least: int = 2) -> TrackSet:
+        """Without the tracks that fewer views see: of these nothing can be known."""
+        count = np.isfinite(self.values).all(axis=-1).sum(axis=0)
+        kept = count >= least
+        if kept.all():
+            return self
+        lost = int((~kept).sum())
+        was = "track is seen in fewer than {} views and was" if lost == 1 else "tracks are seen in fewer than {} views and were"
+        said = f"{lost} {was.format(least)} left out"
+        return replace(
+            self,
+            values=self.values[:, kept],
+            ids=tuple(name for name, keep in zip(self.ids, kept, strict=True) if keep),
+            weights=None if self.weights is None else self.weights[:, kept],
+            static=None if self.static is None else self.static[kept],
+            notes=(*self.notes, said),
+        )
+
+
+def since(times: FloatArray) -> tuple[str, ...]:
+    """Times since the first, in as many decimals as they have; in full where that would give two the same name.
+
+    Example:
+        >>> since(np.array([1700000000.25, 1700000000.45, 1700000001.25]))
+        ('0', '0.2', '1')
+    """
+    finest = float(np.spacing(np.abs(times).max()))
+    short = tuple(f"{step:.10g}" for step in np.round(times - times[0], int(np.floor(-np.log10(finest)))))
+    return short if len(set(short)) == len(short) else tuple(exact(time - times[0]) for time in times)
+
+
+def exact(value: float) -> str:
+    """A number with all the digits that it has, and no more.
+
+    Example:
+        >>> exact(1700000000.25), exact(3.0)
+        ('1700000000.25', '3')
+    """
+    return repr(float(value)).removesuffix(".0")
+
+
+def numbered(count: int) -> tuple[str, ...]:
+    """Names of tracks that have none.
+
+    Example:
+        >>> numbered(3)
+        ('1', '2', '3')
+    """
+    return tuple(str(i + 1) for i in range(count))
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Tracks as one table: a row per point and view, columns ``frame`` (or ``time``), ``id``, ``x``, ``y`` and perhaps ``z``.
+
+
+IntArray = NDArray[np.intp]
+VIEWS = ("view", "frame", "image")
+TIMES = ("time", "t", "seconds", "timestamp")
+EXPECTED = "name the columns frame (or time), id, x, y, and z for 3D points"
+
+
+def heading(path: Path) -> list[str]:
+    """The headings of a table, in small letters; empty where its first row is data."""
+    rows = read_rows(path)
+    return [cell.strip().lower() for cell in rows[0][1]] if rows and not is_data(rows[0][1]) else []
+
+
+def is_long(names: Sequence[str]) -> bool:
+    """Whether these are headings of tracks, rather than of the points of one view."""
+    return bool({*VIEWS, *TIMES} & set(names)) and {"x", "y"} <= set(names)
+
+
+def check_headings(path: Path) -> None:
+    """Raise on a table that is neither of tracks nor of the points of one view, with the columns that tracks need.
+
+    Raises:
+        ValueError: rows without headings, or headings without x and y.
+    """
+    names = heading(path)
+    if not names and read_rows(path):
+        raise error(path, "row 1 holds numbers, and no row names the columns", EXPECTED)
+    if names and not ({"x", "y"} <= set(names) or {"x1", "y1"} <= set(names)):
+        raise error(path, f"its columns are {listed(names)}", EXPECTED)
+
+
+def read_long(path: Path) -> TrackSet:
+    """The tracks of a table; rows that are absent and cells that are empty are missing observations.
+
+    Raises:
+        ValueError: columns that are absent, cells that are no numbers, a point twice in a view, a view with several times.
+    """
+    rows, names = read_rows(path)[1:], heading(path)
+    if not rows:
+        raise error(path, "the file has a header but no rows", "export it again")
+    check_widths(path, rows, names)
+    point = next((names.index(name) for name in IDS if name in names), None)
+    if point is None:
+        raise error(path, f"no column names the points (its columns are {listed(names)})", EXPECTED)
+    timed = next((name for name in TIMES if name in names), None)
+    viewed = next((name for name in VIEWS if name in names), timed)
+    assert viewed is not None  # is_long
+    axes = [axis for axis in ("x", "y", "z") if axis in names]
+    xyz = column_values(path, rows, names, axes)
+    place = _present(path, rows, names, viewed)
+    moments, views = np.unique(place, return_inverse=True)
+    ids: dict[str, int] = {}
+    columns = np.array([ids.setdefault(_named(path, line, cells[point], names[point]), len(ids)) for line, cells in rows])
+    _once(path, rows, names[point], views, columns, moments)
+    shape = (len(moments), len(ids))
+    same = "give a point the same name, and a frame the same number, in all of its rows"
+    check_dense(path, len(moments) * len(ids), len(rows), f"{len(moments)} views and {len(ids)} points", same)
+    values = np.full((*shape, len(axes)), np.nan)
+    values[views, columns] = xyz
+    return TrackSet(
+        str(path), values, tuple(ids), tuple(exact(moment) for moment in moments),
+        None if timed is None else moments if timed == viewed else _times(path, rows, names, timed, views, moments),
+        _weights(path, rows, names, views, columns, shape), _static(path, rows, names, columns, len(ids)),
+        by_time=timed == viewed,
+    )  # fmt: skip
+
+
+def _present(path: Path, rows: Sequence[Row], names: Sequence[str], column: str) -> FloatArray:
+    """A column of numbers of which none may be missing."""
+    found = column_values(path, rows, names, [column])[:, 0]
+    if np.isnan(found).any():
+        line = rows[int(np.flatnonzero(np.isnan(found))[0])][0]
+        raise error(path, f"row {line}, column {shown(column)}: is empty", "every row needs the view that it belongs to")
+    return found
+
+
+def _named(path: Path, line: int, cell: str, column: str) -> str:
+    if not cell.strip():
+        raise error(path, f"row {line}, column {shown(column)}: is empty", "name the point")
+    return cell.strip()
+
+
+def _once(path: Path, rows: Sequence[Row], point: str, views: IntArray, columns: IntArray, moments: FloatArray) -> None:
+    before: dict[tuple[int, int], int] = {}
+    for (line, cells), view, column in zip(rows, views.tolist(), columns.tolist(), strict=True):
+        if (view, column) in before:
+            again = f"was in frame {exact(moments[view])} before, in row {before[view, column]}"
+            said = f"row {line}: point {column + 1} of the file {again}"
+            raise error(
+                path,
+                f"{said} (row: {clipped(', '.join(cells), VALUE)})",
+                f"give each point one row per frame; column {shown(point)} names it",
+            )
+        before[view, column] = line
+
+
+def _times(path: Path, rows: Sequence[Row], names: Sequence[str], column: str, views: IntArray, moments: FloatArray) -> FloatArray:
+    found = _present(path, rows, names, column)
+    out = found[np.unique(views, return_index=True)[1]]
+    wrong = np.flatnonzero(found != out[views])
+    if len(wrong):
+        line, view = rows[wrong[0]][0], views[wrong[0]]
+        said = (
+            f"row {line}: frame {exact(moments[view])} has the {column} {exact(found[wrong[0]])} here and {exact(out[view])} before"
+        )
+        raise error(path, said, "a view has one time")
+    return out
+
+
+def _weights(
+    path: Path, rows: Sequence[Row], names: Sequence[str], views: IntArray, columns: IntArray, shape: tuple[int, int]
+) -> FloatArray | None:
+    column = next((name for name in WEIGHTS if name in names), None)
+    if column is None:
+        return None
+    found = np.nan_to_num(column_values(path, rows, names, [column])[:, 0])
+    if (found < 0).any():
+        at = int(np.flatnonzero(found < 0)[0])
+        raise error(path, f"row {rows[at][0]}, column {shown(column)}: the weight is {found[at]:g}", "weights are 0 or more")
+    out = np.zeros(shape)
+    out[views, columns] = found
+    return out
+
+
+def _static(path: Path, rows: Sequence[Row], names: Sequence[str], columns: IntArray, count: int) -> BoolArray | None:
+    """A point is static where all of its rows say so."""
+    if not set(STATIC) & set(names):
+        return None
+    found = np.asarray(flags(path, rows, names))
+    out = np.ones(count, dtype=bool)
+    out[columns[~found]] = False
+    return out
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Tracks as the arrays of an ``.npz``.
+
+
+KEYS = "give 'tracks' (views, n, 2 or 3) or 'y' (frames, points, 2), and perhaps 'times', 'ids', 'static', 'weights'"
+EXTRA = ("times", "ids", "static", "weights")
+
+
+def read_arrays(path: Path, key: str | None) -> TrackSet:
+    """Tracks of an ``.npz``.
+
+    Raises:
+        ValueError: no tracks in it, several without a key, arrays that do not fit.
+    """
+    archive = Archive(path)
+    before, name = _chosen(path, list(archive), key)
+    values, extra = archive[name], {kind: archive[before + kind] for kind in EXTRA if before + kind in archive}
+    if values.ndim != 3 or values.shape[-1] not in (2, 3):
+        raise error(path, f"{name} has shape {values.shape}", KEYS)
+    flat = as_view(values.reshape(-1, values.shape[-1]), f"{path} {name}")
+    views, n = values.shape[:2]
+    for kind, shape in (("times", (views,)), ("ids", (n,)), ("static", (n,)), ("weights", (views, n))):
+        if kind in extra and extra[kind].shape != shape:
+            raise error(path, f"{kind} has shape {extra[kind].shape}, {name} has {values.shape}", f"expected {shape}")
+    ids = tuple(map(str, extra["ids"].tolist())) if "ids" in extra else numbered(n)
+    return TrackSet(
+        str(path), flat.reshape(values.shape), ids, tuple(map(str, range(views))), _reals(path, extra, "times"),
+        _reals(path, extra, "weights", 0.0), None if "static" not in extra else extra["static"].astype(bool),
+    )  # fmt: skip
+
+
+def _chosen(path: Path, names: list[str], key: str | None) -> tuple[str, str]:
+    """What the names of the arrays begin with, and the name of the tracks."""
+    several = [name[:-2] for name in names if name.endswith("/y")]
+    if key is not None and key in names:
+        return "", key
+    if key is not None and key not in several:
+        known = f"its sequences are {listed(several)}" if several else f"its arrays are {listed(names)}"
+        raise error(path, f"has no {'sequence' if several else 'array'} {shown(key)}", known)
+    if key is None and several:
+        raise error(
+            path, f"holds {len(several)} sequences ({listed(several, 4)})", f"say which: --key {clipped(several[0], VALUE)}"
+        )
+    before = "" if key is None else f"{key}/"
+    name = next((f"{before}{kind}" for kind in ("tracks", "y") if f"{before}{kind}" in names), None)
+    if name is None:
+        others = [other for other in names if other not in EXTRA]
+        choice = f"; or say which array has the tracks: --key {clipped(others[0], VALUE)}" if others else ""
+        raise error(path, f"its arrays are {listed(names)}", KEYS + choice)
+    return before, name
+
+
+def _reals(path: Path, extra: dict[str, Any], kind: str, least: float = -np.inf) -> FloatArray | None:
+    if kind not in extra:
+        return None
+    values = extra[kind]
+    if values.dtype.kind not in "fiub" or not np.isfinite(values).all() or (values < least).any():
+        of = "" if np.isinf(least) else f" of {least:g} or more"
+        raise error(path, f"{kind} holds values that are no finite numbers{of}", "correct them")
+    return np.asarray(values, dtype=np.float64)
+
+
+FORMATS = "give a table with columns frame, id, x, y, an array (views, n, 2 or 3), or a file of points for each view"
+
+
+def read_tracks(
+    paths: Sequence[str | Path], *, frames: Sequence[str] | None = None, key: str | None = None, static: Path | None = None
+) -> TrackSet:
+    """Read tracks.
+
+    Args:
+        paths: a table with a column ``frame`` or ``time``, an ``.npz``, ``.npy`` or ``.c3d``; or a file of points for each view.
+        frames: names of the views to take; all by default.
+        key: of an ``.npz`` with several sequences ``key/y``, or several arrays, the one to take.
+        static: a file that names the points known to stand still, in a column ``id``; where it has a column ``static``, those
+            marked 1.
+
+    Raises:
+        ValueError: one line with the file, the field, what is wrong and what to do.
+
+    Example:
+        >>> import pathlib, tempfile
+        >>> path = pathlib.Path(tempfile.mkdtemp()) / "tracks.csv"
+        >>> _ = path.write_text("time,id,x,y\\n0,p,1,2\\n0,q,3,4\\n0.5,p,2,2\\n1.5,q,3,5\\n1.5,p,4,2\\n")
+        >>> found = read_tracks([path])
+        >>> found.ids, found.times.tolist(), found.values[:, 1].tolist()
+        (('p', 'q'), [0.0, 0.5, 1.5], [[3.0, 4.0], [nan, nan], [3.0, 5.0]])
+    """
+    files = [Path(path).expanduser() for path in paths]
+    if not files:
+        raise ValueError(f"no files; {FORMATS}")
+    found = _read(files, key)
+    if frames is not None:
+        found = found.select(frames)
+    if len(found.views) < 2:
+        raise error(found.path, f"holds {len(found.views)} view", FORMATS)
+    return found if static is None else replace(found, static=_marked(static.expanduser(), found.ids))
+
+
+def _read(files: Sequence[Path], key: str | None) -> TrackSet:
+    if len(files) == 1 and _start(files[0]).startswith(b"PK"):
+        return read_arrays(files[0], key)
+    if key is not None:
+        raise error(files[0], f"--key {key}: has no keys", "leave --key out; it is for .npz with several sequences or arrays")
+    if len(files) == 1 and _is_text(files[0]):
+        if is_long(heading(files[0])):
+            return read_long(files[0])
+        check_headings(files[0])
+    opened = [open_points(path) for path in files]
+    first = opened[0]
+    if isinstance(first, PointSequence) and len(opened) == 1:
+        names = tuple(str(first.first + i) for i in range(len(first.values)))
+        return TrackSet(first.path, first.values, first.ids or numbered(first.values.shape[1]), names)
+    views = []
+    for view in opened:
+        if isinstance(view, PointSequence):
+            raise error(view.path, f"holds {len(view.values)} frames", "give such a file alone")
+        if view.lines:
+            raise error(view.path, "holds lines", "give points")
+        views.append(view)
+    if len(views) == 1:
+        raise error(views[0].path, "holds the points of one view", FORMATS)
+    return _joined(views)
+
+
+def _start(path: Path) -> bytes:
+    """The first bytes of a file; none where there is no file."""
+    return head_of(path) if is_regular(path) else b""
+
+
+def _is_text(path: Path) -> bool:
+    """Whether the file is a table, rather than arrays or a cloud of points."""
+    start = _start(path)
+    return bool(start) and b"\0" not in start and not start.startswith(b"ply")
+
+
+def _joined(views: Sequence[PointSet]) -> TrackSet:
+    """One file per view: by name where all have names, and then a name may be absent from some; otherwise by row."""
+    first = views[0]
+    odd = next((view for view in views if view.values.shape[1] != first.values.shape[1]), None)
+    if odd is not None:
+        said = f"holds {odd.values.shape[1]}D points, {first.path} {first.values.shape[1]}D"
+        raise error(odd.path, said, "give one kind")
+    if all(view.ids is not None for view in views):
+        places = {name: i for i, name in enumerate(dict.fromkeys(name for view in views for name in view.ids or ()))}
+        rows = [np.array([places[name] for name in view.ids or ()]) for view in views]
+        ids = tuple(places)
+    else:
+        longer = next((view for view in views if len(view.values) != len(first.values)), None)
+        if longer is not None:
+            said = f"has {len(longer.values)} rows, {first.path} {len(first.values)}"
+            raise error(longer.path, said, "give a row per track in every file, or a column id to match the rows by")
+        rows, ids = [np.arange(len(first.values))] * len(views), numbered(len(first.values))
+    values = np.full((len(views), len(ids), first.values.shape[1]), np.nan)
+    weights = np.ones(values.shape[:2])
+    still = np.ones(len(ids), dtype=bool)
+    for i, (view, row) in enumerate(zip(views, rows, strict=True)):
+        values[i, row] = view.values
+        if view.weights is not None:
+            weights[i, row] = np.nan_to_num(view.weights)
+        if view.static is not None:
+            still[row] &= view.static
+    if (weights < 0).any():
+        raise error(first.path, f"a weight is {weights.min():g}", "weights are 0 or more")
+    return TrackSet(
+        first.path, values, ids, tuple(Path(view.path).name for view in views), None,
+        weights if any(view.weights is not None for view in views) else None,
+        still if any(view.static is not None for view in views) else None,
+    )  # fmt: skip
+
+
+def _marked(path: Path, ids: Sequence[str]) -> BoolArray:
+    """Points that a file names: those of the column ``id``, or of its only column."""
+    size_of(path, "check the path; --static is a CSV with a column id")
+    rows = read_rows(path)
+    names = [cell.strip().lower() for cell in rows[0][1]] if rows else []
+    column = next((names.index(name) for name in IDS if name in names), None)
+    if column is not None:
+        rows = rows[1:]
+    elif rows and len(rows[0][1]) == 1:
+        names, column = ["id"], 0
+    else:
+        raise error(path, "has no column of names", "name the points that stand still in a column id")
+    marks = flags(path, rows, names) if set(STATIC) & set(names) else None
+    named = {cells[column].strip(): line for i, (line, cells) in enumerate(rows) if marks is None or marks[i]}
+    stranger = next((name for name in named if name not in set(ids)), None)
+    if stranger is not None:
+        raise error(path, f"row {named[stranger]}: no track is named {shown(stranger)}", f"the tracks are {listed(ids, 4)}")
+    return np.array([name in named for name in ids])

@@ -1,1 +1,0 @@
-"""Space-time shapes of actions: what is compared between two windows, and how."""

@@ -1,0 +1,207 @@
+"""Keypoint files on one clock, as Pose2Sim's ``pose-sync`` has them: equal frame numbers are equal moments.
+
+Pose2Sim aligns cameras by copying the files under shifted frame numbers; a folder ``pose-sync`` beside ``pose`` is what its
+next step reads.  Here every frame number of the reference camera takes the nearest frame of each other camera: a shift by whole
+frames where the clocks run alike, and a frame repeated or left out now and then where they do not.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import secrets
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from indexing.clip import Clip
+from indexing.files import recover_folder, replace_folder
+from indexing.opening import error, parse_json, read_text
+from indexing.readers.detect import detect_json
+from indexing.readers.files import frame_number, load_json
+from indexing.sync.takes import Take
+
+FOLDER = "pose-sync"
+NEAR = 0.5 + 1e-6  # frames: no other frame is nearer
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """Which frame of a camera stands for which moment of the reference.
+
+    Args:
+        take: the camera.
+        numbers: ``(k,)`` frame numbers of the reference camera.
+        rows: ``(k,)`` the frame of this camera that is nearest to each, an index of ``take.times``.
+        rest: seconds, the greatest distance that is left.
+        before: frames left out because they were taken before the reference's number 0.
+    """
+
+    take: Take
+    numbers: NDArray[np.int64]
+    rows: NDArray[np.int64]
+    rest: float
+    before: int
+
+    @property
+    def repeated(self) -> int:
+        """How many frames stand for more than one moment."""
+        return len(self.rows) - len(np.unique(self.rows))
+
+    @property
+    def shift(self) -> int | None:
+        """What is taken off the frame numbers where that is the same for all frames; None where it is not."""
+        off = np.unique(np.rint(self.take.times[self.rows] * self.take.fps).astype(np.int64) - self.numbers)
+        return int(off[0]) if len(off) == 1 else None
+
+
+def plan(take: Take, offset: float, rate: float, fps: float) -> Plan:
+    """Match a camera's frames with the frame numbers of the reference camera.
+
+    Args:
+        take: keypoints.
+        offset, rate: the camera's clock is the reference's times rate plus offset.
+        fps: frames per second of the reference.
+
+    Returns:
+        the plan; of a camera that ended before the reference's number 0 it has no frames.
+
+    Example:
+        >>> import numpy as np
+        >>> from indexing.sync.takes import take_of
+        >>> late = plan(take_of(np.ones((6, 3, 2)), fps=10.0), offset=0.21, rate=1.0, fps=10.0)
+        >>> late.numbers.tolist(), late.rows.tolist(), round(late.rest, 3), late.before
+        ([0, 1, 2, 3], [2, 3, 4, 5], 0.01, 2)
+    """
+    times = take.times
+    nearest = np.floor((times - offset) / rate * fps).astype(np.int64)
+    reach = int(np.ceil(NEAR * fps / (rate * take.fps)))  # numbers on either side that one frame may stand for
+    numbers = np.unique(nearest[:, None] + np.arange(-reach, reach + 2))
+    numbers = numbers[numbers >= 0]
+    wanted = rate * numbers / fps + offset
+    after = np.clip(np.searchsorted(times, wanted), 0, len(times) - 1)
+    before = np.maximum(after - 1, 0)
+    rows = np.where(np.abs(times[before] - wanted) <= np.abs(times[after] - wanted) - 1e-9, before, after)
+    apart = np.abs(times[rows] - wanted)
+    keep = apart <= NEAR / take.fps
+    earlier = int((times < offset - NEAR / take.fps).sum())
+    return Plan(take, numbers[keep], rows[keep], float(apart[keep].max(initial=0.0)), earlier)
+
+
+def check_target(folder: Path, inputs: Sequence[Path]) -> None:
+    """Raise where the shifted files would replace an input, or a folder that this command did not write.
+
+    Raises:
+        ValueError: naming what is in the way.
+    """
+    target = folder / FOLDER
+    same = [path for path in inputs if path.is_dir() and path.resolve() == folder.resolve()]
+    if same:
+        raise ValueError(f"{same[0]}: is an input, and files of the report among its frames would spoil it; choose another --out")
+    inside = [path for path in inputs if target.resolve() in (path.resolve(), *path.resolve().parents)]
+    if inside:
+        raise ValueError(f"{inside[0]}: is an input, and {target} would be replaced; choose another folder for --out")
+    if target.exists() and not ours(folder):
+        raise ValueError(f"{target}: is there, and not from this command; move it away, or choose another folder for --out")
+
+
+def ours(folder: Path) -> bool:
+    """Whether an earlier run of this command wrote the folder's shifted files."""
+    try:
+        known = parse_json(folder, read_text(folder / "sync.json"), "")
+        return str(known["manifest"]["arguments"]["command"]) == "sync"
+    except (ValueError, KeyError, TypeError):
+        return False
+
+
+def write_poses(folder: Path, plans: Sequence[Plan]) -> Path:
+    """Write ``pose-sync/<camera>_json/`` for every camera: all of them, or nothing.
+
+    Frames of an OpenPose folder are copied as they are, under their new numbers; other formats are written as OpenPose JSON.
+    """
+    target = folder / FOLDER
+    recover_folder(target)
+    building = folder / f".{FOLDER}-{secrets.token_hex(8)}.tmp"
+    try:
+        for one in (one for one in plans if len(one.rows)):
+            _write_camera(building / f"{one.take.name}_json", one)
+        replace_folder(building, target)
+    except OSError as problem:
+        raise ValueError(
+            f"cannot write {str(target)!r} ({problem.strerror or problem}); free the name or the disk, or choose another folder"
+        ) from problem
+    finally:
+        shutil.rmtree(building, ignore_errors=True)
+    return target
+
+
+def drop_poses(folder: Path) -> bool:
+    """Remove the shifted files of an earlier run, which a refusal has taken the ground from."""
+    target = folder / FOLDER
+    if not (target.is_dir() and ours(folder)):
+        return False
+    shutil.rmtree(target)
+    return True
+
+
+def _write_camera(folder: Path, one: Plan) -> None:
+    folder.mkdir(parents=True)
+    sources = _openpose_files(one.take.path)
+    if sources:
+        by_number = {int(np.rint(time * one.take.fps)): row for row, time in enumerate(one.take.times)}
+        paths = {by_number[number]: path for number, path in sources.items() if number in by_number}
+        for number, row in zip(one.numbers.tolist(), one.rows.tolist(), strict=True):
+            if row in paths:
+                shutil.copyfile(paths[row], folder / renumbered(paths[row].name, number))
+        return
+    texts = openpose_frames(one.take)
+    for number, row in zip(one.numbers.tolist(), one.rows.tolist(), strict=True):
+        (folder / f"{one.take.name}_{number:06d}.json").write_text(texts[row], encoding="utf-8")
+
+
+def _openpose_files(path: Path | None) -> dict[int, Path]:
+    """Frame number -> file, where the camera is a folder of OpenPose JSON."""
+    if path is None or not path.is_dir():
+        return {}
+    found = [entry for entry in sorted(path.iterdir()) if entry.suffix.lower() == ".json" and not entry.name.startswith(".")]
+    if not found or next((kind for file in found if (kind := detect_json(load_json(file)))), None) != "openpose":
+        return {}
+    return {number: file for file in found if (number := frame_number(file.name)) is not None}
+
+
+def renumbered(name: str, number: int) -> str:
+    """A file name with another frame number, at least as many digits.
+
+    Example:
+        >>> renumbered("cam01_000000000012_keypoints.json", 7), renumbered("cam01.000123.json", 99)
+        ('cam01_000000000007_keypoints.json', 'cam01.000099.json')
+    """
+    stem, dot, suffix = name.rpartition(".")
+    found = re.search(r"(\d{1,18})(?=_keypoints)", stem) or re.search(r"(\d{1,18})(?=\D*$)", stem)
+    if found is None:
+        raise error(name, "the file name has no frame number", "name frames by number")
+    return f"{stem[: found.start()]}{number:0{len(found[0])}d}{stem[found.end() :]}{dot}{suffix}"
+
+
+def openpose_frames(take: Take) -> list[str]:
+    """A camera's people as OpenPose JSON, one text per frame; a joint not seen is 0, 0, 0."""
+    people: list[list[dict[str, Any]]] = [[] for _ in take.times]
+    for index, clip in enumerate(take.everyone):
+        rows = np.searchsorted(take.times, clip.times)
+        for row, flat in zip(rows.tolist(), _flat(clip), strict=True):
+            if flat is not None:
+                people[row].append({"person_id": [index if len(take.everyone) > 1 else -1], "pose_keypoints_2d": flat})
+    return [json.dumps({"version": 1.3, "people": present}) for present in people]
+
+
+def _flat(clip: Clip) -> list[list[float] | None]:
+    """``x, y, c, x, y, c, ...`` of every frame; None where the person was not seen."""
+    seen = clip.seen
+    trust = seen.astype(np.float64) if clip.confidence is None else np.asarray(clip.confidence, dtype=np.float64)
+    table = np.where(seen[..., None], np.concatenate([clip.joints, trust[..., None]], axis=2), 0.0).reshape(len(clip), -1)
+    return [row if there else None for row, there in zip(table.tolist(), np.asarray(seen.any(axis=1)).tolist(), strict=True)]

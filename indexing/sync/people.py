@@ -1,0 +1,228 @@
+"""Which person of one camera is which of the other: every likely pairing is tried, and the evidence decides."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from indexing.clip import Clip
+from indexing.skeleton import Skeleton, known
+from indexing.sync.takes import FloatArray, Take
+
+if TYPE_CHECKING:
+    from dyntorch import Shift
+
+LEAST = 8  # joints of the same name in two layouts, for them to be compared as the same points
+TOLERANCE = 2.0  # frames within which two answers are the same
+LIKELIEST = 3  # pairings that are tried thoroughly where a fast look is sure of none
+WEAK = 0.5  # of the best pairing's confidence, below which an answer that differs is no rival
+# Times the usual distance, for how many seconds, by how many joints: what makes a stretch of another person.  Of one person, the
+# running median stays below 1.5 (pose2sim, all pairs, and actors); of two who were swapped 10 m apart it reaches 2 to 3, because
+# two who stand upright fit each other's epipolar lines.
+AWAY, LASTING, SEEN = 2.0, 0.25, 4
+JUMP = 0.5  # box diagonals from one frame to the next: another person
+
+
+Solve = Callable[[Clip, Clip], "Shift"]
+
+
+@dataclass(frozen=True, eq=False)
+class Pairing:
+    """One person of each camera, and what they say.
+
+    Args:
+        shift: of b's clock against a's.
+        people: the numbers of both among the people of their takes.
+        rivals: offsets at which other pairings are sure, too, best first.
+    """
+
+    shift: Shift
+    people: tuple[int, int]
+    rivals: tuple[float, ...] = ()
+
+
+def match_people(a: Take, b: Take, solve: Solve, trial: Solve | None = None) -> Pairing:
+    """The pairing of people on which the evidence is best.
+
+    Where people do different things at different times, a wrong pairing may look right, too: pairings that are sure of
+    different offsets make a refusal, unless one has far more confidence, or more people, behind it.
+
+    Args:
+        a, b: the cameras.
+        solve: compares a person of a with one of b.
+        trial: the same, faster, to find the pairing; ``solve`` then has the last word on it.
+    """
+    every = sorted(((i, j) for i in range(len(a.people)) for j in range(len(b.people))), key=sum)
+    if len(every) == 1:
+        return Pairing(solve(a.people[0], b.people[0]), (0, 0))
+    frame = 1.0 / min(a.fps, b.fps)
+    found: list[Pairing] = []
+    for i, j in every:
+        found.append(Pairing((trial or solve)(a.people[i], b.people[j]), (i, j)))
+        if backing(found[-1], found, frame) > 1:  # two people of each camera say the same
+            break
+    if trial is not None:  # the last word on the winner, or where none is sure, on the likeliest
+        ranked = sorted(found, key=lambda one: -one.shift.confidence)
+        likely = [decide(found, frame)] if any(one.shift.ok for one in found) else [(one, ()) for one in ranked[:LIKELIEST]]
+        again = [Pairing(solve(a.people[one.people[0]], b.people[one.people[1]]), one.people, rivals) for one, rivals in likely]
+        best, rivals = (again[0], again[0].rivals) if len(again) == 1 else decide(again, frame)
+    else:
+        best, rivals = decide(found, frame)
+    shift = best.shift
+    chosen = [f"{who(take, i)} of {take.name}" for take, i in zip((a, b), best.people, strict=True)]
+    note = f"several people in view: compared {chosen[0]} with {chosen[1]}, the best of {len(found)} pairings"
+    shift = dataclasses.replace(shift, notes=(*shift.notes, note))
+    if rivals:
+        listed = " and ".join(f"{rival:+.3f} s" for rival in rivals[:2])
+        reason = f"pairings of other people say {listed}; name one person per camera (person=), or record one who moves otherwise"
+        shift = dataclasses.replace(shift, ok=False, reason=f"one pairing of people says {shift.offset:+.3f} s, but {reason}")
+    return Pairing(shift, best.people, rivals)
+
+
+def backing(one: Pairing, found: Sequence[Pairing], frame: float) -> int:
+    """How many pairings of other people, and this one, are sure of its offset."""
+    others = [other for other in found if not set(enumerate(one.people)) & set(enumerate(other.people))]
+    return one.shift.ok + sum(one.shift.ok and other.shift.ok and not apart(one, other, frame) for other in others)
+
+
+def apart(one: Pairing, other: Pairing, frame: float) -> bool:
+    """Whether two answers differ by more than what both leave open."""
+    return abs(_middle(one) - _middle(other)) > TOLERANCE * frame + 3 * (one.shift.sigma + other.shift.sigma)
+
+
+def _middle(pairing: Pairing) -> float:
+    return float(pairing.shift.at(pairing.shift.center)) - pairing.shift.center
+
+
+def who(take: Take, index: int) -> str:
+    """A person of a camera in words."""
+    person = take.people[index].meta.get("person")
+    return "the largest person of each frame" if person is None else f"person {person}"
+
+
+def decide(found: Sequence[Pairing], frame: float) -> tuple[Pairing, tuple[float, ...]]:
+    """The best pairing, and the offsets of those that contradict it.
+
+    Args:
+        frame: seconds.
+    """
+    behind = {id(pairing): backing(pairing, found, frame) for pairing in found}
+    ranked = sorted(found, key=lambda pairing: (-behind[id(pairing)], -pairing.shift.confidence))
+    best = ranked[0]
+    rivals = [
+        _middle(pairing)
+        for pairing in ranked[1:]
+        if behind[id(pairing)] >= max(1, behind[id(best)])
+        and pairing.shift.confidence >= WEAK * best.shift.confidence
+        and apart(best, pairing, frame)
+    ]
+    return best, tuple(rivals)
+
+
+def common_joints(a: Clip, b: Clip) -> tuple[Clip, Clip, bool, str]:
+    """Both clips with the joints that they have in common, whether these correspond, and what to say about it."""
+    first, second = a.skeleton, b.skeleton
+    count = a.joints.shape[1], b.joints.shape[1]
+    if first is None or second is None or first.joints == second.joints:
+        if count[0] == count[1]:
+            return a, b, True, ""
+    else:
+        shared = [name for name in first.joints if name in second.joints]
+        if len(shared) >= LEAST:
+            said = f"{first.name} and {second.name} share {len(shared)} joints; these are compared"
+            return _only(a, shared), _only(b, shared), True, said
+    names = [clip.skeleton.name if clip.skeleton is not None else f"{n} joints" for clip, n in zip((a, b), count, strict=True)]
+    return a, b, False, f"different joints ({names[0]}, {names[1]}): compared as different points, which needs longer takes"
+
+
+def _only(clip: Clip, names: Sequence[str]) -> Clip:
+    assert clip.skeleton is not None
+    index = [clip.skeleton.joints.index(name) for name in names]
+    confidence = None if clip.confidence is None else clip.confidence[:, index]
+    return clip.replace(joints=clip.joints[:, index], confidence=confidence, skeleton=Skeleton("common joints", tuple(names)))
+
+
+def disagreements(a: Clip, b: Clip, shift: Shift) -> list[tuple[float, float, float]]:
+    """Stretches in which both do not show the same person: start and end on a's clock, and how many times the usual distance.
+
+    What is compared over time is the distance of a joint from the epipolar line of its partner,
+
+    .. math:: |x_b^T F x_a| / \\sqrt{(F x_a)_1^2 + (F x_a)_2^2 + (F^T x_b)_1^2 + (F^T x_b)_2^2},
+
+    as the median over the joints of a frame and over a quarter of a second.
+    """
+    if shift.fundamental is None:
+        return []
+    distance = _running(_distances(a, b, shift), round(LASTING / 2 * float(a.fps or 30.0)))
+    usual = float(np.nanmedian(distance)) if np.isfinite(distance).any() else 0.0
+    if not usual > 0:
+        return []
+    far = np.nan_to_num(distance / usual) > AWAY
+    steps = np.flatnonzero(np.diff(np.concatenate([[0], far.astype(int), [0]])))
+    found = []
+    for start, end in zip(steps[::2], steps[1::2], strict=True):
+        if a.times[end - 1] - a.times[start] >= LASTING:
+            found.append((float(a.times[start]), float(a.times[end - 1]), float(distance[start:end].max()) / usual))
+    return found
+
+
+def jumps(clip: Clip) -> list[float]:
+    """When the person is somewhere else from one frame to the next, and not back at once: seconds."""
+    steps = np.diff(clip.times) <= 1.5 / float(clip.fps or 30.0)
+    apart = np.linalg.norm(np.diff(clip.joints, axis=0), axis=2)
+    low, high = (
+        edge(np.where(np.isfinite(clip.joints), clip.joints, fill), axis=1) for edge, fill in ((np.min, np.inf), (np.max, -np.inf))
+    )
+    size = np.linalg.norm(high - low, axis=1)
+    known = steps & (np.isfinite(apart).sum(axis=1) >= SEEN) & np.isfinite(size[1:]) & np.isfinite(size[:-1])
+    moved = np.nanmedian(apart[known], axis=1) > JUMP * np.maximum(size[1:], size[:-1])[known]
+    times = clip.times[1:][known][moved]
+    alone = np.diff(times, prepend=-np.inf, append=np.inf) >= LASTING  # a false detection leaves and comes back
+    return [float(time) for time in times[alone[1:] & alone[:-1]]]
+
+
+def _running(values: FloatArray, half: int) -> FloatArray:
+    """Running median over ``2 half + 1`` values; NaN where fewer than half of them are known."""
+    windows = np.lib.stride_tricks.sliding_window_view(np.pad(values, half, constant_values=np.nan), 2 * half + 1)
+    enough = np.isfinite(windows).sum(axis=1) > half
+    out = np.full(len(values), np.nan)
+    if enough.any():
+        out[enough] = np.nanmedian(windows[enough], axis=1)
+    return out
+
+
+def _distances(a: Clip, b: Clip, shift: Shift) -> FloatArray:
+    """``(frames,)`` of a; NaN where fewer than :data:`SEEN` joints can be compared."""
+    assert shift.fundamental is not None
+    matrix = shift.fundamental.detach().cpu().numpy().astype(np.float64)
+    moments = shift.at(0.0).item() + shift.rate * a.times
+    after = np.clip(np.searchsorted(b.times, moments), 1, len(b) - 1) if len(b) > 1 else np.zeros(len(a), dtype=np.int64)
+    before = np.maximum(after - 1, 0)
+    width = np.maximum(b.times[after] - b.times[before], 1e-12)
+    share = (moments - b.times[before]) / width
+    inside = (share >= 0) & (share <= 1) & (width <= 1.5 / shift.fps[1])
+    other = b.joints[before] + share[:, None, None] * (b.joints[after] - b.joints[before])
+    there = np.where(inside[:, None, None], other, np.nan)
+    one = np.ones((*a.joints.shape[:2], 1))
+    xa, xb = np.concatenate([a.joints, one], axis=2), np.concatenate([there, one], axis=2)
+    la, lb = xb @ matrix, xa @ matrix.T
+    size = np.square(la[..., :2]).sum(axis=2) + np.square(lb[..., :2]).sum(axis=2)
+    distance = np.abs((xb * lb).sum(axis=2)) / np.sqrt(np.maximum(size, 1e-300))
+    enough = np.isfinite(distance).sum(axis=1) >= SEEN
+    out = np.full(len(a), np.nan)
+    if enough.any():
+        out[enough] = np.nanmedian(distance[enough], axis=1)
+    return out
+
+
+def joint_names(a: Take, b: Take, people: tuple[int, int]) -> tuple[str, ...]:
+    """Names of the joints that were compared; none where they do not correspond or nobody knows their names."""
+    if not (a.people and b.people):
+        return ()
+    first, _, same, _ = common_joints(a.people[people[0]], b.people[people[1]])
+    layout = first.skeleton or known(first.joints.shape[1])
+    return layout.joints if same and layout is not None else ()

@@ -1,0 +1,377 @@
+"""How one camera's clock runs against another's: one verb over keypoints, point tracks and the brightness of videos."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Sequence
+from functools import partial
+from itertools import combinations
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from indexing.clip import Clip
+from indexing.sync.people import Pairing, common_joints, disagreements, jumps, match_people
+from indexing.sync.takes import Take, take_of
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Messages that speak of recordings a and b, in the names of the cameras.
+
+
+LETTER = re.compile(r"(^|\b(?:in|of) |[;:] )([ab])(?=[:;]|$| (?:has \d|changes|fits|must|is)\b)")
+
+
+def in_names(text: str, a: str, b: str) -> str:
+    """A message of the library with the cameras' names for a and b; an article stays what it is.
+
+    Example:
+        >>> in_names("nothing moves in a; film a longer take", "left", "right")
+        'nothing moves in left; film a longer take'
+        >>> in_names("b has 8 frames, 12 are needed at least", "left", "right")
+        'right has 8 frames, 12 are needed at least'
+    """
+    names = {"a": a or "a", "b": b or "b"}
+    return LETTER.sub(lambda found: found[1] + names[found[2]], text)
+
+
+if TYPE_CHECKING:
+    from dyntorch import Shift
+
+Method = Literal["auto", "keypoints", "tracks", "brightness"]
+METHODS = ("auto", "keypoints", "tracks", "brightness")
+LISTED = 3  # moments in a note
+SHORTEST = 12  # frames of keypoints that dyntorch.synchronize takes
+
+
+def synchronize(
+    a: Clip | str | Path | ArrayLike | Take,
+    b: Clip | str | Path | ArrayLike | Take,
+    method: Method = "auto",
+    *,
+    fps: float | tuple[float, float] | None = None,
+    max_shift: float | None = None,
+    calibration: Any = None,
+    person: str = "auto",
+    min_confidence: float = 0.0,
+    **options: Any,
+) -> Shift:
+    """Synchronize two cameras that filmed the same scene from different places, neither of them calibrated.
+
+    A moment that camera a shows at its time :math:`t_a` is shown by b at
+
+    .. math:: t_b = \\text{rate}\\; t_a + \\text{offset}.
+
+    Keypoints of one skeleton are the same points in both: their epipolar constraint :math:`x_b^T F x_a = 0` holds at the right
+    shift alone.  Keypoints of different skeletons, and tracks of whatever can be followed in two videos, are different points of
+    the same moving things: their trajectories span subspaces that meet at the right shift.  Brightness needs no points at all.
+
+    Args:
+        a, b: a :class:`~indexing.Clip` with 2D joints; the path of keypoints in any format of :mod:`indexing.readers` (a file,
+            or a folder with one file per frame); the path of a video; keypoints ``(frames, joints, 2)``, pixels, NaN = missing;
+            or gray frames ``(frames, height, width)``.
+        method: ``"keypoints"``, ``"tracks"``, ``"brightness"``, or ``"auto"``: keypoints where both have them; for two videos
+            tracks and brightness, of which both must say the same.
+        fps: frames per second of arrays and of files that have no times, of both or of each (30 by default, and then a note
+            says so).
+        max_shift: seconds, the largest offset that is searched; by default as far as the takes overlap enough to tell.
+        calibration: lens and matrix of both cameras, as :func:`dyntorch.synchronize` takes it; or the path of a calibration
+            file (``.toml`` with ``matrix`` and ``distortions`` for every camera), cameras matched by name, or by order.
+        person: who is followed where several people are in view: ``"auto"`` tries the likely pairings and says which was taken;
+            ``"largest"``, ``"confident"``, ``"tracked"`` are the rules of :mod:`indexing.readers.recording`.
+        min_confidence: joints that the detector trusts less are taken as not seen.
+        options: for the reader (``format=``, ``size=``) and for :func:`dyntorch.synchronize`.
+
+    Returns:
+        :class:`dyntorch.Shift`: offset and sigma in seconds, rate, confidence, all peaks, ``ok`` and the reason where it is
+        false.  Times are those of the files: frame number / fps where they have none of their own.
+
+    Raises:
+        ValueError: an input that cannot be read or shows nobody, or a method that does not fit it.
+
+    Source:
+        L. Wolf, thesis (2003), chapter 7; L. Wolf and A. Zomet, Sequence-to-sequence self calibration, ECCV 2002.
+
+    Example:
+        >>> import numpy as np
+        >>> from indexing import cameras
+        >>> from indexing.actors import Person, stream
+        >>> scene, _ = stream(["wave", "squat", "kick"], Person(), rng=1)
+        >>> left, right = (cameras.virtual(scene, azimuth) for azimuth in (0.0, 70.0))
+        >>> shift = synchronize(left.joints, right.joints[12:], fps=30.0)  # the second camera starts 12 frames later
+        >>> bool(shift.ok), round(shift.frames, 1)
+        (True, -12.0)
+    """
+    if method not in METHODS:
+        raise ValueError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
+    rates = fps if isinstance(fps, (tuple, list)) else (fps, fps)
+    if len(rates) != 2:
+        raise ValueError(f"fps must be one number, or one for each of two cameras, got {fps!r}")
+    how = {name: options.pop(name) for name in ("format", "size") if name in options}
+    takes = [
+        take_of(value, name="" if isinstance(value, (Clip, str, Path)) else name, fps=rate, person=person,
+                min_confidence=min_confidence, **how)
+        for value, name, rate in zip((a, b), "ab", rates, strict=True)
+    ]  # fmt: skip
+    takes = [dataclasses.replace(take, name=take.name or letter) for take, letter in zip(takes, "ab", strict=True)]
+    shift = pair(takes[0], takes[1], method, max_shift=max_shift, calibration=calibration, **options).shift
+    return dataclasses.replace(shift, notes=(*remarks(takes), *shift.notes))
+
+
+def pair(a: Take, b: Take, method: Method = "auto", *, calibration: Any = None, **options: Any) -> Pairing:
+    """:func:`synchronize` for recordings that were read, and which person of each it is about."""
+    from indexing.sync.calibration import lenses
+
+    _check(a, b, method)
+    lens = lenses(calibration, [a.name, b.name])
+    options = {**options, "calibration": lens.values if lens else None}
+    try:
+        found, notes = _compared(a, b, method, options)
+    except ValueError as problem:
+        raise ValueError(in_names(str(problem), a.name, b.name)) from problem
+    said = [in_names(note, a.name, b.name) for note in [*(lens.notes if lens else ()), *notes, *found.shift.notes]]
+    reason = in_names(found.shift.reason, a.name, b.name)
+    return dataclasses.replace(found, shift=dataclasses.replace(found.shift, reason=reason, notes=tuple(dict.fromkeys(said))))
+
+
+def _compared(a: Take, b: Take, method: Method, options: dict[str, Any]) -> tuple[Pairing, list[str]]:
+    """What the data say, and what is to be said about the people in them."""
+    if a.kind == b.kind == "keypoints":
+        found = match_people(a, b, partial(_keypoints, **options), partial(_keypoints, quick=True, **options))
+        return found, _swapped(a, b, found)
+
+    return Pairing(synchronize_videos(a, b, method, **options), (0, 0)), []
+
+
+def _check(a: Take, b: Take, method: Method) -> None:
+    for take in (a, b):
+        if take.kind == "keypoints" and take.count < SHORTEST:
+            remedy = "give the folder that holds all frames" if take.count == 1 else "film longer"
+            frames = f"{take.count} frame{'' if take.count == 1 else 's'}"
+            raise ValueError(f"{take.path or take.name or 'recording'}: {frames}, {SHORTEST} are needed at least; {remedy}")
+        if method == "keypoints" and take.kind != "keypoints":
+            raise ValueError(
+                f"{take.path or take.name}: is a video, and method='keypoints' needs keypoints; run a pose estimator first, or use "
+                "method='tracks' or method='brightness'"
+            )
+        if method == "brightness" and take.kind == "keypoints":
+            raise ValueError(
+                f"{take.path or take.name}: holds keypoints, and method='brightness' needs videos; give the videos, or use "
+                "method='keypoints'"
+            )
+
+
+def _keypoints(a: Clip, b: Clip, correspondence: bool | None = None, quick: bool = False, **options: Any) -> Shift:
+    """Two people, or one seen twice; ``quick`` looks for no lens distortion, drift, or weak perspective: 5 to 10 times faster."""
+    import torch
+
+    import dyntorch
+
+    first, second, same, note = common_joints(a, b)
+    if correspondence is None:
+        correspondence = same
+    elif correspondence and not same:
+        raise ValueError(
+            f"correspondence=True needs the same joints in both, got {a.joints.shape[1]} and {b.joints.shape[1]}; leave it out"
+        )
+    if quick and correspondence:
+        options = {"camera": "perspective", **options, "rate": options.get("rate") or 1.0}
+        options["calibration"] = options.get("calibration") or (None, None)
+    clips = (first, second) if correspondence else (a, b)
+    places = [torch.from_numpy(np.array(clip.joints, dtype=np.float64)) for clip in clips]
+    trust = [
+        np.where(clip.seen, 1.0, 0.0) if clip.confidence is None else np.nan_to_num(np.clip(clip.confidence, 0.0, None))
+        for clip in clips
+    ]
+    known = any(clip.confidence is not None for clip in clips)
+    shift: Shift = dyntorch.synchronize(
+        places[0],
+        places[1],
+        correspondence=correspondence,
+        times=(torch.from_numpy(a.times.copy()), torch.from_numpy(b.times.copy())),
+        weights=(torch.from_numpy(trust[0]), torch.from_numpy(trust[1])) if known else None,
+        **options,
+    )
+    return dataclasses.replace(shift, notes=(*([note] if note else []), *shift.notes))
+
+
+def remarks(takes: Sequence[Take]) -> list[str]:
+    """What to say about the recordings themselves."""
+    notes = [note for take in takes for note in take.notes]
+    names = [take.name for take in takes if take.fps_assumed]
+    if names:
+        notes.append(f"30 frames per second assumed for {', '.join(names)}; fps= says otherwise")
+    same = [f"{a.name} and {b.name}" for a, b in combinations(takes, 2) if _same(a, b)]
+    return [*notes, *(f"{names} are the same recording" for names in same)]
+
+
+def _same(a: Take, b: Take) -> bool:
+    """Whether both are one recording: the best shift is then 0, and says nothing."""
+    if a.path is not None and b.path is not None and a.path.resolve() == b.path.resolve():
+        return True
+    first, second = (take.people[0].joints if take.people else take.frames for take in (a, b))
+    if first is None or second is None or first.shape != second.shape:
+        return False
+    return bool(np.array_equal(first, second, equal_nan=first.dtype.kind == "f"))
+
+
+def _swapped(a: Take, b: Take, found: Pairing) -> list[str]:
+    """Notes on moments at which somebody else is followed, and on stretches in which the two do not show the same person."""
+    people = [take.people[i] for take, i in zip((a, b), found.people, strict=True)]
+    notes = []
+    for take, clip in zip((a, b), people, strict=True):
+        moments = jumps(clip)
+        if moments:
+            listed = ", ".join(f"{moment:.2f}" for moment in moments[:LISTED]) + " and more" * (len(moments) > LISTED)
+            notes.append(f"{take.name}: whoever is followed jumps at {listed} s: people swapped, or a cut")
+    first, second, same, _ = common_joints(*people)
+    bad = disagreements(first, second, found.shift) if same and found.shift.ok else []
+    if bad:
+        listed = ", ".join(f"{start:.2f} to {end:.2f} s" for start, end, _ in bad[:LISTED]) + " and more" * (len(bad) > LISTED)
+        worst = max(times for *_, times in bad)
+        said = f"from {listed} on the clock of {a.name} the cameras fit each other {worst:.1f} times worse than otherwise"
+        notes.append(f"{said}: people swapped, tracking lost, or a camera moved")
+    return notes
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Synchronization where a camera gives no keypoints: tracks of whatever moves, and brightness, each a check of the other.
+
+
+if TYPE_CHECKING:
+    from dyntorch import Shift
+
+AGREE = 2.0  # frames within which two methods say the same
+FEWEST = 4  # tracks
+SMALL = 320  # pixels of the longer side: all that the brightness method looks at
+
+
+def synchronize_videos(a: Take, b: Take, method: str, **options: Any) -> Shift:
+    """Two recordings of which at least one is a video: by tracks, by brightness, or by both.
+
+    Raises:
+        ValueError: a video cannot be read.
+    """
+    options.pop("correspondence", None)  # tracks of two videos never correspond
+    brightness = {name: value for name, value in options.items() if name == "max_shift"}
+    if method == "brightness":
+        return _brightness(a, b, **brightness)
+    tracked = _tracks(a, b, **options)
+    if method == "tracks" or "keypoints" in (a.kind, b.kind):
+        return tracked
+    try:
+        bright = _brightness(a, b, **brightness)
+    except ValueError as problem:  # too short for it; the files can be read, as the tracks show
+        bright = refused(a, b, str(problem), [], "brightness")
+    return agreed(tracked, bright)
+
+
+def agreed(tracked: Shift, bright: Shift) -> Shift:
+    """One answer from two methods: the tracks' where both are sure of the same, a refusal with both where they are not.
+
+    The two know nothing of each other's data, so that what one suspects and the other is sure of is taken, too.
+    """
+    both = (tracked, bright)
+    sure = [shift for shift in both if shift.ok]
+    said = f"tracks say {_told(tracked)}, brightness says {_told(bright)}"
+    best = sure[0] if sure else max(both, key=lambda shift: shift.confidence)
+    other = bright if best is tracked else tracked
+    notes = [said, *best.notes, *(note for note in other.notes if note not in best.notes)]
+    apart = min((abs(offset - _middle(best)) for offset in _candidates(other)), default=float("inf"))
+    if sure and apart <= AGREE / min(best.fps):
+        return dataclasses.replace(best, notes=tuple(notes))
+    peaks = torch.cat([best.peaks, other.peaks])  # scores of two methods: each list is in order, and the best one's comes first
+    reason = f"{said}; record keypoints of the people, or a longer take with more motion"
+    if not sure:
+        reason = f"neither tracks nor brightness decide: {tracked.reason or 'no tracks'}; {bright.reason}"
+    return dataclasses.replace(best, ok=False, reason=reason, peaks=peaks, notes=tuple(notes))
+
+
+def _told(shift: Shift) -> str:
+    if not len(shift.peaks):
+        return "nothing"
+    return f"{_middle(shift):+.3f} s ({'sure' if shift.ok else 'not sure'})"
+
+
+def _middle(shift: Shift) -> float:
+    return float(shift.at(shift.center)) - shift.center
+
+
+def _candidates(shift: Shift) -> list[float]:
+    """What a method holds possible: its answer where it is sure, else its peaks."""
+    return [_middle(shift)] if shift.ok else [_middle(shift), *shift.peaks[:, 0].tolist()]
+
+
+def _tracks(a: Take, b: Take, *, calibration: Any = None, **options: Any) -> Shift:
+    """Different points in both: trajectories that span meeting subspaces."""
+    import dyntorch
+
+    found = [points_of(take) for take in (a, b)]
+    notes = [note for *_, more in found for note in more]
+    few = [take.name for take, (points, _, _) in zip((a, b), found, strict=True) if points.shape[1] < FEWEST]
+    if few:
+        return refused(a, b, f"fewer than {FEWEST} moving points could be followed in {' and '.join(few)}; use keypoints", notes)
+    shift: Shift = dyntorch.synchronize(
+        found[0][0],
+        found[1][0],
+        correspondence=False,
+        times=(found[0][1], found[1][1]),
+        calibration=calibration,
+        **options,
+    )
+    return dataclasses.replace(shift, notes=(*notes, *shift.notes))
+
+
+def points_of(take: Take) -> tuple[Tensor, Tensor, list[str]]:
+    """``(frames, n, 2)`` of whatever moves, ``(frames,)`` seconds, and what to say about it."""
+    if take.kind == "keypoints":
+        clip = take.people[0]
+        return torch.from_numpy(np.array(clip.joints, dtype=np.float64)), torch.from_numpy(clip.times.copy()), []
+    from indexing.video import track_points
+
+    tracks = track_points(source_of(take))
+    return tracks.points, tracks.times, [f"{take.name}: {note}" for note in tracks.notes]
+
+
+def source_of(take: Take) -> Any:
+    """A video as the functions of :mod:`indexing.video` take it."""
+    if take.path is not None:
+        return take.path
+    from indexing.video import Chunk
+
+    assert take.frames is not None
+    return [Chunk(gray_of(take), take.times)]
+
+
+def gray_of(take: Take) -> Any:
+    """``(frames, height, width)`` uint8; gray values from 0 to 1 are brought to 0 to 255."""
+    assert take.frames is not None
+    if take.frames.dtype == np.uint8:
+        return take.frames
+    values = np.nan_to_num(np.asarray(take.frames, dtype=np.float64))
+    return (values * (255.0 if values.max(initial=0.0) <= 1.0 else 1.0)).clip(0, 255).astype(np.uint8)
+
+
+def _brightness(a: Take, b: Take, **options: Any) -> Shift:
+    """No points at all."""
+    from indexing.sync.brightness import brightness_shift
+    from indexing.video import read_video
+
+    sources = [iter(source_of(take)) if take.path is None else read_video(take.path, size=SMALL) for take in (a, b)]
+    shift: Shift = brightness_shift(*sources, **options)
+    return shift
+
+
+def refused(a: Take, b: Take, reason: str, notes: list[str], method: str = "subspace") -> Shift:
+    """What is said where there is nothing to compare."""
+    from dyntorch import Shift
+
+    none = torch.zeros(0, dtype=torch.float64)
+    return Shift(
+        offset=0.0, sigma=float("inf"), rate=1.0, rate_sigma=0.0, confidence=0.0, peaks=none.reshape(0, 2), ok=False, reason=reason,
+        method=method, fps=(a.fps, b.fps), center=0.0, lags=none, scores=none, notes=tuple(notes),
+    )  # fmt: skip

@@ -1,0 +1,286 @@
+"""What one camera recorded, ready to be compared with what another one did: people over time, a video, or gray frames."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from indexing.clip import Clip, check_fps, stretches
+from indexing.readers.files import VIDEOS
+
+FloatArray = NDArray[np.float64]
+Kind = Literal["keypoints", "video", "frames"]
+CHOICES = ("auto", "largest", "confident", "tracked")
+ASSUMED = 30.0  # frames per second where nobody says
+CANDIDATES = 3  # people of a camera that are tried, besides the largest one of each frame
+UNEVEN = 0.1  # of a frame, by which times of an even grid are off it at most
+EXACT = 1e-9  # by which a frame rate is one that was given
+EMPTY = 0.1  # share of frames without a person, above which it is said
+SPARSE = 20, 20_000  # times its frames, and at least how many, that a take's clock may run over, for its frames to be compared
+PAUSES = 60.0, 10.0, 1.0  # seconds without frames, at which a take that is nearly all gap is cut: as few as will do
+SHARE = 0.2  # of the longest person's frames, that a person must be seen in to be tried
+SAME = 0.9  # of the frames of a person in which the largest one is that person, from where on they are one
+
+
+@dataclass(frozen=True, eq=False)
+class Take:
+    """One camera's recording.
+
+    Args:
+        name: of the camera, for tables and files.
+        kind: what it holds.
+        path: of the file or folder; None for data given as arrays.
+        people: who is tried as the person to compare, most promising first, with times on the camera's own clock
+            (``kind="keypoints"``).
+        everyone: all who were seen.
+        frames: ``(frames, height, width)`` gray values (``kind="frames"``).
+        fps: frames per second; for a video that of its file.
+        fps_assumed: nobody said how many.
+        times: ``(frames,)`` seconds, of all frames; of a video the first and the last.
+        count: how many frames there are.
+        notes: what a user should know, a sentence each.
+    """
+
+    name: str
+    kind: Kind
+    path: Path | None = None
+    people: tuple[Clip, ...] = ()
+    everyone: tuple[Clip, ...] = ()
+    frames: NDArray[Any] | None = None
+    fps: float = ASSUMED
+    fps_assumed: bool = False
+    times: FloatArray = dataclasses.field(default_factory=lambda: np.zeros(0))
+    count: int = 0
+    notes: tuple[str, ...] = ()
+
+
+def take_of(
+    value: Any,
+    *,
+    name: str = "",
+    fps: float | None = None,
+    person: str = "auto",
+    min_confidence: float = 0.0,
+    format: str | None = None,  # noqa: A002  (the word of the readers)
+    size: tuple[float, float] | None = None,
+) -> Take:
+    """A recording from whatever a user has of it: see :func:`indexing.sync.synchronize.synchronize`.
+
+    Raises:
+        ValueError: nothing usable; one line with the file, what is wrong and what to do.
+    """
+    if isinstance(value, Take):
+        return value
+    if fps is not None:
+        check_fps(fps)
+    how = {"min_confidence": min_confidence, "format": format, "size": size}
+    return _without_pauses(_taken(value, name, fps, person, how))
+
+
+def _taken(value: Any, name: str, fps: float | None, person: str, how: dict[str, Any]) -> Take:
+    if person not in CHOICES:
+        raise ValueError(f"person must be one of {', '.join(CHOICES)}, got {person!r}")
+    if isinstance(value, Clip):
+        return _of_clips(name or value.name, None, [value])
+    if isinstance(value, Sequence) and value and all(isinstance(item, Clip) for item in value):
+        return _of_clips(name or value[0].name, None, list(value))
+    if isinstance(value, (str, Path)):
+        path = Path(value).expanduser()
+        name = name or camera_name(path)
+        if path.suffix.lower() in VIDEOS and not path.is_dir():
+            return _of_video(name, path, fps)
+        return _of_file(name, path, fps, person, how)
+    return _of_array(name, value, fps)
+
+
+def _without_pauses(take: Take) -> Take:
+    """The take with its people cut to the longest stretch of frames, where it is nearly all gap.
+
+    Clocks are searched frame by frame, which takes time and memory for every frame that is not there.
+    """
+    if take.kind != "keypoints" or take.count < 2:
+        return take
+    most = max(SPARSE[0] * take.count, SPARSE[1]) / take.fps
+    first, end = 0, take.count
+    for pause in PAUSES:
+        if take.times[end - 1] - take.times[first] <= most:
+            break
+        cuts = stretches(take.times, pause)
+        first, end = cuts[(cuts[:, 1] - cuts[:, 0]).argmax()].tolist()
+    if end - first == take.count:
+        return take
+    begin, last = float(take.times[first]), float(take.times[end - 1])
+    people = [clip.between(begin, last) for clip in take.people if ((clip.times >= begin) & (clip.times <= last)).any()]
+    said = f"{take.name}: nearly all gap: only its {end - first} frames from {begin:.6g} to {last:.6g} s are compared"
+    return dataclasses.replace(take, people=tuple(people), notes=(*take.notes, said))
+
+
+def camera_name(path: Path) -> str:
+    """A camera's name from its file or folder, as Pose2Sim names folders.
+
+    Example:
+        >>> camera_name(Path("pose/cam01_json")), camera_name(Path("videos/left.mp4"))
+        ('cam01', 'left')
+    """
+    path = path if path.name not in ("", "..") else path.resolve()
+    return (path.name if path.is_dir() else path.stem).removesuffix("_json") or path.name
+
+
+def _of_clips(name: str, path: Path | None, people: list[Clip]) -> Take:
+    flat = [clip for clip in people if clip.dims != 2]
+    if flat:
+        raise ValueError(
+            f"{path or name or 'clip'}: has {flat[0].dims}D joints, and cameras are synchronized from what they see; "
+            "give 2D keypoints in pixels"
+        )
+    first = people[0]
+    times = np.unique(np.concatenate([clip.times for clip in people]))
+    seen, rate = tuple(people), frame_rate(times, float(first.fps or ASSUMED))
+    return Take(name, "keypoints", path, seen, seen, fps=rate, fps_assumed=first.fps_assumed, times=times, count=len(times))
+
+
+def frame_rate(times: FloatArray, about: float) -> float:
+    """Frames per second over all of a take: by the median step of rounded times, frame numbers would drift from their frames.
+
+    Example:
+        >>> round(frame_rate(np.round(np.delete(np.arange(300), 7) / 30, 4), 30.03), 3)
+        30.0
+    """
+    steps = np.rint(np.diff(times) * about).sum()
+    exact = float(steps / (times[-1] - times[0])) if steps > 0 else about
+    return exact if abs(exact / about - 1) > EXACT else about
+
+
+def _of_file(name: str, path: Path, fps: float | None, person: str, how: dict[str, Any]) -> Take:
+    from indexing.readers import read
+
+    if person != "auto":
+        clips = read(path, fps=fps, person=person, **how)
+        return _noted(_of_clips(name, path, [_single(path, list(clips))]))
+    everyone = list(read(path, fps=fps, person="everyone", **how))
+    if any(clip.label is not None for clip in everyone) or "person" not in everyone[0].meta:  # a set of clips, not a recording
+        return _of_clips(name, path, [_single(path, everyone)])
+    largest = read(path, fps=fps, person="largest", **how)[0]  # this one has the frames without people, too
+    tried = candidates(largest, everyone) if len(everyone) > 1 else []
+    return _noted(dataclasses.replace(_of_clips(name, path, [largest, *tried]), everyone=tuple(everyone)))
+
+
+def _noted(take: Take) -> Take:
+    """The recording with notes on frames that are missing, and on those that show nobody."""
+    notes, steps = [], np.diff(take.times) * take.fps
+    lost = int(np.rint(steps - 1).clip(0).sum()) if len(steps) and not (np.abs(steps - np.rint(steps)) > UNEVEN).any() else 0
+    if lost:
+        notes.append(f"{take.name}: {lost} of {lost + take.count} frames are missing; the others keep their times")
+    nobody = 1 - float(take.people[0].seen.any(axis=1).sum()) / max(1, take.count)
+    if nobody > EMPTY:
+        notes.append(f"{take.name}: {100 * nobody:.0f} % of the frames show nobody")
+    return dataclasses.replace(take, notes=(*take.notes, *notes))
+
+
+def _single(path: Path, clips: list[Clip]) -> Clip:
+    if len(clips) != 1:
+        raise ValueError(f"{path}: holds {len(clips)} clips where one recording is expected; save the one of this camera by itself")
+    return clips[0]
+
+
+def candidates(largest: Clip, everyone: Sequence[Clip]) -> list[Clip]:
+    """The people worth a try besides the largest one of each frame: seen for long, and large."""
+    longest = max(int(clip.seen.any(axis=1).sum()) for clip in everyone)
+    found = []
+    for clip in everyone:
+        there = clip.seen.any(axis=1)
+        if there.sum() < SHARE * longest:
+            continue
+        rows = np.searchsorted(largest.times, clip.times[there])
+        equal = (np.nan_to_num(largest.joints[rows]) == np.nan_to_num(clip.joints[there])).all(axis=(1, 2))
+        if equal.sum() >= SAME * largest.seen.any(axis=1).sum():  # the largest one of each frame is this person
+            continue
+        extent = np.nanmax(clip.joints[there], axis=1) - np.nanmin(clip.joints[there], axis=1)
+        found.append((float(extent.prod(axis=1).sum()), clip))
+    return [clip for _, clip in sorted(found, key=lambda entry: -entry[0])[:CANDIDATES]]
+
+
+def _of_video(name: str, path: Path, fps: float | None) -> Take:
+    from indexing.video import probe
+
+    info = probe(path, fps=fps)
+    notes = tuple(f"{path.name}: {note}" for note in info.notes)
+    return Take(name, "video", path, fps=info.fps, times=np.array([0.0, info.duration]), count=info.frames, notes=notes)
+
+
+def _of_array(name: str, value: Any, fps: float | None) -> Take:
+    try:
+        array = np.asarray(value.detach().cpu().numpy() if hasattr(value, "detach") else value)
+        if array.dtype.kind not in "fiub":
+            raise TypeError(f"dtype {array.dtype}")
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"{name or 'recording'}: expected a clip, a path or an array, got {type(value).__name__} ({error})"
+        ) from None
+    rate = float(fps or ASSUMED)
+    if array.ndim != 3 or not len(array):
+        raise ValueError(
+            f"{name or 'recording'}: expected keypoints (frames, joints, 2) or gray frames (frames, height, width), got shape "
+            f"{array.shape}; give one camera at a time"
+        )
+    if array.shape[2] > 3:
+        times = np.arange(len(array)) / rate
+        return Take(name, "frames", frames=array, fps=rate, fps_assumed=fps is None, times=times, count=len(times))
+    return _of_clips(name, None, [Clip(array, fps=fps, name=name)])
+
+
+def find_cameras(paths: Sequence[Path]) -> dict[str, Path]:
+    """Name and path of every camera; one folder may hold those of all (Pose2Sim's ``pose/cam01_json``, or a folder of videos).
+
+    Raises:
+        ValueError: fewer than two.
+    """
+    found = list(paths)
+    if len(found) == 1:
+        found = _inside(found[0])
+    if len(found) < 2:
+        raise ValueError(_too_few(paths, len(found)))
+    twice = [path for i, path in enumerate(found) if path.resolve() in [other.resolve() for other in found[:i]]]
+    if twice:
+        raise ValueError(f"{twice[0]}: given twice; name every camera once")
+    names = [camera_name(path) for path in found]
+    for depth in range(2):  # cam1/pose.json and cam2/pose.json are cam1 and cam2
+        if len(set(names)) < len(names):
+            names = [camera_name(path.resolve().parents[depth]) for path in found]
+    if len(set(names)) < len(names):
+        names = [f"{name}-{i}" for i, name in enumerate((camera_name(path) for path in found), start=1)]
+    return dict(zip(names, found, strict=True))
+
+
+def _too_few(paths: Sequence[Path], found: int) -> str:
+    remedy = "two are needed; give a file or folder for each, or the folder that holds a folder for each"
+    if not paths:
+        return f"no cameras given, {remedy}"
+    if not paths[0].exists():
+        return f"{paths[0]}: no such file or folder; check the path"
+    alone = paths[0].is_file() or any(_is_frame(file) for file in paths[0].iterdir())
+    return f"{paths[0]}: {'is one camera' if alone else f'holds {found} cameras'}, {remedy}"
+
+
+def _inside(folder: Path) -> list[Path]:
+    """The cameras in a folder: subfolders with keypoints, or else videos."""
+    if not folder.is_dir():
+        return [folder]
+    for where in (folder, folder / "pose", folder / "videos"):
+        if where.is_dir():
+            entries = sorted(entry for entry in where.iterdir() if not entry.name.startswith("."))
+            folders = [entry for entry in entries if entry.is_dir() and any(_is_frame(file) for file in entry.iterdir())]
+            videos = [entry for entry in entries if entry.suffix.lower() in VIDEOS and entry.is_file()]
+            if len(folders or videos) > 1:
+                return folders or videos
+    return []
+
+
+def _is_frame(file: Path) -> bool:
+    return file.suffix.lower() in (".json", ".txt") and not file.name.startswith(".")
