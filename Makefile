@@ -11,8 +11,8 @@ TORCH_VERSION := $(shell sed -n 's/^torch==//p' constraints.txt)
 PIP = $(BIN)/python -m pip install --quiet
 
 # what computes, apart from reading, drawing and the command line
-NUMERICAL := tests/dyntorch tests/test_readme.py tests/indexing/brightness tests/indexing/phase tests/indexing/test_indexer.py \
-  tests/indexing/test_estimators.py tests/indexing/test_shape.py tests/indexing/test_stream.py dyntorch
+NUMERICAL := tests/dyntorch tests/battery tests/test_readme.py tests/indexing/action tests/indexing/brightness tests/indexing/phase tests/indexing/sync \
+  tests/indexing/test_estimators.py dyntorch
 
 .PHONY: install demo test portable lint bench fuzz tables docs clean
 
@@ -71,33 +71,33 @@ bench: install
 tables: install
 	@echo "All tables: hours.  Each is a command of its own, below, and prints its table as it ends."
 	$(PIP) --constraint constraints.txt --editable '.[experiments]'
-	$(BIN)/python -m experiments.homography_tensor_noise
-	$(BIN)/python -m experiments.tensor_noise_3d
-	$(BIN)/python -m experiments.robust_estimation
-	$(BIN)/python -m experiments.lifted_noise
-	$(BIN)/python -m experiments.lifted_outliers
-	$(BIN)/python -m experiments.trajectories
-	$(BIN)/python -m experiments.segmentation_matrix_noise
-	$(BIN)/python -m experiments.translating_planes
-	$(BIN)/python -m experiments.segmentation
-	$(BIN)/python -m experiments.segmentation_sensitivity
-	$(BIN)/python -m experiments.synchronization
-	$(BIN)/python -m experiments.brightness_synchronization
-	$(BIN)/python -m experiments.pair_reconstruction
-	$(BIN)/python -m experiments.real_lifted
-	$(BIN)/python -m experiments.real_planar
-	$(BIN)/python -m experiments.real_synchronization
-	$(BIN)/python -m experiments.real_space
-	$(BIN)/python -m experiments.action_recognition
-	$(BIN)/python -m experiments.action_baselines
-	$(BIN)/python -m experiments.dynamic_shape
-	$(BIN)/python -m experiments.recognition_protocol
-	$(BIN)/python -m experiments.open_set
-	$(BIN)/python -m experiments.detection
-	$(BIN)/python -m experiments.robustness
-	$(BIN)/python -m experiments.gait
-	$(BIN)/python -m experiments.brightness_indexing
-	$(BIN)/python -m experiments.gestures
+	$(BIN)/python -m experiments.alignment.planar_noise
+	$(BIN)/python -m experiments.alignment.space_noise
+	$(BIN)/python -m experiments.alignment.robust_estimation
+	$(BIN)/python -m experiments.reconstruction.noise
+	$(BIN)/python -m experiments.reconstruction.outliers
+	$(BIN)/python -m experiments.reconstruction.trajectories
+	$(BIN)/python -m experiments.segmentation.matrix_noise
+	$(BIN)/python -m experiments.segmentation.translating_planes
+	$(BIN)/python -m experiments.segmentation.segmentation
+	$(BIN)/python -m experiments.segmentation.sensitivity
+	$(BIN)/python -m experiments.synchronization.synchronization
+	$(BIN)/python -m experiments.synchronization.brightness
+	$(BIN)/python -m experiments.reconstruction.pair
+	$(BIN)/python -m experiments.reconstruction.real
+	$(BIN)/python -m experiments.alignment.real_planar
+	$(BIN)/python -m experiments.synchronization.real
+	$(BIN)/python -m experiments.alignment.real_space
+	$(BIN)/python -m experiments.recognition.action_recognition
+	$(BIN)/python -m experiments.recognition.action_baselines
+	$(BIN)/python -m experiments.recognition.dynamic_shape
+	$(BIN)/python -m experiments.recognition.recognition_protocol
+	$(BIN)/python -m experiments.recognition.open_set
+	$(BIN)/python -m experiments.recognition.detection
+	$(BIN)/python -m experiments.recognition.robustness
+	$(BIN)/python -m experiments.recognition.gait
+	$(BIN)/python -m experiments.recognition.brightness_indexing
+	$(BIN)/python -m experiments.recognition.gestures
 
 docs: install
 	$(PIP) --constraint constraints.txt --editable '.[docs]'

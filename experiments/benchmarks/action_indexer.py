@@ -24,7 +24,7 @@ from typing import Annotated, Any
 import tyro
 
 from experiments.benchmarks.workloads import EXEMPLARS, QUERIES
-from experiments.tables import Row, command, markdown, note
+from experiments.common.tables import Row, command, markdown, note
 from indexing.files import manifest, prepare, write_json
 
 PLAIN, SEARCH, WARPING, PART, SCAN = "plain", "search", "warping", "scan 20 minutes", "scan 1 hour"

@@ -22,7 +22,7 @@ import torch
 import tyro
 from numpy.typing import NDArray
 
-from experiments.tables import Row, command, measured_on_one_thread, note
+from experiments.common.tables import Row, command, measured_on_one_thread, note
 from indexing.brightness.indexer import BrightnessIndexer
 from indexing.brightness.library import Exemplars
 from indexing.brightness.sight import LENGTH

@@ -24,7 +24,7 @@ import tyro
 from numpy.typing import NDArray
 
 from experiments.benchmarks.verbs import VERBS
-from experiments.tables import Row, command, measured_on_one_thread, note
+from experiments.common.tables import Row, command, measured_on_one_thread, note
 
 Array = NDArray[np.float64]
 FIRST, WARM, SHELL = 1.0, 0.5, 4.0  # seconds

@@ -28,7 +28,7 @@ from dyntorch.core.matrix import estimation_matrix
 from dyntorch.geometry.homogeneous import homogeneous
 from dyntorch.scenes import Scene
 from experiments.benchmarks.interleaved import interleaved, threads
-from experiments.tables import Row, command, markdown, note
+from experiments.common.tables import Row, command, markdown, note
 from indexing.files import manifest, prepare, write_json
 
 SCENES: dict[str, tuple[Any, Callable[..., Scene]]] = {

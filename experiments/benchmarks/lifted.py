@@ -16,7 +16,7 @@ import tyro
 import dyntorch as dyn
 from dyntorch import scenes
 from experiments.benchmarks.interleaved import interleaved, threads
-from experiments.tables import Row, command, markdown
+from experiments.common.tables import Row, command, markdown
 
 
 @dataclass(frozen=True)

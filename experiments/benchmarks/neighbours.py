@@ -21,7 +21,7 @@ import tyro
 
 from experiments.benchmarks.interleaved import interleaved, threads
 from experiments.benchmarks.verbs import VERBS
-from experiments.tables import Row, command, measured, note
+from experiments.common.tables import Row, command, measured, note
 from indexing.files import prepare
 
 GOAL = 1.2

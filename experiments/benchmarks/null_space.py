@@ -28,7 +28,7 @@ from rich.table import Table
 from torch import Tensor
 
 from dyntorch.numerics.nullspace import gram_null_space, null_space
-from experiments.tables import command, note
+from experiments.common.tables import command, note
 from indexing.files import manifest, prepare, write_json
 
 ANGLE = 1e-10

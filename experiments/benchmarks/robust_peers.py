@@ -22,7 +22,7 @@ import dyntorch as dyn
 from dyntorch import scenes
 from dyntorch.geometry.homogeneous import homogeneous
 from experiments.benchmarks.interleaved import interleaved
-from experiments.tables import Row, command, markdown, note
+from experiments.common.tables import Row, command, markdown, note
 from indexing.files import manifest, prepare, write_json
 
 THRESHOLD = 1.5

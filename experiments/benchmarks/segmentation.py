@@ -26,9 +26,9 @@ import dyntorch as dyn
 from dyntorch import scenes
 from dyntorch.metrics import misclassification
 from experiments.benchmarks.interleaved import interleaved
-from experiments.protocol import DATA
-from experiments.segmentation_data import Pair, motion_pairs
-from experiments.tables import Row, command, measured_on_one_thread, note
+from experiments.common.tables import Row, command, measured_on_one_thread, note
+from experiments.recognition.protocol import DATA
+from experiments.segmentation.data import Pair, motion_pairs
 
 MODEL, INLIER = 1.0, 2.5
 """px: what a peer fits at, and what it takes out."""

@@ -68,7 +68,7 @@ def recognition(**options: Any) -> dict[str, Any]:
 
 def warping() -> dict[str, Any]:
     """The same by dynamic time warping: 20 of the queries, one thread."""
-    from experiments.baselines import WarpedNearest
+    from experiments.recognition.baselines import WarpedNearest
     from indexing import Clip
 
     exemplars, labels, queries = bank(np.random.default_rng(1))

@@ -78,8 +78,8 @@ class BrightnessIndexer(SavedClassifier):
     **What of this is the thesis.**  Its own measure, the rank of the rows of h over a short window, keeps no image position;
     alone it names 12 of 18 arm-raise videos of another person, .54 of their moving frames, and .37 / .37 of the frames of
     exercises, camera turned by 0 / 60 degrees.  The rows h, rectified, with their position kept, and followed by a box about what
-    moves, name 18, .963 and .82 / .75.  ``python -m experiments.brightness_indexing`` measures both.  Mixed into these scores at .6
-    the measure cost more than it gave (12, .61, .59 / .56), so it no longer is.
+    moves, name 18, .963 and .82 / .75.  ``python -m experiments.recognition.brightness_indexing`` measures both.  Mixed into
+    these scores at .6 the measure cost more than it gave (12, .61, .59 / .56), so it no longer is.
 
     Args:
         fps: frame rate of videos given as arrays, and at which everything is compared.

@@ -198,7 +198,8 @@ SMALLEST = 16  # px of the shorter side
 NEAR = 0.35  # of the image's height: the smallest box about what moves
 SHARES = (0.25, 0.07, 0.48, 0.2)
 """Of the cells about what moves, of those of the image, and of the row profiles of body and image, in the likeness of two frames.
-Chosen on films of exercises by another person, camera turned 0 / 60, with seeds 0, 3, 7 of :mod:`experiments.brightness_indexing`,
+Chosen on films of exercises by another person, camera turned 0 / 60, with seeds 0, 3, 7 of
+:mod:`experiments.recognition.brightness_indexing`,
 and on arm raises of another person (moving frames; videos of 126 recognized when shifted, scaled, stretched or cropped):
 .25 .07 .48 .2: .821 .829 .828 / .751 .722 .786, .963, 119; .3 .1 .5 .1: .822 .830 .829 / .739 .691 .775, .960, 120;
 .2 .1 .6 .1: .811 .823 .829 / .756 .746 .786, .967, 120; with nothing of the image, .35 0 .65 0: .821 / .719 (seed 0), .964, 125;

@@ -11,9 +11,9 @@ from torch import Tensor
 
 import dyntorch as dyn
 from dyntorch import counting, metrics, scenes
-from tests.cases import CASES as INVARIANTS
-from tests.cases import Case
-from tests.shape_cases import SHAPE_CASES, ShapeCase
+from tests.battery.cases import CASES as INVARIANTS
+from tests.battery.cases import Case
+from tests.battery.shape_cases import SHAPE_CASES, ShapeCase
 
 Table = dict[str, Callable[[], Any]]
 

@@ -12,11 +12,14 @@ import torch
 import dyntorch
 from indexing import ActionIndexer, Clip, ClipSet
 from indexing.action.bank import Windows
-from indexing.actors import ACTIONS, Person, dataset
+from indexing.actors import ACTIONS, Person, dataset, stream
+from indexing.actors.textured import film
 from indexing.cli import main
 from indexing.windows import ragged, whole
-from tests.indexing.syncing.scene import filmed, shift
+from tests.indexing.sync.scene import filmed, shift
 
+FILMED = ["squat", "wave", "bow", "punch", "kick"]
+"""What the person of the videos to synchronize does."""
 TEACHER, *STUDENTS = (Person.random(seed) for seed in range(3))
 
 
@@ -107,3 +110,26 @@ def library(monkeypatch):
 
     monkeypatch.setattr(dyntorch, "synchronize", answer, raising=False)
     return asked
+
+
+def two_films(actions, seed, frames=120, image=(80, 60), turn=35.0, noise=2.0):
+    clip, _ = stream(actions, Person.random(seed), rng=seed, rest=(0.1, 0.4))
+    clip = clip.between(0.0, (frames - 1) / 30.0 + 1e-6)
+    return tuple(film(clip, azimuth=angle, image=image, noise=noise, rng=seed + k) for k, angle in enumerate((10.0, 10.0 + turn)))
+
+
+@pytest.fixture(scope="session")
+def films():
+    """Two uint8 videos ``(150, 60, 80)`` in step."""
+    return two_films(FILMED, 5, 150)
+
+
+@pytest.fixture(scope="session")
+def other():
+    """A video of another person at other things."""
+    return two_films(["jumping_jack", "sit_down", "kick", "bow"], 9, 120)[1]
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(0)

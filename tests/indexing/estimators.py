@@ -23,7 +23,7 @@ from indexing import ActionIndexer
 from indexing.actors import Person, dataset, detect, stream
 from indexing.brightness.indexer import BrightnessIndexer
 from indexing.phase.indexer import PhaseIndexer
-from tests.pretend_device import accelerators
+from tests.battery.pretend_device import accelerators
 
 FEW = ("kick", "squat", "wave")
 VERBS = ("predict", "decision_function", "predict_proba", "evidence")

@@ -13,10 +13,11 @@ import torch
 import dyntorch as dyn
 from dyntorch import metrics
 from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC
-from experiments import real_data, real_planar, real_space
-from experiments.real_bodies import Crowd, crowd
-from experiments.real_solvers import aligned, gap, rigid_ransac
-from experiments.tables import Row
+from experiments.alignment import real_planar, real_space
+from experiments.alignment.real_bodies import Crowd, crowd
+from experiments.alignment.real_solvers import aligned, gap, rigid_ransac
+from experiments.common import real_data
+from experiments.common.tables import Row
 
 pytestmark = pytest.mark.skipif(not os.environ.get("DYNTORCH_DATA"), reason="DYNTORCH_DATA is not set: no real data")
 

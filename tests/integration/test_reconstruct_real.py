@@ -10,8 +10,11 @@ import pytest
 import torch
 
 import dyntorch as dyn
-from experiments import lifted_data, lifted_traffic, real_data, real_lifted
-from experiments.lifted_data import declared, predicted
+from experiments.common import real_data
+from experiments.reconstruction import data as lifted_data
+from experiments.reconstruction import real as real_lifted
+from experiments.reconstruction import traffic as lifted_traffic
+from experiments.reconstruction.data import declared, predicted
 
 pytestmark = pytest.mark.skipif(not os.environ.get("DYNTORCH_DATA"), reason="DYNTORCH_DATA is not set: no real data")
 

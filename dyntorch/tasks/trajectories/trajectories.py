@@ -277,7 +277,8 @@ def trajectory_cameras(
     The determinant of the six rows :math:`x_i^T M_i` vanishes for a point on a line: 3^6 = 729 coefficients, 728 matches.  The
     tensor gives the line cameras up to a collineation of P^5, and the Klein quadric, which it has moved, the cameras
     (:func:`~dyntorch.geometry.lines.cameras_of_lines`).  The distances from the images of the lines that this linear result
-    leaves are 200 to 400 times the noise with 728 matches and 17 times with 1500 (``python -m experiments.trajectories``); all
+    leaves are 200 to 400 times the noise with 728 matches and 17 times with 1500 (``python -m
+    experiments.reconstruction.trajectories``); all
     cameras and lines are then adjusted together, which brings them down to the noise.
 
     Static points are of no use here: alone they give the tensor rank 78.

@@ -9,7 +9,7 @@ import torch
 import dyntorch as dyn
 from dyntorch.invariants.dynamic_shape_tensor import DynamicShapeTensor
 from dyntorch.shapes.basis import Fourier, Polynomial
-from tests.dyntorch.moving_views import LINEAR, SQUARE, WAVE, draw, moving_views
+from tests.dyntorch.shapes.moving_views import LINEAR, SQUARE, WAVE, draw, moving_views
 
 FORMS = ("joint", "basis", "span")
 TIMED = ("joint", "basis")

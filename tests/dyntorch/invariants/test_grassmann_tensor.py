@@ -9,8 +9,8 @@ import dyntorch as dyn
 from dyntorch import scenes
 from dyntorch.geometry.homogeneous import apply, homogeneous, inhomogeneous
 from dyntorch.numerics.least_squares import jacobian
-from tests.projections import minors, tensor_error
-from tests.references import subdeterminants
+from tests.battery.projections import minors, tensor_error
+from tests.battery.references import subdeterminants
 
 TRIFOCAL = dyn.GrassmannTensor(3, (2, 1, 1))
 # k, profile, dimensions of the views

@@ -5,8 +5,8 @@ import torch
 
 import dyntorch as dyn
 from dyntorch.invariants.shape_tensor import ShapeTensor
-from tests.references import rank
-from tests.shape_cases import SHAPE_CASES
+from tests.battery.references import rank
+from tests.battery.shape_cases import SHAPE_CASES
 
 STATIC = [case for case in SHAPE_CASES if not case.timed]
 every = pytest.mark.parametrize("case", SHAPE_CASES, ids=repr)

@@ -7,8 +7,8 @@ from dyntorch import counting
 from dyntorch.invariants.shape_tensor import ShapeTensor
 from dyntorch.shapes import static as shape_rows
 from dyntorch.shapes.static import dual_cameras, reference_cameras
-from tests.references import rank
-from tests.shape_cases import SHAPE_CASES
+from tests.battery.references import rank
+from tests.battery.shape_cases import SHAPE_CASES
 
 CPU = torch.device("cpu")
 FREE = {("general", 6): 5, ("general", 7): 11, ("general", 8): 23, ("plane", 6): 3, ("plane", 7): 6, ("plane", 8): 9}

@@ -13,7 +13,7 @@ from indexing.actors import Person, perform
 from indexing.actors.textured import film
 from indexing.brightness.indexer import BrightnessIndexer
 from indexing.video import Chunk
-from tests.pretend_device import accelerators
+from tests.battery.pretend_device import accelerators
 
 ACTIONS = ("squat", "jumping_jack", "bow")
 

@@ -1,0 +1,1 @@
+"""Tensors and alignment: noise, outliers, real data."""

@@ -1,0 +1,1 @@
+"""What experiments share: reproducible books of results, tables, plots, real data."""

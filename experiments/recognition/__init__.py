@@ -1,0 +1,1 @@
+"""Recognition of actions: tables beside baselines, on clip sets and in recordings."""

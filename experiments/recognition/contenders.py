@@ -1,0 +1,104 @@
+"""The methods that are compared, by name: the action indexer as it is configured, and what people use today."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, Literal, Self
+
+import torch
+from torch import Tensor
+
+from experiments.recognition.baselines import Array, ImageNearest, Nearest, WarpedNearest
+from experiments.recognition.protocol import Classifier
+from indexing import ActionIndexer, Clip
+from indexing.action.bank import Windows
+from indexing.action.model import ShapeModel
+from indexing.scoring import Event
+
+Method = Literal["equal", "learned", "unrepaired", "image", "dtw"]
+NAMES: dict[Method, str] = {
+    "equal": "ours",
+    "learned": "ours, learned weights",
+    "unrepaired": "ours, joints not repaired",
+    "image": "2D nearest neighbour",
+    "dtw": "DTW",
+}
+OPTIONS: dict[Method, dict[str, Any]] = {"equal": {}, "learned": {"weights": "learned"}, "unrepaired": {"repair": False}}
+
+
+def contender(method: Method, seed: int = 0, **options: Any) -> Callable[[], Classifier]:
+    """A way to make a new one; ``options`` are those of the action indexer, and no baseline has any."""
+    if method == "image":
+        return ImageNearest
+    if method == "dtw":
+        return WarpedNearest
+    return partial(ActionIndexer, random_state=seed, **OPTIONS[method], **options)
+
+
+def sliding(method: Method, seed: int = 0) -> ActionIndexer | Sliding:
+    """A new scorer of the frames of a stream."""
+    if method == "image":
+        return Sliding(ImageNearest())
+    if method == "dtw":
+        return Sliding(WarpedNearest())
+    return ActionIndexer(random_state=seed, **OPTIONS[method])
+
+
+def check_methods(methods: Sequence[Method]) -> None:
+    """Raise before anything is measured where a method cannot be made.
+
+    Raises:
+        ValueError: no method, or aeon is not installed.
+    """
+    if not methods:
+        raise ValueError(f"methods: give at least one of {', '.join(NAMES)}")
+    if "dtw" in methods:
+        try:
+            WarpedNearest()
+        except ImportError:
+            raise ValueError("aeon is not installed; pip install 'dyntorch[experiments]', or leave dtw out of --methods") from None
+
+
+@dataclasses.dataclass(frozen=True)
+class _Nearest(ShapeModel):
+    """A model whose short windows are compared by a baseline."""
+
+    nearest: Nearest | None = None
+    bank: Any = None
+
+    def moment_residuals(self, query: Windows) -> Tensor:
+        """``(Q, M)`` the baseline's distances."""
+        assert self.nearest is not None
+        return torch.from_numpy(self.nearest.between(self.nearest.describe(query.values), self.bank)).float()
+
+
+class Sliding:
+    """A baseline on a stream: everything is done as the action indexer does it (short windows of the exemplars, several
+    tempi, pooling, levels calibrated on wrong classes), only the distance between two windows is the baseline's."""
+
+    def __init__(self, nearest: Nearest) -> None:
+        self.nearest = nearest
+
+    def fit(self, clips: Sequence[Clip], labels: Array) -> Self:
+        """Keep the exemplars' short windows."""
+        self.indexer = ActionIndexer(scorer="nearest", search=False, mirror=False, virtual_views=0).fit(clips, labels)
+        model = self.indexer.model_
+        same = {field.name: getattr(model, field.name) for field in dataclasses.fields(model)}
+        bank = self.nearest.describe(model.exemplars.moments.values)
+        self.indexer.model_ = _Nearest(**same, nearest=self.nearest, bank=bank)
+        self.classes_: Array = self.indexer.classes_
+        return self
+
+    def score_frames(self, clip: Clip) -> Array:
+        """``(frames, classes)``."""
+        return self.indexer.score_frames(clip)
+
+    def find(self, clip: Clip) -> list[Event]:
+        """Events."""
+        return self.indexer.find(clip)
+
+    def scan(self, clip: Clip) -> tuple[Array, list[Event]]:
+        """Both in one pass."""
+        return self.indexer.scan(clip)

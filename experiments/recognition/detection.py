@@ -1,0 +1,219 @@
+"""Actions found in untrimmed recordings of other people, and from another side: every frame, and as segments.
+
+    DYNTORCH_DATA=../shared/data python -m experiments.recognition.detection
+
+*Exercises*: each subject's streams are asked of what was learned from the other's, cut at their labels and seen at azimuth 0;
+every frame has a label; exercises that were never learned, and what is found in them, are left out of account.  *Actors*:
+synthetic people perform actions with rests between them, seen by a noisy detector that loses joints; learned from one clip per
+action and person of three others.  Queries are seen from azimuth 0 and 90.
+
+Two readings of the same scores: *every frame* gets the class of its best score, runs are segments (there is no rest: made for the
+exercises); *found* is what ``find`` says (rests are not to be found: made for the actors).  A segment's score is how far its class
+stands above the mean of all.  The baselines are given the same windows, tempi, pooling and calibration; only the distance
+differs.  Window, tempi and pooling of ``score_frames`` were chosen on the exercises, those of ``find`` on other actors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import tyro
+
+from experiments.benchmarks.interleaved import threads
+from experiments.common.book import Book
+from experiments.common.tables import command, note
+from experiments.recognition import protocol
+from experiments.recognition.contenders import NAMES, Method, check_methods, sliding
+from experiments.recognition.detection_metrics import edit_score, f1, mean_average_precision, segments
+from experiments.recognition.protocol import Array
+from indexing import Clip
+from indexing.actors import ACTIONS, Person, dataset, detect, stream
+from indexing.report import pictures
+from indexing.scoring import Event, events
+
+TURNS = (0, 90)
+THRESHOLDS = (0.3, 0.5, 0.7)
+COLUMNS = ("frames", *(f"mAP@{t:g}" for t in THRESHOLDS), "F1@0.5", "edit")
+PEOPLE = 3  # actors learned from
+EVERYWHERE, FOUND = READINGS = ("every frame", "found")
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A stream in one view: the clip, its true segments, and the label of frames at some times."""
+
+    clip: Clip
+    truth: list[Event]
+    times: Array
+    labels: Array
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is learned, and by azimuth what is asked of it."""
+
+    clips: list[Clip]
+    labels: Array
+    asked: dict[int, list[Recording]]
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a method says of a recording: whether each frame of a known action is right, its segments, and the true ones."""
+
+    right: Array
+    everywhere: list[Event]
+    found: list[Event]
+    truth: list[Event]
+
+
+@dataclass(frozen=True)
+class Config:
+    """Untrimmed detection on the exercise streams of the folder DYNTORCH_DATA and on synthetic actors."""
+
+    sets: tuple[Literal["exercises", "actors"], ...] = ("exercises", "actors")
+    """Which recordings."""
+    methods: tuple[Method, ...] = ("equal", "image", "dtw")
+    """Which methods."""
+    streams: int = 4
+    """Streams of synthetic actors, a person each."""
+    actions: int = 8
+    """Actions in each of them."""
+    seeds: int = 1
+    """Repetitions with other noise, cameras, and actors."""
+    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("results/detection")
+    """Where tables (JSON) and pictures are written."""
+
+
+# ---- recordings --------------------------------------------------------------------------------------------------------
+def exercise_tasks(seed: int) -> list[Task]:
+    """One per subject: learned from the others' streams, asked of this one's."""
+    with np.load(protocol.data_folder() / "mocap6_exercises.npz") as file:
+        names = file["action_names"]
+    exercises = protocol.load_exercises()
+    rng = np.random.default_rng(seed)
+    images = [protocol.exemplar_view(one.clip, rng) for one in exercises]
+    queries = {turn: [protocol.query_view(one.clip, turn, rng) for one in exercises] for turn in TURNS}
+    tasks = []
+    for train, test in protocol.leave_one_subject_out(np.array([one.subject for one in exercises])):
+        parts = [protocol.cut_runs(exercises[i], images[i]) for i in train]
+        clips, numbers = [clip for part, _ in parts for clip in part], [label for _, part in parts for label in part]
+        step = protocol.RATIO / 30.0
+        true = {i: names[exercises[i].labels - 1] for i in test}
+        asked = {
+            turn: [Recording(views[i], segments(true[i], step), views[i].times[exercises[i].frames], true[i]) for i in test]
+            for turn, views in queries.items()
+        }
+        tasks.append(Task(clips, names[np.array(numbers) - 1], asked))
+    return tasks
+
+
+def actor_tasks(streams: int, actions: int, seed: int) -> list[Task]:
+    """One: synthetic people, of whom others are learned from."""
+    rng = np.random.default_rng([seed, 1])
+    learned = dataset(PEOPLE, ACTIONS, azimuth=0.0, rng=rng)
+    asked: dict[int, list[Recording]] = {turn: [] for turn in TURNS}
+    for _ in range(streams):
+        clip, intervals = stream(rng.choice(ACTIONS, actions).tolist(), Person.random(rng), rng=rng)
+        truth = [Event(label, start, end, 0.0, 0.0) for label, start, end in intervals]
+        labels = np.full(len(clip), "", dtype=learned.labels.dtype)
+        for one in truth:
+            labels[(clip.times >= one.start) & (clip.times <= one.end)] = one.label
+        for turn in TURNS:
+            asked[turn].append(Recording(detect(clip, azimuth=turn, rng=rng), truth, clip.times, labels))
+    return [Task(list(learned), learned.labels, asked)]
+
+
+# ---- answers -----------------------------------------------------------------------------------------------------------
+def answer(learned: Any, recording: Recording) -> Answer:
+    """What a learned method says of a recording, beside the truth of the actions that it knows."""
+    scores, found = learned.scan(recording.clip)
+    classes, times = learned.classes_, recording.clip.times
+    known = np.isin(recording.labels, classes)
+    named = classes[scores[np.searchsorted(times, recording.times)].argmax(axis=1)]
+    contrast = scores - scores.mean(axis=1, keepdims=True)
+    everywhere = events(contrast, times, classes.tolist(), -np.inf, -np.inf)
+    strange = [one for one in recording.truth if one.label not in classes]
+    return Answer(
+        (named == recording.labels)[known],
+        outside(everywhere, strange),
+        outside(found, strange),
+        [one for one in recording.truth if one.label in classes],
+    )
+
+
+def outside(found: Sequence[Event], strange: Sequence[Event]) -> list[Event]:
+    """The finds less than half of which lie in one of the segments that are left out of account."""
+
+    def inside(one: Event, other: Event) -> float:
+        return (min(one.end, other.end) - max(one.start, other.start)) / (one.end - one.start)
+
+    return [one for one in found if all(inside(one, other) < 0.5 for other in strange)]
+
+
+def figures(answers: Sequence[Answer], reading: str) -> list[float]:
+    """In the order of COLUMNS."""
+    truth = [one.truth for one in answers]
+    parts = [one.found if reading == FOUND else one.everywhere for one in answers]
+    precise = [mean_average_precision(parts, truth, threshold) for threshold in THRESHOLDS]
+    frames = np.nan if reading == FOUND else float(np.mean(np.concatenate([one.right for one in answers])))
+    return [frames, *precise, f1(parts, truth), edit_score(parts, truth)]
+
+
+def evaluate(tasks: Sequence[Task], method: Method, seed: int) -> dict[tuple[int, str], list[float]]:
+    """By azimuth and reading: :func:`figures` over the recordings of all tasks."""
+    answers: dict[int, list[Answer]] = {turn: [] for turn in TURNS}
+    for task in tasks:
+        learned = sliding(method, seed).fit(task.clips, task.labels)
+        for turn in TURNS:
+            answers[turn] += [answer(learned, one) for one in task.asked[turn]]
+    return {(turn, reading): figures(answers[turn], reading) for turn in TURNS for reading in READINGS}
+
+
+def timeline(task: Task, turn: int, method: Method) -> bytes:
+    """Picture of the scores of the first recording over time, with what was found and what is true."""
+    learned: Any = sliding(method).fit(task.clips, task.labels)
+    one = task.asked[turn][0]
+    scores, found = learned.scan(one.clip)
+    known = [(each.label, each.start, each.end) for each in one.truth]
+    return pictures.timeline(one.clip.times, scores, learned.classes_.tolist(), found, known)
+
+
+def run(config: Config) -> None:
+    """Print the tables, draw the pictures, write the file.
+
+    Raises:
+        ValueError: no data folder though exercises are asked for, nothing to repeat, or a method that cannot be made.
+    """
+    if min(config.seeds, config.streams, config.actions) < 1:
+        raise ValueError(f"seeds, streams and actions must be at least 1, got {config.seeds}, {config.streams}, {config.actions}")
+    check_methods(config.methods)
+    inputs = [protocol.data_folder() / "mocap6_exercises.npz"] if "exercises" in config.sets else []
+    book = Book(config.out)
+    for name in config.sets:
+        tasks = [
+            exercise_tasks(seed) if name == "exercises" else actor_tasks(config.streams, config.actions, seed)
+            for seed in range(config.seeds)
+        ]
+        with threads(1):
+            found = {}
+            for method in config.methods:
+                note(f"... {name}, {NAMES[method]}")
+                found[method] = [evaluate(each, method, seed) for seed, each in enumerate(tasks)]
+        for turn in TURNS:
+            lines = {
+                f"{NAMES[method]}, {reading}": np.mean([one[turn, reading] for one in found[method]], axis=0).tolist()
+                for reading in READINGS
+                for method in config.methods
+            }
+            book.grid(f"{name}, camera turned {turn} degrees", COLUMNS, lines)
+            book.picture(f"{name}_{turn}", timeline(tasks[0][0], turn, config.methods[0]))
+    book.close(vars(config), inputs, seed=config.seeds)
+
+
+if __name__ == "__main__":
+    command(lambda: run(tyro.cli(Config, prog="python -m experiments.recognition.detection")))

@@ -1,0 +1,1 @@
+"""Reconstruction from tracks of moving points."""

@@ -1,0 +1,1 @@
+"""Segmentation of two views, and planes that translate."""

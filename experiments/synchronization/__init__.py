@@ -1,0 +1,1 @@
+"""Synchronization of cameras: tables on synthetic and real recordings."""

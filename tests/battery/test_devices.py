@@ -1,0 +1,144 @@
+"""Every public verb gives on an accelerator what it gives on the CPU, keeps its tensors there, and seldom makes the host wait."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+import dyntorch as dyn
+from dyntorch import scenes
+from dyntorch.numerics.arguments import on_cpu
+from tests.battery.device_verbs import NOT_VERBS, VERBS, WAITS, Verb, still_shape
+from tests.battery.pretend_device import counted, moved, pretend_device
+
+DEVICES = ("pretend", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")))
+
+
+def device_of(name: str) -> torch.device:
+    return pretend_device() if name == "pretend" else torch.device(name)
+
+
+def parts(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Tensors and numbers of a result, with their names."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        value = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        for key, part in value.items():
+            yield from parts(part, f"{path}.{key}")
+    elif isinstance(value, (tuple, list)):
+        for key, part in enumerate(value):
+            yield from parts(part, f"{path}.{key}")
+    elif isinstance(value, (Tensor, float, int)):
+        yield path, value
+
+
+def same(here: Any, there: Any, path: str, tolerance: float) -> None:
+    """Whole numbers and truth values equal, the others within the tolerance of the largest, and rounding of what is zero."""
+    here, there = torch.as_tensor(here), torch.as_tensor(there).cpu()
+    assert here.shape == there.shape and here.dtype == there.dtype, path
+    size = float(here[here.isfinite()].abs().max()) if here.is_floating_point() and bool(here.isfinite().any()) else 0.0
+    torch.testing.assert_close(
+        there, here, rtol=0, atol=tolerance * size + 1e-9, equal_nan=True, msg=lambda text: f"{path}: {text}"
+    )
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("verb", VERBS, ids=repr)
+def test_a_verb_gives_the_same_there(verb: Verb, device: str) -> None:
+    home, inputs = device_of(device), verb.inputs()
+    here = verb.call(*inputs)
+    with counted() as traffic:
+        there = verb.call(*moved(inputs, home))
+    strangers = [path for path, part in parts(there) if isinstance(part, Tensor) and part.device != home]
+    assert not strangers
+    assert traffic.count <= verb.waits, str(traffic)
+    found = dict(parts(verb.compare(there)))
+    for path, part in parts(verb.compare(here)):
+        same(part, found[path], path, verb.tolerance)
+
+
+def test_the_table_lists_every_public_name():
+    listed = {verb.name.split()[0] for verb in VERBS}
+    assert listed | set(NOT_VERBS) == set(dyn.__all__) and not listed & set(NOT_VERBS)
+    assert set(WAITS) <= listed
+
+
+@pytest.mark.parametrize(
+    ("invariant", "views"),
+    [
+        # one body where two are asked for, velocities in a plane, lines in pure translation: nothing but noise tells tensors apart
+        (dyn.SegmentationMatrix, lambda g: scenes.two_view(60, batch=8, sigma=0.1, generator=g).views),
+        (dyn.ConstantVelocityTensor, lambda g: scenes.constant_velocity(60, batch=8, sigma=0.01, static=1.0, generator=g).views),
+        (dyn.HomographyTensor, lambda g: scenes.planar(60, batch=8, sigma=0.5, generator=g).views),
+    ],
+    ids=("one-body", "static-points", "healthy"),
+)
+def test_status_does_not_depend_on_the_device(invariant, views):
+    views = views(torch.Generator().manual_seed(0))
+    here = dyn.fit(invariant, *views)
+    there = dyn.fit(invariant, *moved(views, pretend_device()))
+    assert there.status.tolist() == here.status.tolist()
+    # nor on the neighbours in the batch
+    assert dyn.fit(invariant, *(x[5:] for x in views)).status.tolist() == here.status[5:].tolist()
+
+
+def test_what_looks_weak_costs_one_wait_more():
+    """Certificate, what looks weak, and where: not one for every tensor that is looked at there."""
+    views = moved(still_shape("plane"), pretend_device())
+    with counted() as traffic:
+        dyn.fit(dyn.ShapeTensor("plane"), *views)
+    assert traffic.count <= 3, str(traffic)
+
+
+def test_a_negative_weight_is_refused_there():
+    views = moved(scenes.planar(40, generator=torch.Generator().manual_seed(0)).views, pretend_device())
+    weights = torch.ones(40, dtype=torch.float64, device=pretend_device())
+    weights[3] = -1.0
+    with pytest.raises(ValueError, match="negative"):
+        dyn.fit(dyn.HomographyTensor, *views, weights=weights)
+
+
+# ---- on_cpu ------------------------------------------------------------------------------------------------------------
+@dataclasses.dataclass(frozen=True)
+class Holder:
+    values: Tensor
+    parts: Mapping[str, list[Tensor]]
+    name: str = "kept"
+
+
+@on_cpu
+def lender(holder: Holder, generator: torch.Generator | None = None) -> tuple[Holder, Tensor]:
+    """Of one device, the CPU's."""
+    assert holder.values.device.type == holder.parts["a"][0].device.type == "cpu"
+    noise = torch.rand(3, generator=generator)
+    return Holder(2 * holder.values, {"a": [noise]}), holder.values.argmax()
+
+
+def test_on_cpu_finds_tensors_wherever_they_are_held():
+    home = pretend_device()
+    values = torch.tensor([1.0, 3.0, 2.0])
+    result, best = lender(Holder(values.to(home), {"a": [values.to(home)]}), generator=torch.Generator().manual_seed(1))
+    assert result.values.device == result.parts["a"][0].device == best.device == home
+    assert result.values.tolist() == [2.0, 6.0, 4.0] and int(best) == 1 and result.name == "kept"
+    assert torch.equal(result.parts["a"][0].cpu(), torch.rand(3, generator=torch.Generator().manual_seed(1)))
+
+
+def test_on_cpu_leaves_tensors_of_the_cpu_alone():
+    values = torch.tensor([1.0, 3.0])
+    assert on_cpu(lambda x: x)(values) is values
+
+
+def test_on_cpu_passes_gradients():
+    values = torch.tensor([1.0, 3.0]).to(pretend_device()).requires_grad_()
+    on_cpu(torch.square)(values).sum().backward()
+    assert values.grad is not None and values.grad.tolist() == [2.0, 6.0]
+
+
+def test_on_cpu_refuses_tensors_of_two_accelerators():
+    with pytest.raises(ValueError, match="meta, pretend"):
+        on_cpu(torch.add)(torch.zeros(2, device="meta"), torch.zeros(2).to(pretend_device()))

@@ -1,0 +1,173 @@
+"""fit(): statuses, spectrum and uncertainty, hard conditioning, blocks; what holds for every invariant is in the battery."""
+
+from copy import copy
+from dataclasses import replace
+
+import pytest
+import torch
+
+import dyntorch as dyn
+from dyntorch import metrics, scenes
+from dyntorch.core import fit as fitting
+from dyntorch.core.solution import Solution, Status
+from tests.battery.cases import CASES, moved_views
+from tests.battery.references import apart, matrices, noisy, spans
+
+
+def seeded(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+@pytest.mark.parametrize("case", CASES, ids=repr)
+def test_singular_values_are_those_of_the_normalized_rows(case):
+    """Down to the rounding of the largest one, also of fewer rows than columns."""
+    n = case.minimal + 3
+    views = noisy(case, case.scene(n).exact, 1e-3)
+    solution = dyn.fit(case.invariant, *views)
+    frames = tuple(t[0, 0] if case.invariant.copies else t[0] for t in solution.normalization.transforms)
+    found = solution.singular_values if case.invariant.copies else solution.singular_values[None]
+    assert found.shape[-1] == case.invariant.width() and (found.diff(dim=-1) <= 0).all()
+    if case.invariant.copies:
+        return  # the cameras of normalized points have been given orthonormal rows
+    moved = moved_views(case.invariant, views, frames)
+    invariant = copy(case.invariant)
+    # what is least squares is said by the primitives of normalized coordinates
+    vars(invariant)["primitives"] = tuple(p.normalized(t) for p, t in zip(invariant.primitives, frames, strict=True))
+    matrix = matrices(replace(case, invariant=invariant), moved)[0]
+    values = torch.linalg.svdvals(matrix)
+    values = torch.nn.functional.pad(values, (0, case.invariant.width() - len(values)))
+    torch.testing.assert_close(found[0], values, rtol=1e-9, atol=1e-13 * float(values[0]))
+
+
+@pytest.mark.parametrize(
+    ("kind", "scene"),
+    [
+        (dyn.HomographyTensor, lambda s, g: scenes.planar(60, static=0.9, sigma=s * 0, batch=4, generator=g)),
+        (dyn.JoinTensor, lambda s, g: scenes.moving_points(100, static=0.8, batch=4, sigma=s * 0, generator=g)),
+        (dyn.ConstantVelocityTensor, lambda s, g: scenes.constant_velocity(60, velocities="planar", batch=4, sigma=s, generator=g)),
+        (dyn.ConstantVelocityTensor, lambda s, g: scenes.constant_velocity(60, velocities="equal", batch=4, sigma=s, generator=g)),
+        (
+            dyn.TranslatingLinesMatrix,
+            lambda s, g: scenes.translating_lines(90, motion="translation", batch=4, sigma=s, generator=g),
+        ),
+        (dyn.TranslatingLinesMatrix, lambda s, g: scenes.translating_lines(90, motion="objects", batch=4, sigma=s, generator=g)),
+    ],
+)
+def test_scenes_of_lower_rank_are_not_ok(kind, scene):
+    exact = dyn.fit(kind, *scene(0.0, seeded()).views)
+    assert (exact.status == Status.DEGENERATE).all() and exact.tensor.abs().max() == 0
+    noise = scene(2e-3, seeded())
+    if noise.sigma:
+        assert (dyn.fit(kind, *noise.views).status == Status.AMBIGUOUS).sum() >= 3
+
+
+def test_static_points_with_noise_still_determine_the_homographies():
+    """Static points are singular points of the true tensor: the spurious ones have residuals of first order (thesis 2; theory)."""
+    scene = scenes.planar(100, static=1.0, sigma=0.5, batch=20, generator=seeded())
+    solution = dyn.fit(dyn.HomographyTensor, *scene.views)
+    assert (solution.status == Status.OK).all()
+    error = metrics.grid_transfer_error(solution.motion[0], scene.motion[0], 640, 480)
+    assert error.median() < 1.5
+
+
+@pytest.mark.parametrize("case", CASES, ids=repr)
+def test_uncertainty_is_the_size_of_the_error(case):
+    """Of the normalized tensor, over many scenes, within a factor of two."""
+    scene = case.scene(2 * case.minimal + 20, batch=(40,))
+    solution = dyn.fit(case.invariant, *noisy(case, scene.exact, case.noise))
+    exact = dyn.fit(case.invariant, *scene.exact)
+    # the exact tensor in the normalized coordinates of the noisy matches
+    frames = solution.normalization.transforms
+    moved = moved_views(case.invariant, scene.exact, tuple(t[:, 0] for t in frames) if case.invariant.copies else frames)
+    if case.invariant.copies:
+        third = solution.normalization.primitives[2]
+        rows = [dyn.fit(type(case.invariant)(third.cameras[b]), *(x[b] for x in moved), normalize=False).tensor for b in range(40)]
+        true = torch.stack(rows)
+    else:
+        true = dyn.fit(case.invariant, *moved, normalize=False).tensor
+    a, b = spans(case, solution.normalized), spans(case, true)
+    a = torch.linalg.qr(a.mT)[0].mT
+    error = torch.linalg.matrix_norm(a - (a @ b.mT) @ b).reshape(40, -1).square().mean(-1).sqrt()
+    ratio = (error / case.nullity**0.5 / solution.uncertainty).median()
+    assert 0.4 < ratio < 2.0
+    assert (exact.uncertainty < 1e-5).all()
+
+
+@pytest.mark.parametrize("step", [1.0, 0.01])
+def test_small_motions_keep_their_digits(step):
+    """The second smallest singular value falls with the motion: a Gram alone would lose twice as many digits."""
+    scene = scenes.planar(60, step=(step, 3 * step), batch=8, generator=seeded())
+    solution = dyn.fit(dyn.HomographyTensor, *scene.exact)
+    assert (solution.status == Status.OK).all()
+    gap = solution.singular_values[:, 25] / solution.singular_values[:, 0]
+    assert gap.max() < 1e-2 * step
+    bound = 1e4 * torch.finfo(torch.float64).eps / gap
+    assert (metrics.relative_error(solution.motion[0], scene.motion[0]) < bound).all()
+
+
+def test_far_away_coordinates_cost_only_their_rounding():
+    scene = scenes.moving_points(100, batch=4, generator=seeded())
+    far = [x + 1e4 for x in scene.exact]
+    shift = torch.eye(4).double()
+    shift[:3, 3] = 1e4
+    solution = dyn.fit(dyn.JoinTensor, *far)
+    back = torch.linalg.inv(shift) @ solution.motion[0] @ shift
+    assert metrics.relative_error(back, scene.motion[0]).max() < 1e-7
+
+
+@pytest.mark.parametrize("case", CASES, ids=repr)
+def test_blocks_are_one_batch(case, monkeypatch):
+    views = noisy(case, case.scene(case.minimal + 5, batch=(9,)).exact, 1e-3)
+    whole = dyn.fit(case.invariant, *views)
+    monkeypatch.setattr(fitting, "BLOCK", 1)
+    single = dyn.fit(case.invariant, *views)
+    assert apart(case, whole.tensor, single.tensor) < 1e-9
+    torch.testing.assert_close(whole.uncertainty, single.uncertainty, rtol=1e-6, atol=1e-12)
+
+
+def test_threads_share_a_batch():
+    scene = scenes.planar(40, sigma=0.5, batch=64, generator=seeded())
+    one = dyn.fit(dyn.HomographyTensor, *scene.views)
+    before = torch.get_num_threads()
+    views = [x.clone().requires_grad_() for x in scene.views]
+    try:
+        torch.set_num_threads(2)
+        two = dyn.fit(dyn.HomographyTensor, *views)
+        two.tensor.abs().sum().backward()
+    finally:
+        torch.set_num_threads(before)
+    assert metrics.relative_error(two.tensor, one.tensor, dims=3).max() < 1e-9
+    assert views[0].grad.abs().amax((1, 2)).min() > 0
+
+
+def test_class_and_instance_are_the_same():
+    scene = scenes.two_view(20, generator=seeded())
+    assert torch.equal(dyn.fit(dyn.FundamentalMatrix, *scene.views).tensor, dyn.fit(dyn.FundamentalMatrix(), *scene.views).tensor)
+    assert dyn.fit(dyn.Collineation, *scene.views).tensor.shape == (3, 3)
+    with pytest.raises(ValueError, match="expected an invariant"):
+        dyn.fit("FundamentalMatrix", *scene.views)
+
+
+def test_fundamental_matrix_has_rank_two():
+    scene = scenes.two_view(30, sigma=2.0, batch=10, generator=seeded())
+    tensor = dyn.fit(dyn.FundamentalMatrix, *scene.views).tensor
+    # in the coordinates of the image it is scaled badly: the determinant against the cofactors
+    s = torch.linalg.svdvals(tensor)
+    assert (s[:, 2] < 1e-12 * s[:, 0]).all()
+
+
+def test_solution_reads_well_and_complains_clearly():
+    scene = scenes.collineation(2, 6, batch=(2, 6), generator=seeded())
+    x1, x2 = (x.clone() for x in scene.views)
+    good = dyn.fit(dyn.Collineation(2), x1, x2)
+    assert good.check() is good and isinstance(good, Solution)
+    assert repr(good) == "Solution(Collineation(n=2), matches=6, batch=(2, 6): 12 OK)"
+    x1[0] = torch.nan
+    x1[1, :4] = torch.nan
+    bad = dyn.fit(dyn.Collineation(2), x1, x2)
+    assert repr(bad) == "Solution(Collineation(n=2), matches=6, batch=(2, 6): 2 OK, 10 TOO_FEW)"
+    with pytest.raises(ValueError, match=r"Collineation\(n=2\): problem 0, 1, 2, 3, 4, 5, 6, 7, \.\.\. of 12: TOO_FEW; give more"):
+        bad.check()
+    with pytest.raises(ValueError, match="the problem: TOO_FEW"):
+        dyn.fit(dyn.Collineation(2), x1[0, 0], x2[0, 0]).check()
+    assert repr(dyn.fit(dyn.Collineation(2), x1[:, :0], x2[:, :0])).endswith("batch=(2, 0): empty)")

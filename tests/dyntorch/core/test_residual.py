@@ -1,0 +1,148 @@
+"""Residuals: whitening against Cholesky, derivatives by autograd, singular points, misuse."""
+
+import math
+
+import pytest
+import torch
+
+import dyntorch as dyn
+from dyntorch import scenes
+from dyntorch.core.residual import distance, multilinear, multilinear_derivative, whiten
+from tests.battery.cases import CASES
+from tests.battery.references import noisy
+
+FORMS = [case for case in CASES if case.invariant.rows() == 1 and case.nullity == 1 and case.invariant.copies is None]
+
+
+def random(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 6])
+def test_whiten_is_the_cholesky_solution(size):
+    root, error = random(5, 7, size, size), random(5, 7, size, seed=1)
+    covariance = root @ root.mT + 0.1 * torch.eye(size).double()
+    expected = torch.linalg.solve_triangular(torch.linalg.cholesky(covariance), error[..., None], upper=False)[..., 0]
+    torch.testing.assert_close(whiten(error, covariance), expected)
+    torch.testing.assert_close(whiten(error, covariance).square().sum(-1), (error * torch.linalg.solve(covariance, error)).sum(-1))
+    square = (whiten(error, covariance)[0, 0].requires_grad_(), covariance[0, 0])
+    assert torch.autograd.gradcheck(
+        whiten, [square[0].detach().requires_grad_(), square[1].clone().requires_grad_()], check_forward_ad=True
+    )
+
+
+def test_whiten_of_a_singular_covariance_is_finite():
+    error = torch.tensor([[1.0, 2.0], [1.0, 2.0]], dtype=torch.float64)
+    covariance = torch.tensor([[[1.0, 1.0], [1.0, 1.0]], [[0.0, 0.0], [0.0, 0.0]]], dtype=torch.float64)
+    assert whiten(error, covariance).isfinite().all()
+
+
+def test_sampson_of_epipolar_geometry_by_hand():
+    f, x1, x2 = random(4, 3, 3), random(4, 6, 2, seed=1), random(4, 6, 2, seed=2)
+    p1, p2 = (torch.cat([x, torch.ones(4, 6, 1).double()], -1) for x in (x1, x2))
+    l2, l1 = p1 @ f.mT, p2 @ f
+    value = (p2 * l2).sum(-1)
+    expected = value.abs() / (l1[..., :2].square().sum(-1) + l2[..., :2].square().sum(-1)).sqrt()
+    torch.testing.assert_close(dyn.sampson(dyn.FundamentalMatrix, f, x1, x2), expected)
+    torch.testing.assert_close(dyn.algebraic(dyn.FundamentalMatrix, f, x1, x2), value)
+    for scale in (1e-3, -4.0):
+        torch.testing.assert_close(dyn.sampson(dyn.FundamentalMatrix, scale * f, x1, x2), expected)
+
+
+@pytest.mark.parametrize("case", FORMS, ids=repr)
+def test_scales_are_the_noise_of_each_view(case):
+    """Noise s_v in view v is noise 1 in coordinates that are divided by s_v."""
+    if "Dual" in repr(case):
+        pytest.skip("the angle of a line has no unit")
+    scene = case.scene(12)
+    tensor = case.invariant.compose(*scene.motion)
+    views = noisy(case, scene.exact, 0.01)
+    scales = torch.tensor([0.3, 2.0, 0.7]).double()[: len(views)]
+    found = multilinear(case.invariant, tensor, views, tuple(scales))
+    value, square = dyn.algebraic(case.invariant, tensor, *views), torch.zeros(12).double()
+    for v, s in enumerate(scales):
+        parts = [x.clone() for x in views]
+        parts[v].requires_grad_()
+        (slope,) = torch.autograd.grad(dyn.algebraic(case.invariant, tensor, *parts).sum(), parts[v])
+        square = square + (s * slope).flatten(1).square().sum(-1)
+    torch.testing.assert_close(found, value / square.sqrt(), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("case", FORMS, ids=repr)
+def test_derivative_by_the_tensor_is_that_of_autograd(case):
+    scene = case.scene(5, batch=(2,))
+    views = noisy(case, scene.exact, 0.02)
+    tensor = random(2, *case.invariant.shape())
+    scales = tuple(torch.rand(2, generator=torch.Generator().manual_seed(v)).double() + 0.5 for v in range(len(views)))
+    value, derivative = multilinear_derivative(case.invariant, tensor, views, scales)
+    torch.testing.assert_close(value, multilinear(case.invariant, tensor, views, scales))
+    assert derivative.shape == (2, 5, case.invariant.width())
+    for b in range(2):
+        one = tuple(x[b] for x in views), tuple(s[b] for s in scales)
+        expected = torch.func.jacrev(lambda t, one=one: multilinear(case.invariant, t, *one))(tensor[b]).flatten(1)
+        torch.testing.assert_close(derivative[b], expected, rtol=1e-6, atol=1e-7)
+
+
+def test_static_points_have_a_finite_distance_and_gradient():
+    """Value and gradient of the homography tensor vanish together there; with noise a third of the variance is left."""
+    scene = scenes.planar(4000, static=1.0, generator=torch.Generator().manual_seed(0))
+    tensor = dyn.HomographyTensor.compose(*scene.motion)
+    exact = [x.clone().requires_grad_() for x in scene.exact]
+    found = dyn.sampson(dyn.HomographyTensor, tensor, *exact)
+    found.sum().backward()
+    assert found.isfinite().all() and found.max() < 1e-3 and all(x.grad.isfinite().all() for x in exact)
+    views = [x + 0.5 * random(*x.shape, seed=v) for v, x in enumerate(scene.exact)]
+    square = (dyn.sampson(dyn.HomographyTensor, tensor, *views) / 0.5).square()
+    assert abs(float(square.mean()) - 1 / 3) < 0.03
+    assert float((square.sqrt() < 1.4).double().mean()) > 0.98
+
+
+@pytest.mark.parametrize("case", CASES, ids=repr)
+def test_square_follows_chi_square(case):
+    n, sigma = 1500, 1e-4
+    scene = case.scene(n)
+    views = noisy(case, scene.exact, sigma)
+    one = torch.full((), sigma, dtype=torch.float64)
+    square = distance(case.invariant, scene.motion, views, (one,) * len(views)).square()
+    k = case.invariant.codim
+    assert abs(float(square.mean()) / k - 1) < 4 * math.sqrt(2 / (k * n))
+    assert abs(float(square.var()) / (2 * k) - 1) < 0.35
+
+
+@pytest.mark.parametrize("case", CASES, ids=repr)
+def test_distance_of_a_batch_is_that_of_its_problems(case):
+    scene = case.scene(7, batch=(2, 3))
+    views = noisy(case, scene.exact, 0.01)
+    tensor = case.invariant.compose(*scene.motion)
+    whole = dyn.sampson(case.invariant, tensor, *views)
+    assert whole.shape == (2, 3, 7) and whole.dtype == torch.float64
+    alone = dyn.sampson(case.invariant, tensor[1, 2], *(x[1, 2] for x in views))
+    torch.testing.assert_close(whole[1, 2], alone, rtol=1e-6, atol=1e-9)
+
+
+def test_misuse():
+    scene = scenes.constant_velocity(5)
+    with pytest.raises(ValueError, match="gives 3 rows; it has no single algebraic residual"):
+        dyn.algebraic(dyn.ConstantVelocityTensor, dyn.ConstantVelocityTensor.compose(*scene.motion), *scene.views)
+    with pytest.raises(ValueError, match=r"takes .*2 views, got 3"):
+        dyn.sampson(dyn.FundamentalMatrix, torch.eye(3), *[torch.rand(4, 2)] * 3)
+    with pytest.raises(ValueError, match="expected an invariant"):
+        dyn.sampson("F", torch.eye(3), torch.rand(4, 2), torch.rand(4, 2))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda t, v: (t, [v[0][:5], *v[1:]]), "same .*batch, n"),
+        (lambda t, v: (t, v[:2]), "3 views, got 2"),
+        (lambda t, v: (t[0], v), "tensor .* must be .*3, 3, 3"),
+        (lambda t, v: (t, [x.float() for x in v]), "tensor is torch.float64"),
+        (lambda t, v: (t, [x[:, :1] for x in v]), "view 1"),
+    ],
+)
+def test_what_does_not_fit_is_named(change, message):
+    scene = scenes.planar(n=12, generator=torch.Generator().manual_seed(0))
+    tensor, views = change(dyn.HomographyTensor.compose(*scene.motion), scene.views)
+    for function in (dyn.sampson, dyn.algebraic):
+        with pytest.raises(ValueError, match=message):
+            function(dyn.HomographyTensor, tensor, *views)

@@ -1,0 +1,386 @@
+"""Robust estimation: wrong matches are found, chance is not believed, and the problems of a batch do not disturb each other."""
+
+from __future__ import annotations
+
+import math
+from math import comb, log
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+import dyntorch as dyn
+from dyntorch import Status, scenes
+from dyntorch.core.invariant import Invariant
+from dyntorch.core.matches import matches
+from dyntorch.core.matrix import estimation_matrix
+from dyntorch.core.normalize import denormalize
+from dyntorch.core.robust import Search, anneal, judge, msac
+from dyntorch.numerics.chi_square import quantile
+from dyntorch.scenes.scene import OUTLIER
+from tests.battery.cases import CASES as KNOWN
+from tests.battery.cases import Case
+
+
+def seeded(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def planar(batch: int | tuple[int, ...] = (), outliers: float = 0.4, n: int = 120, **more: Any) -> scenes.Scene:
+    return scenes.planar(n, batch=batch, sigma=0.5, outliers=outliers, generator=seeded(1), **more)
+
+
+def judge_fit(scene: scenes.Scene, solution: dyn.Solution) -> tuple[Tensor, Tensor]:
+    """RMS distance of the exact true matches, and the share of the true matches kept, per problem."""
+    right = scene.labels != OUTLIER
+    clean = dyn.sampson(solution.invariant, solution.tensor, *scene.exact)
+    assert solution.inliers is not None
+    count = right.sum(-1)
+    return ((clean.square() * right).sum(-1) / count).sqrt(), (solution.inliers & right).sum(-1) / count
+
+
+CASES = [
+    (dyn.HomographyTensor(), scenes.planar, 0.5, 0.4, 120),
+    (dyn.FundamentalMatrix(), scenes.two_view, 0.5, 0.4, 120),
+    (dyn.Collineation(2), scenes.collineation, 0.002, 0.5, 100),
+    (dyn.ConstantVelocityTensor(), scenes.constant_velocity, 0.01, 0.2, 150),
+    (dyn.JoinTensor(), scenes.moving_points, 0.01, 0.15, 180),
+    (dyn.MinimalJoinTensor(), scenes.moving_points, 0.01, 0.15, 150),
+]
+
+
+@pytest.mark.parametrize(("invariant", "scene", "sigma", "outliers", "n"), CASES, ids=lambda v: repr(v)[:20])
+def test_true_matches_are_kept_and_the_model_is_accurate(
+    invariant: Invariant, scene: Any, sigma: float, outliers: float, n: int
+) -> None:
+    made = scene(n=n, batch=2, sigma=sigma, outliers=outliers, generator=seeded(3))
+    solution = dyn.robust_fit(invariant, *made.views, threshold=sigma * quantile(0.995, invariant.codim) ** 0.5, generator=seeded())
+    rms, kept = judge_fit(made, solution)
+    assert solution.status.tolist() == [Status.OK, Status.OK]
+    assert bool((rms < sigma).all())
+    assert bool((kept >= 0.95).all())
+    assert solution.sigma is not None
+    assert bool(((solution.sigma / sigma - 1).abs() < 0.25).all())
+
+
+def test_plain_fit_fails_where_the_robust_one_does_not() -> None:
+    scene = planar(batch=3)
+    plain, robust = dyn.fit(dyn.HomographyTensor, *scene.views), dyn.robust_fit(dyn.HomographyTensor, *scene.views, threshold=1.5)
+    right = scene.labels != OUTLIER
+    clean = dyn.sampson(dyn.HomographyTensor, plain.tensor, *scene.exact)
+    assert float(((clean.square() * right).sum(-1) / right.sum(-1)).sqrt().min()) > 3
+    assert float(judge_fit(scene, robust)[0].max()) < 0.5
+
+
+@pytest.mark.parametrize("polish", [True, False])
+def test_inliers_are_the_matches_within_the_threshold(polish: bool) -> None:
+    scene = planar(batch=2)
+    solution = dyn.robust_fit(dyn.HomographyTensor, *scene.views, threshold=1.5, polish=polish)
+    expected = dyn.sampson(dyn.HomographyTensor, solution.tensor, *scene.views) <= 1.5
+    assert solution.inliers is not None
+    assert torch.equal(solution.inliers, expected)
+
+
+def test_polish_improves() -> None:
+    scene = planar(batch=8, outliers=0.3)
+    rough, fine = (dyn.robust_fit(dyn.HomographyTensor, *scene.views, threshold=1.5, polish=p) for p in (False, True))
+    assert float(judge_fit(scene, fine)[0].mean()) < float(judge_fit(scene, rough)[0].mean())
+
+
+def test_one_threshold_per_problem() -> None:
+    scene = planar(batch=2)
+    views = tuple(x * torch.tensor([1.0, 0.01], dtype=x.dtype)[:, None, None] for x in scene.views)
+    solution = dyn.robust_fit(dyn.HomographyTensor, *views, threshold=torch.tensor([1.5, 0.015], dtype=torch.float64))
+    assert solution.inliers is not None
+    assert solution.sigma is not None
+    both = dyn.robust_fit(dyn.HomographyTensor, *(x[:1].expand(2, -1, -1) for x in scene.views), threshold=1.5)
+    assert both.inliers is not None
+    assert torch.equal(solution.inliers[0], both.inliers[0])
+    assert bool(((solution.sigma / torch.tensor([0.5, 0.005])) - 1).abs().max() < 0.25)
+
+
+@pytest.mark.parametrize(
+    ("invariant", "scene", "sigma"),
+    [(dyn.HomographyTensor(), scenes.planar, 0.5), (dyn.Collineation(2), scenes.collineation, 0.002)],
+)
+def test_noise_is_estimated(invariant: Invariant, scene: Any, sigma: float) -> None:
+    made = scene(n=200, batch=4, sigma=sigma, outliers=0.3, generator=seeded(2))
+    solution = dyn.robust_fit(invariant, *made.views, generator=seeded())
+    rms, kept = judge_fit(made, solution)
+    assert solution.sigma is not None
+    assert abs(float(solution.sigma.mean()) / sigma - 1) < 0.15
+    assert float(rms.max()) < sigma
+    assert float(kept.mean()) > 0.95
+
+
+@pytest.mark.parametrize("case", KNOWN, ids=repr)
+def test_estimated_threshold_for_every_invariant(case: Case) -> None:
+    scale = case.units[0] if case.units else 1.0
+    share = min(0.2, case.outliers)
+    made = case.scene(max(120, 5 * case.minimal), batch=2, seed=41, outliers=share, sigma=case.noise / scale)
+    solution = dyn.robust_fit(case.invariant, *made.views, generator=seeded())
+    right = made.labels != OUTLIER
+    assert solution.inliers is not None
+    assert solution.sigma is not None
+    assert solution.status.tolist() == [Status.OK, Status.OK]
+    assert bool(((solution.inliers & right).sum(-1) >= 0.9 * right.sum(-1)).all())
+    assert bool(((solution.sigma / shown_noise(case, made) - 1).abs() < 0.25).all())
+
+
+def shown_noise(case: Case, made: scenes.Scene) -> Tensor:
+    """The noise of one coordinate that the true matches show under the true motion."""
+    tensor = case.invariant.compose(*made.motion)
+    square = dyn.sampson(case.invariant, tensor, *made.views).square() / case.invariant.codim
+    right = made.labels != OUTLIER
+    return ((square * right).sum(-1) / right.sum(-1)).sqrt()
+
+
+def test_translating_lines_with_many_outliers() -> None:
+    (case,) = [case for case in KNOWN if isinstance(case.invariant, dyn.TranslatingLinesMatrix)]
+    made = case.scene(200, batch=4, seed=31, outliers=0.3, sigma=1e-3)
+    solution = dyn.robust_fit(case.invariant, *made.views, threshold=3e-3, generator=seeded())
+    assert solution.status.tolist() == [Status.OK] * 4
+    assert float(judge_fit(made, solution)[1].min()) > 0.95
+
+
+def test_several_slots_of_hyperplanes_have_distances_right_in_the_mean() -> None:
+    """Against the pseudo-inverse of the whole covariance of the eight rows, which the motion makes of rank four."""
+    made = scenes.planar(400, sigma=0.3, static=1.0, generator=seeded(8))
+    invariant = dyn.DualHomographyTensor("points")
+    search = Search(invariant, matches(invariant, made.views), seeded())
+    work = search._bundle((search.weights, *search.views, *search.norm.transforms))
+    basis = work.first(search.weights[:, None])
+    square = work.distances(basis)[0][0, 0] / search.unit**2
+    assert float(square.mean()) == pytest.approx(4 * 0.3**2, rel=0.1)
+    exact = dyn.sampson(invariant, invariant.compose(*made.motion), *made.views).square()
+    assert float(torch.corrcoef(torch.stack([square, exact]))[0, 1]) > 0.8
+
+
+def test_constrained_tensors_of_motions_are_themselves() -> None:
+    for case in KNOWN:
+        made = case.scene(max(120, 3 * case.minimal), batch=2, seed=3)
+        search = Search(case.invariant, matches(case.invariant, made.views), seeded())
+        work = search._bundle((search.weights, *search.views, *search.norm.transforms))
+        basis = work.first(search.weights[:, None].expand(-1, 3, -1))
+        again = work.constrained(basis)
+        # spans: sign and basis are free
+        inside = basis @ again.mT @ (again @ again.mT).inverse() @ again
+        assert torch.allclose(inside, basis, atol=1e-6), case
+
+
+def test_random_matches_have_no_consensus() -> None:
+    for invariant in (dyn.HomographyTensor(), dyn.FundamentalMatrix(), dyn.Collineation(2)):
+        views = [500 * torch.rand(3, 80, 2, generator=seeded(v), dtype=torch.float64) for v in range(len(invariant.primitives))]
+        solution = dyn.robust_fit(invariant, *views, threshold=1.5, starts=(1, 4), generator=seeded())
+        assert solution.status.tolist() == [Status.NO_CONSENSUS] * 3
+        assert float(solution.tensor.flatten(1).norm(dim=-1).min()) > 0.99
+
+
+def test_evidence_is_the_expected_number_of_chance_finds() -> None:
+    scene = planar(batch=1, outliers=0.2, n=60)
+    data = matches(dyn.HomographyTensor(), scene.views)
+    search = Search(dyn.HomographyTensor(), data, None)
+    work = search._bundle((search.weights, *search.views, *search.norm.transforms))
+    limit = (1.5 * search.unit).square()
+    basis = anneal(work, work.first(search.weights[:, None]), limit, 30)
+    square = work.distances(basis)[0][:, 0]
+    evidence, _ = judge(work, basis, square, limit)
+    n, m, k = 60, 26, int((square <= limit).sum())
+    hits, trials = 0, 0
+    for j in range(4):
+        shift = (2 * j + 1) * n // 24
+        mixed = search.norm.apply(work.invariant, [x.roll(v * shift, -2) for v, x in enumerate(scene.views)])
+        hits, trials = hits + int((_sampson(basis, mixed, work.scales).square() <= limit).sum()), trials + n
+    expected = log(n - m) + log(comb(n, k)) + log(comb(k, m)) + (k - m) * log((hits + 1) / (trials + 1))
+    assert float(evidence) == pytest.approx(expected, rel=1e-9)
+
+
+def _hom(x: Tensor) -> Tensor:
+    return torch.cat([x, torch.ones_like(x[..., :1])], dim=-1)
+
+
+def _sampson(basis: Tensor, views: Any, scales: Any) -> Tensor:
+    """First-order distance by finite differences."""
+    tensor = basis[0, 0, 0, 0].unflatten(-1, (3, 3, 3))
+
+    def value(xs: list[Tensor]) -> Tensor:
+        return torch.einsum("ijk,ni,nj,nk->n", tensor, *(_hom(x) for x in xs))
+
+    xs = [x[0] for x in views]
+    square = torch.zeros(len(xs[0]), dtype=tensor.dtype)
+    for v, scale in enumerate(scales):
+        for c in range(2):
+            step = torch.zeros(2, dtype=tensor.dtype)
+            step[c] = 1e-5
+            up, down = ([x + s * step if u == v else x for u, x in enumerate(xs)] for s in (1, -1))
+            square = square + ((value(up) - value(down)) / 2e-5 * scale).square()
+    return value(xs).abs() / square.sqrt()
+
+
+@pytest.mark.parametrize(
+    ("invariant", "scene"),
+    [
+        (dyn.HomographyTensor(), planar(batch=2)),
+        (dyn.FundamentalMatrix(), scenes.two_view(60, batch=2, sigma=0.5, generator=seeded())),
+        (dyn.Collineation(3), scenes.collineation(3, 60, batch=2, sigma=0.01, generator=seeded())),
+    ],
+    ids=lambda v: repr(v)[:20],
+)
+def test_starts_are_linear_fits_and_distances_are_sampson(invariant: Invariant, scene: scenes.Scene) -> None:
+    data = matches(invariant, scene.views)
+    search = Search(invariant, data, seeded())
+    work = search._bundle((search.weights, *search.views, *search.norm.transforms))
+    chosen = search._samples(torch.arange(2), 3)[:, :3]
+    basis = work.first(chosen)
+    square, _ = work.distances(basis)
+    widths = tuple(p.width for p in invariant.primitives)
+    for k in range(3):
+        tensor = basis[:, 0, k, 0].unflatten(-1, widths).permute(0, *(1 + v for v in invariant.axes()))
+        there = dyn.sampson(invariant, denormalize(invariant, tensor, search.norm.actions), *scene.views)
+        assert torch.allclose(square[:, k].sqrt() / search.unit[:, None], there, rtol=1e-6, atol=1e-8)
+        points = [x[:, 0] for x, p in zip(search.views, invariant.primitives, strict=True) if p.rows == 1]
+        unit = math.prod((1 + x.square().sum(-1) for x in points), start=torch.ones(()))
+        rows = estimation_matrix(search.norm.primitives, [x[:, 0] for x in search.views], chosen[:, k] / unit)
+        null = torch.linalg.svd(rows.double()).Vh[:, -1]
+        assert torch.allclose((null * basis[:, 0, k, 0]).sum(-1).abs(), torch.ones(2, dtype=null.dtype), atol=1e-7)
+
+
+def test_statuses_of_what_the_data_lack() -> None:
+    views = [torch.stack(pair) for pair in zip(planar().views, planar(outliers=0.0, static=1.0).exact, strict=True)]
+    few = torch.ones(3, 120, dtype=torch.float64)
+    few[2, 20:] = 0
+    views = [torch.cat([x, x[:1]]) for x in views]
+    solution = dyn.robust_fit(dyn.HomographyTensor, *views, threshold=1.5, weights=few)
+    assert solution.status.tolist() == [Status.OK, Status.DEGENERATE, Status.TOO_FEW]
+    assert float(solution.tensor[1:].abs().max()) == 0
+    assert solution.inliers is not None
+    assert not bool(solution.inliers[1:].any())
+
+
+def test_a_bad_problem_leaves_the_others_untouched() -> None:
+    scene = planar(batch=3)
+    alone = dyn.robust_fit(dyn.HomographyTensor, *(x[[0, 2]] for x in scene.views), threshold=1.5, starts=(1,))
+    bad = [x.clone() for x in scene.views]
+    bad[1][1] = torch.nan
+    solution = dyn.robust_fit(dyn.HomographyTensor, *bad, threshold=1.5, starts=(1,))
+    assert solution.status.tolist() == [Status.OK, Status.TOO_FEW, Status.OK]
+    assert torch.allclose(solution.tensor[[0, 2]], alone.tensor, atol=1e-9)
+    assert bool(solution.tensor.isfinite().all())
+    assert solution.inliers is not None
+    assert alone.inliers is not None
+    assert torch.equal(solution.inliers[[0, 2]], alone.inliers)
+
+
+def test_missing_matches_and_gross_outliers() -> None:
+    scene = planar(outliers=0.2)
+    views = [x.clone() for x in scene.views]
+    views[0][:5] = torch.nan
+    views[2][5:8] = 1e9
+    solution = dyn.robust_fit(dyn.HomographyTensor, *views, threshold=1.5)
+    assert int(solution.status) == Status.OK
+    assert solution.inliers is not None
+    assert not bool(solution.inliers[:8].any())
+    right = scene.labels[8:] != OUTLIER
+    assert float(solution.inliers[8:][right].double().mean()) > 0.95
+
+
+def test_results_repeat_and_follow_the_generator() -> None:
+    scene = scenes.two_view(100, batch=2, sigma=0.5, outliers=0.5, generator=seeded(4))
+    one, two = (dyn.robust_fit(dyn.FundamentalMatrix, *scene.views, threshold=1.5, generator=seeded(7)) for _ in range(2))
+    assert torch.equal(one.tensor, two.tensor)
+    state = torch.random.get_rng_state()
+    dyn.robust_fit(dyn.FundamentalMatrix, *scene.views, threshold=1.5, generator=seeded(7))
+    assert torch.equal(state, torch.random.get_rng_state())
+
+
+def test_more_matches_than_are_searched() -> None:
+    scene = scenes.collineation(2, 1500, sigma=0.002, outliers=0.4, generator=seeded(5))
+    solution = dyn.robust_fit(dyn.Collineation(2), *scene.views, threshold=0.007, generator=seeded())
+    rms, kept = judge_fit(scene, solution)
+    assert float(rms) < 0.001
+    assert float(kept) > 0.97
+
+
+def test_shapes_and_precision() -> None:
+    scene = planar(batch=(2, 1), outliers=0.2).to(torch.float32)
+    solution = dyn.robust_fit(dyn.HomographyTensor, *(x.requires_grad_() for x in scene.views), threshold=1.5)
+    assert solution.tensor.dtype == torch.float32
+    assert not solution.tensor.requires_grad
+    assert solution.inliers is not None
+    assert (solution.tensor.shape, solution.status.shape, solution.inliers.shape) == ((2, 1, 3, 3, 3), (2, 1), (2, 1, 120))
+    empty = dyn.robust_fit(dyn.HomographyTensor, *(x[:0] for x in scene.views), threshold=1.5)
+    assert empty.tensor.shape == (0, 1, 3, 3, 3)
+
+
+def test_msac_counts_the_weight_lost() -> None:
+    square, weights = torch.tensor([[[0.0, 2.0, 100.0]]]), torch.tensor([[1.0, 0.5, 2.0]])
+    assert msac(square, weights, torch.tensor([4.0])).tolist() == [[0.25 + 2.0]]
+
+
+def test_misuse_is_named() -> None:
+    views = planar().views
+    with pytest.raises(ValueError, match="threshold must be a distance > 0"):
+        dyn.robust_fit(dyn.HomographyTensor, *views, threshold=-1.0)
+    with pytest.raises(ValueError, match=r"threshold must be a number or \(\*batch,\)"):
+        dyn.robust_fit(dyn.HomographyTensor, *views, threshold=torch.ones(3))
+    with pytest.raises(ValueError, match="starts must be numbers"):
+        dyn.robust_fit(dyn.HomographyTensor, *views, threshold=1.5, starts=())
+    with pytest.raises(ValueError, match="needs at least 26 matches, got 20"):
+        dyn.robust_fit(dyn.HomographyTensor, *(x[:20] for x in views), threshold=1.5)
+
+
+@pytest.mark.parametrize("case", KNOWN, ids=repr)
+@pytest.mark.parametrize("threshold", [None, 1.0])
+def test_no_problems_give_an_empty_solution(case: Case, threshold: float | None) -> None:
+    views = [x[:0] for x in case.scene(case.minimal, batch=(2,)).views]
+    solution = dyn.robust_fit(case.invariant, *views, threshold=threshold)
+    assert solution.check() is solution and solution.tensor.shape[0] == 0
+    assert solution.inliers is not None and solution.inliers.shape == (0, case.minimal)
+    assert solution.sigma is not None and solution.sigma.shape == (0,)
+
+
+@pytest.mark.parametrize("threshold", [None, 0.1])
+def test_covariance_of_what_fails_is_never_nan(threshold: float | None) -> None:
+    exact = scenes.two_view(30, generator=torch.Generator().manual_seed(1)).views
+    equal = [x[:1].expand_as(x) for x in exact]
+    line = [x[:1] + torch.linspace(0, 9, 30)[:, None].to(x) * (x[1:2] - x[:1]) for x in exact]
+    views = [torch.stack(pair) for pair in zip(equal, line, strict=True)]
+    solution = dyn.robust_fit(dyn.FundamentalMatrix, *views, threshold=threshold, generator=torch.Generator().manual_seed(0))
+    assert (solution.status != Status.OK).all()
+    assert solution.covariance is not None and not solution.covariance.isnan().any()
+    failed = (solution.status == Status.DEGENERATE) | (solution.status == Status.TOO_FEW)
+    assert (solution.covariance[failed] == 0).all()
+
+
+def test_too_few_matches_with_weight_are_not_searched(monkeypatch: pytest.MonkeyPatch) -> None:
+    views = scenes.planar(60, generator=torch.Generator().manual_seed(0)).views
+    counts: list[int] = []
+    solve = Search._solve
+    monkeypatch.setattr(Search, "_solve", lambda self, where, cut, count: counts.append(count) or solve(self, where, cut, count))
+    solution = dyn.robust_fit(dyn.HomographyTensor, *views, threshold=1.0, weights=torch.zeros(60).double())
+    assert int(solution.status) == Status.TOO_FEW and counts == [1]
+
+
+def test_an_infinite_threshold_is_refused() -> None:
+    views = scenes.planar(30, generator=torch.Generator().manual_seed(0)).views
+    with pytest.raises(ValueError, match=r"threshold must be a distance > 0 .*, got inf"):
+        dyn.robust_fit(dyn.HomographyTensor, *views, threshold=math.inf)
+
+
+def test_more_starts_are_not_tried_where_a_quarter_of_them_agree(monkeypatch):
+    """A tight bound leaves doubt whatever is found; what most of 16 starts find, 256 would find again."""
+    counts, solve = [], Search._solve
+
+    def counted(self, where, cut, count):
+        counts.append(count)
+        return solve(self, where, cut, count)
+
+    monkeypatch.setattr(Search, "_solve", counted)
+    monkeypatch.setattr("dyntorch.core.robust.DOUBT", -1.0)
+    scene = scenes.planar(n=100, sigma=0.5, static=0.3, outliers=0.1, generator=seeded(1))
+    views = tuple(x[None] for x in scene.views)
+    search = Search(dyn.HomographyTensor(), matches(dyn.HomographyTensor(), views, None), torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        found = search.run(torch.tensor([1.5], dtype=torch.float64), (1, 4, 16, 64, 256))
+    assert bool(found.doubt) and counts == [1, 4, 16]

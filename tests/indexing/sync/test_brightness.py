@@ -1,0 +1,104 @@
+"""Two videos, no tracks: right shifts are found and believed, everything else is refused with its reason."""
+
+import numpy as np
+import pytest
+import torch
+
+from indexing.sync.brightness import brightness_shift
+from tests.battery.pretend_device import counted, moved, pretend_device
+
+FPS = (30.0, 30.0)
+
+
+def test_known_shift_is_found_and_believed(films):
+    a, b = films
+    shift = brightness_shift(a[25:], b[:-10], fps=FPS)
+    assert (
+        shift.ok and shift.method == "brightness" and abs(shift.frames - 25) <= 1 and abs(shift.offset - 25 / 30) < 3 * shift.sigma
+    )
+    assert shift.peaks[0, 0] == shift.offset and shift.confidence > 0.9 and shift.rate == 1.0
+    assert shift.scores.nan_to_num(-1).argmax() == (shift.lags - 25 / 30).abs().argmin() or abs(shift.frames - 25) > 0.5
+    other_way = brightness_shift(b[:-10], a[25:], fps=FPS)
+    assert other_way.ok and other_way.offset == pytest.approx(-shift.offset, abs=0.02)
+
+
+def test_streams_sizes_rates_and_clocks(films):
+    a, b = (video[:110] for video in films)
+    times = 100 + np.arange(0, 110, 2) / 30.0
+    stream = ((torch.from_numpy(b[2 * i : 2 * i + 8 : 2]), times[i : i + 4]) for i in range(0, 55, 4))
+    large = np.repeat(np.repeat(a, 5, axis=1), 5, axis=2)
+    shift = brightness_shift(large, stream, fps=(30.0, 15.0), times=(np.arange(110) / 30.0, None))
+    assert abs(shift.offset - 100) < 1 / 15
+    assert shift.fps == pytest.approx((30.0, 15.0))
+
+
+def test_videos_on_an_accelerator(films):
+    a, b = (torch.from_numpy(video) for video in films)
+    pair, home = (a[10:60], b[:50]), pretend_device()
+    here = brightness_shift(*pair, fps=FPS)
+    with counted() as traffic:
+        there = brightness_shift(*moved(pair, home), fps=FPS)
+    assert traffic.count <= 2, str(traffic)  # one copy for each video
+    assert {there.peaks.device, there.lags.device, there.scores.device} == {home}
+    assert (there.offset, there.sigma, there.ok, there.reason) == (here.offset, here.sigma, here.ok, here.reason)
+    assert torch.equal(there.peaks.cpu(), here.peaks)
+
+
+def test_unrelated_and_reversed_videos_are_refused(films, other):
+    a, b = films
+    for second in (other, b[::-1].copy()):
+        shift = brightness_shift(a, second, fps=FPS)
+        assert not shift.ok and shift.reason and len(shift.peaks) >= 1
+        with pytest.raises(ValueError, match="synchronize: "):
+            shift.check()
+
+
+def test_repeated_motion_is_refused_with_its_peaks(films):
+    a, b = (np.concatenate([video[20:65]] * 3) for video in films)
+    shift = brightness_shift(a[45:], b, fps=FPS)
+    assert not shift.ok and "another shift fits nearly as well" in shift.reason
+    lags = (shift.peaks[:4, 0] * 30).round() % 45
+    assert torch.minimum(lags, 45 - lags).max() <= 1
+
+
+def test_too_little_motion_and_flicker_are_said(films, rng):
+    a, b = films
+    still = np.clip(b[:1] + rng.normal(0, 2, b.shape), 0, 255).astype(np.uint8)
+    a, b, still = a[:40], b[:40], still[:40]
+    assert "nothing moves in b" in brightness_shift(a, still, fps=FPS).reason
+    flicker = (b * (0.2 + 0.4 * (np.arange(len(b)) % 3))[:, None, None]).astype(np.uint8)
+    assert "light flickers" in brightness_shift(a, flicker, fps=FPS).reason
+    constant = brightness_shift(np.zeros_like(a), np.zeros_like(b), fps=FPS)
+    assert not constant.ok and np.isfinite([constant.offset, constant.sigma, constant.confidence]).all()
+
+
+def test_shaking_camera_is_said(films):
+    a, b = (video[:60] for video in films)
+    rng = np.random.default_rng(1)
+    path = np.cumsum(rng.integers(-1, 2, (len(b), 2)), axis=0).clip(-6, 6)
+    shaken = np.stack([np.pad(f, 8, mode="edge")[8 + y : 68 + y, 8 + x : 88 + x] for f, (x, y) in zip(b, path, strict=True)])
+    assert any("b: the camera moves" in note for note in brightness_shift(a, shaken, fps=FPS).notes)
+
+
+def test_max_shift_and_region(films):
+    a, b = (video[:70] for video in films)
+    shift = brightness_shift(a[25:], b, fps=FPS, max_shift=0.5, region=(0, 0, 80, 60))
+    assert abs(shift.offset) <= 0.5 + 1 / 60
+    assert brightness_shift(a[25:], b, fps=FPS, region=None).lags.shape == (45 + 70 - 1,)
+
+
+BAD = {
+    "max_shift must be": {"max_shift": -1.0},
+    "overlap by less than": {"times": (np.arange(30) / 30.0, 500 + np.arange(30) / 30.0), "max_shift": 2.0},
+    "region must be 'motion'": {"region": "person"},
+    "region must be .x0": {"region": (5.0, 0.0, 2.0, 9.0)},
+    "outside the image of a": {"region": (500.0, 0.0, 600.0, 9.0)},
+    "fps must be a pair": {"fps": 30.0},
+    "neither fps nor times": {"fps": None},
+}
+
+
+@pytest.mark.parametrize("words", BAD)
+def test_bad_input_is_named(films, words):
+    with pytest.raises(ValueError, match=words):
+        brightness_shift(*(video[:30] for video in films), **({"fps": FPS} | BAD[words]))
