@@ -84,7 +84,7 @@ def demonstrate(
     if people < 1:
         raise ValueError(f"people must be 1 or more, got {people}")
     tell = progress or (lambda share: None)
-    clock = _Clock()
+    clock = _Stopwatch()
     teacher, others, walker = (np.random.default_rng([seed, part]) for part in range(3))
     examples = dataset(1, actions, azimuth=0.0, rng=teacher)
     tell(0.02)
@@ -110,7 +110,7 @@ def demonstrate(
 
 
 def _search(
-    indexer: ActionIndexer, actions: Sequence[str], rng: np.random.Generator, tell: Progress, clock: _Clock
+    indexer: ActionIndexer, actions: Sequence[str], rng: np.random.Generator, tell: Progress, clock: _Stopwatch
 ) -> RecordingResult:
     """All actions in random order by somebody else, seen from elsewhere."""
     order = [actions[i] for i in rng.permutation(len(actions))]
@@ -169,7 +169,7 @@ def _share(truth: Sequence[Any] | NDArray[Any], answers: Sequence[Any] | NDArray
     return float(np.mean(np.asarray(truth).astype(str) == np.asarray(answers).astype(str)))
 
 
-class _Clock:
+class _Stopwatch:
     """Seconds spent per step."""
 
     def __init__(self) -> None:

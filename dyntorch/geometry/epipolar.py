@@ -38,11 +38,11 @@ def sampson_squared(F: Tensor, x1: Tensor, x2: Tensor) -> Tensor:
         >>> sampson_squared(F, torch.tensor([[0.0, 1.0]]), torch.tensor([[5.0, 3.0]])).tolist()
         [2.0]
     """
-    value, square = Monomials(x1, x2).terms(F)
+    value, square = PairMonomials(x1, x2).terms(F)
     return value.square() / square
 
 
-class Monomials:
+class PairMonomials:
     """The products of coordinates in which the epipolar constraint and its squared gradient are linear and quadratic in F."""
 
     def __init__(self, x1: Tensor, x2: Tensor) -> None:
@@ -147,10 +147,10 @@ def eight_point(x1: Tensor, x2: Tensor, weights: Tensor, rounds: int = 0) -> Ten
         >>> bool(sampson_squared(F, x1, x2).max() < 1e-20)
         True
     """
-    return eight_point_of(Monomials(x1, x2), weights, rounds)
+    return eight_point_of(PairMonomials(x1, x2), weights, rounds)
 
 
-def eight_point_of(data: Monomials, weights: Tensor, rounds: int) -> Tensor:
+def eight_point_of(data: PairMonomials, weights: Tensor, rounds: int) -> Tensor:
     # a product of two of the x2_i x1_j is one of x2_i x2_k with one of x1_j x1_l: 36 of them, not 81
     first, second = data.quadratic.split(6)
     products, place = (second[:, None] * first).flatten(0, 1).mT, _places(weights.device)

@@ -10,7 +10,7 @@ from math import pi
 import torch
 from torch import Tensor
 
-from dyntorch.geometry.epipolar import TINY, Monomials, affine_fundamental, bilinear, eight_point_of, polar
+from dyntorch.geometry.epipolar import TINY, PairMonomials, affine_fundamental, bilinear, eight_point_of, polar
 from dyntorch.geometry.homogeneous import cofactors
 from dyntorch.numerics.blocks import constant, map_blocks, uniform
 
@@ -132,10 +132,10 @@ def descend(F: Tensor, x1: Tensor, x2: Tensor, weights: Tensor, scale: float, st
         >>> bool(sampson_squared(F, x1, x2).max() < 1e-12)
         True
     """
-    return _descend(Monomials(x1, x2), F, weights, (scale,), steps)[0]
+    return _descend(PairMonomials(x1, x2), F, weights, (scale,), steps)[0]
 
 
-def _descend(data: Monomials, F: Tensor, weights: Tensor, scales: Sequence[float], steps: int) -> tuple[Tensor, Tensor]:
+def _descend(data: PairMonomials, F: Tensor, weights: Tensor, scales: Sequence[float], steps: int) -> tuple[Tensor, Tensor]:
     """F and its cost at the last scale."""
     tables = Products(data)
     size = max(1, BLOCK // max(1, weights.shape[-1]))
@@ -181,7 +181,7 @@ class Products:
     numbers per match, is never formed (microseconds per step and fit, 300 matches, 400 fits: 14 instead of 22).
     """
 
-    def __init__(self, data: Monomials) -> None:
+    def __init__(self, data: PairMonomials) -> None:
         """Of the matches of ``data``."""
         self.data = data
         first, second, third, self.place = _pairs(data.bilinear.device)
@@ -275,7 +275,7 @@ def fit_fundamental(
         raise ValueError(
             f"scales must be positive thresholds in the unit of the matches, got {tuple(scales)}: pass e.g. (0.02, 0.01)"
         )
-    data = Monomials(x1, x2)
+    data = PairMonomials(x1, x2)
     several = torch.stack([eight_point_of(data, weights, 0), affine_fundamental(x1, x2, weights)], dim=1)
     given = several[:, :0] if starts is None else starts
     several = torch.cat([several, given], dim=1)

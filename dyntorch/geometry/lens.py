@@ -352,7 +352,7 @@ def fit_distortion(
     ideal = Division.of(a[chosen].double(), sizes[0]), Division.of(b[chosen].double(), sizes[1])
     if len(chosen) < LEAST:
         return LensFit(ideal, (torch.inf, torch.inf), 0.0, False)
-    data = Matches.of(a[chosen].double(), b[chosen].double(), weights[chosen].double(), ideal).subset(MOST)
+    data = LensMatches.of(a[chosen].double(), b[chosen].double(), weights[chosen].double(), ideal).subset(MOST)
     plain, full = _fitted(data)
     scale = _scale(data, full)
     plain, full = plain.descended(data, scale, lens=False), full.descended(data, scale, lens=True)
@@ -369,7 +369,7 @@ def fit_distortion(
 
 
 @dataclass(frozen=True)
-class Matches:
+class LensMatches:
     """Points from the centres of their pictures, in half diagonals."""
 
     a: Tensor
@@ -381,20 +381,20 @@ class Matches:
     """px."""
 
     @staticmethod
-    def of(a: Tensor, b: Tensor, weights: Tensor, ideal: tuple[Division, Division]) -> Matches:
+    def of(a: Tensor, b: Tensor, weights: Tensor, ideal: tuple[Division, Division]) -> LensMatches:
         """Of pixels."""
         first, second = ((x - lens.centre) / lens.radius for x, lens in zip((a, b), ideal, strict=True))
-        return Matches(first, second, weights, (ideal[0].radius, ideal[1].radius))
+        return LensMatches(first, second, weights, (ideal[0].radius, ideal[1].radius))
 
-    def subset(self, count: int) -> Matches:
+    def subset(self, count: int) -> LensMatches:
         """As many of them, evenly spread."""
         n = len(self.a)
         chosen = torch.arange(min(count, n), device=self.a.device) * n // min(count, n)
-        return Matches(self.a[chosen], self.b[chosen], self.weights[chosen], self.radii)
+        return LensMatches(self.a[chosen], self.b[chosen], self.weights[chosen], self.radii)
 
-    def weighing(self, weights: Tensor) -> Matches:
+    def weighing(self, weights: Tensor) -> LensMatches:
         """The same matches with other weights."""
-        return Matches(self.a, self.b, weights, self.radii)
+        return LensMatches(self.a, self.b, weights, self.radii)
 
     def distances(self, F: Tensor, lens: Tensor) -> Tensor:
         """Signed Sampson distances ``(B, N)`` in px, of F ``(B, 3, 3)`` and lambda ``(B, 2)``."""
@@ -413,43 +413,43 @@ def _rays(u: Tensor, strength: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
-class Fit:
+class LensDescent:
     """Fundamental matrices of rays and the lenses, B of them."""
 
     frames: Frames
     lens: Tensor
     """``(B, 2)``."""
 
-    def moved(self, step: Tensor) -> Fit:
+    def moved(self, step: Tensor) -> LensDescent:
         """After a step ``(B, 9)``: seven parameters of F, two lambda."""
-        return Fit(self.frames.moved(step[:, :7]), self.lens + step[:, 7:])
+        return LensDescent(self.frames.moved(step[:, :7]), self.lens + step[:, 7:])
 
-    def distances(self, data: Matches) -> Tensor:
+    def distances(self, data: LensMatches) -> Tensor:
         """``(B, N)`` px."""
         return data.distances(self.frames.matrix().unflatten(-1, (3, 3)), self.lens)
 
-    def cost(self, data: Matches, scale: Tensor) -> Tensor:
+    def cost(self, data: LensMatches, scale: Tensor) -> Tensor:
         """Truncated squared distances ``(B,)`` in units of ``scale``."""
         return ((self.distances(data) / scale).square().clamp(max=CAP) * data.weights).sum(-1)
 
-    def best(self, data: Matches, scale: Tensor) -> Fit:
+    def best(self, data: LensMatches, scale: Tensor) -> LensDescent:
         """The one with the least cost."""
         k = int(self.cost(data, scale).argmin())
-        return Fit(Frames(self.frames.turns[k : k + 1], self.frames.core[k : k + 1]), self.lens[k : k + 1])
+        return LensDescent(Frames(self.frames.turns[k : k + 1], self.frames.core[k : k + 1]), self.lens[k : k + 1])
 
-    def _normal(self, data: Matches, scale: Tensor) -> tuple[Tensor, Tensor]:
+    def _normal(self, data: LensMatches, scale: Tensor) -> tuple[Tensor, Tensor]:
         """Gradient ``(B, 9)`` and Gauss-Newton matrix ``(B, 9, 9)`` of half the cost."""
         away = self.distances(data) / scale
         # central differences: exact to 1e-10, and four times faster than jacfwd
         near = NEAR * torch.eye(9, dtype=away.dtype, device=away.device)
         turns, core, lens = (part.repeat_interleave(18, dim=0) for part in (self.frames.turns, self.frames.core, self.lens))
-        moved = Fit(Frames(turns, core), lens).moved(torch.cat([near, -near]).repeat(len(away), 1))
+        moved = LensDescent(Frames(turns, core), lens).moved(torch.cat([near, -near]).repeat(len(away), 1))
         ahead, behind = moved.distances(data).unflatten(0, (-1, 2, 9)).unbind(1)
         jacobian = ((ahead - behind) / (2 * NEAR)).mT / scale[..., None]
         weighted = (data.weights * (away.square() < CAP))[..., None] * jacobian
         return (weighted * away[..., None]).sum(1), weighted.mT @ jacobian
 
-    def descended(self, data: Matches, scale: Tensor, *, lens: bool) -> Fit:
+    def descended(self, data: LensMatches, scale: Tensor, *, lens: bool) -> LensDescent:
         """Levenberg-Marquardt, with the lenses or without."""
         free = torch.ones_like(self.lens[0]).repeat_interleave(5)[:9]
         free[7:] = float(lens)
@@ -457,17 +457,17 @@ class Fit:
         damping = torch.full_like(cost, 1e-3)
         for _ in range(ITERATIONS):
             trial = fit.moved(-damped_step(*fit._normal(data, scale), damping, free))
-            trial = Fit(trial.frames, trial.lens.clamp(*RANGE))
+            trial = LensDescent(trial.frames, trial.lens.clamp(*RANGE))
             fresh = trial.cost(data, scale)
             better = fresh < cost
             done = bool((((cost - fresh).abs() <= CONVERGED * cost) | (~better & (damping > 1e3))).all())
-            fit = Fit(trial.frames.where(better, fit.frames), torch.where(better[:, None], trial.lens, fit.lens))
+            fit = LensDescent(trial.frames.where(better, fit.frames), torch.where(better[:, None], trial.lens, fit.lens))
             cost, damping = torch.where(better, fresh, cost), torch.where(better, 0.1 * damping, 10 * damping).clamp(1e-10, 1e8)
             if done:
                 break
         return fit
 
-    def sigmas(self, data: Matches, scale: Tensor) -> Tensor:
+    def sigmas(self, data: LensMatches, scale: Tensor) -> Tensor:
         """Standard deviations ``(2,)`` of lambda for errors of one ``scale``."""
         matrix = self._normal(data, scale)[1][0]
         if not bool(matrix.isfinite().all()):
@@ -475,20 +475,20 @@ class Fit:
         return torch.linalg.pinv(matrix, hermitian=True).diagonal()[7:].clamp(min=0).sqrt()
 
 
-def _fitted(data: Matches) -> tuple[Fit, Fit]:
+def _fitted(data: LensMatches) -> tuple[LensDescent, LensDescent]:
     """The best fits without and with lenses."""
     few = data.subset(FEW)
     lens = torch.tensor(STARTS, dtype=data.a.dtype, device=data.a.device)
     F = torch.cat([_start(few, one) for one in lens])
-    every = Fit(Frames.of(F), lens)
+    every = LensDescent(Frames.of(F), lens)
     scale = _scale(few, every).min()
-    plain = Fit(Frames.of(F[:1]), lens[:1]).descended(few, scale, lens=False)
+    plain = LensDescent(Frames.of(F[:1]), lens[:1]).descended(few, scale, lens=False)
     # what explains the points without lenses is a start, too
-    every = Fit(Frames.of(torch.cat([F, plain.frames.matrix().unflatten(-1, (3, 3))])), torch.cat([lens, lens[:1]]))
+    every = LensDescent(Frames.of(torch.cat([F, plain.frames.matrix().unflatten(-1, (3, 3))])), torch.cat([lens, lens[:1]]))
     return plain, every.descended(few, scale, lens=True).best(few, scale)
 
 
-def _start(data: Matches, lens: Tensor) -> Tensor:
+def _start(data: LensMatches, lens: Tensor) -> Tensor:
     """F ``(1, 3, 3)`` of straightened points, weighed again by the distances a few times."""
     p, q = _rays(data.a, lens[:1]), _rays(data.b, lens[1:])
     weights = data.weights[None]
@@ -503,12 +503,12 @@ def _median(away: Tensor, weights: Tensor) -> Tensor:
     return away[:, weights > 0].abs().median(-1).values.clamp(min=1e-9)
 
 
-def _scale(data: Matches, fit: Fit) -> Tensor:
+def _scale(data: LensMatches, fit: LensDescent) -> Tensor:
     """Robust standard deviation of the distances, ``(B, 1)`` px."""
     return 1.4826 * _median(fit.distances(data), data.weights)[:, None]
 
 
-def _holds(data: Matches, plain: Fit, full: Fit, scale: Tensor, fold: int) -> bool:
+def _holds(data: LensMatches, plain: LensDescent, full: LensDescent, scale: Tensor, fold: int) -> bool:
     """Whether lenses fitted without one part of the matches explain that part better than no lenses do."""
     place = torch.arange(len(data.weights), device=data.weights.device) * FOLDS // len(data.weights)
     rest, part = (data.weighing(data.weights * own) for own in (place != fold, place == fold))

@@ -113,7 +113,7 @@ def resting_residual(inverses: tuple[Tensor, ...], views: tuple[Tensor, ...], sc
 Motion = tuple[Tensor, Tensor, Tensor]
 
 
-class Diagnosis(NamedTuple):
+class VelocityDegeneracy(NamedTuple):
     """Evidence against a constant velocity tensor, ``(*batch,)`` each: small with good data, 1 for a zero tensor."""
 
     misfit: Tensor
@@ -212,8 +212,8 @@ class ConstantVelocityTensor(Invariant):
         return _solve(tensor, constant_velocity_maps_p6)
 
     @staticmethod
-    def diagnose(tensor: Tensor) -> Diagnosis:
-        """How far a tensor is from one of constant velocity; see :class:`Diagnosis`.
+    def diagnose(tensor: Tensor) -> VelocityDegeneracy:
+        """How far a tensor is from one of constant velocity; see :class:`VelocityDegeneracy`.
 
         Args:
             tensor: ``(*batch, 4, 4, 4)``, or ``(*batch, 4, 4, 3)`` of a camera.
@@ -225,10 +225,10 @@ class ConstantVelocityTensor(Invariant):
         one = torch.ones_like(left)
         misfit = torch.where(exact.flatten(-3).abs().amax(-1) > 0, left, one)
         if tensor.shape[-1] == 3:
-            return Diagnosis(misfit.to(tensor.dtype), torch.zeros_like(misfit).to(tensor.dtype))
+            return VelocityDegeneracy(misfit.to(tensor.dtype), torch.zeros_like(misfit).to(tensor.dtype))
         values = torch.linalg.svdvals(third_infinity(alpha, beta, q, k))
         ratio = torch.where(values[..., 2] > 0, values[..., 3] / torch.where(values[..., 2] > 0, values[..., 2], one), one)
-        return Diagnosis(misfit.to(tensor.dtype), ratio.to(tensor.dtype))
+        return VelocityDegeneracy(misfit.to(tensor.dtype), ratio.to(tensor.dtype))
 
     @staticmethod
     def transfer(tensor: Tensor, x1: Tensor | None = None, x2: Tensor | None = None, x3: Tensor | None = None) -> Tensor:

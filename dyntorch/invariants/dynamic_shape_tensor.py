@@ -18,7 +18,7 @@ from dyntorch.numerics.nullspace import null_space
 from dyntorch.shapes.basis import Polynomial, Trajectory, extremes, times_of_views
 from dyntorch.shapes.moving import (
     AMBIGUOUS,
-    Projected,
+    ProjectedShapes,
     centred_views,
     fit_shapes,
     framed,
@@ -399,7 +399,7 @@ class DynamicShapeTensor(Invariant):
         scale = scales[0][:, None]
         return found.residual.flatten(1) / scale, derivative.transpose(1, 2).flatten(2) / scale[..., None]
 
-    def _projected(self, shapes: Tensor, measured: Tensor) -> tuple[Projected, Tensor]:
+    def _projected(self, shapes: Tensor, measured: Tensor) -> tuple[ProjectedShapes, Tensor]:
         """Views ``(*batch, views, n, 4)`` beside their shapes, and the functions of the time."""
         x, seen = measured[..., :2], measured[..., 2]
         centre = (x * seen[..., None]).sum(-2, keepdim=True) / seen.sum(-1)[..., None, None].clamp(min=1.0)

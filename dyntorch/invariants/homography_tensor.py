@@ -24,7 +24,7 @@ from dyntorch.numerics.least_squares import normalized_derivative
 from dyntorch.numerics.nullspace import null_space
 
 
-class Diagnosis(NamedTuple):
+class PlanarDegeneracy(NamedTuple):
     """How far a tensor can be trusted to be that of a motion, ``(*batch,)`` each; see :meth:`HomographyTensor.diagnose`."""
 
     condition_a: Tensor
@@ -116,7 +116,7 @@ class HomographyTensor(Invariant):
         return unit(a).to(tensor.dtype), unit(b).to(tensor.dtype)
 
     @staticmethod
-    def diagnose(tensor: Tensor) -> Diagnosis:
+    def diagnose(tensor: Tensor) -> PlanarDegeneracy:
         r"""Evidence that a tensor is of the form :math:`\epsilon(A, B)`.
 
         Args:
@@ -154,7 +154,7 @@ class HomographyTensor(Invariant):
         zero = norm.flatten(-3)[..., 0] == 0
         one = torch.ones_like(misfit)
         found = (*conditions, torch.where(zero, one, misfit), torch.where(zero, one, difference))
-        return Diagnosis(*(x.to(tensor.dtype) for x in found))
+        return PlanarDegeneracy(*(x.to(tensor.dtype) for x in found))
 
     @staticmethod
     def transfer(tensor: Tensor, x: Tensor, source: int = 2, target: int = 1) -> Tensor:

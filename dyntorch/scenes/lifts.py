@@ -17,7 +17,7 @@ SPEED, ACCELERATION = 0.12, 0.03  # rms, scene units (the rms radius is 1) per u
 FAR_OFF = (100.0, 0.3)  # largest displacement of an outlier: pixels; scene units, which are as many pixels at the distance
 
 
-class Kind(NamedTuple):
+class LiftedKind(NamedTuple):
     """One motion: coordinates of the world, of which the first ``axes`` move as polynomials of a degree in time."""
 
     dim: int
@@ -29,17 +29,17 @@ class Kind(NamedTuple):
 
 
 KINDS = {
-    "static_2d": Kind(2, 0, 0, views=2),
-    "static_3d": Kind(3, 0, 0, views=2),
-    "constant_direction_2d": Kind(2, 1, 1, views=3),
-    "constant_velocity_2d": Kind(2, 2, 1, views=3),
-    "constant_acceleration_2d": Kind(2, 2, 2, views=4),
-    "constant_direction_3d": Kind(3, 1, 1, views=3),
-    "constant_velocity_planes_3d": Kind(3, 2, 1, views=4),
-    "constant_velocity_3d": Kind(3, 3, 1, views=4),
-    "constant_velocity_3d_sensors": Kind(3, 3, 1, views=3, sensors=True),
-    "two_bodies_2d": Kind(2, 0, 0, views=2, bodies=2),
-    "two_bodies_3d": Kind(3, 0, 0, views=3, bodies=2),
+    "static_2d": LiftedKind(2, 0, 0, views=2),
+    "static_3d": LiftedKind(3, 0, 0, views=2),
+    "constant_direction_2d": LiftedKind(2, 1, 1, views=3),
+    "constant_velocity_2d": LiftedKind(2, 2, 1, views=3),
+    "constant_acceleration_2d": LiftedKind(2, 2, 2, views=4),
+    "constant_direction_3d": LiftedKind(3, 1, 1, views=3),
+    "constant_velocity_planes_3d": LiftedKind(3, 2, 1, views=4),
+    "constant_velocity_3d": LiftedKind(3, 3, 1, views=4),
+    "constant_velocity_3d_sensors": LiftedKind(3, 3, 1, views=3, sensors=True),
+    "two_bodies_2d": LiftedKind(2, 0, 0, views=2, bodies=2),
+    "two_bodies_3d": LiftedKind(3, 0, 0, views=3, bodies=2),
 }
 
 
@@ -202,7 +202,7 @@ def _cameras(draw: Draw, t: Tensor, jitter: float, drift: float, plane: bool) ->
     return cameras[..., [0, 1, 3]] if plane else cameras
 
 
-def _moving(draw: Draw, t: Tensor, cameras: Tensor, middle: Tensor, kind: Kind) -> LiftedScene:
+def _moving(draw: Draw, t: Tensor, cameras: Tensor, middle: Tensor, kind: LiftedKind) -> LiftedScene:
     """The truth of points that move as polynomials in time."""
     dim, axes = kind.dim, kind.axes
     eye = torch.eye(dim + 1, dtype=t.dtype, device=t.device)

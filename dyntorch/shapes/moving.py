@@ -23,7 +23,7 @@ FLAT = 1e-12
 
 
 @dataclass(frozen=True)
-class Views:
+class AffineViews:
     """Centred single views, one row of the problem each.
 
     Attributes:
@@ -38,16 +38,16 @@ class Views:
     share: Tensor
     scale: Tensor
 
-    def repeated(self, count: int) -> Views:
+    def repeated(self, count: int) -> AffineViews:
         """The same problems ``count`` times, one after the other."""
-        return Views(*(part.repeat(count, *([1] * (part.ndim - 1))) for part in vars(self).values()))
+        return AffineViews(*(part.repeat(count, *([1] * (part.ndim - 1))) for part in vars(self).values()))
 
-    def subset(self, keep: Tensor) -> Views:
+    def subset(self, keep: Tensor) -> AffineViews:
         """Some of the problems."""
-        return Views(*(part[keep] for part in vars(self).values()))
+        return AffineViews(*(part[keep] for part in vars(self).values()))
 
 
-def centred_views(x: Tensor, weights: Tensor | None = None, share: Tensor | None = None) -> Views:
+def centred_views(x: Tensor, weights: Tensor | None = None, share: Tensor | None = None) -> AffineViews:
     """Views ``(b, views, n, 2)`` at their centroids, each with energy 1; NaN and weight 0 are missing points.
 
     A view with fewer than five points, or all in one place, says nothing about the shape and weighs 0.
@@ -67,11 +67,11 @@ def centred_views(x: Tensor, weights: Tensor | None = None, share: Tensor | None
     known = (seen > 4) & (scale > 1e-12 * clean.abs().amax((-2, -1)))
     scale = torch.where(known, scale, 1.0)
     given = known.to(x.dtype) if share is None else torch.where(known, share, 0.0)
-    return Views(torch.where(known[..., None, None], moved / scale[..., None, None], 0.0), weight, given, scale)
+    return AffineViews(torch.where(known[..., None, None], moved / scale[..., None, None], 0.0), weight, given, scale)
 
 
 @dataclass(frozen=True)
-class Projected:
+class ProjectedShapes:
     """Views projected onto a shape at each view.
 
     Attributes:
@@ -87,7 +87,7 @@ class Projected:
     inverse: Tensor
 
 
-def project(x: Tensor, weights: Tensor, shape: Tensor) -> Projected:
+def project(x: Tensor, weights: Tensor, shape: Tensor) -> ProjectedShapes:
     """Residuals of centred views ``(..., n, 2)`` for shapes ``(..., n, 3)`` (or of other width); their translation is nothing."""
     root = weights.sqrt()[..., None]
     centre = (shape * weights[..., None]).sum(-2, keepdim=True) / weights.sum(-1)[..., None, None].clamp(min=1e-300)
@@ -100,10 +100,10 @@ def project(x: Tensor, weights: Tensor, shape: Tensor) -> Projected:
     inverse = torch.linalg.solve_triangular(factor, eye.expand_as(factor), upper=False).mT
     basis = moved @ inverse
     inner = basis.mT @ seen
-    return Projected(seen - basis @ inner, inverse @ inner, basis, inverse)
+    return ProjectedShapes(seen - basis @ inner, inverse @ inner, basis, inverse)
 
 
-def slopes(found: Projected, weights: Tensor, rows: Tensor) -> Tensor:
+def slopes(found: ProjectedShapes, weights: Tensor, rows: Tensor) -> Tensor:
     r"""Derivative of the residuals by the shapes (Golub and Pereyra): :math:`dr = -\Pi^\perp dX A - (X^+)^T dX^T r`.
 
     Args:
@@ -144,28 +144,28 @@ def framed(shapes: Tensor) -> Tensor:
     return turned * nonzero_sign(flat.take_along_dim(flat.abs().argmax(1, keepdim=True), 1))[:, None]
 
 
-def cost_of(views: Views, rows: Tensor, shapes: Tensor) -> Tensor:
+def cost_of(views: AffineViews, rows: Tensor, shapes: Tensor) -> Tensor:
     """Weighted square sum of the residuals ``(b,)``."""
     return _cost(views, project(views.x, views.weights, shapes_at(shapes, rows)))
 
 
-def _cost(views: Views, found: Projected) -> Tensor:
+def _cost(views: AffineViews, found: ProjectedShapes) -> Tensor:
     return (found.residual.square().sum((-2, -1)) * views.share).sum(-1)
 
 
 @dataclass(frozen=True)
-class Descent:
+class ShapeDescent:
     r"""The shapes that leave the least, the cameras eliminated; a :class:`dyntorch.numerics.least_squares.Minimand`.
 
     Gauss-Newton with Kaufman's Jacobian :math:`dr = -\Pi^\perp\,dX(t_v)\,A_v`: its normal matrix is a sum of Kronecker products
     :math:`(c c^T) \otimes (A A^T) \otimes \Pi^\perp`, one product of two matrices whatever the number of views.
 
     Attributes:
-        views: see :class:`Views`.
+        views: see :class:`AffineViews`.
         rows: ``(b, views, B)`` values of the basis functions.
     """
 
-    views: Views
+    views: AffineViews
     rows: Tensor
 
     def shapes(self, theta: Tensor) -> Tensor:
@@ -176,9 +176,9 @@ class Descent:
         """The shapes in their canonical form: what no view can tell does not run away."""
         return (canonical(self.shapes(theta)),)
 
-    def subset(self, keep: Tensor) -> Descent:
+    def subset(self, keep: Tensor) -> ShapeDescent:
         """Some of the problems."""
-        return Descent(self.views.subset(keep), self.rows[keep])
+        return ShapeDescent(self.views.subset(keep), self.rows[keep])
 
     def normal_equations(self, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Cost ``(b,)``, gradient ``(b, p)`` and matrix ``(b, p, p)``."""
@@ -200,11 +200,11 @@ class Descent:
         return torch.where(cost.isfinite(), cost, torch.inf), gradient, matrix
 
 
-def descend(views: Views, rows: Tensor, shapes: Tensor, iterations: int) -> tuple[Tensor, Tensor]:
+def descend(views: AffineViews, rows: Tensor, shapes: Tensor, iterations: int) -> tuple[Tensor, Tensor]:
     r"""Minimize :math:`\sum_v w_v \|(I - \Pi(t_v))\,x_v\|^2` over the shapes (variable projection).
 
     Args:
-        views: see :class:`Views`.
+        views: see :class:`AffineViews`.
         rows: ``(b, views, B)`` values of the basis functions.
         shapes: ``(b, B, n, 3)`` start.
         iterations: at most so many steps.
@@ -214,7 +214,7 @@ def descend(views: Views, rows: Tensor, shapes: Tensor, iterations: int) -> tupl
 
     Source: Golub and Pereyra 1973; Kaufman 1975.
     """
-    theta, cost, _ = minimize(Descent(views, rows), shapes.flatten(1), iterations)
+    theta, cost, _ = minimize(ShapeDescent(views, rows), shapes.flatten(1), iterations)
     return canonical(theta.unflatten(1, shapes.shape[1:])), cost
 
 
@@ -288,7 +288,7 @@ def graph(y: Tensor, z: Tensor, powers: Tensor, share: Tensor) -> Graph:
     return Graph(scale, slopes, flat | found.degenerate)
 
 
-def complete(views: Views) -> Tensor:
+def complete(views: AffineViews) -> Tensor:
     """The centred views ``(b, views, n, 2)`` with missing points filled in from the mean shape of all views."""
     x, seen = views.x, (views.weights > 0)[..., None]
     if bool(seen.all()):
@@ -480,7 +480,7 @@ def fit_shapes(
     return MovingShapes(*(part.to(x.dtype) if part.is_floating_point() else part for part in done))
 
 
-def _checked(x: Tensor, rows: Tensor, weights: Tensor | None, share: Tensor | None) -> tuple[tuple[int, ...], Views, Tensor]:
+def _checked(x: Tensor, rows: Tensor, weights: Tensor | None, share: Tensor | None) -> tuple[tuple[int, ...], AffineViews, Tensor]:
     """Batch, flat centred views and flat rows."""
     if x.ndim < 3 or x.shape[-1] != 2 or not x.is_floating_point():
         raise ValueError(f"x must be floating point (*batch, views, n, 2), got {tuple(x.shape)} {x.dtype}")
@@ -503,18 +503,18 @@ def _checked(x: Tensor, rows: Tensor, weights: Tensor | None, share: Tensor | No
     return batch, views, wide / torch.where(largest > 0, largest, 1.0)
 
 
-def _few(views: Views, rows: Tensor) -> Tensor:
+def _few(views: AffineViews, rows: Tensor) -> Tensor:
     """Whether the views hold fewer conditions than the shapes have parameters."""
     return _spare(views, rows) < 0
 
 
-def _spare(views: Views, rows: Tensor) -> Tensor:
+def _spare(views: AffineViews, rows: Tensor) -> Tensor:
     """Conditions beyond those that determine the shapes ``(b,)``."""
     seen = ((views.weights > 0).sum(-1) - 4).clamp(min=0) * (views.share > 0)
     return 2 * seen.sum(-1) - (3 * rows.shape[-1] * (views.x.shape[-2] - 1) - GAUGE)
 
 
-def _best(views: Views, rows: Tensor, iterations: int) -> tuple[Tensor, Tensor]:
+def _best(views: AffineViews, rows: Tensor, iterations: int) -> tuple[Tensor, Tensor]:
     """Shapes and cost of the best of all starts."""
     filled = complete(views)
     made = [make(filled, rows, views.share) for make in (graph_start, window_start, pooled_start)]
@@ -527,7 +527,7 @@ def _best(views: Views, rows: Tensor, iterations: int) -> tuple[Tensor, Tensor]:
     return descend(views, rows, chosen, max(0, iterations - TRIED))
 
 
-def _grown(views: Views, filled: Tensor, rows: Tensor) -> Tensor:
+def _grown(views: AffineViews, filled: Tensor, rows: Tensor) -> Tensor:
     """Shapes ``(b, B, n, 3)`` that start at rest and are given one function of the time after the other."""
     shapes = leading(filled, views.share)[:, None]
     for size in range(2, rows.shape[-1] + 1):
@@ -536,7 +536,7 @@ def _grown(views: Views, filled: Tensor, rows: Tensor) -> Tensor:
     return shapes
 
 
-def _uncertainty(views: Views, rows: Tensor, shapes: Tensor, cost: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _uncertainty(views: AffineViews, rows: Tensor, shapes: Tensor, cost: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Expected relative error, noise, and whether another shape explains the views as well, exactly; ``(b,)`` each."""
     open_ = GAUGE + 3 * rows.shape[-1]  # affine frame, and a translation of every basis function
     rest = _eigenvalues(views, rows, shapes)[..., open_:]
@@ -551,7 +551,7 @@ def _uncertainty(views: Views, rows: Tensor, shapes: Tensor, cost: Tensor) -> tu
     return torch.where(free, torch.inf, (variance * inverse / 3).sqrt()), variance.sqrt(), free
 
 
-def _eigenvalues(views: Views, rows: Tensor, shapes: Tensor) -> Tensor:
+def _eigenvalues(views: AffineViews, rows: Tensor, shapes: Tensor) -> Tensor:
     """Of the normal matrix, ascending ``(b, 3 n B)``."""
-    matrix = Descent(views, rows).normal_equations(shapes.flatten(1))[2]
+    matrix = ShapeDescent(views, rows).normal_equations(shapes.flatten(1))[2]
     return eigenvalues(matrix)

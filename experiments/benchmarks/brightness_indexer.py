@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from experiments.common.tables import Row, command, measured_on_one_thread, note
 from indexing.brightness.indexer import BrightnessIndexer
-from indexing.brightness.library import Exemplars
+from indexing.brightness.library import VideoExemplars
 from indexing.brightness.sight import LENGTH
 
 IMAGES = ((160, 120), (640, 480))
@@ -64,7 +64,7 @@ def learned(frames: int) -> BrightnessIndexer:
     generator = torch.Generator().manual_seed(0)
     rows = torch.nn.functional.normalize(torch.rand(2 * frames, LENGTH, generator=generator), dim=1)
     tracks = 2 * frames // TRACK
-    parts = Exemplars(rows, torch.full((tracks,), TRACK), torch.arange(tracks) % CLASSES)
+    parts = VideoExemplars(rows, torch.full((tracks,), TRACK), torch.arange(tracks) % CLASSES)
     return BrightnessIndexer(flip=False)._learn(parts, np.arange(CLASSES))
 
 

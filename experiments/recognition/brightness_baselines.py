@@ -22,7 +22,7 @@ from torch.nn.functional import avg_pool2d, normalize
 from experiments.recognition.protocol import Array
 from indexing.brightness.features import blur, gradients
 from indexing.brightness.footage import Shrinker
-from indexing.brightness.library import Exemplars, library
+from indexing.brightness.library import VideoExemplars, library
 from indexing.brightness.sight import SMALLEST, described
 from indexing.brightness.stream import Warping
 from indexing.sync.gray import boxes, crop, inverse_root, motion, window_kernels
@@ -117,7 +117,7 @@ class FrameNearest:
         rows = [self.look(video, self.fps) for video in videos]
         lengths = torch.tensor([len(one) for one in rows])
         every = torch.cat(rows)
-        kept = Exemplars(every, lengths, torch.from_numpy(numbers))
+        kept = VideoExemplars(every, lengths, torch.from_numpy(numbers))
         self.library = library(kept, len(self.classes_), flip=False)
         return self
 

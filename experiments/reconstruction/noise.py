@@ -27,9 +27,9 @@ from dyntorch import metrics, scenes
 from dyntorch.geometry.lift import upgrade
 from dyntorch.geometry.triangulation import resect, triangulate
 from dyntorch.tasks.reconstruct.motions import MOTIONS, Motion
-from dyntorch.tasks.reconstruct.projections import Tracks
+from dyntorch.tasks.reconstruct.projections import ViewTracks
 from dyntorch.tasks.reconstruct.reconstruct import normalized
-from dyntorch.tasks.reconstruct.scene import Lifting, Scene, adjusted, distances
+from dyntorch.tasks.reconstruct.scene import LiftedState, Lifting, adjusted, distances
 from experiments.common.tables import command, note
 
 SCENES, QUICK = 40, 8
@@ -67,12 +67,12 @@ TABLE = (
 BODIES = (("two_bodies_2d", 2, 40, 1.0, 1.7), ("two_bodies_3d", 3, 40, 1.0, 1.5), ("two_bodies_3d", 6, 40, 1.0, 0.55))
 
 
-def flat(tracks: Tensor, times: Tensor) -> Tracks:
+def flat(tracks: Tensor, times: Tensor) -> ViewTracks:
     """Tracks ``(b, views, n, l)`` as the steps of a reconstruction take them."""
     return normalized(tracks, torch.ones_like(tracks[..., 0]), times)
 
 
-def stages(tracks: Tracks, motion: Motion) -> dict[str, tuple[Tensor, Tensor]]:
+def stages(tracks: ViewTracks, motion: Motion) -> dict[str, tuple[Tensor, Tensor]]:
     """Projections and points, in the frame of the scene, of the stages before bundle adjustment.
 
     The tensor takes the first, the last, and evenly spread views between them; the others are resected.
@@ -106,7 +106,7 @@ def cell(setting: Setting, count: int, seed: int) -> str:
     tracks = flat(scene.tracks, scene.times)
     lifting = Lifting.of(motion, tracks.times, tracks.x)
     truth = adjusted(
-        tracks, Scene(tracks.transforms @ scene.cameras, scene.structure @ lifting.root.mT, tracks.x[:, 0, 0, 0]), lifting
+        tracks, LiftedState(tracks.transforms @ scene.cameras, scene.structure @ lifting.root.mT, tracks.x[:, 0, 0, 0]), lifting
     )
     found = dyn.reconstruct(scene.tracks, setting.motion, scene.times, threshold=float("inf"))
     steps = stages(tracks, motion)
@@ -126,7 +126,7 @@ def cell(setting: Setting, count: int, seed: int) -> str:
 
 
 def _figures(
-    tracks: Tracks, projections: Tensor, structure: Tensor, lifting: Lifting, scene: scenes.LiftedScene
+    tracks: ViewTracks, projections: Tensor, structure: Tensor, lifting: Lifting, scene: scenes.LiftedScene
 ) -> tuple[float, float, float]:
     """Reprojection, position (%) and velocity (%) error, medians over the scenes."""
     rms = distances(tracks, projections, structure).square().nanmean((1, 2)).sqrt()

@@ -24,9 +24,9 @@ from dyntorch.geometry.homogeneous import unit
 from dyntorch.metrics import relative_error
 from dyntorch.numerics.least_squares import minimize
 from dyntorch.scenes import TranslatingScene, translating_planes
-from dyntorch.tasks.planes.input import Given
+from dyntorch.tasks.planes.input import GivenPlanes
 from dyntorch.tasks.planes.planes import translating_planes as solve
-from dyntorch.tasks.planes.problem import Layout, Matches, PlanesProblem, parameters
+from dyntorch.tasks.planes.problem import Layout, PlaneMatches, PlanesProblem, parameters
 from experiments.common.tables import NoiseConfig, aligned, command, note
 from indexing.files import manifest, write_json
 
@@ -80,25 +80,25 @@ class Config(NoiseConfig):
     """Where the results and this configuration are written as JSON."""
 
 
-def frames(scene: TranslatingScene, H: Tensor, F: Tensor) -> Given:
+def frames(scene: TranslatingScene, H: Tensor, F: Tensor) -> GivenPlanes:
     """The problem in normalized coordinates, with the matches."""
-    return Given.of(H, F, (scene.x1, scene.x2), (scene.body_x1, scene.body_x2), None)
+    return GivenPlanes.of(H, F, (scene.x1, scene.x2), (scene.body_x1, scene.body_x2), None)
 
 
-def error(found: Tensor, scene: TranslatingScene, given: Given) -> float:
+def error(found: Tensor, scene: TranslatingScene, given: GivenPlanes) -> float:
     """Median relative error in the coordinates that Hartley's normalization of the matches gives."""
     first, second = given.frames[0], given.frames[1]
     pair = [unit(second @ h @ torch.linalg.inv(first)) for h in (found, scene.infinity)]
     return float(relative_error(*pair).median())
 
 
-def from_truth(scene: TranslatingScene, given: Given) -> Tensor:
+def from_truth(scene: TranslatingScene, given: GivenPlanes) -> Tensor:
     """The maximum likelihood estimate next to the truth."""
     first, second = given.frames
     layout = Layout(given.homographies.shape[1], given.fundamentals.shape[1])
     infinity = unit(second @ scene.infinity @ torch.linalg.inv(first))
     seen, body = given.planes, given.bodies
-    matches = Matches(seen.views, seen.weights, body.views, body.weights, (first[:, 0, 0], second[:, 0, 0]))
+    matches = PlaneMatches(seen.views, seen.weights, body.views, body.weights, (first[:, 0, 0], second[:, 0, 0]))
     theta = parameters(given.homographies, given.fundamentals, infinity)
     found, _, _ = layout.unpack(minimize(PlanesProblem(layout, matches), theta, 100)[0])
     back: Tensor = torch.linalg.inv(second)

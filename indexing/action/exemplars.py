@@ -23,7 +23,7 @@ ELEVATION, SPREAD = 0.1, 0.15  # radians: virtual cameras around 3D exemplars
 
 
 @dataclass(frozen=True)
-class Plan:
+class ExemplarPlan:
     """How windows are cut: steps per window, copies, and the stream's window and stride in seconds."""
 
     length: int = 12
@@ -79,7 +79,7 @@ class Exemplars:
         )
 
 
-def cut(clips: Sequence[Clip], plan: Plan, random_state: np.random.Generator) -> Exemplars:
+def cut(clips: Sequence[Clip], plan: ExemplarPlan, random_state: np.random.Generator) -> Exemplars:
     """Cut everything that is kept of the clips; 3D clips are rendered, first as seen along z, then from around."""
     images = [_render(clip, 0.0, ELEVATION, random_state) for clip in clips]
     source = ragged(images, plan.repair)
@@ -96,7 +96,7 @@ def _render(clip: Clip, azimuth: float, elevation: float, random_state: np.rando
     return virtual(clip, azimuth, elevation, random_state=random_state) if clip.dims == 3 else clip
 
 
-def _view(clips: Sequence[Clip], source: Ragged, plan: Plan, random_state: np.random.Generator) -> Windows:
+def _view(clips: Sequence[Clip], source: Ragged, plan: ExemplarPlan, random_state: np.random.Generator) -> Windows:
     """One virtual view of every exemplar: rendered where it is 3D, the turned card where it is an image."""
     count = len(clips)
     azimuth = random_state.uniform(0, 2 * np.pi, count)

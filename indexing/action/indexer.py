@@ -13,7 +13,7 @@ from sklearn.utils.validation import check_is_fitted
 
 from dyntorch import one_thread
 from indexing.action.bank import Windows
-from indexing.action.exemplars import CROPS, VIEWS, VIEWS_SOLID, Exemplars, Plan, cut
+from indexing.action.exemplars import CROPS, VIEWS, VIEWS_SOLID, ExemplarPlan, Exemplars, cut
 from indexing.action.inputs import check_common, check_parameters, check_plan, check_queries, gather, gather_groups, gather_labels
 from indexing.action.learning import Lesson, learn
 from indexing.action.model import ShapeModel
@@ -173,9 +173,9 @@ class ActionIndexer(SavedClassifier):
         extended = self.model_.exemplars.extended(cut(found, plan, rng))
         return self._learn(extended, known, numbers, self.skeleton_, both)
 
-    def _plan(self, views: int) -> Plan:
+    def _plan(self, views: int) -> ExemplarPlan:
         views = views if self.virtual_views is None else self.virtual_views
-        return Plan(self.length, self.search, views, self.view == "any", self.repair, self.window, self.stride)
+        return ExemplarPlan(self.length, self.search, views, self.view == "any", self.repair, self.window, self.stride)
 
     def _learn(
         self,

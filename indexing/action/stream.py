@@ -54,7 +54,7 @@ class Stream:
 
 
 @dataclass(frozen=True)
-class Scan:
+class StreamScan:
     """What the windows along a recording say, not pooled.
 
     times ``(T,)``, class scores ``(T, classes)``, motion ``(T,)``, whether anybody was there ``(T,)``, and in which of the
@@ -105,7 +105,7 @@ def check_rate(clip: Clip, window: float) -> None:
         )
 
 
-def scan(model: ShapeModel, clip: Clip, stream: Stream, progress: Progress = None) -> Scan:
+def scan(model: ShapeModel, clip: Clip, stream: Stream, progress: Progress = None) -> StreamScan:
     """Score the windows along a recording, block by block: memory does not grow with its length.
 
     Where frames are missing for longer than a window, the recording is cut, and no window reaches across: what it costs is
@@ -129,7 +129,7 @@ def scan(model: ShapeModel, clip: Clip, stream: Stream, progress: Progress = Non
         motion[part] = _motion(_windows(source, own, at[part], stream.window, stream.length))
         if progress is not None:
             progress(min(1.0, (begin + BLOCK) / len(at)))
-    found_ = Scan(at, scores, motion, _present(clip, cuts, at, owner, stream), cuts, owner)
+    found_ = StreamScan(at, scores, motion, _present(clip, cuts, at, owner, stream), cuts, owner)
     scores[~found_.present] = found_.nothing  # where nobody is seen nothing is said
     return found_
 
@@ -170,7 +170,7 @@ def _windows(source: Ragged, owner: Array, middle: Array, seconds: float, length
     return Windows(values, torch.from_numpy(source.seen[owner]))
 
 
-def frame_scores(clip: Clip, stream: Stream, found: Scan) -> Array:
+def frame_scores(clip: Clip, stream: Stream, found: StreamScan) -> Array:
     """``(frames, classes)``: the window scores, pooled and read off at the clip's own frames."""
     scores = np.full((len(clip), found.scores.shape[1]), found.nothing)
     for windows, frames in found.parts():
@@ -181,7 +181,7 @@ def frame_scores(clip: Clip, stream: Stream, found: Scan) -> Array:
 
 
 def find_events(
-    model: ShapeModel, clip: Clip, stream: Stream, windows: Scan, classes: Sequence[Any] | Array, rate: float | None
+    model: ShapeModel, clip: Clip, stream: Stream, windows: StreamScan, classes: Sequence[Any] | Array, rate: float | None
 ) -> list[Event]:
     """Events of a recording, each with the exemplar that fits its middle best.
 

@@ -37,7 +37,7 @@ def pose(base: Mapping[str, float] | None = None, **values: float) -> FloatArray
 
 
 @dataclass(frozen=True)
-class Move:
+class ActorMove:
     """One action as key poses.
 
     Args:
@@ -183,20 +183,20 @@ _CARRY = pose(r_elbow=88, r_flex=8, r_rot=22)
 _PICK = ((0.0, STAND), (0.15, STAND), (1.0, _REACH), (0.2, _REACH), (0.5, _LIFT), (0.5, _CARRY), (0.4, STAND))
 # fmt: on
 
-MOVES: dict[str, Move] = {
-    "walk": Move(_WALK, repeats=(2, 3), cycle=True),
-    "run": Move(_RUN, repeats=(3, 4), cycle=True),
-    "squat": Move(_SQUAT, loop=(1, 5)),
-    "lunge": Move(_LUNGE, loop=(1, 7), legs=0.4),
-    "jumping_jack": Move(_JACK, loop=(1, 7), repeats=(2, 3), legs=0.5),
-    "wave": Move(_WAVE, loop=(3, 5), repeats=(2, 4)),
-    "punch": Move(_PUNCH, loop=(3, 7), repeats=(1, 3)),
-    "kick": Move(_KICK, loop=(1, 8)),
-    "bow": Move(_BOW, loop=(1, 5)),
-    "sit_down": Move(_SIT, legs=0.15),
-    "stand_up": Move(_RISE, legs=0.15),
-    "throw": Move(_THROW, loop=(1, 8)),
-    "pick_up": Move(_PICK, loop=(1, 7), legs=0.1, reach=0.1),
+MOVES: dict[str, ActorMove] = {
+    "walk": ActorMove(_WALK, repeats=(2, 3), cycle=True),
+    "run": ActorMove(_RUN, repeats=(3, 4), cycle=True),
+    "squat": ActorMove(_SQUAT, loop=(1, 5)),
+    "lunge": ActorMove(_LUNGE, loop=(1, 7), legs=0.4),
+    "jumping_jack": ActorMove(_JACK, loop=(1, 7), repeats=(2, 3), legs=0.5),
+    "wave": ActorMove(_WAVE, loop=(3, 5), repeats=(2, 4)),
+    "punch": ActorMove(_PUNCH, loop=(3, 7), repeats=(1, 3)),
+    "kick": ActorMove(_KICK, loop=(1, 8)),
+    "bow": ActorMove(_BOW, loop=(1, 5)),
+    "sit_down": ActorMove(_SIT, legs=0.15),
+    "stand_up": ActorMove(_RISE, legs=0.15),
+    "throw": ActorMove(_THROW, loop=(1, 8)),
+    "pick_up": ActorMove(_PICK, loop=(1, 7), legs=0.1, reach=0.1),
 }
 ENDS = {"sit_down": (STAND, SEATED), "stand_up": (SEATED, STAND)}  # poses before and after; the others start and end standing
 
@@ -333,14 +333,14 @@ def dataset(
     return ClipSet(clips, "actors")
 
 
-def _move(action: str) -> Move:
+def _move(action: str) -> ActorMove:
     if action not in MOVES:
         raise ValueError(f"unknown action {action!r}; the actors know: {', '.join(ACTIONS)}")
     return MOVES[action]
 
 
 def _angles(
-    move: Move, action: str, person: Person, fps: float, repeats: int | None, rng: np.random.Generator | None
+    move: ActorMove, action: str, person: Person, fps: float, repeats: int | None, rng: np.random.Generator | None
 ) -> FloatArray:
     """``(frames, channels)`` the person's way of doing it, before idle sway."""
     if not (np.isfinite(fps) and fps > 0):
@@ -370,7 +370,7 @@ def _angles(
     return limited(mirrored(angles) if person.handed < 0 else angles)
 
 
-def _gain(move: Move, person: Person, habit: FloatArray, chance: FloatArray) -> FloatArray:
+def _gain(move: ActorMove, person: Person, habit: FloatArray, chance: FloatArray) -> FloatArray:
     """``(channels,)`` how far this execution goes beyond (> 1) or stays behind (< 1) the average one."""
     size = np.log(person.amplitude) + 0.05 * chance[4]
     arms = 0.6 * size + 0.08 * habit[4] + 0.04 * chance[6]

@@ -14,7 +14,7 @@ from sklearn.utils.validation import check_is_fitted
 from dyntorch import one_thread
 from indexing.action.inputs import check_device, check_labels, check_reject, is_number
 from indexing.brightness.footage import Footage, footage, gather
-from indexing.brightness.library import Exemplars, library
+from indexing.brightness.library import VideoExemplars, library
 from indexing.brightness.sight import LENGTH, SMALLEST, Optics
 from indexing.brightness.stream import (
     BrightnessStream,
@@ -176,12 +176,12 @@ class BrightnessIndexer(SavedClassifier):
         labels = torch.cat([torch.from_numpy(numbers[:old]), more.labels])
         return self._learn(self.exemplars_.extended(more, labels), known)
 
-    def _exemplars(self, videos: list[Footage], numbers: Array) -> Exemplars:
+    def _exemplars(self, videos: list[Footage], numbers: Array) -> VideoExemplars:
         views = learned(videos, self._optics())
         labels = np.repeat(numbers, [len(each) for each in views])
-        return Exemplars.of([one for each in views for one in each], torch.from_numpy(labels))
+        return VideoExemplars.of([one for each in views for one in each], torch.from_numpy(labels))
 
-    def _learn(self, exemplars: Exemplars, classes: Array) -> Self:
+    def _learn(self, exemplars: VideoExemplars, classes: Array) -> Self:
         """Learn everything, and only then change anything."""
         if self.reject is not None and self.none_label in classes.tolist():
             raise ValueError(f"none_label={self.none_label!r} is one of the learned labels; choose another for rejected videos")
@@ -194,7 +194,7 @@ class BrightnessIndexer(SavedClassifier):
         self._calibrate()
         return self
 
-    def _recognizer(self, exemplars: Exemplars, classes: int, flip: bool) -> Recognizer:
+    def _recognizer(self, exemplars: VideoExemplars, classes: int, flip: bool) -> Recognizer:
         window, pool = max(FEWEST, self.window * self.fps), max(1.0, self.pool * self.fps)
         placed = library(exemplars.to(self.device), classes, flip)
         return Recognizer(self._optics(), placed, window, pool)
@@ -336,7 +336,7 @@ def _known(parameters: dict[str, Any]) -> dict[str, Any]:
     return known
 
 
-def _exemplars(parts: Parts, classes: int) -> Exemplars:
+def _exemplars(parts: Parts, classes: int) -> VideoExemplars:
     if classes < 2:
         raise ValueError(f"{classes} class")
     lengths = parts.whole("lengths", None, below=FRAMES)
@@ -344,4 +344,4 @@ def _exemplars(parts: Parts, classes: int) -> Exemplars:
     labels = parts.every("labels", len(lengths), below=classes)
     if not bool((lengths > 0).all()):
         raise ValueError("lengths: a video without frames")
-    return Exemplars(motion.float(), lengths, labels)
+    return VideoExemplars(motion.float(), lengths, labels)

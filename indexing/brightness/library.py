@@ -17,7 +17,7 @@ Frames named rightly (shares .3 .1 .5 .1), exercises at 0 / 60, arm raises: 560:
 
 
 @dataclass(frozen=True)
-class Exemplars:
+class VideoExemplars:
     """Learned videos, one after the other.
 
     Attributes:
@@ -31,19 +31,19 @@ class Exemplars:
     labels: Tensor
 
     @classmethod
-    def of(cls, videos: list[Tensor], labels: Tensor) -> Exemplars:
+    def of(cls, videos: list[Tensor], labels: Tensor) -> VideoExemplars:
         """Of the descriptors of each video."""
         return cls(torch.cat(videos), torch.tensor([len(one) for one in videos]), labels)
 
-    def extended(self, others: Exemplars, labels: Tensor) -> Exemplars:
+    def extended(self, others: VideoExemplars, labels: Tensor) -> VideoExemplars:
         """With further videos; ``labels`` are those of all."""
-        return Exemplars(torch.cat([self.motion, others.motion]), torch.cat([self.lengths, others.lengths]), labels)
+        return VideoExemplars(torch.cat([self.motion, others.motion]), torch.cat([self.lengths, others.lengths]), labels)
 
     def videos(self) -> list[Tensor]:
         """Descriptors of each video."""
         return list(self.motion.split(self.lengths.tolist()))
 
-    def to(self, device: str) -> Exemplars:
+    def to(self, device: str) -> VideoExemplars:
         """The same on another device."""
         return replace(self, motion=self.motion.to(device))
 
@@ -65,7 +65,7 @@ class Library:
     basis: Tensor
 
 
-def library(exemplars: Exemplars, classes: int, flip: bool) -> Library:
+def library(exemplars: VideoExemplars, classes: int, flip: bool) -> Library:
     """Lay out the tracks of all exemplars, mirrored ones too where ``flip``."""
     videos, labels = exemplars.videos(), exemplars.labels.tolist()
     rows, gaps, bounds, at = [], [], [0] * (classes + 1), 0

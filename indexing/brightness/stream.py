@@ -14,7 +14,7 @@ from torch import Tensor
 from dyntorch import one_thread
 from indexing.action.stream import EXTENT, FALSE_ALARMS
 from indexing.brightness.footage import Footage, Resampler
-from indexing.brightness.library import Exemplars, Library
+from indexing.brightness.library import Library, VideoExemplars
 from indexing.brightness.sight import Optics, Sight, mirrored, together
 from indexing.scoring import Event, event_levels, events
 
@@ -233,7 +233,7 @@ LEAST = 0.02  # contrast that an event needs: two or three classes have little t
 CLEAR = 0.02  # of the score: mirrored exemplars that look that much more like another action make left and right matter
 
 
-def wrong_evidence(source: Recognizer, exemplars: Exemplars) -> tuple[torch.Tensor, Array]:
+def wrong_evidence(source: Recognizer, exemplars: VideoExemplars) -> tuple[torch.Tensor, Array]:
     """What exemplars find in other actions: the evidence of each ``(videos,)``, the contrast of moving frames ``(frames,)``."""
     best, contrasts = [], []
     for i in _asked(exemplars):
@@ -246,7 +246,7 @@ def wrong_evidence(source: Recognizer, exemplars: Exemplars) -> tuple[torch.Tens
     return torch.tensor(best), np.concatenate(contrasts)
 
 
-def mirrors_matter(source: Recognizer, exemplars: Exemplars) -> bool:
+def mirrors_matter(source: Recognizer, exemplars: VideoExemplars) -> bool:
     """Whether some exemplar's mirror image looks clearly more like another action than like its own.
 
     Args:
@@ -269,7 +269,7 @@ def found_events(scores: Array, times: Array, energy: Array, classes: Array, wro
     return events(contrast, times, classes.tolist(), peak, floor, energy < QUIET)
 
 
-def _asked(exemplars: Exemplars) -> list[int]:
+def _asked(exemplars: VideoExemplars) -> list[int]:
     """Exemplars to ask, spread over all of them."""
     count = len(exemplars.labels)
     return sorted({round(i) for i in np.linspace(0, count - 1, min(count, MOST))})

@@ -151,28 +151,28 @@ def read_part(example: Example, reading: Reading) -> tuple[Any, float]:
 
 
 @dataclass(frozen=True)
-class Recording:
+class FilmRecording:
     """A video to search, and what to call it."""
 
     name: str
     source: Any
 
 
-def read_films(paths: Sequence[Path], reading: Reading) -> tuple[list[Recording], list[str]]:
+def read_films(paths: Sequence[Path], reading: Reading) -> tuple[list[FilmRecording], list[str]]:
     """Videos, and the films of sets, with names that differ, and what a person should know about them."""
     from indexing.readers.clipset import holds_frames
     from indexing.video import read_video
 
-    found: list[Recording] = []
+    found: list[FilmRecording] = []
     notes: list[str] = []
     for path in paths:
         if holds_frames(path):
-            found += [Recording(film.name, AsTheyAre().exemplar(film, i)) for i, film in enumerate(read_set(path, reading))]
+            found += [FilmRecording(film.name, AsTheyAre().exemplar(film, i)) for i, film in enumerate(read_set(path, reading))]
             continue
         video = read_video(path.expanduser(), fps=reading.fps)
         notes += [f"{path}: {note}" for note in video.info.notes]
         twice = [other.name for other in paths].count(path.name) > 1
-        found.append(Recording(str(path) if twice else path.name, video))
+        found.append(FilmRecording(str(path) if twice else path.name, video))
     return found, notes
 
 

@@ -165,7 +165,7 @@ def _show(clips: list[Clip]) -> None:
 if TYPE_CHECKING:
     from indexing.action.indexer import ActionIndexer
     from indexing.brightness.indexer import BrightnessIndexer
-    from indexing.cli.films import Recording
+    from indexing.cli.films import FilmRecording
     from indexing.clip import Clip
     from indexing.report import RecordingResult
 
@@ -245,7 +245,7 @@ class Scan:
         notes += [*remarks(clips, self.reading), *on_gaps(clips), *on_classes([str(label) for label in indexer.classes_])]
         return indexer, clips, notes + assumed(clips)
 
-    def _films(self) -> tuple[BrightnessIndexer, list[Recording], list[str]]:
+    def _films(self) -> tuple[BrightnessIndexer, list[FilmRecording], list[str]]:
         from indexing.brightness.indexer import BrightnessIndexer
         from indexing.cli.films import read_films
 

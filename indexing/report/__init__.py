@@ -5,13 +5,13 @@ Importing this package loads neither matplotlib nor scikit-learn nor torch; they
 
 from indexing.files import manifest, prepare, write_bytes, write_json, write_text
 from indexing.report.recognition import write_recognition
-from indexing.report.results import EvaluationResult, Event, RecognitionReport, RecordingResult
+from indexing.report.results import EvaluationResult, RecognitionReport, RecordingResult, ReportedEvent
 
 __all__ = [
     "EvaluationResult",
-    "Event",
     "RecognitionReport",
     "RecordingResult",
+    "ReportedEvent",
     "manifest",
     "prepare",
     "write_bytes",

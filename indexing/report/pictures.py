@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from indexing.report.canvas import LIGHT, Theme, cmap, columns, new_figure, png, shorten, shorten_all, style
 from indexing.report.page import Tip
-from indexing.report.results import Event, Truth
+from indexing.report.results import ReportedEvent, Truth
 
 COLUMNS = 1400  # score values drawn along the time axis: about one per pixel
 # White text on these reads at 4.5:1 or better; any two are at least 13 apart in CIELAB, as are no more than about 18 such colours.
@@ -77,7 +77,7 @@ class _Layout:
 
 
 def _layout(
-    seconds: NDArray[np.float64], classes: Sequence[object], events: Sequence[Event], truth: Sequence[Truth] | None
+    seconds: NDArray[np.float64], classes: Sequence[object], events: Sequence[ReportedEvent], truth: Sequence[Truth] | None
 ) -> _Layout:
     found = [(str(event.label), float(event.start), float(event.end)) for event in events]
     known = None if truth is None else [(str(label), float(start), float(end)) for label, start, end in truth]
@@ -92,7 +92,7 @@ def _layout(
 
 
 def timeline_tips(
-    times: ArrayLike, classes: Sequence[object], events: Sequence[Event] = (), truth: Sequence[Truth] | None = None
+    times: ArrayLike, classes: Sequence[object], events: Sequence[ReportedEvent] = (), truth: Sequence[Truth] | None = None
 ) -> list[Tip]:
     """What :func:`timeline` draws as bars, and where: for names that do not fit."""
     at = _layout(np.asarray(times, dtype=np.float64), classes, events, truth)
@@ -154,7 +154,7 @@ def timeline(
     times: ArrayLike,
     scores: ArrayLike,
     classes: Sequence[object],
-    events: Sequence[Event] = (),
+    events: Sequence[ReportedEvent] = (),
     truth: Sequence[Truth] | None = None,
     *,
     theme: Theme = LIGHT,

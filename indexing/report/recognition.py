@@ -18,7 +18,7 @@ from indexing.report import pictures
 from indexing.report.canvas import DARK, LIGHT, letters_without_font, strip
 from indexing.report.page import Card, Column, bar, cards, details, escape, even, made_by, page, picture, section, settings, table
 from indexing.report.pictures import timeline_tips
-from indexing.report.results import Event, RecognitionReport, RecordingResult, confused_with, measure, missed, overlapping
+from indexing.report.results import RecognitionReport, RecordingResult, ReportedEvent, confused_with, measure, missed, overlapping
 
 # ----------------------------------------------------------------------------------------------------------------------
 # The sections of the recognition report, as HTML.
@@ -178,12 +178,12 @@ def _events(report: RecognitionReport, recording: RecordingResult, before: int) 
     return html
 
 
-def _found(clip: Clip, event: Event) -> str:
+def _found(clip: Clip, event: ReportedEvent) -> str:
     alt = f"Key frames of {event.label} found at {event.start:.1f} to {event.end:.1f} s"
     return strip(clip, event.start, event.end, alt=alt) or '<span class="none">no joint seen</span>'
 
 
-def _example(clip: Clip | None, event: Event) -> str:
+def _example(clip: Clip | None, event: ReportedEvent) -> str:
     drawn = strip(clip, alt=f"Key frames of the example of {event.label}") if clip is not None else ""
     return drawn or '<span class="none">not given</span>'
 
@@ -195,7 +195,7 @@ def _legend(html: str) -> str:
     return f'<p class="note">{key.format("l")} left limbs &ensp;{key.format("r")} right limbs</p>'
 
 
-def _verdict(event: Event, known: str | None) -> str:
+def _verdict(event: ReportedEvent, known: str | None) -> str:
     if known == str(event.label):
         return '<span class="good">✓ agrees</span>'
     return f'<span class="bad">✗ {"nothing known here" if known is None else f"is {escape(known)}"}</span>'
@@ -250,7 +250,7 @@ def _confusion(measured: Mapping[str, Any], drawn: tuple[bytes, bytes]) -> str:
     return section("What is taken for what", picture(drawn[0], alt, dark=drawn[1]), note)
 
 
-def _when(event: Event) -> str:
+def _when(event: ReportedEvent) -> str:
     clock = f" · {_clock(event.start)}" if event.end >= 60 else ""
     return f"{event.start:.2f} to {event.end:.2f} s<small>{event.end - event.start:.1f} s long{clock}</small>"
 

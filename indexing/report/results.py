@@ -17,7 +17,7 @@ from indexing.clip import Clip
 Truth = tuple[Hashable, float, float]
 
 
-class Event(Protocol):
+class ReportedEvent(Protocol):
     """An action found in a recording; any object with these attributes will do (``exemplar`` may be absent or ``None``)."""
 
     @property
@@ -54,7 +54,7 @@ class RecordingResult:
     times: NDArray[np.floating[Any]]
     classes: Sequence[Hashable]
     scores: NDArray[np.floating[Any]]
-    events: Sequence[Event] = ()
+    events: Sequence[ReportedEvent] = ()
     truth: Sequence[Truth] | None = None
 
     def __post_init__(self) -> None:
@@ -136,7 +136,7 @@ class RecognitionReport:
     notes: Sequence[str] = ()
     manifest: Mapping[str, Any] = field(default_factory=dict)
 
-    def exemplar(self, event: Event) -> Clip | None:
+    def exemplar(self, event: ReportedEvent) -> Clip | None:
         """The clip that an event is shown beside."""
         known = self.exemplars.get(event.label)
         if known is None or isinstance(known, Clip):
@@ -234,7 +234,7 @@ def wilson(share: float, number: int) -> tuple[float, float]:
     return max(0.0, middle - half), min(1.0, middle + half)
 
 
-def overlapping(event: Event, truth: Sequence[Truth]) -> str | None:
+def overlapping(event: ReportedEvent, truth: Sequence[Truth]) -> str | None:
     """The known action that shares most time with an event; of equals, the one with the event's own label.  None = no one."""
     own = str(event.label)
     shared = [(min(event.end, end) - max(event.start, start), str(label) == own, str(label)) for label, start, end in truth]
@@ -244,7 +244,7 @@ def overlapping(event: Event, truth: Sequence[Truth]) -> str | None:
 
 def missed(recording: RecordingResult) -> list[Truth]:
     """Known actions that no event of the same label overlaps."""
-    by_label: dict[str, list[Event]] = {}
+    by_label: dict[str, list[ReportedEvent]] = {}
     for event in recording.events:
         by_label.setdefault(str(event.label), []).append(event)
     return [

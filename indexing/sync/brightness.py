@@ -14,9 +14,9 @@ from dyntorch import Shift, on_cpu, one_thread
 from indexing.sync.gray import (
     FEWEST,
     HALF,
+    GrayTake,
     Region,
     Sampled,
-    Take,
     boxes,
     common_rate,
     kernel_descriptors,
@@ -383,7 +383,7 @@ def brightness_shift(
     return _shift((first, second), (one, two), verdict, "; ".join(filter(None, (why_a, why_b))), notes_a + notes_b)
 
 
-def _takes(a: Any, b: Any, fps: tuple[float, float] | None, times: tuple[Any, Any] | None) -> tuple[Take, Take]:
+def _takes(a: Any, b: Any, fps: tuple[float, float] | None, times: tuple[Any, Any] | None) -> tuple[GrayTake, GrayTake]:
     for name, pair in (("fps", fps), ("times", times)):
         if pair is not None and not (isinstance(pair, (tuple, list)) and len(pair) == 2):
             raise ValueError(f"{name} must be a pair, one for each video, got {pair!r}")
@@ -391,7 +391,7 @@ def _takes(a: Any, b: Any, fps: tuple[float, float] | None, times: tuple[Any, An
     return take(a, "a", rates[0], stamps[0]), take(b, "b", rates[1], stamps[1])
 
 
-def _prepared(source: Take, region: str | Region | None, rate: float) -> tuple[Sampled, str, tuple[str, ...]]:
+def _prepared(source: GrayTake, region: str | Region | None, rate: float) -> tuple[Sampled, str, tuple[str, ...]]:
     """A take on the grid, why it decides nothing (else empty), and what else to know of it."""
     height, width = source.frames.shape[1:]
     found = motion(source.frames, None if region is None else _inside(region, source))
@@ -410,7 +410,7 @@ def _prepared(source: Take, region: str | Region | None, rate: float) -> tuple[S
     return on_grid, "", (f"{name}: motion crosses the image; a moving box follows it",) if moving else ()
 
 
-def _inside(region: str | Region, source: Take) -> Region | None:
+def _inside(region: str | Region, source: GrayTake) -> Region | None:
     if isinstance(region, str):
         if region != "motion":
             raise ValueError(f"region must be 'motion', None or (x0, y0, x1, y1) in pixels, got {region!r}")
@@ -425,7 +425,9 @@ def _inside(region: str | Region, source: Take) -> Region | None:
     return x0, y0, x1, y1
 
 
-def _shift(takes: tuple[Take, Take], grids: tuple[Sampled, Sampled], verdict: Verdict, why: str, notes: tuple[str, ...]) -> Shift:
+def _shift(
+    takes: tuple[GrayTake, GrayTake], grids: tuple[Sampled, Sampled], verdict: Verdict, why: str, notes: tuple[str, ...]
+) -> Shift:
     (one, two), curve, best = grids, verdict.curve, verdict.best
     rate, base = one.rate, two.start - one.start
     found = curve.peaks(APART // 2)[:PEAKS]

@@ -102,7 +102,7 @@ SMALLEST = 16  # px of the shorter side
 
 
 @dataclass(frozen=True, eq=False)
-class Take:
+class GrayTake:
     """What is kept of a video.
 
     Attributes:
@@ -123,7 +123,7 @@ class Take:
         return float(1 / self.times.diff().median())
 
 
-def take(source: Any, name: str, fps: float | None = None, times: Any = None) -> Take:
+def take(source: Any, name: str, fps: float | None = None, times: Any = None) -> GrayTake:
     """Read a video once.
 
     Args:
@@ -151,7 +151,7 @@ def take(source: Any, name: str, fps: float | None = None, times: Any = None) ->
         small = [spool.bytes(source[begin : begin + FOOTAGE_BLOCK]) for begin in range(0, max(len(source), 1), FOOTAGE_BLOCK)]
         spool.check()
         frames = torch.cat(small)
-    return Take(frames, _times(times, fps, len(frames), name), spool.scale, name)
+    return GrayTake(frames, _times(times, fps, len(frames), name), spool.scale, name)
 
 
 def _parts(source: Any, name: str) -> Iterator[Any]:
@@ -295,7 +295,7 @@ Region = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
-class Motion:
+class GrayMotion:
     """Where something moves.
 
     Attributes:
@@ -320,7 +320,7 @@ class Motion:
         return self.rows.sum(1) / (self.rows.shape[1] * self.columns.shape[1])
 
 
-def motion(frames: Tensor, region: Region | None = None) -> Motion:
+def motion(frames: Tensor, region: Region | None = None) -> GrayMotion:
     """What moves in frames ``(T, h, w)``, in a region ``(x0, y0, x1, y1)`` of their pixels, after the background's own motion."""
     rows, columns, changed, steps, lost = [], [], [], [], []
     for begin in range(0, len(frames), BOX_BLOCK):
@@ -340,10 +340,10 @@ def motion(frames: Tensor, region: Region | None = None) -> Motion:
         changed.append((change > 0).double().mean((1, 2)))
         steps.append(camera.step)
         lost.append(camera.lost)
-    return Motion(torch.cat(rows), torch.cat(columns), torch.cat(changed), Drift(torch.cat(steps), torch.cat(lost)))
+    return GrayMotion(torch.cat(rows), torch.cat(columns), torch.cat(changed), Drift(torch.cat(steps), torch.cat(lost)))
 
 
-def boxes(found: Motion, fps: float) -> tuple[Tensor, bool]:
+def boxes(found: GrayMotion, fps: float) -> tuple[Tensor, bool]:
     """``(T, 3)`` centre x, centre y and side in pixels of the square about what moves, frame by frame, and whether it moves.
 
     One box for the take, or, where a person crosses the image, one of constant size that follows the person smoothly.
@@ -490,13 +490,13 @@ class Sampled:
         return Sampled(reversed_profile(self.profile), self.kernels.flip(0, 1, 2), self.start, self.rate)
 
 
-def common_rate(first: Take, second: Take) -> float:
+def common_rate(first: GrayTake, second: GrayTake) -> float:
     """The rate of the slower video, or a whole fraction of it."""
     rate = min(first.fps, second.fps)
     return rate / -(-rate // FASTEST)
 
 
-def sampled(source: Take, where: Tensor, rate: float) -> Sampled:
+def sampled(source: GrayTake, where: Tensor, rate: float) -> Sampled:
     """Profile and kernels of a take in boxes ``(T, 3)`` of its frames, block by block."""
     start = float(source.times[0])
     count = int((float(source.times[-1]) - start) * rate + 1e-6) + 1
@@ -513,7 +513,7 @@ def sampled(source: Take, where: Tensor, rate: float) -> Sampled:
     return Sampled(torch.cat(profiles), torch.cat(kernels), start, rate)
 
 
-def _crops(source: Take, where: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
+def _crops(source: GrayTake, where: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
     """Crops at any times, blended from the frames before and after, and whether these are near enough."""
     stamps = source.times
     after = torch.searchsorted(stamps, times - 1e-9).clamp(1, len(stamps) - 1)

@@ -38,7 +38,7 @@ CONVERGED = 1e-9  # relative decrease of the cost
 
 
 @dataclass(frozen=True)
-class Sightings:
+class RigidSightings:
     """Points of three poses in one common unit; leading dimensions broadcast against those of the motions.
 
     Attributes:
@@ -58,7 +58,7 @@ class Sightings:
         """Degrees of freedom of the residual of one moving point."""
         return MOTIONS[self.motion]
 
-    def sample(self, index: Tensor) -> Sightings:
+    def sample(self, index: Tensor) -> RigidSightings:
         """The matches ``index (b, k, m)`` of sightings ``(b, 1, n, 3)``: k small problems for each."""
         k = index.shape[1]
 
@@ -66,18 +66,18 @@ class Sightings:
             return x.expand(-1, k, -1, -1).gather(2, index[..., None].expand(-1, -1, -1, 3))
 
         weights = self.weights.expand(-1, k, -1).gather(2, index)
-        return Sightings(pick(self.x1), pick(self.x2), pick(self.x3), weights, self.motion)
+        return RigidSightings(pick(self.x1), pick(self.x2), pick(self.x3), weights, self.motion)
 
-    def flat(self, lead: torch.Size) -> Sightings:
+    def flat(self, lead: torch.Size) -> RigidSightings:
         """Expanded to the leading dimensions and flattened to one."""
 
         def spread(x: Tensor, tail: int) -> Tensor:
             return x.expand(*lead, *x.shape[-tail:]).reshape(-1, *x.shape[-tail:])
 
-        return Sightings(spread(self.x1, 2), spread(self.x2, 2), spread(self.x3, 2), spread(self.weights, 1), self.motion)
+        return RigidSightings(spread(self.x1, 2), spread(self.x2, 2), spread(self.x3, 2), spread(self.weights, 1), self.motion)
 
 
-def combinations(motions: Tensor, data: Sightings) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def combinations(motions: Tensor, data: RigidSightings) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """The combinations u and v of each match, and the points y2 and y3 in the frame of view 1, ``(..., n, 3)`` each.
 
     Args:
@@ -97,14 +97,14 @@ def turn(u: Tensor, v: Tensor, motion: str) -> tuple[Tensor, Tensor]:
     return angle.cos(), angle.sin()
 
 
-def squares(motions: Tensor, data: Sightings) -> tuple[Tensor, Tensor]:
+def squares(motions: Tensor, data: RigidSightings) -> tuple[Tensor, Tensor]:
     """Squared residuals ``(..., n)`` of each match as a moving point, and as a static one."""
     u, v, _, _ = combinations(motions, data)
     cos, sin = turn(u, v, data.motion)
     return (cos * v - sin * u).square().sum(-1), u.square().sum(-1) + v.square().sum(-1)
 
 
-def normal_equations(motions: Tensor, data: Sightings, weights: Tensor, still: Tensor | None) -> tuple[Tensor, Tensor]:
+def normal_equations(motions: Tensor, data: RigidSightings, weights: Tensor, still: Tensor | None) -> tuple[Tensor, Tensor]:
     r"""Gradient ``(..., 12)`` and Gauss-Newton matrix in the tangents :math:`(\omega_A, \tau_A, \omega_B, \tau_B)`.
 
     The turn of u and v is held (variable projection): the gradient stays exact, because the residual is normal to the line.
@@ -138,7 +138,7 @@ def normal_equations(motions: Tensor, data: Sightings, weights: Tensor, still: T
 
 
 def descend(
-    motions: Tensor, data: Sightings, *, scale: Tensor | None = None, still: Tensor | None = None, iterations: int = 20
+    motions: Tensor, data: RigidSightings, *, scale: Tensor | None = None, still: Tensor | None = None, iterations: int = 20
 ) -> tuple[Tensor, Tensor]:
     r"""Levenberg-Marquardt over two rigid motions, for a whole batch of problems.
 
@@ -235,7 +235,7 @@ class Rigid:
 
 
 def search(
-    data: Sightings,
+    data: RigidSightings,
     sigma: Tensor | None,
     still: Tensor | None,
     starts: Tensor,
@@ -261,14 +261,14 @@ def search(
 
     def run(*block: Tensor) -> tuple[Tensor, ...]:
         x1, x2, x3, weights, held, noise, picked, given = block
-        part = Sightings(x1[:, None], x2[:, None], x3[:, None], weights[:, None], data.motion)
+        part = RigidSightings(x1[:, None], x2[:, None], x3[:, None], weights[:, None], data.motion)
         found = _search(part, None if sigma is None else noise, held, picked, given, floor)
         return found.motions, found.sigma, found.information, found.inliers, found.still, found.grounded
 
     return Rigid(*map_blocks(run, data.x1, data.x2, data.x3, data.weights, flags, known, order, starts, size=PROBLEMS))
 
 
-def _search(data: Sightings, sigma: Tensor | None, held: Tensor, order: Tensor, given: Tensor, floor: float) -> Rigid:
+def _search(data: RigidSightings, sigma: Tensor | None, held: Tensor, order: Tensor, given: Tensor, floor: float) -> Rigid:
     """One block: sightings ``(b, 1, n, 3)``."""
     candidates = torch.cat([given, _all(data)[:, None], *_samples(data, order)], dim=1)
     moving, static = squares(candidates, data)
@@ -287,7 +287,7 @@ def _search(data: Sightings, sigma: Tensor | None, held: Tensor, order: Tensor, 
     noise = noise if sigma is not None else noise.amin(1, keepdim=True).expand_as(noise)
     winner = _score(*squares(motions, data), held, data, noise).argmin(1)
     first = torch.arange(len(winner), device=winner.device)
-    flat = Sightings(data.x1[:, 0], data.x2[:, 0], data.x3[:, 0], data.weights[:, 0], data.motion)
+    flat = RigidSightings(data.x1[:, 0], data.x2[:, 0], data.x3[:, 0], data.weights[:, 0], data.motion)
     grounded = held.any(-1) if data.motion == "constant_velocity" else torch.ones_like(held[:, 0])
     found = _settle(motions[first, winner], flat, noise[first, winner], sigma is None, held, grounded, floor)
     if data.motion == "straight":
@@ -300,13 +300,13 @@ def _search(data: Sightings, sigma: Tensor | None, held: Tensor, order: Tensor, 
     return _settle(found.motions, flat, found.sigma, sigma is None, held, grounded | standing, floor)
 
 
-def _all(data: Sightings) -> Tensor:
+def _all(data: RigidSightings) -> Tensor:
     """The motions that carry all matches onto each other, as if none moved, ``(b, 2, 4, 4)``."""
     x1, w = data.x1[:, 0], data.weights[:, 0]
     return torch.stack([rigid_alignment(x1, data.x2[:, 0], w), rigid_alignment(x1, data.x3[:, 0], w)], dim=1)
 
 
-def _samples(data: Sightings, order: Tensor) -> tuple[Tensor, Tensor]:
+def _samples(data: RigidSightings, order: Tensor) -> tuple[Tensor, Tensor]:
     """Motions from samples of 3 static matches, and of a few moving ones."""
     found = []
     for index, still in ((order[:, :STATIC_STARTS, :3], True), (order[:, STATIC_STARTS:], False)):
@@ -316,7 +316,7 @@ def _samples(data: Sightings, order: Tensor) -> tuple[Tensor, Tensor]:
     return found[0], found[1]
 
 
-def _scales(moving: Tensor, data: Sightings, floor: float) -> Tensor:
+def _scales(moving: Tensor, data: RigidSightings, floor: float) -> Tensor:
     """Noise ``(b, k)`` from the median of squared residuals, less the parameters that these have absorbed."""
     present = data.weights > 0
     count = present.sum(-1)
@@ -327,7 +327,7 @@ def _scales(moving: Tensor, data: Sightings, floor: float) -> Tensor:
     return (middle / (median(data.conditions) * spare)).sqrt().clamp(min=floor)
 
 
-def _score(moving: Tensor, static: Tensor, held: Tensor, data: Sightings, sigma: Tensor) -> Tensor:
+def _score(moving: Tensor, static: Tensor, held: Tensor, data: RigidSightings, sigma: Tensor) -> Tensor:
     """Description length ``(b, k)``: every match is static, moving or an outlier, whichever is cheapest."""
     square = sigma.square()[..., None]
     free = 6 - data.conditions
@@ -338,7 +338,9 @@ def _score(moving: Tensor, static: Tensor, held: Tensor, data: Sightings, sigma:
     return (cost * (data.weights > 0)).sum(-1)
 
 
-def _settle(motions: Tensor, data: Sightings, sigma: Tensor, estimate: bool, held: Tensor, grounded: Tensor, floor: float) -> Rigid:
+def _settle(
+    motions: Tensor, data: RigidSightings, sigma: Tensor, estimate: bool, held: Tensor, grounded: Tensor, floor: float
+) -> Rigid:
     """Least squares over the matches that belong to the model, static ones as such, until they do not change."""
     present = data.weights > 0
     for _ in range(ROUNDS):
@@ -355,7 +357,7 @@ def _settle(motions: Tensor, data: Sightings, sigma: Tensor, estimate: bool, hel
     return Rigid(motions, sigma, information, inliers, still, grounded)
 
 
-def _noise(motions: Tensor, data: Sightings, inliers: Tensor, still: Tensor, grounded: Tensor, before: Tensor) -> Tensor:
+def _noise(motions: Tensor, data: RigidSightings, inliers: Tensor, still: Tensor, grounded: Tensor, before: Tensor) -> Tensor:
     """Noise of one coordinate from the residuals of the inliers; as before where too few are left."""
     moving, static = squares(motions, data)
     total = torch.where(inliers, torch.where(still, static, moving), 0.0).sum(-1)
@@ -372,7 +374,7 @@ def drifted(motions: Tensor, velocity: Tensor) -> Tensor:
     return motions - shift
 
 
-def common_velocity(found: Rigid, data: Sightings) -> tuple[Tensor, Tensor]:
+def common_velocity(found: Rigid, data: RigidSightings) -> tuple[Tensor, Tensor]:
     """The velocity ``(b, 3)`` that most matches share, in the frame of view 1 and per step, and how many do, ``(b,)``.
 
     Where fewer than 3 share one it is the mean velocity of the inliers.
@@ -423,7 +425,7 @@ def align_rigid(data: Matches, threshold: float | None, motion: str, generator: 
     weights = data.weights / data.weights.amax(-1, keepdim=True).clamp(min=torch.finfo(torch.float64).tiny)
     centres, scale = _frame(data.views, weights)
     x1, x2, x3 = ((x - c[:, None]) * scale[:, None, None] for x, c in zip(data.views, centres, strict=True))
-    sightings = Sightings(x1, x2, x3, weights, motion)
+    sightings = RigidSightings(x1, x2, x3, weights, motion)
     sigma = None if threshold is None else threshold / SIGMAS * scale
     none = x1.new_zeros(len(x1), 0, 2, 4, 4)
     starts = none if data.static is None else _from_static(sightings, data.static & (weights > 0))
@@ -439,13 +441,13 @@ def _frame(views: tuple[Tensor, ...], weights: Tensor) -> tuple[list[Tensor], Te
     return list(centres[..., 0, :]), torch.where(spread > 0, 1 / torch.where(spread > 0, spread, 1.0), 1.0)
 
 
-def _from_static(data: Sightings, known: Tensor) -> Tensor:
+def _from_static(data: RigidSightings, known: Tensor) -> Tensor:
     """``(b, 1, 2, 4, 4)`` motions of the labelled static matches, of all where there are fewer than three."""
     weights = torch.where((known.sum(-1) >= 3)[:, None], data.weights * known, data.weights)
     return torch.stack([rigid_alignment(data.x1, x, weights) for x in (data.x2, data.x3)], dim=1)[:, None]
 
 
-def _result(data: Matches, sightings: Sightings, found: Rigid, centres: list[Tensor], scale: Tensor) -> Alignment:
+def _result(data: Matches, sightings: RigidSightings, found: Rigid, centres: list[Tensor], scale: Tensor) -> Alignment:
     motion = sightings.motion
     labels = _labels(sightings, found)
     dof = torch.where(found.grounded, 12, 9)
@@ -477,7 +479,7 @@ def _result(data: Matches, sightings: Sightings, found: Rigid, centres: list[Ten
     )
 
 
-def _labels(data: Sightings, found: Rigid) -> Tensor:
+def _labels(data: RigidSightings, found: Rigid) -> Tensor:
     moving, static = squares(found.motions, data)
     square = found.sigma.square()[:, None]
     still = found.still & (static <= three_sigma(6) * square)

@@ -24,7 +24,7 @@ PLANE_MATCHES, BODY_MATCHES = 4, 7
 
 
 @dataclass(frozen=True)
-class Given:
+class GivenPlanes:
     """All that is given, in normalized coordinates, with one flat batch.
 
     Attributes:
@@ -42,8 +42,8 @@ class Given:
 
     homographies: Tensor
     fundamentals: Tensor
-    planes: Sightings
-    bodies: Sightings
+    planes: PlaneSightings
+    bodies: PlaneSightings
     matched: bool
     frames: Pair
     measured: Tensor
@@ -52,7 +52,7 @@ class Given:
     like: Tensor
 
     @staticmethod
-    def of(H: Tensor, F: Tensor, planes: Pair | None, bodies: Pair | None, calibration: Tensor | None) -> Given:
+    def of(H: Tensor, F: Tensor, planes: Pair | None, bodies: Pair | None, calibration: Tensor | None) -> GivenPlanes:
         """Checked matrices, with the matches where there are any."""
         # a device without float64 lends its data to the CPU and gets the result back
         home = torch.device("cpu") if H.device.type == "mps" else H.device
@@ -74,7 +74,9 @@ class Given:
         else:
             frames = frames_of_matrices(h, f)
         hn, fn = normalized(h, frames), normalized_fundamentals(f, frames)
-        return Given(hn, fn, seen.moved(frames, hn), more.moved(frames, fn), matched, frames, h * _there(hn), cameras, batch, H)
+        return GivenPlanes(
+            hn, fn, seen.moved(frames, hn), more.moved(frames, fn), matched, frames, h * _there(hn), cameras, batch, H
+        )
 
     def used(self) -> Tensor:
         """Which planes and bodies count, ``(b, p + m)`` bool."""
@@ -96,7 +98,7 @@ class Given:
 
 
 @dataclass(frozen=True)
-class Sightings:
+class PlaneSightings:
     """Matches of k planes or bodies.
 
     Attributes:
@@ -108,16 +110,16 @@ class Sightings:
     weights: Tensor
 
     @staticmethod
-    def none(batch: int, device: torch.device) -> Sightings:
+    def none(batch: int, device: torch.device) -> PlaneSightings:
         """No planes at all."""
         empty = torch.zeros(batch, 0, 0, 2, dtype=torch.float64, device=device)
-        return Sightings((empty, empty), empty[..., 0])
+        return PlaneSightings((empty, empty), empty[..., 0])
 
-    def moved(self, frames: Pair, matrices: Tensor) -> Sightings:
+    def moved(self, frames: Pair, matrices: Tensor) -> PlaneSightings:
         """In new coordinates, without the matches of matrices ``(b, k, 3, 3)`` that are missing."""
         weights = self.weights * _there(matrices)[..., 0] if self.weights.shape[1] else self.weights
         first, second = (apply(frame[:, None], x) * (weights > 0)[..., None] for frame, x in zip(frames, self.views, strict=True))
-        return Sightings((first, second), weights)
+        return PlaneSightings((first, second), weights)
 
 
 def _matrices(name: str, value: Tensor) -> Tensor:
@@ -165,14 +167,14 @@ def _stacked(name: str, points: Sequence[Tensor]) -> Tensor:
     )
 
 
-def _sightings(name: str, views: Pair | None, batch: tuple[int, ...], count: int, least: int, home: torch.device) -> Sightings:
+def _sightings(name: str, views: Pair | None, batch: tuple[int, ...], count: int, least: int, home: torch.device) -> PlaneSightings:
     """Matches of ``count`` planes or bodies with a flat batch; those with fewer than ``least`` weigh nothing.
 
     Raises:
         ValueError: another batch or number of planes than the matrices have.
     """
     if views is None:
-        return Sightings.none(prod(batch), home)
+        return PlaneSightings.none(prod(batch), home)
     if views[0].shape[:-2] != (*batch, count):
         raise ValueError(
             f"{name} must be (*batch, planes, n, 2) with batch {batch} and {count} planes as the matrices have, "
@@ -182,7 +184,7 @@ def _sightings(name: str, views: Pair | None, batch: tuple[int, ...], count: int
     present = (first.isfinite() & second.isfinite()).all(-1)
     present = present & (present.sum(-1, keepdim=True) >= least)
     clean = [torch.where(present[..., None], x, 0.0) for x in (first, second)]
-    return Sightings((clean[0], clean[1]), present.double())
+    return PlaneSightings((clean[0], clean[1]), present.double())
 
 
 def both(H: Tensor | None, F: Tensor | None) -> Pair:

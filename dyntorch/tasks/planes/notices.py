@@ -15,7 +15,7 @@ from dyntorch.geometry.rigid import nearest_rotation
 from dyntorch.numerics.chi_square import quantile
 from dyntorch.numerics.nullspace import eigenvalues, spectrum
 from dyntorch.tasks.outcome import Notice, NoticeCode, notices
-from dyntorch.tasks.planes.input import Given
+from dyntorch.tasks.planes.input import GivenPlanes
 
 EXACT = 1e-7
 """Sine or ratio that is rounding error."""
@@ -133,7 +133,7 @@ class Figures:
 
 
 def planes_notices(
-    figures: Figures, enough: Tensor, said: Mapping[NoticeCode, tuple[Tensor, Tensor]], given: Given
+    figures: Figures, enough: Tensor, said: Mapping[NoticeCode, tuple[Tensor, Tensor]], given: GivenPlanes
 ) -> tuple[Notice, ...]:
     """Notices on all problems, in their order.
 
@@ -248,7 +248,7 @@ class Misfit:
     vague: Tensor
 
 
-def misfit(given: Given, cost: Tensor, separate: Tensor) -> Misfit:
+def misfit(given: GivenPlanes, cost: Tensor, separate: Tensor) -> Misfit:
     r"""How far the planes and bodies are from one homography at infinity, and whether noise does not explain it.
 
     Args:
@@ -290,7 +290,7 @@ def deviate(ratio: Tensor, above: Tensor, below: Tensor) -> Tensor:
     return ((1 - b) * root - (1 - a)) / (b * root.square() + a).sqrt()
 
 
-def _extent(given: Given) -> Tensor:
+def _extent(given: GivenPlanes) -> Tensor:
     """Root mean square distance per coordinate ``(b,)`` of matches from the middle of their plane or body, in the view where it is
     less, in the unit of the matches."""
     found = []
@@ -305,7 +305,7 @@ def _extent(given: Given) -> Tensor:
     return torch.stack(found).amin(0)
 
 
-def turned(given: Given, infinity: Tensor, covariance: Tensor, status: Tensor) -> tuple[Tensor, Tensor]:
+def turned(given: GivenPlanes, infinity: Tensor, covariance: Tensor, status: Tensor) -> tuple[Tensor, Tensor]:
     r"""Distance ``(b,)`` of :math:`K_2^{-1} H_\infty K_1`, of determinant 1, from a rotation, and whether noise is no reason.
 
     Args:

@@ -28,9 +28,9 @@ from dyntorch.invariants.collineation import Collineation
 from dyntorch.invariants.fundamental_matrix import FundamentalMatrix
 from dyntorch.numerics.blocks import map_blocks, one_thread
 from dyntorch.tasks.outcome import Notice, NoticeCode, check_results
-from dyntorch.tasks.planes.input import Given, Pair, Points, both, cameras, check_counts, enough, padded
+from dyntorch.tasks.planes.input import GivenPlanes, Pair, Points, both, cameras, check_counts, enough, padded
 from dyntorch.tasks.planes.notices import EXACT, NEAR, Figures, misfit, planes_notices, turned
-from dyntorch.tasks.planes.problem import Layout, Matches, noise_variance, projected, solve
+from dyntorch.tasks.planes.problem import Layout, PlaneMatches, noise_variance, projected, solve
 
 # ----------------------------------------------------------------------------------------------------------------------
 # What translating_planes() returns: the homography at infinity, how every body moved, and its reconstruction.
@@ -216,7 +216,7 @@ STILL = 3.0
 """Standard deviations within which a plane does not move."""
 
 
-def outcome(given: Given, found: tuple[Tensor, ...], method: str, refined: bool) -> TranslatingPlanes:
+def outcome(given: GivenPlanes, found: tuple[Tensor, ...], method: str, refined: bool) -> TranslatingPlanes:
     """The result with a flat batch.
 
     Args:
@@ -310,7 +310,7 @@ def _figures(layout: Layout, theta: Tensor, covariance: Tensor, used: Tensor) ->
     )
 
 
-def _measured(given: Given, layout: Layout, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _measured(given: GivenPlanes, layout: Layout, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Homography at infinity of norm 1, unit epipoles and normals in measured coordinates."""
     infinity, epipoles, planes = layout.unpack(theta)
     first, back = given.frames[0], torch.linalg.inv_ex(given.frames[1])[0]
@@ -423,7 +423,7 @@ def translating_planes(
         raise ValueError("matches are given of the planes or of the bodies only: give both x1, x2 and body_matches, or neither")
     camera = None if calibration is None else cameras(calibration, tuple(H.shape[:-3]), H)
     with torch.no_grad():
-        given = Given.of(H, F, planes, bodies, camera)
+        given = GivenPlanes.of(H, F, planes, bodies, camera)
         result = outcome(given, _solved(given, method, refine), method, refine)
         shaped: dict[str, Any] = {name: given.back(value) for name, value in vars(result).items() if isinstance(value, Tensor)}
     return replace(result, **shaped)
@@ -437,14 +437,14 @@ def _views(x1: Points | None, x2: Points | None) -> Pair | None:
     return padded("x1 and x2", (x1, x2))
 
 
-def _solved(given: Given, method: str, refine: bool) -> tuple[Tensor, ...]:
+def _solved(given: GivenPlanes, method: str, refine: bool) -> tuple[Tensor, ...]:
     """What :func:`~dyntorch.tasks.planes.problem.solve` says, block by block, and the cost under the given matrices."""
     seen, body = given.planes, given.bodies
     layout = Layout(given.homographies.shape[1], given.fundamentals.shape[1])
 
     def block(h: Tensor, f: Tensor, spare: Tensor, *parts: Tensor) -> tuple[Tensor, ...]:
         x1, x2, w, y1, y2, v, s1, s2 = parts
-        matches = Matches((x1, x2), w, (y1, y2), v, (s1, s2)) if given.matched else None
+        matches = PlaneMatches((x1, x2), w, (y1, y2), v, (s1, s2)) if given.matched else None
         separate = spare * 0 if matches is None else matches.normal(torch.cat([h, f], dim=1)).cost.nansum(1)
         return *solve(h, f, matches, spare, method, refine), separate
 

@@ -122,7 +122,7 @@ def _normal(weighted: Tensor, value: Tensor, slope: Tensor, weight: Tensor) -> N
 
 
 @dataclass(frozen=True)
-class Matches:
+class PlaneMatches:
     """Matches in normalized coordinates: Sampson distances in the unit of the measured points.
 
     Attributes:
@@ -168,14 +168,14 @@ class Matches:
         root = self.body_weights.sqrt()
         return value * root, (slope * root[..., None]).mT
 
-    def each(self, function: Callable[[Tensor], Tensor]) -> Matches:
+    def each(self, function: Callable[[Tensor], Tensor]) -> PlaneMatches:
         """With every array of problems changed."""
 
         def both(pair: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
             return function(pair[0]), function(pair[1])
 
         plane_weights, body_weights = both((self.plane_weights, self.body_weights))
-        return Matches(both(self.planes), plane_weights, both(self.bodies), body_weights, both(self.scales))
+        return PlaneMatches(both(self.planes), plane_weights, both(self.bodies), body_weights, both(self.scales))
 
 
 @dataclass(frozen=True)
@@ -183,7 +183,7 @@ class PlanesProblem:
     """Least squares over a block of problems; a :class:`dyntorch.numerics.least_squares.Minimand`."""
 
     layout: Layout
-    evidence: Matrices | Matches
+    evidence: Matrices | PlaneMatches
 
     def parts(self, theta: Tensor) -> tuple[Tensor, ...]:
         """The parts of parameters ``(b, size)`` that have a scale each."""
@@ -378,7 +378,7 @@ Of 5 planes and 2 bodies at 0.5 px the error without matches is 0.0112; with 1 i
 
 
 def solve(
-    homographies: Tensor, fundamentals: Tensor, matches: Matches | None, spare: Tensor, method: str, refine: bool
+    homographies: Tensor, fundamentals: Tensor, matches: PlaneMatches | None, spare: Tensor, method: str, refine: bool
 ) -> tuple[Tensor, ...]:
     """The best fit to a block of problems.
 

@@ -16,8 +16,8 @@ from dyntorch.numerics.blocks import map_blocks
 from dyntorch.numerics.nullspace import eigenvalues, spectrum
 from dyntorch.tasks.outcome import Notice, NoticeCode, notices
 from dyntorch.tasks.reconstruct.motions import MOTIONS, Motion, polynomial
-from dyntorch.tasks.reconstruct.projections import Tracks, camera_unknowns, projections_of_tracks
-from dyntorch.tasks.reconstruct.scene import Lifting, Scene, bodies_of, distances, scene_of, wild
+from dyntorch.tasks.reconstruct.projections import ViewTracks, camera_unknowns, projections_of_tracks
+from dyntorch.tasks.reconstruct.scene import LiftedState, Lifting, bodies_of, distances, scene_of, wild
 
 # ----------------------------------------------------------------------------------------------------------------------
 # How well noise leaves the points of a lifted scene determined, cameras and all.
@@ -198,7 +198,13 @@ point is one of the plane, :math:`x \\sim p + t q` with p and q of three coordin
 
 
 def diagnose(
-    tracks: Tracks, scene: Scene, lifting: Lifting | None, motion: Motion, status: Tensor, sigma: Tensor, batch: tuple[int, ...]
+    tracks: ViewTracks,
+    scene: LiftedState,
+    lifting: Lifting | None,
+    motion: Motion,
+    status: Tensor,
+    sigma: Tensor,
+    batch: tuple[int, ...],
 ) -> tuple[Tensor, tuple[Notice, ...]]:
     """The status ``(b,)`` of every problem, judged by the scene, and the notices on all of them.
 
@@ -253,7 +259,7 @@ def diagnose(
     return status, tuple(sorted(found, key=lambda notice: notice.problem))
 
 
-def conditions(tracks: Tracks, scene: Scene, lifting: Lifting | None, noise: Tensor) -> tuple[Tensor, Tensor]:
+def conditions(tracks: ViewTracks, scene: LiftedState, lifting: Lifting | None, noise: Tensor) -> tuple[Tensor, Tensor]:
     """Least singular value of the stacked projections over the largest, in coordinates in which the points fill the space, and the
     median expected error of the points over the size of the scene, ``(b,)`` each.
 
@@ -300,19 +306,19 @@ def _extent(structure: Tensor, depth: Tensor, known: Tensor) -> Tensor:
     return off.nanmedian(-1).values.nan_to_num().clamp(min=torch.finfo(off.dtype).tiny)
 
 
-def least_squares(tracks: Tracks, motion: Motion) -> tuple[Tensor, Tensor]:
+def least_squares(tracks: ViewTracks, motion: Motion) -> tuple[Tensor, Tensor]:
     """Reprojection distances ``(b, views, n)`` of a model fitted to all observations, in the unit of the tracks, and its status."""
     size = min(motion.views(tracks.times), motion.k + 1)
     found = projections_of_tracks(tracks, motion.tensor(size))
     if motion.lift is None:
-        scene = bodies_of(tracks, Scene(found.projections, found.structure, torch.zeros_like(tracks.x[:, 0, 0, 0])))[-1]
+        scene = bodies_of(tracks, LiftedState(found.projections, found.structure, torch.zeros_like(tracks.x[:, 0, 0, 0])))[-1]
         return distances(tracks, scene.cameras, scene.structure), found.status
     lifting = Lifting.of(motion, tracks.times, tracks.x)
     scene = scene_of(tracks, found, lifting)
     return distances(tracks, scene.cameras @ lifting.lifts, scene.structure), found.status
 
 
-def spare(tracks: Tracks, counted: Tensor, motion: Motion) -> Tensor:
+def spare(tracks: ViewTracks, counted: Tensor, motion: Motion) -> Tensor:
     """Observed coordinates less all unknowns, ``(b,)``; two bodies with their hyperplanes."""
     views, wide = tracks.x.shape[1], motion.sensor + 1
     if motion.lift is None:
@@ -323,13 +329,13 @@ def spare(tracks: Tracks, counted: Tensor, motion: Motion) -> Tensor:
     return counted.flatten(1).sum(-1) * motion.sensor - points - cameras
 
 
-def unknowns(tracks: Tracks, motion: Motion) -> Tensor:
+def unknowns(tracks: ViewTracks, motion: Motion) -> Tensor:
     """Unknowns of every point, ``(b, n)``: those of the model, of a point known to stand still its position."""
     free = torch.full_like(tracks.weights[:, 0], motion.k - (motion.bodies > 1), dtype=torch.long)
     return free if tracks.static is None or motion.lift is None else torch.where(tracks.static, motion.dim, free)
 
 
-def _noise_of(tracks: Tracks, motion: Motion, asked: Tensor) -> Tensor:
+def _noise_of(tracks: ViewTracks, motion: Motion, asked: Tensor) -> Tensor:
     """Noise ``(b,)`` in normalized images that another model leaves; infinite where it was not asked for, or has no result."""
     left = torch.full_like(tracks.x[:, 0, 0, 0], torch.inf)
     chosen = asked.nonzero()[:, 0]
@@ -346,7 +352,7 @@ def _noise_of(tracks: Tracks, motion: Motion, asked: Tensor) -> Tensor:
     return left.index_copy(0, chosen, torch.where(failed(status) | ~whole, torch.inf, mean))
 
 
-def _observations(tracks: Tracks, motion: Motion, status: Tensor, note: Note) -> None:
+def _observations(tracks: ViewTracks, motion: Motion, status: Tensor, note: Note) -> None:
     """Notices on tracks and views with too few observations."""
     seen = tracks.weights > 0
     need = -(-motion.k // motion.sensor)
@@ -360,13 +366,13 @@ def _observations(tracks: Tracks, motion: Motion, status: Tensor, note: Note) ->
     note(NoticeCode.FEW_OBSERVED, text, enough, status == Status.TOO_FEW)
 
 
-def _through(tracks: Tracks, motion: Motion) -> tuple[Tensor, int]:
+def _through(tracks: ViewTracks, motion: Motion) -> tuple[Tensor, int]:
     """How many tracks ``(b,)`` are seen in as many views as the tensor takes, and these."""
     size = min(motion.views(tracks.times), motion.k + 1)
     return ((tracks.weights > 0).sum(1) >= size).sum(-1), size
 
 
-def _images(tracks: Tracks, scene: Scene, lifting: Lifting | None, noise: Tensor, solved: Tensor, note: Note) -> None:
+def _images(tracks: ViewTracks, scene: LiftedState, lifting: Lifting | None, noise: Tensor, solved: Tensor, note: Note) -> None:
     """Notices on images on a line, and on points behind the cameras."""
     seen = (tracks.weights > 0).to(tracks.x.dtype)
     number = seen.sum(-1).clamp(min=1)[..., None]
@@ -383,7 +389,7 @@ def _images(tracks: Tracks, scene: Scene, lifting: Lifting | None, noise: Tensor
     note(NoticeCode.BEHIND, text, count, solved & (count > 0))
 
 
-def _bodies(scene: Scene, status: Tensor, noise: Tensor, solved: Tensor, note: Note) -> Tensor:
+def _bodies(scene: LiftedState, status: Tensor, noise: Tensor, solved: Tensor, note: Note) -> Tensor:
     """The status where a body has too few points for its hyperplane, and a notice."""
     known = (scene.structure != 0).any(-1) & solved[:, None]
     pair = hyperplane_pair(scene.structure, known.to(scene.structure.dtype))

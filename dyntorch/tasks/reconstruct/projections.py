@@ -28,7 +28,7 @@ they start the structured one.  Of 20 scenes of constant velocity, 4 views of 60
 
 
 @dataclass(frozen=True)
-class Tracks:
+class ViewTracks:
     """Tracks with one flat batch dimension, every view normalized."""
 
     x: Tensor
@@ -44,36 +44,36 @@ class Tracks:
     static: Tensor | None = None
     """``(b, n)`` bool: points known to stand still."""
 
-    def subset(self, keep: Tensor) -> Tracks:
+    def subset(self, keep: Tensor) -> ViewTracks:
         """Some problems of the batch."""
         static = None if self.static is None else self.static[keep]
-        return Tracks(self.x[keep], self.weights[keep], self.scales[keep], self.transforms[keep], self.times, static)
+        return ViewTracks(self.x[keep], self.weights[keep], self.scales[keep], self.transforms[keep], self.times, static)
 
-    def at(self, views: Tensor) -> Tracks:
+    def at(self, views: Tensor) -> ViewTracks:
         """Some views."""
         x, weights, scales, transforms = (p[:, views] for p in (self.x, self.weights, self.scales, self.transforms))
-        return Tracks(x, weights, scales, transforms, self.times[views], self.static)
+        return ViewTracks(x, weights, scales, transforms, self.times[views], self.static)
 
     def scale(self) -> Tensor:
         """Normalized unit over measured unit, ``(b,)``, over all views."""
         return self.scales.square().mean(-1).sqrt()
 
-    def only(self, weights: Tensor) -> Tracks:
+    def only(self, weights: Tensor) -> ViewTracks:
         """Other weights."""
         return replace(self, weights=weights)
 
-    def resting(self) -> Tracks:
+    def resting(self) -> ViewTracks:
         """The points known to stand still alone."""
         assert self.static is not None
         return self.only(self.weights * self.static[:, None])
 
-    def repeated(self, count: int) -> Tracks:
+    def repeated(self, count: int) -> ViewTracks:
         """Every problem so many times in a row."""
         x, weights, scales, transforms = (
             part.repeat_interleave(count, dim=0) for part in (self.x, self.weights, self.scales, self.transforms)
         )
         static = None if self.static is None else self.static.repeat_interleave(count, dim=0)
-        return Tracks(x, weights, scales, transforms, self.times, static)
+        return ViewTracks(x, weights, scales, transforms, self.times, static)
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ def camera_unknowns(views: int, rows: int, columns: int, gauge: int | None = Non
     return views * (rows * columns - 1) - (columns**2 - 1 if gauge is None else gauge)
 
 
-def choices(tracks: Tracks, size: int) -> Tensor:
+def choices(tracks: ViewTracks, size: int) -> Tensor:
     """Indices ``(b, s, size)`` of views for the tensor: seen by many points in common, spread over the time."""
     views = tracks.weights.shape[1]
     device = tracks.x.device
@@ -118,7 +118,7 @@ def choices(tracks: Tracks, size: int) -> Tensor:
     return options[best]
 
 
-def projections_of_tracks(tracks: Tracks, invariant: GrassmannTensor, subsets: Tensor | None = None) -> Projections:
+def projections_of_tracks(tracks: ViewTracks, invariant: GrassmannTensor, subsets: Tensor | None = None) -> Projections:
     """Linear, constrained, resected, adjusted: the best of several choices of views.
 
     Args:
@@ -140,7 +140,7 @@ def projections_of_tracks(tracks: Tracks, invariant: GrassmannTensor, subsets: T
     return Projections(found.projections[best], found.structure[best], found.status[best])
 
 
-def mean_error(tracks: Tracks, found: Projections) -> Tensor:
+def mean_error(tracks: ViewTracks, found: Projections) -> Tensor:
     """Mean square reprojection error ``(b,)`` over the spare observations, in measured units; points that are not determined
     cost the extent of the image."""
     error = (tracks.x - reproject(found.projections, found.structure)).square().sum(-1) * tracks.weights
@@ -149,7 +149,7 @@ def mean_error(tracks: Tracks, found: Projections) -> Tensor:
     return (torch.where(known, error, 0.0) + missed).flatten(1).sum(-1) / (tracks.weights > 0).flatten(1).sum(-1).clamp(min=1)
 
 
-def _from_subset(tracks: Tracks, invariant: GrassmannTensor, chosen: Tensor) -> Projections:
+def _from_subset(tracks: ViewTracks, invariant: GrassmannTensor, chosen: Tensor) -> Projections:
     """From one choice of views ``(b, size)`` each."""
     b, views, n, dim = tracks.x.shape
     x = tracks.x.gather(1, chosen[..., None, None].expand(-1, -1, n, dim))
@@ -174,7 +174,7 @@ def _from_subset(tracks: Tracks, invariant: GrassmannTensor, chosen: Tensor) -> 
     return Projections(torch.where(bad[..., None], 0.0, adjusted.cameras), torch.where(bad, 0.0, adjusted.structure), status)
 
 
-def _grown(tracks: Tracks, whole: Tensor) -> tuple[Tensor, Tensor]:
+def _grown(tracks: ViewTracks, whole: Tensor) -> tuple[Tensor, Tensor]:
     """All views and points from some of them, in turns: tracks shorter than the recording lead from views to their neighbours.
 
     Args:
@@ -197,11 +197,11 @@ def _grown(tracks: Tracks, whole: Tensor) -> tuple[Tensor, Tensor]:
     return whole, structure
 
 
-def _unknown(tracks: Tracks, whole: Tensor) -> Tensor:
+def _unknown(tracks: ViewTracks, whole: Tensor) -> Tensor:
     """Views ``(b, views)`` that see something but are not known."""
     return (whole == 0).flatten(2).all(-1) & (tracks.weights > 0).any(-1)
 
 
-def _seen(tracks: Tracks, whole: Tensor) -> Tensor:
+def _seen(tracks: ViewTracks, whole: Tensor) -> Tensor:
     """The weights of the views that are known."""
     return tracks.weights * (whole != 0).flatten(2).any(-1)[..., None]

@@ -16,7 +16,7 @@ from dyntorch.numerics.arguments import on_cpu
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.tasks.outcome import NoticeCode, notices
 from dyntorch.tasks.reconstruct.motions import Motion, as_motion
-from dyntorch.tasks.reconstruct.projections import Tracks
+from dyntorch.tasks.reconstruct.projections import ViewTracks
 from dyntorch.tasks.reconstruct.result import Reconstruction
 from dyntorch.tasks.reconstruct.solver import choose, least, solve
 
@@ -213,7 +213,7 @@ def _static(static: Tensor | Sequence[bool] | None, batch: tuple[int, ...], x: T
     return known.expand(*batch, n).reshape(len(x), n) if bool(known.any()) else None
 
 
-def normalized(x: Tensor, weights: Tensor, times: Tensor) -> Tracks:
+def normalized(x: Tensor, weights: Tensor, times: Tensor) -> ViewTracks:
     """Every view of mean 0 and rms sqrt(l), the weights such that the error stays that of the measured units."""
     transforms = hartley(x.unsqueeze(-2), (weights > 0).to(x.dtype))
     # a view without images has the scale of the others: no weight of theirs depends on it
@@ -225,7 +225,7 @@ def normalized(x: Tensor, weights: Tensor, times: Tensor) -> Tracks:
     moved = torch.where((weights > 0)[..., None], moved, 0.0)
     # of order one: the views' scales over their mean
     share = scales.square().mean(-1, keepdim=True) / scales.square()
-    return Tracks(moved, weights * share[..., None], scales, transforms, times)
+    return ViewTracks(moved, weights * share[..., None], scales, transforms, times)
 
 
 def _scaling(scales: Tensor, dim: int) -> Tensor:

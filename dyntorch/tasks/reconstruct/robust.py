@@ -17,8 +17,8 @@ from dyntorch.geometry.triangulation import reproject, resect, triangulate
 from dyntorch.invariants.grassmann_tensor import GrassmannTensor
 from dyntorch.numerics.blocks import uniform
 from dyntorch.numerics.chi_square import quantile
-from dyntorch.tasks.reconstruct.projections import Projections, Tracks, camera_unknowns, choices
-from dyntorch.tasks.reconstruct.scene import Lifting, Scene, adjusted, distances, scene_of
+from dyntorch.tasks.reconstruct.projections import Projections, ViewTracks, camera_unknowns, choices
+from dyntorch.tasks.reconstruct.scene import LiftedState, Lifting, adjusted, distances, scene_of
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Which observations agree with given projections: per point all of its views, or all but the fewest that spoil it.
@@ -42,7 +42,7 @@ PAIRS = 1 << 14
 """Points that are looked at together with one view left out."""
 
 
-def distance(tracks: Tracks, projections: Tensor) -> Tensor:
+def distance(tracks: ViewTracks, projections: Tensor) -> Tensor:
     """Squared reprojection error of every point over its views, ``(b, n)``, measured units; :data:`FAR` where there is none."""
     structure = triangulate(projections, tracks.x, tracks.weights, steps=STEPS)
     error = (tracks.x - reproject(projections, structure)).square().sum(-1) / tracks.scales.square()[..., None]
@@ -50,7 +50,7 @@ def distance(tracks: Tracks, projections: Tensor) -> Tensor:
     return torch.where((structure != 0).any(-1), total, FAR).nan_to_num(nan=FAR, posinf=FAR).clamp(max=FAR)
 
 
-def freedom(tracks: Tracks, k: int) -> Tensor:
+def freedom(tracks: ViewTracks, k: int) -> Tensor:
     """Equations that every point fulfils beside those that determine it, ``(b, n)``, not negative."""
     return ((tracks.weights > 0).sum(1) * tracks.x.shape[-1] - k).clamp(min=0)
 
@@ -84,7 +84,7 @@ def noise(square: Tensor, free: Tensor, chosen: Tensor, part: float = 0.5) -> Te
     return torch.where(number[:, 0] > 0, found, 0.0).sqrt()
 
 
-def settled_noise(tracks: Tracks, square: Tensor, free: Tensor, chosen: Tensor, used: int, part: float = 0.5) -> Tensor:
+def settled_noise(tracks: ViewTracks, square: Tensor, free: Tensor, chosen: Tensor, used: int, part: float = 0.5) -> Tensor:
     """Noise ``(b,)`` of one coordinate from a quantile of the chosen points, then the median of those within its threshold.
 
     Args:
@@ -105,7 +105,7 @@ def settled_noise(tracks: Tracks, square: Tensor, free: Tensor, chosen: Tensor, 
     return level
 
 
-def agreeing(tracks: Tracks, projections: Tensor, sigma: Tensor) -> Tensor:
+def agreeing(tracks: ViewTracks, projections: Tensor, sigma: Tensor) -> Tensor:
     r"""Weights ``(b, views, n)``, 0 for all observations that do not agree with the projections.
 
     A point agrees where its squared distance is below the quantile of :math:`\sigma^2 \chi^2`.  Of one that does not, the view
@@ -127,9 +127,9 @@ def agreeing(tracks: Tracks, projections: Tensor, sigma: Tensor) -> Tensor:
     return kept
 
 
-def _without(tracks: Tracks, projections: Tensor, sigma: Tensor, problem: Tensor, point: Tensor) -> Tensor:
+def _without(tracks: ViewTracks, projections: Tensor, sigma: Tensor, problem: Tensor, point: Tensor) -> Tensor:
     """Weights ``(p, views)`` of single points, without the views that spoil them; all 0 where no views agree."""
-    alone = Tracks(
+    alone = ViewTracks(
         tracks.x[problem, :, point][:, :, None],
         tracks.weights[problem, :, point][:, :, None],
         tracks.scales[problem],
@@ -207,7 +207,7 @@ class Consensus:
 
 
 def consensus(
-    tracks: Tracks, invariant: GrassmannTensor, sigma: Tensor | None, generator: torch.Generator | None
+    tracks: ViewTracks, invariant: GrassmannTensor, sigma: Tensor | None, generator: torch.Generator | None
 ) -> tuple[Consensus, Tensor, Tensor]:
     r"""Projections of the tensor's views on whose points the most agree.
 
@@ -256,7 +256,7 @@ class _Search:
     generator: torch.Generator | None
 
     def run(
-        self, tracks: Tracks, views: Tensor, starts: Tensor, shares: tuple[float, ...], sigma: Tensor | None
+        self, tracks: ViewTracks, views: Tensor, starts: Tensor, shares: tuple[float, ...], sigma: Tensor | None
     ) -> tuple[Consensus, Tensor]:
         """The best of the starts ``(b, s, n)``, and the mean rank ``(b, n)`` of the points in all of them."""
         count = starts.shape[1]
@@ -278,7 +278,7 @@ class _Search:
         winner = best.lost.unflatten(0, (-1, count)).argmin(1) + count * torch.arange(len(views), device=views.device)
         return Consensus(views.clone(), best.projections[winner], best.square[winner], best.lost[winner]), rank
 
-    def starts(self, tracks: Tracks, views: Tensor, square: Tensor, ranks: Tensor) -> Tensor:
+    def starts(self, tracks: ViewTracks, views: Tensor, square: Tensor, ranks: Tensor) -> Tensor:
         """Random parts ``(b, s, n)`` of the points near the best projections so far, or in the mean of all."""
         count, minimal = len(SHARES), self.invariant.minimal()
         work = _of_views(tracks, views).repeated(count)
@@ -292,19 +292,19 @@ class _Search:
         chosen = _nearest(number.masked_fill(~(pool & seen), torch.inf), drawn).to(square.dtype)
         return chosen.view(-1, count, chosen.shape[-1])
 
-    def judged(self, tracks: Tracks, found: Consensus) -> tuple[Tensor, Tensor]:
+    def judged(self, tracks: ViewTracks, found: Consensus) -> tuple[Tensor, Tensor]:
         """Noise and doubt ``(b,)``."""
         work = _of_views(tracks, found.chosen)
         level = self._level(work, found.square, self.sigma)
         return level, doubtful(work, found.square, level, self.invariant)
 
-    def weak(self, tracks: Tracks, found: Consensus) -> Tensor:
+    def weak(self, tracks: ViewTracks, found: Consensus) -> Tensor:
         """Where only the search for better ones tells whether projections ``(b,)`` are right."""
         seen = (_of_views(tracks, found.chosen).weights > 0).all(1).sum(-1)
         few = seen * self.invariant.codim < SURE * self.invariant.dof
         return few | torch.full_like(few, self.sigma is None)
 
-    def _fitted(self, tracks: Tracks, kept: Tensor, sigma: Tensor | None) -> Consensus:
+    def _fitted(self, tracks: ViewTracks, kept: Tensor, sigma: Tensor | None) -> Consensus:
         """Projections from the points that are kept ``(b, n)``."""
         some = tracks.only(tracks.weights * kept[:, None])
         seen = (some.weights > 0).all(1).to(kept.dtype)
@@ -323,7 +323,7 @@ class _Search:
             lost = torch.where(whole, (square / cut).clamp(max=1), 0.0).sum(-1) / whole.sum(-1).clamp(min=1)
         return Consensus(torch.empty_like(kept), projections, square, lost)
 
-    def _level(self, tracks: Tracks, square: Tensor, sigma: Tensor | None) -> Tensor:
+    def _level(self, tracks: ViewTracks, square: Tensor, sigma: Tensor | None) -> Tensor:
         """Noise ``(b,)``: as given, or the median distance of all, and then of the inliers."""
         if sigma is not None:
             return sigma
@@ -332,7 +332,7 @@ class _Search:
         return settled_noise(tracks, square, free, chosen, self.invariant.dof, _part(chosen, self.invariant))
 
 
-def doubtful(tracks: Tracks, square: Tensor, sigma: Tensor, invariant: GrassmannTensor) -> Tensor:
+def doubtful(tracks: ViewTracks, square: Tensor, sigma: Tensor, invariant: GrassmannTensor) -> Tensor:
     """Whether projections ``(b,)`` may be wrong: few inliers, many points just outside, or noise as large as the scene."""
     free = freedom(tracks, invariant.k)
     cut = sigma.square()[:, None] * bound(free)
@@ -349,14 +349,14 @@ def _part(chosen: Tensor, invariant: GrassmannTensor) -> float:
     return min(0.9, 0.5 + 0.5 * (invariant.dof / invariant.codim + 1) / number)
 
 
-def _of_views(tracks: Tracks, chosen: Tensor) -> Tracks:
+def _of_views(tracks: ViewTracks, chosen: Tensor) -> ViewTracks:
     """Some views ``(b, size)`` of every problem."""
     rows = torch.arange(len(chosen), device=chosen.device)[:, None]
     x, weights, scales, transforms = (part[rows, chosen] for part in (tracks.x, tracks.weights, tracks.scales, tracks.transforms))
-    return Tracks(x, weights, scales, transforms, tracks.times)
+    return ViewTracks(x, weights, scales, transforms, tracks.times)
 
 
-def _wanted(tracks: Tracks, share: Tensor, minimal: int, least: float) -> Tensor:
+def _wanted(tracks: ViewTracks, share: Tensor, minimal: int, least: float) -> Tensor:
     """How many points ``(b,)``: a share of those seen, but more than the minimal number."""
     seen = (tracks.weights > 0).all(1).sum(-1)
     return torch.minimum((share * seen).long().clamp(min=int(least * minimal) + 1), seen)
@@ -393,7 +393,7 @@ ADJUSTED = 10
 """Steps of bundle adjustment after each choice of the observations."""
 
 
-def suspicious(tracks: Tracks, apart: Tensor, unknowns: Tensor | int, limit: float | None) -> Tensor:
+def suspicious(tracks: ViewTracks, apart: Tensor, unknowns: Tensor | int, limit: float | None) -> Tensor:
     """Which problems ``(b,)`` show outliers after least squares.
 
     Args:
@@ -413,7 +413,7 @@ def suspicious(tracks: Tracks, apart: Tensor, unknowns: Tensor | int, limit: flo
     return loud | (square > sigma.square()[:, None] * bound(free, 1 - share)).logical_and(free >= 1).any(-1)
 
 
-def unfounded(tracks: Tracks, apart: Tensor, unknowns: Tensor) -> Tensor:
+def unfounded(tracks: ViewTracks, apart: Tensor, unknowns: Tensor) -> Tensor:
     """The points ``(b, n)`` said to stand still that fit by far the worst: they move.
 
     Args:
@@ -429,7 +429,9 @@ def unfounded(tracks: Tracks, apart: Tensor, unknowns: Tensor) -> Tensor:
     return (excess > WRONG**2) & (excess >= excess.amax(-1, keepdim=True) / 2)
 
 
-def trimmed(tracks: Tracks, scene: Scene, lifting: Lifting, unknowns: Tensor, limit: float | None) -> tuple[Scene, Tracks, Tensor]:
+def trimmed(
+    tracks: ViewTracks, scene: LiftedState, lifting: Lifting, unknowns: Tensor, limit: float | None
+) -> tuple[LiftedState, ViewTracks, Tensor]:
     """The least squares scene after the few observations that disagree with it are taken away, the tracks without them, and whether
     ``(b,)`` that is all there was to do: one wrong track in many does not need a search.
 
@@ -446,12 +448,12 @@ def trimmed(tracks: Tracks, scene: Scene, lifting: Lifting, unknowns: Tensor, li
         _, _, sigma = _misfit(fewer, distances(fewer, projections, scene.structure), unknowns, limit)
         fewer = tracks.only(agreeing(tracks, projections, sigma))
         structure = triangulate(projections, fewer.x, fewer.weights, steps=2)
-        scene = adjusted(fewer, Scene(scene.cameras, structure, scene.cost), lifting)
+        scene = adjusted(fewer, LiftedState(scene.cameras, structure, scene.cost), lifting)
     apart = distances(fewer, scene.cameras @ lifting.lifts, scene.structure)
     return scene, fewer, ~suspicious(fewer, apart, unknowns, limit) & (_kept(fewer, tracks) >= MOST)
 
 
-def _misfit(tracks: Tracks, apart: Tensor, unknowns: Tensor | int, limit: float | None) -> tuple[Tensor, Tensor, Tensor]:
+def _misfit(tracks: ViewTracks, apart: Tensor, unknowns: Tensor | int, limit: float | None) -> tuple[Tensor, Tensor, Tensor]:
     """Squared distance of every point, its conditions ``(b, n)``, and the noise ``(b,)``, a third of the limit or by the median."""
     square = apart.square().nansum(1)
     free = (apart.isfinite().sum(1) * tracks.x.shape[-1] - unknowns).clamp(min=0)
@@ -460,14 +462,14 @@ def _misfit(tracks: Tracks, apart: Tensor, unknowns: Tensor | int, limit: float 
     return square, free, torch.maximum(sigma, least)
 
 
-def _kept(fewer: Tracks, tracks: Tracks) -> Tensor:
+def _kept(fewer: ViewTracks, tracks: ViewTracks) -> Tensor:
     """Share ``(b,)`` of the observations that are left."""
     return (fewer.weights > 0).flatten(1).sum(-1) / (tracks.weights > 0).flatten(1).sum(-1).clamp(min=1)
 
 
 def robust_projections(
-    tracks: Tracks, invariant: GrassmannTensor, lifting: Lifting | None, limit: float | None, generator: torch.Generator | None
-) -> tuple[Projections, Tracks]:
+    tracks: ViewTracks, invariant: GrassmannTensor, lifting: Lifting | None, limit: float | None, generator: torch.Generator | None
+) -> tuple[Projections, ViewTracks]:
     """Projections from the tracks that agree, and the tracks with weight 0 for all other observations.
 
     Args:
@@ -492,7 +494,7 @@ def robust_projections(
     return Projections(cameras, triangulate(cameras, fewer.x, fewer.weights, steps=2), status), fewer
 
 
-def _level(tracks: Tracks, cameras: Tensor, sigma: Tensor, given: Tensor | None) -> Tensor:
+def _level(tracks: ViewTracks, cameras: Tensor, sigma: Tensor, given: Tensor | None) -> Tensor:
     """The noise ``(b,)``: as given, or that of the points that agree."""
     if given is not None:
         return given
@@ -501,7 +503,7 @@ def _level(tracks: Tracks, cameras: Tensor, sigma: Tensor, given: Tensor | None)
     return settled_noise(tracks, distance(fewer, cameras), free, free >= 1, camera_unknowns(*cameras.shape[1:]))
 
 
-def _extended(tracks: Tracks, found: Consensus, sigma: Tensor) -> Tensor:
+def _extended(tracks: ViewTracks, found: Consensus, sigma: Tensor) -> Tensor:
     """Projections of all views: the others by resection from the points that agree, reweighted."""
     b, size = found.chosen.shape
     if size == tracks.x.shape[1]:
@@ -524,7 +526,7 @@ def _extended(tracks: Tracks, found: Consensus, sigma: Tensor) -> Tensor:
     return whole.index_put((rows, found.chosen), found.projections)
 
 
-def _settled(tracks: Tracks, cameras: Tensor, lifts: Tensor | None, sigma: Tensor, widths: tuple[float, ...]) -> Tensor:
+def _settled(tracks: ViewTracks, cameras: Tensor, lifts: Tensor | None, sigma: Tensor, widths: tuple[float, ...]) -> Tensor:
     """Projections adjusted to the observations that agree, which are chosen again after each time."""
     for width in widths:
         projections = cameras if lifts is None else cameras @ lifts
@@ -534,7 +536,7 @@ def _settled(tracks: Tracks, cameras: Tensor, lifts: Tensor | None, sigma: Tenso
     return cameras if lifts is None else cameras @ lifts
 
 
-def _structured(tracks: Tracks, cameras: Tensor, lifting: Lifting, sigma: Tensor, given: Tensor | None) -> Tensor:
+def _structured(tracks: ViewTracks, cameras: Tensor, lifting: Lifting, sigma: Tensor, given: Tensor | None) -> Tensor:
     """Projections that the lifts allow, where as many observations agree with them."""
     weights = agreeing(tracks, cameras, sigma)
     fewer = tracks.only(weights)

@@ -13,7 +13,7 @@ from dyntorch.geometry.lift import balanced, balanced_algebra, behind, centred, 
 from dyntorch.geometry.pairs import hyperplane_pair, two_bodies
 from dyntorch.geometry.triangulation import reproject, resect, triangulate, unit_projections
 from dyntorch.tasks.reconstruct.motions import Motion
-from dyntorch.tasks.reconstruct.projections import Projections, Tracks, camera_unknowns, choices, projections_of_tracks
+from dyntorch.tasks.reconstruct.projections import Projections, ViewTracks, camera_unknowns, choices, projections_of_tracks
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Starts of structured bundle adjustment that need no tensor: the scene as if it stood still, in several frames.
@@ -45,7 +45,7 @@ def resting_constants(lifts: Tensor) -> Tensor:
     return still if still.shape[-1] >= lifts.shape[-2] else still[:, :0]
 
 
-def resting(tracks: Tracks, sensor: int, dim: int) -> Tensor:
+def resting(tracks: ViewTracks, sensor: int, dim: int) -> Tensor:
     """The cameras ``(b, views, l + 1, dim + 1)`` that explain tracks best if no point moves, points finite and of unit variance.
 
     Where motion is slow against the extent of the scene they are near the truth, whatever the motion model.
@@ -137,7 +137,7 @@ class Lifting:
 
 
 @dataclass(frozen=True)
-class Scene:
+class LiftedState:
     """Cameras and points of a scene, normalized images."""
 
     cameras: Tensor
@@ -148,7 +148,7 @@ class Scene:
     """``(b,)``."""
 
 
-def scene_of(tracks: Tracks, found: Projections, lifting: Lifting, scale: Tensor | None = None) -> Scene:
+def scene_of(tracks: ViewTracks, found: Projections, lifting: Lifting, scale: Tensor | None = None) -> LiftedState:
     """Cameras and points from projections in a projective frame, and from the scene as if it stood still where that is safer.
 
     The second start is taken in high spaces with few spare images (:data:`SEVERAL`, :data:`SPARE`), and where no views have
@@ -169,7 +169,7 @@ def scene_of(tracks: Tracks, found: Projections, lifting: Lifting, scale: Tensor
     size = lifting.lifts.shape[-1]
     known = torch.where(lost[:, None], coordinates >= size - 1, (found.structure != 0).any(-1))
     scene = _scene(tracks, _upgraded(found, lost, lifting), known & ~lost[:, None], lifting, scale)
-    scene = Scene(scene.cameras, scene.structure, torch.where(lost, torch.inf, scene.cost))
+    scene = LiftedState(scene.cameras, scene.structure, torch.where(lost, torch.inf, scene.cost))
     spare = (coordinates * known).sum(-1) - (size - 1) * known.sum(-1)
     shaky = ~lost & (size >= SEVERAL) & (spare <= SPARE * known.sum(-1))
     shaky = shaky | (~lost & wild(tracks, _finite(tracks, scene, lifting), lifting))
@@ -179,7 +179,7 @@ def scene_of(tracks: Tracks, found: Projections, lifting: Lifting, scale: Tensor
     return _confirmed(tracks, scene, left, known, lifting, scale) if len(left) else scene
 
 
-def wild(tracks: Tracks, scene: Scene, lifting: Lifting) -> Tensor:
+def wild(tracks: ViewTracks, scene: LiftedState, lifting: Lifting) -> Tensor:
     """Problems ``(b,)`` with so many points behind cameras that the scene, in a finite frame, is that of a wrong minimum."""
     if tracks.x.shape[-1] != 2:
         return torch.zeros_like(scene.cost, dtype=torch.bool)
@@ -188,7 +188,7 @@ def wild(tracks: Tracks, scene: Scene, lifting: Lifting) -> Tensor:
     return count > (BEHIND * known.sum(-1)).clamp(min=2)
 
 
-def _aided(tracks: Tracks, lifting: Lifting) -> Tensor:
+def _aided(tracks: ViewTracks, lifting: Lifting) -> Tensor:
     """Problems ``(b,)`` whose cameras follow from the points known to stand still."""
     if tracks.static is None or lifting.motion.static or not lifting.still.shape[-1]:
         return torch.zeros_like(tracks.x[:, 0, 0, 0], dtype=torch.bool)
@@ -201,17 +201,19 @@ def _upgraded(found: Projections, lost: Tensor, lifting: Lifting) -> Tensor:
     return upgrade(torch.where(lost[:, None, None, None], 1.0, found.projections), lifting.lifts)[1]
 
 
-def _scene(tracks: Tracks, cameras: Tensor, known: Tensor, lifting: Lifting, scale: Tensor | None) -> Scene:
+def _scene(tracks: ViewTracks, cameras: Tensor, known: Tensor, lifting: Lifting, scale: Tensor | None) -> LiftedState:
     """The scene that adjustment finds from some cameras, with the known points ``(b, n)``."""
     structure = triangulate(cameras @ lifting.lifts, tracks.x, tracks.weights)
-    start = Scene(cameras, torch.where(known[..., None], structure, 0.0), torch.zeros_like(tracks.x[:, 0, 0, 0]))
+    start = LiftedState(cameras, torch.where(known[..., None], structure, 0.0), torch.zeros_like(tracks.x[:, 0, 0, 0]))
     done = adjusted(tracks, start, lifting, scale)
     # a point that was lost costs the extent of the image
     gone = known & (done.structure == 0).all(-1)
-    return Scene(done.cameras, done.structure, done.cost + (tracks.weights * gone[:, None]).flatten(1).sum(-1))
+    return LiftedState(done.cameras, done.structure, done.cost + (tracks.weights * gone[:, None]).flatten(1).sum(-1))
 
 
-def _confirmed(tracks: Tracks, scene: Scene, left: Tensor, known: Tensor, lifting: Lifting, scale: Tensor | None) -> Scene:
+def _confirmed(
+    tracks: ViewTracks, scene: LiftedState, left: Tensor, known: Tensor, lifting: Lifting, scale: Tensor | None
+) -> LiftedState:
     """The scenes of least cost among those of several starts: further ones until two of them end in the same minimum."""
     cameras, structure, cost = scene.cameras.clone(), scene.structure.clone(), scene.cost.clone()
     seen = cost[left].isfinite().long()
@@ -232,10 +234,10 @@ def _confirmed(tracks: Tracks, scene: Scene, left: Tensor, known: Tensor, liftin
             break
     # without a tensor and without points known to stand still only what was found twice counts
     cost[left[torch.isin(left, alone) & ~_aided(tracks, lifting)[left]]] = torch.inf
-    return Scene(cameras, structure, cost)
+    return LiftedState(cameras, structure, cost)
 
 
-def _started(tracks: Tracks, number: int, lifting: Lifting, scale: Tensor | None) -> Tensor:
+def _started(tracks: ViewTracks, number: int, lifting: Lifting, scale: Tensor | None) -> Tensor:
     """Cameras of all views from those of the scene at rest; of a part of many views: adjusted, the others by resection."""
     aided = bool(_aided(tracks, lifting).all())
     window = middle(tracks.times, number)
@@ -250,7 +252,7 @@ def _started(tracks: Tracks, number: int, lifting: Lifting, scale: Tensor | None
     return whole.index_copy(1, window.to(whole.device), part.cameras)
 
 
-def adjusted(tracks: Tracks, scene: Scene, lifting: Lifting, scale: Tensor | None = None) -> Scene:
+def adjusted(tracks: ViewTracks, scene: LiftedState, lifting: Lifting, scale: Tensor | None = None) -> LiftedState:
     """Structured bundle adjustment."""
     confined = tracks.static if lifting.still.shape[-1] else None
     done = bundle_adjust(
@@ -265,10 +267,10 @@ def adjusted(tracks: Tracks, scene: Scene, lifting: Lifting, scale: Tensor | Non
         confined=confined,
         subspace=None if confined is None else lifting.still,
     )
-    return Scene(done.cameras, done.structure, done.cost)
+    return LiftedState(done.cameras, done.structure, done.cost)
 
 
-def framed(tracks: Tracks, scene: Scene, lifting: Lifting) -> Scene:
+def framed(tracks: ViewTracks, scene: LiftedState, lifting: Lifting) -> LiftedState:
     """The scene in its frame: finite, with no motion common to all points (to the static ones), centred, of unit size.
 
     Args:
@@ -287,13 +289,13 @@ def framed(tracks: Tracks, scene: Scene, lifting: Lifting) -> Scene:
     cameras, structure = moved(G, cameras, structure, lifts)
     depth = structure @ lifts[0, -1]
     structure = structure / torch.where(depth.abs() > 1e-12, depth, 1.0)[..., None]
-    return Scene(unit_projections(cameras), structure, scene.cost)
+    return LiftedState(unit_projections(cameras), structure, scene.cost)
 
 
-def _finite(tracks: Tracks, scene: Scene, lifting: Lifting) -> Scene:
+def _finite(tracks: ViewTracks, scene: LiftedState, lifting: Lifting) -> LiftedState:
     """The scene in a frame in which all points are finite, if there is one."""
     G, cameras, structure = finite(scene.cameras, scene.structure, lifting.lifts, lifting.algebra, tracks.weights)
-    return Scene(*moved(G, cameras, structure, lifting.lifts), scene.cost)
+    return LiftedState(*moved(G, cameras, structure, lifting.lifts), scene.cost)
 
 
 def positions(structure: Tensor, lift: Tensor) -> Tensor:
@@ -311,7 +313,7 @@ def velocities(structure: Tensor, lift: Tensor, slope: Tensor) -> Tensor:
     return torch.where(known, moving, torch.nan)
 
 
-def distances(tracks: Tracks, projections: Tensor, structure: Tensor) -> Tensor:
+def distances(tracks: ViewTracks, projections: Tensor, structure: Tensor) -> Tensor:
     """Reprojection distances ``(b, views, n)`` in the unit of the measurements; NaN where missing or not determined."""
     error = (tracks.x - reproject(projections, structure)).norm(dim=-1) / tracks.scales[..., None]
     known = (structure != 0).any(-1)[:, None] & (tracks.weights > 0)
@@ -326,7 +328,7 @@ STEPS = 60
 """Of bundle adjustment."""
 
 
-def bodies_of(tracks: Tracks, scene: Scene) -> tuple[Tensor, Tensor, Tensor, Scene]:
+def bodies_of(tracks: ViewTracks, scene: LiftedState) -> tuple[Tensor, Tensor, Tensor, LiftedState]:
     """Labels by the two hyperplanes of the points, and the affine structure of each body.
 
     Args:
@@ -344,10 +346,10 @@ def bodies_of(tracks: Tracks, scene: Scene) -> tuple[Tensor, Tensor, Tensor, Sce
     structure = _on_hyperplanes(tracks, done.cameras, pair.hyperplanes, pair.labels)
     bodies = two_bodies(done.cameras, structure, pair.hyperplanes, pair.labels)
     points = torch.where(known[..., None], bodies.points, torch.nan)
-    return bodies.cameras, points, pair.labels, Scene(done.cameras, structure, done.cost)
+    return bodies.cameras, points, pair.labels, LiftedState(done.cameras, structure, done.cost)
 
 
-def _on_hyperplanes(tracks: Tracks, cameras: Tensor, hyperplanes: Tensor, labels: Tensor) -> Tensor:
+def _on_hyperplanes(tracks: ViewTracks, cameras: Tensor, hyperplanes: Tensor, labels: Tensor) -> Tensor:
     """The points, each triangulated within the hyperplane of its body."""
     total = torch.zeros_like(labels[..., None] * hyperplanes[:, :1, :])
     for body in (1, 2):

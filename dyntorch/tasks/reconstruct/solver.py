@@ -16,12 +16,22 @@ from dyntorch.numerics.chi_square import quantile
 from dyntorch.tasks.outcome import NoticeCode, notices
 from dyntorch.tasks.reconstruct.diagnosis import diagnose, least_squares, spare, unknowns
 from dyntorch.tasks.reconstruct.motions import MOTIONS, Motion
-from dyntorch.tasks.reconstruct.projections import Projections, Tracks, projections_of_tracks
+from dyntorch.tasks.reconstruct.projections import Projections, ViewTracks, projections_of_tracks
 from dyntorch.tasks.reconstruct.result import Ranked, Reconstruction
 from dyntorch.tasks.reconstruct.robust import robust_projections, suspicious, trimmed, unfounded
-from dyntorch.tasks.reconstruct.scene import Lifting, Scene, adjusted, bodies_of, distances, framed, positions, scene_of, velocities
+from dyntorch.tasks.reconstruct.scene import (
+    LiftedState,
+    Lifting,
+    adjusted,
+    bodies_of,
+    distances,
+    framed,
+    positions,
+    scene_of,
+    velocities,
+)
 
-Part = TypeVar("Part", Projections, Scene)
+Part = TypeVar("Part", Projections, LiftedState)
 
 CORRECTIONS = 4
 """Times that points said to stand still are looked at."""
@@ -30,7 +40,7 @@ EXACT = 1e-18
 
 
 def solve(
-    tracks: Tracks,
+    tracks: ViewTracks,
     motion: Motion,
     static: Tensor | None,
     limit: float | None,
@@ -73,7 +83,7 @@ def solve(
     return _result(tracks, motion, lifting, found, scene, static, batch)
 
 
-def _corrected(tracks: Tracks, scene: Scene, lifting: Lifting) -> tuple[Tracks, Scene]:
+def _corrected(tracks: ViewTracks, scene: LiftedState, lifting: Lifting) -> tuple[ViewTracks, LiftedState]:
     """The scene without points said to stand still that move, a few at a time, and the tracks with the others."""
     for _ in range(CORRECTIONS):
         assert tracks.static is not None
@@ -84,12 +94,12 @@ def _corrected(tracks: Tracks, scene: Scene, lifting: Lifting) -> tuple[Tracks, 
         tracks = replace(tracks, static=tracks.static & ~wrong)
         some = tracks.subset(left)
         structure = triangulate(scene.cameras[left] @ lifting.lifts, some.x, some.weights)
-        again = adjusted(some, Scene(scene.cameras[left], structure, scene.cost[left]), lifting)
+        again = adjusted(some, LiftedState(scene.cameras[left], structure, scene.cost[left]), lifting)
         scene = _merged(scene, again, left)
     return tracks, scene
 
 
-def _scene(tracks: Tracks, found: Projections, lifting: Lifting | None) -> tuple[Projections, Scene]:
+def _scene(tracks: ViewTracks, found: Projections, lifting: Lifting | None) -> tuple[Projections, LiftedState]:
     """With a lift the scene in any of its frames; bodies stay in the projective one, with their projections for cameras."""
     if lifting is not None:
         scene = scene_of(tracks, found, lifting)
@@ -97,7 +107,7 @@ def _scene(tracks: Tracks, found: Projections, lifting: Lifting | None) -> tuple
         status = torch.where(failed(found.status) & scene.cost.isfinite(), int(Status.OK), found.status)
         return Projections(found.projections, found.structure, status), scene
     done = bundle_adjust(tracks.x, tracks.weights, found.projections, found.structure)
-    return found, Scene(done.cameras, done.structure, done.cost)
+    return found, LiftedState(done.cameras, done.structure, done.cost)
 
 
 def _merged(old: Part, new: Part, chosen: Tensor) -> Part:
@@ -110,16 +120,16 @@ def _part(whole: Part, keep: Tensor) -> Part:
     return type(whole)(*(part[keep] for part in vars(whole).values()))
 
 
-def _distances(tracks: Tracks, scene: Scene, lifting: Lifting | None) -> Tensor:
+def _distances(tracks: ViewTracks, scene: LiftedState, lifting: Lifting | None) -> Tensor:
     return distances(tracks, scene.cameras if lifting is None else scene.cameras @ lifting.lifts, scene.structure)
 
 
 def _result(
-    tracks: Tracks,
+    tracks: ViewTracks,
     motion: Motion,
     lifting: Lifting | None,
     found: Projections,
-    scene: Scene,
+    scene: LiftedState,
     given: Tensor | None,
     batch: tuple[int, ...],
 ) -> Reconstruction:
@@ -179,7 +189,7 @@ def _result(
     )
 
 
-def _rests(tracks: Tracks, scene: Scene, lifting: Lifting, projections: Tensor) -> Tensor:
+def _rests(tracks: ViewTracks, scene: LiftedState, lifting: Lifting, projections: Tensor) -> Tensor:
     """Which points ``(b, n)`` are explained as well, within the noise, by one position for all times."""
     still = lifting.still
     apart = distances(tracks, projections, scene.structure)
@@ -228,7 +238,7 @@ FLOOR = 1e-9
 
 
 def choose(
-    tracks: Tracks, static: Tensor | None, limit: float | None, generator: torch.Generator | None, batch: tuple[int, ...]
+    tracks: ViewTracks, static: Tensor | None, limit: float | None, generator: torch.Generator | None, batch: tuple[int, ...]
 ) -> Reconstruction:
     r"""Reconstruct with the declared model of least penalized cost; the others are listed in ``candidates``.
 
@@ -264,7 +274,7 @@ def choose(
         raise ValueError(
             f"no declared motion takes {views} views of {n} tracks; {first.name!r} needs {need[0]} views and {need[1]} tracks"
         )
-    plain = [Fit.of(tracks, model, *least_squares(tracks, model)) for model in models]
+    plain = [LiftedFit.of(tracks, model, *least_squares(tracks, model)) for model in models]
     listed = ranked(tracks, plain, limit)
     best = solve(tracks, MOTIONS[listed[0].motion], static, limit, generator, batch)
     fit = next(fit for fit in plain if fit.motion is best.motion)
@@ -277,13 +287,14 @@ def choose(
     others = [model for model in models if model is not best.motion]
     robust = {best.motion.name: best} | {model.name: solve(tracks, model, static, limit, generator, batch) for model in others}
     fits = [
-        Fit.of(tracks, one.motion, one.residuals.reshape(tracks.weights.shape), one.status.reshape(-1)) for one in robust.values()
+        LiftedFit.of(tracks, one.motion, one.residuals.reshape(tracks.weights.shape), one.status.reshape(-1))
+        for one in robust.values()
     ]
     listed = ranked(tracks, fits, limit)
     return replace(robust[listed[0].motion], candidates=listed + untried)
 
 
-class Fit(NamedTuple):
+class LiftedFit(NamedTuple):
     """How a model fits the problems of a batch."""
 
     motion: Motion
@@ -295,7 +306,7 @@ class Fit(NamedTuple):
     """``(b,)`` noise that it leaves."""
 
     @classmethod
-    def of(cls, tracks: Tracks, motion: Motion, apart: Tensor, status: Tensor) -> Fit:
+    def of(cls, tracks: ViewTracks, motion: Motion, apart: Tensor, status: Tensor) -> LiftedFit:
         """With the noise from the distances."""
         counted = apart.isfinite()
         sigma = (apart.square().nansum((1, 2)) / spare(tracks, counted, motion).clamp(min=1)).sqrt()
@@ -330,7 +341,7 @@ def _lacks(motion: Motion, times: Tensor, views: int, n: int) -> str:
     return ""
 
 
-def ranked(tracks: Tracks, fits: list[Fit], limit: float | None) -> tuple[Ranked, ...]:
+def ranked(tracks: ViewTracks, fits: list[LiftedFit], limit: float | None) -> tuple[Ranked, ...]:
     """The models by their penalized costs over the whole batch, the least first."""
     sigma = _noise(tracks, fits, limit)
     found = []
@@ -341,7 +352,7 @@ def ranked(tracks: Tracks, fits: list[Fit], limit: float | None) -> tuple[Ranked
     return tuple(sorted(found, key=lambda one: one.score))
 
 
-def _noise(tracks: Tracks, fits: list[Fit], limit: float | None) -> Tensor:
+def _noise(tracks: ViewTracks, fits: list[LiftedFit], limit: float | None) -> Tensor:
     """The noise of every problem, ``(b,)``: a third of the limit, or what the models that fit leave in the middle."""
     floor = FLOOR / tracks.scales.square().mean(-1).sqrt()
     if limit is not None and math.isfinite(limit):
@@ -353,7 +364,7 @@ def _noise(tracks: Tracks, fits: list[Fit], limit: float | None) -> Tensor:
     return torch.where(near, sigma, torch.nan).nanmedian(0).values.nan_to_num(nan=1.0).maximum(floor)
 
 
-def penalized(tracks: Tracks, fit: Fit, sigma: Tensor) -> Tensor:
+def penalized(tracks: ViewTracks, fit: LiftedFit, sigma: Tensor) -> Tensor:
     """The penalized cost ``(b,)`` of one model; where it failed, that of outliers only.
 
     Args:

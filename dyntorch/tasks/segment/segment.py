@@ -101,7 +101,7 @@ SPARSE = 0.3
 
 
 @dataclass(frozen=True)
-class Given:
+class GivenMatches:
     """The matches of one problem, ready for the search.
 
     Attributes:
@@ -197,7 +197,7 @@ def nothing(weights: Tensor, threshold: float, status: Status, repeated: float, 
     )
 
 
-def outcome(given: Given, labelled: Labelling, threshold: float, bodies: int | None, spare: bool) -> Outcome:
+def outcome(given: GivenMatches, labelled: Labelling, threshold: float, bodies: int | None, spare: bool) -> Outcome:
     """The labels in order of size, with the model of every body."""
     labelled = _sorted(labelled)
     labels, fundamentals = labelled.labels, labelled.fundamentals
@@ -361,7 +361,7 @@ def _solve(x1: Tensor, x2: Tensor, weights: Tensor, request: Request, threshold:
     return outcome(given, labelled, threshold, request.bodies, chosen.spare)
 
 
-def _labelled(given: Given, candidate: Candidate, request: Request) -> Labelling:
+def _labelled(given: GivenMatches, candidate: Candidate, request: Request) -> Labelling:
     """Labels of all matches by a segmentation of those that were searched."""
     found = torch.zeros_like(given.present)
     found[given.keep[given.searched]] = candidate.labels + 1
@@ -374,12 +374,14 @@ def _labelled(given: Given, candidate: Candidate, request: Request) -> Labelling
     return labelled.of(significant(given.view, labelled.fundamentals, labelled.labels))
 
 
-def _left(given: Given, labelled: Labelling) -> int:
+def _left(given: GivenMatches, labelled: Labelling) -> int:
     """How many of the kept matches became outliers."""
     return int((labelled.labels[given.keep] == 0).sum()) if len(given.groups) else 0
 
 
-def _given(x1: Tensor, x2: Tensor, weights: Tensor, present: Tensor, threshold: float, request: Request, repeated: float) -> Given:
+def _given(
+    x1: Tensor, x2: Tensor, weights: Tensor, present: Tensor, threshold: float, request: Request, repeated: float
+) -> GivenMatches:
     """The present matches ``(m, 2)`` around 0 and of about unit size, by one scale: distances stay comparable."""
     centres = x1.median(0).values, x2.median(0).values
     # squares of tiny coordinates would underflow: a view without extent would not count
@@ -403,7 +405,7 @@ def _given(x1: Tensor, x2: Tensor, weights: Tensor, present: Tensor, threshold: 
         groups = keep[:0]
     view = View(a, b, pixel, links)
     searched = some[keep].nonzero().flatten()
-    return Given(weights, present, view, first, second, float(scale), values, keep, groups, searched, repeated)
+    return GivenMatches(weights, present, view, first, second, float(scale), values, keep, groups, searched, repeated)
 
 
 def _some(count: int, generator: torch.Generator | None, device: torch.device) -> Tensor:

@@ -245,7 +245,7 @@ long."""
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class EpipolarFit:
     """A minimum.
 
     Attributes:
@@ -277,7 +277,7 @@ class Fit:
         return self.offset + (self.rate - 1) * self.center
 
 
-class Descent:
+class ShiftDescent:
     """The problem for two cameras: what does not depend on the start is smoothed once."""
 
     def __init__(self, a: Tracks, b: Tracks, width: float, rows: int = ROWS) -> None:
@@ -292,7 +292,7 @@ class Descent:
         self.changes = (a.change, b.change)
         self.noise = (float(a.change[0, 0]), float(b.change[0, 0]) * noise_ratio(a, b))  # one px of a, in normalized coordinates
 
-    def run(self, offset: float, rate: float = 1.0, *, free_rate: bool = False, start: Tensor | None = None) -> Fit | None:
+    def run(self, offset: float, rate: float = 1.0, *, free_rate: bool = False, start: Tensor | None = None) -> EpipolarFit | None:
         """Descend from a start; None where too little is seen there, or the rate runs away.
 
         Args:
@@ -376,7 +376,7 @@ class Descent:
         state.offset += shift - change * state.center
         return abs(shift) + abs(change) * lever
 
-    def _fit(self, state: _State, rows: _Rows, free_rate: bool) -> Fit:
+    def _fit(self, state: _State, rows: _Rows, free_rate: bool) -> EpipolarFit:
         """What is found, and how sure: each frame's influence on the estimate, with what neighbouring frames have in common."""
         assert state.F is not None
         assert state.center is not None
@@ -398,7 +398,7 @@ class Descent:
         distances = torch.full(rows.both.shape, torch.nan, dtype=J.dtype, device=J.device)
         distances[rows.both] = rows.residual / max(scale_of, 1e-300)
         correlated = 2 * math.sqrt(math.pi) * self.width / step  # frames that the kernel makes into one
-        return Fit(
+        return EpipolarFit(
             offset=state.offset,
             rate=state.rate,
             center=state.center,

@@ -12,7 +12,7 @@ from torch import Generator, Tensor
 
 from dyntorch.geometry.epipolar import epipolar_variance, gradient_moments
 from dyntorch.numerics.lags import epipolar_moments
-from dyntorch.tasks.synchronize.epipolar import FEWEST, OVERLAP, Curve, Descent, Fit, Samples, epipolar_curve
+from dyntorch.tasks.synchronize.epipolar import FEWEST, OVERLAP, Curve, EpipolarFit, Samples, ShiftDescent, epipolar_curve
 from dyntorch.tasks.synchronize.tracks import Tracks
 
 PEAKS = 6
@@ -62,7 +62,7 @@ class Attempt:
 
     a: Tracks
     b: Tracks
-    fit: Fit | None
+    fit: EpipolarFit | None
     curve: Curve
     samples: Samples
     step: float
@@ -100,7 +100,7 @@ class Attempt:
         rough = [self.curve.misfit(self._lag(shift)) for shift, _ in self.peaks] or [0.0]
         if self.fit is None or len(rough) == 1:
             return rough
-        descent = Descent(self.a, self.b, max(self.frame, self.step), rows=FEW_ROWS)
+        descent = ShiftDescent(self.a, self.b, max(self.frame, self.step), rows=FEW_ROWS)
         steps = self.step * torch.linspace(-1, 1, FRACTIONS, dtype=torch.float64)
         level = max(self.curve.level, 1e-300)
         for k, (shift, _) in enumerate(self.peaks[: RIVALS + 1]):

@@ -16,7 +16,7 @@ from dyntorch.geometry.lens import fit_distortion, undistorted
 from dyntorch.numerics.arguments import on_cpu
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.tasks.synchronize.different import different_points
-from dyntorch.tasks.synchronize.epipolar import Curve, Descent, Fit, Samples, epipolar_curve
+from dyntorch.tasks.synchronize.epipolar import Curve, EpipolarFit, Samples, ShiftDescent, epipolar_curve
 from dyntorch.tasks.synchronize.evidence import APART, PEAKS, WANDER, Attempt, consistent_points
 from dyntorch.tasks.synchronize.result import Shift
 from dyntorch.tasks.synchronize.tracks import RATES, Tracks, cleaned, frame_scaled, read_tracks, smoothed, without
@@ -39,7 +39,7 @@ NEGLIGIBLE = 0.1
 
 
 @dataclass(frozen=True)
-class Search:
+class ShiftSearch:
     """How to search.
 
     Attributes:
@@ -57,7 +57,7 @@ class Search:
     method: str = "epipolar"
 
 
-def attempt(a: Tracks, b: Tracks, search: Search, points: Tensor | None = None) -> Attempt:
+def attempt(a: Tracks, b: Tracks, search: ShiftSearch, points: Tensor | None = None) -> Attempt:
     """Search all shifts at the given rates of b's clock, descend from the best, and settle the rate.
 
     Args:
@@ -77,7 +77,7 @@ def attempt(a: Tracks, b: Tracks, search: Search, points: Tensor | None = None) 
     return Attempt(a, b, fit, curve, samples, step, search.max_shift, points, search.method)
 
 
-def _best(a: Tracks, b: Tracks, curves: list[Curve], step: float, free_rate: bool) -> Fit | None:
+def _best(a: Tracks, b: Tracks, curves: list[Curve], step: float, free_rate: bool) -> EpipolarFit | None:
     """The likeliest minimum near the peaks of the curves."""
     frame = max(a.step, b.step)
     starts = sorted(((score, lag * curve.rate, curve.rate) for curve in curves for lag, score in curve.peaks(PEAKS)), reverse=True)
@@ -89,7 +89,7 @@ def _best(a: Tracks, b: Tracks, curves: list[Curve], step: float, free_rate: boo
     widths = [step]
     while widths[-1] > frame:
         widths.append(max(frame, widths[-1] / 3))
-    descent = Descent(a, b, step)
+    descent = ShiftDescent(a, b, step)
     found = []
     for score, offset, rate in starts[: PEAKS if several else 1]:
         fit = descent.run(offset, rate, free_rate=free_rate and step > frame)
@@ -100,13 +100,13 @@ def _best(a: Tracks, b: Tracks, curves: list[Curve], step: float, free_rate: boo
         return None
     best = max(found, key=lambda pair: pair[0])[1]
     for width in widths[1:]:
-        descent = Descent(a, b, width)
+        descent = ShiftDescent(a, b, width)
         best = descent.run(best.offset, best.rate, free_rate=free_rate) or best
     long = float(best.times[-1] - best.times[0]) > DRIFTING
     return _settled(descent, best) if free_rate and long else best
 
 
-def _settled(descent: Descent, fit: Fit) -> Fit:
+def _settled(descent: ShiftDescent, fit: EpipolarFit) -> EpipolarFit:
     """With its own rate where that differs from 1 beyond doubt, else with rate 1."""
     free = descent.run(fit.offset, fit.rate, free_rate=True)
     span = float(fit.times[-1] - fit.times[0])
@@ -168,7 +168,7 @@ def same_points(
         lenses: whether nobody calibrated the cameras, and distortion may be looked for.
     """
     span = min(float(t.times[-1] - t.times[0]) for t in (a, b))
-    search = Search(step=span / LONGEST, max_shift=max_shift, rates=(rate or 1.0,), free_rate=rate is None)
+    search = ShiftSearch(step=span / LONGEST, max_shift=max_shift, rates=(rate or 1.0,), free_rate=rate is None)
     seen = (a.weights > 0).any(0) & (b.weights > 0).any(0)
     if a.still or b.still:
         return Result(dataclasses.replace(attempt(a, b, search), fit=None), (), seen)
@@ -189,7 +189,7 @@ def same_points(
     return Result(found, notes if found.decided else (), seen)
 
 
-def _sorted_out(a: Tracks, b: Tracks, search: Search, generator: Generator | None) -> Attempt:
+def _sorted_out(a: Tracks, b: Tracks, search: ShiftSearch, generator: Generator | None) -> Attempt:
     """An attempt with all points, and one without those that do not fit, where that may be why it fails."""
     found = attempt(a, b, search)
     pruned = _pruned(found)
@@ -227,7 +227,7 @@ def _pruned(found: Attempt) -> tuple[Tracks, Tracks] | None:
     return without(found.a, far), without(found.b, other)
 
 
-def _over_rates(a: Tracks, b: Tracks, search: Search, span: float, generator: Generator | None) -> Attempt | None:
+def _over_rates(a: Tracks, b: Tracks, search: ShiftSearch, span: float, generator: Generator | None) -> Attempt | None:
     """A search over clock rates too, where a wrong one would have smeared the motion."""
     step = max(span / COARSE, 0.1)
     change = 2 * step / span  # moves the ends of the overlap by a step
@@ -241,7 +241,7 @@ def _over_rates(a: Tracks, b: Tracks, search: Search, span: float, generator: Ge
     return _sorted_out(a, b, dataclasses.replace(search, rates=(coarse.fit.rate,)), generator)
 
 
-def _affine(a: Tracks, b: Tracks, search: Search, generator: Generator | None) -> Attempt:
+def _affine(a: Tracks, b: Tracks, search: ShiftSearch, generator: Generator | None) -> Attempt:
     return _sorted_out(frame_scaled(a), frame_scaled(b), dataclasses.replace(search, method="affine"), generator)
 
 
@@ -267,7 +267,7 @@ def _suspects(found: Attempt) -> Tensor:
 
 
 def _straightened(
-    found: Attempt, a: Tracks, b: Tracks, search: Search, generator: Generator | None
+    found: Attempt, a: Tracks, b: Tracks, search: ShiftSearch, generator: Generator | None
 ) -> tuple[Attempt, tuple[str, ...]]:
     """Once more with lenses fitted at the shift found, where they are significant."""
     assert found.fit is not None

@@ -23,7 +23,7 @@ FLAT = 1e-12  # relative size of an image line, or a depth, below which an image
 
 
 @dataclass(frozen=True)
-class Sightings:
+class LineSightings:
     """Points seen by cameras, each at its own time.
 
     Attributes:
@@ -53,7 +53,7 @@ class Sightings:
         return (rows * self.weights.sqrt()[..., None, None]).transpose(-4, -3).flatten(-3, -2)
 
 
-def normalized(cameras: Tensor, x: Tensor, weights: Tensor) -> tuple[Sightings, Tensor, Tensor]:
+def normalized(cameras: Tensor, x: Tensor, weights: Tensor) -> tuple[LineSightings, Tensor, Tensor]:
     """Images about 0 and of size 1, in a world in which the stacked cameras are orthonormal.
 
     Returns:
@@ -79,12 +79,12 @@ def normalized(cameras: Tensor, x: Tensor, weights: Tensor) -> tuple[Sightings, 
     # cameras of one centre only leave the world as it is: nothing can be triangulated
     upper = torch.where((diagonal.amin(-1) > 1e-12 * diagonal.amax(-1))[..., None, None], upper, eye)
     back = torch.linalg.solve_triangular(upper, eye.expand_as(upper), upper=True)
-    data = Sightings(moved @ back[..., None, :, :], apply(transform, x), weights, scale[..., None].expand(weights.shape))
+    data = LineSightings(moved @ back[..., None, :, :], apply(transform, x), weights, scale[..., None].expand(weights.shape))
     return data, transform, back
 
 
 @dataclass(frozen=True)
-class Found:
+class FoundLines:
     """Unit vectors ``(*batch, n, k)``, their cost ``(*batch, n)`` in px^2, and the trace of the inverse Gauss-Newton matrix along
     the surface, ``(*batch, n)``: the squared uncertainty at a noise of 1 px."""
 
@@ -93,7 +93,7 @@ class Found:
     spread: Tensor
 
 
-def image_distances(data: Sightings, lines: Tensor) -> tuple[Tensor, Tensor]:
+def image_distances(data: LineSightings, lines: Tensor) -> tuple[Tensor, Tensor]:
     r"""Weighted distances of the points from the image lines, px, and their derivatives in the image lines.
 
     .. math:: r = x^T l / \|l_{1:2}\|, \qquad l = M L.
@@ -114,13 +114,13 @@ def image_distances(data: Sightings, lines: Tensor) -> tuple[Tensor, Tensor]:
     return distance * factor, normal * (factor / size)[..., None]
 
 
-def to_lines(data: Sightings, lines: Tensor) -> tuple[Tensor, Tensor]:
+def to_lines(data: LineSightings, lines: Tensor) -> tuple[Tensor, Tensor]:
     """The distances ``(*batch, n, views)`` and their derivatives in the lines, ``(*batch, n, views, 6)``."""
     distance, slope = image_distances(data, lines)
     return distance.mT, torch.einsum("...vni,...vik->...nvk", slope, line_camera(data.cameras))
 
 
-def to_points(data: Sightings, points: Tensor) -> tuple[Tensor, Tensor]:
+def to_points(data: LineSightings, points: Tensor) -> tuple[Tensor, Tensor]:
     """Weighted reprojection errors of points ``(*batch, n, 4)``, px: ``(*batch, n, 2 views)`` and ``(*batch, n, 2 views, 4)``."""
     image = torch.einsum("...vik,...nk->...vni", data.cameras, points)
     depth = finite_depth(image)
@@ -132,13 +132,13 @@ def to_points(data: Sightings, points: Tensor) -> tuple[Tensor, Tensor]:
     return error.transpose(-3, -2).flatten(-2), slope.transpose(-4, -3).flatten(-3, -2)
 
 
-def best_lines(data: Sightings, starts: Tensor) -> Found:
+def best_lines(data: LineSightings, starts: Tensor) -> FoundLines:
     """Lines ``(*batch, n, 6)`` of least distance, from starts on the Klein quadric; leading dimensions of the starts broadcast."""
     form = plucker_form(device=starts.device)
     return _descend(starts, lambda v: to_lines(data, v), lambda v: torch.stack([v, v @ form], dim=-2), nearest_line)
 
 
-def best_points(data: Sightings, starts: Tensor) -> Found:
+def best_points(data: LineSightings, starts: Tensor) -> FoundLines:
     """Points ``(*batch, n, 4)`` of least reprojection error."""
     return _descend(
         starts, lambda p: to_points(data, p), lambda p: p[..., None, :], lambda p: torch.nn.functional.normalize(p, dim=-1)
@@ -150,7 +150,7 @@ def _descend(
     measure: Callable[[Tensor], tuple[Tensor, Tensor]],
     normals: Callable[[Tensor], Tensor],
     retract: Callable[[Tensor], Tensor],
-) -> Found:
+) -> FoundLines:
     """Levenberg-Marquardt on a surface of unit vectors: steps along it, then back to the nearest of its points."""
 
     def system(at: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -182,7 +182,7 @@ def _descend(
         cost, gradient, matrix, size = system(vectors)
         step = _solved(gradient, matrix, torch.zeros_like(cost))
         vectors = retract(vectors - torch.where(step.detach().norm(dim=-1, keepdim=True) < NEAR, step, 0.0))
-    return Found(vectors, system(vectors)[0], _spread(matrix.detach(), size.detach(), normals(vectors).shape[-2]))
+    return FoundLines(vectors, system(vectors)[0], _spread(matrix.detach(), size.detach(), normals(vectors).shape[-2]))
 
 
 def _solved(gradient: Tensor, matrix: Tensor, damping: Tensor) -> Tensor:
@@ -208,7 +208,7 @@ ADJUSTMENT_STEPS, SETTLED = 25, 1e-6
 STUCK = 1e8  # damping at which no step is left to take
 
 
-def adjust(data: Sightings, lines: Tensor) -> Sightings:
+def adjust(data: LineSightings, lines: Tensor) -> LineSightings:
     r"""Levenberg-Marquardt over cameras and lines, the lines eliminated (Schur complement).
 
     With :math:`l = M(P) L` and :math:`g = \partial r / \partial l` the derivative of a distance in the camera is
@@ -242,12 +242,12 @@ def adjust(data: Sightings, lines: Tensor) -> Sightings:
     return data
 
 
-def _cost(data: Sightings, lines: Tensor) -> Tensor:
+def _cost(data: LineSightings, lines: Tensor) -> Tensor:
     """Sum of squared weighted distances, ``(*batch,)`` px^2."""
     return image_distances(data, lines)[0].square().sum((-2, -1))
 
 
-def _step(data: Sightings, lines: Tensor, damping: Tensor) -> tuple[Tensor, Tensor]:
+def _step(data: LineSightings, lines: Tensor, damping: Tensor) -> tuple[Tensor, Tensor]:
     """Steps of the cameras ``(*batch, views, 3, 4)`` and the lines ``(*batch, n, 6)``, to be subtracted."""
     distance, slope = image_distances(data, lines)  # (*batch, views, n), (*batch, views, n, 3)
     by_line = torch.einsum("...vni,...vik->...nvk", slope, line_camera(data.cameras))

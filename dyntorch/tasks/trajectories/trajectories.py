@@ -18,7 +18,7 @@ from dyntorch.invariants.grassmann_tensor import GrassmannTensor
 from dyntorch.numerics.arguments import on_cpu
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.numerics.nullspace import gram_null_space
-from dyntorch.tasks.trajectories.descent import Found, Sightings, adjust, best_lines, best_points, normalized
+from dyntorch.tasks.trajectories.descent import FoundLines, LineSightings, adjust, best_lines, best_points, normalized
 
 VIEWS = 4
 """Views of a point that leave finitely many lines: two."""
@@ -165,11 +165,11 @@ def points_on_lines(cameras: Tensor, x: Tensor, lines: Tensor) -> Tensor:
         >>> points_on_lines(torch.eye(3, 4)[None], torch.tensor([[[0.5, 0.1]]]), line).tolist()
         [[[2.0, 0.0, 4.0]]]
     """
-    data = Sightings(cameras, x, torch.ones_like(x[..., 0]), torch.ones_like(x[..., 0]))
+    data = LineSightings(cameras, x, torch.ones_like(x[..., 0]), torch.ones_like(x[..., 0]))
     return inhomogeneous(_feet(data, lines))
 
 
-def _feet(data: Sightings, lines: Tensor) -> Tensor:
+def _feet(data: LineSightings, lines: Tensor) -> Tensor:
     """Homogeneous points ``(*batch, views, n, 4)`` of lines ``(*batch, n, 6)``, nearest in the images."""
     image = torch.einsum("...vik,...nk->...vni", line_camera(data.cameras), lines)
     a, b = image[..., 0], image[..., 1]
@@ -201,12 +201,12 @@ def _checked(cameras: Tensor, x: Tensor, weights: Tensor | None, sigma: float | 
     return torch.where(known, weights, 0.0).double()
 
 
-def fitted_lines(data: Sightings) -> Tensor:
+def fitted_lines(data: LineSightings) -> Tensor:
     """The best lines ``(*batch, n, 6)`` of normalized sightings."""
     return _lines(data)[0].vectors
 
 
-def _lines(data: Sightings) -> tuple[Found, Tensor]:
+def _lines(data: LineSightings) -> tuple[FoundLines, Tensor]:
     """The best lines, and the second ones of four views (0 elsewhere)."""
     rays = data.rays()
     null = gram_null_space(rays.mT @ rays, 2).basis
@@ -217,17 +217,17 @@ def _lines(data: Sightings) -> tuple[Found, Tensor]:
     two = ((data.weights > 0).sum(-2) == VIEWS) & real & apart & cost[1:].isfinite().all(0)
     best = torch.where(two, 1, cost.argmin(0))[None]
     vectors, least, spread = found.vectors.take_along_dim(best[..., None], 0), found.cost, found.spread
-    line = Found(vectors[0], least.take_along_dim(best, 0)[0], spread.take_along_dim(best, 0)[0])
+    line = FoundLines(vectors[0], least.take_along_dim(best, 0)[0], spread.take_along_dim(best, 0)[0])
     return line, torch.where(two[..., None], found.vectors[2], 0.0)
 
 
-def _points(data: Sightings) -> Found:
+def _points(data: LineSightings) -> FoundLines:
     """Every point as if it did not move."""
     sides = data.sides()
     return best_points(data, gram_null_space(sides.mT @ sides).basis[..., 0, :])
 
 
-def _visible(data: Sightings, lines: Tensor) -> Tensor:
+def _visible(data: LineSightings, lines: Tensor) -> Tensor:
     """Whether lines ``(*batch, n, 6)`` stay clear of the centres of the cameras that see their points: the join of two centres
     meets all rays, and has no image in them."""
     image = torch.einsum("...vik,...nk->...vni", line_camera(data.cameras), lines).norm(dim=-1)

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from dyntorch.geometry.epipolar import Monomials, affine_fundamental, eight_point, sampson_squared
+from dyntorch.geometry.epipolar import PairMonomials, affine_fundamental, eight_point, sampson_squared
 from dyntorch.geometry.epipolar_fit import Frames, Products, _normal_equations, descend, fit_fundamental
 from dyntorch.geometry.homogeneous import skew, unit
 from tests.dyntorch.geometry.test_epipolar import distance, random, rms, scene
@@ -35,7 +35,7 @@ def test_a_small_step_turns_by_the_exponential():
 @pytest.mark.parametrize("start", [torch.diag(torch.tensor([1.0, 1.0, 0.0])), torch.diag(torch.tensor([1.0, 0.0, 0.0])), None])
 def test_derivative_by_finite_differences(start):
     frames = Frames.of(random(4, 3, 3) if start is None else start.double().expand(4, 3, 3))
-    data = Monomials(*random(2, 11, 2, seed=1))
+    data = PairMonomials(*random(2, 11, 2, seed=1))
     weights = torch.rand(4, 11, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 
     def residual(step):

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from dyntorch.geometry.epipolar_fit import Frames
-from dyntorch.geometry.lens import Division, Fit, Matches, distort, fit_distortion
+from dyntorch.geometry.lens import Division, LensDescent, LensMatches, distort, fit_distortion
 from dyntorch.scenes import two_view
 
 SIZE = (640.0, 480.0)
@@ -107,15 +107,15 @@ def test_distances_are_the_constraint_by_its_gradient_in_measured_pixels():
     x, step = torch.cat([a, b], dim=1), 1e-4
     moves = step * torch.eye(4, dtype=torch.float64)
     gradient = torch.stack([(constraint(x + move) - constraint(x - move)) / (2 * step) for move in moves], dim=-1)
-    found = Matches.of(a, b, torch.ones(6), ideal).distances(F, lens)[0]
+    found = LensMatches.of(a, b, torch.ones(6), ideal).distances(F, lens)[0]
     assert torch.allclose(found, constraint(x) / gradient.norm(dim=-1), rtol=1e-6)
 
 
 def test_the_descent_never_rises_and_keeps_fixed_lenses():
     a, b = seen((-0.2, -0.1), noise=1.0)
-    data = Matches.of(a, b, torch.ones(len(a), dtype=torch.float64), (Division.of(a, SIZE), Division.of(b, SIZE)))
+    data = LensMatches.of(a, b, torch.ones(len(a), dtype=torch.float64), (Division.of(a, SIZE), Division.of(b, SIZE)))
     F = torch.randn(3, 3, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
-    start = Fit(Frames.of(F), torch.tensor([[-0.1, 0.0]] * 3, dtype=torch.float64))
+    start = LensDescent(Frames.of(F), torch.tensor([[-0.1, 0.0]] * 3, dtype=torch.float64))
     scale = torch.full((3, 1), 5.0, dtype=torch.float64)
     for lens in (False, True):
         found = start.descended(data, scale, lens=lens)

@@ -7,7 +7,7 @@ import torch
 
 from dyntorch.shapes.basis import Fourier, Polynomial
 from dyntorch.shapes.moving import (
-    Descent,
+    ShapeDescent,
     canonical,
     centred_views,
     complete,
@@ -80,7 +80,7 @@ def test_normal_equations_are_the_derivatives_of_the_cost():
     views = centred_views(x, weights, 1 + weights[..., 0])
     at = canonical(shapes).requires_grad_()
     (slope,) = torch.autograd.grad(cost_of(views, rows, at).sum(), at)
-    cost, gradient, matrix = Descent(views, rows).normal_equations(at.detach().flatten(1))
+    cost, gradient, matrix = ShapeDescent(views, rows).normal_equations(at.detach().flatten(1))
     torch.testing.assert_close(cost, cost_of(views, rows, at.detach()))
     torch.testing.assert_close(gradient, slope.flatten(1) / 2)
     # affine frames of the world and translations of each shape change nothing

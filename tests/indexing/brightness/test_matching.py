@@ -3,14 +3,14 @@
 import numpy as np
 import torch
 
-from indexing.brightness.library import Exemplars, library
+from indexing.brightness.library import VideoExemplars, library
 from indexing.brightness.sight import LENGTH
 from indexing.brightness.stream import SHARP, SLACK, Pool, Warping
 
 
 def exemplars(lengths=(5, 3, 7), labels=(1, 0, 1)):
     rows = torch.rand(sum(lengths), LENGTH, generator=torch.Generator().manual_seed(0)) / 20
-    return Exemplars(rows, torch.tensor(lengths), torch.tensor(labels))
+    return VideoExemplars(rows, torch.tensor(lengths), torch.tensor(labels))
 
 
 def test_warping_is_the_loop_of_its_definition():

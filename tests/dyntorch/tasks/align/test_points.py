@@ -17,7 +17,7 @@ from dyntorch.metrics import label_scores, point_error, relative_error, rotation
 from dyntorch.tasks.align import join as align_join
 from dyntorch.tasks.align.points import Model, align_points
 from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC
-from dyntorch.tasks.align.rigid import Sightings, normal_equations, squares
+from dyntorch.tasks.align.rigid import RigidSightings, normal_equations, squares
 
 F64 = torch.float64
 
@@ -83,7 +83,7 @@ class TestRigidAlgebra:
     @pytest.mark.parametrize("mixed", [False, True])
     def test_gradient_of_the_residuals(self, motion: str, mixed: bool) -> None:
         x1, x2, x3 = torch.randn(3, 6, 3, generator=draw(2), dtype=F64)
-        data = Sightings(x1, x2, x3, torch.rand(6, generator=draw(3), dtype=F64), motion)
+        data = RigidSightings(x1, x2, x3, torch.rand(6, generator=draw(3), dtype=F64), motion)
         pose = moved_by(torch.eye(4, dtype=F64).expand(2, 4, 4), torch.randn(2, 6, generator=draw(4), dtype=F64))
         still = torch.arange(6) % 3 == 0 if mixed else None
 

@@ -9,11 +9,11 @@ from dyntorch import scenes
 from dyntorch.geometry.extensors import project
 from dyntorch.geometry.homogeneous import apply, unit
 from dyntorch.metrics import relative_error
-from dyntorch.tasks.planes.input import Given
+from dyntorch.tasks.planes.input import GivenPlanes
 from dyntorch.tasks.planes.problem import (
     Layout,
-    Matches,
     Matrices,
+    PlaneMatches,
     PlanesProblem,
     frames_of_calibration,
     frames_of_matrices,
@@ -32,14 +32,14 @@ def draw(seed: int = 0) -> torch.Generator:
 
 def given(sigma=0.5, seed=0):
     scene = scenes.translating_planes(3, 2, n=9, batch=2, sigma=sigma, generator=draw(seed))
-    found = Given.of(scene.homographies, scene.body_fundamentals, (scene.x1, scene.x2), (scene.body_x1, scene.body_x2), None)
+    found = GivenPlanes.of(scene.homographies, scene.body_fundamentals, (scene.x1, scene.x2), (scene.body_x1, scene.body_x2), None)
     infinity = unit(found.frames[1] @ scene.infinity @ torch.linalg.inv(found.frames[0]))
     return scene, found, parameters(found.homographies, found.fundamentals, infinity)
 
 
 def problems(found):
     scales = found.frames[0][:, 0, 0], found.frames[1][:, 0, 0]
-    matches = Matches(found.planes.views, found.planes.weights, found.bodies.views, found.bodies.weights, scales)
+    matches = PlaneMatches(found.planes.views, found.planes.weights, found.bodies.views, found.bodies.weights, scales)
     weights = torch.tensor([1.0, 2.0, 3.0, 4.0, 5.0], dtype=F64)
     matrices = Matrices(torch.cat([found.homographies, found.fundamentals], dim=1), weights)
     return {"matches": PlanesProblem(LAYOUT, matches), "matrices": PlanesProblem(LAYOUT, matrices)}

@@ -14,10 +14,10 @@ from dyntorch import scenes
 from dyntorch.core.solution import Status
 from dyntorch.tasks.reconstruct import solver as lifted_choice
 from dyntorch.tasks.reconstruct.motions import MOTIONS, Motion
-from dyntorch.tasks.reconstruct.projections import Tracks
+from dyntorch.tasks.reconstruct.projections import ViewTracks
 from dyntorch.tasks.reconstruct.reconstruct import normalized
 from dyntorch.tasks.reconstruct.result import Reconstruction
-from dyntorch.tasks.reconstruct.solver import LABEL, OUTLIER, Fit, _lacks, least, penalized
+from dyntorch.tasks.reconstruct.solver import LABEL, OUTLIER, LiftedFit, _lacks, least, penalized
 
 
 @pytest.mark.parametrize("name", ["static_3d", "constant_velocity_2d", "constant_direction_3d", "two_bodies_3d"])
@@ -37,7 +37,9 @@ def test_formula() -> None:
     apart = torch.full((1, 3, 10), 0.5, dtype=torch.float64)
     apart[0, :, 0] = 100.0
     motion = MOTIONS["constant_velocity_2d"]
-    found = penalized(tracks, Fit(motion, apart, torch.tensor([False]), torch.ones(1)), torch.full((1,), 0.5, dtype=torch.float64))
+    found = penalized(
+        tracks, LiftedFit(motion, apart, torch.tensor([False]), torch.ones(1)), torch.full((1,), 0.5, dtype=torch.float64)
+    )
     # 3 cameras of 8, less the ambiguity of 8; every good point leaves 3 sigma^2, but no more than that of 6 - 4 coordinates
     expected = 10 * min(3.0, OUTLIER * 2) - 3.0 + OUTLIER * 2 + 10 * 4 * math.log(6) + (24 - 8) * math.log(60)
     assert abs(float(found) - expected) < 1e-9
@@ -68,7 +70,7 @@ def test_models_are_all_fitted_robustly_only_where_outliers_mislead_least_square
     tried: list[Reconstruction] = []
     solve = lifted_choice.solve
 
-    def noted(tracks: Tracks, motion: Motion, *rest: Any) -> Reconstruction:
+    def noted(tracks: ViewTracks, motion: Motion, *rest: Any) -> Reconstruction:
         # the others need not be solved: only whether they are asked for matters
         tried.append(replace(tried[0], motion=motion) if tried else solve(tracks, motion, *rest))
         return tried[-1]

@@ -7,7 +7,7 @@ from dyntorch import scenes
 from dyntorch.core.solution import Status
 from dyntorch.geometry.triangulation import reproject
 from dyntorch.tasks.reconstruct.motions import MOTIONS
-from dyntorch.tasks.reconstruct.projections import Projections, Tracks, choices, mean_error, projections_of_tracks
+from dyntorch.tasks.reconstruct.projections import Projections, ViewTracks, choices, mean_error, projections_of_tracks
 from dyntorch.tasks.reconstruct.reconstruct import normalized
 
 
@@ -88,7 +88,7 @@ def test_parts_of_tracks():
     assert torch.equal(some.x[:, 0], tracks.x[:, 3])
     assert some.times.tolist() == [3.0, 1.0]
     twice = tracks.repeated(2)
-    assert isinstance(twice, Tracks)
+    assert isinstance(twice, ViewTracks)
     assert torch.equal(twice.x[0], twice.x[1])
     assert torch.equal(twice.x[2], tracks.x[1])
     assert torch.equal(tracks.subset(torch.tensor([1])).weights[0], tracks.weights[1])

@@ -24,13 +24,13 @@ def draw(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-def scene_of(name: str, n: int = 60, **options: object) -> scenes.LiftedScene:
+def scene_of(name: str, n: int = 60, **options: object) -> scenes.LiftedState:
     if "times" not in options:
         options.setdefault("views", max(4, KINDS[name].views))
     return scenes.lifted(name, n, generator=draw(3), **options)
 
 
-def error(found: Reconstruction, scene: scenes.LiftedScene) -> Tensor:
+def error(found: Reconstruction, scene: scenes.LiftedState) -> Tensor:
     if scene.lifts is not None:
         return metrics.lifted_error(found.structure, scene.structure, scene.lifts).position
     swapped = torch.where(scene.labels > 0, 3 - scene.labels, 0)
@@ -38,7 +38,7 @@ def error(found: Reconstruction, scene: scenes.LiftedScene) -> Tensor:
     return torch.minimum(*either)
 
 
-def off(found: Reconstruction, scene: scenes.LiftedScene) -> Tensor:
+def off(found: Reconstruction, scene: scenes.LiftedState) -> Tensor:
     """Distances of the images of ``at(times)`` by the cameras from the tracks, ``(*batch, views, n)``."""
     places = torch.stack([found.at(t) for t in scene.times.tolist()], dim=-3)
     image = torch.cat([places, torch.ones_like(places[..., :1])], -1) @ found.cameras.mT
@@ -108,7 +108,7 @@ def test_float32_and_units() -> None:
     assert bool((off(milli, scene_at(scene, scene.times * 1e-3)) < 1e-6).all())
 
 
-def scene_at(scene: scenes.LiftedScene, times: Tensor) -> scenes.LiftedScene:
+def scene_at(scene: scenes.LiftedState, times: Tensor) -> scenes.LiftedState:
     from dataclasses import replace
 
     return replace(scene, times=times)

@@ -10,7 +10,7 @@ from dyntorch.core.normalize import hartley
 from dyntorch.core.solution import Status
 from dyntorch.geometry.triangulation import observed, triangulate
 from dyntorch.tasks.reconstruct.motions import MOTIONS
-from dyntorch.tasks.reconstruct.projections import Tracks, projections_of_tracks
+from dyntorch.tasks.reconstruct.projections import ViewTracks, projections_of_tracks
 from dyntorch.tasks.reconstruct.robust import agreeing, bound, distance, freedom, noise, robust_projections, suspicious
 from dyntorch.tasks.reconstruct.scene import Lifting, distances
 
@@ -25,7 +25,7 @@ def tracks_of(images, times):
     scales = transforms[..., 0, 0]
     moved = torch.where((weights > 0)[..., None], x * scales[..., None, None] + transforms[..., None, :-1, -1], 0.0)
     share = scales.square().mean(-1, keepdim=True) / scales.square()
-    return Tracks(moved, weights * share[..., None], scales, transforms, times)
+    return ViewTracks(moved, weights * share[..., None], scales, transforms, times)
 
 
 def problem(motion, n, batch=2, seed=0, **options):

@@ -11,7 +11,7 @@ from dyntorch.tasks.reconstruct import scene as lifted_scene
 from dyntorch.tasks.reconstruct.motions import MOTIONS
 from dyntorch.tasks.reconstruct.projections import projections_of_tracks
 from dyntorch.tasks.reconstruct.reconstruct import normalized
-from dyntorch.tasks.reconstruct.scene import Lifting, Scene, adjusted, distances, framed, positions, scene_of, velocities
+from dyntorch.tasks.reconstruct.scene import LiftedState, Lifting, adjusted, distances, framed, positions, scene_of, velocities
 
 MOVING = [name for name, motion in MOTIONS.items() if motion.lift is not None and not motion.static]
 
@@ -33,7 +33,7 @@ def error(truth, lifting, scene):
 
 
 def from_truth(truth, tracks, lifting):
-    return adjusted(tracks, Scene(tracks.transforms @ truth.cameras, truth.structure @ lifting.root.mT, None), lifting)
+    return adjusted(tracks, LiftedState(tracks.transforms @ truth.cameras, truth.structure @ lifting.root.mT, None), lifting)
 
 
 @pytest.mark.parametrize("name", MOVING)
