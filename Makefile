@@ -100,8 +100,9 @@ tables: install
 	$(BIN)/python -m experiments.recognition.gestures
 
 docs: install
-	$(PIP) --constraint constraints.txt --editable '.[docs]'
-	$(BIN)/python docs/build.py
+	@echo "The documentation: one to three minutes, in which the examples of the gallery run; then open site/index.html."
+	$(PIP) --constraint constraints.txt --editable '.[docs,video]'
+	$(BIN)/python -m sphinx -q -W --keep-going -b html docs site
 
 clean:
-	rm -rf $(VENV) site build dist demo-report results
+	rm -rf $(VENV) site docs/api docs/auto_gallery build dist demo-report results
