@@ -25,15 +25,16 @@ LAST_UNDERSCORE = re.compile(r"(?<=\w)_(?!\w)")
 
 @dataclass
 class Page:
-    """One page: the room (a module), and the public names on it, each as (where to import it from, its name)."""
+    """One page: its title, the room (a module), and the public names on it, each as (where to import it from, its name)."""
 
+    title: str
     room: ModuleType
     names: list[tuple[str, str]] = field(default_factory=list)
 
     @property
     def file(self) -> str:
         """Without ending."""
-        return self.room.__name__.replace(".", "-")
+        return self.title.replace(".", "-")
 
 
 def pages() -> list[Page]:
@@ -43,15 +44,15 @@ def pages() -> list[Page]:
         package = import_module(name)
         for public in package._HOME:
             room = room_of(package._HOME[public])
-            page = found.setdefault(room.__name__, Page(room))
+            page = found.setdefault(room.__name__, Page(room.__name__, room))
             page.names.append((name, public))
         for results in list(found.values()):
             listed = {public for _, public in results.names}
             results.names += dict.fromkeys(one for one in _results(results) if one[1] not in listed)
         for module in (*getattr(package, "_MODULES", ()), *FACES.get(name, ())):
-            whole = import_module(f"{name}.{module}")
+            whole = getattr(package, module, None) or import_module(f"{name}.{module}")
             own = [public for public in members(whole) if public not in package.__all__]
-            found[whole.__name__] = Page(whole, [(whole.__name__, public) for public in own])
+            found[f"{name}.{module}"] = Page(f"{name}.{module}", whole, [(whole.__name__, public) for public in own])
     return list(found.values())
 
 
@@ -94,7 +95,15 @@ def within(module: str, package: str) -> bool:
 def text(page: Page) -> str:
     """A page in reST: what the room says of itself, a table of its names, then each with its whole text."""
     room = page.room.__name__
-    lines = [f"``{room}``", "=" * (len(room) + 4), "", f".. automodule:: {room}", "   :no-members:", "   :no-index:", ""]
+    lines = [
+        f"``{page.title}``",
+        "=" * (len(page.title) + 4),
+        "",
+        f".. automodule:: {room}",
+        "   :no-members:",
+        "   :no-index:",
+        "",
+    ]
     lines += [".. list-table::", "   :widths: 30 70", ""]
     for where, name in page.names:
         lines += [f"   * - {_link(where, name)}", f"     - {_first(getattr(import_module(where), name))}"]
@@ -159,7 +168,7 @@ def index(every: list[Page]) -> str:
     lines += [".. list-table::", "   :widths: 30 70", ""]
     for page in every:
         lines += [
-            f"   * - :doc:`{page.room.__name__} <{page.file}>`",
+            f"   * - :doc:`{page.title} <{page.file}>`",
             "     - " + ", ".join(f"``{name}``" for _, name in page.names),
         ]
     lines += ["", ".. toctree::", "   :hidden:", ""]

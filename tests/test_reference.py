@@ -40,7 +40,7 @@ def test_every_public_name_is_in_the_reference(reference):
     pages = reference.pages()
     written = "\n".join(reference.text(page) for page in pages)
     listed = set(re.findall(r"^\.\. auto(?:class|function):: (\S+)$", written, re.MULTILINE))
-    rooms = {page.room.__name__ for page in pages}
+    rooms = {page.title for page in pages}
     for package, name in PUBLIC:
         whole = f"{package.__name__}.{name}"
         assert whole in listed or whole in rooms, whole
