@@ -51,8 +51,9 @@ def pages() -> list[Page]:
             results.names += dict.fromkeys(one for one in _results(results) if one[1] not in listed)
         for module in (*getattr(package, "_MODULES", ()), *FACES.get(name, ())):
             whole = getattr(package, module, None) or import_module(f"{name}.{module}")
-            own = [public for public in members(whole) if public not in package.__all__]
-            found[f"{name}.{module}"] = Page(f"{name}.{module}", whole, [(whole.__name__, public) for public in own])
+            page = found.setdefault(f"{name}.{module}", Page(f"{name}.{module}", whole))
+            listed = {*package.__all__, *(public for _, public in page.names)}
+            page.names += [(whole.__name__, public) for public in members(whole) if public not in listed]
     return list(found.values())
 
 

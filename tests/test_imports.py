@@ -3,6 +3,7 @@
 import ast
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -123,12 +124,31 @@ def test_counting_stands_alone():
 
 
 def test_indexing_uses_only_public_names_of_dyntorch():
-    public = set(__import__("dyntorch").__all__) | {"__version__"}
+    """Those of the top level, and those that the faces of its rooms hand on."""
 
     def wrong(module, names):
-        return within(module, "dyntorch") and (module != "dyntorch" or not set(names or ()) <= public)
+        if not within(module, "dyntorch"):
+            return False
+        public = set(getattr(import_module(module), "__all__", ())) | {"__version__"}
+        return not set(names or ()) <= public
 
     assert offenders("indexing", wrong) == []
+
+
+@pytest.mark.parametrize("room", ["core", "geometry", "invariants", "numerics", "shapes", "tasks"])
+def test_every_name_that_a_room_hands_on_exists(room):
+    face = import_module(f"dyntorch.{room}")
+    assert face.__all__
+    assert all(getattr(face, name) is not None for name in face.__all__)
+
+
+def test_names_that_moved_into_rooms_are_found_at_their_old_place_with_a_warning():
+    dyntorch = import_module("dyntorch")
+    with pytest.warns(DeprecationWarning, match=r"dyntorch\.geometry\.triangulate"):
+        assert dyntorch.triangulate is dyntorch.geometry.triangulate
+    for room, names in dyntorch._MOVED.items():
+        assert set(names) <= set(import_module(f"dyntorch.{room}").__all__)
+    assert len(dyntorch._HOME) <= 50
 
 
 def test_only_the_demo_uses_the_actors():
@@ -167,3 +187,10 @@ def test_a_class_name_occurs_once_in_a_package(package):
             if isinstance(node, ast.ClassDef):
                 places.setdefault(node.name, []).append(str(path.relative_to(ROOT)))
     assert {name: found for name, found in places.items() if len(found) > 1} == {}
+
+
+def test_no_public_name_is_that_of_a_module_beside_it():
+    """Importing the module would put it where the name is looked for."""
+    for room in ("core", "geometry", "invariants", "numerics", "shapes", "tasks"):
+        face = import_module(f"dyntorch.{room}")
+        assert not {path.stem for path in Path(face.__path__[0]).iterdir()} & set(face.__all__)

@@ -4,3 +4,22 @@ In the order in which data passes: ``primitives`` (what a view measures), ``inva
 ``normalize`` (what was given, checked, at unit size), ``matrix`` (the estimation matrix and its Gram), ``residual``, ``fit``,
 ``refine``, ``robust``; what all of them return is in ``solution``.  Nothing here knows an invariant by name.
 """
+
+from __future__ import annotations
+
+from typing import Any
+
+from dyntorch import _lazily
+
+_HOME = {
+    "algebraic": "dyntorch.core.residual",
+}
+__all__ = sorted(_HOME)
+
+
+def __getattr__(name: str) -> Any:
+    return _lazily(__name__, _HOME, name)
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -2,3 +2,34 @@
 
 Functions of tensors that return tensors or small frozen records.  Stands on ``numerics`` alone.
 """
+
+from __future__ import annotations
+
+from typing import Any
+
+from dyntorch import _lazily
+
+_HOME = {
+    "undistort": "dyntorch.geometry.lens",
+    "distort": "dyntorch.geometry.lens",
+    "fit_distortion": "dyntorch.geometry.lens",
+    "line_camera": "dyntorch.geometry.lines",
+    "triangulate": "dyntorch.geometry.triangulation",
+    "resect": "dyntorch.geometry.triangulation",
+    "reproject": "dyntorch.geometry.triangulation",
+    "bundle_adjust": "dyntorch.geometry.bundle",
+    "structure_covariance": "dyntorch.geometry.bundle",
+    "grassmann_tensor": "dyntorch.geometry.grassmann",
+    "joint_epipoles": "dyntorch.geometry.epipoles",
+    "hyperplane_pair": "dyntorch.geometry.pairs",
+    "two_bodies": "dyntorch.geometry.pairs",
+}
+__all__ = sorted(_HOME)
+
+
+def __getattr__(name: str) -> Any:
+    return _lazily(__name__, _HOME, name)
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -476,7 +476,7 @@ def point_information(cameras: Tensor, structure: Tensor, weights: Tensor | None
         cameras: ``(*batch, views, l + 1, a + 1)``.
         structure: ``(*batch, n, k + 1)``.
         weights: ``(*batch, views, n)``, 0 = missing, or None.
-        lifts: as in :func:`dyntorch.bundle_adjust`.
+        lifts: as in :func:`dyntorch.geometry.bundle_adjust`.
 
     Returns:
         ``(*batch, n, k + 1, k + 1)``, in the unit of 1 / images squared.
@@ -525,7 +525,7 @@ def structure_covariance(
         cameras: ``(*batch, views, l + 1, a + 1)``.
         structure: ``(*batch, n, k + 1)``.
         weights: ``(*batch, views, n)``, 0 = missing, or None.
-        lifts: as in :func:`dyntorch.bundle_adjust`.
+        lifts: as in :func:`dyntorch.geometry.bundle_adjust`.
         sigma: noise per coordinate of an image of weight 1, one or ``(*batch,)``.
 
     Returns:

@@ -4,3 +4,31 @@ Everything here is batched over leading dimensions and computes in float64.  ``n
 are solved, ``least_squares`` holds the one Levenberg-Marquardt, ``blocks`` cuts batches into pieces that fit the cache and
 gives each to a thread, ``arguments`` checks what a function was given and where it computes.
 """
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from dyntorch import _lazily
+
+if TYPE_CHECKING:  # decorators keep the types of what they decorate only if theirs are known
+    from dyntorch.numerics.arguments import on_cpu as on_cpu
+    from dyntorch.numerics.blocks import one_thread as one_thread
+
+_HOME = {
+    "one_thread": "dyntorch.numerics.blocks",
+    "on_cpu": "dyntorch.numerics.arguments",
+    "canonical_correlation": "dyntorch.numerics.subspaces",
+    "orthonormal_basis": "dyntorch.numerics.subspaces",
+    "affine_factorization": "dyntorch.numerics.subspaces",
+    "metric_upgrade": "dyntorch.numerics.subspaces",
+}
+__all__ = sorted(_HOME)
+
+
+def __getattr__(name: str) -> Any:
+    return _lazily(__name__, _HOME, name)
+
+
+def __dir__() -> list[str]:
+    return __all__

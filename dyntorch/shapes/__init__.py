@@ -3,3 +3,25 @@
 ``basis`` says how a point may move, ``moving`` finds the shapes, ``times`` when a new view was taken; ``theory`` holds what the
 thesis proves of dynamic shape tensors and nothing else needs.
 """
+
+from __future__ import annotations
+
+from typing import Any
+
+from dyntorch import _lazily
+
+_HOME = {
+    "fit_shapes": "dyntorch.shapes.moving",
+    "MovingShapes": "dyntorch.shapes.moving",
+    "recover_times": "dyntorch.shapes.times",
+    "Recovery": "dyntorch.shapes.times",
+}
+__all__ = sorted(_HOME)
+
+
+def __getattr__(name: str) -> Any:
+    return _lazily(__name__, _HOME, name)
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from dyntorch import canonical_correlation, orthonormal_basis
+from dyntorch.numerics import canonical_correlation, orthonormal_basis
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Channels: the same window seen with different things taken away, each carrying its own evidence.

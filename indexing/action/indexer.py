@@ -11,7 +11,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from sklearn.utils.validation import check_is_fitted
 
-from dyntorch import one_thread
+from dyntorch.numerics import one_thread
 from indexing.action.bank import Windows
 from indexing.action.exemplars import CROPS, VIEWS, VIEWS_SOLID, ExemplarPlan, Exemplars, cut
 from indexing.action.inputs import check_common, check_parameters, check_plan, check_queries, gather, gather_groups, gather_labels

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from dyntorch import affine_factorization, metric_upgrade
+from dyntorch.numerics import affine_factorization, metric_upgrade
 from indexing.action.bank import COMMON
 from indexing.cameras import virtual
 from indexing.clip import Clip, as_clip

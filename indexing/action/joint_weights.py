@@ -26,7 +26,7 @@ from indexing.action.bank import CHANNELS, EPSILON, NEAREST, JointMetric, Window
 
 CANDIDATES = 2  # nearest exemplars per class that a query is compared with: as many as the scorer averages
 ABSENT = -100.0  # score of a class with no exemplar in another group
-RIDGE = 1e-6  # of a 2x2 Gram, relative to its trace: as in dyntorch.orthonormal_basis
+RIDGE = 1e-6  # of a 2x2 Gram, relative to its trace: as in dyntorch.numerics.orthonormal_basis
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from sklearn.utils.validation import check_is_fitted
 
-from dyntorch import one_thread
+from dyntorch.numerics import one_thread
 from indexing.action.inputs import check_device, check_labels, check_reject, is_number
 from indexing.brightness.footage import Footage, footage, gather
 from indexing.brightness.library import VideoExemplars, library

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dyntorch import one_thread
+from dyntorch.numerics import one_thread
 from indexing.action.stream import EXTENT, FALSE_ALARMS
 from indexing.brightness.footage import Footage, Resampler
 from indexing.brightness.library import Library, VideoExemplars

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyntorch import orthonormal_basis
+from dyntorch.numerics import orthonormal_basis
 from indexing.action.bank import Windows, between, cosine_distance
 from indexing.cameras import virtual, y_up
 from indexing.clip import Clip

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.utils.validation import check_is_fitted
 from torch import Tensor
 
-from dyntorch import one_thread
+from dyntorch.numerics import one_thread
 from indexing.action.bank import stack
 from indexing.action.inputs import check_device, check_queries, gather, gather_labels, is_number
 from indexing.action.inputs import check_reject as check_reject_number

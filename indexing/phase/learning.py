@@ -9,7 +9,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from dyntorch import canonical_correlation, orthonormal_basis
+from dyntorch.numerics import canonical_correlation, orthonormal_basis
 from indexing.action.bank import Windows, stack
 from indexing.clip import Clip
 from indexing.phase.frames import Learned, standardized, training_frames
@@ -20,8 +20,8 @@ from indexing.phase.model import Course, PhaseModel, learn_course, wrong_scores
 #
 # An action that repeats looks like itself a period later, in any one view.  Pieces of clips, each as long as two periods, become
 # mean cycles; two cycles seen from different viewpoints are brought into step where they share a direction (the epipolar residual
-# of their motion, :func:`dyntorch.canonical_correlation`, least over all shifts).  An action that does not repeat goes from the
-# start of its clip to the end.
+# of their motion, :func:`dyntorch.numerics.canonical_correlation`, least over all shifts).  An action that does not repeat goes
+# from the start of its clip to the end.
 
 
 RATE = 25.0  # samples per second

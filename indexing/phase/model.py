@@ -20,10 +20,9 @@ from indexing.phase.frames import Learned, image_distance, shape_distance, stand
 # ----------------------------------------------------------------------------------------------------------------------
 # How the shape of the joints goes through an action, learned from single frames: :math:`X(\phi) = \sum_b c_b(\phi) X_b`.
 #
-# Maximum likelihood (:func:`dyntorch.fit_shapes`) has the least residual on the frames learned from, but not on other takes: 15
-# to
-# 30 views are few, and people differ.  A ridge and a coordinate of style per clip take its phase error from 13.8 to 11.1 degrees
-# (CMU walking, four views per take, other takes), 18 functions by maximum likelihood to 50.
+# Maximum likelihood (:func:`dyntorch.shapes.fit_shapes`) has the least residual on the frames learned from, but not on other
+# takes: 15 to 30 views are few, and people differ.  A ridge and a coordinate of style per clip take its phase error from 13.8 to
+# 11.1 degrees (CMU walking, four views per take, other takes), 18 functions by maximum likelihood to 50.
 
 
 RIDGE = 1e-4  # of the mean diagonal of the normal matrix; 1e-5 is as good, 1e-3 costs .5 and 1e-2 4 degrees

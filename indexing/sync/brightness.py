@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool1d
 
-from dyntorch import Shift, on_cpu, one_thread
+from dyntorch import Shift
+from dyntorch.numerics import on_cpu, one_thread
 from indexing.sync.gray import (
     FEWEST,
     HALF,

@@ -60,7 +60,7 @@ def cameras_and_points() -> tuple[Tensor, Tensor, Tensor]:
     """Cameras ``(3, 3, 4)``, points ``(12, 4)`` and images ``(3, 12, 2)``."""
     cameras = torch.eye(3, 4, dtype=F64) + torch.rand(3, 3, 4, generator=draw(), dtype=F64) / 4
     structure = torch.rand(12, 4, generator=draw(1), dtype=F64) + 1
-    return cameras, structure, dyn.reproject(cameras, structure)
+    return cameras, structure, dyn.geometry.reproject(cameras, structure)
 
 
 def tracks(motion: str, n: int, views: int, **options: Any) -> tuple[Tensor]:
@@ -137,7 +137,7 @@ def two_body_cameras() -> tuple[Tensor, ...]:
     """Projections ``(2, 3, 4)``, structure, hyperplanes and labels of two bodies that translate."""
     structure, first = two_hyperplanes(), torch.rand(2, 3, 3, generator=draw(2), dtype=F64)
     way = torch.tensor([[0.3, 0.2], [0.1, -0.4]], dtype=F64)
-    pair = dyn.hyperplane_pair(structure)
+    pair = dyn.geometry.hyperplane_pair(structure)
     return torch.cat([first, first[:, :, :2] @ way[..., None]], -1), structure, pair.hyperplanes, pair.labels
 
 
@@ -195,7 +195,7 @@ VERBS: tuple[Verb, ...] = (
     Verb(
         "algebraic",
         lambda: (scenes.planar(40, generator=draw(3)).motion, *planar()),
-        lambda m, *x: dyn.algebraic(H, H.compose(*m), *x),
+        lambda m, *x: dyn.core.algebraic(H, H.compose(*m), *x),
     ),
     Verb("null_space", lambda: (randn(3, 12, 9),), dyn.null_space),
     Verb("align_planar", planar, lambda *x: dyn.align_planar(*x, threshold=1.5, generator=draw())),
@@ -295,7 +295,7 @@ VERBS: tuple[Verb, ...] = (
     Verb(
         "fit_distortion",
         lambda: scenes.two_view(60, sigma=0.1, generator=draw()).views,
-        lambda *x: dyn.fit_distortion(*x, sizes=((640, 480),) * 2),
+        lambda *x: dyn.geometry.fit_distortion(*x, sizes=((640, 480),) * 2),
     ),
     Verb(
         "undistort",
@@ -304,7 +304,7 @@ VERBS: tuple[Verb, ...] = (
             torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], dtype=F64),
             torch.tensor([-0.2, 0.05, 0, 0], dtype=F64),
         ),
-        dyn.undistort,
+        dyn.geometry.undistort,
     ),
     Verb(
         "distort",
@@ -313,7 +313,7 @@ VERBS: tuple[Verb, ...] = (
             torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], dtype=F64),
             torch.tensor([-0.2, 0.05, 0, 0], dtype=F64),
         ),
-        dyn.distort,
+        dyn.geometry.distort,
     ),
     Verb("triangulate_trajectories", paths, dyn.triangulate_trajectories),
     Verb(
@@ -322,58 +322,64 @@ VERBS: tuple[Verb, ...] = (
         dyn.triangulate_trajectories,
         compare=lambda found: (found.status, found.residual),
     ),
-    Verb("points_on_lines", lambda: (*paths(), dyn.triangulate_trajectories(*paths()).lines), dyn.points_on_lines),
+    Verb("points_on_lines", lambda: (*paths(), dyn.triangulate_trajectories(*paths()).lines), dyn.tasks.points_on_lines),
     Verb(
         "trajectory_cameras",
         lambda: (inhomogeneous((randn(1, 728, 4) + randn(6, 728, 1, seed=1) * randn(728, 4, seed=2)) @ randn(6, 3, 4, seed=3).mT),),
         lambda x: dyn.trajectory_cameras(x, bundle=False),
     ),
-    Verb("line_camera", lambda: (randn(2, 3, 4),), dyn.line_camera),
-    Verb("triangulate", lambda: (cameras_and_points()[0], cameras_and_points()[2]), lambda c, x: dyn.triangulate(c, x, steps=2)),
-    Verb("resect", lambda: cameras_and_points()[1:], dyn.resect),
-    Verb("reproject", lambda: cameras_and_points()[:2], dyn.reproject),
+    Verb("line_camera", lambda: (randn(2, 3, 4),), dyn.geometry.line_camera),
+    Verb(
+        "triangulate",
+        lambda: (cameras_and_points()[0], cameras_and_points()[2]),
+        lambda c, x: dyn.geometry.triangulate(c, x, steps=2),
+    ),
+    Verb("resect", lambda: cameras_and_points()[1:], dyn.geometry.resect),
+    Verb("reproject", lambda: cameras_and_points()[:2], dyn.geometry.reproject),
     Verb(
         "bundle_adjust",
         lambda: (cameras_and_points()[2], cameras_and_points()[0] + 1e-3 * randn(3, 3, 4), cameras_and_points()[1]),
-        lambda x, c, y: dyn.bundle_adjust(x, None, c, y),
+        lambda x, c, y: dyn.geometry.bundle_adjust(x, None, c, y),
     ),
-    Verb("structure_covariance", lambda: cameras_and_points()[:2], dyn.structure_covariance),
-    Verb("grassmann_tensor", lambda: (cameras_and_points()[0][:2],), lambda p: dyn.grassmann_tensor(p, (2, 2))),
+    Verb("structure_covariance", lambda: cameras_and_points()[:2], dyn.geometry.structure_covariance),
+    Verb("grassmann_tensor", lambda: (cameras_and_points()[0][:2],), lambda p: dyn.geometry.grassmann_tensor(p, (2, 2))),
     Verb(
         "joint_epipoles",
         lambda: (
             [torch.cat([p, t * (p @ torch.tensor([1.0, 2, 2, 0], dtype=F64))[:, None]], -1) for t, p in enumerate(randn(3, 3, 4))],
         ),
-        dyn.joint_epipoles,
+        dyn.geometry.joint_epipoles,
     ),
-    Verb("hyperplane_pair", lambda: (two_hyperplanes(),), dyn.hyperplane_pair),
-    Verb("two_bodies", two_body_cameras, dyn.two_bodies),
-    Verb("affine_segmentation", lambda: affine_bodies(), dyn.affine_segmentation),
+    Verb("hyperplane_pair", lambda: (two_hyperplanes(),), dyn.geometry.hyperplane_pair),
+    Verb("two_bodies", two_body_cameras, dyn.geometry.two_bodies),
+    Verb("affine_segmentation", lambda: affine_bodies(), dyn.tasks.affine_segmentation),
     Verb(
         "multibody_matrix",
         lambda: tuple(x.flatten(0, 1)[:40] for x in scenes.two_view(24, batch=2, generator=draw()).views),
-        lambda a, b: dyn.multibody_matrix(a, b, 2),
+        lambda a, b: dyn.invariants.multibody_matrix(a, b, 2),
     ),
-    Verb("projective_factorization", lambda: (cameras_and_points()[2],), lambda x: dyn.projective_factorization(x, 4)),
+    Verb("projective_factorization", lambda: (cameras_and_points()[2],), lambda x: dyn.tasks.projective_factorization(x, 4)),
     Verb(
         "velocity_factorization",
         lambda: (
             (randn(12, 3) + torch.arange(6, dtype=F64)[:, None, None] * randn(12, 3, seed=1)) @ randn(6, 3, 2, seed=2),
             torch.arange(6, dtype=F64),
         ),
-        dyn.velocity_factorization,
+        dyn.tasks.velocity_factorization,
         compare=lambda found: found.points @ found.cameras.mT + found.offsets[:, None],  # the frame of the world is free
     ),
-    Verb("fit_shapes", lambda: moving_shapes()[:2], dyn.fit_shapes),
+    Verb("fit_shapes", lambda: moving_shapes()[:2], dyn.shapes.fit_shapes),
     Verb(
-        "recover_times", lambda: (moving_shapes()[2], moving_shapes()[0]), lambda s, x: dyn.recover_times(s, dyn.Polynomial(1), x)
+        "recover_times",
+        lambda: (moving_shapes()[2], moving_shapes()[0]),
+        lambda s, x: dyn.shapes.recover_times(s, dyn.Polynomial(1), x),
     ),
     Verb(
         "canonical_correlation",
         lambda: (randn(2, 20, 2), randn(2, 20, 2, seed=1)),
-        lambda a, b: dyn.canonical_correlation(dyn.orthonormal_basis(a), dyn.orthonormal_basis(b)),
+        lambda a, b: dyn.numerics.canonical_correlation(dyn.numerics.orthonormal_basis(a), dyn.numerics.orthonormal_basis(b)),
     ),
-    Verb("orthonormal_basis", lambda: (randn(2, 20, 2),), dyn.orthonormal_basis),
+    Verb("orthonormal_basis", lambda: (randn(2, 20, 2),), dyn.numerics.orthonormal_basis),
     *(
         Verb(
             f"ShapeTensor {frame}",
@@ -394,8 +400,8 @@ VERBS: tuple[Verb, ...] = (
         )
         for form in ("joint", "basis", "span")
     ),
-    Verb("affine_factorization", affine_tracks, dyn.affine_factorization),
-    Verb("metric_upgrade", lambda: dyn.affine_factorization(*affine_tracks())[:2], dyn.metric_upgrade),
+    Verb("affine_factorization", affine_tracks, dyn.numerics.affine_factorization),
+    Verb("metric_upgrade", lambda: dyn.numerics.affine_factorization(*affine_tracks())[:2], dyn.numerics.metric_upgrade),
 )
 
 ASKED = "one for every question on values: what is given, what decides"
@@ -434,12 +440,25 @@ WAITS = {
 7 to 75, 22 and 58 to 86, 34 (fit_shapes), 7 to 24 (ShapeTensor), 7 to 41; before they were lent to the CPU: synchronize 300 to 900,
 reconstruct 33 to 1,000."""
 
+ROOMS = ("core", "geometry", "invariants", "numerics", "shapes", "tasks")
+"""Faces that hand on public names beside those of the top level."""
 NOT_VERBS = {
     **dict.fromkeys(("counting", "metrics", "motions", "scenes"), "modules"),
     **dict.fromkeys(("on_cpu", "one_thread"), "decorators of verbs"),
     **dict.fromkeys(("BodyModel", "LineStatus", "Status", "Motion", "Polynomial", "Fourier", "Invariant"), "names and numbers"),
     **dict.fromkeys(
-        ("Clocks", "MovingShapes", "PairReconstruction", "Recovery", "Segmentation", "Shift", "Solution", "TranslatingPlanes"),
+        (
+            "Alignment",
+            "Clocks",
+            "MovingShapes",
+            "PairReconstruction",
+            "Reconstruction",
+            "Recovery",
+            "Segmentation",
+            "Shift",
+            "Solution",
+            "TranslatingPlanes",
+        ),
         "results",
     ),
     **dict.fromkeys(

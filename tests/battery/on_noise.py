@@ -135,10 +135,10 @@ def algebraic_is_the_form_on_the_vectors(case: Case) -> None:
     g = torch.Generator().manual_seed(0)
     for _ in range(2):
         tensor = torch.randn(case.invariant.shape(), generator=g, dtype=torch.float64)
-        found = dyn.algebraic(case.invariant, tensor, *views)
-        moved = dyn.algebraic(case.invariant, 2 * tensor, *views)
+        found = dyn.core.algebraic(case.invariant, tensor, *views)
+        moved = dyn.core.algebraic(case.invariant, 2 * tensor, *views)
         torch.testing.assert_close(moved, 2 * found)
-    exact = dyn.algebraic(case.invariant, case.invariant.compose(*scene.motion), *scene.exact)
+    exact = dyn.core.algebraic(case.invariant, case.invariant.compose(*scene.motion), *scene.exact)
     assert exact.abs().max() < 1e-13
 
 

@@ -119,16 +119,16 @@ def test_a_failed_shape_leaves_the_scores_of_others_alone(frame):
 def test_times_out_of_range_leave_other_moving_shapes_alone(scale):
     rows = dyn.Polynomial(1).rows(torch.linspace(-1, 1, 12, dtype=F64))
     x = torch.einsum("vb,bnk,vkd->vnd", rows, numbers(2, 8, 3), numbers(12, 3, 2, seed=1)).expand(2, -1, -1, -1)
-    both = dyn.fit_shapes(x, torch.stack([rows, scale * rows]))
-    alone = dyn.fit_shapes(x[:1], rows[None])
+    both = dyn.shapes.fit_shapes(x, torch.stack([rows, scale * rows]))
+    alone = dyn.shapes.fit_shapes(x[:1], rows[None])
     assert torch.allclose(both.residual[0], alone.residual[0], rtol=0, atol=1e-9) and both.residual[0].max() < 1e-9
     assert not any(part.is_floating_point() and part.isnan().any() for part in tensors(both))
 
 
 @pytest.mark.parametrize("scale", [1e-160, 1e300, torch.nan])
 def test_images_out_of_range_leave_other_factorizations_alone(scale):
-    both = dyn.projective_factorization(torch.stack([IMAGES, scale * IMAGES]), 4)
-    alone = dyn.projective_factorization(IMAGES, 4)
+    both = dyn.tasks.projective_factorization(torch.stack([IMAGES, scale * IMAGES]), 4)
+    alone = dyn.tasks.projective_factorization(IMAGES, 4)
     assert both.converged[0] and both.residual[0] < 1e-9 and alone.residual < 1e-9
     assert not any(part.is_floating_point() and part.isnan().any() for part in tensors(both))
 
@@ -136,13 +136,13 @@ def test_images_out_of_range_leave_other_factorizations_alone(scale):
 def test_cameras_of_any_unit_and_such_that_are_not_finite():
     turn = torch.linalg.qr(torch.randn(5, 3, 3, generator=seeded(4), dtype=F64))[0]
     shape, cameras, _ = affine_factorization(numbers(20, 3) @ turn[:, :2].mT)
-    expected, known = dyn.metric_upgrade(shape, cameras)
+    expected, known = dyn.numerics.metric_upgrade(shape, cameras)
     assert known
     for scale in (1e-200, 1e200):
-        found, known = dyn.metric_upgrade(shape, scale * cameras)
+        found, known = dyn.numerics.metric_upgrade(shape, scale * cameras)
         assert known and torch.allclose(found / found.norm(), expected / expected.norm(), atol=1e-9)
     for bad in (torch.nan, torch.inf):
-        found, known = dyn.metric_upgrade(shape, bad * cameras)
+        found, known = dyn.numerics.metric_upgrade(shape, bad * cameras)
         assert not known and torch.equal(found, shape)
 
 
@@ -158,7 +158,7 @@ def test_planes_whose_entries_lie_far_apart_leave_others_alone():
 
 def test_a_lens_is_not_believed_where_points_leave_the_range():
     views = scenes.two_view(60, sigma=0.1, generator=seeded()).views
-    found = dyn.fit_distortion(1e160 * views[0], views[1], sizes=((640, 480),) * 2)
+    found = dyn.geometry.fit_distortion(1e160 * views[0], views[1], sizes=((640, 480),) * 2)
     assert not found.significant
 
 

@@ -82,7 +82,7 @@ def linear(case: Case) -> dict[str, Any]:
         "plain": dyn.fit(invariant, *scene.views, normalize=False).tensor, "float32": dyn.fit(invariant, *single).tensor,
         "refine": shown(dyn.refine(found, *scene.views)), "constrain": tried(lambda: dyn.constrain(found)),
         "sampson": dyn.sampson(invariant, found.tensor, *scene.views), "minimal": tried(lambda: invariant.minimal()),
-        "algebraic": tried(lambda: dyn.algebraic(invariant, found.tensor, *scene.views)),
+        "algebraic": tried(lambda: dyn.core.algebraic(invariant, found.tensor, *scene.views)),
         "few": tried(lambda: dyn.fit(invariant, *(x[:, :3] for x in scene.views))),
         "compose": tried(lambda: invariant.compose(*found.motion)), "decompose": tried(lambda: invariant.decompose(found.tensor)),
         "exact": dyn.fit(invariant, *scene.exact).status,
@@ -207,7 +207,7 @@ def trajectories() -> Any:
     found = dyn.triangulate_trajectories(cameras, x, sigma=1e-3)
     return {
         **shown(found),
-        "points": dyn.points_on_lines(cameras, x, found.lines),
+        "points": dyn.tasks.points_on_lines(cameras, x, found.lines),
         "exact": dyn.triangulate_trajectories(cameras, x),
     }
 
@@ -219,7 +219,7 @@ def line_cameras() -> Any:
     world = start + normal(6, 800, 1, number=4) * way
     image = torch.nn.functional.pad(world, (0, 1), value=1.0) @ cameras.mT
     found = dyn.trajectory_cameras(image[..., :2] / image[..., 2:] + 1e-7 * normal(6, 800, 2, number=5), bundle=False)
-    return {"cameras": dyn.line_camera(cameras), "found": shown(found)}
+    return {"cameras": dyn.geometry.line_camera(cameras), "found": shown(found)}
 
 
 # ---- synchronization -------------------------------------------------------------------------------------------------------
@@ -252,9 +252,9 @@ def pair_scene() -> Any:
 def lens() -> Any:
     K = torch.tensor([[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
     dist = torch.tensor([-0.2, 0.05, 0.001, 0.0], dtype=torch.float64)
-    seen = [dyn.distort(x, K, dist) for x in scenes.two_view(120, sigma=0.2, generator=seed(0)).views]
-    found = dyn.fit_distortion(*seen, sizes=((640, 480), (640, 480)))
-    return {**shown(found), "seen": seen, "straight": [dyn.undistort(x, K, dist) for x in seen]}
+    seen = [dyn.geometry.distort(x, K, dist) for x in scenes.two_view(120, sigma=0.2, generator=seed(0)).views]
+    found = dyn.geometry.fit_distortion(*seen, sizes=((640, 480), (640, 480)))
+    return {**shown(found), "seen": seen, "straight": [dyn.geometry.undistort(x, K, dist) for x in seen]}
 
 
 # ---- shapes, bundles, factorizations ---------------------------------------------------------------------------------------
@@ -262,20 +262,23 @@ def moving_shapes(basis: Any) -> Any:
     rows = basis.rows(torch.linspace(-1, 1, 24, dtype=torch.float64))
     points, cameras = normal(rows.shape[1], 9, 3), normal(24, 3, 2, number=1)
     x = torch.einsum("vb,bnk,vkd->vnd", rows, points, cameras) + 1e-3 * normal(24, 9, 2, number=2)
-    found = dyn.fit_shapes(x, rows)
-    return {**shown(found), "times": shown(dyn.recover_times(found.shapes, basis, x[::4]))}
+    found = dyn.shapes.fit_shapes(x, rows)
+    return {**shown(found), "times": shown(dyn.shapes.recover_times(found.shapes, basis, x[::4]))}
 
 
 def bundle() -> Any:
     P = torch.eye(3, 4, dtype=torch.float64) + normal(4, 3, 4) / 8
     Y = torch.cat([normal(16, 2, number=1), normal(16, 1, number=2) + 5, torch.ones(16, 1)], dim=1).double()
-    x = dyn.reproject(P, Y) + 1e-3 * normal(4, 16, 2, number=3)
+    x = dyn.geometry.reproject(P, Y) + 1e-3 * normal(4, 16, 2, number=3)
     start = P + 0.01 * normal(4, 3, 4, number=4), Y + 0.01 * normal(16, 4, number=5)
     return {
-        "adjusted": dyn.bundle_adjust(x, None, *start), "robust": dyn.bundle_adjust(x, None, *start, scale=1e-3),
-        "triangulated": dyn.triangulate(P, x), "steps": dyn.triangulate(P, x, steps=3), "resected": dyn.resect(Y, x),
-        "covariance": dyn.structure_covariance(P, Y, sigma=1e-3), "grassmann": dyn.grassmann_tensor(list(P[:2]), (2, 2)),
-        "epipoles": tried(lambda: dyn.joint_epipoles(list(normal(3, 3, 5)))), "projective": dyn.projective_factorization(x, 4),
+        "adjusted": dyn.geometry.bundle_adjust(x, None, *start), "robust": dyn.geometry.bundle_adjust(x, None, *start, scale=1e-3),
+        "triangulated": dyn.geometry.triangulate(P, x), "steps": dyn.geometry.triangulate(P, x, steps=3),
+        "resected": dyn.geometry.resect(Y, x),
+        "covariance": dyn.geometry.structure_covariance(P, Y, sigma=1e-3), "grassmann": dyn.geometry.grassmann_tensor(list(P[:2]),
+        (2, 2)),
+        "epipoles": tried(lambda: dyn.geometry.joint_epipoles(list(normal(3, 3, 5)))),
+        "projective": dyn.tasks.projective_factorization(x, 4),
     }  # fmt: skip
 
 
@@ -283,20 +286,20 @@ def factors() -> Any:
     A, X, V = normal(6, 2, 3), normal(12, 3, number=1), normal(12, 3, number=2)
     times = torch.tensor([0.0, 1.0, 2.0, 4.0, 5.0, 7.0], dtype=torch.float64)
     still, moving = X @ A.mT + 1e-3 * normal(6, 12, 2, number=3), (X + times[:, None, None] * V) @ A.mT
-    shape, cameras, part = dyn.affine_factorization(still)
+    shape, cameras, part = dyn.numerics.affine_factorization(still)
     two = torch.rand(24, 4, generator=seed(1), dtype=torch.float64)
     two[:14, 3], two[14:, 3] = 0.0, two[14:, 2]
-    halves = dyn.hyperplane_pair(two)
+    halves = dyn.geometry.hyperplane_pair(two)
     scene = scenes.two_view(24, batch=2, generator=seed(0))
     x1, x2 = (x.flatten(0, 1)[:40] for x in scene.views)
     second = torch.cat([X @ A[0].mT, X[:8] @ A[1].mT + 0.3])
     return {
-        "affine": (shape, cameras, part), "metric": dyn.metric_upgrade(shape, cameras), "halves": halves,
-        "velocity": dyn.velocity_factorization(moving + 1e-3 * normal(6, 12, 2, number=4), times),
-        "bodies": dyn.two_bodies(normal(3, 3, 4, number=5), two, halves.hyperplanes, halves.labels),
-        "two affine": tried(lambda: dyn.affine_segmentation(torch.cat([X[:, :2], X[:8, :2]]), second)),
-        "multibody": dyn.multibody_matrix(x1, x2, 2), "basis": dyn.orthonormal_basis(normal(3, 5, 2)),
-        "correlation": dyn.canonical_correlation(normal(3, 6, 2), normal(3, 6, 2, number=1)),
+        "affine": (shape, cameras, part), "metric": dyn.numerics.metric_upgrade(shape, cameras), "halves": halves,
+        "velocity": dyn.tasks.velocity_factorization(moving + 1e-3 * normal(6, 12, 2, number=4), times),
+        "bodies": dyn.geometry.two_bodies(normal(3, 3, 4, number=5), two, halves.hyperplanes, halves.labels),
+        "two affine": tried(lambda: dyn.tasks.affine_segmentation(torch.cat([X[:, :2], X[:8, :2]]), second)),
+        "multibody": dyn.invariants.multibody_matrix(x1, x2, 2), "basis": dyn.numerics.orthonormal_basis(normal(3, 5, 2)),
+        "correlation": dyn.numerics.canonical_correlation(normal(3, 6, 2), normal(3, 6, 2, number=1)),
         "null": [dyn.null_space(normal(2, 40, 12), dim) for dim in (1, 3)], "wide": dyn.null_space(normal(5, 12), 7),
     }  # fmt: skip
 

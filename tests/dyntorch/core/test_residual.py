@@ -44,7 +44,7 @@ def test_sampson_of_epipolar_geometry_by_hand():
     value = (p2 * l2).sum(-1)
     expected = value.abs() / (l1[..., :2].square().sum(-1) + l2[..., :2].square().sum(-1)).sqrt()
     torch.testing.assert_close(dyn.sampson(dyn.FundamentalMatrix, f, x1, x2), expected)
-    torch.testing.assert_close(dyn.algebraic(dyn.FundamentalMatrix, f, x1, x2), value)
+    torch.testing.assert_close(dyn.core.algebraic(dyn.FundamentalMatrix, f, x1, x2), value)
     for scale in (1e-3, -4.0):
         torch.testing.assert_close(dyn.sampson(dyn.FundamentalMatrix, scale * f, x1, x2), expected)
 
@@ -59,11 +59,11 @@ def test_scales_are_the_noise_of_each_view(case):
     views = noisy(case, scene.exact, 0.01)
     scales = torch.tensor([0.3, 2.0, 0.7]).double()[: len(views)]
     found = multilinear(case.invariant, tensor, views, tuple(scales))
-    value, square = dyn.algebraic(case.invariant, tensor, *views), torch.zeros(12).double()
+    value, square = dyn.core.algebraic(case.invariant, tensor, *views), torch.zeros(12).double()
     for v, s in enumerate(scales):
         parts = [x.clone() for x in views]
         parts[v].requires_grad_()
-        (slope,) = torch.autograd.grad(dyn.algebraic(case.invariant, tensor, *parts).sum(), parts[v])
+        (slope,) = torch.autograd.grad(dyn.core.algebraic(case.invariant, tensor, *parts).sum(), parts[v])
         square = square + (s * slope).flatten(1).square().sum(-1)
     torch.testing.assert_close(found, value / square.sqrt(), rtol=1e-9, atol=1e-12)
 
@@ -123,7 +123,7 @@ def test_distance_of_a_batch_is_that_of_its_problems(case):
 def test_misuse():
     scene = scenes.constant_velocity(5)
     with pytest.raises(ValueError, match="gives 3 rows; it has no single algebraic residual"):
-        dyn.algebraic(dyn.ConstantVelocityTensor, dyn.ConstantVelocityTensor.compose(*scene.motion), *scene.views)
+        dyn.core.algebraic(dyn.ConstantVelocityTensor, dyn.ConstantVelocityTensor.compose(*scene.motion), *scene.views)
     with pytest.raises(ValueError, match=r"takes .*2 views, got 3"):
         dyn.sampson(dyn.FundamentalMatrix, torch.eye(3), *[torch.rand(4, 2)] * 3)
     with pytest.raises(ValueError, match="expected an invariant"):
@@ -143,6 +143,6 @@ def test_misuse():
 def test_what_does_not_fit_is_named(change, message):
     scene = scenes.planar(n=12, generator=torch.Generator().manual_seed(0))
     tensor, views = change(dyn.HomographyTensor.compose(*scene.motion), scene.views)
-    for function in (dyn.sampson, dyn.algebraic):
+    for function in (dyn.sampson, dyn.core.algebraic):
         with pytest.raises(ValueError, match=message):
             function(dyn.HomographyTensor, tensor, *views)

@@ -51,7 +51,7 @@ def test_form_is_the_product_of_the_epipolar_forms():
     x1, x2 = random(3, 7, 2, seed=2), random(3, 7, 2, seed=3)
     S = SM.compose(F1, F2)
     product = epipolar(F1, x1, x2) * epipolar(F2, x1, x2)
-    found = dyn.algebraic(SM, S, x1, x2)
+    found = dyn.core.algebraic(SM, S, x1, x2)
     torch.testing.assert_close(found * (product[:, :1] / found[:, :1]), product)
     torch.testing.assert_close(torch.linalg.matrix_norm(S), torch.ones(3).double())
     # the first axis is of view 2: monomials 00, 01, 02, 11, 12, 22
@@ -123,7 +123,7 @@ def test_reweighted_is_the_inverse_square_of_the_gradient():
     x = torch.cat(found.views, dim=-1)
 
     def form(x):
-        return dyn.algebraic(SM, S, x[None, :2], x[None, 2:])[0]
+        return dyn.core.algebraic(SM, S, x[None, :2], x[None, 2:])[0]
 
     square = torch.func.vmap(torch.func.grad(form))(x).square().sum(-1)
     expected = 1 / (square / square.median()).clamp(min=1e-3)

@@ -250,7 +250,7 @@ def test_misuse_is_a_value_error_with_its_remedy():
         (lambda: dyn.fit(ShapeTensor, *points[:7], points[7].float()), "all points need one dtype"),
         (lambda: dyn.fit(ShapeTensor, *points, static=torch.ones(4)), "no rows for labelled static"),
         (lambda: dyn.robust_fit(ShapeTensor, *points), "fit again with weights"),
-        (lambda: dyn.algebraic(ShapeTensor, tensor, *points), "no single algebraic residual"),
+        (lambda: dyn.core.algebraic(ShapeTensor, tensor, *points), "no single algebraic residual"),
         (lambda: dyn.sampson(ShapeTensor, tensor[0], *points), r"must be \(\*batch, 3, 3, 3, 3\)"),
         (lambda: ShapeTensor("metric"), "one of general, plane, affine, got 'metric'"),
         (lambda: ShapeTensor.minimal(), "does not know its number of points"),

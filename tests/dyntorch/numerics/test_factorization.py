@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from dyntorch import affine_factorization, metric_upgrade
+from dyntorch.numerics import affine_factorization, metric_upgrade
 
 
 def random(*shape, seed=0):

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from dyntorch import canonical_correlation, orthonormal_basis
+from dyntorch.numerics import canonical_correlation, orthonormal_basis
 
 
 def random(*shape, seed=0, dtype=torch.float64):

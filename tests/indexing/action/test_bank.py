@@ -5,7 +5,7 @@ import pytest
 import torch
 from sklearn.svm import SVC
 
-from dyntorch import canonical_correlation
+from dyntorch.numerics import canonical_correlation
 from indexing.action.bank import CHANNELS, EPSILON, JointMetric, Kernels, Windows, channel, fused_residual, order_free
 from indexing.action.model import PairwiseMachine
 from indexing.action.symmetry import mirror, turn

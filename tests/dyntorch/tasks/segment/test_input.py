@@ -132,7 +132,7 @@ def test_one_body(bodies):
 @pytest.mark.parametrize("threshold", [2.5, None])
 def test_a_static_pair_is_one_body_of_a_homography(threshold):
     found = segmented(X1, X1, threshold=threshold).check()
-    assert found.models == (dyn.BodyModel.HOMOGRAPHY,) and bool((found.labels == 1).all())
+    assert found.models == (dyn.tasks.BodyModel.HOMOGRAPHY,) and bool((found.labels == 1).all())
     H = found.homographies[0] / found.homographies[0, 2, 2]
     torch.testing.assert_close(H, torch.eye(3, dtype=F64), rtol=0, atol=1e-4)
     assert float(found.residuals.max()) < 1e-3

@@ -62,7 +62,7 @@ def test_planes_and_rotations_have_homographies():
     for k, model in enumerate(found.models):
         members = found.labels == k + 1
         x1, x2 = (x[members] for x in scene.views)
-        flat = model == dyn.BodyModel.HOMOGRAPHY
+        flat = model == dyn.tasks.BodyModel.HOMOGRAPHY
         assert flat == (int(scene.labels[members].mode().values) > 1)
         if flat:
             assert float((apply(found.homographies[k], x1) - x2).norm(dim=-1).median()) < 0.6
@@ -85,7 +85,7 @@ def test_parts_of_the_result_fit_together():
     squares = []
     for F, H, model in zip(found.fundamentals, found.homographies, found.models, strict=True):
         one, two = homogeneous(x1), homogeneous(x2)
-        if model == dyn.BodyModel.FUNDAMENTAL:
+        if model == dyn.tasks.BodyModel.FUNDAMENTAL:
             line, other = one @ F.mT, two @ F
             squares.append((two * line).sum(-1) ** 2 / (line[:, :2].square().sum(-1) + other[:, :2].square().sum(-1)))
         else:
@@ -221,7 +221,7 @@ def test_threshold_is_estimated_from_planes(sigma):
     draw = torch.Generator().manual_seed(3)
     scene = scenes.bodies(200, bodies=2, planar=(1, 2), sigma=sigma, generator=draw)
     found = dyn.segment(*scene.views, threshold=None, generator=draw)
-    assert found.models == (dyn.BodyModel.HOMOGRAPHY,) * 2
+    assert found.models == (dyn.tasks.BodyModel.HOMOGRAPHY,) * 2
     assert float(found.threshold) == pytest.approx(5 * sigma, rel=0.25)
 
 
