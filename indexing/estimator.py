@@ -1,18 +1,79 @@
-"""What all indexers share as estimators: one thread, their accuracy, and their model files."""
+"""What all indexers share as estimators: the check of their parameters, their accuracy, and their model files."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any, ClassVar, Self, cast
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike
 from sklearn.base import BaseEstimator, ClassifierMixin
 from sklearn.utils.validation import check_is_fitted
 
 from indexing.action.inputs import check_labels
+from indexing.opening import shown
+
+
+@dataclass(frozen=True)
+class Rule:
+    """What a parameter may be."""
+
+    accepts: Callable[[Any], bool]
+    wanted: str
+    """Follows "must be" in the message."""
+
+
+def is_number(value: Any) -> bool:
+    """Whether a value is a finite number, and not a truth value."""
+    return isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool) and bool(np.isfinite(value))
+
+
+def is_positive(value: Any) -> bool:
+    """Whether a value is a number above zero."""
+    return is_number(value) and bool(value > 0)
+
+
+def is_whole(value: Any) -> bool:
+    """Whether a value is a whole number, and not a truth value."""
+    return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+
+
+def one_of(*accepted: Any) -> Rule:
+    """A rule for a choice.
+
+    Example:
+        >>> one_of("any", "same").wanted
+        "one of 'any', 'same'"
+    """
+    return Rule(
+        lambda value: isinstance(value, (str, int, np.bool_)) and value in accepted, f"one of {', '.join(map(repr, accepted))}"
+    )
+
+
+def _seeds(value: Any) -> bool:
+    try:
+        np.random.default_rng(value)
+    except (TypeError, ValueError):
+        return False
+    return True
+
+
+POSITIVE = Rule(is_positive, "a positive number")
+SECONDS = Rule(lambda value: is_number(value) and value >= 0, "seconds, 0 or more")
+REJECT = Rule(lambda value: value is None or is_number(value), "None, a rate between 0 and 1 or a threshold")
+RANDOM_STATE = Rule(_seeds, "None, a whole number from 0, or a generator")
+
+
+def check_device(device: str) -> None:
+    """Raise where there is no such device."""
+    try:
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError, TypeError) as error:
+        raise ValueError(f"device {device!r} is not there: {str(error).splitlines()[0]}; use device='cpu'") from None
 
 
 class SavedClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
@@ -24,6 +85,18 @@ class SavedClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
 
     FITTED: ClassVar[str]
     FILES: ClassVar[str]
+    RULES: ClassVar[Mapping[str, Rule]]
+
+    def check_parameters(self) -> None:
+        """Raise on parameters that make no sense, naming the parameter and what it accepts.
+
+        Raises:
+            ValueError: the first parameter that breaks its rule, or a device that is not there.
+        """
+        for name, rule in self.RULES.items():
+            if not rule.accepts(getattr(self, name)):
+                raise ValueError(f"{name} must be {rule.wanted}, got {shown(getattr(self, name))}")
+        check_device(self.device)
 
     def score(self, clips: Iterable[Any], labels: ArrayLike, sample_weight: ArrayLike | None = None) -> float:
         """Mean accuracy of ``predict``; labels that were never learned count as wrong."""

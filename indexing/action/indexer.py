@@ -14,19 +14,22 @@ from sklearn.utils.validation import check_is_fitted
 from dyntorch.numerics import one_thread
 from indexing.action.bank import Windows
 from indexing.action.exemplars import CROPS, VIEWS, VIEWS_SOLID, ExemplarPlan, Exemplars, cut
-from indexing.action.inputs import check_common, check_parameters, check_plan, check_queries, gather, gather_groups, gather_labels
+from indexing.action.inputs import check_common, check_plan, check_queries, gather, gather_groups, gather_labels
 from indexing.action.learning import Lesson, learn
 from indexing.action.model import ShapeModel
 from indexing.action.stream import Stream, find_events, frame_scores, scan
 from indexing.action.symmetry import mirror_permutation
 from indexing.clip import Clip
-from indexing.estimator import SavedClassifier
+from indexing.estimator import POSITIVE, RANDOM_STATE, REJECT, SECONDS, Rule, SavedClassifier, is_positive, is_whole, one_of
 from indexing.joints import layout_of
 from indexing.scoring import Event, joined, probabilities, refuse, reject_threshold, same_label
 from indexing.skeleton import Skeleton
 from indexing.windows import mended, ragged, whole
 
 Array = NDArray[Any]
+
+
+TEMPI = 100  # at most: a recording is compared once for each of them
 
 
 class ActionIndexer(SavedClassifier):
@@ -77,6 +80,24 @@ class ActionIndexer(SavedClassifier):
     """
 
     FITTED, FILES = "model_", "indexing.action.saving"
+    RULES = {
+        "view": one_of("any", "same"),
+        "weights": one_of("equal", "learned"),
+        "scorer": one_of("both", "nearest", "kernel"),
+        "mirror": one_of("auto", True, False),
+        "fps": POSITIVE,
+        "window": POSITIVE,
+        "stride": POSITIVE,
+        "pool": SECONDS,
+        "tempi": Rule(
+            lambda value: isinstance(value, Iterable) and 0 < len(list(value)) <= TEMPI and all(map(is_positive, value)),
+            f"1 to {TEMPI} positive speed factors such as (0.7, 1.0, 1.4)",
+        ),
+        "length": Rule(lambda value: is_whole(value) and value >= 4, "a whole number, 4 or more"),
+        "virtual_views": Rule(lambda value: value is None or (is_whole(value) and value >= 0), "a whole number, 0 or more"),
+        "reject": REJECT,
+        "random_state": RANDOM_STATE,
+    }
 
     def __init__(
         self,
@@ -131,7 +152,7 @@ class ActionIndexer(SavedClassifier):
         Raises:
             ValueError: naming the clip or the parameter, what is wrong and what to do.
         """
-        check_parameters(self)
+        self.check_parameters()
         found, owners = gather(clips, self.fps)
         people = gather_groups(found, owners, groups)
         values = gather_labels(found, owners, labels)
@@ -155,7 +176,7 @@ class ActionIndexer(SavedClassifier):
         """Learn from further clips, of known or new actions; the earlier ones stay.  Fits where nothing was fitted yet."""
         if not hasattr(self, "model_"):
             return self.fit(clips, labels, groups)
-        check_parameters(self)
+        self.check_parameters()
         found, owners = gather(clips, self.fps, self.n_joints_, self.skeleton_)
         people = gather_groups(found, owners, groups)
         if self.weights == "learned" and (people is None) != (self.groups_ is None):

@@ -16,7 +16,6 @@ from indexing.action.bank import COMMON
 from indexing.cameras import virtual
 from indexing.clip import Clip, as_clip
 from indexing.joints import layout_of, matched_all
-from indexing.opening import shown
 from indexing.skeleton import Skeleton
 from indexing.windows import check_clips, ragged, sample, torn
 
@@ -78,7 +77,6 @@ def combine(views: tuple[Clip, ...]) -> list[Clip]:
 
 
 Array = NDArray[Any]
-TEMPI = 100  # at most: a recording is compared once for each of them
 
 
 def as_clips(clips: Iterable[Any], fps: float) -> list[Clip | tuple[Clip, ...]]:
@@ -246,70 +244,6 @@ def _axes(value: Any) -> int:
         return int(np.ndim(value))
     except ValueError:  # nested lists of different lengths: refused as a clip, by name
         return -1
-
-
-_CHOICES: dict[str, tuple[Any, ...]] = {
-    "view": ("any", "same"),
-    "weights": ("equal", "learned"),
-    "scorer": ("both", "nearest", "kernel"),
-    "mirror": ("auto", True, False),
-}
-
-
-def check_parameters(indexer: Any) -> None:
-    """Raise on parameters that make no sense, naming the parameter and what it accepts."""
-    for name, accepted in _CHOICES.items():
-        if getattr(indexer, name) not in accepted:
-            raise ValueError(f"{name} must be one of {', '.join(map(repr, accepted))}, got {getattr(indexer, name)!r}")
-    _check_numbers(indexer)
-    check_reject(indexer.reject)
-    try:
-        np.random.default_rng(indexer.random_state)
-    except (TypeError, ValueError) as error:
-        raise ValueError(
-            f"random_state must be None, a whole number from 0, or a generator, got {indexer.random_state!r} ({error})"
-        ) from None
-    check_device(indexer.device)
-
-
-def check_reject(reject: Any) -> None:
-    """Raise where ``reject`` is neither ``None`` nor a number."""
-    if reject is not None and not is_number(reject):
-        raise ValueError(f"reject must be None, a rate between 0 and 1 or a threshold, got {reject!r}")
-
-
-def check_device(device: str) -> None:
-    """Raise where there is no such device."""
-    try:
-        torch.empty(0, device=device)
-    except (RuntimeError, AssertionError, TypeError) as error:
-        raise ValueError(f"device {device!r} is not there: {str(error).splitlines()[0]}; use device='cpu'") from None
-
-
-def _check_numbers(indexer: Any) -> None:
-    for name in ("fps", "window", "stride"):
-        if not _positive(getattr(indexer, name)):
-            raise ValueError(f"{name} must be a positive number, got {getattr(indexer, name)!r}")
-    if not (is_number(indexer.pool) and indexer.pool >= 0):
-        raise ValueError(f"pool must be seconds, 0 or more, got {indexer.pool!r}")
-    tempi = list(indexer.tempi) if isinstance(indexer.tempi, Iterable) else []
-    if not tempi or len(tempi) > TEMPI or not all(_positive(tempo) for tempo in tempi):
-        raise ValueError(f"tempi must be 1 to {TEMPI} positive speed factors such as (0.7, 1.0, 1.4), got {shown(indexer.tempi)}")
-    for name, least in (("length", 4), ("virtual_views", 0)):
-        value = getattr(indexer, name)
-        if name == "virtual_views" and value is None:
-            continue
-        if not isinstance(value, (int, np.integer)) or isinstance(value, bool) or value < least:
-            raise ValueError(f"{name} must be a whole number, {least} or more, got {value!r}")
-
-
-def _positive(value: Any) -> bool:
-    return is_number(value) and bool(value > 0)
-
-
-def is_number(value: Any) -> bool:
-    """Whether a value is a finite number, and not a truth value."""
-    return isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool) and bool(np.isfinite(value))
 
 
 def check_plan(indexer: Any, crops: int, exemplars: Any) -> None:

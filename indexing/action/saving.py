@@ -13,10 +13,10 @@ from torch import Tensor
 
 from indexing.action.bank import CHANNELS, NEAREST, JointMetric, Kernels, Windows
 from indexing.action.exemplars import CROPS, Exemplars
-from indexing.action.inputs import check_device, check_parameters
 from indexing.action.joint_weights import JointWeights
 from indexing.action.learning import KERNEL_WHITENING
 from indexing.action.model import Blend, ShapeModel, read_machine
+from indexing.estimator import check_device
 from indexing.modelfile import (
     Parts,
     labels_from_json,
@@ -71,7 +71,7 @@ def load(kind: type[Indexer], path: str | Path, device: str = "cpu") -> Indexer:
     with usable(path):
         parameters = _known(header)
         indexer = kind(**{**parameters, "tempi": tuple(parameters["tempi"])}, device=device)
-        check_parameters(indexer)
+        indexer.check_parameters()
         indexer.classes_ = labels_from_json(header["classes"])
         indexer.n_joints_ = whole(header["joints"], "joints", 1, JOINTS)
         indexer.skeleton_ = skeleton_from_json(header["skeleton"], indexer.n_joints_)

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.utils.validation import check_is_fitted
 
 from dyntorch.numerics import one_thread
-from indexing.action.inputs import check_device, check_labels, check_reject, is_number
+from indexing.action.inputs import check_labels
 from indexing.brightness.footage import Footage, footage, gather
 from indexing.brightness.library import VideoExemplars, library
 from indexing.brightness.sight import LENGTH, SMALLEST, Optics
@@ -25,7 +25,7 @@ from indexing.brightness.stream import (
     recognize,
     wrong_evidence,
 )
-from indexing.estimator import SavedClassifier
+from indexing.estimator import POSITIVE, REJECT, SECONDS, Rule, SavedClassifier, check_device, is_number, is_whole, one_of
 from indexing.modelfile import Parts, labels_from_json, labels_to_json, read_model, usable, write_model
 from indexing.opening import shown
 from indexing.scoring import Event, joined, probabilities, refuse, reject_threshold
@@ -37,30 +37,12 @@ from indexing.scoring import Event, joined, probabilities, refuse, reject_thresh
 LARGEST = 100_000  # px of the shorter side: films have some thousand
 
 
-def check_parameters(indexer: Any) -> None:
-    """Raise on parameters that make no sense, naming the parameter and what it accepts."""
-    for name in ("fps", "window"):
-        value = getattr(indexer, name)
-        if not is_number(value) or value <= 0:
-            raise ValueError(f"{name} must be a positive number, got {value!r}")
-    if not is_number(indexer.pool) or indexer.pool < 0:
-        raise ValueError(f"pool must be seconds, 0 or more, got {indexer.pool!r}")
-    _check_region(indexer.region)
-    if indexer.flip not in (True, False, "auto"):
-        raise ValueError(f"flip must be 'auto', True or False, got {indexer.flip!r}")
-    check_reject(indexer.reject)
-    size = indexer.size
-    if not isinstance(size, (int, np.integer)) or isinstance(size, bool) or not SMALLEST <= size <= LARGEST:
-        raise ValueError(f"size must be a whole number of pixels from {SMALLEST} to {LARGEST}, got {shown(size)}")
-    check_device(indexer.device)
-
-
-def _check_region(region: Any) -> None:
+def is_region(region: Any) -> bool:
+    """Whether a value says which part of the frames is looked at."""
     if region is None or (isinstance(region, str) and region == "motion"):
-        return
+        return True
     fine = isinstance(region, (Sequence, np.ndarray)) and not isinstance(region, str) and len(region) == 4
-    if not (fine and all(is_number(v) for v in region) and region[2] > region[0] and region[3] > region[1]):
-        raise ValueError(f"region must be 'motion', None or (x0, y0, x1, y1) in pixels with x0 < x1 and y0 < y1, got {region!r}")
+    return bool(fine and all(is_number(v) for v in region) and region[2] > region[0] and region[3] > region[1])
 
 
 Array = NDArray[Any]
@@ -112,6 +94,18 @@ class BrightnessIndexer(SavedClassifier):
     """
 
     FITTED, FILES = "exemplars_", "indexing.brightness.indexer"
+    RULES = {
+        "fps": POSITIVE,
+        "window": POSITIVE,
+        "pool": SECONDS,
+        "region": Rule(is_region, "'motion', None or (x0, y0, x1, y1) in pixels with x0 < x1 and y0 < y1"),
+        "flip": one_of("auto", True, False),
+        "reject": REJECT,
+        "size": Rule(
+            lambda value: is_whole(value) and SMALLEST <= value <= LARGEST,
+            f"a whole number of pixels from {SMALLEST} to {LARGEST}",
+        ),
+    }
 
     def __init__(
         self,
@@ -149,7 +143,7 @@ class BrightnessIndexer(SavedClassifier):
         Raises:
             ValueError: naming the video or the parameter, what is wrong and what to do.
         """
-        check_parameters(self)
+        self.check_parameters()
         found = gather(videos, float(self.fps))
         classes, numbers = np.unique(check_labels(labels, len(found)), return_inverse=True)
         if len(classes) < 2:
@@ -165,7 +159,7 @@ class BrightnessIndexer(SavedClassifier):
         """
         if not hasattr(self, "exemplars_"):
             return self.fit(videos, labels)
-        check_parameters(self)
+        self.check_parameters()
         if self._optics() != self._learned_optics:
             raise ValueError("fps, region or size were changed since fit; set them back, or fit all videos again")
         found = gather(videos, float(self.fps))
@@ -318,7 +312,7 @@ def load(kind: type[Indexer], path: str | Path, device: str = "cpu") -> Indexer:
     header, parts = read_model(path, KIND, VERSION)
     with usable(path):
         indexer = kind(**_known(header["parameters"]), device=device)
-        check_parameters(indexer)
+        indexer.check_parameters()
         classes = labels_from_json(header["classes"])
         return indexer._learn(_exemplars(parts, len(classes)), classes)
 

@@ -13,11 +13,10 @@ from torch import Tensor
 
 from dyntorch.numerics import one_thread
 from indexing.action.bank import stack
-from indexing.action.inputs import check_device, check_queries, gather, gather_labels, is_number
-from indexing.action.inputs import check_reject as check_reject_number
+from indexing.action.inputs import check_queries, gather, gather_labels
 from indexing.action.symmetry import mirror_permutation
 from indexing.clip import Clip, stretches
-from indexing.estimator import SavedClassifier
+from indexing.estimator import POSITIVE, REJECT, SECONDS, Rule, SavedClassifier, is_whole, one_of
 from indexing.joints import layout_of
 from indexing.phase.frames import LEAST, images, query_frames
 from indexing.phase.learning import learn_model
@@ -26,25 +25,6 @@ from indexing.scoring import Event, events, probabilities, refuse, reject_thresh
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Parameters and phases that users hand in, checked once.
-
-
-_CHOICES: dict[str, tuple[Any, ...]] = {"course": ("auto", "periodic", "once"), "mirror": ("auto", True, False)}
-
-
-def check_phase_parameters(indexer: Any) -> None:
-    """Raise on parameters that make no sense, naming the parameter and what it accepts."""
-    for name, accepted in _CHOICES.items():
-        if getattr(indexer, name) not in accepted:
-            raise ValueError(f"{name} must be one of {', '.join(map(repr, accepted))}, got {getattr(indexer, name)!r}")
-    harmonics = indexer.harmonics
-    if not isinstance(harmonics, (int, np.integer)) or isinstance(harmonics, bool) or not 1 <= harmonics <= 12:
-        raise ValueError(f"harmonics must be a whole number from 1 to 12, got {harmonics!r}")
-    for name, least in (("fps", 1e-9), ("window", 0.0)):
-        value = getattr(indexer, name)
-        if not (is_number(value) and value >= least):
-            raise ValueError(f"{name} must be {'a positive number' if name == 'fps' else 'seconds, 0 or more'}, got {value!r}")
-    check_reject_number(indexer.reject)
-    check_device(indexer.device)
 
 
 def check_reject(indexer: Any, classes: list[Any]) -> None:
@@ -162,6 +142,14 @@ class PhaseIndexer(SavedClassifier):
     """
 
     FITTED, FILES = "model_", "indexing.phase.saving"
+    RULES = {
+        "course": one_of("auto", "periodic", "once"),
+        "mirror": one_of("auto", True, False),
+        "harmonics": Rule(lambda value: is_whole(value) and 1 <= value <= 12, "a whole number from 1 to 12"),
+        "fps": POSITIVE,
+        "window": SECONDS,
+        "reject": REJECT,
+    }
 
     def __init__(
         self,
@@ -198,7 +186,7 @@ class PhaseIndexer(SavedClassifier):
         Raises:
             ValueError: naming the clip or the parameter, what is wrong and what to do.
         """
-        check_phase_parameters(self)
+        self.check_parameters()
         items = list(clips) if isinstance(clips, Iterable) and not isinstance(clips, (Clip, str, bytes)) else clips
         found, owners = gather(items, self.fps)
         values = gather_labels(found, owners, labels)

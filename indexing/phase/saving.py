@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from indexing.action.bank import Windows
-from indexing.action.inputs import check_device
+from indexing.estimator import check_device
 from indexing.modelfile import (
     Parts,
     labels_from_json,
@@ -23,7 +23,6 @@ from indexing.modelfile import (
 )
 from indexing.opening import shown
 from indexing.phase.frames import LEAST
-from indexing.phase.indexer import check_phase_parameters
 from indexing.phase.model import Course, PhaseModel
 from indexing.scoring import reject_threshold
 
@@ -64,7 +63,7 @@ def load(kind: type[Indexer], path: str | Path, device: str = "cpu") -> Indexer:
     header, parts = read_model(path, FORMAT, VERSION)
     with usable(path):
         indexer = kind(**header["parameters"], device=device)
-        check_phase_parameters(indexer)
+        indexer.check_parameters()
         _restore(indexer, header, parts)
     return indexer
 
