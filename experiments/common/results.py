@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+import platform
 import re
 import shlex
 import sys
@@ -108,7 +109,7 @@ def _machine() -> str:
         parts.append(torch.cuda.get_device_name())
     versions = ", ".join(f"{name} {about['versions'][name]}" for name in ("python", "torch", "numpy"))
     threads = f"OMP_NUM_THREADS={os.environ['OMP_NUM_THREADS']}" if "OMP_NUM_THREADS" in os.environ else "threads not limited"
-    return f"*Measured on {about['time'][:10]}: {', '.join(parts)}; {about['platform']['system']}; {versions}; {threads}.*"
+    return f"*Measured on {about['time'][:10]}: {', '.join(parts)}; {platform.system()}; {versions}; {threads}.*"
 
 
 def _cpuinfo() -> str:

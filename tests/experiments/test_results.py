@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+from fnmatch import fnmatch
 
 import pytest
 
@@ -23,8 +24,8 @@ def test_every_page_states_a_command_that_exists(path):
 
 
 def test_every_page_is_in_the_list():
-    listed = (RESULTS / "index.md").read_text(encoding="utf-8").splitlines()
-    assert {path.stem for path in PAGES} <= set(listed)
+    patterns = (RESULTS / "index.md").read_text(encoding="utf-8").splitlines()
+    assert not [path.stem for path in PAGES if not any(fnmatch(path.stem, pattern) for pattern in patterns)]
 
 
 @pytest.mark.parametrize(("words", "written"), [(["--scenes", "20"], True), (["--scenes", "3"], False), ([], False)])
