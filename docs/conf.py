@@ -36,6 +36,7 @@ autodoc_typehints = "signature"
 autodoc_typehints_format = "short"
 python_use_unqualified_type_names = True
 python_maximum_signature_line_length = 100
+autodoc_type_aliases = {"ArrayLike": "ArrayLike"}
 autodoc_class_signature = "mixed"
 napoleon_numpy_docstring = False
 napoleon_use_ivar = True
@@ -101,6 +102,8 @@ def _escaped(app: Any, what: str, name: str, obj: Any, options: Any, lines: list
         own = reference.member_text(getattr(sys.modules[module], kind), member)
         if own is not None:
             lines[:] = [*own.splitlines(), ""]
+    if what in ("property", "attribute", "data"):
+        lines.insert(0, "")  # or napoleon takes what stands before a colon for a type
     lines[:] = [line if line.lstrip().startswith((">>>", "...", "..")) else reference.escaped(line) for line in lines]
 
 

@@ -59,7 +59,7 @@ def published(module: str, words: Sequence[str], folder: Path = RESULTS) -> Iter
     if stated is None or (stated["module"], shlex.split(stated["words"])) != (module, list(words)):
         print(f"{target.name} stays as it is: it is about another command", file=sys.stderr)
         return
-    write_text(target, f"{head}{MARK}\n\n{_machine()}\n\n{as_markdown(said.getvalue())}\n")
+    write_text(target, f"{head}{MARK}\n\n## As printed\n\n{_machine()}\n\n{as_markdown(said.getvalue())}\n")
     print(f"written: {target}", file=sys.stderr)
 
 
@@ -89,7 +89,7 @@ def as_markdown(printed: str) -> str:
     """
     parts = [part.strip("\n") for part in re.split(r"\n\s*\n", printed.strip("\n"))]
     keep = [part if part.startswith(("|", "#")) or "\n" not in part else f"```text\n{part}\n```" for part in parts]
-    return "\n\n".join(re.sub(r"^#+", "##", part) for part in keep)
+    return "\n\n".join(re.sub(r"^#+", "###", part) for part in keep)
 
 
 def _new(module: str, words: Sequence[str]) -> str:

@@ -65,4 +65,4 @@ def test_nothing_is_written_without_a_folder_of_pages_or_for_other_programs(tmp_
 
 
 def test_headings_are_below_the_title():
-    assert as_markdown("\n### T\n\n| a |\n|---|\n") == "## T\n\n| a |\n|---|"
+    assert as_markdown("\n### T\n\n| a |\n|---|\n") == "### T\n\n| a |\n|---|"

@@ -38,7 +38,11 @@ line = [
     x + torch.stack([speed * place.cos(), 0.4 * speed * place.cos()], dim=1)
     for x, speed in zip(line, (0.0, 20.0, 33.0), strict=True)
 ]
+point = torch.tensor([300.0, 250.0], dtype=torch.float64)
+ways = torch.nn.functional.normalize(torch.randn(60, 2, generator=draw, dtype=torch.float64), dim=1)
+through = [point + ways * (30 + 200 * torch.rand(60, 1, generator=draw, dtype=torch.float64)) for _ in range(3)]
 cases = {"general": general.views, "nothing moves": still.views, "all on one line": moved_in(on_line, line)}
+cases["all lines through one point"] = moved_in(on_line, through)
 figure, axes = plt.subplots()
 for name, views in cases.items():
     solution = dyn.fit(dyn.HomographyTensor, *views)
@@ -46,7 +50,7 @@ for name, views in cases.items():
     values = (solution.singular_values / solution.singular_values.max()).clamp(min=1e-17)
     axes.semilogy(range(1, len(values) + 1), values, "o-", markersize=4, label=f"{name}: {status}")
 axes.set(xlabel="singular value", ylabel="relative size", title="Homography tensor: how many directions the matches leave open")
-axes.legend(loc="center", bbox_to_anchor=(0.66, 0.45))
+axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncol=2)
 plt.show()
 
 # %%
