@@ -102,7 +102,7 @@ tables: install
 docs: install
 	@echo "The documentation: one to three minutes, in which the examples of the gallery run; then open site/index.html."
 	$(PIP) --constraint constraints.txt --editable '.[docs,video]'
-	$(BIN)/python -m sphinx -q -W --keep-going -b html docs site
+	$(BIN)/python -m sphinx -q -E -W --keep-going -b html docs site
 
 clean:
 	rm -rf $(VENV) site docs/api docs/auto_gallery build dist demo-report results

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
 from types import ModuleType
@@ -42,25 +42,37 @@ def pages() -> list[Page]:
     found: dict[str, Page] = {}
     for name in PACKAGES:
         package = import_module(name)
-        for public in package._HOME:
-            room = room_of(package._HOME[public])
-            page = found.setdefault(room.__name__, Page(room.__name__, room))
-            page.names.append((name, public))
-        for results in list(found.values()):
-            listed = {public for _, public in results.names}
-            results.names += dict.fromkeys(one for one in _results(results) if one[1] not in listed)
+        _by_room(found, package, package._HOME)
         for module in (*getattr(package, "_MODULES", ()), *FACES.get(name, ())):
             whole = getattr(package, module, None) or import_module(f"{name}.{module}")
-            page = found.setdefault(f"{name}.{module}", Page(f"{name}.{module}", whole))
-            listed = {*package.__all__, *(public for _, public in page.names)}
-            page.names += [(whole.__name__, public) for public in members(whole) if public not in listed]
+            own = [public for public in members(whole) if not (public in package.__all__ and _same(package, whole, public))]
+            if hasattr(whole, "_HOME"):
+                _by_room(found, whole, {public: whole._HOME[public] for public in own})
+            elif own:
+                page = found.setdefault(f"{name}.{module}", Page(f"{name}.{module}", whole))
+                page.names += [(whole.__name__, public) for public in own]
+    for page in found.values():
+        listed = {public for _, public in page.names}
+        page.names += dict.fromkeys(one for one in _results(page) if one[1] not in listed)
     return list(found.values())
+
+
+def _by_room(found: dict[str, Page], package: ModuleType, home: Mapping[str, str]) -> None:
+    """Put public names of a package on the pages of the rooms that they live in."""
+    for public, module in home.items():
+        room = room_of(module).__name__
+        found.setdefault(room, Page(room, import_module(room))).names.append((package.__name__, public))
 
 
 def room_of(home: str) -> ModuleType:
     """The package that a module stands in; of a package, itself."""
     module = import_module(home)
     return module if hasattr(module, "__path__") else import_module(home.rpartition(".")[0])
+
+
+def _same(package: ModuleType, module: ModuleType, name: str) -> bool:
+    """Whether a public name of a package is the same thing in one of its modules, and not only called alike."""
+    return hasattr(module, name) and getattr(module, name) is getattr(package, name)
 
 
 def members(module: ModuleType) -> list[str]:

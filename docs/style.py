@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import matplotlib as mpl
 
 
 def apply(gallery: dict[str, Any], file: str) -> None:
-    """Before every example."""
+    """Before every example; in one, a name that has moved is an error."""
+    warnings.filterwarnings("error", category=DeprecationWarning, message="dyntorch", module="__main__")
     mpl.rcdefaults()
     mpl.rcParams.update(
         {

@@ -11,6 +11,7 @@ import io
 import os
 import re
 import shlex
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -94,7 +95,8 @@ def run(document: Path, folder: Path) -> list[str]:
 
 def _python(step: Step, document: Path) -> str:
     out = io.StringIO()
-    with contextlib.redirect_stdout(out):
+    with contextlib.redirect_stdout(out), warnings.catch_warnings():
+        warnings.filterwarnings("error", category=DeprecationWarning, message="dyntorch")  # a name that has moved
         exec(compile(step.typed, str(document), "exec"), {"__name__": "__main__"})
     return difference(step.shown, out.getvalue())
 

@@ -11,7 +11,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 
-import dyntorch as dyn
+from dyntorch import numerics
 from indexing.actors import Person, detect, perform
 
 LENGTH = 40
@@ -22,12 +22,12 @@ def image(action, azimuth, person):
     clip = detect(perform(action, person), azimuth=azimuth, noise=0.0, dropout=0.0, outliers=0.0, distance=20.0)
     frames = np.linspace(0, len(clip) - 1, LENGTH).round().astype(int)  # every performance in as many frames
     points = torch.from_numpy(clip.joints[frames].reshape(-1, 2).copy())
-    return dyn.orthonormal_basis(points - points.mean(0))
+    return numerics.orthonormal_basis(points - points.mean(0))
 
 
 def residual(a, b):
     """One minus the largest cosine between the planes that the coordinates span."""
-    return 1 - float(dyn.canonical_correlation(a[None], b[None]))
+    return 1 - float(numerics.canonical_correlation(a[None], b[None]))
 
 
 # %%
