@@ -77,6 +77,8 @@ _HOME = {
     # how a shape moves
     "Polynomial": "dyntorch.shapes.basis",
     "Fourier": "dyntorch.shapes.basis",
+    # the numbers that decide in a task
+    "SegmentOptions": "dyntorch.tasks.segment.options",
 }
 _MODULES = {
     "core": "dyntorch.core",

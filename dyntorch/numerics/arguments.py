@@ -42,6 +42,13 @@ def check_precision(name: str, dtype: torch.dtype, *, precise: bool = True) -> N
         raise ValueError(f"{name} must be float32 or float64, got {dtype}, which has too few digits; use .float()")
 
 
+def check_options(options: object, kind: type) -> None:
+    """Raise a ``ValueError`` unless the options of a verb are of the kind that it takes."""
+    if not isinstance(options, kind):
+        name = kind.__name__
+        raise ValueError(f"options must be {name}, got {options!r}; use dataclasses.replace({name}(), ...)")
+
+
 def refuse_vmap(name: str, value: Tensor) -> None:
     """Raise a ``ValueError`` for a tensor inside of ``torch.func.vmap``: which way to go depends on values."""
     functorch = torch._C._functorch

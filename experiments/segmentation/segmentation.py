@@ -79,10 +79,17 @@ class Outcome:
     seconds: float
 
 
-def segmented(pair: Pair, bodies: int | None = None, threshold: float = DEFAULT, seed: int = 0) -> Outcome:
+def segmented(
+    pair: Pair,
+    bodies: int | None = None,
+    threshold: float = DEFAULT,
+    seed: int = 0,
+    options: dyn.SegmentOptions = dyn.SegmentOptions(),
+) -> Outcome:
     """Segment a pair and compare with the truth."""
     clock = time.perf_counter()
-    found = dyn.segment(pair.x1, pair.x2, bodies=bodies, threshold=threshold, generator=torch.Generator().manual_seed(seed))
+    generator = torch.Generator().manual_seed(seed)
+    found = dyn.segment(pair.x1, pair.x2, bodies=bodies, threshold=threshold, generator=generator, options=options)
     seconds = time.perf_counter() - clock
     return Outcome(100 * float(misclassification(found.labels, pair.labels)), int(found.bodies), seconds)
 

@@ -1,6 +1,7 @@
 """The tables and benchmarks of the segmentation into bodies, on tiny data, with a segmentation that is told the answer."""
 
 import json
+from dataclasses import asdict
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,7 +15,7 @@ from experiments.benchmarks import segmentation as benchmark
 from experiments.recognition import protocol
 from experiments.segmentation import data as segmentation_data
 from experiments.segmentation import matrix_noise as segmentation_matrix_noise
-from experiments.segmentation import segmentation
+from experiments.segmentation import segmentation, sensitivity
 
 WRONG = 2
 """Labels that the segmentation that is told the answer gets wrong."""
@@ -45,7 +46,7 @@ def told(data, monkeypatch):
     truth = {p.x1.sum().item(): p.labels for p in (*segmentation_data.motion_pairs(), *segmentation_data.hopkins_pairs())}
     asked = []
 
-    def segment(x1, x2, bodies=None, threshold=2.5, generator=None):
+    def segment(x1, x2, bodies=None, threshold=2.5, generator=None, options=None):
         asked.append((len(x1), bodies, threshold))
         labels = truth[x1.sum().item()].clone()
         labels[labels.nonzero()[:WRONG]] = 0
@@ -148,3 +149,33 @@ def test_all_methods_are_better_than_guessing():
         if name != "segment":
             labels = dyn.SegmentationMatrix.labels(*solve(), *scene.views)
             assert misclassification(labels, scene.labels).mean() < 0.2, name
+
+
+def flat(options):
+    """Every field of every stage by its full name."""
+    return {f"{stage}.{name}": value for stage, fields in asdict(options).items() for name, value in fields.items()}
+
+
+def test_the_sensitivity_changes_one_option_at_a_time():
+    shipped = flat(dyn.SegmentOptions())
+    for stage, field, values in sensitivity.VARIED:
+        assert min(values) < shipped[f"{stage}.{field}"] < max(values)
+        for value in values:
+            changed = flat(sensitivity.varied(stage, field, value))
+            assert {name for name in shipped if changed[name] != shipped[name]} == {f"{stage}.{field}"}
+
+
+def test_the_sensitivity_hands_every_setting_to_the_segmentation(data, monkeypatch, capsys):
+    seen = []
+
+    def segmented(pair, bodies=None, threshold=2.5, seed=0, options=None):
+        seen.append(options)
+        return segmentation.Outcome(float(options.labels.outlier), pair.bodies, 0.0)
+
+    monkeypatch.setattr(sensitivity, "segmented", segmented)
+    rows = sensitivity.sensitivity(sensitivity.Config(scenes=1, quick=True))
+    assert {options.labels.outlier for options in seen} == {0.7, 1.0, 1.4}
+    assert len({str(options) for options in seen}) == 7
+    least = [row for row in rows if row.setting.startswith("least")]
+    assert len(least) == 2 and all(row.measured == pytest.approx(0.7) for row in least)
+    assert "labels.outlier 1.4" in capsys.readouterr().out

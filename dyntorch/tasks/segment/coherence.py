@@ -8,25 +8,9 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-NEIGHBOURS, EDGES = 15, 8
-"""Neighbours by which the coherence of a match is judged, and those it is linked with."""
-TOLERANCE, EDGE_TOLERANCE = 0.7, 0.5
-"""Relative deviation from the local affine motion at which coherence has fallen to 1/e."""
-RIDGE = 0.25
-REACH = 2.5
-"""Distance from which neighbours are far, in units of the median one."""
-PASSES, TRUSTED = 2, 0.02
-"""Passes, and the coherence below which a match is no neighbour in the next one."""
-MEMBERS = 1500  # of a body, by which conformity is judged: closer ones have no other motion, only noise
+from dyntorch.tasks.segment.options import SegmentOptions
+
 TABLE = 1 << 22  # distances held at a time
-RATIOS, MODES = 400, 16  # pairs of neighbours, and starts among them, by which the common motion is looked for
-DISTORTED = 0.35
-"""Zoom and rotation, as the distance of the complex factor from 1, from which the local motions start from it."""
-APART, OTHERS = 0.7, 0.1
-"""Relative distance of a further factor from the first ones from which local motions start from either (a local fit does not get so
-far), and share of the pairs that must have it: wrong matches beside right ones agree on 0.05 to 0.08 by chance."""
-SHARED = 0.05
-"""Share of the pairs that must have it: 0.02 to 0.04 of random matches agree by chance, 0.06 of 30 % right matches do."""
 
 
 DENSE = 1000
@@ -101,7 +85,7 @@ class Coherence:
     links: Links
 
 
-def coherence(x1: Tensor, x2: Tensor, scale: float, among: Tensor | None = None) -> Coherence:
+def coherence(x1: Tensor, x2: Tensor, scale: float, among: Tensor | None = None, *, options: SegmentOptions) -> Coherence:
     r"""Deviation of each match from the affine motion of its neighbours, in both directions.
 
     For a match i and a neighbour j of it in image a, with the local motion :math:`L_i` from a to b,
@@ -122,35 +106,42 @@ def coherence(x1: Tensor, x2: Tensor, scale: float, among: Tensor | None = None)
     among = torch.ones_like(x1[:, 0], dtype=torch.bool) if among is None else among
     fresh = _first_of_copies(x1, x2, among, scale / 6)
     values = torch.ones_like(x1[:, 0])
-    for _ in range(PASSES):
+    for _ in range(options.coherence.passes):
         # the first pass finds most wrong matches, which then no longer stand between the neighbours of the others
-        trusted = values > TRUSTED
-        values, linked = _judged(x1, x2, fresh & trusted, scale)
+        trusted = values > options.coherence.trusted
+        values, linked = _judged(x1, x2, fresh & trusted, scale, options)
     return Coherence(values, _links(*linked, among))
 
 
-def _judged(x1: Tensor, x2: Tensor, eligible: Tensor, scale: float) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
+def _judged(
+    x1: Tensor, x2: Tensor, eligible: Tensor, scale: float, options: SegmentOptions
+) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
     """Coherence of all matches with their nearest eligible ones ``(n,)``; rows, columns and weights of the links."""
     count = len(x1)
     values = torch.zeros_like(x1[:, 0])
     rows, columns, weights = [], [], []
     for a, b in ((x1, x2), (x2, x1)):
-        index, usable = _nearest(a, b, eligible.nonzero().flatten(), scale / 6)
+        index, usable = _nearest(a, b, eligible.nonzero().flatten(), scale / 6, options)
         da, db = a[index] - a[:, None], b[index] - b[:, None]
-        reach = _reach(da, usable, eligible)
-        each = torch.stack([_deviation(da, db, usable, common, reach, scale) for common in _common_motions(da, db, usable)])
+        reach = _reach(da, usable, eligible, options)
+        each = torch.stack(
+            [_deviation(da, db, usable, common, reach, scale, options) for common in _common_motions(da, db, usable, options)]
+        )
         # a match follows the one of the common motions by which it agrees most with its neighbours
-        agreed, best = (torch.exp(-((each / TOLERANCE) ** 2)) * usable).sum(-1).max(0)
+        agreed, best = (torch.exp(-((each / options.coherence.tolerance) ** 2)) * usable).sum(-1).max(0)
         deviation = each[best, torch.arange(count, device=x1.device)]
         values = values + agreed / usable.sum(-1).clamp(min=1) / 2
-        linked = torch.exp(-((deviation[:, :EDGES] / EDGE_TOLERANCE) ** 2)) * usable[:, :EDGES]
+        linked = (
+            torch.exp(-((deviation[:, : options.coherence.edges] / options.coherence.edge_tolerance) ** 2))
+            * usable[:, : options.coherence.edges]
+        )
         rows.append(torch.arange(count, device=x1.device)[:, None].expand_as(linked).flatten())
-        columns.append(index[:, :EDGES].flatten())
+        columns.append(index[:, : options.coherence.edges].flatten())
         weights.append(linked.flatten())
     return values, (torch.cat(rows), torch.cat(columns), torch.cat(weights))
 
 
-def conformity(x1: Tensor, x2: Tensor, members: Tensor, scale: float) -> Tensor:
+def conformity(x1: Tensor, x2: Tensor, members: Tensor, scale: float, options: SegmentOptions) -> Tensor:
     """How well every match moves like its nearest members of each body.
 
     Args:
@@ -162,15 +153,15 @@ def conformity(x1: Tensor, x2: Tensor, members: Tensor, scale: float) -> Tensor:
     Returns:
         ``(K, n)`` in [0, 1].
     """
-    some = [_thinned(body) for body in members]
+    some = [_thinned(body, options) for body in members]
     fresh = _first_of_copies(x1, x2, torch.stack(some).any(0), scale / 6)
-    return torch.stack([_judged(x1, x2, fresh & body, scale)[0] for body in some])
+    return torch.stack([_judged(x1, x2, fresh & body, scale, options)[0] for body in some])
 
 
-def _thinned(body: Tensor) -> Tensor:
-    """About :data:`MEMBERS` of the members ``(n,)`` bool, evenly."""
+def _thinned(body: Tensor, options: SegmentOptions) -> Tensor:
+    """About ``options.coherence.members`` of the members ``(n,)`` bool, evenly."""
     rank = body.cumsum(-1)
-    return body & (rank % max(1, int(rank[-1]) // MEMBERS) == 0)
+    return body & (rank % max(1, int(rank[-1]) // options.coherence.members) == 0)
 
 
 def _links(row: Tensor, column: Tensor, weight: Tensor, among: Tensor) -> Links:
@@ -213,13 +204,13 @@ def _first_of_copies(x1: Tensor, x2: Tensor, among: Tensor, least: float) -> Ten
     return fresh
 
 
-def _nearest(a: Tensor, b: Tensor, among: Tensor, least: float) -> tuple[Tensor, Tensor]:
+def _nearest(a: Tensor, b: Tensor, among: Tensor, least: float, options: SegmentOptions) -> tuple[Tensor, Tensor]:
     """Indices ``(n, k)`` of the matches nearest in a, nearest first, of some of them (indices), and which of these exist.
 
     A match that is the same, in both views, is no neighbour.
     """
     near, joint = a[among], torch.cat([a, b], dim=-1)
-    count = min(NEIGHBOURS, len(among))
+    count = min(options.coherence.neighbours, len(among))
     indices, exist = [], []
     for rows in _blocks(len(a), len(among)):
         distance = torch.cdist(a[rows], near).masked_fill_(torch.cdist(joint[rows], joint[among]) < least, torch.inf)
@@ -229,12 +220,12 @@ def _nearest(a: Tensor, b: Tensor, among: Tensor, least: float) -> tuple[Tensor,
     return torch.cat(indices), torch.cat(exist)
 
 
-def _common_motions(da: Tensor, db: Tensor, usable: Tensor) -> Tensor:
+def _common_motions(da: Tensor, db: Tensor, usable: Tensor, options: SegmentOptions) -> Tensor:
     """The similarities ``(m, 2, 2)`` that many neighbours share, those that differ much, the identity for all near it."""
     size = da.square().sum(-1)
     near = usable & (size > 0)
     pair = near.flatten().nonzero().flatten()
-    pair = pair[:: max(1, len(pair) // RATIOS)]
+    pair = pair[:: max(1, len(pair) // options.coherence.ratios)]
     da, db, size = da.flatten(0, 1)[pair], db.flatten(0, 1)[pair], size.flatten()[pair]
     # zoom and rotation as a complex number, db / da
     turned = da[:, 0] * db[:, 1] - da[:, 1] * db[:, 0]
@@ -242,7 +233,7 @@ def _common_motions(da: Tensor, db: Tensor, usable: Tensor) -> Tensor:
     if not len(factor):
         return torch.eye(2, dtype=da.dtype, device=da.device)[None]
     # the modes, by mean shift from some of them, with a window relative to their size
-    mode = factor[:: max(1, len(factor) // MODES)]
+    mode = factor[:: max(1, len(factor) // options.coherence.modes)]
     score = torch.zeros_like(mode[:, 0])
     for _ in range(5):
         window = 0.3 * mode.norm(dim=-1, keepdim=True) + torch.finfo(da.dtype).tiny
@@ -253,25 +244,29 @@ def _common_motions(da: Tensor, db: Tensor, usable: Tensor) -> Tensor:
     kept: list[complex] = []
     for (real, imaginary), share in zip(mode[order].tolist(), (score[order] / len(factor)).tolist(), strict=True):
         found = complex(real, imaginary)
-        found = 1.0 if abs(found - 1) <= DISTORTED else found
-        if share >= (OTHERS if kept else SHARED) and all(abs(found - other) > APART * abs(other) for other in kept):
+        found = 1.0 if abs(found - 1) <= options.coherence.distorted else found
+        if share >= (options.coherence.share_of_further if kept else options.coherence.share_of_first) and all(
+            abs(found - other) > options.coherence.apart * abs(other) for other in kept
+        ):
             kept.append(found)
     return torch.tensor([[[z.real, -z.imag], [z.imag, z.real]] for z in kept or [1.0]], dtype=da.dtype, device=da.device)
 
 
-def _reach(da: Tensor, usable: Tensor, eligible: Tensor) -> Tensor:
+def _reach(da: Tensor, usable: Tensor, eligible: Tensor, options: SegmentOptions) -> Tensor:
     """d ``()``, from the neighbours of those matches that are neighbours themselves."""
     distance = da.norm(dim=-1)[usable & eligible[:, None]]
-    return REACH * distance.median() if len(distance) else da.new_tensor(torch.inf)
+    return options.coherence.reach * distance.median() if len(distance) else da.new_tensor(torch.inf)
 
 
-def _deviation(da: Tensor, db: Tensor, usable: Tensor, common: Tensor, reach: Tensor, scale: float) -> Tensor:
+def _deviation(
+    da: Tensor, db: Tensor, usable: Tensor, common: Tensor, reach: Tensor, scale: float, options: SegmentOptions
+) -> Tensor:
     """r ``(n, k)`` after one weighted fit of the local motions."""
     size = da.norm(dim=-1).minimum(reach) * torch.linalg.det(common).abs().sqrt() + scale
     error = db - da @ common.mT
-    weight = torch.exp(-((error.norm(dim=-1) / size / TOLERANCE) ** 2)) * usable
+    weight = torch.exp(-((error.norm(dim=-1) / size / options.coherence.tolerance) ** 2)) * usable
     moment = (da * weight[..., None]).mT @ da
-    ridge = RIDGE * moment.diagonal(dim1=-2, dim2=-1).sum(-1) + 4 * scale * scale
+    ridge = options.coherence.ridge * moment.diagonal(dim1=-2, dim2=-1).sum(-1) + 4 * scale * scale
     moment = moment + ridge[:, None, None] * torch.eye(2, dtype=da.dtype, device=da.device)
     local = torch.linalg.inv_ex(moment)[0] @ (da * weight[..., None]).mT @ error
     return (error - da @ local).norm(dim=-1) / size

@@ -10,20 +10,7 @@ from torch import Tensor
 from dyntorch.geometry.epipolar import sampson_squared
 from dyntorch.geometry.homogeneous import homogeneous, null_vectors, skew
 from dyntorch.tasks.segment.coherence import Links
-
-PIXELS = 2.5
-"""The default threshold: what figures in pixels refer to."""
-NOISE = 0.7
-"""Standard deviation of a Sampson distance, pixels at the default threshold."""
-CAP = 4.0
-"""Squared distances in units of the noise count up to this."""
-CUT = 4.0
-"""Weight of the links between different bodies."""
-PARALLAX = 0.2
-"""Weight of the parallax: motion along the epipolar lines beside that of the body's mean plane."""
-FREEDOM, FLAT = 2.0, 2.0
-"""Of Student's distribution of the parallax, and its least scale, pixels at the default threshold."""
-ROUNDS, SCALES = 6, 2
+from dyntorch.tasks.segment.options import SegmentOptions
 
 
 @dataclass(frozen=True)
@@ -32,7 +19,7 @@ class View:
 
     Attributes:
         x1, x2: ``(n, 2)``.
-        pixel: the threshold / :data:`PIXELS`, in these coordinates: a pixel at the default threshold.
+        pixel: the threshold / ``options.units.threshold_in_pixels``, in these coordinates: a pixel at the default threshold.
         links: between matches.
     """
 
@@ -46,7 +33,7 @@ class View:
         return View(self.x1[keep], self.x2[keep], self.pixel, self.links.subset(keep))
 
 
-def energy(view: View, fundamentals: Tensor, member: Tensor) -> Tensor:
+def energy(view: View, fundamentals: Tensor, member: Tensor, options: SegmentOptions) -> Tensor:
     r"""Cost of labellings with their fundamental matrices:
 
     .. math:: \sum_i \min(r_i^2 / \sigma^2, c) + \lambda \sum_{ij \text{ cut}} S_{ij}
@@ -62,14 +49,16 @@ def energy(view: View, fundamentals: Tensor, member: Tensor) -> Tensor:
     Returns:
         ``(B,)``.
     """
-    square = sampson_squared(fundamentals, view.x1, view.x2) / (NOISE * view.pixel) ** 2
-    distances = (square.clamp(max=CAP) * member).sum((-2, -1))
-    value, scale = parallax(view, fundamentals, member)
-    relief = (FREEDOM + 1) * torch.log1p(value.square() / (FREEDOM * scale[..., None])) + scale.log()[..., None]
-    return distances + CUT * view.links.cut(member) + PARALLAX * (relief * member).sum((-2, -1))
+    square = sampson_squared(fundamentals, view.x1, view.x2) / (options.energy.noise * view.pixel) ** 2
+    distances = (square.clamp(max=options.energy.cap) * member).sum((-2, -1))
+    value, scale = parallax(view, fundamentals, member, options)
+    relief = (options.energy.parallax_freedom + 1) * torch.log1p(
+        value.square() / (options.energy.parallax_freedom * scale[..., None])
+    ) + scale.log()[..., None]
+    return distances + options.energy.cut * view.links.cut(member) + options.energy.parallax * (relief * member).sum((-2, -1))
 
 
-def parallax(view: View, fundamentals: Tensor, member: Tensor) -> tuple[Tensor, Tensor]:
+def parallax(view: View, fundamentals: Tensor, member: Tensor, options: SegmentOptions) -> tuple[Tensor, Tensor]:
     r"""Distances along the epipolar lines from the robust mean plane of each body, and their squared scale, in pixels.
 
     With :math:`A = [e_2]_\times F` every match is :math:`x_2 \sim A x_1 + \rho\, e_2`, and a plane of the body makes
@@ -97,7 +86,7 @@ def parallax(view: View, fundamentals: Tensor, member: Tensor) -> tuple[Tensor, 
     total = member.sum(-1) + 1e-9
     eye = torch.eye(3, dtype=first.dtype, device=first.device)
     weight, scale, value = member, torch.zeros_like(total), depth
-    for turn in range(ROUNDS):
+    for turn in range(options.energy.plane_rounds):
         heavy = weight * lever.square()
         inner = (heavy @ moments).unflatten(-1, (3, 3))
         ridge = 1e-9 * inner.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None] + 1e-20
@@ -106,10 +95,15 @@ def parallax(view: View, fundamentals: Tensor, member: Tensor) -> tuple[Tensor, 
         square = value.square()
         if turn == 0:
             scale = ((member * value.abs()).sum(-1) / total).square()
-        for _ in range(SCALES):
-            share = (FREEDOM + 1) / (FREEDOM + square / scale.clamp(min=FLAT * FLAT)[..., None])
-            scale = ((member * share * square).sum(-1) / total).clamp(min=FLAT * FLAT)
-        weight = member * (FREEDOM + 1) / (FREEDOM + square / scale[..., None])
+        for _ in range(options.energy.scale_rounds):
+            share = (options.energy.parallax_freedom + 1) / (
+                options.energy.parallax_freedom
+                + square / scale.clamp(min=options.energy.parallax_scale * options.energy.parallax_scale)[..., None]
+            )
+            scale = ((member * share * square).sum(-1) / total).clamp(
+                min=options.energy.parallax_scale * options.energy.parallax_scale
+            )
+        weight = member * (options.energy.parallax_freedom + 1) / (options.energy.parallax_freedom + square / scale[..., None])
     return value, scale
 
 

@@ -13,22 +13,8 @@ from dyntorch.geometry.epipolar_fit import descend
 from dyntorch.geometry.homography import homography, homography_sampson_squared
 from dyntorch.numerics.chi_square import median
 from dyntorch.tasks.segment.coherence import Links, conformity
-from dyntorch.tasks.segment.energy import PIXELS, View, mean_field
-
-OUTLIER = 1.0
-"""Cost of an outlier where many are: that of a match a threshold away from a body in which it moves like its neighbours."""
-FEW, MANY = 0.005, 0.2
-"""Share of outliers below which they are no rarer, and above which they cost no less."""
-STRANGE, CONFORMING, LEAST = 2.5, 0.25, 0.02
-"""Cost of a match that moves unlike all its neighbours of a body; the conformity from which it costs nothing, over that of most
-members; and at least."""
-FOUND = 6.0
-"""What a match that the search assigned to a body gains there."""
-SHARPNESS = 4.0
-FAR = 9.0
-TURNS, ROUNDS = 20, 3
-FIT = 0.8
-"""Scale of the fits, in thresholds."""
+from dyntorch.tasks.segment.energy import View, mean_field
+from dyntorch.tasks.segment.options import SegmentOptions
 
 
 @dataclass(frozen=True)
@@ -55,7 +41,14 @@ class Labelling:
 
 
 def label(
-    view: View, found: Tensor, fundamentals: Tensor, weights: Tensor, threshold: float, scale: float | None, share: float
+    view: View,
+    found: Tensor,
+    fundamentals: Tensor,
+    weights: Tensor,
+    threshold: float,
+    scale: float | None,
+    share: float,
+    options: SegmentOptions,
 ) -> Labelling:
     r"""Labels and geometries in turns: a mean field of the costs
 
@@ -76,41 +69,46 @@ def label(
     """
     numbers = torch.arange(1, len(fundamentals) + 1, device=found.device)[:, None]
     members = found == numbers
-    gain = FOUND * members.to(weights.dtype) if scale is not None else 0.0
-    strange = _strange(view, members, scale)
+    gain = options.labels.found * members.to(weights.dtype) if scale is not None else 0.0
+    strange = _strange(view, members, scale, options)
     links = _normalized(view.links)
-    odds = [(1 - p) / p for p in (min(max(share, FEW), MANY), MANY)]
-    outlier = OUTLIER + log(odds[0] / odds[1]) / SHARPNESS
+    odds = [
+        (1 - p) / p
+        for p in (min(max(share, options.labels.few_outliers), options.labels.many_outliers), options.labels.many_outliers)
+    ]
+    outlier = options.labels.outlier + log(odds[0] / odds[1]) / options.labels.sharpness
 
     def probabilities(bodies: Tensor) -> Tensor:
         square = sampson_squared(bodies, view.x1, view.x2) / threshold**2
-        return field(square.clamp(max=FAR) + strange - gain, outlier, links)
+        return field(square.clamp(max=options.labels.cap) + strange - gain, outlier, links, options)
 
     bodies = fundamentals
     member = probabilities(bodies)
-    for turn in range(ROUNDS):
+    for turn in range(options.labels.rounds):
         members = member.argmax(0) == numbers
         # a descent never raises its own truncated cost, so geometries cannot drift away from their members
-        bodies = descend(bodies, view.x1, view.x2, members * weights, FIT * threshold)
-        strange = _strange(view, members, scale) if turn == 0 else strange
+        bodies = descend(bodies, view.x1, view.x2, members * weights, options.labels.fit_scale * threshold)
+        strange = _strange(view, members, scale, options) if turn == 0 else strange
         member = probabilities(bodies)
     return Labelling(member, bodies)
 
 
-def field(cost: Tensor, outlier: float, links: Links) -> Tensor:
+def field(cost: Tensor, outlier: float, links: Links, options: SegmentOptions) -> Tensor:
     """Mean field ``(K + 1, n)`` of the costs ``(K, n)`` of bodies, the first of an outlier."""
     every = torch.cat([torch.full_like(cost[:1], outlier), cost])
-    return mean_field(SHARPNESS * every, links, SHARPNESS, TURNS)
+    return mean_field(options.labels.sharpness * every, links, options.labels.sharpness, options.labels.turns)
 
 
-def _strange(view: View, members: Tensor, scale: float | None) -> Tensor:
+def _strange(view: View, members: Tensor, scale: float | None, options: SegmentOptions) -> Tensor:
     """Cost ``(K, n)`` of moving unlike the neighbours."""
     if scale is None:
         return torch.zeros_like(members, dtype=view.x1.dtype)
-    value = conformity(view.x1, view.x2, members, scale)
+    value = conformity(view.x1, view.x2, members, scale, options)
     # members of deep bodies move less like each other
     usual = torch.where(members, value, torch.nan).nanmedian(-1, keepdim=True).values.nan_to_num(nan=1.0)
-    return STRANGE * (1 - value / (CONFORMING * usual).clamp(min=LEAST)).clamp(min=0)
+    return options.labels.strange * (
+        1 - value / (options.labels.conforming * usual).clamp(min=options.labels.least_conforming)
+    ).clamp(min=0)
 
 
 def _normalized(links: Links) -> Links:
@@ -122,14 +120,6 @@ def _normalized(links: Links) -> Links:
 # Whether two views show a body as one with depth, or as a plane: a fundamental matrix or a homography.
 
 
-OFF, WIDE = 0.02, 1.5
-"""Share of a planar body that may be off the plane, wrong matches that lie on its epipolar lines; and from which distance they are,
-in thresholds (in two dimensions)."""
-LEAST_NOISE = 0.1
-"""Least standard deviation of a coordinate, pixels: no detector is better, and exact data shows none."""
-TRUNCATED, KEPT = 6.25, 0.978
-"""Squares of it count up to the first in the mean, which is the second then."""
-MODELS_ROUNDS = 10
 TINY = 1e-30
 
 
@@ -146,14 +136,14 @@ class Models:
     planar: Tensor
 
 
-def choose(view: View, fundamentals: Tensor, members: Tensor) -> Models:
+def choose(view: View, fundamentals: Tensor, members: Tensor, options: SegmentOptions) -> Models:
     r"""The model with the smaller robust information criterion,
 
     .. math:: \sum_i \min\!\Big(\frac{e_i^2}{\sigma^2},\ 2 (4 - d)\Big) + n\,d \log 4 + k \log 4n,
 
     with dimension d = 3 and k = 7 parameters of a fundamental matrix, d = 2 and k = 8 of a homography.  The noise
     :math:`\sigma` is that of all bodies.  The sum bears a few matches off the plane; but a body is no plane if more than
-    :data:`OFF` of it are farther than :data:`WIDE` thresholds.
+    ``options.models.off_plane_share`` of it are farther than ``options.models.off_plane`` thresholds.
 
     Args:
         view: matches.
@@ -165,16 +155,18 @@ def choose(view: View, fundamentals: Tensor, members: Tensor) -> Models:
     # weights are relative: they count as so many equal ones
     members = members * (members.sum(-1) / members.square().sum(-1).clamp(min=TINY))[:, None]
     epipolar = sampson_squared(fundamentals, view.x1, view.x2)
-    noise = _noise(epipolar, members).clamp(min=(LEAST_NOISE * view.pixel) ** 2)
+    noise = _noise(epipolar, members, options).clamp(min=(options.models.least_noise * view.pixel) ** 2)
     plane = homography(view.x1, view.x2, members, scale=3 * view.pixel, steps=8)[0]
     planar = homography_sampson_squared(plane, view.x1, view.x2)
     first = _criterion(epipolar / noise, members, 3, 7)
     second = _criterion(planar / noise, members, 2, 8)
-    off = ((planar > (WIDE * PIXELS * view.pixel) ** 2) * members).sum(-1) / members.sum(-1).clamp(min=TINY)
-    return Models(plane, (second < first) & (off <= OFF))
+    off = ((planar > (options.models.off_plane * options.units.threshold_in_pixels * view.pixel) ** 2) * members).sum(
+        -1
+    ) / members.sum(-1).clamp(min=TINY)
+    return Models(plane, (second < first) & (off <= options.models.off_plane_share))
 
 
-def _noise(square: Tensor, members: Tensor) -> Tensor:
+def _noise(square: Tensor, members: Tensor, options: SegmentOptions) -> Tensor:
     """Variance ``()`` of a coordinate by the distances ``(K, n)`` from the epipolar lines of all bodies.
 
     The homographies would overestimate it where there is depth.  The median alone is too uncertain (a plane of 100 matches was
@@ -185,8 +177,8 @@ def _noise(square: Tensor, members: Tensor) -> Tensor:
     share = weight[order].cumsum(0)
     total = share[-1].clamp(min=TINY)
     variance = every[order[(share >= 0.5 * total).to(torch.int8).argmax()]] / median(1)
-    for _ in range(MODELS_ROUNDS):
-        variance = (every.minimum(TRUNCATED * variance) * weight).sum() / (KEPT * total)
+    for _ in range(options.models.noise_rounds):
+        variance = (every.minimum(options.models.truncated * variance) * weight).sum() / (options.models.kept * total)
     count = members.sum(-1)
     # the best F of a plane is the luckiest of a family: measured with 15 to 100 matches, its squares lack sqrt(2n) beyond 7
     freedom = (count - 7 - (2 * count).sqrt()).clamp(min=0).sum().clamp(min=1)
@@ -205,17 +197,15 @@ def _criterion(square: Tensor, members: Tensor, dimension: int, parameters: int)
 
 SAMPLE = 7
 """Matches that determine a fundamental matrix."""
-FALSE_ALARMS = 1e-2
-"""Bodies expected in random matches, below which a body is believed."""
 
 
-def significant(view: View, fundamentals: Tensor, labels: Tensor) -> Tensor:
+def significant(view: View, fundamentals: Tensor, labels: Tensor, options: SegmentOptions) -> Tensor:
     r"""Which bodies are no accident, ``(K,)`` bool: their expected number in random matches,
 
     .. math:: (n - 7) \binom{n}{k} \binom{k}{7}\, p^{\,k - 7}, \qquad p = 2 T D / A,
 
-    is below :data:`FALSE_ALARMS`, for k of n matches within T of their epipolar lines in an image of area A and diagonal D.  What
-    other bodies explain is left out.
+    is below ``options.models.false_alarms``, for k of n matches within T of their epipolar lines in an image of area A and
+    diagonal D.  What other bodies explain is left out.
 
     Args:
         view: matches, outliers among them.
@@ -224,14 +214,14 @@ def significant(view: View, fundamentals: Tensor, labels: Tensor) -> Tensor:
 
     Source: Moisan and Stival, A probabilistic criterion to detect rigid point matches, IJCV 2004.
     """
-    threshold = PIXELS * view.pixel
+    threshold = options.units.threshold_in_pixels * view.pixel
     near = sampson_squared(fundamentals, view.x1, view.x2) <= threshold**2
     chance = max(_chance(x, threshold) for x in (view.x1, view.x2))
     found = []
     for number, close in enumerate(near, start=1):
         own = labels == number
         count, among = int((own & close).sum()), int((own | (labels == 0)).sum())
-        found.append(count > SAMPLE and _alarms(among, count, chance) < log(FALSE_ALARMS))
+        found.append(count > SAMPLE and _alarms(among, count, chance) < log(options.models.false_alarms))
     return torch.tensor(found, dtype=torch.bool, device=labels.device)
 
 

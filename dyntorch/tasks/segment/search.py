@@ -14,22 +14,16 @@ from dyntorch.geometry.epipolar_fit import descend, fit_fundamental, sample_fund
 from dyntorch.invariants.segmentation_matrix import SegmentationMatrix
 from dyntorch.numerics.blocks import uniform
 from dyntorch.tasks.segment.coherence import Links
-from dyntorch.tasks.segment.energy import CAP, NOISE, View, energy, mean_field
+from dyntorch.tasks.segment.energy import View, energy, mean_field
+from dyntorch.tasks.segment.options import SegmentOptions
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Starts of a segmentation: several affine flows at a time, from random patches of the image that move alike.
 
 
-PATCHES = (12, 20, 30, 45)
-"""Matches of the patches that runs start from, in turns: small bodies need small ones, noisy flows large ones."""
-ROUNDS, TURNS, SCALES = 8, 3, 2
-CUT = 2.0
-"""Weight of the links that a labelling cuts."""
-FREEDOM = 3.0
-"""Of Student's distribution of the deviations from a flow: bodies have depth."""
-
-
-def affine_flows(x1: Tensor, x2: Tensor, links: Links, bodies: Tensor, noise: float, generator: torch.Generator | None) -> Tensor:
+def affine_flows(
+    x1: Tensor, x2: Tensor, links: Links, bodies: Tensor, noise: float, generator: torch.Generator | None, options: SegmentOptions
+) -> Tensor:
     r"""Labellings by robust affine flows :math:`x_2 = A_k x_1 + b_k`, smooth over the links.
 
     Expectation maximization of Student's distributions with a mean field over the labels, many runs at a time, in single precision.
@@ -48,28 +42,32 @@ def affine_flows(x1: Tensor, x2: Tensor, links: Links, bodies: Tensor, noise: fl
     b = x2.float()
     width = int(bodies.max())
     absent = (torch.arange(width, device=x1.device) >= bodies[:, None])[..., None]
-    member = _patches(x1.float(), (x2 - x1).float(), bodies, width, generator).masked_fill(absent, 0.0)
+    member = _patches(x1.float(), (x2 - x1).float(), bodies, width, generator, options).masked_fill(absent, 0.0)
     moments, targets = (a[:, :, None] * a[:, None, :]).flatten(1), (a[:, :, None] * b[:, None, :]).flatten(1)
     eye = torch.eye(3, device=a.device)
     weight, variance = member, None
-    for _ in range(ROUNDS):
+    for _ in range(options.flows.rounds):
         inner = (weight @ moments).unflatten(-1, (3, 3))
         ridge = 1e-6 * inner.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None] + 1e-12
         flow = torch.linalg.solve_ex(inner + ridge * eye, (weight @ targets).unflatten(-1, (3, 2)))[0]
         square = (a @ flow - b).square().sum(-1)
         total = 2 * member.sum(-1) + 1e-9
-        for _ in range(SCALES):
-            heavy = 1.0 if variance is None else (FREEDOM + 2) / (FREEDOM + square / variance[..., None])
+        for _ in range(options.flows.scale_rounds):
+            heavy = (
+                1.0 if variance is None else (options.flows.freedom + 2) / (options.flows.freedom + square / variance[..., None])
+            )
             variance = ((member * heavy * square).sum(-1) / total).clamp(min=noise * noise)
         assert variance is not None
         ratio = square / variance[..., None]
-        cost = (FREEDOM + 2) * torch.log1p(ratio / FREEDOM) + 2 * variance.log()[..., None]
-        member = mean_field(cost.masked_fill(absent, torch.inf), links, CUT, TURNS)
-        weight = member * (FREEDOM + 2) / (FREEDOM + ratio)
+        cost = (options.flows.freedom + 2) * torch.log1p(ratio / options.flows.freedom) + 2 * variance.log()[..., None]
+        member = mean_field(cost.masked_fill(absent, torch.inf), links, options.flows.cut, options.flows.turns)
+        weight = member * (options.flows.freedom + 2) / (options.flows.freedom + ratio)
     return member.argmax(1)
 
 
-def _patches(x: Tensor, motion: Tensor, bodies: Tensor, width: int, generator: torch.Generator | None) -> Tensor:
+def _patches(
+    x: Tensor, motion: Tensor, bodies: Tensor, width: int, generator: torch.Generator | None, options: SegmentOptions
+) -> Tensor:
     """Members ``(runs, width, n)`` of patches: nearest matches in place and motion of seeds that are far from each other."""
     apart = _scaled_distances(x) + _scaled_distances(motion)
     runs, count = len(bodies), len(x)
@@ -78,8 +76,8 @@ def _patches(x: Tensor, motion: Tensor, bodies: Tensor, width: int, generator: t
         far = apart[seeds].amin(1).double().cumsum(-1)
         pick = uniform(runs, 1, generator=generator, device=x.device) * far[:, -1:]
         seeds = torch.cat([seeds, torch.searchsorted(far, pick).clamp(max=count - 1)], dim=-1)
-    sizes = torch.tensor(PATCHES, device=x.device)[torch.arange(runs, device=x.device) % len(PATCHES)]
-    order = apart[seeds].topk(min(max(PATCHES), count), dim=-1, largest=False).indices
+    sizes = torch.tensor(options.flows.patches, device=x.device)[torch.arange(runs, device=x.device) % len(options.flows.patches)]
+    order = apart[seeds].topk(min(max(options.flows.patches), count), dim=-1, largest=False).indices
     chosen = (torch.arange(order.shape[-1], device=x.device) < sizes[:, None, None].clamp(max=max(4, count // 2))).expand_as(order)
     return torch.zeros(runs, width, count, device=x.device).scatter_(-1, order, chosen.float())
 
@@ -95,22 +93,6 @@ def _scaled_distances(x: Tensor) -> Tensor:
 
 LEAST = 7
 """Fewest matches of a body."""
-FITTED = 10
-"""Fewest matches of a group whose geometry enters the pool."""
-ALIKE = 0.93
-"""Overlap (intersection over union) of groups above which one of them is enough."""
-COARSE = (4.0, 2.0)
-"""Scales of the fits, pixels."""
-ROUGH, TRUNCATED = 1.0, 9.0
-"""Noise in pixels, and cap of the squared distances, by which geometries are chosen."""
-SMOOTH = 3.0
-"""Weight of the links that a start cuts."""
-KEPT = 6
-"""Starts kept of each kind."""
-SETS = 400
-"""Sets followed from one geometry to the next."""
-DISTINCT = 0.97
-"""Share of matches in the same groups above which two labellings are one."""
 
 
 @dataclass(frozen=True)
@@ -126,10 +108,10 @@ def one_hot(labels: Tensor, width: int) -> Tensor:
     return (labels[..., None, :] == torch.arange(width, device=labels.device)[:, None]).double()
 
 
-def rough_cost(view: View, fundamentals: Tensor) -> Tensor:
+def rough_cost(view: View, fundamentals: Tensor, options: SegmentOptions) -> Tensor:
     """Truncated squared distances ``(*batch, n)``."""
     square = sampson_squared(fundamentals, view.x1, view.x2)
-    return (square / (ROUGH * view.pixel) ** 2).clamp(max=TRUNCATED)
+    return (square / (options.pool.noise * view.pixel) ** 2).clamp(max=options.pool.cap)
 
 
 def smoothed(cost: Tensor, view: View) -> Tensor:
@@ -137,26 +119,26 @@ def smoothed(cost: Tensor, view: View) -> Tensor:
     return (cost + view.links.pull(cost)) / (1 + view.links.weight.sum(-1))
 
 
-def pool_of(view: View, groups: Tensor) -> Tensor:
+def pool_of(view: View, groups: Tensor, options: SegmentOptions) -> Tensor:
     """Fundamental matrices ``(P, 3, 3)`` of all different groups ``(g, n)``, 0 and 1."""
     size = groups.sum(-1)
     order = size.argsort(descending=True, stable=True)
-    groups = groups[order][size[order] >= min(FITTED, groups.shape[-1])]
+    groups = groups[order][size[order] >= min(options.pool.fitted, groups.shape[-1])]
     size, single = groups.sum(-1), groups.float()
     shared = (single @ single.mT).double()
     overlap = shared / (size[:, None] + size - shared)
-    groups = groups[~(overlap.triu(1) > ALIKE).any(0)]
-    return fit_fundamental(view.x1, view.x2, groups, [view.pixel * scale for scale in COARSE], steps=2)[0]
+    groups = groups[~(overlap.triu(1) > options.pool.alike).any(0)]
+    return fit_fundamental(view.x1, view.x2, groups, [view.pixel * scale for scale in options.pool.fit_scales], steps=2)[0]
 
 
-def fitted(view: View, labels: Tensor, count: int) -> Starts:
+def fitted(view: View, labels: Tensor, count: int, options: SegmentOptions) -> Starts:
     """Labellings ``(s, n)`` with the geometries of their bodies."""
     member = one_hot(labels, count)
-    found = fit_fundamental(view.x1, view.x2, member.flatten(0, 1), (COARSE[0] * view.pixel,), steps=2)[0]
+    found = fit_fundamental(view.x1, view.x2, member.flatten(0, 1), (options.pool.fit_scales[0] * view.pixel,), steps=2)[0]
     return Starts(labels, found.unflatten(0, member.shape[:2]))
 
 
-def best_sets(cost: Tensor, most: int, first: int | None = None) -> list[Tensor]:
+def best_sets(cost: Tensor, most: int, first: int | None = None, *, options: SegmentOptions) -> list[Tensor]:
     """Sets ``(s, K)`` of geometries of least total cost, :math:`\\sum_i \\min_{k \\in \\text{set}} c_{ki}`, the best first.
 
     Args:
@@ -177,36 +159,36 @@ def best_sets(cost: Tensor, most: int, first: int | None = None) -> list[Tensor]
             continue
         least = single[sets].amin(1)
         grown = torch.stack([torch.minimum(row, single).sum(-1) for row in least])
-        place = grown.flatten().topk(min(5 * SETS, grown.numel()), largest=False).indices
+        place = grown.flatten().topk(min(5 * options.pool.sets, grown.numel()), largest=False).indices
         candidates = torch.cat([sets[place // size], (place % size)[:, None]], dim=-1).sort(-1).values
         candidates = candidates[(candidates.diff(dim=-1) > 0).all(-1)]
-        different = list(dict.fromkeys(map(tuple, candidates.tolist())))[:SETS]
+        different = list(dict.fromkeys(map(tuple, candidates.tolist())))[: options.pool.sets]
         sets = torch.tensor(different, dtype=torch.long, device=cost.device).view(-1, count)
         found.append(sets)
     return found
 
 
-def distinct(view: View, starts: Starts) -> Starts:
-    """Up to :data:`KEPT` starts that differ, the cheapest first, with enough matches in every body."""
+def distinct(view: View, starts: Starts, options: SegmentOptions) -> Starts:
+    """Up to ``options.pool.kept`` starts that differ, the cheapest first, with enough matches in every body."""
     count = starts.fundamentals.shape[-3]
     member = one_hot(starts.labels, count)
-    cost = (rough_cost(view, starts.fundamentals) * member).sum((-2, -1)) + SMOOTH * view.links.cut(member)
+    cost = (rough_cost(view, starts.fundamentals, options) * member).sum((-2, -1)) + options.pool.cut * view.links.cut(member)
     cost = torch.where(member.sum(-1).amin(-1) >= LEAST, cost, torch.inf)
     order = cost.argsort(stable=True)
     order = order[cost[order].isfinite()]
     flat = member[order].float().flatten(0, 1)
     shared = (flat @ flat.mT).unflatten(0, (-1, count)).unflatten(-1, (-1, count))
-    alike = (shared.amax(1).sum(-1) > DISTINCT * flat.shape[-1]).tolist()
+    alike = (shared.amax(1).sum(-1) > options.pool.distinct * flat.shape[-1]).tolist()
     kept: list[int] = []
     for index in range(len(order)):
-        if len(kept) < KEPT and not any(alike[other][index] for other in kept):
+        if len(kept) < options.pool.kept and not any(alike[other][index] for other in kept):
             kept.append(index)
     return Starts(starts.labels[order[kept]], starts.fundamentals[order[kept]])
 
 
-def set_starts(pool: Tensor, cost: Tensor, sets: Tensor) -> Starts:
+def set_starts(pool: Tensor, cost: Tensor, sets: Tensor, options: SegmentOptions) -> Starts:
     """The starts of the first sets ``(s, K)`` of geometries ``(P, 3, 3)``: each match to the one of least cost ``(P, n)``."""
-    chosen = sets[: 8 * KEPT]
+    chosen = sets[: 8 * options.pool.kept]
     return Starts(cost[chosen].argmin(1), pool[chosen])
 
 
@@ -214,16 +196,12 @@ def set_starts(pool: Tensor, cost: Tensor, sets: Tensor) -> Starts:
 # Pairs of geometries by the segmentation matrix, among the starts of a segmentation.
 
 
-MATRIX = 40
-"""Matches that a segmentation matrix takes."""
-
-
-def matrix_pairs(view: View, groups: Tensor, rounds: int) -> Tensor:
+def matrix_pairs(view: View, groups: Tensor, rounds: int, options: SegmentOptions) -> Tensor:
     """Geometries ``(2 g, 3, 3)`` of the segmentation matrices of groups ``(b, n)``, 0 and 1; those too small are left out.
 
     The linear fits are weighed again by their gradients so many times.
     """
-    groups = groups[groups.sum(-1) >= MATRIX]
+    groups = groups[groups.sum(-1) >= options.pool.matrix_matches]
     x1, x2 = (x.expand(len(groups), -1, -1) for x in (view.x1, view.x2))
     weights = groups
     for _ in range(rounds if len(groups) else 0):
@@ -237,15 +215,6 @@ def matrix_pairs(view: View, groups: Tensor, rounds: int) -> Tensor:
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Labels and epipolar geometries in turns, from many starts at once.
-
-
-SCHEDULE = (2.0, 2.0, 1.5, 1.0, 1.0, 1.0, 1.0, 1.0)
-"""Noise in the rounds, in units of :data:`FINE`."""
-FINE = 0.5
-"""Noise, pixels: finer than in the final energy, for small bodies to hold their own."""
-DESCENT_TURNS = 3
-SCALE = 2.0
-"""Of the fits, pixels."""
 
 
 @dataclass(frozen=True)
@@ -263,7 +232,7 @@ class Candidate:
     fundamentals: Tensor
 
 
-def descended(view: View, starts: Sequence[Starts]) -> dict[int, list[Candidate]]:
+def descended(view: View, starts: Sequence[Starts], options: SegmentOptions) -> dict[int, list[Candidate]]:
     """The segmentations that the starts lead to, by their number of bodies, the cheapest first.
 
     One with a body of fewer than :data:`LEAST` matches is given up.
@@ -279,20 +248,22 @@ def descended(view: View, starts: Sequence[Starts]) -> dict[int, list[Candidate]
     def distances(noise: float) -> Tensor:
         square = sampson_squared(geometry, view.x1, view.x2) / (noise * view.pixel) ** 2
         full = torch.full((present.numel(), len(view.x1)), torch.inf, device=device)
-        full[rows] = square.clamp(max=TRUNCATED).float()
+        full[rows] = square.clamp(max=options.pool.cap).float()
         return full.unflatten(0, present.shape)
 
     member = torch.cat([one_hot(s.labels, width) for s in starts]).float()
-    for noise in SCHEDULE:
-        member = mean_field(distances(noise * FINE), view.links, SMOOTH, DESCENT_TURNS, member)
-        geometry = descend(geometry, view.x1, view.x2, member.flatten(0, 1)[rows].double(), SCALE * view.pixel, steps=2)
-    member = mean_field(distances(FINE), view.links, SMOOTH, DESCENT_TURNS, member)
+    for noise in options.descent.schedule:
+        member = mean_field(distances(noise * options.descent.noise), view.links, options.pool.cut, options.descent.turns, member)
+        geometry = descend(
+            geometry, view.x1, view.x2, member.flatten(0, 1)[rows].double(), options.descent.fit_scale * view.pixel, steps=2
+        )
+    member = mean_field(distances(options.descent.noise), view.links, options.pool.cut, options.descent.turns, member)
     labels = member.masked_fill(~present[..., None], -1.0).argmax(1)
     hard = one_hot(labels, width)
     fundamentals = geometry.new_zeros(present.numel(), 3, 3)
     fundamentals[rows] = geometry
     fundamentals = fundamentals.unflatten(0, present.shape)
-    total = energy(view, fundamentals, hard)
+    total = energy(view, fundamentals, hard, options)
     whole = ~((hard.sum(-1) < LEAST) & present).any(-1)
     found: dict[int, list[Candidate]] = {}
     for count in sorted({s.fundamentals.shape[1] for s in starts}):
@@ -302,14 +273,8 @@ def descended(view: View, starts: Sequence[Starts]) -> dict[int, list[Candidate]
     return found
 
 
-RUNS = 16
-"""Runs of flows for each number of flows."""
-FLOW_NOISE = 0.5
-"""Least standard deviation of a flow, pixels."""
-
-
 def search(
-    view: View, counts: Sequence[int], generator: torch.Generator | None, extra: Sequence[Tensor] = ()
+    view: View, counts: Sequence[int], generator: torch.Generator | None, extra: Sequence[Tensor] = (), *, options: SegmentOptions
 ) -> dict[int, list[Candidate]]:
     """Segmentations into each number of bodies, the cheapest first.
 
@@ -323,55 +288,34 @@ def search(
         Candidates for each number; none where no start had so many bodies of enough matches.
     """
     flows = sorted({max(2, count + more) for count in counts for more in (0, 1)})
-    plan = torch.tensor(flows, device=view.x1.device).repeat(RUNS if len(flows) > 2 else 2 * RUNS)
-    labels = affine_flows(view.x1, view.x2, view.links, plan, FLOW_NOISE * view.pixel, generator)
+    plan = torch.tensor(flows, device=view.x1.device).repeat(options.flows.runs if len(flows) > 2 else 2 * options.flows.runs)
+    labels = affine_flows(view.x1, view.x2, view.links, plan, options.flows.noise * view.pixel, generator, options)
     widths = [(labels, int(plan.max())), *((x[None], int(x.max()) + 1) for x in extra), (torch.zeros_like(labels[:1]), 1)]
-    pool = pool_of(view, torch.cat([one_hot(x, width).flatten(0, 1) for x, width in widths]))
+    pool = pool_of(view, torch.cat([one_hot(x, width).flatten(0, 1) for x, width in widths]), options)
     if max(counts) > 1:
         # linear: the search improves it, and its weights would take longer than all flows
-        pool = torch.cat([pool, matrix_pairs(view, torch.ones_like(view.x1[None, :, 0]), rounds=0)])
-    cost = smoothed(rough_cost(view, pool), view)
-    sets = best_sets(cost, max(counts))
+        pool = torch.cat([pool, matrix_pairs(view, torch.ones_like(view.x1[None, :, 0]), rounds=0, options=options)])
+    cost = smoothed(rough_cost(view, pool, options), view)
+    sets = best_sets(cost, max(counts), options=options)
     starts = []
     for count in counts:
-        starts.append(set_starts(pool, cost, sets[count - 1]))
+        starts.append(set_starts(pool, cost, sets[count - 1], options))
         groups = [labels[plan == count], *(x[None] for x in extra if int(x.max()) + 1 == count)]
-        starts += [fitted(view, x, count) for x in groups if len(x)]
-    return descended(view, [distinct(view, start) for start in starts])
+        starts += [fitted(view, x, count, options) for x in groups if len(x)]
+    return descended(view, [distinct(view, start, options) for start in starts], options)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Segmentations by geometry alone, from samples of seven matches: bodies that interleave, outliers among them.
 
 
-SAMPLES, MOST_SAMPLES = 6000, 24000
-"""At a time, and at most from the same matches."""
-PURE = 10.0
-"""Samples wanted all of whose matches are of the largest body."""
 BLOCK = 1024
 """Geometries scored at a time, which stay in the cache."""
-WIDE = 3.0
-"""Distance up to which a match speaks for a sample, pixels: seven matches fix a geometry less well than all of a body."""
-BEST = 240
-"""Samples of a round that descend."""
-SAMPLES_SCALES = (3.0, 2.0)
-"""Of these descents, pixels."""
-PARTIAL = 4
-"""Sets of geometries whose unexplained matches the next round samples."""
-FIRST = 40
-"""Geometries that sets start from."""
-SAMPLES_ALIKE = 0.97
-"""Overlap (intersection over union) of the matches that agree above which one of two geometries is enough."""
-STARTS = 30
-"""Sets that descend, for each number of bodies."""
-WORTH = 5.0
-"""What a body that is worth looking for further ones explains, in units of the root of the number of matches: by chance 2 to 5,
-small bodies 8."""
-REWEIGHTED = 3
-"""Rounds of the weights of the segmentation matrix."""
 
 
-def search_samples(view: View, counts: Sequence[int], generator: torch.Generator | None) -> dict[int, list[Candidate]]:
+def search_samples(
+    view: View, counts: Sequence[int], generator: torch.Generator | None, options: SegmentOptions
+) -> dict[int, list[Candidate]]:
     """Segmentations into each number of bodies, the cheapest first.
 
     Args:
@@ -382,27 +326,27 @@ def search_samples(view: View, counts: Sequence[int], generator: torch.Generator
     Returns:
         Candidates for each number.
     """
-    pool = _pool(view, min(counts), max(counts), generator)
-    cost = rough_cost(view, pool)
-    sets = best_sets(cost, max(counts), FIRST)
+    pool = _pool(view, min(counts), max(counts), generator, options)
+    cost = rough_cost(view, pool, options)
+    sets = best_sets(cost, max(counts), options.samples.first, options=options)
     starts = []
     for count in counts:
         if count <= len(pool):
-            chosen = sets[count - 1][:STARTS]
+            chosen = sets[count - 1][: options.samples.starts]
             starts.append(Starts(cost[chosen].argmin(1), pool[chosen]))
-    found = descended(view, starts) if starts else {}
-    return {count: _ranked(view, found.get(count, [])) for count in counts}
+    found = descended(view, starts, options) if starts else {}
+    return {count: _ranked(view, found.get(count, []), options) for count in counts}
 
 
-def _ranked(view: View, candidates: list[Candidate]) -> list[Candidate]:
+def _ranked(view: View, candidates: list[Candidate], options: SegmentOptions) -> list[Candidate]:
     """The candidates with enough inliers in every body, by their cost if what is far from all bodies is in none."""
     if not candidates:
         return []
     fundamentals = torch.stack([candidate.fundamentals for candidate in candidates])
-    square = _distances(view, fundamentals)
-    member = one_hot(square.argmin(1), square.shape[1]) * (square < CAP)
+    square = _distances(view, fundamentals, options)
+    member = one_hot(square.argmin(1), square.shape[1]) * (square < options.energy.cap)
     inliers = member.sum(-1)
-    total = energy(view, fundamentals, member) + CAP * (len(view.x1) - inliers.sum(-1))
+    total = energy(view, fundamentals, member, options) + options.energy.cap * (len(view.x1) - inliers.sum(-1))
     order = total.argsort(stable=True)
     order = order[inliers[order].amin(-1) >= LEAST]
     if not len(order):
@@ -412,60 +356,64 @@ def _ranked(view: View, candidates: list[Candidate]) -> list[Candidate]:
     return [Candidate(float(total[i]), candidates[i].labels, candidates[i].fundamentals) for i in order.tolist()]
 
 
-def _different(view: View, pool: Tensor) -> Tensor:
+def _different(view: View, pool: Tensor, options: SegmentOptions) -> Tensor:
     """Those of the geometries that not many of the same matches agree with, the cheapest first."""
-    cost = rough_cost(view, pool)
+    cost = rough_cost(view, pool, options)
     order = cost.sum(-1).argsort(stable=True)
-    near = (cost[order] < TRUNCATED).float()
+    near = (cost[order] < options.pool.cap).float()
     shared, size = near @ near.mT, near.sum(-1)
-    alike = shared > SAMPLES_ALIKE * (size[:, None] + size - shared)
+    alike = shared > options.samples.alike * (size[:, None] + size - shared)
     return pool[order[~alike.triu(1).any(0)]]
 
 
-def _pool(view: View, least: int, most: int, generator: torch.Generator | None) -> Tensor:
+def _pool(view: View, least: int, most: int, generator: torch.Generator | None, options: SegmentOptions) -> Tensor:
     """Geometries ``(P, 3, 3)``: of samples from all matches, then from those that sets of one, two, ... leave unexplained.
 
     Beyond the least number of bodies there are no further samples once another body explains little.
     """
     left = torch.ones_like(view.x1[None, :, 0])
-    pool = matrix_pairs(view, left[: most - 1], REWEIGHTED)  # none for a single body
-    last = CAP * len(view.x1)
+    pool = matrix_pairs(view, left[: most - 1], options.samples.matrix_rounds, options)  # none for a single body
+    last = options.energy.cap * len(view.x1)
     for count in range(1, most + 1):
-        pool = _different(view, torch.cat([pool, *(_sampled(view, open_, len(left), generator) for open_ in left)]))
+        pool = _different(
+            view, torch.cat([pool, *(_sampled(view, open_, len(left), generator, options) for open_ in left)]), options
+        )
         if count == most or len(pool) < count:
             break
-        cost = rough_cost(view, pool)
-        sets = best_sets(cost, count, FIRST)[-1][:PARTIAL]
-        total = float(_distances(view, pool[sets]).amin(1).sum(-1).min())
-        if count > least and last - total < WORTH * len(view.x1) ** 0.5:
+        cost = rough_cost(view, pool, options)
+        sets = best_sets(cost, count, options.samples.first, options=options)[-1][: options.samples.partial]
+        total = float(_distances(view, pool[sets], options).amin(1).sum(-1).min())
+        if count > least and last - total < options.samples.worth * len(view.x1) ** 0.5:
             break
         last = total
-        left = (cost[sets].amin(1) >= TRUNCATED).double()
+        left = (cost[sets].amin(1) >= options.pool.cap).double()
         left = left[left.sum(-1) > LEAST]
     return pool
 
 
-def _distances(view: View, fundamentals: Tensor) -> Tensor:
+def _distances(view: View, fundamentals: Tensor, options: SegmentOptions) -> Tensor:
     """Truncated squared distances ``(*batch, n)`` as the energy counts them."""
-    return (sampson_squared(fundamentals, view.x1, view.x2) / (NOISE * view.pixel) ** 2).clamp(max=CAP)
+    return (sampson_squared(fundamentals, view.x1, view.x2) / (options.energy.noise * view.pixel) ** 2).clamp(
+        max=options.energy.cap
+    )
 
 
-def _sampled(view: View, weight: Tensor, parts: int, generator: torch.Generator | None) -> Tensor:
+def _sampled(view: View, weight: Tensor, parts: int, generator: torch.Generator | None, options: SegmentOptions) -> Tensor:
     """Geometries of the best samples of the matches with weights ``(n,)``, descended; this is one of several parts of the work."""
     x1, x2, single = view.x1.float(), view.x2.float(), weight.float()
     best, votes = view.x1.new_zeros(0, 3, 3), single.new_zeros(0)
     drawn, needed = 0, 1.0
-    while drawn < min(needed, MOST_SAMPLES / parts):
-        found, valid = sample_fundamentals(view.x1, view.x2, weight[None], SAMPLES // parts, generator)
-        drawn += SAMPLES // parts
+    while drawn < min(needed, options.samples.most / parts):
+        found, valid = sample_fundamentals(view.x1, view.x2, weight[None], options.samples.at_once // parts, generator)
+        drawn += options.samples.at_once // parts
         found = found[valid]
-        totals = [_votes(part, x1, x2, single, WIDE * view.pixel) for part in found.float().split(BLOCK)]
+        totals = [_votes(part, x1, x2, single, options.samples.distance * view.pixel) for part in found.float().split(BLOCK)]
         best, votes = torch.cat([best, found]), torch.cat([votes, *totals])
-        votes, place = votes.topk(min(BEST // parts, len(votes)))
+        votes, place = votes.topk(min(options.samples.best // parts, len(votes)))
         best = best[place]
         share = float(votes[0] / single.sum()) if len(votes) else 0.0
-        needed = PURE / max(share, 0.1) ** 7
-    for scale in SAMPLES_SCALES:
+        needed = options.samples.pure / max(share, 0.1) ** 7
+    for scale in options.samples.fit_scales:
         best = descend(best, view.x1, view.x2, weight.expand(len(best), -1), scale * view.pixel)
     return best
 

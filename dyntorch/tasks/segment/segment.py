@@ -16,25 +16,20 @@ from dyntorch.geometry.homogeneous import similarity, unit
 from dyntorch.geometry.homography import homography_sampson_squared
 from dyntorch.geometry.pairs import order_of_bodies
 from dyntorch.invariants.fundamental_matrix import FundamentalMatrix
-from dyntorch.numerics.arguments import on_cpu
+from dyntorch.numerics.arguments import check_options, on_cpu
 from dyntorch.numerics.blocks import one_thread, uniform
 from dyntorch.numerics.chi_square import median
 from dyntorch.tasks.outcome import Notice, NoticeCode, check_threshold, notices
 from dyntorch.tasks.segment.coherence import Links, coherence
 from dyntorch.tasks.segment.energy import View
 from dyntorch.tasks.segment.labels import Labelling, Models, choose, label, significant
+from dyntorch.tasks.segment.options import SegmentOptions
 from dyntorch.tasks.segment.result import BodyModel, Segmentation
 from dyntorch.tasks.segment.search import LEAST, Candidate, one_hot, search, search_samples
 
 # ----------------------------------------------------------------------------------------------------------------------
 # How many bodies: the segmentation of least cost with a penalty for each body, or with the number that was asked for.
 
-
-FIRST, NEXT, MOST = 4, 2, 12
-"""Numbers of bodies tried at first, tried further each time that the largest was the best, and tried at all."""
-PENALTY, ALONE = 4.5, 6.2
-"""Of a body, in units of the root of the number of matches: what models leave unexplained grows with the matches.  The second where
-geometry decides alone (spurious bodies explain up to 4.9, true ones 7.6 and more)."""
 
 Search = Callable[[Sequence[int]], dict[int, list[Candidate]]]
 
@@ -54,7 +49,7 @@ class Best:
     """The best segmentation into one body more, where their number was open."""
 
 
-def best(search: Search, matches: int, bodies: int | None, penalty: float) -> Best | None:
+def best(search: Search, matches: int, bodies: int | None, penalty: float, options: SegmentOptions) -> Best | None:
     """The best segmentation of so many matches into ``bodies``, or, for None, into the number of least penalized cost.
 
     Fewer than were asked for where there are no segmentations into as many; None where there are none at all.  The penalty of a
@@ -74,8 +69,8 @@ def best(search: Search, matches: int, bodies: int | None, penalty: float) -> Be
                 return Best(known[count], count > 1 and count - 1 in known and penalized(count - 1) < penalized(count))
         return None
     top = 0
-    while top < min(room, MOST):
-        last, top = top, min(top + (NEXT if top else FIRST), room, MOST)
+    while top < min(room, options.count.most):
+        last, top = top, min(top + (options.count.further if top else options.count.first), room, options.count.most)
         known |= _cheapest(search(range(last + 1, top + 1)))
         chosen = min(known, key=penalized, default=0)
         if chosen < top:
@@ -92,12 +87,6 @@ def _cheapest(found: dict[int, list[Candidate]]) -> dict[int, Candidate]:
 
 # ----------------------------------------------------------------------------------------------------------------------
 # What one problem of segment() gives, in the coordinates and the order of its input.
-
-
-REPEATED = 0.1
-"""Share of repeated matches that deserves a notice."""
-SPARSE = 0.3
-"""Share of matches that move like their neighbours below which geometry alone may do better."""
 
 
 @dataclass(frozen=True)
@@ -197,14 +186,16 @@ def nothing(weights: Tensor, threshold: float, status: Status, repeated: float, 
     )
 
 
-def outcome(given: GivenMatches, labelled: Labelling, threshold: float, bodies: int | None, spare: bool) -> Outcome:
+def outcome(
+    given: GivenMatches, labelled: Labelling, threshold: float, bodies: int | None, spare: bool, options: SegmentOptions
+) -> Outcome:
     """The labels in order of size, with the model of every body."""
     labelled = _sorted(labelled)
     labels, fundamentals = labelled.labels, labelled.fundamentals
     count = len(fundamentals)
     if not count:
         return nothing(given.weights, threshold, Status.NO_CONSENSUS, given.repeated, given.linked)
-    models = choose(given.view, fundamentals, one_hot(labels - 1, count) * given.weights[given.present])
+    models = choose(given.view, fundamentals, one_hot(labels - 1, count) * given.weights[given.present], options)
     planar = unit(torch.linalg.inv(given.second) @ models.homographies @ given.first)
     return Outcome(
         labels=given.spread(labels),
@@ -238,7 +229,9 @@ def _residuals(view: View, labels: Tensor, fundamentals: Tensor, models: Models)
     return torch.where(labels > 0, own, square.amin(0)).sqrt()
 
 
-def segmentation_notices(found: list[Outcome], bodies: int | None, batch: tuple[int, ...]) -> tuple[Notice, ...]:
+def segmentation_notices(
+    found: list[Outcome], bodies: int | None, batch: tuple[int, ...], options: SegmentOptions
+) -> tuple[Notice, ...]:
     """What limits the results of a batch."""
     if not found:
         return ()
@@ -260,9 +253,9 @@ def segmentation_notices(found: list[Outcome], bodies: int | None, batch: tuple[
         message = f"{{value:g}} bodies explain the matches no worse than {bodies}: one may be a part of another; ask for fewer"
         said += notices(NoticeCode.SPARE_BODY, message, count - 1, spare, batch)
     message = "a share of {value:.2g} of the matches repeats others and says nothing new; remove repeated matches"
-    said += notices(NoticeCode.REPEATED, message, repeated, repeated > REPEATED, batch)
+    said += notices(NoticeCode.REPEATED, message, repeated, repeated > options.input.repeated, batch)
     message = "the share of matches that move like their neighbours is {value:.2g}; try spatial=False if bodies interleave"
-    said += notices(NoticeCode.INCOHERENT, message, linked, tried & spatial & (linked < SPARSE), batch)
+    said += notices(NoticeCode.INCOHERENT, message, linked, tried & spatial & (linked < options.input.sparse), batch)
     return tuple(said)
 
 
@@ -270,26 +263,6 @@ def segmentation_notices(found: list[Outcome], bodies: int | None, batch: tuple[
 # One problem of segment(): from matches of two views to labelled bodies, through what moves alike.
 
 
-SIGMAS = 5.0
-"""Threshold over the noise of a coordinate."""
-PIXELS = 2.5
-"""The default threshold: what the figures in pixels refer to."""
-NEIGHBOURLY = 3.0
-"""Noise of the differences of matches, pixels."""
-COHERENT, LINKED = 0.2, 0.3
-"""Coherence of a match, and strength of a link, that put it into a group."""
-UNKNOWN = 0.3
-"""Share of outliers where nothing says what it is."""
-FAR, FARTHEST = 20.0, 1e3
-"""Distance from the middle of the matches, in units of the median one, from which a match is garbage, and where it is put then."""
-SEARCHED = 1500
-"""Matches that the search looks at, and that are neighbours; the others are labelled by what it finds."""
-COARSE = 0.2
-"""Threshold over the spread of the points from which everything is near everything."""
-LEFT, LEFT_SHARE = 10, 0.08
-"""Linked matches without a body, and their share of all linked ones, from which one body more is tried."""
-GUESS = 0.003
-"""Threshold over the diagonal of the image, where it has to be estimated."""
 MEDIANS = {BodyModel.FUNDAMENTAL: median(1) ** 0.5, BodyModel.HOMOGRAPHY: median(2) ** 0.5}
 """Median Sampson distance of inliers, in units of the noise of a coordinate."""
 
@@ -304,19 +277,19 @@ class Request:
     generator: torch.Generator | None
 
 
-def solve(x1: Tensor, x2: Tensor, weights: Tensor, request: Request) -> Outcome:
+def solve(x1: Tensor, x2: Tensor, weights: Tensor, request: Request, options: SegmentOptions) -> Outcome:
     """Segment one problem of matches ``(n, 2)`` with weights ``(n,)``, 0 = missing."""
     if request.threshold is not None:
-        return _solve(x1, x2, weights, request, request.threshold)
+        return _solve(x1, x2, weights, request, request.threshold, options)
     size = _diagonal(x1[weights > 0])
-    first = _solve(x1, x2, weights, request, GUESS * size if size > 0 else 1.0)
+    first = _solve(x1, x2, weights, request, options.units.first_threshold * size if size > 0 else 1.0, options)
     if not first.count:
         return first
     # the median distance in standard deviations: in one dimension from epipolar lines, in two from the points of a plane
     medians = first.labels.new_tensor([MEDIANS[model] for model in first.models], dtype=x1.dtype)
     inlier = first.labels > 0
     noise = float((first.residuals[inlier] / medians[first.labels[inlier] - 1]).median())
-    return _solve(x1, x2, weights, request, max(SIGMAS * noise, 1e-6 * size))
+    return _solve(x1, x2, weights, request, max(options.units.threshold_in_sigmas * noise, 1e-6 * size), options)
 
 
 def _diagonal(x: Tensor) -> float:
@@ -327,7 +300,7 @@ def _diagonal(x: Tensor) -> float:
     return float((high - low).norm()) / 0.9
 
 
-def _solve(x1: Tensor, x2: Tensor, weights: Tensor, request: Request, threshold: float) -> Outcome:
+def _solve(x1: Tensor, x2: Tensor, weights: Tensor, request: Request, threshold: float, options: SegmentOptions) -> Outcome:
     present = (weights > 0).nonzero().flatten()
     distinct, *places = (len(torch.unique(x[present], dim=0)) for x in (torch.cat([x1, x2], dim=-1), x1, x2))
     # points that are all in one place of a view fit any motion of that place
@@ -335,43 +308,52 @@ def _solve(x1: Tensor, x2: Tensor, weights: Tensor, request: Request, threshold:
     repeated = 1 - distinct / len(present) if len(present) else 0.0
     if distinct < LEAST + 1:
         return nothing(weights, threshold, Status.TOO_FEW, repeated)
-    given = _given(x1[present], x2[present], weights, present, threshold, request, repeated)
-    if PIXELS * given.view.pixel > COARSE:
+    given = _given(x1[present], x2[present], weights, present, threshold, request, repeated, options)
+    if options.units.threshold_in_pixels * given.view.pixel > options.input.coarse:
         refused = nothing(weights, threshold, Status.AMBIGUOUS, repeated, given.linked)
-        return replace(refused, coarse=PIXELS * given.view.pixel)
+        return replace(refused, coarse=options.units.threshold_in_pixels * given.view.pixel)
     part = given.view.subset(given.keep[given.searched])
 
     def searched(counts: Sequence[int]) -> dict[int, list[Candidate]]:
         if not request.spatial:
-            return search_samples(part, counts, request.generator)
+            return search_samples(part, counts, request.generator, options)
         groups = given.groups[given.searched]
-        extra = [groups] if int(groups.max()) < MOST else []
-        return search(part, counts, request.generator, extra)
+        extra = [groups] if int(groups.max()) < options.count.most else []
+        return search(part, counts, request.generator, extra, options=options)
 
-    penalty = PENALTY if request.spatial else ALONE
-    chosen = best(searched, len(part.x1), request.bodies, penalty) if len(part.x1) > LEAST else None
+    penalty = options.count.penalty if request.spatial else options.count.penalty_without_neighbours
+    chosen = best(searched, len(part.x1), request.bodies, penalty, options) if len(part.x1) > LEAST else None
     if chosen is None:
         return nothing(weights, threshold, Status.NO_CONSENSUS, repeated, given.linked)
-    labelled = _labelled(given, chosen.candidate, request)
+    labelled = _labelled(given, chosen.candidate, request, options)
     left = _left(given, labelled)
-    if chosen.further is not None and left >= max(LEFT, LEFT_SHARE * len(given.keep)):
+    if chosen.further is not None and left >= max(options.count.left, options.count.left_share * len(given.keep)):
         # matches that move like their neighbours and fit no body: there is another one, which the truncated distances hid
-        other = _labelled(given, chosen.further, request)
+        other = _labelled(given, chosen.further, request, options)
         labelled = other if _left(given, other) < 0.5 * left else labelled
-    return outcome(given, labelled, threshold, request.bodies, chosen.spare)
+    return outcome(given, labelled, threshold, request.bodies, chosen.spare, options)
 
 
-def _labelled(given: GivenMatches, candidate: Candidate, request: Request) -> Labelling:
+def _labelled(given: GivenMatches, candidate: Candidate, request: Request, options: SegmentOptions) -> Labelling:
     """Labels of all matches by a segmentation of those that were searched."""
     found = torch.zeros_like(given.present)
     found[given.keep[given.searched]] = candidate.labels + 1
     pixel = given.view.pixel
-    near, share = (NEIGHBOURLY * pixel, 1 - given.linked) if request.spatial else (None, UNKNOWN)
-    labelled = label(given.view, found, candidate.fundamentals, given.weights[given.present], PIXELS * pixel, near, share)
+    near, share = (options.coherence.noise * pixel, 1 - given.linked) if request.spatial else (None, options.samples.outliers)
+    labelled = label(
+        given.view,
+        found,
+        candidate.fundamentals,
+        given.weights[given.present],
+        options.units.threshold_in_pixels * pixel,
+        near,
+        share,
+        options,
+    )
     if request.spatial:
         return labelled
     # nothing but the geometry speaks for these bodies: those that random matches would show as well are none
-    return labelled.of(significant(given.view, labelled.fundamentals, labelled.labels))
+    return labelled.of(significant(given.view, labelled.fundamentals, labelled.labels, options))
 
 
 def _left(given: GivenMatches, labelled: Labelling) -> int:
@@ -380,7 +362,14 @@ def _left(given: GivenMatches, labelled: Labelling) -> int:
 
 
 def _given(
-    x1: Tensor, x2: Tensor, weights: Tensor, present: Tensor, threshold: float, request: Request, repeated: float
+    x1: Tensor,
+    x2: Tensor,
+    weights: Tensor,
+    present: Tensor,
+    threshold: float,
+    request: Request,
+    repeated: float,
+    options: SegmentOptions,
 ) -> GivenMatches:
     """The present matches ``(m, 2)`` around 0 and of about unit size, by one scale: distances stay comparable."""
     centres = x1.median(0).values, x2.median(0).values
@@ -390,34 +379,37 @@ def _given(
     spread = distance[distance > 0].median() if bool(distance.any()) else torch.ones_like(distance[0])
     scale = 1 / spread.clamp(min=torch.finfo(spread.dtype).tiny)
     first, second = (similarity(scale, centre) for centre in centres)
-    a, b = (((x - centre) * scale).clamp(-FARTHEST, FARTHEST) for x, centre in zip((x1, x2), centres, strict=True))
-    pixel = threshold / PIXELS * float(scale)
+    a, b = (
+        ((x - centre) * scale).clamp(-options.input.farthest, options.input.farthest)
+        for x, centre in zip((x1, x2), centres, strict=True)
+    )
+    pixel = threshold / options.units.threshold_in_pixels * float(scale)
     values = torch.zeros_like(a[:, 0])
-    some = _some(len(a), request.generator, a.device)
+    some = _some(len(a), request.generator, a.device, options)
     if request.spatial:
-        graph = coherence(a, b, NEIGHBOURLY * pixel, some)
+        graph = coherence(a, b, options.coherence.noise * pixel, some, options=options)
         values, links = graph.values, graph.links
-        keep, groups = _groups(values, links)
+        keep, groups = _groups(values, links, options)
     else:
         links = Links(torch.zeros(len(a), 0, dtype=torch.long, device=a.device), a.new_zeros(len(a), 0))
         # without neighbours nothing but the place tells garbage, one of which can spoil the depth of a whole body
-        keep = (torch.cat([a, b], dim=-1).norm(dim=-1) < FAR).nonzero().flatten()
+        keep = (torch.cat([a, b], dim=-1).norm(dim=-1) < options.samples.far).nonzero().flatten()
         groups = keep[:0]
     view = View(a, b, pixel, links)
     searched = some[keep].nonzero().flatten()
     return GivenMatches(weights, present, view, first, second, float(scale), values, keep, groups, searched, repeated)
 
 
-def _some(count: int, generator: torch.Generator | None, device: torch.device) -> Tensor:
+def _some(count: int, generator: torch.Generator | None, device: torch.device, options: SegmentOptions) -> Tensor:
     """``(m,)`` bool: all matches, or a random part of very many: what is dense beside the noise shows no motion of its own."""
-    if count <= SEARCHED:
+    if count <= options.input.searched:
         return torch.ones(count, dtype=torch.bool, device=device)
-    return uniform(count, generator=generator, device=device).argsort().argsort() < SEARCHED
+    return uniform(count, generator=generator, device=device).argsort().argsort() < options.input.searched
 
 
-def _groups(values: Tensor, links: Links) -> tuple[Tensor, Tensor]:
+def _groups(values: Tensor, links: Links, options: SegmentOptions) -> tuple[Tensor, Tensor]:
     """The matches in linked groups large enough for a body, and these groups, from 0."""
-    component = links.components(LINKED, values > COHERENT)
+    component = links.components(options.coherence.linked, values > options.coherence.coherent)
     _, group, size = component.unique(return_inverse=True, return_counts=True)
     keep = (size[group] >= LEAST).nonzero().flatten()
     return keep, torch.unique(group[keep], return_inverse=True)[1]
@@ -438,6 +430,7 @@ def segment(
     weights: Tensor | None = None,
     spatial: bool = True,
     generator: torch.Generator | None = None,
+    options: SegmentOptions = SegmentOptions(),
 ) -> Segmentation:
     r"""Bodies that moved independently between two views, and the matches that belong to none.
 
@@ -462,6 +455,7 @@ def segment(
         spatial: whether bodies are regions of the images.  False for bodies that interleave, such as transparent motions or
             sparse points of a crowd: then only the geometry decides, which takes more matches and bears fewer outliers.
         generator: source of all randomness; None is torch's global one.
+        options: every number that decides, by stage; ``dataclasses.replace`` changes some of them.
 
     Returns:
         A :class:`~dyntorch.tasks.segment.result.Segmentation`, without gradients.
@@ -482,6 +476,7 @@ def segment(
         (2, (2, 3, 3))
     """
     check_threshold(threshold)
+    check_options(options, SegmentOptions)
     data = matches(FundamentalMatrix(), (x1, x2), weights)
     if generator is not None and not isinstance(generator, torch.Generator):
         raise ValueError(f"generator must be a torch.Generator or None, got {generator!r}; use torch.Generator().manual_seed(0)")
@@ -492,7 +487,7 @@ def segment(
     _check_counts(bodies, data.count)
     with torch.no_grad():
         found = [
-            solve(first, second, weight, Request(bodies, threshold, spatial, generator))
+            solve(first, second, weight, Request(bodies, threshold, spatial, generator), options)
             for first, second, weight in zip(*data.views, data.weights, strict=True)
         ]
     width = max([outcome.count for outcome in found], default=0)
@@ -520,7 +515,7 @@ def segment(
         coherence=stacked("coherence", (n,)),
         status=numbers([int(outcome.status) for outcome in found]),
         threshold=stacked("threshold", ()),
-        warnings=segmentation_notices(found, bodies, data.batch),
+        warnings=segmentation_notices(found, bodies, data.batch, options),
     )
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -258,3 +260,17 @@ def test_very_many_matches_are_labelled_by_what_some_of_them_show():
     scene = scenes.bodies(3000, sigma=0.5, outliers=0.2, generator=draw(3))
     found = segmented(scene)
     assert int(found.bodies) == 2 and error(found, scene) < 0.03
+
+
+def test_options_decide():
+    scene, shipped = two_bodies(), dyn.SegmentOptions()
+    assert int(segmented(scene).bodies) == 2
+    costly = replace(shipped, count=replace(shipped.count, penalty=100.0))
+    assert int(segmented(scene, options=costly).bodies) == 1
+    strict = replace(shipped, input=replace(shipped.input, coarse=1e-6))
+    assert int(segmented(scene, options=strict).status) == Status.AMBIGUOUS
+
+
+def test_options_are_of_the_verb():
+    with pytest.raises(ValueError, match=r"options must be SegmentOptions, got \{\}; use dataclasses\.replace"):
+        segmented(two_bodies(), options={})
