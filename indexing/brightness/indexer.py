@@ -109,13 +109,13 @@ class BrightnessIndexer(SavedClassifier):
 
     def __init__(
         self,
+        *,
+        reject: float | None = None,
+        none_label: Any = -1,
         fps: float = 30.0,
         window: float = 0.18,
         region: Any = "motion",
         flip: bool | str = "auto",
-        reject: float | None = None,
-        none_label: Any = -1,
-        *,
         pool: float = 0.33,
         size: int = 80,
         device: str = "cpu",

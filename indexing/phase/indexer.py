@@ -154,11 +154,11 @@ class PhaseIndexer(SavedClassifier):
     def __init__(
         self,
         harmonics: int = 4,
+        *,
         course: str = "auto",
         reject: float | None = None,
         none_label: Any = -1,
         fps: float = 30.0,
-        *,
         mirror: str | bool = "auto",
         window: float = 0.0,
         device: str = "cpu",

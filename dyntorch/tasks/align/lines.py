@@ -239,9 +239,10 @@ def align_lines(
     l1: Tensor,
     l2: Tensor,
     static_points: tuple[Tensor, Tensor] | None = None,
-    static: Tensor | None = None,
+    *,
     threshold: float | None = None,
     weights: Tensor | None = None,
+    static: Tensor | None = None,
     generator: torch.Generator | None = None,
 ) -> Alignment:
     r"""Motion of a 3D sensor from two views of lines, with a label for every line: static, moving or outlier.

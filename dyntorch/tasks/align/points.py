@@ -33,10 +33,11 @@ def align_points(
     P2: Tensor,
     P3: Tensor,
     model: Model = "join",
+    *,
+    motion: Motion = "straight",
     threshold: float | None = None,
     weights: Tensor | None = None,
     static: Tensor | None = None,
-    motion: Motion = "straight",
     generator: torch.Generator | None = None,
 ) -> Alignment:
     r"""Motion of a 3D sensor from three views of points, with a label for every match: static, moving or outlier.
@@ -64,11 +65,11 @@ def align_points(
         P2: the same points in view 2.
         P3: the same points in view 3; for constant velocity the three views are at equal steps of time.
         model: see the table.
-        threshold: three standard deviations of the noise of one coordinate, in the unit of the points.  None estimates the
-            noise of every problem (at least half of the matches must be inliers).
+        motion: of the points before a rigid sensor: ``"straight"``, at any speed, or ``"constant_velocity"``.
+        threshold: three standard deviations of the noise of one coordinate, in the unit of the points: labels are decided at
+            99.7 %.  None estimates the noise of every problem (at least half of the matches must be inliers).
         weights: ``(*batch, n)`` not negative; 0 leaves a match out.
         static: ``(*batch, n)`` bool, matches known not to move (they may still be outliers).
-        motion: of the points before a rigid sensor: ``"straight"``, at any speed, or ``"constant_velocity"``.
         generator: source of the random samples.
 
     Returns:
