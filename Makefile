@@ -85,9 +85,9 @@ tables: install
 	$(BIN)/python -m experiments.synchronization.brightness
 	$(BIN)/python -m experiments.reconstruction.pair
 	$(BIN)/python -m experiments.reconstruction.real
-	$(BIN)/python -m experiments.alignment.real_planar
+	$(BIN)/python -m experiments.alignment.real.planar
 	$(BIN)/python -m experiments.synchronization.real
-	$(BIN)/python -m experiments.alignment.real_space
+	$(BIN)/python -m experiments.alignment.real.space
 	$(BIN)/python -m experiments.recognition.action_recognition
 	$(BIN)/python -m experiments.recognition.action_baselines
 	$(BIN)/python -m experiments.recognition.dynamic_shape

@@ -64,14 +64,14 @@ def published(module: str, words: Sequence[str], folder: Path = RESULTS) -> Iter
 
 
 def page_name(module: str) -> str:
-    """Of the page of a module: its room and its name.
+    """Of the page of a module: its rooms and its name, once where they are the same.
 
     Example:
         >>> page_name("experiments.recognition.open_set"), page_name("experiments.segmentation.segmentation")
         ('recognition-open_set', 'segmentation')
     """
-    *rooms, name = module.split(".")
-    return name if len(rooms) == 1 or rooms[-1] == name else f"{rooms[-1]}-{name}"
+    _, *rooms, name = module.split(".")
+    return "-".join(rooms if rooms and rooms[-1] == name else [*rooms, name])
 
 
 def as_markdown(printed: str) -> str:

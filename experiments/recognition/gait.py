@@ -214,7 +214,7 @@ def picture(config: Config) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    from experiments.alignment.real_pictures import LINES, save
+    from experiments.alignment.real.pictures import LINES, save
 
     takes = list(config.takes or walks())
     figure, axes = plt.subplots(len(takes), 1, figsize=(12, 1.8 * len(takes)), squeeze=False, layout="constrained")

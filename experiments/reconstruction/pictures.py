@@ -21,7 +21,7 @@ from dyntorch.geometry.lift import gauge_algebra
 from dyntorch.numerics.nullspace import null_space
 from dyntorch.scenes.scene import calibration, looking_at
 from dyntorch.tasks.reconstruct.result import Reconstruction
-from experiments.alignment.real_pictures import LINES, MARKS, save
+from experiments.alignment.real.pictures import LINES, MARKS, save
 from experiments.reconstruction.data import CENTRE, World
 
 MOVING, STATIC, CAMERA = "#e07b39", "#8a949e", "#2f5d8a"

@@ -41,7 +41,7 @@ from dyntorch.geometry.homogeneous import homogeneous, inhomogeneous
 from dyntorch.tasks.reconstruct.factorization import projective_factorization, velocity_factorization
 from dyntorch.tasks.reconstruct.motions import MOTIONS, polynomial
 from dyntorch.tasks.reconstruct.result import Reconstruction
-from experiments.alignment.real_solvers import listed, median
+from experiments.alignment.real.solvers import listed, median
 from experiments.common.real_data import Take, takes, traffic
 from experiments.common.tables import Row, command, markdown, note
 from experiments.recognition.protocol import data_folder

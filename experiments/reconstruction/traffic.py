@@ -12,7 +12,7 @@ from torch import Tensor
 
 import dyntorch as dyn
 from dyntorch.geometry.homogeneous import apply, homogeneous
-from experiments.alignment.real_solvers import listed, median
+from experiments.alignment.real.solvers import listed, median
 from experiments.common.real_data import Traffic
 from experiments.common.tables import Row
 from experiments.reconstruction.data import declared, predicted

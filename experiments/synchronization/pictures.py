@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 import dyntorch as dyn
-from experiments.alignment.real_pictures import LINES, save
+from experiments.alignment.real.pictures import LINES, save
 from experiments.synchronization.baselines import Answer, pose2sim
 from indexing.actors import Person, detect, stream
 from indexing.skeleton import COCO17

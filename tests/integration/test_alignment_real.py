@@ -13,9 +13,10 @@ import torch
 import dyntorch as dyn
 from dyntorch import metrics
 from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC
-from experiments.alignment import real_planar, real_space
-from experiments.alignment.real_bodies import Crowd, crowd
-from experiments.alignment.real_solvers import aligned, gap, rigid_ransac
+from experiments.alignment.real import planar as real_planar
+from experiments.alignment.real import space as real_space
+from experiments.alignment.real.bodies import Crowd, crowd
+from experiments.alignment.real.solvers import aligned, gap, rigid_ransac
 from experiments.common import real_data
 from experiments.common.tables import Row
 

@@ -12,7 +12,7 @@ import dyntorch as dyn
 from dyntorch.geometry.homogeneous import apply
 from dyntorch.geometry.rigid import rigid_alignment
 from dyntorch.scenes.scene import Draw
-from experiments.alignment.real_solvers import Matrices, Solver, aligned, gap, listed, median, tensor
+from experiments.alignment.real.solvers import Matrices, Solver, aligned, gap, listed, median, tensor
 from experiments.common.real_data import Take
 from experiments.common.tables import Row, note
 

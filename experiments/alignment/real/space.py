@@ -1,6 +1,6 @@
 """The tensors of space and rigid alignment on real 3D motion: boxes of traffic seen from a car, and moving bodies.
 
-    DYNTORCH_DATA=../shared/data python -m experiments.alignment.real_space
+    DYNTORCH_DATA=../shared/data python -m experiments.alignment.real.space
 
 **Drives** (Argoverse 2): centres of annotated boxes at sweeps t, t + k, t + 2k in the frame of the moving sensor, whose true
 pose is known.  (a) The projective tensors are degenerate there - velocities lie in the ground plane, many boxes are parked,
@@ -35,9 +35,9 @@ from torch import Tensor
 import dyntorch as dyn
 from dyntorch import metrics
 from dyntorch.geometry.homogeneous import apply
-from experiments.alignment.real_bodies import SPACINGS, bodies_rows
-from experiments.alignment.real_pictures import bodies_picture, drive_picture, movers_picture
-from experiments.alignment.real_solvers import Matrices, Solver, aligned, gap, listed, median, rigid_ransac, tensor
+from experiments.alignment.real.bodies import SPACINGS, bodies_rows
+from experiments.alignment.real.pictures import bodies_picture, drive_picture, movers_picture
+from experiments.alignment.real.solvers import Matrices, Solver, aligned, gap, listed, median, rigid_ransac, tensor
 from experiments.common.real_data import Drive, drives, takes
 from experiments.common.tables import Row, command, markdown, note
 from experiments.recognition.protocol import data_folder
@@ -185,4 +185,4 @@ def run(config: Config) -> None:
 
 
 if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.alignment.real_space")))
+    command(lambda: run(tyro.cli(Config, prog="python -m experiments.alignment.real.space")))

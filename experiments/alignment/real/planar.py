@@ -1,6 +1,6 @@
 """The homography tensor on real planes: cars on roads seen by moving cameras, and a board moved by hand.
 
-    DYNTORCH_DATA=../shared/data python -m experiments.alignment.real_planar
+    DYNTORCH_DATA=../shared/data python -m experiments.alignment.real.planar
 
 **Traffic** (Hopkins155): three frames of all tracked points, background and cars alike, go into ``align_planar`` with its
 default threshold for every sequence (an estimated one, tried on the same sequences, called more of the cars outliers).
@@ -44,7 +44,7 @@ from torch import Tensor
 import dyntorch as dyn
 from dyntorch.geometry.homogeneous import apply
 from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment
-from experiments.alignment.real_pictures import board_picture, shares_picture, traffic_picture
+from experiments.alignment.real.pictures import board_picture, shares_picture, traffic_picture
 from experiments.common.real_data import Board, Traffic, board, traffic
 from experiments.common.tables import Row, command, markdown, note
 from experiments.recognition.protocol import data_folder
@@ -288,4 +288,4 @@ def run(config: Config) -> None:
 
 
 if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.alignment.real_planar")))
+    command(lambda: run(tyro.cli(Config, prog="python -m experiments.alignment.real.planar")))
