@@ -20,9 +20,10 @@ MATHEMATICS = {
     "dyntorch/tasks/segment/labels.py": {"SAMPLE"},
     "dyntorch/tasks/segment/search.py": {"LEAST"},
     "dyntorch/tasks/segment/segment.py": {"MINIMAL"},
+    "dyntorch/tasks/trajectories/trajectories.py": {"VIEWS"},
 }
 """Constants that follow from equations (counts of matches, dimensions, quantiles) or from a file format, by file."""
-LOOSE = {"dyntorch": 566, "indexing": 433}
+LOOSE = {"dyntorch": 561, "indexing": 433}
 """Upper bounds of the loose constants of a package: they only go down."""
 
 

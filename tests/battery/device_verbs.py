@@ -461,7 +461,7 @@ NOT_VERBS = {
         ),
         "results",
     ),
-    **dict.fromkeys(("SegmentOptions",), "options of verbs"),
+    **dict.fromkeys(("SegmentOptions", "TrajectoryOptions"), "options of verbs"),
     **dict.fromkeys(
         (
             *("Collineation", "ConstantVelocityTensor", "ConvergentMotionMatrix", "DualHomographyTensor"),

@@ -15,20 +15,14 @@ from dyntorch.geometry.extensors import compound, skew_line
 from dyntorch.geometry.homogeneous import inhomogeneous, unit
 from dyntorch.geometry.lines import cameras_of_lines, line_camera, lines_of_pencil, nearest_line
 from dyntorch.invariants.grassmann_tensor import GrassmannTensor
-from dyntorch.numerics.arguments import on_cpu
+from dyntorch.numerics.arguments import check_options, on_cpu
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.numerics.nullspace import gram_null_space
 from dyntorch.tasks.trajectories.descent import FoundLines, LineSightings, adjust, best_lines, best_points, normalized
+from dyntorch.tasks.trajectories.options import TrajectoryOptions
 
 VIEWS = 4
 """Views of a point that leave finitely many lines: two."""
-STILL = 2.0
-"""A point whose reprojection errors as a static point are below so many sigma (RMS per degree of freedom) is called static."""
-UNCERTAIN = 0.1
-"""Expected error of the unit vector of a line, cameras normalized, above which other lines explain the views as well.
-Five views, 0.5 px: at 0.03 to 0.1 nine of ten points are within 0.04 of the scene's radius, at 0.1 to 0.3 within 0.13."""
-ROUNDING = 1e-10
-"""Noise, in units of the normalized images, that even exact data are taken to have."""
 
 
 class LineStatus(IntEnum):
@@ -72,7 +66,12 @@ class Trajectories:
 
 @one_thread
 def triangulate_trajectories(
-    cameras: Tensor, x: Tensor, weights: Tensor | None = None, *, sigma: float | None = None
+    cameras: Tensor,
+    x: Tensor,
+    weights: Tensor | None = None,
+    *,
+    sigma: float | None = None,
+    options: TrajectoryOptions = TrajectoryOptions(),
 ) -> Trajectories:
     r"""The straight lines on which points move, seen one view at a time, and where on them they were.
 
@@ -95,6 +94,7 @@ def triangulate_trajectories(
         weights: ``(*batch, views, n)``, 0 = ignore.
         sigma: noise of one image coordinate, px; None takes it from the residuals of the lines of five or more views (with
             only four views every point that moves at all then counts as moving).
+        options: every number that decides; ``dataclasses.replace`` changes some of them.
 
     Returns:
         :class:`Trajectories`, in the dtype and on the device of x.
@@ -116,18 +116,20 @@ def triangulate_trajectories(
         >>> bool(torch.allclose(found.points[:, 0], path)), LineStatus(int(found.status)).name
         (True, 'OK')
     """
+    check_options(options, TrajectoryOptions)
     weights = _checked(cameras, x, weights, sigma)
     data, _, back = normalized(cameras.double(), x.double(), weights)
     seen = (data.weights > 0).sum(-2)
-    line, second = _lines(data)
+    line, second = _lines(data, options)
     still = _points(data)
     noise = _noise(line.cost, seen) if sigma is None else torch.full_like(line.cost[..., 0], sigma)
-    least = torch.maximum(noise, ROUNDING / data.unit[..., 0, 0])[..., None]
-    static = (still.cost <= (least * STILL).square() * (2 * seen - 3)) & (seen >= VIEWS)
+    least = torch.maximum(noise, options.least_noise / data.unit[..., 0, 0])[..., None]
+    static = (still.cost <= (least * options.static).square() * (2 * seen - 3)) & (seen >= VIEWS)
     few, two = seen < VIEWS, second.abs().amax(-1) > 0
     # four views without two lines: noise has made them one
     uncertainty = torch.where((seen == VIEWS) & ~two, 1.0, (line.spread.sqrt() * least).clamp(max=1.0))
-    status = torch.where(two, LineStatus.TWO_FOLD, torch.where(uncertainty > UNCERTAIN, LineStatus.AMBIGUOUS, LineStatus.OK))
+    single = torch.where(uncertainty > options.ambiguous, LineStatus.AMBIGUOUS, LineStatus.OK)
+    status = torch.where(two, LineStatus.TWO_FOLD, single)
     status = torch.where(few, LineStatus.TOO_FEW, torch.where(static, LineStatus.STATIC, status))
     none = (few | static)[..., None]
     total = data.weights.sum(-2)
@@ -201,19 +203,19 @@ def _checked(cameras: Tensor, x: Tensor, weights: Tensor | None, sigma: float | 
     return torch.where(known, weights, 0.0).double()
 
 
-def fitted_lines(data: LineSightings) -> Tensor:
+def fitted_lines(data: LineSightings, options: TrajectoryOptions) -> Tensor:
     """The best lines ``(*batch, n, 6)`` of normalized sightings."""
-    return _lines(data)[0].vectors
+    return _lines(data, options)[0].vectors
 
 
-def _lines(data: LineSightings) -> tuple[FoundLines, Tensor]:
+def _lines(data: LineSightings, options: TrajectoryOptions) -> tuple[FoundLines, Tensor]:
     """The best lines, and the second ones of four views (0 elsewhere)."""
     rays = data.rays()
     null = gram_null_space(rays.mT @ rays, 2).basis
     pencil, real = lines_of_pencil(null[..., 0, :], null[..., 1, :])
     found = best_lines(data, torch.stack([nearest_line(null[..., 0, :]), pencil[..., 0, :], pencil[..., 1, :]]))
-    cost = torch.where(_visible(data, found.vectors), found.cost, torch.inf)
-    apart = 1 - (found.vectors[1] * found.vectors[2]).sum(-1).square() > 1e-12
+    cost = torch.where(_visible(data, found.vectors, options), found.cost, torch.inf)
+    apart = 1 - (found.vectors[1] * found.vectors[2]).sum(-1).square() > options.second_line_apart
     two = ((data.weights > 0).sum(-2) == VIEWS) & real & apart & cost[1:].isfinite().all(0)
     best = torch.where(two, 1, cost.argmin(0))[None]
     vectors, least, spread = found.vectors.take_along_dim(best[..., None], 0), found.cost, found.spread
@@ -227,12 +229,12 @@ def _points(data: LineSightings) -> FoundLines:
     return best_points(data, gram_null_space(sides.mT @ sides).basis[..., 0, :])
 
 
-def _visible(data: LineSightings, lines: Tensor) -> Tensor:
+def _visible(data: LineSightings, lines: Tensor, options: TrajectoryOptions) -> Tensor:
     """Whether lines ``(*batch, n, 6)`` stay clear of the centres of the cameras that see their points: the join of two centres
     meets all rays, and has no image in them."""
     image = torch.einsum("...vik,...nk->...vni", line_camera(data.cameras), lines).norm(dim=-1)
     image = image / torch.linalg.matrix_norm(line_camera(data.cameras))[..., None].clamp(min=1e-300)
-    return (torch.where(data.weights > 0, image, 1.0) > 1e-7).all(-2)
+    return (torch.where(data.weights > 0, image, 1.0) > options.visible).all(-2)
 
 
 def _noise(cost: Tensor, seen: Tensor) -> Tensor:
@@ -249,7 +251,6 @@ def _noise(cost: Tensor, seen: Tensor) -> Tensor:
 
 
 SIX = GrassmannTensor(5, (1,) * 6, dual=True)
-ROUNDS = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,7 +271,12 @@ class TrajectoryCameras:
 @one_thread
 @on_cpu
 def trajectory_cameras(
-    x: Tensor, weights: Tensor | None = None, *, bundle: bool = True, sigma: float | None = None
+    x: Tensor,
+    weights: Tensor | None = None,
+    *,
+    bundle: bool = True,
+    sigma: float | None = None,
+    options: TrajectoryOptions = TrajectoryOptions(),
 ) -> TrajectoryCameras:
     r"""Six uncalibrated cameras and straight trajectories from points seen one view at a time.
 
@@ -290,6 +296,7 @@ def trajectory_cameras(
         weights: ``(*batch, n)``, 0 = ignore.
         bundle: follow up with bundle adjustment; without it the linear result.
         sigma: noise of one image coordinate, px, as in :func:`~dyntorch.tasks.trajectories.trajectories.triangulate_trajectories`.
+        options: every number that decides; ``dataclasses.replace`` changes some of them.
 
     Returns:
         :class:`TrajectoryCameras`.
@@ -309,6 +316,7 @@ def trajectory_cameras(
         >>> bool(found.trajectories.residual.median() < 1e-6)
         True
     """
+    check_options(options, TrajectoryOptions)
     if x.ndim < 3 or x.shape[-3] != 6 or x.shape[-1] != 2:
         raise ValueError(f"x must be (*batch, 6, n, 2), six views, got {tuple(x.shape)}")
     if weights is not None and weights.shape != (*x.shape[:-3], x.shape[-2]):
@@ -323,23 +331,24 @@ def trajectory_cameras(
     cameras = cameras_of_lines(transforms.mT @ parts)
     cameras = torch.where(good[..., None, None, None], cameras, torch.eye(3, 4, dtype=cameras.dtype, device=cameras.device))
     each = (mass * good[:, None])[:, None].expand(flat.shape[:-1])
-    found = triangulate_trajectories(cameras, flat.expand(len(cameras), *flat.shape), each.expand(len(cameras), *each.shape))
+    tried = flat.expand(len(cameras), *flat.shape), each.expand(len(cameras), *each.shape)
+    found = triangulate_trajectories(cameras, *tried, options=options)
     best = (found.residual.square() * mass).sum(-1).nan_to_num(nan=torch.inf).argmin(0)
     cameras = cameras[best, torch.arange(len(flat), device=x.device)]
     if bundle:
-        cameras = _adjusted(cameras, flat, each)
-    trajectories = triangulate_trajectories(cameras, flat, each, sigma=sigma)
+        cameras = _adjusted(cameras, flat, each, options)
+    trajectories = triangulate_trajectories(cameras, flat, each, sigma=sigma, options=options)
     cameras = torch.where(good[..., None, None, None], cameras, 0.0)
     lead = x.shape[:-3]
     whole = Trajectories(*(part.reshape((*lead, *part.shape[1:])) for part in vars(trajectories).values()))
     return TrajectoryCameras(cameras.reshape(*lead, 6, 3, 4).to(x.dtype), whole, solution.status.reshape(lead))
 
 
-def _adjusted(cameras: Tensor, x: Tensor, weights: Tensor) -> Tensor:
+def _adjusted(cameras: Tensor, x: Tensor, weights: Tensor, options: TrajectoryOptions) -> Tensor:
     """Cameras ``(b, 6, 3, 4)`` of least distances of the points from the images of their lines."""
     data, transform, _ = normalized(cameras, x, torch.where(x.isfinite().all(-1), weights, 0.0))
-    for _ in range(ROUNDS):
+    for _ in range(options.adjustments):
         # a line whose start from the first cameras was bad stays in a minimum of its own: all get a new start
-        data = adjust(data, fitted_lines(data))
+        data = adjust(data, fitted_lines(data, options))
     moved = torch.linalg.solve(transform, data.cameras)
     return unit(moved)

@@ -1,8 +1,11 @@
 """Straight trajectories against the truth: five and more views, four views, static points, missing views, noise, the tensor."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
+from dyntorch import TrajectoryOptions
 from dyntorch.geometry.extensors import plucker
 from dyntorch.geometry.homogeneous import apply, homogeneous, inhomogeneous
 from dyntorch.tasks.trajectories.trajectories import LineStatus, points_on_lines, trajectory_cameras, triangulate_trajectories
@@ -217,3 +220,21 @@ def test_misuse_of_six_views():
         trajectory_cameras(x[:5])
     with pytest.raises(ValueError, match=r"weights must be \(\*batch, n\) = \(10,\), one per point, got \(6, 10\)"):
         trajectory_cameras(x, torch.ones(6, 10))
+
+
+def test_options_decide():
+    cameras, x, _, _ = scene(6, 20, sigma=0.5)
+    found = triangulate_trajectories(cameras, x)
+    assert (found.status == LineStatus.OK).any()
+    strict = triangulate_trajectories(cameras, x, options=replace(TrajectoryOptions(), ambiguous=0.0))
+    assert (strict.status == LineStatus.AMBIGUOUS).all()
+    lax = triangulate_trajectories(cameras, x, options=replace(TrajectoryOptions(), static=1e6))
+    assert (lax.status == LineStatus.STATIC).all()
+
+
+def test_options_are_of_the_verb():
+    cameras, x, _, _ = scene(5, 3)
+    with pytest.raises(ValueError, match=r"options must be TrajectoryOptions, got None; use dataclasses\.replace"):
+        triangulate_trajectories(cameras, x, options=None)
+    with pytest.raises(ValueError, match=r"options must be TrajectoryOptions, got \{\}; use dataclasses\.replace"):
+        trajectory_cameras(torch.zeros(6, 728, 2), options={})
