@@ -79,6 +79,7 @@ _HOME = {
     "Fourier": "dyntorch.shapes.basis",
     # the numbers that decide in a task
     "SegmentOptions": "dyntorch.tasks.segment.options",
+    "SynchronizeOptions": "dyntorch.tasks.synchronize.options",
     "TrajectoryOptions": "dyntorch.tasks.trajectories.options",
 }
 _MODULES = {

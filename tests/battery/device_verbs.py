@@ -461,7 +461,7 @@ NOT_VERBS = {
         ),
         "results",
     ),
-    **dict.fromkeys(("SegmentOptions", "TrajectoryOptions"), "options of verbs"),
+    **dict.fromkeys((name for name in dyn.__all__ if name.endswith("Options")), "options of verbs"),
     **dict.fromkeys(
         (
             *("Collineation", "ConstantVelocityTensor", "ConvergentMotionMatrix", "DualHomographyTensor"),

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dyntorch.tasks.synchronize.options import SynchronizeOptions
 from dyntorch.tasks.synchronize.result import Shift
 from dyntorch.tasks.synchronize.tracks import Tracks, read_tracks
 
@@ -59,7 +60,10 @@ def overlap(
         ValueError: misuse, naming the field.
     """
     rates, clocks = _clocks(shift, fps, times)
-    tracks = [read_tracks(name, x, rate, clock, None) for name, x, rate, clock in zip("ab", (a, b), rates, clocks, strict=True)]
+    tracks = [
+        read_tracks(name, x, rate, clock, None, options=SynchronizeOptions())
+        for name, x, rate, clock in zip("ab", (a, b), rates, clocks, strict=True)
+    ]
     if a.device != b.device:
         raise ValueError(f"a and b must be on one device, got {a.device} and {b.device}; use b.to(a.device)")
     first, second = tracks

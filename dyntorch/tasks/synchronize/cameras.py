@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import combinations
 from math import exp, isfinite, log, nan
 from typing import Any
@@ -11,27 +12,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dyntorch.numerics.arguments import on_cpu
+from dyntorch.numerics.arguments import check_options, on_cpu
 from dyntorch.numerics.blocks import one_thread
+from dyntorch.tasks.synchronize.options import SynchronizeOptions
 from dyntorch.tasks.synchronize.result import Clocks, Pair, Shift
 from dyntorch.tasks.synchronize.synchronize import synchronize
 
 # ----------------------------------------------------------------------------------------------------------------------
 # The shifts of pairs of cameras as numbers: candidates, times from the middle of what a camera shares with others, and costs.
-
-
-PEAKS = 8
-"""Candidates per pair."""
-FRAME = 0.25
-"""Of a frame: error of a right peak that no standard deviation of one pair knows of (view-dependent keypoints)."""
-SURE, UNSURE = (0.95, 0.99), (0.05, 0.5)
-"""Range of the probability that the best peak is right, of pairs that decide and that refused: their confidence within it."""
-RATE = 5e-5
-"""Standard deviation of the rate of a pair that did not search it, next to pairs that did: what quartz clocks differ by."""
-FIXED = 1e-9
-"""The same where no pair searched it: rates stay as given."""
-RANGE = 10.0
-"""Seconds that the offset of a pair without a curve may have."""
 
 
 @dataclass(frozen=True)
@@ -60,17 +48,18 @@ class Network:
     """``(cameras,)``: -log of that density, once: a camera without a clock has no place to be explained."""
     weight: Tensor
     """``(E,)`` of the squared residual: the probability that the best peak is right."""
+    options: SynchronizeOptions
 
     @property
     def searched(self) -> bool:
         """Whether some pair searched its rate."""
-        return bool((self.rate_sigma > FIXED).any())
+        return bool((self.rate_sigma > self.options.cameras.fixed_rate_sigma).any())
 
 
-def network(shifts: Mapping[tuple[int, int], Shift], cameras: int) -> Network:
+def network(shifts: Mapping[tuple[int, int], Shift], cameras: int, options: SynchronizeOptions) -> Network:
     """The pairs' candidates, times and costs."""
     ends, every = torch.tensor(list(shifts)).reshape(-1, 2), list(shifts.values())
-    found = [_candidates(shift) for shift in every]
+    found = [_candidates(shift, options) for shift in every]
     offsets = torch.stack([offset for offset, _ in found])
     center = torch.tensor([_finite(shift.center, 0.0) for shift in every], dtype=torch.float64)
     moments = torch.cat([center[:, None], center[:, None] + offsets], dim=1)
@@ -81,30 +70,37 @@ def network(shifts: Mapping[tuple[int, int], Shift], cameras: int) -> Network:
         count = count.index_add(0, ends[:, column], known)
     means = total / count.clamp(min=1)
     moments = moments - torch.cat([means[ends[:, :1]], means[ends[:, 1:]].expand(-1, offsets.shape[1])], dim=1)
-    sigma = torch.tensor([max(_finite(shift.sigma, _span(shift)), 0.0) for shift in every], dtype=torch.float64)
-    slack = torch.tensor([FRAME / min(shift.fps) for shift in every], dtype=torch.float64)
+    sigma = torch.tensor([max(_finite(shift.sigma, _span(shift, options)), 0.0) for shift in every], dtype=torch.float64)
+    slack = torch.tensor([options.cameras.peak_error / min(shift.fps) for shift in every], dtype=torch.float64)
     rate_sigma = torch.tensor([_finite(shift.rate_sigma, 1.0) for shift in every], dtype=torch.float64)
-    rate_sigma = torch.where(rate_sigma > 0, rate_sigma, RATE if bool((rate_sigma > 0).any()) else FIXED)
-    gain = torch.tensor([_span(shift) for shift in every], dtype=torch.float64) / (2.5 * torch.hypot(sigma, slack))
+    rate_sigma = torch.where(
+        rate_sigma > 0, rate_sigma, options.cameras.rate_sigma if bool((rate_sigma > 0).any()) else options.cameras.fixed_rate_sigma
+    )
+    gain = torch.tensor([_span(shift, options) for shift in every], dtype=torch.float64) / (2.5 * torch.hypot(sigma, slack))
     gain = gain.clamp(min=1).log()
-    cost, none = torch.stack([cost for _, cost in found]), torch.tensor([_wrong(shift) for shift in every], dtype=torch.float64)
+    cost, none = (
+        torch.stack([cost for _, cost in found]),
+        torch.tensor([_wrong(shift, options) for shift in every], dtype=torch.float64),
+    )
     rate = torch.tensor([_finite(shift.rate, 1.0) for shift in every], dtype=torch.float64).log()
-    weight = torch.tensor([_trust(shift) for shift in every], dtype=torch.float64)
+    weight = torch.tensor([_trust(shift, options) for shift in every], dtype=torch.float64)
     saving = torch.tensor([float(gain[(ends == one).any(-1)].min()) if (ends == one).any() else 0.0 for one in range(cameras)])
-    return Network(cameras, ends, moments, means, sigma, slack, rate, rate_sigma, cost, gain + none, saving, weight)
+    return Network(
+        cameras, ends, moments, means, sigma, slack, rate, rate_sigma, cost, gain + none, saving, weight, options=options
+    )
 
 
-def _candidates(shift: Shift) -> tuple[Tensor, Tensor]:
+def _candidates(shift: Shift, options: SynchronizeOptions) -> tuple[Tensor, Tensor]:
     """Shifts at ``center`` of the best candidate and the other peaks, ``(PEAKS,)``, and their costs."""
     best = _finite(shift.center, 0.0) * (_finite(shift.rate, 1.0) - 1) + shift.offset
     others = shift.peaks[:, 0].double()
     # the best one is refined, and its own peak no other candidate
-    others = others[others.isfinite() & ((others - best).abs() > 1 / min(shift.fps))][: PEAKS - 1]
+    others = others[others.isfinite() & ((others - best).abs() > 1 / min(shift.fps))][: options.cameras.peaks - 1]
     share = 1 / torch.arange(1, len(others) + 1, dtype=torch.float64)
-    left = 0.5 * (1 - _trust(shift))
-    cost = torch.cat([torch.tensor([-log(_trust(shift))], dtype=torch.float64), -(left * share / share.sum()).log()])
+    left = 0.5 * (1 - _trust(shift, options))
+    cost = torch.cat([torch.tensor([-log(_trust(shift, options))], dtype=torch.float64), -(left * share / share.sum()).log()])
     offsets = torch.cat([torch.tensor([best], dtype=torch.float64), others])
-    cost, empty = torch.where(offsets.isfinite(), cost, torch.inf), PEAKS - len(offsets)
+    cost, empty = torch.where(offsets.isfinite(), cost, torch.inf), options.cameras.peaks - len(offsets)
     return torch.nn.functional.pad(offsets, (0, empty), value=torch.nan), torch.nn.functional.pad(cost, (0, empty), value=torch.inf)
 
 
@@ -113,19 +109,19 @@ def _finite(value: float, other: float) -> float:
     return value if isfinite(value) else other
 
 
-def _trust(shift: Shift) -> float:
-    low, high = SURE if shift.ok else UNSURE
+def _trust(shift: Shift, options: SynchronizeOptions) -> float:
+    low, high = options.cameras.sure if shift.ok else options.cameras.unsure
     return min(max(_finite(shift.confidence, 0.0), low), high)
 
 
-def _wrong(shift: Shift) -> float:
+def _wrong(shift: Shift, options: SynchronizeOptions) -> float:
     """-log of the probability that no candidate is right; at most that of the best one, by which a camera may have to hang."""
-    return -log(min((0.5 if len(shift.peaks) > 1 else 1.0) * (1 - _trust(shift)), _trust(shift)))
+    return -log(min((0.5 if len(shift.peaks) > 1 else 1.0) * (1 - _trust(shift, options)), _trust(shift, options)))
 
 
-def _span(shift: Shift) -> float:
+def _span(shift: Shift, options: SynchronizeOptions) -> float:
     lags = shift.lags[shift.lags.isfinite()]
-    return float(lags.max() - lags.min()) if len(lags) > 1 else RANGE
+    return float(lags.max() - lags.min()) if len(lags) > 1 else options.cameras.unknown_range
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -136,13 +132,6 @@ def _span(shift: Shift) -> float:
 # in the logarithms of the rates:
 #
 # .. math:: (u_j / r_j - b_j) - (u_i / r_i - b_i) = 0 \pm \sigma_{ij}, \qquad \log r_{ij} = \log r_j - \log r_i \pm \sigma^r_{ij}.
-
-
-BEAM, FINAL = 100, 30
-"""States that are kept when a camera joins, and that are refined in the end."""
-STEPS = 5
-DRIFT = 8.0
-"""Cost at which a contradiction of the rates stops growing: the pair is wrong, by whatever."""
 
 
 @dataclass(frozen=True)
@@ -160,30 +149,30 @@ class Reading:
     """``(2 cameras, 2 cameras)`` of logs and starts; 0 for the reference, infinite where there is no clock."""
 
 
-def readings(net: Network, reference: int) -> list[Reading]:
+def readings(net: Network, reference: int, options: SynchronizeOptions) -> list[Reading]:
     """The likeliest readings that differ in some clock, best first."""
-    logs, starts = _search(net, reference)
+    logs, starts = _search(net, reference, options)
     found: dict[tuple[int, ...], Reading] = {}
     for one_log, one_start in zip(logs, starts, strict=True):
-        reading = refined(net, reference, one_log, one_start)
+        reading = refined(net, reference, one_log, one_start, options)
         if reading.labels not in found or reading.cost < found[reading.labels].cost:
             found[reading.labels] = reading
     different: list[Reading] = []
     for reading in sorted(found.values(), key=lambda one: one.cost):
-        if all(differing(net, reading, other) for other in different):
+        if all(differing(net, reading, other, options) for other in different):
             different.append(reading)
     return different
 
 
-def differing(net: Network, one: Reading, other: Reading) -> list[int]:
+def differing(net: Network, one: Reading, other: Reading, options: SynchronizeOptions) -> list[int]:
     """Cameras whose clocks differ by more than a frame and four standard deviations, or have none in one of the two."""
     variance = torch.minimum(one.covariance.diagonal(), other.covariance.diagonal())[net.cameras :]
-    allowed = torch.maximum(4 * variance.sqrt(), net.slack.max() / FRAME)
+    allowed = torch.maximum(4 * variance.sqrt(), net.slack.max() / options.cameras.peak_error)
     apart = (one.starts - other.starts).abs()
     return ((apart > allowed) | (one.starts.isnan() != other.starts.isnan())).nonzero().flatten().tolist()
 
 
-def _search(net: Network, reference: int) -> tuple[Tensor, Tensor]:
+def _search(net: Network, reference: int, options: SynchronizeOptions) -> tuple[Tensor, Tensor]:
     """Beam search: cameras join one by one, by any candidate of any pair with those before, or without a clock.
 
     A second round lets each camera move to where any candidate of any of its pairs puts it: in the first, a camera could only
@@ -206,11 +195,11 @@ def _search(net: Network, reference: int) -> tuple[Tensor, Tensor]:
         logs, starts = _joined(net, logs, starts, camera, ties)
         within = torch.tensor([set(ends) <= set(joined) for ends in net.ends.tolist()])
         saved = (starts[:, joined].isnan() * net.saving[joined]).sum(-1)
-        cost = _costs(net, logs, starts, within)[0].sum(-1) - saved
-        keep = _distinct(starts, cost, allowed)
+        cost = _costs(net, logs, starts, within, options)[0].sum(-1) - saved
+        keep = _distinct(starts, cost, allowed, options)
         logs, starts = logs[keep], starts[keep]
     # in the order of _distinct, cheap and complete ones take turns
-    return logs[:FINAL], starts[:FINAL]
+    return logs[: options.cameras.final], starts[: options.cameras.final]
 
 
 def _between(ends: list[int], camera: int, placed: list[int]) -> bool:
@@ -244,7 +233,7 @@ def _joined(net: Network, logs: Tensor, starts: Tensor, camera: int, ties: Tenso
     return torch.cat(new_logs), torch.cat(new_starts)
 
 
-def _costs(net: Network, logs: Tensor, starts: Tensor, pairs: Tensor) -> tuple[Tensor, Tensor]:
+def _costs(net: Network, logs: Tensor, starts: Tensor, pairs: Tensor, options: SynchronizeOptions) -> tuple[Tensor, Tensor]:
     """Cost ``(S, chosen)`` of the pairs chosen ``(E,)`` in states ``(S, cameras)``, and the candidate behind it, -1 = none."""
     i, j = net.ends[pairs].unbind(-1)
     here = net.times[pairs, :1] / logs[:, i, None].exp() - starts[:, i, None]
@@ -252,44 +241,46 @@ def _costs(net: Network, logs: Tensor, starts: Tensor, pairs: Tensor) -> tuple[T
     spread = torch.hypot(net.sigma, net.slack)[pairs, None]
     fit, label = torch.nan_to_num(0.5 * (away / spread).square() + net.cost[pairs], nan=torch.inf).min(-1)
     # rates are compared more loosely than they were measured, like shifts
-    loose = torch.hypot(net.rate_sigma, torch.tensor(RATE if net.searched else FIXED))[pairs]
+    loose = torch.hypot(
+        net.rate_sigma, torch.tensor(options.cameras.rate_sigma if net.searched else options.cameras.fixed_rate_sigma)
+    )[pairs]
     drift = (net.rate[pairs] - logs[:, j] + logs[:, i]) / loose
-    fit = fit + (0.5 * drift.square()).clamp(max=DRIFT)
+    fit = fit + (0.5 * drift.square()).clamp(max=options.cameras.drift_cost)
     return torch.minimum(fit, net.none[pairs]), torch.where(fit <= net.none[pairs], label, -1)
 
 
-def _distinct(starts: Tensor, cost: Tensor, allowed: float) -> Tensor:
+def _distinct(starts: Tensor, cost: Tensor, allowed: float, options: SynchronizeOptions) -> Tensor:
     """States that differ in some clock, at most BEAM: in turns the cheapest, and the cheapest of those with the most clocks."""
-    cheap = cost.argsort(stable=True)[: 5 * BEAM]
-    complete = (starts.isnan().sum(-1) * (cost.max() - cost.min() + 1) + cost).argsort(stable=True)[: 5 * BEAM]
+    cheap = cost.argsort(stable=True)[: 5 * options.cameras.beam]
+    complete = (starts.isnan().sum(-1) * (cost.max() - cost.min() + 1) + cost).argsort(stable=True)[: 5 * options.cameras.beam]
     order = torch.stack([cheap, complete], dim=1).flatten()
     filled = torch.nan_to_num(starts[order], nan=1e15)
     close = torch.cdist(filled, filled, p=torch.inf) <= allowed
     kept: list[int] = []
     free = torch.ones(len(order), dtype=torch.bool)
     for index in range(len(order)):
-        if free[index] and len(kept) < BEAM:
+        if free[index] and len(kept) < options.cameras.beam:
             kept.append(index)
             free &= ~close[index]
     return order[kept]
 
 
-def refined(net: Network, reference: int, logs: Tensor, starts: Tensor) -> Reading:
+def refined(net: Network, reference: int, logs: Tensor, starts: Tensor, options: SynchronizeOptions) -> Reading:
     """The weighted least squares of the candidates that a state agrees with, and these chosen again, until they stay."""
     every = torch.ones(len(net.ends), dtype=torch.bool)
     labels: tuple[int, ...] = ()
-    for _ in range(STEPS):
-        cost, chosen = _costs(net, logs[None], starts[None], every)
+    for _ in range(options.cameras.steps):
+        cost, chosen = _costs(net, logs[None], starts[None], every, options)
         if tuple(chosen[0].tolist()) == labels:
             break
         labels = tuple(chosen[0].tolist())
-        logs, starts, covariance = _least_squares(net, reference, labels, logs, starts)
+        logs, starts, covariance = _least_squares(net, reference, labels, logs, starts, options)
     saved = float((starts.isnan() * net.saving).sum())
     return Reading(labels, logs, starts, float(cost.sum()) - saved, covariance)
 
 
 def _least_squares(
-    net: Network, reference: int, labels: tuple[int, ...], logs: Tensor, starts: Tensor
+    net: Network, reference: int, labels: tuple[int, ...], logs: Tensor, starts: Tensor, options: SynchronizeOptions
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Gauss-Newton from a state: logs, starts and their covariance, scaled up where the residuals exceed their sigmas."""
     n, used = net.cameras, [edge for edge, label in enumerate(labels) if label >= 0]
@@ -308,7 +299,7 @@ def _least_squares(
     jacobian[rows, n + here], jacobian[rows, n + there] = weight, -weight
     jacobian[len(used) + rows, here], jacobian[len(used) + rows, there] = rate_weight, -rate_weight
     state = torch.cat([logs, starts])
-    for _ in range(STEPS):
+    for _ in range(options.cameras.steps):
         v_i, v_j = t_i / state[here].exp(), t_j / state[there].exp()
         jacobian[rows, here], jacobian[rows, there] = weight * v_i, -weight * v_j
         away = (v_j - state[n + there]) - (v_i - state[n + here])
@@ -320,11 +311,6 @@ def _least_squares(
     spread = inverse @ inverse.mT * excess.clamp(min=1)
     covariance[free[:, None], free] = spread
     return state[:n], state[n:], covariance
-
-
-DECIDED, CONFIRMED = log(10), log(300)
-"""Odds of the best reading to another, as logarithms, from which it counts as the answer: where the two differ in cameras that
-sure pairs tie to the reference, and in others.  Refused pairs often fail together, all of one camera."""
 
 
 @one_thread
@@ -341,7 +327,8 @@ def synchronize_cameras(
     reference: int = 0,
     pairs: Sequence[tuple[int, int]] | None = None,
     pair: Callable[..., Shift] | None = None,
-    **options: Any,
+    options: SynchronizeOptions = SynchronizeOptions(),
+    **further: Any,
 ) -> Clocks:
     """The clocks of several cameras that filmed the same motion: :func:`dyntorch.synchronize` on the pairs, then
     :func:`combine_shifts`.
@@ -360,7 +347,8 @@ def synchronize_cameras(
         reference: the camera whose clock the others are told in.
         pairs: which pairs of cameras to compare; all, by default.
         pair: what compares two cameras, with the arguments of ``dyntorch.synchronize`` (the default).
-        options: further arguments of it.
+        options: every number that decides, by stage, here and in ``dyntorch.synchronize``.
+        further: arguments of ``pair``.
 
     Returns:
         The clocks; a pair that refuses, contradicts the others or leaves a camera undecided is data there, not an exception.
@@ -380,6 +368,7 @@ def synchronize_cameras(
         >>> synchronize_cameras(tracks, fps=30.0, pair=pair).offsets.round(decimals=6).tolist()
         [0.0, 2.0, -0.5]
     """
+    check_options(options, SynchronizeOptions)
     count = len(tracks)
     if count < 2:
         raise ValueError(f"tracks: {count} camera given, two are needed at least")
@@ -393,20 +382,22 @@ def synchronize_cameras(
         if values is not None and len(values) != count:
             raise ValueError(f"{name}: {len(values)} values for {count} cameras; give one per camera")
     if pair is None:
-        pair = synchronize
+        pair = partial(synchronize, options=options)
     shifts = {}
     for i, j in combinations(range(count), 2) if pairs is None else pairs:
         _check_pair((i, j), count)
         given: dict[str, Any] = {name: (values[i], values[j]) for name, values in every.items() if values is not None}
         try:
-            shifts[i, j] = pair(tracks[i], tracks[j], correspondence, max_shift=max_shift, **given, **options)
+            shifts[i, j] = pair(tracks[i], tracks[j], correspondence, max_shift=max_shift, **given, **further)
         except ValueError as error:
             raise ValueError(f"cameras {i} and {j}: {error}") from error
-    return combine_shifts(shifts, count, reference)
+    return combine_shifts(shifts, count, reference, options=options)
 
 
 @on_cpu
-def combine_shifts(shifts: Mapping[tuple[int, int], Shift], cameras: int, reference: int = 0) -> Clocks:
+def combine_shifts(
+    shifts: Mapping[tuple[int, int], Shift], cameras: int, reference: int = 0, *, options: SynchronizeOptions = SynchronizeOptions()
+) -> Clocks:
     r"""All cameras' clocks from the shifts of pairs: weighted least squares over the peaks that agree.
 
     .. math:: \min \sum_{ij} \frac{w_{ij}}{\sigma_{ij}^2} \bigl(T_j(t_j) - T_i(t_i)\bigr)^2
@@ -447,13 +438,13 @@ def combine_shifts(shifts: Mapping[tuple[int, int], Shift], cameras: int, refere
         raise ValueError("shifts: no pair of cameras is given; give one per camera but the reference at least")
     for ends in shifts:
         _check_pair(ends, cameras)
-    net = network(shifts, cameras)
-    ranked = readings(net, reference)
+    net = network(shifts, cameras, options)
+    ranked = readings(net, reference, options)
     # the answer gives every camera a clock that can have one; whether it decides is another question
     best = min(ranked, key=lambda one: (int(one.starts.isnan().sum()), one.cost))
     rivals = [one for one in ranked if one is not best]
     confidence = 1 / (1 + sum(exp(min(best.cost - one.cost, 50.0)) for one in rivals))
-    reason = _reason(net, shifts, best, rivals, reference)
+    reason = _reason(net, shifts, best, rivals, reference, options)
     rates = best.logs.exp()
     offsets = net.means + rates * (best.starts - net.means[reference])
     used = [edge for edge, label in enumerate(best.labels) if label >= 0]
@@ -530,18 +521,28 @@ def _cycles(
     return found
 
 
-def _reason(net: Network, shifts: Mapping[tuple[int, int], Shift], best: Reading, rivals: Sequence[Reading], reference: int) -> str:
+def _reason(
+    net: Network,
+    shifts: Mapping[tuple[int, int], Shift],
+    best: Reading,
+    rivals: Sequence[Reading],
+    reference: int,
+    options: SynchronizeOptions,
+) -> str:
     """Why the pairs do not decide; empty where they do."""
     lost = best.starts.isnan().nonzero().flatten().tolist()
     if lost:
         return f"no pair leads from the reference to {_named(lost)}: compare further pairs, or leave these cameras out"
     ends, sure = list(shifts), _surely_tied(shifts, best, reference)
-    margins = [DECIDED if sure.issuperset(differing(net, best, one)) else CONFIRMED for one in rivals]
+    margins = [
+        options.cameras.decided if sure.issuperset(differing(net, best, one, options)) else options.cameras.confirmed
+        for one in rivals
+    ]
     close = [one for one, margin in zip(rivals, margins, strict=True) if one.cost - best.cost < margin]
     if not close:
         return ""
     rival = min(close, key=lambda one: one.cost)
-    named = _named(differing(net, best, rival))
+    named = _named(differing(net, best, rival, options))
     lost = rival.starts.isnan().nonzero().flatten().tolist()
     refused = [pair for pair, shift in shifts.items() if not shift.ok and (not lost or set(lost) & set(pair))]
     if refused:

@@ -9,19 +9,16 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from dyntorch.tasks.synchronize.options import SynchronizeOptions
 from dyntorch.tasks.synchronize.result import Shift
-from dyntorch.tasks.synchronize.subspace import FEWEST, STEP, Body, SubspaceCurve, bodies_curve, halves, information, subspace_curve
-from dyntorch.tasks.synchronize.tracks import RATES, Tracks, smoothed
+from dyntorch.tasks.synchronize.subspace import STEP, Body, SubspaceCurve, bodies_curve, halves, information, subspace_curve
+from dyntorch.tasks.synchronize.tracks import Tracks, smoothed
 
 # ----------------------------------------------------------------------------------------------------------------------
 # What speaks against a lag between different points: motion that repeats itself, and a peak that depends on single moments.
 
 
-BLOCKS = 8
-"""Parts of the overlap that are left out in turn."""
-
-
-def resemblance(curve: SubspaceCurve, best: int, apart: float) -> float:
+def resemblance(curve: SubspaceCurve, best: int, apart: float, options: SynchronizeOptions) -> float:
     r"""How much the motion resembles itself at another time that fits as well: 0 not at all, 1 as much as at the same time.
 
     .. math:: \max_\delta \frac{r_a(\delta) + r_b(\delta)}{r_a(0) + r_b(0)}
@@ -39,10 +36,10 @@ def resemblance(curve: SubspaceCurve, best: int, apart: float) -> float:
     judged = curve.scores.isfinite()
     rivals = judged.nonzero()[:, 0] - best
     frames, step = min(len(body.rows) for body in curve.bodies), curve.bodies[0].step
-    reach = min(int(rivals.abs().max()), frames - math.ceil(FEWEST / step))
+    reach = min(int(rivals.abs().max()), frames - math.ceil(options.subspace.least_seconds / step))
     if reach <= apart:
         return 0.0
-    both = sum((_alike(body, reach) for body in curve.bodies), curve.scores.new_zeros(2 * reach + 1))
+    both = sum((_alike(body, reach, options) for body in curve.bodies), curve.scores.new_zeros(2 * reach + 1))
     both = both + both.flip(0)
     padded = torch.nn.functional.pad(both, (1, 1), value=math.inf)
     peak = (both >= padded[:-2]) & (both >= padded[2:])
@@ -54,13 +51,13 @@ def resemblance(curve: SubspaceCurve, best: int, apart: float) -> float:
     return other / own if own > 0 else math.inf
 
 
-def _alike(body: Body, reach: int) -> Tensor:
+def _alike(body: Body, reach: int, options: SynchronizeOptions) -> Tensor:
     """Evidence per frame ``(2 reach + 1,)`` between halves of the points."""
-    first, second = halves(body)
-    return bodies_curve(first.blurred, second.blurred, (-reach, reach), body.step).rates.nan_to_num(-math.inf)
+    first, second = halves(body, options)
+    return bodies_curve(first.blurred, second.blurred, (-reach, reach), body.step, options=options).rates.nan_to_num(-math.inf)
 
 
-def wobble(curve: SubspaceCurve, lag: int) -> float:
+def wobble(curve: SubspaceCurve, lag: int, options: SynchronizeOptions) -> float:
     r"""Standard deviation of the best lag in frames, by the jackknife over parts of the overlap.
 
     .. math:: \sigma^2 = \frac{B - 1}{B} \sum_k (\hat s_{-k} - \bar s)^2, \qquad
@@ -76,9 +73,9 @@ def wobble(curve: SubspaceCurve, lag: int) -> float:
         return 0.0
     a, b = curve.bodies
     start, end = max(0, 1 - lag), min(len(a.rows), len(b.rows) - lag - 1)
-    if end - start < BLOCKS:
+    if end - start < options.different.blocks:
         return math.inf
-    edges = torch.linspace(start, end, BLOCKS + 1).round().long().tolist()
+    edges = torch.linspace(start, end, options.different.blocks + 1).round().long().tolist()
     sizes = torch.tensor(edges).diff().tolist()
     shapes: list[Tensor] = []
     motions: list[Tensor] = []
@@ -88,9 +85,13 @@ def wobble(curve: SubspaceCurve, lag: int) -> float:
             both = torch.cat([x[start:end], y[start + at : end + at], torch.ones_like(w)[:, None]], dim=1) * w[:, None]
             kept.append(torch.stack([part.mT @ part for part in both.split(sizes)]))
     shape, motion = (_without(torch.stack(kept)) for kept in (shapes, motions))
-    before, here, after = information(shape, a.rows.shape[1], motion).unflatten(0, (3, BLOCKS))
+    before, here, after = information(shape, a.rows.shape[1], motion, options).unflatten(0, (3, options.different.blocks))
     bend = float((before - 2 * here + after).mean())
-    return math.sqrt((BLOCKS - 1) * float(((after - before) / 2).var(correction=0))) / -bend if bend < 0 else math.inf
+    return (
+        math.sqrt((options.different.blocks - 1) * float(((after - before) / 2).var(correction=0))) / -bend
+        if bend < 0
+        else math.inf
+    )
 
 
 def _without(moments: Tensor) -> Tensor:
@@ -103,32 +104,6 @@ def _without(moments: Tensor) -> Tensor:
 
 # ----------------------------------------------------------------------------------------------------------------------
 # The lag between two cameras that track different points, between frames, with what speaks against it.
-
-
-PEAKS = 6
-"""Local maxima that are returned."""
-APART = 0.1
-"""Seconds within which peaks are one."""
-SURE = 0.95
-"""Posterior of the best peak for a decision."""
-CLEAR = 7.0
-"""Nats above the next peak at an equal overlap for a decision.  Motion that repeats itself exactly: 98 of 100 gaits stay below 3,
-sums of harmonics reach 13, so this alone is not enough."""
-TELLING = 1.5
-"""Nats per second below which nothing is shared."""
-SHIFT_SHARP = 0.6
-"""Frames: a larger sigma decides nothing.  (.7 keeps 4 percent more of motion capture, and twice the wrong ones of a detector.)"""
-ALONE = 0.7
-"""Share of its score by which a peak is above the next, from which the motion is not compared with itself: of 425 exactly periodic
-motions all stay below .6."""
-REPEATED = 0.68
-"""Resemblance of the motion to itself from which a peak may be another period."""
-BENT = 1.5
-"""Variance about straight lines at constant velocity over that of the noise, of either camera, below which only such lines are
-seen: 1.0 to 1.1 where they are, 16 and more for bodies that bend and turn, at 6 px of noise.  The growing size of the whole bends
-them alike at every shift."""
-BLUR = 1 / 150
-"""Seconds that the peak is off even where it is sharp, because cameras are not affine."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +129,9 @@ class SubspaceShift:
     reason: str
 
 
-def subspace_shift(curve: SubspaceCurve, *, start: float = 0.0, step: float = STEP) -> SubspaceShift:
+def subspace_shift(
+    curve: SubspaceCurve, *, start: float = 0.0, step: float = STEP, options: SynchronizeOptions = SynchronizeOptions()
+) -> SubspaceShift:
     r"""The best lag of a curve, by the parabola through its highest three scores, and whether to believe it.
 
     The scores are logarithms of a posterior over lags, up to a constant: the probability is the share of the peak.  A score grows
@@ -181,26 +158,30 @@ def subspace_shift(curve: SubspaceCurve, *, start: float = 0.0, step: float = ST
     if int(judged.sum()) < 3:
         return _refused(curve, "the cameras overlap too little to judge any shift: film longer, or give a larger max_shift")
     scores = curve.scores.nan_to_num(-math.inf)
-    top = _maxima(scores, APART / step)
-    positions = [_between(scores, i) for i in top[:PEAKS]]
+    top = _maxima(scores, options.different.apart / step, options)
+    positions = [_between(scores, i) for i in top[: options.different.peaks]]
     places = torch.tensor([p for p, _ in positions], dtype=scores.dtype, device=scores.device)
-    peaks = torch.stack([curve.lags[0] + places, scores[top[:PEAKS]]], dim=1)
+    peaks = torch.stack([curve.lags[0] + places, scores[top[: options.different.peaks]]], dim=1)
     best = top[0]
-    probability, margin = _probability(scores, best), _margin(curve, best, APART / step)
+    probability, margin = _probability(scores, best), _margin(curve, best, options.different.apart / step, options)
     probability = min(probability, 1 / (1 + math.exp(-max(min(margin, 700.0), -700.0))))
     position = float(peaks[0, 0])
-    sigma = math.hypot(BLUR / step, max(positions[0][1], wobble(curve, round(position))))
+    sigma = math.hypot(options.different.blur / step, max(positions[0][1], wobble(curve, round(position), options)))
     times = start + step * peaks[1:4, 0]
-    reason = _reason(curve, best, probability, margin, times, step)
-    if not reason and margin < ALONE * float(scores[best]) and resemblance(curve, best, APART / step) > REPEATED:
+    reason = _reason(curve, best, probability, margin, times, step, options)
+    if (
+        not reason
+        and margin < options.different.alone * float(scores[best])
+        and resemblance(curve, best, options.different.apart / step, options) > options.different.repeated
+    ):
         reason = "the motion repeats itself, and another shift fits as well: film something that does not"
-    if not reason and sigma > SHIFT_SHARP:
+    if not reason and sigma > options.different.sharp:
         known = f"to {sigma * step:.3f} s" if math.isfinite(sigma) else "roughly"
         reason = f"the best shift is only known {known}: film longer, or a larger motion"
     return SubspaceShift(position, sigma, peaks, probability, margin, not reason, reason)
 
 
-def _maxima(scores: Tensor, apart: float) -> list[int]:
+def _maxima(scores: Tensor, apart: float, options: SynchronizeOptions) -> list[int]:
     """Local maxima, best first, none within so many frames of a better one."""
     padded = torch.nn.functional.pad(scores, (1, 1), value=-math.inf)
     top = ((scores >= padded[:-2]) & (scores >= padded[2:]) & scores.isfinite()).nonzero()[:, 0]
@@ -208,7 +189,7 @@ def _maxima(scores: Tensor, apart: float) -> list[int]:
     for i in top[scores[top].argsort(descending=True)].tolist():
         if all(abs(i - j) > apart + 1e-9 for j in kept):
             kept.append(i)
-        if len(kept) > 4 * PEAKS:
+        if len(kept) > 4 * options.different.peaks:
             break
     return kept
 
@@ -229,23 +210,25 @@ def _probability(scores: Tensor, best: int) -> float:
     return float(weight[max(best - 1, 0) : best + 2].sum() / weight.sum())
 
 
-def _margin(curve: SubspaceCurve, best: int, apart: float) -> float:
+def _margin(curve: SubspaceCurve, best: int, apart: float, options: SynchronizeOptions) -> float:
     """Nats per frame over the best other maximum, times the best one's frames."""
     rates = torch.where(curve.scores.isfinite(), curve.rates, -math.inf)
-    others = [i for i in _maxima(rates, apart) if abs(i - best) > apart + 1e-9]
+    others = [i for i in _maxima(rates, apart, options) if abs(i - best) > apart + 1e-9]
     return float((rates[best] - rates[others[0]]) * curve.counts[best]) if others else float(curve.scores[best])
 
 
-def _reason(curve: SubspaceCurve, best: int, probability: float, margin: float, times: Tensor, step: float) -> str:
+def _reason(
+    curve: SubspaceCurve, best: int, probability: float, margin: float, times: Tensor, step: float, options: SynchronizeOptions
+) -> str:
     """Why the data do not decide; empty where they do."""
-    if min(curve.signal) < 1 or float(curve.rates[best]) < TELLING * step:
+    if min(curve.signal) < 1 or float(curve.rates[best]) < options.different.telling * step:
         return "the motion is too small against the noise, or the cameras do not show the same event: film a larger motion"
-    if curve.bodies is not None and min(body.bend for body in curve.bodies) < BENT:
+    if curve.bodies is not None and min(body.bend for body in curve.bodies) < options.different.bent:
         return "all points move on straight lines at constant velocity, as at any other shift: film a motion that turns or stops"
-    if probability >= SURE and margin >= CLEAR:
+    if probability >= options.different.sure and margin >= options.different.clear:
         return ""
     others = ", ".join(f"{time:+.2f}" for time in times.tolist())
-    if margin < CLEAR:
+    if margin < options.different.clear:
         return (
             f"other shifts fit about as well (seconds: {others}), as where the motion repeats itself: film something that does not"
         )
@@ -256,52 +239,32 @@ def _refused(curve: SubspaceCurve, reason: str) -> SubspaceShift:
     return SubspaceShift(0.0, math.inf, curve.scores.new_zeros(0, 2), 0.0, 0.0, False, reason)
 
 
-FINEST = 1 / 30
-"""Seconds per step at least: faster films say no more, and noise of neighbouring frames of real detectors is the same."""
-DRIFTING = 20.0
-"""Seconds of overlap from which clock rates are looked for."""
-NEAR = 1.0
-"""Seconds around the best shift in which rates are compared."""
-SHARP = 0.6
-"""Frames of the slower camera: a larger sigma decides nothing."""
-WINDOW = 10.0
-"""Seconds of a window that has a shift of its own."""
-LIKELY = 0.5
-"""Probability from which the shift of a window counts."""
-SPREAD = 0.3
-"""Frames that the shift of a window is uncertain by at least."""
-SIGNIFICANT = 3.0
-"""Sigmas from 1 for a rate to be believed."""
-CONVINCING = 8.0
-"""Nats by which another clock rate has to be better."""
-
-
-def different_points(a: Tracks, b: Tracks, *, max_shift: float | None, rate: float | None) -> Shift:
+def different_points(a: Tracks, b: Tracks, *, max_shift: float | None, rate: float | None, options: SynchronizeOptions) -> Shift:
     """The shift of cameras that see different points of one motion.
 
     Args:
         rate: of b's clock, where it is known.
     """
-    step = max(a.step, b.step, FINEST)
-    found = _Samples(a, b, step, rate or 1.0)
+    step = max(a.step, b.step, options.different.finest)
+    found = _Samples(a, b, step, rate or 1.0, options=options)
     curve = found.curve(max_shift)
     best = found.shift(curve)
     rate_sigma = 0.0
     span = min(float(t.times[-1] - t.times[0]) for t in (a, b))
-    if rate is None and span > DRIFTING and math.isfinite(best.sigma):
+    if rate is None and span > options.different.drifting and math.isfinite(best.sigma):
         # a shift that is sure of itself is near enough everywhere; one that is not may be smeared by a wrong rate
-        settled = _drift(curve, best, step) if best.ok else _rate(a, b, step, span, found.lag(best.position))
+        settled = _drift(curve, best, step, options) if best.ok else _rate(a, b, step, span, found.lag(best.position), options)
         ratio, rate_sigma = settled
         if ratio != 1:
-            found = _Samples(a, b, step, ratio)
+            found = _Samples(a, b, step, ratio, options=options)
             curve = found.curve(max_shift)
             best = found.shift(curve)
-    return _result(a, b, found, curve, _to_a_frame(best, step, max(a.step, b.step)), rate_sigma)
+    return _result(a, b, found, curve, _to_a_frame(best, step, max(a.step, b.step), options), rate_sigma)
 
 
-def _to_a_frame(best: SubspaceShift, step: float, frame: float) -> SubspaceShift:
+def _to_a_frame(best: SubspaceShift, step: float, frame: float, options: SynchronizeOptions) -> SubspaceShift:
     """Refused where the shift is not known to a frame of the slower camera, though it may be to a step of the search."""
-    if not best.ok or best.sigma * step <= SHARP * frame:
+    if not best.ok or best.sigma * step <= options.different.sharp_frames * frame:
         return best
     reason = (
         f"the best shift is uncertain by {best.sigma * step:.2g} s, frames are {frame:.2g} s apart: film longer, or larger motion"
@@ -312,9 +275,10 @@ def _to_a_frame(best: SubspaceShift, step: float, frame: float) -> SubspaceShift
 class _Samples:
     """Both cameras at equal steps of a's clock."""
 
-    def __init__(self, a: Tracks, b: Tracks, step: float, rate: float) -> None:
-        self.first, self.wa = _sampled(a, step)
-        self.second, self.wb = _sampled(b, step * rate)
+    def __init__(self, a: Tracks, b: Tracks, step: float, rate: float, options: SynchronizeOptions) -> None:
+        self.options = options
+        self.first, self.wa = _sampled(a, step, self.options)
+        self.second, self.wb = _sampled(b, step * rate, self.options)
         self.start = float(b.times[0]) / rate - float(a.times[0])
         self.step, self.rate = step, rate
 
@@ -324,36 +288,36 @@ class _Samples:
         if max_shift is not None:
             low, high = (((around + sign * max_shift) / self.rate - self.start) / self.step for sign in (-1, 1))
             lo, hi = min(max(lo, math.ceil(low - 1e-9)), hi), max(min(hi, math.floor(high + 1e-9)), lo)
-        return subspace_curve(self.first, self.second, self.wa, self.wb, (lo, max(lo, hi)), step=self.step)
+        return subspace_curve(self.first, self.second, self.wa, self.wb, (lo, max(lo, hi)), step=self.step, options=self.options)
 
     def shift(self, curve: SubspaceCurve) -> SubspaceShift:
-        return subspace_shift(curve, start=self.start, step=self.step)
+        return subspace_shift(curve, start=self.start, step=self.step, options=self.options)
 
     def lag(self, position: Tensor | float) -> Tensor | float:
         """Seconds of b's clock at time 0 of a's."""
         return (self.start + position * self.step) * self.rate
 
 
-def _sampled(tracks: Tracks, step: float) -> tuple[Tensor, Tensor]:
+def _sampled(tracks: Tracks, step: float, options: SynchronizeOptions) -> tuple[Tensor, Tensor]:
     if abs(tracks.step / step - 1) < 1e-6 and float((tracks.times.diff() / step - 1).abs().max()) < 1e-3:
         return tracks.x, tracks.weights  # its own frames: nothing to interpolate
-    x, _, weights = smoothed(tracks, tracks.every(step), max(0.5 * step, 0.5 * tracks.step))
+    x, _, weights = smoothed(tracks, tracks.every(step), max(0.5 * step, 0.5 * tracks.step), options)
     return x, weights
 
 
-def _drift(curve: SubspaceCurve, best: SubspaceShift, step: float) -> tuple[float, float]:
+def _drift(curve: SubspaceCurve, best: SubspaceShift, step: float, options: SynchronizeOptions) -> tuple[float, float]:
     """The clock rate by a line through the shifts of windows, and its sigma; 1 unless it differs significantly."""
     assert curve.bodies is not None
     first, second = curve.bodies
-    lag, reach = round(best.position), round(NEAR / step)
+    lag, reach = round(best.position), round(options.different.near / step)
     begin, end = max(0, reach - lag), min(len(first.rows), len(second.rows) - lag)
-    size = min(round(WINDOW / step), (end - begin) // 4)
+    size = min(round(options.different.window / step), (end - begin) // 4)
     found = []
     for start in range(begin, end - size + 1, size):
         parts = _cut(first, start, start + size), _cut(second, start + lag - reach, start + lag + size + reach)
-        local = subspace_shift(bodies_curve(*parts, (0, 2 * reach), step), step=1.0)
-        if math.isfinite(local.sigma) and local.probability > LIKELY and 1 < local.position < 2 * reach - 1:
-            found.append((start + size / 2, local.position, max(local.sigma, SPREAD)))
+        local = subspace_shift(bodies_curve(*parts, (0, 2 * reach), step, options=options), step=1.0, options=options)
+        if math.isfinite(local.sigma) and local.probability > options.different.likely and 1 < local.position < 2 * reach - 1:
+            found.append((start + size / 2, local.position, max(local.sigma, options.different.spread)))
     if len(found) < 3:
         return 1.0, math.inf
     times, shifts, sigmas = torch.tensor(found, dtype=torch.float64).unbind(1)
@@ -368,7 +332,7 @@ def _drift(curve: SubspaceCurve, best: SubspaceShift, step: float) -> tuple[floa
     if total <= 0:
         return 1.0, math.inf
     drift, sigma = float((lever * shifts).sum()) / total, total**-0.5
-    return (1 + drift, sigma) if abs(drift) > SIGNIFICANT * sigma else (1.0, sigma)
+    return (1 + drift, sigma) if abs(drift) > options.different.significant * sigma else (1.0, sigma)
 
 
 def _cut(body: Body, start: int, end: int) -> Body:
@@ -376,18 +340,18 @@ def _cut(body: Body, start: int, end: int) -> Body:
     return dataclasses.replace(body, rows=body.rows[part], motion=body.motion[part], weights=body.weights[part])
 
 
-def _rate(a: Tracks, b: Tracks, step: float, span: float, lag: Tensor | float) -> tuple[float, float]:
+def _rate(a: Tracks, b: Tracks, step: float, span: float, lag: Tensor | float, options: SynchronizeOptions) -> tuple[float, float]:
     """The clock rate whose best score near a shift is highest, by the parabola over rates, and its sigma; 1 unless convincing."""
     change = 4 * step / span  # moves the ends of the overlap by two steps
-    count = math.ceil(RATES / change)
+    count = math.ceil(options.input.frame_rate_error / change)
     rates = [1 + k * change for k in range(-count, count + 1)]
     middle = span / 2
     best = []
     for rate in rates:
-        samples = _Samples(a, b, step, rate)
+        samples = _Samples(a, b, step, rate, options=options)
         # the moment in the middle keeps its place: (t + lag) of the old rate is rate (t + lag') of the new
         around = float(lag) - (rate - 1) * middle
-        best.append(float(samples.curve(NEAR, around).scores.nan_to_num(-math.inf).max()))
+        best.append(float(samples.curve(options.different.near, around).scores.nan_to_num(-math.inf).max()))
     scores = torch.tensor(best, dtype=torch.float64)
     top = int(scores.argmax())
     bend = float(scores[top - 1] - 2 * scores[top] + scores[top + 1]) if 0 < top < len(rates) - 1 else 0.0
@@ -395,7 +359,7 @@ def _rate(a: Tracks, b: Tracks, step: float, span: float, lag: Tensor | float) -
         return 1.0, 0.0
     sigma = change / math.sqrt(-bend)
     place = 0.5 * float(scores[top - 1] - scores[top + 1]) / bend
-    if best[top] - best[count] < CONVINCING:
+    if best[top] - best[count] < options.different.convincing:
         return 1.0, sigma
     return rates[top] + change * max(-0.5, min(0.5, place)), sigma
 

@@ -14,12 +14,9 @@ from dyntorch.geometry.epipolar import epipolar_variance, rank_two
 from dyntorch.geometry.homogeneous import homogeneous
 from dyntorch.numerics.lags import epipolar_moments
 from dyntorch.numerics.least_squares import damped_step
+from dyntorch.tasks.synchronize.options import SynchronizeOptions
 from dyntorch.tasks.synchronize.tracks import Tracks, noise_ratio, smoothed
 
-OVERLAP = 0.25
-"""Share of the largest overlap below which a shift is not judged: little data fit anything."""
-FEWEST = 24
-"""Pairs of positions below which a shift is not judged: three times the unknowns of F."""
 PIECE = 4096
 """Lags at a time: bounds the memory on long takes."""
 
@@ -47,10 +44,10 @@ class Samples:
     noise: tuple[float, float]
 
     @staticmethod
-    def of(a: Tracks, b: Tracks, step: float, rate: float = 1.0) -> Samples:
+    def of(a: Tracks, b: Tracks, step: float, rate: float = 1.0, *, options: SynchronizeOptions) -> Samples:
         """b's clock goes ``rate`` seconds in one of a's.  The kernel is as wide as a step."""
-        first, w1 = _sampled(a, step, step)
-        second, w2 = _sampled(b, step * rate, step * rate)
+        first, w1 = _sampled(a, step, step, options)
+        second, w2 = _sampled(b, step * rate, step * rate, options)
         noise = float(a.change[0, 0]), float(b.change[0, 0]) * noise_ratio(a, b)
         start = float(b.times[0]) / rate - float(a.times[0])
         return Samples(first, second, w1, w2, step, start, rate, noise)
@@ -121,7 +118,9 @@ class Curve:
         return lag + step * max(-0.5, min(0.5, 0.5 * (before - after) / bend))
 
 
-def epipolar_curve(samples: Samples, max_shift: float | None = None, overlap: float = OVERLAP) -> Curve:
+def epipolar_curve(
+    samples: Samples, max_shift: float | None = None, overlap: float | None = None, *, options: SynchronizeOptions
+) -> Curve:
     r"""Scores at all lags.
 
     .. math:: \text{score}(s) = -\tfrac12 \log \frac{\lambda(s)}{\operatorname{med} \lambda}
@@ -132,17 +131,18 @@ def epipolar_curve(samples: Samples, max_shift: float | None = None, overlap: fl
     with half the overlap has to fit with half the variance.
 
     Args:
-        overlap: share of the largest overlap below which a lag is not judged.
+        overlap: share of the largest overlap below which a lag is not judged; None: that of the options.
 
     Source: thesis, chapter 7; Taubin 1991 for the normalization.
     """
+    overlap = options.curve.least_overlap if overlap is None else overlap
     lo, hi = samples.lags(max_shift)
     found = [_piece(samples, first, min(first + PIECE - 1, hi)) for first in range(lo, hi + 1, PIECE)]
     if not found:
         empty = samples.x1.new_zeros(0)
         return Curve(empty, empty, empty, empty, samples.rate, 1.0)
     variance, counts = (torch.cat(parts) for parts in zip(*found, strict=True))
-    judged = (counts >= overlap * counts.max()) & (counts >= FEWEST) & variance.isfinite()
+    judged = (counts >= overlap * counts.max()) & (counts >= options.curve.fewest_pairs) & variance.isfinite()
     level = variance[judged].median() if bool(judged.any()) else variance.new_ones(())
     tiny = torch.finfo(variance.dtype).tiny
     scores = -0.5 * (variance / level.clamp(min=tiny)).clamp(min=tiny).log() + 0.5 * (counts / counts.max()).clamp(min=tiny).log()
@@ -155,19 +155,14 @@ def _piece(samples: Samples, lo: int, hi: int) -> tuple[Tensor, Tensor]:
     return epipolar_variance(moments, samples.noise)[0], counts
 
 
-def _sampled(tracks: Tracks, step: float, width: float) -> tuple[Tensor, Tensor]:
-    x, _, weights = smoothed(tracks, tracks.every(step), width)
+def _sampled(tracks: Tracks, step: float, width: float, options: SynchronizeOptions) -> tuple[Tensor, Tensor]:
+    x, _, weights = smoothed(tracks, tracks.every(step), width, options)
     change = tracks.change
     return torch.where((weights > 0)[..., None], x @ change[:2, :2].mT + change[:2, 2], 0.0), weights
 
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Smoothed tracks at equal steps, for positions and velocities at any moment between.
-
-
-CALM = 0.75, 1.25, 2.5
-"""Velocities are smoothed more widely than positions: what noise they share with the residuals would pull the estimate and
-make it look surer than it is.  How much more: 1 + .75 times the noise over the movement from frame to frame, within bounds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,16 +177,18 @@ class Grid:
     weights: Tensor  # (m, n)
 
     @staticmethod
-    def of(tracks: Tracks, width: float) -> Grid:
+    def of(tracks: Tracks, width: float, options: SynchronizeOptions) -> Grid:
         """With steps of half the kernel's width: between them the polynomial is exact to thousandths of the noise."""
         step, start = width / 2, float(tracks.times[0])
         count = max(2, math.ceil((float(tracks.times[-1]) - start) / step) + 1)
         at = start + step * torch.arange(count, dtype=torch.float64, device=tracks.x.device)
-        x, v, weights = smoothed(tracks, at, width)
+        x, v, weights = smoothed(tracks, at, width, options)
         speed = float(torch.where(weights > 0, v.square().sum(-1), torch.nan).nanmedian()) ** 0.5
-        slope, least, most = CALM
-        wider = min(max(1 + slope * tracks.noise / max(speed * width, 1e-300), least), most)
-        _, calm, _ = smoothed(tracks, at, wider * width)
+        wider = min(
+            max(1 + options.curve.calm_slope * tracks.noise / max(speed * width, 1e-300), options.curve.calm_least),
+            options.curve.calm_most,
+        )
+        _, calm, _ = smoothed(tracks, at, wider * width, options)
         return Grid(start, step, x, v, calm, weights)
 
     def at(self, times: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -211,37 +208,6 @@ class Grid:
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Offset, clock rate and fundamental matrix at once: robust least squares of the Sampson distance from a start near by.
-
-
-CUT = 4.0
-"""Robust standard deviations of the residual at which Geman and McClure's weight is a quarter."""
-BLOCK = 30
-"""Frames that share a scale."""
-UNEQUAL = (0.4, 6.0)
-"""Least and largest scale of a point or a block, over that of all."""
-OPTIMISM = 1.6
-"""Errors over the sigma that the residuals alone say: 1.5 to 1.8 on motion capture with 5 to 60 mm of noise."""
-ITERATIONS = 30
-DONE = 1e-5
-"""Frames: the descent ends with a step below it."""
-NEARLY = 1e-3
-"""Frames: the same before the last rows come in."""
-ENOUGH = 4_000
-"""Rows for most of the way."""
-LEAP = 2.0
-"""Frames: the largest step."""
-LEAST = 0.003
-"""Frames of error that smoothing leaves in exact data."""
-FASTEST = 0.03
-"""Change of the rate at which a descent has gone astray."""
-ROWS = 200_000
-"""Residuals that a descent takes at most; from longer takes it takes moments at equal distances.  Beyond, only sigma would
-shrink."""
-DESCENT_FEWEST = 16
-"""Pairs of positions."""
-MEMORY = 2.0, 6
-"""Residuals are taken to depend on each other over two seconds, but a sixth of the overlap at the most: detectors err for that
-long."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,13 +246,14 @@ class EpipolarFit:
 class ShiftDescent:
     """The problem for two cameras: what does not depend on the start is smoothed once."""
 
-    def __init__(self, a: Tracks, b: Tracks, width: float, rows: int = ROWS) -> None:
-        stride = max(1, math.ceil(len(a.times) * a.x.shape[1] / rows))
+    def __init__(self, a: Tracks, b: Tracks, width: float, rows: int | None = None, *, options: SynchronizeOptions) -> None:
+        self.options = options
+        stride = max(1, math.ceil(len(a.times) * a.x.shape[1] / (self.options.descent.most_rows if rows is None else rows)))
         step = max(a.step, b.step) * stride
         span = float(a.times[-1] - a.times[0])
         self.times = a.times[0] + step * torch.arange(int(span / step) + 1, dtype=torch.float64, device=a.x.device)
-        self.x, _, self.weights = smoothed(a, self.times, width)
-        self.grid = Grid.of(b, width)
+        self.x, _, self.weights = smoothed(a, self.times, width, self.options)
+        self.grid = Grid.of(b, width, self.options)
         self.frame = max(a.step, b.step)
         self.width = width
         self.changes = (a.change, b.change)
@@ -299,17 +266,17 @@ class ShiftDescent:
             start: F of the normalized coordinates; by default the best for the start.
         """
         state = _State(offset, rate, start)
-        stride = max(1, self.weights.numel() // ENOUGH)
+        stride = max(1, self.weights.numel() // self.options.descent.enough_rows)
         # most of the way on some of the rows, the rest on all
         for every in (stride, 1) if stride > 1 else (1,):
-            for _ in range(ITERATIONS):
+            for _ in range(self.options.descent.iterations):
                 rows = self._rows(state, every)
                 if rows is None:
                     return None
                 moved = self._step(state, rows, free_rate)
-                if abs(state.rate / rate - 1) > FASTEST:
+                if abs(state.rate / rate - 1) > self.options.descent.largest_drift:
                     return None
-                if moved < (DONE if every == 1 else NEARLY) * self.frame:
+                if moved < (self.options.descent.done if every == 1 else self.options.descent.nearly) * self.frame:
                     break
         rows = self._rows(state)
         return None if rows is None else self._fit(state, rows, free_rate)
@@ -324,7 +291,7 @@ class ShiftDescent:
         x2, v2, w2 = self.grid.at(self.times[::every] * rate + offset)
         sure = self.weights[::every] * w2
         both = sure > 0
-        if int(both.sum()) < DESCENT_FEWEST:
+        if int(both.sum()) < self.options.descent.fewest_pairs:
             return None
         first, second = self.changes
         p, q = homogeneous(self.x[::every][both]) @ first.mT, homogeneous(x2[both]) @ second.mT
@@ -350,7 +317,7 @@ class ShiftDescent:
         gradient = (s1**2 * Fq[:, :2].square().sum(-1) + s2**2 * Fp[:, :2].square().sum(-1)).clamp(min=1e-300).sqrt()
         residual = (matched.q * Fp).sum(-1) / gradient
         along = (matched.speed * Fp).sum(-1) / gradient
-        return _Rows(residual, matched.products / gradient[:, None], along, times, matched.both, matched.sure)
+        return _Rows(residual, matched.products / gradient[:, None], along, times, matched.both, matched.sure, options=self.options)
 
     def _step(self, state: _State, rows: _Rows, free_rate: bool) -> float:
         """One step of iteratively reweighted least squares; its length in seconds, at the ends of the overlap."""
@@ -367,7 +334,7 @@ class ShiftDescent:
         step = damped_step((J.mT @ (w * rows.residual))[None], (J.mT @ (J * w[:, None]))[None], damping)[0]
         turns = len(tangent)
         moves = -step[turns:]
-        limit = LEAP * self.frame
+        limit = self.options.descent.largest_step * self.frame
         share = min(1.0, limit / max(float(moves.abs().max()), 1e-300))
         state.F = rank_two(state.F - share * (step[:turns] @ tangent).unflatten(0, (3, 3)))
         shift = share * float(moves[0])
@@ -391,7 +358,12 @@ class ShiftDescent:
         frames = torch.zeros(len(self.times), influence.shape[1], dtype=J.dtype, device=J.device)
         frames.index_add_(0, rows.both.nonzero()[:, 0], influence)
         step = float(self.times[1] - self.times[0]) if len(self.times) > 1 else self.frame
-        sigmas = _long_run(frames, round(min(MEMORY[0], float(rows.times[-1] - rows.times[0]) / MEMORY[1]) / step))
+        sigmas = _long_run(
+            frames,
+            round(
+                min(self.options.descent.memory, float(rows.times[-1] - rows.times[0]) / self.options.descent.memory_parts) / step
+            ),
+        )
         scale_of = rows.scale()
         first, second = self.changes
         F = second.mT @ state.F @ first
@@ -402,8 +374,8 @@ class ShiftDescent:
             offset=state.offset,
             rate=state.rate,
             center=state.center,
-            sigma=math.hypot(OPTIMISM * float(sigmas[0]), LEAST * self.frame),
-            rate_sigma=OPTIMISM * float(sigmas[1]) if free_rate else 0.0,
+            sigma=math.hypot(self.options.descent.optimism * float(sigmas[0]), self.options.descent.least_sigma * self.frame),
+            rate_sigma=self.options.descent.optimism * float(sigmas[1]) if free_rate else 0.0,
             residual=scale_of,
             fundamental=F / F.norm(),
             distances=distances,
@@ -442,6 +414,7 @@ class _Rows:
     times: Tensor  # (m,)
     both: Tensor  # (frames, n) bool
     sure: Tensor  # (m,): weights of the positions
+    options: SynchronizeOptions
 
     def scale(self) -> float:
         return 1.4826 * float(self.residual.abs().median())
@@ -451,12 +424,21 @@ class _Rows:
         pooled = max(self.scale(), 1e-300)
         every = torch.full(self.both.shape, torch.nan, dtype=torch.float64, device=self.residual.device)
         every[self.both] = self.residual.abs() * (1.4826 / pooled)
-        point = every.nanmedian(0).values.nan_to_num(1.0).clamp(*UNEQUAL)
-        pad = -len(every) % BLOCK
-        blocks = torch.nn.functional.pad(every / point, (0, 0, 0, pad), value=torch.nan).unflatten(0, (-1, BLOCK)).flatten(1)
-        moment = blocks.nanmedian(1).values.nan_to_num(1.0).clamp(*UNEQUAL).repeat_interleave(BLOCK)[: len(every)]
+        point = every.nanmedian(0).values.nan_to_num(1.0).clamp(*self.options.descent.unequal)
+        pad = -len(every) % self.options.descent.block_frames
+        blocks = (
+            torch.nn.functional.pad(every / point, (0, 0, 0, pad), value=torch.nan)
+            .unflatten(0, (-1, self.options.descent.block_frames))
+            .flatten(1)
+        )
+        moment = (
+            blocks.nanmedian(1)
+            .values.nan_to_num(1.0)
+            .clamp(*self.options.descent.unequal)
+            .repeat_interleave(self.options.descent.block_frames)[: len(every)]
+        )
         own = (moment[:, None] * point)[self.both]
-        return self.sure * (1 + (self.residual / (CUT * pooled * own)).square()).pow(-2) / own.square()
+        return self.sure * (1 + (self.residual / (self.options.descent.cut * pooled * own)).square()).pow(-2) / own.square()
 
 
 def _tangent(F: Tensor) -> Tensor:

@@ -12,37 +12,9 @@ from torch import Generator, Tensor
 
 from dyntorch.geometry.epipolar import epipolar_variance, gradient_moments
 from dyntorch.numerics.lags import epipolar_moments
-from dyntorch.tasks.synchronize.epipolar import FEWEST, OVERLAP, Curve, EpipolarFit, Samples, ShiftDescent, epipolar_curve
+from dyntorch.tasks.synchronize.epipolar import Curve, EpipolarFit, Samples, ShiftDescent, epipolar_curve
+from dyntorch.tasks.synchronize.options import SynchronizeOptions
 from dyntorch.tasks.synchronize.tracks import Tracks
-
-PEAKS = 6
-"""Local maxima of the curve from which a descent may start."""
-FEW_ROWS = 3_000
-"""Residuals that are enough to compare peaks."""
-MARGIN = 0.2
-"""Nats above the next peak for a decision.  Motion capture, 120 frames: exactly periodic gaits stay below .17 in 95 of 100, true
-peaks are above .31 with 30 mm of noise."""
-AFFINE_MARGIN = 0.5
-"""The same for affine cameras: what they leave unexplained differs from period to period of a gait."""
-CHOSEN = 0.5
-"""Nats more, where the residual is e times the usual."""
-ROUGH = (4.0, 2.0)
-"""Usual residual over what the noise explains; where points or positions were left out.  Synthetic takes that have nothing in
-common were made to fit with margins up to .42 and residuals of 7 to 22 times; real detectors have 4 to 9 times and margins above
-1.2."""
-APART = 2.5
-"""Frames within which peaks are one, and halves of a take agree."""
-HALF = 0.5
-"""Share of the largest overlap below which a half of the take does not judge a shift."""
-RIVALS = 3
-"""Other peaks that are compared between frames."""
-FRACTIONS = 5
-"""Places within a step of a peak."""
-SHARP = 0.25, 1 / 30
-"""Frames, of a thirtieth of a second at least: a larger sigma decides nothing: where the motion is hardly above the noise, it is a
-lower bound."""
-WANDER = 1.35
-"""Residual over what each half of the take has by itself, beyond which a camera may have moved."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +41,7 @@ class Attempt:
     max_shift: float | None
     points: Tensor
     method: str
+    options: SynchronizeOptions
     pruned: bool = False
 
     @property
@@ -81,12 +54,12 @@ class Attempt:
         """Shifts at the center and scores of the curve's peaks; the fit's own first."""
         if self.fit is None:
             return []
-        found = [(self._shift(lag), score) for lag, score in self.curve.peaks(4 * PEAKS)]
+        found = [(self._shift(lag), score) for lag, score in self.curve.peaks(4 * self.options.evidence.peaks)]
         here = [score for shift, score in found if self._near(shift)]
         own = here[0] if here else self._score(self.fit.shift)
         # a higher maximum of the curve that a descent found no better is none
         others = [(shift, min(score, own)) for shift, score in found if not self._near(shift)]
-        return [(self.fit.shift, own), *others[: PEAKS - 1]]
+        return [(self.fit.shift, own), *others[: self.options.evidence.peaks - 1]]
 
     @cached_property
     def margin(self) -> float:
@@ -100,14 +73,18 @@ class Attempt:
         rough = [self.curve.misfit(self._lag(shift)) for shift, _ in self.peaks] or [0.0]
         if self.fit is None or len(rough) == 1:
             return rough
-        descent = ShiftDescent(self.a, self.b, max(self.frame, self.step), rows=FEW_ROWS)
-        steps = self.step * torch.linspace(-1, 1, FRACTIONS, dtype=torch.float64)
+        descent = ShiftDescent(self.a, self.b, max(self.frame, self.step), rows=self.options.evidence.rows, options=self.options)
+        steps = self.step * torch.linspace(-1, 1, self.options.evidence.fractions, dtype=torch.float64)
         level = max(self.curve.level, 1e-300)
-        for k, (shift, _) in enumerate(self.peaks[: RIVALS + 1]):
+        for k, (shift, _) in enumerate(self.peaks[: self.options.evidence.rivals + 1]):
             offset = shift - (self.fit.rate - 1) * self.fit.center
             found = [descent.variance(offset + float(step), self.fit.rate) for step in steps]
             # exact data: a step of the own peak is as far from its bottom as the nearest step of a rival's may be
-            least = min(found) if k else min(found[FRACTIONS // 2 - 1], found[FRACTIONS // 2 + 1])
+            least = (
+                min(found)
+                if k
+                else min(found[self.options.evidence.fractions // 2 - 1], found[self.options.evidence.fractions // 2 + 1])
+            )
             rough[k] = -0.5 * math.log(max(least, 1e-300) / level)
         return rough
 
@@ -139,12 +116,17 @@ class Attempt:
         shared = (there >= float(self.b.times[0]) - self.step) & (there <= float(self.b.times[-1]) + self.step)
         early = times < self.fit.center
         parts = [torch.where((shared & part)[:, None], w1, 0.0) for part in (early, ~early)]
-        return [epipolar_curve(dataclasses.replace(self.samples, w1=part), self.max_shift, HALF) for part in parts]
+        return [
+            epipolar_curve(
+                dataclasses.replace(self.samples, w1=part), self.max_shift, self.options.evidence.half_overlap, options=self.options
+            )
+            for part in parts
+        ]
 
     @cached_property
     def agree(self) -> bool:
         """Whether both halves of the overlap say the same shift as the whole."""
-        return self.fit is not None and all(abs(away) <= APART for away in self.halves)
+        return self.fit is not None and all(abs(away) <= self.options.evidence.apart for away in self.halves)
 
     @cached_property
     def wander(self) -> float:
@@ -165,15 +147,21 @@ class Attempt:
     @property
     def sharp(self) -> bool:
         """Whether the shift is known well enough to trust its sigma."""
-        return self.fit is not None and self.fit.sigma <= SHARP[0] * max(self.frame, SHARP[1])
+        return self.fit is not None and self.fit.sigma <= self.options.evidence.sharp * max(
+            self.frame, self.options.evidence.shortest_frame
+        )
 
     @property
     def needed(self) -> float:
         """Nats above the next peak, for a decision."""
-        least = MARGIN if self.method == "epipolar" else AFFINE_MARGIN
+        least = self.options.evidence.margin if self.method == "epipolar" else self.options.evidence.affine_margin
         # with a residual far above the noise something may have been made to fit, the more so by leaving out what does not
-        usual = ROUGH[1] if self.pruned or not bool(self.points.all()) else ROUGH[0]
-        return least + CHOSEN * min(max(math.log(max(self.roughness, 1e-300) / usual), 0.0), 1.0)
+        usual = (
+            self.options.evidence.usual_roughness_pruned
+            if self.pruned or not bool(self.points.all())
+            else self.options.evidence.usual_roughness
+        )
+        return least + self.options.evidence.rough_margin * min(max(math.log(max(self.roughness, 1e-300) / usual), 0.0), 1.0)
 
     @property
     def roughness(self) -> float:
@@ -193,8 +181,18 @@ class Attempt:
         if self.fit is None:
             return 0.0
         own = math.erf(self.frame / max(math.sqrt(2) * self.sigma, 1e-12))
-        rival = 1 / (1 + math.exp(-(self.margin - 0.6 * self.needed) / 0.05)) if self.margin > -10 else 0.0
-        return own * rival * (0.995 if self.agree else 0.3) * (1.0 if self.sharp and not self.edge else 0.5)
+        rival = (
+            1
+            / (1 + math.exp(-(self.margin - self.options.evidence.even_margin * self.needed) / self.options.evidence.margin_scale))
+            if self.margin > self.options.evidence.hopeless_margin
+            else 0.0
+        )
+        return (
+            own
+            * rival
+            * (self.options.evidence.agreeing if self.agree else self.options.evidence.disagreeing)
+            * (1.0 if self.sharp and not self.edge else self.options.evidence.blurred)
+        )
 
     def _shift(self, lag: float) -> float:
         """Of b's clock against a's at the center, of a lag of the curve."""
@@ -208,7 +206,7 @@ class Attempt:
 
     def _near(self, shift: float) -> bool:
         assert self.fit is not None
-        return abs(shift - self.fit.shift) <= max(APART * self.frame, 1.5 * self.step)
+        return abs(shift - self.fit.shift) <= max(self.options.evidence.apart * self.frame, 1.5 * self.step)
 
     def _score(self, shift: float) -> float:
         assert self.fit is not None
@@ -225,21 +223,9 @@ class Attempt:
 # Which points are the same in both cameras: subsets vote, each at the shift it likes best.
 
 
-SIZE = 6
-"""Points of a subset."""
-TRIALS = 60
-"""A subset of 6 without 4 wrong points of 17 comes up with probability .14: one in 60 trials in all but 1 of 10,000."""
-SHARE = 0.7
-"""Of the points that have to fit."""
-WRONG = 3.0
-"""Times the median residual of those that fit, beyond which a point is wrong."""
-FEW = 8
-"""Points below which none can be told wrong."""
-LAGS = 800
-"""At most; longer searches are made in coarser steps."""
-
-
-def consistent_points(a: Tracks, b: Tracks, found: Attempt, generator: Generator | None) -> Tensor | None:
+def consistent_points(
+    a: Tracks, b: Tracks, found: Attempt, generator: Generator | None, options: SynchronizeOptions
+) -> Tensor | None:
     """Points ``(n,)`` bool whose epipolar residual agrees with the others' at one and the same shift; None where there are too few.
 
     Subsets of six are drawn; each has its own best shift and fundamental matrix, by which all points are judged.  The subset
@@ -249,34 +235,34 @@ def consistent_points(a: Tracks, b: Tracks, found: Attempt, generator: Generator
     """
     n = a.x.shape[1]
     lo, hi = found.samples.lags(found.max_shift)
-    if n < FEW or lo > hi:
+    if n < options.points.fewest or lo > hi:
         return None
-    step = found.step * max(1, -(-(hi - lo) // LAGS))
-    samples = Samples.of(a, b, step, found.samples.rate)
+    step = found.step * max(1, -(-(hi - lo) // options.points.most_lags))
+    samples = Samples.of(a, b, step, found.samples.rate, options=options)
     moments, counts = epipolar_moments(
         samples.x1, samples.x2, samples.lags(found.max_shift), (samples.w1, samples.w2), per_point=True
     )
     total = counts.sum(0)
-    judged = (total >= OVERLAP * total.max()) & (total >= FEWEST)
+    judged = (total >= options.curve.least_overlap * total.max()) & (total >= options.curve.fewest_pairs)
     if not bool(judged.any()):
         return None
     moments, counts = moments[:, judged], counts[:, judged]
     forms = gradient_moments(moments, samples.noise)
     generator = generator or torch.Generator().manual_seed(0)
     best: tuple[float, Tensor] | None = None
-    for _ in range(TRIALS):
-        chosen = torch.randperm(n, generator=generator)[:SIZE].to(moments.device)
+    for _ in range(options.points.subsets):
+        chosen = torch.randperm(n, generator=generator)[: options.points.subset].to(moments.device)
         variance, F = epipolar_variance(moments[chosen].sum(0), samples.noise)
         lag = int((variance / counts[chosen].sum(0).clamp(min=1).sqrt()).argmin())
         each = _variances(moments[:, lag], forms[:, lag], F[lag])
-        cost = float(each.nanquantile(SHARE))
+        cost = float(each.nanquantile(options.points.share))
         if best is None or cost < best[0]:
             best = cost, each
     assert best is not None
     each = best[1]
     level = each[each <= best[0]].median()
-    kept = ~(each > WRONG**2 * level)
-    return kept if int(kept.sum()) >= SHARE * n else None
+    kept = ~(each > options.points.wrong**2 * level)
+    return kept if int(kept.sum()) >= options.points.share * n else None
 
 
 def _variances(moments: Tensor, forms: Tensor, F: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.numerics.lags import lag_covariances
+from dyntorch.tasks.synchronize.options import SynchronizeOptions
 
 # ----------------------------------------------------------------------------------------------------------------------
 # What the points of one camera tell about time, whichever points they are: how the body changes and how it moves on the whole.
@@ -16,27 +17,6 @@ from dyntorch.numerics.lags import lag_covariances
 
 STEP = 1 / 30
 """Seconds from frame to frame, unless told."""
-SMOOTH = 1 / 30
-"""Seconds, standard deviation of the Gaussian that positions are smoothed by (15 mm of noise: twice that finds one to two
-percent less)."""
-SLOW = 1 / 3
-"""Seconds, of the Gaussian for the size of the body in the image: the distance changes slowly (half to six times as much are
-alike to a percent)."""
-WIDE = (1.0, 2.5, 6.0, 15.0, 40.0)
-"""Frames, of ever wider Gaussians that look for what is missing."""
-NOISE = 2.0
-"""Noise variance of the rows over that of third differences: cameras are not affine (1 to 4 are alike, 8 is 4 percent
-worse)."""
-NARROW = 0.7
-"""Frames, the least smoothing: below, a sampled Gaussian is none."""
-ROUNDS = 12
-"""Fills of what is missing from the other points."""
-EDGE = 2.0
-"""Widths of smoothing left out at either end, where it is one-sided, in both cameras at once: that would speak for lag 0."""
-STRAY = 3.0
-"""Median distances from the middle beyond which a track takes no part in the middle and the size."""
-ROUNDING = 1e-6
-"""Of the extent of the points: what a track is off a line by that says nothing."""
 TINY = 1e-9
 """Of the size of the body: the least standard deviation of noise that is believed."""
 
@@ -60,6 +40,7 @@ class Body:
     points: Tensor
     seen: Tensor
     step: float
+    options: SynchronizeOptions
 
     @property
     def bend(self) -> float:
@@ -73,7 +54,7 @@ class Body:
         square = (w * t * t).sum(0)
         x = x - t * (w * t * x).sum(0) / torch.where(square > 0, square, 1.0)
         extent = float(self.points.flatten(0, 1).std(0).norm())
-        noise = max(_noise(self.points, self.seen), (ROUNDING * extent) ** 2, 1e-300)
+        noise = max(_noise(self.points, self.seen), (self.options.subspace.rounding * extent) ** 2, 1e-300)
         return float((w * x.square()).sum() / (2 * spare.sum()).clamp(min=1)) / noise
 
     @property
@@ -99,48 +80,49 @@ class Body:
         return float((values / (values + 1)).sum())
 
 
-def body_of(x: Tensor, weights: Tensor, step: float = STEP) -> Body:
+def body_of(x: Tensor, weights: Tensor, step: float = STEP, *, options: SynchronizeOptions) -> Body:
     """Rows, motion and weights of tracks ``(T, n, 2)`` with weights ``(T, n)``, 0 = missing; some frames less at each end."""
     seen = (weights > 0) & x.isfinite().all(-1)
     x = torch.where(seen[..., None], x, 0.0).double()
     whole = seen.sum(-1) >= min(2, seen.shape[1])
-    edge = _edge(step)
+    edge = _edge(step, options)
     if not bool(whole.any()) or len(x) <= 2 * edge:
         rest = max(len(x) - 2 * edge, 1)
-        return Body(x.new_zeros(rest, 2 * x.shape[1]), x.new_zeros(rest, 2), x.new_zeros(rest), x, seen, step)
-    return _body(completed(filled(x, seen), seen), seen, whole, step)
+        return Body(x.new_zeros(rest, 2 * x.shape[1]), x.new_zeros(rest, 2), x.new_zeros(rest), x, seen, step, options=options)
+    return _body(completed(filled(x, seen, options), seen, options), seen, whole, step, options)
 
 
-def halves(body: Body) -> tuple[Body, Body]:
+def halves(body: Body, options: SynchronizeOptions) -> tuple[Body, Body]:
     """Bodies of either half of the points: their noise is independent."""
     n = body.points.shape[1]
     order = torch.randperm(n, generator=torch.Generator().manual_seed(0)).to(body.points.device)
     whole = body.seen.sum(-1) >= min(2, n)
     first, second = (
-        _body(body.points[:, part], body.seen[:, part], whole, body.step) for part in (order[: (n + 1) // 2], order[n // 2 :])
+        _body(body.points[:, part], body.seen[:, part], whole, body.step, options)
+        for part in (order[: (n + 1) // 2], order[n // 2 :])
     )
     return first, second
 
 
-def _body(held: Tensor, seen: Tensor, whole: Tensor, step: float) -> Body:
+def _body(held: Tensor, seen: Tensor, whole: Tensor, step: float, options: SynchronizeOptions) -> Body:
     """The body of complete points."""
-    width, edge = _width(step), _edge(step)
-    size, middle = _frame(held, SLOW / step)
+    width, edge = _width(step, options), _edge(step, options)
+    size, middle = _frame(held, options.subspace.size_width / step, options)
     shape = (held - middle) / size[:, None, None]
-    variance = max(_noise(shape, seen), TINY**2) * NOISE / (2 * math.sqrt(math.pi) * width)
+    variance = max(_noise(shape, seen), TINY**2) * options.subspace.noise / (2 * math.sqrt(math.pi) * width)
     rows = smooth(shape, width).flatten(1)
     inside = slice(edge, -edge)
     rows = rows[inside]
     rows = (rows - rows.mean(0)) / math.sqrt(variance)
-    return Body(rows, _motion(held, width)[inside], whole.double()[inside], held, seen, step)
+    return Body(rows, _motion(held, width)[inside], whole.double()[inside], held, seen, step, options=options)
 
 
-def _width(step: float) -> float:
-    return max(SMOOTH / step, NARROW)
+def _width(step: float, options: SynchronizeOptions) -> float:
+    return max(options.subspace.width / step, options.subspace.narrowest)
 
 
-def _edge(step: float) -> int:
-    return math.ceil(EDGE * _width(step) - 1e-9)
+def _edge(step: float, options: SynchronizeOptions) -> int:
+    return math.ceil(options.subspace.edge * _width(step, options) - 1e-9)
 
 
 def smooth(x: Tensor, width: float) -> Tensor:
@@ -148,10 +130,10 @@ def smooth(x: Tensor, width: float) -> Tensor:
     return _convolved(x, width) / _convolved(x.new_ones(len(x), *[1] * (x.ndim - 1)), width)
 
 
-def filled(x: Tensor, seen: Tensor) -> Tensor:
+def filled(x: Tensor, seen: Tensor, options: SynchronizeOptions) -> Tensor:
     """Missing positions ``(T, n)`` from the same track's nearest times, by the narrowest Gaussian that sees some."""
     result, open_ = x, ~seen
-    for width in WIDE:
+    for width in options.subspace.gap_widths:
         if not bool(open_.any()):
             return result
         share = _convolved(seen.double(), width)
@@ -163,11 +145,11 @@ def filled(x: Tensor, seen: Tensor) -> Tensor:
     return torch.where(open_[..., None], mean, result)
 
 
-def _frame(x: Tensor, slow: float) -> tuple[Tensor, Tensor]:
+def _frame(x: Tensor, slow: float, options: SynchronizeOptions) -> tuple[Tensor, Tensor]:
     """Size ``(T,)`` and middle ``(T, 1, 2)`` of the body, of tracks that stay with it."""
     far = (x - x.median(1, keepdim=True).values).norm(dim=-1)
     ratio = (far / far.median(1, keepdim=True).values.clamp(min=1e-300)).median(0).values
-    kept = (ratio <= max(STRAY, float(ratio.min())))[None, :, None]
+    kept = (ratio <= max(options.subspace.stray, float(ratio.min())))[None, :, None]
     middle = (x * kept).sum(1, keepdim=True) / kept.sum()
     spread = ((x - middle).square() * kept).sum((1, 2)) / kept.sum()
     size = smooth(spread.sqrt(), slow)
@@ -180,7 +162,7 @@ def _noise(x: Tensor, seen: Tensor) -> float:
     return (float(rough.median()) / 0.6745) ** 2 / 20 if rough.numel() else 0.0
 
 
-def completed(x: Tensor, seen: Tensor) -> Tensor:
+def completed(x: Tensor, seen: Tensor, options: SynchronizeOptions) -> Tensor:
     r"""Positions ``(T, n, 2)``, those missing by regression on the other points of their frame, over and over.
 
     .. math:: x_j \leftarrow x_j - K_{jj}^{-1} (K x)_j, \qquad K = (C + \sigma^2 I)^{-1}
@@ -194,11 +176,11 @@ def completed(x: Tensor, seen: Tensor) -> Tensor:
     rows, n = (x - mean).flatten(1), x.shape[1]
     noise = max(_noise(x, seen), 1e-6 * float(rows.square().mean()), 1e-300)
     unit = torch.eye(2 * n, dtype=x.dtype, device=x.device)
-    for _ in range(ROUNDS):
+    for _ in range(options.subspace.fill_rounds):
         inverse = torch.linalg.inv(rows.mT @ rows / len(rows) + noise * unit)
         own = inverse.unflatten(0, (n, 2)).unflatten(2, (n, 2)).diagonal(dim1=0, dim2=2).movedim(-1, 0)  # (n, 2, 2)
         change = torch.linalg.solve(own, (rows @ inverse).unflatten(1, (n, 2)).movedim(0, 2)).movedim(2, 0)
-        nearby = filled(torch.where(seen[..., None], change, 0.0), seen)
+        nearby = filled(torch.where(seen[..., None], change, 0.0), seen, options)
         rows = rows - torch.where(seen[..., None], 0.0, change - nearby).flatten(1)
     return rows.unflatten(1, (n, 2)) + mean
 
@@ -218,17 +200,6 @@ def _convolved(x: Tensor, width: float) -> Tensor:
     return torch.nn.functional.conv1d(flat, (kernel / kernel.sum())[None, None], padding=reach)[:, 0].mT.reshape(x.shape)
 
 
-OVERLAP = 0.35
-"""Share of the shorter take below which a lag is not judged."""
-FEWEST = 0.8
-"""Seconds of overlap below which a lag is not judged."""
-SHAPE, HEIGHT, MOTION = 2.4, 2.25, 5.7
-"""Independent samples per second of the shape, of its vertical part and of the motion: neighbouring frames repeat each other.
-Fitted as weights to the posterior of the true lag (30 frames per second, half of the motion capture takes, 15 mm)."""
-LOADING = 0.02
-"""Share of its own variance that a velocity is blurred by: no two medians of different points are the same."""
-BACKWARDS = 40
-"""Lags at which chance is measured."""
 PIECE = 2048
 """Lags at a time: bounds the memory on long takes."""
 
@@ -262,7 +233,16 @@ class SubspaceCurve:
         return self.scores / self.counts.clamp(min=1.0)
 
 
-def subspace_curve(a: Tensor, b: Tensor, wa: Tensor, wb: Tensor, lags: tuple[int, int], *, step: float = STEP) -> SubspaceCurve:
+def subspace_curve(
+    a: Tensor,
+    b: Tensor,
+    wa: Tensor,
+    wb: Tensor,
+    lags: tuple[int, int],
+    *,
+    step: float = STEP,
+    options: SynchronizeOptions = SynchronizeOptions(),
+) -> SubspaceCurve:
     r"""Evidence for every lag between the tracks of two static cameras that need not have a point in common.
 
     .. math:: S(s) = m(s)\, [\, 2.4\, (J - J_0) + 2.25\, (J_y - J_{y0}) + 5.7\, J_v\, ],\qquad
@@ -302,24 +282,33 @@ def subspace_curve(a: Tensor, b: Tensor, wa: Tensor, wb: Tensor, lags: tuple[int
         >>> int(curve.lags[curve.scores.nan_to_num(-torch.inf).argmax()])
         -7
     """
-    return bodies_curve(body_of(a, wa, step), body_of(b, wb, step), lags, step)
+    return bodies_curve(body_of(a, wa, step, options=options), body_of(b, wb, step, options=options), lags, step, options=options)
 
 
-def bodies_curve(first: Body, second: Body, lags: tuple[int, int], step: float = STEP) -> SubspaceCurve:
+def bodies_curve(
+    first: Body, second: Body, lags: tuple[int, int], step: float = STEP, *, options: SynchronizeOptions
+) -> SubspaceCurve:
     """The same of what is prepared."""
-    shape, height, motion, counts = _curves(first, second, lags)
-    judged = counts >= max(OVERLAP * min(float(first.weights.sum()), float(second.weights.sum())), FEWEST / step - 1e-9)
+    shape, height, motion, counts = _curves(first, second, lags, options)
+    judged = counts >= max(
+        options.subspace.least_overlap * min(float(first.weights.sum()), float(second.weights.sum())),
+        options.subspace.least_seconds / step - 1e-9,
+    )
     if bool(judged.any()):
-        chance = _chance(first, second.reversed, counts, judged, lags)
+        chance = _chance(first, second.reversed, counts, judged, lags, options)
         shape, height = shape - chance[:, 0], height - chance[:, 1]
-    scores = counts * step * (SHAPE * shape + HEIGHT * height + MOTION * motion)
+    scores = (
+        counts
+        * step
+        * (options.subspace.shape_rate * shape + options.subspace.height_rate * height + options.subspace.motion_rate * motion)
+    )
     span = torch.arange(lags[0], lags[1] + 1, dtype=torch.float64, device=counts.device)
     return SubspaceCurve(
         span, torch.where(judged, scores, torch.nan), counts, shape, height, motion, (first.signal, second.signal), (first, second)
     )
 
 
-def _curves(a: Body, b: Body, lags: tuple[int, int]) -> list[Tensor]:
+def _curves(a: Body, b: Body, lags: tuple[int, int], options: SynchronizeOptions) -> list[Tensor]:
     """Information of shapes, of heights and of motions, and counts, at all lags."""
     weights = None if bool((a.weights > 0).all() and (b.weights > 0).all()) else (a.weights, b.weights)
     found = []
@@ -327,14 +316,14 @@ def _curves(a: Body, b: Body, lags: tuple[int, int]) -> list[Tensor]:
         span = lo, min(lo + PIECE - 1, lags[1])
         aa, bb, ab, counts = lag_covariances(a.rows, b.rows, span, weights)
         *motion, _ = lag_covariances(a.motion, b.motion, span, weights)
-        found.append((_shared(aa, bb, ab), _shared(*_vertical(aa, bb, ab)), _correlated(*motion), counts))
+        found.append((_shared(aa, bb, ab), _shared(*_vertical(aa, bb, ab)), _correlated(*motion, options=options), counts))
     return [torch.cat(parts) for parts in zip(*found, strict=True)]
 
 
-def _chance(a: Body, b: Body, counts: Tensor, judged: Tensor, lags: tuple[int, int]) -> Tensor:
+def _chance(a: Body, b: Body, counts: Tensor, judged: Tensor, lags: tuple[int, int], options: SynchronizeOptions) -> Tensor:
     """What shapes and heights ``(L, 2)`` of different events tell about each other: a line in 1 / count, through some lags."""
     at = judged.nonzero()[:, 0]
-    at = at[torch.linspace(0, len(at) - 1, min(BACKWARDS, len(at))).round().long().to(at.device)]
+    at = at[torch.linspace(0, len(at) - 1, min(options.subspace.chance_lags, len(at))).round().long().to(at.device)]
     told, inverse, n = [], [], a.rows.shape[1]
     for lag in (at + lags[0]).tolist():
         start, end = max(0, -lag), min(len(a.rows), len(b.rows) - lag)
@@ -350,11 +339,13 @@ def _chance(a: Body, b: Body, counts: Tensor, judged: Tensor, lags: tuple[int, i
     return line[0] + line[1] / counts.clamp(min=1.0)[:, None]
 
 
-def information(shape: Tensor, n: int, motion: Tensor) -> Tensor:
+def information(shape: Tensor, n: int, motion: Tensor, options: SynchronizeOptions) -> Tensor:
     """Evidence per second ``(L,)`` of joint covariances: of shapes, whose first n rows are a's, and of motions; chance is in it."""
     parts = shape[:, :n, :n], shape[:, n:, n:], shape[:, :n, n:]
-    told = SHAPE * _shared(*parts) + HEIGHT * _shared(*_vertical(*parts))
-    return told + MOTION * _correlated(motion[:, :2, :2], motion[:, 2:, 2:], motion[:, :2, 2:])
+    told = options.subspace.shape_rate * _shared(*parts) + options.subspace.height_rate * _shared(*_vertical(*parts))
+    return told + options.subspace.motion_rate * _correlated(
+        motion[:, :2, :2], motion[:, 2:, 2:], motion[:, :2, 2:], options=options
+    )
 
 
 def _vertical(aa: Tensor, bb: Tensor, ab: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -372,9 +363,9 @@ def _shared(aa: Tensor, bb: Tensor, ab: Tensor) -> Tensor:
     return -_factor(left).diagonal(dim1=-2, dim2=-1).log().sum(-1)
 
 
-def _correlated(aa: Tensor, bb: Tensor, ab: Tensor) -> Tensor:
+def _correlated(aa: Tensor, bb: Tensor, ab: Tensor, *, options: SynchronizeOptions) -> Tensor:
     """Mutual information ``(L,)`` where each coordinate has noise in proportion to itself."""
-    one, two = (LOADING * c.diagonal(dim1=-2, dim2=-1) for c in (aa, bb))
+    one, two = (options.subspace.loading * c.diagonal(dim1=-2, dim2=-1) for c in (aa, bb))
     one, two = (v.clamp(min=1e-12 * float(v.max()) + 1e-300).rsqrt()[..., None] for v in (one, two))
     return _shared(one * aa * one.mT, two * bb * two.mT, one * ab * two.mT)
 

@@ -13,29 +13,17 @@ import torch
 from torch import Generator, Tensor
 
 from dyntorch.geometry.lens import fit_distortion, undistorted
-from dyntorch.numerics.arguments import on_cpu
+from dyntorch.numerics.arguments import check_options, on_cpu
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.tasks.synchronize.different import different_points
 from dyntorch.tasks.synchronize.epipolar import Curve, EpipolarFit, Samples, ShiftDescent, epipolar_curve
-from dyntorch.tasks.synchronize.evidence import APART, PEAKS, WANDER, Attempt, consistent_points
+from dyntorch.tasks.synchronize.evidence import Attempt, consistent_points
+from dyntorch.tasks.synchronize.options import SynchronizeOptions
 from dyntorch.tasks.synchronize.result import Shift
-from dyntorch.tasks.synchronize.tracks import RATES, Tracks, cleaned, frame_scaled, read_tracks, smoothed, without
+from dyntorch.tasks.synchronize.tracks import Tracks, cleaned, frame_scaled, read_tracks, smoothed, without
 
 # ----------------------------------------------------------------------------------------------------------------------
 # The search for the best shift of corresponding points: all lags at some clock rates, then descents from the best of them.
-
-
-CLEAR = 0.6
-"""Nats above the next peak from which on that one needs no descent of its own."""
-DRIFTING = 10.0
-"""Seconds of overlap from which a clock rate is looked for: 1 % amounts to less than two frames of 30 at the ends of shorter takes,
-and what is wrong with a motion fits into a rate."""
-SIGNIFICANT = 3.0
-"""Sigmas from 1 for a clock rate to be believed."""
-FASTEST = 0.022
-"""Clock rates off by more are none."""
-NEGLIGIBLE = 0.1
-"""Frames over the take that a rate must amount to."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +45,7 @@ class ShiftSearch:
     method: str = "epipolar"
 
 
-def attempt(a: Tracks, b: Tracks, search: ShiftSearch, points: Tensor | None = None) -> Attempt:
+def attempt(a: Tracks, b: Tracks, search: ShiftSearch, points: Tensor | None = None, *, options: SynchronizeOptions) -> Attempt:
     """Search all shifts at the given rates of b's clock, descend from the best, and settle the rate.
 
     Args:
@@ -67,31 +55,37 @@ def attempt(a: Tracks, b: Tracks, search: ShiftSearch, points: Tensor | None = N
     a, b = (a, b) if bool(points.all()) else (a.only(points), b.only(points))
     step = max(a.step, b.step, search.step)
     searched = [
-        (samples, epipolar_curve(samples, search.max_shift)) for samples in (Samples.of(a, b, step, r) for r in search.rates)
+        (samples, epipolar_curve(samples, search.max_shift, options=options))
+        for samples in (Samples.of(a, b, step, r, options=options) for r in search.rates)
     ]
-    fit = _best(a, b, [curve for _, curve in searched], step, search.free_rate)
+    fit = _best(a, b, [curve for _, curve in searched], step, search.free_rate, options)
     samples, curve = min(searched, key=lambda found: abs(found[0].rate - (fit.rate if fit else 1.0)))
     if fit is not None and abs(fit.rate - samples.rate) * (float(a.times[-1]) - float(a.times[0])) > 0.25 * step:
-        samples = Samples.of(a, b, step, fit.rate)
-        curve = epipolar_curve(samples, search.max_shift)
-    return Attempt(a, b, fit, curve, samples, step, search.max_shift, points, search.method)
+        samples = Samples.of(a, b, step, fit.rate, options=options)
+        curve = epipolar_curve(samples, search.max_shift, options=options)
+    return Attempt(a, b, fit, curve, samples, step, search.max_shift, points, search.method, options=options)
 
 
-def _best(a: Tracks, b: Tracks, curves: list[Curve], step: float, free_rate: bool) -> EpipolarFit | None:
+def _best(
+    a: Tracks, b: Tracks, curves: list[Curve], step: float, free_rate: bool, options: SynchronizeOptions
+) -> EpipolarFit | None:
     """The likeliest minimum near the peaks of the curves."""
     frame = max(a.step, b.step)
-    starts = sorted(((score, lag * curve.rate, curve.rate) for curve in curves for lag, score in curve.peaks(PEAKS)), reverse=True)
+    starts = sorted(
+        ((score, lag * curve.rate, curve.rate) for curve in curves for lag, score in curve.peaks(options.evidence.peaks)),
+        reverse=True,
+    )
     if not starts:
         return None
-    apart = max(APART * frame, 1.5 * step)
+    apart = max(options.evidence.apart * frame, 1.5 * step)
     rivals = [start for start in starts if abs(start[1] - starts[0][1]) > apart or start[2] != starts[0][2]]
-    several = len(curves) > 1 or not rivals or starts[0][0] - rivals[0][0] < CLEAR
+    several = len(curves) > 1 or not rivals or starts[0][0] - rivals[0][0] < options.search.clear
     widths = [step]
     while widths[-1] > frame:
         widths.append(max(frame, widths[-1] / 3))
-    descent = ShiftDescent(a, b, step)
+    descent = ShiftDescent(a, b, step, options=options)
     found = []
-    for score, offset, rate in starts[: PEAKS if several else 1]:
+    for score, offset, rate in starts[: options.evidence.peaks if several else 1]:
         fit = descent.run(offset, rate, free_rate=free_rate and step > frame)
         if fit is not None:
             # the curve's variance counts everything, the fit's robust residual nothing that is far: both have a say
@@ -100,17 +94,19 @@ def _best(a: Tracks, b: Tracks, curves: list[Curve], step: float, free_rate: boo
         return None
     best = max(found, key=lambda pair: pair[0])[1]
     for width in widths[1:]:
-        descent = ShiftDescent(a, b, width)
+        descent = ShiftDescent(a, b, width, options=options)
         best = descent.run(best.offset, best.rate, free_rate=free_rate) or best
-    long = float(best.times[-1] - best.times[0]) > DRIFTING
-    return _settled(descent, best) if free_rate and long else best
+    long = float(best.times[-1] - best.times[0]) > options.search.drifting
+    return _settled(descent, best, options) if free_rate and long else best
 
 
-def _settled(descent: ShiftDescent, fit: EpipolarFit) -> EpipolarFit:
+def _settled(descent: ShiftDescent, fit: EpipolarFit, options: SynchronizeOptions) -> EpipolarFit:
     """With its own rate where that differs from 1 beyond doubt, else with rate 1."""
     free = descent.run(fit.offset, fit.rate, free_rate=True)
     span = float(fit.times[-1] - fit.times[0])
-    if free is not None and FASTEST > abs(free.rate - 1) > max(SIGNIFICANT * free.rate_sigma, NEGLIGIBLE * descent.frame / span):
+    if free is not None and options.search.largest_drift > abs(free.rate - 1) > max(
+        options.search.significant * free.rate_sigma, options.search.negligible * descent.frame / span
+    ):
         return free
     fixed = descent.run(fit.shift, 1.0) if fit.rate != 1 else fit
     return fixed or fit
@@ -118,23 +114,6 @@ def _settled(descent: ShiftDescent, fit: EpipolarFit) -> EpipolarFit:
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Synchronization by points that both cameras see: plain first, then what may be wrong with the input, one thing at a time.
-
-
-LONGEST = 4_000
-"""Steps of a take at most; longer takes are searched in coarser steps."""
-COARSE = 2_000
-"""Steps of a take for a search over rates, of a tenth of a second at least."""
-SUSPECT = 3.0
-"""Times the usual residual, beyond which a point is wrong."""
-FAR = 6.0
-"""Robust standard deviations from the fit at which a position counts as an outlier."""
-LOST = 0.3
-"""Share of the positions of a point, or of a stretch of the take, that may be outliers."""
-STRETCHES = 8
-RARE = 0.01
-"""Share of the positions that makes no difference to a fit that is sure."""
-ROUGH = 1.25
-"""Residual over what the noise explains, from which lenses are looked at."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -159,6 +138,7 @@ def same_points(
     camera: str,
     lenses: bool,
     generator: Generator | None,
+    options: SynchronizeOptions,
 ) -> Result:
     """The shift of cameras that see the same points.
 
@@ -168,56 +148,59 @@ def same_points(
         lenses: whether nobody calibrated the cameras, and distortion may be looked for.
     """
     span = min(float(t.times[-1] - t.times[0]) for t in (a, b))
-    search = ShiftSearch(step=span / LONGEST, max_shift=max_shift, rates=(rate or 1.0,), free_rate=rate is None)
+    search = ShiftSearch(step=span / options.search.most_steps, max_shift=max_shift, rates=(rate or 1.0,), free_rate=rate is None)
     seen = (a.weights > 0).any(0) & (b.weights > 0).any(0)
     if a.still or b.still:
-        return Result(dataclasses.replace(attempt(a, b, search), fit=None), (), seen)
+        return Result(dataclasses.replace(attempt(a, b, search, options=options), fit=None), (), seen)
     if camera == "affine":
-        return Result(_affine(a, b, search, generator), (), seen)
-    found = _sorted_out(a, b, search, generator)
+        return Result(_affine(a, b, search, generator, options), (), seen)
+    found = _sorted_out(a, b, search, generator, options)
     if not found.decided and rate is None:
-        found = _better(found, _over_rates(a, b, search, span, generator))
+        found = _better(found, _over_rates(a, b, search, span, generator, options))
     notes: tuple[str, ...] = ()
-    if lenses and found.fit is not None and found.roughness > ROUGH:
-        found, notes = _straightened(found, a, b, search, generator)
+    if lenses and found.fit is not None and found.roughness > options.search.rough:
+        found, notes = _straightened(found, a, b, search, generator, options)
     if camera == "auto" and not found.decided:
-        scaled = _affine(a, b, search, generator)
+        scaled = _affine(a, b, search, generator, options)
         # without the place in the picture a gait repeats itself, so that affine cameras alone may be sure of a wrong period
-        if scaled.decided and _agree(scaled, found):
+        if scaled.decided and _agree(scaled, found, options):
             note = "affine cameras: the points do not hold enough depth, or are too noisy, for perspective ones"
             return Result(scaled, (note,), seen)
     return Result(found, notes if found.decided else (), seen)
 
 
-def _sorted_out(a: Tracks, b: Tracks, search: ShiftSearch, generator: Generator | None) -> Attempt:
+def _sorted_out(a: Tracks, b: Tracks, search: ShiftSearch, generator: Generator | None, options: SynchronizeOptions) -> Attempt:
     """An attempt with all points, and one without those that do not fit, where that may be why it fails."""
-    found = attempt(a, b, search)
-    pruned = _pruned(found)
+    found = attempt(a, b, search, options=options)
+    pruned = _pruned(found, options)
     if pruned is not None:
         a, b = pruned
-        found = _better(found, dataclasses.replace(attempt(a, b, search), pruned=True))
-    if found.decided and not bool(_suspects(found).any()):
+        found = _better(found, dataclasses.replace(attempt(a, b, search, options=options), pruned=True))
+    if found.decided and not bool(_suspects(found, options).any()):
         return found
-    points = consistent_points(a, b, found, generator)
+    points = consistent_points(a, b, found, generator, options)
     if points is None or bool(points.all()):
         return found
-    return _better(found, dataclasses.replace(attempt(a, b, search, points), pruned=pruned is not None))
+    return _better(found, dataclasses.replace(attempt(a, b, search, points, options=options), pruned=pruned is not None))
 
 
-def _pruned(found: Attempt) -> tuple[Tracks, Tracks] | None:
+def _pruned(found: Attempt, options: SynchronizeOptions) -> tuple[Tracks, Tracks] | None:
     """Tracks without the positions far from the fit, in both cameras: whose is wrong is not known; None where all is well."""
     fit = found.fit
     if fit is None or len(fit.times) != len(found.a.times):
         return None
-    far = fit.distances.abs() > FAR
+    far = fit.distances.abs() > options.search.far
     seen = fit.distances.isfinite()
     # a point that is mostly elsewhere is another point, and is found as such
-    far = far & (far.sum(0) <= LOST * seen.sum(0))
-    parts = [(float(one.sum()), float(all_.sum())) for one, all_ in zip(far.chunk(STRETCHES), seen.chunk(STRETCHES), strict=True)]
-    if found.decided and float(far.double().mean()) < RARE:
+    far = far & (far.sum(0) <= options.search.lost * seen.sum(0))
+    parts = [
+        (float(one.sum()), float(all_.sum()))
+        for one, all_ in zip(far.chunk(options.search.stretches), seen.chunk(options.search.stretches), strict=True)
+    ]
+    if found.decided and float(far.double().mean()) < options.search.rare:
         return None  # the weights of the fit are enough
     # a stretch that does not fit is no outlier: it contradicts
-    if not bool(far.any()) or any(lost > LOST * whole for lost, whole in parts):
+    if not bool(far.any()) or any(lost > options.search.lost * whole for lost, whole in parts):
         return None
     frames, joints = far.nonzero().unbind(1)
     there = fit.times[frames] * fit.rate + fit.offset
@@ -227,22 +210,26 @@ def _pruned(found: Attempt) -> tuple[Tracks, Tracks] | None:
     return without(found.a, far), without(found.b, other)
 
 
-def _over_rates(a: Tracks, b: Tracks, search: ShiftSearch, span: float, generator: Generator | None) -> Attempt | None:
+def _over_rates(
+    a: Tracks, b: Tracks, search: ShiftSearch, span: float, generator: Generator | None, options: SynchronizeOptions
+) -> Attempt | None:
     """A search over clock rates too, where a wrong one would have smeared the motion."""
-    step = max(span / COARSE, 0.1)
+    step = max(span / options.search.rate_steps, 0.1)
     change = 2 * step / span  # moves the ends of the overlap by a step
-    count = math.ceil(RATES / change)
-    if span < DRIFTING:
+    count = math.ceil(options.input.frame_rate_error / change)
+    if span < options.search.drifting:
         return None
     rates = tuple(1 + k * change for k in range(-count, count + 1))
-    coarse = attempt(a, b, dataclasses.replace(search, step=step, rates=rates))
+    coarse = attempt(a, b, dataclasses.replace(search, step=step, rates=rates), options=options)
     if coarse.fit is None:
         return None
-    return _sorted_out(a, b, dataclasses.replace(search, rates=(coarse.fit.rate,)), generator)
+    return _sorted_out(a, b, dataclasses.replace(search, rates=(coarse.fit.rate,)), generator, options)
 
 
-def _affine(a: Tracks, b: Tracks, search: ShiftSearch, generator: Generator | None) -> Attempt:
-    return _sorted_out(frame_scaled(a), frame_scaled(b), dataclasses.replace(search, method="affine"), generator)
+def _affine(a: Tracks, b: Tracks, search: ShiftSearch, generator: Generator | None, options: SynchronizeOptions) -> Attempt:
+    return _sorted_out(
+        frame_scaled(a, options), frame_scaled(b, options), dataclasses.replace(search, method="affine"), generator, options
+    )
 
 
 def _better(one: Attempt, other: Attempt | None) -> Attempt:
@@ -254,26 +241,28 @@ def _better(one: Attempt, other: Attempt | None) -> Attempt:
     return one if one.decided or one.confidence >= other.confidence else other
 
 
-def _agree(one: Attempt, other: Attempt) -> bool:
+def _agree(one: Attempt, other: Attempt, options: SynchronizeOptions) -> bool:
     """Whether the best shifts are the same."""
-    return one.fit is not None and other.fit is not None and abs(one.fit.shift - other.fit.shift) <= APART * one.frame
+    return (
+        one.fit is not None and other.fit is not None and abs(one.fit.shift - other.fit.shift) <= options.evidence.apart * one.frame
+    )
 
 
-def _suspects(found: Attempt) -> Tensor:
+def _suspects(found: Attempt, options: SynchronizeOptions) -> Tensor:
     """``(n,)`` of the points that took part: whether their residual is out of all proportion."""
     assert found.fit is not None
     own = found.fit.distances.abs().nanmedian(0).values * 1.4826
-    return own.nan_to_num(0.0) > SUSPECT
+    return own.nan_to_num(0.0) > options.search.suspect
 
 
 def _straightened(
-    found: Attempt, a: Tracks, b: Tracks, search: ShiftSearch, generator: Generator | None
+    found: Attempt, a: Tracks, b: Tracks, search: ShiftSearch, generator: Generator | None, options: SynchronizeOptions
 ) -> tuple[Attempt, tuple[str, ...]]:
     """Once more with lenses fitted at the shift found, where they are significant."""
     assert found.fit is not None
     fit = found.fit
-    x1, _, w1 = smoothed(found.a, fit.times, found.frame)
-    x2, _, w2 = smoothed(found.b, fit.times * fit.rate + fit.offset, found.frame)
+    x1, _, w1 = smoothed(found.a, fit.times, found.frame, options)
+    x2, _, w2 = smoothed(found.b, fit.times * fit.rate + fit.offset, found.frame, options)
     lens = fit_distortion(x1.flatten(0, 1), x2.flatten(0, 1), (w1 * w2).flatten())
     if not lens.significant:
         return found, ()
@@ -282,15 +271,11 @@ def _straightened(
         x = one.undistort(tracks.x)
         seen = x.isfinite().all(-1)
         straight.append(dataclasses.replace(tracks, x=torch.where(seen[..., None], x, 0.0), weights=tracks.weights * seen))
-    again = attempt(straight[0], straight[1], search, found.points)
+    again = attempt(straight[0], straight[1], search, found.points, options=options)
     better = again.fit is not None and again.fit.residual < fit.residual and _better(found, again) is again
     return (again, (lens.note,)) if better else (found, ())
 
 
-SHORTEST = 12
-"""Frames of a take at least."""
-BLIND = 10.0
-"""Frames of sigma from which no shift stands out at all."""
 CAMERAS = ("auto", "perspective", "affine")
 
 
@@ -309,6 +294,7 @@ def synchronize(
     rate: float | None = None,
     camera: str = "auto",
     generator: Generator | None = None,
+    options: SynchronizeOptions = SynchronizeOptions(),
 ) -> Shift:
     r"""How b's clock runs against a's, from what two static cameras saw move: :math:`t_b = \text{rate}\; t_a + \text{offset}`.
 
@@ -336,6 +322,7 @@ def synchronize(
         camera: ``"perspective"``, ``"affine"`` (points about their middle in each frame), or ``"auto"``: perspective unless that
             cannot decide and affine can.  Of corresponding points only.
         generator: of the subsets that look for wrong points; a fixed one by default.
+        options: every number that decides, by stage; ``dataclasses.replace`` changes some of them.
 
     Returns:
         offset, sigma, rate, confidence, all peaks, and whether it is ok.
@@ -360,34 +347,42 @@ def synchronize(
         >>> round(shift.offset, 3), shift.ok
         (0.42, True)
     """
+    check_options(options, SynchronizeOptions)
     _check(correspondence, fps, times, weights, max_shift, rate, camera)
     pair: tuple[float | None, float | None] = (None, None)
     if fps is not None:
         pair = (float(fps[0]), float(fps[1])) if isinstance(fps, Sequence) else (float(fps), float(fps))
     given = (None, None) if weights is None else weights
     tracks = [
-        read_tracks(name, x, one, None if times is None else times[i], given[i])
+        read_tracks(name, x, one, None if times is None else times[i], given[i], options)
         for i, (name, x, one) in enumerate(zip("ab", (a, b), pair, strict=True))
     ]
     for name, one in zip("ab", tracks, strict=True):
-        if len(one.times) < SHORTEST:
-            raise ValueError(f"{name} has {len(one.times)} frames, {SHORTEST} are needed at least")
+        if len(one.times) < options.input.fewest_frames:
+            raise ValueError(f"{name} has {len(one.times)} frames, {options.input.fewest_frames} are needed at least")
     if calibration is not None:
         tracks = [_straight(name, one, lens) for name, one, lens in zip("ab", tracks, _pairwise(calibration), strict=True)]
     # both clocks count from a's first frame: timestamps may be of any era, and products of rates with them lose digits
     origin = float(tracks[0].times[0])
-    first, second = (cleaned(dataclasses.replace(one, times=one.times - origin)) for one in tracks)
+    first, second = (cleaned(dataclasses.replace(one, times=one.times - origin), options) for one in tracks)
     if not correspondence:
-        return different_points(first, second, max_shift=max_shift, rate=rate).since(origin)
+        return different_points(first, second, max_shift=max_shift, rate=rate, options=options).since(origin)
     if a.shape[1] != b.shape[1]:
         raise ValueError(
             f"a has {a.shape[1]} points and b {b.shape[1]}: corresponding points are as many; "
             "give the same ones in the same order, or correspondence=False"
         )
     result = same_points(
-        first, second, max_shift=max_shift, rate=rate, camera=camera, lenses=calibration is None, generator=generator
+        first,
+        second,
+        max_shift=max_shift,
+        rate=rate,
+        camera=camera,
+        lenses=calibration is None,
+        generator=generator,
+        options=options,
     )
-    return _shift(result).since(origin)
+    return _shift(result, options).since(origin)
 
 
 def _check(
@@ -431,7 +426,7 @@ def _straight(name: str, tracks: Tracks, lens: Any) -> Tracks:
     return dataclasses.replace(tracks, x=torch.where(seen[..., None], x, 0.0), weights=torch.where(seen, tracks.weights, 0.0))
 
 
-def _shift(result: Result) -> Shift:
+def _shift(result: Result, options: SynchronizeOptions) -> Shift:
     """The result of an attempt."""
     found, notes = result.found, result.notes
     fps = 1 / found.a.step, 1 / found.b.step
@@ -447,7 +442,7 @@ def _shift(result: Result) -> Shift:
     if wrong:
         which = ", ".join(str(point) for point in wrong)
         notes = (*notes, f"{len(wrong)} of {len(points)} points never agree with the others and were left out: {which}")
-    if found.decided and found.wander > WANDER:
+    if found.decided and found.wander > options.evidence.wander:
         notes = (*notes, "each half of the take fits much better by itself: a camera may have moved")
     lags = found.curve.rate * (found.curve.lags + fit.center) - fit.center
     return Shift(
@@ -458,7 +453,7 @@ def _shift(result: Result) -> Shift:
         confidence=found.confidence,
         peaks=torch.tensor(found.peaks, dtype=torch.float64),
         ok=found.decided,
-        reason="" if found.decided else _reason(found),
+        reason="" if found.decided else _reason(found, options),
         method=found.method,
         fps=fps,
         center=fit.center,
@@ -480,10 +475,10 @@ def _nothing(found: Attempt) -> str:
     return "no shift stands out, or both cameras never show enough points at once; film longer, or raise max_shift"
 
 
-def _reason(found: Attempt) -> str:
+def _reason(found: Attempt, options: SynchronizeOptions) -> str:
     fit = found.fit
     assert fit is not None
-    if fit.sigma > BLIND * found.frame:
+    if fit.sigma > options.search.blind * found.frame:
         return _nothing(found)
     if found.edge:
         return f"the best shift, about {fit.shift:+.3g} s, lies at the end of the search or beyond; raise max_shift"
@@ -504,6 +499,6 @@ def _reason(found: Attempt) -> str:
     shifts = (f"{fit.shift + away * found.frame:+.3g} s" for away in (first, second))
     said = " and ".join("nothing" if "nan" in shift else shift for shift in shifts)
     return (
-        f"the halves of the take say {said}, more than {APART:g} frames from {fit.shift:+.3g} s: "
+        f"the halves of the take say {said}, more than {options.evidence.apart:g} frames from {fit.shift:+.3g} s: "
         "the cameras may show different events, overlap too little, or one of them moved"
     )

@@ -13,15 +13,8 @@ from torch.nn.functional import conv1d, pad
 
 from dyntorch.geometry.homogeneous import similarity
 from dyntorch.numerics.arguments import FARTHEST
+from dyntorch.tasks.synchronize.options import SynchronizeOptions
 
-RATES = 0.02
-"""A frame rate as told is wrong by no more than this share."""
-REACH = 4.0
-"""Standard deviations at which the smoothing kernel ends."""
-THIN = 0.4
-"""Share of the kernel's weight that must be seen; less is a gap."""
-SPARSE = 20, 20_000
-"""Times the frames there are, and at least how many, that a clock may run over: it is searched frame by frame."""
 PIECE = 1 << 21
 """Numbers that one piece of a long take gathers at a time."""
 
@@ -86,7 +79,9 @@ class Tracks:
         return dataclasses.replace(self, x=self.x[:, points], weights=self.weights[:, points])
 
 
-def read_tracks(name: str, x: Tensor, fps: float | None, times: Tensor | None, weights: Tensor | None) -> Tracks:
+def read_tracks(
+    name: str, x: Tensor, fps: float | None, times: Tensor | None, weights: Tensor | None, options: SynchronizeOptions
+) -> Tracks:
     """Tracks of checked input.
 
     Raises:
@@ -111,7 +106,7 @@ def read_tracks(name: str, x: Tensor, fps: float | None, times: Tensor | None, w
     if bool((steps <= 0).any()):
         at = int((steps <= 0).nonzero()[0, 0]) + 1
         raise ValueError(f"times of {name} must increase, but frame {at} is not after the one before; sort or drop such frames")
-    _check_dense(name, clock)
+    _check_dense(name, clock, options)
     seen = (x.double().abs() <= FARTHEST).all(-1)
     if weights is None:
         given = seen.double()
@@ -124,13 +119,13 @@ def read_tracks(name: str, x: Tensor, fps: float | None, times: Tensor | None, w
     return Tracks(torch.where((given > 0)[..., None], x.double(), 0.0), given, clock, step)
 
 
-def _check_dense(name: str, times: Tensor) -> None:
+def _check_dense(name: str, times: Tensor, options: SynchronizeOptions) -> None:
     """Raise where a take is nearly all gap."""
     steps = times.diff()
     if len(steps) == 0:
         return
     span, step = float(times[-1] - times[0]), float(steps.median())
-    if span <= step * max(SPARSE[0] * len(times), SPARSE[1]):
+    if span <= step * max(options.input.longest_over_frames * len(times), options.input.longest_steps):
         return
     at = int(steps.argmax())
     raise ValueError(
@@ -152,7 +147,7 @@ def noise_ratio(a: Tracks, b: Tracks) -> float:
     return min(max(noise, size / 2), size * 2)
 
 
-def smoothed(tracks: Tracks, at: Tensor, width: float) -> tuple[Tensor, Tensor, Tensor]:
+def smoothed(tracks: Tracks, at: Tensor, width: float, options: SynchronizeOptions) -> tuple[Tensor, Tensor, Tensor]:
     r"""Positions and velocities at any moments, by a line fitted to the frames around each, with Gaussian weights.
 
     .. math:: \min_{p, v} \sum_k w_k\, e^{-(t_k - t)^2 / 2 \sigma^2}\; |x_k - p - v (t_k - t)|^2
@@ -169,13 +164,15 @@ def smoothed(tracks: Tracks, at: Tensor, width: float) -> tuple[Tensor, Tensor, 
         positions and velocities per second ``(m, n, 2)``, 0 in gaps, and weights ``(m, n)``: the mean of those near, less
         where frames on one side are missing, 0 in gaps.
     """
-    taps = 2 * (math.ceil(REACH * width / tracks.step) + 1) + 1
+    taps = 2 * (math.ceil(options.cleaning.kernel_end * width / tracks.step) + 1) + 1
     rows = max(1, PIECE // max(1, taps * tracks.x.shape[1] * 2))
-    pieces = [_smoothed(tracks, piece, width, taps // 2) for piece in at.split(rows)] or [_smoothed(tracks, at, width, taps // 2)]
+    pieces = [_smoothed(tracks, piece, width, taps // 2, options) for piece in at.split(rows)] or [
+        _smoothed(tracks, at, width, taps // 2, options)
+    ]
     return tuple(torch.cat(parts) for parts in zip(*pieces, strict=True))  # type: ignore[return-value]
 
 
-def _smoothed(tracks: Tracks, at: Tensor, width: float, taps: int) -> tuple[Tensor, Tensor, Tensor]:
+def _smoothed(tracks: Tracks, at: Tensor, width: float, taps: int, options: SynchronizeOptions) -> tuple[Tensor, Tensor, Tensor]:
     frames, points = tracks.weights.shape
     near = torch.searchsorted(tracks.times, at.contiguous())[:, None] + torch.arange(-taps, taps + 1, device=at.device)
     index = near.clamp(0, frames - 1)
@@ -190,7 +187,7 @@ def _smoothed(tracks: Tracks, at: Tensor, width: float, taps: int) -> tuple[Tens
     determinant = s0 * s2 - s1.square()
     usual = torch.bmm(powers[:, :1], (w > 0).double())[:, 0]  # the kernel's weight on frames that show the point
     # two-sided: a line through frames on one side only would extrapolate
-    seen = (usual > THIN * full) & (determinant > 0.15 * s0.square())
+    seen = (usual > options.cleaning.least_seen * full) & (determinant > 0.15 * s0.square())
     share = torch.where(seen, 1 / torch.where(seen, determinant, 1.0), 0.0)[..., None]
     position = (s2[..., None] * t0 - s1[..., None] * t1) * share
     velocity = (s0[..., None] * t1 - s1[..., None] * t0) * share / width
@@ -203,24 +200,7 @@ def _smoothed(tracks: Tracks, at: Tensor, width: float, taps: int) -> tuple[Tens
 # Positions that are elsewhere for a frame or a few: found by the track's own neighbouring frames.
 
 
-OUTLYING = 4.0
-"""Robust standard deviations from the median of the neighbouring frames beyond which a position is an outlier (Hampel's 3 takes
-more good positions at turns of the motion)."""
-NEIGHBOURS = 3
-"""Frames on each side that an outlier is judged by."""
-WIDTH = 1.5
-"""Frames, standard deviation of the line's kernel in the second pass."""
-PEELED = 6.0
-"""Robust standard deviations from that line."""
-ALONE = 2.0
-"""Times the residual of the neighbours: a sudden movement bends several frames alike, a wrong position its own most."""
-FINE = 1e-3
-"""Of the distance of the points from their mean: a deviation below it is none, whatever the spread; points at rest have no
-spread."""
-ROUNDS = 8
-
-
-def cleaned(tracks: Tracks) -> Tracks:
+def cleaned(tracks: Tracks, options: SynchronizeOptions) -> Tracks:
     r"""Without positions far from the median of their neighbours, then, one by one, without those far from a line through the
     others.
 
@@ -232,35 +212,39 @@ def cleaned(tracks: Tracks) -> Tracks:
 
     Source: Hampel 1974, The influence curve and its role in robust estimation.
     """
-    if len(tracks.x) < 2 * NEIGHBOURS + 1:
+    if len(tracks.x) < 2 * options.cleaning.neighbours + 1:
         return tracks
-    return _peeled(without(tracks, _far_from_median(tracks)))
+    return _peeled(without(tracks, _far_from_median(tracks, options)), options)
 
 
-def _far_from_median(tracks: Tracks) -> Tensor:
+def _far_from_median(tracks: Tracks, options: SynchronizeOptions) -> Tensor:
     seen = tracks.weights > 0
     x = torch.where(seen[..., None], tracks.x, torch.nan)
-    ends = [x[:NEIGHBOURS].flip(0), x[-NEIGHBOURS:].flip(0)]
-    window = torch.cat([ends[0], x, ends[1]]).unfold(0, 2 * NEIGHBOURS + 1, 1)  # (frames, n, 2, width)
+    ends = [x[: options.cleaning.neighbours].flip(0), x[-options.cleaning.neighbours :].flip(0)]
+    window = torch.cat([ends[0], x, ends[1]]).unfold(0, 2 * options.cleaning.neighbours + 1, 1)  # (frames, n, 2, width)
     middle = window.nanmedian(-1).values
     far = (x - middle).abs()
     spread = 1.4826 * (window - middle[..., None]).abs().nanmedian(-1).values
     usual = 1.4826 * _usual(torch.where(seen[..., None], far, torch.nan))
-    usual = torch.maximum(usual, usual.nanmedian(0).values).clamp(min=FINE * tracks.scale)
-    return (far > OUTLYING * torch.maximum(spread, usual)).any(-1)
+    usual = torch.maximum(usual, usual.nanmedian(0).values).clamp(min=options.cleaning.least_deviation * tracks.scale)
+    return (far > options.cleaning.outlying * torch.maximum(spread, usual)).any(-1)
 
 
-def _peeled(tracks: Tracks) -> Tracks:
+def _peeled(tracks: Tracks, options: SynchronizeOptions) -> Tracks:
     """The worst position of its neighbourhood goes first, then the line through what is left is fitted again."""
     kept = tracks.weights > 0
-    for _ in range(ROUNDS):
-        away = _from_line(tracks.x, kept)
+    for _ in range(options.cleaning.line_rounds):
+        away = _from_line(tracks.x, kept, options)
         scale = 1.4826 * _usual(away)
-        scale = scale.clamp(min=max(FINE * tracks.scale, float(scale.nanmedian().nan_to_num(0.0))))
+        scale = scale.clamp(min=max(options.cleaning.least_deviation * tracks.scale, float(scale.nanmedian().nan_to_num(0.0))))
         away = away.nan_to_num(0.0)
         rows = pad(away, (0, 0, 2, 2))
         near = torch.stack([rows[k : k + len(away)] for k in (0, 1, 3, 4)])
-        bad = (away > PEELED * scale / 1.18) & (away > ALONE * near.median(0).values) & (away >= near.amax(0))
+        bad = (
+            (away > options.cleaning.line_outlying * scale / 1.18)
+            & (away > options.cleaning.over_neighbours * near.median(0).values)
+            & (away >= near.amax(0))
+        )
         if not bool(bad.any()):
             break
         kept = kept & ~bad
@@ -274,11 +258,11 @@ def _usual(far: Tensor) -> Tensor:
     return torch.where(usual > rounding, usual, other)
 
 
-def _from_line(x: Tensor, kept: Tensor) -> Tensor:
+def _from_line(x: Tensor, kept: Tensor, options: SynchronizeOptions) -> Tensor:
     """``(frames, n)`` distances from a line in time through the neighbouring frames but not the own one; NaN where there is
     none."""
-    reach = int(3 * WIDTH)
-    u = torch.arange(-reach, reach + 1, dtype=x.dtype, device=x.device) / WIDTH
+    reach = int(3 * options.cleaning.line_width)
+    u = torch.arange(-reach, reach + 1, dtype=x.dtype, device=x.device) / options.cleaning.line_width
     kernel = torch.exp(-0.5 * u.square())
     kernel[reach] = 0.0
     w = kept.to(x.dtype)
@@ -300,11 +284,7 @@ def _correlated(rows: Tensor, kernel: Tensor) -> Tensor:
 # Tracks about the middle of each frame, in units of how large they are there: what affine cameras would have seen.
 
 
-SLOW = 0.5
-"""Seconds: how slowly the distance of a person changes."""
-
-
-def frame_scaled(tracks: Tracks) -> Tracks:
+def frame_scaled(tracks: Tracks, options: SynchronizeOptions) -> Tracks:
     r"""Tracks with the strongest effects of perspective taken out.
 
     .. math:: y_{ij} = \frac{x_{ij} - c_i}{\bar r_i}, \qquad c_i = \operatorname{med}_j x_{ij}, \quad r_i =
@@ -319,19 +299,19 @@ def frame_scaled(tracks: Tracks) -> Tracks:
     middle = shown.nanmedian(1).values  # (frames, 2)
     away = shown - middle[:, None]
     size = away.norm(dim=-1).nanmedian(1).values
-    slow = _slow(size, tracks.times)
+    slow = _slow(size, tracks.times, options)
     level = slow[slow > 0].median() if bool((slow > 0).any()) else slow.new_ones(())
     scaled = away / torch.where(slow > 0, slow / level, 1.0)[:, None, None]
     return dataclasses.replace(tracks, x=torch.where(seen[..., None], scaled, 0.0))
 
 
-def _slow(size: Tensor, times: Tensor) -> Tensor:
+def _slow(size: Tensor, times: Tensor, options: SynchronizeOptions) -> Tensor:
     """Gaussian means over time of what is known."""
     known = size.isfinite()
-    reach = max(1, int(3 * SLOW / float(times.diff().median())) if len(times) > 1 else 1)
+    reach = max(1, int(3 * options.cleaning.distance_width / float(times.diff().median())) if len(times) > 1 else 1)
     values = torch.where(known, size, 0.0)
     offsets = torch.arange(-reach, reach + 1, dtype=torch.float64, device=size.device)
     step = float(times.diff().median()) if len(times) > 1 else 1.0
-    kernel = torch.exp(-0.5 * (offsets * step / SLOW).square())[None, None]
+    kernel = torch.exp(-0.5 * (offsets * step / options.cleaning.distance_width).square())[None, None]
     total, share = (torch.nn.functional.conv1d(row[None, None], kernel, padding=reach)[0, 0] for row in (values, known.double()))
     return torch.where(share > 1e-9, total / share.clamp(min=1e-9), 0.0)

@@ -1,0 +1,347 @@
+"""What decides in synchronize(), and in putting several cameras on one clock: every number, with its unit and measurement."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import log
+
+
+@dataclass(frozen=True)
+class TakeOptions:
+    """Which takes are taken."""
+
+    fewest_frames: int = 12
+    """Frames of a take at least."""
+    frame_rate_error: float = 0.02
+    """Share by which a frame rate as told is wrong at most: clock rates are searched so far."""
+    longest_over_frames: int = 20
+    """Steps that a clock may run over, in multiples of the frames there are: it is searched frame by frame."""
+    longest_steps: int = 20_000
+    """Steps that a clock may run over in any case."""
+
+
+@dataclass(frozen=True)
+class CleaningOptions:
+    """Which positions of the tracks are outliers, before the cameras are compared, and how tracks are smoothed."""
+
+    kernel_end: float = 4.0
+    """Standard deviations at which the smoothing kernel ends."""
+    least_seen: float = 0.4
+    """Share of the kernel's weight that must be seen; less is a gap."""
+    outlying: float = 4.0
+    """Robust standard deviations from the median of the neighbouring frames beyond which a position is an outlier (Hampel's 3 takes
+    more good positions at turns of the motion)."""
+    neighbours: int = 3
+    """Frames on each side that an outlier is judged by."""
+    line_width: float = 1.5
+    """Standard deviation of the kernel of the local line in the second pass, frames."""
+    line_outlying: float = 6.0
+    """Robust standard deviations from that line beyond which a position is an outlier."""
+    over_neighbours: float = 2.0
+    """Residual over that of the neighbouring frames beyond which it is one: a sudden movement bends several frames alike, a wrong
+    position its own most."""
+    least_deviation: float = 1e-3
+    """Deviation, over the distance of the points from their mean, below which there is none, whatever the spread: points at rest
+    have no spread."""
+    line_rounds: int = 8
+    """Rounds of the second pass."""
+    distance_width: float = 0.5
+    """Standard deviation of the kernel for the distance of a person, seconds: how slowly it changes."""
+
+
+@dataclass(frozen=True)
+class CurveOptions:
+    """The residual of the best fundamental matrix at every shift."""
+
+    least_overlap: float = 0.25
+    """Share of the largest overlap below which a shift is not judged: little data fit anything."""
+    fewest_pairs: int = 24
+    """Pairs of positions below which a shift is not judged: three times the unknowns of F."""
+    calm_slope: float = 0.75
+    """How much more widely velocities are smoothed than positions, per noise over the movement from frame to frame: noise that they
+    share with the residuals would pull the estimate and make it look surer than it is."""
+    calm_least: float = 1.25
+    """The width for velocities over that for positions, at least."""
+    calm_most: float = 2.5
+    """The width for velocities over that for positions, at most."""
+
+
+@dataclass(frozen=True)
+class ShiftDescentOptions:
+    """The shift between frames, with the fundamental matrix, by reweighted least squares."""
+
+    cut: float = 4.0
+    """Robust standard deviations of the residual at which Geman and McClure's weight is a quarter."""
+    block_frames: int = 30
+    """Frames that share a scale."""
+    unequal: tuple[float, float] = (0.4, 6.0)
+    """Least and largest scale of a point or a block of frames, over that of all."""
+    optimism: float = 1.6
+    """Errors over the sigma that the residuals alone say: 1.5 to 1.8 on motion capture with 5 to 60 mm of noise."""
+    iterations: int = 30
+    """Steps at most, on some of the rows and on all."""
+    done: float = 1e-5
+    """Step below which the descent ends, frames."""
+    nearly: float = 1e-3
+    """The same before the last rows come in, frames."""
+    enough_rows: int = 4_000
+    """Rows for most of the way."""
+    largest_step: float = 2.0
+    """Largest step, frames."""
+    least_sigma: float = 0.003
+    """Error that smoothing leaves in exact data, frames."""
+    largest_drift: float = 0.03
+    """Change of the clock rate at which a descent has gone astray."""
+    most_rows: int = 200_000
+    """Residuals that a descent takes at most, of longer takes at moments at equal distances: beyond, only sigma would shrink."""
+    fewest_pairs: int = 16
+    """Pairs of positions below which there is no descent."""
+    memory: float = 2.0
+    """Seconds over which residuals are taken to depend on each other: detectors err for that long."""
+    memory_parts: int = 6
+    """That time is the overlap over this number at most."""
+
+
+@dataclass(frozen=True)
+class EvidenceOptions:
+    """How sure the shift of the same points is."""
+
+    peaks: int = 6
+    """Local maxima of the curve from which a descent may start."""
+    rows: int = 3_000
+    """Residuals that are enough to compare peaks."""
+    margin: float = 0.2
+    """Nats above the next peak for a decision; motion capture, 120 frames: exactly periodic gaits stay below .17 in 95 of 100, true
+    peaks are above .31 with 30 mm of noise."""
+    affine_margin: float = 0.5
+    """The same for affine cameras: what they leave unexplained differs from period to period of a gait."""
+    rough_margin: float = 0.5
+    """Nats more for a decision where the residual is e times the usual."""
+    usual_roughness: float = 4.0
+    """Usual residual over what the noise explains; synthetic takes that have nothing in common were made to fit with margins up to
+    .42 and residuals of 7 to 22 times, real detectors have 4 to 9 times and margins above 1.2."""
+    usual_roughness_pruned: float = 2.0
+    """The same where points or positions were left out."""
+    apart: float = 2.5
+    """Frames within which peaks are one, and halves of a take agree."""
+    half_overlap: float = 0.5
+    """Share of the largest overlap below which a half of the take does not judge a shift."""
+    rivals: int = 3
+    """Other peaks that are compared between frames."""
+    fractions: int = 5
+    """Places within a step of a peak at which it is compared."""
+    sharp: float = 0.25
+    """Sigma above which a shift decides nothing, frames: where the motion is hardly above the noise, sigma is a lower bound."""
+    shortest_frame: float = 1 / 30
+    """Seconds that a frame counts for at least in it."""
+    wander: float = 1.35
+    """Residual over what each half of the take has by itself beyond which a camera may have moved."""
+    even_margin: float = 0.6
+    """Margin, over the one needed, at which the best peak is as likely as not; set by hand,
+    tests/dyntorch/tasks/synchronize/test_refusal.py and the tables of docs/results hold what comes of it."""
+    margin_scale: float = 0.05
+    """Nats of margin by which these odds grow e times."""
+    hopeless_margin: int = -10
+    """Margin below which the best peak is none, nats."""
+    agreeing: float = 0.995
+    """Probability that a shift is right in which both halves of the take agree, all else being sure."""
+    disagreeing: float = 0.3
+    """The same where they do not."""
+    blurred: float = 0.5
+    """Factor of the confidence where the shift is not sharp, or at the end of what was searched."""
+
+
+@dataclass(frozen=True)
+class ConsistentPointOptions:
+    """Which points are the same in both cameras: subsets vote, each at the shift it likes best."""
+
+    subset: int = 6
+    """Points of a subset."""
+    subsets: int = 60
+    """Subsets; one of 6 without 4 wrong points of 17 comes up with probability .14: one in 60 trials in all but 1 of 10,000."""
+    share: float = 0.7
+    """Share of the points that have to fit."""
+    wrong: float = 3.0
+    """Residual, over the median one of those that fit, beyond which a point is wrong."""
+    fewest: int = 8
+    """Points below which none can be told wrong."""
+    most_lags: int = 800
+    """Shifts at most; longer searches are made in coarser steps."""
+
+
+@dataclass(frozen=True)
+class ShiftSearchOptions:
+    """The search for the shift of the same points, and what is tried where it does not decide."""
+
+    clear: float = 0.6
+    """Nats above the next peak from which on that one needs no descent of its own."""
+    drifting: float = 10.0
+    """Seconds of overlap from which a clock rate is looked for: 1 % amounts to less than two frames of 30 at the ends of shorter
+    takes, and what is wrong with a motion fits into a rate."""
+    significant: float = 3.0
+    """Sigmas from 1 for a clock rate to be believed."""
+    largest_drift: float = 0.022
+    """Clock rates that differ from 1 by more are none."""
+    negligible: float = 0.1
+    """Frames over the take that a rate must amount to."""
+    most_steps: int = 4_000
+    """Steps of a take at most; longer takes are searched in coarser steps."""
+    rate_steps: int = 2_000
+    """Steps of a take for a search over rates, of a tenth of a second at least."""
+    suspect: float = 3.0
+    """Residual over the usual one beyond which a point is wrong."""
+    far: float = 6.0
+    """Robust standard deviations from the fit at which a position counts as an outlier."""
+    lost: float = 0.3
+    """Share of the positions of a point, or of a stretch of the take, that may be outliers."""
+    stretches: int = 8
+    """Stretches of the take that are looked at for it."""
+    rare: float = 0.01
+    """Share of outlying positions that makes no difference to a fit that is sure."""
+    rough: float = 1.25
+    """Residual over what the noise explains from which lenses are looked at."""
+    blind: float = 10.0
+    """Sigma from which no shift stands out at all, frames."""
+
+
+@dataclass(frozen=True)
+class SubspaceOptions:
+    """The curve of evidence without correspondence, from subspaces of shape and motion."""
+
+    width: float = 1 / 30
+    """Standard deviation of the Gaussian that positions are smoothed by, seconds (15 mm of noise: twice that finds one to two
+    percent less)."""
+    size_width: float = 1 / 3
+    """Standard deviation of the Gaussian for the size of the body in the image, seconds: the distance changes slowly (half to six
+    times as much are alike to a percent)."""
+    gap_widths: tuple[float, ...] = (1.0, 2.5, 6.0, 15.0, 40.0)
+    """Standard deviations of ever wider Gaussians that look for what is missing, frames."""
+    noise: float = 2.0
+    """Noise variance of the rows over that of third differences: cameras are not affine (1 to 4 are alike, 8 is 4 percent
+    worse)."""
+    narrowest: float = 0.7
+    """Least smoothing, frames: below, a sampled Gaussian is none."""
+    fill_rounds: int = 12
+    """Fills of what is missing from the other points."""
+    edge: float = 2.0
+    """Widths of smoothing left out at either end, where it is one-sided, in both cameras at once: that would speak for lag 0."""
+    stray: float = 3.0
+    """Median distances from the middle beyond which a track takes no part in the middle and the size."""
+    rounding: float = 1e-6
+    """Distance of a track from a straight line, over the extent of the points, that says nothing."""
+    least_overlap: float = 0.35
+    """Share of the shorter take below which a lag is not judged."""
+    least_seconds: float = 0.8
+    """Seconds of overlap below which a lag is not judged."""
+    shape_rate: float = 2.4
+    """Independent samples per second of the shape: neighbouring frames repeat each other; fitted, with the next two, as weights to
+    the posterior of the true lag (30 frames per second, half of the motion capture takes, 15 mm)."""
+    height_rate: float = 2.25
+    """The same of its vertical part."""
+    motion_rate: float = 5.7
+    """The same of the motion."""
+    loading: float = 0.02
+    """Share of its own variance that a velocity is blurred by: no two medians of different points are the same."""
+    chance_lags: int = 40
+    """Lags at which chance is measured."""
+
+
+@dataclass(frozen=True)
+class DifferentPointOptions:
+    """When that curve decides a shift."""
+
+    blocks: int = 8
+    """Parts of the overlap that are left out in turn."""
+    peaks: int = 6
+    """Local maxima that are returned."""
+    apart: float = 0.1
+    """Seconds within which peaks are one."""
+    sure: float = 0.95
+    """Posterior of the best peak for a decision."""
+    clear: float = 7.0
+    """Nats above the next peak at an equal overlap for a decision; of motion that repeats itself exactly 98 of 100 gaits stay below
+    3, sums of harmonics reach 13, so this alone is not enough."""
+    telling: float = 1.5
+    """Nats per second below which nothing is shared."""
+    sharp: float = 0.6
+    """Sigma above which a shift decides nothing, steps of the curve (.7 keeps 4 percent more of motion capture, and twice the wrong
+    ones of a detector)."""
+    alone: float = 0.7
+    """Share of its score by which a peak is above the next from which the motion is not compared with itself: of 425 exactly
+    periodic motions all stay below .6."""
+    repeated: float = 0.68
+    """Resemblance of the motion to itself from which a peak may be another period."""
+    bent: float = 1.5
+    """Variance about straight lines at constant velocity over that of the noise, of either camera, below which only such lines are
+    seen: 1.0 to 1.1 where they are, 16 and more for bodies that bend and turn, at 6 px of noise; the growing size of the whole
+    bends them alike at every shift."""
+    blur: float = 1 / 150
+    """Seconds that the peak is off even where it is sharp, because cameras are not affine."""
+    finest: float = 1 / 30
+    """Seconds per step at least: faster films say no more, and noise of neighbouring frames of real detectors is the same."""
+    drifting: float = 20.0
+    """Seconds of overlap from which clock rates are looked for."""
+    near: float = 1.0
+    """Seconds around the best shift in which rates are compared."""
+    sharp_frames: float = 0.6
+    """Sigma above which a shift decides nothing, frames."""
+    window: float = 10.0
+    """Seconds of a window that has a shift of its own."""
+    likely: float = 0.5
+    """Probability from which the shift of a window counts."""
+    spread: float = 0.3
+    """Frames that the shift of a window is uncertain by at least."""
+    significant: float = 3.0
+    """Sigmas from 1 for a rate to be believed."""
+    convincing: float = 8.0
+    """Nats by which another clock rate has to be better."""
+
+
+@dataclass(frozen=True)
+class NetworkOptions:
+    """Several cameras on one clock, from the shifts of their pairs."""
+
+    peaks: int = 8
+    """Candidates per pair."""
+    peak_error: float = 0.25
+    """Error of a right peak that no standard deviation of one pair knows of, frames (view-dependent keypoints)."""
+    sure: tuple[float, float] = (0.95, 0.99)
+    """Range of the probability that the best peak is right, of a pair that decides: its confidence within it."""
+    unsure: tuple[float, float] = (0.05, 0.5)
+    """The same of a pair that refused."""
+    rate_sigma: float = 5e-5
+    """Standard deviation of the rate of a pair that did not search it, next to pairs that did: what quartz clocks differ by."""
+    fixed_rate_sigma: float = 1e-9
+    """The same where no pair searched it: rates stay as given."""
+    unknown_range: float = 10.0
+    """Seconds that the offset of a pair without a curve may have."""
+    beam: int = 100
+    """States that are kept when a camera joins."""
+    final: int = 30
+    """States that are refined in the end."""
+    steps: int = 5
+    """Reweighted least squares of a state."""
+    drift_cost: float = 8.0
+    """Cost at which a contradiction of the rates stops growing: the pair is wrong, by whatever."""
+    decided: float = log(10)
+    """Logarithm of the odds of the best reading to another from which it counts as the answer, where the two differ in cameras that
+    sure pairs tie to the reference."""
+    confirmed: float = log(300)
+    """The same where they differ in others: refused pairs often fail together, all of one camera."""
+
+
+@dataclass(frozen=True)
+class SynchronizeOptions:
+    """Every number that decides in :func:`dyntorch.synchronize`, :func:`dyntorch.synchronize_cameras` and
+    :func:`dyntorch.combine_shifts`, by stage; frames are those of the slower camera."""
+
+    input: TakeOptions = TakeOptions()
+    cleaning: CleaningOptions = CleaningOptions()
+    curve: CurveOptions = CurveOptions()
+    descent: ShiftDescentOptions = ShiftDescentOptions()
+    evidence: EvidenceOptions = EvidenceOptions()
+    points: ConsistentPointOptions = ConsistentPointOptions()
+    search: ShiftSearchOptions = ShiftSearchOptions()
+    subspace: SubspaceOptions = SubspaceOptions()
+    different: DifferentPointOptions = DifferentPointOptions()
+    cameras: NetworkOptions = NetworkOptions()
