@@ -78,6 +78,7 @@ _HOME = {
     "Polynomial": "dyntorch.shapes.basis",
     "Fourier": "dyntorch.shapes.basis",
     # the numbers that decide in a task
+    "PairOptions": "dyntorch.tasks.pair.options",
     "SegmentOptions": "dyntorch.tasks.segment.options",
     "SynchronizeOptions": "dyntorch.tasks.synchronize.options",
     "TrajectoryOptions": "dyntorch.tasks.trajectories.options",

@@ -16,10 +16,11 @@ from dyntorch.core.robust import robust_fit
 from dyntorch.core.solution import Status, failed
 from dyntorch.geometry.triangulation import triangulate
 from dyntorch.invariants.fundamental_matrix import FundamentalMatrix
-from dyntorch.numerics.arguments import on_cpu
+from dyntorch.numerics.arguments import check_options, on_cpu
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.tasks.outcome import Notice, NoticeCode, check_threshold
-from dyntorch.tasks.pair.affine import FEWEST, Transfer, filled, solve
+from dyntorch.tasks.pair.affine import Transfer, filled, solve
+from dyntorch.tasks.pair.options import PairOptions
 from dyntorch.tasks.pair.result import PairReconstruction, failure
 from dyntorch.tasks.pair.tracks import Overlap, match_tracks, overlap
 from dyntorch.tasks.synchronize.result import Shift
@@ -28,15 +29,9 @@ from dyntorch.tasks.synchronize.result import Shift
 # Two static cameras that see the same points: one fundamental matrix for the whole take, and projective structure per frame.
 
 
-SAMPLED = 4000
-"""Positions that the fundamental matrix is searched from; its accuracy is then that of the noise's correlations."""
-STEPS = 3
-"""Gauss-Newton steps of the triangulation: the reprojection error no longer falls."""
-LEAST = 12
-"""Positions in both cameras: with fewer, agreement with some fundamental matrix is no evidence."""
-
-
-def projective(seen: Overlap, threshold: float | None, explained: float, generator: torch.Generator | None) -> PairReconstruction:
+def projective(
+    seen: Overlap, threshold: float | None, explained: float, generator: torch.Generator | None, options: PairOptions
+) -> PairReconstruction:
     """The reconstruction of corresponding points.
 
     Args:
@@ -44,17 +39,19 @@ def projective(seen: Overlap, threshold: float | None, explained: float, generat
         threshold: pixels, of the Sampson distance; None estimates it.
         explained: share of a point's frames that must be within it.
         generator: of the random samples.
+        options: every number that decides.
     """
     frames, n = seen.a.shape[:2]
     both = (seen.a.isfinite() & seen.b.isfinite()).all(-1)
-    if int(both.sum()) < LEAST or int(both.any(0).sum()) < 1:
-        text = f"{int(both.sum())} positions are seen by both cameras, {LEAST} are needed; give more frames or points, check shift"
+    if int(both.sum()) < options.corresponding.fewest or int(both.any(0).sum()) < 1:
+        needed = f"{options.corresponding.fewest} are needed; give more frames or points, check shift"
+        text = f"{int(both.sum())} positions are seen by both cameras, {needed}"
         notice = Notice(NoticeCode.FEW_OBSERVED, float(both.sum()), text)
         return failure((n, n), seen.times, Status.TOO_FEW, [notice], 4)
     # of unit size: neither the solver's nor the triangulation's precision depends on the unit
     x1, x2 = seen.a.nan_to_num(), seen.b.nan_to_num()
     chosen = both.flatten().nonzero()[:, 0]
-    stride = -(-len(chosen) // SAMPLED)
+    stride = -(-len(chosen) // options.corresponding.sampled)
     part = chosen[::stride]
     fitted = robust_fit(FundamentalMatrix, x1.flatten(0, 1)[part], x2.flatten(0, 1)[part], threshold=threshold, generator=generator)
     status = Status(int(fitted.status))
@@ -67,10 +64,10 @@ def projective(seen: Overlap, threshold: float | None, explained: float, generat
     distance = sampson(FundamentalMatrix, F, x1.flatten(0, 1), x2.flatten(0, 1)).unflatten(0, (frames, n))
     distance = torch.where(both, distance.abs(), torch.nan)
     sigma = 0.0 if fitted.sigma is None else float(fitted.sigma)
-    limit = threshold if threshold is not None else max(2.6 * sigma, 1e-9 * float(x1.abs().max()))
+    limit = threshold if threshold is not None else max(options.corresponding.sigmas * sigma, 1e-9 * float(x1.abs().max()))
     share = torch.where(both, distance <= limit, False).sum(0) / both.sum(0).clamp(min=1)
     good = (share >= explained) & (both.sum(0) > 0)
-    cameras, points = _structure(F, x1, x2, both, fitted.motion)
+    cameras, points = _structure(F, x1, x2, both, fitted.motion, options)
     points = torch.where((good & both)[..., None], points, torch.nan)
     residuals = distance.square().nanmean(0).sqrt()
     residual = float(distance[:, good].square().nanmean().sqrt())
@@ -92,7 +89,9 @@ def projective(seen: Overlap, threshold: float | None, explained: float, generat
     )
 
 
-def _structure(F: Tensor, x1: Tensor, x2: Tensor, both: Tensor, motion: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+def _structure(
+    F: Tensor, x1: Tensor, x2: Tensor, both: Tensor, motion: tuple[Tensor, ...], options: PairOptions
+) -> tuple[Tensor, Tensor]:
     """Cameras ``(2, 3, 4)`` and points ``(frames, n, 4)``: the frame of :math:`[I \\mid 0],\\ [A \\mid e_2]`, of unit size."""
     views = torch.stack([x1.flatten(0, 1), x2.flatten(0, 1)])
     weights = both.flatten().to(views)
@@ -103,23 +102,9 @@ def _structure(F: Tensor, x1: Tensor, x2: Tensor, both: Tensor, motion: tuple[Te
     first = torch.eye(3, 4, dtype=F.dtype, device=F.device)
     normal = torch.stack([first, second])
     moved = views * T[:, None, :1, 0] + T[:, None, :2, 2]
-    points = triangulate(normal, moved, weights.expand(2, -1), steps=STEPS)
+    points = triangulate(normal, moved, weights.expand(2, -1), steps=options.corresponding.triangulation_steps)
     cameras = torch.linalg.inv(T) @ normal
     return cameras / torch.linalg.matrix_norm(cameras, keepdim=True), points.unflatten(0, both.shape)
-
-
-SHORTEST, SPARE = 12, 6
-"""Frames in common, and more than points of either camera: fewer are explained by any tracks."""
-SEEN = 0.5
-"""Share of the frames in which a track must be seen; more gaps are guessed, not interpolated."""
-STILL = 3.0
-"""Times the noise up to which nothing moves."""
-BEYOND = 1.0
-"""Ranges of the likelihoods of unrelated motions that the one found is above the highest of them.  Two views of one scene: 2 to 16
-(3 px of noise and less, 60 frames and more); 4 points over 40 frames at 1 px: 0.6 and 1.8.  Of 12 pairs of unrelated bodies that
-wander for 4 s, all of which explain each other, one is above 1."""
-EXACT = 1e-7
-"""Of the extent: motion that is rounding."""
 
 
 @one_thread
@@ -135,6 +120,7 @@ def reconstruct_pair(
     explained: float = 0.8,
     threshold: float | None = None,
     generator: torch.Generator | None = None,
+    options: PairOptions = PairOptions(),
 ) -> PairReconstruction:
     r"""Trajectories in space of points that two static, uncalibrated cameras see, even where each camera tracks other points.
 
@@ -163,6 +149,7 @@ def reconstruct_pair(
             its frames within the threshold (corresponding points).
         threshold: pixels, Sampson distance of corresponding points; three standard deviations of the noise.  None estimates it.
         generator: of the random samples for corresponding points.
+        options: every number that decides, by stage; ``dataclasses.replace`` changes some of them.
 
     Returns:
         A :class:`~dyntorch.tasks.pair.result.PairReconstruction` in the frames of a that both cameras show, in the dtype and on the
@@ -185,15 +172,16 @@ def reconstruct_pair(
     """
     _check(a, b, correspondence, explained)
     check_threshold(threshold)
+    check_options(options, PairOptions)
     with torch.no_grad():
-        seen = overlap(a, b, shift, fps=fps, times=times)
-        short = _short(seen)
+        seen = overlap(a, b, shift, fps=fps, times=times, options=options)
+        short = _short(seen, options.input.shortest)
         if short is not None:
             found = failure((a.shape[1], b.shape[1]), seen.times, Status.TOO_FEW, [short], 4 if correspondence else 3)
         elif correspondence:
-            found = projective(seen, threshold, explained, generator)
+            found = projective(seen, threshold, explained, generator, options)
         else:
-            found = _affine(seen, explained)
+            found = _affine(seen, explained, options)
     changed = {
         f.name: getattr(found, f.name).to(dtype=a.dtype)
         for f in fields(found)
@@ -217,7 +205,7 @@ def _check(a: Tensor, b: Tensor, correspondence: bool, explained: float) -> None
         raise ValueError(f"explained must be a share from 0 to below 1, got {explained!r}")
 
 
-def _short(seen: Overlap, needed: int = SHORTEST) -> Notice | None:
+def _short(seen: Overlap, needed: int) -> Notice | None:
     frames = len(seen.times)
     if frames >= needed:
         return None
@@ -227,22 +215,23 @@ def _short(seen: Overlap, needed: int = SHORTEST) -> Notice | None:
     return Notice(NoticeCode.SHORT_OVERLAP, float(frames), text)
 
 
-def _affine(seen: Overlap, explained: float) -> PairReconstruction:
+def _affine(seen: Overlap, explained: float, options: PairOptions) -> PairReconstruction:
     """The reconstruction of different points."""
     n, m = seen.a.shape[1], seen.b.shape[1]
-    often = [x.isfinite().all(-1).double().mean(0) >= SEEN for x in (seen.a, seen.b)]
+    often = [x.isfinite().all(-1).double().mean(0) >= options.input.seen for x in (seen.a, seen.b)]
     for name, kept in zip("ab", often, strict=True):
-        if int(kept.sum()) < FEWEST:
-            text = f"camera {name} shows {int(kept.sum())} points in half of the frames, {FEWEST} are needed; track more, or longer"
+        if int(kept.sum()) < options.input.fewest_points:
+            needed = f"{options.input.fewest_points} are needed; track more, or longer"
+            text = f"camera {name} shows {int(kept.sum())} points in half of the frames, {needed}"
             return failure((n, m), seen.times, Status.TOO_FEW, [Notice(NoticeCode.FEW_POINTS, float(kept.sum()), text)], 3)
-    tracks = [filled(x[:, kept], s * s) for x, kept, s in zip((seen.a, seen.b), often, seen.noise, strict=True)]
+    tracks = [filled(x[:, kept], s * s, options) for x, kept, s in zip((seen.a, seen.b), often, seen.noise, strict=True)]
     most = max(x.shape[1] for x in tracks)
-    wrong = _short(seen, most + SPARE) or _unusable(tracks, seen.noise)
+    wrong = _short(seen, most + options.input.spare_frames) or _unusable(tracks, seen.noise, options)
     if wrong is not None:
         status = Status.TOO_FEW if wrong.code == NoticeCode.SHORT_OVERLAP else Status.DEGENERATE
         return failure((n, m), seen.times, status, [wrong], 3)
     centres = [x.mean((0, 1)) for x in tracks]
-    found = solve(tracks[0] - centres[0], tracks[1] - centres[1], seen.noise, explained)
+    found = solve(tracks[0] - centres[0], tracks[1] - centres[1], seen.noise, explained, options)
     split = int(often[0].sum())
     if isinstance(found, Tensor):
         counts = int(found[:split].sum()), int(found[split:].sum())
@@ -251,29 +240,31 @@ def _affine(seen: Overlap, explained: float) -> PairReconstruction:
             "check the shift, or that both show one scene"
         )
         return failure((n, m), seen.times, Status.NO_CONSENSUS, [Notice(NoticeCode.FEW_POINTS, float(min(counts)), text)], 3)
-    if found.beyond < BEYOND:
+    if found.beyond < options.explanation.beyond:
         text = "unrelated motions explain each other about as well: film longer, motion that changes faster, or check the shift"
         return failure((n, m), seen.times, Status.NO_CONSENSUS, [Notice(NoticeCode.CHANCE, found.beyond, text)], 3)
-    return _assembled(seen, found, tracks, centres, torch.cat(often))
+    return _assembled(seen, found, tracks, centres, torch.cat(often), options)
 
 
-def _unusable(tracks: list[Tensor], noise: tuple[float, float]) -> Notice | None:
+def _unusable(tracks: list[Tensor], noise: tuple[float, float], options: PairOptions) -> Notice | None:
     """Why the motion of one camera cannot be used, if so."""
     for name, x, sigma in zip("ab", tracks, noise, strict=True):
         moved = (x - x.mean(0)).flatten(0, 1)
         least, most = torch.linalg.eigvalsh(moved.mT @ moved / len(moved)).clamp(min=0).sqrt().tolist()
         extent = float((x - x.mean((0, 1))).square().mean().sqrt())
         # third differences of a fast motion are no noise: it is at least seven times as large
-        if most <= max(EXACT * extent, math.sqrt(2) * sigma):
+        if most <= max(options.input.exact * extent, math.sqrt(2) * sigma):
             text = f"nothing moves in camera {name}: {most:.2g} px beside a noise of {sigma:.2g}; film more motion"
             return Notice(NoticeCode.STATIC_SCENE, most, text)
-        if least <= max(EXACT * extent, min(STILL * sigma, 0.01 * most)):
+        if least <= max(options.input.exact * extent, min(options.input.still * sigma, 0.01 * most)):
             text = f"all points of camera {name} move along one line of the image ({least:.2g} px across it); film from elsewhere"
             return Notice(NoticeCode.COLLINEAR, least, text)
     return None
 
 
-def _assembled(seen: Overlap, found: Transfer, tracks: list[Tensor], centres: list[Tensor], often: Tensor) -> PairReconstruction:
+def _assembled(
+    seen: Overlap, found: Transfer, tracks: list[Tensor], centres: list[Tensor], often: Tensor, options: PairOptions
+) -> PairReconstruction:
     """Cameras, trajectories, matches in the frame (u, w_a, w_b): along the common normal, and along the epipolar lines of each."""
     n, split = seen.a.shape[1], tracks[0].shape[1]
     kept = often.clone()
@@ -301,7 +292,7 @@ def _assembled(seen: Overlap, found: Transfer, tracks: list[Tensor], centres: li
     residuals, r2 = (points.new_full(often.shape, torch.nan) for _ in range(2))
     residuals[often] = torch.where(found.good, missed.square().mean(0).sqrt(), torch.nan)
     r2[often] = found.r2
-    matches, distances = match_tracks(points, n, found.residual)
+    matches, distances = match_tracks(points, n, found.residual, options)
     return PairReconstruction(
         cameras=cameras,
         points=points,

@@ -9,17 +9,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dyntorch.tasks.pair.options import PairOptions
 from dyntorch.tasks.synchronize.options import SynchronizeOptions
 from dyntorch.tasks.synchronize.result import Shift
 from dyntorch.tasks.synchronize.tracks import Tracks, read_tracks
-
-ORDERS = (6, 4, 2)
-"""Frames around a moment that one position is interpolated from: as many as are seen of these.  At half a frame six multiply the
-variance of white noise by .71, two by .5, but two also lose what moves within a tenth of the frame rate."""
-ROUNDING = 1e-6
-"""Of a frame."""
-GAP = 2.5
-"""Frame intervals between two neighbouring frames from which on nothing is interpolated between them."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +39,7 @@ def overlap(
     *,
     fps: float | Sequence[float] | None = None,
     times: Sequence[Any] | None = None,
+    options: PairOptions = PairOptions(),
 ) -> Overlap:
     """Both cameras at a's frame times.
 
@@ -55,6 +49,7 @@ def overlap(
         shift: of b's clock against a's; or its offset in seconds.
         fps: frames per second of both or of each; None: the shift's.
         times: seconds of a's and of b's frames, instead of ``fps``.
+        options: how positions between frames are found.
 
     Raises:
         ValueError: misuse, naming the field.
@@ -72,11 +67,15 @@ def overlap(
         return Overlap(_unfilled(first)[:0], _unfilled(second), first.times[:0], (first.noise, second.noise))
     start, end = second.times[0], second.times[-1]
     # rounding moves no frame out of the overlap
-    inside = (wanted - wanted.clamp(start, end)).abs() <= ROUNDING * second.step if len(second.times) > 1 else wanted == start
+    inside = (
+        (wanted - wanted.clamp(start, end)).abs() <= options.resampling.rounding * second.step
+        if len(second.times) > 1
+        else wanted == start
+    )
     wanted = wanted.clamp(start, end)
     return Overlap(
         _unfilled(first)[inside],
-        interpolated(_unfilled(second), second.times, wanted[inside]),
+        interpolated(_unfilled(second), second.times, wanted[inside], options),
         first.times[inside],
         (first.noise, second.noise),
     )
@@ -107,7 +106,7 @@ def _unfilled(tracks: Tracks) -> Tensor:
     return torch.where((tracks.weights > 0)[..., None], tracks.x, torch.nan)
 
 
-def interpolated(x: Tensor, times: Tensor, at: Tensor) -> Tensor:
+def interpolated(x: Tensor, times: Tensor, at: Tensor, options: PairOptions = PairOptions()) -> Tensor:
     r"""Positions at any moments by Lagrange's polynomial through the frames around each: six where all are seen, else four or two.
 
     .. math:: x(t) = \sum_k x_k \prod_{l \ne k} \frac{t - t_l}{t_k - t_l}
@@ -116,6 +115,7 @@ def interpolated(x: Tensor, times: Tensor, at: Tensor) -> Tensor:
         x: ``(frames, n, 2)``, NaN = missing.
         times: ``(frames,)`` increasing.
         at: ``(m,)``.
+        options: from how many frames, and where not.
 
     Returns:
         ``(m, n, 2)``; NaN outside the frames, in gaps, and where a neighbouring frame does not show the point.
@@ -132,17 +132,17 @@ def interpolated(x: Tensor, times: Tensor, at: Tensor) -> Tensor:
         return result
     after = torch.searchsorted(times, at.contiguous(), right=True).clamp(1, max(frames - 1, 1))
     step = times.diff().median() if frames > 1 else times.new_tensor(1.0)
-    for order in reversed(ORDERS):
+    for order in reversed(options.resampling.orders):
         if frames < order:
             continue
         start = (after - order // 2).clamp(0, frames - order)
         index = start[:, None] + torch.arange(order, device=x.device)
-        found = _lagrange(x, times, at, index, step)
+        found = _lagrange(x, times, at, index, options.resampling.gap * step)
         result = torch.where(found.isnan(), result, found)
     return result
 
 
-def _lagrange(x: Tensor, times: Tensor, at: Tensor, index: Tensor, step: Tensor) -> Tensor:
+def _lagrange(x: Tensor, times: Tensor, at: Tensor, index: Tensor, gap: Tensor) -> Tensor:
     t = times[index]
     apart = t[:, :, None] - t[:, None, :]
     eye = torch.eye(index.shape[1], dtype=torch.bool, device=x.device)
@@ -150,7 +150,7 @@ def _lagrange(x: Tensor, times: Tensor, at: Tensor, index: Tensor, step: Tensor)
     weights = share.prod(-1)
     # a frame that the moment falls on needs no neighbours
     needed = weights.abs() > 1e-9
-    whole = (t.diff(dim=1) < GAP * step).all(-1) | (needed.sum(-1) == 1)
+    whole = (t.diff(dim=1) < gap).all(-1) | (needed.sum(-1) == 1)
     seen = torch.where(needed[:, :, None, None], x[index], 0.0)
     found = (weights[:, :, None, None] * seen).sum(1)
     return torch.where(whole[:, None, None] & (at >= times[0])[:, None, None] & (at <= times[-1])[:, None, None], found, torch.nan)
@@ -160,22 +160,14 @@ def _lagrange(x: Tensor, times: Tensor, at: Tensor, index: Tensor, step: Tensor)
 # Which track of one camera is which of the other, once both are transferred into one frame.
 
 
-AMBIGUOUS = 0.5
-"""Of the distance to the second nearest track, above which the nearest one is not taken."""
-SAME, NEAR = 4.0, 12.0
-"""Times the residual that one point seen twice may differ along the coordinate that both cameras see, and in all: transfer
-amplifies noise three to five times."""
-SMALL, CLOSE = 0.005, 0.03
-"""The same, as shares of the extent of the points: mean places are known less well than motions."""
-
-
-def match_tracks(points: Tensor, n: int, residual: float) -> tuple[Tensor, Tensor]:
+def match_tracks(points: Tensor, n: int, residual: float, options: PairOptions = PairOptions()) -> tuple[Tensor, Tensor]:
     """Mutually nearest tracks that no other comes near to.
 
     Args:
         points: ``(frames, n + m, 3)``, the first coordinate seen by both cameras; NaN for points that were not found.
         n: tracks of the first camera.
         residual: rms difference of the first coordinate.
+        options: how near, and how alone.
 
     Returns:
         ``(m,)`` the track of the first camera, -1 = none, and rms distances ``(n, m)``.
@@ -204,6 +196,8 @@ def match_tracks(points: Tensor, n: int, residual: float) -> tuple[Tensor, Tenso
     other = ranked.clone()
     other[track, torch.arange(len(track), device=points.device)] = torch.inf
     second_best = torch.minimum(other.amin(0), other[track].amin(1))
-    same = along.nan_to_num(nan=torch.inf).gather(0, track[None])[0] <= max(SAME * residual, SMALL * extent)
-    near = best <= max(NEAR * residual, CLOSE * extent)
-    return torch.where(mutual & same & near & (best <= AMBIGUOUS * second_best), track, none), distances
+    same = along.nan_to_num(nan=torch.inf).gather(0, track[None])[0] <= max(
+        options.matching.same * residual, options.matching.same_of_extent * extent
+    )
+    near = best <= max(options.matching.near * residual, options.matching.near_of_extent * extent)
+    return torch.where(mutual & same & near & (best <= options.matching.ambiguous * second_best), track, none), distances

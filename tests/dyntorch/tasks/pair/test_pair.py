@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from dyntorch import PairOptions
 from dyntorch.core.solution import Status
 from dyntorch.geometry.homogeneous import skew
 from dyntorch.scenes.filmed import nonrigid_pair
@@ -306,3 +307,18 @@ def test_coordinates_of_any_size_are_a_status(scale: float, camera: int) -> None
     found = reconstruct_pair(*tracks, scene.offset, fps=scene.fps)
     assert found.status == (Status.TOO_FEW if scale > 1 else Status.NO_CONSENSUS)
     assert [notice.code for notice in found.warnings] == [NoticeCode.FEW_POINTS]
+
+
+def test_options_decide():
+    scene, shipped = nonrigid_pair(N, M, FRAMES, sigma=0.3, generator=seeded(3)), PairOptions()
+    assert int(reconstruct_pair(scene.a, scene.b, 0.0, fps=scene.fps).status) == Status.OK
+    long = replace(shipped, input=replace(shipped.input, shortest=FRAMES + 1))
+    assert int(reconstruct_pair(scene.a, scene.b, 0.0, fps=scene.fps, options=long).status) == Status.TOO_FEW
+    sure = replace(shipped, explanation=replace(shipped.explanation, beyond=1e9))
+    assert int(reconstruct_pair(scene.a, scene.b, 0.0, fps=scene.fps, options=sure).status) == Status.NO_CONSENSUS
+
+
+def test_options_are_of_the_verb():
+    scene = nonrigid_pair(N, M, FRAMES, generator=seeded(3))
+    with pytest.raises(ValueError, match=r"options must be PairOptions, got \{\}; use dataclasses\.replace"):
+        reconstruct_pair(scene.a, scene.b, 0.0, fps=scene.fps, options={})
