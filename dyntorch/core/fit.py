@@ -11,8 +11,9 @@ from dyntorch.core.invariant import Invariant, as_invariant
 from dyntorch.core.matches import Matches, matches, relative_weights
 from dyntorch.core.matrix import estimation_matrix, gram, within_noise
 from dyntorch.core.normalize import Normalization, denormalize, normalization
+from dyntorch.core.outcome import Status, failed
 from dyntorch.core.primitives import Primitive
-from dyntorch.core.solution import Solution, Status, copied, failed
+from dyntorch.core.solution import Solution, copied
 from dyntorch.numerics.blocks import map_blocks, one_thread, workers
 from dyntorch.numerics.nullspace import decided_null_space, null_space
 
@@ -113,7 +114,7 @@ def fit_matches(invariant: Invariant, data: Matches, *, normalize: bool = True) 
         parts[4 + count :],
         tuple(t[..., 0, 0] for t in frames),
     )
-    return Solution(invariant, data.back(tensor), data.back(status), data.back(uncertainty), data, norm, normalized)
+    return Solution(invariant, data.back(tensor), data.back(uncertainty), data, norm, normalized, status=data.back(status))
 
 
 def _largest(invariant: Invariant) -> int:

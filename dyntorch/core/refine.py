@@ -12,8 +12,9 @@ from dyntorch.core.invariant import Invariant
 from dyntorch.core.matches import Matches, largest_weights, matches, relative_weights
 from dyntorch.core.matrix import gram
 from dyntorch.core.normalize import Normalization, denormalize, denormalize_motion, relative
+from dyntorch.core.outcome import failed
 from dyntorch.core.residual import multilinear_derivative
-from dyntorch.core.solution import Solution, copied, failed
+from dyntorch.core.solution import Solution, copied
 from dyntorch.numerics.blocks import map_blocks, one_thread, workers
 from dyntorch.numerics.least_squares import by_match, jacobian, minimize
 from dyntorch.numerics.nullspace import spectrum

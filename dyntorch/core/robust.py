@@ -14,10 +14,11 @@ from dyntorch.core.invariant import Invariant, as_invariant
 from dyntorch.core.matches import Matches, matches
 from dyntorch.core.matrix import unpack
 from dyntorch.core.normalize import Normalization, denormalize, normalization, relative
+from dyntorch.core.outcome import Status, failed
 from dyntorch.core.primitives import HyperplanesThrough, Point, Primitive, triangle
 from dyntorch.core.refine import refine_matches
 from dyntorch.core.residual import SINGULAR, multilinear, whiten, whitened
-from dyntorch.core.solution import NOISY, Solution, Status, copied, failed
+from dyntorch.core.solution import NOISY, Solution, copied
 from dyntorch.numerics.blocks import Draws, Result, map_blocks, one_thread, workers
 from dyntorch.numerics.chi_square import quantile
 from dyntorch.numerics.nullspace import gram_null_space, orthonormal
@@ -674,7 +675,8 @@ def _solution(search: Search, found: Found) -> Solution:
     tensor = invariant.normalized(norm.transforms).constrain(tensor)
     status = torch.full(tensor.shape[:1], int(Status.OK), device=tensor.device)
     back = data.back(denormalize(invariant, tensor, norm.actions))
-    return Solution(invariant, back, data.back(status), data.back(torch.zeros_like(found.score)), data, norm, tensor)
+    nothing = data.back(torch.zeros_like(found.score))
+    return Solution(invariant, back, nothing, data, norm, tensor, status=data.back(status))
 
 
 def distances(solution: Solution) -> Tensor:

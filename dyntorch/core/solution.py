@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from enum import IntEnum
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -17,68 +15,16 @@ from dyntorch.core.invariant import Invariant
 from dyntorch.core.matches import Matches
 from dyntorch.core.matrix import CHUNK, estimation_matrix
 from dyntorch.core.normalize import Normalization, denormalize_motion
+from dyntorch.core.outcome import Outcome, Status, check_status, failed
 from dyntorch.numerics.arguments import check_precision
-
-
-class Status(IntEnum):
-    """How one problem of a batch ended."""
-
-    OK = 0
-    TOO_FEW = 1
-    """Fewer matches with weight than determine the tensor.  The tensor is zero."""
-    DEGENERATE = 2
-    """The matches leave more than the invariant's null space, exactly: several tensors fulfil all of them.  The tensor is zero."""
-    AMBIGUOUS = 3
-    """Other tensors fit the matches as well as this one, within the noise.  The tensor is one of them."""
-    NO_CONSENSUS = 4
-    """Robust estimation found no tensor that enough matches agree with.  The tensor is the best one found."""
-
 
 NOISY = 0.05
 """Estimated noise over the extent of the points above which agreement with a tensor is an accident: random matches of space, with
 the noise estimated, agreed with every model, at 0.29 to 1.0."""
-REMEDY = {
-    Status.TOO_FEW: "give more matches, or weigh fewer of them 0",
-    Status.DEGENERATE: "add matches in general position (other trajectories, other directions of motion), or use a smaller model",
-    Status.AMBIGUOUS: "add matches that differ more, lower the noise, or use a model with fewer degrees of freedom",
-    Status.NO_CONSENSUS: "raise the threshold, or give matches of which more belong to the model",
-}
-
-
-def failed(status: Tensor) -> Tensor:
-    """Where a status leaves no tensor, bool of the same shape."""
-    return (status == Status.TOO_FEW) | (status == Status.DEGENERATE)
-
-
-def agreed(status: Tensor) -> Tensor:
-    """Where matches agree with what was found, bool of the same shape; elsewhere no match is an inlier of anything."""
-    return (status == Status.OK) | (status == Status.AMBIGUOUS)
-
-
-def check_status(what: str, status: Tensor, said: Sequence[tuple[int, str]] = ()) -> None:
-    """Raise where any problem failed.
-
-    Args:
-        what: was tried.
-        status: ``(*batch,)`` of :class:`Status`.
-        said: what is known about single problems, with their flat index.
-
-    Raises:
-        ValueError: says which problems failed, how, and what to do.
-    """
-    flat = status.reshape(-1)
-    for state in Status:
-        where = (flat == state).nonzero().flatten().tolist()
-        if state != Status.OK and where:
-            shown = ", ".join(map(str, where[:8])) + (", ..." if len(where) > 8 else "")
-            problems = f"problem {shown} of {len(flat)}" if status.ndim else "the problem"
-            reasons = [text for place, text in said if place in where]
-            known = f" ({'; '.join(reasons[:3])})" if reasons else ""
-            raise ValueError(f"{what}: {problems}: {state.name}; {REMEDY[state]}{known}")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Solution:
+class Solution(Outcome):
     """Result of :func:`dyntorch.fit`, :func:`dyntorch.robust_fit` and :func:`dyntorch.refine`.
 
     It refers to the matches it was given, without a copy: what is computed on first use (``singular_values``) follows them.
@@ -87,7 +33,6 @@ class Solution:
         invariant: what was fitted.
         tensor: ``(*batch, *axes)``, ``(*batch, nullity, *axes)`` where the nullity is above 1; Frobenius norm 1, zero where
             the status says that there is none.
-        status: ``(*batch,)`` of :class:`Status` values.
         uncertainty: ``(*batch,)`` expected relative error of the tensor from the noise that the residuals show; 0 where the
             matches are as few as can be (nothing is left to judge by).
         inliers: ``(*batch, n)`` bool, after robust estimation.
@@ -97,7 +42,6 @@ class Solution:
 
     invariant: Invariant
     tensor: Tensor
-    status: Tensor
     uncertainty: Tensor
     matches: Matches = field(repr=False)
     normalization: Normalization = field(repr=False)
@@ -205,7 +149,6 @@ class Solution:
         return Solution(
             self.invariant,
             outer(self.tensor),
-            outer(self.status),
             outer(self.uncertainty),
             data,
             Normalization(
@@ -215,27 +158,26 @@ class Solution:
                 tuple(map(inner, self.normalization.scales)),
             ),
             inner(self.normalized),
+            status=outer(self.status),
             inliers=None if self.inliers is None else outer(self.inliers),
             covariance=None if self.covariance is None else outer(self.covariance),
             sigma=None if self.sigma is None else outer(self.sigma),
             refined=None if self.refined is None else tuple(map(inner, self.refined)),
         )
 
-    def check(self) -> Solution:
+    def check(self) -> Self:
         """Raise where any problem failed.
 
         Raises:
             ValueError: says which problems of the batch failed, how, and what to do.
         """
-        check_status(repr(self.invariant), self.status)
+        check_status(repr(self.invariant), self.status, self.notices)
         return self
 
     def __repr__(self) -> str:
-        counted = Counter(Status(s).name for s in self.status.reshape(-1).tolist())
-        states = ", ".join(f"{count} {name}" for name, count in sorted(counted.items(), key=lambda item: Status[item[0]]))
-        shape = tuple(self.status.shape)
         noise = "" if self.sigma is None else _shown(self.sigma[self.status == Status.OK])
-        return f"Solution({self.invariant!r}, matches={self.matches.count}, batch={shape}: {states or 'empty'}{noise})"
+        shape = tuple(self.status.shape)
+        return f"Solution({self.invariant!r}, matches={self.matches.count}, batch={shape}: {self.counted()}{noise})"
 
     def _frames(self) -> tuple[Tensor, ...]:
         """Transforms without the dimension of copies."""

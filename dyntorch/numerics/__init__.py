@@ -2,7 +2,8 @@
 
 Everything here is batched over leading dimensions and computes in float64.  ``nullspace`` is the only place where null spaces
 are solved, ``least_squares`` holds the one Levenberg-Marquardt, ``blocks`` cuts batches into pieces that fit the cache and
-gives each to a thread, ``arguments`` checks what a function was given and where it computes.
+gives each to a thread, ``arguments`` checks what a function was given and where it computes, ``messages`` are sentences that keep
+their data.
 """
 
 from __future__ import annotations
@@ -22,6 +23,9 @@ _HOME = {
     "orthonormal_basis": "dyntorch.numerics.subspaces",
     "affine_factorization": "dyntorch.numerics.subspaces",
     "metric_upgrade": "dyntorch.numerics.subspaces",
+    "Message": "dyntorch.numerics.messages",
+    "worded": "dyntorch.numerics.messages",
+    "named": "dyntorch.numerics.messages",
 }
 __all__ = sorted(_HOME)
 

@@ -58,6 +58,20 @@ def refuse_vmap(name: str, value: Tensor) -> None:
         value = functorch.get_unwrapped(value)
 
 
+def check_threshold(threshold: float | None) -> None:
+    """Refuse what is not one distance.
+
+    Raises:
+        ValueError: not a number, not positive, or not finite.
+    """
+    try:
+        value = 1.0 if threshold is None else float(threshold)
+    except (TypeError, ValueError, RuntimeError):
+        value = float("nan")
+    if not 0 < value < float("inf"):
+        raise ValueError(f"threshold must be a positive distance in the unit of the points, got {threshold!r}; None estimates it")
+
+
 def check_together(**tensors: tuple[Tensor, int]) -> torch.Size:
     """The batch of several tensors: raise a ``ValueError`` unless they have one dtype, one device and batches that agree.
 

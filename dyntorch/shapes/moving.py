@@ -8,6 +8,7 @@ from math import prod
 import torch
 from torch import Tensor
 
+from dyntorch.core.outcome import Outcome, Status, status_of
 from dyntorch.geometry.homogeneous import nonzero_sign
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.numerics.least_squares import minimize
@@ -408,8 +409,8 @@ EXACT = 1e-6
 """Noise of views of norm 1 below which they are called exact; float32 leaves 1e-8 to 1e-7."""
 
 
-@dataclass(frozen=True, eq=False)
-class MovingShapes:
+@dataclass(frozen=True, eq=False, repr=False)
+class MovingShapes(Outcome):
     """Result of :func:`fit_shapes`.
 
     Attributes:
@@ -417,16 +418,29 @@ class MovingShapes:
         noise: ``(*batch,)`` standard deviation of one coordinate of a view, its centred views having Frobenius norm 1.
         residual: ``(*batch, views)`` part of the energy of each view that the shape does not explain, in [0, 1].
         uncertainty: ``(*batch,)`` expected relative error of the shapes from the noise; infinite where they are not determined.
-        few: ``(*batch,)`` bool: fewer views than determine the shapes.
-        degenerate: ``(*batch,)`` bool: other shapes explain the views exactly as well (planar or resting points, equal times).
+        status: ``(*batch,)``: ``TOO_FEW`` where fewer views are given than determine the shapes, ``DEGENERATE`` where other shapes
+            explain the views exactly as well (planar or resting points, equal times).
     """
 
     shapes: Tensor
     noise: Tensor
     residual: Tensor
     uncertainty: Tensor
-    few: Tensor
-    degenerate: Tensor
+
+    TASK = "fit_shapes"
+
+    @property
+    def few(self) -> Tensor:
+        """``(*batch,)`` bool: fewer views than determine the shapes."""
+        return self.status == Status.TOO_FEW
+
+    @property
+    def degenerate(self) -> Tensor:
+        """``(*batch,)`` bool: other shapes explain the views exactly as well."""
+        return self.status == Status.DEGENERATE
+
+    def __repr__(self) -> str:
+        return self.head(views=self.residual.shape[-1], points=self.shapes.shape[-2], functions=self.shapes.shape[-3])
 
 
 @one_thread
@@ -475,9 +489,9 @@ def fit_shapes(
     found = project(views.x, views.weights, shapes_at(shapes, times))
     residual = found.residual.square().sum((-2, -1)).clamp(0, 1)
     none = few[:, None, None, None]
-    back = [torch.where(none, 0.0, framed(shapes)), noise, residual, torch.where(few, torch.inf, uncertainty), few, free & ~few]
-    done = [part.reshape((*batch, *part.shape[1:])) for part in back]
-    return MovingShapes(*(part.to(x.dtype) if part.is_floating_point() else part for part in done))
+    back = [torch.where(none, 0.0, framed(shapes)), noise, residual, torch.where(few, torch.inf, uncertainty)]
+    done = [part.reshape((*batch, *part.shape[1:])).to(x.dtype) for part in back]
+    return MovingShapes(*done, status=status_of(free, few).reshape(batch))
 
 
 def _checked(x: Tensor, rows: Tensor, weights: Tensor | None, share: Tensor | None) -> tuple[tuple[int, ...], AffineViews, Tensor]:

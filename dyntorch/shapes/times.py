@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dyntorch.core.outcome import Outcome, status_of
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.shapes.basis import Trajectory
 from dyntorch.shapes.moving import centred_views, project, shapes_at
@@ -22,8 +23,8 @@ CHUNK = 1 << 22
 RIDGE = 1e-12
 
 
-@dataclass(frozen=True, eq=False)
-class Recovery:
+@dataclass(frozen=True, eq=False, repr=False)
+class Recovery(Outcome):
     """Result of :func:`recover_times`: one entry per view.
 
     Attributes:
@@ -33,6 +34,7 @@ class Recovery:
         sigma: ``(*batch, views)`` expected error of the time for noise 1 of the normalized view: times the noise of the shapes.
         second: ``(*batch, views)`` the time of the next minimum; the same time where there is none.
         rise: ``(*batch, views)`` how much more it leaves; infinite where there is none.
+        status: ``(*batch, views)``: ``TOO_FEW`` where the view says nothing.
     """
 
     residual: Tensor
@@ -40,6 +42,11 @@ class Recovery:
     sigma: Tensor
     second: Tensor
     rise: Tensor
+
+    TASK = "recover_times"
+
+    def __repr__(self) -> str:
+        return f"Recovery(views={self.times.shape[-1]}, batch={tuple(self.times.shape[:-1])}: {self.counted()})"
 
     def ambiguous(self, noise: Tensor | float, odds: float = 20.0) -> Tensor:
         """Whether noise of this standard deviation could exchange the two times, ``(*batch, views)`` bool.
@@ -115,7 +122,8 @@ def recover_times(
         torch.where(known, part, value).reshape(*batch, known.shape[-1]).to(x.dtype)
         for part, value in zip(found, none, strict=True)
     ]
-    return Recovery(*(part.reshape(*batch, known.shape[-1]).to(x.dtype) for part in done))
+    status = status_of(torch.zeros_like(known), ~known).reshape(*batch, known.shape[-1])
+    return Recovery(*(part.reshape(*batch, known.shape[-1]).to(x.dtype) for part in done), status=status)
 
 
 def _grid(basis: Trajectory, count: int, interval: tuple[float, float], like: Tensor) -> Tensor:

@@ -106,7 +106,7 @@ def synthetic(views: int, noise: float, config: Config, generator: torch.Generat
     cameras, x, points, lines = scene((config.scenes, views), 200, noise, generator)
     found = triangulate_trajectories(cameras, x)
     angle = 1 - torch.maximum((found.lines * lines).sum(-1).abs(), (found.second * lines).sum(-1).abs())
-    ok = (found.status == LineStatus.OK) | (found.status == LineStatus.TWO_FOLD)
+    ok = (found.kinds == LineStatus.OK) | (found.kinds == LineStatus.TWO_FOLD)
     # of four views nothing tells which line is true: the better one counts
     other = points_on_lines(cameras, x, found.second)
     error = torch.minimum(*((p - points).norm(dim=-1).mean(1) for p in (found.points, other)))
@@ -240,7 +240,7 @@ def real(data: Flight, length: float, count: int | None, seed: int) -> dict[str,
             data.cameras[data.camera[chosen]], data.x[chosen], data.time[chosen]
         )  # fmt: skip
     found = triangulate_trajectories(cameras, x, sigma=1.0)
-    ok = found.status[:, 0] == LineStatus.OK
+    ok = found.kinds[:, 0] == LineStatus.OK
     begin = torch.tensor([start for start, _ in some], dtype=torch.float64)
     head, tail = data.position(begin), data.position(begin + length)
     line = found.lines[:, 0]

@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 import dyntorch as dyn
+from dyntorch.core.outcome import failed
 from dyntorch.core.primitives import Hyperplane
 from dyntorch.core.refine import constrain
-from dyntorch.core.solution import failed
 from tests.battery.cases import Case
 from tests.battery.pretend_device import accelerators, moved
 from tests.battery.properties import example, finite, many, ok, prop, worst

@@ -10,15 +10,15 @@ from torch import Tensor
 from dyntorch.core.fit import fit_matches
 from dyntorch.core.invariant import Invariant
 from dyntorch.core.matches import Matches
+from dyntorch.core.outcome import Notice, Status, failed, in_order, noting
 from dyntorch.core.robust import robust_fit
-from dyntorch.core.solution import NOISY, Solution, Status, failed
+from dyntorch.core.solution import NOISY, Solution
 from dyntorch.geometry.homogeneous import homogeneous, inhomogeneous
 from dyntorch.invariants.join_tensor import JoinTensor
 from dyntorch.invariants.minimal_join_tensor import MinimalJoinTensor
 from dyntorch.numerics.chi_square import median, three_sigma
 from dyntorch.tasks.align.labelling import ROUGH, SIGMAS, Evidence, Labelled, joined, static_consensus
-from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment
-from dyntorch.tasks.outcome import Notice, NoticeCode, notices
+from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment, AlignNotice
 
 MINIMAL = {"join": 47, "minimal_join": 47}
 FULL = 60  # matches for the join tensor itself, which joins the starts from there on
@@ -60,7 +60,7 @@ def align_join(data: Matches, threshold: float | None, model: str, generator: to
         sigma=outcome.sigma,
         covariance=outcome.covariance,
         ambiguity=AMBIGUITY,
-        warnings=_notices(evidence, replace(best, labels=labels), worst, solution.status, data.batch),
+        notices=_notices(evidence, replace(best, labels=labels), worst, solution.status, data.batch),
         solution=outcome,
     )
 
@@ -195,16 +195,13 @@ def _status(evidence: Evidence, best: Labelled, worst: Tensor, undetermined: Ten
 def _notices(evidence: Evidence, best: Labelled, worst: Tensor, status: Tensor, batch: tuple[int, ...]) -> tuple[Notice, ...]:
     solved = ~failed(status)
     moving, still = (best.labels == MOVING).sum(-1), (best.labels == STATIC).sum(-1)
-    text = f"{{value:g}} matches move, {MOVERS} and more would determine the motion without static ones"
-    found = notices(NoticeCode.FEW_MOVING, text, moving, solved & (moving < MOVERS) & (still < ENOUGH), batch)
-    text = "nearly nothing moves ({value:g} matches); the motion rests on the static matches"
-    found += notices(NoticeCode.NEAR_STATIC, text, moving, solved & (moving < LINES) & (still >= ENOUGH), batch)
+    found, note = noting(batch)
+    note(AlignNotice.FEW_MOVING, moving, solved & (moving < MOVERS) & (still < ENOUGH), least=f"{MOVERS} and more")
+    note(AlignNotice.NEAR_STATIC, moving, solved & (moving < LINES) & (still >= ENOUGH), case="matches")
     lines = trajectory_lines(evidence, best)
-    text = f"the moving matches lie on {{value:g}} lines, {LINES} would determine the motion without static ones"
-    found += notices(NoticeCode.FEW_LINES, text, lines, solved & (moving > lines) & (lines < LINES), batch)
-    text = "the worst direction of the motion, of norm 1, has a standard deviation of {value:.2g}; add matches or lower the noise"
-    found += notices(NoticeCode.UNCERTAIN, text, worst, solved & (worst > UNCERTAIN), batch)
-    return tuple(sorted(found, key=lambda notice: notice.problem))
+    note(AlignNotice.FEW_LINES, lines, solved & (moving > lines) & (lines < LINES), least=LINES)
+    note(AlignNotice.UNCERTAIN, worst, solved & (worst > UNCERTAIN), case="matches", what="motion")
+    return in_order(found)
 
 
 def trajectory_lines(evidence: Evidence, best: Labelled) -> Tensor:

@@ -173,7 +173,8 @@ class Evidence:
         parts = problem.parts(theta)
         tensor = self.invariant.compose(*parts)
         data = replace(self.data, weights=problem.weights, static=problem.static)
-        start = Solution(self.invariant, tensor, zero, torch.zeros_like(theta[:, 0]), data, self.norm, tensor, refined=parts)
+        nothing = torch.zeros_like(theta[:, 0])
+        start = Solution(self.invariant, tensor, nothing, data, self.norm, tensor, status=zero, refined=parts)
         return refine_matches(start, data, steps)
 
     def improved(self, theta: Tensor, sigma: Tensor, rough: Tensor) -> Tensor:

@@ -11,20 +11,21 @@ from torch.nn.functional import normalize
 from dyntorch.core.fit import fit_matches
 from dyntorch.core.matches import Matches, matches
 from dyntorch.core.normalize import Normalization, denormalize_motion
+from dyntorch.core.outcome import Notice, Status, failed, in_order, noting
 from dyntorch.core.primitives import Line, direction
 from dyntorch.core.residual import multilinear, multilinear_derivative
 from dyntorch.core.robust import robust_fit
-from dyntorch.core.solution import Solution, Status, failed
+from dyntorch.core.solution import Solution
 from dyntorch.geometry.homogeneous import homogeneous, unit
 from dyntorch.invariants.agreement import point_error, static_residual
 from dyntorch.invariants.translating_lines_matrix import TranslatingLinesMatrix
+from dyntorch.numerics.arguments import check_threshold
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.numerics.chi_square import median, three_sigma
 from dyntorch.numerics.least_squares import by_match, damped_step, derivatives
 from dyntorch.numerics.nullspace import spectrum
 from dyntorch.tasks.align.labelling import SIGMAS
-from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment
-from dyntorch.tasks.outcome import Notice, NoticeCode, check_threshold, notices
+from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment, AlignNotice
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Lines that move in planes, static lines and static points between two views: residuals, refinement, labels.
@@ -222,11 +223,11 @@ AMBIGUOUS, UNCERTAIN = 0.5, 0.05
 INDETERMINATE = 1e-13  # information on the worst direction over that on the best: rounding error below it
 CONSENSUS, SPARE = 0.4, 6
 RANKS = (
-    (20, "all lines stand still"),
-    (28, "the lines belong to two rigid bodies that translate"),
-    (31, "the lines only translate: the position and the scale of view 2 remain unknown, four degrees of freedom"),
+    (20, "static"),
+    (28, "bodies"),
+    (31, "translation"),
 )
-"""Ranks of the estimation matrix (of 35) for special motions (thesis section 8.4, counted exactly)."""
+"""Ranks of the estimation matrix (of 35) for special motions, cases of a notice (thesis section 8.4, counted exactly)."""
 
 AMBIGUITY = (
     "A is unique up to its scale where points of one line move at different speeds, or with two static points. Lines that only "
@@ -392,7 +393,7 @@ def _result(
         sigma=data.back(torch.where(none, 0.0, sigma)),
         covariance=data.back(torch.where(zero, 0.0, covariance * sigma.square()[:, None, None])),
         ambiguity=AMBIGUITY,
-        warnings=_notices(rank, worst, none, status != Status.TOO_FEW, data.batch),
+        notices=_notices(rank, worst, none, status != Status.TOO_FEW, data.batch),
     )
 
 
@@ -409,12 +410,10 @@ def _rank(lines: Lines, labels: Tensor, sigma: Tensor, usable: Tensor, points: t
 
 
 def _notices(rank: Tensor, worst: Tensor, none: Tensor, enough: Tensor, batch: tuple[int, ...]) -> tuple[Notice, ...]:
-    found: list[Notice] = []
+    found, note = noting(batch)
     least = 0
-    for most, kind in RANKS:
-        text = f"the estimation matrix has rank {{value:g}} of {MINIMAL} above the noise: {kind}; give two static points"
-        found += notices(NoticeCode.PURE_TRANSLATION, text, rank, enough & (rank > least) & (rank <= most), batch)
+    for most, case in RANKS:
+        note(AlignNotice.PURE_TRANSLATION, rank, enough & (rank > least) & (rank <= most), case=case, full=MINIMAL)
         least = most
-    text = "the worst direction of the motion, of norm 1, has a standard deviation of {value:.2g}; add lines or static points"
-    found += notices(NoticeCode.UNCERTAIN, text, worst, ~none & (worst > UNCERTAIN), batch)
-    return tuple(sorted(found, key=lambda notice: notice.problem))
+    note(AlignNotice.UNCERTAIN, worst, ~none & (worst > UNCERTAIN), case="lines", what="motion")
+    return in_order(found)

@@ -9,16 +9,17 @@ from torch import Tensor
 
 from dyntorch.core.fit import fit_matches
 from dyntorch.core.matches import Matches, matches
+from dyntorch.core.outcome import Notice, Status, failed, in_order, noting
 from dyntorch.core.robust import robust_fit
-from dyntorch.core.solution import NOISY, Solution, Status, failed
+from dyntorch.core.solution import NOISY, Solution
 from dyntorch.geometry.homogeneous import cofactors, homogeneous, inhomogeneous
 from dyntorch.invariants.agreement import static_residual
 from dyntorch.invariants.homography_tensor import HomographyTensor
+from dyntorch.numerics.arguments import check_threshold
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.numerics.chi_square import three_sigma
 from dyntorch.tasks.align.labelling import ROUGH, SIGMAS, Evidence, Labelled, joined, static_consensus
-from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment
-from dyntorch.tasks.outcome import Notice, NoticeCode, check_threshold, notices
+from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment, AlignNotice
 
 # ----------------------------------------------------------------------------------------------------------------------
 # What should be known about the matches of a plane before its result is trusted.
@@ -57,31 +58,21 @@ def planar_notices(
     solved = ~failed(status)
     moving = best.labels == MOVING
     count = moving.sum(-1)
-    found: list[Notice] = []
-
-    def note(code: NoticeCode, message: str, values: Tensor, flagged: Tensor) -> None:
-        found.extend(notices(code, message, values, flagged, batch))
-
-    text = "the matches leave {value:g} of 26 equations on the tensor; the motion rests on its static matches"
-    note(NoticeCode.DEGENERATE, text, rank, solved & (rank < HomographyTensor.width() - 1))
-    text = "the weakest equation on the tensor is only {value:.2g} times the noise; the motion rests on its static matches"
-    note(NoticeCode.NEAR_STATIC, text, strength, solved & (rank >= HomographyTensor.width() - 1) & (strength < NEAR))
-    text = "the moving matches fit a family of motions, and only {value:g} static ones choose among them; give more static matches"
+    found, note = noting(batch)
+    full = HomographyTensor.width() - 1
+    note(AlignNotice.DEGENERATE, rank, solved & (rank < full))
+    note(AlignNotice.NEAR_STATIC, strength, solved & (rank >= full) & (strength < NEAR), case="tensor")
     family = (status == Status.AMBIGUOUS) & undecided(evidence, best, tensor)
-    note(NoticeCode.OTHER_SOLUTION, text, (best.labels == STATIC).sum(-1), family)
-    text = f"{{value:g}} matches move, {FEWEST} would determine the motion without static ones"
-    note(NoticeCode.FEW_MOVING, text, count, solved & (count < FEWEST))
+    note(AlignNotice.OTHER_SOLUTION, (best.labels == STATIC).sum(-1), family)
+    note(AlignNotice.FEW_MOVING, count, solved & (count < FEWEST), least=f"{FEWEST}")
     lines = trajectory_lines(evidence, best, moving)
-    text = f"the moving matches lie on {{value:g}} lines, {LINES} would determine the motion without static ones"
-    note(NoticeCode.FEW_LINES, text, lines, solved & (lines > 0) & (lines < LINES))
-    note(NoticeCode.ONE_LINE, "all moving matches lie on one line", lines, solved & (lines == 1))
+    note(AlignNotice.FEW_LINES, lines, solved & (lines > 0) & (lines < LINES), least=LINES)
+    note(AlignNotice.ONE_LINE, lines, solved & (lines == 1))
     thin = thinness(evidence, sigma)
-    text = "the points of a view lie on a line, to {value:.2g} standard deviations; a plane needs points off it"
-    note(NoticeCode.COLLINEAR, text, thin, (data.weights > 0).any(-1) & (thin < THIN))
+    note(AlignNotice.COLLINEAR, thin, (data.weights > 0).any(-1) & (thin < THIN))
     doubtful = (best.labels == MOVING) & unverified(evidence, best)
-    text = "{value:g} matches stand still between two views only: a point that paused, or a static one mismatched in one view"
-    note(NoticeCode.UNVERIFIED, text, doubtful.sum(-1), solved & doubtful.any(-1))
-    return tuple(sorted(found, key=lambda notice: notice.problem))
+    note(AlignNotice.UNVERIFIED, doubtful.sum(-1), solved & doubtful.any(-1))
+    return in_order(found)
 
 
 def tensor_rank(inliers: Matches, evidence: Evidence, sigma: Tensor) -> tuple[Tensor, Tensor]:
@@ -277,7 +268,7 @@ def _align(data: Matches, threshold: float | None, generator: torch.Generator | 
         sigma=outcome.sigma,
         covariance=outcome.covariance,
         ambiguity=AMBIGUITY,
-        warnings=planar_notices(evidence, best, tensor, solution.status, data.batch),
+        notices=planar_notices(evidence, best, tensor, solution.status, data.batch),
         unverified=data.back(unverified(evidence, best) & (best.labels == MOVING)),
         solution=outcome,
     )

@@ -9,10 +9,10 @@ from torch import Tensor
 
 from dyntorch.core.matches import Matches, matches
 from dyntorch.invariants.join_tensor import JoinTensor
+from dyntorch.numerics.arguments import check_threshold
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.tasks.align import join, rigid, velocity
 from dyntorch.tasks.align.result import Alignment
-from dyntorch.tasks.outcome import check_threshold
 
 Model = Literal["join", "minimal_join", "constant_velocity", "affine_constant_velocity", "rigid"]
 Motion = Literal["straight", "constant_velocity"]

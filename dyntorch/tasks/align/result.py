@@ -2,21 +2,102 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import ClassVar, Self
 
 import torch
 from torch import Tensor
 
-from dyntorch.core.solution import Solution, Status, agreed
-from dyntorch.tasks.outcome import Notice, NoticeCode, check_results
+from dyntorch.core.outcome import Notice, NoticeCode, Outcome, Status, agreed
+from dyntorch.core.solution import Solution
 
 OUTLIER, STATIC, MOVING = 0, 1, 2
 
 
+_RANK = "the estimation matrix has rank {value:g} of 63 above the noise, {most} for velocities that are "
+_TURN = "; add points that move in other directions, or use {arg:model='rigid'}"
+_LINES = "the estimation matrix has rank {value:g} of {full} above the noise: "
+_WORST = "the worst direction of the {what}, of norm 1, has a standard deviation of {value:.2g}; "
+
+
+class AlignNotice(NoticeCode):
+    """What limits an alignment, and how it is said."""
+
+    DEGENERATE = "degenerate", "the matches leave {value:g} of 26 equations on the tensor; the motion rests on its static matches"
+    """The matches leave several tensors, exactly; the motion rests on static matches alone."""
+    NEAR_STATIC = (
+        "near_static",
+        {
+            "tensor": "the weakest equation on the tensor is only {value:.2g} times the noise; the motion rests on its static "
+            "matches",
+            "matches": "nearly nothing moves ({value:# match|# matches}); the motion rests on the static matches",
+        },
+    )
+    """So little moves that the noise decides between tensors; the motion rests on the static matches."""
+    FEW_MOVING = "few_moving", "{value:# match moves|# matches move}, {least} would determine the motion without static ones"
+    """Fewer moving matches than determine the motion by themselves."""
+    FEW_LINES = (
+        "few_lines",
+        "the moving matches lie on {value:# line|# lines}, {least} would determine the motion without static ones",
+    )
+    """The moving matches lie on fewer lines than determine the motion by themselves."""
+    ONE_LINE = "one_line", "all moving matches lie on one line"
+    """All moving matches lie on one line."""
+    COLLINEAR = (
+        "collinear",
+        "the points of a view lie on a line, to {value:.2g} standard deviations; a plane needs points off it",
+    )
+    """All matches of a view lie on one line."""
+    UNVERIFIED = (
+        "unverified",
+        "{value:# match stands|# matches stand} still between two views only: a point that paused, or a static one mismatched in "
+        "one view",
+    )
+    """Matches that stand still between two views only: points that paused, or static points mismatched in one view."""
+    PLANAR_VELOCITIES = "planar_velocities", f"{_RANK}in a plane{_TURN}"
+    """The velocities lie in a plane."""
+    LINEAR_VELOCITIES = "linear_velocities", f"{_RANK}along a line{_TURN}"
+    """The velocities lie along one line."""
+    EQUAL_VELOCITIES = "equal_velocities", f"{_RANK}equal{_TURN}"
+    """All matches have one velocity, or all are static."""
+    COMMON_VELOCITY = (
+        "common_velocity",
+        "no static match fixes the velocity common to all points, so their mean is taken as zero; label static ones "
+        "({arg:static=})",
+    )
+    """No static match fixes the velocity common to all points."""
+    PURE_TRANSLATION = (
+        "pure_translation",
+        {
+            "static": f"{_LINES}all lines stand still; give two static points",
+            "bodies": f"{_LINES}the lines belong to two rigid bodies that translate; give two static points",
+            "translation": f"{_LINES}the lines only translate: the position and the scale of view 2 remain unknown, four "
+            f"degrees of "
+            "freedom; give two static points",
+        },
+    )
+    """The lines only translate: the motion is known up to a family, unless static points fix it."""
+    OTHER_SOLUTION = (
+        "other_solution",
+        "the moving matches fit a family of motions, and only {value:# static one chooses|# static ones choose} among them; give "
+        "more static matches",
+    )
+    """Another solution fits as well."""
+    UNCERTAIN = (
+        "uncertain",
+        {
+            "matches": f"{_WORST}add matches or lower the noise",
+            "lines": f"{_WORST}add lines or static points",
+            "rigid": "the worst direction of the motion has a standard deviation of {value:.2g} radians or sizes of the scene; add "
+            "matches, static ones or movers that change their speed",
+        },
+    )
+    """The noise leaves the motion so uncertain that it says little."""
+
+
 @dataclass(frozen=True, eq=False, repr=False)
-class Alignment:
+class Alignment(Outcome):
     """Result of ``align_planar``, ``align_points`` and ``align_lines``.
 
     Attributes:
@@ -24,11 +105,9 @@ class Alignment:
             Frobenius norm 1; zero where the status says that there is none, the best one found for ``NO_CONSENSUS``.
         B: the same for view 3; None with two views.
         labels: ``(*batch, n)`` 0 outlier, 1 static, 2 moving; all 0 where the status is neither OK nor AMBIGUOUS.
-        status: ``(*batch,)`` of :class:`dyntorch.Status`.
         sigma: ``(*batch,)`` noise of one coordinate that the inliers show, in the unit of the matches; 0 where there are none.
         covariance: ``(*batch, p, p)`` of the entries of A, then those of B, row by row.
         ambiguity: a sentence: what the data cannot tell, even without noise.
-        warnings: notices on single problems of the batch, in its order.
         velocities: ``(*batch, n, d)``, where the model has them.
         unverified: ``(*batch, n)`` matches that stand still between two of three views: moving by geometry, but a static point
             mismatched in one view looks the same.
@@ -38,11 +117,9 @@ class Alignment:
     A: Tensor
     B: Tensor | None
     labels: Tensor
-    status: Tensor
     sigma: Tensor
     covariance: Tensor
     ambiguity: str
-    warnings: tuple[Notice, ...] = ()
     velocities: Tensor | None = None
     unverified: Tensor | None = None
     solution: Solution | None = field(default=None, repr=False)
@@ -56,22 +133,34 @@ class Alignment:
                 kept = good[(..., *[None] * (value.ndim - good.ndim))]
                 object.__setattr__(self, name, torch.where(kept, value, torch.zeros_like(value)))
 
+    TASK = "align"
+    REMEDIES: ClassVar[Mapping[Status, str]] = {
+        Status.TOO_FEW: "too few matches are present in all views; give more",
+        Status.DEGENERATE: "several motions fit all matches exactly; add matches that move otherwise, or use a model with fewer "
+        "unknowns",
+        Status.AMBIGUOUS: "other motions fit as well; add matches that differ more, lower the noise, or use a model with fewer "
+        "unknowns",
+        Status.NO_CONSENSUS: "no motion fits enough of the matches; raise {arg:threshold}, or give matches of which more belong "
+        "to the "
+        "model",
+    }
+
     def flagged(self, code: NoticeCode | str) -> Tensor:
         """Which problems have a notice of this code, ``(*batch,)`` bool.
 
         Raises:
             ValueError: there is no such code.
         """
-        known = [c.value for c in NoticeCode]
+        known = [c.value for c in AlignNotice]
         if code not in known:
             raise ValueError(f"code must be one of {', '.join(known)}, got {code!r}")
         result = torch.zeros(self.status.shape, dtype=torch.bool)
-        for notice in self.warnings:
+        for notice in self.notices:
             if notice.code == code:
                 result[notice.problem] = True
         return result.to(self.status.device)
 
-    def check(self) -> Alignment:
+    def check(self) -> Self:
         """Raise where any problem failed.
 
         Raises:
@@ -79,34 +168,20 @@ class Alignment:
         """
         if self.solution is not None:
             self.solution.check()
-        check_results("align", self.status, self.warnings)
-        return self
+        return super().check()
+
+    def _telling(self, status: Status) -> Sequence[Notice]:
+        """What a notice says of the data is no reason by itself."""
+        return ()
 
     def __repr__(self) -> str:
-        counts = self._counts()
-        shape = tuple(self.status.shape)
-        lines = [
-            f"Alignment(matches={self.labels.shape[-1]}, batch={shape}: {_listed(counts['status'])})",
-            f"  labels: {_listed(counts['labels'])}",
-        ]
-        if self.sigma.numel():
-            lines.append(f"  noise: {_median(self.sigma):.3g} per coordinate" + (" (median)" if shape else ""))
-        if shape:
-            seen = Counter(notice.code.value for notice in self.warnings)
-            lines += [f"  warning {code}: {count} of {self.status.numel()} problems" for code, count in sorted(seen.items())]
-        else:
-            lines += [f"  warning {notice}" for notice in self.warnings]
-        return "\n".join(lines)
-
-    def _counts(self) -> dict[str, Mapping[str, int]]:
-        states = Counter(Status(s).name for s in self.status.reshape(-1).tolist())
         flat = self.labels.reshape(-1)
         names = {"static": STATIC, "moving": MOVING, "outlier": OUTLIER}
-        return {"status": states, "labels": {name: int((flat == label).sum()) for name, label in names.items()}}
-
-
-def _listed(counts: Mapping[str, int]) -> str:
-    return ", ".join(f"{count} {name}" for name, count in counts.items()) or "empty"
+        counts = ", ".join(f"{int((flat == label).sum())} {name}" for name, label in names.items())
+        lines = [self.head(matches=self.labels.shape[-1]), f"  labels: {counts}"]
+        if self.sigma.numel():
+            lines.append(f"  noise: {_median(self.sigma):.3g} per coordinate" + (" (median)" if self.status.ndim else ""))
+        return "\n".join(lines + self.warned())
 
 
 def _median(values: Tensor) -> float:

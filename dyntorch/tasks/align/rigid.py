@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from dyntorch.core.matches import Matches
-from dyntorch.core.solution import NOISY, Status, failed
+from dyntorch.core.outcome import Notice, Status, failed, in_order, noting
+from dyntorch.core.solution import NOISY
 from dyntorch.geometry.homogeneous import similarity, skew
 from dyntorch.geometry.rigid import moved_by, rigid_alignment
 from dyntorch.numerics.blocks import map_blocks, uniform
@@ -17,8 +18,7 @@ from dyntorch.numerics.chi_square import median, three_sigma
 from dyntorch.numerics.least_squares import damped_step
 from dyntorch.numerics.nullspace import spectrum
 from dyntorch.tasks.align.labelling import SIGMAS
-from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment
-from dyntorch.tasks.outcome import Notice, NoticeCode, notices
+from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment, AlignNotice
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Two rigid motions from points that move: :math:`x_1, A x_2, B x_3` on a straight line, or at equal steps on it.
@@ -465,7 +465,7 @@ def _result(data: Matches, sightings: RigidSightings, found: Rigid, centres: lis
     u, _, _, _ = combinations(found.motions, sightings)
     velocity = torch.where((labels == OUTLIER)[..., None], 0.0, -u / 2**0.5 / scale[:, None, None])
     zero = none[:, None, None]
-    warnings = _notices(labels, worst, found.grounded, none, motion, data.batch)
+    limits = _notices(labels, worst, found.grounded, none, motion, data.batch)
     return Alignment(
         A=data.back(torch.where(zero, 0.0, matrices[:, 0])),
         B=data.back(torch.where(zero, 0.0, matrices[:, 1])),
@@ -474,7 +474,7 @@ def _result(data: Matches, sightings: RigidSightings, found: Rigid, centres: lis
         sigma=data.back(torch.where(none, 0.0, found.sigma / scale)),
         covariance=data.back(torch.where(zero, 0.0, entries)),
         ambiguity=AMBIGUITY[motion],
-        warnings=warnings,
+        notices=limits,
         velocities=data.back(torch.where(zero, 0.0, velocity)) if motion == "constant_velocity" else None,
     )
 
@@ -534,17 +534,9 @@ def _notices(
     labels: Tensor, worst: Tensor, grounded: Tensor, none: Tensor, motion: str, batch: tuple[int, ...]
 ) -> tuple[Notice, ...]:
     moving, solved = (labels == MOVING).sum(-1), ~none
-    found = notices(
-        NoticeCode.UNCERTAIN,
-        "the worst direction of the motion has a standard deviation of {value:.2g} radians or sizes of the scene; add matches, "
-        "static ones or movers that change their speed",
-        worst,
-        solved & (worst > UNCERTAIN),
-        batch,
-    )
-    text = "no static match fixes the velocity common to all points, so their mean is taken as zero; label static ones (static=)"
-    found += notices(NoticeCode.COMMON_VELOCITY, text, worst, solved & ~grounded, batch)
+    found, note = noting(batch)
+    note(AlignNotice.UNCERTAIN, worst, solved & (worst > UNCERTAIN), case="rigid")
+    note(AlignNotice.COMMON_VELOCITY, worst, solved & ~grounded)
     few = solved & (moving < MINIMAL[motion]) & ((labels == STATIC).sum(-1) < 3)
-    text = f"{{value:g}} matches move, {MINIMAL[motion]} would determine the motion without static ones"
-    found += notices(NoticeCode.FEW_MOVING, text, moving, few, batch)
-    return tuple(sorted(found, key=lambda notice: notice.problem))
+    note(AlignNotice.FEW_MOVING, moving, few, least=f"{MINIMAL[motion]}")
+    return in_order(found)

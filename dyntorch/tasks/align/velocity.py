@@ -10,8 +10,9 @@ from torch import Tensor
 from dyntorch.core.fit import fit_matches
 from dyntorch.core.matches import Matches
 from dyntorch.core.normalize import denormalize_motion
+from dyntorch.core.outcome import Notice, Status, failed, in_order, noting
 from dyntorch.core.robust import robust_fit
-from dyntorch.core.solution import NOISY, Status, failed
+from dyntorch.core.solution import NOISY
 from dyntorch.geometry.homogeneous import apply, unit
 from dyntorch.invariants.constant_velocity_tensor import ConstantVelocityTensor
 from dyntorch.numerics.blocks import map_blocks, uniform
@@ -19,8 +20,7 @@ from dyntorch.numerics.chi_square import median, three_sigma
 from dyntorch.numerics.least_squares import damped_step, derivatives
 from dyntorch.numerics.nullspace import spectrum
 from dyntorch.tasks.align.labelling import ROUGH, SIGMAS, Evidence
-from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment
-from dyntorch.tasks.outcome import Notice, NoticeCode, notices
+from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment, AlignNotice
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Points at constant velocity before projective or affine sensors: refinement, the static gauge, labels, the sensor's motion.
@@ -232,7 +232,7 @@ AMBIGUOUS, UNCERTAIN = 0.5, 0.05
 """Standard deviation of the worst direction of the maps, of norm 1, above which they are not known at all; or hardly."""
 CONSENSUS, SPARE = 0.4, 6
 PROBLEMS = 8
-RANKS = ((36, NoticeCode.EQUAL_VELOCITIES), (49, NoticeCode.LINEAR_VELOCITIES), (58, NoticeCode.PLANAR_VELOCITIES))
+RANKS = ((36, AlignNotice.EQUAL_VELOCITIES), (49, AlignNotice.LINEAR_VELOCITIES), (58, AlignNotice.PLANAR_VELOCITIES))
 """Ranks of the estimation matrix for degenerate velocities (of 63)."""
 ABOVE = 3.0  # a singular value counts from so many times the noise on
 
@@ -269,7 +269,7 @@ def align_velocity(data: Matches, threshold: float | None, affine: bool, generat
         sigma=data.back(torch.where(none, 0.0, state.sigma)),
         covariance=data.back(torch.where(zero, 0.0, covariance)),
         ambiguity=AMBIGUITY,
-        warnings=_notices(evidence, state, worst, none, affine, data.batch),
+        notices=_notices(evidence, state, worst, none, affine, data.batch),
         velocities=data.back(velocities),
     )
 
@@ -387,23 +387,17 @@ def _status(evidence: Evidence, state: Velocities, worst: Tensor, undetermined: 
 def _notices(
     evidence: Evidence, state: Velocities, worst: Tensor, none: Tensor, affine: bool, batch: tuple[int, ...]
 ) -> tuple[Notice, ...]:
-    found: list[Notice] = []
+    found, note = noting(batch)
     enough = (evidence.data.weights > 0).sum(-1) >= MINIMAL[affine]
     if evidence.data.count >= MINIMAL[False]:
         rank = _rank(evidence, state, none)
         least = 0
         for most, code in RANKS:
-            text = f"the estimation matrix has rank {{value:g}} of 63 above the noise, {most} for velocities that are "
-            kind = code.removesuffix("_velocities") if code != NoticeCode.LINEAR_VELOCITIES else "along a line"
-            kind = "in a plane" if code == NoticeCode.PLANAR_VELOCITIES else kind
-            text += f"{kind}; add points that move in other directions, or use model='rigid'"
-            found += notices(code, text, rank, enough & (rank > least) & (rank <= most), batch)
+            note(code, rank, enough & (rank > least) & (rank <= most), most=most)
             least = most
-    text = "no static match fixes the velocity common to all points, so their mean is taken as zero; label static ones (static=)"
-    found += notices(NoticeCode.COMMON_VELOCITY, text, worst, ~none & ~state.grounded, batch)
-    text = "the worst direction of the maps, of norm 1, has a standard deviation of {value:.2g}; add matches or lower the noise"
-    found += notices(NoticeCode.UNCERTAIN, text, worst, ~none & (worst > UNCERTAIN), batch)
-    return tuple(sorted(found, key=lambda notice: notice.problem))
+    note(AlignNotice.COMMON_VELOCITY, worst, ~none & ~state.grounded)
+    note(AlignNotice.UNCERTAIN, worst, ~none & (worst > UNCERTAIN), case="matches", what="maps")
+    return in_order(found)
 
 
 def _rank(evidence: Evidence, state: Velocities, none: Tensor) -> Tensor:

@@ -11,17 +11,16 @@ import torch
 from torch import Tensor
 
 from dyntorch.core.normalize import hartley
+from dyntorch.core.outcome import Notice, Status, failed
 from dyntorch.core.residual import sampson
 from dyntorch.core.robust import robust_fit
-from dyntorch.core.solution import Status, failed
 from dyntorch.geometry.triangulation import triangulate
 from dyntorch.invariants.fundamental_matrix import FundamentalMatrix
-from dyntorch.numerics.arguments import check_options, on_cpu
+from dyntorch.numerics.arguments import check_options, check_threshold, on_cpu
 from dyntorch.numerics.blocks import one_thread
-from dyntorch.tasks.outcome import Notice, NoticeCode, check_threshold
 from dyntorch.tasks.pair.affine import Transfer, filled, solve
 from dyntorch.tasks.pair.options import PairOptions
-from dyntorch.tasks.pair.result import PairReconstruction, failure
+from dyntorch.tasks.pair.result import PairNotice, PairReconstruction, failure
 from dyntorch.tasks.pair.tracks import Overlap, match_tracks, overlap
 from dyntorch.tasks.synchronize.result import Shift
 
@@ -43,11 +42,10 @@ def projective(
     """
     frames, n = seen.a.shape[:2]
     both = (seen.a.isfinite() & seen.b.isfinite()).all(-1)
-    if int(both.sum()) < options.corresponding.fewest or int(both.any(0).sum()) < 1:
-        needed = f"{options.corresponding.fewest} are needed; give more frames or points, check shift"
-        text = f"{int(both.sum())} positions are seen by both cameras, {needed}"
-        notice = Notice(NoticeCode.FEW_OBSERVED, float(both.sum()), text)
-        return failure((n, n), seen.times, Status.TOO_FEW, [notice], 4)
+    needed = options.corresponding.fewest
+    if int(both.sum()) < needed or int(both.any(0).sum()) < 1:
+        notice = Notice(PairNotice.FEW_OBSERVED, float(both.sum()), {"needed": needed})
+        return failure((n, n), seen.times, Status.TOO_FEW, notice, 4)
     # of unit size: neither the solver's nor the triangulation's precision depends on the unit
     x1, x2 = seen.a.nan_to_num(), seen.b.nan_to_num()
     chosen = both.flatten().nonzero()[:, 0]
@@ -56,10 +54,7 @@ def projective(
     fitted = robust_fit(FundamentalMatrix, x1.flatten(0, 1)[part], x2.flatten(0, 1)[part], threshold=threshold, generator=generator)
     status = Status(int(fitted.status))
     if bool(failed(fitted.status)):
-        text = (
-            "the positions leave several fundamental matrices: the points stay in one plane, or hardly move; add points or motion"
-        )
-        return failure((n, n), seen.times, status, [Notice(NoticeCode.DEGENERATE, float(len(part)), text)], 4)
+        return failure((n, n), seen.times, status, Notice(PairNotice.DEGENERATE, float(len(part))), 4)
     F = fitted.tensor
     distance = sampson(FundamentalMatrix, F, x1.flatten(0, 1), x2.flatten(0, 1)).unflatten(0, (frames, n))
     distance = torch.where(both, distance.abs(), torch.nan)
@@ -85,7 +80,7 @@ def projective(
         fundamental=F,
         residuals=residuals,
         residual=residual,
-        status=status,
+        status=torch.tensor(int(status), device=F.device),
     )
 
 
@@ -167,8 +162,8 @@ def reconstruct_pair(
         >>> from dyntorch.tasks.pair.pair import reconstruct_pair
         >>> scene = nonrigid_pair(12, 10, 90, sigma=0.3, offset=0.41, generator=torch.Generator().manual_seed(0))
         >>> found = reconstruct_pair(scene.a, scene.b, scene.offset, fps=scene.fps)
-        >>> found.points.shape, found.status.name, int(found.labels.sum())
-        (torch.Size([77, 22, 3]), 'OK', 22)
+        >>> found.points.shape, bool(found.status == 0), int(found.labels.sum())
+        (torch.Size([77, 22, 3]), True, 22)
     """
     _check(a, b, correspondence, explained)
     check_threshold(threshold)
@@ -177,7 +172,7 @@ def reconstruct_pair(
         seen = overlap(a, b, shift, fps=fps, times=times, options=options)
         short = _short(seen, options.input.shortest)
         if short is not None:
-            found = failure((a.shape[1], b.shape[1]), seen.times, Status.TOO_FEW, [short], 4 if correspondence else 3)
+            found = failure((a.shape[1], b.shape[1]), seen.times, Status.TOO_FEW, short, 4 if correspondence else 3)
         elif correspondence:
             found = projective(seen, threshold, explained, generator, options)
         else:
@@ -209,10 +204,7 @@ def _short(seen: Overlap, needed: int) -> Notice | None:
     frames = len(seen.times)
     if frames >= needed:
         return None
-    text = (
-        f"the cameras have {frames} frames in common, {needed} are needed; check shift and fps, film longer, or take fewer points"
-    )
-    return Notice(NoticeCode.SHORT_OVERLAP, float(frames), text)
+    return Notice(PairNotice.SHORT_OVERLAP, float(frames), {"needed": needed})
 
 
 def _affine(seen: Overlap, explained: float, options: PairOptions) -> PairReconstruction:
@@ -221,28 +213,22 @@ def _affine(seen: Overlap, explained: float, options: PairOptions) -> PairRecons
     often = [x.isfinite().all(-1).double().mean(0) >= options.input.seen for x in (seen.a, seen.b)]
     for name, kept in zip("ab", often, strict=True):
         if int(kept.sum()) < options.input.fewest_points:
-            needed = f"{options.input.fewest_points} are needed; track more, or longer"
-            text = f"camera {name} shows {int(kept.sum())} points in half of the frames, {needed}"
-            return failure((n, m), seen.times, Status.TOO_FEW, [Notice(NoticeCode.FEW_POINTS, float(kept.sum()), text)], 3)
+            values = {"case": "shown", "which": name, "needed": options.input.fewest_points}
+            return failure((n, m), seen.times, Status.TOO_FEW, Notice(PairNotice.FEW_POINTS, float(kept.sum()), values), 3)
     tracks = [filled(x[:, kept], s * s, options) for x, kept, s in zip((seen.a, seen.b), often, seen.noise, strict=True)]
     most = max(x.shape[1] for x in tracks)
     wrong = _short(seen, most + options.input.spare_frames) or _unusable(tracks, seen.noise, options)
     if wrong is not None:
-        status = Status.TOO_FEW if wrong.code == NoticeCode.SHORT_OVERLAP else Status.DEGENERATE
-        return failure((n, m), seen.times, status, [wrong], 3)
+        return failure((n, m), seen.times, wrong.code.refuses or Status.DEGENERATE, wrong, 3)
     centres = [x.mean((0, 1)) for x in tracks]
     found = solve(tracks[0] - centres[0], tracks[1] - centres[1], seen.noise, explained, options)
     split = int(often[0].sum())
     if isinstance(found, Tensor):
         counts = int(found[:split].sum()), int(found[split:].sum())
-        text = (
-            f"the cameras explain {counts[0]} points of a and {counts[1]} of b of each other; "
-            "check the shift, or that both show one scene"
-        )
-        return failure((n, m), seen.times, Status.NO_CONSENSUS, [Notice(NoticeCode.FEW_POINTS, float(min(counts)), text)], 3)
+        notice = Notice(PairNotice.FEW_POINTS, float(min(counts)), {"case": "explained", "a": counts[0], "b": counts[1]})
+        return failure((n, m), seen.times, Status.NO_CONSENSUS, notice, 3)
     if found.beyond < options.explanation.beyond:
-        text = "unrelated motions explain each other about as well: film longer, motion that changes faster, or check the shift"
-        return failure((n, m), seen.times, Status.NO_CONSENSUS, [Notice(NoticeCode.CHANCE, found.beyond, text)], 3)
+        return failure((n, m), seen.times, Status.NO_CONSENSUS, Notice(PairNotice.CHANCE, found.beyond), 3)
     return _assembled(seen, found, tracks, centres, torch.cat(often), options)
 
 
@@ -254,11 +240,9 @@ def _unusable(tracks: list[Tensor], noise: tuple[float, float], options: PairOpt
         extent = float((x - x.mean((0, 1))).square().mean().sqrt())
         # third differences of a fast motion are no noise: it is at least seven times as large
         if most <= max(options.input.exact * extent, math.sqrt(2) * sigma):
-            text = f"nothing moves in camera {name}: {most:.2g} px beside a noise of {sigma:.2g}; film more motion"
-            return Notice(NoticeCode.STATIC_SCENE, most, text)
+            return Notice(PairNotice.STATIC_SCENE, most, {"which": name, "noise": sigma})
         if least <= max(options.input.exact * extent, min(options.input.still * sigma, 0.01 * most)):
-            text = f"all points of camera {name} move along one line of the image ({least:.2g} px across it); film from elsewhere"
-            return Notice(NoticeCode.COLLINEAR, least, text)
+            return Notice(PairNotice.COLLINEAR, least, {"which": name})
     return None
 
 
@@ -306,8 +290,8 @@ def _assembled(
         fundamental=_fundamental(cameras),
         residuals=residuals,
         residual=found.residual,
-        status=Status.OK,
-        warnings=() if found.affine else (_free(found, split),),
+        status=torch.tensor(int(Status.OK), device=points.device),
+        notices=() if found.affine else (_free(found, split),),
     )
 
 
@@ -327,8 +311,4 @@ def _fundamental(cameras: Tensor) -> Tensor:
 
 
 def _free(found: Transfer, split: int) -> Notice:
-    text = (
-        f"the mean places of the {split} and {len(found.good) - split} points do not follow from their motions (residual "
-        f"{found.residual:.2g} px without them): motions are right, places along the lines of sight are a guess"
-    )
-    return Notice(NoticeCode.FREE_PLACES, found.residual, text)
+    return Notice(PairNotice.FREE_PLACES, found.residual, {"a": split, "b": len(found.good) - split})

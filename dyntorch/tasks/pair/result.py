@@ -7,13 +7,74 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dyntorch.core.solution import Status
+from dyntorch.core.outcome import Notice, NoticeCode, Outcome, Status, agreed
 from dyntorch.geometry.triangulation import reproject
-from dyntorch.tasks.outcome import Notice, check_results
+
+
+class PairNotice(NoticeCode):
+    """Why two cameras give no reconstruction, or what limits it, and how it is said."""
+
+    FEW_OBSERVED = (
+        "few_observed",
+        "{value:# position is|# positions are} seen by both cameras, {needed} are needed; give more frames or points, check "
+        "{arg:shift}",
+        Status.TOO_FEW,
+    )
+    """Points seen in too few frames."""
+    SHORT_OVERLAP = (
+        "short_overlap",
+        "the cameras have {value:# frame|# frames} in common, {needed} are needed; check {arg:shift} and {arg:fps}, film "
+        "longer, or take "
+        "fewer points",
+        Status.TOO_FEW,
+    )
+    """Two cameras have too few frames in common."""
+    FEW_POINTS = (
+        "few_points",
+        {
+            "shown": "camera {camera:{which}} shows {value:# point|# points} in half of the frames, {needed} are needed; track "
+            "more, or "
+            "longer",
+            "explained": "the cameras explain {a:# point|# points} of {camera:a} and {b:g} of {camera:b} of each other; check the "
+            "{arg:shift}, or that both show one scene",
+        },
+    )
+    """A camera shows too few points, long enough."""
+    CHANCE = (
+        "chance",
+        "unrelated motions explain each other about as well: film longer, motion that changes faster, or check the {arg:shift}",
+        Status.NO_CONSENSUS,
+    )
+    """Random data of the kind would fit as well."""
+    DEGENERATE = (
+        "degenerate",
+        "the positions leave several fundamental matrices: the points stay in one plane, or hardly move; add points or motion",
+        Status.DEGENERATE,
+    )
+    """The matches leave several fundamental matrices, exactly."""
+    STATIC_SCENE = (
+        "static_scene",
+        "nothing moves in camera {camera:{which}}: {value:.2g} px beside a noise of {noise:.2g}; film more motion",
+        Status.DEGENERATE,
+    )
+    """Nothing moves."""
+    COLLINEAR = (
+        "collinear",
+        "all points of camera {camera:{which}} move along one line of the image ({value:.2g} px across it); film from elsewhere",
+        Status.DEGENERATE,
+    )
+    """All points move along one line of the image."""
+    FREE_PLACES = (
+        "free_places",
+        "the mean places of the {a} and {b} points do not follow from their motions (residual {value:.2g} px without them): "
+        "motions "
+        "are right, places along the lines of sight are a guess",
+    )
+    """The mean places of the points do not follow from their motions."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class PairReconstruction:
+class PairReconstruction(Outcome):
     """Result of :func:`dyntorch.reconstruct_pair`.
 
     Attributes:
@@ -32,8 +93,6 @@ class PairReconstruction:
         fundamental: ``(3, 3)`` of norm 1, :math:`x_b^T F x_a = 0`.
         residuals: ``(N,)`` rms distance of each point from the epipolar lines that the other camera says, pixels.
         residual: the same of all points found.
-        status: of :class:`dyntorch.Status`.
-        warnings: what limits what the result can be trusted for.
     """
 
     cameras: Tensor
@@ -48,8 +107,8 @@ class PairReconstruction:
     fundamental: Tensor
     residuals: Tensor
     residual: float
-    status: Status
-    warnings: tuple[Notice, ...] = ()
+
+    TASK = "reconstruct_pair"
 
     def images(self) -> Tensor:
         """Where both cameras see all points, ``(2, frames, N, 2)`` pixels: the tracks of one camera transferred to the other.
@@ -69,30 +128,21 @@ class PairReconstruction:
         seen = reproject(self.cameras, points.nan_to_num().flatten(0, 1)).unflatten(1, points.shape[:2])
         return torch.where(self.points.isnan().any(-1)[None, ..., None], torch.nan, seen)
 
-    def check(self) -> PairReconstruction:
-        """Raise where there is no reconstruction.
-
-        Raises:
-            ValueError: says why, and what to do.
-        """
-        check_results("reconstruct_pair", torch.tensor(int(self.status)), self.warnings)
-        return self
-
     def __repr__(self) -> str:
         kind = "projective" if self.points.shape[-1] == 4 else "affine"
         frames, count = self.points.shape[:2]
         found, matched = int((self.labels > 0).sum()), int((self.matches >= 0).sum())
-        lines = [f"PairReconstruction({kind}, frames={frames}, points={count}: {self.status.name})"]
-        if self.status in (Status.OK, Status.AMBIGUOUS):
+        lines = [f"PairReconstruction({kind}, frames={frames}, points={count}: {Status(int(self.status)).name})"]
+        if bool(agreed(self.status)):
             first, second = (int(((self.labels > 0) & (self.source == k)).sum()) for k in (0, 1))
             of = f" ({first} of a, {second} of b)" if kind == "affine" else ""
             lines.append(
                 f"  {found} found{of}, {count - found} outliers, {matched} seen by both; residual {self.residual:.3g} px rms"
             )
-        return "\n".join(lines + [f"  warning {notice}" for notice in self.warnings])
+        return "\n".join(lines + self.warned())
 
 
-def failure(points: tuple[int, int], times: Tensor, status: Status, notices: list[Notice], width: int) -> PairReconstruction:
+def failure(points: tuple[int, int], times: Tensor, status: Status, notice: Notice, width: int) -> PairReconstruction:
     """Nothing found.
 
     Args:
@@ -121,6 +171,6 @@ def failure(points: tuple[int, int], times: Tensor, status: Status, notices: lis
         fundamental=torch.zeros(3, 3, **like),  # type: ignore[call-overload]
         residuals=empty(count),
         residual=float("nan"),
-        status=status,
-        warnings=tuple(notices),
+        status=torch.tensor(int(status), device=times.device),
+        notices=(notice,),
     )

@@ -9,12 +9,11 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from dyntorch.core.solution import Status
+from dyntorch.core.outcome import Notice, NoticeCode, Status, in_order, noting
 from dyntorch.geometry.homogeneous import two_sided
 from dyntorch.geometry.rigid import nearest_rotation
 from dyntorch.numerics.chi_square import quantile
 from dyntorch.numerics.nullspace import eigenvalues, spectrum
-from dyntorch.tasks.outcome import Notice, NoticeCode, notices
 from dyntorch.tasks.planes.input import GivenPlanes
 
 EXACT = 1e-7
@@ -24,42 +23,69 @@ NEAR = 0.1
 CHI_SQUARE = quantile(0.99, 2)
 """Squared distance in standard deviations, of two degrees of freedom, exceeded once in a hundred."""
 
-MESSAGES: dict[NoticeCode, str | tuple[str, str] | dict[bool, str]] = {
-    NoticeCode.COLLINEAR_EPIPOLES: "the epipoles are within {value:.1g} of one line: all motion is parallel to one plane",
-    NoticeCode.COPLANAR_NORMALS: "the normals are within {value:.1g} of one plane: all planes are parallel to one line",
-    NoticeCode.SHARED_BODY: (
-        "a pair of planes or bodies moves alike, as of one body",
-        "{value:g} pairs of planes or bodies move alike, as of one body",
-    ),
-    NoticeCode.STATIC_BODY: (
-        "a plane does not move, or is at infinity: it has no epipole",
-        "{value:g} planes do not move, or are at infinity: they have no epipole",
-    ),
-    NoticeCode.UNUSED_PLANE: (
-        "a matrix is not finite, singular, or has too few matches; it was left out",
-        "{value:g} matrices are not finite, singular, or have too few matches; they were left out",
-    ),
-    NoticeCode.FEW_PLANES: (
-        "1 plane or body is left: give 3 planes, 2 planes and 1 body, or 2 bodies",
-        "{value:g} planes and bodies are left: give 3 planes, 2 planes and 1 body, or 2 bodies",
-    ),
-    NoticeCode.OTHER_SOLUTION: "another homography at infinity fits the {value:g} planes and bodies as well; add others",
-    NoticeCode.UNCERTAIN: "the noise leaves a relative error of {value:.2g} in the homography at infinity; add larger planes",
-    NoticeCode.NO_COMMON_INFINITY: {
-        True: "the planes and bodies differ from what one homography at infinity allows by {value:.2g} times the noise "
-        "(variances): some rotate, or are no planes; leave them out",
-        False: "one homography at infinity leaves {value:.0%} of what the homographies differ by: some rotate, or the noise is "
-        "large; leave some out, or give larger planes",
-    },
-    NoticeCode.CHANCE: "one homography at infinity leaves {value:.0%} of what the homographies differ by, as of random ones: give "
-    "more planes, larger ones, or their matches",
-    NoticeCode.INCOHERENT: "the matches are off any homographies and fundamental matrices by {value:.0%} of the extent of the "
-    "planes and bodies: check that x1 and x2 are the same points in the same order",
-    NoticeCode.CALIBRATION: "the homography at infinity makes the calibration {value:.2g} from a rotation, more than the noise "
-    "does: check K, or the planes",
-}
-"""Of each code: where the figure is 1 and where it is not, or with matches and without, where these differ."""
-POSITIONS = (NoticeCode.SHARED_BODY, NoticeCode.STATIC_BODY)
+_ALIKE = "{value:a pair of planes or bodies moves|# pairs of planes or bodies move} alike, as of one body"
+_REST = "{value:a plane does not move, or is at infinity: it has|# planes do not move, or are at infinity: they have} no epipole"
+_THREE = "; three planes do not suffice then"
+_INFINITY = "one homography at infinity leaves {value:.0%} of what the homographies differ by"
+
+
+class PlanesNotice(NoticeCode):
+    """What limits the result of translating planes, and how it is said."""
+
+    COLLINEAR_EPIPOLES = (
+        "collinear_epipoles",
+        "the epipoles are within {value:.1g} of one line: all motion is parallel to one plane",
+    )
+    """The epipoles lie on one line: all motion is parallel to one plane."""
+    COPLANAR_NORMALS = "coplanar_normals", "the normals are within {value:.1g} of one plane: all planes are parallel to one line"
+    """The normals of the planes lie in one plane: all planes are parallel to one line."""
+    SHARED_BODY = "shared_body", {"": _ALIKE, "three": f"{_ALIKE}{_THREE}"}
+    """Two planes or bodies that move alike."""
+    STATIC_BODY = "static_body", {"": _REST, "three": f"{_REST}{_THREE}"}
+    """A plane that does not move against the cameras, or is infinitely far."""
+    UNUSED_PLANE = (
+        "unused_plane",
+        "{value:a matrix is not finite, singular, or has too few matches; it was|# matrices are not finite, singular, or have "
+        "too few "
+        "matches; they were} left out",
+    )
+    """A homography or fundamental matrix that is singular, not finite, or has too few matches."""
+    FEW_PLANES = (
+        "few_planes",
+        "{value:# plane or body is|# planes and bodies are} left: give 3 planes, 2 planes and 1 body, or 2 bodies",
+    )
+    """Fewer planes and bodies than determine the homography at infinity."""
+    OTHER_SOLUTION = "other_solution", "another homography at infinity fits the {value:g} planes and bodies as well; add others"
+    """Another solution fits as well."""
+    UNCERTAIN = "uncertain", "the noise leaves a relative error of {value:.2g} in the homography at infinity; add larger planes"
+    """The noise leaves the motion so uncertain that it says little."""
+    NO_COMMON_INFINITY = (
+        "no_common_infinity",
+        {
+            "matches": "the planes and bodies differ from what one homography at infinity allows by {value:.2g} times the noise "
+            "(variances): some rotate, or are no planes; leave them out",
+            "": f"{_INFINITY}: some rotate, or the noise is large; leave some out, or give larger planes",
+        },
+    )
+    """No homography at infinity is common to the planes, or they are too noisy to tell."""
+    CHANCE = "chance", f"{_INFINITY}, as of random ones: give more planes, larger ones, or their matches"
+    """Random data of the kind would fit as well."""
+    INCOHERENT = (
+        "incoherent",
+        "the matches are off any homographies and fundamental matrices by {value:.0%} of the extent of the planes and bodies: "
+        "check "
+        "that x1 and x2 are the same points in the same order",
+    )
+    """The matches agree with no homographies and fundamental matrices."""
+    CALIBRATION = (
+        "calibration",
+        "the homography at infinity makes the calibration {value:.2g} from a rotation, more than the noise does: check K, or the "
+        "planes",
+    )
+    """The homography at infinity and the calibration do not make a rotation."""
+
+
+POSITIONS = (PlanesNotice.SHARED_BODY, PlanesNotice.STATIC_BODY)
 """What three planes do not suffice with."""
 
 
@@ -133,7 +159,7 @@ class Figures:
 
 
 def planes_notices(
-    figures: Figures, enough: Tensor, said: Mapping[NoticeCode, tuple[Tensor, Tensor]], given: GivenPlanes
+    figures: Figures, enough: Tensor, said: Mapping[PlanesNotice, tuple[Tensor, Tensor]], given: GivenPlanes
 ) -> tuple[Notice, ...]:
     """Notices on all problems, in their order.
 
@@ -151,31 +177,23 @@ def planes_notices(
     # one or two bodies are in one line and one plane by themselves
     several = enough & (figures.groups[0] >= 3)
     rows = {
-        NoticeCode.UNUSED_PLANE: (missing, missing > 0),
-        NoticeCode.FEW_PLANES: (used, ~enough),
-        NoticeCode.COLLINEAR_EPIPOLES: (line, collinear & several),
-        NoticeCode.COPLANAR_NORMALS: (plane, coplanar & several),
-        NoticeCode.SHARED_BODY: (pairs, (pairs > 0) & enough),
-        NoticeCode.STATIC_BODY: (still, (still > 0) & enough),
+        PlanesNotice.UNUSED_PLANE: (missing, missing > 0),
+        PlanesNotice.FEW_PLANES: (used, ~enough),
+        PlanesNotice.COLLINEAR_EPIPOLES: (line, collinear & several),
+        PlanesNotice.COPLANAR_NORMALS: (plane, coplanar & several),
+        PlanesNotice.SHARED_BODY: (pairs, (pairs > 0) & enough),
+        PlanesNotice.STATIC_BODY: (still, (still > 0) & enough),
         **said,
     }
-    found = []
+    found, note = noting(given.batch)
+    three = (used <= 3) & (figures.normals.shape[1] >= 3)
     for code, (values, flagged) in rows.items():
-        single, message = _message(code, given.matched)
-        three = "; three planes do not suffice then" if code in POSITIONS else ""
-        few = (used <= 3) & (figures.normals.shape[1] >= 3)
-        for text, one in ((single, values == 1), (message, values != 1)):
-            found += notices(code, text + three, values, flagged & one & few, given.batch)
-            found += notices(code, text, values, flagged & one & ~few, given.batch)
-    return tuple(sorted(found, key=lambda notice: notice.problem))
-
-
-def _message(code: NoticeCode, matched: bool) -> tuple[str, str]:
-    """The sentence where the figure is 1, and where it is not."""
-    message = MESSAGES[code]
-    if isinstance(message, dict):
-        message = message[matched]
-    return message if isinstance(message, tuple) else (message, message)
+        if code in POSITIONS:
+            note(code, values, flagged & three, case="three")
+            note(code, values, flagged & ~three)
+        else:
+            note(code, values, flagged, case="matches" if given.matched and "matches" in code.templates else "")
+    return in_order(found)
 
 
 def _flatness(vectors: Tensor, covariance: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,7 +10,7 @@ from torch import Tensor
 
 from dyntorch.core.fit import fit
 from dyntorch.core.normalize import hartley
-from dyntorch.core.solution import Status, failed
+from dyntorch.core.outcome import Outcome, Status, failed
 from dyntorch.geometry.homogeneous import (
     finite_depth,
     homogeneous,
@@ -27,9 +26,8 @@ from dyntorch.geometry.triangulation import triangulate
 from dyntorch.invariants.collineation import Collineation
 from dyntorch.invariants.fundamental_matrix import FundamentalMatrix
 from dyntorch.numerics.blocks import map_blocks, one_thread
-from dyntorch.tasks.outcome import Notice, NoticeCode, check_results
 from dyntorch.tasks.planes.input import GivenPlanes, Pair, Points, both, cameras, check_counts, enough, padded
-from dyntorch.tasks.planes.notices import EXACT, NEAR, Figures, misfit, planes_notices, turned
+from dyntorch.tasks.planes.notices import EXACT, NEAR, Figures, PlanesNotice, misfit, planes_notices, turned
 from dyntorch.tasks.planes.problem import Layout, PlaneMatches, noise_variance, projected, solve
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -40,7 +38,7 @@ STEPS = 5  # of Gauss and Newton on the reprojection error of a point
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class TranslatingPlanes:
+class TranslatingPlanes(Outcome):
     r"""Result of :func:`dyntorch.translating_planes`, for p planes and m bodies with known fundamental matrices; c = p + m.
 
     Everything is zero where the status says that there is nothing, and for planes and bodies that were left out.
@@ -58,10 +56,8 @@ class TranslatingPlanes:
         covariance: ``(*batch, 9, 9)`` of the entries of the homography at infinity, row by row, from the noise that the residuals
             show, rather too large where few of them are to spare; 0 where nothing is left to judge by.
         uncertainty: ``(*batch,)`` expected relative error of the homography at infinity in normalized coordinates.
-        status: ``(*batch,)`` of :class:`dyntorch.Status`.
         rotation: ``(*batch, 3, 3)`` camera 1 to camera 2, where the calibration was given.
         calibration: ``(*batch, 2, 3, 3)`` of both cameras, where it was given.
-        warnings: notices on single problems of the batch.
         unit: of ``residual``: ``"px"``, as the matches, or ``"relative"`` without matches.
     """
 
@@ -74,11 +70,11 @@ class TranslatingPlanes:
     residual: Tensor
     covariance: Tensor
     uncertainty: Tensor
-    status: Tensor
     rotation: Tensor | None = None
     calibration: Tensor | None = None
-    warnings: tuple[Notice, ...] = ()
     unit: str = "relative"
+
+    TASK = "translating_planes"
 
     @property
     def translations(self) -> Tensor | None:
@@ -170,35 +166,19 @@ class TranslatingPlanes:
         inverse = (homogeneous(x1) * self.normals[..., None, body, :]).sum(-1, keepdim=True)
         return 1 / finite_depth(torch.cat([torch.ones_like(inverse), inverse], dim=-1))[..., 0]
 
-    def check(self) -> TranslatingPlanes:
-        """Raise where any problem failed.
-
-        Raises:
-            ValueError: says which problems failed, how, and what to do.
-        """
-        check_results("translating_planes", self.status, self.warnings)
-        return self
-
     def _check_body(self, body: int, count: int) -> None:
         if not 0 <= body < count:
             raise ValueError(f"body must be an index from 0 to {count - 1}, got {body}")
 
     def __repr__(self) -> str:
-        states = Counter(Status(s).name for s in self.status.reshape(-1).tolist())
         planes, bodies = self.normals.shape[-2], self.epipoles.shape[-2] - self.normals.shape[-2]
-        listed = ", ".join(f"{count} {name}" for name, count in states.items()) or "empty"
-        lines = [f"TranslatingPlanes(planes={planes}, bodies={bodies}, batch={tuple(self.status.shape)}: {listed})"]
+        lines = [self.head(planes=planes, bodies=bodies)]
         good = ~failed(self.status)
         if bool(good.any()):
             middle = " (median)" if self.status.ndim else ""
             error, residual = (float(v[good].double().median()) for v in (self.uncertainty, self.residual))
             lines.append(f"  homography at infinity: relative error about {error:.2g}{middle}; residual {residual:.3g} {self.unit}")
-        if self.status.ndim:
-            seen = Counter(notice.code.value for notice in self.warnings)
-            lines += [f"  warning {code}: {count} of {self.status.numel()} problems" for code, count in sorted(seen.items())]
-        else:
-            lines += [f"  warning {notice}" for notice in self.warnings]
-        return "\n".join(lines)
+        return "\n".join(lines + self.warned())
 
 
 def _centre(frames: Tensor) -> Tensor:
@@ -249,14 +229,14 @@ def outcome(given: GivenPlanes, found: tuple[Tensor, ...], method: str, refined:
     status = torch.where(right, status, Status.TOO_FEW)
     distance, bent = turned(given, theta[:, :9], covariance[:, :9, :9], status)
     said = {
-        NoticeCode.NO_COMMON_INFINITY: (against.ratio, apart & ~vague),
-        NoticeCode.CHANCE: (against.ratio, chance),
-        NoticeCode.INCOHERENT: (against.vagueness, vague),
-        NoticeCode.CALIBRATION: (distance, bent),
-        NoticeCode.UNCERTAIN: (uncertainty, (uncertainty > UNCERTAIN) & right & ~apart),
-        NoticeCode.OTHER_SOLUTION: (used.sum(-1), (other | several) & right & ~apart),
+        PlanesNotice.NO_COMMON_INFINITY: (against.ratio, apart & ~vague),
+        PlanesNotice.CHANCE: (against.ratio, chance),
+        PlanesNotice.INCOHERENT: (against.vagueness, vague),
+        PlanesNotice.CALIBRATION: (distance, bent),
+        PlanesNotice.UNCERTAIN: (uncertainty, (uncertainty > UNCERTAIN) & right & ~apart),
+        PlanesNotice.OTHER_SOLUTION: (used.sum(-1), (other | several) & right & ~apart),
     }
-    warnings = planes_notices(figures, right, said, given)
+    limits = planes_notices(figures, right, said, given)
     there = (~failed(status)).to(theta.dtype)
     infinity, epipoles, normals = _measured(given, layout, theta)
     infinity = infinity * there[:, None, None]
@@ -282,7 +262,7 @@ def outcome(given: GivenPlanes, found: tuple[Tensor, ...], method: str, refined:
         status=status,
         rotation=rotation,
         calibration=given.calibration,
-        warnings=warnings,
+        notices=limits,
         unit="px" if given.matched else "relative",
     )
 

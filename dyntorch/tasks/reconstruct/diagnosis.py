@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from dyntorch.core.solution import NOISY, Status, failed
+from dyntorch.core.outcome import Note, Notice, Status, failed, in_order, noting
+from dyntorch.core.solution import NOISY
 from dyntorch.geometry.lift import behind
 from dyntorch.geometry.pairs import hyperplane_pair
 from dyntorch.geometry.triangulation import unit_projections
 from dyntorch.numerics.blocks import map_blocks
 from dyntorch.numerics.nullspace import eigenvalues, spectrum
-from dyntorch.tasks.outcome import Notice, NoticeCode, notices
 from dyntorch.tasks.reconstruct.motions import MOTIONS, Motion, polynomial
 from dyntorch.tasks.reconstruct.projections import ViewTracks, camera_unknowns, projections_of_tracks
+from dyntorch.tasks.reconstruct.result import ReconstructNotice
 from dyntorch.tasks.reconstruct.scene import LiftedState, Lifting, bodies_of, distances, scene_of, wild
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -118,8 +118,6 @@ def _derivatives(cameras: Tensor, structure: Tensor, weights: Tensor, lifts: Ten
     return (slope[..., None] * world[..., None, None, :]).flatten(-2), slope @ (cameras @ lifts)[:, :, None]
 
 
-Note = Callable[[NoticeCode, str, Tensor, Tensor], None]
-
 UNCERTAIN = 0.1
 """Expected error of the points over the size of the scene above which smaller models are tried, and a notice given.  80 points at
 0.5 px, 10 scenes each: 0.001 to 0.14 (constant_velocity_3d before 4 views), true errors about half of that; 0.2 to 13 with a camera
@@ -140,56 +138,46 @@ THIN = 3.0
 
 
 class Smaller(NamedTuple):
-    """A model of fewer unknowns, and what it means that it explains the tracks."""
+    """A model of fewer unknowns, and the notice that it explains the tracks."""
 
     motion: Motion
-    code: NoticeCode
-    cause: str
+    code: ReconstructNotice
+    case: str = ""
 
 
-_FLAT = "the points lie in a plane, or the camera stands still or only turns: let it move around points in space"
-_UNIFORM = "the camera stands still, only turns or itself moves at constant velocity, or all is in a plane: change its velocity"
-_LINE = "the velocities have one direction: take {!r}"
-_STILL = "nothing moves, or too few points: take {!r}, or add moving points"
 _TURNING = Motion(lambda t: torch.cat([torch.eye(3, dtype=torch.float64), t * torch.eye(3, dtype=torch.float64)], 1), "turning")
 _RESTING_SENSORS = Motion(polynomial(3, 0), "static_3d_sensors", sensor=3, static=True)
 
 
-def _smaller(name: str, code: NoticeCode, cause: str) -> Smaller:
-    return Smaller(MOTIONS[name], code, cause.format(name))
+def _smaller(name: str, code: ReconstructNotice) -> Smaller:
+    return Smaller(MOTIONS[name], code)
 
 
-_STATIC = {d: _smaller(f"static_{d}d", NoticeCode.STATIC_SCENE, _STILL) for d in (2, 3)}
-_SINGLE = "one body, too few points on the other, or a camera that only turns: take {!r}"
-_ONE = {d: _smaller(f"static_{d}d", NoticeCode.ONE_BODY, _SINGLE) for d in (2, 3)}
+_STATIC = {d: _smaller(f"static_{d}d", ReconstructNotice.STATIC_SCENE) for d in (2, 3)}
+_ONE = {d: _smaller(f"static_{d}d", ReconstructNotice.ONE_BODY) for d in (2, 3)}
 SMALLER: dict[str, tuple[Smaller, ...]] = {
-    "static_3d": (_smaller("static_2d", NoticeCode.TURNING_CAMERA, _FLAT),),
+    "static_3d": (_smaller("static_2d", ReconstructNotice.TURNING_CAMERA),),
     "constant_direction_2d": (_STATIC[2],),
-    "constant_velocity_2d": (_STATIC[2], _smaller("constant_direction_2d", NoticeCode.LINEAR_VELOCITIES, _LINE)),
-    "constant_acceleration_2d": (
-        _STATIC[2],
-        _smaller("constant_velocity_2d", NoticeCode.DEGENERATE, "nothing is accelerated: take {!r}"),
-    ),
+    "constant_velocity_2d": (_STATIC[2], _smaller("constant_direction_2d", ReconstructNotice.LINEAR_VELOCITIES)),
+    "constant_acceleration_2d": (_STATIC[2], _smaller("constant_velocity_2d", ReconstructNotice.DEGENERATE)),
     "constant_direction_3d": (
-        _smaller("constant_direction_2d", NoticeCode.TURNING_CAMERA, _FLAT),
+        _smaller("constant_direction_2d", ReconstructNotice.TURNING_CAMERA),
         _STATIC[3],
-        _smaller("constant_velocity_2d", NoticeCode.UNIFORM_CAMERA, _UNIFORM),
+        _smaller("constant_velocity_2d", ReconstructNotice.UNIFORM_CAMERA),
     ),
     "constant_velocity_planes_3d": (
-        _smaller("constant_velocity_2d", NoticeCode.TURNING_CAMERA, _FLAT),
+        _smaller("constant_velocity_2d", ReconstructNotice.TURNING_CAMERA),
         _STATIC[3],
-        _smaller("constant_direction_3d", NoticeCode.LINEAR_VELOCITIES, _LINE),
-        Smaller(_TURNING, NoticeCode.UNIFORM_CAMERA, _UNIFORM),
+        _smaller("constant_direction_3d", ReconstructNotice.LINEAR_VELOCITIES),
+        Smaller(_TURNING, ReconstructNotice.UNIFORM_CAMERA),
     ),
     "constant_velocity_3d": (
         _STATIC[3],
-        _smaller("constant_direction_3d", NoticeCode.LINEAR_VELOCITIES, _LINE),
-        Smaller(_TURNING, NoticeCode.UNIFORM_CAMERA, _UNIFORM),
-        _smaller("constant_velocity_planes_3d", NoticeCode.PLANAR_VELOCITIES, "the velocities are parallel to a plane: take {!r}"),
+        _smaller("constant_direction_3d", ReconstructNotice.LINEAR_VELOCITIES),
+        Smaller(_TURNING, ReconstructNotice.UNIFORM_CAMERA),
+        _smaller("constant_velocity_planes_3d", ReconstructNotice.PLANAR_VELOCITIES),
     ),
-    "constant_velocity_3d_sensors": (
-        Smaller(_RESTING_SENSORS, NoticeCode.STATIC_SCENE, "nothing moves, or too few points: add moving points"),
-    ),
+    "constant_velocity_3d_sensors": (Smaller(_RESTING_SENSORS, ReconstructNotice.STATIC_SCENE, "sensors"),),
     "two_bodies_2d": (_ONE[2],),
     "two_bodies_3d": (_ONE[3],),
 }
@@ -221,11 +209,7 @@ def diagnose(
         sigma: ``(b,)`` noise in measured units.
         batch: the shape that the flat dimension comes from.
     """
-    found: list[Notice] = []
-
-    def note(code: NoticeCode, message: str, values: Tensor, flagged: Tensor) -> None:
-        found.extend(notices(code, message, values, flagged, batch))
-
+    found, note = noting(batch)
     lost = (scene.cameras == 0).flatten(1).all(-1) | ~scene.cameras.isfinite().flatten(1).all(-1)
     status = torch.where(lost & ~failed(status), int(Status.DEGENERATE), status)
     enough, size = _through(tracks, motion)
@@ -241,22 +225,20 @@ def diagnose(
         asked = (suspect | (smaller.motion.static & (status == Status.AMBIGUOUS))) & ~explained
         left = _noise_of(tracks, smaller.motion, asked)
         same = asked & (left <= EXPLAINED * torch.where(solved, noise, 0.0) + EXACT)
-        note(smaller.code, f"a smaller model leaves a residual of {{value:.2g}}: {smaller.cause}", left / tracks.scale(), same)
+        note(smaller.code, left / tracks.scale(), same, case=smaller.case, smaller=smaller.motion.name)
         explained = explained | same
     judged = torch.where((explained | (doubt > UNKNOWN)) & solved, int(Status.AMBIGUOUS), int(Status.OK))
     astray = torch.zeros_like(solved) if lifting is None else wild(tracks, scene, lifting)
     judged = torch.where(solved & ~explained & ((noise > NOISY) | astray), int(Status.NO_CONSENSUS), judged)
     status = torch.where((status == Status.OK) | (status == Status.AMBIGUOUS), judged, status)
-    text = "the noise makes the points uncertain by {value:.2g} of the size of the scene; add views, points or motion"
-    note(NoticeCode.UNCERTAIN, text, doubt, solved & (doubt > UNCERTAIN) & doubt.isfinite())
-    note(NoticeCode.UNCERTAIN, "several scenes give the same images; move points or the camera more", doubt, solved & doubt.isinf())
-    text = "the projections of all views nearly share a centre (singular value {value:.2g} of the largest); move the camera more"
-    note(NoticeCode.WEAK_STACK, text, stack, solved & ((stack < WEAK) | (noise > NOISE_OF_STACK * stack)))
+    note(ReconstructNotice.UNCERTAIN, doubt, solved & (doubt > UNCERTAIN) & doubt.isfinite())
+    note(ReconstructNotice.UNCERTAIN, doubt, solved & doubt.isinf(), case="family")
+    note(ReconstructNotice.WEAK_STACK, stack, solved & ((stack < WEAK) | (noise > NOISE_OF_STACK * stack)))
     _observations(tracks, motion, status, note)
     _images(tracks, scene, lifting, noise, solved, note)
     if lifting is None:
         status = _bodies(scene, status, noise, solved, note)
-    return status, tuple(sorted(found, key=lambda notice: notice.problem))
+    return status, in_order(found)
 
 
 def conditions(tracks: ViewTracks, scene: LiftedState, lifting: Lifting | None, noise: Tensor) -> tuple[Tensor, Tensor]:
@@ -358,12 +340,11 @@ def _observations(tracks: ViewTracks, motion: Motion, status: Tensor, note: Note
     need = -(-motion.k // motion.sensor)
     count = seen.sum(1)
     few = ((count > 0) & (count < need)).sum(-1)
-    text = f"{{value:g}} tracks are seen in fewer than {need} views and have no position; track them longer"
-    note(NoticeCode.FEW_OBSERVED, text, few, (few > 0) & ~failed(status))
+    note(ReconstructNotice.FEW_OBSERVED, few, (few > 0) & ~failed(status), case="points", needed=need)
     enough, size = _through(tracks, motion)
     least = motion.tensor(size).minimal()
-    text = f"{{value:g}} tracks are seen in {size} views or more, {motion.name!r} needs {least} through the same ones; add tracks"
-    note(NoticeCode.FEW_OBSERVED, text, enough, status == Status.TOO_FEW)
+    where = {"case": "tracks", "views": size, "motion": motion.name, "needed": least}
+    note(ReconstructNotice.FEW_OBSERVED, enough, status == Status.TOO_FEW, **where)
 
 
 def _through(tracks: ViewTracks, motion: Motion) -> tuple[Tensor, int]:
@@ -380,13 +361,11 @@ def _images(tracks: ViewTracks, scene: LiftedState, lifting: Lifting | None, noi
     across = eigenvalues(off.mT @ off / number[..., None])[..., -2].clamp(min=0).sqrt()
     across = torch.where(seen.sum(-1) > 2, across, torch.inf).amin(1)
     thin = across / noise.nan_to_num(posinf=0.0).clamp(min=EXACT)
-    text = "the images of a view lie on a line, to {value:.2g} standard deviations; points off it are needed"
-    note(NoticeCode.COLLINEAR, text, thin, thin < THIN)
+    note(ReconstructNotice.COLLINEAR, thin, thin < THIN)
     if lifting is None or tracks.x.shape[-1] != 2:
         return
     count = behind(scene.cameras, scene.structure, lifting.lifts, tracks.weights).sum(-1)
-    text = "{value:g} points behind a camera or at infinity; noise, or tracks that do not follow the motion"
-    note(NoticeCode.BEHIND, text, count, solved & (count > 0))
+    note(ReconstructNotice.BEHIND, count, solved & (count > 0))
 
 
 def _bodies(scene: LiftedState, status: Tensor, noise: Tensor, solved: Tensor, note: Note) -> Tensor:
@@ -396,6 +375,5 @@ def _bodies(scene: LiftedState, status: Tensor, noise: Tensor, solved: Tensor, n
     least, size = torch.stack([(pair.labels == body).sum(-1) for body in (1, 2)]).amin(0), scene.structure.shape[-1]
     # a hyperplane of noisy points takes the nearest one of the others in
     few = solved & (least < size - 1 + (noise > EXACT))
-    text = f"{{value:g}} points lie on the smaller body, {size - 1} determine it and others have to confirm it; add points on it"
-    note(NoticeCode.ONE_BODY, text, least, few)
+    note(ReconstructNotice.ONE_BODY, least, few, case="few", needed=size - 1)
     return torch.where(few & (status == Status.OK), int(Status.AMBIGUOUS), status)

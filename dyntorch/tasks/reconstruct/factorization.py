@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass
 from math import ceil, prod
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from dyntorch.core.outcome import Outcome, Status, status_of
 from dyntorch.geometry.homogeneous import homogeneous, similarity
 from dyntorch.numerics.arguments import on_cpu
 from dyntorch.numerics.blocks import map_blocks, one_thread
@@ -22,8 +24,9 @@ EXACT = 1e-12  # residual of an exact solution; rounding alone leaves up to 1e-1
 BLOCK = 2**20  # depths per block
 
 
-class ProjectiveFactorization(NamedTuple):
-    """Projections and structure up to a collineation of P^k."""
+@dataclass(frozen=True, eq=False, repr=False)
+class ProjectiveFactorization(Outcome):
+    """Projections and structure up to a collineation of P^k; ``AMBIGUOUS`` where the depths still changed at the end."""
 
     projections: Tensor
     """``(*batch, views, l + 1, K)``, Frobenius norm 1."""
@@ -31,8 +34,20 @@ class ProjectiveFactorization(NamedTuple):
     """``(*batch, n, K)`` homogeneous, norm 1; 0 for points that were left out."""
     residual: Tensor
     """``(*batch,)`` part of the norm of the scaled measurements beyond rank K, from 0 (exact) to 1 (nothing was found)."""
-    converged: Tensor
-    """``(*batch,)`` bool: the depths no longer change."""
+
+    TASK = "projective_factorization"
+
+    @property
+    def converged(self) -> Tensor:
+        """``(*batch,)`` bool: the depths no longer change."""
+        return self.status == Status.OK
+
+    def __iter__(self) -> Iterator[Tensor]:
+        """The parts, as of the tuple that this once was."""
+        return iter((self.projections, self.structure, self.residual, self.converged))
+
+    def __repr__(self) -> str:
+        return self.head(views=self.projections.shape[-3], points=self.structure.shape[-2])
 
 
 @one_thread
@@ -94,7 +109,8 @@ def projective_factorization(
     found = map_blocks(block, *problems, size=max(1, ceil(BLOCK / (views * n * MEMORY))))
     projections, structure, residual, converged = (part.reshape(batch + part.shape[1:]) for part in found)
     dtype = tracks.dtype
-    return ProjectiveFactorization(projections.to(dtype), structure.to(dtype), residual.to(dtype), converged)
+    status = torch.where(converged, int(Status.OK), int(Status.AMBIGUOUS))
+    return ProjectiveFactorization(projections.to(dtype), structure.to(dtype), residual.to(dtype), status=status)
 
 
 def _check(tracks: Tensor, rank: int, weights: Tensor | None) -> int:
@@ -218,7 +234,8 @@ FLAT = 1e-9  # of the largest singular value: below it the measurements have no 
 VELOCITY_BLOCK = 2**20  # measurements per block
 
 
-class VelocityFactorization(NamedTuple):
+@dataclass(frozen=True, eq=False, repr=False)
+class VelocityFactorization(Outcome):
     r"""Cameras, points and velocities up to :math:`(X, V) \mapsto (G X + a, G V + b)`; points and velocities have mean 0."""
 
     cameras: Tensor
@@ -231,8 +248,20 @@ class VelocityFactorization(NamedTuple):
     """``(*batch, n, d)`` per unit of time; 0 for points that were left out."""
     residual: Tensor
     """``(*batch,)`` root mean square of the image distances, in the unit of the tracks."""
-    degenerate: Tensor
-    """``(*batch,)`` bool: the tracks do not decide the result (see Args of the function), which then means nothing."""
+
+    TASK = "velocity_factorization"
+
+    @property
+    def degenerate(self) -> Tensor:
+        """``(*batch,)`` bool: the tracks do not decide the result (see Args of the function), which then means nothing."""
+        return self.status != Status.OK
+
+    def __iter__(self) -> Iterator[Tensor]:
+        """The parts, as of the tuple that this once was."""
+        return iter((self.cameras, self.offsets, self.points, self.velocities, self.residual, self.degenerate))
+
+    def __repr__(self) -> str:
+        return self.head(views=self.cameras.shape[-3], points=self.points.shape[-2])
 
 
 @one_thread
@@ -301,7 +330,7 @@ def velocity_factorization(
     found = map_blocks(block, *problems, size=max(1, ceil(VELOCITY_BLOCK / (2 * views * n))))
     *parts, degenerate = (part.reshape(batch + part.shape[1:]) for part in found)
     cameras, offsets, points, velocities, residual = (part.to(tracks.dtype) for part in parts)
-    return VelocityFactorization(cameras, offsets, points, velocities, residual, degenerate)
+    return VelocityFactorization(cameras, offsets, points, velocities, residual, status=status_of(degenerate))
 
 
 def _check_moving(tracks: Tensor, times: Tensor, dim: int, weights: Tensor | None) -> None:

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from dyntorch.core.fit import fit_matches
 from dyntorch.core.matches import Matches
+from dyntorch.core.outcome import Status, failed
 from dyntorch.core.refine import constrain_matches
-from dyntorch.core.solution import Status, failed
 from dyntorch.geometry.bundle import bundle_adjust
 from dyntorch.geometry.triangulation import reproject, resect, triangulate
 from dyntorch.invariants.grassmann_tensor import GrassmannTensor

@@ -10,14 +10,13 @@ import torch
 from torch import Tensor
 
 from dyntorch.core.normalize import hartley
-from dyntorch.core.solution import failed
+from dyntorch.core.outcome import failed, in_order, noting
 from dyntorch.geometry.triangulation import observed
 from dyntorch.numerics.arguments import on_cpu
 from dyntorch.numerics.blocks import one_thread
-from dyntorch.tasks.outcome import NoticeCode, notices
 from dyntorch.tasks.reconstruct.motions import Motion, as_motion
 from dyntorch.tasks.reconstruct.projections import ViewTracks
-from dyntorch.tasks.reconstruct.result import Reconstruction
+from dyntorch.tasks.reconstruct.result import Reconstruction, ReconstructNotice
 from dyntorch.tasks.reconstruct.solver import choose, least, solve
 
 ROUNDED = 1e-3
@@ -275,16 +274,14 @@ def _noted(found: Reconstruction, static: Tensor | None, used: Tensor) -> Recons
     batch = found.status.shape
     good = ~failed(found.status).reshape(-1)
     unused = (~used).sum(-1)
-    text = f"{{value:g}} views show fewer than {_resection(found.motion)} tracks and have no camera; leave them out, or add tracks"
-    notes = notices(NoticeCode.UNUSED_VIEW, text, unused, unused > 0, tuple(batch))
+    more, note = noting(tuple(batch))
+    note(ReconstructNotice.UNUSED_VIEW, unused, unused > 0, needed=_resection(found.motion))
     if static is not None and found.velocities is not None and not found.motion.static:
         given = static & found.points.reshape(*static.shape, found.points.shape[-1]).isfinite().all(-1)
-        text = "{value:g} of the static points have a position: the motion common to all points is not fixed"
-        notes += notices(NoticeCode.COMMON_VELOCITY, text, given.sum(-1), good & static.any(-1) & ~given.any(-1), tuple(batch))
+        note(ReconstructNotice.COMMON_VELOCITY, given.sum(-1), good & static.any(-1) & ~given.any(-1))
     seen = used.reshape(*batch, used.shape[-1])
-    warnings = tuple(sorted((*found.warnings, *notes), key=lambda notice: notice.problem))
     bodies = None if found.bodies is None else found.bodies * seen[..., None, :, None, None]
-    return replace(found, cameras=found.cameras * seen[..., None, None], bodies=bodies, warnings=warnings)
+    return replace(found, cameras=found.cameras * seen[..., None, None], bodies=bodies, notices=in_order((*found.notices, *more)))
 
 
 def _returned(found: Reconstruction, tracks: Tensor) -> Reconstruction:

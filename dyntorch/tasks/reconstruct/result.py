@@ -3,17 +3,114 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
 
-from dyntorch.core.solution import Status, failed
+from dyntorch.core.outcome import Notice, NoticeCode, Outcome, Status, failed
 from dyntorch.geometry.homogeneous import inhomogeneous
 from dyntorch.geometry.triangulation import reproject
-from dyntorch.tasks.outcome import Notice, check_results
 from dyntorch.tasks.reconstruct.motions import Motion
+
+_SMALLER = "a smaller model leaves a residual of {value:.2g}: "
+_TAKE = "take {arg:motion='{smaller}'}"
+
+
+class ReconstructNotice(NoticeCode):
+    """What limits a reconstruction, and how it is said."""
+
+    STATIC_SCENE = (
+        "static_scene",
+        {
+            "": f"{_SMALLER}nothing moves, or too few points: {_TAKE}, or add moving points",
+            "sensors": f"{_SMALLER}nothing moves, or too few points: add moving points",
+        },
+    )
+    """Nothing moves: the model leaves more than its tensor."""
+    TURNING_CAMERA = (
+        "turning_camera",
+        f"{_SMALLER}the points lie in a plane, or the camera stands still or only turns: let it move around points in space",
+    )
+    """The centres of all cameras are one point."""
+    UNIFORM_CAMERA = (
+        "uniform_camera",
+        f"{_SMALLER}the camera stands still, only turns or itself moves at constant velocity, or all is in a plane: change its "
+        "velocity",
+    )
+    """The camera itself moves at constant velocity, which the points' velocities cannot be told from."""
+    LINEAR_VELOCITIES = "linear_velocities", f"{_SMALLER}the velocities have one direction: {_TAKE}"
+    """The velocities lie along one line."""
+    PLANAR_VELOCITIES = "planar_velocities", f"{_SMALLER}the velocities are parallel to a plane: {_TAKE}"
+    """The velocities lie in a plane."""
+    DEGENERATE = "degenerate", f"{_SMALLER}nothing is accelerated: {_TAKE}"
+    """A smaller model explains the tracks."""
+    ONE_BODY = (
+        "one_body",
+        {
+            "": f"{_SMALLER}one body, too few points on the other, or a camera that only turns: {_TAKE}",
+            "few": "{value:# point lies|# points lie} on the smaller body, {needed} determine it and others have to confirm it; "
+            "add "
+            "points on it",
+        },
+    )
+    """All points belong to one of the two bodies, or too few to the other."""
+    UNCERTAIN = (
+        "uncertain",
+        {
+            "": "the noise makes the points uncertain by {value:.2g} of the size of the scene; add views, points or motion",
+            "family": "several scenes give the same images; move points or the camera more",
+        },
+    )
+    """The noise leaves the scene so uncertain that it says little."""
+    WEAK_STACK = (
+        "weak_stack",
+        "the projections of all views nearly share a centre (singular value {value:.2g} of the largest); move the camera more",
+    )
+    """The projections of all views nearly share a centre: points are known badly along it."""
+    FEW_OBSERVED = (
+        "few_observed",
+        {
+            "points": "{value:# track is seen in fewer than {needed} views and has|# tracks are seen in fewer than {needed} "
+            "views and "
+            "have} no position; track {value:it|them} longer",
+            "tracks": "{value:# track is|# tracks are} seen in {views} views or more, {motion!r} needs {needed} through the "
+            "same ones; "
+            "add tracks",
+        },
+    )
+    """Points seen in too few views."""
+    COLLINEAR = (
+        "collinear",
+        "the images of a view lie on a line, to {value:.2g} standard deviations; points off it are needed",
+    )
+    """All images of a view lie on one line."""
+    BEHIND = (
+        "behind",
+        "{value:# point|# points} behind a camera or at infinity; noise, or tracks that do not follow the motion",
+    )
+    """Points behind cameras, or at infinity, in every frame."""
+    UNUSED_VIEW = (
+        "unused_view",
+        "{value:# view shows fewer than {needed} tracks and has no camera; leave it out|# views show fewer than {needed} tracks "
+        "and "
+        "have no camera; leave them out}, or add tracks",
+    )
+    """A view whose camera was not found."""
+    COMMON_VELOCITY = (
+        "common_velocity",
+        "{value:# of the static points has|# of the static points have} a position: the motion common to all points is not fixed",
+    )
+    """No static point fixes the velocity common to all points."""
+    STATIC_MOVES = (
+        "static_moves",
+        "{value:# point given as static moves, and is taken as moving; take it|# points given as static move, and are taken as "
+        "moving; "
+        "take them} off {arg:static=}",
+    )
+    """Points given as static that move."""
 
 
 class Ranked(NamedTuple):
@@ -29,7 +126,7 @@ class Ranked(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Reconstruction:
+class Reconstruction(Outcome):
     """Result of :func:`dyntorch.reconstruct`.
 
     Attributes:
@@ -44,13 +141,11 @@ class Reconstruction:
         residual: ``(*batch,)`` rms reprojection error of the observations that count, in the unit of the tracks.
         residuals: ``(*batch, views, n)`` reprojection distances; NaN where missing or not found.
         sigma: ``(*batch,)`` noise of one coordinate that the residuals show.
-        status: ``(*batch,)`` of :class:`dyntorch.Status`.
         structure: ``(*batch, n, K)`` homogeneous constants Y of the model, :math:`X(t) \\sim B(t)\\,Y`.
         projections: ``(*batch, views, l + 1, K)``, :math:`M_i \\sim P_i B_i`.
         inliers: ``(*batch, views, n)`` observations that count.
         times: ``(views,)``.
         ambiguity: a sentence: what the tracks cannot tell, even without noise.
-        warnings: notices on single problems of the batch.
         bodies: cameras of both bodies, ``(*batch, 2, views, l + 1, d + 1)``; None without.
         candidates: where the model was to be chosen, the models that were tried, best first, and those that could not be, with the
             reason.
@@ -64,15 +159,23 @@ class Reconstruction:
     residual: Tensor
     residuals: Tensor
     sigma: Tensor
-    status: Tensor
     structure: Tensor
     projections: Tensor
     inliers: Tensor
     times: Tensor
     ambiguity: str
-    warnings: tuple[Notice, ...] = ()
     bodies: Tensor | None = None
     candidates: tuple[Ranked, ...] = field(default=())
+
+    REMEDIES: ClassVar[Mapping[Status, str]] = {
+        Status.TOO_FEW: "too few tracks are seen in enough views; track more points, or for longer",
+        Status.DEGENERATE: "the tracks leave several scenes, exactly; let camera and points move otherwise, or take a smaller "
+        "{arg:motion}",
+        Status.AMBIGUOUS: "other scenes fit as well; add views and tracks, let the camera move more, or take a smaller "
+        "{arg:motion}",
+        Status.NO_CONSENSUS: "no scene fits enough of the tracks; raise {arg:threshold}, take another {arg:motion}, or clean the "
+        "tracks",
+    }
 
     def at(self, time: float) -> Tensor:
         """Positions ``(*batch, n, d)`` at any time; of two bodies the points, which rest in their frames.
@@ -98,20 +201,19 @@ class Reconstruction:
         seen = reproject((camera @ lift).unsqueeze(-3), self.structure).squeeze(-3)
         return torch.where(self.points.isnan().any(-1, keepdim=True), torch.nan, seen)
 
-    def check(self) -> Reconstruction:
-        """Raise where any problem failed.
+    @property
+    def task(self) -> str:
+        return self.motion.name
 
-        Raises:
-            ValueError: says which problems failed, how, and what to do.
-        """
-        check_results(self.motion.name, self.status, self.warnings)
-        return self
+    def _telling(self, status: Status) -> Sequence[Notice]:
+        """That nothing fits is no consequence of what a notice says of the scene that fits best."""
+        return () if status == Status.NO_CONSENSUS else self.notices
 
     def __repr__(self) -> str:
-        states = Counter(Status(s).name for s in self.status.reshape(-1).tolist())
         views, n = self.residuals.shape[-2:]
-        listed = ", ".join(f"{count} {name}" for name, count in states.items()) or "empty"
-        lines = [f"Reconstruction({self.motion.name}, views={views}, points={n}, batch={tuple(self.status.shape)}: {listed})"]
+        lines = [
+            f"Reconstruction({self.motion.name}, views={views}, points={n}, batch={tuple(self.status.shape)}: {self.counted()})"
+        ]
         good = ~failed(self.status)
         if bool(good.any()):
             kinds = ("outlier", "body 1", "body 2") if self.motion.bodies > 1 else ("outlier", "static", "moving")
@@ -128,9 +230,4 @@ class Reconstruction:
             lines += [f"  not tried: {c.motion} ({c.reason})" for c in self.candidates if c.reason]
         if self.ambiguity:
             lines.append(f"  {self.ambiguity}")
-        if self.status.ndim:
-            seen = Counter(code for code, _ in {(w.code.value, w.problem) for w in self.warnings})
-            lines += [f"  warning {code}: {count} of {self.status.numel()} problems" for code, count in sorted(seen.items())]
-        else:
-            lines += [f"  warning {w}" for w in self.warnings]
-        return "\n".join(lines)
+        return "\n".join(lines + self.warned())

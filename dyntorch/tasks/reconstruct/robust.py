@@ -10,8 +10,9 @@ from torch import Tensor
 
 from dyntorch.core.fit import fit_matches
 from dyntorch.core.matches import Matches
+from dyntorch.core.outcome import Status
 from dyntorch.core.refine import constrain_matches
-from dyntorch.core.solution import NOISY, Status
+from dyntorch.core.solution import NOISY
 from dyntorch.geometry.bundle import bundle_adjust
 from dyntorch.geometry.triangulation import reproject, resect, triangulate
 from dyntorch.invariants.grassmann_tensor import GrassmannTensor

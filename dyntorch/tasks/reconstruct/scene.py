@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from dyntorch.core.solution import Status, failed
+from dyntorch.core.outcome import Status, failed
 from dyntorch.geometry.bundle import bundle_adjust, point_information
 from dyntorch.geometry.lift import balanced, balanced_algebra, behind, centred, finite, gauge_algebra, moved, steady, upgrade
 from dyntorch.geometry.pairs import hyperplane_pair, two_bodies

@@ -9,15 +9,14 @@ from typing import NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
-from dyntorch.core.solution import Status, agreed, failed
+from dyntorch.core.outcome import Status, agreed, failed, notices
 from dyntorch.geometry.bundle import bundle_adjust
 from dyntorch.geometry.triangulation import triangulate, unit_projections
 from dyntorch.numerics.chi_square import quantile
-from dyntorch.tasks.outcome import NoticeCode, notices
 from dyntorch.tasks.reconstruct.diagnosis import diagnose, least_squares, spare, unknowns
 from dyntorch.tasks.reconstruct.motions import MOTIONS, Motion
 from dyntorch.tasks.reconstruct.projections import Projections, ViewTracks, projections_of_tracks
-from dyntorch.tasks.reconstruct.result import Ranked, Reconstruction
+from dyntorch.tasks.reconstruct.result import Ranked, Reconstruction, ReconstructNotice
 from dyntorch.tasks.reconstruct.robust import robust_projections, suspicious, trimmed, unfounded
 from dyntorch.tasks.reconstruct.scene import (
     LiftedState,
@@ -157,11 +156,10 @@ def _result(
     number = counted.flatten(1).sum(-1)
     sigma = (total / spare(tracks, counted, motion).clamp(min=1)).sqrt()
     back = torch.linalg.inv(tracks.transforms)
-    status, warnings = diagnose(tracks, scene, lifting, motion, status, sigma, batch)
+    status, limits = diagnose(tracks, scene, lifting, motion, status, sigma, batch)
     if given is not None and tracks.static is not None:
         wrong = (given & ~tracks.static).sum(-1)
-        text = "{value:g} points given as static move, and are taken as moving; take them off static="
-        warnings += tuple(notices(NoticeCode.STATIC_MOVES, text, wrong, wrong > 0, batch))
+        limits += tuple(notices(ReconstructNotice.STATIC_MOVES, wrong, wrong > 0, batch))
     bad = failed(status)
 
     def shaped(value: Tensor, none: float = 0.0) -> Tensor:
@@ -184,7 +182,7 @@ def _result(
         inliers=shaped(counted),
         times=tracks.times,
         ambiguity=_open(motion, tracks.times, tracks.static),
-        warnings=warnings,
+        notices=limits,
         bodies=None if bodies is None else shaped(unit_projections(back[:, None] @ bodies)),
     )
 

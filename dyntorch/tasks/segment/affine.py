@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from dyntorch.core.outcome import Outcome, Status, status_of
 from dyntorch.geometry.epipolar import check_matches, described
 from dyntorch.geometry.homogeneous import homogeneous, unit
 from dyntorch.geometry.pairs import hyperplane_pair, order_of_bodies
@@ -21,8 +22,8 @@ TURNS = 5
 TINY = 1e-300
 
 
-@dataclass(frozen=True, repr=False)
-class AffineSegmentation:
+@dataclass(frozen=True, eq=False, repr=False)
+class AffineSegmentation(Outcome):
     """Two bodies under affine cameras; ``fundamentals`` and ``residuals`` carry gradients."""
 
     fundamentals: Tensor
@@ -31,9 +32,14 @@ class AffineSegmentation:
     """``(*batch, n)`` int64: 1 or 2, the nearer body; 0 where the weight is 0 or a coordinate is not finite."""
     residuals: Tensor
     """``(*batch, n)`` distance from the own body, in the unit of the points (Sampson's, here exact); 0 where the label is 0."""
-    degenerate: Tensor
-    """``(*batch,)`` bool: the matches leave several pairs of bodies, exactly: fewer than 14 with weight or than 4 of one body,
-    or a body that is a plane.  The labels are then those of one such pair."""
+
+    TASK = "affine_segmentation"
+
+    @property
+    def degenerate(self) -> Tensor:
+        """``(*batch,)`` bool: the matches leave several pairs of bodies, exactly: fewer than 14 with weight or than 4 of one body,
+        or a body that is a plane.  The labels are then those of one such pair."""
+        return self.status != Status.OK
 
     def __repr__(self) -> str:
         return described(self, self.labels, self.degenerate, 2)
@@ -61,7 +67,7 @@ def affine_segmentation(x1: Tensor, x2: Tensor, weights: Tensor | None = None) -
         weights: ``(*batch, n)``, not negative, 0 = ignore.
 
     Returns:
-        fundamentals, labels, residuals and degenerate.
+        fundamentals, labels, residuals and status (``DEGENERATE``, or OK).
 
     Raises:
         ValueError: fewer than 14 matches, shapes that do not agree, negative weights.
@@ -105,7 +111,7 @@ def affine_segmentation(x1: Tensor, x2: Tensor, weights: Tensor | None = None) -
     labels = torch.where(present, 1 + (label ^ swap[..., None]), 0)
     residuals = torch.where(present, distances.amin(-2), 0.0)
     dtype = x1.dtype
-    return AffineSegmentation(unit(_matrices(planes)).to(dtype), labels, residuals.to(dtype), pair.degenerate)
+    return AffineSegmentation(unit(_matrices(planes)).to(dtype), labels, residuals.to(dtype), status=status_of(pair.degenerate))
 
 
 def _turn(match: Tensor, weight: Tensor, planes: Tensor) -> Tensor:

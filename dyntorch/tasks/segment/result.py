@@ -2,16 +2,46 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any
+from typing import Any, ClassVar
 
 from torch import Tensor
 
-from dyntorch.core.solution import Status
-from dyntorch.tasks.outcome import Notice, check_results
+from dyntorch.core.outcome import NoticeCode, Outcome, Status
 
 OUTLIER = 0
+
+
+class SegmentNotice(NoticeCode):
+    """What limits a segmentation, and how it is said."""
+
+    COARSE = (
+        "coarse",
+        "the threshold is {value:.2g} of the spread of the points, and everything is near everything; give it in their unit",
+    )
+    """The threshold is large beside the spread of the points."""
+    FEWER_BODIES = (
+        "fewer_bodies",
+        "{asked:# body was|# bodies were} asked for, the matches carry {value:g}; ask for fewer, or add matches of the others",
+    )
+    """The matches carry fewer bodies than were asked for."""
+    SPARE_BODY = (
+        "spare_body",
+        "{value:# body explains|# bodies explain} the matches no worse than {asked}: one may be a part of another; ask for fewer",
+    )
+    """Fewer bodies than were asked for explain the matches as well."""
+    REPEATED = (
+        "repeated",
+        "a share of {value:.2g} of the matches repeats others and says nothing new; remove repeated matches",
+    )
+    """Many matches are the same."""
+    INCOHERENT = (
+        "incoherent",
+        "the share of matches that move like their neighbours is {value:.2g}; try {arg:spatial=False} if bodies interleave",
+    )
+    """Few matches move like their neighbours."""
 
 
 class BodyModel(StrEnum):
@@ -24,7 +54,7 @@ class BodyModel(StrEnum):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Segmentation:
+class Segmentation(Outcome):
     """Bodies in two views.
 
     Where problems of a batch have different numbers of bodies, K is the largest; what is behind ``bodies`` is 0.
@@ -42,10 +72,8 @@ class Segmentation:
             the points; 0 where there is no body.  Labels are found by the fundamental matrices: where ``models`` says homography,
             a few matches of the body may be far from its plane.
         coherence: ``(*batch, n)`` in [0, 1]: how well a match moves like its neighbours in both images; 0 where ``spatial=False``.
-        status: ``(*batch,)`` of :class:`dyntorch.Status`.
         threshold: ``(*batch,)`` Sampson distance that divides inliers from outliers where nothing else is known, as in
             :func:`dyntorch.segment`, in the unit of the points.
-        warnings: notices.
     """
 
     labels: Tensor
@@ -56,31 +84,24 @@ class Segmentation:
     probabilities: Tensor
     residuals: Tensor
     coherence: Tensor
-    status: Tensor
     threshold: Tensor
-    warnings: tuple[Notice, ...]
 
-    def check(self) -> Segmentation:
-        """Raise where any problem failed.
-
-        Raises:
-            ValueError: says which problems failed, how, and what to do.
-        """
-        check_results("segment", self.status, self.warnings)
-        return self
+    TASK = "segment"
+    REMEDIES: ClassVar[Mapping[Status, str]] = {
+        Status.TOO_FEW: "too few matches are present in both images; give more",
+        Status.DEGENERATE: "several segmentations fit all matches exactly; add matches in general position",
+        Status.AMBIGUOUS: "other segmentations fit as well; add matches, or say how many {arg:bodies} there are",
+        Status.NO_CONSENSUS: "no body moves so that enough of the matches agree; raise {arg:threshold}, or clean the matches",
+    }
 
     def __repr__(self) -> str:
-        shape = tuple(self.status.shape)
-        states = ", ".join(f"{int((self.status == s).sum())} {s.name}" for s in Status if bool((self.status == s).any()))
-        lines = [f"Segmentation(matches={self.labels.shape[-1]}, batch={shape}: {states or 'empty'})"]
-        if not shape:
+        lines = [self.head(matches=self.labels.shape[-1])]
+        if not self.status.ndim:
             lines += [
                 f"  body {number}: {int((self.labels == number).sum())} matches, {model}"
                 for number, model in enumerate(self.models, start=1)
             ]
             lines.append(f"  outliers: {int((self.labels == OUTLIER).sum())}")
-            lines += [f"  warning {notice}" for notice in self.warnings]
         elif self.bodies.numel():
             lines.append(f"  bodies: {int(self.bodies.min())} to {int(self.bodies.max())}")
-            lines.append(f"  warnings: {len(self.warnings)}")
-        return "\n".join(lines)
+        return "\n".join(lines + self.warned())

@@ -10,21 +10,20 @@ import torch
 from torch import Tensor
 
 from dyntorch.core.matches import matches
-from dyntorch.core.solution import Status
+from dyntorch.core.outcome import Notice, Status, noting
 from dyntorch.geometry.epipolar import sampson_squared
 from dyntorch.geometry.homogeneous import similarity, unit
 from dyntorch.geometry.homography import homography_sampson_squared
 from dyntorch.geometry.pairs import order_of_bodies
 from dyntorch.invariants.fundamental_matrix import FundamentalMatrix
-from dyntorch.numerics.arguments import check_options, on_cpu
+from dyntorch.numerics.arguments import check_options, check_threshold, on_cpu
 from dyntorch.numerics.blocks import one_thread, uniform
 from dyntorch.numerics.chi_square import median
-from dyntorch.tasks.outcome import Notice, NoticeCode, check_threshold, notices
 from dyntorch.tasks.segment.coherence import Links, coherence
 from dyntorch.tasks.segment.energy import View
 from dyntorch.tasks.segment.labels import Labelling, Models, choose, label, significant
 from dyntorch.tasks.segment.options import SegmentOptions
-from dyntorch.tasks.segment.result import BodyModel, Segmentation
+from dyntorch.tasks.segment.result import BodyModel, Segmentation, SegmentNotice
 from dyntorch.tasks.segment.search import LEAST, Candidate, one_hot, search, search_samples
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -131,7 +130,7 @@ class GivenMatches:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class SegmentedProblem:
     """Result of one problem of n matches with K = ``count`` bodies.
 
     Attributes:
@@ -168,10 +167,10 @@ class Outcome:
         return len(self.models)
 
 
-def nothing(weights: Tensor, threshold: float, status: Status, repeated: float, linked: float = 0.0) -> Outcome:
+def nothing(weights: Tensor, threshold: float, status: Status, repeated: float, linked: float = 0.0) -> SegmentedProblem:
     """No bodies: all matches ``(n,)`` are outliers, those with weight surely."""
     none = torch.zeros(0, 3, 3, dtype=torch.float64, device=weights.device)
-    return Outcome(
+    return SegmentedProblem(
         labels=torch.zeros_like(weights, dtype=torch.long),
         probabilities=(weights > 0).double()[:, None],
         fundamentals=none,
@@ -188,7 +187,7 @@ def nothing(weights: Tensor, threshold: float, status: Status, repeated: float, 
 
 def outcome(
     given: GivenMatches, labelled: Labelling, threshold: float, bodies: int | None, spare: bool, options: SegmentOptions
-) -> Outcome:
+) -> SegmentedProblem:
     """The labels in order of size, with the model of every body."""
     labelled = _sorted(labelled)
     labels, fundamentals = labelled.labels, labelled.fundamentals
@@ -197,7 +196,7 @@ def outcome(
         return nothing(given.weights, threshold, Status.NO_CONSENSUS, given.repeated, given.linked)
     models = choose(given.view, fundamentals, one_hot(labels - 1, count) * given.weights[given.present], options)
     planar = unit(torch.linalg.inv(given.second) @ models.homographies @ given.first)
-    return Outcome(
+    return SegmentedProblem(
         labels=given.spread(labels),
         probabilities=given.spread(labelled.probabilities.mT),
         fundamentals=unit(given.second.mT @ fundamentals @ given.first),
@@ -230,7 +229,7 @@ def _residuals(view: View, labels: Tensor, fundamentals: Tensor, models: Models)
 
 
 def segmentation_notices(
-    found: list[Outcome], bodies: int | None, batch: tuple[int, ...], options: SegmentOptions
+    found: list[SegmentedProblem], bodies: int | None, batch: tuple[int, ...], options: SegmentOptions
 ) -> tuple[Notice, ...]:
     """What limits the results of a batch."""
     if not found:
@@ -240,22 +239,17 @@ def segmentation_notices(
     linked = torch.tensor([outcome.linked for outcome in found])
     tried = torch.tensor([outcome.status != Status.TOO_FEW for outcome in found])
     spatial = linked < 1.0  # where neighbours do not matter, all matches count
-    said = []
+    said, note = noting(batch)
     coarse = torch.tensor([outcome.coarse for outcome in found])
     tried = tried & (coarse == 0)
-    message = "the threshold is {value:.2g} of the spread of the points, and everything is near everything; give it in their unit"
-    said += notices(NoticeCode.COARSE, message, coarse, coarse > 0, batch)
+    note(SegmentNotice.COARSE, coarse, coarse > 0)
     if bodies is not None:
-        message = f"{bodies} bodies were asked for, the matches carry {{value:g}}; ask for fewer, or add matches of the others"
-        said += notices(NoticeCode.FEWER_BODIES, message, count, tried & (count < bodies), batch)
+        note(SegmentNotice.FEWER_BODIES, count, tried & (count < bodies), asked=bodies)
         # where a body got lost, the notice above says so
         spare = torch.tensor([outcome.spare for outcome in found]) & (count == bodies)
-        message = f"{{value:g}} bodies explain the matches no worse than {bodies}: one may be a part of another; ask for fewer"
-        said += notices(NoticeCode.SPARE_BODY, message, count - 1, spare, batch)
-    message = "a share of {value:.2g} of the matches repeats others and says nothing new; remove repeated matches"
-    said += notices(NoticeCode.REPEATED, message, repeated, repeated > options.input.repeated, batch)
-    message = "the share of matches that move like their neighbours is {value:.2g}; try spatial=False if bodies interleave"
-    said += notices(NoticeCode.INCOHERENT, message, linked, tried & spatial & (linked < options.input.sparse), batch)
+        note(SegmentNotice.SPARE_BODY, count - 1, spare, asked=bodies)
+    note(SegmentNotice.REPEATED, repeated, repeated > options.input.repeated)
+    note(SegmentNotice.INCOHERENT, linked, tried & spatial & (linked < options.input.sparse))
     return tuple(said)
 
 
@@ -277,7 +271,7 @@ class Request:
     generator: torch.Generator | None
 
 
-def solve(x1: Tensor, x2: Tensor, weights: Tensor, request: Request, options: SegmentOptions) -> Outcome:
+def solve(x1: Tensor, x2: Tensor, weights: Tensor, request: Request, options: SegmentOptions) -> SegmentedProblem:
     """Segment one problem of matches ``(n, 2)`` with weights ``(n,)``, 0 = missing."""
     if request.threshold is not None:
         return _solve(x1, x2, weights, request, request.threshold, options)
@@ -300,7 +294,9 @@ def _diagonal(x: Tensor) -> float:
     return float((high - low).norm()) / 0.9
 
 
-def _solve(x1: Tensor, x2: Tensor, weights: Tensor, request: Request, threshold: float, options: SegmentOptions) -> Outcome:
+def _solve(
+    x1: Tensor, x2: Tensor, weights: Tensor, request: Request, threshold: float, options: SegmentOptions
+) -> SegmentedProblem:
     present = (weights > 0).nonzero().flatten()
     distinct, *places = (len(torch.unique(x[present], dim=0)) for x in (torch.cat([x1, x2], dim=-1), x1, x2))
     # points that are all in one place of a view fit any motion of that place
@@ -515,7 +511,7 @@ def segment(
         coherence=stacked("coherence", (n,)),
         status=numbers([int(outcome.status) for outcome in found]),
         threshold=stacked("threshold", ()),
-        warnings=segmentation_notices(found, bodies, data.batch, options),
+        notices=segmentation_notices(found, bodies, data.batch, options),
     )
 
 

@@ -3,14 +3,15 @@ r"""Trajectory triangulation: points that move on straight lines, at any speed, 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from dyntorch.core.fit import fit
-from dyntorch.core.solution import failed
+from dyntorch.core.outcome import Outcome, Status, failed
 from dyntorch.geometry.extensors import compound, skew_line
 from dyntorch.geometry.homogeneous import inhomogeneous, unit
 from dyntorch.geometry.lines import cameras_of_lines, line_camera, lines_of_pencil, nearest_line
@@ -39,8 +40,12 @@ class LineStatus(IntEnum):
     """Four views: two lines fulfil them exactly, ``lines`` and ``second``; nothing tells which of them is true."""
 
 
-@dataclass(frozen=True, eq=False)
-class Trajectories:
+ENDED = torch.tensor([Status.OK, Status.TOO_FEW, Status.DEGENERATE, Status.AMBIGUOUS, Status.AMBIGUOUS])
+"""The status of a :class:`LineStatus`: every line would do for a point that stands still."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Trajectories(Outcome):
     """Result of :func:`triangulate_trajectories`.
 
     Attributes:
@@ -52,7 +57,8 @@ class Trajectories:
         residual: ``(*batch, n)`` RMS distance of the points from the image lines (``STATIC``: from the image point), px.
         uncertainty: ``(*batch, n)`` expected error of the line, as a unit vector with normalized cameras; 1 = nothing known.
         sigma: ``(*batch,)`` noise of one image coordinate, px: as given, or as the residuals of all lines show.
-        status: ``(*batch, n)`` of :class:`LineStatus` values.
+        kinds: ``(*batch, n)`` of :class:`LineStatus` values.
+        status: ``(*batch, n)``, of every line.
     """
 
     lines: Tensor
@@ -61,7 +67,15 @@ class Trajectories:
     residual: Tensor
     uncertainty: Tensor
     sigma: Tensor
-    status: Tensor
+    kinds: Tensor
+
+    TASK = "triangulate_trajectories"
+
+    def __repr__(self) -> str:
+        """How many lines of each kind."""
+        views, n = self.points.shape[-3:-1]
+        counts = ", ".join(f"{number} {LineStatus(k).name}" for k, number in enumerate(self.kinds.flatten().bincount()) if number)
+        return f"Trajectories(views={views}, points={n}, batch={tuple(self.status.shape[:-1])}: {counts or 'empty'})"
 
 
 @one_thread
@@ -113,7 +127,7 @@ def triangulate_trajectories(
         >>> cameras = torch.cat([torch.eye(3).expand(5, 3, 3), torch.randn(5, 3, 1, generator=g)], dim=-1).double()
         >>> x = torch.stack([torch.cat([p, p.new_ones(1)]) @ c.T for c, p in zip(cameras, path)])
         >>> found = triangulate_trajectories(cameras, (x[:, :2] / x[:, 2:])[:, None])
-        >>> bool(torch.allclose(found.points[:, 0], path)), LineStatus(int(found.status)).name
+        >>> bool(torch.allclose(found.points[:, 0], path)), LineStatus(int(found.kinds)).name
         (True, 'OK')
     """
     check_options(options, TrajectoryOptions)
@@ -129,8 +143,8 @@ def triangulate_trajectories(
     # four views without two lines: noise has made them one
     uncertainty = torch.where((seen == VIEWS) & ~two, 1.0, (line.spread.sqrt() * least).clamp(max=1.0))
     single = torch.where(uncertainty > options.ambiguous, LineStatus.AMBIGUOUS, LineStatus.OK)
-    status = torch.where(two, LineStatus.TWO_FOLD, single)
-    status = torch.where(few, LineStatus.TOO_FEW, torch.where(static, LineStatus.STATIC, status))
+    kinds = torch.where(two, LineStatus.TWO_FOLD, single)
+    kinds = torch.where(few, LineStatus.TOO_FEW, torch.where(static, LineStatus.STATIC, kinds))
     none = (few | static)[..., None]
     total = data.weights.sum(-2)
     residual = torch.where(static, still.cost, line.cost).div(torch.where(total > 0, total, 1.0)).sqrt()
@@ -142,7 +156,7 @@ def triangulate_trajectories(
     uncertainty = torch.where(few | static, 1.0, uncertainty)
     found = (lines, second, points, torch.where(few, 0.0, residual), uncertainty, noise)
     lines, second, points, residual, uncertainty, noise = (part.to(x.dtype) for part in found)
-    return Trajectories(lines, second, points, residual, uncertainty, noise, status)
+    return Trajectories(lines, second, points, residual, uncertainty, noise, kinds, status=ENDED.to(kinds.device)[kinds])
 
 
 def points_on_lines(cameras: Tensor, x: Tensor, lines: Tensor) -> Tensor:
@@ -253,19 +267,23 @@ def _noise(cost: Tensor, seen: Tensor) -> Tensor:
 SIX = GrassmannTensor(5, (1,) * 6, dual=True)
 
 
-@dataclass(frozen=True, eq=False)
-class TrajectoryCameras:
+@dataclass(frozen=True, eq=False, repr=False)
+class TrajectoryCameras(Outcome):
     """Result of :func:`trajectory_cameras`.
 
     Attributes:
         cameras: ``(*batch, 6, 3, 4)`` of norm 1, up to one collineation of space; 0 where the status says that there are none.
         trajectories: lines and points in the same frame.
-        status: ``(*batch,)`` of :class:`dyntorch.Status` values, those of the tensor.
+        status: ``(*batch,)``, that of the tensor.
     """
 
     cameras: Tensor
     trajectories: Trajectories
-    status: Tensor
+
+    TASK = "trajectory_cameras"
+
+    def __repr__(self) -> str:
+        return self.head(points=self.trajectories.lines.shape[-2])
 
 
 @one_thread
@@ -340,8 +358,11 @@ def trajectory_cameras(
     trajectories = triangulate_trajectories(cameras, flat, each, sigma=sigma, options=options)
     cameras = torch.where(good[..., None, None, None], cameras, 0.0)
     lead = x.shape[:-3]
-    whole = Trajectories(*(part.reshape((*lead, *part.shape[1:])) for part in vars(trajectories).values()))
-    return TrajectoryCameras(cameras.reshape(*lead, 6, 3, 4).to(x.dtype), whole, solution.status.reshape(lead))
+    shaped: dict[str, Any] = {
+        name: part.reshape((*lead, *part.shape[1:])) for name, part in vars(trajectories).items() if isinstance(part, Tensor)
+    }
+    whole = replace(trajectories, **shaped)
+    return TrajectoryCameras(cameras.reshape(*lead, 6, 3, 4).to(x.dtype), whole, status=solution.status.reshape(lead))
 
 
 def _adjusted(cameras: Tensor, x: Tensor, weights: Tensor, options: TrajectoryOptions) -> Tensor:

@@ -8,8 +8,8 @@ import torch
 import dyntorch as dyn
 from dyntorch import scenes
 from dyntorch.core.matches import matches
+from dyntorch.core.outcome import failed
 from dyntorch.core.refine import constrain_matches
-from dyntorch.core.solution import failed
 from tests.battery.projections import tensor_error, unit
 
 P4, P6 = dyn.GrassmannTensor(4, (2, 2, 1)), dyn.GrassmannTensor(6, (2, 2, 2, 1))

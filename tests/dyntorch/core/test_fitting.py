@@ -9,7 +9,8 @@ import torch
 import dyntorch as dyn
 from dyntorch import metrics, scenes
 from dyntorch.core import fit as fitting
-from dyntorch.core.solution import Solution, Status
+from dyntorch.core.outcome import Status
+from dyntorch.core.solution import Solution
 from tests.battery.cases import CASES, moved_views
 from tests.battery.references import apart, matrices, noisy, spans
 

@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 import torch
 
-from dyntorch import metrics, scenes
+from dyntorch import Notice, metrics, scenes
+from dyntorch.core import NoticeCode
 from dyntorch.tasks.reconstruct import motions
 from indexing.cli.reconstruct import PURPOSE, REASONS, MotionName
 from indexing.report.reconstruction import FILES
@@ -182,6 +183,10 @@ def test_known_static_points_have_no_velocity_at_all(run, scene):
 
 
 # ---- what is refused -----------------------------------------------------------------------------------------------------
+class Told(NoticeCode):
+    STATIC_SCENE = "static_scene", "nothing moves"
+
+
 def test_data_that_cannot_decide_are_refused_with_code_3(run, tmp_path, monkeypatch):
     import dyntorch
 
@@ -189,8 +194,8 @@ def test_data_that_cannot_decide_are_refused_with_code_3(run, tmp_path, monkeypa
 
     def undecided(*args, **options):
         found = solve(*args, **options)
-        notice = type("Notice", (), {"code": type("Code", (), {"value": "static_scene"}), "value": 1.0, "message": "nothing moves"})
-        return dataclasses.replace(found, status=torch.tensor(3), warnings=(notice,))
+        notice = Notice(Told.STATIC_SCENE, 1.0)
+        return dataclasses.replace(found, status=torch.tensor(3), notices=(notice,))
 
     monkeypatch.setattr(dyntorch, "reconstruct", undecided, raising=False)
     code, out, err = run("@/plane.csv --motion constant_velocity_2d --threshold none --out out")

@@ -15,7 +15,7 @@ import pytest
 import torch
 
 import dyntorch
-from dyntorch.tasks.outcome import Notice, NoticeCode
+from dyntorch.core.outcome import Notice, NoticeCode
 from dyntorch.tasks.segment.result import BodyModel, Segmentation
 from indexing.cli.segment import REASONS
 from indexing.report.segmentation import FILES
@@ -105,7 +105,7 @@ def solved(monkeypatch, scene):
         limit = torch.tensor(float(options["threshold"] or 1.5))
         return Segmentation(
             labels, torch.tensor(2), torch.from_numpy(fundamentals), homographies, (BodyModel.FUNDAMENTAL, BodyModel.HOMOGRAPHY),
-            probabilities * seen[:, None], residuals, torch.ones(len(x1)), torch.tensor(0), limit, (),
+            probabilities * seen[:, None], residuals, torch.ones(len(x1)), limit, status=torch.tensor(0),
         )  # fmt: skip
 
     monkeypatch.setattr(dyntorch, "segment", segment, raising=False)
@@ -213,12 +213,16 @@ def test_data_that_cannot_decide_are_refused_with_code_3(run, solved, monkeypatc
     assert "do not decide" in page and "How each body moved" not in page and "Refused." in page
 
 
+class Told(NoticeCode):
+    UNCERTAIN = "uncertain", "another segmentation fits as well; give {arg:bodies=2}, or {arg:threshold=None} estimates it"
+
+
 def test_a_doubtful_result_is_shown_and_refused(run, solved, monkeypatch):
     solve = dyntorch.segment
-    notice = Notice(NoticeCode.UNCERTAIN, 1.0, "another segmentation fits as well; give bodies=2, or threshold=None estimates it")
+    notice = Notice(Told.UNCERTAIN, 1.0)
 
     monkeypatch.setattr(
-        dyntorch, "segment", lambda *x, **o: dataclasses.replace(solve(*x, **o), status=torch.tensor(3), warnings=(notice,))
+        dyntorch, "segment", lambda *x, **o: dataclasses.replace(solve(*x, **o), status=torch.tensor(3), notices=(notice,))
     )
     code, out, err = run("@/m.npz --out out")
     said = "another segmentation fits as well; give --bodies 2, or --threshold auto estimates it"

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from dyntorch import scenes
-from dyntorch.core.solution import Status
+from dyntorch.core.outcome import Status
 from dyntorch.geometry.extensors import plucker
 from dyntorch.metrics import relative_error
 from dyntorch.tasks.align.lines import align_lines, as_points

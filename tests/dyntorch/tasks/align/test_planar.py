@@ -5,10 +5,10 @@ import torch
 
 import dyntorch as dyn
 from dyntorch import scenes
-from dyntorch.core.solution import Status
+from dyntorch.core.outcome import Notice, Status
 from dyntorch.metrics import grid_transfer_error, label_scores
 from dyntorch.tasks.align.planar import align_planar
-from dyntorch.tasks.outcome import Notice, NoticeCode
+from dyntorch.tasks.align.result import AlignNotice
 from tests.battery.steps import equal_steps
 
 
@@ -84,8 +84,8 @@ def test_exactly_static_scenes_are_solved_with_a_warning():
     assert error(result, scene.motion).max() < 1e-8
     assert (result.labels == 1).all()
     assert (result.status == Status.OK).all()
-    assert result.flagged("degenerate").all() and result.flagged(NoticeCode.FEW_MOVING).all()
-    ranks = [notice.value for notice in result.warnings if notice.code == NoticeCode.DEGENERATE]
+    assert result.flagged("degenerate").all() and result.flagged(AlignNotice.FEW_MOVING).all()
+    ranks = [notice.value for notice in result.warnings if notice.code == AlignNotice.DEGENERATE]
     assert ranks == [10, 10]
 
 
@@ -104,7 +104,7 @@ def test_static_scenes_with_noise_are_flagged_and_as_good_as_two_homographies():
 def test_a_scene_that_moves_is_not_called_static():
     scene = scenes.planar(100, batch=2, sigma=0.5, generator=generator(7))
     result = align_planar(*scene.views, generator=generator())
-    assert codes(result) <= {NoticeCode.UNVERIFIED}
+    assert codes(result) <= {AlignNotice.UNVERIFIED}
 
 
 def on_lines(count, n, sigma, seed):
@@ -129,18 +129,18 @@ def test_few_trajectory_lines_are_counted(count, expected):
     views, motion = on_lines(count, 80, 0.3, 8)
     result = align_planar(*views, threshold=0.9, generator=generator())
     assert float(error(result, motion)) < 1.5
-    found = [notice for notice in result.warnings if notice.code == NoticeCode.FEW_LINES]
+    found = [notice for notice in result.warnings if notice.code == AlignNotice.FEW_LINES]
     assert bool(found) == expected
     if expected:
         assert found[0].value == count
-    assert (NoticeCode.ONE_LINE in codes(result)) == (count == 1)
+    assert (AlignNotice.ONE_LINE in codes(result)) == (count == 1)
 
 
 def test_few_moving_points_are_counted():
     scene = scenes.planar(80, sigma=0.5, static=0.9, generator=generator(9))
     result = align_planar(*scene.views, generator=generator())
     assert [notice.value for notice in result.warnings if notice.code == "few_moving"] == [8.0]
-    assert NoticeCode.FEW_MOVING.value in repr(result)
+    assert AlignNotice.FEW_MOVING.value in repr(result)
 
 
 def test_mismatches_of_static_points_are_reported_as_unverified():
@@ -151,7 +151,7 @@ def test_mismatches_of_static_points_are_reported_as_unverified():
     result = align_planar(scene.views[0], scene.views[1], x3, threshold=0.9, generator=generator())
     assert result.unverified is not None
     assert result.unverified[wrong].all() and (result.labels[wrong] == 2).all()
-    notice = next(n for n in result.warnings if n.code == NoticeCode.UNVERIFIED)
+    notice = next(n for n in result.warnings if n.code == AlignNotice.UNVERIFIED)
     assert notice.value == int(result.unverified.sum()) and "paused" in result.ambiguity
 
 
@@ -211,7 +211,7 @@ def test_points_on_a_line_determine_nothing(sigma):
     views = line + sigma * torch.randn(line.shape, generator=draw, dtype=torch.float64)
     result = align_planar(*views, generator=generator())
     assert result.status != Status.OK
-    assert NoticeCode.COLLINEAR in codes(result)
+    assert AlignNotice.COLLINEAR in codes(result)
     assert result.A.isfinite().all() and result.covariance.isfinite().all()
 
 

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from dyntorch import scenes
+from dyntorch.core.outcome import Status
 from dyntorch.core.robust import robust_fit
-from dyntorch.core.solution import Status
 from dyntorch.geometry.rigid import moved_by, nearest_rotation, rigid_alignment, rigid_motion, rotation_exponential
 from dyntorch.metrics import label_scores, point_error, relative_error, rotation_error, translation_error
 from dyntorch.tasks.align import join as align_join

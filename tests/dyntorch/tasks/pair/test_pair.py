@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from dyntorch import PairOptions
-from dyntorch.core.solution import Status
+from dyntorch.core.outcome import Status
 from dyntorch.geometry.homogeneous import skew
 from dyntorch.scenes.filmed import nonrigid_pair
-from dyntorch.tasks.outcome import NoticeCode
 from dyntorch.tasks.pair.pair import reconstruct_pair
+from dyntorch.tasks.pair.result import PairNotice
 from dyntorch.tasks.synchronize.result import Shift
 
 N, M, FRAMES = 10, 8, 70
@@ -141,7 +141,7 @@ def test_free_mean_places_are_noticed():
     scene = nonrigid_pair(N, M, FRAMES, shapes=3, generator=seeded(8))
     moved = scene.b + 60 * normal(1, M, 2)
     found = reconstruct_pair(scene.a, moved, 0.0, fps=scene.fps)
-    assert [notice.code for notice in found.warnings] == [NoticeCode.FREE_PLACES]
+    assert [notice.code for notice in found.warnings] == [PairNotice.FREE_PLACES]
     seen, truth = found.images()[0, :, N:], scene.images[0, :, N:]
     seen, truth = seen - seen.mean(0), truth - truth.mean(0)
     # up to the scale of b's motions, which nothing fixes then
@@ -213,22 +213,22 @@ def test_wrong_corresponding_points_are_flagged(crowd):
 @pytest.mark.parametrize(
     ("change", "status", "code"),
     [
-        (lambda s: (s.a[:8], s.b[:8], 0.0), Status.TOO_FEW, NoticeCode.SHORT_OVERLAP),
-        (lambda s: (s.a, s.b, 60.0), Status.TOO_FEW, NoticeCode.SHORT_OVERLAP),
-        (lambda s: (s.a[:, :1], s.b, 0.0), Status.TOO_FEW, NoticeCode.FEW_POINTS),
-        (lambda s: (torch.full_like(s.a, torch.nan), s.b, 0.0), Status.TOO_FEW, NoticeCode.FEW_POINTS),
-        (lambda s: (s.a[:1].expand(FRAMES, -1, -1), s.b, 0.0), Status.DEGENERATE, NoticeCode.STATIC_SCENE),
-        (lambda s: (s.a[:1] + 0.2 * normal(FRAMES, N, 2), s.b, 0.0), Status.DEGENERATE, NoticeCode.STATIC_SCENE),
-        (lambda s: (s.a[:14], s.b[:14], 0.0), Status.TOO_FEW, NoticeCode.SHORT_OVERLAP),
+        (lambda s: (s.a[:8], s.b[:8], 0.0), Status.TOO_FEW, PairNotice.SHORT_OVERLAP),
+        (lambda s: (s.a, s.b, 60.0), Status.TOO_FEW, PairNotice.SHORT_OVERLAP),
+        (lambda s: (s.a[:, :1], s.b, 0.0), Status.TOO_FEW, PairNotice.FEW_POINTS),
+        (lambda s: (torch.full_like(s.a, torch.nan), s.b, 0.0), Status.TOO_FEW, PairNotice.FEW_POINTS),
+        (lambda s: (s.a[:1].expand(FRAMES, -1, -1), s.b, 0.0), Status.DEGENERATE, PairNotice.STATIC_SCENE),
+        (lambda s: (s.a[:1] + 0.2 * normal(FRAMES, N, 2), s.b, 0.0), Status.DEGENERATE, PairNotice.STATIC_SCENE),
+        (lambda s: (s.a[:14], s.b[:14], 0.0), Status.TOO_FEW, PairNotice.SHORT_OVERLAP),
         (
             lambda s: (s.a, nonrigid_pair(N, M, FRAMES, sigma=0.1, generator=seeded(99)).b, 0.0),
             Status.NO_CONSENSUS,
-            NoticeCode.FEW_POINTS,
+            PairNotice.FEW_POINTS,
         ),
         (
             lambda s: (s.a, (s.b @ torch.tensor([[0.6], [0.8]]).double()) * torch.tensor([0.6, 0.8]), 0.0),
             Status.DEGENERATE,
-            NoticeCode.COLLINEAR,
+            PairNotice.COLLINEAR,
         ),
     ],
 )
@@ -296,7 +296,7 @@ def test_unrelated_bodies_are_not_explained_by_each_other():
         generator = torch.Generator().manual_seed(seed)
         found = reconstruct_pair(wandering(12, generator), wandering(14, generator), 0.0, fps=30.0)
         assert found.status == Status.NO_CONSENSUS and not found.labels.any()
-        assert found.warnings[0].code == NoticeCode.CHANCE
+        assert found.warnings[0].code == PairNotice.CHANCE
 
 
 @pytest.mark.parametrize("scale", [1e-160, 1e70, 1e160, 1e300])
@@ -306,7 +306,7 @@ def test_coordinates_of_any_size_are_a_status(scale: float, camera: int) -> None
     tracks = [x * scale if i == camera else x for i, x in enumerate((scene.a, scene.b))]
     found = reconstruct_pair(*tracks, scene.offset, fps=scene.fps)
     assert found.status == (Status.TOO_FEW if scale > 1 else Status.NO_CONSENSUS)
-    assert [notice.code for notice in found.warnings] == [NoticeCode.FEW_POINTS]
+    assert [notice.code for notice in found.warnings] == [PairNotice.FEW_POINTS]
 
 
 def test_options_decide():

@@ -7,10 +7,10 @@ import torch
 
 import dyntorch as dyn
 from dyntorch import scenes
-from dyntorch.core.solution import Status
+from dyntorch.core.outcome import Status
 from dyntorch.geometry.homogeneous import apply
 from dyntorch.metrics import relative_error
-from dyntorch.tasks.outcome import NoticeCode
+from dyntorch.tasks.planes.notices import PlanesNotice
 from dyntorch.tasks.planes.planes import translating_planes
 
 
@@ -27,10 +27,10 @@ def solved(planes, batch, seed, *, matched=False, **options):
 @pytest.mark.parametrize(
     ("options", "planes", "code"),
     [
-        ({"collinear_epipoles": True}, 3, NoticeCode.COLLINEAR_EPIPOLES),
-        ({"coplanar_normals": True}, 3, NoticeCode.COPLANAR_NORMALS),
-        ({"shared": 2}, 4, NoticeCode.SHARED_BODY),
-        ({"static": True}, 4, NoticeCode.STATIC_BODY),
+        ({"collinear_epipoles": True}, 3, PlanesNotice.COLLINEAR_EPIPOLES),
+        ({"coplanar_normals": True}, 3, PlanesNotice.COPLANAR_NORMALS),
+        ({"shared": 2}, 4, PlanesNotice.SHARED_BODY),
+        ({"static": True}, 4, PlanesNotice.STATIC_BODY),
     ],
 )
 def test_special_positions_are_named_and_solved(options, planes, code):
@@ -65,13 +65,13 @@ def test_what_several_solutions_fit_is_refused(options, planes):
 def test_noise_does_not_hide_a_single_body(planes, shared, matched):
     found, _, codes = solved(planes, 8, 21, matched=matched, sigma=0.05, patch=240.0, shared=shared)
     assert int((found.status != Status.OK).sum()) >= 6
-    assert NoticeCode.SHARED_BODY in codes
+    assert PlanesNotice.SHARED_BODY in codes
 
 
 def test_one_or_two_bodies_are_not_said_to_be_in_line():
     _, _, codes = solved(5, 6, 25, shared=5)
-    assert NoticeCode.SHARED_BODY in codes
-    assert not codes & {NoticeCode.COLLINEAR_EPIPOLES, NoticeCode.COPLANAR_NORMALS}
+    assert PlanesNotice.SHARED_BODY in codes
+    assert not codes & {PlanesNotice.COLLINEAR_EPIPOLES, PlanesNotice.COPLANAR_NORMALS}
 
 
 def test_two_bodies_of_two_planes_each_are_enough():
@@ -79,14 +79,14 @@ def test_two_bodies_of_two_planes_each_are_enough():
     e = 800 * scene.epipoles[:, [0, 0, 2, 2]]
     found = translating_planes(scene.infinity[:, None] + e[..., :, None] * scene.normals[..., None, :]).check()
     assert relative_error(found.homography_at_infinity, scene.infinity).max() < 1e-7
-    assert {notice.code for notice in found.warnings} == {NoticeCode.SHARED_BODY}
+    assert {notice.code for notice in found.warnings} == {PlanesNotice.SHARED_BODY}
 
 
 def test_five_planes_stand_parallel_motion_of_vertical_planes():
     found, error, codes = solved(5, 3, 9, collinear_epipoles=True, coplanar_normals=True)
     found.check()
     assert error.max() < 1e-7
-    assert codes == {NoticeCode.COLLINEAR_EPIPOLES, NoticeCode.COPLANAR_NORMALS}
+    assert codes == {PlanesNotice.COLLINEAR_EPIPOLES, PlanesNotice.COPLANAR_NORMALS}
 
 
 def test_one_residual_to_spare_does_not_vouch_for_three_planes():
@@ -116,7 +116,7 @@ def test_matches_tell_homographies_that_have_nothing_in_common():
     _, x1, x2 = unrelated(8, 4, 31)
     found = translating_planes(x1=x1, x2=x2)
     assert found.status.tolist() == [Status.NO_CONSENSUS] * 4
-    named = [notice for notice in found.warnings if notice.code == NoticeCode.NO_COMMON_INFINITY]
+    named = [notice for notice in found.warnings if notice.code == PlanesNotice.NO_COMMON_INFINITY]
     assert len(named) == 4 and all(notice.value > 6 for notice in named)
     assert "times the noise" in str(named[0])
     with pytest.raises(ValueError, match=r"NO_CONSENSUS; .* no_common_infinity"):
@@ -127,7 +127,7 @@ def test_matches_tell_homographies_that_have_nothing_in_common():
 def test_homographies_alone_tell_less_often(planes, least):
     drawn = torch.randn(20, planes, 3, 3, generator=torch.Generator().manual_seed(32), dtype=torch.float64)
     found = translating_planes(drawn)
-    named = {w.problem for w in found.warnings if w.code == NoticeCode.NO_COMMON_INFINITY}
+    named = {w.problem for w in found.warnings if w.code == PlanesNotice.NO_COMMON_INFINITY}
     assert len(named) >= 20 * least
     assert int((found.status == Status.NO_CONSENSUS).sum()) == len(named)
     assert translating_planes(drawn, refine=False, method="linear").status.eq(Status.NO_CONSENSUS).sum() == 0
@@ -137,13 +137,13 @@ def test_homographies_alone_tell_less_often(planes, least):
 @pytest.mark.parametrize(("planes", "sigma"), [(3, 1.0), (4, 0.5), (8, 1.0)])
 def test_noise_is_no_lack_of_a_common_homography(planes, sigma, matched):
     found, _, codes = solved(planes, 8, 33, matched=matched, sigma=sigma)
-    assert NoticeCode.NO_COMMON_INFINITY not in codes and Status.NO_CONSENSUS not in found.status.tolist()
+    assert PlanesNotice.NO_COMMON_INFINITY not in codes and Status.NO_CONSENSUS not in found.status.tolist()
 
 
 def test_the_same_homography_many_times_is_not_said_to_differ():
     scene = scenes.translating_planes(1, generator=torch.Generator().manual_seed(34))
     H = scene.homographies.expand(6, 3, 3) + 1e-4 * torch.randn(6, 3, 3, generator=torch.Generator().manual_seed(35)).double()
-    assert NoticeCode.NO_COMMON_INFINITY not in {w.code for w in translating_planes(H).warnings}
+    assert PlanesNotice.NO_COMMON_INFINITY not in {w.code for w in translating_planes(H).warnings}
 
 
 def test_a_calibration_that_contradicts_is_named():
@@ -151,7 +151,7 @@ def test_a_calibration_that_contradicts_is_named():
     wrong = scene.calibration.clone()
     wrong[0, 0] *= 3
     found = translating_planes(scene.homographies, calibration=wrong)
-    named = [w for w in found.warnings if w.code == NoticeCode.CALIBRATION]
+    named = [w for w in found.warnings if w.code == PlanesNotice.CALIBRATION]
     assert len(named) == 6 and bool((found.status == Status.OK).all())
     # the figure, by the polar decomposition
     moved = torch.linalg.inv(wrong) @ scene.infinity @ wrong
@@ -162,7 +162,7 @@ def test_a_calibration_that_contradicts_is_named():
     # halved pixels in the second view, and the right pair
     pair = (scene.calibration, torch.diag(torch.tensor([0.5, 0.5, 1.0], dtype=wrong.dtype)) @ scene.calibration)
     assert translating_planes(scene.homographies, calibration=scene.calibration).warnings == ()
-    assert {w.code for w in translating_planes(scene.homographies, calibration=pair).warnings} == {NoticeCode.CALIBRATION}
+    assert {w.code for w in translating_planes(scene.homographies, calibration=pair).warnings} == {PlanesNotice.CALIBRATION}
 
 
 @pytest.mark.parametrize("planes", [3, 4, 5, 8])
@@ -170,7 +170,7 @@ def test_noise_does_not_contradict_the_calibration(planes):
     scene = scenes.translating_planes(planes, batch=20, sigma=0.5, generator=torch.Generator().manual_seed(37))
     H = dyn.fit(dyn.Collineation(2), scene.x2, scene.x1).tensor
     found = translating_planes(H, calibration=scene.calibration)
-    assert NoticeCode.CALIBRATION not in {w.code for w in found.warnings}
+    assert PlanesNotice.CALIBRATION not in {w.code for w in found.warnings}
 
 
 def test_messages_count_and_say_what_three_planes_lack_only_of_three():
@@ -193,7 +193,7 @@ def test_random_homographies_decide_nothing(size):
     found = translating_planes(H)
     assert Status.OK not in found.status.tolist()
     named = {w.code for w in found.warnings}
-    assert named & {NoticeCode.NO_COMMON_INFINITY, NoticeCode.CHANCE}
+    assert named & {PlanesNotice.NO_COMMON_INFINITY, PlanesNotice.CHANCE}
 
 
 def test_random_matches_decide_nothing():
@@ -201,7 +201,7 @@ def test_random_matches_decide_nothing():
     x1, x2 = 500 * torch.rand(2, 3, 6, 30, 2, generator=draw, dtype=torch.float64)
     found = translating_planes(x1=x1, x2=x2)
     assert Status.OK not in found.status.tolist()
-    assert NoticeCode.INCOHERENT in {w.code for w in found.warnings}
+    assert PlanesNotice.INCOHERENT in {w.code for w in found.warnings}
 
 
 def test_planes_that_turn_by_themselves_are_refused():

@@ -7,10 +7,10 @@ import torch
 
 import dyntorch as dyn
 from dyntorch import scenes
-from dyntorch.core.solution import Status
+from dyntorch.core.outcome import Status
 from dyntorch.geometry.homogeneous import apply, skew, unit
 from dyntorch.metrics import relative_error
-from dyntorch.tasks.outcome import NoticeCode
+from dyntorch.tasks.planes.notices import PlanesNotice
 from dyntorch.tasks.planes.planes import translating_planes
 
 F64 = torch.float64
@@ -158,7 +158,7 @@ def test_missing_planes_are_left_out():
     assert found.status.tolist() == [Status.OK, Status.OK, Status.TOO_FEW]
     assert errors(found, scene)[:2].max() < 1e-8
     assert found.used.sum(-1).tolist() == [5, 5, 2]
-    assert codes(found) == {NoticeCode.UNUSED_PLANE, NoticeCode.FEW_PLANES}
+    assert codes(found) == {PlanesNotice.UNUSED_PLANE, PlanesNotice.FEW_PLANES}
     for name in ("homography_at_infinity", "epipoles", "fundamentals", "normals", "scales", "covariance", "residual"):
         assert bool(getattr(found, name).isfinite().all()), name
     assert bool((found.homography_at_infinity[2] == 0).all()) and bool((found.epipoles[0, 0] == 0).all())

@@ -11,7 +11,7 @@ import torch
 
 import dyntorch as dyn
 from dyntorch import scenes
-from dyntorch.core.solution import Status
+from dyntorch.core.outcome import Status
 from dyntorch.tasks.reconstruct import solver as lifted_choice
 from dyntorch.tasks.reconstruct.motions import MOTIONS, Motion
 from dyntorch.tasks.reconstruct.projections import ViewTracks

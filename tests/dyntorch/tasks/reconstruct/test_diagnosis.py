@@ -9,10 +9,9 @@ import torch
 
 import dyntorch as dyn
 from dyntorch import scenes
-from dyntorch.core.solution import Status
+from dyntorch.core.outcome import Status
 from dyntorch.scenes.lifts import KINDS
-from dyntorch.tasks.outcome import NoticeCode
-from dyntorch.tasks.reconstruct.result import Reconstruction
+from dyntorch.tasks.reconstruct.result import Reconstruction, ReconstructNotice
 
 
 def solved(name: str, sigma: float = 0.5, **options: object) -> Reconstruction:
@@ -22,7 +21,7 @@ def solved(name: str, sigma: float = 0.5, **options: object) -> Reconstruction:
     return dyn.reconstruct(scene.tracks, name, scene.times, threshold=math.inf)
 
 
-def codes(found: Reconstruction, problem: int) -> set[NoticeCode]:
+def codes(found: Reconstruction, problem: int) -> set[ReconstructNotice]:
     return {w.code for w in found.warnings if w.problem == (problem,)}
 
 
@@ -30,7 +29,7 @@ def codes(found: Reconstruction, problem: int) -> set[NoticeCode]:
 def test_sound_scenes_raise_no_doubt(name: str) -> None:
     found = solved(name)
     assert (found.status == Status.OK).all()
-    assert {w.code for w in found.warnings} <= {NoticeCode.UNCERTAIN}
+    assert {w.code for w in found.warnings} <= {ReconstructNotice.UNCERTAIN}
 
 
 STILL = ["constant_direction_2d", "constant_velocity_2d", "constant_direction_3d", "constant_velocity_3d"]
@@ -41,17 +40,17 @@ STILL = ["constant_direction_2d", "constant_velocity_2d", "constant_direction_3d
 def test_static_scenes(name: str, sigma: float) -> None:
     found = solved(name, sigma, static=1.0)
     assert (found.status == (Status.AMBIGUOUS if sigma else Status.DEGENERATE)).all()
-    causes = {NoticeCode.STATIC_SCENE, NoticeCode.TURNING_CAMERA}
+    causes = {ReconstructNotice.STATIC_SCENE, ReconstructNotice.TURNING_CAMERA}
     assert all(codes(found, i) & causes for i in range(3))
     with pytest.raises(ValueError, match="a smaller model leaves a residual"):
         found.check()
 
 
 CAMERAS = {
-    "static_3d": (0.0, NoticeCode.TURNING_CAMERA),
-    "constant_direction_3d": (0.0, NoticeCode.TURNING_CAMERA),
-    "constant_velocity_planes_3d": (1.0, NoticeCode.UNIFORM_CAMERA),
-    "constant_velocity_3d": (1.0, NoticeCode.UNIFORM_CAMERA),
+    "static_3d": (0.0, ReconstructNotice.TURNING_CAMERA),
+    "constant_direction_3d": (0.0, ReconstructNotice.TURNING_CAMERA),
+    "constant_velocity_planes_3d": (1.0, ReconstructNotice.UNIFORM_CAMERA),
+    "constant_velocity_3d": (1.0, ReconstructNotice.UNIFORM_CAMERA),
 }
 
 
@@ -68,7 +67,7 @@ def test_cameras_that_stand_still_or_move_uniformly(name: str, sigma: float) -> 
 def test_one_body(name: str) -> None:
     found = solved(name, static=1.0)
     assert (found.status == Status.AMBIGUOUS).all()
-    assert all(NoticeCode.ONE_BODY in codes(found, i) for i in range(3))
+    assert all(ReconstructNotice.ONE_BODY in codes(found, i) for i in range(3))
 
 
 def test_collinear_images() -> None:
@@ -77,7 +76,7 @@ def test_collinear_images() -> None:
     tracks[..., 1] = 2 * tracks[..., 0]
     found = dyn.reconstruct(tracks, "constant_velocity_2d")
     assert found.status == Status.DEGENERATE
-    assert NoticeCode.COLLINEAR in {w.code for w in found.warnings}
+    assert ReconstructNotice.COLLINEAR in {w.code for w in found.warnings}
 
 
 def test_tracks_of_one_observation_have_no_position() -> None:
@@ -86,5 +85,5 @@ def test_tracks_of_one_observation_have_no_position() -> None:
     tracks[1:, :4] = torch.nan
     found = dyn.reconstruct(tracks, "constant_velocity_2d")
     assert found.status == Status.OK
-    (notice,) = [w for w in found.warnings if w.code == NoticeCode.FEW_OBSERVED]
+    (notice,) = [w for w in found.warnings if w.code == ReconstructNotice.FEW_OBSERVED]
     assert notice.value == 4 and bool(found.points[:4].isnan().all()) and bool(found.points[4:].isfinite().all())

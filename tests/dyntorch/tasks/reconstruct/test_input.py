@@ -8,9 +8,9 @@ from torch import Tensor
 
 import dyntorch as dyn
 from dyntorch import scenes
-from dyntorch.core.solution import Status
-from dyntorch.tasks.outcome import NoticeCode
+from dyntorch.core.outcome import Status
 from dyntorch.tasks.reconstruct.motions import Motion
+from dyntorch.tasks.reconstruct.result import ReconstructNotice
 
 NAN = float("nan")
 CV = "constant_velocity_2d"
@@ -82,7 +82,7 @@ def test_problems_with_too_little_are_statuses_with_reasons() -> None:
     once[1:], few[1:, :20] = NAN, NAN
     found = dyn.reconstruct(torch.stack([x, x * NAN, once, few]), CV)
     assert found.status.tolist() == [Status.OK, *[Status.TOO_FEW] * 3]
-    few_observed = [w for w in found.warnings if w.code == NoticeCode.FEW_OBSERVED]
+    few_observed = [w for w in found.warnings if w.code == ReconstructNotice.FEW_OBSERVED]
     assert [(w.problem, w.value) for w in few_observed] == [((1,), 0), ((2,), 0), ((3,), 10)]
     with pytest.raises(ValueError, match=r"problem 1, 2, 3 of 4: TOO_FEW; .* needs 13 through the same ones"):
         found.check()

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from dyntorch import scenes
-from dyntorch.core.solution import Status
+from dyntorch.core.outcome import Status
 from dyntorch.geometry.triangulation import reproject
 from dyntorch.tasks.reconstruct.motions import MOTIONS
 from dyntorch.tasks.reconstruct.projections import Projections, ViewTracks, choices, mean_error, projections_of_tracks

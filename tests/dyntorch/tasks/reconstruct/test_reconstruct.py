@@ -10,7 +10,7 @@ from torch import Tensor
 
 import dyntorch as dyn
 from dyntorch import metrics, scenes
-from dyntorch.core.solution import Status
+from dyntorch.core.outcome import Status
 from dyntorch.scenes.lifts import KINDS
 from dyntorch.tasks.reconstruct.motions import MOTIONS, Motion
 from dyntorch.tasks.reconstruct.result import Reconstruction

@@ -7,7 +7,7 @@ import torch
 
 from dyntorch import scenes
 from dyntorch.core.normalize import hartley
-from dyntorch.core.solution import Status
+from dyntorch.core.outcome import Status
 from dyntorch.geometry.triangulation import observed, triangulate
 from dyntorch.tasks.reconstruct.motions import MOTIONS
 from dyntorch.tasks.reconstruct.projections import ViewTracks, projections_of_tracks

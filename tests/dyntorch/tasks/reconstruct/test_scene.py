@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from dyntorch import metrics, scenes
-from dyntorch.core.solution import Status
+from dyntorch.core.outcome import Status
 from dyntorch.tasks.reconstruct import scene as lifted_scene
 from dyntorch.tasks.reconstruct.motions import MOTIONS
 from dyntorch.tasks.reconstruct.projections import projections_of_tracks

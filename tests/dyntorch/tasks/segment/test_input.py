@@ -7,9 +7,9 @@ import torch
 
 import dyntorch as dyn
 from dyntorch import scenes
-from dyntorch.core.solution import Status
+from dyntorch.core.outcome import Status
 from dyntorch.metrics import misclassification
-from dyntorch.tasks.outcome import NoticeCode
+from dyntorch.tasks.segment.result import SegmentNotice
 
 F64 = torch.float64
 
@@ -96,7 +96,7 @@ def test_too_few_different_matches(kind, bodies):
     assert int(found.status) == Status.TOO_FEW and int(found.bodies) == 0
     assert bool((found.labels == 0).all())
     # what is missing is not repeated
-    assert codes(found) == ({NoticeCode.REPEATED} if kind in ("one point", "seven copied") else set())
+    assert codes(found) == ({SegmentNotice.REPEATED} if kind in ("one point", "seven copied") else set())
     with pytest.raises(ValueError, match="TOO_FEW"):
         found.check()
 
@@ -113,7 +113,7 @@ def test_random_matches_are_no_body():
         for bodies in (None, 2):
             found = segmented(x1, x2, bodies=bodies)
             assert int(found.status) == Status.NO_CONSENSUS and int(found.bodies) == 0
-            assert bool((found.labels == 0).all()) and NoticeCode.INCOHERENT in codes(found)
+            assert bool((found.labels == 0).all()) and SegmentNotice.INCOHERENT in codes(found)
 
 
 @pytest.mark.parametrize("bodies", [None, 2, 3])
@@ -124,7 +124,7 @@ def test_one_body(bodies):
         assert bool((found.labels == 1).all())
     # asked for more, it is divided, or the result says that there are fewer
     assert int(found.bodies) == (bodies or 1) or (
-        int(found.status) == Status.NO_CONSENSUS and NoticeCode.FEWER_BODIES in codes(found)
+        int(found.status) == Status.NO_CONSENSUS and SegmentNotice.FEWER_BODIES in codes(found)
     )
     assert int((found.labels == 0).sum()) <= 4
 
@@ -150,7 +150,7 @@ def test_copies_of_matches_change_nothing_but_a_notice():
     scene = scene_of(80, 2, outliers=0.2)
     found = segmented(*(x.repeat(3, 1) for x in scene.views))
     assert float(misclassification(found.labels, scene.labels.repeat(3))) <= 0.03
-    assert torch.equal(found.labels[:80], found.labels[80:160]) and codes(found) == {NoticeCode.REPEATED}
+    assert torch.equal(found.labels[:80], found.labels[80:160]) and codes(found) == {SegmentNotice.REPEATED}
 
 
 @pytest.mark.parametrize("unit", [1.0, 50.0])
@@ -165,9 +165,9 @@ def test_a_body_that_got_lost_is_no_spare_one():
     scene = scene_of(80, 1)
     for bodies in range(2, 9):
         found = segmented(*scene.views, bodies=bodies)
-        spare = [notice.value for notice in found.warnings if notice.code == NoticeCode.SPARE_BODY]
+        spare = [notice.value for notice in found.warnings if notice.code == SegmentNotice.SPARE_BODY]
         assert spare in ([], [bodies - 1])
-        assert not {NoticeCode.SPARE_BODY, NoticeCode.FEWER_BODIES} <= codes(found)
+        assert not {SegmentNotice.SPARE_BODY, SegmentNotice.FEWER_BODIES} <= codes(found)
 
 
 def test_garbage_does_not_spoil_the_estimated_threshold():
@@ -216,7 +216,7 @@ def test_a_threshold_in_another_unit_is_named():
     scene = scenes.bodies(120, sigma=0.3, generator=torch.Generator().manual_seed(0))
     found = dyn.segment(*(x / 640 for x in scene.views))
     assert int(found.status) == Status.AMBIGUOUS and int(found.bodies) == 0
-    assert [notice.code for notice in found.warnings] == [NoticeCode.COARSE]
+    assert [notice.code for notice in found.warnings] == [SegmentNotice.COARSE]
     assert int(dyn.segment(*(x / 640 for x in scene.views), threshold=2.5 / 640).bodies) == 2
 
 

@@ -9,10 +9,10 @@ import torch
 
 import dyntorch as dyn
 from dyntorch import scenes
-from dyntorch.core.solution import Status
+from dyntorch.core.outcome import Status
 from dyntorch.geometry.homogeneous import apply, homogeneous
 from dyntorch.metrics import misclassification, relative_error
-from dyntorch.tasks.outcome import NoticeCode
+from dyntorch.tasks.segment.result import SegmentNotice
 
 F64 = torch.float64
 NAMES = ("labels", "bodies", "fundamentals", "homographies", "probabilities", "residuals", "coherence", "status", "threshold")
@@ -240,8 +240,8 @@ def test_check_repr_and_notices():
     with pytest.raises(ValueError, match="problem 1 of 2: NO_CONSENSUS"):
         failed.check()
     assert {(notice.code, notice.problem) for notice in failed.warnings} == {
-        (NoticeCode.FEWER_BODIES, (1,)),
-        (NoticeCode.INCOHERENT, (1,)),
+        (SegmentNotice.FEWER_BODIES, (1,)),
+        (SegmentNotice.INCOHERENT, (1,)),
     }
     # the other problem is not touched
     assert torch.equal(failed.labels[0], segmented(scene, bodies=2).labels)

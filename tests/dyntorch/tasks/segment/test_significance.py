@@ -9,7 +9,7 @@ import torch
 
 import dyntorch as dyn
 from dyntorch import scenes
-from dyntorch.core.solution import Status
+from dyntorch.core.outcome import Status
 from dyntorch.tasks.segment.coherence import Links
 from dyntorch.tasks.segment.energy import View
 from dyntorch.tasks.segment.labels import _alarms, _chance, significant

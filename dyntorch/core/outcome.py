@@ -1,0 +1,254 @@
+"""What every result derives from: a status per problem, and notices on what limits how far it can be trusted."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from enum import IntEnum, StrEnum
+from typing import Any, ClassVar, Self
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dyntorch.numerics.messages import Message, Words, as_python
+
+
+class Status(IntEnum):
+    """How one problem of a batch ended."""
+
+    OK = 0
+    TOO_FEW = 1
+    """Fewer matches with weight than determine the tensor.  The tensor is zero."""
+    DEGENERATE = 2
+    """The matches leave more than the invariant's null space, exactly: several tensors fulfil all of them.  The tensor is zero."""
+    AMBIGUOUS = 3
+    """Other tensors fit the matches as well as this one, within the noise.  The tensor is one of them."""
+    NO_CONSENSUS = 4
+    """Robust estimation found no tensor that enough matches agree with.  The tensor is the best one found."""
+
+
+REMEDY: Mapping[Status, str] = {
+    Status.TOO_FEW: "give more matches, or weigh fewer of them 0",
+    Status.DEGENERATE: "add matches in general position (other trajectories, other directions of motion), or use a smaller model",
+    Status.AMBIGUOUS: "add matches that differ more, lower the noise, or use a model with fewer degrees of freedom",
+    Status.NO_CONSENSUS: "raise the {arg:threshold}, or give matches of which more belong to the model",
+}
+"""What to do, as templates of messages; a task that knows better has its own (:attr:`Outcome.REMEDIES`)."""
+
+
+def failed(status: Tensor) -> Tensor:
+    """Where a status leaves no tensor, bool of the same shape."""
+    return (status == Status.TOO_FEW) | (status == Status.DEGENERATE)
+
+
+def agreed(status: Tensor) -> Tensor:
+    """Where matches agree with what was found, bool of the same shape; elsewhere no match is an inlier of anything."""
+    return (status == Status.OK) | (status == Status.AMBIGUOUS)
+
+
+def status_of(degenerate: Tensor, few: Tensor | None = None) -> Tensor:
+    """The status where nothing else can fail."""
+    status = torch.where(degenerate, int(Status.DEGENERATE), int(Status.OK))
+    return status if few is None else torch.where(few, int(Status.TOO_FEW), status)
+
+
+class NoticeCode(StrEnum):
+    """What a :class:`Notice` is about, and its sentence: every task has its own, in its room.
+
+    A member is its code, the template of its message (see :class:`~dyntorch.numerics.messages.Message`; ``value`` is the figure of
+    the notice) or one for each case, and for what makes a result refuse the status that it then has.
+    """
+
+    templates: Mapping[str, str]
+    refuses: Status | None
+
+    def __new__(cls, code: str, template: str | Mapping[str, str], refuses: Status | None = None) -> Self:
+        self = str.__new__(cls, code)
+        self._value_, self.refuses = code, refuses
+        self.templates = {"": template} if isinstance(template, str) else template
+        return self
+
+
+@dataclass(frozen=True)
+class Notice:
+    """Something about the data of one problem that limits what its result can be trusted for.
+
+    Attributes:
+        code: what it is about.
+        value: the measured figure behind it.
+        values: what else its sentence speaks of, by name; ``case`` chooses among the sentences of the code.
+        problem: index into the batch, () for a single problem.
+        words: what its sentence calls arguments.
+        names: what its sentence calls cameras.
+    """
+
+    code: NoticeCode
+    value: float = 0.0
+    values: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    problem: tuple[int, ...] = ()
+    words: Words = field(default=as_python, repr=False, compare=False)
+    names: Mapping[str, str] = field(default_factory=dict, repr=False, compare=False)
+
+    @property
+    def text(self) -> Message:
+        """One sentence with the figure and the remedy."""
+        template = self.code.templates[self.values.get("case", "")]
+        return Message(template, self.words, self.names, **{"value": self.value, **self.values})
+
+    @property
+    def message(self) -> Message:
+        """The same, by its older name."""
+        return self.text
+
+    def worded(self, words: Words) -> Notice:
+        """The same, with what a surface calls the arguments."""
+        return replace(self, words=words)
+
+    def named(self, names: Mapping[str, str]) -> Notice:
+        """The same, with the names of cameras; names that were given before stay."""
+        values = {key: value.named(names) if isinstance(value, Message) else value for key, value in self.values.items()}
+        return replace(self, names={**names, **self.names}, values=values)
+
+    def __str__(self) -> str:
+        place = f"problem {', '.join(map(str, self.problem))}: " if self.problem else ""
+        return f"{place}{self.code}: {self.text}"
+
+
+def notices(code: NoticeCode, values: Tensor, flagged: Tensor, batch: tuple[int, ...], **more: Any) -> list[Notice]:
+    """A notice for every flagged problem.
+
+    Args:
+        code: what it is about.
+        values: ``(b,)`` figures.
+        flagged: ``(b,)`` bool.
+        batch: shape that the flat dimension b comes from.
+        more: what else the sentence speaks of, the same for all.
+    """
+    # one copy: an accelerator would wait for every number
+    figures = torch.where(flagged, values.detach().double(), torch.nan), flagged.double()
+    found = []
+    for flat, (value, counts) in enumerate(zip(*torch.stack(figures).tolist(), strict=True)):
+        if counts:
+            place = tuple(int(i) for i in np.unravel_index(flat, batch)) if batch else ()
+            found.append(Notice(code, value, more, place))
+    return found
+
+
+Note = Callable[..., None]
+
+
+def noting(batch: tuple[int, ...]) -> tuple[list[Notice], Note]:
+    """An empty list, and what adds to it: :func:`notices` of a batch."""
+    found: list[Notice] = []
+
+    def note(code: NoticeCode, values: Tensor, flagged: Tensor, **more: Any) -> None:
+        found.extend(notices(code, values, flagged, batch, **more))
+
+    return found, note
+
+
+def in_order(found: Iterable[Notice]) -> tuple[Notice, ...]:
+    """Notices in the order of their problems."""
+    return tuple(sorted(found, key=lambda notice: notice.problem))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+class Outcome:
+    """How a verb ended, problem by problem.
+
+    Attributes:
+        status: ``(*batch,)`` of :class:`dyntorch.Status` values, () for one problem.
+        notices: what limits how far the result can be trusted, in the order of the batch.
+    """
+
+    TASK: ClassVar[str] = ""
+    """What was tried."""
+    REMEDIES: ClassVar[Mapping[Status, str]] = REMEDY
+    """What was wrong, and what to do about it, as templates of messages."""
+
+    status: Tensor
+    notices: tuple[Notice, ...] = ()
+
+    @property
+    def task(self) -> str:
+        """What was tried, as :meth:`check` calls it."""
+        return self.TASK or type(self).__name__
+
+    @property
+    def warnings(self) -> tuple[Notice, ...]:
+        """The notices."""
+        return self.notices
+
+    @property
+    def reason(self) -> str:
+        """Why a single problem is not OK, and what to do; empty where it is.  Of a batch: see :meth:`check`."""
+        return self.refusal(as_python)
+
+    def refusal(self, words: Words) -> str:
+        """:attr:`reason` with what a surface calls the arguments."""
+        status = self._single()
+        if status == Status.OK:
+            return ""
+        told = [str(notice.worded(words).text) for notice in self._telling(status)]
+        return "; ".join(told[:2]) or Message(self.REMEDIES[status], words)
+
+    def check(self) -> Self:
+        """Raise where any problem failed.
+
+        Raises:
+            ValueError: says which problems failed, how, and what to do.
+        """
+        check_status(self.task, self.status, self.notices, self.REMEDIES)
+        return self
+
+    def counted(self) -> str:
+        """How many problems ended how: ``2 OK, 1 TOO_FEW``."""
+        states = Counter(self.status.reshape(-1).tolist())
+        return ", ".join(f"{count} {Status(state).name}" for state, count in sorted(states.items())) or "empty"
+
+    def head(self, **what: object) -> str:
+        """First line of a representation: the class, what it is of, the batch and its states."""
+        of = ", ".join(f"{name}={value}" for name, value in what.items())
+        return f"{type(self).__name__}({of}{', ' if of else ''}batch={tuple(self.status.shape)}: {self.counted()})"
+
+    def warned(self) -> list[str]:
+        """Lines of a representation: the notices of one problem, or how many problems of a batch have which."""
+        if not self.status.ndim:
+            return [f"  warning {notice}" for notice in self.notices]
+        seen = Counter(code for code, _ in {(notice.code.value, notice.problem) for notice in self.notices})
+        return [f"  warning {code}: {count} of {self.status.numel()} problems" for code, count in sorted(seen.items())]
+
+    def _single(self) -> Status:
+        if self.status.numel() != 1:
+            raise ValueError(f"the result is that of {self.status.numel()} problems, which have no common reason; see status")
+        return Status(int(self.status))
+
+    def _telling(self, status: Status) -> Sequence[Notice]:
+        """The notices that say why a problem has this status, the first ones first."""
+        return self.notices
+
+
+def check_status(what: str, status: Tensor, said: Sequence[Notice] = (), remedies: Mapping[Status, str] = REMEDY) -> None:
+    """Raise where any problem failed.
+
+    Args:
+        what: was tried.
+        status: ``(*batch,)`` of :class:`Status`.
+        said: what is known about single problems.
+        remedies: what to do, as templates of messages.
+
+    Raises:
+        ValueError: says which problems failed, how, and what to do.
+    """
+    flat = status.reshape(-1)
+    places = np.arange(len(flat)).reshape(tuple(status.shape))
+    for state in Status:
+        where = (flat == state).nonzero().flatten().tolist()
+        if state != Status.OK and where:
+            shown = ", ".join(map(str, where[:8])) + (", ..." if len(where) > 8 else "")
+            problems = f"problem {shown} of {len(flat)}" if status.ndim else "the problem"
+            reasons = [str(notice) for notice in said if int(places[notice.problem]) in where]
+            known = f" ({'; '.join(reasons[:3])})" if reasons else ""
+            raise ValueError(f"{what}: {problems}: {state.name}; {Message(remedies[state])}{known}")
