@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import re
 from pathlib import Path
 
@@ -24,3 +25,11 @@ def test_everything_a_guide_shows_happens(guide, tmp_path):
 def test_what_a_page_points_to_is_there(page):
     for target in re.findall(r"\]\(([^)#:]+)\)", page.read_text(encoding="utf-8")):
         assert (page.parent / target).exists() or "auto_gallery" in target, target
+
+
+def test_scripts_that_pages_name_are_there():
+    named = {
+        name for page in PAGES for name in re.findall(r"python -m (experiments\.[a-z_.]+[a-z])", page.read_text(encoding="utf-8"))
+    }
+    assert len(named) > 20
+    assert not [name for name in named if importlib.util.find_spec(name) is None]
