@@ -15,6 +15,7 @@ from dyntorch.geometry.triangulation import unit_projections
 from dyntorch.numerics.blocks import map_blocks
 from dyntorch.numerics.nullspace import eigenvalues, spectrum
 from dyntorch.tasks.reconstruct.motions import MOTIONS, Motion, polynomial
+from dyntorch.tasks.reconstruct.options import ReconstructOptions
 from dyntorch.tasks.reconstruct.projections import ViewTracks, camera_unknowns, projections_of_tracks
 from dyntorch.tasks.reconstruct.result import ReconstructNotice
 from dyntorch.tasks.reconstruct.scene import LiftedState, Lifting, bodies_of, distances, scene_of, wild
@@ -25,13 +26,19 @@ from dyntorch.tasks.reconstruct.scene import LiftedState, Lifting, bodies_of, di
 
 BLOCK = 1 << 17
 """Entries of the largest array per block of the batch: 200 problems of 3 views and 60 points of P^4 take 0.10 s, 2^21 0.17 s."""
-ROUNDING = 1e-10
-"""Of the largest eigenvalue of the information on the cameras: what rounding leaves of a zero.  Sound scenes of 60 points: 3e-6 to
-0.1; the gauge itself: up to 1e-11."""
 
 
 def point_uncertainty(
-    cameras: Tensor, structure: Tensor, lifts: Tensor, depth: Tensor, weights: Tensor, gauge: int, metric: Tensor, step: int = 1
+    cameras: Tensor,
+    structure: Tensor,
+    lifts: Tensor,
+    depth: Tensor,
+    weights: Tensor,
+    gauge: int,
+    metric: Tensor,
+    step: int = 1,
+    *,
+    options: ReconstructOptions,
 ) -> Tensor:
     r"""Standard deviation of each point per unit of noise, when cameras and points are both unknown.
 
@@ -66,7 +73,7 @@ def point_uncertainty(
     functional = depth.expand(b, n, -1)
 
     def run(*block: Tensor) -> Tensor:
-        return _uncertainty(block, gauge, step)
+        return _uncertainty(block, gauge, step, options)
 
     found = map_blocks(
         run, cameras, unit, functional, weights * known[:, None], lifts, metric, size=max(1, BLOCK // (n * wide + 1))
@@ -74,7 +81,7 @@ def point_uncertainty(
     return torch.where(known[:, ::step] & found.isfinite(), found, torch.inf)
 
 
-def _uncertainty(block: tuple[Tensor, ...], gauge: int, step: int) -> Tensor:
+def _uncertainty(block: tuple[Tensor, ...], gauge: int, step: int, options: ReconstructOptions) -> Tensor:
     cameras, structure, depth, weights, lifts, metric = block
     by_camera, by_point = _derivatives(cameras, structure, weights, lifts)
     information = torch.einsum("bvnlk,bvnlj->bnkj", by_point, by_point)
@@ -94,7 +101,7 @@ def _uncertainty(block: tuple[Tensor, ...], gauge: int, step: int) -> Tensor:
     open_ = seen + gauge + (weights.shape[1] - seen) * cameras.shape[-2] * cameras.shape[-1]
     free = torch.arange(values.shape[-1], device=values.device) >= open_[:, None]
     rounding = torch.where(free, -torch.inf, values).amax(-1, keepdim=True)
-    told = values > torch.maximum(ROUNDING * values[:, -1:], 100 * rounding)
+    told = values > torch.maximum(options.diagnosis.rounding * values[:, -1:], 100 * rounding)
     spread = vectors * torch.where(free & told, values.clamp(min=torch.finfo(values.dtype).tiny).rsqrt(), 0.0)[:, None]
     factor, whitened, structure, depth = factor[:, ::step], whitened[:, ::step], structure[:, ::step], depth[:, ::step]
     inverse = torch.linalg.solve_triangular(factor, eye.expand_as(factor), upper=False)
@@ -116,25 +123,6 @@ def _derivatives(cameras: Tensor, structure: Tensor, weights: Tensor, lifts: Ten
     slope = torch.cat([eye, -(image[..., :-1] / below)[..., None]], dim=-1) / below[..., None]
     slope = slope * torch.where(seen, weights[..., None].sqrt(), 0.0)[..., None]
     return (slope[..., None] * world[..., None, None, :]).flatten(-2), slope @ (cameras @ lifts)[:, :, None]
-
-
-UNCERTAIN = 0.1
-"""Expected error of the points over the size of the scene above which smaller models are tried, and a notice given.  80 points at
-0.5 px, 10 scenes each: 0.001 to 0.14 (constant_velocity_3d before 4 views), true errors about half of that; 0.2 to 13 with a camera
-that stands still or moves at constant velocity, where the true errors are 0.3 to 1."""
-UNKNOWN = 0.3
-"""The same above which the result is one of many."""
-EXPLAINED = 1.25
-"""Noise that a smaller model leaves over that of the model, up to which it explains the tracks as well."""
-EXACT = 1e-7
-"""Noise over the extent of the images that counts as none."""
-WEAK, NOISE_OF_STACK = 3e-3, 0.3
-"""Least singular value of the stacked projections over the largest, and noise over it: 0.015 to 0.8 and up to 0.1 in sound scenes
-at 0.5 px; below 0.005 and above 0.3 with a fixed camera."""
-ASKED = 20
-"""Points whose median uncertainty is taken, about."""
-THIN = 3.0
-"""Standard deviations of the noise across a line of images below which they may as well lie on it."""
 
 
 class Smaller(NamedTuple):
@@ -193,12 +181,13 @@ def diagnose(
     status: Tensor,
     sigma: Tensor,
     batch: tuple[int, ...],
+    options: ReconstructOptions,
 ) -> tuple[Tensor, tuple[Notice, ...]]:
     """The status ``(b,)`` of every problem, judged by the scene, and the notices on all of them.
 
     The linear fit of a tensor has more unknowns than the scene: what it calls ambiguous may be well determined.  A problem is
-    ambiguous where its points are uncertain by :data:`UNKNOWN` of their extent, or a model with fewer unknowns explains the
-    tracks as well, which also tells the cause.
+    ambiguous where its points are uncertain by ``options.diagnosis.unknown`` of their extent, or a model with fewer unknowns
+    explains the tracks as well, which also tells the cause.
 
     Args:
         tracks: flat batch, weights 0 for outliers.
@@ -216,32 +205,40 @@ def diagnose(
     status = torch.where(failed(status) & (enough < motion.tensor(size).minimal()), int(Status.TOO_FEW), status)
     solved = ~failed(status)
     noise = sigma * tracks.scale()
-    stack, doubt = conditions(tracks, scene, lifting, noise)
+    stack, doubt = conditions(tracks, scene, lifting, noise, options)
     stack, doubt = torch.where(solved, stack, 0.0), torch.where(solved, doubt, torch.inf)
     cheap = motion.k <= 4 or motion.bodies > 1
-    suspect = (status == Status.DEGENERATE) | (solved & (doubt > UNCERTAIN)) | ((status == Status.AMBIGUOUS) & cheap)
+    suspect = (
+        (status == Status.DEGENERATE) | (solved & (doubt > options.diagnosis.uncertain)) | ((status == Status.AMBIGUOUS) & cheap)
+    )
     explained = torch.zeros_like(solved)
     for smaller in SMALLER.get(motion.name, ()):
         asked = (suspect | (smaller.motion.static & (status == Status.AMBIGUOUS))) & ~explained
-        left = _noise_of(tracks, smaller.motion, asked)
-        same = asked & (left <= EXPLAINED * torch.where(solved, noise, 0.0) + EXACT)
+        left = _noise_of(tracks, smaller.motion, asked, options)
+        same = asked & (left <= options.diagnosis.explained * torch.where(solved, noise, 0.0) + options.diagnosis.exact)
         note(smaller.code, left / tracks.scale(), same, case=smaller.case, smaller=smaller.motion.name)
         explained = explained | same
-    judged = torch.where((explained | (doubt > UNKNOWN)) & solved, int(Status.AMBIGUOUS), int(Status.OK))
-    astray = torch.zeros_like(solved) if lifting is None else wild(tracks, scene, lifting)
+    judged = torch.where((explained | (doubt > options.diagnosis.unknown)) & solved, int(Status.AMBIGUOUS), int(Status.OK))
+    astray = torch.zeros_like(solved) if lifting is None else wild(tracks, scene, lifting, options)
     judged = torch.where(solved & ~explained & ((noise > NOISY) | astray), int(Status.NO_CONSENSUS), judged)
     status = torch.where((status == Status.OK) | (status == Status.AMBIGUOUS), judged, status)
-    note(ReconstructNotice.UNCERTAIN, doubt, solved & (doubt > UNCERTAIN) & doubt.isfinite())
+    note(ReconstructNotice.UNCERTAIN, doubt, solved & (doubt > options.diagnosis.uncertain) & doubt.isfinite())
     note(ReconstructNotice.UNCERTAIN, doubt, solved & doubt.isinf(), case="family")
-    note(ReconstructNotice.WEAK_STACK, stack, solved & ((stack < WEAK) | (noise > NOISE_OF_STACK * stack)))
+    note(
+        ReconstructNotice.WEAK_STACK,
+        stack,
+        solved & ((stack < options.diagnosis.weak_stack) | (noise > options.diagnosis.noisy_stack * stack)),
+    )
     _observations(tracks, motion, status, note)
-    _images(tracks, scene, lifting, noise, solved, note)
+    _images(tracks, scene, lifting, noise, solved, note, options)
     if lifting is None:
-        status = _bodies(scene, status, noise, solved, note)
+        status = _bodies(scene, status, noise, solved, note, options)
     return status, in_order(found)
 
 
-def conditions(tracks: ViewTracks, scene: LiftedState, lifting: Lifting | None, noise: Tensor) -> tuple[Tensor, Tensor]:
+def conditions(
+    tracks: ViewTracks, scene: LiftedState, lifting: Lifting | None, noise: Tensor, options: ReconstructOptions
+) -> tuple[Tensor, Tensor]:
     """Least singular value of the stacked projections over the largest, in coordinates in which the points fill the space, and the
     median expected error of the points over the size of the scene, ``(b,)`` each.
 
@@ -274,8 +271,8 @@ def conditions(tracks: ViewTracks, scene: LiftedState, lifting: Lifting | None, 
         lifts = torch.linalg.solve_triangular(axes[:, None], lifting.lifts @ spread[:, None], upper=False)
         depth, metric = (below @ spread)[:, None], spread
         gauge, extent = len(lifting.algebra) - 1, _extent(scene.structure.nan_to_num(), below, known)
-    step = -(-known.shape[-1] // ASKED)
-    found = point_uncertainty(cameras, points, lifts, depth, tracks.weights, gauge, metric, step)
+    step = -(-known.shape[-1] // options.diagnosis.asked)
+    found = point_uncertainty(cameras, points, lifts, depth, tracks.weights, gauge, metric, step, options=options)
     middle = torch.where(known[:, ::step], found, torch.nan).nanmedian(-1).values
     return stack, (middle * noise / extent).nan_to_num(nan=torch.inf, posinf=torch.inf)
 
@@ -288,15 +285,17 @@ def _extent(structure: Tensor, depth: Tensor, known: Tensor) -> Tensor:
     return off.nanmedian(-1).values.nan_to_num().clamp(min=torch.finfo(off.dtype).tiny)
 
 
-def least_squares(tracks: ViewTracks, motion: Motion) -> tuple[Tensor, Tensor]:
+def least_squares(tracks: ViewTracks, motion: Motion, options: ReconstructOptions) -> tuple[Tensor, Tensor]:
     """Reprojection distances ``(b, views, n)`` of a model fitted to all observations, in the unit of the tracks, and its status."""
     size = min(motion.views(tracks.times), motion.k + 1)
-    found = projections_of_tracks(tracks, motion.tensor(size))
+    found = projections_of_tracks(tracks, motion.tensor(size), options=options)
     if motion.lift is None:
-        scene = bodies_of(tracks, LiftedState(found.projections, found.structure, torch.zeros_like(tracks.x[:, 0, 0, 0])))[-1]
+        scene = bodies_of(tracks, LiftedState(found.projections, found.structure, torch.zeros_like(tracks.x[:, 0, 0, 0])), options)[
+            -1
+        ]
         return distances(tracks, scene.cameras, scene.structure), found.status
-    lifting = Lifting.of(motion, tracks.times, tracks.x)
-    scene = scene_of(tracks, found, lifting)
+    lifting = Lifting.of(motion, tracks.times, tracks.x, options)
+    scene = scene_of(tracks, found, lifting, options=options)
     return distances(tracks, scene.cameras @ lifting.lifts, scene.structure), found.status
 
 
@@ -317,7 +316,7 @@ def unknowns(tracks: ViewTracks, motion: Motion) -> Tensor:
     return free if tracks.static is None or motion.lift is None else torch.where(tracks.static, motion.dim, free)
 
 
-def _noise_of(tracks: ViewTracks, motion: Motion, asked: Tensor) -> Tensor:
+def _noise_of(tracks: ViewTracks, motion: Motion, asked: Tensor, options: ReconstructOptions) -> Tensor:
     """Noise ``(b,)`` in normalized images that another model leaves; infinite where it was not asked for, or has no result."""
     left = torch.full_like(tracks.x[:, 0, 0, 0], torch.inf)
     chosen = asked.nonzero()[:, 0]
@@ -326,7 +325,7 @@ def _noise_of(tracks: ViewTracks, motion: Motion, asked: Tensor) -> Tensor:
     if not len(chosen) or need > views or n < motion.tensor(min(need, motion.k + 1)).minimal():
         return left
     some = tracks.subset(chosen)
-    apart, status = least_squares(some, motion)
+    apart, status = least_squares(some, motion, options)
     counted = apart.isfinite()
     mean = (apart.square().nansum((1, 2)) / spare(some, counted, motion).clamp(min=1)).sqrt() * some.scale()
     # a model that loses points explains nothing
@@ -353,27 +352,35 @@ def _through(tracks: ViewTracks, motion: Motion) -> tuple[Tensor, int]:
     return ((tracks.weights > 0).sum(1) >= size).sum(-1), size
 
 
-def _images(tracks: ViewTracks, scene: LiftedState, lifting: Lifting | None, noise: Tensor, solved: Tensor, note: Note) -> None:
+def _images(
+    tracks: ViewTracks,
+    scene: LiftedState,
+    lifting: Lifting | None,
+    noise: Tensor,
+    solved: Tensor,
+    note: Note,
+    options: ReconstructOptions,
+) -> None:
     """Notices on images on a line, and on points behind the cameras."""
     seen = (tracks.weights > 0).to(tracks.x.dtype)
     number = seen.sum(-1).clamp(min=1)[..., None]
     off = (tracks.x - (seen[..., None] * tracks.x).sum(2, keepdim=True) / number[..., None]) * seen[..., None]
     across = eigenvalues(off.mT @ off / number[..., None])[..., -2].clamp(min=0).sqrt()
     across = torch.where(seen.sum(-1) > 2, across, torch.inf).amin(1)
-    thin = across / noise.nan_to_num(posinf=0.0).clamp(min=EXACT)
-    note(ReconstructNotice.COLLINEAR, thin, thin < THIN)
+    thin = across / noise.nan_to_num(posinf=0.0).clamp(min=options.diagnosis.exact)
+    note(ReconstructNotice.COLLINEAR, thin, thin < options.diagnosis.thin)
     if lifting is None or tracks.x.shape[-1] != 2:
         return
     count = behind(scene.cameras, scene.structure, lifting.lifts, tracks.weights).sum(-1)
     note(ReconstructNotice.BEHIND, count, solved & (count > 0))
 
 
-def _bodies(scene: LiftedState, status: Tensor, noise: Tensor, solved: Tensor, note: Note) -> Tensor:
+def _bodies(scene: LiftedState, status: Tensor, noise: Tensor, solved: Tensor, note: Note, options: ReconstructOptions) -> Tensor:
     """The status where a body has too few points for its hyperplane, and a notice."""
     known = (scene.structure != 0).any(-1) & solved[:, None]
     pair = hyperplane_pair(scene.structure, known.to(scene.structure.dtype))
     least, size = torch.stack([(pair.labels == body).sum(-1) for body in (1, 2)]).amin(0), scene.structure.shape[-1]
     # a hyperplane of noisy points takes the nearest one of the others in
-    few = solved & (least < size - 1 + (noise > EXACT))
+    few = solved & (least < size - 1 + (noise > options.diagnosis.exact))
     note(ReconstructNotice.ONE_BODY, least, few, case="few", needed=size - 1)
     return torch.where(few & (status == Status.OK), int(Status.AMBIGUOUS), status)

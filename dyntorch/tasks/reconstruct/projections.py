@@ -16,15 +16,7 @@ from dyntorch.core.refine import constrain_matches
 from dyntorch.geometry.bundle import bundle_adjust
 from dyntorch.geometry.triangulation import reproject, resect, triangulate
 from dyntorch.invariants.grassmann_tensor import GrassmannTensor
-
-SUBSETS = 6
-"""Choices of views for the tensor, where there are more than it takes; the one of least error in all views wins."""
-LOOKED_AT = 60
-"""Choices of which the most seen and best spread ones are taken."""
-ALGEBRAIC, FREE, ROUGH = 3, 3, 1e-2
-"""At most so many steps of the constrained fit and of free bundle adjustment, which ends where a step gains less than this share:
-they start the structured one.  Of 20 scenes of constant velocity, 4 views of 60 points at 0.5 px, 18 reach its minimum that way in
-7 ms each, and 18 in 31 ms with 30 steps, 10 steps and 1e-9; below P^6 all do."""
+from dyntorch.tasks.reconstruct.options import ReconstructOptions
 
 
 @dataclass(frozen=True)
@@ -98,27 +90,29 @@ def camera_unknowns(views: int, rows: int, columns: int, gauge: int | None = Non
     return views * (rows * columns - 1) - (columns**2 - 1 if gauge is None else gauge)
 
 
-def choices(tracks: ViewTracks, size: int) -> Tensor:
+def choices(tracks: ViewTracks, size: int, options: ReconstructOptions) -> Tensor:
     """Indices ``(b, s, size)`` of views for the tensor: seen by many points in common, spread over the time."""
     views = tracks.weights.shape[1]
     device = tracks.x.device
-    if comb(views, size) <= LOOKED_AT:
-        options = torch.tensor(list(combinations(range(views), size)), device=device)
+    if comb(views, size) <= options.projections.looked_at:
+        choices = torch.tensor(list(combinations(range(views), size)), device=device)
     else:
-        draw = torch.rand(LOOKED_AT, views, generator=torch.Generator().manual_seed(0))
-        options = draw.argsort(-1)[:, :size].sort(-1).values.to(device)
+        draw = torch.rand(options.projections.looked_at, views, generator=torch.Generator().manual_seed(0))
+        choices = draw.argsort(-1)[:, :size].sort(-1).values.to(device)
         even = torch.linspace(0, views - 1, size).round().long().to(device)
-        options = torch.cat([even[None], options]).unique(dim=0)
-    seen = (tracks.weights > 0).to(tracks.x.dtype)[:, options].prod(2).sum(-1)  # (b, options)
+        choices = torch.cat([even[None], choices]).unique(dim=0)
+    seen = (tracks.weights > 0).to(tracks.x.dtype)[:, choices].prod(2).sum(-1)  # (b, choices)
     span = (tracks.times.amax() - tracks.times.amin()).clamp(min=torch.finfo(tracks.x.dtype).tiny)
-    ordered = (tracks.times.to(device)[options].sort(-1).values / span).to(tracks.x)
+    ordered = (tracks.times.to(device)[choices].sort(-1).values / span).to(tracks.x)
     gap = ordered.diff(dim=-1).amin(-1) * (size - 1)
     score = seen * gap.clamp(min=1e-6).sqrt()
-    best = score.topk(min(SUBSETS, len(options)), dim=-1).indices
-    return options[best]
+    best = score.topk(min(options.projections.subsets, len(choices)), dim=-1).indices
+    return choices[best]
 
 
-def projections_of_tracks(tracks: ViewTracks, invariant: GrassmannTensor, subsets: Tensor | None = None) -> Projections:
+def projections_of_tracks(
+    tracks: ViewTracks, invariant: GrassmannTensor, subsets: Tensor | None = None, *, options: ReconstructOptions
+) -> Projections:
     """Linear, constrained, resected, adjusted: the best of several choices of views.
 
     Args:
@@ -127,10 +121,10 @@ def projections_of_tracks(tracks: ViewTracks, invariant: GrassmannTensor, subset
         subsets: ``(b, s, size)`` choices of views; None: those of :func:`choices`.
     """
     size = len(invariant.profile)
-    subsets = choices(tracks, size) if subsets is None else subsets
+    subsets = choices(tracks, size, options) if subsets is None else subsets
     b, count, _ = subsets.shape
     many = tracks.repeated(count)
-    found = _from_subset(many, invariant, subsets.flatten(0, 1))
+    found = _from_subset(many, invariant, subsets.flatten(0, 1), options)
     if count == 1:
         return found
     error = mean_error(many, found).nan_to_num(nan=torch.inf)
@@ -149,7 +143,7 @@ def mean_error(tracks: ViewTracks, found: Projections) -> Tensor:
     return (torch.where(known, error, 0.0) + missed).flatten(1).sum(-1) / (tracks.weights > 0).flatten(1).sum(-1).clamp(min=1)
 
 
-def _from_subset(tracks: ViewTracks, invariant: GrassmannTensor, chosen: Tensor) -> Projections:
+def _from_subset(tracks: ViewTracks, invariant: GrassmannTensor, chosen: Tensor, options: ReconstructOptions) -> Projections:
     """From one choice of views ``(b, size)`` each."""
     b, views, n, dim = tracks.x.shape
     x = tracks.x.gather(1, chosen[..., None, None].expand(-1, -1, n, dim))
@@ -157,24 +151,31 @@ def _from_subset(tracks: ViewTracks, invariant: GrassmannTensor, chosen: Tensor)
     parts = x.unbind(1)
     data = Matches(tuple(parts), seen.all(1).to(x.dtype), None, (b,), x.dtype, x.device)
     linear = fit_matches(invariant, data)
-    some = torch.stack(constrain_matches(linear, data, ALGEBRAIC).motion, dim=1)  # (b, size, l + 1, K)
+    some = torch.stack(constrain_matches(linear, data, options.projections.constrained_steps).motion, dim=1)  # (b, size, l + 1, K)
     status = linear.status
     structure = triangulate(some, x, seen.to(x.dtype))
     if views > len(invariant.profile):
         whole = resect(structure, tracks.x, tracks.weights)
         whole = whole.scatter(1, chosen[..., None, None].expand(-1, -1, *some.shape[2:]), some)
-        whole, structure = _grown(tracks, whole)
+        whole, structure = _grown(tracks, whole, options)
         lost = _unknown(tracks, whole).any(-1)
         status = torch.where(lost & (status == Status.OK), int(Status.DEGENERATE), status)
     else:
         order = chosen.argsort(1)
         whole = some.gather(1, order[..., None, None].expand_as(some))
-    adjusted = bundle_adjust(tracks.x, tracks.weights, whole, structure, iterations=FREE, tolerance=ROUGH)
+    adjusted = bundle_adjust(
+        tracks.x,
+        tracks.weights,
+        whole,
+        structure,
+        iterations=options.projections.free_steps,
+        tolerance=options.projections.free_tolerance,
+    )
     bad = failed(status)[:, None, None]
     return Projections(torch.where(bad[..., None], 0.0, adjusted.cameras), torch.where(bad, 0.0, adjusted.structure), status)
 
 
-def _grown(tracks: ViewTracks, whole: Tensor) -> tuple[Tensor, Tensor]:
+def _grown(tracks: ViewTracks, whole: Tensor, options: ReconstructOptions) -> tuple[Tensor, Tensor]:
     """All views and points from some of them, in turns: tracks shorter than the recording lead from views to their neighbours.
 
     Args:
@@ -188,7 +189,14 @@ def _grown(tracks: ViewTracks, whole: Tensor) -> tuple[Tensor, Tensor]:
         some, before = tracks.subset(left), missing[left]
         # drift is adjusted away before it is built upon
         seen = _seen(some, whole[left])
-        done = bundle_adjust(some.x, seen, whole[left], structure[left], iterations=FREE, tolerance=ROUGH)
+        done = bundle_adjust(
+            some.x,
+            seen,
+            whole[left],
+            structure[left],
+            iterations=options.projections.free_steps,
+            tolerance=options.projections.free_tolerance,
+        )
         more = torch.where(before[..., None, None], resect(done.structure, some.x, some.weights), done.cameras)
         whole = whole.index_copy(0, left, more)
         structure = structure.index_copy(0, left, triangulate(more, some.x, _seen(some, more)))

@@ -12,19 +12,13 @@ from torch import Tensor
 from dyntorch.core.normalize import hartley
 from dyntorch.core.outcome import failed, in_order, noting
 from dyntorch.geometry.triangulation import observed
-from dyntorch.numerics.arguments import on_cpu
+from dyntorch.numerics.arguments import check_options, on_cpu
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.tasks.reconstruct.motions import Motion, as_motion
+from dyntorch.tasks.reconstruct.options import ReconstructOptions
 from dyntorch.tasks.reconstruct.projections import ViewTracks
 from dyntorch.tasks.reconstruct.result import Reconstruction, ReconstructNotice
 from dyntorch.tasks.reconstruct.solver import choose, least, solve
-
-ROUNDED = 1e-3
-"""Rounding of the times over the spacing of the views that is too much."""
-FRAME = 1 / 16
-"""Rounding below which whole numbers are frames, exact, rather than rounded."""
-FAR = (1e4, 1e9)
-"""Distance of the times from 0 over their span from which the points at time 0 are noise: float32 tracks, float64."""
 
 
 @one_thread
@@ -38,6 +32,7 @@ def reconstruct(
     threshold: float | None = None,
     weights: Tensor | None = None,
     generator: torch.Generator | None = None,
+    options: ReconstructOptions = ReconstructOptions(),
 ) -> Reconstruction:
     r"""Cameras, points and velocities from tracks of moving points, seen by moving, uncalibrated cameras.
 
@@ -76,6 +71,7 @@ def reconstruct(
             tracks; infinity declares that there are no outliers.
         weights: ``(*batch, views, n)`` not negative; 0 leaves an observation out.
         generator: source of the random samples of the robust estimate.
+        options: every number that decides, by stage; ``dataclasses.replace`` changes some of them.
 
     Returns:
         A :class:`~dyntorch.tasks.reconstruct.result.Reconstruction`: ``cameras (*batch, views, 3, d + 1)``,
@@ -101,21 +97,22 @@ def reconstruct(
         (True, True)
     """
     model = None if motion == "auto" else as_motion(motion)
+    check_options(options, ReconstructOptions)
     if generator is not None and not isinstance(generator, torch.Generator):
         raise ValueError(f"generator must be a torch.Generator or None, got {generator!r}; use torch.Generator().manual_seed(...)")
     moment, x, w, batch = _checked(tracks, times, weights)
     if model is None or _moves(model):
-        _resolved(moment, times, tracks.dtype)
+        _resolved(moment, times, tracks.dtype, options)
     label = _static(static, batch, x)
     limit = _limit(threshold)
     with torch.no_grad():
         if model is None:
-            found = choose(normalized(x, w, moment), label, limit, generator, batch)
+            found = choose(normalized(x, w, moment), label, limit, generator, batch, options)
         else:
             _enough(model, moment, x)
             used = (w > 0).sum(-1) >= _resection(model)
             data = normalized(x, w * used[..., None], moment)
-            found = _noted(solve(data, model, label, limit, generator, batch), label, used)
+            found = _noted(solve(data, model, label, limit, generator, batch, options), label, used)
     return _returned(found, tracks)
 
 
@@ -155,7 +152,7 @@ def _times(times: Tensor | Sequence[float] | None, views: int, n: int) -> Tensor
     return moment.double()
 
 
-def _resolved(moment: Tensor, times: Tensor | Sequence[float] | None, dtype: torch.dtype) -> None:
+def _resolved(moment: Tensor, times: Tensor | Sequence[float] | None, dtype: torch.dtype, options: ReconstructOptions) -> None:
     """Refuse times that were rounded before they came here, and those so far from 0 that the points at time 0 would be noise."""
     if not len(moment):
         return
@@ -164,14 +161,14 @@ def _resolved(moment: Tensor, times: Tensor | Sequence[float] | None, dtype: tor
     if kind.is_floating_point and kind != torch.float64:
         rounding = torch.finfo(kind).eps / 2 * furthest
         spacing = float(different.diff().median()) if len(different) > 1 else 1.0
-        frames = bool((moment == moment.round()).all()) and rounding < FRAME
-        if rounding > ROUNDED * spacing and not frames:
+        frames = bool((moment == moment.round()).all()) and rounding < options.times.frame
+        if rounding > options.times.rounded * spacing and not frames:
             raise ValueError(
                 f"times of {kind} near {furthest:g} are rounded by up to {rounding:.2g}, for views {spacing:.2g} apart; "
                 "give them as float64 (.double() before anything is added), or count them from the first view"
             )
     span = float(different[-1] - different[0])
-    far = FAR[dtype == torch.float64]
+    far = options.times.far[dtype == torch.float64]
     if span and furthest > far * span:
         raise ValueError(
             f"times reach {furthest:g}, {furthest / span:.2g} times what they span: in {dtype} the points at time 0 would be noise "

@@ -18,6 +18,7 @@ from dyntorch.geometry.triangulation import reproject, resect, triangulate
 from dyntorch.invariants.grassmann_tensor import GrassmannTensor
 from dyntorch.numerics.blocks import uniform
 from dyntorch.numerics.chi_square import quantile
+from dyntorch.tasks.reconstruct.options import ReconstructOptions
 from dyntorch.tasks.reconstruct.projections import Projections, ViewTracks, camera_unknowns, choices
 from dyntorch.tasks.reconstruct.scene import LiftedState, Lifting, adjusted, distances, scene_of
 
@@ -25,27 +26,15 @@ from dyntorch.tasks.reconstruct.scene import LiftedState, Lifting, adjusted, dis
 # Which observations agree with given projections: per point all of its views, or all but the fewest that spoil it.
 
 
-SHARE = 0.997
-"""Of the inliers that agree: what three standard deviations are for one coordinate."""
-SPARE = 2
-"""Equations that must remain to confirm a point that has lost a view: with fewer, wrong ones confirm each other."""
-STEPS = 2
-"""Of triangulation."""
 FAR = 1e30
 """Squared distance in place of one that is no number."""
-WIDE, SETTLING = 1.5, 4
-"""Times the threshold up to which distances count when the noise is estimated, and how often that is repeated."""
-SMALL = 2.0
-"""Largest correction of the variance for the degrees of freedom of the projections."""
-EXACT = 1e-8
-"""Least noise, as part of the image."""
 PAIRS = 1 << 14
 """Points that are looked at together with one view left out."""
 
 
-def distance(tracks: ViewTracks, projections: Tensor) -> Tensor:
+def distance(tracks: ViewTracks, projections: Tensor, options: ReconstructOptions) -> Tensor:
     """Squared reprojection error of every point over its views, ``(b, n)``, measured units; :data:`FAR` where there is none."""
-    structure = triangulate(projections, tracks.x, tracks.weights, steps=STEPS)
+    structure = triangulate(projections, tracks.x, tracks.weights, steps=options.noise.triangulation_steps)
     error = (tracks.x - reproject(projections, structure)).square().sum(-1) / tracks.scales.square()[..., None]
     total = torch.where(tracks.weights > 0, error, 0.0).sum(1)
     return torch.where((structure != 0).any(-1), total, FAR).nan_to_num(nan=FAR, posinf=FAR).clamp(max=FAR)
@@ -56,7 +45,7 @@ def freedom(tracks: ViewTracks, k: int) -> Tensor:
     return ((tracks.weights > 0).sum(1) * tracks.x.shape[-1] - k).clamp(min=0)
 
 
-def bound(free: Tensor, share: float = SHARE) -> Tensor:
+def bound(free: Tensor, share: float) -> Tensor:
     """The squared distance, in standard deviations, that so many of the inliers keep; 0 where nothing is left to judge by."""
     top = int(free.max()) if free.numel() else 0
     return torch.tensor(_bounds(top, share), dtype=torch.float64, device=free.device)[free]
@@ -85,7 +74,9 @@ def noise(square: Tensor, free: Tensor, chosen: Tensor, part: float = 0.5) -> Te
     return torch.where(number[:, 0] > 0, found, 0.0).sqrt()
 
 
-def settled_noise(tracks: ViewTracks, square: Tensor, free: Tensor, chosen: Tensor, used: int, part: float = 0.5) -> Tensor:
+def settled_noise(
+    tracks: ViewTracks, square: Tensor, free: Tensor, chosen: Tensor, used: int, part: float = 0.5, *, options: ReconstructOptions
+) -> Tensor:
     """Noise ``(b,)`` of one coordinate from a quantile of the chosen points, then the median of those within its threshold.
 
     Args:
@@ -96,17 +87,17 @@ def settled_noise(tracks: ViewTracks, square: Tensor, free: Tensor, chosen: Tens
         used: degrees of freedom of the projections, fitted to these points.
         part: the first quantile.
     """
-    least = EXACT / tracks.scales.amin(1)
+    least = options.noise.least / tracks.scales.amin(1)
     level = torch.maximum(noise(square, free, chosen, part), least)
-    for _ in range(SETTLING):
-        inside = chosen & (square <= (WIDE * level).square()[:, None] * bound(free))
+    for _ in range(options.noise.rounds):
+        inside = chosen & (square <= (options.noise.wide * level).square()[:, None] * bound(free, options.noise.share))
         rows = (free * inside).sum(-1)
         small = rows / (rows - used).clamp(min=1)
-        level = torch.maximum(noise(square, free, inside) * small.clamp(min=1, max=SMALL).sqrt(), least)
+        level = torch.maximum(noise(square, free, inside) * small.clamp(min=1, max=options.noise.correction).sqrt(), least)
     return level
 
 
-def agreeing(tracks: ViewTracks, projections: Tensor, sigma: Tensor) -> Tensor:
+def agreeing(tracks: ViewTracks, projections: Tensor, sigma: Tensor, options: ReconstructOptions) -> Tensor:
     r"""Weights ``(b, views, n)``, 0 for all observations that do not agree with the projections.
 
     A point agrees where its squared distance is below the quantile of :math:`\sigma^2 \chi^2`.  Of one that does not, the view
@@ -119,16 +110,18 @@ def agreeing(tracks: ViewTracks, projections: Tensor, sigma: Tensor) -> Tensor:
     """
     k, size = projections.shape[-1] - 1, tracks.x.shape[-1]
     free = freedom(tracks, k)
-    agrees = (distance(tracks, projections) <= sigma.square()[:, None] * bound(free)) & (free >= 1)
+    agrees = (distance(tracks, projections, options) <= sigma.square()[:, None] * bound(free, options.noise.share)) & (free >= 1)
     kept = tracks.weights * agrees[:, None]
-    rest = (~agrees & (free - size >= SPARE)).nonzero()
+    rest = (~agrees & (free - size >= options.noise.spare)).nonzero()
     for some in rest.split(PAIRS):
         problem, point = some.unbind(-1)
-        kept[problem, :, point] = _without(tracks, projections, sigma, problem, point)
+        kept[problem, :, point] = _without(tracks, projections, sigma, problem, point, options)
     return kept
 
 
-def _without(tracks: ViewTracks, projections: Tensor, sigma: Tensor, problem: Tensor, point: Tensor) -> Tensor:
+def _without(
+    tracks: ViewTracks, projections: Tensor, sigma: Tensor, problem: Tensor, point: Tensor, options: ReconstructOptions
+) -> Tensor:
     """Weights ``(p, views)`` of single points, without the views that spoil them; all 0 where no views agree."""
     alone = ViewTracks(
         tracks.x[problem, :, point][:, :, None],
@@ -145,46 +138,19 @@ def _without(tracks: ViewTracks, projections: Tensor, sigma: Tensor, problem: Te
     while len(left):
         seen = alone.weights[:, :, 0] > 0
         fewer = alone.repeated(views).only((alone.weights[:, None] * others[:, :, None]).flatten(0, 1))
-        square = distance(fewer, matrices.repeat_interleave(views, dim=0)).unflatten(0, (-1, views))[..., 0]
+        square = distance(fewer, matrices.repeat_interleave(views, dim=0), options).unflatten(0, (-1, views))[..., 0]
         least, worst = square.masked_fill(~seen, torch.inf).min(-1)
         alone = alone.only(alone.weights * others[worst][:, :, None])
         free = freedom(alone, k)[:, 0]
-        agrees = least <= limit * bound(free)
+        agrees = least <= limit * bound(free, options.noise.share)
         result[left[agrees]] = alone.weights[agrees][..., 0]
-        on = (~agrees & (free - size >= SPARE)).nonzero()[:, 0]
+        on = (~agrees & (free - size >= options.noise.spare)).nonzero()[:, 0]
         left, alone, matrices, limit = left[on], alone.subset(on), matrices[on], limit[on]
     return result
 
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Tracks of which many are wrong: projections on whose points the most agree, by concentration from many starts.
-
-
-SHARES = (0.5, 0.6, 0.7, 0.8)
-"""Parts of the points that the starts keep: the smaller the fewer outliers, the larger the better the fit to them."""
-DRAWN = 0.5
-"""Of that part, what a start is drawn of."""
-LEAST, DRAWN_LEAST = 1.3, 1.15
-"""Times the minimal number, at least."""
-CONCENTRATED = 3
-"""Fits per start, each to the points nearest to the one before."""
-ROUNDS = 12
-"""Of starts, at most."""
-FREE = 10
-"""Steps of bundle adjustment per fit: what makes the distances tell the outliers (without it half of them stay)."""
-DOUBT = 0.15
-"""Points one to three thresholds away, per inlier, above which the search goes on: a wrong model has many."""
-MAJORITY = 0.4
-"""Inliers among the points, at least: more than half of them found 60 to 70 % outliers right in 3 of 28 scenes, wrong in 2."""
-REDUNDANT = 1.25
-"""Conditions of the inliers over the degrees of freedom of the projections, at least."""
-CONFIRMED, BETTER, SURE = 3, 0.97, 4.0
-"""Rounds without a better find after which the search ends where a find does not speak for itself: where the noise is not known,
-or the points give fewer conditions than so many times the degrees of freedom.  Few points agree with wrong projections, too."""
-TRIED, HOPELESS = 4, 0.3
-"""Rounds after which a search ends whose best find leaves so much noise, over the extent of the images: no start came near.
-Random and shuffled tracks leave 0.45 to 0.7 then (120 points in 6 views, 6 models), scenes with 40 and 50 % wrong tracks that end
-well 0.17 at most."""
 
 
 @dataclass(frozen=True)
@@ -208,7 +174,11 @@ class Consensus:
 
 
 def consensus(
-    tracks: ViewTracks, invariant: GrassmannTensor, sigma: Tensor | None, generator: torch.Generator | None
+    tracks: ViewTracks,
+    invariant: GrassmannTensor,
+    sigma: Tensor | None,
+    generator: torch.Generator | None,
+    options: ReconstructOptions,
 ) -> tuple[Consensus, Tensor, Tensor]:
     r"""Projections of the tensor's views on whose points the most agree.
 
@@ -228,23 +198,26 @@ def consensus(
     Source: Rousseeuw and van Driessen 2006 (concentration steps of least trimmed squares); Chum, Matas and Kittler 2003
         (starts from the inliers so far).
     """
-    options = choices(tracks, len(invariant.profile))
-    search = _Search(invariant, sigma, generator)
+    subsets = choices(tracks, len(invariant.profile), options)
+    search = _Search(invariant, sigma, generator, options=options)
     everyone = torch.arange(len(tracks.x), device=tracks.x.device)
     first = torch.ones_like(tracks.weights[:, :1])
     stale = torch.zeros_like(everyone)
-    best, ranks = search.run(tracks, options[:, 0], first, (SHARES[0],), sigma)
-    for turn in range(1, ROUNDS):
+    best, ranks = search.run(tracks, subsets[:, 0], first, (options.starts.shares[0],), sigma)
+    for turn in range(1, options.starts.rounds):
         level, doubt = search.judged(tracks, best)
-        hopeless = (best.square < FAR).any(-1) & (level * tracks.scales.amax(1) > HOPELESS)
-        left = everyone[(doubt | (search.weak(tracks, best) & (stale < CONFIRMED))) & ~(hopeless & (turn >= TRIED))]
+        hopeless = (best.square < FAR).any(-1) & (level * tracks.scales.amax(1) > options.starts.hopeless)
+        left = everyone[
+            (doubt | (search.weak(tracks, best) & (stale < options.starts.confirmed)))
+            & ~(hopeless & (turn >= options.starts.tried))
+        ]
         if not len(left):
             break
-        views = options[left, turn % options.shape[1]]
+        views = subsets[left, turn % subsets.shape[1]]
         some = tracks.subset(left)
         starts = search.starts(some, views, best.square[left], ranks[left])
-        new, rank = search.run(some, views, starts, SHARES, None if sigma is None else sigma[left])
-        stale[left] = torch.where(new.lost < BETTER * best.lost[left], 0, stale[left] + 1)
+        new, rank = search.run(some, views, starts, options.starts.shares, None if sigma is None else sigma[left])
+        stale[left] = torch.where(new.lost < options.starts.better * best.lost[left], 0, stale[left] + 1)
         best.better(new, left)
         ranks[left] += rank
     return best, *search.judged(tracks, best)
@@ -255,6 +228,7 @@ class _Search:
     invariant: GrassmannTensor
     sigma: Tensor | None
     generator: torch.Generator | None
+    options: ReconstructOptions
 
     def run(
         self, tracks: ViewTracks, views: Tensor, starts: Tensor, shares: tuple[float, ...], sigma: Tensor | None
@@ -265,14 +239,16 @@ class _Search:
         level = None if sigma is None else sigma.repeat_interleave(count)
         share = torch.tensor(shares, dtype=tracks.x.dtype, device=tracks.x.device).repeat(len(views))
         kept, best = starts.flatten(0, 1), None
-        for _ in range(CONCENTRATED):
+        for _ in range(self.options.starts.concentrations):
             new = self._fitted(work, kept, level)
             if best is None:
                 best = new
             else:
                 best.better(new, torch.arange(len(kept), device=kept.device))
-            near = _nearest(new.square, _wanted(work, share, self.invariant.minimal(), LEAST))
-            cut = self._level(work, new.square, level).square() * bound(freedom(work, self.invariant.k)).amax(-1)
+            near = _nearest(new.square, _wanted(work, share, self.invariant.minimal(), self.options.starts.least_kept))
+            cut = self._level(work, new.square, level).square() * bound(
+                freedom(work, self.invariant.k), self.options.noise.share
+            ).amax(-1)
             kept = (near | (new.square <= cut[:, None])).to(kept.dtype)
         assert best is not None
         rank = best.square.argsort(-1).argsort(-1).to(kept.dtype).unflatten(0, (-1, count)).mean(1)
@@ -281,14 +257,14 @@ class _Search:
 
     def starts(self, tracks: ViewTracks, views: Tensor, square: Tensor, ranks: Tensor) -> Tensor:
         """Random parts ``(b, s, n)`` of the points near the best projections so far, or in the mean of all."""
-        count, minimal = len(SHARES), self.invariant.minimal()
+        count, minimal = len(self.options.starts.shares), self.invariant.minimal()
         work = _of_views(tracks, views).repeated(count)
-        share = torch.tensor(SHARES, dtype=tracks.x.dtype, device=tracks.x.device).repeat(len(views))
-        wanted = _wanted(work, share, minimal, LEAST)
-        drawn = _wanted(work, DRAWN * share, minimal, DRAWN_LEAST)
+        share = torch.tensor(self.options.starts.shares, dtype=tracks.x.dtype, device=tracks.x.device).repeat(len(views))
+        wanted = _wanted(work, share, minimal, self.options.starts.least_kept)
+        drawn = _wanted(work, self.options.starts.drawn * share, minimal, self.options.starts.least_drawn)
         order = torch.stack([square, ranks], dim=1).repeat(1, -(-count // 2), 1)[:, :count].flatten(0, 1)
         seen = (work.weights > 0).all(1)
-        pool = _nearest(order.masked_fill(~seen, torch.inf), torch.maximum(wanted, (LEAST * drawn).long()))
+        pool = _nearest(order.masked_fill(~seen, torch.inf), torch.maximum(wanted, (self.options.starts.least_kept * drawn).long()))
         number = uniform(*order.shape, generator=self.generator, device=order.device)
         chosen = _nearest(number.masked_fill(~(pool & seen), torch.inf), drawn).to(square.dtype)
         return chosen.view(-1, count, chosen.shape[-1])
@@ -297,12 +273,12 @@ class _Search:
         """Noise and doubt ``(b,)``."""
         work = _of_views(tracks, found.chosen)
         level = self._level(work, found.square, self.sigma)
-        return level, doubtful(work, found.square, level, self.invariant)
+        return level, doubtful(work, found.square, level, self.invariant, self.options)
 
     def weak(self, tracks: ViewTracks, found: Consensus) -> Tensor:
         """Where only the search for better ones tells whether projections ``(b,)`` are right."""
         seen = (_of_views(tracks, found.chosen).weights > 0).all(1).sum(-1)
-        few = seen * self.invariant.codim < SURE * self.invariant.dof
+        few = seen * self.invariant.codim < self.options.starts.sure * self.invariant.dof
         return few | torch.full_like(few, self.sigma is None)
 
     def _fitted(self, tracks: ViewTracks, kept: Tensor, sigma: Tensor | None) -> Consensus:
@@ -313,14 +289,16 @@ class _Search:
         linear = fit_matches(self.invariant, data)
         projections = torch.stack(constrain_matches(linear, data).motion, dim=1)
         structure = triangulate(projections, some.x, some.weights)
-        projections = bundle_adjust(some.x, some.weights, projections, structure, iterations=FREE).cameras
+        projections = bundle_adjust(
+            some.x, some.weights, projections, structure, iterations=self.options.starts.adjustment_steps
+        ).cameras
         whole = (tracks.weights > 0).all(1)
-        square = torch.where(whole, distance(tracks, projections), FAR)
+        square = torch.where(whole, distance(tracks, projections, self.options), FAR)
         free = freedom(tracks, self.invariant.k)
         if sigma is None:
             lost = noise(square, free, whole, _part(whole, self.invariant))
         else:
-            cut = sigma.square()[:, None] * bound(free).clamp(min=torch.finfo(square.dtype).tiny)
+            cut = sigma.square()[:, None] * bound(free, self.options.noise.share).clamp(min=torch.finfo(square.dtype).tiny)
             lost = torch.where(whole, (square / cut).clamp(max=1), 0.0).sum(-1) / whole.sum(-1).clamp(min=1)
         return Consensus(torch.empty_like(kept), projections, square, lost)
 
@@ -330,18 +308,20 @@ class _Search:
             return sigma
         free = freedom(tracks, self.invariant.k)
         chosen = (tracks.weights > 0).all(1)
-        return settled_noise(tracks, square, free, chosen, self.invariant.dof, _part(chosen, self.invariant))
+        return settled_noise(tracks, square, free, chosen, self.invariant.dof, _part(chosen, self.invariant), options=self.options)
 
 
-def doubtful(tracks: ViewTracks, square: Tensor, sigma: Tensor, invariant: GrassmannTensor) -> Tensor:
+def doubtful(tracks: ViewTracks, square: Tensor, sigma: Tensor, invariant: GrassmannTensor, options: ReconstructOptions) -> Tensor:
     """Whether projections ``(b,)`` may be wrong: few inliers, many points just outside, or noise as large as the scene."""
     free = freedom(tracks, invariant.k)
-    cut = sigma.square()[:, None] * bound(free)
+    cut = sigma.square()[:, None] * bound(free, options.noise.share)
     counted = (free >= 1) & (tracks.weights > 0).any(1)
     inside = (counted & (square <= cut)).sum(-1)
     near = (counted & (square > cut) & (square <= 9 * cut)).sum(-1)
-    few = (inside < MAJORITY * counted.sum(-1)) | (inside * invariant.codim < REDUNDANT * invariant.dof)
-    return few | (near > DOUBT * inside) | (sigma * tracks.scales.amax(1) > NOISY)
+    few = (inside < options.starts.majority * counted.sum(-1)) | (
+        inside * invariant.codim < options.starts.redundant * invariant.dof
+    )
+    return few | (near > options.starts.doubt * inside) | (sigma * tracks.scales.amax(1) > NOISY)
 
 
 def _part(chosen: Tensor, invariant: GrassmannTensor) -> float:
@@ -368,33 +348,9 @@ def _nearest(value: Tensor, count: Tensor) -> Tensor:
     return value.argsort(-1).argsort(-1) < count[:, None]
 
 
-ALARMS, RARE = 0.05, 1e-4
-"""Share of the problems without outliers that are suspected, those whose farthest point is farther than in the others: where few
-conditions are left for every unknown of the cameras, and where there are :data:`PLENTY`."""
-PLENTY = 6.0
-"""Conditions per unknown of the projections from which on one outlier cannot hide.  Of 200 scenes of constant velocity in a plane
-with one outlier among 30, 60 and 100 points the rare alarm misses 40, 3.5, 0.5 %, the other one 12, 0.5, 0 % (space, 60, 100 and
-200 points: 60, 28 and 8 %, 28, 8 and 0 %).  A false alarm costs the time of a robust search, fifty times that of a clean batch."""
-LOUD = 0.01
-"""Noise over the extent of the images from which on even residuals without extremes are looked into: where a fifth of the tracks
-are altogether wrong, least squares spreads the misfit over all."""
-TRUSTED = 0.7
-"""Share of the observations that agree from which on no more is asked: wrong ones may be spread over most of the tracks."""
-TRIMS, MOST = 2, 0.9
-"""Times that observations are taken from the least squares scene, and share of them that has to stay."""
-WRONG = 2.0
-"""Threshold of points said to stand still over that of the others, above which they move."""
-TOLERANT = 4
-"""Coordinates of a point beyond its unknowns that make an accidental agreement of most observations impossible."""
-WIDTHS = (6.0, 3.0, 1.5, 1.0, 1.0)
-"""Thresholds over the final one, while all views settle."""
-RESECTED = 10
-"""Reweightings of the views that the tensor does not see."""
-ADJUSTED = 10
-"""Steps of bundle adjustment after each choice of the observations."""
-
-
-def suspicious(tracks: ViewTracks, apart: Tensor, unknowns: Tensor | int, limit: float | None) -> Tensor:
+def suspicious(
+    tracks: ViewTracks, apart: Tensor, unknowns: Tensor | int, limit: float | None, options: ReconstructOptions
+) -> Tensor:
     """Which problems ``(b,)`` show outliers after least squares.
 
     Args:
@@ -403,18 +359,18 @@ def suspicious(tracks: ViewTracks, apart: Tensor, unknowns: Tensor | int, limit:
         unknowns: of every point, ``(b, n)`` or one number.
         limit: three standard deviations of the noise, None: judged by the residuals alone.
     """
-    square, free, sigma = _misfit(tracks, apart, unknowns, limit)
+    square, free, sigma = _misfit(tracks, apart, unknowns, limit, options)
     if not len(apart):
         return apart.new_zeros(0, dtype=torch.bool)
     size = int(torch.as_tensor(unknowns).max()) + 1
     used = camera_unknowns(tracks.x.shape[1], tracks.x.shape[-1] + 1, size)
-    plenty = size <= 5 and int(free.sum(-1).min()) >= PLENTY * used
-    share = (RARE if plenty else ALARMS) / max(1, apart.shape[-1])
-    loud = sigma * tracks.scales.amax(1) > LOUD
+    plenty = size <= 5 and int(free.sum(-1).min()) >= options.outliers.plenty * used
+    share = (options.outliers.rare_alarms if plenty else options.outliers.alarms) / max(1, apart.shape[-1])
+    loud = sigma * tracks.scales.amax(1) > options.outliers.loud
     return loud | (square > sigma.square()[:, None] * bound(free, 1 - share)).logical_and(free >= 1).any(-1)
 
 
-def unfounded(tracks: ViewTracks, apart: Tensor, unknowns: Tensor) -> Tensor:
+def unfounded(tracks: ViewTracks, apart: Tensor, unknowns: Tensor, options: ReconstructOptions) -> Tensor:
     """The points ``(b, n)`` said to stand still that fit by far the worst: they move.
 
     Args:
@@ -423,15 +379,17 @@ def unfounded(tracks: ViewTracks, apart: Tensor, unknowns: Tensor) -> Tensor:
         unknowns: of every point, ``(b, n)``.
     """
     assert tracks.static is not None
-    square, free, sigma = _misfit(tracks, apart, unknowns, None)
+    square, free, sigma = _misfit(tracks, apart, unknowns, None, options)
     excess = torch.where(
-        tracks.static, square / (sigma.square()[:, None] * bound(free)).clamp(min=torch.finfo(sigma.dtype).tiny), 0.0
+        tracks.static,
+        square / (sigma.square()[:, None] * bound(free, options.noise.share)).clamp(min=torch.finfo(sigma.dtype).tiny),
+        0.0,
     )
-    return (excess > WRONG**2) & (excess >= excess.amax(-1, keepdim=True) / 2)
+    return (excess > options.outliers.wrong**2) & (excess >= excess.amax(-1, keepdim=True) / 2)
 
 
 def trimmed(
-    tracks: ViewTracks, scene: LiftedState, lifting: Lifting, unknowns: Tensor, limit: float | None
+    tracks: ViewTracks, scene: LiftedState, lifting: Lifting, unknowns: Tensor, limit: float | None, options: ReconstructOptions
 ) -> tuple[LiftedState, ViewTracks, Tensor]:
     """The least squares scene after the few observations that disagree with it are taken away, the tracks without them, and whether
     ``(b,)`` that is all there was to do: one wrong track in many does not need a search.
@@ -444,21 +402,23 @@ def trimmed(
         limit: three standard deviations of the noise, None: judged by the residuals alone.
     """
     fewer = tracks
-    for _ in range(TRIMS):
+    for _ in range(options.outliers.trims):
         projections = scene.cameras @ lifting.lifts
-        _, _, sigma = _misfit(fewer, distances(fewer, projections, scene.structure), unknowns, limit)
-        fewer = tracks.only(agreeing(tracks, projections, sigma))
+        _, _, sigma = _misfit(fewer, distances(fewer, projections, scene.structure), unknowns, limit, options)
+        fewer = tracks.only(agreeing(tracks, projections, sigma, options))
         structure = triangulate(projections, fewer.x, fewer.weights, steps=2)
-        scene = adjusted(fewer, LiftedState(scene.cameras, structure, scene.cost), lifting)
+        scene = adjusted(fewer, LiftedState(scene.cameras, structure, scene.cost), lifting, options=options)
     apart = distances(fewer, scene.cameras @ lifting.lifts, scene.structure)
-    return scene, fewer, ~suspicious(fewer, apart, unknowns, limit) & (_kept(fewer, tracks) >= MOST)
+    return scene, fewer, ~suspicious(fewer, apart, unknowns, limit, options) & (_kept(fewer, tracks) >= options.outliers.least_left)
 
 
-def _misfit(tracks: ViewTracks, apart: Tensor, unknowns: Tensor | int, limit: float | None) -> tuple[Tensor, Tensor, Tensor]:
+def _misfit(
+    tracks: ViewTracks, apart: Tensor, unknowns: Tensor | int, limit: float | None, options: ReconstructOptions
+) -> tuple[Tensor, Tensor, Tensor]:
     """Squared distance of every point, its conditions ``(b, n)``, and the noise ``(b,)``, a third of the limit or by the median."""
     square = apart.square().nansum(1)
     free = (apart.isfinite().sum(1) * tracks.x.shape[-1] - unknowns).clamp(min=0)
-    least = EXACT / tracks.scales.amin(1)
+    least = options.noise.least / tracks.scales.amin(1)
     sigma = noise(square, free, free >= 1) if limit is None else torch.full_like(least, limit / 3)
     return square, free, torch.maximum(sigma, least)
 
@@ -469,7 +429,12 @@ def _kept(fewer: ViewTracks, tracks: ViewTracks) -> Tensor:
 
 
 def robust_projections(
-    tracks: ViewTracks, invariant: GrassmannTensor, lifting: Lifting | None, limit: float | None, generator: torch.Generator | None
+    tracks: ViewTracks,
+    invariant: GrassmannTensor,
+    lifting: Lifting | None,
+    limit: float | None,
+    generator: torch.Generator | None,
+    options: ReconstructOptions,
 ) -> tuple[Projections, ViewTracks]:
     """Projections from the tracks that agree, and the tracks with weight 0 for all other observations.
 
@@ -481,30 +446,34 @@ def robust_projections(
         generator: of the random samples.
     """
     given = None if limit is None else torch.full_like(tracks.scales[:, 0], limit / 3)
-    best, sigma, _ = consensus(tracks, invariant, given, generator)
-    cameras = _extended(tracks, best, sigma)
-    cameras = _settled(tracks, cameras, None, sigma, WIDTHS)
-    sigma = _level(tracks, cameras, sigma, given)
+    best, sigma, _ = consensus(tracks, invariant, given, generator, options)
+    cameras = _extended(tracks, best, sigma, options)
+    cameras = _settled(tracks, cameras, None, sigma, options.outliers.widths, options)
+    sigma = _level(tracks, cameras, sigma, given, options)
     if lifting is not None:
-        cameras = _structured(tracks, cameras, lifting, sigma, given)
-        sigma = _level(tracks, cameras, sigma, given)
-    fewer = tracks.only(agreeing(tracks, cameras, sigma))
-    ample = tracks.x.shape[1] * tracks.x.shape[-1] >= cameras.shape[-1] + TOLERANT
-    doubt = doubtful(tracks, distance(tracks, cameras), sigma, invariant) & ~((_kept(fewer, tracks) >= TRUSTED) & ample)
+        cameras = _structured(tracks, cameras, lifting, sigma, given, options)
+        sigma = _level(tracks, cameras, sigma, given, options)
+    fewer = tracks.only(agreeing(tracks, cameras, sigma, options))
+    ample = tracks.x.shape[1] * tracks.x.shape[-1] >= cameras.shape[-1] + options.outliers.tolerant
+    doubt = doubtful(tracks, distance(tracks, cameras, options), sigma, invariant, options) & ~(
+        (_kept(fewer, tracks) >= options.outliers.trusted) & ample
+    )
     status = torch.where(doubt, int(Status.NO_CONSENSUS), int(Status.OK))
     return Projections(cameras, triangulate(cameras, fewer.x, fewer.weights, steps=2), status), fewer
 
 
-def _level(tracks: ViewTracks, cameras: Tensor, sigma: Tensor, given: Tensor | None) -> Tensor:
+def _level(tracks: ViewTracks, cameras: Tensor, sigma: Tensor, given: Tensor | None, options: ReconstructOptions) -> Tensor:
     """The noise ``(b,)``: as given, or that of the points that agree."""
     if given is not None:
         return given
-    fewer = tracks.only(agreeing(tracks, cameras, sigma))
+    fewer = tracks.only(agreeing(tracks, cameras, sigma, options))
     free = freedom(fewer, cameras.shape[-1] - 1)
-    return settled_noise(tracks, distance(fewer, cameras), free, free >= 1, camera_unknowns(*cameras.shape[1:]))
+    return settled_noise(
+        tracks, distance(fewer, cameras, options), free, free >= 1, camera_unknowns(*cameras.shape[1:]), options=options
+    )
 
 
-def _extended(tracks: ViewTracks, found: Consensus, sigma: Tensor) -> Tensor:
+def _extended(tracks: ViewTracks, found: Consensus, sigma: Tensor, options: ReconstructOptions) -> Tensor:
     """Projections of all views: the others by resection from the points that agree, reweighted."""
     b, size = found.chosen.shape
     if size == tracks.x.shape[1]:
@@ -513,11 +482,11 @@ def _extended(tracks: ViewTracks, found: Consensus, sigma: Tensor) -> Tensor:
     some = (tracks.x[rows, found.chosen], tracks.weights[rows, found.chosen])
     structure = triangulate(found.projections, *some, steps=2)
     free = torch.full_like(found.square, size * tracks.x.shape[-1] - structure.shape[-1] + 1).long()
-    known = found.square <= sigma.square()[:, None] * bound(free)
+    known = found.square <= sigma.square()[:, None] * bound(free, options.noise.share)
     structure = torch.where(known[..., None], structure, 0.0)
     counted = (tracks.weights > 0) & known[:, None]
     weights, scale = tracks.weights, None
-    for _ in range(RESECTED):
+    for _ in range(options.outliers.resections):
         whole = resect(structure, tracks.x, weights)
         square = (tracks.x - reproject(whole, structure)).square().sum(-1) / tracks.scales.square()[..., None]
         middle = square.masked_fill(~counted, torch.nan).nanmedian(-1).values.nan_to_num(nan=0.0)
@@ -527,22 +496,26 @@ def _extended(tracks: ViewTracks, found: Consensus, sigma: Tensor) -> Tensor:
     return whole.index_put((rows, found.chosen), found.projections)
 
 
-def _settled(tracks: ViewTracks, cameras: Tensor, lifts: Tensor | None, sigma: Tensor, widths: tuple[float, ...]) -> Tensor:
+def _settled(
+    tracks: ViewTracks, cameras: Tensor, lifts: Tensor | None, sigma: Tensor, widths: tuple[float, ...], options: ReconstructOptions
+) -> Tensor:
     """Projections adjusted to the observations that agree, which are chosen again after each time."""
     for width in widths:
         projections = cameras if lifts is None else cameras @ lifts
-        weights = agreeing(tracks, projections, width * sigma)
+        weights = agreeing(tracks, projections, width * sigma, options)
         structure = triangulate(projections, tracks.x, weights, steps=2)
-        cameras = bundle_adjust(tracks.x, weights, cameras, structure, lifts, iterations=ADJUSTED).cameras
+        cameras = bundle_adjust(tracks.x, weights, cameras, structure, lifts, iterations=options.outliers.adjustment_steps).cameras
     return cameras if lifts is None else cameras @ lifts
 
 
-def _structured(tracks: ViewTracks, cameras: Tensor, lifting: Lifting, sigma: Tensor, given: Tensor | None) -> Tensor:
+def _structured(
+    tracks: ViewTracks, cameras: Tensor, lifting: Lifting, sigma: Tensor, given: Tensor | None, options: ReconstructOptions
+) -> Tensor:
     """Projections that the lifts allow, where as many observations agree with them."""
-    weights = agreeing(tracks, cameras, sigma)
+    weights = agreeing(tracks, cameras, sigma, options)
     fewer = tracks.only(weights)
     found = Projections(cameras, triangulate(cameras, fewer.x, weights, steps=2), torch.zeros_like(sigma).long())
-    scene = scene_of(fewer, found, lifting)
-    better = _settled(tracks, scene.cameras, lifting.lifts, sigma, (1.0, 1.0))
-    more = (agreeing(tracks, better, sigma) > 0).sum((1, 2)) >= 0.98 * (weights > 0).sum((1, 2))
+    scene = scene_of(fewer, found, lifting, options=options)
+    better = _settled(tracks, scene.cameras, lifting.lifts, sigma, (1.0, 1.0), options)
+    more = (agreeing(tracks, better, sigma, options) > 0).sum((1, 2)) >= 0.98 * (weights > 0).sum((1, 2))
     return torch.where(more[:, None, None, None], better, cameras)

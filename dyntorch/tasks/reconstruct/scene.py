@@ -13,39 +13,29 @@ from dyntorch.geometry.lift import balanced, balanced_algebra, behind, centred, 
 from dyntorch.geometry.pairs import hyperplane_pair, two_bodies
 from dyntorch.geometry.triangulation import reproject, resect, triangulate, unit_projections
 from dyntorch.tasks.reconstruct.motions import Motion
+from dyntorch.tasks.reconstruct.options import ReconstructOptions
 from dyntorch.tasks.reconstruct.projections import Projections, ViewTracks, camera_unknowns, choices, projections_of_tracks
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Starts of structured bundle adjustment that need no tensor: the scene as if it stood still, in several frames.
 
 
-REST = 1e-8
-"""Of the lifts: below it constants of a point do not change its position."""
-VIEWS = 4
-"""Of the tensor of the scene at rest."""
-WINDOWS = (6, 5)
-"""Views that are taken at once, in turn.  Of 30 scenes of constant velocity, 8, 9 and 12 views with gaps of 20 to 25 %, most with
-too few points common to any four views, 28 are found and 2 given up."""
-TILT = 0.25
-"""Standard deviation of the hyperplane at infinity of further frames, for points of unit variance."""
-
-
-def middle(times: Tensor, number: int = 0) -> Tensor:
+def middle(times: Tensor, number: int = 0, *, options: ReconstructOptions) -> Tensor:
     """Indices of the views in the middle of the time, during which nothing moves far; all, where they are few."""
-    count = len(times) if len(times) <= WINDOWS[0] else WINDOWS[number % len(WINDOWS)]
+    count = len(times) if len(times) <= options.scene.windows[0] else options.scene.windows[number % len(options.scene.windows)]
     first = (len(times) - count) // 2
     return times.argsort()[first : first + count].sort().values
 
 
-def resting_constants(lifts: Tensor) -> Tensor:
+def resting_constants(lifts: Tensor, options: ReconstructOptions) -> Tensor:
     """Orthonormal ``(K, a + 1)`` constants of the points that do not move; of no columns where not all positions are theirs."""
     change = (lifts - lifts.mean(0)).flatten(0, 1)
     _, values, vh = torch.linalg.svd(change, full_matrices=True)
-    still = vh[int((values > REST * lifts.norm()).sum()) :].mT
+    still = vh[int((values > options.scene.rest * lifts.norm()).sum()) :].mT
     return still if still.shape[-1] >= lifts.shape[-2] else still[:, :0]
 
 
-def resting(tracks: ViewTracks, sensor: int, dim: int) -> Tensor:
+def resting(tracks: ViewTracks, sensor: int, dim: int, options: ReconstructOptions) -> Tensor:
     """The cameras ``(b, views, l + 1, dim + 1)`` that explain tracks best if no point moves, points finite and of unit variance.
 
     Where motion is slow against the extent of the scene they are near the truth, whatever the motion model.
@@ -58,8 +48,8 @@ def resting(tracks: ViewTracks, sensor: int, dim: int) -> Tensor:
     eye = torch.eye(dim + 1, dtype=tracks.x.dtype, device=tracks.x.device)
     views = tracks.x.shape[1]
     still = Motion(lambda time: torch.eye(dim + 1, dtype=torch.float64), sensor=sensor, static=True)
-    invariant = still.tensor(min(views, VIEWS if dim + 1 > sensor + 1 else 2))
-    found = projections_of_tracks(tracks, invariant, choices(tracks, len(invariant.profile))[:, :1])
+    invariant = still.tensor(min(views, options.scene.rest_views if dim + 1 > sensor + 1 else 2))
+    found = projections_of_tracks(tracks, invariant, choices(tracks, len(invariant.profile), options)[:, :1], options=options)
     lifts = eye.expand(views, -1, -1)
     known = (found.structure != 0).any(-1).to(tracks.x.dtype)
     G, cameras, structure = finite(found.projections, found.structure, lifts, gauge_algebra(lifts), tracks.weights)
@@ -68,34 +58,21 @@ def resting(tracks: ViewTracks, sensor: int, dim: int) -> Tensor:
     return cameras
 
 
-def tilted(cameras: Tensor, number: int) -> Tensor:
+def tilted(cameras: Tensor, number: int, options: ReconstructOptions) -> Tensor:
     """Cameras of the resting scene in one of many frames: the first as nearly affine as it can be, the others with the infinite
     tilted."""
     size = cameras.shape[-1]
     frame = torch.eye(size, dtype=torch.float64)
     if number:
-        frame[-1, :-1] = TILT * torch.randn(size - 1, generator=torch.Generator().manual_seed(number), dtype=torch.float64)
+        frame[-1, :-1] = options.scene.tilt * torch.randn(
+            size - 1, generator=torch.Generator().manual_seed(number), dtype=torch.float64
+        )
     return cameras @ frame.to(cameras)
 
 
-STRUCTURED, FINE = 60, 1e-7
-"""At most so many steps of structured bundle adjustment, and the share of the cost that the last one gains."""
-SEVERAL = 7
-"""Size K of the space of the constants from which on one start is not enough.  Of 20 scenes, 4 views of 60 points, the start from
-the tensor misses the minimum in 5 (constant velocity, 0.5 px) and 20 (weak constant acceleration in a plane, 1 px), that of the
-scene at rest in 1 and 0, and both together in none; below P^6 the first reaches it in all."""
-SPARE = 6
-"""Spare coordinates per point beyond which the start from the tensor is enough in those spaces as well: of 20 scenes it misses the
-minimum in up to 18 with 5 views and 1 with 6, in none with 7, 8 and 12."""
-FRAMES, UNAIDED = 3, 6
-"""Starts from the scene at rest, at most: next to that from the tensor, and without one."""
-BEHIND = 0.05
-"""Share of points behind cameras from which on a scene is not believed: wrong minima have a tenth to a half of them there."""
 AIDED = {2: 6, 3: 12}
 """Points known to stand still and seen by all views, half as many more as determine the cameras, from which on they do: in a plane
 and in space."""
-SAME, EXACT = 1e-2, 1e-22
-"""Relative difference of the costs of the same minimum, and of costs that are only rounding, per observation."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +99,7 @@ class Lifting:
     """``(K, a + 1)`` orthonormal: the constants of points that stand still; of no columns where none can."""
 
     @classmethod
-    def of(cls, motion: Motion, times: Tensor, like: Tensor) -> Lifting:
+    def of(cls, motion: Motion, times: Tensor, like: Tensor, options: ReconstructOptions) -> Lifting:
         """The motion at these times, on the device of ``like``."""
         span = float(times.max() - times.min()) / max(1, len(times) - 1)
         even, shift, origin = motion.centred(times)
@@ -132,7 +109,7 @@ class Lifting:
         middle = motion.lifts([float(times.mean()) - origin])[0] @ inverse
         # a shift is inverted exactly by the opposite one, however far
         back = (torch.eye(len(root), dtype=root.dtype) if motion.shift is None else motion.shift(-origin)) @ inverse
-        parts = (lifts, root @ shift, back, start, slope, middle, balanced_algebra(lifts), resting_constants(lifts))
+        parts = (lifts, root @ shift, back, start, slope, middle, balanced_algebra(lifts), resting_constants(lifts, options))
         return cls(motion, *(part.to(like) for part in parts))
 
 
@@ -148,11 +125,13 @@ class LiftedState:
     """``(b,)``."""
 
 
-def scene_of(tracks: ViewTracks, found: Projections, lifting: Lifting, scale: Tensor | None = None) -> LiftedState:
+def scene_of(
+    tracks: ViewTracks, found: Projections, lifting: Lifting, scale: Tensor | None = None, *, options: ReconstructOptions
+) -> LiftedState:
     """Cameras and points from projections in a projective frame, and from the scene as if it stood still where that is safer.
 
-    The second start is taken in high spaces with few spare images (:data:`SEVERAL`, :data:`SPARE`), and where no views have
-    enough points in common for the tensor.
+    The second start is taken in high spaces with few spare images (``options.scene.several``, ``options.scene.spare``), and where
+    no views have enough points in common for the tensor.
 
     Args:
         tracks: flat batch.
@@ -168,24 +147,24 @@ def scene_of(tracks: ViewTracks, found: Projections, lifting: Lifting, scale: Te
     coordinates = (tracks.weights > 0).sum(1) * tracks.x.shape[-1]
     size = lifting.lifts.shape[-1]
     known = torch.where(lost[:, None], coordinates >= size - 1, (found.structure != 0).any(-1))
-    scene = _scene(tracks, _upgraded(found, lost, lifting), known & ~lost[:, None], lifting, scale)
+    scene = _scene(tracks, _upgraded(found, lost, lifting), known & ~lost[:, None], lifting, scale, options)
     scene = LiftedState(scene.cameras, scene.structure, torch.where(lost, torch.inf, scene.cost))
     spare = (coordinates * known).sum(-1) - (size - 1) * known.sum(-1)
-    shaky = ~lost & (size >= SEVERAL) & (spare <= SPARE * known.sum(-1))
-    shaky = shaky | (~lost & wild(tracks, _finite(tracks, scene, lifting), lifting))
+    shaky = ~lost & (size >= options.scene.several) & (spare <= options.scene.spare * known.sum(-1))
+    shaky = shaky | (~lost & wild(tracks, _finite(tracks, scene, lifting), lifting, options))
     unknown = camera_unknowns(tracks.x.shape[1], tracks.x.shape[-1] + 1, lifting.lifts.shape[1], len(lifting.algebra) - 1)
     unaided = (found.status == Status.TOO_FEW) & (spare > unknown)
     left = (shaky | unaided | aided).nonzero()[:, 0] if lifting.still.shape[-1] else lost.new_zeros(0, dtype=torch.long)
-    return _confirmed(tracks, scene, left, known, lifting, scale) if len(left) else scene
+    return _confirmed(tracks, scene, left, known, lifting, scale, options) if len(left) else scene
 
 
-def wild(tracks: ViewTracks, scene: LiftedState, lifting: Lifting) -> Tensor:
+def wild(tracks: ViewTracks, scene: LiftedState, lifting: Lifting, options: ReconstructOptions) -> Tensor:
     """Problems ``(b,)`` with so many points behind cameras that the scene, in a finite frame, is that of a wrong minimum."""
     if tracks.x.shape[-1] != 2:
         return torch.zeros_like(scene.cost, dtype=torch.bool)
     known = (scene.structure != 0).any(-1)
     count = (behind(scene.cameras, scene.structure, lifting.lifts, tracks.weights) & known).sum(-1)
-    return count > (BEHIND * known.sum(-1)).clamp(min=2)
+    return count > (options.scene.behind * known.sum(-1)).clamp(min=2)
 
 
 def _aided(tracks: ViewTracks, lifting: Lifting) -> Tensor:
@@ -201,34 +180,44 @@ def _upgraded(found: Projections, lost: Tensor, lifting: Lifting) -> Tensor:
     return upgrade(torch.where(lost[:, None, None, None], 1.0, found.projections), lifting.lifts)[1]
 
 
-def _scene(tracks: ViewTracks, cameras: Tensor, known: Tensor, lifting: Lifting, scale: Tensor | None) -> LiftedState:
+def _scene(
+    tracks: ViewTracks, cameras: Tensor, known: Tensor, lifting: Lifting, scale: Tensor | None, options: ReconstructOptions
+) -> LiftedState:
     """The scene that adjustment finds from some cameras, with the known points ``(b, n)``."""
     structure = triangulate(cameras @ lifting.lifts, tracks.x, tracks.weights)
     start = LiftedState(cameras, torch.where(known[..., None], structure, 0.0), torch.zeros_like(tracks.x[:, 0, 0, 0]))
-    done = adjusted(tracks, start, lifting, scale)
+    done = adjusted(tracks, start, lifting, scale, options=options)
     # a point that was lost costs the extent of the image
     gone = known & (done.structure == 0).all(-1)
     return LiftedState(done.cameras, done.structure, done.cost + (tracks.weights * gone[:, None]).flatten(1).sum(-1))
 
 
 def _confirmed(
-    tracks: ViewTracks, scene: LiftedState, left: Tensor, known: Tensor, lifting: Lifting, scale: Tensor | None
+    tracks: ViewTracks,
+    scene: LiftedState,
+    left: Tensor,
+    known: Tensor,
+    lifting: Lifting,
+    scale: Tensor | None,
+    options: ReconstructOptions,
 ) -> LiftedState:
     """The scenes of least cost among those of several starts: further ones until two of them end in the same minimum."""
     cameras, structure, cost = scene.cameras.clone(), scene.structure.clone(), scene.cost.clone()
     seen = cost[left].isfinite().long()
     alone = left[seen == 0]
-    floor = EXACT * (tracks.weights > 0).flatten(1).sum(-1)
-    for number in range(UNAIDED):
+    floor = options.scene.exact * (tracks.weights > 0).flatten(1).sum(-1)
+    for number in range(options.scene.frames_alone):
         some = None if scale is None else scale[left]
-        fresh = _scene(tracks.subset(left), _started(tracks.subset(left), number, lifting, some), known[left], lifting, some)
+        fresh = _scene(
+            tracks.subset(left), _started(tracks.subset(left), number, lifting, some, options), known[left], lifting, some, options
+        )
         least = cost[left]
-        near = fresh.cost <= least * (1 + SAME) + floor[left]
-        seen = torch.where(fresh.cost * (1 + SAME) + floor[left] < least, 1, seen + near)
+        near = fresh.cost <= least * (1 + options.scene.same) + floor[left]
+        seen = torch.where(fresh.cost * (1 + options.scene.same) + floor[left] < least, 1, seen + near)
         better = fresh.cost < least
         taken = left[better]
         cameras[taken], structure[taken], cost[taken] = fresh.cameras[better], fresh.structure[better], fresh.cost[better]
-        doubt = (seen < 2) & (torch.isin(left, alone) | (number + 1 < FRAMES))
+        doubt = (seen < 2) & (torch.isin(left, alone) | (number + 1 < options.scene.frames))
         left, seen = left[doubt], seen[doubt]
         if not len(left):
             break
@@ -237,22 +226,24 @@ def _confirmed(
     return LiftedState(cameras, structure, cost)
 
 
-def _started(tracks: ViewTracks, number: int, lifting: Lifting, scale: Tensor | None) -> Tensor:
+def _started(tracks: ViewTracks, number: int, lifting: Lifting, scale: Tensor | None, options: ReconstructOptions) -> Tensor:
     """Cameras of all views from those of the scene at rest; of a part of many views: adjusted, the others by resection."""
     aided = bool(_aided(tracks, lifting).all())
-    window = middle(tracks.times, number)
+    window = middle(tracks.times, number, options=options)
     near = tracks.at(window)
     near = near.resting() if aided else near
-    cameras = tilted(resting(near, lifting.motion.sensor, lifting.motion.dim), number)
+    cameras = tilted(resting(near, lifting.motion.sensor, lifting.motion.dim, options), number, options)
     if len(window) == tracks.x.shape[1]:
         return cameras
     some = replace(lifting, lifts=lifting.lifts[window])
-    part = _scene(tracks.at(window), cameras, torch.ones_like(tracks.weights[:, 0], dtype=torch.bool), some, scale)
+    part = _scene(tracks.at(window), cameras, torch.ones_like(tracks.weights[:, 0], dtype=torch.bool), some, scale, options)
     whole = resect(part.structure, tracks.x, tracks.weights, lifts=lifting.lifts)
     return whole.index_copy(1, window.to(whole.device), part.cameras)
 
 
-def adjusted(tracks: ViewTracks, scene: LiftedState, lifting: Lifting, scale: Tensor | None = None) -> LiftedState:
+def adjusted(
+    tracks: ViewTracks, scene: LiftedState, lifting: Lifting, scale: Tensor | None = None, *, options: ReconstructOptions
+) -> LiftedState:
     """Structured bundle adjustment."""
     confined = tracks.static if lifting.still.shape[-1] else None
     done = bundle_adjust(
@@ -261,9 +252,9 @@ def adjusted(tracks: ViewTracks, scene: LiftedState, lifting: Lifting, scale: Te
         scene.cameras,
         scene.structure,
         lifting.lifts,
-        iterations=STRUCTURED,
+        iterations=options.scene.steps,
         scale=scale,
-        tolerance=FINE,
+        tolerance=options.scene.tolerance,
         confined=confined,
         subspace=None if confined is None else lifting.still,
     )
@@ -324,11 +315,7 @@ def distances(tracks: ViewTracks, projections: Tensor, structure: Tensor) -> Ten
 # Two bodies in relative translation: labels, cameras of each, and their points.
 
 
-STEPS = 60
-"""Of bundle adjustment."""
-
-
-def bodies_of(tracks: ViewTracks, scene: LiftedState) -> tuple[Tensor, Tensor, Tensor, LiftedState]:
+def bodies_of(tracks: ViewTracks, scene: LiftedState, options: ReconstructOptions) -> tuple[Tensor, Tensor, Tensor, LiftedState]:
     """Labels by the two hyperplanes of the points, and the affine structure of each body.
 
     Args:
@@ -339,7 +326,7 @@ def bodies_of(tracks: ViewTracks, scene: LiftedState) -> tuple[Tensor, Tensor, T
         cameras of both bodies ``(b, 2, views, m, d + 1)``, points ``(b, n, d)``, labels ``(b, n)``, and the adjusted scene with
         every point on the hyperplane of its body.
     """
-    done = bundle_adjust(tracks.x, tracks.weights, scene.cameras, scene.structure, iterations=STEPS)
+    done = bundle_adjust(tracks.x, tracks.weights, scene.cameras, scene.structure, iterations=options.scene.final_steps)
     known = (done.structure != 0).any(-1)
     information = point_information(done.cameras, done.structure, tracks.weights)
     pair = hyperplane_pair(done.structure, known.to(done.structure.dtype), information=information)

@@ -15,6 +15,7 @@ from dyntorch.geometry.triangulation import triangulate, unit_projections
 from dyntorch.numerics.chi_square import quantile
 from dyntorch.tasks.reconstruct.diagnosis import diagnose, least_squares, spare, unknowns
 from dyntorch.tasks.reconstruct.motions import MOTIONS, Motion
+from dyntorch.tasks.reconstruct.options import ReconstructOptions
 from dyntorch.tasks.reconstruct.projections import Projections, ViewTracks, projections_of_tracks
 from dyntorch.tasks.reconstruct.result import Ranked, Reconstruction, ReconstructNotice
 from dyntorch.tasks.reconstruct.robust import robust_projections, suspicious, trimmed, unfounded
@@ -32,11 +33,6 @@ from dyntorch.tasks.reconstruct.scene import (
 
 Part = TypeVar("Part", Projections, LiftedState)
 
-CORRECTIONS = 4
-"""Times that points said to stand still are looked at."""
-EXACT = 1e-18
-"""Square of the noise, over that of the extent of the image, that exact data are taken to have."""
-
 
 def solve(
     tracks: ViewTracks,
@@ -45,6 +41,7 @@ def solve(
     limit: float | None,
     generator: torch.Generator | None,
     batch: tuple[int, ...],
+    options: ReconstructOptions,
 ) -> Reconstruction:
     """Reconstruct a flat batch of checked problems.
 
@@ -56,52 +53,56 @@ def solve(
         generator: of random samples.
         batch: the shape that the flat dimension comes from.
     """
-    lifting = None if motion.lift is None else Lifting.of(motion, tracks.times, tracks.x)
+    lifting = None if motion.lift is None else Lifting.of(motion, tracks.times, tracks.x, options)
     tracks = replace(tracks, static=static)
     views = motion.views(tracks.times)
     invariant = motion.tensor(min(views, motion.k + 1))
-    found = projections_of_tracks(tracks, invariant)
-    found, scene = _scene(tracks, found, lifting)
+    found = projections_of_tracks(tracks, invariant, options=options)
+    found, scene = _scene(tracks, found, lifting, options)
     if lifting is not None and static is not None and not motion.static:
-        tracks, scene = _corrected(tracks, scene, lifting)
+        tracks, scene = _corrected(tracks, scene, lifting, options)
     free = unknowns(tracks, motion)
-    doubt = suspicious(tracks, _distances(tracks, scene, lifting), free, limit) | failed(found.status)
+    doubt = suspicious(tracks, _distances(tracks, scene, lifting), free, limit, options) | failed(found.status)
     chosen = doubt.nonzero()[:, 0] if limit != float("inf") else doubt.nonzero()[:0, 0]
     if lifting is not None and len(chosen):
-        again, fewer, fine = trimmed(tracks.subset(chosen), _part(scene, chosen), lifting, free[chosen], limit)
+        again, fewer, fine = trimmed(tracks.subset(chosen), _part(scene, chosen), lifting, free[chosen], limit, options)
         fine = fine & ~failed(found.status[chosen])
         tracks = tracks.only(tracks.weights.index_copy(0, chosen[fine], fewer.weights[fine]))
         scene = _merged(scene, _part(again, fine), chosen[fine])
         chosen = chosen[~fine]
     if len(chosen):
-        some, fewer = robust_projections(tracks.subset(chosen), invariant, lifting, limit, generator)
-        some, again = _scene(fewer, some, lifting)
+        some, fewer = robust_projections(tracks.subset(chosen), invariant, lifting, limit, generator, options)
+        some, again = _scene(fewer, some, lifting, options)
         tracks = tracks.only(tracks.weights.index_copy(0, chosen, fewer.weights))
         found = _merged(found, some, chosen)
         scene = _merged(scene, again, chosen)
-    return _result(tracks, motion, lifting, found, scene, static, batch)
+    return _result(tracks, motion, lifting, found, scene, static, batch, options)
 
 
-def _corrected(tracks: ViewTracks, scene: LiftedState, lifting: Lifting) -> tuple[ViewTracks, LiftedState]:
+def _corrected(
+    tracks: ViewTracks, scene: LiftedState, lifting: Lifting, options: ReconstructOptions
+) -> tuple[ViewTracks, LiftedState]:
     """The scene without points said to stand still that move, a few at a time, and the tracks with the others."""
-    for _ in range(CORRECTIONS):
+    for _ in range(options.models.corrections):
         assert tracks.static is not None
-        wrong = unfounded(tracks, _distances(tracks, scene, lifting), unknowns(tracks, lifting.motion))
+        wrong = unfounded(tracks, _distances(tracks, scene, lifting), unknowns(tracks, lifting.motion), options)
         left = (wrong.any(-1) & scene.cost.isfinite()).nonzero()[:, 0]
         if not len(left):
             break
         tracks = replace(tracks, static=tracks.static & ~wrong)
         some = tracks.subset(left)
         structure = triangulate(scene.cameras[left] @ lifting.lifts, some.x, some.weights)
-        again = adjusted(some, LiftedState(scene.cameras[left], structure, scene.cost[left]), lifting)
+        again = adjusted(some, LiftedState(scene.cameras[left], structure, scene.cost[left]), lifting, options=options)
         scene = _merged(scene, again, left)
     return tracks, scene
 
 
-def _scene(tracks: ViewTracks, found: Projections, lifting: Lifting | None) -> tuple[Projections, LiftedState]:
+def _scene(
+    tracks: ViewTracks, found: Projections, lifting: Lifting | None, options: ReconstructOptions
+) -> tuple[Projections, LiftedState]:
     """With a lift the scene in any of its frames; bodies stay in the projective one, with their projections for cameras."""
     if lifting is not None:
-        scene = scene_of(tracks, found, lifting)
+        scene = scene_of(tracks, found, lifting, options=options)
         # no tensor: too few points in common, or too like each other; but a scene was found without it
         status = torch.where(failed(found.status) & scene.cost.isfinite(), int(Status.OK), found.status)
         return Projections(found.projections, found.structure, status), scene
@@ -131,11 +132,12 @@ def _result(
     scene: LiftedState,
     given: Tensor | None,
     batch: tuple[int, ...],
+    options: ReconstructOptions,
 ) -> Reconstruction:
     """Frame, labels, residuals and notices of solved problems, in the caller's batch."""
     bodies = None
     if lifting is None:
-        bodies, points, labels, scene = bodies_of(tracks, scene)
+        bodies, points, labels, scene = bodies_of(tracks, scene, options)
         cameras, speed, projections = bodies[:, 0], None, scene.cameras
         structure, status = scene.structure, found.status
     else:
@@ -144,7 +146,7 @@ def _result(
         known = (scene.structure != 0).any(-1)
         labels = torch.where(known, 2, 0)
         if tracks.static is not None:
-            rests = tracks.static.any(-1, keepdim=True) & _rests(tracks, scene, lifting, projections)
+            rests = tracks.static.any(-1, keepdim=True) & _rests(tracks, scene, lifting, projections, options)
             labels = torch.where(known & (tracks.static | rests), 1, labels)
         status = found.status
         cameras, structure = scene.cameras, scene.structure @ lifting.back.mT
@@ -156,7 +158,7 @@ def _result(
     number = counted.flatten(1).sum(-1)
     sigma = (total / spare(tracks, counted, motion).clamp(min=1)).sqrt()
     back = torch.linalg.inv(tracks.transforms)
-    status, limits = diagnose(tracks, scene, lifting, motion, status, sigma, batch)
+    status, limits = diagnose(tracks, scene, lifting, motion, status, sigma, batch, options)
     if given is not None and tracks.static is not None:
         wrong = (given & ~tracks.static).sum(-1)
         limits += tuple(notices(ReconstructNotice.STATIC_MOVES, wrong, wrong > 0, batch))
@@ -187,7 +189,7 @@ def _result(
     )
 
 
-def _rests(tracks: ViewTracks, scene: LiftedState, lifting: Lifting, projections: Tensor) -> Tensor:
+def _rests(tracks: ViewTracks, scene: LiftedState, lifting: Lifting, projections: Tensor, options: ReconstructOptions) -> Tensor:
     """Which points ``(b, n)`` are explained as well, within the noise, by one position for all times."""
     still = lifting.still
     apart = distances(tracks, projections, scene.structure)
@@ -197,7 +199,7 @@ def _rests(tracks: ViewTracks, scene: LiftedState, lifting: Lifting, projections
     free = spare(tracks, apart.isfinite(), lifting.motion).clamp(min=1)
     # rounding is noise as well
     extent = (1 / tracks.scales.amin(-1, keepdim=True)).square()
-    sigma = moving.sum(-1, keepdim=True) / free[:, None] + EXACT * extent
+    sigma = moving.sum(-1, keepdim=True) / free[:, None] + options.models.exact * extent
     extra = lifting.lifts.shape[-1] - lifting.lifts.shape[1]
     return resting - moving <= quantile(0.99, extra) * sigma
 
@@ -216,27 +218,13 @@ def _open(motion: Motion, times: Tensor, static: Tensor | None) -> str:
 # The choice of a motion model by penalized cost.
 
 
-OUTLIER = 2.0
-"""Cost of a coordinate too many that does not fit, in variances of the noise: Torr's lambda 3."""
-LABEL = 0.2
-"""Cost of the label of a point of two bodies, which is free to take the better one.  4 views of 80 points: 0 takes two bodies for
-one plane once in 5 scenes (by 5), log 2 = 0.7 takes a static scene for two planes (by 30)."""
-AGREED = 0.6
-"""Share of observations that have to fit a model before the noise is taken from it."""
-SIMILAR = 1.8
-"""Noise over the least that any model leaves, up to which a model fits.  A model with too many unknowns may leave 0.6 times the
-noise that is there (constant_velocity_3d of points moving along one direction in a plane, 4 views of 80 points)."""
-MILD = 1.1
-"""Noise that least squares leaves, over that of the robust fit, up to which the models are not all fitted robustly: single false
-outliers among 720 observations raise it by .5 %, one of 100 px by 800 %."""
-CLEAR = 0.02
-"""Noise over the extent of the images up to which that holds: much noise may hide outliers, and a failed fit says nothing."""
-FLOOR = 1e-9
-"""Least noise over the extent of the images: rounding."""
-
-
 def choose(
-    tracks: ViewTracks, static: Tensor | None, limit: float | None, generator: torch.Generator | None, batch: tuple[int, ...]
+    tracks: ViewTracks,
+    static: Tensor | None,
+    limit: float | None,
+    generator: torch.Generator | None,
+    batch: tuple[int, ...],
+    options: ReconstructOptions,
 ) -> Reconstruction:
     r"""Reconstruct with the declared model of least penalized cost; the others are listed in ``candidates``.
 
@@ -272,23 +260,25 @@ def choose(
         raise ValueError(
             f"no declared motion takes {views} views of {n} tracks; {first.name!r} needs {need[0]} views and {need[1]} tracks"
         )
-    plain = [LiftedFit.of(tracks, model, *least_squares(tracks, model)) for model in models]
-    listed = ranked(tracks, plain, limit)
-    best = solve(tracks, MOTIONS[listed[0].motion], static, limit, generator, batch)
+    plain = [LiftedFit.of(tracks, model, *least_squares(tracks, model, options)) for model in models]
+    listed = ranked(tracks, plain, limit, options)
+    best = solve(tracks, MOTIONS[listed[0].motion], static, limit, generator, batch, options)
     fit = next(fit for fit in plain if fit.motion is best.motion)
     whole = (best.inliers.reshape(fit.apart.shape) >= fit.apart.isfinite()).flatten(1).all(1)
     # what was left out did not mislead least squares where it hardly made the noise larger
     noise = best.sigma.reshape(-1)
-    harmless = (fit.sigma <= MILD * noise) & (noise * tracks.scales.amax(1) <= CLEAR)
+    harmless = (fit.sigma <= options.models.mild * noise) & (noise * tracks.scales.amax(1) <= options.models.clear)
     if bool((whole | harmless).all()):
         return replace(best, candidates=listed + untried)
     others = [model for model in models if model is not best.motion]
-    robust = {best.motion.name: best} | {model.name: solve(tracks, model, static, limit, generator, batch) for model in others}
+    robust = {best.motion.name: best} | {
+        model.name: solve(tracks, model, static, limit, generator, batch, options) for model in others
+    }
     fits = [
         LiftedFit.of(tracks, one.motion, one.residuals.reshape(tracks.weights.shape), one.status.reshape(-1))
         for one in robust.values()
     ]
-    listed = ranked(tracks, fits, limit)
+    listed = ranked(tracks, fits, limit, options)
     return replace(robust[listed[0].motion], candidates=listed + untried)
 
 
@@ -339,30 +329,30 @@ def _lacks(motion: Motion, times: Tensor, views: int, n: int) -> str:
     return ""
 
 
-def ranked(tracks: ViewTracks, fits: list[LiftedFit], limit: float | None) -> tuple[Ranked, ...]:
+def ranked(tracks: ViewTracks, fits: list[LiftedFit], limit: float | None, options: ReconstructOptions) -> tuple[Ranked, ...]:
     """The models by their penalized costs over the whole batch, the least first."""
-    sigma = _noise(tracks, fits, limit)
+    sigma = _noise(tracks, fits, limit, options)
     found = []
     for fit in fits:
-        score = float("inf") if bool(fit.lost.all()) else float(penalized(tracks, fit, sigma).sum())
+        score = float("inf") if bool(fit.lost.all()) else float(penalized(tracks, fit, sigma, options).sum())
         rest = fit.apart[~fit.lost]
         found.append(Ranked(fit.motion.name, score, float(rest.square().nanmean().sqrt())))
     return tuple(sorted(found, key=lambda one: one.score))
 
 
-def _noise(tracks: ViewTracks, fits: list[LiftedFit], limit: float | None) -> Tensor:
+def _noise(tracks: ViewTracks, fits: list[LiftedFit], limit: float | None, options: ReconstructOptions) -> Tensor:
     """The noise of every problem, ``(b,)``: a third of the limit, or what the models that fit leave in the middle."""
-    floor = FLOOR / tracks.scales.square().mean(-1).sqrt()
+    floor = options.models.floor / tracks.scales.square().mean(-1).sqrt()
     if limit is not None and math.isfinite(limit):
         return floor.clamp(min=limit / 3)
     count = (tracks.weights > 0).flatten(1).sum(-1)
-    sound = [(fit.apart.isfinite().flatten(1).sum(-1) >= AGREED * count) & ~fit.lost for fit in fits]
+    sound = [(fit.apart.isfinite().flatten(1).sum(-1) >= options.models.agreed * count) & ~fit.lost for fit in fits]
     sigma = torch.stack([torch.where(ok, fit.sigma, torch.nan) for ok, fit in zip(sound, fits, strict=True)])
-    near = sigma <= SIMILAR * sigma.nan_to_num(nan=torch.inf).amin(0)
+    near = sigma <= options.models.similar * sigma.nan_to_num(nan=torch.inf).amin(0)
     return torch.where(near, sigma, torch.nan).nanmedian(0).values.nan_to_num(nan=1.0).maximum(floor)
 
 
-def penalized(tracks: ViewTracks, fit: LiftedFit, sigma: Tensor) -> Tensor:
+def penalized(tracks: ViewTracks, fit: LiftedFit, sigma: Tensor, options: ReconstructOptions) -> Tensor:
     """The penalized cost ``(b,)`` of one model; where it failed, that of outliers only.
 
     Args:
@@ -375,8 +365,8 @@ def penalized(tracks: ViewTracks, fit: LiftedFit, sigma: Tensor) -> Tensor:
     free = motion.k - (motion.bodies > 1)
     square = (fit.apart / sigma[:, None, None]).square()
     # an observation that was left out costs as much as one can
-    square = torch.where(seen & square.isfinite(), square, torch.where(seen, OUTLIER * motion.sensor, 0.0)).sum(1)
-    misfit = square.minimum(OUTLIER * (r - free).clamp(min=0)).sum(-1)
+    square = torch.where(seen & square.isfinite(), square, torch.where(seen, options.models.outlier * motion.sensor, 0.0)).sum(1)
+    misfit = square.minimum(options.models.outlier * (r - free).clamp(min=0)).sum(-1)
     cameras = r.sum(-1) - (r > 0).sum(-1) * free - spare(tracks, seen, motion)
-    points = free * r.clamp(min=1).log() + LABEL * (motion.bodies - 1) * (r > 0)
+    points = free * r.clamp(min=1).log() + options.models.label * (motion.bodies - 1) * (r > 0)
     return misfit + points.sum(-1) + cameras * r.sum(-1).clamp(min=1).log()
