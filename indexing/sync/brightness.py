@@ -11,10 +11,8 @@ from torch import Tensor
 from torch.nn.functional import max_pool1d
 
 from dyntorch import Shift
-from dyntorch.numerics import on_cpu, one_thread
+from dyntorch.numerics import check_options, on_cpu, one_thread
 from indexing.sync.gray import (
-    FEWEST,
-    HALF,
     GrayTake,
     Region,
     Sampled,
@@ -26,6 +24,7 @@ from indexing.sync.gray import (
     take,
     whitened,
 )
+from indexing.sync.options import SyncOptions, VerdictOptions
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Two sequences of unit vectors against each other at all lags: scores, and the peaks of their curve.
@@ -33,9 +32,6 @@ from indexing.sync.gray import (
 # Lag s pairs row i of the first with row i + s of the second.  Rows of missing frames are 0 and do not count.
 
 
-POWER = 0.35
-"""Of the overlap in the score.  Share within 1 frame at 0 / .25 / .5, training seeds: CMU in place, 70 frames .88 / .88 / .88, 150
-frames .92 / 1.00 / 1.00; walking and running .68 / .72 / .80: a mean alone (0) prefers chance agreement in short overlaps."""
 CHUNK = 32  # columns transformed at once
 
 
@@ -89,7 +85,7 @@ class Curve:
         return max(-0.5, min(0.5, (left - right) / (2 * bend))) if -torch.inf < bend < 0 else 0.0
 
 
-def score_curve(a: Tensor, b: Tensor, least: float) -> Curve:
+def score_curve(a: Tensor, b: Tensor, least: float, options: SyncOptions = SyncOptions()) -> Curve:
     r"""Scores at all lags.
 
     .. math:: score(s) = \bar c(s)\,\Bigl(\frac{m(s)}{\max m}\Bigr)^{.35}
@@ -109,15 +105,15 @@ def score_curve(a: Tensor, b: Tensor, least: float) -> Curve:
     counts = lag_sums(*(x.abs().sum(1, keepdim=True).gt(0).double() for x in (a, b))).round()
     known = counts >= max(least, 1.0)
     mean = lag_sums(a, b) / counts.clamp(min=1.0)
-    scores = mean * (counts / counts.max().clamp(min=1.0)) ** POWER
+    scores = mean * (counts / counts.max().clamp(min=1.0)) ** options.lags.power
     lags = torch.arange(-(len(a) - 1), len(b), device=a.device)
     return Curve(lags, scores.masked_fill(~known, -torch.inf), counts)
 
 
-def part_curve(a: Tensor, b: Tensor, rows: slice, share: float = 0.5) -> Curve:
-    """The curve of a part of the first sequence against all of the second; at least ``share`` of the part must overlap."""
+def part_curve(a: Tensor, b: Tensor, rows: slice, options: SyncOptions = SyncOptions()) -> Curve:
+    """The curve of a part of the first sequence against all of the second."""
     part = a[rows]
-    curve = score_curve(part, b, share * len(part))
+    curve = score_curve(part, b, options.lags.part_overlap * len(part), options=options)
     return Curve(curve.lags - rows.start, curve.scores, curve.counts)
 
 
@@ -127,34 +123,25 @@ def part_curve(a: Tensor, b: Tensor, rows: slice, share: float = 0.5) -> Curve:
 # Two takes of similar motion have a best lag too, but moment by moment the best lag wanders; of one motion it stays.
 
 
-WINDOW, HOP = 16, 8  # frames
-REACH = 12  # lags on either side of the candidate
-TOLERANCE = 1  # lag
-SHARPNESS = 10.0
-"""Of the softmax over mean cosines.  AUC right against wrong candidates, five training sets, at 10 / 20 / 40: .926 / .904 / .892
-(windows of 24: .927 / .921 / .909); of the peak's height .899, halves .854, height above the other lags .853, next peak .821."""
-OUTLIER = 0.05  # share of windows that may say anything
-
-
-def windows(a: Tensor, b: Tensor, lag: int) -> Tensor:
-    """``(windows, 2 REACH + 1)`` mean cosines in windows of the overlap at lags about ``lag``; NaN: less than 3/4 known."""
+def windows(a: Tensor, b: Tensor, lag: int, options: SyncOptions = SyncOptions()) -> Tensor:
+    """``(windows, 2 reach + 1)`` mean cosines in windows of the overlap at lags about ``lag``; NaN: less than 3/4 known."""
     low, high = max(0, -lag), min(len(a), len(b) - lag)
     rows = torch.arange(low, max(high, low), device=a.device)
-    columns = rows[:, None] + lag + torch.arange(-REACH, REACH + 1, device=a.device)
+    columns = rows[:, None] + lag + torch.arange(-options.windows.reach, options.windows.reach + 1, device=a.device)
     inside = (columns >= 0) & (columns < len(b))
     seen_a, seen_b = (x.abs().sum(1) > 0 for x in (a, b))
     columns = columns.clamp(0, len(b) - 1)
     known = inside & seen_a[rows, None] & seen_b[columns]
-    values = torch.stack([(a[rows] * b[columns[:, k]]).sum(1) for k in range(2 * REACH + 1)], dim=1) * known
-    size = min(WINDOW, len(rows))
+    values = torch.stack([(a[rows] * b[columns[:, k]]).sum(1) for k in range(2 * options.windows.reach + 1)], dim=1) * known
+    size = min(options.windows.size, len(rows))
     if size == 0:
-        return values.new_full((1, 2 * REACH + 1), torch.nan)
-    total = values.unfold(0, size, HOP).sum(-1)
-    count = known.double().unfold(0, size, HOP).sum(-1)
-    return torch.where(count >= 0.75 * size, total / count.clamp(min=1), torch.nan)
+        return values.new_full((1, 2 * options.windows.reach + 1), torch.nan)
+    total = values.unfold(0, size, options.windows.hop).sum(-1)
+    count = known.double().unfold(0, size, options.windows.hop).sum(-1)
+    return torch.where(count >= options.windows.known * size, total / count.clamp(min=1), torch.nan)
 
 
-def evidence(a: Tensor, b: Tensor, lag: int) -> float:
+def evidence(a: Tensor, b: Tensor, lag: int, options: SyncOptions = SyncOptions()) -> float:
     r"""Nats that the windows of the overlap speak for ``lag`` (within one) rather than for any of the lags around it.
 
     .. math:: \sum_w \log\Bigl((1 - \epsilon)\,\frac{\sum_{|d| \le 1} p_w(d)}{3 / 25} + \epsilon\Bigr),\quad
@@ -167,30 +154,19 @@ def evidence(a: Tensor, b: Tensor, lag: int) -> float:
     Returns:
         At most 2.1 per window, at least -3; 0 where nothing is known.
     """
-    means = windows(a, b, lag)
+    means = windows(a, b, lag, options=options)
     known = means.isfinite()
-    share = torch.softmax(torch.where(known, SHARPNESS * means, -torch.inf), dim=1)
-    near = share[:, REACH - TOLERANCE : REACH + TOLERANCE + 1].sum(1)
-    chance = (2 * TOLERANCE + 1) / known.sum(1).clamp(min=1).double()
-    nats = torch.log((1 - OUTLIER) * near / chance + OUTLIER)
-    return float(nats[known.sum(1) > REACH].sum())
+    share = torch.softmax(torch.where(known, options.windows.sharpness * means, -torch.inf), dim=1)
+    near = share[:, options.windows.reach - options.windows.tolerance : options.windows.reach + options.windows.tolerance + 1].sum(
+        1
+    )
+    chance = (2 * options.windows.tolerance + 1) / known.sum(1).clamp(min=1).double()
+    nats = torch.log((1 - options.windows.outlier) * near / chance + options.windows.outlier)
+    return float(nats[known.sum(1) > options.windows.reach].sum())
 
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Whether the best lag may be believed: what else must hold besides being the best.
-
-
-LEAST = 0.35  # of the shorter take must overlap
-KERNEL_LEAST = 0.3  # of its kernels
-AGREE = 2  # frames: halves and kernel
-APART = 8  # frames from the best beyond which another peak is another answer
-SECOND = 0.8  # of the best score: a peak as high as this makes the motion periodic or the answer open
-BACKWARDS = 0.95  # of the best score: b played backwards must do worse
-LEAD = 30.0  # nats for doing better than b played backwards by 100 %
-ENOUGH = 31.0
-"""Nats: evidence of short windows, and the lead.  Training, 235 pairs of one event (213 best lags within 1 frame) and 1,175 of
-unrelated or reversed takes: 67 right, 1 wrong (by 2 frames) and none of the unrelated pass; at 25: 84, 2 and 3."""
-AGREED, OPEN = (16.5, 6.2), (23.3, 4.9)  # centre and scale of the logistic curve of confidence, on all these pairs
 
 
 @dataclass(frozen=True)
@@ -205,6 +181,7 @@ class Verdict:
         second: score of the next peak relative to the best.
         backwards: score of the best lag of b played backwards, relative.
         nats: evidence of short windows, profile and kernel.
+        options: what is enough.
     """
 
     curve: Curve
@@ -214,97 +191,99 @@ class Verdict:
     second: float
     backwards: float
     nats: float
+    options: VerdictOptions
 
     @property
     def weight(self) -> float:
-        """Evidence with the lead over the reversed take, in nats; ENOUGH is enough."""
-        return self.nats + LEAD * (1 - min(self.backwards, 2.0))
+        """Evidence with the lead over the reversed take, in nats; ``options.enough`` is enough."""
+        return self.nats + self.options.lead * (1 - min(self.backwards, 2.0))
 
     @property
     def agreed(self) -> bool:
         """Whether halves and kernel agree with the best lag."""
-        halves = all(abs(half - self.best) <= AGREE for half in self.halves)
-        return halves and self.kernel is not None and abs(self.kernel - self.best) <= AGREE
+        tolerance = self.options.tolerance
+        halves = all(abs(half - self.best) <= tolerance for half in self.halves)
+        return halves and self.kernel is not None and abs(self.kernel - self.best) <= tolerance
 
     @property
     def confidence(self) -> float:
         """Probability that the best lag is right to within a frame."""
-        centre, scale = AGREED if self.agreed and self.second <= SECOND else OPEN
+        options = self.options
+        centre, scale = options.agreed if self.agreed and self.second <= options.second else options.open
         return 1 / (1 + math.exp(-max(-30.0, min(30.0, (self.weight - centre) / scale))))
 
     def reason(self, rate: float) -> str:
         """Why the best lag is not to be believed; empty where it is."""
-        if self.second > SECOND:
+        tolerance = self.options.tolerance
+        if self.second > self.options.second:
             return (
                 f"another shift fits nearly as well ({100 * self.second:.0f} % of the best score): the motion repeats, or there is "
                 "too little of it; film longer and less regular motion, or give max_shift"
             )
-        if max(self.halves) - min(self.halves) > AGREE or any(abs(half - self.best) > AGREE for half in self.halves):
+        if max(self.halves) - min(self.halves) > tolerance or any(abs(half - self.best) > tolerance for half in self.halves):
             first, second = ((half - self.best) / rate for half in self.halves)
             return (
                 f"the halves of the overlap disagree with the whole (by {first:+.2f} and {second:+.2f} s): do both videos show "
                 "the same event? Use a longer overlap, or keypoints"
             )
-        if self.kernel is None or abs(self.kernel - self.best) > AGREE:
+        if self.kernel is None or abs(self.kernel - self.best) > tolerance:
             said = "has too few frames" if self.kernel is None else f"says {(self.kernel - self.best) / rate:+.2f} s from it"
             return f"the window kernel {said}, so the best shift is not confirmed; use a longer overlap, or keypoints"
-        if self.backwards > BACKWARDS:
+        if self.backwards > self.options.backwards:
             return "b fits as well when played backwards: the motion is symmetric in time, or of another time; use keypoints"
-        if self.weight < ENOUGH:
+        if self.weight < self.options.enough:
             return (
-                f"too little evidence ({self.weight:.0f} of {ENOUGH:.0f}): similar motion of another time would fit about as well; "
-                "use a longer overlap, or keypoints"
+                f"too little evidence ({self.weight:.0f} of {self.options.enough:.0f}): similar motion of another time would "
+                "fit about as well; use a longer overlap, or keypoints"
             )
         return ""
 
 
-def judge(a: Sampled, b: Sampled, lags: tuple[int, int], least: float) -> Verdict:
+def judge(a: Sampled, b: Sampled, lags: tuple[int, int], least: float, options: SyncOptions = SyncOptions()) -> Verdict:
     """The best lag of two takes between ``lags``, with at least ``least`` frames of overlap, and what else speaks for it."""
-    one, two = whitened(a.profile, b.profile)
-    curve = score_curve(one, two, least).within(*lags)
+    one, two = whitened(a.profile, b.profile, options=options)
+    curve = score_curve(one, two, least, options=options).within(*lags)
     if not bool(curve.scores.isfinite().any()):  # nothing moves in one of them
         nowhere = max(lags[0], min(0, lags[1]))
-        return Verdict(curve, nowhere, (nowhere, nowhere), None, 1.0, 1.0, 0.0)
+        return Verdict(curve, nowhere, (nowhere, nowhere), None, 1.0, 1.0, 0.0, options.verdict)
     best = curve.best
-    others = [float(curve.scores[k]) for k in curve.peaks(APART // 2) if abs(int(curve.lags[k]) - best) > APART]
+    others = [
+        float(curve.scores[k]) for k in curve.peaks(options.lags.apart // 2) if abs(int(curve.lags[k]) - best) > options.lags.apart
+    ]
     top = max(curve.at(best), 1e-9)
-    kernel, nats = _kernel_opinion(a, b, lags, best)
-    back = score_curve(*whitened(a.profile, b.backwards().profile), least)
+    kernel, nats = _kernel_opinion(a, b, lags, best, options)
+    back = score_curve(*whitened(a.profile, b.backwards().profile, options=options), least, options=options)
     return Verdict(
         curve=curve,
         best=best,
-        halves=_halves(one, two, best, lags),
+        halves=_halves(one, two, best, lags, options),
         kernel=kernel,
         second=max([*others, 0.0]) / top,
         backwards=float(back.scores.max()) / top,
-        nats=evidence(one, two, best) + nats,
+        nats=evidence(one, two, best, options=options) + nats,
+        options=options.verdict,
     )
 
 
-def _halves(one: torch.Tensor, two: torch.Tensor, best: int, lags: tuple[int, int]) -> tuple[int, int]:
+def _halves(one: torch.Tensor, two: torch.Tensor, best: int, lags: tuple[int, int], options: SyncOptions) -> tuple[int, int]:
     low, high = max(0, -best), min(len(one), len(two) - best)
     middle = (low + high) // 2
-    first, second = (part_curve(one, two, rows).within(*lags).best for rows in (slice(low, middle), slice(middle, high)))
+    first, second = (
+        part_curve(one, two, rows, options=options).within(*lags).best for rows in (slice(low, middle), slice(middle, high))
+    )
     return first, second
 
 
-def _kernel_opinion(a: Sampled, b: Sampled, lags: tuple[int, int], best: int) -> tuple[int | None, float]:
+def _kernel_opinion(a: Sampled, b: Sampled, lags: tuple[int, int], best: int, options: SyncOptions) -> tuple[int | None, float]:
     """Best lag of the window kernels, and the evidence of their windows for ``best``."""
     shorter = min(len(a.kernels), len(b.kernels))
-    if shorter < HALF or not all(bool(x.kernels.isfinite().all(-1).all(-1).any()) for x in (a, b)):
+    if shorter < options.kernel.half or not all(bool(x.kernels.isfinite().all(-1).all(-1).any()) for x in (a, b)):
         return None, 0.0
-    one, two = kernel_descriptors(a.kernels, b.kernels)
-    curve = score_curve(one, two, KERNEL_LEAST * shorter).within(*lags)
+    one, two = kernel_descriptors(a.kernels, b.kernels, options=options)
+    curve = score_curve(one, two, options.lags.kernel_overlap * shorter, options=options).within(*lags)
     found = curve.best if bool(curve.scores.isfinite().any()) else None
     overlap = min(len(one), len(two) - best) - max(0, -best)
-    return found, evidence(one, two, best) if overlap >= 5 else 0.0
-
-
-PEAKS = 10  # reported at most
-LIVELIEST = 10  # frames in which something moves, at least
-FLOOR = 0.35
-"""Frames of the grid: standard deviation of an accepted offset.  Measured .24 to .32 RMS on shifts by quarters of a frame and
-four pairs of rates: the parabola is hardly better than whole frames (.29)."""
+    return found, evidence(one, two, best, options=options) if overlap >= options.windows.fewest_kernels else 0.0
 
 
 @on_cpu
@@ -317,6 +296,7 @@ def brightness_shift(
     times: tuple[Any, Any] | None = None,
     max_shift: float | None = None,
     region: str | Region | None = "motion",
+    options: SyncOptions = SyncOptions(),
 ) -> Shift:
     r"""How camera b's clock runs against camera a's, from brightness alone, or why that cannot be told.
 
@@ -342,6 +322,7 @@ def brightness_shift(
         max_shift: seconds; offsets beyond are not considered.
         region: ``"motion"``: the box about what moves, found by itself, following a person who crosses the image;
             ``(x0, y0, x1, y1)`` in pixels: about what moves in there, in both videos; None: whole images.
+        options: every number that decides, by stage.
 
     Returns:
         :class:`dyntorch.Shift` with ``method="brightness"`` and rate 1 (clock rates are not fitted).  Where ``ok`` is false,
@@ -361,11 +342,12 @@ def brightness_shift(
         >>> shift.ok, round(shift.frames)
         (True, 20)
     """
-    first, second = _takes(a, b, fps, times)
+    check_options(options, SyncOptions)
+    first, second = _takes(a, b, fps, times, options)
     if max_shift is not None and not (math.isfinite(max_shift) and max_shift >= 0):
         raise ValueError(f"max_shift must be seconds, 0 or more, got {max_shift!r}")
-    rate = common_rate(first, second)
-    (one, why_a, notes_a), (two, why_b, notes_b) = (_prepared(each, region, rate) for each in (first, second))
+    rate = common_rate(first, second, options=options)
+    (one, why_a, notes_a), (two, why_b, notes_b) = (_prepared(each, region, rate, options) for each in (first, second))
     base = two.start - one.start
     span = (1 - len(one.profile), len(two.profile) - 1)
     if max_shift is not None:
@@ -373,37 +355,41 @@ def brightness_shift(
             max(span[0], math.ceil((-max_shift - base) * rate - 1e-6)),
             min(span[1], math.floor((max_shift - base) * rate + 1e-6)),
         )
-    least = max(float(FEWEST), LEAST * min(len(one.profile), len(two.profile)))
+    least = max(float(options.gray.fewest), options.lags.overlap * min(len(one.profile), len(two.profile)))
     longest = min(len(one.profile), len(two.profile) - span[0]) - max(0, -span[1])
     if span[0] > span[1] or longest < least:
         raise ValueError(
             f"max_shift {max_shift!r}: within it the videos overlap by less than {least:.0f} frames at {rate:.3g} per second; "
             "allow larger shifts or give longer videos"
         )
-    verdict = judge(one, two, span, least)
-    return _shift((first, second), (one, two), verdict, "; ".join(filter(None, (why_a, why_b))), notes_a + notes_b)
+    verdict = judge(one, two, span, least, options=options)
+    return _shift((first, second), (one, two), verdict, "; ".join(filter(None, (why_a, why_b))), notes_a + notes_b, options)
 
 
-def _takes(a: Any, b: Any, fps: tuple[float, float] | None, times: tuple[Any, Any] | None) -> tuple[GrayTake, GrayTake]:
+def _takes(
+    a: Any, b: Any, fps: tuple[float, float] | None, times: tuple[Any, Any] | None, options: SyncOptions
+) -> tuple[GrayTake, GrayTake]:
     for name, pair in (("fps", fps), ("times", times)):
         if pair is not None and not (isinstance(pair, (tuple, list)) and len(pair) == 2):
             raise ValueError(f"{name} must be a pair, one for each video, got {pair!r}")
     rates, stamps = fps or (None, None), times or (None, None)
-    return take(a, "a", rates[0], stamps[0]), take(b, "b", rates[1], stamps[1])
+    return take(a, "a", rates[0], stamps[0], options=options), take(b, "b", rates[1], stamps[1], options=options)
 
 
-def _prepared(source: GrayTake, region: str | Region | None, rate: float) -> tuple[Sampled, str, tuple[str, ...]]:
+def _prepared(
+    source: GrayTake, region: str | Region | None, rate: float, options: SyncOptions
+) -> tuple[Sampled, str, tuple[str, ...]]:
     """A take on the grid, why it decides nothing (else empty), and what else to know of it."""
     height, width = source.frames.shape[1:]
-    found = motion(source.frames, None if region is None else _inside(region, source))
-    box, moving = boxes(found, source.fps)
+    found = motion(source.frames, None if region is None else _inside(region, source), options=options)
+    box, moving = boxes(found, source.fps, options=options)
     if region is None:
         whole = torch.tensor([[width / 2, height / 2, max(width, height)]], dtype=torch.float64)
         box, moving = whole.expand(len(source.frames), 3), False
-    on_grid, name = sampled(source, box, rate), source.name
+    on_grid, name = sampled(source, box, rate, options=options), source.name
     if found.drift.hopeless:
         return on_grid, f"all of {name} changes: its camera moves fast, or the light flickers; stabilize the video first", ()
-    if int(found.lively.sum()) < LIVELIEST:
+    if int(found.lively.sum()) < options.box.liveliest:
         return on_grid, f"nothing moves in {name}; choose a take with motion", ()
     if found.drift.moves:
         step = float(found.drift.step.norm(dim=1).mean()) / source.scale
@@ -427,18 +413,23 @@ def _inside(region: str | Region, source: GrayTake) -> Region | None:
 
 
 def _shift(
-    takes: tuple[GrayTake, GrayTake], grids: tuple[Sampled, Sampled], verdict: Verdict, why: str, notes: tuple[str, ...]
+    takes: tuple[GrayTake, GrayTake],
+    grids: tuple[Sampled, Sampled],
+    verdict: Verdict,
+    why: str,
+    notes: tuple[str, ...],
+    options: SyncOptions,
 ) -> Shift:
     (one, two), curve, best = grids, verdict.curve, verdict.best
     rate, base = one.rate, two.start - one.start
-    found = curve.peaks(APART // 2)[:PEAKS]
+    found = curve.peaks(options.lags.apart // 2)[: options.lags.peaks]
     places = torch.tensor([int(curve.lags[k]) + curve.offset(int(curve.lags[k])) for k in found], dtype=torch.float64)
     reason = why or verdict.reason(rate)
     low, high = max(0, -best), min(len(one.profile), len(two.profile) - best)
     spread = max(abs(half - best) for half in verdict.halves) / 2
     return Shift(
         offset=base + (best + curve.offset(best)) / rate,
-        sigma=math.hypot(FLOOR, spread) / rate,
+        sigma=math.hypot(options.lags.floor, spread) / rate,
         rate=1.0,
         rate_sigma=0.0,
         confidence=0.0 if why else verdict.confidence,

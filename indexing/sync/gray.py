@@ -15,24 +15,17 @@ from torch.nn.functional import avg_pool1d, conv1d, grid_sample, normalize
 from indexing.brightness.features import as_grey, blur, gradients, weighted_differences
 from indexing.brightness.footage import SHRINKING_BLOCK as FOOTAGE_BLOCK
 from indexing.brightness.footage import Shrinker
+from indexing.sync.options import SyncOptions
 
 # ----------------------------------------------------------------------------------------------------------------------
 # The row-band profile: how much moves up, down and sideways, at which height of the box, frame by frame.
 
 
-SIGMA = 1.5  # px of the 96 px crop
-BANDS = 6  # rows 4..12: the same
-QUIET = 2.0
-"""Times the median brightness change, below which change is noise.  Share within 1 frame at 0 / 2 / 4, training seeds: CMU in
-place, 70 frames, noise 8: .78 / .88 / .82; walking and running .68 / .72 / .72; 150 frames: all the same."""
-REACH, RIDGE = 3, 0.05
-"""Frames on either side that are whitened together, and the ridge.  Share within 1 frame of 218 training pairs of all kinds: no
-neighbours, ridge .1: .86; reach 2 / 3 / 4 / 6, ridge .1: .89 / .90 / .90 / .90; reach 3, ridge .03 / .2: .91 / .87."""
 PROFILE_BLOCK = 32  # frames at once
 
 
-def row_profile(crops: Tensor, bands: int = BANDS) -> Tensor:
-    """``(T, 3 * bands)`` motion upwards, downwards and sideways in ``bands`` rows that overlap by half, of crops ``(T, s, s)``.
+def row_profile(crops: Tensor, options: SyncOptions = SyncOptions()) -> Tensor:
+    """``(T, 3 * bands)`` motion upwards, downwards and sideways in bands of rows that overlap by half, of crops ``(T, s, s)``.
 
     Square roots of means over the full width: cameras that stand upright share the height of what they see, not its place across,
     and the sign of sideways motion depends on the side from which a camera looks.
@@ -40,10 +33,10 @@ def row_profile(crops: Tensor, bands: int = BANDS) -> Tensor:
     parts = []
     for begin in range(0, len(crops), PROFILE_BLOCK):
         first, end = max(begin - 1, 0), min(begin + PROFILE_BLOCK + 1, len(crops))
-        gx, gy, gt = gradients(blur(crops[first:end], SIGMA))
-        gt = gt.sign() * (gt.abs() - QUIET * gt.abs().median()).clamp(min=0)
+        gx, gy, gt = gradients(blur(crops[first:end], options.profile.sigma))
+        gt = gt.sign() * (gt.abs() - options.profile.quiet * gt.abs().median()).clamp(min=0)
         u, v = weighted_differences(gx, gy, gt)
-        parts.append(_pooled(u, v, bands)[begin - first : begin - first + PROFILE_BLOCK])
+        parts.append(_pooled(u, v, options.profile.bands)[begin - first : begin - first + PROFILE_BLOCK])
     return torch.cat(parts)
 
 
@@ -60,7 +53,7 @@ def _pooled(u: Tensor, v: Tensor, bands: int) -> Tensor:
     return pooled.sqrt().flatten(1).double()
 
 
-def whitened(first: Tensor, second: Tensor, ridge: float = RIDGE, reach: int = REACH) -> tuple[Tensor, Tensor]:
+def whitened(first: Tensor, second: Tensor, options: SyncOptions = SyncOptions()) -> tuple[Tensor, Tensor]:
     r"""Both cameras' profiles in space and time: centred, whitened by the covariance that they share, of norm 1 per frame.
 
     .. math:: z_t \leftarrow \frac{W (y_t - \bar y)}{\|\cdot\|},\quad y_t = (z_{t-3}, \dots, z_{t+3}),\quad
@@ -75,12 +68,12 @@ def whitened(first: Tensor, second: Tensor, ridge: float = RIDGE, reach: int = R
     Returns:
         ``(T, (2 reach + 1) D)`` each.
     """
-    around = torch.arange(-reach, reach + 1)
+    around = torch.arange(-options.profile.reach, options.profile.reach + 1)
     stacked = [z[(torch.arange(len(z))[:, None] + around).clamp(0, len(z) - 1)].flatten(1) for z in (first, second)]
     known = [y.isfinite().all(1) for y in stacked]
     centred = [y - y[seen].mean(0) for y, seen in zip(stacked, known, strict=True)]
     a, b = (y[seen] for y, seen in zip(centred, known, strict=True))
-    root = inverse_root((a.T @ a / len(a) + b.T @ b / len(b)) / 2, ridge)
+    root = inverse_root((a.T @ a / len(a) + b.T @ b / len(b)) / 2, options.profile.ridge)
     one, two = (normalize((y @ root).nan_to_num(0.0), dim=1, eps=1e-9) for y in centred)
     return one, two
 
@@ -96,17 +89,12 @@ def inverse_root(matrix: Tensor, ridge: float) -> Tensor:
 # A grey video as the direct method reads it: small 8-bit frames and their times, from an array or from chunks of any number.
 
 
-LARGEST = 320  # px of the longer side kept: a person a quarter as tall as a 1080p image keeps 45 px
-FEWEST = 20  # frames
-SMALLEST = 16  # px of the shorter side
-
-
 @dataclass(frozen=True, eq=False)
 class GrayTake:
     """What is kept of a video.
 
     Attributes:
-        frames: ``(T, h, w)`` uint8, the longer side at most LARGEST; of a stream, in a file that goes with the object.
+        frames: ``(T, h, w)`` uint8, the longer side at most ``largest``; of a stream, in a file that goes with the object.
         times: ``(T,)`` float64 seconds, increasing.
         scale: pixels here per pixel of the video.
         name: for messages.
@@ -123,7 +111,7 @@ class GrayTake:
         return float(1 / self.times.diff().median())
 
 
-def take(source: Any, name: str, fps: float | None = None, times: Any = None) -> GrayTake:
+def take(source: Any, name: str, fps: float | None = None, times: Any = None, *, options: SyncOptions = SyncOptions()) -> GrayTake:
     """Read a video once.
 
     Args:
@@ -136,11 +124,11 @@ def take(source: Any, name: str, fps: float | None = None, times: Any = None) ->
     Raises:
         ValueError: something else, missing values, fewer than 20 frames, no times at all, or times that do not increase.
     """
-    spool = _Spool(name, LARGEST, SMALLEST)
+    spool = _Spool(name, options.gray.largest, options.gray.smallest)
     if not isinstance(source, (np.ndarray, Tensor)):
         with tempfile.TemporaryFile() as file:
             stamps = [stamp for stamp in (spool.add(part, file) for part in _parts(source, name)) if stamp is not None]
-            spool.check()
+            spool.check(options=options)
             file.flush()
             frames = torch.from_numpy(np.memmap(file, np.uint8, "r+", shape=(spool.count, *spool.size)))
         if stamps and times is None:
@@ -149,7 +137,7 @@ def take(source: Any, name: str, fps: float | None = None, times: Any = None) ->
         if source.ndim < 3:
             raise ValueError(f"{name}: expected grey frames (frames, h, w), got an array of shape {tuple(source.shape)}")
         small = [spool.bytes(source[begin : begin + FOOTAGE_BLOCK]) for begin in range(0, max(len(source), 1), FOOTAGE_BLOCK)]
-        spool.check()
+        spool.check(options=options)
         frames = torch.cat(small)
     return GrayTake(frames, _times(times, fps, len(frames), name), spool.scale, name)
 
@@ -184,10 +172,10 @@ class _Spool(Shrinker):
         """``(n, h, w)`` uint8 of a chunk."""
         return self(frames).round_().to(torch.uint8)
 
-    def check(self) -> None:
+    def check(self, options: SyncOptions = SyncOptions()) -> None:
         """Raise where there are too few frames."""
-        if self.count < FEWEST:
-            raise ValueError(f"{self.name}: {self.count} frames; at least {FEWEST} are needed")
+        if self.count < options.gray.fewest:
+            raise ValueError(f"{self.name}: {self.count} frames; at least {options.gray.fewest} are needed")
 
 
 def _times(times: Any, fps: float | None, frames: int, name: str) -> Tensor:
@@ -209,16 +197,6 @@ def _times(times: Any, fps: float | None, frames: int, name: str) -> Tensor:
 # Whether the camera moves: the flow of the image's border, where the background is.
 
 
-BORDER = 0.12  # of the image, on each side
-EXPLAINED = (
-    0.5  # share of the border's change that one translation must explain; a person who crosses the border leaves most unexplained
-)
-LEAST = 0.05  # px per frame: below, a tripod
-OFTEN = 0.1  # share of the frames
-CHANGE = 0.02  # grey 0..1 per frame: 5 standard deviations of a noise of 8 grey levels, after the blur
-CHANGED = 0.3  # share of the border that changes so without one translation: a fast pan, a cut, flicker
-
-
 @dataclass(frozen=True)
 class Drift:
     """Motion of the background.
@@ -226,20 +204,22 @@ class Drift:
     Attributes:
         step: ``(T, 2)`` px per frame where it is followed, else 0.
         lost: ``(T,)`` bool, where it cannot be.
+        often: share of the frames from which either counts.
     """
 
     step: Tensor
     lost: Tensor
+    often: float
 
     @property
     def moves(self) -> bool:
         """Whether the camera moves."""
-        return bool((self.step.norm(dim=1) > 0).double().mean() > OFTEN)
+        return bool((self.step.norm(dim=1) > 0).double().mean() > self.often)
 
     @property
     def hopeless(self) -> bool:
         """Whether it moves faster than can be followed, or the light changes."""
-        return bool(self.lost.double().mean() > OFTEN)
+        return bool(self.lost.double().mean() > self.often)
 
     @property
     def path(self) -> Tensor:
@@ -247,7 +227,7 @@ class Drift:
         return self.step.cumsum(0)
 
 
-def drift(gx: Tensor, gy: Tensor, gt: Tensor) -> Drift:
+def drift(gx: Tensor, gy: Tensor, gt: Tensor, options: SyncOptions = SyncOptions()) -> Drift:
     r"""Translation of the border of each frame from gradients ``(T, h, w)``, by least squares.
 
     .. math:: I_t = -(I_x, I_y)\,d + c
@@ -259,7 +239,7 @@ def drift(gx: Tensor, gy: Tensor, gt: Tensor) -> Drift:
         The motion per frame where one translation explains the change.
     """
     inside = torch.ones(gt.shape[1:], dtype=torch.bool, device=gt.device)
-    rows, columns = (max(2, round(BORDER * n)) for n in gt.shape[1:])
+    rows, columns = (max(2, round(options.drift.border * n)) for n in gt.shape[1:])
     inside[rows:-rows, columns:-columns] = False
     change = gt[:, inside].double()
     design = torch.stack([*(g[:, inside].double() for g in (gx, gy)), torch.ones_like(change)], dim=2)
@@ -270,25 +250,15 @@ def drift(gx: Tensor, gy: Tensor, gt: Tensor) -> Drift:
     step = found[:, :2, 0]
     spread = change - change.mean(1, keepdim=True)
     explained = 1 - left.square().sum(1) / spread.square().sum(1).clamp(min=1e-12)
-    follows = (explained > EXPLAINED) & (step.norm(dim=1) > LEAST)
-    lost = ((left.abs() > CHANGE).double().mean(1) > CHANGED) & ~follows
-    return Drift(step * follows[:, None], lost)
+    follows = (explained > options.drift.explained) & (step.norm(dim=1) > options.drift.least)
+    lost = ((left.abs() > options.drift.change).double().mean(1) > options.drift.changed) & ~follows
+    return Drift(step * follows[:, None], lost, options.drift.often)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Where something moves: the box of a take, and the box that follows a person across the image or the image with its camera.
 
 
-SIDE = 96  # px of a crop
-BOX_QUIET = 0.006  # grey 0..1 per frame: less than this is noise
-NOISE = 6.0  # times the median change: 4 standard deviations, 1 pixel in 16,000 by chance
-BOX_SIGMA = 1.5
-INSIDE = (0.02, 0.98)  # quantiles of the motion that a box encloses
-PAD = 0.15  # of the box, on each side
-BOX_SMALLEST = 0.35  # of the image's height
-FOLLOW = 0.2  # seconds over which a moving box is smoothed
-WIDER = 1.6  # times the moving box, from which the box of the take is too wide
-LIVELY = 3e-4  # of the pixels must change in a frame that shows motion: 5 times what noise does
 BOX_BLOCK = 32
 
 Region = tuple[float, float, float, float]
@@ -302,17 +272,19 @@ class GrayMotion:
         rows, columns: ``(T, h)`` and ``(T, w)`` sums of the brightness change above the noise.
         changed: ``(T,)`` share of the pixels that change.
         drift: how the background moves.
+        least_changed: share from which a frame shows motion.
     """
 
     rows: Tensor
     columns: Tensor
     changed: Tensor
     drift: Drift
+    least_changed: float
 
     @property
     def lively(self) -> Tensor:
         """``(T,)`` bool: frames in which something moves."""
-        return self.changed > LIVELY
+        return self.changed > self.least_changed
 
     @property
     def activity(self) -> Tensor:
@@ -320,16 +292,16 @@ class GrayMotion:
         return self.rows.sum(1) / (self.rows.shape[1] * self.columns.shape[1])
 
 
-def motion(frames: Tensor, region: Region | None = None) -> GrayMotion:
+def motion(frames: Tensor, region: Region | None = None, *, options: SyncOptions = SyncOptions()) -> GrayMotion:
     """What moves in frames ``(T, h, w)``, in a region ``(x0, y0, x1, y1)`` of their pixels, after the background's own motion."""
     rows, columns, changed, steps, lost = [], [], [], [], []
     for begin in range(0, len(frames), BOX_BLOCK):
         first, end = max(begin - 1, 0), min(begin + BOX_BLOCK + 1, len(frames))
-        gx, gy, gt = (g[begin - first :][:BOX_BLOCK] for g in gradients(blur(as_grey(frames[first:end]), BOX_SIGMA)))
-        camera = drift(gx, gy, gt)
+        gx, gy, gt = (g[begin - first :][:BOX_BLOCK] for g in gradients(blur(as_grey(frames[first:end]), options.box.sigma)))
+        camera = drift(gx, gy, gt, options=options)
         dx, dy = camera.step.float().T[..., None, None]
         change = (gt + gx * dx + gy * dy).abs()
-        change = (change - max(BOX_QUIET, NOISE * float(change.median()))).clamp(min=0)
+        change = (change - max(options.box.quiet, options.box.noise * float(change.median()))).clamp(min=0)
         if region is not None:
             x0, y0, x1, y1 = (round(v) for v in region)
             mask = change.new_zeros(change.shape[1:])
@@ -340,38 +312,49 @@ def motion(frames: Tensor, region: Region | None = None) -> GrayMotion:
         changed.append((change > 0).double().mean((1, 2)))
         steps.append(camera.step)
         lost.append(camera.lost)
-    return GrayMotion(torch.cat(rows), torch.cat(columns), torch.cat(changed), Drift(torch.cat(steps), torch.cat(lost)))
+    return GrayMotion(
+        torch.cat(rows),
+        torch.cat(columns),
+        torch.cat(changed),
+        Drift(torch.cat(steps), torch.cat(lost), options.drift.often),
+        options.box.lively,
+    )
 
 
-def boxes(found: GrayMotion, fps: float) -> tuple[Tensor, bool]:
+def boxes(found: GrayMotion, fps: float, options: SyncOptions = SyncOptions()) -> tuple[Tensor, bool]:
     """``(T, 3)`` centre x, centre y and side in pixels of the square about what moves, frame by frame, and whether it moves.
 
     One box for the take, or, where a person crosses the image, one of constant size that follows the person smoothly.
     """
     height = found.rows.shape[1]
     path = found.drift.path if found.drift.moves else found.rows.new_zeros(len(found.rows), 2)
-    across, along = (_quantiles(_smooth(m, FOLLOW * fps)) for m in (found.columns, found.rows))
-    following = _square(across, along, height)
-    seen = _smooth(found.lively.double()[:, None], FOLLOW * fps)[:, 0] > 0
-    whole = _square(_quantiles(found.columns.sum(0, keepdim=True)), _quantiles(found.rows.sum(0, keepdim=True)), height)
+    across, along = (_quantiles(_smooth(m, options.box.follow * fps), options) for m in (found.columns, found.rows))
+    following = _square(across, along, height, options)
+    seen = _smooth(found.lively.double()[:, None], options.box.follow * fps)[:, 0] > 0
+    whole = _square(
+        _quantiles(found.columns.sum(0, keepdim=True), options),
+        _quantiles(found.rows.sum(0, keepdim=True), options),
+        height,
+        options,
+    )
     size = following[seen, 2].median() if bool(seen.any()) else whole[0, 2]
-    if found.drift.moves or whole[0, 2] > WIDER * size:
+    if found.drift.moves or whole[0, 2] > options.box.wider * size:
         following[~seen] = whole
-        centre = _smooth(following[:, :2] - path, FOLLOW * fps) + path
+        centre = _smooth(following[:, :2] - path, options.box.follow * fps) + path
         return torch.cat([centre, size.expand(len(centre), 1)], dim=1), True
     return whole.expand(len(path), 3), False
 
 
-def _quantiles(marginals: Tensor) -> Tensor:
-    """``(T, 2)`` positions between which INSIDE of the sums of ``(T, n)`` lie."""
+def _quantiles(marginals: Tensor, options: SyncOptions) -> Tensor:
+    """``(T, 2)`` positions between which ``options.box.inside`` of the sums of ``(T, n)`` lie."""
     total = marginals.cumsum(1)
     share = total / total[:, -1:].clamp(min=1e-12)
-    return torch.stack([(share < q).sum(1).double() + end for q, end in zip(INSIDE, (0.0, 1.0), strict=True)], dim=1)
+    return torch.stack([(share < q).sum(1).double() + end for q, end in zip(options.box.inside, (0.0, 1.0), strict=True)], dim=1)
 
 
-def _square(across: Tensor, along: Tensor, height: int) -> Tensor:
-    size = torch.maximum(across[:, 1] - across[:, 0], along[:, 1] - along[:, 0]) * (1 + 2 * PAD)
-    return torch.stack([across.mean(1), along.mean(1), size.clamp(min=BOX_SMALLEST * height)], dim=1)
+def _square(across: Tensor, along: Tensor, height: int, options: SyncOptions) -> Tensor:
+    size = torch.maximum(across[:, 1] - across[:, 0], along[:, 1] - along[:, 0]) * (1 + 2 * options.box.pad)
+    return torch.stack([across.mean(1), along.mean(1), size.clamp(min=options.box.smallest * height)], dim=1)
 
 
 def _smooth(values: Tensor, sigma: float) -> Tensor:
@@ -382,7 +365,7 @@ def _smooth(values: Tensor, sigma: float) -> Tensor:
     return conv1d(values.T[:, None], kernel, padding=reach)[:, 0].T / weight
 
 
-def crop(frames: Tensor, where: Tensor, side: int = SIDE) -> Tensor:
+def crop(frames: Tensor, where: Tensor, side: int) -> Tensor:
     """``(n, side, side)`` float32 crops of frames ``(n, h, w)`` in boxes ``(n, 3)``; the border is repeated outside the image."""
     height, width = frames.shape[1:]
     steps = (torch.arange(side, device=where.device) + 0.5) / side - 0.5
@@ -407,16 +390,13 @@ def crop(frames: Tensor, where: Tensor, side: int = SIDE) -> Tensor:
 # with no rank to choose.
 
 
-KERNEL_SIGMA = 2.0  # px: motion within a window must be small against it
-HALF = 10  # frames on either side of the reference
-PATCH = 10  # px
-ROWS = 80  # kept: those of most energy
 KERNEL_BLOCK = 4  # reference frames at once
 
 
-def window_kernels(crops: Tensor, half: int = HALF, patch: int = PATCH, rows: int = ROWS) -> Tensor:
+def window_kernels(crops: Tensor, options: SyncOptions = SyncOptions()) -> Tensor:
     """``(T - 2 half, L, L)`` float64 of crops ``(T, s, s)``, trace 1 (0 if nothing moves); the first is frame ``half``."""
-    frames = blur(crops, KERNEL_SIGMA)
+    half, patch = options.kernel.half, options.kernel.patch
+    frames = blur(crops, options.kernel.sigma)
     gx, gy = (torch.zeros_like(frames) for _ in range(2))
     gx[:, :, 1:-1] = (frames[:, :, 2:] - frames[:, :, :-2]) / 2
     gy[:, 1:-1] = (frames[:, 2:] - frames[:, :-2]) / 2
@@ -430,8 +410,8 @@ def window_kernels(crops: Tensor, half: int = HALF, patch: int = PATCH, rows: in
         h = steep @ windows
         h = h - h[..., half : half + 1]
         energy = steep.square().sum(-1, keepdim=True)
-        h = h / (energy + 0.05 * energy.amax((1, 2, 3), keepdim=True)).clamp(min=1e-12).sqrt()
-        out[begin : begin + count] = _kernel(h.flatten(1, 2).double(), rows)
+        h = h / (energy + options.kernel.damping * energy.amax((1, 2, 3), keepdim=True)).clamp(min=1e-12).sqrt()
+        out[begin : begin + count] = _kernel(h.flatten(1, 2).double(), options.kernel.rows)
     return out
 
 
@@ -452,28 +432,26 @@ def _kernel(h: Tensor, rows: int) -> Tensor:
     return kernel / trace.clamp(min=1e-12)[:, None, None]
 
 
-def kernel_descriptors(first: Tensor, second: Tensor, ridge: float = 0.02) -> tuple[Tensor, Tensor]:
+def kernel_descriptors(first: Tensor, second: Tensor, options: SyncOptions = SyncOptions()) -> tuple[Tensor, Tensor]:
     """Both cameras' kernels ``(n, L, L)`` as unit vectors ``(n, L * L)``: whitened by the mean kernel, the mean removed.
 
     Kernels that hold NaN (missing frames) become 0.
     """
     kernels = torch.cat([first, second])
     known = kernels.isfinite().all(-1).all(-1)
-    root = inverse_root(kernels[known].mean(0), ridge)
+    root = inverse_root(kernels[known].mean(0), options.kernel.ridge)
     white = root @ kernels @ root
     flat = (white - white[known].mean(0)).flatten(1).nan_to_num(0.0)
     flat = normalize(flat, dim=1, eps=1e-9)
     return flat[: len(first)], flat[len(first) :]
 
 
-FASTEST = 45.0  # frames per second: faster video is compared at a half, a third... of its rate; windows were chosen at 30
-GAP = 2.5  # frames: over longer gaps nothing is interpolated
 BLOCK = 64  # grid frames at once
 
 
 @dataclass(frozen=True)
 class Sampled:
-    """A take on the grid: ``profile (T, D)``, ``kernels (T - 2 HALF, L, L)`` (the first at frame HALF); NaN in gaps.
+    """A take on the grid: ``profile (T, D)``, ``kernels (T - 2 half, L, L)`` (the first at frame ``half``); NaN in gaps.
 
     Attributes:
         start: seconds, of the first frame of the grid.
@@ -490,30 +468,30 @@ class Sampled:
         return Sampled(reversed_profile(self.profile), self.kernels.flip(0, 1, 2), self.start, self.rate)
 
 
-def common_rate(first: GrayTake, second: GrayTake) -> float:
+def common_rate(first: GrayTake, second: GrayTake, options: SyncOptions = SyncOptions()) -> float:
     """The rate of the slower video, or a whole fraction of it."""
     rate = min(first.fps, second.fps)
-    return rate / -(-rate // FASTEST)
+    return rate / -(-rate // options.gray.fastest)
 
 
-def sampled(source: GrayTake, where: Tensor, rate: float) -> Sampled:
+def sampled(source: GrayTake, where: Tensor, rate: float, options: SyncOptions = SyncOptions()) -> Sampled:
     """Profile and kernels of a take in boxes ``(T, 3)`` of its frames, block by block."""
     start = float(source.times[0])
     count = int((float(source.times[-1]) - start) * rate + 1e-6) + 1
     profiles, kernels = [], []
     for begin in range(0, count, BLOCK):
-        first, end = max(begin - HALF, 0), min(begin + BLOCK + HALF, count)
-        crops, known = _crops(source, where, start + torch.arange(first, end, dtype=torch.float64) / rate)
-        part = row_profile(crops)
+        first, end = max(begin - options.kernel.half, 0), min(begin + BLOCK + options.kernel.half, count)
+        crops, known = _crops(source, where, start + torch.arange(first, end, dtype=torch.float64) / rate, options)
+        part = row_profile(crops, options=options)
         part[~_around(known, 1)] = torch.nan
         profiles.append(part[begin - first :][: min(BLOCK, count - begin)])
-        found = window_kernels(crops).float()
-        found[~_around(known, HALF)[HALF : HALF + len(found)]] = torch.nan
+        found = window_kernels(crops, options=options).float()
+        found[~_around(known, options.kernel.half)[options.kernel.half : options.kernel.half + len(found)]] = torch.nan
         kernels.append(found)
     return Sampled(torch.cat(profiles), torch.cat(kernels), start, rate)
 
 
-def _crops(source: GrayTake, where: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
+def _crops(source: GrayTake, where: Tensor, times: Tensor, options: SyncOptions) -> tuple[Tensor, Tensor]:
     """Crops at any times, blended from the frames before and after, and whether these are near enough."""
     stamps = source.times
     after = torch.searchsorted(stamps, times - 1e-9).clamp(1, len(stamps) - 1)
@@ -524,11 +502,13 @@ def _crops(source: GrayTake, where: Tensor, times: Tensor) -> tuple[Tensor, Tens
     box = torch.lerp(where[before], where[after], share[:, None])
     low, high = int(before[0]), int(after[-1]) + 1
     frames = source.frames[low:high]
-    out = crop(frames[torch.where(share < 1, before, after) - low], box)
+    out = crop(frames[torch.where(share < 1, before, after) - low], box, options.box.side)
     mixed = ((share > 0) & (share < 1)).nonzero()[:, 0]
     if len(mixed):
-        out[mixed] = torch.lerp(out[mixed], crop(frames[after[mixed] - low], box[mixed]), share[mixed].float()[:, None, None])
-    known = (span <= GAP / source.fps) | (share == 0) | (share == 1)
+        out[mixed] = torch.lerp(
+            out[mixed], crop(frames[after[mixed] - low], box[mixed], options.box.side), share[mixed].float()[:, None, None]
+        )
+    known = (span <= options.gray.gap / source.fps) | (share == 0) | (share == 1)
     return out, known
 
 

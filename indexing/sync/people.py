@@ -11,20 +11,11 @@ import numpy as np
 
 from indexing.clip import Clip
 from indexing.skeleton import Skeleton, known
+from indexing.sync.options import SyncOptions
 from indexing.sync.takes import FloatArray, Take
 
 if TYPE_CHECKING:
     from dyntorch import Shift
-
-LEAST = 8  # joints of the same name in two layouts, for them to be compared as the same points
-TOLERANCE = 2.0  # frames within which two answers are the same
-LIKELIEST = 3  # pairings that are tried thoroughly where a fast look is sure of none
-WEAK = 0.5  # of the best pairing's confidence, below which an answer that differs is no rival
-# Times the usual distance, for how many seconds, by how many joints: what makes a stretch of another person.  Of one person, the
-# running median stays below 1.5 (pose2sim, all pairs, and actors); of two who were swapped 10 m apart it reaches 2 to 3, because
-# two who stand upright fit each other's epipolar lines.
-AWAY, LASTING, SEEN = 2.0, 0.25, 4
-JUMP = 0.5  # box diagonals from one frame to the next: another person
 
 
 Solve = Callable[[Clip, Clip], "Shift"]
@@ -45,7 +36,7 @@ class Pairing:
     rivals: tuple[float, ...] = ()
 
 
-def match_people(a: Take, b: Take, solve: Solve, trial: Solve | None = None) -> Pairing:
+def match_people(a: Take, b: Take, solve: Solve, trial: Solve | None = None, *, options: SyncOptions = SyncOptions()) -> Pairing:
     """The pairing of people on which the evidence is best.
 
     Where people do different things at different times, a wrong pairing may look right, too: pairings that are sure of
@@ -63,15 +54,19 @@ def match_people(a: Take, b: Take, solve: Solve, trial: Solve | None = None) -> 
     found: list[Pairing] = []
     for i, j in every:
         found.append(Pairing((trial or solve)(a.people[i], b.people[j]), (i, j)))
-        if backing(found[-1], found, frame) > 1:  # two people of each camera say the same
+        if backing(found[-1], found, frame, options=options) > 1:  # two people of each camera say the same
             break
     if trial is not None:  # the last word on the winner, or where none is sure, on the likeliest
         ranked = sorted(found, key=lambda one: -one.shift.confidence)
-        likely = [decide(found, frame)] if any(one.shift.ok for one in found) else [(one, ()) for one in ranked[:LIKELIEST]]
+        likely = (
+            [decide(found, frame, options=options)]
+            if any(one.shift.ok for one in found)
+            else [(one, ()) for one in ranked[: options.people.likeliest]]
+        )
         again = [Pairing(solve(a.people[one.people[0]], b.people[one.people[1]]), one.people, rivals) for one, rivals in likely]
-        best, rivals = (again[0], again[0].rivals) if len(again) == 1 else decide(again, frame)
+        best, rivals = (again[0], again[0].rivals) if len(again) == 1 else decide(again, frame, options=options)
     else:
-        best, rivals = decide(found, frame)
+        best, rivals = decide(found, frame, options=options)
     shift = best.shift
     chosen = [f"{who(take, i)} of {take.name}" for take, i in zip((a, b), best.people, strict=True)]
     note = f"several people in view: compared {chosen[0]} with {chosen[1]}, the best of {len(found)} pairings"
@@ -83,15 +78,17 @@ def match_people(a: Take, b: Take, solve: Solve, trial: Solve | None = None) -> 
     return Pairing(shift, best.people, rivals)
 
 
-def backing(one: Pairing, found: Sequence[Pairing], frame: float) -> int:
+def backing(one: Pairing, found: Sequence[Pairing], frame: float, options: SyncOptions = SyncOptions()) -> int:
     """How many pairings of other people, and this one, are sure of its offset."""
     others = [other for other in found if not set(enumerate(one.people)) & set(enumerate(other.people))]
-    return one.shift.ok + sum(one.shift.ok and other.shift.ok and not apart(one, other, frame) for other in others)
+    return one.shift.ok + sum(one.shift.ok and other.shift.ok and not apart(one, other, frame, options=options) for other in others)
 
 
-def apart(one: Pairing, other: Pairing, frame: float) -> bool:
+def apart(one: Pairing, other: Pairing, frame: float, options: SyncOptions = SyncOptions()) -> bool:
     """Whether two answers differ by more than what both leave open."""
-    return abs(_middle(one) - _middle(other)) > TOLERANCE * frame + 3 * (one.shift.sigma + other.shift.sigma)
+    return abs(_middle(one) - _middle(other)) > options.people.tolerance * frame + options.people.sigmas * (
+        one.shift.sigma + other.shift.sigma
+    )
 
 
 def _middle(pairing: Pairing) -> float:
@@ -104,26 +101,26 @@ def who(take: Take, index: int) -> str:
     return "the largest person of each frame" if person is None else f"person {person}"
 
 
-def decide(found: Sequence[Pairing], frame: float) -> tuple[Pairing, tuple[float, ...]]:
+def decide(found: Sequence[Pairing], frame: float, options: SyncOptions = SyncOptions()) -> tuple[Pairing, tuple[float, ...]]:
     """The best pairing, and the offsets of those that contradict it.
 
     Args:
         frame: seconds.
     """
-    behind = {id(pairing): backing(pairing, found, frame) for pairing in found}
+    behind = {id(pairing): backing(pairing, found, frame, options=options) for pairing in found}
     ranked = sorted(found, key=lambda pairing: (-behind[id(pairing)], -pairing.shift.confidence))
     best = ranked[0]
     rivals = [
         _middle(pairing)
         for pairing in ranked[1:]
         if behind[id(pairing)] >= max(1, behind[id(best)])
-        and pairing.shift.confidence >= WEAK * best.shift.confidence
-        and apart(best, pairing, frame)
+        and pairing.shift.confidence >= options.people.weak * best.shift.confidence
+        and apart(best, pairing, frame, options=options)
     ]
     return best, tuple(rivals)
 
 
-def common_joints(a: Clip, b: Clip) -> tuple[Clip, Clip, bool, str]:
+def common_joints(a: Clip, b: Clip, options: SyncOptions = SyncOptions()) -> tuple[Clip, Clip, bool, str]:
     """Both clips with the joints that they have in common, whether these correspond, and what to say about it."""
     first, second = a.skeleton, b.skeleton
     count = a.joints.shape[1], b.joints.shape[1]
@@ -132,7 +129,7 @@ def common_joints(a: Clip, b: Clip) -> tuple[Clip, Clip, bool, str]:
             return a, b, True, ""
     else:
         shared = [name for name in first.joints if name in second.joints]
-        if len(shared) >= LEAST:
+        if len(shared) >= options.people.joints:
             said = f"{first.name} and {second.name} share {len(shared)} joints; these are compared"
             return _only(a, shared), _only(b, shared), True, said
     names = [clip.skeleton.name if clip.skeleton is not None else f"{n} joints" for clip, n in zip((a, b), count, strict=True)]
@@ -146,7 +143,7 @@ def _only(clip: Clip, names: Sequence[str]) -> Clip:
     return clip.replace(joints=clip.joints[:, index], confidence=confidence, skeleton=Skeleton("common joints", tuple(names)))
 
 
-def disagreements(a: Clip, b: Clip, shift: Shift) -> list[tuple[float, float, float]]:
+def disagreements(a: Clip, b: Clip, shift: Shift, options: SyncOptions = SyncOptions()) -> list[tuple[float, float, float]]:
     """Stretches in which both do not show the same person: start and end on a's clock, and how many times the usual distance.
 
     What is compared over time is the distance of a joint from the epipolar line of its partner,
@@ -157,20 +154,20 @@ def disagreements(a: Clip, b: Clip, shift: Shift) -> list[tuple[float, float, fl
     """
     if shift.fundamental is None:
         return []
-    distance = _running(_distances(a, b, shift), round(LASTING / 2 * float(a.fps or 30.0)))
+    distance = _running(_distances(a, b, shift, options), round(options.people.lasting / 2 * float(a.fps or 30.0)))
     usual = float(np.nanmedian(distance)) if np.isfinite(distance).any() else 0.0
     if not usual > 0:
         return []
-    far = np.nan_to_num(distance / usual) > AWAY
+    far = np.nan_to_num(distance / usual) > options.people.away
     steps = np.flatnonzero(np.diff(np.concatenate([[0], far.astype(int), [0]])))
     found = []
     for start, end in zip(steps[::2], steps[1::2], strict=True):
-        if a.times[end - 1] - a.times[start] >= LASTING:
+        if a.times[end - 1] - a.times[start] >= options.people.lasting:
             found.append((float(a.times[start]), float(a.times[end - 1]), float(distance[start:end].max()) / usual))
     return found
 
 
-def jumps(clip: Clip) -> list[float]:
+def jumps(clip: Clip, options: SyncOptions = SyncOptions()) -> list[float]:
     """When the person is somewhere else from one frame to the next, and not back at once: seconds."""
     steps = np.diff(clip.times) <= 1.5 / float(clip.fps or 30.0)
     apart = np.linalg.norm(np.diff(clip.joints, axis=0), axis=2)
@@ -178,10 +175,10 @@ def jumps(clip: Clip) -> list[float]:
         edge(np.where(np.isfinite(clip.joints), clip.joints, fill), axis=1) for edge, fill in ((np.min, np.inf), (np.max, -np.inf))
     )
     size = np.linalg.norm(high - low, axis=1)
-    known = steps & (np.isfinite(apart).sum(axis=1) >= SEEN) & np.isfinite(size[1:]) & np.isfinite(size[:-1])
-    moved = np.nanmedian(apart[known], axis=1) > JUMP * np.maximum(size[1:], size[:-1])[known]
+    known = steps & (np.isfinite(apart).sum(axis=1) >= options.people.seen) & np.isfinite(size[1:]) & np.isfinite(size[:-1])
+    moved = np.nanmedian(apart[known], axis=1) > options.people.jump * np.maximum(size[1:], size[:-1])[known]
     times = clip.times[1:][known][moved]
-    alone = np.diff(times, prepend=-np.inf, append=np.inf) >= LASTING  # a false detection leaves and comes back
+    alone = np.diff(times, prepend=-np.inf, append=np.inf) >= options.people.lasting  # a false detection leaves and comes back
     return [float(time) for time in times[alone[1:] & alone[:-1]]]
 
 
@@ -195,8 +192,8 @@ def _running(values: FloatArray, half: int) -> FloatArray:
     return out
 
 
-def _distances(a: Clip, b: Clip, shift: Shift) -> FloatArray:
-    """``(frames,)`` of a; NaN where fewer than :data:`SEEN` joints can be compared."""
+def _distances(a: Clip, b: Clip, shift: Shift, options: SyncOptions) -> FloatArray:
+    """``(frames,)`` of a; NaN where fewer than ``options.people.seen`` joints can be compared."""
     assert shift.fundamental is not None
     matrix = shift.fundamental.detach().cpu().numpy().astype(np.float64)
     moments = shift.at(0.0).item() + shift.rate * a.times
@@ -212,17 +209,17 @@ def _distances(a: Clip, b: Clip, shift: Shift) -> FloatArray:
     la, lb = xb @ matrix, xa @ matrix.T
     size = np.square(la[..., :2]).sum(axis=2) + np.square(lb[..., :2]).sum(axis=2)
     distance = np.abs((xb * lb).sum(axis=2)) / np.sqrt(np.maximum(size, 1e-300))
-    enough = np.isfinite(distance).sum(axis=1) >= SEEN
+    enough = np.isfinite(distance).sum(axis=1) >= options.people.seen
     out = np.full(len(a), np.nan)
     if enough.any():
         out[enough] = np.nanmedian(distance[enough], axis=1)
     return out
 
 
-def joint_names(a: Take, b: Take, people: tuple[int, int]) -> tuple[str, ...]:
+def joint_names(a: Take, b: Take, people: tuple[int, int], options: SyncOptions = SyncOptions()) -> tuple[str, ...]:
     """Names of the joints that were compared; none where they do not correspond or nobody knows their names."""
     if not (a.people and b.people):
         return ()
-    first, _, same, _ = common_joints(a.people[people[0]], b.people[people[1]])
+    first, _, same, _ = common_joints(a.people[people[0]], b.people[people[1]], options=options)
     layout = first.skeleton or known(first.joints.shape[1])
     return layout.joints if same and layout is not None else ()

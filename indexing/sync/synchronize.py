@@ -15,7 +15,9 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from dyntorch.numerics import check_options
 from indexing.clip import Clip
+from indexing.sync.options import SyncOptions
 from indexing.sync.people import Pairing, common_joints, disagreements, jumps, match_people
 from indexing.sync.takes import Take, take_of
 
@@ -45,7 +47,6 @@ if TYPE_CHECKING:
 Method = Literal["auto", "keypoints", "tracks", "brightness"]
 METHODS = ("auto", "keypoints", "tracks", "brightness")
 LISTED = 3  # moments in a note
-SHORTEST = 12  # frames of keypoints that dyntorch.synchronize takes
 
 
 def synchronize(
@@ -58,7 +59,8 @@ def synchronize(
     calibration: Any = None,
     person: str = "auto",
     min_confidence: float = 0.0,
-    **options: Any,
+    options: SyncOptions = SyncOptions(),
+    **more: Any,
 ) -> Shift:
     """Synchronize two cameras that filmed the same scene from different places, neither of them calibrated.
 
@@ -84,7 +86,9 @@ def synchronize(
         person: who is followed where several people are in view: ``"auto"`` tries the likely pairings and says which was taken;
             ``"largest"``, ``"confident"``, ``"tracked"`` are the rules of :mod:`indexing.readers.recording`.
         min_confidence: joints that the detector trusts less are taken as not seen.
-        options: for the reader (``format=``, ``size=``) and for :func:`dyntorch.synchronize`.
+        options: every number that decides about recordings, people, tracks and brightness, by stage; ``dataclasses.replace``
+            changes some of them.
+        more: for the reader (``format=``, ``size=``) and for :func:`dyntorch.synchronize`.
 
     Returns:
         :class:`dyntorch.Shift`: offset and sigma in seconds, rate, confidence, all peaks, ``ok`` and the reason where it is
@@ -111,26 +115,35 @@ def synchronize(
     rates = fps if isinstance(fps, (tuple, list)) else (fps, fps)
     if len(rates) != 2:
         raise ValueError(f"fps must be one number, or one for each of two cameras, got {fps!r}")
-    how = {name: options.pop(name) for name in ("format", "size") if name in options}
+    check_options(options, SyncOptions)
+    how = {name: more.pop(name) for name in ("format", "size") if name in more}
     takes = [
         take_of(value, name="" if isinstance(value, (Clip, str, Path)) else name, fps=rate, person=person,
-                min_confidence=min_confidence, **how)
+                min_confidence=min_confidence, **how, options=options)
         for value, name, rate in zip((a, b), "ab", rates, strict=True)
     ]  # fmt: skip
     takes = [dataclasses.replace(take, name=take.name or letter) for take, letter in zip(takes, "ab", strict=True)]
-    shift = pair(takes[0], takes[1], method, max_shift=max_shift, calibration=calibration, **options).shift
+    shift = pair(takes[0], takes[1], method, max_shift=max_shift, calibration=calibration, options=options, **more).shift
     return dataclasses.replace(shift, notes=(*remarks(takes), *shift.notes))
 
 
-def pair(a: Take, b: Take, method: Method = "auto", *, calibration: Any = None, **options: Any) -> Pairing:
+def pair(
+    a: Take,
+    b: Take,
+    method: Method = "auto",
+    *,
+    calibration: Any = None,
+    options: SyncOptions = SyncOptions(),
+    **more: Any,
+) -> Pairing:
     """:func:`synchronize` for recordings that were read, and which person of each it is about."""
     from indexing.sync.calibration import lenses
 
-    _check(a, b, method)
+    _check(a, b, method, options)
     lens = lenses(calibration, [a.name, b.name])
-    options = {**options, "calibration": lens.values if lens else None}
+    more = {**more, "calibration": lens.values if lens else None}
     try:
-        found, notes = _compared(a, b, method, options)
+        found, notes = _compared(a, b, method, more, options)
     except ValueError as problem:
         raise ValueError(in_names(str(problem), a.name, b.name)) from problem
     said = [in_names(note, a.name, b.name) for note in [*(lens.notes if lens else ()), *notes, *found.shift.notes]]
@@ -138,21 +151,29 @@ def pair(a: Take, b: Take, method: Method = "auto", *, calibration: Any = None, 
     return dataclasses.replace(found, shift=dataclasses.replace(found.shift, reason=reason, notes=tuple(dict.fromkeys(said))))
 
 
-def _compared(a: Take, b: Take, method: Method, options: dict[str, Any]) -> tuple[Pairing, list[str]]:
+def _compared(a: Take, b: Take, method: Method, more: dict[str, Any], options: SyncOptions) -> tuple[Pairing, list[str]]:
     """What the data say, and what is to be said about the people in them."""
     if a.kind == b.kind == "keypoints":
-        found = match_people(a, b, partial(_keypoints, **options), partial(_keypoints, quick=True, **options))
-        return found, _swapped(a, b, found)
+        found = match_people(
+            a,
+            b,
+            partial(_keypoints, options=options, **more),
+            partial(_keypoints, quick=True, options=options, **more),
+            options=options,
+        )
+        return found, _swapped(a, b, found, options)
 
-    return Pairing(synchronize_videos(a, b, method, **options), (0, 0)), []
+    return Pairing(synchronize_videos(a, b, method, **more, options=options), (0, 0)), []
 
 
-def _check(a: Take, b: Take, method: Method) -> None:
+def _check(a: Take, b: Take, method: Method, options: SyncOptions) -> None:
     for take in (a, b):
-        if take.kind == "keypoints" and take.count < SHORTEST:
+        if take.kind == "keypoints" and take.count < options.recording.fewest:
             remedy = "give the folder that holds all frames" if take.count == 1 else "film longer"
             frames = f"{take.count} frame{'' if take.count == 1 else 's'}"
-            raise ValueError(f"{take.path or take.name or 'recording'}: {frames}, {SHORTEST} are needed at least; {remedy}")
+            raise ValueError(
+                f"{take.path or take.name or 'recording'}: {frames}, {options.recording.fewest} are needed at least; {remedy}"
+            )
         if method == "keypoints" and take.kind != "keypoints":
             raise ValueError(
                 f"{take.path or take.name}: is a video, and method='keypoints' needs keypoints; run a pose estimator first, or use "
@@ -165,13 +186,15 @@ def _check(a: Take, b: Take, method: Method) -> None:
             )
 
 
-def _keypoints(a: Clip, b: Clip, correspondence: bool | None = None, quick: bool = False, **options: Any) -> Shift:
+def _keypoints(
+    a: Clip, b: Clip, correspondence: bool | None = None, quick: bool = False, *, options: SyncOptions, **more: Any
+) -> Shift:
     """Two people, or one seen twice; ``quick`` looks for no lens distortion, drift, or weak perspective: 5 to 10 times faster."""
     import torch
 
     import dyntorch
 
-    first, second, same, note = common_joints(a, b)
+    first, second, same, note = common_joints(a, b, options=options)
     if correspondence is None:
         correspondence = same
     elif correspondence and not same:
@@ -179,8 +202,8 @@ def _keypoints(a: Clip, b: Clip, correspondence: bool | None = None, quick: bool
             f"correspondence=True needs the same joints in both, got {a.joints.shape[1]} and {b.joints.shape[1]}; leave it out"
         )
     if quick and correspondence:
-        options = {"camera": "perspective", **options, "rate": options.get("rate") or 1.0}
-        options["calibration"] = options.get("calibration") or (None, None)
+        more = {"camera": "perspective", **more, "rate": more.get("rate") or 1.0}
+        more["calibration"] = more.get("calibration") or (None, None)
     clips = (first, second) if correspondence else (a, b)
     places = [torch.from_numpy(np.array(clip.joints, dtype=np.float64)) for clip in clips]
     trust = [
@@ -194,7 +217,7 @@ def _keypoints(a: Clip, b: Clip, correspondence: bool | None = None, quick: bool
         correspondence=correspondence,
         times=(torch.from_numpy(a.times.copy()), torch.from_numpy(b.times.copy())),
         weights=(torch.from_numpy(trust[0]), torch.from_numpy(trust[1])) if known else None,
-        **options,
+        **more,
     )
     return dataclasses.replace(shift, notes=(*([note] if note else []), *shift.notes))
 
@@ -219,17 +242,17 @@ def _same(a: Take, b: Take) -> bool:
     return bool(np.array_equal(first, second, equal_nan=first.dtype.kind == "f"))
 
 
-def _swapped(a: Take, b: Take, found: Pairing) -> list[str]:
+def _swapped(a: Take, b: Take, found: Pairing, options: SyncOptions) -> list[str]:
     """Notes on moments at which somebody else is followed, and on stretches in which the two do not show the same person."""
     people = [take.people[i] for take, i in zip((a, b), found.people, strict=True)]
     notes = []
     for take, clip in zip((a, b), people, strict=True):
-        moments = jumps(clip)
+        moments = jumps(clip, options=options)
         if moments:
             listed = ", ".join(f"{moment:.2f}" for moment in moments[:LISTED]) + " and more" * (len(moments) > LISTED)
             notes.append(f"{take.name}: whoever is followed jumps at {listed} s: people swapped, or a cut")
-    first, second, same, _ = common_joints(*people)
-    bad = disagreements(first, second, found.shift) if same and found.shift.ok else []
+    first, second, same, _ = common_joints(people[0], people[1], options=options)
+    bad = disagreements(first, second, found.shift, options=options) if same and found.shift.ok else []
     if bad:
         listed = ", ".join(f"{start:.2f} to {end:.2f} s" for start, end, _ in bad[:LISTED]) + " and more" * (len(bad) > LISTED)
         worst = max(times for *_, times in bad)
@@ -245,32 +268,28 @@ def _swapped(a: Take, b: Take, found: Pairing) -> list[str]:
 if TYPE_CHECKING:
     from dyntorch import Shift
 
-AGREE = 2.0  # frames within which two methods say the same
-FEWEST = 4  # tracks
-SMALL = 320  # pixels of the longer side: all that the brightness method looks at
 
-
-def synchronize_videos(a: Take, b: Take, method: str, **options: Any) -> Shift:
+def synchronize_videos(a: Take, b: Take, method: str, options: SyncOptions = SyncOptions(), **more: Any) -> Shift:
     """Two recordings of which at least one is a video: by tracks, by brightness, or by both.
 
     Raises:
         ValueError: a video cannot be read.
     """
-    options.pop("correspondence", None)  # tracks of two videos never correspond
-    brightness = {name: value for name, value in options.items() if name == "max_shift"}
+    more.pop("correspondence", None)  # tracks of two videos never correspond
+    brightness = {name: value for name, value in more.items() if name == "max_shift"}
     if method == "brightness":
-        return _brightness(a, b, **brightness)
-    tracked = _tracks(a, b, **options)
+        return _brightness(a, b, **brightness, options=options)
+    tracked = _tracks(a, b, **more, options=options)
     if method == "tracks" or "keypoints" in (a.kind, b.kind):
         return tracked
     try:
-        bright = _brightness(a, b, **brightness)
+        bright = _brightness(a, b, **brightness, options=options)
     except ValueError as problem:  # too short for it; the files can be read, as the tracks show
         bright = refused(a, b, str(problem), [], "brightness")
-    return agreed(tracked, bright)
+    return agreed(tracked, bright, options=options)
 
 
-def agreed(tracked: Shift, bright: Shift) -> Shift:
+def agreed(tracked: Shift, bright: Shift, options: SyncOptions = SyncOptions()) -> Shift:
     """One answer from two methods: the tracks' where both are sure of the same, a refusal with both where they are not.
 
     The two know nothing of each other's data, so that what one suspects and the other is sure of is taken, too.
@@ -282,7 +301,7 @@ def agreed(tracked: Shift, bright: Shift) -> Shift:
     other = bright if best is tracked else tracked
     notes = [said, *best.notes, *(note for note in other.notes if note not in best.notes)]
     apart = min((abs(offset - _middle(best)) for offset in _candidates(other)), default=float("inf"))
-    if sure and apart <= AGREE / min(best.fps):
+    if sure and apart <= options.video.agree / min(best.fps):
         return dataclasses.replace(best, notes=tuple(notes))
     peaks = torch.cat([best.peaks, other.peaks])  # scores of two methods: each list is in order, and the best one's comes first
     reason = f"{said}; record keypoints of the people, or a longer take with more motion"
@@ -306,22 +325,24 @@ def _candidates(shift: Shift) -> list[float]:
     return [_middle(shift)] if shift.ok else [_middle(shift), *shift.peaks[:, 0].tolist()]
 
 
-def _tracks(a: Take, b: Take, *, calibration: Any = None, **options: Any) -> Shift:
+def _tracks(a: Take, b: Take, *, calibration: Any = None, options: SyncOptions, **more: Any) -> Shift:
     """Different points in both: trajectories that span meeting subspaces."""
     import dyntorch
 
     found = [points_of(take) for take in (a, b)]
     notes = [note for *_, more in found for note in more]
-    few = [take.name for take, (points, _, _) in zip((a, b), found, strict=True) if points.shape[1] < FEWEST]
+    few = [take.name for take, (points, _, _) in zip((a, b), found, strict=True) if points.shape[1] < options.video.tracks]
     if few:
-        return refused(a, b, f"fewer than {FEWEST} moving points could be followed in {' and '.join(few)}; use keypoints", notes)
+        return refused(
+            a, b, f"fewer than {options.video.tracks} moving points could be followed in {' and '.join(few)}; use keypoints", notes
+        )
     shift: Shift = dyntorch.synchronize(
         found[0][0],
         found[1][0],
         correspondence=False,
         times=(found[0][1], found[1][1]),
         calibration=calibration,
-        **options,
+        **more,
     )
     return dataclasses.replace(shift, notes=(*notes, *shift.notes))
 
@@ -356,13 +377,13 @@ def gray_of(take: Take) -> Any:
     return (values * (255.0 if values.max(initial=0.0) <= 1.0 else 1.0)).clip(0, 255).astype(np.uint8)
 
 
-def _brightness(a: Take, b: Take, **options: Any) -> Shift:
+def _brightness(a: Take, b: Take, options: SyncOptions, **more: Any) -> Shift:
     """No points at all."""
     from indexing.sync.brightness import brightness_shift
     from indexing.video import read_video
 
-    sources = [iter(source_of(take)) if take.path is None else read_video(take.path, size=SMALL) for take in (a, b)]
-    shift: Shift = brightness_shift(*sources, **options)
+    sources = [iter(source_of(take)) if take.path is None else read_video(take.path, size=options.video.size) for take in (a, b)]
+    shift: Shift = brightness_shift(*sources, **more, options=options)
     return shift
 
 

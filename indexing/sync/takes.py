@@ -13,19 +13,12 @@ from numpy.typing import NDArray
 
 from indexing.clip import Clip, check_fps, stretches
 from indexing.readers.files import VIDEOS
+from indexing.sync.options import SyncOptions
 
 FloatArray = NDArray[np.float64]
 Kind = Literal["keypoints", "video", "frames"]
 CHOICES = ("auto", "largest", "confident", "tracked")
 ASSUMED = 30.0  # frames per second where nobody says
-CANDIDATES = 3  # people of a camera that are tried, besides the largest one of each frame
-UNEVEN = 0.1  # of a frame, by which times of an even grid are off it at most
-EXACT = 1e-9  # by which a frame rate is one that was given
-EMPTY = 0.1  # share of frames without a person, above which it is said
-SPARSE = 20, 20_000  # times its frames, and at least how many, that a take's clock may run over, for its frames to be compared
-PAUSES = 60.0, 10.0, 1.0  # seconds without frames, at which a take that is nearly all gap is cut: as few as will do
-SHARE = 0.2  # of the longest person's frames, that a person must be seen in to be tried
-SAME = 0.9  # of the frames of a person in which the largest one is that person, from where on they are one
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +62,7 @@ def take_of(
     min_confidence: float = 0.0,
     format: str | None = None,  # noqa: A002  (the word of the readers)
     size: tuple[float, float] | None = None,
+    options: SyncOptions = SyncOptions(),
 ) -> Take:
     """A recording from whatever a user has of it: see :func:`indexing.sync.synchronize.synchronize`.
 
@@ -80,35 +74,35 @@ def take_of(
     if fps is not None:
         check_fps(fps)
     how = {"min_confidence": min_confidence, "format": format, "size": size}
-    return _without_pauses(_taken(value, name, fps, person, how))
+    return _without_pauses(_taken(value, name, fps, person, how, options), options)
 
 
-def _taken(value: Any, name: str, fps: float | None, person: str, how: dict[str, Any]) -> Take:
+def _taken(value: Any, name: str, fps: float | None, person: str, how: dict[str, Any], options: SyncOptions) -> Take:
     if person not in CHOICES:
         raise ValueError(f"person must be one of {', '.join(CHOICES)}, got {person!r}")
     if isinstance(value, Clip):
-        return _of_clips(name or value.name, None, [value])
+        return _of_clips(name or value.name, None, [value], options)
     if isinstance(value, Sequence) and value and all(isinstance(item, Clip) for item in value):
-        return _of_clips(name or value[0].name, None, list(value))
+        return _of_clips(name or value[0].name, None, list(value), options)
     if isinstance(value, (str, Path)):
         path = Path(value).expanduser()
         name = name or camera_name(path)
         if path.suffix.lower() in VIDEOS and not path.is_dir():
             return _of_video(name, path, fps)
-        return _of_file(name, path, fps, person, how)
-    return _of_array(name, value, fps)
+        return _of_file(name, path, fps, person, how, options)
+    return _of_array(name, value, fps, options)
 
 
-def _without_pauses(take: Take) -> Take:
+def _without_pauses(take: Take, options: SyncOptions) -> Take:
     """The take with its people cut to the longest stretch of frames, where it is nearly all gap.
 
     Clocks are searched frame by frame, which takes time and memory for every frame that is not there.
     """
     if take.kind != "keypoints" or take.count < 2:
         return take
-    most = max(SPARSE[0] * take.count, SPARSE[1]) / take.fps
+    most = max(options.recording.sparse * take.count, options.recording.sparse_frames) / take.fps
     first, end = 0, take.count
-    for pause in PAUSES:
+    for pause in options.recording.pauses:
         if take.times[end - 1] - take.times[first] <= most:
             break
         cuts = stretches(take.times, pause)
@@ -132,7 +126,7 @@ def camera_name(path: Path) -> str:
     return (path.name if path.is_dir() else path.stem).removesuffix("_json") or path.name
 
 
-def _of_clips(name: str, path: Path | None, people: list[Clip]) -> Take:
+def _of_clips(name: str, path: Path | None, people: list[Clip], options: SyncOptions) -> Take:
     flat = [clip for clip in people if clip.dims != 2]
     if flat:
         raise ValueError(
@@ -141,11 +135,11 @@ def _of_clips(name: str, path: Path | None, people: list[Clip]) -> Take:
         )
     first = people[0]
     times = np.unique(np.concatenate([clip.times for clip in people]))
-    seen, rate = tuple(people), frame_rate(times, float(first.fps or ASSUMED))
+    seen, rate = tuple(people), frame_rate(times, float(first.fps or ASSUMED), options=options)
     return Take(name, "keypoints", path, seen, seen, fps=rate, fps_assumed=first.fps_assumed, times=times, count=len(times))
 
 
-def frame_rate(times: FloatArray, about: float) -> float:
+def frame_rate(times: FloatArray, about: float, options: SyncOptions = SyncOptions()) -> float:
     """Frames per second over all of a take: by the median step of rounded times, frame numbers would drift from their frames.
 
     Example:
@@ -154,31 +148,35 @@ def frame_rate(times: FloatArray, about: float) -> float:
     """
     steps = np.rint(np.diff(times) * about).sum()
     exact = float(steps / (times[-1] - times[0])) if steps > 0 else about
-    return exact if abs(exact / about - 1) > EXACT else about
+    return exact if abs(exact / about - 1) > options.recording.exact else about
 
 
-def _of_file(name: str, path: Path, fps: float | None, person: str, how: dict[str, Any]) -> Take:
+def _of_file(name: str, path: Path, fps: float | None, person: str, how: dict[str, Any], options: SyncOptions) -> Take:
     from indexing.readers import read
 
     if person != "auto":
         clips = read(path, fps=fps, person=person, **how)
-        return _noted(_of_clips(name, path, [_single(path, list(clips))]))
+        return _noted(_of_clips(name, path, [_single(path, list(clips))], options), options)
     everyone = list(read(path, fps=fps, person="everyone", **how))
     if any(clip.label is not None for clip in everyone) or "person" not in everyone[0].meta:  # a set of clips, not a recording
-        return _of_clips(name, path, [_single(path, everyone)])
+        return _of_clips(name, path, [_single(path, everyone)], options)
     largest = read(path, fps=fps, person="largest", **how)[0]  # this one has the frames without people, too
-    tried = candidates(largest, everyone) if len(everyone) > 1 else []
-    return _noted(dataclasses.replace(_of_clips(name, path, [largest, *tried]), everyone=tuple(everyone)))
+    tried = candidates(largest, everyone, options=options) if len(everyone) > 1 else []
+    return _noted(dataclasses.replace(_of_clips(name, path, [largest, *tried], options), everyone=tuple(everyone)), options)
 
 
-def _noted(take: Take) -> Take:
+def _noted(take: Take, options: SyncOptions) -> Take:
     """The recording with notes on frames that are missing, and on those that show nobody."""
     notes, steps = [], np.diff(take.times) * take.fps
-    lost = int(np.rint(steps - 1).clip(0).sum()) if len(steps) and not (np.abs(steps - np.rint(steps)) > UNEVEN).any() else 0
+    lost = (
+        int(np.rint(steps - 1).clip(0).sum())
+        if len(steps) and not (np.abs(steps - np.rint(steps)) > options.recording.uneven).any()
+        else 0
+    )
     if lost:
         notes.append(f"{take.name}: {lost} of {lost + take.count} frames are missing; the others keep their times")
     nobody = 1 - float(take.people[0].seen.any(axis=1).sum()) / max(1, take.count)
-    if nobody > EMPTY:
+    if nobody > options.recording.empty:
         notes.append(f"{take.name}: {100 * nobody:.0f} % of the frames show nobody")
     return dataclasses.replace(take, notes=(*take.notes, *notes))
 
@@ -189,21 +187,21 @@ def _single(path: Path, clips: list[Clip]) -> Clip:
     return clips[0]
 
 
-def candidates(largest: Clip, everyone: Sequence[Clip]) -> list[Clip]:
+def candidates(largest: Clip, everyone: Sequence[Clip], options: SyncOptions = SyncOptions()) -> list[Clip]:
     """The people worth a try besides the largest one of each frame: seen for long, and large."""
     longest = max(int(clip.seen.any(axis=1).sum()) for clip in everyone)
     found = []
     for clip in everyone:
         there = clip.seen.any(axis=1)
-        if there.sum() < SHARE * longest:
+        if there.sum() < options.recording.seen * longest:
             continue
         rows = np.searchsorted(largest.times, clip.times[there])
         equal = (np.nan_to_num(largest.joints[rows]) == np.nan_to_num(clip.joints[there])).all(axis=(1, 2))
-        if equal.sum() >= SAME * largest.seen.any(axis=1).sum():  # the largest one of each frame is this person
+        if equal.sum() >= options.recording.same * largest.seen.any(axis=1).sum():  # the largest one of each frame is this person
             continue
         extent = np.nanmax(clip.joints[there], axis=1) - np.nanmin(clip.joints[there], axis=1)
         found.append((float(extent.prod(axis=1).sum()), clip))
-    return [clip for _, clip in sorted(found, key=lambda entry: -entry[0])[:CANDIDATES]]
+    return [clip for _, clip in sorted(found, key=lambda entry: -entry[0])[: options.recording.candidates]]
 
 
 def _of_video(name: str, path: Path, fps: float | None) -> Take:
@@ -214,7 +212,7 @@ def _of_video(name: str, path: Path, fps: float | None) -> Take:
     return Take(name, "video", path, fps=info.fps, times=np.array([0.0, info.duration]), count=info.frames, notes=notes)
 
 
-def _of_array(name: str, value: Any, fps: float | None) -> Take:
+def _of_array(name: str, value: Any, fps: float | None, options: SyncOptions) -> Take:
     try:
         array = np.asarray(value.detach().cpu().numpy() if hasattr(value, "detach") else value)
         if array.dtype.kind not in "fiub":
@@ -232,7 +230,7 @@ def _of_array(name: str, value: Any, fps: float | None) -> Take:
     if array.shape[2] > 3:
         times = np.arange(len(array)) / rate
         return Take(name, "frames", frames=array, fps=rate, fps_assumed=fps is None, times=times, count=len(times))
-    return _of_clips(name, None, [Clip(array, fps=fps, name=name)])
+    return _of_clips(name, None, [Clip(array, fps=fps, name=name)], options)
 
 
 def find_cameras(paths: Sequence[Path]) -> dict[str, Path]:

@@ -4,7 +4,10 @@ import numpy as np
 import torch
 from torch.nn.functional import interpolate
 
-from indexing.sync.gray import SIDE, boxes, crop, motion
+from indexing.sync.gray import boxes, crop, motion
+from indexing.sync.options import BoxOptions
+
+SIDE = BoxOptions().side
 
 
 def wall(generator, height=60, width=90):
@@ -78,4 +81,4 @@ def test_flicker_is_hopeless():
 def test_crop_is_a_cut_where_pixels_coincide(rng):
     frames = torch.from_numpy(rng.random((2, 120, 130))).float()
     where = torch.tensor([[60.0, 55.0, float(SIDE)]]).expand(2, 3)
-    assert torch.allclose(crop(frames, where), frames[:, 7:103, 12:108], atol=1e-5)
+    assert torch.allclose(crop(frames, where, SIDE), frames[:, 7:103, 12:108], atol=1e-5)

@@ -9,6 +9,7 @@ import torch
 import indexing
 from indexing.clip import Clip
 from indexing.skeleton import COCO17, HALPE26, Skeleton
+from indexing.sync.options import RecordingOptions, SyncOptions
 from indexing.sync.people import common_joints
 from indexing.sync.synchronize import remarks, synchronize
 from indexing.sync.takes import take_of
@@ -140,3 +141,11 @@ def test_remarks_are_about_recordings():
 def test_two_cameras_of_one_scene(cameras):
     found = synchronize(cameras[0], cameras[1])
     assert found.ok and found.frames == pytest.approx(SKIPPED[0] - SKIPPED[1], abs=0.5), found
+
+
+def test_options_reach_the_stages(rng):
+    still = rng.normal(size=(30, 8, 2))
+    with pytest.raises(ValueError, match="30 frames, 40 are needed"):
+        synchronize(still, still, fps=30.0, options=SyncOptions(recording=RecordingOptions(fewest=40)))
+    with pytest.raises(ValueError, match="options must be SyncOptions"):
+        synchronize(still, still, fps=30.0, options=RecordingOptions())
