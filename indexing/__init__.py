@@ -4,7 +4,8 @@
 - :class:`ActionIndexer`: learns from clips, recognizes clips, finds actions in long recordings; :class:`Event` is what it finds;
 - :class:`PhaseIndexer`: the same from single frames, and how far the action has got;
 - :class:`BrightnessIndexer`: the same from pixels alone;
-- :func:`synchronize`: how far two cameras' clocks are apart.
+- :func:`synchronize`: how far two cameras' clocks are apart;
+- :class:`ActionOptions`, :class:`SyncOptions`: every number that decides in these, by stage.
 
 The indexers follow scikit-learn.  Times are seconds.  The public names are imported lazily, as in ``dyntorch``.
 """
@@ -16,11 +17,13 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from indexing.action.indexer import ActionIndexer as ActionIndexer
+    from indexing.action.options import ActionOptions as ActionOptions
     from indexing.brightness.indexer import BrightnessIndexer as BrightnessIndexer
     from indexing.clip import Clip as Clip
     from indexing.clip import ClipSet as ClipSet
     from indexing.phase.indexer import PhaseIndexer as PhaseIndexer
     from indexing.scoring import Event as Event
+    from indexing.sync.options import SyncOptions as SyncOptions
     from indexing.sync.synchronize import synchronize as synchronize
 
 _HOME = {
@@ -31,6 +34,9 @@ _HOME = {
     "PhaseIndexer": "indexing.phase.indexer",
     "Event": "indexing.scoring",
     "synchronize": "indexing.sync.synchronize",
+    # the numbers that decide in a verb
+    "ActionOptions": "indexing.action.options",
+    "SyncOptions": "indexing.sync.options",
 }
 __all__ = sorted(_HOME)
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from importlib import import_module
 from pathlib import Path
-from typing import Any, ClassVar, Self, cast
+from typing import Any, ClassVar, Self, TypeVar, cast, get_args, get_type_hints
 
 import numpy as np
 import torch
@@ -16,6 +16,8 @@ from sklearn.utils.validation import check_is_fitted
 
 from indexing.action.inputs import check_labels
 from indexing.opening import shown
+
+Options = TypeVar("Options")
 
 
 @dataclass(frozen=True)
@@ -76,6 +78,66 @@ def check_device(device: str) -> None:
         raise ValueError(f"device {device!r} is not there: {str(error).splitlines()[0]}; use device='cpu'") from None
 
 
+def changed_options(options: Any) -> dict[str, Any]:
+    """The fields of options that differ from their defaults, stage by stage, as JSON holds them.
+
+    Example:
+        >>> from indexing.action.options import ActionOptions, EventOptions
+        >>> changed_options(ActionOptions(events=EventOptions(step=0.2)))
+        {'events': {'step': 0.2}}
+    """
+    usual = type(options)()
+    found: dict[str, Any] = {}
+    for name in (field.name for field in fields(options)):
+        value = getattr(options, name)
+        if value != getattr(usual, name):
+            found[name] = changed_options(value) if is_dataclass(value) else value
+    return found
+
+
+def read_options(kind: type[Options], header: Mapping[str, Any]) -> Options | None:
+    """The options of a model file: ``None`` where all of them were the defaults, as in files that know none.
+
+    Raises:
+        ValueError: a field that there is not, or a value of another kind.
+    """
+    changed = header["parameters"].get("options")
+    return None if changed is None else _replaced(kind(), changed, "options")
+
+
+def _replaced(options: Options, changed: Any, path: str) -> Options:
+    if not isinstance(changed, dict):
+        raise ValueError(f"{path}: expected fields with their values, got {shown(changed)}")
+    hints, found = get_type_hints(type(options)), {}
+    for name, value in changed.items():
+        if name not in hints:
+            raise ValueError(f"{path}: there is no {shown(name)}")
+        old = getattr(options, name)
+        if is_dataclass(old):
+            found[name] = _replaced(old, value, f"{path}.{name}")
+        elif not _fits(value, hints[name]):
+            raise ValueError(f"{path}.{name}: expected a value like {old!r}, got {shown(value)}")
+        else:
+            found[name] = _tuples(value)
+    return cast("Options", replace(cast("Any", options), **found))
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Whether a value of a file is what a field of options holds: a number, or a list of such where it is a tuple."""
+    kinds = get_args(hint)
+    if not kinds:
+        return is_whole(value) if hint is int else hint is float and is_number(value)
+    if not isinstance(value, list) or not value:
+        return False
+    if kinds[-1] is Ellipsis:
+        return all(_fits(one, kinds[0]) for one in value)
+    return len(value) == len(kinds) and all(map(_fits, value, kinds))
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value
+
+
 class SavedClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
     """A classifier of recordings that can be written to a file.
 
@@ -97,6 +159,13 @@ class SavedClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
             if not rule.accepts(getattr(self, name)):
                 raise ValueError(f"{name} must be {rule.wanted}, got {shown(getattr(self, name))}")
         check_device(self.device)
+
+    def saved_parameters(self) -> dict[str, Any]:
+        """The parameters as a model file holds them: options only where they are not the defaults."""
+        parameters: dict[str, Any] = self.get_params()
+        changed = changed_options(parameters.pop("options")) if parameters.get("options") is not None else {}
+        parameters.pop("options", None)
+        return parameters | ({"options": changed} if changed else {})
 
     def score(self, clips: Iterable[Any], labels: ArrayLike, sample_weight: ArrayLike | None = None) -> float:
         """Mean accuracy of ``predict``; labels that were never learned count as wrong."""

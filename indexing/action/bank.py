@@ -7,13 +7,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
 from dyntorch.numerics import canonical_correlation, orthonormal_basis
+from indexing.action.options import MachineOptions, NearestOptions
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Channels: the same window seen with different things taken away, each carrying its own evidence.
@@ -85,12 +86,11 @@ class JointMetric:
     """
 
     covariance: Tensor  # (channels, joints, joints), float64
-    power: float
-
-    FLOOR = 0.1  # lambda; .03 amplifies noise (-2 %), 1 whitens too little (-1 %) on UTKinect and Florence3D
+    power: float  # alpha
+    floor: float = field(default=NearestOptions.floor, kw_only=True)  # lambda
 
     @classmethod
-    def learn(cls, windows: Tensor, seen: Tensor, power: float) -> JointMetric:
+    def learn(cls, windows: Tensor, seen: Tensor, power: float, floor: float = NearestOptions.floor) -> JointMetric:
         """From windows ``(N, length, joints, dims)`` and the joints seen in each, ``(N, joints)``."""
         # joints never seen go to the middle of the others, where they change no mean
         known = seen[:, None, :, None].to(windows)
@@ -102,7 +102,7 @@ class JointMetric:
             x = x / x.square().sum(dim=(1, 2, 3), keepdim=True).clamp(min=1e-30).sqrt()
             sigma = torch.einsum("ntjd,ntkd->jk", x, x).double() / len(x)
             covariances.append(sigma * len(sigma) / sigma.trace().clamp(min=1e-30))
-        return cls(torch.stack(covariances), power)
+        return cls(torch.stack(covariances), power, floor=floor)
 
     def weights(self, name: str, joints: Tensor | slice = slice(None)) -> Tensor | None:
         """``(joints, joints)`` W of one channel among the chosen joints; ``None`` where it is the identity."""
@@ -110,7 +110,7 @@ class JointMetric:
             return None
         sigma = self.covariance[CHANNELS.index(name)][joints][:, joints]
         values, vectors = torch.linalg.eigh(sigma)
-        return ((vectors * (values.clamp(min=0) + self.FLOOR) ** -self.power) @ vectors.mT).float()
+        return ((vectors * (values.clamp(min=0) + self.floor) ** -self.power) @ vectors.mT).float()
 
     def apply(self, windows: Tensor, name: str, joints: Tensor | slice = slice(None)) -> Tensor:
         """``(N, length' * joints, dims)``: a channel of the windows, weighted and laid out as tall matrices."""
@@ -123,8 +123,8 @@ class JointMetric:
 
 NEAREST = ("clip", "frame", "motion")  # channels of the epipolar residual; velocity adds nothing there
 EPSILON = 1e-3  # added to residuals before the log: the noise floor (1e-4 gives the same accuracy)
-PAIRS_AT_ONCE = 2_000_000  # pairs of windows in flight: bounds memory, and keeps the intermediate matrices in cache
-TABLE = 25_000_000  # entries of a table with every copy of every exemplar: 100 MB
+PAIR_BLOCK = 2_000_000  # pairs of windows in flight: bounds memory, and keeps the intermediate matrices in cache
+TABLE_BLOCK = 25_000_000  # entries of a table with every copy of every exemplar: 100 MB
 
 
 @dataclass(frozen=True)
@@ -210,7 +210,7 @@ def between(
             right: Any = bank.values[columns][:, :, joints]
             if describe is not None:
                 left, right = describe(left, joints), describe(right, joints)
-            step = max(1, PAIRS_AT_ONCE // max(1, len(columns)))
+            step = max(1, PAIR_BLOCK // max(1, len(columns)))
             for at in range(0, len(rows), step):
                 out[rows[at : at + step, None], columns] = compare(left[at : at + step], right, joints)
     return out
@@ -263,7 +263,7 @@ def fused_residual(
 
     total_weight = len(channels) if weights is None else float(weights.sum())
     worst = (1.0 + EPSILON) ** (len(terms) * total_weight)
-    bank, step = stack(copies), max(1, TABLE // sum(len(copy) for copy in copies))
+    bank, step = stack(copies), max(1, TABLE_BLOCK // sum(len(copy) for copy in copies))
     best = [
         between(query[at : at + step], bank, product, worst, describe).unflatten(1, (len(copies), -1)).amin(dim=1)
         for at in range(0, max(1, len(query)), step)
@@ -320,16 +320,16 @@ class Kernels:
         one_side, moments = self.one_side, 3
         return len(CHANNELS) * (4 if one_side else 2) + moments * (2 if one_side else 1)
 
-    def fit(self, windows: Windows) -> Tensor:
+    def fit(self, windows: Windows, options: MachineOptions) -> Tensor:
         """Set the scales from training windows and return their ``(N, N)`` kernel matrix."""
-        chosen = windows[torch.arange(0, len(windows), max(1, len(windows) // SCALE_SAMPLE))]
+        chosen = windows[torch.arange(0, len(windows), max(1, len(windows) // options.scale_windows))]
         scales = []
         for k in range(self.count):
 
             def one(left: Described, right: Described, joints: Tensor | slice, k: int = k) -> Tensor:
                 return next(d for i, d in enumerate(self._distances(left, right)) if i == k)
 
-            scales.append(kernel_scale(between(chosen, chosen, one, 1.0, self._describe)))
+            scales.append(kernel_scale(between(chosen, chosen, one, 1.0, self._describe), options.width))
         self.scales = torch.stack(scales)
         return self(windows, windows)
 
@@ -367,14 +367,10 @@ class Kernels:
                 yield _product(a, b).neg_().add_(1.0).clamp_(min=0.0)
 
 
-KERNEL_WIDTH = 0.5  # of the median distance; 1 costs 1-2 %
-SCALE_SAMPLE = 600  # windows whose distances set the kernel scales: their median is stable to 1 % from 300 on
-
-
-def kernel_scale(distances: Tensor) -> Tensor:
-    """The scale of a kernel from the ``(N, N)`` distances of its training rows: a share of the median between different rows."""
+def kernel_scale(distances: Tensor, width: float) -> Tensor:
+    """The scale of a kernel from the ``(N, N)`` distances of its training rows: ``width`` of the median between different rows."""
     off = ~torch.eye(len(distances), dtype=torch.bool, device=distances.device)
-    return KERNEL_WIDTH * distances[off].median().clamp(min=1e-6 / KERNEL_WIDTH)
+    return width * distances[off].median().clamp(min=1e-6 / width)
 
 
 def cosine_distance(a: Tensor, b: Tensor) -> Tensor:

@@ -11,15 +11,11 @@ import torch
 from numpy.typing import NDArray
 
 from indexing.action.bank import Windows, stack
-from indexing.action.symmetry import PITCH, turn
+from indexing.action.options import ActionOptions, ExemplarOptions
+from indexing.action.symmetry import turn
 from indexing.cameras import virtual
 from indexing.clip import Clip, stretches
 from indexing.windows import Ragged, ragged, sample, whole
-
-CROPS = ((0.0, 1.0), (0.0, 0.85), (0.15, 1.0), (0.1, 0.9), (0.0, 0.7), (0.3, 1.0))  # of exemplars: extent and tempo search
-VIEWS, VIEWS_SOLID = 4, 12  # virtual views per exemplar: of cards 8 give no more than 4, of 3D 12 give +1 % over 4
-EDGE = 0.12  # a virtual view also loses up to this part of its duration at each end
-ELEVATION, SPREAD = 0.1, 0.15  # radians: virtual cameras around 3D exemplars
 
 
 @dataclass(frozen=True)
@@ -28,7 +24,7 @@ class ExemplarPlan:
 
     length: int = 12
     search: bool = True
-    views: int = VIEWS
+    views: int = ExemplarOptions.views
     turned: bool = True  # virtual views turn about the vertical; otherwise they are only cropped
     repair: bool = False
     window: float = 1.0
@@ -79,14 +75,16 @@ class Exemplars:
         )
 
 
-def cut(clips: Sequence[Clip], plan: ExemplarPlan, random_state: np.random.Generator) -> Exemplars:
+def cut(
+    clips: Sequence[Clip], plan: ExemplarPlan, random_state: np.random.Generator, options: ActionOptions = ActionOptions()
+) -> Exemplars:
     """Cut everything that is kept of the clips; 3D clips are rendered, first as seen along z, then from around."""
-    images = [_render(clip, 0.0, ELEVATION, random_state) for clip in clips]
+    images = [_render(clip, 0.0, options.exemplars.elevation, random_state) for clip in clips]
     source = ragged(images, plan.repair)
     seen = torch.from_numpy(source.seen)
-    crops = CROPS if plan.search else CROPS[:1]
+    crops = options.exemplars.crops if plan.search else options.exemplars.crops[:1]
     cropped = stack([Windows(whole(source, plan.length, crop), seen) for crop in crops])
-    views = [_view(clips, source, plan, random_state) for _ in range(plan.views)]
+    views = [_view(clips, source, plan, random_state, options) for _ in range(plan.views)]
     moments, owner = slide(source, plan.length, plan.window, plan.stride)
     solid = torch.tensor([clip.dims == 3 for clip in clips])
     return Exemplars(cropped, stack(views) if views else cropped[:0], moments, owner, solid)
@@ -96,16 +94,23 @@ def _render(clip: Clip, azimuth: float, elevation: float, random_state: np.rando
     return virtual(clip, azimuth, elevation, random_state=random_state) if clip.dims == 3 else clip
 
 
-def _view(clips: Sequence[Clip], source: Ragged, plan: ExemplarPlan, random_state: np.random.Generator) -> Windows:
+def _view(
+    clips: Sequence[Clip], source: Ragged, plan: ExemplarPlan, random_state: np.random.Generator, options: ActionOptions
+) -> Windows:
     """One virtual view of every exemplar: rendered where it is 3D, the turned card where it is an image."""
     count = len(clips)
     azimuth = random_state.uniform(0, 2 * np.pi, count)
-    pitch = random_state.normal(scale=PITCH, size=count)
-    low, high = random_state.uniform(0, EDGE, count), 1 - random_state.uniform(0, EDGE, count)
+    pitch = random_state.normal(scale=options.exemplars.pitch, size=count)
+    low, high = random_state.uniform(0, options.exemplars.edge, count), 1 - random_state.uniform(0, options.exemplars.edge, count)
     solid = np.array([clip.dims == 3 for clip in clips])
     if solid.any() and plan.turned:
         lifted = [
-            _render(clip, float(np.rad2deg(azimuth[i])), ELEVATION + SPREAD * float(random_state.normal()), random_state)
+            _render(
+                clip,
+                float(np.rad2deg(azimuth[i])),
+                options.exemplars.elevation + options.exemplars.elevation_spread * float(random_state.normal()),
+                random_state,
+            )
             if solid[i]
             else clip
             for i, clip in enumerate(clips)

@@ -13,10 +13,11 @@ from sklearn.utils.validation import check_is_fitted
 
 from dyntorch.numerics import one_thread
 from indexing.action.bank import Windows
-from indexing.action.exemplars import CROPS, VIEWS, VIEWS_SOLID, ExemplarPlan, Exemplars, cut
+from indexing.action.exemplars import ExemplarPlan, Exemplars, cut
 from indexing.action.inputs import check_common, check_plan, check_queries, gather, gather_groups, gather_labels
 from indexing.action.learning import Lesson, learn
 from indexing.action.model import ShapeModel
+from indexing.action.options import ActionOptions
 from indexing.action.stream import Stream, find_events, frame_scores, scan
 from indexing.action.symmetry import mirror_permutation
 from indexing.clip import Clip
@@ -62,6 +63,7 @@ class ActionIndexer(SavedClassifier):
             and seconds over which scores are averaged.
         random_state: of the virtual views.
         device: where clips are compared with the exemplars, e.g. ``"cuda"``; ``fit`` computes on the CPU.
+        options: every other number that decides, by stage (:class:`~indexing.action.options.ActionOptions`); None: as measured.
 
     Attributes:
         classes_: ``(classes,)`` labels as given.  model_: the learned :class:`~indexing.action.model.ShapeModel`.
@@ -97,6 +99,7 @@ class ActionIndexer(SavedClassifier):
         "virtual_views": Rule(lambda value: value is None or (is_whole(value) and value >= 0), "a whole number, 0 or more"),
         "reject": REJECT,
         "random_state": RANDOM_STATE,
+        "options": Rule(lambda value: value is None or isinstance(value, ActionOptions), "None or indexing.ActionOptions"),
     }
 
     def __init__(
@@ -119,6 +122,7 @@ class ActionIndexer(SavedClassifier):
         pool: float = 2.1,
         random_state: int = 0,
         device: str = "cpu",
+        options: ActionOptions | None = None,
     ) -> None:
         self.view = view
         self.weights = weights
@@ -137,6 +141,11 @@ class ActionIndexer(SavedClassifier):
         self.pool = pool
         self.random_state = random_state
         self.device = device
+        self.options = options
+
+    @property
+    def _options(self) -> ActionOptions:
+        return ActionOptions() if self.options is None else self.options
 
     # ---- learning ----------------------------------------------------------------------------------------------------
     @one_thread
@@ -153,7 +162,7 @@ class ActionIndexer(SavedClassifier):
             ValueError: naming the clip or the parameter, what is wrong and what to do.
         """
         self.check_parameters()
-        found, owners = gather(clips, self.fps)
+        found, owners = gather(clips, self.fps, options=self._options)
         people = gather_groups(found, owners, groups)
         values = gather_labels(found, owners, labels)
         classes, numbers = np.unique(values, return_inverse=True)
@@ -162,8 +171,8 @@ class ActionIndexer(SavedClassifier):
                 f"labels: only one class ({classes[0]!r}); give clips of at least two actions, for example one of ordinary movement"
             )
         rng = np.random.default_rng(self.random_state)
-        plan = self._plan(_default_views(found))
-        return self._learn(cut(found, plan, rng), classes, numbers, layout_of(found), people)
+        plan = self._plan(_default_views(found, self._options))
+        return self._learn(cut(found, plan, rng, options=self._options), classes, numbers, layout_of(found), people)
 
     @one_thread
     def partial_fit(
@@ -177,7 +186,7 @@ class ActionIndexer(SavedClassifier):
         if not hasattr(self, "model_"):
             return self.fit(clips, labels, groups)
         self.check_parameters()
-        found, owners = gather(clips, self.fps, self.n_joints_, self.skeleton_)
+        found, owners = gather(clips, self.fps, self.n_joints_, self.skeleton_, options=self._options)
         people = gather_groups(found, owners, groups)
         if self.weights == "learned" and (people is None) != (self.groups_ is None):
             here, there = ("these clips", "the earlier ones") if people is not None else ("the earlier clips", "these")
@@ -187,11 +196,11 @@ class ActionIndexer(SavedClassifier):
         old = self.classes_[self.model_.labels.numpy()]
         merged = joined(old, values)
         known, numbers = np.unique(merged, return_inverse=True)
-        check_plan(self, len(CROPS) if self.search else 1, self.model_.exemplars)
+        check_plan(self, len(self._options.exemplars.crops) if self.search else 1, self.model_.exemplars)
         plan = self._plan(len(self.model_.exemplars.views) // len(old))
         seed = 0 if self.random_state is None else self.random_state
         rng = np.random.default_rng([seed, len(old)])
-        extended = self.model_.exemplars.extended(cut(found, plan, rng))
+        extended = self.model_.exemplars.extended(cut(found, plan, rng, options=self._options))
         return self._learn(extended, known, numbers, self.skeleton_, both)
 
     def _plan(self, views: int) -> ExemplarPlan:
@@ -209,7 +218,13 @@ class ActionIndexer(SavedClassifier):
         """Learn everything, and only then change anything."""
         symmetry = None
         if self.mirror:
-            symmetry = mirror_permutation(skeleton, exemplars.crop(0).values[:500], exemplars.crop(0).seen[:500])
+            originals = exemplars.crop(0)
+            symmetry = mirror_permutation(
+                skeleton,
+                originals.values[: self._options.mirror.windows],
+                originals.seen[: self._options.mirror.windows],
+                options=self._options,
+            )
         if self.mirror is True and symmetry is None:
             raise ValueError(
                 "mirror=True: the joints' mirror images are not known; give clips a skeleton with names, or mirror='auto'"
@@ -224,7 +239,7 @@ class ActionIndexer(SavedClassifier):
             symmetry=symmetry,
             guard=self.mirror == "auto",
         )
-        self.model_: ShapeModel = learn(exemplars, torch.from_numpy(numbers).long(), len(classes), lesson)
+        self.model_: ShapeModel = learn(exemplars, torch.from_numpy(numbers).long(), len(classes), lesson, options=self._options)
         self.groups_ = groups
         self.classes_ = classes
         self.n_joints_ = int(exemplars.crops.values.shape[2])
@@ -330,5 +345,5 @@ class ActionIndexer(SavedClassifier):
         return Clip(joints, label=self.classes_[int(self.model_.labels[index])], skeleton=self.skeleton_, name=f"exemplar {index}")
 
 
-def _default_views(clips: Sequence[Clip]) -> int:
-    return VIEWS_SOLID if any(clip.dims == 3 for clip in clips) else VIEWS
+def _default_views(clips: Sequence[Clip], options: ActionOptions) -> int:
+    return options.exemplars.views_solid if any(clip.dims == 3 for clip in clips) else options.exemplars.views

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from dyntorch.numerics import affine_factorization, metric_upgrade
 from indexing.action.bank import COMMON
+from indexing.action.options import ActionOptions
 from indexing.cameras import virtual
 from indexing.clip import Clip, as_clip
 from indexing.joints import layout_of, matched_all
@@ -25,10 +26,9 @@ from indexing.windows import check_clips, ragged, sample, torn
 
 # Share of the energy that one rigid space-time shape may leave unexplained.  On synthetic people a detector's noise leaves
 # .002-.005, views that lag by .3 s .006-.04, views of another action .01-.05.
-UNEXPLAINED = 0.01
 
 
-def combine(views: tuple[Clip, ...]) -> list[Clip]:
+def combine(views: tuple[Clip, ...], options: ActionOptions = ActionOptions()) -> list[Clip]:
     """A 3D clip from three or more views that decide it; otherwise the views themselves, each an exemplar of its own.
 
     The views are factored (Tomasi-Kanade, affine cameras fixed over the clip) and upgraded to a metric shape whose vertical
@@ -60,7 +60,7 @@ def combine(views: tuple[Clip, ...]) -> list[Clip]:
     windows = sample(source, np.arange(len(views)), np.full(len(views), start), np.full(len(views), end), steps)
     shape, cameras, left = affine_factorization(windows[:, :, torch.from_numpy(seen)].flatten(1, 2))
     metric, decided = metric_upgrade(shape, cameras)
-    if not bool(decided) or float(left) > UNEXPLAINED:
+    if not bool(decided) or float(left) > options.exemplars.unexplained:
         why = (
             f"{float(left):.0%} of the motion is not one rigid space-time shape"
             if decided
@@ -100,7 +100,12 @@ def as_clips(clips: Iterable[Any], fps: float) -> list[Clip | tuple[Clip, ...]]:
 
 
 def gather(
-    clips: Iterable[Any], fps: float, joints: int | None = None, skeleton: Skeleton | None = None
+    clips: Iterable[Any],
+    fps: float,
+    joints: int | None = None,
+    skeleton: Skeleton | None = None,
+    *,
+    options: ActionOptions = ActionOptions(),
 ) -> tuple[list[Clip], list[int]]:
     """Checked training clips and, for each, the item it came from (views that do not decide the shape stay apart).
 
@@ -114,7 +119,7 @@ def gather(
     for i, given in enumerate(items):
         views = matched_all(given if isinstance(given, tuple) else [given], skeleton)
         item = tuple(views) if isinstance(given, tuple) else views[0]
-        parts = combine(item) if isinstance(item, tuple) else [item]
+        parts = combine(item, options=options) if isinstance(item, tuple) else [item]
         found += parts
         owners += [i] * len(parts)
     check_clips(found, joints, owners)

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from indexing.action.bank import CHANNELS, EPSILON, NEAREST, JointMetric, Windows, fused_residual
+from indexing.action.options import ActionOptions
 
 # ----------------------------------------------------------------------------------------------------------------------
 # The epipolar residual as a function of joint weights: everything it needs, tabled once for the pairs that matter.
@@ -24,9 +25,8 @@ from indexing.action.bank import CHANNELS, EPSILON, NEAREST, JointMetric, Window
 # costs one matrix product and a closed form, whatever the length of the clips.
 
 
-CANDIDATES = 2  # nearest exemplars per class that a query is compared with: as many as the scorer averages
 ABSENT = -100.0  # score of a class with no exemplar in another group
-RIDGE = 1e-6  # of a 2x2 Gram, relative to its trace: as in dyntorch.numerics.orthonormal_basis
+GRAM_EPSILON = 1e-6  # of a 2x2 Gram, relative to its trace: as in dyntorch.numerics.orthonormal_basis
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ def epipolar(cross: Entries, left: Entries, right: Entries) -> Tensor:
 def _ridged(gram: Entries) -> Entries:
     """Entries 00, 01, 11 and the determinant of symmetric 2x2 matrices, with a ridge."""
     scale = (gram[0] + gram[3]).clamp(min=1e-30)
-    a, b, d = gram[0] + RIDGE * scale, gram[1], gram[3] + RIDGE * scale
+    a, b, d = gram[0] + GRAM_EPSILON * scale, gram[1], gram[3] + GRAM_EPSILON * scale
     return a, b, d, (a * d - b * b).clamp(min=1e-30)
 
 
@@ -123,6 +123,7 @@ def gather(
     labels: Tensor,
     groups: Tensor,
     hub: Tensor,
+    options: ActionOptions = ActionOptions(),
 ) -> Evidence:
     """The tables of queries and, of each class, the exemplars of other groups that are nearest to them.
 
@@ -141,8 +142,8 @@ def gather(
     chosen, valid = [], []
     for action in range(int(labels.max()) + 1):
         mine = (labels == action).nonzero()[:, 0]
-        value, place = table[:, mine].topk(min(CANDIDATES, len(mine)), dim=1, largest=False)
-        room = (0, CANDIDATES - place.shape[1])
+        value, place = table[:, mine].topk(min(options.joints.candidates, len(mine)), dim=1, largest=False)
+        room = (0, options.joints.candidates - place.shape[1])
         chosen.append(torch.nn.functional.pad(mine[place], room))
         valid.append(torch.nn.functional.pad(value.isfinite(), room))
     index = torch.stack(chosen)  # (classes, Q, K)
@@ -170,16 +171,6 @@ def _filled(windows: Windows) -> Tensor:
     known = windows.seen[:, None, :, None].to(windows.values)
     middle = (windows.values * known).sum(dim=2, keepdim=True) / known.sum(dim=2, keepdim=True).clamp(min=1.0)
     return torch.where(known > 0, windows.values, middle)
-
-
-PATH = (1.0, 0.3, 0.1, 0.03)  # pulls towards equal weights that are tried, strongest first
-STEPS, RATE = 40, 0.1  # of Adam, the rate falling to 0; stopping early pulls, too: with junk joints 80 steps win .27, 40 win .34
-SHARP = 1.0  # log of the sharpness at the start
-FOLDS = 4  # parts of the groups, each held out once
-SIGMAS = 1.0  # standard errors over groups by which learning must beat equal weights where it has not seen the people
-ROUNDS = 2  # of finding the nearest exemplars and learning the weights
-QUERIES = 200  # queries at most, and QUERIES x classes x joints at most ENTRIES: 3.5 s of one core, 7 s where it learns
-ENTRIES = 60_000
 
 
 @dataclass(frozen=True)
@@ -230,7 +221,7 @@ class JointWeights:
         roots = weights.mean(dim=0).sqrt().repeat(len(CHANNELS), 1)  # of channels that were not learned, too
         for name, row in zip(NEAREST, weights, strict=True):
             roots[CHANNELS.index(name)] = row.sqrt()
-        return WeightedMetric(metric.covariance, metric.power, roots)
+        return WeightedMetric(metric.covariance, metric.power, roots, floor=metric.floor)
 
     def residual(self, query: Windows, copies: list[Windows], metric: JointMetric, labels: Tensor) -> Tensor:
         """``(Q, N)`` :func:`~indexing.action.bank.fused_residual` under these weights; each class's exemplars under its own."""
@@ -255,6 +246,7 @@ def learn_joint_weights(
     hub: Tensor | None = None,
     symmetry: Tensor | None = None,
     seed: int = 0,
+    options: ActionOptions = ActionOptions(),
 ) -> JointWeights:
     r"""Weights :math:`w \ge 0` of joints and channels under which exemplars of other groups name the queries best.
 
@@ -298,24 +290,24 @@ def learn_joint_weights(
     usable = _usable(labels, groups)[owner].nonzero()[:, 0]
     if len(labels[owner[usable]].unique()) < 2:
         return JointWeights.equal(count)
-    limit = max(1, min(QUERIES, ENTRIES // (count * classes)))
+    limit = max(1, min(options.joints.queries, options.joints.entries // (count * classes)))
     rows = usable[torch.randperm(len(usable), generator=torch.Generator().manual_seed(seed))[:limit]]
     query, owner, tied = query[rows], owner[rows], torch.arange(count) if symmetry is None else symmetry
     found = JointWeights.equal(count)
-    for _ in range(ROUNDS):  # the nearest exemplars, by what was learned before
+    for _ in range(options.joints.rounds):  # the nearest exemplars, by what was learned before
         metrics = metric, found.metric(metric)
-        evidence = gather(query, owner, copies, metrics, found.channels, labels, groups, hub)
-        found = _from_evidence(evidence, tied, classes, seed)
+        evidence = gather(query, owner, copies, metrics, found.channels, labels, groups, hub, options=options)
+        found = _from_evidence(evidence, tied, classes, seed, options)
         if not found.learned:
             break
     return found
 
 
-def _from_evidence(evidence: Evidence, tied: Tensor, classes: int, seed: int) -> JointWeights:
+def _from_evidence(evidence: Evidence, tied: Tensor, classes: int, seed: int, options: ActionOptions) -> JointWeights:
     """For all actions together, and then for each."""
     equal = torch.ones(len(NEAREST), 1, len(tied)), torch.ones(len(NEAREST))
-    together = _choose(evidence, _Together(tied, *equal), seed)
-    each = _choose(evidence, _Each(tied, together.joints, together.channels, classes), seed)
+    together = _choose(evidence, _Together(tied, *equal), seed, options)
+    each = _choose(evidence, _Each(tied, together.joints, together.channels, classes), seed, options)
     by_class = None if each.joints.shape[1] == 1 else _mean_one((each.joints / together.joints)[0])
     gain, sigma = together.gain + each.gain, (together.sigma**2 + each.sigma**2) ** 0.5
     return JointWeights(together.joints[:, 0], together.channels, by_class, gain, sigma)
@@ -373,41 +365,41 @@ class _Choice:
     sigma: float = 0.0
 
 
-def _choose(evidence: Evidence, stage: _Together, seed: int) -> _Choice:
+def _choose(evidence: Evidence, stage: _Together, seed: int, options: ActionOptions) -> _Choice:
     """Learn with the strongest pull that held-out groups cannot tell from the best; not at all where they gain nothing."""
     before = _Choice(stage.joints, stage.channels)
     names, group = evidence.groups.unique(return_inverse=True)
     if len(names) < 3:
         return before
-    folds = min(FOLDS, len(names))
+    folds = min(options.joints.folds, len(names))
     part = torch.randperm(len(names), generator=torch.Generator().manual_seed(seed))[group] % folds
     held = part == torch.arange(folds + 1)[:, None]  # in the last problem nothing is held out
-    losses, (joints, channels) = _descend(evidence, stage, ~held)
+    losses, (joints, channels) = _descend(evidence, stage, ~held, options)
     here = losses[part, :, torch.arange(len(part))]  # (Q, pulls) where a query was held out
     won = here[:, :1] - here[:, 1:]
     by_group = torch.stack([won[group == number].mean(dim=0) for number in range(len(names))])
     gain, sigma = by_group.mean(dim=0), by_group.std(dim=0) / len(names) ** 0.5
     best = int(gain.argmax())
-    if gain[best] <= SIGMAS * sigma[best]:
+    if gain[best] <= options.joints.sigmas * sigma[best]:
         return before
     chosen = int((gain >= gain[best] - sigma[best]).nonzero()[0, 0])
     return _Choice(joints[-1, 1 + chosen], channels[-1, 1 + chosen], float(gain[chosen]), float(sigma[chosen]))
 
 
-def _descend(evidence: Evidence, stage: _Together, train: Tensor) -> tuple[Tensor, Weights]:
-    """Every pull on every part of the queries at once: ``(parts, 1 + PATH, Q)`` losses, and the weights; first without learning.
+def _descend(evidence: Evidence, stage: _Together, train: Tensor, options: ActionOptions) -> tuple[Tensor, Weights]:
+    """Every pull on every part of the queries at once: ``(parts, 1 + pulls, Q)`` losses, and the weights; first without learning.
 
     Args:
         train: ``(parts, Q)`` bool, which queries each part learns from.
     """
-    pulls = evidence.hub.new_tensor(PATH)
+    pulls = evidence.hub.new_tensor(options.joints.pulls)
     shape = len(train), 1 + len(pulls)
     learning = torch.ones(shape).index_fill_(1, torch.tensor(0), 0.0).flatten()
     pull = torch.cat([pulls[:1], pulls]).repeat(len(train))
     share = (train.to(evidence.hub) / train.sum(dim=1, keepdim=True)).repeat_interleave(shape[1], dim=0)
     logs = [value.to(evidence.hub).expand(len(pull), *value.shape).clone().requires_grad_() for value in stage.start()]
-    sharp = torch.full((len(pull),), SHARP).to(evidence.hub).requires_grad_()
-    optimizer = torch.optim.Adam([sharp, *logs], lr=RATE)
+    sharp = torch.full((len(pull),), options.joints.sharp).to(evidence.hub).requires_grad_()
+    optimizer = torch.optim.Adam([sharp, *logs], lr=options.joints.rate)
 
     def losses() -> tuple[Tensor, list[Tensor], Weights]:
         free = [value * learning.view(-1, *(1 for _ in value.shape[1:])) for value in logs]
@@ -415,8 +407,8 @@ def _descend(evidence: Evidence, stage: _Together, train: Tensor) -> tuple[Tenso
         scores = sharp.exp()[:, None, None] * evidence.scores(*weights)
         return torch.nn.functional.cross_entropy(scores.mT, evidence.labels.expand(len(pull), -1), reduction="none"), free, weights
 
-    for step in range(STEPS):
-        optimizer.param_groups[0]["lr"] = RATE * (1 - step / STEPS)
+    for step in range(options.joints.steps):
+        optimizer.param_groups[0]["lr"] = options.joints.rate * (1 - step / options.joints.steps)
         optimizer.zero_grad()
         loss, free, _ = losses()
         penalty = sum(value.square().flatten(1).mean(dim=1) for value in free)

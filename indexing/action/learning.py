@@ -13,9 +13,6 @@ from indexing.action.bank import JointMetric, Kernels, Windows, stack
 from indexing.action.exemplars import Exemplars
 from indexing.action.joint_weights import JointWeights, learn_joint_weights
 from indexing.action.model import (
-    BALANCE,
-    BALANCE_SOLID,
-    MOMENT_SAMPLE,
     Blend,
     PairwiseMachine,
     ShapeModel,
@@ -25,7 +22,8 @@ from indexing.action.model import (
     standardized,
     without_own,
 )
-from indexing.action.symmetry import PITCH, turn
+from indexing.action.options import ActionOptions
+from indexing.action.symmetry import turn
 
 # ----------------------------------------------------------------------------------------------------------------------
 # How the scorers are weighed, learned from people who were left out: once over the whole set, whatever its actions are.
@@ -35,18 +33,10 @@ from indexing.action.symmetry import PITCH, turn
 # scorer looks perfect and nothing is learned (UTKinect .939 against .953 without): so groups must be known.
 
 
-BLENDS = ((1.0, 0.0), (1.0, 0.25), (1.0, 0.5), (1.0, 1.0), (1.0, 1.5), (1.0, 3.0), (0.0, 1.0))  # of B and A
-ENOUGH = 8  # examples per class from which the blend is learned: chosen from 5 on UTKinect it costs 1 to 2 % (.90 to .91 for .92)
-SHARPNESSES = tuple(float(2 ** (k / 4)) for k in range(-4, 17))  # .5 .. 16
-FOLDS = 5  # groups of people whose machines are trained
-VIEWS = 4  # virtual views asked per exemplar, besides the image itself
-NOISE = 0.01  # of the body height, on asked views: without it the kernel machine looks too good
-
-
-def leave_out(groups: Tensor) -> Tensor:
+def leave_out(groups: Tensor, options: ActionOptions = ActionOptions()) -> Tensor:
     """``(N,)`` number of the fold of each exemplar: people are dealt to at most five folds."""
     _, number = groups.unique(return_inverse=True)
-    return number % min(FOLDS, int(number.max()) + 1)
+    return number % min(options.blend.folds, int(number.max()) + 1)
 
 
 @dataclass(frozen=True)
@@ -72,7 +62,7 @@ def learn_blend(model: ShapeModel, groups: Tensor, trained: Trained | None) -> B
     Returns:
         the model's own blend where nothing can be left out.
     """
-    labels, folds = model.labels, leave_out(groups)
+    labels, folds = model.labels, leave_out(groups, options=model.options)
     # only those are asked whose action somebody in another fold performs, too
     usable = ((folds[:, None] != folds[None]) & (labels[:, None] == labels[None])).any(dim=1)
     if int(folds.max()) < 1 or not bool(usable.any()):
@@ -89,15 +79,17 @@ def learn_blend(model: ShapeModel, groups: Tensor, trained: Trained | None) -> B
     evidence = torch.cat([view[:, usable] for view in views], dim=1).double()
     truth = labels[usable].repeat(len(asked))
     if model.scorer != "both":
-        return _sharpened(model.blend, evidence[0], truth, int(usable.sum()))
-    few = int(torch.bincount(labels).median()) < ENOUGH
-    blend = model.blend if few else _fewest_mistakes(evidence, truth, model.blend)
-    return _sharpened(blend, blended(evidence, blend), truth, int(usable.sum()))
+        return _sharpened(model.blend, evidence[0], truth, int(usable.sum()), model.options)
+    few = int(torch.bincount(labels).median()) < model.options.blend.enough
+    blend = model.blend if few else _fewest_mistakes(evidence, truth, model.blend, model.options)
+    return _sharpened(blend, blended(evidence, blend), truth, int(usable.sum()), model.options)
 
 
 def _out(residuals: Tensor, model: ShapeModel, folds: Tensor) -> Tensor:
     """``(N, classes)`` scores of every exemplar among those of the other folds."""
-    scores = class_scores(residuals.masked_fill(folds[:, None] == folds[None], torch.inf), model.labels, model.classes)
+    scores = class_scores(
+        residuals.masked_fill(folds[:, None] == folds[None], torch.inf), model.labels, model.classes, options=model.options
+    )
     known = scores.isfinite()
     least = torch.where(known, scores, torch.inf).amin(dim=1, keepdim=True)
     return torch.where(known, scores, least.nan_to_num(posinf=0.0))
@@ -111,8 +103,8 @@ def asked_views(model: ShapeModel) -> list[Windows]:
     rng, whole = np.random.default_rng(0), model.exemplars.crop(0)
     count = len(whole)
     asked = [whole]
-    for i in range(VIEWS):
-        azimuth, pitch = rng.uniform(0, 2 * np.pi, count), rng.normal(scale=PITCH, size=count)
+    for i in range(model.options.blend.views):
+        azimuth, pitch = rng.uniform(0, 2 * np.pi, count), rng.normal(scale=model.options.exemplars.pitch, size=count)
         if bool(model.exemplars.solid.any()):
             if i >= len(model.exemplars.views) // count:
                 break
@@ -121,7 +113,7 @@ def asked_views(model: ShapeModel) -> list[Windows]:
             values = turn(whole.values, azimuth, pitch)
         size = (values[..., 1].amax(dim=2) - values[..., 1].amin(dim=2)).median(dim=1).values
         noise = torch.from_numpy(rng.normal(size=values.shape)).to(values)
-        asked.append(Windows(values + NOISE * size[:, None, None, None] * noise, whole.seen))
+        asked.append(Windows(values + model.options.blend.noise * size[:, None, None, None] * noise, whole.seen))
     return asked
 
 
@@ -137,7 +129,7 @@ def _machine_out(model: ShapeModel, trained: Trained, asked: Windows, folds: Ten
         known, numbers = np.unique(model.labels[owner[kept]].numpy(), return_inverse=True)
         if len(known) < 2:
             continue
-        machine = PairwiseMachine.fit(trained.gram[kept][:, kept], numbers)
+        machine = PairwiseMachine.fit(trained.gram[kept][:, kept], numbers, model.options.machine.penalty)
         scores = machine(against[mine][:, kept[machine.support]])
         out[mine[:, None], torch.from_numpy(known)[None]] = scores
     return out
@@ -148,10 +140,10 @@ def blended(evidence: Tensor, blend: Blend) -> Tensor:
     return blend.kernel * evidence[0] + blend.nearest * evidence[1]
 
 
-def _fewest_mistakes(evidence: Tensor, truth: Tensor, prior: Blend) -> Blend:
+def _fewest_mistakes(evidence: Tensor, truth: Tensor, prior: Blend, options: ActionOptions) -> Blend:
     """Among blends with the same number of mistakes, that next to the one that is used where nothing was learned."""
     best, chosen = (float("inf"), 0.0), prior
-    for kernel, nearest in BLENDS:
+    for kernel, nearest in options.blend.blends:
         blend = dataclasses.replace(prior, kernel=kernel, nearest=nearest)
         wrong = float((blended(evidence, blend).argmax(dim=1) != truth).sum())
         far = abs(nearest / (kernel + nearest) - prior.nearest / (prior.kernel + prior.nearest))
@@ -160,7 +152,7 @@ def _fewest_mistakes(evidence: Tensor, truth: Tensor, prior: Blend) -> Blend:
     return chosen
 
 
-def _sharpened(blend: Blend, scores: Tensor, truth: Tensor, exemplars: int) -> Blend:
+def _sharpened(blend: Blend, scores: Tensor, truth: Tensor, exemplars: int, options: ActionOptions) -> Blend:
     """The blend with the sharpness that makes the answers most likely, were one more of the exemplars asked a mistake.
 
     Without that mistake, people who are all recognized would make every answer certain.
@@ -168,17 +160,11 @@ def _sharpened(blend: Blend, scores: Tensor, truth: Tensor, exemplars: int) -> B
     even, count = standardized(scores), scores.shape[1]
     doubt = 1 / (exemplars + 2)
     losses = []
-    for sharp in SHARPNESSES:
+    for sharp in options.blend.sharpnesses:
         chance = torch.log_softmax(sharp * even, dim=1)
         right = chance.gather(1, truth[:, None])[:, 0]
         losses.append(-float((1 - doubt) * right.mean() + doubt * chance.mean() * count / max(count - 1, 1)))
-    return dataclasses.replace(blend, sharpness=SHARPNESSES[int(np.argmin(losses))])
-
-
-WHITENING = 0.25  # power of the joint metric: UTKinect A .909 -> .919, few shots +3 %; .5 whitens too much
-HUB_SHARE, HUB_NEIGHBOURS = 0.5, 5  # of an exemplar's closeness to other classes, taken off: +2..3 %, one shot +4 %
-KERNEL_WHITENING = 0.0  # power of the joint metric of B: .15 gives UTKinect +1 %, takes 1 % from Florence3D
-ROWS, ROWS_SOLID = 3000, 5000  # training rows of B at most (its fit grows with their square); true views are worth more
+    return dataclasses.replace(blend, sharpness=options.blend.sharpnesses[int(np.argmin(losses))])
 
 
 @dataclass(frozen=True)
@@ -201,20 +187,25 @@ class Lesson:
     guard: bool = True
 
 
-def learn(exemplars: Exemplars, labels: Tensor, classes: int, lesson: Lesson) -> ShapeModel:
+def learn(
+    exemplars: Exemplars, labels: Tensor, classes: int, lesson: Lesson, options: ActionOptions = ActionOptions()
+) -> ShapeModel:
     """Learn everything from the exemplars' windows.
 
     Args:
         labels: ``(N,)`` class numbers.
     """
     originals = exemplars.crop(0)
-    metric = JointMetric.learn(originals.values, originals.seen, WHITENING)
+    metric = JointMetric.learn(originals.values, originals.seen, options.nearest.whitening, options.nearest.floor)
     none, share = torch.zeros(len(labels), dtype=torch.bool), float(exemplars.solid.float().mean())
     model = ShapeModel(
         exemplars, labels, classes, lesson.view, lesson.scorer, metric, lesson.symmetry, none,
         JointWeights.equal(originals.values.shape[2]),
         torch.zeros(len(labels)), torch.zeros(len(exemplars.owner)), None, None, None,
-        blend=Blend(nearest=share * BALANCE_SOLID + (1 - share) * BALANCE),
+        blend=Blend(
+            nearest=share * options.blend.balance_solid + (1 - share) * options.blend.balance, sharpness=options.blend.sharpness
+        ),
+        options=options,
     )  # fmt: skip
     if lesson.symmetry is not None:
         model = dataclasses.replace(model, mirrored=_mirror_is_same_action(model, originals) if lesson.guard else ~none)
@@ -239,7 +230,15 @@ def _parts(model: ShapeModel, lesson: Lesson) -> JointWeights:
     owner = torch.arange(len(model.labels)).repeat(len(asked))
     groups, symmetry = lesson.groups, lesson.symmetry
     return learn_joint_weights(
-        stack(asked), owner, model.copies(), model.metric, model.labels, groups=groups, hub=model.hub, symmetry=symmetry
+        stack(asked),
+        owner,
+        model.copies(),
+        model.metric,
+        model.labels,
+        groups=groups,
+        hub=model.hub,
+        symmetry=symmetry,
+        options=model.options,
     )
 
 
@@ -255,7 +254,7 @@ def _mirror_is_same_action(model: ShapeModel, originals: Windows) -> Tensor:
     nearest = model.labels[model.residuals(flipped).argmin(dim=1)]
     own = torch.nn.functional.one_hot(model.labels, model.classes).float()
     lands = own.mT @ torch.nn.functional.one_hot(nearest, model.classes).float() / own.sum(dim=0).clamp(min=1)[:, None]
-    mutual = (lands > 0.5) & (lands.mT > 0.5)
+    mutual = (lands > model.options.mirror.mutual) & (lands.mT > model.options.mirror.mutual)
     mutual.fill_diagonal_(False)
     return ~mutual.any(dim=1)[model.labels]
 
@@ -264,12 +263,14 @@ def _with_hubs(model: ShapeModel, originals: Windows) -> ShapeModel:
     """Measure, among the exemplars, how close each is to other classes, and the evidence were its own class unknown."""
     residual, labels = model.residuals(originals), model.labels
     model = dataclasses.replace(
-        model, hub=_hub(residual, labels, labels), evidence_out=evidence(_foreign_scores(residual, model), model.classes)
+        model,
+        hub=_hub(residual, labels, labels, model.options),
+        evidence_out=evidence(_foreign_scores(residual, model), model.classes, options=model.options),
     )
-    sample = torch.arange(0, len(model.exemplars.moments), max(1, len(model.exemplars.moments) // MOMENT_SAMPLE))
+    sample = torch.arange(0, len(model.exemplars.moments), max(1, len(model.exemplars.moments) // model.options.nearest.moments))
     labels = labels[model.exemplars.owner]
     residual = model.moment_residuals(model.exemplars.moments[sample])
-    return dataclasses.replace(model, moment_hub=_hub(residual, labels[sample], labels))
+    return dataclasses.replace(model, moment_hub=_hub(residual, labels[sample], labels, model.options))
 
 
 def _foreign_scores(residual: Tensor, model: ShapeModel) -> Tensor:
@@ -280,27 +281,29 @@ def _foreign_scores(residual: Tensor, model: ShapeModel) -> Tensor:
     out = residual.new_empty(len(model.labels), model.classes - 1)
     for c in range(model.classes):
         mine, rest = model.labels == c, model.labels != c
-        hub = _hub(residual[rest][:, rest], model.labels[rest], model.labels[rest])
-        scores = class_scores(residual[mine][:, rest] - hub, model.labels[rest], model.classes)
+        hub = _hub(residual[rest][:, rest], model.labels[rest], model.labels[rest], model.options)
+        scores = class_scores(residual[mine][:, rest] - hub, model.labels[rest], model.classes, options=model.options)
         out[mine] = without_own(scores, model.labels[mine])
     return out
 
 
-def _hub(residual: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
+def _hub(residual: Tensor, rows: Tensor, columns: Tensor, options: ActionOptions) -> Tensor:
     """``(columns,)`` half the mean residual from the nearest windows of other classes: near to everything = little evidence."""
     other = rows[:, None] != columns[None]
-    count = max(1, min(HUB_NEIGHBOURS, int(other.sum(dim=0).min())))
+    count = max(1, min(options.nearest.hub_neighbours, int(other.sum(dim=0).min())))
     foreign = torch.where(other, residual, torch.inf).topk(count, dim=0, largest=False).values.mean(dim=0)
     # a class that the sampled rows hold alone has nothing to compare with: it gets the usual share
     known = foreign.isfinite()
-    return HUB_SHARE * torch.where(known, foreign, foreign[known].mean() if known.any() else foreign.new_tensor(0.0))
+    return options.nearest.hub_share * torch.where(
+        known, foreign, foreign[known].mean() if known.any() else foreign.new_tensor(0.0)
+    )
 
 
 def _with_machine(model: ShapeModel, one_side: bool) -> tuple[ShapeModel, Trained]:
     """Train scorer B on the exemplars, their virtual views and mirror images, as many as the budget of rows allows."""
     exemplars, count = model.exemplars, len(model.exemplars)
     both = model.symmetry is not None and bool(model.mirrored.any())
-    rows_at_most = ROWS_SOLID if bool(exemplars.solid.any()) else ROWS
+    rows_at_most = model.options.machine.rows_solid if bool(exemplars.solid.any()) else model.options.machine.rows
     copies = max(1, rows_at_most // (count * (1 + both)))
     parts = [exemplars.crop(0)] + [exemplars.view(i) for i in range(min(copies - 1, len(exemplars.views) // count))]
     rows, owner = stack(parts), torch.arange(count).repeat(len(parts))
@@ -308,9 +311,11 @@ def _with_machine(model: ShapeModel, one_side: bool) -> tuple[ShapeModel, Traine
         chosen = model.mirrored[owner]
         rows = stack([rows, mirror_some(rows[chosen], model.symmetry, chosen[chosen])])
         owner = torch.cat([owner, owner[chosen]])
-    kernels = Kernels(JointMetric(model.metric.covariance, KERNEL_WHITENING), one_side=one_side)
-    gram = kernels.fit(rows)
-    machine = PairwiseMachine.fit(gram, model.labels[owner].numpy().astype(np.int64))
+    kernels = Kernels(
+        JointMetric(model.metric.covariance, model.options.machine.whitening, floor=model.metric.floor), one_side=one_side
+    )
+    gram = kernels.fit(rows, model.options.machine)
+    machine = PairwiseMachine.fit(gram, model.labels[owner].numpy().astype(np.int64), model.options.machine.penalty)
     trained = Trained(rows, owner, gram)
     return dataclasses.replace(model, kernels=kernels, support=rows[machine.support], machine=machine), trained
 
@@ -321,12 +326,6 @@ def _with_machine(model: ShapeModel, one_side: bool) -> tuple[ShapeModel, Traine
 # Read off any fitted model, whatever its weights: weights tell how joints are treated, not what they tell; and leaving one
 # joint out tells nothing where its neighbours say the same.  So random halves of the joints are hidden from the queries, and a
 # joint's importance is its linear share in the margin of the true action, over all that can be seen beside it.
-
-
-HALVES = 4  # random halves per joint: importances from two seeds then correlate by .83-.98 on UTKinect (clapping: .60)
-HALVES_AT_MOST = 200
-QUERIES = 120
-RIDGE = 1.0  # of the regression on 0/1 masks, in masks: matters only where there are more joints than halves
 
 
 def importance(model: ShapeModel, groups: Tensor | None = None, seed: int = 0) -> Tensor:
@@ -350,17 +349,17 @@ def importance(model: ShapeModel, groups: Tensor | None = None, seed: int = 0) -
     originals, labels = model.exemplars.crop(0), model.labels
     groups = torch.arange(len(labels), device=labels.device) if groups is None else groups.to(labels.device)
     generator = torch.Generator().manual_seed(seed)
-    asked = _asked(labels, generator)
+    asked = _asked(labels, generator, model.options)
     query, truth = originals[asked], labels[asked]
     hidden = groups[asked][:, None] == groups[None]
     member = torch.nn.functional.one_hot(labels, model.classes).double()
     hidden &= ((~hidden).double() @ member > 0)[:, labels]
-    masks = halves(originals.seen.shape[1], generator).to(labels.device)
+    masks = halves(originals.seen.shape[1], generator, options=model.options).to(labels.device)
     margins = torch.stack([_margins(model, query, truth, hidden, mask) for mask in masks])  # (masks, queries)
     by_class = margins @ (member[asked] / member[asked].sum(dim=0).clamp(min=1))
     design = masks.double() - masks.double().mean(dim=0)
     gram = design.mT @ design
-    gram.diagonal().add_(RIDGE)
+    gram.diagonal().add_(model.options.importance.ridge)
     return torch.linalg.solve(gram, design.mT @ (by_class - by_class.mean(dim=0))).mT
 
 
@@ -370,24 +369,26 @@ def typical(model: ShapeModel) -> Tensor:
     out = torch.zeros(model.classes, dtype=torch.long)
     for action in range(model.classes):
         mine = (labels == action).nonzero()[:, 0]
-        out[action] = mine[model.residuals(originals[mine[:QUERIES]])[:, mine].mean(dim=0).argmin()]
+        out[action] = mine[model.residuals(originals[mine[: model.options.importance.queries]])[:, mine].mean(dim=0).argmin()]
     return out
 
 
-def halves(joints: int, generator: torch.Generator) -> Tensor:
+def halves(joints: int, generator: torch.Generator, options: ActionOptions = ActionOptions()) -> Tensor:
     """``(masks, joints)`` bool: random halves of the joints and, after each, the other half; of at least three joints."""
     size = max(min(3, joints), joints // 2)
     out = []
-    for _ in range(min(HALVES_AT_MOST, max(32, HALVES * joints)) // 2):
+    for _ in range(
+        min(options.importance.most_halves, max(options.importance.least_halves, options.importance.halves * joints)) // 2
+    ):
         order = torch.randperm(joints, generator=generator)
         for part in (order[:size], order[joints - size :]):
             out.append(torch.zeros(joints, dtype=torch.bool).index_fill_(0, part, True))
     return torch.stack(out)
 
 
-def _asked(labels: Tensor, generator: torch.Generator) -> Tensor:
-    """At most :data:`QUERIES` exemplars, as many of every class as there are or as fit."""
-    each = max(1, QUERIES // int(labels.max() + 1))
+def _asked(labels: Tensor, generator: torch.Generator, options: ActionOptions) -> Tensor:
+    """At most ``options.importance.queries`` exemplars, as many of every class as there are or as fit."""
+    each = max(1, options.importance.queries // int(labels.max() + 1))
     order = torch.randperm(len(labels), generator=generator).to(labels.device)
     kept = [order[labels[order] == action][:each] for action in range(int(labels.max()) + 1)]
     return torch.cat(kept)

@@ -20,9 +20,9 @@ from torch import Tensor
 from indexing.action.bank import JointMetric, Kernels, Windows, fused_residual
 from indexing.action.exemplars import Exemplars
 from indexing.action.joint_weights import JointWeights
+from indexing.action.options import ActionOptions, BlendOptions, MachineOptions
 from indexing.action.symmetry import mirror
 from indexing.modelfile import Parts
-from indexing.scoring import SHARPNESS
 
 # ----------------------------------------------------------------------------------------------------------------------
 # A trained kernel machine as plain arrays: scikit-learn fits it, this evaluates it, and a model file can hold it.
@@ -41,12 +41,10 @@ class PairwiseMachine:
     intercept: Tensor
     counts: Tensor
 
-    PENALTY = 10.0  # C; 2 and 30 differ by less than 1 % on UTKinect, Florence3D and JHMDB
-
     @classmethod
-    def fit(cls, kernel: Tensor, classes: np.ndarray) -> PairwiseMachine:
+    def fit(cls, kernel: Tensor, classes: np.ndarray, penalty: float = MachineOptions.penalty) -> PairwiseMachine:
         """From a ``(N, N)`` kernel matrix and class numbers 0..C-1."""
-        machine = SVC(C=cls.PENALTY, kernel="precomputed").fit(kernel.cpu().numpy().astype(np.float64), classes)
+        machine = SVC(C=penalty, kernel="precomputed").fit(kernel.cpu().numpy().astype(np.float64), classes)
         # for two classes scikit-learn stores the decision negated
         sign = -1.0 if len(machine.classes_) == 2 else 1.0
         return cls(
@@ -107,10 +105,7 @@ def read_machine(parts: Parts, classes: int, rows: int) -> PairwiseMachine:
 # Whether a clip shows one of the known actions at all: how good its best score is, and how far that stands out.
 
 
-FEWEST = 4  # classes: with fewer there is nothing for the best one to stand out from, once one is left out
-
-
-def evidence(scores: Tensor, classes: int) -> Tensor:
+def evidence(scores: Tensor, classes: int, options: ActionOptions = ActionOptions()) -> Tensor:
     r"""``(Q,)`` evidence for a known action: :math:`s_1 + (s_1 - \bar s) + (s_1 - s_2)` of the sorted class scores.
 
     The best score alone tells known from unknown actions with an AUROC of .90 / .86 (UTKinect, camera turned 0 / 90 degrees) and
@@ -119,13 +114,13 @@ def evidence(scores: Tensor, classes: int) -> Tensor:
 
     Args:
         scores: ``(Q, classes)``, or one column less where a class was left out.
-        classes: of the model; with fewer than four the best score stands alone.
+        classes: of the model; with fewer than ``options.nearest.classes`` the best score stands alone.
 
     Example:
         >>> evidence(torch.tensor([[1.0, 5.0, 2.0, 0.0]]), 4).tolist()
         [11.0]
     """
-    if classes < FEWEST:
+    if classes < options.nearest.classes:
         return scores.max(dim=1).values
     best, second = scores.topk(2, dim=1).values.unbind(dim=1)
     return best + (best - scores.mean(dim=1)) + (best - second)
@@ -137,12 +132,7 @@ def without_own(scores: Tensor, labels: Tensor) -> Tensor:
     return scores[keep].unflatten(0, (len(scores), -1))
 
 
-NEIGHBOURS = 2  # exemplars per class that score A averages (1: -1 %)
 MOMENT_TERMS = ("epi", "nn")  # on short windows what is bound to the view helps even at 90 degrees: .83/.82 -> .93/.85
-MOMENT_SAMPLE = 500  # short windows whose closeness to others sets the hub shares
-TURNED = 0.3  # weight of turned cards in A: one shot +1.3 %, Florence3D +.8 %; .6 is too much
-BALANCE = 1.5  # weight of A against B after standardizing over classes; 1 .. 2 differ by 1 %
-BALANCE_SOLID = 0.5  # the same for exemplars with depth: B then sees true views (1.5: -1.5 % on Florence3D, UTKinect +-0)
 
 
 @dataclass(frozen=True)
@@ -153,8 +143,8 @@ class Blend:
     """
 
     kernel: float = 1.0
-    nearest: float = BALANCE
-    sharpness: float = SHARPNESS
+    nearest: float = BlendOptions.balance
+    sharpness: float = BlendOptions.sharpness
 
 
 @dataclass(frozen=True)
@@ -177,6 +167,7 @@ class ShapeModel:
     machine: PairwiseMachine | None
     evidence_out: Tensor = field(default_factory=lambda: torch.zeros(0))  # (N,) evidence of exemplars whose class was left out
     blend: Blend = field(default_factory=lambda: Blend())
+    options: ActionOptions = ActionOptions()
 
     def to(self, device: str | torch.device) -> ShapeModel:
         """The model on another device."""
@@ -197,7 +188,7 @@ class ShapeModel:
         """``(Q, N)`` fused epipolar residual to every exemplar, and that of turned cards, less the exemplar's hub share."""
         copies = self.copies()
         epipolar = self.parts.residual(query, copies, self.metric, self.labels)
-        return epipolar + TURNED * fused_residual(query, copies, self.metric, terms=("turned",)) - self.hub
+        return epipolar + self.options.nearest.turned * fused_residual(query, copies, self.metric, terms=("turned",)) - self.hub
 
     def moment_residuals(self, query: Windows) -> Tensor:
         """``(Q, M)`` residual of short windows to every short window of the exemplars, less the hub share."""
@@ -213,7 +204,7 @@ class ShapeModel:
 
     def nearest_scores(self, query: Windows) -> Tensor:
         """``(Q, classes)`` scorer A: minus the mean residual to the nearest exemplars of each class."""
-        return class_scores(self.residuals(query), self.labels, self.classes)
+        return class_scores(self.residuals(query), self.labels, self.classes, options=self.options)
 
     def machine_scores(self, query: Windows) -> Tensor:
         """``(Q, classes)`` scorer B."""
@@ -232,16 +223,16 @@ class ShapeModel:
 
     def evidence(self, query: Windows) -> Tensor:
         """``(Q,)`` how well a query shows one of the known actions rather than another one."""
-        return evidence(self.nearest_scores(query), self.classes)
+        return evidence(self.nearest_scores(query), self.classes, options=self.options)
 
 
-def class_scores(residuals: Tensor, labels: Tensor, classes: int) -> Tensor:
+def class_scores(residuals: Tensor, labels: Tensor, classes: int, options: ActionOptions = ActionOptions()) -> Tensor:
     """``(Q, classes)`` minus the mean of the smallest residuals in each class; -inf where a class has no (finite) exemplar."""
     out = residuals.new_full((len(residuals), classes), float("-inf"))
     for c in range(classes):
         mine = residuals[:, labels == c]
         if mine.shape[1]:
-            least = mine.topk(min(NEIGHBOURS, mine.shape[1]), dim=1, largest=False).values
+            least = mine.topk(min(options.nearest.neighbours, mine.shape[1]), dim=1, largest=False).values
             there = least.isfinite()
             mean = torch.where(there, least, 0.0).sum(dim=1) / there.sum(dim=1).clamp(min=1)
             out[:, c] = torch.where(there.any(dim=1), -mean, out[:, c])

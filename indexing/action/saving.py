@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from indexing.action.bank import CHANNELS, NEAREST, JointMetric, Kernels, Windows
-from indexing.action.exemplars import CROPS, Exemplars
+from indexing.action.exemplars import Exemplars
 from indexing.action.joint_weights import JointWeights
-from indexing.action.learning import KERNEL_WHITENING
 from indexing.action.model import Blend, ShapeModel, read_machine
-from indexing.estimator import check_device
+from indexing.action.options import ActionOptions
+from indexing.estimator import check_device, read_options
 from indexing.modelfile import (
     Parts,
     labels_from_json,
@@ -61,7 +61,7 @@ def save(indexer: ActionIndexer, path: str | Path) -> None:
         "groups": None if indexer.groups_ is None else indexer.groups_.tolist(),
         "skeleton": skeleton_to_json(indexer.skeleton_),
     }
-    write_model(path, FORMAT, VERSION, indexer.get_params(), about, _tensors(indexer.model_))
+    write_model(path, FORMAT, VERSION, indexer.saved_parameters(), about, _tensors(indexer.model_))
 
 
 def load(kind: type[Indexer], path: str | Path, device: str = "cpu") -> Indexer:
@@ -70,12 +70,14 @@ def load(kind: type[Indexer], path: str | Path, device: str = "cpu") -> Indexer:
     header, parts = read_model(path, FORMAT, VERSION)
     with usable(path):
         parameters = _known(header)
-        indexer = kind(**{**parameters, "tempi": tuple(parameters["tempi"])}, device=device)
+        indexer = kind(
+            **{**parameters, "tempi": tuple(parameters["tempi"])}, options=read_options(ActionOptions, header), device=device
+        )
         indexer.check_parameters()
         indexer.classes_ = labels_from_json(header["classes"])
         indexer.n_joints_ = whole(header["joints"], "joints", 1, JOINTS)
         indexer.skeleton_ = skeleton_from_json(header["skeleton"], indexer.n_joints_)
-        indexer.model_ = _model(parts, header, Sizes.of(parts, indexer))
+        indexer.model_ = _model(parts, header, Sizes.of(parts, indexer), indexer._options)
         indexer.groups_ = _groups(header["groups"], len(indexer.model_.labels))
         indexer._calibrate()
     return indexer
@@ -99,7 +101,7 @@ class Sizes:
             ValueError: these contradict each other.
         """
         exemplars = len(parts.truth("solid", None))
-        crops = len(CROPS) if indexer.search else 1
+        crops = len(indexer._options.exemplars.crops) if indexer.search else 1
         if len(indexer.classes_) < 2 or exemplars < len(indexer.classes_):
             raise ValueError(f"{exemplars} exemplars of {len(indexer.classes_)} classes")
         return cls(len(indexer.classes_), exemplars, crops, int(indexer.length), indexer.n_joints_)
@@ -113,7 +115,7 @@ def _known(header: dict[str, Any]) -> dict[str, Any]:
     """
     if header.get("layout") is not None:
         raise ValueError("layout: depth of 2D examples is no longer guessed")
-    return {name: value for name, value in header["parameters"].items() if name != "depth"}
+    return {name: value for name, value in header["parameters"].items() if name not in ("depth", "options")}
 
 
 def _groups(found: Any, exemplars: int) -> NDArray[Any] | None:
@@ -142,7 +144,7 @@ def _windows(name: str, windows: Windows) -> dict[str, Tensor]:
     return {f"{name}.values": windows.values, f"{name}.seen": windows.seen}
 
 
-def _model(parts: Parts, header: dict[str, Any], sizes: Sizes) -> ShapeModel:
+def _model(parts: Parts, header: dict[str, Any], sizes: Sizes, options: ActionOptions) -> ShapeModel:
     n, joints = sizes.exemplars, sizes.joints
     view, scorer, trained = header["view"], header["scorer"], "scales" in parts
     if view != header["parameters"]["view"] or scorer not in SCORERS or trained != (scorer != "nearest"):
@@ -154,8 +156,10 @@ def _model(parts: Parts, header: dict[str, Any], sizes: Sizes) -> ShapeModel:
     if len(views) % n:
         raise ValueError(f"views: {len(views)} windows of {n} exemplars")
     power = float(parts.real("metric_power", least=0, most=10))
-    metric = JointMetric(parts.real("metric", len(CHANNELS), joints, joints), power)
-    kernels = Kernels(JointMetric(metric.covariance, KERNEL_WHITENING), view == "same") if trained else None
+    metric = JointMetric(parts.real("metric", len(CHANNELS), joints, joints), power, floor=options.nearest.floor)
+    kernels = (
+        Kernels(JointMetric(metric.covariance, options.machine.whitening, floor=metric.floor), view == "same") if trained else None
+    )
     if kernels is not None:
         kernels.scales = parts.real("scales", kernels.count, least=LEAST_SCALE)
     support = _read_windows(parts, "support", sizes, None) if trained else None
@@ -178,6 +182,7 @@ def _model(parts: Parts, header: dict[str, Any], sizes: Sizes) -> ShapeModel:
         machine=read_machine(parts, sizes.classes, len(support)) if support is not None else None,
         evidence_out=parts.real("evidence_out", None),
         blend=Blend(**blend),
+        options=options,
     )
 
 

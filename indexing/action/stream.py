@@ -12,7 +12,8 @@ import torch
 from numpy.typing import NDArray
 
 from indexing.action.bank import Windows, channel, stack
-from indexing.action.model import MOMENT_SAMPLE, ShapeModel
+from indexing.action.model import ShapeModel
+from indexing.action.options import ActionOptions
 from indexing.clip import Clip, stretches
 from indexing.scoring import Event, event_levels, events, smooth
 from indexing.windows import Ragged, ragged, sample
@@ -20,25 +21,6 @@ from indexing.windows import Ragged, ragged, sample
 Array = NDArray[Any]
 Progress = Callable[[float], None] | None
 
-STEP = 0.1  # seconds between the windows of a recording
-# Of `find`, on streams of 13 synthetic actions, other people, other views: recall .94 at 13 % false finds with short rests,
-# .91 at 13 % with long ones (rate .1: .62 at 11 %; .5: .9 at 40 %; still .1: 35 % false in long rests; .3: recall .89).
-FALSE_ALARMS = 0.3  # rate at which a wrong action may reach an event's peak
-EXTENT = 1.7  # times that rate for the level that an event's ends reach
-LEAST = (1.0, 0.6)  # of peak and floor: among two or three classes the calibration has little or nothing to compare
-SHOWN = 0.3  # of a window's frames must show the person
-EVENT_POOL = 0.7  # of `pool`: events need sharper ends than frames
-# Rest, measured on `find` with one clip each of 13 synthetic actions, eight other people in three views, rests of 1 / 7 s, and on
-# six exercises.  As written here: F1 .910 / .899, .051 / .006 of the resting time inside an event, frames of the exercises found
-# and right .882, .780, .872.  Below STILL at rest for all actions alike: .890 / .880, .051 / .004 and .862, .606, .791, because
-# what is calmer than the other actions is never found.  Below its own calm moments only: .888 / .867 and .911, .845, .895.
-# Never at rest: .089 / .122 of the resting time inside an event.
-STILL = 0.25  # quantile of the motion of all exemplars' moments: who moves less is still, as actions go,
-DOUBT = 0.5  # and it takes this part of the way to a convincing contrast (.35: exercises .911, .835, .886, more finds at rest)
-CALM = 0.1  # quantile of the motion of one action's moments: who moves less than its calm moments rests,
-HUSH = 1.2  # and who moves so many times less, whatever the contrast, unless it is convincing
-CONVINCING = 0.99  # quantile of the contrast of wrong actions that is convincing (a wave moves one hand only)
-MARGIN = 2.0  # seconds of frames on both sides of a block, from which missing joints are interpolated
 BLOCK = 1200  # windows compared at once: bounds memory whatever the length of the recording
 
 
@@ -82,13 +64,13 @@ class StreamScan:
         ]
 
 
-def _centres(clip: Clip, stretches: Array) -> tuple[Array, Array]:
-    """``(T,)`` times at which windows are centred, a :data:`STEP` apart inside each stretch, and whose they are."""
+def _centres(clip: Clip, stretches: Array, options: ActionOptions) -> tuple[Array, Array]:
+    """``(T,)`` times at which windows are centred, a step apart inside each stretch, and whose they are."""
     begin, end = clip.times[stretches[:, 0]], clip.times[stretches[:, 1] - 1]
-    counts = np.maximum(2, np.ceil((end - begin) / STEP).astype(np.intp) + 1)
+    counts = np.maximum(2, np.ceil((end - begin) / options.events.step).astype(np.intp) + 1)
     owner = np.repeat(np.arange(len(counts)), counts)
     step = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
-    return np.asarray(begin[owner] + STEP * step), owner
+    return np.asarray(begin[owner] + options.events.step * step), owner
 
 
 def check_rate(clip: Clip, window: float) -> None:
@@ -117,11 +99,11 @@ def scan(model: ShapeModel, clip: Clip, stream: Stream, progress: Progress = Non
     check_rate(clip, stream.window)
     cuts = stretches(clip.times, stream.window)
     cuts = cuts[cuts[:, 1] - cuts[:, 0] > 1]  # a single frame says nothing of an action
-    at, owner = _centres(clip, cuts)
+    at, owner = _centres(clip, cuts, model.options)
     scores, motion = np.empty((len(at), model.classes)), np.empty(len(at))
     for begin in range(0, len(at), BLOCK):
         part = slice(begin, begin + BLOCK)
-        source, own = _around(clip, cuts, at[part], owner[part], stream)
+        source, own = _around(clip, cuts, at[part], owner[part], stream, model.options)
         # all tempi at once: the exemplars are described once for all of them
         queries = stack([_windows(source, own, at[part], stream.window * tempo, stream.length) for tempo in stream.tempi])
         found = model.moment_scores(queries.to(stream.device)).unflatten(0, (len(stream.tempi), -1))
@@ -129,12 +111,12 @@ def scan(model: ShapeModel, clip: Clip, stream: Stream, progress: Progress = Non
         motion[part] = _motion(_windows(source, own, at[part], stream.window, stream.length))
         if progress is not None:
             progress(min(1.0, (begin + BLOCK) / len(at)))
-    found_ = StreamScan(at, scores, motion, _present(clip, cuts, at, owner, stream), cuts, owner)
+    found_ = StreamScan(at, scores, motion, _present(clip, cuts, at, owner, stream, model.options), cuts, owner)
     scores[~found_.present] = found_.nothing  # where nobody is seen nothing is said
     return found_
 
 
-def _present(clip: Clip, cuts: Array, at: Array, owner: Array, stream: Stream) -> Array:
+def _present(clip: Clip, cuts: Array, at: Array, owner: Array, stream: Stream, options: ActionOptions) -> Array:
     """Whether enough frames around each time show the person: interpolated poses are no evidence."""
     shown = clip.times[clip.seen.any(axis=1)]
     begin, end = clip.times[cuts[owner, 0]], clip.times[cuts[owner, 1] - 1]
@@ -142,16 +124,16 @@ def _present(clip: Clip, cuts: Array, at: Array, owner: Array, stream: Stream) -
     middle = np.clip(at, begin + span / 2, end - span / 2)
     low, high = np.searchsorted(shown, middle - span / 2 - 1e-6), np.searchsorted(shown, middle + span / 2 + 1e-6)
     rate = 1.0 / float(np.median(np.diff(clip.times)))
-    return np.asarray(high - low >= np.maximum(2.0, SHOWN * span * rate))
+    return np.asarray(high - low >= np.maximum(2.0, options.events.shown * span * rate))
 
 
-def _around(clip: Clip, cuts: Array, at: Array, owner: Array, stream: Stream) -> tuple[Ragged, Array]:
+def _around(clip: Clip, cuts: Array, at: Array, owner: Array, stream: Stream, options: ActionOptions) -> tuple[Ragged, Array]:
     """The frames that windows centred at some times can touch, and some more to interpolate missing joints from.
 
     Returns:
         the frames, stretch by stretch; and for each window, in which of these it lies.
     """
-    margin = max(stream.tempi) * stream.window + MARGIN
+    margin = max(stream.tempi) * stream.window + options.events.margin
     used, own = np.unique(owner, return_inverse=True)
     pieces = []
     for number, (low, high) in enumerate(cuts[used].tolist()):
@@ -195,21 +177,25 @@ def find_events(
             outside 0..1 is that level itself.
     """
     wrong, (still, calm) = _wrong(model), _calm(model)
-    peak, floor = event_levels(wrong, FALSE_ALARMS if rate is None else rate, EXTENT, LEAST)
-    convincing = max(peak, float(np.quantile(wrong, CONVINCING)))
+    peak, floor = event_levels(
+        wrong, model.options.events.false_alarms if rate is None else rate, model.options.events.extent, model.options.events.least
+    )
+    convincing = max(peak, float(np.quantile(wrong, model.options.events.convincing)))
     found: list[Event] = []
     for part, frames in windows.parts():
         at = windows.times[part]
-        scores = smooth(windows.scores[part], at, EVENT_POOL * stream.pool)
+        scores = smooth(windows.scores[part], at, model.options.events.pool * stream.pool)
         contrast = scores - scores.mean(axis=1, keepdims=True)
         motion = smooth(windows.motion[part, None], at, stream.window)[:, 0]
-        resting = at_rest(contrast, motion, still, calm, (floor, convincing)) | ~windows.present[part]
+        resting = at_rest(contrast, motion, still, calm, (floor, convincing), options=model.options) | ~windows.present[part]
         ends = np.minimum(at, clip.times[frames][-1])
         found += events(contrast, ends, list(classes), peak, floor, resting)
     return _with_exemplars(model, clip, stream, windows.stretches, classes, found)
 
 
-def at_rest(contrast: Array, motion: Array, still: float, calm: Array, levels: tuple[float, float]) -> Array:
+def at_rest(
+    contrast: Array, motion: Array, still: float, calm: Array, levels: tuple[float, float], options: ActionOptions = ActionOptions()
+) -> Array:
     """``(T,)`` whether a person rests, whatever action it looks like.
 
     The less a person moves, the more contrast it takes: between the level that every event needs and the convincing one.
@@ -227,8 +213,8 @@ def at_rest(contrast: Array, motion: Array, still: float, calm: Array, levels: t
         [False, False, False, True]
     """
     own = np.minimum(still, calm[contrast.argmax(axis=1)])
-    less = np.log(np.maximum(own, 1e-30) / np.maximum(motion, 1e-30)) / np.log(HUSH)
-    way = np.maximum(np.clip(less, 0.0, 1.0), DOUBT * (motion < still))
+    less = np.log(np.maximum(own, 1e-30) / np.maximum(motion, 1e-30)) / np.log(options.events.hush)
+    way = np.maximum(np.clip(less, 0.0, 1.0), options.events.doubt * (motion < still))
     return np.asarray(contrast.max(axis=1) < levels[0] + (levels[1] - levels[0]) * way)
 
 
@@ -242,8 +228,8 @@ def _with_exemplars(
     middles = np.array([(event.start + event.end) / 2 for event in found])
     owner = np.searchsorted(clip.times[cuts[:, 0]], middles, side="right") - 1
     queries = []
-    for some in np.split(np.arange(len(found)), np.flatnonzero(np.diff(middles // (BLOCK * STEP))) + 1):
-        source, own = _around(clip, cuts, middles[some], owner[some], stream)
+    for some in np.split(np.arange(len(found)), np.flatnonzero(np.diff(middles // (BLOCK * model.options.events.step))) + 1):
+        source, own = _around(clip, cuts, middles[some], owner[some], stream, model.options)
         queries.append(_windows(source, own, middles[some], stream.window, stream.length))
     residual = model.moment_residuals(stack(queries).to(stream.device))
     owners = model.labels[model.exemplars.owner]
@@ -263,7 +249,7 @@ def _motion(windows: Windows) -> Array:
 def _wrong(model: ShapeModel) -> Array:
     """The contrast that short windows of one class reach with other classes."""
     moments, labels = model.exemplars.moments, model.labels[model.exemplars.owner]
-    chosen = torch.arange(0, len(moments), max(1, len(moments) // MOMENT_SAMPLE))
+    chosen = torch.arange(0, len(moments), max(1, len(moments) // model.options.nearest.moments))
     scores = model.moment_scores(moments[chosen]).cpu().numpy()
     scores[np.arange(len(chosen)), labels[chosen].cpu().numpy()] = np.nan
     return np.asarray(np.nanmax(scores, axis=1) - np.nanmean(scores, axis=1))
@@ -272,5 +258,5 @@ def _wrong(model: ShapeModel) -> Array:
 def _calm(model: ShapeModel) -> tuple[float, Array]:
     """The motion of calm moments: of all classes together, and of each ``(classes,)``."""
     motion, labels = _motion(model.exemplars.moments), model.labels[model.exemplars.owner].cpu().numpy()
-    each = np.array([np.quantile(motion[labels == c], CALM) for c in range(model.classes)])
-    return float(np.quantile(motion, STILL)), each
+    each = np.array([np.quantile(motion[labels == c], model.options.events.calm) for c in range(model.classes)])
+    return float(np.quantile(motion, model.options.events.still)), each

@@ -12,21 +12,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from indexing.action.options import ActionOptions
 from indexing.cameras import rotation
 from indexing.clip import FloatArray
 from indexing.skeleton import Skeleton
 
-SHUFFLES = 20
-DISTORTION = 0.25  # of the mean joint distance: the right layout fits to .02-.12 (one clip: .25), wrong ones to .34-.71
 
-
-def mirror_permutation(skeleton: Skeleton | None, windows: Tensor, seen: Tensor | None = None) -> Tensor | None:
+def mirror_permutation(
+    skeleton: Skeleton | None, windows: Tensor, seen: Tensor | None = None, *, options: ActionOptions = ActionOptions()
+) -> Tensor | None:
     """``(joints,)`` index of every joint's mirror image (itself on the midline), or ``None`` where it cannot be told."""
     if skeleton is not None:
         named = from_names(skeleton.joints)
         if named is not None:
             return named
-    return from_data(windows, seen)
+    return from_data(windows, seen, options=options)
 
 
 def from_names(names: tuple[str, ...]) -> Tensor | None:
@@ -95,7 +95,7 @@ _LAYOUTS: dict[int, tuple[tuple[tuple[int, int], ...], ...]] = {
 }  # fmt: skip
 
 
-def from_data(windows: Tensor, seen: Tensor | None = None) -> Tensor | None:
+def from_data(windows: Tensor, seen: Tensor | None = None, *, options: ActionOptions = ActionOptions()) -> Tensor | None:
     r"""The common layout with this number of joints whose mirror image keeps the distances between joints.
 
     A permutation :math:`\pi` is a mirror symmetry where the mean distances obey :math:`D_{ij} = D_{\pi(i)\pi(j)}`; the
@@ -123,8 +123,11 @@ def from_data(windows: Tensor, seen: Tensor | None = None) -> Tensor | None:
         return float((tables - tables[:, swap][:, :, swap]).abs().mean(0)[counted].mean())
 
     shuffles = torch.Generator().manual_seed(0)
-    chance = sum(distortion(torch.randperm(joints, generator=shuffles)) for _ in range(SHUFFLES)) / SHUFFLES
-    best, chosen = min(DISTORTION, chance / 2), None
+    chance = (
+        sum(distortion(torch.randperm(joints, generator=shuffles)) for _ in range(options.mirror.shuffles))
+        / options.mirror.shuffles
+    )
+    best, chosen = min(options.mirror.distortion, options.mirror.chance * chance), None
     for pairs in _LAYOUTS[joints]:
         swap = torch.arange(joints)
         for i, j in pairs:
@@ -141,9 +144,6 @@ def from_data(windows: Tensor, seen: Tensor | None = None) -> Tensor | None:
 # person is taken for a flat card and the card is turned: a random horizontal squeeze or mirror image with a slight pitch.
 # Measured, that gives 65-85 % of the gain of true 3D to a view-bound kernel and nearly all of it once heights are compared
 # too; it needs no weights, no training and no particular joints.
-
-
-PITCH = 0.1  # radians, standard deviation over the virtual cameras
 
 
 def turn(windows: Tensor, azimuth: FloatArray, pitch: FloatArray) -> Tensor:

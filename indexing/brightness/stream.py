@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from dyntorch.numerics import one_thread
-from indexing.action.stream import EXTENT, FALSE_ALARMS
+from indexing.action.options import EventOptions
 from indexing.brightness.footage import Footage, Resampler
 from indexing.brightness.library import Library, VideoExemplars
 from indexing.brightness.sight import Optics, Sight, mirrored, together
@@ -265,7 +265,7 @@ def mirrors_matter(source: Recognizer, exemplars: VideoExemplars) -> bool:
 def found_events(scores: Array, times: Array, energy: Array, classes: Array, wrong: Array, rate: float | None) -> list[Event]:
     """Events of scored frames: where the contrast of the best class exceeds what wrong actions reach at a rate."""
     contrast = scores - scores.mean(axis=1, keepdims=True)
-    peak, floor = event_levels(wrong, FALSE_ALARMS if rate is None else rate, EXTENT, (LEAST, LEAST))
+    peak, floor = event_levels(wrong, EventOptions.false_alarms if rate is None else rate, EventOptions.extent, (LEAST, LEAST))
     return events(contrast, times, classes.tolist(), peak, floor, energy < QUIET)
 
 

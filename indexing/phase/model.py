@@ -13,7 +13,7 @@ from torch import Tensor
 from dyntorch import Fourier, Polynomial
 from indexing import scoring
 from indexing.action.bank import EPSILON, Windows, stack
-from indexing.action.stream import EXTENT
+from indexing.action.options import EventOptions
 from indexing.phase.frames import LEAST as FRAMES_LEAST
 from indexing.phase.frames import Learned, image_distance, shape_distance, standardized
 
@@ -300,4 +300,4 @@ def event_levels(wrong: Tensor, rate: float | None) -> tuple[float, float]:
     Args:
         rate: 0.1 by default; a number outside 0..1 is the level itself.
     """
-    return scoring.event_levels(wrong.cpu().numpy(), FALSE_ALARMS if rate is None else rate, EXTENT, LEAST)
+    return scoring.event_levels(wrong.cpu().numpy(), FALSE_ALARMS if rate is None else rate, EventOptions.extent, LEAST)

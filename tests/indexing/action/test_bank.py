@@ -8,6 +8,7 @@ from sklearn.svm import SVC
 from dyntorch.numerics import canonical_correlation
 from indexing.action.bank import CHANNELS, EPSILON, JointMetric, Kernels, Windows, channel, fused_residual, order_free
 from indexing.action.model import PairwiseMachine
+from indexing.action.options import MachineOptions
 from indexing.action.symmetry import mirror, turn
 
 LENGTH, JOINTS = 8, 6
@@ -145,7 +146,7 @@ def test_residuals_do_not_depend_on_the_chunk(monkeypatch):
     query, bank = random_windows(6, 13, holes=True), random_windows(5, 14, holes=True)
     metric = metric_of(bank)
     expected = fused_residual(query, [bank], metric)
-    monkeypatch.setattr("indexing.action.bank.PAIRS_AT_ONCE", 4)
+    monkeypatch.setattr("indexing.action.bank.PAIR_BLOCK", 4)
     torch.testing.assert_close(fused_residual(query, [bank], metric), expected, atol=1e-5, rtol=0)
 
 
@@ -166,7 +167,7 @@ def test_no_exemplars_is_refused():
 @pytest.mark.parametrize("one_side", [False, True])
 def test_kernels_are_symmetric_with_ones_on_the_diagonal(one_side):
     windows = random_windows(20, 17)
-    kernel = Kernels(metric_of(windows, 0.0), one_side).fit(windows)
+    kernel = Kernels(metric_of(windows, 0.0), one_side).fit(windows, MachineOptions())
     assert kernel.shape == (20, 20)
     torch.testing.assert_close(kernel, kernel.mT, atol=1e-5, rtol=0)
     torch.testing.assert_close(kernel.diagonal(), torch.ones(20), atol=2e-2 if one_side else 1e-4, rtol=0)
@@ -178,7 +179,7 @@ def test_kernels_are_symmetric_with_ones_on_the_diagonal(one_side):
 def test_kernel_by_definition():
     query, bank = random_windows(4, 18), random_windows(9, 19)
     kernels = Kernels(metric_of(bank, 0.0))
-    kernels.fit(bank)
+    kernels.fit(bank, MachineOptions())
 
     def features(windows):
         x = [channel(windows.values, name).double() for name in CHANNELS]

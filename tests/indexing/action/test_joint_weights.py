@@ -7,23 +7,19 @@ import torch
 
 from indexing.action.bank import NEAREST, JointMetric, Windows, fused_residual
 from indexing.action.joint_weights import JointWeights, WeightedMetric, epipolar, gather, learn_joint_weights
+from indexing.action.options import ActionOptions, JointWeightOptions
 
 JOINTS, LENGTH = 6, 8
+ONE_ROUND = ActionOptions(joints=JointWeightOptions(rounds=1))
 TELLING = 4
-
-
-@pytest.fixture
-def one_round(monkeypatch):
-    monkeypatch.setattr("indexing.action.joint_weights.ROUNDS", 1)
 
 
 @pytest.fixture(scope="module")
 def plain():
     """Planted windows of five people, and what is learned from them."""
     bank, labels, groups = planted(5)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("indexing.action.joint_weights.ROUNDS", 1)
-        return bank, labels, groups, learn_joint_weights(bank, torch.arange(15), [bank], a_metric(bank), labels, groups=groups)
+    found = learn_joint_weights(bank, torch.arange(15), [bank], a_metric(bank), labels, groups=groups, options=ONE_ROUND)
+    return bank, labels, groups, found
 
 
 def seen(values):
@@ -123,7 +119,7 @@ def test_a_planted_joint_is_found_and_pays_with_new_people(plain):
     assert accuracy(learned, query, truth, bank, labels, metric) >= accuracy(equal, query, truth, bank, labels, metric) + 0.1
 
 
-def test_each_action_gets_the_joint_that_tells_it(one_round):
+def test_each_action_gets_the_joint_that_tells_it():
     def own_joints(people, seed):
         """Joint c draws the curve of action c; in other actions it wanders."""
         _, labels, groups = planted(people, seed=seed)
@@ -136,25 +132,29 @@ def test_each_action_gets_the_joint_that_tells_it(one_round):
     bank, labels, groups = own_joints(10, seed=0)
     query, truth, _ = own_joints(20, seed=5)
     metric = a_metric(bank)
-    found = learn_joint_weights(bank, torch.arange(len(labels)), [bank], metric, labels, groups=groups)
+    found = learn_joint_weights(bank, torch.arange(len(labels)), [bank], metric, labels, groups=groups, options=ONE_ROUND)
     assert found.by_class is not None
     assert found.by_class.argmax(dim=1).tolist() == [0, 1, 2]
     shared = dataclasses.replace(found, by_class=None)
     assert accuracy(found, query, truth, bank, labels, metric) > accuracy(shared, query, truth, bank, labels, metric)
 
 
-def test_the_order_of_joints_changes_nothing_but_the_order(plain, one_round):
+def test_the_order_of_joints_changes_nothing_but_the_order(plain):
     bank, labels, groups, learned = plain
     order = torch.tensor([3, 5, 0, 4, 1, 2])
     turned = Windows(bank.values[:, :, order], bank.seen[:, order])
-    other = learn_joint_weights(turned, torch.arange(len(labels)), [turned], a_metric(turned), labels, groups=groups)
+    other = learn_joint_weights(
+        turned, torch.arange(len(labels)), [turned], a_metric(turned), labels, groups=groups, options=ONE_ROUND
+    )
     torch.testing.assert_close(other.joints, learned.joints[:, order], atol=0.03, rtol=0.03)
 
 
-def test_mirror_images_share_a_weight(plain, one_round):
+def test_mirror_images_share_a_weight(plain):
     bank, labels, groups, _ = plain
     swap = torch.tensor([0, 1, 2, 3, 5, 4])
-    found = learn_joint_weights(bank, torch.arange(len(labels)), [bank], a_metric(bank), labels, groups=groups, symmetry=swap)
+    found = learn_joint_weights(
+        bank, torch.arange(len(labels)), [bank], a_metric(bank), labels, groups=groups, symmetry=swap, options=ONE_ROUND
+    )
     torch.testing.assert_close(found.joints[:, 4], found.joints[:, 5])
 
 

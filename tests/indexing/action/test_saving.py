@@ -9,8 +9,10 @@ import pytest
 import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
+from sklearn.base import clone
 
 from indexing import ActionIndexer
+from indexing.action.options import ActionOptions, ExemplarOptions, NearestOptions
 from indexing.actors import Person, dataset
 
 FEW = ("squat", "wave", "kick", "bow")
@@ -232,3 +234,38 @@ def test_places_that_cannot_be_written_are_named(train, tmp_path):
 
 def test_text_paths_are_taken(saved, test):
     assert ActionIndexer.load(str(saved)).predict(test).shape == (len(test),)
+
+
+def test_options_are_kept_where_they_are_not_the_defaults(train, test, tmp_path):
+    plain, usual, other = tmp_path / "plain.safetensors", tmp_path / "usual.safetensors", tmp_path / "other.safetensors"
+    ActionIndexer(scorer="nearest").fit(train).save(plain)
+    ActionIndexer(scorer="nearest", options=ActionOptions()).fit(train).save(usual)
+    assert plain.read_bytes() == usual.read_bytes() and ActionIndexer.load(usual).options is None
+    options = ActionOptions(
+        exemplars=ExemplarOptions(crops=((0.0, 1.0), (0.1, 0.8))), nearest=NearestOptions(neighbours=1, floor=0.5, turned=0.0)
+    )
+    taught = clone(ActionIndexer(scorer="nearest", options=options)).fit(train)
+    taught.save(other)
+    assert contents(other)[1]["parameters"]["options"] == {
+        "exemplars": {"crops": [[0.0, 1.0], [0.1, 0.8]]}, "nearest": {"neighbours": 1, "floor": 0.5, "turned": 0.0}
+    }  # fmt: skip
+    again = ActionIndexer.load(other)
+    assert again.options == options and again.model_.options == options
+    np.testing.assert_array_equal(again.decision_function(test), taught.decision_function(test))
+    assert not np.array_equal(again.decision_function(test), ActionIndexer.load(plain).decision_function(test))
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ([1], "options: expected fields"), ({"nearest": {"near": 1}}, "options.nearest: there is no 'near'"),
+        ({"nearest": {"neighbours": 1.5}}, "options.nearest.neighbours: expected a value like 2"),
+        ({"events": {"least": [1.0]}}, "options.events.least"), ({"events": {"step": "x"}}, "options.events.step"),
+    ],
+)  # fmt: skip
+def test_options_that_are_none_are_refused(options, said, saved, tmp_path):
+    tensors, header = contents(saved)
+    header["parameters"]["options"] = options
+    save_file(tensors, tmp_path / "bad.safetensors", metadata={"dyntorch": json.dumps(header)})
+    with pytest.raises(ValueError, match=re.escape(said)):
+        ActionIndexer.load(tmp_path / "bad.safetensors")
