@@ -5,7 +5,7 @@
 - :class:`PhaseIndexer`: the same from single frames, and how far the action has got;
 - :class:`BrightnessIndexer`: the same from pixels alone;
 - :func:`synchronize`: how far two cameras' clocks are apart;
-- :class:`ActionOptions`, :class:`SyncOptions`: every number that decides in these, by stage.
+- :class:`ActionOptions`, :class:`PhaseOptions`, :class:`SyncOptions`: every number that decides in these, by stage.
 
 The indexers follow scikit-learn.  Times are seconds.  The public names are imported lazily, as in ``dyntorch``.
 """
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from indexing.clip import Clip as Clip
     from indexing.clip import ClipSet as ClipSet
     from indexing.phase.indexer import PhaseIndexer as PhaseIndexer
+    from indexing.phase.options import PhaseOptions as PhaseOptions
     from indexing.scoring import Event as Event
     from indexing.sync.options import SyncOptions as SyncOptions
     from indexing.sync.synchronize import synchronize as synchronize
@@ -36,6 +37,7 @@ _HOME = {
     "synchronize": "indexing.sync.synchronize",
     # the numbers that decide in a verb
     "ActionOptions": "indexing.action.options",
+    "PhaseOptions": "indexing.phase.options",
     "SyncOptions": "indexing.sync.options",
 }
 __all__ = sorted(_HOME)

@@ -13,11 +13,10 @@ from dyntorch.numerics import orthonormal_basis
 from indexing.action.bank import Windows, between, cosine_distance
 from indexing.cameras import virtual, y_up
 from indexing.clip import Clip
+from indexing.phase.options import PhaseOptions
 from indexing.windows import ragged
 
 LEAST = 6  # joints: an affine camera takes any four anywhere, so five leave two numbers to judge by
-TURNS = 8  # views of a clip that has depth
-ELEVATIONS = (0.05, 0.3)  # radians, in turn
 
 
 @dataclass(frozen=True)
@@ -43,11 +42,14 @@ def query_frames(clip: Clip) -> Windows:
     return Windows(joints, torch.from_numpy(clip.seen))
 
 
-def images(clip: Clip) -> list[Clip]:
+def images(clip: Clip, options: PhaseOptions = PhaseOptions()) -> list[Clip]:
     """An image itself; of 3D joints, views from all around."""
     if clip.dims == 2:
         return [clip]
-    return [virtual(clip, 360 / TURNS * i, ELEVATIONS[i % len(ELEVATIONS)]) for i in range(TURNS)]
+    return [
+        virtual(clip, 360 / options.views.turns * i, options.views.elevations[i % len(options.views.elevations)])
+        for i in range(options.views.turns)
+    ]
 
 
 def standardized(x: Tensor, seen: Tensor) -> Tensor:

@@ -20,22 +20,24 @@ from indexing.estimator import POSITIVE, REJECT, SECONDS, Rule, SavedClassifier,
 from indexing.joints import layout_of
 from indexing.phase.frames import LEAST, images, query_frames
 from indexing.phase.learning import learn_model
-from indexing.phase.model import FEWEST, SECOND, PhaseModel, event_levels
+from indexing.phase.model import PhaseModel, event_levels
+from indexing.phase.options import PhaseOptions
 from indexing.scoring import Event, events, probabilities, refuse, reject_threshold, same_label, smooth
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Parameters and phases that users hand in, checked once.
 
 
-def check_reject(indexer: Any, classes: list[Any]) -> None:
+def check_reject(indexer: PhaseIndexer, classes: list[Any]) -> None:
     """Raise where a rate cannot be calibrated, or a refused clip would look like a known one."""
     if indexer.reject is None:
         return
     if any(same_label(value, indexer.none_label) for value in classes):
         raise ValueError(f"none_label={indexer.none_label!r} is one of the learned labels; choose another for rejected clips")
-    if 0 < indexer.reject < 1 and len(classes) < FEWEST:
+    fewest = indexer._options.events.classes
+    if 0 < indexer.reject < 1 and len(classes) < fewest:
         raise ValueError(
-            f"reject={indexer.reject!r} is calibrated by leaving a class out, which takes {FEWEST} classes, got {len(classes)}; "
+            f"reject={indexer.reject!r} is calibrated by leaving a class out, which takes {fewest} classes, got {len(classes)}; "
             "give further ones, or a threshold outside 0..1"
         )
 
@@ -65,11 +67,9 @@ def check_phases(phases: Sequence[Any] | None, clips: list[Clip], owners: list[i
 
 
 Array = NDArray[Any]
-FASTEST = 3.0  # cycles per second
-RATES = 61  # tried, from backwards to forwards
 
 
-def smooth_phases(phase: Array, times: Array, seconds: float, periodic: Array) -> Array:
+def smooth_phases(phase: Array, times: Array, seconds: float, periodic: Array, options: PhaseOptions = PhaseOptions()) -> Array:
     r"""``(T, classes)`` phases, each from its neighbours too.
 
     A cycle's: the argument of :math:`\sum_j e^{2\pi i(\phi_j - \rho(t_j - t))}` at the rate with the largest modulus; a course's:
@@ -86,7 +86,7 @@ def smooth_phases(phase: Array, times: Array, seconds: float, periodic: Array) -
         True
     """
     out = np.full_like(phase, np.nan)
-    rates = np.linspace(-FASTEST, FASTEST, RATES)
+    rates = np.linspace(-options.evidence.fastest, options.evidence.fastest, options.evidence.rates)
     for i, time in enumerate(times):
         near = np.abs(times - time) <= seconds / 2
         for c, turns in enumerate(periodic):
@@ -123,6 +123,7 @@ class PhaseIndexer(SavedClassifier):
             ``True``: in every action that repeats; ``False``: never.
         window: seconds of neighbours that a frame's score and phase are averaged over; 0: every frame from itself alone.
         device: where frames are compared with the exemplars, e.g. ``"cuda"``; ``fit`` computes on the CPU.
+        options: every other number that decides, by stage (:class:`~indexing.phase.options.PhaseOptions`); None: as measured.
 
     Attributes:
         classes_: ``(classes,)`` labels as given.  periodic_: ``(classes,)`` which of them repeat.
@@ -149,6 +150,7 @@ class PhaseIndexer(SavedClassifier):
         "fps": POSITIVE,
         "window": SECONDS,
         "reject": REJECT,
+        "options": Rule(lambda value: value is None or isinstance(value, PhaseOptions), "None or indexing.PhaseOptions"),
     }
 
     def __init__(
@@ -162,6 +164,7 @@ class PhaseIndexer(SavedClassifier):
         mirror: str | bool = "auto",
         window: float = 0.0,
         device: str = "cpu",
+        options: PhaseOptions | None = None,
     ) -> None:
         self.harmonics = harmonics
         self.course = course
@@ -171,6 +174,11 @@ class PhaseIndexer(SavedClassifier):
         self.mirror = mirror
         self.window = window
         self.device = device
+        self.options = options
+
+    @property
+    def _options(self) -> PhaseOptions:
+        return PhaseOptions() if self.options is None else self.options
 
     @one_thread
     def fit(self, clips: Iterable[Any], labels: ArrayLike | None = None, phases: Sequence[Any] | None = None) -> Self:
@@ -200,7 +208,7 @@ class PhaseIndexer(SavedClassifier):
         skeleton = layout_of(found)
         views, which = [], []
         for k, clip in enumerate(found):
-            seen_as = images(clip)
+            seen_as = images(clip, options=self._options)
             views += seen_as
             which += [k] * len(seen_as)
         order = sorted(range(len(views)), key=lambda i: (str(numbers[which[i]]), views[i].joints.tobytes()))
@@ -212,6 +220,7 @@ class PhaseIndexer(SavedClassifier):
             course=self.course,
             mirror=self.mirror,
             swap=lambda windows, seen: mirror_permutation(skeleton, windows, seen),
+            options=self._options,
         )
         self.model_: PhaseModel = model
         self.classes_ = classes
@@ -230,7 +239,7 @@ class PhaseIndexer(SavedClassifier):
         (found,) = check_queries([clip], self.fps, self.n_joints_, self.skeleton_, fewest=1, recordings=True)
         scores, phase = (part.cpu().numpy() for part in self._evidence([found]))
         if self.window > 0:
-            phase = smooth_phases(phase, found.times, self.window, self.periodic_)
+            phase = smooth_phases(phase, found.times, self.window, self.periodic_, options=self._options)
             scores = smooth(scores, found.times, self.window)
         return np.asarray(scores), np.asarray(phase)
 
@@ -297,10 +306,11 @@ class PhaseIndexer(SavedClassifier):
         if len(self.classes_) < 2:
             raise ValueError("find needs two classes at least to tell one from the other; fit clips of ordinary movement too")
         scores = self._evidence([found])[0].cpu().numpy()
-        levels = event_levels(self.model_.wrong, self.reject)
-        parts = [slice(first, end) for first, end in stretches(found.times, SECOND).tolist()]  # no event reaches across a gap
+        levels = event_levels(self.model_.wrong, self.reject, options=self._options)
+        second = self._options.events.second
+        parts = [slice(first, end) for first, end in stretches(found.times, second).tolist()]  # no event reaches across a gap
         return [
             event
             for part in parts
-            for event in events(smooth(scores[part], found.times[part], SECOND), found.times[part], list(self.classes_), *levels)
+            for event in events(smooth(scores[part], found.times[part], second), found.times[part], list(self.classes_), *levels)
         ]

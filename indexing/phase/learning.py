@@ -14,6 +14,7 @@ from indexing.action.bank import Windows, stack
 from indexing.clip import Clip
 from indexing.phase.frames import Learned, standardized, training_frames
 from indexing.phase.model import Course, PhaseModel, learn_course, wrong_scores
+from indexing.phase.options import PhaseOptions
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Where in its action every training frame is, found from the clips themselves: no view, joint or action is special.
@@ -24,27 +25,14 @@ from indexing.phase.model import Course, PhaseModel, learn_course, wrong_scores
 # from the start of its clip to the end.
 
 
-RATE = 25.0  # samples per second
-SHORTEST, LONGEST = 0.3, 4.0  # seconds that a period lasts
-DEEP = 0.65  # an action repeats where the best piece of half its clips comes back to 1 - this correlation of the changes of pose:
-# CMU walks .12-.3 and on uneven ground .3-.6, punches .2-.3, bending .2-.4; jumps on one leg .63-.78
-LOOSE = 0.8  # pieces of such an action count their own period up to this
-SAME = 1.3  # lags almost as good as the best one are periods too; the shortest counts
-REACH = 3  # samples to either side that a change of pose is measured over: slow turns of the person are none
-BINS = 24  # of a mean cycle
-PIECE = 2.0  # periods
-LOCAL = 5.0  # seconds over which one period may hold
-SLOW, FAST = 0.5, 1.6  # of the mean rate, while a clip is followed through its cycle
-STEPS = 64  # phases of that path
-
-
-def period(x: Tensor, seconds: Tensor) -> tuple[float, float]:
+def period(x: Tensor, seconds: Tensor, options: PhaseOptions = PhaseOptions()) -> tuple[float, float]:
     """Seconds after which frames ``(F, n, 2)`` come back, and how far from it they remain (1 = they do not)."""
-    x = _sampled(standardized(x, x.new_ones(x.shape[:2])), seconds).flatten(1)
-    low, high = round(SHORTEST * RATE), min(round(LONGEST * RATE), 2 * len(x) // 3)
-    if high <= low + 2 or len(x) <= 4 * REACH:
+    x = _sampled(standardized(x, x.new_ones(x.shape[:2])), seconds, options).flatten(1)
+    rate = options.period.rate
+    low, high = round(options.period.shortest * rate), min(round(options.period.longest * rate), 2 * len(x) // 3)
+    if high <= low + 2 or len(x) <= 4 * options.period.reach:
         return 0.0, 1.0
-    x = x[2 * REACH :] - x[: -2 * REACH]
+    x = x[2 * options.period.reach :] - x[: -2 * options.period.reach]
     lags = range(min(high, len(x) - 2) + 1)
     energy = x.square().sum(1)
     apart = torch.stack(
@@ -59,48 +47,48 @@ def period(x: Tensor, seconds: Tensor) -> tuple[float, float]:
         return 0.0, 1.0
     found = dip.nonzero()[:, 0] + 1
     depth = apart[found]
-    first = int((depth <= max(SAME * float(depth.min()), 0.5 * DEEP)).nonzero()[0, 0])
+    first = int((depth <= max(options.period.alike * float(depth.min()), 0.5 * options.period.deep)).nonzero()[0, 0])
     at = int(found[first])
     before, here, after = (float(apart[at + k]) for k in (-1, 0, 1))
     shift = (before - after) / (2 * max(before + after - 2 * here, 1e-12))
-    return (at + max(-0.5, min(0.5, shift))) / RATE, float(depth[first])
+    return (at + max(-0.5, min(0.5, shift))) / rate, float(depth[first])
 
 
-def _sampled(x: Tensor, seconds: Tensor) -> Tensor:
-    """Frames at :data:`RATE`, by linear interpolation."""
-    wanted = torch.arange(float(seconds[0]), float(seconds[-1]) + 1e-9, 1 / RATE, dtype=seconds.dtype)
+def _sampled(x: Tensor, seconds: Tensor, options: PhaseOptions) -> Tensor:
+    """Frames at the rate of the options, by linear interpolation."""
+    wanted = torch.arange(float(seconds[0]), float(seconds[-1]) + 1e-9, 1 / options.period.rate, dtype=seconds.dtype)
     right = torch.searchsorted(seconds, wanted, right=True).clamp(1, len(seconds) - 1)
     share = ((wanted - seconds[right - 1]) / (seconds[right] - seconds[right - 1])).clamp(0, 1)[:, None, None].to(x)
     return x[right - 1] + share * (x[right] - x[right - 1])
 
 
-def _local(x: Tensor, seconds: Tensor) -> list[tuple[slice, float, float]]:
-    """Pieces of a clip of about :data:`LOCAL` seconds, with the period and its depth in each."""
-    count = max(1, round(float(seconds[-1] - seconds[0]) / LOCAL))
+def _local(x: Tensor, seconds: Tensor, options: PhaseOptions) -> list[tuple[slice, float, float]]:
+    """Pieces of a clip of a few seconds, with the period and its depth in each."""
+    count = max(1, round(float(seconds[-1] - seconds[0]) / options.period.local))
     parts = _cut(seconds, slice(0, len(seconds)), count)
-    return [(part, *period(x[part], seconds[part])) for part in parts]
+    return [(part, *period(x[part], seconds[part], options=options)) for part in parts]
 
 
-def in_step(clips: list[tuple[Tensor, Tensor]]) -> list[Tensor] | None:
+def in_step(clips: list[tuple[Tensor, Tensor]], options: PhaseOptions = PhaseOptions()) -> list[Tensor] | None:
     """Phases in [0, 1) of the frames of clips of one action that repeats; ``None`` where it does not.
 
     Args:
         clips: frames ``(F, n, 2)`` and seconds ``(F,)`` of each.
     """
-    local = [_local(*clip) for clip in clips]
+    local = [_local(*clip, options=options) for clip in clips]
     depths = sorted(min(depth for _, _, depth in parts) for parts in local)
-    if depths[len(depths) // 2] > DEEP:
+    if depths[len(depths) // 2] > options.period.deep:
         return None
-    sure = sorted(seconds for parts in local for _, seconds, depth in parts if depth <= DEEP)
+    sure = sorted(seconds for parts in local for _, seconds, depth in parts if depth <= options.period.deep)
     usual = sure[len(sure) // 2]
     cycles, owner = [], []
     for k, ((x, t), parts) in enumerate(zip(clips, local, strict=True)):
         for part, seconds, depth in parts:
-            tempo = seconds if depth <= LOOSE and 0.6 < seconds / usual < 1.6 else usual
-            for piece in _cut(t, part, max(1, round(float(t[part][-1] - t[part][0]) / (PIECE * tempo)))):
-                cycles.append(_mean_cycle(x[piece], t[piece], tempo))
+            tempo = seconds if depth <= options.period.loose and 0.6 < seconds / usual < 1.6 else usual
+            for piece in _cut(t, part, max(1, round(float(t[part][-1] - t[part][0]) / (options.period.piece * tempo)))):
+                cycles.append(_mean_cycle(x[piece], t[piece], tempo, options))
                 owner.append((k, piece, tempo))
-    shifts = _shifts(torch.stack(cycles))
+    shifts = _shifts(torch.stack(cycles), options)
     phases = [torch.zeros_like(t) for _, t in clips]
     for (k, piece, tempo), shift in zip(owner, shifts, strict=True):
         phases[k][piece] = (clips[k][1][piece] / tempo + shift).remainder(1.0)
@@ -115,23 +103,24 @@ def _cut(seconds: Tensor, part: slice, count: int) -> list[slice]:
     return [slice(a, b) for a, b in pairwise(cuts) if b > a + 1]
 
 
-def _mean_cycle(x: Tensor, seconds: Tensor, period_: float) -> Tensor:
-    """``(BINS, n, 2)`` mean frame around every phase; the phase is time over period."""
+def _mean_cycle(x: Tensor, seconds: Tensor, period_: float, options: PhaseOptions) -> Tensor:
+    """``(bins, n, 2)`` mean frame around every phase; the phase is time over period."""
     x = standardized(x, x.new_ones(x.shape[:2]))
     phase = seconds / period_
-    apart = (phase[:, None] - torch.arange(BINS, dtype=phase.dtype) / BINS + 0.5).remainder(1.0) - 0.5
-    weight = torch.exp(-0.5 * (apart * BINS).square()) + 1e-12  # a phase that a short clip misses takes the nearest frames
+    apart = (phase[:, None] - torch.arange(options.period.bins, dtype=phase.dtype) / options.period.bins + 0.5).remainder(1.0) - 0.5
+    # a phase that a short clip misses takes the nearest frames
+    weight = torch.exp(-0.5 * (apart * options.period.bins).square()) + 1e-12
     return torch.einsum("fg,fnd->gnd", weight / weight.sum(0), x)
 
 
-def _shifts(cycles: Tensor) -> list[float]:
+def _shifts(cycles: Tensor, options: PhaseOptions) -> list[float]:
     """What to add to each cycle's own phase, so that all are in step with the one that fits the others best."""
     moving = cycles - cycles.mean(1, keepdim=True)
     count = len(moving)
-    turned = torch.stack([moving.roll(-k, dims=1) for k in range(BINS)], 1)  # cycle at phase + k
+    turned = torch.stack([moving.roll(-k, dims=1) for k in range(options.period.bins)], 1)  # cycle at phase + k
     basis = orthonormal_basis((turned - turned.mean(2, keepdim=True)).flatten(2, 3).flatten(0, 1))
-    apart = 1 - canonical_correlation(basis[::BINS], basis)
-    apart = (apart + 1e-3).log().unflatten(1, (count, BINS))  # (cycle, other, shift of the other)
+    apart = 1 - canonical_correlation(basis[:: options.period.bins], basis)
+    apart = (apart + 1e-3).log().unflatten(1, (count, options.period.bins))  # (cycle, other, shift of the other)
     rise = (apart.mean(2) - apart.amin(2)).fill_diagonal_(0)
     done, shifts = [int(rise.sum(1).argmax())], [0] * count
     while len(done) < count:
@@ -141,10 +130,12 @@ def _shifts(cycles: Tensor) -> list[float]:
         best = int((total.mean(1) - total.amin(1)).argmax())
         shifts[rest[best]] = int(total[best].argmin())
         done.append(rest[best])
-    return [-shift / BINS for shift in shifts]
+    return [-shift / options.period.bins for shift in shifts]
 
 
-def followed(course: Course, x: Tensor, seen: Tensor, seconds: Tensor, phase: Tensor) -> Tensor:
+def followed(
+    course: Course, x: Tensor, seen: Tensor, seconds: Tensor, phase: Tensor, options: PhaseOptions = PhaseOptions()
+) -> Tensor:
     """Phases of one clip's frames that go forward at about the clip's rate and leave least, by dynamic programming.
 
     Args:
@@ -152,11 +143,11 @@ def followed(course: Course, x: Tensor, seen: Tensor, seconds: Tensor, phase: Te
     """
     if len(x) < 3:
         return phase
-    curve = (course.curve(Windows(x[:, None], seen), STEPS) + 1e-3).log()
+    curve = (course.curve(Windows(x[:, None], seen), options.period.steps) + 1e-3).log()
     steps = (phase.diff() + 0.5).remainder(1.0) - 0.5
     rate = float(steps.median() / seconds.diff().median())
-    least = (SLOW * rate * seconds.diff() * STEPS).floor().long().clamp(min=0)
-    most = torch.maximum((FAST * rate * seconds.diff() * STEPS).ceil().long(), least + 1)
+    least = (options.period.slow * rate * seconds.diff() * options.period.steps).floor().long().clamp(min=0)
+    most = torch.maximum((options.period.fast * rate * seconds.diff() * options.period.steps).ceil().long(), least + 1)
     cost, back = curve[0], []
     for f in range(1, len(curve)):
         moves = torch.arange(int(least[f - 1]), int(most[f - 1]) + 1)
@@ -166,18 +157,9 @@ def followed(course: Course, x: Tensor, seen: Tensor, seconds: Tensor, phase: Te
         cost = best.values + curve[f]
     at = [int(cost.argmin())]
     for move in reversed(back):
-        at.append((at[-1] - int(move[at[-1]])) % STEPS)
-    return torch.tensor(at[::-1], dtype=phase.dtype) / STEPS
+        at.append((at[-1] - int(move[at[-1]])) % options.period.steps)
+    return torch.tensor(at[::-1], dtype=phase.dtype) / options.period.steps
 
-
-MOST = 1500  # frames that an action's course is learned from: 600 costs .9 degrees of phase
-KEPT = 1000  # frames of an action that others are compared with, every one as all the cards below
-CARDS = (1.0, -1.0, 0.6, -0.6)  # widths of the image: a flat card turned about the vertical, and seen from behind; the turned ones
-# take the AUC from one view per take from .970 to .982, 1.6 and .4 to .978
-ROUNDS = (2, 3, 4)  # harmonics while phases are found: 58, 16, 20 and 11 degrees from the truth after none to three of them
-FIRST = 600  # frames for those
-TWIN = 0.35  # of the way from the frames' own residual to that at any phase, on a log scale: CMU
-# gait .17-.2, punching, washing, bending .9-1.0; where all views are from one side gait too has .9-1 (nothing tells)
 
 Swap = Callable[[Tensor, Tensor], Tensor | None]
 
@@ -191,6 +173,7 @@ def learn_model(
     course: str,
     mirror: str | bool,
     swap: Swap,
+    options: PhaseOptions = PhaseOptions(),
 ) -> tuple[PhaseModel, list[bool]]:
     """The model, and which classes are their own mirror image half a cycle later.
 
@@ -199,7 +182,8 @@ def learn_model(
             joints seen.
     """
     learned = training_frames(clips)
-    twin = swap(learned.frames.values[:500], learned.frames.seen[:500]) if mirror else None
+    some = learned.frames[: options.views.mirror_windows]
+    twin = swap(some.values, some.seen) if mirror else None
     if mirror is True and twin is None:
         raise ValueError("mirror=True: the joints' mirror images are not known; give clips a skeleton with names, or mirror='auto'")
     courses, banks, labels, kept, mirrored = [], [], [], [], []
@@ -208,40 +192,42 @@ def learn_model(
         of = [learned.clip == k for k in mine]
         parts = [Learned(learned.frames[at], learned.clip[at], learned.times[at]) for at in of]
         given = [phases[k] for k in mine]
-        found, repeats = _phases(parts, given, course)
+        found, repeats = _phases(parts, given, course, options)
         one = _joined(parts, found)
-        if repeats and twin is not None and (mirror is True or _own_mirror(one, twin)):
+        if repeats and twin is not None and (mirror is True or _own_mirror(one, twin, options)):
             one = _with_mirror(one, twin)
             mirrored.append(True)
         else:
             mirrored.append(False)
-        courses.append(_course(one, MOST, harmonics, repeats))
-        part = _spread(one, KEPT * (1 + mirrored[-1]))
-        banks += [_card(part[0].frames, width) for width in CARDS]
-        kept += [part[1]] * len(CARDS)
-        labels.append(torch.full((len(CARDS) * len(part[1]),), c))
-    model = PhaseModel(stack(banks), torch.cat(labels), torch.cat(kept), tuple(courses), torch.zeros(0))
+        courses.append(_course(one, options.learning.frames, harmonics, repeats, options))
+        part = _spread(one, options.learning.kept * (1 + mirrored[-1]))
+        banks += [_card(part[0].frames, width) for width in options.learning.cards]
+        kept += [part[1]] * len(options.learning.cards)
+        labels.append(torch.full((len(options.learning.cards) * len(part[1]),), c))
+    model = PhaseModel(stack(banks), torch.cat(labels), torch.cat(kept), tuple(courses), torch.zeros(0), options)
     return replace(model, wrong=wrong_scores(model, learned, label)), mirrored
 
 
 Phased = tuple[Learned, Tensor]
 
 
-def _phases(parts: Sequence[Learned], given: Sequence[Tensor | None], course: str) -> tuple[list[Tensor], bool]:
+def _phases(
+    parts: Sequence[Learned], given: Sequence[Tensor | None], course: str, options: PhaseOptions
+) -> tuple[list[Tensor], bool]:
     """Phases of the frames of every clip, and whether the action repeats."""
     known = [values for values in given if values is not None]
     if len(known) == len(given):
         repeats = course == "periodic" or (course == "auto" and _wraps(known))
         return [values.remainder(1.0) if repeats else values.clamp(0, 1) for values in known], repeats
-    stepped = None if course == "once" else in_step([(part.frames.values[:, 0], part.times) for part in parts])
+    stepped = None if course == "once" else in_step([(part.frames.values[:, 0], part.times) for part in parts], options=options)
     if stepped is None:
         if course == "periodic":
             raise ValueError("course='periodic': no period was found in the clips; give longer ones, or phases")
         return [_once(part.times) for part in parts], False
-    for harmonics in ROUNDS:
-        found = _course(_joined(parts, stepped), FIRST, harmonics, True)
+    for harmonics in options.learning.rounds:
+        found = _course(_joined(parts, stepped), options.learning.first_frames, harmonics, True, options)
         stepped = [
-            followed(found, part.frames.values[:, 0], part.frames.seen, part.times, phase)
+            followed(found, part.frames.values[:, 0], part.frames.seen, part.times, phase, options=options)
             for part, phase in zip(parts, stepped, strict=True)
         ]
     return stepped, True
@@ -275,10 +261,16 @@ def _spread(one: Phased, most: int) -> Phased:
     return Learned(learned.frames[at], learned.clip[at], learned.times[at]), phase[at]
 
 
-def _course(one: Phased, most: int, harmonics: int, repeats: bool) -> Course:
+def _course(one: Phased, most: int, harmonics: int, repeats: bool, options: PhaseOptions) -> Course:
     learned, phase = _spread(one, most)
     return learn_course(
-        learned.frames.values[:, 0], learned.frames.seen, phase, learned.clip, harmonics=harmonics, periodic=repeats
+        learned.frames.values[:, 0],
+        learned.frames.seen,
+        phase,
+        learned.clip,
+        harmonics=harmonics,
+        periodic=repeats,
+        options=options,
     )
 
 
@@ -298,16 +290,16 @@ def _with_mirror(one: Phased, swap: Tensor) -> Phased:
     return Learned(stack([learned.frames, _twins(learned.frames, swap)]), *twice), torch.cat([phase, (phase + 0.5).remainder(1.0)])
 
 
-def _own_mirror(one: Phased, swap: Tensor) -> bool:
+def _own_mirror(one: Phased, swap: Tensor, options: PhaseOptions) -> bool:
     """Whether the mirrored frames fit the course half a cycle later."""
-    learned, phase = _spread(one, FIRST)
-    found = _course((learned, phase), FIRST, ROUNDS[1], True)
+    learned, phase = _spread(one, options.learning.first_frames)
+    found = _course((learned, phase), options.learning.first_frames, options.learning.mirror_harmonics, True, options)
 
     def left(frames: Windows, at: Tensor) -> tuple[Tensor, Tensor]:
-        curve = found.curve(frames)
+        curve = found.curve(frames, options.course.grid)
         count = curve.shape[1]
         return curve.gather(1, (at * count).round().long().remainder(count)[:, None]).mean().log(), curve.mean().log()
 
     own, _ = left(learned.frames, phase)
     other, anywhere = left(_twins(learned.frames, swap), phase + 0.5)
-    return bool(other - own < TWIN * (anywhere - own))
+    return bool(other - own < options.learning.twin * (anywhere - own))

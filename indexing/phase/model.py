@@ -13,9 +13,9 @@ from torch import Tensor
 from dyntorch import Fourier, Polynomial
 from indexing import scoring
 from indexing.action.bank import EPSILON, Windows, stack
-from indexing.action.options import EventOptions
 from indexing.phase.frames import LEAST as FRAMES_LEAST
 from indexing.phase.frames import Learned, image_distance, shape_distance, standardized
+from indexing.phase.options import PhaseOptions
 
 # ----------------------------------------------------------------------------------------------------------------------
 # How the shape of the joints goes through an action, learned from single frames: :math:`X(\phi) = \sum_b c_b(\phi) X_b`.
@@ -23,15 +23,6 @@ from indexing.phase.frames import Learned, image_distance, shape_distance, stand
 # Maximum likelihood (:func:`dyntorch.shapes.fit_shapes`) has the least residual on the frames learned from, but not on other
 # takes: 15 to 30 views are few, and people differ.  A ridge and a coordinate of style per clip take its phase error from 13.8 to
 # 11.1 degrees (CMU walking, four views per take, other takes), 18 functions by maximum likelihood to 50.
-
-
-RIDGE = 1e-4  # of the mean diagonal of the normal matrix; 1e-5 is as good, 1e-3 costs .5 and 1e-2 4 degrees
-ROUNDS, AGAIN = 30, 8  # alternations from the mean shape, and after every change of styles
-STYLES = (-0.7, 0.0, 0.7)  # five from -1 to 1 give the same
-CHANGES = 5  # of styles
-SWING = 0.3  # styles start as more and less motion
-STYLED = 4  # clips: fewer do not tell styles apart
-GRID = 96  # phases: 3.75 degrees apart; 192 changes the median error by less than .1 degree
 
 
 @dataclass(frozen=True)
@@ -45,18 +36,18 @@ class Course:
     periodic: bool
     seen: Tensor
 
-    def bank(self, grid: int = GRID) -> Windows:
+    def bank(self, grid: int) -> Windows:
         """The shapes of all styles at all phases of the grid, style by style."""
         rows = basis_of(self.periodic, self.shapes.shape[1]).rows(_argument(phases(grid, self.periodic), self.periodic))
         values = torch.cat([_at(rows.to(self.shapes), shapes) for shapes in self.shapes])
         return Windows(values[:, None], self.seen.expand(len(values), -1))
 
-    def curve(self, query: Windows, grid: int = GRID) -> Tensor:
+    def curve(self, query: Windows, grid: int) -> Tensor:
         """``(Q, grid)`` what is left of every frame at every phase, in the style that leaves least."""
         return curves(query, [self], grid)[0]
 
 
-def curves(query: Windows, courses: Sequence[Course], grid: int = GRID) -> list[Tensor]:
+def curves(query: Windows, courses: Sequence[Course], grid: int) -> list[Tensor]:
     """:meth:`Course.curve` of several courses in one pass."""
     left = shape_distance(query, stack([course.bank(grid) for course in courses]))
     parts = left.split([grid * len(course.shapes) for course in courses], 1)
@@ -77,7 +68,9 @@ def _argument(phase: Tensor, periodic: bool) -> Tensor:
     return phase if periodic else 2 * phase - 1
 
 
-def learn_course(x: Tensor, seen: Tensor, phase: Tensor, clip: Tensor, *, harmonics: int, periodic: bool) -> Course:
+def learn_course(
+    x: Tensor, seen: Tensor, phase: Tensor, clip: Tensor, *, harmonics: int, periodic: bool, options: PhaseOptions = PhaseOptions()
+) -> Course:
     r"""Alternate between cameras and shapes, each a linear problem; then give every clip a style a and repeat.
 
     .. math:: \min \sum_f w_f \Big\|x_f - \sum_b c_b(\phi_f)\,(X_b + a_{k(f)} X'_b)\,A_f - 1 b_f^T\Big\|^2
@@ -97,20 +90,20 @@ def learn_course(x: Tensor, seen: Tensor, phase: Tensor, clip: Tensor, *, harmon
     start = x.new_zeros(rows.shape[1], x.shape[1], 3)
     start[0] = torch.linalg.eigh(flat @ flat.mT)[1][:, -3:].flip(1)
     start[1:] = 0.1 * torch.randn(start[1:].shape, generator=torch.Generator().manual_seed(0), dtype=x.dtype) / rows.shape[1]
-    shapes = _alternated(x, weight, rows, start, ROUNDS)
+    shapes = _alternated(x, weight, rows, start, options.course.rounds, options)
     known = seen.any(0)
-    if len(counts) < STYLED:
+    if len(counts) < options.course.styled:
         return Course(shapes[None], periodic, known)
-    swing = SWING * shapes
+    swing = options.course.swing * shapes
     swing[0] = 0
     both = torch.cat([shapes, swing])
-    levels = torch.tensor(STYLES, dtype=x.dtype)
-    for _ in range(CHANGES):
+    levels = torch.tensor(options.course.styles, dtype=x.dtype)
+    for _ in range(options.course.changes):
         left = torch.stack([_left(x, weight, rows, _styled(both, level)) for level in levels])
         style = levels[x.new_zeros(len(levels), len(counts)).index_add_(1, owner, left).argmin(0)]
         style = style - style.mean()
-        style = max(STYLES) * style / style.std(correction=0).clamp(min=1e-9)
-        both = _alternated(x, weight, torch.cat([rows, style[owner, None] * rows], 1), both, AGAIN)
+        style = max(options.course.styles) * style / style.std(correction=0).clamp(min=1e-9)
+        both = _alternated(x, weight, torch.cat([rows, style[owner, None] * rows], 1), both, options.course.again, options)
     return Course(torch.stack([_styled(both, level) for level in levels]), periodic, known)
 
 
@@ -135,7 +128,7 @@ def _left(x: Tensor, weight: Tensor, rows: Tensor, shapes: Tensor) -> Tensor:
     return ((x - at @ cameras[:, :3] - cameras[:, 3:]).square() * weight[..., None]).sum((1, 2))
 
 
-def _alternated(x: Tensor, weight: Tensor, rows: Tensor, shapes: Tensor, rounds: int) -> Tensor:
+def _alternated(x: Tensor, weight: Tensor, rows: Tensor, shapes: Tensor, rounds: int, options: PhaseOptions) -> Tensor:
     frames, n = weight.shape
     eye = torch.eye(3 * rows.shape[1], dtype=x.dtype)
     for _ in range(rounds):
@@ -143,7 +136,7 @@ def _alternated(x: Tensor, weight: Tensor, rows: Tensor, shapes: Tensor, rounds:
         design = (rows[:, None, :, None] * cameras[:, :3].mT[:, :, None]).flatten(2)  # (F, 2, 3 B)
         gram = (weight.mT @ (design.mT @ design).flatten(1)).unflatten(1, eye.shape)
         right = ((x - cameras[:, 3:]) * weight[..., None]).permute(1, 0, 2).flatten(1) @ design.flatten(0, 1)
-        gram = gram + RIDGE * gram.diagonal(dim1=1, dim2=2).mean(-1).clamp(min=1e-12)[:, None, None] * eye
+        gram = gram + options.course.ridge * gram.diagonal(dim1=1, dim2=2).mean(-1).clamp(min=1e-12)[:, None, None] * eye
         shapes = torch.linalg.solve(gram, right).reshape(n, -1, 3).transpose(0, 1)
         # the affine frame is free: unit covariance keeps the ridge meaningful
         at = _at(rows, shapes)
@@ -159,11 +152,7 @@ def _at(rows: Tensor, shapes: Tensor) -> Tensor:
     return (rows @ shapes.flatten(1)).unflatten(1, shapes.shape[1:])
 
 
-NEAREST = 5  # frames of other actions that an action is held against: 1 costs .004 of the AUC
-NEAR = 4  # steps of the grid, .04 of the course: frames this near in phase stand for a phase; twice as many cost .3 degrees
-MIX = 0.5  # weight of the shape beside the nearest images: 0 / .5 / 1 give .867 / .957 / .946 AUC from one view per take
-
-PAIRS = 4_000_000  # of frames compared at once: bounds memory whatever the length of a recording
+PAIR_BLOCK = 4_000_000  # of frames compared at once: bounds memory whatever the length of a recording
 
 
 @dataclass(frozen=True)
@@ -179,11 +168,12 @@ class PhaseModel:
     phase: Tensor
     courses: tuple[Course, ...]
     wrong: Tensor
+    options: PhaseOptions = PhaseOptions()
 
     def to(self, device: torch.device | str) -> PhaseModel:
         """The same on another device."""
         courses = tuple(Course(c.shapes.to(device), c.periodic, c.seen.to(device)) for c in self.courses)
-        return PhaseModel(self.bank.to(device), self.label.to(device), self.phase.to(device), courses, self.wrong)
+        return replace(self, bank=self.bank.to(device), label=self.label.to(device), phase=self.phase.to(device), courses=courses)
 
     def without(self, c: int) -> PhaseModel:
         """As if a class had never been learned."""
@@ -206,20 +196,24 @@ class PhaseModel:
         term that from the nearest images of the other actions.  A frame that shows fewer than six joints scores 0 everywhere, at
         phase NaN.
         """
-        step = max(1, PAIRS // max(1, len(self.bank)))
+        step = max(1, PAIR_BLOCK // max(1, len(self.bank)))
         parts = [self._evidence(query[at : at + step]) for at in range(0, len(query), step)]
         return torch.cat([scores for scores, _ in parts]), torch.cat([phase for _, phase in parts])
 
     def _evidence(self, query: Windows) -> tuple[Tensor, Tensor]:
         distance = image_distance(query, self.bank)
         scores, found = [], []
-        for c, (course, shapes) in enumerate(zip(self.courses, curves(query, self.courses), strict=True)):
+        for c, (course, shapes) in enumerate(zip(self.courses, curves(query, self.courses, self.options.course.grid), strict=True)):
             mine = self.label == c
-            images = _by_phase(distance[:, mine], self.phase[mine], course.periodic)
-            curve = MIX * _log(shapes) + (1 - MIX) * _log(images)
+            images = _by_phase(distance[:, mine], self.phase[mine], course.periodic, self.options)
+            curve = self.options.evidence.mix * _log(shapes) + (1 - self.options.evidence.mix) * _log(images)
             best, phase = _lowest(curve, course.periodic)
             others = distance[:, ~mine]
-            rival = _log(others.topk(min(NEAREST, others.shape[1]), largest=False).values.mean(1)) if others.shape[1] else 0.0
+            rival = (
+                _log(others.topk(min(self.options.evidence.nearest, others.shape[1]), largest=False).values.mean(1))
+                if others.shape[1]
+                else 0.0
+            )
             scores.append(rival - best)
             found.append(phase)
         told = (query.seen.sum(1) >= FRAMES_LEAST)[:, None]
@@ -230,14 +224,14 @@ def _log(residual: Tensor) -> Tensor:
     return (residual + EPSILON).log()
 
 
-def _by_phase(distance: Tensor, phase: Tensor, periodic: bool) -> Tensor:
-    """``(Q, GRID)`` distance from the nearest frame within ``NEAR`` steps of every phase, 1 where there is none."""
-    at = (phase * (GRID if periodic else GRID - 1)).round().long().remainder(GRID)
-    nearest = distance.new_ones(len(distance), GRID).scatter_reduce(1, at.expand(distance.shape), distance, "amin")
-    sides = nearest[:, -NEAR:], nearest[:, :NEAR]
+def _by_phase(distance: Tensor, phase: Tensor, periodic: bool, options: PhaseOptions) -> Tensor:
+    """``(Q, grid)`` distance from the nearest frame within some steps of every phase, 1 where there is none."""
+    at = (phase * (options.course.grid if periodic else options.course.grid - 1)).round().long().remainder(options.course.grid)
+    nearest = distance.new_ones(len(distance), options.course.grid).scatter_reduce(1, at.expand(distance.shape), distance, "amin")
+    sides = nearest[:, -options.evidence.near :], nearest[:, : options.evidence.near]
     if not periodic:
         sides = torch.ones_like(sides[0]), torch.ones_like(sides[1])
-    return torch.cat([sides[0], nearest, sides[1]], 1).unfold(1, 2 * NEAR + 1, 1).amin(2)
+    return torch.cat([sides[0], nearest, sides[1]], 1).unfold(1, 2 * options.evidence.near + 1, 1).amin(2)
 
 
 def _lowest(curve: Tensor, periodic: bool) -> tuple[Tensor, Tensor]:
@@ -258,14 +252,6 @@ def _lowest(curve: Tensor, periodic: bool) -> tuple[Tensor, Tensor]:
 # What seconds of an action find in the other actions, as if their own had never been learned: levels to refuse and to find by.
 
 
-SECOND = 1.0  # seconds of a recording that scores are averaged over before events are cut from them
-MOST, FRAMES = 120, 8  # seconds asked, spread over all clips, and frames of each: bounds the time of calibration
-FEWEST = 3  # classes: among two, leaving one out leaves nothing to be nearer to
-# Of `find`, on streams of synthetic actions by other people in other views, 13 / 6 of them learned from six clips each: recall
-# .67 / .80 at 7 / 14 % false finds (rate .05: .58 / .80 at none; .3: .78 / .80 at 15 / 37 %)
-FALSE_ALARMS = 0.1  # rate at which a wrong action may reach an event's peak
-LEAST = (0.3, 0.0)  # of an event's peak and ends; at 0 a frame is as near to other actions' frames as to its own
-
 Array = NDArray[Any]
 
 
@@ -275,15 +261,18 @@ def wrong_scores(model: PhaseModel, learned: Learned, label: Tensor) -> Tensor:
     Args:
         learned: the frames of all clips; label: ``(clips,)``.
     """
-    if len(model.courses) < FEWEST:
+    if len(model.courses) < model.options.events.classes:
         return torch.zeros(0, dtype=torch.float64)
-    whole = (learned.times / SECOND).floor().long()
+    whole = (learned.times / model.options.events.second).floor().long()
     cuts = (learned.clip.diff() != 0) | (whole.diff() != 0)
     piece = torch.cat([cuts.new_zeros(1), cuts]).cumsum(0)
     found = []
     for c in range(len(model.courses)):
         mine = piece[label[learned.clip] == c].unique()
-        asked = [_spread((piece == one).nonzero()[:, 0], FRAMES) for one in _spread(mine, max(1, MOST // len(model.courses)))]
+        asked = [
+            _spread((piece == one).nonzero()[:, 0], model.options.events.frames)
+            for one in _spread(mine, max(1, model.options.events.asked // len(model.courses)))
+        ]
         scores = model.without(c).evidence(learned.frames[torch.cat(asked)])[0]
         found += [part.mean(0).max() for part in scores.split([len(one) for one in asked])]
     return torch.stack(found)
@@ -294,10 +283,12 @@ def _spread(values: Tensor, most: int) -> Tensor:
     return values[torch.linspace(0, len(values) - 1, min(most, len(values))).round().long()]
 
 
-def event_levels(wrong: Tensor, rate: float | None) -> tuple[float, float]:
+def event_levels(wrong: Tensor, rate: float | None, options: PhaseOptions = PhaseOptions()) -> tuple[float, float]:
     """Scores that an event needs somewhere and throughout, for a rate of wrong actions that may reach them.
 
     Args:
         rate: 0.1 by default; a number outside 0..1 is the level itself.
     """
-    return scoring.event_levels(wrong.cpu().numpy(), FALSE_ALARMS if rate is None else rate, EventOptions.extent, LEAST)
+    return scoring.event_levels(
+        wrong.cpu().numpy(), options.events.false_alarms if rate is None else rate, options.events.extent, options.events.least
+    )

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from indexing.action.bank import Windows
-from indexing.estimator import check_device
+from indexing.estimator import check_device, read_options
 from indexing.modelfile import (
     Parts,
     labels_from_json,
@@ -24,6 +24,7 @@ from indexing.modelfile import (
 from indexing.opening import shown
 from indexing.phase.frames import LEAST
 from indexing.phase.model import Course, PhaseModel
+from indexing.phase.options import PhaseOptions
 from indexing.scoring import reject_threshold
 
 if TYPE_CHECKING:
@@ -54,7 +55,7 @@ def save(indexer: PhaseIndexer, path: str | Path) -> None:
     tensors["wrong"] = model.wrong
     for c, course in enumerate(model.courses):
         tensors |= {f"course.{c}.shapes": course.shapes, f"course.{c}.seen": course.seen}
-    write_model(path, FORMAT, VERSION, indexer.get_params(), about, tensors)
+    write_model(path, FORMAT, VERSION, indexer.saved_parameters(), about, tensors)
 
 
 def load(kind: type[Indexer], path: str | Path, device: str = "cpu") -> Indexer:
@@ -62,7 +63,8 @@ def load(kind: type[Indexer], path: str | Path, device: str = "cpu") -> Indexer:
     check_device(device)
     header, parts = read_model(path, FORMAT, VERSION)
     with usable(path):
-        indexer = kind(**header["parameters"], device=device)
+        parameters = header["parameters"] | {"options": read_options(PhaseOptions, header)}
+        indexer = kind(**parameters, device=device)
         indexer.check_parameters()
         _restore(indexer, header, parts)
     return indexer
@@ -91,7 +93,7 @@ def _restore(indexer: PhaseIndexer, header: dict[str, Any], parts: Parts) -> Non
     label = parts.every("label", len(bank), below=len(classes))
     phase, wrong = parts.real("phase", len(bank), least=0, most=1).double(), parts.real("wrong", None)
     indexer.skeleton_ = skeleton_from_json(header["skeleton"], joints)
-    indexer.model_ = PhaseModel(bank, label, phase, courses, wrong)
+    indexer.model_ = PhaseModel(bank, label, phase, courses, wrong, indexer._options)
     indexer.classes_, indexer.periodic_, indexer.n_joints_, indexer.mirrored_ = classes, periodic, joints, mirrored
     indexer.reject_threshold_ = reject_threshold(indexer.reject, wrong)
 

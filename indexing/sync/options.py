@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from dyntorch import SynchronizeOptions
+
 
 @dataclass(frozen=True)
 class RecordingOptions:
@@ -237,8 +239,10 @@ class VerdictOptions:
 
 @dataclass(frozen=True)
 class SyncOptions:
-    """Every number that decides in :func:`indexing.synchronize` besides those of :func:`dyntorch.synchronize`, by stage."""
+    """Every number that decides in :func:`indexing.synchronize`, by stage."""
 
+    points: SynchronizeOptions = SynchronizeOptions()
+    """Those of :func:`dyntorch.synchronize`, for keypoints and tracks."""
     recording: RecordingOptions = RecordingOptions()
     people: PeopleOptions = PeopleOptions()
     video: VideoOptions = VideoOptions()

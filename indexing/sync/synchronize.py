@@ -217,6 +217,7 @@ def _keypoints(
         correspondence=correspondence,
         times=(torch.from_numpy(a.times.copy()), torch.from_numpy(b.times.copy())),
         weights=(torch.from_numpy(trust[0]), torch.from_numpy(trust[1])) if known else None,
+        options=options.points,
         **more,
     )
     return dataclasses.replace(shift, notes=(*([note] if note else []), *shift.notes))
@@ -342,6 +343,7 @@ def _tracks(a: Take, b: Take, *, calibration: Any = None, options: SyncOptions, 
         correspondence=False,
         times=(found[0][1], found[1][1]),
         calibration=calibration,
+        options=options.points,
         **more,
     )
     return dataclasses.replace(shift, notes=(*notes, *shift.notes))

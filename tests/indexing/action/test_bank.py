@@ -211,7 +211,7 @@ def test_pairwise_machine_is_the_support_vector_machine(classes):
     gram, cross = x @ x.T, q @ x.T
     machine = PairwiseMachine.fit(torch.from_numpy(gram).float(), labels)
     got = machine(torch.from_numpy(cross).float()[:, machine.support]).numpy()
-    reference = SVC(C=PairwiseMachine.PENALTY, kernel="precomputed", decision_function_shape="ovr").fit(gram, labels)
+    reference = SVC(C=MachineOptions().penalty, kernel="precomputed", decision_function_shape="ovr").fit(gram, labels)
     expected = reference.decision_function(cross)
     assert got.shape == (40, classes)
     if classes == 2:

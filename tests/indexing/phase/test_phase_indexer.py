@@ -10,6 +10,7 @@ from indexing.actors import Person, dataset, detect, perform
 from indexing.phase.frames import query_frames
 from indexing.phase.indexer import PhaseIndexer
 from indexing.phase.model import event_levels
+from indexing.phase.options import CourseOptions, PhaseEvidenceOptions, PhaseOptions
 
 ACTIONS = ("walk", "sit_down")
 TURNS = (0, 40, 80)
@@ -191,3 +192,20 @@ def test_five_joints_tell_no_phase(train):
     few = [clip.replace(joints=clip.joints[:, :5], confidence=None, skeleton=None) for clip in train]
     with pytest.raises(ValueError, match="5 joints, but a frame needs 6"):
         PhaseIndexer().fit(few)
+
+
+def test_options_are_kept_where_they_are_not_the_defaults(tmp_path):
+    clips = dataset(2, ["walk", "squat"], azimuth=0.0, rng=0)
+    plain, usual, other = (tmp_path / f"{name}.safetensors" for name in ("plain", "usual", "other"))
+    PhaseIndexer(harmonics=2).fit(clips, clips.labels).save(plain)
+    PhaseIndexer(harmonics=2, options=PhaseOptions()).fit(clips, clips.labels).save(usual)
+    assert plain.read_bytes() == usual.read_bytes() and PhaseIndexer.load(usual).options is None
+    options = PhaseOptions(evidence=PhaseEvidenceOptions(mix=1.0), course=CourseOptions(grid=48))
+    taught = PhaseIndexer(harmonics=2, options=options).fit(clips, clips.labels)
+    taught.save(other)
+    again = PhaseIndexer.load(other)
+    assert again.options == again.model_.options == options
+    np.testing.assert_array_equal(again.decision_function(clips), taught.decision_function(clips))
+    assert not np.array_equal(again.decision_function(clips), PhaseIndexer.load(plain).decision_function(clips))
+    with pytest.raises(ValueError, match="options must be None or indexing"):
+        PhaseIndexer(options=PhaseEvidenceOptions()).fit(clips, clips.labels)
