@@ -81,6 +81,7 @@ _HOME = {
     "Fourier": "dyntorch.shapes.basis",
     # the numbers that decide in a task
     "PairOptions": "dyntorch.tasks.pair.options",
+    "PlanesOptions": "dyntorch.tasks.planes.options",
     "ReconstructOptions": "dyntorch.tasks.reconstruct.options",
     "SegmentOptions": "dyntorch.tasks.segment.options",
     "SynchronizeOptions": "dyntorch.tasks.synchronize.options",

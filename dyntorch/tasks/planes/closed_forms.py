@@ -13,12 +13,13 @@ from dyntorch.geometry.extensors import compound, extensor_of, subspace_of, wedg
 from dyntorch.geometry.homogeneous import cofactors, nonzero_sign, null_vectors, rank_one, skew, unit_size, unit_vectors
 from dyntorch.numerics.blocks import constant, map_blocks
 from dyntorch.numerics.nullspace import gram_null_space, null_space, real_eigenvalues
+from dyntorch.tasks.planes.options import PlanesOptions
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Pencils of matrices with a member of rank one: what a plane of a translating body makes with the homography at infinity.
 
 
-SINGULAR = 1e-12  # |det| / |H|^3 below which a homography cannot be scaled to determinant 1
+DETERMINANT_EPSILON = 1e-12  # |det| / |H|^3 below which a homography cannot be scaled to determinant 1
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,7 @@ def unit_determinant(matrix: Tensor) -> Tensor:
     norm = torch.linalg.matrix_norm(matrix, keepdim=True)
     scaled = matrix / torch.where(norm > 0, norm, 1.0)
     det = torch.linalg.det(scaled)[..., None, None]
-    regular = det.abs() > SINGULAR
+    regular = det.abs() > DETERMINANT_EPSILON
     root = torch.where(regular, det.abs(), 1.0) ** (1 / 3)
     return torch.where(regular, scaled * nonzero_sign(det) / root, scaled)
 
@@ -198,14 +199,10 @@ def finite_matrices(matrices: Tensor) -> tuple[Tensor, Tensor]:
 # are singular; a left null vector of :math:`D_{ij}` is the line through both epipoles, a right one the line of both normals.
 
 
-BEAM = 243
-"""Scales that are kept while planes are added: every choice of up to six planes."""
-KEPT = 4
-"""Choices of scales that are solved to the end."""
-RIDGE = 1e-14  # of the trace: what keeps normal equations invertible
+RIDGE_EPSILON = 1e-14  # of the trace: what keeps normal equations invertible
 
 
-def infinity_closed_form(homographies: Tensor) -> tuple[Tensor, Tensor]:
+def infinity_closed_form(homographies: Tensor, options: PlanesOptions = PlanesOptions()) -> tuple[Tensor, Tensor]:
     r"""The homography at infinity from three planes of translating bodies, or more, in closed form.
 
     1. :math:`H_1 - t_j H_j` is singular for the right scale: :math:`t_j` is an eigenvalue of :math:`H_j^{-1} H_1`, one of three.
@@ -222,6 +219,7 @@ def infinity_closed_form(homographies: Tensor) -> tuple[Tensor, Tensor]:
     Args:
         homographies: H ``(*batch, n, 3, 3)``, view 1 to view 2, of any scale, in coordinates of size 1 (normalized, the same ones
             for all planes).  A plane that is not finite is left out.
+        options: how many choices of scales are followed.
 
     Returns:
         :math:`H_\infty` ``(*batch, 3, 3)`` in float64, determinant 1, and the residual ``(*batch,)``, the root mean square over the
@@ -247,7 +245,7 @@ def infinity_closed_form(homographies: Tensor) -> tuple[Tensor, Tensor]:
     finite, order = finite.sort(dim=-1, descending=True, stable=True)
     planes = unit_determinant(given.take_along_dim(order[..., None, None], dim=1))
     present = finite.double()[:, None]
-    scaled = _choices(_scaled_candidates(planes), present)
+    scaled = _choices(_scaled_candidates(planes), present, options)
     # the last candidates: each of the planes, if it is static
     found = torch.cat([*(solve(scaled, present) for solve in SOLVERS), planes], dim=1)
     found = unit_determinant(found.nan_to_num(0.0, 0.0, 0.0))
@@ -270,7 +268,7 @@ def _scaled_candidates(planes: Tensor) -> Tensor:
     return ratios[..., None, None] * planes[:, :, None]
 
 
-def _choices(candidates: Tensor, present: Tensor) -> Tensor:
+def _choices(candidates: Tensor, present: Tensor, options: PlanesOptions) -> Tensor:
     """``(b, k, n, 3, 3)``: the choices of scales for which the differences are nearest to singular."""
     cost = _pair_costs(candidates) * (present.mT * present)[..., None, None]
     b, n = candidates.shape[:2]
@@ -280,10 +278,12 @@ def _choices(candidates: Tensor, present: Tensor) -> Tensor:
         # cost[i, j, choice_i, .] summed over the planes i before j
         rows = [cost[:, i, j].gather(1, chosen[:, :, i, None].expand(-1, -1, 3)) for i in range(j)]
         more = (total[..., None] + torch.stack(rows).sum(0)).flatten(1)
-        total, index = more.topk(min(BEAM, more.shape[1]), dim=1, largest=False)
+        total, index = more.topk(min(options.starts.beam, more.shape[1]), dim=1, largest=False)
         before = chosen.gather(1, (index // 3)[..., None].expand(-1, -1, j))
         chosen = torch.cat([before, (index % 3)[..., None]], dim=-1)
-    chosen = chosen.gather(1, total.topk(min(KEPT, total.shape[1]), largest=False).indices[..., None].expand(-1, -1, n))
+    chosen = chosen.gather(
+        1, total.topk(min(options.starts.choices, total.shape[1]), largest=False).indices[..., None].expand(-1, -1, n)
+    )
     return candidates[:, None].take_along_dim(chosen[..., None, None, None], dim=3)[:, :, :, 0]
 
 
@@ -360,13 +360,8 @@ def ridge_solution(gram: Tensor, right: Tensor) -> Tensor:
     """Solution ``(..., k)`` of normal equations ``(..., k, k)``, finite for a singular matrix, as of parallel planes."""
     trace = gram.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
     eye = torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device)
-    inverse = torch.linalg.inv_ex(gram + (RIDGE * trace + torch.finfo(gram.dtype).tiny) * eye)[0]
+    inverse = torch.linalg.inv_ex(gram + (RIDGE_EPSILON * trace + torch.finfo(gram.dtype).tiny) * eye)[0]
     return (inverse @ right[..., None])[..., 0]
-
-
-REWEIGHTINGS = 1
-"""Of the planes, by how well their lines are known.  Errors 0.01 of the entries of H and 0.001 of F, 300 scenes each with
-2, 3, 5 planes: median error .0116, .0097, .0079 without, .0109, .0084, .0069 with one, and the same with three."""
 
 
 def infinity_from_fundamentals(fundamentals: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -414,7 +409,9 @@ def infinity_from_fundamentals(fundamentals: Tensor, weights: Tensor | None = No
     return unit_determinant(found), torch.linalg.svdvals(rows.detach())
 
 
-def infinity_from_mixed(fundamental: Tensor, homographies: Tensor) -> tuple[Tensor, Tensor]:
+def infinity_from_mixed(
+    fundamental: Tensor, homographies: Tensor, options: PlanesOptions = PlanesOptions()
+) -> tuple[Tensor, Tensor]:
     r"""The homography at infinity from one fundamental matrix and two planes of other bodies, or more, in closed form.
 
     With the epipole e' of F, :math:`H_\infty = [e']_\times F + e' a^T` leaves three unknowns a.  Let N be two rows orthogonal to
@@ -433,6 +430,7 @@ def infinity_from_mixed(fundamental: Tensor, homographies: Tensor) -> tuple[Tens
         fundamental: F ``(*batch, 3, 3)``, x2^T F x1 = 0, in coordinates of size 1.
         homographies: H ``(*batch, n, 3, 3)``, view 1 to view 2, in the same coordinates, of any scale; one that is not finite is
             left out.
+        options: how often the planes are weighed anew.
 
     Returns:
         :math:`H_\infty` ``(*batch, 3, 3)`` in float64, determinant 1, and the residual ``(*batch,)``: the root mean square of the
@@ -468,20 +466,20 @@ def infinity_from_mixed(fundamental: Tensor, homographies: Tensor) -> tuple[Tens
     strength = normal.norm(dim=-1) * present
     normal = unit_vectors(normal)
     on_line = (epipole[..., None, None, :] @ planes)[..., 0, :] / scale
-    a = _nearest_to_lines(on_line, normal, strength, scale[..., 0])
+    a = _nearest_to_lines(on_line, normal, strength, scale[..., 0], options.starts.reweightings)
     infinity = unit_determinant(visible + epipole[..., :, None] * a[..., None, :])
     squares = plane_parts(planes, infinity).residual.square() * present
     return infinity, (squares.sum(-1) / present.sum(-1).clamp(min=1.0)).sqrt()
 
 
-def _nearest_to_lines(points: Tensor, directions: Tensor, strength: Tensor, scale: Tensor) -> Tensor:
+def _nearest_to_lines(points: Tensor, directions: Tensor, strength: Tensor, scale: Tensor, reweightings: int) -> Tensor:
     """The point ``(*batch, 3)`` nearest to lines through points ``(*batch, n, 3)``, each by what it is known with.
 
     Entries of H with the error s put the line off by s / |scale|, and turn its direction by s / strength.
     """
     eye = torch.eye(3, dtype=points.dtype, device=points.device)
     weight = strength.square()
-    for _ in range(1 + REWEIGHTINGS):
+    for _ in range(1 + reweightings):
         across = eye - directions[..., :, None] * directions[..., None, :]
         across = across * weight[..., None, None]
         found = ridge_solution(across.sum(-3), (across @ points[..., None]).sum(-3)[..., 0])

@@ -15,13 +15,7 @@ from dyntorch.geometry.rigid import nearest_rotation
 from dyntorch.numerics.chi_square import quantile
 from dyntorch.numerics.nullspace import eigenvalues, spectrum
 from dyntorch.tasks.planes.input import GivenPlanes
-
-EXACT = 1e-7
-"""Sine or ratio that is rounding error."""
-NEAR = 0.1
-"""Sine or ratio below which noise is asked whether it is zero; above, nothing is degenerate."""
-CHI_SQUARE = quantile(0.99, 2)
-"""Squared distance in standard deviations, of two degrees of freedom, exceeded once in a hundred."""
+from dyntorch.tasks.planes.options import PlaneDegeneracyOptions, PlanesOptions
 
 _ALIKE = "{value:a pair of planes or bodies moves|# pairs of planes or bodies move} alike, as of one body"
 _REST = "{value:a plane does not move, or is at infinity: it has|# planes do not move, or are at infinity: they have} no epipole"
@@ -100,6 +94,7 @@ class Figures:
         normal_covariance: ``(b, p, 3, 3)`` of them.
         moving: ``(b, c)`` those that move, and count.
         used: ``(b, c)`` those that count.
+        options: what is near, and how likely.
     """
 
     epipoles: Tensor
@@ -108,16 +103,17 @@ class Figures:
     normal_covariance: Tensor
     moving: Tensor
     used: Tensor
+    options: PlaneDegeneracyOptions
 
     @cached_property
     def line(self) -> tuple[Tensor, Tensor]:
         """How far the epipoles are from one line ``(b,)``, and whether noise explains it."""
-        return _flatness(self.epipoles, self.epipole_covariance, self.moving)
+        return _flatness(self.epipoles, self.epipole_covariance, self.moving, self.options)
 
     @cached_property
     def plane(self) -> tuple[Tensor, Tensor]:
         """The same for the normals and one plane."""
-        return _flatness(self.normals, self.normal_covariance, self.moving[:, : self.normals.shape[1]])
+        return _flatness(self.normals, self.normal_covariance, self.moving[:, : self.normals.shape[1]], self.options)
 
     def several(self) -> Tensor:
         """Where more than one homography at infinity fits the planes, by their position ``(b,)``.
@@ -140,7 +136,8 @@ class Figures:
         square = (e[:, :, None] - sign[..., None] * e[:, None]).square().sum(-1)
         spread = self.epipole_covariance.diagonal(dim1=-2, dim2=-1).sum(-1)
         variance = (spread[:, :, None] + spread[:, None]) / 2
-        near = (square < NEAR**2) & (square <= CHI_SQUARE * (variance + EXACT**2))
+        limit = quantile(self.options.confidence, 2) * (variance + self.options.exact**2)
+        near = (square < self.options.near**2) & (square <= limit)
         both = self.moving[:, :, None] & self.moving[:, None]
         return near & both & ~torch.eye(e.shape[1], dtype=torch.bool, device=e.device)
 
@@ -196,7 +193,7 @@ def planes_notices(
     return in_order(found)
 
 
-def _flatness(vectors: Tensor, covariance: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
+def _flatness(vectors: Tensor, covariance: Tensor, count: Tensor, options: PlaneDegeneracyOptions) -> tuple[Tensor, Tensor]:
     """Smallest over largest singular value ``(b,)`` of at least three vectors, and whether it is 0 within the noise."""
     kept = torch.where(count[..., None], vectors, 0.0)
     values, directions = spectrum(kept.mT @ kept)
@@ -204,43 +201,13 @@ def _flatness(vectors: Tensor, covariance: Tensor, count: Tensor) -> tuple[Tenso
     across = directions[:, None, :, 0]
     distance = (kept * across).sum(-1)
     variance = (across[..., None, :] @ covariance @ across[..., :, None])[..., 0, 0]
-    square = (distance.square() / (variance + EXACT**2)).sum(-1)
+    square = (distance.square() / (variance + options.exact**2)).sum(-1)
     spare = (count.sum(-1) - 2).clamp(min=1)
-    return ratio, (count.sum(-1) >= 3) & (ratio < NEAR) & (square <= CHI_SQUARE * spare)
+    return ratio, (count.sum(-1) >= 3) & (ratio < options.near) & (square <= quantile(options.confidence, 2) * spare)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
 # What speaks against a fit of translating planes: a residual that noise does not explain, and a calibration that does not fit.
-
-
-SPREAD = 0.4
-"""Noise that the residuals show, over what it would be without epipoles and normals, from which on no homography at infinity is
-common to the planes.  Of 1200 scenes of 4, 5 and 8 planes, 40 matches in 120 pixels each, the largest is 0.37 at 0.5 and 1 px."""
-CHANCE, NARROW = 0.43, 0.62
-"""The same, from which on random homographies near any common one would do as well: the first less the second over the root of the
-residuals to spare.  Of such random ones a twentieth stays below 0.15, 0.20, 0.24, 0.28 and 0.34 (4, 5, 6, 8 and 12 planes; 150
-times each); of the scenes nine in ten below 0.18, 0.18, 0.16, 0.15 at 0.5 px and 0.23, 0.24, 0.25, 0.24 at 1 px (4, 5, 6, 8 of
-them)."""
-ENTRIES = 0.065
-"""Noise of the entries of homographies of norm 1 in normalized coordinates, the same; there it is 0.059 at most."""
-UNLIKELY = 3.09
-"""Normal deviate of the F ratio, exceeded once in a thousand, from which on one homography at infinity is not common to matched
-planes.  The largest of 60 scenes of 4, 6 and 8 planes at 0.5 px: 1.6.  Planes that turn by themselves by 3 degrees: 1 to 12."""
-DOUBTFUL = 2.33
-"""The same, exceeded once in a hundred, from which on the ratio is taken for an error of the model."""
-VAGUE = 0.25
-"""Noise of the matches over the extent of their planes and bodies from which on they are no matches: 0.03 at 1 px in 120 pixels,
-0.4 to 0.5 where they are random."""
-LEAST = 8
-"""Residuals of the separate matrices to spare from which on these say what the noise is."""
-ROUNDING = 1e-5
-"""Residual in normalized coordinates that single precision may leave."""
-TURNED = 0.01
-"""Distance from a rotation that a calibration to two or three digits leaves."""
-SMALL = 0.01
-"""Deviation from which on four planes do not tell."""
-DEVIATIONS = 8.0
-"""Standard deviations of that distance that noise is believed to reach."""
 
 
 @dataclass(frozen=True)
@@ -266,13 +233,14 @@ class Misfit:
     vague: Tensor
 
 
-def misfit(given: GivenPlanes, cost: Tensor, separate: Tensor) -> Misfit:
+def misfit(given: GivenPlanes, cost: Tensor, separate: Tensor, options: PlanesOptions) -> Misfit:
     r"""How far the planes and bodies are from one homography at infinity, and whether noise does not explain it.
 
     Args:
         given: what was fitted.
         cost: ``(b,)`` of the fit.
         separate: ``(b,)`` cost of the matches under the given matrices; zero without matches.
+        options: what noise does not explain.
     """
     rows, spare = given.rows()
     sigma, used = (cost / spare.clamp(min=1)).sqrt(), given.used()
@@ -280,21 +248,21 @@ def misfit(given: GivenPlanes, cost: Tensor, separate: Tensor) -> Misfit:
     if given.matched:
         planes, bodies = used[:, :p].sum(-1), used[:, p:].sum(-1)
         free = rows - 8 * planes - 7 * bodies
-        variance = (separate / free.clamp(min=1)).clamp(min=(ROUNDING / given.frames[1][:, 0, 0]) ** 2)
+        variance = (separate / free.clamp(min=1)).clamp(min=(options.misfit.rounding / given.frames[1][:, 0, 0]) ** 2)
         more = (spare - free).clamp(min=1)
         ratio = (cost - separate) / more / variance
-        told, unusual = (free >= LEAST) & (spare > free), deviate(ratio, more, free.clamp(min=1))
-        excess = torch.where(told & (unusual > DOUBTFUL), ratio, 1.0)
-        apart = told & (unusual > UNLIKELY)
+        told, unusual = (free >= options.misfit.fewest_spare) & (spare > free), deviate(ratio, more, free.clamp(min=1))
+        excess = torch.where(told & (unusual > options.misfit.doubtful), ratio, 1.0)
+        apart = told & (unusual > options.misfit.unlikely)
         # the given matrices may fit badly where they are linear, and the common ones where none is common
         vagueness = sigma.minimum(variance.sqrt()) / _extent(given).clamp(min=torch.finfo(sigma.dtype).tiny)
-        return Misfit(ratio, excess, apart, torch.zeros_like(apart), vagueness, (vagueness > VAGUE) & (spare > 0))
+        return Misfit(ratio, excess, apart, torch.zeros_like(apart), vagueness, (vagueness > options.misfit.vague) & (spare > 0))
     entries = given.homographies.flatten(-2)
     different = used[:, :p].sum(-1) - eigenvalues(entries.mT @ entries)[:, -1]
     ratio = sigma / (different / (rows - 8).clamp(min=1)).clamp(min=torch.finfo(sigma.dtype).tiny).sqrt()
-    told = (spare > 1) & (used[:, p:].sum(-1) == 0) & (sigma > ROUNDING)
-    chance = told & (ratio > CHANCE - NARROW / spare.clamp(min=1).sqrt())
-    apart = told & ((ratio > SPREAD) | (sigma > ENTRIES))
+    told = (spare > 1) & (used[:, p:].sum(-1) == 0) & (sigma > options.misfit.rounding)
+    chance = told & (ratio > options.misfit.chance - options.misfit.chance_of_few / spare.clamp(min=1).sqrt())
+    apart = told & ((ratio > options.misfit.spread) | (sigma > options.misfit.entries))
     return Misfit(ratio, torch.ones_like(ratio), apart, chance, torch.zeros_like(ratio), torch.zeros_like(told))
 
 
@@ -323,7 +291,9 @@ def _extent(given: GivenPlanes) -> Tensor:
     return torch.stack(found).amin(0)
 
 
-def turned(given: GivenPlanes, infinity: Tensor, covariance: Tensor, status: Tensor) -> tuple[Tensor, Tensor]:
+def turned(
+    given: GivenPlanes, infinity: Tensor, covariance: Tensor, status: Tensor, options: PlanesOptions
+) -> tuple[Tensor, Tensor]:
     r"""Distance ``(b,)`` of :math:`K_2^{-1} H_\infty K_1`, of determinant 1, from a rotation, and whether noise is no reason.
 
     Args:
@@ -331,6 +301,7 @@ def turned(given: GivenPlanes, infinity: Tensor, covariance: Tensor, status: Ten
         infinity: ``(b, 9)`` homography at infinity in normalized coordinates, of any scale.
         covariance: ``(b, 9, 9)`` of it, its scale held.
         status: ``(b,)``; only where it is OK anything is said.
+        options: what noise does not explain.
     """
     if given.calibration is None:
         return torch.zeros_like(infinity[:, 0]), torch.zeros_like(status, dtype=torch.bool)
@@ -353,5 +324,5 @@ def turned(given: GivenPlanes, infinity: Tensor, covariance: Tensor, status: Ten
     known = (status == Status.OK) & (given.rows()[1] > 1)
     # the fit of four small planes may be another minimum, far from what its covariance says
     used, p = given.used(), given.homographies.shape[1]
-    known = known & ((used[:, :p].sum(-1) >= 5) | used[:, p:].any(-1) | (deviation < SMALL))
-    return distance, known & (distance > TURNED) & (distance > DEVIATIONS * deviation)
+    known = known & ((used[:, :p].sum(-1) >= 5) | used[:, p:].any(-1) | (deviation < options.calibration.small))
+    return distance, known & (distance > options.calibration.turned) & (distance > options.calibration.deviations * deviation)

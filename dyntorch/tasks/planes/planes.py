@@ -25,9 +25,11 @@ from dyntorch.geometry.rigid import nearest_rotation
 from dyntorch.geometry.triangulation import triangulate
 from dyntorch.invariants.collineation import Collineation
 from dyntorch.invariants.fundamental_matrix import FundamentalMatrix
+from dyntorch.numerics.arguments import check_options
 from dyntorch.numerics.blocks import map_blocks, one_thread
 from dyntorch.tasks.planes.input import GivenPlanes, Pair, Points, both, cameras, check_counts, enough, padded
-from dyntorch.tasks.planes.notices import EXACT, NEAR, Figures, PlanesNotice, misfit, planes_notices, turned
+from dyntorch.tasks.planes.notices import Figures, PlanesNotice, misfit, planes_notices, turned
+from dyntorch.tasks.planes.options import PlanesOptions
 from dyntorch.tasks.planes.problem import Layout, PlaneMatches, noise_variance, projected, solve
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -190,13 +192,7 @@ def _centre(frames: Tensor) -> Tensor:
 # From the parameters of the fit of translating planes to what the caller gets.
 
 
-UNCERTAIN = 0.5
-"""Expected relative error of the homography at infinity, in normalized coordinates, from which on nothing is known of it."""
-STILL = 3.0
-"""Standard deviations within which a plane does not move."""
-
-
-def outcome(given: GivenPlanes, found: tuple[Tensor, ...], method: str, refined: bool) -> TranslatingPlanes:
+def outcome(given: GivenPlanes, found: tuple[Tensor, ...], method: str, refined: bool, options: PlanesOptions) -> TranslatingPlanes:
     """The result with a flat batch.
 
     Args:
@@ -204,15 +200,16 @@ def outcome(given: GivenPlanes, found: tuple[Tensor, ...], method: str, refined:
         found: what :func:`~dyntorch.tasks.planes.problem.solve` returns, for all problems, and the cost under the given matrices.
         method: of the start.
         refined: whether it was refined; a start as it is has a residual of its own.
+        options: every number that decides.
     """
     theta, cost, covariance, undetermined, other, separate = found
     layout = Layout(given.homographies.shape[1], given.fundamentals.shape[1])
     used = given.used()
     planes, bodies = used[:, : layout.planes].sum(-1), used[:, layout.planes :].sum(-1)
     rows, spare = given.rows()
-    covariance = noise_variance(cost, spare)[:, None, None] * covariance
-    figures = _figures(layout, theta, covariance, used)
-    against = misfit(given, cost, separate)
+    covariance = noise_variance(cost, spare, options)[:, None, None] * covariance
+    figures = _figures(layout, theta, covariance, used, options)
+    against = misfit(given, cost, separate, options)
     # what one homography at infinity leaves beyond the noise is an error as well
     covariance = against.excess[:, None, None] * covariance
     uncertainty = projected(covariance[:, :9, :9], theta[:, :9]).diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
@@ -223,17 +220,17 @@ def outcome(given: GivenPlanes, found: tuple[Tensor, ...], method: str, refined:
     vague = against.vague & told
     apart = (against.apart & told) | vague
     chance = against.chance & told & ~apart
-    status = torch.where((uncertainty > UNCERTAIN) | other | several | chance, Status.AMBIGUOUS, Status.OK)
+    status = torch.where((uncertainty > options.ambiguity.uncertain) | other | several | chance, Status.AMBIGUOUS, Status.OK)
     status = torch.where(apart, Status.NO_CONSENSUS, status)
     status = torch.where(undetermined, Status.DEGENERATE, status)
     status = torch.where(right, status, Status.TOO_FEW)
-    distance, bent = turned(given, theta[:, :9], covariance[:, :9, :9], status)
+    distance, bent = turned(given, theta[:, :9], covariance[:, :9, :9], status, options)
     said = {
         PlanesNotice.NO_COMMON_INFINITY: (against.ratio, apart & ~vague),
         PlanesNotice.CHANCE: (against.ratio, chance),
         PlanesNotice.INCOHERENT: (against.vagueness, vague),
         PlanesNotice.CALIBRATION: (distance, bent),
-        PlanesNotice.UNCERTAIN: (uncertainty, (uncertainty > UNCERTAIN) & right & ~apart),
+        PlanesNotice.UNCERTAIN: (uncertainty, (uncertainty > options.ambiguity.uncertain) & right & ~apart),
         PlanesNotice.OTHER_SOLUTION: (used.sum(-1), (other | several) & right & ~apart),
     }
     limits = planes_notices(figures, right, said, given)
@@ -267,7 +264,7 @@ def outcome(given: GivenPlanes, found: tuple[Tensor, ...], method: str, refined:
     )
 
 
-def _figures(layout: Layout, theta: Tensor, covariance: Tensor, used: Tensor) -> Figures:
+def _figures(layout: Layout, theta: Tensor, covariance: Tensor, used: Tensor, options: PlanesOptions) -> Figures:
     """Directions of epipoles and normals with their covariances, and which planes move."""
     infinity, epipoles, planes = layout.unpack(theta)
     p = layout.planes
@@ -283,10 +280,17 @@ def _figures(layout: Layout, theta: Tensor, covariance: Tensor, used: Tensor) ->
         + of_epipoles[:, :p].diagonal(dim1=-2, dim2=-1).sum(-1) * n.square().sum(-1)
     ).sqrt()
     length = e.norm(dim=-1) * n.norm(dim=-1)
-    still = (length <= EXACT * size) | ((length <= NEAR * size) & (length <= STILL * spread))
+    limits = options.degeneracy
+    still = (length <= limits.exact * size) | ((length <= limits.near * size) & (length <= limits.still * spread))
     moving = torch.cat([used[:, :p] & ~still, used[:, p:]], dim=1)
     return Figures(
-        unit_vectors(epipoles), projected(of_epipoles, epipoles), unit_vectors(n), projected(of_normals, n), moving, used
+        epipoles=unit_vectors(epipoles),
+        epipole_covariance=projected(of_epipoles, epipoles),
+        normals=unit_vectors(n),
+        normal_covariance=projected(of_normals, n),
+        moving=moving,
+        used=used,
+        options=options.degeneracy,
     )
 
 
@@ -328,8 +332,10 @@ def _carried(covariance: Tensor, entries: Tensor, frames: tuple[Tensor, Tensor])
     return projected(lift @ covariance @ lift.mT, (lift @ entries[..., None])[..., 0])
 
 
-BLOCK, STARTS = 1 << 21, 4
-"""Numbers in the derivatives of one block of problems, and how many starts a problem has at most of the time."""
+BLOCK = 1 << 21
+"""Numbers in the derivatives of one block of problems."""
+STARTS_PER_BLOCK = 4
+"""Starts that a problem has, about: the size of a block stands on it, nothing else."""
 
 
 @one_thread
@@ -343,6 +349,7 @@ def translating_planes(
     method: str = "auto",
     refine: bool = True,
     calibration: Tensor | tuple[Tensor, Tensor] | None = None,
+    options: PlanesOptions = PlanesOptions(),
 ) -> TranslatingPlanes:
     r"""The homography at infinity from planes that translate independently, seen in two views.
 
@@ -371,6 +378,7 @@ def translating_planes(
         refine: False returns the start as it is.
         calibration: K ``(3, 3)`` or ``(*batch, 3, 3)``, or a pair of them for the two views, upgrades the affine frame to a
             similarity: :math:`H_\infty \sim K_2 R K_1^{-1}`.
+        options: every number that decides, by stage; ``dataclasses.replace`` changes some of them.
 
     Returns:
         A :class:`~dyntorch.tasks.planes.planes.TranslatingPlanes`.
@@ -391,6 +399,7 @@ def translating_planes(
         >>> print(repr(found).splitlines()[0])
         TranslatingPlanes(planes=4, bodies=0, batch=(): 1 OK)
     """
+    check_options(options, PlanesOptions)
     planes = _views(x1, x2)
     bodies = None if body_matches is None else padded("body_matches", body_matches)
     if H is None and planes is not None:
@@ -403,8 +412,8 @@ def translating_planes(
         raise ValueError("matches are given of the planes or of the bodies only: give both x1, x2 and body_matches, or neither")
     camera = None if calibration is None else cameras(calibration, tuple(H.shape[:-3]), H)
     with torch.no_grad():
-        given = GivenPlanes.of(H, F, planes, bodies, camera)
-        result = outcome(given, _solved(given, method, refine), method, refine)
+        given = GivenPlanes.of(H, F, planes, bodies, camera, options)
+        result = outcome(given, _solved(given, method, refine, options), method, refine, options)
         shaped: dict[str, Any] = {name: given.back(value) for name, value in vars(result).items() if isinstance(value, Tensor)}
     return replace(result, **shaped)
 
@@ -417,7 +426,7 @@ def _views(x1: Points | None, x2: Points | None) -> Pair | None:
     return padded("x1 and x2", (x1, x2))
 
 
-def _solved(given: GivenPlanes, method: str, refine: bool) -> tuple[Tensor, ...]:
+def _solved(given: GivenPlanes, method: str, refine: bool, options: PlanesOptions) -> tuple[Tensor, ...]:
     """What :func:`~dyntorch.tasks.planes.problem.solve` says, block by block, and the cost under the given matrices."""
     seen, body = given.planes, given.bodies
     layout = Layout(given.homographies.shape[1], given.fundamentals.shape[1])
@@ -426,9 +435,9 @@ def _solved(given: GivenPlanes, method: str, refine: bool) -> tuple[Tensor, ...]
         x1, x2, w, y1, y2, v, s1, s2 = parts
         matches = PlaneMatches((x1, x2), w, (y1, y2), v, (s1, s2)) if given.matched else None
         separate = spare * 0 if matches is None else matches.normal(torch.cat([h, f], dim=1)).cost.nansum(1)
-        return *solve(h, f, matches, spare, method, refine), separate
+        return *solve(h, f, matches, spare, method, refine, options), separate
 
     parts = (*seen.views, seen.weights, *body.views, body.weights, *(frame[:, 0, 0] for frame in given.frames))
     numbers = 18 * seen.weights.shape[1] * seen.weights.shape[2] + layout.size * (9 * (layout.planes + layout.bodies) + layout.size)
-    size = max(1, BLOCK // (STARTS * numbers))
+    size = max(1, BLOCK // (STARTS_PER_BLOCK * numbers))
     return map_blocks(block, given.homographies, given.fundamentals, given.rows()[1], *parts, size=size)

@@ -28,6 +28,7 @@ from dyntorch.tasks.planes.closed_forms import (
     plane_parts,
     unit_determinant,
 )
+from dyntorch.tasks.planes.options import PlaneFrameOptions, PlanesOptions
 
 
 class Normal(NamedTuple):
@@ -233,16 +234,6 @@ def _own(planes: int, bodies: int, device: torch.device) -> Tensor:
 LEAST = {"linear": (4, 0), "closed_form": (3, 0), "thesis": (5, 0), "mixed": (2, 1), "fundamentals": (0, 2)}
 """Planes and bodies with a known fundamental matrix that each method takes."""
 AUTOMATIC = ("closed_form", "linear", "mixed", "fundamentals")
-FEW = 5
-"""Planes of which each is tried as if it stood still.  That raises the share of problems of 4 planes at 0.5 px that reach the best
-minimum from 90 to 98 %; with 8 planes 97 % reach it without."""
-EXTENT = 2.0
-"""Focal lengths per half image.  The error of H alone at 1 is 1.3 times as large, at 3 the same."""
-CENTRES = ((0.0, 0.0), (0.5, 0.4))
-"""Where the middle of the image may be, in focal lengths: at the origin, or where pixels are counted from a corner.  With its
-estimate from the homographies instead, the error of the homography at infinity is 1.1 to 1.4 times as large (0.5 px)."""
-FOCAL = (-1.0, 4.5, 56)
-"""Decimal logarithms of the least and largest focal length, and how many are tried."""
 
 
 def frames_of_matches(views: tuple[Tensor, Tensor], weights: Tensor) -> tuple[Tensor, Tensor]:
@@ -251,14 +242,16 @@ def frames_of_matches(views: tuple[Tensor, Tensor], weights: Tensor) -> tuple[Te
     return first, second
 
 
-def frames_of_calibration(calibration: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+def frames_of_calibration(calibration: tuple[Tensor, Tensor], options: PlanesOptions = PlanesOptions()) -> tuple[Tensor, Tensor]:
     """Similarities, but for skew, in which known cameras have images of size about 1."""
     first, second = (torch.linalg.inv_ex(k)[0] for k in calibration)
-    size = torch.tensor([EXTENT, EXTENT, 1.0], dtype=first.dtype, device=first.device)[:, None]
+    size = torch.tensor([options.frames.extent, options.frames.extent, 1.0], dtype=first.dtype, device=first.device)[:, None]
     return size * first, size * second
 
 
-def frames_of_matrices(homographies: Tensor, fundamentals: Tensor) -> tuple[Tensor, Tensor]:
+def frames_of_matrices(
+    homographies: Tensor, fundamentals: Tensor, options: PlanesOptions = PlanesOptions()
+) -> tuple[Tensor, Tensor]:
     r"""Similarities for images that nothing is known of, from what homographies between them look like.
 
     In the coordinates of calibrated cameras :math:`H_\infty` is a rotation, and a homography of determinant 1 has its least
@@ -267,6 +260,7 @@ def frames_of_matrices(homographies: Tensor, fundamentals: Tensor) -> tuple[Tens
     Args:
         homographies: ``(b, p, 3, 3)``, zero where one is missing.
         fundamentals: ``(b, m, 3, 3)``; only where there are no homographies, by the sizes of their entries.
+        options: which focal lengths and centres are tried.
 
     Returns:
         ``(b, 3, 3)`` for view 1 and view 2, the same.
@@ -277,24 +271,27 @@ def frames_of_matrices(homographies: Tensor, fundamentals: Tensor) -> tuple[Tens
         scale = torch.where((near > 0) & (far > 0), near / far, 1.0).sqrt()
         frame = similarity(scale, torch.zeros_like(fundamentals[:, 0, 0, :2]))
         return frame, frame
-    frames, inverses = _frames(homographies.device)
+    frames, inverses = _frames(options.frames, homographies.device)
     scaled = unit_determinant(homographies)
     size = torch.stack([(frame @ scaled @ inverse).square().sum((-2, -1)) for frame, inverse in zip(frames, inverses, strict=True)])
     best = torch.where(size > 0, size, 1.0).log().sum(-1).argmin(0)
-    frame = frames[best] * torch.tensor([EXTENT, EXTENT, 1.0], dtype=frames.dtype, device=frames.device)[:, None]
+    extent = options.frames.extent
+    frame = frames[best] * torch.tensor([extent, extent, 1.0], dtype=frames.dtype, device=frames.device)[:, None]
     return frame, frame
 
 
 @constant
-def _frames(device: torch.device) -> tuple[Tensor, Tensor]:
+def _frames(options: PlaneFrameOptions, device: torch.device) -> tuple[Tensor, Tensor]:
     """All similarities that are tried, and their inverses."""
-    focal = torch.logspace(*FOCAL, dtype=torch.float64, device=device)
-    centres = torch.tensor(CENTRES, dtype=torch.float64, device=device)
+    focal = torch.logspace(options.shortest_focal, options.longest_focal, options.focals, dtype=torch.float64, device=device)
+    centres = torch.tensor(options.centres, dtype=torch.float64, device=device)
     frames = similarity((1 / focal)[:, None].expand(-1, len(centres)), focal[:, None, None] * centres).flatten(0, 1)
     return frames, torch.linalg.inv(frames)
 
 
-def starts(method: str, homographies: Tensor, fundamentals: Tensor, several: bool = True) -> list[Tensor]:
+def starts(
+    method: str, homographies: Tensor, fundamentals: Tensor, several: bool = True, *, options: PlanesOptions = PlanesOptions()
+) -> list[Tensor]:
     """Homographies at infinity ``(b, 3, 3)`` of norm about 1 by one method, or by all that the numbers of planes and bodies allow.
 
     Args:
@@ -302,6 +299,7 @@ def starts(method: str, homographies: Tensor, fundamentals: Tensor, several: boo
         homographies: ``(b, p, 3, 3)`` in coordinates of order 1, zero where one is missing.
         fundamentals: ``(b, m, 3, 3)``.
         several: with ``"auto"``, each of a few planes besides, as if it stood still.
+        options: of the closed forms.
     """
     planes, bodies = homographies.shape[1], fundamentals.shape[1]
     filled, known = _filled(homographies), _filled(fundamentals)
@@ -311,13 +309,13 @@ def starts(method: str, homographies: Tensor, fundamentals: Tensor, several: boo
         if planes < LEAST[name][0] or bodies < LEAST[name][1]:
             continue
         if name == "mixed":
-            found.append(infinity_from_mixed(known[:, 0], filled)[0])
+            found.append(infinity_from_mixed(known[:, 0], filled, options)[0])
         elif name == "fundamentals":
             found.append(infinity_from_fundamentals(known)[0])
         else:
-            solve = {"linear": infinity_linear, "closed_form": infinity_closed_form, "thesis": infinity_thesis}[name]
-            found.append(solve(filled)[0])
-    if method == "auto" and several and bodies < 2 and planes <= FEW:
+            linear = {"linear": infinity_linear, "thesis": infinity_thesis}
+            found.append((linear[name](filled) if name in linear else infinity_closed_form(filled, options))[0])
+    if method == "auto" and several and bodies < 2 and planes <= options.starts.static_planes:
         found += unit_determinant(filled).unbind(1)
     eye = torch.eye(3, dtype=homographies.dtype, device=homographies.device)
     return [
@@ -350,35 +348,18 @@ def parameters(homographies: Tensor, fundamentals: Tensor, infinity: Tensor) -> 
 # The fit of translating planes: every start refined on the matrices, then on the matches; the best one, and its covariance.
 
 
-ROUGH, FINE = 40, 100
-"""Steps on the matrices and on the matches, at most.  With 60 on the matches the median error of 3 to 5 planes at 0.5 px is the
-same, that of 8 at 1 px 0.031 instead of 0.027."""
-KEPT = 4
-"""Results on the matrices, of different homographies at infinity, that are refined on the matches.  Of 4 planes at 0.5 px the best
-minimum is reached in 98 %; with 2 in 90 %."""
-SAME = 1e-6
-"""One minus the cosine of homographies at infinity that are one solution."""
-APART = 0.3
-"""Sine of homographies at infinity that are two solutions: a camera that turns by 20 degrees moves them as far."""
-LIKELY = 4.0
-"""Difference of costs in noise variances up to which a solution is as likely as the best."""
-LOW = 0.1
-"""Share of problems whose noise is underestimated.  With a quarter instead, 8 of 109 answers to 3 to 8 planes without matches at
-0.5 px are off by more than 0.2 and three standard deviations; so 3 of 97."""
-EXACT = 1e-20
-"""Cost that is rounding error."""
-FLOOR = 1e-15
+EIGENVALUE_EPSILON = 1e-15
 """Eigenvalue of a Gauss-Newton matrix with the diagonal 1 that is rounding error."""
-OPEN = 1e12
-"""Variance of the homography at infinity over what it would be if all epipoles and planes were known, from which on it is open.
-Three planes: 1e3 to 1e9; with collinear epipoles and coplanar normals: 1e14 and more."""
-BODY_WEIGHT = 100.0
-"""Inverse variance of a fundamental matrix against that of a homography: a body with depth is seen larger than a plane's patch.
-Of 5 planes and 2 bodies at 0.5 px the error without matches is 0.0112; with 1 it is 0.0174, with 10 or 10000 0.012."""
 
 
 def solve(
-    homographies: Tensor, fundamentals: Tensor, matches: PlaneMatches | None, spare: Tensor, method: str, refine: bool
+    homographies: Tensor,
+    fundamentals: Tensor,
+    matches: PlaneMatches | None,
+    spare: Tensor,
+    method: str,
+    refine: bool,
+    options: PlanesOptions,
 ) -> tuple[Tensor, ...]:
     """The best fit to a block of problems.
 
@@ -389,6 +370,7 @@ def solve(
         spare: ``(b,)`` residuals beyond the degrees of freedom.
         method: see :func:`~dyntorch.tasks.planes.problem.starts`.
         refine: False leaves a start as it is.
+        options: every number that decides.
 
     Returns:
         theta ``(b, size)`` of :class:`Layout`, cost ``(b,)``, the covariance ``(b, size, size)`` of theta for residuals of
@@ -396,58 +378,59 @@ def solve(
         fits them as well ``(b,)``.
     """
     layout, b = Layout(homographies.shape[1], fundamentals.shape[1]), len(homographies)
-    weights = homographies.new_tensor([1.0] * layout.planes + [BODY_WEIGHT] * layout.bodies)
+    weights = homographies.new_tensor([1.0] * layout.planes + [options.fit.body_weight] * layout.bodies)
     matrices = PlanesProblem(layout, Matrices(torch.cat([homographies, fundamentals], dim=1), weights))
-    first = starts(method, homographies, fundamentals, several=refine)
+    first = starts(method, homographies, fundamentals, several=refine, options=options)
     theta = torch.cat([parameters(homographies, fundamentals, infinity) for infinity in first])
     rounds = matrices.repeated(len(first))
     if refine:
-        theta = minimize(rounds, theta, ROUGH)[0]
-    theta, cost = _distinct(theta.unflatten(0, (len(first), b)), rounds.normal_equations(theta)[0].unflatten(0, (len(first), b)))
+        theta = minimize(rounds, theta, options.fit.steps_on_matrices)[0]
+    cost = rounds.normal_equations(theta)[0]
+    theta, cost = _distinct(theta.unflatten(0, (len(first), b)), cost.unflatten(0, (len(first), b)), options)
     problem = matrices if matches is None else PlanesProblem(layout, matches)
     if matches is not None:
         chosen = cost.flatten().isfinite().nonzero()[:, 0]
         again = problem.repeated(len(cost)).subset(chosen)
         if refine:
-            found, value, _ = minimize(again, theta.flatten(0, 1)[chosen], FINE)
+            found, value, _ = minimize(again, theta.flatten(0, 1)[chosen], options.fit.steps_on_matches)
             theta = theta.flatten(0, 1).index_copy(0, chosen, found).unflatten(0, cost.shape)
         else:
             value = again.normal_equations(theta.flatten(0, 1)[chosen])[0]
         cost = cost.flatten().index_copy(0, chosen, value).unflatten(0, cost.shape)
     best = cost.argmin(0)
     everyone = torch.arange(b, device=best.device)
-    other = _others(theta[..., :9], cost, best, spare) if refine else torch.zeros_like(spare, dtype=torch.bool)
+    other = _others(theta[..., :9], cost, best, spare, options) if refine else torch.zeros_like(spare, dtype=torch.bool)
     theta, cost = theta[best, everyone], cost[best, everyone]
-    covariance, undetermined = _covariance(problem, theta)
+    covariance, undetermined = _covariance(problem, theta, options)
     if matches is not None:
-        undetermined = _covariance(matrices, theta)[1]
+        undetermined = _covariance(matrices, theta, options)[1]
     return theta, cost, covariance, undetermined, other
 
 
-def _distinct(theta: Tensor, cost: Tensor) -> tuple[Tensor, Tensor]:
-    """The ``KEPT`` best of several results ``(rounds, b, *)``; the cost of one that was found before is infinite."""
+def _distinct(theta: Tensor, cost: Tensor, options: PlanesOptions) -> tuple[Tensor, Tensor]:
+    """The best few of several results ``(rounds, b, *)``; the cost of one that was found before is infinite."""
     cost, order = cost.nan_to_num(torch.inf).sort(dim=0, stable=True)
     theta = theta.gather(0, order[..., None].expand_as(theta))
     directions = unit_vectors(theta[..., :9])
     cosine = torch.einsum("kbi,lbi->klb", directions, directions).abs()
-    again = cosine > 1 - SAME
+    again = cosine > 1 - options.fit.same
     before = torch.ones(len(cost), len(cost), dtype=torch.bool, device=cost.device).tril(-1)[..., None]
     cost = torch.where((again & before).any(1), torch.inf, cost)
     cost, order = cost.sort(dim=0, stable=True)
-    return theta.gather(0, order[..., None].expand_as(theta))[:KEPT], cost[:KEPT]
+    return theta.gather(0, order[..., None].expand_as(theta))[: options.fit.kept], cost[: options.fit.kept]
 
 
-def _others(infinity: Tensor, cost: Tensor, best: Tensor, spare: Tensor) -> Tensor:
+def _others(infinity: Tensor, cost: Tensor, best: Tensor, spare: Tensor, options: PlanesOptions) -> Tensor:
     """Where another homography at infinity ``(k, b, 9)`` has about the cost of the best."""
     directions = unit_vectors(infinity)
     everyone = torch.arange(len(best), device=best.device)
     least = cost[best, everyone]
     sine = (1 - (directions * directions[best, everyone]).sum(-1).square()).clamp(min=0).sqrt()
-    limit = least + LIKELY * noise_variance(least, spare) + EXACT * (least + 1)
-    return ((cost <= limit) & (sine > APART)).any(0)
+    limit = least + options.ambiguity.likely * noise_variance(least, spare, options) + options.ambiguity.exact * (least + 1)
+    return ((cost <= limit) & (sine > options.ambiguity.apart)).any(0)
 
 
-def noise_variance(cost: Tensor, spare: Tensor) -> Tensor:
+def noise_variance(cost: Tensor, spare: Tensor, options: PlanesOptions = PlanesOptions()) -> Tensor:
     r"""Variance of the noise, :math:`c / q` with the lower quantile q of :math:`\chi^2`, which is near the number of residuals to
     spare where that is large; 0 where none is.
 
@@ -456,25 +439,27 @@ def noise_variance(cost: Tensor, spare: Tensor) -> Tensor:
     Args:
         cost: c ``(b,)``.
         spare: ``(b,)`` residuals beyond the degrees of freedom.
+        options: which quantile.
     """
-    limits = spare.new_tensor([quantile(LOW, degrees) for degrees in spare.clamp(min=1).flatten().tolist()]).reshape(spare.shape)
+    share, degrees = options.ambiguity.underestimated, spare.clamp(min=1).flatten().tolist()
+    limits = spare.new_tensor([quantile(share, free) for free in degrees]).reshape(spare.shape)
     return torch.where(spare > 0, cost / limits, 0.0)
 
 
-def _covariance(problem: PlanesProblem, theta: Tensor) -> tuple[Tensor, Tensor]:
+def _covariance(problem: PlanesProblem, theta: Tensor, options: PlanesOptions) -> tuple[Tensor, Tensor]:
     """Inverse of the Gauss-Newton matrix with the gauges held, and whether the homography at infinity has an open direction."""
     matrix = problem.normal_equations(theta)[2]
     size = matrix.diagonal(dim1=-2, dim2=-1).sqrt()
     # parameters that nothing depends on (of a missing plane) are held
-    none = size <= FLOOR * size.amax(-1, keepdim=True)
+    none = size <= EIGENVALUE_EPSILON * size.amax(-1, keepdim=True)
     unit = torch.where(none, torch.inf, size)
     gauges = unit_vectors(_gauges(problem.layout, theta) * torch.where(none, 0.0, size)[:, None]).mT
     scaled = matrix / (unit[:, :, None] * unit[:, None]) + gauges @ gauges.mT + torch.diag_embed(none.to(matrix.dtype))
     values, vectors = spectrum(scaled)
-    inverse = (vectors / values.clamp(min=FLOOR)[:, None, :]) @ vectors.mT / (unit[:, :, None] * unit[:, None])
+    inverse = (vectors / values.clamp(min=EIGENVALUE_EPSILON)[:, None, :]) @ vectors.mT / (unit[:, :, None] * unit[:, None])
     spread = projected(inverse[:, :9, :9], theta[:, :9]).diagonal(dim1=-2, dim2=-1).sum(-1)
     least = 1 / matrix[:, :9, :9].diagonal(dim1=-2, dim2=-1).mean(-1).clamp(min=torch.finfo(matrix.dtype).tiny)
-    return inverse, spread > OPEN * least
+    return inverse, spread > options.ambiguity.open * least
 
 
 def projected(covariance: Tensor, vector: Tensor) -> Tensor:

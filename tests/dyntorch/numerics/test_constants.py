@@ -30,6 +30,7 @@ from dyntorch.shapes.basis import Polynomial
 from dyntorch.tasks.planes import closed_forms as infinity_extensors
 from dyntorch.tasks.planes import problem as planes_problem
 from dyntorch.tasks.planes import problem as planes_starts
+from dyntorch.tasks.planes.options import PlaneFrameOptions
 
 CPU = torch.device("cpu")
 TABLES = [
@@ -60,7 +61,7 @@ TABLES = [
     (monomials.collecting, (2, 2, CPU)),
     (monomials.multiplicity, (2, 2, CPU)),
     (planes_problem._own, (3, 1, CPU)),
-    (planes_starts._frames, (CPU,)),
+    (planes_starts._frames, (PlaneFrameOptions(), CPU)),
     (shape_completion._choices, (8, CPU)),
     (shape_points._basis, ("plane", CPU)),
     (shape_points.plane_inverse, (6, CPU)),

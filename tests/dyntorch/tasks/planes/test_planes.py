@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -282,3 +284,18 @@ def test_nonsense_gets_a_status():
     found = translating_planes(H)
     assert found.status[:2].tolist() == [Status.TOO_FEW, Status.TOO_FEW]
     assert bool(found.homography_at_infinity.isfinite().all()) and bool(found.fundamentals.isfinite().all())
+
+
+def test_options_decide():
+    scene, shipped = scenes.translating_planes(5, sigma=0.5, generator=torch.Generator().manual_seed(0)), dyn.PlanesOptions()
+    matches = {"x1": scene.x1, "x2": scene.x2}
+    assert int(translating_planes(**matches).status) == Status.OK
+    sure = replace(shipped, ambiguity=replace(shipped.ambiguity, uncertain=0.0))
+    assert int(translating_planes(**matches, options=sure).status) == Status.AMBIGUOUS
+    strict = replace(shipped, misfit=replace(shipped.misfit, unlikely=-100.0))
+    assert int(translating_planes(**matches, options=strict).status) == Status.NO_CONSENSUS
+
+
+def test_options_are_of_the_verb():
+    with pytest.raises(ValueError, match=r"options must be PlanesOptions, got \{\}; use dataclasses\.replace"):
+        translating_planes(torch.eye(3).expand(3, 3, 3), options={})
