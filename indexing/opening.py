@@ -71,6 +71,16 @@ def shown(value: Any) -> str:
     return clipped(SHORT.repr(value), VALUE)
 
 
+def count(number: int, one: str, many: str = "") -> str:
+    """``1 clip``, ``2 clips``; ``many`` where the plural is not the noun with an s.
+
+    Example:
+        >>> count(2, "match", "matches")
+        '2 matches'
+    """
+    return f"{number:,} {one if number == 1 else many or f'{one}s'}"
+
+
 def listed(names: Iterable[object], most: int = LISTED) -> str:
     """The first names, each clipped.
 

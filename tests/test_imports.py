@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-HEAVY = ("torch", "sklearn", "scipy", "kornia", "matplotlib", "safetensors", "cv2", "av", "rich")
+HEAVY = ("torch", "sklearn", "scipy", "kornia", "matplotlib", "safetensors", "cv2", "av", "rich", "jinja2")
 
 
 def files(package):

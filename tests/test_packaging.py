@@ -27,7 +27,7 @@ def test_the_wheel_holds_both_packages_and_nothing_else(tmp_path: Path) -> None:
     about = {name for name in held if name.partition("/")[0].endswith(".dist-info")}
     assert held - about == of_packages()
     assert {name.partition("/")[2] for name in about} == {"METADATA", "WHEEL", "RECORD", "entry_points.txt", "licenses/LICENSE"}
-    assert {"dyntorch/py.typed", "indexing/py.typed", "indexing/report/page.css", "indexing/report/page.html"} <= held
+    assert {"dyntorch/py.typed", "indexing/py.typed", "indexing/report/base.css", "indexing/report/base.html.j2"} <= held
 
 
 def test_the_sdist_holds_the_sources_and_nothing_else(tmp_path: Path) -> None:

@@ -11,28 +11,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from indexing.cli import console
-from indexing.cli.console import check_report, count, ended, names, progress, say, table
+from indexing.cli.console import check_report, count, ended, names, progress, say, table, tell
 
 if TYPE_CHECKING:
     from indexing.readers.matches import Matched
     from indexing.report.alignment import AlignmentReport
 
 Model = Literal["planar", "join", "minimal_join", "constant_velocity", "affine_constant_velocity", "rigid", "lines"]
-PURPOSE = {
-    "planar": "Points of a plane stand still or move on straight lines before a moving camera.",
-    "join": "Points stand still or move on straight lines before an uncalibrated 3D sensor.",
-    "minimal_join": "Points stand still or move on straight lines before an uncalibrated 3D sensor.",
-    "constant_velocity": "Points move at constant velocity before an uncalibrated 3D sensor.",
-    "affine_constant_velocity": "Points move at constant velocity before a 3D sensor that is known up to an affinity.",
-    "rigid": "Points stand still or move on straight lines before a 3D sensor that moves rigidly.",
-    "lines": "Lines stand still or stay in a plane while they move, before a 3D sensor.",
-}
-REASONS = {
-    "TOO_FEW": "too few matches are present in all views; give more",
-    "DEGENERATE": "several motions fit all matches exactly; add matches that move otherwise, or use a model with fewer unknowns",
-    "AMBIGUOUS": "other motions fit as well; add matches that differ more, lower the noise, or use a model with fewer unknowns",
-    "NO_CONSENSUS": "no motion fits enough of the matches; raise --threshold, or give matches of which more belong to the model",
-}
 
 
 @dataclass(frozen=True)
@@ -69,7 +54,8 @@ class Align:
         """Read, align, write, and say what was found."""
         inputs = [path.expanduser() for path in (*self.files, *self.static_points)]
         self._check()
-        from indexing.report.alignment import FILES
+        from indexing.files import manifest
+        from indexing.report.alignment import FILES, AlignmentReport, write_alignment
 
         folder = check_report(self.out, inputs, FILES)
         started = time.perf_counter()
@@ -79,14 +65,21 @@ class Align:
             matched = read_matches(self.files, frames=frame_numbers(self.frames), static_points=self.static_points)
         model, notes = self._model(matched)
         read = time.perf_counter()
-        with progress(f"aligning {count(len(matched.ids), 'match').replace('matchs', 'matches')}", steps=False):
+        with progress(f"aligning {count(len(matched.ids), 'match', 'matches')}", steps=False):
             result = self._solve(matched, model)
         timings = {"read": read - started, "align": time.perf_counter() - read}
-        report = self._report(matched, model, result, [*notes, *matched.notes], inputs, timings)
+        arguments = {"command": "align", **dataclasses.asdict(self), "model": model}
+        report = AlignmentReport(
+            result=result,
+            read=matched,
+            model=model,
+            threshold=None if self.threshold == "auto" else float(self.threshold),
+            notes=[*notes, *matched.notes],
+            words=in_flags,
+            manifest=manifest(arguments, inputs, self.seed, timings),
+        )
         page = None
         if folder is not None:
-            from indexing.report.alignment import write_alignment
-
             with progress("drawing the report", steps=False):
                 page = write_alignment(folder, report)
         show(report)
@@ -124,6 +117,8 @@ class Align:
             raise ValueError(f"--motion {self.motion} belongs to --model rigid, got {given}; use --model constant_velocity")
         if self.model is not None:
             return given, []
+        from indexing.report.alignment import PURPOSE
+
         others = ", ".join(name for name in PURPOSE if name not in ("planar", "lines", given))
         hint = f"; if their scale or axes are not to be trusted, say --model with one of {others}" if given == "rigid" else ""
         return given, [f"model {given}, because the files hold {kind}{hint}"]
@@ -156,37 +151,6 @@ class Align:
         except ValueError as problem:
             raise ValueError(f"{names(matched.names)}: {in_flags(str(problem))}") from problem
 
-    def _report(
-        self, matched: Matched, model: str, result: Any, notes: list[str], inputs: list[Path], timings: dict[str, float]
-    ) -> AlignmentReport:
-        from dyntorch import Status
-        from indexing.files import manifest
-        from indexing.report.alignment import AlignmentReport, as_segments
-
-        status = Status(int(result.status)).name
-        parts = [part for part in (result.A, result.B) if part is not None]
-        return AlignmentReport(
-            title="What moved, and how the sensor did" if status == "OK" else "The matches do not decide",
-            model=(model, PURPOSE[model]),
-            views=[as_segments(view) if view.shape[1:] == (6,) else view for view in matched.views],
-            names=[str(Path(name).name) for name in matched.names],
-            ids=matched.ids,
-            labels=result.labels.numpy(),
-            motion=[part.numpy() for part in parts],
-            covariance=result.covariance.numpy(),
-            sigma=float(result.sigma),
-            status=status,
-            reason=REASONS.get(status, ""),
-            ambiguity=in_flags(result.ambiguity),
-            warnings=[(notice.code.value, notice.value, in_flags(notice.message)) for notice in result.warnings],
-            notes=notes,
-            velocities=None if result.velocities is None else result.velocities.numpy(),
-            unverified=None if result.unverified is None else result.unverified.numpy(),
-            metric=model == "rigid",
-            threshold=None if self.threshold == "auto" else float(self.threshold),
-            manifest=manifest({"command": "align", **dataclasses.asdict(self), "model": model}, inputs, self.seed, timings),
-        )
-
 
 def frame_numbers(text: str | None) -> tuple[int, ...] | None:
     """``10,20,30`` as numbers.
@@ -215,29 +179,15 @@ def in_flags(message: str) -> str:
 
 def show(report: AlignmentReport) -> None:
     """Print the result."""
-    from indexing.report.alignment import display_scale, figures
-
     counts = report.counts
     known = report.solved
-    rows = [[len(report.ids), *(counts[name] if known or name == "missing" else "" for name in counts)]]
-    rows[0] += [f"{report.sigma:.3g}" if known else "", report.status.lower().replace("_", " ")]
-    table(["matches ", "static ", "moving ", "outliers ", "missing ", "noise ", "status"], rows)
-    start = 0
-    for number, (name, matrix) in enumerate(zip("AB", report.motion, strict=False), start=2):
-        block = report.covariance[start : start + matrix.size, start : start + matrix.size]
-        start += matrix.size
-        if known:
-            values, spread, scaled = display_scale(matrix, block)
-            cells = [
-                [" ± ".join(filter(None, figures(float(v), float(s)))) for v, s in zip(*row, strict=True)]
-                for row in zip(values, spread, strict=True)
-            ]
-            rows = [[f"row {i}", *row] for i, row in enumerate(cells, start=1)]
-            heading = f"{name}: view {number} to view 1" + ("" if scaled else ", norm 1")
-            table([heading, *(f"column {j} " for j in range(1, matrix.shape[1] + 1))], rows)
-    for note in report.notes:
-        say(f"note: {note}")
-    for code, _, message in report.warnings:
-        say(f"warning: {code.replace('_', ' ')}: {message}")
+    row = [len(report.ids), *(counts[name] if known or name == "missing" else "" for name in counts)]
+    row += [f"{report.sigma:.3g}" if known else "", report.state]
+    table(["matches ", "static ", "moving ", "outliers ", "missing ", "noise ", "status"], [row])
+    for name, view, rows, scaled in report.shown:
+        heading = f"{name}: view {view} to view 1" + ("" if scaled else ", norm 1")
+        cells = [[f"row {i}", *(" ± ".join(filter(None, cell)) for cell in row[1:])] for i, row in enumerate(rows, start=1)]
+        table([heading, *(f"column {j} " for j in range(1, len(cells[0])))], cells)
+    tell(report)
     if known and report.ambiguity:
         say(f"open: {report.ambiguity}")

@@ -14,6 +14,12 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+from indexing.opening import count as count  # by this name for all commands
+
+if TYPE_CHECKING:
+    from indexing.report.page import ResultReport
 
 PLAIN_WIDTH = 132  # columns where the output is no terminal
 REFUSED = 3  # exit code: the data cannot decide
@@ -71,6 +77,16 @@ def in_flags(message: str, *flags: str) -> str:
     return re.sub(rf"\b({'|'.join(flags)})=(?:'?(\w[\w.]*\b)'?)?", flag, message)
 
 
+def one(message: str) -> str:
+    """A message with the singular where its number is 1.
+
+    Example:
+        >>> one("1 points are behind a camera"), one("11 points are behind a camera")
+        ('1 point is behind a camera', '11 points are behind a camera')
+    """
+    return re.sub(r"\b(?<![\d.,])1 (\w+)s are\b", r"1 \1 is", message)
+
+
 def names(values: Sequence[object]) -> str:
     """The first few, and how many more.
 
@@ -82,9 +98,14 @@ def names(values: Sequence[object]) -> str:
     return ", ".join(map(str, values[:SHOWN])) + more
 
 
-def count(number: int, noun: str) -> str:
-    """``1 clip``, ``2 clips``."""
-    return f"{number:,} {noun}{'' if number == 1 else 's'}"
+def tell(report: ResultReport) -> None:
+    """What a reader should note, a line each."""
+    from indexing.report.page import heading
+
+    for note in report.notes:
+        say(f"note: {note}")
+    for code, _, message in report.warnings:
+        say(f"warning: {heading(code)}: {message}")
 
 
 def table(columns: Sequence[str], rows: Sequence[Sequence[object]], title: str = "") -> None:

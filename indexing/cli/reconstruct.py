@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from indexing.cli.console import check_report, count, ended, in_flags, say, table
+from indexing.cli.console import check_report, count, ended, in_flags, one, say, table, tell
 from indexing.cli.console import progress as progress_of
 
 if TYPE_CHECKING:
@@ -24,25 +24,6 @@ MotionName = Literal[
     "constant_direction_3d", "constant_velocity_planes_3d", "constant_velocity_3d", "constant_velocity_3d_sensors",
     "two_bodies_2d", "two_bodies_3d",
 ]  # fmt: skip
-PURPOSE = {
-    "static_2d": "The points of a plane stand still.",
-    "static_3d": "The points stand still.",
-    "constant_direction_2d": "The points move in a plane along one common direction, each at its own speed.",
-    "constant_velocity_2d": "The points move in a plane, each at its own constant velocity.",
-    "constant_acceleration_2d": "The points move in a plane, each with its own constant acceleration.",
-    "constant_direction_3d": "The points move in space along one common direction, each at its own speed.",
-    "constant_velocity_planes_3d": "The points move in space, parallel to a plane, each at its own constant velocity.",
-    "constant_velocity_3d": "The points move in space, each at its own constant velocity.",
-    "constant_velocity_3d_sensors": "The points move in space, each at its own constant velocity, before a 3D sensor.",
-    "two_bodies_2d": "The points of a plane belong to two bodies, one of which is shifted against the other.",
-    "two_bodies_3d": "The points belong to two bodies, one of which is shifted against the other.",
-}
-REASONS = {
-    "TOO_FEW": "too few tracks are seen in enough views; track more points, or for longer",
-    "DEGENERATE": "the tracks leave several scenes, exactly; let camera and points move otherwise, or take a smaller --motion",
-    "AMBIGUOUS": "other scenes fit as well; add views and tracks, let the camera move more, or take a smaller --motion",
-    "NO_CONSENSUS": "no scene fits enough of the tracks; raise --threshold, take another --motion, or clean the tracks",
-}
 FLAGS = ("times", "static", "threshold", "motion")
 UNFIXED = (
     "no point is known to stand still, so that a motion common to all is open and none can be told to rest; "
@@ -88,7 +69,8 @@ class Reconstruct:
         """Read, reconstruct, write, and say what was found."""
         inputs = [path.expanduser() for path in (*self.files, *((self.static,) if self.static else ()))]
         self._check()
-        from indexing.report.reconstruction import FILES
+        from indexing.files import manifest
+        from indexing.report.reconstruction import FILES, ReconstructionReport, write_reconstruction
 
         folder = check_report(self.out, inputs, FILES)
         started = time.perf_counter()
@@ -101,11 +83,17 @@ class Reconstruct:
         with progress_of(f"reconstructing {count(len(tracks.ids), 'track')}", steps=False):
             result = self._solve(tracks)
         timings = {"read": read - started, "reconstruct": time.perf_counter() - read}
-        report = self._report(tracks, result, inputs, timings)
+        limit = self._limit()
+        report = ReconstructionReport(
+            result=result,
+            tracks=tracks,
+            threshold=None if limit == math.inf else limit,
+            notes=[*tracks.notes, *unfixed(tracks, result)],
+            words=words,
+            manifest=manifest({"command": "reconstruct", **dataclasses.asdict(self)}, inputs, self.seed, timings),
+        )
         page = None
         if folder is not None:
-            from indexing.report.reconstruction import write_reconstruction
-
             with progress_of("drawing the report", steps=False):
                 page = write_reconstruction(folder, report)
         show(report)
@@ -189,53 +177,19 @@ class Reconstruct:
                 generator=torch.Generator().manual_seed(self.seed),
             )
         except ValueError as problem:
-            raise ValueError(f"{tracks.path}: {in_flags(str(problem), *FLAGS)}") from problem
+            raise ValueError(f"{tracks.path}: {words(str(problem))}") from problem
 
-    def _report(self, tracks: TrackSet, result: Any, inputs: list[Path], timings: dict[str, float]) -> ReconstructionReport:
-        import torch
 
-        from dyntorch import Status
-        from indexing.files import manifest
-        from indexing.report.reconstruction import ReconstructionReport, one, rested
+def words(message: str) -> str:
+    """A message of the library in the words of the command line."""
+    return one(in_flags(message, *FLAGS))
 
-        status, name = Status(int(result.status)).name, result.motion.name
-        warnings = [(notice.code.value, notice.value, one(in_flags(notice.message, *FLAGS))) for notice in result.warnings]
-        notes = list(tracks.notes)
-        if (
-            status == "OK"
-            and (tracks.static is None or not tracks.static.any())
-            and result.velocities is not None
-            and not result.motion.static
-        ):
-            notes.append(UNFIXED)
-        # that nothing fits is no consequence of what a notice says of the scene that fits best
-        because = "" if status == "NO_CONSENSUS" else "; ".join(message for _, _, message in warnings[:2])
-        arrays = ("cameras", "points", "velocities", "labels", "residuals", "inliers", "structure", "projections")
-        found: dict[str, Any] = {
-            field: None if getattr(result, field) is None else getattr(result, field).numpy() for field in arrays
-        }
-        found["velocities"] = rested(found["velocities"], found["points"], float(result.times.max() - result.times.min()))
-        if result.motion.static and result.motion.bodies == 1:
-            found["labels"] = found["labels"].clip(max=1)
-        limit = self._limit()
-        return ReconstructionReport(
-            title="What moves, and how" if status == "OK" else "The tracks do not decide",
-            motion=(name, PURPOSE.get(name, "")),
-            tracks=tracks,
-            residual=float(result.residual),
-            sigma=float(result.sigma),
-            status=status,
-            reason="" if status == "OK" else because or REASONS[status],
-            ambiguity=in_flags(result.ambiguity, *FLAGS),
-            warnings=warnings,
-            notes=notes,
-            candidates=[(tried.motion, tried.score, tried.residual, tried.reason) for tried in result.candidates],
-            threshold=None if limit == math.inf else limit,
-            manifest=manifest({"command": "reconstruct", **dataclasses.asdict(self)}, inputs, self.seed, timings),
-            bodies=result.motion.bodies,
-            positions=torch.stack([result.at(float(moment)) for moment in result.times]).numpy(),
-            **found,
-        )
+
+def unfixed(tracks: TrackSet, result: Any) -> list[str]:
+    """That a motion common to all points is open, where it is."""
+    known = tracks.static is not None and bool(tracks.static.any())
+    decided = int(result.status) == 0 and result.velocities is not None and not result.motion.static
+    return [UNFIXED] if decided and not known else []
 
 
 def numbers(text: str, expected: int) -> Any:
@@ -257,22 +211,19 @@ def numbers(text: str, expected: int) -> Any:
 
 def show(report: ReconstructionReport) -> None:
     """Print the result."""
-    from indexing.report.reconstruction import heading, left_out
+    from indexing.report.reconstruction import left_out
 
-    counts = report.counts
+    counts, candidates = report.counts, report.result.candidates
     known = report.solved
     cells = [number if known or name == "missing" else "" for name, number in counts.items()]
-    row = [report.motion[0], len(report.tracks.views), len(report.tracks.ids), *cells]
-    row += [f"{report.residual:.3g}" if known else "", report.status.lower().replace("_", " ")]
+    row = [report.motion, len(report.tracks.views), len(report.tracks.ids), *cells]
+    row += [f"{report.residual:.3g}" if known else "", report.state]
     table(["motion", "views ", "tracks ", *(f"{name} " for name in counts), "rms residual ", "status"], [row])
-    if report.candidates:
-        fitted = [(name, score, residual) for name, score, residual, _ in report.candidates if math.isfinite(score)]
-        table(["model", "penalized cost ", "rms residual "], [[name, f"{s:.6g}", f"{r:.3g}"] for name, s, r in fitted])
-        if failed := left_out(report.candidates):
+    if candidates:
+        fitted = [[one.motion, f"{one.score:.6g}", f"{one.residual:.3g}"] for one in candidates if math.isfinite(one.score)]
+        table(["model", "penalized cost ", "rms residual "], fitted)
+        if failed := left_out(report):
             say(f"note: {failed}")
-    for note in report.notes:
-        say(f"note: {note}")
-    for code, _, message in report.warnings:
-        say(f"warning: {heading(code)}: {message}")
+    tell(report)
     if known and report.ambiguity:
         say(f"open: {report.ambiguity}")

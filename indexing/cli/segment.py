@@ -10,18 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from indexing.cli.console import check_report, count, ended, in_flags, progress, say, table
+from indexing.cli.console import check_report, count, ended, in_flags, one, progress, say, table, tell
 
 if TYPE_CHECKING:
     from indexing.readers.pairs import MatchedPair, Photograph
     from indexing.report.segmentation import SegmentationReport
 
-REASONS = {
-    "TOO_FEW": "too few matches are present in both images; give more",
-    "DEGENERATE": "several segmentations fit all matches exactly; add matches in general position",
-    "AMBIGUOUS": "other segmentations fit as well; add matches, or say how many --bodies there are",
-    "NO_CONSENSUS": "no body moves so that enough of the matches agree; raise --threshold, or clean the matches",
-}
 FLAGS = ("bodies", "threshold", "spatial", "weights")
 LEAST = 8  # matches
 SMALL = 50  # thresholds across the points, below which these are hardly pixels
@@ -64,7 +58,8 @@ class Segment:
         """Read, segment, write, and say what was found."""
         inputs = [path.expanduser() for path in (self.file, *(self.images or ()))]
         self._check()
-        from indexing.report.segmentation import FILES
+        from indexing.files import manifest
+        from indexing.report.segmentation import FILES, SegmentationReport, write_segmentation
 
         folder = check_report(self.out, inputs, FILES)
         started = time.perf_counter()
@@ -75,14 +70,24 @@ class Segment:
             photographs = [read_image(path) for path in self.images or ()]
         notes = self._notes(pair, photographs)
         read = time.perf_counter()
-        with progress(f"segmenting {count(int(pair.seen.sum()), 'match').replace('matchs', 'matches')}", steps=False):
+        with progress(f"segmenting {count(int(pair.seen.sum()), 'match', 'matches')}", steps=False):
             result = self._solve(pair)
         timings = {"read": read - started, "segment": time.perf_counter() - read}
-        report = self._report(pair, photographs, result, notes, inputs, timings)
+        found = int(result.bodies)
+        if self.bodies != "auto" and 0 < found < self.bodies:
+            notes.append(f"--bodies asks for {self.bodies}, the matches carry {found}")
+        report = SegmentationReport(
+            result=result,
+            pair=pair,
+            photographs=photographs,
+            size=self.size or pair.size,
+            heading=self.title or "",
+            notes=notes,
+            words=words,
+            manifest=manifest({"command": "segment", **dataclasses.asdict(self)}, inputs, self.seed, timings),
+        )
         page = None
         if folder is not None:
-            from indexing.report.segmentation import write_segmentation
-
             with progress("drawing the report", steps=False):
                 page = write_segmentation(folder, report)
         show(report)
@@ -116,8 +121,8 @@ class Segment:
             raise ValueError(f"{said}, {LEAST} are needed; give more matches")
         notes = []
         if lost:
-            was = "match lacks a coordinate and was" if lost == 1 else "matches lack a coordinate and were"
-            notes.append(f"{lost:,} {was} left out")
+            was = count(lost, "match lacks a coordinate and was", "matches lack a coordinate and were")
+            notes.append(f"{was} left out")
         reach = float(np.ptp(np.concatenate([pair.x1[seen], pair.x2[seen]]), axis=0).max())
         if self.threshold != "auto" and reach < SMALL * float(self.threshold):
             said = f"the points lie within {reach:.3g}, and --threshold is {self.threshold:g}"
@@ -156,68 +161,19 @@ class Segment:
                 generator=torch.Generator().manual_seed(self.seed),
             )
         except ValueError as problem:
-            raise ValueError(f"{pair.path}: {in_flags(str(problem), *FLAGS)}") from problem
-
-    def _report(
-        self,
-        pair: MatchedPair,
-        photographs: list[Photograph],
-        result: Any,
-        notes: list[str],
-        inputs: list[Path],
-        timings: dict[str, float],
-    ) -> SegmentationReport:
-        from dyntorch import Status
-        from indexing.files import manifest
-        from indexing.report.reconstruction import one
-        from indexing.report.segmentation import SegmentationReport
-
-        found = int(result.bodies)
-        status = Status(int(result.status)).name
-        if status == "OK" and not found:
-            status = "NO_CONSENSUS"
-        if self.bodies != "auto" and 0 < found < self.bodies:
-            notes = [*notes, f"--bodies asks for {self.bodies}, the matches carry {found}"]
-        warnings = [(notice.code.value, notice.value, one(in_flags(notice.message, *FLAGS))) for notice in result.warnings]
-        reason = "; ".join(message for _, _, message in warnings[:2]) or REASONS[status] if status != "OK" else ""
-        arrays = ("labels", "residuals", "coherence")
-        return SegmentationReport(
-            title=self.title or ("What moves with what" if status == "OK" else "The matches do not decide"),
-            pair=pair,
-            fundamentals=result.fundamentals[:found].numpy(),
-            homographies=result.homographies[:found].numpy(),
-            models=[str(model) for model in result.models[:found]],
-            probabilities=result.probabilities[:, : found + 1].numpy(),
-            threshold=float(result.threshold),
-            status=status,
-            reason=reason,
-            warnings=warnings,
-            notes=notes,
-            misclassified=misclassified(pair, result.labels) if found else None,
-            photographs=photographs,
-            size=self.size or pair.size,
-            manifest=manifest({"command": "segment", **dataclasses.asdict(self)}, inputs, self.seed, timings),
-            **{name: getattr(result, name).numpy() for name in arrays},
-        )
+            raise ValueError(f"{pair.path}: {words(str(problem))}") from problem
 
 
-def misclassified(pair: MatchedPair, labels: Any) -> float | None:
-    """Share of the matches that are not labelled as the file says, whatever the bodies' numbers; None where it does not say."""
-    if pair.known is None:
-        return None
-    import torch
-
-    from dyntorch import metrics
-
-    seen = torch.from_numpy(pair.seen)
-    return float(metrics.misclassification(labels[seen], torch.from_numpy(pair.known)[seen]))
+def words(message: str) -> str:
+    """A message of the library in the words of the command line."""
+    return one(in_flags(message, *FLAGS))
 
 
 def show(report: SegmentationReport) -> None:
     """Print the result."""
     from indexing.report.page import even
 
-    number, counts = int(report.pair.seen.sum()), report.counts
+    number, counts = report.seen, report.counts
     noise = even([report.rms(label) for label in range(1, len(report.models) + 1)])
     rows: list[list[object]] = []
     for label, model in enumerate(report.models, start=1):
@@ -228,7 +184,4 @@ def show(report: SegmentationReport) -> None:
     table(["body", "matches ", "share ", "model", "noise rms px "], rows)
     if report.misclassified is not None:
         say(f"misclassified: {100 * report.misclassified:.2f} % against the labels of the file")
-    for note in report.notes:
-        say(f"note: {note}")
-    for code, _, message in report.warnings:
-        say(f"warning: {code.replace('_', ' ')}: {message}")
+    tell(report)

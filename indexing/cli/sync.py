@@ -65,6 +65,7 @@ class Sync:
     def run(self) -> int:
         """Read, synchronize, write, and say what was found."""
         self._check()
+        from indexing.files import manifest
         from indexing.report.sync import FILES, names_of
         from indexing.sync.files import check_target
         from indexing.sync.takes import find_cameras
@@ -80,12 +81,13 @@ class Sync:
         read = time.perf_counter()
         pairs = len(takes) * (len(takes) - 1) // 2
         with progress(f"comparing {count(pairs, 'pair')} of cameras") as done:
-            report, compared = self._solve(takes, done)
+            report = self._solve(takes, done)
         timings = {"read": read - started, "synchronize": time.perf_counter() - read}
         page = None
         if folder is not None:
             with progress("writing", steps=False):
-                report, page = self._write(folder, takes, report, compared, inputs, timings)
+                made = manifest({"command": "sync", **dataclasses.asdict(self)}, inputs, None, timings)
+                report, page = self._write(folder, dataclasses.replace(report, manifest=made))
         show(report, folder)
         return ended(page, None if report.ok else report.reason)
 
@@ -130,10 +132,10 @@ class Sync:
         except ValueError as problem:
             raise ValueError(words(str(problem))) from problem
 
-    def _solve(self, takes: list[Take], done: Any) -> tuple[SyncReport, dict[tuple[int, int], Pairing]]:
+    def _solve(self, takes: list[Take], done: Any) -> SyncReport:
         """All pairs, and what they say together."""
         import dyntorch
-        from indexing.report.sync import reported
+        from indexing.report.sync import SyncReport
         from indexing.sync.calibration import named_lenses
         from indexing.sync.synchronize import pair, remarks
 
@@ -159,40 +161,32 @@ class Sync:
         except ValueError as problem:
             said = re.sub(r"^cameras \d+ and \d+: ", "", str(problem))
             raise ValueError(words(said)) from problem
-        report = reported(takes, compared, clocks, [*remarks(takes), *told], self.title, words)
-        return report, compared
+        known: dict[str, Any] = {"remarks": [*remarks(takes), *told], "heading": self.title or "", "words": words}
+        return SyncReport(takes=takes, compared=compared, together=clocks, **known)
 
-    def _write(
-        self, folder: Path, takes: list[Take], report: SyncReport, compared: dict[tuple[int, int], Pairing], inputs: list[Path],
-        timings: dict[str, float],
-    ) -> tuple[SyncReport, Path]:  # fmt: skip
+    def _write(self, folder: Path, report: SyncReport) -> tuple[SyncReport, Path]:
         """The shifted files where the data decide, the check video where asked for, and the report."""
-        from indexing.files import manifest, prepare
-        from indexing.report.sync import drop_checks, write_sync
+        from indexing.files import prepare
+        from indexing.report.sync import drop_checks, write_checks, write_sync
         from indexing.sync.files import drop_poses, plan, write_poses
 
         prepare(folder)
-        notes, clocks = list(report.notes), list(report.clocks)
-        poses = [i for i, take in enumerate(takes) if take.kind == "keypoints"]
+        notes, first = [], report.reference
+        poses = {i: clock for i, clock in enumerate(report.clocks) if clock.take.kind == "keypoints"}
         if report.ok and poses:
-            plans = {i: plan(takes[i], clocks[i].offset, clocks[i].rate, clocks[0].fps) for i in poses}
+            plans = {i: plan(clock.take, clock.offset, clock.rate, first.take.fps) for i, clock in poses.items()}
             write_poses(folder, list(plans.values()))
-            notes += early(list(plans.values()), takes[0].name)
-            clocks = [
-                dataclasses.replace(clock, shifted=_shifted(plans[i])) if i in plans else clock for i, clock in enumerate(clocks)
-            ]
+            notes += early(list(plans.values()), first.name)
+            report = dataclasses.replace(report, shifted={i: _shifted(one) for i, one in plans.items()})
         elif drop_poses(folder):
             notes.append("pose-sync of an earlier run was removed, because this one does not decide")
         videos: list[str] = []
-        if self.check and any(len(found.shift.peaks) for found in compared.values()):  # of the best candidate, sure or not
-            from indexing.report.sync import write_checks
-
-            videos, failed = write_checks(folder, takes, report, compared)
+        if self.check and any(len(pair.shift.peaks) for pair in report.pairs):  # of the best candidate, sure or not
+            videos, failed = write_checks(folder, report)
             notes += failed
         drop_checks(folder, videos)
-        settings = manifest({"command": "sync", **dataclasses.asdict(self)}, inputs, None, timings)
-        final = dataclasses.replace(report, notes=notes, clocks=clocks, manifest=settings)
-        return final, write_sync(folder, final, videos)
+        report = dataclasses.replace(report, afterwards=notes)
+        return report, write_sync(folder, report, videos)
 
 
 def words(message: str) -> str:
@@ -239,10 +233,10 @@ def show(report: SyncReport, folder: Path | None = None) -> None:
         say(f"{other.name} began {when} {first.name}: {clock}")
     for pair in report.pairs:
         if pair.wrong and pair.shift.ok:
-            say(f"inconsistent joints of {pair.a} and {pair.b}: {', '.join(pair.wrong)}")
+            say(f"inconsistent joints of {pair.a.name} and {pair.b.name}: {', '.join(pair.wrong)}")
     open_pairs = [pair for pair in report.pairs if not pair.shift.ok] if len(report.pairs) > 1 else []
     for pair in open_pairs[:SHOWN]:
-        say(f"{pair.a} and {pair.b} refused: {pair.shift.reason}")
+        say(f"{pair.a.name} and {pair.b.name} refused: {pair.reason}")
     if len(open_pairs) > SHOWN:
         say(f"and {len(open_pairs) - SHOWN} more pairs refused")
     for note in report.notes:
@@ -268,7 +262,9 @@ def _show_pairs(report: SyncReport) -> None:
             ppm(shift.rate, shift.rate_sigma),
             f"{shift.confidence:.3f}",
         ]
-        rows.append([f"{pair.a} → {pair.b}", *numbers, f"{rival[0]:+.3f}" if rival else "none", "ok" if shift.ok else "refused"])
+        rows.append(
+            [f"{pair.a.name} → {pair.b.name}", *numbers, f"{rival[0]:+.3f}" if rival else "none", "ok" if shift.ok else "refused"]
+        )
     where = "offset s (mid) " if any(pair.shift.rate != 1 for pair in report.pairs) else "offset s "
     table(["pair", where, "± s ", "frames ", "rate ppm ", "confidence ", "next peak s ", "status"], rows)
 
@@ -281,7 +277,7 @@ def _show_clocks(report: SyncReport) -> None:
             clock.name,
             f"{clock.offset:+.4f}",
             f"{clock.sigma:.4f}" if clock.sigma < UNKNOWN else "unknown",
-            f"{clock.offset * clock.fps:+.2f}",
+            f"{clock.offset * clock.take.fps:+.2f}",
             ppm(clock.rate),
         ]
         for clock in report.clocks

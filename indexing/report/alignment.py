@@ -2,46 +2,141 @@
 
 from __future__ import annotations
 
-import csv
-import io
+import functools
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from indexing import files
-from indexing.report.canvas import DARK, LIGHT, Theme, new_figure, png, shorten, style
-from indexing.report.page import Card, Column, cards, escape, listed, made_by, page, picture, provenance, section, sentence, table
-
-# ----------------------------------------------------------------------------------------------------------------------
-# The sections of the report on an alignment, as HTML.
-
+from indexing.readers.matches import Matched
+from indexing.report.canvas import LIGHT, new_figure, png, shorten, style
+from indexing.report.page import Picture, ResultReport, markup, render, safe_cell, sentence, table_csv, write_files
 
 FloatArray = NDArray[np.float64]
-LISTED = 300  # matches whose labels are listed on the page
+FILES = ("report.html", "alignment.json", "labels.csv", "alignment.png")
+LABELS = ("outlier", "static", "moving")
 ROUNDING = 1e-14  # of the largest entry: what arithmetic leaves of a deviation that is zero (measured: 3e-17)
+PURPOSE = {
+    "planar": "Points of a plane stand still or move on straight lines before a moving camera.",
+    "join": "Points stand still or move on straight lines before an uncalibrated 3D sensor.",
+    "minimal_join": "Points stand still or move on straight lines before an uncalibrated 3D sensor.",
+    "constant_velocity": "Points move at constant velocity before an uncalibrated 3D sensor.",
+    "affine_constant_velocity": "Points move at constant velocity before a 3D sensor that is known up to an affinity.",
+    "rigid": "Points stand still or move on straight lines before a 3D sensor that moves rigidly.",
+    "lines": "Lines stand still or stay in a plane while they move, before a 3D sensor.",
+}
 
 
-def body(report: AlignmentReport, drawn: tuple[bytes, bytes]) -> str:
-    """The page's sections: headline numbers, warnings, picture, motion, what stays open, labels, settings."""
-    parts = [cards(_headline(report)), _warnings(report), _picture(report, drawn)]
-    if report.solved:
-        parts.append(_motion(report))
-    if report.ambiguity:
-        parts.append(section("What the data cannot tell", "", report.ambiguity))
-    parts.append(_labels(report))
-    parts.append(provenance(report.manifest))
-    return "\n".join(part for part in parts if part)
+@dataclass(frozen=True, eq=False, kw_only=True)
+class AlignmentReport(ResultReport):
+    """Everything that the report on an alignment says.
+
+    Args:
+        read: the matches.
+        model: how points may move, and what the sensor may do.
+        threshold: greatest distance of an inlier; None = estimated.
+    """
+
+    read: Matched
+    model: str
+    threshold: float | None = None
+
+    TITLES = ("What moved, and how the sensor did", "The matches do not decide")
+    REASONS = {
+        "TOO_FEW": "too few matches are present in all views; give more",
+        "DEGENERATE": (
+            "several motions fit all matches exactly; add matches that move otherwise, or use a model with fewer unknowns"
+        ),
+        "AMBIGUOUS": "other motions fit as well; add matches that differ more, lower the noise, or use a model with fewer unknowns",
+        "NO_CONSENSUS": (
+            "no motion fits enough of the matches; raise --threshold, or give matches of which more belong to the model"
+        ),
+    }
+    UNTOLD = frozenset(REASONS)
+
+    @functools.cached_property
+    def views(self) -> list[FloatArray]:
+        """``(n, d)`` points or ``(n, 2, 3)`` lines of each view, NaN = missing."""
+        return [as_segments(view) if view.shape[1:] == (6,) else view for view in self.read.views]
+
+    @property
+    def segments(self) -> bool:
+        """Whether the matches are lines."""
+        return self.views[0].ndim == 3
+
+    @property
+    def ids(self) -> tuple[str, ...]:
+        """Names of the matches."""
+        return self.read.ids
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the views."""
+        return [Path(name).name for name in self.read.names]
+
+    @functools.cached_property
+    def motion(self) -> list[FloatArray]:
+        """A and B (with three views), from view 2 and 3 to view 1."""
+        return [part for part in (self.found.A, self.found.B) if part is not None]
+
+    @property
+    def sigma(self) -> float:
+        """Noise of one coordinate, in the unit of the views."""
+        return float(self.found.sigma)
+
+    @property
+    def ambiguity(self) -> str:
+        """What the data cannot tell, even without noise."""
+        return self.words(self.found.ambiguity)
+
+    @property
+    def solved(self) -> bool:
+        """Whether there is a motion at all, good or doubtful."""
+        return all(np.isfinite(part).all() and np.abs(part).max() > 0 for part in self.motion)
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether there are matches that stand still between two of the views only."""
+        return bool(np.any(self.found.unverified))
+
+    @property
+    def missing(self) -> NDArray[np.bool_]:
+        """``(n,)`` matches that are missing in a view."""
+        return np.any([np.isnan(view.reshape(len(view), -1)).any(axis=1) for view in self.views], axis=0)
+
+    @functools.cached_property
+    def kinds(self) -> list[str]:
+        """What each match is: outlier, static, moving or missing."""
+        labels = self.found.labels.tolist()
+        return ["missing" if gone else LABELS[label] for label, gone in zip(labels, self.missing.tolist(), strict=True)]
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """How many matches of each kind."""
+        return {name: self.kinds.count(name) for name in ("static", "moving", "outlier", "missing")}
+
+    @functools.cached_property
+    def shown(self) -> list[tuple[str, int, list[list[Any]], bool]]:
+        """Of each motion: its name, the view that it leads from, its rows with deviations, and whether its last entry is 1."""
+        out, start = [], 0
+        for view, (name, matrix) in enumerate(zip("AB", self.motion if self.solved else (), strict=False), start=2):
+            block = slice(start, start := start + matrix.size)
+            values, spreads, scaled = display_scale(matrix, self.found.covariance[block, block])
+            rows = [
+                [f"{name}, row {i}", *(figures(float(v), float(s)) for v, s in zip(*row, strict=True))]
+                for i, row in enumerate(zip(values, spreads, strict=True), start=1)
+            ]
+            out.append((name, view, rows, scaled))
+        return out
 
 
 def describe(report: AlignmentReport) -> str:
     """The result in plain words."""
     number, counts = len(report.ids), report.counts
-    what = "lines" if report.views[0].ndim == 3 else "points"
+    what = "lines" if report.segments else "points"
     if report.status != "OK":
         start = f"The {number:,} {what} do not decide how the sensor moved."
         return f"{start} {sentence(report.reason)}" + (
@@ -52,7 +147,74 @@ def describe(report: AlignmentReport) -> str:
         parts.append(f"{counts['outlier']:,} fit neither")
     if counts["missing"]:
         parts.append(f"{counts['missing']:,} are missing in a view")
-    return f"Of {number:,} {what} in {len(report.views)} views, {'; '.join(parts)}. {report.model[1]}"
+    return f"Of {number:,} {what} in {len(report.views)} views, {'; '.join(parts)}. {PURPOSE[report.model]}"
+
+
+def write_alignment(folder: str | Path, report: AlignmentReport) -> Path:
+    """Write a report into a folder: ``report.html``, ``alignment.json``, ``labels.csv`` and ``alignment.png``.
+
+    Every file is written whole or not at all, ``report.html`` last.
+
+    Returns:
+        the path of ``report.html``.
+
+    Raises:
+        ValueError: the folder or a file in it cannot be written.
+    """
+    drawn = picture_of(report)
+    turns = []
+    if report.model == "rigid":
+        turns = [(angle, shift, float(np.linalg.norm(shift))) for angle, shift in map(turn_and_shift, report.motion)]
+    motions = [(name, view, [[row[0], *map(_cell, row[1:])] for row in rows], one) for name, view, rows, one in report.shown]
+    html = render("alignment", report, summary=describe(report), picture=Picture(drawn), motions=motions, turns=turns)
+    contents = {"alignment.png": drawn, "labels.csv": labels_csv(report), "alignment.json": as_json(report), "report.html": html}
+    return write_files(folder, contents)
+
+
+def _cell(number: tuple[str, str]) -> Any:
+    value, spread = number
+    return markup('{value} <small class="none">± {spread}</small>', value=value, spread=spread) if spread else value
+
+
+def as_json(report: AlignmentReport) -> dict[str, Any]:
+    """The result as numbers: motion, labels, noise, covariance, status, warnings, and how it came about."""
+    known: dict[str, Any] = {}
+    if report.solved:
+        spread = np.sqrt(np.clip(np.diagonal(report.found.covariance), 0, None))
+        spreads = np.split(spread, np.cumsum([part.size for part in report.motion])[:-1])
+        known = dict(zip("AB", report.motion, strict=False))
+        known |= {f"{name}_deviation": part.reshape(known[name].shape) for name, part in zip("AB", spreads, strict=False)}
+    unverified = report.found.unverified
+    return {
+        "status": report.status,
+        "reason": report.reason or None,
+        "model": report.model,
+        "views": report.names,
+        "matches": len(report.ids),
+        "counts": report.counts,
+        "sigma": report.sigma,
+        "threshold": report.threshold,
+        **known,
+        "covariance": report.found.covariance if report.solved else None,
+        "ambiguity": report.ambiguity,
+        "warnings": report.warnings_json,
+        "notes": list(report.notes),
+        "ids": list(report.ids),
+        "labels": report.found.labels,
+        "velocities": report.found.velocities,
+        "unverified": None if unverified is None else [report.ids[i] for i in np.flatnonzero(unverified)],
+        "manifest": report.manifest,
+    }
+
+
+def labels_csv(report: AlignmentReport) -> str:
+    """``id,label,name`` of every match; 0 outlier or missing, 1 static, 2 moving."""
+    rows = zip(map(safe_cell, report.ids), report.found.labels.tolist(), report.kinds, strict=True)
+    return table_csv(["id", "label", "name"], list(rows))
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Numbers as the page shows them.
 
 
 def display_scale(matrix: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray, bool]:
@@ -101,87 +263,6 @@ def figures(value: float, spread: float) -> tuple[str, str]:
     return f"{value:.{max(0, places)}f}", f"{spread:.{max(0, places)}f}"
 
 
-def _headline(report: AlignmentReport) -> list[Card]:
-    counts, number = report.counts, len(report.ids)
-    ok = report.status == "OK"
-    items = [Card("Status", "Solved" if ok else "Refused", "the data decide" if ok else report.status.lower().replace("_", " "))]
-    if report.solved:
-        items += [Card(name.capitalize(), f"{counts[name]:,}", f"of {number:,}") for name in ("static", "moving")]
-        rest = f"and {counts['missing']:,} missing in a view" if counts["missing"] else f"of {number:,}"
-        items.append(Card("Outliers", f"{counts['outlier']:,}", rest))
-        items.append(Card("Noise", f"{report.sigma:.3g}", "standard deviation of a coordinate, in the unit of the files"))
-        if report.metric:
-            angle, shift = turn_and_shift(report.motion[0])
-            items.append(Card("View 2 to 1", f"{angle:.3g}°", f"turn, and a shift of {np.linalg.norm(shift):.4g}"))
-    else:
-        items.append(Card("Matches", f"{number:,}", f"{counts['missing']:,} of them missing in a view"))
-    return items
-
-
-def _warnings(report: AlignmentReport) -> str:
-    lines = [
-        f"<li><b>{escape(code.replace('_', ' ').capitalize())}.</b> {escape(sentence(text))}</li>"
-        for code, _, text in report.warnings
-    ]
-    lines += [f"<li>{escape(sentence(note))}</li>" for note in report.notes]
-    if report.reason:
-        lines.insert(0, f'<li><b class="bad">Refused.</b> {escape(sentence(report.reason))}</li>')
-    return section("Please note", f"<ul>{''.join(lines)}</ul>") if lines else ""
-
-
-def _picture(report: AlignmentReport, drawn: tuple[bytes, bytes]) -> str:
-    counts = report.counts
-    if not report.solved:
-        note, caption = "The matches as measured; without a motion there are no labels.", ""
-    elif report.views[0].ndim == 3:
-        note = "Every match in every view, by what it was found to be."
-        caption = "Dashed in view 1: where view 2 saw what moves, carried over by A."
-    else:
-        note = "Every match in every view, by what it was found to be."
-        caption = (
-            "In view 1, the path of each moving point: where view 1 saw it (filled), where the others did, carried over by A and B "
-            "(open, view 3 the smaller), and the straight line it moves on."
-        ) + (" Dashed: static in two views, mismatched or moved in the third." * bool(np.any(report.unverified)))
-    if report.views[0].shape[-1] == 3:
-        caption += " Of the three coordinates, the two are shown in which view 1 extends most."
-    alt = f"The views: {counts['static']} static, {counts['moving']} moving, {counts['outlier']} outliers"
-    title = "What moves" if report.solved else "The matches"
-    return section(title, picture(drawn[0], alt, dark=drawn[1], caption=caption.strip()), note)
-
-
-def _motion(report: AlignmentReport) -> str:
-    parts, scaled_all, start = [], True, 0
-    for number, (name, matrix) in enumerate(zip("AB", report.motion, strict=False), start=2):
-        size = matrix.size
-        values, spread, scaled = display_scale(matrix, report.covariance[start : start + size, start : start + size])
-        scaled_all &= scaled
-        start += size
-        rows = []
-        for i, row in enumerate(values):
-            cells = [_cell(*figures(float(v), float(s))) for v, s in zip(row, spread[i], strict=True)]
-            rows.append([f"{name}, row {i + 1}", *cells])
-        columns = [Column(f"View {number} to view 1"), *(Column(f"column {j + 1}", "number") for j in range(values.shape[1]))]
-        parts.append(table(columns, rows, caption=f"{name}, from view {number} to view 1"))
-        if report.metric:
-            angle, shift = turn_and_shift(matrix)
-            moved = ", ".join(f"{value:.4g}" for value in shift)
-            parts.append(f'<p class="note">A turn by {angle:.4g}° and a shift by ({moved}).</p>')
-    scale = "" if report.metric else f" Scaled {'so that the last entry is 1' if scaled_all else 'to Frobenius norm 1'}."
-    note = f"The matrices that carry a static point to where view 1 sees it, each entry ± its standard deviation.{scale}"
-    return section("How the sensor moved", "".join(parts), note)
-
-
-def _cell(value: str, spread: str) -> str:
-    return f'{value} <small class="none">± {spread}</small>' if spread else value
-
-
-def _labels(report: AlignmentReport) -> str:
-    if not report.solved:
-        return ""
-    names = listed(report.ids, report.kinds, ("moving", "outlier", "missing", "static"), LISTED, "labels.csv")
-    return section("Each match", names, "By the names of the file, or the numbers of its rows; labels.csv has them all.")
-
-
 # ----------------------------------------------------------------------------------------------------------------------
 # The picture of an alignment: view 1 with the paths of what moves, and the other views, coloured alike.
 
@@ -197,17 +278,17 @@ WIDTH, MARGIN, GAP, TITLE, FOOT = 10.2, 0.65, 0.6, 0.3, 0.35  # inches
 WIDE = 0.62  # height over width of view 1, below which it gets the whole width
 
 
-def picture_of(report: AlignmentReport, theme: Theme) -> bytes:
+def picture_of(report: AlignmentReport) -> bytes:
     """PNG: view 1, large, with the path of every moving match carried over from the other views; beside it the other views."""
     kinds = np.array(report.kinds) if report.solved else np.where(report.missing, "missing", "unlabelled")
-    colours = {**COLOURS, "unlabelled": theme.muted}
-    segments = report.views[0].ndim == 3
+    colours = {**COLOURS, "unlabelled": LIGHT.muted}
+    segments = report.segments
     axes_shown, turned = _axes(report)
     flat = [view[..., axes_shown] for view in report.views]
     boxes = [_box(points, kinds) for points in flat]
     if report.solved:
         boxes[0] = _widened(boxes[0], report, kinds, axes_shown)
-    with style(theme):
+    with style():
         height, places = _layout([(box[3] - box[2]) / (box[1] - box[0]) for box in boxes])
         figure = new_figure(WIDTH, height)
         for number, (points, place, box) in enumerate(zip(flat, places, boxes, strict=True), start=1):
@@ -216,12 +297,12 @@ def picture_of(report: AlignmentReport, theme: Theme) -> bytes:
             if number == 1 and report.solved:
                 _draw_paths(panel, report, kinds, axes_shown, box)
             _draw_points(panel, points, kinds, colours, large=number == 1, segments=segments)
-            _finish(panel, box, turned, theme)
+            _finish(panel, box, turned)
             panel.set_title(f"view {number}: {shorten(report.names[number - 1], 40)}", fontsize=9, loc="left", parse_math=False)
             if number == 1:
                 panel.set_xlabel("xyz"[axes_shown[0]])
                 panel.set_ylabel("xyz"[axes_shown[1]])
-        _legend(figure, kinds, colours, theme, segments)
+        _legend(figure, kinds, colours, segments)
         return png(figure, tight=True)
 
 
@@ -334,7 +415,7 @@ def _draw_paths(panel: Any, report: AlignmentReport, kinds: NDArray[Any], shown:
         return
     moving = np.flatnonzero(kinds == "moving")[:PATHS]
     others = [carried(matrix, view[moving]) for view, matrix in zip(report.views[1:], report.motion, strict=True)]
-    if report.views[0].ndim == 3:  # lines: where view 2 saw them, dashed
+    if report.segments:  # lines: where view 2 saw them, dashed
         panel.add_collection(
             LineCollection(list(others[0][..., shown]), colors=colour, linewidths=0.9, alpha=0.55, linestyles=(0, (3, 2)))
         )
@@ -342,7 +423,7 @@ def _draw_paths(panel: Any, report: AlignmentReport, kinds: NDArray[Any], shown:
     path = np.stack([report.views[0][moving], *others], axis=1)[..., shown]
     size = max(box[1] - box[0], box[3] - box[2])
     near = np.isfinite(path).all(axis=(1, 2)) & (np.abs(path - path[:, :1]).max(axis=(1, 2), initial=0) < 2 * size)
-    doubtful = np.zeros(len(path), dtype=bool) if report.unverified is None else report.unverified[moving]
+    doubtful = np.zeros(len(path), dtype=bool) if report.found.unverified is None else report.found.unverified[moving]
     if (near & doubtful).any():
         look: Any = {"linewidths": 0.9, "alpha": 0.6, "linestyles": (0, (2, 2))}
         panel.add_collection(LineCollection(list(path[near & doubtful]), colors=colour, **look))
@@ -381,7 +462,7 @@ def _draw_points(panel: Any, points: FloatArray, kinds: NDArray[Any], colours: d
             panel.scatter(*mine.T, s=size, c=colours[kind], marker=MARKS.get(kind, "o"), zorder=4, **line)
 
 
-def _finish(panel: Any, box: Box, turned: bool, theme: Theme) -> None:
+def _finish(panel: Any, box: Box, turned: bool) -> None:
     panel.set(xlim=box[:2], ylim=box[2:][::-1] if turned else box[2:])
     panel.set_aspect("equal", adjustable="box", anchor="N")
     panel.tick_params(length=2.5, labelsize=7.5)
@@ -391,7 +472,7 @@ def _finish(panel: Any, box: Box, turned: bool, theme: Theme) -> None:
         side.set_linewidth(0.8)
 
 
-def _legend(figure: Any, kinds: NDArray[Any], colours: dict[str, str], theme: Theme, segments: bool) -> None:
+def _legend(figure: Any, kinds: NDArray[Any], colours: dict[str, str], segments: bool) -> None:
     from matplotlib.lines import Line2D
 
     handles = []
@@ -417,157 +498,5 @@ def _legend(figure: Any, kinds: NDArray[Any], colours: dict[str, str], theme: Th
         bbox_to_anchor=(0.5, 0.25 / figure.get_figheight()),
         ncols=4,
         frameon=False,
-        labelcolor=theme.ink,
+        labelcolor=LIGHT.ink,
     )
-
-
-FILES = ("report.html", "alignment.json", "labels.csv", "alignment.png")
-LABELS = ("outlier", "static", "moving")
-
-
-@dataclass(frozen=True, eq=False)
-class AlignmentReport:
-    """Everything that the report on an alignment says.
-
-    Args:
-        title: heading of the page.
-        model: how points may move, and what the sensor may do; and in a few words.
-        views: ``(n, d)`` points or ``(n, 2, 3)`` lines of each view, NaN = missing.
-        names: of the views.
-        ids: ``n`` names of the matches.
-        labels: ``(n,)`` 0 outlier, 1 static, 2 moving.
-        motion: A and B (with three views), from view 2 and 3 to view 1.
-        covariance: ``(p, p)`` of their entries, one after the other, row by row.
-        sigma: noise of one coordinate, in the unit of the views.
-        status: the status's name, ``"OK"`` where the data decided.
-        reason: why not, and what to do; empty where they did.
-        ambiguity: what the data cannot tell, even without noise.
-        warnings: code, figure and message of each.
-        notes: what a reader should know about the input, a sentence each.
-        velocities: ``(n, d)``, where the model has them.
-        unverified: ``(n,)`` matches that stand still between two of the views only.
-        metric: whether the motion is rigid.
-        threshold: greatest distance of an inlier; None = estimated.
-        manifest: of :func:`indexing.files.manifest`.
-    """
-
-    title: str
-    model: tuple[str, str]
-    views: Sequence[FloatArray]
-    names: Sequence[str]
-    ids: Sequence[str]
-    labels: NDArray[np.int64]
-    motion: Sequence[FloatArray]
-    covariance: FloatArray
-    sigma: float
-    status: str = "OK"
-    reason: str = ""
-    ambiguity: str = ""
-    warnings: Sequence[tuple[str, float, str]] = ()
-    notes: Sequence[str] = ()
-    velocities: FloatArray | None = None
-    unverified: NDArray[np.bool_] | None = None
-    metric: bool = False
-    threshold: float | None = None
-    manifest: Mapping[str, Any] = field(default_factory=dict)
-
-    @property
-    def solved(self) -> bool:
-        """Whether there is a motion at all, good or doubtful."""
-        return all(np.isfinite(part).all() and np.abs(part).max() > 0 for part in self.motion)
-
-    @property
-    def missing(self) -> NDArray[np.bool_]:
-        """``(n,)`` matches that are missing in a view."""
-        return np.any([np.isnan(view.reshape(len(view), -1)).any(axis=1) for view in self.views], axis=0)
-
-    @property
-    def kinds(self) -> list[str]:
-        """What each match is: outlier, static, moving or missing."""
-        return [
-            "missing" if gone else LABELS[label] for label, gone in zip(self.labels.tolist(), self.missing.tolist(), strict=True)
-        ]
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """How many matches of each kind."""
-        kinds = self.kinds
-        return {name: kinds.count(name) for name in ("static", "moving", "outlier", "missing")}
-
-    def deviations(self) -> list[FloatArray]:
-        """Standard deviations of the entries of the motion."""
-        spread = np.sqrt(np.clip(np.diagonal(self.covariance), 0, None))
-        ends = np.cumsum([part.size for part in self.motion])[:-1]
-        return [part.reshape(matrix.shape) for part, matrix in zip(np.split(spread, ends), self.motion, strict=True)]
-
-
-def write_alignment(folder: str | Path, report: AlignmentReport) -> Path:
-    """Write a report into a folder: ``report.html``, ``alignment.json``, ``labels.csv`` and ``alignment.png``.
-
-    Every file is written whole or not at all, ``report.html`` last.
-
-    Returns:
-        the path of ``report.html``.
-
-    Raises:
-        ValueError: the folder or a file in it cannot be written.
-
-    Example:
-        >>> import tempfile
-        >>> points = np.array([[0.0, 0.0], [3.0, 1.0], [1.0, 2.0]])
-        >>> found = dict(labels=np.array([1, 1, 2]), motion=[np.eye(3)] * 2, covariance=np.eye(18) * 1e-8, sigma=0.1)
-        >>> report = AlignmentReport("Three dots", ("planar", ""), [points] * 3, ["a", "b", "c"], ["1", "2", "3"], **found)
-        >>> path = write_alignment(tempfile.mkdtemp(), report)
-        >>> sorted(file.name for file in path.parent.iterdir())
-        ['alignment.json', 'alignment.png', 'labels.csv', 'report.html']
-    """
-    where = files.prepare(folder)
-    drawn = picture_of(report, LIGHT), picture_of(report, DARK)
-    html = page(
-        report.title, body(report, drawn), summary=describe(report), kind="Dynamic alignment", footer=made_by(report.manifest)
-    )
-    files.write_bytes(where / "alignment.png", drawn[0])
-    files.write_text(where / "labels.csv", labels_csv(report))
-    files.write_json(where / "alignment.json", as_json(report))
-    return files.write_text(where / "report.html", html)
-
-
-def as_json(report: AlignmentReport) -> dict[str, Any]:
-    """The result as numbers: motion, labels, noise, covariance, status, warnings, and how it came about."""
-    names = ("A", "B")[: len(report.motion)]
-    spreads = report.deviations()
-    return {
-        "status": report.status,
-        "reason": report.reason or None,
-        "model": report.model[0],
-        "views": list(report.names),
-        "matches": len(report.ids),
-        "counts": report.counts,
-        "sigma": report.sigma,
-        "threshold": report.threshold,
-        **(dict(zip(names, report.motion, strict=True)) if report.solved else {}),
-        **({f"{name}_deviation": spread for name, spread in zip(names, spreads, strict=True)} if report.solved else {}),
-        "covariance": report.covariance if report.solved else None,
-        "ambiguity": report.ambiguity,
-        "warnings": [{"code": code, "value": value, "message": message} for code, value, message in report.warnings],
-        "notes": list(report.notes),
-        "ids": list(report.ids),
-        "labels": report.labels,
-        "velocities": report.velocities,
-        "unverified": None if report.unverified is None else [report.ids[i] for i in np.flatnonzero(report.unverified)],
-        "manifest": report.manifest,
-    }
-
-
-def labels_csv(report: AlignmentReport) -> str:
-    """``id,label,name`` of every match; 0 outlier or missing, 1 static, 2 moving."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(["id", "label", "name"])
-    writer.writerows(zip(map(safe_cell, report.ids), report.labels.tolist(), report.kinds, strict=True))
-    return out.getvalue()
-
-
-def safe_cell(name: str) -> str:
-    """A name as a cell.  Spreadsheets run text that begins like a formula; an apostrophe keeps it text."""
-    return f"'{name}" if name.lstrip(" ")[:1] in tuple("=+@\t\r\n") or (name[:1] == "-" and not name[1:2].isdigit()) else name

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from indexing.cameras import y_up
 from indexing.clip import Clip
-from indexing.report.page import escape
+from indexing.report.page import markup
 from indexing.skeleton import known
 
 DPI = 150
@@ -108,7 +108,7 @@ def letters_without_font(texts: Iterable[object]) -> str:
 
 
 @contextmanager
-def style(theme: Theme) -> Iterator[None]:
+def style(theme: Theme = LIGHT) -> Iterator[None]:
     """Our own look whatever the user's matplotlibrc says (``usetex``, say, would need LaTeX), and theirs again afterwards."""
     import matplotlib
     from matplotlib import font_manager
@@ -136,7 +136,7 @@ def new_figure(width: float, height: float) -> Any:
     return figure
 
 
-def cmap(theme: Theme) -> Any:
+def cmap(theme: Theme = LIGHT) -> Any:
     """The theme's colour map for heat cells."""
     from matplotlib.colors import LinearSegmentedColormap
 
@@ -199,8 +199,9 @@ def strip(clip: Clip, start: float | None = None, end: float | None = None, *, f
     places[..., 1] = (middle[1] - points[..., 1]) * scale + HEIGHT / 2  # SVG's y points down
     paths = _paths(clip, places, seen)
     width = WIDTH * len(points)
-    drawing = "".join(f'<path class="{css}" d="{path}"/>' for css, path in paths.items() if path)
-    return f'<svg class="strip" viewBox="0 0 {width:g} {HEIGHT:g}" role="img" aria-label="{escape(alt)}">{drawing}</svg>'
+    drawing = markup("".join(f'<path class="{css}" d="{path}"/>' for css, path in paths.items() if path))
+    svg = '<svg class="strip" viewBox="0 0 {width:g} {height:g}" role="img" aria-label="{alt}">{drawing}</svg>'
+    return markup(svg, width=width, height=HEIGHT, alt=alt, drawing=drawing)
 
 
 def _right(clip: Clip, at: NDArray[np.intp]) -> NDArray[Any]:

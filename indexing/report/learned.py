@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 from indexing import files
 from indexing.cameras import y_up
 from indexing.clip import Clip
-from indexing.report.canvas import DARK, FACE, LIGHT, Theme, new_figure, png, shorten_all, style
-from indexing.report.page import Card, Column, cards, details, escape, made_by, page, picture, section, settings, table
+from indexing.report.canvas import FACE, LIGHT, new_figure, png, shorten_all, style
+from indexing.report.page import Picture, markup, render, write_files
 from indexing.skeleton import Skeleton, known
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 COLUMNS = 5  # skeletons in a row
 PANEL = 1.62, 1.95  # inches
 PIECES = 16  # of a bone, each in its own colour
-HOT = {LIGHT.paper: ("#f2a65a", "#dd4f0e"), DARK.paper: ("#a8501c", "#ff9a45")}  # some, and most; the theme's line colour = none
+HOT = ("#f2a65a", "#dd4f0e")  # some, and most; the colour of lines = none
 THIN, THICK, DOT = 1.6, 4.6, 2.2  # points: bones that matter least and most, and how much wider joints are than bones
 HEAD = 15.0  # points across, where the joints of a face stand for it
 TRAIL = 2  # joints per action whose path is drawn
@@ -94,7 +94,7 @@ def measure_body_parts(indexer: ActionIndexer, groups: ArrayLike | None = None) 
     return BodyParts(indexer.classes_.tolist(), values, examples, indexer.skeleton_)
 
 
-def body_parts(parts: BodyParts, *, columns: int = COLUMNS, theme: Theme = LIGHT) -> bytes:
+def body_parts(parts: BodyParts, *, columns: int = COLUMNS) -> bytes:
     """PNG: a skeleton per action, in its most telling pose; strong colour and thick lines where a joint matters.
 
     Thin lines are the paths of the joints that matter most.  Without bones the joints are dots.
@@ -107,35 +107,28 @@ def body_parts(parts: BodyParts, *, columns: int = COLUMNS, theme: Theme = LIGHT
     columns = -(-number // rows)  # rows of about the same length
     width, height = PANEL[0] * columns + 0.2, PANEL[1] * rows + 0.42
     names = shorten_all(parts.classes, 20)
-    with style(theme):
+    with style():
         figure = new_figure(width, height)
         for i in range(number):
             row, column = divmod(i, columns)
             box = (0.1 + PANEL[0] * column, 0.42 + PANEL[1] * (rows - 1 - row), PANEL[0], PANEL[1] - 0.24)
             axes = figure.add_axes((box[0] / width, box[1] / height, box[2] / width, box[3] / height))
             axes.set_axis_off()
-            _person(axes, parts, i, theme)
+            _person(axes, parts, i)
             centre = ((box[0] + box[2] / 2) / width, (box[1] + box[3] + 0.05) / height)
             figure.text(*centre, names[i], ha="center", va="bottom", fontsize=9, fontweight="bold", parse_math=False)
-        _key(figure, width, height, theme)
+        _key(figure, width, height)
         return png(figure)
 
 
-def body_parts_section(parts: BodyParts) -> str:
-    """HTML section of the recognition report: the picture, and the joints that matter most by name."""
-    light, dark = (body_parts(parts, theme=theme) for theme in (LIGHT, DARK))
+def telling_joints(parts: BodyParts) -> list[list[Any]]:
+    """The page's table of the joints that matter most, by name."""
     names = parts.skeleton.joints if parts.skeleton is not None else tuple(f"joint {i}" for i in range(parts.shares.shape[1]))
-    rows = []
+    rows: list[list[Any]] = []
     for label, share in zip(parts.classes, parts.shares, strict=True):
-        first = [f"{escape(_plain(names[j]))} ({share[j]:.0%})" for j in np.argsort(-share)[:NAMED] if share[j] > 0]
-        rows.append([escape(label), ", ".join(first) or '<span class="none">none stands out</span>'])
-    note = "How much the evidence for an action grows when a joint is seen, whatever else is seen: strong colour = most."
-    alt = f"A skeleton for each of {len(parts.classes)} actions, coloured by how much each joint matters"
-    caption = "Each action in a telling pose of one of its examples; thin lines are the paths of the joints that matter most."
-    html = picture(light, alt, dark=dark, caption=caption)
-    return section(
-        "Which body parts matter", html + table([Column("Action"), Column("Joints that matter most", "long")], rows), note
-    )
+        first = [f"{_plain(names[j])} ({share[j]:.0%})" for j in np.argsort(-share)[:NAMED] if share[j] > 0]
+        rows.append([label, ", ".join(first) or markup('<span class="none">none stands out</span>')])
+    return rows
 
 
 def telling_pose(points: Array, usual: Array, share: Array) -> int:
@@ -161,14 +154,14 @@ def in_body(points: Array) -> Array:
     return np.asarray((points - middle) / max(float(height), 1e-9))
 
 
-def _person(axes: Any, parts: BodyParts, index: int, theme: Theme) -> None:
+def _person(axes: Any, parts: BodyParts, index: int) -> None:
     """One skeleton, and the paths of its most telling joints."""
     share = parts.shares[index]
     points = _points(parts.examples[index])
     everyone = np.concatenate([in_body(_points(clip)) for clip in parts.examples])
     usual = np.nan_to_num(everyone).sum(axis=0) / np.maximum((~np.isnan(everyone)).sum(axis=0), 1)
     pose = points[telling_pose(in_body(points), usual, share)]
-    colours = _colours(theme)
+    colours = _colours()
     paths = np.argsort(share)[-TRAIL:]
     for joint in paths:
         axes.plot(*points[:, joint].T, color=colours(share[joint]), linewidth=0.9, alpha=0.55, zorder=1, solid_capstyle="round")
@@ -181,7 +174,7 @@ def _person(axes: Any, parts: BodyParts, index: int, theme: Theme) -> None:
         size = np.append(size, HEAD)
     order = np.argsort(values)
     colour = colours(values[order])
-    axes.scatter(*dots[order].T, s=np.square(size[order]), c=colour, edgecolors=theme.paper, linewidths=0.6, zorder=4)
+    axes.scatter(*dots[order].T, s=np.square(size[order]), c=colour, edgecolors=LIGHT.paper, linewidths=0.6, zorder=4)
     _frame(axes, np.concatenate([pose, points[:, paths].reshape(-1, 2)]), points)
 
 
@@ -217,14 +210,14 @@ def _frame(axes: Any, shown: Array, points: Array) -> None:
     axes.set(xlim=(middle[0] - aspect * half, middle[0] + aspect * half), ylim=(middle[1] - half, middle[1] + half))
 
 
-def _key(figure: Any, width: float, height: float, theme: Theme) -> None:
+def _key(figure: Any, width: float, height: float) -> None:
     """What the colours mean, below the skeletons."""
     middle, y = 0.5, 0.2 / height
     axes = figure.add_axes((middle - 0.45 / width, y - 0.045 / height, 0.9 / width, 0.09 / height))
-    axes.imshow(np.linspace(0, 1, 64)[None], cmap=_colours(theme), aspect="auto")
+    axes.imshow(np.linspace(0, 1, 64)[None], cmap=_colours(), aspect="auto")
     axes.set_axis_off()
-    figure.text(middle - 0.53 / width, y, "tells little", ha="right", va="center", fontsize=8, color=theme.muted)
-    figure.text(middle + 0.53 / width, y, "tells most", ha="left", va="center", fontsize=8, color=theme.muted)
+    figure.text(middle - 0.53 / width, y, "tells little", ha="right", va="center", fontsize=8, color=LIGHT.muted)
+    figure.text(middle + 0.53 / width, y, "tells most", ha="left", va="center", fontsize=8, color=LIGHT.muted)
 
 
 def _face(skeleton: Skeleton | None, joints: int) -> NDArray[np.bool_]:
@@ -245,15 +238,11 @@ def _plain(name: str) -> str:
     return name.replace("_", " ")
 
 
-def _colours(theme: Theme) -> Any:
+def _colours() -> Any:
     from matplotlib.colors import LinearSegmentedColormap
 
-    return LinearSegmentedColormap.from_list("parts", (theme.line, *HOT.get(theme.paper, HOT[LIGHT.paper])))
+    return LinearSegmentedColormap.from_list("parts", (LIGHT.line, *HOT))
 
-
-if TYPE_CHECKING:
-    from indexing.action.indexer import ActionIndexer
-    from indexing.clip import Clip
 
 PICTURE = "body_parts.png"
 NOBODY = "Nobody could be left out (the clips have no field 'subject', or it is one person): the usual weights stand."
@@ -273,24 +262,16 @@ def write_learned(
     Raises:
         ValueError: the folder or a file in it cannot be written.
     """
-    where, parts = files.prepare(folder), measure_body_parts(indexer)
+    parts = measure_body_parts(indexer)
+    drawn = body_parts(parts)
     names = [PICTURE, "metrics.json", files.MANIFEST, "report.html"]
-    files.write_bytes(where / PICTURE, body_parts(parts))
-    files.write_json(where / "metrics.json", _metrics(indexer, parts))
-    files.write_json(where / files.MANIFEST, {**manifest, "files": names})
-    sections = [cards(_headline(indexer, clips)), body_parts_section(parts), _weighing(indexer), _examples(clips)]
-    if notes:
-        sections.insert(1, section("Please note", f"<ul>{''.join(f'<li>{escape(note)}</li>' for note in notes)}</ul>"))
-    made = "What was run, with which versions and on which files: enough to run it again."
-    sections.append(section("How this was made", details("Settings, versions and inputs", settings(manifest)), made))
-    html = page(
-        f"{len(indexer.classes_)} actions learned",
-        "\n".join(sections),
-        summary=_summary(indexer, clips),
-        kind="Action recognition",
-        footer=made_by(manifest),
-    )
-    return files.write_text(where / "report.html", html)
+    said = [("", "", note) for note in notes]
+    report = {"title": f"{len(indexer.classes_)} actions learned", "notes": said, "manifest": manifest}
+    values = {"joints": telling_joints(parts), "weighing": _weighing(indexer), "examples": _examples(clips)}
+    summary = _summary(indexer, clips)
+    html = render("learned", report, summary=summary, cards=_headline(indexer, clips), picture=Picture(drawn), **values)
+    contents = {PICTURE: drawn, "metrics.json": _metrics(indexer, parts), files.MANIFEST: {**manifest, "files": names}}
+    return write_files(folder, {**contents, "report.html": html})
 
 
 def _summary(indexer: ActionIndexer, clips: Sequence[Clip]) -> str:
@@ -311,19 +292,19 @@ def people_left_out(indexer: ActionIndexer) -> int:
     return people if people > 1 else 0
 
 
-def _headline(indexer: ActionIndexer, clips: Sequence[Clip]) -> list[Card]:
+def _headline(indexer: ActionIndexer, clips: Sequence[Clip]) -> list[tuple[str, str, str]]:
     counts = Counter(str(clip.label) for clip in clips)
     few, many = min(counts.values()), max(counts.values())
     people = {str(clip.meta["subject"]) for clip in clips if "subject" in clip.meta}
     items = [
-        Card("Actions", f"{len(indexer.classes_):,}"),
-        Card("Examples", f"{len(clips):,}", f"{few} per action" if few == many else f"{few} to {many} per action"),
-        Card("Joints", f"{indexer.n_joints_}", "" if indexer.skeleton_ is None else indexer.skeleton_.name),
+        ("Actions", f"{len(indexer.classes_):,}", ""),
+        ("Examples", f"{len(clips):,}", f"{few} per action" if few == many else f"{few} to {many} per action"),
+        ("Joints", f"{indexer.n_joints_}", "" if indexer.skeleton_ is None else indexer.skeleton_.name),
     ]
-    return [*items, Card("People", f"{len(people)}")] if people else items
+    return [*items, ("People", f"{len(people)}", "")] if people else items
 
 
-def _weighing(indexer: ActionIndexer) -> str:
+def _weighing(indexer: ActionIndexer) -> list[list[str]]:
     """What each kind of evidence weighs."""
     model, blend = indexer.model_, indexer.model_.blend
     total = blend.kernel + blend.nearest
@@ -333,23 +314,19 @@ def _weighing(indexer: ActionIndexer) -> str:
     shares = {"nearest": blend.nearest / total, "kernel": blend.kernel / total}
     if model.scorer != "both":
         shares = {name: float(name == model.scorer) for name in shares}
-    rows = [
+    return [
         ["Nearest example, whatever the viewpoint", f"{shares['nearest']:.0%}"],
         ["Kernel machine over virtual views", f"{shares['kernel']:.0%}"],
         ["Depth for virtual views", depth],
         ["Joints weighed differently", learned if indexer.weights == "learned" else "no: weights were not learned"],
     ]
-    return section("How the evidence is weighed", table([Column("Evidence"), Column("Share", "long")], rows))
 
 
-def _examples(clips: Sequence[Clip]) -> str:
+def _examples(clips: Sequence[Clip]) -> list[list[str]]:
     groups: dict[str, list[Clip]] = {}
     for clip in clips:
         groups.setdefault(str(clip.label), []).append(clip)
-    rows = [
-        [escape(label), f"{len(mine):,}", f"{sum(clip.duration for clip in mine):.1f}"] for label, mine in sorted(groups.items())
-    ]
-    return section("Examples", table([Column("Action"), Column("Clips", "number"), Column("Seconds", "number")], rows))
+    return [[label, f"{len(mine):,}", f"{sum(clip.duration for clip in mine):.1f}"] for label, mine in sorted(groups.items())]
 
 
 def _metrics(indexer: ActionIndexer, parts: BodyParts) -> dict[str, Any]:

@@ -1,42 +1,36 @@
-"""The page that all reports share: one self-contained HTML file, readable in light, dark, narrow and printed.
+"""What all pages share: values put into the templates beside this file, so that each is one self-contained HTML file.
 
-Functions that take ``html`` expect markup; all others take plain text and escape it.  No script runs on the page and nothing
-is loaded from outside; the content security policy in its head makes the browser enforce that.
+Whatever a template is given is escaped.  No script runs on a page and nothing is loaded from outside; the content security policy
+in its head makes the browser enforce that.
 """
 
 from __future__ import annotations
 
 import base64
+import csv
+import functools
 import hashlib
-import html as _html
+import io
 import math
 import re
 import struct
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from string import Template
-from typing import Any
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from indexing import files
+from indexing.opening import count
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+    from markupsafe import Markup
 
 PIXEL_RATIO = 1.5  # picture pixels per CSS pixel: sharp on dense screens at twice the file size
+LISTED = 300  # names that a page lists of each kind
+LINES = 200  # settings that a page lists
 _CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\ufffe\uffff]")
-
-
-@dataclass(frozen=True)
-class Card:
-    """A headline number: what it is called, what it is, and a few words on how to read it."""
-
-    name: str
-    value: str
-    note: str = ""
-
-
-@dataclass(frozen=True)
-class Column:
-    """A table column: its heading and the CSS class of its cells (``"number"`` aligns right)."""
-
-    name: str
-    css: str = ""
 
 
 @dataclass(frozen=True)
@@ -50,42 +44,215 @@ class Tip:
     text: str
 
 
-def escape(value: object) -> str:
-    """Any value as text that is safe between tags and in quoted attributes; control characters are dropped.
+@dataclass(frozen=True)
+class Picture:
+    """A PNG on white paper, and places on it that say something when pointed at.
 
-    Example:
-        >>> escape('<b> & "c"')
-        '&lt;b&gt; &amp; &quot;c&quot;'
+    On a dark screen the style sheet turns the paper dark and keeps the hues; a photograph would be a negative, so a picture that
+    holds one has ``dark``, the same on dark paper.
     """
-    return _html.escape(_CONTROL.sub("", str(value)))
+
+    png: bytes
+    dark: bytes | None = None
+    tips: Sequence[Tip] = ()
+
+    @property
+    def images(self) -> list[tuple[str, str]]:
+        """Class and address of each image that the style sheet chooses from (not <picture>: on paper its dark one is kept)."""
+        named = [("light", self.png), ("dark", self.dark)] if self.dark else [("drawn", self.png)]
+        return [(name, f"data:image/png;base64,{base64.b64encode(png).decode('ascii')}") for name, png in named if png]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height in CSS pixels."""
+        width, height = struct.unpack(">II", self.png[16:24])
+        return round(width / PIXEL_RATIO), round(height / PIXEL_RATIO)
+
+    @property
+    def least(self) -> int:
+        """CSS pixels of its width below which its small print is lost: wide pictures scroll rather than shrink to dust."""
+        width = self.size[0]
+        return min(width, 680) if width <= 1100 else round(0.85 * width)
 
 
-def page(title: str, body: str, *, summary: str = "", kind: str = "Report", footer: str = "") -> str:
-    """The whole HTML document.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ResultReport:
+    """What the reports on a result of the library share.
 
     Args:
-        title: heading and window title.
-        body: html of the sections.
-        summary: one paragraph in plain words.
-        kind: what sort of report this is, shown above the title.
-        footer: one line at the end.
+        result: as the library returned it, of one problem.
+        heading: of the page; by default one that says whether the data decide.
+        notes: what a reader should know about the input, a sentence each.
+        words: what brings sentences of the library into the words of whoever reads the report.
+        manifest: of :func:`indexing.files.manifest`.
     """
-    folder = Path(__file__).parent
-    return Template((folder / "page.html").read_text(encoding="utf-8")).substitute(
-        title=escape(title),
-        kind=escape(kind),
-        summary=f'<p class="summary">{escape(summary)}</p>' if summary else "",
-        style=(folder / "page.css").read_text(encoding="utf-8"),
-        body=body,
-        footer=escape(footer),
+
+    result: Any
+    heading: str = ""
+    notes: Sequence[str] = ()
+    words: Callable[[str], str] = str
+    manifest: Mapping[str, Any] = field(default_factory=dict)
+
+    TITLES: ClassVar[tuple[str, str]] = ("", "")
+    """The heading where the data decide, and where they do not."""
+    REASONS: ClassVar[Mapping[str, str]] = {}
+    """Why the data do not decide, and what to do, by status."""
+    UNTOLD: ClassVar[frozenset[str]] = frozenset()
+    """Statuses that no notice explains."""
+
+    @functools.cached_property
+    def found(self) -> SimpleNamespace:
+        """The result's fields, tensors as numpy arrays."""
+        values = {each.name: getattr(self.result, each.name) for each in fields(self.result)}
+        return SimpleNamespace(**{name: value.numpy() if hasattr(value, "numpy") else value for name, value in values.items()})
+
+    @property
+    def title(self) -> str:
+        """Heading of the page."""
+        return self.heading or self.TITLES[self.status != "OK"]
+
+    @property
+    def status(self) -> str:
+        """The status's name, ``"OK"`` where the data decide."""
+        from dyntorch import Status
+
+        return Status(int(self.result.status)).name
+
+    @functools.cached_property
+    def warnings(self) -> list[tuple[str, float, str]]:
+        """Code, figure and sentence of every notice."""
+        return [(notice.code.value, notice.value, self.words(notice.message)) for notice in self.result.warnings]
+
+    @property
+    def reason(self) -> str:
+        """Why the data do not decide, and what to do; empty where they do."""
+        if self.status == "OK":
+            return ""
+        told = "" if self.status in self.UNTOLD else "; ".join(text for _, _, text in self.warnings[:2])
+        return told or self.REASONS.get(self.status, "")
+
+    @property
+    def state(self) -> str:
+        """The status in small letters."""
+        return self.status.lower().replace("_", " ")
+
+    @property
+    def warnings_json(self) -> list[dict[str, Any]]:
+        """The notices for a JSON file."""
+        return [{"code": code, "value": value, "message": message} for code, value, message in self.warnings]
+
+
+MEANING = {
+    "weak_stack": (
+        "Where and how fast a point moves is found from the differences between the views; here they hardly differ in one respect, "
+        "so that a small error of a track becomes a large error of its point."
+    ),
+    "behind": (
+        "No camera sees what is behind it: the places found for these points, or for that camera, are wrong, however well they fit."
+    ),
+}
+HEADINGS = {"weak_stack": "views too alike", "behind": "points behind a camera"}
+
+
+def heading(code: str) -> str:
+    """What a notice is about.
+
+    Example:
+        >>> heading("weak_stack"), heading("static_scene")
+        ('views too alike', 'static scene')
+    """
+    return HEADINGS.get(code, code.replace("_", " "))
+
+
+def remarks(reason: str, warnings: Iterable[tuple[str, float, str]] = (), notes: Iterable[str] = ()) -> list[tuple[str, str, str]]:
+    """What a reader should note: CSS class and words of the heading (or none), and the sentence; refusals first.
+
+    Example:
+        >>> remarks("it is open", [("uncertain", 1.0, "it is open"), ("few_points", 2.0, "two are few")], ["a note"])
+        [('bad', 'Refused: uncertain.', 'It is open.'), ('', 'Few points.', 'Two are few.'), ('', '', 'A note.')]
+    """
+    warnings = list(warnings)
+    told = [text for _, _, text in warnings if text in reason]
+    out = [("bad", "Refused.", sentence(reason))] if reason and not told else []
+    for code, _, text in sorted(warnings, key=lambda warning: warning[2] not in told):
+        head = f"Refused: {heading(code)}." if text in told else f"{heading(code).capitalize()}."
+        out.append(("bad" if text in told else "", head, f"{sentence(text)} {MEANING.get(code, '')}".strip()))
+    return out + [("", "", sentence(note)) for note in notes]
+
+
+def clean(value: object) -> object:
+    """Any value without the control characters that a page cannot hold."""
+    return value if hasattr(value, "__html__") or isinstance(value, (int, float)) else _CONTROL.sub("", str(value))
+
+
+@functools.cache
+def _environment() -> Environment:
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    made = Environment(
+        loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
+        lstrip_blocks=True, finalize=clean,
+    )  # fmt: skip
+    made.filters |= {"form": lambda value, form: f"{value:{form}}", "sentence": sentence, "settings": settings}
+    made.globals |= {"count": count, "remarks": remarks, "listed": listed, "ceil": math.ceil, "LISTED": LISTED, "LINES": LINES}
+    return made
+
+
+def render(template: str, report: Any, **values: Any) -> str:
+    """The page of a report, from the template ``NAME.html.j2``.
+
+    Args:
+        report: with ``title`` and ``manifest``; values: whatever else the template shows, among them ``summary``, one paragraph.
+    """
+    return _environment().get_template(f"{template}.html.j2").render(report=report, **values)
+
+
+def markup(html: str, **values: object) -> Markup:
+    """Markup with values in it, which are escaped, so that it may stand in a table's cell.
+
+    Example:
+        >>> str(markup("<b>{name}</b>", name="<i>"))
+        '<b>&lt;i&gt;</b>'
+    """
+    from markupsafe import Markup
+
+    return Markup(html).format(**{name: clean(value) for name, value in values.items()})
+
+
+def matrix(values: Iterable[Iterable[float]]) -> Markup:
+    """A matrix in a table's cell, row below row."""
+    return markup("<code>{rows}</code>", rows=markup("<br>".join("&ensp;".join(f"{x:.6g}" for x in row) for row in values)))
+
+
+def bar(fraction: float, mark: float | None = None) -> Markup:
+    """A fraction between 0 and 1 as a thin bar, with a tick at ``mark``.  SVG, because printers drop CSS backgrounds."""
+    tick = f'<rect class="mark" x="{100 * mark:.1f}" y="0" width=".6" height="8"/>' if mark is not None else ""
+    filled = 100 * min(max(fraction, 0.0), 1.0)
+    return markup(
+        '<svg class="bar" viewBox="0 0 100 8" preserveAspectRatio="none" aria-hidden="true">'
+        f'<rect class="track" width="100" height="8"/><rect class="fill" width="{filled:.1f}" height="8"/>{tick}</svg>'
     )
 
 
-def made_by(manifest: Mapping[str, Any]) -> str:
-    """The footer's words, from a manifest (or an empty one)."""
-    version = (manifest.get("versions") or {}).get("dyntorch")
-    when = manifest.get("time")
-    return " ".join(["Made by dyntorch", *([str(version)] if version else []), *([f"at {when}"] if when else [])]) + "."
+def listed(
+    ids: Sequence[str], kinds: Sequence[str], order: Sequence[str], several: Mapping[str, str] | None = None
+) -> list[tuple[str, list[str]]]:
+    """How many there are of each kind, and their names.
+
+    Args:
+        several: what more than one of a kind are called, where that is something else.
+
+    Example:
+        >>> listed(["a", "b", "c"], ["body 1", "outlier", "outlier"], ["body 1", "outlier", "missing"], {"outlier": "outliers"})
+        [('body 1: 1', ['a']), ('2 outliers', ['b', 'c'])]
+    """
+    out = []
+    for kind in order:
+        mine = [name for name, other in zip(ids, kinds, strict=True) if other == kind]
+        noun = (several or {}).get(kind, kind) if len(mine) > 1 else kind
+        if mine:
+            out.append((f"{noun}: {len(mine):,}" if " " in noun else f"{len(mine):,} {noun}", mine))
+    return out
 
 
 def sentence(text: str) -> str:
@@ -111,121 +278,11 @@ def even(values: Sequence[float]) -> list[str]:
     return [f"{value:,.{decimals if abs(value) < 1000 else 0}f}" if math.isfinite(value) else "n/a" for value in values]
 
 
-def section(title: str, html: str, note: str = "") -> str:
-    """A titled part of the page, with an optional sentence below the title."""
-    lead = f'<p class="note">{escape(note)}</p>' if note else ""
-    return f"<section><h2>{escape(title)}</h2>{lead}{html}</section>"
-
-
-def cards(items: Sequence[Card]) -> str:
-    """Headline numbers side by side; nothing where there are none."""
-    if not items:
-        return ""
-    cells = "".join(
-        f"<div><dt>{escape(item.name)}</dt><dd>{escape(item.value)}<small>{escape(item.note)}</small></dd></div>" for item in items
-    )
-    rows = math.ceil(len(items) / 6)  # rows of nearly equal length: 7 cards as 4 and 3, not as 6 and 1
-    return f'<dl class="cards" style="--columns:{math.ceil(len(items) / rows)}">{cells}</dl>'
-
-
-def table(columns: Sequence[Column], rows: Sequence[Sequence[str]], *, caption: str = "", css: str = "") -> str:
-    """A table.
-
-    Args:
-        columns: the headings.
-        rows: html of the cells; the first cell of a row is its header.
-        caption: for screen readers.
-        css: extra class; ``"stack"`` turns each row into a block on narrow screens.
-    """
-    head = "".join(f'<th scope="col" class="{column.css}">{escape(column.name)}</th>' for column in columns)
-    lines = []
-    for row in rows:
-        cells = [
-            f'<{tag} class="{column.css}" data-name="{escape(column.name)}">{cell}</{tag.split()[0]}>'
-            for tag, column, cell in zip(['th scope="row"'] + ["td"] * len(row), columns, row, strict=False)
-        ]
-        lines.append(f"<tr>{''.join(cells)}</tr>")
-    title = f'<caption class="unseen">{escape(caption)}</caption>' if caption else ""
-    body = "\n".join(lines)
-    return f'<div class="scroll"><table class="{css}">{title}<thead><tr>{head}</tr></thead><tbody>\n{body}\n</tbody></table></div>'
-
-
-def picture(light: bytes, alt: str, *, dark: bytes | None = None, caption: str = "", tips: Sequence[Tip] = ()) -> str:
-    """A PNG inside the page, with another one for dark screens where given; wide ones scroll rather than shrink to dust.
-
-    Args:
-        tips: places on the picture that say something when pointed at.
-    """
-    width, height = (round(side / PIXEL_RATIO) for side in struct.unpack(">II", light[16:24]))
-    least = min(width, 680) if width <= 1100 else round(0.85 * width)  # pixels, below which its small print is lost
-    shape = f'alt="{escape(alt)}" width="{width}" height="{height}" style="min-width:{least}px"'
-    # Two images that the style sheet switches, not <picture>: browsers keep its dark source on paper.
-    images = [("light", light), ("dark", dark)] if dark else [("", light)]
-    shown = "".join(f'<img class="{theme}" src="{_data(png)}" {shape}>' for theme, png in images)
-    text = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
-    scroll = f'<div class="scroll" tabindex="0" role="group" aria-label="{escape(alt)}">'  # reachable by keyboard where it scrolls
-    if tips:
-        shown = f'<div class="tipped" style="min-width:{least}px;max-width:{width}px">{shown}{_tips(tips)}</div>'
-    hint = '<p class="swipe" aria-hidden="true">wider than this screen: move it sideways</p>' if least > 340 else ""
-    return f"<figure>{scroll}{shown}</div>{hint}{text}</figure>"
-
-
-def _tips(tips: Sequence[Tip]) -> str:
-    places = ""
-    for tip in tips:
-        x, y, width, height = (f"{100 * share:.2f}" for share in (tip.left, tip.top, tip.width, tip.height))
-        rect = f'<rect x="{x}" y="{y}" width="{width}" height="{height}"/>'
-        places += f"<g><title>{escape(tip.text)}</title>{rect}</g>"
-    return f'<svg class="tips" viewBox="0 0 100 100" preserveAspectRatio="none" aria-hidden="true">{places}</svg>'
-
-
-def bar(fraction: float, mark: float | None = None) -> str:
-    """A fraction between 0 and 1 as a thin bar, with a tick at ``mark``.  SVG, because printers drop CSS backgrounds."""
-    tick = f'<rect class="mark" x="{100 * mark:.1f}" y="0" width=".6" height="8"/>' if mark is not None else ""
-    filled = 100 * min(max(fraction, 0.0), 1.0)
-    return (
-        '<svg class="bar" viewBox="0 0 100 8" preserveAspectRatio="none" aria-hidden="true">'
-        f'<rect class="track" width="100" height="8"/><rect class="fill" width="{filled:.1f}" height="8"/>{tick}</svg>'
-    )
-
-
-def details(title: str, html: str, *, open_: bool = False) -> str:
-    """A block that opens on a click (and is open on paper)."""
-    return f"<details{' open' if open_ else ''}><summary>{escape(title)}</summary><div>{html}</div></details>"
-
-
-def listed(ids: Sequence[str], kinds: Sequence[str], order: Sequence[str], limit: int, file: str) -> str:
-    """The names of each kind behind a click, at most ``limit`` of them; the rest is in a file."""
-    blocks = []
-    for kind in order:
-        mine = [name for name, other in zip(ids, kinds, strict=True) if other == kind]
-        if mine:
-            more = f" and {len(mine) - limit:,} more, in {file}" if len(mine) > limit else ""
-            count = f"{kind}: {len(mine):,}" if " " in kind else f"{len(mine):,} {kind}"
-            blocks.append(details(count, f"<p>{escape(', '.join(mine[:limit]) + more)}</p>"))
-    return "".join(blocks)
-
-
-def provenance(manifest: Mapping[str, Any]) -> str:
-    """The section on how the result was made; nothing without a manifest."""
-    if not manifest:
-        return ""
-    note = "What was run, with which versions and on which files: enough to run it again."
-    return section("How this was made", details("Settings, versions and inputs", settings(manifest)), note)
-
-
-def settings(values: Mapping[str, Any], limit: int = 200) -> str:
-    """Nested settings as a two-column table, ``a.b`` for ``b`` in ``a``; at most ``limit`` lines, and the rest counted.
+def settings(values: Mapping[str, Any], before: str = "") -> list[tuple[str, object]]:
+    """Nested settings as name and value, ``a.b`` for ``b`` in ``a``.
 
     A folder's files and their hashes are one line: a recording may have a file for each of its frames.
     """
-    lines = list(_flat(values))
-    rows = [[f"<code>{escape(name)}</code>", f"<code>{escape(value)}</code>"] for name, value in lines[:limit]]
-    more = f'<p class="note">{len(lines) - limit} more lines are in manifest.json.</p>' if len(lines) > limit else ""
-    return table([Column("Setting"), Column("Value", "long")], rows, css="plain") + more
-
-
-def _flat(values: Mapping[str, Any], before: str = "") -> list[tuple[str, object]]:
     lines: list[tuple[str, object]] = []
     for name, value in values.items():
         path = f"{before}{name}"
@@ -233,7 +290,7 @@ def _flat(values: Mapping[str, Any], before: str = "") -> list[tuple[str, object
             together = hashlib.sha256("".join(f"{file}:{value[file]}\n" for file in sorted(value)).encode()).hexdigest()
             lines.append((path, f"{len(value):,} files, each in manifest.json; sha256 of their names and hashes: {together}"))
         elif isinstance(value, Mapping) and value:
-            lines += _flat(value, f"{path}.")
+            lines += settings(value, f"{path}.")
         elif isinstance(value, (list, tuple)):
             lines.append((path, " ".join(str(item) for item in value) or "none"))
         elif value is not None and not isinstance(value, Mapping):
@@ -245,5 +302,49 @@ def _is_hash(value: object) -> bool:
     return isinstance(value, str) and re.fullmatch(r"[0-9a-f]{64}", value) is not None
 
 
-def _data(png: bytes) -> str:
-    return f"data:image/png;base64,{base64.b64encode(png).decode('ascii')}"
+def table_csv(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """A table as CSV."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(head)
+    writer.writerows(rows)
+    return out.getvalue()
+
+
+def safe_cell(name: str) -> str:
+    """A name as a cell.  Spreadsheets run text that begins like a formula; an apostrophe keeps it text."""
+    return f"'{name}" if name.lstrip(" ")[:1] in tuple("=+@\t\r\n") or (name[:1] == "-" and not name[1:2].isdigit()) else name
+
+
+def npz(arrays: Mapping[str, Any]) -> bytes:
+    """Arrays as an ``.npz`` file."""
+    import numpy as np
+
+    stream = io.BytesIO()
+    np.savez_compressed(stream, **arrays)
+    return stream.getvalue()
+
+
+def write_files(folder: str | Path, contents: Mapping[str, Any]) -> Path:
+    """Write the files of a report: bytes, text, or values as JSON, each whole or not at all, in the order given.
+
+    A file without content is removed: that of an earlier run is not that of this one.
+
+    Returns:
+        the path of the last one.
+
+    Raises:
+        ValueError: the folder or a file in it cannot be written.
+    """
+    where = files.prepare(folder)
+    for name, content in contents.items():
+        if content is None:
+            (where / name).unlink(missing_ok=True)
+            continue
+        if isinstance(content, bytes):
+            path = files.write_bytes(where / name, content)
+        elif isinstance(content, str):
+            path = files.write_text(where / name, content)
+        else:
+            path = files.write_json(where / name, content)
+    return path

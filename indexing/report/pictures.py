@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from indexing.report.canvas import LIGHT, Theme, cmap, columns, new_figure, png, shorten, shorten_all, style
+from indexing.report.canvas import LIGHT, cmap, columns, new_figure, png, shorten, shorten_all, style
 from indexing.report.page import Tip
 from indexing.report.results import ReportedEvent, Truth
 
@@ -37,7 +37,6 @@ class _View:
     low: float
     high: float
     colours: Mapping[str, str]
-    theme: Theme
 
     @property
     def minutes(self) -> bool:
@@ -108,7 +107,7 @@ def timeline_tips(
     return tips
 
 
-def confusion(counts: ArrayLike, classes: Sequence[object], *, theme: Theme = LIGHT) -> bytes:
+def confusion(counts: ArrayLike, classes: Sequence[object]) -> bytes:
     """PNG of a confusion matrix: a row per true class and a column per predicted one; colour = share of the row.
 
     Args:
@@ -127,23 +126,23 @@ def confusion(counts: ArrayLike, classes: Sequence[object], *, theme: Theme = LI
     number = len(names)
     cell = float(np.clip(4.6 / number, 0.27, 0.7))  # inches: 60 classes stay legible, 2 do not fill the page
     size = min(9.0, 3.0 + 18 * cell)
-    with style(theme):
+    with style():
         figure = new_figure(cell * number + 2.6, cell * number + 2.3)
         axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-        axes.imshow(share, cmap=cmap(theme), vmin=0, vmax=1, interpolation="nearest")
+        axes.imshow(share, cmap=cmap(), vmin=0, vmax=1, interpolation="nearest")
         level = number <= 4 and max(map(len, names)) <= 9
         slant = {} if level else {"rotation": 45, "ha": "right", "rotation_mode": "anchor"}
         axes.set_xticks(range(number), labels=names, parse_math=False, fontsize=max(size, 7.0), **slant)
         axes.set_yticks(range(number), labels=names, parse_math=False, fontsize=max(size, 7.0))
         edges = np.arange(-0.5, number)
-        axes.hlines(edges, -0.5, number - 0.5, color=theme.line, linewidth=0.6)
-        axes.vlines(edges, -0.5, number - 0.5, color=theme.line, linewidth=0.6)
+        axes.hlines(edges, -0.5, number - 0.5, color=LIGHT.line, linewidth=0.6)
+        axes.vlines(edges, -0.5, number - 0.5, color=LIGHT.line, linewidth=0.6)
         axes.set(xlim=(-0.5, number - 0.5), ylim=(number - 0.5, -0.5))
         axes.tick_params(length=0)
         axes.set_xlabel("recognized as", labelpad=8)
         axes.set_ylabel("performed", labelpad=8)
         for row, column in np.argwhere(table > 0):  # zeros stay blank: the eye then finds the errors
-            colour = theme.paper if share[row, column] > 0.55 else theme.ink
+            colour = LIGHT.paper if share[row, column] > 0.55 else LIGHT.ink
             text = f"{table[row, column]}"
             fits = min(size, 100 * cell / max(3, len(text)))
             axes.text(column, row, text, color=colour, fontsize=fits, ha="center", va="center")
@@ -156,8 +155,6 @@ def timeline(
     classes: Sequence[object],
     events: Sequence[ReportedEvent] = (),
     truth: Sequence[Truth] | None = None,
-    *,
-    theme: Theme = LIGHT,
 ) -> bytes:
     """PNG of scores over time: a heat row per class, found events as labelled bars above, the known ones below those.
 
@@ -176,8 +173,8 @@ def timeline(
         raise ValueError(f"scores must be (frames, classes) = ({len(seconds)}, {len(classes)}), not empty, got {values.shape}")
     at = _layout(seconds, classes, events, truth)
     height, low, high = at.height, at.low, at.high
-    view = _View(low, high, {name: PALETTE[i % len(PALETTE)] for i, name in enumerate(at.names)}, theme)
-    with style(theme):
+    view = _View(low, high, {name: PALETTE[i % len(PALETTE)] for i, name in enumerate(at.names)})
+    with style():
         figure = new_figure(WIDTH, height)
         box = (at.left / WIDTH, at.width / WIDTH)
         top = figure.add_axes((box[0], 1 - (ABOVE + at.bars) / height, box[1], at.bars / height))
@@ -222,7 +219,7 @@ def _draw_bars(axes: Any, spans: Sequence[tuple[str, list[list[Bar]]]], view: _V
                 bar[0] for bar in lane
             ):  # one collection per label: drawing each bar by itself takes seconds
                 bars = [(start, view.width(start, end)) for name, start, end in lane if name == label]
-                axes.broken_barh(bars, (row - 0.4, 0.8), facecolor=view.colours[label], edgecolor=view.theme.paper, linewidth=0.5)
+                axes.broken_barh(bars, (row - 0.4, 0.8), facecolor=view.colours[label], edgecolor=LIGHT.paper, linewidth=0.5)
                 for start, width in bars:
                     pixels = axes.bbox.width * width / (view.high - view.low)
                     if pixels > 24:  # three letters and an ellipsis
@@ -234,7 +231,7 @@ def _draw_bars(axes: Any, spans: Sequence[tuple[str, list[list[Bar]]]], view: _V
     for side in axes.spines.values():
         side.set_visible(False)
     for at in np.cumsum([len(lanes) for _, lanes in spans])[:-1]:
-        axes.axhline(at - 0.5, color=view.theme.line, linewidth=0.6)
+        axes.axhline(at - 0.5, color=LIGHT.line, linewidth=0.6)
 
 
 def _write(axes: Any, text: str, x: float, y: float, room: float) -> None:
@@ -276,10 +273,10 @@ def _draw_heat(axes: Any, cells: NDArray[np.float64], classes: Sequence[object],
         bottom, peak = np.nanpercentile(cells, [2, 99.7])
         image = axes.imshow(
             cells.T, extent=(view.low, view.high, len(classes) - 0.5, -0.5), aspect="auto", interpolation="nearest",
-            cmap=cmap(view.theme), vmin=bottom, vmax=peak if peak > bottom else bottom + 1,
+            cmap=cmap(), vmin=bottom, vmax=peak if peak > bottom else bottom + 1,
         )  # fmt: skip
     else:
-        axes.text((view.low + view.high) / 2, (len(classes) - 1) / 2, "no scores", color=view.theme.muted, ha="center", va="center")
+        axes.text((view.low + view.high) / 2, (len(classes) - 1) / 2, "no scores", color=LIGHT.muted, ha="center", va="center")
     for row, name in enumerate(map(str, classes)):
         spans = [(start, end) for label, start, end in found if label == name]
         for thin in (True, False):
@@ -289,7 +286,7 @@ def _draw_heat(axes: Any, cells: NDArray[np.float64], classes: Sequence[object],
         axes.plot(-0.009, row, "s", color=view.colours[name], markersize=5.5, transform=axes.get_yaxis_transform(), clip_on=False)
     axes.set(xlim=(view.low, view.high), ylim=(len(classes) - 0.5, -0.5))
     axes.set_yticks(range(len(classes)), labels=shorten_all(classes, 22), parse_math=False)
-    axes.hlines(np.arange(0.5, len(classes) - 1), view.low, view.high, color=view.theme.paper, linewidth=1)
+    axes.hlines(np.arange(0.5, len(classes) - 1), view.low, view.high, color=LIGHT.paper, linewidth=1)
     axes.tick_params(axis="y", length=0, pad=14)
     return image
 

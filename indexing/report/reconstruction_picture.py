@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from indexing.report.canvas import Theme, new_figure, png, shorten, style
+from indexing.report.canvas import LIGHT, new_figure, png, shorten, style
 
 if TYPE_CHECKING:
     from indexing.report.reconstruction import ReconstructionReport
@@ -48,9 +48,9 @@ def layout(boxes: list[tuple[FloatArray, FloatArray]], tall: float, edge: float,
     return figure, panels
 
 
-def colour_of(kind: str, theme: Theme) -> str:
+def colour_of(kind: str) -> str:
     """The colour of a kind."""
-    return COLOURS.get(kind, theme.muted)
+    return COLOURS.get(kind, LIGHT.muted)
 
 
 def size_of(count: int) -> float:
@@ -100,7 +100,7 @@ def sample(paths: FloatArray, box: tuple[FloatArray, FloatArray]) -> NDArray[np.
     return np.linspace(0, count - 1, TANGLE).round().astype(np.intp) if long else np.arange(min(count, SHOWN))
 
 
-def legend(figure: Any, kinds: NDArray[Any], theme: Theme) -> None:
+def legend(figure: Any, kinds: NDArray[Any]) -> None:
     """How many tracks of every kind, at the foot of the figure."""
     from matplotlib.lines import Line2D
 
@@ -110,14 +110,14 @@ def legend(figure: Any, kinds: NDArray[Any], theme: Theme) -> None:
         if number:
             name = f"{number:,} {kind}{'s' * (kind == 'outlier' and number > 1)}" if " " not in kind else f"{kind}: {number:,}"
             mark = "x" if kind == "outlier" else "o"
-            handles.append(Line2D([], [], color=colour_of(kind, theme), marker=mark, linestyle="", markersize=5, label=name))
-    foot(figure, handles, theme)
+            handles.append(Line2D([], [], color=colour_of(kind), marker=mark, linestyle="", markersize=5, label=name))
+    foot(figure, handles)
 
 
-def foot(figure: Any, handles: list[Any], theme: Theme, columns: int = 4) -> None:
+def foot(figure: Any, handles: list[Any], columns: int = 4, ink: str = LIGHT.ink) -> None:
     """The legend at the foot of the figure."""
     anchor = (0.5, 0.28 / figure.get_figheight())
-    figure.legend(handles=handles, loc="upper center", bbox_to_anchor=anchor, ncols=columns, frameon=False, labelcolor=theme.ink)
+    figure.legend(handles=handles, loc="upper center", bbox_to_anchor=anchor, ncols=columns, frameon=False, labelcolor=ink)
 
 
 def finish(panel: Any, low: FloatArray, high: FloatArray, down: bool, title: str) -> None:
@@ -136,23 +136,20 @@ def finish(panel: Any, low: FloatArray, high: FloatArray, down: bool, title: str
 # The picture of the scene: a plan of a plane, or space from two sides, with the way of every point from first to last view.
 
 
-if TYPE_CHECKING:
-    from indexing.report.reconstruction import ReconstructionReport
-
 Box = tuple[FloatArray, FloatArray]
 TALL = 6.2  # inches, the greatest height of a plan
 STRAYS = 0.99  # of the positions, those that a panel shows
 SIDES = ((90.0, -90.0, 1.6, "as the first camera looks"), (24.0, -62.0, 1.2, "from the side"))  # elevation, azimuth, zoom, name
 
 
-def scene_picture(report: ReconstructionReport, theme: Theme) -> bytes:
+def scene_picture(report: ReconstructionReport) -> bytes:
     """PNG of the scene in the frame nearest to the first view: the tracks fix it only up to an affinity or less."""
     kinds = kinds_of(report)
     positions = nearest_frame(report)
-    with style(theme):
+    with style():
         draw = _plan if positions.shape[-1] == 2 else _space
-        figure = draw(report, positions, kinds, theme)
-        legend(figure, kinds, theme)
+        figure = draw(report, positions, kinds)
+        legend(figure, kinds)
         return png(figure, tight=True)
 
 
@@ -162,8 +159,8 @@ def nearest_frame(report: ReconstructionReport) -> FloatArray:
     Of space, the depth is what is left: scaled to the spread across, along the direction that says least about the image.
     """
     image = report.tracks.values[0, :, :2]
-    fits = np.isfinite(image).all(axis=1) & report.found & (report.labels > 0)
-    dim = report.points.shape[1]
+    fits = np.isfinite(image).all(axis=1) & report.placed & (report.labels > 0)
+    dim = report.found.points.shape[1]
     if fits.sum() < dim + 1:
         return report.positions
     start = report.positions[0, fits]
@@ -185,12 +182,12 @@ def nearest_frame(report: ReconstructionReport) -> FloatArray:
 
 def _depth_order(report: ReconstructionReport, fits: NDArray[np.bool_], depth: FloatArray) -> float:
     """Whether a coordinate grows with the depth in the first view; no telling up to a collineation, but nearly always right."""
-    camera = report.cameras[0]
-    w = report.points[fits] @ camera[-1, :-1] + camera[-1, -1]
+    camera = report.found.cameras[0]
+    w = report.found.points[fits] @ camera[-1, :-1] + camera[-1, -1]
     return float(np.nan_to_num(np.sign(w.mean()) * np.cov(w, depth)[0, 1]))
 
 
-def _plan(report: ReconstructionReport, positions: FloatArray, kinds: NDArray[Any], theme: Theme) -> Any:
+def _plan(report: ReconstructionReport, positions: FloatArray, kinds: NDArray[Any]) -> Any:
     """The plane, with an arrow from the first to the last view for every moving point."""
     halves = ["body 1", "body 2"] if report.bodies > 1 else [""]
     shown = [positions[:, kinds == half] if half else positions[:, np.isin(kinds, ("static", "moving"))] for half in halves]
@@ -200,7 +197,7 @@ def _plan(report: ReconstructionReport, positions: FloatArray, kinds: NDArray[An
         reach = float(np.max(box[1] - box[0]))
         for kind in ("outlier", "static", "moving", "body 1", "body 2"):
             mine = positions[:, (kinds == kind) & np.isin(kind, [half or kind])][:, :SHOWN]
-            _arrows(panel, mine, kind, reach, size_of(positions.shape[1]), theme, box)
+            _arrows(panel, mine, kind, reach, size_of(positions.shape[1]), box)
         finish(panel, *box, True, half or "the plane, in a frame of its own" + _sampled(positions, kinds, box))
         panel.set(xticks=[], yticks=[])
     return figure
@@ -213,13 +210,13 @@ def _sampled(positions: FloatArray, kinds: NDArray[Any], box: Box) -> str:
     return f"; the ways of {drawn} of {moving.shape[1]:,}" if drawn < moving.shape[1] else ""
 
 
-def _arrows(panel: Any, points: FloatArray, kind: str, reach: float, size: float, theme: Theme, box: Box) -> None:
+def _arrows(panel: Any, points: FloatArray, kind: str, reach: float, size: float, box: Box) -> None:
     """Where points ``(views, n, 2)`` begin, their ways, and the heads of those long enough to have one."""
     from matplotlib.collections import LineCollection
 
     if not points.shape[1] or kind == "outlier":
         return
-    colour = colour_of(kind, theme)
+    colour = colour_of(kind)
     panel.scatter(*points[0].T, s=size, c=colour, linewidth=0, zorder=3)
     if kind != "moving":
         return
@@ -239,7 +236,7 @@ def _arrows(panel: Any, points: FloatArray, kind: str, reach: float, size: float
     panel.add_collection(LineCollection(list(wings[long]), colors=colour, linewidths=1.2, zorder=2))
 
 
-def _space(report: ReconstructionReport, positions: FloatArray, kinds: NDArray[Any], theme: Theme) -> Any:
+def _space(report: ReconstructionReport, positions: FloatArray, kinds: NDArray[Any]) -> Any:
     """Space, as the first camera looks and from the side; of two bodies, each for itself."""
     from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
@@ -255,7 +252,7 @@ def _space(report: ReconstructionReport, positions: FloatArray, kinds: NDArray[A
             mine = positions[:, (kinds == kind) & np.isin(kind, [half or kind])][:, :SHOWN]
             if not mine.shape[1]:
                 continue
-            colour = colour_of(kind, theme)
+            colour = colour_of(kind)
             panel.scatter(*mine[0].T, s=size_of(positions.shape[1]), c=colour, linewidth=0, depthshade=not half)
             if kind == "moving":
                 mine = mine[:, sample(mine, box)]
@@ -265,8 +262,8 @@ def _space(report: ReconstructionReport, positions: FloatArray, kinds: NDArray[A
         panel.set(xticklabels=[], yticklabels=[], zticklabels=[])
         panel.set_box_aspect((1, 1, 1), zoom=zoom)
         for axis in (panel.xaxis, panel.yaxis, panel.zaxis):
-            axis.set_pane_color(theme.paper)
-            axis._axinfo["grid"].update(color=theme.line, linewidth=0.5)
+            axis.set_pane_color(LIGHT.paper)
+            axis._axinfo["grid"].update(color=LIGHT.line, linewidth=0.5)
         panel.view_init(elev=elevation, azim=azimuth)
         panel.set_title(half or name + _sampled(positions, kinds, box), fontsize=9, loc="left", y=1.0)
     return figure
@@ -276,14 +273,11 @@ def _space(report: ReconstructionReport, positions: FloatArray, kinds: NDArray[A
 # The picture of the tracks: as they were measured, and as the first camera would have seen them had it stood still.
 
 
-if TYPE_CHECKING:
-    from indexing.report.reconstruction import ReconstructionReport
-
 GAP, LEFT, TRACKS_TALL = 0.55, 0.45, 5.2  # inches; the last is the greatest height of a panel
 TRACKS_STRAYS = 0.995  # of the positions, those that a panel shows
 
 
-def tracks_picture(report: ReconstructionReport, theme: Theme) -> bytes:
+def tracks_picture(report: ReconstructionReport) -> bytes:
     """PNG: the tracks through all views in the first one; beside them the same without the motion of the camera."""
     kinds = kinds_of(report)
     measured = report.tracks.values[..., shown_axes(report.tracks.values)]
@@ -296,12 +290,12 @@ def tracks_picture(report: ReconstructionReport, theme: Theme) -> bytes:
     kept = [points[:, kinds != "missing"] for points, _ in panels]
     boxes = [limits(points, TRACKS_STRAYS) for points in kept]
     down = report.tracks.values.shape[-1] == 2
-    with style(theme):
+    with style():
         figure, places = layout(boxes, TRACKS_TALL, LEFT, GAP)
         for panel, (points, title), box in zip(places, panels, boxes, strict=True):
-            _draw(panel, points, kinds, theme)
+            _draw(panel, points, kinds)
             finish(panel, *box, down, title)
-        legend(figure, kinds, theme)
+        legend(figure, kinds)
         return png(figure, tight=True)
 
 
@@ -324,7 +318,7 @@ def as_first_camera(report: ReconstructionReport) -> FloatArray | None:
     where no scene was decided on."""
     if not report.drawable or report.velocities is None:
         return None
-    camera = report.cameras[0]
+    camera = report.found.cameras[0]
     rays = report.positions @ camera[:, :-1].T + camera[:, -1]
     with np.errstate(divide="ignore", invalid="ignore"):
         seen: FloatArray = rays[..., :-1] / rays[..., -1:]
@@ -332,7 +326,7 @@ def as_first_camera(report: ReconstructionReport) -> FloatArray | None:
     return np.where(rays[..., -1:] * rays[:1, :, -1:] > 0, seen, np.nan)
 
 
-def _draw(panel: Any, points: FloatArray, kinds: NDArray[Any], theme: Theme) -> None:
+def _draw(panel: Any, points: FloatArray, kinds: NDArray[Any]) -> None:
     """Paths ``(views, n, 2)`` with a dot where they begin."""
     from matplotlib.collections import LineCollection
 
@@ -341,7 +335,7 @@ def _draw(panel: Any, points: FloatArray, kinds: NDArray[Any], theme: Theme) -> 
         mine = points[:, kinds == kind][:, :SHOWN]
         if not mine.shape[1]:
             continue
-        colour = colour_of(kind, theme)
+        colour = colour_of(kind)
         paths = [path[np.isfinite(path).all(axis=1)] for path in mine.transpose(1, 0, 2)]
         paths = [path for path in paths if len(path)]
         quiet = 0.35 if kind == "outlier" else 0.7

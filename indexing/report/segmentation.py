@@ -2,46 +2,266 @@
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from indexing import files
+from indexing.opening import count
 from indexing.readers.pairs import MatchedPair, Photograph
-from indexing.report.alignment import safe_cell
 from indexing.report.canvas import DARK, LIGHT, Theme, new_figure, png, shorten, style
 from indexing.report.page import (
-    Card,
-    Column,
-    cards,
-    details,
-    escape,
-    listed,
-    made_by,
-    page,
-    picture,
-    provenance,
-    section,
+    Picture,
+    ResultReport,
+    markup,
+    matrix,
+    npz,
+    render,
+    safe_cell,
     sentence,
-    table,
+    table_csv,
+    write_files,
 )
-from indexing.report.reconstruction import heading
 from indexing.report.reconstruction_picture import finish, foot, layout, limits, sample
+
+FloatArray = NDArray[np.float64]
+FILES = ("report.html", "segmentation.npz", "segmentation.json", "labels.csv", "segmentation.png")
+SURE = 0.9  # probability of its label below which a match is called doubtful
+MOTION = {
+    "fundamental": "fundamental matrix: a rigid body with depth",
+    "homography": "homography: a plane, or a body seen under a rotation alone",
+}
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SegmentationReport(ResultReport):
+    """Everything that the report on a segmentation says.
+
+    Args:
+        pair: what was given.
+        photographs: of both images; empty = none.
+        size: width and height of the images; None = not known.
+    """
+
+    pair: MatchedPair
+    photographs: Sequence[Photograph] = ()
+    size: tuple[float, float] | None = None
+
+    TITLES = ("What moves with what", "The matches do not decide")
+    REASONS = {
+        "TOO_FEW": "too few matches are present in both images; give more",
+        "DEGENERATE": "several segmentations fit all matches exactly; add matches in general position",
+        "AMBIGUOUS": "other segmentations fit as well; add matches, or say how many --bodies there are",
+        "NO_CONSENSUS": "no body moves so that enough of the matches agree; raise --threshold, or clean the matches",
+    }
+
+    @property
+    def bodies(self) -> int:
+        """How many bodies."""
+        return int(self.found.bodies)
+
+    @property
+    def models(self) -> list[str]:
+        """What each body's motion is: fundamental or homography."""
+        return [str(model) for model in self.found.models[: self.bodies]]
+
+    @property
+    def status(self) -> str:
+        """The status's name; that there are no bodies is no answer."""
+        status = super().status
+        return status if status != "OK" or self.bodies else "NO_CONSENSUS"
+
+    @property
+    def seen(self) -> int:
+        """How many matches are there in both images."""
+        return int(self.pair.seen.sum())
+
+    @property
+    def misclassified(self) -> float | None:
+        """Share of the matches that are not labelled as the file says, whatever the bodies' numbers; None where it does not say."""
+        if self.pair.known is None or not self.bodies:
+            return None
+        import torch
+
+        from dyntorch import metrics
+
+        known, seen = torch.from_numpy(self.pair.known), torch.from_numpy(self.pair.seen)
+        return float(metrics.misclassification(self.result.labels[seen], known[seen]))
+
+    @property
+    def names(self) -> list[str]:
+        """What labels mean: outlier, body 1, body 2, ..."""
+        return ["outlier", *(f"body {i}" for i in range(1, self.bodies + 1))]
+
+    @property
+    def kinds(self) -> list[str]:
+        """What each match is: one of the names, or missing."""
+        seen = self.pair.seen.tolist()
+        return [self.names[label] if there else "missing" for label, there in zip(self.found.labels.tolist(), seen, strict=True)]
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """How many matches of each kind, bodies first."""
+        kinds = self.kinds
+        return {name: kinds.count(name) for name in (*self.names[1:], "outlier", "missing")}
+
+    @property
+    def certainty(self) -> FloatArray:
+        """``(n,)`` probability of the label of each match; NaN where it is missing."""
+        own = np.take_along_axis(self.found.probabilities, self.found.labels[:, None], axis=1)[:, 0]
+        return np.where(self.pair.seen, own, np.nan)
+
+    @property
+    def doubtful(self) -> NDArray[np.bool_]:
+        """``(n,)`` matches that might well have another label."""
+        return np.asarray(self.certainty < SURE)
+
+    def rms(self, label: int | None = None) -> float:
+        """Root mean square of the residuals of one body, or of all; NaN where there are no matches."""
+        mine = self.pair.seen & ((self.found.labels > 0) if label is None else (self.found.labels == label))
+        return float(np.sqrt(np.mean(np.square(self.found.residuals[mine])))) if mine.any() else float("nan")
+
+
+def describe(report: SegmentationReport) -> str:
+    """The result in plain words."""
+    number, counts = report.seen, report.counts
+    if report.status != "OK":
+        start = f"The {number:,} matches do not decide what moves with what. {sentence(report.reason)}"
+        return start + " What follows is the best segmentation found, and not to be relied on." * (report.bodies > 0)
+    *most, last = [f"{counts[f'body {i}']:,}" for i in range(1, report.bodies + 1)]
+    moved = f"{number - counts['outlier']:,} move "
+    moved += f"with one of {report.bodies} bodies ({', '.join(most)} and {last})" if most else "as one body"
+    rest = f"; {count(counts['outlier'], 'fits', 'fit')} none" * (counts["outlier"] > 0)
+    lost = f" {count(counts['missing'], 'more is', 'more are')} missing in an image." * (counts["missing"] > 0)
+    return f"Of {number:,} matches of two images, {moved}{rest}.{lost}"
+
+
+def write_segmentation(folder: str | Path, report: SegmentationReport) -> Path:
+    """Write a report into a folder: the files of :data:`FILES`, each whole or not at all, ``report.html`` last.
+
+    Returns:
+        the path of ``report.html``.
+
+    Raises:
+        ValueError: the folder or a file in it cannot be written.
+    """
+    drawn = picture_of(report)
+    picture = Picture(drawn, dark=picture_of(report, DARK) if report.photographs else None)
+    doubtful = ["doubtful" if odd else "" for odd in report.doubtful.tolist()]
+    values = {"summary": describe(report), "picture": picture, "doubtful": doubtful, "share": share, "rms": rms_text(report)}
+    html = render("segmentation", report, **values, **tables(report))
+    return write_files(
+        folder,
+        {
+            "segmentation.png": drawn,
+            "labels.csv": labels_csv(report),
+            "segmentation.npz": as_npz(report),
+            "segmentation.json": as_json(report),
+            "report.html": html,
+        },
+    )
+
+
+def tables(report: SegmentationReport) -> dict[str, list[list[Any]]]:
+    """Rows of the page's tables: the bodies, their matrices, and how many matches of every known body were found to be of which."""
+    bodies, matrices, compared = [], [], []
+    for label, model in enumerate(report.models, start=1):
+        mine = report.pair.seen & (report.found.labels == label)
+        dot = '<span class="drawn" style="color:{colour}" aria-hidden="true">●</span> body {label}'
+        figures = [f"{mine.sum():,}", share(int(mine.sum()), report.seen), rms_text(report, label)]
+        doubtful = f"{int((mine & report.doubtful).sum()):,}"
+        bodies.append([markup(dot, colour=colour_of(label), label=label), *figures, doubtful, MOTION.get(model, model)])
+        found = report.found.homographies if model == "homography" else report.found.fundamentals
+        matrices.append([f"body {label}", model, matrix(found[label - 1])])
+    known = report.pair.known
+    if known is not None and report.bodies:
+        for label in sorted(np.unique(known[report.pair.seen]).tolist(), key=lambda label: (label == 0, label)):
+            of = report.found.labels[report.pair.seen & (known == label)]
+            cells = [int((of == i).sum()) for i in (*range(1, report.bodies + 1), 0)]
+            compared.append([f"body {label}" if label else "outlier", *(f"{cell:,}" if cell else "" for cell in cells)])
+    return {"bodies": bodies, "matrices": matrices, "compared": compared}
+
+
+def rms_text(report: SegmentationReport, label: int | None = None) -> str:
+    """Root mean square of the residuals of one body or of all, empty where there are none."""
+    value = report.rms(label)
+    return f"{value:.3g}" if np.isfinite(value) else ""
+
+
+def share(part: int, whole: int) -> str:
+    """A share in whole percents.
+
+    Example:
+        >>> share(1, 3), share(1, 300)
+        ('33 %', 'under 1 %')
+    """
+    percent = 100 * part / max(1, whole)
+    return "under 1 %" if 0 < percent < 1 else f"{percent:.0f} %"
+
+
+def as_npz(report: SegmentationReport) -> bytes:
+    """All arrays, without pickle; ``x1, x2, ids, known`` are those that were given."""
+    found, bodies = report.found, report.bodies
+    arrays: dict[str, Any] = {name: getattr(found, name) for name in ("labels", "residuals", "coherence", "threshold")}
+    arrays |= {name: getattr(found, name)[:bodies] for name in ("fundamentals", "homographies")}
+    arrays |= {"probabilities": found.probabilities[:, : bodies + 1], "models": np.array(report.models, dtype=np.str_)}
+    arrays |= {"status": report.status, "x1": report.pair.x1, "x2": report.pair.x2, "ids": np.array(report.pair.ids)}
+    return npz(arrays if report.pair.known is None else {**arrays, "known": report.pair.known})
+
+
+def as_json(report: SegmentationReport) -> dict[str, Any]:
+    """The result as numbers: bodies with their models, counts, status, warnings, and how it came about."""
+    bodies = [
+        {
+            "label": label,
+            "matches": report.counts[f"body {label}"],
+            "share": report.counts[f"body {label}"] / max(1, report.seen),
+            "model": model,
+            "rms_residual": report.rms(label),
+            "fundamental": report.found.fundamentals[label - 1],
+            "homography": report.found.homographies[label - 1] if model == "homography" else None,
+        }
+        for label, model in enumerate(report.models, start=1)
+    ]
+    return {
+        "status": report.status,
+        "reason": report.reason or None,
+        "pair": report.pair.name,
+        "matches": len(report.pair.ids),
+        "bodies": bodies,
+        "counts": report.counts,
+        "doubtful": int(report.doubtful.sum()),
+        "rms_residual": report.rms(),
+        "threshold": float(report.found.threshold),
+        "misclassified": report.misclassified,
+        "warnings": report.warnings_json,
+        "notes": list(report.notes),
+        "manifest": report.manifest,
+    }
+
+
+def labels_csv(report: SegmentationReport) -> str:
+    """``id, x1, y1, x2, y2, label, name, probability, residual`` of every match; label 0 is an outlier, or missing.
+
+    The probability is that of the label, the residual the distance from the own body's model, for outliers from the nearest.
+    """
+    rows: list[list[Any]] = []
+    columns = zip(report.pair.ids, report.pair.x1, report.pair.x2, report.kinds, report.certainty, strict=True)
+    for i, (name, first, second, kind, sure) in enumerate(columns):
+        places = [f"{value:.9g}" if np.isfinite(value) else "" for value in (*first, *second)]
+        residual = f"{report.found.residuals[i]:.6g}" if report.bodies else ""
+        rest = ["", ""] if kind == "missing" else [f"{sure:.4f}", residual]
+        rows.append([safe_cell(name), *places, int(report.found.labels[i]), kind, *rest])
+    return table_csv(["id", "x1", "y1", "x2", "y2", "label", "name", "probability", "residual"], rows)
+
 
 # ----------------------------------------------------------------------------------------------------------------------
 # The picture of a segmentation: both images, the matches coloured by their body, and how they moved.
 
 
-if TYPE_CHECKING:
-    from indexing.readers.pairs import Photograph
-
-FloatArray = NDArray[np.float64]
 Box = tuple[FloatArray, FloatArray]
 # neighbours in the list are apart for colour-blind eyes, too, on both papers and on gray
 COLOURS = ("#2f7fb8", "#e8741e", "#2fa36b", "#c2478f", "#b99a0d", "#7d62c9", "#1fa6a6", "#d1493f")
@@ -63,20 +283,20 @@ def colour_of(label: int) -> str:
     return COLOURS[(label - 1) % len(COLOURS)]
 
 
-def picture_of(report: SegmentationReport, theme: Theme) -> bytes:
+def picture_of(report: SegmentationReport, theme: Theme = LIGHT) -> bytes:
     """PNG: image 1 with the way of every match of a body to its place in image 2, and image 2."""
     places = (report.pair.x1, report.pair.x2)
     photographs: list[Photograph | None] = [*report.photographs] or [None, None]
     boxes = [_box(report, i) for i in range(2)]
-    size = float(np.clip(4500 / max(1, len(report.labels)), 5, 20))
+    size = float(np.clip(4500 / max(1, len(report.found.labels)), 5, 20))
     with style(theme):
         figure, panels = _panels(boxes, bool(report.photographs))
         for i, (panel, points, photograph, box) in enumerate(zip(panels, places, photographs, boxes, strict=True)):
             if photograph is not None:
                 _draw_photograph(panel, photograph, theme)
-            _draw_outliers(panel, points[report.pair.seen & (report.labels == 0)], size, theme)
+            _draw_outliers(panel, points[report.pair.seen & (report.found.labels == 0)], size, theme)
             for label in range(1, report.bodies + 1):  # the small ones on top: dense bodies would hide them otherwise
-                mine = report.pair.seen & (report.labels == label)
+                mine = report.pair.seen & (report.found.labels == label)
                 if i == 0:
                     _draw_ways(panel, np.stack([points[mine], places[1][mine]]), label, box)
                 _draw_points(panel, points[mine], label, size, theme)
@@ -84,7 +304,7 @@ def picture_of(report: SegmentationReport, theme: Theme) -> bytes:
             finish(panel, *box, True, shorten(name, 50) + ", with the way to image 2" * (i == 0 and report.bodies > 0))
             if photograph is not None:
                 panel.set(xticks=[], yticks=[])
-        foot(figure, _handles(report, theme), theme, columns=6)
+        foot(figure, _handles(report, theme), columns=6, ink=theme.ink)
         return png(figure, tight=True)
 
 
@@ -94,9 +314,9 @@ def _box(report: SegmentationReport, which: int) -> Box:
     if size is not None:
         return np.array([-0.5, -0.5]), np.array(size) - 0.5
     places = np.stack([report.pair.x1, report.pair.x2])
-    low, high = limits(places[:, report.labels > 0])
+    low, high = limits(places[:, report.found.labels > 0])
     every = limits(places[:, report.pair.seen], STRAYS)
-    if (report.labels > 0).any():
+    if (report.found.labels > 0).any():
         every = np.minimum(low, every[0]), np.maximum(high, every[1])
     sides = every[1] - every[0]
     room = np.maximum(0, SLIM * sides.max() - sides) / 2
@@ -165,306 +385,3 @@ def _handles(report: SegmentationReport, theme: Theme) -> list[Any]:
         text = f"{counts['outlier']:,} {noun}{'s' * (report.bodies > 0 and counts['outlier'] > 1)}"
         found.append(Line2D([], [], color=theme.muted, marker="x", linestyle="", markersize=5, label=text))
     return found
-
-
-# ----------------------------------------------------------------------------------------------------------------------
-# The sections of the report on a segmentation, as HTML.
-
-
-LISTED = 300  # matches whose names are listed on the page
-MEANING = {
-    "fundamental": "fundamental matrix: a rigid body with depth",
-    "homography": "homography: a plane, or a body seen under a rotation alone",
-}
-
-
-def body(report: SegmentationReport, drawn: tuple[bytes, bytes]) -> str:
-    """The page's sections: headline numbers, warnings, picture, bodies, comparison, labels, settings."""
-    parts = [cards(_headline(report)), _warnings(report), _picture(report, drawn)]
-    if report.bodies:
-        parts += [_bodies(report), _comparison(report), _labels(report)]
-    parts.append(provenance(report.manifest))
-    return "\n".join(part for part in parts if part)
-
-
-def describe(report: SegmentationReport) -> str:
-    """The result in plain words."""
-    number, counts = int(report.pair.seen.sum()), report.counts
-    if report.status != "OK" or not report.bodies:
-        start = f"The {number:,} matches do not decide what moves with what. {sentence(report.reason)}"
-        return start + " What follows is the best segmentation found, and not to be relied on." * (report.bodies > 0)
-    *most, last = [f"{counts[f'body {i}']:,}" for i in range(1, report.bodies + 1)]
-    moved = f"{number - counts['outlier']:,} move "
-    moved += f"with one of {report.bodies} bodies ({', '.join(most)} and {last})" if most else "as one body"
-    rest = f"; {counts['outlier']:,} fit{'s' * (counts['outlier'] == 1)} none" * (counts["outlier"] > 0)
-    lost = f" {counts['missing']:,} more {'is' if counts['missing'] == 1 else 'are'} missing in an image." * (counts["missing"] > 0)
-    return f"Of {number:,} matches of two images, {moved}{rest}.{lost}"
-
-
-def _headline(report: SegmentationReport) -> list[Card]:
-    counts, ok = report.counts, report.status == "OK"
-    number = int(report.pair.seen.sum())
-    items = [Card("Status", "Solved" if ok else "Refused", "the matches decide" if ok else report.status.lower().replace("_", " "))]
-    if not report.bodies:
-        return [*items, Card("Matches", f"{number:,}", f"and {counts['missing']:,} missing" if counts["missing"] else "")]
-    planes = sum(model == "homography" for model in report.models)
-    kind = f"{planes} by a homography" if planes else "all with depth"
-    items.append(Card("Bodies", f"{report.bodies:,}", kind))
-    items.append(Card("On a body", f"{number - counts['outlier']:,}", f"of {number:,} matches"))
-    rest = f", and {counts['missing']:,} missing in an image" if counts["missing"] else ""
-    items.append(Card("Outliers", f"{counts['outlier']:,}", f"{_share(counts['outlier'], number)} of the matches{rest}"))
-    items.append(Card("Residual", f"{_rms(report) or 'no'} px", f"rms; the threshold is {report.threshold:.3g} px"))
-    if report.misclassified is not None:
-        items.append(Card("Misclassified", f"{100 * report.misclassified:.2g} %", "against the labels of the file"))
-    return items
-
-
-def _rms(report: SegmentationReport, label: int | None = None) -> str:
-    value = report.rms(label)
-    return f"{value:.3g}" if np.isfinite(value) else ""
-
-
-def _share(part: int, whole: int) -> str:
-    share = 100 * part / max(1, whole)
-    return "under 1 %" if 0 < share < 1 else f"{share:.0f} %"
-
-
-def _warnings(report: SegmentationReport) -> str:
-    lines = [
-        f"<li><b>{escape(heading(code).capitalize())}.</b> {escape(sentence(text))}</li>"
-        for code, _, text in report.warnings
-        if text not in report.reason
-    ]
-    lines += [f"<li>{escape(sentence(note))}</li>" for note in report.notes]
-    if report.reason:
-        lines.insert(0, f'<li><b class="bad">Refused.</b> {escape(sentence(report.reason))}</li>')
-    return section("Please note", f"<ul>{''.join(lines)}</ul>") if lines else ""
-
-
-def _picture(report: SegmentationReport, drawn: tuple[bytes, bytes]) -> str:
-    note = "Every match in both images, coloured by the body that it moves with; crosses fit none."
-    if not report.bodies:
-        note = "The matches as given; no bodies were found in them."
-    ways = "Lines in image 1 lead to where image 2 shows the match; where long ones would tangle, some are drawn."
-    caption = ways if report.bodies else ""
-    alt = f"Two images: {', '.join(f'{count} {name}' for name, count in report.counts.items() if count)}"
-    title = "What moves with what" if report.bodies else "The matches"
-    return section(title, picture(drawn[0], alt, dark=drawn[1], caption=caption), note)
-
-
-def _bodies(report: SegmentationReport) -> str:
-    number, rows, matrices = int(report.pair.seen.sum()), [], []
-    for label, model in enumerate(report.models, start=1):
-        mine = report.pair.seen & (report.labels == label)
-        count = int(mine.sum())
-        dot = f'<span style="color:{colour_of(label)}" aria-hidden="true">●</span> body {label}'
-        figures = [f"{count:,}", _share(count, number), _rms(report, label), f"{int((mine & report.doubtful).sum()):,}"]
-        rows.append([dot, *figures, escape(MEANING.get(model, model))])
-        flat = report.homographies[label - 1] if model == "homography" else report.fundamentals[label - 1]
-        entries = "<br>".join("&ensp;".join(f"{value:.6g}" for value in row) for row in flat)
-        matrices.append([f"body {label}", escape(model), f"<code>{entries}</code>"])
-    names = ("Matches", "Share", "Rms residual, px", "Doubtful")
-    shown = table(
-        [Column("Body"), *(Column(name, "number") for name in names), Column("Motion")], rows, caption="Bodies", css="stack"
-    )
-    columns = [Column("Body"), Column("Model"), Column("Matrix, norm 1", "long")]
-    kept = details("Matrices", table(columns, matrices, css="plain", caption="Matrices"))
-    note = (
-        "The largest first. A residual is the Sampson distance from the motion of the own body; a match is doubtful where its "
-        "label has a probability below 0.9. Fundamental matrices fulfil x2ᵀ F x1 = 0, homographies lead from image 1 to image 2."
-    )
-    return section("How each body moved", shown + kept, note)
-
-
-def _comparison(report: SegmentationReport) -> str:
-    """How many matches of every known body were found to be of which."""
-    known = report.pair.known
-    if known is None:
-        return ""
-    rows = []
-    for label in sorted(np.unique(known[report.pair.seen]).tolist(), key=lambda label: (label == 0, label)):
-        found = report.labels[report.pair.seen & (known == label)]
-        cells = [f"{int((found == i).sum()):,}" for i in (*range(1, report.bodies + 1), 0)]
-        rows.append([f"body {label}" if label else "outlier", *(cell if cell != "0" else "" for cell in cells)])
-    columns = [Column("In the file"), *(Column(name, "number") for name in (*report.names[1:], "outlier"))]
-    note = "Rows are the labels of the file, columns what was found; the numbers of the bodies need not agree."
-    return section("Compared with the labels of the file", table(columns, rows, caption="Known and found labels"), note)
-
-
-def _labels(report: SegmentationReport) -> str:
-    several = report.counts["outlier"] > 1
-    kinds = ["outliers" if kind == "outlier" and several else kind for kind in report.kinds]
-    order = (*report.names[1:], "outliers" if several else "outlier", "missing")
-    names = listed(report.pair.ids, kinds, order, LISTED, "labels.csv")
-    doubtful = ["doubtful" if odd else "" for odd in report.doubtful.tolist()]
-    names += listed(report.pair.ids, doubtful, ("doubtful",), LISTED, "labels.csv")
-    note = "By the names of the file, or the numbers of its rows; labels.csv has them all, segmentation.npz all arrays."
-    return section("Each match", names, note)
-
-
-FILES = ("report.html", "segmentation.npz", "segmentation.json", "labels.csv", "segmentation.png")
-SURE = 0.9  # probability of its label below which a match is called doubtful
-
-
-@dataclass(frozen=True, eq=False)
-class SegmentationReport:
-    """Everything that the report on a segmentation says.
-
-    Args:
-        title: heading of the page.
-        pair: what was given.
-        labels: ``(n,)`` 0 outlier or missing, 1..K the bodies.
-        fundamentals: ``(K, 3, 3)``.
-        homographies: ``(K, 3, 3)``, 0 where the model is a fundamental matrix.
-        models: ``K`` names, fundamental or homography.
-        probabilities: ``(n, K + 1)`` of outlier and bodies.
-        residuals: ``(n,)`` distance from the own body's model, px.
-        coherence: ``(n,)`` in [0, 1].
-        threshold: greatest distance of an inlier, px.
-        status: the status's name, ``"OK"`` where the data decided.
-        reason: why not, and what to do; empty where they did.
-        warnings: code, figure and message of each.
-        notes: what a reader should know about the input, a sentence each.
-        misclassified: share of the matches whose label is not the known one; None = not known.
-        photographs: of both images; empty = none.
-        size: width and height of the images; None = not known.
-        manifest: of :func:`indexing.files.manifest`.
-    """
-
-    title: str
-    pair: MatchedPair
-    labels: NDArray[np.int64]
-    fundamentals: FloatArray
-    homographies: FloatArray
-    models: Sequence[str]
-    probabilities: FloatArray
-    residuals: FloatArray
-    coherence: FloatArray
-    threshold: float
-    status: str = "OK"
-    reason: str = ""
-    warnings: Sequence[tuple[str, float, str]] = ()
-    notes: Sequence[str] = ()
-    misclassified: float | None = None
-    photographs: Sequence[Photograph] = ()
-    size: tuple[float, float] | None = None
-    manifest: Mapping[str, Any] = field(default_factory=dict)
-
-    @property
-    def bodies(self) -> int:
-        """How many bodies."""
-        return len(self.models)
-
-    @property
-    def names(self) -> list[str]:
-        """What labels mean: outlier, body 1, body 2, ..."""
-        return ["outlier", *(f"body {i}" for i in range(1, self.bodies + 1))]
-
-    @property
-    def kinds(self) -> list[str]:
-        """What each match is: one of the names, or missing."""
-        seen = self.pair.seen.tolist()
-        return [self.names[label] if there else "missing" for label, there in zip(self.labels.tolist(), seen, strict=True)]
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """How many matches of each kind, bodies first."""
-        kinds = self.kinds
-        return {name: kinds.count(name) for name in (*self.names[1:], "outlier", "missing")}
-
-    @property
-    def certainty(self) -> FloatArray:
-        """``(n,)`` probability of the label of each match; NaN where it is missing."""
-        own = np.take_along_axis(self.probabilities, self.labels[:, None], axis=1)[:, 0]
-        return np.where(self.pair.seen, own, np.nan)
-
-    @property
-    def doubtful(self) -> NDArray[np.bool_]:
-        """``(n,)`` matches that might well have another label."""
-        return np.asarray(self.certainty < SURE)
-
-    def rms(self, label: int | None = None) -> float:
-        """Root mean square of the residuals of one body, or of all; NaN where there are no matches."""
-        mine = self.pair.seen & ((self.labels > 0) if label is None else (self.labels == label))
-        return float(np.sqrt(np.mean(np.square(self.residuals[mine])))) if mine.any() else float("nan")
-
-
-def write_segmentation(folder: str | Path, report: SegmentationReport) -> Path:
-    """Write a report into a folder: the files of :data:`FILES`, each whole or not at all, ``report.html`` last.
-
-    Returns:
-        the path of ``report.html``.
-
-    Raises:
-        ValueError: the folder or a file in it cannot be written.
-    """
-    where = files.prepare(folder)
-    drawn = picture_of(report, LIGHT), picture_of(report, DARK)
-    html = page(
-        report.title, body(report, drawn), summary=describe(report), kind="Bodies in two views", footer=made_by(report.manifest)
-    )
-    files.write_bytes(where / "segmentation.png", drawn[0])
-    files.write_text(where / "labels.csv", labels_csv(report))
-    files.write_bytes(where / "segmentation.npz", as_npz(report))
-    files.write_json(where / "segmentation.json", as_json(report))
-    return files.write_text(where / "report.html", html)
-
-
-def as_npz(report: SegmentationReport) -> bytes:
-    """All arrays, without pickle; ``x1, x2, ids, known`` are those that were given."""
-    names = ("labels", "fundamentals", "homographies", "probabilities", "residuals", "coherence", "threshold")
-    arrays: dict[str, Any] = {name: np.asarray(getattr(report, name)) for name in names}
-    arrays |= {"models": np.array(report.models, dtype=np.str_), "status": np.array(report.status)}
-    arrays |= {"x1": report.pair.x1, "x2": report.pair.x2, "ids": np.array(report.pair.ids)}
-    if report.pair.known is not None:
-        arrays["known"] = report.pair.known
-    stream = io.BytesIO()
-    np.savez_compressed(stream, **arrays)
-    return stream.getvalue()
-
-
-def as_json(report: SegmentationReport) -> dict[str, Any]:
-    """The result as numbers: bodies with their models, counts, status, warnings, and how it came about."""
-    seen = max(1, int(report.pair.seen.sum()))
-    return {
-        "status": report.status,
-        "reason": report.reason or None,
-        "pair": report.pair.name,
-        "matches": len(report.pair.ids),
-        "bodies": [
-            {
-                "label": label,
-                "matches": report.counts[f"body {label}"],
-                "share": report.counts[f"body {label}"] / seen,
-                "model": str(model),
-                "rms_residual": report.rms(label),
-                "fundamental": report.fundamentals[label - 1],
-                "homography": report.homographies[label - 1] if model == "homography" else None,
-            }
-            for label, model in enumerate(report.models, start=1)
-        ],
-        "counts": report.counts,
-        "doubtful": int(report.doubtful.sum()),
-        "rms_residual": report.rms(),
-        "threshold": report.threshold,
-        "misclassified": report.misclassified,
-        "warnings": [{"code": code, "value": value, "message": message} for code, value, message in report.warnings],
-        "notes": list(report.notes),
-        "manifest": report.manifest,
-    }
-
-
-def labels_csv(report: SegmentationReport) -> str:
-    """``id, x1, y1, x2, y2, label, name, probability, residual`` of every match; label 0 is an outlier, or missing.
-
-    The probability is that of the label, the residual the distance from the own body's model, for outliers from the nearest.
-    """
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(["id", "x1", "y1", "x2", "y2", "label", "name", "probability", "residual"])
-    columns = zip(report.pair.ids, report.pair.x1, report.pair.x2, report.kinds, report.certainty, strict=True)
-    for i, (name, first, second, kind, sure) in enumerate(columns):
-        places = [f"{value:.9g}" if np.isfinite(value) else "" for value in (*first, *second)]
-        rest = ["", ""] if kind == "missing" else [f"{sure:.4f}", f"{report.residuals[i]:.6g}" if report.bodies else ""]
-        writer.writerow([safe_cell(name), *places, int(report.labels[i]), kind, *rest])
-    return out.getvalue()

@@ -17,8 +17,7 @@ import torch
 import dyntorch
 from dyntorch.core.outcome import Notice, NoticeCode
 from dyntorch.tasks.segment.result import BodyModel, Segmentation
-from indexing.cli.segment import REASONS
-from indexing.report.segmentation import FILES
+from indexing.report.segmentation import FILES, SegmentationReport
 
 # torch's own, when it first loads its transforms; hidden outside of tests
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated")
@@ -140,7 +139,7 @@ def test_an_archive_with_labels(run, solved, scene):
     assert [int(row["label"]) for row in rows] == arrays["labels"].tolist()
     assert float(rows[0]["x1"]) == pytest.approx(x1[0, 0]) and float(rows[0]["probability"]) == pytest.approx(0.9333, abs=1e-4)
     page = Path("out/report.html").read_text()
-    assert page.count("data:image/png;base64,") == 2 and "Compared with the labels of the file" in page and "1.7 %" in page
+    assert page.count("data:image/png;base64,") == 1 and "Compared with the labels of the file" in page and "1.7 %" in page
 
 
 def test_the_same_from_other_files(run, solved):
@@ -207,7 +206,8 @@ def test_data_that_cannot_decide_are_refused_with_code_3(run, solved, monkeypatc
 
     monkeypatch.setattr(dyntorch, "segment", nothing)
     code, out, err = run("@/m.npz --out out")
-    assert (code, err) == (3, f"dyntorch: refused: {REASONS['NO_CONSENSUS']}\n") and re.search(r"unlabelled +119", out)
+    assert (code, err) == (3, f"dyntorch: refused: {SegmentationReport.REASONS['NO_CONSENSUS']}\n")
+    assert re.search(r"unlabelled +119", out)
     assert read()["status"] == "NO_CONSENSUS" and read()["bodies"] == [] and read()["misclassified"] is None
     page = Path("out/report.html").read_text()
     assert "do not decide" in page and "How each body moved" not in page and "Refused." in page
@@ -287,4 +287,4 @@ def test_help_loads_nothing_heavy():
 
 
 def test_every_status_has_a_reason():
-    assert set(REASONS) == {status.name for status in dyntorch.Status} - {"OK"}
+    assert set(SegmentationReport.REASONS) == {status.name for status in dyntorch.Status} - {"OK"}

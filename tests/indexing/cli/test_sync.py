@@ -60,7 +60,7 @@ def library(monkeypatch):
 
     monkeypatch.setattr(dyntorch, "synchronize", answer, raising=False)
     monkeypatch.setattr(dyntorch, "synchronize_cameras", synchronize_cameras, raising=False)
-    monkeypatch.setattr("indexing.report.sync.picture_of", lambda report, theme: DRAWN)  # half of a run's time
+    monkeypatch.setattr("indexing.report.sync.picture_of", lambda report: DRAWN)  # half of a run's time
     return said
 
 

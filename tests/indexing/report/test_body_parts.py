@@ -9,7 +9,7 @@ import torch
 from indexing import ActionIndexer, Clip
 from indexing.action.bank import Windows
 from indexing.action.learning import halves, importance
-from indexing.report.learned import BodyParts, body_parts, body_parts_section, in_body, measure_body_parts
+from indexing.report.learned import BodyParts, body_parts, in_body, measure_body_parts, telling_joints
 from indexing.skeleton import COCO17
 
 JOINTS, TELLING = 6, 2
@@ -77,11 +77,11 @@ def people(count, joints=17, skeleton=COCO17, unseen=()):
     return BodyParts([f"<move {i}>" for i in range(count)], rng.normal(size=(count, joints)), clips)
 
 
-def test_the_section_names_the_joints_and_holds_both_pictures():
-    html = body_parts_section(people(2))
-    assert html.count("data:image/png;base64,") == 2
-    assert "&lt;move 1&gt;" in html
-    assert "(100%)" in html
+def test_the_joints_that_matter_most_are_named():
+    rows = telling_joints(people(2))
+    assert [label for label, _ in rows] == ["<move 0>", "<move 1>"] and all("(100%)" in str(joints) for _, joints in rows)
+    nobody = BodyParts(["a"], -np.ones((1, 17)), people(1).examples)
+    assert "none stands out" in telling_joints(nobody)[0][1]
 
 
 def test_skeletons_without_bones_or_names_and_joints_that_were_not_seen():

@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import re
+import struct
 from dataclasses import dataclass
 from html.parser import HTMLParser
 
@@ -18,6 +19,7 @@ from indexing.report import EvaluationResult, RecognitionReport, RecordingResult
 from indexing.report.recognition import events_csv
 from indexing.skeleton import from_names
 
+PNG = struct.pack(">8sI4sII", b"\x89PNG\r\n\x1a\n", 13, b"IHDR", 30, 30)
 SCRIPT = "<script>alert(1)</script>"
 STICK = from_names(
     "stick", ("nose", "left_hand", "right_hand", "hip", "left_foot", "right_foot"),
@@ -205,14 +207,21 @@ def test_a_file_in_the_way_is_refused_before_anything_is_written(tmp_path):
 
 
 def test_page_parts_escape_and_nest():
-    body = page.section(
-        "A & B", page.cards([page.Card("<n>", "1", "<i>")]) + page.details("more", page.settings({"a": {"b": [1, 2]}}))
-    )
-    text = page.page("<t>", body, summary="<s>", kind="<k>", footer="<f>")
+    notes = page.remarks("", [("<k>", 1.0, "<m>")], ["<q>"])
+    report = {"title": "<t>", "notes": notes, "manifest": {"a": {"b": [1, 2]}, "time": "<f>"}}
+    values = {"cards": [("<n>", "1", "<i>\x00")], "joints": [["<j>", "A & B"]]}
+    drawn = {"picture": page.Picture(PNG, tips=[page.Tip(0, 0, 1, 1, "<u>")]), "weighing": [], "examples": []}
+    text = page.render("learned", report, summary="<s>", **values, **drawn)
     assert Page(text).bad == [] and "A &amp; B" in text and "<code>a.b</code>" in text and "<code>1 2</code>" in text
-    assert not re.search(r"<(n|i|s|k|f|t)>", text)
-    assert "5 more lines" in page.settings({str(i): i for i in range(205)})
+    assert not re.search(r"<(n|i|s|k|m|q|j|u|f|t)>", text) and "\x00" not in text
+    long = page.render("learned", {**report, "manifest": {str(i): i for i in range(205)}}, summary="", **values, **drawn)
+    assert "5 more lines" in long and "<code>199</code>" in long and "<code>200</code>" not in long
     assert 'width="100.0"' in page.bar(1.7) and 'width="0.0"' in page.bar(-1)
+
+
+def test_a_picture_is_turned_dark_by_the_style_sheet_and_a_photograph_is_drawn_twice():
+    assert [theme for theme, _ in page.Picture(PNG).images] == ["drawn"]
+    assert [theme for theme, _ in page.Picture(PNG, dark=PNG).images] == ["light", "dark"]
 
 
 def test_what_is_always_right_takes_one_line(tmp_path):
@@ -229,9 +238,9 @@ def test_what_is_always_right_takes_one_line(tmp_path):
 
 def test_a_folder_of_frames_is_one_line_of_the_settings():
     inputs = {"op": {f"op_{i:012d}_keypoints.json": f"{i:064x}" for i in range(1164)}, "moves.safetensors": "f" * 64}
-    html = page.settings({"inputs": inputs})
-    assert html.count("<tr>") == 3 and "1,164 files, each in manifest.json; sha256 of their names and hashes: " in html
-    assert "more lines" not in html and "f" * 64 in html
+    (_, folder), last = page.settings({"inputs": inputs})
+    assert str(folder).startswith("1,164 files, each in manifest.json; sha256 of their names and hashes: ")
+    assert last == ("inputs.moves.safetensors", "f" * 64)
 
 
 def test_finds_are_explained_and_the_comparison_stacks_on_narrow_screens(tmp_path):
@@ -242,4 +251,4 @@ def test_finds_are_explained_and_the_comparison_stacks_on_narrow_screens(tmp_pat
     text = write(tmp_path, report)
     assert "Score: the evidence for the action" in text and "Margin: how far that is above the next best" in text
     assert "1 of them false" in text and "<title>found: lunge, 5.00 to 6.50 s</title>" in text
-    assert '<table class="stack"><thead><tr><th scope="col" class="">Setting' in text
+    assert re.search(r'<table class="stack">\s*<thead><tr><th scope="col" class="">Setting', text)

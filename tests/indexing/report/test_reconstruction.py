@@ -5,15 +5,28 @@ from __future__ import annotations
 import csv
 import dataclasses
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 
+from dyntorch import Status
+from dyntorch.core.outcome import Notice, NoticeCode
+from dyntorch.tasks.reconstruct.result import Ranked, Reconstruction
 from indexing.readers.tracks import TrackSet
 from indexing.report.reconstruction import ReconstructionReport, as_json, points_csv, write_reconstruction
 from indexing.report.reconstruction_picture import around, as_first_camera, nearest_frame, sample
 
 SCRIPT = "<script>alert(1)</script>"
+
+
+class Told(NoticeCode):
+    HOSTILE = "hostile", SCRIPT
+    WHY = "why", "why"
+    WEAK_STACK = "weak_stack", "nearly one centre"
+    FEW = "few_observed", "few"
+    BEHIND = "behind", "1 is behind"
 
 
 def report(dim: int = 2, **changes) -> ReconstructionReport:
@@ -27,14 +40,32 @@ def report(dim: int = 2, **changes) -> ReconstructionReport:
     rays = positions @ cameras[0, :, :-1].T + cameras[0, :, -1]
     tracks = TrackSet("t.csv", rays[..., :2] / rays[..., 2:], (SCRIPT, "=1+1", "-2", "d", "e"), ("0", SCRIPT), np.arange(2.0))
     points[4] = positions[:, 4] = tracks.values[1, 4] = np.nan
+    motion = changes.pop("motion", SimpleNamespace(name="constant_velocity_2d", bodies=1, static=False))
     values = {
-        "title": SCRIPT, "motion": ("constant_velocity_2d", "Points."), "tracks": tracks, "cameras": cameras, "points": points,
-        "positions": positions, "velocities": np.tile(speed, (5, 1)), "labels": np.array([1, 2, 0, 2, 0]), "residual": 0.1,
-        "residuals": np.full((2, 5), 0.1), "inliers": np.ones((2, 5), dtype=bool), "structure": np.ones((5, 2 * dim + 1)),
-        "projections": np.ones((2, 3, 2 * dim + 1)), "sigma": 0.1, "warnings": [("weak_stack", 1.0, SCRIPT)],
-        "candidates": [("constant_velocity_2d", 1.0, 0.1, ""), (SCRIPT, float("inf"), float("nan"), SCRIPT)],
+        "cameras": cameras, "points": points, "velocities": np.tile(speed, (5, 1)), "labels": np.array([1, 2, 0, 2, 0]),
+        "residual": np.array(0.1), "residuals": np.full((2, 5), 0.1), "sigma": np.array(0.1), "status": np.array(0),
+        "structure": np.ones((5, 2 * dim + 1)), "projections": np.ones((2, 3, 2 * dim + 1)),
+        "inliers": np.ones((2, 5), dtype=bool), "times": np.arange(2.0),
     }  # fmt: skip
-    return ReconstructionReport(**{**values, **changes})
+    changed = {name: changes.pop(name, value) for name, value in values.items()}
+    positions = changes.pop("positions", positions)
+    tensors = {name: None if value is None else torch.as_tensor(value) for name, value in changed.items()}
+    candidates = (Ranked("constant_velocity_2d", 1.0, 0.1), Ranked(SCRIPT, float("inf"), float("nan"), SCRIPT))
+    said = changes.pop("said", (Told.HOSTILE,))
+    notices = tuple(Notice(code, 1.0) for code in said)
+    result = Placed(motion=motion, **tensors, ambiguity="", notices=notices, candidates=candidates)
+    result.__dict__["positions"] = torch.as_tensor(positions)
+    return ReconstructionReport(**{"result": result, "heading": SCRIPT, "tracks": tracks, **changes})
+
+
+class Placed(Reconstruction):
+    """A reconstruction whose points are told to be somewhere at the times of the views."""
+
+    def at(self, time):
+        return self.__dict__["positions"][int(time)]
+
+
+TWO = SimpleNamespace(name="two_bodies_2d", bodies=2, static=False)
 
 
 def test_what_comes_from_files_is_escaped(tmp_path):
@@ -49,11 +80,11 @@ def test_every_kind_of_data_can_be_drawn(tmp_path):
     nothing = np.full((5, 2), np.nan)
     for i, made in enumerate((
         report(3),
-        report(cameras=np.zeros((2, 3, 3)), points=nothing, positions=np.stack([nothing] * 2), status="DEGENERATE", reason="no"),
-        report(2, bodies=2, velocities=None),
-        report(3, bodies=2, velocities=None),
+        report(cameras=np.zeros((2, 3, 3)), points=nothing, positions=np.stack([nothing] * 2), status=Status.DEGENERATE),
+        report(2, motion=TWO, velocities=None),
+        report(3, motion=TWO, velocities=None),
         report(labels=np.zeros(5, dtype=int)),
-        report(velocities=np.zeros((5, 2)), positions=np.stack([report().points] * 2)),
+        report(velocities=np.zeros((5, 2)), positions=np.stack([report().found.points] * 2)),
     )):  # fmt: skip
         page = write_reconstruction(tmp_path / str(i), made).read_text()
         assert "<img" in page and "nan" not in page.partition("<main>")[2].replace("data:image", "").split("base64")[0]
@@ -61,7 +92,7 @@ def test_every_kind_of_data_can_be_drawn(tmp_path):
 
 
 def test_json_has_no_scene_where_there_is_none():
-    found = as_json(report(cameras=np.zeros((2, 3, 3)), status="DEGENERATE", reason="why"))
+    found = as_json(report(cameras=np.zeros((2, 3, 3)), status=Status.DEGENERATE, said=[Told.WHY]))
     assert found["status"] == "DEGENERATE" and found["reason"] == "why" and found["cameras"] is None
 
 
@@ -79,7 +110,7 @@ def test_what_the_pictures_show(dim):
 
 def test_a_point_without_a_position_is_missing_where_too_few_views_show_it_and_an_outlier_otherwise():
     made = report()
-    values, points = np.repeat(report().tracks.values, 2, axis=0), made.points.copy()
+    values, points = np.repeat(report().tracks.values, 2, axis=0), made.found.points.copy()
     values[2:, 3], points[2:] = np.nan, np.nan  # four coordinates for the four unknowns of a point, eight, and four
     weights = np.ones((4, 5))
     weights[1:, 2] = 0
@@ -92,10 +123,9 @@ def test_a_point_without_a_position_is_missing_where_too_few_views_show_it_and_a
 def test_what_a_refused_report_says_and_does_not(tmp_path):
     write_reconstruction(tmp_path, report())
     assert (tmp_path / "scene.png").exists()
-    warnings = [("weak_stack", 1.0, "nearly one centre"), ("behind", 1.0, "1 point is behind a camera")]
-    page = write_reconstruction(
-        tmp_path, report(status="AMBIGUOUS", reason="nearly one centre", warnings=warnings, inliers=np.arange(10).reshape(2, 5) > 0)
-    ).read_text()
+    said = [Told.WEAK_STACK, Told.FEW, Told.BEHIND]
+    made = report(status=Status.AMBIGUOUS, said=said, inliers=np.arange(10).reshape(2, 5) > 0)
+    page = write_reconstruction(tmp_path, made).read_text()
     assert not (tmp_path / "scene.png").exists() and "The scene</h2>" not in page and page.count("early one centre") == 1
     assert "Refused: views too alike." in page and "Points behind a camera." in page and "No camera sees what is behind it" in page
     assert "1 single observation left out" in page

@@ -7,7 +7,10 @@ import json
 
 import numpy as np
 import pytest
+import torch
 
+from dyntorch import Segmentation, Status
+from dyntorch.core.outcome import Notice, NoticeCode
 from indexing.readers.pairs import MatchedPair, Photograph
 from indexing.report.canvas import DARK, LIGHT
 from indexing.report.segmentation import (
@@ -23,6 +26,12 @@ from indexing.report.segmentation import (
 SCRIPT = "<script>alert(1)</script>"
 
 
+class Told(NoticeCode):
+    HOSTILE = "hostile", SCRIPT
+    UNCERTAIN = "uncertain", "it is open"
+    WHY = "why", "why"
+
+
 def report(bodies: int = 2, count: int = 8, **changes) -> SegmentationReport:
     """Matches that belong to the bodies and the outliers in turn, of which the last is missing."""
     rng = np.random.default_rng(0)
@@ -34,13 +43,17 @@ def report(bodies: int = 2, count: int = 8, **changes) -> SegmentationReport:
     labels[-1] = 0
     probabilities = np.eye(bodies + 1)[labels] * 0.95 + 0.05 / (bodies + 1)
     probabilities[-1] = 0
-    values = {
-        "title": SCRIPT, "pair": MatchedPair("m.csv", SCRIPT, x1, x2, ids), "labels": labels,
-        "fundamentals": np.tile(np.eye(3), (bodies, 1, 1)), "homographies": np.zeros((bodies, 3, 3)),
-        "models": ["fundamental"] * bodies, "probabilities": probabilities, "residuals": np.full(count, 0.5),
-        "coherence": np.ones(count), "threshold": 2.5, "warnings": [("uncertain", 1.0, SCRIPT)], "notes": [SCRIPT],
+    result = {
+        "labels": labels, "bodies": np.array(bodies), "fundamentals": np.tile(np.eye(3), (bodies, 1, 1)),
+        "homographies": np.zeros((bodies, 3, 3)), "probabilities": probabilities, "residuals": np.full(count, 0.5),
+        "coherence": np.ones(count), "status": np.array(0), "threshold": np.array(2.5),
     }  # fmt: skip
-    return SegmentationReport(**{**values, **changes})
+    known = {name: torch.as_tensor(changes.pop(name, value)) for name, value in result.items()}
+    models = tuple(changes.pop("models", ["fundamental"] * bodies))
+    said = (Notice(changes.pop("said", Told.HOSTILE), 1.0),)
+    found = Segmentation(**known, models=models, notices=said)
+    pair = MatchedPair("m.csv", SCRIPT, x1, x2, ids)
+    return SegmentationReport(**{"result": found, "pair": pair, "heading": SCRIPT, "notes": [SCRIPT], **changes})
 
 
 def photograph(wide: int = 100, tall: int = 80) -> Photograph:
@@ -60,7 +73,7 @@ def test_every_kind_of_data_can_be_drawn(tmp_path):
     for i, made in enumerate((
         report(1, 12),
         report(0),
-        report(0, status="NO_CONSENSUS", reason="no"),
+        report(0, status=Status.NO_CONSENSUS),
         report(11, 40),  # more bodies than colours
         report(labels=np.zeros(8, dtype=int)),
         report(models=["fundamental", "homography"], homographies=np.tile(np.eye(3), (2, 1, 1))),
@@ -73,7 +86,7 @@ def test_every_kind_of_data_can_be_drawn(tmp_path):
         assert "<img" in page and "nan" not in page.partition("<main>")[2].replace("data:image", "").split("base64")[0]
         found = json.loads((tmp_path / str(i) / "segmentation.json").read_text())
         assert len(found["bodies"]) == made.bodies
-        assert np.load(tmp_path / str(i) / "segmentation.npz")["labels"].tolist() == made.labels.tolist()
+        assert np.load(tmp_path / str(i) / "segmentation.npz")["labels"].tolist() == made.found.labels.tolist()
 
 
 def test_numbers_of_a_report():
@@ -83,7 +96,7 @@ def test_numbers_of_a_report():
     assert made.rms() == pytest.approx(np.sqrt(7.5)) and np.isnan(report(0).rms())
     found = as_json(made)
     assert [part["share"] for part in found["bodies"]] == [2 / 7, 2 / 7] and found["doubtful"] == 0
-    doubtful = made.probabilities.copy()
+    doubtful = made.found.probabilities.copy()
     doubtful[1] = [0.2, 0.5, 0.3]
     assert report(probabilities=doubtful).doubtful.tolist() == [False, True, *[False] * 6]
 
@@ -93,8 +106,8 @@ def test_numbers_of_a_report():
     [
         (report(), "Of 7 matches of two images, 4 move with one of 2 bodies (2 and 2); 3 fit none. 1 more is missing in an image."),
         (report(1), "Of 7 matches of two images, 3 move as one body; 4 fit none. 1 more is missing in an image."),
-        (report(status="AMBIGUOUS", reason="it is open"), "do not decide what moves with what. It is open. What follows is"),
-        (report(0, status="NO_CONSENSUS", reason="why"), "The 7 matches do not decide what moves with what. Why."),
+        (report(status=Status.AMBIGUOUS, said=Told.UNCERTAIN), "do not decide what moves with what. It is open. What follows is"),
+        (report(0, said=Told.WHY), "The 7 matches do not decide what moves with what. Why."),
     ],
 )
 def test_the_summary(made, says):
@@ -104,11 +117,10 @@ def test_the_summary(made, says):
 def test_what_is_known_is_compared_and_what_is_refused_is_said_once(tmp_path):
     pair = report().pair
     known = MatchedPair(pair.path, "m", pair.x1, pair.x2, pair.ids, known=np.array([0, 2, 1, 0, 2, 1, 1, 1]))
-    made = report(
-        pair=known, misclassified=1 / 7, status="AMBIGUOUS", reason="it is open", warnings=[("uncertain", 1.0, "it is open")]
-    )
+    made = report(pair=known, status=Status.AMBIGUOUS, said=Told.UNCERTAIN)
     page = write_segmentation(tmp_path, made).read_text()
-    assert "Compared with the labels of the file" in page and "14 %" in page and "<b>Uncertain." not in page
+    assert "Compared with the labels of the file" in page and f"{100 * made.misclassified:.2g} %" in page
+    assert "Refused: uncertain." in page and page.count("It is open.") == 2 and "<b>Uncertain." not in page
     assert "Compared" not in write_segmentation(tmp_path, report()).read_text()
 
 
