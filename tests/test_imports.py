@@ -148,7 +148,8 @@ def test_names_that_moved_into_rooms_are_found_at_their_old_place_with_a_warning
         assert dyntorch.triangulate is dyntorch.geometry.triangulate
     for room, names in dyntorch._MOVED.items():
         assert set(names) <= set(import_module(f"dyntorch.{room}").__all__)
-    assert len(dyntorch._HOME) <= 50
+    # what a verb decides with stands beside the verb, one class each
+    assert len([name for name in dyntorch._HOME if not name.endswith("Options")]) <= 50
 
 
 def test_only_the_demo_uses_the_actors():

@@ -13,6 +13,7 @@ _HOME = {
     "undistort": "dyntorch.geometry.lens",
     "distort": "dyntorch.geometry.lens",
     "fit_distortion": "dyntorch.geometry.lens",
+    "LensOptions": "dyntorch.geometry.options",
     "line_camera": "dyntorch.geometry.lines",
     "triangulate": "dyntorch.geometry.triangulation",
     "resect": "dyntorch.geometry.triangulation",

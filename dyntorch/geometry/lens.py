@@ -12,7 +12,8 @@ from torch import Tensor
 from dyntorch.geometry.epipolar import TINY, eight_point
 from dyntorch.geometry.epipolar_fit import Frames
 from dyntorch.geometry.homogeneous import homogeneous
-from dyntorch.numerics.arguments import on_cpu
+from dyntorch.geometry.options import LensOptions
+from dyntorch.numerics.arguments import check_options, on_cpu
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.numerics.least_squares import damped_step
 
@@ -254,18 +255,9 @@ def _invert(target: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
 
 RANGE = (-0.8, 0.4)
 """Of lambda: from a fisheye of 150 degrees across the diagonal to more pincushion than any lens sold."""
-STARTS = ((0.0, 0.0), (-0.15, -0.15), (-0.4, -0.4), (-0.3, 0.0), (0.0, -0.3))
-MOST, FEW = 1500, 300
-"""Matches that are used, and those that choose among the starts: lambda is known to 1e-3 long before."""
-LEAST = 40
-CAP = 9.0
-"""Squared distances count up to this multiple of the squared scale."""
 ITERATIONS, CONVERGED = 30, 1e-6
 NEAR = 1e-5
 """Of a parameter: the step of a difference."""
-FOLDS = 4
-SIGNIFICANT = 12.0
-"""Of F(2, n - 9): 1e-5 of ideal cameras with independent errors exceed it, and the held-out parts guard against the others."""
 
 
 @dataclass(frozen=True)
@@ -306,7 +298,12 @@ class LensFit:
 @one_thread
 @on_cpu
 def fit_distortion(
-    a: Tensor, b: Tensor, weights: Tensor | None = None, sizes: Sequence[Sequence[float] | None] | None = None
+    a: Tensor,
+    b: Tensor,
+    weights: Tensor | None = None,
+    sizes: Sequence[Sequence[float] | None] | None = None,
+    *,
+    options: LensOptions = LensOptions(),
 ) -> LensFit:
     r"""One parameter of radial distortion per camera, and whether it is there:
 
@@ -322,6 +319,7 @@ def fit_distortion(
         a, b: ``(N, 2)`` px, matches in the order of time; NaN = none.
         weights: ``(N,)``, 0 = ignore.
         sizes: (width, height) of the pictures; without, the boxes of the points stand in for them.
+        options: every number that decides; ``dataclasses.replace`` changes some of them.
 
     Returns:
         Lenses that straighten the two cameras' points; lambda = 0 and not significant where there are too few matches.
@@ -342,6 +340,7 @@ def fit_distortion(
         >>> round(fit.lambda_a, 4), round(fit.lambda_b, 4), fit.significant
         (-0.2, -0.2, True)
     """
+    check_options(options, LensOptions)
     if a.ndim != 2 or a.shape[-1] != 2 or a.shape != b.shape:
         raise ValueError(f"matches must be (N, 2) in both cameras, got {tuple(a.shape)} and {tuple(b.shape)}")
     weights = torch.ones(len(a)) if weights is None else weights
@@ -350,9 +349,9 @@ def fit_distortion(
     sizes = (None, None) if sizes is None else sizes
     chosen = (a.isfinite().all(-1) & b.isfinite().all(-1) & (weights > 0)).nonzero().flatten()
     ideal = Division.of(a[chosen].double(), sizes[0]), Division.of(b[chosen].double(), sizes[1])
-    if len(chosen) < LEAST:
+    if len(chosen) < options.fewest:
         return LensFit(ideal, (torch.inf, torch.inf), 0.0, False)
-    data = LensMatches.of(a[chosen].double(), b[chosen].double(), weights[chosen].double(), ideal).subset(MOST)
+    data = LensMatches.of(a[chosen].double(), b[chosen].double(), weights[chosen].double(), ideal, options).subset(options.matches)
     plain, full = _fitted(data)
     scale = _scale(data, full)
     plain, full = plain.descended(data, scale, lens=False), full.descended(data, scale, lens=True)
@@ -360,8 +359,8 @@ def fit_distortion(
     free = float((data.weights / data.weights.max()).sum()) - 9
     strength = full.lens[0]
     inside = bool(((strength > RANGE[0]) & (strength < RANGE[1])).all())
-    clear = inside and free > 0 and (before - after) / 2 > SIGNIFICANT * max(after, TINY) / free
-    significant = clear and all(_holds(data, plain, full, scale, fold) for fold in range(FOLDS))
+    clear = inside and free > 0 and (before - after) / 2 > options.significant * max(after, TINY) / free
+    significant = clear and all(_holds(data, plain, full, scale, fold) for fold in range(options.folds))
     lenses = tuple(Division(float(value), one.centre, one.radius) for value, one in zip(strength, ideal, strict=True))
     sigma = full.sigmas(data, scale) * max(after / max(free, 1.0), 0.0) ** 0.5
     gain = 1 - float(_median(full.distances(data), data.weights) / _median(plain.distances(data), data.weights))
@@ -379,22 +378,25 @@ class LensMatches:
     """``(N,)``."""
     radii: tuple[float, float]
     """px."""
+    options: LensOptions
 
     @staticmethod
-    def of(a: Tensor, b: Tensor, weights: Tensor, ideal: tuple[Division, Division]) -> LensMatches:
+    def of(
+        a: Tensor, b: Tensor, weights: Tensor, ideal: tuple[Division, Division], options: LensOptions = LensOptions()
+    ) -> LensMatches:
         """Of pixels."""
         first, second = ((x - lens.centre) / lens.radius for x, lens in zip((a, b), ideal, strict=True))
-        return LensMatches(first, second, weights, (ideal[0].radius, ideal[1].radius))
+        return LensMatches(first, second, weights, (ideal[0].radius, ideal[1].radius), options)
 
     def subset(self, count: int) -> LensMatches:
         """As many of them, evenly spread."""
         n = len(self.a)
         chosen = torch.arange(min(count, n), device=self.a.device) * n // min(count, n)
-        return LensMatches(self.a[chosen], self.b[chosen], self.weights[chosen], self.radii)
+        return LensMatches(self.a[chosen], self.b[chosen], self.weights[chosen], self.radii, self.options)
 
     def weighing(self, weights: Tensor) -> LensMatches:
         """The same matches with other weights."""
-        return LensMatches(self.a, self.b, weights, self.radii)
+        return LensMatches(self.a, self.b, weights, self.radii, self.options)
 
     def distances(self, F: Tensor, lens: Tensor) -> Tensor:
         """Signed Sampson distances ``(B, N)`` in px, of F ``(B, 3, 3)`` and lambda ``(B, 2)``."""
@@ -430,7 +432,7 @@ class LensDescent:
 
     def cost(self, data: LensMatches, scale: Tensor) -> Tensor:
         """Truncated squared distances ``(B,)`` in units of ``scale``."""
-        return ((self.distances(data) / scale).square().clamp(max=CAP) * data.weights).sum(-1)
+        return ((self.distances(data) / scale).square().clamp(max=data.options.cap) * data.weights).sum(-1)
 
     def best(self, data: LensMatches, scale: Tensor) -> LensDescent:
         """The one with the least cost."""
@@ -446,7 +448,7 @@ class LensDescent:
         moved = LensDescent(Frames(turns, core), lens).moved(torch.cat([near, -near]).repeat(len(away), 1))
         ahead, behind = moved.distances(data).unflatten(0, (-1, 2, 9)).unbind(1)
         jacobian = ((ahead - behind) / (2 * NEAR)).mT / scale[..., None]
-        weighted = (data.weights * (away.square() < CAP))[..., None] * jacobian
+        weighted = (data.weights * (away.square() < data.options.cap))[..., None] * jacobian
         return (weighted * away[..., None]).sum(1), weighted.mT @ jacobian
 
     def descended(self, data: LensMatches, scale: Tensor, *, lens: bool) -> LensDescent:
@@ -477,8 +479,8 @@ class LensDescent:
 
 def _fitted(data: LensMatches) -> tuple[LensDescent, LensDescent]:
     """The best fits without and with lenses."""
-    few = data.subset(FEW)
-    lens = torch.tensor(STARTS, dtype=data.a.dtype, device=data.a.device)
+    few = data.subset(data.options.start_matches)
+    lens = torch.tensor(data.options.starts, dtype=data.a.dtype, device=data.a.device)
     F = torch.cat([_start(few, one) for one in lens])
     every = LensDescent(Frames.of(F), lens)
     scale = _scale(few, every).min()
@@ -492,7 +494,7 @@ def _start(data: LensMatches, lens: Tensor) -> Tensor:
     """F ``(1, 3, 3)`` of straightened points, weighed again by the distances a few times."""
     p, q = _rays(data.a, lens[:1]), _rays(data.b, lens[1:])
     weights = data.weights[None]
-    for _ in range(4):
+    for _ in range(data.options.start_rounds):
         F = eight_point(p[:, :2] / p[:, 2:], q[:, :2] / q[:, 2:], weights, rounds=1)
         away = data.distances(F, lens[None])
         weights = data.weights / (1 + (away / _median(away, data.weights)[:, None]).square())
@@ -510,7 +512,7 @@ def _scale(data: LensMatches, fit: LensDescent) -> Tensor:
 
 def _holds(data: LensMatches, plain: LensDescent, full: LensDescent, scale: Tensor, fold: int) -> bool:
     """Whether lenses fitted without one part of the matches explain that part better than no lenses do."""
-    place = torch.arange(len(data.weights), device=data.weights.device) * FOLDS // len(data.weights)
+    place = torch.arange(len(data.weights), device=data.weights.device) * data.options.folds // len(data.weights)
     rest, part = (data.weighing(data.weights * own) for own in (place != fold, place == fold))
     costs = [fit.descended(rest, scale, lens=lens).cost(part, scale) for fit, lens in ((plain, False), (full, True))]
     return bool(costs[1] < costs[0])

@@ -17,7 +17,6 @@ from dyntorch.numerics.blocks import constant
 from dyntorch.numerics.nullspace import null_space
 from dyntorch.shapes.basis import Polynomial, Trajectory, extremes, times_of_views
 from dyntorch.shapes.moving import (
-    AMBIGUOUS,
     ProjectedShapes,
     centred_views,
     fit_shapes,
@@ -27,6 +26,7 @@ from dyntorch.shapes.moving import (
     shapes_through,
     slopes,
 )
+from dyntorch.shapes.options import ShapesOptions
 from dyntorch.shapes.static import centred
 from dyntorch.shapes.times import Recovery, recover_times
 
@@ -335,11 +335,12 @@ class DynamicShapeTensor(Invariant):
         """The form ``joint`` by least squares over all points; the others are the null space of the rows."""
         if self.form != "joint":
             return None
+        options = ShapesOptions()
         with torch.no_grad():
             measured = views[0]
             rows = self.trajectory.rows(measured[..., 0, 3])
-            found = fit_shapes(measured[..., :2], rows, measured[..., 2], share=weights)
-        ambiguous = found.uncertainty > AMBIGUOUS
+            found = fit_shapes(measured[..., :2], rows, measured[..., 2], share=weights, options=options)
+        ambiguous = found.uncertainty > options.ambiguous
         return Estimate(beside(found.shapes), found.few, found.degenerate, ambiguous, found.uncertainty)
 
     @on_class

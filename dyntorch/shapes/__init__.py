@@ -13,6 +13,8 @@ from dyntorch import _lazily
 _HOME = {
     "fit_shapes": "dyntorch.shapes.moving",
     "MovingShapes": "dyntorch.shapes.moving",
+    "ShapesOptions": "dyntorch.shapes.options",
+    "RecoveryOptions": "dyntorch.shapes.options",
     "recover_times": "dyntorch.shapes.times",
     "Recovery": "dyntorch.shapes.times",
 }

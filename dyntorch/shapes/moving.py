@@ -10,16 +10,18 @@ from torch import Tensor
 
 from dyntorch.core.outcome import Outcome, Status, status_of
 from dyntorch.geometry.homogeneous import nonzero_sign
+from dyntorch.numerics.arguments import check_options
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.numerics.least_squares import minimize
 from dyntorch.numerics.nullspace import eigenvalues, eigh, gram_null_space, null_space, spectrum
+from dyntorch.shapes.options import ShapesOptions
 from dyntorch.shapes.static import centred
 
 # ----------------------------------------------------------------------------------------------------------------------
 # All joints of a moving shape at once: the least squares shapes :math:`X_b` behind single affine views of it.
 
 
-FLAT = 1e-12
+RIDGE_EPSILON = 1e-12
 """Ridge of the Gram of three coordinates, of its trace: a planar shape keeps the residual finite and exact to 1e-12."""
 
 
@@ -96,7 +98,7 @@ def project(x: Tensor, weights: Tensor, shape: Tensor) -> ProjectedShapes:
     seen = x * root
     gram = moved.mT @ moved
     eye = torch.eye(gram.shape[-1], dtype=x.dtype, device=x.device)
-    ridge = FLAT * gram.diagonal(dim1=-2, dim2=-1).sum(-1) + torch.finfo(x.dtype).tiny
+    ridge = RIDGE_EPSILON * gram.diagonal(dim1=-2, dim2=-1).sum(-1) + torch.finfo(x.dtype).tiny
     factor, _ = torch.linalg.cholesky_ex(gram + ridge[..., None, None] * eye)
     inverse = torch.linalg.solve_triangular(factor, eye.expand_as(factor), upper=False).mT
     basis = moved @ inverse
@@ -223,16 +225,6 @@ def descend(views: AffineViews, rows: Tensor, shapes: Tensor, iterations: int) -
 # Linear forms of a moving shape seen by affine cameras: the graph over a basis, and the span of all its positions.
 
 
-RANK = 1e-9
-"""Singular value, of the largest, below which products of basis functions are the same function at these times."""
-NEAREST = 6
-"""Least number of views in a window in which the shape is taken to stand still."""
-ANCHORS = 200
-"""Windows at most."""
-ROUNDS = 3
-"""Rounds in which missing points are filled in from the mean shape."""
-
-
 @dataclass(frozen=True)
 class Graph:
     r"""The subspace as a graph over three coordinates: :math:`D(t)\, z_j = \sum_i N_{ij}(t)\, y_i`.
@@ -289,24 +281,24 @@ def graph(y: Tensor, z: Tensor, powers: Tensor, share: Tensor) -> Graph:
     return Graph(scale, slopes, flat | found.degenerate)
 
 
-def complete(views: AffineViews) -> Tensor:
+def complete(views: AffineViews, options: ShapesOptions = ShapesOptions()) -> Tensor:
     """The centred views ``(b, views, n, 2)`` with missing points filled in from the mean shape of all views."""
     x, seen = views.x, (views.weights > 0)[..., None]
     if bool(seen.all()):
         return x
-    for _ in range(ROUNDS):
+    for _ in range(options.starts.fill_rounds):
         mean = leading(x, views.share)[:, None]
         part = torch.where(seen, mean, 0.0)
-        filled = mean @ _regressed(part, torch.where(seen, x, 0.0))
+        filled = mean @ _regressed(part, torch.where(seen, x, 0.0), options.starts.fill_ridge)
         x = torch.where(seen, x, filled)
         x = x - x.mean(-2, keepdim=True)
     return x
 
 
-def _regressed(basis: Tensor, x: Tensor) -> Tensor:
+def _regressed(basis: Tensor, x: Tensor, ridge: float) -> Tensor:
     gram = basis.mT @ basis
-    ridge = 1e-3 * torch.eye(basis.shape[-1], dtype=x.dtype, device=x.device)
-    return torch.linalg.solve_ex(gram + ridge, basis.mT @ x)[0]
+    eye = torch.eye(basis.shape[-1], dtype=x.dtype, device=x.device)
+    return torch.linalg.solve_ex(gram + ridge * eye, basis.mT @ x)[0]
 
 
 def leading(x: Tensor, share: Tensor, count: int = 3) -> Tensor:
@@ -315,14 +307,14 @@ def leading(x: Tensor, share: Tensor, count: int = 3) -> Tensor:
     return spectrum(scatter)[1][..., -count:].flip(-1)
 
 
-def products(rows: Tensor) -> Tensor:
+def products(rows: Tensor, options: ShapesOptions) -> Tensor:
     """Orthonormal basis ``(b, views, K)`` of all products of three of the functions ``(b, views, B)``, as seen at the views."""
     size = rows.shape[-1]
     places = torch.combinations(torch.arange(size), 3, with_replacement=True).to(rows.device)
     cubes = rows[..., places].prod(-1)
     u, s, _ = torch.linalg.svd(cubes, full_matrices=False)
     # one width for the whole batch: a function more than a problem can tell is one it cannot tell either
-    return u[..., : max((s > RANK * s[..., :1]).sum(-1).clamp(min=1).tolist(), default=size)]
+    return u[..., : max((s > options.starts.same_function * s[..., :1]).sum(-1).clamp(min=1).tolist(), default=size)]
 
 
 def shapes_through(bases: Tensor, rows: Tensor, share: Tensor) -> Tensor:
@@ -345,9 +337,9 @@ def shapes_through(bases: Tensor, rows: Tensor, share: Tensor) -> Tensor:
     return gram_null_space(gram, 3).basis.mT.unflatten(1, (size, k))
 
 
-def graph_start(x: Tensor, rows: Tensor, share: Tensor) -> Tensor | None:
+def graph_start(x: Tensor, rows: Tensor, share: Tensor, options: ShapesOptions = ShapesOptions()) -> Tensor | None:
     """Shapes ``(b, B, n, 3)`` by the graph over the mean shape of centred views ``(b, views, n, 2)``; None with too few views."""
-    powers = products(rows)
+    powers = products(rows, options)
     helmert = centred(x.shape[-2], x.device)
     flat = helmert @ x
     if 2 * x.shape[1] < 3 * powers.shape[-1] + 1:
@@ -358,13 +350,13 @@ def graph_start(x: Tensor, rows: Tensor, share: Tensor) -> Tensor | None:
     return helmert.mT @ scatter[:, None] @ shapes_through(found.bases(powers), rows, share)
 
 
-def window_start(x: Tensor, rows: Tensor, share: Tensor) -> Tensor:
+def window_start(x: Tensor, rows: Tensor, share: Tensor, options: ShapesOptions = ShapesOptions()) -> Tensor:
     """Shapes ``(b, B, n, 3)`` by the static shapes of windows of views at about one time."""
     helmert = centred(x.shape[-2], x.device)
     flat = helmert @ x
     count = x.shape[1]
-    anchors = torch.linspace(0, count - 1, min(count, ANCHORS), device=x.device).round().long()
-    nearest = min(count, max(NEAREST, count // (4 * rows.shape[-1])))
+    anchors = torch.linspace(0, count - 1, min(count, options.starts.windows), device=x.device).round().long()
+    nearest = min(count, max(options.starts.window_views, count // (4 * rows.shape[-1])))
     apart = torch.cdist(rows[:, anchors], rows) + torch.where(share > 0, 0.0, torch.inf)[:, None]
     window = apart.topk(nearest, largest=False).indices  # (b, anchors, nearest)
     problem = torch.arange(len(x), device=x.device)[:, None, None]
@@ -392,21 +384,6 @@ def pooled_start(x: Tensor, rows: Tensor, share: Tensor) -> Tensor | None:
 
 GAUGE = 9
 """Parameters of the shapes that no view can tell: a constant affine frame of the world."""
-TRIED = 20
-"""Steps from every start before the best one goes on.  Measured (16 kinds of 15 scenes: degree 1 and 2, 1 and 2 harmonics, 8 and 14
-points, noise 1 and 3 %, 40 views): of 240 scenes 3 go on from a start that does not lead to the least cost of all; of 45 of the
-hardest kind (2 harmonics, 8 points, 3 %) 6, and 8 after 10 steps, which take 15 % less time."""
-GROWN = 5
-"""Steps for each function that is added to the last start.  It leads to the least cost most often where points move by a third of
-the extent of their shape (55 of 60 scenes of degree 2 and of 2 harmonics at 1 %, the graph 33), the graph where by all of it."""
-AMBIGUOUS = 0.5
-"""Expected relative error of the shapes above which other shapes explain the views as well."""
-FREE = 4e-12
-"""Eigenvalue of the normal matrix with all cameras at norm 1, of the largest, below which its direction is free.  Measured: the
-affine frame, which is, 1e-12 (the ridge of the Grams), points in a plane or at rest 1e-16 to 2e-12, five points of degree 2 from
-7e-11, eight points of constant velocity from 3e-4."""
-EXACT = 1e-6
-"""Noise of views of norm 1 below which they are called exact; float32 leaves 1e-8 to 1e-7."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -445,7 +422,13 @@ class MovingShapes(Outcome):
 
 @one_thread
 def fit_shapes(
-    x: Tensor, rows: Tensor, weights: Tensor | None = None, *, share: Tensor | None = None, iterations: int = 50
+    x: Tensor,
+    rows: Tensor,
+    weights: Tensor | None = None,
+    *,
+    share: Tensor | None = None,
+    iterations: int = 50,
+    options: ShapesOptions = ShapesOptions(),
 ) -> MovingShapes:
     r"""Learn how n points move from single affine views of them, all points at once, each view by another camera.
 
@@ -463,6 +446,7 @@ def fit_shapes(
         weights: ``(*batch, views, n)``, 0 = ignore.
         share: ``(*batch, views)`` weight of whole views.
         iterations: steps of the descent at most.
+        options: every number that decides; ``dataclasses.replace`` changes some of them.
 
     Returns:
         :class:`MovingShapes` in the dtype of x; zero shapes where ``few``.
@@ -482,10 +466,11 @@ def fit_shapes(
         >>> bool(found.residual.max() < 1e-12), bool(found.degenerate)
         (True, False)
     """
+    check_options(options, ShapesOptions)
     batch, views, times = _checked(x, rows, weights, share)
     few = _few(views, times)
-    shapes, cost = _best(views, times, iterations)
-    uncertainty, noise, free = _uncertainty(views, times, shapes, cost)
+    shapes, cost = _best(views, times, iterations, options)
+    uncertainty, noise, free = _uncertainty(views, times, shapes, cost, options)
     found = project(views.x, views.weights, shapes_at(shapes, times))
     residual = found.residual.square().sum((-2, -1)).clamp(0, 1)
     none = few[:, None, None, None]
@@ -528,29 +513,31 @@ def _spare(views: AffineViews, rows: Tensor) -> Tensor:
     return 2 * seen.sum(-1) - (3 * rows.shape[-1] * (views.x.shape[-2] - 1) - GAUGE)
 
 
-def _best(views: AffineViews, rows: Tensor, iterations: int) -> tuple[Tensor, Tensor]:
+def _best(views: AffineViews, rows: Tensor, iterations: int, options: ShapesOptions) -> tuple[Tensor, Tensor]:
     """Shapes and cost of the best of all starts."""
-    filled = complete(views)
-    made = [make(filled, rows, views.share) for make in (graph_start, window_start, pooled_start)]
-    made.append(_grown(views, filled, rows))
+    filled = complete(views, options)
+    made = [make(filled, rows, views.share, options) for make in (graph_start, window_start)]
+    made += [pooled_start(filled, rows, views.share), _grown(views, filled, rows, options)]
     starts = [torch.where(start.isfinite(), start, 0.0) for start in made if start is not None]
-    shapes, cost = descend(views.repeated(len(starts)), rows.repeat(len(starts), 1, 1), torch.cat(starts), TRIED)
+    shapes, cost = descend(views.repeated(len(starts)), rows.repeat(len(starts), 1, 1), torch.cat(starts), options.starts.steps)
     cost = torch.where(cost.isfinite(), cost, torch.inf).unflatten(0, (len(starts), -1))
     best = cost.argmin(0)
     chosen = shapes.unflatten(0, (len(starts), -1))[best, torch.arange(len(best), device=best.device)]
-    return descend(views, rows, chosen, max(0, iterations - TRIED))
+    return descend(views, rows, chosen, max(0, iterations - options.starts.steps))
 
 
-def _grown(views: AffineViews, filled: Tensor, rows: Tensor) -> Tensor:
+def _grown(views: AffineViews, filled: Tensor, rows: Tensor, options: ShapesOptions) -> Tensor:
     """Shapes ``(b, B, n, 3)`` that start at rest and are given one function of the time after the other."""
     shapes = leading(filled, views.share)[:, None]
     for size in range(2, rows.shape[-1] + 1):
         wider = torch.nn.functional.pad(shapes, (0, 0, 0, 0, 0, 1))
-        shapes, _ = descend(views, rows[..., :size], wider, GROWN)
+        shapes, _ = descend(views, rows[..., :size], wider, options.starts.steps_for_a_function)
     return shapes
 
 
-def _uncertainty(views: AffineViews, rows: Tensor, shapes: Tensor, cost: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _uncertainty(
+    views: AffineViews, rows: Tensor, shapes: Tensor, cost: Tensor, options: ShapesOptions
+) -> tuple[Tensor, Tensor, Tensor]:
     """Expected relative error, noise, and whether another shape explains the views as well, exactly; ``(b,)`` each."""
     open_ = GAUGE + 3 * rows.shape[-1]  # affine frame, and a translation of every basis function
     rest = _eigenvalues(views, rows, shapes)[..., open_:]
@@ -561,7 +548,7 @@ def _uncertainty(views: AffineViews, rows: Tensor, shapes: Tensor, cost: Tensor)
     # the weights of the views do not move the null space: none of them may be large because its shape is nearly flat
     size = project(views.x, views.weights, shapes_at(shapes, rows)).cameras.square().sum((-2, -1))
     even = _eigenvalues(replace(views, share=views.share / torch.where(size > 0, size, 1.0)), rows, shapes)
-    free = (even[..., open_] <= FREE * even[..., -1]) & (variance < EXACT**2)
+    free = (even[..., open_] <= options.free * even[..., -1]) & (variance < options.exact**2)
     return torch.where(free, torch.inf, (variance * inverse / 3).sqrt()), variance.sqrt(), free
 
 

@@ -10,17 +10,15 @@ import torch
 from torch import Tensor
 
 from dyntorch.core.outcome import Outcome, status_of
+from dyntorch.numerics.arguments import check_options
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.shapes.basis import Trajectory
 from dyntorch.shapes.moving import centred_views, project, shapes_at
+from dyntorch.shapes.options import RecoveryOptions
 
-PEAKS = 3
-"""Minima of the grid that are refined."""
-STEPS = 8
-"""Gauss-Newton steps in the time; exact data need 4 from a grid of 64, noise of 3 % 6."""
 CHUNK = 1 << 22
 """Numbers in the largest temporary."""
-RIDGE = 1e-12
+RIDGE_EPSILON = 1e-12
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -65,6 +63,7 @@ def recover_times(
     *,
     grid: int = 64,
     interval: tuple[float, float] = (-1.0, 1.0),
+    options: RecoveryOptions = RecoveryOptions(),
 ) -> Recovery:
     r"""Find the time at which a moving shape looks most like each of some new views, and what it leaves unexplained.
 
@@ -79,6 +78,7 @@ def recover_times(
         weights: ``(*batch, views, n)``, 0 = ignore.
         grid: times tried.
         interval: polynomial trajectories: times tried from and to.  Periodic ones are tried over the period.
+        options: every number that decides; ``dataclasses.replace`` changes some of them.
 
     Returns:
         :class:`Recovery` in the dtype of x.
@@ -97,6 +97,7 @@ def recover_times(
         >>> bool(found.residual < 1e-12), round(float(found.times), 6)
         (True, 0.3)
     """
+    check_options(options, RecoveryOptions)
     if x.ndim < 3 or x.shape[-1] != 2 or shapes.ndim < 3 or shapes.shape[-1] != 3 or shapes.shape[-2] != x.shape[-2]:
         raise ValueError(
             f"expected shapes (*batch, B, n, 3) and x (*batch, views, n, 2), got {tuple(shapes.shape)}, {tuple(x.shape)}"
@@ -114,7 +115,7 @@ def recover_times(
     times = _grid(basis, grid, interval, wide)
     step = max(1, CHUNK // (grid * 16 * max(1, flat)))
     pieces = [slice(i, i + step) for i in range(0, max(1, views.x.shape[1]), step)]
-    parts = [_recovered(wide, basis, times, views.x[:, p], views.weights[:, p]) for p in pieces]
+    parts = [_recovered(wide, basis, times, views.x[:, p], views.weights[:, p], options) for p in pieces]
     found = [torch.cat(part, dim=1) for part in zip(*parts, strict=True)]
     known, middle = views.share > 0, times[len(times) // 2]
     none = (middle.new_tensor(1.0), middle, middle.new_tensor(torch.inf), middle, middle.new_tensor(0.0))
@@ -132,12 +133,15 @@ def _grid(basis: Trajectory, count: int, interval: tuple[float, float], like: Te
     return torch.arange(count, dtype=like.dtype, device=like.device) * (basis.period / count)
 
 
-def _recovered(shapes: Tensor, basis: Trajectory, times: Tensor, x: Tensor, weights: Tensor) -> tuple[Tensor, ...]:
+def _recovered(
+    shapes: Tensor, basis: Trajectory, times: Tensor, x: Tensor, weights: Tensor, options: RecoveryOptions
+) -> tuple[Tensor, ...]:
     """Residual, time, sigma, second and rise of one piece of the views, ``(b, views)`` each."""
     curve = residuals_at(shapes, basis.rows(times), x, weights)
-    start, lone = _minima(curve, basis.period is not None)
+    start, lone = _minima(curve, basis.period is not None, options.minima)
     step = times[1] - times[0]
-    t, f, h = _refined(shapes, basis, times[start], step, x, weights, times if basis.period is None else None)
+    within = times if basis.period is None else None
+    t, f, h = _refined(shapes, basis, times[start], step, x, weights, within, options.steps)
     f = torch.where(lone, torch.inf, f)
     order = f.argsort(-1)
     t, f, h = (part.gather(-1, order) for part in (t, f, h))
@@ -162,12 +166,12 @@ def residuals_at(shapes: Tensor, rows: Tensor, x: Tensor, weights: Tensor) -> Te
     mean = (weights @ q.permute(0, 2, 1, 3).flatten(2)).reshape(b, views, grid, 3)
     total = weights.sum(-1)[..., None, None, None].clamp(min=1e-300)
     gram = gram - mean[..., :, None] * mean[..., None, :] / total
-    factor, _ = torch.linalg.cholesky_ex(gram + RIDGE * torch.eye(3, dtype=x.dtype, device=x.device))
+    factor, _ = torch.linalg.cholesky_ex(gram + RIDGE_EPSILON * torch.eye(3, dtype=x.dtype, device=x.device))
     return 1 - torch.linalg.solve_triangular(factor, inner, upper=False).square().sum((-2, -1))
 
 
-def _minima(curve: Tensor, periodic: bool) -> tuple[Tensor, Tensor]:
-    """Places ``(b, views, PEAKS)`` of the deepest local minima of curves, and which of them are none."""
+def _minima(curve: Tensor, periodic: bool, count: int) -> tuple[Tensor, Tensor]:
+    """Places ``(b, views, minima)`` of the deepest local minima of curves, and which of them are none."""
     if periodic:
         before, after = curve.roll(1, -1), curve.roll(-1, -1)
     else:
@@ -176,12 +180,19 @@ def _minima(curve: Tensor, periodic: bool) -> tuple[Tensor, Tensor]:
     low = (curve <= before) & (curve < after)
     # a constant curve has no minimum: its first time stands in
     low[..., 0] |= ~low.any(-1)
-    depth, place = torch.where(low, curve, torch.inf).topk(min(PEAKS, curve.shape[-1]), dim=-1, largest=False)
+    depth, place = torch.where(low, curve, torch.inf).topk(min(count, curve.shape[-1]), dim=-1, largest=False)
     return place, ~depth.isfinite()
 
 
 def _refined(
-    shapes: Tensor, basis: Trajectory, start: Tensor, step: Tensor, x: Tensor, weights: Tensor, within: Tensor | None
+    shapes: Tensor,
+    basis: Trajectory,
+    start: Tensor,
+    step: Tensor,
+    x: Tensor,
+    weights: Tensor,
+    within: Tensor | None,
+    steps: int,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Times, residuals and curvatures ``(b, views, peaks)`` at the minima next to ``start``; not more than a step away."""
     low, high = start - step, start + step
@@ -200,7 +211,7 @@ def _refined(
 
     t, size = start, torch.ones_like(start)
     f, gain, curvature = at(t)
-    for _ in range(STEPS):
+    for _ in range(steps):
         trial = (t + size * gain / curvature.clamp(min=1e-300)).clamp(low, high)
         fresh = at(trial)
         better = fresh[0] < f

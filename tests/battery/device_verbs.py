@@ -461,7 +461,10 @@ NOT_VERBS = {
         ),
         "results",
     ),
-    **dict.fromkeys((name for name in dyn.__all__ if name.endswith("Options")), "options of verbs"),
+    **dict.fromkeys(
+        (name for face in (dyn, *(getattr(dyn, room) for room in ROOMS)) for name in face.__all__ if name.endswith("Options")),
+        "options of verbs",
+    ),
     **dict.fromkeys(
         (
             *("Collineation", "ConstantVelocityTensor", "ConvergentMotionMatrix", "DualHomographyTensor"),

@@ -1,10 +1,14 @@
 """Lenses fitted to matches: against scenes seen through known lenses, and finite differences."""
 
+import math
+from dataclasses import replace
+
 import pytest
 import torch
 
 from dyntorch.geometry.epipolar_fit import Frames
 from dyntorch.geometry.lens import Division, LensDescent, LensMatches, distort, fit_distortion
+from dyntorch.geometry.options import LensOptions
 from dyntorch.scenes import two_view
 
 SIZE = (640.0, 480.0)
@@ -134,3 +138,14 @@ def test_the_descent_never_rises_and_keeps_fixed_lenses():
 def test_misuse_is_named(arguments, words):
     with pytest.raises(ValueError, match=words):
         fit_distortion(*arguments)
+
+
+def test_options_decide():
+    matches, shipped = seen((-0.2, -0.1)), LensOptions()
+    assert fit_distortion(*matches, sizes=(SIZE, SIZE)).significant
+    sure = replace(shipped, significant=math.inf)
+    assert not fit_distortion(*matches, sizes=(SIZE, SIZE), options=sure).significant
+    many = fit_distortion(*matches, sizes=(SIZE, SIZE), options=replace(shipped, fewest=10**6))
+    assert not many.significant and many.sigmas == (math.inf, math.inf)
+    with pytest.raises(ValueError, match=r"options must be LensOptions, got \{\}; use dataclasses\.replace"):
+        fit_distortion(*matches, options={})

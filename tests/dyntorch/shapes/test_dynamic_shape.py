@@ -1,6 +1,7 @@
 """All joints of a moving shape at once: descent, starts, missing points, and the time of a single view."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -18,6 +19,7 @@ from dyntorch.shapes.moving import (
     pooled_start,
     window_start,
 )
+from dyntorch.shapes.options import RecoveryOptions, ShapesOptions
 from dyntorch.shapes.times import recover_times
 from tests.dyntorch.shapes.moving_views import LINEAR, SQUARE, WAVE, draw, moving_views
 
@@ -286,3 +288,26 @@ def test_similarities_of_single_views_change_nothing_and_dtype_is_kept():
 def test_misuse(call, said):
     with pytest.raises(ValueError, match=said):
         call(torch.rand(9, 6, 2), torch.rand(9, 2))
+
+
+def test_options_decide():
+    t = times(30)
+    x, _ = moving_views(LINEAR, t, n=8, noise=0.02)
+    rows = Polynomial(1).rows(t)
+    found = fit_shapes(x, rows)
+    assert not found.degenerate
+    everything = replace(ShapesOptions(), free=2.0, exact=1.0)
+    assert fit_shapes(x, rows, options=everything).degenerate
+    seen = recover_times(found.shapes, Polynomial(1), x)
+    assert (seen.times != recover_times(found.shapes, Polynomial(1), x, options=RecoveryOptions(steps=0)).times).any()
+    one = recover_times(found.shapes, Polynomial(1), x, options=RecoveryOptions(minima=2))
+    torch.testing.assert_close(one.times, seen.times)
+
+
+def test_options_are_of_the_verb():
+    t = times(9)
+    x, _ = moving_views(LINEAR, t)
+    with pytest.raises(ValueError, match=r"options must be ShapesOptions, got \{\}; use dataclasses\.replace"):
+        fit_shapes(x, Polynomial(1).rows(t), options={})
+    with pytest.raises(ValueError, match=r"options must be RecoveryOptions, got ShapesOptions\("):
+        recover_times(torch.zeros(2, 8, 3), Polynomial(1), x, options=ShapesOptions())

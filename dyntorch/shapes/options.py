@@ -1,0 +1,54 @@
+"""What decides in fit_shapes() and recover_times(): every number, by its name, with its unit and what was measured for it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class ShapeStartOptions:
+    """The solutions that the descent starts from."""
+
+    same_function: float = 1e-9
+    """Singular value, over the largest, below which products of basis functions are the same function at the times of the views."""
+    window_views: int = 6
+    """Least number of views in a window in which the shape is taken to stand still."""
+    windows: int = 200
+    """Windows at most."""
+    fill_rounds: int = 3
+    """Rounds in which missing points are filled in from the mean shape."""
+    fill_ridge: float = 1e-3
+    """Ridge of the regression of a view's points on the mean shape, whose columns are of norm 1."""
+    steps: int = 20
+    """Steps from every start before the best one goes on.  Measured (16 kinds of 15 scenes: degree 1 and 2, 1 and 2 harmonics, 8
+    and 14 points, noise 1 and 3 %, 40 views): of 240 scenes 3 go on from a start that does not lead to the least cost of all; of 45
+    of the hardest kind (2 harmonics, 8 points, 3 %) 6, and 8 after 10 steps, which take 15 % less time."""
+    steps_for_a_function: int = 5
+    """Steps for each function that is added to the last start.  It leads to the least cost most often where points move by a third
+    of the extent of their shape (55 of 60 scenes of degree 2 and of 2 harmonics at 1 %, the graph 33), the graph where by all of
+    it."""
+
+
+@dataclass(frozen=True)
+class ShapesOptions:
+    """Every number that decides in :func:`dyntorch.shapes.fit_shapes`."""
+
+    starts: ShapeStartOptions = ShapeStartOptions()
+    ambiguous: float = 0.5
+    """Expected relative error of the shapes above which other shapes explain the views as well."""
+    free: float = 4e-12
+    """Eigenvalue of the normal matrix with all cameras at norm 1, over the largest, below which its direction is free.  Measured:
+    the affine frame, which is, 1e-12 (the ridge of the Grams), points in a plane or at rest 1e-16 to 2e-12, five points of degree 2
+    from 7e-11, eight points of constant velocity from 3e-4."""
+    exact: float = 1e-6
+    """Noise of views of norm 1 below which they are called exact; float32 leaves 1e-8 to 1e-7."""
+
+
+@dataclass(frozen=True)
+class RecoveryOptions:
+    """Every number that decides in :func:`dyntorch.shapes.recover_times`."""
+
+    minima: int = 3
+    """Minima of the grid that are refined."""
+    steps: int = 8
+    """Gauss-Newton steps in the time; exact data need 4 from a grid of 64, noise of 3 % 6."""
