@@ -80,6 +80,7 @@ _HOME = {
     "Polynomial": "dyntorch.shapes.basis",
     "Fourier": "dyntorch.shapes.basis",
     # the numbers that decide in a task
+    "AlignOptions": "dyntorch.tasks.align.options",
     "PairOptions": "dyntorch.tasks.pair.options",
     "PlanesOptions": "dyntorch.tasks.planes.options",
     "ReconstructOptions": "dyntorch.tasks.reconstruct.options",

@@ -17,25 +17,16 @@ from dyntorch.geometry.homogeneous import homogeneous, inhomogeneous
 from dyntorch.invariants.join_tensor import JoinTensor
 from dyntorch.invariants.minimal_join_tensor import MinimalJoinTensor
 from dyntorch.numerics.chi_square import median, three_sigma
-from dyntorch.tasks.align.labelling import ROUGH, SIGMAS, Evidence, Labelled, joined, static_consensus
+from dyntorch.tasks.align.labelling import Evidence, Labelled, joined, static_consensus
+from dyntorch.tasks.align.options import AlignOptions
 from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment, AlignNotice
 
 MINIMAL = {"join": 47, "minimal_join": 47}
-FULL = 60  # matches for the join tensor itself, which joins the starts from there on
-SAMPLES = 1000
-"""Samples of five matches: 97 % to draw five static ones where they are 20 % of all."""
-STEPS = 30
 LABELLED = 9
 """Fewest matches where some are labelled static: five determine A and B, and room to tell static from moving."""
-INDETERMINATE = 1e-13  # information on the worst direction over that on the best: rounding error below it
-AMBIGUOUS = 0.5
-"""Standard deviation of the worst direction of the motion, of norm 1, above which the motion is not known at all."""
-UNCERTAIN = 0.05
-CONSENSUS, SPARE = 0.4, 10
 MOVERS, LINES = 40, 10
 """Moving matches, and lines they lie on, that determine the tensors where nothing stands still (thesis section 8.2)."""
 ENOUGH = 5  # static matches that determine A and B by themselves
-ROOM = 3.0
 
 AMBIGUITY = (
     "A and B are unique, each up to its scale, unless the steps of all points keep one ratio (constant velocity): then they are "
@@ -44,11 +35,13 @@ AMBIGUITY = (
 )
 
 
-def align_join(data: Matches, threshold: float | None, model: str, generator: torch.Generator | None) -> Alignment:
+def align_join(
+    data: Matches, threshold: float | None, model: str, generator: torch.Generator | None, options: AlignOptions
+) -> Alignment:
     """:func:`dyntorch.align_points` with a join tensor, for checked matches."""
-    evidence = Evidence.of(JoinTensor(), data)
-    best = _search(evidence, threshold, model, generator)
-    solution, labels, worst = _solved(evidence, best)
+    evidence = Evidence.of(JoinTensor(), data, options)
+    best = _search(evidence, threshold, model, generator, options)
+    solution, labels, worst = _solved(evidence, best, options)
     outcome = replace(solution, inliers=labels != OUTLIER).back(data)
     A, B = outcome.motion
     assert outcome.sigma is not None and outcome.covariance is not None
@@ -60,21 +53,27 @@ def align_join(data: Matches, threshold: float | None, model: str, generator: to
         sigma=outcome.sigma,
         covariance=outcome.covariance,
         ambiguity=AMBIGUITY,
-        notices=_notices(evidence, replace(best, labels=labels), worst, solution.status, data.batch),
+        notices=_notices(evidence, replace(best, labels=labels), worst, solution.status, data.batch, options),
         solution=outcome,
     )
 
 
-def _search(evidence: Evidence, threshold: float | None, model: str, generator: torch.Generator | None) -> Labelled:
+def _search(
+    evidence: Evidence, threshold: float | None, model: str, generator: torch.Generator | None, options: AlignOptions
+) -> Labelled:
     """The best of the motions that static samples and the tensors lead to."""
-    given = None if threshold is None else torch.full_like(evidence.floor, threshold / SIGMAS).maximum(evidence.floor)
-    starts = [_from_static(evidence, given, generator)]
+    given = (
+        None
+        if threshold is None
+        else torch.full_like(evidence.floor, threshold / options.labels.threshold_in_sigmas).maximum(evidence.floor)
+    )
+    starts = [_from_static(evidence, given, generator, options)]
     if evidence.data.count >= MINIMAL[model]:
-        starts.append(_from_tensor(MinimalJoinTensor(), evidence, given, generator))
-    full, size = model == "join" and evidence.data.count >= FULL, len(evidence.floor)
+        starts.append(_from_tensor(MinimalJoinTensor(), evidence, given, generator, options))
+    full, size = model == "join" and evidence.data.count >= options.join.full, len(evidence.floor)
     if given is None:
         if full:
-            starts.append(_from_tensor(JoinTensor(), evidence, None, generator))
+            starts.append(_from_tensor(JoinTensor(), evidence, None, generator, options))
         # the least estimate is that of a motion most matches agree with; it may be low, for static matches show half the noise
         sigma = 2 * torch.stack([noise for _, noise in starts]).amin(0).maximum(evidence.floor)
         theta = _improved(evidence, [start for start, _ in starts], sigma, sampled=True)
@@ -83,7 +82,7 @@ def _search(evidence: Evidence, threshold: float | None, model: str, generator: 
         # where the noise is known, so is whether the motion of the minimal tensor is the right one
         doubt = _doubt(evidence, theta[-size:], given) if full else torch.zeros_like(given)
         if bool(doubt.any()):
-            last, _ = _from_tensor(JoinTensor(), evidence.weighted(doubt), given, generator)
+            last, _ = _from_tensor(JoinTensor(), evidence.weighted(doubt), given, generator, options)
             theta = torch.cat([theta, _improved(evidence, [last], given, sampled=False)])
     count = len(theta) // size if size else 1
     best = evidence.repeated(count).cost(theta, sigma.repeat(count)).unflatten(0, (count, size)).argmin(0)
@@ -108,7 +107,9 @@ def _doubt(evidence: Evidence, theta: Tensor, sigma: Tensor) -> Tensor:
     return ((2 * agreeing <= present) | (moving * JoinTensor.codim <= JoinTensor.dof)).to(theta)
 
 
-def _from_static(evidence: Evidence, given: Tensor | None, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
+def _from_static(
+    evidence: Evidence, given: Tensor | None, generator: torch.Generator | None, options: AlignOptions
+) -> tuple[Tensor, Tensor]:
     """Motion on which the most matches agree that they stand still, and the noise by their median."""
     data = evidence.data
     pool = data.weights > 0
@@ -117,8 +118,8 @@ def _from_static(evidence: Evidence, given: Tensor | None, generator: torch.Gene
         pool = torch.where((known.sum(-1) >= ENOUGH)[:, None], known, pool)
     scale = evidence.norm.scales[0]
     # each distance has the noise of two views
-    limit = None if given is None else 2 * three_sigma(6) * (ROUGH * scale * given).square()
-    motion, variance = static_consensus(evidence.views, pool, limit, SAMPLES, generator)
+    limit = None if given is None else 2 * three_sigma(6) * (options.labels.rough * scale * given).square()
+    motion, variance = static_consensus(evidence.views, pool, limit, options.join.samples, generator, options)
     theta = torch.cat([part.flatten(1) for part in motion], dim=-1)
     if given is not None:
         return theta, given
@@ -127,7 +128,7 @@ def _from_static(evidence: Evidence, given: Tensor | None, generator: torch.Gene
 
 
 def _from_tensor(
-    invariant: Invariant, evidence: Evidence, given: Tensor | None, generator: torch.Generator | None
+    invariant: Invariant, evidence: Evidence, given: Tensor | None, generator: torch.Generator | None, options: AlignOptions
 ) -> tuple[Tensor, Tensor]:
     """Motion of a tensor by robust estimation, and the noise that the median of all matches shows."""
     data = evidence.data
@@ -145,7 +146,7 @@ def _from_tensor(
     if given is not None:
         return theta, given
     if plain:
-        refined = evidence.refined(theta, torch.where(data.weights > 0, MOVING, OUTLIER), STEPS)
+        refined = evidence.refined(theta, torch.where(data.weights > 0, MOVING, OUTLIER), options.join.steps)
         assert refined.sigma is not None
         theta, noise = joined(refined), refined.sigma
     else:
@@ -155,14 +156,16 @@ def _from_tensor(
     return theta, torch.where(usable & noise.isfinite(), noise, torch.inf)
 
 
-def _solved(evidence: Evidence, best: Labelled) -> tuple[Solution, Tensor, Tensor]:
+def _solved(evidence: Evidence, best: Labelled, options: AlignOptions) -> tuple[Solution, Tensor, Tensor]:
     """The solution with its status, the final labels (none where there is no motion), and the worst standard deviation."""
-    refined = evidence.refined(best.theta, best.labels, STEPS)
+    refined = evidence.refined(best.theta, best.labels, options.join.steps)
     theta = joined(refined)
     values, spread = evidence.information(theta, best.labels)
     labels = evidence.labels(theta, best.sigma, spread)
     worst = best.sigma * values[:, 0].clamp(min=torch.finfo(values.dtype).tiny).rsqrt() * torch.stack(evidence.norm.scales).amax(0)
-    status = _status(evidence, replace(best, labels=labels), worst, values[:, 0] <= INDETERMINATE * values[:, -1])
+    status = _status(
+        evidence, replace(best, labels=labels), worst, values[:, 0] <= options.join.indeterminate * values[:, -1], options
+    )
     none = failed(status)
     labels = torch.where(none[:, None], OUTLIER, labels)
     assert refined.sigma is not None and refined.covariance is not None
@@ -179,32 +182,34 @@ def _solved(evidence: Evidence, best: Labelled) -> tuple[Solution, Tensor, Tenso
     return solution, labels, worst
 
 
-def _status(evidence: Evidence, best: Labelled, worst: Tensor, undetermined: Tensor) -> Tensor:
+def _status(evidence: Evidence, best: Labelled, worst: Tensor, undetermined: Tensor, options: AlignOptions) -> Tensor:
     usable = evidence.data.weights > 0
     present = usable.sum(-1)
     known = torch.zeros_like(present) if evidence.data.static is None else (usable & evidence.data.static).sum(-1)
     still, moving = (best.labels == STATIC).sum(-1), (best.labels == MOVING).sum(-1)
-    accident = (still + moving < CONSENSUS * present) | (6 * still + 2 * moving < JoinTensor.dof + SPARE)
+    accident = (still + moving < options.join.consensus * present) | (6 * still + 2 * moving < JoinTensor.dof + options.join.spare)
     accident = accident | (best.sigma * torch.stack(evidence.norm.scales).amax(0) > NOISY)
-    status = torch.where(worst > AMBIGUOUS, int(Status.AMBIGUOUS), torch.zeros_like(present))
+    status = torch.where(worst > options.join.ambiguous, int(Status.AMBIGUOUS), torch.zeros_like(present))
     status = torch.where(accident, int(Status.NO_CONSENSUS), status)
     status = torch.where(undetermined, int(Status.DEGENERATE), status)
     return torch.where((present < MINIMAL["join"]) & (known < ENOUGH), int(Status.TOO_FEW), status)
 
 
-def _notices(evidence: Evidence, best: Labelled, worst: Tensor, status: Tensor, batch: tuple[int, ...]) -> tuple[Notice, ...]:
+def _notices(
+    evidence: Evidence, best: Labelled, worst: Tensor, status: Tensor, batch: tuple[int, ...], options: AlignOptions
+) -> tuple[Notice, ...]:
     solved = ~failed(status)
     moving, still = (best.labels == MOVING).sum(-1), (best.labels == STATIC).sum(-1)
     found, note = noting(batch)
     note(AlignNotice.FEW_MOVING, moving, solved & (moving < MOVERS) & (still < ENOUGH), least=f"{MOVERS} and more")
     note(AlignNotice.NEAR_STATIC, moving, solved & (moving < LINES) & (still >= ENOUGH), case="matches")
-    lines = trajectory_lines(evidence, best)
+    lines = trajectory_lines(evidence, best, options)
     note(AlignNotice.FEW_LINES, lines, solved & (moving > lines) & (lines < LINES), least=LINES)
-    note(AlignNotice.UNCERTAIN, worst, solved & (worst > UNCERTAIN), case="matches", what="motion")
+    note(AlignNotice.UNCERTAIN, worst, solved & (worst > options.join.uncertain), case="matches", what="motion")
     return in_order(found)
 
 
-def trajectory_lines(evidence: Evidence, best: Labelled) -> Tensor:
+def trajectory_lines(evidence: Evidence, best: Labelled, options: AlignOptions) -> Tensor:
     """How many lines hold the paths of all moving matches ``(b,)``, counted up to LINES.
 
     Greedy: the longest path determines its line best; all matches on that line go, and so on.
@@ -217,7 +222,7 @@ def trajectory_lines(evidence: Evidence, best: Labelled) -> Tensor:
     along = ends.gather(0, widest[None, ..., None].expand(1, -1, -1, 3))[0] / length[..., None].clamp(min=1e-12)
     problem = torch.arange(len(length), device=length.device)
     left, count = best.labels == MOVING, torch.zeros(len(length), dtype=torch.long, device=length.device)
-    noise = ROOM * (evidence.norm.scales[0] * best.sigma)[:, None]
+    noise = options.join.room * (evidence.norm.scales[0] * best.sigma)[:, None]
     for _ in range(LINES):
         longest = torch.where(left, length, -1.0).argmax(-1)
         centre, direction, base = places[:, problem, longest].mean(0), along[problem, longest], length[problem, longest]

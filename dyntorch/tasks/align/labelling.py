@@ -17,21 +17,8 @@ from dyntorch.geometry.homogeneous import apply, homogeneous
 from dyntorch.numerics.blocks import map_blocks, uniform
 from dyntorch.numerics.chi_square import median, three_sigma
 from dyntorch.numerics.nullspace import spectrum
+from dyntorch.tasks.align.options import AlignOptions
 from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC
-
-SIGMAS = 3.0
-"""The threshold in standard deviations of the noise."""
-ROUNDS, ESTIMATING = 3, 6
-"""Turns of labelling and refining, with the noise known and with the noise to be found as well."""
-ROUGH = 3.0
-"""How much wider than the noise the first labels are where the motion comes from a minimal sample."""
-STEADY = 0.02
-"""Relative change of the noise that needs no further turn."""
-WIDEST = 4.0
-"""No uncertainty of the motion widens a limit more than so many times: calling a static match moving costs some accuracy, calling
-a moving one static gives a wrong motion."""
-STEPS = 6
-"""Levenberg-Marquardt steps between two labellings."""
 
 
 @dataclass(frozen=True)
@@ -57,9 +44,10 @@ class Evidence:
     """Normalized."""
     floor: Tensor
     """``(b,)`` the least noise that the numbers allow, in the unit of the matches."""
+    options: AlignOptions
 
     @classmethod
-    def of(cls, invariant: Invariant, data: Matches) -> Evidence:
+    def of(cls, invariant: Invariant, data: Matches, options: AlignOptions) -> Evidence:
         """From checked matches; those with ``data.static`` are known not to move."""
         largest = data.weights.amax(-1, keepdim=True).clamp(min=torch.finfo(torch.float64).tiny)
         flat = replace(
@@ -67,7 +55,7 @@ class Evidence:
         )
         norm = normalization(invariant, flat.views, flat.weights)
         floor = 100 * torch.finfo(data.dtype).eps / torch.stack(norm.scales).amin(0)
-        return cls(invariant, flat, norm, norm.apply(invariant, flat.views), floor)
+        return Evidence(invariant, flat, norm, norm.apply(invariant, flat.views), floor, options=options)
 
     def repeated(self, count: int) -> Evidence:
         """The same problems several times, one block after the other."""
@@ -82,7 +70,7 @@ class Evidence:
             tuple(map(again, norm.transforms)), norm.primitives, tuple(map(again, norm.actions)), tuple(map(again, norm.scales))
         )
         data = replace(data, batch=data.weights.shape[:1])
-        return Evidence(self.invariant, data, again_norm, tuple(map(again, self.views)), again(self.floor))
+        return Evidence(self.invariant, data, again_norm, tuple(map(again, self.views)), again(self.floor), options=self.options)
 
     def weighted(self, weights: Tensor) -> Evidence:
         """With the matches of each problem weighted by ``(b,)``; 0 leaves a problem out."""
@@ -134,7 +122,7 @@ class Evidence:
             pieces = [self._widened(theta, spread, piece) for piece in self._pieces(theta)]
             for k, (plain, limit) in enumerate(zip((path, still), limits, strict=True)):
                 widened = torch.cat([piece[k] for piece in pieces], dim=-1)
-                agree[k] = agree[k] | ((widened <= limit) & (plain <= WIDEST**2 * limit))
+                agree[k] = agree[k] | ((widened <= limit) & (plain <= self.options.labels.widest**2 * limit))
         if self.data.static is not None:
             agree[0] = agree[0] & ~self.data.static
         labels = torch.where(agree[1], STATIC, torch.where(agree[0], MOVING, OUTLIER))
@@ -179,25 +167,25 @@ class Evidence:
 
     def improved(self, theta: Tensor, sigma: Tensor, rough: Tensor) -> Tensor:
         """One labelling and refinement; where ``rough (b,)``, the motion comes from a minimal sample of static matches."""
-        labels = self.labels(theta, torch.where(rough, ROUGH * sigma, sigma))
+        labels = self.labels(theta, torch.where(rough, self.options.labels.rough * sigma, sigma))
         # what a rough motion says about moving matches is left to chance
         labels = torch.where(rough[:, None] & (labels == MOVING), OUTLIER, labels)
-        return joined(self.refined(theta, labels, STEPS))
+        return joined(self.refined(theta, labels, self.options.labels.steps))
 
     def settled(self, theta: Tensor, sigma: Tensor, *, estimate: bool) -> Labelled:
         """Label and refine in turns, until the labels stay; ``estimate``: and the noise with them."""
         labels, steady = self.labels(theta, sigma), not estimate
-        for _ in range(ESTIMATING if estimate else ROUNDS):
+        for _ in range(self.options.labels.rounds_with_noise if estimate else self.options.labels.rounds):
             _, spread = self.information(theta, labels)
             new = self.labels(theta, sigma, spread)
             if bool((new == labels).all()) and steady:
                 break
             labels = new
-            found = self.refined(theta, labels, STEPS)
+            found = self.refined(theta, labels, self.options.labels.steps)
             theta = joined(found)
             if estimate and found.sigma is not None:
                 old, sigma = sigma, torch.where(found.sigma.isfinite() & (found.sigma > 0), found.sigma, sigma).maximum(self.floor)
-                steady = bool(((sigma - old).abs() <= STEADY * old).all())
+                steady = bool(((sigma - old).abs() <= self.options.labels.steady * old).all())
         return Labelled(theta, labels, sigma)
 
 
@@ -212,12 +200,15 @@ def joined(solution: Solution) -> Tensor:
 
 BLOCK = 1 << 19
 """Numbers in the largest temporary of one block of the batch (4 MB)."""
-JUDGES = 256
-"""Matches that judge a hypothesis: enough to tell 5 % of agreement from none."""
 
 
 def static_consensus(
-    views: tuple[Tensor, ...], pool: Tensor, limit: Tensor | None, samples: int, generator: torch.Generator | None
+    views: tuple[Tensor, ...],
+    pool: Tensor,
+    limit: Tensor | None,
+    samples: int,
+    generator: torch.Generator | None,
+    options: AlignOptions,
 ) -> tuple[tuple[Tensor, ...], Tensor]:
     r"""Collineations of view 2, 3, ... to view 1 on which the most matches agree, from samples of d + 2 matches.
 
@@ -252,7 +243,7 @@ def static_consensus(
             place = place + (place >= other)
         taken.append(place)
     chosen = torch.stack(taken, -1).clamp(max=n - 1)
-    judges = shuffled[:, :JUDGES]
+    judges = shuffled[:, : options.labels.judges]
     limits = torch.full_like(views[0][:, 0, 0], torch.inf) if limit is None else limit
 
     def search(*block: Tensor) -> tuple[Tensor, ...]:

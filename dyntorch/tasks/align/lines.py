@@ -19,19 +19,19 @@ from dyntorch.core.solution import Solution
 from dyntorch.geometry.homogeneous import homogeneous, unit
 from dyntorch.invariants.agreement import point_error, static_residual
 from dyntorch.invariants.translating_lines_matrix import TranslatingLinesMatrix
-from dyntorch.numerics.arguments import check_threshold
+from dyntorch.numerics.arguments import check_options, check_threshold
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.numerics.chi_square import median, three_sigma
 from dyntorch.numerics.least_squares import by_match, damped_step, derivatives
 from dyntorch.numerics.nullspace import spectrum
-from dyntorch.tasks.align.labelling import SIGMAS
+from dyntorch.tasks.align.options import AlignOptions
 from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment, AlignNotice
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Lines that move in planes, static lines and static points between two views: residuals, refinement, labels.
 
 
-ROUNDS, STEPS = 4, 12
+STEPS = 12
 CONVERGED = 1e-10  # relative decrease of the cost
 DOF = TranslatingLinesMatrix.dof
 
@@ -138,7 +138,9 @@ def _two_points(line: Tensor, present: Tensor) -> Tensor:
     return torch.stack([nearest - size / 2 * along, nearest + size / 2 * along], dim=-2)
 
 
-def settle(lines: Lines, theta: Tensor, sigma: Tensor, *, estimate: bool, plain: bool) -> tuple[Tensor, Tensor, Tensor]:
+def settle(
+    lines: Lines, theta: Tensor, sigma: Tensor, *, estimate: bool, plain: bool, options: AlignOptions
+) -> tuple[Tensor, Tensor, Tensor]:
     """Label and refine in turns: A ``(b, 16)`` in normalized coordinates, labels ``(b, n)``, noise ``(b,)``.
 
     Args:
@@ -150,7 +152,7 @@ def settle(lines: Lines, theta: Tensor, sigma: Tensor, *, estimate: bool, plain:
     """
     present = lines.data.weights > 0
     labels = torch.where(present, MOVING, OUTLIER) if plain else _labels(lines, theta, sigma)
-    for _ in range(ROUNDS):
+    for _ in range(options.lines.rounds):
         theta = refined(lines, theta, labels)
         if estimate:
             left = lines.residual(theta, labels).square().sum(-1)
@@ -213,15 +215,6 @@ def _labels(lines: Lines, theta: Tensor, sigma: Tensor) -> Tensor:
 
 MINIMAL = TranslatingLinesMatrix.minimal()
 PER_POINT = 9  # matches of lines that one static point gives
-CERTAIN = 45
-"""Lines (three times the degrees of freedom) below which noise of unknown size cannot be told from outliers."""
-ABOVE = 2.0
-"""A singular value counts from so many times the noise on: those that the model lacks reach 1.7, those of 45 lines in general
-position at a noise of a two-hundredth of the scene begin at 2.4 (measured)."""
-AMBIGUOUS, UNCERTAIN = 0.5, 0.05
-"""Standard deviation of the worst direction of A, of norm 1, above which it is not known at all; or hardly."""
-INDETERMINATE = 1e-13  # information on the worst direction over that on the best: rounding error below it
-CONSENSUS, SPARE = 0.4, 6
 RANKS = (
     (20, "static"),
     (28, "bodies"),
@@ -245,6 +238,7 @@ def align_lines(
     weights: Tensor | None = None,
     static: Tensor | None = None,
     generator: torch.Generator | None = None,
+    options: AlignOptions = AlignOptions(),
 ) -> Alignment:
     r"""Motion of a 3D sensor from two views of lines, with a label for every line: static, moving or outlier.
 
@@ -264,6 +258,7 @@ def align_lines(
             of every problem (at least half of the lines must be inliers; fewer than 45 lines are all taken as such).
         weights: ``(*batch, n)`` not negative; 0 leaves a line out.
         generator: source of the random samples.
+        options: every number that decides, by stage and model; ``dataclasses.replace`` changes some of them.
 
     Returns:
         An :class:`~dyntorch.tasks.align.result.Alignment` with A only.
@@ -283,6 +278,7 @@ def align_lines(
         >>> bool((result.A - scene.motion[0]).norm() < 0.02)
         True
     """
+    check_options(options, AlignOptions)
     check_threshold(threshold)
     data = matches(TranslatingLinesMatrix(), (l1, l2), weights, static)
     points = _points(static_points, data, l1)
@@ -293,7 +289,7 @@ def align_lines(
             f"{PER_POINT} each; add lines, or give static_points=(P1, P2)"
         )
     with torch.no_grad():
-        return _align(data, points, threshold, generator)
+        return _align(data, points, threshold, generator, options)
 
 
 def _points(pair: tuple[Tensor, Tensor] | None, data: Matches, like: Tensor) -> tuple[Tensor, Tensor] | None:
@@ -312,20 +308,24 @@ def _points(pair: tuple[Tensor, Tensor] | None, data: Matches, like: Tensor) -> 
 
 
 def _align(
-    data: Matches, points: tuple[Tensor, Tensor] | None, threshold: float | None, generator: torch.Generator | None
+    data: Matches,
+    points: tuple[Tensor, Tensor] | None,
+    threshold: float | None,
+    generator: torch.Generator | None,
+    options: AlignOptions,
 ) -> Alignment:
     flat = replace(data, views=as_points(data.views, data.weights), batch=data.weights.shape[:1], dtype=torch.float64)
     flat = replace(flat, weights=flat.weights / flat.weights.amax(-1, keepdim=True).clamp(min=1e-300), device=flat.weights.device)
     joined = _joined(flat, points)
-    given = None if threshold is None else torch.full_like(flat.weights[:, 0], threshold / SIGMAS)
-    plain = (given is None and joined.count < CERTAIN) or not len(flat.weights)
+    given = None if threshold is None else torch.full_like(flat.weights[:, 0], threshold / options.labels.threshold_in_sigmas)
+    plain = (given is None and joined.count < options.lines.certain) or not len(flat.weights)
     start = (
         fit_matches(TranslatingLinesMatrix(), joined)
         if plain
         else robust_fit(
             TranslatingLinesMatrix,
             *joined.views,
-            threshold=None if given is None else (SIGMAS * given),
+            threshold=None if given is None else (options.labels.threshold_in_sigmas * given),
             weights=joined.weights,
             generator=generator,
         )
@@ -334,8 +334,8 @@ def _align(
     lines = Lines.of(flat, points, start.normalization)
     theta = torch.where(usable[:, None], start.normalized_motion()[0].flatten(1), torch.eye(4).to(flat.weights).flatten() / 2)
     sigma = _noise(lines, theta, plain) if given is None else given.maximum(lines.floor)
-    theta, labels, sigma = settle(lines, theta, sigma, estimate=given is None, plain=plain)
-    return _result(data, lines, start, theta, labels, sigma, usable, points)
+    theta, labels, sigma = settle(lines, theta, sigma, estimate=given is None, plain=plain, options=options)
+    return _result(data, lines, start, theta, labels, sigma, usable, points, options)
 
 
 def _joined(data: Matches, points: tuple[Tensor, Tensor] | None) -> Matches:
@@ -368,19 +368,20 @@ def _result(
     sigma: Tensor,
     usable: Tensor,
     points: tuple[Tensor, Tensor] | None,
+    options: AlignOptions,
 ) -> Alignment:
     extent, A, covariance = spread(lines, theta, labels)
     worst = sigma * extent[:, 0].clamp(min=torch.finfo(theta.dtype).tiny).rsqrt()
     present = (data.weights > 0).sum(-1)
     conditions = (labels != OUTLIER).sum(-1) + 3 * (labels == STATIC).sum(-1) + (0 if points is None else 3 * points[0].shape[1])
-    accident = ((labels != OUTLIER).sum(-1) < CONSENSUS * present) | (
-        (conditions < TranslatingLinesMatrix.dof + SPARE) & (present > MINIMAL)
+    accident = ((labels != OUTLIER).sum(-1) < options.lines.consensus * present) | (
+        (conditions < TranslatingLinesMatrix.dof + options.lines.spare) & (present > MINIMAL)
     )
-    status = torch.where(worst > AMBIGUOUS, int(Status.AMBIGUOUS), torch.zeros_like(present))
+    status = torch.where(worst > options.lines.ambiguous, int(Status.AMBIGUOUS), torch.zeros_like(present))
     status = torch.where(accident, int(Status.NO_CONSENSUS), status)
-    rank = _rank(lines, labels, sigma, usable, points)
+    rank = _rank(lines, labels, sigma, usable, points, options)
     status = torch.where((rank <= RANKS[-1][0]) & (status == Status.OK), int(Status.AMBIGUOUS), status)
-    status = torch.where(extent[:, 0] <= INDETERMINATE * extent[:, 1], int(Status.DEGENERATE), status)
+    status = torch.where(extent[:, 0] <= options.lines.indeterminate * extent[:, 1], int(Status.DEGENERATE), status)
     status = torch.where(usable, status, start.status.to(status))
     none = failed(status)
     labels = torch.where(none[:, None], OUTLIER, labels)
@@ -393,11 +394,13 @@ def _result(
         sigma=data.back(torch.where(none, 0.0, sigma)),
         covariance=data.back(torch.where(zero, 0.0, covariance * sigma.square()[:, None, None])),
         ambiguity=AMBIGUITY,
-        notices=_notices(rank, worst, none, status != Status.TOO_FEW, data.batch),
+        notices=_notices(rank, worst, none, status != Status.TOO_FEW, data.batch, options),
     )
 
 
-def _rank(lines: Lines, labels: Tensor, sigma: Tensor, usable: Tensor, points: tuple[Tensor, Tensor] | None) -> Tensor:
+def _rank(
+    lines: Lines, labels: Tensor, sigma: Tensor, usable: Tensor, points: tuple[Tensor, Tensor] | None, options: AlignOptions
+) -> Tensor:
     """Singular values ``(b,)`` of the estimation matrix above the noise: of the inliers, of all lines where there is no motion."""
     kept = lines.data.restricted((labels != OUTLIER) | ~usable[:, None])
     joined = _joined(kept, points)
@@ -406,14 +409,16 @@ def _rank(lines: Lines, labels: Tensor, sigma: Tensor, usable: Tensor, points: t
     values = fit_matches(TranslatingLinesMatrix(), joined).singular_values
     noise = torch.where(usable, sigma, lines.floor) * torch.stack(lines.norm.scales).mean(0)
     noise = noise * joined.weights.square().sum(-1).sqrt()
-    return (values > torch.maximum(ABOVE * noise[:, None], 1e-9 * values[:, :1])).sum(-1)
+    return (values > torch.maximum(options.lines.above * noise[:, None], 1e-9 * values[:, :1])).sum(-1)
 
 
-def _notices(rank: Tensor, worst: Tensor, none: Tensor, enough: Tensor, batch: tuple[int, ...]) -> tuple[Notice, ...]:
+def _notices(
+    rank: Tensor, worst: Tensor, none: Tensor, enough: Tensor, batch: tuple[int, ...], options: AlignOptions
+) -> tuple[Notice, ...]:
     found, note = noting(batch)
     least = 0
     for most, case in RANKS:
         note(AlignNotice.PURE_TRANSLATION, rank, enough & (rank > least) & (rank <= most), case=case, full=MINIMAL)
         least = most
-    note(AlignNotice.UNCERTAIN, worst, ~none & (worst > UNCERTAIN), case="lines", what="motion")
+    note(AlignNotice.UNCERTAIN, worst, ~none & (worst > options.lines.uncertain), case="lines", what="motion")
     return in_order(found)

@@ -15,33 +15,17 @@ from dyntorch.core.solution import NOISY, Solution
 from dyntorch.geometry.homogeneous import cofactors, homogeneous, inhomogeneous
 from dyntorch.invariants.agreement import static_residual
 from dyntorch.invariants.homography_tensor import HomographyTensor
-from dyntorch.numerics.arguments import check_threshold
+from dyntorch.numerics.arguments import check_options, check_threshold
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.numerics.chi_square import three_sigma
-from dyntorch.tasks.align.labelling import ROUGH, SIGMAS, Evidence, Labelled, joined, static_consensus
+from dyntorch.tasks.align.labelling import Evidence, Labelled, joined, static_consensus
+from dyntorch.tasks.align.options import AlignOptions
 from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment, AlignNotice
 
 # ----------------------------------------------------------------------------------------------------------------------
 # What should be known about the matches of a plane before its result is trusted.
 
 
-RANK = 1e-9
-"""Singular value of the estimation matrix, over the largest, that rounding alone leaves."""
-NEAR = 2.0
-"""Strength of the weakest equation of the tensor: 0.4 to 0.7 where all stands still, 1.3 to 1.6 where points move by 1 to 5 pixels
-at 0.5 pixels of noise, 15 to 25 where they move by 25 to 80 (100 matches)."""
-UNDECIDED = 1.2
-"""The same, corrected for the matches that 26 equations use up, below which moving matches alone leave a family of motions.  0.7 to
-0.9 where all make equal steps (80 matches), 0.5 where all stands still; at 3 px of motion at changing speed on either side."""
-SUPPORT, CHANCE = 10, 3.0
-"""Static matches that settle such a family: so many, and so many for each that is expected by chance.  A motion of the family that
-is off makes 0 to 6 of 80 matches static at steps of 10 to 40 px, and up to 16 at 3 px, where 3 to 5 are expected."""
-WIDER = 3.0
-"""Times the limit of static matches within which those that are static by chance spread evenly, over a plane of velocities."""
-THIN = 3.0
-"""Standard deviations of the noise across a line of points, below which they may as well lie on it."""
-ROOM = 3.0
-"""Standard deviations of the noise within which a match belongs to a trajectory line."""
 LINES, FEWEST = 4, 16
 """Trajectory lines, and moving matches, that the tensor needs where nothing stands still (thesis chapter 2)."""
 NOTICES_MINIMAL = 4
@@ -49,7 +33,7 @@ NOTICES_MINIMAL = 4
 
 
 def planar_notices(
-    evidence: Evidence, best: Labelled, tensor: tuple[Tensor, Tensor], status: Tensor, batch: tuple[int, ...]
+    evidence: Evidence, best: Labelled, tensor: tuple[Tensor, Tensor], status: Tensor, batch: tuple[int, ...], options: AlignOptions
 ) -> tuple[Notice, ...]:
     """All notices on a flat batch of problems with final labels, in the order of the problems; ``tensor`` from
     :func:`tensor_rank`."""
@@ -61,30 +45,30 @@ def planar_notices(
     found, note = noting(batch)
     full = HomographyTensor.width() - 1
     note(AlignNotice.DEGENERATE, rank, solved & (rank < full))
-    note(AlignNotice.NEAR_STATIC, strength, solved & (rank >= full) & (strength < NEAR), case="tensor")
-    family = (status == Status.AMBIGUOUS) & undecided(evidence, best, tensor)
+    note(AlignNotice.NEAR_STATIC, strength, solved & (rank >= full) & (strength < options.planar.near_static), case="tensor")
+    family = (status == Status.AMBIGUOUS) & undecided(evidence, best, tensor, options)
     note(AlignNotice.OTHER_SOLUTION, (best.labels == STATIC).sum(-1), family)
     note(AlignNotice.FEW_MOVING, count, solved & (count < FEWEST), least=f"{FEWEST}")
-    lines = trajectory_lines(evidence, best, moving)
+    lines = trajectory_lines(evidence, best, moving, options)
     note(AlignNotice.FEW_LINES, lines, solved & (lines > 0) & (lines < LINES), least=LINES)
     note(AlignNotice.ONE_LINE, lines, solved & (lines == 1))
     thin = thinness(evidence, sigma)
-    note(AlignNotice.COLLINEAR, thin, (data.weights > 0).any(-1) & (thin < THIN))
+    note(AlignNotice.COLLINEAR, thin, (data.weights > 0).any(-1) & (thin < options.planar.thin))
     doubtful = (best.labels == MOVING) & unverified(evidence, best)
     note(AlignNotice.UNVERIFIED, doubtful.sum(-1), solved & doubtful.any(-1))
     return in_order(found)
 
 
-def tensor_rank(inliers: Matches, evidence: Evidence, sigma: Tensor) -> tuple[Tensor, Tensor]:
+def tensor_rank(inliers: Matches, evidence: Evidence, sigma: Tensor, options: AlignOptions) -> tuple[Tensor, Tensor]:
     """Numeric rank ``(b,)`` of the estimation matrix, and how far its 26th singular value is above the noise."""
     values = fit_matches(HomographyTensor(), inliers).singular_values
-    rank = (values > RANK * values[:, :1]).sum(-1)
+    rank = (values > options.planar.rank * values[:, :1]).sum(-1)
     # a row of unit length changes by about the noise of the normalized coordinates
     noise = sigma * torch.stack(evidence.norm.scales).square().mean(0).sqrt() * inliers.weights.square().sum(-1).sqrt()
     return rank, values[:, -2] / noise.clamp(min=torch.finfo(values.dtype).tiny)
 
 
-def undecided(evidence: Evidence, best: Labelled, tensor: tuple[Tensor, Tensor]) -> Tensor:
+def undecided(evidence: Evidence, best: Labelled, tensor: tuple[Tensor, Tensor], options: AlignOptions) -> Tensor:
     """Where the moving matches leave a family of motions ``(b,)``, and no more are static than some motion of it makes by chance.
 
     Points that make equal steps move as straight if the camera moves along at any velocity common to all.  The motion that makes
@@ -94,14 +78,14 @@ def undecided(evidence: Evidence, best: Labelled, tensor: tuple[Tensor, Tensor])
     used = (best.labels != OUTLIER).sum(-1)
     equations = HomographyTensor.width() - 1
     spare = ((used - equations).clamp(min=1) / used.clamp(min=1)).sqrt()
-    family = (rank >= equations) & (strength < UNDECIDED * spare)
+    family = (rank >= equations) & (strength < options.planar.undecided * spare)
     still = (best.labels == STATIC) & (evidence.data.weights > 0)
     if evidence.data.static is not None:
         family = family & ((still & evidence.data.static).sum(-1) < NOTICES_MINIMAL)
     square = evidence.residuals(best.theta)[1].square().sum(-1)
-    limit = WIDER**2 * three_sigma(4) * best.sigma.square()[:, None]
+    limit = options.planar.wider**2 * three_sigma(4) * best.sigma.square()[:, None]
     beside = ((square <= limit) & ~still & (evidence.data.weights > 0)).sum(-1)
-    return family & (still.sum(-1) < SUPPORT + CHANCE * beside / (WIDER**2 - 1))
+    return family & (still.sum(-1) < options.planar.support + options.planar.chance * beside / (options.planar.wider**2 - 1))
 
 
 def unverified(evidence: Evidence, best: Labelled) -> Tensor:
@@ -120,7 +104,7 @@ def unverified(evidence: Evidence, best: Labelled) -> Tensor:
     return agree.any(0) & (evidence.data.weights > 0)
 
 
-def trajectory_lines(evidence: Evidence, best: Labelled, moving: Tensor) -> Tensor:
+def trajectory_lines(evidence: Evidence, best: Labelled, moving: Tensor, options: AlignOptions) -> Tensor:
     """How many lines hold the paths of all moving matches ``(b,)``, counted up to LINES.
 
     Greedy: the longest path determines its line best; all matches on that line go, and so on.
@@ -135,7 +119,7 @@ def trajectory_lines(evidence: Evidence, best: Labelled, moving: Tensor) -> Tens
     normal = torch.stack([-along[..., 1], along[..., 0]], dim=-1)
     problem = torch.arange(len(length), device=length.device)
     left, count = moving, torch.zeros(len(length), dtype=torch.long, device=length.device)
-    noise = ROOM * (evidence.norm.scales[0] * best.sigma)[:, None]
+    noise = options.planar.room * (evidence.norm.scales[0] * best.sigma)[:, None]
     for _ in range(LINES):
         longest = torch.where(left, length, -1.0).argmax(-1)
         centre, across, base = places[:, problem, longest].mean(0), normal[problem, longest], length[problem, longest]
@@ -164,27 +148,11 @@ def thinness(evidence: Evidence, sigma: Tensor) -> Tensor:
     return torch.stack(found).amin(0)
 
 
-SAMPLES = 1000
-"""Samples of four matches: 96 % to draw four static ones where they are 24 % of all (30 % static, 20 % outliers)."""
-STEPS = 30
 MINIMAL = HomographyTensor.minimal()
 FEW = 3 * HomographyTensor.dof
 """Matches below which half of them do not determine a motion with certainty: noise and outliers cannot be told apart by it."""
 LABELLED = 9
 """Fewest matches where some are labelled static: nine rows each for 26 equations, and room to tell static from moving."""
-INDETERMINATE = 1e-13
-"""Information on the worst direction of the motion over that on the best, below which it is rounding error."""
-AMBIGUOUS = 0.5
-"""Standard deviation of the worst direction of the motion, of norm 1, above which the motion is not known at all."""
-SINGULAR = 1e-3
-"""Ratio of the singular values of a homography in normalized coordinates (usually above 0.1) that no camera gives a plane."""
-CONSENSUS = 0.4
-"""Share of inliers below which the best motion may be an accident."""
-UNIFORM, DOUBTFUL = 1.3, 0.7
-"""Noise that the inliers show over the assumed noise, above which they fill the limits evenly as random matches do (1.7), where
-their share is below the second figure."""
-SPARE = 8
-"""Conditions beyond the 16 degrees of freedom that inliers must fulfil: a minimal set fulfils 16 whatever it is."""
 
 AMBIGUITY = (
     "A and B are unique, each up to its scale. A match that agrees in two views only counts as moving: a point that paused and a "
@@ -202,6 +170,7 @@ def align_planar(
     weights: Tensor | None = None,
     static: Tensor | None = None,
     generator: torch.Generator | None = None,
+    options: AlignOptions = AlignOptions(),
 ) -> Alignment:
     r"""Motion of a camera from three views of a plane, with a label for every match: static, moving or outlier.
 
@@ -223,6 +192,7 @@ def align_planar(
         weights: ``(*batch, n)`` not negative; 0 leaves a match out.
         static: ``(*batch, n)`` bool, matches known not to move (they may still be outliers).
         generator: source of the random samples.
+        options: every number that decides, by stage and model; ``dataclasses.replace`` changes some of them.
 
     Returns:
         An :class:`~dyntorch.tasks.align.result.Alignment`.
@@ -244,6 +214,7 @@ def align_planar(
         >>> float((result.labels == scene.labels).double().mean()) > 0.9
         True
     """
+    check_options(options, AlignOptions)
     check_threshold(threshold)
     data = matches(HomographyTensor(), (x1, x2, x3), weights, static)
     least = MINIMAL if static is None else LABELLED
@@ -251,12 +222,12 @@ def align_planar(
         remedy = "add matches" if static is not None else f"add matches, or label static ones (static=; then {LABELLED} suffice)"
         raise ValueError(f"align_planar needs at least {least} matches, got {data.count}; {remedy}")
     with torch.no_grad():
-        return _align(data, threshold, generator)
+        return _align(data, threshold, generator, options)
 
 
-def _align(data: Matches, threshold: float | None, generator: torch.Generator | None) -> Alignment:
-    evidence = Evidence.of(HomographyTensor(), data)
-    solution, best, tensor = _solved(evidence, _search(evidence, threshold, generator))
+def _align(data: Matches, threshold: float | None, generator: torch.Generator | None, options: AlignOptions) -> Alignment:
+    evidence = Evidence.of(HomographyTensor(), data, options)
+    solution, best, tensor = _solved(evidence, _search(evidence, threshold, generator, options), options)
     outcome = solution.back(data)
     A, B = outcome.motion
     assert outcome.sigma is not None and outcome.covariance is not None
@@ -268,19 +239,23 @@ def _align(data: Matches, threshold: float | None, generator: torch.Generator | 
         sigma=outcome.sigma,
         covariance=outcome.covariance,
         ambiguity=AMBIGUITY,
-        notices=planar_notices(evidence, best, tensor, solution.status, data.batch),
+        notices=planar_notices(evidence, best, tensor, solution.status, data.batch, options),
         unverified=data.back(unverified(evidence, best) & (best.labels == MOVING)),
         solution=outcome,
     )
 
 
-def _search(evidence: Evidence, threshold: float | None, generator: torch.Generator | None) -> Labelled:
+def _search(evidence: Evidence, threshold: float | None, generator: torch.Generator | None, options: AlignOptions) -> Labelled:
     """The better one of the motions that the two searches start from, with its labels."""
     size = len(evidence.floor)
-    given = None if threshold is None else torch.full_like(evidence.floor, threshold / SIGMAS).maximum(evidence.floor)
-    starts = [_from_static(evidence, given, generator)]
+    given = (
+        None
+        if threshold is None
+        else torch.full_like(evidence.floor, threshold / options.labels.threshold_in_sigmas).maximum(evidence.floor)
+    )
+    starts = [_from_static(evidence, given, generator, options)]
     if MINIMAL <= evidence.data.count < FEW:
-        starts.append(_from_all(evidence, given))
+        starts.append(_from_all(evidence, given, options))
     if size and evidence.data.count >= (MINIMAL if given is not None else FEW):
         starts.append(_from_tensor(evidence, given, generator))
     count = len(starts)
@@ -289,19 +264,21 @@ def _search(evidence: Evidence, threshold: float | None, generator: torch.Genera
     several, noise = evidence.repeated(count), sigma.repeat(count)
     rough = torch.arange(count, device=sigma.device).repeat_interleave(size) == 0
     theta = several.improved(torch.cat([start for start, _ in starts]), noise, rough)
-    cost = torch.where(_singular(theta), torch.inf, several.cost(theta, noise))
+    cost = torch.where(_singular(theta, options), torch.inf, several.cost(theta, noise))
     best = cost.unflatten(0, (count, size)).argmin(0)
     chosen = theta[best * size + torch.arange(size, device=best.device)]
     return evidence.settled(chosen, sigma, estimate=given is None)
 
 
-def _singular(theta: Tensor) -> Tensor:
+def _singular(theta: Tensor, options: AlignOptions) -> Tensor:
     """Whether a motion ``(b, 18)`` maps the plane into a line or a point, which fulfils every match and explains none."""
     values = torch.linalg.svdvals(theta.nan_to_num().unflatten(-1, (2, 3, 3)))
-    return (values[..., 2] < SINGULAR * values[..., 0]).any(-1)
+    return (values[..., 2] < options.planar.singular * values[..., 0]).any(-1)
 
 
-def _from_static(evidence: Evidence, given: Tensor | None, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
+def _from_static(
+    evidence: Evidence, given: Tensor | None, generator: torch.Generator | None, options: AlignOptions
+) -> tuple[Tensor, Tensor]:
     """Motion on which the most matches agree that they stand still, and the noise by their median."""
     data = evidence.data
     pool = data.weights > 0
@@ -310,8 +287,8 @@ def _from_static(evidence: Evidence, given: Tensor | None, generator: torch.Gene
         pool = torch.where((known.sum(-1) >= 4)[:, None], known, pool)
     scale = evidence.norm.scales[0]
     # each distance has the noise of two views
-    limit = None if given is None else 2 * three_sigma(4) * (ROUGH * scale * given).square()
-    motion, variance = static_consensus(evidence.views, pool, limit, SAMPLES, generator)
+    limit = None if given is None else 2 * three_sigma(4) * (options.labels.rough * scale * given).square()
+    motion, variance = static_consensus(evidence.views, pool, limit, options.planar.samples, generator, options)
     theta = torch.cat([part.flatten(1) for part in motion], dim=-1)
     return theta, variance.nan_to_num(posinf=1.0).sqrt() / scale if given is None else given
 
@@ -331,11 +308,11 @@ def _from_tensor(evidence: Evidence, given: Tensor | None, generator: torch.Gene
     return theta, torch.where(usable & noise.isfinite(), noise, torch.inf)
 
 
-def _from_all(evidence: Evidence, given: Tensor | None) -> tuple[Tensor, Tensor]:
+def _from_all(evidence: Evidence, given: Tensor | None, options: AlignOptions) -> tuple[Tensor, Tensor]:
     """Motion as if all matches were moving inliers, and the noise that they then show."""
     data = evidence.data
     theta, usable = _usable(evidence, fit_matches(HomographyTensor(), replace(data, static=None)))
-    refined = evidence.refined(theta, torch.where(data.weights > 0, MOVING, OUTLIER), STEPS)
+    refined = evidence.refined(theta, torch.where(data.weights > 0, MOVING, OUTLIER), options.planar.steps)
     assert refined.sigma is not None
     return joined(refined), torch.where(usable, refined.sigma, torch.inf) if given is None else given
 
@@ -348,18 +325,18 @@ def _usable(evidence: Evidence, found: Solution) -> tuple[Tensor, Tensor]:
     return torch.where(usable[:, None], theta, identity), usable
 
 
-def _solved(evidence: Evidence, best: Labelled) -> tuple[Solution, Labelled, tuple[Tensor, Tensor]]:
+def _solved(evidence: Evidence, best: Labelled, options: AlignOptions) -> tuple[Solution, Labelled, tuple[Tensor, Tensor]]:
     """The solution with its status, the final labels, none where there is no motion, and what the tensor alone rests on."""
-    refined = evidence.refined(best.theta, best.labels, STEPS)
+    refined = evidence.refined(best.theta, best.labels, options.planar.steps)
     theta = joined(refined)
     values, spread = evidence.information(theta, best.labels)
     labels = evidence.labels(theta, best.sigma, spread)
     worst = best.sigma * values[:, 0].clamp(min=torch.finfo(values.dtype).tiny).rsqrt()
     assert refined.sigma is not None and refined.covariance is not None
     best = Labelled(theta, labels, best.sigma)
-    tensor = tensor_rank(evidence.data.restricted(labels != OUTLIER), evidence, best.sigma)
-    free = (worst > AMBIGUOUS) | undecided(evidence, best, tensor)
-    status = _status(evidence, best, refined.sigma, free, values[:, 0] <= INDETERMINATE * values[:, -1])
+    tensor = tensor_rank(evidence.data.restricted(labels != OUTLIER), evidence, best.sigma, options)
+    free = (worst > options.planar.ambiguous) | undecided(evidence, best, tensor, options)
+    status = _status(evidence, best, refined.sigma, free, values[:, 0] <= options.planar.indeterminate * values[:, -1], options)
     none = failed(status)
     labels = torch.where(none[:, None], OUTLIER, labels)
     zero = none[:, None, None]
@@ -376,7 +353,7 @@ def _solved(evidence: Evidence, best: Labelled) -> tuple[Solution, Labelled, tup
     return solution, replace(best, labels=labels), tensor
 
 
-def _status(evidence: Evidence, best: Labelled, shown: Tensor, free: Tensor, undetermined: Tensor) -> Tensor:
+def _status(evidence: Evidence, best: Labelled, shown: Tensor, free: Tensor, undetermined: Tensor, options: AlignOptions) -> Tensor:
     """``(b,)`` from the inliers, the noise they show, and whether a part of the motion is free by the noise, or exactly."""
     usable = evidence.data.weights > 0
     present = usable.sum(-1)
@@ -384,9 +361,9 @@ def _status(evidence: Evidence, best: Labelled, shown: Tensor, free: Tensor, und
     still, moving = (best.labels == STATIC).sum(-1), (best.labels == MOVING).sum(-1)
     share = (still + moving) / present.clamp(min=1)
     accident = (
-        (share < CONSENSUS)
-        | ((share < DOUBTFUL) & (shown > UNIFORM * best.sigma))
-        | (4 * still + moving < HomographyTensor.dof + SPARE)
+        (share < options.planar.consensus)
+        | ((share < options.planar.doubtful) & (shown > options.planar.uniform * best.sigma))
+        | (4 * still + moving < HomographyTensor.dof + options.planar.spare)
     )
     accident = accident | (best.sigma * torch.stack(evidence.norm.scales).amax(0) > NOISY)
     status = torch.full_like(present, int(Status.OK))

@@ -9,9 +9,10 @@ from torch import Tensor
 
 from dyntorch.core.matches import Matches, matches
 from dyntorch.invariants.join_tensor import JoinTensor
-from dyntorch.numerics.arguments import check_threshold
+from dyntorch.numerics.arguments import check_options, check_threshold
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.tasks.align import join, rigid, velocity
+from dyntorch.tasks.align.options import AlignOptions
 from dyntorch.tasks.align.result import Alignment
 
 Model = Literal["join", "minimal_join", "constant_velocity", "affine_constant_velocity", "rigid"]
@@ -39,6 +40,7 @@ def align_points(
     weights: Tensor | None = None,
     static: Tensor | None = None,
     generator: torch.Generator | None = None,
+    options: AlignOptions = AlignOptions(),
 ) -> Alignment:
     r"""Motion of a 3D sensor from three views of points, with a label for every match: static, moving or outlier.
 
@@ -71,6 +73,7 @@ def align_points(
         weights: ``(*batch, n)`` not negative; 0 leaves a match out.
         static: ``(*batch, n)`` bool, matches known not to move (they may still be outliers).
         generator: source of the random samples.
+        options: every number that decides, by stage and model; ``dataclasses.replace`` changes some of them.
 
     Returns:
         An :class:`~dyntorch.tasks.align.result.Alignment`.  Rigid A and B have 1 as last entry, all others norm 1.  With constant
@@ -99,18 +102,21 @@ def align_points(
         raise ValueError(f"motion must be one of {', '.join(get_args(Motion))}, got {motion!r}")
     if motion != "straight" and model != "rigid":
         raise ValueError(f"motion={motion!r} belongs to model='rigid', got model={model!r}; use model='constant_velocity'")
+    check_options(options, AlignOptions)
     check_threshold(threshold)
     data = matches(JoinTensor(), (P1, P2, P3), weights, static)
     least = (LEAST if static is None else LABELLED)[model]
     if data.count < least:
         raise ValueError(f"align_points with model={model!r} needs at least {least} matches, got {data.count}; add matches")
     with torch.no_grad():
-        return _dispatch(data, model, threshold, motion, generator)
+        return _dispatch(data, model, threshold, motion, generator, options)
 
 
-def _dispatch(data: Matches, model: str, threshold: float | None, motion: str, generator: torch.Generator | None) -> Alignment:
+def _dispatch(
+    data: Matches, model: str, threshold: float | None, motion: str, generator: torch.Generator | None, options: AlignOptions
+) -> Alignment:
     if model == "rigid":
-        return rigid.align_rigid(data, threshold, motion, generator)
+        return rigid.align_rigid(data, threshold, motion, generator, options)
     if model in ("join", "minimal_join"):
-        return join.align_join(data, threshold, model, generator)
-    return velocity.align_velocity(data, threshold, model == "affine_constant_velocity", generator)
+        return join.align_join(data, threshold, model, generator, options)
+    return velocity.align_velocity(data, threshold, model == "affine_constant_velocity", generator, options)

@@ -17,7 +17,7 @@ from dyntorch.numerics.blocks import map_blocks, uniform
 from dyntorch.numerics.chi_square import median, three_sigma
 from dyntorch.numerics.least_squares import damped_step
 from dyntorch.numerics.nullspace import spectrum
-from dyntorch.tasks.align.labelling import SIGMAS
+from dyntorch.tasks.align.options import AlignOptions
 from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment, AlignNotice
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -197,20 +197,11 @@ def _step(pose: Tensor, gradient: Tensor, matrix: Tensor, damping: Tensor) -> Te
 # Robust estimation of two rigid motions: many starts from small samples, the best few annealed over all matches.
 
 
-STATIC_STARTS = 60
-"""Samples of 3 matches taken as static: 40 % static points without outliers are met by 98 % of 60 such samples."""
-MOVING_STARTS = 60
 SAMPLE = {"straight": 7, "constant_velocity": 5}
 """Matches per moving sample, one or two above the minimum (6 and 3): at the minimum itself local minima abound."""
-FINALISTS = 5
 BITS = three_sigma(2) / 2
 """Cost, in units of 2 log likelihood, of one free coordinate: a match is an outlier (6 free ones) rather than a point on a
 straight line (4) above the limit of chi-square with 2 degrees of freedom."""
-ROUNDS = 4  # of labelling and least squares
-PROBLEMS = 16  # of a batch solved together
-SEEDS = 512  # velocities tried as the common one
-STANDING = 0.1
-"""Least share of the matches that must have one velocity before they are taken for the static background (and at least 3)."""
 
 
 @dataclass(frozen=True)
@@ -241,6 +232,8 @@ def search(
     starts: Tensor,
     generator: torch.Generator | None,
     floor: float = 1e-13,
+    *,
+    options: AlignOptions,
 ) -> Rigid:
     """The two rigid motions that most matches agree with.
 
@@ -253,7 +246,7 @@ def search(
         floor: least noise that is believed.
     """
     b, n = data.weights.shape
-    draws = uniform(b, STATIC_STARTS + MOVING_STARTS, n, generator=generator, device=data.x1.device)
+    draws = uniform(b, options.rigid.static_starts + options.rigid.moving_starts, n, generator=generator, device=data.x1.device)
     # matches of weight 0 come last, so that they are drawn only where there is nothing else
     order = (draws + 2.0 * (data.weights <= 0)[:, None]).argsort(-1)[..., : SAMPLE[data.motion]]
     known = torch.zeros(b, dtype=data.x1.dtype, device=data.x1.device) if sigma is None else sigma
@@ -262,19 +255,23 @@ def search(
     def run(*block: Tensor) -> tuple[Tensor, ...]:
         x1, x2, x3, weights, held, noise, picked, given = block
         part = RigidSightings(x1[:, None], x2[:, None], x3[:, None], weights[:, None], data.motion)
-        found = _search(part, None if sigma is None else noise, held, picked, given, floor)
+        found = _search(part, None if sigma is None else noise, held, picked, given, floor, options)
         return found.motions, found.sigma, found.information, found.inliers, found.still, found.grounded
 
-    return Rigid(*map_blocks(run, data.x1, data.x2, data.x3, data.weights, flags, known, order, starts, size=PROBLEMS))
+    return Rigid(
+        *map_blocks(run, data.x1, data.x2, data.x3, data.weights, flags, known, order, starts, size=options.rigid.problems)
+    )
 
 
-def _search(data: RigidSightings, sigma: Tensor | None, held: Tensor, order: Tensor, given: Tensor, floor: float) -> Rigid:
+def _search(
+    data: RigidSightings, sigma: Tensor | None, held: Tensor, order: Tensor, given: Tensor, floor: float, options: AlignOptions
+) -> Rigid:
     """One block: sightings ``(b, 1, n, 3)``."""
-    candidates = torch.cat([given, _all(data)[:, None], *_samples(data, order)], dim=1)
+    candidates = torch.cat([given, _all(data)[:, None], *_samples(data, order, options)], dim=1)
     moving, static = squares(candidates, data)
     noise = _scales(moving, data, floor) if sigma is None else sigma[:, None].expand(candidates.shape[:2]).clamp(min=floor)
     score = noise if sigma is None else _score(moving, static, held, data, noise)
-    best = score.topk(min(FINALISTS, score.shape[1]), dim=1, largest=False).indices
+    best = score.topk(min(options.rigid.finalists, score.shape[1]), dim=1, largest=False).indices
     # the given starts run as well: they rest on all matches, which no small sample does
     chosen = torch.cat([torch.arange(given.shape[1] + 1, device=best.device).expand(len(best), -1), best], dim=1)
     motions = candidates.gather(1, chosen[..., None, None, None].expand(-1, -1, 2, 4, 4))
@@ -289,15 +286,15 @@ def _search(data: RigidSightings, sigma: Tensor | None, held: Tensor, order: Ten
     first = torch.arange(len(winner), device=winner.device)
     flat = RigidSightings(data.x1[:, 0], data.x2[:, 0], data.x3[:, 0], data.weights[:, 0], data.motion)
     grounded = held.any(-1) if data.motion == "constant_velocity" else torch.ones_like(held[:, 0])
-    found = _settle(motions[first, winner], flat, noise[first, winner], sigma is None, held, grounded, floor)
+    found = _settle(motions[first, winner], flat, noise[first, winner], sigma is None, held, grounded, floor, options)
     if data.motion == "straight":
         return found
-    common, members, present = *common_velocity(found, flat), (flat.weights > 0).sum(-1)
-    standing = ~grounded & (members >= 3) & (members >= STANDING * present)
+    common, members, present = *common_velocity(found, flat, options), (flat.weights > 0).sum(-1)
+    standing = ~grounded & (members >= 3) & (members >= options.rigid.standing * present)
     found = replace(found, motions=drifted(found.motions, torch.where(grounded[:, None], 0.0, common)))
     if not bool(standing.any()):
         return found
-    return _settle(found.motions, flat, found.sigma, sigma is None, held, grounded | standing, floor)
+    return _settle(found.motions, flat, found.sigma, sigma is None, held, grounded | standing, floor, options)
 
 
 def _all(data: RigidSightings) -> Tensor:
@@ -306,10 +303,10 @@ def _all(data: RigidSightings) -> Tensor:
     return torch.stack([rigid_alignment(x1, data.x2[:, 0], w), rigid_alignment(x1, data.x3[:, 0], w)], dim=1)
 
 
-def _samples(data: RigidSightings, order: Tensor) -> tuple[Tensor, Tensor]:
+def _samples(data: RigidSightings, order: Tensor, options: AlignOptions) -> tuple[Tensor, Tensor]:
     """Motions from samples of 3 static matches, and of a few moving ones."""
     found = []
-    for index, still in ((order[:, :STATIC_STARTS, :3], True), (order[:, STATIC_STARTS:], False)):
+    for index, still in ((order[:, : options.rigid.static_starts, :3], True), (order[:, options.rigid.static_starts :], False)):
         sample = data.sample(index)
         start = torch.stack([rigid_alignment(sample.x1, x, sample.weights) for x in (sample.x2, sample.x3)], dim=2)
         found.append(start if still else descend(start, sample, iterations=12)[0])
@@ -339,11 +336,18 @@ def _score(moving: Tensor, static: Tensor, held: Tensor, data: RigidSightings, s
 
 
 def _settle(
-    motions: Tensor, data: RigidSightings, sigma: Tensor, estimate: bool, held: Tensor, grounded: Tensor, floor: float
+    motions: Tensor,
+    data: RigidSightings,
+    sigma: Tensor,
+    estimate: bool,
+    held: Tensor,
+    grounded: Tensor,
+    floor: float,
+    options: AlignOptions,
 ) -> Rigid:
     """Least squares over the matches that belong to the model, static ones as such, until they do not change."""
     present = data.weights > 0
-    for _ in range(ROUNDS):
+    for _ in range(options.rigid.rounds):
         moving, static = squares(motions, data)
         square = sigma.square()[:, None]
         resting = static <= three_sigma(6) * square
@@ -374,14 +378,14 @@ def drifted(motions: Tensor, velocity: Tensor) -> Tensor:
     return motions - shift
 
 
-def common_velocity(found: Rigid, data: RigidSightings) -> tuple[Tensor, Tensor]:
+def common_velocity(found: Rigid, data: RigidSightings, options: AlignOptions) -> tuple[Tensor, Tensor]:
     """The velocity ``(b, 3)`` that most matches share, in the frame of view 1 and per step, and how many do, ``(b,)``.
 
     Where fewer than 3 share one it is the mean velocity of the inliers.
     """
     u, v, _, _ = combinations(found.motions, data)
     velocity = -u / 2**0.5
-    step = max(1, velocity.shape[-2] // SEEDS)
+    step = max(1, velocity.shape[-2] // options.rigid.seeds)
     # of a static point |u|^2 + |v|^2 is within the limit, with u counted from the common velocity
     room = (three_sigma(6) * found.sigma.square()[:, None] - v.square().sum(-1)).clamp(min=0.0) / 2
     near = (torch.cdist(velocity[:, ::step], velocity).square() <= 2 * room[:, None]) & found.inliers[:, None]
@@ -390,7 +394,7 @@ def common_velocity(found: Rigid, data: RigidSightings) -> tuple[Tensor, Tensor]
     mean = _mean(velocity, members)
     members = ((velocity - mean[:, None]).square().sum(-1) <= room) & found.inliers
     count = members.sum(-1)
-    enough = (count >= 3) & (count >= STANDING * found.inliers.sum(-1))
+    enough = (count >= 3) & (count >= options.rigid.standing * found.inliers.sum(-1))
     return _mean(velocity, torch.where(enough[:, None], members, found.inliers)), count
 
 
@@ -400,13 +404,6 @@ def _mean(x: Tensor, members: Tensor) -> Tensor:
 
 MINIMAL = {"straight": 6, "constant_velocity": 3}
 """Moving matches for the 12 (9) degrees of freedom, at 2 (3) conditions each; static ones give 6."""
-INDETERMINATE = 1e-10  # information on the worst direction over that on the best: rounding error below it
-AMBIGUOUS = 0.3
-"""Standard deviation of the worst direction, in radians or sizes of the scene, above which the motion is not known at all."""
-UNCERTAIN = 0.05
-"""The same, from where a notice says so: 3 degrees."""
-CONSENSUS = 0.4  # share of inliers below which the best motion may be an accident
-SPARE = 4  # conditions beyond the degrees of freedom: a minimal set fulfils those whatever it is
 
 AMBIGUITY = {
     "straight": (
@@ -420,17 +417,19 @@ AMBIGUITY = {
 }
 
 
-def align_rigid(data: Matches, threshold: float | None, motion: str, generator: torch.Generator | None) -> Alignment:
+def align_rigid(
+    data: Matches, threshold: float | None, motion: str, generator: torch.Generator | None, options: AlignOptions
+) -> Alignment:
     """:func:`dyntorch.align_points` with ``model="rigid"``, for checked matches."""
     weights = data.weights / data.weights.amax(-1, keepdim=True).clamp(min=torch.finfo(torch.float64).tiny)
     centres, scale = _frame(data.views, weights)
     x1, x2, x3 = ((x - c[:, None]) * scale[:, None, None] for x, c in zip(data.views, centres, strict=True))
     sightings = RigidSightings(x1, x2, x3, weights, motion)
-    sigma = None if threshold is None else threshold / SIGMAS * scale
+    sigma = None if threshold is None else threshold / options.labels.threshold_in_sigmas * scale
     none = x1.new_zeros(len(x1), 0, 2, 4, 4)
     starts = none if data.static is None else _from_static(sightings, data.static & (weights > 0))
-    found = search(sightings, sigma, data.static, starts, generator, floor=100 * torch.finfo(data.dtype).eps)
-    return _result(data, sightings, found, centres, scale)
+    found = search(sightings, sigma, data.static, starts, generator, floor=100 * torch.finfo(data.dtype).eps, options=options)
+    return _result(data, sightings, found, centres, scale, options)
 
 
 def _frame(views: tuple[Tensor, ...], weights: Tensor) -> tuple[list[Tensor], Tensor]:
@@ -447,7 +446,9 @@ def _from_static(data: RigidSightings, known: Tensor) -> Tensor:
     return torch.stack([rigid_alignment(data.x1, x, weights) for x in (data.x2, data.x3)], dim=1)[:, None]
 
 
-def _result(data: Matches, sightings: RigidSightings, found: Rigid, centres: list[Tensor], scale: Tensor) -> Alignment:
+def _result(
+    data: Matches, sightings: RigidSightings, found: Rigid, centres: list[Tensor], scale: Tensor, options: AlignOptions
+) -> Alignment:
     motion = sightings.motion
     labels = _labels(sightings, found)
     dof = torch.where(found.grounded, 12, 9)
@@ -455,7 +456,9 @@ def _result(data: Matches, sightings: RigidSightings, found: Rigid, centres: lis
     worst = found.sigma * values.clamp(min=torch.finfo(values.dtype).tiny).rsqrt()
     top = found.information.diagonal(dim1=-2, dim2=-1).amax(-1)
     noisy = found.sigma.isfinite() & (found.sigma > NOISY)
-    status = _status(labels, sightings.weights, worst, noisy, values <= INDETERMINATE * top, dof, MOTIONS[motion])
+    status = _status(
+        labels, sightings.weights, worst, noisy, values <= options.rigid.indeterminate * top, dof, MOTIONS[motion], options
+    )
     none = failed(status)
     labels = torch.where(none[:, None], OUTLIER, labels)
     matrices, entries = _measured(found.motions, covariance * found.sigma.square()[:, None, None], centres, scale)
@@ -465,7 +468,7 @@ def _result(data: Matches, sightings: RigidSightings, found: Rigid, centres: lis
     u, _, _, _ = combinations(found.motions, sightings)
     velocity = torch.where((labels == OUTLIER)[..., None], 0.0, -u / 2**0.5 / scale[:, None, None])
     zero = none[:, None, None]
-    limits = _notices(labels, worst, found.grounded, none, motion, data.batch)
+    limits = _notices(labels, worst, found.grounded, none, motion, data.batch, options)
     return Alignment(
         A=data.back(torch.where(zero, 0.0, matrices[:, 0])),
         B=data.back(torch.where(zero, 0.0, matrices[:, 1])),
@@ -498,13 +501,22 @@ def _inverse(information: Tensor, dof: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _status(
-    labels: Tensor, weights: Tensor, worst: Tensor, noisy: Tensor, undetermined: Tensor, dof: Tensor, conditions: int
+    labels: Tensor,
+    weights: Tensor,
+    worst: Tensor,
+    noisy: Tensor,
+    undetermined: Tensor,
+    dof: Tensor,
+    conditions: int,
+    options: AlignOptions,
 ) -> Tensor:
     present = (weights > 0).sum(-1)
     still, moving = (labels == STATIC).sum(-1), (labels == MOVING).sum(-1)
-    accident = (still + moving < CONSENSUS * present) | (6 * still + conditions * moving < dof + SPARE) | noisy
+    accident = (
+        (still + moving < options.rigid.consensus * present) | (6 * still + conditions * moving < dof + options.rigid.spare) | noisy
+    )
     status = torch.full_like(present, int(Status.OK))
-    status = torch.where(worst > AMBIGUOUS, int(Status.AMBIGUOUS), status)
+    status = torch.where(worst > options.rigid.ambiguous, int(Status.AMBIGUOUS), status)
     status = torch.where(accident, int(Status.NO_CONSENSUS), status)
     status = torch.where(undetermined & ~accident, int(Status.DEGENERATE), status)
     return torch.where(present < 3, int(Status.TOO_FEW), status)
@@ -531,11 +543,11 @@ def _measured(motions: Tensor, covariance: Tensor, centres: list[Tensor], scale:
 
 
 def _notices(
-    labels: Tensor, worst: Tensor, grounded: Tensor, none: Tensor, motion: str, batch: tuple[int, ...]
+    labels: Tensor, worst: Tensor, grounded: Tensor, none: Tensor, motion: str, batch: tuple[int, ...], options: AlignOptions
 ) -> tuple[Notice, ...]:
     moving, solved = (labels == MOVING).sum(-1), ~none
     found, note = noting(batch)
-    note(AlignNotice.UNCERTAIN, worst, solved & (worst > UNCERTAIN), case="rigid")
+    note(AlignNotice.UNCERTAIN, worst, solved & (worst > options.rigid.uncertain), case="rigid")
     note(AlignNotice.COMMON_VELOCITY, worst, solved & ~grounded)
     few = solved & (moving < MINIMAL[motion]) & ((labels == STATIC).sum(-1) < 3)
     note(AlignNotice.FEW_MOVING, moving, few, least=f"{MINIMAL[motion]}")

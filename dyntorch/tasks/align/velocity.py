@@ -19,20 +19,16 @@ from dyntorch.numerics.blocks import map_blocks, uniform
 from dyntorch.numerics.chi_square import median, three_sigma
 from dyntorch.numerics.least_squares import damped_step, derivatives
 from dyntorch.numerics.nullspace import spectrum
-from dyntorch.tasks.align.labelling import ROUGH, SIGMAS, Evidence
+from dyntorch.tasks.align.labelling import Evidence
+from dyntorch.tasks.align.options import AlignOptions
 from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment, AlignNotice
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Points at constant velocity before projective or affine sensors: refinement, the static gauge, labels, the sensor's motion.
 
 
-ROUNDS = 4
 STEPS = 15
 CONVERGED = 1e-10  # relative decrease of the cost
-SEEDS = 64
-"""Velocities tried as the common one: of 10 % static matches six or seven are among them."""
-STANDING = 0.1
-"""Least share of the inliers that must have one velocity before they are taken for the static background (and at least 3)."""
 GAUGE = 3  # degrees of freedom of the common velocity
 DOF = {False: 30, True: 21}
 """Of three projective (affine) maps up to an affinity of the world and the common velocity."""
@@ -77,7 +73,7 @@ def refined(evidence: Evidence, theta: Tensor, labels: Tensor, affine: bool) -> 
     return theta
 
 
-def settle(evidence: Evidence, theta: Tensor, sigma: Tensor, affine: bool, estimate: bool) -> Velocities:
+def settle(evidence: Evidence, theta: Tensor, sigma: Tensor, affine: bool, estimate: bool, options: AlignOptions) -> Velocities:
     """Label and refine in turns: first without a gauge, then with the static matches, if there are such.
 
     Args:
@@ -91,15 +87,17 @@ def settle(evidence: Evidence, theta: Tensor, sigma: Tensor, affine: bool, estim
     grounded = torch.zeros_like(sigma, dtype=torch.bool) if known is None else (known & (evidence.data.weights > 0)).any(-1)
     if known is not None:
         theta = _fixed(evidence, theta, known & (evidence.data.weights > 0))
-    state = _rounds(evidence, Velocities(theta, _labels(evidence, theta, sigma, grounded), sigma, grounded), affine, estimate)
-    theta, standing = _ground(evidence, state)
+    state = _rounds(
+        evidence, Velocities(theta, _labels(evidence, theta, sigma, grounded), sigma, grounded), affine, estimate, options
+    )
+    theta, standing = _ground(evidence, state, options)
     standing = standing & ~grounded
     state = replace(state, theta=theta)
     if not bool(standing.any()):
         return state
     grounded = grounded | standing
     labels = _labels(evidence, theta, state.sigma, grounded)
-    return _rounds(evidence, Velocities(theta, labels, state.sigma, grounded), affine, estimate)
+    return _rounds(evidence, Velocities(theta, labels, state.sigma, grounded), affine, estimate, options)
 
 
 def information(evidence: Evidence, state: Velocities, affine: bool) -> tuple[Tensor, Tensor, Tensor]:
@@ -138,9 +136,9 @@ def residuals(evidence: Evidence, theta: Tensor) -> tuple[Tensor, Tensor]:
     return moving, model.whitened_static(motion, evidence.views, scales).square().sum(-1)
 
 
-def _rounds(evidence: Evidence, state: Velocities, affine: bool, estimate: bool) -> Velocities:
+def _rounds(evidence: Evidence, state: Velocities, affine: bool, estimate: bool, options: AlignOptions) -> Velocities:
     theta, labels, sigma = state.theta, state.labels, state.sigma
-    for _ in range(ROUNDS):
+    for _ in range(options.velocity.rounds):
         theta = refined(evidence, theta, labels, affine)
         if estimate:
             sigma = _noise(evidence, theta, labels, sigma, DOF[affine] + GAUGE * state.grounded.long())
@@ -169,12 +167,12 @@ def _noise(evidence: Evidence, theta: Tensor, labels: Tensor, before: Tensor, do
     return torch.where(spare >= 6, shown, before).maximum(evidence.floor)
 
 
-def _ground(evidence: Evidence, state: Velocities) -> tuple[Tensor, Tensor]:
+def _ground(evidence: Evidence, state: Velocities, options: AlignOptions) -> tuple[Tensor, Tensor]:
     """Maps in the gauge in which the most matches stand still, and where these are enough; else the mean velocity is 0."""
     inliers = state.labels != OUTLIER
     limit = three_sigma(6) * state.sigma.square()[:, None]
     n = inliers.shape[-1]
-    chosen = torch.arange(0, n, max(1, -(-n // SEEDS)), device=inliers.device)
+    chosen = torch.arange(0, n, max(1, -(-n // options.velocity.seeds)), device=inliers.device)
     motion, views = _maps(evidence, state.theta), evidence.views
     several = tuple(m[:, None].expand(-1, len(chosen), -1, -1) for m in motion)
     one = tuple(x[:, chosen, None] for x in views)
@@ -182,13 +180,13 @@ def _ground(evidence: Evidence, state: Velocities) -> tuple[Tensor, Tensor]:
     scales = tuple(s[:, None] for s in evidence.norm.scales)
     resting = ConstantVelocityTensor().whitened_static(tried, tuple(x[:, None] for x in views), scales).square().sum(-1)
     # the noise of the one match that chose the velocity is in these residuals, too
-    near = (resting <= ROUGH**2 * limit[:, None]) & inliers[:, None]
+    near = (resting <= options.labels.rough**2 * limit[:, None]) & inliers[:, None]
     best = (near.sum(-1) * inliers[:, chosen]).argmax(-1)
     members = near[torch.arange(len(best), device=best.device), best]
     theta = _fixed(evidence, state.theta, members)
     members = (residuals(evidence, theta)[1] <= limit) & inliers
     count = members.sum(-1)
-    enough = (count >= 3) & (count >= STANDING * inliers.sum(-1))
+    enough = (count >= 3) & (count >= options.velocity.standing * inliers.sum(-1))
     free = torch.where(state.grounded[:, None], False, torch.where(enough[:, None], members, inliers))
     return _fixed(evidence, state.theta, free), enough
 
@@ -224,17 +222,8 @@ def _scaled(theta: Tensor) -> Tensor:
 
 
 MINIMAL = {False: 21, True: 7}
-SAMPLES, SAMPLE = 150, 8
-"""Affine samples, one match above the minimum: 40 % outliers leave 1.7 % of such samples clean, 92 % to draw one."""
-HELD = 1e-9  # eigenvalue over the largest: 3e-5 of the size of the data, far below any real noise
-INDETERMINATE = 1e-13  # information on the worst direction over that on the best: rounding error below it
-AMBIGUOUS, UNCERTAIN = 0.5, 0.05
-"""Standard deviation of the worst direction of the maps, of norm 1, above which they are not known at all; or hardly."""
-CONSENSUS, SPARE = 0.4, 6
-PROBLEMS = 8
 RANKS = ((36, AlignNotice.EQUAL_VELOCITIES), (49, AlignNotice.LINEAR_VELOCITIES), (58, AlignNotice.PLANAR_VELOCITIES))
 """Ranks of the estimation matrix for degenerate velocities (of 63)."""
-ABOVE = 3.0  # a singular value counts from so many times the noise on
 
 AMBIGUITY = (
     "A velocity common to all points cannot be told from a motion of the sensor: the largest group of matches of one velocity (at "
@@ -243,19 +232,27 @@ AMBIGUITY = (
 )
 
 
-def align_velocity(data: Matches, threshold: float | None, affine: bool, generator: torch.Generator | None) -> Alignment:
+def align_velocity(
+    data: Matches, threshold: float | None, affine: bool, generator: torch.Generator | None, options: AlignOptions
+) -> Alignment:
     """:func:`dyntorch.align_points` with a model of constant velocity, for checked matches."""
-    evidence = Evidence.of(ConstantVelocityTensor(), data)
-    given = None if threshold is None else torch.full_like(evidence.floor, threshold / SIGMAS).maximum(evidence.floor)
-    start = _affine_start(evidence, given, generator) if affine else _projective_start(evidence, given, threshold, generator)
+    evidence = Evidence.of(ConstantVelocityTensor(), data, options)
+    given = (
+        None
+        if threshold is None
+        else torch.full_like(evidence.floor, threshold / options.labels.threshold_in_sigmas).maximum(evidence.floor)
+    )
+    start = (
+        _affine_start(evidence, given, generator, options) if affine else _projective_start(evidence, given, threshold, generator)
+    )
     theta, sigma, found = start
-    state = settle(evidence, theta, sigma, affine, given is None)
+    state = settle(evidence, theta, sigma, affine, given is None, options)
     extent, motions, covariance = information(evidence, state, affine)
     covariance = covariance * state.sigma.square()[:, None, None]
     # singular maps have no motion between them to be known
     covariance = torch.where(covariance.isfinite().flatten(1).all(-1)[:, None, None], covariance, torch.inf)
     worst = state.sigma * extent[:, 0].clamp(min=torch.finfo(theta.dtype).tiny).rsqrt()
-    status = _status(evidence, state, worst, extent[:, 0] <= INDETERMINATE * extent[:, 1], found, affine)
+    status = _status(evidence, state, worst, extent[:, 0] <= options.velocity.indeterminate * extent[:, 1], found, affine, options)
     none = failed(status)
     labels = torch.where(none[:, None], OUTLIER, state.labels)
     zero = none[:, None, None]
@@ -269,7 +266,7 @@ def align_velocity(data: Matches, threshold: float | None, affine: bool, generat
         sigma=data.back(torch.where(none, 0.0, state.sigma)),
         covariance=data.back(torch.where(zero, 0.0, covariance)),
         ambiguity=AMBIGUITY,
-        notices=_notices(evidence, state, worst, none, affine, data.batch),
+        notices=_notices(evidence, state, worst, none, affine, data.batch, options),
         velocities=data.back(velocities),
     )
 
@@ -286,7 +283,9 @@ def _projective_start(
     return theta, _starting_noise(evidence, theta, given), torch.where(usable, int(Status.OK), found.status)
 
 
-def _affine_start(evidence: Evidence, given: Tensor | None, generator: torch.Generator | None) -> tuple[Tensor, Tensor, Tensor]:
+def _affine_start(
+    evidence: Evidence, given: Tensor | None, generator: torch.Generator | None, options: AlignOptions
+) -> tuple[Tensor, Tensor, Tensor]:
     """The same for affine maps: the consensus of small samples in the 9 coordinates of a match, which lie in a space of 6."""
     data = evidence.data
     # the normalization may stretch the views differently; a common one leaves the noise alike in all nine coordinates
@@ -294,14 +293,14 @@ def _affine_start(evidence: Evidence, given: Tensor | None, generator: torch.Gen
     nine = torch.cat([x / s[:, None, None] for x, s in zip(evidence.views, scale / scale.mean(0), strict=True)], dim=-1)
     size = scale.mean(0)
     present = data.weights > 0
-    draws = uniform(len(nine), SAMPLES, nine.shape[1], generator=generator, device=nine.device)
-    order = (draws + 2.0 * ~present[:, None]).argsort(-1)[..., :SAMPLE]
+    draws = uniform(len(nine), options.velocity.samples, nine.shape[1], generator=generator, device=nine.device)
+    order = (draws + 2.0 * ~present[:, None]).argsort(-1)[..., : options.velocity.sample]
     noise = torch.zeros_like(size) if given is None else given * size
 
     def run(points: Tensor, weights: Tensor, index: Tensor, sigma: Tensor) -> tuple[Tensor, ...]:
-        return _affine_consensus(points, weights, index, None if given is None else sigma)
+        return _affine_consensus(points, weights, index, None if given is None else sigma, options)
 
-    null, mean, ok = map_blocks(run, nine, data.weights, order, noise, size=PROBLEMS)
+    null, mean, ok = map_blocks(run, nine, data.weights, order, noise, size=options.velocity.problems)
     theta = _affine_maps(null, mean, ok)
     parts = theta.unflatten(-1, (3, 4, 4)).clone()
     parts[..., :3, :] *= (scale / size).mT[..., None, None]
@@ -310,13 +309,15 @@ def _affine_start(evidence: Evidence, given: Tensor | None, generator: torch.Gen
     return theta, _starting_noise(evidence, theta, given), status
 
 
-def _affine_consensus(points: Tensor, weights: Tensor, index: Tensor, sigma: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+def _affine_consensus(
+    points: Tensor, weights: Tensor, index: Tensor, sigma: Tensor | None, options: AlignOptions
+) -> tuple[Tensor, Tensor, Tensor]:
     """Conditions ``(b, 3, 9)`` on the centred coordinates, their centre ``(b, 9)``, and whether the matches decide."""
     present = weights > 0
     sample = points[:, None].expand(-1, index.shape[1], -1, -1).gather(2, index[..., None].expand(-1, -1, -1, 9))
-    null, mean, _ = _conditions(sample, torch.ones_like(sample[..., 0]))
+    null, mean, _ = _conditions(sample, torch.ones_like(sample[..., 0]), options)
     # the last start is of all matches, which is the best one where there are no outliers
-    own, centre, _ = _conditions(points, weights)
+    own, centre, _ = _conditions(points, weights, options)
     null, mean = torch.cat([null, own[:, None]], dim=1), torch.cat([mean, centre[:, None]], dim=1)
     square = ((points[:, None] - mean[:, :, None]) @ null.mT).square().sum(-1)
     if sigma is None:
@@ -335,15 +336,15 @@ def _affine_consensus(points: Tensor, weights: Tensor, index: Tensor, sigma: Ten
     inside = (square[first, best] <= 4 * limit[:, None]) & present
     floor = torch.finfo(points.dtype).eps
     inside = inside | ((square[first, best] <= floor) & present)
-    return _conditions(points, weights * inside)
+    return _conditions(points, weights * inside, options)
 
 
-def _conditions(points: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _conditions(points: Tensor, weights: Tensor, options: AlignOptions) -> tuple[Tensor, Tensor, Tensor]:
     total = weights.sum(-1, keepdim=True).clamp(min=torch.finfo(weights.dtype).tiny)
     mean = (weights[..., None] * points).sum(-2) / total
     centred = (points - mean[..., None, :]) * weights.sqrt()[..., None]
     values, vectors = spectrum(centred.mT @ centred)
-    ok = (values[..., 3] > HELD * values[..., 8]) & ((weights > 0).sum(-1) >= MINIMAL[True])
+    ok = (values[..., 3] > options.velocity.held * values[..., 8]) & ((weights > 0).sum(-1) >= MINIMAL[True])
     return vectors[..., :3].mT, mean, ok
 
 
@@ -370,14 +371,18 @@ def _identity(theta: Tensor) -> Tensor:
     return torch.eye(4, dtype=theta.dtype, device=theta.device).flatten().repeat(3) / 2
 
 
-def _status(evidence: Evidence, state: Velocities, worst: Tensor, undetermined: Tensor, found: Tensor, affine: bool) -> Tensor:
+def _status(
+    evidence: Evidence, state: Velocities, worst: Tensor, undetermined: Tensor, found: Tensor, affine: bool, options: AlignOptions
+) -> Tensor:
     present = (evidence.data.weights > 0).sum(-1)
     still = (state.labels == STATIC).sum(-1)
     moving = (state.labels != OUTLIER).sum(-1) - still
     dof = DOF[affine] + GAUGE * state.grounded.long()
-    accident = (still + moving < CONSENSUS * present) | (6 * still + 3 * moving < dof + SPARE * (present > MINIMAL[affine] + 1))
+    accident = (still + moving < options.velocity.consensus * present) | (
+        6 * still + 3 * moving < dof + options.velocity.spare * (present > MINIMAL[affine] + 1)
+    )
     accident = accident | (state.sigma * torch.stack(evidence.norm.scales).amax(0) > NOISY)
-    status = torch.where(worst > AMBIGUOUS, int(Status.AMBIGUOUS), torch.zeros_like(present))
+    status = torch.where(worst > options.velocity.ambiguous, int(Status.AMBIGUOUS), torch.zeros_like(present))
     status = torch.where(accident, int(Status.NO_CONSENSUS), status)
     status = torch.where(undetermined & ~accident, int(Status.DEGENERATE), status)
     status = torch.where(found != Status.OK, found.to(status), status)
@@ -385,25 +390,25 @@ def _status(evidence: Evidence, state: Velocities, worst: Tensor, undetermined: 
 
 
 def _notices(
-    evidence: Evidence, state: Velocities, worst: Tensor, none: Tensor, affine: bool, batch: tuple[int, ...]
+    evidence: Evidence, state: Velocities, worst: Tensor, none: Tensor, affine: bool, batch: tuple[int, ...], options: AlignOptions
 ) -> tuple[Notice, ...]:
     found, note = noting(batch)
     enough = (evidence.data.weights > 0).sum(-1) >= MINIMAL[affine]
     if evidence.data.count >= MINIMAL[False]:
-        rank = _rank(evidence, state, none)
+        rank = _rank(evidence, state, none, options)
         least = 0
         for most, code in RANKS:
             note(code, rank, enough & (rank > least) & (rank <= most), most=most)
             least = most
     note(AlignNotice.COMMON_VELOCITY, worst, ~none & ~state.grounded)
-    note(AlignNotice.UNCERTAIN, worst, ~none & (worst > UNCERTAIN), case="matches", what="maps")
+    note(AlignNotice.UNCERTAIN, worst, ~none & (worst > options.velocity.uncertain), case="matches", what="maps")
     return in_order(found)
 
 
-def _rank(evidence: Evidence, state: Velocities, none: Tensor) -> Tensor:
+def _rank(evidence: Evidence, state: Velocities, none: Tensor, options: AlignOptions) -> Tensor:
     """Singular values ``(b,)`` of the estimation matrix of the inliers (of all matches where there is no motion) above noise."""
     inliers = torch.where(none[:, None], torch.ones_like(state.labels, dtype=torch.bool), state.labels != OUTLIER)
     kept = evidence.data.restricted(inliers)
     values = fit_matches(ConstantVelocityTensor(), kept).singular_values
     noise = state.sigma * torch.stack(evidence.norm.scales).mean(0) * kept.weights.square().sum(-1).sqrt()
-    return (values > torch.maximum(ABOVE * noise[:, None], 1e-9 * values[:, :1])).sum(-1)
+    return (values > torch.maximum(options.velocity.above * noise[:, None], 1e-9 * values[:, :1])).sum(-1)

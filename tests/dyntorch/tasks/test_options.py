@@ -1,0 +1,103 @@
+"""Options of the verbs: frozen, nested by stage, every field said in a sentence and read by its room."""
+
+import ast
+import re
+from dataclasses import FrozenInstanceError, fields, is_dataclass, replace
+from pathlib import Path
+
+import pytest
+import torch
+
+import dyntorch as dyn
+from dyntorch import scenes
+
+KINDS = [getattr(dyn, name) for name in dyn.__all__ if name.endswith("Options")]
+NAMES = [kind.__name__ for kind in KINDS]
+
+
+def room_of(kind):
+    return Path(dyn.__file__).parent.joinpath(*kind.__module__.split(".")[1:-1])
+
+
+def stages(kind):
+    """Every class of numbers with the name by which it is read: the stages, or the options themselves where there are none."""
+    options = kind()
+    nested = {one.name: getattr(options, one.name) for one in fields(options) if is_dataclass(getattr(options, one.name))}
+    return nested or {"options": options}
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=NAMES)
+def test_options_are_frozen_and_nested_by_stage(kind):
+    assert set(stages(kind)) in ({"options"}, {one.name for one in fields(kind)})
+    for part in stages(kind).values():
+        assert fields(part)
+        with pytest.raises(FrozenInstanceError):
+            setattr(part, fields(part)[0].name, 0)
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=NAMES)
+def test_every_field_is_said_in_a_sentence(kind):
+    tree = ast.parse((room_of(kind) / "options.py").read_text(encoding="utf-8"))
+    classes = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
+    for part in stages(kind).values():
+        stage = classes[type(part).__name__]
+        assert ast.get_docstring(stage)
+        for before, after in zip(stage.body[1::2], stage.body[2::2], strict=True):
+            assert isinstance(before, ast.AnnAssign), stage.name
+            assert isinstance(after, ast.Expr) and len(after.value.value) > 10, f"{stage.name}.{ast.unparse(before.target)}"
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=NAMES)
+def test_every_field_is_read_where_it_decides(kind):
+    files = [path for path in sorted(room_of(kind).rglob("*.py")) if path.name != "options.py"]
+    text = " ".join(path.read_text(encoding="utf-8") for path in files)
+    read = set(re.findall(r"(?=\b(\w+)\s*\.(\w+)\b)", text))
+    for stage, part in stages(kind).items():
+        # a function that takes one stage calls it options
+        assert {one.name for one in fields(part) if not {(stage, one.name), ("options", one.name)} & read} == set(), stage
+
+
+def plane():
+    draw = torch.Generator().manual_seed(0)
+    return [torch.rand(40, 2, generator=draw, dtype=torch.float64) * 100 for _ in range(3)]
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda **given: dyn.align_planar(*plane(), **given),
+        lambda **given: dyn.align_points(*[torch.cat([x, x[:, :1]], -1) for x in plane()], **given),
+        lambda **given: dyn.align_lines(*[torch.rand(50, 2, 3) for _ in range(2)], **given),
+        lambda **given: dyn.reconstruct(torch.stack(plane()), "constant_velocity_2d", **given),
+        lambda **given: dyn.synchronize(
+            plane()[0][:, None].expand(-1, 8, -1), plane()[1][:, None].expand(-1, 8, -1), fps=30, **given
+        ),
+        lambda **given: dyn.synchronize_cameras([torch.rand(40, 8, 2), torch.rand(40, 8, 2)], fps=30.0, **given),
+    ],
+    ids=["align_planar", "align_points", "align_lines", "reconstruct", "synchronize", "synchronize_cameras"],
+)
+def test_options_of_another_verb_are_refused(call):
+    with pytest.raises(ValueError, match=r"options must be \w+Options, got SegmentOptions.*use dataclasses\.replace"):
+        call(options=dyn.SegmentOptions())
+
+
+def test_options_of_the_alignment_decide():
+    scene = scenes.planar(60, sigma=0.3, static=0.5, generator=torch.Generator().manual_seed(0))
+    shipped = dyn.AlignOptions()
+    severe = replace(shipped, labels=replace(shipped.labels, threshold_in_sigmas=30.0))
+    found = [
+        dyn.align_planar(*scene.views, generator=torch.Generator().manual_seed(0), options=options) for options in (shipped, severe)
+    ]
+    static = [int((one.labels == 1).sum()) for one in found]
+    assert static[1] < static[0]
+
+
+def test_options_of_the_synchronization_decide():
+    g = torch.Generator().manual_seed(0)
+    a = torch.randn(60, 10, 2, generator=g, dtype=torch.float64).cumsum(0)
+    shipped = dyn.SynchronizeOptions()
+    longer = replace(shipped, input=replace(shipped.input, fewest_frames=100))
+    with pytest.raises(ValueError, match="a has 60 frames, 100 are needed"):
+        dyn.synchronize(a, a, fps=30.0, options=longer)
+    careful = replace(shipped, evidence=replace(shipped.evidence, margin=20.0, affine_margin=20.0))
+    assert not dyn.synchronize(a, a, fps=30.0, options=careful).ok
