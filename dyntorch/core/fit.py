@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -14,7 +16,7 @@ from dyntorch.core.normalize import Normalization, denormalize, normalization
 from dyntorch.core.outcome import Status, failed
 from dyntorch.core.primitives import Primitive
 from dyntorch.core.solution import Solution, copied
-from dyntorch.numerics.blocks import map_blocks, one_thread, workers
+from dyntorch.numerics.blocks import map_blocks, one_thread, select, workers
 from dyntorch.numerics.nullspace import decided_null_space, null_space
 
 AMBIGUOUS = 0.5
@@ -96,25 +98,26 @@ def fit_matches(invariant: Invariant, data: Matches, *, normalize: bool = True) 
     whole, present = invariant.completed(data.views, data.weights)
     data = replace(data, views=whole, weights=present)
     views, weights, static = copied(invariant, data)
-    options = () if static is None else (static,)
-
-    def solve(*block: Tensor) -> tuple[Tensor, ...]:
-        return _solve(invariant, block[: len(views)], block[len(views)], block[len(views) + 1 :], normalize)
-
     per_problem = data.count * max(1, invariant.copies or 1) * _largest(invariant)
     most, least = (max(1, number // max(1, per_problem)) for number in (BLOCK, LEAST))
     size = min(most, max(least, -(-len(weights) // workers())))
-    parts = map_blocks(solve, *views, weights, *options, size=size)
-    normalized, tensor, status, uncertainty = parts[:4]
-    count = len(invariant.primitives)
-    frames = parts[4 : 4 + count]
-    norm = Normalization(
-        frames,
-        tuple(p.normalized(t) for p, t in zip(invariant.primitives, frames, strict=True)),
-        parts[4 + count :],
-        tuple(t[..., 0, 0] for t in frames),
-    )
-    return Solution(invariant, data.back(tensor), data.back(uncertainty), data, norm, normalized, status=data.back(status))
+    found = map_blocks(partial(_solve, invariant, normalize), views, weights, static, size=size)
+    pairs = zip(invariant.primitives, found.transforms, strict=True)
+    norm = Normalization(found.transforms, tuple(p.normalized(t) for p, t in pairs), found.actions)
+    tensor, status, uncertainty = (data.back(part) for part in (found.tensor, found.status, found.uncertainty))
+    return Solution(invariant, tensor, uncertainty, data, norm, found.normalized, status=status)
+
+
+class Solved(NamedTuple):
+    """Linear fits of a block of problems, in their own coordinates and in normalized ones."""
+
+    tensor: Tensor
+    normalized: Tensor
+    status: Tensor
+    uncertainty: Tensor
+    transforms: tuple[Tensor, ...]
+    actions: tuple[Tensor, ...]
+    """As in :class:`~dyntorch.core.normalize.Normalization`."""
 
 
 def _largest(invariant: Invariant) -> int:
@@ -127,11 +130,8 @@ def _largest(invariant: Invariant) -> int:
     return size
 
 
-def _solve(
-    invariant: Invariant, views: tuple[Tensor, ...], weights: Tensor, options: tuple[Tensor, ...], normalize: bool
-) -> tuple[Tensor, ...]:
-    """One block: normalized tensor, tensor, status, uncertainty, transforms and actions."""
-    static = options[0] if options else None
+def _solve(invariant: Invariant, normalize: bool, views: tuple[Tensor, ...], weights: Tensor, static: Tensor | None) -> Solved:
+    """One block."""
     # components first in memory: every later pass then runs along the matches
     views = tuple(x.mT.contiguous().mT for x in views)
     # weights of any unit: a problem that counts its matches in thousands is no different
@@ -143,27 +143,19 @@ def _solve(
     if own is None:
         basis, status, uncertainty = _null(invariant, norm.primitives, moved, weights, static)
         tensor = invariant.normalized(norm.transforms).constrain(invariant.tensor_of(basis))
-        if invariant.nullity == 1:
-            status = torch.where(invariant.singular(tensor) & (status != int(Status.TOO_FEW)), int(Status.DEGENERATE), status)
     else:
         tensor, uncertainty = own.tensor, own.uncertainty
         status = _status(own.few, own.degenerate, own.ambiguous)
     if invariant.copies is not None:
         status, uncertainty = status.amax(-1), uncertainty.amax(-1)
-    tensor = _zero_where_failed(status, tensor)
+    tensor = select(~failed(status), tensor, 0.0)
     # coordinates may be so large or small that float64 holds no tensor of theirs
     back = denormalize(invariant, tensor, norm.actions)
     flat = back.detach().flatten(status.ndim)
     held = flat.isfinite().all(-1) & (flat != 0).any(-1)
     status = torch.where(held | failed(status), status, int(Status.DEGENERATE))
-    tensor, back = _zero_where_failed(status, tensor), _zero_where_failed(status, back)
-    return (tensor, back, status, uncertainty, *norm.transforms, *norm.actions)
-
-
-def _zero_where_failed(status: Tensor, tensor: Tensor) -> Tensor:
-    """The tensor, zero where the status says that there is none."""
-    zero = failed(status)[(..., *([None] * (tensor.ndim - status.ndim)))]
-    return torch.where(zero, torch.zeros_like(tensor), tensor)
+    sound = ~failed(status)
+    return Solved(select(sound, back, 0.0), select(sound, tensor, 0.0), status, uncertainty, norm.transforms, norm.actions)
 
 
 def _null(
@@ -240,6 +232,4 @@ def _identity(invariant: Invariant, views: tuple[Tensor, ...]) -> Normalization:
     for primitive, x in zip(invariant.primitives, views, strict=True):
         eye = torch.eye(primitive.dim + 1, dtype=x.dtype, device=x.device)
         transforms.append(eye.expand(*x.shape[: primitive.match_axis(x)], -1, -1))
-    actions = tuple(p.action(t) for p, t in zip(invariant.primitives, transforms, strict=True))
-    primitives = tuple(p.normalized(t) for p, t in zip(invariant.primitives, transforms, strict=True))
-    return Normalization(tuple(transforms), primitives, actions, tuple(t[..., 0, 0] for t in transforms))
+    return Normalization.of(invariant, transforms)

@@ -17,11 +17,10 @@ from dataclasses import dataclass
 from functools import partial, update_wrapper
 from typing import Any, Concatenate, Generic, ParamSpec, TypeVar, cast
 
-import torch
 from torch import Tensor
 
 from dyntorch.core.primitives import Primitive
-from dyntorch.numerics.least_squares import jacobian
+from dyntorch.numerics.least_squares import flattened, jacobian, parts_of
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -90,14 +89,8 @@ class Invariant:
     """Conditions that the true positions of one moving match fulfil."""
     layout: tuple[int, ...] | None = None
     """Which view each axis of the tensor belongs to; None: in the order of the views."""
-    copies: int | None = None
-    """Tensors per problem, where one set of matches is solved several times (one per given camera)."""
     resolves_noise: bool = True
     """Whether, among tensors that nearly all matches fulfil, the one with the least residual under noise is the true one."""
-    staged: bool = False
-    """Whether the linear tensor is too far from that of a motion to refine it by distances: the algebraic error comes first."""
-    guides: bool = True
-    """Whether robust estimation measures distances to the motions behind its tensors, which takes a decomposition each time."""
     labels_static: bool = False
     """Whether a match known to be static says more than one that may move (the argument ``static``)."""
     intrinsic: bool = False
@@ -108,6 +101,9 @@ class Invariant:
     """The tensor of a motion, ``(*batch, *axes)`` (with ``(*batch, nullity, *axes)`` where nullity > 1)."""
     decompose: Callable[..., Any]
     """The motion of a tensor: one part alone, or the tuple of the parts."""
+    starts: Callable[[Tensor], tuple[Tensor, ...]] | None = None
+    """Motions ``(tries, *batch, ...)`` from which to look for that of a noisy tensor, where what it decomposes into may be far off:
+    refinement then minimizes the algebraic error first, and no motion guides robust estimation.  None: decomposing is enough."""
 
     def prepared(
         self, views: Sequence[Tensor], weights: Tensor | None = None, **given: Tensor
@@ -135,7 +131,8 @@ class Invariant:
         return None
 
     def constrain(self, tensor: Tensor) -> Tensor:
-        """The nearest tensor that fulfils the internal constraints, in normalized coordinates; by default the tensor itself."""
+        """The nearest tensor that fulfils the internal constraints, in normalized coordinates, 0 for that of no motion; by default
+        the tensor itself."""
         return tensor
 
     def whitened(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor | None:
@@ -154,46 +151,14 @@ class Invariant:
     def linearized(
         self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]
     ) -> tuple[Tensor, Tensor] | None:
-        """:meth:`whitened`, flat ``(b, n c)``, and its derivative by all entries of the motion ``(b, p, n c)``, by hand.
-
-        None: they are found by automatic differentiation.
-        """
+        """:meth:`whitened`, flat ``(b, n c)``, and its derivative by all entries of the motion ``(b, p, n c)``, where there is a
+        shorter way than automatic differentiation match by match; by default None, there is not."""
         return None
 
     def compose_derivative(self, motion: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
         """The tensor, flat ``(b, D)``, and its derivative ``(b, p, D)`` by all entries of the motion ``(b, ...)``."""
         shapes = [part.shape[1:] for part in motion]
-        sizes = [shape.numel() for shape in shapes]
-
-        def tensor(theta: Tensor) -> Tensor:
-            parts = zip(theta.split(sizes, -1), shapes, strict=True)
-            composed = self.compose(*(part.unflatten(-1, shape) for part, shape in parts))
-            return composed.flatten(theta.ndim - 1)
-
-        return jacobian(tensor, torch.cat([part.flatten(1) for part in motion], dim=-1))
-
-    def singular(self, tensor: Tensor) -> Tensor:
-        """Which normalized tensors ``(*batch, *axes)`` are those of no motion: ``(*batch,)`` bool, by default none."""
-        return torch.zeros(tensor.shape[: tensor.ndim - len(self.shape())], dtype=torch.bool, device=tensor.device)
-
-    def starts(self, tensor: Tensor) -> tuple[Tensor, ...]:
-        """Motions ``(tries, *batch, ...)`` from which to look for the one of a noisy tensor; by default what it decomposes into."""
-        found = self.decompose(tensor)
-        return tuple(part[None] for part in (found if isinstance(found, tuple) else (found,)))
-
-    def shared(self, motion: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-        """Functions of the motion that the residuals of all matches share (inverses): refinement computes them once per motion."""
-        return motion
-
-    def shared_derivative(self, motion: tuple[Tensor, ...]) -> tuple[tuple[Tensor, ...], Tensor | None]:
-        """:meth:`shared` and its derivative ``(b, p, q)`` by all entries of the motion; None where it is the motion."""
-        return motion, None
-
-    def whitened_shared(self, shared: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
-        """:meth:`whitened` from :meth:`shared`."""
-        found = self.whitened(shared, views, scales)
-        assert found is not None
-        return found
+        return jacobian(lambda t: self.compose(*parts_of(t, shapes)).flatten(t.ndim - 1), flattened(motion))
 
     def whitened_static(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
         """The same for matches that do not move: all their views agree under the motion.  ``(*batch, n, c)``."""
@@ -202,6 +167,16 @@ class Invariant:
     def normalized(self, transforms: tuple[Tensor, ...]) -> Invariant:
         """The invariant that the tensor of normalized matches belongs to: the same one, unless it depends on coordinates."""
         return self
+
+    def motion_of(self, tensor: Tensor) -> tuple[Tensor, ...]:
+        """The parts of the motion that :meth:`decompose` finds."""
+        found = self.decompose(tensor)
+        return found if isinstance(found, tuple) else (found,)
+
+    @property
+    def copies(self) -> int | None:
+        """Tensors per problem, where a view measures through several given cameras; None: one, without an axis of its own."""
+        return next((primitive.copies for primitive in self.primitives if primitive.copies is not None), None)
 
     @on_class
     def shape(self) -> tuple[int, ...]:

@@ -24,7 +24,17 @@ class Normalization:
     transforms: tuple[Tensor, ...]
     primitives: tuple[Primitive, ...]
     actions: tuple[Tensor, ...]
-    scales: tuple[Tensor, ...]
+
+    @classmethod
+    def of(cls, invariant: Invariant, transforms: Sequence[Tensor]) -> Normalization:
+        """What similarities of the views do to what the invariant measures in them."""
+        pairs = tuple(zip(invariant.primitives, transforms, strict=True))
+        return cls(tuple(transforms), tuple(p.normalized(t) for p, t in pairs), tuple(p.action(t) for p, t in pairs))
+
+    @property
+    def scales(self) -> tuple[Tensor, ...]:
+        """Size of one unit of each view in normalized coordinates."""
+        return tuple(t[..., 0, 0] for t in self.transforms)
 
     def apply(self, invariant: Invariant, views: Sequence[Tensor]) -> tuple[Tensor, ...]:
         """Measurements in normalized coordinates."""
@@ -45,12 +55,8 @@ def normalization(invariant: Invariant, views: Sequence[Tensor], weights: Tensor
     points = [p.points(x, weights) for p, x in zip(invariant.primitives, views, strict=True)]
     if len({x.shape for x in points}) == 1:
         # all views in one pass: a copy costs less than two more rounds of small operations
-        transforms = hartley(torch.stack(points), weights).unbind(0)
-    else:
-        transforms = tuple(hartley(x, weights) for x in points)
-    primitives = tuple(p.normalized(t) for p, t in zip(invariant.primitives, transforms, strict=True))
-    actions = tuple(p.action(t) for p, t in zip(invariant.primitives, transforms, strict=True))
-    return Normalization(transforms, primitives, actions, tuple(t[..., 0, 0] for t in transforms))
+        return Normalization.of(invariant, hartley(torch.stack(points), weights).unbind(0))
+    return Normalization.of(invariant, [hartley(x, weights) for x in points])
 
 
 def relative(scales: Sequence[Tensor]) -> tuple[tuple[Tensor, ...], Tensor]:

@@ -115,6 +115,11 @@ class Primitive(ABC):
         """The measurement with noise of the same shape, in units of normalized coordinates."""
         return x + noise
 
+    @property
+    def copies(self) -> int | None:
+        """Vectors of one measurement that belong to problems of their own; None: it has one."""
+        return None
+
     def normalized(self, transform: Tensor) -> Primitive:
         """The primitive that measures in normalized coordinates: the same one, unless it depends on the coordinates."""
         return self
@@ -527,6 +532,10 @@ class Projected(Primitive):
 
     def shapes(self) -> tuple[tuple[int, ...], ...]:
         return ((self.dim,),)
+
+    @property
+    def copies(self) -> int:
+        return int(self.cameras.shape[-3])
 
     def raw(self, x: Tensor) -> Tensor:
         return homogeneous(x) @ self.cameras.to(x).mT

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -11,12 +11,12 @@ from torch import Tensor
 from dyntorch.core.invariant import Invariant
 from dyntorch.core.matches import Matches, largest_weights, matches, relative_weights
 from dyntorch.core.matrix import gram
-from dyntorch.core.normalize import Normalization, denormalize, denormalize_motion, relative
+from dyntorch.core.normalize import denormalize, denormalize_motion, relative
 from dyntorch.core.outcome import failed
-from dyntorch.core.residual import multilinear_derivative
-from dyntorch.core.solution import Solution, copied
-from dyntorch.numerics.blocks import map_blocks, one_thread, workers
-from dyntorch.numerics.least_squares import by_match, jacobian, minimize
+from dyntorch.core.residual import multilinear_derivative, residual_derivative
+from dyntorch.core.solution import Solution
+from dyntorch.numerics.blocks import each, map_blocks, one_thread, select, workers
+from dyntorch.numerics.least_squares import Minimum, flattened, jacobian, minimize, parts_of
 from dyntorch.numerics.nullspace import spectrum
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -44,9 +44,8 @@ class Problem:
 
     def subset(self, keep: Tensor) -> Problem:
         """Only some of the problems."""
-        cut = [x[keep] for x in self.views], [s[keep] for s in self.scales], self.weights[keep]
-        static = None if self.static is None else self.static[keep]
-        return Problem(self.invariant, self.shapes, tuple(cut[0]), tuple(cut[1]), cut[2], static)
+        data = self.views, self.scales, self.weights, self.static
+        return Problem(self.invariant, self.shapes, *each(lambda x: x[keep], data))
 
     def residual(self, theta: Tensor, piece: slice) -> tuple[Tensor, Tensor]:
         """Weighted whitened residuals ``(b, rows)`` of some of the matches, and their derivative ``(b, p, rows)``."""
@@ -68,31 +67,21 @@ class Problem:
 
     def moving(self, theta: Tensor, views: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
         """Unweighted residuals of matches that may move, and their derivative."""
-        known = self.invariant.linearized(self.parts(theta), views, self.scales)
+        invariant, motion = self.invariant, self.parts(theta)
+        known = invariant.linearized(motion, views, self.scales)
         if known is not None:
             return known
-        empty = tuple(x[:0] for x in views), tuple(scale[:0] for scale in self.scales)
-        if self.invariant.whitened(self.parts(theta[:0]), *empty) is not None:
-            shared, slope = self.invariant.shared_derivative(self.parts(theta))
-            value, derivative = self._by_match(self.invariant.whitened_shared, flattened(shared), views)
-            return value, derivative if slope is None else slope @ derivative
+        nothing = each(lambda x: x[:0], (motion, views, self.scales))
+        if invariant.whitened(*nothing) is not None:
+            return residual_derivative(invariant.whitened, motion, views, self.scales)  # type: ignore[arg-type]
         # one row per match: by hand through the tensor, several times cheaper than forward mode through the matches
-        tensor, slope = self.invariant.compose_derivative(self.parts(theta))
-        shape = self.invariant.shape()
-        value, derivative = multilinear_derivative(self.invariant, tensor.unflatten(1, shape), views, self.scales)
+        tensor, slope = invariant.compose_derivative(motion)
+        value, derivative = multilinear_derivative(invariant, tensor.unflatten(1, invariant.shape()), views, self.scales)
         return value, slope @ derivative.mT
 
     def resting(self, theta: Tensor, views: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
         """Unweighted residuals of matches that do not move, and their derivative."""
-        return self._by_match(self.invariant.whitened_static, theta, views)
-
-    def _by_match(self, function: Callable[..., Tensor], theta: Tensor, views: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
-        """Residuals ``(b, n c)`` and derivative ``(b, p, n c)``."""
-
-        def residual(copies: Tensor, scales: tuple[Tensor, ...], single: tuple[Tensor, ...]) -> Tensor:
-            return function(self.parts(copies), single, scales)
-
-        return by_match(residual, theta, self.scales, views)
+        return residual_derivative(self.invariant.whitened_static, self.parts(theta), views, self.scales)
 
     def pieces(self, width: int) -> list[slice]:
         """The matches in slices whose Jacobians fit into memory, whatever their number."""
@@ -110,17 +99,6 @@ class Problem:
             gradient = gradient + (derivative @ value[..., None])[..., 0]
             matrix = matrix + derivative @ derivative.mT
         return torch.where(cost.isfinite(), cost, torch.inf), gradient, matrix
-
-
-def parts_of(theta: Tensor, shapes: Sequence[torch.Size]) -> tuple[Tensor, ...]:
-    """The inverse of :func:`flattened`."""
-    sizes = [shape.numel() for shape in shapes]
-    return tuple(part.unflatten(-1, shape) for part, shape in zip(theta.split(sizes, -1), shapes, strict=True))
-
-
-def flattened(parts: tuple[Tensor, ...]) -> Tensor:
-    """All entries of a motion, ``(b, p)``."""
-    return torch.cat([part.flatten(1) for part in parts], dim=-1)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -204,15 +182,13 @@ def constrain_matches(solution: Solution, data: Matches, iterations: int = CONST
         raise ValueError(f"the tensors of {invariant!r} do not stand alone; use refine")
     with torch.no_grad():
         motion = algebraic_motion(solution, data, iterations)
-        base = invariant.normalized(solution.normalization.transforms)
-        normalized = base.compose(*motion)
+        normalized = solution.base().compose(*motion)
         tensor = data.back(denormalize(invariant, normalized, solution.normalization.actions))
-        bad = failed(solution.status.reshape(-1))
-        wide = bad[(..., *[None] * (normalized.ndim - 1))]
+        good = ~failed(solution.status.reshape(-1)).to(normalized.device)
         return replace(
             solution,
-            tensor=torch.where(data.back(wide), solution.tensor, tensor),
-            normalized=torch.where(wide.to(normalized.device), solution.normalized, normalized),
+            tensor=select(data.back(good), tensor, solution.tensor),
+            normalized=select(good, normalized, solution.normalized),
             refined=motion,
         )
 
@@ -220,28 +196,23 @@ def constrain_matches(solution: Solution, data: Matches, iterations: int = CONST
 def algebraic_motion(solution: Solution, data: Matches, iterations: int = CONSTRAINED_ITERATIONS) -> tuple[Tensor, ...]:
     """The motion of least algebraic error in normalized coordinates, from the best start of each problem."""
     invariant, norm = solution.invariant, solution.normalization
-    views, weights, static = copied(invariant, data)
-    views = tuple(x.detach() for x in norm.apply(invariant, views))
-    weights = relative_weights(weights)
-    base = invariant.normalized(tuple(t.detach() for t in norm.transforms))
-    starts = base.starts(solution.normalized.detach())
+    base, tensor = solution.base(), solution.normalized.detach()
+    views = tuple(x.detach() for x in norm.apply(invariant, data.views))
+    starts = tuple(part[None] for part in base.motion_of(tensor)) if base.starts is None else base.starts(tensor)
     shapes = tuple(part.shape[2:] for part in starts)
 
-    def run(tensors: Tensor, *block: Tensor) -> tuple[Tensor, Tensor]:
-        rest = block[1 + len(views) :]
-        matrix = gram(norm.primitives, block[: len(views)], block[len(views)], rest[0] if rest else None)
+    def run(tries: Tensor, views: tuple[Tensor, ...], weights: Tensor, static: Tensor | None) -> Tensor:
+        matrix = gram(norm.primitives, views, weights, static)
         trace = matrix.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None]
         problem = Algebraic(base, shapes, matrix / trace.clamp(min=torch.finfo(trace.dtype).tiny))
-        costs = torch.stack([problem.cost(theta) for theta in tensors.unbind(1)])
+        costs = torch.stack([problem.cost(theta) for theta in tries.unbind(1)])
         best = costs.nan_to_num(nan=torch.inf).argmin(0)
-        theta = tensors.gather(1, best[:, None, None].expand(-1, 1, tensors.shape[-1]))[:, 0]
-        return minimize(problem, theta, iterations, settle=2, least=FREE)[:2]
+        theta = tries.gather(1, best[:, None, None].expand(-1, 1, tries.shape[-1]))[:, 0]
+        return minimize(problem, theta, iterations, settle=2, least=FREE).theta
 
     theta = torch.cat([part.flatten(2) for part in starts], dim=-1).transpose(0, 1)
-    options = () if static is None else (static,)
     size = max(1, min(BLOCK // (invariant.width() * theta.shape[-1]), -(-len(theta) // workers())))
-    found = map_blocks(run, theta, *views, weights, *options, size=size)[0]
-    return parts_of(found, shapes)
+    return parts_of(map_blocks(run, theta, views, relative_weights(data.weights), data.static, size=size), shapes)
 
 
 ITERATIONS = 30
@@ -308,22 +279,18 @@ def refine(
 
 def refine_matches(solution: Solution, data: Matches, iterations: int = ITERATIONS) -> Solution:
     """:func:`refine` for checked matches."""
-    invariant, norm = solution.invariant, _plain(solution)
-    parts = solution.normalized_motion()
-    shapes = tuple(part.shape[1:] for part in parts)
-    thetas = [flattened(parts).detach()]
-    if invariant.staged and solution.refined is None:
-        thetas.append(flattened(algebraic_motion(solution, data)))
-    moved = tuple(x.detach() for x in norm.apply(invariant, data.views))
-    frames = tuple(t.detach() for t in norm.transforms)
-    base = invariant.normalized(tuple(t.detach() for t in solution.normalization.transforms))
-    flags = () if data.static is None else (data.static,)
-    count = len(moved)
+    invariant, motion = solution.invariant, solution.normalized_motion()
+    starts = [flattened(motion).detach()]
+    if invariant.starts is not None and solution.refined is None:
+        starts.append(flattened(algebraic_motion(solution, data)))
+    base, shapes = solution.base(), tuple(part.shape[1:] for part in motion)
+    frames = tuple(t.detach() for t in solution.frames())
+    views = tuple(p.move(x, t).detach() for p, x, t in zip(invariant.primitives, data.views, frames, strict=True))
 
-    def run(*block: Tensor) -> tuple[Tensor, ...]:
-        views, scales, rest = block[1 : 1 + count], block[1 + count : 1 + 2 * count], block[1 + 2 * count :]
-        problem = Problem(base, shapes, views, scales, rest[0], rest[1] if len(rest) > 1 else None)
-        starts = block[0]
+    def run(
+        starts: Tensor, views: tuple[Tensor, ...], scales: tuple[Tensor, ...], weights: Tensor, static: Tensor | None
+    ) -> Minimum:
+        problem = Problem(base, shapes, views, scales, weights, static)
         if starts.shape[1] == 1:
             return minimize(problem, starts[:, 0], iterations)
         costs = torch.stack([problem.normal_equations(theta)[0] for theta in starts.unbind(1)], dim=1)
@@ -331,79 +298,68 @@ def refine_matches(solution: Solution, data: Matches, iterations: int = ITERATIO
         return minimize(problem, starts.gather(1, best)[:, 0], iterations)
 
     # a block for every thread at least: threads inside of small operations cost more than they bring
-    theta = torch.stack(thetas, dim=1)
+    theta = torch.stack(starts, dim=1)
     size = max(1, min(BLOCK // max(1, data.count * theta.shape[-1]), -(-len(theta) // workers())))
     with torch.no_grad():
         start = torch.where(theta.isfinite(), theta, torch.zeros_like(theta))
-        scales, unit = relative(norm.scales)
-        best, cost, matrix = map_blocks(run, start, *moved, *scales, data.weights, *flags, size=size)
-        cost, matrix = cost / unit.square(), matrix / unit.square()[:, None, None]
-        return _refined(solution, data, norm, frames, shapes, best, cost, matrix)
+        scales, unit = relative([t[:, 0, 0] for t in frames])
+        found = map_blocks(run, start, views, scales, data.weights, data.static, size=size)
+        found = Minimum(found.theta, found.cost / unit.square(), found.matrix / unit.square()[:, None, None])
+        return _refined(solution, data, motion, found)
 
 
-def _refined(
-    solution: Solution,
-    data: Matches,
-    norm: Normalization,
-    frames: tuple[Tensor, ...],
-    shapes: tuple[torch.Size, ...],
-    theta: Tensor,
-    cost: Tensor,
-    matrix: Tensor,
-) -> Solution:
-    """The solution with the refined motion, where refinement was possible."""
-    invariant = solution.invariant
-    problem = Problem(invariant, shapes, (), (), data.weights, None)
-    status = solution.status.reshape(-1).to(theta.device)
-    good = cost.isfinite() & ~failed(status)
-    motion = tuple(
-        torch.where(good[(..., *([None] * (part.ndim - 1)))], part, old)
-        for part, old in zip(problem.parts(theta), solution.normalized_motion(), strict=True)
-    )
-    safe = tuple(torch.where(good[(..., *([None] * (part.ndim - 1)))], part, _any(part)) for part in motion)
+def _refined(solution: Solution, data: Matches, old: tuple[Tensor, ...], found: Minimum) -> Solution:
+    """The solution with the refined motion, where refinement was possible; elsewhere with the old one."""
+    invariant, shapes = solution.invariant, tuple(part.shape[1:] for part in old)
+    good = found.cost.isfinite() & ~failed(solution.status.reshape(-1).to(found.cost.device))
+    motion = tuple(select(good, new, part) for new, part in zip(parts_of(found.theta, shapes), old, strict=True))
     # tensors of copies have the axis of the copies behind the batch, like the transforms of the solution
-    normalized = invariant.normalized(solution.normalization.transforms).compose(*safe)
+    normalized = solution.base().compose(*(select(good, part, _any(part)) for part in motion))
     tensor = denormalize(invariant, normalized, solution.normalization.actions)
-    keep = good[(..., *([None] * (tensor.ndim - 1)))]
+    sigma = _noise(invariant, data, found.cost)
+
+    def moved(theta: Tensor) -> Tensor:
+        parts = denormalize_motion(invariant, parts_of(theta, shapes), frames)
+        return torch.cat([part.flatten(theta.ndim - 1) for part in parts], dim=-1)
+
+    frames = tuple(t.detach() for t in solution.frames())
+    covariance = _covariance(moved, found, invariant.dof, sigma * largest_weights(data.weights).sqrt())
+    return replace(
+        solution,
+        tensor=select(data.back(good), data.back(tensor), solution.tensor),
+        normalized=select(good, normalized, solution.normalized),
+        refined=motion,
+        sigma=data.back(select(good, sigma, torch.zeros_like(sigma))),
+        covariance=data.back(select(good, covariance, torch.zeros_like(covariance))),
+    )
+
+
+def _noise(invariant: Invariant, data: Matches, cost: Tensor) -> Tensor:
+    """Noise ``(b,)`` of one coordinate that the residuals show; infinite where no match is left to tell it."""
     conditions = torch.full_like(data.weights, float(invariant.codim))
     if data.static is not None:
         still = sum(p.freedom() for p in invariant.primitives[1:])
         conditions = torch.where(data.static, float(still), conditions)
     spare = ((data.weights > 0) * conditions).sum(-1) - invariant.dof
     mean = cost / largest_weights(data.weights).clamp(min=torch.finfo(cost.dtype).tiny)
-    sigma = torch.where(spare > 0, (mean / spare.clamp(min=1)).sqrt(), torch.inf)
-    covariance = _covariance(invariant, problem, frames, theta, matrix, sigma, data.weights)
-    return replace(
-        solution,
-        tensor=torch.where(data.back(keep), data.back(tensor), solution.tensor),
-        normalized=torch.where(keep, normalized, solution.normalized),
-        refined=motion,
-        sigma=data.back(torch.where(good, sigma, torch.zeros_like(sigma))),
-        covariance=data.back(torch.where(good[:, None, None], covariance, torch.zeros_like(covariance))),
-    )
+    return torch.where(spare > 0, (mean / spare.clamp(min=1)).sqrt(), torch.inf)
 
 
-def _covariance(
-    invariant: Invariant,
-    problem: Problem,
-    frames: tuple[Tensor, ...],
-    theta: Tensor,
-    matrix: Tensor,
-    sigma: Tensor,
-    weights: Tensor,
-) -> Tensor:
-    r"""Covariance ``(b, p, p)`` of the motion in the coordinates of the matches: :math:`\sigma^2 D H^+ D^T`, H of rank dof."""
-    values, vectors = spectrum(matrix)
-    count = min(invariant.dof, values.shape[-1])
+def _covariance(moved: Callable[[Tensor], Tensor], found: Minimum, dof: int, scale: Tensor) -> Tensor:
+    r"""Covariance ``(b, p, p)`` of the motion in the coordinates of the matches: :math:`\sigma^2 D H^+ D^T`, H of rank dof.
+
+    Args:
+        moved: the motion in the coordinates of the matches, whose derivative is D.
+        found: where refinement ended.
+        dof: degrees of freedom of the motion.
+        scale: ``(b,)`` noise of a coordinate of a match of weight 1.
+    """
+    values, vectors = spectrum(found.matrix)
+    count = min(dof, values.shape[-1])
     values, vectors = values[..., -count:], vectors[..., -count:]
     root = vectors * values.clamp(min=1e-12 * values[..., -1:].clamp(min=torch.finfo(values.dtype).tiny)).rsqrt()[..., None, :]
-
-    def moved(t: Tensor) -> Tensor:
-        return torch.cat([part.flatten(t.ndim - 1) for part in denormalize_motion(invariant, problem.parts(t), frames)], dim=-1)
-
-    _, derivative = jacobian(moved, theta)
+    _, derivative = jacobian(moved, found.theta)
     spread = derivative.mT @ root
-    scale = sigma * largest_weights(weights).sqrt()
     covariance = (spread @ spread.mT) * scale.square()[:, None, None]
     # a motion without a matrix in the coordinates of the matches (singular) is not known at all, like one without spare matches
     known = scale.isfinite() & covariance.isfinite().flatten(1).all(-1)
@@ -415,13 +371,3 @@ def _any(part: Tensor) -> Tensor:
     if part.ndim == 3:
         return torch.eye(part.shape[-2], part.shape[-1], dtype=part.dtype, device=part.device).expand_as(part)
     return torch.ones_like(part)
-
-
-def _plain(solution: Solution) -> Normalization:
-    """The normalization of one problem each, without the dimension of copies."""
-    norm = solution.normalization
-    if solution.invariant.copies is None:
-        return norm
-    return Normalization(
-        tuple(t[:, 0] for t in norm.transforms), norm.primitives, norm.actions, tuple(s[:, 0] for s in norm.scales)
-    )

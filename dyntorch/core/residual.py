@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -10,6 +10,8 @@ from torch import Tensor
 from dyntorch.core.invariant import Invariant, as_invariant
 from dyntorch.core.matches import check_views
 from dyntorch.numerics.arguments import FARTHEST
+from dyntorch.numerics.blocks import select
+from dyntorch.numerics.least_squares import by_match, flattened, parts_of
 
 SINGULAR = 1e-14  # squared gradient, in normalized units, added where value and gradient vanish together (static points)
 LETTERS = "abcdefgh"
@@ -83,15 +85,14 @@ def sampson(invariant: Invariant | type[Invariant], tensor: Tensor, *views: Tens
     ones = (torch.ones((), dtype=tensor.dtype, device=tensor.device),) * len(views)
     if invariant.single():
         return _infinite(multilinear(invariant, tensor, views, ones).abs(), missing)
-    motion = invariant.decompose(tensor)
-    return _infinite(distance(invariant, motion if isinstance(motion, tuple) else (motion,), views, ones), missing)
+    return _infinite(distance(invariant, invariant.motion_of(tensor), views, ones), missing)
 
 
 def _whole(invariant: Invariant, views: Sequence[Tensor]) -> tuple[tuple[Tensor, ...], Tensor]:
     """The views with 0 for matches that are missing in any of them, and which these are, ``(*batch, n)``."""
     present = [(x.abs() <= FARTHEST).flatten(p.match_axis(x) + 1).all(-1) for p, x in zip(invariant.primitives, views, strict=True)]
     missing = ~torch.stack(present).all(0)
-    return tuple(torch.where(missing[(..., *[None] * (x.ndim - missing.ndim))], 0.0, x) for x in views), missing
+    return tuple(select(~missing, x, 0.0) for x in views), missing
 
 
 def _infinite(residual: Tensor, missing: Tensor) -> Tensor:
@@ -120,6 +121,21 @@ def whitened(invariant: Invariant, motion: tuple[Tensor, ...], views: Sequence[T
     """Whitened residual ``(*batch, n, c)`` of matches that may move: the invariant's own, or that of its multilinear form."""
     own = invariant.whitened(motion, tuple(views), scales)
     return own if own is not None else multilinear(invariant, invariant.compose(*motion), views, scales)[..., None]
+
+
+def residual_derivative(
+    residual: Callable[[tuple[Tensor, ...], tuple[Tensor, ...], tuple[Tensor, ...]], Tensor],
+    motion: tuple[Tensor, ...],
+    views: tuple[Tensor, ...],
+    scales: tuple[Tensor, ...],
+) -> tuple[Tensor, Tensor]:
+    """A residual of motion, views and scales, flat ``(b, n c)``, and its derivative ``(b, p, n c)`` by the motion."""
+    shapes = [part.shape[1:] for part in motion]
+
+    def of_copies(theta: Tensor, scales: tuple[Tensor, ...], single: tuple[Tensor, ...]) -> Tensor:
+        return residual(parts_of(theta, shapes), single, scales)
+
+    return by_match(of_copies, flattened(motion), scales, views)
 
 
 def multilinear(invariant: Invariant, tensor: Tensor, views: Sequence[Tensor], scales: tuple[Tensor, ...]) -> Tensor:

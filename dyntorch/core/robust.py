@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -19,7 +20,7 @@ from dyntorch.core.primitives import HyperplanesThrough, Point, Primitive, trian
 from dyntorch.core.refine import refine_matches
 from dyntorch.core.residual import SINGULAR, multilinear, whiten, whitened
 from dyntorch.core.solution import NOISY, Solution, copied
-from dyntorch.numerics.blocks import Draws, Result, map_blocks, one_thread, workers
+from dyntorch.numerics.blocks import Draws, Record, each, map_blocks, one_thread, select, workers
 from dyntorch.numerics.chi_square import quantile
 from dyntorch.numerics.nullspace import gram_null_space, orthonormal
 
@@ -69,11 +70,10 @@ class Bundle:
 
     def constrained(self, basis: Tensor) -> Tensor:
         """The tensors of the motions that tensors ``(b, c, K, a, D)`` decompose into; where no motion guides, the tensors."""
-        if not self.invariant.guides:
+        if self.invariant.starts is not None:
             return basis
         inv, own = self.invariant, basis.transpose(1, 2)
-        motion = inv.decompose(inv.tensor_of(own if inv.copies else own[:, :, 0]))
-        made = inv.compose(*motion) if isinstance(motion, tuple) else inv.compose(motion)
+        made = inv.compose(*inv.motion_of(inv.tensor_of(own if inv.copies else own[:, :, 0])))
         made = inv.basis_of(made).reshape(own.shape).transpose(1, 2)
         sound = made.isfinite().all(-1, keepdim=True) & (made.abs().amax(-1, keepdim=True) > 0)
         return torch.where(sound.all(-2, keepdim=True).all(1, keepdim=True), made, basis)
@@ -286,8 +286,7 @@ MANY, AGREEING, SAME = 16, 0.25, 0.01
 relative difference.  Whatever attracts one start in five, and is better, is then missed once in thirty times."""
 
 
-@dataclass(frozen=True)
-class Found:
+class Found(NamedTuple):
     """The best tensor of each problem."""
 
     basis: Tensor
@@ -303,6 +302,22 @@ class Found:
     agreeing: Tensor
     """``(b,)`` share of the starts that ended there, of so many that it says something, else 0."""
 
+    def better(self, new: Found, at: Tensor) -> Found:
+        """With the new ones of some problems, where they lose less."""
+        wins = new.score < self.score[at]
+        return Found(*(old.index_put((at[wins],), part[wins]) for old, part in zip(self, new, strict=True)))
+
+
+class Searched(NamedTuple):
+    """Matches among which is searched."""
+
+    weights: Tensor
+    """``(b, n)``, 1 at most."""
+    views: tuple[Tensor, ...]
+    """``(b, 1, n, ...)`` in normalized coordinates."""
+    transforms: tuple[Tensor, ...]
+    """That led there."""
+
 
 class Search:
     """The search for the tensors of a batch, among at most so many matches that memory stays bounded."""
@@ -317,8 +332,9 @@ class Search:
         self.unit = relative([t.flatten(1)[:, 0] for t in self.norm.transforms])[1]
         self.some = some = self._some()
         moved = self.norm.apply(invariant, copied(invariant, some)[0])
-        self.views = moved if invariant.copies else tuple(x[:, None] for x in moved)
         self.weights = some.weights / some.weights.amax(-1, keepdim=True).clamp(min=1e-300)
+        views = moved if invariant.copies else tuple(x[:, None] for x in moved)
+        self.searched = Searched(self.weights, views, self.norm.transforms)
 
     def run(self, cut: Tensor, starts: Sequence[int]) -> Found:
         """Best tensors: more and more starts for the problems that need them.
@@ -336,9 +352,7 @@ class Search:
             if not len(left):
                 break
             new = self._solve(left, cut, count)
-            better = (new.score < found.score[left]).nonzero()[:, 0]
-            for old, part in zip(vars(found).values(), vars(new).values(), strict=True):
-                old[left[better]] = part[better]
+            found = found.better(new, left)
             # more starts would find it again
             settled[left] = (new.agreeing >= AGREEING) & (new.score <= _same(found.score[left]))
         return found
@@ -348,8 +362,8 @@ class Search:
         inv, everyone = self.invariant, self.everyone
         chosen = torch.cat([self.weights[:, None], self._samples(everyone, 16)], dim=1)
 
-        def block(chosen: Tensor, *rest: Tensor) -> Tensor:
-            work = self._bundle(rest)
+        def block(searched: Searched, chosen: Tensor) -> Tensor:
+            work = self._bundle(searched)
             basis = _best(work, work.first(chosen), lambda square: median(square, work.weights), 17)
             # guided and soft: hard halves alone are 40 to 70 times off for lines (175, 20 % outliers), this 0.6 to 1.6 times
             basis = concentrate(work, anneal(work, basis, None, 20, guided=True), None, 5)
@@ -365,8 +379,8 @@ class Search:
         inv = self.invariant
         tensors = inv.basis_of(tensor)
 
-        def block(basis: Tensor, cut: Tensor, *rest: Tensor) -> Tensor:
-            work = self._bundle(rest)
+        def block(searched: Searched, basis: Tensor, cut: Tensor) -> Tensor:
+            work = self._bundle(searched)
             square = work.distances(basis[:, :, None])[0][:, 0]
             return judge(work, basis[:, :, None], square, cut.square())[0]
 
@@ -377,8 +391,8 @@ class Search:
         kind = "all" if count == 1 else "many" if chosen.shape[1] == count else "minimal"
         keep, steps = max(1, count // KEPT) if kind == "minimal" else count, ANNEALED[kind]
 
-        def block(chosen: Tensor, cut: Tensor, *rest: Tensor) -> tuple[Tensor, ...]:
-            work, limit = self._bundle(rest), cut.square()
+        def block(searched: Searched, chosen: Tensor, cut: Tensor) -> Found:
+            work, limit = self._bundle(searched), cut.square()
 
             def score(square: Tensor) -> Tensor:
                 return msac(square, work.weights, limit)
@@ -395,9 +409,9 @@ class Search:
             basis = concentrate(work, _chosen(basis, lost.argmin(-1, keepdim=True)), limit, 5)
             square = work.distances(basis)[0]
             evidence, doubt = judge(work, basis, square[:, 0], limit)
-            return basis[:, :, 0], score(square)[:, 0], evidence, doubt, square[:, 0] <= limit[:, None], agreeing
+            return Found(basis[:, :, 0], score(square)[:, 0], evidence, doubt, square[:, 0] <= limit[:, None], agreeing)
 
-        return Found(*self._map(block, where, chosen, cut[where]))
+        return self._map(block, where, chosen, cut[where])
 
     def _samples(self, where: Tensor, count: int) -> Tensor:
         """Starts ``(problems, K, n)``: 1 for so many random matches with weight."""
@@ -417,26 +431,20 @@ class Search:
         rows = torch.arange(len(order), device=order.device)[:, None]
         return replace(data, views=tuple(x[rows, order] for x in data.views), weights=data.weights[rows, order])
 
-    def _map(self, function: Callable[..., Result], where: Tensor, starts: Tensor, *more: Tensor) -> Result:
+    def _map(self, function: Callable[..., Record], where: Tensor, starts: Tensor, *more: Tensor) -> Record:
         inv, n = self.invariant, self.weights.shape[-1]
         packed = math.prod(p.width * (p.width + 1) // 2 for p in inv.primitives)
         per_start = 2 * inv.width() ** 2 + n * inv.nullity * sum(p.width for p in inv.primitives)
         per_problem = (inv.copies or 1) * (n * packed + starts.shape[1] * per_start)
         size = min(STARTS_BLOCK // per_problem, -(-len(where) // workers()))
-        rest = (self.weights, *self.views, *self.norm.transforms)
-        return map_blocks(function, starts, *more, *(x[where] for x in rest), size=max(1, size))
+        return map_blocks(function, each(lambda x: x[where], self.searched), starts, *more, size=max(1, size))
 
-    def _bundle(self, rest: tuple[Tensor, ...]) -> Bundle:
-        count = len(self.invariant.primitives)
-        weights, views, transforms = rest[0], rest[1 : 1 + count], rest[1 + count :]
+    def _bundle(self, searched: Searched) -> Bundle:
+        transforms = searched.transforms
         primitives = tuple(p.normalized(t) for p, t in zip(self.invariant.primitives, transforms, strict=True))
-        return bundle(
-            self.invariant.normalized(tuple(t[:, None] for t in transforms)),
-            primitives,
-            views,
-            relative([t.flatten(1)[:, 0] for t in transforms])[0],
-            weights,
-        )
+        base = self.invariant.normalized(tuple(t[:, None] for t in transforms))
+        scales = relative([t.flatten(1)[:, 0] for t in transforms])[0]
+        return bundle(base, primitives, searched.views, scales, searched.weights)
 
 
 def judge(work: Bundle, basis: Tensor, square: Tensor, limit: Tensor) -> tuple[Tensor, Tensor]:
@@ -672,7 +680,9 @@ def _solution(search: Search, found: Found) -> Solution:
     """The tensors found, as a solution in the coordinates of the search."""
     invariant, norm, data = search.invariant, search.norm, search.data
     tensor = invariant.tensor_of(found.basis if invariant.copies else found.basis[:, 0])
-    tensor = invariant.normalized(norm.transforms).constrain(tensor)
+    nearest = invariant.normalized(norm.transforms).constrain(tensor)
+    # 0 where there is none, which all matches would fulfil
+    tensor = select((nearest != 0).flatten(1).any(-1), nearest, tensor)
     status = torch.full(tensor.shape[:1], int(Status.OK), device=tensor.device)
     back = data.back(denormalize(invariant, tensor, norm.actions))
     nothing = data.back(torch.zeros_like(found.score))
@@ -681,14 +691,11 @@ def _solution(search: Search, found: Found) -> Solution:
 
 def distances(solution: Solution) -> Tensor:
     """Sampson distances ``(b, n)`` in the unit of the matches, as :func:`dyntorch.sampson` has them."""
-    invariant, data, norm = solution.invariant, solution.matches, solution.normalization
+    invariant, data = solution.invariant, solution.matches
     alone = invariant.single()
     parts = (solution.normalized,) if alone else solution.normalized_motion()
-    transforms = tuple(t[:, 0] for t in norm.transforms) if invariant.copies else norm.transforms
-    count = len(data.views)
 
-    def block(*tensors: Tensor) -> Tensor:
-        frames, x, motion = tensors[:count], tensors[count : 2 * count], tensors[2 * count :]
+    def block(frames: tuple[Tensor, ...], x: tuple[Tensor, ...], motion: tuple[Tensor, ...]) -> Tensor:
         views = tuple(p.move(v, t) for p, v, t in zip(invariant.primitives, x, frames, strict=True))
         scales, unit = relative([t[:, 0, 0] for t in frames])
         if alone:
@@ -696,7 +703,7 @@ def distances(solution: Solution) -> Tensor:
         return whitened(invariant, motion, views, scales).norm(dim=-1) / unit[:, None]
 
     size = max(1, min(BLOCK // max(1, data.count), -(-len(data.weights) // workers())))
-    return map_blocks(block, *transforms, *data.views, *parts, size=size).nan_to_num(nan=torch.inf)
+    return map_blocks(block, solution.frames(), data.views, parts, size=size).nan_to_num(nan=torch.inf)
 
 
 def _score(data: Matches, distance: Tensor, cut: Tensor) -> Tensor:
@@ -711,23 +718,18 @@ def _sigma(invariant: Invariant, data: Matches, distance: Tensor, cut: Tensor) -
     return middle / quantile(0.5, invariant.codim) ** 0.5 * (rows / (rows - invariant.dof).clamp(min=1)).clamp(min=1.0).sqrt()
 
 
-def _where(mask: Tensor, new: Tensor, old: Tensor) -> Tensor:
-    """``new`` where the mask, which has the leading dimensions, is true."""
-    return torch.where(mask[(..., *[None] * (new.ndim - mask.ndim))], new, old)
-
-
 def _pick(better: Tensor, new: Solution, old: Solution) -> Solution:
     """The better one of two solutions of every problem."""
     caller = old.matches.back(better)
     motion = new.normalized_motion(), old.normalized_motion()
     covariance = (
-        new.covariance if old.covariance is None or new.covariance is None else _where(caller, new.covariance, old.covariance)
+        new.covariance if old.covariance is None or new.covariance is None else select(caller, new.covariance, old.covariance)
     )
     return replace(
         new,
-        tensor=_where(caller, new.tensor, old.tensor),
-        normalized=_where(better, new.normalized, old.normalized),
-        refined=tuple(_where(better, a, b) for a, b in zip(*motion, strict=True)),
+        tensor=select(caller, new.tensor, old.tensor),
+        normalized=select(better, new.normalized, old.normalized),
+        refined=tuple(select(better, a, b) for a, b in zip(*motion, strict=True)),
         covariance=covariance,
     )
 
@@ -743,11 +745,11 @@ def _judged(solution: Solution, evidence: Tensor, degenerate: Tensor, inliers: T
     good, covariance = ~failed(status), solution.covariance
     return replace(
         solution,
-        tensor=_where(data.back(good), solution.tensor, torch.zeros_like(solution.tensor)),
-        normalized=_where(good, solution.normalized, torch.zeros_like(solution.normalized)),
+        tensor=select(data.back(good), solution.tensor, torch.zeros_like(solution.tensor)),
+        normalized=select(good, solution.normalized, torch.zeros_like(solution.normalized)),
         status=data.back(status),
         uncertainty=linear.uncertainty,
-        covariance=None if covariance is None else _where(data.back(good), covariance, torch.zeros_like(covariance)),
+        covariance=None if covariance is None else select(data.back(good), covariance, torch.zeros_like(covariance)),
         inliers=data.back(inliers & good[:, None]),
         sigma=data.back(torch.where(good, sigma, torch.zeros_like(sigma))),
     )

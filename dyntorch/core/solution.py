@@ -17,6 +17,7 @@ from dyntorch.core.matrix import CHUNK, estimation_matrix
 from dyntorch.core.normalize import Normalization, denormalize_motion
 from dyntorch.core.outcome import Outcome, Status, check_status, failed
 from dyntorch.numerics.arguments import check_precision
+from dyntorch.numerics.blocks import select
 
 NOISY = 0.05
 """Estimated noise over the extent of the points above which agreement with a tensor is an accident: random matches of space, with
@@ -57,7 +58,7 @@ class Solution(Outcome):
     def motion(self) -> tuple[Tensor, ...]:
         """The parts of the motion in the coordinates of the matches; decomposed in normalized ones, which is more accurate."""
         parts = self.normalized_motion()
-        moved = denormalize_motion(self.invariant, parts, self._frames())
+        moved = denormalize_motion(self.invariant, parts, self.frames())
         return tuple(self.matches.back(self._or_zero(part)) for part in moved)
 
     @cached_property
@@ -87,8 +88,15 @@ class Solution(Outcome):
         """Parts of the motion in normalized coordinates, flat batch, float64."""
         if self.refined is not None:
             return self.refined
-        parts = self.invariant.normalized(self.normalization.transforms).decompose(self.normalized)
-        return parts if isinstance(parts, tuple) else (parts,)
+        return self.base().motion_of(self.normalized)
+
+    def base(self) -> Invariant:
+        """The invariant of the normalized matches."""
+        return self.invariant.normalized(self.normalization.transforms)
+
+    def frames(self) -> tuple[Tensor, ...]:
+        """What normalized the views, ``(b, d + 1, d + 1)`` each, without an axis of copies."""
+        return tuple(t.reshape(t.shape[0], *t.shape[-2:]) for t in self.normalization.transforms)
 
     def back(self, data: Matches) -> Solution:
         """This solution of flat float64 problems in the batch, dtype and device of the caller's matches."""
@@ -151,12 +159,7 @@ class Solution(Outcome):
             outer(self.tensor),
             outer(self.uncertainty),
             data,
-            Normalization(
-                transforms,
-                tuple(p.normalized(t) for p, t in pairs),
-                tuple(map(inner, self.normalization.actions)),
-                tuple(map(inner, self.normalization.scales)),
-            ),
+            Normalization(transforms, tuple(p.normalized(t) for p, t in pairs), tuple(map(inner, self.normalization.actions))),
             inner(self.normalized),
             status=outer(self.status),
             inliers=None if self.inliers is None else outer(self.inliers),
@@ -179,13 +182,8 @@ class Solution(Outcome):
         shape = tuple(self.status.shape)
         return f"Solution({self.invariant!r}, matches={self.matches.count}, batch={shape}: {self.counted()}{noise})"
 
-    def _frames(self) -> tuple[Tensor, ...]:
-        """Transforms without the dimension of copies."""
-        return tuple(t[:, 0] for t in self.normalization.transforms) if self.invariant.copies else self.normalization.transforms
-
     def _or_zero(self, part: Tensor) -> Tensor:
-        none = failed(self.status.reshape(-1).to(part.device))
-        return torch.where(none[(..., *([None] * (part.ndim - 1)))], torch.zeros_like(part), part)
+        return select(~failed(self.status.reshape(-1).to(part.device)), part, 0.0)
 
 
 def _shown(sigma: Tensor) -> str:

@@ -92,9 +92,11 @@ class Collineation(Invariant):
         """
         return unit(tensor)
 
-    def singular(self, tensor: Tensor) -> Tensor:
-        """Matrices that map everything onto less than the space: what coinciding points of view 1 leave."""
-        return torch.linalg.det(tensor.detach()).abs() <= SINGULAR * torch.linalg.matrix_norm(tensor.detach()) ** (self.n + 1)
+    def constrain(self, tensor: Tensor) -> Tensor:
+        """0 for matrices that map everything onto less than the space: what coinciding points of view 1 leave."""
+        flat = tensor.detach()
+        singular = torch.linalg.det(flat).abs() <= SINGULAR * torch.linalg.matrix_norm(flat) ** (self.n + 1)
+        return torch.where(singular[..., None, None], 0.0, tensor)
 
     @staticmethod
     def transfer(tensor: Tensor, x2: Tensor) -> Tensor:

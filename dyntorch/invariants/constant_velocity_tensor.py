@@ -12,7 +12,7 @@ from torch.nn.functional import pad
 
 from dyntorch.core.invariant import Frame, Invariant
 from dyntorch.core.primitives import HyperplanesThrough, Point, Primitive
-from dyntorch.core.residual import whiten
+from dyntorch.core.residual import residual_derivative, whiten
 from dyntorch.geometry.extensors import adjugate, back_project, compound, dual, join, project
 from dyntorch.geometry.homogeneous import homogeneous, inhomogeneous, unit
 from dyntorch.invariants.constant_velocity_algebra import (
@@ -365,10 +365,17 @@ class ConstantVelocityTensor(Invariant):
         """
         return moving_residual(inverses(motion), views, scales)
 
-    def shared(self, motion: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-        return inverses(motion)
+    def linearized(
+        self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]
+    ) -> tuple[Tensor, Tensor]:
+        """By way of the inverses, which the residuals of all matches share: computed once per motion."""
+        maps, slope = self._inverses(motion)
+        value, derivative = residual_derivative(moving_residual, maps, views, scales)
+        return value, slope @ derivative
 
-    def shared_derivative(self, motion: tuple[Tensor, ...]) -> tuple[tuple[Tensor, ...], Tensor | None]:
+    @staticmethod
+    def _inverses(motion: tuple[Tensor, ...]) -> tuple[tuple[Tensor, ...], Tensor]:
+        """:func:`inverses` and their derivative ``(b, p, q)`` by all entries of the motion ``(b, ...)``."""
         square = [part for part in motion if part.shape[-2] == part.shape[-1]]
         b, count = len(motion[0]), len(square)
         # every inverse depends on its own matrix: the derivatives of all of them in one pass
@@ -379,9 +386,6 @@ class ConstantVelocityTensor(Invariant):
         sizes = [block.shape[-1] for block in blocks]
         rows = [pad(block, (sum(sizes[:i]), sum(sizes[i + 1 :]))) for i, block in enumerate(blocks)]
         return (*value.unflatten(-1, (4, 4)).unflatten(0, (count, b)), *motion[count:]), torch.cat(rows, dim=-2)
-
-    def whitened_shared(self, shared: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
-        return moving_residual(shared, views, scales)
 
     def whitened_static(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
         r"""Residual of matches that stand still, :math:`(y_1 - y_0, y_2 - y_1)`, whitened; it holds the common velocity at 0.

@@ -47,7 +47,6 @@ class MinimalJoinTensor(CollinearPoints):
 
     cameras: Tensor | None = None
     primitives: tuple[Primitive, ...] = field(init=False)
-    copies: int | None = field(init=False)
 
     def __post_init__(self) -> None:
         cameras = _dropping() if self.cameras is None else self.cameras
@@ -56,7 +55,6 @@ class MinimalJoinTensor(CollinearPoints):
         if self.cameras is not None and cameras.ndim == 3:
             _check_cameras(cameras)
         object.__setattr__(self, "primitives", (Point(3), Point(3), Projected(cameras)))
-        object.__setattr__(self, "copies", int(cameras.shape[-3]))
 
     def normalized(self, transforms: tuple[Tensor, ...]) -> Invariant:
         """The invariant of normalized matches, whose cameras have orthonormal rows.

@@ -8,9 +8,10 @@ five to twenty times longer than one thread takes for the whole.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import fields, is_dataclass
 from functools import _lru_cache_wrapper, lru_cache, wraps
 from threading import Barrier, local
 from typing import Any, ParamSpec, TypeVar
@@ -18,7 +19,7 @@ from typing import Any, ParamSpec, TypeVar
 import torch
 from torch import Tensor
 
-Result = TypeVar("Result", Tensor, tuple[Tensor, ...])
+Record = TypeVar("Record")
 P = ParamSpec("P")
 R = TypeVar("R")
 LARGE = 1 << 20
@@ -107,7 +108,7 @@ def _all_threads(tensors: tuple[Tensor, ...]) -> Iterator[None]:
         _set_threads(1, others=threads)
 
 
-def map_blocks(function: Callable[..., Result], *tensors: Tensor, size: int) -> Result:
+def map_blocks(function: Callable[..., Record], *data: Any, size: int) -> Record:
     r"""Apply ``function`` to blocks of the leading dimension of all tensors, on a thread pool, and concatenate the results.
 
     On the CPU torch factorizes a batch of matrices one after the other on one core (``svd``, ``eigh``, ``cholesky`` and
@@ -117,12 +118,13 @@ def map_blocks(function: Callable[..., Result], *tensors: Tensor, size: int) -> 
     they gain.  A single problem, one thread or an accelerator needs no pool.  The caller's grad mode holds in the workers.
 
     Args:
-        function: takes one block per tensor and returns a tensor, or a tuple of tensors, with the same leading dimension.
-        tensors: ``(batch, ...)``, all with the same ``batch``; zero is one empty block.
+        function: takes one block of each argument, and returns a tensor or a record of tensors with the same leading dimension.
+        *data: tensors ``(batch, ...)``, and records of them: tuples, named ones, dataclasses, nested as you like.  All tensors have
+            the same ``batch``; zero is one empty block.  What is no tensor (None for one that is not there) comes as it is.
         size: problems per block.
 
     Returns:
-        what ``function`` returns for the whole batch.
+        what ``function`` returns for the whole batch, of the same kind.
 
     Raises:
         ValueError: no tensor, different leading dimensions, or a size below 1.
@@ -131,7 +133,10 @@ def map_blocks(function: Callable[..., Result], *tensors: Tensor, size: int) -> 
         >>> import torch
         >>> map_blocks(lambda a, b: a + b, torch.arange(5), torch.ones(5, dtype=torch.int64), size=2)
         tensor([1, 2, 3, 4, 5])
+        >>> map_blocks(lambda views, weights: (views[0] + views[1], weights), (torch.ones(3), torch.arange(3)), None, size=2)
+        (tensor([1., 2., 3.]), None)
     """
+    tensors = tuple(_tensors(data))
     lengths = {tensor.shape[0] if tensor.ndim else None for tensor in tensors}
     if len(lengths) != 1 or None in lengths:
         raise ValueError(f"map_blocks needs tensors of the same leading dimension, got {[tuple(t.shape) for t in tensors]}")
@@ -140,15 +145,15 @@ def map_blocks(function: Callable[..., Result], *tensors: Tensor, size: int) -> 
     threads = workers() if tensors[0].device.type == "cpu" else 1
     if len(tensors[0]) <= min(size, 1) or (threads == 1 and len(tensors[0]) <= size):
         with _all_threads(tensors):
-            return function(*tensors)
+            return function(*data)
     if len(tensors[0]) <= size and torch.get_num_threads() == 1:
-        return function(*tensors)
-    blocks = list(zip(*(tensor.split(size) for tensor in tensors), strict=True))
+        return function(*data)
+    blocks = [_rebuilt(data, iter(block)) for block in zip(*(tensor.split(size) for tensor in tensors), strict=True)]
     if threads == 1:
         return _concatenate([function(*block) for block in blocks])
     grad, inference = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
 
-    def run(block: tuple[Tensor, ...]) -> Result:
+    def run(block: tuple[Any, ...]) -> Record:
         # grad mode belongs to a thread; a worker starts with the default
         with torch.inference_mode(inference), torch.set_grad_enabled(grad):
             return function(*block)
@@ -156,10 +161,60 @@ def map_blocks(function: Callable[..., Result], *tensors: Tensor, size: int) -> 
     return _concatenate(list(_pool(threads).map(run, blocks)))
 
 
-def _concatenate(results: list[Result]) -> Result:
-    if isinstance(results[0], Tensor):
-        return torch.cat(results)
-    return tuple(torch.cat(parts) for parts in zip(*results, strict=True))
+def each(function: Callable[[Tensor], Tensor], record: Record) -> Record:
+    """The record with a function of each of its tensors in its place; what is a record says :func:`map_blocks`.
+
+    Example:
+        >>> import torch
+        >>> each(lambda x: x[1:], (torch.arange(3), (torch.ones(2), None)))
+        (tensor([1, 2]), (tensor([1.]), None))
+    """
+    return _rebuilt(record, map(function, _tensors(record)))
+
+
+def select(mask: Tensor, new: Tensor, old: Tensor | float) -> Tensor:
+    """``new`` where the mask is true, which has the leading dimensions alone, elsewhere ``old``.
+
+    Example:
+        >>> import torch
+        >>> select(torch.tensor([True, False]), torch.ones(2, 3), 0.0).tolist()
+        [[1.0, 1.0, 1.0], [0.0, 0.0, 0.0]]
+    """
+    return torch.where(mask[(..., *[None] * (new.ndim - mask.ndim))], new, old)
+
+
+def _concatenate(results: list[Record]) -> Record:
+    columns = zip(*(tuple(_tensors(result)) for result in results), strict=True)
+    return _rebuilt(results[0], iter([torch.cat(column) for column in columns]))
+
+
+def _tensors(record: Any) -> Iterator[Tensor]:
+    """The tensors of a record, in the order of its fields."""
+    if isinstance(record, Tensor):
+        yield record
+    else:
+        for part in _parts(record) or ():
+            yield from _tensors(part)
+
+
+def _rebuilt(record: Record, tensors: Iterator[Tensor]) -> Record:
+    """The same record of other tensors, in the order of :func:`_tensors`."""
+    if isinstance(record, Tensor):
+        return next(tensors)  # type: ignore[return-value]
+    parts = _parts(record)
+    if parts is None:
+        return record
+    made, kind = [_rebuilt(part, tensors) for part in parts], type(record)
+    return kind(made) if kind is tuple else kind(*made)  # type: ignore[call-arg]
+
+
+def _parts(record: Any) -> Iterable[Any] | None:
+    """The fields of a record; None for what is none."""
+    if isinstance(record, tuple):
+        return record
+    if is_dataclass(record):
+        return [getattr(record, field.name) for field in fields(record)]
+    return None
 
 
 def _one_thread() -> None:

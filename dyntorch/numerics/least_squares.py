@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Protocol
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -30,6 +30,28 @@ class Minimand(Protocol):
         ...
 
 
+class Minimum(NamedTuple):
+    """Where a block of least squares problems ended."""
+
+    theta: Tensor
+    """``(b, p)`` parameters."""
+    cost: Tensor
+    """``(b,)``."""
+    matrix: Tensor
+    """``(b, p, p)`` of Gauss and Newton."""
+
+
+def flattened(parts: Sequence[Tensor]) -> Tensor:
+    """All entries of motions ``(b, ...)``, part after part, ``(b, p)``."""
+    return torch.cat([part.flatten(1) for part in parts], dim=-1)
+
+
+def parts_of(theta: Tensor, shapes: Sequence[torch.Size]) -> tuple[Tensor, ...]:
+    """The inverse of :func:`flattened`, for any leading dimensions."""
+    sizes = [shape.numel() for shape in shapes]
+    return tuple(part.unflatten(-1, shape) for part, shape in zip(theta.split(sizes, -1), shapes, strict=True))
+
+
 def damped_step(gradient: Tensor, matrix: Tensor, damping: Tensor, free: Tensor | None = None) -> Tensor:
     r"""The step of Levenberg and Marquardt, :math:`(H + \mu\,\mathrm{diag}\,H)^{-1} g`, to be subtracted; 0 where it is not finite.
 
@@ -51,9 +73,7 @@ def damped_step(gradient: Tensor, matrix: Tensor, damping: Tensor, free: Tensor 
     return torch.where(step.isfinite(), step, torch.zeros_like(step))
 
 
-def minimize(
-    problem: Minimand, theta: Tensor, iterations: int, *, settle: int = 0, least: float = LEAST
-) -> tuple[Tensor, Tensor, Tensor]:
+def minimize(problem: Minimand, theta: Tensor, iterations: int, *, settle: int = 0, least: float = LEAST) -> Minimum:
     """Parameters, cost and Gauss-Newton matrix at the minimum of every problem of a block, by Levenberg-Marquardt.
 
     Args:
@@ -83,7 +103,8 @@ def minimize(
             state = tuple(part[keep] for part in state)
     for _ in range(settle):
         result = _settled(given, result, least)
-    return result[0], result[1], result[3]
+    theta, cost, _, matrix = result
+    return Minimum(theta, cost, matrix)
 
 
 def _step(problem: Minimand, state: tuple[Tensor, ...], damping: Tensor, least: float) -> tuple[tuple[Tensor, ...], Tensor, Tensor]:

@@ -14,7 +14,7 @@ from dyntorch.core.refine import Problem, refine_matches
 from dyntorch.core.residual import whiten, whitened
 from dyntorch.core.solution import Solution
 from dyntorch.geometry.homogeneous import apply, homogeneous
-from dyntorch.numerics.blocks import map_blocks, uniform
+from dyntorch.numerics.blocks import each, map_blocks, uniform
 from dyntorch.numerics.chi_square import median, three_sigma
 from dyntorch.numerics.nullspace import spectrum
 from dyntorch.tasks.align.options import AlignOptions
@@ -63,14 +63,11 @@ class Evidence:
         def again(x: Tensor) -> Tensor:
             return x.repeat(count, *([1] * (x.ndim - 1)))
 
-        static = None if self.data.static is None else again(self.data.static)
-        data = replace(self.data, views=tuple(map(again, self.data.views)), weights=again(self.data.weights), static=static)
-        norm = self.norm
-        again_norm = Normalization(
-            tuple(map(again, norm.transforms)), norm.primitives, tuple(map(again, norm.actions)), tuple(map(again, norm.scales))
-        )
-        data = replace(data, batch=data.weights.shape[:1])
-        return Evidence(self.invariant, data, again_norm, tuple(map(again, self.views)), again(self.floor), options=self.options)
+        views, weights, static = each(again, (self.data.views, self.data.weights, self.data.static))
+        data = replace(self.data, views=views, weights=weights, static=static, batch=weights.shape[:1])
+        transforms, actions = each(again, (self.norm.transforms, self.norm.actions))
+        norm = Normalization(transforms, self.norm.primitives, actions)
+        return Evidence(self.invariant, data, norm, each(again, self.views), again(self.floor), options=self.options)
 
     def weighted(self, weights: Tensor) -> Evidence:
         """With the matches of each problem weighted by ``(b,)``; 0 leaves a problem out."""

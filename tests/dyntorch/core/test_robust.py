@@ -149,7 +149,7 @@ def test_several_slots_of_hyperplanes_have_distances_right_in_the_mean() -> None
     made = scenes.planar(400, sigma=0.3, static=1.0, generator=seeded(8))
     invariant = dyn.DualHomographyTensor("points")
     search = Search(invariant, matches(invariant, made.views), seeded())
-    work = search._bundle((search.weights, *search.views, *search.norm.transforms))
+    work = search._bundle(search.searched)
     basis = work.first(search.weights[:, None])
     square = work.distances(basis)[0][0, 0] / search.unit**2
     assert float(square.mean()) == pytest.approx(4 * 0.3**2, rel=0.1)
@@ -161,7 +161,7 @@ def test_constrained_tensors_of_motions_are_themselves() -> None:
     for case in KNOWN:
         made = case.scene(max(120, 3 * case.minimal), batch=2, seed=3)
         search = Search(case.invariant, matches(case.invariant, made.views), seeded())
-        work = search._bundle((search.weights, *search.views, *search.norm.transforms))
+        work = search._bundle(search.searched)
         basis = work.first(search.weights[:, None].expand(-1, 3, -1))
         again = work.constrained(basis)
         # spans: sign and basis are free
@@ -181,7 +181,7 @@ def test_evidence_is_the_expected_number_of_chance_finds() -> None:
     scene = planar(batch=1, outliers=0.2, n=60)
     data = matches(dyn.HomographyTensor(), scene.views)
     search = Search(dyn.HomographyTensor(), data, None)
-    work = search._bundle((search.weights, *search.views, *search.norm.transforms))
+    work = search._bundle(search.searched)
     limit = (1.5 * search.unit).square()
     basis = anneal(work, work.first(search.weights[:, None]), limit, 30)
     square = work.distances(basis)[0][:, 0]
@@ -230,7 +230,7 @@ def _sampson(basis: Tensor, views: Any, scales: Any) -> Tensor:
 def test_starts_are_linear_fits_and_distances_are_sampson(invariant: Invariant, scene: scenes.Scene) -> None:
     data = matches(invariant, scene.views)
     search = Search(invariant, data, seeded())
-    work = search._bundle((search.weights, *search.views, *search.norm.transforms))
+    work = search._bundle(search.searched)
     chosen = search._samples(torch.arange(2), 3)[:, :3]
     basis = work.first(chosen)
     square, _ = work.distances(basis)
@@ -239,9 +239,9 @@ def test_starts_are_linear_fits_and_distances_are_sampson(invariant: Invariant, 
         tensor = basis[:, 0, k, 0].unflatten(-1, widths).permute(0, *(1 + v for v in invariant.axes()))
         there = dyn.sampson(invariant, denormalize(invariant, tensor, search.norm.actions), *scene.views)
         assert torch.allclose(square[:, k].sqrt() / search.unit[:, None], there, rtol=1e-6, atol=1e-8)
-        points = [x[:, 0] for x, p in zip(search.views, invariant.primitives, strict=True) if p.rows == 1]
+        points = [x[:, 0] for x, p in zip(search.searched.views, invariant.primitives, strict=True) if p.rows == 1]
         unit = math.prod((1 + x.square().sum(-1) for x in points), start=torch.ones(()))
-        rows = estimation_matrix(search.norm.primitives, [x[:, 0] for x in search.views], chosen[:, k] / unit)
+        rows = estimation_matrix(search.norm.primitives, [x[:, 0] for x in search.searched.views], chosen[:, k] / unit)
         null = torch.linalg.svd(rows.double()).Vh[:, -1]
         assert torch.allclose((null * basis[:, 0, k, 0]).sum(-1).abs(), torch.ones(2, dtype=null.dtype), atol=1e-7)
 

@@ -5,12 +5,14 @@ import threading
 import time
 import types
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import pytest
 import torch
 
 import dyntorch as dyn
-from dyntorch.numerics.blocks import LARGE, map_blocks, one_thread, workers
+from dyntorch.numerics.blocks import LARGE, each, map_blocks, one_thread, select, workers
 
 
 @pytest.fixture
@@ -32,6 +34,59 @@ def test_blocks_equal_the_whole(batch, threads):
     torch.set_num_threads(before)
     assert torch.equal(total, x.sum(-1) + y)
     assert torch.equal(twice, 2 * x)
+
+
+class Pair(NamedTuple):
+    total: torch.Tensor
+    rest: tuple[torch.Tensor | None, ...]
+
+
+@dataclass(frozen=True)
+class Given:
+    views: tuple[torch.Tensor, ...]
+    name: str
+    pair: Pair
+    flags: torch.Tensor | None = None
+
+
+@pytest.mark.parametrize("batch", [0, 1, 7])
+@pytest.mark.parametrize("threads", [1, 2])
+def test_records_go_in_and_come_back_as_records(batch, threads):
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    a, b = torch.arange(batch * 2.0).reshape(batch, 2), torch.arange(batch)
+    given = Given((a, 2 * a), "names stay", Pair(b, (None, 3 * b)))
+
+    def block(one, scale, nothing):
+        assert (
+            isinstance(one, Given) and isinstance(one.pair, Pair) and (one.name, one.flags, nothing) == ("names stay", None, None)
+        )
+        assert len(one.views[1]) == len(one.pair.total) == len(scale) <= 3
+        return Given((one.views[1] * scale[:, None],), one.name, Pair(one.pair.rest[1] + one.pair.total, (None, scale)))
+
+    found = map_blocks(block, given, b, None, size=3)
+    torch.set_num_threads(before)
+    assert isinstance(found, Given) and isinstance(found.pair, Pair) and (found.name, found.flags) == ("names stay", None)
+    assert torch.equal(found.views[0], 2 * a * b[:, None]) and torch.equal(found.pair.total, 4 * b)
+    assert found.pair.rest[0] is None and torch.equal(found.pair.rest[1], b)
+
+
+def test_each_takes_the_tensors_of_a_record_one_by_one():
+    given = Given(
+        (torch.arange(3), torch.ones(3, 2)), "names stay", Pair(torch.zeros(3), (None,)), torch.tensor([True, False, True])
+    )
+    found = each(lambda x: x[1:], given)
+    assert [x.tolist() for x in found.views] == [[1, 2], [[1, 1], [1, 1]]] and found.flags.tolist() == [False, True]
+    assert found.name == "names stay" and found.pair.rest == (None,) and len(given.flags) == 3
+
+
+def test_select_takes_whole_problems():
+    mask = torch.tensor([[True, False], [False, True]])
+    new, old = torch.rand(2, 2, 3, 4), torch.rand(2, 2, 3, 4)
+    found = select(mask, new, old)
+    for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        assert torch.equal(found[i, j], (new if mask[i, j] else old)[i, j])
+    assert torch.equal(select(mask, mask.double(), 5.0), torch.tensor([[1.0, 5.0], [5.0, 1.0]]).double())
 
 
 def test_a_single_tensor_comes_back_as_a_tensor(two_threads):
