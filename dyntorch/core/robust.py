@@ -20,7 +20,7 @@ from dyntorch.core.primitives import HyperplanesThrough, Point, Primitive, trian
 from dyntorch.core.refine import refine_matches
 from dyntorch.core.residual import SINGULAR, multilinear, whiten, whitened
 from dyntorch.core.solution import NOISY, Solution, copied
-from dyntorch.numerics.blocks import Draws, Record, each, map_blocks, one_thread, select, workers
+from dyntorch.numerics.blocks import Draws, Record, each, map_blocks, one_thread, put, select, workers
 from dyntorch.numerics.chi_square import quantile
 from dyntorch.numerics.nullspace import gram_null_space, orthonormal
 
@@ -305,7 +305,7 @@ class Found(NamedTuple):
     def better(self, new: Found, at: Tensor) -> Found:
         """With the new ones of some problems, where they lose less."""
         wins = new.score < self.score[at]
-        return Found(*(old.index_put((at[wins],), part[wins]) for old, part in zip(self, new, strict=True)))
+        return put(self, at[wins], each(lambda x: x[wins], new))
 
 
 class Searched(NamedTuple):

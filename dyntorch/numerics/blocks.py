@@ -172,6 +172,18 @@ def each(function: Callable[[Tensor], Tensor], record: Record) -> Record:
     return _rebuilt(record, map(function, _tensors(record)))
 
 
+def put(record: Record, at: Tensor, new: Record) -> Record:
+    """The record with the problems ``at (k,)`` replaced by those of another record of k problems, in memory of its own.
+
+    Example:
+        >>> import torch
+        >>> put((torch.zeros(3), None), torch.tensor([2]), (torch.ones(1), None))
+        (tensor([0., 0., 1.]), None)
+    """
+    pairs = zip(_tensors(record), _tensors(new), strict=True)
+    return _rebuilt(record, (old.index_put((at,), part) for old, part in pairs))
+
+
 def select(mask: Tensor, new: Tensor, old: Tensor | float) -> Tensor:
     """``new`` where the mask is true, which has the leading dimensions alone, elsewhere ``old``.
 

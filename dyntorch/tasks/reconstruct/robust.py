@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import lru_cache
 
 import torch
@@ -16,7 +16,7 @@ from dyntorch.core.solution import NOISY
 from dyntorch.geometry.bundle import bundle_adjust
 from dyntorch.geometry.triangulation import reproject, resect, triangulate
 from dyntorch.invariants.grassmann_tensor import GrassmannTensor
-from dyntorch.numerics.blocks import uniform
+from dyntorch.numerics.blocks import each, put, uniform
 from dyntorch.numerics.chi_square import quantile
 from dyntorch.tasks.reconstruct.options import ReconstructOptions
 from dyntorch.tasks.reconstruct.projections import Projections, ViewTracks, camera_unknowns, choices
@@ -166,11 +166,10 @@ class Consensus:
     lost: Tensor
     """``(b,)`` what the problems are judged by, less is better."""
 
-    def better(self, new: Consensus, where: Tensor) -> None:
-        """Take the new ones of some problems, where they are better."""
-        wins = new.lost < self.lost[where]
-        for field in fields(self):
-            getattr(self, field.name)[where[wins]] = getattr(new, field.name)[wins]
+    def better(self, new: Consensus, at: Tensor) -> Consensus:
+        """With the new ones of some problems, where they are better."""
+        wins = new.lost < self.lost[at]
+        return put(self, at[wins], each(lambda x: x[wins], new))
 
 
 def consensus(
@@ -218,7 +217,7 @@ def consensus(
         starts = search.starts(some, views, best.square[left], ranks[left])
         new, rank = search.run(some, views, starts, options.starts.shares, None if sigma is None else sigma[left])
         stale[left] = torch.where(new.lost < options.starts.better * best.lost[left], 0, stale[left] + 1)
-        best.better(new, left)
+        best = best.better(new, left)
         ranks[left] += rank
     return best, *search.judged(tracks, best)
 
@@ -235,16 +234,13 @@ class _Search:
     ) -> tuple[Consensus, Tensor]:
         """The best of the starts ``(b, s, n)``, and the mean rank ``(b, n)`` of the points in all of them."""
         count = starts.shape[1]
-        work = _of_views(tracks, views).repeated(count)
+        work, chosen = _of_views(tracks, views).repeated(count), views.repeat_interleave(count, 0)
         level = None if sigma is None else sigma.repeat_interleave(count)
         share = torch.tensor(shares, dtype=tracks.x.dtype, device=tracks.x.device).repeat(len(views))
         kept, best = starts.flatten(0, 1), None
         for _ in range(self.options.starts.concentrations):
-            new = self._fitted(work, kept, level)
-            if best is None:
-                best = new
-            else:
-                best.better(new, torch.arange(len(kept), device=kept.device))
+            new = self._fitted(work, chosen, kept, level)
+            best = new if best is None else best.better(new, torch.arange(len(kept), device=kept.device))
             near = _nearest(new.square, _wanted(work, share, self.invariant.minimal(), self.options.starts.least_kept))
             cut = self._level(work, new.square, level).square() * bound(
                 freedom(work, self.invariant.k), self.options.noise.share
@@ -253,7 +249,7 @@ class _Search:
         assert best is not None
         rank = best.square.argsort(-1).argsort(-1).to(kept.dtype).unflatten(0, (-1, count)).mean(1)
         winner = best.lost.unflatten(0, (-1, count)).argmin(1) + count * torch.arange(len(views), device=views.device)
-        return Consensus(views.clone(), best.projections[winner], best.square[winner], best.lost[winner]), rank
+        return each(lambda x: x[winner], best), rank
 
     def starts(self, tracks: ViewTracks, views: Tensor, square: Tensor, ranks: Tensor) -> Tensor:
         """Random parts ``(b, s, n)`` of the points near the best projections so far, or in the mean of all."""
@@ -281,8 +277,8 @@ class _Search:
         few = seen * self.invariant.codim < self.options.starts.sure * self.invariant.dof
         return few | torch.full_like(few, self.sigma is None)
 
-    def _fitted(self, tracks: ViewTracks, kept: Tensor, sigma: Tensor | None) -> Consensus:
-        """Projections from the points that are kept ``(b, n)``."""
+    def _fitted(self, tracks: ViewTracks, views: Tensor, kept: Tensor, sigma: Tensor | None) -> Consensus:
+        """Projections of these views from the points that are kept ``(b, n)``."""
         some = tracks.only(tracks.weights * kept[:, None])
         seen = (some.weights > 0).all(1).to(kept.dtype)
         data = Matches(some.x.unbind(1), seen, None, (len(kept),), kept.dtype, kept.device)
@@ -300,7 +296,7 @@ class _Search:
         else:
             cut = sigma.square()[:, None] * bound(free, self.options.noise.share).clamp(min=torch.finfo(square.dtype).tiny)
             lost = torch.where(whole, (square / cut).clamp(max=1), 0.0).sum(-1) / whole.sum(-1).clamp(min=1)
-        return Consensus(torch.empty_like(kept), projections, square, lost)
+        return Consensus(views, projections, square, lost)
 
     def _level(self, tracks: ViewTracks, square: Tensor, sigma: Tensor | None) -> Tensor:
         """Noise ``(b,)``: as given, or the median distance of all, and then of the inliers."""

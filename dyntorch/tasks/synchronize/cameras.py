@@ -305,7 +305,8 @@ def _least_squares(
         away = (v_j - state[n + there]) - (v_i - state[n + here])
         value = torch.cat([weight * away, rate_weight * (net.rate[used] - state[there] + state[here])])
         A = jacobian[:, free]
-        state = state.index_add(0, free, -torch.linalg.lstsq(A, value).solution)
+        # the default driver gives other last digits in every run (pytorch issue 187411)
+        state = state.index_add(0, free, -torch.linalg.lstsq(A, value, driver="gelsd").solution)
     inverse = torch.linalg.pinv(A, rtol=1e-15)
     excess = value.unflatten(0, (2, -1)).square().sum(-1).max() / max(1, len(used) - len(free) // 2)
     spread = inverse @ inverse.mT * excess.clamp(min=1)

@@ -335,7 +335,9 @@ def _chance(a: Body, b: Body, counts: Tensor, judged: Tensor, lags: tuple[int, i
         parts = c[:, :n, :n], c[:, n:, n:], c[:, :n, n:]
         told.append(torch.cat([_shared(*parts), _shared(*_vertical(*parts))]))
         inverse.append([1.0, share])
-    line = torch.linalg.lstsq(torch.tensor(inverse, dtype=torch.float64, device=counts.device), torch.stack(told)).solution
+    design = torch.tensor(inverse, dtype=torch.float64, device=counts.device)
+    # the default driver reads an order of pivots that nobody wrote: last digits that differ from run to run (pytorch issue 187411)
+    line = torch.linalg.lstsq(design, torch.stack(told), driver="gelsd").solution
     return line[0] + line[1] / counts.clamp(min=1.0)[:, None]
 
 

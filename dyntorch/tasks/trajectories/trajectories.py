@@ -327,12 +327,13 @@ def trajectory_cameras(
     Example:
         >>> import torch
         >>> g = torch.Generator().manual_seed(0)
-        >>> cameras = torch.randn(6, 3, 4, generator=g).double()
-        >>> start, way = torch.randn(2, 728, 4, generator=g).double()
-        >>> x = (start + torch.randn(6, 728, 1, generator=g).double() * way) @ cameras.mT
-        >>> found = trajectory_cameras(x[..., :2] / x[..., 2:], bundle=False)
-        >>> bool(found.trajectories.residual.median() < 1e-6)
-        True
+        >>> turns = torch.linalg.qr(torch.randn(6, 3, 3, generator=g).double()).Q  # cameras all around
+        >>> start, way = torch.randn(2, 900, 3, generator=g).double()
+        >>> points = start + torch.randn(6, 900, 1, generator=g).double() * way
+        >>> seen = points @ turns.mT + torch.tensor([0.0, 0.0, 12.0])
+        >>> found = trajectory_cameras(seen[..., :2] / seen[..., 2:], bundle=False)
+        >>> int(found.status), bool(found.trajectories.residual.median() < 1e-9)
+        (0, True)
     """
     check_options(options, TrajectoryOptions)
     if x.ndim < 3 or x.shape[-3] != 6 or x.shape[-1] != 2:
