@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import prod
 
 import torch
@@ -11,7 +11,7 @@ from torch.nn.functional import normalize
 
 from dyntorch.geometry.triangulation import observed
 from dyntorch.numerics.arguments import check_tensor, check_together
-from dyntorch.numerics.blocks import map_blocks, one_thread, workers
+from dyntorch.numerics.blocks import each, map_blocks, one_thread, select, workers
 from dyntorch.numerics.least_squares import damped_step
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -47,10 +47,7 @@ class BundleProblem:
 
     def subset(self, keep: Tensor) -> BundleProblem:
         """Only some of the problems."""
-        lifts = None if self.lifts is None else self.lifts[keep]
-        scale = None if self.scale is None else self.scale[keep]
-        outside = None if self.outside is None else self.outside[keep]
-        return BundleProblem(self.x[keep], self.weights[keep], lifts, scale, self.loss, outside)
+        return each(lambda part: part[keep], self)
 
     def world(self, points: Tensor) -> Tensor:
         """The points :math:`B_i Y_j` that the cameras see, ``(b, v, a + 1, n)``."""
@@ -329,36 +326,32 @@ def bundle_adjust(
         return tensor.detach().double().expand(*batch, *shape).reshape(count, *shape)
 
     images, w = observed(x, weights)
-    start = flat(cameras, *cameras.shape[-3:]), flat(structure, *structure.shape[-2:])
-    w, moves, seen = _counted(flat(w, views, n), start[1], size)
-    extra: tuple[Tensor, ...] = () if lifts is None else (flat(lifts, *lifts.shape[-3:]),)
-    extra += () if scale is None else (_scales(scale, batch, x.device),)
+    cameras_, points = flat(cameras, *cameras.shape[-3:]), flat(structure, *structure.shape[-2:])
+    w, moves, seen = _counted(flat(w, views, n), points, size)
+    lift = None if lifts is None else flat(lifts, *lifts.shape[-3:])
+    limit = None if scale is None else _scales(scale, batch, x.device)
+    outside: Tensor | None = None
     if confined is not None:
-        start, outside = _inside(*start, confined.expand(*batch, n).reshape(count, n), subspace)
-        extra += (outside,)
+        points, outside = _inside(points, confined.expand(*batch, n).reshape(count, n), subspace)
 
-    def run(*block: Tensor) -> tuple[Tensor, ...]:
-        rest = list(block[4:])
-        lift = None if lifts is None else rest.pop(0)
-        limit = None if scale is None else rest.pop(0)
-        outside = rest.pop(0).permute(0, 2, 3, 1) if rest else None
-        problem = BundleProblem(block[0].mT.contiguous(), block[1], lift, limit, loss, outside)
-        return _minimize(problem, block[2], block[3].mT.contiguous(), iterations, tolerance)
+    def run(given: BundleProblem, cameras: Tensor, points: Tensor) -> Adjusted:
+        return _minimize(replace(given, x=given.x.contiguous()), cameras, points.mT.contiguous(), iterations, tolerance)
 
     a, k = cameras.shape[-1], structure.shape[-1]
     width = n * (views**2 * ((size + 1) ** 2 + a**2) + (k + views * size) * k)
     problems = max(1, min(BLOCK // max(1, width), -(-count // workers())))
-    clean = tuple(torch.where(part.isfinite(), part, 0.0) for part in start)
+    clean = each(lambda part: torch.where(part.isfinite(), part, 0.0), (cameras_, points))
+    given = BundleProblem(flat(images, views, n, size).mT, w, lift, limit, loss, outside)
     with torch.no_grad():
-        found = map_blocks(run, flat(images, views, n, size), w, *clean, *extra, size=problems)
+        found = map_blocks(run, given, *clean, size=problems)
     # what counts has to be finite; the rest stays as it is
-    sound = (start[0].isfinite().flatten(2).all(-1) | ~seen).all(-1) & (start[1].isfinite().all(-1) | ~moves).all(-1)
-    sound = (sound & found[2].isfinite())[:, None]
+    sound = (cameras_.isfinite().flatten(2).all(-1) | ~seen).all(-1) & (points.isfinite().all(-1) | ~moves).all(-1)
+    sound = (sound & found.cost.isfinite())[:, None]
     return Adjusted(
-        torch.where((sound & seen)[..., None, None], found[0], clean[0]).reshape(*batch, *cameras.shape[-3:]).to(x.dtype),
-        torch.where((sound & moves)[..., None], found[1], clean[1]).reshape(*batch, *structure.shape[-2:]).to(x.dtype),
-        torch.where(sound[:, 0], found[2], torch.inf).reshape(batch).to(x.dtype),
-        found[3].reshape(batch),
+        select(sound & seen, found.cameras, clean[0]).reshape(*batch, *cameras.shape[-3:]).to(x.dtype),
+        select(sound & moves, found.structure, clean[1]).reshape(*batch, *structure.shape[-2:]).to(x.dtype),
+        torch.where(sound[:, 0], found.cost, torch.inf).reshape(batch).to(x.dtype),
+        found.iterations.reshape(batch),
     )
 
 
@@ -369,10 +362,8 @@ def _counted(weights: Tensor, structure: Tensor, size: int) -> tuple[Tensor, Ten
     return weights, moves, (weights > 0).any(-1)
 
 
-def _minimize(
-    problem: BundleProblem, cameras: Tensor, points: Tensor, iterations: int, tolerance: float
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Cameras, points ``(b, n, k + 1)``, cost and steps tried at the minimum of every problem of a block."""
+def _minimize(problem: BundleProblem, cameras: Tensor, points: Tensor, iterations: int, tolerance: float) -> Adjusted:
+    """The minimum of every problem of a block."""
     cameras, points = _unit_cameras(cameras), normalize(points, dim=1)
     state = [cameras, points, problem.costs(cameras, points).sum(-1), torch.full_like(cameras[:, 0, 0, 0], 1e-3)]
     # errors of the size of the rounding of the images are no errors
@@ -391,7 +382,8 @@ def _minimize(
         for whole, part in zip(result[:3], state[:3], strict=True):
             whole[left] = part
         result[3][left] = count
-    return result[0], result[1].mT, result[2], result[3]
+    cameras, points, cost, tried = result
+    return Adjusted(cameras, points.mT, cost, tried)
 
 
 def _step(problem: BundleProblem, state: list[Tensor], tolerance: float, floor: Tensor) -> tuple[list[Tensor], Tensor]:
@@ -410,8 +402,8 @@ def _step(problem: BundleProblem, state: list[Tensor], tolerance: float, floor: 
     return [cameras, points, torch.where(better, fresh, cost), damping], done
 
 
-def _inside(cameras: Tensor, structure: Tensor, confined: Tensor, subspace: Tensor | None) -> tuple[tuple[Tensor, Tensor], Tensor]:
-    """The start with the confined points within the subspace, and the projectors ``(b, n, K, K)`` onto what is forbidden."""
+def _inside(structure: Tensor, confined: Tensor, subspace: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Points, the confined ones within the subspace, and the projectors ``(b, K, K, n)`` onto what is forbidden."""
     size = structure.shape[-1]
     if subspace is None or subspace.shape[0] != size:
         got = None if subspace is None else tuple(subspace.shape)
@@ -419,7 +411,7 @@ def _inside(cameras: Tensor, structure: Tensor, confined: Tensor, subspace: Tens
     basis = subspace.to(structure)
     away = torch.eye(size, dtype=basis.dtype, device=basis.device) - basis @ basis.mT
     outside = away * confined[..., None, None]
-    return (cameras, structure - (structure[..., None, :] @ outside)[..., 0, :]), outside
+    return structure - (structure[..., None, :] @ outside)[..., 0, :], outside.permute(0, 2, 3, 1)
 
 
 def _unit_cameras(cameras: Tensor) -> Tensor:

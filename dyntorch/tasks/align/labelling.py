@@ -241,19 +241,13 @@ def static_consensus(
         taken.append(place)
     chosen = torch.stack(taken, -1).clamp(max=n - 1)
     judges = shuffled[:, : options.labels.judges]
-    limits = torch.full_like(views[0][:, 0, 0], torch.inf) if limit is None else limit
-
-    def search(*block: Tensor) -> tuple[Tensor, ...]:
-        return _search(block[: len(views)], *block[len(views) :], robust=limit is None)
-
     size = max(1, BLOCK // max(1, samples * judges.shape[-1] * (d + 1)))
-    *found, variance = map_blocks(search, *views, shuffled, chosen, judges, count, limits, size=size)
-    return tuple(found), variance
+    return map_blocks(_search, views, shuffled, chosen, judges, count, limit, size=size)
 
 
 def _search(
-    views: tuple[Tensor, ...], shuffled: Tensor, chosen: Tensor, judges: Tensor, count: Tensor, limit: Tensor, *, robust: bool
-) -> tuple[Tensor, ...]:
+    views: tuple[Tensor, ...], shuffled: Tensor, chosen: Tensor, judges: Tensor, count: Tensor, limit: Tensor | None
+) -> tuple[tuple[Tensor, ...], Tensor]:
     index = shuffled.gather(1, chosen.flatten(1)).unflatten(1, chosen.shape[1:])
     problem = torch.arange(len(index), device=index.device)
     sampled = [homogeneous(x[problem[:, None, None], index]) for x in views]
@@ -266,13 +260,13 @@ def _search(
     valid = torch.arange(judges.shape[-1], device=judges.device) < count[:, None]
     ordered = torch.where(valid[:, None], square, torch.inf)
     middle = ((valid.sum(-1) - 1) // 2).clamp(min=0)[:, None].expand(-1, square.shape[1])
-    if robust:
+    if limit is None:
         score = ordered.sort(dim=-1).values.gather(-1, middle[..., None])[..., 0]
     else:
         score = torch.where(valid[:, None], torch.minimum(square, limit[:, None, None]), 0.0).sum(-1)
     best = score.argmin(-1)
     chosen_square = ordered[problem, best].sort(dim=-1).values.gather(-1, middle[:, :1])[:, 0]
-    return (*(matrix[problem, best] for matrix in maps), chosen_square / (2 * median(4)))
+    return tuple(matrix[problem, best] for matrix in maps), chosen_square / (2 * median(4))
 
 
 def _collineation(target: Tensor, source: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ from dyntorch.core.outcome import Notice, Status, failed, in_order, noting
 from dyntorch.core.solution import NOISY
 from dyntorch.geometry.homogeneous import similarity, skew
 from dyntorch.geometry.rigid import moved_by, rigid_alignment
-from dyntorch.numerics.blocks import map_blocks, uniform
+from dyntorch.numerics.blocks import each, map_blocks, uniform
 from dyntorch.numerics.chi_square import median, three_sigma
 from dyntorch.numerics.least_squares import damped_step
 from dyntorch.numerics.nullspace import spectrum
@@ -249,18 +249,12 @@ def search(
     draws = uniform(b, options.rigid.static_starts + options.rigid.moving_starts, n, generator=generator, device=data.x1.device)
     # matches of weight 0 come last, so that they are drawn only where there is nothing else
     order = (draws + 2.0 * (data.weights <= 0)[:, None]).argsort(-1)[..., : SAMPLE[data.motion]]
-    known = torch.zeros(b, dtype=data.x1.dtype, device=data.x1.device) if sigma is None else sigma
     flags = torch.zeros(b, n, dtype=torch.bool, device=data.x1.device) if still is None else still
 
-    def run(*block: Tensor) -> tuple[Tensor, ...]:
-        x1, x2, x3, weights, held, noise, picked, given = block
-        part = RigidSightings(x1[:, None], x2[:, None], x3[:, None], weights[:, None], data.motion)
-        found = _search(part, None if sigma is None else noise, held, picked, given, floor, options)
-        return found.motions, found.sigma, found.information, found.inliers, found.still, found.grounded
+    def run(data: RigidSightings, sigma: Tensor | None, held: Tensor, order: Tensor, given: Tensor) -> Rigid:
+        return _search(each(lambda x: x[:, None], data), sigma, held, order, given, floor, options)
 
-    return Rigid(
-        *map_blocks(run, data.x1, data.x2, data.x3, data.weights, flags, known, order, starts, size=options.rigid.problems)
-    )
+    return map_blocks(run, data, sigma, flags, order, starts, size=options.rigid.problems)
 
 
 def _search(

@@ -295,10 +295,10 @@ def _affine_start(
     present = data.weights > 0
     draws = uniform(len(nine), options.velocity.samples, nine.shape[1], generator=generator, device=nine.device)
     order = (draws + 2.0 * ~present[:, None]).argsort(-1)[..., : options.velocity.sample]
-    noise = torch.zeros_like(size) if given is None else given * size
+    noise = None if given is None else given * size
 
-    def run(points: Tensor, weights: Tensor, index: Tensor, sigma: Tensor) -> tuple[Tensor, ...]:
-        return _affine_consensus(points, weights, index, None if given is None else sigma, options)
+    def run(points: Tensor, weights: Tensor, index: Tensor, sigma: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+        return _affine_consensus(points, weights, index, sigma, options)
 
     null, mean, ok = map_blocks(run, nine, data.weights, order, noise, size=options.velocity.problems)
     theta = _affine_maps(null, mean, ok)

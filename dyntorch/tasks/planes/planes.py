@@ -431,13 +431,15 @@ def _solved(given: GivenPlanes, method: str, refine: bool, options: PlanesOption
     seen, body = given.planes, given.bodies
     layout = Layout(given.homographies.shape[1], given.fundamentals.shape[1])
 
-    def block(h: Tensor, f: Tensor, spare: Tensor, *parts: Tensor) -> tuple[Tensor, ...]:
-        x1, x2, w, y1, y2, v, s1, s2 = parts
-        matches = PlaneMatches((x1, x2), w, (y1, y2), v, (s1, s2)) if given.matched else None
+    matches: PlaneMatches | None = None
+    if given.matched:
+        first, second = (frame[:, 0, 0] for frame in given.frames)
+        matches = PlaneMatches(seen.views, seen.weights, body.views, body.weights, (first, second))
+
+    def block(h: Tensor, f: Tensor, spare: Tensor, matches: PlaneMatches | None) -> tuple[Tensor, ...]:
         separate = spare * 0 if matches is None else matches.normal(torch.cat([h, f], dim=1)).cost.nansum(1)
         return *solve(h, f, matches, spare, method, refine, options), separate
 
-    parts = (*seen.views, seen.weights, *body.views, body.weights, *(frame[:, 0, 0] for frame in given.frames))
     numbers = 18 * seen.weights.shape[1] * seen.weights.shape[2] + layout.size * (9 * (layout.planes + layout.bodies) + layout.size)
     size = max(1, BLOCK // (STARTS_PER_BLOCK * numbers))
-    return map_blocks(block, given.homographies, given.fundamentals, given.rows()[1], *parts, size=size)
+    return map_blocks(block, given.homographies, given.fundamentals, given.rows()[1], matches, size=size)

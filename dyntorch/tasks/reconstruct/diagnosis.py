@@ -72,17 +72,28 @@ def point_uncertainty(
     unit = torch.where(known[..., None], structure / torch.where(known[..., None], value, 1.0), 0.0)
     functional = depth.expand(b, n, -1)
 
-    def run(*block: Tensor) -> Tensor:
-        return _uncertainty(block, gauge, step, options)
+    def run(given: _Given) -> Tensor:
+        return _uncertainty(given, gauge, step, options)
 
-    found = map_blocks(
-        run, cameras, unit, functional, weights * known[:, None], lifts, metric, size=max(1, BLOCK // (n * wide + 1))
-    )
+    given = _Given(cameras, unit, functional, weights * known[:, None], lifts, metric)
+    found = map_blocks(run, given, size=max(1, BLOCK // (n * wide + 1)))
     return torch.where(known[:, ::step] & found.isfinite(), found, torch.inf)
 
 
-def _uncertainty(block: tuple[Tensor, ...], gauge: int, step: int, options: ReconstructOptions) -> Tensor:
-    cameras, structure, depth, weights, lifts, metric = block
+class _Given(NamedTuple):
+    """What :func:`point_uncertainty` is asked about, points of depth 1."""
+
+    cameras: Tensor
+    structure: Tensor
+    depth: Tensor
+    """``(b, n, K)``."""
+    weights: Tensor
+    lifts: Tensor
+    metric: Tensor
+
+
+def _uncertainty(given: _Given, gauge: int, step: int, options: ReconstructOptions) -> Tensor:
+    cameras, structure, depth, weights, lifts, metric = given
     by_camera, by_point = _derivatives(cameras, structure, weights, lifts)
     information = torch.einsum("bvnlk,bvnlj->bnkj", by_point, by_point)
     trace = information.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
