@@ -12,7 +12,6 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("dyntorch", "indexing", "experiments")
 LONGEST = 600
 LONGER = {
-    "dyntorch/core/robust.py": 760,
     "dyntorch/geometry/pairs.py": 660,
     "dyntorch/numerics/nullspace.py": 740,
     "dyntorch/tasks/pair/affine.py": 680,

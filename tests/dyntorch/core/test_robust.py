@@ -12,11 +12,11 @@ from torch import Tensor
 
 import dyntorch as dyn
 from dyntorch import Status, scenes
+from dyntorch.core.consensus import Search, anneal, judge, msac
 from dyntorch.core.invariant import Invariant
 from dyntorch.core.matches import matches
 from dyntorch.core.matrix import estimation_matrix
 from dyntorch.core.normalize import denormalize
-from dyntorch.core.robust import Search, anneal, judge, msac
 from dyntorch.numerics.chi_square import quantile
 from dyntorch.scenes.scene import OUTLIER
 from tests.battery.cases import CASES as KNOWN
@@ -377,7 +377,7 @@ def test_more_starts_are_not_tried_where_a_quarter_of_them_agree(monkeypatch):
         return solve(self, where, cut, count)
 
     monkeypatch.setattr(Search, "_solve", counted)
-    monkeypatch.setattr("dyntorch.core.robust.DOUBT", -1.0)
+    monkeypatch.setattr("dyntorch.core.consensus.DOUBT", -1.0)
     scene = scenes.planar(n=100, sigma=0.5, static=0.3, outliers=0.1, generator=seeded(1))
     views = tuple(x[None] for x in scene.views)
     search = Search(dyn.HomographyTensor(), matches(dyn.HomographyTensor(), views, None), torch.Generator().manual_seed(0))
