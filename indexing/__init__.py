@@ -5,7 +5,8 @@
 - :class:`PhaseIndexer`: the same from single frames, and how far the action has got;
 - :class:`BrightnessIndexer`: the same from pixels alone;
 - :func:`synchronize`: how far two cameras' clocks are apart;
-- :class:`ActionOptions`, :class:`PhaseOptions`, :class:`SyncOptions`: every number that decides in these, by stage.
+- :class:`ActionOptions`, :class:`BrightnessOptions`, :class:`PhaseOptions`, :class:`SyncOptions`: every number that decides in
+  these, by stage.
 
 The indexers follow scikit-learn.  Times are seconds.  The public names are imported lazily, as in ``dyntorch``.
 """
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from indexing.action.indexer import ActionIndexer as ActionIndexer
     from indexing.action.options import ActionOptions as ActionOptions
     from indexing.brightness.indexer import BrightnessIndexer as BrightnessIndexer
+    from indexing.brightness.options import BrightnessOptions as BrightnessOptions
     from indexing.clip import Clip as Clip
     from indexing.clip import ClipSet as ClipSet
     from indexing.phase.indexer import PhaseIndexer as PhaseIndexer
@@ -37,6 +39,7 @@ _HOME = {
     "synchronize": "indexing.sync.synchronize",
     # the numbers that decide in a verb
     "ActionOptions": "indexing.action.options",
+    "BrightnessOptions": "indexing.brightness.options",
     "PhaseOptions": "indexing.phase.options",
     "SyncOptions": "indexing.sync.options",
 }

@@ -8,7 +8,7 @@ import torch
 from kornia.filters import gaussian_blur2d, spatial_gradient3d
 from torch import Tensor
 
-SOFT = 0.02  # grey 0..1: gradients below this are not divided by (theory: within noise from .01 to .05)
+GRADIENT_EPSILON = 0.02  # grey 0..1: gradients below this are not divided by (theory: within noise from .01 to .05)
 
 
 def as_grey(frames: Tensor) -> Tensor:
@@ -78,5 +78,5 @@ def weighted_differences(gx: Tensor, gy: Tensor, gt: Tensor) -> tuple[Tensor, Te
         >>> round(u.item(), 3)  # darker to the right and getting brighter: the bright side moves right
         0.091
     """
-    weight = -gt / ((gx * gx + gy * gy).sqrt() + SOFT)
+    weight = -gt / ((gx * gx + gy * gy).sqrt() + GRADIENT_EPSILON)
     return weight * gx, weight * gy

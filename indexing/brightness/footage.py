@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, avg_pool2d
 
+from indexing.brightness.options import RateOptions
+
 BLOCK = 32  # frames at once: memory is that of one block
 FILE_BLOCK = 8  # of files: frames of 4K take 8 MB each
 UNEVEN = 0.2  # of the median step, between the shortest and the longest: as for files, a tenth of a frame to either side
-PAUSE = 10.0  # seconds without a frame, for which none are interpolated: what a video costs is told by its frames
-SAME_RATE = 0.01  # relative difference of frame rates that is none (29.97 and 30)
 
 Times = NDArray[np.float64]
 
@@ -138,9 +138,9 @@ class Resampler:
         fps: of the video: ``None`` where it is that of the grid, NaN where it varies.
     """
 
-    def __init__(self, rate: float, fps: float | None) -> None:
-        self.step, self.made = 1 / rate, 0
-        self.off = fps is not None and not abs(fps / rate - 1) <= SAME_RATE
+    def __init__(self, rate: float, fps: float | None, options: RateOptions = RateOptions()) -> None:
+        self.step, self.made, self.pause = 1 / rate, 0, options.pause
+        self.off = fps is not None and not abs(fps / rate - 1) <= options.same
         self.last: tuple[Tensor, float] | None = None
         self.begin = 0.0
 
@@ -154,7 +154,7 @@ class Resampler:
             self.begin = float(times[0])
         for frame, time in zip(frames, (times - self.begin).tolist(), strict=True):
             before, start = self.last or (frame, time - self.step)
-            if time - start > PAUSE:  # nothing is made up for it, whatever its length
+            if time - start > self.pause:  # nothing is made up for it, whatever its length
                 before, start, self.made = frame, time - self.step, math.ceil(time / self.step - 1e-9)
             while self.made * self.step <= time + 1e-9:
                 share = (self.made * self.step - start) / (time - start)

@@ -15,6 +15,7 @@ from dyntorch.numerics import one_thread
 from indexing.action.inputs import check_labels
 from indexing.brightness.footage import Footage, footage, gather
 from indexing.brightness.library import VideoExemplars, library
+from indexing.brightness.options import BrightnessOptions
 from indexing.brightness.sight import LENGTH, SMALLEST, Optics
 from indexing.brightness.stream import (
     BrightnessStream,
@@ -25,7 +26,18 @@ from indexing.brightness.stream import (
     recognize,
     wrong_evidence,
 )
-from indexing.estimator import POSITIVE, REJECT, SECONDS, Rule, SavedClassifier, check_device, is_number, is_whole, one_of
+from indexing.estimator import (
+    POSITIVE,
+    REJECT,
+    SECONDS,
+    Rule,
+    SavedClassifier,
+    check_device,
+    is_number,
+    is_whole,
+    one_of,
+    read_options,
+)
 from indexing.modelfile import Parts, labels_from_json, labels_to_json, read_model, usable, write_model
 from indexing.opening import shown
 from indexing.scoring import Event, joined, probabilities, refuse, reject_threshold
@@ -46,8 +58,6 @@ def is_region(region: Any) -> bool:
 
 
 Array = NDArray[Any]
-
-FEWEST = 5.0  # frames of the window: of exercises at 15 per second, 0 / 60 degrees, 3 name .816 / .690 of the frames, 5 .821 / .751
 
 
 class BrightnessIndexer(SavedClassifier):
@@ -76,6 +86,7 @@ class BrightnessIndexer(SavedClassifier):
         pool: seconds over which :meth:`score_frames` averages, backwards from each frame.
         size: px of the longer side of the image that is worked on.
         device: where to compute, e.g. ``"cuda"``.
+        options: every other number that decides, by stage (:class:`~indexing.brightness.options.BrightnessOptions`); None: as measured.
 
     Attributes:
         classes_: ``(classes,)`` labels as given.  exemplars_: what is kept of the videos.  flip_: whether mirrored exemplars
@@ -101,6 +112,7 @@ class BrightnessIndexer(SavedClassifier):
         "region": Rule(is_region, "'motion', None or (x0, y0, x1, y1) in pixels with x0 < x1 and y0 < y1"),
         "flip": one_of("auto", True, False),
         "reject": REJECT,
+        "options": Rule(lambda value: value is None or isinstance(value, BrightnessOptions), "None or indexing.BrightnessOptions"),
         "size": Rule(
             lambda value: is_whole(value) and SMALLEST <= value <= LARGEST,
             f"a whole number of pixels from {SMALLEST} to {LARGEST}",
@@ -119,6 +131,7 @@ class BrightnessIndexer(SavedClassifier):
         pool: float = 0.33,
         size: int = 80,
         device: str = "cpu",
+        options: BrightnessOptions | None = None,
     ) -> None:
         self.fps = fps
         self.window = window
@@ -129,6 +142,11 @@ class BrightnessIndexer(SavedClassifier):
         self.pool = pool
         self.size = size
         self.device = device
+        self.options = options
+
+    @property
+    def _options(self) -> BrightnessOptions:
+        return BrightnessOptions() if self.options is None else self.options
 
     # ---- learning ----------------------------------------------------------------------------------------------------
     @one_thread
@@ -161,7 +179,7 @@ class BrightnessIndexer(SavedClassifier):
             return self.fit(videos, labels)
         self.check_parameters()
         if self._optics() != self._learned_optics:
-            raise ValueError("fps, region or size were changed since fit; set them back, or fit all videos again")
+            raise ValueError("fps, region, size or options were changed since fit; set them back, or fit all videos again")
         found = gather(videos, float(self.fps))
         values = joined(self.classes_[self.exemplars_.labels.numpy()], check_labels(labels, len(found)))
         known, numbers = np.unique(values, return_inverse=True)
@@ -189,8 +207,8 @@ class BrightnessIndexer(SavedClassifier):
         return self
 
     def _recognizer(self, exemplars: VideoExemplars, classes: int, flip: bool) -> Recognizer:
-        window, pool = max(FEWEST, self.window * self.fps), max(1.0, self.pool * self.fps)
-        placed = library(exemplars.to(self.device), classes, flip)
+        window, pool = max(self._options.matching.window_frames, self.window * self.fps), max(1.0, self.pool * self.fps)
+        placed = library(exemplars.to(self.device), classes, flip, self._options.descriptor.kept)
         return Recognizer(self._optics(), placed, window, pool)
 
     def _optics(self) -> Optics:
@@ -198,7 +216,7 @@ class BrightnessIndexer(SavedClassifier):
         if region is not None and not isinstance(region, str):
             x0, y0, x1, y1 = (float(v) for v in region)
             region = (x0, y0, x1, y1)
-        return Optics(float(self.fps), int(self.size), region, self.device)
+        return Optics(float(self.fps), int(self.size), region, self.device, self._options)
 
     def _calibrate(self) -> None:
         wrong = torch.zeros(0)
@@ -267,7 +285,7 @@ class BrightnessIndexer(SavedClassifier):
         """
         times, scores, energy = self._scan(video, progress)
         wrong = wrong_evidence(self.recognizer_, self.exemplars_)[1]
-        return times, scores, found_events(scores, times, energy, self.classes_, wrong, self.reject)
+        return times, scores, found_events(scores, times, energy, self.classes_, wrong, self.reject, self._options)
 
     def _scan(self, video: Any, progress: Callable[[float], None] | None) -> tuple[Array, Array, Array]:
         check_is_fitted(self, "exemplars_")
@@ -303,7 +321,7 @@ def save(indexer: BrightnessIndexer, path: str | Path) -> None:
         ValueError: the file cannot be written, or labels or parameters are neither text nor numbers.
     """
     tensors = {name: getattr(indexer.exemplars_, name) for name in PARTS}
-    write_model(path, KIND, VERSION, indexer.get_params(), {"classes": labels_to_json(indexer.classes_)}, tensors)
+    write_model(path, KIND, VERSION, indexer.saved_parameters(), {"classes": labels_to_json(indexer.classes_)}, tensors)
 
 
 def load(kind: type[Indexer], path: str | Path, device: str = "cpu") -> Indexer:
@@ -311,7 +329,8 @@ def load(kind: type[Indexer], path: str | Path, device: str = "cpu") -> Indexer:
     check_device(device)
     header, parts = read_model(path, KIND, VERSION)
     with usable(path):
-        indexer = kind(**_known(header["parameters"]), device=device)
+        parameters = _known(header["parameters"]) | {"options": read_options(BrightnessOptions, header)}
+        indexer = kind(**parameters, device=device)
         indexer.check_parameters()
         classes = labels_from_json(header["classes"])
         return indexer._learn(_exemplars(parts, len(classes)), classes)

@@ -7,13 +7,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from indexing.brightness.options import DescriptorOptions
 from indexing.brightness.sight import mirrored
 
 GAP = 2  # empty rows before each track: no step leads from one track into the next
-KEPT = 96
-"""Principal directions in which frames are compared: all of 560 cost 4.3 ms per frame and 20,000 rows, these .2 ms.
-Frames named rightly (shares .3 .1 .5 .1), exercises at 0 / 60, arm raises: 560: .822 .744 .962, 128: .821 .746 .962,
-64: .821 .745 .960, 32: .821 .745 .950."""
 
 
 @dataclass(frozen=True)
@@ -65,8 +62,8 @@ class Library:
     basis: Tensor
 
 
-def library(exemplars: VideoExemplars, classes: int, flip: bool) -> Library:
-    """Lay out the tracks of all exemplars, mirrored ones too where ``flip``."""
+def library(exemplars: VideoExemplars, classes: int, flip: bool, kept: int = DescriptorOptions.kept) -> Library:
+    """Lay out the tracks of all exemplars, mirrored ones too where ``flip``, in ``kept`` directions."""
     videos, labels = exemplars.videos(), exemplars.labels.tolist()
     rows, gaps, bounds, at = [], [], [0] * (classes + 1), 0
     for i in sorted(range(len(videos)), key=labels.__getitem__):
@@ -76,11 +73,11 @@ def library(exemplars: VideoExemplars, classes: int, flip: bool) -> Library:
             at += GAP + len(track)
         bounds[labels[i] + 1] = at
     every = torch.cat(rows)
-    basis = principal(every)
+    basis = principal(every, kept)
     return Library(every @ basis, torch.tensor(gaps), tuple(bounds), basis)
 
 
-def principal(rows: Tensor, count: int = KEPT) -> Tensor:
+def principal(rows: Tensor, count: int) -> Tensor:
     """``(D, count)`` orthonormal directions that hold most of the energy of ``rows (M, D)``; all where there are no more."""
     if rows.shape[1] <= count:
         return torch.eye(rows.shape[1]).to(rows)

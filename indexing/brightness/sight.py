@@ -11,13 +11,10 @@ from torch import Tensor
 
 from indexing.brightness.features import blurred, inner_gradients, weighted_differences
 from indexing.brightness.footage import Shrinker
+from indexing.brightness.options import BrightnessOptions, DescriptorOptions, MotionBoxOptions, MotionMapOptions
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Rectified motion maps of a stream: how much moves right, left, down and up, pixel by pixel, as fast as frames come in.
-
-
-SIGMA = 1.2  # px of the work image (80 px wide)
-QUIET = 0.004  # grey 0..1 per frame: below, brightness change is noise (theory: .004; .008 at sensor noise 3/255)
 
 
 class MotionMaps:
@@ -25,13 +22,10 @@ class MotionMaps:
 
     The maps of frame t need the frames up to t alone: brightness changes from t - 2 to t about frame t - 1.
 
-    Args:
-        sigma: pixels.
-        quiet: grey 0..1 per frame.
     """
 
-    def __init__(self, sigma: float = SIGMA, quiet: float = QUIET) -> None:
-        self.sigma, self.quiet = sigma, quiet
+    def __init__(self, options: MotionMapOptions = MotionMapOptions()) -> None:
+        self.sigma, self.quiet = options.sigma, options.quiet
         self.last: Tensor | None = None
 
     def push(self, frames: Tensor) -> tuple[Tensor, Tensor]:
@@ -54,11 +48,7 @@ def rectified(u: Tensor, v: Tensor) -> Tensor:
 # The causal motion box: where somebody has moved of late, known while the frames come in.
 
 
-MEMORY = 20.0  # seconds over which motion is forgotten; 10: .007 fewer of the frames of exercises
-LIVELY = 0.006  # grey 0..1 per frame: less does not widen the box
-INSIDE = (0.02, 0.98)  # quantiles of the motion that a box encloses
-NOTHING = 1e-12  # brightness change of every pixel in a box: where nothing has moved, it is about the whole image
-PAD = 0.15  # of the box, on each side
+NOTHING_EPSILON = 1e-12  # brightness change of every pixel in a box: where nothing has moved, it is about the whole image
 
 
 class MotionBox:
@@ -73,35 +63,36 @@ class MotionBox:
         seen: ``(h, w)`` A before the first frame; nothing by default.
     """
 
-    def __init__(self, memory: float, seen: Tensor | None = None) -> None:
-        self.decay, self.seen = 1 - 1 / memory, seen
+    def __init__(self, memory: float, seen: Tensor | None = None, *, options: MotionBoxOptions = MotionBoxOptions()) -> None:
+        self.decay, self.seen, self.options = 1 - 1 / memory, seen, options
 
     def push(self, change: Tensor) -> Tensor:
         """``(n, 4)`` centre x, centre y, width and height in pixels for brightness changes ``(n, h, w)``."""
         n = len(change)
         age = self.decay ** torch.arange(1, n + 1, dtype=change.dtype, device=change.device)[:, None, None]
-        fresh = (change - LIVELY).clamp_(min=NOTHING) / age
+        fresh = (change - self.options.lively).clamp_(min=NOTHING_EPSILON) / age
         if self.seen is not None:
             fresh[0] = torch.maximum(fresh[0], self.seen)
         seen = fresh.cummax(0).values * age
         self.seen = seen[-1]
-        return boxes_about(seen)
+        return boxes_about(seen, self.options)
 
 
-def boxes_about(seen: Tensor) -> Tensor:
+def boxes_about(seen: Tensor, options: MotionBoxOptions) -> Tensor:
     """Square boxes ``(n, 4)`` about most of what is in maps ``(n, h, w)``."""
     n, height, width = seen.shape
     sums = seen.new_zeros(n, 2, max(height, width))
     torch.sum(seen, 1, out=sums[:, 0, :width])
     torch.sum(seen, 2, out=sums[:, 1, :height])
     total = sums.cumsum(2)
-    ends = (total[:, None] < torch.stack([q * total[:, :, -1:] for q in INSIDE], dim=1)).sum(3).to(seen)  # (n, low or high, x or y)
+    inside = torch.stack([q * total[:, :, -1:] for q in options.inside], dim=1)
+    ends = (total[:, None] < inside).sum(3).to(seen)  # (n, low or high, x or y)
     low, high = ends[:, 0], ends[:, 1] + 1
-    size = (high - low).amax(1, keepdim=True) * (1 + 2 * PAD)
+    size = (high - low).amax(1, keepdim=True) * (1 + 2 * options.pad)
     return torch.cat([(low + high) / 2, size, size], dim=1)
 
 
-def together(seen: list[Tensor]) -> list[Tensor]:
+def together(seen: list[Tensor], options: MotionBoxOptions = MotionBoxOptions()) -> list[Tensor]:
     """Of each video, what moved in it and in all videos of its size that were taken at its place.
 
     Where the box about one holds at least half of the other's, somebody stands at one place in both.
@@ -119,7 +110,7 @@ def together(seen: list[Tensor]) -> list[Tensor]:
     for shape in {one.shape for one in seen}:
         of = [i for i, one in enumerate(seen) if one.shape == shape]
         maps = torch.stack([seen[i] for i in of])
-        boxes = boxes_about(maps)
+        boxes = boxes_about(maps, options)
         low, high = boxes[:, :2] - boxes[:, 2:] / 2, boxes[:, :2] + boxes[:, 2:] / 2
         common = (torch.minimum(high[:, None], high) - torch.maximum(low[:, None], low)).clamp(min=0).prod(2)
         area = boxes[:, 2:].prod(1)
@@ -134,7 +125,6 @@ def together(seen: list[Tensor]) -> list[Tensor]:
 
 
 CELLS = 8
-SOFT = 0.005  # added to the norm: noise frames stay near 0 instead of being blown up
 
 
 def overlaps(centre: Tensor, side: Tensor, pixels: int, cells: int = CELLS) -> Tensor:
@@ -166,7 +156,7 @@ def pooled(maps: Tensor, boxes: Tensor, cells: int = CELLS) -> Tensor:
     return (along[:, :, None, :, :height] @ bands).flatten(2)
 
 
-def described(cells: Tensor, soft: float = SOFT) -> Tensor:
+def described(cells: Tensor, soft: float = DescriptorOptions.soft) -> Tensor:
     r"""Descriptor :math:`f = s / (\|s\| + .005)` with :math:`s = \sqrt{cells}`: shorter than 1, and near 0 where nothing moves."""
     root = cells.sqrt()
     return root / (root.norm(dim=-1, keepdim=True) + soft)
@@ -195,15 +185,6 @@ def mirrored(rows: Tensor, count: int = CELLS) -> Tensor:
 
 
 SMALLEST = 16  # px of the shorter side
-NEAR = 0.35  # of the image's height: the smallest box about what moves
-SHARES = (0.25, 0.07, 0.48, 0.2)
-"""Of the cells about what moves, of those of the image, and of the row profiles of body and image, in the likeness of two frames.
-Chosen on films of exercises by another person, camera turned 0 / 60, with seeds 0, 3, 7 of
-:mod:`experiments.recognition.brightness_indexing`,
-and on arm raises of another person (moving frames; videos of 126 recognized when shifted, scaled, stretched or cropped):
-.25 .07 .48 .2: .821 .829 .828 / .751 .722 .786, .963, 119; .3 .1 .5 .1: .822 .830 .829 / .739 .691 .775, .960, 120;
-.2 .1 .6 .1: .811 .823 .829 / .756 .746 .786, .967, 120; with nothing of the image, .35 0 .65 0: .821 / .719 (seed 0), .964, 125;
-the image alone: .812 / .779 (seed 0), .939, 100."""
 LENGTH = 2 * (4 * CELLS**2 + 3 * CELLS)  # of a descriptor
 
 Region = tuple[float, float, float, float]
@@ -218,12 +199,14 @@ class Optics:
         size: px of the longer side of the work image.
         region: ``"motion"``, ``None`` (the whole image) or ``(x0, y0, x1, y1)`` in pixels of the video.
         device: where to compute.
+        options: every number that decides.
     """
 
     fps: float
     size: int
     region: str | Region | None
     device: str
+    options: BrightnessOptions = BrightnessOptions()
 
 
 class Sight:
@@ -237,7 +220,9 @@ class Sight:
     def __init__(self, optics: Optics, name: str, seen: Tensor | None = None) -> None:
         self.optics = optics
         self.shrink = Shrinker(name, optics.size, SMALLEST)
-        self.maps, self.box = MotionMaps(), MotionBox(MEMORY * optics.fps, seen)
+        options = optics.options
+        self.maps = MotionMaps(options.maps)
+        self.box = MotionBox(options.box.memory * optics.fps, seen, options=options.box)
 
     def push(self, frames: Tensor) -> Tensor:
         """Descriptors ``(n, 560)`` of more small frames ``(n, h, w)``, grey 0..1, at the rate of the optics."""
@@ -249,20 +234,21 @@ class Sight:
 
     def _described(self, maps: Tensor, change: Tensor) -> Tensor:
         n, height, width = change.shape
-        region = self.optics.region
+        region, options = self.optics.region, self.optics.options
         x0, y0, x1, y1 = (v * self.shrink.scale for v in region) if isinstance(region, tuple) else (0.0, 0.0, width, height)
         boxes = change.new_tensor([(x0 + x1) / 2, (y0 + y1) / 2, x1 - x0, y1 - y0]).repeat(n, 3, 1)  # near, image, body
         if region == "motion":
             boxes[:, ::2] = self.box.push(change)[:, None]
-            boxes[:, 0, 2:].clamp_(min=NEAR * height)
+            boxes[:, 0, 2:].clamp_(min=options.box.near * height)
             boxes[:, 2, 2:].clamp_(min=height)
         cells = pooled(maps, boxes)
-        grids, rows = described(cells[:, :2]), described(profile(cells.flip(1)[:, :2]))
-        return torch.cat([grids.flatten(1), rows.flatten(1)], dim=1).mul_(_weights(maps.dtype, maps.device))
+        grids, rows = (described(part, options.descriptor.soft) for part in (cells[:, :2], profile(cells.flip(1)[:, :2])))
+        weights = _weights(options.descriptor.shares, maps.dtype, maps.device)
+        return torch.cat([grids.flatten(1), rows.flatten(1)], dim=1).mul_(weights)
 
 
 @lru_cache(maxsize=64)
-def _weights(dtype: torch.dtype, device: torch.device) -> Tensor:
+def _weights(shares: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
     """``(560,)`` factors by which the parts of a descriptor have their shares in the likeness."""
     sizes = torch.tensor([4 * CELLS**2, 4 * CELLS**2, 3 * CELLS, 3 * CELLS])
-    return torch.tensor(SHARES, dtype=dtype, device=device).sqrt().repeat_interleave(sizes.to(device))
+    return torch.tensor(shares, dtype=dtype, device=device).sqrt().repeat_interleave(sizes.to(device))

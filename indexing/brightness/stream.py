@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from dyntorch.numerics import one_thread
-from indexing.action.options import EventOptions
 from indexing.brightness.footage import Footage, Resampler
 from indexing.brightness.library import Library, VideoExemplars
+from indexing.brightness.options import BrightnessOptions, MatchingOptions
 from indexing.brightness.sight import Optics, Sight, mirrored, together
 from indexing.scoring import Event, event_levels, events
 
@@ -26,7 +26,6 @@ from indexing.scoring import Event, event_levels, events
 # One float per library frame is all the memory; steps of 0, 1 and 2 library frames allow for half to double tempo.
 
 
-SLACK = 0.02  # price of a step other than 1
 BLOCK = 32  # frames compared at once: library rows are read once per block
 
 
@@ -35,10 +34,11 @@ class Warping:
 
     Args:
         window: frames of memory.
+        slack: price of a step other than 1.
     """
 
-    def __init__(self, source: Library, window: float) -> None:
-        self.source, self.keep = source, 1 - 1 / window
+    def __init__(self, source: Library, window: float, slack: float = MatchingOptions.slack) -> None:
+        self.source, self.keep, self.slack = source, 1 - 1 / window, slack
         self.state = source.rows.new_zeros(len(source.rows))
         self.held = 1.0
 
@@ -54,7 +54,7 @@ class Warping:
         before = self.state
         known = []
         for state in states:
-            torch.sub(before, SLACK, out=slower)
+            torch.sub(before, self.slack, out=slower)
             best = slower.clone()
             torch.maximum(best[2:], slower[:-2], out=best[2:])
             torch.maximum(best[1:], before[:-1], out=best[1:])
@@ -72,13 +72,6 @@ class Warping:
         return torch.stack([part.amax(1) for part in states.split(sizes, dim=1)], dim=1)
 
 
-SHARP = 20.0
-"""Of the mean over frames: moments that fit an exemplar well count more than many that fit somewhat.
-Frames named rightly in exercise streams, camera turned 0 / 60: the mean itself .76 / .59, sharpness 12 .80 / .62 (cells alone)."""
-FEWEST = 3  # frames of an exemplar
-MOVES = 0.1  # energy of a frame in which anything moves
-COLD = 1e-3  # weight of a video's first window in its score: the warping has seen too little, but a short video has nothing else
-
 Array = NDArray[Any]
 
 
@@ -91,6 +84,11 @@ class Recognizer:
     window: float
     pool: float
 
+    @property
+    def options(self) -> BrightnessOptions:
+        """Every number that decides."""
+        return self.optics.options
+
 
 class Pool:
     r"""Running mean of scores over frames in which something moves.
@@ -101,28 +99,30 @@ class Pool:
 
     Args:
         frames: memory; infinite for the mean over a whole video.
+        sharp: 20 above.
     """
 
-    def __init__(self, classes: int, frames: float) -> None:
+    def __init__(self, classes: int, frames: float, sharp: float = MatchingOptions.sharp) -> None:
+        self.sharp = sharp
         self.keep = 1 - 1 / max(frames, 1.0)
         self.total, self.weight = np.zeros(classes), 0.0
 
     def push(self, scores: Array, energy: Array) -> Array:
         """``(n, classes)`` means after each of ``n`` more frames; 0 before anything has moved."""
-        totals, weights = energy[:, None] * np.exp(SHARP * scores), energy.copy()
+        totals, weights = energy[:, None] * np.exp(self.sharp * scores), energy.copy()
         for t in range(len(totals)):
             totals[t] += self.keep * self.total
             weights[t] += self.keep * self.weight
             self.total, self.weight = totals[t], weights[t]
-        return _mean(totals, weights[:, None])
+        return _mean(totals, weights[:, None], self.sharp)
 
     def mean(self) -> Array:
         """``(classes,)`` the mean now."""
-        return _mean(self.total, self.weight)
+        return _mean(self.total, self.weight, self.sharp)
 
 
-def _mean(total: Array, weight: Any) -> Array:
-    return np.asarray(np.log(np.maximum(total / np.maximum(weight, 1e-12), 1.0)) / SHARP)
+def _mean(total: Array, weight: Any, sharp: float) -> Array:
+    return np.asarray(np.log(np.maximum(total / np.maximum(weight, 1e-12), 1.0)) / sharp)
 
 
 class BrightnessStream:
@@ -134,10 +134,11 @@ class BrightnessStream:
     def __init__(self, source: Recognizer, classes: int, name: str, fps: float | None) -> None:
         self.source, self.fps = source, fps
         self.sight = Sight(source.optics, name)
-        self.resample = Resampler(source.optics.fps, fps)
-        self.warping = Warping(source.library, source.window)
-        self.pool = Pool(classes, source.pool)
-        self.whole = Pool(classes, float("inf"))
+        matching = source.options.matching
+        self.resample = Resampler(source.optics.fps, fps, source.options.rate)
+        self.warping = Warping(source.library, source.window, matching.slack)
+        self.pool = Pool(classes, source.pool, matching.sharp)
+        self.whole = Pool(classes, float("inf"), matching.sharp)
         self.pushed = self.compared = 0
         self.latest = np.zeros(classes)
         self.energy = 0.0
@@ -184,7 +185,7 @@ class BrightnessStream:
         energy = seen.square().sum(1).cpu().numpy().astype(float)
         warm = np.arange(self.compared, self.compared + len(seen)) >= self.source.window
         self.compared += len(seen)
-        self.whole.push(scores, energy * np.where(warm, 1.0, COLD))
+        self.whole.push(scores, energy * np.where(warm, 1.0, self.source.options.matching.cold))
         return self.pool.push(scores, energy), energy
 
 
@@ -208,17 +209,18 @@ def learned(videos: list[Footage], optics: Optics) -> list[list[Tensor]]:
     moved = [seen for _, seen in first if seen is not None]
     if not moved:
         return [[one] for one, _ in first]
-    again = [_looked_at(video, optics, seen)[0] for video, seen in zip(videos, together(moved), strict=True)]
+    again = [_looked_at(video, optics, seen)[0] for video, seen in zip(videos, together(moved, optics.options.box), strict=True)]
     return [[one, other] for (one, _), other in zip(first, again, strict=True)]
 
 
 def _looked_at(video: Footage, optics: Optics, seen: Tensor | None) -> tuple[Tensor, Tensor | None]:
     """Descriptors of a whole video, and where something has moved in the end."""
-    sight, resample = Sight(optics, video.name, seen), Resampler(optics.fps, video.own_rate)
+    sight, resample = Sight(optics, video.name, seen), Resampler(optics.fps, video.own_rate, optics.options.rate)
+    options = optics.options.matching
     found = torch.cat([sight.push(resample.push(sight.small(frames), times)[0]) for frames, times in video]).cpu()
-    if len(found) < FEWEST:
-        raise ValueError(f"{video.name}: {len(found)} frames; motion needs at least {FEWEST}")
-    if not bool((found.square().sum(1) > MOVES).any()):
+    if len(found) < options.fewest:
+        raise ValueError(f"{video.name}: {len(found)} frames; motion needs at least {options.fewest}")
+    if not bool((found.square().sum(1) > options.moves).any()):
         raise ValueError(f"{video.name}: nothing moves in it; leave it out, or give a video in which the action is seen")
     return found, sight.box.seen
 
@@ -227,20 +229,14 @@ def _looked_at(video: Footage, optics: Optics, seen: Tensor | None) -> tuple[Ten
 # What exemplars find in wrong actions: levels for rejecting and for events, and whether left and right are different here.
 
 
-MOST = 64  # exemplars asked: bounds the time of calibration
-QUIET = 0.7  # of a frame's energy: below, nothing moves
-LEAST = 0.02  # contrast that an event needs: two or three classes have little to stand out from
-CLEAR = 0.02  # of the score: mirrored exemplars that look that much more like another action make left and right matter
-
-
 def wrong_evidence(source: Recognizer, exemplars: VideoExemplars) -> tuple[torch.Tensor, Array]:
     """What exemplars find in other actions: the evidence of each ``(videos,)``, the contrast of moving frames ``(frames,)``."""
     best, contrasts = [], []
-    for i in _asked(exemplars):
+    for i in _asked(exemplars, source.options.events.asked):
         stream, seen = _fresh(source), exemplars.videos()[i]
         label = int(exemplars.labels[i])
         scores, energy = stream.compare(seen.to(source.optics.device))
-        others = np.delete(scores, label, axis=1)[energy >= QUIET]
+        others = np.delete(scores, label, axis=1)[energy >= source.options.events.quiet]
         contrasts.append(others.max(axis=1) - others.mean(axis=1))
         best.append(float(np.delete(stream.whole.mean(), label).max()))
     return torch.tensor(best), np.concatenate(contrasts)
@@ -252,27 +248,30 @@ def mirrors_matter(source: Recognizer, exemplars: VideoExemplars) -> bool:
     Args:
         source: without mirrored exemplars.
     """
-    for i in _asked(exemplars):
+    for i in _asked(exemplars, source.options.events.asked):
         stream, seen = _fresh(source), exemplars.videos()[i]
         stream.compare(mirrored(seen).to(source.optics.device))
         scores = stream.whole.mean()
         label = int(exemplars.labels[i])
-        if float(scores.max() - scores[label]) > CLEAR:
+        if float(scores.max() - scores[label]) > source.options.events.clear:
             return True
     return False
 
 
-def found_events(scores: Array, times: Array, energy: Array, classes: Array, wrong: Array, rate: float | None) -> list[Event]:
+def found_events(
+    scores: Array, times: Array, energy: Array, classes: Array, wrong: Array, rate: float | None, options: BrightnessOptions
+) -> list[Event]:
     """Events of scored frames: where the contrast of the best class exceeds what wrong actions reach at a rate."""
     contrast = scores - scores.mean(axis=1, keepdims=True)
-    peak, floor = event_levels(wrong, EventOptions.false_alarms if rate is None else rate, EventOptions.extent, (LEAST, LEAST))
-    return events(contrast, times, classes.tolist(), peak, floor, energy < QUIET)
+    of = options.events
+    peak, floor = event_levels(wrong, of.false_alarms if rate is None else rate, of.extent, (of.least, of.least))
+    return events(contrast, times, classes.tolist(), peak, floor, energy < of.quiet)
 
 
-def _asked(exemplars: VideoExemplars) -> list[int]:
+def _asked(exemplars: VideoExemplars, most: int) -> list[int]:
     """Exemplars to ask, spread over all of them."""
     count = len(exemplars.labels)
-    return sorted({round(i) for i in np.linspace(0, count - 1, min(count, MOST))})
+    return sorted({round(i) for i in np.linspace(0, count - 1, min(count, most))})
 
 
 def _fresh(source: Recognizer) -> BrightnessStream:

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from indexing.brightness.features import SOFT, as_grey, blur, gradients, weighted_differences
+from indexing.brightness.features import GRADIENT_EPSILON, as_grey, blur, gradients, weighted_differences
 
 
 def test_gradients_are_central_differences(rng):
@@ -19,7 +19,7 @@ def test_weighted_differences_are_the_motion_times_the_contrast():
     for slope in (0.05, -0.05):
         ramp = (slope * (x - 0.3 * t)).T[:, None].expand(-1, 10, -1)  # moves right by 0.3 px per frame
         u, v = weighted_differences(*gradients(ramp))
-        assert torch.allclose(u[2, 5, 20], torch.tensor(0.3 * 0.05**2 / (0.05 + SOFT)))
+        assert torch.allclose(u[2, 5, 20], torch.tensor(0.3 * 0.05**2 / (0.05 + GRADIENT_EPSILON)))
         assert v.abs().max() < 1e-7
 
 

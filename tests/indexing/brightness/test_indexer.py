@@ -12,6 +12,7 @@ from sklearn.base import clone
 from indexing.actors import Person, perform
 from indexing.actors.textured import film
 from indexing.brightness.indexer import BrightnessIndexer
+from indexing.brightness.options import BrightnessOptions, MatchingOptions, MotionMapOptions
 from indexing.video import Chunk
 from tests.battery.pretend_device import accelerators
 
@@ -208,3 +209,19 @@ def test_an_accelerator_says_the_same(indexer, learned, asked):
     for device in accelerators():
         there = clone(indexer).set_params(device=device).fit(learned, ACTIONS * 2)
         np.testing.assert_allclose(there.decision_function(asked), indexer.decision_function(asked), atol=1e-3)
+
+
+def test_options_are_kept_where_they_are_not_the_defaults(learned, asked, tmp_path):
+    plain, usual, other = (tmp_path / f"{name}.safetensors" for name in ("plain", "usual", "other"))
+    BrightnessIndexer(fps=15.0).fit(learned, ACTIONS * 2).save(plain)
+    BrightnessIndexer(fps=15.0, options=BrightnessOptions()).fit(learned, ACTIONS * 2).save(usual)
+    assert plain.read_bytes() == usual.read_bytes() and BrightnessIndexer.load(usual).options is None
+    options = BrightnessOptions(maps=MotionMapOptions(sigma=2.0), matching=MatchingOptions(slack=0.1))
+    taught = clone(BrightnessIndexer(fps=15.0, options=options)).fit(learned, ACTIONS * 2)
+    taught.save(other)
+    again = BrightnessIndexer.load(other)
+    assert again.options == options
+    np.testing.assert_array_equal(again.decision_function(asked), taught.decision_function(asked))
+    assert not np.array_equal(again.decision_function(asked), BrightnessIndexer.load(plain).decision_function(asked))
+    with pytest.raises(ValueError, match="options were changed since fit"):
+        again.set_params(options=None).partial_fit(asked, ACTIONS)

@@ -4,8 +4,11 @@ import numpy as np
 import torch
 
 from indexing.brightness.library import VideoExemplars, library
+from indexing.brightness.options import MatchingOptions
 from indexing.brightness.sight import LENGTH
-from indexing.brightness.stream import SHARP, SLACK, Pool, Warping
+from indexing.brightness.stream import Pool, Warping
+
+SHARP, SLACK = MatchingOptions().sharp, MatchingOptions().slack
 
 
 def exemplars(lengths=(5, 3, 7), labels=(1, 0, 1)):

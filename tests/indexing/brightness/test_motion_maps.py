@@ -6,7 +6,11 @@ import torch
 
 from indexing.brightness import sight as motion_box
 from indexing.brightness.features import blur, blurred, gradients, inner_gradients
-from indexing.brightness.sight import QUIET, SIGMA, SOFT, MotionBox, MotionMaps, described, mirrored, pooled, profile
+from indexing.brightness.options import BrightnessOptions
+from indexing.brightness.sight import MotionBox, MotionMaps, described, mirrored, pooled, profile
+
+USUAL = BrightnessOptions()
+QUIET, SIGMA, SOFT = USUAL.maps.quiet, USUAL.maps.sigma, USUAL.descriptor.soft
 
 
 def video(frames=9, height=18, width=24, seed=0):
