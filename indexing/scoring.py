@@ -10,11 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-SHARPNESS = 2.0  # of the softmax over standardized scores: leave-one-out likelihood peaks between 1.5 and 2.5 on UTKinect
-SHORTEST = 0.4  # seconds: shorter finds are flicker
-BRIDGE = 0.5  # seconds: a gap up to this between two finds of one class does not part them
-
 Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class DecisionOptions:
+    """From scores to probabilities and events."""
+
+    sharpness: float = 2.0
+    """Of the softmax over standardized scores: leave-one-out likelihood peaks between 1.5 and 2.5 on UTKinect."""
+    shortest: float = 0.4
+    """Seconds: shorter finds are flicker."""
+    bridge: float = 0.5
+    """Seconds: a gap up to this between two finds of one class does not part them."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +41,7 @@ class Event:
     exemplar: int | None = None
 
 
-def probabilities(scores: Array, sharpness: float = SHARPNESS) -> Array:
+def probabilities(scores: Array, sharpness: float = DecisionOptions.sharpness) -> Array:
     """``(N, classes)`` softmax of ``sharpness`` times the scores, after standardizing each row.
 
     Example:
@@ -96,7 +104,13 @@ def smooth(scores: Array, times: Array, seconds: float) -> Array:
 
 
 def events(
-    scores: Array, times: Array, classes: Sequence[Any], peak: float, floor: float, blocked: Array | None = None
+    scores: Array,
+    times: Array,
+    classes: Sequence[Any],
+    peak: float,
+    floor: float,
+    blocked: Array | None = None,
+    options: DecisionOptions = DecisionOptions(),
 ) -> list[Event]:
     """Runs of samples whose best class is the same: at least ``floor`` throughout and ``peak`` somewhere.
 
@@ -114,9 +128,10 @@ def events(
     state = np.where(open_, scores.argmax(axis=1), -1)
     middle = (times[1:] + times[:-1]) / 2
     edges = np.concatenate([times[:1], middle, times[-1:]])
-    runs = _bridged(_runs(state), state, edges)
+    runs = _bridged(_runs(state), state, edges, options.bridge)
     # once flicker is gone, what it parted is one again
-    runs = _bridged([(a, b) for a, b in runs if edges[b + 1] - edges[a] >= SHORTEST], state, edges)
+    long = [(a, b) for a, b in runs if edges[b + 1] - edges[a] >= options.shortest]
+    runs = _bridged(long, state, edges, options.bridge)
     found = []
     for first, last in runs:
         label, inside = int(state[first]), np.arange(first, last + 1)
@@ -129,11 +144,11 @@ def events(
     return found
 
 
-def _bridged(runs: list[tuple[int, int]], state: Array, edges: Array) -> list[tuple[int, int]]:
+def _bridged(runs: list[tuple[int, int]], state: Array, edges: Array, gap: float) -> list[tuple[int, int]]:
     """Runs of one class that only a short gap parts become one."""
     out: list[tuple[int, int]] = []
     for first, last in runs:
-        if out and state[out[-1][0]] == state[first] and edges[first] - edges[out[-1][1] + 1] <= BRIDGE:
+        if out and state[out[-1][0]] == state[first] and edges[first] - edges[out[-1][1] + 1] <= gap:
             out[-1] = (out[-1][0], last)
         else:
             out.append((first, last))

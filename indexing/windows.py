@@ -24,22 +24,39 @@ from indexing.clip import GAP, RARE, Clip, FloatArray, stretches
 # own deviations, which grow with the noise, with the speed of the movement and with the gaps between frames.
 
 
-# How far windows are from those of uncorrupted clips, in % of their deviation, Florence3D at 90 degrees.  As they are: 5 % wrong
-# joints 33, 10 % 47, bursts of three 39, half the frames dropped 8.6.  Repaired so: 7.4, 14, 19, 8.9, and clean clips .09.
-WIDTH = 9  # sightings of one joint compared: 7 finds more (6.2) and fails in bursts (23), 11 finds less (9.1)
-LIMIT = 4.0  # spreads of the neighbours: 6 finds less (8.6)
-# Times the deviation that this share of all joints stays below.  3 finds more (3.1), at the same accuracy (5 % wrong joints: .862)
-# but takes movement for error where frames are dropped: Florence3D .856 -> .817, 8 -> .843.  Chosen on that set.
-USUAL, SHARE = 8.0, 0.8
-FLOOR = 0.01  # of the body: smaller steps are the noise of every detector
-LEAST = 5  # sightings: among fewer nobody can say which is wrong
-PART = 9000  # frames of a long recording that are judged together: 5 minutes at 30 per second
-PASSES = 2  # the second sees past what the first took out: bursts 21 -> 19; a third adds nothing
+@dataclass(frozen=True)
+class RepairOptions:
+    """Which sightings of a joint are wrong.
+
+    How far windows are from those of uncorrupted clips, in % of their deviation, Florence3D at 90 degrees.  As they are: 5 % wrong
+    joints 33, 10 % 47, bursts of three 39, half the frames dropped 8.6.  Repaired so: 7.4, 14, 19, 8.9, and clean clips .09.
+    """
+
+    width: int = 9
+    """Sightings of one joint compared: 7 finds more (6.2) and fails in bursts (23), 11 finds less (9.1)."""
+    limit: float = 4.0
+    """Spreads of the neighbours up to which a sighting is right: 6 finds less (8.6)."""
+    usual: float = 8.0
+    """Times the deviation that most joints stay below, added to that.  3 finds more (3.1), at the same accuracy (5 % wrong joints:
+    .862) but takes movement for error where frames are dropped: Florence3D .856 -> .817, 8 -> .843.  Chosen on that set."""
+    share: float = 0.8
+    """Share of all joints that stays below that deviation."""
+    floor: float = 0.01
+    """Of the body: smaller steps are the noise of every detector."""
+    least: int = 5
+    """Sightings: among fewer nobody can say which is wrong."""
+    passes: int = 2
+    """Times that all are judged: the second sees past what the first took out: bursts 21 -> 19; a third adds nothing."""
+    part: int = 9000
+    """Frames of a long recording that are judged together: 5 minutes at 30 per second."""
+
+
 REPAIR_CHUNK = 20_000  # sightings at once: bounds memory
-_A, _B = zip(*((a, b) for a, b in combinations(range(WIDTH), 2) if b - a > 1), strict=True)
 
 
-def wrong_joints(joints: FloatArray, times: FloatArray, starts: NDArray[np.intp]) -> NDArray[np.bool_]:
+def wrong_joints(
+    joints: FloatArray, times: FloatArray, starts: NDArray[np.intp], options: RepairOptions = RepairOptions()
+) -> NDArray[np.bool_]:
     r"""Sightings that do not lie on their joint's path.
 
     With :math:`x_k, t_k` the nine sightings of a joint around one of them, a robust line is laid through them (the median of
@@ -68,18 +85,18 @@ def wrong_joints(joints: FloatArray, times: FloatArray, starts: NDArray[np.intp]
     """
     there: NDArray[np.bool_] = np.asarray(np.isfinite(joints).all(axis=2))
     clip_of = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
-    floor = FLOOR * _sizes(joints, there, starts)
+    floor = options.floor * _sizes(joints, there, starts)
     wrong, asked, usual = np.zeros_like(there), there, np.zeros_like(floor)
-    for once in range(PASSES):
+    for once in range(options.passes):
         # every joint's sightings in every clip, one path after the other
         joint, frame = np.nonzero((there & ~wrong).T)
         clip = clip_of[frame]
-        around, counts = _around(joint * len(starts) + clip)
-        rows = np.flatnonzero(asked[frame, joint] & (counts >= LEAST))
+        around, counts = _around(joint * len(starts) + clip, options.width)
+        rows = np.flatnonzero(asked[frame, joint] & (counts >= options.least))
         far, spread = _deviations(joints[frame, joint], times[frame], around, rows)
         if once == 0:
-            usual = USUAL * _share(far.max(axis=1), clip[rows], len(starts) - 1)
-        bad = (far > LIMIT * spread + (usual + floor)[clip[rows], None]).any(axis=1)
+            usual = options.usual * _share(far.max(axis=1), clip[rows], len(starts) - 1, options.share)
+        bad = (far > options.limit * spread + (usual + floor)[clip[rows], None]).any(axis=1)
         wrong[frame[rows[bad]], joint[rows[bad]]] = True
         # whoever had a wrong neighbour is asked once more
         touched = (wrong[frame[around], joint[:, None]] & (around >= 0)).any(axis=1)
@@ -88,11 +105,12 @@ def wrong_joints(joints: FloatArray, times: FloatArray, starts: NDArray[np.intp]
     return wrong
 
 
-def mended(clip: Clip) -> Clip:
-    """A clip of any length without its wrong joints; judged in parts of :data:`PART` frames, which bounds memory, between gaps."""
-    pieces = [np.arange(begin, max(end - PART // 2, begin + 1), PART) for begin, end in stretches(clip.times).tolist()]
+def mended(clip: Clip, options: RepairOptions = RepairOptions()) -> Clip:
+    """A clip of any length without its wrong joints; judged in parts, which bounds memory, between gaps."""
+    part, cuts = options.part, stretches(clip.times).tolist()
+    pieces = [np.arange(begin, max(end - part // 2, begin + 1), part) for begin, end in cuts]
     parts = np.append(np.concatenate(pieces), len(clip))
-    wrong = wrong_joints(clip.joints, clip.times, parts)
+    wrong = wrong_joints(clip.joints, clip.times, parts, options)
     if not wrong.any():
         return clip
     joints = clip.joints.copy()
@@ -100,11 +118,11 @@ def mended(clip: Clip) -> Clip:
     return clip.replace(joints=joints)
 
 
-def _around(path: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """``(sightings, WIDTH)`` the nearest sightings on the same path, -1 where a path has fewer; and how many it has."""
+def _around(path: NDArray[np.intp], width: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """``(sightings, width)`` the nearest sightings on the same path, -1 where a path has fewer; and how many it has."""
     begin, end = np.searchsorted(path, path, side="left"), np.searchsorted(path, path, side="right")
-    first = np.maximum(np.minimum(np.arange(len(path)) - WIDTH // 2, end - WIDTH), begin)
-    around = first[:, None] + np.arange(WIDTH)
+    first = np.maximum(np.minimum(np.arange(len(path)) - width // 2, end - width), begin)
+    around = first[:, None] + np.arange(width)
     return np.where(around < end[:, None], around, -1), end - begin
 
 
@@ -114,12 +132,13 @@ def _deviations(
     """``(rows, dims)`` distance of sightings from the robust line through their neighbours, and the neighbours' spread."""
     far, spread = (np.empty((len(rows), places.shape[1]), places.dtype) for _ in range(2))
     x, clock = torch.from_numpy(places), torch.from_numpy(times)
+    before, after = zip(*((a, b) for a, b in combinations(range(around.shape[1]), 2) if b - a > 1), strict=True)
     for at in range(0, len(rows), REPAIR_CHUNK):
         some = torch.from_numpy(rows[at : at + REPAIR_CHUNK])
         index = torch.from_numpy(around)[some]
         near = torch.where((index >= 0)[..., None], x[index], torch.nan).mT.contiguous()
         since = (clock[index] - clock[some, None]).to(x)[:, None]
-        slope = _median((near[..., _B] - near[..., _A]) / (since[..., _B] - since[..., _A])).nan_to_num()
+        slope = _median((near[..., after] - near[..., before]) / (since[..., after] - since[..., before])).nan_to_num()
         remainder = near - slope * since
         middle = _median(remainder)
         far[at : at + REPAIR_CHUNK] = (x[some] - middle[..., 0]).abs().numpy()
@@ -131,10 +150,10 @@ def _median(values: Tensor) -> Tensor:
     return values.nanmedian(dim=-1, keepdim=True).values
 
 
-def _share(far: FloatArray, clip: NDArray[np.intp], clips: int) -> FloatArray:
+def _share(far: FloatArray, clip: NDArray[np.intp], clips: int, share: float) -> FloatArray:
     """``(clips,)`` the deviation that a share of the clip's sightings stays below."""
     counts = np.bincount(clip, minlength=clips)
-    last = np.cumsum(counts) - counts + np.minimum((SHARE * counts).astype(int), np.maximum(counts - 1, 0))
+    last = np.cumsum(counts) - counts + np.minimum((share * counts).astype(int), np.maximum(counts - 1, 0))
     ordered = np.append(far[np.lexsort((far, clip))], 0.0)
     return np.where(counts > 0, ordered[np.minimum(last, len(far))], 0.0)
 
@@ -166,7 +185,7 @@ class Ragged:
     seen: NDArray[np.bool_]  # (clips, joints): seen at least once; the others are zeros in `joints`
 
 
-def ragged(clips: Sequence[Clip], repair: bool = False) -> Ragged:
+def ragged(clips: Sequence[Clip], repair: RepairOptions | None = None) -> Ragged:
     """Lay clips end to end and fill what is missing by linear interpolation in time, joint by joint.
 
     Before its first and after its last sighting a joint keeps the nearest seen position.  A joint never seen in a clip is
@@ -174,14 +193,15 @@ def ragged(clips: Sequence[Clip], repair: bool = False) -> Ragged:
 
     Args:
         clips: checked by :func:`check_clips`.
-        repair: take out wrong joints first (:func:`~indexing.windows.wrong_joints`); joints that were right are left as they are.
+        repair: by which wrong joints are taken out first (:func:`~indexing.windows.wrong_joints`); joints that were right are left
+            as they are, all of them where it is ``None``.
     """
     joints = np.concatenate([y_up(clip) for clip in clips]).astype(np.float32)
     times = np.concatenate([clip.times for clip in clips])
     lengths = np.array([len(clip) for clip in clips])
     starts = np.concatenate([[0], np.cumsum(lengths)])
-    if repair:
-        joints[wrong_joints(joints, times, starts)] = np.nan
+    if repair is not None:
+        joints[wrong_joints(joints, times, starts, repair)] = np.nan
     there: NDArray[np.bool_] = np.asarray(np.isfinite(joints).all(axis=2))
     seen = np.logical_or.reduceat(there, starts[:-1], axis=0)
     if not there.all():

@@ -15,7 +15,7 @@ from indexing.action.options import ActionOptions, ExemplarOptions
 from indexing.action.symmetry import turn
 from indexing.cameras import virtual
 from indexing.clip import Clip, stretches
-from indexing.windows import Ragged, ragged, sample, whole
+from indexing.windows import Ragged, RepairOptions, ragged, sample, whole
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class ExemplarPlan:
     search: bool = True
     views: int = ExemplarOptions.views
     turned: bool = True  # virtual views turn about the vertical; otherwise they are only cropped
-    repair: bool = False
+    repair: RepairOptions | None = None
     window: float = 1.0
     stride: float = 0.3
 

@@ -25,7 +25,7 @@ from indexing.estimator import POSITIVE, RANDOM_STATE, REJECT, SECONDS, Rule, Sa
 from indexing.joints import layout_of
 from indexing.scoring import Event, joined, probabilities, refuse, reject_threshold, same_label
 from indexing.skeleton import Skeleton
-from indexing.windows import mended, ragged, whole
+from indexing.windows import RepairOptions, mended, ragged, whole
 
 Array = NDArray[Any]
 
@@ -147,6 +147,10 @@ class ActionIndexer(SavedClassifier):
     def _options(self) -> ActionOptions:
         return ActionOptions() if self.options is None else self.options
 
+    @property
+    def _repair(self) -> RepairOptions | None:
+        return self._options.repair if self.repair else None
+
     # ---- learning ----------------------------------------------------------------------------------------------------
     @one_thread
     def fit(self, clips: Iterable[Any], labels: ArrayLike | None = None, groups: ArrayLike | None = None) -> Self:
@@ -205,7 +209,7 @@ class ActionIndexer(SavedClassifier):
 
     def _plan(self, views: int) -> ExemplarPlan:
         views = views if self.virtual_views is None else self.virtual_views
-        return ExemplarPlan(self.length, self.search, views, self.view == "any", self.repair, self.window, self.stride)
+        return ExemplarPlan(self.length, self.search, views, self.view == "any", self._repair, self.window, self.stride)
 
     def _learn(
         self,
@@ -254,7 +258,7 @@ class ActionIndexer(SavedClassifier):
     def _queries(self, clips: Iterable[Any]) -> Windows:
         check_is_fitted(self, "model_")
         found = check_queries(clips, self.fps, self.n_joints_, self.skeleton_)
-        source = ragged(found, self.repair)
+        source = ragged(found, self._repair)
         check_common(found, source.seen, self.model_.exemplars.crop(0).seen.numpy())
         return Windows(whole(source, self.length), torch.from_numpy(source.seen)).to(self.device)
 
@@ -311,7 +315,7 @@ class ActionIndexer(SavedClassifier):
         model, stream = self._model(), self._stream()
         begin = float(found.times[0])
         found = found.replace(times=found.times - begin)  # rounding must not depend on what the clock shows
-        found = mended(found) if self.repair else found
+        found = mended(found, self._repair) if self._repair else found
         windows = scan(model, found, stream, progress)
         events = find_events(model, found, stream, windows, self.classes_, self.reject)
         events = [dataclasses.replace(event, start=event.start + begin, end=event.end + begin) for event in events]

@@ -203,7 +203,7 @@ def learn(
         JointWeights.equal(originals.values.shape[2]),
         torch.zeros(len(labels)), torch.zeros(len(exemplars.owner)), None, None, None,
         blend=Blend(
-            nearest=share * options.blend.balance_solid + (1 - share) * options.blend.balance, sharpness=options.blend.sharpness
+            nearest=share * options.blend.balance_solid + (1 - share) * options.blend.balance, sharpness=options.decisions.sharpness
         ),
         options=options,
     )  # fmt: skip

@@ -23,6 +23,7 @@ from indexing.action.joint_weights import JointWeights
 from indexing.action.options import ActionOptions, BlendOptions, MachineOptions
 from indexing.action.symmetry import mirror
 from indexing.modelfile import Parts
+from indexing.scoring import DecisionOptions
 
 # ----------------------------------------------------------------------------------------------------------------------
 # A trained kernel machine as plain arrays: scikit-learn fits it, this evaluates it, and a model file can hold it.
@@ -144,7 +145,7 @@ class Blend:
 
     kernel: float = 1.0
     nearest: float = BlendOptions.balance
-    sharpness: float = BlendOptions.sharpness
+    sharpness: float = DecisionOptions.sharpness
 
 
 @dataclass(frozen=True)

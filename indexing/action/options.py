@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from indexing.scoring import DecisionOptions
+from indexing.windows import RepairOptions
+
 
 @dataclass(frozen=True)
 class ExemplarOptions:
@@ -93,9 +96,6 @@ class BlendOptions:
     """Weight of A against B after standardizing over classes; 1 .. 2 differ by 1 %."""
     balance_solid: float = 0.5
     """The same for exemplars with depth: B then sees true views (1.5: -1.5 % on Florence3D, UTKinect +-0)."""
-    sharpness: float = 2.0
-    """Of the softmax over the standardized sum where it is not learned: leave-one-out likelihood peaks between 1.5 and 2.5 on
-    UTKinect."""
     blends: tuple[tuple[float, float], ...] = ((1.0, 0.0), (1.0, 0.25), (1.0, 0.5), (1.0, 1.0), (1.0, 1.5), (1.0, 3.0), (0.0, 1.0))
     """Weights of B and A among which those are chosen that serve left-out people best."""
     sharpnesses: tuple[float, ...] = tuple(float(2 ** (k / 4)) for k in range(-4, 17))
@@ -205,3 +205,5 @@ class ActionOptions:
     joints: JointWeightOptions = JointWeightOptions()
     importance: ImportanceOptions = ImportanceOptions()
     events: EventOptions = EventOptions()
+    decisions: DecisionOptions = DecisionOptions()
+    repair: RepairOptions = RepairOptions()

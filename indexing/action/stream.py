@@ -189,7 +189,7 @@ def find_events(
         motion = smooth(windows.motion[part, None], at, stream.window)[:, 0]
         resting = at_rest(contrast, motion, still, calm, (floor, convincing), options=model.options) | ~windows.present[part]
         ends = np.minimum(at, clip.times[frames][-1])
-        found += events(contrast, ends, list(classes), peak, floor, resting)
+        found += events(contrast, ends, list(classes), peak, floor, resting, model.options.decisions)
     return _with_exemplars(model, clip, stream, windows.stretches, classes, found)
 
 

@@ -86,7 +86,8 @@ class BrightnessIndexer(SavedClassifier):
         pool: seconds over which :meth:`score_frames` averages, backwards from each frame.
         size: px of the longer side of the image that is worked on.
         device: where to compute, e.g. ``"cuda"``.
-        options: every other number that decides, by stage (:class:`~indexing.brightness.options.BrightnessOptions`); None: as measured.
+        options: every other number that decides, by stage (:class:`~indexing.brightness.options.BrightnessOptions`); None: as
+            measured.
 
     Attributes:
         classes_: ``(classes,)`` labels as given.  exemplars_: what is kept of the videos.  flip_: whether mirrored exemplars
@@ -238,7 +239,7 @@ class BrightnessIndexer(SavedClassifier):
 
     def predict_proba(self, videos: Iterable[Any]) -> Array:
         """``(videos, classes)`` probabilities of the known classes, rows sum to 1 (a softmax of the standardized scores)."""
-        return probabilities(self.decision_function(videos))
+        return probabilities(self.decision_function(videos), self._options.decisions.sharpness)
 
     def predict(self, videos: Iterable[Any]) -> Array:
         """``(videos,)`` labels; ``none_label`` where ``reject`` is set and no class explains the video."""

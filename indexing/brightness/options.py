@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from indexing.scoring import DecisionOptions
+
 
 @dataclass(frozen=True)
 class RateOptions:
@@ -108,3 +110,4 @@ class BrightnessOptions:
     descriptor: DescriptorOptions = DescriptorOptions()
     matching: MatchingOptions = MatchingOptions()
     events: PixelEventOptions = PixelEventOptions()
+    decisions: DecisionOptions = DecisionOptions()

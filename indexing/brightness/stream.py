@@ -265,7 +265,7 @@ def found_events(
     contrast = scores - scores.mean(axis=1, keepdims=True)
     of = options.events
     peak, floor = event_levels(wrong, of.false_alarms if rate is None else rate, of.extent, (of.least, of.least))
-    return events(contrast, times, classes.tolist(), peak, floor, energy < of.quiet)
+    return events(contrast, times, classes.tolist(), peak, floor, energy < of.quiet, options.decisions)
 
 
 def _asked(exemplars: VideoExemplars, most: int) -> list[int]:

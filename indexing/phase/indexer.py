@@ -277,7 +277,7 @@ class PhaseIndexer(SavedClassifier):
     def predict_proba(self, clips: Iterable[Any]) -> Array:
         """``(clips, classes)`` probabilities, rows sum to 1 (a softmax of the standardized scores)."""
         scores = self.decision_function(clips)
-        return probabilities(scores) if scores.shape[1] > 1 else np.ones_like(scores)
+        return probabilities(scores, self._options.decisions.sharpness) if scores.shape[1] > 1 else np.ones_like(scores)
 
     @one_thread
     def evidence(self, clips: Iterable[Any]) -> Array:
@@ -307,10 +307,12 @@ class PhaseIndexer(SavedClassifier):
             raise ValueError("find needs two classes at least to tell one from the other; fit clips of ordinary movement too")
         scores = self._evidence([found])[0].cpu().numpy()
         levels = event_levels(self.model_.wrong, self.reject, options=self._options)
-        second = self._options.events.second
+        second, decisions = self._options.events.second, self._options.decisions
         parts = [slice(first, end) for first, end in stretches(found.times, second).tolist()]  # no event reaches across a gap
         return [
             event
             for part in parts
-            for event in events(smooth(scores[part], found.times[part], second), found.times[part], list(self.classes_), *levels)
+            for event in events(
+                smooth(scores[part], found.times[part], second), found.times[part], list(self.classes_), *levels, options=decisions
+            )
         ]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from indexing.scoring import DecisionOptions
+
 
 @dataclass(frozen=True)
 class PhaseViewOptions:
@@ -142,3 +144,4 @@ class PhaseOptions:
     learning: PhaseLearningOptions = PhaseLearningOptions()
     evidence: PhaseEvidenceOptions = PhaseEvidenceOptions()
     events: PhaseEventOptions = PhaseEventOptions()
+    decisions: DecisionOptions = DecisionOptions()

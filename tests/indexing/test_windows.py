@@ -68,7 +68,7 @@ def test_the_result_does_not_depend_on_the_chunk(monkeypatch):
     owner, start = np.arange(4).repeat(3), np.zeros(12)
     begin = np.array([clip.times[0] for clip in CLIPS])[owner] + start
     expected = sample(source, owner, begin, begin + 0.5, 6)
-    monkeypatch.setattr("indexing.windows.REPAIR_CHUNK", 6 * SUBSAMPLES * 5 * 2 * 5)
+    monkeypatch.setattr("indexing.windows.CHUNK", 6 * SUBSAMPLES * 5 * 2 * 5)
     assert torch.equal(sample(source, owner, begin, begin + 0.5, 6), expected)
 
 

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 
-from indexing.brightness import sight as motion_box
 from indexing.brightness.features import blur, blurred, gradients, inner_gradients
 from indexing.brightness.options import BrightnessOptions
 from indexing.brightness.sight import MotionBox, MotionMaps, described, mirrored, pooled, profile
@@ -46,7 +45,7 @@ def slow_box(change):
     """Frame by frame, quantiles by counting."""
     seen, out = np.zeros(change.shape[1:]), []
     for frame in change:
-        seen = np.maximum(seen * (1 - 1 / 150), np.maximum(frame - motion_box.LIVELY, 0))
+        seen = np.maximum(seen * (1 - 1 / 150), np.maximum(frame - USUAL.box.lively, 0))
         ends = []
         for axis in (0, 1):
             share = np.cumsum(seen.sum(axis)) / seen.sum()
