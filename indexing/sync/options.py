@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from dyntorch import SynchronizeOptions
+from indexing.video.options import TrackOptions
 
 
 @dataclass(frozen=True)
@@ -241,6 +242,8 @@ class VerdictOptions:
 class SyncOptions:
     """Every number that decides in :func:`indexing.synchronize`, by stage."""
 
+    tracks: TrackOptions = TrackOptions()
+    """Of moving points followed through videos."""
     points: SynchronizeOptions = SynchronizeOptions()
     """Those of :func:`dyntorch.synchronize`, for keypoints and tracks."""
     recording: RecordingOptions = RecordingOptions()

@@ -330,7 +330,7 @@ def _tracks(a: Take, b: Take, *, calibration: Any = None, options: SyncOptions, 
     """Different points in both: trajectories that span meeting subspaces."""
     import dyntorch
 
-    found = [points_of(take) for take in (a, b)]
+    found = [points_of(take, options) for take in (a, b)]
     notes = [note for *_, more in found for note in more]
     few = [take.name for take, (points, _, _) in zip((a, b), found, strict=True) if points.shape[1] < options.video.tracks]
     if few:
@@ -349,14 +349,14 @@ def _tracks(a: Take, b: Take, *, calibration: Any = None, options: SyncOptions, 
     return dataclasses.replace(shift, notes=(*notes, *shift.notes))
 
 
-def points_of(take: Take) -> tuple[Tensor, Tensor, list[str]]:
+def points_of(take: Take, options: SyncOptions = SyncOptions()) -> tuple[Tensor, Tensor, list[str]]:
     """``(frames, n, 2)`` of whatever moves, ``(frames,)`` seconds, and what to say about it."""
     if take.kind == "keypoints":
         clip = take.people[0]
         return torch.from_numpy(np.array(clip.joints, dtype=np.float64)), torch.from_numpy(clip.times.copy()), []
     from indexing.video import track_points
 
-    tracks = track_points(source_of(take))
+    tracks = track_points(source_of(take), options=options.tracks)
     return tracks.points, tracks.times, [f"{take.name}: {note}" for note in tracks.notes]
 
 

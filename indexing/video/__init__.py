@@ -7,6 +7,8 @@ from indexing.video.motion import CameraMotion as CameraMotion
 from indexing.video.motion import Move as Move
 from indexing.video.motion import camera_motion as camera_motion
 from indexing.video.motion import stabilize as stabilize
+from indexing.video.options import CameraMotionOptions as CameraMotionOptions
+from indexing.video.options import TrackOptions as TrackOptions
 from indexing.video.reading import Chunk as Chunk
 from indexing.video.reading import Video as Video
 from indexing.video.reading import VideoInfo as VideoInfo

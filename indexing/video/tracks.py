@@ -11,16 +11,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from dyntorch.numerics import check_options
 from indexing.video.motion import Background, CameraMotion, Floats, PathBuilder, shrinking, transform, warp
+from indexing.video.options import TrackOptions
 from indexing.video.reading import Chunk, Source, chunks, cv2
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Following single points, and where in the picture there is something to follow.
-
-
-BACK = 0.7  # pixels between a point and where following it there and back ends
-PATCH = (17, 17)
-CHANGE = 16  # grey levels over a chunk, after shrinking by four: beyond noise, where something moved
 
 
 class MovingArea:
@@ -36,7 +33,7 @@ class MovingArea:
         (True, False)
     """
 
-    def __init__(self, chunk: Chunk, path: list[Floats]):
+    def __init__(self, chunk: Chunk, path: list[Floats], change: float = TrackOptions.change):
         height, width = chunk.frames.shape[1:]
         self.shape = (height, width)
         self.shrink = shrinking((0.25, 0.25))
@@ -49,8 +46,8 @@ class MovingArea:
             low = small if low is None else np.minimum(low, small)
             high = small if high is None else np.maximum(high, small)
         assert low is not None and high is not None
-        change = cv2().GaussianBlur(high - low, (5, 5), 0)
-        changed = (change > max(CHANGE, 3 * float(np.median(change)))).astype(np.uint8)
+        changes = cv2().GaussianBlur(high - low, (5, 5), 0)
+        changed = (changes > max(change, 3 * float(np.median(changes)))).astype(np.uint8)
         self.small = cv2().dilate(changed, np.ones((5, 5), np.uint8))
 
     def __call__(self, matrix: Floats) -> NDArray[np.uint8]:
@@ -60,22 +57,24 @@ class MovingArea:
 
 
 def follow(
-    before: NDArray[np.uint8], after: NDArray[np.uint8], points: NDArray[np.float32]
+    before: NDArray[np.uint8], after: NDArray[np.uint8], points: NDArray[np.float32], options: TrackOptions = TrackOptions()
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Where points of one frame are in the next, and which of them can be trusted: following back ends where they came from."""
-    options = {"winSize": PATCH, "maxLevel": 3, "criteria": (3, 20, 0.01)}
-    ahead, found, _ = cv2().calcOpticalFlowPyrLK(before, after, points, None, **options)
-    back, found_back, _ = cv2().calcOpticalFlowPyrLK(after, before, ahead, None, **options)
-    good = (found.ravel() > 0) & (found_back.ravel() > 0) & (np.linalg.norm(back - points, axis=1) < BACK)
+    how = {"winSize": options.patch, "maxLevel": 3, "criteria": (3, 20, 0.01)}
+    ahead, found, _ = cv2().calcOpticalFlowPyrLK(before, after, points, None, **how)
+    back, found_back, _ = cv2().calcOpticalFlowPyrLK(after, before, ahead, None, **how)
+    good = (found.ravel() > 0) & (found_back.ravel() > 0) & (np.linalg.norm(back - points, axis=1) < options.back)
     inside = ((ahead >= 2) & (ahead < np.array(after.shape[::-1]) - 2)).all(axis=1)
     return np.asarray(ahead, np.float32), np.asarray(good & inside)
 
 
-def patches(image: NDArray[np.uint8], points: NDArray[np.float32]) -> NDArray[np.float32]:
+def patches(image: NDArray[np.uint8], points: NDArray[np.float32], options: TrackOptions = TrackOptions()) -> NDArray[np.float32]:
     """Surroundings of points ``(n, pixels)``, free of mean and of norm 1: their products are correlations."""
     if not len(points):
-        return np.zeros((0, PATCH[0] * PATCH[1]), np.float32)
-    found = np.stack([cv2().getRectSubPix(image, PATCH, point, patchType=cv2().CV_32F).ravel() for point in points.tolist()])
+        return np.zeros((0, options.patch[0] * options.patch[1]), np.float32)
+    found = np.stack(
+        [cv2().getRectSubPix(image, options.patch, point, patchType=cv2().CV_32F).ravel() for point in points.tolist()]
+    )
     found -= found.mean(1, keepdims=True)
     return np.asarray(found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-6), np.float32)
 
@@ -90,17 +89,6 @@ def extent(track: Floats, share: float = 0.9) -> float:
     """
     low, high = np.percentile(track, [50 - 50 * share, 50 + 50 * share], axis=0)
     return float(np.hypot(*(high - low)))
-
-
-WORKING = 960  # pixels of the longest side: KLT is exact to a tenth of these
-CHECK = 5  # frames after which a point must still look like itself (correlation SAME of its surroundings):
-SAME = 0.6  # where somebody passes before the background, its points are dragged along, and there and back agree
-RENEW = 10  # frames after which new points replace lost ones
-APART = 90  # points are at least 1/APART of the width apart
-MOVING = 0.01  # of the diagonal: extent of a track that counts as moving
-DRAGGED = 0.15  # of that, extent of the middle half: background dragged along by a passer-by rests for the rest of its life
-REST = 0.25  # share of points on ground where nothing moves now: people who rest and move later
-SHORTEST = 10  # frames of a track that is worth keeping
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -136,7 +124,13 @@ class Tracks:
 
 
 def track_points(
-    source: str | Path | Source, *, count: int = 200, keep: int = 40, complete: float = 0.7, motion: float | None = None
+    source: str | Path | Source,
+    *,
+    count: int = 200,
+    keep: int = 40,
+    complete: float = 0.7,
+    motion: float | None = None,
+    options: TrackOptions = TrackOptions(),
 ) -> Tracks:
     """Follow points that move against the background through a video.
 
@@ -150,6 +144,7 @@ def track_points(
         keep: tracks returned at most.
         complete: least share of the frames in which a track must be there, in [0, 1].
         motion: least extent of a track in pixels (of the middle nine tenths of its positions); default: 1 % of the diagonal.
+        options: every number that decides besides these.
 
     Returns:
         the tracks; none of them (``n = 0``), and a note, where nothing that moves could be followed long enough.
@@ -170,16 +165,17 @@ def track_points(
         >>> (tracks.points[-1] - tracks.points[0]).median(0).values.round().tolist()
         [57.0, 0.0]
     """
+    check_options(options, TrackOptions)
     if count < 1 or keep < 1:
         raise ValueError(f"track_points: count and keep must be at least 1, got count={count!r}, keep={keep!r}")
     if not 0 <= complete <= 1:
         raise ValueError(f"track_points: complete is a share of the frames in [0, 1], got {complete!r}")
-    background, path, book = Background(), PathBuilder(), _Book(count)
+    background, path, book = Background(options.camera), PathBuilder(options.camera), _Book(count, options)
     previous: NDArray[np.uint8] | None = None
-    for chunk in (stream := chunks(source, size=WORKING)):
+    for chunk in (stream := chunks(source, size=options.working)):
         moved = [path.add(background, image) for image in chunk.frames]
         path.times.extend(chunk.times.tolist())
-        where = MovingArea(chunk, moved)
+        where = MovingArea(chunk, moved, options.change)
         for image, matrix in zip(chunk.frames, moved, strict=True):
             book.step(previous, image, where(matrix), matrix)
             previous = image
@@ -188,8 +184,8 @@ def track_points(
         raise ValueError(f"track_points: the video has {len(path.times)} frame(s); tracks need at least 2")
     scale = getattr(stream, "scale", (1.0, 1.0)) if isinstance(source, (str, Path)) else (1.0, 1.0)
     camera = path.finish(scale, None, getattr(stream, "notes", ()))
-    limit = MOVING * float(np.hypot(*camera.size)) if motion is None else motion
-    points, notes = _select(book, camera, scale, limit, complete, keep)
+    limit = options.moving * float(np.hypot(*camera.size)) if motion is None else motion
+    points, notes = _select(book, camera, scale, limit, complete, keep, options)
     notes += [*camera.notes, *([f"{camera}; it is taken out"] if camera.moves else [])]
     return Tracks(torch.from_numpy(points), torch.from_numpy(camera.times), camera.size, camera, tuple(notes))
 
@@ -197,7 +193,8 @@ def track_points(
 class _Book:
     """Points being followed, and the histories of those that are worth it."""
 
-    def __init__(self, count: int):
+    def __init__(self, count: int, options: TrackOptions):
+        self.options = options
         self.count, self.frame = count, -1
         self.alive = np.zeros((0, 2), np.float32)
         self.ids = np.zeros(0, int)
@@ -205,42 +202,42 @@ class _Book:
         self.done: list[tuple[int, NDArray[np.float32]]] = []
         self.moved: list[Floats] = []
         self.next = 0
-        self.looks = np.zeros((0, PATCH[0] * PATCH[1]), np.float32)
+        self.looks = np.zeros((0, self.options.patch[0] * self.options.patch[1]), np.float32)
 
     def step(self, previous: NDArray[np.uint8] | None, image: NDArray[np.uint8], where: NDArray[np.uint8], matrix: Floats) -> None:
         """Follow all points into the next frame, and find new ones."""
         self.frame += 1
         self.moved.append(matrix)
         if previous is not None and len(self.ids):
-            ahead, good = follow(previous, image, self.alive)
+            ahead, good = follow(previous, image, self.alive, options=self.options)
             self.alive = ahead
             self._keep(good)
-            if self.frame % CHECK == 0:
-                looks = patches(image, self.alive)
-                same = (looks * self.looks).sum(1) > SAME
+            if self.frame % self.options.check == 0:
+                looks = patches(image, self.alive, options=self.options)
+                same = (looks * self.looks).sum(1) > self.options.same
                 self.looks = looks
                 self._keep(same)
         for key, position in zip(self.ids.tolist(), self.alive, strict=True):
             self.histories[key][1].append(position)
-        if self.frame % RENEW == 0:
+        if self.frame % self.options.renew == 0:
             self._replace(image, where)
 
     def _replace(self, image: NDArray[np.uint8], where: NDArray[np.uint8]) -> None:
         """New points where something moves, and a few where nothing does; points that rest elsewhere make room."""
         x, y = np.rint(self.alive).astype(int).T.clip(0, [[image.shape[1] - 1], [image.shape[0] - 1]])
         elsewhere = where[y, x] == 0
-        spare = elsewhere.sum() - int(REST * self.count)
+        spare = elsewhere.sum() - int(self.options.rest * self.count)
         if spare > 0:
             old = [key for key in self.ids[elsewhere].tolist() if not self._moves(key)][:spare]
             self._keep(~np.isin(self.ids, old))
         self._detect(image, where, self.count - len(self.ids))
-        resting = int(REST * self.count) - max(0, int(elsewhere.sum()))
+        resting = int(self.options.rest * self.count) - max(0, int(elsewhere.sum()))
         self._detect(image, 1 - (where > 0), min(resting, self.count - len(self.ids)))
 
     def _detect(self, image: NDArray[np.uint8], mask: NDArray[Any], room: int) -> None:
         if room <= 0 or not mask.any():
             return
-        apart = max(4, image.shape[1] // APART)
+        apart = max(4, image.shape[1] // self.options.apart)
         free = (mask > 0).astype(np.uint8)
         for x, y in self.alive.tolist():
             cv2().circle(free, (round(x), round(y)), apart, 0, -1)
@@ -253,7 +250,7 @@ class _Book:
         for key, position in zip(ids.tolist(), found, strict=True):
             self.histories[key] = (self.frame, [position])
         self.alive, self.ids = np.r_[self.alive, found], np.r_[self.ids, ids]
-        self.looks = np.r_[self.looks, patches(image, found)]
+        self.looks = np.r_[self.looks, patches(image, found, options=self.options)]
 
     def _keep(self, good: NDArray[np.bool_]) -> None:
         self._finish(self.ids[~good])
@@ -264,12 +261,12 @@ class _Book:
         image = transform(np.array(self.moved[first : first + len(positions)]), np.array(positions).astype(np.float64)[:, None])[
             :, 0
         ]
-        return extent(image) > 3.0
+        return extent(image) > self.options.wandering
 
     def _finish(self, keys: NDArray[np.int_]) -> None:
         """Put tracks away, or forget those that are too short or do not move."""
         for key in keys.tolist():
-            if len(self.histories[key][1]) >= SHORTEST and self._moves(key):
+            if len(self.histories[key][1]) >= self.options.shortest and self._moves(key):
                 first, positions = self.histories[key]
                 self.done.append((first, np.array(positions)))
             del self.histories[key]
@@ -282,7 +279,7 @@ class _Book:
 
 
 def _select(
-    book: _Book, camera: CameraMotion, scale: tuple[float, float], limit: float, complete: float, keep: int
+    book: _Book, camera: CameraMotion, scale: tuple[float, float], limit: float, complete: float, keep: int, options: TrackOptions
 ) -> tuple[Floats, list[str]]:
     """The tracks that live long enough and move, ``(frames, n, 2)``, and what to say about them."""
     frames = len(camera.times)
@@ -294,7 +291,7 @@ def _select(
         if camera.moves:
             track = transform(camera.path[first : first + len(track)], track[:, None])[:, 0]
         moves = extent(track)
-        if moves < limit or extent(track, 0.5) < DRAGGED * limit:
+        if moves < limit or extent(track, 0.5) < options.dragged * limit:
             continue
         if len(track) < complete * frames:
             shorter += 1
