@@ -12,7 +12,7 @@ from pathlib import Path
 from indexing.clip import Clip, ClipSet
 from indexing.opening import error, shown
 from indexing.readers.detect import detect
-from indexing.readers.files import Options, open_source
+from indexing.readers.files import LinkOptions, Options, open_source
 
 FORMATS = ("clipset", "openpose", "coco", "mediapipe", "deeplabcut", "mmpose", "ultralytics", "sleap")
 
@@ -26,6 +26,7 @@ def read(
     min_confidence: float = 0.0,
     label: Hashable | None = None,
     size: tuple[float, float] | None = None,
+    linking: LinkOptions = LinkOptions(),
 ) -> ClipSet:
     """Read a keypoint file or folder; a single recording is a set of one clip.
 
@@ -40,6 +41,7 @@ def read(
         label: the action, given to every clip read.
         size: ``(width, height)`` in pixels of the image, for files with coordinates from 0 to 1 (MediaPipe, YOLO labels):
             brings them back to pixels.  Without it they stay stretched by the image's aspect ratio.
+        linking: how people are followed from frame to frame where the file has no ids.
 
     Returns:
         clips with times in seconds (frame number / fps), NaN where a joint was not seen, and the detector's confidence.
@@ -57,7 +59,7 @@ def read(
         >>> read(path, fps=25.0, label="squat")[0]
         Clip('squat.json', label='squat', 5 frames x 2 joints x 2D, 0.16 s)
     """
-    options = Options(fps=fps, person=person, min_confidence=min_confidence, label=label, size=size)
+    options = Options(fps=fps, person=person, min_confidence=min_confidence, label=label, size=size, linking=linking)
     if format is not None and format not in FORMATS:
         raise ValueError(f"{path}: unknown format={shown(format)}; use one of {', '.join(FORMATS)}, or leave it out to detect it")
     source = open_source(path)
@@ -75,13 +77,16 @@ def read_clip(
     min_confidence: float = 0.0,
     label: Hashable | None = None,
     size: tuple[float, float] | None = None,
+    linking: LinkOptions = LinkOptions(),
 ) -> Clip:
     """Read one recording; the arguments are those of :func:`read`.
 
     Raises:
         ValueError: as :func:`read`; also where the file holds several clips.
     """
-    clips = read(path, format=format, fps=fps, person=person, min_confidence=min_confidence, label=label, size=size)
+    clips = read(
+        path, format=format, fps=fps, person=person, min_confidence=min_confidence, label=label, size=size, linking=linking
+    )
     if len(clips) != 1:
         raise error(path, f"holds {len(clips)} clips where one is expected", "use ClipSet.load, or dyntorch index evaluate")
     return clips[0]

@@ -211,6 +211,21 @@ PEOPLE = ("largest", "confident", "tracked", "all", "everyone")
 
 
 @dataclass(frozen=True)
+class LinkOptions:
+    """Who is who where a file has no ids: people linked from frame to frame by position."""
+
+    point: float = 0.2
+    """Of the scene, that counts as the box of a person of whom there is only one point."""
+    reach: float = 0.5
+    """Box diagonals: a joint moves less from one detection of a person to the next, another person is farther away."""
+    waiting: int = 256
+    """Identities that are waited for at most, the latest seen: where nobody matches, the time for all detections is linear.  A
+    frame before 256 takes 0.1 ms (17 joints)."""
+    crowded: float = 0.05
+    """Share of the frames with somebody that show several people, from where on a clip says how many."""
+
+
+@dataclass(frozen=True)
 class Options:
     """The arguments of :func:`indexing.readers.read` that the format modules share.
 
@@ -223,12 +238,15 @@ class Options:
     min_confidence: float = 0.0
     label: Hashable | None = None
     size: tuple[float, float] | None = None
+    linking: LinkOptions = LinkOptions()
 
     def __post_init__(self) -> None:
         if self.fps is not None:
             check_fps(self.fps)
         if self.person not in PEOPLE:
             raise ValueError(f"unknown person={self.person!r}; use one of {', '.join(PEOPLE)}")
+        if not isinstance(self.linking, LinkOptions):
+            raise ValueError(f"linking must be LinkOptions, got {self.linking!r}; use dataclasses.replace(LinkOptions(), ...)")
         if not _is_number(self.min_confidence):
             raise ValueError(f"min_confidence must be a number (0 keeps every joint), got {self.min_confidence!r}")
         if self.size is not None:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from indexing.clip import LARGEST, Clip, ClipSet, FloatArray
 from indexing.opening import error, shown
-from indexing.readers.files import Options
+from indexing.readers.files import LinkOptions, Options
 from indexing.skeleton import Skeleton
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -39,19 +39,17 @@ from indexing.skeleton import Skeleton
 
 
 IntArray = NDArray[np.int64]
-POINT = 0.2  # of the scene, that counts as the box of a person of whom there is only one point
-REACH = 0.5  # box diagonals: a joint moves less from one detection of a person to the next, another person is farther away
-WAITING = 256
-"""Identities that are waited for at most, the latest seen: where nobody matches, the time for all detections is linear.  A frame
-before 256 takes 0.1 ms (17 joints)."""
 
 
-def choose(path: Path, recording: Recording, person: str) -> list[tuple[Hashable | None, IntArray]]:
+def choose(
+    path: Path, recording: Recording, person: str, linking: LinkOptions = LinkOptions()
+) -> list[tuple[Hashable | None, IntArray]]:
     """The detections that make each clip.
 
     Args:
         recording: joints not seen are NaN, and every detection has at least one joint.
         person: the rule (see the module).
+        linking: how people are followed where the file has no ids.
 
     Returns:
         per clip, the identity (None where people are not tracked) and its rows of the recording, one per frame.
@@ -64,7 +62,7 @@ def choose(path: Path, recording: Recording, person: str) -> list[tuple[Hashable
         why = f"its person ids repeat in frame {repeated}" if repeated is not None else "it has no person ids"
         raise error(path, f"person='all' needs tracked people, but {why}", "run a tracker, or use person='largest' or 'tracked'")
     if person in ("all", "everyone"):
-        ids = link(recording.at, recording.joints) if ids is None else ids
+        ids = link(recording.at, recording.joints, linking) if ids is None else ids
         return [(name, np.flatnonzero(ids == i)) for i, name in enumerate(names or range(int(ids.max()) + 1))]
     if person == "confident" and recording.confidence is None:
         raise error(path, "has no confidences, so person='confident' cannot be applied", "use person='largest' or 'tracked'")
@@ -74,7 +72,7 @@ def choose(path: Path, recording: Recording, person: str) -> list[tuple[Hashable
     weight = recording.confidence.mean(axis=1) if person == "confident" and recording.confidence is not None else area
     tracked = ids is not None
     if ids is None:
-        ids = link(recording.at, recording.joints)
+        ids = link(recording.at, recording.joints, linking)
     known = np.maximum(ids, 0)
     total = np.bincount(known, weight * (ids >= 0))
     if person == "tracked":
@@ -103,12 +101,12 @@ def _given(recording: Recording) -> tuple[IntArray | None, list[Hashable], int |
     return ids, list(index), None
 
 
-def link(at: IntArray, joints: FloatArray) -> IntArray:
+def link(at: IntArray, joints: FloatArray, options: LinkOptions = LinkOptions()) -> IntArray:
     """Identities by position: each detection continues the nearest identity, nearest pairs first.
 
     An identity is expected one step farther along its last movement (people who cross would swap otherwise), and waits there
-    until :data:`WAITING` others have been seen since.  Distance is the mean over the joints that both show, in units of the
-    larger box's diagonal; beyond :data:`REACH` a new identity begins.  Tracked points have no box: one alone in every frame is
+    until ``options.waiting`` others have been seen since.  Distance is the mean over the joints that both show, in units of the
+    larger box's diagonal; beyond ``options.reach`` a new identity begins.  Tracked points have no box: one alone in every frame is
     always the same one.
 
     Args:
@@ -132,11 +130,11 @@ def link(at: IntArray, joints: FloatArray) -> IntArray:
     if len(at) and not (diagonal > 0).any():
         if len(np.unique(at)) == len(at):
             return np.zeros(len(at), dtype=np.int64)
-        diagonal[:] = POINT * np.linalg.norm(_extents(joints.reshape(1, -1, joints.shape[2])))
+        diagonal[:] = options.point * np.linalg.norm(_extents(joints.reshape(1, -1, joints.shape[2])))
     for rows in np.split(np.argsort(at, kind="stable"), np.flatnonzero(np.diff(np.sort(at))) + 1):
         before = last[waiting]
         cost = _distances(joints[before] + step[waiting, None], joints[rows], np.maximum.outer(diagonal[before], diagonal[rows]))
-        while cost.size and cost.min() <= REACH:
+        while cost.size and cost.min() <= options.reach:
             old, new = (int(i) for i in np.unravel_index(int(np.argmin(cost)), cost.shape))
             who, row = waiting[old], rows[new]
             step[who] = np.nanmean(joints[row] - joints[last[who]], axis=0)
@@ -146,16 +144,16 @@ def link(at: IntArray, joints: FloatArray) -> IntArray:
         identity[fresh] = np.arange(count, count + len(fresh))
         last[identity[fresh]] = fresh
         count += len(fresh)
-        waiting = _latest(np.append(waiting, identity[fresh]), at, last)
+        waiting = _latest(np.append(waiting, identity[fresh]), at, last, options.waiting)
     return identity
 
 
-def _latest(waiting: IntArray, at: IntArray, last: IntArray) -> IntArray:
-    """Of some identities the :data:`WAITING` that were seen last, and all seen in the same frame as the first of these."""
-    if len(waiting) <= WAITING:
+def _latest(waiting: IntArray, at: IntArray, last: IntArray, most: int) -> IntArray:
+    """Of some identities those that were seen last, ``most`` of them, and all seen in the same frame as the first of these."""
+    if len(waiting) <= most:
         return waiting
     frames = at[last[waiting]]
-    return waiting[frames >= np.partition(frames, -WAITING)[-WAITING]]
+    return waiting[frames >= np.partition(frames, -most)[-most]]
 
 
 def _distances(awaited: FloatArray, found: FloatArray, size: FloatArray) -> FloatArray:
@@ -180,7 +178,6 @@ def _areas(joints: FloatArray) -> FloatArray:
 
 
 LAST_FRAME = 2**53  # whole numbers are exact below it
-CROWDED = 0.05  # share of the frames with somebody, that show several people, from where on a clip says how many
 NORMALIZED = 4.0  # coordinates from 0 to 1 stay below it even for joints guessed outside the image; pixels do not
 
 
@@ -314,9 +311,9 @@ def to_clips(path: Path, recording: Recording, options: Options) -> ClipSet:
     name = path.name or path.resolve().name
     each = options.person in ("all", "everyone")
     crowd = np.bincount(recording.at)
-    others = {"people": int(crowd.max())} if (crowd > 1).mean() > CROWDED else {}
+    others = {"people": int(crowd.max())} if (crowd > 1).mean() > options.linking.crowded else {}
     clips = []
-    for track, rows in choose(path, recording, options.person):
+    for track, rows in choose(path, recording, options.person, options.linking):
         frames = slice(0, len(times))
         if each:  # each person's clip spans what was seen of that person
             seen = recording.at[rows]

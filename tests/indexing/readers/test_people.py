@@ -10,7 +10,10 @@ import pytest
 
 from indexing.readers import read, read_clip
 from indexing.readers import recording as people
-from indexing.readers.recording import WAITING, link
+from indexing.readers.files import LinkOptions
+from indexing.readers.recording import link
+
+WAITING = LinkOptions().waiting
 
 Write = Callable[..., Path]
 FRAMES = 8
@@ -180,3 +183,10 @@ def test_a_crowd_larger_than_what_is_waited_for_is_followed() -> None:
     ids = link(np.repeat(np.arange(3), len(crowd)), np.concatenate([crowd, crowd + 1, crowd[::-1] + 2]))
     first, second, third = ids.reshape(3, -1)
     assert (first == second).all() and (first == third[::-1]).all()
+
+
+def test_how_people_are_linked_is_an_option():
+    box = np.array([[0.0, 0.0], [10.0, 20.0]])
+    at, joints = np.arange(3), np.stack([box, box + 5, box + 10])
+    assert link(at, joints).tolist() == [0, 0, 0]
+    assert link(at, joints, LinkOptions(reach=0.1)).tolist() == [0, 1, 2]
