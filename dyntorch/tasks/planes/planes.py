@@ -280,8 +280,8 @@ def _figures(layout: Layout, theta: Tensor, covariance: Tensor, used: Tensor, op
         + of_epipoles[:, :p].diagonal(dim1=-2, dim2=-1).sum(-1) * n.square().sum(-1)
     ).sqrt()
     length = e.norm(dim=-1) * n.norm(dim=-1)
-    limits = options.degeneracy
-    still = (length <= limits.exact * size) | ((length <= limits.near * size) & (length <= limits.still * spread))
+    near = (length <= options.degeneracy.near * size) & (length <= options.degeneracy.still * spread)
+    still = (length <= options.degeneracy.exact * size) | near
     moving = torch.cat([used[:, :p] & ~still, used[:, p:]], dim=1)
     return Figures(
         epipoles=unit_vectors(epipoles),
