@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
-from importlib import import_module
 from pathlib import Path
 from typing import Any, ClassVar, Self, TypeVar, cast, get_args, get_type_hints
 
@@ -141,12 +140,10 @@ def _tuples(value: Any) -> Any:
 class SavedClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
     """A classifier of recordings that can be written to a file.
 
-    A subclass names the attribute that fitting sets, and the module whose ``save(indexer, path)`` and ``load(kind, path, device)``
-    know its parts; that is imported when a file is written or read.
+    A subclass names the attribute that fitting sets, and writes and reads its parts.
     """
 
     FITTED: ClassVar[str]
-    FILES: ClassVar[str]
     RULES: ClassVar[Mapping[str, Rule]]
 
     def check_parameters(self) -> None:
@@ -177,7 +174,7 @@ class SavedClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
     def save(self, path: str | Path) -> None:
         """Write a ``.safetensors`` file with JSON metadata; atomically, and without pickle."""
         check_is_fitted(self, self.FITTED)
-        import_module(self.FILES).save(self, path)
+        self._write(Path(path))
 
     @classmethod
     def load(cls, path: str | Path, device: str = "cpu") -> Self:
@@ -186,7 +183,15 @@ class SavedClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         Raises:
             ValueError: the file is missing, or is not such a model.
         """
-        return cast("Self", import_module(cls.FILES).load(cls, path, device))
+        check_device(device)
+        return cls._read(Path(path), device)
+
+    def _write(self, path: Path) -> None:
+        raise NotImplementedError
+
+    @classmethod
+    def _read(cls, path: Path, device: str) -> Self:
+        raise NotImplementedError
 
     def __sklearn_is_fitted__(self) -> bool:
         return hasattr(self, self.FITTED)

@@ -9,8 +9,9 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 import numpy as np
 import torch
@@ -226,6 +227,88 @@ class Parts:
             got = f"{found.dtype} {tuple(found.shape)}".replace("torch.", "")
             raise ValueError(f"{name}: expected {str(kinds[0]).removeprefix('torch.')} ({wanted}), got {got}")
         return found
+
+
+@dataclass(frozen=True)
+class Stored:
+    """How a field of a model is kept in its file, and what is believed when it is read: see :func:`stored` and :func:`part`."""
+
+    kind: str
+    shape: tuple[int | str | None, ...] = ()
+    limits: Mapping[str, Any] = field(default_factory=dict)
+    name: str | None = None
+
+
+def stored(kind: str, *shape: int | str | None, name: str | None = None, **limits: float | str) -> dict[str, Stored]:
+    """The metadata of a dataclass's field that is a tensor of the model's file.
+
+    Args:
+        kind: the method of :class:`Parts` that takes it.
+        shape: numbers or names of sizes, None = any.  A name is bound by the first tensor that has it; all others must agree.
+        name: in the file, by default that of the field.
+        limits: of its values; a name stands for a size.
+    """
+    return {"stored": Stored(kind, shape, limits, name)}
+
+
+def part(name: str | None = None, **sizes: int | str) -> dict[str, Stored]:
+    """The metadata of a field that is a dataclass with such fields itself; theirs stand behind ``name.``, or beside the others.
+
+    Args:
+        name: in the file, by default that of the field; ``""`` = beside the others.
+        sizes: what a size of the part's is called outside of it, or how large it is.
+    """
+    return {"stored": Stored("part", (), sizes, name)}
+
+
+def tensors_of(model: Any, before: str = "") -> dict[str, Tensor]:
+    """All stored fields of a model, by their names in the file."""
+    out: dict[str, Tensor] = {}
+    for name, each, _, how in _stored(model, before):
+        value = getattr(model, each)
+        if value is not None:
+            out |= tensors_of(value, name) if how.kind == "part" else {name: torch.as_tensor(value)}
+    return out
+
+
+def read_fields(kind: type, parts: Parts, sizes: dict[str, int], before: str = "") -> dict[str, Any]:
+    """The stored fields of a model, as its file has them; those that may be None are where the file lacks them.
+
+    Args:
+        sizes: those that are known; those that tensors bind are added.
+
+    Raises:
+        ValueError: a tensor that is not what its field must be.
+    """
+    out: dict[str, Any] = {}
+    for name, each, hint, how in _stored(kind, before):
+        kinds = get_args(hint) or (hint,)
+        if type(None) in kinds and not any(other == name or other.startswith(name) for other in parts.tensors):
+            out[each] = None
+        elif how.kind == "part":
+            known = {own: sizes.get(size) if isinstance(size, str) else size for own, size in how.limits.items()}
+            inner = {own: size for own, size in {**sizes, **known}.items() if size is not None}
+            made: Any = next(one for one in kinds if is_dataclass(one))
+            out[each] = made(**read_fields(made, parts, inner, name))
+            outer = {own: how.limits.get(own, own) for own in inner}
+            sizes |= {size: inner[own] for own, size in outer.items() if isinstance(size, str)}
+        else:
+            shape = [sizes.get(size) if isinstance(size, str) else size for size in how.shape]
+            limits = {key: sizes[value] if isinstance(value, str) else value for key, value in how.limits.items()}
+            value = getattr(parts, how.kind)(name, *shape, **limits)
+            sizes |= {size: n for size, n in zip(how.shape, value.shape, strict=True) if isinstance(size, str)}
+            out[each] = float(value) if hint is float else value
+    return out
+
+
+def _stored(model: Any, before: str) -> Iterator[tuple[str, str, Any, Stored]]:
+    """Name in the file, name, type and storage of every stored field."""
+    hints = get_type_hints(model if isinstance(model, type) else type(model))
+    for each in fields(model):
+        how = each.metadata.get("stored")
+        if how is not None:
+            name = each.name if how.name is None else how.name
+            yield f"{before}{name}{'.' if how.kind == 'part' and name else ''}", each.name, hints[each.name], how
 
 
 def _opened(path: Path, with_tensors: bool) -> tuple[dict[str, Any], dict[str, Tensor]]:

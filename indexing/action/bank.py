@@ -15,6 +15,7 @@ from torch import Tensor
 
 from dyntorch.numerics import canonical_correlation, orthonormal_basis
 from indexing.action.options import MachineOptions, NearestOptions
+from indexing.modelfile import stored
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Channels: the same window seen with different things taken away, each carrying its own evidence.
@@ -85,8 +86,8 @@ class JointMetric:
     the rows (joints) of both coordinates alike, so the rank conditions between views stay exact.
     """
 
-    covariance: Tensor  # (channels, joints, joints), float64
-    power: float  # alpha
+    covariance: Tensor = field(metadata=stored("real", "channels", "joints", "joints", name="metric"))  # float64
+    power: float = field(metadata=stored("real", name="metric_power", least=0, most=10))  # alpha
     floor: float = field(default=NearestOptions.floor, kw_only=True)  # lambda
 
     @classmethod
@@ -134,8 +135,8 @@ class Windows:
     values: ``(N, length, joints, dims)`` float32 without NaN; seen: ``(N, joints)`` bool.
     """
 
-    values: Tensor
-    seen: Tensor
+    values: Tensor = field(metadata=stored("real", "rows", "length", "joints", 2))
+    seen: Tensor = field(metadata=stored("truth", "rows", "joints"))
 
     def __len__(self) -> int:
         return len(self.values)

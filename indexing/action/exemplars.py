@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
@@ -15,6 +15,7 @@ from indexing.action.options import ActionOptions, ExemplarOptions
 from indexing.action.symmetry import turn
 from indexing.cameras import virtual
 from indexing.clip import Clip, stretches
+from indexing.modelfile import part, stored
 from indexing.windows import Ragged, RepairOptions, ragged, sample, whole
 
 
@@ -39,11 +40,11 @@ class Exemplars:
     ``owner`` telling whose they are; solid: ``(N,)`` which exemplars had depth.
     """
 
-    crops: Windows
-    views: Windows
-    moments: Windows
-    owner: torch.Tensor
-    solid: torch.Tensor
+    crops: Windows = field(metadata=part(rows="crops"))
+    views: Windows = field(metadata=part(rows="views"))
+    moments: Windows = field(metadata=part(rows="moments"))
+    owner: torch.Tensor = field(metadata=stored("every", "moments", below="exemplars"))
+    solid: torch.Tensor = field(metadata=stored("truth", "exemplars"))
 
     def __len__(self) -> int:
         return len(self.solid)

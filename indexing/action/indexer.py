@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.utils.validation import check_is_fitted
 
 from dyntorch.numerics import one_thread
+from indexing.action import saving
 from indexing.action.bank import Windows
 from indexing.action.exemplars import ExemplarPlan, Exemplars, cut
 from indexing.action.inputs import check_common, check_plan, check_queries, gather, gather_groups, gather_labels
@@ -81,7 +83,7 @@ class ActionIndexer(SavedClassifier):
     Source: Wolf 2003, chapters 4 and 7 and section 10.1.
     """
 
-    FITTED, FILES = "model_", "indexing.action.saving"
+    FITTED = "model_"
     RULES = {
         "view": one_of("any", "same"),
         "weights": one_of("equal", "learned"),
@@ -150,6 +152,13 @@ class ActionIndexer(SavedClassifier):
     @property
     def _repair(self) -> RepairOptions | None:
         return self._options.repair if self.repair else None
+
+    def _write(self, path: Path) -> None:
+        saving.save(self, path)
+
+    @classmethod
+    def _read(cls, path: Path, device: str) -> Self:
+        return saving.load(cls, path, device)
 
     # ---- learning ----------------------------------------------------------------------------------------------------
     @one_thread

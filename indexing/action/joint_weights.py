@@ -8,7 +8,7 @@ affine image of itself, from which this residual learns nothing about other view
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import cast
 
 import torch
@@ -16,6 +16,9 @@ from torch import Tensor
 
 from indexing.action.bank import CHANNELS, EPSILON, NEAREST, JointMetric, Windows, fused_residual
 from indexing.action.options import ActionOptions
+from indexing.modelfile import stored
+
+MOST_WEIGHT = 1e6  # of a joint or a scorer, the mean being 1
 
 # ----------------------------------------------------------------------------------------------------------------------
 # The epipolar residual as a function of joint weights: everything it needs, tabled once for the pairs that matter.
@@ -197,9 +200,9 @@ class JointWeights:
     factors on top, or ``None``; gain, sigma: held-out log likelihood per query won over equal weights, and its standard error.
     """
 
-    joints: Tensor
-    channels: Tensor
-    by_class: Tensor | None = None
+    joints: Tensor = field(metadata=stored("real", "nearest", "joints", least=0, most=MOST_WEIGHT))
+    channels: Tensor = field(metadata=stored("real", "nearest", least=0, most=MOST_WEIGHT))
+    by_class: Tensor | None = field(default=None, metadata=stored("real", "classes", "joints", least=0, most=MOST_WEIGHT))
     gain: float = 0.0
     sigma: float = 0.0
 

@@ -22,7 +22,7 @@ from indexing.action.exemplars import Exemplars
 from indexing.action.joint_weights import JointWeights
 from indexing.action.options import ActionOptions, BlendOptions, MachineOptions
 from indexing.action.symmetry import mirror
-from indexing.modelfile import Parts
+from indexing.modelfile import part, stored
 from indexing.scoring import DecisionOptions
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -37,10 +37,10 @@ class PairwiseMachine:
     ``(classes (classes - 1) / 2,)``; counts: ``(classes,)`` support vectors per class.
     """
 
-    support: Tensor
-    dual: Tensor
-    intercept: Tensor
-    counts: Tensor
+    support: Tensor = field(metadata=stored("whole", "rows"))
+    dual: Tensor = field(metadata=stored("real", "others", "rows"))
+    intercept: Tensor = field(metadata=stored("real", "pairs"))
+    counts: Tensor = field(metadata=stored("whole", "classes", below=2**31))
 
     @classmethod
     def fit(cls, kernel: Tensor, classes: np.ndarray, penalty: float = MachineOptions.penalty) -> PairwiseMachine:
@@ -80,26 +80,6 @@ class PairwiseMachine:
                 margins[:, j] -= value
                 pair += 1
         return votes + margins / (3 * (margins.abs() + 1))
-
-
-def read_machine(parts: Parts, classes: int, rows: int) -> PairwiseMachine:
-    """The machine of a model file, whose tensors are named ``machine.support``, ``dual``, ``intercept`` and ``counts``.
-
-    Args:
-        rows: of the training windows that are kept.
-
-    Raises:
-        ValueError: its parts do not belong together.
-    """
-    counts = parts.whole("machine.counts", classes, below=rows + 1)
-    if int(counts.sum()) != rows:
-        raise ValueError(f"machine.counts: {int(counts.sum())} support vectors, and {rows} are there")
-    return PairwiseMachine(
-        parts.whole("machine.support", rows),
-        parts.real("machine.dual", classes - 1, rows),
-        parts.real("machine.intercept", classes * (classes - 1) // 2),
-        counts,
-    )
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -152,21 +132,22 @@ class Blend:
 class ShapeModel:
     """Learned state; ``classes`` are numbers 0..C-1 and ``labels`` holds one per exemplar."""
 
-    exemplars: Exemplars
-    labels: Tensor
+    exemplars: Exemplars = field(metadata=part(""))
+    labels: Tensor = field(metadata=stored("every", "exemplars", below="classes"))
     classes: int
     view: str
     scorer: str  # "nearest" (A), "kernel" (B) or "both"
-    metric: JointMetric
-    symmetry: Tensor | None  # joint permutation of the mirror image, or None
-    mirrored: Tensor  # (N,) which exemplars also count mirrored
-    parts: JointWeights  # how much each joint and each channel of A counts
-    hub: Tensor  # (N,) how close an exemplar is to other classes
-    moment_hub: Tensor  # (M,) the same of its short windows
+    metric: JointMetric = field(metadata=part(""))
+    symmetry: Tensor | None = field(metadata=stored("every", "joints", below="joints"))  # of the mirror image's joints
+    mirrored: Tensor = field(metadata=stored("truth", "exemplars"))  # which exemplars also count mirrored
+    parts: JointWeights = field(metadata=part())  # how much each joint and each channel of A counts
+    hub: Tensor = field(metadata=stored("real", "exemplars"))  # how close an exemplar is to other classes
+    moment_hub: Tensor = field(metadata=stored("real", "moments"))  # the same of its short windows
     kernels: Kernels | None
-    support: Windows | None  # windows behind the machine's support rows
-    machine: PairwiseMachine | None
-    evidence_out: Tensor = field(default_factory=lambda: torch.zeros(0))  # (N,) evidence of exemplars whose class was left out
+    support: Windows | None = field(metadata=part(rows="rows"))  # windows behind the machine's support rows
+    machine: PairwiseMachine | None = field(metadata=part())
+    # (N,) evidence of exemplars whose class was left out
+    evidence_out: Tensor = field(default_factory=lambda: torch.zeros(0), metadata=stored("real", None))
     blend: Blend = field(default_factory=lambda: Blend())
     options: ActionOptions = ActionOptions()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
@@ -32,13 +33,12 @@ from indexing.estimator import (
     SECONDS,
     Rule,
     SavedClassifier,
-    check_device,
     is_number,
     is_whole,
     one_of,
     read_options,
 )
-from indexing.modelfile import Parts, labels_from_json, labels_to_json, read_model, usable, write_model
+from indexing.modelfile import Parts, labels_from_json, labels_to_json, read_fields, read_model, tensors_of, usable, write_model
 from indexing.opening import shown
 from indexing.scoring import Event, joined, probabilities, refuse, reject_threshold
 
@@ -105,7 +105,7 @@ class BrightnessIndexer(SavedClassifier):
     Source: Wolf 2003, chapter 7 and section 10.1 (direct measure, after Irani 1999); rectified channels after Efros et al. 2003.
     """
 
-    FITTED, FILES = "exemplars_", "indexing.brightness.indexer"
+    FITTED = "exemplars_"
     RULES = {
         "fps": POSITIVE,
         "window": POSITIVE,
@@ -148,6 +148,13 @@ class BrightnessIndexer(SavedClassifier):
     @property
     def _options(self) -> BrightnessOptions:
         return BrightnessOptions() if self.options is None else self.options
+
+    def _write(self, path: Path) -> None:
+        save(self, path)
+
+    @classmethod
+    def _read(cls, path: Path, device: str) -> Self:
+        return load(cls, path, device)
 
     # ---- learning ----------------------------------------------------------------------------------------------------
     @one_thread
@@ -308,9 +315,6 @@ class BrightnessIndexer(SavedClassifier):
 
 KIND = "dyntorch.brightness-indexer"
 VERSION = 1
-FRAMES = 2**31  # of a video, at most
-ROUNDING = 1e-3  # of a unit vector
-PARTS = ("motion", "lengths", "labels")
 
 Indexer = TypeVar("Indexer", bound="BrightnessIndexer")
 
@@ -321,13 +325,18 @@ def save(indexer: BrightnessIndexer, path: str | Path) -> None:
     Raises:
         ValueError: the file cannot be written, or labels or parameters are neither text nor numbers.
     """
-    tensors = {name: getattr(indexer.exemplars_, name) for name in PARTS}
-    write_model(path, KIND, VERSION, indexer.saved_parameters(), {"classes": labels_to_json(indexer.classes_)}, tensors)
+    write_model(
+        path,
+        KIND,
+        VERSION,
+        indexer.saved_parameters(),
+        {"classes": labels_to_json(indexer.classes_)},
+        tensors_of(indexer.exemplars_),
+    )
 
 
 def load(kind: type[Indexer], path: str | Path, device: str = "cpu") -> Indexer:
     """Read a fitted indexer; see :meth:`indexing.BrightnessIndexer.load`."""
-    check_device(device)
     header, parts = read_model(path, KIND, VERSION)
     with usable(path):
         parameters = _known(header["parameters"]) | {"options": read_options(BrightnessOptions, header)}
@@ -353,9 +362,8 @@ def _known(parameters: dict[str, Any]) -> dict[str, Any]:
 def _exemplars(parts: Parts, classes: int) -> VideoExemplars:
     if classes < 2:
         raise ValueError(f"{classes} class")
-    lengths = parts.whole("lengths", None, below=FRAMES)
-    motion = parts.real("motion", int(lengths.sum()), LENGTH, least=-1 - ROUNDING, most=1 + ROUNDING)
-    labels = parts.every("labels", len(lengths), below=classes)
-    if not bool((lengths > 0).all()):
-        raise ValueError("lengths: a video without frames")
-    return VideoExemplars(motion.float(), lengths, labels)
+    sizes = {"classes": classes, "descriptor": LENGTH}
+    found = VideoExemplars(**read_fields(VideoExemplars, parts, sizes))
+    if not bool((found.lengths > 0).all()) or int(found.lengths.sum()) != sizes["frames"]:
+        raise ValueError(f"lengths: videos of {shown(found.lengths.tolist())} frames, and {sizes['frames']} are there")
+    return replace(found, motion=found.motion.float())

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
 
 from indexing.brightness.options import DescriptorOptions
 from indexing.brightness.sight import mirrored
+from indexing.modelfile import stored
 
+FRAMES = 2**31  # of a video, at most
+LONGEST = 1.001  # of the entries of a unit vector, with rounding
 GAP = 2  # empty rows before each track: no step leads from one track into the next
 
 
@@ -23,9 +26,9 @@ class VideoExemplars:
         labels: ``(videos,)`` numbers of classes.
     """
 
-    motion: Tensor
-    lengths: Tensor
-    labels: Tensor
+    motion: Tensor = field(metadata=stored("real", "frames", "descriptor", least=-LONGEST, most=LONGEST))
+    lengths: Tensor = field(metadata=stored("whole", "videos", below=FRAMES))
+    labels: Tensor = field(metadata=stored("every", "videos", below="classes"))
 
     @classmethod
     def of(cls, videos: list[Tensor], labels: Tensor) -> VideoExemplars:

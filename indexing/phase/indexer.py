@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
@@ -18,6 +19,7 @@ from indexing.action.symmetry import mirror_permutation
 from indexing.clip import Clip, stretches
 from indexing.estimator import POSITIVE, REJECT, SECONDS, Rule, SavedClassifier, is_whole, one_of
 from indexing.joints import layout_of
+from indexing.phase import saving
 from indexing.phase.frames import LEAST, images, query_frames
 from indexing.phase.learning import learn_model
 from indexing.phase.model import PhaseModel, event_levels
@@ -142,7 +144,7 @@ class PhaseIndexer(SavedClassifier):
     Source: Wolf 2003, chapter 4 (dynamic shape tensors) and section 10.1.
     """
 
-    FITTED, FILES = "model_", "indexing.phase.saving"
+    FITTED = "model_"
     RULES = {
         "course": one_of("auto", "periodic", "once"),
         "mirror": one_of("auto", True, False),
@@ -230,6 +232,13 @@ class PhaseIndexer(SavedClassifier):
         self.skeleton_ = skeleton
         self.reject_threshold_ = reject_threshold(self.reject, model.wrong)
         return self
+
+    def _write(self, path: Path) -> None:
+        saving.save(self, path)
+
+    @classmethod
+    def _read(cls, path: Path, device: str) -> Self:
+        return saving.load(cls, path, device)
 
     # ---- single frames -----------------------------------------------------------------------------------------------
     @one_thread

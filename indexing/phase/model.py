@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -13,6 +13,7 @@ from torch import Tensor
 from dyntorch import Fourier, Polynomial
 from indexing import scoring
 from indexing.action.bank import EPSILON, Windows, stack
+from indexing.modelfile import part, stored
 from indexing.phase.frames import LEAST as FRAMES_LEAST
 from indexing.phase.frames import Learned, image_distance, shape_distance, standardized
 from indexing.phase.options import PhaseOptions
@@ -32,9 +33,9 @@ class Course:
     shapes: ``(styles, B, n, 3)`` float64; periodic: whether phase 1 is phase 0 again; seen: ``(n,)`` joints that are known.
     """
 
-    shapes: Tensor
+    shapes: Tensor = field(metadata=stored("real", None, "basis", "joints", 3))
     periodic: bool
-    seen: Tensor
+    seen: Tensor = field(metadata=stored("truth", "joints"))
 
     def bank(self, grid: int) -> Windows:
         """The shapes of all styles at all phases of the grid, style by style."""
@@ -163,11 +164,11 @@ class PhaseModel:
     score of training seconds whose class was left out, empty where there are fewer than three classes.
     """
 
-    bank: Windows
-    label: Tensor
-    phase: Tensor
+    bank: Windows = field(metadata=part(rows="frames", length=1))
+    label: Tensor = field(metadata=stored("every", "frames", below="classes"))
+    phase: Tensor = field(metadata=stored("real", "frames", least=0, most=1))
     courses: tuple[Course, ...]
-    wrong: Tensor
+    wrong: Tensor = field(metadata=stored("real", None))
     options: PhaseOptions = PhaseOptions()
 
     def to(self, device: torch.device | str) -> PhaseModel:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -9,14 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from indexing.action.bank import Windows
-from indexing.estimator import check_device, read_options
+from indexing.estimator import read_options
 from indexing.modelfile import (
     Parts,
     labels_from_json,
     labels_to_json,
+    read_fields,
     read_model,
     skeleton_from_json,
     skeleton_to_json,
+    tensors_of,
     usable,
     whole,
     write_model,
@@ -51,16 +54,14 @@ def save(indexer: PhaseIndexer, path: str | Path) -> None:
         "periodic": indexer.periodic_.tolist(),
         "skeleton": skeleton_to_json(indexer.skeleton_),
     }
-    tensors = {"bank.values": model.bank.values, "bank.seen": model.bank.seen, "label": model.label, "phase": model.phase}
-    tensors["wrong"] = model.wrong
+    tensors = tensors_of(model)
     for c, course in enumerate(model.courses):
-        tensors |= {f"course.{c}.shapes": course.shapes, f"course.{c}.seen": course.seen}
+        tensors |= tensors_of(course, f"course.{c}.")
     write_model(path, FORMAT, VERSION, indexer.saved_parameters(), about, tensors)
 
 
 def load(kind: type[Indexer], path: str | Path, device: str = "cpu") -> Indexer:
     """Read a fitted indexer; see :meth:`indexing.phase.indexer.PhaseIndexer.load`."""
-    check_device(device)
     header, parts = read_model(path, FORMAT, VERSION)
     with usable(path):
         parameters = header["parameters"] | {"options": read_options(PhaseOptions, header)}
@@ -78,24 +79,19 @@ def _restore(indexer: PhaseIndexer, header: dict[str, Any], parts: Parts) -> Non
     """
     classes, joints = labels_from_json(header["classes"]), whole(header["joints"], "joints", LEAST, JOINTS)
     periodic, mirrored = (_flags(header[name], name, len(classes)) for name in ("periodic", "mirrored"))
+    sizes = {"classes": len(classes), "joints": joints, "basis": 2 * indexer.harmonics + 1}
     courses = tuple(
-        Course(
-            parts.real(f"course.{c}.shapes", None, 2 * indexer.harmonics + 1, joints, 3).double(),
-            bool(periodic[c]),
-            parts.truth(f"course.{c}.seen", joints),
-        )
-        for c in range(len(classes))
+        Course(**read_fields(Course, parts, sizes, f"course.{c}."), periodic=bool(periodic[c])) for c in range(len(classes))
     )
+    courses = tuple(replace(course, shapes=course.shapes.double()) for course in courses)
     if not all(len(course.shapes) for course in courses):
         raise ValueError("course: an action without a shape")
-    values = parts.real("bank.values", None, 1, joints, 2).double()
-    bank = Windows(values, parts.truth("bank.seen", len(values), joints))
-    label = parts.every("label", len(bank), below=len(classes))
-    phase, wrong = parts.real("phase", len(bank), least=0, most=1).double(), parts.real("wrong", None)
+    found = read_fields(PhaseModel, parts, sizes)
+    found |= {"bank": Windows(found["bank"].values.double(), found["bank"].seen), "phase": found["phase"].double()}
     indexer.skeleton_ = skeleton_from_json(header["skeleton"], joints)
-    indexer.model_ = PhaseModel(bank, label, phase, courses, wrong, indexer._options)
+    indexer.model_ = PhaseModel(**found, courses=courses, options=indexer._options)
     indexer.classes_, indexer.periodic_, indexer.n_joints_, indexer.mirrored_ = classes, periodic, joints, mirrored
-    indexer.reject_threshold_ = reject_threshold(indexer.reject, wrong)
+    indexer.reject_threshold_ = reject_threshold(indexer.reject, indexer.model_.wrong)
 
 
 def _flags(found: Any, name: str, count: int) -> NDArray[np.bool_]:

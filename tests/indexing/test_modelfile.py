@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,19 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from indexing import ActionIndexer, BrightnessIndexer, Clip, PhaseIndexer
-from indexing.modelfile import Parts, labels_from_json, model_kind, number, skeleton_from_json, usable, whole
+from indexing.modelfile import (
+    Parts,
+    labels_from_json,
+    model_kind,
+    number,
+    part,
+    read_fields,
+    skeleton_from_json,
+    stored,
+    tensors_of,
+    usable,
+    whole,
+)
 
 
 def clip(seed: int, frames: int = 30) -> Clip:
@@ -184,6 +197,36 @@ def test_pipes_and_devices_are_no_models(name: str, tmp_path: Path) -> None:
 def test_truth_values_of_other_bytes_than_0_and_1_are_true() -> None:
     odd = torch.tensor([0, 1, 2, 255], dtype=torch.uint8).view(torch.bool)
     assert Parts({"a": odd}).truth("a", 4).tolist() == [False, True, True, True]
+
+
+@dataclass(frozen=True)
+class Inner:
+    values: torch.Tensor = field(metadata=stored("real", "rows", "wide"))
+    rows: torch.Tensor | None = field(metadata=stored("every", "rows", below="rows"))
+
+
+@dataclass(frozen=True)
+class Outer:
+    shown: Inner = field(metadata=part(rows="windows"))
+    other: Inner | None = field(metadata=part("", rows=3))
+    weight: float = field(metadata=stored("real", name="w", most=1))
+    about: str = ""
+
+
+def test_a_model_is_kept_by_its_fields() -> None:
+    model = Outer(Inner(torch.ones(5, 2), torch.arange(5)), Inner(torch.ones(3, 2), None), 0.5, "not kept")
+    kept = tensors_of(model)
+    assert list(kept) == ["shown.values", "shown.rows", "values", "w"]
+    sizes: dict[str, int] = {}
+    found = read_fields(Outer, Parts(kept), sizes)
+    assert sizes == {"windows": 5, "wide": 2} and found["weight"] == 0.5 and found["other"].rows is None
+    assert torch.equal(found["shown"].rows, torch.arange(5)) and "about" not in found
+    with pytest.raises(ValueError, match=r"shown\.values: expected float32 \(4, any\)"):
+        read_fields(Outer, Parts(kept), {"windows": 4})
+    with pytest.raises(ValueError, match=r"values: expected float32 \(3, 2\), got float32 \(4, 2\)"):
+        read_fields(Outer, Parts({**kept, "values": torch.ones(4, 2)}), {})
+    with pytest.raises(ValueError, match="w: expected numbers from -1e\\+10 to 1"):
+        read_fields(Outer, Parts({**kept, "w": torch.tensor(2.0)}), {})
 
 
 def test_parts_and_values_say_what_they_expect() -> None:
