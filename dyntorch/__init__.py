@@ -84,6 +84,7 @@ _HOME = {
     "PairOptions": "dyntorch.tasks.pair.options",
     "PlanesOptions": "dyntorch.tasks.planes.options",
     "ReconstructOptions": "dyntorch.tasks.reconstruct.options",
+    "RobustOptions": "dyntorch.core.options",
     "SegmentOptions": "dyntorch.tasks.segment.options",
     "SynchronizeOptions": "dyntorch.tasks.synchronize.options",
     "TrajectoryOptions": "dyntorch.tasks.trajectories.options",

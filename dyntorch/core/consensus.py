@@ -14,6 +14,7 @@ from dyntorch.core.invariant import Invariant
 from dyntorch.core.matches import Matches
 from dyntorch.core.matrix import unpack
 from dyntorch.core.normalize import Normalization, normalization, relative
+from dyntorch.core.options import RobustOptions
 from dyntorch.core.primitives import HyperplanesThrough, Point, Primitive, triangle
 from dyntorch.core.residual import SINGULAR, whiten
 from dyntorch.core.solution import copied
@@ -25,11 +26,8 @@ from dyntorch.numerics.nullspace import gram_null_space, orthonormal
 # Many weightings of the same matches: tensors, distances and annealed reweighting for a whole bundle of starts at once.
 
 
-STEPS = 2
-"""Inverse iterations per reweighting: the weights change more than what is left of the null vector's error."""
-SHIFT = 1e-14  # of the trace: keeps the factor of an exactly singular Gram finite
+SHIFT_EPSILON = 1e-14  # of the trace: keeps the factor of an exactly singular Gram finite
 FAR = 1e30  # squared distance in place of one that is no number
-HOLD = 0.7  # share of the reweightings during which the scale shrinks
 
 
 @dataclass(frozen=True)
@@ -52,6 +50,7 @@ class Bundle:
     """``(b, c, n, m)`` packed outer squares of the rows of each match."""
     vectors: tuple[Tensor, ...]
     """``(b, c, width, rows, n)`` per view, of the length that the derivatives of the primitives suppose."""
+    options: RobustOptions
 
     def first(self, weights: Tensor) -> Tensor:
         """Null spaces ``(b, c, K, a, D)`` of the weightings ``(b, K, n)`` of rows of unit length."""
@@ -79,10 +78,10 @@ class Bundle:
         """The same for weightings ``(b, c, K, n)`` of unscaled rows, by inverse iteration from the null spaces before."""
         gram = self._gram(weights)
         diagonal = gram.diagonal(dim1=-2, dim2=-1)
-        diagonal += diagonal.sum(-1, keepdim=True) * SHIFT + 1e-300
+        diagonal += diagonal.sum(-1, keepdim=True) * SHIFT_EPSILON + 1e-300
         factor, _ = torch.linalg.cholesky_ex(gram)
         columns = basis.mT
-        for _ in range(STEPS):
+        for _ in range(self.options.annealing.inverse_iterations):
             columns = orthonormal(torch.cholesky_solve(columns, factor))
         found = columns.mT
         return torch.where(found.isfinite().all(-1, keepdim=True).all(-2, keepdim=True), found, basis)
@@ -162,7 +161,12 @@ class Bundle:
 
 
 def bundle(
-    invariant: Invariant, primitives: tuple[Primitive, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...], weights: Tensor
+    invariant: Invariant,
+    primitives: tuple[Primitive, ...],
+    views: tuple[Tensor, ...],
+    scales: tuple[Tensor, ...],
+    weights: Tensor,
+    options: RobustOptions,
 ) -> Bundle:
     """Prepare matches ``(b, 1, n, ...)`` in normalized coordinates, with weights ``(b, n)``."""
     packed, vectors = [], []
@@ -178,7 +182,7 @@ def bundle(
     moments = packed[0]
     for factor in packed[1:]:
         moments = (moments[..., :, None] * factor[..., None, :]).flatten(-2)
-    return Bundle(invariant, primitives, views, scales, weights, moments, tuple(vectors))
+    return Bundle(invariant, primitives, views, scales, weights, moments, tuple(vectors), options)
 
 
 def transfer_slot(primitives: Sequence[Primitive]) -> int | None:
@@ -206,8 +210,9 @@ def anneal(data: Bundle, basis: Tensor, end: Tensor | None, iterations: int, *, 
     Source: Black and Rangarajan 1996; Yang, Antonante, Tzoumas and Carlone 2020.
     """
     start: Tensor | None = None
+    shrinking = data.options.annealing.shrinking * iterations
     for i in range(iterations):
-        square, rows = data.distances(data.constrained(basis) if guided and i < HOLD * iterations else basis)
+        square, rows = data.distances(data.constrained(basis) if guided and i < shrinking else basis)
         if guided and 2 * i < iterations:
             # the gradients of a wrong tensor mislead: half their say doubles the successes of lines (175, 30 % outliers)
             rows = (rows / data.lengths()[:, :, None]).sqrt()
@@ -216,7 +221,7 @@ def anneal(data: Bundle, basis: Tensor, end: Tensor | None, iterations: int, *, 
         else:
             stop = end[:, None, None, None]
             start = torch.maximum(4 * median(square, data.weights)[:, None, :, None], stop) if start is None else start
-            scale = start * (stop / start) ** min(1.0, i / (HOLD * iterations))
+            scale = start * (stop / start) ** min(1.0, i / shrinking)
         weights = (scale / (scale + square[:, None])).square() * data.weights[:, None, None] * rows
         basis = data.next(weights, basis)
     return basis
@@ -255,32 +260,8 @@ def _products(vectors: list[Tensor]) -> Tensor:
 # The search of robust estimation: which weightings to start from, when to stop, and whether what was found beats chance.
 
 
-SMALL = 8
-"""Largest minimal sample for which samples of that size are drawn; other starts take 2.5 times the minimal number."""
-DRAWN, KEPT = 32, 4
-"""Minimal samples per start, and starts per sample that is annealed: the best samples are near already."""
-ANNEALED = {"all": 30, "many": 20, "guided": 60, "minimal": 10}
-"""Reweightings of a start: from all matches; from 2.5 times the minimal number, without and with a motion as guide; from a minimal
-sample."""
-FREE = 4
-"""One start of so many is not guided by a motion.  Successes per start, not guided and guided: homography tensor (100 matches, 50 %
-outliers) 0.48 and 0.70, translating lines (175, 30 %) 0.01 and 0.20, constant velocity tensor (150, 35 %) 0.53 and 0.52, but in
-one scene of eight 0.9 and 0."""
-
 STARTS_BLOCK = 1 << 20
 """Numbers in one block of the batch (8 MB)."""
-SEARCHED = 1000
-"""Matches among which is searched, at least 10 for every column; of more, a random part (all are used for the final fit)."""
-NEAR = 5.0
-"""Matches farther from the median than so many median distances have no say in the normalization."""
-MIXED = 4
-"""Random sets of matches, made by mixing up the views, on which the chance of an inlier is measured."""
-DOUBT = 0.15
-"""Matches between one and three thresholds away, per inlier, above which the search goes on: a wrong model has many (constant
-velocity tensors, 20 % outliers: wrong 0.7 and more, right 0.03 at most; right homography tensors reach 0.15 at 60 %)."""
-MANY, AGREEING, SAME = 16, 0.25, 0.01
-"""So many starts decide when to stop where there is doubt: when this share of them end at the best score so far, up to this
-relative difference.  Whatever attracts one start in five, and is better, is then missed once in thirty times."""
 
 
 class Found(NamedTuple):
@@ -319,11 +300,17 @@ class Searched(NamedTuple):
 class Search:
     """The search for the tensors of a batch, among at most so many matches that memory stays bounded."""
 
-    def __init__(self, invariant: Invariant, data: Matches, generator: torch.Generator | None) -> None:
-        self.invariant, self.data = invariant, data
+    def __init__(
+        self,
+        invariant: Invariant,
+        data: Matches,
+        generator: torch.Generator | None,
+        options: RobustOptions = RobustOptions(),
+    ) -> None:
+        self.invariant, self.data, self.options = invariant, data, options
         self.draws = Draws(len(data.weights), generator, data.weights.device)
         self.everyone = torch.arange(len(data.weights), device=data.weights.device)
-        views, weights, _ = copied(invariant, replace(data, weights=data.weights * _near(invariant, data)))
+        views, weights, _ = copied(invariant, replace(data, weights=data.weights * _near(invariant, data, options.starts.gross)))
         self.norm: Normalization = normalization(invariant, views, weights)
         # the search measures in this unit, so that no limit of it depends on that of the matches
         self.unit = relative([t.flatten(1)[:, 0] for t in self.norm.transforms])[1]
@@ -351,19 +338,19 @@ class Search:
             new = self._solve(left, cut, count)
             found = found.better(new, left)
             # more starts would find it again
-            settled[left] = (new.agreeing >= AGREEING) & (new.score <= _same(found.score[left]))
+            settled[left] = (new.agreeing >= self.options.doubt.agreeing) & (new.score <= self._same(found.score[left]))
         return found
 
     def scale(self) -> Tensor:
         """Threshold ``(b,)`` from the data: least median of squares (annealed), and what 99 % of the inliers then keep."""
-        inv, everyone = self.invariant, self.everyone
-        chosen = torch.cat([self.weights[:, None], self._samples(everyone, 16)], dim=1)
+        inv, everyone, options = self.invariant, self.everyone, self.options.annealing
+        count = self.options.starts.scale_starts
+        chosen = torch.cat([self.weights[:, None], self._samples(everyone, count)], dim=1)
 
         def block(searched: Searched, chosen: Tensor) -> Tensor:
             work = self._bundle(searched)
-            basis = _best(work, work.first(chosen), lambda square: median(square, work.weights), 17)
-            # guided and soft: hard halves alone are 40 to 70 times off for lines (175, 20 % outliers), this 0.6 to 1.6 times
-            basis = concentrate(work, anneal(work, basis, None, 20, guided=True), None, 5)
+            basis = _best(work, work.first(chosen), lambda square: median(square, work.weights), count + 1)
+            basis = concentrate(work, anneal(work, basis, None, options.scale_steps, guided=True), None, options.concentrations)
             return median(work.distances(basis)[0], work.weights).amin(1)
 
         middle = self._map(block, everyone, chosen)
@@ -386,7 +373,9 @@ class Search:
     def _solve(self, where: Tensor, cut: Tensor, count: int) -> Found:
         chosen = self.weights[where, None] if count == 1 else self._samples(where, count)
         kind = "all" if count == 1 else "many" if chosen.shape[1] == count else "minimal"
-        keep, steps = max(1, count // KEPT) if kind == "minimal" else count, ANNEALED[kind]
+        options, many = self.options.annealing, self.options.doubt.many
+        steps = {"all": options.from_all, "many": options.from_many, "minimal": options.from_minimal}[kind]
+        keep = max(1, count // self.options.starts.drawn_per_annealed) if kind == "minimal" else count
 
         def block(searched: Searched, chosen: Tensor, cut: Tensor) -> Found:
             work, limit = self._bundle(searched), cut.square()
@@ -395,25 +384,32 @@ class Search:
                 return msac(square, work.weights, limit)
 
             basis = _best(work, work.first(chosen), score, keep)
-            free, led = basis[:, :, : -(-keep // FREE)], basis[:, :, -(-keep // FREE) :]
+            unguided = -(-keep // options.unguided)
+            free, led = basis[:, :, :unguided], basis[:, :, unguided:]
             if kind == "many":
-                led = anneal(work, led, limit, ANNEALED["guided"], guided=True)
+                led = anneal(work, led, limit, options.guided, guided=True)
                 basis = torch.cat([anneal(work, free, limit, steps), led], dim=2)
             else:
                 basis = anneal(work, basis, limit, steps)
             lost = score(work.distances(basis)[0])
-            agreeing = (lost <= _same(lost.amin(-1, keepdim=True))).double().mean(-1) * (lost.shape[-1] >= MANY)
-            basis = concentrate(work, _chosen(basis, lost.argmin(-1, keepdim=True)), limit, 5)
+            agreeing = (lost <= self._same(lost.amin(-1, keepdim=True))).double().mean(-1) * (lost.shape[-1] >= many)
+            basis = concentrate(work, _chosen(basis, lost.argmin(-1, keepdim=True)), limit, options.concentrations)
             square = work.distances(basis)[0]
             evidence, doubt = judge(work, basis, square[:, 0], limit)
             return Found(basis[:, :, 0], score(square)[:, 0], evidence, doubt, square[:, 0] <= limit[:, None], agreeing)
 
         return self._map(block, where, chosen, cut[where])
 
+    def _same(self, score: Tensor) -> Tensor:
+        """The score up to which two finds are the same one: the weight of a hundredth of a match is no difference."""
+        same = self.options.doubt.same
+        return score * (1 + same) + same
+
     def _samples(self, where: Tensor, count: int) -> Tensor:
         """Starts ``(problems, K, n)``: 1 for so many random matches with weight."""
         minimal = self.invariant.minimal()
-        size, count = (minimal, count * DRAWN) if minimal <= SMALL else (-(-5 * minimal // 2), count)
+        options = self.options.starts
+        size, count = (minimal, count * options.drawn) if minimal <= options.smallest_samples else (-(-5 * minimal // 2), count)
         present = self.weights[where, None] > 0
         drawn = self.draws(where, count, self.weights.shape[-1]).masked_fill(~present, 2.0)
         last = drawn.kthvalue(min(size, drawn.shape[-1]), dim=-1, keepdim=True).values
@@ -421,7 +417,7 @@ class Search:
 
     def _some(self) -> Matches:
         """The matches to search among."""
-        data, limit = self.data, max(SEARCHED, 10 * self.invariant.width())
+        data, limit = self.data, max(self.options.starts.searched, 10 * self.invariant.width())
         if data.count <= limit:
             return data
         order = (self.draws(self.everyone, data.count) * (data.weights > 0)).topk(limit).indices
@@ -441,7 +437,7 @@ class Search:
         primitives = tuple(p.normalized(t) for p, t in zip(self.invariant.primitives, transforms, strict=True))
         base = self.invariant.normalized(tuple(t[:, None] for t in transforms))
         scales = relative([t.flatten(1)[:, 0] for t in transforms])[0]
-        return bundle(base, primitives, searched.views, scales, searched.weights)
+        return bundle(base, primitives, searched.views, scales, searched.weights, self.options)
 
 
 def judge(work: Bundle, basis: Tensor, square: Tensor, limit: Tensor) -> tuple[Tensor, Tensor]:
@@ -466,13 +462,14 @@ def judge(work: Bundle, basis: Tensor, square: Tensor, limit: Tensor) -> tuple[T
     chance = (hits + 1) / (trials + 1)
     evidence = (n - m).clamp(min=1).log() + _choose(n, k) + _choose(k, m) + (k - m) * chance.log()
     near = ((square > limit[:, None]) & (square <= 9 * limit[:, None]) & present).sum(-1)
-    return torch.where(k > m, evidence, torch.inf), (k <= m) | (evidence >= 0) | (near > DOUBT * k)
+    return torch.where(k > m, evidence, torch.inf), (k <= m) | (evidence >= 0) | (near > work.options.doubt.just_beyond * k)
 
 
 def _mixed(work: Bundle) -> list[Bundle]:
     """Random matches: view v shifted against the first one by v steps of several sizes."""
     n, count = work.weights.shape[-1], len(work.views)
-    steps = sorted({max(1, (2 * j + 1) * n // (2 * MIXED * count)) for j in range(MIXED)})
+    sets = work.options.doubt.mixed
+    steps = sorted({max(1, (2 * j + 1) * n // (2 * sets * count)) for j in range(sets)})
     mixed = []
     for step in steps:
         weights = work.weights
@@ -501,19 +498,14 @@ def _chosen(basis: Tensor, order: Tensor) -> Tensor:
     return basis.gather(2, order[:, None, :, None, None].expand(*basis.shape[:2], order.shape[-1], *basis.shape[3:]))
 
 
-def _same(score: Tensor) -> Tensor:
-    """The score up to which two finds are the same one: the weight of a hundredth of a match is no difference."""
-    return score * (1 + SAME) + SAME
-
-
-def _near(invariant: Invariant, data: Matches) -> Tensor:
+def _near(invariant: Invariant, data: Matches, gross: float) -> Tensor:
     """Matches ``(b, n)`` without gross outliers, which would make the others small."""
     keep = data.weights > 0
     for primitive, x in zip(invariant.primitives, data.views, strict=True):
         points = primitive.points(x, data.weights).flatten(2).masked_fill((data.weights <= 0)[..., None], torch.nan)
         far = (points - points.nanmedian(1, keepdim=True).values).norm(dim=-1)
         middle = far.nanmedian(-1, keepdim=True).values
-        keep = keep & ((far <= NEAR * middle) | ~(middle > 0))
+        keep = keep & ((far <= gross * middle) | ~(middle > 0))
     return keep
 
 

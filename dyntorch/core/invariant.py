@@ -25,7 +25,7 @@ from dyntorch.numerics.least_squares import flattened, jacobian, parts_of
 P = ParamSpec("P")
 R = TypeVar("R")
 
-ARGUMENTS = ("weights", "static", "normalize", "threshold", "generator", "starts", "polish", "iterations")
+ARGUMENTS = ("weights", "static", "normalize", "threshold", "generator", "starts", "polish", "iterations", "options")
 """What ``fit``, ``robust_fit``, ``refine`` and ``sampson`` take by name for every invariant."""
 
 
