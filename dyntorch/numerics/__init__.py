@@ -25,6 +25,7 @@ _HOME = {
     "affine_factorization": "dyntorch.numerics.subspaces",
     "metric_upgrade": "dyntorch.numerics.subspaces",
     "Message": "dyntorch.numerics.messages",
+    "as_python": "dyntorch.numerics.messages",
     "worded": "dyntorch.numerics.messages",
     "named": "dyntorch.numerics.messages",
 }

@@ -17,6 +17,7 @@ from dyntorch.geometry.homogeneous import homogeneous, inhomogeneous
 from dyntorch.invariants.join_tensor import JoinTensor
 from dyntorch.invariants.minimal_join_tensor import MinimalJoinTensor
 from dyntorch.numerics.chi_square import median, three_sigma
+from dyntorch.numerics.messages import Message
 from dyntorch.tasks.align.labelling import Evidence, Labelled, joined, static_consensus
 from dyntorch.tasks.align.options import AlignOptions
 from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment, AlignNotice
@@ -28,9 +29,10 @@ MOVERS, LINES = 40, 10
 """Moving matches, and lines they lie on, that determine the tensors where nothing stands still (thesis section 8.2)."""
 ENOUGH = 5  # static matches that determine A and B by themselves
 
-AMBIGUITY = (
+AMBIGUITY = Message(
     "A and B are unique, each up to its scale, unless the steps of all points keep one ratio (constant velocity): then they are "
-    "known up to a velocity common to all points; use model='constant_velocity'. A match that agrees in two views only counts as "
+    "known up to a velocity common to all points; use {arg:model='constant_velocity'}. A match that agrees in two views only "
+    "counts as "
     "moving: a point that paused and a static point mismatched in the third view look the same."
 )
 

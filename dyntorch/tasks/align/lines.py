@@ -23,6 +23,7 @@ from dyntorch.numerics.arguments import check_options, check_threshold
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.numerics.chi_square import median, three_sigma
 from dyntorch.numerics.least_squares import by_match, damped_step, derivatives
+from dyntorch.numerics.messages import Message
 from dyntorch.numerics.nullspace import spectrum
 from dyntorch.tasks.align.options import AlignOptions
 from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment, AlignNotice
@@ -284,10 +285,10 @@ def align_lines(
     points = _points(static_points, data, l1)
     extra = 0 if points is None else points[0].shape[1]
     if data.count + PER_POINT * extra < MINIMAL:
-        raise ValueError(
-            f"align_lines needs at least {MINIMAL} lines, got {data.count} and {extra} static points, which count "
-            f"{PER_POINT} each; add lines, or give static_points=(P1, P2)"
-        )
+        text = "align_lines needs at least {needed} lines, got {lines} and {points} static points, which count {each} each; add "
+        "lines, or "
+        text += "give {arg:static_points=(P1, P2)}"
+        raise ValueError(Message(text, needed=MINIMAL, lines=data.count, points=extra, each=PER_POINT))
     with torch.no_grad():
         return _align(data, points, threshold, generator, options)
 

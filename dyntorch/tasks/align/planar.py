@@ -18,6 +18,7 @@ from dyntorch.invariants.homography_tensor import HomographyTensor
 from dyntorch.numerics.arguments import check_options, check_threshold
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.numerics.chi_square import three_sigma
+from dyntorch.numerics.messages import Message
 from dyntorch.tasks.align.labelling import Evidence, Labelled, joined, static_consensus
 from dyntorch.tasks.align.options import AlignOptions
 from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment, AlignNotice
@@ -219,8 +220,9 @@ def align_planar(
     data = matches(HomographyTensor(), (x1, x2, x3), weights, static)
     least = MINIMAL if static is None else LABELLED
     if data.count < least:
-        remedy = "add matches" if static is not None else f"add matches, or label static ones (static=; then {LABELLED} suffice)"
-        raise ValueError(f"align_planar needs at least {least} matches, got {data.count}; {remedy}")
+        remedy = "" if static is not None else ", or label static ones ({arg:static=}; then {labelled} suffice)"
+        text = "align_planar needs at least {least} matches, got {count}; add matches" + remedy
+        raise ValueError(Message(text, least=least, count=data.count, labelled=LABELLED))
     with torch.no_grad():
         return _align(data, threshold, generator, options)
 

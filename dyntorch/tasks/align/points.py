@@ -11,6 +11,7 @@ from dyntorch.core.matches import Matches, matches
 from dyntorch.invariants.join_tensor import JoinTensor
 from dyntorch.numerics.arguments import check_options, check_threshold
 from dyntorch.numerics.blocks import one_thread
+from dyntorch.numerics.messages import Message
 from dyntorch.tasks.align import join, rigid, velocity
 from dyntorch.tasks.align.options import AlignOptions
 from dyntorch.tasks.align.result import Alignment
@@ -101,13 +102,17 @@ def align_points(
     if motion not in get_args(Motion):
         raise ValueError(f"motion must be one of {', '.join(get_args(Motion))}, got {motion!r}")
     if motion != "straight" and model != "rigid":
-        raise ValueError(f"motion={motion!r} belongs to model='rigid', got model={model!r}; use model='constant_velocity'")
+        text = (
+            "{arg:motion='{motion}'} belongs to {arg:model='rigid'}, got {arg:model='{model}'}; use {arg:model='constant_velocity'}"
+        )
+        raise ValueError(Message(text, motion=motion, model=model))
     check_options(options, AlignOptions)
     check_threshold(threshold)
     data = matches(JoinTensor(), (P1, P2, P3), weights, static)
     least = (LEAST if static is None else LABELLED)[model]
     if data.count < least:
-        raise ValueError(f"align_points with model={model!r} needs at least {least} matches, got {data.count}; add matches")
+        text = "align_points with {arg:model='{model}'} needs at least {least} matches, got {count}; add matches"
+        raise ValueError(Message(text, model=model, least=least, count=data.count))
     with torch.no_grad():
         return _dispatch(data, model, threshold, motion, generator, options)
 

@@ -14,6 +14,7 @@ from dyntorch.core.outcome import failed, in_order, noting
 from dyntorch.geometry.triangulation import observed
 from dyntorch.numerics.arguments import check_options, on_cpu
 from dyntorch.numerics.blocks import one_thread
+from dyntorch.numerics.messages import Message
 from dyntorch.tasks.reconstruct.motions import Motion, as_motion
 from dyntorch.tasks.reconstruct.options import ReconstructOptions
 from dyntorch.tasks.reconstruct.projections import ViewTracks
@@ -244,10 +245,12 @@ def _enough(model: Motion, times: Tensor, x: Tensor) -> None:
     if dim != model.sensor:
         kind = "3D sensors" if model.sensor == 3 else "images"
         takes = f"{model.name!r} takes tracks of {kind}, (*batch, views, n, {model.sensor}), got {tuple(x.shape[1:])}"
-        raise ValueError(f"{takes}; choose a motion for tracks of {dim} coordinates, or motion='auto'")
+        text = "{takes}; choose a motion for tracks of {dim} coordinates, or {arg:motion='auto'}"
+        raise ValueError(Message(text, takes=takes, dim=dim))
     moves, different = _moves(model), len(times.unique())
     if moves and views > 1 and different == 1:
-        raise ValueError(f"all times are {float(times[0]):g}: views at different times are needed to see a motion; give times=")
+        text = "all times are {time:g}: views at different times are needed to see a motion; give {arg:times=}"
+        raise ValueError(Message(text, time=float(times[0])))
     many = torch.arange(12, dtype=torch.float64)
     if model.shift is None and different > 1:  # the lift may make sense between the views only
         many = torch.linspace(float(times.min()), float(times.max()), 12, dtype=torch.float64)

@@ -19,6 +19,7 @@ from dyntorch.invariants.fundamental_matrix import FundamentalMatrix
 from dyntorch.numerics.arguments import check_options, check_threshold, on_cpu
 from dyntorch.numerics.blocks import one_thread, uniform
 from dyntorch.numerics.chi_square import median
+from dyntorch.numerics.messages import Message
 from dyntorch.tasks.segment.coherence import Links, coherence
 from dyntorch.tasks.segment.energy import View
 from dyntorch.tasks.segment.labels import Labelling, Models, choose, label, significant
@@ -521,10 +522,11 @@ def _check_counts(bodies: int | None, count: int) -> None:
     if count < MINIMAL:
         raise ValueError(f"segment needs at least {MINIMAL} matches, got {count}: add {MINIMAL - count}")
     if bodies is not None and bodies * LEAST > count:
-        raise ValueError(
-            f"bodies={bodies} take at least {LEAST} matches each, {bodies * LEAST} in all, got {count}: "
-            f"add {bodies * LEAST - count}, or ask for at most {count // LEAST}"
-        )
+        text = "{arg:bodies={bodies}} take at least {least} matches each, {all} in all, got {count}: add {more}, or ask for at "
+        "most {most}"
+        whole = bodies * LEAST
+        values = {"bodies": bodies, "least": LEAST, "all": whole, "count": count, "more": whole - count, "most": count // LEAST}
+        raise ValueError(Message(text, **values))
 
 
 def _nested(models: list[tuple[BodyModel, ...]], batch: tuple[int, ...]) -> tuple[object, ...]:
