@@ -48,6 +48,12 @@ def agreed(status: Tensor) -> Tensor:
     return (status == Status.OK) | (status == Status.AMBIGUOUS)
 
 
+def status_from(found: Iterable[Notice]) -> Tensor:
+    """The status of one problem with these notices: that of the first that refuses, OK without one."""
+    refused = next((notice.code.refuses for notice in found if notice.code.refuses is not None), Status.OK)
+    return torch.tensor(int(refused))
+
+
 def status_of(degenerate: Tensor, few: Tensor | None = None) -> Tensor:
     """The status where nothing else can fail."""
     status = torch.where(degenerate, int(Status.DEGENERATE), int(Status.OK))
@@ -227,7 +233,8 @@ class Outcome:
 
     def _telling(self, status: Status) -> Sequence[Notice]:
         """The notices that say why a problem has this status, the first ones first."""
-        return self.notices
+        refusing = [notice for notice in self.notices if notice.code.refuses is not None]
+        return refusing or self.notices
 
 
 def check_status(what: str, status: Tensor, said: Sequence[Notice] = (), remedies: Mapping[Status, str] = REMEDY) -> None:

@@ -16,6 +16,7 @@ from dyntorch.geometry.options import LensOptions
 from dyntorch.numerics.arguments import check_options, on_cpu
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.numerics.least_squares import damped_step
+from dyntorch.numerics.messages import Message
 
 COEFFICIENTS = (4, 5, 8)
 """Lengths of OpenCV's vectors k1, k2, p1, p2 [, k3 [, k4, k5, k6]]."""
@@ -289,10 +290,8 @@ class LensFit:
     @property
     def note(self) -> str:
         """What a user should know where the fit is used."""
-        return (
-            f"lens distortion fitted, lambda = {self.lambda_a:+.3f} and {self.lambda_b:+.3f}: an approximation; "
-            "give calibration=((K, dist), (K, dist))"
-        )
+        text = "lens distortion fitted, lambda = {a:+.3f} and {b:+.3f}: an approximation; give "
+        return Message(text + "{arg:calibration=((K, dist), (K, dist))}", a=self.lambda_a, b=self.lambda_b)
 
 
 @one_thread

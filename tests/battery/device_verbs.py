@@ -150,7 +150,7 @@ def affine_bodies() -> tuple[Tensor, Tensor]:
 def shift(offset: float) -> dyn.Shift:
     """A shift that stands out alone."""
     peaks, none = torch.tensor([[offset, 1.0]], dtype=F64), torch.zeros(0, dtype=F64)
-    return dyn.Shift(offset, 0.01, 1.0, 0.0, 0.9, peaks, True, "", "epipolar", (30.0, 30.0), 0.0, none, none)
+    return dyn.Shift(offset, 0.01, 1.0, 0.0, 0.9, peaks, "epipolar", (30.0, 30.0), 0.0, none, none, status=torch.tensor(0))
 
 
 # ---- calls that take several steps -------------------------------------------------------------------------------------

@@ -12,10 +12,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dyntorch.core.outcome import Notice, status_from
 from dyntorch.numerics.arguments import check_options, on_cpu
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.tasks.synchronize.options import SynchronizeOptions
-from dyntorch.tasks.synchronize.result import Clocks, Pair, Shift
+from dyntorch.tasks.synchronize.result import Clocks, ClocksNotice, Pair, Shift
 from dyntorch.tasks.synchronize.synchronize import synchronize
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -364,7 +365,7 @@ def synchronize_cameras(
         >>> def pair(a, b, correspondence, **given):  # stands in for dyntorch.synchronize
         ...     shift = float(b[0, 0, 0] - a[0, 0, 0])
         ...     peaks, none = torch.tensor([[shift, 1.0]]), torch.zeros(0)
-        ...     return Shift(shift, 0.01, 1.0, 0.0, 0.99, peaks, True, "", "epipolar", (30.0, 30.0), 0.0, none, none)
+        ...     return Shift(shift, 0.01, 1.0, 0.0, 0.99, peaks, "epipolar", (30.0, 30.0), 0.0, none, none, status=torch.tensor(0))
         >>> tracks = [torch.full((9, 4, 2), start) for start in (0.0, 2.0, -0.5)]
         >>> synchronize_cameras(tracks, fps=30.0, pair=pair).offsets.round(decimals=6).tolist()
         [0.0, 2.0, -0.5]
@@ -425,8 +426,8 @@ def combine_shifts(
         >>> import torch
         >>> def shift(offset, *more):
         ...     peaks = torch.tensor([[value, 1.0] for value in (offset, *more)])
-        ...     none, reason = torch.zeros(0), "periodic" if more else ""
-        ...     return Shift(offset, 0.01, 1.0, 0.0, 0.9, peaks, not more, reason, "epipolar", (30.0, 30.0), 0.0, none, none)
+        ...     none, status = torch.zeros(0), torch.tensor(3 if more else 0)  # periodic motion is ambiguous
+        ...     return Shift(offset, 0.01, 1.0, 0.0, 0.9, peaks, "epipolar", (30.0, 30.0), 0.0, none, none, status=status)
         >>> clocks = combine_shifts({(0, 1): shift(1.0), (0, 2): shift(3.0), (1, 2): shift(0.9, 2.0, 3.1)}, 3)
         >>> clocks.offsets.round(decimals=3).tolist(), clocks.ok
         ([0.0, 1.0, 3.0], True)
@@ -445,7 +446,6 @@ def combine_shifts(
     best = min(ranked, key=lambda one: (int(one.starts.isnan().sum()), one.cost))
     rivals = [one for one in ranked if one is not best]
     confidence = 1 / (1 + sum(exp(min(best.cost - one.cost, 50.0)) for one in rivals))
-    reason = _reason(net, shifts, best, rivals, reference, options)
     rates = best.logs.exp()
     offsets = net.means + rates * (best.starts - net.means[reference])
     used = [edge for edge, label in enumerate(best.labels) if label >= 0]
@@ -453,6 +453,8 @@ def combine_shifts(
     center = float((net.times[used, 0] / rates[here] - best.starts[here]).mean()) if used else 0.0
     table = _pairs(net, shifts, best)
     cycles = _cycles(net, shifts, best, table)
+    refusal = _refusal(net, shifts, best, rivals, reference, options)
+    limits = (*(() if refusal is None else (refusal,)), *_notices(table, cameras, shifts))
     return Clocks(
         offsets=offsets,
         rates=rates,
@@ -463,12 +465,11 @@ def combine_shifts(
         cycle_error=(sum(error**2 for _, error in cycles) / len(cycles)) ** 0.5 if cycles else nan,
         worst_cycle=max(cycles, key=lambda one: abs(one[1]), default=None),
         outliers=[row.cameras for row in table if row.outlier],
-        ok=not reason,
-        reason=reason,
         reference=reference,
         center=center + float(net.means[reference]),
         shifts=dict(shifts),
-        notes=_notes(table, cameras, shifts),
+        status=status_from(limits),
+        notices=limits,
     )
 
 
@@ -522,18 +523,18 @@ def _cycles(
     return found
 
 
-def _reason(
+def _refusal(
     net: Network,
     shifts: Mapping[tuple[int, int], Shift],
     best: Reading,
     rivals: Sequence[Reading],
     reference: int,
     options: SynchronizeOptions,
-) -> str:
-    """Why the pairs do not decide; empty where they do."""
+) -> Notice | None:
+    """Why the pairs do not decide; None where they do."""
     lost = best.starts.isnan().nonzero().flatten().tolist()
     if lost:
-        return f"no pair leads from the reference to {_named(lost)}: compare further pairs, or leave these cameras out"
+        return Notice(ClocksNotice.LOST, float(len(lost)), {"lost": tuple(lost)})
     ends, sure = list(shifts), _surely_tied(shifts, best, reference)
     margins = [
         options.cameras.decided if sure.issuperset(differing(net, best, one, options)) else options.cameras.confirmed
@@ -541,18 +542,17 @@ def _reason(
     ]
     close = [one for one, margin in zip(rivals, margins, strict=True) if one.cost - best.cost < margin]
     if not close:
-        return ""
+        return None
     rival = min(close, key=lambda one: one.cost)
-    named = _named(differing(net, best, rival, options))
+    undecided = tuple(differing(net, best, rival, options))
     lost = rival.starts.isnan().nonzero().flatten().tolist()
     refused = [pair for pair, shift in shifts.items() if not shift.ok and (not lost or set(lost) & set(pair))]
     if refused:
-        first = shifts[refused[0]].reason
-        return f"{named}: too few sure pairs, {_listed(refused)} refused ({first})" if len(shifts) > 1 else first
+        values = {"cameras": undecided, "refused": tuple(refused), "first": shifts[refused[0]].reason}
+        case = "pairs" if len(shifts) > 1 else "pair"
+        return Notice(ClocksNotice.REFUSED, float(len(refused)), {"case": case, **values})
     torn = [pair for pair, one, other in zip(ends, best.labels, rival.labels, strict=True) if one != other]
-    return (
-        f"{named}: the pairs {_listed(torn)} contradict each other and nothing tells which is wrong; film longer, or add a camera"
-    )
+    return Notice(ClocksNotice.CONTRADICTION, float(len(torn)), {"cameras": undecided, "torn": tuple(torn)})
 
 
 def _surely_tied(shifts: Mapping[tuple[int, int], Shift], best: Reading, reference: int) -> set[int]:
@@ -564,32 +564,25 @@ def _surely_tied(shifts: Mapping[tuple[int, int], Shift], best: Reading, referen
     return tied
 
 
-def _notes(table: Sequence[Pair], cameras: int, shifts: Mapping[tuple[int, int], Shift]) -> tuple[str, ...]:
-    notes = []
+def _notices(table: Sequence[Pair], cameras: int, shifts: Mapping[tuple[int, int], Shift]) -> tuple[Notice, ...]:
+    """What to know besides."""
+    found = []
     degree = [sum(row.used and camera in row.cameras for row in table) for camera in range(cameras)]
-    alone = [camera for camera in range(cameras) if degree[camera] == 1]
+    alone = tuple(camera for camera in range(cameras) if degree[camera] == 1)
     if cameras == 2:
-        notes.append("two cameras: nothing checks the pair; a third one would")
+        found.append(Notice(ClocksNotice.TWO))
     elif alone:
-        notes.append(f"{_named(alone)}: tied by one pair alone, which nothing checks")
+        found.append(Notice(ClocksNotice.ALONE, float(len(alone)), {"cameras": alone}))
     for row in table:
-        i, j = row.cameras
-        if row.outlier:
-            own = row if row.peak < 0 else None
-            away = f" by {own.residual:+.3f} s" if own else f": the others confirm its {_place(row.peak)} at {row.shift:+.3f} s"
-            notes.append(f"pair {i}-{j} is sure of itself but contradicts the others{away}")
+        values = {"pair": (row.cameras,), "peak": _place(row.peak)}
+        if row.outlier and row.used:
+            found.append(Notice(ClocksNotice.OUTLIER, row.shift, {"case": "used", **values}))
+        elif row.outlier:
+            found.append(Notice(ClocksNotice.OUTLIER, row.residual, {"case": "unused", **values}))
         elif row.used and not row.ok and cameras > 2:
-            notes.append(f"pair {i}-{j} refused on its own; the others confirm its {_place(row.peak)} at {row.shift:+.3f} s")
-    notes += [f"pair {i}-{j}: {note}" for (i, j), shift in shifts.items() for note in shift.notes]
-    return tuple(notes)
-
-
-def _named(cameras: Sequence[int]) -> str:
-    return f"camera{'s' if len(cameras) > 1 else ''} {', '.join(map(str, cameras))}"
-
-
-def _listed(pairs: Sequence[tuple[int, int]]) -> str:
-    return ", ".join(f"{i}-{j}" for i, j in pairs)
+            found.append(Notice(ClocksNotice.CONFIRMED, row.shift, values))
+    of_pairs = [(ends, note) for ends, shift in shifts.items() for note in shift.notes]
+    return (*found, *(Notice(ClocksNotice.OF_PAIR, 0.0, {"pair": (ends,), "note": note}) for ends, note in of_pairs))
 
 
 def _place(peak: int) -> str:

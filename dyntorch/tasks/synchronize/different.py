@@ -9,8 +9,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from dyntorch.core.outcome import Notice, status_from
 from dyntorch.tasks.synchronize.options import SynchronizeOptions
-from dyntorch.tasks.synchronize.result import Shift
+from dyntorch.tasks.synchronize.result import Shift, ShiftNotice
 from dyntorch.tasks.synchronize.subspace import STEP, Body, SubspaceCurve, bodies_curve, halves, information, subspace_curve
 from dyntorch.tasks.synchronize.tracks import Tracks, smoothed
 
@@ -116,8 +117,7 @@ class SubspaceShift:
         peaks: ``(k, 2)`` position and score of local maxima, best first.
         probability: that the position is right to within a frame.
         margin: nats per frame over the next peak, times the frames that overlap at the best: periodic motion has none.
-        ok: whether the data decide.
-        reason: why not, and what to do; empty where ``ok``.
+        refusal: why the data do not decide; None where they do.
     """
 
     position: float
@@ -125,8 +125,17 @@ class SubspaceShift:
     peaks: Tensor
     probability: float
     margin: float
-    ok: bool
-    reason: str
+    refusal: Notice | None = None
+
+    @property
+    def ok(self) -> bool:
+        """Whether the data decide."""
+        return self.refusal is None
+
+    @property
+    def reason(self) -> str:
+        """Why not, and what to do; empty where they do."""
+        return "" if self.refusal is None else self.refusal.text
 
 
 def subspace_shift(
@@ -156,7 +165,7 @@ def subspace_shift(
     """
     judged = curve.scores.isfinite()
     if int(judged.sum()) < 3:
-        return _refused(curve, "the cameras overlap too little to judge any shift: film longer, or give a larger max_shift")
+        return SubspaceShift(0.0, math.inf, curve.scores.new_zeros(0, 2), 0.0, 0.0, Notice(ShiftNotice.SHORT_OVERLAP))
     scores = curve.scores.nan_to_num(-math.inf)
     top = _maxima(scores, options.different.apart / step, options)
     positions = [_between(scores, i) for i in top[: options.different.peaks]]
@@ -168,17 +177,16 @@ def subspace_shift(
     position = float(peaks[0, 0])
     sigma = math.hypot(options.different.blur / step, max(positions[0][1], wobble(curve, round(position), options)))
     times = start + step * peaks[1:4, 0]
-    reason = _reason(curve, best, probability, margin, times, step, options)
+    refusal = _refusal(curve, best, probability, margin, times, step, options)
     if (
-        not reason
+        refusal is None
         and margin < options.different.alone * float(scores[best])
         and resemblance(curve, best, options.different.apart / step, options) > options.different.repeated
     ):
-        reason = "the motion repeats itself, and another shift fits as well: film something that does not"
-    if not reason and sigma > options.different.sharp:
-        known = f"to {sigma * step:.3f} s" if math.isfinite(sigma) else "roughly"
-        reason = f"the best shift is only known {known}: film longer, or a larger motion"
-    return SubspaceShift(position, sigma, peaks, probability, margin, not reason, reason)
+        refusal = Notice(ShiftNotice.REPEATED, margin, {"case": "itself"})
+    if refusal is None and sigma > options.different.sharp:
+        refusal = Notice(ShiftNotice.BLUNT, sigma * step, {"case": "known" if math.isfinite(sigma) else "rough"})
+    return SubspaceShift(position, sigma, peaks, probability, margin, refusal)
 
 
 def _maxima(scores: Tensor, apart: float, options: SynchronizeOptions) -> list[int]:
@@ -217,26 +225,20 @@ def _margin(curve: SubspaceCurve, best: int, apart: float, options: SynchronizeO
     return float((rates[best] - rates[others[0]]) * curve.counts[best]) if others else float(curve.scores[best])
 
 
-def _reason(
+def _refusal(
     curve: SubspaceCurve, best: int, probability: float, margin: float, times: Tensor, step: float, options: SynchronizeOptions
-) -> str:
+) -> Notice | None:
     """Why the data do not decide; empty where they do."""
     if min(curve.signal) < 1 or float(curve.rates[best]) < options.different.telling * step:
-        return "the motion is too small against the noise, or the cameras do not show the same event: film a larger motion"
+        return Notice(ShiftNotice.NOISY, min(curve.signal))
     if curve.bodies is not None and min(body.bend for body in curve.bodies) < options.different.bent:
-        return "all points move on straight lines at constant velocity, as at any other shift: film a motion that turns or stops"
+        return Notice(ShiftNotice.STRAIGHT, min(body.bend for body in curve.bodies))
     if probability >= options.different.sure and margin >= options.different.clear:
-        return ""
+        return None
     others = ", ".join(f"{time:+.2f}" for time in times.tolist())
-    if margin < options.different.clear:
-        return (
-            f"other shifts fit about as well (seconds: {others}), as where the motion repeats itself: film something that does not"
-        )
-    return f"the best shift is not clear of others (seconds: {others}): film longer, or a larger motion"
-
-
-def _refused(curve: SubspaceCurve, reason: str) -> SubspaceShift:
-    return SubspaceShift(0.0, math.inf, curve.scores.new_zeros(0, 2), 0.0, 0.0, False, reason)
+    return Notice(
+        ShiftNotice.REPEATED, margin, {"case": "others" if margin < options.different.clear else "unclear", "rivals": others}
+    )
 
 
 def different_points(a: Tracks, b: Tracks, *, max_shift: float | None, rate: float | None, options: SynchronizeOptions) -> Shift:
@@ -266,10 +268,7 @@ def _to_a_frame(best: SubspaceShift, step: float, frame: float, options: Synchro
     """Refused where the shift is not known to a frame of the slower camera, though it may be to a step of the search."""
     if not best.ok or best.sigma * step <= options.different.sharp_frames * frame:
         return best
-    reason = (
-        f"the best shift is uncertain by {best.sigma * step:.2g} s, frames are {frame:.2g} s apart: film longer, or larger motion"
-    )
-    return dataclasses.replace(best, ok=False, reason=reason)
+    return dataclasses.replace(best, refusal=Notice(ShiftNotice.BLUNT, best.sigma * step, {"case": "frame", "frame": frame}))
 
 
 class _Samples:
@@ -374,6 +373,7 @@ def _result(a: Tracks, b: Tracks, samples: _Samples, curve: SubspaceCurve, best:
     peaks = best.peaks.clone()
     if len(peaks):
         peaks[:, 0] = samples.lag(peaks[:, 0]) + drift
+    limits = () if best.refusal is None else (best.refusal,)
     return Shift(
         offset=offset,
         sigma=best.sigma * samples.step,
@@ -381,11 +381,11 @@ def _result(a: Tracks, b: Tracks, samples: _Samples, curve: SubspaceCurve, best:
         rate_sigma=rate_sigma if rate != 1 else 0.0,
         confidence=best.probability,
         peaks=peaks,
-        ok=best.ok,
-        reason=best.reason,
         method="subspace",
         fps=(1 / a.step, 1 / b.step),
         center=center,
         lags=torch.as_tensor(samples.lag(curve.lags)) + drift,
         scores=curve.scores,
+        status=status_from(limits),
+        notices=limits,
     )

@@ -3,15 +3,104 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Self
 
 import torch
 from torch import Tensor
 
+from dyntorch.core.outcome import Notice, NoticeCode, Outcome, Status
+
+
+class ShiftNotice(NoticeCode):
+    """Why two cameras' clocks are not decided, or what to know besides, and how it is said."""
+
+    NO_POINT = "no_point", "no point is seen in {camera:{which}}; check the detections", Status.TOO_FEW
+    """A camera shows nothing."""
+    STILL = "still", "nothing moves in {camera:{which}}; film some movement", Status.DEGENERATE
+    """Nothing moves."""
+    NOTHING = (
+        "nothing",
+        "no shift stands out, or both cameras never show enough points at once; film longer, or raise {arg:max_shift}",
+        Status.DEGENERATE,
+    )
+    """No shift is better than others."""
+    EDGE = (
+        "edge",
+        "the best shift, about {best:+.3g} s, lies at the end of the search or beyond; raise {arg:max_shift}",
+        Status.AMBIGUOUS,
+    )
+    """The best shift lies at the end of the search."""
+    BLUNT = (
+        "blunt",
+        {
+            "small": "the motion is too small for its noise: the best shift, {best:+.3g} s, is uncertain by {value:.2g} s or "
+            "more; film "
+            "larger or faster movements",
+            "known": "the best shift is only known to {value:.3f} s: film longer, or a larger motion",
+            "rough": "the best shift is only known roughly: film longer, or a larger motion",
+            "frame": "the best shift is uncertain by {value:.2g} s, frames are {frame:.2g} s apart: film longer, or larger motion",
+        },
+        Status.AMBIGUOUS,
+    )
+    """The shift is uncertain by more than a frame."""
+    REPEATED = (
+        "repeated",
+        {
+            "rivals": "the motion repeats itself or is too small: {best:+.3g} s fits hardly better than {rivals}; film "
+            "something that "
+            "happens once, or narrow {arg:max_shift}",
+            "itself": "the motion repeats itself, and another shift fits as well: film something that does not",
+            "others": "other shifts fit about as well (seconds: {rivals}), as where the motion repeats itself: film something "
+            "that does "
+            "not",
+            "unclear": "the best shift is not clear of others (seconds: {rivals}): film longer, or a larger motion",
+        },
+        Status.AMBIGUOUS,
+    )
+    """Other shifts fit as well."""
+    HALVES = (
+        "halves",
+        "the halves of the take say {halves}, more than {apart:g} frames from {best:+.3g} s: the cameras may show different "
+        "events, "
+        "overlap too little, or one of them moved",
+        Status.NO_CONSENSUS,
+    )
+    """The two halves of the take contradict the whole."""
+    SHORT_OVERLAP = (
+        "short_overlap",
+        "the cameras overlap too little to judge any shift: film longer, or give a larger {arg:max_shift}",
+        Status.TOO_FEW,
+    )
+    """Two cameras have too few frames in common."""
+    NOISY = (
+        "noisy",
+        "the motion is too small against the noise, or the cameras do not show the same event: film a larger motion",
+        Status.NO_CONSENSUS,
+    )
+    """The motion is below the noise."""
+    STRAIGHT = (
+        "straight",
+        "all points move on straight lines at constant velocity, as at any other shift: film a motion that turns or stops",
+        Status.DEGENERATE,
+    )
+    """Motion that looks the same at every shift."""
+    AFFINE = "affine", "affine cameras: the points do not hold enough depth, or are too noisy, for perspective ones"
+    """What was fitted are affine cameras."""
+    LENS = (
+        "lens",
+        "lens distortion fitted, lambda = {a:+.3f} and {b:+.3f}: an approximation; give {arg:calibration=((K, dist), (K, dist))}",
+    )
+    """What was fitted are lenses, too."""
+    LEFT_OUT = "left_out", "{value:g} of {points} points never agree with the others and were left out: {which}"
+    """Points that are never consistent with the others."""
+    MOVED = "moved", "each half of the take fits much better by itself: a camera may have moved"
+    """A camera that moved."""
+
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Shift:
+class Shift(Outcome):
     """One camera's clock against another's.
 
     A moment that camera a shows at time :math:`t_a` is shown by camera b at
@@ -26,8 +115,8 @@ class Shift:
         confidence: probability in [0, 1] that the offset is right to within a frame, as far as the data can tell.
         peaks: ``(k, 2)`` float64, offset in seconds and score of every local maximum of the curve worth a look, best first.
             Offsets are those at ``center``: :math:`t_b - t_a` there.
-        ok: whether the data decide.
-        reason: why not, in one sentence with what to do; empty where ``ok``.
+        status: OK where the data decide, as ``ok`` says; ``reason`` says why not, in one sentence with what to do.
+        notices: that reason, and what a user should know besides (``notes``).
         method: ``"epipolar"``, ``"affine"`` (both: same points), ``"subspace"`` (different points), ``"brightness"``.
         fps: frames per second of a and of b, of the timestamps' median where these were given.
         center: a's time in the middle of the overlap: where offset and rate are least correlated.
@@ -37,7 +126,6 @@ class Shift:
             where points do not correspond.
         fundamental: ``(3, 3)`` of norm 1, :math:`x_b^T F x_a = 0` in the coordinates given (after removal of lens distortion, where
             that was asked for); None where there is none.
-        notes: what a user should know besides.
     """
 
     offset: float
@@ -46,8 +134,6 @@ class Shift:
     rate_sigma: float
     confidence: float
     peaks: Tensor
-    ok: bool
-    reason: str
     method: str
     fps: tuple[float, float]
     center: float
@@ -55,7 +141,18 @@ class Shift:
     scores: Tensor
     points: Tensor | None = None
     fundamental: Tensor | None = None
-    notes: tuple[str, ...] = field(default=())
+
+    TASK = "synchronize"
+
+    @property
+    def ok(self) -> bool:
+        """Whether the data decide."""
+        return int(self.status) == Status.OK
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a user should know besides the reason."""
+        return told(self.notices)
 
     @property
     def frames(self) -> float:
@@ -74,15 +171,19 @@ class Shift:
         """The same clocks, counted from another moment: both said ``origin`` at what was 0."""
         return dataclasses.replace(self, offset=self.offset + (1 - self.rate) * origin, center=self.center + origin)
 
-    def check(self) -> Shift:
+    def check(self) -> Self:
         """Raise where the data do not decide.
 
         Raises:
             ValueError: the reason.
         """
         if not self.ok:
-            raise ValueError(f"synchronize: {self.reason}")
+            raise ValueError(f"{self.task}: {self.reason}")
         return self
+
+    def _telling(self, status: Status) -> Sequence[Notice]:
+        """The first notice that refuses."""
+        return refusing(self.notices)
 
     def __repr__(self) -> str:
         drift = f", rate {1e6 * (self.rate - 1):+.0f} ± {1e6 * self.rate_sigma:.0f} ppm" if self.rate != 1 else ""
@@ -91,6 +192,16 @@ class Shift:
         lines += [f"  peak {offset:+.3f} s, score {score:.3f}" for offset, score in self.peaks[:3].tolist()]
         lines += [f"  note: {note}" for note in self.notes]
         return "\n".join(lines)
+
+
+def told(found: Sequence[Notice]) -> tuple[str, ...]:
+    """The sentences of the notices that refuse nothing."""
+    return tuple(notice.text for notice in found if notice.code.refuses is None)
+
+
+def refusing(found: Sequence[Notice]) -> tuple[Notice, ...]:
+    """The first notice that refuses, if any."""
+    return tuple(notice for notice in found if notice.code.refuses is not None)[:1]
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -125,8 +236,52 @@ class Pair:
         return self.ok and self.peak != 0
 
 
+class ClocksNotice(NoticeCode):
+    """Why the clocks of several cameras are not decided, or what to know besides, and how it is said."""
+
+    LOST = (
+        "lost",
+        "no pair leads from the reference to {lost:cameras}: compare further pairs, or leave these cameras out",
+        Status.TOO_FEW,
+    )
+    """Cameras that no pair ties to the reference."""
+    REFUSED = (
+        "refused",
+        {
+            "pairs": "{cameras:cameras}: too few sure pairs, {refused:pairs} refused ({first})",
+            "pair": "{first}",
+        },
+        Status.AMBIGUOUS,
+    )
+    """Too few pairs decide by themselves."""
+    CONTRADICTION = (
+        "contradiction",
+        "{cameras:cameras}: the pairs {torn:pairs} contradict each other and nothing tells which is wrong; film longer, or add "
+        "a camera",
+        Status.NO_CONSENSUS,
+    )
+    """Sure pairs contradict each other."""
+    TWO = "two", "two cameras: nothing checks the pair; a third one would"
+    """Nothing checks a single pair."""
+    ALONE = "alone", "{cameras:cameras}: tied by one pair alone, which nothing checks"
+    """Nothing checks the only pair of a camera."""
+    OUTLIER = (
+        "outlier",
+        {
+            "unused": "pair {pair:pairs} is sure of itself but contradicts the others by {value:+.3f} s",
+            "used": "pair {pair:pairs} is sure of itself but contradicts the others: the others confirm its {peak} at "
+            "{value:+.3f} s",
+        },
+    )
+    """A pair that is sure and wrong."""
+    CONFIRMED = "confirmed", "pair {pair:pairs} refused on its own; the others confirm its {peak} at {value:+.3f} s"
+    """A pair that does not decide, but has a peak that the others confirm."""
+    OF_PAIR = "of_pair", "pair {pair:pairs}: {note}"
+    """What the comparison of a pair says."""
+
+
 @dataclass(frozen=True, eq=False, repr=False)
-class Clocks:
+class Clocks(Outcome):
     """All cameras' clocks against the reference camera's.
 
     The moment that the reference camera shows at time :math:`t` is shown by camera i at
@@ -144,12 +299,11 @@ class Clocks:
         cycle_error: RMS over triangles of cameras, in seconds, of going round them by the pairs used; NaN without triangles.
         worst_cycle: the cameras of the triangle that closes worst, and by how many seconds; None without triangles.
         outliers: pairs (i, j) that are sure of themselves and wrong.
-        ok: whether the data decide.
-        reason: why not, in one sentence with what to do; empty where ``ok``.
+        status: OK where the data decide, as ``ok`` says; ``reason`` says why not, in one sentence with what to do.
+        notices: that reason, and what a user should know besides (``notes``).
         reference: the camera whose clock is t.
         center: time of the reference camera in the middle of the overlaps.
         shifts: what the pairs said.
-        notes: what a user should know besides.
     """
 
     offsets: Tensor
@@ -161,12 +315,21 @@ class Clocks:
     cycle_error: float
     worst_cycle: tuple[tuple[int, int, int], float] | None
     outliers: list[tuple[int, int]]
-    ok: bool
-    reason: str
     reference: int
     center: float
     shifts: Mapping[tuple[int, int], Shift]
-    notes: tuple[str, ...] = field(default=())
+
+    TASK = "synchronize_cameras"
+
+    @property
+    def ok(self) -> bool:
+        """Whether the data decide."""
+        return int(self.status) == Status.OK
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a user should know besides the reason."""
+        return told(self.notices)
 
     def at(self, times: Tensor | float) -> Tensor:
         """Times of all clocks, ``(cameras, ...)``, of the moments at ``times`` of the reference clock."""
@@ -178,15 +341,19 @@ class Clocks:
         """Times of the reference clock, of the moments at ``times`` of a camera's clock."""
         return (torch.as_tensor(times, dtype=torch.float64) - self.offsets[camera]) / self.rates[camera]
 
-    def check(self) -> Clocks:
+    def check(self) -> Self:
         """Raise where the data do not decide.
 
         Raises:
             ValueError: the reason.
         """
         if not self.ok:
-            raise ValueError(f"synchronize_cameras: {self.reason}")
+            raise ValueError(f"{self.task}: {self.reason}")
         return self
+
+    def _telling(self, status: Status) -> Sequence[Notice]:
+        """The first notice that refuses."""
+        return refusing(self.notices)
 
     def __repr__(self) -> str:
         cycle = "" if self.worst_cycle is None else f", cycle error {self.cycle_error:.4f} s"

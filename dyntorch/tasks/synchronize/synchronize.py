@@ -12,14 +12,16 @@ from typing import Any
 import torch
 from torch import Generator, Tensor
 
+from dyntorch.core.outcome import Notice, status_from
 from dyntorch.geometry.lens import fit_distortion, undistorted
 from dyntorch.numerics.arguments import check_options, on_cpu
 from dyntorch.numerics.blocks import one_thread
+from dyntorch.numerics.messages import Message
 from dyntorch.tasks.synchronize.different import different_points
 from dyntorch.tasks.synchronize.epipolar import Curve, EpipolarFit, Samples, ShiftDescent, epipolar_curve
 from dyntorch.tasks.synchronize.evidence import Attempt, consistent_points
 from dyntorch.tasks.synchronize.options import SynchronizeOptions
-from dyntorch.tasks.synchronize.result import Shift
+from dyntorch.tasks.synchronize.result import Shift, ShiftNotice
 from dyntorch.tasks.synchronize.tracks import Tracks, cleaned, frame_scaled, read_tracks, smoothed, without
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -125,7 +127,7 @@ class Result:
     """
 
     found: Attempt
-    notes: tuple[str, ...]
+    notices: tuple[Notice, ...]
     seen: Tensor
 
 
@@ -157,16 +159,15 @@ def same_points(
     found = _sorted_out(a, b, search, generator, options)
     if not found.decided and rate is None:
         found = _better(found, _over_rates(a, b, search, span, generator, options))
-    notes: tuple[str, ...] = ()
+    known: tuple[Notice, ...] = ()
     if lenses and found.fit is not None and found.roughness > options.search.rough:
-        found, notes = _straightened(found, a, b, search, generator, options)
+        found, known = _straightened(found, a, b, search, generator, options)
     if camera == "auto" and not found.decided:
         scaled = _affine(a, b, search, generator, options)
         # without the place in the picture a gait repeats itself, so that affine cameras alone may be sure of a wrong period
         if scaled.decided and _agree(scaled, found, options):
-            note = "affine cameras: the points do not hold enough depth, or are too noisy, for perspective ones"
-            return Result(scaled, (note,), seen)
-    return Result(found, notes if found.decided else (), seen)
+            return Result(scaled, (Notice(ShiftNotice.AFFINE),), seen)
+    return Result(found, known if found.decided else (), seen)
 
 
 def _sorted_out(a: Tracks, b: Tracks, search: ShiftSearch, generator: Generator | None, options: SynchronizeOptions) -> Attempt:
@@ -257,7 +258,7 @@ def _suspects(found: Attempt, options: SynchronizeOptions) -> Tensor:
 
 def _straightened(
     found: Attempt, a: Tracks, b: Tracks, search: ShiftSearch, generator: Generator | None, options: SynchronizeOptions
-) -> tuple[Attempt, tuple[str, ...]]:
+) -> tuple[Attempt, tuple[Notice, ...]]:
     """Once more with lenses fitted at the shift found, where they are significant."""
     assert found.fit is not None
     fit = found.fit
@@ -273,7 +274,8 @@ def _straightened(
         straight.append(dataclasses.replace(tracks, x=torch.where(seen[..., None], x, 0.0), weights=tracks.weights * seen))
     again = attempt(straight[0], straight[1], search, found.points, options=options)
     better = again.fit is not None and again.fit.residual < fit.residual and _better(found, again) is again
-    return (again, (lens.note,)) if better else (found, ())
+    values = {"a": lens.lambda_a, "b": lens.lambda_b}
+    return (again, (Notice(ShiftNotice.LENS, 0.0, values),)) if better else (found, ())
 
 
 CAMERAS = ("auto", "perspective", "affine")
@@ -359,7 +361,8 @@ def synchronize(
     ]
     for name, one in zip("ab", tracks, strict=True):
         if len(one.times) < options.input.fewest_frames:
-            raise ValueError(f"{name} has {len(one.times)} frames, {options.input.fewest_frames} are needed at least")
+            text = "{camera:{which}} has {frames} frames, {needed} are needed at least"
+            raise ValueError(Message(text, which=name, frames=len(one.times), needed=options.input.fewest_frames))
     if calibration is not None:
         tracks = [_straight(name, one, lens) for name, one, lens in zip("ab", tracks, _pairwise(calibration), strict=True)]
     # both clocks count from a's first frame: timestamps may be of any era, and products of rates with them lose digits
@@ -368,10 +371,9 @@ def synchronize(
     if not correspondence:
         return different_points(first, second, max_shift=max_shift, rate=rate, options=options).since(origin)
     if a.shape[1] != b.shape[1]:
-        raise ValueError(
-            f"a has {a.shape[1]} points and b {b.shape[1]}: corresponding points are as many; "
-            "give the same ones in the same order, or correspondence=False"
-        )
+        text = "{camera:a} has {a} points and {camera:b} {b}: corresponding points are as many; give the same ones in the same "
+        "order, or "
+        raise ValueError(Message(text + "{arg:correspondence=False}", a=a.shape[1], b=b.shape[1]))
     result = same_points(
         first,
         second,
@@ -402,7 +404,7 @@ def _check(
             got = f"{len(value)} values" if isinstance(value, Sequence) else type(value).__name__
             raise ValueError(f"{name} must be a pair, one of a and one of b, got {got}")
     if max_shift is not None and not 0 < max_shift < math.inf:
-        raise ValueError(f"max_shift must be a positive number of seconds or None, got {max_shift}")
+        raise ValueError(Message("{arg:max_shift} must be a positive number of seconds or None, got {given}", given=max_shift))
     if rate is not None and not 0.1 < rate < 10:
         raise ValueError(f"rate must be about 1 (seconds of b's clock per second of a's), got {rate}; give fps for frame rates")
     if camera not in CAMERAS:
@@ -421,29 +423,32 @@ def _straight(name: str, tracks: Tracks, lens: Any) -> Tracks:
     try:
         x = undistorted(tracks.x, lens)
     except ValueError as problem:
-        raise ValueError(f"calibration of {name}: {problem}") from problem
+        raise ValueError(Message("calibration of {camera:{which}}: {said}", which=name, said=str(problem))) from problem
     seen = (tracks.weights > 0) & x.isfinite().all(-1)
     return dataclasses.replace(tracks, x=torch.where(seen[..., None], x, 0.0), weights=torch.where(seen, tracks.weights, 0.0))
 
 
 def _shift(result: Result, options: SynchronizeOptions) -> Shift:
     """The result of an attempt."""
-    found, notes = result.found, result.notes
+    found, limits = result.found, result.notices
     fps = 1 / found.a.step, 1 / found.b.step
     fit = found.fit
     points = found.points & result.seen
     if fit is None:
         none = torch.zeros(0, dtype=torch.float64)
-        reason = _nothing(found)
+        limits = (_nothing(found),)
         return Shift(
-            0.0, math.inf, 1.0, 0.0, 0.0, none.reshape(0, 2), False, reason, found.method, fps, 0.0, none, none, result.seen
-        )
+            0.0, math.inf, 1.0, 0.0, 0.0, none.reshape(0, 2), found.method, fps, 0.0, none, none, result.seen,
+            status=status_from(limits), notices=limits,
+        )  # fmt: skip
+    if not found.decided:
+        limits = (_refusal(found, options), *limits)
     wrong = (result.seen & ~found.points).nonzero()[:, 0].tolist()
     if wrong:
         which = ", ".join(str(point) for point in wrong)
-        notes = (*notes, f"{len(wrong)} of {len(points)} points never agree with the others and were left out: {which}")
+        limits = (*limits, Notice(ShiftNotice.LEFT_OUT, float(len(wrong)), {"points": len(points), "which": which}))
     if found.decided and found.wander > options.evidence.wander:
-        notes = (*notes, "each half of the take fits much better by itself: a camera may have moved")
+        limits = (*limits, Notice(ShiftNotice.MOVED, found.wander))
     lags = found.curve.rate * (found.curve.lags + fit.center) - fit.center
     return Shift(
         offset=fit.offset,
@@ -452,8 +457,6 @@ def _shift(result: Result, options: SynchronizeOptions) -> Shift:
         rate_sigma=fit.rate_sigma,
         confidence=found.confidence,
         peaks=torch.tensor(found.peaks, dtype=torch.float64),
-        ok=found.decided,
-        reason="" if found.decided else _reason(found, options),
         method=found.method,
         fps=fps,
         center=fit.center,
@@ -461,44 +464,37 @@ def _shift(result: Result, options: SynchronizeOptions) -> Shift:
         scores=found.curve.scores,
         points=points,
         fundamental=fit.fundamental if found.method == "epipolar" else None,
-        notes=notes,
+        status=status_from(limits),
+        notices=limits,
     )
 
 
-def _nothing(found: Attempt) -> str:
+def _nothing(found: Attempt) -> Notice:
     """Why no shift stands out."""
     for name, tracks in (("a", found.a), ("b", found.b)):
         if not bool((tracks.weights > 0).any()):
-            return f"no point is seen in {name}; check the detections"
+            return Notice(ShiftNotice.NO_POINT, 0.0, {"which": name})
         if tracks.still:
-            return f"nothing moves in {name}; film some movement"
-    return "no shift stands out, or both cameras never show enough points at once; film longer, or raise max_shift"
+            return Notice(ShiftNotice.STILL, 0.0, {"which": name})
+    return Notice(ShiftNotice.NOTHING)
 
 
-def _reason(found: Attempt, options: SynchronizeOptions) -> str:
+def _refusal(found: Attempt, options: SynchronizeOptions) -> Notice:
+    """Why the data do not decide."""
     fit = found.fit
     assert fit is not None
     if fit.sigma > options.search.blind * found.frame:
         return _nothing(found)
     if found.edge:
-        return f"the best shift, about {fit.shift:+.3g} s, lies at the end of the search or beyond; raise max_shift"
+        return Notice(ShiftNotice.EDGE, fit.shift, {"best": fit.shift})
     if not found.sharp:
-        return (
-            f"the motion is too small for its noise: the best shift, {fit.shift:+.3g} s, is uncertain by {fit.sigma:.2g} s "
-            "or more; film larger or faster movements"
-        )
+        return Notice(ShiftNotice.BLUNT, fit.sigma, {"case": "small", "best": fit.shift})
     if found.margin < found.needed and len(found.peaks) > 1:
         least = found.misfits[0] - found.needed
         near = [shift for (shift, _), misfit in zip(found.peaks, found.misfits, strict=True) if misfit > least]
         rivals = ", ".join(f"{shift:+.3g} s" for shift in near[1:4])
-        return (
-            f"the motion repeats itself or is too small: {found.peaks[0][0]:+.3g} s fits hardly better than {rivals}; "
-            "film something that happens once, or narrow max_shift"
-        )
+        return Notice(ShiftNotice.REPEATED, found.margin, {"case": "rivals", "best": found.peaks[0][0], "rivals": rivals})
     first, second = found.halves
     shifts = (f"{fit.shift + away * found.frame:+.3g} s" for away in (first, second))
     said = " and ".join("nothing" if "nan" in shift else shift for shift in shifts)
-    return (
-        f"the halves of the take say {said}, more than {options.evidence.apart:g} frames from {fit.shift:+.3g} s: "
-        "the cameras may show different events, overlap too little, or one of them moved"
-    )
+    return Notice(ShiftNotice.HALVES, 0.0, {"halves": said, "apart": options.evidence.apart, "best": fit.shift})

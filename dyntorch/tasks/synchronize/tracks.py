@@ -13,6 +13,7 @@ from torch.nn.functional import conv1d, pad
 
 from dyntorch.geometry.homogeneous import similarity
 from dyntorch.numerics.arguments import FARTHEST
+from dyntorch.numerics.messages import Message
 from dyntorch.tasks.synchronize.options import SynchronizeOptions
 
 PIECE = 1 << 21
@@ -89,23 +90,44 @@ def read_tracks(
     """
     if not isinstance(x, Tensor) or x.ndim != 3 or x.shape[-1] != 2:
         got = tuple(x.shape) if isinstance(x, Tensor) else type(x).__name__
-        raise ValueError(f"{name} must be a tensor (frames, points, 2), got {got}")
+        raise ValueError(Message("{camera:{which}} must be a tensor (frames, points, 2), got {got}", which=name, got=got))
     if x.shape[1] == 0:
-        raise ValueError(f"{name} has no points: shape {tuple(x.shape)}; give (frames, points, 2)")
+        raise ValueError(
+            Message("{camera:{which}} has no points: shape {shape}; give (frames, points, 2)", which=name, shape=tuple(x.shape))
+        )
     if not x.is_floating_point():
         raise ValueError(f"{name} must hold floating point numbers, got {x.dtype}; use {name}.double()")
     if times is None:
         if fps is None or not 0 < fps < math.inf:
-            raise ValueError(f"fps of {name} must be a positive number of frames per second, got {fps}; or give times=")
+            raise ValueError(
+                Message(
+                    "{arg:fps} of {camera:{which}} must be a positive number of frames per second, got {fps}; or give {arg:times=}",
+                    which=name,
+                    fps=fps,
+                )
+            )
         times = torch.arange(len(x), dtype=torch.float64, device=x.device) / fps
     x = x.detach()
     clock = torch.as_tensor(times, dtype=torch.float64, device=x.device)
     if clock.shape != x.shape[:1] or not bool(clock.isfinite().all()):
-        raise ValueError(f"times of {name} must be {x.shape[0]} finite seconds, one per frame, got {tuple(clock.shape)}")
+        raise ValueError(
+            Message(
+                "times of {camera:{which}} must be {count} finite seconds, one per frame, got {shape}",
+                which=name,
+                count=x.shape[0],
+                shape=tuple(clock.shape),
+            )
+        )
     steps = clock.diff()
     if bool((steps <= 0).any()):
         at = int((steps <= 0).nonzero()[0, 0]) + 1
-        raise ValueError(f"times of {name} must increase, but frame {at} is not after the one before; sort or drop such frames")
+        raise ValueError(
+            Message(
+                "times of {camera:{which}} must increase, but frame {at} is not after the one before; sort or drop such frames",
+                which=name,
+                at=at,
+            )
+        )
     _check_dense(name, clock, options)
     seen = (x.double().abs() <= FARTHEST).all(-1)
     if weights is None:
@@ -129,8 +151,17 @@ def _check_dense(name: str, times: Tensor, options: SynchronizeOptions) -> None:
         return
     at = int(steps.argmax())
     raise ValueError(
-        f"times of {name} run over {span:.3g} s, but it has {len(times)} frames {step:.3g} s apart, and none for "
-        f"{float(steps[at]):.3g} s after {float(times[at]):.6g} s; give the frames on one side of that gap"
+        Message(
+            "times of {camera:{which}} run over {span:.3g} s, but it has {count} frames {step:.3g} s apart, and none for "
+            "{gap:.3g} s after "
+            "{last:.6g} s; give the frames on one side of that gap",
+            which=name,
+            span=span,
+            count=len(times),
+            step=step,
+            gap=float(steps[at]),
+            last=float(times[at]),
+        )
     )
 
 

@@ -16,6 +16,7 @@ import torch
 
 import dyntorch
 from dyntorch.core.outcome import Notice, NoticeCode
+from dyntorch.numerics import Message
 from dyntorch.tasks.segment.result import BodyModel, Segmentation
 from indexing.report.segmentation import FILES, SegmentationReport
 
@@ -263,7 +264,7 @@ def test_bad_input_is_one_line_and_code_2(run, solved, tmp_path, line, says):
 
 def test_what_the_library_refuses_names_the_file(run, monkeypatch):
     def refuse(*x, **options):
-        raise ValueError("bodies=40 need 280 matches; lower bodies=")
+        raise ValueError(Message("{arg:bodies=40} need 280 matches; lower {arg:bodies=}"))
 
     monkeypatch.setattr(dyntorch, "segment", refuse, raising=False)
     code, _, err = run("@/m.npz --bodies 40")

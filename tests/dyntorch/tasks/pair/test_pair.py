@@ -82,7 +82,7 @@ def test_clocks(kind):
     scene = nonrigid_pair(N, M, FRAMES, offset=0.4137, generator=seeded(3))
     if kind == "shift":
         empty = torch.zeros(0)
-        told = Shift(scene.offset, 0.0, 1.0, 0.0, 1.0, empty, True, "", "subspace", (30.0, 30.0), 0.0, empty, empty)
+        told = Shift(scene.offset, 0.0, 1.0, 0.0, 1.0, empty, "subspace", (30.0, 30.0), 0.0, empty, empty, status=torch.tensor(0))
         found = reconstruct_pair(scene.a, scene.b, told)
     elif kind == "times":
         clock = torch.arange(FRAMES, dtype=torch.float64) / 30

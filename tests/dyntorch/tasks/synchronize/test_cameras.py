@@ -5,6 +5,7 @@ from itertools import combinations
 import pytest
 import torch
 
+from dyntorch.core.outcome import Notice, NoticeCode, Status, status_from
 from dyntorch.tasks.synchronize.cameras import combine_shifts, synchronize_cameras
 from dyntorch.tasks.synchronize.result import Shift
 
@@ -12,14 +13,20 @@ NONE = torch.zeros(0)
 LAGS = torch.linspace(-5, 5, 301, dtype=torch.float64)
 
 
+class Told(NoticeCode):
+    PERIODIC = "periodic", "the motion is periodic", Status.AMBIGUOUS
+    APART = "apart", "no overlap", Status.TOO_FEW
+
+
 def shift(offset, *others, rate=1.0, center=0.0, sigma=0.01, rate_sigma=0.0, ok=True, confidence=0.97, fps=30.0):
     """A pair whose shift at ``center`` is ``offset``, with other peaks."""
     peaks = torch.tensor([[value, 1.0 - 0.1 * k] for k, value in enumerate((offset, *others))], dtype=torch.float64)
-    reason = "" if ok else "the motion is periodic"
+    limits = () if ok else (Notice(Told.PERIODIC),)
     start = offset - center * (rate - 1)
     return Shift(
-        start, sigma, rate, rate_sigma, confidence, peaks, ok, reason, "epipolar", (fps, fps), center, LAGS, torch.zeros_like(LAGS)
-    )
+        start, sigma, rate, rate_sigma, confidence, peaks, "epipolar", (fps, fps), center, LAGS, torch.zeros_like(LAGS),
+        status=status_from(limits), notices=limits,
+    )  # fmt: skip
 
 
 def network(offsets, rates=None, noise=0.0, center=20.0, seed=0, **more):
@@ -205,7 +212,8 @@ def test_random_peaks_are_never_taken_for_an_answer():
 def test_pairs_that_failed_altogether_do_no_harm():
     pairs = network([0.0, 1.2, -0.7])
     nan = float("nan")
-    pairs[1, 2] = Shift(nan, nan, nan, nan, nan, torch.zeros(0, 2), False, "no overlap", "epipolar", (30.0, 30.0), nan, NONE, NONE)
+    none = torch.zeros(0, 2), "epipolar", (30.0, 30.0), nan, NONE, NONE
+    pairs[1, 2] = Shift(nan, nan, nan, nan, nan, *none, status=torch.tensor(1), notices=(Notice(Told.APART),))
     clocks = combine_shifts(pairs, 3)
     assert clocks.ok and "cameras 1, 2: tied by one pair alone, which nothing checks" in clocks.notes
     assert torch.allclose(clocks.offsets, torch.tensor([0.0, 1.2, -0.7], dtype=torch.float64), atol=1e-9)
