@@ -17,6 +17,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from dyntorch.numerics import Message
+
 VALUE = 60  # characters of a received value that a message quotes
 SAID = 240  # characters of what is wrong, and of what to do
 SHORT = reprlib.Repr()  # knows where to stop in a list of a million, or in one that is a thousand deep
@@ -42,7 +44,8 @@ KINDS: tuple[tuple[Callable[[int], bool], str, str], ...] = (
 # ---- messages ------------------------------------------------------------------------------------------------------------
 def error(path: str | Path, what: object, remedy: str) -> ValueError:
     """The one shape of every message, a line that is never long: file, what is wrong, what to do."""
-    return ValueError(f"{path}: {clipped(what)}; {clipped(remedy)}")
+    said, help_ = (part if isinstance(part, Message) else clipped(part) for part in (what, remedy))
+    return ValueError(Message("{path}: {what}; {remedy}", path=str(path), what=said, remedy=help_))
 
 
 def clipped(text: object, most: int = SAID) -> str:

@@ -8,13 +8,17 @@ the library derives from, with its status and its notices, in ``outcome``.  Noth
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from dyntorch import _lazily
+
+if TYPE_CHECKING:  # a class to derive from
+    from dyntorch.core.outcome import NoticeCode as NoticeCode
 
 _HOME = {
     "algebraic": "dyntorch.core.residual",
     "NoticeCode": "dyntorch.core.outcome",
+    "status_from": "dyntorch.core.outcome",
 }
 __all__ = sorted(_HOME)
 

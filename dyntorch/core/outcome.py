@@ -190,15 +190,15 @@ class Outcome:
     @property
     def reason(self) -> str:
         """Why a single problem is not OK, and what to do; empty where it is.  Of a batch: see :meth:`check`."""
-        return self.refusal(as_python)
+        return self.refusal()
 
-    def refusal(self, words: Words) -> str:
-        """:attr:`reason` with what a surface calls the arguments."""
+    def refusal(self, words: Words | None = None) -> str:
+        """:attr:`reason` with what a surface calls the arguments; by default in the words that the notices have."""
         status = self._single()
         if status == Status.OK:
             return ""
-        told = [str(notice.worded(words).text) for notice in self._telling(status)]
-        return "; ".join(told[:2]) or Message(self.REMEDIES[status], words)
+        told = [notice.text if words is None else notice.worded(words).text for notice in self._telling(status)]
+        return "; ".join(told[:2]) or Message(self.REMEDIES[status], words or as_python)
 
     def check(self) -> Self:
         """Raise where any problem failed.

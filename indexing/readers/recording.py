@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from dyntorch.numerics import Message
 from indexing.clip import LARGEST, Clip, ClipSet, FloatArray
 from indexing.opening import error, shown
 from indexing.readers.files import LinkOptions, Options
@@ -60,12 +61,14 @@ def choose(
     ids, names, repeated = _given(recording)
     if person == "all" and ids is None:
         why = f"its person ids repeat in frame {repeated}" if repeated is not None else "it has no person ids"
-        raise error(path, f"person='all' needs tracked people, but {why}", "run a tracker, or use person='largest' or 'tracked'")
+        what = Message("{arg:person='all'} needs tracked people, but {why}", why=why)
+        raise error(path, what, Message("run a tracker, or use {arg:person='largest'} or 'tracked'"))
     if person in ("all", "everyone"):
         ids = link(recording.at, recording.joints, linking) if ids is None else ids
         return [(name, np.flatnonzero(ids == i)) for i, name in enumerate(names or range(int(ids.max()) + 1))]
     if person == "confident" and recording.confidence is None:
-        raise error(path, "has no confidences, so person='confident' cannot be applied", "use person='largest' or 'tracked'")
+        what = Message("has no confidences, so {arg:person='confident'} cannot be applied")
+        raise error(path, what, Message("use {arg:person='largest'} or 'tracked'"))
     if ids is None and len(np.unique(recording.at)) == len(recording.at):
         return [(None, np.arange(len(recording.at)))]  # never more than one person
     area = _areas(recording.joints)
@@ -339,7 +342,9 @@ def to_clips(path: Path, recording: Recording, options: Options) -> ClipSet:
 def nobody(path: Path, frames: int) -> ValueError:
     """The error for a file without a single usable detection."""
     return error(
-        path, f"no person was detected in any of {frames} frames", "check the video, the estimator's threshold and min_confidence"
+        path,
+        f"no person was detected in any of {frames} frames",
+        Message("check the video, the estimator's threshold and {arg:min_confidence}"),
     )
 
 
@@ -350,7 +355,7 @@ def _scale(path: Path, recording: Recording, options: Options) -> Recording:
     finite = np.abs(recording.joints[np.isfinite(recording.joints)])
     with np.errstate(over="ignore"):  # what is too large is refused when it is known which joints count
         if recording.joints.shape[2] != 2 or (finite.size and np.median(finite) > NORMALIZED):
-            raise error(path, "size= is for 2D coordinates from 0 to 1, and these are not", "leave size out")
+            raise error(path, Message("{arg:size=} is for 2D coordinates from 0 to 1, and these are not"), "leave size out")
         return replace(recording, joints=recording.joints * np.asarray(options.size, dtype=float))
 
 
@@ -371,7 +376,11 @@ def _mask(path: Path, recording: Recording, min_confidence: float) -> Recording:
             )
         missing |= ~(confidence > 0) | (confidence < min_confidence)
     elif min_confidence > 0:
-        raise error(path, "has no confidences, so min_confidence cannot be applied", "leave min_confidence at 0")
+        raise error(
+            path,
+            Message("has no confidences, so {arg:min_confidence} cannot be applied"),
+            Message("leave {arg:min_confidence} at 0"),
+        )
     if (np.abs(joints[~missing]) > LARGEST).any():
         row, joint = np.argwhere((np.abs(joints) > LARGEST).any(axis=2) & ~missing)[0]
         said = f"frame {recording.frames[recording.at[row]]}, joint {joint}: infinite coordinates, or beyond {LARGEST:g}"
@@ -401,7 +410,7 @@ def _times(path: Path, recording: Recording, fps: float | None) -> tuple[FloatAr
     bad = np.flatnonzero(~(np.abs(recording.times) < LAST_FRAME))
     if bad.size:
         said = f"frame {recording.frames[bad[0]]} has no time, or one beyond any recording"
-        raise error(path, said, "give every row a time, or drop the column and use fps=")
+        raise error(path, said, Message("give every row a time, or drop the column and use {arg:fps=}"))
     back = np.flatnonzero(np.diff(recording.times) <= 0)
     if back.size:
         a, b = recording.times[back[0] : back[0] + 2]

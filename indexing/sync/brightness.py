@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool1d
 
-from dyntorch import Shift
-from dyntorch.numerics import check_options, on_cpu, one_thread
+from dyntorch import Notice, Shift
+from dyntorch.core import status_from
+from dyntorch.numerics import Message, check_options, on_cpu, one_thread
 from indexing.sync.gray import (
     GrayTake,
     Region,
@@ -24,6 +25,7 @@ from indexing.sync.gray import (
     take,
     whitened,
 )
+from indexing.sync.notices import BrightnessNotice
 from indexing.sync.options import SyncOptions, VerdictOptions
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -212,31 +214,23 @@ class Verdict:
         centre, scale = options.agreed if self.agreed and self.second <= options.second else options.open
         return 1 / (1 + math.exp(-max(-30.0, min(30.0, (self.weight - centre) / scale))))
 
-    def reason(self, rate: float) -> str:
-        """Why the best lag is not to be believed; empty where it is."""
+    def refusal(self, rate: float) -> Notice | None:
+        """Why the best lag is not to be believed; None where it is."""
         tolerance = self.options.tolerance
         if self.second > self.options.second:
-            return (
-                f"another shift fits nearly as well ({100 * self.second:.0f} % of the best score): the motion repeats, or there is "
-                "too little of it; film longer and less regular motion, or give max_shift"
-            )
+            return Notice(BrightnessNotice.REPEATED, 100 * self.second)
         if max(self.halves) - min(self.halves) > tolerance or any(abs(half - self.best) > tolerance for half in self.halves):
             first, second = ((half - self.best) / rate for half in self.halves)
-            return (
-                f"the halves of the overlap disagree with the whole (by {first:+.2f} and {second:+.2f} s): do both videos show "
-                "the same event? Use a longer overlap, or keypoints"
-            )
-        if self.kernel is None or abs(self.kernel - self.best) > tolerance:
-            said = "has too few frames" if self.kernel is None else f"says {(self.kernel - self.best) / rate:+.2f} s from it"
-            return f"the window kernel {said}, so the best shift is not confirmed; use a longer overlap, or keypoints"
+            return Notice(BrightnessNotice.HALVES, 0.0, {"first": first, "second": second})
+        if self.kernel is None:
+            return Notice(BrightnessNotice.KERNEL, 0.0, {"case": "short"})
+        if abs(self.kernel - self.best) > tolerance:
+            return Notice(BrightnessNotice.KERNEL, (self.kernel - self.best) / rate, {"case": "apart"})
         if self.backwards > self.options.backwards:
-            return "b fits as well when played backwards: the motion is symmetric in time, or of another time; use keypoints"
+            return Notice(BrightnessNotice.BACKWARDS, self.backwards)
         if self.weight < self.options.enough:
-            return (
-                f"too little evidence ({self.weight:.0f} of {self.options.enough:.0f}): similar motion of another time would "
-                "fit about as well; use a longer overlap, or keypoints"
-            )
-        return ""
+            return Notice(BrightnessNotice.EVIDENCE, self.weight, {"needed": self.options.enough})
+        return None
 
 
 def judge(a: Sampled, b: Sampled, lags: tuple[int, int], least: float, options: SyncOptions = SyncOptions()) -> Verdict:
@@ -347,7 +341,7 @@ def brightness_shift(
     if max_shift is not None and not (math.isfinite(max_shift) and max_shift >= 0):
         raise ValueError(f"max_shift must be seconds, 0 or more, got {max_shift!r}")
     rate = common_rate(first, second, options=options)
-    (one, why_a, notes_a), (two, why_b, notes_b) = (_prepared(each, region, rate, options) for each in (first, second))
+    (one, of_a), (two, of_b) = (_prepared(each, region, rate, options) for each in (first, second))
     base = two.start - one.start
     span = (1 - len(one.profile), len(two.profile) - 1)
     if max_shift is not None:
@@ -358,12 +352,12 @@ def brightness_shift(
     least = max(float(options.gray.fewest), options.lags.overlap * min(len(one.profile), len(two.profile)))
     longest = min(len(one.profile), len(two.profile) - span[0]) - max(0, -span[1])
     if span[0] > span[1] or longest < least:
-        raise ValueError(
-            f"max_shift {max_shift!r}: within it the videos overlap by less than {least:.0f} frames at {rate:.3g} per second; "
-            "allow larger shifts or give longer videos"
-        )
+        text = "{arg:max_shift} {given!r}: within it the videos overlap by less than {least:.0f} frames at {rate:.3g} per "
+        "second; allow "
+        text += "larger shifts or give longer videos"
+        raise ValueError(Message(text, given=max_shift, least=least, rate=rate))
     verdict = judge(one, two, span, least, options=options)
-    return _shift((first, second), (one, two), verdict, "; ".join(filter(None, (why_a, why_b))), notes_a + notes_b, options)
+    return _shift((first, second), (one, two), verdict, (*of_a, *of_b), options)
 
 
 def _takes(
@@ -378,23 +372,23 @@ def _takes(
 
 def _prepared(
     source: GrayTake, region: str | Region | None, rate: float, options: SyncOptions
-) -> tuple[Sampled, str, tuple[str, ...]]:
-    """A take on the grid, why it decides nothing (else empty), and what else to know of it."""
+) -> tuple[Sampled, tuple[Notice, ...]]:
+    """A take on the grid, and why it decides nothing, or what else to know of it."""
     height, width = source.frames.shape[1:]
     found = motion(source.frames, None if region is None else _inside(region, source), options=options)
     box, moving = boxes(found, source.fps, options=options)
     if region is None:
         whole = torch.tensor([[width / 2, height / 2, max(width, height)]], dtype=torch.float64)
         box, moving = whole.expand(len(source.frames), 3), False
-    on_grid, name = sampled(source, box, rate, options=options), source.name
+    on_grid, values = sampled(source, box, rate, options=options), {"which": source.name, "camera": source.name}
     if found.drift.hopeless:
-        return on_grid, f"all of {name} changes: its camera moves fast, or the light flickers; stabilize the video first", ()
+        return on_grid, (Notice(BrightnessNotice.FLICKER, 0.0, values),)
     if int(found.lively.sum()) < options.box.liveliest:
-        return on_grid, f"nothing moves in {name}; choose a take with motion", ()
+        return on_grid, (Notice(BrightnessNotice.STILL, float(found.lively.sum()), values),)
     if found.drift.moves:
         step = float(found.drift.step.norm(dim=1).mean()) / source.scale
-        return on_grid, "", (f"{name}: the camera moves ({step:.1f} px per frame); its motion was taken out approximately",)
-    return on_grid, "", (f"{name}: motion crosses the image; a moving box follows it",) if moving else ()
+        return on_grid, (Notice(BrightnessNotice.CAMERA_MOVES, step, values),)
+    return on_grid, (Notice(BrightnessNotice.CROSSES, 0.0, values),) if moving else ()
 
 
 def _inside(region: str | Region, source: GrayTake) -> Region | None:
@@ -416,15 +410,16 @@ def _shift(
     takes: tuple[GrayTake, GrayTake],
     grids: tuple[Sampled, Sampled],
     verdict: Verdict,
-    why: str,
-    notes: tuple[str, ...],
+    known: tuple[Notice, ...],
     options: SyncOptions,
 ) -> Shift:
     (one, two), curve, best = grids, verdict.curve, verdict.best
     rate, base = one.rate, two.start - one.start
     found = curve.peaks(options.lags.apart // 2)[: options.lags.peaks]
     places = torch.tensor([int(curve.lags[k]) + curve.offset(int(curve.lags[k])) for k in found], dtype=torch.float64)
-    reason = why or verdict.reason(rate)
+    unusable = any(notice.code.refuses is not None for notice in known)
+    refusal = None if unusable else verdict.refusal(rate)
+    limits = known if refusal is None else (refusal, *known)
     low, high = max(0, -best), min(len(one.profile), len(two.profile) - best)
     spread = max(abs(half - best) for half in verdict.halves) / 2
     return Shift(
@@ -432,14 +427,13 @@ def _shift(
         sigma=math.hypot(options.lags.floor, spread) / rate,
         rate=1.0,
         rate_sigma=0.0,
-        confidence=0.0 if why else verdict.confidence,
+        confidence=0.0 if unusable else verdict.confidence,
         peaks=torch.stack([base + places / rate, curve.scores[found]], dim=1),
-        ok=not reason,
-        reason=reason,
         method="brightness",
         fps=(takes[0].fps, takes[1].fps),
         center=one.start + (low + high - 1) / 2 / rate,
         lags=base + curve.lags.double() / rate,
         scores=curve.scores.masked_fill(~curve.scores.isfinite(), torch.nan),
-        notes=notes,
+        status=status_from(limits),
+        notices=limits,
     )

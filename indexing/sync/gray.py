@@ -163,7 +163,8 @@ class _Spool(Shrinker):
         chunk = torch.as_tensor(part).cpu()
         chunk = chunk[None] if chunk.ndim == 2 else chunk
         if stamps is not None and len(stamps) != len(chunk):
-            raise ValueError(f"{self.name}: a chunk of {len(chunk)} frames has {len(stamps)} times; give one per frame")
+            text = "{camera:{which}}: a chunk of {frames} frames has {times} times; give one per frame"
+            raise ValueError(Message(text, which=self.name, frames=len(chunk), times=len(stamps)))
         for begin in range(0, len(chunk), FOOTAGE_BLOCK):
             file.write(self.bytes(chunk[begin : begin + FOOTAGE_BLOCK]).numpy().tobytes())
         return stamps
@@ -175,7 +176,8 @@ class _Spool(Shrinker):
     def check(self, options: SyncOptions = SyncOptions()) -> None:
         """Raise where there are too few frames."""
         if self.count < options.gray.fewest:
-            raise ValueError(f"{self.name}: {self.count} frames; at least {options.gray.fewest} are needed")
+            text = "{camera:{which}}: {frames} frames; at least {needed} are needed"
+            raise ValueError(Message(text, which=self.name, frames=self.count, needed=options.gray.fewest))
 
 
 def _times(times: Any, fps: float | None, frames: int, name: str) -> Tensor:

@@ -9,8 +9,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dyntorch import Notice
+from dyntorch.core import status_from
 from indexing.clip import Clip
 from indexing.skeleton import Skeleton, known
+from indexing.sync.notices import SyncNotice, besides
 from indexing.sync.options import SyncOptions
 from indexing.sync.takes import FloatArray, Take
 
@@ -69,12 +72,12 @@ def match_people(a: Take, b: Take, solve: Solve, trial: Solve | None = None, *, 
         best, rivals = decide(found, frame, options=options)
     shift = best.shift
     chosen = [f"{who(take, i)} of {take.name}" for take, i in zip((a, b), best.people, strict=True)]
-    note = f"several people in view: compared {chosen[0]} with {chosen[1]}, the best of {len(found)} pairings"
-    shift = dataclasses.replace(shift, notes=(*shift.notes, note))
+    note = Notice(SyncNotice.PEOPLE, float(len(found)), {"first": chosen[0], "second": chosen[1]})
+    shift = dataclasses.replace(shift, notices=(*shift.notices, note))
     if rivals:
         listed = " and ".join(f"{rival:+.3f} s" for rival in rivals[:2])
-        reason = f"pairings of other people say {listed}; name one person per camera (person=), or record one who moves otherwise"
-        shift = dataclasses.replace(shift, ok=False, reason=f"one pairing of people says {shift.offset:+.3f} s, but {reason}")
+        limits = (Notice(SyncNotice.PAIRINGS, shift.offset, {"rivals": listed}), *besides(shift))
+        shift = dataclasses.replace(shift, status=status_from(limits), notices=limits)
     return Pairing(shift, best.people, rivals)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import re
 from collections.abc import Sequence
 from functools import partial
 from itertools import combinations
@@ -15,31 +14,14 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from dyntorch.numerics import check_options
+from dyntorch import Notice
+from dyntorch.core import status_from
+from dyntorch.numerics import check_options, named
 from indexing.clip import Clip
+from indexing.sync.notices import SyncNotice, besides, noted
 from indexing.sync.options import SyncOptions
 from indexing.sync.people import Pairing, common_joints, disagreements, jumps, match_people
 from indexing.sync.takes import Take, take_of
-
-# ----------------------------------------------------------------------------------------------------------------------
-# Messages that speak of recordings a and b, in the names of the cameras.
-
-
-LETTER = re.compile(r"(^|\b(?:in|of) |[;:] )([ab])(?=[:;]|$| (?:has \d|changes|fits|must|is)\b)")
-
-
-def in_names(text: str, a: str, b: str) -> str:
-    """A message of the library with the cameras' names for a and b; an article stays what it is.
-
-    Example:
-        >>> in_names("nothing moves in a; film a longer take", "left", "right")
-        'nothing moves in left; film a longer take'
-        >>> in_names("b has 8 frames, 12 are needed at least", "left", "right")
-        'right has 8 frames, 12 are needed at least'
-    """
-    names = {"a": a or "a", "b": b or "b"}
-    return LETTER.sub(lambda found: found[1] + names[found[2]], text)
-
 
 if TYPE_CHECKING:
     from dyntorch import Shift
@@ -124,7 +106,7 @@ def synchronize(
     ]  # fmt: skip
     takes = [dataclasses.replace(take, name=take.name or letter) for take, letter in zip(takes, "ab", strict=True)]
     shift = pair(takes[0], takes[1], method, max_shift=max_shift, calibration=calibration, options=options, **more).shift
-    return dataclasses.replace(shift, notes=(*remarks(takes), *shift.notes))
+    return dataclasses.replace(shift, notices=(*remarks(takes), *shift.notices))
 
 
 def pair(
@@ -141,17 +123,18 @@ def pair(
 
     _check(a, b, method, options)
     lens = lenses(calibration, [a.name, b.name])
+    names = {"a": a.name or "a", "b": b.name or "b"}
     more = {**more, "calibration": lens.values if lens else None}
     try:
-        found, notes = _compared(a, b, method, more, options)
+        found, limits = _compared(a, b, method, more, options)
     except ValueError as problem:
-        raise ValueError(in_names(str(problem), a.name, b.name)) from problem
-    said = [in_names(note, a.name, b.name) for note in [*(lens.notes if lens else ()), *notes, *found.shift.notes]]
-    reason = in_names(found.shift.reason, a.name, b.name)
-    return dataclasses.replace(found, shift=dataclasses.replace(found.shift, reason=reason, notes=tuple(dict.fromkeys(said))))
+        raise ValueError(named(problem, names)) from problem
+    said = [notice.named(names) for notice in [*noted(lens.notes if lens else ()), *limits, *found.shift.notices]]
+    unique = {(notice.code, str(notice.text)): notice for notice in said}
+    return dataclasses.replace(found, shift=dataclasses.replace(found.shift, notices=tuple(unique.values())))
 
 
-def _compared(a: Take, b: Take, method: Method, more: dict[str, Any], options: SyncOptions) -> tuple[Pairing, list[str]]:
+def _compared(a: Take, b: Take, method: Method, more: dict[str, Any], options: SyncOptions) -> tuple[Pairing, list[Notice]]:
     """What the data say, and what is to be said about the people in them."""
     if a.kind == b.kind == "keypoints":
         found = match_people(
@@ -220,17 +203,17 @@ def _keypoints(
         options=options.points,
         **more,
     )
-    return dataclasses.replace(shift, notes=(*([note] if note else []), *shift.notes))
+    return dataclasses.replace(shift, notices=(*noted([note] if note else []), *shift.notices))
 
 
-def remarks(takes: Sequence[Take]) -> list[str]:
+def remarks(takes: Sequence[Take]) -> list[Notice]:
     """What to say about the recordings themselves."""
-    notes = [note for take in takes for note in take.notes]
+    found = [notice for take in takes for notice in noted(take.notes, take.name)]
     names = [take.name for take in takes if take.fps_assumed]
     if names:
-        notes.append(f"30 frames per second assumed for {', '.join(names)}; fps= says otherwise")
+        found.append(Notice(SyncNotice.ASSUMED, 30.0, {"names": ", ".join(names)}))
     same = [f"{a.name} and {b.name}" for a, b in combinations(takes, 2) if _same(a, b)]
-    return [*notes, *(f"{names} are the same recording" for names in same)]
+    return [*found, *(Notice(SyncNotice.SAME, 0.0, {"names": both}) for both in same)]
 
 
 def _same(a: Take, b: Take) -> bool:
@@ -243,23 +226,23 @@ def _same(a: Take, b: Take) -> bool:
     return bool(np.array_equal(first, second, equal_nan=first.dtype.kind == "f"))
 
 
-def _swapped(a: Take, b: Take, found: Pairing, options: SyncOptions) -> list[str]:
+def _swapped(a: Take, b: Take, found: Pairing, options: SyncOptions) -> list[Notice]:
     """Notes on moments at which somebody else is followed, and on stretches in which the two do not show the same person."""
     people = [take.people[i] for take, i in zip((a, b), found.people, strict=True)]
-    notes = []
+    found_notes = []
     for take, clip in zip((a, b), people, strict=True):
         moments = jumps(clip, options=options)
         if moments:
             listed = ", ".join(f"{moment:.2f}" for moment in moments[:LISTED]) + " and more" * (len(moments) > LISTED)
-            notes.append(f"{take.name}: whoever is followed jumps at {listed} s: people swapped, or a cut")
+            found_notes += noted([f"{take.name}: whoever is followed jumps at {listed} s: people swapped, or a cut"], take.name)
     first, second, same, _ = common_joints(people[0], people[1], options=options)
     bad = disagreements(first, second, found.shift, options=options) if same and found.shift.ok else []
     if bad:
         listed = ", ".join(f"{start:.2f} to {end:.2f} s" for start, end, _ in bad[:LISTED]) + " and more" * (len(bad) > LISTED)
         worst = max(times for *_, times in bad)
         said = f"from {listed} on the clock of {a.name} the cameras fit each other {worst:.1f} times worse than otherwise"
-        notes.append(f"{said}: people swapped, tracking lost, or a camera moved")
-    return notes
+        found_notes += noted([f"{said}: people swapped, tracking lost, or a camera moved"])
+    return found_notes
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -286,7 +269,8 @@ def synchronize_videos(a: Take, b: Take, method: str, options: SyncOptions = Syn
     try:
         bright = _brightness(a, b, **brightness, options=options)
     except ValueError as problem:  # too short for it; the files can be read, as the tracks show
-        bright = refused(a, b, str(problem), [], "brightness")
+        said = problem.args[0] if problem.args else str(problem)
+        bright = refused(a, b, Notice(SyncNotice.UNUSABLE, 0.0, {"text": said}), method="brightness")
     return agreed(tracked, bright, options=options)
 
 
@@ -297,18 +281,25 @@ def agreed(tracked: Shift, bright: Shift, options: SyncOptions = SyncOptions()) 
     """
     both = (tracked, bright)
     sure = [shift for shift in both if shift.ok]
-    said = f"tracks say {_told(tracked)}, brightness says {_told(bright)}"
+    values = {"tracks": _told(tracked), "brightness": _told(bright)}
     best = sure[0] if sure else max(both, key=lambda shift: shift.confidence)
     other = bright if best is tracked else tracked
-    notes = [said, *best.notes, *(note for note in other.notes if note not in best.notes)]
+    known = [Notice(SyncNotice.METHODS, 0.0, values), *besides(best), *(one for one in besides(other) if one not in besides(best))]
     apart = min((abs(offset - _middle(best)) for offset in _candidates(other)), default=float("inf"))
     if sure and apart <= options.video.agree / min(best.fps):
-        return dataclasses.replace(best, notes=tuple(notes))
+        return dataclasses.replace(best, notices=tuple(known))
     peaks = torch.cat([best.peaks, other.peaks])  # scores of two methods: each list is in order, and the best one's comes first
-    reason = f"{said}; record keypoints of the people, or a longer take with more motion"
+    refusal = Notice(SyncNotice.DISAGREE, 0.0, values)
     if not sure:
-        reason = f"neither tracks nor brightness decide: {tracked.reason or 'no tracks'}; {bright.reason}"
-    return dataclasses.replace(best, ok=False, reason=reason, peaks=peaks, notes=tuple(notes))
+        refusal = Notice(SyncNotice.UNDECIDED, 0.0, {"tracks": _why(tracked), "brightness": _why(bright)})
+    limits = (refusal, *known)
+    return dataclasses.replace(best, status=status_from(limits), notices=limits, peaks=peaks)
+
+
+def _why(shift: Shift) -> str:
+    """Why a method does not decide: a message, where there is one."""
+    told = [notice.text for notice in shift.notices if notice.code.refuses is not None]
+    return told[0] if told else shift.reason
 
 
 def _told(shift: Shift) -> str:
@@ -331,12 +322,11 @@ def _tracks(a: Take, b: Take, *, calibration: Any = None, options: SyncOptions, 
     import dyntorch
 
     found = [points_of(take, options) for take in (a, b)]
-    notes = [note for *_, more in found for note in more]
+    known = [notice for *_, more in found for notice in more]
     few = [take.name for take, (points, _, _) in zip((a, b), found, strict=True) if points.shape[1] < options.video.tracks]
     if few:
-        return refused(
-            a, b, f"fewer than {options.video.tracks} moving points could be followed in {' and '.join(few)}; use keypoints", notes
-        )
+        values = {"needed": options.video.tracks, "names": " and ".join(few)}
+        return refused(a, b, Notice(SyncNotice.FEW_TRACKS, 0.0, values), *known)
     shift: Shift = dyntorch.synchronize(
         found[0][0],
         found[1][0],
@@ -346,10 +336,10 @@ def _tracks(a: Take, b: Take, *, calibration: Any = None, options: SyncOptions, 
         options=options.points,
         **more,
     )
-    return dataclasses.replace(shift, notes=(*notes, *shift.notes))
+    return dataclasses.replace(shift, notices=(*known, *shift.notices))
 
 
-def points_of(take: Take, options: SyncOptions = SyncOptions()) -> tuple[Tensor, Tensor, list[str]]:
+def points_of(take: Take, options: SyncOptions = SyncOptions()) -> tuple[Tensor, Tensor, list[Notice]]:
     """``(frames, n, 2)`` of whatever moves, ``(frames,)`` seconds, and what to say about it."""
     if take.kind == "keypoints":
         clip = take.people[0]
@@ -357,7 +347,7 @@ def points_of(take: Take, options: SyncOptions = SyncOptions()) -> tuple[Tensor,
     from indexing.video import track_points
 
     tracks = track_points(source_of(take), options=options.tracks)
-    return tracks.points, tracks.times, [f"{take.name}: {note}" for note in tracks.notes]
+    return tracks.points, tracks.times, noted([f"{take.name}: {note}" for note in tracks.notes], take.name)
 
 
 def source_of(take: Take) -> Any:
@@ -389,12 +379,12 @@ def _brightness(a: Take, b: Take, options: SyncOptions, **more: Any) -> Shift:
     return shift
 
 
-def refused(a: Take, b: Take, reason: str, notes: list[str], method: str = "subspace") -> Shift:
+def refused(a: Take, b: Take, *limits: Notice, method: str = "subspace") -> Shift:
     """What is said where there is nothing to compare."""
     from dyntorch import Shift
 
     none = torch.zeros(0, dtype=torch.float64)
     return Shift(
-        offset=0.0, sigma=float("inf"), rate=1.0, rate_sigma=0.0, confidence=0.0, peaks=none.reshape(0, 2), ok=False, reason=reason,
-        method=method, fps=(a.fps, b.fps), center=0.0, lags=none, scores=none, notes=tuple(notes),
+        offset=0.0, sigma=float("inf"), rate=1.0, rate_sigma=0.0, confidence=0.0, peaks=none.reshape(0, 2),
+        method=method, fps=(a.fps, b.fps), center=0.0, lags=none, scores=none, status=status_from(limits), notices=limits,
     )  # fmt: skip

@@ -182,7 +182,7 @@ class Shift(Outcome):
         return self
 
     def _telling(self, status: Status) -> Sequence[Notice]:
-        """The first notice that refuses."""
+        """The notices that refuse."""
         return refusing(self.notices)
 
     def __repr__(self) -> str:
@@ -200,8 +200,8 @@ def told(found: Sequence[Notice]) -> tuple[str, ...]:
 
 
 def refusing(found: Sequence[Notice]) -> tuple[Notice, ...]:
-    """The first notice that refuses, if any."""
-    return tuple(notice for notice in found if notice.code.refuses is not None)[:1]
+    """The notices that refuse."""
+    return tuple(notice for notice in found if notice.code.refuses is not None)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -352,7 +352,7 @@ class Clocks(Outcome):
         return self
 
     def _telling(self, status: Status) -> Sequence[Notice]:
-        """The first notice that refuses."""
+        """The notices that refuse."""
         return refusing(self.notices)
 
     def __repr__(self) -> str:

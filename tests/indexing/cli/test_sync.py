@@ -14,6 +14,7 @@ import pytest
 import torch
 
 import dyntorch
+from dyntorch.numerics import Message
 from dyntorch.tasks.synchronize.cameras import synchronize_cameras
 from indexing.clip import Clip, ClipSet
 from tests.indexing.sync.scene import FPS, SKIPPED, cut, filmed, shift, write_openpose
@@ -153,7 +154,7 @@ def test_frames_before_the_reference_are_mentioned(run, library):
 def test_what_does_not_decide_is_refused_and_writes_no_files(run, library):
     line = "@/pose/cam01_json @/pose/cam02_json --fps 30 --out out"
     assert run(line)[0] == 0 and Path("out/pose-sync").is_dir()
-    library[0, 1] = {"ok": False, "reason": "the motion is periodic: record a single move, or give max_shift=0.5"}
+    library[0, 1] = {"ok": False, "reason": Message("the motion is periodic: record a single move, or give {arg:max_shift=0.5}")}
     code, out, err = run(line)
     assert code == 3 and err == "dyntorch: refused: the motion is periodic: record a single move, or give --max-shift 0.5\n"
     assert "refused" in out and "note: pose-sync of an earlier run was removed" in out

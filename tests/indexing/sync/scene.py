@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from dyntorch.tasks.synchronize.result import Shift
+from dyntorch import Notice, Shift, Status
+from dyntorch.core import NoticeCode, status_from
 from indexing.actors import Person, detect, stream
 from indexing.clip import Clip
 
@@ -57,7 +58,22 @@ def shift(offset: float = -0.4, **changes: object) -> Shift:
     lags = torch.linspace(-2, 2, 121, dtype=torch.float64)
     values: dict = {
         "offset": offset, "sigma": 0.002, "rate": 1.0, "rate_sigma": 0.0, "confidence": 0.99,
-        "peaks": torch.tensor([[offset, 9.0], [offset + 1.1, 4.0]], dtype=torch.float64), "ok": True, "reason": "",
+        "peaks": torch.tensor([[offset, 9.0], [offset + 1.1, 4.0]], dtype=torch.float64), "status": torch.tensor(0), "notices": (),
         "method": "epipolar", "fps": (FPS, FPS), "center": 2.0, "lags": lags, "scores": 9 - (lags - offset).abs(),
     }  # fmt: skip
-    return Shift(**{**values, **changes})
+    return Shift(**{**values, **told(changes)})
+
+
+class Told(NoticeCode):
+    NOTE = "note", "{text}"
+    REFUSED = "refused", "{text}", Status.AMBIGUOUS
+
+
+def told(changes: dict[str, object]) -> dict[str, object]:
+    """``ok``, ``reason`` and ``notes`` of a shift as status and notices."""
+    left = {name: value for name, value in changes.items() if name not in ("ok", "reason", "notes")}
+    if {"ok", "reason", "notes"} & set(changes):
+        refusal = () if changes.get("ok", True) else (Notice(Told.REFUSED, 0.0, {"text": changes.get("reason", "")}),)
+        notices = (*refusal, *(Notice(Told.NOTE, 0.0, {"text": text}) for text in changes.get("notes", ())))
+        left |= {"status": status_from(notices), "notices": notices}
+    return left

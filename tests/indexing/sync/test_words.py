@@ -1,25 +1,50 @@
-"""Messages about a and b, in the names of the cameras."""
+"""Notices about a and b, or about cameras by number, in the names of the cameras and the words of the command line."""
 
 from __future__ import annotations
 
 import pytest
 
-from indexing.sync.synchronize import in_names
+from dyntorch import Notice
+from dyntorch.numerics import Message, named, worded
+from dyntorch.tasks.synchronize.result import ClocksNotice, ShiftNotice
+from indexing.cli.sync import WORDS
+from indexing.sync.notices import BrightnessNotice, SyncNotice
+
+NAMES = {"a": "left-1", "b": "right", "0": "left-1", "1": "mid", "2": "right"}
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("notice", "said"),
     [
-        ("no point is seen in b; check the detections", "no point is seen in right; check the detections"),
-        ("b: 10 frames; at least 20 are needed", "right: 10 frames; at least 20 are needed"),
-        ("all of a changes: its camera moves fast", "all of left changes: its camera moves fast"),
-        ("nothing moves in a; choose a take; nothing moves in b", "nothing moves in left; choose a take; nothing moves in right"),
-        ("b fits as well when played backwards", "right fits as well when played backwards"),
-        ("calibration of a: dist must be finite", "calibration of left: dist must be finite"),
-        ("film a larger motion, or a longer take in a hall", "film a larger motion, or a longer take in a hall"),
-        ("a camera has moved; b is fine", "a camera has moved; right is fine"),
+        (Notice(ShiftNotice.NO_POINT, 0.0, {"which": "b"}), "no point is seen in right; check the detections"),
+        (Notice(ShiftNotice.STRAIGHT), str(Notice(ShiftNotice.STRAIGHT).text)),  # an article stays what it is
+        (Notice(BrightnessNotice.STILL, 0.0, {"which": "a"}), "nothing moves in left-1; choose a take with motion"),
+        (Notice(ClocksNotice.ALONE, 1.0, {"cameras": (2,)}), "camera right: tied by one pair alone, which nothing checks"),
+        (
+            Notice(ClocksNotice.CONTRADICTION, 2.0, {"cameras": (1, 7), "torn": ((0, 2), (1, 2))}),
+            "cameras mid, 7: the pairs left-1-right, mid-right contradict each other and nothing tells which is wrong; film "
+            "longer, or "
+            "add a camera",
+        ),
     ],
 )
-def test_letters_become_names_and_articles_stay(text, said):
-    assert in_names(text, "left", "right") == said
-    assert in_names(text, "", "") == text
+def test_cameras_have_names(notice, said):
+    assert notice.named(NAMES).text == said
+    assert notice.text == notice.named({}).text
+
+
+def test_names_that_were_given_first_stay():
+    inner = Message("{camera:a} has 8 frames").named({"a": "left"})
+    assert Message("{pair:pairs}: {note}", pair=((0, 1),), note=inner).named({"a": "other", "0": "x"}) == "x-1: left has 8 frames"
+
+
+def test_arguments_are_flags():
+    lens = Notice(ShiftNotice.LENS, 0.0, {"a": -0.1, "b": 0.2}).worded(WORDS).text
+    assert lens.endswith("an approximation; give --calibration FILE.toml")
+    assert Notice(ShiftNotice.NOTHING).worded(WORDS).text.endswith("film longer, or raise --max-shift")
+    assert Notice(SyncNotice.ASSUMED, 30.0, {"names": "cam1"}).worded(WORDS).text.endswith("assumed for cam1; --fps says otherwise")
+    inner = Notice(ShiftNotice.NOTHING).text
+    both = Notice(SyncNotice.UNDECIDED, 0.0, {"tracks": inner, "brightness": "no"}).worded(WORDS).text
+    assert "raise --max-shift; no" in both and "max_shift" not in both
+    assert worded(ValueError(Message("{arg:person='all'} needs more")), WORDS) == "--person all needs more"
+    assert named(ValueError("a plain one"), NAMES) == "a plain one"
