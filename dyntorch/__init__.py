@@ -52,9 +52,7 @@ _HOME = {
     "refine": "dyntorch.core.refine",
     "sampson": "dyntorch.core.residual",
     "Solution": "dyntorch.core.solution",
-    "Outcome": "dyntorch.core.outcome",
     "Status": "dyntorch.core.outcome",
-    "Notice": "dyntorch.core.outcome",
     # tasks
     "Alignment": "dyntorch.tasks.align.result",
     "align_planar": "dyntorch.tasks.align.planar",

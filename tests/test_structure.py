@@ -148,6 +148,100 @@ def test_what_is_explained_is_there(kind):
         assert names <= set(constants(ROOT / file)), file
 
 
+RESULTS = {
+    "Solution", "Alignment", "Segmentation", "AffineSegmentation", "Reconstruction", "ProjectiveFactorization",
+    "VelocityFactorization", "TranslatingPlanes", "PairReconstruction", "Trajectories", "TrajectoryCameras", "Shift", "Clocks",
+    "MovingShapes", "Recovery",
+}  # fmt: skip
+"""What the verbs of dyntorch return."""
+
+
+def classes(package):
+    """``(file, class)`` of every class of a package, as its source has it."""
+    for path in sorted((ROOT / package).rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"), str(path))):
+            if isinstance(node, ast.ClassDef):
+                yield path, node
+
+
+def fields(node):
+    return {item.target.id for item in node.body if isinstance(item, ast.AnnAssign) and isinstance(item.target, ast.Name)}
+
+
+def test_every_result_is_an_outcome():
+    found = {node.name: node for _, node in classes("dyntorch")}
+    assert set(found) >= RESULTS
+    derived = {name for name, node in found.items() if "Outcome" in {base.id for base in node.bases if isinstance(base, ast.Name)}}
+    assert derived == RESULTS
+    own = {"status", "notices", "warnings", "notes", "reason", "ok", "degenerate"}
+    assert {name: fields(found[name]) & own for name in RESULTS if fields(found[name]) & own} == {}
+
+
+def test_what_verbs_return_is_an_outcome():
+    """By what the public verbs say that they return, so that a new one cannot bring a result of its own kind."""
+    import dyntorch
+    from dyntorch.core import Outcome
+
+    names = {name: getattr(dyntorch, name) for name in dyntorch._HOME}
+    results = {name for name, value in names.items() if isinstance(value, type) and "status" in dir(value)}
+    returned = {
+        str(getattr(value, "__annotations__", {}).get("return", "")) for value in names.values() if not isinstance(value, type)
+    }
+    assert {name for name in returned if name in RESULTS} >= {"Solution", "Alignment", "Segmentation", "Shift", "Clocks"}
+    assert all(issubclass(names[name], Outcome) for name in results)
+
+
+def test_notices_have_codes_of_their_task_and_a_sentence():
+    codes = {node.name: node for package in ("dyntorch", "indexing") for _, node in classes(package) if based(node, "NoticeCode")}
+    assert len(codes) >= 8
+    for name, node in codes.items():
+        members = [item for item in node.body if isinstance(item, ast.Assign)]
+        assert members and all(isinstance(item.value, ast.Tuple) and len(item.value.elts) in (2, 3) for item in members), name
+
+
+def based(node, name):
+    return any(isinstance(base, ast.Name) and base.id == name for base in node.bases)
+
+
+WORDS = ("text", "reason", "message", "notes", "notices", "warnings")
+"""Attributes that hold what the library says."""
+
+
+def test_nobody_parses_what_the_library_says():
+    """No regular expression is applied to a sentence of the library: notices and messages carry their data."""
+    wrong = []
+    for package in ("dyntorch", "indexing"):
+        for path in sorted((ROOT / package).rglob("*.py")):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"), str(path))):
+                if isinstance(node, ast.Call) and regular(node) and any(map(said, [*node.args, *(k.value for k in node.keywords)])):
+                    wrong.append(f"{path.relative_to(ROOT)}:{node.lineno}")
+    assert wrong == []
+    for file in (
+        "indexing/sync/synchronize.py",
+        "indexing/cli/align.py",
+        "indexing/cli/segment.py",
+        "indexing/cli/sync.py",
+        "indexing/report/sync.py",
+    ):
+        assert "\nimport re\n" not in (ROOT / file).read_text(encoding="utf-8"), file
+
+
+def regular(call):
+    """Whether a call may be one of a regular expression."""
+    name = call.func.attr if isinstance(call.func, ast.Attribute) else ""
+    return name in ("sub", "subn", "match", "fullmatch", "search", "findall", "finditer")
+
+
+def said(node):
+    """Whether an expression is what the library says: ``x.reason``, ``notice.text``, ``str(problem)`` of an error."""
+    for part in ast.walk(node):
+        if isinstance(part, ast.Attribute) and part.attr in WORDS:
+            return True
+        if isinstance(part, ast.Call) and ast.unparse(part) in ("str(problem)", "str(error)"):
+            return True
+    return False
+
+
 def main():
     for package in LOOSE:
         rooms = Counter(file.rsplit("/", 1)[0] for file, _ in loose(package))

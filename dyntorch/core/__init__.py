@@ -13,10 +13,14 @@ from typing import TYPE_CHECKING, Any
 from dyntorch import _lazily
 
 if TYPE_CHECKING:  # a class to derive from
+    from dyntorch.core.outcome import Notice as Notice
     from dyntorch.core.outcome import NoticeCode as NoticeCode
+    from dyntorch.core.outcome import Outcome as Outcome
 
 _HOME = {
     "algebraic": "dyntorch.core.residual",
+    "Outcome": "dyntorch.core.outcome",
+    "Notice": "dyntorch.core.outcome",
     "NoticeCode": "dyntorch.core.outcome",
     "status_from": "dyntorch.core.outcome",
 }

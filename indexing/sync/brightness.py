@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool1d
 
-from dyntorch import Notice, Shift
-from dyntorch.core import status_from
+from dyntorch import Shift
+from dyntorch.core import Notice, status_from
 from dyntorch.numerics import Message, check_options, on_cpu, one_thread
 from indexing.sync.gray import (
     GrayTake,

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool1d, conv1d, grid_sample, normalize
 
+from dyntorch.numerics import Message
 from indexing.brightness.features import as_grey, blur, gradients, weighted_differences
 from indexing.brightness.footage import SHRINKING_BLOCK as FOOTAGE_BLOCK
 from indexing.brightness.footage import Shrinker

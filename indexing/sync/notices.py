@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from dyntorch import Notice, Status
-from dyntorch.core import NoticeCode
+from dyntorch import Status
+from dyntorch.core import Notice, NoticeCode
 
 if TYPE_CHECKING:
     from dyntorch import Shift

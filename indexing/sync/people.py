@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dyntorch import Notice
-from dyntorch.core import status_from
+from dyntorch.core import Notice, status_from
 from indexing.clip import Clip
 from indexing.skeleton import Skeleton, known
 from indexing.sync.notices import SyncNotice, besides

@@ -14,8 +14,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from dyntorch import Notice
-from dyntorch.core import status_from
+from dyntorch.core import Notice, status_from
 from dyntorch.numerics import check_options, named
 from indexing.clip import Clip
 from indexing.sync.notices import SyncNotice, besides, noted

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 import torch
 
-from dyntorch import Notice, metrics, scenes
-from dyntorch.core import NoticeCode
+from dyntorch import metrics, scenes
+from dyntorch.core import Notice, NoticeCode
 from dyntorch.tasks.reconstruct import motions
 from indexing.cli.reconstruct import MotionName
 from indexing.report.reconstruction import FILES, PURPOSE, ReconstructionReport

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from dyntorch import Notice, Shift, Status
-from dyntorch.core import NoticeCode, status_from
+from dyntorch import Shift, Status
+from dyntorch.core import Notice, NoticeCode, status_from
 from indexing.actors import Person, detect, stream
 from indexing.clip import Clip
 

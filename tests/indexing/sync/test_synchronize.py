@@ -134,7 +134,7 @@ def test_arrays_of_other_kinds_are_refused(cameras, library, value, says):
 
 def test_remarks_are_about_recordings():
     takes = [take_of(np.full((5, 3, 2), float(i)), name=f"c{i}", fps=None if i else 25.0) for i in range(3)]
-    assert remarks(takes) == ["30 frames per second assumed for c1, c2; fps= says otherwise"]
+    assert [note.text for note in remarks(takes)] == ["30 frames per second assumed for c1, c2; fps= says otherwise"]
 
 
 # ---- the library itself --------------------------------------------------------------------------------------------------

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from dyntorch import Notice
+from dyntorch.core import Notice
 from dyntorch.numerics import Message, named, worded
 from dyntorch.tasks.synchronize.result import ClocksNotice, ShiftNotice
 from indexing.cli.sync import WORDS
