@@ -192,9 +192,14 @@ class Outcome:
         """Why a single problem is not OK, and what to do; empty where it is.  Of a batch: see :meth:`check`."""
         return self.refusal()
 
-    def refusal(self, words: Words | None = None) -> str:
-        """:attr:`reason` with what a surface calls the arguments; by default in the words that the notices have."""
-        status = self._single()
+    def refusal(self, words: Words | None = None, status: Status | None = None) -> str:
+        """:attr:`reason` with what a surface calls the arguments; by default in the words that the notices have.
+
+        Args:
+            words: what arguments are called.
+            status: another than that of the problem.
+        """
+        status = self._single() if status is None else status
         if status == Status.OK:
             return ""
         told = [notice.text if words is None else notice.worded(words).text for notice in self._telling(status)]

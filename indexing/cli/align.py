@@ -10,14 +10,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from indexing.cli import console
-from indexing.cli.console import check_report, count, ended, names, progress, say, table, tell
+from dyntorch.numerics import worded
+from indexing.cli.console import check_report, count, ended, flags, names, progress, say, table, tell
 
 if TYPE_CHECKING:
     from indexing.readers.matches import Matched
     from indexing.report.alignment import AlignmentReport
 
 Model = Literal["planar", "join", "minimal_join", "constant_velocity", "affine_constant_velocity", "rigid", "lines"]
+WORDS = flags("model", "threshold", "motion", static="a column static", static_points="--static-points FILE FILE")
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,7 @@ class Align:
             model=model,
             threshold=None if self.threshold == "auto" else float(self.threshold),
             notes=[*notes, *matched.notes],
-            words=in_flags,
+            words=WORDS,
             manifest=manifest(arguments, inputs, self.seed, timings),
         )
         page = None
@@ -149,7 +150,7 @@ class Align:
                 return dyntorch.align_lines(*views, static_points=points or None, **options)
             return dyntorch.align_points(*views, model=model, motion=self.motion, **options)
         except ValueError as problem:
-            raise ValueError(f"{names(matched.names)}: {in_flags(str(problem))}") from problem
+            raise ValueError(f"{names(matched.names)}: {worded(problem, WORDS)}") from problem
 
 
 def frame_numbers(text: str | None) -> tuple[int, ...] | None:
@@ -164,17 +165,6 @@ def frame_numbers(text: str | None) -> tuple[int, ...] | None:
         return tuple(int(word) for word in text.split(","))
     except ValueError:
         raise ValueError(f"--frames {text!r}: expected whole numbers with commas between them, such as --frames 10,20,30") from None
-
-
-def in_flags(message: str) -> str:
-    """A message of the library in the words of the command line.
-
-    Example:
-        >>> in_flags("use model='rigid', or label static ones (static=)")
-        'use --model rigid, or label static ones (a column static)'
-    """
-    message = message.replace("(static=)", "(a column static)").replace("(static=; then", "(a column static; then")
-    return console.in_flags(message, "model", "static_points")
 
 
 def show(report: AlignmentReport) -> None:

@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from dyntorch.numerics import as_python
 from indexing.opening import count as count  # by this name for all commands
 
 if TYPE_CHECKING:
@@ -58,33 +59,31 @@ def ended(page: object, refusal: str | None) -> int:
     return REFUSED
 
 
-def in_flags(message: str, *flags: str) -> str:
-    """A message of the library in the words of the command line.
+def flags(*names: str, **own: str) -> Callable[[str, str | None], str]:
+    """What the command line calls the arguments that a message of the library speaks of.
 
     Args:
-        message: with arguments as ``name=`` or ``name=value``.
-        flags: names of the arguments that are flags.
+        names: of the arguments that are flags.
+        own: what an argument is called that is another flag, or none.
 
     Example:
-        >>> in_flags("give times=, or motion='auto'; threshold=None estimates it", "times", "motion", "threshold")
-        'give --times, or --motion auto; --threshold auto estimates it'
+        >>> words = flags("times", "motion", "threshold", "spatial", static="a column static")
+        >>> [words("times", ""), words("motion", "'auto'"), words("threshold", "None"), words("spatial", "False")]
+        ['--times', '--motion auto', '--threshold auto', '--no-spatial']
+        >>> words("static", ""), words("weights", "")
+        ('a column static', 'weights=')
     """
 
-    def flag(found: re.Match[str]) -> str:
-        name, value = found[1].replace("_", "-"), {"None": "auto", "True": ""}.get(found[2], found[2])
-        return f"--no-{name}" if value == "False" else f"--{name} {value or ''}".rstrip()
+    def words(name: str, value: str | None) -> str:
+        if name in own:
+            return own[name]
+        if name not in names:
+            return as_python(name, value)
+        flag = name.replace("_", "-")
+        given = {None: "", "None": "auto", "True": ""}.get(value, (value or "").strip("'"))
+        return f"--no-{flag}" if value == "False" else f"--{flag} {given}".rstrip()
 
-    return re.sub(rf"\b({'|'.join(flags)})=(?:'?(\w[\w.]*\b)'?)?", flag, message)
-
-
-def one(message: str) -> str:
-    """A message with the singular where its number is 1.
-
-    Example:
-        >>> one("1 points are behind a camera"), one("11 points are behind a camera")
-        ('1 point is behind a camera', '11 points are behind a camera')
-    """
-    return re.sub(r"\b(?<![\d.,])1 (\w+)s are\b", r"1 \1 is", message)
+    return words
 
 
 def names(values: Sequence[object]) -> str:

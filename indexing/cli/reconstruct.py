@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from indexing.cli.console import check_report, count, ended, in_flags, one, say, table, tell
+from dyntorch.numerics import worded
+from indexing.cli.console import check_report, count, ended, flags, say, table, tell
 from indexing.cli.console import progress as progress_of
 
 if TYPE_CHECKING:
@@ -24,7 +25,7 @@ MotionName = Literal[
     "constant_direction_3d", "constant_velocity_planes_3d", "constant_velocity_3d", "constant_velocity_3d_sensors",
     "two_bodies_2d", "two_bodies_3d",
 ]  # fmt: skip
-FLAGS = ("times", "static", "threshold", "motion")
+WORDS = flags("times", "static", "threshold", "motion")
 UNFIXED = (
     "no point is known to stand still, so that a motion common to all is open and none can be told to rest; "
     "--static names some that do"
@@ -89,7 +90,7 @@ class Reconstruct:
             tracks=tracks,
             threshold=None if limit == math.inf else limit,
             notes=[*tracks.notes, *unfixed(tracks, result)],
-            words=words,
+            words=WORDS,
             manifest=manifest({"command": "reconstruct", **dataclasses.asdict(self)}, inputs, self.seed, timings),
         )
         page = None
@@ -177,12 +178,7 @@ class Reconstruct:
                 generator=torch.Generator().manual_seed(self.seed),
             )
         except ValueError as problem:
-            raise ValueError(f"{tracks.path}: {words(str(problem))}") from problem
-
-
-def words(message: str) -> str:
-    """A message of the library in the words of the command line."""
-    return one(in_flags(message, *FLAGS))
+            raise ValueError(f"{tracks.path}: {worded(problem, WORDS)}") from problem
 
 
 def unfixed(tracks: TrackSet, result: Any) -> list[str]:

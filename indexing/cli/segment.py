@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from indexing.cli.console import check_report, count, ended, in_flags, one, progress, say, table, tell
+from dyntorch.numerics import worded
+from indexing.cli.console import check_report, count, ended, flags, progress, say, table, tell
 
 if TYPE_CHECKING:
     from indexing.readers.pairs import MatchedPair, Photograph
     from indexing.report.segmentation import SegmentationReport
 
-FLAGS = ("bodies", "threshold", "spatial", "weights")
+WORDS = flags("bodies", "threshold", "spatial")
 LEAST = 8  # matches
 SMALL = 50  # thresholds across the points, below which these are hardly pixels
 OUTSIDE = 0.02  # of the matches, beyond which an image is hardly the one they were found in
@@ -83,7 +84,7 @@ class Segment:
             size=self.size or pair.size,
             heading=self.title or "",
             notes=notes,
-            words=words,
+            words=WORDS,
             manifest=manifest({"command": "segment", **dataclasses.asdict(self)}, inputs, self.seed, timings),
         )
         page = None
@@ -161,12 +162,7 @@ class Segment:
                 generator=torch.Generator().manual_seed(self.seed),
             )
         except ValueError as problem:
-            raise ValueError(f"{pair.path}: {words(str(problem))}") from problem
-
-
-def words(message: str) -> str:
-    """A message of the library in the words of the command line."""
-    return one(in_flags(message, *FLAGS))
+            raise ValueError(f"{pair.path}: {worded(problem, WORDS)}") from problem
 
 
 def show(report: SegmentationReport) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import re
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from indexing.cli.console import SHOWN, check_report, count, ended, in_flags, names, progress, say, table
+from dyntorch.numerics import Message, worded
+from indexing.cli.console import SHOWN, check_report, count, ended, flags, names, progress, say, table
 from indexing.cli.inputs import Format
 
 if TYPE_CHECKING:
@@ -21,7 +21,9 @@ if TYPE_CHECKING:
     from indexing.sync.people import Pairing
     from indexing.sync.takes import Take
 
-FLAGS = ("fps", "person", "method", "max_shift", "calibration", "min_confidence", "format", "size", "rate")
+WORDS = flags(
+    "fps", "person", "method", "max_shift", "min_confidence", "format", "size", "rate", calibration="--calibration FILE.toml"
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -130,7 +132,7 @@ class Sync:
         try:
             return [take_of(path, name=name, fps=rate, **options) for (name, path), rate in zip(found.items(), rates, strict=True)]
         except ValueError as problem:
-            raise ValueError(words(str(problem))) from problem
+            raise ValueError(worded(problem, WORDS)) from problem
 
     def _solve(self, takes: list[Take], done: Any) -> SyncReport:
         """All pairs, and what they say together."""
@@ -148,8 +150,10 @@ class Sync:
             try:
                 found = pair(a, b, self.method, **options)
             except ValueError as problem:
-                known = str(problem).startswith(tuple(str(word) for take in (a, b) for word in (take.name, take.path or take.name)))
-                raise ValueError(str(problem) if known else f"{a.name} and {b.name}: {problem}") from problem
+                said = problem.args[0] if problem.args else str(problem)
+                known = said.startswith(tuple(str(word) for take in (a, b) for word in (take.name, take.path or take.name)))
+                both = Message("{a} and {b}: {said}", a=a.name, b=b.name, said=said)
+                raise ValueError(said if known else both) from problem
             compared[takes.index(a), takes.index(b)] = found
             done(len(compared) / total)
             return found.shift
@@ -159,10 +163,11 @@ class Sync:
             if clocks is None:
                 compare(takes[0], takes[1])
         except ValueError as problem:
-            said = re.sub(r"^cameras \d+ and \d+: ", "", str(problem))
-            raise ValueError(words(said)) from problem
-        known: dict[str, Any] = {"remarks": [*remarks(takes), *told], "heading": self.title or "", "words": words}
-        return SyncReport(takes=takes, compared=compared, together=clocks, **known)
+            # that of a pair says which cameras it is about by name, and so not by number
+            of_pair = problem.__cause__ if len(takes) > 2 and problem.__cause__ is not None else problem
+            raise ValueError(worded(of_pair, WORDS)) from problem
+        known: dict[str, Any] = {"remarks": [*(one.text for one in remarks(takes)), *told], "heading": self.title or ""}
+        return SyncReport(takes=takes, compared=compared, together=clocks, words=WORDS, **known)
 
     def _write(self, folder: Path, report: SyncReport) -> tuple[SyncReport, Path]:
         """The shifted files where the data decide, the check video where asked for, and the report."""
@@ -187,18 +192,6 @@ class Sync:
         drop_checks(folder, videos)
         report = dataclasses.replace(report, afterwards=notes)
         return report, write_sync(folder, report, videos)
-
-
-def words(message: str) -> str:
-    """A message of the library in the words of the command line.
-
-    Example:
-        >>> words("an approximation; give calibration=((K, dist), (K, dist))"), words("narrow max_shift")
-        ('an approximation; give --calibration FILE.toml', 'narrow --max-shift')
-    """
-    said = message.replace("calibration=((K, dist), (K, dist))", "calibration=FILE.toml")
-    parts = [part if part.startswith("np.") else in_flags(part, *FLAGS) for part in re.split(r"(np\.\w+\([^)]*\))", said)]
-    return re.sub(r"(?<!-)\b(max|min)_(shift|confidence)\b", r"--\1-\2", "".join(parts))
 
 
 def early(plans: list[Plan], reference: str) -> list[str]:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dyntorch.numerics import worded
 from indexing.readers.matches import Matched
 from indexing.report.canvas import LIGHT, new_figure, png, shorten, style
 from indexing.report.page import Picture, ResultReport, markup, render, safe_cell, sentence, table_csv, write_files
@@ -45,17 +46,6 @@ class AlignmentReport(ResultReport):
     threshold: float | None = None
 
     TITLES = ("What moved, and how the sensor did", "The matches do not decide")
-    REASONS = {
-        "TOO_FEW": "too few matches are present in all views; give more",
-        "DEGENERATE": (
-            "several motions fit all matches exactly; add matches that move otherwise, or use a model with fewer unknowns"
-        ),
-        "AMBIGUOUS": "other motions fit as well; add matches that differ more, lower the noise, or use a model with fewer unknowns",
-        "NO_CONSENSUS": (
-            "no motion fits enough of the matches; raise --threshold, or give matches of which more belong to the model"
-        ),
-    }
-    UNTOLD = frozenset(REASONS)
 
     @functools.cached_property
     def views(self) -> list[FloatArray]:
@@ -90,7 +80,7 @@ class AlignmentReport(ResultReport):
     @property
     def ambiguity(self) -> str:
         """What the data cannot tell, even without noise."""
-        return self.words(self.found.ambiguity)
+        return worded(self.result.ambiguity, self.words)
 
     @property
     def solved(self) -> bool:

@@ -20,6 +20,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from dyntorch.numerics import as_python
 from indexing import files
 from indexing.opening import count
 
@@ -83,22 +84,18 @@ class ResultReport:
         result: as the library returned it, of one problem.
         heading: of the page; by default one that says whether the data decide.
         notes: what a reader should know about the input, a sentence each.
-        words: what brings sentences of the library into the words of whoever reads the report.
+        words: what whoever reads the report calls the arguments that sentences of the library speak of.
         manifest: of :func:`indexing.files.manifest`.
     """
 
     result: Any
     heading: str = ""
     notes: Sequence[str] = ()
-    words: Callable[[str], str] = str
+    words: Callable[[str, str | None], str] = as_python
     manifest: Mapping[str, Any] = field(default_factory=dict)
 
     TITLES: ClassVar[tuple[str, str]] = ("", "")
     """The heading where the data decide, and where they do not."""
-    REASONS: ClassVar[Mapping[str, str]] = {}
-    """Why the data do not decide, and what to do, by status."""
-    UNTOLD: ClassVar[frozenset[str]] = frozenset()
-    """Statuses that no notice explains."""
 
     @functools.cached_property
     def found(self) -> SimpleNamespace:
@@ -121,15 +118,14 @@ class ResultReport:
     @functools.cached_property
     def warnings(self) -> list[tuple[str, float, str]]:
         """Code, figure and sentence of every notice."""
-        return [(notice.code.value, notice.value, self.words(notice.message)) for notice in self.result.warnings]
+        return [(notice.code.value, notice.value, notice.worded(self.words).text) for notice in self.result.notices]
 
     @property
     def reason(self) -> str:
         """Why the data do not decide, and what to do; empty where they do."""
-        if self.status == "OK":
-            return ""
-        told = "" if self.status in self.UNTOLD else "; ".join(text for _, _, text in self.warnings[:2])
-        return told or self.REASONS.get(self.status, "")
+        from dyntorch import Status
+
+        return str(self.result.refusal(self.words, Status[self.status]))
 
     @property
     def state(self) -> str:

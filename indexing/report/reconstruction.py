@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dyntorch.numerics import worded
 from indexing.readers.tracks import TrackSet
 from indexing.report.page import Picture, ResultReport, markup, matrix, npz, render, safe_cell, sentence, table_csv, write_files
 from indexing.report.reconstruction_picture import scene_picture, tracks_picture
@@ -48,15 +49,6 @@ class ReconstructionReport(ResultReport):
     threshold: float | None = None
 
     TITLES = ("What moves, and how", "The tracks do not decide")
-    REASONS = {
-        "TOO_FEW": "too few tracks are seen in enough views; track more points, or for longer",
-        "DEGENERATE": (
-            "the tracks leave several scenes, exactly; let camera and points move otherwise, or take a smaller --motion"
-        ),
-        "AMBIGUOUS": "other scenes fit as well; add views and tracks, let the camera move more, or take a smaller --motion",
-        "NO_CONSENSUS": "no scene fits enough of the tracks; raise --threshold, take another --motion, or clean the tracks",
-    }
-    UNTOLD = frozenset({"NO_CONSENSUS"})  # that nothing fits is no consequence of what is said of the scene that fits best
 
     @property
     def motion(self) -> str:
@@ -97,7 +89,7 @@ class ReconstructionReport(ResultReport):
     @property
     def ambiguity(self) -> str:
         """What the tracks cannot tell, even without noise."""
-        return self.words(self.found.ambiguity)
+        return worded(self.result.ambiguity, self.words)
 
     @property
     def single(self) -> int:

@@ -51,12 +51,6 @@ class SegmentationReport(ResultReport):
     size: tuple[float, float] | None = None
 
     TITLES = ("What moves with what", "The matches do not decide")
-    REASONS = {
-        "TOO_FEW": "too few matches are present in both images; give more",
-        "DEGENERATE": "several segmentations fit all matches exactly; add matches in general position",
-        "AMBIGUOUS": "other segmentations fit as well; add matches, or say how many --bodies there are",
-        "NO_CONSENSUS": "no body moves so that enough of the matches agree; raise --threshold, or clean the matches",
-    }
 
     @property
     def bodies(self) -> int:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import functools
 import json
 import math
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,9 +15,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dyntorch.numerics import as_python, worded
 from indexing.clip import Clip
 from indexing.report.canvas import LIGHT, new_figure, png, shorten, style
 from indexing.report.page import Picture, markup, render, sentence, write_files
+from indexing.sync.notices import besides
 from indexing.sync.people import Pairing, joint_names, who
 from indexing.sync.takes import Take
 
@@ -26,7 +28,6 @@ if TYPE_CHECKING:
 
 FloatArray = NDArray[np.float64]
 FILES = ("report.html", "sync.json", "curve.png")
-LEFT_OUT = "never agree with the others and were left out"  # of points: they are named beside their pair
 METHODS = {
     "epipolar": "same points, epipolar",
     "affine": "same points, affine",
@@ -137,7 +138,7 @@ class SyncReport:
         afterwards: what a user should know of the files written, a sentence each.
         shifted: by the number of the camera, what was written of it.
         heading: of the page; by default what was found.
-        words: what brings sentences of the library into the words of whoever reads the report.
+        words: what whoever reads the report calls the arguments that sentences of the library speak of.
         manifest: of :func:`indexing.files.manifest`.
     """
 
@@ -148,7 +149,7 @@ class SyncReport:
     afterwards: Sequence[str] = ()
     shifted: Mapping[int, Mapping[str, Any]] = field(default_factory=dict)
     heading: str = ""
-    words: Callable[[str], str] = str
+    words: Callable[[str, str | None], str] = as_python
     manifest: Mapping[str, Any] = field(default_factory=dict)
 
     @functools.cached_property
@@ -161,7 +162,7 @@ class SyncReport:
         """All that were compared."""
         residuals = {} if self.together is None else {row.cameras: row.residual for row in self.together.pairs}
         return [
-            Compared(self.takes[i], self.takes[j], found, residuals.get((i, j), math.nan), self.words(found.shift.reason))
+            Compared(self.takes[i], self.takes[j], found, residuals.get((i, j), math.nan), found.shift.refusal(self.words))
             for (i, j), found in self.compared.items()
         ]
 
@@ -189,7 +190,13 @@ class SyncReport:
     @property
     def reason(self) -> str:
         """Why not, and what to do."""
-        return self.pairs[0].reason if self.together is None else self.words(named(self.together.reason, self.names))
+        return self.pairs[0].reason if self.together is None else str(self.spoken.refusal(self.words))
+
+    @functools.cached_property
+    def spoken(self) -> Any:
+        """The clocks of all cameras, whose notices call them by name."""
+        names = {str(number): name for number, name in enumerate(self.names)}
+        return dataclasses.replace(self.together, notices=tuple(notice.named(names) for notice in self.together.notices))
 
     @property
     def cycle(self) -> float | None:
@@ -211,35 +218,18 @@ class SyncReport:
     @functools.cached_property
     def notes(self) -> list[str]:
         """What a user should know besides, a sentence each."""
-        told = [(one, note) for one in self.pairs for note in one.shift.notes if LEFT_OUT not in note or not one.wrong]
-        own = [
-            note if len(self.pairs) == 1 or note.startswith((f"{one.a.name}: ", f"{one.b.name}: "))
-            else f"{one.a.name} and {one.b.name}: {note}"
-            for one, note in told
-        ]  # fmt: skip
-        if self.together is not None:
-            repeated = {f"pair {i}-{j}: {note}" for (i, j), found in self.compared.items() for note in found.shift.notes}
-            own = [named(note, self.names) for note in self.together.notes if note not in repeated] + own
-        return [*dict.fromkeys(self.words(note) for note in [*self.remarks, *own]), *self.afterwards]
-
-
-def named(text: str, names: Sequence[str]) -> str:
-    """A message of the library with the cameras' names for their numbers.
-
-    Example:
-        >>> named("cameras 1, 2: the pairs 0-2, 1-2 contradict each other by 0.1 s", ["left", "mid", "right"])
-        'cameras mid, right: the pairs left-right, mid-right contradict each other by 0.1 s'
-    """
-
-    def name(number: str) -> str:
-        return names[int(number)] if int(number) < len(names) else number
-
-    def found(match: re.Match[str]) -> str:
-        if match["list"]:
-            return match["word"] + ", ".join(name(number) for number in match["list"].split(", "))
-        return f"{name(match['a'])}-{name(match['b'])}"
-
-    return re.sub(r"\b(?P<word>cameras? )(?P<list>\d+(?:, \d+)*)|\b(?P<a>\d+)-(?P<b>\d+)\b", found, text)
+        own = []
+        for one in self.pairs:
+            for notice in besides(one.shift):
+                if notice.code == "left_out" and one.wrong:  # these points are named beside their pair
+                    continue
+                alone = len(self.pairs) == 1 or notice.values.get("camera")  # or it names the camera that it is about
+                said = notice.worded(self.words).text
+                own.append(str(said) if alone else f"{one.a.name} and {one.b.name}: {said}")
+        if self.together is not None:  # what the pairs say is told with them
+            more = [notice for notice in besides(self.spoken) if notice.code != "of_pair"]
+            own = [str(notice.worded(self.words).text) for notice in more] + own
+        return [*dict.fromkeys([*(worded(note, self.words) for note in self.remarks), *own]), *self.afterwards]
 
 
 def describe(report: SyncReport) -> str:

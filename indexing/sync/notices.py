@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
 
 from dyntorch import Status
-from dyntorch.core import Notice, NoticeCode
-
-if TYPE_CHECKING:
-    from dyntorch import Shift
+from dyntorch.core import Notice, NoticeCode, Outcome
 
 _METHODS = "tracks say {tracks}, brightness says {brightness}"
 
@@ -116,6 +112,6 @@ def noted(texts: Iterable[str], camera: str = "") -> list[Notice]:
     return [Notice(SyncNotice.NOTE, 0.0, {"text": text, "camera": camera}) for text in texts]
 
 
-def besides(shift: Shift) -> list[Notice]:
+def besides(shift: Outcome) -> list[Notice]:
     """The notices that refuse nothing."""
     return [notice for notice in shift.notices if notice.code.refuses is None]

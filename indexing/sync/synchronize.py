@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from dyntorch.core import Notice, status_from
-from dyntorch.numerics import check_options, named
+from dyntorch.numerics import Message, check_options, named
 from indexing.clip import Clip
 from indexing.sync.notices import SyncNotice, besides, noted
 from indexing.sync.options import SyncOptions
@@ -157,15 +157,11 @@ def _check(a: Take, b: Take, method: Method, options: SyncOptions) -> None:
                 f"{take.path or take.name or 'recording'}: {frames}, {options.recording.fewest} are needed at least; {remedy}"
             )
         if method == "keypoints" and take.kind != "keypoints":
-            raise ValueError(
-                f"{take.path or take.name}: is a video, and method='keypoints' needs keypoints; run a pose estimator first, or use "
-                "method='tracks' or method='brightness'"
-            )
+            text = "{path}: is a video, and {arg:method='keypoints'} needs keypoints; run a pose estimator first, or use "
+            raise ValueError(Message(text + "{arg:method='tracks'} or {arg:method='brightness'}", path=str(take.path or take.name)))
         if method == "brightness" and take.kind == "keypoints":
-            raise ValueError(
-                f"{take.path or take.name}: holds keypoints, and method='brightness' needs videos; give the videos, or use "
-                "method='keypoints'"
-            )
+            text = "{path}: holds keypoints, and {arg:method='brightness'} needs videos; give the videos, or use "
+            raise ValueError(Message(text + "{arg:method='keypoints'}", path=str(take.path or take.name)))
 
 
 def _keypoints(

@@ -18,8 +18,9 @@ import torch
 from dyntorch import metrics, scenes
 from dyntorch.core import Notice, NoticeCode
 from dyntorch.tasks.reconstruct import motions
+from dyntorch.tasks.reconstruct.result import Reconstruction
 from indexing.cli.reconstruct import MotionName
-from indexing.report.reconstruction import FILES, PURPOSE, ReconstructionReport
+from indexing.report.reconstruction import FILES, PURPOSE
 
 # torch's own, when it first loads its transforms; hidden outside of tests
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated")
@@ -276,4 +277,4 @@ def test_every_model_and_status_is_named():
     assert set(get_args(MotionName)) == {*motions.MOTIONS, "auto"} and set(PURPOSE) == set(motions.MOTIONS)
     from dyntorch import Status
 
-    assert set(ReconstructionReport.REASONS) == {status.name for status in Status} - {"OK"}
+    assert set(Reconstruction.REMEDIES) == set(Status) - {Status.OK}

@@ -18,7 +18,7 @@ import dyntorch
 from dyntorch.core.outcome import Notice, NoticeCode
 from dyntorch.numerics import Message
 from dyntorch.tasks.segment.result import BodyModel, Segmentation
-from indexing.report.segmentation import FILES, SegmentationReport
+from indexing.report.segmentation import FILES
 
 # torch's own, when it first loads its transforms; hidden outside of tests
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated")
@@ -207,7 +207,8 @@ def test_data_that_cannot_decide_are_refused_with_code_3(run, solved, monkeypatc
 
     monkeypatch.setattr(dyntorch, "segment", nothing)
     code, out, err = run("@/m.npz --out out")
-    assert (code, err) == (3, f"dyntorch: refused: {SegmentationReport.REASONS['NO_CONSENSUS']}\n")
+    reason = "no body moves so that enough of the matches agree; raise --threshold, or clean the matches"
+    assert (code, err) == (3, f"dyntorch: refused: {reason}\n")
     assert re.search(r"unlabelled +119", out)
     assert read()["status"] == "NO_CONSENSUS" and read()["bodies"] == [] and read()["misclassified"] is None
     page = Path("out/report.html").read_text()
@@ -288,4 +289,4 @@ def test_help_loads_nothing_heavy():
 
 
 def test_every_status_has_a_reason():
-    assert set(SegmentationReport.REASONS) == {status.name for status in dyntorch.Status} - {"OK"}
+    assert set(Segmentation.REMEDIES) == set(dyntorch.Status) - {dyntorch.Status.OK}

@@ -14,7 +14,7 @@ import torch
 from dyntorch import Clocks, Shift
 from dyntorch.tasks.synchronize.result import Pair
 from indexing import Clip
-from indexing.report.sync import Compared, SyncReport, as_json, describe, named, page, picture_of, title_of, write_sync
+from indexing.report.sync import Compared, SyncReport, as_json, describe, page, picture_of, title_of, write_sync
 from indexing.skeleton import Skeleton
 from indexing.sync.people import Pairing
 from indexing.sync.takes import Take
@@ -95,13 +95,3 @@ def test_wrong_points_without_names_have_numbers():
     nobody = Take("a", "keypoints", people=(Clip(np.zeros((9, 2, 2))),))
     pair = Compared(nobody, nobody, Pairing(shift(points=torch.tensor([True, False])), (0, 0)))
     assert pair.wrong == ["joint 1"] and pair.runner_up == (pytest.approx(0.7), 4.0) and one(shift()).wrong == []
-
-
-def test_cameras_have_names_instead_of_numbers():
-    names = ["left-1", "mid", "right"]
-    assert named("camera 2: tied by one pair alone", names) == "camera right: tied by one pair alone"
-    assert (
-        named("pair 0-2 differs by -0.5 s; pairs 0-1, 1-2", names)
-        == "pair left-1-right differs by -0.5 s; pairs left-1-mid, mid-right"
-    )
-    assert named("cameras 0, 7", names) == "cameras left-1, 7"
