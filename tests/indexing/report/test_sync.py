@@ -37,7 +37,7 @@ def report(cameras: int = 2, first: Shift | None = None, outliers=(), **changes)
         rows = tuple(Pair(end, 0.4, 0.002, 0.001, 0, True) for end in ends)
         together = Clocks(
             0.4 * column, 1 + 2e-5 * column, column * 0 + 0.002, column * 0, 0.9, rows, 0.0123, None, list(outliers),
-            True, "", 0, 1.5, {},
+            0, 1.5, {}, status=torch.tensor(0),
         )  # fmt: skip
     return SyncReport(**{"takes": takes, "compared": compared, "together": together, "remarks": ["a note & more"], **changes})
 
