@@ -1,9 +1,12 @@
 """The battery over all invariants."""
 
+from pathlib import Path
+
 import pytest
 
 import dyntorch as dyn
 from dyntorch.core.invariant import Invariant
+from tests.battery import on_input, on_noise  # noqa: F401 - they add to the list
 from tests.battery.cases import CASES
 from tests.battery.properties import CHECKS
 from tests.battery.shape_cases import SHAPE_CASES
@@ -14,6 +17,11 @@ PAIRS = [pytest.param(check, case, id=f"{check.__name__}-{case!r}") for check, a
 @pytest.mark.parametrize(("check", "case"), PAIRS)
 def test_property(check, case):
     check(case)
+
+
+def test_every_property_is_on_the_list():
+    written = sum(text.count("\n@prop(") for path in Path(__file__).parent.glob("*.py") if (text := path.read_text()))
+    assert len(CHECKS) == written >= 40
 
 
 def test_every_public_invariant_has_a_case():
