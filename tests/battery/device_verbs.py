@@ -445,7 +445,9 @@ ROOMS = ("core", "geometry", "invariants", "numerics", "shapes", "tasks")
 NOT_VERBS = {
     **dict.fromkeys(("counting", "metrics", "motions", "scenes"), "modules"),
     **dict.fromkeys(("on_cpu", "one_thread"), "decorators of verbs"),
-    **dict.fromkeys(("Message", "Notice", "NoticeCode", "Outcome", "named", "worded"), "what results say"),
+    **dict.fromkeys(
+        ("Message", "Notice", "NoticeCode", "Outcome", "named", "worded", "as_python", "status_from"), "what results say"
+    ),
     "check_options": "looks at no tensor",
     **dict.fromkeys(("BodyModel", "LineStatus", "Status", "Motion", "Polynomial", "Fourier", "Invariant"), "names and numbers"),
     **dict.fromkeys(
