@@ -142,6 +142,29 @@ def test_numbers_that_decide_are_options(package):
     assert len(found) <= LOOSE[package], f"a new constant? make it a field of the verb's options: {found}"
 
 
+DAMPED = {"dyntorch/numerics/least_squares.py", "dyntorch/metrics/errors.py"}
+"""Files with a loop that damps its steps: the one Levenberg-Marquardt, and the one whose weights change with every step."""
+
+
+def damps(loop):
+    """Whether a loop sets its damping, or takes damped steps."""
+    for node in ast.walk(loop):
+        if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store) and "damping" in node.id:
+            return True
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "damped_step":
+            return True
+    return False
+
+
+def test_levenberg_and_marquardt_loop_once():
+    found = set()
+    for path in sorted(path for package in LOOSE for path in (ROOT / package).rglob("*.py")):
+        loops = (node for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(node, (ast.For, ast.While)))
+        if any(map(damps, loops)):
+            found.add(path.relative_to(ROOT).as_posix())
+    assert found == DAMPED, "a problem of numerics.least_squares only accumulates: minimize() loops"
+
+
 @pytest.mark.parametrize("kind", EXPLAINED)
 def test_what_is_explained_is_there(kind):
     for file, names in kind.items():

@@ -16,7 +16,7 @@ from dyntorch.core.outcome import failed
 from dyntorch.core.residual import multilinear_derivative, residual_derivative
 from dyntorch.core.solution import Solution
 from dyntorch.numerics.blocks import each, map_blocks, one_thread, select, workers
-from dyntorch.numerics.least_squares import Minimum, flattened, jacobian, minimize, parts_of
+from dyntorch.numerics.least_squares import LeastSquaresOptions, Minimum, NormalEquations, flattened, jacobian, minimize, parts_of
 from dyntorch.numerics.nullspace import spectrum
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -28,7 +28,7 @@ BLOCK = 1 << 18
 
 
 @dataclass(frozen=True)
-class Problem:
+class Problem(NormalEquations):
     """Least squares in the entries of a motion, over a block of problems."""
 
     invariant: Invariant
@@ -37,6 +37,7 @@ class Problem:
     scales: tuple[Tensor, ...]
     weights: Tensor
     static: Tensor | None
+    free: Tensor | None = None
 
     def parts(self, theta: Tensor) -> tuple[Tensor, ...]:
         """The motion ``(b, *shape)`` of parameters ``(b, p)``."""
@@ -45,7 +46,7 @@ class Problem:
     def subset(self, keep: Tensor) -> Problem:
         """Only some of the problems."""
         data = self.views, self.scales, self.weights, self.static
-        return Problem(self.invariant, self.shapes, *each(lambda x: x[keep], data))
+        return Problem(self.invariant, self.shapes, *each(lambda x: x[keep], data), self.free)
 
     def residual(self, theta: Tensor, piece: slice) -> tuple[Tensor, Tensor]:
         """Weighted whitened residuals ``(b, rows)`` of some of the matches, and their derivative ``(b, p, rows)``."""
@@ -110,7 +111,7 @@ FREE = 1e-8  # least damping: leaves the gauge of the motions where it is to 1e-
 
 
 @dataclass(frozen=True)
-class Algebraic:
+class Algebraic(NormalEquations):
     r"""The algebraic error :math:`u^T G u` of tensors :math:`u = A(M) / |A(M)|`, with the Gram G of the matches."""
 
     invariant: Invariant
@@ -200,6 +201,7 @@ def algebraic_motion(solution: Solution, data: Matches, iterations: int = CONSTR
     views = tuple(x.detach() for x in norm.apply(invariant, data.views))
     starts = tuple(part[None] for part in base.motion_of(tensor)) if base.starts is None else base.starts(tensor)
     shapes = tuple(part.shape[2:] for part in starts)
+    options = LeastSquaresOptions(iterations=iterations, settling_steps=2, least_damping=FREE)
 
     def run(tries: Tensor, views: tuple[Tensor, ...], weights: Tensor, static: Tensor | None) -> Tensor:
         matrix = gram(norm.primitives, views, weights, static)
@@ -208,7 +210,7 @@ def algebraic_motion(solution: Solution, data: Matches, iterations: int = CONSTR
         costs = torch.stack([problem.cost(theta) for theta in tries.unbind(1)])
         best = costs.nan_to_num(nan=torch.inf).argmin(0)
         theta = tries.gather(1, best[:, None, None].expand(-1, 1, tries.shape[-1]))[:, 0]
-        return minimize(problem, theta, iterations, settle=2, least=FREE).theta
+        return minimize(problem, problem.evaluate((theta,)), options).theta[0]
 
     theta = torch.cat([part.flatten(2) for part in starts], dim=-1).transpose(0, 1)
     size = max(1, min(BLOCK // (invariant.width() * theta.shape[-1]), -(-len(theta) // workers())))
@@ -291,11 +293,11 @@ def refine_matches(solution: Solution, data: Matches, iterations: int = ITERATIO
         starts: Tensor, views: tuple[Tensor, ...], scales: tuple[Tensor, ...], weights: Tensor, static: Tensor | None
     ) -> Minimum:
         problem = Problem(base, shapes, views, scales, weights, static)
-        if starts.shape[1] == 1:
-            return minimize(problem, starts[:, 0], iterations)
-        costs = torch.stack([problem.normal_equations(theta)[0] for theta in starts.unbind(1)], dim=1)
-        best = costs.argmin(1)[:, None, None].expand(-1, 1, starts.shape[-1])
-        return minimize(problem, starts.gather(1, best)[:, 0], iterations)
+        theta = starts[:, 0]
+        if starts.shape[1] > 1:
+            costs = torch.stack([problem.normal_equations(theta)[0] for theta in starts.unbind(1)], dim=1)
+            theta = starts.gather(1, costs.argmin(1)[:, None, None].expand(-1, 1, starts.shape[-1]))[:, 0]
+        return minimize(problem, problem.evaluate((theta,)), LeastSquaresOptions(iterations=iterations))
 
     # a block for every thread at least: threads inside of small operations cost more than they bring
     theta = torch.stack(starts, dim=1)
@@ -304,7 +306,8 @@ def refine_matches(solution: Solution, data: Matches, iterations: int = ITERATIO
         start = torch.where(theta.isfinite(), theta, torch.zeros_like(theta))
         scales, unit = relative([t[:, 0, 0] for t in frames])
         found = map_blocks(run, start, views, scales, data.weights, data.static, size=size)
-        found = Minimum(found.theta, found.cost / unit.square(), found.matrix / unit.square()[:, None, None])
+        gradient, matrix = (x / unit.square()[(..., *[None] * (x.ndim - 1))] for x in found.terms)
+        found = Minimum(found.theta, found.cost / unit.square(), (gradient, matrix), found.steps)
         return _refined(solution, data, motion, found)
 
 
@@ -312,7 +315,7 @@ def _refined(solution: Solution, data: Matches, old: tuple[Tensor, ...], found: 
     """The solution with the refined motion, where refinement was possible; elsewhere with the old one."""
     invariant, shapes = solution.invariant, tuple(part.shape[1:] for part in old)
     good = found.cost.isfinite() & ~failed(solution.status.reshape(-1).to(found.cost.device))
-    motion = tuple(select(good, new, part) for new, part in zip(parts_of(found.theta, shapes), old, strict=True))
+    motion = tuple(select(good, new, part) for new, part in zip(parts_of(found.theta[0], shapes), old, strict=True))
     # tensors of copies have the axis of the copies behind the batch, like the transforms of the solution
     normalized = solution.base().compose(*(select(good, part, _any(part)) for part in motion))
     tensor = denormalize(invariant, normalized, solution.normalization.actions)
@@ -354,11 +357,11 @@ def _covariance(moved: Callable[[Tensor], Tensor], found: Minimum, dof: int, sca
         dof: degrees of freedom of the motion.
         scale: ``(b,)`` noise of a coordinate of a match of weight 1.
     """
-    values, vectors = spectrum(found.matrix)
+    values, vectors = spectrum(found.terms[1])
     count = min(dof, values.shape[-1])
     values, vectors = values[..., -count:], vectors[..., -count:]
     root = vectors * values.clamp(min=1e-12 * values[..., -1:].clamp(min=torch.finfo(values.dtype).tiny)).rsqrt()[..., None, :]
-    _, derivative = jacobian(moved, found.theta)
+    _, derivative = jacobian(moved, found.theta[0])
     spread = derivative.mT @ root
     covariance = (spread @ spread.mT) * scale.square()[:, None, None]
     # a motion without a matrix in the coordinates of the matches (singular) is not known at all, like one without spare matches

@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from math import pi
 
 import torch
 from torch import Tensor
 
-from dyntorch.geometry.epipolar import TINY, PairMonomials, affine_fundamental, bilinear, eight_point_of, polar
+from dyntorch.geometry.epipolar import PairMonomials, affine_fundamental, bilinear, eight_point_of, polar
 from dyntorch.geometry.homogeneous import cofactors
 from dyntorch.numerics.blocks import constant, map_blocks, uniform
+from dyntorch.numerics.least_squares import Iterate, LeastSquares, LeastSquaresOptions, Minimum, Tensors, damped_step, minimize
 
 CAP = 2.25
 """Squared distances count up to this multiple of the squared scale."""
 BLOCK = 1 << 17
 """Matches times fits per block: the weights stay in the cache."""
-DAMPING = 1e-3
-LAST = 1e-8
+RIDGE = 1e-10  # of the largest diagonal entry: few matches, or those of a plane, leave directions open
+DESCENT = LeastSquaresOptions(increase=10.0, least_damping=1e-8, tolerance=None)
 LEAST = 1e-100  # scale, whose square still has an inverse
 
 
@@ -59,25 +60,20 @@ class Frames:
 
     def moved(self, step: Tensor) -> Frames:
         """After a step ``(b, 7)``: U turned about its first two axes, V about its own, B along its tangents."""
-        _, quaternions, rotation, multiplied = _tables(step.dtype, step.device)
-        q = (step @ quaternions).unflatten(-1, (3, 4)) + quaternions.new_tensor([1.0, 0.0, 0.0, 0.0])
+        _, quaternions, rotation, multiplied, still = _tables(step.dtype, step.device)
+        q = torch.addmm(still, step, quaternions).unflatten(-1, (3, 4))
         q = q / torch.linalg.vector_norm(q, dim=-1, keepdim=True)
         pairs = (torch.cat([q[:, :2], self.core[:, None]], dim=1)[..., None] * q[..., None, :]).flatten(-2)
         turns = self.turns @ (pairs[:, :2] @ rotation).unflatten(-1, (3, 3))
         return Frames(turns, pairs[:, 2] @ multiplied)
 
-    def where(self, chosen: Tensor, other: Frames) -> Frames:
-        """These where ``chosen (b,)``, the others elsewhere."""
-        turns = torch.where(chosen[:, None, None, None], self.turns, other.turns)
-        return Frames(turns, torch.where(chosen[:, None], self.core, other.core))
-
 
 @constant
-def _tables(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _tables(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """What is linear in the parts of frames.
 
     Tangents ``(4, 63)`` of B, steps to quaternions ``(7, 12)``, products of quaternions to rotations ``(16, 9)``, and of B and a
-    quaternion to the new B ``(16, 4)``.
+    quaternion to the new B ``(16, 4)``; and three quaternions ``(12,)`` that turn nothing.
     """
     # B = (b0, b1, b2, b3) times 1, i, j, k: an orthonormal basis, as (unit, new entry, old entry)
     units = torch.zeros(4, 4, 4, dtype=dtype)
@@ -101,7 +97,13 @@ def _tables(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, T
         rotation[i + 1, j + 1, i, j] = rotation[i + 1, j + 1, j, i] = 2.0
         rotation[0, i + 1, k, j], rotation[0, i + 1, j, k] = 2.0, -2.0
     multiplied = units.permute(2, 0, 1).reshape(16, 4)
-    found = generators.reshape(4, 63), quaternions.reshape(7, 12), rotation.reshape(16, 9), multiplied
+    found = (
+        generators.reshape(4, 63),
+        quaternions.reshape(7, 12),
+        rotation.reshape(16, 9),
+        multiplied,
+        torch.eye(4, dtype=dtype)[0].repeat(3),
+    )
     return tuple(table.to(device) for table in found)  # type: ignore[return-value]
 
 
@@ -148,25 +150,45 @@ def _descend(data: PairMonomials, F: Tensor, weights: Tensor, scales: Sequence[f
 
 
 def _descend_block(tables: Products, F: Tensor, weights: Tensor, scales: Sequence[float], steps: int) -> tuple[Tensor, Tensor]:
-    frames = Frames.of(F)
-    f = frames.matrix()
-    value, square = tables.data.flat_terms(f)
+    options, frames, found = replace(DESCENT, iterations=steps), Frames.of(F), None
     for scale in scales:
-        inverse = 1 / max(scale, LEAST) ** 2
-        cost = _msac(value, square, weights, inverse)
-        damping = torch.full_like(cost, DAMPING)
-        for _ in range(steps):
-            normal, gradient = _normal_equations(tables, frames, f, value, square, weights, inverse)
-            fresh = frames.moved(marquardt(normal, gradient, damping))
-            trial = fresh.matrix()
-            value_, square_ = tables.data.flat_terms(trial)
-            cost_ = _msac(value_, square_, weights, inverse)
-            better = cost_ < cost
-            damping = torch.where(better, (0.1 * damping).clamp(min=LAST), 10 * damping)
-            frames, cost, wide = fresh.where(better, frames), torch.where(better, cost_, cost), better[:, None]
-            f = torch.where(wide, trial, f)
-            value, square = torch.where(wide, value_, value), torch.where(wide, square_, square)
-    return f.unflatten(-1, (3, 3)), cost
+        problem = EpipolarProblem(tables, weights, 1 / max(scale, LEAST) ** 2)
+        start = problem.evaluate((frames.turns, frames.core)) if found is None else problem.again(found)
+        found = minimize(problem, start, options)
+    assert found is not None
+    return found.terms[0].unflatten(-1, (3, 3)), found.cost
+
+
+@dataclass(frozen=True)
+class EpipolarProblem(LeastSquares):
+    """Truncated Sampson distances of one list of matches with weights ``(b, n)``, in the parts of :class:`Frames`."""
+
+    tables: Products
+    weights: Tensor
+    inverse: float
+    """Of the squared scale."""
+
+    def evaluate(self, theta: Tensors) -> Iterate:
+        """With F, its values at the matches and the squared gradients."""
+        f = Frames(*theta).matrix()
+        value, square = self.tables.data.flat_terms(f)
+        return Iterate(theta, _msac(value, square, self.weights, self.inverse), (f, value, square))
+
+    def again(self, at: Minimum) -> Iterate:
+        """The same place at another scale."""
+        _, value, square = at.terms
+        return Iterate(at.theta, _msac(value, square, self.weights, self.inverse), at.terms)
+
+    def step(self, at: Iterate, damping: Tensor) -> Tensors:
+        """Of the seven parameters."""
+        f, value, square = at.terms
+        normal, gradient = _normal_equations(self.tables, Frames(*at.theta), f, value, square, self.weights, self.inverse)
+        return (damped_step(gradient, normal, damping, ridge=RIDGE),)
+
+    def retract(self, theta: Tensors, step: Tensors) -> Tensors:
+        """The frames turned."""
+        fresh = Frames(*theta).moved(-step[0])
+        return fresh.turns, fresh.core
 
 
 def _msac(value: Tensor, square: Tensor, weights: Tensor, inverse: float) -> Tensor:
@@ -231,15 +253,6 @@ def _normal_equations(
     outer = torch.cat([tangents, tangents @ gradients], dim=-1)  # (b, 7, 21)
     product = outer @ tables.gram(a, b, b * ratio)
     return product @ outer.mT, (product[..., :9] @ f[..., None])[..., 0]
-
-
-def marquardt(matrix: Tensor, gradient: Tensor, damping: Tensor) -> Tensor:
-    """Steps damped by the diagonal; none where the equations do not decide."""
-    diagonal = matrix.diagonal(dim1=-2, dim2=-1)
-    floor = 1e-10 * diagonal.amax(-1, keepdim=True) + TINY
-    factor = torch.linalg.cholesky_ex(matrix + torch.diag_embed(diagonal * damping[:, None] + floor))[0]
-    step = torch.cholesky_solve(-gradient[..., None], factor)[..., 0]
-    return torch.where(step.isfinite(), step, 0.0)
 
 
 def fit_fundamental(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import accumulate, combinations, product
 from math import comb, prod
 
@@ -12,9 +13,11 @@ from torch import Tensor
 from dyntorch.geometry.grassmann import balanced, candidates, check, grassmann_derivative, grassmann_tensor, rotated, tables, unit
 from dyntorch.geometry.homogeneous import unit_vectors
 from dyntorch.numerics.blocks import constant, map_blocks
+from dyntorch.numerics.least_squares import Iterate, LeastSquares, LeastSquaresOptions, Tensors, minimize
 
-STEPS, NEWTON = 30, 8
-"""At most, of Levenberg-Marquardt and of Newton, in each round."""
+DESCENT = LeastSquaresOptions(increase=10.0, least_damping=0.0, stuck_damping=5e4, tolerance=0.0)
+NEWTON = 8
+"""Newton's steps at most, in each round."""
 NEAR = (1e-2, 1e-4, 1e-7)
 """Length of a step, relative to the projections, at which a round leaves the rest to Newton; the next is for those he fails."""
 LAST = 1e-9
@@ -164,26 +167,8 @@ class _Nearest:
 
     def descend(self, theta: Tensor, target: Tensor, near: float) -> Tensor:
         """Levenberg-Marquardt, until the steps are short."""
-        cost = self.cost(theta, target)
-        damping = torch.full_like(cost, 1e-3)
-        active = torch.arange(len(theta), device=theta.device)
-        for _ in range(STEPS):
-            now, aim, mu = theta[active], target[active], damping[active]
-            u, slope, matrix = self.linearized(now)
-            gradient = -(slope @ _across(aim, u)[..., None])[..., 0]
-            diagonal = matrix.diagonal(dim1=-2, dim2=-1)
-            floor = mu[:, None] * (diagonal + 1e-3 * diagonal.mean(-1, keepdim=True))
-            step, _ = _solved(matrix + self.free(now) + torch.diag_embed(floor), gradient)
-            ahead = now - step
-            lower = self.cost(ahead, aim)
-            better = lower < cost[active]
-            theta[active] = torch.where(better[:, None], ahead, now)
-            cost[active] = torch.where(better, lower, cost[active])
-            damping[active] = torch.where(better, 0.1 * mu, 10 * mu)
-            active = active[(step.norm(dim=-1) > near * now.norm(dim=-1)) & (damping[active] < 1e6)]
-            if len(active) == 0:
-                break
-        return theta
+        problem = NearestProblem(self, target, near)
+        return minimize(problem, problem.evaluate((theta,)), DESCENT).theta[0]
 
     def newton(self, theta: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
         """Newton's steps while they get shorter, the last digits at any distance of the target; and whether they did ``(b,)``."""
@@ -229,6 +214,35 @@ class _Nearest:
     def cost(self, theta: Tensor, target: Tensor) -> Tensor:
         u = unit_vectors(grassmann_tensor(self.parts(theta), self.profile).flatten(1))
         return 0.5 * (u - target).square().sum(-1)
+
+
+@dataclass(frozen=True)
+class NearestProblem(LeastSquares):
+    """The distance of unit tensors from ``target (b, D)``, until steps are as short as ``near``, relative to the projections."""
+
+    family: _Nearest
+    target: Tensor
+    near: float
+
+    def subset(self, keep: Tensor) -> NearestProblem:
+        """Only some of the problems."""
+        return NearestProblem(self.family, self.target[keep], self.near)
+
+    def evaluate(self, theta: Tensors) -> Iterate:
+        """Half the squared distance."""
+        return Iterate(theta, self.family.cost(theta[0], self.target), ())
+
+    def step(self, at: Iterate, damping: Tensor) -> Tensors:
+        """Across the directions that leave the tensor alone."""
+        u, slope, matrix = self.family.linearized(at.theta[0])
+        gradient = -(slope @ _across(self.target, u)[..., None])[..., 0]
+        diagonal = matrix.diagonal(dim1=-2, dim2=-1)
+        floor = damping[:, None] * (diagonal + 1e-3 * diagonal.mean(-1, keepdim=True))
+        return (_solved(matrix + self.family.free(at.theta[0]) + torch.diag_embed(floor), gradient)[0],)
+
+    def finished(self, at: Iterate, fresh: Iterate, step: Tensors, tolerance: float) -> Tensor:
+        """Where the rest is left to Newton."""
+        return step[0].norm(dim=-1) <= self.near * at.theta[0].norm(dim=-1)
 
 
 def _standard(parts: Sequence[Tensor], profile: Sequence[int]) -> list[Tensor]:

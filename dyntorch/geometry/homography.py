@@ -5,16 +5,18 @@ As in :mod:`dyntorch.geometry.epipolar`, the matches are centred, of about unit 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from dyntorch.geometry.epipolar import TINY, hartley, null_vector
-from dyntorch.geometry.epipolar_fit import CAP, DAMPING, LAST, marquardt
+from dyntorch.geometry.epipolar_fit import CAP, DESCENT, RIDGE
 from dyntorch.geometry.homogeneous import homogeneous, unit_vectors
 from dyntorch.numerics.blocks import map_blocks
+from dyntorch.numerics.least_squares import Iterate, LeastSquares, Tensors, damped_step, minimize
 
 BLOCK = 1 << 15
 """Matches times fits per block: the Jacobian, 15 numbers per match, stays in the cache."""
@@ -179,28 +181,37 @@ def descend_homography(
 
 
 def _descend(H: Tensor, x1: Tensor, x2: Tensor, weights: Tensor, inverse: float, cap: float, steps: int) -> tuple[Tensor, Tensor]:
-    H = unit_vectors(H.flatten(1)).unflatten(-1, (3, 3))
-    terms = _terms(H, x1, x2)
-    cost = _msac(terms, weights, inverse, cap)
-    damping = torch.full_like(cost, DAMPING)
-    for _ in range(steps):
-        weighted = weights * (1 - terms.distance * (inverse / cap)).clamp(min=0)
-        matrix, gradient = _normal_equations(H, terms, x1, x2, weighted)
-        trial = unit_vectors(H.flatten(1) + marquardt(matrix, gradient, damping)).unflatten(-1, (3, 3))
-        fresh = _terms(trial, x1, x2)
-        cost_ = _msac(fresh, weights, inverse, cap)
-        better = cost_ < cost
-        damping = torch.where(better, (0.1 * damping).clamp(min=LAST), 10 * damping)
-        H, cost = torch.where(better[:, None, None], trial, H), torch.where(better, cost_, cost)
-        parts = (
-            torch.where(better[:, None], new, old) for new, old in zip(vars(fresh).values(), vars(terms).values(), strict=True)
-        )
-        terms = _Terms(*parts)
-    return H, cost
+    problem = HomographyProblem(x1, x2, weights, inverse, cap)
+    found = minimize(problem, problem.evaluate((H,)), replace(DESCENT, iterations=steps))
+    return found.theta[0], found.cost
 
 
 @dataclass(frozen=True)
-class _Terms:
+class HomographyProblem(LeastSquares):
+    """Truncated Sampson distances of matches ``(n, 2)`` with weights ``(b, n)`` from homographies ``(b, 3, 3)``."""
+
+    x1: Tensor
+    x2: Tensor
+    weights: Tensor
+    inverse: float
+    """Of the squared scale."""
+    cap: float
+
+    def evaluate(self, theta: Tensors) -> Iterate:
+        """Of homographies of norm 1."""
+        H = unit_vectors(theta[0].flatten(1)).unflatten(-1, (3, 3))
+        terms = _terms(H, self.x1, self.x2)
+        return Iterate((H,), _msac(terms, self.weights, self.inverse, self.cap), terms)
+
+    def step(self, at: Iterate, damping: Tensor) -> Tensors:
+        """By the matches that are not truncated, smoothly."""
+        terms = _Terms(*at.terms)
+        weighted = self.weights * (1 - terms.distance * (self.inverse / self.cap)).clamp(min=0)
+        matrix, gradient = _normal_equations(at.theta[0], terms, self.x1, self.x2, weighted)
+        return (damped_step(gradient, matrix, damping, ridge=RIDGE).unflatten(-1, (3, 3)),)
+
+
+class _Terms(NamedTuple):
     """Of every match ``(*batch, n)``: what the Sampson distance consists of."""
 
     depth: Tensor  # h_3 (x_1, 1)

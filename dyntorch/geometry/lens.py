@@ -15,7 +15,7 @@ from dyntorch.geometry.homogeneous import homogeneous
 from dyntorch.geometry.options import LensOptions
 from dyntorch.numerics.arguments import check_options, on_cpu
 from dyntorch.numerics.blocks import one_thread
-from dyntorch.numerics.least_squares import damped_step
+from dyntorch.numerics.least_squares import Iterate, LeastSquares, LeastSquaresOptions, Minimum, Tensors, damped_step, minimize
 from dyntorch.numerics.messages import Message
 
 COEFFICIENTS = (4, 5, 8)
@@ -256,7 +256,7 @@ def _invert(target: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
 
 RANGE = (-0.8, 0.4)
 """Of lambda: from a fisheye of 150 degrees across the diagonal to more pincushion than any lens sold."""
-ITERATIONS, CONVERGED = 30, 1e-6
+DESCENT = LeastSquaresOptions(increase=10.0, least_damping=1e-10, stuck_damping=1e3, tolerance=1e-6)
 NEAR = 1e-5
 """Of a parameter: the step of a difference."""
 
@@ -438,7 +438,14 @@ class LensDescent:
         k = int(self.cost(data, scale).argmin())
         return LensDescent(Frames(self.frames.turns[k : k + 1], self.frames.core[k : k + 1]), self.lens[k : k + 1])
 
-    def _normal(self, data: LensMatches, scale: Tensor) -> tuple[Tensor, Tensor]:
+    def descended(self, data: LensMatches, scale: Tensor, *, lens: bool) -> LensDescent:
+        """At the minimum next to it, with the lenses or without."""
+        free = torch.ones_like(self.lens[0]).repeat_interleave(5)[:9]
+        free[7:] = float(lens)
+        problem = LensProblem(data, scale.expand(len(self.lens), 1), free)
+        return LensProblem.lenses(minimize(problem, problem.evaluate((self.frames.turns, self.frames.core, self.lens)), DESCENT))
+
+    def normal_equations(self, data: LensMatches, scale: Tensor) -> tuple[Tensor, Tensor]:
         """Gradient ``(B, 9)`` and Gauss-Newton matrix ``(B, 9, 9)`` of half the cost."""
         away = self.distances(data) / scale
         # central differences: exact to 1e-10, and four times faster than jacfwd
@@ -450,30 +457,46 @@ class LensDescent:
         weighted = (data.weights * (away.square() < data.options.cap))[..., None] * jacobian
         return (weighted * away[..., None]).sum(1), weighted.mT @ jacobian
 
-    def descended(self, data: LensMatches, scale: Tensor, *, lens: bool) -> LensDescent:
-        """Levenberg-Marquardt, with the lenses or without."""
-        free = torch.ones_like(self.lens[0]).repeat_interleave(5)[:9]
-        free[7:] = float(lens)
-        fit, cost = self, self.cost(data, scale)
-        damping = torch.full_like(cost, 1e-3)
-        for _ in range(ITERATIONS):
-            trial = fit.moved(-damped_step(*fit._normal(data, scale), damping, free))
-            trial = LensDescent(trial.frames, trial.lens.clamp(*RANGE))
-            fresh = trial.cost(data, scale)
-            better = fresh < cost
-            done = bool((((cost - fresh).abs() <= CONVERGED * cost) | (~better & (damping > 1e3))).all())
-            fit = LensDescent(trial.frames.where(better, fit.frames), torch.where(better[:, None], trial.lens, fit.lens))
-            cost, damping = torch.where(better, fresh, cost), torch.where(better, 0.1 * damping, 10 * damping).clamp(1e-10, 1e8)
-            if done:
-                break
-        return fit
-
     def sigmas(self, data: LensMatches, scale: Tensor) -> Tensor:
         """Standard deviations ``(2,)`` of lambda for errors of one ``scale``."""
-        matrix = self._normal(data, scale)[1][0]
+        matrix = self.normal_equations(data, scale)[1][0]
         if not bool(matrix.isfinite().all()):
             return matrix.new_full((2,), torch.inf)
         return torch.linalg.pinv(matrix, hermitian=True).diagonal()[7:].clamp(min=0).sqrt()
+
+
+@dataclass(frozen=True)
+class LensProblem(LeastSquares):
+    """Truncated distances in the turns, the core of :class:`Frames` and the lenses of a :class:`LensDescent`."""
+
+    data: LensMatches
+    scale: Tensor
+    """``(B, 1)`` px."""
+    free: Tensor
+    """``(9,)``, 0 for parameters that stay as they are."""
+
+    @staticmethod
+    def lenses(at: Iterate | Minimum) -> LensDescent:
+        """As matrices and lenses."""
+        return LensDescent(Frames(*at.theta[:2]), at.theta[2])
+
+    def subset(self, keep: Tensor) -> LensProblem:
+        """Only some of the starts."""
+        return LensProblem(self.data, self.scale[keep], self.free)
+
+    def evaluate(self, theta: Tensors) -> Iterate:
+        """With lenses that are sold."""
+        at = Iterate((*theta[:2], theta[2].clamp(*RANGE)), self.scale[:, 0], ())
+        return at._replace(cost=self.lenses(at).cost(self.data, self.scale))
+
+    def step(self, at: Iterate, damping: Tensor) -> Tensors:
+        """Of the nine parameters."""
+        return (damped_step(*self.lenses(at).normal_equations(self.data, self.scale), damping, self.free),)
+
+    def retract(self, theta: Tensors, step: Tensors) -> Tensors:
+        """The frames turned, the lenses changed."""
+        fresh = LensDescent(Frames(*theta[:2]), theta[2]).moved(-step[0])
+        return fresh.frames.turns, fresh.frames.core, fresh.lens
 
 
 def _fitted(data: LensMatches) -> tuple[LensDescent, LensDescent]:

@@ -20,6 +20,7 @@ from dyntorch.geometry.homogeneous import (
     unit_vectors,
 )
 from dyntorch.numerics.blocks import constant, one_thread
+from dyntorch.numerics.least_squares import Iterate, LeastSquares, LeastSquaresOptions, Tensors, minimize
 from dyntorch.numerics.nullspace import gram_null_space, null_space, spectrum
 
 REWEIGHTINGS, CANDIDATES = 3, 4
@@ -252,7 +253,7 @@ def _mean(values: Tensor, weights: Tensor) -> Tensor:
 # The matrix takes monomials of the points, :math:`\nu(p_2)^T S\, \nu(p_1)`, in the order 00, 01, 02, 11, 12, 22.
 
 
-STEPS = 12
+DESCENT = LeastSquaresOptions(iterations=12, damping=1e-4, increase=10.0, least_damping=0.0, tolerance=None)
 """Steps to the nearest product.  Without any, 1 of 40 noisy scenes (100 matches, .01 px, epipoles 2 degrees apart) is useless."""
 EXACT = 1e-10  # of the norm of the matrix: what rounding leaves of an exact product
 FULL = 1e-12  # damping that is none
@@ -398,25 +399,18 @@ def _nearest(matrix: Tensor, tries: Tensor) -> Tensor:
     if len(chosen):
         forms = forms.index_copy(0, chosen, _descent(matrix[chosen], tries[chosen]))
     # a full step at the end gives exact products the gradient of the nearest one, too
-    rest, scale = _rest(matrix, forms)
-    trial = _step(matrix, forms, scale, torch.full_like(rest, FULL))
-    better = _rest(matrix, trial)[0] <= rest.clamp(min=EXACT)
-    return torch.where(better[:, None, None, None], trial, forms)
+    problem = ProductProblem(matrix)
+    at = problem.evaluate((forms,))
+    trial = problem.moved(at, problem.step(at, torch.full_like(at.cost, FULL)))
+    better = trial.cost <= at.cost.clamp(min=EXACT)
+    return torch.where(better[:, None, None, None], trial.theta[0], forms)
 
 
 def _descent(matrix: Tensor, tries: Tensor) -> Tensor:
     """:func:`_nearest` of matrices that are no product."""
-    target, current = matrix.repeat_interleave(2, 0), tries.flatten(0, 1)
-    rest, scale = _rest(target, current)
-    damping = torch.full_like(rest, 1e-4)
-    for _ in range(STEPS):
-        trial = _step(target, current, scale, damping)
-        left, size = _rest(target, trial)
-        better = left < rest
-        current = torch.where(better[:, None, None, None], trial, current)
-        rest, scale = torch.where(better, left, rest), torch.where(better, size, scale)
-        damping = torch.where(better, damping * 0.1, damping * 10)
-    return _best(current.unflatten(0, (-1, 2)), rest.unflatten(0, (-1, 2)))
+    problem = ProductProblem(matrix.repeat_interleave(2, 0))
+    found = minimize(problem, problem.evaluate((tries.flatten(0, 1),)), DESCENT)
+    return _best(found.theta[0].unflatten(0, (-1, 2)), found.cost.unflatten(0, (-1, 2)))
 
 
 def _best(tries: Tensor, rest: Tensor) -> Tensor:
@@ -432,24 +426,40 @@ def _rest(matrix: Tensor, forms: Tensor) -> tuple[Tensor, Tensor]:
     return (flat - scale[:, None] * product).norm(dim=-1), scale
 
 
-def _step(matrix: Tensor, forms: Tensor, scale: Tensor, damping: Tensor) -> Tensor:
-    """Forms of norm 1 and rank two after one damped step along them."""
-    flat = forms.flatten(2)
-    first, second = (_with(forms[:, 1 - k]) * scale[:, None, None] for k in (0, 1))
-    value = matrix.flatten(1) - (first @ flat[:, 0, :, None])[..., 0]
-    jacobian = torch.cat([first, second], dim=-1)
-    # the scale of the second form is that of the first, and the rank stays two
-    left, right = null_vectors(forms)
-    across = (left[..., :, None] * right[..., None, :]).flatten(2)
-    zero = torch.zeros_like(across[:, 0])
-    fixed = [[across[:, 0], zero], [zero, across[:, 1]], [zero, flat[:, 1]]]
-    rows = torch.stack([torch.cat(pair, dim=-1) for pair in fixed], dim=1)
-    system = jacobian.mT @ jacobian + rows.mT @ rows + torch.diag_embed(damping[:, None].expand(-1, 18))
-    step = torch.linalg.solve_ex(system, jacobian.mT @ value[..., None])[0].nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
-    moved = forms + step[..., 0].unflatten(-1, (2, 3, 3))
-    right = null_vectors(moved)[1]
-    moved = moved - (moved @ right[..., None]) * right[..., None, :]
-    return moved / torch.linalg.matrix_norm(moved, keepdim=True).clamp(min=1e-300)
+@dataclass(frozen=True)
+class ProductProblem(LeastSquares):
+    """Two forms ``(b, 2, 3, 3)`` of rank two and norm 1 whose product is nearest to a matrix ``(b, 6, 6)``."""
+
+    matrix: Tensor
+
+    def evaluate(self, theta: Tensors) -> Iterate:
+        """The distance, which falls with its square, and the best factor of the product."""
+        rest, scale = _rest(self.matrix, theta[0])
+        return Iterate(theta, rest, (scale,))
+
+    def step(self, at: Iterate, damping: Tensor) -> Tensors:
+        """Along the forms of norm 1 and rank two."""
+        forms, scale = at.theta[0], at.terms[0]
+        flat = forms.flatten(2)
+        first, second = (_with(forms[:, 1 - k]) * scale[:, None, None] for k in (0, 1))
+        value = self.matrix.flatten(1) - (first @ flat[:, 0, :, None])[..., 0]
+        jacobian = torch.cat([first, second], dim=-1)
+        # the scale of the second form is that of the first, and the rank stays two
+        left, right = null_vectors(forms)
+        across = (left[..., :, None] * right[..., None, :]).flatten(2)
+        zero = torch.zeros_like(across[:, 0])
+        fixed = [[across[:, 0], zero], [zero, across[:, 1]], [zero, flat[:, 1]]]
+        rows = torch.stack([torch.cat(pair, dim=-1) for pair in fixed], dim=1)
+        system = jacobian.mT @ jacobian + rows.mT @ rows + torch.diag_embed(damping[:, None].expand(-1, 18))
+        step = torch.linalg.solve_ex(system, jacobian.mT @ value[..., None])[0].nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
+        return (-step[..., 0].unflatten(-1, (2, 3, 3)),)
+
+    def retract(self, theta: Tensors, step: Tensors) -> Tensors:
+        """The nearest forms of norm 1 and rank two."""
+        moved = theta[0] - step[0]
+        right = null_vectors(moved)[1]
+        moved = moved - (moved @ right[..., None]) * right[..., None, :]
+        return (moved / torch.linalg.matrix_norm(moved, keepdim=True).clamp(min=1e-300),)
 
 
 def _with(form: Tensor) -> Tensor:

@@ -1,44 +1,148 @@
-"""Nonlinear least squares by Levenberg-Marquardt, for a block of problems at once."""
+"""Nonlinear least squares by Levenberg-Marquardt, for a block of problems at once.
+
+A problem only accumulates: what it costs, and the step that its normal equations give.  What is done with that, whether a step is
+taken, how much the next one is damped, which problems are done, is decided here, once for all.
+"""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, Protocol
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.autograd import grad
 
-CONVERGED = 1e-9  # relative decrease of the cost
-LEAST = 1e-12  # damping
-NEAR = 1e-3  # length of a step, of motions of norm 1, that ends near the minimum
+SHORT = 1e-13  # change of parameters of norm 1 that is rounding
+
+Tensors = tuple[Tensor, ...]
 
 
-class Minimand(Protocol):
-    """A block of least squares problems in the entries of motions."""
+@dataclass(frozen=True)
+class LeastSquaresOptions:
+    """How a descent damps its steps and when it ends.  Dampings and costs are relative, they have no unit."""
 
-    def parts(self, theta: Tensor) -> tuple[Tensor, ...]:
-        """The parts ``(b, *shape)`` of parameters ``(b, p)``, each of any scale."""
-        ...
+    iterations: int = 30
+    """Steps at most, the refused ones included."""
+    damping: float = 1e-3
+    """Of the first step, as a multiple of the diagonal of the Gauss-Newton matrix."""
+    decrease: float = 0.1
+    """Factor of the damping after a step that lowers the cost."""
+    increase: float = 8.0
+    """Factor of the damping after one that does not and is refused."""
+    least_damping: float = 1e-12
+    """Damping never falls below; rounding moves the parameters along directions that are free by its inverse."""
+    stuck_damping: float = 1e6
+    """A problem is done where a step of more damping is refused: there is no way down even by the shortest steps."""
+    tolerance: float | None = 1e-9
+    """A problem is done where a step lowers its cost by this share at most.  None: all problems take all steps."""
+    settling_steps: int = 0
+    """Gauss-Newton steps of all problems at the end.  The last digits of a step depend on how many problems take it, and a flat
+    minimum makes more of them than digits; these steps take them back."""
+    settling_length: float = 1e-3
+    """Length of a step, of parameters of norm 1, that ends near the minimum."""
 
-    def normal_equations(self, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Cost ``(b,)``, gradient ``(b, p)`` and Gauss-Newton matrix ``(b, p, p)``."""
-        ...
 
-    def subset(self, keep: Tensor) -> Minimand:
-        """Only some of the problems."""
-        ...
+class Iterate(NamedTuple):
+    """Where a block of problems is: parameters ``(b, ...)`` each, cost ``(b,)``, and what else is known there and the next step
+    takes, ``(b, ...)`` each.  A problem whose cost is not finite stays where it is."""
+
+    theta: Tensors
+    cost: Tensor
+    terms: Tensors
+
+    def where(self, chosen: Tensor, other: Iterate) -> Iterate:
+        """This one where ``chosen (b,)``, the other elsewhere."""
+        wide, own = [chosen], chosen.ndim  # with as many dimensions as each part has
+        for _ in range(max([part.ndim for part in (*self.theta, *self.terms)]) - own):
+            wide.append(wide[-1].unsqueeze(-1))
+        theta, terms = (
+            tuple([torch.where(wide[new.ndim - own], new, old) for new, old in zip(*pair, strict=True)])
+            for pair in ((self.theta, other.theta), (self.terms, other.terms))
+        )
+        return Iterate(theta, torch.where(chosen, self.cost, other.cost), terms)
+
+    def subset(self, keep: Tensor) -> Iterate:
+        """Some of the problems."""
+        return Iterate(tuple(x[keep] for x in self.theta), self.cost[keep], tuple(x[keep] for x in self.terms))
+
+    def updated(self, index: Tensor, part: Iterate) -> Iterate:
+        """With other values for the problems ``index``."""
+        theta, terms = (
+            tuple(old.index_copy(0, index, new) for old, new in zip(*pair, strict=True))
+            for pair in ((self.theta, part.theta), (self.terms, part.terms))
+        )
+        return Iterate(theta, self.cost.index_copy(0, index, part.cost), terms)
 
 
 class Minimum(NamedTuple):
-    """Where a block of least squares problems ended."""
+    """Where a descent ended, as :class:`Iterate` says it, after ``steps (b,)``, the refused ones included."""
 
-    theta: Tensor
-    """``(b, p)`` parameters."""
+    theta: Tensors
     cost: Tensor
-    """``(b,)``."""
-    matrix: Tensor
-    """``(b, p, p)`` of Gauss and Newton."""
+    terms: Tensors
+    steps: Tensor
+
+
+class LeastSquares(ABC):
+    """A block of least squares problems."""
+
+    @abstractmethod
+    def evaluate(self, theta: Tensors) -> Iterate:
+        """The cost of parameters, and what of it the next step takes; in the normal form that the problem wants them in."""
+
+    @abstractmethod
+    def step(self, at: Iterate, damping: Tensor) -> Tensors:
+        """The step ``(b, ...)`` of Levenberg and Marquardt with damping ``(b,)``, most often :func:`damped_step`."""
+
+    def retract(self, theta: Tensors, step: Tensors) -> Tensors:
+        """The parameters after a step."""
+        return tuple([part - move for part, move in zip(theta, step, strict=True)])
+
+    def moved(self, at: Iterate, step: Tensors) -> Iterate:
+        """The place after a step."""
+        return self.evaluate(self.retract(at.theta, step))
+
+    def finished(self, at: Iterate, fresh: Iterate, step: Tensors, tolerance: float) -> Tensor | None:
+        """Problems ``(b,)`` that the step from one place to another shows to be done, whatever the cost says."""
+        return None
+
+    def subset(self, keep: Tensor) -> LeastSquares:
+        """Only some of the problems; what descends with a tolerance says how."""
+        raise NotImplementedError(f"{type(self).__name__} has no subset: descend with tolerance=None")
+
+
+class NormalEquations(LeastSquares):
+    """Least squares in one vector ``(b, p)`` of parameters, whose derivatives come with the cost."""
+
+    free: Tensor | None = None
+    """``(p,)``, 0 for parameters that stay as they are; None: all vary."""
+
+    @abstractmethod
+    def normal_equations(self, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Cost ``(b,)``, gradient ``(b, p)`` and Gauss-Newton matrix ``(b, p, p)``."""
+
+    def parts(self, theta: Tensor) -> Tensors:
+        """The parts ``(b, *shape)`` of parameters ``(b, p)`` that may have any scale: each is kept at norm 1."""
+        return (theta,)
+
+    def evaluate(self, theta: Tensors) -> Iterate:
+        """At parameters whose parts have norm 1, which changes nothing but the size of the numbers."""
+        scaled = [part.flatten(1) / part.flatten(1).norm(dim=-1, keepdim=True).clamp(min=1e-30) for part in self.parts(theta[0])]
+        vector = torch.cat(scaled, dim=-1)
+        cost, gradient, matrix = self.normal_equations(vector)
+        return Iterate((vector,), cost, (gradient, matrix))
+
+    def step(self, at: Iterate, damping: Tensor) -> Tensors:
+        """By the normal equations."""
+        gradient, matrix = at.terms
+        return (damped_step(gradient, matrix, damping, self.free),)
+
+    def finished(self, at: Iterate, fresh: Iterate, step: Tensors, tolerance: float) -> Tensor | None:
+        """Where nothing moves."""
+        return step[0].abs().amax(-1) < SHORT
 
 
 def flattened(parts: Sequence[Tensor]) -> Tensor:
@@ -52,7 +156,7 @@ def parts_of(theta: Tensor, shapes: Sequence[torch.Size]) -> tuple[Tensor, ...]:
     return tuple(part.unflatten(-1, shape) for part, shape in zip(theta.split(sizes, -1), shapes, strict=True))
 
 
-def damped_step(gradient: Tensor, matrix: Tensor, damping: Tensor, free: Tensor | None = None) -> Tensor:
+def damped_step(gradient: Tensor, matrix: Tensor, damping: Tensor, free: Tensor | None = None, ridge: float = 0.0) -> Tensor:
     r"""The step of Levenberg and Marquardt, :math:`(H + \mu\,\mathrm{diag}\,H)^{-1} g`, to be subtracted; 0 where it is not finite.
 
     Args:
@@ -60,82 +164,84 @@ def damped_step(gradient: Tensor, matrix: Tensor, damping: Tensor, free: Tensor 
         matrix: ``(b, p, p)``.
         damping: ``(b,)``.
         free: ``(p,)``, 0 for parameters that stay as they are.
+        ridge: share of the largest diagonal entry that is added to all, whatever the damping.
     """
     if free is not None:
         gradient, matrix = gradient * free, matrix * free * free[:, None]
     diagonal = matrix.diagonal(dim1=-2, dim2=-1)
     # directions that the matches leave open (scales, a common velocity) must not be divided by zero
-    floor = damping[:, None] * (diagonal + 1e-9 * diagonal.amax(-1, keepdim=True) + torch.finfo(matrix.dtype).tiny)
+    largest = diagonal.amax(-1, keepdim=True)
+    floor = damping[:, None] * (diagonal.add(largest, alpha=1e-9) + torch.finfo(matrix.dtype).tiny)
+    floor = floor.add(largest, alpha=ridge) if ridge else floor
     # a parameter that stays has an equation of its own, step = 0
     floor = floor if free is None else floor + (1 - free)
-    factor, _ = torch.linalg.cholesky_ex(matrix + torch.diag_embed(floor))
+    held = matrix.clone()
+    held.diagonal(dim1=-2, dim2=-1).add_(floor)
+    factor, _ = torch.linalg.cholesky_ex(held)
     step = torch.cholesky_solve(gradient[..., None], factor)[..., 0]
-    return torch.where(step.isfinite(), step, torch.zeros_like(step))
+    return torch.where(step.isfinite(), step, 0.0)
 
 
-def minimize(problem: Minimand, theta: Tensor, iterations: int, *, settle: int = 0, least: float = LEAST) -> Minimum:
-    """Parameters, cost and Gauss-Newton matrix at the minimum of every problem of a block, by Levenberg-Marquardt.
+def minimize(problem: LeastSquares, start: Iterate, options: LeastSquaresOptions) -> Minimum:
+    """The minimum next to given parameters, of every problem of a block, by Levenberg-Marquardt.
+
+    The cost never rises.  Where gradients are recorded they go through all the steps.
 
     Args:
-        problem: says cost and derivatives.
-        theta: ``(b, p)`` start.
-        iterations: at most so many steps.
-        settle: Gauss-Newton steps of all problems at the end.  The last digits of a step depend on how many problems take it,
-            and a flat minimum makes more of them than digits; these steps take them back.
-        least: damping never falls below; rounding moves the motion along directions that are free by its inverse.
+        problem: says costs and steps.
+        start: what the problem says of the parameters to start from; with a tolerance of None ``b`` may be several dimensions.
+        options: see :class:`LeastSquaresOptions`.
     """
-    given = problem
-    theta = _unit_parts(problem, theta)
-    result: tuple[Tensor, ...] = (theta, *problem.normal_equations(theta))
-    damping = torch.full_like(result[1], 1e-3)
-    left = torch.arange(theta.shape[0], device=theta.device)
-    state, current = result, problem
-    for _ in range(iterations):
-        state, damping, done = _step(current, state, damping, least)
+    at, damping = start, torch.full_like(start.cost, options.damping)
+    steps = torch.full_like(start.cost, options.iterations, dtype=torch.long)
+    if options.tolerance is None:
+        for _ in range(options.iterations):
+            at, damping, _ = _stepped(problem, at, damping, options)
+    else:
+        at = _until_done(problem, at, damping, options, steps)
+    for _ in range(options.settling_steps):
+        at = _settled(problem, at, options)
+    return Minimum(at.theta, at.cost, at.terms, steps)
+
+
+def _until_done(problem: LeastSquares, whole: Iterate, damping: Tensor, options: LeastSquaresOptions, steps: Tensor) -> Iterate:
+    """Steps of every problem until it is done; their numbers are written into ``steps``."""
+    at, done = whole, ~whole.cost.isfinite()
+    left = torch.arange(done.shape[0], device=done.device)
+    for count in range(options.iterations):
         # problems that are done leave: the slow ones do not make the others wait.  An accelerator is asked once per step, which
         # launches hundreds of kernels
-        result = tuple(whole.index_copy(0, left, part) for whole, part in zip(result, state, strict=True))
-        keep = (~done).nonzero().flatten()
-        if not len(keep):
-            break
-        if len(keep) < len(left):
-            left, damping, current = left[keep], damping[keep], current.subset(keep)
-            state = tuple(part[keep] for part in state)
-    for _ in range(settle):
-        result = _settled(given, result, least)
-    theta, cost, _, matrix = result
-    return Minimum(theta, cost, matrix)
+        keep = (~done).nonzero()[:, 0]
+        if keep.shape != left.shape:
+            whole = whole.updated(left, at)
+            steps[left[done]] = count
+            left, damping, at, problem = left[keep], damping[keep], at.subset(keep), problem.subset(keep)
+        if not keep.shape[0]:
+            return whole
+        at, damping, done = _stepped(problem, at, damping, options)
+    return at if left.shape == steps.shape else whole.updated(left, at)
 
 
-def _step(problem: Minimand, state: tuple[Tensor, ...], damping: Tensor, least: float) -> tuple[tuple[Tensor, ...], Tensor, Tensor]:
-    """One damped step of every problem: the new state, the new damping, and which problems are done."""
-    theta, cost, gradient, matrix = state
-    step = damped_step(gradient, matrix, damping)
-    trial = _unit_parts(problem, theta - step)
-    fresh = (trial, *problem.normal_equations(trial))
-    better = fresh[1] < cost
-    # a problem is done when it gains nothing any more, does not move, or finds no way down even by the shortest steps
-    gained = torch.where(better, cost - fresh[1], torch.inf) <= CONVERGED * cost
-    done = gained | (step.abs().amax(-1) < 1e-13) | (~better & (damping > 1e6)) | ~cost.isfinite()
-    damping = torch.where(better, (damping * 0.1).clamp(min=least), damping * 8)
-    chosen = tuple(torch.where(better[(..., *([None] * (new.ndim - 1)))], new, old) for new, old in zip(fresh, state, strict=True))
-    return chosen, damping, done
+def _stepped(problem: LeastSquares, at: Iterate, damping: Tensor, options: LeastSquaresOptions) -> tuple[Iterate, Tensor, Tensor]:
+    """Where a step of every problem leads, the next damping, and which problems are done (where there is a tolerance)."""
+    step = problem.step(at, damping)
+    fresh = problem.moved(at, step)
+    fall = at.cost - fresh.cost
+    done = better = fall > 0
+    if options.tolerance is not None:
+        done = torch.where(better, fall <= options.tolerance * at.cost, damping > options.stuck_damping)
+        finished = problem.finished(at, fresh, step, options.tolerance)
+        done = done if finished is None else done | finished
+    damping = torch.where(better, (damping * options.decrease).clamp(min=options.least_damping), damping * options.increase)
+    return fresh.where(better, at), damping, done
 
 
-def _settled(problem: Minimand, state: tuple[Tensor, ...], least: float) -> tuple[Tensor, ...]:
+def _settled(problem: LeastSquares, at: Iterate, options: LeastSquaresOptions) -> Iterate:
     """One step of every problem that is near its minimum, whatever rounding makes of the cost."""
-    theta, cost, gradient, matrix = state
-    step = damped_step(gradient, matrix, torch.full_like(cost, least))
-    trial = _unit_parts(problem, theta - step)
-    fresh = (trial, *problem.normal_equations(trial))
-    good = (step.abs().amax(-1) < NEAR) & (fresh[1] <= cost * (1 + CONVERGED))
-    return tuple(torch.where(good[(..., *([None] * (new.ndim - 1)))], new, old) for new, old in zip(fresh, state, strict=True))
-
-
-def _unit_parts(problem: Minimand, theta: Tensor) -> Tensor:
-    """Every part of the motion with norm 1, which changes nothing but the size of the numbers."""
-    scaled = [part.flatten(1) / part.flatten(1).norm(dim=-1, keepdim=True).clamp(min=1e-30) for part in problem.parts(theta)]
-    return torch.cat(scaled, dim=-1)
+    step = problem.step(at, torch.full_like(at.cost, options.least_damping))
+    fresh = problem.moved(at, step)
+    near = step[0].abs().amax(-1) < options.settling_length
+    return fresh.where(near & (fresh.cost <= at.cost * (1 + (options.tolerance or 0.0))), at)
 
 
 # ----------------------------------------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from dyntorch.core.outcome import Outcome, Status, status_of
 from dyntorch.geometry.homogeneous import nonzero_sign
 from dyntorch.numerics.arguments import check_options
 from dyntorch.numerics.blocks import one_thread
-from dyntorch.numerics.least_squares import minimize
+from dyntorch.numerics.least_squares import LeastSquaresOptions, NormalEquations, minimize
 from dyntorch.numerics.nullspace import eigenvalues, eigh, gram_null_space, null_space, spectrum
 from dyntorch.shapes.options import ShapesOptions
 from dyntorch.shapes.static import centred
@@ -157,8 +157,8 @@ def _cost(views: AffineViews, found: ProjectedShapes) -> Tensor:
 
 
 @dataclass(frozen=True)
-class ShapeDescent:
-    r"""The shapes that leave the least, the cameras eliminated; a :class:`dyntorch.numerics.least_squares.Minimand`.
+class ShapeDescent(NormalEquations):
+    r"""The shapes that leave the least, the cameras eliminated.
 
     Gauss-Newton with Kaufman's Jacobian :math:`dr = -\Pi^\perp\,dX(t_v)\,A_v`: its normal matrix is a sum of Kronecker products
     :math:`(c c^T) \otimes (A A^T) \otimes \Pi^\perp`, one product of two matrices whatever the number of views.
@@ -217,8 +217,9 @@ def descend(views: AffineViews, rows: Tensor, shapes: Tensor, iterations: int) -
 
     Source: Golub and Pereyra 1973; Kaufman 1975.
     """
-    theta, cost, _ = minimize(ShapeDescent(views, rows), shapes.flatten(1), iterations)
-    return canonical(theta.unflatten(1, shapes.shape[1:])), cost
+    problem = ShapeDescent(views, rows)
+    found = minimize(problem, problem.evaluate((shapes.flatten(1),)), LeastSquaresOptions(iterations=iterations))
+    return canonical(found.theta[0].unflatten(1, shapes.shape[1:])), found.cost
 
 
 # ----------------------------------------------------------------------------------------------------------------------

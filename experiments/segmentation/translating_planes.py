@@ -22,7 +22,7 @@ from torch import Tensor
 import dyntorch as dyn
 from dyntorch.geometry.homogeneous import unit
 from dyntorch.metrics import relative_error
-from dyntorch.numerics.least_squares import minimize
+from dyntorch.numerics.least_squares import LeastSquaresOptions, minimize
 from dyntorch.scenes import TranslatingScene, translating_planes
 from dyntorch.tasks.planes.input import GivenPlanes
 from dyntorch.tasks.planes.planes import translating_planes as solve
@@ -100,7 +100,8 @@ def from_truth(scene: TranslatingScene, given: GivenPlanes) -> Tensor:
     seen, body = given.planes, given.bodies
     matches = PlaneMatches(seen.views, seen.weights, body.views, body.weights, (first[:, 0, 0], second[:, 0, 0]))
     theta = parameters(given.homographies, given.fundamentals, infinity)
-    found, _, _ = layout.unpack(minimize(PlanesProblem(layout, matches), theta, 100)[0])
+    problem = PlanesProblem(layout, matches)
+    found, _, _ = layout.unpack(minimize(problem, problem.evaluate((theta,)), LeastSquaresOptions(iterations=100)).theta[0])
     back: Tensor = torch.linalg.inv(second)
     return back @ found @ first
 

@@ -22,7 +22,7 @@ from dyntorch.invariants.translating_lines_matrix import TranslatingLinesMatrix
 from dyntorch.numerics.arguments import check_options, check_threshold
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.numerics.chi_square import median, three_sigma
-from dyntorch.numerics.least_squares import by_match, damped_step, derivatives
+from dyntorch.numerics.least_squares import LeastSquaresOptions, NormalEquations, by_match, derivatives, minimize
 from dyntorch.numerics.messages import Message
 from dyntorch.numerics.nullspace import spectrum
 from dyntorch.tasks.align.options import AlignOptions
@@ -32,8 +32,7 @@ from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment, Alig
 # Lines that move in planes, static lines and static points between two views: residuals, refinement, labels.
 
 
-STEPS = 12
-CONVERGED = 1e-10  # relative decrease of the cost
+DESCENT = LeastSquaresOptions(iterations=12, stuck_damping=1e5, tolerance=1e-10)
 DOF = TranslatingLinesMatrix.dof
 
 
@@ -84,21 +83,41 @@ class Lines:
             [self.moving(theta) * moving, self.still(theta).flatten(1) * still, self.at_points(theta).flatten(1)], dim=-1
         )
 
-    def linearized(self, theta: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
-        """:meth:`residual` and its derivative ``(b, 16, rows)``."""
-        model, scales = TranslatingLinesMatrix(), self.norm.scales
-        tensor, slope = model.compose_derivative((theta.unflatten(-1, (4, 4)),))
-        path, by_tensor = multilinear_derivative(model, tensor.unflatten(1, model.shape()), self.views, scales)
-        parts = [(path, slope @ by_tensor.mT), by_match(_still, theta, scales, self.views)]
-        roots = self._roots(labels)
-        parts = [(value * root, slope * root[:, None]) for (value, slope), root in zip(parts, roots, strict=True)]
-        parts.append(by_match(_at_points, theta, scales, self.points))
-        return torch.cat([value for value, _ in parts], dim=-1), torch.cat([derivative for _, derivative in parts], dim=-1)
+    def problem(self, labels: Tensor) -> LinesProblem:
+        """Least squares of :meth:`residual`."""
+        return LinesProblem(self.views, self.points, self.norm.scales, self._roots(labels))
 
     def _roots(self, labels: Tensor) -> tuple[Tensor, Tensor]:
         """Roots of the weights of the moving lines ``(b, n)`` and of the static ones, six for each, ``(b, 6 n)``."""
         root = self.data.weights.sqrt()
         return torch.where(labels == MOVING, root, 0.0), torch.where(labels == STATIC, root, 0.0).repeat_interleave(6, dim=-1)
+
+
+@dataclass(frozen=True)
+class LinesProblem(NormalEquations):
+    """Least squares in A, from labelled lines and static points in normalized coordinates."""
+
+    views: tuple[Tensor, ...]
+    points: tuple[Tensor, ...]
+    scales: tuple[Tensor, ...]
+    roots: tuple[Tensor, ...]
+    """Of the weights of the residuals of moving and of static lines."""
+
+    def subset(self, keep: Tensor) -> LinesProblem:
+        """Only some of the problems."""
+        return LinesProblem(*(tuple(x[keep] for x in part) for part in (self.views, self.points, self.scales, self.roots)))
+
+    def normal_equations(self, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Cost ``(b,)``, gradient ``(b, 16)`` and Gauss-Newton matrix ``(b, 16, 16)``."""
+        model = TranslatingLinesMatrix()
+        tensor, slope = model.compose_derivative((theta.unflatten(-1, (4, 4)),))
+        path, by_tensor = multilinear_derivative(model, tensor.unflatten(1, model.shape()), self.views, self.scales)
+        parts = [(path, slope @ by_tensor.mT), by_match(_still, theta, self.scales, self.views)]
+        parts = [(value * root, slope * root[:, None]) for (value, slope), root in zip(parts, self.roots, strict=True)]
+        parts.append(by_match(_at_points, theta, self.scales, self.points))
+        value, slope = (torch.cat(part, dim=-1) for part in zip(*parts, strict=True))
+        cost = value.square().sum(-1)
+        return torch.where(cost.isfinite(), cost, torch.inf), (slope @ value[..., None])[..., 0], slope @ slope.mT
 
 
 def _still(theta: Tensor, scales: tuple[Tensor, ...], views: tuple[Tensor, ...]) -> Tensor:
@@ -168,24 +187,13 @@ def settle(
 
 def refined(lines: Lines, theta: Tensor, labels: Tensor) -> Tensor:
     """A that minimizes the residuals of all labelled matches, by Levenberg-Marquardt."""
-    cost, gradient, matrix = _equations(lines, theta, labels)
-    damping = torch.full_like(cost, 1e-3)
-    for _ in range(STEPS):
-        trial = normalize(theta - damped_step(gradient, matrix, damping), dim=-1)
-        fresh = _equations(lines, trial, labels)
-        better = fresh[0] < cost
-        done = (better & (cost - fresh[0] <= CONVERGED * cost)) | (~better & (damping > 1e5))
-        theta, gradient = torch.where(better[:, None], trial, theta), torch.where(better[:, None], fresh[1], gradient)
-        matrix, cost = torch.where(better[:, None, None], fresh[2], matrix), torch.where(better, fresh[0], cost)
-        damping = torch.where(better, (damping * 0.1).clamp(min=1e-12), damping * 8)
-        if bool(done.all()):
-            break
-    return theta
+    problem = lines.problem(labels)
+    return minimize(problem, problem.evaluate((theta,)), DESCENT).theta[0]
 
 
 def spread(lines: Lines, theta: Tensor, labels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Extreme information ``(b, 2)`` on A, A ``(b, 4, 4)`` as measured, and its covariance ``(b, 16, 16)`` for noise 1."""
-    _, _, matrix = _equations(lines, theta, labels)
+    _, _, matrix = lines.problem(labels).normal_equations(theta)
     values, vectors = spectrum(matrix)
     values, vectors = values[:, -DOF:], vectors[..., -DOF:]
     root = vectors * values.clamp(min=1e-12 * values[:, -1:].clamp(min=1e-300)).rsqrt()[:, None]
@@ -196,13 +204,6 @@ def spread(lines: Lines, theta: Tensor, labels: Tensor) -> tuple[Tensor, Tensor,
 
     place, moved = derivatives(measured, theta, root.movedim(-1, 0))
     return values[:, [0, -1]], place.unflatten(-1, (4, 4)), moved.mT @ moved
-
-
-def _equations(lines: Lines, theta: Tensor, labels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Cost ``(b,)``, gradient ``(b, 16)`` and Gauss-Newton matrix."""
-    value, slope = lines.linearized(theta, labels)
-    cost = value.square().sum(-1)
-    return torch.where(cost.isfinite(), cost, torch.inf), (slope @ value[..., None])[..., 0], slope @ slope.mT
 
 
 def _labels(lines: Lines, theta: Tensor, sigma: Tensor) -> Tensor:

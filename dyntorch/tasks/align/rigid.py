@@ -15,7 +15,7 @@ from dyntorch.geometry.homogeneous import similarity, skew
 from dyntorch.geometry.rigid import moved_by, rigid_alignment
 from dyntorch.numerics.blocks import each, map_blocks, uniform
 from dyntorch.numerics.chi_square import median, three_sigma
-from dyntorch.numerics.least_squares import damped_step
+from dyntorch.numerics.least_squares import Iterate, LeastSquares, LeastSquaresOptions, Tensors, damped_step, minimize
 from dyntorch.numerics.nullspace import spectrum
 from dyntorch.tasks.align.options import AlignOptions
 from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment, AlignNotice
@@ -34,7 +34,7 @@ from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment, Alig
 
 MOTIONS = {"straight": 2, "constant_velocity": 3}
 """Conditions that a moving point fulfils."""
-CONVERGED = 1e-9  # relative decrease of the cost
+DESCENT = LeastSquaresOptions(iterations=20, least_damping=1e-10, stuck_damping=1e5)
 
 
 @dataclass(frozen=True)
@@ -154,43 +154,48 @@ def descend(
     """
     lead = motions.shape[:-3]
     flat = data.flat(lead)
-    pose = motions.reshape(-1, 2, 4, 4)
     square = None if scale is None else scale.expand(lead).reshape(-1, 1).square()
     held = None if still is None else still.expand(*lead, -1).reshape(flat.weights.shape)
-
-    def residual(at: Tensor) -> Tensor:
-        moving, static = squares(at, flat)
-        return moving if held is None else torch.where(held, static, moving)
-
-    def cost_of(r: Tensor) -> Tensor:
-        return (flat.weights * (r if square is None else r * square / (square + r))).sum(-1)
-
-    r = residual(pose)
-    cost, damping = cost_of(r), torch.full(pose.shape[:1], 1e-3, dtype=pose.dtype, device=pose.device)
-    done = torch.zeros_like(cost, dtype=torch.bool)
-    for _ in range(iterations):
-        weights = flat.weights if square is None else flat.weights * (square / (square + r)).square()
-        gradient, matrix = normal_equations(pose, flat, weights, held)
-        trial = _step(pose, gradient, matrix, damping)
-        fresh = residual(trial)
-        new = cost_of(fresh)
-        better = (new < cost) & ~done
-        done = done | (better & (cost - new <= CONVERGED * cost)) | (~better & (damping > 1e5))
-        pose, r = torch.where(better[:, None, None, None], trial, pose), torch.where(better[:, None], fresh, r)
-        cost = torch.where(better, new, cost)
-        damping = torch.where(better, (damping * 0.1).clamp(min=1e-10), damping * 8)
-        if bool(done.all()):
-            break
-    return pose.reshape(motions.shape), cost.reshape(lead)
+    problem = RigidProblem(flat, square, held)
+    found = minimize(problem, problem.evaluate((motions.reshape(-1, 2, 4, 4),)), replace(DESCENT, iterations=iterations))
+    return found.theta[0].reshape(motions.shape), found.cost.reshape(lead)
 
 
-def _step(pose: Tensor, gradient: Tensor, matrix: Tensor, damping: Tensor) -> Tensor:
-    """The motions after a damped Gauss-Newton step."""
-    step = damped_step(gradient, matrix, damping)
-    # half a radian is as far as the linearization of a rotation can be trusted
-    length = step.unflatten(-1, (2, 2, 3))[:, :, 0].norm(dim=-1).amax(-1)
-    step = step / (2 * length).clamp(min=1.0)[:, None]
-    return moved_by(pose, -step.unflatten(-1, (2, 6)))
+@dataclass(frozen=True)
+class RigidProblem(LeastSquares):
+    """Least squares in motions ``(b, 2, 4, 4)``, robust with the squared ``scale (b, 1)``; ``still (b, n)`` points are static."""
+
+    data: RigidSightings
+    square: Tensor | None
+    still: Tensor | None
+
+    def subset(self, keep: Tensor) -> RigidProblem:
+        """Only some of the problems."""
+        data, (square, still) = self.data, (None if x is None else x[keep] for x in (self.square, self.still))
+        return RigidProblem(
+            RigidSightings(data.x1[keep], data.x2[keep], data.x3[keep], data.weights[keep], data.motion), square, still
+        )
+
+    def evaluate(self, theta: Tensors) -> Iterate:
+        """With the squared residuals ``(b, n)``."""
+        moving, static = squares(theta[0], self.data)
+        r = moving if self.still is None else torch.where(self.still, static, moving)
+        loss = r if self.square is None else r * self.square / (self.square + r)
+        return Iterate(theta, (self.data.weights * loss).sum(-1), (r,))
+
+    def step(self, at: Iterate, damping: Tensor) -> Tensors:
+        """Turns and shifts ``(b, 12)``."""
+        weights = self.data.weights
+        if self.square is not None:
+            weights = weights * (self.square / (self.square + at.terms[0])).square()
+        step = damped_step(*normal_equations(at.theta[0], self.data, weights, self.still), damping)
+        # half a radian is as far as the linearization of a rotation can be trusted
+        length = step.unflatten(-1, (2, 2, 3))[:, :, 0].norm(dim=-1).amax(-1)
+        return (step / (2 * length).clamp(min=1.0)[:, None],)
+
+    def retract(self, theta: Tensors, step: Tensors) -> Tensors:
+        """The motions after them."""
+        return (moved_by(theta[0], -step[0].unflatten(-1, (2, 6))),)
 
 
 # ----------------------------------------------------------------------------------------------------------------------

@@ -17,7 +17,7 @@ from dyntorch.geometry.homogeneous import apply, unit
 from dyntorch.invariants.constant_velocity_tensor import ConstantVelocityTensor
 from dyntorch.numerics.blocks import map_blocks, uniform
 from dyntorch.numerics.chi_square import median, three_sigma
-from dyntorch.numerics.least_squares import damped_step, derivatives
+from dyntorch.numerics.least_squares import LeastSquaresOptions, derivatives, minimize
 from dyntorch.numerics.nullspace import spectrum
 from dyntorch.tasks.align.labelling import Evidence
 from dyntorch.tasks.align.options import AlignOptions
@@ -27,8 +27,7 @@ from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment, Alig
 # Points at constant velocity before projective or affine sensors: refinement, the static gauge, labels, the sensor's motion.
 
 
-STEPS = 15
-CONVERGED = 1e-10  # relative decrease of the cost
+DESCENT = LeastSquaresOptions(iterations=15, stuck_damping=1e5, tolerance=1e-10)
 GAUGE = 3  # degrees of freedom of the common velocity
 DOF = {False: 30, True: 21}
 """Of three projective (affine) maps up to an affinity of the world and the common velocity."""
@@ -54,23 +53,10 @@ class Velocities:
 
 def refined(evidence: Evidence, theta: Tensor, labels: Tensor, affine: bool) -> Tensor:
     """The maps ``(b, 48)`` that minimize the residuals of the labelled matches, by Levenberg-Marquardt; affine maps stay affine."""
-    problem, free = evidence.problem(labels), _free(theta, affine)
+    problem = replace(evidence.problem(labels), free=_free(theta, affine))
     if not bool((labels == STATIC).any()):
         problem = replace(problem, static=None)  # half of the work
-    cost, gradient, matrix = problem.normal_equations(theta)
-    damping = torch.full_like(cost, 1e-3)
-    for _ in range(STEPS):
-        trial = _scaled(theta - damped_step(gradient, matrix, damping, free))
-        fresh = problem.normal_equations(trial)
-        better = fresh[0] < cost
-        small = ~better | (cost - fresh[0] <= CONVERGED * cost)
-        theta, gradient = torch.where(better[:, None], trial, theta), torch.where(better[:, None], fresh[1], gradient)
-        matrix, cost = torch.where(better[:, None, None], fresh[2], matrix), torch.where(better, fresh[0], cost)
-        finished = small & (better | (damping > 1e5))
-        damping = torch.where(better, (damping * 0.1).clamp(min=1e-12), damping * 8)
-        if bool(finished.all()):
-            break
-    return theta
+    return minimize(problem, problem.evaluate((theta,)), DESCENT).theta[0]
 
 
 def settle(evidence: Evidence, theta: Tensor, sigma: Tensor, affine: bool, estimate: bool, options: AlignOptions) -> Velocities:
@@ -214,11 +200,6 @@ def _free(theta: Tensor, affine: bool) -> Tensor:
     if affine:
         free[[16 * part + entry for part in range(3) for entry in ENTRIES]] = 0.0
     return free
-
-
-def _scaled(theta: Tensor) -> Tensor:
-    parts = theta.unflatten(-1, (3, 16))
-    return (parts / parts.norm(dim=-1, keepdim=True).clamp(min=1e-30)).flatten(1)
 
 
 MINIMAL = {False: 21, True: 7}

@@ -17,7 +17,7 @@ from dyntorch.invariants.agreement import static_residual
 from dyntorch.invariants.fundamental_matrix import FundamentalMatrix
 from dyntorch.numerics.blocks import constant
 from dyntorch.numerics.chi_square import quantile
-from dyntorch.numerics.least_squares import by_match, jacobian, minimize
+from dyntorch.numerics.least_squares import LeastSquaresOptions, NormalEquations, by_match, jacobian, minimize
 from dyntorch.numerics.nullspace import spectrum
 from dyntorch.tasks.planes.closed_forms import (
     infinity_closed_form,
@@ -180,8 +180,8 @@ class PlaneMatches:
 
 
 @dataclass(frozen=True)
-class PlanesProblem:
-    """Least squares over a block of problems; a :class:`dyntorch.numerics.least_squares.Minimand`."""
+class PlanesProblem(NormalEquations):
+    """Least squares over a block of problems."""
 
     layout: Layout
     evidence: Matrices | PlaneMatches
@@ -384,7 +384,8 @@ def solve(
     theta = torch.cat([parameters(homographies, fundamentals, infinity) for infinity in first])
     rounds = matrices.repeated(len(first))
     if refine:
-        theta = minimize(rounds, theta, options.fit.steps_on_matrices)[0]
+        start = rounds.evaluate((theta,))
+        theta = minimize(rounds, start, LeastSquaresOptions(iterations=options.fit.steps_on_matrices)).theta[0]
     cost = rounds.normal_equations(theta)[0]
     theta, cost = _distinct(theta.unflatten(0, (len(first), b)), cost.unflatten(0, (len(first), b)), options)
     problem = matrices if matches is None else PlanesProblem(layout, matches)
@@ -392,8 +393,9 @@ def solve(
         chosen = cost.flatten().isfinite().nonzero()[:, 0]
         again = problem.repeated(len(cost)).subset(chosen)
         if refine:
-            found, value, _ = minimize(again, theta.flatten(0, 1)[chosen], options.fit.steps_on_matches)
-            theta = theta.flatten(0, 1).index_copy(0, chosen, found).unflatten(0, cost.shape)
+            start = again.evaluate((theta.flatten(0, 1)[chosen],))
+            found = minimize(again, start, LeastSquaresOptions(iterations=options.fit.steps_on_matches))
+            theta, value = theta.flatten(0, 1).index_copy(0, chosen, found.theta[0]).unflatten(0, cost.shape), found.cost
         else:
             value = again.normal_equations(theta.flatten(0, 1)[chosen])[0]
         cost = cost.flatten().index_copy(0, chosen, value).unflatten(0, cost.shape)

@@ -8,14 +8,15 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from dyntorch.geometry.extensors import plucker_form, skew_line
 from dyntorch.geometry.homogeneous import apply, finite_depth, homogeneous, similarity, skew
 from dyntorch.geometry.lines import line_camera, nearest_line
-from dyntorch.numerics.least_squares import damped_step
+from dyntorch.numerics.least_squares import Iterate, LeastSquares, LeastSquaresOptions, Tensors, damped_step, minimize
 from dyntorch.numerics.nullspace import eigenvalues
 
-STEPS = 15
+SURFACE = LeastSquaresOptions(iterations=15, damping=1e-4, increase=10.0, least_damping=1e-15, tolerance=None)
 FOLLOWED, NEAR = 5, 1e-4
 """Steps that carry derivatives, where they are as small as at a minimum."""
 FREE = 1e-13  # eigenvalue of a Gauss-Newton matrix of trace 1 that is rounding
@@ -135,59 +136,63 @@ def to_points(data: LineSightings, points: Tensor) -> tuple[Tensor, Tensor]:
 def best_lines(data: LineSightings, starts: Tensor) -> FoundLines:
     """Lines ``(*batch, n, 6)`` of least distance, from starts on the Klein quadric; leading dimensions of the starts broadcast."""
     form = plucker_form(device=starts.device)
-    return _descend(starts, lambda v: to_lines(data, v), lambda v: torch.stack([v, v @ form], dim=-2), nearest_line)
+    return _descend(Surface(lambda v: to_lines(data, v), lambda v: torch.stack([v, v @ form], dim=-2), nearest_line), starts)
 
 
 def best_points(data: LineSightings, starts: Tensor) -> FoundLines:
     """Points ``(*batch, n, 4)`` of least reprojection error."""
-    return _descend(
-        starts, lambda p: to_points(data, p), lambda p: p[..., None, :], lambda p: torch.nn.functional.normalize(p, dim=-1)
-    )
+    return _descend(Surface(lambda p: to_points(data, p), lambda p: p[..., None, :], lambda p: normalize(p, dim=-1)), starts)
 
 
-def _descend(
-    vectors: Tensor,
-    measure: Callable[[Tensor], tuple[Tensor, Tensor]],
-    normals: Callable[[Tensor], Tensor],
-    retract: Callable[[Tensor], Tensor],
-) -> FoundLines:
-    """Levenberg-Marquardt on a surface of unit vectors: steps along it, then back to the nearest of its points."""
+@dataclass(frozen=True)
+class Surface(LeastSquares):
+    """Least squares on a surface of unit vectors ``(*batch, n, k)``: steps along it, then back to the nearest of its points.
 
-    def system(at: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        value, slope = measure(at)
-        across = normals(at)
-        along = torch.eye(at.shape[-1], dtype=at.dtype, device=at.device) - across.mT @ across
+    Attributes:
+        measure: residuals ``(*batch, n, rows)`` of vectors and their derivative.
+        normals: orthonormal directions off the surface, ``(*batch, n, constraints, k)``.
+        nearest: the nearest point of the surface.
+    """
+
+    measure: Callable[[Tensor], tuple[Tensor, Tensor]]
+    normals: Callable[[Tensor], Tensor]
+    nearest: Callable[[Tensor], Tensor]
+
+    def evaluate(self, theta: Tensors) -> Iterate:
+        """With gradient, Gauss-Newton matrix and its trace along the surface."""
+        value, slope = self.measure(theta[0])
+        across = self.normals(theta[0])
+        along = torch.eye(across.shape[-1], dtype=value.dtype, device=value.device) - across.mT @ across
         slope = slope @ along
         matrix = slope.mT @ slope
         # an equation of their own for the directions off the surface, of the size of the others
-        size = matrix.diagonal(dim1=-2, dim2=-1).sum(-1) + torch.finfo(at.dtype).tiny
+        size = matrix.diagonal(dim1=-2, dim2=-1).sum(-1) + torch.finfo(value.dtype).tiny
         matrix = matrix + size[..., None, None] * (across.mT @ across)
-        return value.square().sum(-1), (slope.mT @ value[..., None])[..., 0], matrix, size
+        return Iterate(theta, value.square().sum(-1), ((slope.mT @ value[..., None])[..., 0], matrix, size))
 
+    def step(self, at: Iterate, damping: Tensor) -> Tensors:
+        """Along the surface."""
+        gradient, matrix, _ = at.terms
+        return (damped_step(gradient.flatten(0, -2), matrix.flatten(0, -3), damping.flatten()).view(gradient.shape),)
+
+    def retract(self, theta: Tensors, step: Tensors) -> Tensors:
+        """Back onto it."""
+        return (self.nearest(theta[0] - step[0]),)
+
+
+def _descend(surface: Surface, starts: Tensor) -> FoundLines:
+    """The vectors of least cost; with their derivatives, where gradients are recorded."""
     with torch.no_grad():
-        vectors = vectors.detach()
-        cost, gradient, matrix, size = system(vectors)
-        damping = torch.full_like(cost, 1e-4)
-        for _ in range(STEPS):
-            trial = retract(vectors - _solved(gradient, matrix, damping))
-            found = system(trial)
-            better = found[0] < cost
-            vectors = torch.where(better[..., None], trial, vectors)
-            gradient = torch.where(better[..., None], found[1], gradient)
-            matrix = torch.where(better[..., None, None], found[2], matrix)
-            cost, size = torch.where(better, found[0], cost), torch.where(better, found[3], size)
-            damping = torch.where(better, damping / 10, damping * 10).clamp(1e-15, 1e6)
-    # at the minimum the derivatives are those of the last steps: each brings them nearer by what Gauss-Newton leaves out
-    for _ in range(FOLLOWED if torch.is_grad_enabled() else 0):
-        cost, gradient, matrix, size = system(vectors)
-        step = _solved(gradient, matrix, torch.zeros_like(cost))
-        vectors = retract(vectors - torch.where(step.detach().norm(dim=-1, keepdim=True) < NEAR, step, 0.0))
-    return FoundLines(vectors, system(vectors)[0], _spread(matrix.detach(), size.detach(), normals(vectors).shape[-2]))
-
-
-def _solved(gradient: Tensor, matrix: Tensor, damping: Tensor) -> Tensor:
-    """The damped steps ``(*batch, k)``."""
-    return damped_step(gradient.flatten(0, -2), matrix.flatten(0, -3), damping.flatten()).view(gradient.shape)
+        at = Iterate(*minimize(surface, surface.evaluate((starts.detach(),)), SURFACE)[:3])
+    if torch.is_grad_enabled():
+        at = surface.evaluate(at.theta)
+        # at the minimum the derivatives are those of the last steps: each brings them nearer by what Gauss-Newton leaves out
+        for _ in range(FOLLOWED):
+            (step,) = surface.step(at, torch.zeros_like(at.cost))
+            near = step.detach().norm(dim=-1, keepdim=True) < NEAR
+            at = surface.moved(at, (torch.where(near, step, 0.0),))
+    (vectors,), (_, matrix, size) = at.theta, at.terms
+    return FoundLines(vectors, at.cost, _spread(matrix.detach(), size.detach(), surface.normals(vectors).shape[-2]))
 
 
 def _spread(matrix: Tensor, size: Tensor, constraints: int) -> Tensor:
@@ -203,13 +208,39 @@ def _spread(matrix: Tensor, size: Tensor, constraints: int) -> Tensor:
 # Bundle adjustment of cameras and straight trajectories: all distances of points from the images of their lines at once.
 
 
-ADJUSTMENT_STEPS, SETTLED = 25, 1e-6
-"""At most so many steps, and the relative decrease of the cost below which a problem has converged."""
-STUCK = 1e8  # damping at which no step is left to take
+ADJUSTMENT = LeastSquaresOptions(iterations=25, increase=10.0, stuck_damping=1e8, tolerance=1e-6)
+
+
+@dataclass(frozen=True)
+class Adjustment(LeastSquares):
+    r"""Least squares in cameras ``(b, views, 3, 4)`` and lines ``(b, n, 6)``, the lines eliminated (Schur complement)."""
+
+    data: LineSightings
+    """Whose cameras do not count."""
+
+    def subset(self, keep: Tensor) -> Adjustment:
+        """Only some of the problems."""
+        return Adjustment(LineSightings(*(part[keep] for part in vars(self.data).values())))
+
+    def evaluate(self, theta: Tensors) -> Iterate:
+        """Sum of squared weighted distances, px^2."""
+        return Iterate(theta, image_distances(self._seen(theta), theta[1])[0].square().sum((-2, -1)), ())
+
+    def step(self, at: Iterate, damping: Tensor) -> Tensors:
+        """Of cameras and lines."""
+        return _adjustment_step(self._seen(at.theta), at.theta[1], damping)
+
+    def retract(self, theta: Tensors, step: Tensors) -> Tensors:
+        """Cameras of norm 1, lines on the Klein quadric."""
+        cameras = theta[0] - step[0]
+        return cameras / torch.linalg.matrix_norm(cameras, keepdim=True), nearest_line(theta[1] - step[1])
+
+    def _seen(self, theta: Tensors) -> LineSightings:
+        return replace(self.data, cameras=theta[0])
 
 
 def adjust(data: LineSightings, lines: Tensor) -> LineSightings:
-    r"""Levenberg-Marquardt over cameras and lines, the lines eliminated (Schur complement).
+    r"""Cameras and lines of least distances of the points from the images of the lines.
 
     With :math:`l = M(P) L` and :math:`g = \partial r / \partial l` the derivative of a distance in the camera is
     :math:`[g]_\times P [L]`; along the collineations of space and the scales of the cameras, which change nothing, the damping
@@ -222,32 +253,11 @@ def adjust(data: LineSightings, lines: Tensor) -> LineSightings:
     Returns:
         The sightings with the best cameras, each of norm 1.
     """
-    damping = torch.full_like(lines[..., 0, 0], 1e-3)
-    cost = _cost(data, lines)
-    done = torch.zeros_like(cost, dtype=torch.bool)
-    for _ in range(ADJUSTMENT_STEPS):
-        shift, turn = _step(data, lines, damping)
-        moved = data.cameras - shift
-        trial = replace(data, cameras=moved / torch.linalg.matrix_norm(moved, keepdim=True))
-        ends = nearest_line(lines - turn)
-        found = _cost(trial, ends)
-        better = (found < cost) & ~done
-        settled = (better & (cost - found <= SETTLED * cost)) | (damping > STUCK)
-        data = replace(data, cameras=torch.where(better[..., None, None, None], trial.cameras, data.cameras))
-        lines = torch.where(better[..., None, None], ends, lines)
-        cost, damping = torch.where(better, found, cost), torch.where(better, damping / 10, damping * 10).clamp(min=1e-12)
-        done = done | settled
-        if bool(done.all()):
-            break
-    return data
+    problem = Adjustment(data)
+    return replace(data, cameras=minimize(problem, problem.evaluate((data.cameras, lines)), ADJUSTMENT).theta[0])
 
 
-def _cost(data: LineSightings, lines: Tensor) -> Tensor:
-    """Sum of squared weighted distances, ``(*batch,)`` px^2."""
-    return image_distances(data, lines)[0].square().sum((-2, -1))
-
-
-def _step(data: LineSightings, lines: Tensor, damping: Tensor) -> tuple[Tensor, Tensor]:
+def _adjustment_step(data: LineSightings, lines: Tensor, damping: Tensor) -> Tensors:
     """Steps of the cameras ``(*batch, views, 3, 4)`` and the lines ``(*batch, n, 6)``, to be subtracted."""
     distance, slope = image_distances(data, lines)  # (*batch, views, n), (*batch, views, n, 3)
     by_line = torch.einsum("...vni,...vik->...nvk", slope, line_camera(data.cameras))

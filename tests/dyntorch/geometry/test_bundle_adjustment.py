@@ -7,6 +7,7 @@ import torch
 
 from dyntorch.geometry.bundle import BundleProblem, bundle_adjust, point_information, structure_covariance
 from dyntorch.geometry.triangulation import reproject
+from dyntorch.numerics.least_squares import Iterate
 from dyntorch.scenes import lifted
 
 
@@ -108,7 +109,8 @@ def test_a_step_solves_the_dense_damped_equations(name, loss):
     weights[:, 0, 3] = 0
     scale = None if loss is None else torch.tensor([0.05]).double()
     problem = BundleProblem(x.mT, weights, None if lifts is None else lifts[None], scale, str(loss))
-    camera_step, point_step, gain = problem.step(cameras, structure.mT.contiguous(), torch.tensor([0.1]).double())
+    at = Iterate((cameras, structure.mT.contiguous()), torch.zeros(1).double(), ())
+    camera_step, point_step, gain = problem.step(at, torch.tensor([0.1]).double())
     split, theta = cameras.numel(), torch.cat([cameras.flatten(), structure.flatten()])
     root = problem.robust(reproject(cameras if lifts is None else cameras @ lifts, structure).mT)[1].sqrt()[..., None]
 
