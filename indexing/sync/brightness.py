@@ -352,9 +352,10 @@ def brightness_shift(
     least = max(float(options.gray.fewest), options.lags.overlap * min(len(one.profile), len(two.profile)))
     longest = min(len(one.profile), len(two.profile) - span[0]) - max(0, -span[1])
     if span[0] > span[1] or longest < least:
-        text = "{arg:max_shift} {given!r}: within it the videos overlap by less than {least:.0f} frames at {rate:.3g} per "
-        "second; allow "
-        text += "larger shifts or give longer videos"
+        text = (
+            "{arg:max_shift} {given!r}: within it the videos overlap by less than {least:.0f} frames at {rate:.3g} per second; "
+            "allow larger shifts or give longer videos"
+        )
         raise ValueError(Message(text, given=max_shift, least=least, rate=rate))
     verdict = judge(one, two, span, least, options=options)
     return _shift((first, second), (one, two), verdict, (*of_a, *of_b), options)

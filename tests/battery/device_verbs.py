@@ -432,7 +432,7 @@ WAITS = {
     "reconstruct": (2, LENT),
     "synchronize": (2, LENT),
     "synchronize_cameras": (3, LENT),
-    "combine_shifts": (9, LENT),
+    "combine_shifts": (12, LENT),
     "reconstruct_pair": (2, LENT),
     "fit_distortion": (2, LENT),
 }

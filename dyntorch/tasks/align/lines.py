@@ -286,9 +286,10 @@ def align_lines(
     points = _points(static_points, data, l1)
     extra = 0 if points is None else points[0].shape[1]
     if data.count + PER_POINT * extra < MINIMAL:
-        text = "align_lines needs at least {needed} lines, got {lines} and {points} static points, which count {each} each; add "
-        "lines, or "
-        text += "give {arg:static_points=(P1, P2)}"
+        text = (
+            "align_lines needs at least {needed} lines, got {lines} and {points} static points, which count {each} each; "
+            "add lines, or give {arg:static_points=(P1, P2)}"
+        )
         raise ValueError(Message(text, needed=MINIMAL, lines=data.count, points=extra, each=PER_POINT))
     with torch.no_grad():
         return _align(data, points, threshold, generator, options)

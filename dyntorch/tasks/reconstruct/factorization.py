@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from math import ceil, prod
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -45,6 +46,9 @@ class ProjectiveFactorization(Outcome):
     def __iter__(self) -> Iterator[Tensor]:
         """The parts, as of the tuple that this once was."""
         return iter((self.projections, self.structure, self.residual, self.converged))
+
+    def __getitem__(self, part: int | slice) -> Any:
+        return tuple(self)[part]
 
     def __repr__(self) -> str:
         return self.head(views=self.projections.shape[-3], points=self.structure.shape[-2])
@@ -259,6 +263,9 @@ class VelocityFactorization(Outcome):
     def __iter__(self) -> Iterator[Tensor]:
         """The parts, as of the tuple that this once was."""
         return iter((self.cameras, self.offsets, self.points, self.velocities, self.residual, self.degenerate))
+
+    def __getitem__(self, part: int | slice) -> Any:
+        return tuple(self)[part]
 
     def __repr__(self) -> str:
         return self.head(views=self.cameras.shape[-3], points=self.points.shape[-2])

@@ -94,7 +94,7 @@ class NoiseOptions:
 
 
 @dataclass(frozen=True)
-class RobustStartOptions:
+class ConcentrationOptions:
     """Starts of the search for projections among outliers, by concentration on the points that fit best."""
 
     shares: tuple[float, ...] = (0.5, 0.6, 0.7, 0.8)
@@ -230,7 +230,7 @@ class ReconstructOptions:
     projections: ProjectionOptions = ProjectionOptions()
     scene: SceneOptions = SceneOptions()
     noise: NoiseOptions = NoiseOptions()
-    starts: RobustStartOptions = RobustStartOptions()
+    starts: ConcentrationOptions = ConcentrationOptions()
     outliers: OutlierOptions = OutlierOptions()
     models: MotionModelOptions = MotionModelOptions()
     diagnosis: DiagnosisOptions = DiagnosisOptions()

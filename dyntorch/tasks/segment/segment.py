@@ -522,8 +522,10 @@ def _check_counts(bodies: int | None, count: int) -> None:
     if count < MINIMAL:
         raise ValueError(f"segment needs at least {MINIMAL} matches, got {count}: add {MINIMAL - count}")
     if bodies is not None and bodies * LEAST > count:
-        text = "{arg:bodies={bodies}} take at least {least} matches each, {all} in all, got {count}: add {more}, or ask for at "
-        "most {most}"
+        text = (
+            "{arg:bodies={bodies}} take at least {least} matches each, {all} in all, got {count}: "
+            "add {more}, or ask for at most {most}"
+        )
         whole = bodies * LEAST
         values = {"bodies": bodies, "least": LEAST, "all": whole, "count": count, "more": whole - count, "most": count // LEAST}
         raise ValueError(Message(text, **values))

@@ -371,9 +371,11 @@ def synchronize(
     if not correspondence:
         return different_points(first, second, max_shift=max_shift, rate=rate, options=options).since(origin)
     if a.shape[1] != b.shape[1]:
-        text = "{camera:a} has {a} points and {camera:b} {b}: corresponding points are as many; give the same ones in the same "
-        "order, or "
-        raise ValueError(Message(text + "{arg:correspondence=False}", a=a.shape[1], b=b.shape[1]))
+        text = (
+            "{camera:a} has {a} points and {camera:b} {b}: corresponding points are as many; "
+            "give the same ones in the same order, or {arg:correspondence=False}"
+        )
+        raise ValueError(Message(text, a=a.shape[1], b=b.shape[1]))
     result = same_points(
         first,
         second,

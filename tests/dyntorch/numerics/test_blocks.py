@@ -271,6 +271,12 @@ ELEMENTWISE = {
     "line_camera",
     "points_on_lines",
     "combine_shifts",
+    # of words and checks, not of numbers
+    "as_python",
+    "check_options",
+    "named",
+    "status_from",
+    "worded",
 }
 """Without a search or a factorization: torch starts threads for them only above 32,768 numbers, where they pay."""
 
