@@ -99,8 +99,36 @@ class ShiftNotice(NoticeCode):
     """A camera that moved."""
 
 
+class ClockOutcome(Outcome):
+    """What results about clocks share: the data decide, or some notices say why they do not."""
+
+    @property
+    def ok(self) -> bool:
+        """Whether the data decide."""
+        return int(self.status) == Status.OK
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a user should know besides the reason."""
+        return told(self.notices)
+
+    def check(self) -> Self:
+        """Raise where the data do not decide.
+
+        Raises:
+            ValueError: the reason.
+        """
+        if not self.ok:
+            raise ValueError(f"{self.task}: {self.reason}")
+        return self
+
+    def _telling(self, status: Status) -> Sequence[Notice]:
+        """The notices that refuse."""
+        return refusing(self.notices)
+
+
 @dataclass(frozen=True, eq=False, repr=False)
-class Shift(Outcome):
+class Shift(ClockOutcome):
     """One camera's clock against another's.
 
     A moment that camera a shows at time :math:`t_a` is shown by camera b at
@@ -145,16 +173,6 @@ class Shift(Outcome):
     TASK = "synchronize"
 
     @property
-    def ok(self) -> bool:
-        """Whether the data decide."""
-        return int(self.status) == Status.OK
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """What a user should know besides the reason."""
-        return told(self.notices)
-
-    @property
     def frames(self) -> float:
         """The offset in frames of b."""
         return self.offset * self.fps[1]
@@ -170,20 +188,6 @@ class Shift(Outcome):
     def since(self, origin: float) -> Shift:
         """The same clocks, counted from another moment: both said ``origin`` at what was 0."""
         return dataclasses.replace(self, offset=self.offset + (1 - self.rate) * origin, center=self.center + origin)
-
-    def check(self) -> Self:
-        """Raise where the data do not decide.
-
-        Raises:
-            ValueError: the reason.
-        """
-        if not self.ok:
-            raise ValueError(f"{self.task}: {self.reason}")
-        return self
-
-    def _telling(self, status: Status) -> Sequence[Notice]:
-        """The notices that refuse."""
-        return refusing(self.notices)
 
     def __repr__(self) -> str:
         drift = f", rate {1e6 * (self.rate - 1):+.0f} ± {1e6 * self.rate_sigma:.0f} ppm" if self.rate != 1 else ""
@@ -281,7 +285,7 @@ class ClocksNotice(NoticeCode):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Clocks(Outcome):
+class Clocks(ClockOutcome):
     """All cameras' clocks against the reference camera's.
 
     The moment that the reference camera shows at time :math:`t` is shown by camera i at
@@ -321,16 +325,6 @@ class Clocks(Outcome):
 
     TASK = "synchronize_cameras"
 
-    @property
-    def ok(self) -> bool:
-        """Whether the data decide."""
-        return int(self.status) == Status.OK
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """What a user should know besides the reason."""
-        return told(self.notices)
-
     def at(self, times: Tensor | float) -> Tensor:
         """Times of all clocks, ``(cameras, ...)``, of the moments at ``times`` of the reference clock."""
         t = torch.as_tensor(times, dtype=torch.float64)
@@ -340,20 +334,6 @@ class Clocks(Outcome):
     def inverse(self, camera: int, times: Tensor | float) -> Tensor:
         """Times of the reference clock, of the moments at ``times`` of a camera's clock."""
         return (torch.as_tensor(times, dtype=torch.float64) - self.offsets[camera]) / self.rates[camera]
-
-    def check(self) -> Self:
-        """Raise where the data do not decide.
-
-        Raises:
-            ValueError: the reason.
-        """
-        if not self.ok:
-            raise ValueError(f"{self.task}: {self.reason}")
-        return self
-
-    def _telling(self, status: Status) -> Sequence[Notice]:
-        """The notices that refuse."""
-        return refusing(self.notices)
 
     def __repr__(self) -> str:
         cycle = "" if self.worst_cycle is None else f", cycle error {self.cycle_error:.4f} s"

@@ -7,49 +7,18 @@ import io
 import json
 import re
 import struct
-from dataclasses import dataclass
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
 
 from indexing import files
-from indexing.clip import Clip
 from indexing.report import EvaluationResult, RecognitionReport, RecordingResult, manifest, page, write_recognition
 from indexing.report.recognition import events_csv
-from indexing.skeleton import from_names
+from tests.indexing.report.people import Hit, person, recording
 
 PNG = struct.pack(">8sI4sII", b"\x89PNG\r\n\x1a\n", 13, b"IHDR", 30, 30)
 SCRIPT = "<script>alert(1)</script>"
-STICK = from_names(
-    "stick", ("nose", "left_hand", "right_hand", "hip", "left_foot", "right_foot"),
-    (("nose", "hip"), ("nose", "left_hand"), ("nose", "right_hand"), ("hip", "left_foot"), ("hip", "right_foot")),
-)  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Hit:
-    label: object
-    start: float
-    end: float
-    score: float = -0.5
-    margin: float = 0.25
-    exemplar: int | None = None
-
-
-def person(frames=60, up="y", fps=30.0):
-    joints = np.zeros((frames, 6, 2))
-    joints[:] = [[0, 1.7], [-0.6, 1.2], [0.6, 1.2], [0, 0.9], [-0.2, 0], [0.2, 0]]
-    joints[:, 1:3, 1] += 0.5 * np.sin(np.arange(frames) / 8)[:, None]
-    return Clip(joints * ([1, -1] if up == "-y" else [1, 1]), fps=fps, skeleton=STICK, up=up)
-
-
-def recording(events=(), truth=None, classes=("squat", "lunge"), frames=300, name="session.json", clip=True):
-    rng = np.random.default_rng(0)
-    times = np.arange(frames) / 30
-    return RecordingResult(
-        name, person(frames) if clip else None, times, list(classes), rng.normal(size=(frames, len(classes))), events, truth
-    )
 
 
 class Page(HTMLParser):
