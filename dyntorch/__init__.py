@@ -35,6 +35,7 @@ _HOME = {
     "HomographyTensor": "dyntorch.invariants.homography_tensor",
     "DualHomographyTensor": "dyntorch.invariants.dual_homography_tensor",
     "JoinTensor": "dyntorch.invariants.join_tensor",
+    "DynamicTensor": "dyntorch.invariants.dynamic_tensor",
     "MinimalJoinTensor": "dyntorch.invariants.minimal_join_tensor",
     "ConstantVelocityTensor": "dyntorch.invariants.constant_velocity_tensor",
     "TranslatingLinesMatrix": "dyntorch.invariants.translating_lines_matrix",

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dyntorch.core.invariant import Invariant, as_invariant
 from dyntorch.core.matches import Matches, matches, relative_weights
-from dyntorch.core.matrix import estimation_matrix, gram, within_noise
+from dyntorch.core.matrix import estimation_matrix, gram, labelled_rows, within_noise
 from dyntorch.core.normalize import Normalization, denormalize, normalization
 from dyntorch.core.outcome import Status, failed
 from dyntorch.core.primitives import Primitive
@@ -46,6 +46,7 @@ def fit(
     *views: Tensor,
     weights: Tensor | None = None,
     static: Tensor | None = None,
+    dimensions: Tensor | None = None,
     normalize: bool = True,
     **given: Tensor,
 ) -> Solution:
@@ -61,6 +62,8 @@ def fit(
         *views: matches, one argument per view, ``(*batch, n, ...)``; NaN = missing.
         weights: ``(*batch, n)`` not negative; 0 leaves a match out.
         static: ``(*batch, n)`` bool: matches known not to move add all their rows (segmented configuration, thesis 8.1).
+        dimensions: ``(*batch, n)`` integers in place of it: dimension of the linear subspace that each match is known to stay in, 1
+            for a static point, 2 for a line, up to ``invariant.within``, which says nothing new.
         normalize: False skips the similarity of every view (for matches that are of order 1 already).
         **given: what else the invariant takes, by name.
 
@@ -84,7 +87,7 @@ def fit(
         [[1.0, 0.1, 2.0], [-0.1, 1.0, 3.0], [0.1, 0.2, 1.0]]
     """
     invariant, views = as_invariant(invariant).prepared(views, weights, **given)
-    return fit_matches(invariant, matches(invariant, views, weights, static), normalize=normalize)
+    return fit_matches(invariant, matches(invariant, views, weights, static, dimensions), normalize=normalize)
 
 
 def fit_matches(invariant: Invariant, data: Matches, *, normalize: bool = True) -> Solution:
@@ -92,7 +95,7 @@ def fit_matches(invariant: Invariant, data: Matches, *, normalize: bool = True) 
     few = data.count < invariant.minimal()
     if data.static is not None:
         # a static match frees one slot at a time; how many of its rows are new the rank will say
-        few = few and data.count * sum(p.width for p in invariant.primitives) < invariant.width() - invariant.nullity
+        few = few and data.count * max(labelled_rows(invariant.primitives)) < invariant.width() - invariant.nullity
     if data.views[0].shape[0] and few:
         raise ValueError(f"{invariant!r} needs at least {invariant.minimal()} matches, got {data.count}; add matches")
     whole, present = invariant.completed(data.views, data.weights)
@@ -165,7 +168,8 @@ def _null(
     nullity, width = invariant.nullity, invariant.width()
     present = (weights > 0).sum(-1) * invariant.rows()
     if static is not None:
-        present = present + ((weights > 0) & static).sum(-1) * (sum(p.width for p in primitives) - invariant.rows())
+        for free, count in enumerate(labelled_rows(primitives), start=1):
+            present = present + ((weights > 0) & (static == free)).sum(-1) * (count - invariant.rows())
     g = gram(primitives, views, weights, static)
     found = decided_null_space(g, nullity)
     basis = found.basis

@@ -25,7 +25,7 @@ from dyntorch.numerics.least_squares import flattened, jacobian, parts_of
 P = ParamSpec("P")
 R = TypeVar("R")
 
-ARGUMENTS = ("weights", "static", "normalize", "threshold", "generator", "starts", "polish", "iterations", "options")
+ARGUMENTS = ("weights", "static", "dimensions", "normalize", "threshold", "generator", "starts", "polish", "iterations", "options")
 """What ``fit``, ``robust_fit``, ``refine`` and ``sampson`` take by name for every invariant."""
 
 
@@ -93,6 +93,9 @@ class Invariant:
     """Whether, among tensors that nearly all matches fulfil, the one with the least residual under noise is the true one."""
     labels_static: bool = False
     """Whether a match known to be static says more than one that may move (the argument ``static``)."""
+    within: int = 2
+    """Dimension of the linear subspace that a moving match stays in, 2 for a line.  One that is known to stay in fewer (the
+    argument ``dimensions``; a static one in 1) fulfils the form with so many slots less, whatever stands in them."""
     intrinsic: bool = False
     """Whether the tensor is free of the coordinates of the views, each match being brought into a frame of its own: matches are
     then not normalized, and the tensor is the same in all coordinates."""
@@ -163,6 +166,11 @@ class Invariant:
     def whitened_static(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
         """The same for matches that do not move: all their views agree under the motion.  ``(*batch, n, c)``."""
         raise ValueError(f"{self!r} has no separate residual for static matches; leave out static=")
+
+    def confined(self, free: int) -> Invariant | None:
+        """The invariant of matches that stay in a subspace of ``free`` dimensions less; None where that is a static point, whose
+        residual is :meth:`whitened_static`."""
+        return None
 
     def normalized(self, transforms: tuple[Tensor, ...]) -> Invariant:
         """The invariant that the tensor of normalized matches belongs to: the same one, unless it depends on coordinates."""

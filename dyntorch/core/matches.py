@@ -26,7 +26,7 @@ class Matches:
     weights: Tensor
     """``(b, n)``, 0 where the match is missing in any view."""
     static: Tensor | None
-    """``(b, n)`` bool."""
+    """``(b, n)`` bool, or integers: slots of the form that hold anything, 1 for what True says (see ``Invariant.within``)."""
     batch: tuple[int, ...]
     """The leading dimensions that came in."""
     dtype: torch.dtype
@@ -47,14 +47,20 @@ class Matches:
         return Matches(self.views, self.weights * keep, self.static, self.batch, self.dtype, self.device)
 
 
-def matches(invariant: Invariant, views: Sequence[Tensor], weights: Tensor | None = None, static: Tensor | None = None) -> Matches:
+def matches(
+    invariant: Invariant,
+    views: Sequence[Tensor],
+    weights: Tensor | None = None,
+    static: Tensor | None = None,
+    dimensions: Tensor | None = None,
+) -> Matches:
     """Check the views of one invariant and put them into float64.
 
     A match with a coordinate that is NaN or infinite in any view (beyond 1e60 is infinite), or a weight that is, weighs nothing.
 
     Raises:
-        ValueError: another number of views, shapes that do not agree, mixed dtypes or devices, negative weights, or ``static``
-            for an invariant that knows no labelled static matches.
+        ValueError: another number of views, shapes that do not agree, mixed dtypes or devices, negative weights, ``static`` or
+            ``dimensions`` for an invariant that knows no labelled static matches, both of them, or other dimensions.
     """
     check_views(invariant, views)
     for v, x in enumerate(views, start=1):
@@ -72,6 +78,10 @@ def matches(invariant: Invariant, views: Sequence[Tensor], weights: Tensor | Non
     flat = [x.to(home, torch.float64).reshape(math.prod(batch), *x.shape[axis:]) for x in views]
     weight = _weights(option("weights", weights, batch, n, first), flat[0])
     label = option("static", static, batch, n, first)
+    if dimensions is not None:
+        label = _freed(invariant, option("dimensions", dimensions, batch, n, first), static is not None)
+    elif label is not None:
+        label = label.bool() if invariant.within == 2 else label.bool() * (invariant.within - 1)
     if home.type == "cpu" and bool(weight.detach().sum().isfinite()) and all(bool(_near(x.detach())) for x in flat):
         # nothing is missing: one norm per view says so, and nothing is copied
         return Matches(tuple(flat), weight, _labels(label, home), batch, first.dtype, first.device)
@@ -113,7 +123,23 @@ def largest_weights(weights: Tensor) -> Tensor:
 
 
 def _labels(label: Tensor | None, home: torch.device) -> Tensor | None:
-    return None if label is None else label.to(home).bool()
+    return None if label is None else label.to(home)
+
+
+def _freed(invariant: Invariant, dimensions: Tensor | None, static: bool) -> Tensor:
+    """Slots ``(b, n)`` that hold anything, for matches within subspaces of known dimensions."""
+    assert dimensions is not None
+    if not invariant.labels_static:
+        raise ValueError(f"{invariant!r} has no rows for matches within fewer dimensions; leave out dimensions=")
+    if static:
+        raise ValueError("dimensions= says which matches are static, too (1); give it or static=, not both")
+    if dimensions.is_floating_point() or dimensions.dtype == torch.bool:
+        raise ValueError(f"dimensions must be integers, got {dimensions.dtype}; 1 stands still, 2 moves on a line, ...")
+    if dimensions.numel() and not bool(((dimensions >= 1) & (dimensions <= invariant.within)).all()):
+        low, high = int(dimensions.min()), int(dimensions.max())
+        raise ValueError(f"dimensions must be 1 to {invariant.within} for {invariant!r}, got {low} to {high}; 1 stands still")
+    freed = invariant.within - dimensions.long()
+    return freed if invariant.within > 2 else freed == 1
 
 
 def check_views(invariant: Invariant, views: Sequence[Tensor]) -> None:

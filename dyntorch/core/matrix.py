@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import combinations
 
 import numpy as np
 import torch
@@ -22,13 +23,14 @@ def estimation_matrix(
 ) -> Tensor:
     r"""Rows :math:`\sqrt w\; u_1 \otimes u_2 \otimes \dots` of all matches, with the vectors u of the primitives.
 
-    A match labelled static puts, for every slot in turn, all the vectors that a static match allows there.
+    A match labelled static puts, for every slot in turn, all the vectors that a static match allows there; one with several
+    free slots does so for every choice of so many.
 
     Args:
         primitives: one per view.
         views: ``(*batch, n, ...)`` finite matches.
         weights: ``(*batch, n)``.
-        static: ``(*batch, n)`` bool.
+        static: ``(*batch, n)`` bool, or numbers of free slots.
 
     Returns:
         ``(*batch, rows, width)``.
@@ -36,10 +38,12 @@ def estimation_matrix(
     vectors = [p.vectors(x) for p, x in zip(primitives, views, strict=True)]
     if static is None:
         return _kronecker(vectors, weights)
-    blocks = [_kronecker(vectors, weights * ~static)]
-    for v, (primitive, x) in enumerate(zip(primitives, views, strict=True)):
-        # a projector is its own Gram, so its rows serve as the vectors
-        blocks.append(_kronecker([*vectors[:v], primitive.free(x), *vectors[v + 1 :]], weights * static))
+    blocks = [_kronecker(vectors, weights * (static == 0))]
+    # a projector is its own Gram, so its rows serve as the vectors
+    free = [p.free(x) for p, x in zip(primitives, views, strict=True)]
+    for slots in _freed(len(views), static):
+        chosen = [free[v] if v in slots else u for v, u in enumerate(vectors)]
+        blocks.append(_kronecker(chosen, weights * (static == len(slots))))
     lead = np.broadcast_shapes(*(block.shape[:-2] for block in blocks))
     return torch.cat([block.expand(*lead, -1, -1) for block in blocks], dim=-2)
 
@@ -98,10 +102,24 @@ def _moments(primitives: Sequence[Primitive], views: Sequence[Tensor], weights: 
     packed = [p.packed(x) for p, x in zip(primitives, views, strict=True)]
     if static is None:
         return moment(packed, weights)
-    moments = moment(packed, weights * ~static)
-    for v, (primitive, x) in enumerate(zip(primitives, views, strict=True)):
-        moments = moments + moment([*packed[:v], _pack(primitive.free(x)), *packed[v + 1 :]], weights * static)
+    moments = moment(packed, weights * (static == 0))
+    free = [_pack(p.free(x)) for p, x in zip(primitives, views, strict=True)]
+    for slots in _freed(len(views), static):
+        chosen = [free[v] if v in slots else m for v, m in enumerate(packed)]
+        moments = moments + moment(chosen, weights * (static == len(slots)))
     return moments
+
+
+def _freed(views: int, static: Tensor) -> list[tuple[int, ...]]:
+    """Which slots are free at once in some match."""
+    most = 1 if static.dtype == torch.bool else int(static.max()) if static.numel() else 0
+    return [slots for count in range(1, most + 1) for slots in combinations(range(views), count)]
+
+
+def labelled_rows(primitives: Sequence[Primitive]) -> list[int]:
+    """Rows of a match with 1, 2, ... free slots, as many as there are views less one."""
+    widths = [p.width for p in primitives]
+    return [sum(math.prod(chosen) for chosen in combinations(widths, count)) for count in range(1, max(2, len(widths)))]
 
 
 def _pack(form: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from dyntorch.core.invariant import Frame, Invariant
 from dyntorch.core.primitives import Primitive
 from dyntorch.geometry.homogeneous import similarity, unit
 
-LETTERS = "abcdefgh"
+LETTERS = "abcdefghijkl"
 SPREAD = 1e-120
 """Mean square distance below which points are one: squares of lesser distances leave the range of float64."""
 

@@ -52,19 +52,20 @@ class Problem(NormalEquations):
         """Weighted whitened residuals ``(b, rows)`` of some of the matches, and their derivative ``(b, p, rows)``."""
         views, weights = tuple(x[:, piece] for x in self.views), self.weights[:, piece]
         still = None if self.static is None else self.static[:, piece]
-        moving = weights if still is None else weights * ~still
+        moving = weights if still is None else weights * (still == 0)
         value, derivative = self.moving(theta, views)
         root = moving.sqrt()[..., None].expand(*moving.shape, value.shape[1] // max(1, moving.shape[1])).flatten(1)
         value, derivative = value * root, derivative * root[:, None]
         if still is None:
             return value, derivative
-        resting = (weights * still).sqrt()[..., None]
-        more = self.resting(theta, views)
-        more = (
-            (more[0].unflatten(1, (views[0].shape[1], -1)) * resting).flatten(1),
-            more[1] * resting.expand(*resting.shape[:2], more[0].shape[1] // max(1, resting.shape[1])).flatten(1)[:, None],
-        )
-        return torch.cat([value, more[0]], dim=-1), torch.cat([derivative, more[1]], dim=-1)
+        values, slopes = [value], [derivative]
+        for free in range(1, 2 if still.dtype == torch.bool else self.invariant.within):
+            resting = (weights * (still == free)).sqrt()[..., None]
+            more = self.resting(theta, views, free)
+            values.append((more[0].unflatten(1, (views[0].shape[1], -1)) * resting).flatten(1))
+            wide = resting.expand(*resting.shape[:2], more[0].shape[1] // max(1, resting.shape[1])).flatten(1)
+            slopes.append(more[1] * wide[:, None])
+        return torch.cat(values, dim=-1), torch.cat(slopes, dim=-1)
 
     def moving(self, theta: Tensor, views: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
         """Unweighted residuals of matches that may move, and their derivative."""
@@ -80,8 +81,11 @@ class Problem(NormalEquations):
         value, derivative = multilinear_derivative(invariant, tensor.unflatten(1, invariant.shape()), views, self.scales)
         return value, slope @ derivative.mT
 
-    def resting(self, theta: Tensor, views: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
-        """Unweighted residuals of matches that do not move, and their derivative."""
+    def resting(self, theta: Tensor, views: tuple[Tensor, ...], free: int = 1) -> tuple[Tensor, Tensor]:
+        """Unweighted residuals of matches that do not move, or move in so many dimensions less, and their derivative."""
+        smaller = self.invariant.confined(free)
+        if smaller is not None:
+            return replace(self, invariant=smaller).moving(theta, views)
         return residual_derivative(self.invariant.whitened_static, self.parts(theta), views, self.scales)
 
     def pieces(self, width: int) -> list[slice]:
@@ -226,6 +230,7 @@ def refine(
     *views: Tensor,
     weights: Tensor | None = None,
     static: Tensor | None = None,
+    dimensions: Tensor | None = None,
     iterations: int = ITERATIONS,
     **given: Tensor,
 ) -> Solution:
@@ -241,6 +246,7 @@ def refine(
         *views: the same matches.
         weights: ``(*batch, n)``; default: the solution's inliers, else its weights.
         static: ``(*batch, n)`` bool, matches that do not move; default: those labelled in the fit.
+        dimensions: ``(*batch, n)`` integers in place of it, as in :func:`dyntorch.fit`.
         iterations: at most so many steps.
         **given: what else the invariant takes.
 
@@ -264,7 +270,7 @@ def refine(
         True
     """
     invariant, views = solution.invariant.prepared(views, **given)
-    data = matches(invariant, views, weights, static)
+    data = matches(invariant, views, weights, static, dimensions)
     old = solution.matches
     if data.batch != old.batch or data.count != old.count:
         raise ValueError(
@@ -274,7 +280,7 @@ def refine(
     if weights is None:
         keep = old.weights if solution.inliers is None else solution.inliers.reshape(old.weights.shape).to(old.weights)
         data = replace(data, weights=data.weights * (keep > 0 if solution.inliers is not None else keep))
-    if static is None and old.static is not None:
+    if data.static is None and old.static is not None:
         data = replace(data, static=old.static)
     return refine_matches(solution, data, iterations)
 
@@ -341,8 +347,10 @@ def _noise(invariant: Invariant, data: Matches, cost: Tensor) -> Tensor:
     """Noise ``(b,)`` of one coordinate that the residuals show; infinite where no match is left to tell it."""
     conditions = torch.full_like(data.weights, float(invariant.codim))
     if data.static is not None:
-        still = sum(p.freedom() for p in invariant.primitives[1:])
-        conditions = torch.where(data.static, float(still), conditions)
+        for free in range(1, invariant.within):
+            smaller = invariant.confined(free)
+            still = sum(p.freedom() for p in invariant.primitives[1:]) if smaller is None else smaller.codim
+            conditions = torch.where(data.static == free, float(still), conditions)
     spare = ((data.weights > 0) * conditions).sum(-1) - invariant.dof
     mean = cost / largest_weights(data.weights).clamp(min=torch.finfo(cost.dtype).tiny)
     return torch.where(spare > 0, (mean / spare.clamp(min=1)).sqrt(), torch.inf)

@@ -14,7 +14,7 @@ from dyntorch.numerics.blocks import select
 from dyntorch.numerics.least_squares import by_match, flattened, parts_of
 
 SINGULAR = 1e-14  # squared gradient, in normalized units, added where value and gradient vanish together (static points)
-LETTERS = "abcdefgh"
+LETTERS = "abcdefghijkl"
 
 
 def algebraic(invariant: Invariant | type[Invariant], tensor: Tensor, *views: Tensor, **given: Tensor) -> Tensor:

@@ -215,20 +215,22 @@ def motion_of_forms(forms: Tensor) -> tuple[Tensor, Tensor]:
         >>> bool(torch.allclose(found, unit(A)))
         True
     """
-    A, B = _skew_partner(torch.stack([forms.movedim(-1, -3), forms.movedim(-2, -3)])).unbind(0)
+    slices = torch.stack([forms.movedim(-1, -3), forms.movedim(-2, -3)])
+    A, B = skew_partner(slices.flatten(-4, -3)).unbind(0)
     return A, B
 
 
-def _skew_partner(slices: Tensor) -> Tensor:
-    """The matrix X for which X^T S is skew, for all slices S in ``(*batch, c, 4, 4, 4)``."""
-    rows, columns = torch.triu_indices(4, 4, device=slices.device)
-    s = slices.flatten(-4, -3).mT  # column n of S is s[n]
-    eye = torch.eye(4, dtype=slices.dtype, device=slices.device)
+def skew_partner(slices: Tensor) -> Tensor:
+    """The matrix X ``(*batch, N, N)`` for which X^T S is skew, for all S in ``(*batch, slices, N, N)``; norm 1, canonical sign."""
+    size = slices.shape[-1]
+    rows, columns = torch.triu_indices(size, size, device=slices.device)
+    s = slices.mT  # column n of S is s[n]
+    eye = torch.eye(size, dtype=slices.dtype, device=slices.device)
     # entry (m, n) of X^T S + S^T X as a function of X[l, x]: S[l, n] where x = m, and S[l, m] where x = n
     system = s[..., columns, :, None] * eye[rows, None, :] + s[..., rows, :, None] * eye[columns, None, :]
     # an equation off the diagonal stands for two: with its weight a rotation of the coordinates changes nothing
     system = system * torch.where(rows == columns, 1.0, 2**0.5).to(s)[:, None, None]
-    return unit(null_space(system.flatten(-2).flatten(-3, -2))[..., 0, :].unflatten(-1, (4, 4)))
+    return unit(null_space(system.flatten(-2).flatten(-3, -2))[..., 0, :].unflatten(-1, (size, size)))
 
 
 def collinearity(motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:

@@ -5,7 +5,7 @@ from dyntorch.scenes.filmed import FilmedScene, NonrigidScene, filmed, nonrigid_
 from dyntorch.scenes.lifts import LiftedScene, lifted
 from dyntorch.scenes.plane import lines_concurrent, planar, translating_lines
 from dyntorch.scenes.scene import Scene
-from dyntorch.scenes.space import collineation, constant_velocity, moving_points, two_view
+from dyntorch.scenes.space import collineation, constant_velocity, dynamic, moving_points, two_view
 from dyntorch.scenes.translation import TranslatingScene, translating_planes
 
 __all__ = [
@@ -18,6 +18,7 @@ __all__ = [
     "collineation",
     "constant_velocity",
     "convergent_motions",
+    "dynamic",
     "filmed",
     "lifted",
     "lines_concurrent",

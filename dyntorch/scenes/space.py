@@ -68,6 +68,74 @@ def moving_points(
     return draw.scene(exact, to_first, points=points, sensors=maps)
 
 
+def dynamic(
+    dim: int = 3,
+    sights: int = 3,
+    step: int = 2,
+    n: int = 200,
+    *,
+    batch: int | Sequence[int] = (),
+    sigma: float = 0.0,
+    static: float = 0.0,
+    outliers: float = 0.0,
+    mixed: bool = False,
+    generator: torch.Generator | None = None,
+    dtype: torch.dtype = torch.float64,
+) -> Scene:
+    r"""Points of a space of any dimension in any number of views, each moving within a linear subspace of dimension ``step``.
+
+    Points within 2 of the origin in each coordinate at the second instant, and .5 to 2 away from there, in a random direction of
+    their flat, at the others.
+
+    Args:
+        dim: of the space.
+        sights: views.
+        step: 1 stands still, 2 moves on a line, 3 in a plane.
+        n: number of matches.
+        batch: shape of the batch of independent scenes.
+        sigma: noise, in the unit of the scene.
+        static: share of static points.
+        outliers: share of matches of which one view is replaced by a random point.
+        mixed: matches stay within subspaces of all dimensions from 1 to ``step``, in turn.
+        generator: source of all randomness.
+        dtype: of the result; the scene is made in float64.
+
+    Returns:
+        Scene with ``views`` of ``(*batch, n, dim)``; ``motion`` the collineations from view 2, 3, ... to view 1;
+        ``extras["dimensions"]`` ``(*batch, n)`` of the subspaces, ``extras["points"]`` ``(*batch, n, dim)`` at the second instant.
+
+    Raises:
+        ValueError: dim, sights or step < 1, shares outside 0 to 1, negative sigma, n < 1.
+
+    Source: thesis section 9.3.
+
+    Example:
+        >>> scene = dynamic(3, 4, 3, 7, batch=2)  # in planes
+        >>> len(scene.views), scene.views[0].shape, scene.motion[2].shape
+        (4, torch.Size([2, 7, 3]), torch.Size([2, 4, 4]))
+    """
+    if min(dim, sights, step) < 1:
+        raise ValueError(f"dim, sights and step must be 1 or more, got {dim}, {sights}, {step}")
+    draw = Draw(n, batch, sigma, static, outliers, generator, dtype)
+    eye = torch.eye(dim + 1, dtype=torch.float64)
+    maps = eye + 0.2 * draw.normal(sights, dim + 1, dim + 1)
+    # a bounded last row keeps the scene in front of the hyperplane at infinity
+    last = torch.cat([draw.uniform(sights, 1, dim, low=-0.18 / dim, high=0.18 / dim), torch.ones_like(maps[..., :1, :1])], dim=-1)
+    maps = torch.cat([maps[..., :dim, :], last], dim=-2)
+    points = draw.uniform(n, dim, low=-2.0, high=2.0)
+    turn = torch.arange(n, device=points.device) % step + 1 if mixed else torch.full((n,), step, device=points.device)
+    dimensions = torch.where(draw.moving, turn, 1)
+    flats = draw.directions(n, max(1, step - 1), dim)
+    used = torch.arange(1, max(2, step), device=points.device) < dimensions[..., None]
+    along = torch.nn.functional.normalize(draw.normal(sights, n, max(1, step - 1)) * used[..., None, :, :], dim=-1)
+    way = (along[..., None, :] @ flats[..., None, :, :, :])[..., 0, :] * draw.uniform(sights, n, 1, low=0.5, high=2.0)
+    present = (torch.arange(sights, device=points.device) != 1)[:, None, None]
+    placed = points[..., None, :, :] + torch.where(present, way, 0.0)
+    exact = [apply(maps[..., v, :, :], placed[..., v, :, :]) for v in range(sights)]
+    to_first = [maps[..., 0, :, :] @ torch.linalg.inv(maps[..., v, :, :]) for v in range(1, sights)]
+    return draw.scene(exact, to_first, points=points, dimensions=dimensions)
+
+
 def constant_velocity(
     n: int = 200,
     *,

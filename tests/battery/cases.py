@@ -30,7 +30,7 @@ from tests.battery.epipolar import (
     two_epipolar_errors,
     two_epipolar_truths,
 )
-from tests.battery.projections import collinear_images, lifted, on_image_lines, seen, tensor_error
+from tests.battery.projections import collinear_images, in_a_flat, lifted, on_image_lines, seen, tensor_error
 
 PIXELS = (1 / 250.0, (320.0, 240.0))
 """Scale and centre that bring the pictures of the planar scenes to order 1."""
@@ -207,6 +207,25 @@ def grassmann(k: int, profile: tuple[int, ...], make: Callable[..., Scene], mini
     return Case(dyn.GrassmannTensor(k, profile, dims), make, 1, error, seen, minimal, projected=projected, units=units, **options)
 
 
+def dynamic(n: int, views: int, step: int, minimal: int, **options: Any) -> Case:
+    """Points that move within flats; distances are those to the nearest exact match, where one equation is not all there is."""
+    invariant = dyn.DynamicTensor(n, views, step)
+    make = partial(scenes.dynamic, n, views, step)
+    several = (n + 1) ** views - minimal
+    projected = (views - step) * (n + 1 - step) > 1
+    moves = {"moves": step > 1, **options}
+    return Case(invariant, renamed(make), several, parts_error, partial(in_a_flat, step), minimal, projected=projected, **moves)
+
+
+def renamed(make: Callable[..., Scene]) -> Callable[..., Scene]:
+    """``n`` is the dimension of the space there, and the number of matches here."""
+
+    def made(n: int, **options: Any) -> Scene:
+        return make(n, **options)
+
+    return made
+
+
 JOIN_LABELLED = {0: 60, 1: 50, 2: 40, 3: 30, 4: 20, 5: 10, 6: 4, 7: 0}
 PLANE = {"moves": True, "labelled": {0: 26, 1: 19, 2: 12, 3: 5, 4: 0}}
 SPACE = {"moves": True, "outliers": 0.2}
@@ -261,5 +280,7 @@ CASES = (
     grassmann(5, (2, 2, 1, 1), lifted("constant_velocity_planes_3d", (0, 4, 9, 13)), 20, moves=True),
     grassmann(6, (2, 2, 2, 1), lifted("constant_velocity_3d", (0, 4, 9, 13)), 40, moves=True),
     grassmann(6, (3, 3, 1), lifted("constant_velocity_3d_sensors", (0, 4, 9)), 21, dims=3, moves=True),
+    dynamic(1, 3, 1, 4),
+    dynamic(2, 4, 2, 72, outliers=0.2),
     Case(dyn.GrassmannTensor(2, (1, 1, 1), dual=True), collinear_images, 1, partial(tensor_error, (1, 1, 1)), on_image_lines, 26),
 )

@@ -86,3 +86,15 @@ def on_image_lines(motion: Motion, *views: Tensor) -> Tensor:
     """The lines of the plane that the points allow meet in the one that is seen."""
     points = [torch.cat([x, torch.ones_like(x[:1])]) for x in views]
     return torch.linalg.det(torch.stack([p @ m for p, m in zip(points, motion, strict=True)]))[None]
+
+
+def in_a_flat(step: int, motion: Motion, x1: Tensor, *others: Tensor) -> Tensor:
+    """All positions carried into view 1 span so many dimensions: every minor of one order more is zero."""
+    carried = torch.stack([lifted_point(x1), *(m @ lifted_point(x) for m, x in zip(motion, others, strict=True))])
+    rows, columns = (combinations(range(size), step + 1) for size in carried.shape)
+    sets = list(product(rows, columns))
+    return torch.linalg.det(torch.stack([carried[list(r)][:, list(c)] for r, c in sets]))
+
+
+def lifted_point(x: Tensor) -> Tensor:
+    return torch.cat([x, torch.ones_like(x[:1])])

@@ -197,7 +197,9 @@ def similarity_commutes_with_noisy_fit(case: Case) -> None:
     frames = similarities(case)
     before = dyn.fit(case.invariant, *views)
     after = dyn.fit(case.follows(case.invariant, frames), *moved_views(case.invariant, views, frames))
-    assert apart(case, pulled_back(case, after.tensor, frames), before.tensor) < 1e-8
+    # several tensors that are orthonormal in one system of coordinates are near to dependent in another one
+    rounding = 1e-15 * float(torch.stack([torch.linalg.cond(frame) for frame in frames]).prod()) if case.nullity > 1 else 0.0
+    assert apart(case, pulled_back(case, after.tensor, frames), before.tensor) < max(1e-8, rounding)
     assert torch.equal(before.status, after.status)
     torch.testing.assert_close(before.uncertainty, after.uncertainty, rtol=1e-4, atol=1e-9)
     # decompositions that balance the axes of a tensor that is not quite one change by far less than the noise

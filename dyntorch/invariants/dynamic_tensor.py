@@ -1,0 +1,314 @@
+"""Dynamic P^n -> P^n: points that move within flats of any dimension, in any number of views of a space of any dimension."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache, reduce
+
+import torch
+from torch import Tensor
+
+from dyntorch.core.invariant import Frame, Invariant
+from dyntorch.core.primitives import Point, Primitive
+from dyntorch.counting.dimension import dim_v
+from dyntorch.geometry.homogeneous import homogeneous, inhomogeneous
+from dyntorch.invariants.agreement import static_residual
+from dyntorch.invariants.flats import collineations, flat_residual, flat_residual_derivative, nearest_flats, vanishing_forms
+from dyntorch.numerics.least_squares import normalized_derivative
+
+
+@lru_cache
+def _nullity(size: int, views: int, step: int) -> int:
+    return int(size**views - dim_v(size, views, step))
+
+
+@dataclass(frozen=True, repr=False)
+class DynamicTensor(Invariant):
+    r"""Points of :math:`P^n` in m views related by collineations, each moving within a linear subspace of dimension k.
+
+    Every match has vectors :math:`p_1, A_2 p_2, \dots, A_m p_m` in k dimensions: k = 1 is a point that stands still, k = 2 one
+    that moves on a line, k = 3 in a plane.  Any k + 1 of its views are then linearly dependent,
+
+    .. math:: p_1 \wedge A_2 p_2 \wedge \dots \wedge A_{k+1} p_{k+1} = 0 ,
+
+    and so for every choice of k + 1 views.  All forms on the m views that vanish are a space of :math:`(n+1)^m - \dim V(n+1, m, k)`
+    dimensions, the null space of the rows :math:`p_1 \otimes \dots \otimes p_m`; a fit gives an orthonormal basis of it.
+
+    It determines :math:`A_2, \dots, A_m`, each up to its scale, whenever there is a form at all, that is for k <= n and m > k; a
+    point that may be anywhere (k = n + 1), or that k views or fewer show, fulfils nothing.  ``DynamicTensor(2, 3, 2)`` is the
+    homography tensor, ``DynamicTensor(3, 3, 2)`` the family of join tensors.  What more than k + 1 views have in common follows
+    from k + 1 of them; they lower the noise, but the linear fit takes more matches: :func:`dyntorch.align_planar` and
+    :func:`dyntorch.align_points` start from three views each and refine all of them together.
+
+    Matches may be of different kinds.  Those known to stay within fewer dimensions say more; the argument ``dimensions`` of
+    ``fit`` and ``refine``, ``(*batch, n)`` integers from 1 to k, says how many (``static`` means 1).
+
+    Args:
+        n: dimension of the space.
+        views: m, their number.
+        k: dimension of the subspace of a match, as in the thesis's V(n, m, k): 2 for a line.
+
+    Raises:
+        ValueError: numbers for which nothing can be told.
+
+    Source: thesis sections 9.3 and 9.4.
+
+    Example:
+        >>> import torch
+        >>> DynamicTensor(2, 3, 2).minimal(), DynamicTensor(3, 3, 2).minimal(), DynamicTensor(3, 4, 3).minimal()
+        (26, 60, 255)
+        >>> draw = torch.Generator().manual_seed(0)
+        >>> A = torch.rand(2, 4, 4, generator=draw, dtype=torch.float64)
+        >>> in_three_views = DynamicTensor(3, 3, 2)
+        >>> found = in_three_views.decompose(in_three_views.compose(*A))
+        >>> [bool(torch.allclose(a / a.norm(), b)) for a, b in zip(A, found)]
+        [True, True]
+    """
+
+    n: int
+    views: int
+    k: int
+
+    def __post_init__(self) -> None:
+        for name in ("n", "views", "k"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+                raise ValueError(f"{name} must be an integer of at least 1, got {value!r}")
+        if self.k > self.n:
+            raise ValueError(
+                f"k must be at most n = {self.n}, got {self.k}: points that may be anywhere in P^{self.n} fulfil no equation"
+            )
+        if self.views <= self.k:
+            raise ValueError(
+                f"views must be more than k = {self.k}, got {self.views}: so many points always lie in {self.k} dimensions; "
+                f"give {self.k + 1} views or more"
+            )
+
+    @property
+    def size(self) -> int:
+        """Homogeneous coordinates of a point."""
+        return self.n + 1
+
+    @property
+    def primitives(self) -> tuple[Primitive, ...]:  # type: ignore[override]
+        return (Point(self.n),) * self.views
+
+    @property
+    def motion(self) -> tuple[Frame, ...]:  # type: ignore[override]
+        return tuple(Frame(0, view) for view in range(1, self.views))
+
+    @property
+    def nullity(self) -> int:  # type: ignore[override]
+        """Independent forms that all matches fulfil."""
+        return _nullity(self.size, self.views, self.k)
+
+    @property
+    def dof(self) -> int:  # type: ignore[override]
+        """Entries of the collineations, each up to scale."""
+        return (self.views - 1) * (self.size**2 - 1)
+
+    @property
+    def codim(self) -> int:  # type: ignore[override]
+        """Coordinates of all views, less those of a flat and of a point on it in every view."""
+        return (self.views - self.k) * (self.size - self.k)
+
+    @property
+    def within(self) -> int:  # type: ignore[override]
+        return self.k
+
+    @property
+    def labels_static(self) -> bool:  # type: ignore[override]
+        return self.k > 1
+
+    def compose(self, *maps: Tensor) -> Tensor:
+        r"""An orthonormal basis of the forms that vanish on points moved by :math:`A_2, \dots, A_m`.
+
+        Args:
+            *maps: ``(*batch, n + 1, n + 1)``, view 2, 3, ... to view 1, of any scale.
+
+        Returns:
+            ``(*batch, nullity, n + 1, ..., n + 1)``, one axis per view, without that of the nullity where it is 1; zero where a
+            map is.
+
+        Raises:
+            ValueError: another number of maps, or of another size.
+
+        Example:
+            >>> import torch
+            >>> still = DynamicTensor(1, 2, 1).compose(torch.eye(2))  # p x p' = 0
+            >>> still.mul(2**0.5).round().tolist()
+            [[0.0, 1.0], [-1.0, 0.0]]
+        """
+        self._check(maps)
+        value = self._moved(maps)
+        flat = value.flatten(-self.views)
+        if self.nullity == 1:
+            norm = flat.norm(dim=-1, keepdim=True)
+            return (flat / norm.where(norm > 0, 1.0))[..., 0, :].unflatten(-1, (self.size,) * self.views)
+        # a zero motion has no forms: it stays zero, and any basis in its place keeps the derivative of the others finite
+        none = flat.abs().amax((-2, -1), keepdim=True) == 0
+        other = torch.eye(*flat.shape[-2:], dtype=flat.dtype, device=flat.device)
+        basis = torch.linalg.qr(torch.where(none, other, flat).mT)[0].mT
+        return torch.where(none, 0.0, basis).unflatten(-1, (self.size,) * self.views)
+
+    def compose_derivative(self, motion: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+        if self.nullity > 1:
+            return super().compose_derivative(motion)
+        size, views = self.size, self.views
+        eye = torch.eye(size, dtype=motion[0].dtype, device=motion[0].device)
+        slopes = []
+        for v in range(1, views):
+            # linear in each map: its axis i is left as it is, and entry (i, j) of the map takes it to j
+            rest = self._moved(motion, but=v).squeeze(-views - 1).movedim(v - views, -views).flatten(-views + 1)
+            put = rest[..., :, None, None, :] * eye[:, :, None]  # i, j, where it is taken, the other axes
+            put = put.unflatten(-1, (size,) * (views - 1)).movedim(-views, v - views)
+            slopes.append(put.flatten(-views).flatten(-3, -2))
+        return normalized_derivative(self._moved(motion).flatten(-views)[..., 0, :], torch.cat(slopes, dim=-2))
+
+    def decompose(self, tensor: Tensor) -> tuple[Tensor, ...]:
+        r"""The collineations behind a basis of vanishing forms, linearly.
+
+        The forms on k + 1 views alone are those that stay forms whatever stands in the other slots; a slice S of them between
+        view 1 and view v is a skew matrix times :math:`A_v`, so that :math:`A_v^T S + S^T A_v = 0`, whose only solution is
+        :math:`A_v` up to scale.
+
+        Args:
+            tensor: ``(*batch, nullity, n + 1, ..., n + 1)`` any basis, without the first axis where the nullity is 1.
+
+        Returns:
+            :math:`A_2, \dots, A_m`, ``(*batch, n + 1, n + 1)`` each, norm 1, canonical sign; zero for a zero tensor (a failed fit).
+
+        Raises:
+            ValueError: another shape.
+
+        Source: thesis sections 8.1 (i) and 9.3; the forms on k + 1 views: derived here.
+
+        Example:
+            >>> import torch
+            >>> in_planes = DynamicTensor(3, 4, 3)
+            >>> A = torch.rand(3, 4, 4, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+            >>> bool(torch.allclose(in_planes.decompose(in_planes.compose(*A))[2], A[2] / A[2].norm()))
+            True
+        """
+        shape = (self.nullity,) * (self.nullity > 1) + self.shape()
+        if tuple(tensor.shape[-len(shape) :]) != shape:
+            raise ValueError(f"tensor of {self!r} must be (*batch, {', '.join(map(str, shape))}), got {tuple(tensor.shape)}")
+        flat = self.basis_of(tensor.double())
+        none = (flat == 0).all(-1).all(-1)[..., None, None]
+        stand_in = vanishing_forms(self.size, self.views, self.k, flat.device).flatten(1)
+        rows = torch.where(none, stand_in, flat)
+        basis = torch.linalg.qr(rows.mT)[0].mT if self.nullity > 1 else torch.nn.functional.normalize(rows, dim=-1)
+        found = collineations(basis.unflatten(-1, (self.size,) * self.views), self.views, self.k)
+        return tuple(torch.where(none, 0.0, part).to(tensor.dtype) for part in found)
+
+    def transfer(self, tensor: Tensor, x: Tensor, source: int = 2, target: int = 1) -> Tensor:
+        r"""Where static points of one view are in another: :math:`A_t^{-1} A_s p`.
+
+        Args:
+            tensor: as :func:`dyntorch.fit` gives it.
+            x: ``(*batch, n, d)`` points of view ``source``.
+            source: 1 to m.
+            target: another view.
+
+        Returns:
+            ``(*batch, n, d)``.
+
+        Raises:
+            ValueError: views that are not two different ones.
+
+        Example:
+            >>> import torch
+            >>> shift = torch.tensor([[1.0, 5.0], [0.0, 1.0]])
+            >>> line = DynamicTensor(1, 2, 1)
+            >>> line.transfer(line.compose(shift), torch.tensor([[2.0]])).round(decimals=4).tolist()
+            [[7.0]]
+        """
+        if source == target or not {source, target} <= set(range(1, self.views + 1)):
+            raise ValueError(f"source and target must be two different views of 1 to {self.views}, got {source} and {target}")
+        maps = self._stacked(self.decompose(tensor.double()))
+        both = torch.linalg.solve_ex(maps[..., target - 1, :, :], maps[..., source - 1, :, :])[0]
+        return inhomogeneous(homogeneous(x.double()) @ both.mT).to(x.dtype)
+
+    def flats(self, tensor: Tensor, *views: Tensor, view: int = 1) -> Tensor:
+        r"""The subspace in which each match moves, by hyperplanes that contain it: for k = 2 in the plane its trajectory line.
+
+        Args:
+            tensor: as :func:`dyntorch.fit` gives it.
+            *views: the matches, ``(*batch, n, d)`` each.
+            view: 1 to m, in whose coordinates the hyperplanes are.
+
+        Returns:
+            ``(*batch, n, d + 1 - k, d + 1)`` orthonormal hyperplanes; those of least distance from all views.
+
+        Raises:
+            ValueError: another number of views, or no such view.
+
+        Source: thesis section 8.1 (iii), for any dimension.
+
+        Example:
+            >>> import torch
+            >>> eye, x = torch.eye(3), torch.tensor([[0.0, 1.0]])
+            >>> on_lines = DynamicTensor(2, 3, 2)
+            >>> on_lines.flats(on_lines.compose(eye, eye), x, x + x, x * 4).abs().round(decimals=4).tolist()
+            [[[1.0, 0.0, 0.0]]]
+        """
+        if len(views) != self.views or view not in range(1, self.views + 1):
+            raise ValueError(f"expected {self.views} views and one of their numbers, got {len(views)} views and view={view}")
+        batch, count = views[0].shape[:-2], views[0].shape[-2]
+        points = torch.stack([x.double() for x in views], dim=-2).reshape(-1, count, self.views, self.n)
+        maps = self._stacked(self.decompose(tensor.double()))
+        maps = maps.expand(*batch, -1, -1, -1).reshape(-1, self.views, self.size, self.size)
+        found = nearest_flats(maps, points, torch.ones(len(maps), self.views, dtype=torch.float64, device=maps.device), self.k)
+        planes = torch.linalg.qr((found.hyperplanes @ maps[:, None, view - 1]).mT)[0].mT
+        return planes.reshape(*batch, *planes.shape[1:]).to(views[0].dtype)
+
+    def whitened(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor | None:
+        """Distances of all views from the nearest flat, ``(*batch, n, m (n + 1 - k))``; None where one equation says it all."""
+        if self.single():
+            return None
+        batch = torch.broadcast_shapes(*(part.shape[:-2] for part in motion), *(x.shape[:-2] for x in views))
+        maps = self._stacked(motion).expand(*batch, -1, -1, -1).reshape(-1, self.views, self.size, self.size)
+        flat = [x.expand(*batch, -1, -1).reshape(-1, *x.shape[-2:]).double() for x in views]
+        found = flat_residual(maps.double(), flat, [s.double().expand(batch).reshape(-1) for s in scales], self.k)
+        return found.reshape(*batch, *found.shape[1:]).to(views[0].dtype)
+
+    def linearized(
+        self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]
+    ) -> tuple[Tensor, Tensor] | None:
+        return None if self.single() else flat_residual_derivative(self._stacked(motion), views, scales, self.k)
+
+    def whitened_static(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
+        """Disagreement of the views of a static point, ``(*batch, n, n (m - 1))``."""
+        return static_residual(motion, views, scales)
+
+    def confined(self, free: int) -> Invariant | None:
+        return None if self.k - free <= 1 else DynamicTensor(self.n, self.views, self.k - free)
+
+    def _moved(self, maps: tuple[Tensor, ...], but: int = -1) -> Tensor:
+        """The forms ``(*batch, nullity, N, ..., N)`` of the maps, of any length; axis ``but`` is left as it is."""
+        forms = vanishing_forms(self.size, self.views, self.k, maps[0].device).to(maps[0].dtype)
+        batch = torch.broadcast_shapes(*(part.shape[:-2] for part in maps))
+        return reduce(
+            lambda total, v: total if v == but else self._along(total, maps[v - 1], v),
+            range(1, self.views),
+            forms.expand(*batch, *forms.shape),
+        )
+
+    def _along(self, forms: Tensor, matrix: Tensor, view: int) -> Tensor:
+        """One axis of the forms contracted with a map ``(*batch, N, N)``."""
+        axis = view - self.views
+        moved = forms.movedim(axis, -1)
+        return (moved @ matrix.reshape(*matrix.shape[:-2], *[1] * (self.views - 1), self.size, self.size)).movedim(-1, axis)
+
+    def _stacked(self, maps: tuple[Tensor, ...]) -> Tensor:
+        """``(*batch, m, N, N)`` with the identity for view 1."""
+        return torch.stack([torch.eye(self.size, dtype=maps[0].dtype, device=maps[0].device).expand_as(maps[0]), *maps], dim=-3)
+
+    def _check(self, maps: tuple[Tensor, ...]) -> None:
+        if len(maps) != self.views - 1 or any(part.shape[-2:] != (self.size, self.size) for part in maps):
+            raise ValueError(
+                f"{self!r} has {self.views - 1} maps (*batch, {self.size}, {self.size}), got {[tuple(part.shape) for part in maps]}"
+            )
+
+    def __repr__(self) -> str:
+        return f"DynamicTensor({self.n}, {self.views}, {self.k})"

@@ -1,0 +1,163 @@
+"""Dynamic tensors against brute force: the forms that vanish, their derivatives, and the distance from the nearest flat."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import minimize
+
+import dyntorch as dyn
+from dyntorch import counting, scenes
+from dyntorch.invariants.flats import flat_residual, flat_residual_derivative, forms_of_views, vanishing_forms
+
+CPU = torch.device("cpu")
+
+
+SIZES = [(2, 2, 1), (2, 5, 1), (3, 3, 2), (3, 4, 2), (3, 4, 1), (4, 4, 3), (4, 3, 2), (3, 5, 2)]
+
+
+@pytest.mark.parametrize(("size", "views", "step"), SIZES)
+def test_vanishing_forms_are_the_complement_of_products_within_a_subspace(size, views, step):
+    forms = vanishing_forms(size, views, step, CPU).flatten(1)
+    assert len(forms) == size**views - counting.dim_v(size, views, step)
+    torch.testing.assert_close(forms @ forms.T, torch.eye(len(forms), dtype=torch.float64))
+    draw = torch.Generator().manual_seed(0)
+    for _ in range(5):
+        span = torch.randn(step, size, generator=draw, dtype=torch.float64)
+        row = torch.ones(1, dtype=torch.float64)
+        for _ in range(views):
+            row = torch.kron(row, torch.randn(step, generator=draw, dtype=torch.float64) @ span)
+        assert (forms @ row).abs().max() < 1e-12 * row.norm()
+
+
+def test_forms_of_some_views_are_found_within_those_of_all():
+    draw = torch.Generator().manual_seed(1)
+    A = torch.eye(3) + 0.3 * torch.randn(4, 3, 3, generator=draw, dtype=torch.float64)
+    basis = dyn.DynamicTensor(2, 5, 2).compose(*A)
+    for slots in ((0, 1, 2), (0, 2, 4), (1, 3, 4)):
+        found = forms_of_views(basis, 5, slots, 2)[0]
+        maps = [torch.eye(3).double(), *A]
+        a, b, c = (maps[s] for s in slots)
+        wanted = torch.einsum("uvw,ui,vj,wk->ijk", torch.from_numpy(epsilon()), a, b, c)
+        assert abs(float((found * wanted / wanted.norm()).sum())) == pytest.approx(1, abs=1e-9)
+
+
+def epsilon():
+    return np.array([[[(i - j) * (j - k) * (k - i) / 2 for k in range(3)] for j in range(3)] for i in range(3)])
+
+
+@pytest.mark.parametrize("numbers", [(2, 3, 2), (3, 4, 3), (1, 2, 1)])
+def test_derivative_of_the_tensor_is_right(numbers):
+    invariant = dyn.DynamicTensor(*numbers)
+    draw = torch.Generator().manual_seed(2)
+    size = invariant.size
+    motion = tuple(torch.randn(2, size, size, generator=draw, dtype=torch.float64) for _ in range(invariant.views - 1))
+    value, slope = invariant.compose_derivative(motion)
+    torch.testing.assert_close(value, invariant.compose(*motion).flatten(1))
+    theta = torch.cat([part.flatten(1) for part in motion], dim=-1)
+
+    def tensor(theta):
+        return invariant.compose(*theta.unflatten(-1, (-1, size, size)).unbind(-3)).flatten(-invariant.views)
+
+    torch.testing.assert_close(slope, torch.stack([torch.func.jacfwd(tensor)(row) for row in theta]).mT)
+
+
+@pytest.mark.parametrize(("dim", "views", "step"), [(3, 4, 2), (3, 5, 3), (2, 3, 1)])
+def test_distance_is_the_least_one_to_exact_matches(dim, views, step):
+    """By a general search over the flat and the positions within it, from the true ones."""
+    sigma, n = 2e-2, 4
+    scene = scenes.dynamic(dim, views, step, n, sigma=sigma, generator=torch.Generator().manual_seed(3))
+    invariant = dyn.DynamicTensor(dim, views, step)
+    found = dyn.sampson(invariant, invariant.compose(*scene.motion), *scene.views)
+    maps = np.stack([np.eye(dim + 1), *(m.numpy() for m in scene.motion)])
+    back = np.linalg.inv(maps)
+    for i in range(n):
+        seen = np.stack([x[i].numpy() for x in scene.views])
+        exact = np.stack([x[i].numpy() for x in scene.exact])
+        carried = np.einsum("vij,vj->vi", maps, np.hstack([exact, np.ones((views, 1))]))
+        carried = carried[:, :-1] / carried[:, -1:]
+        centre = carried.mean(0)
+        frame = np.linalg.svd(carried - centre)[2][: step - 1]
+        start = np.concatenate([centre, frame.ravel(), ((carried - centre) @ frame.T).ravel()])
+
+        def cost(z, seen=seen):
+            origin, axes, t = np.split(z, [dim, dim + (step - 1) * dim])
+            world = origin + t.reshape(views, step - 1) @ axes.reshape(step - 1, dim)
+            image = np.einsum("vij,vj->vi", back, np.hstack([world, np.ones((views, 1))]))
+            return float(((image[:, :-1] / image[:, -1:] - seen) ** 2).sum()) / sigma**2
+
+        least = minimize(cost, start, method="BFGS", options={"gtol": 1e-6}).fun
+        assert float(found[i]) ** 2 / sigma**2 == pytest.approx(least, rel=1e-4)
+
+
+@pytest.mark.parametrize(("dim", "views", "step"), [(3, 4, 2), (3, 5, 3), (2, 4, 1), (4, 5, 2)])
+def test_derivative_of_the_distance_is_right(dim, views, step):
+    scene = scenes.dynamic(dim, views, step, 6, batch=2, sigma=1e-2, generator=torch.Generator().manual_seed(4))
+    size = dim + 1
+    scales = [torch.tensor([1.0, 2.0]).double() * (v + 1) for v in range(views)]
+
+    def stacked(theta):
+        return torch.cat([torch.eye(size).double().expand(2, 1, -1, -1), theta.unflatten(-1, (-1, size, size))], dim=1)
+
+    theta = torch.cat([m.flatten(1) for m in scene.motion], dim=-1)
+    value, derivative = flat_residual_derivative(stacked(theta), scene.views, scales, step)
+    draw, h = torch.Generator().manual_seed(5), 1e-6
+    for _ in range(3):
+        along = torch.randn(theta.shape, generator=draw, dtype=torch.float64)
+        squares = [
+            flat_residual(stacked(theta + s * along), scene.views, scales, step).flatten(1).square().sum(-1) for s in (h, -h)
+        ]
+        expected = (squares[0] - squares[1]) / (2 * h)
+        torch.testing.assert_close(2 * (along[:, None] @ derivative)[:, 0].mul(value).sum(-1), expected, rtol=1e-5, atol=1e-8)
+
+
+def test_distances_carry_gradients():
+    scene = scenes.dynamic(2, 4, 2, 5, sigma=1e-2, generator=torch.Generator().manual_seed(6))
+    invariant = dyn.DynamicTensor(2, 4, 2)
+
+    def total(*views):
+        return invariant.whitened(scene.motion, views, (torch.ones(()).double(),) * 4).square().sum(-1)
+
+    views = [x.clone().requires_grad_() for x in scene.views]
+    assert torch.autograd.gradcheck(total, views, eps=1e-7, atol=1e-5, rtol=1e-4)
+
+
+def test_points_that_stand_still_have_a_distance_as_well():
+    """The flat is open there: the distance stays below that of a point, above that of the best of many lines."""
+    scene = scenes.dynamic(3, 4, 2, 50, sigma=1e-3, static=1.0, generator=torch.Generator().manual_seed(7))
+    on_lines, at_points = dyn.DynamicTensor(3, 4, 2), dyn.DynamicTensor(3, 4, 1)
+    line = dyn.sampson(on_lines, on_lines.compose(*scene.motion), *scene.views).square() / 1e-6
+    point = dyn.sampson(at_points, at_points.compose(*scene.motion), *scene.views).square() / 1e-6
+    assert (line <= point * (1 + 1e-9)).all() and 0.8 < float(point.mean()) / 9 < 1.2
+    still = on_lines.whitened_static(scene.motion, scene.views, (torch.ones(()).double(),) * 4).square().sum(-1) / 1e-6
+    torch.testing.assert_close(still, point, rtol=0.05, atol=0.05)
+
+
+def test_robust_estimation_finds_static_points_among_outliers():
+    scene = scenes.dynamic(2, 4, 1, 80, sigma=1e-3, outliers=0.3, generator=torch.Generator().manual_seed(8))
+    found = dyn.robust_fit(
+        dyn.DynamicTensor(2, 4, 1), *scene.views, threshold=5e-3, generator=torch.Generator().manual_seed(0)
+    ).check()
+    right = scene.labels != 0
+    assert float(found.inliers[right].double().mean()) > 0.95 and not found.inliers[~right].any()
+    assert all(float((f - t).norm()) < 0.01 for f, t in zip(found.motion, scene.motion, strict=True))
+
+
+def test_mixed_scenes_are_what_they_say():
+    scene = scenes.dynamic(3, 4, 3, 30, mixed=True, generator=torch.Generator().manual_seed(9))
+    maps = (torch.eye(4).double(), *scene.motion)
+    p = [torch.cat([x, torch.ones_like(x[:, :1])], dim=-1) for x in scene.exact]
+    p = torch.stack([x @ m.T for x, m in zip(p, maps, strict=True)], dim=1)
+    ranks = torch.linalg.matrix_rank(torch.nn.functional.normalize(p, dim=-1), rtol=1e-9)
+    assert torch.equal(ranks, scene.extras["dimensions"]) and set(ranks.tolist()) == {1, 2, 3}
+    with pytest.raises(ValueError, match="must be 1 or more, got 0, 3, 2"):
+        scenes.dynamic(0)
+
+
+def test_wrong_shapes_are_named():
+    invariant = dyn.DynamicTensor(2, 4, 2)
+    with pytest.raises(ValueError, match=r"has 3 maps \(\*batch, 3, 3\), got \[\(3, 3\)\]"):
+        invariant.compose(torch.eye(3))
+    with pytest.raises(ValueError, match=r"must be \(\*batch, 9, 3, 3, 3, 3\), got \(3, 3, 3\)"):
+        invariant.decompose(torch.zeros(3, 3, 3))
+    with pytest.raises(ValueError, match="expected 4 views and one of their numbers, got 1 views and view=1"):
+        invariant.flats(torch.zeros(9, 3, 3, 3, 3), torch.zeros(1, 2))
