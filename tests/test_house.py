@@ -13,7 +13,6 @@ PACKAGES = ("dyntorch", "indexing", "experiments")
 LONGEST = 600
 LONGER = {
     "dyntorch/geometry/pairs.py": 670,
-    "dyntorch/numerics/nullspace.py": 740,
     "dyntorch/tasks/pair/affine.py": 680,
     "dyntorch/tasks/planes/closed_forms.py": 650,
 }

@@ -136,7 +136,7 @@ def map_blocks(function: Callable[..., Record], *data: Any, size: int) -> Record
         >>> map_blocks(lambda views, weights: (views[0] + views[1], weights), (torch.ones(3), torch.arange(3)), None, size=2)
         (tensor([1., 2., 3.]), None)
     """
-    tensors = tuple(_tensors(data))
+    tensors = tuple(tensors_of(data))
     lengths = {tensor.shape[0] if tensor.ndim else None for tensor in tensors}
     if len(lengths) != 1 or None in lengths:
         raise ValueError(f"map_blocks needs tensors of the same leading dimension, got {[tuple(t.shape) for t in tensors]}")
@@ -148,7 +148,7 @@ def map_blocks(function: Callable[..., Record], *data: Any, size: int) -> Record
             return function(*data)
     if len(tensors[0]) <= size and torch.get_num_threads() == 1:
         return function(*data)
-    blocks = [_rebuilt(data, iter(block)) for block in zip(*(tensor.split(size) for tensor in tensors), strict=True)]
+    blocks = [rebuilt(data, iter(block)) for block in zip(*(tensor.split(size) for tensor in tensors), strict=True)]
     if threads == 1:
         return _concatenate([function(*block) for block in blocks])
     grad, inference = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
@@ -169,7 +169,7 @@ def each(function: Callable[[Tensor], Tensor], record: Record) -> Record:
         >>> each(lambda x: x[1:], (torch.arange(3), (torch.ones(2), None)))
         (tensor([1, 2]), (tensor([1.]), None))
     """
-    return _rebuilt(record, map(function, _tensors(record)))
+    return rebuilt(record, map(function, tensors_of(record)))
 
 
 def put(record: Record, at: Tensor, new: Record) -> Record:
@@ -180,8 +180,8 @@ def put(record: Record, at: Tensor, new: Record) -> Record:
         >>> put((torch.zeros(3), None), torch.tensor([2]), (torch.ones(1), None))
         (tensor([0., 0., 1.]), None)
     """
-    pairs = zip(_tensors(record), _tensors(new), strict=True)
-    return _rebuilt(record, (old.index_put((at,), part) for old, part in pairs))
+    pairs = zip(tensors_of(record), tensors_of(new), strict=True)
+    return rebuilt(record, (old.index_put((at,), part) for old, part in pairs))
 
 
 def select(mask: Tensor, new: Tensor, old: Tensor | float) -> Tensor:
@@ -196,27 +196,27 @@ def select(mask: Tensor, new: Tensor, old: Tensor | float) -> Tensor:
 
 
 def _concatenate(results: list[Record]) -> Record:
-    columns = zip(*(tuple(_tensors(result)) for result in results), strict=True)
-    return _rebuilt(results[0], iter([torch.cat(column) for column in columns]))
+    columns = zip(*(tuple(tensors_of(result)) for result in results), strict=True)
+    return rebuilt(results[0], iter([torch.cat(column) for column in columns]))
 
 
-def _tensors(record: Any) -> Iterator[Tensor]:
+def tensors_of(record: Any) -> Iterator[Tensor]:
     """The tensors of a record, in the order of its fields."""
     if isinstance(record, Tensor):
         yield record
     else:
         for part in _parts(record) or ():
-            yield from _tensors(part)
+            yield from tensors_of(part)
 
 
-def _rebuilt(record: Record, tensors: Iterator[Tensor]) -> Record:
-    """The same record of other tensors, in the order of :func:`_tensors`."""
+def rebuilt(record: Record, tensors: Iterator[Tensor]) -> Record:
+    """The same record of other tensors, in the order of :func:`tensors_of`."""
     if isinstance(record, Tensor):
         return next(tensors)  # type: ignore[return-value]
     parts = _parts(record)
     if parts is None:
         return record
-    made, kind = [_rebuilt(part, tensors) for part in parts], type(record)
+    made, kind = [rebuilt(part, tensors) for part in parts], type(record)
     return kind(made) if kind is tuple else kind(*made)  # type: ignore[call-arg]
 
 

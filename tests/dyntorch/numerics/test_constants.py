@@ -18,9 +18,8 @@ from dyntorch.geometry import homogeneous as monomials
 from dyntorch.geometry import pairs as epipole_pairs
 from dyntorch.invariants import dynamic_shape_tensor as dynamic_shape_rows
 from dyntorch.invariants import shape_tensor as shape_residual
-from dyntorch.numerics import lags
+from dyntorch.numerics import eigenspaces, lags
 from dyntorch.numerics import lags as covariances
-from dyntorch.numerics import nullspace as eigenspace
 from dyntorch.numerics.blocks import constant
 from dyntorch.shapes import static as shape_completion
 from dyntorch.shapes import static as shape_points
@@ -48,7 +47,7 @@ TABLES = [
     (plane._moving_minors, (3, 2, CPU)),
     (base.triangle, (4, CPU)),
     (matrix._unpacking, ((3, 3), CPU)),
-    (eigenspace._generic, (5, 2, CPU)),
+    (eigenspaces._generic, (5, 2, CPU)),
     (epipolar.polar, (torch.float64, CPU)),
     (epipolar._places, (CPU,)),
     (epipolar_descent._tables, (torch.float64, CPU)),

@@ -4,8 +4,7 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from dyntorch.numerics import nullspace
-from dyntorch.numerics import nullspace as eigenspace
+from dyntorch.numerics import eigenspaces, null_space_gradient, nullspace
 from dyntorch.numerics.nullspace import gram_null_space, null_space
 
 aten = torch.ops.aten
@@ -50,7 +49,7 @@ def gradient_holds(function, *inputs):
 @pytest.fixture
 def accelerator(monkeypatch):
     """The code takes the branches of an accelerator, and reading a value on the host raises."""
-    for module in (eigenspace, nullspace):
+    for module in (eigenspaces, null_space_gradient, nullspace):
         monkeypatch.setattr(module, "on_host", lambda tensor: False)
     forbidden = {aten._local_scalar_dense.default, aten.nonzero.default, aten.is_nonzero.default, aten.equal.default}
     forbidden |= {aten._linalg_eigh.default, aten._linalg_svd.default, aten._linalg_check_errors.default}
@@ -111,7 +110,7 @@ def test_rows_lose_no_more_than_the_svd(kappa, limit):
 
 
 def test_start_vectors_that_miss_the_null_vector_are_noticed():
-    start = eigenspace._generic(12, 2, torch.device("cpu"))
+    start = eigenspaces._generic(12, 2, torch.device("cpu"))
     missed = rotation(12, 12, seed=5)
     missed[:, 0] = torch.linalg.qr(torch.cat([start, missed], -1)).Q[:, 2]  # orthogonal to every start vector
     v = torch.linalg.qr(missed).Q
@@ -265,7 +264,7 @@ def test_the_whole_space_is_a_null_space():
 
 
 def test_inference_mode_before_anything_else():
-    eigenspace._generic.cache_clear()
+    eigenspaces._generic.cache_clear()
     matrix = random(10, 30, 9)
     with torch.inference_mode():
         null_space(matrix)
@@ -290,7 +289,7 @@ def test_blocks_of_unequal_size_give_the_same(monkeypatch, rows):
     whole, parts = matrix.clone().requires_grad_(), matrix.clone().requires_grad_()
     expected = null_space(whole)
     expected.sum().backward()
-    monkeypatch.setattr(nullspace, "GRAM_BLOCK", 16 * 8 * 27 * 27)
+    monkeypatch.setattr(eigenspaces, "GRAM_BLOCK", 16 * 8 * 27 * 27)
     found = null_space(parts)
     found.sum().backward()
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-10)
