@@ -43,6 +43,7 @@ _HOME = {
     "ConvergentMotionMatrix": "dyntorch.invariants.convergent_motion_matrix",
     "GrassmannTensor": "dyntorch.invariants.grassmann_tensor",
     "ShapeTensor": "dyntorch.invariants.shape_tensor",
+    "LiftedShapeTensor": "dyntorch.invariants.lifted_shape_tensor",
     "DynamicShapeTensor": "dyntorch.invariants.dynamic_shape_tensor",
     "Invariant": "dyntorch.core.invariant",
     # from matches to the tensor and its motion

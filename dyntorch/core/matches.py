@@ -149,16 +149,16 @@ def check_views(invariant: Invariant, views: Sequence[Tensor]) -> None:
     _check_measured(invariant, invariant.primitives, views, "view")
 
 
-def constellations(invariant: Invariant, points: Sequence[Tensor]) -> Tensor:
-    """Points p1, p2, ... ``(*batch, views, 2)``, each seen in the same views, as one measurement per view.
+def constellations(invariant: Invariant, points: Sequence[Tensor], dim: int = 2) -> Tensor:
+    """Points p1, p2, ... ``(*batch, views, dim)``, each seen in the same views, as one measurement per view.
 
     Returns:
-        ``(*batch, views, points, 3)``: (x, y, 1), and (0, 0, 0) where a point is missing (NaN or infinite).
+        ``(*batch, views, points, dim + 1)``: (x, y, 1), and (0, 0, 0) where a point is missing (NaN or infinite).
 
     Raises:
         ValueError: shapes that do not agree, mixed dtypes or devices.
     """
-    _check_measured(invariant, (Point(2),) * len(points), points, "point")
+    _check_measured(invariant, (Point(dim),) * len(points), points, "point")
     x = torch.stack(list(points), dim=-2)
     seen = x.isfinite().all(-1, keepdim=True)
     return torch.cat([torch.where(seen, x, 0.0), seen.to(x)], dim=-1)

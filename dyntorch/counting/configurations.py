@@ -12,6 +12,7 @@ import numpy as np
 
 from dyntorch.counting.exact import Configuration, Field, IntArray, Measure, Step, Views
 from dyntorch.counting.lifted import MOTIONS
+from dyntorch.counting.shapes import dynamic_shape, lifted_shape
 
 
 def homography(
@@ -197,7 +198,7 @@ def by_numbers(
 
 _NAMED: tuple[Configuration, ...] = (
     homography, dual_homography, join, minimal_join, constant_velocity, constant_velocity_3x4x4, lines, fundamental, segmentation,
-    trifocal, quadrifocal, shape_tensor, *MOTIONS,
+    trifocal, quadrifocal, shape_tensor, lifted_shape, dynamic_shape, *MOTIONS,
 )  # fmt: skip
 CONFIGURATIONS: dict[str, Configuration] = {function.__name__: function for function in _NAMED}
 

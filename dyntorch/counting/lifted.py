@@ -21,7 +21,7 @@ CAMERAS = {
 }
 PATIENCE = 4
 """Points in a row that add nothing before no more are drawn; one of each body tells."""
-SETTINGS = ("profile", "times", "camera", "points")
+SETTINGS = ("profile", "times", "camera", "points", "space", "image", "degree")
 """Options that are no matches."""
 
 

@@ -61,12 +61,12 @@ def canonical(x: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def local(x: Tensor) -> tuple[Tensor, Tensor]:
-    """Points ``(..., n, 3)`` of each view about the mean of those that are seen, at unit RMS distance; missing ones 0.
+    """Points ``(..., n, l + 1)`` of each view about the mean of those that are seen, at unit RMS distance; missing ones 0.
 
     Returns:
         the points, and by what they were multiplied, ``(...)``.
     """
-    xy, seen = x[..., :2], x[..., 2:]
+    xy, seen = x[..., :-1], x[..., -1:]
     count = seen.sum(-2, keepdim=True).clamp(min=1.0)
     centred = (xy - (xy * seen).sum(-2, keepdim=True) / count) * seen
     square = centred.square().sum((-2, -1), keepdim=True) / count
@@ -75,11 +75,16 @@ def local(x: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def lines_through(q: Tensor) -> Tensor:
-    """Two orthonormal lines through each point ``(..., 3)`` of norm 1, ``(..., 2, 3)``; 0 through a zero one."""
-    # two rows of the reflection that takes the point to the third axis
-    shifted = torch.cat([q[..., :2], q[..., 2:] + torch.where(q[..., 2:] < 0, -1.0, 1.0)], dim=-1)
+    """Two orthonormal lines through each point ``(..., 3)`` of norm 1, ``(..., 2, 3)``; 0 through a zero one.
+
+    In other dimensions l hyperplanes through points ``(..., l + 1)``, ``(..., l, l + 1)``.
+    """
+    # all rows but the last of the reflection that takes the point to the last axis
+    size = q.shape[-1] - 1
+    shifted = torch.cat([q[..., :-1], q[..., -1:] + torch.where(q[..., -1:] < 0, -1.0, 1.0)], dim=-1)
     scale = 2.0 / shifted.square().sum(-1).clamp(min=1e-300)
-    rows = torch.eye(2, 3, dtype=q.dtype, device=q.device) - scale[..., None, None] * q[..., :2, None] * shifted[..., None, :]
+    eye = torch.eye(size, size + 1, dtype=q.dtype, device=q.device)
+    rows = eye - scale[..., None, None] * q[..., :-1, None] * shifted[..., None, :]
     return rows * (q != 0).any(-1)[..., None, None]
 
 
@@ -123,8 +128,8 @@ def plane_rows(x: Tensor) -> Tensor:
 
 
 def affine_rows(x: Tensor) -> Tensor:
-    """The two centred coordinates of all points of each view, in the coordinates of :func:`centred`: ``(..., 2, n - 1)``."""
-    xy = x[..., :2] - x[..., :2].mean(-2, keepdim=True)
+    """The centred coordinates of all points of each view, in the coordinates of :func:`centred`: ``(..., 2, n - 1)``."""
+    xy = x[..., :-1] - x[..., :-1].mean(-2, keepdim=True)
     square = xy.square().mean((-2, -1), keepdim=True)
     xy = xy * torch.where(square > 0, square, 1.0).rsqrt()
     return xy.mT @ centred(x.shape[-2], x.device).mT
@@ -200,37 +205,39 @@ def standard(points: Tensor, frame: str) -> Tensor:
     - ``affine``: last coordinate 1.
 
     Args:
-        points: ``(*batch, n, 4)`` homogeneous, of any scale.
+        points: ``(*batch, n, 4)`` homogeneous, of any scale; ``(*batch, n, k + 1)`` of P^k, with k + 1 in the place of 4.
         frame: one of the three.
 
     Returns:
-        ``(*batch, n, 4)``; not finite where the basis points have no frame.
+        the same shape; not finite where the basis points have no frame.
     """
+    k = points.shape[-1] - 1
     if frame == AFFINE:
-        return points / points[..., 3:]
-    corners = points[..., :4, :]
+        return points / points[..., k:]
+    corners = points[..., : k + 1, :]
     if frame == PLANE:
-        normal = meet(*corners[..., :3, :].unbind(-2))
-        corners = torch.cat([corners[..., :3, :], unit_vectors(normal)[..., None, :]], dim=-2)
-    others = points[..., 3:, :] @ inverse(corners)
+        normal = meet(*corners[..., :k, :].unbind(-2))
+        corners = torch.cat([corners[..., :k, :], unit_vectors(normal)[..., None, :]], dim=-2)
+    others = points[..., k:, :] @ inverse(corners)
     volume = torch.linalg.det(unit_vectors(corners))[..., None, None]
     others = torch.where(volume.abs() > THIN, others, torch.nan)
     if frame == PLANE:
-        others = others / torch.cat([others[..., :1, :3], torch.ones_like(others[..., :1, 3:])], dim=-1)
+        others = others / torch.cat([others[..., :1, :k], torch.ones_like(others[..., :1, k:])], dim=-1)
     return with_basis(others[..., 1:, :], frame)
 
 
 def with_basis(others: Tensor, frame: str) -> Tensor:
-    """The points ``(*batch, n - 4, 4)`` behind the four of the basis: ``(*batch, n, 4)``."""
-    basis = _basis(frame, others.device).to(others.dtype)
-    return torch.cat([basis.expand(*others.shape[:-2], 4, 4), others], dim=-2)
+    """The points ``(*batch, n - 4, 4)`` behind the four of the basis: ``(*batch, n, 4)``; k + 1 in the place of 4 in P^k."""
+    size = others.shape[-1]
+    basis = _basis(frame, size, others.device).to(others.dtype)
+    return torch.cat([basis.expand(*others.shape[:-2], size, size), others], dim=-2)
 
 
 @constant
-def _basis(frame: str, device: torch.device) -> Tensor:
-    basis = torch.eye(4, dtype=torch.float64)
+def _basis(frame: str, size: int, device: torch.device) -> Tensor:
+    basis = torch.eye(size, dtype=torch.float64)
     if frame == PLANE:
-        basis[3] = torch.tensor([1.0, 1.0, 1.0, 0.0])
+        basis[-1] = 1 - basis[-1]
     return basis.to(device)
 
 
@@ -287,13 +294,13 @@ def plane_inverse(points: int, device: torch.device) -> Tensor:
     return torch.linalg.pinv(plane_map(points, device))
 
 
-def affine_points(annihilator: Tensor) -> Tensor:
-    """Points ``(*batch, n, 4)``, orthonormal coordinates of RMS 1, of the annihilator ``(*batch, n - 4, n)`` of their shape."""
+def affine_points(annihilator: Tensor, k: int = 3) -> Tensor:
+    """Points ``(*batch, n, k + 1)``, orthonormal coordinates of RMS 1, of the annihilator ``(*batch, n - k - 1, n)``."""
     n = annihilator.shape[-1]
     zero = annihilator.flatten(-2).abs().amax(-1)[..., None, None] == 0
     rows = torch.cat([annihilator, torch.ones_like(annihilator[..., :1, :])], dim=-2)
     eye = torch.eye(*rows.shape[-2:], dtype=rows.dtype, device=rows.device)
-    found = null_space(torch.where(zero, eye, rows), 3).mT * n**0.5
+    found = null_space(torch.where(zero, eye, rows), k).mT * n**0.5
     points = torch.cat([found, torch.ones_like(found[..., :1])], dim=-1)
     return torch.where(zero, 0.0, points)
 

@@ -46,11 +46,19 @@ class Matches:
     coplanar: Number = None
     """of fundamental, trifocal and quadrifocal: static points of one plane"""
     images: Number = None
-    """of shape_tensor"""
+    """of shape_tensor, lifted_shape and dynamic_shape"""
     synthetic: tyro.conf.FlagCreatePairsOff[bool] = False
-    """of shape_tensor: use the constraints that hold without any image"""
+    """of the same: use the constraints that hold without any image"""
     points: Number = None
-    """of shape_tensor: 6, 7 or 8 (without it 8) in each image"""
+    """of shape_tensor: 6, 7 or 8 (without it 8) in each image; of lifted_shape (without it 8)"""
+    space: Number = None
+    """of lifted_shape: k of the projections P^k -> P^l (without it 4)"""
+    image: Number = None
+    """of lifted_shape: l of the projections P^k -> P^l (without it 2)"""
+    degree: Number = None
+    """of dynamic_shape: of the positions in the time (without it 1, constant velocity)"""
+    coplanar_base: tyro.conf.FlagCreatePairsOff[bool] = False
+    """of dynamic_shape: four of the six points stand still in a plane"""
     general: tyro.conf.FlagCreatePairsOff[bool] = False
     """of shape_tensor: points in general position, in place of four in a plane"""
 

@@ -108,6 +108,12 @@ def still_shape(frame: str) -> tuple[Tensor, ...]:
     return (x + 1e-4 * randn(*x.shape, seed=2)).unbind(-2)
 
 
+def lifted_shape() -> tuple[Tensor, ...]:
+    """Eight points of P^4, ``(14, 2)`` each: what as many projections to the plane see of them."""
+    x = inhomogeneous(randn(8, 5) @ randn(14, 5, 3, seed=1))
+    return (x + 1e-4 * randn(*x.shape, seed=2)).unbind(-2)
+
+
 def timed_shape() -> tuple[Tensor, ...]:
     """Twelve times, and eight points ``(12, 2)`` at constant velocity."""
     x = moving_shapes()[0]
@@ -154,9 +160,9 @@ def shift(offset: float) -> dyn.Shift:
 
 
 # ---- calls that take several steps -------------------------------------------------------------------------------------
-def shape_tensor(frame: str, points: tuple[Tensor, ...]) -> tuple[Any, ...]:
+def shape_tensor(tensor: dyn.Invariant, points: tuple[Tensor, ...]) -> tuple[Any, ...]:
     """A shape tensor from fit to use."""
-    found = dyn.refine(dyn.fit(dyn.ShapeTensor(frame), *points), *points)
+    found = dyn.refine(dyn.fit(tensor, *points), *points)
     family = found.invariant
     return found, family.score(found.tensor, *points), dyn.sampson(family, found.tensor, *points)
 
@@ -384,11 +390,18 @@ VERBS: tuple[Verb, ...] = (
         Verb(
             f"ShapeTensor {frame}",
             lambda frame=frame: still_shape(frame),
-            lambda *p, frame=frame: shape_tensor(frame, p),
+            lambda *p, frame=frame: shape_tensor(dyn.ShapeTensor(frame), p),
             compare=without_frame,
             tolerance=1e-4,  # of distances and of times: descents stop where the cost does, at the root of its digits
         )
         for frame in ("general", "plane", "affine")
+    ),
+    Verb(
+        "LiftedShapeTensor",
+        lifted_shape,
+        lambda *p: shape_tensor(dyn.LiftedShapeTensor(4), p),
+        compare=without_frame,
+        tolerance=1e-4,
     ),
     *(
         Verb(
@@ -420,6 +433,7 @@ WAITS = {
     "bundle_adjust": (50, STEPS),
     "fit_shapes": (60, STEPS),
     "ShapeTensor": (40, f"{FITS}; {STEPS}"),
+    "LiftedShapeTensor": (60, f"{FITS}; {STEPS}"),
     "DynamicShapeTensor": (60, f"{FITS}; {STEPS}"),
     "velocity_factorization": (8, ASKED),
     "affine_factorization": (1, ASKED),

@@ -14,7 +14,7 @@ import dyntorch as dyn
 class ShapeCase:
     """One form and its counts, by the theory."""
 
-    invariant: dyn.ShapeTensor | dyn.DynamicShapeTensor
+    invariant: dyn.ShapeTensor | dyn.DynamicShapeTensor | dyn.LiftedShapeTensor
     minimal: int
     """Fewest views."""
     width: int
@@ -33,6 +33,11 @@ class ShapeCase:
     def timed(self) -> bool:
         """Whether the points move; the times of the views then stand behind the points, ``(*batch, views, 1)``."""
         return isinstance(self.invariant, dyn.DynamicShapeTensor)
+
+    @property
+    def dims(self) -> tuple[int, int]:
+        """Of the space and of the views."""
+        return (self.invariant.k, self.invariant.l) if isinstance(self.invariant, dyn.LiftedShapeTensor) else (3, 2)
 
     @property
     def n(self) -> int:
@@ -70,17 +75,17 @@ class ShapeCase:
         self, views: int, *, batch: tuple[int, ...] = (), seed: int = 0, sigma: float = 0.0
     ) -> tuple[tuple[Tensor, ...], Tensor]:
         """Images ``(*batch, views, 2)`` of every point, in pixels (and times), and the points of space ``(*batch, n, 3)``."""
-        g = torch.Generator().manual_seed(seed)
-        shape = spread(self.n, batch, g)
+        g, (k, d) = torch.Generator().manual_seed(seed), self.dims
+        shape = spread(self.n, batch, g, k)
         if self.timed:
             return self._moving(shape, views, sigma, g)
         if self.frame == "plane":
-            corners = shape[..., :3, :]
-            shape[..., 3, :] = corners[..., 0, :] + corners[..., 1, :] - corners[..., 2, :]
-        turn = torch.linalg.qr(torch.randn(*batch, views, 3, 3, generator=g, dtype=torch.float64)).Q
+            corners = shape[..., :k, :]
+            shape[..., k, :] = corners[..., :-1, :].sum(-2) - (k - 2) * corners[..., -1, :]
+        turn = torch.linalg.qr(torch.randn(*batch, views, k, k, generator=g, dtype=torch.float64)).Q
         seen = shape[..., None, :, :] @ turn.mT
-        depth = 1.0 if self.frame == "affine" else 6.0 + seen[..., 2:]
-        x = 300 + 800 * seen[..., :2] / depth
+        depth = 1.0 if self.frame == "affine" else 6.0 + seen[..., d : d + 1]
+        x = 300 + 800 * seen[..., :d] / depth
         x = x + sigma * torch.randn(x.shape, generator=g, dtype=torch.float64)
         return x.unbind(-2), shape
 
@@ -102,16 +107,20 @@ class ShapeCase:
         """The same after a change of coordinates of every view, its own: a similarity, or what the cameras leave open."""
         g = torch.Generator().manual_seed(seed)
         x = torch.stack(points[: self.n], dim=-2)
-        frame = torch.eye(3, dtype=torch.float64) + 0.25 * torch.randn(*x.shape[:-2], 3, 3, generator=g, dtype=torch.float64)
-        frame[..., 2, :] = torch.tensor([0.0, 0.0, 1.0])
-        if similar:
+        d = self.dims[1]
+        frame = torch.eye(d + 1).double() + 0.25 * torch.randn(*x.shape[:-2], d + 1, d + 1, generator=g, dtype=torch.float64)
+        frame[..., d, :] = torch.eye(d + 1, dtype=torch.float64)[d]
+        if similar and d == 2:
             angle, size = torch.rand(2, *x.shape[:-2], generator=g, dtype=torch.float64)
             cosine, sine = (0.2 + size) * (6 * angle).cos(), (0.2 + size) * (6 * angle).sin()
             frame[..., :2, :2] = torch.stack([cosine, -sine, sine, cosine], dim=-1).unflatten(-1, (2, 2))
+        elif similar:
+            size = 0.2 + torch.rand(*x.shape[:-2], 1, 1, generator=g, dtype=torch.float64)
+            frame[..., :d, :d] = size * torch.linalg.qr(frame[..., :d, :d]).Q
         elif self.frame != "affine":
-            frame[..., 2, :2] = 1e-4 * torch.randn(*x.shape[:-2], 2, generator=g, dtype=torch.float64)
+            frame[..., d, :d] = 1e-4 * torch.randn(*x.shape[:-2], d, generator=g, dtype=torch.float64)
         moved = torch.nn.functional.pad(x, (0, 1), value=1.0) @ frame.mT
-        return (*(moved[..., :2] / moved[..., 2:]).unbind(-2), *points[self.n :])
+        return (*(moved[..., :d] / moved[..., d:]).unbind(-2), *points[self.n :])
 
     def apart(self, first: Tensor, second: Tensor) -> float:
         """How far two tensors are apart, up to sign or basis."""
@@ -126,11 +135,14 @@ class ShapeCase:
 
     def __repr__(self) -> str:
         form = f"{self.invariant.form}-{type(self.invariant.trajectory).__name__}-" if self.timed else self.frame
-        return f"{form}{self.n}"
+        lifted = f"P{self.dims[0]}-P{self.dims[1]}-" if isinstance(self.invariant, dyn.LiftedShapeTensor) else ""
+        return f"{lifted}{form}{self.n}"
 
 
-def spread(n: int, batch: tuple[int, ...], generator: torch.Generator) -> Tensor:
-    """Points ``(*batch, n, 3)`` in general position: corners of a cube in turn, moved about."""
+def spread(n: int, batch: tuple[int, ...], generator: torch.Generator, k: int = 3) -> Tensor:
+    """Points ``(*batch, n, k)`` in general position: corners of a cube in turn, moved about."""
+    if k != 3:
+        return 1.3 * torch.randn(*batch, n, k, generator=generator, dtype=torch.float64).clamp(-2, 2)
     corners = torch.tensor([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1], [-1, -1, -1], [-1, 1, 1], [1, -1, 1], [1, 1, -1]])
     places = corners.double().repeat(-(-n // 8), 1)[:n]
     return places + 0.35 * torch.randn(*batch, n, 3, generator=generator, dtype=torch.float64)
@@ -151,3 +163,14 @@ SHAPE_CASES = [
     ShapeCase(dyn.DynamicShapeTensor(points=8), 7, 52, 33, 8, exact=1e-5),
     ShapeCase(dyn.DynamicShapeTensor(dyn.Fourier(1), points=7), 12, 70, 45, 6, exact=1e-5),
 ]
+
+LIFTED_CASES = [
+    ShapeCase(dyn.LiftedShapeTensor(4, points=8), 10, 21, 8, 2),
+    ShapeCase(dyn.LiftedShapeTensor(4, points=9), 6, 47, 12, 4),
+    ShapeCase(dyn.LiftedShapeTensor(4, 3, points=8), 2, 29, 8, 5),
+    ShapeCase(dyn.LiftedShapeTensor(2, 1, points=6), 4, 5, 4, 1),
+    ShapeCase(dyn.LiftedShapeTensor(3, points=7), 3, 11, 6, 3),
+    ShapeCase(dyn.LiftedShapeTensor(4, 3, "plane", 9), 2, 12, 11, 8),
+    ShapeCase(dyn.LiftedShapeTensor(6, 2, "affine", 10), 3, 9, 18, 6),
+]
+"""Any projections P^k -> P^l."""

@@ -175,6 +175,10 @@ def ranks(counted: Count):
         ("segmentation", {}, 35, 36, 35),
         ("segmentation", {"first": 28, "second": 7}, 34, 36, 34),
         ("shape_tensor", {}, 80, 81, 6),
+        ("lifted_shape", {"synthetic": True}, 29, 30, 10),
+        ("dynamic_shape", {"synthetic": True}, 59, 60, 49),
+        ("dynamic_shape", {"coplanar_base": True}, 8, 9, 8),
+        ("dynamic_shape", {"degree": 2, "coplanar_base": True}, 14, 15, 14),
     ],
 )
 def test_rank_of_named_configurations(name, options, rank, width, minimal):

@@ -1,18 +1,21 @@
 """Static and dynamic shape tensors: the properties that every invariant has, for all their forms; a match is a view."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 import dyntorch as dyn
 from dyntorch.invariants.shape_tensor import ShapeTensor
 from tests.battery.references import rank
-from tests.battery.shape_cases import SHAPE_CASES
+from tests.battery.shape_cases import LIFTED_CASES, SHAPE_CASES
 
+EVERY = [*SHAPE_CASES, *LIFTED_CASES]
 STATIC = [case for case in SHAPE_CASES if not case.timed]
-every = pytest.mark.parametrize("case", SHAPE_CASES, ids=repr)
-most = pytest.mark.parametrize("case", [SHAPE_CASES[i] for i in (1, 2, 5, 6, 8, 9, 10, 11)], ids=repr)
-forms = pytest.mark.parametrize("case", STATIC, ids=repr)
-some = pytest.mark.parametrize("case", [STATIC[i] for i in (2, 6, 8)], ids=repr)
+every = pytest.mark.parametrize("case", EVERY, ids=repr)
+most = pytest.mark.parametrize("case", [EVERY[i] for i in (1, 2, 5, 6, 8, 9, 10, 11, 13, 15, 18, 19)], ids=repr)
+forms = pytest.mark.parametrize("case", [*STATIC, *LIFTED_CASES], ids=repr)
+some = pytest.mark.parametrize("case", [*(STATIC[i] for i in (2, 6, 8)), *(LIFTED_CASES[i] for i in (1, 2, 6))], ids=repr)
 MANY = 8
 
 
@@ -69,14 +72,15 @@ def test_structure_of_a_composed_tensor_gives_it_back(case):
     shape = case.scene(1, batch=(2, 3), seed=4)[1]
     tensor = case.invariant.compose(shape)
     points = case.invariant.decompose(-0.3 * tensor)
-    assert points.shape == (2, 3, case.n, 4)
+    size = case.dims[0] + 1
+    assert points.shape == (2, 3, case.n, size)
     assert case.apart(case.invariant.compose(points), tensor) < 1e-8
     homogeneous = torch.nn.functional.pad(shape, (0, 1), value=1.0)
     scaled = homogeneous * torch.linspace(0.5, 2, case.n).double()[:, None].mul(torch.tensor(-1.0)) ** 3
     assert case.apart(case.invariant.compose(scaled), tensor) < 1e-10
     # a collineation of space (affinity) is what is left open
-    moved = homogeneous @ (torch.eye(4) + 0.1 * torch.randn(4, 4, generator=torch.Generator().manual_seed(0))).double()
-    moved = moved if case.frame != "affine" else torch.cat([moved[..., :3], homogeneous[..., 3:]], -1)
+    moved = homogeneous @ (torch.eye(size) + 0.1 * torch.randn(size, size, generator=torch.Generator().manual_seed(0))).double()
+    moved = moved if case.frame != "affine" else torch.cat([moved[..., :-1], homogeneous[..., -1:]], -1)
     assert case.apart(case.invariant.compose(moved), tensor) < 1e-10
     assert case.invariant.decompose(torch.zeros_like(tensor)).abs().max() == 0
 
@@ -156,26 +160,26 @@ def test_gradients(case):
 def test_sampson_is_the_distance_to_the_nearest_image(case):
     points, shape = case.scene(4, batch=(2,), seed=9, sigma=0.3)
     tensor = case.invariant.compose(shape)
-    found = dyn.sampson(ShapeTensor(case.frame), tensor, *points)
+    found = dyn.sampson(replace(case.invariant, points=None), tensor, *points)
     exact, _ = case.scene(4, batch=(2,), seed=9)
     assert dyn.sampson(case.invariant, tensor, *exact).max() < 1e-6
     assert case.invariant.score(tensor, *exact).max() < 1e-9
     assert (case.invariant.score(tensor, *points) > 1e-6).all()
     # brute force: Gauss-Newton over all entries of the camera
     x, world = torch.stack(points, -2)[1, 2], torch.nn.functional.pad(shape[1], (0, 1), value=1.0)
-    rows = 2 if case.frame == "affine" else 3
+    k, d = case.dims
+    rows = d if case.frame == "affine" else d + 1
     truth = torch.stack(exact, -2)[1, 2]
 
     def error(camera):
-        image = world @ camera.reshape(rows, 4).T
-        return ((image if rows == 2 else image[:, :2] / image[:, 2:]) - x).flatten()
+        image = world @ camera.reshape(rows, k + 1).T
+        return ((image if rows == d else image[:, :d] / image[:, d:]) - x).flatten()
 
     lifted = torch.nn.functional.pad(truth, (0, 1), value=1.0)
-    blocks = torch.stack(
-        [torch.kron(torch.linalg.cross(torch.eye(3).double(), p.expand(3, 3)), q[None]) for p, q in zip(lifted, world, strict=True)]
-    )
-    camera = torch.linalg.svd(blocks.reshape(-1, 12)).Vh[-1]
-    camera = (camera.reshape(3, 4) / camera[11])[:rows].flatten()
+    across = [torch.linalg.svd(p[None], full_matrices=True).Vh[1:] for p in lifted]
+    blocks = torch.cat([torch.kron(a.contiguous(), q[None]) for a, q in zip(across, world, strict=True)])
+    camera = torch.linalg.svd(blocks).Vh[-1]
+    camera = (camera.reshape(d + 1, k + 1) / camera[-1])[:rows].flatten()
     for _ in range(6):
         camera = camera - torch.linalg.pinv(torch.func.jacrev(error)(camera), rtol=1e-10) @ error(camera)
     torch.testing.assert_close(found[1, 2], error(camera).norm(), rtol=2e-2, atol=0)

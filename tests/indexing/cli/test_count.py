@@ -95,6 +95,13 @@ def test_shape_tensors(run, words, expected):
     assert (code, err) == (0, "") and expected in out
 
 
+def test_lifted_and_moving_shapes(run):
+    assert "rank 20 of 30, nullity 10, from 10 matches" in run("lifted-shape")[1]
+    assert "rank 119 of 120, nullity 1, from 4 matches\nenough" in run("lifted_shape", "--points", "10", "--synthetic")[1]
+    assert "rank 49 of 60, nullity 11, from 49 matches" in run("dynamic_shape")[1]
+    assert "rank 8 of 9, nullity 1, from 8 matches" in run("dynamic_shape", "--coplanar-base")[1]
+
+
 def test_dimension(run):
     assert run("--dim-v", "3", "3", "2") == (0, "dim V(3, 3, 2) = 26\n", "")
     assert json.loads(run("--dim-v", "3", "4", "2", "--json")[1]) == {"n": 3, "m": 4, "k": 2, "dim_v": 72}
@@ -109,7 +116,7 @@ def test_table_of_all(run):
     assert rows["constant_velocity_planes_3d"] == ["81", "80", "1", "20", "moving"]
     assert max(map(len, out.splitlines())) <= 132
     listed = json.loads(run("--json")[1])
-    assert {entry["name"] for entry in listed} <= rows.keys() and len(listed) == 23
+    assert {entry["name"] for entry in listed} <= rows.keys() and len(listed) == 25
 
 
 def test_json_has_the_profile(run):

@@ -1,0 +1,345 @@
+"""Lifted shape tensors: what one image P^k -> P^l says about the shape of n points of P^k, whatever the projection."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from dyntorch.core.invariant import Frame, Invariant
+from dyntorch.core.matches import constellations
+from dyntorch.core.primitives import Equations
+from dyntorch.invariants.reprojected_shapes import CameraKind, looked_at, reprojection_derivative, reprojection_residual
+from dyntorch.numerics.least_squares import jacobian
+from dyntorch.numerics.nullspace import null_space
+from dyntorch.shapes import lifted, static
+from dyntorch.shapes.lifted import Profile
+from dyntorch.shapes.static import AFFINE, GENERAL, PLANE
+
+FRAMES = (GENERAL, PLANE, AFFINE)
+
+
+@dataclass(frozen=True, repr=False)
+class LiftedShapeTensor(Invariant):
+    r"""The shape of n points of :math:`P^k` from which projections :math:`P^k \to P^l` are eliminated; a match is one view.
+
+    What :class:`~dyntorch.GrassmannTensor` is for points seen by given projections this is for projections of given points: its
+    dual.  ``LiftedShapeTensor(3, 2)`` is :class:`~dyntorch.ShapeTensor`.  Points of constant velocity in space are static in
+    :math:`P^6`: ``LiftedShapeTensor(6)`` knows them at all times and before all cameras, times unknown, from 63 views of twelve
+    points (105 of eleven).  Points of constant velocity in a plane are degenerate for :math:`P^4`: their cameras are too special.
+    The arguments of :func:`dyntorch.fit` are the points, ``p1, ..., pn``, each ``(*batch, views, l)``.
+
+    - ``general``: any projections, n from :math:`\lceil (k + 1)(l + 1) / l \rceil` to 2 k + 2.  The first k + 1 points are the
+      basis, B their images.  With :math:`\alpha_j` hyperplanes :math:`S_j` through further point j, :math:`\sum \alpha_j = k + 1`
+      as even as can be,
+
+      .. math:: \det(S_1 B\,\mathrm{diag}(X_1); \dots; S_m B\,\mathrm{diag}(X_m))
+                = \sum_{(I_1, \dots, I_m)} \pm \prod_j \det (S_j B)_{I_j} \; T_{I_1 \dots I_m} = 0, \qquad
+                T_{I_1 \dots I_m} = \prod_j \prod_{i \in I_j} X_{ji},
+
+      over all ordered partitions of the basis.  Synthetic constraints, which every view of every shape fulfils, leave
+      :math:`\sum_\lambda K_{\lambda' \alpha} f^\lambda` of the coefficients, over diagrams of k + 1 boxes in up to l + 1 rows.
+    - ``plane``: k = l + 1, and the first l + 2 points lie in a hyperplane; n from l + 4 on.  The tensor is where the others are
+      beside it, v of sum 0, ``(n - l - 2, l + 1)``: with the frame of these l + 2 in every view :math:`p_j \times (v_j + c) = 0`.
+    - ``affine``: affine projections, n from k + 2 on; the tensor is the annihilator of all coordinates, ``(n - k - 1, n)``.
+
+    =========  ========================================================================================
+    k, l       n: unknowns, fewest views of the frame ``general``
+    =========  ========================================================================================
+    2, 1       6: 5, 4
+    3, 2       6: 5, 4;     7: 11, 3;    8: 23, 2
+    4, 2       8: 21, 10;   9: 47, 6;    10: 103, 4
+    5, 2       9: 42, 41;   10: 98, 25;  11: 225, 14;  12: 513, 10
+    6, 2       11: 210, 105;  12: 498, 63
+    6, 3       10: 140, 16; 11: 496, 8
+    =========  ========================================================================================
+
+    A missing point (NaN) makes its view missing in a fit; :func:`dyntorch.sampson` measures the points that there are.
+    The motion is the structure, homogeneous points ``(*batch, n, k + 1)``: the first k + 1 are the basis, the next one is
+    (1, ..., 1) (``general``); see :class:`~dyntorch.ShapeTensor` for the others.
+
+    Args:
+        k: dimension of the space of the points.
+        l: dimension of the views.
+        frame: ``"general"``, ``"plane"`` or ``"affine"``.
+        points: n; None takes it from the arguments.
+
+    Raises:
+        ValueError: dimensions or numbers of points for which there is no such tensor.
+
+    Source: thesis chapter 4 ("any kind of projection matrix") and section 9.2; Carlsson and Weinshall 1998; Hartley and
+    Schaffalitzky 2004, whose tensor is the dual; the widths by Schur and Weyl's duality.
+
+    Example:
+        >>> import torch, dyntorch as dyn
+        >>> draw = torch.Generator().manual_seed(0)
+        >>> Y = torch.randn(9, 5, generator=draw, dtype=torch.float64)
+        >>> seen = Y @ torch.randn(9, 5, 3, generator=draw, dtype=torch.float64)
+        >>> points = (seen[..., :2] / seen[..., 2:]).unbind(-2)
+        >>> solution = dyn.fit(dyn.LiftedShapeTensor(4), *(p[:6] for p in points)).check()
+        >>> solution
+        Solution(LiftedShapeTensor(4, points=9), matches=6, batch=(): 1 OK)
+        >>> bool(dyn.sampson(solution.invariant, solution.tensor, *(p[6:] for p in points)).max() < 1e-6)
+        True
+    """
+
+    k: int
+    l: int = 2  # noqa: E741 - its name in the literature
+    frame: str = GENERAL
+    points: int | None = None
+
+    intrinsic = True
+    motion = (Frame(None),)
+
+    def __post_init__(self) -> None:
+        if self.frame not in FRAMES:
+            raise ValueError(f"frame must be one of {', '.join(FRAMES)}, got {self.frame!r}")
+        if not 1 <= self.l < self.k:
+            raise ValueError(f"projections lower the dimension: l must be 1 to k - 1, got k = {self.k}, l = {self.l}")
+        if self.frame == PLANE and self.k != self.l + 1:
+            raise ValueError(
+                f"frame 'plane' takes k = l + 1, where a view fixes its camera up to one point, got k = {self.k}, l = {self.l}; "
+                "use 'general' or 'affine'"
+            )
+        if self.points is not None:
+            self._check_points(self.points)
+
+    @property
+    def least(self) -> int:
+        """Fewest points of which a view says anything."""
+        general = -(-(self.k + 1) * (self.l + 1) // self.l)
+        beside = max(2, -(-(self.l + 2) // self.l))
+        return {GENERAL: general, PLANE: self.l + 2 + beside, AFFINE: self.k + 2}[self.frame]
+
+    def _check_points(self, n: int) -> None:
+        if n < self.least:
+            raise ValueError(f"{self._name()} needs at least {self.least} points, got {n}; add points")
+        if self.frame == GENERAL and n > 2 * self.k + 2:
+            raise ValueError(f"{self._name()} takes up to {2 * self.k + 2} points, got {n}; take as many of them")
+
+    @property
+    def n(self) -> int:
+        """Points of one view."""
+        if self.points is None:
+            raise ValueError(f"{self!r} does not know its number of points; give it, {self._name()[:-1]}, points=...)")
+        return self.points
+
+    @property
+    def profile(self) -> Profile:
+        """Hyperplanes through each point behind the basis (``general``)."""
+        return lifted.profile_of(self.k, self.n - self.k - 1)
+
+    @property
+    def cameras(self) -> CameraKind:
+        """The projections that are eliminated."""
+        return CameraKind(self.k, self.l, self.frame == AFFINE)
+
+    def prepared(
+        self, views: Sequence[Tensor], weights: Tensor | None = None, **given: Tensor
+    ) -> tuple[Invariant, tuple[Tensor, ...]]:
+        super().prepared(views, weights, **given)
+        if self.points not in (None, len(views)):
+            raise ValueError(f"{self!r} takes {self.points} points, each (*batch, views, {self.l}), got {len(views)} arguments")
+        self._check_points(len(views))
+        return replace(self, points=len(views)), (constellations(self, views, self.l),)
+
+    def completed(self, views: tuple[Tensor, ...], weights: Tensor) -> tuple[tuple[Tensor, ...], Tensor]:
+        """Views that miss a point have no part in a fit, while the points that they show can still be measured."""
+        return views, weights * looked_at(views[0]).all(-1)
+
+    @property
+    def primitives(self) -> tuple[Equations]:  # type: ignore[override]
+        n, size = self.n, self.l + 1
+        if self.frame == GENERAL:
+            width = len(lifted.free(self.k, self.l, self.profile, torch.device("cpu")))
+            rows, make = lifted.counted(self.k, self.l, self.profile)[0], partial(lifted.view_rows, profile=self.profile)
+        elif self.frame == PLANE:
+            m = n - size - 1
+            width, rows, make = size * (m - 1), self.l * m - size, lifted.plane_rows  # type: ignore[assignment]
+        else:
+            width, rows, make = n - 1, self.l, static.affine_rows  # type: ignore[assignment]
+        return (Equations((n, size), width, make, rows),)
+
+    def minimal(self) -> int:
+        """Fewest views that determine the tensor: in the frame ``general`` by the rank of views of a random shape."""
+        if self.frame == GENERAL:
+            return lifted.counted(self.k, self.l, self.profile)[1]
+        return -(-(self.width() - self.nullity) // self.rows())
+
+    @property
+    def resolves_noise(self) -> bool:  # type: ignore[override]
+        """Not where points of the basis that nearly depend on each other make the frame of every view an accident."""
+        return self.frame == AFFINE
+
+    @property
+    def nullity(self) -> int:  # type: ignore[override]
+        return self.n - self.k - 1 if self.frame == AFFINE else 1
+
+    @property
+    def dof(self) -> int:  # type: ignore[override]
+        """Coordinates of the points less the collineations that keep the basis."""
+        n, k = self.n, self.k
+        return {GENERAL: k * (n - k - 2), PLANE: k * (n - k - 1) - k - 1, AFFINE: k * (n - k - 1)}[self.frame]
+
+    @property
+    def codim(self) -> int:  # type: ignore[override]
+        """Coordinates of a view less the freedom of its camera."""
+        return self.l * self.n - self.cameras.freedom
+
+    def shape(self) -> tuple[int, ...]:
+        if self.frame == AFFINE:
+            return (self.n,)
+        if self.frame == PLANE:
+            return (self.n - self.l - 2, self.l + 1)
+        return (lifted.partitions(self.k, self.profile, torch.device("cpu"))[0].shape[1],)
+
+    def _free(self, device: torch.device) -> Tensor:
+        """Orthonormal basis of what the estimation matrix says of a flat tensor."""
+        if self.frame == AFFINE:
+            return static.centred(self.n, device)
+        return lifted.free(self.k, self.l, self.profile, device)
+
+    def tensor_of(self, basis: Tensor) -> Tensor:
+        """The tensor of a null space of the estimation matrix, whose columns are the coordinates that constraints leave free."""
+        if self.frame == PLANE:
+            v = basis.unflatten(-1, (-1, self.l + 1))
+            tensor = (v.mT @ static.centred(v.shape[-2] + 1, basis.device)).mT
+            return tensor[..., 0, :, :]
+        tensor = basis @ self._free(basis.device)
+        return tensor[..., 0, :] if self.nullity == 1 else tensor
+
+    def basis_of(self, tensor: Tensor) -> Tensor:
+        if self.frame == PLANE:
+            return (tensor.mT @ static.centred(tensor.shape[-2], tensor.device).mT).mT.flatten(-2)[..., None, :]
+        basis = tensor @ self._free(tensor.device).mT
+        return basis[..., None, :] if self.nullity == 1 else basis
+
+    def compose(self, points: Tensor) -> Tensor:
+        """The tensor of known points.
+
+        Args:
+            points: ``(*batch, n, k)``, or ``(*batch, n, k + 1)`` homogeneous.  Of a plane point l + 2 is moved onto that of the
+                first l + 1.
+
+        Returns:
+            ``(*batch, [n - k - 1,] *shape)`` of norm 1 (affine: orthonormal); zero where the basis points have no frame.
+
+        Example:
+            >>> import torch
+            >>> P = torch.randn(8, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+            >>> T = LiftedShapeTensor(4).compose(P)
+            >>> T.shape, bool(torch.allclose(T, LiftedShapeTensor(4).compose(2 * P)))  # homogeneous: the scale means nothing
+            (torch.Size([30]), True)
+        """
+        own = replace(self, points=int(points.shape[-2]))
+        whole = points if points.shape[-1] == self.k + 1 else torch.nn.functional.pad(points, (0, 1), value=1.0)
+        if whole.shape[-1] != self.k + 1:
+            raise ValueError(f"points must be (*batch, n, {self.k}) or homogeneous, (*batch, n, {self.k + 1}), got {points.shape}")
+        whole = static.standard(whole.double(), own.frame)
+        sound = whole.isfinite().flatten(-2).all(-1)[..., None, None]
+        whole = torch.where(
+            sound, whole, 1.0 if own.frame == PLANE else torch.eye(*whole.shape[-2:], device=whole.device).to(whole)
+        )
+        tensor = own._composed(whole)
+        if own.frame == GENERAL:
+            # what no view tells is left out: tensors of one shape are then equal
+            tensor = own.tensor_of(own.basis_of(tensor))
+        flat = tensor.flatten(-len(own.shape()))
+        norm = flat.norm(dim=-1, keepdim=True)
+        flat = torch.where(sound if own.nullity > 1 else sound[..., 0], flat / torch.where(norm > 0, norm, 1.0), 0.0)
+        return flat.unflatten(-1, own.shape()).to(points.dtype)
+
+    def _composed(self, points: Tensor) -> Tensor:
+        """The tensor, of any scale, of points ``(*batch, n, k + 1)`` in the standard frame."""
+        if self.frame == AFFINE:
+            annihilator = null_space(points.mT, self.n - self.k - 1)
+            return annihilator.squeeze(-2) if self.nullity == 1 else annihilator
+        if self.frame == GENERAL:
+            # the scale of each point is that of the tensor
+            others = points[..., self.k + 1 :, :]
+            size = others.abs().amax(-1, keepdim=True)
+            return lifted.composed(others / torch.where(size > 0, size, 1.0), self.profile)
+        others = points[..., self.k + 1 :, :]
+        v = others[..., :-1] / others[..., -1:]
+        return v - v.mean(-2, keepdim=True)
+
+    def decompose(self, tensor: Tensor) -> Tensor:
+        """The points behind a tensor, homogeneous ``(*batch, n, k + 1)``, in the frame that it leaves open; zero for a zero tensor.
+
+        In closed form for the tensor of a shape; of a noisy one the nearest Grassmann tensor is found first.
+
+        Example:
+            >>> import torch
+            >>> P = torch.randn(9, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+            >>> family = LiftedShapeTensor(4, points=9)
+            >>> T = family.compose(P)
+            >>> bool(torch.allclose(family.compose(family.decompose(T)).abs(), T.abs()))
+            True
+        """
+        whole = tensor.double()
+        if self.frame == AFFINE:
+            points = static.affine_points(whole[..., None, :] if self.nullity == 1 else whole, self.k)
+        elif self.frame == GENERAL:
+            points = lifted.points_of(whole, self.k, self.l, self.profile)
+        else:
+            points = static.plane_points(whole)
+        return points.to(tensor.dtype)
+
+    def multilinear(self, tensor: Tensor, basis: Tensor) -> Tensor:
+        r"""The form of the points behind the basis, for given images of it (``general``).
+
+        Args:
+            tensor: ``(*batch, *shape)``.
+            basis: ``(k + 1, l + 1)`` homogeneous images of the first k + 1 points.
+
+        Returns:
+            ``(*batch, binomial(l + 1, alpha_1), ...)``, the :class:`~dyntorch.GrassmannTensor` of the dual projections
+            :math:`B\,\mathrm{diag}(X_j)`; for k = 3, l = 2 and the basis :math:`e_1, e_2, e_3, (1, 1, 1)` that of
+            :class:`~dyntorch.ShapeTensor` (with the lines of its two-line slots in the place of their meets).
+        """
+        if self.frame != GENERAL or basis.shape != (self.k + 1, self.l + 1):
+            raise ValueError(
+                f"frame 'general' and a basis ({self.k + 1}, {self.l + 1}) have a form, got {self!r}, {tuple(basis.shape)}"
+            )
+        return lifted.multilinear(tensor.double(), basis.double(), self.profile).to(tensor.dtype)
+
+    def whitened(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
+        """Reprojection error ``(*batch, views, l n)`` of the points of each view, whose camera is found first."""
+        structure = static.standard(motion[0].double(), self.frame)
+        return reprojection_residual(structure, views[0].double(), scales[0].double(), self.cameras).to(views[0].dtype)
+
+    def linearized(
+        self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]
+    ) -> tuple[Tensor, Tensor]:
+        shape = motion[0].shape[-2:]
+        value, slope = jacobian(lambda t: static.standard(t.unflatten(-1, shape), self.frame).flatten(-2), motion[0].flatten(-2))
+        error, derivative = reprojection_derivative(value.unflatten(-1, shape), views[0], scales[0], self.cameras)
+        return error.flatten(-2), slope @ derivative.flatten(-2).flatten(-3, -2).mT
+
+    def score(self, tensor: Tensor, *points: Tensor) -> Tensor:
+        r"""Algebraic score of views: how nearly the equations of the camera, given the shape, are dependent.
+
+        :math:`\sigma_{\min} / \|E\|_F` of the incidences :math:`E = (S_i\,M X_i)` of unit hyperplanes, linear in the entries of the
+        camera M, over all points.  It is no distance (see :func:`dyntorch.sampson`).
+
+        Args:
+            tensor: ``(*batch, ...)`` as fitted.
+            *points: p1, ..., pn, ``(*batch, views, l)``.
+
+        Returns:
+            ``(*batch, views)`` in [0, 1], 0 for a view of the shape; NaN where the view says nothing.
+        """
+        invariant, (x,) = self.prepared(points)
+        assert isinstance(invariant, LiftedShapeTensor)
+        structure = static.standard(invariant.decompose(tensor.double()), self.frame)
+        return lifted.camera_score(structure, x.double(), self.cameras.freedom, self.frame == AFFINE).to(x.dtype)
+
+    def _name(self) -> str:
+        dims = f"{self.k}" if self.l == 2 else f"{self.k}, {self.l}"
+        return f"LiftedShapeTensor({dims}{'' if self.frame == GENERAL else f', frame={self.frame!r}'})"
+
+    def __repr__(self) -> str:
+        return self._name() if self.points is None else f"{self._name()[:-1]}, points={self.points})"
