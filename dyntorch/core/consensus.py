@@ -20,7 +20,8 @@ from dyntorch.core.residual import SINGULAR, whiten
 from dyntorch.core.solution import copied
 from dyntorch.numerics.blocks import Draws, Record, each, map_blocks, put, workers
 from dyntorch.numerics.chi_square import quantile
-from dyntorch.numerics.nullspace import gram_null_space, orthonormal
+from dyntorch.numerics.eigenspaces import orthonormal
+from dyntorch.numerics.nullspace import gram_null_space
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Many weightings of the same matches: tensors, distances and annealed reweighting for a whole bundle of starts at once.
@@ -310,12 +311,13 @@ class Search:
         self.invariant, self.data, self.options = invariant, data, options
         self.draws = Draws(len(data.weights), generator, data.weights.device)
         self.everyone = torch.arange(len(data.weights), device=data.weights.device)
-        views, weights, _ = copied(invariant, replace(data, weights=data.weights * _near(invariant, data, options.starts.gross)))
+        near = data.weights * _near(invariant, data, options.starts.gross)
+        views, weights, _ = copied(invariant, data.views, near, None)
         self.norm: Normalization = normalization(invariant, views, weights)
         # the search measures in this unit, so that no limit of it depends on that of the matches
         self.unit = relative([t.flatten(1)[:, 0] for t in self.norm.transforms])[1]
         self.some = some = self._some()
-        moved = self.norm.apply(invariant, copied(invariant, some)[0])
+        moved = self.norm.apply(invariant, copied(invariant, some.views, some.weights, None)[0])
         self.weights = some.weights / some.weights.amax(-1, keepdim=True).clamp(min=1e-300)
         views = moved if invariant.copies else tuple(x[:, None] for x in moved)
         self.searched = Searched(self.weights, views, self.norm.transforms)

@@ -10,13 +10,14 @@ import torch
 from torch import Tensor
 
 from dyntorch.core.invariant import Invariant, as_invariant
-from dyntorch.core.matches import Matches, matches, relative_weights
+from dyntorch.core.matches import Matches, check_plain, matches, relative_weights
 from dyntorch.core.matrix import estimation_matrix, gram, labelled_rows, within_noise
 from dyntorch.core.normalize import Normalization, denormalize, normalization
 from dyntorch.core.outcome import Status, failed
 from dyntorch.core.primitives import Primitive
 from dyntorch.core.solution import Solution, copied
 from dyntorch.numerics.blocks import map_blocks, one_thread, select, workers
+from dyntorch.numerics.function_transforms import over_problems
 from dyntorch.numerics.nullspace import decided_null_space, null_space
 
 AMBIGUOUS = 0.5
@@ -87,7 +88,7 @@ def fit(
         [[1.0, 0.1, 2.0], [-0.1, 1.0, 3.0], [0.1, 0.2, 1.0]]
     """
     invariant, views = as_invariant(invariant).prepared(views, weights, **given)
-    return fit_matches(invariant, matches(invariant, views, weights, static, dimensions), normalize=normalize)
+    return fit_matches(invariant, matches(invariant, views, weights, static, dimensions, mapped=True), normalize=normalize)
 
 
 def fit_matches(invariant: Invariant, data: Matches, *, normalize: bool = True) -> Solution:
@@ -98,13 +99,10 @@ def fit_matches(invariant: Invariant, data: Matches, *, normalize: bool = True) 
         few = few and data.count * max(labelled_rows(invariant.primitives)) < invariant.width() - invariant.nullity
     if data.views[0].shape[0] and few:
         raise ValueError(f"{invariant!r} needs at least {invariant.minimal()} matches, got {data.count}; add matches")
-    whole, present = invariant.completed(data.views, data.weights)
+    check_plain(invariant)
+    solved = over_problems(partial(_solved, invariant, normalize), data.views, data.weights, data.static)
+    (whole, present), found = solved
     data = replace(data, views=whole, weights=present)
-    views, weights, static = copied(invariant, data)
-    per_problem = data.count * max(1, invariant.copies or 1) * _largest(invariant)
-    most, least = (max(1, number // max(1, per_problem)) for number in (BLOCK, LEAST))
-    size = min(most, max(least, -(-len(weights) // workers())))
-    found = map_blocks(partial(_solve, invariant, normalize), views, weights, static, size=size)
     pairs = zip(invariant.primitives, found.transforms, strict=True)
     norm = Normalization(found.transforms, tuple(p.normalized(t) for p, t in pairs), found.actions)
     tensor, status, uncertainty = (data.back(part) for part in (found.tensor, found.status, found.uncertainty))
@@ -121,6 +119,19 @@ class Solved(NamedTuple):
     transforms: tuple[Tensor, ...]
     actions: tuple[Tensor, ...]
     """As in :class:`~dyntorch.core.normalize.Normalization`."""
+
+
+def _solved(
+    invariant: Invariant, normalize: bool, views: tuple[Tensor, ...], weights: Tensor, static: Tensor | None
+) -> tuple[tuple[tuple[Tensor, ...], Tensor], Solved]:
+    """Views and weights ``(b, n, ...)`` with what they lack filled in, and the linear fits of all problems."""
+    views, weights = invariant.completed(views, weights)
+    count = weights.shape[-1]
+    per_problem = count * max(1, invariant.copies or 1) * _largest(invariant)
+    most, least = (max(1, number // max(1, per_problem)) for number in (BLOCK, LEAST))
+    size = min(most, max(least, -(-len(weights) // workers())))
+    copies = copied(invariant, views, weights, static)
+    return (views, weights), map_blocks(partial(_solve, invariant, normalize), *copies, size=size)
 
 
 def _largest(invariant: Invariant) -> int:

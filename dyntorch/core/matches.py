@@ -12,6 +12,7 @@ from torch import Tensor
 from dyntorch.core.invariant import Invariant
 from dyntorch.core.primitives import Point, Primitive
 from dyntorch.numerics.arguments import FARTHEST, check_tensor, refuse_vmap
+from dyntorch.numerics.function_transforms import over_problems, transformed
 
 WIDEST = 4096
 """Unknowns of a tensor; the Gram of one problem then takes 134 MB."""
@@ -53,18 +54,30 @@ def matches(
     weights: Tensor | None = None,
     static: Tensor | None = None,
     dimensions: Tensor | None = None,
+    *,
+    mapped: bool = False,
 ) -> Matches:
     """Check the views of one invariant and put them into float64.
 
     A match with a coordinate that is NaN or infinite in any view (beyond 1e60 is infinite), or a weight that is, weighs nothing.
+
+    Args:
+        invariant: says what is measured.
+        views: one per primitive.
+        weights: ``(*batch, n)``.
+        static: ``(*batch, n)`` bool.
+        dimensions: ``(*batch, n)`` integers in place of it.
+        mapped: whether what follows may be mapped over by ``torch.func.vmap``.
 
     Raises:
         ValueError: another number of views, shapes that do not agree, mixed dtypes or devices, negative weights, ``static`` or
             ``dimensions`` for an invariant that knows no labelled static matches, both of them, or other dimensions.
     """
     check_views(invariant, views)
-    for v, x in enumerate(views, start=1):
+    for v, x in enumerate(() if mapped else views, start=1):
         refuse_vmap(f"view {v}", x)
+    if dimensions is not None:
+        refuse_vmap("dimensions", dimensions, "give them as they are, from outside of the function that is mapped")
     if invariant.width() > WIDEST:
         raise ValueError(f"{invariant!r} has {invariant.width():,} unknowns; up to {WIDEST:,} are estimated")
     first = views[0]
@@ -82,7 +95,8 @@ def matches(
         label = _freed(invariant, option("dimensions", dimensions, batch, n, first), static is not None)
     elif label is not None:
         label = label.bool() if invariant.within == 2 else label.bool() * (invariant.within - 1)
-    if home.type == "cpu" and bool(weight.detach().sum().isfinite()) and all(bool(_near(x.detach())) for x in flat):
+    looked_at = home.type == "cpu" and not transformed(tuple(flat), weight)
+    if looked_at and bool(weight.detach().sum().isfinite()) and all(bool(_near(x.detach())) for x in flat):
         # nothing is missing: one norm per view says so, and nothing is copied
         return Matches(tuple(flat), weight, _labels(label, home), batch, first.dtype, first.device)
     present = weight.isfinite()
@@ -99,6 +113,17 @@ def matches(
     )
 
 
+def check_plain(invariant: Invariant) -> None:
+    """Raise a ``ValueError`` for an invariant whose own numbers are inside of a transformation of ``torch.func``."""
+    held = [part for part in vars(invariant).values() if isinstance(part, Tensor)]
+    held += [part for primitive in invariant.primitives for part in vars(primitive).values() if isinstance(part, Tensor)]
+    if transformed(*held):
+        raise ValueError(
+            f"{invariant!r} holds numbers that torch.func transforms (cameras, an interval of times): make it from what is not "
+            "transformed, or give all problems at once, in leading dimensions"
+        )
+
+
 def _near(x: Tensor) -> Tensor:
     return torch.linalg.vector_norm(x, torch.inf) <= FARTHEST if x.numel() else torch.tensor(True)
 
@@ -107,9 +132,14 @@ def _weights(given: Tensor | None, like: Tensor) -> Tensor:
     """``(b, n)`` float64."""
     if given is None:
         return torch.ones(like.shape[:2], dtype=like.dtype, device=like.device)
-    if bool((given < 0).any()):
-        raise ValueError(f"weights must not be negative, got {float(given.nan_to_num().min()):g}; use 0 to leave a match out")
-    return given.to(like)
+    return over_problems(_not_negative, given).to(like)
+
+
+def _not_negative(weights: Tensor) -> Tensor:
+    """The weights as they are."""
+    if bool((weights < 0).any()):
+        raise ValueError(f"weights must not be negative, got {float(weights.nan_to_num().min()):g}; use 0 to leave a match out")
+    return weights
 
 
 def relative_weights(weights: Tensor) -> Tensor:

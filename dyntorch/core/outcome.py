@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dyntorch.numerics.arguments import refuse_vmap
 from dyntorch.numerics.messages import Message, Words, as_python
 
 
@@ -254,6 +255,7 @@ def check_status(what: str, status: Tensor, said: Sequence[Notice] = (), remedie
     Raises:
         ValueError: says which problems failed, how, and what to do.
     """
+    refuse_vmap("status", status, "return what is needed from the function that is mapped, and look at its status behind that")
     flat = status.reshape(-1)
     places = np.arange(len(flat)).reshape(tuple(status.shape))
     for state in Status:

@@ -486,9 +486,7 @@ class Line(Primitive):
         if not self._as_points(x):
             return gradient
         # l = P ^ Q is bilinear: with the skew matrix W of the gradient, dh/dP = W Q and dh/dQ = -W P
-        skew = torch.zeros(*gradient.shape[:-1], 4, 4, dtype=gradient.dtype, device=gradient.device)
-        rows, columns = torch.triu_indices(4, 4, 1, device=gradient.device)
-        skew[..., rows, columns] = gradient
+        skew = torch.nn.functional.pad(gradient, (0, 1))[..., _above_the_diagonal(gradient.device)]
         skew = skew - skew.mT
         first, second = homogeneous(x).unbind(-2)
         return torch.cat([(skew @ second[..., None])[..., :3, 0], -(skew @ first[..., None])[..., :3, 0]], dim=-1)
@@ -510,6 +508,15 @@ class Line(Primitive):
 
     def _as_points(self, x: Tensor) -> bool:
         return x.ndim >= 3 and tuple(x.shape[-2:]) == (2, 3)
+
+
+@constant
+def _above_the_diagonal(device: torch.device) -> Tensor:
+    """Which of six numbers each entry of a strictly upper triangular 4 x 4 matrix is, ``(4, 4)``; 6 is none of them."""
+    index = torch.full((4, 4), 6)
+    rows, columns = torch.triu_indices(4, 4, 1)
+    index[rows, columns] = torch.arange(6)
+    return index.to(device)
 
 
 def _feet(line: Tensor) -> Tensor:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 
 from dyntorch.core.invariant import Invariant, as_invariant
-from dyntorch.core.matches import check_views
+from dyntorch.core.matches import check_plain, check_views
 from dyntorch.numerics.arguments import FARTHEST
 from dyntorch.numerics.blocks import select
+from dyntorch.numerics.function_transforms import over_problems, transformed
 from dyntorch.numerics.least_squares import by_match, flattened, parts_of
 
 SINGULAR = 1e-14  # squared gradient, in normalized units, added where value and gradient vanish together (static points)
@@ -85,7 +87,29 @@ def sampson(invariant: Invariant | type[Invariant], tensor: Tensor, *views: Tens
     ones = (torch.ones((), dtype=tensor.dtype, device=tensor.device),) * len(views)
     if invariant.single():
         return _infinite(multilinear(invariant, tensor, views, ones).abs(), missing)
-    return _infinite(distance(invariant, invariant.motion_of(tensor), views, ones), missing)
+    if not transformed(tensor, views):
+        return _infinite(distance(invariant, invariant.motion_of(tensor), views, ones), missing)
+    check_plain(invariant)
+    return _infinite(_of_transformed(invariant, tensor, views, missing.shape[:-1]), missing)
+
+
+def _of_transformed(invariant: Invariant, tensor: Tensor, views: Sequence[Tensor], batch: torch.Size) -> Tensor:
+    """Distances ``(*batch, n)`` within ``torch.func``: how a tensor decomposes is decided by its values."""
+    axes = len(invariant.shape()) + (invariant.nullity > 1) + (invariant.copies is not None)
+    whole = torch.broadcast_shapes(batch, tensor.shape[: tensor.ndim - axes])
+    places = [p.match_axis(x) for p, x in zip(invariant.primitives, views, strict=True)]
+    flat = [_flat(x, whole, place) for x, place in zip(views, places, strict=True)]
+
+    def found(tensor: Tensor, views: tuple[Tensor, ...]) -> Tensor:
+        ones = (torch.ones((), dtype=tensor.dtype, device=tensor.device),) * len(views)
+        return distance(invariant, invariant.motion_of(tensor), views, ones)
+
+    return over_problems(found, _flat(tensor, whole, tensor.ndim - axes), tuple(flat)).reshape(*whole, -1)
+
+
+def _flat(x: Tensor, batch: torch.Size, leading: int) -> Tensor:
+    """A tensor with so many leading dimensions, in all problems of a batch, which are one dimension."""
+    return x.expand(*batch, *x.shape[leading:]).reshape(math.prod(batch), *x.shape[leading:])
 
 
 def _whole(invariant: Invariant, views: Sequence[Tensor]) -> tuple[tuple[Tensor, ...], Tensor]:

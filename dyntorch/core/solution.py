@@ -18,6 +18,7 @@ from dyntorch.core.normalize import Normalization, denormalize_motion
 from dyntorch.core.outcome import Outcome, Status, check_status, failed
 from dyntorch.numerics.arguments import check_precision
 from dyntorch.numerics.blocks import select
+from dyntorch.numerics.function_transforms import mapped_over, over_problems
 
 NOISY = 0.05
 """Estimated noise over the extent of the points above which agreement with a tensor is an accident: random matches of space, with
@@ -57,9 +58,16 @@ class Solution(Outcome):
     @cached_property
     def motion(self) -> tuple[Tensor, ...]:
         """The parts of the motion in the coordinates of the matches; decomposed in normalized ones, which is more accurate."""
-        parts = self.normalized_motion()
-        moved = denormalize_motion(self.invariant, parts, self.frames())
-        return tuple(self.matches.back(self._or_zero(part)) for part in moved)
+        known = self.normalized, self.status.reshape(-1), self.normalization.transforms, self.refined
+        return tuple(self.matches.back(part) for part in over_problems(self._motion, *known))
+
+    def _motion(
+        self, normalized: Tensor, status: Tensor, transforms: tuple[Tensor, ...], refined: tuple[Tensor, ...] | None
+    ) -> tuple[Tensor, ...]:
+        """:attr:`motion`, flat batch, float64."""
+        parts = self.invariant.normalized(transforms).motion_of(normalized) if refined is None else refined
+        moved = denormalize_motion(self.invariant, parts, _frames(transforms))
+        return tuple(select(~failed(status.to(part.device)), part, 0.0) for part in moved)
 
     @cached_property
     def singular_values(self) -> Tensor:
@@ -68,7 +76,7 @@ class Solution(Outcome):
         Computed on first use from the matrix itself, so that they are accurate down to the rounding of the largest one.
         """
         m = self.matches
-        views, weights, static = copied(self.invariant, m)
+        views, weights, static = copied(self.invariant, m.views, m.weights, m.static)
         moved = self.normalization.apply(self.invariant, views)
         width, rows = self.invariant.width(), self.invariant.rows()
         step = max(2 * width, CHUNK // (width * rows * max(1, weights.numel() // max(1, weights.shape[-1]))))
@@ -96,7 +104,7 @@ class Solution(Outcome):
 
     def frames(self) -> tuple[Tensor, ...]:
         """What normalized the views, ``(b, d + 1, d + 1)`` each, without an axis of copies."""
-        return tuple(t.reshape(t.shape[0], *t.shape[-2:]) for t in self.normalization.transforms)
+        return _frames(self.normalization.transforms)
 
     def back(self, data: Matches) -> Solution:
         """This solution of flat float64 problems in the batch, dtype and device of the caller's matches."""
@@ -178,12 +186,15 @@ class Solution(Outcome):
         return self
 
     def __repr__(self) -> str:
+        if mapped_over(self.status):
+            return f"Solution({self.invariant!r}, matches={self.matches.count}, batch={tuple(self.status.shape)}: mapped over)"
         noise = "" if self.sigma is None else _shown(self.sigma[self.status == Status.OK])
         shape = tuple(self.status.shape)
         return f"Solution({self.invariant!r}, matches={self.matches.count}, batch={shape}: {self.counted()}{noise})"
 
-    def _or_zero(self, part: Tensor) -> Tensor:
-        return select(~failed(self.status.reshape(-1).to(part.device)), part, 0.0)
+
+def _frames(transforms: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+    return tuple(t.reshape(t.shape[0], *t.shape[-2:]) for t in transforms)
 
 
 def _shown(sigma: Tensor) -> str:
@@ -191,9 +202,10 @@ def _shown(sigma: Tensor) -> str:
     return f", sigma {'about ' if sigma.numel() > 1 else ''}{float(sigma.median()):.2g}" if sigma.numel() else ""
 
 
-def copied(invariant: Invariant, matches: Matches) -> tuple[tuple[Tensor, ...], Tensor, Tensor | None]:
+def copied(
+    invariant: Invariant, views: tuple[Tensor, ...], weights: Tensor, static: Tensor | None
+) -> tuple[tuple[Tensor, ...], Tensor, Tensor | None]:
     """Views, weights and labels with the dimension of copies behind the batch, for an invariant that has it."""
     if invariant.copies is None:
-        return matches.views, matches.weights, matches.static
-    static = None if matches.static is None else matches.static[:, None]
-    return tuple(x[:, None] for x in matches.views), matches.weights[:, None], static
+        return views, weights, static
+    return tuple(x[:, None] for x in views), weights[:, None], None if static is None else static[:, None]

@@ -11,6 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dyntorch.numerics.function_transforms import mapped_over
+
 PRECISE = (torch.float32, torch.float64)
 """Types of numbers with the digits that measurements have; three digits (float16) or two (bfloat16) are fewer than pixels need."""
 
@@ -49,13 +51,10 @@ def check_options(options: object, kind: type) -> None:
         raise ValueError(f"options must be {name}, got {options!r}; use dataclasses.replace({name}(), ...)")
 
 
-def refuse_vmap(name: str, value: Tensor) -> None:
+def refuse_vmap(name: str, value: Tensor, remedy: str = "give all problems at once, in leading dimensions") -> None:
     """Raise a ``ValueError`` for a tensor inside of ``torch.func.vmap``: which way to go depends on values."""
-    functorch = torch._C._functorch
-    while functorch.is_functorch_wrapped_tensor(value):
-        if functorch.is_batchedtensor(value):
-            raise ValueError(f"{name} is mapped over by torch.func.vmap; give all problems at once, in leading dimensions")
-        value = functorch.get_unwrapped(value)
+    if mapped_over(value):
+        raise ValueError(f"{name} is mapped over by torch.func.vmap; {remedy}")
 
 
 def check_threshold(threshold: float | None) -> None:

@@ -84,6 +84,24 @@ def second_derivatives_are_right(case: Case) -> None:
         torch.testing.assert_close(second, expected, rtol=1e-3, atol=1e-4 * float(first.detach().abs()) + 1e-3)
 
 
+@prop(lambda case: case.invariant.width() < 36)
+def torch_func_agrees_with_autograd(case: Case) -> None:
+    """A derivative of each problem, mapped over the problems: of the tensor, its motion and the distances, in one go."""
+    views = example(case, batch=(2,))
+
+    def function(*views: Tensor) -> Tensor:
+        solution = dyn.fit(case.invariant, *views)
+        composed = case.invariant.compose(*solution.motion)
+        far = dyn.sampson(case.invariant, solution.tensor, *views).square().sum()
+        return projector(case, solution.tensor).sum() + projector(case, composed).sin().sum() + far
+
+    leaves = [x.clone().requires_grad_() for x in views]
+    expected = torch.autograd.grad(sum(function(*(x[b] for x in leaves)) for b in range(2)), leaves)
+    found = torch.func.vmap(torch.func.grad(function, argnums=tuple(range(len(views)))))(*views)
+    for one, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5 * float(other.abs().max()))
+
+
 @prop()
 def failed_problems_leave_gradients_of_the_others_alone(case: Case) -> None:
     views = example(case, batch=(3,))

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import pytest
@@ -187,13 +188,45 @@ def test_a_singular_collineation_is_degenerate():
     assert dyn.fit(dyn.Collineation(1), x1, x2).status == dyn.Status.DEGENERATE
 
 
-def test_half_precision_complex_and_mapped_matches_are_refused():
+def test_half_precision_and_complex_matches_are_refused():
     views = scenes.planar(40, generator=seeded()).views
     for dtype, words in ((torch.float16, r"too few digits; use .float\(\)"), (torch.complex64, r"use .double\(\)")):
         with pytest.raises(ValueError, match=words):
             dyn.fit(dyn.HomographyTensor, *(x.to(dtype) for x in views))
-    with pytest.raises(ValueError, match=r"mapped over by torch.func.vmap; give all problems at once"):
-        torch.func.vmap(lambda *v: dyn.fit(dyn.HomographyTensor, *v).tensor)(*(x.expand(2, *x.shape) for x in views))
+
+
+def test_what_cannot_be_mapped_over_says_what_to_do():
+    views = tuple(x.expand(2, *x.shape) for x in scenes.planar(40, generator=seeded()).views)
+    fit = partial(dyn.fit, dyn.HomographyTensor)
+    for verb in (partial(dyn.robust_fit, dyn.HomographyTensor, threshold=1.5), dyn.align_planar):
+        with pytest.raises(ValueError, match=r"mapped over by torch.func.vmap; give all problems at once"):
+            torch.func.vmap(lambda *v, verb=verb: verb(*v))(*views)
+    with pytest.raises(ValueError, match=r"status is mapped over .* look at its status behind that"):
+        torch.func.vmap(lambda *v: fit(*v).check().tensor)(*views)
+    with pytest.raises(ValueError, match="weights must not be negative, got -1; use 0 to leave a match out"):
+        torch.func.vmap(lambda w: fit(*(x[0] for x in views), weights=w).tensor)(-torch.ones(2, 40))
+    with pytest.raises(ValueError, match=r"dimensions is mapped over .* from outside of the function"):
+        torch.func.vmap(lambda d: fit(*(x[0] for x in views), dimensions=d).tensor)(torch.ones(2, 40, dtype=torch.long))
+    times, points = torch.linspace(0, 1, 20).double(), torch.randn(6, 20, 2, generator=seeded()).double()
+    with pytest.raises(ValueError, match=r"holds numbers that torch.func transforms .* an interval of times"):
+        torch.func.vmap(lambda t: dyn.fit(dyn.DynamicShapeTensor, *points, times=t).tensor)(times.expand(2, -1))
+
+
+def test_solutions_that_are_mapped_over_have_statuses_and_a_representation():
+    views = scenes.planar(40, sigma=0.5, batch=3, generator=seeded()).views
+    views[0][1, :20] = torch.nan
+    shown = []
+
+    def answers(*views: Tensor) -> tuple[Tensor, Tensor]:
+        solution = dyn.fit(dyn.HomographyTensor, *views)
+        shown.append(repr(solution))
+        return solution.status, solution.singular_values
+
+    status, values = torch.func.vmap(answers)(*views)
+    expected = dyn.fit(dyn.HomographyTensor, *views)
+    assert status.equal(expected.status) and int(status[1]) == dyn.Status.TOO_FEW
+    assert shown == ["Solution(HomographyTensor, matches=40, batch=(): mapped over)"]
+    torch.testing.assert_close(values, expected.singular_values)
 
 
 def test_fit_takes_the_derivatives_of_torch_func():

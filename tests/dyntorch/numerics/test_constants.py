@@ -17,6 +17,7 @@ from dyntorch.geometry import grassmann as grassmann_recovery
 from dyntorch.geometry import homogeneous as monomials
 from dyntorch.geometry import pairs as epipole_pairs
 from dyntorch.invariants import dynamic_shape_tensor as dynamic_shape_rows
+from dyntorch.invariants import flats
 from dyntorch.invariants import shape_tensor as shape_residual
 from dyntorch.numerics import eigenspaces, lags
 from dyntorch.numerics import lags as covariances
@@ -40,12 +41,14 @@ TABLES = [
     (extensors._laplace, (4, 2, CPU)),
     (extensors._dual_signs, (4, 2, CPU)),
     (exterior._splits, (4, 2, 1, CPU)),
+    (flats.vanishing_forms, (2, 3, 2, CPU)),
     (grassmann._removals, (4, 2, CPU)),
     (grassmann._insertions, (4, 2, CPU)),
     (grassmann_nearest._chosen, ((2, 1, 1), (3, 3, 3), CPU)),
     (grassmann_recovery.tables, ((2, 1, 1), (3, 3, 3), 2, CPU)),
     (plane._moving_minors, (3, 2, CPU)),
     (base.triangle, (4, CPU)),
+    (base._above_the_diagonal, (CPU,)),
     (matrix._unpacking, ((3, 3), CPU)),
     (eigenspaces._generic, (5, 2, CPU)),
     (epipolar.polar, (torch.float64, CPU)),
