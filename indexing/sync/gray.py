@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 import torch
+from kornia.filters import get_gaussian_kernel1d
 from torch import Tensor
 from torch.nn.functional import avg_pool1d, conv1d, grid_sample, normalize
 
 from dyntorch.numerics import Message
-from indexing.brightness.features import as_grey, blur, gradients, weighted_differences
+from indexing.brightness.features import as_grey, blur, gradients, slopes, weighted_differences
 from indexing.brightness.footage import SHRINKING_BLOCK as FOOTAGE_BLOCK
 from indexing.brightness.footage import Shrinker
 from indexing.sync.options import SyncOptions
@@ -363,7 +364,7 @@ def _square(across: Tensor, along: Tensor, height: int, options: SyncOptions) ->
 def _smooth(values: Tensor, sigma: float) -> Tensor:
     """Gaussian mean over time of ``(T, n)``, renormalized at the ends."""
     reach = max(1, int(3 * sigma))
-    kernel = torch.exp(-0.5 * (torch.arange(-reach, reach + 1, dtype=values.dtype, device=values.device) / sigma) ** 2)[None, None]
+    kernel = get_gaussian_kernel1d(2 * reach + 1, sigma, device=values.device, dtype=values.dtype)[None]
     weight = conv1d(values.new_ones(1, 1, len(values)), kernel, padding=reach)[0].T
     return conv1d(values.T[:, None], kernel, padding=reach)[:, 0].T / weight
 
@@ -400,9 +401,8 @@ def window_kernels(crops: Tensor, options: SyncOptions = SyncOptions()) -> Tenso
     """``(T - 2 half, L, L)`` float64 of crops ``(T, s, s)``, trace 1 (0 if nothing moves); the first is frame ``half``."""
     half, patch = options.kernel.half, options.kernel.patch
     frames = blur(crops, options.kernel.sigma)
-    gx, gy = (torch.zeros_like(frames) for _ in range(2))
-    gx[:, :, 1:-1] = (frames[:, :, 2:] - frames[:, :, :-2]) / 2
-    gy[:, 1:-1] = (frames[:, 2:] - frames[:, :-2]) / 2
+    gx, gy = slopes(frames)
+    gx[:, :, [0, -1]], gy[:, [0, -1]] = 0.0, 0.0  # with a neighbour on one side only, a difference is not central
     cells, slope = _patches(frames, patch), torch.stack([_patches(gx, patch), _patches(gy, patch)], dim=2)
     length = 2 * half + 1
     out = frames.new_zeros(max(len(frames) - 2 * half, 0), length, length, dtype=torch.float64)
@@ -442,6 +442,8 @@ def kernel_descriptors(first: Tensor, second: Tensor, options: SyncOptions = Syn
     """
     kernels = torch.cat([first, second])
     known = kernels.isfinite().all(-1).all(-1)
+    if not bool(known.any()):
+        return torch.zeros_like(first).flatten(1), torch.zeros_like(second).flatten(1)
     root = inverse_root(kernels[known].mean(0), options.kernel.ridge)
     white = root @ kernels @ root
     flat = (white - white[known].mean(0)).flatten(1).nan_to_num(0.0)

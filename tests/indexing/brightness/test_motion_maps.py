@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from indexing.brightness.features import blur, blurred, gradients, inner_gradients
+from indexing.brightness.features import FEW_BLOCK, blur, blurred, gradients, inner_gradients, slopes
 from indexing.brightness.options import BrightnessOptions
 from indexing.brightness.sight import MotionBox, MotionMaps, described, mirrored, pooled, profile
 
@@ -34,11 +34,13 @@ def test_maps_do_not_know_the_sign_of_the_contrast():
     torch.testing.assert_close(MotionMaps().push(1 - frames)[0], MotionMaps().push(frames)[0], atol=1e-5, rtol=1e-4)
 
 
-def test_tables_and_slices_are_kornias():
-    frames = video()
-    torch.testing.assert_close(blurred(frames, SIGMA), blur(frames, SIGMA))
-    for found, expected in zip(inner_gradients(frames), gradients(frames), strict=True):
-        torch.testing.assert_close(found, expected[1:-1])
+def test_tables_are_kornias():
+    for count in (3, FEW_BLOCK + 2, FEW_BLOCK + 3):
+        frames = video(count)
+        torch.testing.assert_close(blurred(frames, SIGMA), blur(frames, SIGMA))
+        found, expected = inner_gradients(frames), gradients(frames)
+        for one, other in zip((*found, *slopes(frames)), (*(part[1:-1] for part in expected), *expected[:2]), strict=True):
+            torch.testing.assert_close(one, other)
 
 
 def slow_box(change):
