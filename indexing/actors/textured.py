@@ -73,8 +73,8 @@ def film(
     radius = np.clip(0.22 * length, 0.03, 0.11)
     if clip.skeleton == COCO17:
         radius[-1] = 0.1  # the head
-    background = 40 + 175 * _texture(image[1], image[0], (4, 8, 16), generator)
-    skins = torch.stack([20 + 215 * _texture(24, 12, (3, 6), generator) for _ in bones])
+    background = 40 + 175 * texture(image[1], image[0], (4, 8, 16), generator)
+    skins = torch.stack([20 + 215 * texture(24, 12, (3, 6), generator) for _ in bones])
     out = np.empty((len(clip), image[1], image[0]), dtype=np.uint8)
     for begin in range(0, len(clip), BLOCK):
         part = slice(begin, begin + BLOCK)
@@ -114,7 +114,7 @@ def _project(
     return flat @ np.array([[c, s], [-s, c]]) + np.array(image) / 2, depth
 
 
-def _texture(height: int, width: int, cells: tuple[int, ...], generator: torch.Generator) -> Tensor:
+def texture(height: int, width: int, cells: tuple[int, ...], generator: torch.Generator) -> Tensor:
     """``(height, width)`` in [0, 1]: smooth noise at several scales."""
     total = torch.zeros(1, 1, height, width)
     for n in cells:

@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     from indexing.sync.takes import Take
 
 WORDS = flags(
-    "fps", "person", "method", "max_shift", "min_confidence", "format", "size", "rate", calibration="--calibration FILE.toml"
+    "fps", "person", "method", "measure", "max_shift", "min_confidence", "format", "size", "rate",
+    calibration="--calibration FILE.toml",
 )  # fmt: skip
 
 
@@ -43,6 +44,8 @@ class Sync:
     """where to write report.html, sync.json, curve.png and pose-sync/; without it, print only"""
     method: Literal["auto", "keypoints", "tracks", "brightness"] = "auto"
     """auto: keypoints where there are any; for videos tracks and brightness, which must agree"""
+    measure: Literal["profile", "window"] = "profile"
+    """of --method brightness: what moves at which height, confirmed by the window kernel; or that kernel alone, as in the thesis"""
     fps: Annotated[str | None, tyro.conf.arg(metavar="N|N,N,...", help_behavior_hint="")] = None
     """frames per second of all cameras, or of each, for files that do not say (30 is assumed then, and the output says so)"""
     max_shift: Annotated[float | None, tyro.conf.arg(metavar="S", help_behavior_hint="")] = None
@@ -143,6 +146,7 @@ class Sync:
 
         lenses, told = (None, ()) if self.calibration is None else named_lenses(self.calibration, [take.name for take in takes])
         options: dict[str, Any] = {"max_shift": self.max_shift, "calibration": lenses, "rate": None if self.rate else 1.0}
+        options["measure"] = self.measure
         total = len(takes) * (len(takes) - 1) // 2
         compared: dict[tuple[int, int], Pairing] = {}
 

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 from dyntorch import SynchronizeOptions
 from indexing.video.options import TrackOptions
+
+Measure = Literal["profile", "window"]
+"""What of the brightness is compared: the row-band profile, which the window kernel must confirm, or the window kernel alone."""
+MEASURES = ("profile", "window")
 
 
 @dataclass(frozen=True)
@@ -257,3 +262,6 @@ class SyncOptions:
     lags: LagOptions = LagOptions()
     windows: WindowOptions = WindowOptions()
     verdict: VerdictOptions = VerdictOptions()
+    window_verdict: VerdictOptions = VerdictOptions(enough=25.0, agreed=(12.1, 4.0), open=(112.0, 38.0))
+    """Of the window kernel alone, ``measure="window"``.  144 pairs of synthetic actors (129 best lags within 1 frame; the profile:
+    135) and 576 of unrelated or reversed takes: 22 right ones pass and none of the others; at 20: 49 and 3, at 15: 74 and 10."""

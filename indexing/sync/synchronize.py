@@ -18,7 +18,7 @@ from dyntorch.core import Notice, status_from
 from dyntorch.numerics import Message, check_options, named
 from indexing.clip import Clip
 from indexing.sync.notices import SyncNotice, besides, noted
-from indexing.sync.options import SyncOptions
+from indexing.sync.options import MEASURES, Measure, SyncOptions
 from indexing.sync.people import Pairing, common_joints, disagreements, jumps, match_people
 from indexing.sync.takes import Take, take_of
 
@@ -40,6 +40,7 @@ def synchronize(
     calibration: Any = None,
     person: str = "auto",
     min_confidence: float = 0.0,
+    measure: Measure = "profile",
     options: SyncOptions = SyncOptions(),
     **more: Any,
 ) -> Shift:
@@ -67,6 +68,8 @@ def synchronize(
         person: who is followed where several people are in view: ``"auto"`` tries the likely pairings and says which was taken;
             ``"largest"``, ``"confident"``, ``"tracked"`` are the rules of :mod:`indexing.readers.recording`.
         min_confidence: joints that the detector trusts less are taken as not seen.
+        measure: of ``method="brightness"``: ``"profile"``, how much moves at which height, which the thesis's window kernel must
+            confirm; or ``"window"``, that kernel alone (see :func:`indexing.sync.brightness.brightness_shift`).
         options: every number that decides about recordings, people, tracks and brightness, by stage; ``dataclasses.replace``
             changes some of them.
         more: for the reader (``format=``, ``size=``) and for :func:`dyntorch.synchronize`.
@@ -104,7 +107,9 @@ def synchronize(
         for value, name, rate in zip((a, b), "ab", rates, strict=True)
     ]  # fmt: skip
     takes = [dataclasses.replace(take, name=take.name or letter) for take, letter in zip(takes, "ab", strict=True)]
-    shift = pair(takes[0], takes[1], method, max_shift=max_shift, calibration=calibration, options=options, **more).shift
+    shift = pair(
+        takes[0], takes[1], method, max_shift=max_shift, calibration=calibration, measure=measure, options=options, **more
+    ).shift
     return dataclasses.replace(shift, notices=(*remarks(takes), *shift.notices))
 
 
@@ -114,18 +119,19 @@ def pair(
     method: Method = "auto",
     *,
     calibration: Any = None,
+    measure: Measure = "profile",
     options: SyncOptions = SyncOptions(),
     **more: Any,
 ) -> Pairing:
     """:func:`synchronize` for recordings that were read, and which person of each it is about."""
     from indexing.sync.calibration import lenses
 
-    _check(a, b, method, options)
+    _check(a, b, method, measure, options)
     lens = lenses(calibration, [a.name, b.name])
     names = {"a": a.name or "a", "b": b.name or "b"}
     more = {**more, "calibration": lens.values if lens else None}
     try:
-        found, limits = _compared(a, b, method, more, options)
+        found, limits = _compared(a, b, method, measure, more, options)
     except ValueError as problem:
         raise ValueError(named(problem, names)) from problem
     said = [notice.named(names) for notice in [*noted(lens.notes if lens else ()), *limits, *found.shift.notices]]
@@ -133,7 +139,9 @@ def pair(
     return dataclasses.replace(found, shift=dataclasses.replace(found.shift, notices=tuple(unique.values())))
 
 
-def _compared(a: Take, b: Take, method: Method, more: dict[str, Any], options: SyncOptions) -> tuple[Pairing, list[Notice]]:
+def _compared(
+    a: Take, b: Take, method: Method, measure: Measure, more: dict[str, Any], options: SyncOptions
+) -> tuple[Pairing, list[Notice]]:
     """What the data say, and what is to be said about the people in them."""
     if a.kind == b.kind == "keypoints":
         found = match_people(
@@ -145,10 +153,15 @@ def _compared(a: Take, b: Take, method: Method, more: dict[str, Any], options: S
         )
         return found, _swapped(a, b, found, options)
 
-    return Pairing(synchronize_videos(a, b, method, **more, options=options), (0, 0)), []
+    return Pairing(synchronize_videos(a, b, method, measure, **more, options=options), (0, 0)), []
 
 
-def _check(a: Take, b: Take, method: Method, options: SyncOptions) -> None:
+def _check(a: Take, b: Take, method: Method, measure: Measure, options: SyncOptions) -> None:
+    if measure not in MEASURES:
+        raise ValueError(f"measure must be one of {', '.join(MEASURES)}, got {measure!r}")
+    if measure != "profile" and method != "brightness":
+        text = "{arg:measure={measure!r}} is a measure of brightness, and {arg:method={method!r}} was asked for; use "
+        raise ValueError(Message(text + "{arg:method='brightness'}", measure=measure, method=method))
     for take in (a, b):
         if take.kind == "keypoints" and take.count < options.recording.fewest:
             remedy = "give the folder that holds all frames" if take.count == 1 else "film longer"
@@ -248,7 +261,9 @@ if TYPE_CHECKING:
     from dyntorch import Shift
 
 
-def synchronize_videos(a: Take, b: Take, method: str, options: SyncOptions = SyncOptions(), **more: Any) -> Shift:
+def synchronize_videos(
+    a: Take, b: Take, method: str, measure: Measure = "profile", options: SyncOptions = SyncOptions(), **more: Any
+) -> Shift:
     """Two recordings of which at least one is a video: by tracks, by brightness, or by both.
 
     Raises:
@@ -257,7 +272,7 @@ def synchronize_videos(a: Take, b: Take, method: str, options: SyncOptions = Syn
     more.pop("correspondence", None)  # tracks of two videos never correspond
     brightness = {name: value for name, value in more.items() if name == "max_shift"}
     if method == "brightness":
-        return _brightness(a, b, **brightness, options=options)
+        return _brightness(a, b, **brightness, measure=measure, options=options)
     tracked = _tracks(a, b, **more, options=options)
     if method == "tracks" or "keypoints" in (a.kind, b.kind):
         return tracked

@@ -8,11 +8,15 @@ from indexing.video.motion import Move as Move
 from indexing.video.motion import camera_motion as camera_motion
 from indexing.video.motion import stabilize as stabilize
 from indexing.video.options import CameraMotionOptions as CameraMotionOptions
+from indexing.video.options import SceneOptions as SceneOptions
 from indexing.video.options import TrackOptions as TrackOptions
 from indexing.video.reading import Chunk as Chunk
 from indexing.video.reading import Video as Video
 from indexing.video.reading import VideoInfo as VideoInfo
 from indexing.video.reading import probe as probe
 from indexing.video.reading import read_video as read_video
+from indexing.video.scene import SceneTracks as SceneTracks
+from indexing.video.scene import track_scene as track_scene
+from indexing.video.sequence import PictureSequence as PictureSequence
 from indexing.video.tracks import Tracks as Tracks
 from indexing.video.tracks import track_points as track_points

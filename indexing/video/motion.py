@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from dyntorch.numerics import check_options
 from indexing.video.options import CameraMotionOptions
-from indexing.video.reading import Chunk, Source, chunks, cv2
+from indexing.video.reading import Chunk, Source, cv2
+from indexing.video.sequence import chunks
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Where the picture of the first frame lies in every later one: the motion of the camera, seen by the background.

@@ -59,6 +59,8 @@ class TrackOptions:
     same: float = 0.6
     """Correlation of its surroundings then: where somebody passes before the background, its points are dragged along, and there
     and back agree."""
+    corner: float = 0.01
+    """Of the best corner's strength, below which nothing is a corner."""
     renew: int = 10
     """Frames after which new points replace lost ones."""
     apart: int = 90
@@ -75,3 +77,28 @@ class TrackOptions:
     """Frames of a track that is worth keeping."""
     camera: CameraMotionOptions = CameraMotionOptions()
     """How the camera's own motion is found, which is taken out."""
+
+
+@dataclass(frozen=True)
+class SceneOptions:
+    """Every point that can be followed through pictures, the background too."""
+
+    count: int = 800
+    """Points followed at a time."""
+    follow: TrackOptions = TrackOptions(working=1280, back=0.5, patch=(15, 15), corner=0.003, renew=5, apart=60, shortest=2)
+    """How each is followed.  Rendered scenes of :mod:`experiments.alignment.videos`, points more than a pixel off after 40 frames,
+    patches of 11 / 15 / 21 pixels: a plane .001 / 0 / .002, a room .021 / .029 / .042."""
+    views: int = 3
+    """Pictures taken where nobody says which."""
+    lasting: float = 0.5
+    """Share of the points of the first picture that must still be followed in the last one taken, where nobody says which."""
+    anchored: float = 1.0
+    """Pixels, of the working image, by which a point is corrected at most when it is compared with the first picture that shows it;
+    beyond, it is lost.  Without that comparison .08 of the points of a plane and .09 of those of a room are more than a pixel off:
+    the edges of what moves drag them along."""
+    anchors: int = 24
+    """Pictures taken up to which that is done: it costs their number squared."""
+    fewest: int = 12
+    """Points that must be there in two pictures."""
+    rest: float = 1.0
+    """Pixels, of the working image: where fewer points than those go beyond it, nothing moves."""

@@ -439,11 +439,6 @@ def read_video(
         return Video(path, gray, size, span, chunk, fps)
 
 
-def chunks(source: Source, **options: Any) -> Iterable[Chunk]:
-    """The chunks of a source; ``options`` are those of :func:`read_video` and count for paths alone."""
-    return read_video(source, **options) if isinstance(source, (str, Path)) else source
-
-
 class _Clock:
     """Seconds since the stream's start."""
 

@@ -14,7 +14,8 @@ from torch import Tensor
 from dyntorch.numerics import check_options
 from indexing.video.motion import Background, CameraMotion, Floats, PathBuilder, shrinking, transform, warp
 from indexing.video.options import TrackOptions
-from indexing.video.reading import Chunk, Source, chunks, cv2
+from indexing.video.reading import Chunk, Source, cv2
+from indexing.video.sequence import chunks
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Following single points, and where in the picture there is something to follow.
@@ -170,14 +171,14 @@ def track_points(
         raise ValueError(f"track_points: count and keep must be at least 1, got count={count!r}, keep={keep!r}")
     if not 0 <= complete <= 1:
         raise ValueError(f"track_points: complete is a share of the frames in [0, 1], got {complete!r}")
-    background, path, book = Background(options.camera), PathBuilder(options.camera), _Book(count, options)
+    background, path, book = Background(options.camera), PathBuilder(options.camera), _MovingBook(count, options)
     previous: NDArray[np.uint8] | None = None
     for chunk in (stream := chunks(source, size=options.working)):
         moved = [path.add(background, image) for image in chunk.frames]
         path.times.extend(chunk.times.tolist())
         where = MovingArea(chunk, moved, options.change)
         for image, matrix in zip(chunk.frames, moved, strict=True):
-            book.step(previous, image, where(matrix), matrix)
+            book.look(previous, image, where(matrix), matrix)
             previous = image
     book.end()
     if len(path.times) < 2:
@@ -190,7 +191,7 @@ def track_points(
     return Tracks(torch.from_numpy(points), torch.from_numpy(camera.times), camera.size, camera, tuple(notes))
 
 
-class _Book:
+class Book:
     """Points being followed, and the histories of those that are worth it."""
 
     def __init__(self, count: int, options: TrackOptions):
@@ -200,14 +201,12 @@ class _Book:
         self.ids = np.zeros(0, int)
         self.histories: dict[int, tuple[int, list[NDArray[np.float32]]]] = {}  # id -> first frame, positions
         self.done: list[tuple[int, NDArray[np.float32]]] = []
-        self.moved: list[Floats] = []
         self.next = 0
         self.looks = np.zeros((0, self.options.patch[0] * self.options.patch[1]), np.float32)
 
-    def step(self, previous: NDArray[np.uint8] | None, image: NDArray[np.uint8], where: NDArray[np.uint8], matrix: Floats) -> None:
+    def step(self, previous: NDArray[np.uint8] | None, image: NDArray[np.uint8]) -> None:
         """Follow all points into the next frame, and find new ones."""
         self.frame += 1
-        self.moved.append(matrix)
         if previous is not None and len(self.ids):
             ahead, good = follow(previous, image, self.alive, options=self.options)
             self.alive = ahead
@@ -220,19 +219,11 @@ class _Book:
         for key, position in zip(self.ids.tolist(), self.alive, strict=True):
             self.histories[key][1].append(position)
         if self.frame % self.options.renew == 0:
-            self._replace(image, where)
+            self._replace(image)
 
-    def _replace(self, image: NDArray[np.uint8], where: NDArray[np.uint8]) -> None:
-        """New points where something moves, and a few where nothing does; points that rest elsewhere make room."""
-        x, y = np.rint(self.alive).astype(int).T.clip(0, [[image.shape[1] - 1], [image.shape[0] - 1]])
-        elsewhere = where[y, x] == 0
-        spare = elsewhere.sum() - int(self.options.rest * self.count)
-        if spare > 0:
-            old = [key for key in self.ids[elsewhere].tolist() if not self._moves(key)][:spare]
-            self._keep(~np.isin(self.ids, old))
-        self._detect(image, where, self.count - len(self.ids))
-        resting = int(self.options.rest * self.count) - max(0, int(elsewhere.sum()))
-        self._detect(image, 1 - (where > 0), min(resting, self.count - len(self.ids)))
+    def _replace(self, image: NDArray[np.uint8]) -> None:
+        """New points where there are none."""
+        self._detect(image, np.ones(image.shape, np.uint8), self.count - len(self.ids))
 
     def _detect(self, image: NDArray[np.uint8], mask: NDArray[Any], room: int) -> None:
         if room <= 0 or not mask.any():
@@ -241,7 +232,7 @@ class _Book:
         free = (mask > 0).astype(np.uint8)
         for x, y in self.alive.tolist():
             cv2().circle(free, (round(x), round(y)), apart, 0, -1)
-        found = cv2().goodFeaturesToTrack(image, room, 0.01, apart, mask=free, blockSize=7)
+        found = cv2().goodFeaturesToTrack(image, room, self.options.corner, apart, mask=free, blockSize=7)
         if found is None:
             return
         found = found.reshape(-1, 2)
@@ -256,6 +247,49 @@ class _Book:
         self._finish(self.ids[~good])
         self.alive, self.ids, self.looks = self.alive[good], self.ids[good], self.looks[good]
 
+    def _worth(self, key: int) -> bool:
+        """Whether a track that has ended is kept."""
+        return len(self.histories[key][1]) >= self.options.shortest
+
+    def _finish(self, keys: NDArray[np.int_]) -> None:
+        """Put tracks away, or forget those that are worth nothing."""
+        for key in keys.tolist():
+            if self._worth(key):
+                first, positions = self.histories[key]
+                self.done.append((first, np.array(positions)))
+            del self.histories[key]
+
+    def end(self) -> None:
+        """After the last frame."""
+        self._keep(np.zeros(len(self.ids), bool))
+
+
+class _MovingBook(Book):
+    """Points that move: they are looked for where something does."""
+
+    def __init__(self, count: int, options: TrackOptions):
+        super().__init__(count, options)
+        self.moved: list[Floats] = []
+        self.where = np.zeros((0, 0), np.uint8)
+
+    def look(self, previous: NDArray[np.uint8] | None, image: NDArray[np.uint8], where: NDArray[np.uint8], matrix: Floats) -> None:
+        """:meth:`step` into a frame of which is known where something moves, and how its camera did."""
+        self.moved.append(matrix)
+        self.where = where
+        self.step(previous, image)
+
+    def _replace(self, image: NDArray[np.uint8]) -> None:
+        """New points where something moves, and a few where nothing does; points that rest elsewhere make room."""
+        x, y = np.rint(self.alive).astype(int).T.clip(0, [[image.shape[1] - 1], [image.shape[0] - 1]])
+        elsewhere = self.where[y, x] == 0
+        spare = elsewhere.sum() - int(self.options.rest * self.count)
+        if spare > 0:
+            old = [key for key in self.ids[elsewhere].tolist() if not self._moves(key)][:spare]
+            self._keep(~np.isin(self.ids, old))
+        self._detect(image, self.where, self.count - len(self.ids))
+        resting = int(self.options.rest * self.count) - max(0, int(elsewhere.sum()))
+        self._detect(image, 1 - (self.where > 0), min(resting, self.count - len(self.ids)))
+
     def _moves(self, key: int) -> bool:
         first, positions = self.histories[key]
         image = transform(np.array(self.moved[first : first + len(positions)]), np.array(positions).astype(np.float64)[:, None])[
@@ -263,23 +297,17 @@ class _Book:
         ]
         return extent(image) > self.options.wandering
 
+    def _worth(self, key: int) -> bool:
+        return super()._worth(key) and self._moves(key)
+
     def _finish(self, keys: NDArray[np.int_]) -> None:
-        """Put tracks away, or forget those that are too short or do not move."""
-        for key in keys.tolist():
-            if len(self.histories[key][1]) >= self.options.shortest and self._moves(key):
-                first, positions = self.histories[key]
-                self.done.append((first, np.array(positions)))
-            del self.histories[key]
+        super()._finish(keys)
         if len(self.done) > 4 * self.count:  # bounded memory: the longest stay
             self.done = sorted(self.done, key=lambda track: -len(track[1]))[: 2 * self.count]
 
-    def end(self) -> None:
-        """After the last frame."""
-        self._keep(np.zeros(len(self.ids), bool))
-
 
 def _select(
-    book: _Book, camera: CameraMotion, scale: tuple[float, float], limit: float, complete: float, keep: int, options: TrackOptions
+    book: Book, camera: CameraMotion, scale: tuple[float, float], limit: float, complete: float, keep: int, options: TrackOptions
 ) -> tuple[Floats, list[str]]:
     """The tracks that live long enough and move, ``(frames, n, 2)``, and what to say about them."""
     frames = len(camera.times)

@@ -48,7 +48,7 @@ def test_pairs_show_the_same_moment_at_the_shift():
 def test_figures_count_right_believed_and_wrong(data, monkeypatch):
     answers = iter([(0, True), (1, True), (2, False), (0, True), (0, False), (0, False), (0, False), (0, True), (0, False)])
 
-    def told(a, b):
+    def told(a, b, measure):
         by, ok = next(answers)
         return SimpleNamespace(frames=truth[id(a)] + by, ok=ok)
 
