@@ -1,0 +1,30 @@
+"""Every statement of the thesis is measured again, and comes out as the page says."""
+
+from __future__ import annotations
+
+import pytest
+
+from experiments.thesis.checked import CHAPTERS
+from experiments.thesis.statements import Chapter, Finding, Statement
+
+STATEMENTS = [(chapter, statement) for chapter in CHAPTERS for statement in chapter.statements]
+
+
+@pytest.mark.parametrize(
+    ("chapter", "statement"), STATEMENTS, ids=[f"{c.number}-{s.measure.__name__}-{k}" for k, (c, s) in enumerate(STATEMENTS)]
+)
+def test_a_statement_comes_out_as_the_page_says(chapter: Chapter, statement: Statement) -> None:
+    *_, measured, verdict = statement.row()
+    assert verdict != "FAILS", f"{statement.place}: {statement.says}: {measured}"
+
+
+def test_what_contradicts_expectation_fails() -> None:
+    holds, breaks = (Statement("1, p. 1", "one", lambda value=value: Finding(value, "")) for value in (True, False))
+    corrected = Statement("1, p. 1", "one", breaks.measure, "two")
+    surprising = Statement("1, p. 1", "one", holds.measure, "two")
+    assert [s.row()[-1] for s in (holds, breaks, corrected, surprising)] == ["holds", "FAILS", "wrong as printed: two", "FAILS"]
+
+
+def test_chapters_come_in_order_and_each_states_something() -> None:
+    assert [chapter.number for chapter in CHAPTERS] == list(range(1, 11))
+    assert all(chapter.statements for chapter in CHAPTERS)
