@@ -119,6 +119,24 @@ def measured(names: Sequence[str], table: Callable[[str], list[Row]], target: Pa
     note(f"written: {target}")
 
 
+def noise_tables(tables: Mapping[str, Callable[[], tuple[Sequence[str], list[Sequence[str]]]]], config: NoiseConfig) -> None:
+    """Print tables of words, each a head and lines, on one thread, and write them to the file of their configuration.
+
+    Raises:
+        ValueError: no scenes, or a file that cannot be written; said before anything is measured.
+    """
+    target = config.target()
+    kept = {}
+    with threads(1):
+        for title, table in tables.items():
+            note(f"... {title}")
+            head, lines = table()
+            print(f"\n### {title}\n\n{aligned(head, lines)}", flush=True)
+            kept[title] = [dict(zip(head, line, strict=True)) for line in lines]
+    write_json(target, {"manifest": manifest(vars(config), seed=config.seed), "tables": kept})
+    note(f"written: {target}")
+
+
 def measured_on_one_thread(tables: Mapping[str, Callable[[C], list[Row]]], config: C, out: Path) -> None:
     """:func:`measured` of named tables of one configuration, which goes into the file, without the noise of threads.
 

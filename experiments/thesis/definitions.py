@@ -67,13 +67,13 @@ def rotation(angles: Tensor) -> Tensor:
     return turned
 
 
-def cameras(count: int, draw: torch.Generator, distance: float = 6.0) -> Tensor:
-    """Cameras ``K [R | t]`` that look at the origin from a few units away, pixels."""
+def cameras(count: int, draw: torch.Generator, distance: float = 6.0, turn: float = 0.25) -> Tensor:
+    """Cameras ``K [R | t]`` that look at the origin from a few units away, pixels; each angle is at most ``turn`` radians."""
     K = torch.tensor([[FOCAL, 0, CENTRE[0]], [0, FOCAL, CENTRE[1]], [0, 0, 1]], dtype=torch.float64)
     views = []
     for _ in range(count):
         t = torch.tensor([0, 0, distance], dtype=torch.float64) + 0.8 * normal(3, draw=draw)
-        views.append(K @ torch.cat([rotation(0.25 * uniform(3, draw=draw)), t[:, None]], -1))
+        views.append(K @ torch.cat([rotation(turn * uniform(3, draw=draw)), t[:, None]], -1))
     return torch.stack(views)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import torch
 from torch import Tensor
@@ -10,6 +11,7 @@ from torch.nn.functional import normalize
 
 from dyntorch.core.fit import fit_matches
 from dyntorch.core.matches import Matches, matches
+from dyntorch.core.matrix import gram
 from dyntorch.core.normalize import Normalization, denormalize_motion
 from dyntorch.core.outcome import Notice, Status, failed, in_order, noting
 from dyntorch.core.primitives import Line, direction
@@ -383,6 +385,8 @@ def _result(
     status = torch.where(worst > options.lines.ambiguous, int(Status.AMBIGUOUS), torch.zeros_like(present))
     status = torch.where(accident, int(Status.NO_CONSENSUS), status)
     rank = _rank(lines, labels, sigma, usable, points, options)
+    doubtful = (rank < MINIMAL) & (status == Status.OK)
+    status = torch.where(doubtful & _rivals(lines, theta, labels, points, doubtful, options), int(Status.AMBIGUOUS), status)
     status = torch.where((rank <= RANKS[-1][0]) & (status == Status.OK), int(Status.AMBIGUOUS), status)
     status = torch.where(extent[:, 0] <= options.lines.indeterminate * extent[:, 1], int(Status.DEGENERATE), status)
     status = torch.where(usable, status, start.status.to(status))
@@ -399,6 +403,40 @@ def _result(
         ambiguity=AMBIGUITY,
         notices=_notices(rank, worst, none, status != Status.TOO_FEW, data.batch, options),
     )
+
+
+def _rivals(
+    lines: Lines,
+    theta: Tensor,
+    labels: Tensor,
+    points: tuple[Tensor, Tensor] | None,
+    doubtful: Tensor,
+    options: AlignOptions,
+) -> Tensor:
+    """Whether another motion ``(b,)``, far from this one, explains the lines about as well.
+
+    A space of linear solutions may hold several that are motions, each certain by itself: of the lines of one translating body with
+    two or three static points, exact ones, two to four.  Descents from the weakest directions of the matrix, and
+    from between them, find them.
+    """
+    found = torch.zeros_like(doubtful)
+    if not bool(doubtful.any()):
+        return found
+    model, problem = TranslatingLinesMatrix(), lines.problem(labels)
+    joined = _joined(lines.data.restricted(labels != OUTLIER), points)
+    _, vectors = spectrum(gram(model.primitives, lines.norm.apply(model, joined.views), joined.weights))
+    best, here = problem.normal_equations(theta)[0], unit(theta.unflatten(-1, (4, 4)))
+    weakest = vectors[..., : options.lines.starts].unbind(-1)
+    mixed = [one + sign * two for one, two in combinations(weakest, 2) for sign in (1, -1)]
+    for flat in (*weakest, *mixed):
+        start = model.decompose(flat.unflatten(-1, (6, 6))).flatten(1)
+        other = refined(lines, torch.where(start.isfinite(), start, theta), labels)
+        there = unit(other.unflatten(-1, (4, 4)))
+        far = (
+            torch.minimum((there - here).flatten(1).norm(dim=-1), (there + here).flatten(1).norm(dim=-1)) > options.lines.uncertain
+        )
+        found |= far & (problem.normal_equations(other)[0] <= options.lines.rival * best)
+    return found & doubtful
 
 
 def _rank(

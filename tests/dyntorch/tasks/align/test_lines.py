@@ -74,6 +74,14 @@ class TestPureTranslation:
         found = align_lines(*scene.views, static_points=points, threshold=1e-3, generator=draw(11)).check()
         assert bool((relative_error(found.A, scene.motion[0]) < 1e-6).all())
 
+    def test_noise_does_not_decide_what_the_lines_leave_open(self) -> None:
+        kind = {"motion": "objects", "objects": 1, "static_points": 2}
+        for sigma in (0.0, 0.001):
+            scene = scenes.translating_lines(90, batch=3, sigma=sigma, generator=draw(14), **kind)
+            points = (scene.extras["points1"], scene.extras["points2"])
+            found = align_lines(*scene.views, static_points=points, threshold=max(3 * sigma, 1e-6), generator=draw(15))
+            assert bool((found.status != Status.OK).all())
+
     def test_with_noise(self) -> None:
         scene = scenes.translating_lines(60, batch=3, sigma=0.005, motion="translation", static_points=4, generator=draw(12))
         points = (scene.extras["points1"], scene.extras["points2"])
