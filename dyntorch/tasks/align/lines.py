@@ -34,6 +34,7 @@ from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment, Alig
 # Lines that move in planes, static lines and static points between two views: residuals, refinement, labels.
 
 
+FIVE = 5  # static lines that determine a collineation
 DESCENT = LeastSquaresOptions(iterations=12, stuck_damping=1e5, tolerance=1e-10)
 DOF = TranslatingLinesMatrix.dof
 
@@ -338,9 +339,60 @@ def _align(
     usable = ~failed(start.status)
     lines = Lines.of(flat, points, start.normalization)
     theta = torch.where(usable[:, None], start.normalized_motion()[0].flatten(1), torch.eye(4).to(flat.weights).flatten() / 2)
+    if not plain:
+        bound = three_sigma(1) * (_noise(lines, theta, plain) if given is None else given.maximum(lines.floor)).square()
+        theta = _better(lines, theta, usable, bound, generator, options)
     sigma = _noise(lines, theta, plain) if given is None else given.maximum(lines.floor)
     theta, labels, sigma = settle(lines, theta, sigma, estimate=given is None, plain=plain, options=options)
     return _result(data, lines, start, theta, labels, sigma, usable, points, options)
+
+
+def _from_static(lines: Lines, bound: Tensor, generator: torch.Generator | None, options: AlignOptions) -> Tensor:
+    """A ``(b, 16)`` that the most lines agree with that did not move, of those that five random lines determine.
+
+    A static line gives four equations, :math:`\pi^T A\, q = 0` for two planes through it and two of its points.  Four lines
+    would be enough to count, but collineations of one parameter keep any four lines (and their two transversals); five have
+    none.  A sample of 35 lines without an outlier is rare where one in five is one: .8^35 = .0004.
+    """
+    first, second = lines.views
+    planes = torch.linalg.qr(homogeneous(first).mT, mode="complete").Q[..., 2:].mT  # (b, n, 2, 4) through the line in view 1
+    planes = planes / planes[..., :3].norm(dim=-1, keepdim=True).clamp(min=1e-12)
+    rows = (planes[..., :, None, :, None] * homogeneous(second)[..., None, :, None, :]).flatten(-2).flatten(-3, -2)  # (b, n, 4, 16)
+    rows = torch.where((lines.data.weights > 0)[..., None, None], rows, 0.0)
+    draw = torch.randint(rows.shape[1], (options.lines.samples, FIVE), generator=generator).to(rows.device)
+    sample = rows[:, draw].flatten(2, 3)  # (b, samples, 16, 16)
+    found = spectrum(sample.mT @ sample)[1][..., 0]
+    present = lines.data.weights > 0
+
+    def agree(motion: Tensor, times: float) -> Tensor:
+        """Which lines ``(b, samples, n)`` are where ``motion (b, samples, 16)`` takes them, to a multiple of the bound."""
+        moved = homogeneous(second)[:, None] @ motion.unflatten(-1, (4, 4))[:, :, None].mT  # (b, samples, n, 2, 4)
+        away = (moved @ planes[:, None].mT / moved[..., 3:]).square().amax((-2, -1)) / lines.norm.scales[0][:, None, None].square()
+        return (away <= times**2 * bound[:, None, None]) & present[:, None]
+
+    support = agree(found, options.lines.loose).sum(-1)
+    best = found.gather(1, support.argmax(-1)[:, None, None].expand(-1, 1, 16))
+    for times in (options.lines.loose, options.lines.loose / 2, 1.0):  # more lines and less noise in each turn
+        kept = rows * agree(best, times)[:, 0, :, None, None]
+        best = spectrum(torch.einsum("bnij,bnik->bjk", kept, kept))[1][:, None, :, 0]
+    return best[:, 0]
+
+
+def _better(
+    lines: Lines, theta: Tensor, usable: Tensor, bound: Tensor, generator: torch.Generator | None, options: AlignOptions
+) -> Tensor:
+    """The start, or where few lines agree with it that of :func:`_from_static`, if its truncated squared error is less."""
+    present = lines.data.weights > 0
+
+    def squares(motion: Tensor) -> Tensor:
+        return torch.where(present, lines.moving(motion).square().nan_to_num(torch.inf).minimum(bound[:, None]), 0.0)
+
+    here = squares(theta)
+    doubtful = usable & (((here < bound[:, None]) & present).sum(-1) < options.lines.agreed * present.sum(-1))
+    if not bool(doubtful.any()):
+        return theta
+    other = _from_static(lines, bound, generator, options)
+    return torch.where((doubtful & (squares(other).sum(-1) < here.sum(-1)))[:, None], other, theta)
 
 
 def _joined(data: Matches, points: tuple[Tensor, Tensor] | None) -> Matches:

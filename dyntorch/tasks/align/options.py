@@ -175,6 +175,12 @@ class AlignLinesOptions:
     """The same from which on a notice is given."""
     indeterminate: float = 1e-13
     """Information on the worst direction over that on the best, below which it is rounding error."""
+    agreed: float = 0.65
+    """Share of lines that agree with the robust start below which a start from static lines is tried: wrong ones reach .54."""
+    samples: int = 2000
+    """Samples of five lines that may stand still: eight of them are clean where a third of the lines is static."""
+    loose: float = 4.0
+    """Times the threshold within which a line agrees with such a sample, whose noise is that of five lines."""
     starts: int = 4
     """Weakest directions of the matrix from which, and from between which, another motion is looked for where its rank is short."""
     rival: float = 1.3

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -43,6 +44,14 @@ def test_a_few_outliers() -> None:
     found = align_lines(*scene.views, threshold=0.006, generator=draw(5)).check()
     assert bool((relative_error(found.A, scene.motion[0]) < 0.01).all())
     assert float((found.labels == OUTLIER)[scene.labels == OUTLIER].double().mean()) > 0.9
+
+
+def test_static_lines_help_where_samples_of_many_lines_are_never_clean() -> None:
+    scene = scenes.translating_lines(120, batch=6, sigma=0.005, static=0.4, outliers=0.2, generator=draw(0))
+    scene = replace(scene, views=tuple(v[1:3] for v in scene.views), motion=(scene.motion[0][1:3],), labels=scene.labels[1:3])
+    found = align_lines(*scene.views, threshold=0.015, generator=draw(1)).check()
+    assert bool((relative_error(found.A, scene.motion[0]) < 0.02).all())
+    assert bool(((found.labels == scene.labels).double().mean(-1) > 0.95).all())
 
 
 def test_pluecker_coordinates_give_the_same_motion() -> None:
