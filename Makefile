@@ -71,18 +71,26 @@ bench: install
 tables: install
 	@echo "All tables: hours.  Each is a command of its own, below, and prints its table as it ends."
 	$(PIP) --constraint constraints.txt --editable '.[experiments]'
+	$(BIN)/python -m experiments.thesis.checked
 	$(BIN)/python -m experiments.alignment.planar_noise
 	$(BIN)/python -m experiments.alignment.space_noise
 	$(BIN)/python -m experiments.alignment.robust_estimation
+	$(BIN)/python -m experiments.alignment.dual_homography
+	$(BIN)/python -m experiments.alignment.lines
 	$(BIN)/python -m experiments.reconstruction.noise
 	$(BIN)/python -m experiments.reconstruction.outliers
 	$(BIN)/python -m experiments.reconstruction.trajectories
+	$(BIN)/python -m experiments.reconstruction.joint_epipoles
 	$(BIN)/python -m experiments.segmentation.matrix_noise
 	$(BIN)/python -m experiments.segmentation.translating_planes
+	$(BIN)/python -m experiments.segmentation.affine_bodies
+	$(BIN)/python -m experiments.segmentation.convergent
+	$(BIN)/python -m experiments.segmentation.multibody
 	$(BIN)/python -m experiments.segmentation.segmentation
 	$(BIN)/python -m experiments.segmentation.sensitivity
 	$(BIN)/python -m experiments.synchronization.synchronization
 	$(BIN)/python -m experiments.synchronization.brightness
+	$(BIN)/python -m experiments.synchronization.cameras
 	$(BIN)/python -m experiments.reconstruction.pair
 	$(BIN)/python -m experiments.reconstruction.real
 	$(BIN)/python -m experiments.alignment.real.planar
@@ -91,6 +99,7 @@ tables: install
 	$(BIN)/python -m experiments.recognition.action_recognition
 	$(BIN)/python -m experiments.recognition.action_baselines
 	$(BIN)/python -m experiments.recognition.dynamic_shape
+	$(BIN)/python -m experiments.recognition.shape_tensor
 	$(BIN)/python -m experiments.recognition.recognition_protocol
 	$(BIN)/python -m experiments.recognition.open_set
 	$(BIN)/python -m experiments.recognition.detection

@@ -348,7 +348,7 @@ def _align(
 
 
 def _from_static(lines: Lines, bound: Tensor, generator: torch.Generator | None, options: AlignOptions) -> Tensor:
-    """A ``(b, 16)`` that the most lines agree with that did not move, of those that five random lines determine.
+    r"""A ``(b, 16)`` that the most lines agree with that did not move, of those that five random lines determine.
 
     A static line gives four equations, :math:`\pi^T A\, q = 0` for two planes through it and two of its points.  Four lines
     would be enough to count, but collineations of one parameter keep any four lines (and their two transversals); five have
