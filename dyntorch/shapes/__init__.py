@@ -1,7 +1,8 @@
 """Shapes of points seen by uncalibrated cameras, every view by another one: standing still (``static``), or moving in time.
 
-``basis`` says how a point may move, ``moving`` finds the shapes, ``times`` when a new view was taken; ``theory`` holds what the
-thesis proves of dynamic shape tensors and nothing else needs.
+``basis`` says how a point may move, ``moving`` finds the shapes, ``times`` when a new view was taken; ``projective`` does both for
+perspective views, ``lifted`` is of shapes of P^k; ``theory`` holds what the thesis proves of dynamic shape tensors and nothing else
+needs.
 """
 
 from __future__ import annotations
@@ -15,6 +16,9 @@ _HOME = {
     "MovingShapes": "dyntorch.shapes.moving",
     "ShapesOptions": "dyntorch.shapes.options",
     "RecoveryOptions": "dyntorch.shapes.options",
+    "fit_perspective_shapes": "dyntorch.shapes.projective",
+    "recover_perspective_times": "dyntorch.shapes.projective",
+    "PerspectiveOptions": "dyntorch.shapes.options",
     "recover_times": "dyntorch.shapes.times",
     "Recovery": "dyntorch.shapes.times",
 }

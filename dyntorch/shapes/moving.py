@@ -468,7 +468,7 @@ def fit_shapes(
         (True, False)
     """
     check_options(options, ShapesOptions)
-    batch, views, times = _checked(x, rows, weights, share)
+    batch, views, times = checked_views(x, rows, weights, share)
     few = _few(views, times)
     shapes, cost = _best(views, times, iterations, options)
     uncertainty, noise, free = _uncertainty(views, times, shapes, cost, options)
@@ -480,7 +480,9 @@ def fit_shapes(
     return MovingShapes(*done, status=status_of(free, few).reshape(batch))
 
 
-def _checked(x: Tensor, rows: Tensor, weights: Tensor | None, share: Tensor | None) -> tuple[tuple[int, ...], AffineViews, Tensor]:
+def checked_views(
+    x: Tensor, rows: Tensor, weights: Tensor | None, share: Tensor | None
+) -> tuple[tuple[int, ...], AffineViews, Tensor]:
     """Batch, flat centred views and flat rows."""
     if x.ndim < 3 or x.shape[-1] != 2 or not x.is_floating_point():
         raise ValueError(f"x must be floating point (*batch, views, n, 2), got {tuple(x.shape)} {x.dtype}")

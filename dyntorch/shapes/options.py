@@ -52,3 +52,23 @@ class RecoveryOptions:
     """Minima of the grid that are refined."""
     steps: int = 8
     """Gauss-Newton steps in the time; exact data need 4 from a grid of 64, noise of 3 % 6."""
+
+
+@dataclass(frozen=True)
+class PerspectiveOptions:
+    """Every number that decides about perspective cameras in :func:`dyntorch.shapes.fit_perspective_shapes`."""
+
+    steps: int = 2
+    """Gauss-Newton steps from the linear camera."""
+    nearest: float = 0.05
+    """Least depth of a point, in parts of that of the middle of the shape."""
+    depth: float = 0.15
+    """Relative depths of points to expect, RMS: people before a camera at 2 m have .1 to .15, at 4.5 m .05."""
+    first_depth: float = 1.0
+    """The same in the first round, whose noise is what affine cameras leave (.15: 1.5 to 2 times as many steps)."""
+    rounds: int = 8
+    """Descents at most, each with the noise that the last one left: the cameras leave the affine ones step by step."""
+    settled: float = 0.8
+    """Of the noise of the last round, above which it is the noise of the views and no more rounds follow."""
+    affine: ShapesOptions = ShapesOptions()
+    """Of the affine shapes from which the descent starts."""

@@ -98,21 +98,13 @@ def recover_times(
         (True, 0.3)
     """
     check_options(options, RecoveryOptions)
-    if x.ndim < 3 or x.shape[-1] != 2 or shapes.ndim < 3 or shapes.shape[-1] != 3 or shapes.shape[-2] != x.shape[-2]:
-        raise ValueError(
-            f"expected shapes (*batch, B, n, 3) and x (*batch, views, n, 2), got {tuple(shapes.shape)}, {tuple(x.shape)}"
-        )
-    if shapes.shape[-3] != basis.size:
-        raise ValueError(f"{basis!r} has {basis.size} functions, shapes {tuple(shapes.shape)} have {shapes.shape[-3]}")
-    if grid < 3:
-        raise ValueError(f"grid must be at least 3 times, got {grid}")
+    times = tried_times(shapes, basis, x, grid, interval)
     batch = np.broadcast_shapes(shapes.shape[:-3], x.shape[:-3])
     flat = prod(batch)
     wide = shapes.double().expand(*batch, *shapes.shape[-3:]).reshape(flat, *shapes.shape[-3:])
     seen = x.double().expand(*batch, *x.shape[-3:]).reshape(flat, *x.shape[-3:])
     weight = None if weights is None else weights.double().expand(*batch, *x.shape[-3:-1]).reshape(flat, *x.shape[-3:-1])
     views = centred_views(seen, weight)
-    times = _grid(basis, grid, interval, wide)
     step = max(1, CHUNK // (grid * 16 * max(1, flat)))
     pieces = [slice(i, i + step) for i in range(0, max(1, views.x.shape[1]), step)]
     parts = [_recovered(wide, basis, times, views.x[:, p], views.weights[:, p], options) for p in pieces]
@@ -127,10 +119,19 @@ def recover_times(
     return Recovery(*(part.reshape(*batch, known.shape[-1]).to(x.dtype) for part in done), status=status)
 
 
-def _grid(basis: Trajectory, count: int, interval: tuple[float, float], like: Tensor) -> Tensor:
+def tried_times(shapes: Tensor, basis: Trajectory, x: Tensor, count: int, interval: tuple[float, float]) -> Tensor:
+    """The times of a grid, float64, for shapes and views that agree."""
+    if x.ndim < 3 or x.shape[-1] != 2 or shapes.ndim < 3 or shapes.shape[-1] != 3 or shapes.shape[-2] != x.shape[-2]:
+        raise ValueError(
+            f"expected shapes (*batch, B, n, 3) and x (*batch, views, n, 2), got {tuple(shapes.shape)}, {tuple(x.shape)}"
+        )
+    if shapes.shape[-3] != basis.size:
+        raise ValueError(f"{basis!r} has {basis.size} functions, shapes {tuple(shapes.shape)} have {shapes.shape[-3]}")
+    if count < 3:
+        raise ValueError(f"grid must be at least 3 times, got {count}")
     if basis.period is None:
-        return torch.linspace(*interval, count, dtype=like.dtype, device=like.device)
-    return torch.arange(count, dtype=like.dtype, device=like.device) * (basis.period / count)
+        return torch.linspace(*interval, count, dtype=torch.float64, device=x.device)
+    return torch.arange(count, dtype=torch.float64, device=x.device) * (basis.period / count)
 
 
 def _recovered(
@@ -138,7 +139,7 @@ def _recovered(
 ) -> tuple[Tensor, ...]:
     """Residual, time, sigma, second and rise of one piece of the views, ``(b, views)`` each."""
     curve = residuals_at(shapes, basis.rows(times), x, weights)
-    start, lone = _minima(curve, basis.period is not None, options.minima)
+    start, lone = lowest_minima(curve, basis.period is not None, options.minima)
     step = times[1] - times[0]
     within = times if basis.period is None else None
     t, f, h = _refined(shapes, basis, times[start], step, x, weights, within, options.steps)
@@ -170,7 +171,7 @@ def residuals_at(shapes: Tensor, rows: Tensor, x: Tensor, weights: Tensor) -> Te
     return 1 - torch.linalg.solve_triangular(factor, inner, upper=False).square().sum((-2, -1))
 
 
-def _minima(curve: Tensor, periodic: bool, count: int) -> tuple[Tensor, Tensor]:
+def lowest_minima(curve: Tensor, periodic: bool, count: int) -> tuple[Tensor, Tensor]:
     """Places ``(b, views, minima)`` of the deepest local minima of curves, and which of them are none."""
     if periodic:
         before, after = curve.roll(1, -1), curve.roll(-1, -1)

@@ -380,6 +380,13 @@ VERBS: tuple[Verb, ...] = (
         lambda: (moving_shapes()[2], moving_shapes()[0]),
         lambda s, x: dyn.shapes.recover_times(s, dyn.Polynomial(1), x),
     ),
+    Verb("fit_perspective_shapes", lambda: moving_shapes()[:2], dyn.shapes.fit_perspective_shapes, tolerance=1e-4),
+    Verb(
+        "recover_perspective_times",
+        lambda: (moving_shapes()[2], moving_shapes()[0]),
+        lambda s, x: dyn.shapes.recover_perspective_times(s, dyn.Polynomial(1), x),
+        tolerance=1e-4,
+    ),
     Verb(
         "canonical_correlation",
         lambda: (randn(2, 20, 2), randn(2, 20, 2, seed=1)),
@@ -432,6 +439,8 @@ WAITS = {
     "translating_planes": (150, f"{FITS}; {STEPS}; one for every notice"),
     "bundle_adjust": (50, STEPS),
     "fit_shapes": (60, STEPS),
+    "fit_perspective_shapes": (150, STEPS),
+    "recover_perspective_times": (2, ASKED),
     "ShapeTensor": (40, f"{FITS}; {STEPS}"),
     "LiftedShapeTensor": (60, f"{FITS}; {STEPS}"),
     "DynamicShapeTensor": (60, f"{FITS}; {STEPS}"),

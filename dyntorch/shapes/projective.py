@@ -1,0 +1,396 @@
+r"""Moving shapes from single perspective views at known times, and when a new view was taken: all points at once.
+
+A view of points :math:`X_i(t) = \sum_b c_b(t) X_{bi}` by any camera of the plane is, up to a similarity of the view,
+
+.. math:: x_i = \frac{A^T X_i + b}{1 + m^T X_i}, \qquad A\ (3 \times 2),\ b\ (2),\ m\ (3),
+
+with m = 0 for affine cameras: :math:`m^T X_i` is how much further than the middle of the shape a point is, in parts of the
+distance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from math import prod
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dyntorch.core.outcome import status_of
+from dyntorch.numerics.arguments import check_options
+from dyntorch.numerics.blocks import one_thread
+from dyntorch.numerics.least_squares import LeastSquaresOptions, NormalEquations, minimize
+from dyntorch.numerics.nullspace import eigenvalues
+from dyntorch.shapes.basis import Trajectory
+from dyntorch.shapes.moving import (
+    GAUGE,
+    AffineViews,
+    MovingShapes,
+    canonical,
+    centred_views,
+    checked_views,
+    fit_shapes,
+    framed,
+    shapes_at,
+)
+from dyntorch.shapes.options import PerspectiveOptions, RecoveryOptions
+from dyntorch.shapes.times import Recovery, lowest_minima, tried_times
+
+CAMERA = 11
+CHUNK = 1 << 22
+"""Numbers in the largest temporary."""
+RIDGE = 1e-13
+
+
+@dataclass(frozen=True)
+class PerspectiveViews:
+    """Views beside the best perspective images of a shape at each view.
+
+    Attributes:
+        residual: ``(..., 3 n)`` of each point measurement minus image, two numbers, and its relative depth by the root of the
+            prior; all by the root of the weights.
+        cost: ``(...)`` its square sum without the prior.
+        slopes: ``(..., n, 3, 3)`` of the three numbers of the image of each point by the point.
+        columns: ``(..., 3 n, 11)`` of them by the camera.
+        inverse: ``(..., 11, 11)`` of their Gram.
+        depth: ``(..., n)`` the depths of the points, 1 in the middle.
+    """
+
+    residual: Tensor
+    cost: Tensor
+    slopes: Tensor
+    columns: Tensor
+    inverse: Tensor
+    depth: Tensor
+
+    def across(self, x: Tensor) -> Tensor:
+        """What no camera takes away of columns ``(..., 3 n, k)``."""
+        return x - self.columns @ (self.inverse @ (self.columns.mT @ x))
+
+
+def perspective(x: Tensor, weights: Tensor, shape: Tensor, prior: Tensor | float, options: PerspectiveOptions) -> PerspectiveViews:
+    r"""The best perspective image of a shape in each view: a linear solution, then Gauss-Newton steps.
+
+    Args:
+        x: ``(..., n, 2)`` views, finite; weights: ``(..., n)``.
+        shape: ``(..., n, 3)``.
+        prior: noise variance over that of the relative depths; its cost is :math:`\kappa \sum_i w_i (m^T X_i)^2 / n`.
+        options: how many steps, and how near to the camera a point may be.
+    """
+    root = weights.sqrt()
+    total = weights.sum(-1)[..., None, None].clamp(min=1e-300)
+    points = shape - (shape * weights[..., None]).sum(-2, keepdim=True) / total
+    square = (points * weights[..., None]).mT @ points / total
+    # in a frame of unit spread: points of a plane keep a camera
+    eye = torch.eye(3, dtype=x.dtype, device=x.device)
+    trace = square.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
+    factor = torch.linalg.cholesky_ex(square + (1e-12 * trace + 1e-300) * eye)[0]
+    points = torch.linalg.solve_triangular(factor, points.mT, upper=False).mT
+    pull = (
+        torch.as_tensor(prior, dtype=x.dtype, device=x.device).expand(x.shape[:-2]).sqrt()[..., None] * root / total[..., 0].sqrt()
+    )
+    camera = _camera(points, x, torch.ones_like(root), root, torch.nn.functional.pad(x * root[..., None], (0, 1)), pull)[0]
+    for step in range(options.steps + 1):
+        depth = (1 + (points @ camera[..., 8:, None])[..., 0]).clamp(min=options.nearest)
+        image = (points @ camera[..., :6].unflatten(-1, (3, 2)) + camera[..., None, 6:8]) / depth[..., None]
+        error = torch.cat([(x - image) * root[..., None], (pull * (1 - depth))[..., None]], dim=-1)
+        change, columns, inverse = _camera(points, image, depth, root, error, pull)
+        if step < options.steps:
+            camera = camera + change
+    affine, lean = camera[..., :6].unflatten(-1, (3, 2)).mT, camera[..., 8:]
+    own = (affine[..., None, :, :] - image[..., None] * lean[..., None, None, :]) * (root / depth)[..., None, None]
+    own = torch.cat([own, pull[..., None, None] * lean[..., None, None, :]], dim=-2)
+    # back to the frame of the shape: a point moves by factor^-1 of what it moves there
+    own = torch.linalg.solve_triangular(factor[..., None, :, :], own, upper=False, left=False)
+    return PerspectiveViews(error.flatten(-2), error[..., :2].square().sum((-2, -1)), own, columns, inverse, depth)
+
+
+def _camera(
+    points: Tensor, image: Tensor, depth: Tensor, root: Tensor, wanted: Tensor, pull: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Least squares change of the camera for ``wanted`` changes ``(..., n, 3)``, the columns, and the inverse of their Gram."""
+    wide = torch.nn.functional.pad(points, (0, 1), value=1.0)  # of A and b, each for both coordinates
+    eye = torch.eye(2, dtype=points.dtype, device=points.device)
+    above = (wide[..., None, :, None] * eye[:, None]).flatten(-2)  # (.., n, 2, 8)
+    columns = torch.cat([above, -image[..., None] * points[..., None, :]], dim=-1) * (root / depth)[..., None, None]
+    held = torch.nn.functional.pad(pull[..., None] * points, (CAMERA - 3, 0))
+    columns = torch.cat([columns, held[..., None, :]], dim=-2).flatten(-3, -2)
+    gram = columns.mT @ columns
+    scale = gram.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).rsqrt()
+    whole = torch.eye(CAMERA, dtype=points.dtype, device=points.device)
+    even = gram * scale[..., None, :] * scale[..., :, None] + RIDGE * whole
+    inverse = torch.linalg.inv_ex(even)[0] * scale[..., None, :] * scale[..., :, None]
+    return (inverse @ (columns.mT @ wanted.flatten(-2)[..., None]))[..., 0], columns, inverse
+
+
+@dataclass(frozen=True)
+class PerspectiveDescent(NormalEquations):
+    """The shapes that leave the least, the perspective cameras eliminated (variable projection, Kaufman's Jacobian).
+
+    Attributes:
+        views: see :class:`~dyntorch.shapes.moving.AffineViews`.
+        rows: ``(b, views, B)`` values of the basis functions.
+        prior: ``(b,)`` see :func:`perspective`.
+        options: of the cameras.
+    """
+
+    views: AffineViews
+    rows: Tensor
+    prior: Tensor
+    options: PerspectiveOptions
+
+    def at(self, theta: Tensor) -> PerspectiveViews:
+        """All views beside the shapes of parameters ``(b, 3 n B)``."""
+        shapes = shapes_at(theta.unflatten(1, (self.rows.shape[-1], -1, 3)), self.rows)
+        return perspective(self.views.x, self.views.weights, shapes, self.prior[:, None], self.options)
+
+    def parts(self, theta: Tensor) -> tuple[Tensor, ...]:
+        """The shapes in their canonical form: what no view can tell does not run away."""
+        return (canonical(theta.unflatten(1, (self.rows.shape[-1], -1, 3))),)
+
+    def subset(self, keep: Tensor) -> PerspectiveDescent:
+        """Some of the problems."""
+        return PerspectiveDescent(self.views.subset(keep), self.rows[keep], self.prior[keep], self.options)
+
+    def normal_equations(self, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Cost ``(b,)``, gradient ``(b, p)`` and matrix ``(b, p, p)``."""
+        found, rows = self.at(theta), self.rows
+        b, _, n = self.views.weights.shape
+        size = rows.shape[-1]
+        share = self.views.share
+        own = torch.eye(n, dtype=theta.dtype, device=theta.device)
+        whole = (found.slopes[..., None, :] * own[:, None, :, None]).flatten(-2).flatten(2, 3)
+        slope = found.across(whole) * share.sqrt()[..., None, None]  # (b, v, 3 n, 3 n)
+        residual = found.residual * share.sqrt()[..., None]
+        gradient = (rows.mT @ -(slope.mT @ residual[..., None])[..., 0]).flatten(1)
+        lifted = (rows[..., None] * rows[..., None, :]).flatten(2)
+        matrix = (lifted.mT @ (slope.mT @ slope).flatten(2)).reshape(b, size, size, 3 * n, 3 * n)
+        matrix = matrix.permute(0, 1, 3, 2, 4).reshape(b, size * n * 3, size * n * 3)
+        cost = residual.square().sum((-2, -1))
+        return torch.where(cost.isfinite(), cost, torch.inf), gradient, matrix
+
+
+@one_thread
+def fit_perspective_shapes(
+    x: Tensor,
+    rows: Tensor,
+    weights: Tensor | None = None,
+    *,
+    share: Tensor | None = None,
+    iterations: int = 60,
+    options: PerspectiveOptions = PerspectiveOptions(),
+) -> MovingShapes:
+    r"""Learn how n points move from single perspective views of them, all points at once, each view by another camera.
+
+    .. math:: \min_{X_b, A_v, b_v, m_v} \sum_v \sum_i \Big| x_{vi} - \frac{A_v^T X_i(t_v) + b_v}{1 + m_v^T X_i(t_v)} \Big|^2
+              + \kappa \sum_v \frac 1n \sum_i (m_v^T X_i(t_v))^2
+
+    from the affine shapes of :func:`~dyntorch.shapes.fit_shapes`, with :math:`\kappa` falling to the noise variance over that of
+    the relative depths that people have before cameras: it vanishes with the noise, and where perspective is weaker than noise
+    the cameras are affine.  A descent: 20 of 21 exact scenes (9 and 14 points, 20 and 30 views, distance 8) end at the shapes to
+    rounding, the other one in another minimum, with more ``uncertainty`` than is told from noise.
+
+    Args:
+        x: ``(*batch, views, n, 2)`` image points in any unit, n >= 6; NaN = missing.
+        rows: ``(*batch, views, B)`` or ``(views, B)`` values of the basis functions at the time of each view, the first one 1.
+        weights: ``(*batch, views, n)``, 0 = ignore.
+        share: ``(*batch, views)`` weight of whole views.
+        iterations: steps of each descent at most.
+        options: every number that decides; ``dataclasses.replace`` changes some of them.
+
+    Returns:
+        :class:`~dyntorch.shapes.MovingShapes`: its shapes are up to a constant affine frame (a collineation where nothing moves).
+
+    Raises:
+        ValueError: shapes that do not agree, or fewer than six points.
+
+    Source: thesis chapter 4 (dynamic shape tensors of projective cameras); Golub and Pereyra 1973.
+
+    Example:
+        >>> import torch
+        >>> from dyntorch import Polynomial
+        >>> g = torch.Generator().manual_seed(0)
+        >>> t = torch.linspace(-1, 1, 14).double()
+        >>> points = torch.randn(9, 3, generator=g).double() + t[:, None, None] * 0.5 * torch.randn(9, 3, generator=g).double()
+        >>> seen = points @ torch.linalg.qr(torch.randn(14, 3, 3, generator=g).double())[0]
+        >>> found = fit_perspective_shapes(seen[..., :2] / (8 + seen[..., 2:]), Polynomial(1).rows(t))
+        >>> bool(found.residual.max() < 1e-12), found.counted()
+        (True, '1 OK')
+    """
+    check_options(options, PerspectiveOptions)
+    if x.ndim > 2 and x.shape[-2] < 6:
+        raise ValueError(f"x needs at least 6 points, five of which a camera takes anywhere, got {x.shape[-2]}")
+    batch, views, times = checked_views(x, rows, weights, share)
+    views = replace(views, share=views.share * ((views.weights > 0).sum(-1) > 5))
+    affine = fit_shapes(views.x, times, views.weights, share=views.share, iterations=iterations, options=options.affine)
+    shapes, noise = affine.shapes, affine.noise
+    few = _spare(views, times) < 0
+    for round_ in range(options.rounds):
+        # what affine cameras leave is perspective for the most part, no noise
+        descent = PerspectiveDescent(views, times, (noise / (options.depth if round_ else options.first_depth)).square(), options)
+        found = minimize(descent, descent.evaluate((shapes.flatten(1),)), LeastSquaresOptions(iterations=iterations))
+        shapes, old = canonical(found.theta[0].unflatten(1, shapes.shape[1:])), noise
+        noise = _noise(views, times, descent.at(shapes.flatten(1)).cost)
+        # the noise that the next round believes: exact views have less every time, others the same
+        if round_ > 1 and bool((noise > options.settled * old).all()):
+            break
+    uncertainty, free = _uncertainty(descent, shapes, noise, options)
+    none = few[:, None, None, None]
+    residual = descent.at(shapes.flatten(1)).cost.clamp(0, 1)
+    back = [torch.where(none, 0.0, framed(shapes)), noise, residual, torch.where(few, torch.inf, uncertainty)]
+    done = [part.reshape((*batch, *part.shape[1:])).to(x.dtype) for part in back]
+    return MovingShapes(*done, status=status_of(free, few).reshape(batch))
+
+
+def _spare(views: AffineViews, rows: Tensor) -> Tensor:
+    """Conditions beyond those that determine the shapes ``(b,)``."""
+    seen = (2 * (views.weights > 0).sum(-1) - CAMERA).clamp(min=0) * (views.share > 0)
+    return seen.sum(-1) - (3 * rows.shape[-1] * (views.x.shape[-2] - 1) - gauge(rows.shape[-1]))
+
+
+def gauge(size: int) -> int:
+    """Freedom of the frame of the shapes of so many functions, without the translations: affine, projective where nothing moves."""
+    return GAUGE + 3 * (size == 1)
+
+
+def _noise(views: AffineViews, rows: Tensor, cost: Tensor) -> Tensor:
+    share = views.share.sum(-1) / (views.share > 0).sum(-1).clamp(min=1)
+    variance = (cost * views.share).sum(-1) / (_spare(views, rows).clamp(min=1) * torch.where(share > 0, share, 1.0))
+    return variance.sqrt()
+
+
+def _uncertainty(descent: PerspectiveDescent, shapes: Tensor, noise: Tensor, options: PerspectiveOptions) -> tuple[Tensor, Tensor]:
+    """Expected relative error, and whether another shape explains the views as well, exactly; ``(b,)`` each."""
+    size = descent.rows.shape[-1]
+    values = eigenvalues(replace(descent, prior=torch.zeros_like(descent.prior)).normal_equations(shapes.flatten(1))[2])
+    rest = values[..., gauge(size) + 3 * size :]
+    share = descent.views.share.sum(-1) / (descent.views.share > 0).sum(-1).clamp(min=1)
+    inverse = (share[:, None] / rest.clamp(min=torch.finfo(rest.dtype).tiny)).sum(-1)
+    free = (rest[..., 0] <= options.affine.free * values[..., -1]) & (noise < options.affine.exact)
+    return torch.where(free, torch.inf, (noise.square() * inverse / 3).sqrt()), free
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# When a perspective view was taken.
+
+
+@one_thread
+def recover_perspective_times(
+    shapes: Tensor,
+    basis: Trajectory,
+    x: Tensor,
+    weights: Tensor | None = None,
+    *,
+    grid: int = 64,
+    interval: tuple[float, float] = (-1.0, 1.0),
+    prior: float = 0.0,
+    options: RecoveryOptions = RecoveryOptions(),
+    cameras: PerspectiveOptions = PerspectiveOptions(),
+) -> Recovery:
+    r"""As :func:`~dyntorch.shapes.recover_times`, by perspective images of the shapes.
+
+    Args:
+        shapes: ``(*batch, B, n, 3)`` of :func:`fit_perspective_shapes`.
+        basis: of the trajectories.
+        x: ``(*batch, views, n, 2)`` image points in any unit; NaN = missing.  A view says something from six points on.
+        weights: ``(*batch, views, n)``, 0 = ignore.
+        grid: times tried.
+        interval: polynomial trajectories: times tried from and to.  Periodic ones are tried over the period.
+        prior: noise variance of the normalized views over that of the relative depths of the points; 0 believes any perspective.
+        options: every number that decides about times; cameras: about cameras.
+
+    Returns:
+        :class:`~dyntorch.shapes.Recovery` in the dtype of x.
+
+    Raises:
+        ValueError: shapes that do not agree, or a grid of fewer than 3 times.
+
+    Source: thesis chapter 4: one view of enough points determines the time.
+
+    Example:
+        >>> import torch
+        >>> from dyntorch import Polynomial
+        >>> g = torch.Generator().manual_seed(0)
+        >>> points = torch.randn(2, 8, 3, generator=g).double()
+        >>> seen = points[0] + 0.3 * points[1]
+        >>> found = recover_perspective_times(points, Polynomial(1), (seen[..., :2] / (6 + seen[..., 2:]))[None])
+        >>> bool(found.residual < 1e-12), round(float(found.times), 6)
+        (True, 0.3)
+    """
+    check_options(options, RecoveryOptions)
+    check_options(cameras, PerspectiveOptions)
+    batch = np.broadcast_shapes(shapes.shape[:-3], x.shape[:-3])
+    flat, count = prod(batch), x.shape[-3]
+    times = tried_times(shapes, basis, x, grid, interval)
+    wide = shapes.double().expand(*batch, *shapes.shape[-3:]).reshape(flat, *shapes.shape[-3:])
+    seen = x.double().expand(*batch, *x.shape[-3:]).reshape(flat, *x.shape[-3:])
+    weight = None if weights is None else weights.double().expand(*batch, *x.shape[-3:-1]).reshape(flat, *x.shape[-3:-1])
+    views = centred_views(seen, weight)
+    known = (views.share > 0) & ((views.weights > 0).sum(-1) > 5)
+    step = max(1, CHUNK // (grid * 50 * x.shape[-2] * max(1, flat)))
+    pieces = [slice(i, i + step) for i in range(0, max(1, count), step)]
+    dater = _Dater(wide, basis, times, prior, options, cameras)
+    parts = [dater(views.x[:, p], views.weights[:, p]) for p in pieces]
+    found = [torch.cat(part, dim=1) for part in zip(*parts, strict=True)]
+    middle = times[len(times) // 2]
+    none = (middle.new_tensor(1.0), middle, middle.new_tensor(torch.inf), middle, middle.new_tensor(0.0))
+    done = [torch.where(known, part, value).reshape(*batch, count).to(x.dtype) for part, value in zip(found, none, strict=True)]
+    return Recovery(*done, status=status_of(torch.zeros_like(known), ~known).reshape(*batch, count))
+
+
+@dataclass(frozen=True)
+class _Dater:
+    """Residual, time, sigma, second and rise of some of the views, ``(b, views)`` each."""
+
+    shapes: Tensor
+    basis: Trajectory
+    times: Tensor
+    prior: float
+    options: RecoveryOptions
+    cameras: PerspectiveOptions
+
+    def __call__(self, x: Tensor, weights: Tensor) -> tuple[Tensor, ...]:
+        periodic, step = self.basis.period is not None, self.times[1] - self.times[0]
+        curve = self.costs(x, weights, self.times.expand(*x.shape[:2], -1))
+        place, lone = lowest_minima(curve, periodic, self.options.minima)
+        t, f, h = self.refined(x, weights, self.times[place], step)
+        f = torch.where(lone, torch.inf, f)
+        order = f.argsort(-1)
+        t, f, h = (part.gather(-1, order) for part in (t, f, h))
+        second = torch.where(f[..., 1].isfinite(), t[..., 1], t[..., 0])
+        return f[..., 0].clamp(0, 1), t[..., 0], h[..., 0].clamp(min=1e-300).rsqrt(), second, f[..., 1] - f[..., 0]
+
+    def beside(self, x: Tensor, weights: Tensor, t: Tensor) -> PerspectiveViews:
+        """Views ``(b, views, n, 2)`` at times ``(b, views, times)``."""
+        shape = shapes_at(self.shapes, self.basis.rows(t).flatten(1, 2)).unflatten(1, t.shape[1:])
+        many = (x[:, :, None].expand(*t.shape, *x.shape[-2:]), weights[:, :, None].expand(*t.shape, weights.shape[-1]))
+        return perspective(*many, shape, self.prior, self.cameras)
+
+    def costs(self, x: Tensor, weights: Tensor, t: Tensor) -> Tensor:
+        """With what the prior adds, ``(b, views, times)``."""
+        return self.beside(x, weights, t).residual.square().sum(-1)
+
+    def refined(self, x: Tensor, weights: Tensor, start: Tensor, step: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Times, costs and curvatures at the minima next to ``start``; not more than a step away."""
+        low, high = start - step, start + step
+        if self.basis.period is None:
+            low, high = low.clamp(min=self.times[0]), high.clamp(max=self.times[-1])
+
+        def at(t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+            found = self.beside(x, weights, t)
+            speed = shapes_at(self.shapes, self.basis.slopes(t).flatten(1, 2)).unflatten(1, t.shape[1:])
+            moved = (found.slopes @ speed[..., None])[..., 0].flatten(-2)
+            slope = found.across(moved[..., None])[..., 0]
+            return found.residual.square().sum(-1), (found.residual * slope).sum(-1), slope.square().sum(-1)
+
+        t, size = start, torch.ones_like(start)
+        f, gain, curvature = at(t)
+        for _ in range(self.options.steps):
+            trial = (t + size * gain / curvature.clamp(min=1e-300)).clamp(low, high)
+            fresh = at(trial)
+            better = fresh[0] < f
+            t = torch.where(better, trial, t)
+            f, gain, curvature = (torch.where(better, new, old) for new, old in zip(fresh, (f, gain, curvature), strict=True))
+            size = torch.where(better, 1.0, size / 4)
+        return t, f, curvature
