@@ -29,13 +29,15 @@ class Statement:
     """One sentence of the thesis.
 
     ``place`` is its section and its page; ``says`` is the sentence in our words; ``correction`` is what is right where the printed
-    sentence is not, and empty otherwise; ``measure`` makes the data and looks.
+    sentence is not, and empty otherwise; ``answer`` is what has come of a question that it leaves open; ``measure`` makes the
+    data and looks.
     """
 
     place: str
     says: str
     measure: Callable[[], Finding]
     correction: str = ""
+    answer: str = ""
 
     def row(self) -> tuple[str, str, str, str]:
         """The statement measured: its line of the table."""
@@ -46,6 +48,8 @@ class Statement:
         """``holds``, ``wrong as printed: ...`` with the correction, or ``FAILS`` where the measurement says otherwise."""
         if found.holds != (not self.correction):
             return "FAILS"
+        if self.answer:
+            return f"open there, answered here: {self.answer}"
         return f"wrong as printed: {self.correction}" if self.correction else "holds"
 
 
@@ -57,11 +61,13 @@ class Chapter:
     title: str
     statements: list[Statement] = field(default_factory=list)
 
-    def states(self, place: str, says: str, correction: str = "") -> Callable[[Callable[[], Finding]], Callable[[], Finding]]:
+    def states(
+        self, place: str, says: str, correction: str = "", answer: str = ""
+    ) -> Callable[[Callable[[], Finding]], Callable[[], Finding]]:
         """A decorator: the function below measures this statement."""
 
         def keep(measure: Callable[[], Finding]) -> Callable[[], Finding]:
-            self.statements.append(Statement(place, says, measure, correction))
+            self.statements.append(Statement(place, says, measure, correction, answer))
             return measure
 
         return keep
@@ -92,6 +98,9 @@ def main(chapters: Sequence[Chapter]) -> None:
             print(f"\n{table}", flush=True)
     wrong = sum(verdict.startswith("wrong") for verdict in verdicts)
     failed = verdicts.count("FAILS")
-    print(f"\n{len(verdicts)} statements: {verdicts.count('holds')} hold, {wrong} are wrong as printed, {failed} fail")
+    answered = sum(verdict.startswith("open") for verdict in verdicts)
+    held = verdicts.count("holds")
+    said = f"{held} hold, {wrong} are wrong as printed, {answered} were open and are answered, {failed} fail"
+    print(f"\n{len(verdicts)} statements: {said}")
     if failed:
         raise SystemExit(1)
