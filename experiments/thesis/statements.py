@@ -100,7 +100,7 @@ def main(chapters: Sequence[Chapter]) -> None:
     failed = verdicts.count("FAILS")
     answered = sum(verdict.startswith("open") for verdict in verdicts)
     held = verdicts.count("holds")
-    said = f"{held} hold, {wrong} are wrong as printed, {answered} were open and are answered, {failed} fail"
-    print(f"\n{len(verdicts)} statements: {said}")
+    summary = f"{held} hold, {wrong} are wrong as printed, {answered} were open and are answered, {failed} fail"
+    print(f"\n{len(verdicts)} statements: {summary}")
     if failed:
         raise SystemExit(1)
