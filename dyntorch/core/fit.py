@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from dyntorch.core.invariant import Invariant, as_invariant
 from dyntorch.core.matches import Matches, check_plain, matches, relative_weights
-from dyntorch.core.matrix import estimation_matrix, gram, labelled_rows, within_noise
+from dyntorch.core.matrix import estimation_matrix, gram, labelled_rows, triangular_factor, within_noise
 from dyntorch.core.normalize import Normalization, denormalize, normalization
 from dyntorch.core.outcome import Status, failed
 from dyntorch.core.primitives import Primitive
 from dyntorch.core.solution import Solution, copied
 from dyntorch.numerics.blocks import map_blocks, one_thread, select, workers
+from dyntorch.numerics.eigenspaces import on_host, orthonormal
 from dyntorch.numerics.function_transforms import over_problems
-from dyntorch.numerics.nullspace import decided_null_space, null_space
+from dyntorch.numerics.nullspace import GramNullSpace, gram_null_space, null_space
 
 AMBIGUOUS = 0.5
 """Residual energy of the solution times the harmonic sum of that of all other directions: above it another tensor fits as well.
@@ -32,6 +35,13 @@ collineations of a line keep it at noise of 3 % of the scene (8 matches) to 10 %
 ILL_CONDITIONED = 1e-10
 """Rounding error of a null vector from a float64 Gram, eps * (s_1 / s_{D-1})^2, above which the matrix itself is decomposed, unless
 the noise outweighs it a thousandfold anyway."""
+WORN = 1e-6
+"""The same rounding error, as that of derivatives, which come from a Gram in any case, above which the rows are levelled first
+(unless the noise, which the derivatives of levelled rows leave out, outweighs it)."""
+ROUNDING = 32.0
+"""Singular value, in units of eps times the largest, up to which exact matches make it by their rounding: those that the Gram calls
+degenerate are so in their rows as well.  Measured on 70 kinds of degenerate matches: 3 at most where the centre of the views is
+within their extent; a centre so many extents away loses so many times the digits.  Of general matches the smallest was 1e5."""
 WEAK = 5e5
 """Trace of the Gram times the harmonic sum of its other eigenvalues above which noise may reach the last of them.  General motion
 has 1e4 (lines) to 3e5 (constant velocity, 60 matches), data of lower rank 1e6 at noise of 1 % of the scene and 1e9 at 0.03 %."""
@@ -100,8 +110,8 @@ def fit_matches(invariant: Invariant, data: Matches, *, normalize: bool = True) 
     if data.views[0].shape[0] and few:
         raise ValueError(f"{invariant!r} needs at least {invariant.minimal()} matches, got {data.count}; add matches")
     check_plain(invariant)
-    solved = over_problems(partial(_solved, invariant, normalize), data.views, data.weights, data.static)
-    (whole, present), found = solved
+    solve = partial(_solved, invariant, normalize, torch.finfo(data.dtype).eps)
+    (whole, present), found = over_problems(solve, data.views, data.weights, data.static)
     data = replace(data, views=whole, weights=present)
     pairs = zip(invariant.primitives, found.transforms, strict=True)
     norm = Normalization(found.transforms, tuple(p.normalized(t) for p, t in pairs), found.actions)
@@ -122,7 +132,7 @@ class Solved(NamedTuple):
 
 
 def _solved(
-    invariant: Invariant, normalize: bool, views: tuple[Tensor, ...], weights: Tensor, static: Tensor | None
+    invariant: Invariant, normalize: bool, precision: float, views: tuple[Tensor, ...], weights: Tensor, static: Tensor | None
 ) -> tuple[tuple[tuple[Tensor, ...], Tensor], Solved]:
     """Views and weights ``(b, n, ...)`` with what they lack filled in, and the linear fits of all problems."""
     views, weights = invariant.completed(views, weights)
@@ -131,7 +141,7 @@ def _solved(
     most, least = (max(1, number // max(1, per_problem)) for number in (BLOCK, LEAST))
     size = min(most, max(least, -(-len(weights) // workers())))
     copies = copied(invariant, views, weights, static)
-    return (views, weights), map_blocks(partial(_solve, invariant, normalize), *copies, size=size)
+    return (views, weights), map_blocks(partial(_solve, invariant, normalize, precision), *copies, size=size)
 
 
 def _largest(invariant: Invariant) -> int:
@@ -144,7 +154,9 @@ def _largest(invariant: Invariant) -> int:
     return size
 
 
-def _solve(invariant: Invariant, normalize: bool, views: tuple[Tensor, ...], weights: Tensor, static: Tensor | None) -> Solved:
+def _solve(
+    invariant: Invariant, normalize: bool, precision: float, views: tuple[Tensor, ...], weights: Tensor, static: Tensor | None
+) -> Solved:
     """One block."""
     # components first in memory: every later pass then runs along the matches
     views = tuple(x.mT.contiguous().mT for x in views)
@@ -155,7 +167,10 @@ def _solve(invariant: Invariant, normalize: bool, views: tuple[Tensor, ...], wei
     moved = norm.apply(invariant, views)
     own = invariant.estimated(moved, weights)
     if own is None:
-        basis, status, uncertainty = _null(invariant, norm.primitives, moved, weights, static)
+        # as many digits as the measurements have, less those that their distance from the origin takes
+        away = torch.stack([t[..., :-1, -1].norm(dim=-1) for t in norm.transforms]).amax(0).detach()
+        rows = Rows(norm.primitives, moved, weights, static, ROUNDING * precision * (1 + away))
+        basis, status, uncertainty = _null(invariant, rows)
         tensor = invariant.normalized(norm.transforms).constrain(invariant.tensor_of(basis))
     else:
         tensor, uncertainty = own.tensor, own.uncertainty
@@ -172,42 +187,78 @@ def _solve(invariant: Invariant, normalize: bool, views: tuple[Tensor, ...], wei
     return Solved(select(sound, back, 0.0), select(sound, tensor, 0.0), status, uncertainty, norm.transforms, norm.actions)
 
 
-def _null(
-    invariant: Invariant, primitives: tuple[Primitive, ...], views: tuple[Tensor, ...], weights: Tensor, static: Tensor | None
-) -> tuple[Tensor, Tensor, Tensor]:
+@dataclass(frozen=True)
+class Rows:
+    """What the estimation matrices of a block of problems are made of: normalized matches."""
+
+    primitives: tuple[Primitive, ...]
+    views: tuple[Tensor, ...]
+    weights: Tensor
+    static: Tensor | None
+    rounding: Tensor
+    """``(*batch,)`` singular value, of the largest, up to which it is rounding of the measurements."""
+
+    def of(self, place: tuple[Tensor, ...]) -> Rows:
+        """Those of some problems, where none has primitives of its own."""
+        static = None if self.static is None else self.static[place]
+        return replace(
+            self,
+            views=tuple(x[place] for x in self.views),
+            weights=self.weights[place],
+            static=static,
+            rounding=self.rounding[place],
+        )
+
+    @property
+    def parts(self) -> tuple[tuple[Primitive, ...], tuple[Tensor, ...], Tensor, Tensor | None]:
+        """As the functions of :mod:`dyntorch.core.matrix` take them."""
+        return self.primitives, self.views, self.weights, self.static
+
+
+def _null(invariant: Invariant, rows: Rows) -> tuple[Tensor, Tensor, Tensor]:
     """Null space ``(*batch, nullity, D)``, status and uncertainty ``(*batch,)`` of normalized matches."""
-    nullity, width = invariant.nullity, invariant.width()
+    nullity, width, weights = invariant.nullity, invariant.width(), rows.weights
     present = (weights > 0).sum(-1) * invariant.rows()
-    if static is not None:
-        for free, count in enumerate(labelled_rows(primitives), start=1):
-            present = present + ((weights > 0) & (static == free)).sum(-1) * (count - invariant.rows())
-    g = gram(primitives, views, weights, static)
-    found = decided_null_space(g, nullity)
+    if rows.static is not None:
+        for free, count in enumerate(labelled_rows(rows.primitives), start=1):
+            present = present + ((weights > 0) & (rows.static == free)).sum(-1) * (count - invariant.rows())
+    g = gram(*rows.parts)
+
+    def factor(chosen: Tensor) -> Tensor:
+        if invariant.copies is not None:
+            return triangular_factor(*rows.parts)[chosen]
+        return triangular_factor(*rows.of((chosen,)).parts)
+
+    few = present < width - nullity
+    if rows.static is None:
+        few = few | ((weights > 0).sum(-1) < invariant.minimal())
+    found, again = _decided(g, nullity, factor, torch.where(few, torch.inf, rows.rounding))
     basis = found.basis
     spare = (present - (width - nullity)).clamp(min=0)
     # the noise that the solution leaves, per row, against what every other direction has
     noise = found.residual.clamp(min=0).mean(-1) / spare.clamp(min=1)
     square = torch.where(spare > 0, noise * found.competing, torch.zeros_like(noise)).detach()
-    rounding = torch.finfo(g.dtype).eps * (g.diagonal(dim1=-2, dim2=-1).sum(-1) * found.competing).detach()
-    exact = (rounding > ILL_CONDITIONED) & (rounding > 1e-3 * square) & ~found.degenerate
+    trace = g.diagonal(dim1=-2, dim2=-1).sum(-1)
+    rounding = torch.finfo(g.dtype).eps * (trace * found.competing).detach()
+    exact = (rounding > ILL_CONDITIONED) & (rounding > 1e-3 * square)
+    exact = (exact.index_fill(0, again, True) if len(again) else exact) & ~found.degenerate
     # frames of single matches, from points of theirs, may be all noise, and then nothing looks weak
     limit = 0.0 if invariant.intrinsic else WEAK
-    weak = (spare > 0) & ~found.degenerate & (g.diagonal(dim1=-2, dim2=-1).sum(-1) * found.competing > limit)
+    weak = (spare > 0) & ~found.degenerate & (trace * found.competing > limit)
     if invariant.copies is not None:
         weak = torch.zeros_like(weak)
-    # an accelerator waits once per block for both answers: what a tensor and its status are must not depend on where it lives
-    asked = int(exact.any().long() + 2 * weak.any())
+    worn = exact & (rounding > WORN) & (rounding > square) & _followed(g)
+    # an accelerator waits once per block for all answers: what a tensor and its status are must not depend on where it lives
+    asked = int((exact & ~worn).any().long() + 2 * weak.any() + 4 * worn.any())
     if asked & 1:
-        basis = _with_matrix(basis, exact, primitives, views, weights, static, nullity)
-    few = present < width - nullity
-    if static is None:
-        few = few | ((weights > 0).sum(-1) < invariant.minimal())
+        basis = _with_matrix(basis, exact & ~worn, null_space, rows, invariant, host=bool(len(again)))
+    if asked & 4:
+        basis = _with_matrix(basis, worn, _levelled, rows, invariant, host=bool(len(again)))
     ambiguous = square * present.clamp(min=1) > _limit(spare, width)
     if asked & 2:
         place = weak.nonzero(as_tuple=True)  # an accelerator waits here, and for every mask that is an index
-        chosen = [x[place] for x in views], weights[place], None if static is None else static[place], basis[place]
         with torch.no_grad():
-            ambiguous[place] |= within_noise(primitives, *chosen, invariant.resolves_noise)
+            ambiguous[place] |= within_noise(*rows.of(place).parts, basis[place], invariant.resolves_noise)
     return basis, _status(few, found.degenerate, ambiguous), square.sqrt()
 
 
@@ -227,19 +278,97 @@ def _status(few: Tensor, degenerate: Tensor, ambiguous: Tensor) -> Tensor:
     return torch.where(few, int(Status.TOO_FEW), status)
 
 
+def _decided(gram: Tensor, dim: int, factor: Callable[[Tensor], Tensor], tolerance: Tensor) -> tuple[GramNullSpace, Tensor]:
+    r"""``gram_null_space`` whose ``degenerate`` does not depend on the device, and is what the rows say, not their squares.
+
+    Singular values below 1e-7 of the largest are lost in the rounding of a Gram, but not in the rows.  So problems that a Gram
+    calls degenerate, and these alone, are looked at again: their rows decide.  An accelerator waits, once, for the certificates;
+    Grams whose certificate fails there go to the solvers of the CPU first, which look further before they give up.
+
+    Args:
+        gram: ``(b, ..., D, D)``.
+        dim: dimension of the null space.
+        factor: of the problems ``(k,)`` a triangular factor of the rows ``(k, ..., rows, D)``, at most D rows each.
+        tolerance: ``(b, ...)`` singular value, of the largest, up to which it is one of the null space; infinity: do not look.
+
+    Returns:
+        The null space, and which problems ``(k,)`` the rows took up again: ``residual``, ``competing`` and ``degenerate`` of these
+        are right, ``basis`` is that of the Gram.
+    """
+    found = gram_null_space(gram, dim)
+    asked = tolerance.isfinite().expand_as(found.degenerate)
+    doubted = _some(found.degenerate & asked)
+    if not len(doubted):
+        return found, doubted
+    if not on_host(gram):
+        found = _replaced(found, doubted, **vars(gram_null_space(gram[doubted].cpu(), dim)))
+        doubted = _some(found.degenerate & asked)
+        if not len(doubted):
+            return found, doubted
+    values = _singular_values(factor(doubted).detach().cpu(), gram.shape[-1])
+    others, null = values[..., :-dim], values[..., -dim:].flip(-1)
+    lost = others[..., -1] <= tolerance[doubted].cpu() * values[..., 0]
+    # of a null space that is larger there is nothing to say
+    competing = torch.where(lost[..., None], 1.0, others).square().reciprocal().sum(-1)
+    return _replaced(found, doubted, residual=null.square(), competing=competing, degenerate=lost), doubted
+
+
+def _some(flagged: Tensor) -> Tensor:
+    """Problems ``(k,)`` with a flag, of ``(b, ...)``."""
+    return flagged.flatten(1).any(-1).nonzero()[:, 0] if flagged.ndim > 1 else flagged.nonzero()[:, 0]
+
+
+def _replaced(found: GramNullSpace, place: Tensor, **parts: Tensor) -> GramNullSpace:
+    """The null spaces with these parts of some problems."""
+    put = {name: (whole := getattr(found, name)).index_put((place,), part.to(whole.device)) for name, part in parts.items()}
+    return replace(found, **put)
+
+
+def _singular_values(factor: Tensor, size: int) -> Tensor:
+    """``(..., D)``, descending; 0 of a matrix that is not finite, and those that fewer rows lack."""
+    finite = torch.isfinite(factor).flatten(-2).all(-1)[..., None, None]
+    values: Tensor = torch.linalg.svdvals(torch.where(finite, factor, 0.0))
+    return torch.nn.functional.pad(values, (0, size - values.shape[-1]))
+
+
 def _with_matrix(
-    basis: Tensor,
-    exact: Tensor,
-    primitives: tuple[Primitive, ...],
-    views: tuple[Tensor, ...],
-    weights: Tensor,
-    static: Tensor | None,
-    nullity: int,
+    basis: Tensor, exact: Tensor, solve: Callable[[Tensor, int], Tensor], rows: Rows, invariant: Invariant, *, host: bool
 ) -> Tensor:
-    """Replace the null spaces of the chosen problems by those of their estimation matrices, which are not squared."""
-    matrix = estimation_matrix(primitives, views, weights, static)
+    """Replace the null spaces of the chosen problems by those of their estimation matrices, which are not squared.
+
+    Args:
+        basis: ``(*batch, nullity, D)``.
+        exact: ``(*batch,)`` bool: the problems.
+        solve: rows ``(k, rows, D)`` and the nullity -> null space.
+        rows: of all problems.
+        invariant: of the rows.
+        host: whether the CPU computes it: the solvers of an accelerator start from a Gram.
+    """
     place = exact.nonzero(as_tuple=True)
-    return basis.index_put(place, null_space(matrix[place], nullity))
+    matrix = estimation_matrix(*rows.of(place).parts) if invariant.copies is None else estimation_matrix(*rows.parts)[place]
+    found = solve(matrix.cpu() if host else matrix, invariant.nullity)
+    return basis.index_put(place, found.to(basis.device))
+
+
+def _followed(x: Tensor) -> bool:
+    """Whether somebody wants a derivative of it."""
+    return (torch.is_grad_enabled() and x.requires_grad) or forward_ad.unpack_dual(x).tangent is not None
+
+
+def _levelled(matrix: Tensor, dim: int) -> Tensor:
+    r"""``null_space`` of rows that hardly tell some vectors from null ones.
+
+    In the coordinates :math:`y = \Sigma V^T x` of their own singular value decomposition, which are taken as given, all directions
+    but those of the null space weigh the same.  Rows that are fulfilled have the same null space there, with the same derivatives:
+    those of ``null_space`` come from a Gram, and lose twice the digits.
+    """
+    with torch.no_grad():
+        finite = torch.isfinite(matrix).flatten(1).all(-1)[:, None, None]
+        values, frame = torch.linalg.svd(torch.where(finite, matrix, 0.0), full_matrices=matrix.shape[-2] < matrix.shape[-1])[1:]
+        others = values[:, : matrix.shape[-1] - dim].clamp(min=torch.finfo(values.dtype).tiny)
+        size = torch.cat([others, others[:, -1:].expand(-1, dim)], dim=-1)
+        level = frame.mT / size[:, None, :]
+    return orthonormal(level @ null_space(matrix @ level, dim).mT).mT
 
 
 def _identity(invariant: Invariant, views: tuple[Tensor, ...]) -> Normalization:

@@ -55,6 +55,29 @@ def _kronecker(vectors: Sequence[Tensor], weights: Tensor) -> Tensor:
     return rows.flatten(-3, -2)
 
 
+def triangular_factor(
+    primitives: Sequence[Primitive], views: Sequence[Tensor], weights: Tensor, static: Tensor | None = None
+) -> Tensor:
+    """Triangular factor R of :func:`estimation_matrix`, ``(*batch, at most width, width)``, whose Gram is the same.
+
+    It is of orthogonal steps, so its singular values are right down to the rounding of the largest one; those of a Gram are lost
+    below 1e-8 of it.  The rows are written in pieces.
+    """
+    width, n = math.prod(p.width for p in primitives), weights.shape[-1]
+    per_match = width * math.prod(p.rows for p in primitives) * max(1, weights.numel() // max(1, n))
+    step = max(2 * width, CHUNK // per_match)
+    factor: Tensor | None = None
+    for start in range(0, max(1, n), step):
+        count = min(step, n - start)
+        part = [x.narrow(p.match_axis(x), start, count) for p, x in zip(primitives, views, strict=True)]
+        label = None if static is None else static.narrow(-1, start, count)
+        rows = estimation_matrix(primitives, part, weights.narrow(-1, start, count), label)
+        stacked = rows if factor is None else torch.cat([factor, rows], dim=-2)
+        factor = torch.linalg.qr(stacked, mode="r")[1] if stacked.shape[-2] > width else stacked
+    assert factor is not None
+    return factor
+
+
 def gram(primitives: Sequence[Primitive], views: Sequence[Tensor], weights: Tensor, static: Tensor | None = None) -> Tensor:
     r"""Gram matrix of :func:`estimation_matrix` without building it:
 
@@ -205,7 +228,10 @@ def within_noise(
     step = -(-weights.shape[1] // ENOUGH)
     views, weights = [x[:, ::step] for x in views], weights[:, ::step]
     static = None if static is None else static[:, ::step]
-    second = eigh(g)[1][..., basis.shape[-2], None]
+    # the null space at the other end of the spectrum: where its eigenvalue and the next one are both lost in rounding, an
+    # eigenvector beside it is one beside it all the same
+    away = g + g.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None] * (basis.mT @ basis)
+    second = eigh(away)[1][..., :1]
     # a generator of its own: the same matches get the same answer, on any device and beside any others, and the caller's random
     # numbers stay
     draw = torch.Generator().manual_seed(0)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dyntorch.core.invariant import Invariant
 from dyntorch.core.matches import Matches
-from dyntorch.core.matrix import CHUNK, estimation_matrix
+from dyntorch.core.matrix import triangular_factor
 from dyntorch.core.normalize import Normalization, denormalize_motion
 from dyntorch.core.outcome import Outcome, Status, check_status, failed
 from dyntorch.numerics.arguments import check_precision
@@ -78,18 +78,8 @@ class Solution(Outcome):
         m = self.matches
         views, weights, static = copied(self.invariant, m.views, m.weights, m.static)
         moved = self.normalization.apply(self.invariant, views)
-        width, rows = self.invariant.width(), self.invariant.rows()
-        step = max(2 * width, CHUNK // (width * rows * max(1, weights.numel() // max(1, weights.shape[-1]))))
-        factor: Tensor | None = None
-        for start in range(0, max(1, weights.shape[-1]), step):
-            piece = slice(start, start + step)
-            part = [x.narrow(2 if self.invariant.copies else 1, start, min(step, weights.shape[-1] - start)) for x in moved]
-            label = None if static is None else static[..., piece]
-            matrix = estimation_matrix(self.normalization.primitives, part, weights[..., piece], label)
-            stacked = matrix if factor is None else torch.cat([factor, matrix], dim=-2)
-            factor = torch.linalg.qr(stacked, mode="r")[1] if stacked.shape[-2] > width else stacked
-        assert factor is not None
-        values = torch.linalg.svdvals(factor)
+        values = torch.linalg.svdvals(triangular_factor(self.normalization.primitives, moved, weights, static))
+        width = self.invariant.width()
         return self.matches.back(torch.nn.functional.pad(values, (0, width - values.shape[-1])))
 
     def normalized_motion(self) -> tuple[Tensor, ...]:

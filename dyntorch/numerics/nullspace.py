@@ -190,20 +190,6 @@ def gram_null_space(gram: Tensor, dim: int = 1) -> GramNullSpace:
     )
 
 
-def decided_null_space(gram: Tensor, dim: int = 1) -> GramNullSpace:
-    """:func:`gram_null_space` whose ``degenerate`` does not depend on the device: an accelerator waits, once, for the certificates.
-
-    Grams ``(b, D, D)`` whose certificate fails there go to the solvers of the CPU, which look further before they give up.
-    """
-    found = gram_null_space(gram, dim)
-    doubted = found.degenerate[:0] if on_host(gram) else found.degenerate.nonzero()[:, 0]
-    if not len(doubted):
-        return found
-    again = gram_null_space(gram[doubted].cpu(), dim)
-    pairs = zip(vars(found).values(), vars(again).values(), strict=True)
-    return GramNullSpace(*(whole.index_put((doubted,), part.to(whole.device)) for whole, part in pairs))
-
-
 def _check(matrix: Tensor, name: str, dim: int) -> None:
     check_tensor(name, matrix, "rows", "D", precise=False)
     if isinstance(dim, bool) or not isinstance(dim, int):
