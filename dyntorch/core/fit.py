@@ -169,7 +169,7 @@ def _solve(
     if own is None:
         # as many digits as the measurements have, less those that their distance from the origin takes
         away = torch.stack([t[..., :-1, -1].norm(dim=-1) for t in norm.transforms]).amax(0).detach()
-        rows = Rows(norm.primitives, moved, weights, static, ROUNDING * precision * (1 + away))
+        rows = EstimationRows(norm.primitives, moved, weights, static, ROUNDING * precision * (1 + away))
         basis, status, uncertainty = _null(invariant, rows)
         tensor = invariant.normalized(norm.transforms).constrain(invariant.tensor_of(basis))
     else:
@@ -188,7 +188,7 @@ def _solve(
 
 
 @dataclass(frozen=True)
-class Rows:
+class EstimationRows:
     """What the estimation matrices of a block of problems are made of: normalized matches."""
 
     primitives: tuple[Primitive, ...]
@@ -198,7 +198,7 @@ class Rows:
     rounding: Tensor
     """``(*batch,)`` singular value, of the largest, up to which it is rounding of the measurements."""
 
-    def of(self, place: tuple[Tensor, ...]) -> Rows:
+    def of(self, place: tuple[Tensor, ...]) -> EstimationRows:
         """Those of some problems, where none has primitives of its own."""
         static = None if self.static is None else self.static[place]
         return replace(
@@ -215,7 +215,7 @@ class Rows:
         return self.primitives, self.views, self.weights, self.static
 
 
-def _null(invariant: Invariant, rows: Rows) -> tuple[Tensor, Tensor, Tensor]:
+def _null(invariant: Invariant, rows: EstimationRows) -> tuple[Tensor, Tensor, Tensor]:
     """Null space ``(*batch, nullity, D)``, status and uncertainty ``(*batch,)`` of normalized matches."""
     nullity, width, weights = invariant.nullity, invariant.width(), rows.weights
     present = (weights > 0).sum(-1) * invariant.rows()
@@ -332,7 +332,7 @@ def _singular_values(factor: Tensor, size: int) -> Tensor:
 
 
 def _with_matrix(
-    basis: Tensor, exact: Tensor, solve: Callable[[Tensor, int], Tensor], rows: Rows, invariant: Invariant, *, host: bool
+    basis: Tensor, exact: Tensor, solve: Callable[[Tensor, int], Tensor], rows: EstimationRows, invariant: Invariant, *, host: bool
 ) -> Tensor:
     """Replace the null spaces of the chosen problems by those of their estimation matrices, which are not squared.
 
@@ -359,7 +359,7 @@ def _levelled(matrix: Tensor, dim: int) -> Tensor:
     r"""``null_space`` of rows that hardly tell some vectors from null ones.
 
     In the coordinates :math:`y = \Sigma V^T x` of their own singular value decomposition, which are taken as given, all directions
-    but those of the null space weigh the same.  Rows that are fulfilled have the same null space there, with the same derivatives:
+    but those of the null space weigh the same.  EstimationRows that are fulfilled have the same null space there, with the same derivatives:
     those of ``null_space`` come from a Gram, and lose twice the digits.
     """
     with torch.no_grad():

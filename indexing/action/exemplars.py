@@ -49,6 +49,11 @@ class Exemplars:
     def __len__(self) -> int:
         return len(self.solid)
 
+    def to(self, device: torch.device | str) -> Exemplars:
+        """The same windows on another device."""
+        crops, views, moments = (part.to(device) for part in (self.crops, self.views, self.moments))
+        return Exemplars(crops, views, moments, self.owner.to(device), self.solid.to(device))
+
     def crop(self, index: int) -> Windows:
         """``N`` windows of one crop; 0 is the whole exemplar."""
         count = len(self)

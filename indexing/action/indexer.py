@@ -64,7 +64,7 @@ class ActionIndexer(SavedClassifier):
         window, stride, tempi, pool: of :meth:`score_frames`: seconds, seconds between exemplar windows, speed factors tried,
             and seconds over which scores are averaged.
         random_state: of the virtual views.
-        device: where clips are compared with the exemplars, e.g. ``"cuda"``; ``fit`` computes on the CPU.
+        device: where clips are compared, in ``fit`` too, e.g. ``"cuda"``; what was learned is kept on the CPU.
         options: every other number that decides, by stage (:class:`~indexing.action.options.ActionOptions`); None: as measured.
 
     Attributes:
@@ -248,11 +248,12 @@ class ActionIndexer(SavedClassifier):
             view=self.view,
             scorer="kernel" if self.view == "same" else self.scorer,
             learned=self.weights == "learned",
-            groups=None if groups is None else torch.from_numpy(np.unique(groups, return_inverse=True)[1]).long(),
+            groups=None if groups is None else torch.from_numpy(np.unique(groups, return_inverse=True)[1]).long().to(self.device),
             symmetry=symmetry,
             guard=self.mirror == "auto",
         )
-        self.model_: ShapeModel = learn(exemplars, torch.from_numpy(numbers).long(), len(classes), lesson, options=self._options)
+        there, labels = exemplars.to(self.device), torch.from_numpy(numbers).long().to(self.device)
+        self.model_: ShapeModel = learn(there, labels, len(classes), lesson, options=self._options).to("cpu")
         self.groups_ = groups
         self.classes_ = classes
         self.n_joints_ = int(exemplars.crops.values.shape[2])

@@ -136,7 +136,7 @@ def gather(
     """
     metric, found_by = metrics
     table = fused_residual(query, copies[:1], found_by, NEAREST, channels)
-    which = torch.zeros(table.shape, dtype=torch.long)
+    which = torch.zeros_like(table, dtype=torch.long)
     for number, copy in enumerate(copies[1:], 1):
         other = fused_residual(query, [copy], found_by, NEAREST, channels)
         which[other < table] = number
@@ -207,9 +207,9 @@ class JointWeights:
     sigma: float = 0.0
 
     @classmethod
-    def equal(cls, joints: int, gain: float = 0.0, sigma: float = 0.0) -> JointWeights:
+    def equal(cls, joints: int, device: torch.device | None = None) -> JointWeights:
         """All ones."""
-        return cls(torch.ones(len(NEAREST), joints), torch.ones(len(NEAREST)), None, gain, sigma)
+        return cls(torch.ones(len(NEAREST), joints, device=device), torch.ones(len(NEAREST), device=device))
 
     @property
     def learned(self) -> bool:
@@ -282,8 +282,9 @@ def learn_joint_weights(
         >>> learn_joint_weights(x, torch.arange(2), [x], metric, torch.tensor([0, 1])).learned  # one example per class
         False
     """
-    groups = torch.arange(len(labels)) if groups is None else groups
-    hub = torch.zeros(len(labels)) if hub is None else hub
+    home = labels.device
+    groups = torch.arange(len(labels), device=home) if groups is None else groups
+    hub = torch.zeros(len(labels), device=home) if hub is None else hub
     if not len(owner) == len(query) or not len(groups) == len(hub) == len(labels) == len(copies[0]):
         raise ValueError(
             f"owner ({len(owner)}) needs one entry per query ({len(query)}); labels ({len(labels)}), groups ({len(groups)}) and "
@@ -292,11 +293,11 @@ def learn_joint_weights(
     count, classes = query.values.shape[2], int(labels.max()) + 1
     usable = _usable(labels, groups)[owner].nonzero()[:, 0]
     if len(labels[owner[usable]].unique()) < 2:
-        return JointWeights.equal(count)
+        return JointWeights.equal(count, home)
     limit = max(1, min(options.joints.queries, options.joints.entries // (count * classes)))
-    rows = usable[torch.randperm(len(usable), generator=torch.Generator().manual_seed(seed))[:limit]]
+    rows = usable[torch.randperm(len(usable), generator=torch.Generator().manual_seed(seed))[:limit].to(home)]
     query, owner, tied = query[rows], owner[rows], torch.arange(count) if symmetry is None else symmetry
-    found = JointWeights.equal(count)
+    found, tied = JointWeights.equal(count, home), tied.to(home)
     for _ in range(options.joints.rounds):  # the nearest exemplars, by what was learned before
         metrics = metric, found.metric(metric)
         evidence = gather(query, owner, copies, metrics, found.channels, labels, groups, hub, options=options)
@@ -308,7 +309,7 @@ def learn_joint_weights(
 
 def _from_evidence(evidence: Evidence, tied: Tensor, classes: int, seed: int, options: ActionOptions) -> JointWeights:
     """For all actions together, and then for each."""
-    equal = torch.ones(len(NEAREST), 1, len(tied)), torch.ones(len(NEAREST))
+    equal = torch.ones(len(NEAREST), 1, len(tied), device=tied.device), torch.ones(len(NEAREST), device=tied.device)
     together = _choose(evidence, _Together(tied, *equal), seed, options)
     each = _choose(evidence, _Each(tied, together.joints, together.channels, classes), seed, options)
     by_class = None if each.joints.shape[1] == 1 else _mean_one((each.joints / together.joints)[0])
@@ -375,10 +376,10 @@ def _choose(evidence: Evidence, stage: _Together, seed: int, options: ActionOpti
     if len(names) < 3:
         return before
     folds = min(options.joints.folds, len(names))
-    part = torch.randperm(len(names), generator=torch.Generator().manual_seed(seed))[group] % folds
-    held = part == torch.arange(folds + 1)[:, None]  # in the last problem nothing is held out
+    part = torch.randperm(len(names), generator=torch.Generator().manual_seed(seed)).to(group.device)[group] % folds
+    held = part == torch.arange(folds + 1, device=group.device)[:, None]  # in the last problem nothing is held out
     losses, (joints, channels) = _descend(evidence, stage, ~held, options)
-    here = losses[part, :, torch.arange(len(part))]  # (Q, pulls) where a query was held out
+    here = losses[part, :, torch.arange(len(part), device=part.device)]  # (Q, pulls) where a query was held out
     won = here[:, :1] - here[:, 1:]
     by_group = torch.stack([won[group == number].mean(dim=0) for number in range(len(names))])
     gain, sigma = by_group.mean(dim=0), by_group.std(dim=0) / len(names) ** 0.5
@@ -397,7 +398,9 @@ def _descend(evidence: Evidence, stage: _Together, train: Tensor, options: Actio
     """
     pulls = evidence.hub.new_tensor(options.joints.pulls)
     shape = len(train), 1 + len(pulls)
-    learning = torch.ones(shape).index_fill_(1, torch.tensor(0), 0.0).flatten()
+    learning = torch.ones(shape, device=pulls.device)
+    learning[:, 0] = 0.0
+    learning = learning.flatten()
     pull = torch.cat([pulls[:1], pulls]).repeat(len(train))
     share = (train.to(evidence.hub) / train.sum(dim=1, keepdim=True)).repeat_interleave(shape[1], dim=0)
     logs = [value.to(evidence.hub).expand(len(pull), *value.shape).clone().requires_grad_() for value in stage.start()]

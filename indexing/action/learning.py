@@ -119,19 +119,19 @@ def asked_views(model: ShapeModel) -> list[Windows]:
 
 def _machine_out(model: ShapeModel, trained: Trained, asked: Windows, folds: Tensor) -> Tensor:
     """The same of the kernel machine, trained once per fold; actions that nobody else performs get the least."""
-    out = torch.full((len(folds), model.classes), -1.0)
+    out = torch.full((len(folds), model.classes), -1.0, device=folds.device)
     if model.kernels is None:
         return out
     owner, against = trained.owner, model.kernels(asked, trained.rows)
     for fold in folds.unique():
         kept = (folds[owner] != fold).nonzero()[:, 0]
         mine = (folds == fold).nonzero()[:, 0]
-        known, numbers = np.unique(model.labels[owner[kept]].numpy(), return_inverse=True)
+        known, numbers = np.unique(model.labels[owner[kept]].cpu().numpy(), return_inverse=True)
         if len(known) < 2:
             continue
         machine = PairwiseMachine.fit(trained.gram[kept][:, kept], numbers, model.options.machine.penalty)
-        scores = machine(against[mine][:, kept[machine.support]])
-        out[mine[:, None], torch.from_numpy(known)[None]] = scores
+        scores = machine(against[mine][:, kept[machine.support.to(kept.device)]])
+        out[mine[:, None], torch.from_numpy(known).to(mine.device)[None]] = scores
     return out
 
 
@@ -192,16 +192,19 @@ def learn(
 ) -> ShapeModel:
     """Learn everything from the exemplars' windows.
 
+    It is computed where the exemplars and labels are; support vector machines are trained on the CPU.
+
     Args:
         labels: ``(N,)`` class numbers.
     """
     originals = exemplars.crop(0)
+    nothing = torch.zeros(len(labels), device=labels.device)
     metric = JointMetric.learn(originals.values, originals.seen, options.nearest.whitening, options.nearest.floor)
-    none, share = torch.zeros(len(labels), dtype=torch.bool), float(exemplars.solid.float().mean())
+    none, share = torch.zeros_like(labels, dtype=torch.bool), float(exemplars.solid.float().mean())
     model = ShapeModel(
         exemplars, labels, classes, lesson.view, lesson.scorer, metric, lesson.symmetry, none,
-        JointWeights.equal(originals.values.shape[2]),
-        torch.zeros(len(labels)), torch.zeros(len(exemplars.owner)), None, None, None,
+        JointWeights.equal(originals.values.shape[2], labels.device),
+        nothing, torch.zeros_like(exemplars.owner, dtype=nothing.dtype), None, None, None,
         blend=Blend(
             nearest=share * options.blend.balance_solid + (1 - share) * options.blend.balance, sharpness=options.decisions.sharpness
         ),
@@ -213,7 +216,7 @@ def learn(
     if lesson.learned and lesson.view == "any" and lesson.groups is not None:
         parts = _parts(model, lesson)
         if parts.learned:
-            model = _with_hubs(dataclasses.replace(model, parts=parts, hub=torch.zeros(len(labels))), originals)
+            model = _with_hubs(dataclasses.replace(model, parts=parts, hub=nothing), originals)
     trained = None
     if lesson.scorer != "nearest":
         model, trained = _with_machine(model, one_side=lesson.view == "same")
@@ -227,7 +230,7 @@ def _parts(model: ShapeModel, lesson: Lesson) -> JointWeights:
     asked = asked_views(model)[1:]
     if not asked or not bool(model.exemplars.solid.all()):
         return model.parts
-    owner = torch.arange(len(model.labels)).repeat(len(asked))
+    owner = torch.arange(len(model.labels), device=model.labels.device).repeat(len(asked))
     groups, symmetry = lesson.groups, lesson.symmetry
     return learn_joint_weights(
         stack(asked),
@@ -267,7 +270,8 @@ def _with_hubs(model: ShapeModel, originals: Windows) -> ShapeModel:
         hub=_hub(residual, labels, labels, model.options),
         evidence_out=evidence(_foreign_scores(residual, model), model.classes, options=model.options),
     )
-    sample = torch.arange(0, len(model.exemplars.moments), max(1, len(model.exemplars.moments) // model.options.nearest.moments))
+    step = max(1, len(model.exemplars.moments) // model.options.nearest.moments)
+    sample = torch.arange(0, len(model.exemplars.moments), step, device=labels.device)
     labels = labels[model.exemplars.owner]
     residual = model.moment_residuals(model.exemplars.moments[sample])
     return dataclasses.replace(model, moment_hub=_hub(residual, labels[sample], labels, model.options))
@@ -306,7 +310,7 @@ def _with_machine(model: ShapeModel, one_side: bool) -> tuple[ShapeModel, Traine
     rows_at_most = model.options.machine.rows_solid if bool(exemplars.solid.any()) else model.options.machine.rows
     copies = max(1, rows_at_most // (count * (1 + both)))
     parts = [exemplars.crop(0)] + [exemplars.view(i) for i in range(min(copies - 1, len(exemplars.views) // count))]
-    rows, owner = stack(parts), torch.arange(count).repeat(len(parts))
+    rows, owner = stack(parts), torch.arange(count, device=model.labels.device).repeat(len(parts))
     if both and model.symmetry is not None:
         chosen = model.mirrored[owner]
         rows = stack([rows, mirror_some(rows[chosen], model.symmetry, chosen[chosen])])
@@ -315,9 +319,9 @@ def _with_machine(model: ShapeModel, one_side: bool) -> tuple[ShapeModel, Traine
         JointMetric(model.metric.covariance, model.options.machine.whitening, floor=model.metric.floor), one_side=one_side
     )
     gram = kernels.fit(rows, model.options.machine)
-    machine = PairwiseMachine.fit(gram, model.labels[owner].numpy().astype(np.int64), model.options.machine.penalty)
+    machine = PairwiseMachine.fit(gram, model.labels[owner].cpu().numpy().astype(np.int64), model.options.machine.penalty)
     trained = Trained(rows, owner, gram)
-    return dataclasses.replace(model, kernels=kernels, support=rows[machine.support], machine=machine), trained
+    return dataclasses.replace(model, kernels=kernels, support=rows[machine.support.to(owner.device)], machine=machine), trained
 
 
 # ----------------------------------------------------------------------------------------------------------------------

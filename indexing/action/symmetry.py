@@ -156,7 +156,8 @@ def turn(windows: Tensor, azimuth: FloatArray, pitch: FloatArray) -> Tensor:
     Returns:
         ``(N, length, joints, 2)``.
     """
-    rotations = torch.tensor(np.stack([rotation(a, p) for a, p in zip(azimuth, pitch, strict=True)]), dtype=windows.dtype)
+    rotations = torch.tensor(np.stack([rotation(a, p) for a, p in zip(azimuth, pitch, strict=True)]))
+    rotations = rotations.to(windows)
     centred = windows - windows.mean(dim=(1, 2), keepdim=True)
     return torch.einsum("nij,ntkj->ntki", rotations[:, :2, :2], centred)
 

@@ -27,6 +27,10 @@ class Learned:
     clip: Tensor
     times: Tensor
 
+    def to(self, device: torch.device | str) -> Learned:
+        """The same on another device."""
+        return Learned(self.frames.to(device), self.clip.to(device), self.times.to(device))
+
 
 def training_frames(clips: Sequence[Clip]) -> Learned:
     """All frames of images, missing joints interpolated in time (a joint that a clip never shows is not seen)."""

@@ -124,7 +124,7 @@ class PhaseIndexer(SavedClassifier):
         mirror: ``"auto"``: where an action half a cycle later is its own mirror image (gait), frames also count mirrored;
             ``True``: in every action that repeats; ``False``: never.
         window: seconds of neighbours that a frame's score and phase are averaged over; 0: every frame from itself alone.
-        device: where frames are compared with the exemplars, e.g. ``"cuda"``; ``fit`` computes on the CPU.
+        device: where frames are compared, in ``fit`` too, e.g. ``"cuda"``; what was learned is kept on the CPU.
         options: every other number that decides, by stage (:class:`~indexing.phase.options.PhaseOptions`); None: as measured.
 
     Attributes:
@@ -221,6 +221,7 @@ class PhaseIndexer(SavedClassifier):
             harmonics=self.harmonics,
             course=self.course,
             mirror=self.mirror,
+            device=self.device,
             swap=lambda windows, seen: mirror_permutation(skeleton, windows, seen),
             options=self._options,
         )

@@ -9,7 +9,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from dyntorch.numerics import canonical_correlation, orthonormal_basis
+from dyntorch.numerics import canonical_correlation, on_cpu, orthonormal_basis
 from indexing.action.bank import Windows, stack
 from indexing.clip import Clip
 from indexing.phase.frames import Learned, standardized, training_frames
@@ -69,8 +69,11 @@ def _local(x: Tensor, seconds: Tensor, options: PhaseOptions) -> list[tuple[slic
     return [(part, *period(x[part], seconds[part], options=options)) for part in parts]
 
 
+@on_cpu
 def in_step(clips: list[tuple[Tensor, Tensor]], options: PhaseOptions = PhaseOptions()) -> list[Tensor] | None:
     """Phases in [0, 1) of the frames of clips of one action that repeats; ``None`` where it does not.
+
+    A search over a few seconds at a time: it computes on the CPU.
 
     Args:
         clips: frames ``(F, n, 2)`` and seconds ``(F,)`` of each.
@@ -143,7 +146,9 @@ def followed(
     """
     if len(x) < 3:
         return phase
-    curve = (course.curve(Windows(x[:, None], seen), options.period.steps) + 1e-3).log()
+    # one comparison of all frames at once, and then one step after the other, which only the CPU is quick at
+    curve = (course.curve(Windows(x[:, None], seen), options.period.steps) + 1e-3).log().cpu()
+    home, seconds, phase = phase.device, seconds.cpu(), phase.cpu()
     steps = (phase.diff() + 0.5).remainder(1.0) - 0.5
     rate = float(steps.median() / seconds.diff().median())
     least = (options.period.slow * rate * seconds.diff() * options.period.steps).floor().long().clamp(min=0)
@@ -158,7 +163,7 @@ def followed(
     at = [int(cost.argmin())]
     for move in reversed(back):
         at.append((at[-1] - int(move[at[-1]])) % options.period.steps)
-    return torch.tensor(at[::-1], dtype=phase.dtype) / options.period.steps
+    return (torch.tensor(at[::-1], dtype=phase.dtype) / options.period.steps).to(home)
 
 
 Swap = Callable[[Tensor, Tensor], Tensor | None]
@@ -173,17 +178,19 @@ def learn_model(
     course: str,
     mirror: str | bool,
     swap: Swap,
+    device: torch.device | str = "cpu",
     options: PhaseOptions = PhaseOptions(),
 ) -> tuple[PhaseModel, list[bool]]:
-    """The model, and which classes are their own mirror image half a cycle later.
+    """The model, on the CPU, and which classes are their own mirror image half a cycle later.
 
     Args:
         clips: images; label: ``(clips,)``; phases: of each clip, or ``None``; swap: the joints' mirror images from windows and the
-            joints seen.
+            joints seen; device: where frames are compared and shapes estimated.
     """
     learned = training_frames(clips)
     some = learned.frames[: options.views.mirror_windows]
     twin = swap(some.values, some.seen) if mirror else None
+    learned, phases = learned.to(device), [None if values is None else values.to(device) for values in phases]
     if mirror is True and twin is None:
         raise ValueError("mirror=True: the joints' mirror images are not known; give clips a skeleton with names, or mirror='auto'")
     courses, banks, labels, kept, mirrored = [], [], [], [], []
@@ -203,9 +210,9 @@ def learn_model(
         part = _spread(one, options.learning.kept * (1 + mirrored[-1]))
         banks += [_card(part[0].frames, width) for width in options.learning.cards]
         kept += [part[1]] * len(options.learning.cards)
-        labels.append(torch.full((len(options.learning.cards) * len(part[1]),), c))
+        labels.append(torch.full((len(options.learning.cards) * len(part[1]),), c, device=part[1].device))
     model = PhaseModel(stack(banks), torch.cat(labels), torch.cat(kept), tuple(courses), torch.zeros(0), options)
-    return replace(model, wrong=wrong_scores(model, learned, label)), mirrored
+    return replace(model, wrong=wrong_scores(model, learned, label.to(learned.clip.device))).to("cpu"), mirrored
 
 
 Phased = tuple[Learned, Tensor]
@@ -281,7 +288,7 @@ def _twins(frames: Windows, swap: Tensor) -> Windows:
 
 def _card(frames: Windows, width: float) -> Windows:
     """What a far upright camera sees from elsewhere, were the people flat; at width -1, from behind, they need not be."""
-    return Windows(frames.values * torch.tensor([width, 1.0], dtype=frames.values.dtype), frames.seen)
+    return Windows(frames.values * frames.values.new_tensor([width, 1.0]), frames.seen)
 
 
 def _with_mirror(one: Phased, swap: Tensor) -> Phased:

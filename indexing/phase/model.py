@@ -90,7 +90,8 @@ def learn_course(
     flat = x.permute(1, 0, 2).flatten(1)
     start = x.new_zeros(rows.shape[1], x.shape[1], 3)
     start[0] = torch.linalg.eigh(flat @ flat.mT)[1][:, -3:].flip(1)
-    start[1:] = 0.1 * torch.randn(start[1:].shape, generator=torch.Generator().manual_seed(0), dtype=x.dtype) / rows.shape[1]
+    noise = torch.randn(start[1:].shape, generator=torch.Generator().manual_seed(0), dtype=x.dtype)
+    start[1:] = 0.1 * noise.to(x.device) / rows.shape[1]
     shapes = _alternated(x, weight, rows, start, options.course.rounds, options)
     known = seen.any(0)
     if len(counts) < options.course.styled:
@@ -98,7 +99,7 @@ def learn_course(
     swing = options.course.swing * shapes
     swing[0] = 0
     both = torch.cat([shapes, swing])
-    levels = torch.tensor(options.course.styles, dtype=x.dtype)
+    levels = x.new_tensor(options.course.styles)
     for _ in range(options.course.changes):
         left = torch.stack([_left(x, weight, rows, _styled(both, level)) for level in levels])
         style = levels[x.new_zeros(len(levels), len(counts)).index_add_(1, owner, left).argmin(0)]
@@ -118,7 +119,8 @@ def _cameras(x: Tensor, weight: Tensor, at: Tensor) -> Tensor:
     wide = torch.cat([at, torch.ones_like(at[..., :1])], -1)
     heavy = (wide * weight[..., None]).mT
     gram = heavy @ wide
-    ridge = 1e-9 * gram.diagonal(dim1=1, dim2=2).sum(-1).clamp(min=1e-12)[:, None, None] * torch.eye(4, dtype=x.dtype)
+    size = gram.diagonal(dim1=1, dim2=2).sum(-1).clamp(min=1e-12)[:, None, None]
+    ridge = 1e-9 * size * torch.eye(4, dtype=x.dtype, device=x.device)
     return torch.linalg.solve(gram + ridge, heavy @ x)
 
 
@@ -131,7 +133,7 @@ def _left(x: Tensor, weight: Tensor, rows: Tensor, shapes: Tensor) -> Tensor:
 
 def _alternated(x: Tensor, weight: Tensor, rows: Tensor, shapes: Tensor, rounds: int, options: PhaseOptions) -> Tensor:
     frames, n = weight.shape
-    eye = torch.eye(3 * rows.shape[1], dtype=x.dtype)
+    eye = torch.eye(3 * rows.shape[1], dtype=x.dtype, device=x.device)
     for _ in range(rounds):
         cameras = _cameras(x, weight, _at(rows, shapes))
         design = (rows[:, None, :, None] * cameras[:, :3].mT[:, :, None]).flatten(2)  # (F, 2, 3 B)
@@ -143,7 +145,7 @@ def _alternated(x: Tensor, weight: Tensor, rows: Tensor, shapes: Tensor, rounds:
         at = _at(rows, shapes)
         at = (at - at.mean(1, keepdim=True)).flatten(0, 1)
         spread = at.mT @ at / frames
-        factor = torch.linalg.cholesky_ex(spread + 1e-9 * spread.trace() * torch.eye(3, dtype=x.dtype))[0]
+        factor = torch.linalg.cholesky_ex(spread + 1e-9 * spread.trace() * torch.eye(3).to(spread))[0]
         shapes = torch.linalg.solve_triangular(factor, shapes.mT, upper=False).mT
     return shapes
 
@@ -174,7 +176,8 @@ class PhaseModel:
     def to(self, device: torch.device | str) -> PhaseModel:
         """The same on another device."""
         courses = tuple(Course(c.shapes.to(device), c.periodic, c.seen.to(device)) for c in self.courses)
-        return replace(self, bank=self.bank.to(device), label=self.label.to(device), phase=self.phase.to(device), courses=courses)
+        moved = {name: getattr(self, name).to(device) for name in ("bank", "label", "phase", "wrong")}
+        return replace(self, courses=courses, **moved)
 
     def without(self, c: int) -> PhaseModel:
         """As if a class had never been learned."""

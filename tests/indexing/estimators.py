@@ -6,15 +6,18 @@ check is skipped, which proves nothing.  What those checks are for is tested her
 
 from __future__ import annotations
 
+import pydoc
 from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
+import torch
 from sklearn.base import clone, is_classifier
 from sklearn.exceptions import NotFittedError
 from sklearn.model_selection import GridSearchCV, LeaveOneGroupOut
@@ -330,11 +333,22 @@ def what_is_loaded_answers_the_same(case: Case, path: Path) -> None:
     assert (path / "again.safetensors").read_bytes() == (path / "m.safetensors").read_bytes()
 
 
+TAUGHT_BY: dict[type, tuple[str, Callable[..., torch.Tensor]]] = {
+    ActionIndexer: ("indexing.action.indexer.learn", lambda exemplars, labels, *_: exemplars.crops.values),
+    PhaseIndexer: ("indexing.phase.learning.learn_course", lambda frames, *_: frames),
+    BrightnessIndexer: ("indexing.brightness.indexer.library", lambda exemplars, *_: exemplars.motion),
+}
+"""What does the work of ``fit``, and a tensor that it is given."""
+
+
 @promise()
 def an_accelerator_answers_the_same(case: Case) -> None:
-    lesson = case.lesson()
+    lesson, (teacher, given) = case.lesson(), TAUGHT_BY[case.kind]
     for device in accelerators():
-        there = case.make(device=device).fit(lesson.items, lesson.labels)
+        with mock.patch(teacher, wraps=pydoc.locate(teacher)) as learning:
+            there = case.make(device=device).fit(lesson.items, lesson.labels)
+        # where the work is done; what was learned is handled on the CPU
+        assert {given(*call.args).device.type for call in learning.call_args_list} == {device}
         np.testing.assert_allclose(there.decision_function(lesson.asked), fitted(case).decision_function(lesson.asked), atol=0.01)
         assert there.predict(lesson.asked).tolist() == fitted(case).predict(lesson.asked).tolist()
 

@@ -1,4 +1,4 @@
-"""Exact matches at the stated counts are solved, whatever the digits that their squares lose; those that decide nothing are refused.
+"""Exact matches at the stated counts are solved, whatever digits their squares lose; those that decide nothing are refused.
 
 Scenes from the thesis's definitions (1.3, chapters 3 and 6), in pixels, by torch alone.
 """
