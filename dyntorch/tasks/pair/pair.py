@@ -20,6 +20,7 @@ from dyntorch.numerics.arguments import check_options, check_threshold, on_cpu
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.tasks.pair.affine import Transfer, filled, solve
 from dyntorch.tasks.pair.options import PairOptions
+from dyntorch.tasks.pair.projective import body_pair
 from dyntorch.tasks.pair.result import PairNotice, PairReconstruction, failure
 from dyntorch.tasks.pair.tracks import Overlap, match_tracks, overlap
 from dyntorch.tasks.synchronize.result import Shift
@@ -114,6 +115,7 @@ def reconstruct_pair(
     times: Sequence[Any] | None = None,
     explained: float = 0.8,
     threshold: float | None = None,
+    camera: str = "auto",
     generator: torch.Generator | None = None,
     options: PairOptions = PairOptions(),
 ) -> PairReconstruction:
@@ -131,6 +133,13 @@ def reconstruct_pair(
     told from motion by their own spectrum in time and by their correlations.  With ``correspondence=True`` point i of a is
     point i of b, the cameras are projective, and one fundamental matrix of all frames gives the structure of each.
 
+    Different points before perspective cameras (``camera="projective"``): six or more of each camera, of one rigid body that turns.
+    Scaled by their projective depths, the rows of both cameras are linear in the same 12 functions of time, the body's motion
+
+    .. math:: \lambda_{ti}\,(x_{ti}, 1) = P_a\, M(t)\, X_i, \qquad \mu_{tj}\,(y_{tj}, 1) = P_b\, M(t)\, Y_j,
+
+    which brings both cameras, and the points of both, into one frame, without one point in common.
+
     A search: it computes on the CPU wherever its tensors are, and the result returns to their device.
 
     Args:
@@ -142,7 +151,9 @@ def reconstruct_pair(
         times: (seconds of a's frames, of b's frames) instead of ``fps``.
         explained: share of a point's motion that the other camera must predict for the point to be transferred (affine), share of
             its frames within the threshold (corresponding points).
-        threshold: pixels, Sampson distance of corresponding points; three standard deviations of the noise.  None estimates it.
+        threshold: pixels, Sampson distance of corresponding points, of different ones before projective cameras the distance from
+            the reprojection; three standard deviations of the noise.  None estimates it.
+        camera: ``"affine"`` or ``"projective"``; ``"auto"``: affine for different points, projective for corresponding ones.
         generator: of the random samples for corresponding points.
         options: every number that decides, by stage; ``dataclasses.replace`` changes some of them.
 
@@ -165,16 +176,20 @@ def reconstruct_pair(
         >>> found.points.shape, bool(found.status == 0), int(found.labels.sum())
         (torch.Size([77, 22, 3]), True, 22)
     """
-    _check(a, b, correspondence, explained)
+    _check(a, b, correspondence, explained, camera)
     check_threshold(threshold)
     check_options(options, PairOptions)
     with torch.no_grad():
         seen = overlap(a, b, shift, fps=fps, times=times, options=options)
         short = _short(seen, options.input.shortest)
         if short is not None:
-            found = failure((a.shape[1], b.shape[1]), seen.times, Status.TOO_FEW, short, 4 if correspondence else 3)
+            count = a.shape[1] + (0 if correspondence else b.shape[1])
+            width = 4 if correspondence or camera == "projective" else 3
+            found = failure((a.shape[1], b.shape[1]), seen.times, Status.TOO_FEW, short, width, count)
         elif correspondence:
             found = projective(seen, threshold, explained, generator, options)
+        elif camera == "projective":
+            found = body_pair(seen, threshold, explained, options)
         else:
             found = _affine(seen, explained, options)
     changed = {
@@ -185,7 +200,14 @@ def reconstruct_pair(
     return replace(found, **changed)
 
 
-def _check(a: Tensor, b: Tensor, correspondence: bool, explained: float) -> None:
+CAMERAS = ("auto", "affine", "projective")
+
+
+def _check(a: Tensor, b: Tensor, correspondence: bool, explained: float, camera: str) -> None:
+    if camera not in CAMERAS:
+        raise ValueError(f"camera must be one of {', '.join(CAMERAS)}, got {camera!r}")
+    if camera == "affine" and correspondence is True:
+        raise ValueError("camera='affine' is for different points: give correspondence=False, or leave it out")
     if not isinstance(correspondence, bool):
         raise ValueError(f"correspondence must be True or False, got {correspondence!r}")
     for name, x in (("a", a), ("b", b)):

@@ -64,6 +64,13 @@ class PairNotice(NoticeCode):
         Status.DEGENERATE,
     )
     """All points move along one line of the image."""
+    TWO_MOTIONS = (
+        "two_motions",
+        "the cameras do not see one rigid motion (they differ by {value:.2g} times what is known of it): check the {arg:shift}, or that "
+        "both show points of the same body",
+        Status.NO_CONSENSUS,
+    )
+    """The motions before the two cameras are not one."""
     FREE_PLACES = (
         "free_places",
         "the mean places of the {a} and {b} points do not follow from their motions (residual {value:.2g} px without them): "
@@ -81,17 +88,19 @@ class PairReconstruction(Outcome):
         cameras: ``(2, 3, 4)``, of a and of b; the last row is (0, 0, 0, 1) where they are affine.  Zero where the status says that
             there are none.
         points: ``(frames, N, 3)`` trajectories up to one affinity of space, first a's n points, then b's m.  Of corresponding
-            points ``(frames, n, 4)``, homogeneous of norm 1, up to one collineation of space.  NaN where a point was not found.
+            points ``(frames, n, 4)``, of different ones before projective cameras ``(frames, N, 4)``, homogeneous of norm 1, up to
+            one collineation of space.  NaN where a point was not found.
         times: ``(frames,)`` seconds of a's clock.
         source: ``(N,)`` camera that a point was seen by: 0 = a, 1 = b; all 0 for corresponding points.
         labels: ``(N,)`` 0 outlier or not transferable, 1 found.
         r2: ``(N,)`` share of the motion of a point's epipolar coordinate that the other camera predicts, in stretches of time left
-            out one after the other; of corresponding points the share of their frames within the threshold.
+            out one after the other; of projective cameras the share of a point's frames within the threshold.
         matches: ``(m,)`` the track of a that a track of b is, -1 = none.
         distances: ``(n, m)`` rms distance between a track of a and one of b, in pixels of a; NaN where there is none.
-        normals: ``(2, 2)`` unit normals of the epipolar lines of a and of b; of corresponding points NaN.
+        normals: ``(2, 2)`` unit normals of the epipolar lines of a and of b; of projective cameras NaN.
         fundamental: ``(3, 3)`` of norm 1, :math:`x_b^T F x_a = 0`.
-        residuals: ``(N,)`` rms distance of each point from the epipolar lines that the other camera says, pixels.
+        residuals: ``(N,)`` rms distance of each point from the epipolar lines that the other camera says, pixels; of different points
+            before projective cameras from its reprojection.
         residual: the same of all points found.
     """
 
@@ -135,22 +144,25 @@ class PairReconstruction(Outcome):
         lines = [f"PairReconstruction({kind}, frames={frames}, points={count}: {Status(int(self.status)).name})"]
         if bool(agreed(self.status)):
             first, second = (int(((self.labels > 0) & (self.source == k)).sum()) for k in (0, 1))
-            of = f" ({first} of a, {second} of b)" if kind == "affine" else ""
+            of = f" ({first} of a, {second} of b)" if bool((self.source > 0).any()) else ""
             lines.append(
                 f"  {found} found{of}, {count - found} outliers, {matched} seen by both; residual {self.residual:.3g} px rms"
             )
         return "\n".join(lines + self.warned())
 
 
-def failure(points: tuple[int, int], times: Tensor, status: Status, notice: Notice, width: int) -> PairReconstruction:
+def failure(
+    points: tuple[int, int], times: Tensor, status: Status, notice: Notice, width: int, count: int | None = None
+) -> PairReconstruction:
     """Nothing found.
 
     Args:
         points: of a and of b.
         width: coordinates of a point, 3 or 4.
+        count: points in all; None: those of both cameras, of corresponding points (width 4) those of one.
     """
     n, m = points
-    count = n + m if width == 3 else n
+    count = count if count is not None else n + m if width == 3 else n
     like = {"dtype": torch.float64, "device": times.device}
 
     def empty(*shape: int) -> Tensor:

@@ -298,6 +298,59 @@ class DifferentPointOptions:
 
 
 @dataclass(frozen=True)
+class ProjectiveOptions:
+    """Different points of one rigid body before perspective cameras (``camera="projective"``)."""
+
+    fewest_points: int = 6
+    """Points on the body that a camera has to see: fewer leave projective depths undecided."""
+    seen: float = 0.5
+    """Share of the frames in which a point must be seen to be used."""
+    fewest_in_frame: int = 4
+    """Points that place the body in a frame, once its shape is known."""
+    fewest_frames: int = 10
+    """Frames that show enough points, at least."""
+    views: int = 20
+    """Frames that the search starts with, spread over the take."""
+    focals: tuple[float, ...] = (4.0, 9.0, 25.0)
+    """Focal lengths to start from, over the rms coordinate of the tracks.  Of 96 cameras at 5 to 50 times the size of the body all
+    ended at the same minimum as from six focal lengths, from 2 to 60."""
+    start_iterations: int = 60
+    """Steps from each start."""
+    iterations: int = 60
+    """Steps of the adjustment of all frames."""
+    placing_steps: int = 3
+    """Gauss-Newton steps that place a point on a body whose motion is known."""
+    misfit: float = 3.0
+    """Rms of a point about the body, over the noise of its coordinates, beyond which it is not on the body."""
+    exact: float = 1e-6
+    """The same over the rms coordinate of the tracks, where that is more: rounding."""
+    subsets: int = 100
+    """Subsets of points that are compared where some are not on the body."""
+    tried: int = 8
+    """Of them those that are fitted, at most."""
+    thick: float = 3.0
+    """Thickness of the body in the image, over the noise, below which its points are in one plane."""
+    turned: float = 5.0
+    """Rms angle that the body turns by, over the noise at the distance of its points from their middle, below which it does not."""
+    measure: str = "attitude"
+    """What is compared at all lags: ``"attitude"``, how far the cameras disagree about the turns of the body, or ``"rank"``, the
+    thesis's rank of both cameras' scaled measurements together; either way descents from its best lags decide."""
+    peaks: int = 5
+    """Lags from which a descent starts."""
+    agree: float = 1.8
+    """Difference of the two motions, in standard deviations of what the cameras know, beyond which they are not one: 0.9 to 1.2 at the
+    right shift."""
+    margin: float = 0.2
+    """Logarithm of that difference at the next lag over that at the best, for a decision."""
+    even: float = 0.1
+    """The same at which the best lag is as likely as not; set by hand."""
+    margin_scale: float = 0.03
+    """By how much it grows for odds of e times as much."""
+    blur: float = 1e-6
+    """Seconds that a shift is uncertain by at least: poses between frames are interpolated."""
+
+
+@dataclass(frozen=True)
 class NetworkOptions:
     """Several cameras on one clock, from the shifts of their pairs."""
 
@@ -345,3 +398,4 @@ class SynchronizeOptions:
     subspace: SubspaceOptions = SubspaceOptions()
     different: DifferentPointOptions = DifferentPointOptions()
     cameras: NetworkOptions = NetworkOptions()
+    projective: ProjectiveOptions = ProjectiveOptions()

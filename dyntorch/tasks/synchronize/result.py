@@ -86,6 +86,39 @@ class ShiftNotice(NoticeCode):
         Status.DEGENERATE,
     )
     """Motion that looks the same at every shift."""
+    FEW_ON_BODY = (
+        "few_on_body",
+        "{camera:{which}} shows {value:# point|# points} in half of the frames, projective cameras need {needed} on one body; "
+        "track more, or longer",
+        Status.TOO_FEW,
+    )
+    """Too few points for projective depths."""
+    NO_BODY = (
+        "no_body",
+        "the points of {camera:{which}} do not move as one rigid body before a fixed perspective camera ({value:.2g} px beside a "
+        "noise of {noise:.2g}): leave out those of other bodies, or use {arg:camera='auto'}",
+        Status.NO_CONSENSUS,
+    )
+    """No rigid body explains what a camera sees."""
+    FLAT_BODY = (
+        "flat_body",
+        "the points of {camera:{which}} lie in one plane ({value:.2g} px beside a noise of {noise:.2g}): add points off it",
+        Status.DEGENERATE,
+    )
+    """A plane has no projective depths of its own."""
+    NO_TURN = (
+        "no_turn",
+        "the body turns by {value:.2g} radians before {camera:{which}}, too little to tell its shape: film a larger turn",
+        Status.DEGENERATE,
+    )
+    """A body that does not turn."""
+    NO_COMMON_MOTION = (
+        "no_common_motion",
+        "at no shift do both cameras see one motion (they differ by {value:.2g} times what is known of it): check that both show "
+        "points of the same rigid body, raise {arg:max_shift}",
+        Status.NO_CONSENSUS,
+    )
+    """Two bodies that move in different ways."""
     AFFINE = "affine", "affine cameras: the points do not hold enough depth, or are too noisy, for perspective ones"
     """What was fitted are affine cameras."""
     LENS = (
@@ -145,7 +178,8 @@ class Shift(ClockOutcome):
             Offsets are those at ``center``: :math:`t_b - t_a` there.
         status: OK where the data decide, as ``ok`` says; ``reason`` says why not, in one sentence with what to do.
         notices: that reason, and what a user should know besides (``notes``).
-        method: ``"epipolar"``, ``"affine"`` (both: same points), ``"subspace"`` (different points), ``"brightness"``.
+        method: ``"epipolar"``, ``"affine"`` (both: same points), ``"subspace"``, ``"projective"`` (both: different points),
+            ``"brightness"``.
         fps: frames per second of a and of b, of the timestamps' median where these were given.
         center: a's time in the middle of the overlap: where offset and rate are least correlated.
         lags: ``(L,)`` seconds, at ``center``: the abscissa of ``scores``.

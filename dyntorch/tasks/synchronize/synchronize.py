@@ -21,6 +21,7 @@ from dyntorch.tasks.synchronize.different import different_points
 from dyntorch.tasks.synchronize.epipolar import Curve, EpipolarFit, Samples, ShiftDescent, epipolar_curve
 from dyntorch.tasks.synchronize.evidence import Attempt, consistent_points
 from dyntorch.tasks.synchronize.options import SynchronizeOptions
+from dyntorch.tasks.synchronize.projective import projective_points
 from dyntorch.tasks.synchronize.result import Shift, ShiftNotice
 from dyntorch.tasks.synchronize.tracks import Tracks, cleaned, frame_scaled, read_tracks, smoothed, without
 
@@ -278,7 +279,7 @@ def _straightened(
     return (again, (Notice(ShiftNotice.LENS, 0.0, values),)) if better else (found, ())
 
 
-CAMERAS = ("auto", "perspective", "affine")
+CAMERAS = ("auto", "perspective", "affine", "projective")
 
 
 @one_thread
@@ -322,7 +323,9 @@ def synchronize(
         weights: per camera ``(frames, n)``, such as a detector's confidences; 0 = ignore.
         rate: of b's clock, where known; by default 1 unless the takes say otherwise (up to 2 %).
         camera: ``"perspective"``, ``"affine"`` (points about their middle in each frame), or ``"auto"``: perspective unless that
-            cannot decide and affine can.  Of corresponding points only.
+            cannot decide and affine can; these are of corresponding points.  Of different points ``"projective"``: uncalibrated
+            perspective cameras, six points or more each of one rigid body that turns (see
+            :func:`dyntorch.tasks.synchronize.projective.projective_points`).
         generator: of the subsets that look for wrong points; a fixed one by default.
         options: every number that decides, by stage; ``dataclasses.replace`` changes some of them.
 
@@ -368,6 +371,8 @@ def synchronize(
     # both clocks count from a's first frame: timestamps may be of any era, and products of rates with them lose digits
     origin = float(tracks[0].times[0])
     first, second = (cleaned(dataclasses.replace(one, times=one.times - origin), options) for one in tracks)
+    if camera == "projective":
+        return projective_points(first, second, max_shift=max_shift, rate=rate, options=options).since(origin)
     if not correspondence:
         return different_points(first, second, max_shift=max_shift, rate=rate, options=options).since(origin)
     if a.shape[1] != b.shape[1]:
@@ -411,8 +416,10 @@ def _check(
         raise ValueError(f"rate must be about 1 (seconds of b's clock per second of a's), got {rate}; give fps for frame rates")
     if camera not in CAMERAS:
         raise ValueError(f"camera must be one of {', '.join(CAMERAS)}, got {camera!r}")
-    if camera != "auto" and not correspondence:
+    if camera in ("perspective", "affine") and not correspondence:
         raise ValueError(f"camera={camera!r} is for corresponding points; leave it out with correspondence=False")
+    if camera == "projective" and correspondence:
+        raise ValueError("camera='projective' is for different points: give correspondence=False, or camera='perspective'")
 
 
 def _pairwise(calibration: Any) -> Sequence[Any]:
