@@ -131,7 +131,10 @@ class BodyProblem(LeastSquares):
         blocks = [
             (mine[:, None, :, None] * inner[..., None, :]).flatten(-2),
             (mine[:, None, 1:, None] * sight[..., None, :]).flatten(-2),
-            (torch.eye(n, dtype=x.dtype, device=x.device)[:, None, :, None] * (by_placed @ at.motions[:, :, None, :, :3])[..., None, :]).flatten(-2),
+            (
+                torch.eye(n, dtype=x.dtype, device=x.device)[:, None, :, None]
+                * (by_placed @ at.motions[:, :, None, :, :3])[..., None, :]
+            ).flatten(-2),
         ]
         return error.flatten(2), torch.cat(blocks, -1).flatten(2, 3), own
 

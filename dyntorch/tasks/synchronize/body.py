@@ -14,7 +14,6 @@ from dyntorch.geometry.body import BodyProblem, FilmedBody, fit_body
 from dyntorch.geometry.homogeneous import homogeneous
 from dyntorch.geometry.rigid import nearest_rotation
 from dyntorch.geometry.triangulation import resect, triangulate
-from dyntorch.numerics.blocks import each
 from dyntorch.numerics.least_squares import LeastSquaresOptions
 from dyntorch.numerics.subspaces import affine_factorization, metric_upgrade
 from dyntorch.tasks.reconstruct.factorization import projective_factorization
@@ -240,7 +239,9 @@ class _Take:
             return None
         sets = self._subsets(index)
         left = affine_factorization(torch.stack([self.x[whole][:, part] for part in sets]))
-        energy = torch.stack([(self.x[whole][:, part] - self.x[whole][:, part].mean(1, keepdim=True)).square().sum() for part in sets])
+        energy = torch.stack(
+            [(self.x[whole][:, part] - self.x[whole][:, part].mean(1, keepdim=True)).square().sum() for part in sets]
+        )
         best: _Fit | None = None
         for i in (left[2] * energy).argsort(stable=True)[: self.options.tried].tolist():
             found = self.fitted(torch.zeros_like(often).index_fill(0, sets[i], True))
@@ -261,7 +262,9 @@ class _Take:
         else:
             # a generator of its own: the same tracks get the same answer
             generator = torch.Generator().manual_seed(0)
-            draws = (torch.randperm(len(index), generator=generator)[:size].sort().values.tolist() for _ in range(self.options.subsets))
+            draws = (
+                torch.randperm(len(index), generator=generator)[:size].sort().values.tolist() for _ in range(self.options.subsets)
+            )
             parts = [[index[i] for i in part] for part in draws]
         return [torch.tensor(part, device=self.x.device) for part in parts]
 
@@ -290,9 +293,11 @@ def started(x: Tensor, options: ProjectiveOptions) -> FilmedBody | None:
     count = len(body.points)
     weights = torch.ones(count, *x.shape[:2], dtype=x.dtype, device=x.device)
     problem = BodyProblem(x.expand(count, *x.shape), weights, _camera(x.shape[1], x))
-    body, cost = fit_body(problem, body, LeastSquaresOptions(iterations=options.start_iterations, tolerance=1e-6))
-    best = cost.argmin()
-    return FilmedBody(*each(lambda part: part[best][None], tuple(body))) if bool(cost[best].isfinite()) else None
+    for steps, kept in ((options.first_iterations, options.kept), (options.start_iterations, 1)):
+        body, cost = fit_body(problem, body, LeastSquaresOptions(iterations=steps, tolerance=1e-6))
+        best = cost.argsort(stable=True)[:kept]
+        body, problem = FilmedBody(*(part[best] for part in body)), problem.subset(best)
+    return body if bool(cost[best].isfinite().all()) else None
 
 
 def _projective(x: Tensor, focal: Tensor) -> list[FilmedBody]:

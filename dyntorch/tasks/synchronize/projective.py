@@ -181,7 +181,9 @@ class SharedMotion(LeastSquares):
         counted = error.isfinite().all(-1) & inside
         error = torch.where(counted[..., None], error, 0.0)
         upper = torch.cat([x, torch.zeros_like(x)], -1)[:, None].expand(-1, len(times), -1, -1)
-        lower = torch.cat([-skew(arm) @ x[:, None], (scale[..., None] * x)[:, None].expand_as(arm[..., None].expand(*arm.shape, 3))], -1)
+        lower = torch.cat(
+            [-skew(arm) @ x[:, None], (scale[..., None] * x)[:, None].expand_as(arm[..., None].expand(*arm.shape, 3))], -1
+        )
         carry = torch.where(counted[..., None, None], torch.cat([upper, lower], -2), 0.0)
         eye = torch.eye(6, dtype=x.dtype, device=x.device)
         total = self.b.spread(moments) + carry @ self.a.spread(times) @ carry.mT
@@ -223,7 +225,12 @@ class SharedMotion(LeastSquares):
         """Clocks moved, turns turned."""
         clock, x, y, rest = theta
         move = -step[0]
-        return clock + move[:, :2], rotation_exponential(move[:, 2:5]) @ x, rotation_exponential(move[:, 5:8]) @ y, rest + move[:, 8:]
+        return (
+            clock + move[:, :2],
+            rotation_exponential(move[:, 2:5]) @ x,
+            rotation_exponential(move[:, 5:8]) @ y,
+            rest + move[:, 8:],
+        )
 
 
 def _log(rotation: Tensor) -> Tensor:
@@ -278,8 +285,8 @@ def rank_curve(a: Tensor, b: Tensor, wa: Tensor, wb: Tensor, lags: tuple[int, in
     r"""What of the motions before two cameras is beyond one space of 13 dimensions, at all lags.
 
     Scaled by its projective depths, a point's image :math:`\lambda_j(t)\, x_j(t) = P\, M(t)\, X_j` is linear in the 12 entries of the
-    motion: the rows of camera a span 12 dimensions of time, those of b 12, with the constant both span the same 13.  At a wrong shift
-    they have nothing but the constant in common, and span 25.
+    motion and in 1: the rows of camera a span 12 dimensions of time, those of b 12, both lie in the same 13 and meet in 11.  At a
+    wrong shift they meet in nothing, and span 24, with the constant 25.
 
     Args:
         a: ``(Ta, 3, 4)`` projections :math:`[R\ T]` of the body before the first camera, scaled alike in all frames.
@@ -327,14 +334,25 @@ def _scaled(own: Tensor, cross: Tensor) -> tuple[Tensor, Tensor]:
 # The whole: two bodies, all lags, a descent from the best of them, and whether to believe it.
 
 
-def projective_points(
-    a: Tracks, b: Tracks, *, max_shift: float | None, rate: float | None, options: SynchronizeOptions
-) -> Shift:
+MEASURES = ("attitude", "rank")
+
+
+def projective_points(a: Tracks, b: Tracks, *, max_shift: float | None, rate: float | None, options: SynchronizeOptions) -> Shift:
     """The shift of uncalibrated perspective cameras that see different points of one rigid body.
+
+    Fixed cameras before one moving body, or cameras that move together (a rig) before a static scene.  Each camera alone tells the
+    motion, up to the place and the axes of the body; at the right shift both motions are one.  It takes six points of each camera
+    and a body that turns.  Measured with 7 to 10 points each over 2 to 5 s and a body of 100 px: exact tracks to 1e-5 frame, .3 px
+    to .003 frame, 1 px to .01 frame.
 
     Args:
         rate: of b's clock, where it is known.
+
+    Raises:
+        ValueError: an unknown measure.
     """
+    if options.projective.measure not in MEASURES:
+        raise ValueError(f"options.projective.measure must be {' or '.join(MEASURES)}, got {options.projective.measure!r}")
     motions = [body_motion(name, tracks, options.projective) for name, tracks in (("a", a), ("b", b))]
     wrong = tuple(motion for motion in motions if isinstance(motion, Notice))
     if wrong:
@@ -356,7 +374,9 @@ def match_motions(
     if not top:
         return _nothing(a, b, (Notice(ShiftNotice.SHORT_OVERLAP),))
     problem, theta = _starts(first, second, curve, top)
-    found = minimize(problem, problem.evaluate(theta), LeastSquaresOptions(iterations=options.projective.iterations, tolerance=1e-9))
+    found = minimize(
+        problem, problem.evaluate(theta), LeastSquaresOptions(iterations=options.projective.iterations, tolerance=1e-9)
+    )
     misfits = (found.cost / 6).sqrt()
     if not bool(misfits.isfinite().any()):
         return _nothing(a, b, (Notice(ShiftNotice.SHORT_OVERLAP),))
