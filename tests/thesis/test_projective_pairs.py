@@ -4,6 +4,7 @@ A fixed camera sees a point X of a body that moves by M(t) at P M(t) X.  Everyth
 """
 
 import math
+from itertools import chain
 
 import pytest
 import torch
@@ -61,10 +62,10 @@ def test_exact_ranks_of_measurements_scaled_by_depth():
         return table
 
     def joined(*parts):
-        return rank_mod([sum(row, []) for row in zip(*parts, strict=True)])
+        return rank_mod([[*chain(*row)] for row in zip(*parts, strict=True)])
 
     a, b, one = filmed(draw(3, 4)), filmed(draw(3, 4)), [[1]] * frames
-    # a camera's 12 rows are combinations of the 12 entries of the motion and of 1: a space of 12 dimensions, which is not the other's
+    # a camera's 12 rows are combinations of the 12 entries of the motion and of 1: each a space of 12 dimensions
     assert joined(a) == joined(b) == 12 and joined(a, one) == joined(b, one) == 13
     # at the right shift both lie in the 13 dimensions of the motion, and meet in 11; at a wrong one they meet in nothing
     assert joined(a, b) == joined(a, b, one) == 13 and 12 + 12 - 13 == 11

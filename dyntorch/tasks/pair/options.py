@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from dyntorch.tasks.synchronize.options import ProjectiveOptions
-
 
 @dataclass(frozen=True)
 class ResamplingOptions:
@@ -160,4 +158,3 @@ class PairOptions:
     explanation: ExplanationOptions = ExplanationOptions()
     places: PlaceOptions = PlaceOptions()
     matching: TrackMatchOptions = TrackMatchOptions()
-    projective: ProjectiveOptions = ProjectiveOptions()

@@ -1,4 +1,4 @@
-"""Reconstruction from different points of one rigid body before two uncalibrated perspective cameras: both in one projective frame."""
+"""Different points of one rigid body before two uncalibrated perspective cameras: both point sets in one projective frame."""
 
 from __future__ import annotations
 
@@ -17,43 +17,51 @@ from dyntorch.tasks.pair.options import PairOptions
 from dyntorch.tasks.pair.result import PairNotice, PairReconstruction, failure
 from dyntorch.tasks.pair.tracks import Overlap
 from dyntorch.tasks.synchronize.body import BodyMotion, body_motion
+from dyntorch.tasks.synchronize.options import ProjectiveOptions
 from dyntorch.tasks.synchronize.projective import Poses, common_motion
 from dyntorch.tasks.synchronize.tracks import Tracks
 
 
-def body_pair(seen: Overlap, threshold: float | None, explained: float, options: PairOptions) -> PairReconstruction:
+def body_pair(
+    seen: Overlap,
+    threshold: float | None,
+    explained: float,
+    options: PairOptions,
+    bodies: ProjectiveOptions = ProjectiveOptions(),
+) -> PairReconstruction:
     r"""One body, two cameras, points of either's own:
 
     .. math:: x_{ti} \simeq K_a\,[R_t \mid T_t]\,X_i, \qquad y_{tj} \simeq K_b\,[R \mid \tau]\, \begin{bmatrix} R_t & T_t \\ 0 & 1
        \end{bmatrix} Y_j.
 
-    Each camera alone gives the motion up to a similarity; that both motions are one, up to where the cameras are and how the axes of
-    the body were chosen, brings them into one frame; the reprojection error of both is minimized in all of it together.
+    Each camera alone gives the motion up to a similarity; that both motions are one, up to where the cameras are and how the axes
+    of the body were chosen, brings them into one frame; the reprojection error of both is minimized in all of it together.
 
     Args:
         seen: tracks of both cameras at the same moments.
         threshold: pixels from a point's reprojection; None: three standard deviations of the noise.
         explained: share of a point's frames that must be within it.
-        options: every number that decides.
+        options: every number that decides about pairs.
+        bodies: those that decide what one camera says of a body, as in :func:`dyntorch.synchronize`.
     """
     n, m = seen.a.shape[1], seen.b.shape[1]
     tracks = [_tracks(x, seen) for x in (seen.a, seen.b)]
     motions = []
     for name, one in zip("ab", tracks, strict=True):
-        motion = body_motion(name, one, options.projective)
+        motion = body_motion(name, one, bodies)
         if isinstance(motion, Notice):
             return failure((n, m), seen.times, motion.code.refuses or Status.DEGENERATE, motion, 4, n + m)
         motions.append(motion)
     first, second = motions
-    poses = [Poses.of(motion, seen.times, options.projective) for motion in motions]
-    shared, misfit = common_motion(poses[0], poses[1], options.projective)
-    if not misfit <= options.projective.agree:
+    poses = [Poses.of(motion, seen.times, bodies) for motion in motions]
+    shared, misfit = common_motion(poses[0], poses[1], bodies)
+    if not misfit <= bodies.agree:
         return failure((n, m), seen.times, Status.NO_CONSENSUS, Notice(PairNotice.TWO_MOTIONS, misfit), 4, n + m)
-    body, problem = _joint(first, second, shared, tracks, options)
-    body, cost = fit_body(problem, body, LeastSquaresOptions(iterations=options.projective.iterations, tolerance=1e-10))
+    body, problem = _joint(first, second, shared, tracks, bodies)
+    body, cost = fit_body(problem, body, LeastSquaresOptions(iterations=bodies.iterations, tolerance=1e-10))
     if not bool(cost.isfinite().all()):
         return failure((n, m), seen.times, Status.NO_CONSENSUS, Notice(PairNotice.TWO_MOTIONS, math.inf), 4, n + m)
-    return _assembled(seen, body, first, second, threshold, explained, options)
+    return _assembled(seen, body, first, second, threshold, explained, options, bodies)
 
 
 def _tracks(x: Tensor, seen: Overlap) -> Tracks:
@@ -63,7 +71,7 @@ def _tracks(x: Tensor, seen: Overlap) -> Tracks:
 
 
 def _joint(
-    first: BodyMotion, second: BodyMotion, shared: tuple[Tensor, ...], tracks: list[Tracks], options: PairOptions
+    first: BodyMotion, second: BodyMotion, shared: tuple[Tensor, ...], tracks: list[Tracks], bodies: ProjectiveOptions
 ) -> tuple[FilmedBody, BodyProblem]:
     """The start in the frame of a, and the problem of both cameras' tracks, each in its own unit."""
     turn, seat, (scale, *rest) = shared[0], shared[1], shared[2].split([1, 3, 3])
@@ -80,7 +88,7 @@ def _joint(
     for k, (motion, one) in enumerate(zip((first, second), tracks, strict=True)):
         own = one.x[:, motion.points]
         x.append((own - motion.centre) / motion.scale)
-        noise = max(motion.residual, options.projective.exact * motion.scale)
+        noise = max(motion.residual, bodies.exact * motion.scale)
         known = (one.weights[:, motion.points] > 0) & (first.seen | second.seen)[:, None]
         weights.append(known * (motion.scale / noise) ** 2)
         camera.append(torch.full((own.shape[1],), k, device=own.device))
@@ -126,7 +134,7 @@ def _assembled(
     sigma = float(apart[:, kept].nanmedian()) / 1.1774
     limit = options.corresponding.sigmas * sigma if threshold is None else threshold
     counted = apart.isfinite()
-    share = (counted & (apart <= max(limit, options.projective.exact * first.scale))).sum(0) / counted.sum(0).clamp(min=1)
+    share = (counted & (apart <= max(limit, bodies.exact * first.scale))).sum(0) / counted.sum(0).clamp(min=1)
     good = kept & (share >= explained)
     matches, distances = _matched(both, good, n, float(apart[:, good].square().nanmean().sqrt()), options)
     rotation, place = body.sights[0, 1].split([3, 1], -1)

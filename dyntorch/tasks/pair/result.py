@@ -66,8 +66,8 @@ class PairNotice(NoticeCode):
     """All points move along one line of the image."""
     TWO_MOTIONS = (
         "two_motions",
-        "the cameras do not see one rigid motion (they differ by {value:.2g} times what is known of it): check the {arg:shift}, or that "
-        "both show points of the same body",
+        "the cameras do not see one rigid motion (they differ by {value:.2g} times what is known of it): check the {arg:shift}, or "
+        "that both show points of the same body",
         Status.NO_CONSENSUS,
     )
     """The motions before the two cameras are not one."""
@@ -99,8 +99,8 @@ class PairReconstruction(Outcome):
         distances: ``(n, m)`` rms distance between a track of a and one of b, in pixels of a; NaN where there is none.
         normals: ``(2, 2)`` unit normals of the epipolar lines of a and of b; of projective cameras NaN.
         fundamental: ``(3, 3)`` of norm 1, :math:`x_b^T F x_a = 0`.
-        residuals: ``(N,)`` rms distance of each point from the epipolar lines that the other camera says, pixels; of different points
-            before projective cameras from its reprojection.
+        residuals: ``(N,)`` rms distance of each point from the epipolar lines that the other camera says, pixels; of different
+            points before projective cameras from its reprojection.
         residual: the same of all points found.
     """
 

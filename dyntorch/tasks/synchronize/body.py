@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations
 
 import torch
@@ -68,9 +68,9 @@ def body_motion(name: str, tracks: Tracks, options: ProjectiveOptions) -> BodyMo
 
     .. math:: \lambda_{tj}\,(x_{tj}, 1)^T = K\,[R_t \mid T_t]\,(X_j, 1)^T
 
-    Some frames are factored with their projective depths, and, as where the depths hardly vary, as affine ones; both are brought to a
-    constant calibration from several focal lengths, all descend, the best one is taken.  The other frames follow by resection, all
-    together are adjusted.  Points that are not on the body are told by subsets of six.
+    Some frames are factored with their projective depths, and as affine ones, where depths hardly vary; both are brought to a
+    constant calibration from several focal lengths, all descend, the best one is taken.  The other frames follow by resection,
+    all together are adjusted.  Points that are not on the body are told by subsets of six.
 
     Args:
         name: of the camera, in notices.
@@ -179,7 +179,7 @@ class _Take:
         return chosen, whole[torch.linspace(0, max(len(whole) - 1, 0), views).round().long()]
 
     def _posed(self, body: FilmedBody, chosen: Tensor, frames: Tensor) -> tuple[FilmedBody, Tensor] | None:
-        """The same body in all frames, by resection or as in the nearest frame of the start, whichever fits; and where it is known."""
+        """The body in all frames, by resection or as in the nearest frame of the start, whichever fits; and where it is known."""
         x, seen = self.x[:, chosen], self.seen[:, chosen]
         projections = torch.linalg.inv(body.calibrations[0, 0]) @ resect(homogeneous(body.points[0]), x, seen.to(x))
         size = torch.linalg.det(projections[..., :3])

@@ -339,13 +339,13 @@ class ProjectiveOptions:
     measure: str = "attitude"
     """What is compared at all lags: ``"attitude"``, how far the cameras disagree about the turns of the body, or ``"rank"``, the
     thesis's rank of both cameras' scaled measurements together; either way descents from its best lags decide.  The rank is exact
-    where the shift is a whole number of frames and the take long: of 5 s of motion below .6 Hz 12 dimensions explain as much at other
-    lags."""
+    where the shift is a whole number of frames and the take long: of 5 s of motion below .6 Hz 12 dimensions explain as much
+    at other lags."""
     peaks: int = 5
     """Lags from which a descent starts."""
     agree: float = 1.8
-    """Difference of the two motions, in standard deviations of what the cameras know, beyond which they are not one: 0.9 to 1.2 at the
-    right shift."""
+    """Difference of the two motions, in standard deviations of what the cameras know, beyond which they are not one: 0.9 to 1.2 at
+    the right shift."""
     margin: float = 0.2
     """Logarithm of that difference at the next lag over that at the best, for a decision."""
     even: float = 0.1

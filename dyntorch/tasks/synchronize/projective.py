@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dyntorch.core.outcome import Notice, status_from
 from dyntorch.geometry.homogeneous import skew
-from dyntorch.geometry.rigid import nearest_rotation, rotation_exponential
+from dyntorch.geometry.rigid import rotation_exponential
 from dyntorch.numerics.blocks import constant
 from dyntorch.numerics.lags import lag_covariances, lag_products
 from dyntorch.numerics.least_squares import Iterate, LeastSquares, LeastSquaresOptions, Tensors, damped_step, minimize
@@ -135,8 +135,8 @@ class Poses:
 class SharedMotion(LeastSquares):
     r"""Minimize what is left of :math:`R_b(\rho t + o) = X R_a(t) Y` and :math:`T_b(\rho t + o) = \sigma X T_a(t) + c + R_b d`.
 
-    In standard deviations of both poses; X turns camera a to b, Y the body's axes, :math:`\sigma, c, d` are the scale and the places
-    of the origins.  The parameters: ``(b, 2)`` offset and rate, ``(b, 3, 3)`` X and Y, ``(b, 7)`` :math:`\sigma, c, d`.
+    In standard deviations of both poses; X turns camera a to b, Y the body's axes, :math:`\sigma, c, d` are the scale and the
+    places of the origins.  The parameters: ``(b, 2)`` offset and rate, ``(b, 3, 3)`` X and Y, ``(b, 7)`` :math:`\sigma, c, d`.
     """
 
     a: Poses
@@ -284,8 +284,8 @@ def common_motion(first: Poses, second: Poses, options: ProjectiveOptions) -> tu
 def rank_curve(a: Tensor, b: Tensor, wa: Tensor, wb: Tensor, lags: tuple[int, int]) -> tuple[Tensor, Tensor]:
     r"""What of the motions before two cameras is beyond one space of 13 dimensions, at all lags.
 
-    Scaled by its projective depths, a point's image :math:`\lambda_j(t)\, x_j(t) = P\, M(t)\, X_j` is linear in the 12 entries of the
-    motion and in 1: the rows of camera a span 12 dimensions of time, those of b 12, both lie in the same 13 and meet in 11.  At a
+    Scaled by its projective depths, a point's image :math:`\lambda_j(t)\, x_j(t) = P\, M(t)\, X_j` is linear in the 12 entries of
+    the motion and in 1: the rows of camera a span 12 dimensions of time, those of b 12, both lie in the same 13 and meet in 11.  At a
     wrong shift they meet in nothing, and span 24, with the constant 25.
 
     Args:
@@ -316,7 +316,7 @@ def rank_curve(a: Tensor, b: Tensor, wa: Tensor, wb: Tensor, lags: tuple[int, in
         x = torch.where(known, poses.flatten(1), 0.0)
         x = torch.where(known, x - x.sum(0) / w.sum().clamp(min=1), 0.0)
         rows.append(x / x.square().sum(0).clamp(min=1e-300).sqrt())
-    aa, bb, ab, counts = lag_covariances(*rows, lags, (wa, wb))
+    aa, bb, ab, counts = lag_covariances(rows[0], rows[1], lags, (wa, wb))
     # each camera by its own spread in the overlap: what is large in one frame of coordinates is no evidence
     aa, ab = _scaled(aa, ab)
     bb, ba = _scaled(bb, ab.mT)

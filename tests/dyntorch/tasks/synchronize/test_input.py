@@ -24,7 +24,7 @@ K = [[100.0, 0, 50], [0, 100, 50], [0, 0, 1]]
         ({"fps": 30.0, "max_shift": 0.0}, r"max_shift must be a positive number of seconds or None, got 0.0"),
         ({"fps": 30.0, "max_shift": math.inf}, r"max_shift must be .* got inf"),
         ({"fps": 30.0, "rate": 30.0}, r"rate must be about 1 .*, got 30.0; give fps for frame rates"),
-        ({"fps": 30.0, "camera": "pinhole"}, r"camera must be one of auto, perspective, affine, got 'pinhole'"),
+        ({"fps": 30.0, "camera": "pinhole"}, r"camera must be one of auto, perspective, affine, projective, got 'pinhole'"),
         ({"fps": 30.0, "camera": "affine", "correspondence": False}, r"camera='affine' is for corresponding points; leave it out"),
         ({"fps": 30.0, "weights": (torch.ones(20, 4),)}, r"weights must be a pair, one of a and one of b"),
         ({"fps": 30.0, "weights": torch.ones(20, 4)}, r"weights must be a pair, one of a and one of b"),
