@@ -27,7 +27,6 @@ def body_pair(
     threshold: float | None,
     explained: float,
     options: PairOptions,
-    bodies: ProjectiveOptions = ProjectiveOptions(),
 ) -> PairReconstruction:
     r"""One body, two cameras, points of either's own:
 
@@ -41,9 +40,9 @@ def body_pair(
         seen: tracks of both cameras at the same moments.
         threshold: pixels from a point's reprojection; None: three standard deviations of the noise.
         explained: share of a point's frames that must be within it.
-        options: every number that decides about pairs.
-        bodies: those that decide what one camera says of a body, as in :func:`dyntorch.synchronize`.
+        options: every number that decides about pairs; of one camera they are those of :func:`dyntorch.synchronize`.
     """
+    bodies = ProjectiveOptions()
     n, m = seen.a.shape[1], seen.b.shape[1]
     tracks = [_tracks(x, seen) for x in (seen.a, seen.b)]
     motions = []
@@ -113,6 +112,7 @@ def _assembled(
     threshold: float | None,
     explained: float,
     options: PairOptions,
+    bodies: ProjectiveOptions,
 ) -> PairReconstruction:
     n, m, frames = seen.a.shape[1], seen.b.shape[1], len(seen.times)
     kept = torch.cat([first.points, second.points])

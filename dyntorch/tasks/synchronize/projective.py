@@ -284,9 +284,9 @@ def common_motion(first: Poses, second: Poses, options: ProjectiveOptions) -> tu
 def rank_curve(a: Tensor, b: Tensor, wa: Tensor, wb: Tensor, lags: tuple[int, int]) -> tuple[Tensor, Tensor]:
     r"""What of the motions before two cameras is beyond one space of 13 dimensions, at all lags.
 
-    Scaled by its projective depths, a point's image :math:`\lambda_j(t)\, x_j(t) = P\, M(t)\, X_j` is linear in the 12 entries of
-    the motion and in 1: the rows of camera a span 12 dimensions of time, those of b 12, both lie in the same 13 and meet in 11.  At a
-    wrong shift they meet in nothing, and span 24, with the constant 25.
+    Scaled by its projective depth, a point's image :math:`\lambda_j(t)\, x_j(t) = P\, M(t)\, X_j` is linear in the 12 entries of
+    the motion and in 1: the rows of camera a span 12 dimensions of time, those of b 12, both lie in the same 13 and meet in 11.
+    At a wrong shift they meet in nothing, and span 24, with the constant 25.
 
     Args:
         a: ``(Ta, 3, 4)`` projections :math:`[R\ T]` of the body before the first camera, scaled alike in all frames.
