@@ -359,7 +359,7 @@ def _levelled(matrix: Tensor, dim: int) -> Tensor:
     r"""``null_space`` of rows that hardly tell some vectors from null ones.
 
     In the coordinates :math:`y = \Sigma V^T x` of their own singular value decomposition, which are taken as given, all directions
-    but those of the null space weigh the same.  EstimationRows that are fulfilled have the same null space there, with the same derivatives:
+    but those of the null space weigh the same.  Rows that are fulfilled have the same null space there, with the same derivatives:
     those of ``null_space`` come from a Gram, and lose twice the digits.
     """
     with torch.no_grad():

@@ -2,6 +2,7 @@ r"""When a single view of a moving shape was taken: the residual over a grid of 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from math import prod
 
@@ -51,7 +52,8 @@ class Recovery(Outcome):
 
         The likelihoods of two times differ by the factor exp(rise / 2 noise^2); below ``odds`` the view does not decide.
         """
-        return self.rise < 2 * torch.as_tensor(noise)[..., None] ** 2 * torch.tensor(odds).log()
+        sigma = torch.as_tensor(noise, device=self.rise.device)
+        return self.rise < 2 * sigma[..., None] ** 2 * math.log(odds)
 
 
 @one_thread

@@ -361,13 +361,14 @@ class Clocks(ClockOutcome):
 
     def at(self, times: Tensor | float) -> Tensor:
         """Times of all clocks, ``(cameras, ...)``, of the moments at ``times`` of the reference clock."""
-        t = torch.as_tensor(times, dtype=torch.float64)
+        t = torch.as_tensor(times, dtype=torch.float64, device=self.rates.device)
         wide = (slice(None), *([None] * t.ndim))
         return self.rates[wide] * t + self.offsets[wide]
 
     def inverse(self, camera: int, times: Tensor | float) -> Tensor:
         """Times of the reference clock, of the moments at ``times`` of a camera's clock."""
-        return (torch.as_tensor(times, dtype=torch.float64) - self.offsets[camera]) / self.rates[camera]
+        t = torch.as_tensor(times, dtype=torch.float64, device=self.rates.device)
+        return (t - self.offsets[camera]) / self.rates[camera]
 
     def __repr__(self) -> str:
         cycle = "" if self.worst_cycle is None else f", cycle error {self.cycle_error:.4f} s"
