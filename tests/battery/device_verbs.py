@@ -496,7 +496,7 @@ NOT_VERBS = {
         (
             *("Collineation", "ConstantVelocityTensor", "ConvergentMotionMatrix", "DualHomographyTensor"),
             *("FundamentalMatrix", "GrassmannTensor", "HomographyTensor", "JoinTensor", "MinimalJoinTensor", "SegmentationMatrix"),
-            "TranslatingLinesMatrix",
+            *("TranslatingLinesMatrix", "DynamicTensor"),
         ),
         "invariants: tests/battery/on_input.py takes each of them to a device",
     ),
