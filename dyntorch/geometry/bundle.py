@@ -27,6 +27,67 @@ TINY = 1e-300
 
 
 @dataclass(frozen=True)
+class CalibratedCameras:
+    r"""Cameras :math:`P \sim K\,[R_{:d} \mid *]` of known K: their first d columns are those of a rotation, the others are free.
+
+    A static or moving scene of the plane or of space has d = 2 or 3 and one further column t; two bodies that translate have one
+    for each.  Sensors that measure points (l = 3) have the last row (0, 0, 0, 1).
+    """
+
+    matrices: Tensor
+    """``(b, v, l + 1, l + 1)``."""
+    turned: int
+    """d."""
+
+    def parts(self, cameras: Tensor) -> tuple[Tensor, Tensor]:
+        """The orthonormal columns ``(b, v, 3, d)`` next to a camera and the others ``(b, v, 3, *)``, in units of the same scale.
+
+        Of space they are a rotation or minus one: the camera may have either sign.
+        """
+        seen = torch.linalg.solve_ex(self.matrices, cameras)[0]
+        if cameras.shape[-2] == 4:
+            last = seen[..., -1:, -1:]
+            seen = seen / torch.where(last.abs() > TINY, last, 1.0)
+        d = self.turned
+        seen = torch.where(seen.isfinite(), seen, 0.0)[..., :3, :]
+        u, s, vh = torch.linalg.svd(seen[..., :d], full_matrices=False)
+        size = s.mean(-1)[..., None, None].clamp(min=TINY) if cameras.shape[-2] == 3 else torch.ones_like(s[..., :1, None])
+        return u @ vh, seen[..., d:] / size
+
+    def nearest(self, cameras: Tensor) -> Tensor:
+        """The cameras of these calibrations next to any, ``(b, v, l + 1, a + 1)`` of any scale."""
+        turn, rest = self.parts(cameras)
+        found = torch.cat([turn, rest], dim=-1)
+        if cameras.shape[-2] == 4:
+            last = torch.eye(4, dtype=found.dtype, device=found.device)[3:, -found.shape[-1] :]
+            found = torch.cat([found, last.expand(*found.shape[:-2], 1, -1)], dim=-2)
+        return self.matrices @ found
+
+    def tangents(self, cameras: Tensor) -> Tensor:
+        """Changes of the entries of cameras of these calibrations, ``(b, v, (l + 1)(a + 1), p)``: turns, then the free columns."""
+        turn, rest = self.parts(cameras)
+        d, free = self.turned, rest.shape[-1]
+        eye = torch.eye(3, dtype=cameras.dtype, device=cameras.device)
+        size = torch.linalg.matrix_norm(torch.cat([turn, rest], dim=-1), keepdim=True)
+        turns = torch.linalg.cross(eye[:, None, None, None, :], turn.mT[None], dim=-1).mT  # (3, b, v, 3, d)
+        total = cameras.new_zeros(3 + 3 * free, *cameras.shape[:2], cameras.shape[-2], cameras.shape[-1])
+        total[:3, :, :, :3, :d] = turns
+        for column in range(free):
+            for row in range(3):
+                total[3 + 3 * column + row, :, :, row, d + column] = 1.0
+        return (self.matrices @ total / size).flatten(-2).permute(1, 2, 3, 0)
+
+    def step(self, cameras: Tensor, gradient: Tensor, matrix: Tensor, damping: Tensor) -> Tensor:
+        """The damped step within these cameras, from the gradient by their entries and its matrix ``(b, p, p)``."""
+        basis = self.tangents(cameras)
+        b, v, entries, free = basis.shape
+        inner = torch.einsum("bvep,bvewf,bwfq->bvpwq", basis, matrix.view(b, v, entries, v, entries), basis)
+        slope = (basis.mT @ gradient.flatten(2)[..., None]).flatten(1)
+        move = damped_step(slope, inner.reshape(b, v * free, v * free), damping).view(b, v, free, 1)
+        return (basis @ move).view_as(cameras)
+
+
+@dataclass(frozen=True)
 class BundleProblem(LeastSquares):
     r"""Minimize :math:`\sum_{ij} w_{ij}\, \rho(|x_{ij} - \pi(P_i B_i Y_j)|^2)` over a block of problems.
 
@@ -45,6 +106,8 @@ class BundleProblem(LeastSquares):
     """How outliers count: ``"geman_mcclure"`` or ``"huber"``."""
     outside: Tensor | None = None
     """``(b, k + 1, k + 1, n)`` projector onto what is forbidden to each point, 0 for free points; None where all are free."""
+    calibration: CalibratedCameras | None = None
+    """Cameras that are confined to known calibrations; None where they are any matrices."""
 
     def subset(self, keep: Tensor) -> BundleProblem:
         """Only some of the problems."""
@@ -85,8 +148,13 @@ class BundleProblem(LeastSquares):
 
     def evaluate(self, theta: Tensors) -> Iterate:
         """The cost of cameras and points, of norm 1."""
-        cameras, points = normalize(theta[0].flatten(2), dim=-1).view_as(theta[0]), normalize(theta[1], dim=1)
+        cameras, points = self._cameras(theta[0]), normalize(theta[1], dim=1)
         return Iterate((cameras, points), self.costs(cameras, points).sum(-1), ())
+
+    def _cameras(self, cameras: Tensor) -> Tensor:
+        """Cameras of norm 1, the nearest ones of their calibrations where these are known."""
+        allowed = cameras if self.calibration is None else self.calibration.nearest(cameras)
+        return normalize(allowed.flatten(2), dim=-1).view_as(cameras)
 
     def step(self, at: Iterate, damping: Tensor) -> Tensors:
         r"""The step of Levenberg and Marquardt, to be subtracted, by the Schur complement.
@@ -114,7 +182,10 @@ class BundleProblem(LeastSquares):
         rest = error - (reduced * whitened[:, None]).sum(2).view_as(error)
         gradient = pull(rest, images, slope, 2) @ linear.world.mT
         matrix = _schur(reduced.unflatten(1, error.shape[1:3]), images, slope, linear.world)
-        camera_step = damped_step(gradient.flatten(1), matrix, damping).view_as(cameras)
+        if self.calibration is None:
+            camera_step = damped_step(gradient.flatten(1), matrix, damping).view_as(cameras)
+        else:
+            camera_step = self.calibration.step(cameras, gradient, matrix, damping)
 
         moved = push(camera_step @ linear.world, images, slope)
         whitened = whitened - (reduced * moved.flatten(1, 2)[:, :, None]).sum(1)
@@ -129,7 +200,7 @@ class BundleProblem(LeastSquares):
         views and 200 points (P^6), noise of 0.5 % of the image: 100 % and 100 % reach the minimum within 50 steps, 10 and 12 on
         average; without it 96 % and 83 %, 13 and 18 on average, in the same time.
         """
-        cameras = normalize((at.theta[0] - step[0]).flatten(2), dim=-1).view_as(step[0])
+        cameras = self._cameras(at.theta[0] - step[0])
         points = normalize(at.theta[1] - step[1], dim=1)
         linear = self._linear(cameras, points)
         gradient = (linear.by_point * linear.error.flatten(1, 2)[:, :, None]).sum(1, keepdim=True)
@@ -293,6 +364,8 @@ def bundle_adjust(
     tolerance: float = 1e-9,
     confined: Tensor | None = None,
     subspace: Tensor | None = None,
+    calibration: Tensor | None = None,
+    turned: int = 3,
 ) -> Adjusted:
     r"""Cameras and points that minimize the reprojection error :math:`\sum_{ij} w_{ij}\, \rho(|x_{ij} - \pi(P_i B_i Y_j)|^2)`.
 
@@ -315,8 +388,13 @@ def bundle_adjust(
         scale: error beyond which an image counts as an outlier, in the unit of ``x``, one or ``(*batch,)``; None: none does.
         loss: ``"geman_mcclure"`` or ``"huber"``, used with a scale.
         tolerance: done where a step lowers the cost by less than this fraction.
-        confined: ``(*batch, n)`` bool: points kept within a subspace of the constants, such as those known to stand still.
-        subspace: ``(k + 1, r)`` orthonormal columns that span it.
+        confined: ``(*batch, n)`` bool: points kept within a subspace of the constants, such as those known to stand still.  With
+            several subspaces the number of each point's, from 1; 0 leaves it free.
+        subspace: ``(k + 1, r)`` orthonormal columns that span it, or ``(s, k + 1, r)``.
+        calibration: K ``(*batch, views, l + 1, l + 1)``: cameras stay :math:`P_i \\sim K_i\\,[R_i \\mid t_i]` (a start that is
+            none is replaced by the nearest that is), and the gauge is a similarity.
+        turned: number d of the first columns of a camera that are those of :math:`R_i`: 3 of space, 2 of a plane; all others are
+            free.  Only with a calibration.
 
     Returns:
         Adjusted, in the dtype of ``x``, without gradients.  A problem whose start is not finite is not adjusted and has cost
@@ -339,6 +417,9 @@ def bundle_adjust(
     """
     batch = check(x, weights, cameras, structure, lifts, loss)
     count, (views, n, size) = prod(batch), x.shape[-3:]
+    if calibration is not None and (calibration.shape[-3:] != (views, size + 1, size + 1) or turned not in (2, 3) or size < 2):
+        want = f"(*batch, {views}, {size + 1}, {size + 1}) of images or 3D sensors, and turned 2 or 3"
+        raise ValueError(f"calibration must be {want}, got {tuple(calibration.shape)} and {turned}")
 
     def flat(tensor: Tensor, *shape: int) -> Tensor:
         return tensor.detach().double().expand(*batch, *shape).reshape(count, *shape)
@@ -363,7 +444,8 @@ def bundle_adjust(
     width = n * (views**2 * ((size + 1) ** 2 + a**2) + (k + views * size) * k)
     problems = max(1, min(BLOCK // max(1, width), -(-count // workers())))
     clean = each(lambda part: torch.where(part.isfinite(), part, 0.0), (cameras_, points))
-    given = BundleProblem(flat(images, views, n, size).mT, w, lift, limit, loss, outside)
+    known = None if calibration is None else CalibratedCameras(flat(calibration, views, size + 1, size + 1), turned)
+    given = BundleProblem(flat(images, views, n, size).mT, w, lift, limit, loss, outside, known)
     with torch.no_grad():
         found = map_blocks(run, given, *clean, size=problems)
     # what counts has to be finite; the rest stays as it is
@@ -387,12 +469,12 @@ def _counted(weights: Tensor, structure: Tensor, size: int) -> tuple[Tensor, Ten
 def _inside(structure: Tensor, confined: Tensor, subspace: Tensor | None) -> tuple[Tensor, Tensor]:
     """Points, the confined ones within the subspace, and the projectors ``(b, K, K, n)`` onto what is forbidden."""
     size = structure.shape[-1]
-    if subspace is None or subspace.shape[0] != size:
+    if subspace is None or subspace.ndim not in (2, 3) or subspace.shape[-2] != size:
         got = None if subspace is None else tuple(subspace.shape)
-        raise ValueError(f"confined points need a subspace ({size}, r) of orthonormal columns, got {got}")
-    basis = subspace.to(structure)
+        raise ValueError(f"confined points need a subspace ({size}, r) of orthonormal columns, or several, got {got}")
+    basis = subspace.to(structure).reshape(-1, *subspace.shape[-2:])
     away = torch.eye(size, dtype=basis.dtype, device=basis.device) - basis @ basis.mT
-    outside = away * confined[..., None, None]
+    outside = torch.cat([torch.zeros_like(away[:1]), away])[confined.long()]
     return structure - (structure[..., None, :] @ outside)[..., 0, :], outside.permute(0, 2, 3, 1)
 
 

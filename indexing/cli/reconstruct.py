@@ -17,6 +17,8 @@ from indexing.cli.console import check_report, count, ended, flags, say, table, 
 from indexing.cli.console import progress as progress_of
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from indexing.readers.tracks import TrackSet
     from indexing.report.reconstruction import ReconstructionReport
 
@@ -25,7 +27,7 @@ MotionName = Literal[
     "constant_direction_3d", "constant_velocity_planes_3d", "constant_velocity_3d", "constant_velocity_3d_sensors",
     "two_bodies_2d", "two_bodies_3d",
 ]  # fmt: skip
-WORDS = flags("times", "static", "threshold", "motion")
+WORDS = flags("times", "static", "threshold", "motion", "calibration")
 UNFIXED = (
     "no point is known to stand still, so that a motion common to all is open and none can be told to rest; "
     "--static names some that do"
@@ -39,6 +41,8 @@ class Reconstruct:
     dyntorch reconstruct tracks.csv --motion constant_velocity_2d --out out/
 
     dyntorch reconstruct tracks.csv --static parked.csv --fps 25 --out out/
+
+    dyntorch reconstruct tracks.csv --motion constant_velocity_3d --calibration 1300,1300,640,360 --out out/
 
     dyntorch reconstruct view1.csv view2.csv view3.csv --times 0,0.5,1.2
 
@@ -55,6 +59,9 @@ class Reconstruct:
     """frames per second, where the file numbers frames: times are then in seconds"""
     static: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
     """names of points known to stand still, in a column id (or a column static, 0 or 1, in the table of the tracks)"""
+    calibration: Annotated[str | None, tyro.conf.arg(metavar="FILE|FX,FY,CX,CY", help_behavior_hint="")] = None
+    """of the camera: focal lengths and middle of the image in pixels, or a TOML file with matrix and distortions, one section
+    for all views or one for each; the result is then metric"""
     threshold: Annotated[str, tyro.conf.arg(metavar="T|auto|none")] = "auto"
     """three times the noise of a coordinate, in the unit of the tracks; auto estimates it, none declares that all tracks fit"""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
@@ -68,7 +75,8 @@ class Reconstruct:
 
     def run(self) -> int:
         """Read, reconstruct, write, and say what was found."""
-        inputs = [path.expanduser() for path in (*self.files, *((self.static,) if self.static else ()))]
+        given = (*self.files, *((self.static,) if self.static else ()), *calibration_files(self.calibration))
+        inputs = [path.expanduser() for path in given]
         self._check()
         from indexing.files import manifest
         from indexing.report.reconstruction import FILES, ReconstructionReport, write_reconstruction
@@ -167,18 +175,69 @@ class Reconstruct:
 
         import dyntorch
 
+        values, matrices = calibrated(self.calibration, torch.from_numpy(tracks.values))
         try:
             return dyntorch.reconstruct(
-                torch.from_numpy(tracks.values),
+                values,
                 self.motion,
                 torch.from_numpy(tracks.times),
                 static=None if tracks.static is None else torch.from_numpy(tracks.static),
                 threshold=self._limit(),
                 weights=None if tracks.weights is None else torch.from_numpy(tracks.weights),
+                calibration=matrices,
                 generator=torch.Generator().manual_seed(self.seed),
             )
         except ValueError as problem:
             raise ValueError(f"{tracks.path}: {worded(problem, WORDS)}") from problem
+
+
+def calibration_files(given: str | None) -> list[Path]:
+    """The file that ``--calibration`` names, if it does."""
+    return [] if given is None or _inner(given) is not None else [Path(given)]
+
+
+def _inner(given: str) -> list[float] | None:
+    """The four numbers of ``FX,FY,CX,CY``, or None for anything else."""
+    try:
+        found = [float(word) for word in given.split(",")]
+    except ValueError:
+        return None
+    if len(found) != 4 or not all(math.isfinite(x) for x in found) or min(found[:2]) <= 0:
+        raise ValueError(f"--calibration {given!r}: expected fx,fy,cx,cy in pixels, focal lengths positive, or a TOML file")
+    return found
+
+
+def calibrated(given: str | None, tracks: Tensor) -> tuple[Tensor, Tensor | None]:
+    """Tracks ``(views, n, 2)`` without lens distortion, and K of all views or of each; None without a calibration.
+
+    Raises:
+        ValueError: no four numbers and no sound file, or other than one section or one for each view.
+    """
+    import torch
+
+    if given is None:
+        return tracks, None
+    if tracks.shape[-1] != 2:
+        raise ValueError(f"--calibration is of cameras, and the tracks are of sensors that measure {tracks.shape[-1]} coordinates")
+    numbers = _inner(given)
+    if numbers is not None:
+        fx, fy, cx, cy = numbers
+        return tracks, torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    from dyntorch.geometry import undistort
+    from indexing.sync.calibration import read_calibration
+
+    lenses = read_calibration(given)
+    if len(lenses) not in (1, len(tracks)):
+        raise ValueError(f"--calibration {given}: {len(lenses)} cameras for {len(tracks)} views; give one for all, or one for each")
+    if any(lens.fisheye for lens in lenses):
+        raise ValueError(f"--calibration {given}: a fisheye lens is not modelled; undistort the points first")
+    every = lenses * (len(tracks) // len(lenses))
+    K = torch.stack([lens.matrix for lens in every]).double()
+    straight = [
+        undistort(x, k, lens.distortions.double()) if len(lens.distortions) else x
+        for x, k, lens in zip(tracks.double(), K, every, strict=True)
+    ]
+    return torch.stack(straight), K
 
 
 def unfixed(tracks: TrackSet, result: Any) -> list[str]:

@@ -87,6 +87,19 @@ class ReconstructionReport(ResultReport):
         return float(self.found.sigma)
 
     @property
+    def poses(self) -> dict[str, Any]:
+        """Whether the scene is metric, and rotations and translations of the cameras; nothing without a calibration."""
+        found = self.result
+        if found.metric is None:
+            return {}
+        return {
+            "metric": bool(found.metric),
+            "rotations": found.rotations.numpy(),
+            "translations": found.translations.numpy(),
+            "calibration": found.calibration.numpy(),
+        }
+
+    @property
     def ambiguity(self) -> str:
         """What the tracks cannot tell, even without noise."""
         return worded(self.result.ambiguity, self.words)
@@ -205,6 +218,7 @@ def as_npz(report: ReconstructionReport) -> bytes:
     arrays: dict[str, Any] = {name: getattr(report.found, name) for name in ARRAYS}
     arrays |= {"labels": report.labels, "times": report.times, "tracks": report.tracks.values, "ids": np.array(report.tracks.ids)}
     arrays |= {} if report.velocities is None else {"velocities": report.velocities}
+    arrays |= {name: np.asarray(value) for name, value in report.poses.items()}
     return npz({**arrays, "status": report.status, "first_time": report.tracks.start})
 
 
@@ -224,6 +238,7 @@ def as_json(report: ReconstructionReport) -> dict[str, Any]:
         "threshold": report.threshold,
         "cameras": report.found.cameras if report.solved else None,
         "ambiguity": report.ambiguity,
+        **report.poses,
         "candidates": [
             {"motion": one.motion, "score": one.score, "residual": one.residual, "not_tried": one.reason or None}
             for one in report.result.candidates

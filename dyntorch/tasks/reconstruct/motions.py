@@ -42,6 +42,7 @@ class Motion:
         static: whether the points do not move at all: the times do not matter, no frame is chosen in which they move least.
         shift: takes c and returns :math:`R(c)`, ``(K, K)`` float64, with :math:`B(t + c) = B(t)\,R(c)` for all t, where there is
             one (for polynomials: :func:`polynomial_shift`): then times far from 0 lose no digits.
+        metric_open: the ambiguity that remains with calibrated cameras, in words.
 
     Raises:
         ValueError: a lift that does not return, at time 0, a finite real matrix of full rank with no fewer columns than rows, or
@@ -68,6 +69,7 @@ class Motion:
     k: int = 0
     static: bool = False
     shift: Callable[[float], Tensor] | None = None
+    metric_open: str = ""
 
     def __post_init__(self) -> None:
         if self.lift is None and self.k < 2:
@@ -231,29 +233,52 @@ def polynomial_shift(dim: int, directions: int, degree: int = 1) -> Callable[[fl
     return shift
 
 
-def _polynomial(name: str, leaves_open: str, dim: int, directions: int, degree: int = 1, sensor: int = 2) -> Motion:
+def _polynomial(
+    name: str, leaves_open: str, metric_open: str, dim: int, directions: int, degree: int = 1, sensor: int = 2
+) -> Motion:
     shift = polynomial_shift(dim, directions, degree)
     static = directions == 0
-    return Motion(polynomial(dim, directions, degree), name, sensor, leaves_open, static=static, shift=shift)
+    lift = polynomial(dim, directions, degree)
+    return Motion(lift, name, sensor, leaves_open, static=static, shift=shift, metric_open=metric_open)
 
 
 _PARTLY = "a collineation of the world that keeps the direction{} of motion, and a velocity, linear in the position, added to all"
 _BODIES = "an affinity of each body, with a linear part common to both"
+_SAME = "a similarity of the {}"
+_ALONG = "a similarity of the {}, and a velocity along the direction of motion, common to all points"
+_COMMON = "a similarity of the {}, and a velocity common to all points"
+_BESIDE = "a similarity of the world, and a velocity parallel to the planes of motion, common to all points"
+_RIGID = "a rigid motion of the world, and a velocity common to all points"
+_TWO = "a similarity of each body, with a rotation common to both"
 MOTIONS: dict[str, Motion] = {
     motion.name: motion
     for motion in (
-        _polynomial("static_2d", "a collineation of the plane", 2, 0),
-        _polynomial("static_3d", "a collineation of space", 3, 0),
-        _polynomial("constant_direction_2d", _PARTLY.format(""), 2, 1),
-        _polynomial("constant_velocity_2d", AFFINE, 2, 2),
-        _polynomial("constant_acceleration_2d", f"{AFFINE}, and likewise a common acceleration", 2, 2, 2),
-        _polynomial("constant_direction_3d", _PARTLY.format(""), 3, 1),
-        _polynomial("constant_velocity_planes_3d", _PARTLY.format("s"), 3, 2),
-        _polynomial("constant_velocity_3d", AFFINE, 3, 3),
-        _polynomial("constant_velocity_3d_sensors", AFFINE, 3, 3, sensor=3),
-        Motion(None, "two_bodies_2d", bodies=2, k=3, leaves_open=_BODIES),
+        _polynomial("static_2d", "a collineation of the plane", _SAME.format("plane"), 2, 0),
+        _polynomial("static_3d", "a collineation of space", _SAME.format("world"), 3, 0),
+        _polynomial("constant_direction_2d", _PARTLY.format(""), _ALONG.format("plane"), 2, 1),
+        _polynomial("constant_velocity_2d", AFFINE, _COMMON.format("plane"), 2, 2),
+        _polynomial(
+            "constant_acceleration_2d",
+            f"{AFFINE}, and likewise a common acceleration",
+            f"{_COMMON.format('plane')}, and likewise a common acceleration",
+            2,
+            2,
+            2,
+        ),
+        _polynomial("constant_direction_3d", _PARTLY.format(""), _ALONG.format("world"), 3, 1),
+        _polynomial("constant_velocity_planes_3d", _PARTLY.format("s"), _BESIDE, 3, 2),
+        _polynomial("constant_velocity_3d", AFFINE, _COMMON.format("world"), 3, 3),
+        _polynomial("constant_velocity_3d_sensors", AFFINE, _RIGID, 3, 3, sensor=3),
         # in a plane the centres of the cameras, where both bodies would meet, show how large one is against the other
-        Motion(None, "two_bodies_3d", bodies=2, k=4, leaves_open=f"{_BODIES}, and the size of one body against the other"),
+        Motion(None, "two_bodies_2d", bodies=2, k=3, leaves_open=_BODIES, metric_open=f"{_TWO}, which are of one scale"),
+        Motion(
+            None,
+            "two_bodies_3d",
+            bodies=2,
+            k=4,
+            leaves_open=f"{_BODIES}, and the size of one body against the other",
+            metric_open=f"{_TWO}, and the size of one body against the other",
+        ),
     )
 }
 """The declared models.  ``constant_direction``: all points move along one common, unknown direction; ``planes``: within parallel

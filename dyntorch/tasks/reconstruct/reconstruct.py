@@ -32,6 +32,7 @@ def reconstruct(
     static: Tensor | Sequence[bool] | None = None,
     threshold: float | None = None,
     weights: Tensor | None = None,
+    calibration: Tensor | None = None,
     generator: torch.Generator | None = None,
     options: ReconstructOptions = ReconstructOptions(),
 ) -> Reconstruction:
@@ -71,6 +72,12 @@ def reconstruct(
         threshold: three standard deviations of the noise of one coordinate, in the unit of the tracks.  None estimates it from the
             tracks; infinity declares that there are no outliers.
         weights: ``(*batch, views, n)`` not negative; 0 leaves an observation out.
+        calibration: K of all views ``(3, 3)``, or of each ``(views, 3, 3)``, or ``(*batch, views, 3, 3)``, in the unit of the
+            tracks (3D sensors: the collineation ``(4, 4)`` from metric coordinates to the measured ones, the identity for sensors
+            that measure lengths).  The scene is then metric, up to a similarity, where the motion and the cameras determine it:
+            constant velocity and acceleration do before a single camera, bodies too; static points and points that move along one
+            direction, or within parallel planes, need cameras that move, a static plane three of them.  See ``metric``,
+            ``rotations``, ``translations`` and ``ambiguity`` of the result.
         generator: source of the random samples of the robust estimate.
         options: every number that decides, by stage; ``dataclasses.replace`` changes some of them.
 
@@ -105,15 +112,16 @@ def reconstruct(
     if model is None or _moves(model):
         _resolved(moment, times, tracks.dtype, options)
     label = _static(static, batch, x)
+    K = None if calibration is None else _calibrations(calibration, batch, x)
     limit = _limit(threshold)
     with torch.no_grad():
         if model is None:
-            found = choose(normalized(x, w, moment), label, limit, generator, batch, options)
+            found = choose(normalized(x, w, moment), label, limit, generator, batch, options, K)
         else:
             _enough(model, moment, x)
             used = (w > 0).sum(-1) >= _resection(model)
             data = normalized(x, w * used[..., None], moment)
-            found = _noted(solve(data, model, label, limit, generator, batch, options), label, used)
+            found = _noted(solve(data, model, label, limit, generator, batch, options, K), label, used)
     return _returned(found, tracks)
 
 
@@ -208,6 +216,24 @@ def _static(static: Tensor | Sequence[bool] | None, batch: tuple[int, ...], x: T
         got = type(static).__name__ if known.shape == (0,) else f"{tuple(known.shape)} {known.dtype}"
         raise ValueError(f"static must be a bool tensor (*batch, n) = {(*batch, n)}, got {got}")
     return known.expand(*batch, n).reshape(len(x), n) if bool(known.any()) else None
+
+
+def _calibrations(calibration: Tensor, batch: tuple[int, ...], x: Tensor) -> Tensor:
+    """K of every view, ``(b, views, l + 1, l + 1)``."""
+    b, views, _, size = x.shape
+    want = (*batch, views, size + 1, size + 1)
+    shapes = ((size + 1, size + 1), want[-3:], want)
+    if not isinstance(calibration, Tensor) or tuple(calibration.shape) not in shapes:
+        got = tuple(calibration.shape) if isinstance(calibration, Tensor) else type(calibration).__name__
+        raise ValueError(f"calibration must be a tensor K {' or '.join(map(str, dict.fromkeys(shapes)))}, got {got}")
+    K = calibration.detach().to(x).expand(want).reshape(b, views, size + 1, size + 1)
+    if not bool(K.isfinite().all()) or bool((torch.linalg.det(K) == 0).any()):
+        raise ValueError("calibration must be finite and invertible; a camera has K = [f 0 u; 0 f v; 0 0 1]")
+    if size == 2 and bool((K[..., 2, :2] != 0).any()):
+        raise ValueError(
+            f"calibration must have the last row (0, 0, 1), got {K[..., 2, :].reshape(-1, 3)[0].tolist()}; transposed?"
+        )
+    return K
 
 
 def normalized(x: Tensor, weights: Tensor, times: Tensor) -> ViewTracks:

@@ -104,6 +104,40 @@ class ReconstructNotice(NoticeCode):
         "{value:# of the static points has|# of the static points have} a position: the motion common to all points is not fixed",
     )
     """No static point fixes the velocity common to all points."""
+    METRIC_FAMILY = (
+        "metric_family",
+        {
+            "plane": "the calibration leaves a family of metric frames (singular value {value:.2g} of the largest): before a "
+            "camera that only turns the slant of a plane is open; move the camera",
+            "space": "the calibration leaves a family of metric frames (singular value {value:.2g} of the largest): the cameras "
+            "turn and move too little against each other; add views from other places",
+        },
+    )
+    """The calibration does not determine a metric frame."""
+    METRIC_UNCERTAIN = (
+        "metric_uncertain",
+        "the metric frame is badly determined (before adjustment its entries are uncertain by {value:.2g}); let the camera move "
+        "more, or add views",
+    )
+    """The noise leaves the metric frame uncertain."""
+    METRIC_SEVERAL = (
+        "metric_several",
+        {
+            "plane": "{value:.0f} metric frames fit as well: two views of a plane leave its slant open between two; add a view",
+            "space": "{value:.0f} metric frames fit as well, with all points before the cameras; add a view",
+        },
+    )
+    """Several metric frames fit, and one of them is given."""
+    CALIBRATION = (
+        "calibration",
+        {
+            "": "cameras of this calibration leave {value:.3g} times the noise that any cameras leave; check "
+            "{arg:calibration=}, and that lens distortion is removed",
+            "none": "cameras of this calibration leave {value:.3g} times the noise that any cameras leave, so that the scene "
+            "stays as it is without; check {arg:calibration=}, and that lens distortion is removed",
+        },
+    )
+    """The tracks speak against the calibration."""
     STATIC_MOVES = (
         "static_moves",
         "{value:# point given as static moves, and is taken as moving; take it|# points given as static move, and are taken as "
@@ -149,6 +183,14 @@ class Reconstruction(Outcome):
         bodies: cameras of both bodies, ``(*batch, 2, views, l + 1, d + 1)``; None without.
         candidates: where the model was to be chosen, the models that were tried, best first, and those that could not be, with the
             reason.
+        metric: ``(*batch,)`` bool, with a calibration: whether the scene is metric, known up to a similarity (and what
+            ``ambiguity`` says of common motions); elsewhere everything is as without calibration, and a notice says why.  None
+            without a calibration.
+        rotations: :math:`R_i`, ``(*batch, views, 3, 3)`` of determinant 1, with a calibration; zero where the scene is not metric.
+            :math:`P_i \\sim K_i [R_i \\mid t_i]`, of a plane (z = 0) without the third column of :math:`R_i`.
+        translations: :math:`t_i`, ``(*batch, views, 3)``, in the unit of the points (of sensors: in that of the tracks); of two
+            bodies those of both, ``(*batch, 2, views, 3)``.
+        calibration: K that was given, ``(*batch, views, l + 1, l + 1)``.
     """
 
     motion: Motion
@@ -166,6 +208,10 @@ class Reconstruction(Outcome):
     ambiguity: str
     bodies: Tensor | None = None
     candidates: tuple[Ranked, ...] = field(default=())
+    metric: Tensor | None = None
+    rotations: Tensor | None = None
+    translations: Tensor | None = None
+    calibration: Tensor | None = None
 
     REMEDIES: ClassVar[Mapping[Status, str]] = {
         Status.TOO_FEW: "too few tracks are seen in enough views; track more points, or for longer",
@@ -228,6 +274,9 @@ class Reconstruction(Outcome):
             others = ", ".join(f"{c.motion} (+{c.score - best:.0f})" for c in tried[:3])
             lines.append(f"  chosen by a penalized cost of {best:.0f}; then {others or 'no other'}")
             lines += [f"  not tried: {c.motion} ({c.reason})" for c in self.candidates if c.reason]
+        if self.metric is not None:
+            whole = f" in {int(self.metric.sum())} of {self.metric.numel()} problems" if self.metric.ndim else ""
+            lines.append(f"  metric{whole}" if bool(self.metric.any()) else "  not metric")
         if self.ambiguity:
             lines.append(f"  {self.ambiguity}")
         return "\n".join(lines + self.warned())

@@ -13,6 +13,7 @@ from dyntorch.core.outcome import Status, agreed, failed, notices
 from dyntorch.geometry.bundle import bundle_adjust
 from dyntorch.geometry.triangulation import triangulate, unit_projections
 from dyntorch.numerics.chi_square import quantile
+from dyntorch.tasks.reconstruct.calibrated import calibrated, of_bodies
 from dyntorch.tasks.reconstruct.diagnosis import diagnose, least_squares, spare, unknowns
 from dyntorch.tasks.reconstruct.motions import MOTIONS, Motion
 from dyntorch.tasks.reconstruct.options import ReconstructOptions
@@ -42,6 +43,7 @@ def solve(
     generator: torch.Generator | None,
     batch: tuple[int, ...],
     options: ReconstructOptions,
+    calibration: Tensor | None = None,
 ) -> Reconstruction:
     """Reconstruct a flat batch of checked problems.
 
@@ -52,6 +54,8 @@ def solve(
         limit: three standard deviations of the noise; None: estimated; infinite: no outliers.
         generator: of random samples.
         batch: the shape that the flat dimension comes from.
+        options: what decides.
+        calibration: K ``(b, views, l + 1, l + 1)``; None: cameras are any matrices.
     """
     lifting = None if motion.lift is None else Lifting.of(motion, tracks.times, tracks.x, options)
     tracks = replace(tracks, static=static)
@@ -76,7 +80,7 @@ def solve(
         tracks = tracks.only(tracks.weights.index_copy(0, chosen, fewer.weights))
         found = _merged(found, some, chosen)
         scene = _merged(scene, again, chosen)
-    return _result(tracks, motion, lifting, found, scene, static, batch, options)
+    return _result(tracks, motion, lifting, found, scene, static, batch, options, calibration)
 
 
 def _corrected(
@@ -133,6 +137,7 @@ def _result(
     given: Tensor | None,
     batch: tuple[int, ...],
     options: ReconstructOptions,
+    calibration: Tensor | None,
 ) -> Reconstruction:
     """Frame, labels, residuals and notices of solved problems, in the caller's batch."""
     bodies = None
@@ -169,7 +174,7 @@ def _result(
         return torch.where(wide, torch.full_like(value, none), value).reshape((*batch, *value.shape[1:]))
 
     nan = float("nan")
-    return Reconstruction(
+    plain = Reconstruction(
         motion=motion,
         cameras=shaped(unit_projections(back @ cameras)),
         points=shaped(points, nan),
@@ -187,6 +192,10 @@ def _result(
         notices=limits,
         bodies=None if bodies is None else shaped(unit_projections(back[:, None] @ bodies)),
     )
+    if calibration is None:
+        return plain
+    start = scene if bodies is None else of_bodies(bodies, points, labels)
+    return calibrated(plain, tracks, start, lifting, labels, calibration, options)
 
 
 def _rests(tracks: ViewTracks, scene: LiftedState, lifting: Lifting, projections: Tensor, options: ReconstructOptions) -> Tensor:
@@ -225,6 +234,7 @@ def choose(
     generator: torch.Generator | None,
     batch: tuple[int, ...],
     options: ReconstructOptions,
+    calibration: Tensor | None = None,
 ) -> Reconstruction:
     r"""Reconstruct with the declared model of least penalized cost; the others are listed in ``candidates``.
 
@@ -244,6 +254,8 @@ def choose(
         limit: three standard deviations of the noise; None: estimated; infinite: no outliers.
         generator: of random samples.
         batch: the shape that the flat dimension comes from.
+        options: what decides.
+        calibration: K ``(b, views, l + 1, l + 1)``; None: cameras are any matrices.  The models are compared without it.
 
     Raises:
         ValueError: too few views or tracks for any model.
@@ -262,7 +274,7 @@ def choose(
         )
     plain = [LiftedFit.of(tracks, model, *least_squares(tracks, model, options)) for model in models]
     listed = ranked(tracks, plain, limit, options)
-    best = solve(tracks, MOTIONS[listed[0].motion], static, limit, generator, batch, options)
+    best = solve(tracks, MOTIONS[listed[0].motion], static, limit, generator, batch, options, calibration)
     fit = next(fit for fit in plain if fit.motion is best.motion)
     whole = (best.inliers.reshape(fit.apart.shape) >= fit.apart.isfinite()).flatten(1).all(1)
     # what was left out did not mislead least squares where it hardly made the noise larger
@@ -272,7 +284,7 @@ def choose(
         return replace(best, candidates=listed + untried)
     others = [model for model in models if model is not best.motion]
     robust = {best.motion.name: best} | {
-        model.name: solve(tracks, model, static, limit, generator, batch, options) for model in others
+        model.name: solve(tracks, model, static, limit, generator, batch, options, calibration) for model in others
     }
     fits = [
         LiftedFit.of(tracks, one.motion, one.residuals.reshape(tracks.weights.shape), one.status.reshape(-1))

@@ -96,6 +96,32 @@ def test_a_plane_from_a_table(run, scene):
     assert page.count("data:image/png;base64,") == 2 and "each at its own constant velocity" in page
 
 
+def test_a_calibration_makes_it_metric(run, data, tmp_path):
+    """Numbers and a file with the same say the same; poses are written; what is no calibration is refused."""
+    draw_ = draw(3)
+    points, speed = torch.randn(30, 2, generator=draw_).double(), 0.1 * torch.randn(30, 2, generator=draw_).double()
+    turn, _ = torch.linalg.qr(torch.eye(3).double() + 0.3 * torch.randn(4, 3, 3, generator=draw_).double())
+    turn = turn * torch.linalg.det(turn)[:, None, None]
+    place = points + torch.tensor(TIMES, dtype=torch.float64)[:, None, None] * speed
+    seen = place @ turn[..., :2].mT + torch.tensor([0.1, -0.2, 7.0], dtype=torch.float64)
+    image = 900 * seen[..., :2] / seen[..., 2:] + torch.tensor([320.0, 240.0])
+    table(tmp_path / "metric.csv", image.numpy(), TIMES)
+    inner = "[cam]\nmatrix = [[900, 0, 320], [0, 900, 240], [0, 0, 1]]\ndistortions = [0, 0, 0, 0]\n"
+    (tmp_path / "lens.toml").write_text(inner)
+    for given in ("900,900,320,240", str(tmp_path / "lens.toml")):
+        line = f"{tmp_path}/metric.csv --motion constant_velocity_2d --threshold none --out out --calibration {given}"
+        code, out, _ = run(line)
+        assert code == 0 and "open: known up to a similarity of the plane" in out
+        found, arrays = read(), np.load("out/reconstruction.npz")
+        assert found["metric"] is True and np.array(found["rotations"]).shape == (4, 3, 3)
+        lengths = np.linalg.norm(arrays["points"][:1] - arrays["points"][1:], axis=1)
+        true = (points[:1] - points[1:]).norm(dim=1).numpy()
+        np.testing.assert_allclose(lengths / lengths[0], true / true[0], rtol=1e-3)
+    for wrong, says in (("900,900", "fx,fy,cx,cy"), ("900,-900,320,240", "fx,fy,cx,cy")):
+        code, _, err = run(f"@/plane.csv --calibration {wrong}")
+        assert code == 2 and says in err.lower()
+
+
 def test_the_same_from_other_files(run, scene):
     results = []
     for i, files in enumerate((
