@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from dyntorch.core.outcome import Note, Status, failed, in_order, noting
-from dyntorch.geometry.bundle import CalibratedCameras, bundle_adjust
+from dyntorch.geometry.bundle import bundle_adjust
+from dyntorch.geometry.calibrated_cameras import CalibratedCameras
 from dyntorch.geometry.homogeneous import nonzero_sign
 from dyntorch.geometry.lift import moved, steady
 from dyntorch.geometry.triangulation import unit_projections
