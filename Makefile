@@ -73,6 +73,8 @@ tables: install
 	$(PIP) --constraint constraints.txt --editable '.[experiments]'
 	$(BIN)/python -m experiments.thesis.checked
 	$(BIN)/python -m experiments.alignment.planar_noise
+	$(BIN)/python -m experiments.alignment.more_views
+	$(BIN)/python -m experiments.alignment.minimal_conditions
 	$(BIN)/python -m experiments.alignment.space_noise
 	$(BIN)/python -m experiments.alignment.robust_estimation
 	$(BIN)/python -m experiments.alignment.dual_homography

@@ -100,6 +100,10 @@ class Invariant:
     """Whether the tensor is free of the coordinates of the views, each match being brought into a frame of its own: matches are
     then not normalized, and the tensor is the same in all coordinates."""
 
+    motion_alone: bool = False
+    """Whether the collineations themselves, ``(*batch, parts, rows, columns)``, stand for the tensor: for matches of so many views
+    that the forms they fulfil would be too many to hold.  There is nothing to fit linearly; a motion found otherwise is refined."""
+
     compose: Callable[..., Tensor]
     """The tensor of a motion, ``(*batch, *axes)`` (with ``(*batch, nullity, *axes)`` where nullity > 1)."""
     decompose: Callable[..., Any]

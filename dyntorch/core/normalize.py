@@ -91,6 +91,8 @@ def denormalize(invariant: Invariant, tensor: Tensor, actions: Sequence[Tensor])
     Returns:
         The same shape; several tensors are orthonormal again.
     """
+    if invariant.motion_alone:
+        return torch.stack(denormalize_motion(invariant, tensor.unbind(-3), actions), dim=-3)
     rank = len(invariant.shape())
     return _unit_norm(tensor if invariant.intrinsic else _moved_axes(invariant, tensor, actions), rank, invariant.nullity)
 

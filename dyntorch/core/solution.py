@@ -76,6 +76,8 @@ class Solution(Outcome):
         Computed on first use from the matrix itself, so that they are accurate down to the rounding of the largest one.
         """
         m = self.matches
+        if self.invariant.motion_alone:
+            raise ValueError(f"{self.invariant!r} has no estimation matrix: it holds the motion of all views, and no tensor")
         views, weights, static = copied(self.invariant, m.views, m.weights, m.static)
         moved = self.normalization.apply(self.invariant, views)
         values = torch.linalg.svdvals(triangular_factor(self.normalization.primitives, moved, weights, static))

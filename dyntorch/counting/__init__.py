@@ -25,9 +25,9 @@ Both reproduce the numbers of the thesis, except where it is wrong:
 from dyntorch.counting.configurations import CONFIGURATIONS
 from dyntorch.counting.dimension import dim_v, dim_v_closed_form, partitions, semistandard_tableaux, standard_tableaux
 from dyntorch.counting.exact import Field, Kind
-from dyntorch.counting.ranks import Count, count, options_of
+from dyntorch.counting.ranks import Capacity, Count, capacities, count, options_of
 
 __all__ = [
-    "CONFIGURATIONS", "Count", "Field", "Kind", "count", "dim_v", "dim_v_closed_form", "options_of", "partitions",
-    "semistandard_tableaux", "standard_tableaux",
+    "CONFIGURATIONS", "Capacity", "Count", "Field", "Kind", "capacities", "count", "dim_v", "dim_v_closed_form", "options_of",
+    "partitions", "semistandard_tableaux", "standard_tableaux",
 ]  # fmt: skip

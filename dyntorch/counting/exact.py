@@ -253,11 +253,12 @@ class Views:
         """Rows of a primitive spanned by this number of points that are anywhere within an extensor, in every view anew."""
         return self.field.kron(*self.images([self.within(extensor, number) for _ in self.cameras]))
 
-    def labelled(self, primitive: IntArray) -> IntArray:
-        """Rows of a primitive that is known not to move: any measurement of one view completes those of the others."""
+    def labelled(self, primitive: IntArray, free: int = 1) -> IntArray:
+        """Rows of a primitive that is known not to move: any measurement of one view (or of more) completes those of the others."""
         seen = self.images([primitive] * len(self.cameras))
-        free = [np.eye(image.shape[1], dtype=np.int64) for image in seen]
-        return np.vstack([self.field.kron(*seen[:view], free[view], *seen[view + 1 :]) for view in range(len(seen))])
+        anything = [np.eye(image.shape[1], dtype=np.int64) for image in seen]
+        chosen = combinations(range(len(seen)), free)
+        return np.vstack([self.field.kron(*(anything[v] if v in c else seen[v] for v in range(len(seen)))) for c in chosen])
 
     def filled(self, extensor: IntArray) -> IntArray:
         """Rows of an extensor, any point of which matches any other."""

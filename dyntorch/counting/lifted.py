@@ -21,79 +21,88 @@ CAMERAS = {
 }
 PATIENCE = 4
 """Points in a row that add nothing before no more are drawn; one of each body tells."""
-SETTINGS = ("profile", "times", "camera", "points", "space", "image", "degree")
+SETTINGS = ("profile", "times", "camera", "points", "space", "image", "degree", "dim", "poses", "within")
 """Options that are no matches."""
 
 
 def static_2d(
-    field: Field, *, static: int | None = None, profile: Sequence[int] = (2, 1), camera: str = "generic"
+    field: Field, *, static: int | None = None, on_line: int = 0, profile: Sequence[int] = (2, 1), camera: str = "generic"
 ) -> list[Step]:  # fmt: skip
     """Points of a plane: homography matrix, P^2 -> P^2."""
-    return _Lifted(field, 2, (), profile, camera=camera).static(static)
+    return _Lifted(field, 2, (), profile, camera=camera).static(static, on_line=on_line)
 
 
 def static_3d(
-    field: Field, *, static: int | None = None, profile: Sequence[int] = (2, 2), camera: str = "generic"
+    field: Field, *, static: int | None = None, on_plane: int = 0, on_line: int = 0, profile: Sequence[int] = (2, 2),
+    camera: str = "generic",
 ) -> list[Step]:  # fmt: skip
     """Points of space: fundamental matrix, or by profile the trifocal and quadrifocal tensors, P^3 -> P^2."""
-    return _Lifted(field, 3, (), profile, camera=camera).static(static)
+    return _Lifted(field, 3, (), profile, camera=camera).static(static, on_plane, on_line)
 
 
 def constant_direction_2d(
-    field: Field, *, moving: int | None = None, static: int = 0, profile: Sequence[int] = (2, 1, 1), times: Sequence[int] = (),
-    camera: str = "generic",
+    field: Field, *, moving: int | None = None, static: int = 0, on_line: int = 0,
+    profile: Sequence[int] = (2, 1, 1), times: Sequence[int] = (), camera: str = "generic",
 ) -> list[Step]:  # fmt: skip
     """Points of a plane at constant speeds along one direction: Grassmann tensor P^3 -> P^2."""
-    return _Lifted(field, 2, (1,), profile, times, camera).steps(moving, static)
+    return _Lifted(field, 2, (1,), profile, times, camera).steps(moving, static, on_line=on_line)
 
 
 def constant_velocity_2d(
     field: Field, *, moving: int | None = None, static: int = 0, equal_velocity: int = 0, linear_velocity: int = 0,
-    profile: Sequence[int] = (2, 2, 1), times: Sequence[int] = (), camera: str = "generic",
+    on_line: int = 0, profile: Sequence[int] = (2, 2, 1), times: Sequence[int] = (), camera: str = "generic",
 ) -> list[Step]:  # fmt: skip
     """Points of a plane with constant velocities: Grassmann tensor P^4 -> P^2."""
-    return _Lifted(field, 2, (2,), profile, times, camera).steps(moving, static, equal_velocity, linear_velocity)
+    return _Lifted(field, 2, (2,), profile, times, camera).steps(moving, static, equal_velocity, linear_velocity, on_line=on_line)
 
 
 def constant_acceleration_2d(
-    field: Field, *, moving: int | None = None, static: int = 0, profile: Sequence[int] = (2, 2, 2, 1), times: Sequence[int] = (),
-    camera: str = "generic",
+    field: Field, *, moving: int | None = None, static: int = 0, on_line: int = 0,
+    profile: Sequence[int] = (2, 2, 2, 1), times: Sequence[int] = (), camera: str = "generic",
 ) -> list[Step]:  # fmt: skip
     """Points of a plane with constant accelerations: Grassmann tensor P^6 -> P^2."""
-    return _Lifted(field, 2, (2, 2), profile, times, camera).steps(moving, static)
+    return _Lifted(field, 2, (2, 2), profile, times, camera).steps(moving, static, on_line=on_line)
 
 
 def constant_direction_3d(
-    field: Field, *, moving: int | None = None, static: int = 0, profile: Sequence[int] = (2, 2, 1), times: Sequence[int] = (),
+    field: Field, *, moving: int | None = None, static: int = 0, on_plane: int = 0, on_line: int = 0,
+    profile: Sequence[int] = (2, 2, 1), times: Sequence[int] = (),
     camera: str = "generic",
 ) -> list[Step]:  # fmt: skip
     """3D points at constant speeds along one direction: Grassmann tensor P^4 -> P^2."""
-    return _Lifted(field, 3, (1,), profile, times, camera).steps(moving, static)
+    return _Lifted(field, 3, (1,), profile, times, camera).steps(moving, static, on_plane=on_plane, on_line=on_line)
 
 
 def constant_velocity_planes_3d(
     field: Field, *, moving: int | None = None, static: int = 0, equal_velocity: int = 0, linear_velocity: int = 0,
+    on_plane: int = 0, on_line: int = 0,
     profile: Sequence[int] = (2, 2, 1, 1), times: Sequence[int] = (), camera: str = "generic",
 ) -> list[Step]:  # fmt: skip
     """3D points with constant velocities in parallel planes: Grassmann tensor P^5 -> P^2."""
-    return _Lifted(field, 3, (2,), profile, times, camera).steps(moving, static, equal_velocity, linear_velocity)
+    return _Lifted(field, 3, (2,), profile, times, camera).steps(
+        moving, static, equal_velocity, linear_velocity, on_plane=on_plane, on_line=on_line
+    )
 
 
 def constant_velocity_3d(
     field: Field, *, moving: int | None = None, static: int = 0, equal_velocity: int = 0, linear_velocity: int = 0,
-    planar_velocity: int = 0, profile: Sequence[int] = (2, 2, 2, 1), times: Sequence[int] = (), camera: str = "generic",
+    planar_velocity: int = 0, on_plane: int = 0, on_line: int = 0,
+    profile: Sequence[int] = (2, 2, 2, 1), times: Sequence[int] = (), camera: str = "generic",
 ) -> list[Step]:  # fmt: skip
     """3D points with constant velocities: Grassmann tensor P^6 -> P^2."""
-    return _Lifted(field, 3, (3,), profile, times, camera).steps(moving, static, equal_velocity, linear_velocity, planar_velocity)
+    return _Lifted(field, 3, (3,), profile, times, camera).steps(
+        moving, static, equal_velocity, linear_velocity, planar_velocity, on_plane=on_plane, on_line=on_line
+    )
 
 
 def constant_velocity_3d_sensors(
     field: Field, *, moving: int | None = None, static: int = 0, equal_velocity: int = 0, linear_velocity: int = 0,
-    planar_velocity: int = 0, profile: Sequence[int] = (3, 3, 1), times: Sequence[int] = (),
+    planar_velocity: int = 0, on_plane: int = 0, on_line: int = 0,
+    profile: Sequence[int] = (3, 3, 1), times: Sequence[int] = (),
 ) -> list[Step]:  # fmt: skip
     """3D points with constant velocities, 3D sensors: Grassmann tensor P^6 -> P^3."""
     model = _Lifted(field, 3, (3,), profile, times, sensor=3)
-    return model.steps(moving, static, equal_velocity, linear_velocity, planar_velocity)
+    return model.steps(moving, static, equal_velocity, linear_velocity, planar_velocity, on_plane=on_plane, on_line=on_line)
 
 
 def two_bodies_2d(
@@ -139,7 +148,7 @@ class _Lifted:
         self, field: Field, dim: int, directions: Sequence[int], profile: Sequence[int], times: Sequence[int] = (),
         camera: str = "generic", sensor: int = 2, bodies: int = 1,
     ) -> None:  # fmt: skip
-        self.field, self.dim, self.rates = field, dim, sum(directions) + bodies - 1
+        self.field, self.dim, self.rates, self.directions = field, dim, sum(directions) + bodies - 1, directions
         _check(profile, sensor, dim + 1 + self.rates, times, camera, along=bool(directions))
         moments = field.reduce(times) if times else field.random(len(profile))
         course = np.zeros((dim, 1), dtype=np.int64)  # of the camera
@@ -169,16 +178,43 @@ class _Lifted:
 
         return Step(kind, matches, draw, patience=PATIENCE)
 
-    def static(self, static: int | None) -> list[Step]:
-        """Points that do not move."""
-        return [self.step("static", static, lambda w: np.zeros(self.rates, dtype=np.int64))]
+    def static(self, static: int | None, on_plane: int = 0, on_line: int = 0) -> list[Step]:
+        """Points that do not move, some of them on one plane or line."""
+        still = self.step("static", static, lambda w: np.zeros(self.rates, dtype=np.int64))
+        return [self.confined("on line", on_line, 1), *([self.confined("on plane", on_plane, 2)] if self.dim > 2 else []), still]
 
-    def steps(self, moving: int | None, static: int, equal: int = 0, linear: int = 0, planar: int = 0) -> list[Step]:
+    def confined(self, kind: str, matches: int, size: int) -> Step:
+        """Matches of points that stay on one line (size 1) or plane (2), which has as many directions of motion as can be."""
+        field, free = self.field, self.directions[0] if self.directions else 0
+        ways = field.random(min(size, free), free)
+        axes = np.vstack(
+            [np.hstack([ways, np.zeros((len(ways), self.dim - free), dtype=np.int64)]), field.random(size - len(ways), self.dim)]
+        )
+        origin = field.random(self.dim)
+
+        def draw() -> IntArray:
+            point = (origin + field.product(field.random(size), axes)) % field.prime
+            rates = [field.product(field.random(len(ways)), ways) for _ in self.directions]
+            return self.views.fixed(np.concatenate([point, [1], *rates])[None])
+
+        return Step(kind, matches, draw, patience=PATIENCE)
+
+    def steps(
+        self,
+        moving: int | None,
+        static: int,
+        equal: int = 0,
+        linear: int = 0,
+        planar: int = 0,
+        *,
+        on_plane: int = 0,
+        on_line: int = 0,
+    ) -> list[Step]:
         """Points of all kinds."""
         field, common = self.field, self.field.random(self.rates)
         plane = field.random(min(2, self.rates), self.rates)
         return [
-            *self.static(static),
+            *self.static(static, on_plane, on_line),
             self.step("equal velocity", equal, lambda w: w * common),
             self.step("linear velocity", linear, lambda w: field.random() * common),
             self.step("planar velocity", planar, lambda w: field.product(field.random(len(plane)), plane)),

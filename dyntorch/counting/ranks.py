@@ -68,7 +68,7 @@ def count(what: str, /, *, seed: int = 0, **options: int | str | Sequence[int] |
 @overload
 def count(
     what: int, /, *, views: Sequence[int] = (), m: int = 1, r: int = 1, measure: Measure | Sequence[Measure] = "join",
-    matches: int | None = None, profile: Sequence[int] = (), seed: int = 0,
+    matches: int | None = None, profile: Sequence[int] = (), static: int = 0, on_plane: int = 0, on_line: int = 0, seed: int = 0,
 ) -> Count: ...  # fmt: skip
 @overload
 def count(what: Sampler, /, *, matches: int | None = None, seed: int = 0) -> Count: ...
@@ -81,16 +81,17 @@ def count(what: str | int | Sampler, /, *, seed: int = 0, **options: Any) -> Cou
     **A name** of :data:`CONFIGURATIONS`, with the number of matches of each kind, such as ``moving=30, static=2``.  Of the first
     kind, None means as many as raise the rank, and so does no number at all.  Lists give the number of points on each of several
     ``lines``, or of lines on each of several translating ``objects``.  ``labelled_static`` are known to be static, ``static``
-    are not.  The motion models of :func:`dyntorch.reconstruct` also take the ``profile`` of their tensor, the ``times`` of the
-    views (by default random) and the path of the ``camera``: ``"generic"``, ``"fixed"``, ``"constant_velocity"``, or
-    ``"along"`` the motion.
+    are not.  Of points, ``on_plane`` and ``on_line`` say how many stay on one plane or line, wherever they move in it, and
+    ``static_on_plane``, ``static_on_line`` how many stand still there.  The motion models of :func:`dyntorch.reconstruct` also take
+    the ``profile`` of their tensor, the ``times`` of the views (by default random) and the path of the ``camera``: ``"generic"``,
+    ``"fixed"``, ``"constant_velocity"``, or ``"along"`` the motion.
 
     **Numbers**: ``count(k, views=[l1, l2, ...], m=, r=, measure=)``, and ``count(k, profile=[a1, a2, ...])`` for the
     Grassmann tensor of points in views of the plane, or in ``views=``.  A primitive spanned by ``m`` points is, in every view
     anew, anywhere within a random extensor of ``r`` points of :math:`P^k` (r = m: it stays; m = 1, r = 2: a point on a line), and
     seen through random projections :math:`P^k \to P^{l_v}`.  A view measures its Pluecker coordinates (``"join"``) or the
     hyperplanes that contain it (``"hyper"``); one word for all views, or one for each.  A profile says how many of these
-    hyperplanes are taken at once.
+    hyperplanes are taken at once.  Some primitives may be ``static``, or stay ``on_line``, or ``on_plane`` (in one hyperplane).
 
     **A sampler** for anything else: a function that takes a :class:`Field` and returns an iterable, usually a generator, of the
     rows of each match, ``(width,)`` or ``(rows, width)`` integers, taken modulo ``field.prime``.  It is called once per prime.
@@ -149,6 +150,81 @@ def count(what: str | int | Sampler, /, *, seed: int = 0, **options: Any) -> Cou
     return dataclasses.replace(best, agreed=len({result.rank for result in found}) == 1)
 
 
+@dataclass(frozen=True)
+class Capacity:
+    """What matches of one kind can tell at most, however many there are.
+
+    Args:
+        option: that says how many there are.
+        matches: how many of them count.
+        rank: that they reach by themselves.
+        missing: matches of the usual kind that are needed beside them.
+        full: rank that these reach together; less than that of the usual kind alone only if something is wrong.
+    """
+
+    option: str
+    matches: int
+    rank: int
+    missing: int
+    full: int
+
+
+def capacities(name: str, *, only: Sequence[str] = (), seed: int = 0, **settings: Any) -> tuple[Capacity, ...]:
+    """How many matches of each kind count at most in a named configuration, and what is missing beside them.
+
+    Thesis section 10.1 asks for such conditions on the measurements, "up to 10 points on one hyperplane".
+
+    Args:
+        name: one of :data:`CONFIGURATIONS`.
+        only: some of its options; all of them by default.
+        seed: of the random matches.
+        **settings: options that are no matches, such as ``profile`` or ``points``.
+
+    Raises:
+        ValueError: an unknown name or option.
+
+    Example:
+        >>> {c.option: (c.matches, c.rank, c.missing) for c in capacities("homography")}["static"]
+        (10, 10, 16)
+        >>> [(c.option, c.matches, c.missing) for c in capacities("fundamental")]
+        [('static', 8, 0), ('coplanar', 6, 2), ('on_plane', 6, 2), ('on_line', 3, 5)]
+    """
+    name, configure, usual = _configuration(name, dict(settings))
+    _check(name, configure, settings)
+    found = []
+    for option, default in _defaults(configure).items():
+        if option in SETTINGS or isinstance(default, bool | str) or (only and option not in only):
+            continue
+        given: dict[str, Any] = {option: (1,) if isinstance(default, tuple) else 1}
+        if option != usual:
+            given[usual] = None
+        found.append(
+            max((_capacity(name, configure, prime, option, given | settings, seed) for prime in PRIMES), key=lambda c: c.rank)
+        )
+    return tuple(found)
+
+
+def _capacity(name: str, configure: Configuration, prime: int, option: str, given: dict[str, Any], seed: int) -> Capacity:
+    steps = configure(Field(prime, [seed, prime]), **given)
+    usual = steps[-1]
+    # of defaults, such as the other body's matches, none
+    chosen = (
+        usual
+        if option == next(iter(_defaults(configure)))
+        else next(step for step in steps if step.kind.replace(" ", "_") in (option, option.removesuffix("s")))
+    )
+    tally = Tally(Field(prime, [seed, prime]))
+    tally.take(dataclasses.replace(chosen, matches=None))
+    alone = tally.rank
+    matches = sum(kind.useful for kind in tally.kinds)
+    others = [step for step in steps if step is not chosen and step is not usual and step.matches]
+    for step in (*others, usual):
+        if step is not chosen:
+            tally.take(dataclasses.replace(step, matches=None) if step is usual else step)
+    missing = sum(kind.useful for kind in tally.kinds) - matches
+    return Capacity(option, matches, alone, missing, tally.rank)
+
+
 def _counts(option: str, value: Any) -> bool:
     """Whether an option asks for matches."""
     return option not in SETTINGS and value is not True and bool(value)
@@ -174,7 +250,7 @@ def options_of(name: str) -> dict[str, Any]:
 
     Example:
         >>> options_of("fundamental")
-        {'static': None, 'coplanar': 0}
+        {'static': None, 'coplanar': 0, 'on_plane': 0, 'on_line': 0}
     """
     return _defaults(CONFIGURATIONS[name])
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from dyntorch.core.invariant import Frame, Invariant
 from dyntorch.core.primitives import Point, Primitive
 from dyntorch.counting.dimension import dim_v
-from dyntorch.geometry.homogeneous import homogeneous, inhomogeneous
+from dyntorch.geometry.homogeneous import homogeneous, inhomogeneous, unit
 from dyntorch.invariants.agreement import static_residual
 from dyntorch.invariants.flats import collineations, flat_residual, flat_residual_derivative, nearest_flats, vanishing_forms
 from dyntorch.numerics.least_squares import normalized_derivative
@@ -312,3 +312,52 @@ class DynamicTensor(Invariant):
 
     def __repr__(self) -> str:
         return f"DynamicTensor({self.n}, {self.views}, {self.k})"
+
+
+@dataclass(frozen=True, repr=False)
+class DynamicMotion(DynamicTensor):
+    r"""The motion of a :class:`DynamicTensor` by itself, for any number of views: no form is composed, so nothing grows with them.
+
+    What the tasks refine, from motions of a few views each.  Static points are measured like moving ones, by their exact distance
+    from one point.
+
+    Example:
+        >>> import torch
+        >>> twenty = DynamicMotion(2, 20, 2)
+        >>> twenty.compose(*torch.rand(19, 3, 3)).shape, twenty.codim
+        (torch.Size([19, 3, 3]), 18)
+    """
+
+    nullity = 1
+    motion_alone = True
+
+    def shape(self) -> tuple[int, ...]:
+        return (self.views - 1, self.size, self.size)
+
+    def width(self) -> int:
+        return (self.views - 1) * self.size**2
+
+    def single(self) -> bool:
+        return False
+
+    def minimal(self) -> int:
+        raise ValueError(f"{self!r} holds no forms to fit; use DynamicTensor{self.n, self.views, self.k}")
+
+    def compose(self, *maps: Tensor) -> Tensor:
+        self._check(maps)
+        return torch.stack([unit(part) for part in maps], dim=-3)
+
+    def decompose(self, tensor: Tensor) -> tuple[Tensor, ...]:
+        return tensor.unbind(-3)
+
+    def confined(self, free: int) -> Invariant | None:
+        return DynamicMotion(self.n, self.views, self.k - free)
+
+    def whitened_static(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
+        """Distances of all views from the nearest static point, ``(*batch, n, m n)``, of n (m - 1) degrees of freedom."""
+        found = DynamicMotion(self.n, self.views, 1).whitened(motion, views, scales)
+        assert found is not None
+        return found
+
+    def __repr__(self) -> str:
+        return f"DynamicMotion({self.n}, {self.views}, {self.k})"

@@ -23,13 +23,14 @@ def planar(
     static: float = 0.0,
     outliers: float = 0.0,
     step: tuple[float, float] = (25.0, 80.0),
+    views: int = 3,
     generator: torch.Generator | None = None,
     dtype: torch.dtype = torch.float64,
 ) -> Scene:
     r"""Points of a plane that move on straight lines at changing speed: :math:`\det[p_1, A p_2, B p_3] = 0`.
 
-    Three views of 640 x 480 pixels, focal length 700, of a plane seen at a slant; a point moves along its line by a random
-    amount between two views, forwards or backwards, in pixels of the second view.
+    Three views or more of 640 x 480 pixels, focal length 700, of a plane seen at a slant; a point moves along its line from where
+    it is in the second view by a random amount, forwards or backwards, in pixels of that view.
 
     Args:
         n: number of matches.
@@ -37,12 +38,13 @@ def planar(
         sigma: noise, pixels.
         static: share of static points.
         outliers: share of matches of which view 2 or 3 is replaced by a random point.
-        step: least and greatest motion between views, pixels.
+        step: least and greatest motion between the second view and another, pixels.
+        views: their number.
         generator: source of all randomness.
         dtype: of the result; the scene is made in float64.
 
     Returns:
-        Scene with ``views`` three ``(*batch, n, 2)``; ``motion`` (A, B), the homographies of the plane from view 2 and 3 to
+        Scene with ``views`` of ``(*batch, n, 2)``; ``motion`` (A, B, ...), the homographies of the plane from view 2, 3, ... to
         view 1.  A single-view outlier of a static match still satisfies the equation: see ``extras["moving"]``.
 
     Raises:
@@ -60,16 +62,17 @@ def planar(
         True
     """
     draw = Draw(n, batch, sigma, static, outliers, generator, dtype)
-    to_image = _plane_to_images(draw)
+    to_image = _plane_to_images(draw, views)
     angle = draw.uniform(n, high=2 * torch.pi)
     # half of the points turn back: near constant speed would leave a family of B undetermined (four times the error)
-    steps = draw.uniform(n, 2, 1, low=step[0], high=step[1]) * torch.where(draw.uniform(n, 2, 1) < 0.5, -1.0, 1.0)
+    signs = (n, views - 1, 1)
+    steps = draw.uniform(*signs, low=step[0], high=step[1]) * torch.where(draw.uniform(*signs) < 0.5, -1.0, 1.0)
     path = torch.stack([angle.cos(), angle.sin()], dim=-1)[..., None, :] * steps
     path = torch.where(draw.moving[..., None, None], path, 0.0)
     middle = _in_image(draw)
     # the straight paths are drawn in the second view and carried over to the others by the plane
     from_second = to_image @ torch.linalg.inv(to_image[..., 1:2, :, :])
-    placed = (middle - path[..., 0, :], middle, middle + path[..., 1, :])
+    placed = (middle - path[..., 0, :], middle, *(middle + way for way in path[..., 1:, :].unbind(-2)))
     exact = [apply(from_second[..., v, :, :], x) for v, x in enumerate(placed)]
     return draw.scene(exact, _to_first(to_image))
 
@@ -153,20 +156,20 @@ def _in_image(draw: Draw) -> Tensor:
 
 
 def _to_first(to_image: Tensor) -> list[Tensor]:
-    """A and B, from the second and the third view to the first."""
-    return [to_image[..., 0, :, :] @ torch.linalg.inv(to_image[..., v, :, :]) for v in (1, 2)]
+    """A, B, ..., from the second, the third, ... view to the first."""
+    return [to_image[..., 0, :, :] @ torch.linalg.inv(to_image[..., v, :, :]) for v in range(1, to_image.shape[-3])]
 
 
-def _plane_to_images(draw: Draw) -> Tensor:
-    r"""``(*batch, 3, 3, 3)`` maps :math:`K R\,[e_1, e_2, -c]` of the plane z = 0 to three views that look at its origin."""
-    slant = draw.uniform(1, low=0.35, high=0.7) + draw.uniform(3, low=-0.15, high=0.15)
-    around = draw.uniform(1, high=2 * torch.pi) + draw.uniform(3, low=-0.4, high=0.4)
-    distance = draw.uniform(3, 1, low=6.0, high=8.0)
+def _plane_to_images(draw: Draw, views: int = 3) -> Tensor:
+    r"""``(*batch, views, 3, 3)`` maps :math:`K R\,[e_1, e_2, -c]` of the plane z = 0 to views that look at its origin."""
+    slant = draw.uniform(1, low=0.35, high=0.7) + draw.uniform(views, low=-0.15, high=0.15)
+    around = draw.uniform(1, high=2 * torch.pi) + draw.uniform(views, low=-0.4, high=0.4)
+    distance = draw.uniform(views, 1, low=6.0, high=8.0)
     ray = torch.stack([slant.sin() * around.cos(), slant.sin() * around.sin(), -slant.cos()], dim=-1)
     up = torch.zeros_like(ray)
     up[..., 1] = 1.0
     x = normalize(torch.linalg.cross(up, -ray), dim=-1)
-    rotation = draw.rotations(3, spread=0.03) @ torch.stack([x, torch.linalg.cross(-ray, x), -ray], dim=-2)
+    rotation = draw.rotations(views, spread=0.03) @ torch.stack([x, torch.linalg.cross(-ray, x), -ray], dim=-2)
     plane = torch.cat([torch.eye(3, 2, dtype=ray.dtype, device=ray.device).expand(*ray.shape, 2), -(ray * distance)[..., None]], -1)
     calibration = torch.tensor([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]], dtype=ray.dtype, device=ray.device)
     return calibration @ rotation @ plane

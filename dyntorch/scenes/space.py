@@ -23,10 +23,11 @@ def moving_points(
     outliers: float = 0.0,
     sensors: str = "projective",
     step: tuple[float, float] = (0.5, 2.0),
+    views: int = 3,
     generator: torch.Generator | None = None,
     dtype: torch.dtype = torch.float64,
 ) -> Scene:
-    r"""Points of space on straight lines at changing speed, seen from three poses: :math:`P_1, A P_2, B P_3` are collinear.
+    r"""Points of space on straight lines at changing speed, seen from three poses or more: :math:`P_1, A P_2, B P_3` are collinear.
 
     Points within 2 of the origin in each coordinate at the second instant; steps along the line go forwards or backwards.
 
@@ -37,13 +38,14 @@ def moving_points(
         static: share of static points.
         outliers: share of matches of which view 2 or 3 is replaced by a random point.
         sensors: ``"projective"``, ``"affine"`` (both near rigid) or ``"rigid"``.
-        step: least and greatest motion between views.
+        step: least and greatest distance of the other views from where a point is in the second.
+        views: their number.
         generator: source of all randomness.
         dtype: of the result; the scene is made in float64.
 
     Returns:
-        Scene with ``views`` three ``(*batch, n, 3)``; ``motion`` (A, B) from view 2 and 3 to view 1; ``extras["points"]``
-        ``(*batch, n, 3)`` at the second instant in the frame of the world, ``extras["sensors"]`` ``(*batch, 3, 4, 4)``.
+        Scene with ``views`` of ``(*batch, n, 3)``; ``motion`` (A, B, ...) from view 2, 3, ... to view 1; ``extras["points"]``
+        ``(*batch, n, 3)`` at the second instant in the frame of the world, ``extras["sensors"]`` ``(*batch, views, 4, 4)``.
 
     Raises:
         ValueError: shares outside 0 to 1, negative sigma, n < 1, unknown sensors.
@@ -56,21 +58,21 @@ def moving_points(
         (torch.Size([4, 7, 3]), torch.Size([4, 4, 4]))
     """
     draw = Draw(n, batch, sigma, static, outliers, generator, dtype)
-    maps = draw.sensors(3, sensors)
+    maps = draw.sensors(views, sensors)
     points = draw.uniform(n, 3, low=-2.0, high=2.0)
     # half of the points turn back: near constant speed would leave a family of B almost undetermined
-    signs = torch.where(draw.uniform(2, n, 1) < 0.5, -1.0, 1.0)
+    signs = torch.where(draw.uniform(views - 1, n, 1) < 0.5, -1.0, 1.0)
     directions = torch.where(draw.moving[..., None], draw.directions(n, 3), 0.0)
-    steps = signs * draw.uniform(2, n, 1, low=step[0], high=step[1]) * directions[..., None, :, :]
-    placed = (points - steps[..., 0, :, :], points, points + steps[..., 1, :, :])
+    steps = signs * draw.uniform(views - 1, n, 1, low=step[0], high=step[1]) * directions[..., None, :, :]
+    placed = (points - steps[..., 0, :, :], points, *(points + way for way in steps[..., 1:, :, :].unbind(-3)))
     exact = [apply(maps[..., v, :, :], x) for v, x in enumerate(placed)]
-    to_first = [maps[..., 0, :, :] @ torch.linalg.inv(maps[..., v, :, :]) for v in (1, 2)]
+    to_first = [maps[..., 0, :, :] @ torch.linalg.inv(maps[..., v, :, :]) for v in range(1, views)]
     return draw.scene(exact, to_first, points=points, sensors=maps)
 
 
 def dynamic(
     dim: int = 3,
-    sights: int = 3,
+    views: int = 3,
     step: int = 2,
     n: int = 200,
     *,
@@ -89,7 +91,7 @@ def dynamic(
 
     Args:
         dim: of the space.
-        sights: views.
+        views: their number.
         step: 1 stands still, 2 moves on a line, 3 in a plane.
         n: number of matches.
         batch: shape of the batch of independent scenes.
@@ -105,7 +107,7 @@ def dynamic(
         ``extras["dimensions"]`` ``(*batch, n)`` of the subspaces, ``extras["points"]`` ``(*batch, n, dim)`` at the second instant.
 
     Raises:
-        ValueError: dim, sights or step < 1, shares outside 0 to 1, negative sigma, n < 1.
+        ValueError: dim, views or step < 1, shares outside 0 to 1, negative sigma, n < 1.
 
     Source: thesis section 9.3.
 
@@ -114,25 +116,25 @@ def dynamic(
         >>> len(scene.views), scene.views[0].shape, scene.motion[2].shape
         (4, torch.Size([2, 7, 3]), torch.Size([2, 4, 4]))
     """
-    if min(dim, sights, step) < 1:
-        raise ValueError(f"dim, sights and step must be 1 or more, got {dim}, {sights}, {step}")
+    if min(dim, views, step) < 1:
+        raise ValueError(f"dim, views and step must be 1 or more, got {dim}, {views}, {step}")
     draw = Draw(n, batch, sigma, static, outliers, generator, dtype)
     eye = torch.eye(dim + 1, dtype=torch.float64)
-    maps = eye + 0.2 * draw.normal(sights, dim + 1, dim + 1)
+    maps = eye + 0.2 * draw.normal(views, dim + 1, dim + 1)
     # a bounded last row keeps the scene in front of the hyperplane at infinity
-    last = torch.cat([draw.uniform(sights, 1, dim, low=-0.18 / dim, high=0.18 / dim), torch.ones_like(maps[..., :1, :1])], dim=-1)
+    last = torch.cat([draw.uniform(views, 1, dim, low=-0.18 / dim, high=0.18 / dim), torch.ones_like(maps[..., :1, :1])], dim=-1)
     maps = torch.cat([maps[..., :dim, :], last], dim=-2)
     points = draw.uniform(n, dim, low=-2.0, high=2.0)
     turn = torch.arange(n, device=points.device) % step + 1 if mixed else torch.full((n,), step, device=points.device)
     dimensions = torch.where(draw.moving, turn, 1)
     flats = draw.directions(n, max(1, step - 1), dim)
     used = torch.arange(1, max(2, step), device=points.device) < dimensions[..., None]
-    along = torch.nn.functional.normalize(draw.normal(sights, n, max(1, step - 1)) * used[..., None, :, :], dim=-1)
-    way = (along[..., None, :] @ flats[..., None, :, :, :])[..., 0, :] * draw.uniform(sights, n, 1, low=0.5, high=2.0)
-    present = (torch.arange(sights, device=points.device) != 1)[:, None, None]
+    along = torch.nn.functional.normalize(draw.normal(views, n, max(1, step - 1)) * used[..., None, :, :], dim=-1)
+    way = (along[..., None, :] @ flats[..., None, :, :, :])[..., 0, :] * draw.uniform(views, n, 1, low=0.5, high=2.0)
+    present = (torch.arange(views, device=points.device) != 1)[:, None, None]
     placed = points[..., None, :, :] + torch.where(present, way, 0.0)
-    exact = [apply(maps[..., v, :, :], placed[..., v, :, :]) for v in range(sights)]
-    to_first = [maps[..., 0, :, :] @ torch.linalg.inv(maps[..., v, :, :]) for v in range(1, sights)]
+    exact = [apply(maps[..., v, :, :], placed[..., v, :, :]) for v in range(views)]
+    to_first = [maps[..., 0, :, :] @ torch.linalg.inv(maps[..., v, :, :]) for v in range(1, views)]
     return draw.scene(exact, to_first, points=points, dimensions=dimensions)
 
 

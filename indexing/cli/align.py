@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from indexing.report.alignment import AlignmentReport
 
 Model = Literal["planar", "join", "minimal_join", "constant_velocity", "affine_constant_velocity", "rigid", "lines"]
+SEVERAL = ("planar", "join", "minimal_join")
+"""Models that take more than three views."""
 WORDS = flags("model", "threshold", "motion", static="a column static", static_points="--static-points FILE FILE")
 
 
@@ -29,13 +31,14 @@ class Align:
 
     dyntorch align scan1.ply scan2.ply scan3.ply --model rigid
 
-    dyntorch align walk.c3d --frames 10,20,30 --model join
+    dyntorch align walk.c3d --frames 10,20,30,40,50 --model join
 
     dyntorch align l1.csv l2.csv --model lines --static-points p1.csv p2.csv
     """
 
     files: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="FILE ...", help_behavior_hint="")]
-    """a file per view (CSV with columns x,y or x,y,z and perhaps id; npy; PLY), or one for all (npz with x1, x2, x3; C3D)"""
+    """a file per view (CSV with columns x,y or x,y,z and perhaps id; npy; PLY), or one for all (npz with x1, x2, x3; C3D); planar,
+    join and minimal_join take three or more views"""
     model: Annotated[Model | None, tyro.conf.arg(help_behavior_hint="")] = None
     """how points may move, and the sensor; by default planar for 2D points, rigid for 3D points, lines for lines"""
     threshold: Annotated[float | Literal["auto"], tyro.conf.arg(metavar="T|auto")] = "auto"
@@ -111,7 +114,7 @@ class Align:
             fitting = "lines" if matched.lines else "planar" if dims[0] == 2 else "rigid, join or another of 3D points"
             raise ValueError(f"{matched.names[0]}: holds {kind}, --model {given} needs {needed}; use --model {fitting}")
         views = 2 if given == "lines" else 3
-        if len(dims) != views:
+        if len(dims) != views and not (given in SEVERAL and len(dims) > views):
             have = f"{count(len(dims), 'view')} ({names(matched.names)})"
             raise ValueError(f"--model {given} needs {views} views, got {have}; give {views} files, or {views} frames of one")
         if self.motion != "straight" and given != "rigid":

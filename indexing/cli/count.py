@@ -13,6 +13,17 @@ from indexing.cli.console import say, table
 if TYPE_CHECKING:
     from dyntorch import counting
 
+CONFINED = ("static", "on_plane", "on_line")
+"""Kinds of matches that say less than others, of named configurations and of numbers."""
+CONFINED_MORE = (
+    "static_on_plane",
+    "static_on_line",
+    "labelled_static",
+    "coplanar",
+    "equal_velocity",
+    "linear_velocity",
+    "planar_velocity",
+)
 Number = Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")]
 Numbers = Annotated[tuple[int, ...], tyro.conf.arg(metavar="N ...", help_behavior_hint="")]
 
@@ -43,6 +54,20 @@ class Matches:
     """of constant velocities: along one direction"""
     planar_velocity: Number = None
     """of constant velocities in space: within one plane, such as cars on a road"""
+    on_plane: Number = None
+    """that stay on one plane of space, moving or not as the configuration lets them; of numbers (--k): in one hyperplane"""
+    on_line: Number = None
+    """that stay on one line"""
+    static_on_plane: Number = None
+    """that stand still on one plane of space"""
+    static_on_line: Number = None
+    """that stand still on one line"""
+    dim: Number = None
+    """of dynamic: dimension of the space (without it 3)"""
+    poses: Number = None
+    """of dynamic: how many views (without it 4)"""
+    within: Number = None
+    """of dynamic: points that span the flat in which a match moves: 2 is a line, 3 a plane (without it 3)"""
     coplanar: Number = None
     """of fundamental, trifocal and quadrifocal: static points of one plane"""
     images: Number = None
@@ -109,6 +134,10 @@ class Count:
 
     dyntorch count constant_velocity_3d --static 100 --camera fixed
 
+    dyntorch count join --on-plane 10 --static 2
+
+    dyntorch count dynamic --dim 2 --poses 5 --within 2
+
     dyntorch count --k 3 --views 2 2 2 2 --r 2
 
     dyntorch count --k 6 --profile 2 2 2 1
@@ -137,7 +166,7 @@ class Count:
             given |= self.motion.given()
         if (self.configuration != "") + general + (self.dim_v is not None) > 1:
             raise ValueError("a configuration's name, numbers (--k, --views...) and --dim-v exclude each other; give one of them")
-        if given and not self.configuration:
+        if given and not self.configuration and not (general and given.keys() <= set(CONFINED)):
             flag = "--" + next(iter(given)).replace("_", "-")
             raise ValueError(f"{flag} needs a configuration before it, one of {', '.join(counting.CONFIGURATIONS)}")
         if self.dim_v is not None:
@@ -147,9 +176,9 @@ class Count:
             if name not in counting.CONFIGURATIONS:
                 raise ValueError(f"unknown configuration {self.configuration!r}; known are {', '.join(counting.CONFIGURATIONS)}")
             result = counting.count(name, seed=self.seed, **given)
-            self._print(result, purpose(name), unique="profile" in counting.options_of(name))
+            self._print(result, purpose(name), unique="profile" in counting.options_of(name), most=self._most(name, given))
         elif general:
-            self._print_general()
+            self._print_general(given)
         else:
             results = [counting.count(name, seed=self.seed) for name in counting.CONFIGURATIONS]
             say(json.dumps([asdict(result) for result in results])) if self.json else overview(results)
@@ -161,13 +190,24 @@ class Count:
         dimension = counting.dim_v(n, m, k)
         say(json.dumps({"n": n, "m": m, "k": k, "dim_v": dimension}) if self.json else f"dim V({n}, {m}, {k}) = {dimension}")
 
-    def _print_general(self) -> None:
+    def _most(self, name: str, given: dict[str, Any]) -> dict[str, int]:
+        """How many matches of each kind that was given count at most."""
+        from dyntorch import counting
+
+        asked = [option for option in counting.options_of(name) if option in given and option in (*CONFINED, *CONFINED_MORE)]
+        if not asked:
+            return {}
+        settings = {option: value for option, value in given.items() if option in ("profile", "points", "dim", "poses", "within")}
+        found = counting.capacities(name, only=asked, seed=self.seed, **settings)
+        return {capacity.option: capacity.matches for capacity in found}
+
+    def _print_general(self, given: dict[str, Any]) -> None:
         from dyntorch import counting
 
         sizes = self.general.views or (2,) * len(self.motion.profile)
         if self.general.k is None or not sizes:
             raise ValueError("numbers need at least --k, the dimension of the space, and --views, such as --k 2 --views 2 2 2")
-        numbers = asdict(self.general) | self.motion.given() | {"views": sizes}
+        numbers = asdict(self.general) | self.motion.given() | {"views": sizes} | given
         if len(self.general.measure) == 1:
             numbers["measure"] = self.general.measure[0]
         result = counting.count(numbers.pop("k"), seed=self.seed, **numbers)
@@ -176,10 +216,10 @@ class Count:
         seen = ", ".join(f"P^{size}" for size in sizes)
         self._print(result, f"{what} of P^{self.general.k} {within}, views {seen}")
 
-    def _print(self, result: counting.Count, heading: str, unique: bool = False) -> None:
-        """Print a count; ``unique``: there is one tensor, unless the views are degenerate."""
+    def _print(self, result: counting.Count, heading: str, unique: bool = False, most: dict[str, int] | None = None) -> None:
+        """Print a count; ``unique``: there is one tensor, unless the views are degenerate; ``most``: how many of a kind count."""
         if self.json:
-            say(json.dumps(asdict(result)))
+            say(json.dumps(asdict(result) | ({"at_most": most} if most else {})))
             return
         say(heading)
         if len(result.kinds) > 1:
@@ -196,6 +236,8 @@ class Count:
             say("no constraint: no tensor satisfies all matches")
         else:
             say("enough: more matches do not raise the rank")
+        if most:
+            say("at most " + ", ".join(f"{number} {kind.replace('_', ' ')}" for kind, number in most.items()) + " count")
 
 
 def overview(results: list[counting.Count]) -> None:

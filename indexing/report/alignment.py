@@ -6,6 +6,7 @@ import functools
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from string import ascii_uppercase
 from typing import Any
 
 import numpy as np
@@ -69,8 +70,8 @@ class AlignmentReport(ResultReport):
 
     @functools.cached_property
     def motion(self) -> list[FloatArray]:
-        """A and B (with three views), from view 2 and 3 to view 1."""
-        return [part for part in (self.found.A, self.found.B) if part is not None]
+        """A, B (with three views) and so on, from view 2, 3, ... to view 1."""
+        return [part for part in (self.found.A, self.found.B, *map(np.asarray, self.found.others)) if part is not None]
 
     @property
     def sigma(self) -> float:
@@ -112,7 +113,7 @@ class AlignmentReport(ResultReport):
     def shown(self) -> list[tuple[str, int, list[list[Any]], bool]]:
         """Of each motion: its name, the view that it leads from, its rows with deviations, and whether its last entry is 1."""
         out, start = [], 0
-        for view, (name, matrix) in enumerate(zip("AB", self.motion if self.solved else (), strict=False), start=2):
+        for view, (name, matrix) in enumerate(zip(ascii_uppercase, self.motion if self.solved else (), strict=False), start=2):
             block = slice(start, start := start + matrix.size)
             values, spreads, scaled = display_scale(matrix, self.found.covariance[block, block])
             rows = [
@@ -172,8 +173,10 @@ def as_json(report: AlignmentReport) -> dict[str, Any]:
     if report.solved:
         spread = np.sqrt(np.clip(np.diagonal(report.found.covariance), 0, None))
         spreads = np.split(spread, np.cumsum([part.size for part in report.motion])[:-1])
-        known = dict(zip("AB", report.motion, strict=False))
-        known |= {f"{name}_deviation": part.reshape(known[name].shape) for name, part in zip("AB", spreads, strict=False)}
+        known = dict(zip(ascii_uppercase, report.motion, strict=False))
+        known |= {
+            f"{name}_deviation": part.reshape(known[name].shape) for name, part in zip(ascii_uppercase, spreads, strict=False)
+        }
     unverified = report.found.unverified
     return {
         "status": report.status,
@@ -261,6 +264,7 @@ Box = tuple[float, float, float, float]  # left, right, low, high
 # apart for colour-blind eyes, too, on both papers; outliers are crosses besides
 COLOURS = {"static": "#2f7fb8", "moving": "#e8741e", "outlier": "#8b949c"}
 MARKS = {"static": "o", "moving": "o", "outlier": "x"}
+PANELS = 3  # views drawn; the paths are those of all
 PATHS = 1500  # paths drawn; more are a blot
 ROOM = 0.06  # around the points, of their extent
 REACH = 0.6  # how far beyond view 1 paths are shown, of its extent
@@ -274,7 +278,7 @@ def picture_of(report: AlignmentReport) -> bytes:
     colours = {**COLOURS, "unlabelled": LIGHT.muted}
     segments = report.segments
     axes_shown, turned = _axes(report)
-    flat = [view[..., axes_shown] for view in report.views]
+    flat = [view[..., axes_shown] for view in report.views[:PANELS]]
     boxes = [_box(points, kinds) for points in flat]
     if report.solved:
         boxes[0] = _widened(boxes[0], report, kinds, axes_shown)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import combinations
 
 import torch
 from torch import Tensor
@@ -11,16 +12,19 @@ from dyntorch.core.fit import fit_matches
 from dyntorch.core.invariant import Invariant
 from dyntorch.core.matches import Matches
 from dyntorch.core.outcome import Notice, Status, failed, in_order, noting
+from dyntorch.core.residual import whitened
 from dyntorch.core.robust import robust_fit
 from dyntorch.core.solution import NOISY, Solution
 from dyntorch.geometry.homogeneous import homogeneous, inhomogeneous
 from dyntorch.invariants.join_tensor import JoinTensor
 from dyntorch.invariants.minimal_join_tensor import MinimalJoinTensor
+from dyntorch.numerics.blocks import select
 from dyntorch.numerics.chi_square import median, three_sigma
 from dyntorch.numerics.messages import Message
 from dyntorch.tasks.align.labelling import Evidence, Labelled, joined, static_consensus
 from dyntorch.tasks.align.options import AlignOptions
 from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment, AlignNotice
+from dyntorch.tasks.align.several import motion_of_all, moving_points
 
 MINIMAL = {"join": 47, "minimal_join": 47}
 LABELLED = 9
@@ -37,15 +41,22 @@ AMBIGUITY = Message(
 )
 
 
+MORE_VIEWS = Message(
+    "The collineations are unique, each up to its scale, unless the steps of all points keep one ratio (constant velocity): then "
+    "they are known up to a velocity common to all points. A match that agrees in all views but one counts as moving: a point that "
+    "paused and a static point mismatched in that view look the same."
+)
+
+
 def align_join(
     data: Matches, threshold: float | None, model: str, generator: torch.Generator | None, options: AlignOptions
 ) -> Alignment:
     """:func:`dyntorch.align_points` with a join tensor, for checked matches."""
-    evidence = Evidence.of(JoinTensor(), data, options)
+    evidence = Evidence.of(moving_points(3, len(data.views)), data, options)
     best = _search(evidence, threshold, model, generator, options)
     solution, labels, worst = _solved(evidence, best, options)
     outcome = replace(solution, inliers=labels != OUTLIER).back(data)
-    A, B = outcome.motion
+    A, B, *others = outcome.motion
     assert outcome.sigma is not None and outcome.covariance is not None
     return Alignment(
         A=A,
@@ -54,9 +65,10 @@ def align_join(
         status=outcome.status,
         sigma=outcome.sigma,
         covariance=outcome.covariance,
-        ambiguity=AMBIGUITY,
+        ambiguity=MORE_VIEWS if others else AMBIGUITY,
         notices=_notices(evidence, replace(best, labels=labels), worst, solution.status, data.batch, options),
         solution=outcome,
+        others=tuple(others),
     )
 
 
@@ -104,9 +116,9 @@ def _doubt(evidence: Evidence, theta: Tensor, sigma: Tensor) -> Tensor:
 
     For the others a further start can only lead to the same motion: one that as many matches agree with shares some with it.
     """
-    labels = evidence.labels(theta, sigma)
+    labels, invariant = evidence.labels(theta, sigma), evidence.invariant
     moving, agreeing, present = ((labels == MOVING).sum(-1), (labels != OUTLIER).sum(-1), (evidence.data.weights > 0).sum(-1))
-    return ((2 * agreeing <= present) | (moving * JoinTensor.codim <= JoinTensor.dof)).to(theta)
+    return ((2 * agreeing <= present) | (moving * invariant.codim <= invariant.dof)).to(theta)
 
 
 def _from_static(
@@ -120,13 +132,13 @@ def _from_static(
         pool = torch.where((known.sum(-1) >= ENOUGH)[:, None], known, pool)
     scale = evidence.norm.scales[0]
     # each distance has the noise of two views
-    limit = None if given is None else 2 * three_sigma(6) * (options.labels.rough * scale * given).square()
+    limit = None if given is None else 2 * three_sigma(evidence.still) * (options.labels.rough * scale * given).square()
     motion, variance = static_consensus(evidence.views, pool, limit, options.join.samples, generator, options)
     theta = torch.cat([part.flatten(1) for part in motion], dim=-1)
     if given is not None:
         return theta, given
     # static_consensus divides by the median of 4 conditions; three views of space have 6
-    return theta, (variance * median(4) / median(6)).nan_to_num(posinf=1.0).sqrt() / scale
+    return theta, (variance * median(4) / median(evidence.still)).nan_to_num(posinf=1.0).sqrt() / scale
 
 
 def _from_tensor(
@@ -136,14 +148,16 @@ def _from_tensor(
     data = evidence.data
     # of so few matches no half determines a motion, so that the noise cannot be told from outliers
     plain = (given is None and data.count < 3 * JoinTensor.dof) or not len(data.weights)
-    found = (
-        fit_matches(invariant, replace(data, static=None))
-        if plain
-        else robust_fit(invariant, *data.views, threshold=given, weights=data.weights, generator=generator)
-    )
-    theta = evidence.parameters(tuple(part.reshape(-1, 4, 4) for part in found.motion))
+
+    def solve(views: tuple[Tensor, ...]) -> Solution:
+        if plain:
+            return fit_matches(invariant, replace(data, views=views, static=None))
+        return robust_fit(invariant, *views, threshold=given, weights=data.weights, generator=generator)
+
+    motion, found = motion_of_all(evidence, solve, given, generator)
+    theta = torch.cat([part.flatten(1) for part in motion], dim=-1)
     usable = theta.isfinite().all(-1) & ~failed(found.status.reshape(-1))
-    identity = torch.eye(4, dtype=theta.dtype, device=theta.device).flatten().repeat(2) / 2
+    identity = torch.eye(4, dtype=theta.dtype, device=theta.device).flatten().repeat(len(motion)) / 2
     theta = torch.where(usable[:, None], theta, identity)
     if given is not None:
         return theta, given
@@ -152,9 +166,10 @@ def _from_tensor(
         assert refined.sigma is not None
         theta, noise = joined(refined), refined.sigma
     else:
-        motion = evidence.problem(torch.zeros_like(data.weights)).parts(theta)
-        moving = JoinTensor().whitened(motion, evidence.views, evidence.norm.scales).square().sum(-1)
-        noise = (torch.where(data.weights > 0, moving, torch.nan).nanmedian(dim=-1).values / median(JoinTensor.codim)).sqrt()
+        parts = evidence.problem(torch.zeros_like(data.weights)).parts(theta)
+        moving = whitened(evidence.invariant, parts, evidence.views, evidence.norm.scales).square().sum(-1)
+        middle = torch.where(data.weights > 0, moving, torch.nan).nanmedian(dim=-1).values
+        noise = (middle / median(evidence.invariant.codim)).sqrt()
     return theta, torch.where(usable & noise.isfinite(), noise, torch.inf)
 
 
@@ -171,12 +186,11 @@ def _solved(evidence: Evidence, best: Labelled, options: AlignOptions) -> tuple[
     none = failed(status)
     labels = torch.where(none[:, None], OUTLIER, labels)
     assert refined.sigma is not None and refined.covariance is not None
-    lead = none[(..., *[None] * 4)]
     solution = replace(
         refined,
         status=status,
-        tensor=torch.where(lead, 0.0, refined.tensor),
-        normalized=torch.where(lead, 0.0, refined.normalized),
+        tensor=select(~none, refined.tensor, 0.0),
+        normalized=select(~none, refined.normalized, 0.0),
         covariance=torch.where(none[:, None, None], 0.0, refined.covariance),
         sigma=torch.where(none, 0.0, refined.sigma),
         uncertainty=torch.where(none, 0.0, worst),
@@ -189,7 +203,8 @@ def _status(evidence: Evidence, best: Labelled, worst: Tensor, undetermined: Ten
     present = usable.sum(-1)
     known = torch.zeros_like(present) if evidence.data.static is None else (usable & evidence.data.static).sum(-1)
     still, moving = (best.labels == STATIC).sum(-1), (best.labels == MOVING).sum(-1)
-    accident = (still + moving < options.join.consensus * present) | (6 * still + 2 * moving < JoinTensor.dof + options.join.spare)
+    conditions = evidence.still * still + evidence.invariant.codim * moving
+    accident = (still + moving < options.join.consensus * present) | (conditions < evidence.invariant.dof + options.join.spare)
     accident = accident | (best.sigma * torch.stack(evidence.norm.scales).amax(0) > NOISY)
     status = torch.where(worst > options.join.ambiguous, int(Status.AMBIGUOUS), torch.zeros_like(present))
     status = torch.where(accident, int(Status.NO_CONSENSUS), status)
@@ -219,7 +234,7 @@ def trajectory_lines(evidence: Evidence, best: Labelled, options: AlignOptions) 
     parts = evidence.problem(best.labels).parts(best.theta)
     others = [inhomogeneous(homogeneous(x) @ m.mT) for m, x in zip(parts, evidence.views[1:], strict=True)]
     places = torch.stack([evidence.views[0], *others])
-    ends = torch.stack([places[1] - places[0], places[2] - places[0], places[2] - places[1]])
+    ends = torch.stack([places[b] - places[a] for a, b in combinations(range(len(places)), 2)])
     length, widest = ends.norm(dim=-1).max(dim=0)
     along = ends.gather(0, widest[None, ..., None].expand(1, -1, -1, 3))[0] / length[..., None].clamp(min=1e-12)
     problem = torch.arange(len(length), device=length.device)

@@ -57,6 +57,11 @@ class Evidence:
         floor = 100 * torch.finfo(data.dtype).eps / torch.stack(norm.scales).amin(0)
         return Evidence(invariant, flat, norm, norm.apply(invariant, flat.views), floor, options=options)
 
+    @property
+    def still(self) -> int:
+        """Conditions that a static match fulfils."""
+        return sum(p.freedom() for p in self.invariant.primitives[1:])
+
     def repeated(self, count: int) -> Evidence:
         """The same problems several times, one block after the other."""
 
@@ -101,7 +106,7 @@ class Evidence:
         """
         moving, resting = self.residuals(theta)
         variance = sigma.square()[:, None]
-        still, path = three_sigma(resting.shape[-1]), three_sigma(self.invariant.codim)
+        still, path = three_sigma(self.still), three_sigma(self.invariant.codim)
         other = still + (moving.square().sum(-1) / variance).clamp(max=path)
         if self.data.static is not None:
             other = torch.where(self.data.static, still + path, other)
@@ -113,7 +118,7 @@ class Evidence:
         moving, resting = self.residuals(theta)
         variance = sigma.square()[:, None]
         path, still = moving.square().sum(-1), resting.square().sum(-1)
-        limits = [three_sigma(c) * variance for c in (self.invariant.codim, resting.shape[-1])]
+        limits = [three_sigma(c) * variance for c in (self.invariant.codim, self.still)]
         agree = [path <= limits[0], still <= limits[1]]
         if spread is not None:
             pieces = [self._widened(theta, spread, piece) for piece in self._pieces(theta)]

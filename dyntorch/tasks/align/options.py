@@ -29,6 +29,19 @@ class AlignLabelOptions:
 
 
 @dataclass(frozen=True)
+class AlignSeveralOptions:
+    """More than three views: the collineation of each further view from the lines that three views show."""
+
+    samples: int = 256
+    """Samples of matches per view."""
+    sample: int = 10
+    """Matches of a sample; 8 determine a collineation of the plane or of space.  Of 256 samples 99.9 % draw a clean one at 30 %
+    wrong points in that view."""
+    rounds: int = 4
+    """Reweighted fits to all matches after that."""
+
+
+@dataclass(frozen=True)
 class AlignPlanarOptions:
     """A plane in three views."""
 
@@ -198,6 +211,7 @@ class AlignOptions:
     by stage and model."""
 
     labels: AlignLabelOptions = AlignLabelOptions()
+    several: AlignSeveralOptions = AlignSeveralOptions()
     planar: AlignPlanarOptions = AlignPlanarOptions()
     join: AlignJoinOptions = AlignJoinOptions()
     velocity: AlignVelocityOptions = AlignVelocityOptions()

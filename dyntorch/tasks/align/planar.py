@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import combinations
 
 import torch
 from torch import Tensor
@@ -16,12 +17,13 @@ from dyntorch.geometry.homogeneous import cofactors, homogeneous, inhomogeneous
 from dyntorch.invariants.agreement import static_residual
 from dyntorch.invariants.homography_tensor import HomographyTensor
 from dyntorch.numerics.arguments import check_options, check_threshold
-from dyntorch.numerics.blocks import one_thread
-from dyntorch.numerics.chi_square import three_sigma
+from dyntorch.numerics.blocks import one_thread, select
+from dyntorch.numerics.chi_square import median, three_sigma
 from dyntorch.numerics.messages import Message
 from dyntorch.tasks.align.labelling import Evidence, Labelled, joined, static_consensus
 from dyntorch.tasks.align.options import AlignOptions
 from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment, AlignNotice
+from dyntorch.tasks.align.several import motion_of_all, moving_points, still_but_one, three_of
 
 # ----------------------------------------------------------------------------------------------------------------------
 # What should be known about the matches of a plane before its result is trusted.
@@ -38,7 +40,7 @@ def planar_notices(
 ) -> tuple[Notice, ...]:
     """All notices on a flat batch of problems with final labels, in the order of the problems; ``tensor`` from
     :func:`tensor_rank`."""
-    data, sigma = evidence.data, best.sigma
+    data = evidence.data
     rank, strength = tensor
     solved = ~failed(status)
     moving = best.labels == MOVING
@@ -53,7 +55,7 @@ def planar_notices(
     lines = trajectory_lines(evidence, best, moving, options)
     note(AlignNotice.FEW_LINES, lines, solved & (lines > 0) & (lines < LINES), least=LINES)
     note(AlignNotice.ONE_LINE, lines, solved & (lines == 1))
-    thin = thinness(evidence, sigma)
+    thin = thinness(evidence, best.sigma)
     note(AlignNotice.COLLINEAR, thin, (data.weights > 0).any(-1) & (thin < options.planar.thin))
     doubtful = (best.labels == MOVING) & unverified(evidence, best)
     note(AlignNotice.UNVERIFIED, doubtful.sum(-1), solved & doubtful.any(-1))
@@ -61,12 +63,18 @@ def planar_notices(
 
 
 def tensor_rank(inliers: Matches, evidence: Evidence, sigma: Tensor, options: AlignOptions) -> tuple[Tensor, Tensor]:
-    """Numeric rank ``(b,)`` of the estimation matrix, and how far its 26th singular value is above the noise."""
-    values = fit_matches(HomographyTensor(), inliers).singular_values
-    rank = (values > options.planar.rank * values[:, :1]).sum(-1)
+    """Numeric rank ``(b,)`` of the estimation matrix, and how far its 26th singular value is above the noise.
+
+    Of more than three views the three that say most: a motion that some of them determine leaves none of the others open.
+    """
     # a row of unit length changes by about the noise of the normalized coordinates
     noise = sigma * torch.stack(evidence.norm.scales).square().mean(0).sqrt() * inliers.weights.square().sum(-1).sqrt()
-    return rank, values[:, -2] / noise.clamp(min=torch.finfo(values.dtype).tiny)
+    ranks, strengths = [], []
+    for three in three_of(inliers):
+        values = fit_matches(HomographyTensor(), three).singular_values
+        ranks.append((values > options.planar.rank * values[:, :1]).sum(-1))
+        strengths.append(values[:, -2] / noise.clamp(min=torch.finfo(values.dtype).tiny))
+    return torch.stack(ranks).amax(0), torch.stack(strengths).amax(0)
 
 
 def undecided(evidence: Evidence, best: Labelled, tensor: tuple[Tensor, Tensor], options: AlignOptions) -> Tensor:
@@ -84,14 +92,17 @@ def undecided(evidence: Evidence, best: Labelled, tensor: tuple[Tensor, Tensor],
     if evidence.data.static is not None:
         family = family & ((still & evidence.data.static).sum(-1) < NOTICES_MINIMAL)
     square = evidence.residuals(best.theta)[1].square().sum(-1)
-    limit = options.planar.wider**2 * three_sigma(4) * best.sigma.square()[:, None]
+    limit = options.planar.wider**2 * three_sigma(evidence.still) * best.sigma.square()[:, None]
     beside = ((square <= limit) & ~still & (evidence.data.weights > 0)).sum(-1)
     return family & (still.sum(-1) < options.planar.support + options.planar.chance * beside / (options.planar.wider**2 - 1))
 
 
 def unverified(evidence: Evidence, best: Labelled) -> Tensor:
-    """Matches ``(b, n)`` that two views agree on as static, whatever the third says."""
+    """Matches ``(b, n)`` that all views but one agree on as static, whatever that one says."""
     parts = evidence.problem(best.labels).parts(best.theta)
+    if len(evidence.views) > 3:
+        limit = three_sigma(evidence.still - 2) * best.sigma.square()[:, None]
+        return still_but_one(parts, evidence.views, evidence.norm.scales, limit) & (evidence.data.weights > 0)
     first, second, third = evidence.views
     s1, s2, s3 = evidence.norm.scales
     between = cofactors(parts[0]).mT @ parts[1]  # view 3 to view 2
@@ -114,7 +125,7 @@ def trajectory_lines(evidence: Evidence, best: Labelled, moving: Tensor, options
     places = torch.stack(
         [evidence.views[0], *(inhomogeneous(homogeneous(x) @ m.mT) for m, x in zip(parts, evidence.views[1:], strict=True))]
     )
-    ends = torch.stack([places[1] - places[0], places[2] - places[0], places[2] - places[1]])
+    ends = torch.stack([places[b] - places[a] for a, b in combinations(range(len(places)), 2)])
     length, widest = ends.norm(dim=-1).max(dim=0)
     along = ends.gather(0, widest[None, ..., None].expand(1, -1, -1, 2))[0] / length[..., None].clamp(min=1e-12)
     normal = torch.stack([-along[..., 1], along[..., 0]], dim=-1)
@@ -159,6 +170,10 @@ AMBIGUITY = (
     "A and B are unique, each up to its scale. A match that agrees in two views only counts as moving: a point that paused and a "
     "static point mismatched in the third view look the same."
 )
+MORE_VIEWS = (
+    "The collineations are unique, each up to its scale. A match that agrees in all views but one counts as moving: a point that "
+    "paused and a static point mismatched in that view look the same."
+)
 
 
 @one_thread
@@ -166,14 +181,14 @@ def align_planar(
     x1: Tensor,
     x2: Tensor,
     x3: Tensor,
-    *,
+    *more: Tensor,
     threshold: float | None = 1.5,
     weights: Tensor | None = None,
     static: Tensor | None = None,
     generator: torch.Generator | None = None,
     options: AlignOptions = AlignOptions(),
 ) -> Alignment:
-    r"""Motion of a camera from three views of a plane, with a label for every match: static, moving or outlier.
+    r"""Motion of a camera from three or more views of a plane, with a label for every match: static, moving or outlier.
 
     Points of the plane stand still or move on straight lines, at any speed; none has to be known to do either:
 
@@ -184,10 +199,14 @@ def align_planar(
     matches by their disagreement (four conditions each), moving ones by their Sampson distance.  The motion that explains the
     matches better is returned.
 
+    Of more views, three at a time give the start; labels and motion are then those of all: a static match is held to one point, a
+    moving one to one line, by their distances from it in every view.
+
     Args:
         x1: ``(*batch, n, 2)`` points of view 1; NaN = missing.
         x2: the same points in view 2.
         x3: the same points in view 3.
+        *more: the same points in further views.
         threshold: greatest Sampson distance of a moving inlier, in the unit of the points: three standard deviations of the
             noise of one coordinate.  None estimates the noise of every problem (at least half of the matches must be inliers).
         weights: ``(*batch, n)`` not negative; 0 leaves a match out.
@@ -196,13 +215,13 @@ def align_planar(
         options: every number that decides, by stage and model; ``dataclasses.replace`` changes some of them.
 
     Returns:
-        An :class:`~dyntorch.tasks.align.result.Alignment`.
+        An :class:`~dyntorch.tasks.align.result.Alignment`; ``collineations`` holds A, B and those of further views.
 
     Raises:
         ValueError: fewer than 26 matches (9 with ``static``), shapes, dtypes or devices that do not agree, a threshold that is
             not positive.
 
-    Source: thesis chapter 2 and section 8.1; Shashua and Wolf, ECCV 2000.
+    Source: thesis chapter 2 and section 8.1; Shashua and Wolf, ECCV 2000.  More views: thesis section 9.3.
 
     Example:
         >>> import torch, dyntorch as dyn
@@ -217,7 +236,7 @@ def align_planar(
     """
     check_options(options, AlignOptions)
     check_threshold(threshold)
-    data = matches(HomographyTensor(), (x1, x2, x3), weights, static)
+    data = matches(moving_points(2, 3 + len(more)), (x1, x2, x3, *more), weights, static)
     least = MINIMAL if static is None else LABELLED
     if data.count < least:
         remedy = "" if static is not None else ", or label static ones ({arg:static=}; then {labelled} suffice)"
@@ -228,10 +247,10 @@ def align_planar(
 
 
 def _align(data: Matches, threshold: float | None, generator: torch.Generator | None, options: AlignOptions) -> Alignment:
-    evidence = Evidence.of(HomographyTensor(), data, options)
+    evidence = Evidence.of(moving_points(2, len(data.views)), data, options)
     solution, best, tensor = _solved(evidence, _search(evidence, threshold, generator, options), options)
     outcome = solution.back(data)
-    A, B = outcome.motion
+    A, B, *others = outcome.motion
     assert outcome.sigma is not None and outcome.covariance is not None
     return Alignment(
         A=A,
@@ -240,10 +259,11 @@ def _align(data: Matches, threshold: float | None, generator: torch.Generator | 
         status=outcome.status,
         sigma=outcome.sigma,
         covariance=outcome.covariance,
-        ambiguity=AMBIGUITY,
+        ambiguity=MORE_VIEWS if others else AMBIGUITY,
         notices=planar_notices(evidence, best, tensor, solution.status, data.batch, options),
         unverified=data.back(unverified(evidence, best) & (best.labels == MOVING)),
         solution=outcome,
+        others=tuple(others),
     )
 
 
@@ -257,7 +277,7 @@ def _search(evidence: Evidence, threshold: float | None, generator: torch.Genera
     )
     starts = [_from_static(evidence, given, generator, options)]
     if MINIMAL <= evidence.data.count < FEW:
-        starts.append(_from_all(evidence, given, options))
+        starts.append(_from_all(evidence, given, generator, options))
     if size and evidence.data.count >= (MINIMAL if given is not None else FEW):
         starts.append(_from_tensor(evidence, given, generator))
     count = len(starts)
@@ -273,8 +293,8 @@ def _search(evidence: Evidence, threshold: float | None, generator: torch.Genera
 
 
 def _singular(theta: Tensor, options: AlignOptions) -> Tensor:
-    """Whether a motion ``(b, 18)`` maps the plane into a line or a point, which fulfils every match and explains none."""
-    values = torch.linalg.svdvals(theta.nan_to_num().unflatten(-1, (2, 3, 3)))
+    """Whether a motion ``(b, 9 maps)`` takes the plane to a line or a point, which fulfils every match and explains none."""
+    values = torch.linalg.svdvals(theta.nan_to_num().unflatten(-1, (-1, 3, 3)))
     return (values[..., 2] < options.planar.singular * values[..., 0]).any(-1)
 
 
@@ -289,41 +309,55 @@ def _from_static(
         pool = torch.where((known.sum(-1) >= 4)[:, None], known, pool)
     scale = evidence.norm.scales[0]
     # each distance has the noise of two views
-    limit = None if given is None else 2 * three_sigma(4) * (options.labels.rough * scale * given).square()
+    limit = None if given is None else 2 * three_sigma(evidence.still) * (options.labels.rough * scale * given).square()
     motion, variance = static_consensus(evidence.views, pool, limit, options.planar.samples, generator, options)
     theta = torch.cat([part.flatten(1) for part in motion], dim=-1)
+    # static_consensus divides by the median of 4 conditions; more views have more
+    variance = variance * (median(4) / median(evidence.still))
     return theta, variance.nan_to_num(posinf=1.0).sqrt() / scale if given is None else given
 
 
 def _from_tensor(evidence: Evidence, given: Tensor | None, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
     """Motion of the homography tensor by robust estimation, and the noise by the median distance from it."""
     data = evidence.data
-    found = robust_fit(HomographyTensor, *data.views, threshold=given, weights=data.weights, generator=generator)
-    theta, usable = _usable(evidence, found)
+
+    def solve(views: tuple[Tensor, ...]) -> Solution:
+        return robust_fit(HomographyTensor, *views, threshold=given, weights=data.weights, generator=generator)
+
+    motion, found = motion_of_all(evidence, solve, given, generator)
+    theta, usable = _usable(motion, found)
     if given is not None:
         return theta, given
     moving, _ = evidence.residuals(theta)
-    noise = torch.where(data.weights > 0, moving[..., 0].abs(), torch.nan).nanmedian(dim=-1).values / 0.6745
+    codim = evidence.invariant.codim
+    size = moving[..., 0].abs() / 0.6745 if codim == 1 else moving.norm(dim=-1) / median(codim) ** 0.5
+    noise = torch.where(data.weights > 0, size, torch.nan).nanmedian(dim=-1).values
     if found.sigma is not None:
         # what its inliers show is less than the median, where there are many outliers
         noise = torch.where((found.status == Status.OK) & (found.sigma > 0), torch.minimum(found.sigma, noise), noise)
     return theta, torch.where(usable & noise.isfinite(), noise, torch.inf)
 
 
-def _from_all(evidence: Evidence, given: Tensor | None, options: AlignOptions) -> tuple[Tensor, Tensor]:
+def _from_all(
+    evidence: Evidence, given: Tensor | None, generator: torch.Generator | None, options: AlignOptions
+) -> tuple[Tensor, Tensor]:
     """Motion as if all matches were moving inliers, and the noise that they then show."""
     data = evidence.data
-    theta, usable = _usable(evidence, fit_matches(HomographyTensor(), replace(data, static=None)))
+
+    def solve(views: tuple[Tensor, ...]) -> Solution:
+        return fit_matches(HomographyTensor(), replace(data, views=views, static=None))
+
+    theta, usable = _usable(*motion_of_all(evidence, solve, given, generator))
     refined = evidence.refined(theta, torch.where(data.weights > 0, MOVING, OUTLIER), options.planar.steps)
     assert refined.sigma is not None
     return joined(refined), torch.where(usable, refined.sigma, torch.inf) if given is None else given
 
 
-def _usable(evidence: Evidence, found: Solution) -> tuple[Tensor, Tensor]:
-    """The motion of a solution, the identity where it failed, and where it did not."""
-    theta = evidence.parameters(tuple(part.reshape(-1, 3, 3) for part in found.motion))
+def _usable(motion: tuple[Tensor, ...], found: Solution) -> tuple[Tensor, Tensor]:
+    """The normalized motion, the identity where it failed, and where it did not."""
+    theta = torch.cat([part.flatten(1) for part in motion], dim=-1)
     usable = theta.isfinite().all(-1) & ~failed(found.status)
-    identity = torch.eye(3, dtype=theta.dtype, device=theta.device).flatten().repeat(2)
+    identity = torch.eye(3, dtype=theta.dtype, device=theta.device).flatten().repeat(len(motion))
     return torch.where(usable[:, None], theta, identity), usable
 
 
@@ -345,8 +379,8 @@ def _solved(evidence: Evidence, best: Labelled, options: AlignOptions) -> tuple[
     solution = replace(
         refined,
         status=status,
-        tensor=torch.where(zero[..., None], 0.0, refined.tensor),
-        normalized=torch.where(zero[..., None], 0.0, refined.normalized),
+        tensor=select(~none, refined.tensor, 0.0),
+        normalized=select(~none, refined.normalized, 0.0),
         covariance=torch.where(zero, 0.0, refined.covariance),
         sigma=torch.where(none, 0.0, refined.sigma),
         uncertainty=torch.where(none, 0.0, worst),
@@ -365,7 +399,7 @@ def _status(evidence: Evidence, best: Labelled, shown: Tensor, free: Tensor, und
     accident = (
         (share < options.planar.consensus)
         | ((share < options.planar.doubtful) & (shown > options.planar.uniform * best.sigma))
-        | (4 * still + moving < HomographyTensor.dof + options.planar.spare)
+        | (evidence.still * still + evidence.invariant.codim * moving < evidence.invariant.dof + options.planar.spare)
     )
     accident = accident | (best.sigma * torch.stack(evidence.norm.scales).amax(0) > NOISY)
     status = torch.full_like(present, int(Status.OK))

@@ -51,10 +51,10 @@ class AlignNotice(NoticeCode):
     """All matches of a view lie on one line."""
     UNVERIFIED = (
         "unverified",
-        "{value:# match stands|# matches stand} still between two views only: a point that paused, or a static one mismatched in "
-        "one view",
+        "{value:# match stands|# matches stand} still in all views but one: a point that paused, or a static one mismatched in "
+        "that view",
     )
-    """Matches that stand still between two views only: points that paused, or static points mismatched in one view."""
+    """Matches that stand still in all views but one: points that paused, or static points mismatched in that view."""
     PLANAR_VELOCITIES = "planar_velocities", f"{_RANK}in a plane{_TURN}"
     """The velocities lie in a plane."""
     LINEAR_VELOCITIES = "linear_velocities", f"{_RANK}along a line{_TURN}"
@@ -104,13 +104,14 @@ class Alignment(Outcome):
         A: ``(*batch, d + 1, d + 1)`` motion of the sensor, view 2 to view 1, :math:`p_1 \\sim A\\,p_2` for static points;
             Frobenius norm 1; zero where the status says that there is none, the best one found for ``NO_CONSENSUS``.
         B: the same for view 3; None with two views.
+        collineations: ``(*batch, views - 1, d + 1, d + 1)``: A, B, and the same for every further view.
         labels: ``(*batch, n)`` 0 outlier, 1 static, 2 moving; all 0 where the status is neither OK nor AMBIGUOUS.
         sigma: ``(*batch,)`` noise of one coordinate that the inliers show, in the unit of the matches; 0 where there are none.
-        covariance: ``(*batch, p, p)`` of the entries of A, then those of B, row by row.
+        covariance: ``(*batch, p, p)`` of the entries of A, then those of B (and of further views), row by row.
         ambiguity: a sentence: what the data cannot tell, even without noise.
         velocities: ``(*batch, n, d)``, where the model has them.
-        unverified: ``(*batch, n)`` matches that stand still between two of three views: moving by geometry, but a static point
-            mismatched in one view looks the same.
+        unverified: ``(*batch, n)`` matches that stand still in all views but one: moving by geometry, but a static point mismatched
+            in one view looks the same.
         solution: the fitted invariant behind it.
     """
 
@@ -123,6 +124,13 @@ class Alignment(Outcome):
     velocities: Tensor | None = None
     unverified: Tensor | None = None
     solution: Solution | None = field(default=None, repr=False)
+    others: tuple[Tensor, ...] = field(default=(), repr=False)
+    """Of the views after the third."""
+
+    @property
+    def collineations(self) -> Tensor:
+        """The motion of every view after the first."""
+        return torch.stack([part for part in (self.A, self.B, *self.others) if part is not None], dim=-3)
 
     def __post_init__(self) -> None:
         """Where the matches do not agree, no label, velocity or noise says otherwise."""

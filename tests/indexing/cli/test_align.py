@@ -202,6 +202,18 @@ def test_data_that_cannot_decide_are_refused_with_code_3(run, tmp_path):
     assert sorted(path.name for path in Path("out").iterdir()) == sorted(FILES)
 
 
+def test_more_than_three_views_of_a_plane(run, tmp_path):
+    scene = scenes.planar(50, sigma=0.5, static=0.4, views=5, generator=torch.Generator().manual_seed(3))
+    for name, view in zip("abcde", scene.views, strict=True):
+        table(tmp_path / f"{name}.csv", view.numpy())
+    code, out, _ = run("a.csv b.csv c.csv d.csv e.csv --threshold 1.5 --out out")
+    found = read()
+    assert code == 0 and "D: view 5 to view 1" in out and found["status"] == "OK"
+    assert np.shape(found["D"]) == (3, 3) and np.shape(found["covariance"]) == (36, 36) and len(found["views"]) == 5
+    page = Path("out/report.html").read_text()
+    assert all(f"{name}, row 1" in page for name in "ABCD")
+
+
 def test_noise_alone_is_refused(run, tmp_path):
     rng = np.random.default_rng(0)
     for name in "abc":

@@ -116,7 +116,7 @@ def test_table_of_all(run):
     assert rows["constant_velocity_planes_3d"] == ["81", "80", "1", "20", "moving"]
     assert max(map(len, out.splitlines())) <= 132
     listed = json.loads(run("--json")[1])
-    assert {entry["name"] for entry in listed} <= rows.keys() and len(listed) == 25
+    assert {entry["name"] for entry in listed} <= rows.keys() and len(listed) == 26
 
 
 def test_json_has_the_profile(run):
@@ -170,3 +170,36 @@ def test_nothing_heavy_is_loaded():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1].strip() == "end"
+
+
+def test_how_many_of_a_kind_count_at_most(run):
+    code, out, _ = run("join", "--on-plane", "40", "--static", "30", "--moving", "0")
+    assert code == 0 and "rank 36 of 64, nullity 28, from 36 of 70 matches\n" in out
+    assert "not enough: rank 60 takes 24 more matches (moving)\nat most 20 static, 26 on plane count\n" in out
+    assert json.loads(run("homography", "--on-line", "9", "--json")[1])["at_most"] == {"on_line": 8}
+    code, out, _ = run("--k", "3", "--views", "3", "3", "3", "--r", "2", "--on-plane", "30", "--static", "2")
+    assert code == 0 and ["on", "plane", "30", "26", "28"] in cells(out) and "rank 60 of 64" in out
+    assert "rank 72 of 81, nullity 9" in run("dynamic", "--dim", "2", "--poses", "4", "--within", "2")[1]
+
+
+def test_the_page_of_minimal_conditions_is_right():
+    from experiments.alignment.minimal_conditions import rows
+    from experiments.common.results import RESULTS
+
+    page = [
+        [cell.strip() for cell in line.split("|")[1:-1]]
+        for line in (RESULTS / "alignment-minimal_conditions.md").read_text().splitlines()
+    ]
+    for name in (
+        "homography",
+        "minimal_join",
+        "constant_velocity",
+        "lines",
+        "fundamental",
+        "segmentation",
+        "shape_tensor",
+        "constant_velocity_2d",
+    ):
+        wanted = [list(row) for row in rows(name)]
+        at = page.index(wanted[0])
+        assert page[at : at + len(wanted)] == wanted, name
