@@ -66,7 +66,8 @@ def dynamic(
             f"expected 1 <= within <= dim and poses > within, got within = {within}, dim = {dim}, poses = {poses}: within counts "
             "the points that span the flat of a match, 2 for a line"
         )
-    space = Views(field, dim, (dim,) * poses, ("join",) * poses)
+    join_of_points: list[Measure | int] = ["join"] * poses
+    space = Views(field, dim, (dim,) * poses, join_of_points)
     return [
         Step("labelled static", labelled_static, lambda: space.labelled(space.extensor(1), free=within - 1)),
         Step("static", static, lambda: space.fixed(space.extensor(1))),

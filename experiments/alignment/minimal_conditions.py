@@ -39,7 +39,7 @@ def rows(name: str) -> list[tuple[str, ...]]:
     usual, *_ = counting.options_of(name)
     found = {capacity.option: capacity for capacity in counting.capacities(name)}
     first = found[usual]
-    table = [(name, f"general ({usual})", f"{first.matches}", f"{first.rank} of {first.rank}", "0")]
+    table: list[tuple[str, ...]] = [(name, f"general ({usual})", f"{first.matches}", f"{first.rank} of {first.rank}", "0")]
     for option, word in words.items():
         if option in found and option != usual:
             capacity = found[option]

@@ -264,7 +264,6 @@ Box = tuple[float, float, float, float]  # left, right, low, high
 # apart for colour-blind eyes, too, on both papers; outliers are crosses besides
 COLOURS = {"static": "#2f7fb8", "moving": "#e8741e", "outlier": "#8b949c"}
 MARKS = {"static": "o", "moving": "o", "outlier": "x"}
-PANELS = 3  # views drawn; the paths are those of all
 PATHS = 1500  # paths drawn; more are a blot
 ROOM = 0.06  # around the points, of their extent
 REACH = 0.6  # how far beyond view 1 paths are shown, of its extent
@@ -278,7 +277,8 @@ def picture_of(report: AlignmentReport) -> bytes:
     colours = {**COLOURS, "unlabelled": LIGHT.muted}
     segments = report.segments
     axes_shown, turned = _axes(report)
-    flat = [view[..., axes_shown] for view in report.views[:PANELS]]
+    # three views are drawn; the paths are those of all
+    flat = [view[..., axes_shown] for view in report.views[:3]]
     boxes = [_box(points, kinds) for points in flat]
     if report.solved:
         boxes[0] = _widened(boxes[0], report, kinds, axes_shown)

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
+from functools import lru_cache
 from math import comb
 
 import torch
 from torch import Tensor
 
+from dyntorch import counting
+from dyntorch.counting.exact import IntArray, Views
 from dyntorch.geometry.lift import gauge_algebra, least_views
 from dyntorch.invariants.grassmann_tensor import GrassmannTensor
 
@@ -19,6 +23,10 @@ STENCIL = ((-2, 1 / 12), (-1, -2 / 3), (1, 2 / 3), (2, -1 / 12))
 """Central differences of fourth order, exact for motions that are polynomials of the time."""
 STEP = 1e-2
 """Step of these differences over the mean spacing of the views."""
+COUNTED = 1024
+"""Unknowns of a tensor up to which its matches are counted exactly: 0.1 s for 81, 10 s for 1000."""
+SPARE = 8
+"""Matches beyond those of general projections that are looked at."""
 RANK = 1e-13
 """Relative singular value below which a row of a lift depends on the others."""
 
@@ -155,9 +163,17 @@ class Motion:
         return max(2, enough, least_views(self.centred(times)[0], self.sensor + 1))
 
     def minimal(self, times: Tensor | Sequence[float]) -> tuple[int, int]:
-        """Fewest views, and fewest matches in them."""
+        """Fewest views, and fewest matches in them.
+
+        Of the declared models the matches are those of general projections, which is what exact ranks of each of them say, too.  Of
+        any other lift the ranks are counted, exactly: its views may have centres in special position, and then it takes more.
+        """
         views = self.views(times)
-        return views, self.tensor(min(views, self.k + 1)).minimal()
+        tensor = self.tensor(min(views, self.k + 1))
+        if self.lift is None or MOTIONS.get(self.name) is self or tensor.width() > COUNTED:
+            return views, tensor.minimal()
+        lifts = self.centred(times)[0][: len(tensor.profile)]
+        return views, _counted(tensor.profile, self.sensor, tuple(tuple(map(tuple, lift)) for lift in lifts.tolist()))
 
     def ambiguity(self, times: Tensor | Sequence[float]) -> int:
         """Dimension of the ambiguity from views at these times; without a lift that of the projections, all collineations."""
@@ -180,6 +196,26 @@ class Motion:
 
     def __repr__(self) -> str:
         return f"Motion({self.name})"
+
+
+@lru_cache(maxsize=64)
+def _counted(profile: tuple[int, ...], sensor: int, lifts: tuple[tuple[tuple[float, ...], ...], ...]) -> int:
+    """Matches that determine the tensor of views at random places with these lifts; what general ones take where none do."""
+    k = len(lifts[0][0]) - 1
+    tensor = GrassmannTensor(k, profile, sensor)
+
+    def points(field: counting.Field) -> Iterator[IntArray]:
+        # a number of the machine is a fraction, and that has a place in every field
+        parts = [[[Fraction(x) for x in row] for row in lift] for lift in lifts]
+        known = [[[f.numerator * pow(f.denominator, -1, field.prime) % field.prime for f in row] for row in lift] for lift in parts]
+        cameras = [field.product(field.random(sensor + 1, len(lift)), lift) for lift in known]
+        views = Views(field, k, (sensor,) * len(profile), profile, cameras)
+        while True:
+            yield views.fixed(field.random(k + 1)[None])
+
+    least = tensor.minimal()
+    found = counting.count(points, matches=least + SPARE)
+    return found.minimal if found.rank == tensor.width() - 1 else least
 
 
 def polynomial(dim: int, directions: int, degree: int = 1) -> Lift:

@@ -321,9 +321,9 @@ def least(motion: Motion, times: Tensor) -> tuple[int, int]:
         >>> least(MOTIONS["two_bodies_2d"], torch.arange(3.0))
         (2, 9)
     """
-    views = motion.views(times)
+    views, matches = motion.minimal(times)
     bodies = (motion.k + 1) * (motion.k + 2) // 2 - 1 if motion.bodies > 1 else 0
-    return views, max(motion.tensor(min(views, motion.k + 1)).minimal(), bodies)
+    return views, max(matches, bodies)
 
 
 def _lacks(motion: Motion, times: Tensor, views: int, n: int) -> str:
