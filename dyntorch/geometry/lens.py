@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import prod
 from typing import Any
 
 import torch
@@ -13,7 +14,7 @@ from dyntorch.geometry.epipolar import TINY, eight_point
 from dyntorch.geometry.epipolar_fit import Frames
 from dyntorch.geometry.homogeneous import homogeneous
 from dyntorch.geometry.options import LensOptions
-from dyntorch.numerics.arguments import check_options, on_cpu
+from dyntorch.numerics.arguments import check_options, check_together, on_cpu
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.numerics.least_squares import Iterate, LeastSquares, LeastSquaresOptions, Minimum, Tensors, damped_step, minimize
 from dyntorch.numerics.messages import Message
@@ -279,19 +280,60 @@ class LensFit:
 
     @property
     def lambda_a(self) -> float:
-        """Of the first camera; negative = barrel."""
-        return self.lenses[0].strength
+        """Of the first camera; negative = barrel.  Of a batch ``(*batch,)``."""
+        return _number(self.lenses[0].strength)
 
     @property
     def lambda_b(self) -> float:
         """Of the second camera."""
-        return self.lenses[1].strength
+        return _number(self.lenses[1].strength)
 
     @property
     def note(self) -> str:
         """What a user should know where the fit is used."""
         text = "lens distortion fitted, lambda = {a:+.3f} and {b:+.3f}: an approximation; give "
         return Message(text + "{arg:calibration=((K, dist), (K, dist))}", a=self.lambda_a, b=self.lambda_b)
+
+
+def _number(value: Any) -> Any:
+    """A number, or those of a batch ``(*batch, 1, 1)`` as ``(*batch,)``."""
+    return value[..., 0, 0] if isinstance(value, Tensor) else value
+
+
+def _fit_batch(
+    a: Tensor, b: Tensor, weights: Tensor | None, sizes: Sequence[Sequence[float] | None] | None, options: LensOptions
+) -> LensFit:
+    """All pairs of cameras one after the other: their descents share nothing."""
+    batch = check_together(a=(a, 2), b=(b, 2))
+    if not prod(batch) or a.shape[-2:] != b.shape[-2:] or a.shape[-1] != 2:
+        raise ValueError(f"matches must be (*batch, N, 2) in both cameras, got {tuple(a.shape)} and {tuple(b.shape)}")
+    if weights is not None and weights.shape[-1:] != a.shape[-2:-1]:
+        raise ValueError(f"weights must be (*batch, {a.shape[-2]}), one per match, got {tuple(weights.shape)}")
+    x, y = (part.expand(*batch, *part.shape[-2:]).flatten(0, -3) for part in (a, b))
+    w = torch.ones_like(x[..., 0]) if weights is None else weights.expand(*batch, a.shape[-2]).flatten(0, -2)
+    seen = (x.isfinite() & y.isfinite()).all(-1) & (w > 0)
+    if not bool(seen.any()):
+        raise ValueError("no point is seen in any problem: the picture's size cannot be guessed; give matches")
+    # where a pair shows nothing its lenses change nothing
+    none = Division(0.0, x.new_zeros(2, dtype=torch.float64), 1.0)
+    bare = LensFit((none, none), (torch.inf, torch.inf), 0.0, False)
+    found = [
+        fit_distortion(p, q, v, sizes, options=options) if bool(some.any()) else bare
+        for p, q, v, some in zip(x, y, w, seen, strict=True)
+    ]
+
+    def numbers(values: Sequence[Any]) -> Any:
+        return torch.tensor(values, dtype=torch.bool if isinstance(values[0], bool) else torch.float64, device=a.device).reshape(
+            batch
+        )
+
+    lenses = []
+    for pair in zip(*(one.lenses for one in found), strict=True):
+        strength, radius = (numbers([getattr(lens, name) for lens in pair])[..., None, None] for name in ("strength", "radius"))
+        lenses.append(Division(strength, torch.stack([lens.centre for lens in pair]).reshape(*batch, 1, 2), radius))
+    sigmas = [numbers(part) for part in zip(*(one.sigmas for one in found), strict=True)]
+    gain, significant = numbers([one.gain for one in found]), numbers([one.significant for one in found])
+    return LensFit((lenses[0], lenses[1]), (sigmas[0], sigmas[1]), gain, significant)
 
 
 @one_thread
@@ -315,13 +357,15 @@ def fit_distortion(
     A search: it computes on the CPU wherever its tensors are, and the result returns to their device.
 
     Args:
-        a, b: ``(N, 2)`` px, matches in the order of time; NaN = none.
-        weights: ``(N,)``, 0 = ignore.
+        a, b: ``(*batch, N, 2)`` px, matches in the order of time; NaN = none.
+        weights: ``(*batch, N)``, 0 = ignore.
         sizes: (width, height) of the pictures; without, the boxes of the points stand in for them.
         options: every number that decides; ``dataclasses.replace`` changes some of them.
 
     Returns:
-        Lenses that straighten the two cameras' points; lambda = 0 and not significant where there are too few matches.
+        Lenses that straighten the two cameras' points; lambda = 0 and not significant where there are too few matches.  Of a batch
+        all numbers are tensors ``(*batch,)``, each pair of cameras is fitted by itself, and the lenses straighten points ``(*batch,
+        n, 2)``.
 
     Raises:
         ValueError: other shapes, or no match at all.
@@ -340,6 +384,8 @@ def fit_distortion(
         (-0.2, -0.2, True)
     """
     check_options(options, LensOptions)
+    if a.ndim > 2 or b.ndim > 2:
+        return _fit_batch(a, b, weights, sizes, options)
     if a.ndim != 2 or a.shape[-1] != 2 or a.shape != b.shape:
         raise ValueError(f"matches must be (N, 2) in both cameras, got {tuple(a.shape)} and {tuple(b.shape)}")
     weights = torch.ones(len(a)) if weights is None else weights

@@ -61,12 +61,12 @@ def canonical_correlation(first: Tensor, second: Tensor, *, shared: int = 1) -> 
     .. math:: s_{1,2}^2 = \tfrac12 \left(\|C\|^2 \pm \sqrt{\|C\|^4 - 4 \det(C)^2}\right).
 
     Args:
-        first: ``(m, rows, 2)`` orthonormal bases.
-        second: ``(k, rows, 2)`` orthonormal bases.
+        first: ``(*batch, m, rows, 2)`` orthonormal bases.
+        second: ``(*batch, k, rows, 2)`` orthonormal bases; batches broadcast.
         shared: 1 for :math:`s_1`; 2 for :math:`\sqrt{(s_1^2 + s_2^2) / 2}`, which asks the planes to coincide.
 
     Returns:
-        ``(m, k)`` in [0, 1]; the product is one GEMM.  What is not finite counts as 0.
+        ``(*batch, m, k)`` in [0, 1]; the product is one GEMM, batched.  What is not finite counts as 0.
 
     Raises:
         ValueError: bases that are not planes, of different lengths, or another ``shared``.
@@ -82,13 +82,14 @@ def canonical_correlation(first: Tensor, second: Tensor, *, shared: int = 1) -> 
     """
     check_tensor("first", first)
     check_tensor("second", second)
-    if first.ndim != 3 or second.ndim != 3 or first.shape[-1] != 2 or second.shape[-1] != 2 or first.shape[1] != second.shape[1]:
-        raise ValueError(f"expected bases (m, rows, 2) and (k, rows, 2), got {tuple(first.shape)} and {tuple(second.shape)}")
+    flat = first.ndim < 3 or second.ndim < 3
+    if flat or first.shape[-1] != 2 or second.shape[-1] != 2 or first.shape[-2] != second.shape[-2]:
+        shapes = f"{tuple(first.shape)} and {tuple(second.shape)}"
+        raise ValueError(f"expected bases (*batch, m, rows, 2) and (*batch, k, rows, 2), got {shapes}")
     check_together(first=(first, 3), second=(second, 3))
     # planes of coordinates, so that the four entries of every product are contiguous (m, k) matrices
-    left, right = (
-        torch.nan_to_num(basis).clamp(-1.0, 1.0).permute(order) for basis, order in ((first, (2, 0, 1)), (second, (2, 1, 0)))
-    )
+    left, right = (torch.nan_to_num(basis).clamp(-1.0, 1.0).movedim(-1, 0) for basis in (first, second))
+    right = right.mT
     c00, c01, c10, c11 = (left[i] @ right[j] for i in (0, 1) for j in (0, 1))
     norm = c00.square().addcmul_(c01, c01).addcmul_(c10, c10).addcmul_(c11, c11)
     if shared == 2:

@@ -7,16 +7,18 @@ from collections.abc import Sequence
 from dataclasses import fields, replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from dyntorch.core.normalize import hartley
 from dyntorch.core.outcome import Notice, Status, failed
+from dyntorch.core.problems import of_problem, one_by_one, without_filling
 from dyntorch.core.residual import sampson
 from dyntorch.core.robust import robust_fit
 from dyntorch.geometry.triangulation import triangulate
 from dyntorch.invariants.fundamental_matrix import FundamentalMatrix
-from dyntorch.numerics.arguments import check_options, check_threshold, on_cpu
+from dyntorch.numerics.arguments import check_options, check_threshold, check_together, on_cpu
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.tasks.pair.affine import Transfer, filled, solve
 from dyntorch.tasks.pair.options import PairOptions
@@ -144,7 +146,8 @@ def reconstruct_pair(
 
     Args:
         a: ``(frames_a, n, 2)`` pixels, NaN = missing.
-        b: ``(frames_b, m, 2)`` pixels; m = n where points correspond.
+        b: ``(frames_b, m, 2)`` pixels; m = n where points correspond.  Both may have batch dimensions in front, ``shift`` and
+            ``times`` too: takes of different lengths end in frames of NaN; each problem is searched by itself.
         shift: b's clock against a's, of :func:`dyntorch.synchronize`; or its offset in seconds (then with ``fps`` or ``times``).
         correspondence: whether point i of a is point i of b.
         fps: frames per second, one number or (of a, of b); default: those of the shift.
@@ -176,6 +179,11 @@ def reconstruct_pair(
         >>> found.points.shape, bool(found.status == 0), int(found.labels.sum())
         (torch.Size([77, 22, 3]), True, 22)
     """
+    if isinstance(a, Tensor) and isinstance(b, Tensor) and max(a.ndim, b.ndim) > 3:
+        return _batch(
+            a, b, shift, times, correspondence, camera, fps=fps, explained=explained, threshold=threshold, generator=generator,
+            options=options,
+        )  # fmt: skip
     _check(a, b, correspondence, explained, camera)
     check_threshold(threshold)
     check_options(options, PairOptions)
@@ -192,12 +200,44 @@ def reconstruct_pair(
             found = body_pair(seen, threshold, explained, options)
         else:
             found = _affine(seen, explained, options)
+    return _in(found, a.dtype)
+
+
+def _in(found: PairReconstruction, dtype: torch.dtype) -> PairReconstruction:
+    """In the precision of the tracks; times keep theirs."""
     changed = {
-        f.name: getattr(found, f.name).to(dtype=a.dtype)
+        f.name: getattr(found, f.name).to(dtype=dtype)
         for f in fields(found)
         if isinstance(getattr(found, f.name), Tensor) and getattr(found, f.name).is_floating_point() and f.name != "times"
     }
     return replace(found, **changed)
+
+
+def _batch(
+    a: Tensor, b: Tensor, shift: Any, times: Sequence[Any] | None, correspondence: bool, camera: str, **more: Any
+) -> PairReconstruction:
+    """All problems one after the other: a search shares nothing between takes."""
+    batch = check_together(a=(a, 3), b=(b, 3))
+
+    def solve(place: int) -> PairReconstruction:
+        takes = [without_filling(of_problem(x, place, batch, 3)) for x in (a, b)]
+        own = of_problem(shift, place, batch, 0)
+        if isinstance(shift, Shift) and shift.status.ndim:
+            own = shift.problem(*(int(i) for i in np.unravel_index(place, tuple(batch))))
+        clocks = None
+        if times is not None:
+            clocks = [of_problem(x, place, batch, 1)[: len(take)] for x, take in zip(times, takes, strict=True)]
+        own = float(own) if isinstance(own, Tensor) else own
+        return reconstruct_pair(*takes, own, correspondence, times=clocks, camera=camera, **more)
+
+    def spare(said: str) -> PairReconstruction:
+        width = 4 if correspondence or camera == "projective" else 3
+        n, m = a.shape[-2], b.shape[-2]
+        none = torch.zeros(0, dtype=torch.float64, device=a.device)
+        notice = Notice(PairNotice.UNUSABLE, 0.0, {"said": said})
+        return _in(failure((n, m), none, Status.TOO_FEW, notice, width, n if correspondence else n + m), a.dtype)
+
+    return one_by_one(batch, solve, spare)
 
 
 CAMERAS = ("auto", "affine", "projective")

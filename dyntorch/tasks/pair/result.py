@@ -71,6 +71,8 @@ class PairNotice(NoticeCode):
         Status.NO_CONSENSUS,
     )
     """The motions before the two cameras are not one."""
+    UNUSABLE = "unusable", "{said}", Status.TOO_FEW
+    """A problem of a batch that would be refused as misuse by itself."""
     FREE_PLACES = (
         "free_places",
         "the mean places of the {a} and {b} points do not follow from their motions (residual {value:.2g} px without them): "
@@ -83,6 +85,8 @@ class PairNotice(NoticeCode):
 @dataclass(frozen=True, eq=False, repr=False)
 class PairReconstruction(Outcome):
     """Result of :func:`dyntorch.reconstruct_pair`.
+
+    Of a batch every attribute has the batch in front, filled up with NaN (whole numbers: -1) where problems have fewer frames.
 
     Attributes:
         cameras: ``(2, 3, 4)``, of a and of b; the last row is (0, 0, 0, 1) where they are affine.  Zero where the status says that
@@ -120,7 +124,7 @@ class PairReconstruction(Outcome):
     TASK = "reconstruct_pair"
 
     def images(self) -> Tensor:
-        """Where both cameras see all points, ``(2, frames, N, 2)`` pixels: the tracks of one camera transferred to the other.
+        """Where both cameras see all points, ``(*batch, 2, frames, N, 2)`` pixels: one camera's tracks transferred to the other.
 
         Example:
             >>> import torch
@@ -134,10 +138,12 @@ class PairReconstruction(Outcome):
         """
         homogeneous = self.points.shape[-1] == 4
         points = self.points if homogeneous else torch.cat([self.points, torch.ones_like(self.points[..., :1])], dim=-1)
-        seen = reproject(self.cameras, points.nan_to_num().flatten(0, 1)).unflatten(1, points.shape[:2])
-        return torch.where(self.points.isnan().any(-1)[None, ..., None], torch.nan, seen)
+        seen = reproject(self.cameras, points.nan_to_num().flatten(-3, -2)).unflatten(-2, points.shape[-3:-1])
+        return torch.where(self.points.isnan().any(-1)[..., None, :, :, None], torch.nan, seen)
 
     def __repr__(self) -> str:
+        if self.status.ndim:
+            return "\n".join([self.head(), *self.warned()])
         kind = "projective" if self.points.shape[-1] == 4 else "affine"
         frames, count = self.points.shape[:2]
         found, matched = int((self.labels > 0).sum()), int((self.matches >= 0).sum())

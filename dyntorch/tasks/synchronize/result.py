@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -119,6 +119,8 @@ class ShiftNotice(NoticeCode):
         Status.NO_CONSENSUS,
     )
     """Two bodies that move in different ways."""
+    UNUSABLE = "unusable", "{said}", Status.TOO_FEW
+    """A problem of a batch that would be refused as misuse by itself."""
     AFFINE = "affine", "affine cameras: the points do not hold enough depth, or are too noisy, for perspective ones"
     """What was fitted are affine cameras."""
     LENS = (
@@ -137,8 +139,9 @@ class ClockOutcome(Outcome):
 
     @property
     def ok(self) -> bool:
-        """Whether the data decide."""
-        return int(self.status) == Status.OK
+        """Whether the data decide; of a batch a bool tensor ``(*batch,)``."""
+        decided: Any = self.status == Status.OK
+        return decided if self.status.ndim else bool(decided)
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -151,6 +154,8 @@ class ClockOutcome(Outcome):
         Raises:
             ValueError: the reason.
         """
+        if self.status.ndim:
+            return super().check()
         if not self.ok:
             raise ValueError(f"{self.task}: {self.reason}")
         return self
@@ -167,6 +172,9 @@ class Shift(ClockOutcome):
     A moment that camera a shows at time :math:`t_a` is shown by camera b at
 
     .. math:: t_b = \\text{rate}\\; t_a + \\text{offset}.
+
+    Of a batch every attribute has the batch in front, numbers are tensors ``(*batch,)``, filled up with NaN where problems have
+    fewer frames, lags or peaks; :meth:`problem` is the result of one.
 
     Attributes:
         offset: seconds; always the best candidate, whether or not ``ok``.
@@ -212,8 +220,24 @@ class Shift(ClockOutcome):
         return self.offset * self.fps[1]
 
     def at(self, times: Tensor | float) -> Tensor:
-        """Times of b's clock, of the moments at ``times`` of a's clock."""
-        return torch.as_tensor(times, dtype=torch.float64) * self.rate + self.offset
+        """Times of b's clock, of the moments at ``times`` of a's clock; of a batch ``(*batch, ...)``."""
+        t = torch.as_tensor(times, dtype=torch.float64)
+        if isinstance(self.offset, Tensor):
+            wide = (..., *([None] * t.ndim))
+            return t * torch.as_tensor(self.rate)[wide] + self.offset[wide]
+        return t * self.rate + self.offset
+
+    def problem(self, *place: int) -> Shift:
+        """The clocks of one problem of a batch, with what was filled up."""
+        flat = {one.name: getattr(self, one.name) for one in dataclasses.fields(self)}
+        parts = {name: value[place] if isinstance(value, Tensor) else value for name, value in flat.items()}
+        numbers = ("offset", "sigma", "rate", "rate_sigma", "confidence", "center")
+        parts |= {name: float(parts[name]) for name in numbers}
+        parts["fps"] = tuple(float(one[place]) if isinstance(one, Tensor) else one for one in self.fps)
+        if isinstance(self.method, tuple):
+            parts["method"] = self.method[int(torch.arange(self.status.numel()).reshape(self.status.shape)[place])]
+        parts["notices"] = tuple(dataclasses.replace(one, problem=()) for one in self.notices if one.problem == tuple(place))
+        return Shift(**parts)
 
     def inverse(self, times: Tensor | float) -> Tensor:
         """Times of a's clock, of the moments at ``times`` of b's clock."""
@@ -224,6 +248,8 @@ class Shift(ClockOutcome):
         return dataclasses.replace(self, offset=self.offset + (1 - self.rate) * origin, center=self.center + origin)
 
     def __repr__(self) -> str:
+        if self.status.ndim:
+            return "\n".join([self.head(), *self.warned()])
         drift = f", rate {1e6 * (self.rate - 1):+.0f} ± {1e6 * self.rate_sigma:.0f} ppm" if self.rate != 1 else ""
         state = "ok" if self.ok else f"refused: {self.reason}"
         lines = [f"Shift({self.offset:+.4f} ± {self.sigma:.4f} s = {self.frames:+.2f} frames{drift}, {self.method}, {state})"]

@@ -17,6 +17,7 @@ from dyntorch.geometry.lens import fit_distortion, undistorted
 from dyntorch.numerics.arguments import check_options, on_cpu
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.numerics.messages import Message
+from dyntorch.tasks.synchronize.batches import synchronize_batch
 from dyntorch.tasks.synchronize.different import different_points
 from dyntorch.tasks.synchronize.epipolar import Curve, EpipolarFit, Samples, ShiftDescent, epipolar_curve
 from dyntorch.tasks.synchronize.evidence import Attempt, consistent_points
@@ -313,7 +314,8 @@ def synchronize(
 
     Args:
         a: ``(frames_a, n, 2)`` px, y down; NaN = missing.  Point k of a is point k of b.
-        b: ``(frames_b, n, 2)``; without correspondence ``(frames_b, m, 2)``.
+        b: ``(frames_b, n, 2)``; without correspondence ``(frames_b, m, 2)``.  Both may have batch dimensions in front, ``times``
+            and ``weights`` too: takes of different lengths end in frames of NaN; each problem is searched by itself.
         correspondence: whether points correspond.
         fps: frames per second of both, or of each; frame 0 is at 0 s.
         times: instead, ``(frames,)`` seconds of each frame, increasing, for variable frame rates and dropped frames.
@@ -330,7 +332,8 @@ def synchronize(
         options: every number that decides, by stage; ``dataclasses.replace`` changes some of them.
 
     Returns:
-        offset, sigma, rate, confidence, all peaks, and whether it is ok.
+        offset, sigma, rate, confidence, all peaks, and whether it is ok; of a batch tensors ``(*batch, ...)``, and a problem that
+            cannot be used is refused alone.
 
     Raises:
         ValueError: input of the wrong shape, fewer than 12 frames, a take that is nearly all gap, or settings that make no sense.
@@ -352,6 +355,11 @@ def synchronize(
         >>> round(shift.offset, 3), shift.ok
         (0.42, True)
     """
+    if isinstance(a, Tensor) and isinstance(b, Tensor) and max(a.ndim, b.ndim) > 3:
+        return synchronize_batch(
+            synchronize, a, b, times=times, weights=weights, correspondence=correspondence, fps=fps, max_shift=max_shift,
+            calibration=calibration, rate=rate, camera=camera, generator=generator, options=options,
+        )  # fmt: skip
     check_options(options, SynchronizeOptions)
     _check(correspondence, fps, times, weights, max_shift, rate, camera)
     pair: tuple[float | None, float | None] = (None, None)

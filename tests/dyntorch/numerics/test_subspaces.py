@@ -161,12 +161,11 @@ def test_a_nan_basis_stays_in_its_own_row():
         ((2, 8, 2), (2, 9, 2)),
         ((8, 2), (2, 8, 2)),
         ((2, 8, 2), (8, 2)),
-        ((3, 2, 8, 2), (3, 2, 8, 2)),
         ((2,), (2,)),
     ],
 )
 def test_wrong_shapes_are_refused(first, second):
-    with pytest.raises(ValueError, match=r"\(m, rows, 2\)"):
+    with pytest.raises(ValueError, match=r"m, rows, 2\)"):
         canonical_correlation(torch.zeros(first), torch.zeros(second))
 
 
