@@ -80,7 +80,7 @@ def stacked(found: Sequence[Result], batch: Sequence[int]) -> Result:
     if plain and all(one == first for one in found):
         return first
     if tuples:
-        return tuple(stacked(part, batch) for part in zip(*found, strict=True))  # type: ignore[return-value, call-overload]
+        return tuple(stacked(part, batch) for part in zip(*found, strict=True))  # type: ignore[return-value]
     return tuple(found)  # type: ignore[return-value]
 
 
@@ -90,7 +90,7 @@ def _filled(tensors: Sequence[Tensor], batch: Sequence[int]) -> Tensor:
     blank = float("nan") if like.is_floating_point() else 0 if like.dtype == torch.bool else -1
     whole = like.new_full((len(tensors), *shape), blank)
     for place, x in enumerate(tensors):
-        whole[(place, *(slice(size) for size in x.shape))] = x
+        whole[place][tuple([slice(size) for size in x.shape])] = x
     return whole.reshape(*batch, *shape)
 
 

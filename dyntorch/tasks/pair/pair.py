@@ -220,15 +220,15 @@ def _batch(
     batch = check_together(a=(a, 3), b=(b, 3))
 
     def solve(place: int) -> PairReconstruction:
-        takes = [without_filling(of_problem(x, place, batch, 3)) for x in (a, b)]
+        first, second = (without_filling(of_problem(x, place, batch, 3)) for x in (a, b))
         own = of_problem(shift, place, batch, 0)
         if isinstance(shift, Shift) and shift.status.ndim:
             own = shift.problem(*(int(i) for i in np.unravel_index(place, tuple(batch))))
         clocks = None
         if times is not None:
-            clocks = [of_problem(x, place, batch, 1)[: len(take)] for x, take in zip(times, takes, strict=True)]
+            clocks = [of_problem(x, place, batch, 1)[: len(take)] for x, take in zip(times, (first, second), strict=True)]
         own = float(own) if isinstance(own, Tensor) else own
-        return reconstruct_pair(*takes, own, correspondence, times=clocks, camera=camera, **more)
+        return reconstruct_pair(first, second, own, correspondence, times=clocks, camera=camera, **more)
 
     def spare(said: str) -> PairReconstruction:
         width = 4 if correspondence or camera == "projective" else 3

@@ -222,26 +222,30 @@ class Shift(ClockOutcome):
     def at(self, times: Tensor | float) -> Tensor:
         """Times of b's clock, of the moments at ``times`` of a's clock; of a batch ``(*batch, ...)``."""
         t = torch.as_tensor(times, dtype=torch.float64)
-        if isinstance(self.offset, Tensor):
+        if self.status.ndim:
             wide = (..., *([None] * t.ndim))
-            return t * torch.as_tensor(self.rate)[wide] + self.offset[wide]
+            return t * torch.as_tensor(self.rate)[wide] + torch.as_tensor(self.offset)[wide]
         return t * self.rate + self.offset
 
     def problem(self, *place: int) -> Shift:
         """The clocks of one problem of a batch, with what was filled up."""
-        flat = {one.name: getattr(self, one.name) for one in dataclasses.fields(self)}
-        parts = {name: value[place] if isinstance(value, Tensor) else value for name, value in flat.items()}
+        flat: dict[str, Any] = {one.name: getattr(self, one.name) for one in dataclasses.fields(self)}
+        parts: dict[str, Any] = {name: value[place] if isinstance(value, Tensor) else value for name, value in flat.items()}
         numbers = ("offset", "sigma", "rate", "rate_sigma", "confidence", "center")
         parts |= {name: float(parts[name]) for name in numbers}
-        parts["fps"] = tuple(float(one[place]) if isinstance(one, Tensor) else one for one in self.fps)
-        if isinstance(self.method, tuple):
-            parts["method"] = self.method[int(torch.arange(self.status.numel()).reshape(self.status.shape)[place])]
+        parts["fps"] = tuple(float(one[place]) if isinstance(one, Tensor) else one for one in flat["fps"])
+        if isinstance(flat["method"], tuple):
+            parts["method"] = flat["method"][int(torch.arange(self.status.numel()).reshape(self.status.shape)[place])]
         parts["notices"] = tuple(dataclasses.replace(one, problem=()) for one in self.notices if one.problem == tuple(place))
         return Shift(**parts)
 
     def inverse(self, times: Tensor | float) -> Tensor:
-        """Times of a's clock, of the moments at ``times`` of b's clock."""
-        return (torch.as_tensor(times, dtype=torch.float64) - self.offset) / self.rate
+        """Times of a's clock, of the moments at ``times`` of b's clock; of a batch ``(*batch, ...)``."""
+        t = torch.as_tensor(times, dtype=torch.float64)
+        if self.status.ndim:
+            wide = (..., *([None] * t.ndim))
+            return (t - torch.as_tensor(self.offset)[wide]) / torch.as_tensor(self.rate)[wide]
+        return (t - self.offset) / self.rate
 
     def since(self, origin: float) -> Shift:
         """The same clocks, counted from another moment: both said ``origin`` at what was 0."""

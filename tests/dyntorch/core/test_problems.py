@@ -63,7 +63,9 @@ def test_synchronize_in_batches(takes, correspondence):
         assert (again.offset, again.ok, again.reason, repr(again)[:20]) == (one.offset, one.ok, one.reason, repr(one)[:20])
     assert whole.status.tolist() == [*(int(one.status) for one in alone), int(Status.TOO_FEW)] and not bool(whole.ok[2])
     assert "batch=(3,)" in repr(whole) and {notice.problem for notice in whole.notices if notice.code == "unusable"} == {(2,)}
-    torch.testing.assert_close(whole.at(1.0)[:2], torch.stack([one.at(1.0) for one in alone]))
+    moments = torch.tensor([0.0, 1.0], dtype=D)
+    torch.testing.assert_close(whole.at(moments)[:2], torch.stack([one.at(moments) for one in alone]))
+    torch.testing.assert_close(whole.inverse(moments)[:2], torch.stack([one.inverse(moments) for one in alone]))
     with pytest.raises(ValueError, match="problem 2 of 3"):
         replace(whole, status=whole.status * torch.tensor([0, 0, 1])).check()
 
