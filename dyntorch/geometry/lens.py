@@ -14,7 +14,7 @@ from dyntorch.geometry.epipolar import TINY, eight_point
 from dyntorch.geometry.epipolar_fit import Frames
 from dyntorch.geometry.homogeneous import homogeneous
 from dyntorch.geometry.options import LensOptions
-from dyntorch.numerics.arguments import check_options, check_together, on_cpu
+from dyntorch.numerics.arguments import check_options, check_together, check_weights, on_cpu
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.numerics.least_squares import Iterate, LeastSquares, LeastSquaresOptions, Minimum, Tensors, damped_step, minimize
 from dyntorch.numerics.messages import Message
@@ -368,7 +368,7 @@ def fit_distortion(
         n, 2)``.
 
     Raises:
-        ValueError: other shapes, or no match at all.
+        ValueError: other shapes, negative weights, or no match at all.
 
     Source: Fitzgibbon 2001, Simultaneous linear estimation of multiple view geometry and lens distortion; the Sampson distance
         in measured pixels, as in Barreto and Daniilidis 2005.
@@ -391,6 +391,7 @@ def fit_distortion(
     weights = torch.ones(len(a)) if weights is None else weights
     if weights.shape != a.shape[:1]:
         raise ValueError(f"weights must be ({len(a)},), one per match, got {tuple(weights.shape)}")
+    check_weights(weights, "a match")
     sizes = (None, None) if sizes is None else sizes
     chosen = (a.isfinite().all(-1) & b.isfinite().all(-1) & (weights > 0)).nonzero().flatten()
     ideal = Division.of(a[chosen].double(), sizes[0]), Division.of(b[chosen].double(), sizes[1])

@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from dyntorch.geometry.homogeneous import finite_depth, inhomogeneous
-from dyntorch.numerics.arguments import check_tensor, check_together
+from dyntorch.numerics.arguments import check_tensor, check_together, check_weights
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.numerics.nullspace import gram_null_space
 
@@ -161,7 +161,7 @@ def observed(x: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor]:
         weights: ``(*batch, views, n)``, 0 = missing, or None.
 
     Raises:
-        ValueError: images of fewer than three dimensions, or weights of another shape.
+        ValueError: images of fewer than three dimensions, weights of another shape, or negative ones.
 
     Example:
         >>> import torch
@@ -173,6 +173,7 @@ def observed(x: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor]:
         raise ValueError(f"weights must be a torch.Tensor, got {type(weights).__name__}; use torch.as_tensor(...)")
     if weights is not None and weights.shape != x.shape[:-1]:
         raise ValueError(f"weights must be (*batch, views, n) = {tuple(x.shape[:-1])}, got {tuple(weights.shape)}")
+    check_weights(weights, "an image")
     x = x.double()
     w = torch.ones_like(x[..., 0]) if weights is None else weights.to(x)
     seen = x.isfinite().all(-1) & (w > 0)

@@ -24,6 +24,7 @@ from dyntorch.invariants.constant_velocity_algebra import (
     third_infinity,
     unit_tensor,
 )
+from dyntorch.numerics.arguments import check_weights
 from dyntorch.numerics.least_squares import jacobian
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -302,7 +303,7 @@ class ConstantVelocityTensor(Invariant):
             the maps in the new gauge, of norm 1; unchanged where all weights are 0.
 
         Raises:
-            ValueError: no matches.
+            ValueError: no matches, or negative weights.
 
         Example:
             >>> from dyntorch.scenes import constant_velocity
@@ -314,6 +315,7 @@ class ConstantVelocityTensor(Invariant):
         """
         if x1.shape[-2] == 0:
             raise ValueError("x1 has no matches; the common velocity takes one static match or more")
+        check_weights(weights, "a match")
         velocity = ConstantVelocityTensor.velocities(motion, x1, x2, x3)
         weight = torch.ones_like(velocity[..., 0]) if weights is None else weights.to(velocity)
         total = weight.sum(-1, keepdim=True)

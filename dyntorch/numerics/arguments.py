@@ -71,6 +71,24 @@ def check_threshold(threshold: float | None) -> None:
         raise ValueError(f"threshold must be a positive distance in the unit of the points, got {threshold!r}; None estimates it")
 
 
+def check_weights(weights: Tensor | None, what: str) -> None:
+    """Raise a ``ValueError`` for a negative weight; within ``torch.func`` values are not at hand, and not looked at.
+
+    Args:
+        weights: of any shape, NaN = missing; or None.
+        what: is left out by a weight of 0.
+
+    Example:
+        >>> import torch
+        >>> check_weights(torch.tensor([1.0, -2.0]), "a point")
+        Traceback (most recent call last):
+        ValueError: weights must not be negative, got -2; use 0 to leave a point out
+    """
+    if weights is None or torch._C._functorch.is_functorch_wrapped_tensor(weights) or not bool((weights < 0).any()):
+        return
+    raise ValueError(f"weights must not be negative, got {float(weights[weights < 0].min()):g}; use 0 to leave {what} out")
+
+
 def check_together(**tensors: tuple[Tensor, int]) -> torch.Size:
     """The batch of several tensors: raise a ``ValueError`` unless they have one dtype, one device and batches that agree.
 

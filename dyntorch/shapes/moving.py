@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dyntorch.core.outcome import Outcome, Status, status_of
 from dyntorch.geometry.homogeneous import nonzero_sign
-from dyntorch.numerics.arguments import check_options
+from dyntorch.numerics.arguments import check_options, check_weights
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.numerics.least_squares import LeastSquaresOptions, NormalEquations, minimize
 from dyntorch.numerics.nullspace import eigenvalues, eigh, gram_null_space, null_space, spectrum
@@ -496,8 +496,7 @@ def checked_views(
     known = wide.isfinite().all(-1)
     part = known.double() if share is None else torch.where(known, share.double().expand(*batch, count).reshape(flat, count), 0.0)
     weight = None if weights is None else weights.double().expand(*batch, count, n).reshape(flat, count, n)
-    if weight is not None and bool((weight < 0).any()):
-        raise ValueError(f"weights must not be negative, got {float(weight.min()):g}; use 0 to leave a point out")
+    check_weights(weight, "a point")
     views = centred_views(x.double().reshape(flat, count, n, 2), weight, part)
     wide = torch.where(known[..., None], wide, 0.0)
     # shapes have no size: in the unit of the largest function no product of three leaves the range

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.core.outcome import Outcome, status_of
-from dyntorch.numerics.arguments import check_options
+from dyntorch.numerics.arguments import check_options, check_weights
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.shapes.basis import Trajectory
 from dyntorch.shapes.moving import centred_views, project, shapes_at
@@ -86,7 +86,7 @@ def recover_times(
         :class:`Recovery` in the dtype of x.
 
     Raises:
-        ValueError: shapes that do not agree, or a grid of fewer than 3 times.
+        ValueError: shapes that do not agree, negative weights, or a grid of fewer than 3 times.
 
     Source: thesis chapter 4: one view of enough points determines the time; a grid in the place of resultants.
 
@@ -100,6 +100,7 @@ def recover_times(
         (True, 0.3)
     """
     check_options(options, RecoveryOptions)
+    check_weights(weights, "a point")
     times = tried_times(shapes, basis, x, grid, interval)
     batch = np.broadcast_shapes(shapes.shape[:-3], x.shape[:-3])
     flat = prod(batch)

@@ -19,15 +19,18 @@ from tests.battery.device_verbs import (
     VERBS,
     WAITS,
     Verb,
+    cameras_and_points,
     draw,
     moving_shapes,
     nonrigid,
+    paths,
     planar,
     planes,
     randn,
     shift,
     still_shape,
     tracks,
+    two_hyperplanes,
 )
 from tests.battery.pretend_device import counted, moved, pretend_device
 from tests.thesis.test_minimal_data import bodies
@@ -195,12 +198,46 @@ def test_what_looks_weak_costs_one_wait_more():
     assert traffic.count <= 3, str(traffic)
 
 
-def test_a_negative_weight_is_refused_there():
-    views = moved(scenes.planar(40, generator=torch.Generator().manual_seed(0)).views, pretend_device())
-    weights = torch.ones(40, dtype=torch.float64, device=pretend_device())
-    weights[3] = -1.0
-    with pytest.raises(ValueError, match="negative"):
-        dyn.fit(dyn.HomographyTensor, *views, weights=weights)
+WEIGHED: dict[str, tuple[Callable[[], tuple[Any, ...]], Callable[..., Any], tuple[int, ...]]] = {
+    # inputs, the call with weights, the shape of these
+    "fit": (planar, lambda w, *x: dyn.fit(H, *x, weights=w), (40,)),
+    "robust_fit": (planar, lambda w, *x: dyn.robust_fit(H, *x, weights=w, threshold=1.5), (40,)),
+    "align_planar": (planar, lambda w, *x: dyn.align_planar(*x, weights=w), (40,)),
+    "segment": (planar, lambda w, *x: dyn.segment(*x[:2], weights=w), (40,)),
+    "multibody_matrix": (planar, lambda w, *x: dyn.invariants.multibody_matrix(*x[:2], 2, w), (40,)),
+    "affine_segmentation": (planar, lambda w, *x: dyn.tasks.affine_segmentation(*x[:2], w), (40,)),
+    "fit_distortion": (planar, lambda w, *x: dyn.geometry.fit_distortion(*x[:2], w), (40,)),
+    "fix_gauge": (
+        lambda: (torch.eye(4, dtype=torch.float64), randn(9, 3), randn(9, 3, seed=1), randn(9, 3, seed=2)),
+        lambda w, m, *x: CV.fix_gauge((m, m, m), *x, weights=w),
+        (9,),
+    ),
+    "reconstruct": (lambda: tracks("static_2d", 12, 3), lambda w, x: dyn.reconstruct(x, "static_2d", weights=w), (3, 12)),
+    "projective_factorization": (lambda: (randn(3, 12, 2),), lambda w, x: dyn.tasks.projective_factorization(x, 4, w), (3, 12)),
+    "velocity_factorization": (
+        lambda: (randn(6, 10, 2), torch.arange(6, dtype=torch.float64)),
+        lambda w, x, t: dyn.tasks.velocity_factorization(x, t, 3, w),
+        (6, 10),
+    ),
+    "triangulate_trajectories": (paths, lambda w, p, x: dyn.triangulate_trajectories(p, x, w), (6, 10)),
+    "triangulate": (cameras_and_points, lambda w, p, y, x: dyn.geometry.triangulate(p, x, w), (3, 12)),
+    "resect": (cameras_and_points, lambda w, p, y, x: dyn.geometry.resect(y, x, w), (3, 12)),
+    "bundle_adjust": (cameras_and_points, lambda w, p, y, x: dyn.geometry.bundle_adjust(x, w, p, y), (3, 12)),
+    "structure_covariance": (cameras_and_points, lambda w, p, y, x: dyn.geometry.structure_covariance(p, y, w), (3, 12)),
+    "hyperplane_pair": (lambda: (two_hyperplanes(),), lambda w, y: dyn.geometry.hyperplane_pair(y, w), (12,)),
+    "fit_shapes": (moving_shapes, lambda w, x, rows, s: dyn.shapes.fit_shapes(x, rows, w), (12, 8)),
+    "recover_times": (moving_shapes, lambda w, x, r, s: dyn.shapes.recover_times(s, dyn.Polynomial(1), x, w), (12, 8)),
+}
+
+
+@pytest.mark.parametrize("name", WEIGHED)
+def test_a_negative_weight_is_refused_everywhere(name: str) -> None:
+    inputs, call, shape = WEIGHED[name]
+    weights = torch.ones(shape, dtype=torch.float64)
+    weights.view(-1)[3] = -1.0
+    for home in ("cpu", pretend_device()):
+        with pytest.raises(ValueError, match=r"weights must .*not .*negative"):
+            call(*moved((weights, *inputs()), home))
 
 
 # ---- on_cpu ------------------------------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from dyntorch.core.outcome import Outcome, Status, status_of
 from dyntorch.geometry.homogeneous import homogeneous, similarity
-from dyntorch.numerics.arguments import on_cpu
+from dyntorch.numerics.arguments import check_weights, on_cpu
 from dyntorch.numerics.blocks import map_blocks, one_thread
 from dyntorch.numerics.nullspace import gram_null_space, null_space, spectrum
 
@@ -124,6 +124,7 @@ def _check(tracks: Tensor, rank: int, weights: Tensor | None) -> int:
     views, n, size = tracks.shape[-3:]
     if weights is not None and weights.shape != tracks.shape[:-1]:
         raise ValueError(f"weights must be (*batch, views, n) = {tuple(tracks.shape[:-1])}, got {tuple(weights.shape)}")
+    check_weights(weights, "a point")
     if rank <= size + 1:
         raise ValueError(f"rank must exceed l + 1 = {size + 1}, or one view decides everything; got {rank}")
     # every point has rank - 1 unknowns, and must leave equations for the projections
@@ -348,6 +349,7 @@ def _check_moving(tracks: Tensor, times: Tensor, dim: int, weights: Tensor | Non
     views, n = tracks.shape[-3:-1]
     if weights is not None and weights.shape != tracks.shape[:-1]:
         raise ValueError(f"weights must be (*batch, views, n) = {tuple(tracks.shape[:-1])}, got {tuple(weights.shape)}")
+    check_weights(weights, "a point")
     least = 5 if dim == 3 else 3
     if views < least:
         raise ValueError(f"constant velocity in {dim} dimensions needs at least {least} affine views, got {views}: add views")
