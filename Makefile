@@ -107,6 +107,7 @@ tables: install
 	$(BIN)/python -m experiments.recognition.detection
 	$(BIN)/python -m experiments.recognition.robustness
 	$(BIN)/python -m experiments.recognition.gait
+	$(BIN)/python -m experiments.recognition.near_cameras
 	$(BIN)/python -m experiments.recognition.brightness_indexing
 	$(BIN)/python -m experiments.recognition.gestures
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -61,7 +62,7 @@ def walks() -> list[str]:
     return [take.name for take in takes() if "walk" in take.what]
 
 
-def split(held_out: str, views: int, seed: int, noise: float) -> Split:
+def split(held_out: str, views: int, seed: int, noise: float, camera: Callable[..., Clip] = virtual) -> Split:
     """One walking take asked, the others learned from in so many views each; of other actions the first half is learned."""
     rng = np.random.default_rng([seed, views])
     data = Split([], [])
@@ -77,20 +78,29 @@ def split(held_out: str, views: int, seed: int, noise: float) -> Split:
             cuts = [0, count // 2, count] if label == "walk" and count > LONG else [0, asked[0]]
             for first, last in pairwise(cuts):
                 for _ in range(views):
-                    data.train.append(_filmed(joints, phase, (first, last), label, take.name, rng, noise))
+                    data.train.append(_filmed(joints, phase, (first, last), label, take.name, rng, noise, camera))
         for _ in range(max(1, round(LEAST / max(1, asked[1] - asked[0]))) if asked[1] > asked[0] else 0):
             for first in range(asked[0], asked[1] - PIECE // 3, PIECE):
-                data.test.append(_filmed(joints, phase, (first, min(first + PIECE, asked[1])), label, take.name, rng, noise))
+                data.test.append(
+                    _filmed(joints, phase, (first, min(first + PIECE, asked[1])), label, take.name, rng, noise, camera)
+                )
     return data
 
 
 def _filmed(
-    joints: Array, phase: Array, part: tuple[int, int], label: str, take: str, rng: np.random.Generator, noise: float
+    joints: Array,
+    phase: Array,
+    part: tuple[int, int],
+    label: str,
+    take: str,
+    rng: np.random.Generator,
+    noise: float,
+    camera: Callable[..., Clip],
 ) -> Frames:
     chosen = slice(part[0], part[1], STEP)
     bones = Skeleton("CMU-17", JOINTS)
     solid = Clip(joints[chosen][:, list(SAME)], fps=RECORDED / STEP, skeleton=bones, name=take)
-    image = virtual(solid, rng.uniform(0, 360), rng.uniform(*ELEVATIONS), noise=noise, random_state=rng)
+    image = camera(solid, rng.uniform(0, 360), rng.uniform(*ELEVATIONS), noise=noise, random_state=rng)
     return Frames(image, label, take, phase[chosen])
 
 

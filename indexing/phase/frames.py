@@ -67,7 +67,7 @@ def image_distance(query: Windows, bank: Windows) -> Tensor:
     """``(Q, E)`` 1 - cosine between frames, each about its middle: place and size in the image are free, the viewpoint is not."""
 
     def compare(a: Tensor, b: Tensor, _: Tensor | slice) -> Tensor:
-        return cosine_distance(_centred(a).flatten(1), _centred(b).flatten(1))
+        return cosine_distance(centred(a).flatten(1), centred(b).flatten(1))
 
     return between(query, bank, compare, worst=1.0)
 
@@ -84,8 +84,8 @@ def shape_distance(query: Windows, shapes: Windows) -> Tensor:
     def compare(a: Tensor, b: Tensor, joints: Tensor | slice) -> Tensor:
         if a.shape[2] < LEAST:
             return a.new_ones(len(a), len(b))
-        basis = orthonormal_basis(_centred(b)[:, 0])
-        x = _centred(a)[:, 0]
+        basis = orthonormal_basis(centred(b)[:, 0])
+        x = centred(a)[:, 0]
         x = x / x.flatten(1).norm(dim=1).clamp(min=1e-300)[:, None, None]
         inner = x.mT.flatten(0, 1) @ basis.permute(1, 0, 2).flatten(1)
         return (1 - inner.square().reshape(len(a), 2, len(b), 3).sum((1, 3))).clamp(0, 1)
@@ -93,5 +93,5 @@ def shape_distance(query: Windows, shapes: Windows) -> Tensor:
     return between(query, shapes, compare, worst=1.0)
 
 
-def _centred(x: Tensor) -> Tensor:
+def centred(x: Tensor) -> Tensor:
     return x - x.mean(-2, keepdim=True)

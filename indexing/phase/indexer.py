@@ -116,6 +116,8 @@ class PhaseIndexer(SavedClassifier):
     Args:
         harmonics: of the series of an action that repeats; polynomials have twice the degree.
         course: ``"auto"``: an action repeats where its clips do; ``"periodic"``; ``"once"``: from the start of a clip to its end.
+        camera: ``"affine"``: the shape of a frame as cameras from afar see it; ``"projective"``: from near by (2 or 3 m), where the
+            nearer joints are larger, and no worse from afar.
         reject: ``None``: closed set.  A number between 0 and 1: the rate at which a second of an unknown action may be taken for a
             known one, calibrated by leaving each class out (three classes at least).  Any other number: the least
             :meth:`evidence` that is accepted.
@@ -147,6 +149,7 @@ class PhaseIndexer(SavedClassifier):
     FITTED = "model_"
     RULES = {
         "course": one_of("auto", "periodic", "once"),
+        "camera": one_of("affine", "projective"),
         "mirror": one_of("auto", True, False),
         "harmonics": Rule(lambda value: is_whole(value) and 1 <= value <= 12, "a whole number from 1 to 12"),
         "fps": POSITIVE,
@@ -160,6 +163,7 @@ class PhaseIndexer(SavedClassifier):
         harmonics: int = 4,
         *,
         course: str = "auto",
+        camera: str = "affine",
         reject: float | None = None,
         none_label: Any = -1,
         fps: float = 30.0,
@@ -170,6 +174,7 @@ class PhaseIndexer(SavedClassifier):
     ) -> None:
         self.harmonics = harmonics
         self.course = course
+        self.camera = camera
         self.reject = reject
         self.none_label = none_label
         self.fps = fps
@@ -222,6 +227,7 @@ class PhaseIndexer(SavedClassifier):
             course=self.course,
             mirror=self.mirror,
             device=self.device,
+            camera=self.camera,
             swap=lambda windows, seen: mirror_permutation(skeleton, windows, seen),
             options=self._options,
         )

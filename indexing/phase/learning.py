@@ -179,6 +179,7 @@ def learn_model(
     mirror: str | bool,
     swap: Swap,
     device: torch.device | str = "cpu",
+    camera: str = "affine",
     options: PhaseOptions = PhaseOptions(),
 ) -> tuple[PhaseModel, list[bool]]:
     """The model, on the CPU, and which classes are their own mirror image half a cycle later.
@@ -211,7 +212,7 @@ def learn_model(
         banks += [_card(part[0].frames, width) for width in options.learning.cards]
         kept += [part[1]] * len(options.learning.cards)
         labels.append(torch.full((len(options.learning.cards) * len(part[1]),), c, device=part[1].device))
-    model = PhaseModel(stack(banks), torch.cat(labels), torch.cat(kept), tuple(courses), torch.zeros(0), options)
+    model = PhaseModel(stack(banks), torch.cat(labels), torch.cat(kept), tuple(courses), torch.zeros(0), options, camera)
     return replace(model, wrong=wrong_scores(model, learned, label.to(learned.clip.device))).to("cpu"), mirrored
 
 

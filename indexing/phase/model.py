@@ -17,6 +17,7 @@ from indexing.modelfile import part, stored
 from indexing.phase.frames import LEAST as FRAMES_LEAST
 from indexing.phase.frames import Learned, image_distance, shape_distance, standardized
 from indexing.phase.options import PhaseOptions
+from indexing.phase.perspective import perspective_distance
 
 # ----------------------------------------------------------------------------------------------------------------------
 # How the shape of the joints goes through an action, learned from single frames: :math:`X(\phi) = \sum_b c_b(\phi) X_b`.
@@ -48,9 +49,10 @@ class Course:
         return curves(query, [self], grid)[0]
 
 
-def curves(query: Windows, courses: Sequence[Course], grid: int) -> list[Tensor]:
-    """:meth:`Course.curve` of several courses in one pass."""
-    left = shape_distance(query, stack([course.bank(grid) for course in courses]))
+def curves(query: Windows, courses: Sequence[Course], grid: int, lean: float | None = None) -> list[Tensor]:
+    """:meth:`Course.curve` of several courses in one pass; ``lean``: by perspective cameras, see :func:`perspective_distance`."""
+    bank = stack([course.bank(grid) for course in courses])
+    left = shape_distance(query, bank) if lean is None else perspective_distance(query, bank, lean)
     parts = left.split([grid * len(course.shapes) for course in courses], 1)
     return [part.unflatten(1, (-1, grid)).amin(1) for part in parts]
 
@@ -172,6 +174,7 @@ class PhaseModel:
     courses: tuple[Course, ...]
     wrong: Tensor = field(metadata=stored("real", None))
     options: PhaseOptions = PhaseOptions()
+    camera: str = "affine"
 
     def to(self, device: torch.device | str) -> PhaseModel:
         """The same on another device."""
@@ -207,7 +210,9 @@ class PhaseModel:
     def _evidence(self, query: Windows) -> tuple[Tensor, Tensor]:
         distance = image_distance(query, self.bank)
         scores, found = [], []
-        for c, (course, shapes) in enumerate(zip(self.courses, curves(query, self.courses, self.options.course.grid), strict=True)):
+        lean = self.options.evidence.lean if self.camera == "projective" else None
+        every = curves(query, self.courses, self.options.course.grid, lean)
+        for c, (course, shapes) in enumerate(zip(self.courses, every, strict=True)):
             mine = self.label == c
             images = _by_phase(distance[:, mine], self.phase[mine], course.periodic, self.options)
             curve = self.options.evidence.mix * _log(shapes) + (1 - self.options.evidence.mix) * _log(images)

@@ -89,7 +89,7 @@ def _restore(indexer: PhaseIndexer, header: dict[str, Any], parts: Parts) -> Non
     found = read_fields(PhaseModel, parts, sizes)
     found |= {"bank": Windows(found["bank"].values.double(), found["bank"].seen), "phase": found["phase"].double()}
     indexer.skeleton_ = skeleton_from_json(header["skeleton"], joints)
-    indexer.model_ = PhaseModel(**found, courses=courses, options=indexer._options)
+    indexer.model_ = PhaseModel(**found, courses=courses, options=indexer._options, camera=indexer.camera)
     indexer.classes_, indexer.periodic_, indexer.n_joints_, indexer.mirrored_ = classes, periodic, joints, mirrored
     indexer.reject_threshold_ = reject_threshold(indexer.reject, indexer.model_.wrong)
 

@@ -1,0 +1,77 @@
+"""Frames of people near a camera: leaning cameras against brute force, phases near by and from afar, files."""
+
+import numpy as np
+import pytest
+import torch
+
+from indexing import PhaseIndexer
+from indexing.actors import dataset
+from indexing.cameras import virtual
+from indexing.clip import Clip
+from indexing.phase.perspective import leaning
+
+
+def centred(*shape, seed):
+    x = torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return x - x.mean(1, keepdim=True)
+
+
+def test_leaning_cameras_leave_what_least_squares_leaves():
+    basis = torch.linalg.qr(centred(4, 9, 3, seed=0)).Q
+    x = centred(3, 9, 2, seed=1)
+    x = x / x.flatten(1).norm(dim=1)[:, None, None]
+    found = leaning(x, basis, 0.05)
+    for q in range(3):
+        for e in range(4):
+            image = basis[e] @ basis[e].T @ x[q]
+            away = torch.eye(9).double() - basis[e] @ basis[e].T - 1 / 9
+            bent = torch.einsum("ij,jd,jk->idk", away, image, 3 * basis[e]).reshape(18, 3)
+            rows = torch.cat([bent, 0.05**0.5 * torch.eye(3).double()])
+            right = torch.cat([(x[q] - image).reshape(18), torch.zeros(3).double()])
+            m = torch.linalg.lstsq(rows, -right[:, None]).solution
+            torch.testing.assert_close(found[q, e], (rows @ m + right[:, None]).square().sum())
+    # a stiff camera does not lean: what is left is that of affine ones
+    stiff = 1 - torch.einsum("enk,qnd->qekd", basis, x).square().sum((2, 3))
+    torch.testing.assert_close(leaning(x, basis, 1e9), stiff, atol=1e-8, rtol=0)
+
+
+def walker(distance, azimuth, seed):
+    """A synthetic walk on the spot in a camera at some distance, and the phase of every frame by construction."""
+    draw = np.random.default_rng(seed)
+    rest = np.random.default_rng(7).normal(size=(14, 3)) * [0.25, 0.5, 0.25]
+    swing = np.random.default_rng(8).normal(size=(2, 14, 3)) * 0.12
+    phase = np.linspace(0, 3, 90, endpoint=False) + draw.uniform()
+    turns = 2 * np.pi * phase[:, None, None]
+    joints = rest + np.cos(turns) * swing[0] + np.sin(turns) * swing[1]
+    image = virtual(Clip(joints, fps=30.0), azimuth, 0.1, distance=distance, noise=0.01, random_state=draw)
+    return image, phase % 1.0
+
+
+def test_phases_near_by_are_nearer_and_from_afar_no_further_off():
+    train = [walker(4.5, azimuth, seed) for seed, azimuth in enumerate((0, 70, 140, 220, 300))]
+    errors = {}
+    for camera in ("affine", "projective"):
+        indexer = PhaseIndexer(2, camera=camera, mirror=False)
+        indexer.fit([clip for clip, _ in train], ["walk"] * 5, [phase for _, phase in train])
+        for distance in (1.6, 10.0):
+            off = []
+            for seed in range(4):
+                clip, phase = walker(distance, 40 + 90 * seed, 50 + seed)
+                apart = np.abs((indexer.phase(clip)[:, 0] - phase + 0.5) % 1 - 0.5)
+                off.append(np.median(apart))
+            errors[camera, distance] = np.mean(off)
+    assert errors["projective", 1.6] < 0.95 * errors["affine", 1.6]
+    assert errors["projective", 10.0] < 1.1 * errors["affine", 10.0]
+
+
+def test_the_camera_is_a_parameter_that_files_keep(tmp_path):
+    clips = dataset(2, ["walk", "squat"], azimuth=0, rng=0)
+    indexer = PhaseIndexer(1, camera="projective").fit(clips, clips.labels)
+    indexer.save(tmp_path / "phase.safetensors")
+    again = PhaseIndexer.load(tmp_path / "phase.safetensors")
+    assert again.camera == "projective"
+    np.testing.assert_array_equal(again.score_frames(clips[0]), indexer.score_frames(clips[0]))
+    plain = again.set_params(camera="affine").fit(clips, clips.labels)
+    assert not np.allclose(plain.score_frames(clips[0]), indexer.score_frames(clips[0]))
+    with pytest.raises(ValueError, match="camera must be one of"):
+        PhaseIndexer(camera="pinhole").fit(clips, clips.labels)
