@@ -30,7 +30,7 @@ import torch
 
 import dyntorch as dyn
 from experiments.thesis.chapter9 import PRIME, rank_mod
-from experiments.thesis.definitions import apart, normal, rank, seeded
+from experiments.thesis.definitions import apart, collineations, homogeneous, mapped, normal, products, rank, seeded, uniform
 from experiments.thesis.statements import Chapter, Finding, main
 
 CHAPTER = Chapter(10, "conclusions and what was open")
@@ -113,6 +113,23 @@ def general_counts() -> Finding:
     }
     said = "; ".join(f"{name}: {ours} (by definition {theirs})" for name, (ours, theirs) in cases.items())
     return Finding(all(ours == theirs for ours, theirs in cases.values()), said)
+
+
+@CHAPTER.states(
+    "10.1, p. 126",
+    "the minimal conditions on the measurements, such as 'up to 10 points on one hyperplane'",
+    answer="a table for every invariant (results: minimal conditions; dyntorch count)",
+)
+def conditions() -> Finding:
+    draw = seeded(5)
+    flat = torch.zeros(80, 1, dtype=torch.float64)
+    plane, line = torch.cat([2 * uniform(80, 2, draw=draw), flat], -1), torch.cat([2 * uniform(80, 1, draw=draw), flat, flat], -1)
+    # by definition: static points seen by three sensors, rows of the join tensors
+    own = [rank(products(*(homogeneous(mapped(points, A)) for A in collineations(3, 3, draw)))) for points in (plane, line)]
+    counted = {c.option: c.matches for c in dyn.counting.capacities("join", only=["static_on_plane", "static_on_line"])}
+    found = [counted["static_on_plane"], counted["static_on_line"]]
+    said = f"static points of join tensors on one plane: {found[0]} (by definition {own[0]}), on one line {found[1]} ({own[1]})"
+    return Finding(found == own and own[0] == 10, said)
 
 
 if __name__ == "__main__":

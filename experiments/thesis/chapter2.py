@@ -121,13 +121,23 @@ def dual() -> Finding:
     return Finding(max(errors) < EXACT, f"A and B from 26 lines to {errors[0]:.0e}, from 4 points to {errors[1]:.0e}")
 
 
-@CHAPTER.states("9.3, p. 118", "the same for points of a plane in any number of views: 4 views fill 72 of 81 dimensions")
-def four_views() -> Finding:
-    draw = seeded(6)
-    points = on_lines(120, 2, 4, draw)
-    maps = [torch.eye(3, dtype=torch.float64), *collineations(3, 2, draw)]
-    found = rank(products(*(homogeneous(mapped(x, m)) for x, m in zip(points, maps, strict=True))))
-    return Finding(found == dyn.counting.dim_v(3, 4, 2) == 72, f"rank {found}; V(3,4,2) = {dyn.counting.dim_v(3, 4, 2)}")
+@CHAPTER.states("9.3, p. 118", "the same for any number of views, and points of P^n: all collineations are recovered")
+def any_views() -> Finding:
+    said, holds = [], True
+    for n, views, k in ((2, 4, 2), (3, 4, 2), (3, 4, 3)):
+        draw = seeded(6)
+        invariant = dyn.DynamicTensor(n, views, k)
+        count = invariant.minimal()
+        maps = collineations(views - 1, n, draw)
+        within = normal(k, count, n, draw=draw)  # each point anywhere in the span of k points of its own
+        at = torch.softmax(normal(views, k, count, 1, draw=draw), 1)
+        points = (at * within).sum(1)
+        seen = [points[0], *(mapped(x, torch.linalg.inv(m)) for x, m in zip(points[1:], maps, strict=True))]
+        found = dyn.fit(invariant, *seen).check()
+        error = max(apart(mine, true) for mine, true in zip(invariant.decompose(found.tensor), maps, strict=True))
+        holds &= error < EXACT and count == dyn.counting.dim_v(n + 1, views, k)
+        said.append(f"P^{n}, {views} views, k = {k}: {error:.0e} from {count}")
+    return Finding(holds, "; ".join(said))
 
 
 @CHAPTER.states(

@@ -13,7 +13,18 @@ import torch
 from torch import Tensor
 
 import dyntorch as dyn
-from experiments.thesis.definitions import apart, cameras, homogeneous, inhomogeneous, mapped, normal, products, rank, seeded
+from experiments.thesis.definitions import (
+    apart,
+    cameras,
+    homogeneous,
+    inhomogeneous,
+    mapped,
+    normal,
+    products,
+    rank,
+    seeded,
+    uniform,
+)
 from experiments.thesis.statements import Chapter, Finding, main
 
 CHAPTER = Chapter(4, "shape tensors")
@@ -154,6 +165,40 @@ def affine() -> Finding:
     basis = torch.cat([P, torch.ones(6, 1, dtype=torch.float64)], -1)
     minors = [torch.linalg.det(basis[list(four)]) for four in combinations(range(6), 4)]
     return Finding(left < EXACT and min(abs(float(m)) for m in minors) > 1e-3, f"3 new views: {left:.0e} px")
+
+
+@CHAPTER.states("1.3, p. 9", "shape tensors for any kind of projection matrix")
+def any_projection() -> Finding:
+    said, holds = [], True
+    for k, target in ((2, 1), (3, 2), (4, 2), (4, 3)):
+        draw = seeded(40 + 10 * k + target)
+        invariant = dyn.LiftedShapeTensor(k, target)
+        n, views = invariant.least, dyn.LiftedShapeTensor(k, target, points=invariant.least).minimal()
+        P = normal(n, k + 1, draw=draw)
+        images = torch.stack([inhomogeneous(P @ M.mT) for M in normal(views + 3, target + 1, k + 1, draw=draw)])
+        other = torch.stack([inhomogeneous(normal(n, k + 1, draw=draw) @ M.mT) for M in normal(3, target + 1, k + 1, draw=draw)])
+        found = dyn.fit(invariant, *images[:views].unbind(1))
+        new, strange = (found.invariant.score(found.tensor, *x.unbind(1)) for x in (images[views:], other))
+        holds &= bool(found.status == dyn.Status.OK) and bool(new.max() < 1e-5 < strange.min())
+        said.append(f"P^{k} to P^{target}, {n} points: new views {new.max():.0e}, another shape {strange.min():.0e}")
+    return Finding(holds, "; ".join(said))
+
+
+@CHAPTER.states("1.3, p. 9; chapter 4", "dynamic shape tensors for perspective cameras: the time of one image")
+def perspective() -> Finding:
+    draw = seeded(60)
+    n, views = 9, 30
+    start, speed = normal(n, 3, draw=draw), 0.4 * normal(n, 3, draw=draw)
+    times = torch.cat([torch.tensor([-1.0, 1.0], dtype=torch.float64), uniform(views - 2, draw=draw)])
+    turns = torch.linalg.qr(normal(views, 3, 3, draw=draw)).Q
+    seen = (start + times[:, None, None] * speed) @ turns.mT
+    images = 800 * seen[..., :2] / (8 + seen[..., 2:])
+    errors = []
+    for kind in (dyn.DynamicShapeTensor(), dyn.DynamicShapeTensor(camera="projective")):
+        found = dyn.fit(kind, *images[:20].unbind(1), times=times[:20])
+        read = found.invariant.recover(found.tensor, *images[20:].unbind(1)).times
+        errors.append(float((read - times[20:]).abs().median()))
+    return Finding(errors[1] < 1e-5, f"cameras 8 away of points of size 1: affine form {errors[0]:.3f}, projective {errors[1]:.0e}")
 
 
 if __name__ == "__main__":
