@@ -138,7 +138,8 @@ def _weights(given: Tensor | None, like: Tensor) -> Tensor:
 def _not_negative(weights: Tensor) -> Tensor:
     """The weights as they are."""
     if bool((weights < 0).any()):
-        raise ValueError(f"weights must not be negative, got {float(weights.nan_to_num().min()):g}; use 0 to leave a match out")
+        least = float(weights.detach().nan_to_num().min())
+        raise ValueError(f"weights must not be negative, got {least:g}; use 0 to leave a match out")
     return weights
 
 

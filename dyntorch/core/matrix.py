@@ -49,7 +49,9 @@ def estimation_matrix(
 
 
 def _kronecker(vectors: Sequence[Tensor], weights: Tensor) -> Tensor:
-    rows = vectors[0] * weights.sqrt()[..., None, None]
+    # no root of 0, whose derivative is not finite
+    root = torch.where(weights > 0, weights, 1.0).sqrt() * (weights > 0) if weights.requires_grad else weights.sqrt()
+    rows = vectors[0] * root[..., None, None]
     for u in vectors[1:]:
         rows = torch.einsum("...ra,...sb->...rsab", rows, u).flatten(-2).flatten(-3, -2)
     return rows.flatten(-3, -2)
@@ -97,6 +99,10 @@ def gram(primitives: Sequence[Primitive], views: Sequence[Tensor], weights: Tens
     """
     if len(primitives) == 1:
         # nothing to multiply: a match gives its rows as they are
+        if torch.is_grad_enabled() and weights.requires_grad:  # weights of 0 have derivatives, but their roots do not
+            matrix = estimation_matrix(primitives, views, torch.ones_like(weights))
+            shared = weights[..., None].expand(*weights.shape, matrix.shape[-2] // max(1, weights.shape[-1])).flatten(-2)
+            return (matrix * shared[..., None]).mT @ matrix
         matrix = estimation_matrix(primitives, views, weights)
         return matrix.mT @ matrix
     n, width = weights.shape[-1], math.prod(p.width * (p.width + 1) // 2 for p in primitives[1:])

@@ -9,13 +9,17 @@ import torch
 from torch import Tensor
 
 from dyntorch.core.invariant import Invariant
-from dyntorch.core.matches import Matches, largest_weights, matches, relative_weights
+from dyntorch.core.matches import Matches, check_plain, largest_weights, matches, relative_weights
 from dyntorch.core.matrix import gram
-from dyntorch.core.normalize import denormalize, denormalize_motion, relative
-from dyntorch.core.outcome import failed
+from dyntorch.core.normalize import Normalization, denormalize, denormalize_motion, relative
+from dyntorch.core.options import RefineOptions
+from dyntorch.core.outcome import failed, in_order
+from dyntorch.core.refine_gradient import followed, unfinished, wanted
 from dyntorch.core.residual import multilinear_derivative, residual_derivative
 from dyntorch.core.solution import Solution
+from dyntorch.numerics.arguments import check_options
 from dyntorch.numerics.blocks import each, map_blocks, one_thread, select, workers
+from dyntorch.numerics.function_transforms import over_problems, transformed
 from dyntorch.numerics.least_squares import LeastSquaresOptions, Minimum, NormalEquations, flattened, jacobian, minimize, parts_of
 from dyntorch.numerics.nullspace import spectrum
 
@@ -232,6 +236,7 @@ def refine(
     static: Tensor | None = None,
     dimensions: Tensor | None = None,
     iterations: int = ITERATIONS,
+    options: RefineOptions = RefineOptions(),
     **given: Tensor,
 ) -> Solution:
     r"""Refine the motion of a solution: minimize :math:`\sum_n w_n d_n^2` over its entries by Levenberg-Marquardt.
@@ -241,6 +246,11 @@ def refine(
     labelled static are held to agree in all views (the segmented refinement).  The cost never rises; where the solution had
     failed it is returned as it was.
 
+    ``tensor``, ``motion`` and ``sigma`` are differentiable with respect to matches and weights, to every order: by the implicit
+    function theorem at the minimum, whatever steps led there; a gradient costs one Hessian of the cost.  Inliers of a robust
+    fit stay the inliers that they are.  A descent that ended before its minimum has a notice, ``unfinished`` (none within
+    ``torch.func``); the covariance carries no gradient, and a problem that failed has gradients of 0.
+
     Args:
         solution: from :func:`dyntorch.fit` or :func:`dyntorch.robust_fit`.
         *views: the same matches.
@@ -248,6 +258,7 @@ def refine(
         static: ``(*batch, n)`` bool, matches that do not move; default: those labelled in the fit.
         dimensions: ``(*batch, n)`` integers in place of it, as in :func:`dyntorch.fit`.
         iterations: at most so many steps.
+        options: when gradients are those of a minimum that was not reached.
         **given: what else the invariant takes.
 
     Returns:
@@ -269,8 +280,9 @@ def refine(
         >>> bool((refined.sigma - 0.5).abs() < 0.15)
         True
     """
+    check_options(options, RefineOptions)
     invariant, views = solution.invariant.prepared(views, **given)
-    data = matches(invariant, views, weights, static, dimensions)
+    data = matches(invariant, views, weights, static, dimensions, mapped=True)
     old = solution.matches
     if data.batch != old.batch or data.count != old.count:
         raise ValueError(
@@ -282,12 +294,48 @@ def refine(
         data = replace(data, weights=data.weights * (keep > 0 if solution.inliers is not None else keep))
     if data.static is None and old.static is not None:
         data = replace(data, static=old.static)
-    return refine_matches(solution, data, iterations)
+    if not transformed(data.views, data.weights, data.static, solution.normalized, solution.normalization.transforms):
+        return refine_matches(solution, data, iterations, options)
+    return _of_transformed(solution, data, iterations)
 
 
-def refine_matches(solution: Solution, data: Matches, iterations: int = ITERATIONS) -> Solution:
+def _of_transformed(solution: Solution, data: Matches, iterations: int) -> Solution:
+    """:func:`refine` within ``torch.func``."""
+    invariant, norm, status = solution.invariant, solution.normalization, solution.status.reshape(-1)
+    check_plain(invariant)
+    # the tensor of problems that failed stays: flat, in float64
+    whole = solution.tensor.reshape(*status.shape, *solution.tensor.shape[solution.status.ndim :]).to(data.weights.dtype)
+
+    def found(
+        state: tuple[Tensor, Tensor, Tensor, tuple[Tensor, ...] | None],
+        transforms: tuple[Tensor, ...],
+        views: tuple[Tensor, ...],
+        weights: Tensor,
+        static: Tensor | None,
+    ) -> tuple[Tensor, Tensor, tuple[Tensor, ...], Tensor, Tensor]:
+        tensor, normalized, status, refined = state
+        flat = Matches(views, weights, static, weights.shape[:1], weights.dtype, weights.device)
+        known = Normalization.of(invariant, transforms)
+        nothing = torch.zeros_like(normalized.flatten(1)[:, 0])
+        start = Solution(invariant, tensor, nothing, flat, known, normalized, refined=refined, status=status)
+        result = refine_matches(start, flat, iterations)
+        assert result.refined is not None and result.sigma is not None and result.covariance is not None
+        return result.tensor, result.normalized, result.refined, result.sigma, result.covariance
+
+    state = whole, solution.normalized, status, solution.refined
+    tensor, normalized, refined, sigma, covariance = over_problems(
+        found, state, norm.transforms, data.views, data.weights, data.static
+    )
+    back = data.back(tensor), normalized, refined, data.back(sigma), data.back(covariance)
+    names = "tensor", "normalized", "refined", "sigma", "covariance"
+    return replace(solution, **dict(zip(names, back, strict=True)))
+
+
+def refine_matches(
+    solution: Solution, data: Matches, iterations: int = ITERATIONS, options: RefineOptions = RefineOptions()
+) -> Solution:
     """:func:`refine` for checked matches."""
-    invariant, motion = solution.invariant, solution.normalized_motion()
+    invariant, motion, recorded = solution.invariant, solution.normalized_motion(), wanted(solution, data)
     starts = [flattened(motion).detach()]
     if invariant.starts is not None and solution.refined is None:
         starts.append(flattened(algebraic_motion(solution, data)))
@@ -314,7 +362,12 @@ def refine_matches(solution: Solution, data: Matches, iterations: int = ITERATIO
         found = map_blocks(run, start, views, scales, data.weights, data.static, size=size)
         gradient, matrix = (x / unit.square()[(..., *[None] * (x.ndim - 1))] for x in found.terms)
         found = Minimum(found.theta, found.cost / unit.square(), (gradient, matrix), found.steps)
-        return _refined(solution, data, motion, found)
+        if not recorded:
+            return _refined(solution, data, motion, found)
+        open_ = unfinished(found, invariant.dof, data.batch, options.unfinished_decrease, options.unfinished_length)
+    theta, cost = followed(solution, data, shapes, found)
+    refined = _refined(solution, data, motion, Minimum((theta,), cost, found.terms, found.steps))
+    return replace(refined, notices=in_order((*solution.notices, *open_)))
 
 
 def _refined(solution: Solution, data: Matches, old: tuple[Tensor, ...], found: Minimum) -> Solution:
@@ -332,7 +385,8 @@ def _refined(solution: Solution, data: Matches, old: tuple[Tensor, ...], found: 
         return torch.cat([part.flatten(theta.ndim - 1) for part in parts], dim=-1)
 
     frames = tuple(t.detach() for t in solution.frames())
-    covariance = _covariance(moved, found, invariant.dof, sigma * largest_weights(data.weights).sqrt())
+    with torch.no_grad():
+        covariance = _covariance(moved, found, invariant.dof, sigma * largest_weights(data.weights).sqrt())
     return replace(
         solution,
         tensor=select(data.back(good), data.back(tensor), solution.tensor),

@@ -12,15 +12,17 @@ from torch import Tensor
 
 from dyntorch.core.invariant import Estimate, Frame, Invariant, on_class, unknown_argument
 from dyntorch.core.matches import constellations, option
+from dyntorch.core.outcome import Status
 from dyntorch.core.primitives import Equations
 from dyntorch.invariants import perspective_shapes
-from dyntorch.numerics.blocks import constant
+from dyntorch.numerics.blocks import constant, select
 from dyntorch.numerics.nullspace import null_space
 from dyntorch.shapes.basis import Polynomial, Trajectory, extremes, times_of_views
 from dyntorch.shapes.moving import (
     ProjectedShapes,
     centred_views,
     fit_shapes,
+    followed_shapes,
     framed,
     project,
     shapes_at,
@@ -369,12 +371,15 @@ class DynamicShapeTensor(Invariant):
         if self.projective:
             return perspective_shapes.estimate(views[0], weights, self.trajectory, PerspectiveOptions())
         options = ShapesOptions()
+        measured = views[0]
+        rows = self.trajectory.rows(measured[..., 0, 3])
         with torch.no_grad():
-            measured = views[0]
-            rows = self.trajectory.rows(measured[..., 0, 3])
             found = fit_shapes(measured[..., :2], rows, measured[..., 2], share=weights, options=options)
         ambiguous = found.uncertainty > options.ambiguous
-        return Estimate(beside(found.shapes), found.few, found.degenerate, ambiguous, found.uncertainty)
+        shapes = found.shapes
+        if torch.is_grad_enabled() and (measured.requires_grad or weights.requires_grad):
+            shapes = select(found.status == Status.OK, followed_shapes(shapes, measured, rows, weights), shapes)
+        return Estimate(beside(shapes), found.few, found.degenerate, ambiguous, found.uncertainty)
 
     @on_class
     def compose(self, shapes: Tensor) -> Tensor:
@@ -440,7 +445,7 @@ class DynamicShapeTensor(Invariant):
 
     def _projected(self, shapes: Tensor, measured: Tensor) -> tuple[ProjectedShapes, Tensor]:
         """Views ``(*batch, views, n, 4)`` beside their shapes, and the functions of the time."""
-        x, seen = measured[..., :2], measured[..., 2]
+        x, seen = measured[..., :2], measured[..., 2].detach()
         centre = (x * seen[..., None]).sum(-2, keepdim=True) / seen.sum(-1)[..., None, None].clamp(min=1.0)
         rows = self.trajectory.rows(measured[..., 0, 3])
         shape = shapes[..., None, :, :] if self.form == "span" else shapes_at(apart(shapes), rows)

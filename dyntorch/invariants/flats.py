@@ -15,6 +15,7 @@ from dyntorch.geometry.extensors import levi_civita
 from dyntorch.geometry.homogeneous import homogeneous
 from dyntorch.invariants.agreement import skew_partner
 from dyntorch.numerics.blocks import constant
+from dyntorch.numerics.implicit import follow_minimum
 from dyntorch.numerics.nullspace import eigh, gram_null_space
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -193,14 +194,36 @@ def whitened_incidence(hyperplanes: Tensor, maps: Tensor, p: Tensor, s: Tensor) 
 def flat_residual(maps: Tensor, views: Sequence[Tensor], scales: Sequence[Tensor], step: int) -> Tensor:
     r"""Whitened distances of matches from the flats they stay in, ``(b, n, m c)``, whose square sum is the least possible.
 
-    With noise it follows :math:`\chi^2` with :math:`(m - k)(N - k)` degrees of freedom.  Differentiable once: the flat is the
-    best one, so that it may be held.
+    With noise it follows :math:`\chi^2` with :math:`(m - k)(N - k)` degrees of freedom.  Where gradients are recorded the flats
+    follow what they are the nearest ones of, so that derivatives of every order are right.
     """
     points, noise = torch.stack(list(views), dim=-2), torch.stack(list(scales), dim=-1)
     with torch.no_grad():
-        flats = nearest_flats(maps, points, noise, step)
+        hyperplanes = nearest_flats(maps, points, noise, step).hyperplanes
+    if torch.is_grad_enabled() and any(x.requires_grad for x in (maps, points, noise)):
+        hyperplanes = _followed(hyperplanes, maps, points, noise, step)
     s = noise[:, None, :, None, None]
-    return whitened_incidence(flats.hyperplanes, maps, homogeneous(points), s)[0].flatten(-2)
+    return whitened_incidence(hyperplanes, maps, homogeneous(points), s)[0].flatten(-2)
+
+
+def _followed(hyperplanes: Tensor, maps: Tensor, points: Tensor, noise: Tensor, step: int) -> Tensor:
+    """The nearest flats ``(b, n, c, N)`` as functions of what they are nearest to, every match by itself."""
+    problems, count, c, size = hyperplanes.shape
+    across = eigh(hyperplanes.mT @ hyperplanes)[1][..., : size - c].mT[..., :step, :]
+
+    def moved(by: Tensor, hyperplanes: Tensor, across: Tensor) -> Tensor:
+        return hyperplanes + by.unflatten(-1, (c, across.shape[-2])) @ across
+
+    def cost(by: Tensor, hyperplanes: Tensor, across: Tensor, points: Tensor, maps: Tensor, noise: Tensor) -> Tensor:
+        at = moved(by, hyperplanes, across)[:, None]
+        found = whitened_incidence(at, maps, homogeneous(points)[:, None], noise[:, None, :, None, None])
+        return found[0].square().sum((-3, -2, -1))
+
+    held = hyperplanes.flatten(0, 1), across.flatten(0, 1)
+    still = held[0].new_zeros(problems * count, c * across.shape[-2])
+    several = [x[:, None].expand(-1, count, *x.shape[1:]).flatten(0, 1) for x in (maps, noise)]
+    by = follow_minimum(cost, still, still.new_zeros(*still.shape, 0), *held, points.flatten(0, 1), *several)
+    return moved(by, *held).unflatten(0, (problems, count))
 
 
 def flat_residual_derivative(maps: Tensor, views: Sequence[Tensor], scales: Sequence[Tensor], step: int) -> tuple[Tensor, Tensor]:

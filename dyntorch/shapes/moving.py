@@ -11,7 +11,8 @@ from torch import Tensor
 from dyntorch.core.outcome import Outcome, Status, status_of
 from dyntorch.geometry.homogeneous import nonzero_sign
 from dyntorch.numerics.arguments import check_options, check_weights
-from dyntorch.numerics.blocks import one_thread
+from dyntorch.numerics.blocks import one_thread, select
+from dyntorch.numerics.implicit import flat_directions, follow_minimum
 from dyntorch.numerics.least_squares import LeastSquaresOptions, NormalEquations, minimize
 from dyntorch.numerics.nullspace import eigenvalues, eigh, gram_null_space, null_space, spectrum
 from dyntorch.shapes.options import ShapesOptions
@@ -65,7 +66,9 @@ def centred_views(x: Tensor, weights: Tensor | None = None, share: Tensor | None
     clean = torch.where(present[..., None], x, 0.0)
     centre = (clean * weight[..., None]).sum(-2, keepdim=True) / x.shape[-2]
     moved = torch.where((weight > 0)[..., None], clean - centre, 0.0)
-    scale = (moved.square() * weight[..., None]).sum((-2, -1)).sqrt()
+    energy = (moved.square() * weight[..., None]).sum((-2, -1))
+    # no root of 0, whose derivative is not finite
+    scale = torch.where(energy > 0, energy, 1.0).sqrt() * (energy > 0)
     # coordinates equal to rounding are one place
     known = (seen > 4) & (scale > 1e-12 * clean.abs().amax((-2, -1)))
     scale = torch.where(known, scale, 1.0)
@@ -478,6 +481,39 @@ def fit_shapes(
     back = [torch.where(none, 0.0, framed(shapes)), noise, residual, torch.where(few, torch.inf, uncertainty)]
     done = [part.reshape((*batch, *part.shape[1:])).to(x.dtype) for part in back]
     return MovingShapes(*done, status=status_of(free, few).reshape(batch))
+
+
+def followed_shapes(shapes: Tensor, measured: Tensor, rows: Tensor, share: Tensor) -> Tensor:
+    """The shapes ``(b, B, n, 3)`` of least squares as a function of what they were fitted to, in the same form.
+
+    Args:
+        shapes: by :func:`fit_shapes`.
+        measured: ``(b, views, n, 3)`` or wider: x, y, 1 where seen.
+        rows: ``(b, views, B)``.
+        share: ``(b, views)``.
+    """
+    theta = shapes.detach().flatten(1)
+    with torch.no_grad():
+        matrix = ShapeDescent(_views_of(measured, share), rows).normal_equations(theta)[2]
+    free = flat_directions(matrix, GAUGE + 3 * rows.shape[-1])
+
+    def cost(theta: Tensor, measured: Tensor, rows: Tensor, share: Tensor) -> Tensor:
+        return cost_of(_views_of(measured, share), rows, theta.unflatten(1, shapes.shape[1:]))
+
+    found = follow_minimum(cost, theta, free, measured, rows, share).unflatten(1, shapes.shape[1:])
+    # what no view can tell is nailed down as it is in the fit
+    none = (theta == 0).all(-1)
+    return select(~none, framed(select(~none, found, _standing(shapes))), 0.0)
+
+
+def _standing(shapes: Tensor) -> Tensor:
+    """A shape whose frame has derivatives, in place of one that is zero."""
+    n = torch.arange(1.0, shapes.shape[-2] * 3 + 1, dtype=shapes.dtype, device=shapes.device).reshape(-1, 3)
+    return (n.sin() * torch.tensor([1.0, 2.0, 3.0]).to(n)).expand_as(shapes)
+
+
+def _views_of(measured: Tensor, share: Tensor) -> AffineViews:
+    return centred_views(measured[..., :2], measured[..., 2].detach(), share)
 
 
 def checked_views(

@@ -221,6 +221,28 @@ def refinement_keeps_exact_solutions(case: Case) -> None:
             assert refined.sigma is not None and refined.sigma.max() < 1e-7
 
 
+@prop(lambda case: case.invariant.width() < 36)
+def gradient_of_refinement_is_right(case: Case) -> None:
+    """Along a direction of the data, from refinements beside it: of the tensor and of the noise that is left."""
+    views = example(case, batch=())
+    g = torch.Generator().manual_seed(3)
+    along = [case.noise * torch.randn(x.shape, generator=g, dtype=x.dtype) for x in views]
+
+    def answer(s: Tensor) -> Tensor:
+        moved = [x + s * e for x, e in zip(views, along, strict=True)]
+        found = dyn.refine(dyn.fit(case.invariant, *moved), *moved)
+        assert found.sigma is not None and not found.notices
+        return torch.cat([projector(case, found.tensor)[0, 0], found.sigma[None] / case.noise])
+
+    at = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    fixed = torch.randn(len(answer(at)), generator=g, dtype=torch.float64)
+    (slope,) = torch.autograd.grad((answer(at) * fixed).sum(), at)
+    h = 2e-2
+    steps = [(answer(torch.tensor(s * h, dtype=torch.float64)) * fixed).sum() for s in (-2.0, -1.0, 1.0, 2.0)]
+    expected = (8 * (steps[2] - steps[1]) - (steps[3] - steps[0])) / (12 * h)
+    torch.testing.assert_close(slope, expected, rtol=1e-3, atol=1e-6)
+
+
 def features(case: Case, motion: Motion) -> Tensor:
     """A function of the motion ``(b, f)`` that is blind to what the invariant leaves open."""
     if case.nullity > 1:
