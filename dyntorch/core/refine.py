@@ -326,9 +326,14 @@ def _of_transformed(solution: Solution, data: Matches, iterations: int) -> Solut
     tensor, normalized, refined, sigma, covariance = over_problems(
         found, state, norm.transforms, data.views, data.weights, data.static
     )
-    back = data.back(tensor), normalized, refined, data.back(sigma), data.back(covariance)
-    names = "tensor", "normalized", "refined", "sigma", "covariance"
-    return replace(solution, **dict(zip(names, back, strict=True)))
+    return replace(
+        solution,
+        tensor=data.back(tensor),
+        normalized=normalized,
+        refined=refined,
+        sigma=data.back(sigma),
+        covariance=data.back(covariance),
+    )
 
 
 def refine_matches(

@@ -191,7 +191,7 @@ def _frames(transforms: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
 
 def _shown(sigma: Tensor) -> str:
     """The noise for a repr: of a batch the median."""
-    return f", sigma {'about ' if sigma.numel() > 1 else ''}{float(sigma.median()):.2g}" if sigma.numel() else ""
+    return f", sigma {'about ' if sigma.numel() > 1 else ''}{float(sigma.detach().median()):.2g}" if sigma.numel() else ""
 
 
 def copied(

@@ -25,6 +25,7 @@ from dyntorch.numerics.eigenspaces import (
     solve,
     unit_trace,
 )
+from dyntorch.numerics.function_transforms import transformed
 from dyntorch.numerics.null_space_gradient import NullSpaceOfGrams, NullSpaceOfRows
 
 UNDERFLOW = 1e-250  # of the order of the entries: squares and products of what is smaller are no normal numbers
@@ -40,8 +41,14 @@ def eigh(matrix: Tensor) -> tuple[Tensor, Tensor]:
         >>> eigh(torch.tensor([[1.0, 1e-310], [1e-310, 2.0]], dtype=torch.float64))[0].tolist()
         [1.0, 2.0]
     """
-    values, vectors = torch.linalg.eigh(torch.where(matrix.abs() < UNDERFLOW, 0.0, matrix))
+    values, vectors = torch.linalg.eigh(_without(matrix, UNDERFLOW))
     return values, vectors
+
+
+def _without(matrix: Tensor, limit: float) -> Tensor:
+    """The matrix with 0 for entries below a limit, which keep their derivatives."""
+    nothing = matrix - matrix.detach() if matrix.requires_grad or transformed(matrix) else 0.0
+    return torch.where(matrix.abs() < limit, nothing, matrix)
 
 
 def spectrum(matrix: Tensor) -> tuple[Tensor, Tensor]:
@@ -61,7 +68,7 @@ def spectrum(matrix: Tensor) -> tuple[Tensor, Tensor]:
 def eigenvalues(matrix: Tensor) -> Tensor:
     """The eigenvalues of :func:`spectrum`."""
     even, size = _even(matrix)
-    values: Tensor = torch.linalg.eigvalsh(torch.where(even.abs() < UNDERFLOW, 0.0, even))
+    values: Tensor = torch.linalg.eigvalsh(_without(even, UNDERFLOW))
     return values * size
 
 
@@ -77,7 +84,7 @@ def real_eigenvalues(matrix: Tensor) -> Tensor:
         [[1e+200, 3e+200], [1.0, 1.0]]
     """
     even, size = _even(matrix)
-    values: Tensor = torch.linalg.eigvals(torch.where(even.abs() < 1e-100, 0.0, even)).real
+    values: Tensor = torch.linalg.eigvals(_without(even, 1e-100)).real
     return values * size
 
 

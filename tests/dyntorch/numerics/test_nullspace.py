@@ -5,7 +5,7 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from dyntorch.numerics import eigenspaces, null_space_gradient, nullspace
-from dyntorch.numerics.nullspace import gram_null_space, null_space
+from dyntorch.numerics.nullspace import eigenvalues, eigh, gram_null_space, null_space, spectrum
 
 aten = torch.ops.aten
 
@@ -240,8 +240,8 @@ def test_bad_conditioning_is_not_a_larger_null_space(batch, size):
         torch.tensor([1.0] + [1e-6] * (size - 2) + [0.0]),
         torch.tensor([1.0] * (size - 2) + [1e-6, 0.0]),
     ]
-    for spectrum in spectra:
-        matrix, expected = with_spectrum(spectrum, 80, batch)
+    for singular in spectra:
+        matrix, expected = with_spectrum(singular, 80, batch)
         found = gram_null_space(matrix.mT @ matrix)
         assert not found.degenerate.any()
         assert angle(found.basis, expected[:, -1:]).max() < 1e-2
@@ -501,3 +501,15 @@ def test_cuda_equals_cpu(rows, dim):
     torch.testing.assert_close(there.grad.cpu(), here.grad, rtol=1e-6, atol=1e-8)
     gram = matrix.mT @ matrix
     assert angle(gram_null_space(gram.cuda(), dim).basis.cpu(), gram_null_space(gram, dim).basis).max() < 1e-10
+
+
+def test_entries_that_are_zero_have_derivatives():
+    """A diagonal matrix turns when its other entries grow: dv_1 = dM_12 / (m_1 - m_2) v_2."""
+    matrix = torch.diag(torch.tensor([1.0, 3.0], dtype=torch.float64)).requires_grad_()
+    for vectors in (eigh(matrix)[1], spectrum(matrix)[1]):
+        turn = vectors[0, 1] * vectors[1, 1].sign()
+        slope = torch.autograd.grad(turn, matrix)[0]
+        torch.testing.assert_close(0.5 * (slope + slope.mT), torch.tensor([[0.0, 0.25], [0.25, 0.0]], dtype=torch.float64))
+    (first,) = torch.autograd.grad(eigenvalues(matrix)[1], matrix, create_graph=True)
+    curved = torch.autograd.grad(first[0, 1] + first[1, 0], matrix)[0]
+    torch.testing.assert_close(curved.sum() - curved.trace(), torch.tensor(1.0, dtype=torch.float64))  # 3 + e^2 / 2
