@@ -32,6 +32,7 @@ from dyntorch.tasks.planes import closed_forms as infinity_extensors
 from dyntorch.tasks.planes import problem as planes_problem
 from dyntorch.tasks.planes import problem as planes_starts
 from dyntorch.tasks.planes.options import PlaneFrameOptions
+from dyntorch.tasks.synchronize import projective
 
 CPU = torch.device("cpu")
 TABLES = [
@@ -65,6 +66,7 @@ TABLES = [
     (monomials.multiplicity, (2, 2, CPU)),
     (planes_problem._own, (3, 1, CPU)),
     (planes_starts._frames, (PlaneFrameOptions(), CPU)),
+    (projective._products, (CPU,)),
     (shape_completion._choices, (8, CPU)),
     (shape_points._basis, ("plane", 4, CPU)),
     (lifted.partitions, (3, (2, 2), CPU)),
