@@ -272,7 +272,9 @@ def an_accelerator_agrees(case: Case) -> None:
     views = tuple(x[:1] for x in example(case))
     here = dyn.fit(case.invariant, *views)
     motion = dyn.refine(here, *views).motion
+    nothing = tuple(map(torch.stack, zip(*(degenerate(case, kind) for kind in kinds(case)), strict=True)))
     for device in accelerators():
+        assert dyn.fit(case.invariant, *moved(nothing, device)).status.tolist() == dyn.fit(case.invariant, *nothing).status.tolist()
         away = moved(views, device)
         there = dyn.fit(case.invariant, *away)
         assert {x.device.type for x in (there.tensor, there.status, *there.motion)} == {device}
