@@ -94,6 +94,7 @@ tables: install
 	$(BIN)/python -m experiments.synchronization.brightness
 	$(BIN)/python -m experiments.synchronization.cameras
 	$(BIN)/python -m experiments.reconstruction.pair
+	$(BIN)/python -m experiments.reconstruction.bodies
 	$(BIN)/python -m experiments.reconstruction.real
 	$(BIN)/python -m experiments.alignment.real.planar
 	$(BIN)/python -m experiments.synchronization.real
