@@ -15,6 +15,7 @@ from dyntorch.geometry.extensors import levi_civita
 from dyntorch.geometry.homogeneous import homogeneous
 from dyntorch.invariants.agreement import skew_partner
 from dyntorch.numerics.blocks import constant
+from dyntorch.numerics.eigenspaces import jacobi, on_host
 from dyntorch.numerics.implicit import follow_minimum
 from dyntorch.numerics.nullspace import eigh, gram_null_space
 
@@ -145,7 +146,9 @@ def nearest_flats(maps: Tensor, points: Tensor, scales: Tensor, step: int) -> Fl
     p, s = homogeneous(points), scales[:, None, :, None, None]
     carried = torch.nn.functional.normalize((maps[:, None] @ p[..., None])[..., 0], dim=-1)
     carried = torch.nan_to_num(carried)
-    vectors = eigh(carried.mT @ carried)[1]
+    square = carried.mT @ carried
+    # an accelerator waits for eigh, and these are tiny
+    vectors = eigh(square)[1] if on_host(square) else jacobi(square.flatten(0, 1))[1].unflatten(0, square.shape[:2])
     size = vectors.shape[-1]
     count = size - step
     base, across = vectors[..., :count].mT, vectors[..., count:].mT
@@ -159,7 +162,8 @@ def nearest_flats(maps: Tensor, points: Tensor, scales: Tensor, step: int) -> Fl
         # where the points hardly move the flat may turn far: only what helps counts
         better = new < cost
         at = Flats(*(torch.where(better[(..., *[None] * (a.ndim - 2))], a, b) for a, b in zip(tried, at, strict=True)))
-        if not bool((better & (cost - new > 1e-12 * cost)).any()):
+        # an accelerator would wait for the answer longer than for the steps
+        if on_host(cost) and not bool((better & (cost - new > 1e-12 * cost)).any()):
             break
     return at
 

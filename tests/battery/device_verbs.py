@@ -205,6 +205,18 @@ VERBS: tuple[Verb, ...] = (
     ),
     Verb("null_space", lambda: (randn(3, 12, 9),), dyn.null_space),
     Verb("align_planar", planar, lambda *x: dyn.align_planar(*x, threshold=1.5, generator=draw())),
+    Verb(
+        "align_planar four views",
+        lambda: scenes.planar(40, static=0.4, sigma=0.2, views=4, generator=draw(3)).views,
+        lambda *x: dyn.align_planar(*x, threshold=1.5, generator=draw()),
+    ),
+    Verb(
+        "DynamicTensor motion",
+        lambda: scenes.dynamic(2, 4, 2, 90, static=0.2, sigma=1e-3, generator=draw(3)).views,
+        lambda *x: (lambda fitted: (dyn.refine(fitted, *x).motion, dyn.sampson(fitted.invariant, fitted.tensor, *x)))(
+            dyn.fit(dyn.DynamicTensor(2, 4, 2), *x)
+        ),
+    ),
     *(
         Verb(
             f"align_points {model}",
@@ -444,6 +456,7 @@ WAITS = {
     "ShapeTensor": (40, f"{FITS}; {STEPS}"),
     "LiftedShapeTensor": (60, f"{FITS}; {STEPS}"),
     "DynamicShapeTensor": (60, f"{FITS}; {STEPS}"),
+    "DynamicTensor": (40, f"{FITS}; {STEPS}"),
     "velocity_factorization": (8, ASKED),
     "affine_factorization": (1, ASKED),
     "metric_upgrade": (4, ASKED),
