@@ -74,7 +74,7 @@ WORDING = {
 """How much a message lists."""
 DRAWING = {
     "indexing/report/alignment.py": {"PATHS", "ROOM", "REACH", "WIDTH", "MARGIN", "GAP", "TITLE", "FOOT", "WIDE"},
-    "indexing/report/canvas.py": {"DPI", "FRAMES", "AROUND", "WIDTH", "HEIGHT"},
+    "indexing/report/canvas.py": {"DPI", "FADE", "FRAMES", "AROUND", "WIDTH", "HEIGHT"},
     "indexing/report/learned.py": {"COLUMNS", "PANEL", "PIECES", "THIN", "THICK", "DOT", "HEAD", "TRAIL", "NAMED"},
     "indexing/report/page.py": {"PIXEL_RATIO", "LISTED", "LINES"},
     "indexing/report/pictures.py": {"COLUMNS", "STEPS", "WIDTH", "ABOVE", "BESIDE"},
@@ -84,7 +84,7 @@ DRAWING = {
         *("TRACKS_TALL", "TRACKS_STRAYS"),
     },
     "indexing/report/segmentation.py": {
-        *("WIDTH", "TALL", "EDGE", "GAP", "HEAD", "TICKS", "FOOT", "WIDE", "FADE", "STRAYS", "SLIM"),
+        *("WIDTH", "TALL", "EDGE", "GAP", "HEAD", "TICKS", "FOOT", "WIDE", "STRAYS", "SLIM"),
     },
     "indexing/report/sync.py": {
         *("WIDTH", "TOP", "ROW", "GAP", "FOOT", "LEFT", "MIDDLE", "CLOSE", "EDGE", "DRAWN", "NEAR", "LISTED"),

@@ -12,10 +12,12 @@ import tyro
 
 from dyntorch.numerics import worded
 from indexing.cli.console import check_report, count, ended, flags, names, progress, say, table, tell
+from indexing.cli.scenes import Asked, as_matches, follow, inputs_of, is_scene, photographs, tracks_csv
 
 if TYPE_CHECKING:
     from indexing.readers.matches import Matched
     from indexing.report.alignment import AlignmentReport
+    from indexing.video.scene import SceneTracks
 
 Model = Literal["planar", "join", "minimal_join", "constant_velocity", "affine_constant_velocity", "rigid", "lines"]
 SEVERAL = ("planar", "join", "minimal_join")
@@ -34,19 +36,25 @@ class Align:
     dyntorch align walk.c3d --frames 10,20,30,40,50 --model join
 
     dyntorch align l1.csv l2.csv --model lines --static-points p1.csv p2.csv
+
+    dyntorch align street.mp4 --frames 0,20,40 --out out/
     """
 
     files: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="FILE ...", help_behavior_hint="")]
     """a file per view (CSV with columns x,y or x,y,z and perhaps id; npy; PLY), or one for all (npz with x1, x2, x3; C3D); planar,
-    join and minimal_join take three or more views"""
+    join and minimal_join take three or more views; or a video, a folder or pattern of pictures, whose points are followed,
+    background included"""
     model: Annotated[Model | None, tyro.conf.arg(help_behavior_hint="")] = None
     """how points may move, and the sensor; by default planar for 2D points, rigid for 3D points, lines for lines"""
     threshold: Annotated[float | Literal["auto"], tyro.conf.arg(metavar="T|auto")] = "auto"
     """greatest distance of an inlier in the unit of the files: three times the noise of a coordinate; auto estimates it"""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
-    """where to write report.html, alignment.json, labels.csv and alignment.png; without it, print only"""
+    """where to write report.html, alignment.json, labels.csv, alignment.png (and tracks.csv of a video); without it, print only"""
     frames: Annotated[str | None, tyro.conf.arg(metavar="N,N,N", help_behavior_hint="")] = None
-    """of a file with many frames (C3D, npy), those that are the views"""
+    """of a file with many frames (C3D, npy) or a video, those that are the views; of a video by default the first, the last in
+    which half of its points are still followed, and the one between"""
+    at: Annotated[str | None, tyro.conf.arg(metavar="S,S,S", help_behavior_hint="")] = None
+    """of a video, seconds of the views instead: the first frame at or after each"""
     motion: Literal["straight", "constant_velocity"] = "straight"
     """of rigid: points move on straight lines at any speed, or at constant velocity"""
     static_points: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE FILE", help_behavior_hint="")] = ()
@@ -58,15 +66,16 @@ class Align:
         """Read, align, write, and say what was found."""
         inputs = [path.expanduser() for path in (*self.files, *self.static_points)]
         self._check()
+        scene, asked = is_scene(inputs), Asked(self.frames, self.at)
+        asked.check(scene)
+        inputs = inputs_of(inputs) if scene else inputs
         from indexing.files import manifest
         from indexing.report.alignment import FILES, AlignmentReport, write_alignment
 
         folder = check_report(self.out, inputs, FILES)
         started = time.perf_counter()
         with progress("reading", steps=False):
-            from indexing.readers.matches import read_matches
-
-            matched = read_matches(self.files, frames=frame_numbers(self.frames), static_points=self.static_points)
+            matched, tracks = self._read(asked if scene else None)
         model, notes = self._model(matched)
         read = time.perf_counter()
         with progress(f"aligning {count(len(matched.ids), 'match', 'matches')}", steps=False):
@@ -81,6 +90,8 @@ class Align:
             notes=[*notes, *matched.notes],
             words=WORDS,
             manifest=manifest(arguments, inputs, self.seed, timings),
+            photographs=photographs(tracks) if tracks else (),
+            besides={"tracks.csv": tracks_csv(tracks)} if tracks else {},
         )
         page = None
         if folder is not None:
@@ -97,6 +108,23 @@ class Align:
             raise ValueError(f"--threshold must be a positive distance in the unit of the files or auto, got {self.threshold}")
         if self.seed < 0:
             raise ValueError(f"--seed must be a whole number from 0, got {self.seed}")
+
+    def _read(self, asked: Asked | None) -> tuple[Matched, SceneTracks | None]:
+        """The matches, and the tracks that they are where ``asked`` says frames of a video.
+
+        Raises:
+            ValueError: what cannot be read, or does not fit together.
+        """
+        from indexing.readers.matches import read_matches
+
+        if asked is None:
+            return read_matches(self.files, frames=frame_numbers(self.frames), static_points=self.static_points), None
+        if self.static_points:
+            raise ValueError("--static-points are of lines, and a video has points; leave it out")
+        if self.model not in (None, "planar"):
+            raise ValueError(f"--model {self.model} needs 3D points or lines, and a video has 2D points; use --model planar")
+        tracks = follow(self.files, asked, views=3)
+        return as_matches(tracks), tracks
 
     def _model(self, matched: Matched) -> tuple[str, list[str]]:
         """The model, and what to say about it.

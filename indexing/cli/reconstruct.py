@@ -15,6 +15,8 @@ import tyro
 from dyntorch.numerics import worded
 from indexing.cli.console import check_report, count, ended, flags, say, table, tell
 from indexing.cli.console import progress as progress_of
+from indexing.cli.scenes import Asked, as_tracks, follow, inputs_of, is_scene, photographs, tracks_csv
+from indexing.readers.files import VIDEOS
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -47,10 +49,13 @@ class Reconstruct:
     dyntorch reconstruct view1.csv view2.csv view3.csv --times 0,0.5,1.2
 
     dyntorch reconstruct hopkins155.npz --key cars1 --frames 0,6,12,18
+
+    dyntorch reconstruct street.mp4 --every 5 --motion constant_velocity_2d --out out/
     """
 
     files: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="FILE ...", help_behavior_hint="")]
-    """a table with columns frame (or time), id, x, y; an npz with tracks (views, n, 2); npy, C3D; or a file per view"""
+    """a table with columns frame (or time), id, x, y; an npz with tracks (views, n, 2); npy, C3D; a file per view;
+    or a video, a folder or pattern of pictures, whose points are followed, background included"""
     motion: MotionName = "auto"
     """how the points move; auto compares the models"""
     times: Annotated[str | None, tyro.conf.arg(metavar="T,T,...", help_behavior_hint="")] = None
@@ -67,7 +72,12 @@ class Reconstruct:
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
     """where to write report.html, reconstruction.npz, reconstruction.json, points.csv and pictures; without it, print only"""
     frames: Annotated[str | None, tyro.conf.arg(metavar="N,N,...", help_behavior_hint="")] = None
-    """the views to take, by the number of their frame, or by their time where there is none; all by default"""
+    """the views to take, by the number of their frame, or by their time where there is none; all by default.  Of a video, 8
+    by default, evenly from the first to the last in which half of its points are still followed"""
+    at: Annotated[str | None, tyro.conf.arg(metavar="S,S,...", help_behavior_hint="")] = None
+    """of a video, seconds of the views instead: the first frame at or after each"""
+    every: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
+    """of a video, every so many frames instead; 1 takes all"""
     key: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
     """of an npz with several sequences or arrays, the one to take"""
     seed: int = 0
@@ -78,6 +88,9 @@ class Reconstruct:
         given = (*self.files, *((self.static,) if self.static else ()), *calibration_files(self.calibration))
         inputs = [path.expanduser() for path in given]
         self._check()
+        scene, asked = is_scene([path.expanduser() for path in self.files]), Asked(self.frames, self.at, self.every)
+        self._check_scene(scene, asked)
+        inputs = inputs_of(inputs) if scene else inputs
         from indexing.files import manifest
         from indexing.report.reconstruction import FILES, ReconstructionReport, write_reconstruction
 
@@ -87,7 +100,9 @@ class Reconstruct:
             from indexing.readers.tracks import read_tracks
 
             frames = None if self.frames is None else [word.strip() for word in self.frames.split(",")]
-            tracks = self._timed(read_tracks(self.files, frames=frames, key=self.key, static=self.static))
+            followed = follow(self.files, asked, missing=True, fps=self.fps) if scene else None
+            given = as_tracks(followed, self.files[0], self._filmed()) if followed else None
+            tracks = self._timed(given or read_tracks(self.files, frames=frames, key=self.key, static=self.static))
         read = time.perf_counter()
         with progress_of(f"reconstructing {count(len(tracks.ids), 'track')}", steps=False):
             result = self._solve(tracks)
@@ -100,6 +115,8 @@ class Reconstruct:
             notes=[*tracks.notes, *unfixed(tracks, result)],
             words=WORDS,
             manifest=manifest({"command": "reconstruct", **dataclasses.asdict(self)}, inputs, self.seed, timings),
+            photograph=photographs(followed)[0] if followed else None,
+            besides={"tracks.csv": tracks_csv(followed)} if followed else {},
         )
         page = None
         if folder is not None:
@@ -119,6 +136,19 @@ class Reconstruct:
             raise ValueError("--fps and --times both give times; leave one out")
         if self.seed < 0:
             raise ValueError(f"--seed must be a whole number from 0, got {self.seed}")
+
+    def _check_scene(self, scene: bool, asked: Asked) -> None:
+        """Raise on flags that do not fit what is given."""
+        asked.check(scene)
+        for flag in ("key", "static"):
+            if scene and getattr(self, flag) is not None:
+                raise ValueError(f"--{flag} is of files of tracks, and a video or pictures are given; leave it out")
+        if scene and self.fps is not None and self._filmed():
+            raise ValueError(f"--fps {self.fps:g}: a video has the times of its frames; leave it out")
+
+    def _filmed(self) -> bool:
+        """Whether the frames have times of their own, or a rate that was given."""
+        return self.files[0].suffix.lower() in VIDEOS
 
     def _limit(self) -> float | None:
         """The threshold as the library takes it: None = estimated, inf = all tracks fit.

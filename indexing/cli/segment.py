@@ -12,6 +12,7 @@ import tyro
 
 from dyntorch.numerics import worded
 from indexing.cli.console import check_report, count, ended, flags, progress, say, table, tell
+from indexing.cli.scenes import LEFT_OUT, Asked, as_pair, follow, inputs_of, is_scene, photographs, tracks_csv
 
 if TYPE_CHECKING:
     from indexing.readers.pairs import MatchedPair, Photograph
@@ -32,10 +33,13 @@ class Segment:
     dyntorch segment matches.csv --images left.jpg right.jpg --out out/
 
     dyntorch segment adelaidermf.npz --pair breadtoy --bodies 2 --threshold auto
+
+    dyntorch segment street.mp4 --at 0.4,1.2 --out out/
     """
 
-    file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MATCHES", help_behavior_hint="")]
-    """npz with x1, x2 (n, 2), or NAME/x1, NAME/x2 of several pairs; npy (n, 4); or CSV with columns x1,y1,x2,y2"""
+    files: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="MATCHES", help_behavior_hint="")]
+    """npz with x1, x2 (n, 2), or NAME/x1, NAME/x2 of several pairs; npy (n, 4); CSV with columns x1,y1,x2,y2; or a video, a folder,
+    pattern or list of pictures, whose points are followed, background included"""
     bodies: Annotated[int | Literal["auto"], tyro.conf.arg(metavar="K|auto")] = "auto"
     """how many bodies there are"""
     threshold: Annotated[float | Literal["auto"], tyro.conf.arg(metavar="PX|auto")] = 2.5
@@ -44,6 +48,11 @@ class Segment:
     """neighbours tend to move with one body; --no-spatial where bodies are transparent or interleaved"""
     pair: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
     """of an npz with several pairs, the one to take"""
+    frames: Annotated[str | None, tyro.conf.arg(metavar="N,N", help_behavior_hint="")] = None
+    """of a video or of pictures, the two to compare; by default the first and the last in which half of its points are still
+    followed"""
+    at: Annotated[str | None, tyro.conf.arg(metavar="S,S", help_behavior_hint="")] = None
+    """of a video, seconds of the two instead: the first frame at or after each"""
     images: Annotated[tuple[Path, Path] | None, tyro.conf.arg(metavar="LEFT RIGHT", help_behavior_hint="")] = None
     """both images (png, jpg, ...), to draw the matches on"""
     size: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="W H", help_behavior_hint="")] = None
@@ -57,8 +66,11 @@ class Segment:
 
     def run(self) -> int:
         """Read, segment, write, and say what was found."""
-        inputs = [path.expanduser() for path in (self.file, *(self.images or ()))]
+        inputs = [path.expanduser() for path in (*self.files, *(self.images or ()))]
         self._check()
+        scene, asked = is_scene([path.expanduser() for path in self.files]), Asked(self.frames, self.at)
+        self._check_scene(scene, asked)
+        inputs = inputs_of(inputs) if scene else inputs
         from indexing.files import manifest
         from indexing.report.segmentation import FILES, SegmentationReport, write_segmentation
 
@@ -67,9 +79,10 @@ class Segment:
         with progress("reading", steps=False):
             from indexing.readers.pairs import read_image, read_pair
 
-            pair = read_pair(self.file, self.pair)
-            photographs = [read_image(path) for path in self.images or ()]
-        notes = self._notes(pair, photographs)
+            tracks = follow(self.files, asked, views=2) if scene else None
+            pair = as_pair(tracks, self.files[0]) if tracks else read_pair(self.files[0], self.pair)
+            shown = photographs(tracks) if tracks else [read_image(path) for path in self.images or ()]
+        notes = [*(tracks.notes if tracks else ()), *self._notes(pair, shown)]
         read = time.perf_counter()
         with progress(f"segmenting {count(int(pair.seen.sum()), 'match', 'matches')}", steps=False):
             result = self._solve(pair)
@@ -80,12 +93,13 @@ class Segment:
         report = SegmentationReport(
             result=result,
             pair=pair,
-            photographs=photographs,
+            photographs=shown,
             size=self.size or pair.size,
             heading=self.title or "",
             notes=notes,
             words=WORDS,
             manifest=manifest({"command": "segment", **dataclasses.asdict(self)}, inputs, self.seed, timings),
+            besides={"tracks.csv": tracks_csv(tracks)} if tracks else {},
         )
         page = None
         if folder is not None:
@@ -107,7 +121,20 @@ class Segment:
         if self.seed < 0:
             raise ValueError(f"--seed must be a whole number from 0, got {self.seed}")
 
-    def _notes(self, pair: MatchedPair, photographs: list[Photograph]) -> list[str]:
+    def _check_scene(self, scene: bool, asked: Asked) -> None:
+        """Raise on flags that do not fit what is given."""
+        if not self.files:
+            raise ValueError("no matches; give a file with x1, x2, or a video")
+        if not scene and len(self.files) > 1:
+            raise ValueError(f"{len(self.files)} files; give one file of matches, or pictures alone")
+        if not scene and self.frames is not None:
+            raise ValueError(f"--frames {self.frames}: {LEFT_OUT}; leave it out")
+        asked.check(scene)
+        for flag in ("pair", "images", "size"):
+            if scene and getattr(self, flag) is not None:
+                raise ValueError(f"--{flag} is of files of matches, and a video or pictures are given; leave it out")
+
+    def _notes(self, pair: MatchedPair, shown: list[Photograph]) -> list[str]:
         """What to say about the input.
 
         Raises:
@@ -131,13 +158,13 @@ class Segment:
                 raise ValueError(f"{pair.path}: {said}: give --threshold in the unit of the points, or --threshold auto")
             notes.append(f"{said}; if they are not in pixels, give --threshold in their unit, or auto")
         size = self.size or pair.size
-        frames = [(photograph.name, photograph.size) for photograph in photographs]
+        frames = [(photograph.name, photograph.size) for photograph in shown]
         frames = frames or [(f"image {i}", size) for i in (1, 2) if size is not None]
         for (name, (wide, tall)), points in zip(frames, (pair.x1[seen], pair.x2[seen]), strict=False):
             out = int(((points < -0.5) | (points > np.array([wide, tall]) - 0.5)).any(axis=1).sum())
             if out > OUTSIDE * number:
                 said = f"{out:,} of {number:,} matches lie outside of {name} ({wide:g} by {tall:g})"
-                what = "images" if photographs else "size of the images"
+                what = "images" if shown else "size of the images"
                 notes.append(f"{said}; give the {what} in which the matches were found, in their order, and x before y")
         return notes
 

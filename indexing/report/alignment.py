@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from string import ascii_uppercase
@@ -14,11 +15,12 @@ from numpy.typing import NDArray
 
 from dyntorch.numerics import worded
 from indexing.readers.matches import Matched
-from indexing.report.canvas import LIGHT, new_figure, png, shorten, style
+from indexing.readers.pairs import Photograph
+from indexing.report.canvas import DARK, LIGHT, Theme, draw_photograph, new_figure, png, shorten, style
 from indexing.report.page import Picture, ResultReport, markup, render, safe_cell, sentence, table_csv, write_files
 
 FloatArray = NDArray[np.float64]
-FILES = ("report.html", "alignment.json", "labels.csv", "alignment.png")
+FILES = ("report.html", "alignment.json", "labels.csv", "alignment.png", "tracks.csv")
 LABELS = ("outlier", "static", "moving")
 ROUNDING = 1e-14  # of the largest entry: what arithmetic leaves of a deviation that is zero (measured: 3e-17)
 PURPOSE = {
@@ -40,11 +42,13 @@ class AlignmentReport(ResultReport):
         read: the matches.
         model: how points may move, and what the sensor may do.
         threshold: greatest distance of an inlier; None = estimated.
+        photographs: of the views; empty = none.
     """
 
     read: Matched
     model: str
     threshold: float | None = None
+    photographs: Sequence[Photograph] = ()
 
     TITLES = ("What moved, and how the sensor did", "The matches do not decide")
 
@@ -153,12 +157,14 @@ def write_alignment(folder: str | Path, report: AlignmentReport) -> Path:
         ValueError: the folder or a file in it cannot be written.
     """
     drawn = picture_of(report)
+    picture = Picture(drawn, dark=picture_of(report, DARK) if report.photographs else None)
     turns = []
     if report.model == "rigid":
         turns = [(angle, shift, float(np.linalg.norm(shift))) for angle, shift in map(turn_and_shift, report.motion)]
     motions = [(name, view, [[row[0], *map(_cell, row[1:])] for row in rows], one) for name, view, rows, one in report.shown]
-    html = render("alignment", report, summary=describe(report), picture=Picture(drawn), motions=motions, turns=turns)
-    contents = {"alignment.png": drawn, "labels.csv": labels_csv(report), "alignment.json": as_json(report), "report.html": html}
+    html = render("alignment", report, summary=describe(report), picture=picture, motions=motions, turns=turns)
+    contents = {"alignment.png": drawn, "labels.csv": labels_csv(report), "alignment.json": as_json(report), "tracks.csv": None}
+    contents |= {**report.besides, "report.html": html}
     return write_files(folder, contents)
 
 
@@ -271,23 +277,27 @@ WIDTH, MARGIN, GAP, TITLE, FOOT = 10.2, 0.65, 0.6, 0.3, 0.35  # inches
 WIDE = 0.62  # height over width of view 1, below which it gets the whole width
 
 
-def picture_of(report: AlignmentReport) -> bytes:
+def picture_of(report: AlignmentReport, theme: Theme = LIGHT) -> bytes:
     """PNG: view 1, large, with the path of every moving match carried over from the other views; beside it the other views."""
     kinds = np.array(report.kinds) if report.solved else np.where(report.missing, "missing", "unlabelled")
-    colours = {**COLOURS, "unlabelled": LIGHT.muted}
+    colours = {**COLOURS, "unlabelled": theme.muted}
     segments = report.segments
     axes_shown, turned = _axes(report)
     # three views are drawn; the paths are those of all
     flat = [view[..., axes_shown] for view in report.views[:3]]
     boxes = [_box(points, kinds) for points in flat]
-    if report.solved:
+    if report.photographs:
+        boxes = [(-0.5, wide - 0.5, -0.5, tall - 0.5) for wide, tall in (one.size for one in report.photographs)]
+    elif report.solved:
         boxes[0] = _widened(boxes[0], report, kinds, axes_shown)
-    with style():
+    with style(theme):
         height, places = _layout([(box[3] - box[2]) / (box[1] - box[0]) for box in boxes])
         figure = new_figure(WIDTH, height)
         for number, (points, place, box) in enumerate(zip(flat, places, boxes, strict=True), start=1):
             left, top, width, tall = place
             panel = figure.add_axes((left / WIDTH, 1 - (top + tall) / height, width / WIDTH, tall / height))
+            if report.photographs:
+                draw_photograph(panel, report.photographs[number - 1], theme)
             if number == 1 and report.solved:
                 _draw_paths(panel, report, kinds, axes_shown, box)
             _draw_points(panel, points, kinds, colours, large=number == 1, segments=segments)
@@ -296,7 +306,7 @@ def picture_of(report: AlignmentReport) -> bytes:
             if number == 1:
                 panel.set_xlabel("xyz"[axes_shown[0]])
                 panel.set_ylabel("xyz"[axes_shown[1]])
-        _legend(figure, kinds, colours, segments)
+        _legend(figure, kinds, colours, segments, theme.ink)
         return png(figure, tight=True)
 
 
@@ -466,7 +476,7 @@ def _finish(panel: Any, box: Box, turned: bool) -> None:
         side.set_linewidth(0.8)
 
 
-def _legend(figure: Any, kinds: NDArray[Any], colours: dict[str, str], segments: bool) -> None:
+def _legend(figure: Any, kinds: NDArray[Any], colours: dict[str, str], segments: bool, ink: str) -> None:
     from matplotlib.lines import Line2D
 
     handles = []
@@ -492,5 +502,5 @@ def _legend(figure: Any, kinds: NDArray[Any], colours: dict[str, str], segments:
         bbox_to_anchor=(0.5, 0.25 / figure.get_figheight()),
         ncols=4,
         frameon=False,
-        labelcolor=LIGHT.ink,
+        labelcolor=ink,
     )

@@ -16,10 +16,12 @@ from numpy.typing import NDArray
 
 from indexing.cameras import y_up
 from indexing.clip import Clip
+from indexing.readers.pairs import Photograph
 from indexing.report.page import markup
 from indexing.skeleton import known
 
 DPI = 150
+FADE = (0.62, 0.78)  # how much of white and of dark paper is laid over a photograph
 FONT = "DejaVu Sans"
 # Matplotlib's own font has no Chinese, Japanese, Korean, Hindi or Arabic letters; those of these fonts that are installed help out.
 FALLBACKS = (
@@ -261,3 +263,14 @@ def _stray(values: NDArray[np.float64]) -> NDArray[np.bool_]:
     low, high = np.percentile(values[~np.isnan(values)], [10, 90])
     spread = high - low
     return (values < low - 2 * spread) | (values > high + 2 * spread) if spread > 0 else np.zeros(values.shape, dtype=bool)
+
+
+def draw_photograph(panel: Any, photograph: Photograph, theme: Theme) -> None:
+    """The image in gray, faded into the paper, so that the colours of what is drawn on it stand out."""
+    from matplotlib.colors import to_rgb
+
+    wide, tall = photograph.size
+    paper = np.array(to_rgb(theme.paper))
+    fade = FADE[int(paper.mean() < 0.5)]
+    shown = (1 - fade) * photograph.gray[..., None] + fade * paper
+    panel.imshow(shown, extent=(-0.5, wide - 0.5, tall - 0.5, -0.5), interpolation="bilinear", zorder=0)

@@ -86,6 +86,7 @@ class ResultReport:
         notes: what a reader should know about the input, a sentence each.
         words: what whoever reads the report calls the arguments that sentences of the library speak of.
         manifest: of :func:`indexing.files.manifest`.
+        besides: further files of the report, by their names.
     """
 
     result: Any
@@ -93,6 +94,7 @@ class ResultReport:
     notes: Sequence[str] = ()
     words: Callable[[str, str | None], str] = as_python
     manifest: Mapping[str, Any] = field(default_factory=dict)
+    besides: Mapping[str, Any] = field(default_factory=dict)
 
     TITLES: ClassVar[tuple[str, str]] = ("", "")
     """The heading where the data decide, and where they do not."""

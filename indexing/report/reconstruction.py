@@ -12,12 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dyntorch.numerics import worded
+from indexing.readers.pairs import Photograph
 from indexing.readers.tracks import TrackSet
+from indexing.report.canvas import DARK
 from indexing.report.page import Picture, ResultReport, markup, matrix, npz, render, safe_cell, sentence, table_csv, write_files
 from indexing.report.reconstruction_picture import scene_picture, tracks_picture
 
 FloatArray = NDArray[np.float64]
-FILES = ("report.html", "reconstruction.npz", "reconstruction.json", "points.csv", "tracks.png", "scene.png")
+FILES = ("report.html", "reconstruction.npz", "reconstruction.json", "points.csv", "tracks.png", "scene.png", "tracks.csv")
 ROUNDING = 1e-12
 LABELS = (("outlier", "static", "moving"), ("outlier", "body 1", "body 2"))
 ARRAYS = ("cameras", "points", "residuals", "inliers", "structure", "projections")
@@ -43,10 +45,12 @@ class ReconstructionReport(ResultReport):
     Args:
         tracks: what was given, with times from 0.
         threshold: as given; None = estimated, or no outliers.
+        photograph: of the first view; None = none.
     """
 
     tracks: TrackSet
     threshold: float | None = None
+    photograph: Photograph | None = None
 
     TITLES = ("What moves, and how", "The tracks do not decide")
 
@@ -181,9 +185,11 @@ def write_reconstruction(folder: str | Path, report: ReconstructionReport) -> Pa
     """
     tracks = tracks_picture(report)
     scene = scene_picture(report) if report.drawable else None
-    values = {"summary": describe(report), "scene": scene and Picture(scene), "picture": Picture(tracks), **tables(report)}
+    picture = Picture(tracks, dark=tracks_picture(report, DARK) if report.photograph is not None else None)
+    values = {"summary": describe(report), "scene": scene and Picture(scene), "picture": picture, **tables(report)}
     contents: dict[str, Any] = {"tracks.png": tracks, "scene.png": scene, "points.csv": points_csv(report)}
-    contents |= {"reconstruction.npz": as_npz(report), "reconstruction.json": as_json(report)}
+    contents |= {"reconstruction.npz": as_npz(report), "reconstruction.json": as_json(report), "tracks.csv": None}
+    contents |= report.besides
     contents["report.html"] = render("reconstruction", report, **values)
     return write_files(folder, contents)
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from indexing.report.canvas import LIGHT, new_figure, png, shorten, style
+from indexing.report.canvas import LIGHT, Theme, draw_photograph, new_figure, png, shorten, style
 
 if TYPE_CHECKING:
     from indexing.report.reconstruction import ReconstructionReport
@@ -100,7 +100,7 @@ def sample(paths: FloatArray, box: tuple[FloatArray, FloatArray]) -> NDArray[np.
     return np.linspace(0, count - 1, TANGLE).round().astype(np.intp) if long else np.arange(min(count, SHOWN))
 
 
-def legend(figure: Any, kinds: NDArray[Any]) -> None:
+def legend(figure: Any, kinds: NDArray[Any], ink: str = LIGHT.ink) -> None:
     """How many tracks of every kind, at the foot of the figure."""
     from matplotlib.lines import Line2D
 
@@ -111,7 +111,7 @@ def legend(figure: Any, kinds: NDArray[Any]) -> None:
             name = f"{number:,} {kind}{'s' * (kind == 'outlier' and number > 1)}" if " " not in kind else f"{kind}: {number:,}"
             mark = "x" if kind == "outlier" else "o"
             handles.append(Line2D([], [], color=colour_of(kind), marker=mark, linestyle="", markersize=5, label=name))
-    foot(figure, handles)
+    foot(figure, handles, ink=ink)
 
 
 def foot(figure: Any, handles: list[Any], columns: int = 4, ink: str = LIGHT.ink) -> None:
@@ -277,7 +277,7 @@ GAP, LEFT, TRACKS_TALL = 0.55, 0.45, 5.2  # inches; the last is the greatest hei
 TRACKS_STRAYS = 0.995  # of the positions, those that a panel shows
 
 
-def tracks_picture(report: ReconstructionReport) -> bytes:
+def tracks_picture(report: ReconstructionReport, theme: Theme = LIGHT) -> bytes:
     """PNG: the tracks through all views in the first one; beside them the same without the motion of the camera."""
     kinds = kinds_of(report)
     measured = report.tracks.values[..., shown_axes(report.tracks.values)]
@@ -289,13 +289,17 @@ def tracks_picture(report: ReconstructionReport) -> bytes:
         panels.append((still[..., shown_axes(report.tracks.values)], "as the first camera would see it, standing still"))
     kept = [points[:, kinds != "missing"] for points, _ in panels]
     boxes = [limits(points, TRACKS_STRAYS) for points in kept]
+    if report.photograph is not None:
+        boxes[0] = np.array([-0.5, -0.5]), np.array(report.photograph.size) - 0.5
     down = report.tracks.values.shape[-1] == 2
-    with style():
+    with style(theme):
         figure, places = layout(boxes, TRACKS_TALL, LEFT, GAP)
         for panel, (points, title), box in zip(places, panels, boxes, strict=True):
+            if report.photograph is not None and panel is places[0]:
+                draw_photograph(panel, report.photograph, theme)
             _draw(panel, points, kinds)
             finish(panel, *box, down, title)
-        legend(figure, kinds)
+        legend(figure, kinds, theme.ink)
         return png(figure, tight=True)
 
 

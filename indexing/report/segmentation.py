@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from indexing.opening import count
 from indexing.readers.pairs import MatchedPair, Photograph
-from indexing.report.canvas import DARK, LIGHT, Theme, new_figure, png, shorten, style
+from indexing.report.canvas import DARK, LIGHT, Theme, draw_photograph, new_figure, png, shorten, style
 from indexing.report.page import (
     Picture,
     ResultReport,
@@ -28,7 +28,7 @@ from indexing.report.page import (
 from indexing.report.reconstruction_picture import finish, foot, layout, limits, sample
 
 FloatArray = NDArray[np.float64]
-FILES = ("report.html", "segmentation.npz", "segmentation.json", "labels.csv", "segmentation.png")
+FILES = ("report.html", "segmentation.npz", "segmentation.json", "labels.csv", "segmentation.png", "tracks.csv")
 SURE = 0.9  # probability of its label below which a match is called doubtful
 MOTION = {
     "fundamental": "fundamental matrix: a rigid body with depth",
@@ -154,6 +154,8 @@ def write_segmentation(folder: str | Path, report: SegmentationReport) -> Path:
             "labels.csv": labels_csv(report),
             "segmentation.npz": as_npz(report),
             "segmentation.json": as_json(report),
+            "tracks.csv": None,
+            **report.besides,
             "report.html": html,
         },
     )
@@ -262,7 +264,6 @@ COLOURS = ("#2f7fb8", "#e8741e", "#2fa36b", "#c2478f", "#b99a0d", "#7d62c9", "#1
 MARKS = ("o", "s", "^", "D")  # one for every round through the colours
 WIDTH, TALL, EDGE, GAP, HEAD, TICKS, FOOT = 10.2, 5.2, 0.45, 0.5, 0.32, 0.3, 0.5  # inches
 WIDE = 0.42  # height over width below which images are drawn one above the other
-FADE = (0.62, 0.78)  # how much of white and of dark paper is laid over a photograph
 STRAYS = 0.995  # of the matches, those that a panel without image shows
 SLIM = 0.2  # least ratio of the sides of such a panel
 
@@ -287,7 +288,7 @@ def picture_of(report: SegmentationReport, theme: Theme = LIGHT) -> bytes:
         figure, panels = _panels(boxes, bool(report.photographs))
         for i, (panel, points, photograph, box) in enumerate(zip(panels, places, photographs, boxes, strict=True)):
             if photograph is not None:
-                _draw_photograph(panel, photograph, theme)
+                draw_photograph(panel, photograph, theme)
             _draw_outliers(panel, points[report.pair.seen & (report.found.labels == 0)], size, theme)
             for label in range(1, report.bodies + 1):  # the small ones on top: dense bodies would hide them otherwise
                 mine = report.pair.seen & (report.found.labels == label)
@@ -332,17 +333,6 @@ def _panels(boxes: list[Box], bare: bool) -> tuple[Any, list[Any]]:
         panels.append(figure.add_axes((edge / WIDTH, 1 - top / height, wide / WIDTH, tall / height)))
         top += ticks
     return figure, panels
-
-
-def _draw_photograph(panel: Any, photograph: Photograph, theme: Theme) -> None:
-    """The image in gray, faded into the paper, so that the colours of the bodies stand out on it."""
-    from matplotlib.colors import to_rgb
-
-    wide, tall = photograph.size
-    paper = np.array(to_rgb(theme.paper))
-    fade = FADE[int(paper.mean() < 0.5)]
-    shown = (1 - fade) * photograph.gray[..., None] + fade * paper
-    panel.imshow(shown, extent=(-0.5, wide - 0.5, tall - 0.5, -0.5), interpolation="bilinear", zorder=0)
 
 
 def _draw_outliers(panel: Any, points: FloatArray, size: float, theme: Theme) -> None:

@@ -90,6 +90,10 @@ class SceneOptions:
     patches of 11 / 15 / 21 pixels: a plane .001 / 0 / .002, a room .021 / .029 / .042."""
     views: int = 3
     """Pictures taken where nobody says which."""
+    several: int = 8
+    """The same for ``dyntorch reconstruct``, which compares many models of motion."""
+    present: float = 0.6
+    """Share of the pictures taken in which a point must be seen, where it may be missing in some."""
     lasting: float = 0.5
     """Share of the points of the first picture that must still be followed in the last one taken, where nobody says which."""
     anchored: float = 1.0
@@ -101,4 +105,6 @@ class SceneOptions:
     fewest: int = 12
     """Points that must be there in two pictures."""
     rest: float = 1.0
-    """Pixels, of the working image: where fewer points than those go beyond it, nothing moves."""
+    """Pixels, of the working image, that a point which rests before a resting camera stays within."""
+    movers: int = 4
+    """Points that must go beyond that: with fewer, nothing moves."""

@@ -75,7 +75,7 @@ def track_scene(
         every: every so many frames, instead.
         views: how many to take where none of these says it: evenly from the first one to the last in which half of its points are
             still followed; 3 by default.
-        missing: whether a point may be missing in some of them (two are enough), or must be in all.
+        missing: whether a point may be missing in some of them (``options.present``), or must be in all.
         fps: frames per second of pictures and of files without times.
         options: every number that decides.
 
@@ -105,7 +105,8 @@ def track_scene(
     taken = wanted.taken(times, first, _name(source))
     pictures = _pictures(stream, taken)
     scale = getattr(stream, "scale", (1.0, 1.0))
-    positions = _seen(_anchored(_at(book, [k - first for k in taken]), pictures, options), missing)
+    least = max(2, round(options.present * len(taken))) if missing else len(taken)
+    positions = _seen(_anchored(_at(book, [k - first for k in taken]), pictures, options), least)
     shape = pictures[0].shape
     shown = (round(shape[1] / scale[0]), round(shape[0] / scale[1]))
     _check(positions, taken, _name(source), options)
@@ -236,10 +237,9 @@ def _at(book: Book, places: list[int]) -> Floats:
     return np.stack(kept, axis=1) if kept else np.zeros((len(places), 0, 2))
 
 
-def _seen(positions: Floats, missing: bool) -> Floats:
-    """Those that are in all pictures, or in two."""
-    count = np.isfinite(positions[..., 0]).sum(axis=0)
-    return positions[:, count >= (2 if missing else len(positions))]
+def _seen(positions: Floats, least: int) -> Floats:
+    """Those that are in so many pictures."""
+    return positions[:, np.isfinite(positions[..., 0]).sum(axis=0) >= least]
 
 
 def _anchored(positions: Floats, pictures: Images, options: SceneOptions) -> Floats:
@@ -280,7 +280,7 @@ def _check(positions: Floats, taken: list[int], name: str, options: SceneOptions
     with np.errstate(invalid="ignore"):
         low, high = np.nanmin(positions, axis=0), np.nanmax(positions, axis=0)
     moving = int((np.linalg.norm(high - low, axis=1) > options.rest).sum())
-    if moving < options.fewest:
+    if moving < options.movers:
         said = f"{name}: nothing moves: {count - moving} of {count} points stay within {options.rest:g} pixel in {where}"
         raise ValueError(f"{said}; take frames further apart")
 

@@ -1,0 +1,186 @@
+"""Videos and pictures as inputs of align, reconstruct and segment: points followed through the frames asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from indexing.readers.files import VIDEOS
+
+if TYPE_CHECKING:
+    from indexing.readers.matches import Matched
+    from indexing.readers.pairs import MatchedPair, Photograph
+    from indexing.readers.tracks import TrackSet
+    from indexing.video.scene import SceneTracks
+
+PICTURE_FILES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+LEFT_OUT = "it is for a video or a sequence of pictures"
+
+
+def is_scene(paths: Sequence[Path]) -> bool:
+    """Whether the inputs are pixels: a video, a folder, a pattern, or nothing but pictures.
+
+    Raises:
+        ValueError: several videos, or a video and something else.
+    """
+    kinds = [_kind(path) for path in paths]
+    if not any(kinds):
+        return False
+    if set(kinds) != {"picture"} and len(paths) > 1:
+        odd = next(path for path, kind in zip(paths, kinds, strict=True) if kind != "")
+        what = "is a folder" if odd.is_dir() else "is a video" if _kind(odd) == "video" else "is a picture"
+        raise ValueError(
+            f"{odd}: {what}, and {len(paths)} inputs are given; give one video, one folder of pictures, or pictures alone"
+        )
+    return True
+
+
+def _kind(path: Path) -> str:
+    if path.is_dir() or (any(sign in str(path) for sign in "*?[") and not path.exists()):
+        return "sequence"
+    return "video" if path.suffix.lower() in VIDEOS else "picture" if path.suffix.lower() in PICTURE_FILES else ""
+
+
+@dataclass(frozen=True)
+class Asked:
+    """Which frames the flags ask for."""
+
+    frames: str | None = None
+    at: str | None = None
+    every: int | None = None
+
+    def check(self, scene: bool) -> None:
+        """Raise on flags that contradict each other, or that belong to videos where none is given."""
+        given = [name for name in ("frames", "at", "every") if getattr(self, name) is not None]
+        wrong = [name for name in given if name != "frames"]
+        if wrong and not scene:
+            raise ValueError(f"--{wrong[0]} {getattr(self, wrong[0])}: {LEFT_OUT}; leave it out")
+        if scene and len(given) > 1:
+            raise ValueError(f"--{given[0]} and --{given[1]} both say which frames to take; leave one out")
+        if self.every is not None and self.every < 1:
+            raise ValueError(f"--every must be a whole number from 1, got {self.every}")
+
+    def numbers(self) -> list[int] | None:
+        """Those of ``--frames``.
+
+        Raises:
+            ValueError: something else than whole numbers that increase.
+        """
+        return None if self.frames is None else [int(value) for value in _increasing("frames", self.frames, int, "0,20,40")]
+
+    def moments(self) -> list[float] | None:
+        """Those of ``--at``, in seconds.
+
+        Raises:
+            ValueError: something else than numbers that increase.
+        """
+        return None if self.at is None else [float(value) for value in _increasing("at", self.at, float, "0,0.8,1.6")]
+
+
+def _increasing(flag: str, text: str, kind: Any, example: str) -> list[Any]:
+    try:
+        found = [kind(word) for word in text.split(",")]
+    except ValueError:
+        raise ValueError(f"--{flag} {text!r}: expected numbers with commas between them, such as --{flag} {example}") from None
+    if found != sorted(set(found)) or not all(0 <= value < float("inf") for value in found):
+        raise ValueError(f"--{flag} {text!r}: numbers are from 0 and increase, such as --{flag} {example}")
+    return found
+
+
+def follow(
+    paths: Sequence[Path], asked: Asked, *, views: int | None = None, missing: bool = False, fps: float | None = None
+) -> SceneTracks:
+    """Points of a video or of pictures, in the frames asked for.
+
+    Args:
+        paths: one video, folder or pattern; or pictures.
+        asked: by flags.
+        views: frames that are taken; None = any number, and some where no flag says which.
+        missing: whether a point may be missing in some.
+        fps: of pictures.
+
+    Raises:
+        ValueError: flags that make no sense, or as :func:`indexing.video.track_scene`.
+    """
+    from indexing.video.options import SceneOptions
+    from indexing.video.scene import track_scene
+    from indexing.video.sequence import PictureSequence, in_order
+
+    numbers, moments = asked.numbers(), asked.moments()
+    for flag, given in (("frames", numbers), ("at", moments)):
+        if given is not None and (len(given) != views if views else len(given) < 2):
+            said = f"--{flag} {getattr(asked, flag)}: {len(given)} given"
+            raise ValueError(f"{said}, {views} are needed" if views else f"{said}, at least 2 are needed")
+    files = [path.expanduser() for path in paths]
+    source: Any = files[0] if len(files) == 1 else in_order(files)
+    if moments is not None and fps is None and _kind(files[0]) != "video":
+        frames = len(PictureSequence(source))
+        raise ValueError(f"--at {asked.at}: pictures have no times; give their numbers, --frames with some of 0 to {frames - 1}")
+    few = None if numbers or moments or asked.every else views or SceneOptions().several
+    return track_scene(source, frames=numbers, at=moments, every=asked.every, views=few, missing=missing, fps=fps)
+
+
+def inputs_of(paths: Sequence[Path]) -> list[Path]:
+    """The files that are read, for the manifest."""
+    from indexing.video.sequence import is_pattern, pictures_of
+
+    found = []
+    for path in (path.expanduser() for path in paths):
+        found += pictures_of(path) if path.is_dir() or is_pattern(path) else [path]
+    return found
+
+
+def photographs(tracks: SceneTracks) -> list[Photograph]:
+    """The frames taken, to draw on."""
+    import numpy as np
+
+    from indexing.readers.pairs import Photograph
+
+    size = (float(tracks.size[0]), float(tracks.size[1]))
+    gray = [np.divide(image, 255, dtype=np.float32) for image in tracks.pictures]
+    return [Photograph(f"frame {k}", image, size) for k, image in zip(tracks.frames, gray, strict=True)]
+
+
+def named(tracks: SceneTracks) -> tuple[str, ...]:
+    """Names of the points: their numbers, from 1."""
+    return tuple(str(i + 1) for i in range(tracks.points.shape[1]))
+
+
+def as_matches(tracks: SceneTracks) -> Matched:
+    """As files of points for each view would give them."""
+    from indexing.readers.matches import Matched
+
+    views = tuple(view.numpy() for view in tracks.points)
+    return Matched(views, named(tracks), tuple(f"frame {k}" for k in tracks.frames), notes=tracks.notes)
+
+
+def as_pair(tracks: SceneTracks, path: Path) -> MatchedPair:
+    """As a file of matches would give them."""
+    from indexing.readers.pairs import MatchedPair
+
+    x1, x2 = (view.numpy() for view in tracks.points)
+    size = (float(tracks.size[0]), float(tracks.size[1]))
+    return MatchedPair(str(path), path.name, x1, x2, named(tracks), size=size)
+
+
+def as_tracks(tracks: SceneTracks, path: Path, timed: bool) -> TrackSet:
+    """As a table of tracks would give them."""
+    from indexing.readers.tracks import TrackSet
+
+    times = tracks.times.numpy() if timed else None
+    return TrackSet(str(path), tracks.points.numpy(), named(tracks), tuple(map(str, tracks.frames)), times, notes=tracks.notes)
+
+
+def tracks_csv(tracks: SceneTracks) -> str:
+    """``frame, time, id, x, y`` of every point in every frame that shows it: what ``dyntorch reconstruct`` reads, too."""
+    import numpy as np
+
+    from indexing.report.page import table_csv
+
+    rows: list[list[object]] = []
+    for k, moment, view in zip(tracks.frames, tracks.times.tolist(), tracks.points.numpy(), strict=True):
+        for i in np.flatnonzero(np.isfinite(view[:, 0])).tolist():
+            rows.append([k, f"{moment:.6g}", i + 1, f"{view[i, 0]:.4f}", f"{view[i, 1]:.4f}"])
+    return table_csv(["frame", "time", "id", "x", "y"], rows)
