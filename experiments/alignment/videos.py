@@ -27,12 +27,13 @@ from dyntorch import metrics
 from experiments.common.tables import Row, command, measured_on_one_thread, note
 from experiments.recognition.protocol import data_folder
 from indexing.actors.sheets import RenderedVideo, render, sheet
-from indexing.video import Chunk, SceneTracks, track_scene
+from indexing.video import Chunk, SceneOptions, SceneTracks, track_scene
 
 Floats = NDArray[np.float64]
 SIZE = (480, 360)
 CAMERA = np.array([[450.0, 0, 239.5], [0, 450.0, 179.5], [0, 0, 1]])
 FPS = 25.0
+THRESHOLD = SceneOptions().threshold
 RECORDED = ("pose2sim/cam01.mp4", "pose2sim/cam02.mp4")
 
 
@@ -96,7 +97,8 @@ def room_scene(config: Config, seed: int) -> RenderedVideo:
         ((-0.6, -0.6, 0.6), (0, 0, -1.2), (0, 1.2, 0)),
         ((-0.6, -0.6, 0.6), (1.2, 0, 0), (0, 0, -1.2)),
     )
-    sheets = [sheet(*where, 0, generator) for where in standing] + [sheet(*face, 170, 1, generator) for face in faces]
+    sheets = [sheet(corner, right, down, pixels, 0, generator) for corner, right, down, pixels in standing]
+    sheets += [sheet(corner, right, down, 170, 1, generator) for corner, right, down in faces]
     motions = np.tile(np.eye(4), (config.frames, 2, 1, 1))
     velocity, axis = rng.uniform((0, -0.5, -0.5), (1, 0.5, 0.5)), rng.normal(size=3)
     for i, t in enumerate(time):
@@ -138,7 +140,7 @@ def aligned(config: Config) -> list[Row]:
         video = planar_scene(config, seed)
         tracks = followed(video, views=3)
         tracks_of.append(track_errors(video, tracks))
-        found = dyn.align_planar(*tracks.points, generator=torch.Generator().manual_seed(0))
+        found = dyn.align_planar(*tracks.points, threshold=THRESHOLD, generator=torch.Generator().manual_seed(0))
         solved += int(found.status == dyn.Status.OK)
         shown = video.shown(tracks.points[0].numpy(), tracks.frames[0])
         truth = np.where(video.bodies[shown] > 0, 2, 1)
@@ -220,7 +222,8 @@ def recordings(config: Config) -> list[Row]:
     rows = []
     for name in RECORDED:
         tracks = track_scene(data_folder() / name, views=3)
-        found = dyn.align_planar(*tracks.points, generator=torch.Generator().manual_seed(0))
+        shrunk = max(1.0, max(tracks.size) / SceneOptions().follow.working)
+        found = dyn.align_planar(*tracks.points, threshold=shrunk * THRESHOLD, generator=torch.Generator().manual_seed(0))
         still = torch.eye(3, dtype=torch.float64)
         size = (float(tracks.size[0]), float(tracks.size[1]))
         off = max(float(metrics.grid_transfer_error(matrix, still, *size)) for matrix in (found.A, found.B))

@@ -46,8 +46,9 @@ class Align:
     background included"""
     model: Annotated[Model | None, tyro.conf.arg(help_behavior_hint="")] = None
     """how points may move, and the sensor; by default planar for 2D points, rigid for 3D points, lines for lines"""
-    threshold: Annotated[float | Literal["auto"], tyro.conf.arg(metavar="T|auto")] = "auto"
-    """greatest distance of an inlier in the unit of the files: three times the noise of a coordinate; auto estimates it"""
+    threshold: Annotated[float | Literal["auto"] | None, tyro.conf.arg(metavar="T|auto", help_behavior_hint="")] = None
+    """greatest distance of an inlier in the unit of the files: three times the noise of a coordinate; auto estimates it (the
+    default but for videos, where it is one pixel)"""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
     """where to write report.html, alignment.json, labels.csv, alignment.png (and tracks.csv of a video); without it, print only"""
     frames: Annotated[str | None, tyro.conf.arg(metavar="N,N,N", help_behavior_hint="")] = None
@@ -70,23 +71,26 @@ class Align:
         asked.check(scene)
         inputs = inputs_of(inputs) if scene else inputs
         from indexing.files import manifest
-        from indexing.report.alignment import FILES, AlignmentReport, write_alignment
+        from indexing.report.alignment import WRITTEN, AlignmentReport, write_alignment
 
-        folder = check_report(self.out, inputs, FILES)
+        folder = check_report(self.out, inputs, WRITTEN)
         started = time.perf_counter()
         with progress("reading", steps=False):
             matched, tracks = self._read(asked if scene else None)
         model, notes = self._model(matched)
+        threshold = self._limit(tracks)
+        if self.threshold is None and threshold is not None:
+            notes.append(f"threshold {threshold:.3g} px, that of points followed through videos; --threshold says otherwise")
         read = time.perf_counter()
         with progress(f"aligning {count(len(matched.ids), 'match', 'matches')}", steps=False):
-            result = self._solve(matched, model)
+            result = self._solve(matched, model, threshold)
         timings = {"read": read - started, "align": time.perf_counter() - read}
         arguments = {"command": "align", **dataclasses.asdict(self), "model": model}
         report = AlignmentReport(
             result=result,
             read=matched,
             model=model,
-            threshold=None if self.threshold == "auto" else float(self.threshold),
+            threshold=threshold,
             notes=[*notes, *matched.notes],
             words=WORDS,
             manifest=manifest(arguments, inputs, self.seed, timings),
@@ -104,7 +108,7 @@ class Align:
         """Raise on flags that make no sense by themselves, before any file is read."""
         if not self.files:
             raise ValueError("no files; give a file of points for each view, or one .npz or .c3d with all of them")
-        if self.threshold != "auto" and not 0 < float(self.threshold) < float("inf"):
+        if self.threshold not in ("auto", None) and not 0 < float(self.threshold) < float("inf"):
             raise ValueError(f"--threshold must be a positive distance in the unit of the files or auto, got {self.threshold}")
         if self.seed < 0:
             raise ValueError(f"--seed must be a whole number from 0, got {self.seed}")
@@ -155,7 +159,16 @@ class Align:
         hint = f"; if their scale or axes are not to be trusted, say --model with one of {others}" if given == "rigid" else ""
         return given, [f"model {given}, because the files hold {kind}{hint}"]
 
-    def _solve(self, matched: Matched, model: str) -> Any:
+    def _limit(self, tracks: SceneTracks | None) -> float | None:
+        """The threshold as the library takes it; None = estimated."""
+        if self.threshold is None and tracks is not None:
+            from indexing.video.options import SceneOptions
+
+            options = SceneOptions()
+            return options.threshold * max(1.0, max(tracks.size) / options.follow.working)
+        return None if self.threshold in ("auto", None) else float(self.threshold)
+
+    def _solve(self, matched: Matched, model: str, threshold: float | None) -> Any:
         """The alignment, by the library.
 
         Raises:
@@ -167,7 +180,7 @@ class Align:
 
         views = [torch.from_numpy(view) for view in matched.views]
         options: dict[str, Any] = {
-            "threshold": None if self.threshold == "auto" else float(self.threshold),
+            "threshold": threshold,
             "weights": None if matched.weights is None else torch.from_numpy(matched.weights),
             "generator": torch.Generator().manual_seed(self.seed),
         }

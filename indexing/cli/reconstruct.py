@@ -15,8 +15,7 @@ import tyro
 from dyntorch.numerics import worded
 from indexing.cli.console import check_report, count, ended, flags, say, table, tell
 from indexing.cli.console import progress as progress_of
-from indexing.cli.scenes import Asked, as_tracks, follow, inputs_of, is_scene, photographs, tracks_csv
-from indexing.readers.files import VIDEOS
+from indexing.cli.scenes import Asked, as_tracks, follow, inputs_of, is_scene, is_video, photographs, tracks_csv
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -92,9 +91,9 @@ class Reconstruct:
         self._check_scene(scene, asked)
         inputs = inputs_of(inputs) if scene else inputs
         from indexing.files import manifest
-        from indexing.report.reconstruction import FILES, ReconstructionReport, write_reconstruction
+        from indexing.report.reconstruction import WRITTEN, ReconstructionReport, write_reconstruction
 
-        folder = check_report(self.out, inputs, FILES)
+        folder = check_report(self.out, inputs, WRITTEN)
         started = time.perf_counter()
         with progress_of("reading", steps=False):
             from indexing.readers.tracks import read_tracks
@@ -148,7 +147,7 @@ class Reconstruct:
 
     def _filmed(self) -> bool:
         """Whether the frames have times of their own, or a rate that was given."""
-        return self.files[0].suffix.lower() in VIDEOS
+        return is_video(self.files[0])
 
     def _limit(self) -> float | None:
         """The threshold as the library takes it: None = estimated, inf = all tracks fit.

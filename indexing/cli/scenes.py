@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from indexing.readers.files import VIDEOS
-
 if TYPE_CHECKING:
     from indexing.readers.matches import Matched
     from indexing.readers.pairs import MatchedPair, Photograph
@@ -37,10 +35,17 @@ def is_scene(paths: Sequence[Path]) -> bool:
     return True
 
 
+def is_video(path: Path) -> bool:
+    """Whether a file's name says that it is a video."""
+    from indexing.readers.files import VIDEOS
+
+    return path.suffix.lower() in VIDEOS
+
+
 def _kind(path: Path) -> str:
     if path.is_dir() or (any(sign in str(path) for sign in "*?[") and not path.exists()):
         return "sequence"
-    return "video" if path.suffix.lower() in VIDEOS else "picture" if path.suffix.lower() in PICTURE_FILES else ""
+    return "video" if is_video(path) else "picture" if path.suffix.lower() in PICTURE_FILES else ""
 
 
 @dataclass(frozen=True)

@@ -72,9 +72,9 @@ class Segment:
         self._check_scene(scene, asked)
         inputs = inputs_of(inputs) if scene else inputs
         from indexing.files import manifest
-        from indexing.report.segmentation import FILES, SegmentationReport, write_segmentation
+        from indexing.report.segmentation import WRITTEN, SegmentationReport, write_segmentation
 
-        folder = check_report(self.out, inputs, FILES)
+        folder = check_report(self.out, inputs, WRITTEN)
         started = time.perf_counter()
         with progress("reading", steps=False):
             from indexing.readers.pairs import read_image, read_pair

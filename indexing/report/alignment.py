@@ -20,7 +20,8 @@ from indexing.report.canvas import DARK, LIGHT, Theme, draw_photograph, new_figu
 from indexing.report.page import Picture, ResultReport, markup, render, safe_cell, sentence, table_csv, write_files
 
 FloatArray = NDArray[np.float64]
-FILES = ("report.html", "alignment.json", "labels.csv", "alignment.png", "tracks.csv")
+FILES = ("report.html", "alignment.json", "labels.csv", "alignment.png")
+WRITTEN = (*FILES, "tracks.csv")  # the last one of videos
 LABELS = ("outlier", "static", "moving")
 ROUNDING = 1e-14  # of the largest entry: what arithmetic leaves of a deviation that is zero (measured: 3e-17)
 PURPOSE = {

@@ -19,7 +19,8 @@ from indexing.report.page import Picture, ResultReport, markup, matrix, npz, ren
 from indexing.report.reconstruction_picture import scene_picture, tracks_picture
 
 FloatArray = NDArray[np.float64]
-FILES = ("report.html", "reconstruction.npz", "reconstruction.json", "points.csv", "tracks.png", "scene.png", "tracks.csv")
+FILES = ("report.html", "reconstruction.npz", "reconstruction.json", "points.csv", "tracks.png", "scene.png")
+WRITTEN = (*FILES, "tracks.csv")  # the last one of videos
 ROUNDING = 1e-12
 LABELS = (("outlier", "static", "moving"), ("outlier", "body 1", "body 2"))
 ARRAYS = ("cameras", "points", "residuals", "inliers", "structure", "projections")

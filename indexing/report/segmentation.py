@@ -28,7 +28,8 @@ from indexing.report.page import (
 from indexing.report.reconstruction_picture import finish, foot, layout, limits, sample
 
 FloatArray = NDArray[np.float64]
-FILES = ("report.html", "segmentation.npz", "segmentation.json", "labels.csv", "segmentation.png", "tracks.csv")
+FILES = ("report.html", "segmentation.npz", "segmentation.json", "labels.csv", "segmentation.png")
+WRITTEN = (*FILES, "tracks.csv")  # the last one of videos
 SURE = 0.9  # probability of its label below which a match is called doubtful
 MOTION = {
     "fundamental": "fundamental matrix: a rigid body with depth",

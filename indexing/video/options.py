@@ -108,3 +108,6 @@ class SceneOptions:
     """Pixels, of the working image, that a point which rests before a resting camera stays within."""
     movers: int = 4
     """Points that must go beyond that: with fewer, nothing moves."""
+    threshold: float = 1.0
+    """Pixels, of the working image, within which a point is followed.  Estimated from the matches, it is .3: a tenth of a wall that
+    rests before a resting camera is then called moving, because a few per cent of the points are that far off."""

@@ -236,10 +236,10 @@ def test_a_doubtful_result_is_shown_and_refused(run, solved, monkeypatch):
 @pytest.mark.parametrize(
     ("line", "says"),
     [
-        ("", "missing: MATCHES"),
+        ("", "no matches; give a file with x1, x2, or a video"),
         ("no.npz", "no.npz: no such file; check the path"),
-        ("@/", "is a folder; give a file of points"),
-        ("@/left.png", "left.png: is a binary file of no known format; give npz with x1, x2"),
+        ("@/", "small.png: has 200 x 200 pixels, left.png 640 x 480; pictures of one sequence"),
+        ("@/left.png", "left.png: has 1 frame, and motion needs at least 2"),
         ("@/m.npz --bodies 0", "--bodies must be a whole number from 1, or auto, got 0"),
         ("@/m.npz --bodies two", "see dyntorch segment --help"),
         ("@/m.npz --threshold 0", "--threshold must be a positive distance in pixels or auto, got 0"),
