@@ -127,7 +127,7 @@ class Align:
             raise ValueError("--static-points are of lines, and a video has points; leave it out")
         if self.model not in (None, "planar"):
             raise ValueError(f"--model {self.model} needs 3D points or lines, and a video has 2D points; use --model planar")
-        tracks = follow(self.files, asked, views=3)
+        tracks = follow(self.files, asked, views=3, more=True)
         return as_matches(tracks), tracks
 
     def _model(self, matched: Matched) -> tuple[str, list[str]]:

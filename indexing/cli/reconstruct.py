@@ -100,8 +100,8 @@ class Reconstruct:
 
             frames = None if self.frames is None else [word.strip() for word in self.frames.split(",")]
             followed = follow(self.files, asked, missing=True, fps=self.fps) if scene else None
-            given = as_tracks(followed, self.files[0], self._filmed()) if followed else None
-            tracks = self._timed(given or read_tracks(self.files, frames=frames, key=self.key, static=self.static))
+            filmed = as_tracks(followed, self.files[0], self._filmed()) if followed else None
+            tracks = self._timed(filmed or read_tracks(self.files, frames=frames, key=self.key, static=self.static))
         read = time.perf_counter()
         with progress_of(f"reconstructing {count(len(tracks.ids), 'track')}", steps=False):
             result = self._solve(tracks)

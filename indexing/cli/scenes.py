@@ -95,7 +95,13 @@ def _increasing(flag: str, text: str, kind: Any, example: str) -> list[Any]:
 
 
 def follow(
-    paths: Sequence[Path], asked: Asked, *, views: int | None = None, missing: bool = False, fps: float | None = None
+    paths: Sequence[Path],
+    asked: Asked,
+    *,
+    views: int | None = None,
+    more: bool = False,
+    missing: bool = False,
+    fps: float | None = None,
 ) -> SceneTracks:
     """Points of a video or of pictures, in the frames asked for.
 
@@ -103,6 +109,7 @@ def follow(
         paths: one video, folder or pattern; or pictures.
         asked: by flags.
         views: frames that are taken; None = any number, and some where no flag says which.
+        more: whether flags may ask for more.
         missing: whether a point may be missing in some.
         fps: of pictures.
 
@@ -115,9 +122,10 @@ def follow(
 
     numbers, moments = asked.numbers(), asked.moments()
     for flag, given in (("frames", numbers), ("at", moments)):
-        if given is not None and (len(given) != views if views else len(given) < 2):
-            said = f"--{flag} {getattr(asked, flag)}: {len(given)} given"
-            raise ValueError(f"{said}, {views} are needed" if views else f"{said}, at least 2 are needed")
+        least, exactly = views or 2, views is not None and not more
+        if given is not None and (len(given) < least or (exactly and len(given) > least)):
+            needed = f"{'' if exactly else 'at least '}{least} are needed"
+            raise ValueError(f"--{flag} {getattr(asked, flag)}: {len(given)} given, {needed}")
     files = [path.expanduser() for path in paths]
     source: Any = files[0] if len(files) == 1 else in_order(files)
     if moments is not None and fps is None and _kind(files[0]) != "video":
