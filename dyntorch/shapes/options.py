@@ -72,3 +72,34 @@ class PerspectiveOptions:
     """Of the noise of the last round, above which it is the noise of the views and no more rounds follow."""
     affine: ShapesOptions = ShapesOptions()
     """Of the affine shapes from which the descent starts."""
+
+
+@dataclass(frozen=True)
+class DeformableOptions:
+    """Every number that decides in :func:`dyntorch.shapes.deformable_shapes`."""
+
+    rounds: int = 150
+    """Rounds of least squares in turn, at most; exact data with 20 % of the images missing need 20 to 100."""
+    tolerance: float = 1e-7
+    """Share of the error by which a round has to lower it for another one; the error of exact data is 0 at 1e-26."""
+    exact: float = 1e-26
+    """Mean squared error, of images of rms 1, that is rounding."""
+    fills: int = 30
+    """Rounds in which coordinates that only one camera saw, or none, are filled in from the shapes, before the first turn."""
+    ridge: float = 1e-13
+    """Ridge of the normal equations, of their mean diagonal entry: what no image shows stays finite."""
+    flat: float = 1e-4
+    """Third singular value of the joint images of both cameras, over the first, below which both see one projection only: cameras
+    that look the same way, or a flat scene."""
+    alike: float = 3.0
+    """The same over the fourth, which is noise, below which the third may be noise as well."""
+    metric: float = 1e-3
+    """Least eigenvalue of the metric that constant lengths give, over the largest, below which they decide none."""
+    lengths: int = 8
+    """Rounds of reweighting of the metric that constant lengths give; 4 leave up to 1 % of its entries."""
+    grid: int = 120
+    """Members of the family of metrics of two scaled orthographic cameras that are tried at once."""
+    zooms: int = 5
+    """Times that the grid is laid closer about the best one: the last one is 1e-7 wide."""
+    turns: int = 5
+    """Rounds of rotations to the mean shape before the shapes are found."""
