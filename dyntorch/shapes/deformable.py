@@ -1,4 +1,4 @@
-r"""Shapes that deform in ways nobody knows, before two cameras: basis shapes, how much of each is in every frame, and the cameras."""
+r"""Shapes that deform in ways nobody knows, before two cameras: basis shapes, their share in every frame, and the cameras."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ from dyntorch.numerics.nullspace import eigh, spectrum
 from dyntorch.shapes.options import DeformableOptions
 
 TINY = 1e-300
+CHANCE = 9.0
+"""Cost, in variances, that three standard deviations of one parameter make."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -31,12 +33,12 @@ class DeformableShapes(Outcome):
         shapes: basis shapes B, ``(*batch, basis, n, 3)``, centroids 0, the most important first.
         coefficients: c, ``(*batch, frames, basis)``, columns orthogonal, of mean square 1.
         cameras: M of both cameras, ``(*batch, 2, 2, 3)``.
-        rotations: :math:`R_t`, ``(*batch, frames, 3, 3)``: of the metric result, from the frame of the basis to that of the cameras;
-            the identity otherwise.
+        rotations: :math:`R_t`, ``(*batch, frames, 3, 3)``: of the metric result, from the frame of the basis to that of the
+            cameras; the identity otherwise.
         offsets: o, ``(*batch, 2, frames, 2)`` in the unit of the images.
         points: :math:`R_t \sum_b c_{tb} B_{bi}`, ``(*batch, frames, n, 3)``, in the frame of the cameras.
-        metric: ``(*batch,)`` bool: known up to a similarity (and the mirror image), by the constant lengths; else up to an affinity,
-            the same for all frames.
+        metric: ``(*batch,)`` bool: known up to a similarity (and the mirror image), by the constant lengths; else up to an
+            affinity, the same for all frames.
         residual: ``(*batch,)`` rms of the residuals of one coordinate, in the unit of the images.
         sigma: ``(*batch,)`` noise that they show.
     """
@@ -105,18 +107,19 @@ def deformable_shapes(
 
     .. math:: x_{vti} = M_v\, S_{ti} + o_{vt}, \qquad S_t = R_t \sum_{b} c_{tb}\, B_b
 
-    The joint images of both cameras, :math:`(x_{1ti}, x_{2ti})` about their mean in each frame, have rank 3 over all frames at once:
-    one factorization gives the cameras and every point at every time up to one affinity.  All its shapes have rank ``basis``, which
-    fills in what only one camera saw, and averages over the noise.  Least squares in turn over coefficients, shapes and cameras then
-    count every image.
+    The joint images of both cameras, :math:`(x_{1ti}, x_{2ti})` about their mean in each frame, have rank 3 over all frames at
+    once: one factorization gives the cameras and every point at every time up to one affinity.  All its shapes have rank
+    ``basis``, which fills in what only one camera saw, and averages over the noise.  Least squares in turn over coefficients,
+    shapes and cameras then count every image.
 
     Where ``lengths`` names pairs of points at constant distance (bones), these decide the metric, linear in
     :math:`Q = A^T A`: :math:`d_t^T Q\, d_t` is the same for all t; (with scaled orthographic cameras all but one
     parameter of it is known); the frames are then turned onto each other, so that the basis has
     to explain deformations alone, and a rig that moves around does not matter.
 
-    A single moving camera determines the same things in principle; a fixed one, or shapes that are symmetric before it, do not
-    (``python -m experiments.reconstruction.deformable --counts``).
+    A single camera that moves determines a shape basis too, by the counts, and so does the symmetry of the shapes even before a
+    fixed camera; a fixed camera alone leaves every depth open (``python -m experiments.reconstruction.deformable_counts``).  Two
+    cameras are the case that is linear and well conditioned.
 
     Args:
         x1: ``(*batch, frames, n, 2)`` images in the first camera, any unit; NaN = missing.
@@ -239,7 +242,7 @@ def _size(x: Tensor, w: Tensor) -> Tensor:
 
 
 def _stereo(x: Tensor, w: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Cameras ``(b, 2, 2, 3)``, points ``(b, T, n, 3)``, where both see them ``(b, T, n)``, and the four squared singular values."""
+    """Cameras ``(b, 2, 2, 3)``, points ``(b, T, n, 3)``, where both see them ``(b, T, n)``, four squared singular values."""
     both = (w > 0).all(1)
     weight = both.to(x.dtype)
     joint = torch.cat([x[:, 0], x[:, 1]], dim=-1)
@@ -326,7 +329,10 @@ def _of_any_cameras(ways: _Ways, options: DeformableOptions) -> tuple[Tensor, Te
         cost = ways.spread(matrix[:, None])[:, 0]
         better = (cost < least) & (eigh(matrix)[0][:, 0] > 0)
         best, least = torch.where(better[:, None, None], matrix, best), torch.where(better, cost, least)
-        decided = torch.where(better, values[:, 1] > options.metric**2 * values[:, 5], decided)
+        # another metric that far off has to cost more than the noise does
+        clear = (values[:, 1] - values[:, 0]) * seen.sum((1, 2)) > CHANCE / options.uncertain**2 * values[:, 0]
+        clear = clear & (values[:, 1] > (1 + options.hardly) * values[:, 0])
+        decided = torch.where(better, clear & (values[:, 1] > options.metric**2 * values[:, 5]), decided)
         weight = ways.lengths(matrix[:, None])[1][:, 0] * (weight > 0)
     return best, decided
 
@@ -349,7 +355,8 @@ def _along_family(ways: _Ways, cameras: Tensor, options: DeformableOptions) -> t
     middle = torch.zeros_like(ways.noise)
     width = torch.pi
     steps = torch.linspace(-1, 1, options.grid, dtype=cameras.dtype, device=cameras.device)
-    for _ in range(options.zooms):
+    decided = torch.zeros_like(ways.noise, dtype=torch.bool)
+    for zoom in range(options.zooms):
         angle = middle[:, None] + width * steps
         trial = angle.cos()[..., None, None] * pair[:, None, 0] + angle.sin()[..., None, None] * pair[:, None, 1]
         values, axes = eigh(trial)
@@ -360,7 +367,13 @@ def _along_family(ways: _Ways, cameras: Tensor, options: DeformableOptions) -> t
         at = cost.argmin(-1, keepdim=True)
         middle, width = angle.gather(1, at)[:, 0], 2 * width / options.grid
         best = inverse.gather(1, at[..., None, None].expand(-1, 1, 3, 3))[:, 0]
-    return best, fine.any(-1)
+        if not zoom:  # how far off the metrics are that cost hardly more
+            far = torch.linalg.matrix_norm(inverse - best[:, None])
+            decided = fine.any(-1) & (
+                torch.where(cost <= cost.amin(-1, keepdim=True) * (1 + options.hardly) + CHANCE, far, 0.0).amax(-1)
+                <= options.uncertain
+            )
+    return best, decided
 
 
 def _turned(points: Tensor, both: Tensor, options: DeformableOptions) -> Tensor:
@@ -446,7 +459,7 @@ def _deformed(x: Tensor, w: Tensor, model: _Model, options: DeformableOptions) -
 
 def _shaped_anew(x: Tensor, w: Tensor, model: _Model, options: DeformableOptions) -> _Model:
     """The best place of every point in every basis shape."""
-    basis, n = model.shapes.shape[1:3]
+    basis = model.shapes.shape[1]
     views = model.cameras[:, :, None] @ model.turns[:, None]
     rows = (model.coefficients[:, None, :, None, :, None] * views[..., None, :]).flatten(-2)  # (b, 2, T, 2, 3 B)
     outer = (rows.mT @ rows).flatten(1, 2).flatten(2)  # (b, 2 T, (3 B)^2)

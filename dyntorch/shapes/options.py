@@ -97,6 +97,11 @@ class DeformableOptions:
     """Least eigenvalue of the metric that constant lengths give, over the largest, below which they decide none."""
     lengths: int = 8
     """Rounds of reweighting of the metric that constant lengths give; 4 leave up to 1 % of its entries."""
+    uncertain: float = 0.3
+    """Relative error of the metric within three standard deviations above which lengths decide none."""
+    hardly: float = 0.2
+    """Share of the cost by which a metric that is so far off has to cost more, too: the noise in the weights themselves makes some
+    per cent where bones are a few times as long as the noise and nothing moves."""
     grid: int = 120
     """Members of the family of metrics of two scaled orthographic cameras that are tried at once."""
     zooms: int = 5

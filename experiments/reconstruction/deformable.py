@@ -1,7 +1,7 @@
 """Deforming shapes from two cameras, beside one-camera methods, on motion capture and on shapes whose truth is few.
 
-``python -m experiments.reconstruction.deformable`` (DYNTORCH_DATA: the CMU motion capture set) prints the 3D error, rms over points and
-frames after the best similarity (and mirror) of every frame by itself, over the rms radius of the frames:
+``python -m experiments.reconstruction.deformable`` (DYNTORCH_DATA: the CMU motion capture set) prints the 3D error, rms over points
+and frames after the best similarity (and mirror) of every frame by itself, over the rms radius of the frames:
 
 - rigid: one shape (Tomasi and Kanade), one camera;
 - mean shape: that of the training takes, in the best pose of every frame: what a method reaches that sees nothing;
@@ -11,9 +11,9 @@ frames after the best similarity (and mirror) of every frame by itself, over the
 - two views: two cameras, factorization and constant lengths of bones, no shape basis;
 - deformable_shapes: with a basis; and with 20 % of the images of each camera missing, where no method above gives anything.
 
-Numbers of cosines and shapes and the weight of the nuclear norm are chosen on training takes (subjects 01 and 03), the table is of the
-others.  Cameras: orthographic, a person of 400 px, noise of 2 px, the second 60 degrees beside the first; they stand still, or go
-around by 180 degrees in 60 frames at 15 Hz.
+Numbers of cosines and shapes and the weight of the nuclear norm are chosen on training takes (subjects 01 and 03), the table is of
+the others.  Cameras: orthographic, a person of 400 px, noise of 2 px, the second 60 degrees beside the first; they stand still, or
+go around by 180 degrees in 60 frames at 15 Hz.
 """
 
 from __future__ import annotations

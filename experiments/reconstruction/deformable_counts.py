@@ -4,8 +4,9 @@
 images leave open beyond what they cannot tell (the frame of the scene, a change of the basis, the scale of a frame), and the least
 number of frames and points from which that is 0.
 
-The images :math:`x_{ti} = M_t \\sum_b c_{tb} B_{bi}` (about a known origin) are polynomials of all unknowns; their Jacobian at a random
-point modulo 2^31 - 1 has the rank that it has at almost every real point.  Rotations are those of quaternions, of any length.
+The images :math:`x_{ti} = M_t \\sum_b c_{tb} B_{bi}` (about a known origin) are polynomials of all unknowns; their Jacobian
+at a random point modulo 2^31 - 1 has the rank that it has at almost every real point. Rotations are those of quaternions, of
+any length.
 """
 
 from __future__ import annotations
