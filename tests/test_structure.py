@@ -174,7 +174,7 @@ def test_what_is_explained_is_there(kind):
 RESULTS = {
     "Solution", "Alignment", "Segmentation", "AffineSegmentation", "Reconstruction", "ProjectiveFactorization",
     "VelocityFactorization", "TranslatingPlanes", "PairReconstruction", "Trajectories", "TrajectoryCameras", "Shift", "Clocks",
-    "MovingShapes", "Recovery",
+    "MovingShapes", "Recovery", "DeformableShapes",
 }  # fmt: skip
 """What the verbs of dyntorch return."""
 

@@ -17,8 +17,6 @@ from dyntorch.numerics.nullspace import eigh, spectrum
 from dyntorch.shapes.options import DeformableOptions
 
 TINY = 1e-300
-CHANCE = 9.0
-"""Cost, in variances, that three standard deviations of one parameter make."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -330,7 +328,7 @@ def _of_any_cameras(ways: _Ways, options: DeformableOptions) -> tuple[Tensor, Te
         better = (cost < least) & (eigh(matrix)[0][:, 0] > 0)
         best, least = torch.where(better[:, None, None], matrix, best), torch.where(better, cost, least)
         # another metric that far off has to cost more than the noise does
-        clear = (values[:, 1] - values[:, 0]) * seen.sum((1, 2)) > CHANCE / options.uncertain**2 * values[:, 0]
+        clear = (values[:, 1] - values[:, 0]) * seen.sum((1, 2)) > options.chance / options.uncertain**2 * values[:, 0]
         clear = clear & (values[:, 1] > (1 + options.hardly) * values[:, 0])
         decided = torch.where(better, clear & (values[:, 1] > options.metric**2 * values[:, 5]), decided)
         weight = ways.lengths(matrix[:, None])[1][:, 0] * (weight > 0)
@@ -370,7 +368,7 @@ def _along_family(ways: _Ways, cameras: Tensor, options: DeformableOptions) -> t
         if not zoom:  # how far off the metrics are that cost hardly more
             far = torch.linalg.matrix_norm(inverse - best[:, None])
             decided = fine.any(-1) & (
-                torch.where(cost <= cost.amin(-1, keepdim=True) * (1 + options.hardly) + CHANCE, far, 0.0).amax(-1)
+                torch.where(cost <= cost.amin(-1, keepdim=True) * (1 + options.hardly) + options.chance, far, 0.0).amax(-1)
                 <= options.uncertain
             )
     return best, decided

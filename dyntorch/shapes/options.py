@@ -99,6 +99,8 @@ class DeformableOptions:
     """Rounds of reweighting of the metric that constant lengths give; 4 leave up to 1 % of its entries."""
     uncertain: float = 0.3
     """Relative error of the metric within three standard deviations above which lengths decide none."""
+    chance: float = 9.0
+    """Cost, in variances, that three standard deviations of one parameter make."""
     hardly: float = 0.2
     """Share of the cost by which a metric that is so far off has to cost more, too: the noise in the weights themselves makes some
     per cent where bones are a few times as long as the noise and nothing moves."""
