@@ -109,9 +109,20 @@ class _Nearest:
         return self.joined(balanced(self.parts(theta)))
 
     def followed(self, theta: Tensor, target: Tensor) -> Tensor:
-        """The minimum as a function of the target: with its derivative, and the value that it has."""
-        step = self.newton_step(theta, self.sided(theta, target))[0]
-        return theta - (step - step.detach())
+        """The minimum as a function of the target: the value that it has, with its first derivative and its second.
+
+        Each Newton step from a fixed place and with a fixed Hessian makes one more order right.
+        """
+        sided = self.sided(theta, target)
+        step = self.newton_step(theta, sided)[0]
+        first = theta - (step - step.detach())
+        with torch.no_grad():
+            u, _, matrix = self.linearized(theta)
+            hessian = self.hessian(theta, sided, u, matrix) + self.free(theta)
+        with torch.enable_grad():
+            (slope,) = torch.autograd.grad(self.cost(first, sided).sum(), first, create_graph=True)
+        again = _solved(hessian, slope)[0]
+        return first - (again - again.detach())
 
     def starts(self, target: Tensor) -> list[Tensor]:
         """The nearest candidates, ``(b, p)`` each."""

@@ -85,7 +85,9 @@ def infinity_planes(tensor: Tensor) -> tuple[Tensor, Tensor]:
         for _ in range(NEWTON_STEPS):
             alpha, beta = _newton(tensor, alpha, beta)
         alpha, beta = _upright(alpha), _upright(beta)
-    return _newton(tensor, alpha, beta)
+    # one step has the first derivative of the minimum, two have the second
+    alpha, beta = _newton(tensor, alpha, beta)
+    return _newton(tensor, alpha, beta) if tensor.requires_grad else (alpha, beta)
 
 
 def structure(tensor: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -182,3 +182,15 @@ def test_misuse():
         projections_of(random(3, 3, 3), (2, 2, 0), (3, 3, 3))
     with pytest.raises(ValueError, match="is floating point"):
         projections_of(random(3, 3), (2, 2, 1), (3, 3, 3))
+
+
+def test_second_derivatives_of_the_nearest_tensor():
+    """Of a noisy tensor, composed again: free of the gauge of the projections."""
+    draw = torch.Generator().manual_seed(4)
+    true = grassmann_tensor(torch.randn(3, 3, 4, generator=draw, dtype=torch.float64), (2, 1, 1))
+    noisy = true / true.norm() + 0.01 * torch.randn(true.shape, generator=draw, dtype=torch.float64)
+
+    def again(tensor):
+        return grassmann_tensor(projections_of(tensor, (2, 1, 1), (3, 3, 3)), (2, 1, 1))
+
+    assert torch.autograd.gradgradcheck(again, noisy.requires_grad_(), fast_mode=True, eps=1e-5, atol=1e-4)
