@@ -342,8 +342,8 @@ def projective_points(a: Tracks, b: Tracks, *, max_shift: float | None, rate: fl
 
     Fixed cameras before one moving body, or cameras that move together (a rig) before a static scene.  Each camera alone tells the
     motion, up to the place and the axes of the body; at the right shift both motions are one.  It takes six points of each camera
-    and a body that turns.  ``python -m experiments.reconstruction.bodies`` prints what it reaches: 8 points each over 4 s .002 frame
-    at .3 px and .011 at 1 px, over 2 s .010 and .042.
+    and a body that turns.  ``python -m experiments.reconstruction.bodies`` prints what is reached: 8 points each, 4 s: .002 frame
+    at .3 px, .011 at 1 px; 2 s: .010 and .042.
 
     Args:
         rate: of b's clock, where it is known.
