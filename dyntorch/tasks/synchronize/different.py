@@ -9,9 +9,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dyntorch.core.outcome import Notice, status_from
+from dyntorch.core.outcome import Notice, Status, status_from
+from dyntorch.tasks.synchronize.camera_models import KINDS
+from dyntorch.tasks.synchronize.measures import MEASURES
 from dyntorch.tasks.synchronize.options import SynchronizeOptions
 from dyntorch.tasks.synchronize.result import Shift, ShiftNotice
+from dyntorch.tasks.synchronize.row_spaces import RowSpaceShift, row_space_shift
 from dyntorch.tasks.synchronize.subspace import STEP, Body, SubspaceCurve, bodies_curve, halves, information, subspace_curve
 from dyntorch.tasks.synchronize.tracks import Tracks, smoothed
 
@@ -246,7 +249,16 @@ def different_points(a: Tracks, b: Tracks, *, max_shift: float | None, rate: flo
 
     Args:
         rate: of b's clock, where it is known.
+
+    Raises:
+        ValueError: a measure or a kind of camera that there is not.
     """
+    for name, value, known in (
+        ("measure", options.different.measure, MEASURES),
+        ("camera", options.different.camera, ("auto", *KINDS)),
+    ):
+        if value not in known:
+            raise ValueError(f"options.different.{name} must be one of {', '.join(known)}, got {value!r}")
     step = max(a.step, b.step, options.different.finest)
     found = _Samples(a, b, step, rate or 1.0, options=options)
     curve = found.curve(max_shift)
@@ -261,7 +273,79 @@ def different_points(a: Tracks, b: Tracks, *, max_shift: float | None, rate: flo
             found = _Samples(a, b, step, ratio, options=options)
             curve = found.curve(max_shift)
             best = found.shift(curve)
-    return _result(a, b, found, curve, _to_a_frame(best, step, max(a.step, b.step), options), rate_sigma)
+    body = _result(a, b, found, curve, _to_a_frame(best, step, max(a.step, b.step), options), rate_sigma)
+    spaces = row_space_shift(a, b, step=step, rate=body.rate, max_shift=max_shift, around=body.offset, options=options)
+    if options.different.measure == options.different.camera == "auto":
+        return _combined(body, spaces, options)
+    return _of_spaces(body, spaces, 1 / min(body.fps), options)
+
+
+def _combined(body: Shift, spaces: RowSpaceShift | None, options: SynchronizeOptions) -> Shift:
+    """What the body's shape and motion say, and what its row spaces say: both may decide, neither may contradict the other."""
+    if spaces is None or body.status in (Status.TOO_FEW, Status.DEGENERATE):
+        return body
+    away = abs(spaces.lag - body.offset)
+    apart, frame = away > options.different.apart, 1 / min(body.fps)
+    if not apart and spaces.clearness < options.rows.beyond:
+        # cameras that are nearly of some kind bend a lag by a frame or two, each way of looking by as much as it is wrong
+        spaces = dataclasses.replace(spaces, sigma=math.hypot(spaces.sigma, away))
+    if spaces.ok or not body.ok:
+        return _refused(body, spaces) if apart and body.ok else _of_spaces(body, spaces, frame, options)
+    if apart:
+        return _refused(body, spaces) if spaces.strength > options.rows.contradicting else body
+    if spaces.strength > options.rows.confirming:
+        return _of_spaces(body, spaces, frame, options, confirmed=True)
+    if spaces.strength < options.rows.heard:
+        return _refused(body, spaces)
+    return body if away <= frame else _blunt(body, math.hypot(body.sigma, away / 2), frame)
+
+
+def _blunt(shift: Shift, sigma: float, frame: float) -> Shift:
+    """Refused: known to no better than a frame."""
+    notice = Notice(ShiftNotice.BLUNT, sigma, {"case": "frame", "frame": frame})
+    return dataclasses.replace(
+        shift, sigma=sigma, status=status_from((notice,)), notices=(notice,), confidence=min(shift.confidence, 0.5)
+    )
+
+
+def _refused(body: Shift, spaces: RowSpaceShift) -> Shift:
+    """Two answers, both sure."""
+    rivals = ", ".join(f"{second + (body.rate - 1) * body.center:+.2f}" for second in (body.offset, spaces.lag))
+    notice = Notice(ShiftNotice.REPEATED, spaces.margin, {"case": "others", "rivals": rivals})
+    return dataclasses.replace(body, status=status_from((notice,)), notices=(notice,), confidence=min(body.confidence, 0.5))
+
+
+def _of_spaces(
+    body: Shift, spaces: RowSpaceShift | None, frame: float, options: SynchronizeOptions, *, confirmed: bool = False
+) -> Shift:
+    """The answer of the row spaces, with the body's clock rate; ``confirmed`` by the evidence of shape and motion."""
+    if spaces is None:
+        notice = Notice(ShiftNotice.SHORT_OVERLAP)
+        return dataclasses.replace(body, status=status_from((notice,)), notices=(notice,), confidence=0.0, sigma=math.inf)
+    drift = (body.rate - 1) * body.center
+    peaks = spaces.peaks.clone()
+    peaks[:, 0] += drift
+    notices: list[Notice] = []
+    if not (spaces.ok or confirmed):
+        rivals = ", ".join(f"{second:+.2f}" for second in peaks[1:4, 0].tolist())
+        notices.append(Notice(ShiftNotice.REPEATED, spaces.margin, {"case": "unclear", "rivals": rivals}))
+    for which, mask in zip("ab", spaces.foreign, strict=True):
+        if bool(mask.any()):
+            tracks = ", ".join(str(k) for k in mask.nonzero()[:, 0].tolist())
+            notices.append(Notice(ShiftNotice.FOREIGN, float(mask.sum()), {"which": which, "tracks": tracks, "points": len(mask)}))
+    found = dataclasses.replace(
+        body,
+        offset=spaces.lag,
+        sigma=spaces.sigma,
+        confidence=max(spaces.confidence, body.confidence) if confirmed else spaces.confidence,
+        peaks=peaks,
+        lags=spaces.seconds + drift,
+        scores=spaces.curve.scores * spaces.curve.counts * spaces.curve.samples,
+        status=status_from(tuple(notices)),
+        notices=tuple(notices),
+    )
+    decided = spaces.ok or confirmed
+    return _blunt(found, found.sigma, frame) if decided and found.sigma > options.different.sharp_frames * frame else found
 
 
 def _to_a_frame(best: SubspaceShift, step: float, frame: float, options: SynchronizeOptions) -> SubspaceShift:

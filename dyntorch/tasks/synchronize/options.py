@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import log
+from typing import Literal
 
 
 @dataclass(frozen=True)
@@ -247,9 +248,80 @@ class SubspaceOptions:
 
 
 @dataclass(frozen=True)
+class RowSpaceOptions:
+    """Row spaces of both cameras as they are, for every kind of camera."""
+
+    width: float = 1.0
+    """Standard deviation of the Gaussian that positions are smoothed by, frames of the slower camera: below 1 the noise would
+    depend on where between frames a moment is."""
+    edge: float = 3.0
+    """Widths left out at either end, where the kernel is one-sided."""
+    fractions: int = 2
+    """Places within a frame at which lags are compared."""
+    levels: tuple[float, ...] = (0.0, 0.03)
+    """What a kind of camera may leave unexplained, as share of the rms coordinate, beside the noise."""
+    noise: float = 2.0
+    """Noise variance of the rows over that of third differences."""
+    exact: float = 1e-6
+    """Least noise, over the rms distance of the points from their mean: rounding."""
+    least_overlap: float = 0.35
+    """Share of the shorter take below which a lag is not judged."""
+    least_seconds: float = 0.8
+    """Seconds of overlap below which a lag is not judged."""
+    apart: float = 0.2
+    """Seconds within which peaks are one."""
+    finest: float = 1 / 2048
+    """Step at which the search between frames ends, frames."""
+    bend: float = 0.125
+    """Step by which the curvature of the score is told, frames."""
+    zoom_terms: int = 8
+    """Chebyshev polynomials in time of the logarithm of one camera's zoom over the other's."""
+    zoom_steps: int = 12
+    """Steps of least squares for it."""
+    zoom_rounds: int = 3
+    """Times that the zoom and the place between frames are found in turn."""
+    zoom_least: float = 1e-6
+    """Least share of a direction that is not common: rounding."""
+    most_lags: int = 1_200
+    """Lags that are looked at, at most: of longer searches those near the best of the body's evidence."""
+    clear: float = 4.2
+    """Margin of the best lag, over the spread of the others, from which it decides where all kinds and levels agree on it."""
+    alone: float = 3.0
+    """How much more is asked for where one kind and level says so alone; in proportion between."""
+    odds: float = 4.0
+    """How much the logarithm of the odds grows with the clearness, over that which decides."""
+    beyond: float = 8.0
+    """Clearness from which the lag is that of one kind of camera, exactly; below, it is as uncertain as the body's evidence differs."""
+    contradicting: float = 0.3
+    """Clearness, over that which decides, from which another lag than that of the body's evidence speaks against it."""
+    confirming: float = 0.6
+    """The same from which the same lag as that of the body's evidence, where that decides, is sure by itself."""
+    heard: float = 0.25
+    """The same below which not even the lag of the body's evidence is believed: nothing of it shows in the row spaces."""
+    nearly: float = 0.75
+    """Share of the nats of the best kind of camera from which another one is as good: their places are as uncertain as they
+    differ."""
+    hopeful: float = 0.35
+    """The same below which no track is looked for that has no part in the motion."""
+    looked_at: int = 400
+    """Lags among which local maxima are looked for."""
+    foreign: float = 0.34
+    """Share of a camera's tracks that may have no part in the motion."""
+    fewest: int = 3
+    """Tracks that are kept at least."""
+    gain: float = 1.15
+    """Factor by which a lag must stand out more without a track for that to be left out."""
+
+
+@dataclass(frozen=True)
 class DifferentPointOptions:
     """When that curve decides a shift."""
 
+    camera: Literal["auto", "affine", "affine_moving", "perspective"] = "auto"
+    """Kind of both cameras; ``"auto"`` is the one whose best lag stands out most."""
+    measure: Literal["auto", "rank", "log_determinant", "principal_angles"] = "auto"
+    """What two row spaces share: a measure of the thesis by itself, or ``"auto"``: the log-determinant, beside the evidence of the
+    body's shape and motion."""
     blocks: int = 8
     """Parts of the overlap that are left out in turn."""
     peaks: int = 6
@@ -402,6 +474,7 @@ class SynchronizeOptions:
     points: ConsistentPointOptions = ConsistentPointOptions()
     search: ShiftSearchOptions = ShiftSearchOptions()
     subspace: SubspaceOptions = SubspaceOptions()
+    rows: RowSpaceOptions = RowSpaceOptions()
     different: DifferentPointOptions = DifferentPointOptions()
     cameras: NetworkOptions = NetworkOptions()
     projective: ProjectiveOptions = ProjectiveOptions()

@@ -130,6 +130,11 @@ class ShiftNotice(NoticeCode):
     """What was fitted are lenses, too."""
     LEFT_OUT = "left_out", "{value:g} of {points} points never agree with the others and were left out: {which}"
     """Points that are never consistent with the others."""
+    FOREIGN = (
+        "foreign",
+        "{value:g} of {points} tracks of {camera:{which}} have no part in the motion and were left out: {tracks}",
+    )
+    """Tracks that go their own way."""
     MOVED = "moved", "each half of the take fits much better by itself: a camera may have moved"
     """A camera that moved."""
 

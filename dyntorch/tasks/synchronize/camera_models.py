@@ -1,0 +1,386 @@
+"""Different points before cameras of one kind or another: which kind shows a lag most clearly, and where between frames it lies.
+
+Affine cameras that stand still show :math:`x_i = A X_i + b`: the rows of coordinates over time are those of the motion, and the
+thesis's rank condition holds for them as they are.  Affine cameras that pan and zoom, :math:`x_i(t) = z(t) A X_i(t) + b(t)`,
+show it about the middle of each frame, :math:`x_i(t) - \\bar x(t)`, and over a zoom that only one camera has to be freed of: the
+condition is one on :math:`z_a V_a \\cap z_b V_b`, which the ratio :math:`z_b / z_a` decides alone.  For a body that is small
+beside its distance a perspective camera is the latter, with the inverse of the distance as zoom; what is left adds to the
+noise.
+
+Nobody says which it is.  Every kind is tried with little and with much noise; the one whose best lag stands out most, above what
+lags of the film played backwards reach, is believed.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from dyntorch.tasks.synchronize.measures import LagCovariances, shared
+from dyntorch.tasks.synchronize.options import SynchronizeOptions
+from dyntorch.tasks.synchronize.subspace import completed, filled, smooth
+from dyntorch.tasks.synchronize.tracks import Tracks, smoothed
+
+Kind = Literal["affine", "affine_moving", "perspective"]
+KINDS: tuple[Kind, ...] = ("affine", "affine_moving", "perspective")
+
+
+@dataclass(frozen=True, eq=False)
+class Films:
+    """Two cameras' tracks on a common clock, smoothed alike, b at several moments between frames.
+
+    Attributes:
+        a, b: the tracks.
+        step: seconds of a's clock from frame to frame.
+        rate: of b's clock.
+    """
+
+    a: Tracks
+    b: Tracks
+    step: float
+    rate: float
+    options: SynchronizeOptions
+
+    @property
+    def width(self) -> float:
+        """Standard deviation of the kernel, seconds: from one frame on noise is alike at all moments."""
+        return self.options.rows.width * max(self.step, self.a.step, self.b.step)
+
+    @cached_property
+    def times(self) -> tuple[Tensor, Tensor]:
+        """Of a's frames and of b's, on their clocks, ends left out: there the kernel is one-sided."""
+        edge = math.ceil(self.options.rows.edge * self.width / self.step)
+        ta, tb = self.a.every(self.step), self.b.every(self.step * self.rate)
+        return ta[edge : len(ta) - edge], tb[edge : len(tb) - edge - 1]
+
+    @cached_property
+    def first(self) -> Tensor:
+        """``(T, n, 2)`` a's points, complete."""
+        return self._points(self.a, self.times[0], self.width)
+
+    def second(self, fraction: float) -> Tensor:
+        """``(T', m, 2)`` b's points, so much of a frame later."""
+        return self._points(self.b, self.times[1] + fraction * self.step * self.rate, self.width * self.rate)
+
+    def _points(self, tracks: Tracks, times: Tensor, width: float) -> Tensor:
+        x, _, weights = smoothed(tracks, times, width, self.options)
+        seen = weights > 0
+        return completed(filled(x, seen, self.options), seen, self.options)
+
+    def variance(self, tracks: Tracks, width: float) -> float:
+        """Of a coordinate's noise after the kernel."""
+        least = self.options.rows.exact * tracks.scale
+        return max(tracks.noise, least, 1e-150) ** 2 * min(1.0, tracks.step / (2 * math.sqrt(math.pi) * width))
+
+    @property
+    def variances(self) -> tuple[float, float]:
+        """Of a's and of b's coordinates."""
+        return self.variance(self.a, self.width), self.variance(self.b, self.width * self.rate)
+
+    @property
+    def samples(self) -> float:
+        """Independent ones of the noise per frame."""
+        return min(1.0, self.step / (2 * math.sqrt(math.pi) * self.width))
+
+    def only(self, a: Tensor, b: Tensor) -> Films:
+        """Of these points ``(n,)`` and ``(m,)`` bool alone."""
+        return replace(self, a=self.a.only(a), b=self.b.only(b))
+
+
+def rows_of(x: Tensor, kind: Kind, slow: float) -> Tensor:
+    """Rows ``(T, 2n)`` of mean 0 of points ``(T, n, 2)`` as a camera of this kind needs them.
+
+    Args:
+        slow: frames that the size of the whole changes in.
+    """
+    if kind != "affine":
+        x = x - x.mean(1, keepdim=True)
+    if kind == "perspective":
+        size = smooth(x.square().sum((1, 2)).sqrt(), slow)
+        x = x / size.clamp(min=1e-9 * float(size.max()) + 1e-300)[:, None, None] * size.mean()
+    rows = x.flatten(1)
+    return rows - rows.mean(0)
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """What one kind of camera, at one level of noise, says of all lags.
+
+    Attributes:
+        kind: of the cameras.
+        level: what the kind leaves unexplained, as share of the rms coordinate, beside the noise of the tracks.
+        lags: ``(L,)`` frames.
+        scores: ``(L,)`` nats per frame above chance, NaN where the overlap is too short.
+        counts: ``(L,)``.
+        samples: independent ones per frame.
+        apart: frames within which peaks are one.
+    """
+
+    kind: Kind
+    level: float
+    lags: Tensor
+    scores: Tensor
+    counts: Tensor
+    samples: float
+    apart: float
+
+    @cached_property
+    def totals(self) -> Tensor:
+        """``(L,)`` nats of the whole overlap."""
+        return (self.scores * self.counts * self.samples).nan_to_num(-math.inf)
+
+    @cached_property
+    def best(self) -> int:
+        """Entry of the best lag."""
+        return int(self.totals.argmax())
+
+    @cached_property
+    def margin(self) -> float:
+        """Nats above any lag apart, in total and per frame, whichever is less."""
+        return self._over(self.totals)[0]
+
+    @cached_property
+    def clearness(self) -> float:
+        """That margin over the standard deviation of the scores at lags apart."""
+        return self._over(self.totals)[1]
+
+    def _over(self, totals: Tensor) -> tuple[float, float]:
+        away = ((self.lags - self.lags[self.best]).abs() > self.apart) & totals.isfinite()
+        if int(away.sum()) < 3 or not math.isfinite(float(totals[self.best])):
+            return 0.0, 0.0
+        count = self.counts * self.samples
+        per_frame = totals / count.clamp(min=1e-9) * count[self.best]
+        found = []
+        for values in (totals, per_frame):
+            rest = values[away]
+            margin = float(values[self.best] - rest.max())
+            found.append((margin, margin / max(float(rest.std()), 1e-12 + 1e-6 * float(rest.abs().max()))))
+        return min(m for m, _ in found), min(c for _, c in found)
+
+
+@dataclass(frozen=True, eq=False)
+class KindMoments:
+    """Covariances of both cameras' rows as one kind of camera needs them, at all lags and with b played backwards.
+
+    Attributes:
+        kind: of the cameras.
+        moments, chance: of the films, and with b backwards.
+        judged, ruled: ``(L,)`` bool, lags of either that overlap enough.
+        lags: ``(L,)`` frames.
+        energies: mean squares of a's and of b's rows.
+    """
+
+    films: Films
+    kind: Kind
+    moments: LagCovariances
+    chance: LagCovariances
+    judged: Tensor
+    ruled: Tensor
+    lags: Tensor
+    energies: tuple[float, float]
+
+    @staticmethod
+    def of(films: Films, kind: Kind, second: list[Tensor], lags: tuple[int, int]) -> KindMoments:
+        """Of b's points at fractions of frames."""
+        options = films.options.rows
+        slow = films.options.subspace.size_width / films.step
+        a, bs = rows_of(films.first, kind, slow), [rows_of(part, kind, slow) for part in second]
+        parts = [LagCovariances.of(a, b, lags) for b in bs]
+        moments = LagCovariances(
+            *(torch.stack([getattr(part, name) for part in parts], dim=1).flatten(0, 1) for name in ("aa", "bb", "ab", "counts"))
+        )
+        chance = LagCovariances.of(a, bs[0].flip(0), lags)
+        least = max(options.least_overlap * min(len(a), len(bs[0])), options.least_seconds / films.step)
+        places = torch.arange(lags[0], lags[1] + 1, dtype=a.dtype, device=a.device)[:, None]
+        places = (places + torch.arange(len(bs), dtype=a.dtype, device=a.device) / len(bs)).flatten()
+        within = places <= lags[1]  # fractions after the last lag are beyond the search
+        moments, places = LagCovariances(*(getattr(moments, x)[within] for x in ("aa", "bb", "ab", "counts"))), places[within]
+        energies = float(a.square().mean()), float(bs[0].square().mean())
+        return KindMoments(films, kind, moments, chance, moments.counts >= least, chance.counts >= least, places, energies)
+
+    def only(self, a: Tensor, b: Tensor) -> KindMoments:
+        """Of these points ``(n,)`` and ``(m,)`` bool alone: their rows are combinations of all points' rows."""
+        one, two = (self._combined(kept) for kept in (a, b))
+        return replace(self, moments=self.moments.combined(one, two), chance=self.chance.combined(one, two))
+
+    def _combined(self, kept: Tensor) -> Tensor:
+        rows = torch.eye(len(kept), dtype=self.moments.aa.dtype, device=kept.device)[kept]
+        if self.kind != "affine":  # about the middle of those that are left
+            rows = rows - rows.mean(0)
+        return torch.kron(rows, torch.eye(2, dtype=rows.dtype, device=rows.device))
+
+    def hypothesis(self, level: float) -> Hypothesis | None:
+        """What all lags share at a level of noise; None without motion."""
+        options, measure = self.films.options.rows, self.films.options.different.measure
+        first, second = (
+            v * options.noise + level**2 * energy for v, energy in zip(self.films.variances, self.energies, strict=True)
+        )
+        if not (0 < first < math.inf and 0 < second < math.inf and min(self.energies) > 0):
+            return None
+        scores = shared(self.moments.scaled((first, second)), self.judged, measure)
+        if bool(self.ruled.any()):
+            chance = shared(self.chance.scaled((first, second)), self.ruled, measure).nan_to_num(0.0)
+            scores = scores - _line(chance, self.chance.counts, self.moments.counts, self.ruled)
+        scores = torch.where(self.judged, scores, torch.nan)
+        apart = options.apart / self.films.step
+        return Hypothesis(self.kind, level, self.lags, scores, self.moments.counts, self.films.samples, apart)
+
+
+def kind_moments(films: Films, lags: tuple[int, int]) -> list[KindMoments]:
+    """Of every kind of camera that the options allow."""
+    fractions = films.options.rows.fractions
+    asked = films.options.different.camera
+    second = [films.second(k / fractions) for k in range(fractions)]
+    return [KindMoments.of(films, kind, second, lags) for kind in KINDS if asked in ("auto", kind)]
+
+
+def hypotheses(kinds: list[KindMoments]) -> list[Hypothesis]:
+    """One of every kind of camera and level of noise, by the measure of the options."""
+    found = [one.hypothesis(level) for one in kinds for level in one.films.options.rows.levels]
+    return [one for one in found if one is not None and bool(one.scores.isfinite().any())]
+
+
+def _line(values: Tensor, of: Tensor, at: Tensor, judged: Tensor) -> Tensor:
+    """What different events share by chance at counts ``at``: a line in 1 / count, through values at counts ``of``."""
+    inverse = 1 / of[judged].clamp(min=1.0)
+    if float(inverse.max() - inverse.min()) < 1e-9:
+        return values[judged].mean().expand(len(at))
+    design = torch.stack([torch.ones_like(inverse), inverse], dim=1)
+    line = torch.linalg.lstsq(design, values[judged][:, None], driver="gelsd").solution[:, 0]
+    return line[0] + line[1] / at.clamp(min=1.0)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# The place of a lag between frames, and the zoom of one camera over that of the other.
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a hypothesis's best lag lies.
+
+    Attributes:
+        lag: frames.
+        sigma: its standard deviation, frames.
+        nats: that the rows tell about each other there.
+        zoom: ``(T,)`` logarithm of a's zoom over b's in a's frames; None where a common one explains as much.
+    """
+
+    lag: float
+    sigma: float
+    nats: float
+    zoom: Tensor | None = None
+
+
+def refined(films: Films, found: Hypothesis) -> Place:
+    """Lag of most information near a hypothesis's best; of cameras that may zoom, with the ratio of their zooms."""
+    start = float(found.lags[found.best])
+    plain = _climbed(_Between(films, found.kind, found.level), start)
+    if found.kind == "affine" or films.options.different.measure not in ("auto", "log_determinant"):
+        return plain
+    place = plain
+    rounds = films.options.rows.zoom_rounds
+    for level in [max(films.options.rows.levels)] + [found.level] * (rounds - 1):  # a wide optimum first
+        between = _Between(films, "affine_moving", level, place.zoom)
+        place = _climbed(replace(between, zoom=between.freed(place.lag)), place.lag)
+    # a function of time is fitted with so many numbers, each worth half the logarithm of the samples
+    price = 0.5 * films.options.rows.zoom_terms * math.log(max(len(films.first) * films.samples, 2.0))
+    return replace(place, nats=place.nats - price) if place.nats > plain.nats + price else plain
+
+
+def _climbed(score: _Between, place: float) -> Place:
+    """The highest place near this one."""
+    options = score.films.options.rows
+    top, reach = score(place), 1.0 / options.fractions
+    while reach > options.finest:
+        for other in (place - reach, place + reach):
+            value = score(other)
+            if value > top:
+                place, top = other, value
+                break
+        else:
+            reach /= 2
+    bend = (2 * top - score(place - options.bend) - score(place + options.bend)) / options.bend**2
+    return Place(place, 1 / math.sqrt(bend) if bend > 0 else math.inf, top, score.zoom)
+
+
+@dataclass(frozen=True)
+class _Between:
+    """Nats at any lag, by one kind of camera and level of noise; ``zoom`` as of :class:`Place`."""
+
+    films: Films
+    kind: Kind
+    level: float
+    zoom: Tensor | None = None
+
+    def __call__(self, lag: float) -> float:
+        a, b = self.rows(lag)
+        if len(a) < 3:
+            return -math.inf
+        # a zoom multiplies mean places as well: they are part of what both cameras see
+        both = torch.cat([a, b], dim=1)
+        both = both - both.mean(0) if self.zoom is None else both
+        c, p = (both.mT @ both / len(both))[None], a.shape[1]
+        count = both.new_full((1,), len(both))
+        moments = LagCovariances(c[:, :p, :p], c[:, p:, p:], c[:, :p, p:], count)
+        value = shared(moments, count > 0, self.films.options.different.measure)
+        return float(value[0] * count[0]) * self.films.samples
+
+    def rows(self, lag: float) -> tuple[Tensor, Tensor]:
+        """Both cameras' rows in the overlap, in units of noise; of cameras with a zoom about no mean over time."""
+        films, whole = self.films, math.floor(lag)
+        slow = films.options.subspace.size_width / films.step
+        first, second = films.first, films.second(lag - whole)
+        if self.zoom is None:
+            a, b = rows_of(first, self.kind, slow), rows_of(second, self.kind, slow)
+        else:
+            a = ((first - first.mean(1, keepdim=True)) * torch.exp(-self.zoom)[:, None, None]).flatten(1)
+            b = (second - second.mean(1, keepdim=True)).flatten(1)
+        units = []
+        for variance, x in zip(films.variances, (a, b), strict=True):
+            spread = float((x - x.mean(0)).square().mean())
+            units.append(math.sqrt(variance * films.options.rows.noise + self.level**2 * spread))
+        start, end = max(0, -whole), max(min(len(a), len(b) - whole), 0)
+        return a[start:end] / units[0], b[start + whole : max(end + whole, 0)] / units[1]
+
+    def freed(self, lag: float) -> Tensor:
+        r"""The ratio of the zooms that makes the row spaces meet best, by steps of least squares.
+
+        .. math:: \min_\theta \sum_k \frac{1}{1 - \rho_k^2} \sum_t (u_k(t)\,(1 - \phi(t)^T \theta) - \rho_k v_k(t))^2
+
+        :math:`u_k, v_k` are the canonical variates of the rows and :math:`\rho_k` their correlations; the ascent of the information
+        :math:`-\tfrac12 \sum_k \log (1 - \rho_k^2)` in the logarithm of the zoom, a sum of few polynomials :math:`\phi`.
+        """
+        options = self.films.options.rows
+        frames = len(self.films.first)
+        zoom = self.films.first.new_zeros(frames) if self.zoom is None else self.zoom
+        time = (torch.arange(frames, dtype=zoom.dtype, device=zoom.device) + 0.5) / frames
+        order = torch.arange(1, options.zoom_terms + 1, dtype=zoom.dtype, device=zoom.device)
+        basis = torch.cos(torch.acos(2 * time - 1)[:, None] * order)  # Chebyshev polynomials
+        start = max(0, -math.floor(lag))
+        for _ in range(options.zoom_steps):
+            a, b = replace(self, zoom=zoom).rows(lag)
+            u, v, rho = _canonical(a, b)
+            here = basis[start : start + len(a)]
+            weight = rho / (1 - rho.square()).clamp(min=options.zoom_least).sqrt()
+            design = (u * weight)[:, None, :] * here[:, :, None]  # (T, terms, pairs)
+            rest = (u - v * rho) * weight
+            normal = torch.einsum("tik,tjk->ij", design, design)
+            normal = normal + 1e-9 * normal.diagonal().mean() * torch.eye(len(normal), dtype=normal.dtype, device=normal.device)
+            step = torch.linalg.solve_ex(normal, torch.einsum("tik,tk->i", design, rest))[0]
+            zoom = zoom + basis @ step.nan_to_num(0.0).clamp(-0.5, 0.5)
+        return zoom
+
+
+def _canonical(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Canonical variates ``(T, k)`` of rows with noise of variance 1, of unit square, and their correlations ``(k,)``."""
+    eye_a, eye_b = (torch.eye(x.shape[1], dtype=x.dtype, device=x.device) for x in (a, b))
+    low_a, low_b = (torch.linalg.cholesky_ex(x.mT @ x / len(x) + eye).L for x, eye in ((a, eye_a), (b, eye_b)))
+    white_a = torch.linalg.solve_triangular(low_a, a.mT, upper=False)
+    white_b = torch.linalg.solve_triangular(low_b, b.mT, upper=False)
+    left, rho, right = torch.linalg.svd(white_a @ white_b.mT / len(a), full_matrices=False)
+    return white_a.mT @ left, white_b.mT @ right.mT, rho.clamp(max=1.0)
