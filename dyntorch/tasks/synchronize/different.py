@@ -286,7 +286,7 @@ def _combined(body: Shift, spaces: RowSpaceShift | None, options: SynchronizeOpt
         return body
     away = abs(spaces.lag - body.offset)
     apart, frame = away > options.different.apart, 1 / min(body.fps)
-    if not apart and spaces.clearness < options.rows.beyond:
+    if not apart and spaces.clearness < options.rows.beyond and spaces.sigma > options.rows.precise * frame:
         # cameras that are nearly of some kind bend a lag by a frame or two, each way of looking by as much as it is wrong
         spaces = dataclasses.replace(spaces, sigma=math.hypot(spaces.sigma, away))
     if spaces.ok or not body.ok:

@@ -291,7 +291,9 @@ class RowSpaceOptions:
     odds: float = 4.0
     """How much the logarithm of the odds grows with the clearness, over that which decides."""
     beyond: float = 8.0
-    """Clearness from which the lag is that of one kind of camera, exactly; below, it is as uncertain as the body's evidence differs."""
+    """Clearness from which the lag is that of one kind of camera; below, it is as uncertain as the body's evidence differs."""
+    precise: float = 0.045
+    """Sigma up to which it is that of one kind of camera as well, frames: what cameras leave unexplained blurs."""
     contradicting: float = 0.3
     """Clearness, over that which decides, from which another lag than that of the body's evidence speaks against it."""
     confirming: float = 0.6

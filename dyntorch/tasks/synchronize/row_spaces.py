@@ -158,7 +158,7 @@ def _plainest(films: Films, found: list[Hypothesis], best: Hypothesis) -> tuple[
     places = [(one.kind, refined(films, one)) for one in chosen]
     kind, first = max(places, key=lambda pair: pair[1].nats)
     rivals = [place for _, place in places if place.nats > films.options.rows.nearly * first.nats]
-    apart = max(abs(place.lag - first.lag) for place in rivals) / 2
+    apart = max((abs(place.lag - first.lag) for place in rivals), default=0.0) / 2
     return kind, replace(first, sigma=math.hypot(first.sigma, apart))
 
 
