@@ -222,9 +222,9 @@ class KindMoments:
         )
         if not (0 < first < math.inf and 0 < second < math.inf and min(self.energies) > 0):
             return None
-        scores = shared(self.moments.scaled((first, second)), self.judged, measure)
+        scores = shared(self.moments.scaled((first, second)), self.judged, measure, options.above)
         if bool(self.ruled.any()):
-            chance = shared(self.chance.scaled((first, second)), self.ruled, measure).nan_to_num(0.0)
+            chance = shared(self.chance.scaled((first, second)), self.ruled, measure, options.above).nan_to_num(0.0)
             scores = scores - _line(chance, self.chance.counts, self.moments.counts, self.ruled)
         scores = torch.where(self.judged, scores, torch.nan)
         apart = options.apart / self.films.step
@@ -327,7 +327,7 @@ class _Between:
         c, p = (both.mT @ both / len(both))[None], a.shape[1]
         count = both.new_full((1,), len(both))
         moments = LagCovariances(c[:, :p, :p], c[:, p:, p:], c[:, :p, p:], count)
-        value = shared(moments, count > 0, self.films.options.different.measure)
+        value = shared(moments, count > 0, self.films.options.different.measure, self.films.options.rows.above)
         return float(value[0] * count[0]) * self.films.samples
 
     def rows(self, lag: float) -> tuple[Tensor, Tensor]:

@@ -22,12 +22,10 @@ import torch
 from torch import Tensor
 
 from dyntorch.numerics.lags import lag_covariances
+from dyntorch.tasks.synchronize.options import RowSpaceOptions
 
 Measure = Literal["auto", "rank", "log_determinant", "principal_angles"]
 MEASURES: tuple[Measure, ...] = ("auto", "rank", "log_determinant", "principal_angles")
-ABOVE = 4.0
-"""Variance, over that of the noise, from which a direction belongs to a row space."""
-TINY = 1e-12
 
 
 @dataclass(frozen=True)
@@ -66,13 +64,14 @@ class LagCovariances:
         return torch.cat([torch.cat([self.aa, self.ab], dim=-1), torch.cat([self.ab.mT, self.bb], dim=-1)], dim=-2)
 
 
-def shared(moments: LagCovariances, judged: Tensor, measure: Measure) -> Tensor:
+def shared(moments: LagCovariances, judged: Tensor, measure: Measure, above: float = RowSpaceOptions().above) -> Tensor:
     r"""How much the rows share at every lag ``(L,)``, more is better; in units of noise of variance 1.
 
     Args:
         moments: at all lags.
         judged: ``(L,)`` bool, lags that overlap enough; ranks are told from these.
         measure: ``"rank"``, ``"log_determinant"`` or ``"principal_angles"``; ``"auto"`` is the second.
+        above: variance, over that of the noise, from which a direction belongs to a row space.
 
     Returns:
         Nats per frame of the first two (of the rank, :math:`-\tfrac12 \log` of what lies beyond the least rank); of the angles,
@@ -91,9 +90,9 @@ def shared(moments: LagCovariances, judged: Tensor, measure: Measure) -> Tensor:
         [-5, -5, -5, -5]
     """
     if measure == "rank":
-        return _beyond_rank(moments, judged)
+        return _beyond_rank(moments, judged, above)
     if measure == "principal_angles":
-        return _angles(moments, judged)
+        return _angles(moments, judged, above)
     if measure not in MEASURES:
         raise ValueError(f"measure must be one of {', '.join(MEASURES)}, got {measure!r}")
     return 0.5 * (_log_determinant(moments.aa) + _log_determinant(moments.bb) - _log_determinant(moments.joint))
@@ -104,23 +103,23 @@ def _log_determinant(c: Tensor) -> Tensor:
     return 2 * low.diagonal(dim1=-2, dim2=-1).log().sum(-1)
 
 
-def _beyond_rank(moments: LagCovariances, judged: Tensor) -> Tensor:
+def _beyond_rank(moments: LagCovariances, judged: Tensor, above: float) -> Tensor:
     """Less of what the least rank at any lag leaves is better."""
     values = torch.linalg.eigvalsh(moments.joint).clamp(min=0.0).flip(-1)
-    ranks = (values > ABOVE).sum(-1)
+    ranks = (values > above).sum(-1)
     rank = int(ranks[judged].min()) if bool(judged.any()) else 0
     rest = values[:, rank:].sum(-1) if rank < values.shape[1] else values.new_zeros(len(values))
     return -0.5 * (rest + 1).log()
 
 
-def _angles(moments: LagCovariances, judged: Tensor) -> Tensor:
+def _angles(moments: LagCovariances, judged: Tensor, above: float) -> Tensor:
     """Sum of squared cosines between the spaces of most motion, of as many dimensions as rise above the noise."""
-    one, two = (_basis(c, judged) for c in (moments.aa, moments.bb))
+    one, two = (_basis(c, judged, above) for c in (moments.aa, moments.bb))
     return (one.mT @ moments.ab @ two).square().sum((-2, -1))
 
 
-def _basis(c: Tensor, judged: Tensor) -> Tensor:
+def _basis(c: Tensor, judged: Tensor, above: float) -> Tensor:
     """``(L, p, k)`` combinations of rows that are orthonormal over time."""
     values, vectors = torch.linalg.eigh(c)
-    rank = int((values[judged] > ABOVE).sum(-1).max()) if bool(judged.any()) else 0
-    return vectors[..., c.shape[-1] - rank :] * values[..., None, c.shape[-1] - rank :].clamp(min=TINY).rsqrt()
+    rank = int((values[judged] > above).sum(-1).max()) if bool(judged.any()) else 0
+    return vectors[..., c.shape[-1] - rank :] * values[..., None, c.shape[-1] - rank :].clamp(min=1e-12).rsqrt()

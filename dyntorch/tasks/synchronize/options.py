@@ -262,6 +262,8 @@ class RowSpaceOptions:
     """What a kind of camera may leave unexplained, as share of the rms coordinate, beside the noise."""
     noise: float = 2.0
     """Noise variance of the rows over that of third differences."""
+    above: float = 4.0
+    """Variance, over that of the noise, from which a direction belongs to a row space."""
     exact: float = 1e-6
     """Least noise, over the rms distance of the points from their mean: rounding."""
     least_overlap: float = 0.35
