@@ -289,8 +289,10 @@ def _combined(body: Shift, spaces: RowSpaceShift | None, options: SynchronizeOpt
     if not apart and spaces.clearness < options.rows.beyond and spaces.sigma > options.rows.precise * frame:
         # cameras that are nearly of some kind bend a lag by a frame or two, each way of looking by as much as it is wrong
         spaces = dataclasses.replace(spaces, sigma=math.hypot(spaces.sigma, away))
-    if spaces.ok or not body.ok:
+    if spaces.ok:
         return _refused(body, spaces) if apart and body.ok else _of_spaces(body, spaces, frame, options)
+    if not body.ok:  # the likelier candidate of two that do not decide
+        return _of_spaces(body, spaces, frame, options) if spaces.strength > options.rows.confirming else body
     if apart:
         return _refused(body, spaces) if spaces.strength > options.rows.contradicting else body
     if spaces.strength > options.rows.confirming:

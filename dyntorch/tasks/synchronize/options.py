@@ -300,7 +300,7 @@ class RowSpaceOptions:
     """Clearness, over that which decides, from which another lag than that of the body's evidence speaks against it."""
     confirming: float = 0.6
     """The same from which the same lag as that of the body's evidence, where that decides, is sure by itself."""
-    heard: float = 0.25
+    heard: float = 0.15
     """The same below which not even the lag of the body's evidence is believed: nothing of it shows in the row spaces."""
     nearly: float = 0.75
     """Share of the nats of the best kind of camera from which another one is as good: their places are as uncertain as they
