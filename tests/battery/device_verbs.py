@@ -90,6 +90,14 @@ def paths() -> tuple[Tensor, Tensor]:
     return cameras, inhomogeneous(points @ cameras.mT)
 
 
+def deforming_images() -> tuple[Tensor, Tensor]:
+    """Images of a thing that is a mixture of two shapes, by two affine cameras fixed to each other."""
+    draw = torch.Generator().manual_seed(5)
+    mixed = torch.randn(20, 2, generator=draw, dtype=F64) @ torch.randn(2, 30, generator=draw, dtype=F64)
+    first, second = (mixed.unflatten(1, (10, 3)) @ torch.randn(2, 3, 2, generator=draw, dtype=F64)[:, None]).unbind(0)
+    return first, second
+
+
 def moving_shapes() -> tuple[Tensor, Tensor, Tensor]:
     """Tracks ``(12, 8, 2)``, rows ``(12, 2)`` and points ``(2, 8, 3)`` of a shape at constant velocity."""
     rows = dyn.Polynomial(1).rows(torch.linspace(-1, 1, 12, dtype=F64))
@@ -393,6 +401,7 @@ VERBS: tuple[Verb, ...] = (
         lambda s, x: dyn.shapes.recover_times(s, dyn.Polynomial(1), x),
     ),
     Verb("fit_perspective_shapes", lambda: moving_shapes()[:2], dyn.shapes.fit_perspective_shapes, tolerance=1e-4),
+    Verb("deformable_shapes", deforming_images, lambda a, b: dyn.shapes.deformable_shapes(a, b, 2), tolerance=1e-4),
     Verb(
         "recover_perspective_times",
         lambda: (moving_shapes()[2], moving_shapes()[0]),
@@ -453,6 +462,7 @@ WAITS = {
     "fit_shapes": (60, STEPS),
     "fit_perspective_shapes": (150, STEPS),
     "recover_perspective_times": (2, ASKED),
+    "deformable_shapes": (16, STEPS),
     "ShapeTensor": (40, f"{FITS}; {STEPS}"),
     "LiftedShapeTensor": (60, f"{FITS}; {STEPS}"),
     "DynamicShapeTensor": (60, f"{FITS}; {STEPS}"),
@@ -490,6 +500,7 @@ NOT_VERBS = {
         (
             "Alignment",
             "Clocks",
+            "DeformableShapes",
             "MovingShapes",
             "PairReconstruction",
             "Reconstruction",
