@@ -520,7 +520,7 @@ NOT_VERBS = {
         (
             *("Collineation", "ConstantVelocityTensor", "ConvergentMotionMatrix", "DualHomographyTensor"),
             *("FundamentalMatrix", "GrassmannTensor", "HomographyTensor", "JoinTensor", "MinimalJoinTensor", "SegmentationMatrix"),
-            *("TranslatingLinesMatrix", "DynamicTensor"),
+            "TranslatingLinesMatrix",
         ),
         "invariants: tests/battery/on_input.py takes each of them to a device",
     ),
