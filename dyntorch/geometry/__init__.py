@@ -23,6 +23,7 @@ _HOME = {
     "grassmann_tensor": "dyntorch.geometry.grassmann",
     "joint_epipoles": "dyntorch.geometry.epipoles",
     "hyperplane_pair": "dyntorch.geometry.pairs",
+    "plane_motions": "dyntorch.geometry.plane_motion",
     "two_bodies": "dyntorch.geometry.pairs",
 }
 __all__ = sorted(_HOME)

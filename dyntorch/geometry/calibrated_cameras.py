@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import prod
 
 import torch
 from torch import Tensor
@@ -71,3 +72,31 @@ class CalibratedCameras:
         slope = (basis.mT @ gradient.flatten(2)[..., None]).flatten(1)
         move = damped_step(slope, inner.reshape(b, v * free, v * free), damping).view(b, v, free, 1)
         return (basis @ move).view_as(cameras)
+
+
+def calibrations(calibration: Tensor, batch: tuple[int, ...], views: int, like: Tensor, size: int = 2) -> Tensor:
+    """K of every view, ``(b, views, size + 1, size + 1)``, from one for all, one for each view, or also for each problem.
+
+    Args:
+        calibration: ``(size + 1, size + 1)``, ``(views, size + 1, size + 1)`` or ``(*batch, views, size + 1, size + 1)``.
+        batch: leading dimensions of the problems; b is their product.
+        views: how many.
+        like: a tensor of the dtype and device of the result.
+        size: coordinates of a point of a view.
+
+    Raises:
+        ValueError: another shape, a matrix that is singular or not finite, or of a camera without the last row (0, 0, 1).
+    """
+    want = (*batch, views, size + 1, size + 1)
+    shapes = ((size + 1, size + 1), want[-3:], want)
+    if not isinstance(calibration, Tensor) or tuple(calibration.shape) not in shapes:
+        got = tuple(calibration.shape) if isinstance(calibration, Tensor) else type(calibration).__name__
+        raise ValueError(f"calibration must be a tensor K {' or '.join(map(str, dict.fromkeys(shapes)))}, got {got}")
+    K = calibration.detach().to(like).expand(want).reshape(prod(batch), views, size + 1, size + 1)
+    if not bool(K.isfinite().all()) or bool((torch.linalg.det(K) == 0).any()):
+        raise ValueError("calibration must be finite and invertible; a camera has K = [f 0 u; 0 f v; 0 0 1]")
+    if size == 2 and bool((K[..., 2, :2] != 0).any()):
+        raise ValueError(
+            f"calibration must have the last row (0, 0, 1), got {K[..., 2, :].reshape(-1, 3)[0].tolist()}; transposed?"
+        )
+    return K

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from dyntorch.numerics import worded
+from indexing.cli.calibration import calibrated, calibration_files
 from indexing.cli.console import check_report, count, ended, flags, names, progress, say, table, tell
 from indexing.cli.scenes import Asked, as_matches, follow, inputs_of, is_scene, photographs, tracks_csv
 
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 Model = Literal["planar", "join", "minimal_join", "constant_velocity", "affine_constant_velocity", "rigid", "lines"]
 SEVERAL = ("planar", "join", "minimal_join")
 """Models that take more than three views."""
-WORDS = flags("model", "threshold", "motion", static="a column static", static_points="--static-points FILE FILE")
+WORDS = flags("model", "threshold", "motion", "calibration", static="a column static", static_points="--static-points FILE FILE")
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ class Align:
 
     dyntorch align l1.csv l2.csv --model lines --static-points p1.csv p2.csv
 
-    dyntorch align street.mp4 --frames 0,20,40 --out out/
+    dyntorch align street.mp4 --frames 0,20,40 --calibration 1300,1300,640,360 --out out/
     """
 
     files: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="FILE ...", help_behavior_hint="")]
@@ -60,6 +61,9 @@ class Align:
     """of rigid: points move on straight lines at any speed, or at constant velocity"""
     static_points: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE FILE", help_behavior_hint="")] = ()
     """of lines: points that are known to stand still, a file for each view"""
+    calibration: Annotated[str | None, tyro.conf.arg(metavar="FILE|FX,FY,CX,CY", help_behavior_hint="")] = None
+    """of the camera (planar): focal lengths and middle of the image in pixels, or a TOML file with matrix and distortions, one
+    section for all views or one for each; rotations, translations and the normal of the plane are then found, too"""
     seed: int = 0
     """of the random samples"""
 
@@ -69,7 +73,7 @@ class Align:
         self._check()
         scene, asked = is_scene(inputs), Asked(self.frames, self.at)
         asked.check(scene)
-        inputs = inputs_of(inputs) if scene else inputs
+        inputs = [*(inputs_of(inputs) if scene else inputs), *calibration_files(self.calibration)]
         from indexing.files import manifest
         from indexing.report.alignment import WRITTEN, AlignmentReport, write_alignment
 
@@ -151,6 +155,8 @@ class Align:
             raise ValueError(f"--model {given} needs {views} views, got {have}; give {views} files, or {views} frames of one")
         if self.motion != "straight" and given != "rigid":
             raise ValueError(f"--motion {self.motion} belongs to --model rigid, got {given}; use --model constant_velocity")
+        if self.calibration is not None and given != "planar":
+            raise ValueError(f"--calibration is of cameras, and --model {given} of 3D sensors, which need none; leave it out")
         if self.model is not None:
             return given, []
         from indexing.report.alignment import PURPOSE
@@ -188,7 +194,8 @@ class Align:
             options["static"] = torch.from_numpy(matched.static)
         try:
             if model == "planar":
-                return dyntorch.align_planar(*views, **options)
+                straight, matrices = calibrated(self.calibration, torch.stack(views))
+                return dyntorch.align_planar(*straight, calibration=matrices, **options)
             if model == "lines":
                 points = tuple(torch.from_numpy(part) for part in matched.static_points)
                 return dyntorch.align_lines(*views, static_points=points or None, **options)
@@ -222,6 +229,11 @@ def show(report: AlignmentReport) -> None:
         heading = f"{name}: view {view} to view 1" + ("" if scaled else ", norm 1")
         cells = [[f"row {i}", *(" ± ".join(filter(None, cell)) for cell in row[1:])] for i, row in enumerate(rows, start=1)]
         table([heading, *(f"column {j} " for j in range(1, len(cells[0])))], cells)
+    if report.poses:
+        cells = [[f"view {v}", f"{turn:.4g}°", *(f"{x:.4g}" for x in shift)] for v, turn, shift in report.poses]
+        table(["camera against view 1", "turn ", "x ", "y ", "z "], cells)
+        normal = ", ".join(f"{x:.4g}" for x in report.found.normal)
+        say(f"plane: normal ({normal}) before view 1; shifts in units of its distance")
     tell(report)
     if known and report.ambiguity:
         say(f"open: {report.ambiguity}")

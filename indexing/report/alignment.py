@@ -128,6 +128,15 @@ class AlignmentReport(ResultReport):
             out.append((name, view, rows, scaled))
         return out
 
+    @property
+    def poses(self) -> list[tuple[int, float, list[float]]]:
+        """Of calibrated cameras: view, turn in degrees against view 1, and shift in distances of the plane; empty without."""
+        found = self.found
+        if found.rotations is None or not self.solved:
+            return []
+        pairs = enumerate(zip(found.rotations, found.translations, strict=True), start=1)
+        return [(view, turn_of(turn), shift.tolist()) for view, (turn, shift) in pairs if view > 1]
+
 
 def describe(report: AlignmentReport) -> str:
     """The result in plain words."""
@@ -196,6 +205,7 @@ def as_json(report: AlignmentReport) -> dict[str, Any]:
         "threshold": report.threshold,
         **known,
         "covariance": report.found.covariance if report.solved else None,
+        **_euclidean(report),
         "ambiguity": report.ambiguity,
         "warnings": report.warnings_json,
         "notes": list(report.notes),
@@ -205,6 +215,15 @@ def as_json(report: AlignmentReport) -> dict[str, Any]:
         "unverified": None if unverified is None else [report.ids[i] for i in np.flatnonzero(unverified)],
         "manifest": report.manifest,
     }
+
+
+def _euclidean(report: AlignmentReport) -> dict[str, Any]:
+    """Rotations, translations and the normal of the plane, and the other ones that fit as well; nothing without a calibration."""
+    found, names = report.found, ("rotations", "translations", "normal")
+    if not report.poses:
+        return {}
+    other = {name: part.numpy() for name, part in zip(names, found.other_motion, strict=True)}
+    return {**{name: getattr(found, name) for name in names}, "other_motion": other if other["normal"].any() else None}
 
 
 def labels_csv(report: AlignmentReport) -> str:
@@ -241,9 +260,13 @@ def display_scale(matrix: FloatArray, covariance: FloatArray) -> tuple[FloatArra
 def turn_and_shift(matrix: FloatArray) -> tuple[float, FloatArray]:
     """Angle of a rigid motion in degrees, and its translation."""
     motion = matrix / matrix[-1, -1]
-    rotation = motion[:3, :3]
+    return turn_of(motion[:3, :3]), motion[:3, 3]
+
+
+def turn_of(rotation: FloatArray) -> float:
+    """Angle of a rotation in degrees."""
     sine = 0.5 * np.linalg.norm([rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]])
-    return math.degrees(math.atan2(float(sine), float(np.trace(rotation) - 1) / 2)), motion[:3, 3]
+    return math.degrees(math.atan2(float(sine), float(np.trace(rotation) - 1) / 2))
 
 
 def figures(value: float, spread: float) -> tuple[str, str]:

@@ -213,6 +213,12 @@ VERBS: tuple[Verb, ...] = (
     ),
     Verb("null_space", lambda: (randn(3, 12, 9),), dyn.null_space),
     Verb("align_planar", planar, lambda *x: dyn.align_planar(*x, threshold=1.5, generator=draw())),
+    Verb("plane_motions", lambda: (torch.eye(3, dtype=F64) + 0.2 * randn(4, 3, 3),), dyn.geometry.plane_motions),
+    Verb(
+        "align_planar calibration",
+        planar,
+        lambda *x: dyn.align_planar(*x, threshold=1.5, calibration=torch.diag(torch.tensor([900.0, 900, 1])), generator=draw()),
+    ),
     Verb(
         "align_planar four views",
         lambda: scenes.planar(40, static=0.4, sigma=0.2, views=4, generator=draw(3)).views,

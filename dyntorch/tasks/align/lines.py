@@ -251,6 +251,9 @@ def align_lines(
 
     .. math:: l_2^T F\, l_1 = 0, \qquad F \sim C_2(A)^T J .
 
+    There is no calibration to give: the coordinates of a 3D sensor need none.  One that measures metres moves rigidly:
+    :func:`dyntorch.align_points` with ``model="rigid"`` finds that motion from points.
+
     Args:
         l1: ``(*batch, n, 2, 3)`` two points of each line, or ``(*batch, n, 6)`` Pluecker coordinates (01, 02, 03, 12, 13, 23),
             in view 1; NaN = missing.  Pairs of points of a translating body do as well.

@@ -86,6 +86,30 @@ class AlignPlanarOptions:
 
 
 @dataclass(frozen=True)
+class AlignMetricOptions:
+    """The motion of calibrated cameras above a plane."""
+
+    steps: int = 30
+    """Steps of each descent on the normal of the plane."""
+    floor: float = 1e-9
+    """Relative deviation from equal lengths that is rounding: homographies of pixels lose 6 of 16 digits."""
+    as_good: float = 9.0
+    """Chi-square beyond the least up to which a plane explains the homographies as well: three standard deviations."""
+    as_visible: float = 0.02
+    """Share of points behind cameras beyond the least up to which a plane shows them as well."""
+    other: float = 0.03
+    """Angle between two normals, radians, from which on they are two."""
+    deviations: float = 3.0
+    """And besides so many standard deviations."""
+    undetermined: float = 0.3
+    """Standard deviation of the normal, radians, from which on it is not known: a camera that only turns leaves 1 and more."""
+    misfit: float = 5.0
+    """Chi-square over its quantile of three standard deviations from which on the calibration is doubted."""
+    small: float = 0.003
+    """Relative deviation from equal lengths that a calibration to two or three digits leaves."""
+
+
+@dataclass(frozen=True)
 class AlignJoinOptions:
     """Points in space before projective sensors: the join tensors."""
 
@@ -213,6 +237,7 @@ class AlignOptions:
     labels: AlignLabelOptions = AlignLabelOptions()
     several: AlignSeveralOptions = AlignSeveralOptions()
     planar: AlignPlanarOptions = AlignPlanarOptions()
+    metric: AlignMetricOptions = AlignMetricOptions()
     join: AlignJoinOptions = AlignJoinOptions()
     velocity: AlignVelocityOptions = AlignVelocityOptions()
     rigid: AlignRigidOptions = AlignRigidOptions()

@@ -13,6 +13,7 @@ from dyntorch.core.matches import Matches, matches
 from dyntorch.core.outcome import Notice, Status, failed, in_order, noting
 from dyntorch.core.robust import robust_fit
 from dyntorch.core.solution import NOISY, Solution
+from dyntorch.geometry.calibrated_cameras import calibrations
 from dyntorch.geometry.homogeneous import cofactors, homogeneous, inhomogeneous
 from dyntorch.invariants.agreement import static_residual
 from dyntorch.invariants.homography_tensor import HomographyTensor
@@ -20,6 +21,7 @@ from dyntorch.numerics.arguments import check_options, check_threshold
 from dyntorch.numerics.blocks import one_thread, select
 from dyntorch.numerics.chi_square import median, three_sigma
 from dyntorch.numerics.messages import Message
+from dyntorch.tasks.align.euclidean import euclidean
 from dyntorch.tasks.align.labelling import Evidence, Labelled, joined, static_consensus
 from dyntorch.tasks.align.options import AlignOptions
 from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment, AlignNotice
@@ -185,6 +187,7 @@ def align_planar(
     threshold: float | None = 1.5,
     weights: Tensor | None = None,
     static: Tensor | None = None,
+    calibration: Tensor | None = None,
     generator: torch.Generator | None = None,
     options: AlignOptions = AlignOptions(),
 ) -> Alignment:
@@ -202,6 +205,15 @@ def align_planar(
     Of more views, three at a time give the start; labels and motion are then those of all: a static match is held to one point, a
     moving one to one line, by their distances from it in every view.
 
+    With the calibration K of the cameras the motion is Euclidean: rotations, translations and the normal n of the plane,
+
+    .. math:: X_v = R_v X_1 + t_v, \qquad n^T X_1 = 1, \qquad A_v^{-1} \sim K_v\,(R_v + t_v n^T)\,K_1^{-1},
+
+    lengths in units of the distance of the plane from camera 1, which no view tells.  One homography leaves two planes
+    (:func:`dyntorch.geometry.plane_motions`); the one that explains all views, by the covariance of A, B, and has the points before
+    the cameras is the true one.  Where two still do, as before a camera that was at two places only, a notice says so and
+    ``other_motion`` has the other.
+
     Args:
         x1: ``(*batch, n, 2)`` points of view 1; NaN = missing.
         x2: the same points in view 2.
@@ -211,6 +223,8 @@ def align_planar(
             noise of one coordinate.  None estimates the noise of every problem (at least half of the matches must be inliers).
         weights: ``(*batch, n)`` not negative; 0 leaves a match out.
         static: ``(*batch, n)`` bool, matches known not to move (they may still be outliers).
+        calibration: K of all views ``(3, 3)``, or of each ``(views, 3, 3)``, or ``(*batch, views, 3, 3)``, in the unit of the
+            points, which are without lens distortion.  A, B and labels are the same with and without.
         generator: source of the random samples.
         options: every number that decides, by stage and model; ``dataclasses.replace`` changes some of them.
 
@@ -219,9 +233,10 @@ def align_planar(
 
     Raises:
         ValueError: fewer than 26 matches (9 with ``static``), shapes, dtypes or devices that do not agree, a threshold that is
-            not positive.
+            not positive, a calibration of another shape or that is none.
 
-    Source: thesis chapter 2 and section 8.1; Shashua and Wolf, ECCV 2000.  More views: thesis section 9.3.
+    Source: thesis chapter 2 and section 8.1; Shashua and Wolf, ECCV 2000.  More views: thesis section 9.3.  Calibrated cameras:
+    Faugeras and Lustman 1988.
 
     Example:
         >>> import torch, dyntorch as dyn
@@ -233,6 +248,10 @@ def align_planar(
         True
         >>> float((result.labels == scene.labels).double().mean()) > 0.9
         True
+        >>> K = torch.tensor([[800.0, 0.0, 320.0], [0.0, 800.0, 240.0], [0.0, 0.0, 1.0]])  # of some camera
+        >>> result = dyn.align_planar(*scene.views, threshold=1.5, generator=draw, calibration=K)
+        >>> result.rotations.shape, result.translations.shape, result.normal.shape
+        (torch.Size([3, 3, 3]), torch.Size([3, 3]), torch.Size([3]))
     """
     check_options(options, AlignOptions)
     check_threshold(threshold)
@@ -242,16 +261,24 @@ def align_planar(
         remedy = "" if static is not None else ", or label static ones ({arg:static=}; then {labelled} suffice)"
         text = "align_planar needs at least {least} matches, got {count}; add matches" + remedy
         raise ValueError(Message(text, least=least, count=data.count, labelled=LABELLED))
+    K = None if calibration is None else calibrations(calibration, data.batch, len(data.views), data.views[0])
     with torch.no_grad():
-        return _align(data, threshold, generator, options)
+        return _align(data, threshold, K, generator, options)
 
 
-def _align(data: Matches, threshold: float | None, generator: torch.Generator | None, options: AlignOptions) -> Alignment:
+def _align(
+    data: Matches, threshold: float | None, K: Tensor | None, generator: torch.Generator | None, options: AlignOptions
+) -> Alignment:
     evidence = Evidence.of(moving_points(2, len(data.views)), data, options)
     solution, best, tensor = _solved(evidence, _search(evidence, threshold, generator, options), options)
     outcome = solution.back(data)
     A, B, *others = outcome.motion
     assert outcome.sigma is not None and outcome.covariance is not None
+    notices = planar_notices(evidence, best, tensor, solution.status, data.batch, options)
+    turned, other = None, None
+    if K is not None:
+        turned, other, told = euclidean(solution, data, best.labels, K, options.metric)
+        notices = in_order([*notices, *told])
     return Alignment(
         A=A,
         B=B,
@@ -260,10 +287,14 @@ def _align(data: Matches, threshold: float | None, generator: torch.Generator | 
         sigma=outcome.sigma,
         covariance=outcome.covariance,
         ambiguity=MORE_VIEWS if others else AMBIGUITY,
-        notices=planar_notices(evidence, best, tensor, solution.status, data.batch, options),
+        notices=notices,
         unverified=data.back(unverified(evidence, best) & (best.labels == MOVING)),
         solution=outcome,
         others=tuple(others),
+        rotations=None if turned is None else turned.rotations,
+        translations=None if turned is None else turned.translations,
+        normal=None if turned is None else turned.normal,
+        other_motion=other,
     )
 
 

@@ -66,6 +66,9 @@ def align_points(
     distances), static matches by their disagreement, moving ones by what their model demands, and matches are labelled in
     turns with it.
 
+    There is no calibration to give: a 3D sensor that measures metres is Euclidean as it is, and ``model="rigid"`` says that it
+    does; before a projective or affine one nothing that could be known of it in advance is asked for.
+
     Args:
         P1: ``(*batch, n, 3)`` points of view 1; NaN = missing.
         P2: the same points in view 2.

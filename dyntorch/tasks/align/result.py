@@ -11,6 +11,7 @@ from torch import Tensor
 
 from dyntorch.core.outcome import Notice, NoticeCode, Outcome, Status, agreed
 from dyntorch.core.solution import Solution
+from dyntorch.geometry.plane_motion import PlaneMotion
 
 OUTLIER, STATIC, MOVING = 0, 1, 2
 
@@ -94,6 +95,24 @@ class AlignNotice(NoticeCode):
         },
     )
     """The noise leaves the motion so uncertain that it says little."""
+    PLANE_OPEN = (
+        "plane_open",
+        "the cameras turn and hardly move (the normal of the plane has a standard deviation of {value:.2g} radians): rotations are "
+        "known, translations and the normal are not; move the camera",
+    )
+    """Calibrated cameras that only turn do not determine the plane."""
+    TWO_PLANES = (
+        "two_planes",
+        "two planes, {value:.3g} degrees apart, explain the matches, both before the cameras; the other one and its motion are in "
+        "other_motion; add a view from a third place, away from the line of the others",
+    )
+    """Two motions of calibrated cameras fit, and one of them is given."""
+    CALIBRATION = (
+        "calibration",
+        "no motion of cameras of this calibration gives these homographies (lengths in the plane differ by {value:.2g}); check "
+        "{arg:calibration=}, and that lens distortion is removed",
+    )
+    """The homographies speak against the calibration."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -113,6 +132,13 @@ class Alignment(Outcome):
         unverified: ``(*batch, n)`` matches that stand still in all views but one: moving by geometry, but a static point mismatched
             in one view looks the same.
         solution: the fitted invariant behind it.
+        rotations: :math:`R_v`, ``(*batch, views, 3, 3)`` of determinant 1, with a calibration: :math:`X_v = R_v X_1 + t_v`, the
+            first one the identity; zero where the status says that there is no motion.  None without a calibration.
+        translations: :math:`t_v`, ``(*batch, views, 3)`` in units of the distance of the plane from camera 1; zero as well where
+            the normal is not determined (notice ``plane_open``).
+        normal: ``(*batch, 3)`` n of length 1, the plane in the frame of camera 1: :math:`n^T X_1 = 1`; zero as the translations.
+        other_motion: with a calibration, rotations, translations and normal of another motion that explains the matches as well;
+            zero where there is none (elsewhere notice ``two_planes``).
     """
 
     A: Tensor
@@ -126,6 +152,10 @@ class Alignment(Outcome):
     solution: Solution | None = field(default=None, repr=False)
     others: tuple[Tensor, ...] = field(default=(), repr=False)
     """Of the views after the third."""
+    rotations: Tensor | None = None
+    translations: Tensor | None = None
+    normal: Tensor | None = None
+    other_motion: PlaneMotion | None = field(default=None, repr=False)
 
     @property
     def collineations(self) -> Tensor:

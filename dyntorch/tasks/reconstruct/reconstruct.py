@@ -11,6 +11,7 @@ from torch import Tensor
 
 from dyntorch.core.normalize import hartley
 from dyntorch.core.outcome import failed, in_order, noting
+from dyntorch.geometry.calibrated_cameras import calibrations
 from dyntorch.geometry.triangulation import observed
 from dyntorch.numerics.arguments import check_options, on_cpu
 from dyntorch.numerics.blocks import one_thread
@@ -112,7 +113,7 @@ def reconstruct(
     if model is None or _moves(model):
         _resolved(moment, times, tracks.dtype, options)
     label = _static(static, batch, x)
-    K = None if calibration is None else _calibrations(calibration, batch, x)
+    K = None if calibration is None else calibrations(calibration, batch, x.shape[1], x, x.shape[-1])
     limit = _limit(threshold)
     with torch.no_grad():
         if model is None:
@@ -216,24 +217,6 @@ def _static(static: Tensor | Sequence[bool] | None, batch: tuple[int, ...], x: T
         got = type(static).__name__ if known.shape == (0,) else f"{tuple(known.shape)} {known.dtype}"
         raise ValueError(f"static must be a bool tensor (*batch, n) = {(*batch, n)}, got {got}")
     return known.expand(*batch, n).reshape(len(x), n) if bool(known.any()) else None
-
-
-def _calibrations(calibration: Tensor, batch: tuple[int, ...], x: Tensor) -> Tensor:
-    """K of every view, ``(b, views, l + 1, l + 1)``."""
-    b, views, _, size = x.shape
-    want = (*batch, views, size + 1, size + 1)
-    shapes = ((size + 1, size + 1), want[-3:], want)
-    if not isinstance(calibration, Tensor) or tuple(calibration.shape) not in shapes:
-        got = tuple(calibration.shape) if isinstance(calibration, Tensor) else type(calibration).__name__
-        raise ValueError(f"calibration must be a tensor K {' or '.join(map(str, dict.fromkeys(shapes)))}, got {got}")
-    K = calibration.detach().to(x).expand(want).reshape(b, views, size + 1, size + 1)
-    if not bool(K.isfinite().all()) or bool((torch.linalg.det(K) == 0).any()):
-        raise ValueError("calibration must be finite and invertible; a camera has K = [f 0 u; 0 f v; 0 0 1]")
-    if size == 2 and bool((K[..., 2, :2] != 0).any()):
-        raise ValueError(
-            f"calibration must have the last row (0, 0, 1), got {K[..., 2, :].reshape(-1, 3)[0].tolist()}; transposed?"
-        )
-    return K
 
 
 def normalized(x: Tensor, weights: Tensor, times: Tensor) -> ViewTracks:

@@ -190,6 +190,32 @@ def test_frames_of_one_file(run, data, tmp_path):
     assert read("one")["A"] == read("two")["A"] and read("one")["views"][1] == "walk.npy frame 2"
 
 
+def test_a_calibration_tells_how_the_camera_moved_and_the_plane(run, tmp_path):
+    """Numbers and a file with the same say the same; the page and the JSON have it."""
+    side = torch.tensor([[0.8, 0.0], [0.0, 1.0], [0.6, 0.0]], dtype=torch.float64)
+    normal = torch.tensor([-0.6, 0.0, 0.8], dtype=torch.float64)
+    points = 0.3 * torch.randn(60, 2, generator=draw(5)).double()
+    speed = 0.1 * torch.randn(60, 2, generator=draw(6)).double() * (torch.arange(60) > 20)[:, None]
+    turns, shifts = [0.0, 0.1, -0.15], [[0.0, 0.0, 0.0], [0.1, -0.2, 0.1], [-0.2, 0.0, 0.15]]
+    for name, pace, turn, shift in zip("abc", (0.0, 1.0, 1.7), turns, shifts, strict=True):
+        c, s = np.cos(turn), np.sin(turn)
+        camera = torch.tensor([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]], dtype=torch.float64)
+        place = normal + (points + pace * speed) @ side.mT
+        seen = place @ camera.mT + torch.tensor(shift, dtype=torch.float64)
+        table(tmp_path / f"{name}.csv", (900 * seen[:, :2] / seen[:, 2:] + torch.tensor([320.0, 240.0])).numpy())
+    (tmp_path / "lens.toml").write_text("[cam]\nmatrix = [[900, 0, 320], [0, 900, 240], [0, 0, 1]]\ndistortions = [0, 0, 0, 0]\n")
+    for given in ("900,900,320,240", "lens.toml"):
+        code, out, err = run(f"a.csv b.csv c.csv --threshold 0.1 --out out --calibration {given}")
+        assert (code, err) == (0, "") and re.search(r"view 2 +5\.73°  +0\.1 ", out) and "plane: normal (" in out
+        found = read()
+        np.testing.assert_allclose(found["normal"], normal.numpy(), atol=1e-5)
+        np.testing.assert_allclose(found["translations"], shifts, atol=1e-5)
+        assert np.shape(found["rotations"]) == (3, 3, 3) and found["other_motion"] is None
+        assert "Camera against view 1" in Path("out/report.html").read_text()
+    assert run("a.csv b.csv c.csv --threshold 0.1 --out plain")[0] == 0
+    assert "rotations" not in read("plain") and np.allclose(read("plain")["A"], found["A"], atol=1e-9)
+
+
 # ---- what is refused -----------------------------------------------------------------------------------------------------
 def test_data_that_cannot_decide_are_refused_with_code_3(run, tmp_path):
     equal = table(tmp_path / "e.csv", np.full((40, 2), 5.0))
@@ -238,6 +264,8 @@ def test_noise_alone_is_refused(run, tmp_path):
         ("@/a.csv @/b.csv @/c.csv --threshold x", "threshold"),
         ("@/a.csv @/b.csv @/c.csv --seed -1", "--seed must be a whole number"),
         ("@/a.csv @/b.csv @/c.csv --motion constant_velocity", "--motion constant_velocity belongs to --model rigid"),
+        ("@/a.csv @/b.csv @/c.csv --calibration 900,900", "expected fx,fy,cx,cy"),
+        ("@/rigid.npz --calibration 900,900,320,240", "--calibration is of cameras, and --model rigid of 3D sensors"),
         ("@/rigid.npz --frames 1,x,3", "--frames '1,x,3': expected whole numbers"),
         ("@/rigid.npz --frames 1,2,3", "an .npz has no frames"),
         ("@/a.csv @/b.csv @/c.csv --static-points @/p1.csv", "static points are for lines"),
