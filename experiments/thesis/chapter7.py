@@ -133,7 +133,7 @@ def outliers() -> Finding:
     wrong = any(ok and error > 1 for error, ok in found)
     return Finding(
         right >= TAKES - 1 and not wrong,
-        f"2 of 9 points foreign, .5 px: just these discarded by the reconstruction in {right} of {TAKES} takes; synchronized {said}",
+        f"2 of 9 points foreign, .5 px: just these discarded in {right} of {TAKES} takes; synchronized {said}",
     )
 
 
