@@ -10,6 +10,7 @@ from torch import Tensor
 
 from dyntorch.geometry.homogeneous import nonzero_sign
 from dyntorch.geometry.rigid import nearest_rotation
+from dyntorch.numerics.blocks import one_thread
 from dyntorch.numerics.least_squares import NormalEquations
 
 TINY = 1e-300
@@ -26,6 +27,7 @@ class PlaneMotion(NamedTuple):
     """``(*batch, 3)`` of length 1, away from view 1."""
 
 
+@one_thread
 def plane_motions(H: Tensor) -> PlaneMotion:
     r"""The two motions and planes behind the homography of a plane between two calibrated views,
 
