@@ -8,6 +8,7 @@ nothing else: missing joints are NaN, times are seconds, and no value is invente
 from __future__ import annotations
 
 import dataclasses
+import sys
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -392,4 +393,5 @@ def _check_times(times: FloatArray, frames: int, who: str) -> None:
 
 
 def _rate(times: FloatArray) -> float:
-    return float(1.0 / np.median(np.diff(times))) if len(times) > 1 else 30.0
+    # of steps below the smallest normal number the rate would be infinite
+    return float(1.0 / max(float(np.median(np.diff(times))), sys.float_info.min)) if len(times) > 1 else 30.0

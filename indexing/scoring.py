@@ -29,7 +29,7 @@ class DecisionOptions:
 class Event:
     """One action found in a recording; start and end in seconds on its clock.
 
-    score: mean evidence while it lasts; margin: how far its class stands above the next one, same scale; exemplar: number
+    score: mean evidence while it lasts; margin: how far its class stands above the next one, 0 or more; exemplar: number
     of the exemplar that fits best, among those of the model.
     """
 

@@ -266,10 +266,12 @@ def torn(clip: Clip) -> str | None:
     usual, longest = float(np.median(steps)), int(steps.argmax())
     if usual > SLOWEST:
         return f"its frames are {usual:.3g} s apart; times are seconds: correct them, or fps"
-    if steps[longest] > RARE * usual and steps[longest] > clip.duration / 2:
+    pauses = steps[steps > max(GAP, RARE * usual)]
+    if len(pauses) and pauses.sum() > clip.duration / 2:
+        more = f", with {len(pauses) - 1} pauses more" * (len(pauses) > 1)
         return (
-            f"no frames for {steps[longest]:.3g} s after {clip.times[longest]:.6g} s, which is most of the clip; a clip is one "
-            "performance: cut it there"
+            f"no frames for {steps[longest]:.3g} s after {clip.times[longest]:.6g} s, which is most of the clip{more}; a clip is "
+            "one performance: cut it there"
         )
     return None
 

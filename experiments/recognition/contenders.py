@@ -63,7 +63,7 @@ def check_methods(methods: Sequence[Method]) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class _Nearest(ShapeModel):
-    """A model whose short windows are compared by a baseline."""
+    """A model whose windows are compared by a baseline."""
 
     nearest: Nearest | None = None
     bank: Any = None
@@ -73,10 +73,16 @@ class _Nearest(ShapeModel):
         assert self.nearest is not None
         return torch.from_numpy(self.nearest.between(self.nearest.describe(query.values), self.bank)).float()
 
+    def whole_residuals(self, query: Windows, chosen: Tensor) -> Tensor:
+        """``(Q, chosen)`` the same to whole exemplars."""
+        assert self.nearest is not None
+        bank = self.nearest.describe(self.exemplars.crop(0)[chosen].values)
+        return torch.from_numpy(self.nearest.between(self.nearest.describe(query.values), bank)).float()
+
 
 class Sliding:
-    """A baseline on a stream: everything is done as the action indexer does it (short windows of the exemplars, several
-    tempi, pooling, levels calibrated on wrong classes), only the distance between two windows is the baseline's."""
+    """A baseline on a stream: everything is done as the action indexer does it (short windows of the exemplars at several tempi,
+    windows of every duration, the best segments), only the distance between two windows is the baseline's."""
 
     def __init__(self, nearest: Nearest) -> None:
         self.nearest = nearest

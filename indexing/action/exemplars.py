@@ -37,7 +37,8 @@ class Exemplars:
     """Windows of ``N`` exemplars.
 
     crops: ``C * N`` windows, crop by crop; views: ``V * N``, view by view; moments: short windows of all exemplars, with
-    ``owner`` telling whose they are; solid: ``(N,)`` which exemplars had depth.
+    ``owner`` telling whose they are; solid: ``(N,)`` which exemplars had depth; seconds: ``(N,)`` how long each lasts; cyclic:
+    ``(N,)`` how much it repeats itself (:func:`recurrence`).  Model files written before these were kept have neither.
     """
 
     crops: Windows = field(metadata=part(rows="crops"))
@@ -45,6 +46,8 @@ class Exemplars:
     moments: Windows = field(metadata=part(rows="moments"))
     owner: torch.Tensor = field(metadata=stored("every", "moments", below="exemplars"))
     solid: torch.Tensor = field(metadata=stored("truth", "exemplars"))
+    seconds: torch.Tensor | None = field(default=None, metadata=stored("real", "exemplars"))
+    cyclic: torch.Tensor | None = field(default=None, metadata=stored("real", "exemplars"))
 
     def __len__(self) -> int:
         return len(self.solid)
@@ -52,7 +55,8 @@ class Exemplars:
     def to(self, device: torch.device | str) -> Exemplars:
         """The same windows on another device."""
         crops, views, moments = (part.to(device) for part in (self.crops, self.views, self.moments))
-        return Exemplars(crops, views, moments, self.owner.to(device), self.solid.to(device))
+        seconds, cyclic = (None if one is None else one.to(device) for one in (self.seconds, self.cyclic))
+        return Exemplars(crops, views, moments, self.owner.to(device), self.solid.to(device), seconds, cyclic)
 
     def crop(self, index: int) -> Windows:
         """``N`` windows of one crop; 0 is the whole exemplar."""
@@ -78,6 +82,8 @@ class Exemplars:
             stack([self.moments, other.moments]),
             torch.cat([self.owner, other.owner + mine]),
             torch.cat([self.solid, other.solid]),
+            None if self.seconds is None or other.seconds is None else torch.cat([self.seconds, other.seconds]),
+            None if self.cyclic is None or other.cyclic is None else torch.cat([self.cyclic, other.cyclic]),
         )
 
 
@@ -91,9 +97,49 @@ def cut(
     crops = options.exemplars.crops if plan.search else options.exemplars.crops[:1]
     cropped = stack([Windows(whole(source, plan.length, crop), seen) for crop in crops])
     views = [_view(clips, source, plan, random_state, options) for _ in range(plan.views)]
-    moments, owner = slide(source, plan.length, plan.window, plan.stride)
+    seconds = torch.tensor([lasts(clip) for clip in images], dtype=torch.float32)
+    window = moment_window(plan.window, seconds)
+    moments, owner = slide(source, plan.length, window, plan.stride * window / plan.window)
     solid = torch.tensor([clip.dims == 3 for clip in clips])
-    return Exemplars(cropped, stack(views) if views else cropped[:0], moments, owner, solid)
+    return Exemplars(
+        cropped, stack(views) if views else cropped[:0], moments, owner, solid, seconds, recurrence(source, options.exemplars)
+    )
+
+
+def lasts(clip: Clip) -> float:
+    """Seconds from the first frame of a clip to the end of its last one."""
+    steps = np.diff(clip.times)
+    return float(clip.duration + (np.median(steps) if len(steps) else 0.0))
+
+
+def moment_window(longest: float, seconds: torch.Tensor | None) -> float:
+    """Seconds of a short window: half an ordinary exemplar, so that one lasts less than the action, and ``longest`` at most."""
+    return longest if seconds is None else min(longest, 0.5 * float(seconds.median()))
+
+
+def recurrence(source: Ragged, options: ExemplarOptions) -> torch.Tensor:
+    r"""``(N,)`` how much each exemplar repeats itself within its first half: near 1 for two cycles or more, .3 or less for none.
+
+    The greatest autocorrelation of the frame-centred motion :math:`x`, at lags up to half the exemplar, after it first fell:
+
+    .. math:: R(k) = \frac{\sum_t x_t \cdot x_{t+k}}{\sqrt{\sum_t |x_t|^2 \sum_t |x_{t+k}|^2}}
+    """
+    count, fine = len(source.starts) - 1, options.recurrence_steps
+    begin, end = source.times[source.starts[:-1]], source.times[source.starts[1:] - 1]
+    found = torch.zeros(count)
+    for i in range(count):
+        values = sample(source, np.array([i]), begin[i : i + 1], end[i : i + 1], fine)[0].double()
+        x = values - values.mean(dim=1, keepdim=True)
+        x = (x - x.mean(dim=0)).flatten(1)
+        gram, energy = x @ x.T, x.square().sum(dim=1)
+        lags = range(fine // 2 + 1)
+        curve = torch.stack([gram.diagonal(k).sum() for k in lags])
+        norm = torch.stack([(energy[: fine - k].sum() * energy[k:].sum()).sqrt() for k in lags]).clamp(min=1e-30)
+        curve = curve / norm
+        fallen = (curve < options.fallen).nonzero()
+        if len(fallen):
+            found[i] = float(curve[int(fallen[0]) :].max().clamp(min=0.0))
+    return found
 
 
 def _render(clip: Clip, azimuth: float, elevation: float, random_state: np.random.Generator) -> Clip:

@@ -20,11 +20,13 @@ from indexing.action.inputs import check_common, check_plan, check_queries, gath
 from indexing.action.learning import Lesson, learn
 from indexing.action.model import ShapeModel
 from indexing.action.options import ActionOptions
-from indexing.action.stream import Stream, find_events, frame_scores, scan
+from indexing.action.stream import Stream
 from indexing.action.symmetry import mirror_permutation
 from indexing.clip import Clip
 from indexing.estimator import POSITIVE, RANDOM_STATE, REJECT, SECONDS, Rule, SavedClassifier, is_positive, is_whole, one_of
 from indexing.joints import layout_of
+from indexing.recordings.explain import explain
+from indexing.recordings.explanation import Explanation, Withheld
 from indexing.scoring import Event, joined, probabilities, refuse, reject_threshold, same_label
 from indexing.skeleton import Skeleton
 from indexing.windows import RepairOptions, mended, ragged, whole
@@ -61,8 +63,9 @@ class ActionIndexer(SavedClassifier):
         virtual_views: copies of every exemplar for the kernel machine; by default 4, and 12 where exemplars have depth.
         repair: replace joints that jump where their clip gives no reason to (:mod:`indexing.windows`);
             costs nothing on clean clips.
-        window, stride, tempi, pool: of :meth:`score_frames`: seconds, seconds between exemplar windows, speed factors tried,
-            and seconds over which scores are averaged.
+        window, stride, tempi: of the short windows of long recordings: seconds (half an ordinary exemplar at most), seconds between
+            those of exemplars, speed factors tried.
+        pool: without effect: segments average by themselves; kept for programs and model files that have it.
         random_state: of the virtual views.
         device: where clips are compared, in ``fit`` too, e.g. ``"cuda"``; what was learned is kept on the CPU.
         options: every other number that decides, by stage (:class:`~indexing.action.options.ActionOptions`); None: as measured.
@@ -314,39 +317,55 @@ class ActionIndexer(SavedClassifier):
         return Stream(self.length, self.window, tuple(self.tempi), self.pool, self.device)
 
     @one_thread
-    def scan(self, clip: Any, progress: Callable[[float], None] | None = None) -> tuple[Array, list[Event]]:
-        """:meth:`score_frames` and :meth:`find` in one pass.
+    def explain(self, clip: Any, progress: Callable[[float], None] | None = None) -> Explanation:
+        """An untrimmed recording as segments: scores of its frames, events, and what was held back and why.
 
         Args:
             progress: called with the share done, 0..1.
         """
         check_is_fitted(self, "model_")
         (found,) = check_queries([clip], self.fps, self.n_joints_, self.skeleton_, recordings=True)
-        model, stream = self._model(), self._stream()
         begin = float(found.times[0])
+        times = found.times
         found = found.replace(times=found.times - begin)  # rounding must not depend on what the clock shows
         found = mended(found, self._repair) if self._repair else found
-        windows = scan(model, found, stream, progress)
-        events = find_events(model, found, stream, windows, self.classes_, self.reject)
-        events = [dataclasses.replace(event, start=event.start + begin, end=event.end + begin) for event in events]
-        return frame_scores(found, stream, windows), events
+        told = explain(self._model(), found, self._stream(), self.classes_.tolist(), self.reject, progress)
+
+        def later(event: Event) -> Event:
+            return dataclasses.replace(event, start=event.start + begin, end=event.end + begin)
+
+        held = [Withheld(later(one.event), one.reason) for one in told.withheld]
+        return dataclasses.replace(told, times=times, events=[later(event) for event in told.events], withheld=held)
+
+    @one_thread
+    def scan(self, clip: Any, progress: Callable[[float], None] | None = None) -> tuple[Array, list[Event]]:
+        """:meth:`score_frames` and :meth:`find` in one pass.
+
+        Args:
+            progress: called with the share done, 0..1.
+        """
+        told = self.explain(clip, progress)
+        return told.scores, list(told.events)
 
     @one_thread
     def score_frames(self, clip: Any, progress: Callable[[float], None] | None = None) -> Array:
         """``(frames, classes)`` score of every frame of an untrimmed recording, larger is better.
 
-        Short windows at several tempi are compared with short windows of the exemplars, and averaged over ``pool`` seconds.
+        The logarithm of how likely the frame belongs to a performance of each class, summed over all explanations of the recording
+        as segments of the lengths that the exemplars have.
         """
         return self.scan(clip, progress)[0]
 
     @one_thread
     def find(self, clip: Any, progress: Callable[[float], None] | None = None) -> list[Event]:
-        """The actions in an untrimmed recording, in order of time: label, start, end (seconds), score and margin.
+        """The actions in an untrimmed recording, in order of time: one event per performance, with label, start, end (seconds),
+        score and margin.
 
-        An event needs a class to stand out from the others further than wrong actions do, at a rate calibrated by leaving
-        classes out: ``reject``, else 0.3 (outside 0..1 it is the least score an event needs).  Nothing is found where nobody
-        is seen, and hardly anything while the person rests.  Two or three classes have little to stand out from: add a class
-        of ordinary movement.
+        The best explanation of the recording as segments: each is worth its resemblance to whole exemplars and to short windows of
+        them, by how long it lasts, and must be worth more than no action at all, which is worth more while the person rests.
+        Cyclic actions that touch are one event.  ``reject`` asks for more: a rate at which wrong actions may reach an event's
+        score, or, outside 0..1, the least score.  Two or three classes have little to stand out from: add one of ordinary
+        movement.
         """
         return self.scan(clip, progress)[1]
 

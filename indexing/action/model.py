@@ -172,6 +172,13 @@ class ShapeModel:
         epipolar = self.parts.residual(query, copies, self.metric, self.labels)
         return epipolar + self.options.nearest.turned * fused_residual(query, copies, self.metric, terms=("turned",)) - self.hub
 
+    def whole_residuals(self, query: Windows, chosen: Tensor) -> Tensor:
+        """``(Q, chosen)`` the same of whole exemplars, without their crops, which would match windows that are cut short."""
+        copies = [copy[chosen] for copy in self.copies()[:: max(1, len(self.exemplars.crops) // max(1, len(self.exemplars)))]]
+        epipolar = self.parts.residual(query, copies, self.metric, self.labels[chosen])
+        turned = fused_residual(query, copies, self.metric, terms=("turned",))
+        return epipolar + self.options.nearest.turned * turned - self.hub[chosen]
+
     def moment_residuals(self, query: Windows) -> Tensor:
         """``(Q, M)`` residual of short windows to every short window of the exemplars, less the hub share."""
         copies = [self.exemplars.moments]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from indexing.recordings.options import ExplanationOptions
 from indexing.scoring import DecisionOptions
 from indexing.windows import RepairOptions
 
@@ -26,6 +27,10 @@ class ExemplarOptions:
     """Its standard deviation, radians."""
     pitch: float = 0.1
     """Standard deviation of the pitch of turned cards, radians."""
+    recurrence_steps: int = 96
+    """Steps in which an exemplar is compared with itself: eight of each cycle where it holds twelve."""
+    fallen: float = 0.3
+    """Autocorrelation below which a movement has left the pose that it may come back to."""
     unexplained: float = 0.01
     """Share of the energy that one rigid space-time shape may leave unexplained, for views of one performance to become a 3D clip.
     On synthetic people a detector's noise leaves .002-.005, views that lag by .3 s .006-.04, views of another action .01-.05."""
@@ -205,5 +210,6 @@ class ActionOptions:
     joints: JointWeightOptions = JointWeightOptions()
     importance: ImportanceOptions = ImportanceOptions()
     events: EventOptions = EventOptions()
+    recordings: ExplanationOptions = ExplanationOptions()
     decisions: DecisionOptions = DecisionOptions()
     repair: RepairOptions = RepairOptions()

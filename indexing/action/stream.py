@@ -176,7 +176,7 @@ def find_events(
         rate: at which the contrast of wrong actions may reach the level that an event needs (0.3 by default); a number
             outside 0..1 is that level itself.
     """
-    wrong, (still, calm) = _wrong(model), _calm(model)
+    wrong, (still, calm) = wrong_contrast(model), motion_levels(model)
     peak, floor = event_levels(
         wrong, model.options.events.false_alarms if rate is None else rate, model.options.events.extent, model.options.events.least
     )
@@ -246,7 +246,7 @@ def _motion(windows: Windows) -> Array:
     return (moving / whole.clamp(min=1e-30)).sqrt().cpu().numpy()
 
 
-def _wrong(model: ShapeModel) -> Array:
+def wrong_contrast(model: ShapeModel) -> Array:
     """The contrast that short windows of one class reach with other classes."""
     moments, labels = model.exemplars.moments, model.labels[model.exemplars.owner]
     chosen = torch.arange(0, len(moments), max(1, len(moments) // model.options.nearest.moments))
@@ -255,7 +255,7 @@ def _wrong(model: ShapeModel) -> Array:
     return np.asarray(np.nanmax(scores, axis=1) - np.nanmean(scores, axis=1))
 
 
-def _calm(model: ShapeModel) -> tuple[float, Array]:
+def motion_levels(model: ShapeModel) -> tuple[float, Array]:
     """The motion of calm moments: of all classes together, and of each ``(classes,)``."""
     motion, labels = _motion(model.exemplars.moments), model.labels[model.exemplars.owner].cpu().numpy()
     each = np.array([np.quantile(motion[labels == c], model.options.events.calm) for c in range(model.classes)])

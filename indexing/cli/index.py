@@ -15,17 +15,16 @@ from indexing.cli.console import check_file, check_report, count, names, progres
 from indexing.cli.films import Pixels, are_films, refuse_film_flags
 from indexing.cli.inputs import (
     Example,
+    Following,
     KnownEvent,
+    Lane,
     Reading,
-    assumed,
     on_classes,
-    on_gaps,
     on_truth,
     parse_example,
     read_examples,
     read_recordings,
     read_truth,
-    remarks,
 )
 
 if TYPE_CHECKING:
@@ -174,8 +173,8 @@ if TYPE_CHECKING:
 class Scan:
     """Find the actions of a model in untrimmed recordings.
 
-    Score: the evidence for the action, averaged over the time it lasts; higher is better.  Margin: how far that is above the next
-    best action; near 0 it might as well be that one.
+    Score: the evidence for the action, averaged over the time it lasts; higher is better.  Margin: how much more the
+    segment is worth than as the next best action; near 0 it might as well be that one.
 
     dyntorch index scan session.json -m moves.safetensors --report out/
 
@@ -192,7 +191,7 @@ class Scan:
     """what is known to have happened: columns label,start,end in seconds (and file, where there are several recordings)"""
     reject: Annotated[float | None, tyro.conf.arg(metavar="R", help_behavior_hint="")] = None
     """rate of false alarms that is accepted, 0 to 1, or else the least score; by default that of the model"""
-    reading: Reading = field(default_factory=Reading)
+    reading: Following = field(default_factory=Following)
 
     def run(self) -> int:
         """Read all, scan all, write the report, print the hits."""
@@ -205,8 +204,8 @@ class Scan:
             indexer, recordings, notes = self._films() if self._of_films() else self._clips()
         if self.reject is not None:
             indexer.set_params(reject=self.reject)
-        names = [recording.name for recording in recordings]
-        truth, unread = (None, []) if self.truth is None else read_truth(self.truth, names)
+        names, people = [one.name for one in recordings], [getattr(one, "person", "") for one in recordings]
+        truth, unread = (None, []) if self.truth is None else read_truth(self.truth, names, people)
         notes = notes + unread + _unknown(truth, indexer)
         if truth is not None:
             notes += on_truth(truth, recordings)
@@ -237,13 +236,12 @@ class Scan:
             raise ValueError(f"{self.recordings[0]}: the model {self.model} was learned from {has}; give {need} to search")
         return of_films
 
-    def _clips(self) -> tuple[ActionIndexer, list[Clip], list[str]]:
+    def _clips(self) -> tuple[ActionIndexer, list[Lane], list[str]]:
         from indexing.action.indexer import ActionIndexer
 
         indexer = ActionIndexer.load(self.model.expanduser())
-        clips, notes = read_recordings(self.recordings, self.reading, indexer.n_joints_, self.model, indexer.skeleton_)
-        notes += [*remarks(clips, self.reading), *on_gaps(clips), *on_classes([str(label) for label in indexer.classes_])]
-        return indexer, clips, notes + assumed(clips)
+        lanes, notes = read_recordings(self.recordings, self.reading, indexer.n_joints_, self.model, indexer.skeleton_)
+        return indexer, lanes, notes + on_classes([str(label) for label in indexer.classes_])
 
     def _films(self) -> tuple[BrightnessIndexer, list[FilmRecording], list[str]]:
         from indexing.brightness.indexer import BrightnessIndexer
@@ -252,15 +250,20 @@ class Scan:
         return BrightnessIndexer.load(self.model.expanduser()), *read_films(self.recordings, self.reading)
 
     def _scan(self, indexer: Any, recording: Any, truth: list[KnownEvent] | None, which: str) -> RecordingResult:
-        from indexing.clip import Clip
+        import numpy as np
+
         from indexing.report import RecordingResult
 
         classes = [str(label) for label in indexer.classes_]
-        with progress(f"scanning {recording.name}{which}") as bar:
-            if isinstance(recording, Clip):
-                scores, events = indexer.scan(recording, bar)
+        if isinstance(recording, Lane) and recording.clip is None:  # nobody is in view
+            nothing = np.full((len(recording.times), len(classes)), np.nan)
+            return RecordingResult(recording.name, None, recording.times, classes, nothing, (), truth)
+        person = getattr(recording, "person", "")
+        with progress(f"scanning {recording.name}{f', person {person}' * bool(person)}{which}") as bar:
+            if isinstance(recording, Lane):
+                scores, events = indexer.scan(recording.clip, bar)
                 mine = [dataclasses.replace(event, exemplar=within_label(indexer, event.exemplar)) for event in events]
-                return RecordingResult(recording.name, recording, recording.times, classes, scores, mine, truth)
+                return _of_person(recording, classes, scores, mine, truth)
             times, scores, events = indexer.scan(recording.source, bar)
             return RecordingResult(recording.name, None, times, classes, scores, events, truth)
 
@@ -283,6 +286,21 @@ class Scan:
             return write_recognition(folder, report)
 
 
+def _of_person(
+    lane: Lane, classes: list[str], scores: Any, events: Sequence[Any], truth: list[KnownEvent] | None
+) -> RecordingResult:
+    from indexing.report import RecordingResult
+
+    return RecordingResult(
+        lane.name, lane.clip, lane.times, classes, scores, events, truth, **_known(RecordingResult, person=lane.person)
+    )
+
+
+def _known(kind: Any, **values: Any) -> dict[str, Any]:
+    """What a result has fields for."""
+    return {name: value for name, value in values.items() if name in kind.__dataclass_fields__}
+
+
 def within_label(indexer: ActionIndexer, exemplar: int | None) -> int | None:
     """An exemplar's number among those of its label, from its number in the model."""
     if exemplar is None:
@@ -300,31 +318,41 @@ def exemplars(indexer: ActionIndexer) -> dict[Any, list[Clip]]:
     return found
 
 
-def _unknown(truth: list[list[KnownEvent]] | None, indexer: Any) -> list[str]:
+def _unknown(truth: Sequence[Sequence[KnownEvent] | None] | None, indexer: Any) -> list[str]:
     known = {str(label) for label in indexer.classes_}
-    strange = sorted({str(label) for events in truth or [] for label, _, _ in events} - known)
+    strange = sorted({str(label) for events in truth or [] for label, _, _ in events or []} - known)
     return [f"the model does not know {names(strange)}, which the known events name"] if strange else []
 
 
 def _scan_show(results: list[RecordingResult]) -> None:
-    several = len(results) > 1
+    """The events as a table, with the recording and the person where there are several."""
     from indexing.report.page import even
 
-    found = [(result.name, event) for result in results for event in result.events]
+    found = [(result, event) for result in results for event in result.events]
     scores, margins = even([event.score for _, event in found]), even([event.margin for _, event in found])
+    named = {"recording": len({result.name for result in results}) > 1, "person": any(_person(result) for result in results)}
+    columns = [name for name, wanted in named.items() if wanted]
     rows = []
-    for (name, event), score, margin in zip(found, scores, margins, strict=True):
-        cells = [str(event.label), f"{event.start:.2f}", f"{event.end:.2f}", score, margin]
-        rows.append([name, *cells] if several else cells)
-    columns = ["action", "start (s) ", "end (s) ", "score ", "margin "]
+    for (result, event), score, margin in zip(found, scores, margins, strict=True):
+        who = [result.name] * named["recording"] + [_person(result)] * named["person"]
+        rows.append([*who, str(event.label), f"{event.start:.2f}", f"{event.end:.2f}", score, margin])
     if rows:
-        table(["recording", *columns] if several else columns, rows)
+        table([*columns, "action", "start (s) ", "end (s) ", "score ", "margin "], rows)
+
+
+def _person(result: RecordingResult) -> str:
+    return str(getattr(result, "person", ""))
 
 
 def _summary(results: list[RecordingResult], seconds: float) -> str:
-    found, length = sum(len(result.events) for result in results), sum(result.duration for result in results)
-    where = f"{count(len(results), 'recording')} ({length:.1f} s long)"
-    return f"{count(found, 'action') if found else 'no action'} found in {where} in {seconds:.1f} s"
+    """What was found, where, and how long it took; of a recording with several people, its length counts once."""
+    found, files = sum(len(result.events) for result in results), {result.name for result in results}
+    spans = [[result for result in results if result.name == name] for name in files]
+    length = sum(max(one.times[-1] for one in lanes) - min(one.times[0] for one in lanes) for lanes in spans)
+    where = f"{count(len(files), 'recording')} ({length:.1f} s long)"
+    people = sum(bool(_person(result)) for result in results)
+    who = f" of {count(people, 'person', 'people')}" if people else ""
+    return f"{count(found, 'action') if found else 'no action'}{who} found in {where} in {seconds:.1f} s"
 
 
 def _against_truth(results: list[RecordingResult]) -> str:

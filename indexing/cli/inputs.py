@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from collections.abc import Hashable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -20,6 +21,7 @@ from indexing.opening import clipped, read_rows, shown
 
 if TYPE_CHECKING:
     from indexing.clip import Clip
+    from indexing.recordings.people import Appearance, Crowd
 
 SLOW, FAST = 5.0, 480.0  # frames per second given by hand, beyond which they are mentioned
 STILL = 0.005  # of a body's size: joints that stay this close to their places do not move
@@ -77,19 +79,60 @@ def on_gaps(clips: Sequence[Clip]) -> list[str]:
     return found
 
 
-def on_truth(truth: Sequence[Sequence[KnownEvent]], recordings: Sequence[Any]) -> list[str]:
-    """On known events that the recordings do not show; of videos that is not known before they are read."""
-    from indexing.clip import Clip
-
+def on_people(name: str, crowd: Crowd) -> list[str]:
+    """On who is in view, who comes and goes, and what was left out."""
     found = []
-    for clip, events in zip(recordings, truth, strict=True):
-        if not isinstance(clip, Clip):
+    if len(crowd.people) > 1:
+        told = "by the file's ids" if crowd.by_ids else "by position, as the file has no ids to rely on"
+        found.append(
+            f"{len(crowd.people)} people in view, told apart {told}; each is scanned by itself; --person largest follows one"
+        )
+    if not crowd.people:
+        found.append("nobody is in view for long enough to be scanned")
+    if crowd.ghosts:
+        reasons = ", ".join(f"{number} {reason}" for reason, number in crowd.ghosts.items())
+        found.append(f"{count(sum(crowd.ghosts.values()), 'track')} left out, as of no person ({reasons})")
+    if crowd.untracked:
+        found.append(f"{count(crowd.untracked, 'detection')} without an id left out; --person largest uses them")
+    found += _few([_appears(one) for one in crowd.appearances])
+    found += _few([_is_away(who, crowd) for who in dict.fromkeys(one.person for one in crowd.absences)])
+    swapped = "change places at {:.2f} s; their ids may be swapped there"
+    found += _few([f"persons {one.first} and {one.second} {swapped.format(one.at)}" for one in crowd.exchanges])
+    return [f"{name}: {sentence}" for sentence in found]
+
+
+def _appears(one: Appearance) -> str:
+    where = "where" if one.near else "elsewhere than"
+    perhaps = "may be the same" if one.near else "may be the same or not"
+    return f"person {one.person} appears at {one.at:.1f} s {where} person {one.left} left at {one.since:.1f} s: {perhaps}"
+
+
+def _is_away(who: str, crowd: Crowd) -> str:
+    spans = [f"{one.start:.1f} to {one.end:.1f} s" for one in crowd.absences if one.person == who]
+    listed = ", ".join(spans[:LISTED]) + f" and {count(len(spans) - LISTED, 'time')} more" * (len(spans) > LISTED)
+    if crowd.by_ids:
+        return f"person {who} is out of view from {listed}; that it is the same person says the file's id"
+    return f"nobody is in view from {listed}; whoever comes then may be somebody else"
+
+
+def _few(sentences: Sequence[str]) -> list[str]:
+    """The first of many, and how many more there are."""
+    more = len(sentences) - LISTED
+    return [*sentences[:LISTED], *([f"and so {count(more, 'time')} more"] if more > 0 else [])]
+
+
+def on_truth(truth: Sequence[Sequence[KnownEvent] | None], recordings: Sequence[Any]) -> list[str]:
+    """On known events that the recordings do not show; of videos that is not known before they are read."""
+    found = []
+    for one, events in zip(recordings, truth, strict=True):
+        if not isinstance(one, Lane):
             continue
-        out = [event for event in events if event[2] < clip.times[0] or event[1] > clip.times[-1]]
+        out = [event for event in events or [] if event[2] < one.times[0] or event[1] > one.times[-1]]
         if out:
             label, start, end = out[0]
             first = f"{label} at {start:g} to {end:g} s" + ", ..." * (len(out) > 1)
-            runs = f"{clip.name} runs from {clip.times[0]:.6g} to {clip.times[-1]:.6g} s"
+            who = f"{one.name}, person {one.person}," if one.person else one.name
+            runs = f"{who} runs from {one.times[0]:.6g} to {one.times[-1]:.6g} s"
             found.append(f"{runs}: {count(len(out), 'known event')} outside of it cannot be found ({first})")
     return found
 
@@ -140,7 +183,7 @@ def _is_still(clip: Clip) -> bool:
 
 
 if TYPE_CHECKING:
-    from indexing.clip import Clip, ClipSet
+    from indexing.clip import Clip, ClipSet, FloatArray
     from indexing.skeleton import Skeleton
 
 Format = Literal["clipset", "openpose", "coco", "mediapipe", "deeplabcut", "mmpose", "ultralytics", "sleap"]
@@ -173,6 +216,27 @@ class Reading:
             path, format=self.format, fps=self.fps, person=self.person, min_confidence=self.min_confidence, label=label,
             size=self.size,
         )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Following(Reading):
+    """How recordings are read that may show several people."""
+
+    person: People = "everyone"
+    """who is scanned where several people are in view: everyone by itself, or the one who is followed"""
+
+
+@dataclass(frozen=True, eq=False)
+class Lane:
+    """What is scanned by itself: one person of a recording.
+
+    name: the recording; person: empty where only one is in view; clip: ``None`` where nobody is; times: ``(F,)`` seconds.
+    """
+
+    name: str
+    person: str
+    clip: Clip | None
+    times: FloatArray
 
 
 @dataclass(frozen=True)
@@ -332,8 +396,8 @@ def assumed(clips: Sequence[Clip], path: Path | None = None) -> list[str]:
 
 def read_recordings(
     paths: Sequence[Path], reading: Reading, joints: int, model: Path, skeleton: Skeleton | None = None
-) -> tuple[list[Clip], list[str]]:
-    """Recordings with names that differ, checked against the model, and what a person should know about them.
+) -> tuple[list[Lane], list[str]]:
+    """Recordings with names that differ, person by person, checked against the model, and what a reader should know about them.
 
     Args:
         joints, skeleton: how many the model knows, and which.
@@ -341,13 +405,12 @@ def read_recordings(
     Raises:
         ValueError: naming the file: unreadable, unusable, or with other joints than the model.
     """
-    found: list[tuple[Path, Clip]] = []
+    found: list[list[Lane]] = []
     notes: list[str] = []
     for path in paths:
-        read = list(reading.read(path))
-        if len(read) == 1:  # a recording goes by its file, not by what a set calls its only clip
-            read = [read[0].replace(name=path.name or path.resolve().name)]
-        clips, said = of_layout(read, skeleton, path)
+        lanes, said = _lanes(path, reading)
+        notes += said
+        clips, said = of_layout([lane.clip for lane in lanes if lane.clip is not None], skeleton, path)
         notes += said
         for clip in clips:
             if clip.joints.shape[1] != joints:
@@ -355,42 +418,100 @@ def read_recordings(
                     f"{path}: has {clip.joints.shape[1]} joints, but the model {model} was learned from clips with {joints}; "
                     "actions are compared joint by joint: use the same pose estimator and joint layout for both"
                 )
-            found += [(path, clip) for clip in _checked([clip], path)]
-    twice = [clip.name for _, clip in found]
-    return [
-        clip if twice.count(clip.name) == 1 else clip.replace(name=f"{path}" if len(paths) == len(found) else f"{path} {clip.name}")
-        for path, clip in found
-    ], notes
+        same = iter(_checked(clips, path))
+        found.append([replace(lane, clip=None if lane.clip is None else next(same)) for lane in lanes])
+    lanes = _apart(paths, found)
+    clips = [lane.clip for lane in lanes if lane.clip is not None]
+    alone = [clip for clip in clips if "followed" not in clip.meta or clip.meta.get("person") is None]
+    return lanes, notes + remarks(clips, reading) + on_gaps(alone) + assumed(clips)
 
 
-def read_truth(path: Path, recordings: Sequence[str]) -> tuple[list[list[KnownEvent]], list[str]]:
-    """Known events of each recording from a CSV with the columns ``label,start,end`` and, for several recordings, ``file``.
+def _apart(paths: Sequence[Path], found: Sequence[Sequence[Lane]]) -> list[Lane]:
+    """All lanes, under names that tell recordings apart: those that are equal get their path."""
+    owners = {(lane.name, i, 0 if lane.person else j) for i, lanes in enumerate(found) for j, lane in enumerate(lanes)}
+    times = Counter(name for name, *_ in owners)
+    out = []
+    for path, lanes in zip(paths, found, strict=True):
+        several = len(lanes) > 1
+        for lane in lanes:
+            longer = f"{path} {lane.name}" if several and not lane.person else str(path)
+            out.append(lane if times[lane.name] == 1 else replace(lane, name=longer))
+    return out
+
+
+def _lanes(path: Path, reading: Reading) -> tuple[list[Lane], list[str]]:
+    """What one file holds, person by person, or recording by recording."""
+    import numpy as np
+
+    from indexing.readers.recording import NobodySeen
+    from indexing.recordings.people import of_recording, tracked_people
+
+    name = path.name or path.resolve().name
+    try:
+        clips = list(reading.read(path))
+    except NobodySeen as nobody:
+        rate = 30.0 if reading.fps is None else reading.fps
+        times = nobody.frames / rate if nobody.times is None else nobody.times
+        return [Lane(name, "", None, times)], [f"{path}: nobody is in view in any of its {count(len(times), 'frame')}"]
+    if of_recording(clips):
+        crowd = tracked_people(clips, name)
+        times = np.unique(np.concatenate([clip.times for clip in clips]))
+        lanes = [Lane(name, who.name, who.clip, who.clip.times) for who in crowd.people] or [Lane(name, "", None, times)]
+        return lanes, on_people(name, crowd)
+    if len(clips) == 1:  # a recording goes by its file, not by what a set calls its only clip
+        clips = [clips[0].replace(name=name)]
+    empty = [clip.name for clip in clips if not clip.seen.any()]
+    notes = [f"{path}: nobody is in view in any frame" + (f" of {names(empty)}" if len(clips) > 1 else "")] if empty else []
+    return [Lane(clip.name, "", clip if clip.seen.any() else None, clip.times) for clip in clips], notes
+
+
+def read_truth(
+    path: Path, recordings: Sequence[str], people: Sequence[str] | None = None
+) -> tuple[list[list[KnownEvent] | None], list[str]]:
+    """Known events of each recording from a CSV with the columns ``label,start,end``, for several recordings ``file``, and
+    ``person`` where who does it is known.
 
     Args:
-        recordings: their names.
+        recordings: their names; people: who of them, the largest first.  Of several people of a recording, those that nothing
+            is known of have ``None``.
 
     Raises:
         ValueError: naming file, row and column.
     """
     rows = _rows(path)
-    if len(recordings) > 1 and rows and "file" not in rows[0][1]:
-        raise ValueError(f"{path}: has no column 'file', but {len(recordings)} recordings are scanned; add it, with their names")
-    known: list[list[KnownEvent]] = [[] for _ in recordings]
-    elsewhere = []
+    people = people or [""] * len(recordings)
+    if len(set(recordings)) > 1 and rows and "file" not in rows[0][1]:
+        raise ValueError(
+            f"{path}: has no column 'file', but {len(set(recordings))} recordings are scanned; add it, with their names"
+        )
+    by_person = bool(rows) and "person" in rows[0][1]
+    first = {name: i for i, name in reversed(list(enumerate(recordings)))}
+    known: list[list[KnownEvent] | None] = [[] if by_person or first[name] == i else None for i, name in enumerate(recordings)]
+    elsewhere, blamed = [], set()
     for line, row in rows:
         event = _event(path, line, row)
-        file = row.get("file", "")
+        file, person = row.get("file", ""), row.get("person", "")
         owner = [i for i, name in enumerate(recordings) if not file or {file, Path(file).name} & {name, Path(name).name}]
-        if owner:
-            known[owner[0]].append(event)
+        mine = [i for i in owner if not person or people[i] == person]
+        if mine:
+            events = known[mine[0]]
+            assert events is not None  # a person's, or the first of a recording
+            events.append(event)
+            blamed |= {recordings[mine[0]]} if not person and people[mine[0]] else set()
         else:
-            elsewhere.append(file)
+            elsewhere.append(f"{file} person {person}".strip() if owner or not file else file)
     if rows and len(elsewhere) == len(rows):
+        column = "'person' names" if by_person and not any(row.get("file") for _, row in rows) else "'file' names"
         raise ValueError(
-            f"{path}: column 'file' names {clipped(names(sorted(set(elsewhere))))}, none of the recordings; correct the names"
+            f"{path}: column {column} {clipped(names(sorted(set(elsewhere))))}, none of the recordings; correct the names"
         )
-    left = [f"{count(len(elsewhere), 'row')} of {path} left out: of other recordings ({clipped(names(sorted(set(elsewhere))))})"]
-    return known, left if elsewhere else []
+    notes = [
+        f"{path}: does not say whose the events of {name} are; compared with person {people[first[name]]}, the largest; a column "
+        "'person' says otherwise"
+        for name in sorted(blamed)
+    ]
+    left = f"{count(len(elsewhere), 'row')} of {path} left out: of other recordings ({clipped(names(sorted(set(elsewhere))))})"
+    return known, notes + ([left] if elsewhere else [])
 
 
 def _rows(path: Path) -> list[tuple[int, dict[str, str]]]:

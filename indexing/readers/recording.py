@@ -33,7 +33,8 @@ from indexing.skeleton import Skeleton
 # - ``"tracked"``: one identity only, and empty frames where it is absent: the id seen in most frames (of equals, the larger);
 #   without ids, the identity with the largest summed box.
 # - ``"all"``: every tracked identity by itself; needs ids in the file.
-# - ``"everyone"``: the same, with identities by position where the file has no ids.
+# - ``"everyone"``: the same, with identities by position where the file has no ids; there, all frames of the one person where
+#   never two are in view together.
 #
 # Ids that repeat within a frame are not identities (some tools write the same id for everybody) and are not used.
 # Detections without an id, in a file that has ids, are used by ``"largest"`` and ``"confident"`` where no other is there.
@@ -63,14 +64,17 @@ def choose(
         why = f"its person ids repeat in frame {repeated}" if repeated is not None else "it has no person ids"
         what = Message("{arg:person='all'} needs tracked people, but {why}", why=why)
         raise error(path, what, Message("run a tracker, or use {arg:person='largest'} or 'tracked'"))
+    alone = ids is None and len(np.unique(recording.at)) == len(recording.at)  # never more than one person
+    if person == "everyone" and alone:
+        return [(None, np.arange(len(recording.at)))]
     if person in ("all", "everyone"):
         ids = link(recording.at, recording.joints, linking) if ids is None else ids
         return [(name, np.flatnonzero(ids == i)) for i, name in enumerate(names or range(int(ids.max()) + 1))]
     if person == "confident" and recording.confidence is None:
         what = Message("has no confidences, so {arg:person='confident'} cannot be applied")
         raise error(path, what, Message("use {arg:person='largest'} or 'tracked'"))
-    if ids is None and len(np.unique(recording.at)) == len(recording.at):
-        return [(None, np.arange(len(recording.at)))]  # never more than one person
+    if alone:
+        return [(None, np.arange(len(recording.at)))]
     area = _areas(recording.joints)
     weight = recording.confidence.mean(axis=1) if person == "confident" and recording.confidence is not None else area
     tracked = ids is not None
@@ -282,7 +286,7 @@ def gather(path: Path, frames: Sequence[tuple[int, Sequence[Detection]]]) -> Rec
         raise error(path, f"frame number {shown(frames[-1][0])} is beyond any recording", "number images by frame")
     found = [(i, number, person) for i, (number, people) in enumerate(frames) for person in people]
     if not found:
-        raise nobody(path, len(frames))
+        raise NobodySeen(path, np.array([number for number, _ in frames], dtype=np.int64))
     shape = found[0][2].joints.shape
     for _, number, person in found:
         if person.joints.shape != shape:
@@ -313,14 +317,15 @@ def to_clips(path: Path, recording: Recording, options: Options) -> ClipSet:
     times, fps = _times(path, recording, options.fps)
     name = path.name or path.resolve().name
     each = options.person in ("all", "everyone")
+    ids = _given(recording)[0] if each else None
+    own = {"followed": "position"} if ids is None else {"followed": "ids", "untracked": int((ids < 0).sum())}
     crowd = np.bincount(recording.at)
     others = {"people": int(crowd.max())} if (crowd > 1).mean() > options.linking.crowded else {}
     clips = []
     for track, rows in choose(path, recording, options.person, options.linking):
-        frames = slice(0, len(times))
-        if each:  # each person's clip spans what was seen of that person
-            seen = recording.at[rows]
-            frames = slice(int(seen.min()), int(seen.max()) + 1)
+        # each person's clip spans what was seen of that person
+        one = each and track is not None
+        frames = _around(times, recording.at[rows], options.linking.away) if one else np.arange(len(times))
         joints, confidence = _fill(recording, rows, frames)
         clips.append(
             Clip(
@@ -329,23 +334,32 @@ def to_clips(path: Path, recording: Recording, options: Options) -> ClipSet:
                 confidence=confidence,
                 fps=fps,
                 label=options.label,
-                name=f"{name}#{track}" if each else name,
+                name=f"{name}#{track}" if one else name,
                 skeleton=recording.skeleton,
                 up=recording.up,
-                meta={"person": track} if each else others,
+                meta={"person": track, **own} if each else others,
                 fps_assumed=recording.times is None and options.fps is None,
             )
         )
     return ClipSet(clips, name)
 
 
-def nobody(path: Path, frames: int) -> ValueError:
-    """The error for a file without a single usable detection."""
-    return error(
-        path,
-        f"no person was detected in any of {frames} frames",
-        Message("check the video, the estimator's threshold and {arg:min_confidence}"),
-    )
+class NobodySeen(ValueError):
+    """A file without a single usable detection; of its frames, the numbers and the times (seconds) where it has them."""
+
+    def __init__(self, path: Path, frames: IntArray, times: FloatArray | None = None) -> None:
+        what = f"no person was detected in any of {len(frames)} frames"
+        super().__init__(*error(path, what, Message("check the video, the estimator's threshold and {arg:min_confidence}")).args)
+        self.frames, self.times = frames, times
+
+
+def _around(times: FloatArray, at: IntArray, away: float) -> IntArray:
+    """The frames from the first to the last of a person, without those where nothing was seen of it for longer than ``away``."""
+    seen = np.sort(at)
+    frames = np.arange(int(seen[0]), int(seen[-1]) + 1)
+    after = np.searchsorted(seen, frames)
+    before = np.where(seen[after] == frames, after, after - 1)
+    return np.asarray(frames[times[seen[after]] - times[seen[before]] <= away])
 
 
 def _scale(path: Path, recording: Recording, options: Options) -> Recording:
@@ -388,7 +402,7 @@ def _mask(path: Path, recording: Recording, min_confidence: float) -> Recording:
     joints[missing] = np.nan
     keep = np.asarray(~missing.all(axis=1))
     if not keep.any():
-        raise nobody(path, len(recording.frames))
+        raise NobodySeen(path, recording.frames, recording.times)
     tracks = None if recording.tracks is None else [track for track, kept in zip(recording.tracks, keep, strict=True) if kept]
     return replace(
         recording,
@@ -422,10 +436,10 @@ def _times(path: Path, recording: Recording, fps: float | None) -> tuple[FloatAr
     return recording.times, None
 
 
-def _fill(recording: Recording, rows: IntArray, frames: slice) -> tuple[FloatArray, FloatArray | None]:
+def _fill(recording: Recording, rows: IntArray, frames: IntArray) -> tuple[FloatArray, FloatArray | None]:
     """``(f, n, d)`` and ``(f, n)``: the chosen detections in their frames, NaN (confidence 0) in the others."""
-    f, (_, n, d) = frames.stop - frames.start, recording.joints.shape
-    at = recording.at[rows] - frames.start
+    f, (_, n, d) = len(frames), recording.joints.shape
+    at = np.searchsorted(frames, recording.at[rows])
     joints = np.full((f, n, d), np.nan)
     joints[at] = recording.joints[rows]
     if recording.confidence is None:

@@ -77,7 +77,10 @@ def test_recordings(run, clips):
         code == 0 and f"wave runs from 0 to {wave.times[-1]:.6g} s: 1 known event outside of it cannot be found (kick at 50" in out
     )
     assert out.count("note:") == 1
-    assert "two: 2 people in view; followed is the largest; --person says otherwise" in run(scan.format("two"))[1]
+    two = run(scan.format("two"))[1]
+    assert "two: 2 people in view, told apart by position, as the file has no ids to rely on; each is scanned by itself" in two
+    one = run(scan.format("two --person largest"))[1]
+    assert "two: 2 people in view; followed is the largest; --person says otherwise" in one
     assert "small: coordinates from 0 to 1, so the shape of the image is not known" in run(scan.format("small"))[1]
     assert "coordinates" not in run(scan.format("small --size 2000 2000"))[1]
     code, out, _ = run(scan.format("gap"))
@@ -115,3 +118,60 @@ def test_confidence_is_no_depth():
     Clip(x * [1, 1, 700])
     Clip(x * [1 / 720, 1 / 720, 1])
     Clip(x * [1, 1, 0])
+
+
+def people(path, frames):
+    """COCO results: for each frame, (id, joints) of everybody; 17 joints."""
+    rows = []
+    for i, found in enumerate(frames):
+        for who, joints in found:
+            triples = np.concatenate([np.nan_to_num(joints), np.isfinite(joints[:, :1])], axis=1)
+            rows.append({"image_id": i, "category_id": 1, "keypoints": triples.ravel().tolist(), "score": 0.9, "track_id": who})
+    path.write_text(json.dumps(rows))
+
+
+def test_everybody_in_view_is_scanned(run, clips):
+    assert run("index fit squat=squat wave=wave kick=kick --fps 30 -o m.safetensors")[0] == 0
+    left = np.concatenate([clips["wave"].joints, clips["wave"].joints[::-1]])
+    right = np.concatenate([clips["squat"].joints, clips["squat"].joints]) + np.array([700.0, 0.0])
+    frames = [[(4, pose)] for pose in left]
+    for i, pose in enumerate(right):
+        frames[i if i < 60 else i + 40].append((7, pose))
+    frames[20].append((9, left[0] + 3000))
+    people(Path("both.json"), frames)
+    code, out, _ = run("index scan both.json -m m.safetensors --fps 30")
+    assert code == 0
+    assert "both.json: 2 people in view, told apart by the file's ids; each is scanned by itself" in out
+    assert "both.json: 1 track left out, as of no person (1 too short)" in out
+    assert "both.json: person 7 is out of view from 2.0 to 3.3 s; that it is the same person says the file's id" in out
+
+
+def test_whose_the_known_events_are(run, clips):
+    assert run("index fit squat=squat wave=wave kick=kick --fps 30 -o m.safetensors")[0] == 0
+    both = zip(clips["wave"].joints, clips["squat"].joints * 0.5 + 900.0, strict=False)
+    people(Path("both.json"), [[(1, one), (2, other)] for one, other in both])
+    scan = "index scan both.json -m m.safetensors --fps 30 --truth "
+    Path("plain.csv").write_text("label,start,end\nwave,0,2\n")
+    code, out, _ = run(scan + "plain.csv")
+    assert code == 0 and "plain.csv: does not say whose the events of both.json are; compared with person 1, the largest" in out
+    assert "1 of 1 known action found" in out
+    Path("whose.csv").write_text("label,start,end,person\nwave,0,2,1\nsquat,0,2,2\nkick,0,1,8\n")
+    code, out, _ = run(scan + "whose.csv")
+    assert (
+        code == 0 and "2 of 2 known actions found" in out and "1 row of whose.csv left out: of other recordings (person 8)" in out
+    )
+    Path("odd.csv").write_text("label,start,end,person\nwave,0,2,Anna\n")
+    code, _, err = run(scan + "odd.csv")
+    assert code == 2 and "odd.csv: column 'person' names person Anna" in err
+
+
+def test_nobody_in_view_is_an_answer(run, tmp_path):
+    assert run("index fit squat=squat wave=wave kick=kick --fps 30 -o m.safetensors")[0] == 0
+    openpose(Path("empty"), [Clip(np.full((40, 17, 2), np.nan))])
+    code, out, err = run("index scan empty -m m.safetensors --fps 30 --report out")
+    assert code == 0 and err == "" and "empty: nobody is in view in any of its 40 frames" in out
+    assert "no action found in 1 recording (1.3 s long)" in out
+    assert (tmp_path / "out" / "events.csv").read_text().count("\n") == 1 and (tmp_path / "out" / "report.html").exists()
+    ClipSet([Clip(np.full((20, 17, 2), np.nan), name=name, skeleton=COCO17) for name in "ab"]).save("set.npz")
+    code, out, _ = run("index scan set.npz -m m.safetensors")
+    assert code == 0 and "set.npz: nobody is in view in any frame of" in out and "no action found in 2 recordings" in out

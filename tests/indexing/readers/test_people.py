@@ -190,3 +190,31 @@ def test_how_people_are_linked_is_an_option():
     at, joints = np.arange(3), np.stack([box, box + 5, box + 10])
     assert link(at, joints).tolist() == [0, 0, 0]
     assert link(at, joints, LinkOptions(reach=0.1)).tolist() == [0, 1, 2]
+
+
+def test_everyone_says_how_people_are_followed(openpose_folder: Write) -> None:
+    both = shuffled(BIG, SMALL)
+    by_place = read(openpose_folder(both), person="everyone")
+    assert [clip.meta for clip in by_place] == [{"person": 0, "followed": "position"}, {"person": 1, "followed": "position"}]
+    ids = {i: [9, -1] for i in range(FRAMES)}
+    (one,) = read(openpose_folder(both, "ids", ids=ids), person="everyone")
+    assert one.meta == {"person": 9, "followed": "ids", "untracked": FRAMES}
+
+
+def test_everyone_of_one_person_is_the_whole_recording(openpose_folder: Write) -> None:
+    frames = {i: [walk(500.0 * i, 60)[i]] if i not in (0, 3) else [] for i in range(FRAMES)}
+    folder = openpose_folder(frames)
+    (alone,) = read(folder, person="everyone")
+    largest = read_clip(folder)
+    np.testing.assert_array_equal(alone.joints, largest.joints)
+    assert alone.name == largest.name and alone.meta == {"person": None, "followed": "position"}
+
+
+def test_a_person_s_clip_keeps_no_frames_of_long_absences(openpose_folder: Write) -> None:
+    frames = {i: [BIG[i % FRAMES]] + [SMALL[0]] * (i in (5, 7, 60)) for i in range(70)}
+    folder = openpose_folder(frames, ids={i: [1, 2][: len(people)] for i, people in frames.items()})
+    clips = read(folder, person="all", fps=10.0)
+    assert [len(clip) for clip in clips] == [70, 4]
+    assert clips[1].times.tolist() == [0.5, 0.6, 0.7, 6.0]
+    kept = read(folder, person="all", fps=10.0, linking=LinkOptions(away=10.0))
+    assert len(kept[1]) == 56

@@ -1,0 +1,144 @@
+"""What each window of a recording says for each class: one quality per segment, comparable between durations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from indexing.action.bank import Windows
+from indexing.action.model import ShapeModel, standardized
+from indexing.recordings.options import ExplanationOptions
+from indexing.windows import Ragged, sample
+
+Array = NDArray[Any]
+BLOCK = 2000  # windows compared at once: bounds memory whatever the length of the recording
+
+
+@dataclass(frozen=True)
+class Durations:
+    """How long the actions of a model last, and which of them are cycles.
+
+    seconds: ``(exemplars,)``; typical: ``(classes,)`` the median of each; cyclic: ``(classes,)`` 0 = performed once, 1 = a cycle.
+    """
+
+    seconds: Array
+    typical: Array
+    cyclic: Array
+
+    @classmethod
+    def of(cls, model: ShapeModel, window: float, stride: float, options: ExplanationOptions) -> Durations:
+        """Of a model; where its file does not say, from how many short windows each exemplar was cut into."""
+        labels = model.labels.cpu().numpy()
+        kept = model.exemplars.seconds
+        counts = np.bincount(model.exemplars.owner.cpu().numpy(), minlength=len(labels))
+        seconds = (window + stride * (counts - 1.0)) if kept is None else kept.cpu().numpy().astype(float)
+        seconds = np.maximum(seconds, 1e-3)
+        low, high = options.cyclic
+        again = np.zeros(len(labels)) if model.exemplars.cyclic is None else model.exemplars.cyclic.cpu().numpy()
+        each = [labels == c for c in range(model.classes)]
+        return cls(
+            seconds,
+            np.array([np.median(seconds[mine]) for mine in each]),
+            np.array([np.clip((np.median(again[mine]) - low) / (high - low), 0.0, 1.0) for mine in each]),
+        )
+
+    @property
+    def unit(self) -> float:
+        """Seconds of an ordinary exemplar: what qualities are counted by."""
+        return float(np.median(self.seconds))
+
+    def likelihoods(self, durations: Array, labels: Array, options: ExplanationOptions) -> Array:
+        """``(durations, classes)`` log likelihood of each duration, a kernel density around the exemplars of each class."""
+        apart = np.log(durations)[:, None] - np.log(self.seconds)[None]
+        near = np.exp(-0.5 * (apart / options.spread) ** 2)
+        each = [near[:, labels == c].mean(axis=1) for c in range(len(self.typical))]
+        return np.asarray(np.log(np.stack(each, axis=1) + options.unlikely))
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Where segments of one stretch of a recording may begin and end.
+
+    edges: ``(cells + 1,)`` seconds; windows: ``(W, 2)`` first and last edge, sorted by the last.
+    """
+
+    edges: Array
+    windows: Array
+
+    @classmethod
+    def over(cls, begin: float, end: float, durations: Durations, options: ExplanationOptions) -> Lattice:
+        """Of a stretch: windows of every duration that actions have, from every edge."""
+        step = min(options.coarsest, float(durations.typical.min()) / options.step)
+        cells = max(1, round((end - begin) / step))
+        shortest, longest = options.reach * durations.seconds.min(), durations.seconds.max() / options.reach
+        count = min(options.durations, int(np.ceil(np.log(longest / shortest) / np.log(options.ratio))) + 1)
+        lengths = np.geomspace(shortest, longest, max(2, count)) / max(end - begin, 1e-9) * cells
+        lengths = np.unique(np.clip(np.round(lengths), 1, cells).astype(np.intp))
+        windows = np.concatenate(
+            [np.stack([np.arange(cells - k + 1), np.arange(cells - k + 1) + k], axis=1) for k in lengths.tolist()]
+        )
+        windows = windows[np.lexsort((windows[:, 0], windows[:, 1]))]
+        return cls(begin + np.arange(cells + 1) * ((end - begin) / cells), windows)
+
+    @property
+    def seconds(self) -> Array:
+        """``(W,)`` how long each window lasts."""
+        return np.asarray(self.edges[self.windows[:, 1]] - self.edges[self.windows[:, 0]])
+
+    def mean(self, cells: Array) -> Array:
+        """``(W, columns)`` of ``(cells, columns)`` over each window."""
+        total = np.vstack([np.zeros((1, cells.shape[1])), np.cumsum(cells, axis=0)])
+        first, last = self.windows.T
+        return np.asarray((total[last] - total[first]) / (last - first)[:, None])
+
+    def cut(self, source: Ragged, stretch: int, chosen: Array, length: int) -> Windows:
+        """Some windows, resampled."""
+        first, last = self.windows[chosen].T
+        owner = np.full(len(chosen), stretch)
+        values = sample(source, owner, self.edges[first], self.edges[last], length)
+        return Windows(values, torch.from_numpy(source.seen[owner]))
+
+
+def whole_scores(
+    model: ShapeModel, lattice: Lattice, cut: Callable[[Array], Windows], durations: Durations, options: ExplanationOptions
+) -> Array:
+    """``(W, classes)`` minus the mean residual to the nearest whole exemplars of each class that last about as long; NaN: none."""
+    labels = model.labels.cpu().numpy()
+    out = np.full((len(lattice.windows), model.classes), np.nan, dtype=np.float32)
+    cells = lattice.windows[:, 1] - lattice.windows[:, 0]
+    for count in np.unique(cells).tolist():
+        rows = np.flatnonzero(cells == count)
+        lasts = float(np.median(lattice.seconds[rows]))
+        near = np.flatnonzero(np.abs(np.log(durations.seconds / max(lasts, 1e-9))) <= np.log(options.tempo))
+        if not len(near):
+            continue
+        chosen = torch.from_numpy(near).to(model.labels.device)
+        for at in range(0, len(rows), BLOCK):
+            some = rows[at : at + BLOCK]
+            residual = model.whole_residuals(cut(some).to(chosen.device), chosen).cpu().numpy()
+            for c in np.unique(labels[near]).tolist():
+                mine = residual[:, labels[near] == c]
+                kept = min(options.neighbours, mine.shape[1])
+                out[some, c] = -np.partition(mine, kept - 1, axis=1)[:, :kept].mean(axis=1)
+    return out
+
+
+def machine_scores(model: ShapeModel, cut: Callable[[Array], Windows], chosen: Array) -> Array:
+    """``(chosen, classes)`` of the kernel machine, standardized over the classes of each window."""
+    parts = [
+        standardized(model.machine_scores(cut(chosen[at : at + BLOCK]).to(model.labels.device))).cpu().numpy()
+        for at in range(0, len(chosen), BLOCK)
+    ]
+    return np.concatenate(parts) if parts else np.zeros((0, model.classes))
+
+
+def level(values: Array) -> tuple[float, float]:
+    """Mean and standard deviation of what is there; 1 where nothing differs."""
+    there = values[np.isfinite(values)]
+    spread = float(there.std()) if len(there) else 0.0
+    return (float(there.mean()) if len(there) else 0.0), (spread if spread > 1e-9 else 1.0)

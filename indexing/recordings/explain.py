@@ -1,0 +1,215 @@
+"""A recording explained by the actions of a model: as segments, one per performance, and frame by frame.
+
+The stages: short windows say what each moment looks like (:mod:`indexing.action.stream`); windows of every duration that the
+actions have say what a whole performance looks like (:mod:`indexing.recordings.evidence`); the best segments that do not overlap
+are found by dynamic programming, in which rest and other movement have a value, too (:mod:`indexing.recordings.tiling`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from indexing.action.bank import Windows
+from indexing.action.exemplars import moment_window
+from indexing.action.model import ShapeModel
+from indexing.action.stream import Progress, Stream, StreamScan, motion_levels, scan, wrong_contrast
+from indexing.clip import Clip
+from indexing.recordings.evidence import Array, Durations, Lattice, level, machine_scores, whole_scores
+from indexing.recordings.explanation import Explanation, Withheld
+from indexing.recordings.options import ExplanationOptions
+from indexing.recordings.tiling import TiledSegment, best_tiling, posterior, through
+from indexing.scoring import Event, event_levels
+from indexing.windows import Ragged, ragged
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """One stretch of a recording without gaps: its lattice, and what is known of its cells.
+
+    contrast: ``(cells, classes)`` of the moments, in standard deviations; motion ``(cells,)``; present ``(cells,)``; whole
+    ``(W, classes)``; frames: first frame, and the one after the last.
+    """
+
+    source: Ragged
+    lattice: Lattice
+    raw: Array
+    contrast: Array
+    motion: Array
+    present: Array
+    whole: Array
+    frames: tuple[int, int]
+
+    def cut(self, chosen: Array, length: int) -> Windows:
+        """Some windows, resampled."""
+        return self.lattice.cut(self.source, 0, chosen, length)
+
+
+def explain(
+    model: ShapeModel, clip: Clip, stream: Stream, classes: Sequence[Any], rate: float | None, progress: Progress = None
+) -> Explanation:
+    """The segments of a recording, and what they say of its frames.
+
+    Args:
+        clip: times from 0 on; stream: how moments are scanned, ``window`` at most; classes: labels.
+        rate: at which the contrast of wrong actions may reach the level that an event needs, or, outside 0..1, the least score;
+            ``None``: what is worth more than the background is reported.
+    """
+    options = model.options.recordings
+    kept = model.exemplars.seconds
+    stream = dataclasses.replace(stream, window=moment_window(stream.window, kept))
+    durations = Durations.of(model, stream.window, 0.3 * stream.window, options)
+    events = dataclasses.replace(model.options.events, step=min(model.options.events.step, stream.window / 4))
+    finer = dataclasses.replace(model, options=dataclasses.replace(model.options, events=events))
+    moments = scan(finer, clip, stream, None if progress is None else lambda share: progress(0.5 * share))
+    stretches = _stretches(model, clip, moments, durations, stream, progress)
+    wholes = level(np.concatenate([one.whole.ravel() for one in stretches]) if stretches else np.zeros(0))
+    scores = np.full((len(clip), model.classes), _log(np.zeros(1), options)[0])
+    background = np.ones(len(clip))
+    found: list[Event] = []
+    held: list[Withheld] = []
+    for one in stretches:
+        values, calm = _values(model, one, durations, wholes, stream.length, options)
+        segments, _ = best_tiling(one.lattice.windows, values, calm)
+        inside = posterior(one.lattice.windows, values, calm, options.temperature)
+        first, end = one.frames
+        cell = np.searchsorted(one.lattice.edges, clip.times[first:end] + options.edge, side="right") - 1
+        cell = np.clip(cell, 0, len(inside) - 1)
+        scores[first:end] = _log(inside, options)[cell]
+        background[first:end] = 1.0 - inside.sum(axis=1).clip(0.0, 1.0)[cell]
+        mine = [_event(model, one, part, values, classes, stream.length) for part in _joined(segments, durations, options)]
+        found += mine
+        awake = np.where(one.present, np.minimum(calm, options.background * _unit(one, durations)), calm)
+        restless, _ = best_tiling(one.lattice.windows, values, awake)
+        restless = _joined(restless, durations, options)
+        held += _at_rest([_event(model, one, part, values, classes, stream.length) for part in restless], mine)
+    found, low = _levelled(model, found, rate)
+    if progress is not None:
+        progress(1.0)
+    held = sorted([*held, *low], key=lambda each: each.event.start)
+    return Explanation(clip.times, tuple(classes), scores, found, held, background)
+
+
+def _log(likely: Array, options: ExplanationOptions) -> Array:
+    """Logarithms of likelihoods; below the least ones a shade tells classes apart."""
+    return np.asarray(np.log(np.maximum(likely, options.least)) + options.shade * np.log(np.maximum(likely, options.faint)))
+
+
+def _unit(one: Stretch, durations: Durations) -> float:
+    """How long a cell lasts, in ordinary exemplars."""
+    return float((one.lattice.edges[1] - one.lattice.edges[0]) / durations.unit)
+
+
+def _stretches(
+    model: ShapeModel, clip: Clip, moments: StreamScan, durations: Durations, stream: Stream, progress: Progress
+) -> list[Stretch]:
+    """What is known of every stretch before anything is decided."""
+    contrast = moments.scores - moments.scores.mean(axis=1, keepdims=True)
+    _, spread = level(contrast[moments.present])
+    out: list[Stretch] = []
+    for number, (part, frames) in enumerate(moments.parts()):
+        times = clip.times[frames]
+        lattice = Lattice.over(float(times[0]), float(times[-1]), durations, model.options.recordings)
+        middle, at = (lattice.edges[1:] + lattice.edges[:-1]) / 2, moments.times[part]
+        cells = np.stack([np.interp(middle, at, column) for column in contrast[part].T], axis=1)
+        motion = np.interp(middle, at, moments.motion[part])
+        present = np.interp(middle, at, moments.present[part].astype(float)) > 0.5
+        source = ragged([clip.replace(joints=clip.joints[frames], times=times, confidence=None)])
+
+        def cut(chosen: Array, lattice: Lattice = lattice, source: Ragged = source) -> Windows:
+            return lattice.cut(source, 0, chosen, stream.length)
+
+        whole = whole_scores(model, lattice, cut, durations, model.options.recordings)
+        out.append(Stretch(source, lattice, cells, cells / spread, motion, present, whole, (frames.start, frames.stop)))
+        if progress is not None:
+            progress(0.5 + 0.4 * (number + 1) / len(moments.stretches))
+    return out
+
+
+def _values(
+    model: ShapeModel, one: Stretch, durations: Durations, wholes: tuple[float, float], length: int, options: ExplanationOptions
+) -> tuple[Array, Array]:
+    """``(W, classes)`` what each window is worth as a segment of each class, and ``(cells,)`` what background is worth.
+
+    A segment is worth its quality times its duration in ordinary exemplars, the likelihood of its duration, less what it costs to
+    begin one.  The kernel machine is asked of windows only that good explanations hold; until then the nearest exemplars speak
+    for it.
+    """
+    lattice, cyclic = one.lattice, durations.cyclic[None]
+    whole = np.nan_to_num((one.whole - wholes[0]) / wholes[1], nan=-2.0)
+    unseen = options.absent * ~one.present
+    moments = options.moments * (1 + options.cyclic_moments * cyclic) * lattice.mean(one.contrast)
+    share = 1 - options.cyclic_whole * cyclic
+    rest = _rest(model, one)
+    # what moments say of cyclic actions counts more, so rest must, too
+    calmer = options.rest * options.cyclic_moments * cyclic * lattice.mean(rest.clip(min=0.0)[:, None])
+    base = moments + options.whole * share * whole - lattice.mean(unseen[:, None]) - calmer
+    each = whole - whole.mean(axis=1, keepdims=True)
+    proxy = each / np.maximum(each.std(axis=1, keepdims=True), 1e-9)
+    lasts = (lattice.seconds / durations.unit)[:, None]
+    labels = model.labels.cpu().numpy()
+    prior = options.duration * durations.likelihoods(lattice.seconds, labels, options) - options.entry
+    background = (options.background + options.rest * rest + unseen) * _unit(one, durations)
+    values = lasts * (base + options.machine * share * proxy) + prior
+    if model.kernels is None:
+        return values, background
+    total = through(lattice.windows, values, background)
+    survivors = np.flatnonzero(total >= total.max() - options.survive)
+    machine = machine_scores(model, lambda chosen: one.cut(chosen, length), survivors)
+    out = values.copy()
+    out[survivors] = lasts[survivors] * (base[survivors] + options.machine * share * machine) + prior[survivors]
+    return out, background
+
+
+def _rest(model: ShapeModel, one: Stretch) -> Array:
+    """``(cells,)`` -1 where a person moves e times more than calm moments of what it looks like, 1 where e times less."""
+    still, calm = motion_levels(model)
+    own = np.minimum(still, calm[one.contrast.argmax(axis=1)])
+    return np.asarray(np.log(np.maximum(own, 1e-30) / np.maximum(one.motion, 1e-30)).clip(-1.0, 1.0))
+
+
+def _joined(segments: list[TiledSegment], durations: Durations, options: ExplanationOptions) -> list[TiledSegment]:
+    """Segments of cyclic actions that touch become one."""
+    out: list[TiledSegment] = []
+    for one in segments:
+        if out and out[-1].last == one.first and out[-1].label == one.label and durations.cyclic[one.label] > options.joined:
+            longer = one.window if one.last - one.first > out[-1].last - out[-1].first else out[-1].window
+            out[-1] = TiledSegment(out[-1].first, one.last, one.label, out[-1].value + one.value, longer)
+        else:
+            out.append(one)
+    return out
+
+
+def _event(model: ShapeModel, one: Stretch, part: TiledSegment, values: Array, classes: Sequence[Any], length: int) -> Event:
+    """A segment as it is told: its score is the mean contrast of its moments, its margin what it is worth above the next class."""
+    score = float(one.raw[part.first : part.last, part.label].mean())
+    others = np.delete(values[part.window], part.label)
+    mine = (model.labels == part.label).nonzero()[:, 0]
+    residual = model.whole_residuals(one.cut(np.array([part.window]), length).to(mine.device), mine)
+    start, end = one.lattice.edges[part.first], one.lattice.edges[part.last]
+    margin = float(values[part.window, part.label] - others.max()) if len(others) else 0.0
+    exemplar = int(mine[int(torch.argmin(residual[0]))])
+    return Event(classes[part.label], float(start), float(end), score, margin, exemplar)
+
+
+def _at_rest(awake: list[Event], found: list[Event]) -> list[Withheld]:
+    """What would be there, did rest count as movement, and is not."""
+    return [
+        Withheld(event, "at rest")
+        for event in awake
+        if not any(min(event.end, other.end) - max(event.start, other.start) > 0 for other in found)
+    ]
+
+
+def _levelled(model: ShapeModel, found: list[Event], rate: float | None) -> tuple[list[Event], list[Withheld]]:
+    """Those events that reach the level that was asked for, and those that do not."""
+    if rate is None:
+        return found, []
+    _, floor = event_levels(wrong_contrast(model), rate, 1.0, (-np.inf, -np.inf))
+    high = [event for event in found if event.score >= floor]
+    return high, [Withheld(event, "below the level") for event in found if event.score < floor]

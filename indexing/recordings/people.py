@@ -1,0 +1,317 @@
+"""Who is in a recording: which tracks are people, what they are called, and who comes, goes and changes places.
+
+A file with several people is read as one clip per identity (``person="everyone"``: by the ids of the file, else by position).
+What follows from that is decided here, and nothing more than what was seen: a detector's ghosts are left out, and somebody who
+leaves and returns is the same person only where the file's own ids say so.  Everything that a reader should know besides is
+returned as data.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from indexing.clip import Clip, FloatArray
+from indexing.windows import unusable
+
+IntArray = NDArray[np.intp]
+GhostReason = Literal["too short", "too few joints", "at one place"]
+
+
+@dataclass(frozen=True)
+class PresenceOptions:
+    """Which tracks are people, and when one is said to leave, to appear, and to change places with another."""
+
+    shortest: float = 0.5
+    """Seconds in view: tracks of less are a detector's ghosts.  Actions last from a third of a second, people in view longer."""
+    share: float = 0.5
+    """Of the recording: whoever is in view for so much of it is a person, however short the recording."""
+    joints: int = 3
+    """Seen in half the frames: of fewer nothing can be compared (:data:`indexing.action.bank.COMMON`)."""
+    absence: float = 1.0
+    """Seconds out of view, from which on a person has left: by position nobody can say who comes then.  Detectors lose a person
+    who is in view for less."""
+    near: float = 1.0
+    """Box diagonals between where one left and another appears: there it may be the same."""
+    jump: float = 0.5
+    """Box diagonals from one frame to the next that nobody goes: the reader's reach for one person."""
+    closer: float = 4.0
+    """Times that two identities must be nearer to each other's last places than to their own, to be said to have changed places."""
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedPerson:
+    """One person of a recording; the name is empty where never more than one is in view."""
+
+    name: str
+    clip: Clip
+
+
+@dataclass(frozen=True)
+class Appearance:
+    """A person who comes into view at ``at`` seconds after ``left`` was last seen at ``since``: perhaps the same.
+
+    near: whether one appears about where the other left.
+    """
+
+    person: str
+    at: float
+    left: str
+    since: float
+    near: bool
+
+
+@dataclass(frozen=True)
+class Absence:
+    """A person who is out of view from ``start`` to ``end`` (seconds)."""
+
+    person: str
+    start: float
+    end: float
+
+
+@dataclass(frozen=True)
+class Exchange:
+    """Two identities of which each is, at ``at`` seconds, where the other was a frame before."""
+
+    first: str
+    second: str
+    at: float
+
+
+@dataclass(frozen=True, eq=False)
+class Crowd:
+    """Who is in a recording.
+
+    people: largest first (boxes summed over time); ghosts: how many tracks were left out, by reason; by_ids: whether the file
+    itself says who is who; untracked: detections without an id, in a file that has ids.
+    """
+
+    people: tuple[TrackedPerson, ...]
+    ghosts: dict[GhostReason, int]
+    by_ids: bool
+    untracked: int = 0
+    appearances: tuple[Appearance, ...] = ()
+    absences: tuple[Absence, ...] = ()
+    exchanges: tuple[Exchange, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class _Track:
+    """A clip and what is asked of it again and again: when it is seen, and how large, ``(frames seen,)``."""
+
+    clip: Clip
+    times: FloatArray
+    rows: IntArray
+    sides: FloatArray  # (frames seen, dims) of the box
+
+    @property
+    def area(self) -> float:
+        """Summed over time; in 3D, of the box's largest face."""
+        return float(np.sort(self.sides, axis=1)[:, -2:].prod(axis=1).sum())
+
+    @property
+    def size(self) -> float:
+        return float(np.median(np.linalg.norm(self.sides, axis=1)))
+
+
+def of_recording(clips: Sequence[Clip]) -> bool:
+    """Whether clips are the people of one recording, as the readers follow them, and not a set of recordings."""
+    return bool(clips) and all("followed" in clip.meta for clip in clips)
+
+
+def tracked_people(clips: Sequence[Clip], name: str = "", options: PresenceOptions = PresenceOptions()) -> Crowd:
+    """The people of one recording from its identities.
+
+    By ids each id is a person, away or not, called by its id.  By position an identity ends where it is out of view for long, and
+    people are numbered from 1 by size, then by their first appearance; where never two of them are in view at once, all is taken
+    for one recording of one person, as if nobody had been tracked.
+
+    Args:
+        clips: one per identity, with ``meta`` ``person`` (``None``: never two in one frame) and ``followed`` (``"ids"`` or
+            ``"position"``), as :func:`indexing.readers.read` gives them with ``person="everyone"``.
+        name: of the recording.
+
+    Example:
+        >>> def seen(start, place, person):
+        ...     box = np.array([[0.0, 0.0], [40.0, 0.0], [20.0, 90.0]]) + [place, 0.0]
+        ...     way = box + np.arange(90)[:, None, None] * [0.1, 0.0]
+        ...     return Clip(way, times=start + np.arange(90) / 30, meta={"person": person, "followed": "position"})
+        >>> crowd = tracked_people([seen(0.0, 100, 0), seen(1.0, 600, 1), seen(6.0, 620, 2)])
+        >>> [person.name for person in crowd.people]
+        ['1', '2', '3']
+        >>> crowd.appearances[0]
+        Appearance(person='3', at=6.0, left='2', since=3.966666666666667, near=True)
+    """
+    by_ids = clips[0].meta["followed"] == "ids"
+    whole = by_ids or clips[0].meta["person"] is None
+    parts = list(clips) if whole else [part for clip in clips for part in _parted(clip, options)]
+    step = _step(clips)
+    length = max(clip.times[-1] for clip in clips) - min(clip.times[0] for clip in clips) + step
+    least = min(options.joints, max(int(clip.seen.sum(axis=1).max()) for clip in clips))
+    tracks, ghosts = [], Counter[GhostReason]()
+    for part in parts:
+        reason = _ghost(part, step, length, least, options)
+        if reason is None:
+            tracks.append(_track(part))
+        else:
+            ghosts[reason] += 1
+    if not by_ids and tracks and not _together(tracks):
+        tracks = [_track(_one(tracks))]
+    tracks.sort(key=lambda track: (-track.area, track.times[0]))
+    alone = not by_ids and len(tracks) == 1
+    names = [""] if alone else [str(track.clip.meta["person"]) if by_ids else str(i) for i, track in enumerate(tracks, 1)]
+    people = tuple(
+        TrackedPerson(who, track.clip.replace(name=name if not who else f"{name}#{who}"))
+        for who, track in zip(names, tracks, strict=True)
+    )
+    return Crowd(
+        people,
+        dict(ghosts),
+        by_ids,
+        int(clips[0].meta.get("untracked", 0)),
+        tuple(_appearances(names, tracks, options)),
+        tuple(Absence(who, *gap) for who, track in zip(names, tracks, strict=True) for gap in _absences(track, options)),
+        tuple(_exchanges(names, tracks, options)),
+    )
+
+
+def _track(clip: Clip) -> _Track:
+    rows = np.flatnonzero(clip.seen.any(axis=1))
+    joints = clip.joints[rows]
+    return _Track(clip, clip.times[rows], rows, np.nanmax(joints, axis=1) - np.nanmin(joints, axis=1))
+
+
+def _step(clips: Sequence[Clip]) -> float:
+    """Seconds between the frames of a recording, of which every clip has a part."""
+    steps = [np.diff(clip.times) for clip in clips if len(clip) > 1]
+    return float(np.median(np.concatenate(steps))) if steps else 0.0
+
+
+def _parted(clip: Clip, options: PresenceOptions) -> list[Clip]:
+    """An identity by position, cut where it is out of view for long; frames that do not show it at an end are left out."""
+    rows = np.flatnonzero(clip.seen.any(axis=1))
+    cuts = np.flatnonzero(np.diff(clip.times[rows]) > options.absence) + 1
+    if not len(cuts) and len(rows) == len(clip):
+        return [clip]
+    return [_rows(clip, slice(int(some[0]), int(some[-1]) + 1)) for some in np.split(rows, cuts) if len(some)]
+
+
+def _rows(clip: Clip, rows: slice) -> Clip:
+    confidence = None if clip.confidence is None else clip.confidence[rows]
+    return clip.replace(joints=clip.joints[rows], times=clip.times[rows], confidence=confidence)
+
+
+def _ghost(clip: Clip, step: float, length: float, least: int, options: PresenceOptions) -> GhostReason | None:
+    """Why an identity is no person."""
+    joints = clip.seen.sum(axis=1)
+    shown = joints > 0
+    if shown.sum() * step < min(options.shortest, options.share * length) - step / 2 or len(clip) < 2:
+        return "too short"
+    if np.median(joints[shown]) < least:
+        return "too few joints"
+    return "at one place" if unusable(clip) else None
+
+
+def _together(tracks: Sequence[_Track]) -> bool:
+    """Whether any two are ever in view in the same frame."""
+    moments = np.concatenate([track.times for track in tracks])
+    return len(np.unique(moments)) < len(moments)
+
+
+def _one(tracks: Sequence[_Track]) -> Clip:
+    """Identities that are never in view together as one clip, without the frames between them that another's clip has empty."""
+    if len(tracks) == 1:
+        return tracks[0].clip
+    clips = [_rows(track.clip, slice(int(track.rows[0]), int(track.rows[-1]) + 1)) for track in tracks]
+    times, seen = np.concatenate([clip.times for clip in clips]), np.concatenate([clip.seen.any(axis=1) for clip in clips])
+    order = np.lexsort((~seen, times))  # of the rows of one moment, the one that shows somebody first
+    order = order[np.append(True, np.diff(times[order]) > 0)]
+    sure = (
+        None if clips[0].confidence is None else np.concatenate([clip.confidence for clip in clips if clip.confidence is not None])
+    )
+    joints = np.concatenate([clip.joints for clip in clips])[order]
+    return clips[0].replace(joints=joints, times=times[order], confidence=None if sure is None else sure[order])
+
+
+def _absences(track: _Track, options: PresenceOptions) -> list[tuple[float, float]]:
+    """When a person is out of view; a pause of the recording itself is none, where the clip has all of its frames."""
+    away = np.diff(track.times) > options.absence
+    if track.clip.meta["person"] is None:
+        away &= np.diff(track.rows) > 1
+    return [(float(track.times[i]), float(track.times[i + 1])) for i in np.flatnonzero(away)]
+
+
+def _appearances(names: Sequence[str], tracks: Sequence[_Track], options: PresenceOptions) -> list[Appearance]:
+    """Whoever comes after somebody else has left; of those who may be the same, who left nearby, and of these the latest."""
+    if not tracks:
+        return []
+    begin = min(float(track.times[0]) for track in tracks)
+    found = []
+    for who, track in zip(names, tracks, strict=True):
+        at = float(track.times[0])
+        candidates: list[tuple[bool, float, str]] = []
+        for other, left in zip(names, tracks, strict=True):
+            before = int(np.searchsorted(left.times, at)) - 1
+            if left is track or before < 0:
+                continue  # itself, or not there yet
+            gone = before + 1 == len(left.times)
+            if not gone and left.times[before + 1] - left.times[before] <= options.absence:
+                continue  # in view all the time
+            near = _apart(left, before, track) <= options.near * max(left.size, track.size)
+            if near or gone:
+                candidates.append((near, float(left.times[before]), other))
+        if candidates and at > begin:
+            near, since, other = max(candidates)
+            found.append(Appearance(who, at, other, since, near))
+    return sorted(found, key=lambda one: one.at)
+
+
+def _apart(left: _Track, row: int, track: _Track) -> float:
+    """From the middle of one person's joints in a frame to that of another's first."""
+    a, b = left.clip.joints[left.rows[row]], track.clip.joints[track.rows[0]]
+    return float(np.linalg.norm(np.nanmean(a, axis=0) - np.nanmean(b, axis=0)))
+
+
+def _exchanges(names: Sequence[str], tracks: Sequence[_Track], options: PresenceOptions) -> list[Exchange]:
+    """Where two identities are, from one frame to the next, at each other's places."""
+    leaps = [(who, track, _leaps(track, options)) for who, track in zip(names, tracks, strict=True)]
+    found = []
+    for (first, a, mine), (second, b, other) in combinations([one for one in leaps if len(one[2])], 2):
+        for at in np.intersect1d(mine, other).tolist():
+            now, then = _pair(a, at), _pair(b, at)
+            own = min(_mean(now[1] - now[0]), _mean(then[1] - then[0]))
+            crossed = max(_mean(now[1] - then[0]), _mean(then[1] - now[0]))
+            if own > options.closer * crossed:
+                found.append(Exchange(first, second, float(at)))
+    return sorted(found, key=lambda one: one.at)
+
+
+def _leaps(track: _Track, options: PresenceOptions) -> FloatArray:
+    """The times at which a person is farther from where it was a frame before than anybody goes."""
+    if len(track.times) < 2:
+        return np.empty(0)
+    joints = track.clip.joints[track.rows]
+    apart = np.linalg.norm(np.diff(joints, axis=0), axis=2)
+    known = np.isfinite(apart)
+    mean = np.where(known, apart, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
+    return np.asarray(track.times[1:][(mean > options.jump * track.size) & (np.diff(track.times) <= options.absence)])
+
+
+def _pair(track: _Track, at: float) -> tuple[Any, Any]:
+    row = int(np.searchsorted(track.times, at))
+    joints = track.clip.joints
+    return joints[track.rows[row - 1]], joints[track.rows[row]]
+
+
+def _mean(apart: FloatArray) -> float:
+    """Mean length over the joints that both show; infinite where there is none."""
+    lengths = np.linalg.norm(apart, axis=1)
+    known = np.isfinite(lengths)
+    return float(lengths[known].mean()) if known.any() else np.inf

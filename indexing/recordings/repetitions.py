@@ -1,0 +1,444 @@
+"""How often an action is performed, how long each time, with which pauses and how far: counted by the movement itself.
+
+The heights of the joints hardly depend on where the camera stands, so an exemplar's heights say what to look for.  Its course is
+followed through the recording as often as it is there, with rests between (dynamic programming over a loop); then it is learned
+anew from what was found, in the recording's own view, and followed again.  Where exemplars repeat themselves, their cycles count.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from indexing.action.symmetry import mirror_permutation
+from indexing.clip import Clip
+from indexing.scoring import Event
+from indexing.windows import RepairOptions, ragged, sample, whole
+
+Array = NDArray[Any]
+Unit = Literal["performance", "cycle"]
+
+
+@dataclass(frozen=True)
+class RepetitionOptions:
+    """What decides when repetitions are counted; chosen on synthetic actors, other people than those of any acceptance set."""
+
+    rate: float = 15.0
+    """Samples per second that movements are compared at."""
+    margin: float = 0.5
+    """Seconds looked at before the first and after the last event of a span."""
+    bridge: float = 4.0
+    """Seconds between events of one label, without another label between them, up to which they are one span."""
+    exemplars: int = 4
+    """Exemplars that are asked, spread over those given."""
+    deep: float = 0.55
+    """An exemplar repeats itself where its changes of pose come back to 1 - this correlation: actors' gait .1-.5 and jacks .02-.1,
+    single movements mostly above .6."""
+    shortest: float = 0.4
+    """Seconds that a cycle lasts at least."""
+    longest: float = 4.0
+    """Seconds that a cycle lasts at most."""
+    lag: float = 0.15
+    """Seconds that velocities are multiplied by beside heights: down and up differ."""
+    scales: tuple[float, ...] = (0.75, 1.0, 1.33)
+    """Durations tried, times the exemplar's."""
+    tried: int = 3
+    """Best beginnings that are learned on."""
+    rounds: int = 4
+    """Times that the course is learned anew from what was found."""
+    first: float = 2.0
+    """Cost of a sample that nothing explains while the exemplar is another person's, in units of the movement's variance; at 1
+    one of three people's lunges towards the camera are all missed, at 2 none."""
+    unexplained: float = 1.0
+    """The same once it was learned anew."""
+    begin: float = 1.0
+    """Cost of beginning a performance."""
+    begin_cycle: float = 2.0
+    """Cost of beginning a run of cycles."""
+    tempo: float = 0.08
+    """Cost of a sample at half or twice the tempo."""
+    noise: float = 0.01
+    """Body heights: what a joint jitters."""
+    stretch: float = 1.6
+    """Times longer or shorter that a course may become while it is learned anew; without a bound one slow course explains all."""
+
+
+@dataclass(frozen=True)
+class Repetition:
+    """One performance or cycle: start and end in seconds; range: the farthest that any joint goes up or down meanwhile.
+
+    The unit of the range is the median upright extent of the body in the recording.  Only heights count, which hardly depend on
+    where the camera stands; what moves towards it or sideways, at one height, is not in it.
+    """
+
+    start: float
+    end: float
+    range: float
+
+
+@dataclass(frozen=True)
+class RepetitionCount:
+    """All repetitions of one action.  unit: ``"performance"``, one exemplar's worth; ``"cycle"`` where exemplars repeat it."""
+
+    label: Any
+    performances: tuple[Repetition, ...]
+    unit: Unit = "performance"
+
+    @property
+    def count(self) -> int:
+        """How many."""
+        return len(self.performances)
+
+    @property
+    def durations(self) -> tuple[float, ...]:
+        """Seconds of each."""
+        return tuple(one.end - one.start for one in self.performances)
+
+    @property
+    def pauses(self) -> tuple[float, ...]:
+        """Seconds between one and the next."""
+        return tuple(max(0.0, after.start - before.end) for before, after in pairwise(self.performances))
+
+    @property
+    def ranges(self) -> tuple[float, ...]:
+        """Of each, see :class:`Repetition`."""
+        return tuple(one.range for one in self.performances)
+
+
+def count_repetitions(
+    clip: Clip,
+    events: Sequence[Event],
+    exemplars: Mapping[Any, Sequence[Clip]] = {},
+    options: RepetitionOptions = RepetitionOptions(),
+) -> list[RepetitionCount]:
+    """Count what was found in a recording, one entry per label in order of the labels' first performance.
+
+    Args:
+        clip: the recording.
+        events: of one label they may be one per performance, or cover several, or parts of one.
+        exemplars: by label, clips with true times; where a label has none, its own events stand for them.
+        options: every number that decides.
+
+    Raises:
+        ValueError: an exemplar has other joints than the recording.
+
+    Example:
+        >>> from indexing.actors import Person, detect, perform
+        >>> seen = detect(perform("squat", Person.random(3), repeats=6, rng=1), azimuth=90.0, rng=1)
+        >>> shown = detect(perform("squat", Person.random(4), rng=2), azimuth=0.0, rng=2)
+        >>> found = count_repetitions(seen, [Event("squat", 0.0, seen.duration, 1.0, 1.0)], {"squat": [shown]})
+        >>> found[0].count, found[0].unit
+        (6, 'performance')
+    """
+    found = []
+    for label in dict.fromkeys(event.label for event in sorted(events, key=lambda event: event.start)):
+        mine = sorted((event for event in events if event.label == label), key=lambda event: event.start)
+        given = list(exemplars.get(label, ()))
+        for shown in given:
+            if shown.joints.shape[1] != clip.joints.shape[1]:
+                raise ValueError(
+                    f"exemplars of {label!r}: {shown.joints.shape[1]} joints, but the recording has {clip.joints.shape[1]}; "
+                    "use clips of one joint layout"
+                )
+        pick: list[int] = (
+            np.unique(np.linspace(0, len(given) - 1, min(len(given), options.exemplars)).round().astype(int)).tolist()
+            if given
+            else []
+        )
+        shown_clips = [given[i] for i in pick] or _own(clip, mine, options)
+        pattern = _pattern(shown_clips, options)
+        performances: list[Repetition] = []
+        for start, end, inside in _spans(mine, events, options):
+            performances += _counted(clip, start, end, inside, pattern, options)
+        found.append(RepetitionCount(label, tuple(performances), "cycle" if pattern.period else "performance"))
+    return sorted(found, key=lambda one: one.performances[0].start if one.performances else np.inf)
+
+
+def _own(clip: Clip, events: Sequence[Event], options: RepetitionOptions) -> list[Clip]:
+    """Events of usual length, as exemplars."""
+    ordered = sorted(events, key=lambda event: event.end - event.start)
+    middle = ordered[max(0, len(ordered) // 2 - 1) : len(ordered) // 2 + 1]
+    parts = [(event.start, event.end) for event in middle if ((clip.times >= event.start) & (clip.times <= event.end)).sum() > 1]
+    return [clip.between(*part) for part in parts]
+
+
+def _spans(mine: Sequence[Event], events: Sequence[Event], options: RepetitionOptions) -> list[tuple[float, float, list[Event]]]:
+    """Neighbouring events of one label as one span, kept apart from those of other labels."""
+    others = [event for event in events if event.label != mine[0].label]
+    groups: list[list[Event]] = []
+    for event in mine:
+        last = max((one.end for one in groups[-1]), default=-np.inf) if groups else -np.inf
+        between = any(last <= (one.start + one.end) / 2 <= event.start for one in others)
+        if event.start - last <= options.bridge and not between:
+            groups[-1].append(event)
+        else:
+            groups.append([event])
+    out = []
+    for group in groups:
+        first, last = group[0].start, max(one.end for one in group)
+        before = max([one.end for one in others if one.end <= first] + [first - options.margin])
+        after = min([one.start for one in others if one.start >= last] + [last + options.margin])
+        out.append((before, after, group))
+    return out
+
+
+# ---- movements ---------------------------------------------------------------------------------------------------------
+class _RepeatedTrack(NamedTuple):
+    """A recording at an even rate: times ``(F,)``, heights ``(F, n)``, poses ``(F, n * dims)``, in body heights."""
+
+    times: Array
+    heights: Array
+    poses: Array
+
+
+class _Cycle(NamedTuple):
+    """An exemplar: its heights, and those of its left-right mirror image."""
+
+    heights: Array
+    swap: Array | None
+
+
+class _Pattern(NamedTuple):
+    """What is looked for: exemplars (one cycle each where there is a period), and the period in seconds."""
+
+    shown: tuple[_Cycle, ...]
+    period: float
+
+
+def _track(clip: Clip, start: float, end: float, options: RepetitionOptions) -> _RepeatedTrack:
+    source = ragged([clip], RepairOptions())
+    y = source.joints[:, source.seen[0], 1]
+    size = max(float(np.median(y.max(axis=1) - y.min(axis=1))), 1e-9) if y.shape[1] else 1.0
+    start, end = max(start, float(clip.times[0])), min(end, float(clip.times[-1]))
+    count = max(1, round((end - start) * options.rate))
+    x = sample(source, np.zeros(1, int), np.array([start]), np.array([end]), count)[0].double().numpy() / size
+    x = x - x.mean(axis=1, keepdims=True)
+    if count > 2:
+        padded = np.concatenate([x[:1], x, x[-1:]])
+        x = (padded[:-2] + 2 * padded[1:-1] + padded[2:]) / 4
+    times = start + (np.arange(count) + 0.5) * (end - start) / count
+    return _RepeatedTrack(times, x[..., 1], x.reshape(count, -1))
+
+
+def _moving(values: Array, options: RepetitionOptions) -> Array:
+    """Positions beside velocities."""
+    if len(values) < 2:
+        return np.concatenate([values, np.zeros_like(values)], axis=1)
+    return np.concatenate([values, options.lag * options.rate * np.gradient(values, axis=0)], axis=1)
+
+
+def _period(poses: Array, shortest: float, longest: float, options: RepetitionOptions) -> tuple[float, float]:
+    """Seconds after which changes of pose come back, and how far from it they remain (1 = they do not)."""
+    count = len(poses)
+    x = poses[4:] - poses[:-4] if count > 8 else poses[:0]
+    low, high = round(shortest * options.rate), min(round(longest * options.rate), 2 * count // 3, len(x) - 2)
+    if high <= low + 2:
+        return 0.0, 1.0
+    energy = np.square(x).sum(axis=1)
+    apart = np.array(
+        [
+            1 - 2 * (x[k:] * x[: len(x) - k]).sum() / max(energy[k:].sum() + energy[: len(x) - k].sum(), 1e-30)
+            for k in range(high + 1)
+        ]
+    )
+    dips = [k for k in range(max(low, 1), high) if apart[k] <= apart[k - 1] and apart[k] < apart[k + 1]]
+    if not dips:
+        return 0.0, 1.0
+    level = max(1.3 * min(apart[k] for k in dips), options.deep / 2)
+    best = next(k for k in dips if apart[k] <= level)
+    return best / options.rate, float(apart[best])
+
+
+def _pattern(shown: Sequence[Clip], options: RepetitionOptions) -> _Pattern:
+    """What exemplars show, and whether they repeat it."""
+    parts = []
+    for clip in shown:
+        track = _track(clip, float(clip.times[0]), float(clip.times[-1]), options)
+        source = ragged([clip])
+        swap = mirror_permutation(clip.skeleton, whole(source, 12)) if clip.dims == 2 or clip.skeleton is not None else None
+        seconds, depth = _period(track.poses, options.shortest, options.longest, options)
+        parts.append((track.heights, None if swap is None else swap.numpy(), seconds, depth))
+    sure = [seconds for _, _, seconds, depth in parts if depth <= options.deep]
+    usual = float(np.median(sure)) if sure else 0.0
+    # an exemplar of about one cycle cannot tell
+    able = [
+        depth <= options.deep for h, _, _, depth in parts if sure and (depth <= options.deep or len(h) > 2.2 * usual * options.rate)
+    ]
+    if not able or np.mean(able) < 0.5:
+        return _Pattern(tuple(_Cycle(h, swap) for h, swap, _, _ in parts if len(h) > 3), 0.0)
+    cycles = [_Cycle(_mean_cycle(h, seconds, options), swap) for h, swap, seconds, depth in parts if depth <= options.deep]
+    return _Pattern(tuple(cycles), usual)
+
+
+def _mean_cycle(heights: Array, seconds: float, options: RepetitionOptions) -> Array:
+    m = max(4, round(seconds * options.rate))
+    phase = np.arange(len(heights)) / (options.rate * seconds)
+    apart = (phase[:, None] - np.arange(m) / m + 0.5) % 1.0 - 0.5
+    weight = np.exp(-0.5 * np.square(apart * m)) + 1e-9
+    return np.asarray((weight / weight.sum(axis=0)).T @ heights)
+
+
+def _resampled(course: Array, m: int, turns: bool) -> Array:
+    at = np.arange(m) * len(course) / m if turns else np.linspace(0, len(course) - 1, m)
+    longer = np.concatenate([course, course[:1]]) if turns else course
+    return np.stack([np.interp(at, np.arange(len(longer)), column) for column in longer.T], axis=1)
+
+
+# ---- following a course through a recording ----------------------------------------------------------------------------
+def _costs(
+    x: Array, course: Array, turns: bool, level: float, left: Array | None, options: RepetitionOptions
+) -> tuple[Array, Array]:
+    """``(F, m)`` cost of every sample at every place of the course, and ``(F,)`` at rest; joints count by what they tell."""
+    spread = course.var(axis=0)
+    doubt = np.full(len(spread), options.noise**2) if left is None else np.maximum(left, options.noise**2)
+    weight = spread / (spread + doubt)
+    scale = np.sqrt(weight / max((weight * spread).sum(), 1e-12))
+    a, b = x * scale, course * scale
+    cost = np.maximum(np.square(a).sum(1)[:, None] + np.square(b).sum(1) - 2 * a @ b.T, 0)
+    rest = np.full(len(x), level)
+    if not turns:
+        pose = (b[0] + b[-1]) / 2
+        pose[len(pose) // 2 :] = 0
+        rest = np.minimum(rest, np.square(a - pose).sum(axis=1))
+    return cost, rest
+
+
+def _followed(cost: Array, rest: Array, turns: bool, options: RepetitionOptions) -> tuple[float, Array]:
+    """The cheapest way, and ``(F,)`` the place of every sample; m = at rest."""
+    count, m = cost.shape
+    begin = options.begin_cycle if turns else options.begin
+    place, back = np.arange(m), np.zeros((count, m + 1), int)
+    total = np.append(cost[0] + begin if turns else np.full(m, np.inf), rest[0])
+    total[0] = cost[0, 0] + begin
+    for f in range(1, count):
+        came, idle = total[:m], total[m]
+        ways = np.full((4, m), np.inf)
+        ways[0] = came + options.tempo
+        ways[1, 1:], ways[2, 2:] = came[:-1], came[:-2] + options.tempo
+        if turns:
+            ways[1, 0], ways[2, :2], ways[3] = came[-1], came[-2:] + options.tempo, idle + begin
+        else:
+            ways[3, 0] = min(idle + begin, came[-1] + begin / 2)
+        way = ways.argmin(axis=0)
+        source = np.select([way == 0, way == 1, way == 2], [place, (place - 1) % m, (place - 2) % m], m)
+        if not turns and way[0] == 3 and came[-1] + begin / 2 < idle + begin:
+            source[0] = m - 1
+        last = int(came.argmin()) if turns else m - 1 if came[-1] <= came[-2] + options.tempo else m - 2
+        back[f, :m], back[f, m] = source, m if idle <= came[last] else last
+        total = np.append(ways[way, place] + cost[f], min(idle, came[last]) + rest[f])
+    at = int(total.argmin()) if turns else m if total[m] <= total[m - 1] else m - 1
+    best, path = float(total[at]), np.zeros(count, int)
+    for f in range(count - 1, -1, -1):
+        path[f], at = at, back[f, at]
+    return best, path
+
+
+def _runs(path: Array, m: int, turns: bool) -> list[tuple[int, Array]]:
+    """First sample of every run, and its places: unwrapped phase where the course turns."""
+    out, active = [], path < m
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], active, [False]]).astype(int)))
+    for first, end in edges.reshape(-1, 2):
+        part = path[first:end]
+        step = np.diff(part)
+        if turns:
+            out.append((int(first), part[0] + np.concatenate([[0], np.cumsum(np.where(step < 0, step + m, step))])))
+        else:
+            cuts = [0, *(np.flatnonzero(step < 0) + 1).tolist(), len(part)]
+            out += [(int(first) + a, part[a:b]) for a, b in pairwise(cuts)]
+    return out
+
+
+def _learned(x: Array, path: Array, m: int) -> Array | None:
+    """``(m, d)`` mean sample at every place; None where too few are known."""
+    known = np.unique(path[path < m])
+    if len(known) < 3:
+        return None
+    means = np.stack([x[path == place].mean(axis=0) for place in known])
+    return np.stack([np.interp(np.arange(m), known, column) for column in means.T], axis=1)
+
+
+def _even(course: Array, path: Array, turns: bool, first: int, options: RepetitionOptions) -> Array:
+    """The course with its places spread evenly over the time that samples spend at them."""
+    m = len(course)
+    covers = np.zeros(m)
+    for _, places in _runs(path, m, turns):
+        np.add.at(covers, np.arange(places[0], places[-1] + 1) % m, 1)
+    spent = np.bincount(path[path < m], minlength=m) / np.maximum(covers, 1)
+    used = spent > 0
+    size = int(np.clip(round(spent.sum()), max(4, first / options.stretch), max(4, first * options.stretch)))
+    middle = (np.cumsum(spent) - spent / 2)[used]
+    whole_time, values = spent.sum(), course[used]
+    at = (np.arange(size) + 0.5) * whole_time / size
+    if turns:
+        middle, values = np.concatenate([middle - whole_time, middle, middle + whole_time]), np.concatenate([values] * 3)
+    return np.stack([np.interp(at, middle, column) for column in values.T], axis=1)
+
+
+def _beginnings(track: _RepeatedTrack, pattern: _Pattern, options: RepetitionOptions) -> list[tuple[float, Array, int]]:
+    """Cost, path and length of the courses that fit best: exemplars, their mirror images, and the span's own cycle."""
+    x, turns, found = _moving(track.heights, options), pattern.period > 0, []
+    for shown in pattern.shown:
+        for heights in [shown.heights] if shown.swap is None else [shown.heights, shown.heights[:, shown.swap]]:
+            tried = []
+            for scale in options.scales:
+                m = max(4, round(len(heights) * scale))
+                course = _resampled(heights, m, turns)
+                course = _moving(np.concatenate([course] * 3), options)[m : 2 * m] if turns else _moving(course, options)
+                tried.append((*_followed(*_costs(x, course, turns, options.first, None, options), turns, options), m))
+            found.append(min(tried, key=lambda one: one[0]))
+    found = sorted(found, key=lambda one: one[0])[: options.tried]
+    if turns:
+        seconds, depth = _period(track.poses, max(0.3, pattern.period / 2), 2 * pattern.period, options)
+        if depth < 0.8:
+            m = max(4, round(seconds * options.rate))
+            found.append((0.0, (np.arange(len(x)) / (seconds * options.rate) * m).astype(int) % m, m))
+    return found
+
+
+def _counted(
+    clip: Clip, start: float, end: float, events: Sequence[Event], pattern: _Pattern, options: RepetitionOptions
+) -> list[Repetition]:
+    """The repetitions in one span; its longest event where the movement tells nothing."""
+    track, turns = _track(clip, start, end, options), pattern.period > 0
+    best: tuple[float, Array, int] | None = None
+    if len(track.times) > 3:
+        for _, begun, first in _beginnings(track, pattern, options):
+            for values in (track.poses, track.heights):
+                x, path, m, cost = _moving(values, options), begun, first, np.inf
+                for again in range(options.rounds):
+                    course = _learned(x, path, m)
+                    if course is None:
+                        break
+                    on = path < m
+                    left = np.square(x[on] - course[path[on]]).mean(axis=0)
+                    course = _even(course, path, turns, first, options) if again else course
+                    m = len(course)
+                    cost, path = _followed(*_costs(x, course, turns, options.unexplained, left, options), turns, options)
+                if best is None or cost < best[0]:
+                    best = (cost, path, m)
+    parts: list[tuple[float, float]] = []
+    if best is not None and np.isfinite(best[0]):
+        step = float(track.times[1] - track.times[0])
+        for first, places in _runs(best[1], best[2], turns):
+            phase = (places - places[0]) / best[2]
+            cycles = int(phase[-1] + 1 / best[2] + 0.5) if turns else 1
+            cuts = [first + int(np.searchsorted(phase, k)) for k in range(cycles)] + [first + len(phase)]
+            if cycles and turns and phase[-1] > cycles:
+                cuts[-1] = first + int(np.searchsorted(phase, cycles))
+            edges = [float(track.times[0]) + step * (cut - 0.5) for cut in cuts]
+            parts += list(pairwise(edges)) if cycles else []
+    if not parts:
+        one = max(events, key=lambda event: event.end - event.start)
+        parts = [(one.start, one.end)]
+    return [_repetition(track, *part) for part in parts]
+
+
+def _repetition(track: _RepeatedTrack, start: float, end: float) -> Repetition:
+    inside = (track.times >= start) & (track.times <= end)
+    reach = float(np.ptp(track.heights[inside], axis=0).max()) if inside.any() else 0.0
+    return Repetition(float(start), float(end), reach)
