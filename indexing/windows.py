@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations, pairwise
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -97,6 +97,8 @@ def wrong_joints(
         if once == 0:
             usual = options.usual * _share(far.max(axis=1), clip[rows], len(starts) - 1, options.share)
         bad = (far > options.limit * spread + (usual + floor)[clip[rows], None]).any(axis=1)
+        if not bad.any():
+            break
         wrong[frame[rows[bad]], joint[rows[bad]]] = True
         # whoever had a wrong neighbour is asked once more
         touched = (wrong[frame[around], joint[:, None]] & (around >= 0)).any(axis=1)
@@ -132,13 +134,14 @@ def _deviations(
     """``(rows, dims)`` distance of sightings from the robust line through their neighbours, and the neighbours' spread."""
     far, spread = (np.empty((len(rows), places.shape[1]), places.dtype) for _ in range(2))
     x, clock = torch.from_numpy(places), torch.from_numpy(times)
-    before, after = zip(*((a, b) for a, b in combinations(range(around.shape[1]), 2) if b - a > 1), strict=True)
+    lags = range(2, around.shape[1])  # neighbours further apart than one step
     for at in range(0, len(rows), REPAIR_CHUNK):
         some = torch.from_numpy(rows[at : at + REPAIR_CHUNK])
         index = torch.from_numpy(around)[some]
         near = torch.where((index >= 0)[..., None], x[index], torch.nan).mT.contiguous()
         since = (clock[index] - clock[some, None]).to(x)[:, None]
-        slope = _median((near[..., after] - near[..., before]) / (since[..., after] - since[..., before])).nan_to_num()
+        rises, runs = (torch.cat([one[..., lag:] - one[..., :-lag] for lag in lags], dim=-1) for one in (near, since))
+        slope = _median(rises / runs).nan_to_num()
         remainder = near - slope * since
         middle = _median(remainder)
         far[at : at + REPAIR_CHUNK] = (x[some] - middle[..., 0]).abs().numpy()
@@ -147,15 +150,22 @@ def _deviations(
 
 
 def _median(values: Tensor) -> Tensor:
-    return values.nanmedian(dim=-1, keepdim=True).values
+    """The lower median of the last axis, without NaN.  Sorted by numpy: 28 numbers take 70 ns, torch's ``nanmedian`` 530."""
+    ordered = torch.from_numpy(np.sort(values.numpy(), axis=-1))  # NaN comes last
+    if not bool(ordered[..., -1].isnan().any()):
+        return ordered[..., (ordered.shape[-1] - 1) // 2, None]
+    there = ordered.isnan().logical_not_().sum(dim=-1, keepdim=True)
+    return ordered.gather(-1, (there - 1).clamp_(min=0) // 2)
 
 
 def _share(far: FloatArray, clip: NDArray[np.intp], clips: int, share: float) -> FloatArray:
     """``(clips,)`` the deviation that a share of the clip's sightings stays below."""
-    counts = np.bincount(clip, minlength=clips)
-    last = np.cumsum(counts) - counts + np.minimum((share * counts).astype(int), np.maximum(counts - 1, 0))
-    ordered = np.append(far[np.lexsort((far, clip))], 0.0)
-    return np.where(counts > 0, ordered[np.minimum(last, len(far))], 0.0)
+    ends = np.cumsum(np.bincount(clip, minlength=clips))
+    out = np.zeros(clips)
+    for i, mine in enumerate(np.split(far[np.argsort(clip, kind="stable")], ends[:-1])):
+        if len(mine):
+            out[i] = np.sort(mine)[min(int(share * len(mine)), len(mine) - 1)]
+    return out
 
 
 def _sizes(joints: FloatArray, there: NDArray[np.bool_], starts: NDArray[np.intp]) -> FloatArray:
@@ -166,7 +176,8 @@ def _sizes(joints: FloatArray, there: NDArray[np.bool_], starts: NDArray[np.intp
     sizes = np.zeros(len(starts) - 1)
     for i, (begin, end) in enumerate(pairwise(starts)):
         if seen[begin:end].any():
-            sizes[i] = np.median(extent[begin:end][seen[begin:end]], axis=0).max()
+            mine = np.sort(extent[begin:end][seen[begin:end]], axis=0)
+            sizes[i] = (0.5 * (mine[(len(mine) - 1) // 2] + mine[len(mine) // 2])).max()  # np.median takes 40 us more
     return sizes
 
 

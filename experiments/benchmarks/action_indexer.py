@@ -2,7 +2,8 @@
 
     python -m experiments.benchmarks.action_indexer
 
-Recognition: 1000 exemplars x 500 queries of 16 frames x 20 joints, ten classes.  Scanning: keypoints of 17 joints at 30 fps.
+Recognition: 1000 exemplars x 500 queries of 16 frames x 20 joints, ten classes, all at once and one at a time.
+Scanning: keypoints of 17 joints at 30 fps.
 Start-up: ``import dyntorch`` against ``import torch``, and ``dyntorch --help``.  Every measurement runs in a process of its
 own; the workloads take turns, and the figure is the median over rounds of the median in each.  Memory is the peak above
 what the process held after its imports: data, model and all.
@@ -28,8 +29,9 @@ from experiments.common.tables import Row, command, markdown, note
 from indexing.files import manifest, prepare, write_json
 
 PLAIN, SEARCH, WARPING, PART, SCAN = "plain", "search", "warping", "scan 20 minutes", "scan 1 hour"
+PLAIN_ONE, SEARCH_ONE = "plain, one query", "search, one query"
 MANY, FIT, LEARNED = "scan 1 hour, 1000 exemplars", "fit 1000 clips", "fit 1000 clips, learned"
-TASK = f"{EXEMPLARS} exemplars x {QUERIES} queries"
+TASK, ONE = f"{EXEMPLARS} exemplars x {QUERIES} queries", f"{EXEMPLARS} exemplars x 1 query"
 STARTS = {
     "import torch": [sys.executable, "-c", "import torch"],
     "import dyntorch": [sys.executable, "-c", "import dyntorch"],
@@ -105,6 +107,8 @@ def table(found: dict[str, list[dict[str, Any]]], starts: dict[str, float]) -> l
         rows.append(Row(TASK, f"{setting}: peak memory of predict", most(name), 500.0, at_most=True, unit=" MB"))
         rows.append(Row(TASK, f"{setting}: fit", median(one["fit_seconds"] for one in found[name]), unit=" s"))
         rows.append(Row(TASK, f"{setting}: peak memory of fit", most(name, "fit_megabytes"), 500.0, at_most=True, unit=" MB"))
+    for name, setting, goal in ((PLAIN_ONE, "nearest, no search", 5.0), (SEARCH_ONE, "default, with search", 42.0)):
+        rows.append(Row(ONE, f"{setting}: predict, each of many", 1e3 * seconds(name), goal, at_most=True, unit=" ms"))
     if found.get(WARPING):
         for name, setting in ((PLAIN, "nearest, no search"), (SEARCH, "default")):
             rows.append(Row(TASK, f"time of DTW (32 steps, one thread) over {setting}", seconds(WARPING) / seconds(name), 100.0))
@@ -140,7 +144,7 @@ def run(config: Config) -> None:
         raise ValueError(f"rounds and starts must be at least 1, got {config.rounds} and {config.starts}")
     target = config.out.expanduser()
     prepare(target.parent)
-    names = [PLAIN, SEARCH, *([WARPING] if has_aeon() else []), PART, SCAN, MANY, FIT, LEARNED]
+    names = [PLAIN, SEARCH, PLAIN_ONE, SEARCH_ONE, *([WARPING] if has_aeon() else []), PART, SCAN, MANY, FIT, LEARNED]
     found, starts = measure(names, config.rounds, config.threads), start_ups(config.starts)
     rows = table(found, starts)
     print(markdown(rows, "Speed and memory of the action indexer"), flush=True)

@@ -6,15 +6,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from functools import lru_cache, partial
+from itertools import groupby, product
 
 import torch
 from torch import Tensor
 
-from dyntorch.numerics import canonical_correlation, orthonormal_basis
+from dyntorch.numerics import map_blocks
 from indexing.action.options import MachineOptions, NearestOptions
+from indexing.action.planes import Fusion, entries, epipolar_correlation, factorize, fused
+from indexing.action.symmetry import mirror
 from indexing.modelfile import stored
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -115,17 +119,24 @@ class JointMetric:
 
     def apply(self, windows: Tensor, name: str, joints: Tensor | slice = slice(None)) -> Tensor:
         """``(N, length' * joints, dims)``: a channel of the windows, weighted and laid out as tall matrices."""
-        x = channel(windows, name)
-        weights = self.weights(name, joints)
-        if weights is not None:
-            x = torch.einsum("jk,ntkd->ntjd", weights.to(x), x)
-        return x.flatten(1, 2)
+        return laid_out(windows, name, self.weights(name, joints)).mT
+
+
+def laid_out(windows: Tensor, name: str, weights: Tensor | None) -> Tensor:
+    """``(N, dims, length' * joints)``: each coordinate of a channel in one piece, its joints weighted."""
+    x = channel(windows, name).movedim(-1, 1)
+    return (x if weights is None else x @ weights.to(x).mT).flatten(2)
 
 
 NEAREST = ("clip", "frame", "motion")  # channels of the epipolar residual; velocity adds nothing there
 EPSILON = 1e-3  # added to residuals before the log: the noise floor (1e-4 gives the same accuracy)
-PAIR_BLOCK = 2_000_000  # pairs of windows in flight: bounds memory, and keeps the intermediate matrices in cache
-TABLE_BLOCK = 25_000_000  # entries of a table with every copy of every exemplar: 100 MB
+PAIR_BLOCK = 2**16  # pairs of windows in flight: their tables stay in the cache (2 million: 50 ns a pair and channel, so 28)
+DEVICE_BLOCK = 2**21  # the same elsewhere, where every call costs a launch
+VALUE_BLOCK = 2**21  # the same where values are compared, not what is described of them: bounds memory
+ROW_BLOCK = 128  # queries among them: enough for a fast matrix product
+QUERY_BLOCK = 256  # queries that one worker describes at once: bounds memory
+TINY = 1e-12  # norm of heights, in images of norm 1, below which they are none
+KEPT_BLOCK = 2**25  # bytes of the descriptions that a bank keeps: 32 MB; those it needed last stay in any case
 
 
 @dataclass(frozen=True)
@@ -148,14 +159,15 @@ class Windows:
         """The same windows on another device."""
         return Windows(self.values.to(device), self.seen.to(device))
 
-    def patterns(self) -> Iterator[tuple[Tensor, Tensor]]:
-        """``(indices, joints seen)`` of every group of windows with the same joints seen."""
-        if bool(self.seen.all()):
-            yield torch.arange(len(self), device=self.values.device), self.seen.new_ones(self.seen.shape[1])
-            return
-        rows, group = self.seen.unique(dim=0, return_inverse=True)
-        for i, joints in enumerate(rows):
-            yield (group == i).nonzero()[:, 0], joints
+
+def patterns(seen: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+    """``(indices, joints seen)`` of every group of windows ``(N, joints)`` with the same joints seen."""
+    if bool(seen.all()):
+        yield torch.arange(len(seen), device=seen.device), seen.new_ones(seen.shape[1])
+        return
+    rows, group = seen.unique(dim=0, return_inverse=True)
+    for i, joints in enumerate(rows):
+        yield (group == i).nonzero()[:, 0], joints
 
 
 def stack(parts: list[Windows]) -> Windows:
@@ -166,60 +178,238 @@ def stack(parts: list[Windows]) -> Windows:
 COMMON = 3  # joints that two windows must share: two always fit one another
 
 
+def between(query: Windows, bank: Windows, compare: Callable[[Tensor, Tensor, Tensor | slice], Tensor], worst: float) -> Tensor:
+    """Fill a ``(queries, bank)`` table from ``compare(queries, bank, joints)`` of values, on the joints both sides saw.
+
+    Windows are grouped by which joints were seen, so that a comparison is always exact on the joints it has; pairs that
+    share fewer than three joints get the value ``worst``.
+    """
+    groups = list(patterns(bank.seen))
+    out = query.values.new_empty(len(query), len(bank))
+    for rows, seen in patterns(query.seen):
+        for columns, known in groups:
+            joints = _common(seen, known)
+            if joints is None:
+                out[rows[:, None], columns] = worst
+            else:
+                right = bank.values[columns][:, :, joints]
+                for some in rows.split(max(1, VALUE_BLOCK // max(1, len(columns)))):
+                    out[some[:, None], columns] = compare(query.values[some][:, :, joints], right, joints)
+    return out
+
+
+def _common(seen: Tensor, known: Tensor) -> Tensor | slice | None:
+    """The joints that both sides saw; ``None`` where they are too few."""
+    both = seen & known
+    if int(both.sum()) < min(COMMON, len(both)):
+        return None
+    return slice(None) if bool(both.all()) else both.nonzero()[:, 0]
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Exemplars, described once.  What a query costs beside its comparisons is the description of what it is compared with: mirror
+# images, channels, the joint metric, bases.  A bank makes it on first use and keeps it.
+
+
 @dataclass(frozen=True)
 class Described:
-    """Windows as they are compared, described once for all comparisons: tensors whose first axis is the windows'."""
+    """Windows as they are compared: tensors whose first axis is the windows'."""
 
     parts: tuple[Tensor, ...]
 
     def __len__(self) -> int:
         return len(self.parts[0])
 
-    def __getitem__(self, index: slice) -> Described:
+    def __getitem__(self, index: Tensor | slice) -> Described:
         return Described(tuple(part[index] for part in self.parts))
 
+    @property
+    def size(self) -> int:
+        """Bytes."""
+        return sum(part.numel() * part.element_size() for part in self.parts)
 
-Side = TypeVar("Side", Tensor, Described)
+
+Describe = Callable[[Tensor], Described]  # of ``(N, length, joints, 2)`` values among some joints
+Describer = Callable[[Tensor | slice], Describe]  # makes it for some joints
+Compare = Callable[[Described, Described], Sequence[Tensor]]  # ``(Q, E)`` tables
 
 
-def between(
-    query: Windows,
-    bank: Windows,
-    compare: Callable[[Side, Side, Tensor | slice], Tensor],
-    worst: float,
-    describe: Callable[[Tensor, Tensor | slice], Side] | None = None,
-) -> Tensor:
-    """Fill a ``(queries, bank)`` table from ``compare(queries, bank, joints)``, on the joints both sides saw.
+@dataclass(frozen=True)
+class Copy:
+    """Images of exemplars that are compared as these: crops, mirror images.
 
-    Windows are grouped by which joints were seen, so that a comparison is always exact on the joints it has; pairs that
-    share fewer than three joints get the value ``worst``.
+    windows: of all exemplars; numbers: of those that count, ``None`` for all; symmetry: joints of the mirror image, if it is one.
+    """
+
+    windows: Windows
+    numbers: Tensor | None = None
+    symmetry: Tensor | None = None
+
+    def only(self, mine: Tensor) -> Copy:
+        """Of some exemplars, ``(N,)`` bool."""
+        return dataclasses.replace(self, numbers=mine.nonzero()[:, 0] if self.numbers is None else self.numbers[mine[self.numbers]])
+
+    def groups(self) -> Iterator[tuple[Tensor | None, Tensor]]:
+        """``(numbers, joints seen)`` of the exemplars that show the same joints."""
+        seen = self.windows.seen if self.numbers is None else self.windows.seen[self.numbers]
+        seen = seen if self.symmetry is None else seen[:, self.symmetry]
+        for rows, known in patterns(seen):
+            alone = self.numbers is None and len(rows) == len(seen)
+            yield (None if alone else rows if self.numbers is None else self.numbers[rows]), known
+
+    def values(self, numbers: Tensor | slice) -> Tensor:
+        """``(N, length, joints, 2)`` of some."""
+        values = self.windows.values[numbers]
+        return values if self.symmetry is None else mirror(values, self.symmetry)
+
+
+@dataclass(frozen=True)
+class Facing:
+    """Windows of a copy that show the same joints, as they face queries that show the same joints.
+
+    numbers: of their exemplars, ``None`` for all in order; described: among the joints that both sides saw, ``None`` where these
+    are too few; describe: makes the same of queries, and the same of all that have the same ``key``.
+    """
+
+    numbers: Tensor | None
+    described: Described | None = None
+    describe: Describe | None = None
+    key: tuple[int, ...] = ()
+
+    @property
+    def size(self) -> int:
+        """Bytes of what is kept."""
+        return 0 if self.described is None else self.described.size
+
+    def chosen(self, numbers: Tensor, place: Tensor) -> Facing:
+        """Some exemplars only, given their numbers and the place of every exemplar among these, -1 without one."""
+        if self.numbers is None:
+            return self if self.described is None else dataclasses.replace(self, described=self.described[numbers])
+        columns = place[self.numbers]
+        kept = (columns >= 0).nonzero()[:, 0]
+        described = None if self.described is None else self.described[kept]
+        return dataclasses.replace(self, numbers=columns[kept], described=described)
+
+
+class Bank:
+    """Exemplars that queries are compared with again and again, described on first use and kept.
+
+    Each set of joints that queries saw needs a description of its own; the least recently used are dropped where they take more
+    than ``KEPT_BLOCK`` bytes.
 
     Args:
-        describe: what is compared of ``(N, length, joints, dims)`` values among some joints; the values themselves by default.
-            It is called once for all comparisons of a group.
+        copies: of the same exemplars, the nearest of which counts.
+        describer: makes what describes windows among some joints.
     """
-    groups = list(bank.patterns())
-    out = query.values.new_empty(len(query), len(bank))
-    for rows, seen in query.patterns():
-        for columns, known in groups:
-            both = seen & known
-            if int(both.sum()) < min(COMMON, len(both)):
-                out[rows[:, None], columns] = worst
+
+    def __init__(self, copies: Sequence[Copy], describer: Describer) -> None:
+        self._copies, self._describer = copies, describer
+        self._kept: dict[tuple[bool, ...], list[Facing]] = {}
+
+    def __len__(self) -> int:
+        return len(self._copies[0].windows)
+
+    def facing(self, seen: Tensor) -> list[Facing]:
+        """All copies, as they face queries that saw these joints."""
+        key = tuple(seen.tolist())
+        found = self._kept.pop(key, None)
+        if found is None:
+            found = [one for copy in self._copies for one in self._described(copy, seen)]
+        self._kept[key] = found  # the last one is the one used last
+        for old in list(self._kept)[:-1]:
+            if sum(one.size for faced in list(self._kept.values()) for one in faced) <= KEPT_BLOCK:
+                break
+            self._kept.pop(old, None)
+        return found
+
+    def _described(self, copy: Copy, seen: Tensor) -> Iterator[Facing]:
+        for numbers, known in copy.groups():
+            joints, count = _common(seen, known), len(copy.windows) if numbers is None else len(numbers)
+            if joints is None or not count:
+                yield Facing(numbers)
                 continue
-            joints: Tensor | slice = slice(None) if bool(both.all()) else both.nonzero()[:, 0]
-            left: Any = query.values[rows][:, :, joints]
-            right: Any = bank.values[columns][:, :, joints]
-            if describe is not None:
-                left, right = describe(left, joints), describe(right, joints)
-            step = max(1, PAIR_BLOCK // max(1, len(columns)))
-            for at in range(0, len(rows), step):
-                out[rows[at : at + step, None], columns] = compare(left[at : at + step], right, joints)
+            describe = partial(_among, joints, self._describer(joints))
+            blocks = (slice(at, at + QUERY_BLOCK) for at in range(0, count, QUERY_BLOCK))
+            parts = [describe(copy.values(some if numbers is None else numbers[some])) for some in blocks]
+            described = Described(tuple(torch.cat(same) for same in zip(*(one.parts for one in parts), strict=True)))
+            yield Facing(numbers, described, describe, (id(self._describer), *(seen & known).tolist()))
+
+
+def _among(joints: Tensor | slice, describe: Describe, values: Tensor) -> Described:
+    return describe(values[:, :, joints])
+
+
+def least(
+    query: Windows, banks: Sequence[Bank], compare: Compare, worst: Sequence[float], chosen: Tensor | None = None
+) -> list[Tensor]:
+    """``(queries, exemplars)`` tables, each the least over the exemplars' copies of what ``compare`` says.
+
+    Windows are grouped by which joints were seen, so that a comparison is always exact on the joints that both sides saw.
+
+    Args:
+        banks: of the same exemplars.
+        worst: in each table, of pairs that share fewer than three joints.
+        chosen: numbers of the exemplars that are asked; all by default.
+    """
+    total = max((len(bank) for bank in banks), default=0)
+    place = None
+    if chosen is not None and not torch.equal(chosen, torch.arange(total, device=chosen.device)):
+        place = torch.full((total,), -1, device=chosen.device)
+        place[chosen] = torch.arange(len(chosen), device=chosen.device)
+    width = total if chosen is None else len(chosen)
+    out: list[Tensor] = []
+    for rows, seen in patterns(query.seen):
+        faced = [one for bank in banks for one in bank.facing(seen)]
+        if place is not None and chosen is not None:
+            faced = [one.chosen(chosen, place) for one in faced]
+        faced.sort(key=lambda one: one.key)
+        every = len(rows) == len(query)
+        values = query.values if every else query.values[rows]
+        size = QUERY_BLOCK if values.device.type == "cpu" else max(1, DEVICE_BLOCK // max(1, width))
+        found: tuple[Tensor, ...] = map_blocks(partial(_tables, faced, compare, worst, width), values, size=size)
+        if every:
+            return list(found)
+        out = out or [query.values.new_empty(len(query), width) for _ in worst]
+        for table, part in zip(out, found, strict=True):
+            table[rows] = part
     return out
+
+
+def _tables(faced: list[Facing], compare: Compare, worst: Sequence[float], width: int, values: Tensor) -> tuple[Tensor, ...]:
+    """Of one block of queries that saw the same joints: compared with all that faces them, tile by tile."""
+    tables = tuple(values.new_full((len(values), width), torch.inf) for _ in worst)
+    block = PAIR_BLOCK if values.device.type == "cpu" else DEVICE_BLOCK
+    for _, alike in groupby(faced, key=lambda one: one.key):
+        query: Described | None = None
+        for one in alike:
+            if one.describe is None or one.described is None:
+                for table, bound in zip(tables, worst, strict=True):
+                    _lower(table, one.numbers, table.new_full((1, 1), bound))
+                continue
+            query = one.describe(values) if query is None else query
+            tall = min(len(query), max(min(block, ROW_BLOCK), block // max(1, len(one.described))))
+            wide = max(1, block // max(1, tall))
+            for top, left in product(range(0, len(query), max(1, tall)), range(0, len(one.described), wide)):
+                down, across = slice(top, top + tall), slice(left, left + wide)
+                for table, part in zip(tables, compare(query[down], one.described[across]), strict=True):
+                    if one.numbers is None:
+                        _lower(table[down, across], None, part)
+                    else:
+                        _lower(table[down], one.numbers[across], part)
+    return tables
+
+
+def _lower(table: Tensor, columns: Tensor | None, values: Tensor) -> None:
+    """Where values are less than a table, or some columns of it, they take their place."""
+    if columns is None:
+        torch.minimum(table, values, out=table)
+    else:
+        table.index_copy_(1, columns, torch.minimum(table.index_select(1, columns), values))
 
 
 def fused_residual(
     query: Windows,
-    copies: list[Windows],
+    copies: Sequence[Windows],
     metric: JointMetric,
     channels: tuple[str, ...] = NEAREST,
     weights: Tensor | None = None,
@@ -230,8 +420,7 @@ def fused_residual(
     .. math:: D(q, e) = \min_{\text{copies}} \sum_{c} w_c \sum_{\text{terms}} \log(r_c(q, e) + \epsilon)
 
     Terms: ``epi`` :math:`1 - s_1(U_q, U_e)`, the largest canonical correlation between the channel spaces under the joint
-    metric (any viewpoint); ``up`` :math:`1 - \cos(y_q, y_e)`, heights only (upright cameras, turned about the vertical);
-    ``nn`` :math:`1 - \cos(X_q, X_e)`, the whole image (one viewpoint); ``turned``
+    metric (any viewpoint); ``nn`` :math:`1 - \cos(X_q, X_e)`, the whole image (one viewpoint); ``turned``
     :math:`1 - \max_R \cos(X_q R, X_e)` over turns R of flat cards about the vertical.
 
     Args:
@@ -242,63 +431,48 @@ def fused_residual(
 
     Source: thesis chapter 7 (rank of stacked measurements).
     """
-
     if not copies:
         raise ValueError("no exemplar to compare with")
-    spelled = [(i, *_TERMS[term]) for i in range(len(channels)) for term in terms]
-
-    def describe(values: Tensor, joints: Tensor | slice) -> Described:
-        applied = [metric.apply(values, name, joints) for name in channels]
-        return Described(tuple(unit(applied[i]) for i, unit, _ in spelled))
-
-    def product(left: Described, right: Described, joints: Tensor | slice) -> Tensor:
-        total: Tensor | None = None
-        for (i, _, correlation), a, b in zip(spelled, left.parts, right.parts, strict=True):
-            residual = correlation(a, b).neg_().add_(1.0).clamp_(min=0.0).add_(EPSILON)
-            if weights is not None and weights[i] != 1:
-                residual = residual.pow_(float(weights[i]))
-            total = residual if total is None else total.mul_(residual)
-        if total is None:
-            raise ValueError("no channel to compare")
-        return total
-
-    total_weight = len(channels) if weights is None else float(weights.sum())
-    worst = (1.0 + EPSILON) ** (len(terms) * total_weight)
-    bank, step = stack(copies), max(1, TABLE_BLOCK // sum(len(copy) for copy in copies))
-    best = [
-        between(query[at : at + step], bank, product, worst, describe).unflatten(1, (len(copies), -1)).amin(dim=1)
-        for at in range(0, max(1, len(query)), step)
-    ]
-    return torch.cat(best).log_()
+    bank = Bank([Copy(windows) for windows in copies], planes_of(metric, channels))
+    return fused_residuals(query, [bank], [fusion(terms, channels, weights)])[0]
 
 
-Unit = Callable[[Tensor], Tensor]
+def fused_residuals(query: Windows, banks: Sequence[Bank], fusions: Sequence[Fusion], chosen: Tensor | None = None) -> list[Tensor]:
+    """The same of banks of planes (:func:`planes_of`): a ``(queries, chosen)`` table for each fusion."""
+    worst = [(1.0 + EPSILON) ** (len(one.terms) * sum(one.powers)) for one in fusions]
+    tables = least(query, banks, lambda left, right: fused(left.parts, right.parts, fusions, EPSILON), worst, chosen)
+    return [table.log_() for table in tables]
+
+
+def fusion(terms: tuple[str, ...], channels: tuple[str, ...] = NEAREST, weights: Tensor | None = None) -> Fusion:
+    """Terms in channels that count as the weights say."""
+    if not channels or not terms:
+        raise ValueError("no channel to compare")
+    return Fusion(terms, (1.0,) * len(channels) if weights is None else tuple(weights.tolist()))
+
+
+def planes_of(metric: JointMetric, channels: tuple[str, ...] = NEAREST) -> Describer:
+    """A describer for :class:`Bank`: windows as planes, in each channel."""
+
+    @lru_cache(maxsize=8)  # banks of all crops ask for the same joints, one after the other
+    def weights(joints: tuple[int, ...] | None) -> list[Tensor | None]:
+        chosen = slice(None) if joints is None else torch.tensor(joints, device=metric.covariance.device)
+        return [metric.weights(name, chosen) for name in channels]
+
+    def among(joints: Tensor | slice) -> Describe:
+        each = weights(None if isinstance(joints, slice) else tuple(joints.tolist()))
+
+        def describe(values: Tensor) -> Described:
+            pairs = [factorize(laid_out(values, name, some)) for name, some in zip(channels, each, strict=True)]
+            return Described(tuple(part for pair in pairs for part in pair))
+
+        return describe
+
+    return among
 
 
 def _flat(x: Tensor) -> Tensor:
     return torch.nn.functional.normalize(x.flatten(1), dim=1)
-
-
-def _product(a: Tensor, b: Tensor) -> Tensor:
-    return a @ b.mT
-
-
-def _solid(x: Tensor) -> Tensor:
-    return x / x.flatten(1).norm(dim=1).clamp(min=1e-12)[:, None, None]
-
-
-def _turned(a: Tensor, b: Tensor) -> Tensor:
-    """A turn of a flat card scales its x by -1 to 1: the best one takes the product of the x without its sign."""
-    return (a[..., 1] @ b[..., 1].mT).add_((a[..., 0] @ b[..., 0].mT).abs_())
-
-
-# What is compared of a channel, and the correlation of two of them: 1 where they are the same.
-_TERMS: dict[str, tuple[Unit, Callable[[Tensor, Tensor], Tensor]]] = {
-    "epi": (orthonormal_basis, canonical_correlation),
-    "up": (lambda x: _flat(x[..., 1]), _product),
-    "nn": (_flat, _product),
-    "turned": (_solid, _turned),
-}
 
 
 @dataclass
@@ -324,48 +498,67 @@ class Kernels:
     def fit(self, windows: Windows, options: MachineOptions) -> Tensor:
         """Set the scales from training windows and return their ``(N, N)`` kernel matrix."""
         chosen = windows[torch.arange(0, len(windows), max(1, len(windows) // options.scale_windows))]
-        scales = []
-        for k in range(self.count):
-
-            def one(left: Described, right: Described, joints: Tensor | slice, k: int = k) -> Tensor:
-                return next(d for i, d in enumerate(self._distances(left, right)) if i == k)
-
-            scales.append(kernel_scale(between(chosen, chosen, one, 1.0, self._describe), options.width))
-        self.scales = torch.stack(scales)
+        tables = least(chosen, [self.bank(chosen)], lambda left, right: list(self._distances(left, right)), [1.0] * self.count)
+        self.scales = torch.stack([kernel_scale(table, options.width) for table in tables])
         return self(windows, windows)
 
-    def __call__(self, query: Windows, bank: Windows) -> Tensor:
+    def bank(self, windows: Windows) -> Bank:
+        """Windows that queries are compared with again and again."""
+        return Bank([Copy(windows)], self._describer)
+
+    def __call__(self, query: Windows, bank: Windows | Bank) -> Tensor:
         """``(Q, E)`` kernel matrix."""
-        scales = self.scales
-        if scales is None:
+        if self.scales is None:
             raise ValueError("the kernels have no scales yet; fit them first")
+        slopes = (-1.0 / self.scales).tolist()
 
-        def total(left: Described, right: Described, joints: Tensor | slice) -> Tensor:
-            out = scales.new_zeros(len(left), len(right))
-            for scale, distance in zip(scales, self._distances(left, right), strict=True):
-                out.add_(distance.div_(-scale).exp_())
-            return out.div_(len(scales))
+        def total(left: Described, right: Described) -> list[Tensor]:
+            kernels = (distance.mul_(slope).exp_() for slope, distance in zip(slopes, self._distances(left, right), strict=True))
+            out = next(kernels)
+            for kernel in kernels:
+                out.add_(kernel)
+            return [out.div_(len(slopes))]
 
-        return between(query, bank, total, 0.0, self._describe)
+        return least(query, [bank if isinstance(bank, Bank) else self.bank(bank)], total, [0.0])[0]
 
-    def _describe(self, values: Tensor, joints: Tensor | slice) -> Described:
-        """Unit vectors, and where bases are compared those with three axes."""
-        parts = []
-        for name in CHANNELS:
-            x = self.metric.apply(values, name, joints)
-            parts += [_flat(x[..., 1]), _flat(x), *([orthonormal_basis(x)] if self.one_side else [])]
-        for whole_image in (False, True)[: 1 + self.one_side]:
-            parts += [_flat(moment) for moment in order_free(values, whole_image)]
-        return Described(tuple(parts))
+    def _describer(self, joints: Tensor | slice) -> Describe:
+        weights = [self.metric.weights(name, joints) for name in CHANNELS]
+
+        def describe(values: Tensor) -> Described:
+            """Unit images and how much larger they are than their heights, where bases are compared these; then moments."""
+            parts = []
+            for name, some in zip(CHANNELS, weights, strict=True):
+                image = laid_out(values, name, some)
+                unit = _flat(image).view_as(image)
+                parts += [unit, 1 / unit[:, 1].norm(dim=1, keepdim=True).clamp(min=TINY)]
+                parts += [factorize(image)[0]] if self.one_side else []
+            for whole_image in (False, True)[: 1 + self.one_side]:
+                parts += [_flat(moment) for moment in order_free(values, whole_image)]
+            return Described(tuple(parts))
+
+        return describe
 
     def _distances(self, left: Described, right: Described) -> Iterator[Tensor]:
         """``(Q, E)`` distances, one kernel after the other."""
-        for a, b in zip(left.parts, right.parts, strict=True):
-            if a.ndim == 3:
-                yield 1 - canonical_correlation(a, b)
-                yield 1 - canonical_correlation(a, b, shared=2)
-            else:
-                yield _product(a, b).neg_().add_(1.0).clamp_(min=0.0)
+        each = 3 if self.one_side else 2
+        pairs = list(zip(left.parts, right.parts, strict=True))
+        for i in range(0, each * len(CHANNELS), each):
+            (a, b), (ratio, other) = pairs[i], pairs[i + 1]
+            heights = a[:, 1] @ b[:, 1].mT
+            whole = (a[:, 0] @ b[:, 0].mT).add_(heights)
+            yield _distance(heights.mul_(ratio).mul_(other.T))
+            yield _distance(whole)
+            if self.one_side:
+                c = entries(*pairs[i + 2])
+                yield _distance(epipolar_correlation(c))
+                norm = sum((x.square() for x in c[1:]), start=c[0].square())
+                yield _distance(norm.mul_(0.5).sqrt_())
+        for a, b in pairs[each * len(CHANNELS) :]:
+            yield _distance(a @ b.mT)
+
+
+def _distance(correlation: Tensor) -> Tensor:
+    return correlation.neg_().add_(1.0).clamp_(min=0.0)
 
 
 def kernel_scale(distances: Tensor, width: float) -> Tensor:
@@ -376,4 +569,4 @@ def kernel_scale(distances: Tensor, width: float) -> Tensor:
 
 def cosine_distance(a: Tensor, b: Tensor) -> Tensor:
     """``(Q, E)`` 1 - cosine of the angle between rows."""
-    return _product(_flat(a), _flat(b)).neg_().add_(1.0).clamp_(min=0.0)
+    return _distance(_flat(a) @ _flat(b).mT)

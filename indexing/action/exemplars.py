@@ -68,6 +68,17 @@ class Exemplars:
         count = len(self)
         return self.views[slice(index * count, (index + 1) * count)]
 
+    def only(self, chosen: torch.Tensor) -> Exemplars:
+        """Some of them, ``(N,)`` bool."""
+        count, moments = len(self), chosen[self.owner]
+
+        def copies(windows: Windows) -> Windows:
+            return windows[chosen.repeat(len(windows) // count)] if len(windows) else windows
+
+        seconds, cyclic = (None if one is None else one[chosen] for one in (self.seconds, self.cyclic))
+        owner = (torch.cumsum(chosen, 0) - 1)[self.owner[moments]]
+        return Exemplars(copies(self.crops), copies(self.views), self.moments[moments], owner, self.solid[chosen], seconds, cyclic)
+
     def extended(self, other: Exemplars) -> Exemplars:
         """These and then the others."""
         mine, theirs = len(self), len(other)
@@ -123,6 +134,8 @@ def recurrence(source: Ragged, options: ExemplarOptions) -> torch.Tensor:
     The greatest autocorrelation of the frame-centred motion :math:`x`, at lags up to half the exemplar, after it first fell:
 
     .. math:: R(k) = \frac{\sum_t x_t \cdot x_{t+k}}{\sqrt{\sum_t |x_t|^2 \sum_t |x_{t+k}|^2}}
+
+    It is measured by that of steps that nearly touch: what keeps these from being alike is noise, which lowers all others as much.
     """
     count, fine = len(source.starts) - 1, options.recurrence_steps
     begin, end = source.times[source.starts[:-1]], source.times[source.starts[1:] - 1]
@@ -136,6 +149,7 @@ def recurrence(source: Ragged, options: ExemplarOptions) -> torch.Tensor:
         curve = torch.stack([gram.diagonal(k).sum() for k in lags])
         norm = torch.stack([(energy[: fine - k].sum() * energy[k:].sum()).sqrt() for k in lags]).clamp(min=1e-30)
         curve = curve / norm
+        curve = (curve / curve[options.touching].clamp(min=options.fallen)).clamp(max=1.0)
         fallen = (curve < options.fallen).nonzero()
         if len(fallen):
             found[i] = float(curve[int(fallen[0]) :].max().clamp(min=0.0))

@@ -14,19 +14,30 @@ from sklearn.utils.validation import check_is_fitted
 
 from dyntorch.numerics import one_thread
 from indexing.action import saving
+from indexing.action.background import (
+    OtherMovement,
+    alike,
+    event_level,
+    performed,
+    played_otherwise,
+    recorded,
+    segment_evidence,
+    without_background,
+)
 from indexing.action.bank import Windows
-from indexing.action.exemplars import ExemplarPlan, Exemplars, cut
+from indexing.action.exemplars import ExemplarPlan, Exemplars, cut, lasts
 from indexing.action.inputs import check_common, check_plan, check_queries, gather, gather_groups, gather_labels
 from indexing.action.learning import Lesson, learn
 from indexing.action.model import ShapeModel
 from indexing.action.options import ActionOptions
 from indexing.action.stream import Stream
 from indexing.action.symmetry import mirror_permutation
-from indexing.clip import Clip
+from indexing.clip import Clip, check_fps
 from indexing.estimator import POSITIVE, RANDOM_STATE, REJECT, SECONDS, Rule, SavedClassifier, is_positive, is_whole, one_of
 from indexing.joints import layout_of
 from indexing.recordings.explain import explain
 from indexing.recordings.explanation import Explanation, Withheld
+from indexing.recordings.live import ActionStream, LiveSource
 from indexing.scoring import Event, joined, probabilities, refuse, reject_threshold, same_label
 from indexing.skeleton import Skeleton
 from indexing.windows import RepairOptions, mended, ragged, whole
@@ -165,14 +176,24 @@ class ActionIndexer(SavedClassifier):
 
     # ---- learning ----------------------------------------------------------------------------------------------------
     @one_thread
-    def fit(self, clips: Iterable[Any], labels: ArrayLike | None = None, groups: ArrayLike | None = None) -> Self:
+    def fit(
+        self,
+        clips: Iterable[Any],
+        labels: ArrayLike | None = None,
+        groups: ArrayLike | None = None,
+        background: Iterable[Any] | None = None,
+    ) -> Self:
         """Learn from clips.
+
+        Of one action alone, too: a background is then made of the clips played otherwise and, where the joints have names, of
+        synthetic people who do other things (:mod:`indexing.action.background`).
 
         Args:
             clips: of :class:`Clip`, or ``(frames, joints, 2 | 3)`` arrays, or tuples of synchronized views of one
                 performance (an array ``(views, frames, joints, 2)`` too).  One 2D clip per action is enough.
             labels: ``(clips,)``; by default the clips' own.
             groups: ``(clips,)`` who performs, for ``weights="learned"``; by default the clips' field ``subject``, if all have it.
+            background: clips or recordings, of any length, of other movement: what resembles them more than the actions is none.
 
         Raises:
             ValueError: naming the clip or the parameter, what is wrong and what to do.
@@ -182,13 +203,54 @@ class ActionIndexer(SavedClassifier):
         people = gather_groups(found, owners, groups)
         values = gather_labels(found, owners, labels)
         classes, numbers = np.unique(values, return_inverse=True)
-        if len(classes) < 2:
-            raise ValueError(
-                f"labels: only one class ({classes[0]!r}); give clips of at least two actions, for example one of ordinary movement"
-            )
         rng = np.random.default_rng(self.random_state)
+        other = self._other_movement(found, len(classes) == 1, background)
         plan = self._plan(_default_views(found, self._options))
-        return self._learn(cut(found, plan, rng, options=self._options), classes, numbers, layout_of(found), people)
+        exemplars = cut([*found, *other.clips], plan, rng, options=self._options)
+        numbers = np.concatenate([numbers, len(classes) + other.numbers])
+        if people is not None:
+            people = np.concatenate([people, [f"background: {kind}" for kind in other.kinds]])
+        if len(classes) == 1:
+            exemplars, numbers, people = self._unlike(exemplars, numbers, people, other)
+        self._learn(exemplars, classes, numbers, layout_of(found), people)
+        if len(classes) == 1 and any(other.sure):
+            # what was given tells itself how near other movement comes to the action
+            given = self.model_.exemplars.crop(0)[len(found) : len(found) + sum(other.sure)]
+            self.model_ = dataclasses.replace(self.model_, evidence_out=self.model_.evidence(given))
+            self._calibrate()
+        return self
+
+    def _other_movement(self, found: Sequence[Clip], alone: bool, background: Iterable[Any] | None) -> OtherMovement:
+        """What is not one of the actions: what was given, and where there is one action alone what is made."""
+        options, skeleton = self._options.background, layout_of(found)
+        other = OtherMovement()
+        if background is not None:
+            lengths = [lasts(clip) for clip in found]
+            other += recorded(background, self.fps, found[0].joints.shape[1], skeleton, float(np.median(lengths)), options)
+        if alone:
+            # a generator of its own: what is made does not hang on how the exemplars are seen
+            rng = np.random.default_rng(0)
+            people = performed(skeleton, 3 if all(clip.dims == 3 for clip in found) else 2, options, rng)
+            other += people + played_otherwise(found, not len(people), options, rng)
+        return other
+
+    def _unlike(
+        self, exemplars: Exemplars, numbers: Array, people: Array | None, other: OtherMovement
+    ) -> tuple[Exemplars, Array, Array | None]:
+        """Without the kinds of made movement that come out too much like the action; the kinds that are left are numbered anew.
+
+        Raises:
+            ValueError: nothing is left.
+        """
+        like = alike(exemplars, numbers, other.kinds, self._options) & ~np.array(other.sure)
+        if like.all():
+            raise ValueError(
+                "labels: only one class, and however its clips are played otherwise they come out the same; give background=, a "
+                "recording of other movement, or clips of a second action"
+            )
+        kept = np.concatenate([np.ones(len(numbers) - len(like), dtype=bool), ~like])
+        numbers = np.unique(numbers[kept], return_inverse=True)[1]
+        return exemplars.only(torch.from_numpy(kept)), numbers, None if people is None else people[kept]
 
     @one_thread
     def partial_fit(
@@ -209,13 +271,15 @@ class ActionIndexer(SavedClassifier):
             raise ValueError(f"groups: {here} say who performs, {there} do not; give groups=, or clips with the field 'subject'")
         both = None if people is None or self.groups_ is None else np.concatenate([self.groups_, people])
         values = gather_labels(found, owners, labels)
-        old = self.classes_[self.model_.labels.numpy()]
-        merged = joined(old, values)
-        known, numbers = np.unique(merged, return_inverse=True)
+        before = self.model_.labels.numpy()
+        named = before < self.model_.known  # the others are background
+        known, fresh = np.unique(joined(self.classes_[before[named]], values), return_inverse=True)
+        numbers = np.concatenate([before - self.model_.known + len(known), fresh[named.sum() :]])
+        numbers[: len(before)][named] = fresh[: named.sum()]
         check_plan(self, len(self._options.exemplars.crops) if self.search else 1, self.model_.exemplars)
-        plan = self._plan(len(self.model_.exemplars.views) // len(old))
+        plan = self._plan(len(self.model_.exemplars.views) // len(before))
         seed = 0 if self.random_state is None else self.random_state
-        rng = np.random.default_rng([seed, len(old)])
+        rng = np.random.default_rng([seed, len(before)])
         extended = self.model_.exemplars.extended(cut(found, plan, rng, options=self._options))
         return self._learn(extended, known, numbers, self.skeleton_, both)
 
@@ -245,7 +309,8 @@ class ActionIndexer(SavedClassifier):
             raise ValueError(
                 "mirror=True: the joints' mirror images are not known; give clips a skeleton with names, or mirror='auto'"
             )
-        if self.reject is not None and any(same_label(value, self.none_label) for value in classes.tolist()):
+        hidden = int(numbers.max()) + 1 - len(classes)
+        if (hidden or self.reject is not None) and any(same_label(value, self.none_label) for value in classes.tolist()):
             raise ValueError(f"none_label={self.none_label!r} is one of the learned labels; choose another for rejected clips")
         lesson = Lesson(
             view=self.view,
@@ -254,9 +319,10 @@ class ActionIndexer(SavedClassifier):
             groups=None if groups is None else torch.from_numpy(np.unique(groups, return_inverse=True)[1]).long().to(self.device),
             symmetry=symmetry,
             guard=self.mirror == "auto",
+            hidden=hidden,
         )
         there, labels = exemplars.to(self.device), torch.from_numpy(numbers).long().to(self.device)
-        self.model_: ShapeModel = learn(there, labels, len(classes), lesson, options=self._options).to("cpu")
+        self.model_: ShapeModel = learn(there, labels, len(classes) + hidden, lesson, options=self._options).to("cpu")
         self.groups_ = groups
         self.classes_ = classes
         self.n_joints_ = int(exemplars.crops.values.shape[2])
@@ -265,14 +331,19 @@ class ActionIndexer(SavedClassifier):
         return self
 
     def _calibrate(self) -> None:
-        self.reject_threshold_ = reject_threshold(self.reject, self.model_.evidence_out, len(self.classes_))
+        self.reject_threshold_ = reject_threshold(self._rate, self.model_.evidence_out, self.model_.judged)
+
+    @property
+    def _rate(self) -> float | None:
+        """The rate of false alarms that is asked for: of one action alone there is always one."""
+        return self._options.background.false_alarms if self.reject is None and len(self.classes_) == 1 else self.reject
 
     # ---- recognition -------------------------------------------------------------------------------------------------
     def _queries(self, clips: Iterable[Any]) -> Windows:
         check_is_fitted(self, "model_")
         found = check_queries(clips, self.fps, self.n_joints_, self.skeleton_)
         source = ragged(found, self._repair)
-        check_common(found, source.seen, self.model_.exemplars.crop(0).seen.numpy())
+        check_common(found, source.seen, self.model_.shown())
         return Windows(whole(source, self.length), torch.from_numpy(source.seen)).to(self.device)
 
     def _model(self) -> ShapeModel:
@@ -282,13 +353,14 @@ class ActionIndexer(SavedClassifier):
     @one_thread
     def decision_function(self, clips: Iterable[Any]) -> Array:
         """``(clips, classes)`` scores, larger is better; columns are ``classes_``."""
-        return np.asarray(self._model().scores(self._queries(clips)).cpu().numpy())
+        return np.asarray(self._model().scores(self._queries(clips)).cpu().numpy())[:, : len(self.classes_)]
 
     @one_thread
     def evidence(self, clips: Iterable[Any]) -> Array:
         """``(clips,)`` how well a clip shows a known action rather than another one, comparable between clips.
 
-        The nearest-exemplar score of the best class, and how far it stands above the next and above the mean of all.
+        The nearest-exemplar score of the best class, how far it stands above the next and above the mean of all, and how usual
+        the scores of all classes are beside one another (:func:`indexing.action.model.evidence`).
         """
         return np.asarray(self._model().evidence(self._queries(clips)).cpu().numpy())
 
@@ -296,20 +368,23 @@ class ActionIndexer(SavedClassifier):
     def predict_proba(self, clips: Iterable[Any]) -> Array:
         """``(clips, classes)`` probabilities of the known classes, rows sum to 1 (a softmax of the standardized scores).
 
-        With ``weights="learned"`` its sharpness is the one that made left-out people's answers most likely.
+        With ``weights="learned"`` its sharpness is the one that made left-out people's answers most likely.  Where there is a
+        background, what is missing to 1 is its probability.
         """
-        scores = self.decision_function(clips)
-        return probabilities(scores, self.model_.blend.sharpness)
+        scores = np.asarray(self._model().scores(self._queries(clips)).cpu().numpy())
+        return probabilities(scores, self.model_.blend.sharpness)[:, : len(self.classes_)]
 
     @one_thread
     def predict(self, clips: Iterable[Any]) -> Array:
-        """``(clips,)`` labels; ``none_label`` where ``reject`` is set and no class explains the clip."""
+        """``(clips,)`` labels; ``none_label`` where ``reject`` is set and no class explains the clip, and for background."""
         query = self._queries(clips)
         model = self._model()
-        labels = self.classes_[model.scores(query).argmax(dim=1).cpu().numpy()]
-        if self.reject_threshold_ is None:
-            return np.asarray(labels)
-        refused = (model.evidence(query) < self.reject_threshold_).cpu().numpy()
+        nearest = None if self.reject_threshold_ is None else model.nearest_scores(query)
+        numbers = model.scores(query, nearest).argmax(dim=1).cpu().numpy()
+        refused = numbers >= model.known
+        labels = self.classes_[np.where(refused, 0, numbers)]
+        if self.reject_threshold_ is not None:
+            refused = refused | (model.evidence(query, nearest) < self.reject_threshold_).cpu().numpy()
         return refuse(labels, refused, self.none_label)
 
     # ---- long recordings ---------------------------------------------------------------------------------------------
@@ -329,7 +404,23 @@ class ActionIndexer(SavedClassifier):
         times = found.times
         found = found.replace(times=found.times - begin)  # rounding must not depend on what the clock shows
         found = mended(found, self._repair) if self._repair else found
-        told = explain(self._model(), found, self._stream(), self.classes_.tolist(), self.reject, progress)
+        model = self._model()
+        # nothing of this stage is learned: options set on a loaded model count
+        model = model.with_options(dataclasses.replace(model.options, recordings=self._options.recordings))
+        rate = None if model.hidden else self.reject
+        told = explain(
+            model,
+            found,
+            self._stream(),
+            [*self.classes_.tolist(), *(("background", i) for i in range(model.hidden))],
+            rate,
+            progress,
+        )
+        if model.hidden:
+            floor, least = event_level(model, self._rate), -np.inf if self.reject_threshold_ is None else self.reject_threshold_
+            told = without_background(
+                told, self.classes_.tolist(), floor, lambda some: segment_evidence(model, found, some, self.length) >= least
+            )
 
         def later(event: Event) -> Event:
             return dataclasses.replace(event, start=event.start + begin, end=event.end + begin)
@@ -369,13 +460,45 @@ class ActionIndexer(SavedClassifier):
         """
         return self.scan(clip, progress)[1]
 
+    def stream(
+        self, fps: float | None = None, *, lag: float | None = None, up: str = "y", skeleton: Skeleton | None = None
+    ) -> ActionStream:
+        """A stream to push frames into as they come: ``stream.push(joints)`` gives what is decided by then.
+
+        Args:
+            fps: of frames that are pushed without times, where it is another than the indexer's.
+            lag: seconds after its end at which an event is told; by default a quarter more than the longest action takes, and what
+                it takes to look at a moment.
+            up, skeleton: of the frames, as of a :class:`Clip`; without a skeleton joints are taken in the order of those learned.
+
+        Raises:
+            ValueError: a frame rate that no camera has, or a lag that is shorter than an action.
+        """
+        model = self._model()
+        options = dataclasses.replace(model.options, recordings=self._options.recordings, live=self._options.live)
+        source = LiveSource(
+            model.with_options(options),
+            tuple(self.classes_.tolist()),
+            self._stream(),
+            self._rate if model.hidden else self.reject,
+            self._repair,
+            self.n_joints_,
+            self.skeleton_,
+            check_fps(self.fps if fps is None else fps),
+        )
+        return ActionStream(source, lag, up, skeleton)
+
     def exemplar(self, index: int) -> Clip:
-        """Exemplar number ``index`` as it is compared: resampled, y up (for pictures)."""
+        """Exemplar number ``index`` as it is compared: resampled, y up, and as long as it was, where the model knows."""
         check_is_fitted(self, "model_")
-        windows = self.model_.exemplars.crop(0)
+        exemplars = self.model_.exemplars
+        windows, seconds = exemplars.crop(0), exemplars.seconds
         joints = windows.values[index].numpy().copy()
         joints[:, ~windows.seen[index].numpy()] = np.nan
-        return Clip(joints, label=self.classes_[int(self.model_.labels[index])], skeleton=self.skeleton_, name=f"exemplar {index}")
+        times = None if seconds is None else (np.arange(len(joints)) + 0.5) * max(float(seconds[index]), 1e-3) / len(joints)
+        number = int(self.model_.labels[index])
+        label = self.classes_[number] if number < len(self.classes_) else self.none_label
+        return Clip(joints, times=times, label=label, skeleton=self.skeleton_, name=f"exemplar {index}")
 
 
 def _default_views(clips: Sequence[Clip], options: ActionOptions) -> int:

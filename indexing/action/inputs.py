@@ -154,9 +154,9 @@ def check_common(clips: list[Clip], seen: NDArray[np.bool_], known: NDArray[np.b
     """Raise where a query shares too few joints with every exemplar to be compared at all.
 
     Args:
-        seen: ``(clips, joints)`` joints seen in the queries; known: ``(exemplars, joints)``.
+        seen: ``(clips, joints)`` joints seen in the queries; known: ``(sets, joints)`` in exemplars.
     """
-    most = (seen.astype(int) @ np.unique(known, axis=0).astype(int).T).max(axis=1)
+    most = (seen.astype(int) @ known.astype(int).T).max(axis=1)
     few = np.flatnonzero(most < min(COMMON, seen.shape[1]))
     if len(few):
         clip = clips[few[0]]

@@ -8,14 +8,28 @@ affine image of itself, from which this residual learns nothing about other view
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import cast
 
 import torch
 from torch import Tensor
 
-from indexing.action.bank import CHANNELS, EPSILON, NEAREST, JointMetric, Windows, fused_residual
+from indexing.action.bank import (
+    CHANNELS,
+    EPSILON,
+    NEAREST,
+    Bank,
+    Copy,
+    JointMetric,
+    Windows,
+    fused_residual,
+    fused_residuals,
+    fusion,
+    planes_of,
+)
 from indexing.action.options import ActionOptions
+from indexing.action.planes import GRAM_EPSILON, Entries, Fusion
 from indexing.modelfile import stored
 
 MOST_WEIGHT = 1e6  # of a joint or a scorer, the mean being 1
@@ -29,7 +43,6 @@ MOST_WEIGHT = 1e6  # of a joint or a scorer, the mean being 1
 
 
 ABSENT = -100.0  # score of a class with no exemplar in another group
-GRAM_EPSILON = 1e-6  # of a 2x2 Gram, relative to its trace: as in dyntorch.numerics.orthonormal_basis
 
 
 @dataclass(frozen=True)
@@ -68,9 +81,6 @@ class Evidence:
         count = self.valid.sum(2)
         mean = torch.where(self.valid, total, 0.0).sum(3) / count.clamp(min=1)
         return torch.where(count > 0, -mean, ABSENT).mT
-
-
-Entries = tuple[Tensor, Tensor, Tensor, Tensor]  # 00, 01, 10, 11 of 2x2 matrices
 
 
 def epipolar(cross: Entries, left: Entries, right: Entries) -> Tensor:
@@ -226,16 +236,23 @@ class JointWeights:
             roots[CHANNELS.index(name)] = row.sqrt()
         return WeightedMetric(metric.covariance, metric.power, roots, floor=metric.floor)
 
-    def residual(self, query: Windows, copies: list[Windows], metric: JointMetric, labels: Tensor) -> Tensor:
-        """``(Q, N)`` :func:`~indexing.action.bank.fused_residual` under these weights; each class's exemplars under its own."""
+    @property
+    def fusion(self) -> Fusion:
+        """The epipolar residual, its channels weighted."""
+        return fusion(("epi",), NEAREST, self.channels)
+
+    def banks(self, crops: Sequence[Sequence[Copy]], metric: JointMetric, labels: Tensor) -> list[list[Bank]]:
+        """Banks of each crop to compare with under these weights; each class's exemplars under its own."""
         if self.by_class is None:
-            return fused_residual(query, copies, self.metric(metric), NEAREST, self.channels)
-        out = query.values.new_empty(len(query), len(labels))
-        for action in labels.unique().tolist():
-            mine = (labels == action).nonzero()[:, 0]
-            part = [copy[mine] for copy in copies]
-            out[:, mine] = fused_residual(query, part, self.metric(metric, action), NEAREST, self.channels)
-        return out
+            planes = planes_of(self.metric(metric))
+            return [[Bank(copies, planes)] for copies in crops]
+        own = [(labels == action, planes_of(self.metric(metric, action))) for action in labels.unique().tolist()]
+        return [[Bank([copy.only(mine) for copy in copies], planes) for mine, planes in own] for copies in crops]
+
+    def residual(self, query: Windows, copies: Sequence[Windows], metric: JointMetric, labels: Tensor) -> Tensor:
+        """``(Q, N)`` :func:`~indexing.action.bank.fused_residual` under these weights; each class's exemplars under its own."""
+        (banks,) = self.banks([[Copy(one) for one in copies]], metric, labels)
+        return fused_residuals(query, banks, [self.fusion])[0]
 
 
 def learn_joint_weights(

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 FORMAT = "dyntorch.action-indexer"
 VERSION = 2
 SCORERS = ("nearest", "kernel", "both")
+KINDS = 10_000  # of background, at most
 JOINTS = 10_000  # at most; the largest layouts have some hundred
 LEAST_SCALE = 1e-7  # of a kernel, over distances from 0 to 2
 
@@ -54,6 +55,7 @@ def save(indexer: ActionIndexer, path: str | Path) -> None:
         tensors["scales"] = kernels.scales
     about = {
         "classes": labels_to_json(indexer.classes_),
+        "hidden": indexer.model_.hidden,
         "joints": indexer.n_joints_,
         "view": indexer.model_.view,
         "scorer": indexer.model_.scorer,
@@ -77,19 +79,20 @@ def load(kind: type[Indexer], path: str | Path, device: str = "cpu") -> Indexer:
         indexer.classes_ = labels_from_json(header["classes"])
         indexer.n_joints_ = whole(header["joints"], "joints", 1, JOINTS)
         indexer.skeleton_ = skeleton_from_json(header["skeleton"], indexer.n_joints_)
-        indexer.model_ = _model(parts, header, _sizes(parts, indexer), indexer._options)
+        hidden = whole(header.get("hidden", 0), "hidden", 0, KINDS)  # older files know no background
+        indexer.model_ = _model(parts, header, _sizes(parts, indexer, hidden), hidden, indexer._options)
         indexer.groups_ = _groups(header["groups"], len(indexer.model_.labels))
         indexer._calibrate()
     return indexer
 
 
-def _sizes(parts: Parts, indexer: ActionIndexer) -> dict[str, int]:
+def _sizes(parts: Parts, indexer: ActionIndexer, hidden: int) -> dict[str, int]:
     """How many there are of what the tensors of a model are about.
 
     Raises:
         ValueError: the parameters and the tensors contradict each other.
     """
-    classes, exemplars = len(indexer.classes_), len(parts.truth("solid", None))
+    classes, exemplars = len(indexer.classes_) + hidden, len(parts.truth("solid", None))
     if classes < 2 or exemplars < classes:
         raise ValueError(f"{exemplars} exemplars of {classes} classes")
     return {
@@ -118,7 +121,7 @@ def _groups(found: Any, exemplars: int) -> NDArray[Any] | None:
     return np.array(found, dtype=str)
 
 
-def _model(parts: Parts, header: dict[str, Any], sizes: dict[str, int], options: ActionOptions) -> ShapeModel:
+def _model(parts: Parts, header: dict[str, Any], sizes: dict[str, int], hidden: int, options: ActionOptions) -> ShapeModel:
     view, scorer, trained = header["view"], header["scorer"], "scales" in parts
     if view != header["parameters"]["view"] or scorer not in SCORERS or trained != (scorer != "nearest"):
         raise ValueError(f"view, scorer: {shown(view)} and {shown(scorer)} do not fit the rest")
@@ -136,7 +139,7 @@ def _model(parts: Parts, header: dict[str, Any], sizes: dict[str, int], options:
     blend = {name: number(value, name, 0, MOST_WEIGHT) for name, value in header["blend"].items()}
     weights = _joint_weights(found.pop("parts"), header["parts"])
     about = {"classes": sizes["classes"], "view": view, "scorer": scorer, "kernels": kernels, "blend": Blend(**blend)}
-    return ShapeModel(**found, **about, metric=metric, parts=weights, options=options)
+    return ShapeModel(**found, **about, metric=metric, parts=weights, options=options, hidden=hidden)
 
 
 def _joint_weights(found: JointWeights, learned: Any) -> JointWeights:

@@ -104,19 +104,23 @@ def scan(model: ShapeModel, clip: Clip, stream: Stream, progress: Progress = Non
     for begin in range(0, len(at), BLOCK):
         part = slice(begin, begin + BLOCK)
         source, own = _around(clip, cuts, at[part], owner[part], stream, model.options)
-        # all tempi at once: the exemplars are described once for all of them
-        queries = stack([_windows(source, own, at[part], stream.window * tempo, stream.length) for tempo in stream.tempi])
-        found = model.moment_scores(queries.to(stream.device)).unflatten(0, (len(stream.tempi), -1))
-        scores[part] = found.amax(dim=0).cpu().numpy()
-        motion[part] = _motion(_windows(source, own, at[part], stream.window, stream.length))
+        scores[part], motion[part] = moments(model, source, own, at[part], stream)
         if progress is not None:
             progress(min(1.0, (begin + BLOCK) / len(at)))
-    found_ = StreamScan(at, scores, motion, _present(clip, cuts, at, owner, stream, model.options), cuts, owner)
+    found_ = StreamScan(at, scores, motion, presence(clip, cuts, at, owner, stream, model.options), cuts, owner)
     scores[~found_.present] = found_.nothing  # where nobody is seen nothing is said
     return found_
 
 
-def _present(clip: Clip, cuts: Array, at: Array, owner: Array, stream: Stream, options: ActionOptions) -> Array:
+def moments(model: ShapeModel, source: Ragged, owner: Array, at: Array, stream: Stream) -> tuple[Array, Array]:
+    """Class scores ``(T, classes)`` and motion ``(T,)`` of windows centred at some times, the best of all tempi."""
+    # all tempi at once: the exemplars are described once for all of them
+    queries = stack([_windows(source, owner, at, stream.window * tempo, stream.length) for tempo in stream.tempi])
+    found = model.moment_scores(queries.to(stream.device)).unflatten(0, (len(stream.tempi), -1))
+    return found.amax(dim=0).cpu().numpy(), _motion(_windows(source, owner, at, stream.window, stream.length))
+
+
+def presence(clip: Clip, cuts: Array, at: Array, owner: Array, stream: Stream, options: ActionOptions) -> Array:
     """Whether enough frames around each time show the person: interpolated poses are no evidence."""
     shown = clip.times[clip.seen.any(axis=1)]
     begin, end = clip.times[cuts[owner, 0]], clip.times[cuts[owner, 1] - 1]

@@ -252,6 +252,7 @@ def stream(
     fps: float = 30.0,
     rng: np.random.Generator | int = 0,
     rest: tuple[float, float] = (0.6, 1.5),
+    repeats: int | None = None,
 ) -> tuple[Clip, list[tuple[str, float, float]]]:
     """Several actions one after the other, with rests between them and at both ends.
 
@@ -261,6 +262,7 @@ def stream(
     Args:
         actions: labels from :data:`ACTIONS`, in order.
         rest: shortest and longest rest in seconds.
+        repeats: of each action, as in :func:`perform`; default: what is natural.
 
     Returns:
         the unlabelled 3D clip, and (label, start, end) in seconds on the clip's clock for each action in turn.
@@ -281,7 +283,7 @@ def stream(
     for action, move in moves:
         before, after = ENDS.get(action, (STAND, STAND))
         gap = _rest(posture, before, rng.uniform(*rest), person, fps)
-        body = _faded(_angles(move, action, person, fps, None, rng), before, after, person, fps)
+        body = _faded(_angles(move, action, person, fps, repeats, rng), before, after, person, fps)
         truth.append((action, (at + len(gap)) / fps, (at + len(gap) + len(body) - 1) / fps))
         parts += [gap, body]
         at, posture = at + len(gap) + len(body), after

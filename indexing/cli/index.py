@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from indexing.cli.console import check_file, check_report, count, names, progress, say, table
+from indexing.cli.console import Progress, check_file, check_report, count, names, progress, say, table
 from indexing.cli.films import Pixels, are_films, refuse_film_flags
 from indexing.cli.inputs import (
     Example,
@@ -40,6 +40,8 @@ class Fit:
 
     dyntorch index fit clips.npz --select view=1,2 -o moves.safetensors
 
+    dyntorch index fit squat=a.json --background session.json -o squat.safetensors      (one action: "more of this")
+
     dyntorch index fit raise=a.mp4 wave=b.mp4@3-5 -o moves.safetensors      (videos: from pixels alone, no pose estimator)
     """
 
@@ -54,6 +56,9 @@ class Fit:
     """from where recordings will be seen: from anywhere, or from about where the examples were"""
     reject: Annotated[float | None, tyro.conf.arg(metavar="R", help_behavior_hint="")] = None
     """share of clips of unknown actions that may be taken for a known one, 0 to 1; any other number is the least score"""
+    background: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE ...", help_behavior_hint="")] = ()
+    """recordings of other movement, of any length: what resembles them more than the actions is none; one action alone can be
+    learned without them, too, and is found more surely with them"""
     weights: Literal["equal", "learned"] = "equal"
     """of the kinds of evidence; learned: by what serves people best who are left out (clip sets with a field 'subject')"""
     report: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
@@ -68,16 +73,16 @@ class Fit:
     def run(self) -> int:
         """Read, learn, write, and say what was learned."""
         if not self.examples:
-            raise ValueError("no examples; give at least two actions, such as squat=a.json lunge=b.json, or a clip set SET.npz")
+            raise ValueError("no examples; give an action or more, such as squat=a.json lunge=b.json, or a clip set SET.npz")
         examples = [parse_example(text) for text in self.examples]
-        paths = [example.path for example in examples]
+        paths = [example.path for example in examples] + list(self.background)
         output, folder = check_file(self.output, paths), check_report(self.report, paths)
-        if are_films(paths):
+        if are_films([example.path for example in examples]):
             return self._from_pixels(examples, output)
         refuse_film_flags(self.pixels)
         with progress("reading", steps=False):
             clips, notes = read_examples(examples, self.reading, self.select)
-        _check_two([str(clip.label) for clip in clips], examples)
+            background = [clip for path in self.background for clip in self.reading.read(path)]
         started = time.perf_counter()
         with progress(f"learning from {count(len(clips), 'clip')}", steps=False):
             from indexing.action.indexer import ActionIndexer
@@ -87,7 +92,7 @@ class Fit:
                 view=self.view, weights=self.weights, reject=self.reject, mirror="auto" if self.mirror else False,
                 random_state=self.seed,
             )  # fmt: skip
-            indexer.fit(clips, [str(clip.label) for clip in clips])
+            indexer.fit(clips, [str(clip.label) for clip in clips], background=background or None)
         seconds = time.perf_counter() - started
         if self.weights == "learned" and (indexer.groups_ is None or len(set(indexer.groups_)) < 2):
             notes.append(
@@ -97,6 +102,7 @@ class Fit:
         indexer.save(output)
         page = None if folder is None else self._write(folder, indexer, clips, notes, paths)
         _show(clips)
+        notes += _other_movement(indexer)
         for note in notes:
             say(f"note: {note}")
         code = _written(output, seconds)
@@ -117,7 +123,7 @@ class Fit:
         from indexing.cli import films
         from indexing.files import prepare
 
-        films.refuse_keypoint_flags(self, "view", "weights", "mirror", "seed", "report")
+        films.refuse_keypoint_flags(self, "view", "weights", "mirror", "seed", "report", "background")
         with progress("reading", steps=False):
             sources, labels, lengths = films.read_examples(examples, self.reading, self.select)
         _check_two(labels, examples)
@@ -139,6 +145,15 @@ def _check_two(labels: Sequence[str], examples: Sequence[Example]) -> None:
     if len(set(labels)) < 2:
         files = names([str(example.path) for example in examples])
         raise ValueError(f"{files}: only one action ({labels[0]}); give examples of two or more, such as ordinary movement")
+
+
+def _other_movement(indexer: ActionIndexer) -> list[str]:
+    """What the actions are told from, besides one another."""
+    model = indexer.model_
+    if not model.hidden:
+        return []
+    clips = int((model.labels >= model.known).sum())
+    return [f"told from a background of {count(clips, 'clip')} in {count(model.hidden, 'kind')}, which are never reported"]
 
 
 def _written(output: Path, seconds: float) -> int:
@@ -167,6 +182,12 @@ if TYPE_CHECKING:
     from indexing.cli.films import FilmRecording
     from indexing.clip import Clip
     from indexing.report import RecordingResult
+    from indexing.scoring import Event
+
+
+Rest = Literal["strict", "usual", "off"]
+RESTED = {"strict": 2.0, "usual": 1.0, "off": 0.0}
+"""Times the usual weight that resting has against an action."""
 
 
 @dataclass(frozen=True)
@@ -186,15 +207,20 @@ class Scan:
     model: Annotated[Path, tyro.conf.arg(aliases=("-m",), metavar="FILE")]
     """what 'dyntorch index fit' wrote"""
     report: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
-    """where to write report.html, events.csv, timeline.png, metrics.json and manifest.json; without it, print only"""
+    """where to write report.html (which plays the recordings), events.csv, repetitions.csv, timeline.png, metrics.json and
+    manifest.json; without it, print only"""
     truth: Annotated[Path | None, tyro.conf.arg(metavar="CSV", help_behavior_hint="")] = None
     """what is known to have happened: columns label,start,end in seconds (and file, where there are several recordings)"""
     reject: Annotated[float | None, tyro.conf.arg(metavar="R", help_behavior_hint="")] = None
     """rate of false alarms that is accepted, 0 to 1, or else the least score; by default that of the model"""
+    rest: Rest = "usual"
+    """who hardly moves rests, and what looks like an action then is held back: strict doubts more, off reports it"""
     reading: Following = field(default_factory=Following)
 
     def run(self) -> int:
         """Read all, scan all, write the report, print the hits."""
+        from indexing.report.tallies import held_sentences
+
         if not self.recordings:
             raise ValueError("no recordings; give at least one keypoint file or folder to search")
         inputs = [*self.recordings, self.model, *([self.truth] if self.truth is not None else [])]
@@ -217,11 +243,15 @@ class Scan:
         timings = {"load": loaded - started, "scan": time.perf_counter() - loaded}
         page = None if folder is None else self._write(folder, indexer, results, notes, inputs, timings)
         _scan_show(results)
+        _counts_show(results)
         for note in notes:
             say(f"note: {note}")
+        for sentence in held_sentences(results):
+            say(sentence)
         say(_summary(results, timings["scan"]))
         if truth is not None:
-            say(_against_truth(results))
+            for sentence in [_against_truth(results), *_right(results)]:
+                say(sentence)
         if page is not None:
             say(f"report: {page}")
         return 0
@@ -238,8 +268,12 @@ class Scan:
 
     def _clips(self) -> tuple[ActionIndexer, list[Lane], list[str]]:
         from indexing.action.indexer import ActionIndexer
+        from indexing.action.options import ActionOptions
 
         indexer = ActionIndexer.load(self.model.expanduser())
+        options = indexer.options or ActionOptions()
+        told = dataclasses.replace(options.recordings, rest=RESTED[self.rest] * options.recordings.rest)
+        indexer.set_params(options=dataclasses.replace(options, recordings=told))
         lanes, notes = read_recordings(self.recordings, self.reading, indexer.n_joints_, self.model, indexer.skeleton_)
         return indexer, lanes, notes + on_classes([str(label) for label in indexer.classes_])
 
@@ -247,6 +281,10 @@ class Scan:
         from indexing.brightness.indexer import BrightnessIndexer
         from indexing.cli.films import read_films
 
+        if self.rest != "usual":
+            raise ValueError(
+                f"--rest {self.rest}: {self.model} was learned from videos, in which nobody's rest is judged; leave it out"
+            )
         return BrightnessIndexer.load(self.model.expanduser()), *read_films(self.recordings, self.reading)
 
     def _scan(self, indexer: Any, recording: Any, truth: list[KnownEvent] | None, which: str) -> RecordingResult:
@@ -257,13 +295,11 @@ class Scan:
         classes = [str(label) for label in indexer.classes_]
         if isinstance(recording, Lane) and recording.clip is None:  # nobody is in view
             nothing = np.full((len(recording.times), len(classes)), np.nan)
-            return RecordingResult(recording.name, None, recording.times, classes, nothing, (), truth)
+            return RecordingResult(recording.name, None, recording.times, classes, nothing, (), truth, repetitions=())
         person = getattr(recording, "person", "")
         with progress(f"scanning {recording.name}{f', person {person}' * bool(person)}{which}") as bar:
             if isinstance(recording, Lane):
-                scores, events = indexer.scan(recording.clip, bar)
-                mine = [dataclasses.replace(event, exemplar=within_label(indexer, event.exemplar)) for event in events]
-                return _of_person(recording, classes, scores, mine, truth)
+                return _of_person(indexer, recording, truth, bar)
             times, scores, events = indexer.scan(recording.source, bar)
             return RecordingResult(recording.name, None, times, classes, scores, events, truth)
 
@@ -273,10 +309,12 @@ class Scan:
     ) -> Path:  # fmt: skip
         from indexing.files import manifest
         from indexing.report import RecognitionReport, write_recognition
+        from indexing.report.results import by_recording
 
+        number = len(by_recording(results))
         arguments = {"command": "index scan", **dataclasses.asdict(self)}
         report = RecognitionReport(
-            f"Actions in {results[0].name}" if len(results) == 1 else f"Actions in {len(results)} recordings",
+            f"Actions in {results[0].name}" if number == 1 else f"Actions in {number} recordings",
             recordings=results,
             exemplars=exemplars(indexer) if hasattr(indexer, "exemplar") else {},
             notes=notes,
@@ -286,19 +324,23 @@ class Scan:
             return write_recognition(folder, report)
 
 
-def _of_person(
-    lane: Lane, classes: list[str], scores: Any, events: Sequence[Any], truth: list[KnownEvent] | None
-) -> RecordingResult:
+def _of_person(indexer: ActionIndexer, lane: Lane, truth: list[KnownEvent] | None, bar: Progress) -> RecordingResult:
+    """One person of a recording: explained, and what was found counted."""
+    from indexing.recordings.repetitions import count_repetitions
     from indexing.report import RecordingResult
 
+    assert lane.clip is not None
+    told = indexer.explain(lane.clip, bar)
+    counts = count_repetitions(lane.clip, told.events, exemplars(indexer))
+
+    def named(event: Event) -> Event:
+        return dataclasses.replace(event, exemplar=within_label(indexer, event.exemplar))
+
+    held = [dataclasses.replace(one, event=named(one.event)) for one in told.withheld]
     return RecordingResult(
-        lane.name, lane.clip, lane.times, classes, scores, events, truth, **_known(RecordingResult, person=lane.person)
-    )
-
-
-def _known(kind: Any, **values: Any) -> dict[str, Any]:
-    """What a result has fields for."""
-    return {name: value for name, value in values.items() if name in kind.__dataclass_fields__}
+        lane.name, lane.clip, lane.times, [str(label) for label in told.classes], told.scores, list(map(named, told.events)), truth,
+        person=lane.person, withheld=held, repetitions=counts,
+    )  # fmt: skip
 
 
 def within_label(indexer: ActionIndexer, exemplar: int | None) -> int | None:
@@ -330,27 +372,41 @@ def _scan_show(results: list[RecordingResult]) -> None:
 
     found = [(result, event) for result in results for event in result.events]
     scores, margins = even([event.score for _, event in found]), even([event.margin for _, event in found])
-    named = {"recording": len({result.name for result in results}) > 1, "person": any(_person(result) for result in results)}
-    columns = [name for name, wanted in named.items() if wanted]
-    rows = []
-    for (result, event), score, margin in zip(found, scores, margins, strict=True):
-        who = [result.name] * named["recording"] + [_person(result)] * named["person"]
-        rows.append([*who, str(event.label), f"{event.start:.2f}", f"{event.end:.2f}", score, margin])
+    columns, whose = _whose(results)
+    rows = [
+        [*whose(result), str(event.label), f"{event.start:.2f}", f"{event.end:.2f}", score, margin]
+        for (result, event), score, margin in zip(found, scores, margins, strict=True)
+    ]
     if rows:
         table([*columns, "action", "start (s) ", "end (s) ", "score ", "margin "], rows)
 
 
-def _person(result: RecordingResult) -> str:
-    return str(getattr(result, "person", ""))
+def _counts_show(results: list[RecordingResult]) -> None:
+    """How often each action was performed, and how."""
+    from indexing.report.tallies import COUNTS, count_row
+
+    columns, whose = _whose(results)
+    rows = [[*whose(result), *count_row(one)] for result in results for one in result.repetitions or ()]
+    if rows:
+        table([*columns, *COUNTS], rows)
+
+
+def _whose(results: Sequence[RecordingResult]) -> tuple[list[str], Callable[[RecordingResult], list[str]]]:
+    """Headings that tell recordings and people apart, where there are several, and a result's cells below them."""
+    named = {"recording": len({result.name for result in results}) > 1, "person": any(result.person for result in results)}
+    columns = [name for name, wanted in named.items() if wanted]
+    return columns, lambda result: [result.name] * named["recording"] + [result.person] * named["person"]
 
 
 def _summary(results: list[RecordingResult], seconds: float) -> str:
     """What was found, where, and how long it took; of a recording with several people, its length counts once."""
-    found, files = sum(len(result.events) for result in results), {result.name for result in results}
-    spans = [[result for result in results if result.name == name] for name in files]
-    length = sum(max(one.times[-1] for one in lanes) - min(one.times[0] for one in lanes) for lanes in spans)
+    from indexing.report.results import by_recording
+    from indexing.report.results import seconds as lasts
+
+    found, files = sum(len(result.events) for result in results), by_recording(results)
+    length = sum(map(lasts, files))
     where = f"{count(len(files), 'recording')} ({length:.1f} s long)"
-    people = sum(bool(_person(result)) for result in results)
+    people = sum(bool(result.person) for result in results)
     who = f" of {count(people, 'person', 'people')}" if people else ""
     return f"{count(found, 'action') if found else 'no action'}{who} found in {where} in {seconds:.1f} s"
 
@@ -364,3 +420,14 @@ def _against_truth(results: list[RecordingResult]) -> str:
     named = ", ".join(f"{label} at {start:.2f} to {end:.2f} s" for _, (label, start, end) in lost[:5])
     more = f" and {len(lost) - 5} more" if len(lost) > 5 else ""
     return f"{known - len(lost)} of {count(known, 'known action')} found" + (f"; missed: {named}{more}" if lost else "")
+
+
+def _right(results: list[RecordingResult]) -> list[str]:
+    """Precision and recall of what was reported, where both times overlap by half or more."""
+    from indexing.report.results import matched
+
+    compared = [result for result in results if result.truth is not None]
+    right, said = sum(map(matched, compared)), sum(len(result.events) for result in compared)
+    known = sum(len(result.truth or ()) for result in compared)
+    shares = [f"{name} {right / number:.3f}" for name, number in (("precision", said), ("recall", known)) if number]
+    return [f"{right} of {said} reported share half of their time or more with a known one ({', '.join(shares)})"] * bool(shares)

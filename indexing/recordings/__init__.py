@@ -1,1 +1,1 @@
-"""Long recordings: windows at many durations, the best explanation as segments, events, counts, people."""
+"""Long recordings: windows at many durations, the best explanation as segments, events, counts, people; live, too."""

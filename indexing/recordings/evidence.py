@@ -72,18 +72,20 @@ class Lattice:
 
     @classmethod
     def over(cls, begin: float, end: float, durations: Durations, options: ExplanationOptions) -> Lattice:
-        """Of a stretch: windows of every duration that actions have, from every edge."""
+        """Of a stretch: windows of every duration that actions have; long ones begin and end at coarser steps, powers of two apart."""
         step = min(options.coarsest, float(durations.typical.min()) / options.step)
         cells = max(1, round((end - begin) / step))
         shortest, longest = options.reach * durations.seconds.min(), durations.seconds.max() / options.reach
         count = min(options.durations, int(np.ceil(np.log(longest / shortest) / np.log(options.ratio))) + 1)
         lengths = np.geomspace(shortest, longest, max(2, count)) / max(end - begin, 1e-9) * cells
-        lengths = np.unique(np.clip(np.round(lengths), 1, cells).astype(np.intp))
-        windows = np.concatenate(
-            [np.stack([np.arange(cells - k + 1), np.arange(cells - k + 1) + k], axis=1) for k in lengths.tolist()]
-        )
-        windows = windows[np.lexsort((windows[:, 0], windows[:, 1]))]
-        return cls(begin + np.arange(cells + 1) * ((end - begin) / cells), windows)
+        strides = np.exp2(np.floor(np.log2(np.maximum(lengths / options.parts, 1.0)))).astype(np.intp)
+        lengths = np.clip(np.round(lengths / strides).astype(np.intp) * strides, 1, cells)
+        found = [
+            np.stack([first, first + k], axis=1)
+            for k, stride in sorted(set(zip(lengths.tolist(), strides.tolist(), strict=True)))
+            for first in [np.arange(0, cells - k + 1, stride)]
+        ]
+        return cls(begin + np.arange(cells + 1) * ((end - begin) / cells), _in_order(np.concatenate(found)))
 
     @property
     def seconds(self) -> Array:
@@ -102,6 +104,12 @@ class Lattice:
         owner = np.full(len(chosen), stretch)
         values = sample(source, owner, self.edges[first], self.edges[last], length)
         return Windows(values, torch.from_numpy(source.seen[owner]))
+
+
+def _in_order(windows: Array) -> Array:
+    """Each once, by their last edge, then their first."""
+    windows = np.unique(windows, axis=0)
+    return np.asarray(windows[np.lexsort((windows[:, 0], windows[:, 1]))])
 
 
 def whole_scores(

@@ -65,7 +65,7 @@ def explain(
     stream = dataclasses.replace(stream, window=moment_window(stream.window, kept))
     durations = Durations.of(model, stream.window, 0.3 * stream.window, options)
     events = dataclasses.replace(model.options.events, step=min(model.options.events.step, stream.window / 4))
-    finer = dataclasses.replace(model, options=dataclasses.replace(model.options, events=events))
+    finer = model.with_options(dataclasses.replace(model.options, events=events))
     moments = scan(finer, clip, stream, None if progress is None else lambda share: progress(0.5 * share))
     stretches = _stretches(model, clip, moments, durations, stream, progress)
     wholes = level(np.concatenate([one.whole.ravel() for one in stretches]) if stretches else np.zeros(0))

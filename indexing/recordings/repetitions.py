@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from indexing.action.symmetry import mirror_permutation
 from indexing.clip import Clip
 from indexing.scoring import Event
-from indexing.windows import RepairOptions, ragged, sample, whole
+from indexing.windows import Ragged, RepairOptions, ragged, sample, whole
 
 Array = NDArray[Any]
 Unit = Literal["performance", "cycle"]
@@ -37,8 +37,19 @@ class RepetitionOptions:
     exemplars: int = 4
     """Exemplars that are asked, spread over those given."""
     deep: float = 0.55
-    """An exemplar repeats itself where its changes of pose come back to 1 - this correlation: actors' gait .1-.5 and jacks .02-.1,
+    """A movement repeats itself where its changes of pose come back to 1 - this correlation: actors' gait .1-.5 and jacks .02-.1,
     single movements mostly above .6."""
+    throughout: float = 0.75
+    """An exemplar is made of cycles where that holds everywhere, to 1 - this correlation over half a cycle: 97 % of 240 gaits and
+    jacks stay below .71; several punches or swings of a wave, with a beginning and an end, are above .82."""
+    again: float = 1.6
+    """Times the longest exemplar that a movement goes on without rest where what it repeats inside is counted, not itself."""
+    inside: float = 0.6
+    """Of the shortest exemplar: longest cycle that is counted then; punches in a row .4 and swings of a wave .25."""
+    calm: float = 0.35
+    """Of the usual speed of the joints (80 % of the time slower): slower than this is a rest between cycles."""
+    pause: float = 0.3
+    """Seconds that such a rest lasts at least."""
     shortest: float = 0.4
     """Seconds that a cycle lasts at least."""
     longest: float = 4.0
@@ -135,7 +146,9 @@ def count_repetitions(
         >>> found[0].count, found[0].unit
         (6, 'performance')
     """
-    found = []
+    if not events:
+        return []
+    found, repaired = [], _Repaired.of(clip)
     for label in dict.fromkeys(event.label for event in sorted(events, key=lambda event: event.start)):
         mine = sorted((event for event in events if event.label == label), key=lambda event: event.start)
         given = list(exemplars.get(label, ()))
@@ -152,9 +165,12 @@ def count_repetitions(
         )
         shown_clips = [given[i] for i in pick] or _own(clip, mine, options)
         pattern = _pattern(shown_clips, options)
+        spans = _spans(mine, events, options)
+        tracks = [_track(repaired, start, end, options) for start, end, _ in spans]
+        pattern = _unbroken(tracks, pattern, options)
         performances: list[Repetition] = []
-        for start, end, inside in _spans(mine, events, options):
-            performances += _counted(clip, start, end, inside, pattern, options)
+        for track, (_, _, inside) in zip(tracks, spans, strict=True):
+            performances += _counted(track, inside, pattern, options)
         found.append(RepetitionCount(label, tuple(performances), "cycle" if pattern.period else "performance"))
     return sorted(found, key=lambda one: one.performances[0].start if one.performances else np.inf)
 
@@ -210,11 +226,22 @@ class _Pattern(NamedTuple):
     period: float
 
 
-def _track(clip: Clip, start: float, end: float, options: RepetitionOptions) -> _RepeatedTrack:
-    source = ragged([clip], RepairOptions())
-    y = source.joints[:, source.seen[0], 1]
-    size = max(float(np.median(y.max(axis=1) - y.min(axis=1))), 1e-9) if y.shape[1] else 1.0
-    start, end = max(start, float(clip.times[0])), min(end, float(clip.times[-1]))
+class _Repaired(NamedTuple):
+    """A recording without what is missing or wrong, and how tall the person is in it: found once, however many spans it has."""
+
+    source: Ragged
+    size: float
+
+    @classmethod
+    def of(cls, clip: Clip) -> _Repaired:
+        source = ragged([clip], RepairOptions())
+        y = source.joints[:, source.seen[0], 1]
+        return cls(source, max(float(np.median(y.max(axis=1) - y.min(axis=1))), 1e-9) if y.shape[1] else 1.0)
+
+
+def _track(repaired: _Repaired, start: float, end: float, options: RepetitionOptions) -> _RepeatedTrack:
+    source, size = repaired
+    start, end = max(start, float(source.times[0])), min(end, float(source.times[-1]))
     count = max(1, round((end - start) * options.rate))
     x = sample(source, np.zeros(1, int), np.array([start]), np.array([end]), count)[0].double().numpy() / size
     x = x - x.mean(axis=1, keepdims=True)
@@ -232,13 +259,13 @@ def _moving(values: Array, options: RepetitionOptions) -> Array:
     return np.concatenate([values, options.lag * options.rate * np.gradient(values, axis=0)], axis=1)
 
 
-def _period(poses: Array, shortest: float, longest: float, options: RepetitionOptions) -> tuple[float, float]:
-    """Seconds after which changes of pose come back, and how far from it they remain (1 = they do not)."""
+def _period(poses: Array, shortest: float, longest: float, options: RepetitionOptions) -> tuple[float, float, float]:
+    """Seconds after which changes of pose come back, how far from it they remain (1 = they do not), and where it is worst."""
     count = len(poses)
     x = poses[4:] - poses[:-4] if count > 8 else poses[:0]
     low, high = round(shortest * options.rate), min(round(longest * options.rate), 2 * count // 3, len(x) - 2)
     if high <= low + 2:
-        return 0.0, 1.0
+        return 0.0, 1.0, 1.0
     energy = np.square(x).sum(axis=1)
     apart = np.array(
         [
@@ -248,20 +275,60 @@ def _period(poses: Array, shortest: float, longest: float, options: RepetitionOp
     )
     dips = [k for k in range(max(low, 1), high) if apart[k] <= apart[k - 1] and apart[k] < apart[k + 1]]
     if not dips:
-        return 0.0, 1.0
+        return 0.0, 1.0, 1.0
     level = max(1.3 * min(apart[k] for k in dips), options.deep / 2)
     best = next(k for k in dips if apart[k] <= level)
-    return best / options.rate, float(apart[best])
+    box, most = np.ones(min(max(1, best // 2), len(x) - best)), energy[best:] + energy[: len(x) - best]
+    worst = np.convolve(np.square(x[best:] - x[: len(x) - best]).sum(axis=1), box, "valid") / np.maximum(
+        np.convolve(most, box, "valid"), 1e-30
+    )
+    return best / options.rate, float(apart[best]), float(worst.max())
+
+
+def _still(track: _RepeatedTrack, options: RepetitionOptions) -> Array:
+    """``(F,)`` where the joints rest."""
+    wide = max(1, round(options.pause * options.rate))
+    if len(track.times) < 2 * wide:
+        return np.zeros(len(track.times), bool)
+    speed = np.sqrt(np.convolve(np.square(np.gradient(track.poses, axis=0)).sum(axis=1), np.ones(wide) / wide, "same"))
+    slow = speed < options.calm * np.quantile(speed, 0.8)
+    for first, end in _stretches(slow):
+        slow[first:end] = end - first >= wide
+    return slow
+
+
+def _stretches(on: Array) -> Array:
+    """``(n, 2)`` first sample, and the one after the last, of every run."""
+    return np.flatnonzero(np.diff(np.concatenate([[False], on, [False]]).astype(int))).reshape(-1, 2)
+
+
+def _liveliest(track: _RepeatedTrack, options: RepetitionOptions) -> slice:
+    """The longest part without a rest."""
+    parts = _stretches(~_still(track, options))
+    return slice(*parts[(parts[:, 1] - parts[:, 0]).argmax()]) if len(parts) else slice(0, len(track.times))
+
+
+def _unbroken(tracks: Sequence[_RepeatedTrack], pattern: _Pattern, options: RepetitionOptions) -> _Pattern:
+    """A movement that goes on for longer than its exemplars, because it repeats a part of them, is counted by that part."""
+    if pattern.period or not pattern.shown:
+        return pattern
+    lasts = [len(one.heights) / options.rate for one in pattern.shown]
+    part = max((track.poses[_liveliest(track, options)] for track in tracks), key=len)
+    if len(part) < options.again * max(lasts) * options.rate:
+        return pattern
+    seconds, depth, _ = _period(part, options.shortest, options.inside * min(lasts), options)
+    return _Pattern((), seconds) if depth <= options.deep else pattern
 
 
 def _pattern(shown: Sequence[Clip], options: RepetitionOptions) -> _Pattern:
     """What exemplars show, and whether they repeat it."""
     parts = []
     for clip in shown:
-        track = _track(clip, float(clip.times[0]), float(clip.times[-1]), options)
+        track = _track(_Repaired.of(clip), float(clip.times[0]), float(clip.times[-1]), options)
         source = ragged([clip])
         swap = mirror_permutation(clip.skeleton, whole(source, 12)) if clip.dims == 2 or clip.skeleton is not None else None
-        seconds, depth = _period(track.poses, options.shortest, options.longest, options)
+        seconds, depth, worst = _period(track.poses, options.shortest, options.longest, options)
+        depth = depth if worst <= options.throughout else 1.0
         parts.append((track.heights, None if swap is None else swap.numpy(), seconds, depth))
     sure = [seconds for _, _, seconds, depth in parts if depth <= options.deep]
     usual = float(np.median(sure)) if sure else 0.0
@@ -291,7 +358,7 @@ def _resampled(course: Array, m: int, turns: bool) -> Array:
 
 # ---- following a course through a recording ----------------------------------------------------------------------------
 def _costs(
-    x: Array, course: Array, turns: bool, level: float, left: Array | None, options: RepetitionOptions
+    x: Array, course: Array, turns: bool, level: float, left: Array | None, still: Array, options: RepetitionOptions
 ) -> tuple[Array, Array]:
     """``(F, m)`` cost of every sample at every place of the course, and ``(F,)`` at rest; joints count by what they tell."""
     spread = course.var(axis=0)
@@ -301,7 +368,9 @@ def _costs(
     a, b = x * scale, course * scale
     cost = np.maximum(np.square(a).sum(1)[:, None] + np.square(b).sum(1) - 2 * a @ b.T, 0)
     rest = np.full(len(x), level)
-    if not turns:
+    if turns:
+        cost[still], rest[still] = cost[still] + level, 0.0
+    else:
         pose = (b[0] + b[-1]) / 2
         pose[len(pose) // 2 :] = 0
         rest = np.minimum(rest, np.square(a - pose).sum(axis=1))
@@ -313,6 +382,7 @@ def _followed(cost: Array, rest: Array, turns: bool, options: RepetitionOptions)
     count, m = cost.shape
     begin = options.begin_cycle if turns else options.begin
     place, back = np.arange(m), np.zeros((count, m + 1), int)
+    before = np.stack([place, (place - 1) % m, (place - 2) % m, np.full(m, m)])
     total = np.append(cost[0] + begin if turns else np.full(m, np.inf), rest[0])
     total[0] = cost[0, 0] + begin
     for f in range(1, count):
@@ -325,7 +395,7 @@ def _followed(cost: Array, rest: Array, turns: bool, options: RepetitionOptions)
         else:
             ways[3, 0] = min(idle + begin, came[-1] + begin / 2)
         way = ways.argmin(axis=0)
-        source = np.select([way == 0, way == 1, way == 2], [place, (place - 1) % m, (place - 2) % m], m)
+        source = before[way, place]
         if not turns and way[0] == 3 and came[-1] + begin / 2 < idle + begin:
             source[0] = m - 1
         last = int(came.argmin()) if turns else m - 1 if came[-1] <= came[-2] + options.tempo else m - 2
@@ -340,9 +410,8 @@ def _followed(cost: Array, rest: Array, turns: bool, options: RepetitionOptions)
 
 def _runs(path: Array, m: int, turns: bool) -> list[tuple[int, Array]]:
     """First sample of every run, and its places: unwrapped phase where the course turns."""
-    out, active = [], path < m
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], active, [False]]).astype(int)))
-    for first, end in edges.reshape(-1, 2):
+    out = []
+    for first, end in _stretches(path < m):
         part = path[first:end]
         step = np.diff(part)
         if turns:
@@ -381,7 +450,8 @@ def _even(course: Array, path: Array, turns: bool, first: int, options: Repetiti
 
 def _beginnings(track: _RepeatedTrack, pattern: _Pattern, options: RepetitionOptions) -> list[tuple[float, Array, int]]:
     """Cost, path and length of the courses that fit best: exemplars, their mirror images, and the span's own cycle."""
-    x, turns, found = _moving(track.heights, options), pattern.period > 0, []
+    x, turns, still = _moving(track.heights, options), pattern.period > 0, _still(track, options)
+    found: list[tuple[float, Array, int]] = []
     for shown in pattern.shown:
         for heights in [shown.heights] if shown.swap is None else [shown.heights, shown.heights[:, shown.swap]]:
             tried = []
@@ -389,22 +459,23 @@ def _beginnings(track: _RepeatedTrack, pattern: _Pattern, options: RepetitionOpt
                 m = max(4, round(len(heights) * scale))
                 course = _resampled(heights, m, turns)
                 course = _moving(np.concatenate([course] * 3), options)[m : 2 * m] if turns else _moving(course, options)
-                tried.append((*_followed(*_costs(x, course, turns, options.first, None, options), turns, options), m))
+                tried.append((*_followed(*_costs(x, course, turns, options.first, None, still, options), turns, options), m))
             found.append(min(tried, key=lambda one: one[0]))
     found = sorted(found, key=lambda one: one[0])[: options.tried]
     if turns:
-        seconds, depth = _period(track.poses, max(0.3, pattern.period / 2), 2 * pattern.period, options)
+        part = _liveliest(track, options)
+        seconds, depth, _ = _period(track.poses[part], max(0.3, pattern.period / 2), 2 * pattern.period, options)
         if depth < 0.8:
             m = max(4, round(seconds * options.rate))
-            found.append((0.0, (np.arange(len(x)) / (seconds * options.rate) * m).astype(int) % m, m))
+            path = np.full(len(x), m)
+            path[part] = (np.arange(part.stop - part.start) / (seconds * options.rate) * m).astype(int) % m
+            found.append((0.0, path, m))
     return found
 
 
-def _counted(
-    clip: Clip, start: float, end: float, events: Sequence[Event], pattern: _Pattern, options: RepetitionOptions
-) -> list[Repetition]:
+def _counted(track: _RepeatedTrack, events: Sequence[Event], pattern: _Pattern, options: RepetitionOptions) -> list[Repetition]:
     """The repetitions in one span; its longest event where the movement tells nothing."""
-    track, turns = _track(clip, start, end, options), pattern.period > 0
+    turns, still = pattern.period > 0, _still(track, options)
     best: tuple[float, Array, int] | None = None
     if len(track.times) > 3:
         for _, begun, first in _beginnings(track, pattern, options):
@@ -418,7 +489,7 @@ def _counted(
                     left = np.square(x[on] - course[path[on]]).mean(axis=0)
                     course = _even(course, path, turns, first, options) if again else course
                     m = len(course)
-                    cost, path = _followed(*_costs(x, course, turns, options.unexplained, left, options), turns, options)
+                    cost, path = _followed(*_costs(x, course, turns, options.unexplained, left, still, options), turns, options)
                 if best is None or cost < best[0]:
                     best = (cost, path, m)
     parts: list[tuple[float, float]] = []

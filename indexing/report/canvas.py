@@ -220,8 +220,8 @@ def _paths(clip: Clip, places: NDArray[np.float64], seen: NDArray[np.bool_]) -> 
     """SVG path data by CSS class: left limbs, right limbs, the middle, and dots for joints without bones."""
     skeleton = clip.skeleton or known(clip.joints.shape[1])
     bones = skeleton.bones if skeleton is not None else ()
-    sides = [_side(name) for name in skeleton.joints] if skeleton is not None else []
-    face = [_words(name) & FACE != set() for name in skeleton.joints] if skeleton is not None else []
+    sides = [side_of(name) for name in skeleton.joints] if skeleton is not None else []
+    face = [words_of(name) & FACE != set() for name in skeleton.joints] if skeleton is not None else []
     lines: dict[str, list[str]] = {"m": [], "r": [], "l": [], "h": [], "d": []}
     for place, ok in zip(places, seen, strict=True):
         spot = [f"{x:.1f} {y:.1f}" if good else "" for (x, y), good in zip(place, ok, strict=True)]
@@ -248,14 +248,15 @@ def _head(place: NDArray[np.float64], ok: NDArray[np.bool_], face: list[bool], s
     return f"M{x - radius:.1f} {y:.1f}{arc}{2 * radius:.1f} 0{arc}{-2 * radius:.1f} 0"
 
 
-def _words(name: str) -> set[str]:
+def words_of(name: str) -> set[str]:
     """``{"left", "eye"}`` of ``left_eye``, ``LeftEye`` or ``left eye``."""
     return {word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])", name)}
 
 
-def _side(name: str) -> str:
-    words = _words(name)
-    return "l" if words & {"left", "l"} else "r" if words & {"right", "r"} else "m"
+def side_of(name: str) -> str:
+    """``"l"``, ``"r"`` or, in the middle, ``"m"``."""
+    found = words_of(name)
+    return "l" if found & {"left", "l"} else "r" if found & {"right", "r"} else "m"
 
 
 def _stray(values: NDArray[np.float64]) -> NDArray[np.bool_]:

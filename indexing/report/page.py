@@ -1,7 +1,7 @@
 """What all pages share: values put into the templates beside this file, so that each is one self-contained HTML file.
 
-Whatever a template is given is escaped.  No script runs on a page and nothing is loaded from outside; the content security policy
-in its head makes the browser enforce that.
+Whatever a template is given is escaped.  Nothing is loaded from outside, and no script runs but one of our own whose hash the page
+names (:class:`Script`); the content security policy in its head makes the browser enforce that.
 """
 
 from __future__ import annotations
@@ -74,6 +74,26 @@ class Picture:
         """CSS pixels of its width below which its small print is lost: wide pictures scroll rather than shrink to dust."""
         width = self.size[0]
         return min(width, 680) if width <= 1100 else round(0.85 * width)
+
+
+@dataclass(frozen=True)
+class Script:
+    """A script beside this file that a page holds, and the words of the policy that let it run, and it alone."""
+
+    name: str
+
+    @property
+    def text(self) -> Markup:
+        """The script as it stands in the page."""
+        from markupsafe import Markup
+
+        return Markup((Path(__file__).parent / self.name).read_text(encoding="utf-8"))
+
+    @property
+    def policy(self) -> str:
+        """What the content security policy says of it."""
+        digest = hashlib.sha256(self.text.encode("utf-8")).digest()
+        return f"; script-src 'sha256-{base64.b64encode(digest).decode('ascii')}'"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

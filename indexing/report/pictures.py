@@ -19,15 +19,27 @@ from indexing.report.page import Tip
 from indexing.report.results import ReportedEvent, Truth
 
 COLUMNS = 1400  # score values drawn along the time axis: about one per pixel
-# White text on these reads at 4.5:1 or better; any two are at least 13 apart in CIELAB, as are no more than about 18 such colours.
+# White text on these reads at 4.5:1 or better, and so does black text where the style sheet turns them for dark paper; any two are
+# 15 apart by CIEDE2000 or more on either paper.  Each is the one that is farthest from those before it.
 PALETTE = (
-    "#2a76aa", "#a84573", "#2f8253", "#6d5bb3", "#8a6d14", "#1d8079", "#b8433c", "#5d6f7c", "#64801f", "#8c5a3c", "#1f4a8c",
-    "#7a1f55", "#1d5a2c", "#9b3fb0", "#c2410c", "#6b1a1a", "#3c3f46", "#35277a",
+    "#0078b4", "#5a820a", "#820028", "#c85000", "#0a8278", "#785afa", "#464628", "#b45a6e", "#0a14d2", "#8c6e0a",
+    "#c832be", "#005a1e", "#8c6450", "#643200", "#785a82", "#144650", "#aa0a00", "#463c3c", "#6e7864", "#5a6478",
 )  # fmt: skip
 STEPS = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 14400)  # seconds between ticks
 FRAME = "#e8741e"  # around found actions: stands out from the heat colours of both themes
 WIDTH, ABOVE, BESIDE = 10.2, 0.12, 0.85  # inches: of a timeline, above its bars, and for the scale on its right
 Bar = tuple[str, float, float]  # label, start, end
+Span = tuple[float, float]
+
+
+def colours(names: Sequence[object]) -> dict[str, str]:
+    """A colour for each name; beyond as many as the palette has they come again.
+
+    Example:
+        >>> list(colours(["squat", "lunge", "squat"]))
+        ['squat', 'lunge']
+    """
+    return {name: PALETTE[i % len(PALETTE)] for i, name in enumerate(dict.fromkeys(map(str, names)))}
 
 
 @dataclass(frozen=True)
@@ -76,13 +88,18 @@ class _Layout:
 
 
 def _layout(
-    seconds: NDArray[np.float64], classes: Sequence[object], events: Sequence[ReportedEvent], truth: Sequence[Truth] | None
+    seconds: NDArray[np.float64],
+    classes: Sequence[object],
+    events: Sequence[ReportedEvent],
+    truth: Sequence[Truth] | None,
+    span: Span | None,
 ) -> _Layout:
     found = [(str(event.label), float(event.start), float(event.end)) for event in events]
     known = None if truth is None else [(str(label), float(start), float(end)) for label, start, end in truth]
     names = list(dict.fromkeys([str(name) for name in classes] + [bar[0] for bar in found + (known or [])]))
     spans = [("found", _lanes(found))] + ([] if known is None else [("known", _lanes(known))])
-    bounds = [float(seconds[0]), float(seconds[-1])] + [t for _, start, end in found + (known or []) for t in (start, end)]
+    bounds = [float(seconds[0]), float(seconds[-1]), *(span or ())]
+    bounds += [t for _, start, end in found + (known or []) for t in (start, end)]
     low, high = min(bounds), max(bounds)
     high = high if high > low else low + 1.0
     left = 0.45 + 0.075 * max([5] + [columns(name) for name in shorten_all(classes, 22)])
@@ -91,10 +108,14 @@ def _layout(
 
 
 def timeline_tips(
-    times: ArrayLike, classes: Sequence[object], events: Sequence[ReportedEvent] = (), truth: Sequence[Truth] | None = None
+    times: ArrayLike,
+    classes: Sequence[object],
+    events: Sequence[ReportedEvent] = (),
+    truth: Sequence[Truth] | None = None,
+    span: Span | None = None,
 ) -> list[Tip]:
     """What :func:`timeline` draws as bars, and where: for names that do not fit."""
-    at = _layout(np.asarray(times, dtype=np.float64), classes, events, truth)
+    at = _layout(np.asarray(times, dtype=np.float64), classes, events, truth, span)
     lanes = [(title, lane) for title, several in at.spans for lane in several]
     tips = []
     for row, (title, lane) in enumerate(lanes):
@@ -155,6 +176,7 @@ def timeline(
     classes: Sequence[object],
     events: Sequence[ReportedEvent] = (),
     truth: Sequence[Truth] | None = None,
+    span: Span | None = None,
 ) -> bytes:
     """PNG of scores over time: a heat row per class, found events as labelled bars above, the known ones below those.
 
@@ -164,6 +186,7 @@ def timeline(
         classes: ``C`` names.
         events: what was found.
         truth: ``(label, start, end)`` of what is known to have happened; ``None`` = not known.
+        span: seconds that are shown at least, so that the timelines of several people have one axis.
 
     Raises:
         ValueError: shapes do not fit.
@@ -171,9 +194,9 @@ def timeline(
     seconds, values = np.asarray(times, dtype=np.float64), np.asarray(scores, dtype=np.float64)
     if values.shape != (len(seconds), len(classes)) or not len(seconds):
         raise ValueError(f"scores must be (frames, classes) = ({len(seconds)}, {len(classes)}), not empty, got {values.shape}")
-    at = _layout(seconds, classes, events, truth)
+    at = _layout(seconds, classes, events, truth, span)
     height, low, high = at.height, at.low, at.high
-    view = _View(low, high, {name: PALETTE[i % len(PALETTE)] for i, name in enumerate(at.names)})
+    view = _View(low, high, colours(at.names))
     with style():
         figure = new_figure(WIDTH, height)
         box = (at.left / WIDTH, at.width / WIDTH)
@@ -222,7 +245,7 @@ def _draw_bars(axes: Any, spans: Sequence[tuple[str, list[list[Bar]]]], view: _V
                 axes.broken_barh(bars, (row - 0.4, 0.8), facecolor=view.colours[label], edgecolor=LIGHT.paper, linewidth=0.5)
                 for start, width in bars:
                     pixels = axes.bbox.width * width / (view.high - view.low)
-                    if pixels > 24:  # three letters and an ellipsis
+                    if pixels > 24:  # three letters
                         _write(axes, shorten(label, 22), start + width / 2, row, pixels)
             row += 1
     axes.set(xlim=(view.low, view.high), ylim=(row - 0.5, -0.5))
@@ -235,21 +258,14 @@ def _draw_bars(axes: Any, spans: Sequence[tuple[str, list[list[Bar]]]], view: _V
 
 
 def _write(axes: Any, text: str, x: float, y: float, room: float) -> None:
-    """Text centred in a bar of ``room`` pixels, in one line or two; cut, or left out, where it does not fit."""
+    """Text centred in a bar of ``room`` pixels, in one line or two; left out where it does not fit: its colour says it."""
     written = axes.text(
         x, y, text, color="#ffffff", fontsize=8, ha="center", va="center", parse_math=False, clip_on=True, linespacing=0.95
     )
     for several, size in ((text, 7), (_in_two(text), 6.5), (_in_two(text), 5.8)):
         if written.get_window_extent().width + 8 > room:
             written.set(text=several, fontsize=size)
-    if written.get_window_extent().width + 4 <= room:
-        return
-    written.set(text=text, fontsize=7)
-    keep = len(text)
-    while keep >= 3 and (need := written.get_window_extent().width + 6) > room:
-        keep = min(keep - 1, int(keep * room / need))
-        written.set_text(f"{text[:keep].rstrip()}…")
-    if keep < min(3, len(text)):
+    if written.get_window_extent().width + 4 > room:
         written.remove()
 
 
@@ -296,7 +312,8 @@ def _draw_scale(figure: Any, image: Any, box: tuple[float, float, float, float])
     bar = figure.colorbar(image, cax=axes)
     bar.outline.set_visible(False)
     low, high = image.get_clim()
-    bar.set_ticks([low, high], labels=[f"{low:.2g}", f"{high:.2g}"])
+    nearly = 1e-6 * (high - low)  # rounding, where the best score is 0
+    bar.set_ticks([low, high], labels=["0" if abs(value) < nearly else f"{value:.2g}" for value in (low, high)])
     axes.tick_params(length=0, labelsize=7.5)
     axes.set_title("score", fontsize=7.5, loc="left", pad=8)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numbers
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,24 +12,38 @@ from indexing import files
 from indexing.opening import count
 from indexing.report import pictures
 from indexing.report.canvas import letters_without_font, strip
-from indexing.report.page import Picture, bar, even, markup, render, table_csv, write_files
+from indexing.report.page import Picture, Script, bar, even, markup, render, table_csv, write_files
 from indexing.report.pictures import timeline_tips
-from indexing.report.results import RecognitionReport, RecordingResult, ReportedEvent, confused_with, measure, missed, overlapping
+from indexing.report.player import Player, players
+from indexing.report.results import (
+    RecognitionReport,
+    RecordingResult,
+    ReportedEvent,
+    by_recording,
+    confused_with,
+    measure,
+    missed,
+    overlapping,
+    seconds,
+)
+from indexing.report.tallies import MEANING, cell, count_row, held_rows, repetition_rows, repetitions_csv
 
-TIMELINES = 12  # recordings whose timeline is drawn
+TIMELINES = 12  # recordings, or people in them, whose timeline is drawn, and recordings that have a player
 STRIPS = 60  # events that are shown as stick figures, over all recordings
 TIPS = 2000  # bars of a timeline that say what they are when pointed at
 ROWS = 1000  # events that are listed, over all recordings
+PERFORMANCES = 400  # performances that are listed of a recording
 LOST = 12  # known actions that were not found and are listed
 NONE = "n/a"  # shown where a number does not exist
-OURS = r"confusion\.png|timeline(-\d+)?\.png|events\.csv"
+OURS = r"confusion\.png|timeline(-\d+)?\.png|events\.csv|repetitions\.csv"
 
 
 def write_recognition(folder: str | Path, report: RecognitionReport) -> Path:
     """Write a report into a folder: ``report.html`` and the numbers and pictures it shows, as files.
 
-    ``report.html`` (one file that needs no other), ``metrics.json``, ``manifest.json``; for recordings ``events.csv`` and
-    ``timeline.png`` (``timeline-2.png``... for further ones); for evaluations ``confusion.png``.  Every file is written whole
+    ``report.html`` (one file that needs no other), ``metrics.json``, ``manifest.json``; for recordings ``events.csv``,
+    ``repetitions.csv`` where performances were counted, and ``timeline.png`` (``timeline-2.png``... for further ones, and for
+    further people); for evaluations ``confusion.png``.  Every file is written whole
     or not at all, ``report.html`` last.  What an earlier report left in the folder and this one does not have is removed.
 
     Returns:
@@ -49,17 +62,7 @@ def write_recognition(folder: str | Path, report: RecognitionReport) -> Path:
     """
     where = files.prepare(folder)
     measured = measure(report)
-    drawn: dict[str, bytes] = {}
-    shown, before = [], 0
-    for index, recording in enumerate(report.recordings):
-        picture = None
-        if index < TIMELINES:
-            at = (recording.times, recording.scores, recording.classes, recording.events, recording.truth)
-            drawn[timeline_name(index)] = pictures.timeline(*at)
-            tips = timeline_tips(recording.times, recording.classes, recording.events, recording.truth)
-            picture = Picture(drawn[timeline_name(index)], tips=tips[:TIPS])
-        shown.append({**of_recording(report, recording, before), "picture": picture})
-        before += len(recording.events)
+    shown, drawn = of_recordings(report)
     notes = [("", "", note) for note in report.notes]
     values: dict[str, Any] = {
         "shown": shown,
@@ -67,6 +70,7 @@ def write_recognition(folder: str | Path, report: RecognitionReport) -> Path:
         "notes": notes,
         "percent": percent,
         "duration": duration,
+        "script": Script("player.js") if any(one["player"] is not None for one in shown) else None,
     }
     if report.evaluations:
         drawn["confusion.png"] = pictures.confusion(measured["confusion"]["counts"], measured["confusion"]["labels"])
@@ -74,6 +78,8 @@ def write_recognition(folder: str | Path, report: RecognitionReport) -> Path:
     summary = report.summary or describe(report, measured)
     html = render("recognition", report, summary=summary, measured=measured, TIMELINES=TIMELINES, STRIPS=STRIPS, **values)
     contents: dict[str, Any] = {**drawn, **({"events.csv": events_csv(report.recordings)} if report.recordings else {})}
+    if any(recording.repetitions is not None for recording in report.recordings):
+        contents["repetitions.csv"] = repetitions_csv(report.recordings)
     names = sorted([*contents, "metrics.json", files.MANIFEST, "report.html"])
     files.remove_stale(where, names, OURS)
     contents |= {"metrics.json": measured, files.MANIFEST: {**report.manifest, "files": names}, "report.html": html}
@@ -86,16 +92,22 @@ def describe(report: RecognitionReport, measured: Mapping[str, Any]) -> str:
     if report.recordings:
         where = f"{count(measured['recordings'], 'recording')} ({duration(measured['seconds'])} in all)"
         kinds = measured["events_by_class"]
+        who = f" of {count(measured['people'], 'person', 'people')}" if measured["people"] else ""
         if not measured["events"]:
-            words.append(f"No action was found in {where}.")
+            words.append(f"No action{who} was found in {where}.")
         else:
             most, *others = kinds  # most frequent first
             often = f", most often {most} ({kinds[most]} times)" if others and kinds[most] > kinds[others[0]] else ""
             were = "was" if measured["events"] == 1 else "were"
-            words.append(f"{count(measured['events'], 'action')} of {count(len(kinds), 'kind')} {were} found in {where}{often}.")
+            words.append(
+                f"{count(measured['events'], 'action')} of {count(len(kinds), 'kind')}{who} {were} found in {where}{often}."
+            )
         if measured.get("known_events"):
             got = measured["known_events"] - measured["missed_events"]
             words.append(f"Of {count(measured['known_events'], 'known action')}, {got} overlap a find of the same name.")
+        if measured["withheld"]:
+            reasons = ", ".join(f"{number:,} {reason}" for reason, number in measured["withheld"].items())
+            words.append(f"Held back: {reasons}.")
     if report.evaluations:
         by_setting = measured["accuracy_by_setting"]
         right = round(measured["accuracy"] * measured["clips"])
@@ -122,25 +134,83 @@ def headline(report: RecognitionReport, measured: Mapping[str, Any]) -> list[tup
             ("Mean F1", f"{measured['macro_f1']:.2f}", "over actions; 1 is perfect"),
         ]
     if report.recordings:
-        kinds = f"of {count(len(measured['events_by_class']), 'kind')}"
-        if "false_events" in measured:
-            kinds += f"; {measured['false_events']:,} of them false: something else, or nothing known there"
-        items.append(("Actions found", f"{measured['events']:,}", kinds))
-        if measured.get("known_events"):
-            got = measured["known_events"] - measured["missed_events"]
-            items.append(("Known actions hit", f"{got} of {measured['known_events']}", "overlap a find of the same name"))
-            every = percent(measured["frame_agreement"])
-            note = f"in known actions, by the best score; {every} of all frames, by what was reported"
-            items.append(("Frames right", percent(measured["frame_accuracy"]), note))
-        items.append(("Searched", duration(measured["seconds"]), f"in {count(measured['recordings'], 'recording')}"))
+        items += _of_search(measured)
     for name, value in report.metrics.items():
         if isinstance(value, (int, float, str, np.number, np.bool_)) and measured.get(name) is value:
             items.append((str(name).replace("_", " ").capitalize(), value if isinstance(value, str) else _plain(value), ""))
     return items
 
 
+def _of_search(measured: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    """Headline numbers of recordings: what was reported, and how much of it is right; else who, and how often."""
+    kinds = f"of {count(len(measured['events_by_class']), 'kind')}"
+    if "false_events" in measured:
+        kinds += f"; {measured['false_events']:,} of them false: something else, or nothing known there"
+    items = [("Actions reported", f"{measured['events']:,}", kinds)]
+    if measured.get("known_events"):
+        right, reported, happened = measured["right_events"], measured["compared_events"], measured["known_events"]
+        like = "share half of their time, or more, with a known action of their name"
+        if reported:
+            items.append(("Precision", percent(measured["precision"]), f"{right} of {reported} reported {like}"))
+        items.append(("Recall", percent(measured["recall"]), f"{right} of {happened} known actions are reported so"))
+        items.append(("Frames right", percent(measured["frame_agreement"]), "of all, by what was reported: the action, or none"))
+    if "repetitions" in measured:
+        often = sorted(measured["repetitions"].items(), key=lambda item: -item[1])
+        shown = often if len(often) < 5 else often[:3]
+        each = ", ".join(f"{number:,} {label}" for label, number in shown)
+        note = each + f", and of {len(often) - 3} more" * (len(shown) < len(often)) or "nothing was performed"
+        items.append(("Performances", f"{sum(measured['repetitions'].values()):,}", note))
+    if measured["people"]:
+        items.append(("People", f"{measured['people']:,}", "each searched by itself"))
+    items.append(("Searched", duration(measured["seconds"]), f"in {count(measured['recordings'], 'recording')}"))
+    return items
+
+
+def of_recordings(report: RecognitionReport) -> tuple[list[dict[str, Any]], dict[str, bytes]]:
+    """What the page says of each recording, person by person, and the timelines as files."""
+    groups = by_recording(report.recordings)
+    play: list[Player | None] = [*players(groups[:TIMELINES], report), *[None] * len(groups[TIMELINES:])]
+    shown: list[dict[str, Any]] = []
+    drawn: dict[str, bytes] = {}
+    index = before = 0
+    for people, player in zip(groups, play, strict=True):
+        lanes = []
+        span = (float(min(one.times[0] for one in people)), float(max(one.times[-1] for one in people)))
+        for recording in people:
+            picture = None
+            if index < TIMELINES:
+                at = (recording.classes, recording.events, recording.truth, span)
+                drawn[timeline_name(index)] = pictures.timeline(recording.times, recording.scores, *at)
+                tips = timeline_tips(recording.times, *at)
+                picture = Picture(drawn[timeline_name(index)], tips=tips[:TIPS])
+            lanes.append({**of_recording(report, recording, before), "picture": picture})
+            before += len(recording.events)
+            index += 1
+        shown.append({
+            "name": people[0].name or "Recording", "lanes": lanes, "player": player, "seconds": seconds(people),
+            "events": sum(len(one.events) for one in people), "held": held_rows(people), "meaning": MEANING, **counting(people),
+        })  # fmt: skip
+    return shown, drawn
+
+
+def counting(people: Sequence[RecordingResult]) -> dict[str, Any]:
+    """The tables of how often each action was performed, and of each performance; ``counted`` is false where nobody counted."""
+    several = any(one.person for one in people)
+    counts: list[list[Any]] = []
+    performances: list[list[Any]] = []
+    for one in people:
+        for each in one.repetitions or ():
+            head = [each.label, *[one.person] * several]
+            counts.append([*head, *(text or none("none") for text in count_row(each)[1:])])
+            performances += [[*head, *(text or none("none") for text in row)] for row in repetition_rows(each)]
+    return {
+        "counted": any(one.repetitions is not None for one in people), "several": several, "counts": counts,
+        "performances": performances[:PERFORMANCES], "uncounted": max(0, len(performances) - PERFORMANCES),
+    }  # fmt: skip
+
+
 def of_recording(report: RecognitionReport, recording: RecordingResult, before: int) -> dict[str, Any]:
-    """What the page says of one recording.
+    """What the page says of one person in a recording.
 
     Args:
         before: how many events the recordings before it have: so many are listed, and drawn, over all.
@@ -154,13 +224,8 @@ def of_recording(report: RecognitionReport, recording: RecordingResult, before: 
         rows.append([event.label, _when(event), score, margin])
         if recording.truth is not None:
             rows[-1].append(_verdict(event, overlapping(event, recording.truth)))
-        if number < draw and recording.clip is not None:
-            alt = f"Key frames of {event.label} found at {event.start:.1f} to {event.end:.1f} s"
-            rows[-1].append(strip(recording.clip, event.start, event.end, alt=alt) or none("no joint seen"))
-            if report.exemplars:
-                clip = report.exemplar(event)
-                example = strip(clip, alt=f"Key frames of the example of {event.label}") if clip is not None else ""
-                rows[-1].append(example or none("not given"))
+        if number < draw:
+            rows[-1] += _drawn(report, recording, event)
     lost = missed(recording)
     more = f"; and {len(lost) - LOST} more" if len(lost) > LOST else ""
     return {
@@ -169,6 +234,18 @@ def of_recording(report: RecognitionReport, recording: RecordingResult, before: 
         "boxes": letters_without_font([*recording.classes, *(event.label for event in events)])[:12],
         "lost": "; ".join(f"{label} {start:.1f} to {end:.1f} s" for label, start, end in lost[:LOST]) + more,
     }  # fmt: skip
+
+
+def _drawn(report: RecognitionReport, recording: RecordingResult, event: ReportedEvent) -> list[Any]:
+    """An event's cells with key frames: its own, and those of its example."""
+    assert recording.clip is not None  # else nothing is drawn
+    alt = f"Key frames of {event.label} found at {event.start:.1f} to {event.end:.1f} s"
+    cells = [strip(recording.clip, event.start, event.end, alt=alt) or none("no joint seen")]
+    if report.exemplars:
+        clip = report.exemplar(event)
+        example = strip(clip, alt=f"Key frames of the example of {event.label}") if clip is not None else ""
+        cells.append(example or none("not given"))
+    return cells
 
 
 def none(text: str) -> Any:
@@ -246,26 +323,17 @@ def timeline_name(index: int) -> str:
 
 
 def events_csv(recordings: Sequence[RecordingResult]) -> str:
-    """All events as CSV: ``file,label,start,end,score,margin``; seconds with 3 decimals, an empty cell for no number."""
+    """All events as CSV: ``file,label,start,end,score,margin,person``; seconds with 3 decimals, an empty cell for no number and for
+    whoever is alone."""
     rows = [
         [
-            _cell(recording.name),
-            _cell(event.label),
-            f"{event.start:.3f}",
-            f"{event.end:.3f}",
-            *map(_number, (event.score, event.margin)),
+            cell(recording.name), cell(event.label), f"{event.start:.3f}", f"{event.end:.3f}",
+            *map(_number, (event.score, event.margin)), cell(recording.person),
         ]
         for recording in recordings
         for event in sorted(recording.events, key=lambda event: event.start)
-    ]
-    return table_csv(["file", "label", "start", "end", "score", "margin"], rows)
-
-
-def _cell(value: object) -> str:
-    """A name as a cell.  Spreadsheets run text that begins like a formula; an apostrophe keeps it text.  Numbers stay numbers."""
-    text = str(value)
-    is_number = isinstance(value, numbers.Number)
-    return f"'{text}" if not is_number and text.lstrip(" ")[:1] in tuple("=+-@\t\r\n") else text
+    ]  # fmt: skip
+    return table_csv(["file", "label", "start", "end", "score", "margin", "person"], rows)
 
 
 def _number(value: float) -> str:

@@ -7,14 +7,19 @@ import warnings
 from collections import Counter
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from indexing.clip import Clip
 
+if TYPE_CHECKING:
+    from indexing.recordings.explanation import Withheld
+    from indexing.recordings.repetitions import RepetitionCount
+
 Truth = tuple[Hashable, float, float]
+OVERLAP = 0.5  # of the time of both together that a right event shares with a known action, as benchmarks of detection ask
 
 
 class ReportedEvent(Protocol):
@@ -34,16 +39,19 @@ class ReportedEvent(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class RecordingResult:
-    """What was found in one recording.
+    """What was found in one recording, or of one person in a recording of several.
 
     Args:
-        name: usually the file's name.
+        name: usually the file's name; results of one name with a ``person`` are of one recording.
         clip: the recording's joints, for the pictures; ``None`` where there are none (video).
         times: ``(F,)`` seconds, increasing.
         classes: ``C`` labels.
         scores: ``(F, C)`` higher is better; NaN = no score.
         events: what was found.
         truth: ``(label, start, end)`` of what is known to have happened; ``None`` = not known, ``[]`` = nothing happened.
+        person: who of several; empty where one is alone.
+        withheld: what looked like an action and was not reported, and why.
+        repetitions: how often each action was performed; ``None`` = not counted.
 
     Raises:
         ValueError: shapes do not fit, or an interval ends before it starts.
@@ -56,15 +64,19 @@ class RecordingResult:
     scores: NDArray[np.floating[Any]]
     events: Sequence[ReportedEvent] = ()
     truth: Sequence[Truth] | None = None
+    person: str = ""
+    withheld: Sequence[Withheld] = ()
+    repetitions: Sequence[RepetitionCount] | None = None
 
     def __post_init__(self) -> None:
-        who = f"recording {self.name!r}"
+        who = f"recording {self.name!r}" + f", person {self.person}" * bool(self.person)
         times, scores = np.asarray(self.times, dtype=np.float64), np.asarray(self.scores, dtype=np.float64)
         if times.ndim != 1 or not len(times) or not np.isfinite(times).all() or (np.diff(times) < 0).any():
             raise ValueError(f"{who}: times must be (frames,) increasing finite seconds, at least one, got shape {times.shape}")
         if scores.shape != (len(times), len(self.classes)):
             raise ValueError(f"{who}: scores must be (frames, classes) = ({len(times)}, {len(self.classes)}), got {scores.shape}")
-        spans = [(event.label, event.start, event.end) for event in self.events] + list(self.truth or ())
+        events = [*self.events, *(one.event for one in self.withheld)]
+        spans = [(event.label, event.start, event.end) for event in events] + list(self.truth or ())
         for label, start, end in spans:
             if not (np.isfinite(start) and np.isfinite(end) and start <= end):
                 raise ValueError(f"{who}: {label!r} from {start} s to {end} s is no interval; give seconds, start first")
@@ -155,8 +167,10 @@ def measure(report: RecognitionReport) -> dict[str, Any]:
     Returns:
         the report's own ``metrics``, and
         for evaluations ``clips, accuracy, accuracy_interval, macro_f1, accuracy_by_setting, per_class, confusion``;
-        for recordings ``recordings, seconds, events, events_by_class``, and where some are known ``known_events, missed_events,
-        false_events`` (finds of which nothing of their name is known there), ``frame_accuracy, frame_agreement``.
+        for recordings ``recordings, people, seconds, events, events_by_class, withheld`` (by reason), ``repetitions`` (by action,
+        where they were counted), and where some actions are known ``known_events, missed_events, false_events`` (finds of which
+        nothing of their name is known there), ``right_events, precision, recall`` (see :func:`matched`), ``frame_accuracy,
+        frame_agreement``.
     """
     out = dict(report.metrics)
     if report.notes:
@@ -286,24 +300,86 @@ def confused_with(confusion: Mapping[str, Any], label: str) -> tuple[str, int] |
     return row.most_common(1)[0] if row else None
 
 
+def matched(recording: RecordingResult) -> int:
+    r"""How many events are right: each of a known action of its own, of the same name, with which it shares enough of the time,
+
+    .. math:: \frac{|event \cap known|}{|event \cup known|} \ge \tfrac12 .
+
+    Pairs are taken in order of what they share, so no known action makes two events right.
+
+    Example:
+        >>> from indexing.scoring import Event
+        >>> halves = [Event("squat", 0.0, 1.1, 1.0, 1.0), Event("squat", 1.1, 2.0, 1.0, 1.0)]
+        >>> matched(RecordingResult("a", None, np.arange(3.0), ["squat"], np.zeros((3, 1)), halves, [("squat", 0.0, 2.0)]))
+        1
+    """
+    pairs = []
+    for i, event in enumerate(recording.events):
+        for j, (label, start, end) in enumerate(recording.truth or ()):
+            shared = min(event.end, end) - max(event.start, start)
+            if str(label) == str(event.label) and shared > 0:
+                pairs.append((shared / (max(event.end, end) - min(event.start, start)), i, j))
+    used: set[tuple[str, int]] = set()
+    for share, i, j in sorted(pairs, reverse=True):
+        if share >= OVERLAP and not {("event", i), ("known", j)} & used:
+            used |= {("event", i), ("known", j)}
+    return len(used) // 2
+
+
+def by_recording(recordings: Sequence[RecordingResult]) -> list[list[RecordingResult]]:
+    """Results person by person, put together where they are of one recording."""
+    out: list[list[RecordingResult]] = []
+    for one in recordings:
+        if out and one.person and out[-1][0].person and out[-1][0].name == one.name:
+            out[-1].append(one)
+        else:
+            out.append([one])
+    return out
+
+
+def seconds(people: Sequence[RecordingResult]) -> float:
+    """From the first frame of a recording, of whomever it shows, to the last."""
+    return float(max(one.times[-1] for one in people) - min(one.times[0] for one in people))
+
+
 def _search(recordings: Sequence[RecordingResult]) -> dict[str, Any]:
     events = Counter(str(event.label) for recording in recordings for event in recording.events)
+    groups = by_recording(recordings)
     out: dict[str, Any] = {
-        "recordings": len(recordings),
-        "seconds": float(sum(recording.duration for recording in recordings)),
+        "recordings": len(groups),
+        "people": sum(bool(recording.person) for recording in recordings),
+        "seconds": float(sum(map(seconds, groups))),
         "events": sum(events.values()),
         "events_by_class": dict(events.most_common()),
+        "withheld": dict(Counter(one.reason for recording in recordings for one in recording.withheld)),
     }
+    counted = [recording.repetitions for recording in recordings if recording.repetitions is not None]
+    if counted:
+        numbers: Counter[str] = Counter()
+        for counts in counted:
+            numbers.update({str(one.label): one.count for one in counts})
+        out["repetitions"] = dict(numbers)
     known = [recording for recording in recordings if recording.truth is not None]
-    if known:
-        out["known_events"] = sum(len(recording.truth or ()) for recording in known)
-        out["false_events"] = sum(
+    return out | (_against_known(known) if known else {})
+
+
+def _against_known(known: Sequence[RecordingResult]) -> dict[str, Any]:
+    """How what was reported compares with what is known, over the recordings of which something is."""
+    reported, happened = sum(len(recording.events) for recording in known), sum(len(recording.truth or ()) for recording in known)
+    right = sum(map(matched, known))
+    inside = np.array([(_known_frames(recording) != "").sum() for recording in known], dtype=float)
+    shares = np.array([frame_accuracy(recording) for recording in known])
+    frames = [len(recording.times) for recording in known]
+    return {
+        "known_events": happened,
+        "compared_events": reported,
+        "false_events": sum(
             overlapping(event, recording.truth or ()) != str(event.label) for recording in known for event in recording.events
-        )
-        out["missed_events"] = sum(len(missed(recording)) for recording in known)
-        inside = np.array([(_known_frames(recording) != "").sum() for recording in known], dtype=float)
-        shares = np.array([frame_accuracy(recording) for recording in known])
-        out["frame_accuracy"] = float(np.nansum(shares * inside) / inside.sum()) if inside.any() else math.nan
-        frames = [len(recording.times) for recording in known]
-        out["frame_agreement"] = float(np.average([frame_agreement(recording) for recording in known], weights=frames))
-    return out
+        ),
+        "missed_events": sum(len(missed(recording)) for recording in known),
+        "right_events": right,
+        "precision": right / reported if reported else math.nan,
+        "recall": right / happened if happened else math.nan,
+        "frame_accuracy": float(np.nansum(shares * inside) / inside.sum()) if inside.any() else math.nan,
+        "frame_agreement": float(np.average([frame_agreement(recording) for recording in known], weights=frames)),
+    }

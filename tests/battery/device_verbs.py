@@ -501,6 +501,7 @@ NOT_VERBS = {
         ("Message", "Notice", "NoticeCode", "Outcome", "named", "worded", "as_python", "status_from"), "what results say"
     ),
     "check_options": "looks at no tensor",
+    "map_blocks": "computes nothing by itself",
     **dict.fromkeys(("BodyModel", "LineStatus", "Status", "Motion", "Polynomial", "Fourier", "Invariant"), "names and numbers"),
     **dict.fromkeys(
         (

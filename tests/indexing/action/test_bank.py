@@ -1,14 +1,35 @@
 """Shapes: channels, the joint metric, all-pairs residuals and kernels, and the kernel machine, against slow references."""
 
+import copy
+import dataclasses
+import pickle
+
 import numpy as np
 import pytest
 import torch
 from sklearn.svm import SVC
 
-from dyntorch.numerics import canonical_correlation
-from indexing.action.bank import CHANNELS, EPSILON, JointMetric, Kernels, Windows, channel, fused_residual, order_free
-from indexing.action.model import PairwiseMachine
+from dyntorch.numerics import canonical_correlation, orthonormal_basis
+from indexing import ActionIndexer
+from indexing.action.bank import (
+    CHANNELS,
+    EPSILON,
+    Bank,
+    Copy,
+    JointMetric,
+    Kernels,
+    Windows,
+    channel,
+    fused_residual,
+    fused_residuals,
+    fusion,
+    order_free,
+    planes_of,
+)
+from indexing.action.joint_weights import JointWeights
+from indexing.action.model import MOMENT_TERMS, PairwiseMachine, mirror_some
 from indexing.action.options import MachineOptions
+from indexing.action.planes import entries, epipolar_correlation, factorize
 from indexing.action.symmetry import mirror, turn
 
 LENGTH, JOINTS = 8, 6
@@ -109,14 +130,15 @@ def slow_residual(query, exemplar, metric, channels, terms, weights):
                 u, v = (torch.linalg.svd(x, full_matrices=False).U for x in (a, b))
                 r = 1 - torch.linalg.svdvals(u.mT @ v)[0]
             else:
-                a1, b1 = (a[:, 1], b[:, 1]) if term == "up" else (a.flatten(), b.flatten())
-                r = 1 - (a1 @ b1) / (a1.norm() * b1.norm())
+                across, heights = (a[:, 0] @ b[:, 0], a[:, 1] @ b[:, 1])
+                across = across.abs() if term == "turned" else across
+                r = 1 - (across + heights) / (a.norm() * b.norm())
             total += float(weights[i]) * float(torch.log(r + EPSILON))
     return total
 
 
 @pytest.mark.parametrize("holes", [False, True])
-@pytest.mark.parametrize("terms", [("epi",), ("epi", "up", "nn")])
+@pytest.mark.parametrize("terms", [("epi",), ("epi", "turned", "nn")])
 @pytest.mark.parametrize("weights", [None, (0.5, 1.0, 2.0)])
 def test_fused_residual_against_singular_values(holes, terms, weights):
     query, bank, second = random_windows(5, 7, holes), random_windows(7, 8, holes), random_windows(7, 9)
@@ -159,6 +181,146 @@ def test_pairs_with_too_few_common_joints_get_the_worst_residual(common):
     assert got == pytest.approx(3 * np.log(1 + EPSILON), abs=1e-3)
 
 
+@pytest.mark.parametrize("count", [3, 20])
+def test_planes_against_the_bases_of_the_library(count):
+    left, right = (random(n, 2, 24, seed=21 + n) for n in (count, 7))
+    (u, own), (v, other) = factorize(left), factorize(right)
+    c = entries(u, v)
+    bases = [orthonormal_basis(x.mT.double()) for x in (left, right)]
+    torch.testing.assert_close(torch.stack(c), torch.einsum("qri,erj->ijqe", *bases).flatten(0, 1).float(), atol=2e-5, rtol=0)
+    torch.testing.assert_close(epipolar_correlation(c).double(), canonical_correlation(*bases), atol=1e-5, rtol=0)
+    for x, basis, factor in ((left, u, own), (right, v, other)):
+        zero = torch.zeros(len(x))
+        triangle = torch.stack([factor[:, 0], zero, factor[:, 1], factor[:, 2]], dim=1).unflatten(1, (2, 2))
+        torch.testing.assert_close(triangle @ basis, x / x.flatten(1).norm(dim=1)[:, None, None], atol=1e-5, rtol=0)
+
+
+def test_planes_of_nothing_and_of_lines_are_no_numbers_gone_wrong():
+    line = random(1, 1, 24, seed=22)
+    images = torch.cat([torch.zeros(1, 2, 24), torch.cat([line, 2 * line], dim=1), torch.full((1, 2, 24), torch.nan)])
+    basis, factor = factorize(images)
+    assert basis.isfinite().all() and factor.isfinite().all()
+    assert not basis[[0, 2]].any() and float(basis.abs().max()) <= 1
+
+
+# ---- exemplars described once ------------------------------------------------------------------------------------------
+SWAP = torch.tensor([0, 2, 1, 3, 5, 4])
+
+
+def test_a_bank_is_the_least_over_its_copies_and_their_mirror_images():
+    query, bank = random_windows(6, 23, holes=True), random_windows(8, 24, holes=True)
+    metric, mirrored = metric_of(bank), torch.tensor([True, False] * 4)
+    kept = Bank([Copy(bank), Copy(bank, mirrored.nonzero()[:, 0], SWAP)], planes_of(metric))
+    found = fused_residuals(query, [kept], [fusion(("epi",)), fusion(("turned",)), fusion(MOMENT_TERMS)])
+    for terms, table in zip((("epi",), ("turned",), MOMENT_TERMS), found, strict=True):
+        expected = fused_residual(query, [bank, mirror_some(bank, SWAP, mirrored)], metric, terms=terms)
+        torch.testing.assert_close(table, expected, atol=1e-4, rtol=0)
+    chosen = torch.tensor([1, 2, 6])
+    for table, part in zip(found, fused_residuals(query, [kept], [fusion(("epi",)), fusion(("turned",))], chosen), strict=False):
+        torch.testing.assert_close(part, table[:, chosen], atol=1e-4, rtol=0)
+
+
+def test_each_class_keeps_its_own_weights():
+    query, bank = random_windows(5, 25), random_windows(6, 26, holes=True)
+    metric, labels = metric_of(bank), torch.tensor([0, 1, 2, 0, 1, 2])
+    weights = JointWeights(random(3, JOINTS, seed=27).exp(), torch.tensor([0.5, 1.0, 1.5]), random(3, JOINTS, seed=28).exp())
+    (banks,) = weights.banks([[Copy(bank), Copy(bank, torch.arange(3), SWAP)]], metric, labels)
+    (found,) = fused_residuals(query, banks, [weights.fusion])
+    expected = weights.residual(query, [bank, mirror_some(bank, SWAP, torch.arange(6) < 3)], metric, labels)
+    torch.testing.assert_close(found, expected, atol=1e-4, rtol=0)
+
+
+def counted(metric):
+    """A describer that says how many windows it described."""
+    seen, planes = [], planes_of(metric)
+
+    def among(joints):
+        describe = planes(joints)
+        return lambda values: (seen.append(len(values)), describe(values))[1]
+
+    return seen, among
+
+
+def test_exemplars_are_described_once_for_every_set_of_joints(monkeypatch):
+    bank, first, second = random_windows(9, 29), random_windows(2, 30), random_windows(3, 31)
+    second.seen[:, 2] = False
+    described, describer = counted(metric_of(bank))
+    kept = Bank([Copy(bank), Copy(bank, torch.arange(4), SWAP)], describer)
+    answers = [fused_residuals(query, [kept], [fusion(("epi",))])[0] for query in (first, second, first, second)]
+    assert described == [9, 4, 2, 9, 4, 3, 2, 3]
+    torch.testing.assert_close(answers[2:], answers[:2], atol=1e-4, rtol=0)
+    monkeypatch.setattr("indexing.action.bank.KEPT_BLOCK", 0)  # the set of joints used last stays in any case
+    described.clear()
+    for query in (first, first, second, first):
+        fused_residuals(query, [kept], [fusion(("epi",))])
+    assert described == [2, 2, 9, 4, 3, 9, 4, 2]
+
+
+def test_queries_of_any_number_are_compared_alike():
+    bank, query = random_windows(7, 32), random_windows(300, 33)
+    metric = metric_of(bank)
+    whole = fused_residual(query, [bank], metric)
+    alone = torch.cat([fused_residual(query[at : at + 1], [bank], metric) for at in (0, 128, 299)])
+    torch.testing.assert_close(alone, whole[[0, 128, 299]], atol=1e-4, rtol=0)
+    assert fused_residual(query[:0], [bank], metric).shape == (0, 7)
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    rng = np.random.default_rng(34)
+    body, waves = rng.normal(size=(JOINTS, 2)), np.sin(np.linspace(0, 6, 20))[:, None, None]
+    styles = rng.normal(size=(3, JOINTS, 2))
+    labels = np.repeat(np.arange(3), 4)
+    clips = [body + waves * styles[label] + 0.05 * rng.normal(size=(20, JOINTS, 2)) for label in labels]
+    indexer = ActionIndexer(length=LENGTH).fit(clips, labels)
+    symmetric = dataclasses.replace(indexer.model_, symmetry=SWAP, mirrored=torch.from_numpy(labels != 1))
+    return indexer, symmetric, clips
+
+
+def slow_residuals(model, query, crops, chosen):
+    copies = [windows for i in range(crops) for windows in (model.exemplars.crop(i),)]
+    copies += [mirror_some(windows, model.symmetry, model.mirrored) for windows in copies]
+    copies = [windows[chosen] for windows in copies]
+    epipolar = model.parts.residual(query, copies, model.metric, model.labels[chosen])
+    turned = fused_residual(query, copies, model.metric, terms=("turned",))
+    return epipolar + model.options.nearest.turned * turned - model.hub[chosen]
+
+
+@pytest.mark.parametrize("learned", [False, True])
+def test_a_model_scores_as_if_it_kept_nothing(fitted, learned):
+    _, model, _ = fitted
+    query = random_windows(5, 35, holes=True)
+    if learned:
+        model = dataclasses.replace(model, parts=JointWeights(random(3, JOINTS, seed=36).exp(), torch.tensor([0.5, 1.0, 1.5])))
+    every, some = torch.arange(12), torch.tensor([0, 3, 4, 9])
+    for _ in range(2):
+        crops = len(model.exemplars.crops) // len(model.exemplars)
+        torch.testing.assert_close(model.residuals(query), slow_residuals(model, query, crops, every), atol=1e-4, rtol=0)
+        torch.testing.assert_close(model.whole_residuals(query, some), slow_residuals(model, query, 1, some), atol=1e-4, rtol=0)
+        moments = model.exemplars.moments
+        copies = [moments, mirror_some(moments, SWAP, model.mirrored[model.exemplars.owner])]
+        expected = fused_residual(query, copies, model.metric, terms=MOMENT_TERMS) - model.moment_hub
+        torch.testing.assert_close(model.moment_residuals(query), expected, atol=1e-4, rtol=0)
+
+
+def test_what_a_model_keeps_stays_with_it_alone(fitted):
+    indexer, model, clips = fitted
+    before = len(pickle.dumps(model))
+    answer = model.scores(random_windows(3, 37))
+    assert len(pickle.dumps(model)) == before
+    for other in (pickle.loads(pickle.dumps(model)), copy.deepcopy(model), dataclasses.replace(model, hub=model.hub + 1)):
+        assert other.kept is not model.kept
+    torch.testing.assert_close(copy.deepcopy(model).scores(random_windows(3, 37)), answer, atol=1e-3, rtol=0)
+    calmer = dataclasses.replace(model.options, nearest=dataclasses.replace(model.options.nearest, turned=0.0))
+    assert model.with_options(calmer).kept is model.kept and model.with_options(calmer).options is calmer
+    assert not torch.equal(model.with_options(calmer).residuals(random_windows(3, 37)), model.residuals(random_windows(3, 37)))
+    assert model.to("meta") is model.to("meta") and model.to("cpu") is model
+    assert model.with_options(calmer).to("meta").options == calmer and model.to("meta").options == model.options
+    first = indexer.model_
+    indexer = copy.copy(indexer).partial_fit(clips[:1], [2])
+    assert indexer.model_.kept is not first.kept and len(indexer.decision_function(clips[:2])) == 2
+
+
 def test_no_exemplars_is_refused():
     with pytest.raises(ValueError, match="no exemplar"):
         fused_residual(random_windows(2), [], metric_of(random_windows(3)))
@@ -176,19 +338,25 @@ def test_kernels_are_symmetric_with_ones_on_the_diagonal(one_side):
         assert torch.linalg.eigvalsh(kernel.double()).min() > -1e-4
 
 
-def test_kernel_by_definition():
+@pytest.mark.parametrize("one_side", [False, True])
+def test_kernel_by_definition(one_side):
     query, bank = random_windows(4, 18), random_windows(9, 19)
-    kernels = Kernels(metric_of(bank, 0.0))
+    kernels = Kernels(metric_of(bank, 0.0), one_side)
     kernels.fit(bank, MachineOptions())
-
-    def features(windows):
-        x = [channel(windows.values, name).double() for name in CHANNELS]
-        both = [part for one in x for part in (one[..., 1].flatten(1), one.flatten(1))]
-        return both + [moment.double() for moment in order_free(windows.values)]
 
     def distances(a, b):
         unit = torch.nn.functional.normalize
-        return [1 - unit(p, dim=1) @ unit(q, dim=1).mT for p, q in zip(features(a), features(b), strict=True)]
+        x, y = ([channel(windows.values, name).double() for name in CHANNELS] for windows in (a, b))
+        for p, q in zip(x, y, strict=True):
+            for one, other in ((p[..., 1], q[..., 1]), (p, q)):
+                yield 1 - unit(one.flatten(1), dim=1) @ unit(other.flatten(1), dim=1).mT
+            if one_side:
+                bases = [orthonormal_basis(part.flatten(1, 2)) for part in (p, q)]
+                yield 1 - canonical_correlation(*bases)
+                yield 1 - canonical_correlation(*bases, shared=2)
+        for whole_image in (False, True)[: 1 + one_side]:
+            for p, q in zip(order_free(a.values, whole_image), order_free(b.values, whole_image), strict=True):
+                yield 1 - unit(p.double(), dim=1) @ unit(q.double(), dim=1).mT
 
     off = ~torch.eye(9, dtype=torch.bool)
     scales = [d[off].median() / 2 for d in distances(bank, bank)]

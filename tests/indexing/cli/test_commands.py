@@ -220,11 +220,15 @@ def test_scan_prints_hits_and_writes_the_report(run, tmp_path: Path) -> None:
     assert "action" in out and "margin" in out and "30 frames per second assumed for session.json" in out
     folder = tmp_path / "a" / "out"
     names = {path.name for path in folder.iterdir()}
-    assert names == {"report.html", "events.csv", "timeline.png", "metrics.json", "manifest.json"}
+    assert names == {"report.html", "events.csv", "repetitions.csv", "timeline.png", "metrics.json", "manifest.json"}
     rows = list(csv.DictReader((folder / "events.csv").open()))
     assert rows and {row["label"] for row in rows} <= set(ACTIONS)
     measured = json.loads((folder / "metrics.json").read_text())
     assert f"{3 - measured['missed_events']} of 3 known actions found" in out
+    assert f"(precision {measured['precision']:.3f}, recall {measured['recall']:.3f})" in out
+    counted = list(csv.DictReader((folder / "repetitions.csv").open()))
+    assert {row["label"] for row in counted} == {row["label"] for row in rows} and "pause (s)" in out
+    assert sum(measured["repetitions"].values()) == len(counted) and {row["person"] for row in rows} == {""}
     assert measured["known_events"] == 3 and 0.5 < measured["frame_accuracy"] <= 1
     assert "assumed" in measured["notes"][0]
     made = json.loads((folder / "manifest.json").read_text())
@@ -246,7 +250,7 @@ def test_labels_are_escaped_in_the_page(run) -> None:
     code, out, _ = run("index", "scan", "@/session.json", "-m", "m.safetensors", "--report", "out", "--reject", "-100")
     assert code == 0 and "[red]" in out
     page = Path("out/report.html").read_text()
-    assert "<script" not in page and "&lt;script&gt;" in page
+    assert page.count("<script") == 1 and "&lt;script&gt;" in page  # the player's
 
 
 def test_scan_refuses_bad_input(refuse, run, data: Path, tmp_path: Path) -> None:

@@ -1,6 +1,8 @@
 """What commands say of recordings that are read without an error and still are not what they seem."""
 
+import csv
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -139,11 +141,21 @@ def test_everybody_in_view_is_scanned(run, clips):
         frames[i if i < 60 else i + 40].append((7, pose))
     frames[20].append((9, left[0] + 3000))
     people(Path("both.json"), frames)
-    code, out, _ = run("index scan both.json -m m.safetensors --fps 30")
+    code, out, _ = run("index scan both.json -m m.safetensors --fps 30 --report out")
     assert code == 0
     assert "both.json: 2 people in view, told apart by the file's ids; each is scanned by itself" in out
     assert "both.json: 1 track left out, as of no person (1 too short)" in out
     assert "both.json: person 7 is out of view from 2.0 to 3.3 s; that it is the same person says the file's id" in out
+    with open("out/events.csv", newline="") as file:
+        found = list(csv.DictReader(file))
+    assert {row["person"] for row in found} == {"4", "7"} and {row["file"] for row in found} == {"both.json"}
+    with open("out/repetitions.csv", newline="") as file:
+        counted = list(csv.DictReader(file))
+    assert list(counted[0]) == "file person label unit number start end seconds pause_before range".split()
+    assert {(row["person"], row["label"]) for row in counted} == {(row["person"], row["label"]) for row in found}
+    page = Path("out/report.html").read_text()
+    assert "Actions in both.json" in page and "<h3>Person 4</h3>" in page and "<h3>Person 7</h3>" in page
+    assert page.count('class="player"') == 1 and "timeline-2.png" in {path.name for path in Path("out").iterdir()}
 
 
 def test_whose_the_known_events_are(run, clips):
@@ -163,6 +175,19 @@ def test_whose_the_known_events_are(run, clips):
     Path("odd.csv").write_text("label,start,end,person\nwave,0,2,Anna\n")
     code, _, err = run(scan + "odd.csv")
     assert code == 2 and "odd.csv: column 'person' names person Anna" in err
+
+
+def test_what_is_held_back_is_said_with_its_reason(run, clips):
+    assert run("index fit squat=squat wave=wave kick=kick --fps 30 -o m.safetensors")[0] == 0
+    code, out, _ = run("index scan wave -m m.safetensors --fps 30 --reject 100 --report out")
+    assert code == 0 and "no action found" in out and re.search(r"held back, below the level: 1 wave \(\d\.\d\d s\)", out)
+    page = Path("out/report.html").read_text()
+    assert "Held back" in page and "below the level" in page and json.loads(Path("out/metrics.json").read_text())["withheld"]
+    still = clips["wave"].joints[:1] + 0.2 * (clips["wave"].joints - clips["wave"].joints[:1])  # a wave that hardly moves
+    openpose(Path("calm"), [clips["wave"].replace(joints=still)])
+    found = {rest: run(f"index scan calm -m m.safetensors --fps 30 --rest {rest}")[1] for rest in ("strict", "usual", "off")}
+    assert "held back, at rest: " in found["strict"] and "no action found" in found["strict"]
+    assert "held back" not in found["off"] and "no action" not in found["off"]
 
 
 def test_nobody_in_view_is_an_answer(run, tmp_path):

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import base64
 import csv
+import hashlib
+import html
 import io
 import json
 import re
@@ -55,7 +58,14 @@ def write(folder, report):
     text = path.read_text(encoding="utf-8")
     parsed = Page(text)
     assert parsed.bad == []
-    assert "script" not in parsed.tags and "link" not in parsed.tags and "iframe" not in parsed.tags
+    assert "link" not in parsed.tags and "iframe" not in parsed.tags
+    scripts = re.findall(r"<script>(.*?)</script>", text, re.DOTALL)
+    assert len(scripts) == parsed.tags.count("script") == ("data-player=" in text)
+    for script in scripts:  # the page lets run what has this hash, and nothing else
+        digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+        assert f"script-src &#39;sha256-{digest}&#39;" in text and script == page.Script("player.js").text
+    assert scripts or "script-src" not in text
+    assert "fetch(" not in text and "XMLHttpRequest" not in text and "import(" not in text and "http" not in "".join(scripts)
     assert all(address.startswith("data:image/png;base64,") for address in parsed.addresses)
     assert "url(" not in text and "@import" not in text and "default-src 'none'" in text
     assert not list(path.parent.glob(".*"))
@@ -73,7 +83,7 @@ def test_a_full_report(tmp_path):
         manifest=manifest({"command": "scan"}, [__file__], seed=1),
     )
     text = write(tmp_path, report)
-    names = ["confusion.png", "events.csv", "manifest.json", "metrics.json", "report.html", "timeline.png"]
+    names = ["confusion.png", "events.csv", "manifest.json", "metrics.json", "report.html", "timeline.png"]  # nobody counted
     assert sorted(file.name for file in tmp_path.iterdir()) == names
     assert text.count('<svg class="strip"') == 4 and "left limbs" in text
     said = ["2 actions of 2 kinds were found", "2 of 4 clips (50.0%)", "Mean overlap", "azimuth 90", "✓ agrees", "Each action"]
@@ -98,14 +108,16 @@ def test_names_cannot_break_out_of_the_page(tmp_path):
         manifest={"arguments": {SCRIPT: [SCRIPT]}, "time": SCRIPT, "versions": {"dyntorch": SCRIPT}},
     )  # fmt: skip
     text = write(tmp_path, report)
-    assert "<script" not in text and text.count("&lt;script&gt;alert(1)&lt;/script&gt;") > 12
+    assert text.count("<script") == 1 and text.count("&lt;script&gt;alert(1)&lt;/script&gt;") > 12
+    played = json.loads(html.unescape(re.search(r'data-player="([^"]*)"', text)[1]))
+    assert SCRIPT in [name for name, _ in played["actions"]] and "</style>$title" in [name for name, _ in played["actions"]]
     assert "onerror=alert(1)&gt;" in text and "深蹲 приседание नमस्ते" in text and "\x00" not in text and "\x1b" not in text
 
 
 def test_nothing_found_and_nothing_known(tmp_path):
     text = write(tmp_path, RecognitionReport("Empty", recordings=[recording(classes=["only"])]))
     assert "No action was found in 1 recording" in text and "Nothing was found" in text and "Known" not in text
-    assert (tmp_path / "events.csv").read_text() == "file,label,start,end,score,margin\n"
+    assert (tmp_path / "events.csv").read_text() == "file,label,start,end,score,margin,person\n"
     assert not (tmp_path / "confusion.png").exists()
     assert "neither recordings nor evaluations" in write(tmp_path / "none", RecognitionReport("Nothing"))
     assert "0 of 1" in write(tmp_path / "missed", RecognitionReport("Missed", recordings=[recording([], [("squat", 1, 2)])]))

@@ -269,11 +269,55 @@ def lab(colour):
     return np.array([116 * y - 16, 500 * (x - y), 200 * (y - z)]), float(y**3)
 
 
-def test_sixteen_actions_have_sixteen_colours_that_white_text_reads_on():
-    colours, luminances = zip(*map(lab, pictures.PALETTE), strict=True)
-    apart = np.linalg.norm(np.subtract.outer(np.array(colours), np.array(colours))[:, [0, 1, 2], :, [0, 1, 2]], axis=0)
-    assert len(colours) >= 16 and apart[~np.eye(len(colours), dtype=bool)].min() > 13
-    assert 1.05 / (max(luminances) + 0.05) > 4.5
+def ciede2000(first, second):
+    """``(N, M)`` colour difference of two sets of CIELAB colours (Sharma, Wu, Dalal 2005)."""
+    (l1, a1, b1), (l2, a2, b2) = first.T[:, :, None], second.T[:, None, :]
+    mean = (np.hypot(a1, b1) + np.hypot(a2, b2)) / 2
+    turn = 1.5 - 0.5 * np.sqrt(mean**7 / (mean**7 + 25.0**7))
+    c1, c2 = np.hypot(turn * a1, b1), np.hypot(turn * a2, b2)
+    h1, h2 = np.degrees(np.arctan2(b1, turn * a1)) % 360, np.degrees(np.arctan2(b2, turn * a2)) % 360
+    way = (h2 - h1 + 180) % 360 - 180
+    hue, chroma, light = 2 * np.sqrt(c1 * c2) * np.sin(np.radians(way) / 2), (c1 + c2) / 2, (l1 + l2) / 2
+    at = np.radians((h1 + way / 2) % 360)
+    t = 1 - 0.17 * np.cos(at - np.radians(30)) + 0.24 * np.cos(2 * at) + 0.32 * np.cos(3 * at + np.radians(6))
+    t = t - 0.2 * np.cos(4 * at - np.radians(63))
+    blue = np.sin(np.radians(60 * np.exp(-(((np.degrees(at) - 275) / 25) ** 2)))) * -2 * np.sqrt(chroma**7 / (chroma**7 + 25.0**7))
+    dl = (l2 - l1) / (1 + 0.015 * (light - 50) ** 2 / np.sqrt(20 + (light - 50) ** 2))
+    dc, dh = (c2 - c1) / (1 + 0.045 * chroma), hue / (1 + 0.015 * chroma * t)
+    return np.sqrt(dl**2 + dc**2 + dh**2 + blue * dc * dh)
+
+
+def test_the_difference_of_colours_is_the_published_one():
+    first, second = np.array([[50.0, 2.6772, -79.7751], [50, 2.5, 0]]), np.array([[50.0, 0, -82.7485], [73, 25, -18]])
+    assert np.diag(ciede2000(first, second)).round(4).tolist() == [2.0425, 27.1492]
+
+
+def turned(colour):
+    """A colour as the style sheet turns it for dark paper: ``invert(1) hue-rotate(180deg)``."""
+    left = 1 - np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)]) / 255
+    grey = left @ [0.213, 0.715, 0.072]
+    return "#" + "".join(f"{round(255 * value):02x}" for value in np.clip(2 * grey - left, 0, 1))
+
+
+@pytest.mark.parametrize("paper", ["light", "dark"])
+def test_twenty_actions_have_twenty_colours_that_names_read_on(paper):
+    palette = pictures.PALETTE if paper == "light" else tuple(map(turned, pictures.PALETTE))
+    colours, luminances = zip(*map(lab, palette), strict=True)
+    apart = ciede2000(np.array(colours), np.array(colours))[~np.eye(len(colours), dtype=bool)]
+    assert len(colours) >= 20 and apart.min() > 14
+    if paper == "light":
+        assert 1.05 / (max(luminances) + 0.05) > 4.5  # white on it
+    else:
+        assert (min(luminances) + 0.05) / 0.05 > 4.5  # what was white is black there
+    assert len(set(pictures.colours([f"action {i}" for i in range(20)]).values())) == 20
+
+
+def test_a_name_that_does_not_fit_its_bar_is_left_out_not_cut():
+    with pictures.style():
+        axes = pictures.new_figure(4.0, 1.0).add_axes((0, 0, 1, 1))
+        for room in (400, 60, 34, 10):
+            pictures._write(axes, "jumping_jack", 0.5, 0.5, room)
+    assert [text.get_text() for text in axes.texts] == ["jumping_jack", "jumping_\njack"]
 
 
 def test_bars_of_a_timeline_say_what_they_are():

@@ -1,0 +1,251 @@
+"""What is not the action: further classes of a model that are learned and never reported, so that one action alone can be.
+
+They are made of three sources.  Synthetic people who do other things, seen from anywhere, where the joints go by names that theirs
+have; the clip itself, played otherwise: by other joints and, where there are no such people, backwards, its halves exchanged, in
+another order; and recordings of other movement that somebody gives.  What comes out too much like the action is left out: a squat
+played backwards is a squat, and so is somebody else's.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from indexing.action.bank import Windows
+from indexing.action.exemplars import Exemplars
+from indexing.action.inputs import as_clips
+from indexing.action.learning import Lesson, learn
+from indexing.action.model import ShapeModel, class_scores
+from indexing.action.options import ActionOptions, BackgroundOptions
+from indexing.actors import ACTIONS, dataset
+from indexing.clip import Clip, stretches
+from indexing.joints import FEWEST, matched, matched_all, named
+from indexing.recordings.explanation import Explanation, Withheld
+from indexing.scoring import Event
+from indexing.skeleton import Skeleton
+from indexing.windows import check_clips, ragged, sample
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class OtherMovement:
+    """Clips that are not the action, and of which kind each is: kinds are classes of the model that are never reported.
+
+    clips: as exemplars; kinds: name of each clip's kind; sure: ``(clips,)`` bool, whether somebody said that they are not the
+    action (the others are left out where they are too much like it).
+    """
+
+    clips: tuple[Clip, ...] = ()
+    kinds: tuple[str, ...] = ()
+    sure: tuple[bool, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.clips)
+
+    def __add__(self, other: OtherMovement) -> OtherMovement:
+        return OtherMovement(self.clips + other.clips, self.kinds + other.kinds, self.sure + other.sure)
+
+    def without(self, kinds: Iterable[str]) -> OtherMovement:
+        """Those of other kinds."""
+        gone = set(kinds)
+        kept = [i for i, kind in enumerate(self.kinds) if kind not in gone]
+        return OtherMovement(*(tuple(part[i] for i in kept) for part in (self.clips, self.kinds, self.sure)))
+
+    @property
+    def numbers(self) -> Array:
+        """``(clips,)`` the number of each clip's kind."""
+        return np.asarray(np.unique(np.array(self.kinds, dtype=str), return_inverse=True)[1])
+
+
+def _made(found: Sequence[tuple[str, Clip]], sure: bool) -> OtherMovement:
+    return OtherMovement(tuple(clip for _, clip in found), tuple(kind for kind, _ in found), (sure,) * len(found))
+
+
+ORDERS = ("backwards", "halves exchanged", "another order")
+
+
+def played_otherwise(
+    clips: Sequence[Clip], ordered: bool, options: BackgroundOptions, random_state: np.random.Generator
+) -> OtherMovement:
+    """The clips with the movement of each joint done by another one, and in another order.
+
+    Args:
+        ordered: in another order, too; within a short window that is still the action, so only where there is nothing better.
+
+    Example:
+        >>> clip = Clip(np.random.default_rng(0).normal(size=(8, 5, 2)))
+        >>> sorted(set(played_otherwise([clip], True, BackgroundOptions(), np.random.default_rng(0)).kinds))
+        ['another order', 'backwards', 'halves exchanged', 'other joints 0', 'other joints 1']
+    """
+    found = []
+    for clip in clips:
+        frames = np.arange(len(clip))
+        quarters = np.array_split(frames, 4)
+        orders = (frames[::-1], np.roll(frames, len(frames) // 2), np.concatenate([quarters[i] for i in (2, 0, 3, 1)]))
+        for name, order in zip(ORDERS, orders, strict=True) if ordered else ():
+            found.append((name, clip.replace(joints=clip.joints[order], confidence=None)))
+        seen = clip.seen.any(axis=0)
+        middle = np.zeros((1, *clip.joints.shape[1:]), dtype=clip.joints.dtype)
+        middle[0, seen] = np.nanmean(clip.joints[:, seen], axis=0)
+        for number in range(options.exchanges):
+            order = np.arange(len(seen))
+            order[seen] = random_state.permutation(order[seen])
+            joints = middle + (clip.joints - middle)[:, order]
+            found.append((f"other joints {number}", clip.replace(joints=joints, confidence=None)))
+    return _made(found, False)
+
+
+def performed(skeleton: Skeleton | None, dims: int, options: BackgroundOptions, random_state: np.random.Generator) -> OtherMovement:
+    """Synthetic people who do everyday actions, each seen from somewhere; nothing where the joints cannot be told by name.
+
+    Args:
+        skeleton: of the clips that are learned from; dims: 3 gives the actors in 3D.
+    """
+    if not named(skeleton):
+        return OtherMovement()
+    azimuth = None if dims == 3 else [float(a) for a in random_state.uniform(0.0, 360.0, options.views)]
+    found = []
+    for clip in dataset(options.people, ACTIONS, azimuth=azimuth, rng=random_state):
+        try:
+            found.append((str(clip.label), matched(clip, skeleton)[0]))
+        except ValueError:  # too few joints have these names
+            return OtherMovement()
+    return _made(found, False)
+
+
+def recorded(
+    background: Iterable[Any], fps: float, joints: int, skeleton: Skeleton | None, seconds: float, options: BackgroundOptions
+) -> OtherMovement:
+    """Recordings of other movement, cut into pieces as long as an action.
+
+    Args:
+        background: clips or arrays, of any length; joints, skeleton: how many, and which, those of the action are.
+        seconds: that an ordinary action lasts.
+
+    Raises:
+        ValueError: naming the clip: other joints, no frames, nobody seen.
+    """
+    try:
+        clips = [part for item in as_clips(background, fps) for part in (item if isinstance(item, tuple) else (item,))]
+        clips = matched_all(clips, skeleton)
+        check_clips(clips, joints, recordings=True)
+    except ValueError as problem:
+        raise ValueError(f"background: {problem}") from None
+    found = [piece for number, clip in enumerate(clips) for piece in _pieces(clip, number, seconds, options)]
+    if not found:
+        raise ValueError(
+            f"background: no {seconds:.3g} s without a gap in {len(clips)} clips show anybody; give a recording of other movement"
+        )
+    kept = np.unique(np.linspace(0, len(found) - 1, options.pieces).round().astype(int))
+    return _made([found[i] for i in kept], True)
+
+
+def _pieces(clip: Clip, number: int, seconds: float, options: BackgroundOptions) -> list[tuple[str, Clip]]:
+    """Pieces of a recording, half a piece apart; neighbours are of one kind, of which a recording gives a few."""
+    found = []
+    for first, end in stretches(clip.times).tolist():
+        times = clip.times[first:end]
+        room = max(0.0, float(times[-1] - times[0]) - seconds)
+        for start in times[0] + np.linspace(0.0, room, 1 + int(np.ceil(2 * room / seconds))):
+            inside = first + np.flatnonzero((times >= start - 1e-9) & (times <= start + seconds + 1e-9))
+            joints = clip.joints[inside]
+            shown = np.isfinite(joints).all(axis=2)
+            if len(inside) < 2 or int(shown.any(axis=0).sum()) < FEWEST or shown.any(axis=1).mean() < options.shown:
+                continue
+            found.append(clip.replace(joints=joints, times=clip.times[inside], confidence=None))
+    parts = min(options.parts, len(found))
+    label = f"recording {number}" if clip.label is None else str(clip.label)
+    return [(f"{label}, part {i * parts // len(found)}" if clip.label is None else label, one) for i, one in enumerate(found)]
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# What of it is too much like the action, and what a recording tells once background is taken out.
+
+
+def alike(exemplars: Exemplars, numbers: Array, kinds: Sequence[str], options: ActionOptions) -> Array:
+    """``(kinds,)`` bool, which of the made exemplars are of a kind that may be the action itself.
+
+    A kind is compared with the action as two actions are, by the mean residual to the nearest exemplars; joints count as they do
+    among all of them.  Of a cycle every order is the same.
+
+    Args:
+        numbers: ``(N,)`` classes; 0 is the action, whose exemplars come first; kinds: names of those of the others, in order.
+    """
+    labels = torch.from_numpy(np.asarray(numbers))
+    classes = int(labels.max()) + 1
+    model = learn(exemplars, labels, classes, Lesson(scorer="nearest", hidden=classes - 1), options)
+    own = labels == 0
+    scores = class_scores(model.residuals(exemplars.crop(0)[own]) + model.hub, labels, classes, options=options)
+    nearest = -scores.amax(dim=0)[labels[~own]].numpy()
+    again = exemplars.cyclic is not None and float(exemplars.cyclic[own].median()) > options.recordings.joined
+    replayed = np.array([kind in ORDERS or kind.startswith("other joints") for kind in kinds])
+    cycle = np.array([again and kind in ORDERS for kind in kinds])
+    return np.asarray((nearest < np.where(replayed, options.background.replayed, options.background.alike)) | cycle)
+
+
+def event_level(model: ShapeModel, rate: float | None) -> float:
+    """The least score of an event, at which other movement is reported at the rate that is asked for.
+
+    Every exemplar is asked as if its class were not known: what its short windows say, on average, for the known class that they
+    say most for.  Where they say more for background it would not be reported at all.
+    """
+    if rate is None:
+        return -np.inf
+    if not 0 < rate < 1:
+        return float(rate)
+    labels, owner = model.labels, model.exemplars.owner
+    scores = model.moment_scores(model.exemplars.moments)
+    total = scores.new_zeros(len(labels), model.classes).index_add_(0, owner, scores)
+    own = torch.nn.functional.one_hot(labels, model.classes).bool()
+    mean = (total / torch.bincount(owner, minlength=len(labels))[:, None]).masked_fill(own, torch.nan)
+    contrast = (mean - mean.nanmean(dim=1, keepdim=True)).masked_fill(own, -torch.inf)
+    best, other = contrast[:, : model.known].amax(dim=1), contrast[:, model.known :].amax(dim=1)
+    wrong = torch.where(best > other, best, -torch.inf)
+    if model.known == 1:
+        wrong = wrong[labels > 0]  # nothing is left that its own exemplars could be taken for
+    return float(np.quantile(wrong.cpu().numpy(), 1 - rate, method="higher"))
+
+
+def segment_evidence(model: ShapeModel, clip: Clip, events: Sequence[Event], length: int) -> Array:
+    """``(events,)`` the evidence of segments of a recording, each asked as if it had been cut out by hand."""
+    if not events:
+        return np.zeros(0)
+    source, owner = ragged([clip]), np.zeros(len(events), dtype=np.intp)
+    begin, end = (np.array([getattr(event, name) for event in events]) for name in ("start", "end"))
+    windows = Windows(sample(source, owner, begin, end, length), torch.from_numpy(source.seen[owner]))
+    return np.asarray(model.evidence(windows.to(model.labels.device)).cpu().numpy())
+
+
+def without_background(
+    told: Explanation, classes: Sequence[Any], least: float, enough: Callable[[Sequence[Event]], NDArray[np.bool_]]
+) -> Explanation:
+    """What is said of the known actions: other movement is told as held back.
+
+    Args:
+        told: its last classes are background; classes: the known labels; least: score of an event; enough: which events of
+            known actions have the evidence that is asked for.
+    """
+    known = len(classes)
+    scores = told.scores[:, :known]
+    likely = np.exp(scores).sum(axis=1).clip(0.0, 1.0)
+    held = [one for one in told.withheld if one.event.label in told.classes[:known]]
+    mine = [event for event in told.events if event.label in told.classes[:known]]
+    good = enough(mine)
+    events = [event for event, fine in zip(mine, good, strict=True) if fine and event.score >= least]
+    held += [
+        Withheld(event, "below the level") for event, fine in zip(mine, good, strict=True) if not (fine and event.score >= least)
+    ]
+    for event in told.events:
+        if event.label not in told.classes[:known]:
+            inside = (told.times >= event.start) & (told.times <= event.end)
+            nearest = int(scores[inside].mean(axis=0).argmax()) if inside.any() else 0
+            held.append(Withheld(dataclasses.replace(event, label=classes[nearest]), "other movement"))
+    held.sort(key=lambda one: one.event.start)
+    return dataclasses.replace(told, classes=tuple(classes), scores=scores, events=events, withheld=held, background=1.0 - likely)

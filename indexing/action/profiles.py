@@ -1,0 +1,71 @@
+r"""What a clip of a known action says of all actions, not of its own alone: profiles of class scores, and how usual one is.
+
+A clip of a known action is near to its own exemplars, about as far from those of each other action as its own exemplars are, and
+these distances belong together.  A clip of an unknown action may be as near to some class as that, but hardly in such company.
+So the exemplars, each asked as if it had not been learned, tell what the profiles of their class look like.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Self
+
+import torch
+from torch import Tensor
+
+from indexing.action.options import NearestOptions
+from indexing.modelfile import stored
+
+DEFAULTS = NearestOptions()
+
+
+@dataclass(frozen=True)
+class ClassProfiles:
+    r"""The profiles of the exemplars of each class: their mean, and how they scatter about it.
+
+    A profile holds the class scores of each scorer, one after the other.
+
+    centres: ``(known, columns)`` mean profiles of the known classes; precision: ``(columns, columns)``
+    :math:`P = (\Sigma + \lambda \operatorname{diag} \Sigma)^{-1}` of the scatter :math:`\Sigma` within all of them.
+    """
+
+    centres: Tensor = field(metadata=stored("real", "known", "columns"))
+    precision: Tensor = field(metadata=stored("real", "columns", "columns"))
+
+    @classmethod
+    def learn(cls, profiles: Tensor, labels: Tensor, known: int, options: NearestOptions = DEFAULTS) -> Self | None:
+        """From the profiles of the exemplars, each asked without itself.
+
+        Args:
+            profiles: ``(N, columns)``, not finite where nothing was left to ask; labels: ``(N,)``.
+            known: how many of the first classes are actions; the others are background, which no clip is to resemble.
+
+        Returns:
+            ``None`` where fewer than two exemplars of some action can say anything.
+        """
+        usable = profiles.isfinite().all(dim=1) & (labels < known)
+        own = torch.nn.functional.one_hot(labels[usable], known).to(profiles)
+        counts = own.sum(dim=0)
+        if not known or int(counts.min()) < 2:
+            return None
+        centres = own.mT @ profiles[usable] / counts[:, None]
+        apart = (profiles[usable] - own @ centres).double()
+        scatter = apart.mT @ apart / len(apart)
+        ridge = (options.profile_floor * scatter.diagonal()).clamp(min=1e-9)
+        return cls(centres, torch.linalg.inv(scatter + ridge.diag()).to(profiles))
+
+    def distance(self, profiles: Tensor) -> Tensor:
+        r"""``(Q,)`` how unusual profiles ``(Q, columns)`` are, in standard deviations of the class whose they resemble most.
+
+        .. math:: m(p) = \min_c \sqrt{(p - \mu_c)^T P (p - \mu_c)}
+
+        Source: Lee et al. 2018 (Mahalanobis distance from the nearest class, pooled covariance).
+
+        Example:
+            >>> profiles = ClassProfiles(torch.tensor([[0.0, -4.0], [-4.0, 0.0]]), torch.eye(2))
+            >>> profiles.distance(torch.tensor([[0.0, -4.0], [-4.0, 3.0], [0.0, 0.0]])).tolist()
+            [0.0, 3.0, 4.0]
+        """
+        apart = profiles[:, None] - self.centres
+        squares = torch.einsum("qci,ij,qcj->qc", apart, self.precision, apart)
+        return squares.amin(dim=1).clamp(min=0.0).sqrt()

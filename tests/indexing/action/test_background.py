@@ -1,0 +1,145 @@
+"""One action learned alone, and a background of other movement: nothing of it is ever an answer."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from indexing import ActionIndexer, Clip
+from indexing.action.background import OtherMovement, performed, played_otherwise, recorded
+from indexing.action.options import BackgroundOptions
+from indexing.actors import Person, dataset, detect, stream
+from indexing.skeleton import COCO17, OPENPOSE18
+
+OPTIONS = BackgroundOptions(people=1, views=1)
+
+
+@pytest.fixture(scope="module")
+def squat():
+    return dataset([Person.random(3)], ["squat"], azimuth=0.0, rng=3).clips[0]
+
+
+@pytest.fixture(scope="module")
+def others():
+    """Other people, who do other things, too."""
+    return dataset([Person.random(i) for i in (11, 12)], ["squat", "wave", "kick", "bow", "throw"], azimuth=20.0, rng=4)
+
+
+@pytest.fixture(scope="module")
+def alone(squat):
+    return ActionIndexer(virtual_views=2, none_label="nothing").fit([squat], ["squat"])
+
+
+@pytest.fixture(scope="module")
+def session():
+    clip, truth = stream(["wave", "squat", "kick", "squat"], Person.random(21), rng=5)
+    return detect(clip, azimuth=20.0, rng=6), truth
+
+
+def test_one_action_is_told_from_everything_else(alone, others):
+    assert alone.classes_.tolist() == ["squat"] and alone.model_.hidden > 3
+    said = alone.predict(others)
+    assert set(said.tolist()) <= {"squat", "nothing"}
+    assert np.mean(said[others.labels == "squat"] == "squat") == 1.0 and np.mean(said[others.labels != "squat"] == "squat") <= 0.25
+
+
+def test_scores_are_of_the_known_actions(alone, others):
+    assert alone.decision_function(others).shape == alone.predict_proba(others).shape == (len(others), 1)
+    likely = alone.predict_proba(others)[:, 0]
+    assert (likely >= 0).all() and (likely <= 1).all()
+    assert likely[others.labels == "squat"].min() > np.median(likely[others.labels != "squat"])
+
+
+def test_a_recording_holds_the_one_action(alone, session):
+    clip, truth = session
+    told = alone.explain(clip)
+    squats = [(start, end) for label, start, end in truth if label == "squat"]
+    assert told.classes == ("squat",) and told.scores.shape == (len(clip), 1)
+    assert [event.label for event in told.events] == ["squat"] * len(squats)
+    for event, (start, end) in zip(told.events, squats, strict=True):
+        assert min(event.end, end) - max(event.start, start) > 0.5 * (end - start)
+    assert {one.event.label for one in told.withheld} <= {"squat"}
+    assert "other movement" in {one.reason for one in told.withheld}
+    assert told.background is not None and (told.background >= 0).all() and (told.background <= 1).all()
+
+
+def test_the_rate_sets_the_level(squat):
+    strict, usual, loose = (
+        ActionIndexer(scorer="nearest", virtual_views=0, reject=rate).fit([squat], ["squat"]).reject_threshold_
+        for rate in (0.02, None, 0.5)
+    )
+    assert strict > usual > loose  # where nothing is said a rate is asked for all the same
+
+
+def test_models_come_back_from_their_files(alone, others, tmp_path):
+    path = tmp_path / "squat.safetensors"
+    alone.save(path)
+    again = ActionIndexer.load(path)
+    assert again.model_.hidden == alone.model_.hidden and again.reject_threshold_ == alone.reject_threshold_
+    assert again.predict(others).tolist() == alone.predict(others).tolist()
+
+
+def test_several_actions_and_a_recording_of_something_else(others, session):
+    taught = [clip for clip in others if clip.label in ("squat", "wave")]
+    clip, truth = stream(["kick", "throw", "kick"], Person.random(8), rng=9)
+    indexer = ActionIndexer(virtual_views=2, none_label="nothing").fit(taught, background=[detect(clip, azimuth=20.0, rng=1)])
+    assert indexer.classes_.tolist() == ["squat", "wave"] and 1 <= indexer.model_.hidden <= 6
+    assert indexer.reject_threshold_ is None  # several actions: no rate where none is asked for
+    kicks = others.select(label="kick") if "label" in others.fields else [one for one in others if one.label == "kick"]
+    assert (indexer.predict(kicks) == "nothing").all()
+    assert (indexer.predict(taught) == np.array([one.label for one in taught])).all()
+    assert {event.label for event in indexer.find(session[0])} <= {"squat", "wave"}
+
+
+def test_a_second_action_can_be_added(squat, others):
+    indexer = ActionIndexer(scorer="nearest", virtual_views=0).fit([squat], ["squat"])
+    hidden = indexer.model_.hidden
+    waves = [clip for clip in others if clip.label == "wave"]
+    indexer.partial_fit(waves)
+    assert indexer.classes_.tolist() == ["squat", "wave"] and indexer.model_.hidden <= hidden
+    assert indexer.predict(waves).tolist() == ["wave"] * len(waves) and indexer.predict([squat]).tolist() == ["squat"]
+
+
+def test_what_is_made():
+    clip = Clip(np.random.default_rng(0).normal(size=(20, 17, 2)), skeleton=COCO17)
+    rng = np.random.default_rng(0)
+    played = played_otherwise([clip], True, OPTIONS, rng)
+    assert all(one.joints.shape == clip.joints.shape for one in played.clips) and not any(played.sure)
+    for one, kind in zip(played.clips, played.kinds, strict=True):
+        assert np.allclose(one.joints.mean(axis=0), clip.joints.mean(axis=0), atol=1e-5), kind  # other movement about the same pose
+    people = performed(OPENPOSE18, 2, OPTIONS, rng)
+    assert len(set(people.kinds)) == 13 and {one.joints.shape[1:] for one in people.clips} == {(18, 2)}
+    assert len(performed(None, 2, OPTIONS, rng)) == 0
+    assert len(people.without(people.kinds[:1])) == len(people) - 1 and len(OtherMovement()) == 0
+
+
+def test_recordings_are_cut_into_pieces_as_long_as_the_action():
+    clip = Clip(np.random.default_rng(0).normal(size=(600, 5, 2)), fps=30.0)
+    pieces = recorded([clip], 30.0, 5, None, 2.0, BackgroundOptions(pieces=10, parts=3))
+    assert len(pieces) == 10 and len(set(pieces.kinds)) == 3 and all(pieces.sure)
+    assert {round(piece.duration, 1) for piece in pieces.clips} == {2.0}
+    short = recorded([clip.replace(joints=clip.joints[:20], times=clip.times[:20])], 30.0, 5, None, 2.0, BackgroundOptions())
+    assert len(short) == 1
+
+
+@pytest.mark.parametrize(
+    ("background", "message"),
+    [
+        ([], "background: clips: the list is empty"),
+        ([np.zeros((0, 17, 2))], "background: "),
+        ([np.full((30, 17, 2), np.nan)], "background: clip 0.*joint"),
+        ([np.random.default_rng(0).normal(size=(30, 9, 2))], "background: clip 0.*9 joints, but the fitted clips have 17"),
+        (3, "background: clips: expected a list"),
+        (["session.json"], "background: clips: item 0 is text"),
+    ],
+)
+def test_bad_backgrounds(squat, background, message):
+    with pytest.raises(ValueError, match=message):
+        ActionIndexer().fit([squat], ["squat"], background=background)
+
+
+def test_an_action_that_is_the_same_however_it_is_played():
+    turning = np.linspace(0, 12 * np.pi, 90)
+    wheel = np.stack([np.stack([np.cos(turning + i), np.sin(turning + i)], axis=1) for i in range(6)], axis=1)
+    with pytest.raises(ValueError, match=r"labels: only one class .*'wheel'.*background="):
+        ActionIndexer(scorer="nearest", virtual_views=0).fit([wheel], ["wheel"])
