@@ -152,8 +152,9 @@ def test_names_that_moved_into_rooms_are_found_at_their_old_place_with_a_warning
     assert len([name for name in dyntorch._HOME if not name.endswith("Options")]) <= 50
 
 
-def test_only_the_demo_uses_the_actors():
+def test_only_the_demo_and_the_background_use_the_actors():
     inside = (
+        "indexing/action/background",
         "indexing/actors/",
         "indexing/cli/",
         "indexing/demo",

@@ -69,6 +69,7 @@ WORDING = {
     "indexing/joints.py": {"LISTED"},
     "indexing/opening.py": {"VALUE", "SAID", "LISTED"},
     "indexing/readers/matches.py": {"SHOWN"},
+    "indexing/report/tallies.py": {"TIMES"},
     "indexing/sync/synchronize.py": {"LISTED"},
 }
 """How much a message lists."""
@@ -78,7 +79,7 @@ DRAWING = {
     "indexing/report/learned.py": {"COLUMNS", "PANEL", "PIECES", "THIN", "THICK", "DOT", "HEAD", "TRAIL", "NAMED"},
     "indexing/report/page.py": {"PIXEL_RATIO", "LISTED", "LINES"},
     "indexing/report/pictures.py": {"COLUMNS", "STEPS", "WIDTH", "ABOVE", "BESIDE"},
-    "indexing/report/recognition.py": {"TIMELINES", "STRIPS", "TIPS", "ROWS", "LOST"},
+    "indexing/report/recognition.py": {"TIMELINES", "STRIPS", "TIPS", "ROWS", "LOST", "PERFORMANCES"},
     "indexing/report/reconstruction_picture.py": {
         *("WIDTH", "FOOT", "TITLE", "TICKS", "SHOWN", "TANGLE", "LONG", "ROOM", "TALL", "STRAYS", "GAP", "LEFT"),
         *("TRACKS_TALL", "TRACKS_STRAYS"),

@@ -28,22 +28,14 @@ from experiments.common.book import Book
 from experiments.common.tables import command, note
 from experiments.recognition import protocol
 from experiments.recognition.detection_metrics import overlap
+from experiments.recognition.novelty import named
 from indexing import ActionIndexer, Clip, ClipSet
 from indexing.actors import ACTIONS, Person, dataset, detect, stream
 from indexing.scoring import Event
-from indexing.skeleton import Skeleton
 
 TURNS = (0, 90)
 PAUSE = 0.1  # seconds between joined clips
 Source = Literal["actors", "unnamed", "utkinect", "florence3d"]
-_LIMBS = [f"{side}_{joint}" for side in ("left", "right") for joint in ("shoulder", "elbow", "wrist")]
-JOINTS = {
-    "utkinect": ["mid_hip", "spine", "neck", "nose", *_LIMBS[:3], "left_hand", *_LIMBS[3:], "right_hand"]
-    + [f"{side}_{joint}" for side in ("left", "right") for joint in ("hip", "knee", "ankle", "foot")],
-    "florence3d": ["nose", "neck", "spine", *_LIMBS]
-    + [f"{side}_{joint}" for side in ("left", "right") for joint in ("hip", "knee", "ankle")],
-}
-"""Names of the joints, which the files number: the head is compared with a nose."""
 
 
 @dataclass(frozen=True)
@@ -134,7 +126,7 @@ def actors(recordings: int, named: bool) -> Search:
 
 def people(name: str, recordings: int) -> Search:
     """Clips of a set: learned from its first subject, looked for in all clips of others, joined; another one is given."""
-    rendered = protocol.render(_named(protocol.load_set(name), name), 0, turns=TURNS)
+    rendered = protocol.render(ClipSet([named(clip, name) for clip in protocol.load_set(name)]), 0, turns=TURNS)
     subjects = np.unique(rendered.subjects)
     first = np.flatnonzero(rendered.subjects == subjects[0])
     examples = {str(rendered.labels[i]): rendered.exemplars[i] for i in first[::-1]}
@@ -146,11 +138,6 @@ def people(name: str, recordings: int) -> Search:
     second = np.flatnonzero(rendered.subjects == subjects[1])
     other = [rendered.queries[0][i].replace(label=str(rendered.labels[i])) for i in second]
     return Search(examples, asked, other)
-
-
-def _named(clips: ClipSet, name: str) -> ClipSet:
-    skeleton = Skeleton(name, tuple(JOINTS[name]), clips.clips[0].skeleton.bones if clips.clips[0].skeleton else ())
-    return ClipSet([clip.replace(skeleton=skeleton) for clip in clips])
 
 
 def joined(clips: Sequence[Clip], labels: protocol.Array) -> Joined:
@@ -193,7 +180,7 @@ def measure(task: Search, given: bool, config: Config) -> tuple[dict[tuple[int, 
 def tables(name: Source, config: Config, book: Book) -> None:
     """Measure one set."""
     task = search(name, config)
-    lines = {}
+    lines: dict[str, list[float]] = {}
     for given in config.background:
         words = "with a recording" if given else "alone"
         note(f"... {name}, {words}")

@@ -8,8 +8,9 @@ chance that a clip of a learned class has more evidence than one of a class held
 camera, so it must be comparable between them.  Then ``reject`` asks for rates of false alarms: the share of unknown clips that are
 taken for a known action is what one got, beside the share of known clips that are answered, and answered rightly.
 Evidence of the baselines is minus the distance to the nearest exemplar; "best probability" is the largest of ``predict_proba``,
-as people take it from a softmax.  How the threshold is calibrated was chosen on UTKinect and Florence3D (leave-class-out among
-the exemplars), so rates on them are, if anything, too good.
+as people take it from a softmax.  The other ways (a to e) are those of :mod:`experiments.recognition.novelty`; ours is e with the
+profiles of both scorers.  How the threshold is calibrated was chosen on UTKinect and Florence3D (leave-class-out among the
+exemplars), so rates on them are, if anything, too good; the weight of the profiles is on a plateau of both.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from experiments.common.plots import curves
 from experiments.common.tables import command, note
 from experiments.recognition import protocol
 from experiments.recognition.contenders import NAMES, OPTIONS, Method, check_methods, contender
+from experiments.recognition.novelty import ways
 from experiments.recognition.protocol import Array, Rendered
 from indexing import Clip
 
@@ -52,6 +54,8 @@ class Config:
     """Classes that are not learned."""
     draws: int = 1
     """Repetitions: every class is held out once in each."""
+    ways: bool = True
+    """Whether other ways to tell unknown actions are compared (:mod:`experiments.recognition.novelty`)."""
     out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("results/open_set")
     """Where tables (JSON) and pictures are written."""
 
@@ -66,29 +70,43 @@ class Answers:
     evidence: dict[str, list[float]]
 
 
-def evidences(method: Method, learned: Any) -> dict[str, Callable[[Sequence[Clip]], Array]]:
-    """The ways in which a learned method says how well it knows a clip."""
+def evidences(
+    method: Method, learned: Any, clips: Sequence[Clip], labels: Array, compared: str | None
+) -> Callable[[Sequence[Clip]], dict[str, Array]]:
+    """What a learned method says of how well it knows clips, in all its ways.
+
+    Args:
+        clips, labels: that it has learned; compared: the set they are of, where other ways are compared with its own.
+    """
+    mine = NAMES[method]
     if method not in OPTIONS:
-        return {NAMES[method]: learned.evidence}
-    return {
-        NAMES[method]: learned.evidence,
-        f"{NAMES[method]}, best probability": lambda clips: learned.predict_proba(clips).max(axis=1),
-    }
+        return lambda asked: {mine: learned.evidence(asked)}
+    others = ways(learned, clips, labels, compared) if compared is not None else (lambda _: {})
+
+    def say(asked: Sequence[Clip]) -> dict[str, Array]:
+        return {
+            mine: learned.evidence(asked),
+            f"{mine}, best probability": learned.predict_proba(asked).max(axis=1),
+            **{f"{mine}, {way}": values for way, values in others(asked).items()},
+        }
+
+    return say
 
 
 def fold(
-    rendered: Rendered, train: Array, test: Array, method: Method, seed: int, config: Config, into: dict[int, Answers]
+    rendered: Rendered, train: Array, test: Array, method: Method, seed: int, config: Config, name: str, into: dict[int, Answers]
 ) -> None:
-    """Learn from some clips, ask about others, and add what was said, by azimuth."""
+    """Learn from some clips, ask about others, and add what was said, by azimuth; name: of the set."""
     clips, labels = [rendered.exemplars[i] for i in train], rendered.labels[train]
     learned: Any = contender(method, seed)()
     learned.fit(clips, labels)
     known = np.isin(rendered.labels[test], labels)
+    say = evidences(method, learned, clips, labels, name if config.ways else None)
     for turn, answers in into.items():
         asked = [rendered.queries[turn][i] for i in test]
         answers.known += known.tolist()
-        for name, evidence in evidences(method, learned).items():
-            answers.evidence.setdefault(name, []).extend(evidence(asked).tolist())
+        for way, values in say(asked).items():
+            answers.evidence.setdefault(way, []).extend(values.tolist())
     for rate in config.rates if method in OPTIONS else ():
         # what fitting with reject=rate does last, and all that depends on the rate: a new fit per rate takes four times as long
         learned.set_params(reject=rate, none_label=NONE)._calibrate()
@@ -114,7 +132,7 @@ def ask(name: str, method: Method, config: Config) -> dict[int, Answers]:
         rendered = protocol.render(clips, seed, turns=config.turns)
         for hidden in companies(rendered.labels, config.held_out, seed):
             for train, test in protocol.leave_one_subject_out(protocol.merged(rendered.subjects, FOLDS)):
-                fold(rendered, train[~np.isin(rendered.labels[train], hidden)], test, method, seed, config, into)
+                fold(rendered, train[~np.isin(rendered.labels[train], hidden)], test, method, seed, config, name, into)
     return into
 
 

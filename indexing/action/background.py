@@ -52,12 +52,6 @@ class OtherMovement:
     def __add__(self, other: OtherMovement) -> OtherMovement:
         return OtherMovement(self.clips + other.clips, self.kinds + other.kinds, self.sure + other.sure)
 
-    def without(self, kinds: Iterable[str]) -> OtherMovement:
-        """Those of other kinds."""
-        gone = set(kinds)
-        kept = [i for i, kind in enumerate(self.kinds) if kind not in gone]
-        return OtherMovement(*(tuple(part[i] for i in kept) for part in (self.clips, self.kinds, self.sure)))
-
     @property
     def numbers(self) -> Array:
         """``(clips,)`` the number of each clip's kind."""
@@ -91,7 +85,7 @@ def played_otherwise(
         orders = (frames[::-1], np.roll(frames, len(frames) // 2), np.concatenate([quarters[i] for i in (2, 0, 3, 1)]))
         for name, order in zip(ORDERS, orders, strict=True) if ordered else ():
             found.append((name, clip.replace(joints=clip.joints[order], confidence=None)))
-        seen = clip.seen.any(axis=0)
+        seen = np.asarray(clip.seen.any(axis=0))
         middle = np.zeros((1, *clip.joints.shape[1:]), dtype=clip.joints.dtype)
         middle[0, seen] = np.nanmean(clip.joints[:, seen], axis=0)
         for number in range(options.exchanges):

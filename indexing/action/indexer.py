@@ -211,14 +211,15 @@ class ActionIndexer(SavedClassifier):
         if people is not None:
             people = np.concatenate([people, [f"background: {kind}" for kind in other.kinds]])
         if len(classes) == 1:
-            exemplars, numbers, people = self._unlike(exemplars, numbers, people, other)
-        self._learn(exemplars, classes, numbers, layout_of(found), people)
-        if len(classes) == 1 and any(other.sure):
-            # what was given tells itself how near other movement comes to the action
-            given = self.model_.exemplars.crop(0)[len(found) : len(found) + sum(other.sure)]
-            self.model_ = dataclasses.replace(self.model_, evidence_out=self.model_.evidence(given))
-            self._calibrate()
-        return self
+            kept = self._unlike(exemplars, numbers, 1, np.arange(len(numbers)) < len(found), other)
+            if not kept[len(found) :].any():
+                raise ValueError(
+                    f"labels: only one class ({classes[0]!r}), and however its clips are played otherwise they come out the same; "
+                    "give background=, a recording of other movement, or clips of a second action"
+                )
+            exemplars, numbers, people = _only(kept, exemplars, numbers, people)
+        given = slice(len(found), len(found) + sum(other.sure))
+        return self._learn(exemplars, classes, numbers, layout_of(found), people, given)
 
     def _other_movement(self, found: Sequence[Clip], alone: bool, background: Iterable[Any] | None) -> OtherMovement:
         """What is not one of the actions: what was given, and where there is one action alone what is made."""
@@ -234,23 +235,22 @@ class ActionIndexer(SavedClassifier):
             other += people + played_otherwise(found, not len(people), options, rng)
         return other
 
-    def _unlike(
-        self, exemplars: Exemplars, numbers: Array, people: Array | None, other: OtherMovement
-    ) -> tuple[Exemplars, Array, Array | None]:
-        """Without the kinds of made movement that come out too much like the action; the kinds that are left are numbered anew.
+    def _unlike(self, exemplars: Exemplars, numbers: Array, known: int, new: Array, other: OtherMovement | None = None) -> Array:
+        """``(N,)`` bool, all exemplars but the background that comes out too much like new ones.
 
-        Raises:
-            ValueError: nothing is left.
+        Args:
+            numbers: ``(N,)`` classes, the first ``known`` of which are no background; new: ``(N,)`` bool; other: the background,
+                where it was made just now.
         """
-        like = alike(exemplars, numbers, other.kinds, self._options) & ~np.array(other.sure)
-        if like.all():
-            raise ValueError(
-                "labels: only one class, and however its clips are played otherwise they come out the same; give background=, a "
-                "recording of other movement, or clips of a second action"
-            )
-        kept = np.concatenate([np.ones(len(numbers) - len(like), dtype=bool), ~like])
-        numbers = np.unique(numbers[kept], return_inverse=True)[1]
-        return exemplars.only(torch.from_numpy(kept)), numbers, None if people is None else people[kept]
+        hidden = numbers >= known
+        asked = torch.from_numpy(new | hidden)
+        own = np.where(hidden, numbers - known + 1, 0)[new | hidden]
+        kinds = other.kinds if other is not None else ("",) * int(hidden.sum())
+        kept = np.ones(len(numbers), dtype=bool)
+        kept[hidden] = ~alike(exemplars.only(asked), own, kinds, self._options)
+        if other is not None:
+            kept[hidden] |= np.array(other.sure)
+        return kept
 
     @one_thread
     def partial_fit(
@@ -281,6 +281,10 @@ class ActionIndexer(SavedClassifier):
         seed = 0 if self.random_state is None else self.random_state
         rng = np.random.default_rng([seed, len(before)])
         extended = self.model_.exemplars.extended(cut(found, plan, rng, options=self._options))
+        if self.model_.hidden:
+            kept = self._unlike(extended, numbers, len(known), np.arange(len(numbers)) >= len(before))
+            if len(known) > 1 or kept[numbers >= len(known)].any():
+                extended, numbers, both = _only(kept, extended, numbers, both)
         return self._learn(extended, known, numbers, self.skeleton_, both)
 
     def _plan(self, views: int) -> ExemplarPlan:
@@ -294,8 +298,9 @@ class ActionIndexer(SavedClassifier):
         numbers: Array,
         skeleton: Skeleton | None,
         groups: Array | None,
+        given: slice = slice(0, 0),
     ) -> Self:
-        """Learn everything, and only then change anything."""
+        """Learn everything, and only then change anything; given: exemplars of background that are known not to be the action."""
         symmetry = None
         if self.mirror:
             originals = exemplars.crop(0)
@@ -322,7 +327,11 @@ class ActionIndexer(SavedClassifier):
             hidden=hidden,
         )
         there, labels = exemplars.to(self.device), torch.from_numpy(numbers).long().to(self.device)
-        self.model_: ShapeModel = learn(there, labels, len(classes) + hidden, lesson, options=self._options).to("cpu")
+        model = learn(there, labels, len(classes) + hidden, lesson, options=self._options).to("cpu")
+        if len(classes) == 1 and given.stop > given.start:
+            # these tell by themselves how near other movement comes to the action
+            model = dataclasses.replace(model, evidence_out=model.evidence(exemplars.crop(0)[given]))
+        self.model_: ShapeModel = model
         self.groups_ = groups
         self.classes_ = classes
         self.n_joints_ = int(exemplars.crops.values.shape[2])
@@ -495,11 +504,19 @@ class ActionIndexer(SavedClassifier):
         windows, seconds = exemplars.crop(0), exemplars.seconds
         joints = windows.values[index].numpy().copy()
         joints[:, ~windows.seen[index].numpy()] = np.nan
-        times = None if seconds is None else (np.arange(len(joints)) + 0.5) * max(float(seconds[index]), 1e-3) / len(joints)
+        timing: dict[str, Any] = {}
+        if seconds is not None:
+            timing["times"] = (np.arange(len(joints)) + 0.5) * max(float(seconds[index]), 1e-3) / len(joints)
         number = int(self.model_.labels[index])
         label = self.classes_[number] if number < len(self.classes_) else self.none_label
-        return Clip(joints, times=times, label=label, skeleton=self.skeleton_, name=f"exemplar {index}")
+        return Clip(joints, label=label, skeleton=self.skeleton_, name=f"exemplar {index}", **timing)
 
 
 def _default_views(clips: Sequence[Clip], options: ActionOptions) -> int:
     return options.exemplars.views_solid if any(clip.dims == 3 for clip in clips) else options.exemplars.views
+
+
+def _only(kept: Array, exemplars: Exemplars, numbers: Array, people: Array | None) -> tuple[Exemplars, Array, Array | None]:
+    """Some exemplars, their classes numbered anew, and who performs them."""
+    numbers = np.unique(numbers[kept], return_inverse=True)[1]
+    return exemplars.only(torch.from_numpy(kept)), numbers, None if people is None else people[kept]

@@ -312,7 +312,7 @@ def _evidence_out(tables: list[Tensor], model: ShapeModel) -> Tensor:
         among[0], asked[0] = among[0] - hub, asked[0] - hub
         profiles = _profiles(among, labels, classes, hidden, model.options)
         scores = [class_scores(table, labels, classes, options=model.options) for table in asked]
-        unusual = None if profiles is None else profiles.distance(torch.cat(scores, dim=1))
+        unusual = None if profiles is None else profiles.distance(torch.cat(scores, dim=1), classes)
         found.append(evidence(scores[0], model.classes, unusual, hidden, options=model.options))
         refused.append(scores[0].argmax(dim=1) >= classes - hidden)
     if not found:

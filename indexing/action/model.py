@@ -292,7 +292,7 @@ class ShapeModel:
         unusual = None
         if self.profiles is not None:
             alike = [self.kernel_scores(query)] if self.kernels is not None else []
-            unusual = self.profiles.distance(torch.cat([nearest, *alike], dim=1))
+            unusual = self.profiles.distance(torch.cat([nearest, *alike], dim=1), self.classes)
         return evidence(nearest, self.classes, unusual, self.hidden, options=self.options)
 
     def plain_scores(self, query: Windows) -> Tensor:

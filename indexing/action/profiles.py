@@ -54,18 +54,27 @@ class ClassProfiles:
         ridge = (options.profile_floor * scatter.diagonal()).clamp(min=1e-9)
         return cls(centres, torch.linalg.inv(scatter + ridge.diag()).to(profiles))
 
-    def distance(self, profiles: Tensor) -> Tensor:
+    def distance(self, profiles: Tensor, classes: int) -> Tensor:
         r"""``(Q,)`` how unusual profiles ``(Q, columns)`` are, in standard deviations of the class whose they resemble most.
 
         .. math:: m(p) = \min_c \sqrt{(p - \mu_c)^T P (p - \mu_c)}
+
+        Own scores above the mean count as the mean.
+
+        Args:
+            classes: how many columns each scorer has.
 
         Source: Lee et al. 2018 (Mahalanobis distance from the nearest class, pooled covariance).
 
         Example:
             >>> profiles = ClassProfiles(torch.tensor([[0.0, -4.0], [-4.0, 0.0]]), torch.eye(2))
-            >>> profiles.distance(torch.tensor([[0.0, -4.0], [-4.0, 3.0], [0.0, 0.0]])).tolist()
-            [0.0, 3.0, 4.0]
+            >>> profiles.distance(torch.tensor([[0.0, -4.0], [-4.0, -3.0], [0.0, 0.0], [9.0, -4.0]]), 2).tolist()
+            [0.0, 3.0, 4.0, 0.0]
         """
         apart = profiles[:, None] - self.centres
+        # who is nearer to a class than usual, as the same person is, is not unusual for it
+        known, columns = self.centres.shape
+        own = torch.arange(columns, device=apart.device) % classes == torch.arange(known, device=apart.device)[:, None]
+        apart = torch.where(own, apart.clamp(max=0.0), apart)
         squares = torch.einsum("qci,ij,qcj->qc", apart, self.precision, apart)
         return squares.amin(dim=1).clamp(min=0.0).sqrt()

@@ -36,8 +36,7 @@ if TYPE_CHECKING:
 FORMAT = "dyntorch.action-indexer"
 VERSION = 2
 SCORERS = ("nearest", "kernel", "both")
-KINDS = 10_000  # of background, at most
-JOINTS = 10_000  # at most; the largest layouts have some hundred
+MOST = 10_000  # joints, or kinds of background; the largest layouts have some hundred
 LEAST_SCALE = 1e-7  # of a kernel, over distances from 0 to 2
 
 Indexer = TypeVar("Indexer", bound="ActionIndexer")
@@ -77,9 +76,9 @@ def load(kind: type[Indexer], path: str | Path, device: str = "cpu") -> Indexer:
         )
         indexer.check_parameters()
         indexer.classes_ = labels_from_json(header["classes"])
-        indexer.n_joints_ = whole(header["joints"], "joints", 1, JOINTS)
+        indexer.n_joints_ = whole(header["joints"], "joints", 1, MOST)
         indexer.skeleton_ = skeleton_from_json(header["skeleton"], indexer.n_joints_)
-        hidden = whole(header.get("hidden", 0), "hidden", 0, KINDS)  # older files know no background
+        hidden = whole(header.get("hidden", 0), "hidden", 0, MOST)  # older files know no background
         indexer.model_ = _model(parts, header, _sizes(parts, indexer, hidden), hidden, indexer._options)
         indexer.groups_ = _groups(header["groups"], len(indexer.model_.labels))
         indexer._calibrate()

@@ -54,10 +54,11 @@ class Durations:
 
     def likelihoods(self, durations: Array, labels: Array, options: ExplanationOptions) -> Array:
         """``(durations, classes)`` log likelihood of each duration, a kernel density around the exemplars of each class."""
+        durations, again = np.unique(np.round(durations, 9), return_inverse=True)
         apart = np.log(durations)[:, None] - np.log(self.seconds)[None]
         near = np.exp(-0.5 * (apart / options.spread) ** 2)
         each = [near[:, labels == c].mean(axis=1) for c in range(len(self.typical))]
-        return np.asarray(np.log(np.stack(each, axis=1) + options.unlikely))
+        return np.log(np.stack(each, axis=1) + options.unlikely).astype(np.float32)[again]
 
 
 @dataclass(frozen=True)
@@ -72,20 +73,17 @@ class Lattice:
 
     @classmethod
     def over(cls, begin: float, end: float, durations: Durations, options: ExplanationOptions) -> Lattice:
-        """Of a stretch: windows of every duration that actions have; long ones begin and end at coarser steps, powers of two apart."""
+        """Of a stretch: windows of every duration that actions have, from every edge."""
         step = min(options.coarsest, float(durations.typical.min()) / options.step)
         cells = max(1, round((end - begin) / step))
         shortest, longest = options.reach * durations.seconds.min(), durations.seconds.max() / options.reach
         count = min(options.durations, int(np.ceil(np.log(longest / shortest) / np.log(options.ratio))) + 1)
         lengths = np.geomspace(shortest, longest, max(2, count)) / max(end - begin, 1e-9) * cells
-        strides = np.exp2(np.floor(np.log2(np.maximum(lengths / options.parts, 1.0)))).astype(np.intp)
-        lengths = np.clip(np.round(lengths / strides).astype(np.intp) * strides, 1, cells)
-        found = [
-            np.stack([first, first + k], axis=1)
-            for k, stride in sorted(set(zip(lengths.tolist(), strides.tolist(), strict=True)))
-            for first in [np.arange(0, cells - k + 1, stride)]
-        ]
-        return cls(begin + np.arange(cells + 1) * ((end - begin) / cells), _in_order(np.concatenate(found)))
+        lengths = np.unique(np.clip(np.round(lengths), 1, cells).astype(np.intp))
+        # in order of their last edges, then of their first ones: of each last edge the longest that fit, the longest first
+        last = np.repeat(np.arange(1, cells + 1), len(lengths))
+        windows = np.stack([last - np.tile(lengths[::-1], cells), last], axis=1)
+        return cls(begin + np.arange(cells + 1) * ((end - begin) / cells), windows[windows[:, 0] >= 0])
 
     @property
     def seconds(self) -> Array:
@@ -96,7 +94,11 @@ class Lattice:
         """``(W, columns)`` of ``(cells, columns)`` over each window."""
         total = np.vstack([np.zeros((1, cells.shape[1])), np.cumsum(cells, axis=0)])
         first, last = self.windows.T
-        return np.asarray((total[last] - total[first]) / (last - first)[:, None])
+        out = np.empty((len(first), cells.shape[1]), dtype=np.float32)  # an hour has hundreds of thousands of windows
+        for at in range(0, len(first), BLOCK):
+            some = slice(at, at + BLOCK)
+            out[some] = (total[last[some]] - total[first[some]]) / (last[some] - first[some])[:, None]
+        return out
 
     def cut(self, source: Ragged, stretch: int, chosen: Array, length: int) -> Windows:
         """Some windows, resampled."""
@@ -104,12 +106,6 @@ class Lattice:
         owner = np.full(len(chosen), stretch)
         values = sample(source, owner, self.edges[first], self.edges[last], length)
         return Windows(values, torch.from_numpy(source.seen[owner]))
-
-
-def _in_order(windows: Array) -> Array:
-    """Each once, by their last edge, then their first."""
-    windows = np.unique(windows, axis=0)
-    return np.asarray(windows[np.lexsort((windows[:, 0], windows[:, 1]))])
 
 
 def whole_scores(

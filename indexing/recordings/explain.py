@@ -21,7 +21,7 @@ from indexing.action.model import ShapeModel
 from indexing.action.stream import Progress, Stream, StreamScan, motion_levels, scan, wrong_contrast
 from indexing.clip import Clip
 from indexing.recordings.evidence import Array, Durations, Lattice, level, machine_scores, whole_scores
-from indexing.recordings.explanation import Explanation, Withheld
+from indexing.recordings.explanation import Explanation, Reason, Withheld
 from indexing.recordings.options import ExplanationOptions
 from indexing.recordings.tiling import TiledSegment, best_tiling, posterior, through
 from indexing.scoring import Event, event_levels
@@ -74,7 +74,7 @@ def explain(
     found: list[Event] = []
     held: list[Withheld] = []
     for one in stretches:
-        values, calm = _values(model, one, durations, wholes, stream.length, options)
+        values, calm, absent = _values(model, one, durations, wholes, stream.length, options)
         segments, _ = best_tiling(one.lattice.windows, values, calm)
         inside = posterior(one.lattice.windows, values, calm, options.temperature)
         first, end = one.frames
@@ -82,12 +82,15 @@ def explain(
         cell = np.clip(cell, 0, len(inside) - 1)
         scores[first:end] = _log(inside, options)[cell]
         background[first:end] = 1.0 - inside.sum(axis=1).clip(0.0, 1.0)[cell]
-        mine = [_event(model, one, part, values, classes, stream.length) for part in _joined(segments, durations, options)]
-        found += mine
-        awake = np.where(one.present, np.minimum(calm, options.background * _unit(one, durations)), calm)
-        restless, _ = best_tiling(one.lattice.windows, values, awake)
-        restless = _joined(restless, durations, options)
-        held += _at_rest([_event(model, one, part, values, classes, stream.length) for part in restless], mine)
+        mine = _joined(segments, durations, options)
+        found += _events(model, one, mine, values, classes, stream.length)
+        # what would be there, did rest and absence count as movement, and is not
+        awake = np.minimum(calm, options.background * _unit(one, durations))
+        restless, _ = best_tiling(one.lattice.windows, values + absent, awake)
+        silent = [part for part in _joined(restless, durations, options) if not _meets(part, mine)]
+        reasons: list[Reason] = ["nobody there" if not one.present[part.first : part.last].any() else "at rest" for part in silent]
+        told = _events(model, one, silent, values, classes, stream.length)
+        held += [Withheld(event, reason) for event, reason in zip(told, reasons, strict=True)]
     found, low = _levelled(model, found, rate)
     if progress is not None:
         progress(1.0)
@@ -131,39 +134,61 @@ def _stretches(
     return out
 
 
-def _values(
-    model: ShapeModel, one: Stretch, durations: Durations, wholes: tuple[float, float], length: int, options: ExplanationOptions
-) -> tuple[Array, Array]:
-    """``(W, classes)`` what each window is worth as a segment of each class, and ``(cells,)`` what background is worth.
+@dataclass(frozen=True)
+class _Worth:
+    """What windows are worth as segments of each class ``(W, classes)``, while nearest exemplars speak for the kernel machine.
 
-    A segment is worth its quality times its duration in ordinary exemplars, the likelihood of its duration, less what it costs to
-    begin one.  The kernel machine is asked of windows only that good explanations hold; until then the nearest exemplars speak
-    for it.
+    told: the same without what the machine says; share: of ``told``, by which that is weighed; background: ``(cells,)`` what
+    a cell is worth in no segment; absent: ``(W, 1)`` of ``values``, what is taken off where nobody is seen.
     """
-    lattice, cyclic = one.lattice, durations.cyclic[None]
+
+    values: Array
+    told: Array
+    share: Array
+    background: Array
+    absent: Array
+
+
+def _worth(
+    model: ShapeModel, one: Stretch, durations: Durations, wholes: tuple[float, float], options: ExplanationOptions
+) -> _Worth:
+    """A segment is worth its quality times its duration in ordinary exemplars, the likelihood of its duration, less what it costs
+    to begin one."""
+    lattice, cyclic = one.lattice, durations.cyclic[None].astype(np.float32)
     whole = np.nan_to_num((one.whole - wholes[0]) / wholes[1], nan=-2.0)
     unseen = options.absent * ~one.present
-    moments = options.moments * (1 + options.cyclic_moments * cyclic) * lattice.mean(one.contrast)
-    share = 1 - options.cyclic_whole * cyclic
     rest = _rest(model, one)
+    lasts = (lattice.seconds / durations.unit).astype(np.float32)[:, None]
+    absent = lasts * lattice.mean(unseen[:, None])
+    quality = options.moments * (1 + options.cyclic_moments * cyclic) * lattice.mean(one.contrast)
     # what moments say of cyclic actions counts more, so rest must, too
-    calmer = options.rest * options.cyclic_moments * cyclic * lattice.mean(rest.clip(min=0.0)[:, None])
-    base = moments + options.whole * share * whole - lattice.mean(unseen[:, None]) - calmer
-    each = whole - whole.mean(axis=1, keepdims=True)
-    proxy = each / np.maximum(each.std(axis=1, keepdims=True), 1e-9)
-    lasts = (lattice.seconds / durations.unit)[:, None]
-    labels = model.labels.cpu().numpy()
-    prior = options.duration * durations.likelihoods(lattice.seconds, labels, options) - options.entry
+    quality -= options.rest * options.cyclic_moments * cyclic * lattice.mean(rest.clip(min=0.0)[:, None])
+    weight = 1 - options.cyclic_whole * cyclic
+    quality += options.whole * weight * whole
+    prior = durations.likelihoods(lattice.seconds, model.labels.cpu().numpy(), options)
+    told = lasts * quality + options.duration * prior - options.entry - absent
+    share = options.machine * lasts * weight
+    proxy = whole - whole.mean(axis=1, keepdims=True)
+    proxy /= np.maximum(proxy.std(axis=1, keepdims=True), 1e-9)
     background = (options.background + options.rest * rest + unseen) * _unit(one, durations)
-    values = lasts * (base + options.machine * share * proxy) + prior
-    if model.kernels is None:
-        return values, background
-    total = through(lattice.windows, values, background)
-    survivors = np.flatnonzero(total >= total.max() - options.survive)
-    machine = machine_scores(model, lambda chosen: one.cut(chosen, length), survivors)
-    out = values.copy()
-    out[survivors] = lasts[survivors] * (base[survivors] + options.machine * share * machine) + prior[survivors]
-    return out, background
+    return _Worth(told + share * proxy, told, share, background, absent)
+
+
+def _values(
+    model: ShapeModel, one: Stretch, durations: Durations, wholes: tuple[float, float], length: int, options: ExplanationOptions
+) -> tuple[Array, Array, Array]:
+    """``(W, classes)`` what windows are worth as segments of each class, ``(cells,)`` what background is worth, ``(W, 1)`` what
+    absence takes off.
+
+    The kernel machine is asked of windows only that good explanations hold; until then the nearest exemplars speak for it.
+    """
+    worth = _worth(model, one, durations, wholes, options)
+    if model.kernels is not None:
+        total = through(one.lattice.windows, worth.values, worth.background)
+        survivors = np.flatnonzero(total >= total.max() - options.survive)
+        machine = machine_scores(model, lambda chosen: one.cut(chosen, length), survivors)
+        worth.values[survivors] = worth.told[survivors] + worth.share[survivors] * machine
+    return worth.values, worth.background, worth.absent
 
 
 def _rest(model: ShapeModel, one: Stretch) -> Array:
@@ -185,25 +210,29 @@ def _joined(segments: list[TiledSegment], durations: Durations, options: Explana
     return out
 
 
-def _event(model: ShapeModel, one: Stretch, part: TiledSegment, values: Array, classes: Sequence[Any], length: int) -> Event:
-    """A segment as it is told: its score is the mean contrast of its moments, its margin what it is worth above the next class."""
-    score = float(one.raw[part.first : part.last, part.label].mean())
-    others = np.delete(values[part.window], part.label)
-    mine = (model.labels == part.label).nonzero()[:, 0]
-    residual = model.whole_residuals(one.cut(np.array([part.window]), length).to(mine.device), mine)
-    start, end = one.lattice.edges[part.first], one.lattice.edges[part.last]
-    margin = float(values[part.window, part.label] - others.max()) if len(others) else 0.0
-    exemplar = int(mine[int(torch.argmin(residual[0]))])
-    return Event(classes[part.label], float(start), float(end), score, margin, exemplar)
+def _events(
+    model: ShapeModel, one: Stretch, parts: Sequence[TiledSegment], values: Array, classes: Sequence[Any], length: int
+) -> list[Event]:
+    """Segments as they are told: score: mean contrast of their moments; margin: what they are worth above the next class."""
+    if not parts:
+        return []
+    windows = one.cut(np.array([part.window for part in parts]), length).to(model.labels.device)
+    residual = model.whole_residuals(windows, torch.arange(len(model.labels), device=model.labels.device))
+    others = model.labels[None] != torch.tensor([part.label for part in parts], device=model.labels.device)[:, None]
+    nearest = residual.masked_fill(others, torch.inf).argmin(dim=1).tolist()
+    found = []
+    for part, exemplar in zip(parts, nearest, strict=True):
+        score = float(one.raw[part.first : part.last, part.label].mean())
+        next_best = np.delete(values[part.window], part.label).max(initial=-np.inf)
+        margin = float(values[part.window, part.label] - next_best) if np.isfinite(next_best) else 0.0
+        start, end = one.lattice.edges[part.first], one.lattice.edges[part.last]
+        found.append(Event(classes[part.label], float(start), float(end), score, margin, exemplar))
+    return found
 
 
-def _at_rest(awake: list[Event], found: list[Event]) -> list[Withheld]:
-    """What would be there, did rest count as movement, and is not."""
-    return [
-        Withheld(event, "at rest")
-        for event in awake
-        if not any(min(event.end, other.end) - max(event.start, other.start) > 0 for other in found)
-    ]
+def _meets(part: TiledSegment, others: Sequence[TiledSegment]) -> bool:
+    """Whether a segment shares any cell with some others."""
+    return any(min(part.last, other.last) > max(part.first, other.first) for other in others)
 
 
 def _levelled(model: ShapeModel, found: list[Event], rate: float | None) -> tuple[list[Event], list[Withheld]]:

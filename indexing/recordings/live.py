@@ -26,7 +26,7 @@ from indexing.clip import Clip
 from indexing.estimator import is_number
 from indexing.joints import matched_all
 from indexing.recordings.evidence import Durations, Lattice
-from indexing.recordings.explain import Stretch, _event, _log, _values
+from indexing.recordings.explain import Stretch, _events, _log, _values
 from indexing.recordings.options import ExplanationOptions
 from indexing.recordings.tiling import TiledSegment, best_tiling, posterior
 from indexing.scoring import Event, event_levels
@@ -359,7 +359,7 @@ class ActionStream:
         one = Stretch(self._source(frames), lattice, cells.raw, cells.raw / spread, cells.motion, cells.present, whole, (0, frames))
         if not len(row):
             return _Tiled(one, np.zeros((0, model.classes)), {}, np.zeros((count, model.classes)))
-        values, calm = _values(model, one, self._durations, self._wholes.level(), self._look.length, options)
+        values, calm, _ = _values(model, one, self._durations, self._wholes.level(), self._look.length, options)
         segments, _ = best_tiling(lattice.windows, values, calm)
         likely = posterior(lattice.windows, values, calm, options.temperature)
         return _Tiled(one, values, {each.first: each for each in segments}, likely)
@@ -411,7 +411,7 @@ class ActionStream:
 
     def _event(self, tiled: _Tiled, part: TiledSegment) -> Event:
         """As it is told, on the clock of the stream."""
-        event = _event(self.source.model, tiled.one, part, tiled.values, self.classes, self._look.length)
+        (event,) = _events(self.source.model, tiled.one, [part], tiled.values, self.classes, self._look.length)
         last = float(self._at[-1])
         return replace(event, start=min(event.start, last) + self._begin, end=min(event.end, last) + self._begin)
 

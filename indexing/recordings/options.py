@@ -24,8 +24,6 @@ class ExplanationOptions:
     """Times the shortest exemplar (and the longest, divided by it): the durations of windows."""
     durations: int = 24
     """At most; of exemplars that differ more the ratio grows."""
-    parts: float = 8.0
-    """Steps that a window is at least divided into: long ones begin and end at every second, fourth, ... of the recording's steps."""
     tempo: float = 2.0
     """Times longer or shorter than an exemplar up to which a window is compared with it."""
     spread: float = 0.35
@@ -82,8 +80,8 @@ class LiveOptions:
     """Seconds of frames that are looked at together: a part of the lag."""
     horizon: float = 1.25
     """Of the usual duration of the longest action: so much of what follows a moment is looked at before it is decided.  With half
-    of it long actions are not found.  F1 of events, thirteen synthetic actions at 0 / 60 degrees, exercises at 0 / 90: 1: .94 / .91,
-    .77 / .64; 1.25: .93 / .90, .79 / .69; 2: .93 / .89, .79 / .72; where recordings are known as a whole: .93 / .89, .79 / .77."""
+    of it long actions are not found.  F1 of events, thirteen synthetic actions at 0 / 60 degrees, exercises at 0 / 90: 1: .94 /
+    .91, .77 / .64; 1.25: .93 / .90, .79 / .69; 2: .93 / .89, .79 / .72; where recordings are known as a whole: .93 / .89, .79 / .77."""
     memory: float = 300.0
     """Seconds by which levels of scores are told, at most: cameras and people change."""
     recent: int = 30

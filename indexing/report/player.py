@@ -25,7 +25,6 @@ from indexing.report.results import RecognitionReport, RecordingResult, Reported
 from indexing.skeleton import known
 
 Array = NDArray[Any]
-MISSING = np.iinfo(np.int32).min
 PIECE = 6000  # frames that are searched at once for joints in wrong places: bounds memory
 FOUND, KNOWN, HELD = range(3)  # kinds of bars of the strip
 
@@ -176,7 +175,7 @@ def _player(
         ],
         key=lambda bar: (bar[1], bar[3]),
     )
-    usual = float(np.median([np.median(np.diff(part.clip.times)) for part in parts if len(part.clip) > 1] or [0.0]))
+    usual = float(np.median([float(np.median(np.diff(part.clip.times))) for part in parts if len(part.clip) > 1] or [0.0]))
     data = {
         "people": people, "view": view, "actions": [[str(clean(name)), colour] for name, colour in paint.items()],
         "bars": bars[: options.bars], "absent": 1000 * (options.absent + max(1.5 / rates[1], 3 * usual)),

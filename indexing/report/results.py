@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from indexing.recordings.repetitions import RepetitionCount
 
 Truth = tuple[Hashable, float, float]
-OVERLAP = 0.5  # of the time of both together that a right event shares with a known action, as benchmarks of detection ask
 
 
 class ReportedEvent(Protocol):
@@ -300,12 +299,15 @@ def confused_with(confusion: Mapping[str, Any], label: str) -> tuple[str, int] |
     return row.most_common(1)[0] if row else None
 
 
-def matched(recording: RecordingResult) -> int:
+def matched(recording: RecordingResult, overlap: float = 0.5) -> int:
     r"""How many events are right: each of a known action of its own, of the same name, with which it shares enough of the time,
 
-    .. math:: \frac{|event \cap known|}{|event \cup known|} \ge \tfrac12 .
+    .. math:: \frac{|event \cap known|}{|event \cup known|} \ge overlap .
 
     Pairs are taken in order of what they share, so no known action makes two events right.
+
+    Args:
+        overlap: share of the time of both together; half of it is what benchmarks of detection ask.
 
     Example:
         >>> from indexing.scoring import Event
@@ -321,7 +323,7 @@ def matched(recording: RecordingResult) -> int:
                 pairs.append((shared / (max(event.end, end) - min(event.start, start)), i, j))
     used: set[tuple[str, int]] = set()
     for share, i, j in sorted(pairs, reverse=True):
-        if share >= OVERLAP and not {("event", i), ("known", j)} & used:
+        if share >= overlap and not {("event", i), ("known", j)} & used:
             used |= {("event", i), ("known", j)}
     return len(used) // 2
 

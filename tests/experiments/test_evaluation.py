@@ -11,7 +11,7 @@ import pytest
 from experiments.common import plots
 from experiments.common.book import Book
 from experiments.common.tables import Row
-from experiments.recognition import corruptions, open_set, protocol, recognition_protocol, robustness
+from experiments.recognition import corruptions, novelty, open_set, protocol, recognition_protocol, robustness
 from experiments.recognition.baselines import ImageNearest
 from experiments.recognition.contenders import NAMES, check_methods, contender, sliding
 from indexing import ActionIndexer, Clip, ClipSet
@@ -200,7 +200,8 @@ def test_open_set_runs(folder: Path, monkeypatch, capsys) -> None:
     monkeypatch.setitem(open_set.OPTIONS, "equal", FAST)
     monkeypatch.setattr(open_set, "FOLDS", 2)
     out = folder / "out"
-    open_set.run(open_set.Config(sets=("utkinect",), methods=("equal", "image"), held_out=2, turns=(0,), rates=(0.3,), out=out))
+    asked = {"held_out": 2, "turns": (0,), "rates": (0.3,), "ways": False}
+    open_set.run(open_set.Config(sets=("utkinect",), methods=("equal", "image"), out=out, **asked))
     tables, pictures = written(out)
     areas, rates = tables.values()
     assert set(areas["lines"]) == {"ours", "ours, best probability", "2D nearest neighbour"}
@@ -209,6 +210,21 @@ def test_open_set_runs(folder: Path, monkeypatch, capsys) -> None:
     assert 0 <= alarms < kept and right <= kept
     assert pictures == ["rates_utkinect.png"]
     capsys.readouterr()
+
+
+def test_ways_to_tell_unknown_actions() -> None:
+    clips = dataset(4, ACTIONS, takes=2, azimuth=0.0, fps=12.0, rng=0)
+    taught, asked = [c for c in clips if c.label != "punch" and c.meta["subject"] < 3], list(clips.select(subject=3))
+    indexer = ActionIndexer(**FAST).fit(taught)
+    said = novelty.ways(indexer, taught, np.array([clip.label for clip in taught]), "actors")(asked)
+    assert {way[0] for way in said if way[1] == ":"} == set("abcde")  # five ways that are compared
+    assert all(values.shape == (len(asked),) and np.isfinite(values).all() for values in said.values())
+    known = np.array([clip.label != "punch" for clip in asked])
+    best = said["e: with the profiles of the nearest"]
+    assert best[known].mean() > best[~known].mean()
+    few = [next(clip for clip in clips if clip.label == label) for label in ACTIONS]
+    with pytest.raises(ValueError, match="one exemplar only"):
+        novelty.ways(ActionIndexer(**FAST).fit(few), few, np.array(ACTIONS), "actors")
 
 
 def test_the_rate_asked_for_is_that_of_a_new_fit(people: ClipSet) -> None:

