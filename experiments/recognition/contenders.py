@@ -12,20 +12,37 @@ from torch import Tensor
 
 from experiments.recognition.baselines import Array, ImageNearest, Nearest, WarpedNearest
 from experiments.recognition.protocol import Classifier
+from experiments.recognition.short_windows import ShortWindows
 from indexing import ActionIndexer, Clip
 from indexing.action.bank import Windows
 from indexing.action.model import ShapeModel
+from indexing.action.options import ActionOptions
+from indexing.recordings.options import ExplanationOptions
 from indexing.scoring import Event
 
-Method = Literal["equal", "learned", "unrepaired", "image", "dtw"]
+Part = Literal["short windows", "whole exemplars", "kernel machine", "durations", "priors", "rest", "background"]
+Method = Literal["equal", "learned", "unrepaired", "windows", "image", "dtw"]
 NAMES: dict[Method, str] = {
     "equal": "ours",
     "learned": "ours, learned weights",
     "unrepaired": "ours, joints not repaired",
+    "windows": "short windows alone",
     "image": "2D nearest neighbour",
     "dtw": "DTW",
 }
 OPTIONS: dict[Method, dict[str, Any]] = {"equal": {}, "learned": {"weights": "learned"}, "unrepaired": {"repair": False}}
+
+
+# what the explanation of a recording is without one of its parts
+WITHOUT: dict[Part, ExplanationOptions] = {
+    "short windows": ExplanationOptions(moments=0.0),
+    "whole exemplars": ExplanationOptions(whole=0.0),
+    "kernel machine": ExplanationOptions(machine=0.0),
+    "durations": ExplanationOptions(durations=2),  # the shortest and the longest alone
+    "priors": ExplanationOptions(duration=0.0),
+    "rest": ExplanationOptions(rest=0.0),
+    "background": ExplanationOptions(background=-100.0),
+}
 
 
 def contender(method: Method, seed: int = 0, **options: Any) -> Callable[[], Classifier]:
@@ -37,13 +54,16 @@ def contender(method: Method, seed: int = 0, **options: Any) -> Callable[[], Cla
     return partial(ActionIndexer, random_state=seed, **OPTIONS[method], **options)
 
 
-def sliding(method: Method, seed: int = 0) -> ActionIndexer | Sliding:
-    """A new scorer of the frames of a stream."""
+def sliding(method: Method, seed: int = 0, without: Part | None = None) -> ActionIndexer | Sliding | ShortWindows:
+    """A new scorer of the frames of a stream; of ours also without one part of the explanation."""
+    if method == "windows":
+        return ShortWindows(seed)
     if method == "image":
         return Sliding(ImageNearest())
     if method == "dtw":
         return Sliding(WarpedNearest())
-    return ActionIndexer(random_state=seed, **OPTIONS[method])
+    options = None if without is None else ActionOptions(recordings=WITHOUT[without])
+    return ActionIndexer(random_state=seed, options=options, **OPTIONS[method])
 
 
 def check_methods(methods: Sequence[Method]) -> None:
@@ -91,7 +111,7 @@ class Sliding:
         """Keep the exemplars' short windows."""
         self.indexer = ActionIndexer(scorer="nearest", search=False, mirror=False, virtual_views=0).fit(clips, labels)
         model = self.indexer.model_
-        same = {field.name: getattr(model, field.name) for field in dataclasses.fields(model)}
+        same = {field.name: getattr(model, field.name) for field in dataclasses.fields(model) if field.init}
         bank = self.nearest.describe(model.exemplars.moments.values)
         self.indexer.model_ = _Nearest(**same, nearest=self.nearest, bank=bank)
         self.classes_: Array = self.indexer.classes_

@@ -18,15 +18,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import tyro
 from scipy.signal import find_peaks
 
-from experiments.benchmarks.interleaved import threads
-from experiments.common.book import Book
-from experiments.common.tables import Row, command, note
 from experiments.recognition.protocol import Array
 from indexing import ActionIndexer, Clip, PhaseIndexer
 from indexing.actors import ACTIONS, Person, dataset, detect, perform, stream

@@ -220,7 +220,7 @@ def segment_evidence(model: ShapeModel, clip: Clip, events: Sequence[Event], len
 def without_background(
     told: Explanation, classes: Sequence[Any], least: float, enough: Callable[[Sequence[Event]], NDArray[np.bool_]]
 ) -> Explanation:
-    """What is said of the known actions: other movement is told as held back.
+    """What is said of the known actions: other movement is left out, or told as held back where it has their evidence.
 
     Args:
         told: its last classes are background; classes: the known labels; least: score of an event; enough: which events of
@@ -236,10 +236,12 @@ def without_background(
     held += [
         Withheld(event, "below the level") for event, fine in zip(mine, good, strict=True) if not (fine and event.score >= least)
     ]
-    for event in told.events:
-        if event.label not in told.classes[:known]:
-            inside = (told.times >= event.start) & (told.times <= event.end)
-            nearest = int(scores[inside].mean(axis=0).argmax()) if inside.any() else 0
-            held.append(Withheld(dataclasses.replace(event, label=classes[nearest]), "other movement"))
+    # background wins everywhere else; where the action has evidence, too, that is worth telling
+    others = [event for event in told.events if event.label not in told.classes[:known]]
+    for event, like in zip(others, enough(others), strict=True):
+        inside = (told.times >= event.start) & (told.times <= event.end)
+        if like and inside.any():
+            label = classes[int(scores[inside].mean(axis=0).argmax())]
+            held.append(Withheld(dataclasses.replace(event, label=label), "other movement"))
     held.sort(key=lambda one: one.event.start)
     return dataclasses.replace(told, classes=tuple(classes), scores=scores, events=events, withheld=held, background=1.0 - likely)

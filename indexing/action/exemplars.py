@@ -109,7 +109,7 @@ def cut(
     cropped = stack([Windows(whole(source, plan.length, crop), seen) for crop in crops])
     views = [_view(clips, source, plan, random_state, options) for _ in range(plan.views)]
     seconds = torch.tensor([lasts(clip) for clip in images], dtype=torch.float32)
-    window = moment_window(plan.window, seconds)
+    window = moment_window(plan.window, seconds, options.exemplars)
     moments, owner = slide(source, plan.length, window, plan.stride * window / plan.window)
     solid = torch.tensor([clip.dims == 3 for clip in clips])
     return Exemplars(
@@ -123,9 +123,9 @@ def lasts(clip: Clip) -> float:
     return float(clip.duration + (np.median(steps) if len(steps) else 0.0))
 
 
-def moment_window(longest: float, seconds: torch.Tensor | None) -> float:
-    """Seconds of a short window: half an ordinary exemplar, so that one lasts less than the action, and ``longest`` at most."""
-    return longest if seconds is None else min(longest, 0.5 * float(seconds.median()))
+def moment_window(longest: float, seconds: torch.Tensor | None, options: ExemplarOptions) -> float:
+    """Seconds of a short window: a part of an ordinary exemplar, and ``longest`` at most."""
+    return longest if seconds is None else min(longest, options.moment * float(seconds.median()))
 
 
 def recurrence(source: Ragged, options: ExemplarOptions) -> torch.Tensor:

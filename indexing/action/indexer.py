@@ -398,7 +398,7 @@ class ActionIndexer(SavedClassifier):
 
     # ---- long recordings ---------------------------------------------------------------------------------------------
     def _stream(self) -> Stream:
-        return Stream(self.length, self.window, tuple(self.tempi), self.pool, self.device)
+        return Stream(self.length, self.window, tuple(self.tempi), self.device)
 
     @one_thread
     def explain(self, clip: Any, progress: Callable[[float], None] | None = None) -> Explanation:

@@ -27,11 +27,13 @@ class ExemplarOptions:
     """Its standard deviation, radians."""
     pitch: float = 0.1
     """Standard deviation of the pitch of turned cards, radians."""
+    moment: float = 0.5
+    """Of the duration of an ordinary exemplar: how long a short window lasts at most, so that one holds less than the action."""
     recurrence_steps: int = 96
     """Steps in which an exemplar is compared with itself: eight of each cycle where it holds twelve."""
     touching: int = 2
-    """Steps apart (one step is smoothed into the next) whose autocorrelation only noise keeps from 1: with 15 mm of it on every joint
-    a jog of exercises repeats itself to .48, measured by these to .74; what is performed once stays below .36."""
+    """Steps apart (one step is smoothed into the next) whose autocorrelation only noise keeps from 1: with 15 mm of it on every
+    joint a jog of exercises repeats itself to .48, measured by these to .74; what is performed once stays below .36."""
     fallen: float = 0.3
     """Autocorrelation below which a movement has left the pose that it may come back to."""
     unexplained: float = 0.01
@@ -167,18 +169,7 @@ class ImportanceOptions:
 
 @dataclass(frozen=True)
 class EventOptions:
-    """Long recordings: levels that events reach, and when a person rests.
-
-    ``false_alarms`` and ``still`` on streams of 13 synthetic actions, other people, other views: recall .94 at 13 % false finds
-    with short rests, .91 at 13 % with long ones (rate .1: .62 at 11 %; .5: .9 at 40 %; still .1: 35 % false in long rests; .3:
-    recall .89).
-
-    Rest, with one clip each of 13 synthetic actions, eight other people in three views, rests of 1 / 7 s, and on six exercises.
-    As written here: F1 .910 / .899, .051 / .006 of the resting time inside an event, frames of the exercises found and right .882,
-    .780, .872.  Below ``still`` at rest for all actions alike: .890 / .880, .051 / .004 and .862, .606, .791, because what is
-    calmer than the other actions is never found.  Below its own calm moments only: .888 / .867 and .911, .845, .895.  Never at
-    rest: .089 / .122 of the resting time inside an event.
-    """
+    """The short windows along a recording, and when a person rests."""
 
     step: float = 0.2
     """Seconds between the short windows of a recording; .1 is as good (frames of exercises, actors, UTKinect: +-.002)."""
@@ -186,24 +177,10 @@ class EventOptions:
     """Share of a window's frames that must show the person."""
     margin: float = 2.0
     """Seconds of frames on both sides of a block from which missing joints are interpolated."""
-    pool: float = 0.7
-    """Of the indexer's ``pool``, over which scores are averaged for events: they need sharper ends than frames."""
-    false_alarms: float = 0.3
-    """Rate at which a wrong action may reach an event's peak."""
-    extent: float = 1.7
-    """Times that rate for the level that an event's ends reach."""
-    least: tuple[float, float] = (1.0, 0.6)
-    """Least level of the peak and of the ends: among two or three classes the calibration has little or nothing to compare."""
     still: float = 0.25
     """Quantile of the motion of all exemplars' short windows: who moves less is still, as actions go."""
-    doubt: float = 0.5
-    """Part of the way to a convincing contrast that being still takes (.35: exercises .911, .835, .886, more finds at rest)."""
     calm: float = 0.1
     """Quantile of the motion of one action's short windows: who moves less than its calm ones rests."""
-    hush: float = 1.2
-    """Times less motion than that, from which a person rests whatever the contrast, unless it is convincing."""
-    convincing: float = 0.99
-    """Quantile of the contrast of wrong actions that is convincing (a wave moves one hand only)."""
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,8 @@
-"""Untrimmed recordings: a score for every frame, and the events they form."""
+"""Short windows along an untrimmed recording: what each moment looks like, and how much the person moves."""
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +14,6 @@ from indexing.action.bank import Windows, channel, stack
 from indexing.action.model import ShapeModel
 from indexing.action.options import ActionOptions
 from indexing.clip import Clip, stretches
-from indexing.scoring import Event, event_levels, events, smooth
 from indexing.windows import Ragged, ragged, sample
 
 Array = NDArray[Any]
@@ -31,7 +29,6 @@ class Stream:
     length: int
     window: float
     tempi: tuple[float, ...]
-    pool: float
     device: str
 
 
@@ -103,7 +100,7 @@ def scan(model: ShapeModel, clip: Clip, stream: Stream, progress: Progress = Non
     scores, motion = np.empty((len(at), model.classes)), np.empty(len(at))
     for begin in range(0, len(at), BLOCK):
         part = slice(begin, begin + BLOCK)
-        source, own = _around(clip, cuts, at[part], owner[part], stream, model.options)
+        source, own = around(clip, cuts, at[part], owner[part], stream, model.options)
         scores[part], motion[part] = moments(model, source, own, at[part], stream)
         if progress is not None:
             progress(min(1.0, (begin + BLOCK) / len(at)))
@@ -115,9 +112,9 @@ def scan(model: ShapeModel, clip: Clip, stream: Stream, progress: Progress = Non
 def moments(model: ShapeModel, source: Ragged, owner: Array, at: Array, stream: Stream) -> tuple[Array, Array]:
     """Class scores ``(T, classes)`` and motion ``(T,)`` of windows centred at some times, the best of all tempi."""
     # all tempi at once: the exemplars are described once for all of them
-    queries = stack([_windows(source, owner, at, stream.window * tempo, stream.length) for tempo in stream.tempi])
+    queries = stack([windows_at(source, owner, at, stream.window * tempo, stream.length) for tempo in stream.tempi])
     found = model.moment_scores(queries.to(stream.device)).unflatten(0, (len(stream.tempi), -1))
-    return found.amax(dim=0).cpu().numpy(), _motion(_windows(source, owner, at, stream.window, stream.length))
+    return found.amax(dim=0).cpu().numpy(), _motion(windows_at(source, owner, at, stream.window, stream.length))
 
 
 def presence(clip: Clip, cuts: Array, at: Array, owner: Array, stream: Stream, options: ActionOptions) -> Array:
@@ -131,7 +128,7 @@ def presence(clip: Clip, cuts: Array, at: Array, owner: Array, stream: Stream, o
     return np.asarray(high - low >= np.maximum(2.0, options.events.shown * span * rate))
 
 
-def _around(clip: Clip, cuts: Array, at: Array, owner: Array, stream: Stream, options: ActionOptions) -> tuple[Ragged, Array]:
+def around(clip: Clip, cuts: Array, at: Array, owner: Array, stream: Stream, options: ActionOptions) -> tuple[Ragged, Array]:
     """The frames that windows centred at some times can touch, and some more to interpolate missing joints from.
 
     Returns:
@@ -148,98 +145,12 @@ def _around(clip: Clip, cuts: Array, at: Array, owner: Array, stream: Stream, op
     return ragged(pieces), own
 
 
-def _windows(source: Ragged, owner: Array, middle: Array, seconds: float, length: int) -> Windows:
+def windows_at(source: Ragged, owner: Array, middle: Array, seconds: float, length: int) -> Windows:
     # windows at the ends are shifted inwards rather than padded with a frozen pose
     begin, end = source.times[source.starts[:-1]][owner], source.times[source.starts[1:] - 1][owner]
     start = np.clip(middle - seconds / 2, begin, begin + np.maximum(0.0, end - begin - seconds))
     values = sample(source, owner, start, np.minimum(start + seconds, end), length)
     return Windows(values, torch.from_numpy(source.seen[owner]))
-
-
-def frame_scores(clip: Clip, stream: Stream, found: StreamScan) -> Array:
-    """``(frames, classes)``: the window scores, pooled and read off at the clip's own frames."""
-    scores = np.full((len(clip), found.scores.shape[1]), found.nothing)
-    for windows, frames in found.parts():
-        at = found.times[windows]
-        pooled = smooth(found.scores[windows], at, stream.pool)
-        scores[frames] = np.stack([np.interp(clip.times[frames], at, column) for column in pooled.T], axis=1)
-    return scores
-
-
-def find_events(
-    model: ShapeModel, clip: Clip, stream: Stream, windows: StreamScan, classes: Sequence[Any] | Array, rate: float | None
-) -> list[Event]:
-    """Events of a recording, each with the exemplar that fits its middle best.
-
-    Found on the contrast: how far the best class stands above the mean of all.  Unlike the score itself it hardly changes
-    with the viewpoint, so levels calibrated among the exemplars hold for other views.  A person who moves less than the calm
-    moments of that class is at rest, unless the contrast is convincing (:func:`at_rest`).
-
-    Args:
-        windows: of :func:`scan`.
-        rate: at which the contrast of wrong actions may reach the level that an event needs (0.3 by default); a number
-            outside 0..1 is that level itself.
-    """
-    wrong, (still, calm) = wrong_contrast(model), motion_levels(model)
-    peak, floor = event_levels(
-        wrong, model.options.events.false_alarms if rate is None else rate, model.options.events.extent, model.options.events.least
-    )
-    convincing = max(peak, float(np.quantile(wrong, model.options.events.convincing)))
-    found: list[Event] = []
-    for part, frames in windows.parts():
-        at = windows.times[part]
-        scores = smooth(windows.scores[part], at, model.options.events.pool * stream.pool)
-        contrast = scores - scores.mean(axis=1, keepdims=True)
-        motion = smooth(windows.motion[part, None], at, stream.window)[:, 0]
-        resting = at_rest(contrast, motion, still, calm, (floor, convincing), options=model.options) | ~windows.present[part]
-        ends = np.minimum(at, clip.times[frames][-1])
-        found += events(contrast, ends, list(classes), peak, floor, resting, model.options.decisions)
-    return _with_exemplars(model, clip, stream, windows.stretches, classes, found)
-
-
-def at_rest(
-    contrast: Array, motion: Array, still: float, calm: Array, levels: tuple[float, float], options: ActionOptions = ActionOptions()
-) -> Array:
-    """``(T,)`` whether a person rests, whatever action it looks like.
-
-    The less a person moves, the more contrast it takes: between the level that every event needs and the convincing one.
-
-    Args:
-        contrast: ``(T, classes)``; motion: ``(T,)``.
-        still: motion below which most actions do not go; calm: ``(classes,)`` motion of the calm moments of each.
-        levels: the contrast of an event, and the convincing one.
-
-    Example:
-        >>> contrast, calm = np.array([[2.0, -2.0]] * 4), np.array([0.1, 0.5])
-        >>> at_rest(contrast, np.array([0.4, 0.2, 0.09, 0.01]), 0.3, calm, (1.0, 4.0)).tolist()
-        [False, True, True, True]
-        >>> at_rest(contrast + 1, np.array([0.4, 0.2, 0.09, 0.01]), 0.3, calm, (1.0, 4.0)).tolist()
-        [False, False, False, True]
-    """
-    own = np.minimum(still, calm[contrast.argmax(axis=1)])
-    less = np.log(np.maximum(own, 1e-30) / np.maximum(motion, 1e-30)) / np.log(options.events.hush)
-    way = np.maximum(np.clip(less, 0.0, 1.0), options.events.doubt * (motion < still))
-    return np.asarray(contrast.max(axis=1) < levels[0] + (levels[1] - levels[0]) * way)
-
-
-def _with_exemplars(
-    model: ShapeModel, clip: Clip, stream: Stream, cuts: Array, classes: Sequence[Any] | Array, found: list[Event]
-) -> list[Event]:
-    """Each event with the number of the exemplar of its class that fits its middle best."""
-    if not found:
-        return []
-    numbers = {label: i for i, label in enumerate(classes)}
-    middles = np.array([(event.start + event.end) / 2 for event in found])
-    owner = np.searchsorted(clip.times[cuts[:, 0]], middles, side="right") - 1
-    queries = []
-    for some in np.split(np.arange(len(found)), np.flatnonzero(np.diff(middles // (BLOCK * model.options.events.step))) + 1):
-        source, own = _around(clip, cuts, middles[some], owner[some], stream, model.options)
-        queries.append(_windows(source, own, middles[some], stream.window, stream.length))
-    residual = model.moment_residuals(stack(queries).to(stream.device))
-    owners = model.labels[model.exemplars.owner]
-    mine = torch.tensor([numbers[event.label] for event in found], device=owners.device)[:, None] == owners
-    nearest = model.exemplars.owner[torch.where(mine, residual, torch.inf).argmin(dim=1)].tolist()
-    return [dataclasses.replace(event, exemplar=exemplar) for event, exemplar in zip(found, nearest, strict=True)]
 
 
 def _motion(windows: Windows) -> Array:

@@ -61,8 +61,7 @@ def explain(
             ``None``: what is worth more than the background is reported.
     """
     options = model.options.recordings
-    kept = model.exemplars.seconds
-    stream = dataclasses.replace(stream, window=moment_window(stream.window, kept))
+    stream = dataclasses.replace(stream, window=moment_window(stream.window, model.exemplars.seconds, model.options.exemplars))
     durations = Durations.of(model, stream.window, 0.3 * stream.window, options)
     events = dataclasses.replace(model.options.events, step=min(model.options.events.step, stream.window / 4))
     finer = model.with_options(dataclasses.replace(model.options, events=events))

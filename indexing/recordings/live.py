@@ -167,7 +167,7 @@ class ActionStream:
         self.source, self.up, self.skeleton, self.classes = source, up, skeleton, source.classes
         self._asked = source.joints if skeleton is None else len(skeleton.joints)  # joints of a frame
         model, options = source.model, source.model.options
-        self._look = replace(source.look, window=moment_window(source.look.window, model.exemplars.seconds))
+        self._look = replace(source.look, window=moment_window(source.look.window, model.exemplars.seconds, options.exemplars))
         self._durations = Durations.of(model, self._look.window, 0.3 * self._look.window, options.recordings)
         self._step, self._lengths = _grid(self._durations, options.recordings)
         self._ahead = max(1.0, *self._look.tempi) * self._look.window / 2  # seconds that a moment looks ahead

@@ -81,7 +81,8 @@ class LiveOptions:
     horizon: float = 1.25
     """Of the usual duration of the longest action: so much of what follows a moment is looked at before it is decided.  With half
     of it long actions are not found.  F1 of events, thirteen synthetic actions at 0 / 60 degrees, exercises at 0 / 90: 1: .94 /
-    .91, .77 / .64; 1.25: .93 / .90, .79 / .69; 2: .93 / .89, .79 / .72; where recordings are known as a whole: .93 / .89, .79 / .77."""
+    .91, .77 / .64; 1.25: .93 / .90, .79 / .69; 2: .93 / .89, .79 / .72; recordings that are known as a whole: .93 / .89,
+    .79 / .77."""
     memory: float = 300.0
     """Seconds by which levels of scores are told, at most: cameras and people change."""
     recent: int = 30

@@ -89,8 +89,9 @@ def measure_body_parts(indexer: ActionIndexer, groups: ArrayLike | None = None) 
 
     groups = getattr(indexer, "groups_", None) if groups is None else groups
     numbers = None if groups is None else torch.from_numpy(np.unique(np.asarray(groups), return_inverse=True)[1])
-    examples = [indexer.exemplar(int(i)) for i in typical(indexer.model_)]
-    values = importance(indexer.model_, numbers).cpu().numpy()
+    known = len(indexer.classes_)  # what follows is background
+    examples = [indexer.exemplar(int(i)) for i in typical(indexer.model_)[:known]]
+    values = importance(indexer.model_, numbers)[:known].cpu().numpy()
     return BodyParts(indexer.classes_.tolist(), values, examples, indexer.skeleton_)
 
 

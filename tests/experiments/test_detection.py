@@ -19,6 +19,7 @@ from experiments.recognition.detection_metrics import (
     overlap,
     segments,
 )
+from experiments.recognition.short_windows import at_rest
 from indexing.actors import dataset
 from indexing.scoring import Event
 
@@ -114,10 +115,10 @@ def test_streams_of_actors_are_found(tmp_path: Path, monkeypatch, capsys) -> Non
     monkeypatch.setattr(detection.pictures, "timeline", lambda times, scores, classes, found, known: str(known).encode())
     detection.run(detection.Config(sets=("actors",), methods=("equal", "image"), streams=1, actions=3, out=tmp_path))
     tables = json.loads((tmp_path / "figures.json").read_text())["tables"]
-    lines = tables["actors, camera turned 90 degrees"]["lines"]
+    lines = tables["actors, camera turned 60 degrees"]["lines"]
     assert set(lines) == {f"{name}, {how}" for name in ("ours", "2D nearest neighbour") for how in ("every frame", "found")}
     assert lines["ours, every frame"][0] > 0.7  # frames
-    assert (tmp_path / "actors_90.png").read_text().count("(") == 3  # the true segments
+    assert (tmp_path / "actors_60.png").read_text().count("(") == 3  # the true segments
     assert "mAP@0.5" in capsys.readouterr().out
 
 
@@ -130,3 +131,9 @@ def test_a_sliding_baseline_differs_in_the_distance_only() -> None:
     np.testing.assert_array_equal(scores, baseline.score_frames(clips[0]))
     assert events == baseline.find(clips[0])
     assert not np.allclose(scores, ours.score_frames(clips[0]))
+
+
+def test_an_action_calmer_than_the_others_is_not_taken_for_rest():
+    contrast, calm = np.array([[2.8, -2.8], [-2.8, 2.8], [2.8, -2.8]]), np.array([0.05, 0.3])
+    motion = np.array([0.06, 0.06, 0.03])  # of the calm action as it is, of the other one, and of a person who stands
+    assert at_rest(contrast, motion, 0.1, calm, (1.0, 4.0)).tolist() == [False, True, True]

@@ -284,5 +284,6 @@ ELEMENTWISE = {
 def test_every_public_verb_runs_on_one_thread():
     faces = [dyn, dyn.core, dyn.geometry, dyn.invariants, dyn.numerics, dyn.shapes, dyn.tasks]
     named = {name: getattr(face, name) for face in faces for name in face.__all__}
-    verbs = {name for name, value in named.items() if isinstance(value, types.FunctionType)} - {"one_thread", "map_blocks", "on_cpu"}
+    helpers = {"one_thread", "map_blocks", "on_cpu"}
+    verbs = {name for name, value in named.items() if isinstance(value, types.FunctionType)} - helpers
     assert {name for name in verbs if not hasattr(named[name], "one_thread")} == ELEMENTWISE

@@ -8,7 +8,6 @@ import pytest
 
 from indexing import ActionIndexer, Event, PhaseIndexer
 from indexing.action.exemplars import slide
-from indexing.action.stream import at_rest
 from indexing.actors import ACTIONS, Person, dataset, detect, stream
 from indexing.scoring import events, probabilities, reject_threshold, smooth
 from indexing.windows import ragged
@@ -219,12 +218,6 @@ def test_a_resting_person_is_mostly_left_alone():
     idle = [e for e in found if all(e.end <= start or e.start >= end for _, start, end in truth)]
     assert sum(e.end - e.start for e in idle) < 0.15 * solid.duration
     assert np.mean(hits(found, truth)) >= 0.75
-
-
-def test_an_action_calmer_than_the_others_is_not_taken_for_rest():
-    contrast, calm = np.array([[2.8, -2.8], [-2.8, 2.8], [2.8, -2.8]]), np.array([0.05, 0.3])
-    motion = np.array([0.06, 0.06, 0.03])  # of the calm action as it is, of the other one, and of a person who stands
-    assert at_rest(contrast, motion, 0.1, calm, (1.0, 4.0)).tolist() == [False, True, True]
 
 
 # ---- gaps: what a recording costs is told by its frames, not by its clock ------------------------------------------------------

@@ -128,7 +128,7 @@ def test_what_does_not_exist_is_refused_in_one_line(refuse, words: list[str]) ->
 
 
 def test_interrupted_leaves_nothing(run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def stop(*_: object) -> None:
+    def stop(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(ActionIndexer, "fit", stop)
