@@ -2,12 +2,13 @@
 
     DYNTORCH_DATA=../shared/data python -m experiments.recognition.detection
 
-*UTKinect*, *Florence3D*: recordings joined from all clips of one person, in random order and without a pause, every clip seen by the
-camera that looks at it; learned from the clips of others (five folds), seen at azimuth 0.  *UTKinect, evenly*: the same with its
-frames 1/30 s apart, as files without times are read; its own clock has 15 frames per second and many gaps.  *Exercises*: each subject's streams are asked of what was learned from the other's, cut at their labels and seen at azimuth 0;
-every frame has a label; exercises that were never learned, and what is found in them, are left out of account.  *Actors*:
-synthetic people perform actions with rests between them, seen by a noisy detector that loses joints; learned from one clip per
-action and person of three others.  Queries are seen from azimuth 0 and 90, actors from 0 and 60.
+*UTKinect*, *Florence3D*: recordings joined from all clips of one person, in random order and without a pause, each seen from
+where it is asked; learned from the clips of others (five folds), seen at azimuth 0.  *UTKinect, evenly*: the same with its frames
+1/30 s apart, as files without times are read; its own clock has about 7 frames per second.  *Exercises*: each subject's streams
+are asked of what was learned from the other's, cut at their labels and seen at azimuth 0; every frame has a label; exercises that
+were never learned, and what is found in them, are left out of account.  *Actors*: synthetic people perform actions with rests
+between them, seen by a noisy detector that loses joints; learned from one clip per action and person of three others.  Queries are
+seen from azimuth 0 and 90, actors from 0 and 60.
 
 Two readings of the same scores: *every frame* gets the class of its best score, runs are segments (there is no rest: made for the
 exercises); *found* is what ``find`` says (rests are not to be found: made for the actors).  A segment's score is how far its class

@@ -42,8 +42,9 @@ class ExplanationOptions:
     """What beginning a segment costs."""
     background: float = 3.0
     """Quality that a segment must exceed to be told from no action at all."""
-    rest: float = 3.0
-    """Added to that where the person moves e times less than calm moments of the action, taken off where e times more."""
+    rest: float = 4.0
+    """Added to that where the person moves e times less than calm moments of the action, taken off where e times more.  F1 of actors
+    who rest 2 to 7 s between actions, camera turned by 60 degrees: 3: .79, 4: .85, 6: .90, but then Florence3D loses .02."""
     absent: float = 8.0
     """Quality that is taken off where nobody is seen."""
     temperature: float = 0.15

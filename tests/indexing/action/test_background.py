@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
+from safetensors import safe_open
+from safetensors.torch import save_file
 
 from indexing import ActionIndexer, Clip
 from indexing.action.background import OtherMovement, performed, played_otherwise, recorded
@@ -78,6 +82,24 @@ def test_models_come_back_from_their_files(alone, others, tmp_path):
     again = ActionIndexer.load(path)
     assert again.model_.hidden == alone.model_.hidden and again.reject_threshold_ == alone.reject_threshold_
     assert again.predict(others).tolist() == alone.predict(others).tolist()
+
+
+def test_files_that_know_neither_background_nor_profiles_are_read(others, tmp_path):
+    indexer = ActionIndexer(scorer="nearest", virtual_views=0).fit(others)
+    assert indexer.model_.profiles is not None
+    indexer.save(tmp_path / "new.safetensors")
+    with safe_open(tmp_path / "new.safetensors", "pt") as file:
+        header = json.loads(file.metadata()["dyntorch"])
+        tensors = {name: file.get_tensor(name) for name in file.keys() if not name.startswith("profiles.")}  # noqa: SIM118
+    assert header.pop("hidden") == 0
+    save_file(tensors, tmp_path / "old.safetensors", metadata={"dyntorch": json.dumps(header)})
+    again = ActionIndexer.load(tmp_path / "old.safetensors")
+    assert again.model_.profiles is None and again.model_.hidden == 0
+    assert again.predict(others).tolist() == indexer.predict(others).tolist()
+    header["hidden"] = 2
+    save_file(tensors, tmp_path / "bad.safetensors", metadata={"dyntorch": json.dumps(header)})
+    with pytest.raises(ValueError, match=r"bad\.safetensors"):
+        ActionIndexer.load(tmp_path / "bad.safetensors")
 
 
 def test_several_actions_and_a_recording_of_something_else(others, session):
