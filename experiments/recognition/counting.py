@@ -204,6 +204,6 @@ def measure(config: Config, people: int) -> dict[tuple[str, Kind, int], Array]:
 
 def within_one(errors: Array) -> list[float]:
     """Share of the sets counted to within one, for each way; NaN where there is none."""
-    known = np.isfinite(errors)
+    known: Array = np.asarray(np.isfinite(errors))
     right = (np.abs(np.where(known, errors, np.inf)) <= 1).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
-    return [float(v) if any_known else np.nan for v, any_known in zip(right, known.any(axis=0), strict=True)]
+    return [float(v) if any_known else np.nan for v, any_known in zip(right, np.atleast_1d(known.any(axis=0)), strict=True)]

@@ -260,7 +260,7 @@ def test_options_are_kept_where_they_are_not_the_defaults(train, test, tmp_path)
     [
         ([1], "options: expected fields"), ({"nearest": {"near": 1}}, "options.nearest: there is no 'near'"),
         ({"nearest": {"neighbours": 1.5}}, "options.nearest.neighbours: expected a value like 2"),
-        ({"events": {"least": [1.0]}}, "options.events.least"), ({"events": {"step": "x"}}, "options.events.step"),
+        ({"recordings": {"cyclic": [1.0]}}, "options.recordings.cyclic"), ({"events": {"step": "x"}}, "options.events.step"),
     ],
 )  # fmt: skip
 def test_options_that_are_none_are_refused(options, said, saved, tmp_path):
