@@ -23,7 +23,8 @@ BLOCK = 2000  # windows compared at once: bounds memory whatever the length of t
 class Durations:
     """How long the actions of a model last, and which of them are cycles.
 
-    seconds: ``(exemplars,)``; typical: ``(classes,)`` the median of each; cyclic: ``(classes,)`` 0 = performed once, 1 = a cycle.
+    seconds: ``(exemplars,)``, NaN for one that lasts so much longer or shorter than is usual for its class that it must hold more
+    or less than the action: it is not compared as a whole; typical: ``(classes,)`` the median of each; cyclic: ``(classes,)`` 0 = performed once, 1 = a cycle.
     """
 
     seconds: Array
@@ -41,22 +42,24 @@ class Durations:
         low, high = options.cyclic
         again = np.zeros(len(labels)) if model.exemplars.cyclic is None else model.exemplars.cyclic.cpu().numpy()
         each = [labels == c for c in range(model.classes)]
+        usual = np.array([np.median(seconds[mine]) for mine in each])[labels]
+        seconds = np.where(np.abs(np.log(seconds / usual)) <= np.log(options.strange), seconds, np.nan)
         return cls(
             seconds,
-            np.array([np.median(seconds[mine]) for mine in each]),
+            np.array([np.nanmedian(seconds[mine]) for mine in each]),
             np.array([np.clip((np.median(again[mine]) - low) / (high - low), 0.0, 1.0) for mine in each]),
         )
 
     @property
     def unit(self) -> float:
         """Seconds of an ordinary exemplar: what qualities are counted by."""
-        return float(np.median(self.seconds))
+        return float(np.nanmedian(self.seconds))
 
     def likelihoods(self, durations: Array, labels: Array, options: ExplanationOptions) -> Array:
         """``(durations, classes)`` log likelihood of each duration, a kernel density around the exemplars of each class."""
         durations, again = np.unique(np.round(durations, 9), return_inverse=True)
         apart = np.log(durations)[:, None] - np.log(self.seconds)[None]
-        near = np.exp(-0.5 * (apart / options.spread) ** 2)
+        near = np.nan_to_num(np.exp(-0.5 * (apart / options.spread) ** 2))
         each = [near[:, labels == c].mean(axis=1) for c in range(len(self.typical))]
         return np.log(np.stack(each, axis=1) + options.unlikely).astype(np.float32)[again]
 
@@ -76,7 +79,7 @@ class Lattice:
         """Of a stretch: windows of every duration that actions have, from every edge."""
         step = min(options.coarsest, float(durations.typical.min()) / options.step)
         cells = max(1, round((end - begin) / step))
-        shortest, longest = options.reach * durations.seconds.min(), durations.seconds.max() / options.reach
+        shortest, longest = options.reach * np.nanmin(durations.seconds), np.nanmax(durations.seconds) / options.reach
         count = min(options.durations, int(np.ceil(np.log(longest / shortest) / np.log(options.ratio))) + 1)
         lengths = np.geomspace(shortest, longest, max(2, count)) / max(end - begin, 1e-9) * cells
         lengths = np.unique(np.clip(np.round(lengths), 1, cells).astype(np.intp))

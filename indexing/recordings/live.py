@@ -434,7 +434,7 @@ class ActionStream:
 
 def _grid(durations: Durations, options: ExplanationOptions) -> tuple[float, Array]:
     """Seconds of a cell, and ``(lengths,)`` of windows in cells, as in recordings that are there as a whole."""
-    longest = 10 * float(durations.seconds.max()) / options.reach  # a recording that is long enough for all windows
+    longest = 10 * float(np.nanmax(durations.seconds)) / options.reach  # a recording that is long enough for all windows
     lattice = Lattice.over(0.0, longest, durations, options)
     lengths = np.unique(lattice.windows[:, 1] - lattice.windows[:, 0])
     return float(lattice.edges[1]), lengths
