@@ -24,6 +24,9 @@ import numpy as np
 import tyro
 from scipy.signal import find_peaks
 
+from experiments.benchmarks.interleaved import threads
+from experiments.common.book import Book
+from experiments.common.tables import Row, command, note
 from experiments.recognition.protocol import Array
 from indexing import ActionIndexer, Clip, PhaseIndexer
 from indexing.actors import ACTIONS, Person, dataset, detect, perform, stream
@@ -207,3 +210,51 @@ def within_one(errors: Array) -> list[float]:
     known: Array = np.asarray(np.isfinite(errors))
     right = (np.abs(np.where(known, errors, np.inf)) <= 1).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
     return [float(v) if any_known else np.nan for v, any_known in zip(right, np.atleast_1d(known.any(axis=0)), strict=True)]
+
+
+def tables(found: dict[tuple[str, Kind, int], Array], people: int, book: Book) -> None:
+    """Shares counted to within one, by kind and view and by action, and the mean absolute errors."""
+    who = "one person" if people == 1 else f"{people} people"
+    shares, off = {}, {}
+    rows = []
+    for kind in KINDS:
+        for turn in TURNS:
+            errors = np.concatenate([value for (_, one, view), value in found.items() if (one, view) == (kind, turn)])[:, :-1]
+            name = f"{kind}, {turn}°"
+            shares[name], off[name] = within_one(errors), np.nanmean(np.abs(errors), axis=0).tolist()
+            rows.append(Row(name, f"counted within one, learned from {who}", shares[name][WAYS.index("counted")], GOAL))
+    book.grid(f"share of the sets counted to within one, learned from {who}", WAYS, shares, rows)
+    book.grid(f"mean absolute error, learned from {who}", WAYS, off)
+    each = {
+        f"{action}, {turn}°": [
+            within_one(np.concatenate([found[action, kind, turn] for kind in KINDS if (action, kind, turn) in found])[:, :-1])[k]
+            for k in (WAYS.index("counted"), WAYS.index("counted, true events"))
+        ]
+        + [float(np.concatenate([v[:, -1] for (a, _, view), v in found.items() if (a, view) == (action, turn)]).mean())]
+        for action in dict.fromkeys(action for action, _, _ in found)
+        for turn in TURNS
+    }
+    book.grid(f"by action, learned from {who}", ["counted", "counted, true events", "events of other labels"], each)
+
+
+def run(config: Config) -> None:
+    """Print the tables, write the file.
+
+    Raises:
+        ValueError: nothing to repeat, nobody to learn from, or an action that actors do not know.
+    """
+    if min(config.sets, config.seeds, *config.people) < 1:
+        raise ValueError(f"sets, seeds and people must be at least 1, got {config.sets}, {config.seeds} and {config.people}")
+    unknown = [action for action in config.actions if action not in ACTIONS]
+    if unknown or len(config.actions) < 2:
+        raise ValueError(f"actions: give two or more of {', '.join(ACTIONS)}, got {', '.join(config.actions)}")
+    book = Book(config.out)
+    with threads(1):
+        for people in config.people:
+            note(f"... learned from {people}")
+            tables(measure(config, people), people, book)
+    book.close(vars(config), seed=config.first)
+
+
+if __name__ == "__main__":
+    command(lambda: run(tyro.cli(Config, prog="python -m experiments.recognition.counting")))
