@@ -67,6 +67,7 @@ bench: install
 	$(BIN)/python -m experiments.benchmarks.synchronization
 	$(BIN)/python -m experiments.benchmarks.action_indexer
 	$(BIN)/python -m experiments.benchmarks.brightness_indexer
+	$(BIN)/python -m experiments.benchmarks.live
 
 tables: install
 	@echo "All tables: hours.  Each is a command of its own, below, and prints its table as it ends."
@@ -106,6 +107,8 @@ tables: install
 	$(BIN)/python -m experiments.recognition.recognition_protocol
 	$(BIN)/python -m experiments.recognition.open_set
 	$(BIN)/python -m experiments.recognition.detection
+	$(BIN)/python -m experiments.recognition.counting
+	$(BIN)/python -m experiments.recognition.one_action
 	$(BIN)/python -m experiments.recognition.robustness
 	$(BIN)/python -m experiments.recognition.gait
 	$(BIN)/python -m experiments.recognition.near_cameras

@@ -82,8 +82,8 @@ def changed_options(options: Any) -> dict[str, Any]:
 
     Example:
         >>> from indexing.action.options import ActionOptions, EventOptions
-        >>> changed_options(ActionOptions(events=EventOptions(step=0.2)))
-        {'events': {'step': 0.2}}
+        >>> changed_options(ActionOptions(events=EventOptions(step=0.3)))
+        {'events': {'step': 0.3}}
     """
     usual = type(options)()
     found: dict[str, Any] = {}

@@ -57,7 +57,8 @@ class Durations:
 
     def likelihoods(self, durations: Array, labels: Array, options: ExplanationOptions) -> Array:
         """``(durations, classes)`` log likelihood of each duration, a kernel density around the exemplars of each class."""
-        durations, again = np.unique(np.round(durations, 9), return_inverse=True)
+        least = 1e-9  # seconds: windows of one length are equal up to the rounding of their edges
+        durations, again = np.unique(np.maximum(np.round(durations / least), 1.0) * least, return_inverse=True)
         apart = np.log(durations)[:, None] - np.log(self.seconds)[None]
         near = np.nan_to_num(np.exp(-0.5 * (apart / options.spread) ** 2))
         each = [near[:, labels == c].mean(axis=1) for c in range(len(self.typical))]
