@@ -65,7 +65,7 @@ class Config:
 
     people: tuple[int, ...] = (1, 3)
     """How many people are learned from, a clip of each action by each."""
-    sets: int = 4
+    sets: int = 1
     """Sets per action, kind and seed, a person each."""
     seeds: int = 2
     """Repetitions with other people everywhere."""

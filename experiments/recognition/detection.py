@@ -23,7 +23,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 import tyro
@@ -87,7 +87,7 @@ class Config:
     """Which recordings."""
     methods: tuple[Method, ...] = ("equal", "windows", "image", "dtw")
     """Which methods."""
-    parts: tuple[Part, ...] = ()
+    parts: tuple[Part, ...] = get_args(Part)
     """Parts of the explanation that ours is measured without, one at a time."""
     streams: int = 4
     """Streams of synthetic actors, a person each."""

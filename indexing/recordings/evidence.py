@@ -24,7 +24,8 @@ class Durations:
     """How long the actions of a model last, and which of them are cycles.
 
     seconds: ``(exemplars,)``, NaN for one that lasts so much longer or shorter than is usual for its class that it must hold more
-    or less than the action: it is not compared as a whole; typical: ``(classes,)`` the median of each; cyclic: ``(classes,)`` 0 = performed once, 1 = a cycle.
+    or less than the action: it is not compared as a whole; typical: ``(classes,)`` the median of each; cyclic: ``(classes,)``
+    0 = performed once, 1 = a cycle.
     """
 
     seconds: Array

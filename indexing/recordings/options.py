@@ -24,8 +24,8 @@ class ExplanationOptions:
     reach: float = 0.8
     """Times the shortest exemplar (and the longest, divided by it): the durations of windows."""
     strange: float = 3.0
-    """Times longer or shorter than is usual for its class, from which an exemplar is not compared as a whole.  Labels that hold more
-    than the action, as one of UTKinect's, swallow whole recordings."""
+    """Times longer or shorter than is usual for its class, from which an exemplar is not compared as a whole.  A label that holds
+    more than the action, as one of UTKinect's, swallows whole recordings."""
     durations: int = 24
     """At most; of exemplars that differ more the ratio grows."""
     tempo: float = 2.0
@@ -47,8 +47,8 @@ class ExplanationOptions:
     background: float = 3.0
     """Quality that a segment must exceed to be told from no action at all."""
     rest: float = 4.0
-    """Added to that where the person moves e times less than calm moments of the action, taken off where e times more.  F1 of actors
-    who rest 2 to 7 s between actions, camera turned by 60 degrees: 3: .79, 4: .85, 6: .90, but then Florence3D loses .02."""
+    """Added to that where the person moves e times less than calm moments of the action, taken off where e times more.  F1 of
+    actors who rest 2 to 7 s between actions, camera turned by 60 degrees: 3: .79, 4: .85, 6: .90, but then Florence3D loses .02."""
     absent: float = 8.0
     """Quality that is taken off where nobody is seen."""
     temperature: float = 0.15

@@ -166,8 +166,10 @@ const toggle = player.querySelector(".controls button:nth-child(2)");
 const note = (name) => { said[name] = [Number(player.dataset.time), toggle.textContent]; };
 note("begin"); press("ArrowRight"); note("step"); press("ArrowDown"); note("first"); press("ArrowDown"); note("second");
 press("ArrowUp"); note("back"); press(" "); note("stopped"); bars[1].click();
-setTimeout(() => {
-  note("played"); press("Escape"); press(" ");
+let tries = 0;
+const wait = setInterval(() => {
+  if (Number(player.dataset.time) <= 1.5 && ++tries < 40) return;  // a busy machine draws its first frame late
+  clearInterval(wait); note("played"); press("Escape"); press(" ");
   said.bars = bars.map((bar) => bar.getAttribute("aria-label"));
   said.ink = [...player.querySelectorAll("canvas")].map((canvas) => {
     const pixels = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data;
@@ -175,7 +177,7 @@ setTimeout(() => {
   });
   said.wide = document.documentElement.scrollWidth - window.innerWidth;
   document.title = JSON.stringify(said);
-}, 700);
+}, 100);
 """
 
 
