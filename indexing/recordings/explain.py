@@ -19,6 +19,7 @@ from indexing.action.bank import Windows
 from indexing.action.exemplars import moment_window
 from indexing.action.model import ShapeModel
 from indexing.action.stream import Progress, Stream, StreamScan, motion_levels, scan, wrong_contrast
+from indexing.action.symmetry import mirror
 from indexing.clip import Clip
 from indexing.recordings.evidence import Array, Durations, Lattice, level, machine_scores, whole_scores
 from indexing.recordings.explanation import Explanation, Reason, Withheld
@@ -81,12 +82,12 @@ def explain(
         cell = np.clip(cell, 0, len(inside) - 1)
         scores[first:end] = _log(inside, options)[cell]
         background[first:end] = 1.0 - inside.sum(axis=1).clip(0.0, 1.0)[cell]
-        mine = _joined(segments, durations, options)
+        mine = _joined(model, one, segments, durations, stream.length)
         found += _events(model, one, mine, values, classes, stream.length)
         # what would be there, did rest and absence count as movement, and is not
         awake = np.minimum(calm, options.background * _unit(one, durations))
         restless, _ = best_tiling(one.lattice.windows, values + absent, awake)
-        silent = [part for part in _joined(restless, durations, options) if not _meets(part, mine)]
+        silent = [part for part in _joined(model, one, restless, durations, stream.length) if not _meets(part, mine)]
         reasons: list[Reason] = ["nobody there" if not one.present[part.first : part.last].any() else "at rest" for part in silent]
         told = _events(model, one, silent, values, classes, stream.length)
         held += [Withheld(event, reason) for event, reason in zip(told, reasons, strict=True)]
@@ -197,16 +198,44 @@ def _rest(model: ShapeModel, one: Stretch) -> Array:
     return np.asarray(np.log(np.maximum(own, 1e-30) / np.maximum(one.motion, 1e-30)).clip(-1.0, 1.0))
 
 
-def _joined(segments: list[TiledSegment], durations: Durations, options: ExplanationOptions) -> list[TiledSegment]:
-    """Segments of cyclic actions that touch become one."""
+def _joined(model: ShapeModel, one: Stretch, segments: list[TiledSegment], durations: Durations, length: int) -> list[TiledSegment]:
+    """Segments of one action that touch become one where it is a cycle, or where the performance has not ended there."""
+    options = model.options.recordings
     out: list[TiledSegment] = []
-    for one in segments:
-        if out and out[-1].last == one.first and out[-1].label == one.label and durations.cyclic[one.label] > options.joined:
-            longer = one.window if one.last - one.first > out[-1].last - out[-1].first else out[-1].window
-            out[-1] = TiledSegment(out[-1].first, one.last, one.label, out[-1].value + one.value, longer)
+    for part in segments:
+        before = out[-1] if out else None
+        touch = before is not None and before.last == part.first and before.label == part.label
+        cycle = durations.cyclic[part.label] > options.joined
+        if before is not None and touch and (cycle or _goes_on(model, one, before, part, length)):
+            longer = part.window if part.last - part.first > before.last - before.first else before.window
+            out[-1] = TiledSegment(before.first, part.last, part.label, before.value + part.value, longer)
         else:
-            out.append(one)
+            out.append(part)
     return out
+
+
+def _goes_on(model: ShapeModel, one: Stretch, before: TiledSegment, after: TiledSegment, length: int) -> bool:
+    """Whether the pose between two segments is one from within the action, and not one that it begins or ends with.
+
+    Poses are compared by the heights of their joints, which hardly depend on where the camera stands, with the exemplar of the
+    class that is most like both segments.
+    """
+    seen = _heights(one.cut(np.array([before.window, after.window]), length).values.to(model.labels.device))
+    mine = (model.labels == before.label).nonzero()[:, 0]
+    shown = model.exemplars.crop(0)[mine].values
+    if model.symmetry is not None:
+        shown = torch.cat([shown, mirror(shown, model.symmetry)])
+    known = _heights(shown)
+    exemplar = known[(seen[:, None] - known).square().mean(dim=(0, 2, 3)).argmin()]
+    apart = ((seen[0, -1] + seen[1, 0]) / 2 - exemplar).square().mean(dim=1).sqrt()
+    ends, within = (apart[0] + apart[-1]) / 2, apart[2:-2].min() if len(apart) > 4 else apart.max()
+    return bool(ends > model.options.recordings.seam * within)
+
+
+def _heights(windows: torch.Tensor) -> torch.Tensor:
+    """``(N, length, joints)`` above the middle of the body, in units of their deviation in the window."""
+    up = windows[..., 1] - windows[..., 1].mean(dim=-1, keepdim=True)
+    return up / up.square().mean(dim=(1, 2), keepdim=True).sqrt().clamp(min=1e-9)
 
 
 def _events(

@@ -65,6 +65,10 @@ class ExplanationOptions:
     """Share of the weight of whole exemplars that they lose."""
     joined: float = 0.5
     """How cyclic (0..1) a class must be for segments that touch to be one."""
+    seam: float = 2.0
+    """Times farther from the first and the last pose of the exemplar than from one within, from which the pose between two segments
+    is none that the action begins or ends with.  Between bows, kicks, lunges, squats, throws of other people: .3 to 1.2; between
+    the blows of a bout of punches: 3.7 to 3.9."""
     neighbours: int = 2
     """Exemplars per class that are averaged."""
     least: float = 1e-6

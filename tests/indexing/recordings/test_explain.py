@@ -69,3 +69,13 @@ def test_cycles_are_told_from_what_is_performed_once():
     clips = [detect(perform(name, person, rng=1), azimuth=0.0, rng=1) for name in ("jumping_jack", "bow", "squat")]
     jack, bow, squat = recurrence(ragged(clips), ExemplarOptions()).tolist()
     assert jack > 0.6 and bow < 0.4 and squat < 0.4
+
+
+def test_blows_of_one_bout_are_one_performance_and_squats_in_a_row_are_not():
+    lesson = dataset([Person.random(5)], ("squat", "punch", "bow", "kick"), azimuth=0.0, rng=2)
+    indexer = ActionIndexer(scorer="nearest").fit(lesson)
+    found = {}
+    for action in ("punch", "squat"):
+        clip = detect(perform(action, Person.random(8), repeats=3, rng=4), azimuth=30.0, rng=4)
+        found[action] = [event.label for event in indexer.find(clip)]
+    assert found == {"punch": ["punch"], "squat": ["squat"] * 3}
