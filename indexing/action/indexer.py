@@ -490,6 +490,7 @@ class ActionIndexer(SavedClassifier):
             tuple(self.classes_.tolist()),
             self._stream(),
             self._rate if model.hidden else self.reject,
+            -np.inf if self.reject_threshold_ is None else self.reject_threshold_,
             self._repair,
             self.n_joints_,
             self.skeleton_,

@@ -69,27 +69,27 @@ def explain(
     moments = scan(finer, clip, stream, None if progress is None else lambda share: progress(0.5 * share))
     stretches = _stretches(model, clip, moments, durations, stream, progress)
     wholes = level(np.concatenate([one.whole.ravel() for one in stretches]) if stretches else np.zeros(0))
-    scores = np.full((len(clip), model.classes), _log(np.zeros(1), options)[0])
+    scores = np.full((len(clip), model.classes), log_scores(np.zeros(1), options)[0])
     background = np.ones(len(clip))
     found: list[Event] = []
     held: list[Withheld] = []
     for one in stretches:
-        values, calm, absent = _values(model, one, durations, wholes, stream.length, options)
+        values, calm, absent = segment_values(model, one, durations, wholes, stream.length, options)
         segments, _ = best_tiling(one.lattice.windows, values, calm)
         inside = posterior(one.lattice.windows, values, calm, options.temperature)
         first, end = one.frames
         cell = np.searchsorted(one.lattice.edges, clip.times[first:end] + options.edge, side="right") - 1
         cell = np.clip(cell, 0, len(inside) - 1)
-        scores[first:end] = _log(inside, options)[cell]
+        scores[first:end] = log_scores(inside, options)[cell]
         background[first:end] = 1.0 - inside.sum(axis=1).clip(0.0, 1.0)[cell]
         mine = _joined(model, one, segments, durations, stream.length)
-        found += _events(model, one, mine, values, classes, stream.length)
+        found += told_events(model, one, mine, values, classes, stream.length)
         # what would be there, did rest and absence count as movement, and is not
         awake = np.minimum(calm, options.background * _unit(one, durations))
         restless, _ = best_tiling(one.lattice.windows, values + absent, awake)
         silent = [part for part in _joined(model, one, restless, durations, stream.length) if not _meets(part, mine)]
         reasons: list[Reason] = ["nobody there" if not one.present[part.first : part.last].any() else "at rest" for part in silent]
-        told = _events(model, one, silent, values, classes, stream.length)
+        told = told_events(model, one, silent, values, classes, stream.length)
         held += [Withheld(event, reason) for event, reason in zip(told, reasons, strict=True)]
     found, low = _levelled(model, found, rate)
     if progress is not None:
@@ -98,7 +98,7 @@ def explain(
     return Explanation(clip.times, tuple(classes), scores, found, held, background)
 
 
-def _log(likely: Array, options: ExplanationOptions) -> Array:
+def log_scores(likely: Array, options: ExplanationOptions) -> Array:
     """Logarithms of likelihoods; below the least ones a shade tells classes apart."""
     return np.asarray(np.log(np.maximum(likely, options.least)) + options.shade * np.log(np.maximum(likely, options.faint)))
 
@@ -174,7 +174,7 @@ def _worth(
     return _Worth(told + share * proxy, told, share, background, absent)
 
 
-def _values(
+def segment_values(
     model: ShapeModel, one: Stretch, durations: Durations, wholes: tuple[float, float], length: int, options: ExplanationOptions
 ) -> tuple[Array, Array, Array]:
     """``(W, classes)`` what windows are worth as segments of each class, ``(cells,)`` what background is worth, ``(W, 1)`` what
@@ -238,7 +238,7 @@ def _heights(windows: torch.Tensor) -> torch.Tensor:
     return up / up.square().mean(dim=(1, 2), keepdim=True).sqrt().clamp(min=1e-9)
 
 
-def _events(
+def told_events(
     model: ShapeModel, one: Stretch, parts: Sequence[TiledSegment], values: Array, classes: Sequence[Any], length: int
 ) -> list[Event]:
     """Segments as they are told: score: mean contrast of their moments; margin: what they are worth above the next class."""

@@ -26,7 +26,7 @@ from indexing.clip import Clip
 from indexing.estimator import is_number
 from indexing.joints import matched_all
 from indexing.recordings.evidence import Durations, Lattice
-from indexing.recordings.explain import Stretch, _events, _log, _values
+from indexing.recordings.explain import Stretch, log_scores, segment_values, told_events
 from indexing.recordings.options import ExplanationOptions
 from indexing.recordings.tiling import TiledSegment, best_tiling, posterior
 from indexing.scoring import Event, event_levels
@@ -53,13 +53,15 @@ class LiveAnswer:
 class LiveSource:
     """All that a stream needs of its indexer: the model, its labels, how moments are looked at, which joints frames have.
 
-    rate: at which events are asked for, as ``reject`` of the indexer; repair: of wrong joints; fps: of frames without times.
+    rate: at which events are asked for, as ``reject`` of the indexer; least: evidence of a segment, asked for where there is a
+    background; repair: of wrong joints; fps: of frames without times.
     """
 
     model: ShapeModel
     classes: tuple[Any, ...]
     look: Stream
     rate: float | None
+    least: float
     repair: RepairOptions | None
     joints: int
     skeleton: Skeleton | None
@@ -359,7 +361,7 @@ class ActionStream:
         one = Stretch(self._source(frames), lattice, cells.raw, cells.raw / spread, cells.motion, cells.present, whole, (0, frames))
         if not len(row):
             return _Tiled(one, np.zeros((0, model.classes)), {}, np.zeros((count, model.classes)))
-        values, calm, _ = _values(model, one, self._durations, self._wholes.level(), self._look.length, options)
+        values, calm, _ = segment_values(model, one, self._durations, self._wholes.level(), self._look.length, options)
         segments, _ = best_tiling(lattice.windows, values, calm)
         likely = posterior(lattice.windows, values, calm, options.temperature)
         return _Tiled(one, values, {each.first: each for each in segments}, likely)
@@ -392,7 +394,7 @@ class ActionStream:
         while edge < (len(self._cells) if count is None else count):
             part = tiled.segments.get(edge)
             edge = edge + 1 if part is None else part.last
-            mine = None if part is None or part.label >= known else part
+            mine = None if part is None or part.label >= known or not self._evident(tiled, part) else part
             goes_on = mine is not None and running is not None and running.label == mine.label
             if running is not None and not (goes_on and self._durations.cyclic[running.label] > options.joined):
                 done.append(running.event)
@@ -406,12 +408,20 @@ class ActionStream:
         last = len(self._at) if count is None else int(np.searchsorted(self._at, edges[edge] - options.edge))
         rows = slice(self._told, max(last, self._told))
         cell = np.searchsorted(edges, self._at[rows] + options.edge, side="right") - 1
-        scores = _log(tiled.likely, options)[np.clip(cell, 0, len(tiled.likely) - 1), :known]
+        scores = log_scores(tiled.likely, options)[np.clip(cell, 0, len(tiled.likely) - 1), :known]
         return LiveAnswer(self._at[rows] + self._begin, scores, self._loud(done)), edge, running
+
+    def _evident(self, tiled: _Tiled, part: TiledSegment) -> bool:
+        """Whether a segment has the evidence that is asked for where there is a background, as if it had been cut out by hand."""
+        model = self.source.model
+        if not model.hidden or not np.isfinite(self.source.least):
+            return True
+        windows = tiled.one.cut(np.array([part.window]), self._look.length).to(model.labels.device)
+        return float(model.evidence(windows)[0]) >= self.source.least
 
     def _event(self, tiled: _Tiled, part: TiledSegment) -> Event:
         """As it is told, on the clock of the stream."""
-        (event,) = _events(self.source.model, tiled.one, [part], tiled.values, self.classes, self._look.length)
+        (event,) = told_events(self.source.model, tiled.one, [part], tiled.values, self.classes, self._look.length)
         last = float(self._at[-1])
         return replace(event, start=min(event.start, last) + self._begin, end=min(event.end, last) + self._begin)
 
@@ -422,7 +432,7 @@ class ActionStream:
     def _silent(self, rows: slice) -> LiveAnswer:
         """Frames of which nothing can be said."""
         at = self._at[rows]
-        least = _log(np.zeros(1), self.source.model.options.recordings)[0]
+        least = log_scores(np.zeros(1), self.source.model.options.recordings)[0]
         return LiveAnswer(at + self._begin, np.full((len(at), len(self.classes)), least))
 
     def _joined(self, told: list[LiveAnswer]) -> LiveAnswer:
