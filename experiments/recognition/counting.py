@@ -221,7 +221,10 @@ def tables(found: dict[tuple[str, Kind, int], Array], people: int, book: Book) -
         for turn in TURNS:
             errors = np.concatenate([value for (_, one, view), value in found.items() if (one, view) == (kind, turn)])[:, :-1]
             name = f"{kind}, {turn}°"
-            shares[name], off[name] = within_one(errors), np.nanmean(np.abs(errors), axis=0).tolist()
+            known = np.isfinite(errors)
+            total = np.where(known, np.abs(errors), 0.0).sum(axis=0)
+            mean = np.where(known.any(axis=0), total / np.maximum(known.sum(axis=0), 1), np.nan)
+            shares[name], off[name] = within_one(errors), mean.tolist()
             rows.append(Row(name, f"counted within one, learned from {who}", shares[name][WAYS.index("counted")], GOAL))
     book.grid(f"share of the sets counted to within one, learned from {who}", WAYS, shares, rows)
     book.grid(f"mean absolute error, learned from {who}", WAYS, off)
