@@ -82,7 +82,8 @@ class Lattice:
         step = min(options.coarsest, float(durations.typical.min()) / options.step)
         cells = max(1, round((end - begin) / step))
         shortest, longest = options.reach * np.nanmin(durations.seconds), np.nanmax(durations.seconds) / options.reach
-        count = min(options.durations, int(np.ceil(np.log(longest / shortest) / np.log(options.ratio))) + 1)
+        ratio = options.ratio if len(durations.seconds) <= options.many else options.ratio**2
+        count = min(options.durations, int(np.ceil(np.log(longest / shortest) / np.log(ratio))) + 1)
         lengths = np.geomspace(shortest, longest, max(2, count)) / max(end - begin, 1e-9) * cells
         lengths = np.unique(np.clip(np.round(lengths), 1, cells).astype(np.intp))
         # in order of their last edges, then of their first ones: of each last edge the longest that fit, the longest first

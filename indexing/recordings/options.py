@@ -21,6 +21,8 @@ class ExplanationOptions:
     ratio: float = 1.12
     """Between neighbouring durations of the windows that are looked through.  1.25 takes a third less time, and costs .02 of the
     frames of exercises, .01 / .03 of Florence3D at 0 / 90 degrees."""
+    many: int = 300
+    """Exemplars up to which durations lie so close; of more, every other one is looked through, for the time it takes."""
     reach: float = 0.8
     """Times the shortest exemplar (and the longest, divided by it): the durations of windows."""
     strange: float = 3.0
