@@ -171,7 +171,13 @@ def wrong_contrast(model: ShapeModel) -> Array:
 
 
 def motion_levels(model: ShapeModel) -> tuple[float, Array]:
-    """The motion of calm moments: of all classes together, and of each ``(classes,)``."""
-    motion, labels = _motion(model.exemplars.moments), model.labels[model.exemplars.owner].cpu().numpy()
-    each = np.array([np.quantile(motion[labels == c], model.options.events.calm) for c in range(model.classes)])
-    return float(np.quantile(motion, model.options.events.still)), each
+    """The motion of calm moments: of all classes together, and of each ``(classes,)``.  Kept: every stretch asks for it again."""
+    events = model.options.events
+
+    def make() -> tuple[float, Array]:
+        motion, labels = _motion(model.exemplars.moments), model.labels[model.exemplars.owner].cpu().numpy()
+        each = np.array([np.quantile(motion[labels == c], events.calm) for c in range(model.classes)])
+        return float(np.quantile(motion, events.still)), each
+
+    levels: tuple[float, Array] = model.kept.get(("motion levels", events.still, events.calm), make)
+    return levels
