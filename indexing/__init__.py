@@ -4,9 +4,10 @@
 - :class:`ActionIndexer`: learns from clips, recognizes clips, finds actions in long recordings; :class:`Event` is what it finds;
 - :class:`PhaseIndexer`: the same from single frames, and how far the action has got;
 - :class:`BrightnessIndexer`: the same from pixels alone;
+- :class:`Archive`: recordings kept as movement, searched by example or by a learned model; :class:`Hit` is what it finds;
 - :func:`synchronize`: how far two cameras' clocks are apart;
-- :class:`ActionOptions`, :class:`BrightnessOptions`, :class:`PhaseOptions`, :class:`SyncOptions`: every number that decides in
-  these, by stage.
+- :class:`ActionOptions`, :class:`ArchiveOptions`, :class:`BrightnessOptions`, :class:`PhaseOptions`, :class:`SyncOptions`: every
+  number that decides in these, by stage.
 
 The indexers follow scikit-learn.  Times are seconds.  The public names are imported lazily, as in ``dyntorch``.
 """
@@ -19,6 +20,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from indexing.action.indexer import ActionIndexer as ActionIndexer
     from indexing.action.options import ActionOptions as ActionOptions
+    from indexing.archive.archive import Archive as Archive
+    from indexing.archive.options import ArchiveOptions as ArchiveOptions
+    from indexing.archive.results import Hit as Hit
     from indexing.brightness.indexer import BrightnessIndexer as BrightnessIndexer
     from indexing.brightness.options import BrightnessOptions as BrightnessOptions
     from indexing.clip import Clip as Clip
@@ -33,12 +37,15 @@ _HOME = {
     "Clip": "indexing.clip",
     "ClipSet": "indexing.clip",
     "ActionIndexer": "indexing.action.indexer",
+    "Archive": "indexing.archive.archive",
+    "Hit": "indexing.archive.results",
     "BrightnessIndexer": "indexing.brightness.indexer",
     "PhaseIndexer": "indexing.phase.indexer",
     "Event": "indexing.scoring",
     "synchronize": "indexing.sync.synchronize",
     # the numbers that decide in a verb
     "ActionOptions": "indexing.action.options",
+    "ArchiveOptions": "indexing.archive.options",
     "BrightnessOptions": "indexing.brightness.options",
     "PhaseOptions": "indexing.phase.options",
     "SyncOptions": "indexing.sync.options",

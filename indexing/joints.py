@@ -57,8 +57,7 @@ def matched(clip: Clip, known: Skeleton | None, who: str = "") -> tuple[Clip, st
         return clip, _unnamed(clip, known, who)
     if own.joints == known.joints:
         return clip, ""
-    index = {_plain(joint): i for i, joint in enumerate(own.joints)}
-    place = [index.get(_plain(joint), -1) for joint in known.joints]
+    place = places(own, known)
     missing = [joint for joint, i in zip(known.joints, place, strict=True) if i < 0]
     shared = len(known.joints) - len(missing)
     if shared < max(FEWEST, len(known.joints) / 2):
@@ -78,6 +77,17 @@ def matched(clip: Clip, known: Skeleton | None, who: str = "") -> tuple[Clip, st
     elif shared < len(own.joints):
         said = f"{who}: of its {len(own.joints)} joints ({own.name}) the {shared} learned ({known.name}) are used"
     return clip.replace(joints=joints, confidence=confidence, skeleton=known), said
+
+
+def places(own: Skeleton, known: Skeleton) -> list[int]:
+    """Where each joint known is among one's own, by name; -1 where it is not.
+
+    Example:
+        >>> places(Skeleton("a", ("hip", "knee", "toe")), Skeleton("b", ("Toe", "hand")))
+        [2, -1]
+    """
+    index = {_plain(joint): i for i, joint in enumerate(own.joints)}
+    return [index.get(_plain(joint), -1) for joint in known.joints]
 
 
 def matched_all(clips: Sequence[Clip], known: Skeleton | None) -> list[Clip]:

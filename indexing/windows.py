@@ -49,6 +49,12 @@ class RepairOptions:
     """Times that all are judged: the second sees past what the first took out: bursts 21 -> 19; a third adds nothing."""
     part: int = 9000
     """Frames of a long recording that are judged together: 5 minutes at 30 per second."""
+    sampled: int = 1
+    """Of so many sightings one tells how far is usual; where it is more than 1, the others are judged only near those that leave
+    the middle of their neighbours.  8 takes a third of the time on clean clips and finds the same
+    but for .5 % (CMU, 5 % wrong)."""
+    leaving: float = 3.0
+    """Times the usual distance from that middle (of 80 %), by which such a sighting leaves it."""
 
 
 REPAIR_CHUNK = 20_000  # sightings at once: bounds memory
@@ -92,10 +98,16 @@ def wrong_joints(
         joint, frame = np.nonzero((there & ~wrong).T)
         clip = clip_of[frame]
         around, counts = _around(joint * len(starts) + clip, options.width)
-        rows = np.flatnonzero(asked[frame, joint] & (counts >= options.least))
-        far, spread = _deviations(joints[frame, joint], times[frame], around, rows)
+        judged, places = asked[frame, joint] & (counts >= options.least), joints[frame, joint]
+        if once == 0 and options.sampled > 1:
+            judged &= (np.arange(len(joint)) % options.sampled == 0) | _near_leaving(
+                places, times[frame], around, floor[clip], options
+            )
+        rows = np.flatnonzero(judged)
+        far, spread = _deviations(places, times[frame], around, rows)
         if once == 0:
-            usual = options.usual * _share(far.max(axis=1), clip[rows], len(starts) - 1, options.share)
+            told = rows % options.sampled == 0
+            usual = options.usual * _share(far[told].max(axis=1), clip[rows[told]], len(starts) - 1, options.share)
         bad = (far > options.limit * spread + (usual + floor)[clip[rows], None]).any(axis=1)
         if not bad.any():
             break
@@ -126,6 +138,29 @@ def _around(path: NDArray[np.intp], width: int) -> tuple[NDArray[np.intp], NDArr
     first = np.maximum(np.minimum(np.arange(len(path)) - width // 2, end - width), begin)
     around = first[:, None] + np.arange(width)
     return np.where(around < end[:, None], around, -1), end - begin
+
+
+def _near_leaving(
+    places: FloatArray, times: FloatArray, around: NDArray[np.intp], floor: FloatArray, options: RepairOptions
+) -> NDArray[np.bool_]:
+    """``(sightings,)`` whether one that leaves the middle of those before and after it is among the neighbours compared.
+
+    A wrong sighting leaves it, and so do the first and the last of several; what no such one is near needs no closer look.
+    """
+    count = len(places)
+    if count < 3:
+        return np.ones(count, dtype=bool)
+    span = times[2:] - times[:-2]
+    inside = span > 0  # within one path: the clock of another one starts anew
+    share = np.where(inside, (times[1:-1] - times[:-2]) / np.where(inside, span, 1.0), 0.0)[:, None].astype(places.dtype)
+    leaves = np.abs(places[1:-1] - places[:-2] - share * (places[2:] - places[:-2])).max(axis=1)
+    usual = np.quantile(leaves[inside], options.share) if inside.any() else 0.0
+    marked = np.ones(count, dtype=bool)
+    marked[1:-1] = ~inside | (leaves > options.leaving * usual + floor[1:-1] / 2)
+    total = np.concatenate([[0], np.cumsum(marked)])
+    reach = options.width // 2 + 1
+    index = np.arange(count)
+    return np.asarray(total[np.minimum(index + reach + 1, count)] > total[np.maximum(index - reach, 0)])
 
 
 def _deviations(
@@ -213,9 +248,15 @@ def ragged(clips: Sequence[Clip], repair: RepairOptions | None = None) -> Ragged
     starts = np.concatenate([[0], np.cumsum(lengths)])
     if repair is not None:
         joints[wrong_joints(joints, times, starts, repair)] = np.nan
+    return bridged(joints, times, starts)
+
+
+def bridged(joints: FloatArray, times: FloatArray, starts: NDArray[np.intp]) -> Ragged:
+    """Stretches that lie end to end, y up, with what is missing interpolated; arguments as in :class:`Ragged`, NaN = not seen."""
     there: NDArray[np.bool_] = np.asarray(np.isfinite(joints).all(axis=2))
     seen = np.logical_or.reduceat(there, starts[:-1], axis=0)
     if not there.all():
+        lengths = np.diff(starts)
         joints = _fill(joints, there, times, np.repeat(starts[:-1], lengths), np.repeat(starts[1:], lengths))
     return Ragged(joints, times, starts, seen)
 

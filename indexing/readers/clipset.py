@@ -30,7 +30,7 @@ from indexing.clip import UP_AXES, Clip, ClipSet, FloatArray, LabelledSet
 from indexing.files import replacing
 from indexing.opening import error, listed, shown
 from indexing.readers.files import Options, Source
-from indexing.readers.npz import Archive
+from indexing.readers.npz import NumpyArchive
 from indexing.skeleton import Skeleton
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -274,7 +274,7 @@ def frame_times(
     return np.asarray(stamps if key == "times" else stamps / np.repeat(rate.astype(np.float64), np.diff(offsets)))
 
 
-def clip_meta(data: Archive, count: int, rows: str) -> dict[str, Array]:
+def clip_meta(data: NumpyArchive, count: int, rows: str) -> dict[str, Array]:
     """What else is known of each clip, one entry per clip; ``rows`` is the key of what all of them consist of."""
     meta: dict[str, Array] = {}
     for key in data:
@@ -321,7 +321,7 @@ def read_clip_set(
         (['run', 'sit'], 0.4)
     """
     path = Path(path)
-    data = Archive(path)
+    data = NumpyArchive(path)
     joints = need(path, data, "joints", 3)
     if joints.shape[2] not in (2, 3) or joints.dtype.kind not in "fiu":
         raise error(
@@ -444,7 +444,7 @@ def holds_frames(path: str | Path) -> bool:
     if path.suffix.lower() != ".npz":
         return False
     try:
-        names = set(Archive(path))
+        names = set(NumpyArchive(path))
     except ValueError:
         return False  # whoever reads it says what is wrong
     return "frames" in names and "joints" not in names
@@ -469,7 +469,7 @@ def read_film_set(path: str | Path, *, fps: float | None = None) -> FilmSet:
         (True, ['run', 'sit'], 5)
     """
     path = Path(path).expanduser()
-    data = Archive(path)
+    data = NumpyArchive(path)
     frames = need(path, data, "frames", 3)
     if frames.dtype != np.uint8:
         raise error(path, f"frames must be uint8 grey, got {frames.dtype}", "save grey values from 0 to 255")

@@ -59,7 +59,7 @@ class Header(NamedTuple):
         return math.prod(self.shape) * self.dtype.itemsize
 
 
-class Archive(Mapping[str, Array]):
+class NumpyArchive(Mapping[str, Array]):
     """The arrays of an ``.npz``, each read when it is asked for.
 
     Raises:
@@ -70,7 +70,7 @@ class Archive(Mapping[str, Array]):
         >>> import tempfile
         >>> path = Path(tempfile.mkdtemp()) / "a.npz"
         >>> np.savez(path, x=np.arange(3), y=np.zeros((4, 2)))
-        >>> archive = Archive(path)
+        >>> archive = NumpyArchive(path)
         >>> list(archive), archive.shape("y"), archive["x"].tolist()
         (['x', 'y'], (4, 2), [0, 1, 2])
     """

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from indexing.opening import VALUE, clipped, error, listed, repeated, shown, size_of
 from indexing.readers import points
 from indexing.readers.matches import opening
-from indexing.readers.npz import Archive, read_npy
+from indexing.readers.npz import NumpyArchive, read_npy
 from indexing.readers.points import FloatArray, as_view
 
 COLUMNS = ("x1", "y1", "x2", "y2")
@@ -114,7 +114,7 @@ def _points(values: Any, where: str | Path) -> FloatArray:
 
 # ---- npz -----------------------------------------------------------------------------------------------------------------
 def _archive(path: Path, pair: str | None) -> MatchedPair:
-    archive = Archive(path)
+    archive = NumpyArchive(path)
     before = _chosen(path, list(archive), pair)
     x1, x2 = (_points(archive[before + name], f"{path} {before}{name}") for name in ("x1", "x2"))
     if len(x1) != len(x2):

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from indexing.opening import Row, error, listed, repeated, shown
 from indexing.opening import read_rows as rows_of
-from indexing.readers.npz import Archive
+from indexing.readers.npz import NumpyArchive
 from indexing.readers.npz import read_npy as read_npy_file
 
 FloatArray = NDArray[np.float64]
@@ -268,7 +268,7 @@ def read_npz(path: Path) -> tuple[list[PointSet], list[PointSet]]:
     Raises:
         ValueError: no known keys, a view is missing, or arrays that do not fit.
     """
-    archive = Archive(path)
+    archive = NumpyArchive(path)
     names = list(archive)
     prefix = next((prefix for prefix in ("x", "P", "l") if f"{prefix}1" in names), None)
     if prefix is None:

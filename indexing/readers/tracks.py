@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from indexing.opening import VALUE, Row, check_dense, clipped, error, head_of, is_regular, listed, shown, size_of
 from indexing.readers.matches import open_points
-from indexing.readers.npz import Archive
+from indexing.readers.npz import NumpyArchive
 from indexing.readers.points import (
     IDS,
     STATIC,
@@ -298,7 +298,7 @@ def read_arrays(path: Path, key: str | None) -> TrackSet:
     Raises:
         ValueError: no tracks in it, several without a key, arrays that do not fit.
     """
-    archive = Archive(path)
+    archive = NumpyArchive(path)
     before, name = _chosen(path, list(archive), key)
     values, extra = archive[name], {kind: archive[before + kind] for kind in EXTRA if before + kind in archive}
     if values.ndim != 3 or values.shape[-1] not in (2, 3):

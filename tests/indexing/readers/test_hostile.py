@@ -151,7 +151,7 @@ def test_what_numpy_writes_is_read_as_numpy_reads_it(tmp_path: Path) -> None:
     }  # fmt: skip
     for save in (np.savez, np.savez_compressed):
         save(tmp_path / "a.npz", **arrays)
-        archive = npz_gate.Archive(tmp_path / "a.npz")
+        archive = npz_gate.NumpyArchive(tmp_path / "a.npz")
         assert list(archive) == list(arrays)
         for name, value in arrays.items():
             np.testing.assert_array_equal(archive[name], value)

@@ -1,0 +1,284 @@
+"""Adding: sources are read by workers, put together in their order, and committed as segments; the coordinator alone writes.
+
+Stages: what is known already is left alone (:func:`_news`); the others are read (:mod:`indexing.archive.sources`); batches of them
+are written as segments and committed in one step each (:meth:`Adder.commit`); small segments are put together (:func:`tidy`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from dyntorch.numerics import one_thread
+from indexing.archive.catalogue import Catalogue, SegmentRow, SourceRow, add_layout, drop_recordings
+from indexing.archive.layout import Layout, layout_key
+from indexing.archive.options import ArchiveOptions
+from indexing.archive.results import Addition, SourceOutcome
+from indexing.archive.segments import ArchiveSegment, WrittenSegment, write_segment
+from indexing.archive.sources import ArchiveSource, ReadRecording, ReadSource, Stamp, read_source, reading_key, stamp
+from indexing.archive.tracks import Track, windows_of
+from indexing.archive.workers import InOrder, WorkerLost
+
+Progress = Callable[[float], None] | None
+
+
+@dataclass(eq=False)
+class Staged:
+    """Sources that were read and are not committed yet."""
+
+    sources: list[tuple[ArchiveSource, ReadSource]] = field(default_factory=list)
+    since: float = 0.0
+
+    @property
+    def windows(self) -> int:
+        """Of all."""
+        return sum(read.windows for _, read in self.sources)
+
+
+@one_thread
+def add(
+    catalogue: Catalogue,
+    sources: Sequence[ArchiveSource],
+    options: ArchiveOptions,
+    executor: Executor | None,
+    reading: Mapping[str, Any],
+    progress: Progress,
+) -> Addition:
+    """Add what is new or has changed; see :meth:`indexing.Archive.add`."""
+    with catalogue.alone():
+        clear(catalogue)
+        adder = Adder(catalogue, options, reading)
+        outcomes: dict[str, SourceOutcome] = {}
+        news = list(_news(adder.known, sources, adder.reading, outcomes))
+        work = InOrder(
+            partial(_read, reading=dict(reading), options=adder.storage), executor, options.growth.ahead, options.growth.tries
+        )
+        try:
+            for done, (source, read) in enumerate(work(news), 1):
+                outcomes[source.key] = adder.take(source, read)
+                if progress is not None:
+                    progress(done / len(news))
+        finally:
+            # whoever interrupts keeps what was read; a second failure must not hide the first
+            adder.commit()
+        tidy(catalogue, options)
+    return Addition(tuple(outcomes[source.key] for source in sources))
+
+
+def _read(source: ArchiveSource, reading: Mapping[str, Any], options: Any) -> ReadSource:
+    return read_source(source, reading, options)
+
+
+def _news(
+    known: Mapping[str, SourceRow], sources: Sequence[ArchiveSource], reading: str, outcomes: dict[str, SourceOutcome]
+) -> Iterator[ArchiveSource]:
+    """The sources that must be read; of the others, what became of them."""
+    for source in sources:
+        row = known.get(source.key)
+        if row is None or row.reading != reading:
+            yield source
+            continue
+        try:
+            now = stamp(source)
+        except OSError as problem:
+            reason = f"{source.name}: {problem.strerror or problem}; what is in the archive of it stays"
+            outcomes[source.key] = SourceOutcome(source.name, "failed", reason)
+            continue
+        same = now.sha256 == row.sha256 if source.clip is not None else (now.size, now.modified) == (row.size, row.modified)
+        if same:
+            outcomes[source.key] = SourceOutcome(source.name, "known", row.note)
+        else:
+            yield source
+
+
+class Adder:
+    """Takes what was read, and commits it batch by batch.
+
+    Args:
+        catalogue: held alone by the caller.
+    """
+
+    def __init__(self, catalogue: Catalogue, options: ArchiveOptions, reading: Mapping[str, Any]) -> None:
+        self.catalogue, self.options, self.reading = catalogue, options, reading_key(reading)
+        contents = catalogue.contents()
+        self.storage = contents.options
+        self.known = catalogue.sources()
+        self.layouts = {layout_key(one.joints, one.skeleton): (number, one) for number, one in contents.layouts.items()}
+        self.staged = Staged(since=time.monotonic())
+
+    def take(self, source: ArchiveSource, read: ReadSource | WorkerLost) -> SourceOutcome:
+        """What becomes of a source."""
+        if isinstance(read, WorkerLost):
+            return SourceOutcome(source.name, "failed", f"{source.name}: {read}; leave it out, or give its worker more memory")
+        if read.failure:
+            return SourceOutcome(source.name, "failed", read.failure)
+        row = self.known.get(source.key)
+        if row is not None and row.reading == self.reading and row.sha256 == read.stamp.sha256:
+            self._touch(row, read.stamp)
+            return SourceOutcome(source.name, "known", row.note)
+        self.staged.sources.append((source, read))
+        grown = self.options.growth
+        if self.staged.windows >= grown.windows or time.monotonic() - self.staged.since >= grown.seconds:
+            self.commit()
+        outcome = "left out" if not read.windows else "added" if row is None else "replaced"
+        return SourceOutcome(source.name, outcome, read.note, read.windows, read.seconds)  # type: ignore[arg-type]
+
+    def _touch(self, row: SourceRow, now: Stamp) -> None:
+        """The same content at another time."""
+        with self.catalogue.writing() as connection:
+            connection.execute("UPDATE sources SET size = ?, modified = ? WHERE id = ?", (now.size, now.modified, row.id))
+
+    def commit(self) -> None:
+        """Write what is staged as segments, and let the catalogue know: all of it or nothing.
+
+        Raises:
+            ValueError: it cannot be written; the archive is then as it was before.
+        """
+        staged, self.staged = self.staged, Staged(since=time.monotonic())
+        if not staged.sources:
+            return
+        number = self._first_number()
+        numbered: list[tuple[int, int, ReadRecording]] = []  # (source, number, recording)
+        for i, (_, read) in enumerate(staged.sources):
+            for one in read.recordings:
+                numbered.append((i, number, one))
+                number += 1
+        written: dict[str, tuple[Layout, WrittenSegment, int]] = {}
+        try:
+            for key in dict.fromkeys(layout_key(one.joints, one.skeleton) for _, _, one in numbered):
+                mine = [(n, one) for _, n, one in numbered if layout_key(one.joints, one.skeleton) == key]
+                tracks = [replace(track, recording=n) for n, one in mine for track in one.tracks]
+                layout = self._layout(key, tracks, mine[0][1])
+                made = write_segment(self.catalogue.segments_folder, tracks, layout, self.storage)
+                written[key] = (layout, made, sum(one.windows for _, one in mine))
+            self._enter(staged, numbered, written)
+        except BaseException:
+            with contextlib.suppress(OSError, ValueError):
+                clear(self.catalogue)  # what is not in the catalogue: an interruption may have come after the commit
+            raise
+
+    def _layout(self, key: str, tracks: Sequence[Track], one: ReadRecording) -> Layout:
+        known = self.layouts.get(key)
+        return known[1] if known is not None else Layout.learn(tracks, one.skeleton, self.storage, self.options.search)
+
+    def _first_number(self) -> int:
+        """Of the recordings to come; nobody else writes."""
+        with self.catalogue.reading() as connection:
+            row = connection.execute("SELECT seq FROM sqlite_sequence WHERE name = 'recordings'").fetchone()
+        return 1 + (int(row[0]) if row is not None else 0)
+
+    def _enter(
+        self,
+        staged: Staged,
+        numbered: Sequence[tuple[int, int, ReadRecording]],
+        written: Mapping[str, tuple[Layout, WrittenSegment, int]],
+    ) -> None:
+        fresh: dict[str, tuple[int, Layout]] = {}
+        with self.catalogue.writing() as connection:
+            segments: dict[str, int] = {}
+            for key, (layout, made, windows) in written.items():
+                number = self.layouts[key][0] if key in self.layouts else add_layout(connection, layout)
+                fresh[key] = (number, layout)
+                found = connection.execute(
+                    "INSERT INTO segments (file, layout, windows, size, sha256) VALUES (?, ?, ?, ?, ?)",
+                    (made.file, number, windows, made.size, made.sha256),
+                )
+                segments[key] = int(found.lastrowid or 0)
+            rows = [_enter_source(connection, source, read, self.reading) for source, read in staged.sources]
+            connection.executemany(
+                "INSERT INTO recordings VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
+                [
+                    (n, rows[i].id, segments[layout_key(one.joints, one.skeleton)], one.name, one.person, one.begins, one.ends,
+                     one.seconds, one.windows)
+                    for i, n, one in numbered
+                ],
+            )  # fmt: skip
+        self.layouts |= fresh
+        self.known |= {row.key: row for row in rows}
+
+
+def _enter_source(connection: Any, source: ArchiveSource, read: ReadSource, reading: str) -> SourceRow:
+    """The row of a source, in the place of an earlier one."""
+    path = "" if source.path is None else str(source.path.resolve())
+    values = (source.name, path, read.stamp.size, read.stamp.modified, read.stamp.sha256, reading, read.note)
+    row = connection.execute("SELECT id FROM sources WHERE key = ?", (source.key,)).fetchone()
+    if row is not None:
+        drop_recordings(connection, int(row[0]))
+        fields = "name = ?, path = ?, size = ?, modified = ?, sha256 = ?, reading = ?, note = ?"
+        connection.execute(f"UPDATE sources SET {fields} WHERE id = ?", (*values, row[0]))
+        return SourceRow(int(row[0]), source.key, *values)
+    found = connection.execute(
+        "INSERT INTO sources (key, name, path, size, modified, sha256, reading, note) VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
+        (source.key, *values),
+    )
+    return SourceRow(int(found.lastrowid or 0), source.key, *values)
+
+
+# ---- keeping house; the caller holds the archive alone -------------------------------------------------------------------
+
+
+def orphans(catalogue: Catalogue) -> list[Path]:
+    """Files of interrupted additions: nothing in the catalogue says that they are there."""
+    known = {row.file for row in catalogue.contents().segments}
+    return [one for one in sorted(catalogue.segments_folder.iterdir()) if one.name not in known]
+
+
+def clear(catalogue: Catalogue) -> None:
+    """Take the files of interrupted additions away."""
+    for one in orphans(catalogue):
+        with contextlib.suppress(OSError):
+            one.unlink()
+
+
+def tidy(catalogue: Catalogue, options: ArchiveOptions) -> None:
+    """Put small segments together, and write those anew of which much was removed.
+
+    Whoever searches meanwhile has the old files or the new ones: the change is one step of the catalogue.
+    """
+    contents, grown = catalogue.contents(), options.growth
+    for number, layout in contents.layouts.items():
+        mine = [row for row in contents.segments if row.layout == number]
+        small = [row for row in mine if row.windows - row.dead < grown.windows / 2]
+        due = [row for row in mine if row.dead > grown.dead * row.windows]
+        if len(small) > grown.small:
+            due = [row for row in mine if row in small or row in due]
+        batch: list[SegmentRow] = []
+        for row in due:
+            batch.append(row)
+            if sum(one.windows - one.dead for one in batch) >= grown.windows:
+                _join(catalogue, batch, layout)
+                batch = []
+        if batch:
+            _join(catalogue, batch, layout)
+
+
+def _join(catalogue: Catalogue, rows: Sequence[SegmentRow], layout: Layout) -> None:
+    """One segment in the place of some, without what was removed."""
+    storage = catalogue.contents().options
+    tracks: list[Track] = []
+    for row in rows:
+        live = {one.id for one in catalogue.recordings(row.id)}
+        segment = ArchiveSegment.open(catalogue.segments_folder / row.file)
+        tracks += [segment.track(i) for i in range(len(segment)) if int(segment.tracks[i, 0]) in live]
+    windows = sum(windows_of(len(track), storage) for track in tracks)
+    made = write_segment(catalogue.segments_folder, tracks, layout, storage) if tracks else None
+    with catalogue.writing() as connection:
+        number = 0
+        if made is not None:
+            found = connection.execute(
+                "INSERT INTO segments (file, layout, windows, size, sha256) VALUES (?, ?, ?, ?, ?)",
+                (made.file, rows[0].layout, windows, made.size, made.sha256),
+            )
+            number = int(found.lastrowid or 0)
+        for row in rows:
+            connection.execute("UPDATE recordings SET segment = ? WHERE segment = ?", (number, row.id))
+            connection.execute("DELETE FROM segments WHERE id = ?", (row.id,))
+    for row in rows:
+        with contextlib.suppress(OSError):
+            (catalogue.segments_folder / row.file).unlink()

@@ -1,0 +1,285 @@
+"""The archive: recordings of a laboratory, kept as movement, and asked where else anybody did *this*."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import Executor
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from indexing.archive import adding
+from indexing.archive.catalogue import Catalogue, RecordingRow, drop_recordings
+from indexing.archive.options import ArchiveOptions
+from indexing.archive.queries import checked, examples_of
+from indexing.archive.results import Addition, ArchivedEvent, ArchivedRecording, ArchiveInfo, Hit, Verification
+from indexing.archive.searching import Shortlist, Snapshot, search
+from indexing.archive.segments import ArchiveSegment
+from indexing.archive.sources import Taken, gather
+from indexing.archive.verifying import verify
+from indexing.clip import Clip
+
+if TYPE_CHECKING:
+    from indexing.action.indexer import ActionIndexer
+
+Progress = Callable[[float], None] | None
+ATTEMPTS = 3  # of a question, where segments are put together while it is asked
+
+
+class Archive:
+    """Movement of many recordings on disk, searched by example from any viewpoint.
+
+    Args:
+        path: a folder; made by the first :meth:`add`.
+        options: every number that decides; how movement is stored holds for a new archive, an old one says it itself.
+
+    Raises:
+        ValueError: the folder is there and no archive, or one of a newer version.
+
+    Example:
+        >>> import tempfile
+        >>> from indexing.actors import Person, detect, perform
+        >>> def filmed(action, person, azimuth):
+        ...     clip = detect(perform(action, Person.random(person), rng=person), azimuth=azimuth, rng=person)
+        ...     return clip.replace(name=f"{action} {person}")
+        >>> archive = Archive(tempfile.mkdtemp())
+        >>> clips = [filmed(action, person, 40.0) for action in ("squat", "kick", "wave") for person in (1, 2)]
+        >>> len(archive.add(clips).of("added"))
+        6
+        >>> hits = archive.search(filmed("kick", 3, 0.0), k=2)
+        >>> sorted(hit.source for hit in hits)
+        ['kick 1', 'kick 2']
+        >>> archive.verify().ok
+        True
+    """
+
+    def __init__(self, path: str | os.PathLike[str], options: ArchiveOptions = ArchiveOptions()) -> None:
+        self.path, self.options = Path(path).expanduser(), options
+        self._library: Snapshot | None = None
+        if self.path.exists() and not self.path.is_dir():
+            raise ValueError(f"{self.path}: is a file; an archive is a folder")
+        if self.path.is_dir() and any(self.path.iterdir()):
+            Catalogue(self.path)  # says what is wrong with it, if anything
+
+    def __len__(self) -> int:
+        """Windows: poses from which one of the shortest duration lasts."""
+        return self._catalogue().contents().windows if self._made() else 0
+
+    def __repr__(self) -> str:
+        return f"Archive({str(self.path)!r}, {len(self):,} windows)"
+
+    # ---- what is in it -----------------------------------------------------------------------------------------------
+    def add(
+        self,
+        sources: Taken | Iterable[Taken],
+        executor: Executor | None = None,
+        progress: Progress = None,
+        reading: Mapping[str, Any] | None = None,
+    ) -> Addition:
+        """Add recordings: what is known is left alone, what has changed is replaced.
+
+        Whatever happens, the archive holds what was committed before, whole: killed at any moment nothing is lost of it and nothing
+        is there twice.
+
+        Args:
+            sources: files, folders (walked), clips, sets of clips; one or many.
+            executor: anything with the interface of ``concurrent.futures``, such as a process pool or
+                ``dask.distributed.Client(...).get_executor()``; by default this process reads one source after the other.
+            progress: told the share done.
+            reading: arguments of :func:`indexing.readers.read`, such as ``fps``; everybody in view by default.
+
+        Returns:
+            what became of each source; one that cannot be read is no exception.
+
+        Raises:
+            ValueError: another process adds, or the archive cannot be written.
+        """
+        found = gather(sources)
+        catalogue = Catalogue.make(self.path, self.options.storage)
+        return adding.add(catalogue, found, self.options, executor, dict(reading or {}), progress)
+
+    def remove(self, source: str) -> int:
+        """Take a source out: a file by its path or name, a clip by its name.  How many recordings it had.
+
+        Raises:
+            ValueError: there is none of this name.
+        """
+        catalogue = self._catalogue()
+        with catalogue.alone():
+            resolved = str(Path(source).expanduser().resolve())
+            mine = [row for row in catalogue.sources().values() if source in (row.name, row.path) or resolved == row.path != ""]
+            if not mine:
+                raise ValueError(f"{self.path}: has no source {source!r}; dyntorch archive info --sources lists them")
+            count = 0
+            with catalogue.writing() as connection:
+                for row in mine:
+                    count += drop_recordings(connection, row.id)
+                    connection.execute("DELETE FROM sources WHERE id = ?", (row.id,))
+            adding.tidy(catalogue, self.options)
+        return count
+
+    def recordings(self) -> list[ArchivedRecording]:
+        """Everybody in every recording, in the order of their addition."""
+        catalogue = self._catalogue()
+        contents = catalogue.contents()
+        layouts = {row.id: contents.layouts[row.layout].name for row in contents.segments}
+        paths = {row.id: row.path for row in catalogue.sources().values()}
+        return [
+            ArchivedRecording(
+                row.name, paths[row.source], row.person, row.begins, row.ends, row.seconds, layouts[row.segment]
+            )
+            for row in catalogue.recordings()
+        ]  # fmt: skip
+
+    def info(self) -> ArchiveInfo:
+        """How much is in it."""
+        catalogue = self._catalogue()
+        contents, rows = catalogue.contents(), catalogue.recordings()
+        layouts = {row.id: row.layout for row in contents.segments}
+        seconds = dict.fromkeys(contents.layouts, 0.0)
+        for row in rows:
+            seconds[layouts[row.segment]] += row.seconds
+        size = sum(one.stat().st_size for one in self.path.rglob("*") if one.is_file())
+        return ArchiveInfo(
+            sources=len(catalogue.sources()),
+            recordings=len(rows),
+            windows=contents.windows,
+            seconds=sum(seconds.values()),
+            segments=len(contents.segments),
+            dead=sum(row.dead for row in contents.segments),
+            size=size,
+            layouts=tuple((one.name, one.joints, seconds[number]) for number, one in contents.layouts.items()),
+            version=catalogue.version,
+        )
+
+    def clip(self, source: str, start: float | None = None, end: float | None = None, person: str = "") -> Clip:
+        """What is stored of a recording: y up, NaN where not seen.
+
+        Args:
+            source: its name, as hits have it; start, end: seconds on its clock; person: who, where several are in view.
+
+        Raises:
+            ValueError: there is none of this name, or nothing of it in that time.
+        """
+        rows = [row for row in self._catalogue().by_name(source) if person in ("", row.person)]
+        if not rows:
+            who = f" with a person {person!r}" if person else ""
+            raise ValueError(f"{self.path}: has no recording {source!r}{who}; dyntorch archive info --sources lists them")
+        clip = self._stored(rows[0])
+        lowest = -np.inf if start is None else start - 0.5 / (clip.fps or 1.0)
+        return clip.between(lowest, np.inf if end is None else end + 0.5 / (clip.fps or 1.0))
+
+    def _stored(self, row: RecordingRow) -> Clip:
+        """All of a recording's first image."""
+        library = self._opened()
+        number = next(i for i, one in enumerate(library.contents.segments) if one.id == row.segment)
+        segment = library.segments[number]
+        mine = np.flatnonzero((segment.tracks[:, 0] == row.id) & (segment.tracks[:, 1] == 0))
+        mine = mine[np.argsort(segment.starts[mine])]
+        rate = segment.rate
+        joints = np.concatenate([segment.positions(i) for i in mine.tolist()])
+        times = np.concatenate([segment.starts[i] + np.arange(int(segment.tracks[i, 3])) / rate for i in mine.tolist()])
+        layout = library.contents.layouts[library.contents.segments[number].layout]
+        return Clip(joints, times=times, fps=rate, name=row.name, skeleton=layout.skeleton, up="y", meta={"person": row.person})
+
+    # ---- asking it ---------------------------------------------------------------------------------------------------
+    def search(
+        self, clip: Clip, k: int = 10, executor: Executor | None = None, progress: Progress = None, mirror: bool = False
+    ) -> list[Hit]:
+        """Where else anybody did this, best first.
+
+        Args:
+            clip: one performance, from any viewpoint; with 3D joints it is asked from two sides.
+            k: hits at most; executor: as in :meth:`add`, over segments on a file system that all see; mirror: whether its mirror
+                image counts, too.
+
+        Raises:
+            ValueError: nothing is in the archive, or the example is too short, too long, or has too few joints in common with it.
+        """
+        if isinstance(k, bool) or not isinstance(k, (int, np.integer)) or k < 1:
+            raise ValueError(f"k must be a whole number of hits, 1 or more, got {k!r}")
+        for attempt in range(ATTEMPTS):
+            library = self._opened()
+            if not library.contents.windows:
+                raise ValueError(f"{self.path}: holds no movement yet; add recordings first")
+            asked = checked(clip, library.contents.options.shortest, self.options.search)
+            examples = examples_of(asked, library.contents, self.options.search, mirror)
+            try:
+                pool = search(library, examples, int(k), self.options.search, executor, progress)
+                return self._hits(library, pool)
+            except FileNotFoundError:
+                self._library = None
+                if attempt == ATTEMPTS - 1:
+                    raise
+        raise AssertionError("unreachable")
+
+    def _hits(self, library: Snapshot, pool: Shortlist) -> list[Hit]:
+        where = [
+            (library.segments[i], int(t)) for i, t in zip(pool.places.segment.tolist(), pool.places.track.tolist(), strict=True)
+        ]
+        names = self._catalogue().named([int(segment.tracks[track, 0]) for segment, track in where])
+        hits: list[Hit] = []
+        for i, (segment, track) in enumerate(where):
+            row = names.get(int(segment.tracks[track, 0]))
+            if row is None:
+                continue  # removed meanwhile
+            start, last = float(segment.starts[track]), (int(segment.tracks[track, 3]) - 1) / segment.rate
+            begin, end = max(0.0, float(pool.places.begin[i])), min(last, float(pool.places.end[i]))
+            hits.append(Hit(row.name, row.person, start + begin, start + end, float(pool.score[i]), bool(pool.mirrored[i])))
+        return hits
+
+    def find(
+        self, model: ActionIndexer | str | os.PathLike[str], executor: Executor | None = None, progress: Progress = None
+    ) -> list[ArchivedEvent]:
+        """All learned actions in everything, by recording, person and time.
+
+        Args:
+            model: fitted, or its file; executor: as in :meth:`add`.
+
+        Raises:
+            ValueError: the model has too few joints in common with what is in the archive.
+        """
+        from indexing.archive.finding import find
+
+        return find(self._opened(), self._catalogue(), model, self.options.find, executor, progress)
+
+    def verify(self) -> Verification:
+        """Whether every window of the catalogue is there, whole, and once; reads everything."""
+        return verify(self._catalogue())
+
+    # ---- inside ------------------------------------------------------------------------------------------------------
+    def _made(self) -> bool:
+        return self.path.is_dir() and any(self.path.iterdir())
+
+    def _catalogue(self) -> Catalogue:
+        if not self._made():
+            raise ValueError(f"{self.path}: is no archive yet; add recordings first")
+        return Catalogue(self.path)
+
+    def _opened(self) -> Snapshot:
+        """As it is now; what was mapped before and has not changed stays mapped."""
+        catalogue = self._catalogue()
+        if self._library is not None and self._library.contents.generation == catalogue.generation():
+            return self._library
+        for attempt in range(ATTEMPTS):
+            contents = catalogue.contents()
+            known = {} if self._library is None else {one.path.name: one for one in self._library.segments}
+            try:
+                segments = tuple(
+                    known.get(row.file) or ArchiveSegment.open(catalogue.segments_folder / row.file) for row in contents.segments
+                )
+            except FileNotFoundError as problem:
+                if attempt == ATTEMPTS - 1:
+                    raise ValueError(f"{problem.filename}: is missing; dyntorch archive verify says what is lost") from None
+                continue
+            dead = tuple(
+                frozenset(segment.tracks[:, 0].tolist()) - {one.id for one in catalogue.recordings(row.id)}
+                if row.dead
+                else frozenset()
+                for row, segment in zip(contents.segments, segments, strict=True)
+            )
+            self._library = Snapshot(catalogue.segments_folder, contents, segments, dead)
+            return self._library
+        raise AssertionError("unreachable")

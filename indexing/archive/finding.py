@@ -1,0 +1,196 @@
+"""Finding: all actions of a learned model in everything, recording by recording, as the indexer explains them.
+
+The sketches tell first where somebody moves at all as an exemplar does (:func:`indexing.archive.sketches.resembling`); what they
+leave is explained by the indexer itself.  Workers need the file of a segment and the model, and nothing else.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+import warnings
+from collections.abc import Callable
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dyntorch.numerics import one_thread
+from indexing.archive.catalogue import Catalogue
+from indexing.archive.layout import Layout
+from indexing.archive.options import FindOptions, SearchOptions
+from indexing.archive.queries import probe_of
+from indexing.archive.results import ArchivedEvent
+from indexing.archive.searching import Snapshot
+from indexing.archive.segments import ArchiveSegment
+from indexing.archive.sketches import Probe, resembling
+from indexing.archive.workers import InOrder, WorkerLost
+from indexing.cameras import y_up
+from indexing.clip import Clip
+from indexing.scoring import Event
+from indexing.windows import ragged, unusable
+
+if TYPE_CHECKING:
+    from indexing.action.indexer import ActionIndexer
+
+Progress = Callable[[float], None] | None
+
+
+@dataclass(frozen=True)
+class FindTask:
+    """One recording: rows of a segment that may hold actions are told by the probes; none: all of them are looked at.
+
+    model: the bytes of a model file; tracks: of the recording's first image; margin: poses.
+    """
+
+    path: Path
+    recording: int
+    tracks: tuple[int, ...]
+    layout: Layout
+    probes: tuple[Probe, ...]
+    least: float
+    margin: int
+    model: bytes
+
+
+@one_thread
+def find(
+    library: Snapshot,
+    catalogue: Catalogue,
+    model: ActionIndexer | str | os.PathLike[str],
+    options: FindOptions,
+    executor: Executor | None,
+    progress: Progress,
+) -> list[ArchivedEvent]:
+    """See :meth:`indexing.Archive.find`."""
+    from indexing.action.indexer import ActionIndexer
+
+    indexer = ActionIndexer.load(Path(model).expanduser()) if isinstance(model, (str, os.PathLike)) else model
+    data = _dumped(indexer)
+    probes = probes_of(library, indexer, options)
+    if not probes:
+        known = ", ".join(one.name for one in library.contents.layouts.values()) or "nothing"
+        raise ValueError(
+            f"{catalogue.folder}: joints: the model has too few in common with what is in the archive ({known}); use the same pose "
+            "estimator for both"
+        )
+    tasks = _tasks(library, probes, data, options)
+    names = catalogue.named([task.recording for task in tasks])
+    found: list[ArchivedEvent] = []
+    for done, (task, events) in enumerate(InOrder(find_in, executor, tries=2)(tasks), 1):
+        row = names.get(task.recording)
+        if isinstance(events, WorkerLost):
+            raise ValueError(f"{row.name if row else task.path}: could not be searched: {events}; try again, or with fewer workers")
+        if row is not None:
+            found += [ArchivedEvent(**{**vars(event), "source": row.name, "person": row.person}) for event in events]
+        if progress is not None:
+            progress(done / len(tasks))
+    return sorted(found, key=lambda event: (event.source, event.person, event.start, event.end))
+
+
+def probes_of(library: Snapshot, indexer: ActionIndexer, options: FindOptions) -> dict[int, tuple[Probe, ...]]:
+    """How the exemplars move, for each layout that the model can be asked about."""
+    rate, asked = library.contents.options.rate, SearchOptions()
+    exemplars = [indexer.exemplar(i) for i in range(len(indexer.model_.labels))]
+    found: dict[int, tuple[Probe, ...]] = {}
+    for number, layout in library.contents.layouts.items():
+        facing = [layout.facing(clip) for clip in exemplars]
+        if any(clip is None for clip in facing):
+            continue
+        clips = [clip.replace(joints=y_up(clip), up="y") for clip in facing if clip is not None]
+        source = ragged(clips)
+        all_of = [
+            probe_of(source, i, layout, rate, tempo, asked, moving=True) for i in range(len(clips)) for tempo in options.tempos
+        ]
+        found[number] = tuple(probe for probe in all_of if probe is not None)
+    return found
+
+
+def _tasks(library: Snapshot, probes: dict[int, tuple[Probe, ...]], model: bytes, options: FindOptions) -> list[FindTask]:
+    contents, tasks = library.contents, []
+    margin = round(options.margin * contents.options.rate)
+    for i, row in enumerate(contents.segments):
+        if row.layout not in probes:
+            continue
+        segment = library.segments[i]
+        by_recording: dict[int, list[int]] = {}
+        for track in np.flatnonzero(segment.tracks[:, 1] == 0).tolist():
+            number = int(segment.tracks[track, 0])
+            if number not in library.dead[i]:
+                by_recording.setdefault(number, []).append(track)
+        layout = contents.layouts[row.layout]
+        tasks += [
+            FindTask(segment.path, number, tuple(tracks), layout, probes[row.layout], options.least, margin, model)
+            for number, tracks in by_recording.items()
+        ]
+    return tasks
+
+
+# ---- one recording, in a worker ------------------------------------------------------------------------------------------
+
+
+@one_thread
+def find_in(task: FindTask) -> list[Event]:
+    """The events of one recording."""
+    segment = ArchiveSegment.open(task.path)
+    clips: list[tuple[NDArray[np.float64], NDArray[np.float32]]] = []
+    for track in sorted(task.tracks, key=lambda number: float(segment.starts[number])):
+        part = segment.only(track)
+        rows = np.flatnonzero(_widened(resembling(part, task.probes, task.least), task.margin))
+        if len(rows) > 1:
+            clips.append((float(part.starts[0]) + rows / part.rate, part.poses(np.zeros(len(rows), np.int64), rows)))
+    if not clips:
+        return []
+    times, joints = np.concatenate([one for one, _ in clips]), np.concatenate([one for _, one in clips])
+    clip = Clip(joints, times=times, skeleton=task.layout.skeleton)
+    if unusable(clip):
+        return []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # that the model has other joints, too, is so of every recording
+        return list(_loaded(task.model).find(clip))
+
+
+def _widened(mask: NDArray[np.bool_], margin: int) -> NDArray[np.bool_]:
+    """Rows within a margin of those marked."""
+    total = np.concatenate([[0], np.cumsum(mask)])
+    index = np.arange(len(mask))
+    return np.asarray(total[np.minimum(index + margin + 1, len(mask))] > total[np.maximum(index - margin, 0)])
+
+
+def _dumped(indexer: ActionIndexer) -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "model.safetensors"
+        indexer.save(path)
+        return path.read_bytes()
+
+
+def _loaded(data: bytes) -> ActionIndexer:
+    return _kept(hashlib.sha256(data).hexdigest(), _Bytes(data))
+
+
+class _Bytes:
+    """Bytes that are all alike to a cache, which knows them by their hash."""
+
+    def __init__(self, data: bytes) -> None:
+        self.data = data
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Bytes)
+
+    def __hash__(self) -> int:
+        return 0
+
+
+@lru_cache(maxsize=4)
+def _kept(name: str, data: _Bytes) -> ActionIndexer:
+    from indexing.action.indexer import ActionIndexer
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"{name[:8]}.safetensors"
+        path.write_bytes(data.data)
+        return ActionIndexer.load(path)

@@ -1,0 +1,109 @@
+"""What decides in an archive: every number of its stages, by its name, with its unit and what was measured for it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from indexing.windows import RepairOptions
+
+
+@dataclass(frozen=True)
+class StorageOptions:
+    """How movement is stored.  Fixed when an archive is made: it says so itself, whatever is asked of it later."""
+
+    rate: float = 15.0
+    """Stored poses per second, each with a sketch: 4.8 MB per hour of 17 joints.  Windows may begin and end at any of them."""
+    dimensions: int = 8
+    """Directions of joint space that a sketch keeps, of x and of y.  Right moment among the best 10 / 100 / 300 of 280,000 windows
+    of 1 s (CMU): 6 give .72 / .89 / .96, 8 .88 / .98 / .99, 12 .92 / 1.00 / 1.00, all .98 / .99 / .99 (without re-ranking)."""
+    whitening: float = 0.5
+    """Power of the joint covariance by which directions are evened out: .25 gives .88 / .98 / .99 there, too, at 2 s .82 of first
+    places for .88."""
+    floor: float = 0.03
+    """Added to the covariance of mean diagonal 1."""
+    shortest: float = 0.5
+    """Seconds of the shortest window; what is in view for less is left out."""
+    bridged: float = 1.0
+    """Seconds between two sightings of a joint over which it is interpolated; it counts as not seen in longer gaps."""
+    joints: int = 3
+    """Joints that a frame must show, to show anybody."""
+    far: float = 200.0
+    """Body sizes from the middle of a stretch beyond which a joint is a slip: rounding costs .6 % of a body at worst."""
+    repair: RepairOptions = RepairOptions(sampled=8)
+    """By which wrong joints are told, as everywhere."""
+    learned: int = 20_000
+    """Poses from which the directions of a layout are learned, at most: evenly spread over what is added first."""
+
+
+@dataclass(frozen=True)
+class GrowthOptions:
+    """How files of an archive grow and are put together."""
+
+    windows: int = 1_000_000
+    """Of a segment at most, unless one source has more: 18 hours, 88 MB of 17 joints."""
+    seconds: float = 120.0
+    """After which what was read is committed: as much is lost at most where an addition is killed."""
+    small: int = 16
+    """Segments of less than half the size that may lie about before they are put together."""
+    dead: float = 0.5
+    """Share of removed windows from which a segment is written anew."""
+    tries: int = 3
+    """Times that a source is tried where its worker dies, the last time by itself."""
+    ahead: int = 4
+    """Sources per worker that are read ahead of what is written: bounds memory."""
+
+
+@dataclass(frozen=True)
+class SearchOptions:
+    """How an example is searched."""
+
+    candidates: int = 1000
+    """Moments that sketches choose, which are then compared exactly."""
+    tempos: tuple[float, ...] = (0.8, 1.0, 1.25)
+    """Durations that are searched, in those of the query: people differ."""
+    samples: int = 5
+    """Steps that a window is divided into, and by whose ends it is compared: of a second 5 poses find the right moment among 300 in
+    .99 (8: .99), of two seconds 10 in 1.00 (20: 1.00)."""
+    apart: float = 0.35
+    """Durations between two candidates: nearer ones are one."""
+    shifts: tuple[float, ...] = (-1.0, 0.0, 1.0)
+    """Steps of the sketch by which the best candidates are moved where they are compared exactly."""
+    stretches: tuple[float, ...] = (0.9, 1.0, 1.1)
+    """Durations, in its own, with which a candidate is compared then."""
+    refined: int = 100
+    """Best candidates that are moved and stretched."""
+    merged: float = 0.5
+    """Share of the shorter of two hits, of one person, that both cover, from which they are one."""
+    power: float = 0.4
+    """Of the joint metric.  Right moment first, of 280,000 of 1 s and 2 s: .25 gives .81 / .93, .4 .83 / .95, .5 .79 / .95."""
+    floor: float = 0.05
+    """Of the joint metric."""
+    length: int = 12
+    """Steps that windows are resampled to for the exact comparison."""
+    deepest: float = 30.0
+    """Seconds of the longest query; a longer one is no movement but a recording."""
+    sampled: int = 3000
+    """Windows from which the joint metric of a layout is learned."""
+
+
+@dataclass(frozen=True)
+class FindOptions:
+    """How learned actions are found in an archive."""
+
+    least: float = 0.36
+    """Squared correlation of movement between sketches and the nearest exemplar, below which nothing is looked for.  All of 182
+    actions of the exercises, UTKinect and synthetic people, by others and from other sides, reach .33, all but two .36."""
+    tempos: tuple[float, ...] = (0.7, 1.0, 1.4)
+    """Durations of exemplars by which that is told, in their own."""
+    margin: float = 1.5
+    """Seconds around what may be an action that are looked at with it."""
+
+
+@dataclass(frozen=True)
+class ArchiveOptions:
+    """Every number that decides in :class:`indexing.Archive`, by stage."""
+
+    storage: StorageOptions = StorageOptions()
+    growth: GrowthOptions = GrowthOptions()
+    search: SearchOptions = SearchOptions()
+    find: FindOptions = FindOptions()

@@ -1,0 +1,236 @@
+"""Searching: an example in, the stretches of all recordings that resemble it out.
+
+Stages: the example becomes probes, for each joint layout (:mod:`indexing.archive.queries`); each segment's sketches give
+candidates (:func:`candidates`), which are merged (:func:`merged`); the best are compared exactly, moved and stretched
+(:func:`ranked`); neighbours become one hit (:func:`distinct`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from dyntorch.numerics import one_thread, workers
+from indexing.archive.catalogue import Contents
+from indexing.archive.comparing import Places, residuals
+from indexing.archive.options import SearchOptions
+from indexing.archive.queries import Query
+from indexing.archive.segments import ArchiveSegment
+from indexing.archive.sketches import TASK, Candidates, Probe, scan
+from indexing.archive.workers import InOrder, WorkerLost
+from indexing.clip import FloatArray
+
+Progress = Callable[[float], None] | None
+
+
+@dataclass(frozen=True)
+class ScanTask:
+    """What one worker scans: rows of one segment (its place among all); dead: recordings that were removed."""
+
+    path: Path
+    segment: int
+    probes: tuple[Probe, ...]
+    keep: int
+    dead: frozenset[int]
+    begin: int
+    end: int
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """An archive as it is searched: what the catalogue says, the segments in its order, and who of each was removed."""
+
+    folder: Path
+    contents: Contents
+    segments: tuple[ArchiveSegment, ...]
+    dead: tuple[frozenset[int], ...]
+
+    def tasks(self, examples: Mapping[int, Query], keep: int) -> list[ScanTask]:
+        """What there is to scan, in its order."""
+        rows = self.contents.segments
+        return [
+            ScanTask(self.folder / row.file, i, examples[row.layout].probes, keep, self.dead[i], begin, begin + TASK)
+            for i, row in enumerate(rows)
+            if row.layout in examples
+            for begin in range(0, len(self.segments[i].codes), TASK)
+        ]
+
+
+@dataclass(frozen=True, eq=False)
+class Shortlist:
+    """Windows that may be hits, each a row of all arrays.
+
+    places: where they are; probe: which probe of the layout's example they resemble; score: the squared correlation of sketches,
+    then minus the residual; mirrored: whether that is a mirror image.
+    """
+
+    places: Places
+    probe: NDArray[np.int64]
+    score: FloatArray
+    mirrored: NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        return len(self.probe)
+
+    def __getitem__(self, index: NDArray[np.intp] | slice) -> Shortlist:
+        return Shortlist(self.places[index], self.probe[index], self.score[index], self.mirrored[index])
+
+    def at(self, places: Places, score: FloatArray) -> Shortlist:
+        """The same windows elsewhere, with other scores."""
+        return replace(self, places=places, score=score)
+
+
+@one_thread
+def search(
+    library: Snapshot, examples: Mapping[int, Query], k: int, options: SearchOptions, executor: Executor | None, progress: Progress
+) -> Shortlist:
+    """The best ``k`` stretches, best first."""
+    found = candidates(library.tasks(examples, options.candidates), executor, progress)
+    pool = merged(library, examples, found, options)
+    pool = ranked(library, examples, pool, k, options)
+    return distinct(library, pool, options)[:k]
+
+
+# ---- candidates ----------------------------------------------------------------------------------------------------------
+
+
+def scan_task(task: ScanTask) -> Candidates:
+    """What a worker does: it needs nothing but the file."""
+    return scan(_opened(str(task.path)), task.probes, task.keep, task.dead, task.begin, task.end)
+
+
+@lru_cache(maxsize=256)
+def _opened(path: str) -> ArchiveSegment:
+    return ArchiveSegment.open(Path(path))
+
+
+def candidates(tasks: Sequence[ScanTask], executor: Executor | None, progress: Progress) -> list[tuple[int, Candidates]]:
+    """``(segment, candidates)`` of every task; threads of this process do it where there is no executor.
+
+    Raises:
+        FileNotFoundError: a segment is no longer there; ValueError: a task's workers died.
+    """
+    found: list[tuple[int, Candidates]] = []
+    with contextlib.ExitStack() as stack:
+        if executor is None and workers() > 1 and len(tasks) > 1:
+            executor = stack.enter_context(ThreadPoolExecutor(workers(), initializer=torch.set_num_threads, initargs=(1,)))
+        for task, result in InOrder(scan_task, executor, tries=2)(tasks):
+            if isinstance(result, WorkerLost):
+                if not task.path.exists():
+                    raise FileNotFoundError(str(task.path))
+                raise ValueError(f"{task.path}: could not be searched: {result}; try again, or with fewer workers")
+            found.append((task.segment, result))
+            if progress is not None:
+                progress(0.9 * len(found) / len(tasks))
+    return found
+
+
+def merged(
+    library: Snapshot, examples: Mapping[int, Query], found: Sequence[tuple[int, Candidates]], options: SearchOptions
+) -> Shortlist:
+    """The best candidates of all; of those of one track that nearly coincide, whatever their tempo, the best."""
+    rows = library.contents.segments
+    rate = library.contents.options.rate
+    segment = np.concatenate([np.zeros(0, np.intp), *(np.full(len(one), i, np.intp) for i, one in found)])
+    track, row, probe = (
+        np.concatenate([np.zeros(0, np.int64), *(getattr(one, name) for _, one in found)]) for name in ("track", "row", "probe")
+    )
+    score = np.concatenate([np.zeros(0), *(one.score for _, one in found)])
+    asked = [examples[rows[i].layout].probes[p] for i, p in zip(segment.tolist(), probe.tolist(), strict=True)]
+    middle = (row + np.array([one.span / 2 for one in asked])) / rate
+    half = np.array([one.seconds / 2 for one in asked])
+    kept: list[int] = []
+    near: dict[tuple[int, int], list[int]] = {}
+    for i in np.lexsort((probe, row, track, segment, -score)).tolist():
+        others = near.setdefault((int(segment[i]), int(track[i])), [])
+        if all(abs(middle[i] - middle[j]) > options.apart * 2 * min(half[i], half[j]) for j in others):
+            others.append(i)
+            kept.append(i)
+            if len(kept) == options.candidates:
+                break
+    chosen = np.array(kept, dtype=np.intp)
+    places = Places(segment, track, middle - half, middle + half)
+    return Shortlist(places, probe, score, np.array([one.mirrored for one in asked], dtype=bool))[chosen]
+
+
+# ---- the exact comparison ------------------------------------------------------------------------------------------------
+
+
+def ranked(library: Snapshot, examples: Mapping[int, Query], pool: Shortlist, k: int, options: SearchOptions) -> Shortlist:
+    """Candidates by their exact residual, best first; the best ones moved and stretched to where it is least."""
+    pool = _compared(library, examples, pool, options)
+    best = pool[: max(options.refined, 4 * k)]
+    count, rate = len(best), library.contents.options.rate
+    rows = library.contents.segments
+    strides = np.array(
+        [
+            examples[rows[i].layout].probes[p].stride
+            for i, p in zip(best.places.segment.tolist(), best.probe.tolist(), strict=True)
+        ],
+        dtype=float,
+    )  # fmt: skip
+    middle, half = (best.places.begin + best.places.end) / 2, (best.places.end - best.places.begin) / 2
+    parts = [
+        replace(
+            best.places,
+            begin=middle + shift * strides / rate - stretch * half,
+            end=middle + shift * strides / rate + stretch * half,
+        )
+        for shift in options.shifts
+        for stretch in options.stretches
+    ]
+    if not count:
+        return best
+    tried = np.stack([_scores(library, examples, best.at(part, best.score), options) for part in parts])
+    which, index = np.argmax(tried, axis=0), np.arange(count)
+    begin, end = (np.stack([getattr(part, name) for part in parts])[which, index] for name in ("begin", "end"))
+    return _sorted(best.at(replace(best.places, begin=begin, end=end), tried[which, index]))
+
+
+def _compared(library: Snapshot, examples: Mapping[int, Query], pool: Shortlist, options: SearchOptions) -> Shortlist:
+    return _sorted(pool.at(pool.places, _scores(library, examples, pool, options)))
+
+
+def _scores(library: Snapshot, examples: Mapping[int, Query], pool: Shortlist, options: SearchOptions) -> FloatArray:
+    """``(windows,)`` minus the residual, layout by layout."""
+    rows = library.contents.segments
+    layouts = np.array([rows[i].layout for i in pool.places.segment.tolist()], dtype=np.intp)
+    out = np.full(len(pool), -np.inf)
+    for number in np.unique(layouts).tolist():
+        mine = np.flatnonzero(layouts == number)
+        example = examples[number]
+        image = np.array([example.probes[p].image for p in pool.probe[mine].tolist()], dtype=np.intp)
+        metric = library.contents.layouts[number].joint_metric(options)
+        out[mine] = -residuals(example.windows, image, pool.places[mine], library.segments, metric, options.length)
+    return out
+
+
+def _sorted(pool: Shortlist) -> Shortlist:
+    places = pool.places
+    kept = np.flatnonzero(np.isfinite(pool.score))
+    order = np.lexsort((pool.probe, places.begin, places.track, places.segment, -pool.score))
+    return pool[order[np.isin(order, kept)]]
+
+
+def distinct(library: Snapshot, pool: Shortlist, options: SearchOptions) -> Shortlist:
+    """Windows, best first, without those that mostly cover what a better one of the same person covers, from whatever image."""
+    kept: list[int] = []
+    spans: dict[int, list[tuple[float, float]]] = {}
+    places = pool.places
+    for i in range(len(pool)):
+        segment, track = library.segments[int(places.segment[i])], int(places.track[i])
+        start = float(segment.starts[track])
+        begin, end = start + float(places.begin[i]), start + float(places.end[i])
+        others = spans.setdefault(int(segment.tracks[track, 0]), [])
+        if all(min(end, b) - max(begin, a) < options.merged * min(end - begin, b - a) for a, b in others):
+            others.append((begin, end))
+            kept.append(i)
+    return pool[np.array(kept, dtype=np.intp)]

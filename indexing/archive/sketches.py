@@ -1,0 +1,269 @@
+r"""Sketches compared: an example of any duration slid along the codes of every pose of an archive.
+
+With :math:`q_d \in R^{L k}` the codes of the example's x and y at L moments, orthonormalized, and :math:`a_d(t)` those of a window
+that begins at t, the window resembles the example by the largest canonical correlation of the two planes,
+
+.. math:: \sigma_1^2 = \lambda_{\max}\!\left(G^{-1} C C^T\right), \quad C_{de} = a_d(t)^T q_e, \quad G_{de} = a_d(t)^T a_e(t),
+
+which is 1 where both are images of one movement by affine cameras, whatever these are (thesis, chapter 7).  All windows share
+their products with each of the example's poses, so that no window is ever stored:
+:math:`C(t) = \sum_l \langle a(t + l m), q_l \rangle`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from indexing.archive.segments import ArchiveSegment
+
+BLOCK = 2**15  # windows compared at once: 5 ns a window and pass; at 4096 half of the time is spent between the passes
+TASK = 2**20  # rows of a segment that one worker scans: 19 hours
+ROUND = 1e-6  # of the trace of G, added to its diagonal: planes that are nearly lines stay finite
+
+
+@dataclass(frozen=True, eq=False)
+class Probe:
+    """An example as it is slid along the codes.
+
+    image: which image of the example; mirrored: whether it is the mirror image; seconds: duration of the windows; stride: poses
+    from one sample to the next; codes: ``(2, samples, k)`` orthonormal, of x and y; apart: windows
+    around a candidate that are none.
+    """
+
+    image: int
+    mirrored: bool
+    seconds: float
+    stride: int
+    codes: NDArray[np.float32]
+    apart: int
+
+    @property
+    def samples(self) -> int:
+        """How many poses of a window are compared."""
+        return int(self.codes.shape[1])
+
+    @property
+    def span(self) -> int:
+        """Poses from the first one compared to the last."""
+        return (self.samples - 1) * self.stride
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Windows that resemble an example, best first, each a row of all arrays.
+
+    score: the squared correlation; track, row: where the first pose compared is; probe: which probe it resembles.
+    """
+
+    score: NDArray[np.float32]
+    track: NDArray[np.int64]
+    row: NDArray[np.int64]
+    probe: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.score)
+
+    def best(self, count: int) -> Candidates:
+        """The best ones; equal ones in the order in which they lie."""
+        order = np.lexsort((self.probe, self.row, self.track, -self.score))[:count]
+        return Candidates(self.score[order], self.track[order], self.row[order], self.probe[order])
+
+
+def orthonormal(codes: NDArray[np.float32]) -> NDArray[np.float32] | None:
+    """``(2, samples, k)`` the same plane with orthonormal axes; ``None`` where it is no plane (nothing was seen).
+
+    Example:
+        >>> plane = orthonormal(np.random.default_rng(0).normal(size=(2, 5, 3)).astype(np.float32))
+        >>> bool(np.allclose(plane.reshape(2, -1) @ plane.reshape(2, -1).T, np.eye(2), atol=1e-6))
+        True
+    """
+    flat = codes.reshape(2, -1).astype(np.float64)
+    gram = flat @ flat.T
+    trace = np.trace(gram)
+    if not trace > 0:
+        return None
+    lower = np.linalg.cholesky(gram + ROUND * trace * np.eye(2))
+    return np.linalg.solve(lower, flat).reshape(codes.shape).astype(np.float32)
+
+
+def correlation(c: Tensor, gram: Tensor) -> Tensor:
+    r"""``(probes, n)`` squared largest canonical correlations.
+
+    Args:
+        c: ``(2, probes, 2, n)`` products of the windows' axes (first) with the orthonormal ones of each probe; gram: ``(3, n)`` the
+            entries 00, 01, 11 of G.
+
+    Example:
+        >>> c = torch.eye(2).reshape(2, 1, 2, 1)
+        >>> correlation(c, torch.tensor([[1.0], [0.0], [1.0]])).item()
+        1.0
+    """
+    trace = gram[0] + gram[2]
+    g00, g01, g11 = gram[0] + ROUND * trace, gram[1], gram[2] + ROUND * trace
+    determinant = g00 * g11 - g01 * g01
+    inverse = torch.where(determinant > 0, determinant, torch.inf).reciprocal_()
+    (a0, a1), (b0, b1) = (c[d].unbind(1) for d in range(2))
+    p, q, r = (a0 * a0).addcmul_(a1, a1), (a0 * b0).addcmul_(a1, b1), (b0 * b0).addcmul_(b1, b1)
+    total = (p * g11).addcmul_(q, g01, value=-2.0).addcmul_(r, g00).mul_(inverse)
+    product = p.mul_(r).addcmul_(q, q, value=-1.0).mul_(inverse)
+    return (total * total).add_(product, alpha=-4.0).clamp_(min=0.0).sqrt_().add_(total).mul_(0.5)
+
+
+def scan(
+    segment: ArchiveSegment,
+    probes: Sequence[Probe],
+    keep: int,
+    dead: frozenset[int] = frozenset(),
+    begin: int = 0,
+    end: int | None = None,
+) -> Candidates:
+    """The windows of a segment that resemble an example best; neighbours of better ones are left out.
+
+    Args:
+        keep: windows at most; dead: recordings that were removed; begin, end: rows at which windows may begin.
+    """
+    end = len(segment.codes) if end is None else min(end, len(segment.codes))
+    found = _Kept(keep)
+    gone = np.isin(segment.tracks[:, 0], list(dead)) if dead else np.zeros(len(segment), dtype=bool)
+    for stride in sorted({probe.stride for probe in probes}):
+        numbers = [i for i, probe in enumerate(probes) if probe.stride == stride]
+        halo = max(probes[i].apart for i in numbers)
+        reach = max(probes[i].samples for i in numbers) - 1
+        total = -(-len(segment.codes) // stride)
+        for first in range(-(-begin // stride), -(-end // stride), BLOCK):
+            last = min(first + BLOCK, -(-end // stride))  # windows that may be candidates: first to last
+            low, high = max(0, first - halo), min(total, last + halo + reach)
+            x = _poses(segment, low, high, stride)
+            gram = _gram(x)
+            for samples in sorted({probes[i].samples for i in numbers}):
+                mine = [i for i in numbers if probes[i].samples == samples]
+                if high - low < samples:
+                    continue
+                scores = _scores(x, gram, [probes[i] for i in mine], samples)
+                scores[:, torch.from_numpy(_outside(segment, gone, low, scores.shape[1], samples, stride))] = -1.0
+                for i, score in zip(mine, scores, strict=True):
+                    _take(found, score, low, (first, last), probes[i].apart, i, stride)
+    return found.candidates(segment)
+
+
+def resembling(segment: ArchiveSegment, probes: Sequence[Probe], least: float) -> NDArray[np.bool_]:
+    """``(rows,)`` the poses of windows that move as an example does, well enough.
+
+    Args:
+        probes: of how poses differ from their mean; least: squared correlation.
+    """
+    marks = np.zeros(len(segment.codes) + 1, dtype=np.int64)
+    none = np.zeros(len(segment), dtype=bool)
+    for stride, samples in sorted({(probe.stride, probe.samples) for probe in probes}):
+        mine = [probe for probe in probes if (probe.stride, probe.samples) == (stride, samples)]
+        total = -(-len(segment.codes) // stride)
+        for low in range(0, total - samples + 1, BLOCK):
+            x = _poses(segment, low, min(total, low + BLOCK + samples - 1), stride)
+            best = _scores(x, _gram(x), mine, samples, moving=True).amax(dim=0)
+            best[torch.from_numpy(_outside(segment, none, low, len(best), samples, stride))] = -1.0
+            begin = (np.flatnonzero(best.numpy() >= least) + low) * stride
+            np.add.at(marks, begin, 1)
+            np.add.at(marks, np.minimum(begin + (samples - 1) * stride + 1, len(marks) - 1), -1)
+    return np.asarray(np.cumsum(marks[:-1]) > 0)
+
+
+def _poses(segment: ArchiveSegment, low: int, high: int, stride: int) -> Tensor:
+    """``(2, k, n)`` codes of every ``stride``-th pose, as they were before they were rounded."""
+    rows = slice(low * stride, (high - 1) * stride + 1, stride)
+    codes = segment.codes[rows]
+    x = torch.from_numpy(np.ascontiguousarray(codes.reshape(len(codes), -1).T)).float()
+    return x.mul_(torch.from_numpy(np.array(segment.scales[rows]))).view(2, codes.shape[2], len(codes))
+
+
+def _gram(x: Tensor) -> Tensor:
+    """``(3, n)`` x x, x y and y y of each pose."""
+    return torch.stack([(x[0] * x[0]).sum(0), (x[0] * x[1]).sum(0), (x[1] * x[1]).sum(0)])
+
+
+def _scores(x: Tensor, gram: Tensor, probes: Sequence[Probe], samples: int, moving: bool = False) -> Tensor:
+    """``(probes, windows)`` of all windows whose poses are there.
+
+    Args:
+        moving: of how poses differ from their mean; the probes' codes have mean 0 then, so that C knows nothing of the mean.
+    """
+    codes = torch.from_numpy(np.stack([probe.codes for probe in probes]))  # (probes, 2, samples, k)
+    count = x.shape[2] - samples + 1
+    products = (codes.flatten(0, 2) @ x).view(2, len(probes), 2, samples, x.shape[2])
+    c, total = products[:, :, :, 0, :count].clone(), gram[:, :count].clone()
+    for step in range(1, samples):
+        c += products[:, :, :, step, step : step + count]
+        total += gram[:, step : step + count]
+    if moving:
+        means = x[:, :, :count].clone()
+        for step in range(1, samples):
+            means += x[:, :, step : step + count]
+        total -= _gram(means) / samples
+    return correlation(c, total)
+
+
+def _outside(
+    segment: ArchiveSegment, gone: NDArray[np.bool_], low: int, count: int, samples: int, stride: int
+) -> NDArray[np.bool_]:
+    """``(windows,)`` which of them do not lie in one track that counts."""
+    bounds = np.append(segment.firsts, len(segment.codes))
+    first = max(0, int(np.searchsorted(bounds, low * stride, side="right")) - 1)
+    last = int(np.searchsorted(bounds, (low + count + samples) * stride, side="left")) + 1
+    begins, ends = bounds[first:last][:-1], bounds[first:last][1:]
+    # windows that begin in a track, and those of them that end in it
+    mine = np.clip(-(-begins // stride) - low, 0, count), np.clip(-(-(ends - (samples - 1) * stride) // stride) - low, 0, count)
+    there = ~gone[first : first + len(begins)] & (mine[1] > mine[0])
+    steps = np.zeros(count + 1, dtype=np.int64)
+    np.add.at(steps, mine[0][there], 1)
+    np.add.at(steps, mine[1][there], -1)
+    return np.asarray(np.cumsum(steps[:-1]) <= 0)
+
+
+class _Kept:
+    """The best windows so far: what is certainly not among them is not looked at."""
+
+    def __init__(self, keep: int) -> None:
+        self.keep, self.threshold = keep, 0.0
+        self._parts: list[tuple[NDArray[np.float32], NDArray[np.int64], int]] = []
+        self._count = 0
+
+    def add(self, scores: NDArray[np.float32], rows: NDArray[np.int64], probe: int) -> None:
+        self._parts.append((scores, rows, probe))
+        self._count += len(scores)
+        if self._count > 8 * self.keep:
+            scores, rows, probes = self._all()
+            order = np.lexsort((probes, rows, -scores))[: self.keep]
+            self.threshold = float(scores[order[-1]])
+            self._parts = [(scores[order][probes[order] == i], rows[order][probes[order] == i], i) for i in set(probes.tolist())]
+            self._count = len(order)
+
+    def _all(self) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.int64]]:
+        scores = np.concatenate([np.zeros(0, np.float32), *(part[0] for part in self._parts)])
+        rows = np.concatenate([np.zeros(0, np.int64), *(part[1] for part in self._parts)])
+        probes = np.concatenate([np.zeros(0, np.int64), *(np.full(len(part[0]), part[2]) for part in self._parts)])
+        return scores, rows, probes
+
+    def candidates(self, segment: ArchiveSegment) -> Candidates:
+        scores, rows, probes = self._all()
+        track = np.searchsorted(segment.firsts, rows, side="right") - 1
+        return Candidates(scores, track, rows - segment.firsts[track], probes).best(self.keep)
+
+
+def _take(found: _Kept, score: Tensor, low: int, inner: tuple[int, int], apart: int, probe: int, stride: int) -> None:
+    """The local maxima among the inner windows."""
+    first, last = inner[0] - low, min(inner[1] - low, len(score))
+    if last <= first:
+        return
+    highest = score.clone()
+    for step in range(1, min(apart, len(score) - 1) + 1):
+        torch.maximum(highest[step:], score[:-step], out=highest[step:])
+        torch.maximum(highest[:-step], score[step:], out=highest[:-step])
+    mine = score[first:last]
+    chosen = ((mine >= highest[first:last]) & (mine > found.threshold)).nonzero()[:, 0]
+    if len(chosen):
+        found.add(mine[chosen].numpy(), ((chosen + inner[0]) * stride).numpy(), probe)

@@ -1,0 +1,291 @@
+"""What an archive takes in: files, folders, clips and sets of them; how each is told from the others; and reading one of them.
+
+Reading happens in workers, which know nothing of the archive: :func:`read_source` is handed a :class:`ArchiveSource` and gives back
+movement as it is stored, or the reason why there is none.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from indexing.archive.catalogue import CATALOGUE
+from indexing.archive.options import StorageOptions
+from indexing.archive.tracks import Track, total_windows, tracks_of
+from indexing.clip import Clip, LabelledSet
+from indexing.opening import parse_json, read_text
+from indexing.readers.files import VIDEOS, frame_number
+from indexing.skeleton import Skeleton
+
+KEYPOINT_FILES = (".json", ".npz", ".csv")  # suffixes that are looked into where a folder is given
+PEEKED = 2**22  # bytes of a JSON file up to which it may be one frame of many
+CHUNK = 2**20  # bytes hashed at once
+
+Taken = Clip | LabelledSet[Clip] | str | os.PathLike[str]
+
+
+@dataclass(frozen=True, eq=False)
+class ArchiveSource:
+    """One thing to add.
+
+    key: what it is known by in the archive; name: what to call it; path: of a file or folder; clip: from memory.
+    """
+
+    key: str
+    name: str
+    path: Path | None = None
+    clip: Clip | None = None
+
+
+@dataclass(frozen=True)
+class Stamp:
+    """What a source was like when it was read: bytes, time of its last change (ns), hash of its content."""
+
+    size: int
+    modified: int
+    sha256: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class ReadRecording:
+    """One person of a recording, as it is stored.
+
+    begins, ends: seconds, from the first stored pose to the last.
+    """
+
+    name: str
+    person: str
+    joints: int
+    skeleton: Skeleton | None
+    tracks: tuple[Track, ...]
+    begins: float
+    ends: float
+    seconds: float
+    windows: int
+
+
+@dataclass(frozen=True, eq=False)
+class ReadSource:
+    """What reading gave: recordings, and what a reader should know; or, in ``failure``, why there are none."""
+
+    stamp: Stamp
+    recordings: tuple[ReadRecording, ...] = ()
+    note: str = ""
+    failure: str = ""
+
+    @property
+    def windows(self) -> int:
+        """Of all recordings."""
+        return sum(one.windows for one in self.recordings)
+
+    @property
+    def seconds(self) -> float:
+        """Stored, of all people."""
+        return sum(one.seconds for one in self.recordings)
+
+
+# ---- what there is to add ------------------------------------------------------------------------------------------------
+
+
+def gather(given: Taken | Iterable[Taken]) -> list[ArchiveSource]:
+    """All sources, folders walked, each once.
+
+    Raises:
+        ValueError: nothing to add, or what is no file, clip or set of clips.
+    """
+    listed: list[Any] = [given] if isinstance(given, (Clip, str, os.PathLike)) else list(given)
+    found: list[ArchiveSource] = []
+    for one in listed:
+        if isinstance(one, Clip):
+            found.append(_of_clip(one))
+        elif isinstance(one, (str, os.PathLike)):
+            found += _of_path(Path(one))
+        elif isinstance(one, LabelledSet) and all(isinstance(clip, Clip) for clip in one):
+            found += [_of_clip(clip) for clip in one]
+        else:
+            raise ValueError(f"sources: got {type(one).__name__}; give paths of files or folders, Clips or ClipSets")
+    if not found:
+        raise ValueError("sources: nothing to add; give keypoint files, folders that hold some, Clips or ClipSets")
+    return _once(found)
+
+
+def _of_clip(clip: Clip) -> ArchiveSource:
+    name = clip.name or f"clip {_hash_of(clip)[:12]}"
+    return ArchiveSource(f"clip:{name}", name, clip=clip)
+
+
+def _of_path(path: Path) -> list[ArchiveSource]:
+    path = path.expanduser()
+    if not path.is_dir() or is_recording(path):
+        return [ArchiveSource(f"file:{path.resolve()}", str(path), path)]
+    try:
+        inside = sorted(path.iterdir())
+    except OSError:
+        return [ArchiveSource(f"file:{path.resolve()}", str(path), path)]
+    found: list[ArchiveSource] = []
+    for one in inside:
+        if one.name.startswith("."):
+            continue
+        if (one.is_dir() and not (one / CATALOGUE).exists()) or one.suffix.lower() in KEYPOINT_FILES:
+            found += _of_path(one)
+    return found
+
+
+def is_recording(folder: Path) -> bool:
+    """Whether a folder is one recording, with a file for each frame, and not a collection of recordings.
+
+    It holds text or JSON files with frame numbers and nothing to walk into, and its first JSON file is one frame.
+    """
+    try:
+        files = sorted(one for one in folder.iterdir() if not one.name.startswith("."))
+    except OSError:
+        return False
+    for suffix in (".json", ".txt"):
+        frames = [one for one in files if one.suffix.lower() == suffix and one.name != "classes.txt"]
+        if not frames or any(
+            one.is_dir() or one.suffix.lower() in (*KEYPOINT_FILES, *VIDEOS) for one in files if one not in frames
+        ):
+            continue
+        if any(frame_number(one.name) is None for one in frames):
+            continue
+        return suffix == ".txt" or (len(frames) > 1 and _is_frame(frames[0]))
+    return False
+
+
+def _is_frame(path: Path) -> bool:
+    """Whether a JSON file is one frame as OpenPose writes it."""
+    try:
+        if path.stat().st_size > PEEKED:
+            return False
+        data = parse_json(path, read_text(path), "")
+    except (ValueError, OSError):
+        return False
+    return isinstance(data, dict) and ("people" in data or "bodies" in data)
+
+
+def _once(found: Sequence[ArchiveSource]) -> list[ArchiveSource]:
+    """A file that was named twice is one; clips of one name are told apart by their number, in the order given."""
+    out: dict[str, ArchiveSource] = {}
+    for one in found:
+        if one.clip is None:
+            out.setdefault(one.key, one)
+            continue
+        key, name, number = one.key, one.name, 1
+        while key in out and out[key].clip is not one.clip:
+            number += 1
+            key, name = f"{one.key} ({number})", f"{one.name} ({number})"
+        out[key] = ArchiveSource(key, name, clip=one.clip)
+    return list(out.values())
+
+
+# ---- what a source is like -----------------------------------------------------------------------------------------------
+
+
+def stamp(source: ArchiveSource) -> Stamp:
+    """Size and last change, without reading a file; of a clip, the hash of what it holds.
+
+    Raises:
+        OSError: it cannot be reached.
+    """
+    if source.clip is not None:
+        return Stamp(source.clip.joints.nbytes, 0, _hash_of(source.clip))
+    assert source.path is not None
+    facts = [one.stat() for one in _files(source.path)]
+    return Stamp(sum(one.st_size for one in facts), max((one.st_mtime_ns for one in facts), default=0))
+
+
+def content(source: ArchiveSource) -> str:
+    """The hash of what a source holds."""
+    if source.clip is not None:
+        return _hash_of(source.clip)
+    assert source.path is not None
+    digest = hashlib.sha256()
+    for one in _files(source.path):
+        if source.path.is_dir():
+            digest.update(one.name.encode("utf-8", "surrogateescape") + b"\0")
+        with open(one, "rb") as stream:
+            while part := stream.read(CHUNK):
+                digest.update(part)
+    return digest.hexdigest()
+
+
+def reading_key(reading: Mapping[str, Any]) -> str:
+    """How sources are read, as text that is the same for the same."""
+    return json.dumps({name: value for name, value in reading.items() if value is not None}, sort_keys=True, default=str)
+
+
+def _files(path: Path) -> list[Path]:
+    return sorted(one for one in path.iterdir() if one.is_file()) if path.is_dir() else [path]
+
+
+def _hash_of(clip: Clip) -> str:
+    digest = hashlib.sha256(json.dumps([clip.up, clip.joints.shape, str(clip.joints.dtype)]).encode())
+    digest.update(np.ascontiguousarray(clip.joints).tobytes() + np.ascontiguousarray(clip.times).tobytes())
+    return digest.hexdigest()
+
+
+# ---- reading one, in a worker --------------------------------------------------------------------------------------------
+
+
+def read_source(source: ArchiveSource, reading: Mapping[str, Any], options: StorageOptions) -> ReadSource:
+    """Movement of one source as it is stored; whatever is wrong with it becomes a reason, never an exception.
+
+    Args:
+        reading: arguments of :func:`indexing.readers.read`; everybody in view by default.
+    """
+    try:
+        before = stamp(source)
+        people, note = _people(source, reading)
+        found = [_recording(clip, name, person, options) for name, person, clip in people]
+        kept = tuple(one for one in found if one.windows)
+        if not kept:
+            note = note or f"nobody is in view for {options.shortest:g} s"
+        return ReadSource(Stamp(before.size, before.modified, before.sha256 or content(source)), kept, note)
+    except (KeyboardInterrupt, SystemExit):
+        raise
+    except OSError as problem:
+        return ReadSource(Stamp(0, 0), failure=f"{source.name}: {problem.strerror or problem}; check the path and its permissions")
+    except ValueError as problem:
+        return ReadSource(Stamp(0, 0), failure=" ".join(str(problem).split()))
+    except Exception as problem:  # one file among thousands must not end an addition, whatever a reader does with it
+        return ReadSource(Stamp(0, 0), failure=f"{source.name}: {type(problem).__name__}: {' '.join(str(problem).split())}")
+
+
+def _people(source: ArchiveSource, reading: Mapping[str, Any]) -> tuple[list[tuple[str, str, Clip]], str]:
+    """``(name, person, clip)`` of everybody, and what a reader should know."""
+    from indexing.readers import read
+    from indexing.readers.recording import NobodySeen
+    from indexing.recordings.people import of_recording, tracked_people
+
+    if source.clip is not None:
+        return [(source.name, "", source.clip)], ""
+    assert source.path is not None
+    try:
+        clips = read(source.path, **{"person": "everyone", **reading})
+    except NobodySeen:
+        return [], "nobody is in view in any frame"
+    note = "30 frames per second assumed" if any(clip.fps_assumed for clip in clips) else ""
+    if of_recording(clips):
+        crowd = tracked_people(clips, source.name)
+        return [(source.name, who.name, who.clip) for who in crowd.people], note
+    if len(clips) == 1:
+        return [(source.name, "", clips[0])], note
+    return [(f"{source.name}: {clip.name}", "", clip) for clip in clips], note
+
+
+def _recording(clip: Clip, name: str, person: str, options: StorageOptions) -> ReadRecording:
+    tracks = tuple(tracks_of(clip, options))
+    first = [track for track in tracks if track.view == 0] or list(tracks)
+    seconds = sum((len(track) - 1) / options.rate for track in first)
+    begins = min((track.start for track in tracks), default=0.0)
+    ends = max((track.start + (len(track) - 1) / options.rate for track in tracks), default=0.0)
+    return ReadRecording(
+        name, person, clip.joints.shape[1], clip.skeleton, tracks, begins, ends, seconds, total_windows(tracks, options)
+    )

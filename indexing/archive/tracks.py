@@ -1,0 +1,169 @@
+"""Movement as it is stored: one person's stretch without gaps, poses at a steady rate, joints as whole numbers of 16 bits."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dyntorch.numerics import one_thread
+from indexing.archive.options import StorageOptions
+from indexing.cameras import rotation, y_up
+from indexing.clip import Clip, FloatArray, stretches
+from indexing.windows import mended, ragged, sample
+
+MISSING = -(2**15)  # stored coordinate of a joint that was not seen
+LARGEST = 2**15 - 2  # of the others
+SOME = 500  # frames by which the size of a body is told
+VIEWS = (0.0, 90.0)  # degrees about the vertical from which movement in 3D is kept: what goes towards one camera, the other sees
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """A stretch of one person's movement.
+
+    recording: number of the recording it belongs to; view: 0, or which image of movement in 3D; start: seconds, of the first pose;
+    joints: ``(rows, joints, 2)`` int16, y up, :data:`MISSING` where not seen; origin: ``(2,)`` and scale: what a coordinate of 0
+    is, and a step of 1, in the unit of the source.
+    """
+
+    recording: int
+    view: int
+    start: float
+    joints: NDArray[np.int16]
+    origin: FloatArray
+    scale: float
+
+    def __len__(self) -> int:
+        return len(self.joints)
+
+    def positions(self, first: int = 0, end: int | None = None) -> NDArray[np.float32]:
+        """``(rows, joints, 2)`` in the unit of the source, NaN where not seen."""
+        return positions(self.joints[first:end], self.origin, self.scale)
+
+
+def positions(stored: NDArray[np.int16], origin: FloatArray, scale: float | FloatArray) -> NDArray[np.float32]:
+    """Stored joints in the unit of their source.
+
+    Example:
+        >>> positions(np.array([[[MISSING, 0], [10, -10]]], np.int16), np.array([5.0, 0.0]), 0.1).tolist()
+        [[[nan, nan], [6.0, -1.0]]]
+    """
+    found = (stored * scale + origin).astype(np.float32)
+    found[(stored == MISSING).any(axis=-1)] = np.nan
+    return found
+
+
+@one_thread
+def tracks_of(clip: Clip, options: StorageOptions, recording: int = 0) -> list[Track]:
+    """One person's recording as tracks; none where nobody is in view for long enough.
+
+    Args:
+        clip: 2D, or 3D, of which two images are kept (:data:`VIEWS`).
+        recording: number to give them.
+
+    Example:
+        >>> way = np.array([[0.0, 0.0], [40.0, 0.0], [20.0, 90.0]]) + np.arange(90)[:, None, None] * [1.0, 0.0]
+        >>> (track,) = tracks_of(Clip(way, fps=30.0), StorageOptions())
+        >>> len(track), track.joints.dtype.name, bool(np.abs(track.positions()[10, 0] - [20.0, 0.0]).max() < 0.6)
+        (45, 'int16', True)
+    """
+    found: list[Track] = []
+    clip = mended(clip, options.repair)
+    for view, image in enumerate(images(clip)):
+        there = image.seen.sum(axis=1) >= min(options.joints, image.joints.shape[1])
+        if not there.any():
+            continue
+        rows = np.flatnonzero(there)
+        joints, times = y_up(image)[rows], image.times[rows]
+        for begin, end in stretches(times).tolist():
+            track = _track(joints[begin:end], times[begin:end], options, recording, view)
+            found += [] if track is None else [track]
+    return found
+
+
+def images(clip: Clip) -> list[Clip]:
+    """What is kept of a clip: itself where it is an image, else the images of two cameras far away, a quarter turn apart."""
+    if clip.dims == 2:
+        return [clip]
+    points = y_up(clip)
+    turned = [points @ rotation(np.deg2rad(azimuth), 0.0).T.astype(points.dtype) for azimuth in VIEWS]
+    return [clip.replace(joints=np.ascontiguousarray(one[..., :2]), up="y") for one in turned]
+
+
+def _track(joints: FloatArray, times: FloatArray, options: StorageOptions, recording: int, view: int) -> Track | None:
+    """A stretch without gaps at a steady rate; ``None`` where it is too short."""
+    count = int((times[-1] - times[0]) * options.rate + 1e-6) + 1
+    if count < options.shortest * options.rate + 1 or len(times) < 2:
+        return None
+    joints = _without_slips(joints, options.far)
+    source = ragged([Clip(joints, times=times)])
+    at = times[0] + np.arange(count) / options.rate
+    half = 0.5 / options.rate
+    values = sample(source, np.zeros(count, dtype=np.intp), at - half, at + half, 1)[:, 0].numpy().astype(np.float64)
+    seen: NDArray[np.bool_] = np.asarray(~np.isnan(joints).any(axis=2))
+    shown = seen_around(seen, times, at, options.bridged)
+    if not shown.any():
+        return None
+    low, high = values[shown].min(axis=0), values[shown].max(axis=0)
+    origin, scale = (low + high) / 2, float((high - low).max()) / 2 / LARGEST
+    if not scale > 0:
+        return None  # all joints at one place
+    stored = np.clip(np.round((values - origin) / scale), -LARGEST, LARGEST).astype(np.int16)
+    stored[~shown] = MISSING
+    return Track(recording, view, float(times[0]), stored, origin, scale)
+
+
+def _without_slips(joints: FloatArray, far: float) -> FloatArray:
+    """Joints without those so far from the others that nothing else could be told from one another beside them."""
+    some = joints[:: max(1, len(joints) // SOME)].reshape(-1, 2)
+    some = some[~np.isnan(some).any(axis=1)]
+    if not len(some):
+        return joints
+    middle = np.median(some, axis=0)
+    body = max(2 * float(np.median(np.abs(some - middle), axis=0).max()), 1e-30)
+    low, high = np.nanmin(joints, axis=(0, 1)), np.nanmax(joints, axis=(0, 1))
+    if max(float((high - middle).max()), float((middle - low).max())) <= far * body:
+        return joints  # nearly always
+    with np.errstate(invalid="ignore"):
+        slip = (np.abs(joints - middle) > far * body).any(axis=2)
+    joints = joints.copy()
+    joints[slip] = np.nan
+    return joints
+
+
+def seen_around(seen: NDArray[np.bool_], times: FloatArray, at: FloatArray, bridged: float) -> NDArray[np.bool_]:
+    """``(moments, joints)``: which joints are known at moments, from sightings on both sides that are not too far apart.
+
+    Args:
+        seen: ``(frames, joints)``; times: ``(frames,)``; at: ``(moments,)`` seconds; bridged: seconds between two sightings.
+
+    Example:
+        >>> seen = np.array([[True], [False], [False], [True]])
+        >>> seen_around(seen, np.arange(4.0), np.array([0.0, 1.5, 3.0]), 2.0)[:, 0].tolist()
+        [True, False, True]
+    """
+    found = np.zeros((len(at), seen.shape[1]), dtype=bool)
+    step = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+    for joint in range(seen.shape[1]):
+        known = times[seen[:, joint]]
+        if not len(known):
+            continue
+        after = np.searchsorted(known, at)
+        before, later = known[np.maximum(after - 1, 0)], known[np.minimum(after, len(known) - 1)]
+        near = np.minimum(np.abs(at - before), np.abs(later - at)) <= 0.5 * step + 1e-9
+        found[:, joint] = near | ((before <= at) & (at <= later) & (later - before <= bridged))
+    return found
+
+
+def windows_of(rows: int, options: StorageOptions) -> int:
+    """How many windows of the shortest duration begin at a pose of a track."""
+    return max(0, rows - math.ceil(options.shortest * options.rate))
+
+
+def total_windows(tracks: Sequence[Track], options: StorageOptions) -> int:
+    """Windows of some tracks."""
+    return sum(windows_of(len(track), options) for track in tracks)

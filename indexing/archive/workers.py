@@ -1,0 +1,122 @@
+"""Whoever does the work: this process, a pool of processes, a cluster; anything with the interface of ``concurrent.futures``.
+
+Results come in the order of the tasks, whoever is quicker.  A worker that dies costs another try of the task that killed it.
+"""
+
+from __future__ import annotations
+
+import itertools
+import multiprocessing
+import os
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+AHEAD = 32  # tasks under way at least: nobody says how many workers a cluster has
+
+
+class WorkerLost(Exception):
+    """A task's workers died every time, or the task did not reach one."""
+
+
+def process_pool(workers: int | None = None) -> ProcessPoolExecutor:
+    """Processes of one thread each, started afresh: threads of this one are none of their business.
+
+    Args:
+        workers: how many; by default as many as there are cores.
+    """
+    context = multiprocessing.get_context("spawn")
+    return ProcessPoolExecutor(workers or os.cpu_count() or 1, mp_context=context, initializer=_alone)
+
+
+def _alone() -> None:
+    """One thread: the others are the other workers'."""
+    import torch
+
+    torch.set_num_threads(1)
+
+
+@dataclass
+class _Pending(Generic[Task]):
+    task: Task
+    future: Future[Any] | None = None
+    tries: int = 0
+
+
+class InOrder(Generic[Task, Result]):
+    """Tasks done by an executor, results in the order of the tasks.
+
+    Args:
+        function: of one task; what it raises is a failure of the worker, not of the task.
+        executor: ``None``: this process does it, one after the other.
+        ahead: tasks under way per worker; tries: of a task whose worker dies, the last ones by itself.
+    """
+
+    def __init__(self, function: Callable[[Task], Result], executor: Executor | None, ahead: int = 4, tries: int = 3) -> None:
+        self._function, self._executor, self._tries = function, executor, tries
+        self._ahead = max(AHEAD, ahead * int(getattr(executor, "_max_workers", 0) or 0))
+        self._own: Executor | None = None  # in the place of one that broke
+
+    def __call__(self, tasks: Iterable[Task]) -> Iterator[tuple[Task, Result | WorkerLost]]:
+        """Each task with its result, or with what kept it from having one."""
+        if self._executor is None:
+            for task in tasks:
+                yield task, self._function(task)
+            return
+        waiting, rest = deque[_Pending[Task]](), iter(tasks)
+        try:
+            while True:
+                for task in itertools.islice(rest, self._ahead - len(waiting)):
+                    waiting.append(_Pending(task))
+                    self._submit(waiting[-1])
+                if not waiting:
+                    return
+                first = waiting.popleft()
+                yield first.task, self._result(first, waiting)
+        finally:
+            for one in waiting:
+                if one.future is not None:
+                    one.future.cancel()
+            if self._own is not None:
+                self._own.shutdown(wait=False, cancel_futures=True)
+
+    def _submit(self, one: _Pending[Task]) -> None:
+        assert self._executor is not None
+        try:
+            one.future = self._executor.submit(self._function, one.task)
+        except (BrokenExecutor, RuntimeError):
+            one.future = None  # asked again when it is its turn
+
+    def _result(self, one: _Pending[Task], others: Iterable[_Pending[Task]]) -> Result | WorkerLost:
+        """Of one task; where its worker died it is tried again by itself, and the others are sent out anew."""
+        problem: BaseException | None = None
+        while one.tries < self._tries:
+            try:
+                if one.future is not None:
+                    return one.future.result()
+            except Exception as error:  # whatever an executor raises: the function's own failures are results
+                problem = error
+                one.tries += 1
+            self._renew(others)
+            if one.tries < self._tries:
+                self._submit(one)
+                if one.future is None:
+                    one.tries += 1
+        said = " ".join(str(problem).split()) if problem is not None and str(problem) else "no worker took it"
+        return WorkerLost(f"its worker died {self._tries} times ({type(problem).__name__}: {said})")
+
+    def _renew(self, others: Iterable[_Pending[Task]]) -> None:
+        """Another pool where this one is broken; what it had not done is waited for by nobody until its turn comes."""
+        pool = self._executor
+        if not isinstance(pool, ProcessPoolExecutor) or not getattr(pool, "_broken", False):
+            return
+        if self._own is not None:
+            self._own.shutdown(wait=False, cancel_futures=True)
+        workers = int(getattr(pool, "_max_workers", 1))
+        self._executor = self._own = process_pool(workers)
+        for other in others:
+            other.future = None
