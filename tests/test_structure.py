@@ -20,6 +20,7 @@ MATHEMATICS = {
     "dyntorch/shapes/moving.py": {"GAUGE"},
     "dyntorch/shapes/theory.py": {"SIX_DEGREE"},
     "indexing/action/bank.py": {"COMMON"},
+    "indexing/archive/comparing.py": {"AROUND"},
     "indexing/brightness/library.py": {"GAP"},
     "indexing/phase/frames.py": {"LEAST"},
     "dyntorch/tasks/align/join.py": {"LABELLED", "MOVERS", "LINES", "ENOUGH"},
@@ -48,6 +49,10 @@ ALGEBRA = {
 """Index sets, primes, minimal samples and the numbers of labels."""
 FORMATS = {
     "indexing/action/saving.py": {"VERSION"},
+    "indexing/archive/catalogue.py": {"VERSION"},
+    "indexing/archive/layout.py": {"EIGHT"},
+    "indexing/archive/segments.py": {"VERSION", "HEADER", "COLUMNS"},
+    "indexing/archive/tracks.py": {"MISSING", "LARGEST"},
     "indexing/brightness/footage.py": {"LUMA"},
     "indexing/brightness/indexer.py": {"VERSION"},
     "indexing/cli/__init__.py": {"DONE", "BAD_INPUT", "REFUSED", "INTERRUPTED", "BROKEN_PIPE"},

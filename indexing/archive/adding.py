@@ -18,9 +18,9 @@ from typing import Any
 from dyntorch.numerics import one_thread
 from indexing.archive.catalogue import Catalogue, SegmentRow, SourceRow, add_layout, drop_recordings
 from indexing.archive.layout import Layout, layout_key
-from indexing.archive.options import ArchiveOptions
+from indexing.archive.options import ArchiveOptions, StorageOptions
 from indexing.archive.results import Addition, SourceOutcome
-from indexing.archive.segments import ArchiveSegment, WrittenSegment, write_segment
+from indexing.archive.segments import ArchiveSegment, WrittenSegment, intact, write_segment
 from indexing.archive.sources import ArchiveSource, ReadRecording, ReadSource, Stamp, read_source, reading_key, stamp
 from indexing.archive.tracks import Track, windows_of
 from indexing.archive.workers import InOrder, WorkerLost
@@ -81,13 +81,16 @@ def _news(
     """The sources that must be read; of the others, what became of them."""
     for source in sources:
         row = known.get(source.key)
-        if row is None or row.reading != reading:
+        if row is None or row.reading != _asked(source, reading):
             yield source
             continue
         try:
             now = stamp(source)
-        except OSError as problem:
-            reason = f"{source.name}: {problem.strerror or problem}; what is in the archive of it stays"
+        except (OSError, ValueError) as problem:
+            said = (
+                f"{source.name}: {problem.strerror or problem}" if isinstance(problem, OSError) else " ".join(str(problem).split())
+            )
+            reason = f"{said}; what is in the archive of it stays"
             outcomes[source.key] = SourceOutcome(source.name, "failed", reason)
             continue
         same = now.sha256 == row.sha256 if source.clip is not None else (now.size, now.modified) == (row.size, row.modified)
@@ -95,6 +98,11 @@ def _news(
             outcomes[source.key] = SourceOutcome(source.name, "known", row.note)
         else:
             yield source
+
+
+def _asked(source: ArchiveSource, reading: str) -> str:
+    """How a source is read: clips from memory are as they are."""
+    return reading if source.clip is None else ""
 
 
 class Adder:
@@ -119,7 +127,7 @@ class Adder:
         if read.failure:
             return SourceOutcome(source.name, "failed", read.failure)
         row = self.known.get(source.key)
-        if row is not None and row.reading == self.reading and row.sha256 == read.stamp.sha256:
+        if row is not None and row.reading == _asked(source, self.reading) and row.sha256 == read.stamp.sha256:
             self._touch(row, read.stamp)
             return SourceOutcome(source.name, "known", row.note)
         self.staged.sources.append((source, read))
@@ -205,8 +213,9 @@ class Adder:
 
 def _enter_source(connection: Any, source: ArchiveSource, read: ReadSource, reading: str) -> SourceRow:
     """The row of a source, in the place of an earlier one."""
-    path = "" if source.path is None else str(source.path.resolve())
-    values = (source.name, path, read.stamp.size, read.stamp.modified, read.stamp.sha256, reading, read.note)
+    path = source.key.removeprefix("file:") if source.clip is None else ""
+    stamped = read.stamp
+    values = (source.name, path, stamped.size, stamped.modified, stamped.sha256, _asked(source, reading), read.note)
     row = connection.execute("SELECT id FROM sources WHERE key = ?", (source.key,)).fetchone()
     if row is not None:
         drop_recordings(connection, int(row[0]))
@@ -226,7 +235,8 @@ def _enter_source(connection: Any, source: ArchiveSource, read: ReadSource, read
 def orphans(catalogue: Catalogue) -> list[Path]:
     """Files of interrupted additions: nothing in the catalogue says that they are there."""
     known = {row.file for row in catalogue.contents().segments}
-    return [one for one in sorted(catalogue.segments_folder.iterdir()) if one.name not in known]
+    there = sorted(catalogue.segments_folder.iterdir()) if catalogue.segments_folder.is_dir() else []
+    return [one for one in there if one.name not in known]
 
 
 def clear(catalogue: Catalogue) -> None:
@@ -239,7 +249,8 @@ def clear(catalogue: Catalogue) -> None:
 def tidy(catalogue: Catalogue, options: ArchiveOptions) -> None:
     """Put small segments together, and write those anew of which much was removed.
 
-    Whoever searches meanwhile has the old files or the new ones: the change is one step of the catalogue.
+    Whoever searches meanwhile has the old files or the new ones: the change is one step of the catalogue.  A segment that is damaged
+    stays as it is, so that verifying finds it; where the disk is full all stay, for the next time.
     """
     contents, grown = catalogue.contents(), options.growth
     for number, layout in contents.layouts.items():
@@ -249,23 +260,26 @@ def tidy(catalogue: Catalogue, options: ArchiveOptions) -> None:
         if len(small) > grown.small:
             due = [row for row in mine if row in small or row in due]
         batch: list[SegmentRow] = []
-        for row in due:
-            batch.append(row)
-            if sum(one.windows - one.dead for one in batch) >= grown.windows:
-                _join(catalogue, batch, layout)
-                batch = []
-        if batch:
-            _join(catalogue, batch, layout)
+        with contextlib.suppress(ValueError):  # what it would have freed or put together is no part of what was asked for
+            for row in due:
+                if row.dead < row.windows and not intact(catalogue.segments_folder / row.file, row.sha256):
+                    continue
+                batch.append(row)
+                if sum(one.windows - one.dead for one in batch) >= grown.windows:
+                    _join(catalogue, batch, layout, contents.options)
+                    batch = []
+            if batch:
+                _join(catalogue, batch, layout, contents.options)
 
 
-def _join(catalogue: Catalogue, rows: Sequence[SegmentRow], layout: Layout) -> None:
+def _join(catalogue: Catalogue, rows: Sequence[SegmentRow], layout: Layout, storage: StorageOptions) -> None:
     """One segment in the place of some, without what was removed."""
-    storage = catalogue.contents().options
     tracks: list[Track] = []
     for row in rows:
         live = {one.id for one in catalogue.recordings(row.id)}
-        segment = ArchiveSegment.open(catalogue.segments_folder / row.file)
-        tracks += [segment.track(i) for i in range(len(segment)) if int(segment.tracks[i, 0]) in live]
+        if live:
+            segment = ArchiveSegment.open(catalogue.segments_folder / row.file)
+            tracks += [segment.track(i) for i in range(len(segment)) if int(segment.tracks[i, 0]) in live]
     windows = sum(windows_of(len(track), storage) for track in tracks)
     made = write_segment(catalogue.segments_folder, tracks, layout, storage) if tracks else None
     with catalogue.writing() as connection:

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from indexing.action.indexer import ActionIndexer
 
 Progress = Callable[[float], None] | None
-ATTEMPTS = 3  # of a question, where segments are put together while it is asked
 
 
 class Archive:
@@ -200,7 +199,7 @@ class Archive:
         """
         if isinstance(k, bool) or not isinstance(k, (int, np.integer)) or k < 1:
             raise ValueError(f"k must be a whole number of hits, 1 or more, got {k!r}")
-        for attempt in range(ATTEMPTS):
+        for attempt in range(self.options.search.attempts):
             library = self._opened()
             if not library.contents.windows:
                 raise ValueError(f"{self.path}: holds no movement yet; add recordings first")
@@ -211,7 +210,7 @@ class Archive:
                 return self._hits(library, pool)
             except FileNotFoundError:
                 self._library = None
-                if attempt == ATTEMPTS - 1:
+                if attempt == self.options.search.attempts - 1:
                     raise
         raise AssertionError("unreachable")
 
@@ -263,7 +262,7 @@ class Archive:
         catalogue = self._catalogue()
         if self._library is not None and self._library.contents.generation == catalogue.generation():
             return self._library
-        for attempt in range(ATTEMPTS):
+        for attempt in range(self.options.search.attempts):
             contents = catalogue.contents()
             known = {} if self._library is None else {one.path.name: one for one in self._library.segments}
             try:
@@ -271,7 +270,7 @@ class Archive:
                     known.get(row.file) or ArchiveSegment.open(catalogue.segments_folder / row.file) for row in contents.segments
                 )
             except FileNotFoundError as problem:
-                if attempt == ATTEMPTS - 1:
+                if attempt == self.options.search.attempts - 1:
                     raise ValueError(f"{problem.filename}: is missing; dyntorch archive verify says what is lost") from None
                 continue
             dead = tuple(

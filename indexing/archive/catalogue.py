@@ -9,19 +9,21 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
+import random
 import sqlite3
+import time
+import zipfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from indexing.archive.layout import Layout, layout_key
-from indexing.archive.options import StorageOptions
+from indexing.archive.options import GrowthOptions, StorageOptions
 from indexing.skeleton import Skeleton
 from indexing.windows import RepairOptions
 
 VERSION = 1
 CATALOGUE, LOCK, SEGMENTS = "catalogue.sqlite", "writer.lock", "segments"
-PATIENCE = 30.0  # seconds that a reader waits for a commit
 SCHEMA = """
 CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL);
 CREATE TABLE layouts (id INTEGER PRIMARY KEY, key TEXT UNIQUE NOT NULL, joints INTEGER NOT NULL, skeleton TEXT,
@@ -131,37 +133,67 @@ class Catalogue:
         Raises:
             ValueError: other files are in the folder.
         """
-        folder.mkdir(parents=True, exist_ok=True)
         path = folder / CATALOGUE
-        strangers = [one.name for one in folder.iterdir() if not one.name.startswith((".", CATALOGUE, LOCK, SEGMENTS))]
-        if not path.exists() and strangers:
-            raise ValueError(
-                f"{folder}: is a folder with other files ({sorted(strangers)[0]}); give a new or an empty one for the archive"
-            )
-        (folder / SEGMENTS).mkdir(exist_ok=True)
-        with contextlib.closing(sqlite3.connect(path, timeout=PATIENCE, isolation_level=None)) as connection:
-            connection.execute("PRAGMA journal_mode=WAL")
-            connection.execute("BEGIN IMMEDIATE")
-            if not connection.execute("SELECT name FROM sqlite_master WHERE name = 'meta'").fetchone():
-                for statement in SCHEMA.split(";"):
-                    connection.execute(statement)
-                facts = {"version": str(VERSION), "generation": "0", "storage": json.dumps(dataclasses.asdict(options))}
-                connection.executemany("INSERT INTO meta VALUES (?, ?)", list(facts.items()))
-            connection.execute("COMMIT")
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            strangers = [one.name for one in folder.iterdir() if not one.name.startswith((".", CATALOGUE, LOCK))]
+            if not path.exists() and strangers:
+                raise ValueError(
+                    f"{folder}: is a folder with other files ({sorted(strangers)[0]}); give a new or an empty one for the archive"
+                )
+            if not path.exists():
+                path.touch()  # first of all: a folder with an empty catalogue is an archive that somebody was killed in making
+            (folder / SEGMENTS).mkdir(exist_ok=True)
+        except OSError as problem:
+            said = problem.strerror or problem
+            raise ValueError(f"{folder}: cannot be written ({said}); choose a folder that you may write to") from problem
+        with _told(folder), contextlib.closing(_connect(path)) as connection:
+            if connection.execute("SELECT name FROM sqlite_master").fetchone() is None:
+                _write_ahead(connection)
+                connection.execute("BEGIN IMMEDIATE")
+                if connection.execute("SELECT name FROM sqlite_master").fetchone() is None:
+                    if any((folder / SEGMENTS).iterdir()):
+                        raise ValueError(
+                            f"{path}: is empty, but segments are there; restore it from a copy, or give another folder"
+                        )
+                    _create(connection, options)
+                connection.execute("COMMIT")
         return cls(folder)
 
     @contextlib.contextmanager
     def reading(self) -> Iterator[sqlite3.Connection]:
         """A connection whose answers are all of one moment."""
-        with contextlib.closing(self._connect()) as connection, _told(self.folder):
+        with _told(self.folder), contextlib.closing(self._reader()) as connection:
             connection.execute("BEGIN")
             yield connection
             connection.execute("COMMIT")
 
+    def _reader(self) -> sqlite3.Connection:
+        """A connection to what is committed; of a catalogue that was begun and never made, to an empty one.
+
+        SQLite writes beside a file that it reads.  Where it cannot (no rights, a full disk) the file is read as it lies, which is all
+        of it unless somebody was killed while writing.
+        """
+        connection = _connect(self.path)
+        try:
+            made = connection.execute("SELECT name FROM sqlite_master").fetchone()
+        except sqlite3.OperationalError as problem:
+            connection.close()
+            log = self.path.with_name(f"{CATALOGUE}-wal")
+            if "locked" in str(problem) or (log.exists() and log.stat().st_size):
+                raise
+            connection = sqlite3.connect(f"{self.path.absolute().as_uri()}?immutable=1", uri=True, isolation_level=None)
+            made = connection.execute("SELECT name FROM sqlite_master").fetchone()
+        if made is None:
+            connection.close()
+            connection = sqlite3.connect(":memory:", isolation_level=None)
+            _create(connection, StorageOptions())
+        return connection
+
     @contextlib.contextmanager
     def writing(self) -> Iterator[sqlite3.Connection]:
         """A connection whose changes are made all or none, when the block ends."""
-        with contextlib.closing(self._connect()) as connection, _told(self.folder):
+        with _told(self.folder), contextlib.closing(_connect(self.path)) as connection:
             connection.execute("PRAGMA synchronous=FULL")
             connection.execute("BEGIN IMMEDIATE")
             try:
@@ -173,13 +205,11 @@ class Catalogue:
                     connection.execute("ROLLBACK")
                 raise
 
-    def _connect(self) -> sqlite3.Connection:
-        return sqlite3.connect(self.path, timeout=PATIENCE, isolation_level=None)
-
     def _version(self) -> int:
         with self.reading() as connection:
-            row = connection.execute("SELECT value FROM meta WHERE key = 'version'").fetchone()
-        if row is None:
+            tables = {row[0] for row in connection.execute("SELECT name FROM sqlite_master")}
+            row = connection.execute("SELECT value FROM meta WHERE key = 'version'").fetchone() if "meta" in tables else None
+        if row is None or not str(row[0]).isdecimal():
             raise ValueError(f"{self.path}: has no version, so it is no catalogue of an archive; give another folder")
         return int(row[0])
 
@@ -192,6 +222,10 @@ class Catalogue:
     def contents(self) -> Contents:
         """Everything that a search needs."""
         with self.reading() as connection:
+            return self._contents(connection)
+
+    def _contents(self, connection: sqlite3.Connection) -> Contents:
+        try:
             facts = dict(connection.execute("SELECT key, value FROM meta").fetchall())
             layouts = {
                 row[0]: Layout.load(row[3], row[1], _skeleton(row[2]))
@@ -199,9 +233,25 @@ class Catalogue:
             }
             segments = tuple(SegmentRow(*row) for row in connection.execute("SELECT * FROM segments ORDER BY id"))
             windows = int(connection.execute("SELECT COALESCE(SUM(windows), 0) FROM recordings").fetchone()[0])
-        stored = json.loads(facts["storage"])
-        options = StorageOptions(**{**stored, "repair": RepairOptions(**stored["repair"])})
-        return Contents(int(facts["generation"]), options, layouts, segments, windows)
+            stored = json.loads(facts["storage"])
+            options = StorageOptions(**{**stored, "views": tuple(stored["views"]), "repair": RepairOptions(**stored["repair"])})
+            return Contents(int(facts["generation"]), options, layouts, segments, windows)
+        except (ValueError, TypeError, KeyError, EOFError, zipfile.BadZipFile) as problem:
+            raise _senseless(self.folder, problem) from problem
+
+    def moment(self) -> tuple[Contents, list[RecordingRow], list[SourceRow]]:
+        """Contents, recordings and sources, all of one moment, whoever writes meanwhile.
+
+        Raises:
+            ValueError: the file is damaged.
+        """
+        with self.reading() as connection:
+            (said,) = connection.execute("PRAGMA integrity_check(1)").fetchone()
+            if said != "ok":
+                raise _senseless(self.folder, " ".join(str(said).split()))
+            recordings = [RecordingRow(*row) for row in connection.execute("SELECT * FROM recordings ORDER BY id")]
+            sources = [SourceRow(*row) for row in connection.execute("SELECT * FROM sources ORDER BY id")]
+            return self._contents(connection), recordings, sources
 
     def sources(self) -> dict[str, SourceRow]:
         """All sources, by key."""
@@ -226,6 +276,7 @@ class Catalogue:
 
     def by_name(self, name: str) -> list[RecordingRow]:
         """The recordings that a name, or a source's name or path, stands for."""
+        name = storable(name)
         with self.reading() as connection:
             rows = connection.execute(
                 "SELECT * FROM recordings WHERE name = ? OR source IN (SELECT id FROM sources WHERE name = ? OR path = ?)"
@@ -242,26 +293,62 @@ class Catalogue:
         Raises:
             ValueError: another process writes.
         """
-        with contextlib.closing(sqlite3.connect(self.folder / LOCK, timeout=0.0, isolation_level=None)) as lock:
+        with contextlib.ExitStack() as stack:
             try:
+                lock = stack.enter_context(
+                    contextlib.closing(sqlite3.connect(self.folder / LOCK, timeout=0.0, isolation_level=None))
+                )
                 lock.execute("BEGIN EXCLUSIVE")
-            except sqlite3.OperationalError as problem:
+            except sqlite3.Error as problem:
                 if "locked" not in str(problem):
                     raise ValueError(f"{self.folder / LOCK}: {problem}; check the folder's permissions and the disk") from problem
                 raise ValueError(
                     f"{self.folder}: is locked, another process adds to it or removes from it; try again when it has ended"
                 ) from None
-            try:
-                yield
-            finally:
-                lock.execute("ROLLBACK")
+            yield  # closing lets go of it
+
+
+def storable(text: str) -> str:
+    r"""Text as SQLite takes it: bytes of a file name that are no UTF-8 (Python's lone surrogates) are written out.
+
+    Example:
+        >>> storable("caf\udce9.json")
+        'caf\\udce9.json'
+    """
+    return text.encode("utf-8", "backslashreplace").decode()
+
+
+def _connect(path: Path) -> sqlite3.Connection:
+    """To a catalogue that is there: one that was deleted is not made anew."""
+    return sqlite3.connect(f"{path.absolute().as_uri()}?mode=rw", uri=True, timeout=GrowthOptions.patience, isolation_level=None)
+
+
+def _write_ahead(connection: sqlite3.Connection) -> None:
+    """Let others read while somebody writes.  SQLite does not wait for others to do the same to the same file."""
+    until = time.monotonic() + GrowthOptions.patience
+    while True:
+        try:
+            connection.execute("PRAGMA journal_mode=WAL")
+            return
+        except sqlite3.OperationalError as problem:
+            if "locked" not in str(problem) or time.monotonic() > until:
+                raise
+            time.sleep(random.uniform(0.001, 0.02))
+
+
+def _create(connection: sqlite3.Connection, options: StorageOptions) -> None:
+    """The tables of a new catalogue."""
+    for statement in SCHEMA.split(";"):
+        connection.execute(statement)
+    facts = {"version": str(VERSION), "generation": "0", "storage": json.dumps(dataclasses.asdict(options))}
+    connection.executemany("INSERT INTO meta VALUES (?, ?)", list(facts.items()))
 
 
 def add_layout(connection: sqlite3.Connection, layout: Layout) -> int:
     """Register what was learned of a layout; its number."""
     skeleton = layout.skeleton
     said = None if skeleton is None else json.dumps([skeleton.name, skeleton.joints, skeleton.bones])
-    values = (layout_key(layout.joints, skeleton), layout.joints, said, layout.dump())
+    values = (storable(layout_key(layout.joints, skeleton)), layout.joints, said, layout.dump())
     found = connection.execute("INSERT INTO layouts (key, joints, skeleton, learned) VALUES (?, ?, ?, ?)", values)
     return int(found.lastrowid or 0)
 
@@ -292,6 +379,8 @@ def _told(folder: Path) -> Iterator[None]:
         remedy = "another process holds it; try again" if "locked" in str(problem) else "check the disk and the permissions"
         raise ValueError(f"{folder / CATALOGUE}: {problem}; {remedy}") from problem
     except sqlite3.DatabaseError as problem:
-        raise ValueError(
-            f"{folder / CATALOGUE}: {problem}; restore it from a copy, or add the recordings to a new archive"
-        ) from problem
+        raise _senseless(folder, problem) from problem
+
+
+def _senseless(folder: Path, problem: object) -> ValueError:
+    return ValueError(f"{folder / CATALOGUE}: {problem}; restore it from a copy, or add the recordings to a new archive")

@@ -25,8 +25,6 @@ from indexing.joints import FEWEST, named, places
 from indexing.skeleton import Skeleton
 from indexing.windows import Ragged, sample
 
-FREE = 10.0  # variance of where the middle of all joints is, in those of a joint, where some were not seen
-SURE = 1e-3  # variance of a sighting, in the same
 EIGHT = 127  # largest whole number of 8 bits
 
 
@@ -91,8 +89,8 @@ class Layout:
         """``(seen, dimensions)``: from the joints seen to codes."""
         if seen.all():
             return self.basis
-        wide = self.covariance + FREE
-        given = wide[np.ix_(seen, seen)] + SURE * np.eye(int(seen.sum()))
+        wide = self.covariance + StorageOptions.free
+        given = wide[np.ix_(seen, seen)] + StorageOptions.sure * np.eye(int(seen.sum()))
         likely = np.linalg.solve(given, wide[seen])  # (seen, joints)
         likely = likely - likely.mean(axis=1, keepdims=True)
         return np.asarray((likely @ self.basis).astype(np.float32))

@@ -17,7 +17,7 @@ from indexing.archive.sketches import Probe, orthonormal
 from indexing.archive.tracks import images
 from indexing.cameras import y_up
 from indexing.clip import Clip
-from indexing.windows import Ragged, mended, ragged, sample, whole
+from indexing.windows import Ragged, mended, ragged, sample, unusable, whole
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +38,9 @@ def checked(clip: Clip, shortest: float, options: SearchOptions) -> Clip:
     there = np.flatnonzero(clip.seen.any(axis=1))
     if not len(there):
         raise ValueError(f"{who}: nobody is in view in any frame; give a clip that shows the movement")
+    reason = unusable(clip)
+    if reason:
+        raise ValueError(f"{who}: {reason}; give a clip that shows the movement")
     clip = mended(clip.replace(joints=clip.joints[there], times=clip.times[there], confidence=None))
     if clip.duration < shortest * (1 - 1e-9):
         raise ValueError(
@@ -61,7 +64,7 @@ def examples_of(clip: Clip, contents: Contents, options: SearchOptions, mirrored
     for number, layout in contents.layouts.items():
         facing = layout.facing(clip)
         if facing is not None:
-            example = _example(facing, layout, contents.options.rate, options, mirrored)
+            example = _example(facing, layout, contents.options.rate, contents.options.views, options, mirrored)
             if example.probes:
                 found[number] = example
     if not found:
@@ -74,8 +77,8 @@ def examples_of(clip: Clip, contents: Contents, options: SearchOptions, mirrored
     return found
 
 
-def _example(clip: Clip, layout: Layout, rate: float, options: SearchOptions, mirrored: bool) -> Query:
-    clips = [one.replace(joints=y_up(one), up="y", confidence=None) for one in images(clip)]
+def _example(clip: Clip, layout: Layout, rate: float, views: Sequence[float], options: SearchOptions, mirrored: bool) -> Query:
+    clips = [one.replace(joints=y_up(one), up="y", confidence=None) for one in images(clip, views)]
     windows = _windows(clips, options.length)
     count = len(clips)
     if mirrored:

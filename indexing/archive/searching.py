@@ -24,7 +24,7 @@ from indexing.archive.comparing import Places, residuals
 from indexing.archive.options import SearchOptions
 from indexing.archive.queries import Query
 from indexing.archive.segments import ArchiveSegment
-from indexing.archive.sketches import TASK, Candidates, Probe, scan
+from indexing.archive.sketches import TASK_BLOCK, Candidates, Probe, scan
 from indexing.archive.workers import InOrder, WorkerLost
 from indexing.clip import FloatArray
 
@@ -57,10 +57,10 @@ class Snapshot:
         """What there is to scan, in its order."""
         rows = self.contents.segments
         return [
-            ScanTask(self.folder / row.file, i, examples[row.layout].probes, keep, self.dead[i], begin, begin + TASK)
+            ScanTask(self.folder / row.file, i, examples[row.layout].probes, keep, self.dead[i], begin, begin + TASK_BLOCK)
             for i, row in enumerate(rows)
             if row.layout in examples
-            for begin in range(0, len(self.segments[i].codes), TASK)
+            for begin in range(0, len(self.segments[i].codes), TASK_BLOCK)
         ]
 
 
@@ -168,29 +168,16 @@ def ranked(library: Snapshot, examples: Mapping[int, Query], pool: Shortlist, k:
     """Candidates by their exact residual, best first; the best ones moved and stretched to where it is least."""
     pool = _compared(library, examples, pool, options)
     best = pool[: max(options.refined, 4 * k)]
-    count, rate = len(best), library.contents.options.rate
-    rows = library.contents.segments
-    strides = np.array(
-        [
-            examples[rows[i].layout].probes[p].stride
-            for i, p in zip(best.places.segment.tolist(), best.probe.tolist(), strict=True)
-        ],
-        dtype=float,
-    )  # fmt: skip
     middle, half = (best.places.begin + best.places.end) / 2, (best.places.end - best.places.begin) / 2
     parts = [
-        replace(
-            best.places,
-            begin=middle + shift * strides / rate - stretch * half,
-            end=middle + shift * strides / rate + stretch * half,
-        )
+        replace(best.places, begin=middle + (2 * shift - stretch) * half, end=middle + (2 * shift + stretch) * half)
         for shift in options.shifts
         for stretch in options.stretches
     ]
-    if not count:
+    if not len(best):
         return best
     tried = np.stack([_scores(library, examples, best.at(part, best.score), options) for part in parts])
-    which, index = np.argmax(tried, axis=0), np.arange(count)
+    which, index = np.argmax(tried, axis=0), np.arange(len(best))
     begin, end = (np.stack([getattr(part, name) for part in parts])[which, index] for name in ("begin", "end"))
     return _sorted(best.at(replace(best.places, begin=begin, end=end), tried[which, index]))
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import math
 import os
 import secrets
 from collections.abc import Sequence
@@ -78,6 +79,15 @@ def write_segment(folder: Path, tracks: Sequence[Track], layout: Layout, options
     return WrittenSegment(name, len(data), hashlib.sha256(data).hexdigest())
 
 
+def intact(path: Path, sha256: str) -> bool:
+    """Whether a file is there and still what was written."""
+    try:
+        with open(path, "rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest() == sha256
+    except OSError:
+        return False
+
+
 def _settle(folder: Path) -> None:
     """The new name on disk, too, where the system can be asked for that."""
     with contextlib.suppress(OSError):
@@ -115,18 +125,19 @@ class ArchiveSegment:
             length = int.from_bytes(stream.read(8), "little")
             if not 2 <= length <= min(HEADER, size - 8):
                 raise damaged(path, "its header is cut off")
-            try:
-                header = json.loads(stream.read(length))
-                about = header.pop("__metadata__", {})
-                if about.get("format") != FORMAT:
-                    raise damaged(path, "it is no segment of an archive")
-                if int(about["version"]) > VERSION:
-                    raise ValueError(f"{path}: written by a newer dyntorch (segment version {about['version']}); update dyntorch")
-                arrays = {name: _mapped(path, header[name], 8 + length, size, ndim) for name, ndim in SHAPES.items()}
-            except (KeyError, TypeError, json.JSONDecodeError, UnicodeDecodeError, AttributeError) as problem:
-                raise damaged(path, "its header makes no sense") from problem
+            header = _header(path, stream.read(length))
+        try:
+            places = {name: _place(header[name], 8 + length) for name in SHAPES}
+            rate = float(header["__metadata__"]["rate"])
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as problem:
+            raise damaged(path, "its header makes no sense") from problem
+        arrays = {name: _mapped(path, *places[name], size, ndim) for name, ndim in SHAPES.items()}
         small = {name: np.array(arrays[name]) for name in ("tracks", "starts", "origins", "steps")}
-        return cls(path, **{**arrays, **small}, rate=float(about["rate"]))
+        segment = cls(path, **{**arrays, **small}, rate=rate)
+        wrong = segment.check()
+        if wrong is not None:
+            raise damaged(path, wrong)
+        return segment
 
     def __len__(self) -> int:
         return len(self.tracks)
@@ -178,12 +189,32 @@ def damaged(path: Path, what: str) -> ValueError:
     return ValueError(f"{path}: {what}; dyntorch archive verify says what is lost: remove those sources and add them again")
 
 
-def _mapped(path: Path, entry: dict[str, Any], base: int, size: int, ndim: int) -> NDArray[Any]:
+def _header(path: Path, data: bytes) -> dict[str, Any]:
+    """What a file says of itself, where it is a segment that can be read here."""
+    try:
+        header: dict[str, Any] = json.loads(data)
+        about = header.get("__metadata__", {})
+        form, version = about.get("format"), int(about.get("version", 0))
+    except (TypeError, ValueError, AttributeError, OverflowError) as problem:
+        raise damaged(path, "its header makes no sense") from problem
+    if form != FORMAT:
+        raise damaged(path, "it is no segment of an archive")
+    if version > VERSION:
+        raise ValueError(f"{path}: written by a newer dyntorch (segment version {version}); update dyntorch")
+    return header
+
+
+def _place(entry: dict[str, Any], base: int) -> tuple[int, int, tuple[int, ...], type[np.generic]]:
+    """What a header says of an array: its first byte in the file and the one behind it, shape, and type."""
+    begin, end = map(int, entry["data_offsets"])
+    return base + begin, base + end, tuple(map(int, entry["shape"])), TYPES[entry["dtype"]]
+
+
+def _mapped(path: Path, begin: int, end: int, shape: tuple[int, ...], kind: type[np.generic], size: int, ndim: int) -> NDArray[Any]:
     """One array of the file, which must lie in it."""
-    (begin, end), shape, kind = entry["data_offsets"], tuple(entry["shape"]), TYPES[entry["dtype"]]
-    expected = int(np.prod(shape, dtype=np.int64)) * np.dtype(kind).itemsize
-    if len(shape) != ndim or end - begin != expected or base + end > size or begin < 0:
+    expected = math.prod(shape) * np.dtype(kind).itemsize
+    if len(shape) != ndim or min(shape) < 0 or end - begin != expected or end > size or begin < 0:
         raise damaged(path, "it is cut off")
     if expected == 0:
         return np.zeros(shape, kind)
-    return np.memmap(path, dtype=kind, mode="r", offset=base + begin, shape=shape)
+    return np.memmap(path, dtype=kind, mode="r", offset=begin, shape=shape)

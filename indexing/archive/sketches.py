@@ -23,8 +23,8 @@ from torch import Tensor
 from indexing.archive.segments import ArchiveSegment
 
 BLOCK = 2**15  # windows compared at once: 5 ns a window and pass; at 4096 half of the time is spent between the passes
-TASK = 2**20  # rows of a segment that one worker scans: 19 hours
-ROUND = 1e-6  # of the trace of G, added to its diagonal: planes that are nearly lines stay finite
+TASK_BLOCK = 2**20  # rows of a segment that one worker scans: 19 hours
+GRAM_EPSILON = 1e-6  # of the trace of G, added to its diagonal: planes that are nearly lines stay finite
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +88,7 @@ def orthonormal(codes: NDArray[np.float32]) -> NDArray[np.float32] | None:
     trace = np.trace(gram)
     if not trace > 0:
         return None
-    lower = np.linalg.cholesky(gram + ROUND * trace * np.eye(2))
+    lower = np.linalg.cholesky(gram + GRAM_EPSILON * trace * np.eye(2))
     return np.linalg.solve(lower, flat).reshape(codes.shape).astype(np.float32)
 
 
@@ -105,7 +105,7 @@ def correlation(c: Tensor, gram: Tensor) -> Tensor:
         1.0
     """
     trace = gram[0] + gram[2]
-    g00, g01, g11 = gram[0] + ROUND * trace, gram[1], gram[2] + ROUND * trace
+    g00, g01, g11 = gram[0] + GRAM_EPSILON * trace, gram[1], gram[2] + GRAM_EPSILON * trace
     determinant = g00 * g11 - g01 * g01
     inverse = torch.where(determinant > 0, determinant, torch.inf).reciprocal_()
     (a0, a1), (b0, b1) = (c[d].unbind(1) for d in range(2))
@@ -149,7 +149,31 @@ def scan(
                 scores[:, torch.from_numpy(_outside(segment, gone, low, scores.shape[1], samples, stride))] = -1.0
                 for i, score in zip(mine, scores, strict=True):
                     _take(found, score, low, (first, last), probes[i].apart, i, stride)
-    return found.candidates(segment)
+    return settled(segment, probes, found.candidates(segment))
+
+
+def settled(segment: ArchiveSegment, probes: Sequence[Probe], found: Candidates) -> Candidates:
+    """Candidates moved by less than a step of the scan to where they resemble the example best."""
+    row, score = found.row.copy(), found.score.copy()
+    first, rows = segment.firsts[found.track], segment.tracks[found.track, 3]
+    for number in np.unique(found.probe).tolist():
+        probe = probes[number]
+        mine = np.flatnonzero(found.probe == number)
+        if probe.stride == 1:
+            continue
+        moved = np.arange(-(probe.stride // 2), probe.stride // 2 + 1)
+        begin = found.row[mine, None] + moved  # (candidates, moves)
+        inside = (begin >= 0) & (begin + probe.span < rows[mine, None])
+        at = np.where(inside, begin, found.row[mine, None]) + first[mine, None]
+        places = at[..., None] + np.arange(probe.samples) * probe.stride
+        x = torch.from_numpy(segment.codes[places] * segment.scales[places][..., None, None])  # (..., samples, 2, k)
+        c = torch.einsum("nmldk,elk->denm", x, torch.from_numpy(probe.codes)).flatten(2)[:, None]
+        gram = torch.einsum("nmldk,nmlek->denm", x, x).flatten(2)
+        each = correlation(c, torch.stack([gram[0, 0], gram[0, 1], gram[1, 1]])).view(inside.shape).numpy()
+        each = np.where(inside, each, -1.0)
+        best = each.argmax(axis=1)
+        row[mine], score[mine] = begin[np.arange(len(mine)), best], each[np.arange(len(mine)), best]
+    return Candidates(score, found.track, row, found.probe).best(len(found))
 
 
 def resembling(segment: ArchiveSegment, probes: Sequence[Probe], least: float) -> NDArray[np.bool_]:

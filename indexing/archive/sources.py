@@ -7,8 +7,10 @@ movement as it is stored, or the reason why there is none.
 from __future__ import annotations
 
 import hashlib
+import inspect
 import json
 import os
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,17 +18,17 @@ from typing import Any
 
 import numpy as np
 
-from indexing.archive.catalogue import CATALOGUE
-from indexing.archive.options import StorageOptions
+from indexing.archive.catalogue import CATALOGUE, storable
+from indexing.archive.options import GrowthOptions, StorageOptions
 from indexing.archive.tracks import Track, total_windows, tracks_of
 from indexing.clip import Clip, LabelledSet
-from indexing.opening import parse_json, read_text
+from indexing.opening import parse_json, read_text, size_of
 from indexing.readers.files import VIDEOS, frame_number
 from indexing.skeleton import Skeleton
 
 KEYPOINT_FILES = (".json", ".npz", ".csv")  # suffixes that are looked into where a folder is given
-PEEKED = 2**22  # bytes of a JSON file up to which it may be one frame of many
 CHUNK = 2**20  # bytes hashed at once
+READING = {"person": "everyone"}  # how files are read where nothing else is said
 
 Taken = Clip | LabelledSet[Clip] | str | os.PathLike[str]
 
@@ -117,25 +119,49 @@ def gather(given: Taken | Iterable[Taken]) -> list[ArchiveSource]:
 
 
 def _of_clip(clip: Clip) -> ArchiveSource:
-    name = clip.name or f"clip {_hash_of(clip)[:12]}"
+    name = storable(clip.name or f"clip {_hash_of(clip)[:12]}")
     return ArchiveSource(f"clip:{name}", name, clip=clip)
 
 
 def _of_path(path: Path) -> list[ArchiveSource]:
     path = path.expanduser()
-    if not path.is_dir() or is_recording(path):
-        return [ArchiveSource(f"file:{path.resolve()}", str(path), path)]
+    return _walked(path, set()) if os.path.isdir(path) and not is_recording(path) else [_of_file(path)]
+
+
+def _of_file(path: Path) -> ArchiveSource:
+    """A file, or a folder that is one recording; whatever is wrong with it is found when it is read."""
+    return ArchiveSource(storable(f"file:{_resolved(path)}"), storable(str(path)), path)
+
+
+def _walked(folder: Path, walked: set[Path]) -> list[ArchiveSource]:
+    """All that is in a folder, by name; links that lead to where the walk has been are not followed."""
+    real = Path(_resolved(folder))
+    if real in walked:
+        return []
+    walked.add(real)
     try:
-        inside = sorted(path.iterdir())
+        inside = sorted(folder.iterdir())
     except OSError:
-        return [ArchiveSource(f"file:{path.resolve()}", str(path), path)]
+        return [_of_file(folder)]
     found: list[ArchiveSource] = []
     for one in inside:
         if one.name.startswith("."):
             continue
-        if (one.is_dir() and not (one / CATALOGUE).exists()) or one.suffix.lower() in KEYPOINT_FILES:
-            found += _of_path(one)
+        if os.path.isdir(one):
+            if is_recording(one):
+                found.append(_of_file(one))
+            elif not os.path.exists(one / CATALOGUE):
+                found += _walked(one, walked)
+        elif one.suffix.lower() in KEYPOINT_FILES:
+            found.append(_of_file(one))
     return found
+
+
+def _resolved(path: Path) -> str:
+    try:
+        return os.path.realpath(path)
+    except (OSError, ValueError):  # no file can have this name
+        return str(path)
 
 
 def is_recording(folder: Path) -> bool:
@@ -162,7 +188,7 @@ def is_recording(folder: Path) -> bool:
 def _is_frame(path: Path) -> bool:
     """Whether a JSON file is one frame as OpenPose writes it."""
     try:
-        if path.stat().st_size > PEEKED:
+        if path.stat().st_size > GrowthOptions.peeked:
             return False
         data = parse_json(path, read_text(path), "")
     except (ValueError, OSError):
@@ -192,7 +218,7 @@ def stamp(source: ArchiveSource) -> Stamp:
     """Size and last change, without reading a file; of a clip, the hash of what it holds.
 
     Raises:
-        OSError: it cannot be reached.
+        OSError, ValueError: it cannot be reached.
     """
     if source.clip is not None:
         return Stamp(source.clip.joints.nbytes, 0, _hash_of(source.clip))
@@ -217,17 +243,37 @@ def content(source: ArchiveSource) -> str:
 
 
 def reading_key(reading: Mapping[str, Any]) -> str:
-    """How sources are read, as text that is the same for the same."""
-    return json.dumps({name: value for name, value in reading.items() if value is not None}, sort_keys=True, default=str)
+    """How files are read, as text that is the same for the same: what is said as it is anyway counts as not said.
+
+    Raises:
+        ValueError: no reader knows what is asked.
+
+    Example:
+        >>> reading_key({"fps": 25.0}), reading_key({"person": "everyone", "fps": None})
+        ('{"fps": 25.0}', '{}')
+    """
+    from indexing.readers import read
+
+    usual = {name: one.default for name, one in inspect.signature(read).parameters.items() if one.kind is one.KEYWORD_ONLY}
+    unknown = sorted(set(reading) - set(usual))
+    if unknown:
+        raise ValueError(f"reading: nothing is known of {unknown[0]!r}; give some of {', '.join(usual)}")
+    told = {name: value for name, value in reading.items() if value != {**usual, **READING}[name]}
+    return json.dumps(told, sort_keys=True, default=str)
 
 
 def _files(path: Path) -> list[Path]:
-    return sorted(one for one in path.iterdir() if one.is_file()) if path.is_dir() else [path]
+    if os.path.isdir(path):
+        return sorted(one for one in path.iterdir() if one.is_file())
+    size_of(path)  # says what is wrong with it, if anything
+    return [path]
 
 
 def _hash_of(clip: Clip) -> str:
-    digest = hashlib.sha256(json.dumps([clip.up, clip.joints.shape, str(clip.joints.dtype)]).encode())
-    digest.update(np.ascontiguousarray(clip.joints).tobytes() + np.ascontiguousarray(clip.times).tobytes())
+    skeleton = None if clip.skeleton is None else [clip.skeleton.name, clip.skeleton.joints, clip.skeleton.bones]
+    digest = hashlib.sha256(json.dumps([clip.up, clip.joints.shape, str(clip.joints.dtype), skeleton], default=int).encode())
+    for one in (clip.joints, clip.times) if clip.confidence is None else (clip.joints, clip.times, clip.confidence):
+        digest.update(np.ascontiguousarray(one).tobytes())
     return digest.hexdigest()
 
 
@@ -243,11 +289,14 @@ def read_source(source: ArchiveSource, reading: Mapping[str, Any], options: Stor
     try:
         before = stamp(source)
         people, note = _people(source, reading)
+        held = before.sha256 or content(source)
+        if stamp(source) != before:  # what was read may be half of it, under the hash of another half
+            raise ValueError(f"{source.name}: was written to while it was read; add it again when it is finished")
         found = [_recording(clip, name, person, options) for name, person, clip in people]
         kept = tuple(one for one in found if one.windows)
         if not kept:
             note = note or f"nobody is in view for {options.shortest:g} s"
-        return ReadSource(Stamp(before.size, before.modified, before.sha256 or content(source)), kept, note)
+        return ReadSource(Stamp(before.size, before.modified, held), kept, note)
     except (KeyboardInterrupt, SystemExit):
         raise
     except OSError as problem:
@@ -268,7 +317,7 @@ def _people(source: ArchiveSource, reading: Mapping[str, Any]) -> tuple[list[tup
         return [(source.name, "", source.clip)], ""
     assert source.path is not None
     try:
-        clips = read(source.path, **{"person": "everyone", **reading})
+        clips = read(source.path, **{**READING, **reading})
     except NobodySeen:
         return [], "nobody is in view in any frame"
     note = "30 frames per second assumed" if any(clip.fps_assumed for clip in clips) else ""
@@ -277,7 +326,13 @@ def _people(source: ArchiveSource, reading: Mapping[str, Any]) -> tuple[list[tup
         return [(source.name, who.name, who.clip) for who in crowd.people], note
     if len(clips) == 1:
         return [(source.name, "", clips[0])], note
-    return [(f"{source.name}: {clip.name}", "", clip) for clip in clips], note
+    seen = Counter[str]()
+    named: list[tuple[str, str, Clip]] = []
+    for clip in clips:
+        seen[clip.name] += 1
+        number = f" ({seen[clip.name]})" if seen[clip.name] > 1 else ""
+        named.append((f"{source.name}: {clip.name}{number}", "", clip))
+    return named, note
 
 
 def _recording(clip: Clip, name: str, person: str, options: StorageOptions) -> ReadRecording:
@@ -287,5 +342,13 @@ def _recording(clip: Clip, name: str, person: str, options: StorageOptions) -> R
     begins = min((track.start for track in tracks), default=0.0)
     ends = max((track.start + (len(track) - 1) / options.rate for track in tracks), default=0.0)
     return ReadRecording(
-        name, person, clip.joints.shape[1], clip.skeleton, tracks, begins, ends, seconds, total_windows(tracks, options)
+        storable(name),
+        storable(person),
+        clip.joints.shape[1],
+        clip.skeleton,
+        tracks,
+        begins,
+        ends,
+        seconds,
+        total_windows(tracks, options),
     )

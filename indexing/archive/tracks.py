@@ -17,8 +17,6 @@ from indexing.windows import mended, ragged, sample
 
 MISSING = -(2**15)  # stored coordinate of a joint that was not seen
 LARGEST = 2**15 - 2  # of the others
-SOME = 500  # frames by which the size of a body is told
-VIEWS = (0.0, 90.0)  # degrees about the vertical from which movement in 3D is kept: what goes towards one camera, the other sees
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +60,7 @@ def tracks_of(clip: Clip, options: StorageOptions, recording: int = 0) -> list[T
     """One person's recording as tracks; none where nobody is in view for long enough.
 
     Args:
-        clip: 2D, or 3D, of which two images are kept (:data:`VIEWS`).
+        clip: 2D, or 3D, of which two images are kept (``options.views``).
         recording: number to give them.
 
     Example:
@@ -73,7 +71,7 @@ def tracks_of(clip: Clip, options: StorageOptions, recording: int = 0) -> list[T
     """
     found: list[Track] = []
     clip = mended(clip, options.repair)
-    for view, image in enumerate(images(clip)):
+    for view, image in enumerate(images(clip, options.views)):
         there = image.seen.sum(axis=1) >= min(options.joints, image.joints.shape[1])
         if not there.any():
             continue
@@ -85,12 +83,12 @@ def tracks_of(clip: Clip, options: StorageOptions, recording: int = 0) -> list[T
     return found
 
 
-def images(clip: Clip) -> list[Clip]:
-    """What is kept of a clip: itself where it is an image, else the images of two cameras far away, a quarter turn apart."""
+def images(clip: Clip, views: Sequence[float]) -> list[Clip]:
+    """What is kept of a clip: itself where it is an image, else the images of cameras far away, at degrees about the vertical."""
     if clip.dims == 2:
         return [clip]
     points = y_up(clip)
-    turned = [points @ rotation(np.deg2rad(azimuth), 0.0).T.astype(points.dtype) for azimuth in VIEWS]
+    turned = [points @ rotation(np.deg2rad(azimuth), 0.0).T.astype(points.dtype) for azimuth in views]
     return [clip.replace(joints=np.ascontiguousarray(one[..., :2]), up="y") for one in turned]
 
 
@@ -99,7 +97,7 @@ def _track(joints: FloatArray, times: FloatArray, options: StorageOptions, recor
     count = int((times[-1] - times[0]) * options.rate + 1e-6) + 1
     if count < options.shortest * options.rate + 1 or len(times) < 2:
         return None
-    joints = _without_slips(joints, options.far)
+    joints = _without_slips(joints, options)
     source = ragged([Clip(joints, times=times)])
     at = times[0] + np.arange(count) / options.rate
     half = 0.5 / options.rate
@@ -117,19 +115,19 @@ def _track(joints: FloatArray, times: FloatArray, options: StorageOptions, recor
     return Track(recording, view, float(times[0]), stored, origin, scale)
 
 
-def _without_slips(joints: FloatArray, far: float) -> FloatArray:
+def _without_slips(joints: FloatArray, options: StorageOptions) -> FloatArray:
     """Joints without those so far from the others that nothing else could be told from one another beside them."""
-    some = joints[:: max(1, len(joints) // SOME)].reshape(-1, 2)
+    some = joints[:: max(1, len(joints) // options.sized)].reshape(-1, 2)
     some = some[~np.isnan(some).any(axis=1)]
     if not len(some):
         return joints
     middle = np.median(some, axis=0)
     body = max(2 * float(np.median(np.abs(some - middle), axis=0).max()), 1e-30)
     low, high = np.nanmin(joints, axis=(0, 1)), np.nanmax(joints, axis=(0, 1))
-    if max(float((high - middle).max()), float((middle - low).max())) <= far * body:
+    if max(float((high - middle).max()), float((middle - low).max())) <= options.far * body:
         return joints  # nearly always
     with np.errstate(invalid="ignore"):
-        slip = (np.abs(joints - middle) > far * body).any(axis=2)
+        slip = (np.abs(joints - middle) > options.far * body).any(axis=2)
     joints = joints.copy()
     joints[slip] = np.nan
     return joints
