@@ -1,0 +1,194 @@
+"""Sketches against brute force: every window by itself, its planes by a decomposition of numpy's."""
+
+import numpy as np
+import pytest
+import torch
+
+from indexing.archive import sketches
+from indexing.archive.layout import Layout
+from indexing.archive.options import SearchOptions, StorageOptions
+from indexing.archive.queries import probe_of
+from indexing.archive.segments import ArchiveSegment, write_segment
+from indexing.archive.sketches import Candidates, Probe, correlation, orthonormal, resembling, scan, settled
+from indexing.archive.tracks import tracks_of
+from indexing.clip import Clip
+from indexing.windows import ragged
+
+STORAGE = StorageOptions()
+
+
+def movement(rng, seconds, joints=9):
+    """Joints that swing about their places at frequencies of their own: ``(frames, joints, 3)`` at 30 frames per second."""
+    t = np.arange(round(seconds * 30))[:, None, None] / 30
+    rate, phase, size = rng.uniform(0.2, 1.5, (joints, 3)), rng.uniform(0, 6.3, (joints, 3)), rng.uniform(0.05, 0.4, (joints, 3))
+    return rng.normal(size=(joints, 3)) + size * np.sin(2 * np.pi * rate * t + phase)
+
+
+def image(points, rng):
+    """By any affine camera, in pixels."""
+    return points @ rng.normal(size=(3, 2)) * 80 + rng.uniform(200, 800, 2)
+
+
+@pytest.fixture(scope="module")
+def segment(tmp_path_factory):
+    rng = np.random.default_rng(0)
+    folder = tmp_path_factory.mktemp("segment")
+    tracks = []
+    for number, seconds in enumerate((20.0, 3.0, 0.7, 12.0), 1):
+        tracks += tracks_of(Clip(image(movement(rng, seconds), rng), fps=30.0), STORAGE, number)
+    layout = Layout.learn(tracks, None, STORAGE)
+    path = folder / write_segment(folder, tracks, layout, STORAGE).file
+    return ArchiveSegment.open(path), layout
+
+
+def planes(segment, probe, track, row):
+    """The window's axes and the example's, ``(2, samples k)``, in floats."""
+    rows = int(segment.firsts[track]) + row + np.arange(probe.samples) * probe.stride
+    x = np.asarray(segment.codes[rows], dtype=np.float64) * np.asarray(segment.scales[rows])[:, None, None]
+    return x.transpose(1, 0, 2).reshape(2, -1), probe.codes.reshape(2, -1).astype(np.float64)
+
+
+def reference(segment, probe):
+    """``{(track, row): squared largest canonical correlation}`` of every window that lies in a track."""
+    found = {}
+    for track, (first, rows) in enumerate(segment.tracks[:, 2:4].tolist()):
+        for row in range(rows - probe.span):
+            if (first + row) % probe.stride == 0:
+                window, example = planes(segment, probe, track, row)
+                cosines = np.linalg.svd(np.linalg.qr(window.T)[0].T @ np.linalg.qr(example.T)[0], compute_uv=False)
+                found[track, row] = cosines[0] ** 2
+    return found
+
+
+def probe(segment, layout, seconds=1.0, track=0, begin=4.0, tempo=1.0, moving=False):
+    rows = slice(round(begin * segment.rate), round((begin + seconds) * segment.rate) + 1)
+    joints = segment.positions(track)[rows]
+    source = ragged([Clip(joints, times=np.arange(len(joints)) / segment.rate)])
+    return probe_of(source, 0, layout, segment.rate, tempo, SearchOptions(), moving=moving)
+
+
+def test_correlation_is_that_of_the_planes():
+    rng = np.random.default_rng(1)
+    windows = rng.normal(size=(50, 2, 12))
+    example = orthonormal(rng.normal(size=(2, 4, 3)).astype(np.float32)).reshape(2, -1)
+    c = torch.tensor(np.einsum("ndk,ek->den", windows, example))[:, None]
+    gram = torch.tensor(np.einsum("ndk,nek->den", windows, windows))
+    found = correlation(c, torch.stack([gram[0, 0], gram[0, 1], gram[1, 1]]))[0]
+    for window, value in zip(windows, found.tolist(), strict=True):
+        cosines = np.linalg.svd(np.linalg.qr(window.T)[0].T @ np.linalg.qr(example.T)[0], compute_uv=False)
+        assert value == pytest.approx(cosines[0] ** 2, abs=1e-4)
+
+
+def test_windows_of_nothing_resemble_nothing():
+    c = torch.zeros(2, 1, 2, 3)
+    assert correlation(c, torch.zeros(3, 3)).tolist() == [[0.0, 0.0, 0.0]]
+
+
+@pytest.mark.parametrize("seconds", [0.5, 1.0, 2.5])
+def test_scan_is_the_best_of_every_window(segment, seconds):
+    stored, layout = segment
+    asked = probe(stored, layout, seconds)
+    every = reference(stored, asked)
+    found = scan(stored, [asked], 10_000)
+    assert len(found) >= 3
+    # candidates are moved by less than a stride after the scan, and only to where they are better
+    for score, track, row in zip(found.score.tolist(), found.track.tolist(), found.row.tolist(), strict=True):
+        near = [value for (t, r), value in every.items() if t == track and abs(r - row) <= asked.stride // 2]
+        assert score >= max(near) - 1e-3
+    window, example = planes(stored, asked, int(found.track[0]), int(found.row[0]))
+    cosines = np.linalg.svd(np.linalg.qr(window.T)[0].T @ np.linalg.qr(example.T)[0], compute_uv=False)
+    assert found.score[0] == pytest.approx(cosines[0] ** 2, abs=1e-3)
+    assert found.score[0] >= max(every.values()) - 1e-3
+    assert found.track[0] == 0 and abs(found.row[0] / stored.rate - 4.0) <= 1 / stored.rate + 0.1 * seconds
+
+
+def test_another_camera_sees_the_same(segment):
+    """The rank condition: any affine image of the same points lies in the span of their three coordinates."""
+    rng = np.random.default_rng(2)
+    points = movement(rng, 30.0)
+    tracks = [one for camera in range(2) for one in tracks_of(Clip(image(points, rng), fps=30.0), STORAGE, camera)]
+    layout = Layout.learn(tracks, None, StorageOptions(dimensions=9))
+    codes = [layout.project(track.positions()) for track in tracks]
+    rows = 100 + np.arange(6) * 3
+    window, example = (one[rows].transpose(1, 0, 2) for one in codes)
+    flat = window.reshape(2, -1).astype(np.float64)
+    c = torch.tensor(flat @ orthonormal(example).reshape(2, -1).T.astype(np.float64))[:, None, :, None]
+    gram = torch.tensor(flat @ flat.T)
+    value = float(correlation(c, torch.stack([gram[0, 0], gram[0, 1], gram[1, 1]])[:, None]))
+    assert value > 0.99  # two planes of one space of three dimensions share a line
+
+
+@pytest.mark.parametrize("block", [7, 64])
+def test_blocks_change_nothing(segment, block, monkeypatch):
+    stored, layout = segment
+    asked = [probe(stored, layout, 1.0), probe(stored, layout, 1.5, tempo=1.25)]
+    whole = scan(stored, asked, 500)
+    monkeypatch.setattr(sketches, "BLOCK", block)
+    assert same(whole, scan(stored, asked, 500))
+
+
+def test_parts_are_the_whole(segment):
+    stored, layout = segment
+    asked = [probe(stored, layout, 1.0)]
+    whole = scan(stored, asked, 500)
+    parts = [scan(stored, asked, 500, begin=at, end=at + 90) for at in range(0, len(stored.codes), 90)]
+    joined = Candidates(*(np.concatenate([getattr(one, name) for one in parts]) for name in ("score", "track", "row", "probe")))
+    assert same(whole, joined.best(500))
+
+
+def test_the_best_are_kept(segment):
+    stored, layout = segment
+    asked = [probe(stored, layout, 0.5)]
+    assert same(scan(stored, asked, 500).best(5), scan(stored, asked, 5))
+
+
+def test_removed_recordings_are_not_found(segment):
+    stored, layout = segment
+    found = scan(stored, [probe(stored, layout)], 500, dead=frozenset({1}))
+    assert len(found) and not (stored.tracks[found.track, 0] == 1).any()
+
+
+def test_no_window_lies_in_two_tracks(segment):
+    stored, layout = segment
+    asked = probe(stored, layout, 2.0)
+    found = scan(stored, [asked], 10_000)
+    assert (found.row >= 0).all() and (found.row + asked.span < stored.tracks[found.track, 3]).all()
+    assert 2 not in found.track  # .7 s is shorter than the window
+
+
+def test_candidates_settle_where_they_fit_best(segment):
+    stored, layout = segment
+    asked = probe(stored, layout, 2.5)
+    start = np.array([60, 58])
+    found = Candidates(np.zeros(2, np.float32), np.zeros(2, np.int64), start, np.zeros(2, np.int64))
+    moved = settled(stored, [asked], found)
+    half = asked.stride // 2
+    for row, score in zip(moved.row.tolist(), moved.score.tolist(), strict=True):
+        values = []
+        for at in range(start.min() - half, start.max() + half + 1):
+            window, example = planes(stored, asked, 0, at)
+            values.append(np.linalg.svd(np.linalg.qr(window.T)[0].T @ np.linalg.qr(example.T)[0], compute_uv=False)[0] ** 2)
+        assert score <= max(values) + 1e-3 and abs(row - 60) <= half + 2
+    assert moved.score.max() > 0.99  # the moment itself is within reach
+
+
+def test_only_movement_counts_where_it_is_asked_for(tmp_path):
+    rng = np.random.default_rng(3)
+    points = movement(rng, 12.0)
+    points[150:] = points[150]  # who stands still is no example of anything
+    tracks = tracks_of(Clip(image(points, rng) + rng.normal(size=(360, 9, 2)), fps=30.0), STORAGE)
+    layout = Layout.learn(tracks, None, STORAGE)
+    stored = ArchiveSegment.open(tmp_path / write_segment(tmp_path, tracks, layout, STORAGE).file)
+    marked = resembling(stored, [probe(stored, layout, 1.5, begin=2.0, moving=True)], 0.6)
+    assert marked[31:50].all() and not marked[85:].any()
+
+
+def same(one, other):
+    return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in ("track", "row", "probe")) and np.allclose(
+        one.score, other.score, atol=1e-4
+    )
+
+
+def test_probe_lies_in_the_middle():
+    asked = Probe(0, False, 1.0, 3, np.zeros((2, 5, 8), np.float32), 1)
+    assert (asked.samples, asked.span) == (5, 12)

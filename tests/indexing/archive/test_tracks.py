@@ -1,0 +1,208 @@
+"""What is stored of a clip: a steady rate, whole numbers, nothing that was not seen; and the codes of its poses."""
+
+import numpy as np
+import pytest
+
+from indexing.archive.layout import Layout, filled, layout_key
+from indexing.archive.options import StorageOptions
+from indexing.archive.tracks import MISSING, images, positions, seen_around, tracks_of, windows_of
+from indexing.cameras import rotation
+from indexing.clip import Clip
+from indexing.skeleton import Skeleton
+
+STORAGE = StorageOptions()
+
+
+def swinging(t, joints=6, seed=0):
+    """``(frames, joints, 2)`` smooth movement at any times, in pixels."""
+    rng = np.random.default_rng(seed)
+    rate, phase = rng.uniform(0.2, 0.8, (joints, 2)), rng.uniform(0, 6.3, (joints, 2))
+    return rng.uniform(100, 600, (joints, 2)) + 40 * np.sin(2 * np.pi * rate * np.asarray(t)[:, None, None] + phase)
+
+
+def test_stored_movement_is_the_movement():
+    t = np.arange(300) / 30
+    (track,) = tracks_of(Clip(swinging(t), times=t), STORAGE)
+    at = track.start + np.arange(len(track)) / STORAGE.rate
+    assert np.abs(track.positions()[1:-1] - swinging(at)[1:-1]).max() < 1.0  # a pose is the mean of a fifteenth of a second
+    assert track.scale < 0.05 and track.joints.dtype == np.int16 and len(track) == 150
+
+
+def test_rate_is_steady_whatever_the_clock():
+    rng = np.random.default_rng(1)
+    t = np.cumsum(rng.uniform(0.01, 0.07, 400)) + 1000.0
+    (track,) = tracks_of(Clip(swinging(t - 1000), times=t), STORAGE)
+    at = track.start + np.arange(len(track)) / STORAGE.rate
+    assert track.start == t[0]
+    assert np.abs(track.positions()[1:-1] - swinging(at - 1000)[1:-1]).max() < 2.0
+
+
+def test_y_is_up():
+    t = np.arange(60) / 30
+    (down,) = tracks_of(Clip(swinging(t), times=t, up="-y"), STORAGE)
+    (up,) = tracks_of(Clip(swinging(t), times=t), STORAGE)
+    assert np.allclose(down.positions() * [1, -1], up.positions(), atol=0.1)
+
+
+def test_gaps_part_tracks_and_short_ones_are_left_out():
+    t = np.concatenate([np.arange(60) / 30, 10 + np.arange(10) / 30, 20 + np.arange(90) / 30])
+    tracks = tracks_of(Clip(swinging(t), times=t), STORAGE)
+    assert [(track.start, len(track)) for track in tracks] == [(0.0, 30), (20.0, 45)]
+
+
+def test_frames_that_show_nobody_part_tracks():
+    t = np.arange(300) / 30
+    joints = swinging(t)
+    joints[100:180] = np.nan
+    tracks = tracks_of(Clip(joints, times=t), STORAGE)
+    assert [round(track.start, 2) for track in tracks] == [0.0, 6.0]
+
+
+def test_a_joint_that_is_lost_for_long_is_missing_and_bridged_otherwise():
+    t = np.arange(300) / 30
+    joints = swinging(t)
+    joints[60:75, 0] = np.nan  # half a second
+    joints[60:180, 1] = np.nan
+    joints[:, 2] = np.nan
+    (track,) = tracks_of(Clip(joints, times=t), STORAGE)
+    seen = (track.joints != MISSING).all(axis=2)
+    assert seen[:, 0].all() and not seen[:, 2].any() and seen[:, 3:].all()
+    assert not seen[35:85, 1].any() and seen[:29, 1].all() and seen[92:, 1].all()
+    assert np.isnan(track.positions()[40, 1]).all()
+
+
+def test_sightings_around_a_moment():
+    seen = np.array([[True, False], [True, True], [False, False], [True, True]])
+    assert seen_around(seen, np.array([0.0, 1.0, 2.0, 3.0]), np.array([0.4, 2.0, 3.4]), 1.5).tolist() == [
+        [True, False], [False, False], [True, True],
+    ]  # fmt: skip
+
+
+def test_movement_in_3d_is_kept_from_two_sides():
+    rng = np.random.default_rng(2)
+    points = rng.normal(size=(60, 5, 3))
+    front, side = images(Clip(points, up="z"), STORAGE.views)
+    assert np.allclose(front.joints, np.stack([points[..., 0], points[..., 2]], axis=2))
+    turned = np.stack([points[..., 0], points[..., 2], -points[..., 1]], axis=2) @ rotation(np.pi / 2, 0.0).T
+    assert np.allclose(side.joints, turned[..., :2])
+    assert [track.view for track in tracks_of(Clip(points), STORAGE)] == [0, 1]
+
+
+def test_a_slip_does_not_take_the_precision_of_the_others():
+    t = np.arange(300) / 30
+    joints = swinging(t)
+    joints[100:104, 0] = 1e8
+    (track,) = tracks_of(Clip(joints, times=t), STORAGE)
+    assert track.scale < 0.05
+    assert np.nanmax(np.abs(track.positions()[10:40] - swinging(np.arange(10, 40) / 15))) < 1.0
+
+
+@pytest.mark.parametrize("joints", [np.zeros((60, 4, 2)), np.full((60, 4, 2), np.nan), np.ones((1, 4, 2))])
+def test_nothing_is_kept_of_nothing(joints):
+    assert tracks_of(Clip(joints), STORAGE) == []
+
+
+def test_windows_are_counted_by_the_shortest():
+    assert [windows_of(rows, STORAGE) for rows in (0, 8, 9, 100)] == [0, 0, 1, 92]
+
+
+def test_positions_of_many_tracks_at_once():
+    stored = np.arange(24, dtype=np.int16).reshape(3, 4, 2)
+    origins, steps = np.array([[0.0, 1.0], [2.0, 3.0], [4.0, 5.0]]), np.array([0.1, 0.2, 0.3])
+    each = [positions(stored[i], origins[i], steps[i]) for i in range(3)]
+    assert np.allclose(positions(stored, origins[:, None], steps[:, None, None]), each)
+
+
+# ---- layouts -------------------------------------------------------------------------------------------------------------
+
+
+def learned(seed=0, joints=8, dimensions=5, **options):
+    rng = np.random.default_rng(seed)
+    mixing = rng.normal(size=(joints, joints))
+    t = np.arange(900) / 30
+    hidden = swinging(t, joints, seed)
+    clip = Clip(np.einsum("ij,tjd->tid", mixing, hidden), times=t)
+    storage = StorageOptions(dimensions=dimensions, **options)
+    tracks = tracks_of(clip, storage)
+    return Layout.learn(tracks, None, storage), tracks, storage
+
+
+def test_basis_is_that_of_the_covariance():
+    layout, tracks, storage = learned()
+    x = tracks[0].positions().astype(float)
+    x = x - x.mean(axis=1, keepdims=True)
+    x = x / np.linalg.norm(x, axis=(1, 2))[:, None, None]
+    sigma = np.einsum("tjd,tkd->jk", x, x)
+    sigma *= len(sigma) / np.trace(sigma)
+    values, vectors = np.linalg.eigh(sigma)
+    for number in range(3):
+        expected = vectors[:, -1 - number] * (values[-1 - number] + storage.floor) ** -storage.whitening
+        assert abs(expected @ layout.basis[:, number]) == pytest.approx(expected @ expected, rel=1e-3)
+
+
+def test_codes_are_rounded_by_less_than_half_a_step():
+    layout, tracks, _ = learned()
+    poses = tracks[0].positions()
+    codes, scales = layout.codes(poses)
+    exact = layout.project(poses)
+    assert np.abs(codes * scales[:, None, None] - exact).max() <= 0.5001 * scales.max()
+    assert np.abs(codes).max() == 127
+
+
+def test_codes_know_no_place():
+    layout, tracks, _ = learned()
+    poses = tracks[0].positions()
+    assert np.allclose(layout.project(poses + np.array([1000.0, -500.0])), layout.project(poses), atol=0.05)
+
+
+def test_a_joint_that_is_missing_is_what_the_others_make_likely():
+    """Against the conditional expectation of a Gaussian, written out."""
+    layout, tracks, storage = learned()
+    poses = tracks[0].positions()[:20].copy()
+    poses[:, 3] = np.nan
+    seen = np.arange(8) != 3
+    sigma = layout.covariance + storage.free
+    known = poses[:, seen] - poses[:, seen].mean(axis=1, keepdims=True)
+    gain = sigma[:, seen] @ np.linalg.inv(sigma[np.ix_(seen, seen)] + storage.sure * np.eye(7))
+    full = np.einsum("js,tsd->tjd", gain, known)
+    full = full - full.mean(axis=1, keepdims=True)
+    expected = np.einsum("tjd,jk->tdk", full, layout.basis)
+    assert np.allclose(layout.project(poses), expected, atol=1e-2 * np.abs(expected).max())
+
+
+def test_a_pose_of_two_joints_is_none():
+    layout, tracks, _ = learned()
+    poses = tracks[0].positions()[:3].copy()
+    poses[:, 2:] = np.nan
+    codes, scales = layout.codes(poses)
+    assert not codes.any() and not scales.any()
+
+
+def test_layouts_come_back_from_bytes():
+    layout, _, _ = learned()
+    again = Layout.load(layout.dump(), layout.joints, None)
+    assert all(np.array_equal(getattr(again, name), getattr(layout, name)) for name in ("covariance", "basis", "metric"))
+
+
+def test_joints_are_met_by_name():
+    layout, _, _ = learned(joints=4)
+    named = Layout(4, Skeleton("body", ("hip", "knee", "foot", "hand")), layout.covariance, layout.basis, layout.metric)
+    clip = Clip(swinging(np.arange(9), 5), skeleton=Skeleton("other", ("Hand", "foot", "nose", "hip", "eye")))
+    facing = named.facing(clip)
+    assert np.array_equal(facing.joints[:, [0, 2, 3]], clip.joints[:, [3, 1, 0]]) and np.isnan(facing.joints[:, 1]).all()
+    assert named.facing(clip.replace(skeleton=Skeleton("none", tuple("abcde")))) is None
+    assert layout.facing(clip) is None and layout.facing(Clip(swinging(np.arange(9), 4))) is not None
+
+
+def test_layouts_differ_by_names_or_bones():
+    assert layout_key(3, Skeleton("a", ("x", "y", "z"))) == layout_key(3, Skeleton("b", ("x", "y", "z"), ((0, 1),)))
+    assert layout_key(3, None) != layout_key(3, Skeleton("a", ("0", "1", "2"), ((0, 1),)))
+
+
+def test_gaps_are_bridged_in_time():
+    poses = np.zeros((5, 2, 2), np.float32)
+    poses[:, 0] = np.arange(5)[:, None]
+    poses[1:4, 0] = np.nan
+    poses[:, 1] = np.nan
+    out, seen = filled(poses)
+    assert out[:, 0, 0].tolist() == [0, 1, 2, 3, 4] and seen.tolist() == [[True, False]] and not out[:, 1].any()
