@@ -20,10 +20,11 @@ from indexing.archive.catalogue import Catalogue, SegmentRow, SourceRow, add_lay
 from indexing.archive.layout import Layout, layout_key
 from indexing.archive.options import ArchiveOptions, StorageOptions
 from indexing.archive.results import Addition, SourceOutcome
-from indexing.archive.segments import ArchiveSegment, WrittenSegment, intact, write_segment
+from indexing.archive.segments import ArchiveSegment, WrittenSegment, damaged, intact, write_segment
 from indexing.archive.sources import ArchiveSource, ReadRecording, ReadSource, Stamp, read_source, reading_key, stamp
-from indexing.archive.tracks import Track, windows_of
+from indexing.archive.tracks import Track, total_windows
 from indexing.archive.workers import InOrder, WorkerLost
+from indexing.skeleton import Skeleton
 
 Progress = Callable[[float], None] | None
 
@@ -105,6 +106,16 @@ def _asked(source: ArchiveSource, reading: str) -> str:
     return reading if source.clip is None else ""
 
 
+@dataclass(frozen=True, eq=False)
+class PreparedSegment:
+    """A segment that is written and not entered yet, and the rows of those that it takes the place of."""
+
+    layout: Layout
+    made: WrittenSegment
+    windows: int
+    joined: tuple[SegmentRow, ...]
+
+
 class Adder:
     """Takes what was read, and commits it batch by batch.
 
@@ -157,23 +168,43 @@ class Adder:
             for one in read.recordings:
                 numbered.append((i, number, one))
                 number += 1
-        written: dict[str, tuple[Layout, WrittenSegment, int]] = {}
+        written: dict[str, PreparedSegment] = {}
         try:
             for key in dict.fromkeys(layout_key(one.joints, one.skeleton) for _, _, one in numbered):
                 mine = [(n, one) for _, n, one in numbered if layout_key(one.joints, one.skeleton) == key]
                 tracks = [replace(track, recording=n) for n, one in mine for track in one.tracks]
-                layout = self._layout(key, tracks, mine[0][1])
-                made = write_segment(self.catalogue.segments_folder, tracks, layout, self.storage)
-                written[key] = (layout, made, sum(one.windows for _, one in mine))
+                layout, joined, older = self._layout(key, tracks, mine[0][1].skeleton)
+                made = write_segment(self.catalogue.segments_folder, [*older, *tracks], layout, self.storage)
+                windows = total_windows(older, self.storage) + sum(one.windows for _, one in mine)
+                written[key] = PreparedSegment(layout, made, windows, joined)
             self._enter(staged, numbered, written)
+            _unlink(self.catalogue, [row for one in written.values() for row in one.joined])
         except BaseException:
             with contextlib.suppress(OSError, ValueError):
                 clear(self.catalogue)  # what is not in the catalogue: an interruption may have come after the commit
             raise
 
-    def _layout(self, key: str, tracks: Sequence[Track], one: ReadRecording) -> Layout:
-        known = self.layouts.get(key)
-        return known[1] if known is not None else Layout.learn(tracks, one.skeleton, self.storage, self.options.search)
+    def _layout(
+        self, key: str, tracks: Sequence[Track], skeleton: Skeleton | None
+    ) -> tuple[Layout, tuple[SegmentRow, ...], list[Track]]:
+        """What a layout's codes are, and which segments are written anew for that, with what is in them.
+
+        What was learned of little is learned again of more: codes from one short clip find .86 of the moments among ten, those of
+        all .96.
+        """
+        storage, search = self.storage, self.options.search
+        if key not in self.layouts:
+            return Layout.learn(tracks, skeleton, storage, search), (), []
+        number, layout = self.layouts[key]
+        rows = tuple(row for row in self.catalogue.contents().segments if row.layout == number)
+        total = sum(row.windows - row.dead for row in rows) + sum(map(len, tracks))
+        if layout.poses >= storage.learned or total < self.options.growth.relearned * layout.poses:
+            return layout, (), []
+        try:
+            older = [track for row in rows for track in live_tracks(self.catalogue, row)]
+        except (OSError, ValueError):
+            return layout, (), []  # damaged: verifying says so
+        return Layout.learn([*older, *tracks], skeleton, storage, search), rows, older
 
     def _first_number(self) -> int:
         """Of the recordings to come; nobody else writes."""
@@ -185,19 +216,17 @@ class Adder:
         self,
         staged: Staged,
         numbered: Sequence[tuple[int, int, ReadRecording]],
-        written: Mapping[str, tuple[Layout, WrittenSegment, int]],
+        written: Mapping[str, PreparedSegment],
     ) -> None:
         fresh: dict[str, tuple[int, Layout]] = {}
         with self.catalogue.writing() as connection:
             segments: dict[str, int] = {}
-            for key, (layout, made, windows) in written.items():
-                number = self.layouts[key][0] if key in self.layouts else add_layout(connection, layout)
-                fresh[key] = (number, layout)
-                found = connection.execute(
-                    "INSERT INTO segments (file, layout, windows, size, sha256) VALUES (?, ?, ?, ?, ?)",
-                    (made.file, number, windows, made.size, made.sha256),
-                )
-                segments[key] = int(found.lastrowid or 0)
+            for key, one in written.items():
+                number = self.layouts[key][0] if key in self.layouts else add_layout(connection, one.layout)
+                fresh[key] = (number, one.layout)
+                segments[key] = enter_segment(connection, one.made, number, one.windows, one.joined)
+                if one.joined:
+                    connection.execute("UPDATE layouts SET learned = ? WHERE id = ?", (one.layout.dump(), number))
             rows = [_enter_source(connection, source, read, self.reading) for source, read in staged.sources]
             connection.executemany(
                 "INSERT INTO recordings VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
@@ -234,8 +263,8 @@ def _enter_source(connection: Any, source: ArchiveSource, read: ReadSource, read
 
 def orphans(catalogue: Catalogue) -> list[Path]:
     """Files of interrupted additions: nothing in the catalogue says that they are there."""
-    known = {row.file for row in catalogue.contents().segments}
     there = sorted(catalogue.segments_folder.iterdir()) if catalogue.segments_folder.is_dir() else []
+    known = {row.file for row in catalogue.contents().segments}  # asked last: what was committed meanwhile is no orphan
     return [one for one in there if one.name not in known]
 
 
@@ -249,8 +278,8 @@ def clear(catalogue: Catalogue) -> None:
 def tidy(catalogue: Catalogue, options: ArchiveOptions) -> None:
     """Put small segments together, and write those anew of which much was removed.
 
-    Whoever searches meanwhile has the old files or the new ones: the change is one step of the catalogue.  A segment that is damaged
-    stays as it is, so that verifying finds it; where the disk is full all stay, for the next time.
+    Whoever searches meanwhile has the old files or the new ones: the change is one step of the catalogue.  A segment that is
+    damaged stays as it is, so that verifying finds it; where the disk is full all stay, for the next time.
     """
     contents, grown = catalogue.contents(), options.growth
     for number, layout in contents.layouts.items():
@@ -274,25 +303,46 @@ def tidy(catalogue: Catalogue, options: ArchiveOptions) -> None:
 
 def _join(catalogue: Catalogue, rows: Sequence[SegmentRow], layout: Layout, storage: StorageOptions) -> None:
     """One segment in the place of some, without what was removed."""
-    tracks: list[Track] = []
-    for row in rows:
-        live = {one.id for one in catalogue.recordings(row.id)}
-        if live:
-            segment = ArchiveSegment.open(catalogue.segments_folder / row.file)
-            tracks += [segment.track(i) for i in range(len(segment)) if int(segment.tracks[i, 0]) in live]
-    windows = sum(windows_of(len(track), storage) for track in tracks)
+    tracks = [track for row in rows for track in live_tracks(catalogue, row)]
     made = write_segment(catalogue.segments_folder, tracks, layout, storage) if tracks else None
     with catalogue.writing() as connection:
-        number = 0
-        if made is not None:
-            found = connection.execute(
-                "INSERT INTO segments (file, layout, windows, size, sha256) VALUES (?, ?, ?, ?, ?)",
-                (made.file, rows[0].layout, windows, made.size, made.sha256),
-            )
-            number = int(found.lastrowid or 0)
-        for row in rows:
-            connection.execute("UPDATE recordings SET segment = ? WHERE segment = ?", (number, row.id))
-            connection.execute("DELETE FROM segments WHERE id = ?", (row.id,))
+        enter_segment(connection, made, rows[0].layout, total_windows(tracks, storage), rows)
+    _unlink(catalogue, rows)
+
+
+def live_tracks(catalogue: Catalogue, row: SegmentRow) -> list[Track]:
+    """What is in a segment, without what was removed.
+
+    Raises:
+        ValueError: it is damaged: written anew, under a hash of its own, nobody would find that any more.
+    """
+    live = {one.id for one in catalogue.recordings(row.id)}
+    if not live:
+        return []
+    path = catalogue.segments_folder / row.file
+    if not intact(path, row.sha256):
+        raise damaged(path, "it is not what was written")
+    segment = ArchiveSegment.open(path)
+    return [segment.track(i) for i in range(len(segment)) if int(segment.tracks[i, 0]) in live]
+
+
+def enter_segment(connection: Any, made: WrittenSegment | None, layout: int, windows: int, joined: Sequence[SegmentRow]) -> int:
+    """The row of a new segment, in the place of those joined in it; its number, 0 where there is none."""
+    number = 0
+    if made is not None:
+        found = connection.execute(
+            "INSERT INTO segments (file, layout, windows, size, sha256) VALUES (?, ?, ?, ?, ?)",
+            (made.file, layout, windows, made.size, made.sha256),
+        )
+        number = int(found.lastrowid or 0)
+    for row in joined:
+        connection.execute("UPDATE recordings SET segment = ? WHERE segment = ?", (number, row.id))
+        connection.execute("DELETE FROM segments WHERE id = ?", (row.id,))
+    return number
+
+
+def _unlink(catalogue: Catalogue, rows: Sequence[SegmentRow]) -> None:
+    """The files of segments that others took the place of."""
     for row in rows:
         with contextlib.suppress(OSError):
             (catalogue.segments_folder / row.file).unlink()

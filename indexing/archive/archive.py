@@ -242,7 +242,14 @@ class Archive:
         """
         from indexing.archive.finding import find
 
-        return find(self._opened(), self._catalogue(), model, self.options.find, executor, progress)
+        for attempt in range(self.options.search.attempts):
+            try:
+                return find(self._opened(), self._catalogue(), model, self.options.find, executor, progress)
+            except FileNotFoundError:
+                self._library = None
+                if attempt == self.options.search.attempts - 1:
+                    raise
+        raise AssertionError("unreachable")
 
     def verify(self) -> Verification:
         """Whether every window of the catalogue is there, whole, and once; reads everything."""

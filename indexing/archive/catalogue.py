@@ -171,8 +171,8 @@ class Catalogue:
     def _reader(self) -> sqlite3.Connection:
         """A connection to what is committed; of a catalogue that was begun and never made, to an empty one.
 
-        SQLite writes beside a file that it reads.  Where it cannot (no rights, a full disk) the file is read as it lies, which is all
-        of it unless somebody was killed while writing.
+        SQLite writes beside a file that it reads.  Where it cannot (no rights, a full disk) the file is read as it lies, which is
+        all of it unless somebody was killed while writing.
         """
         connection = _connect(self.path)
         try:
@@ -296,7 +296,8 @@ class Catalogue:
         with contextlib.ExitStack() as stack:
             try:
                 lock = stack.enter_context(
-                    contextlib.closing(sqlite3.connect(self.folder / LOCK, timeout=0.0, isolation_level=None))
+                    # a moment, for those who only look whether somebody writes
+                    contextlib.closing(sqlite3.connect(self.folder / LOCK, timeout=0.1, isolation_level=None))
                 )
                 lock.execute("BEGIN EXCLUSIVE")
             except sqlite3.Error as problem:
@@ -306,6 +307,16 @@ class Catalogue:
                     f"{self.folder}: is locked, another process adds to it or removes from it; try again when it has ended"
                 ) from None
             yield  # closing lets go of it
+
+    def held(self) -> bool:
+        """Whether somebody writes right now."""
+        lock = self.folder / LOCK
+        try:
+            with contextlib.closing(sqlite3.connect(f"{lock.absolute().as_uri()}?mode=ro", uri=True, timeout=0.0)) as connection:
+                connection.execute("SELECT name FROM sqlite_master").fetchone()
+        except sqlite3.Error as problem:
+            return "locked" in str(problem)
+        return False
 
 
 def storable(text: str) -> str:

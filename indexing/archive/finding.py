@@ -10,7 +10,7 @@ import hashlib
 import os
 import tempfile
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import lru_cache
@@ -43,18 +43,16 @@ Progress = Callable[[float], None] | None
 
 @dataclass(frozen=True)
 class FindTask:
-    """One recording: rows of a segment that may hold actions are told by the probes; none: all of them are looked at.
+    """Some recordings of a segment, what tells where to look in them, and the model as bytes of its file.
 
-    model: the bytes of a model file; tracks: of the recording's first image; margin: poses.
+    recordings: the number of each, and the tracks of its first image.
     """
 
     path: Path
-    recording: int
-    tracks: tuple[int, ...]
+    recordings: tuple[tuple[int, tuple[int, ...]], ...]
     layout: Layout
     probes: tuple[Probe, ...]
-    least: float
-    margin: int
+    options: FindOptions
     model: bytes
 
 
@@ -80,14 +78,17 @@ def find(
             "estimator for both"
         )
     tasks = _tasks(library, probes, data, options)
-    names = catalogue.named([task.recording for task in tasks])
+    names = catalogue.named([number for task in tasks for number, _ in task.recordings])
     found: list[ArchivedEvent] = []
     for done, (task, events) in enumerate(InOrder(find_in, executor, tries=2)(tasks), 1):
-        row = names.get(task.recording)
         if isinstance(events, WorkerLost):
-            raise ValueError(f"{row.name if row else task.path}: could not be searched: {events}; try again, or with fewer workers")
-        if row is not None:
-            found += [ArchivedEvent(**{**vars(event), "source": row.name, "person": row.person}) for event in events]
+            if not task.path.exists():
+                raise FileNotFoundError(str(task.path))
+            raise ValueError(f"{task.path}: could not be searched: {events}; try again, or with fewer workers")
+        for number, event in events:
+            row = names.get(number)
+            if row is not None:
+                found.append(ArchivedEvent(**{**vars(event), "source": row.name, "person": row.person}))
         if progress is not None:
             progress(done / len(tasks))
     return sorted(found, key=lambda event: (event.source, event.person, event.start, event.end))
@@ -113,7 +114,6 @@ def probes_of(library: Snapshot, indexer: ActionIndexer, options: FindOptions) -
 
 def _tasks(library: Snapshot, probes: dict[int, tuple[Probe, ...]], model: bytes, options: FindOptions) -> list[FindTask]:
     contents, tasks = library.contents, []
-    margin = round(options.margin * contents.options.rate)
     for i, row in enumerate(contents.segments):
         if row.layout not in probes:
             continue
@@ -125,23 +125,43 @@ def _tasks(library: Snapshot, probes: dict[int, tuple[Probe, ...]], model: bytes
                 by_recording.setdefault(number, []).append(track)
         layout = contents.layouts[row.layout]
         tasks += [
-            FindTask(segment.path, number, tuple(tracks), layout, probes[row.layout], options.least, margin, model)
-            for number, tracks in by_recording.items()
+            FindTask(segment.path, part, layout, probes[row.layout], options, model)
+            for part in _parts(by_recording, segment, options.rows)
         ]
     return tasks
 
 
-# ---- one recording, in a worker ------------------------------------------------------------------------------------------
+def _parts(
+    by_recording: Mapping[int, Sequence[int]], segment: ArchiveSegment, rows: int
+) -> Iterator[tuple[tuple[int, tuple[int, ...]], ...]]:
+    """Recordings, so many together that their poses are about as many as asked."""
+    part: list[tuple[int, tuple[int, ...]]] = []
+    count = 0
+    for number, tracks in by_recording.items():
+        part.append((number, tuple(tracks)))
+        count += int(segment.tracks[list(tracks), 3].sum())
+        if count >= rows:
+            yield tuple(part)
+            part, count = [], 0
+    if part:
+        yield tuple(part)
+
+
+# ---- some recordings, in a worker ----------------------------------------------------------------------------------------
 
 
 @one_thread
-def find_in(task: FindTask) -> list[Event]:
-    """The events of one recording."""
+def find_in(task: FindTask) -> list[tuple[int, Event]]:
+    """``(recording, event)`` of all events of some recordings."""
     segment = ArchiveSegment.open(task.path)
+    return [(number, event) for number, tracks in task.recordings for event in _events(task, segment, tracks)]
+
+
+def _events(task: FindTask, segment: ArchiveSegment, tracks: Sequence[int]) -> list[Event]:
     clips: list[tuple[NDArray[np.float64], NDArray[np.float32]]] = []
-    for track in sorted(task.tracks, key=lambda number: float(segment.starts[number])):
+    for track in sorted(tracks, key=lambda number: float(segment.starts[number])):
         part = segment.only(track)
-        rows = np.flatnonzero(_widened(resembling(part, task.probes, task.least), task.margin))
+        rows = np.flatnonzero(marked_rows(part, task.probes, task.options))
         if len(rows) > 1:
             clips.append((float(part.starts[0]) + rows / part.rate, part.poses(np.zeros(len(rows), np.int64), rows)))
     if not clips:
@@ -155,8 +175,9 @@ def find_in(task: FindTask) -> list[Event]:
         return list(_loaded(task.model).find(clip))
 
 
-def _widened(mask: NDArray[np.bool_], margin: int) -> NDArray[np.bool_]:
-    """Rows within a margin of those marked."""
+def marked_rows(track: ArchiveSegment, probes: Sequence[Probe], options: FindOptions) -> NDArray[np.bool_]:
+    """``(rows,)`` the poses of a track that are looked at: of what moves as an exemplar does, and a margin around it."""
+    mask, margin = resembling(track, probes, options.least, options.quiet), round(options.margin * track.rate)
     total = np.concatenate([[0], np.cumsum(mask)])
     index = np.arange(len(mask))
     return np.asarray(total[np.minimum(index + margin + 1, len(mask))] > total[np.maximum(index - margin, 0)])

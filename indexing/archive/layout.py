@@ -33,7 +33,8 @@ class Layout:
     """Joints that recordings share, and what was learned of them.
 
     joints: how many; skeleton: their names and bones, where known; covariance: ``(joints, joints)`` of centred poses, mean diagonal
-    1; basis: ``(joints, dimensions)`` B; metric: ``(channels, joints, joints)`` covariances for the exact comparison.
+    1; basis: ``(joints, dimensions)`` B; metric: ``(channels, joints, joints)`` covariances for the exact comparison; poses: from
+    how many all this was learned.
     """
 
     joints: int
@@ -41,6 +42,7 @@ class Layout:
     covariance: NDArray[np.float64]
     basis: NDArray[np.float32]
     metric: NDArray[np.float64]
+    poses: int = 0
 
     @property
     def name(self) -> str:
@@ -63,7 +65,7 @@ class Layout:
         vectors = vectors * np.sign(vectors[np.abs(vectors).argmax(axis=0), np.arange(vectors.shape[1])])
         basis = (vectors * (values + storage.floor) ** -storage.whitening).astype(np.float32)
         metric = _metric(tracks, storage, search)
-        return cls(joints, skeleton, covariance, basis, metric)
+        return cls(joints, skeleton, covariance, basis, metric, sum(map(len, tracks)))
 
     # ---- codes -------------------------------------------------------------------------------------------------------
     def project(self, poses: FloatArray) -> NDArray[np.float32]:
@@ -124,14 +126,14 @@ class Layout:
     def dump(self) -> bytes:
         """What was learned, as a file of numpy's."""
         stream = io.BytesIO()
-        np.savez(stream, covariance=self.covariance, basis=self.basis, metric=self.metric)
+        np.savez(stream, covariance=self.covariance, basis=self.basis, metric=self.metric, poses=self.poses)
         return stream.getvalue()
 
     @classmethod
     def load(cls, data: bytes, joints: int, skeleton: Skeleton | None) -> Layout:
         """From the same."""
         with np.load(io.BytesIO(data), allow_pickle=False) as found:
-            return cls(joints, skeleton, found["covariance"], found["basis"], found["metric"])
+            return cls(joints, skeleton, found["covariance"], found["basis"], found["metric"], int(found["poses"]))
 
 
 def layout_key(joints: int, skeleton: Skeleton | None) -> str:

@@ -40,7 +40,7 @@ class StorageOptions:
     repair: RepairOptions = RepairOptions(sampled=8)
     """By which wrong joints are told, as everywhere."""
     learned: int = 20_000
-    """Poses from which the directions of a layout are learned, at most: evenly spread over what is added first."""
+    """Poses from which the directions of a layout are learned, at most, and after which they stay: 22 minutes."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +51,8 @@ class GrowthOptions:
     """Of a segment at most, unless one source has more: 18 hours, 88 MB of 17 joints."""
     seconds: float = 120.0
     """After which what was read is committed: as much is lost at most where an addition is killed."""
+    relearned: float = 4.0
+    """Times as much movement as a layout was learned from, from which on it is learned anew, until it was learned from enough."""
     small: int = 16
     """Segments of less than half the size that may lie about before they are put together."""
     dead: float = 0.5
@@ -76,9 +78,9 @@ class SearchOptions:
     tempos: tuple[float, ...] = (0.8, 1.0, 1.25)
     """Durations that are searched, in those of the query: people differ."""
     samples: int = 4
-    """Steps that a window is divided into, at least where its duration allows: it is compared by the poses at their ends, and the best
-    are moved to where they fit best.  Right moment first / among ten, 280,000 windows of 1 s and 2 s: 4 give .79 / .97 and .89 / .96,
-    8 .80 / .98 and .90 / .98, at twice the time."""
+    """Steps that a window is divided into, at least where its duration allows: it is compared by the poses at their ends, and the
+    best are moved to where they fit best.  Right moment first / among ten, 280,000 windows of 1 s and 2 s: 4 give .79 / .97 and
+    .89 / .96, 8 .80 / .98 and .90 / .98, at twice the time."""
     apart: float = 0.35
     """Durations between two candidates: nearer ones are one."""
     shifts: tuple[float, ...] = (-0.03, 0.0, 0.03)
@@ -107,13 +109,20 @@ class SearchOptions:
 class FindOptions:
     """How learned actions are found in an archive."""
 
-    least: float = 0.36
+    least: float = 0.3
     """Squared correlation of movement between sketches and the nearest exemplar, below which nothing is looked for.  All of 182
-    actions of the exercises, UTKinect and synthetic people, by others and from other sides, reach .33, all but two .36."""
+    actions of the exercises, UTKinect and synthetic people, by others and from other sides, reach .33; at .36 the F1 of three
+    exercises falls by .07."""
+    quiet: float = 0.25
+    """Share of an exemplar's movement, by energy beside that of the pose, below which somebody rests and is no match.  With both a
+    quarter of a recording is skipped in which people stand for three quarters of the time, and nothing of one in which all of it
+    may be an action."""
     tempos: tuple[float, ...] = (0.7, 1.0, 1.4)
     """Durations of exemplars by which that is told, in their own."""
-    margin: float = 1.5
+    margin: float = 0.5
     """Seconds around what may be an action that are looked at with it."""
+    rows: int = 54_000
+    """Poses that one worker looks at before it answers: an hour."""
 
 
 @dataclass(frozen=True)

@@ -129,7 +129,10 @@ def probe_of(
     poses = sample(source, np.full(samples, image), at - half, at + half, 1)[:, 0].numpy()
     poses[:, ~source.seen[image]] = np.nan
     each = np.ascontiguousarray(layout.project(poses).transpose(1, 0, 2))
-    codes = orthonormal(each - each.mean(axis=1, keepdims=True) if moving else each)
+    mean = each.mean(axis=1, keepdims=True)
+    codes = orthonormal(each - mean if moving else each)
     if codes is None:
         return None
-    return Probe(image, mirrored, seconds, stride, codes, max(1, round(options.apart * seconds * rate / stride)))
+    moved = float(((each - mean) ** 2).sum() / max(float((each**2).sum()), 1e-30))
+    apart = max(1, round(options.apart * seconds * rate / stride))
+    return Probe(image, mirrored, seconds, stride, codes, apart, moved)

@@ -30,7 +30,7 @@ from indexing.files import replacing
 FORMAT, VERSION = "dyntorch.archive-segment", 1
 HEADER = 2**26  # bytes of a header at most
 COLUMNS = 4  # of the table of tracks
-TYPES = {"I16": np.int16, "I8": np.int8, "F32": np.float32, "F64": np.float64, "I64": np.int64}
+TYPES: dict[str, type[np.generic]] = {"I16": np.int16, "I8": np.int8, "F32": np.float32, "F64": np.float64, "I64": np.int64}
 SHAPES = {"joints": 3, "codes": 3, "scales": 1, "tracks": 2, "starts": 1, "origins": 2, "steps": 1}
 
 

@@ -32,8 +32,8 @@ class Probe:
     """An example as it is slid along the codes.
 
     image: which image of the example; mirrored: whether it is the mirror image; seconds: duration of the windows; stride: poses
-    from one sample to the next; codes: ``(2, samples, k)`` orthonormal, of x and y; apart: windows
-    around a candidate that are none.
+    from one sample to the next; codes: ``(2, samples, k)`` orthonormal, of x and y; apart: windows around a candidate that are
+    none; moved: share of movement in the energy of its poses.
     """
 
     image: int
@@ -42,6 +42,7 @@ class Probe:
     stride: int
     codes: NDArray[np.float32]
     apart: int
+    moved: float = 0.0
 
     @property
     def samples(self) -> int:
@@ -176,11 +177,12 @@ def settled(segment: ArchiveSegment, probes: Sequence[Probe], found: Candidates)
     return Candidates(score, found.track, row, found.probe).best(len(found))
 
 
-def resembling(segment: ArchiveSegment, probes: Sequence[Probe], least: float) -> NDArray[np.bool_]:
+def resembling(segment: ArchiveSegment, probes: Sequence[Probe], least: float, quiet: float = 0.0) -> NDArray[np.bool_]:
     """``(rows,)`` the poses of windows that move as an example does, well enough.
 
     Args:
-        probes: of how poses differ from their mean; least: squared correlation.
+        probes: of how poses differ from their mean; least: squared correlation; quiet: share of an example's movement, by energy,
+            below which a window rests.
     """
     marks = np.zeros(len(segment.codes) + 1, dtype=np.int64)
     none = np.zeros(len(segment), dtype=bool)
@@ -189,7 +191,10 @@ def resembling(segment: ArchiveSegment, probes: Sequence[Probe], least: float) -
         total = -(-len(segment.codes) // stride)
         for low in range(0, total - samples + 1, BLOCK):
             x = _poses(segment, low, min(total, low + BLOCK + samples - 1), stride)
-            best = _scores(x, _gram(x), mine, samples, moving=True).amax(dim=0)
+            gram = _gram(x)
+            scores = _scores(x, gram, mine, samples, moving=True)
+            scores[_moved(x, gram, samples) < quiet * torch.tensor([[probe.moved] for probe in mine])] = -1.0
+            best = scores.amax(dim=0)
             best[torch.from_numpy(_outside(segment, none, low, len(best), samples, stride))] = -1.0
             begin = (np.flatnonzero(best.numpy() >= least) + low) * stride
             np.add.at(marks, begin, 1)
@@ -223,12 +228,23 @@ def _scores(x: Tensor, gram: Tensor, probes: Sequence[Probe], samples: int, movi
     for step in range(1, samples):
         c += products[:, :, :, step, step : step + count]
         total += gram[:, step : step + count]
-    if moving:
-        means = x[:, :, :count].clone()
-        for step in range(1, samples):
-            means += x[:, :, step : step + count]
-        total -= _gram(means) / samples
-    return correlation(c, total)
+    return correlation(c, total - _resting(x, samples) if moving else total)
+
+
+def _resting(x: Tensor, samples: int) -> Tensor:
+    """``(3, windows)`` the part of G that a window has of its mean pose."""
+    count = x.shape[2] - samples + 1
+    means = x[:, :, :count].clone()
+    for step in range(1, samples):
+        means += x[:, :, step : step + count]
+    return _gram(means) / samples
+
+
+def _moved(x: Tensor, gram: Tensor, samples: int) -> Tensor:
+    """``(windows,)`` the share of movement in the energy of each window."""
+    energy = (gram[0] + gram[2]).unfold(0, samples, 1).sum(dim=1)
+    rest = _resting(x, samples)
+    return 1.0 - (rest[0] + rest[2]) / torch.where(energy > 0, energy, 1.0)
 
 
 def _outside(

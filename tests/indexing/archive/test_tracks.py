@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from indexing import Archive
 from indexing.archive.layout import Layout, filled, layout_key
 from indexing.archive.options import StorageOptions
 from indexing.archive.tracks import MISSING, images, positions, seen_around, tracks_of, windows_of
@@ -206,3 +207,20 @@ def test_gaps_are_bridged_in_time():
     poses[:, 1] = np.nan
     out, seen = filled(poses)
     assert out[:, 0, 0].tolist() == [0, 1, 2, 3, 4] and seen.tolist() == [[True, False]] and not out[:, 1].any()
+
+
+def test_what_was_learned_of_little_is_learned_again_of_more(tmp_path):
+    """One second first: the directions are those of all that came later, and every code with them."""
+    clips = [Clip(swinging(np.arange(600) / 30 + 40 * k, 8, seed=3), fps=30.0, name=f"clip {k}") for k in range(3)]
+    grown = Archive(tmp_path / "grown")
+    grown.add(clips[0].between(0.0, 1.0).replace(name="short"))
+    before = grown._opened().contents.layouts[1]
+    grown.add(clips)
+    after = grown._opened()
+    assert before.poses == 16 and after.contents.layouts[1].poses == 16 + 3 * 300
+    assert not np.allclose(before.basis, after.contents.layouts[1].basis) and grown.verify().ok and len(after.segments) == 1
+    for segment in after.segments:
+        for i in range(len(segment)):
+            codes, scales = after.contents.layouts[1].codes(segment.positions(i))
+            rows = slice(int(segment.firsts[i]), int(segment.firsts[i]) + len(scales))
+            assert np.array_equal(codes, segment.codes[rows]) and np.array_equal(scales, segment.scales[rows])
