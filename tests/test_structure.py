@@ -55,6 +55,7 @@ FORMATS = {
     "indexing/archive/tracks.py": {"MISSING", "LARGEST"},
     "indexing/brightness/footage.py": {"LUMA"},
     "indexing/brightness/indexer.py": {"VERSION"},
+    "indexing/cli/archive.py": {"PROBLEMS", "INTERRUPTED"},
     "indexing/cli/__init__.py": {"DONE", "BAD_INPUT", "REFUSED", "INTERRUPTED", "BROKEN_PIPE"},
     "indexing/cli/console.py": {"REFUSED"},
     "indexing/phase/saving.py": {"VERSION"},
@@ -68,6 +69,7 @@ FORMATS = {
 SCENES = ("dyntorch/scenes/", "indexing/actors/", "indexing/cameras.py")
 """Places whose numbers say how large made-up scenes and people are: they are the truth, and decide nothing about it."""
 WORDING = {
+    "indexing/cli/archive.py": {"SHOWN"},
     "indexing/cli/console.py": {"PLAIN_WIDTH", "SHOWN"},
     "indexing/cli/inputs.py": {"LISTED"},
     "indexing/cli/protocol.py": {"LISTED"},
@@ -80,6 +82,22 @@ WORDING = {
 """How much a message lists."""
 DRAWING = {
     "indexing/report/alignment.py": {"PATHS", "ROOM", "REACH", "WIDTH", "MARGIN", "GAP", "TITLE", "FOOT", "WIDE"},
+    "indexing/report/archive.py": {
+        *(
+            "PICTURED",
+            "WEIGHT",
+            "LEAST",
+            "MOST",
+            "DOUBTFUL",
+            "ROWS",
+            "FIRST",
+            "FILM",
+            "AROUND",
+            "PLAYED",
+            "PLAYED_SECONDS",
+            "MARKS",
+        ),
+    },
     "indexing/report/canvas.py": {"DPI", "FADE", "FRAMES", "AROUND", "WIDTH", "HEIGHT"},
     "indexing/report/learned.py": {"COLUMNS", "PANEL", "PIECES", "THIN", "THICK", "DOT", "HEAD", "TRAIL", "NAMED"},
     "indexing/report/page.py": {"PIXEL_RATIO", "LISTED", "LINES"},

@@ -97,7 +97,11 @@ def find(
 def probes_of(library: Snapshot, indexer: ActionIndexer, options: FindOptions) -> dict[int, tuple[Probe, ...]]:
     """How the exemplars move, for each layout that the model can be asked about."""
     rate, asked = library.contents.options.rate, SearchOptions()
-    exemplars = [indexer.exemplar(i) for i in range(len(indexer.model_.labels))]
+    model = indexer.model_
+    exemplars = [indexer.exemplar(i) for i in range(len(model.labels))]
+    if model.symmetry is not None:  # those that count mirrored: an image and its mirror image are of one shape, but for the joints
+        swap, mirrored = model.symmetry.numpy(), model.mirrored.tolist()
+        exemplars += [one.replace(joints=one.joints[:, swap]) for one, too in zip(exemplars, mirrored, strict=True) if too]
     found: dict[int, tuple[Probe, ...]] = {}
     for number, layout in library.contents.layouts.items():
         facing = [layout.facing(clip) for clip in exemplars]

@@ -15,8 +15,8 @@ class Hit:
     """A stretch of a recording that resembles a query.
 
     source: the recording's name (its file, or what the clip was called); person: who, empty where only one is in view; start, end:
-    seconds on the recording's own clock; score: minus the fused residual, higher is better; mirrored: whether it is the query's
-    mirror image that resembles it.
+    seconds on the recording's own clock; score: minus the logarithm of the fused residual, higher is better; mirrored: whether it
+    is the query's mirror image that resembles it.
     """
 
     source: str

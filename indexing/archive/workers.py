@@ -8,6 +8,7 @@ from __future__ import annotations
 import itertools
 import multiprocessing
 import os
+import signal
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
@@ -35,8 +36,10 @@ def process_pool(workers: int | None = None) -> ProcessPoolExecutor:
 
 
 def _alone() -> None:
-    """One thread: the others are the other workers'."""
+    """One thread: the others are the other workers'.  Whoever interrupts means the process that asked, which ends these."""
     import torch
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     torch.set_num_threads(1)
 

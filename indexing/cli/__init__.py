@@ -1,9 +1,10 @@
-"""The command line ``dyntorch demo | index fit | index scan | index evaluate | align | reconstruct | segment | sync | count``.
+"""The command line ``dyntorch demo | index fit | index scan | index evaluate | archive add | ... | align | reconstruct | ...``.
 
 Each has a file of its own: a dataclass whose fields are its flags, with ``run() -> exit code``.  Only what parsing needs is
 imported here, so that ``--help`` answers at once; a command imports its tools when it runs.
 
-A new command is a new file, and a line in :data:`COMMANDS` (or :data:`INDEX` for a verb of ``dyntorch index``).
+A new command is a new file, and a line in :data:`COMMANDS` (or :data:`INDEX` for a verb of
+``dyntorch index``, :data:`ARCHIVE` of ``dyntorch archive``).
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from typing import Annotated, Any, Protocol, cast, get_args
 import tyro
 
 from indexing.cli.align import Align
+from indexing.cli.archive import Add, Find, Info, Remove, Search, Verify
 from indexing.cli.console import complain, reworded
 from indexing.cli.count import Count
 from indexing.cli.demo import Demo
@@ -32,20 +34,30 @@ DONE, BAD_INPUT, REFUSED, INTERRUPTED, BROKEN_PIPE = 0, 2, 3, 130, 141
 
 Command = tyro.conf.subcommand
 INDEX: Any = Annotated[Fit, Command("fit")] | Annotated[Scan, Command("scan")] | Annotated[Evaluate, Command("evaluate")]
+ARCHIVE: Any = (
+    Annotated[Add, Command("add")]
+    | Annotated[Search, Command("search")]
+    | Annotated[Find, Command("find")]
+    | Annotated[Info, Command("info")]
+    | Annotated[Verify, Command("verify")]
+    | Annotated[Remove, Command("remove")]
+)
 COMMANDS: Any = (
     Annotated[Demo, Command("demo")]
     | Annotated[INDEX, Command("index", description="Learn actions from one clip each and find them elsewhere.")]
+    | Annotated[ARCHIVE, Command("archive", description="Keep recordings as movement, and ask where else anybody did this.")]
     | Annotated[Align, Command("align")]
     | Annotated[Reconstruct, Command("reconstruct")]
     | Annotated[Segment, Command("segment")]
     | Annotated[Sync, Command("sync")]
     | Annotated[Count, Command("count")]
 )
-GROUPS = ("index",)  # words that need another one behind them
+GROUPS = ("index", "archive")  # words that need another one behind them
 DESCRIPTION = """Geometry of scenes in which everything moves: learn actions from one clip each and find them in other clips, from
-other viewpoints (index); find how a camera or 3D sensor moved among things that move, and what stood still (align); find cameras,
-points and velocities from tracks through several views (reconstruct); find which matches of two images move together (segment);
-put cameras that nobody synchronized on one clock (sync); count how many matches such a problem takes (count).
+other viewpoints (index); keep thousands of recordings and ask where else anybody did this (archive); find how a camera or 3D
+sensor moved among things that move, and what stood still (align); find cameras, points and velocities from tracks through several
+views (reconstruct); find which matches of two images move together (segment); put cameras that nobody synchronized on one clock
+(sync); count how many matches such a problem takes (count).
 
 dyntorch COMMAND --help explains a command, dyntorch --version says the version."""
 

@@ -1,0 +1,597 @@
+"""``dyntorch archive add | search | find | info | verify | remove``: where else anybody did this."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from indexing.cli.console import REPORT_FILES, Progress, check_report, complain, count, names, one_line, progress, say, table
+from indexing.cli.inputs import CUT, Example, Following, Reading, assumed, parse_example, remarks
+
+if TYPE_CHECKING:
+    from indexing import Archive
+    from indexing.archive.results import Addition, ArchivedEvent, ArchiveInfo, Hit
+    from indexing.archive.sources import ArchiveSource
+    from indexing.clip import Clip
+
+PROBLEMS, INTERRUPTED = 2, 130  # exit codes
+SHOWN = 100  # events that are printed: all are in the report
+FOLDER = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DIR", help_behavior_hint="")]
+REPORT = Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")]
+WORKERS = Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")]
+DASK = Annotated[str | None, tyro.conf.arg(metavar="ADDRESS", help_behavior_hint="")]
+
+
+@dataclass(frozen=True)
+class WorkforceOptions:
+    """When other processes are worth their start: some 8 s on two cores, and the load of modules in each."""
+
+    sources: int = 1000
+    """That one process has added by then."""
+    size: int = 2**28
+    """Bytes of them."""
+    seconds: float = 5400.0
+    """Of recordings in which one process has found all actions as soon as two that have to start."""
+    patience: int = 5
+    """Seconds for a cluster to answer."""
+    ending: float = 1.0
+    """Seconds for a process to end by itself after an interruption."""
+
+
+WORK = WorkforceOptions()
+
+
+@dataclass(frozen=True)
+class Add:
+    """Add recordings to an archive: what is new, and what has changed since.  The same command again adds only the difference.
+
+    dyntorch archive add lab.archive recordings/ more.npz
+
+    dyntorch archive add lab.archive /data/recordings --dask tcp://head:8786      (a cluster that is there already)
+    """
+
+    archive: FOLDER
+    """the archive's folder; it is made if it is not there"""
+    sources: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="SOURCE ...", help_behavior_hint="")]
+    """keypoint files, clip sets, and folders, in which all of them are looked for"""
+    workers: WORKERS = None
+    """processes that read; by default as many as there are cores"""
+    dask: DASK = None
+    """of the scheduler of a Dask cluster that reads instead; it must see the same files"""
+    strict: bool = False
+    """exit code 2 if any source cannot be read, not only if nothing was added"""
+    reading: Following = field(default_factory=Following)
+
+    def run(self) -> int:
+        """Read what is new, and say what became of it."""
+        if not self.sources:
+            raise ValueError("no sources; give keypoint files, clip sets, or folders that hold them")
+        check_workers(self.workers, self.dask)
+        with progress("looking for recordings", steps=False):
+            from indexing import Archive
+            from indexing.archive.sources import gather
+
+            archive = Archive(_absolute(self.archive) if self.dask else self.archive)
+            given = [_absolute(path) if self.dask else path for path in self.sources]
+            found = gather(given)
+            alone = self.workers is None and _soon(found)
+        before, started = len(archive), time.perf_counter()
+        try:
+            with workforce(1 if alone else self.workers, self.dask, len(found)) as executor, rate("adding", len(found)) as bar:
+                done = archive.add(given, executor, bar, _options(self.reading))
+        except KeyboardInterrupt:
+            complain(f"interrupted; {_kept(archive, before)}")
+            return INTERRUPTED
+        _added_show(done)
+        say(f"{archive.path}: {_size(archive.info())}; took {time.perf_counter() - started:.1f} s")
+        for failure in done.failed:
+            complain(f"failed: {failure.reason or failure.source}")
+        fine = bool(done.of("added") or done.of("replaced")) and not self.strict
+        return PROBLEMS if done.failed and not fine else 0
+
+
+@dataclass(frozen=True)
+class Search:
+    """Where else anybody did this: what resembles one example, from whatever side it was seen, best first.
+
+    dyntorch archive search lab.archive throw.json@2.1-3.0 -k 20 --report out/
+    """
+
+    archive: FOLDER
+    """what 'dyntorch archive add' made"""
+    example: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="FILE", help_behavior_hint="")]
+    """keypoint file of one performance; file@2.1-3.0 takes these seconds of it"""
+    k: Annotated[int, tyro.conf.arg(aliases=("-k",), name="hits", metavar="N")] = 10
+    """how many hits at most"""
+    mirror: bool = False
+    """let its mirror image count, too: done with the other hand, say"""
+    select: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="FIELD=VALUES")] = ()
+    """of a clip set, the clip with these values, e.g. action=kick, or name=NAME as hits are listed"""
+    report: REPORT = None
+    """where to write report.html (in which the hits play beside the example), hits.csv, metrics.json and manifest.json"""
+    workers: WORKERS = None
+    """threads that search; by default as many as there are cores"""
+    dask: DASK = None
+    """of the scheduler of a Dask cluster that searches instead; it must see the archive"""
+    reading: Reading = field(default_factory=Reading)
+
+    def run(self) -> int:
+        """Search, print the hits, write the report."""
+        check_workers(self.workers, self.dask)
+        example = _example(self.example)
+        folder = check_report(self.report, [example.path], (*REPORT_FILES, "hits.csv"))
+        with progress("loading", steps=False):
+            from indexing import Archive
+
+            archive = Archive(_absolute(self.archive) if self.dask else self.archive)
+            clip, notes = read_query(example, self.reading, self.select)
+        started = time.perf_counter()
+        with workforce(self.workers, self.dask, threads=True) as executor, progress("searching") as bar:
+            hits = archive.search(clip, self.k, executor, bar, self.mirror)
+        seconds = time.perf_counter() - started
+        info = archive.info()
+        page = None if folder is None else self._write(folder, archive, clip, hits, info, notes, seconds)
+        _hits_show(hits, self.mirror)
+        for note in notes:
+            say(f"note: {note}")
+        say(f"{count(len(hits), 'hit')} in {_size(info)}, searched in {seconds:.1f} s")
+        if page is not None:
+            say(f"report: {page}")
+        return 0
+
+    def _write(
+        self, folder: Path, archive: Archive, clip: Clip, hits: list[Hit], info: ArchiveInfo, notes: list[str], seconds: float
+    ) -> Path:
+        from indexing.report.archive import SearchReport, write_search
+
+        about = _manifest("search", self, [_example(self.example).path], archive, info, {"search": seconds})
+        with progress("drawing the report", steps=False):
+            return write_search(folder, SearchReport(clip, hits, archive, info, notes, about))
+
+
+@dataclass(frozen=True)
+class Find:
+    """Find the actions of a model in everything that an archive holds.
+
+    dyntorch archive find lab.archive -m moves.safetensors --report out/
+    """
+
+    archive: FOLDER
+    """what 'dyntorch archive add' made"""
+    model: Annotated[Path, tyro.conf.arg(aliases=("-m",), metavar="FILE")]
+    """what 'dyntorch index fit' wrote, from keypoints"""
+    report: REPORT = None
+    """where to write report.html, events.csv (file,label,start,end,score,margin,person), metrics.json and manifest.json"""
+    reject: Annotated[float | None, tyro.conf.arg(metavar="R", help_behavior_hint="")] = None
+    """rate of false alarms that is accepted, 0 to 1, or else the least score; by default that of the model"""
+    workers: WORKERS = None
+    """processes that search; by default as many as there are cores"""
+    dask: DASK = None
+    """of the scheduler of a Dask cluster that searches instead; it must see the archive"""
+
+    def run(self) -> int:
+        """Search everything, count, write the report."""
+        check_workers(self.workers, self.dask)
+        folder = check_report(self.report, [self.model])
+        with progress("loading", steps=False):
+            from indexing import Archive
+            from indexing.action.indexer import ActionIndexer
+            from indexing.modelfile import model_kind
+
+            archive = Archive(_absolute(self.archive) if self.dask else self.archive)
+            info = archive.info()
+            if model_kind(self.model) == "dyntorch.brightness-indexer":
+                raise ValueError(f"{self.model}: was learned from videos, and archives hold keypoints; learn from keypoint files")
+            indexer = ActionIndexer.load(self.model.expanduser())
+        if self.reject is not None:
+            indexer.set_params(reject=self.reject)
+        started = time.perf_counter()
+        workers = 1 if self.workers is None and info.seconds <= WORK.seconds else self.workers
+        with workforce(workers, self.dask, info.recordings) as executor, rate("searching", info.recordings) as bar:
+            events = archive.find(indexer, executor, bar)
+        seconds = time.perf_counter() - started
+        page = None if folder is None else self._write(folder, archive, indexer, events, info, seconds)
+        _events_show(events, [str(label) for label in indexer.classes_])
+        where = len({event.source for event in events})
+        said = f"{count(len(events), 'action')} found in {count(where, 'recording')} of" if events else "no action found in"
+        say(f"{said} {_size(info)}, searched in {seconds:.1f} s")
+        if page is not None:
+            say(f"report: {page}")
+        return 0
+
+    def _write(
+        self, folder: Path, archive: Archive, indexer: Any, events: list[ArchivedEvent], info: ArchiveInfo, seconds: float
+    ) -> Path:
+        from indexing.cli.index import exemplars, within_label
+        from indexing.report.archive import FindReport, write_finds
+
+        about = _manifest("find", self, [self.model], archive, info, {"find": seconds})
+        named = [dataclasses.replace(event, exemplar=within_label(indexer, event.exemplar)) for event in events]
+        classes = [str(label) for label in indexer.classes_]
+        report = FindReport(classes, named, archive.recordings(), archive, exemplars(indexer), manifest=about)
+        with progress("drawing the report", steps=False):
+            return write_finds(folder, report)
+
+
+@dataclass(frozen=True)
+class Info:
+    """What is in an archive.
+
+    dyntorch archive info lab.archive
+    """
+
+    archive: FOLDER
+    """what 'dyntorch archive add' made"""
+    sources: bool = False
+    """list every recording, too"""
+
+    def run(self) -> int:
+        """Count, and list."""
+        with progress("counting", steps=False):
+            from indexing import Archive
+
+            archive = Archive(self.archive)
+            info = archive.info()
+        if self.sources:
+            rows = [
+                [one.source, one.person, f"{one.start:.2f}", f"{one.end:.2f}", f"{one.seconds:.1f}", one.layout]
+                for one in archive.recordings()
+            ]
+            table(["source", "person", "start (s) ", "end (s) ", "stored (s) ", "joints"], rows)
+        else:
+            lines = [[name, joints, _long(seconds)] for name, joints, seconds in info.layouts]
+            table(["joint layout", "joints ", "time "], lines)
+        people = f" ({count(info.recordings, 'recording')} of one person each)" * (info.recordings != info.sources)
+        hours = info.seconds / 3600
+        each = f", {info.size / 1e6 / hours:.1f} MB an hour" * (hours >= 1)
+        say(f"{count(info.sources, 'source')}{people}, {_long(info.seconds)}, {count(info.windows, 'window')}")
+        say(f"{info.size / 1e6:,.1f} MB in {count(info.segments, 'segment')}{each}; version {info.version}")
+        if info.dead:
+            say(f"{count(info.dead, 'window')} of what was removed still take space; later additions take it back")
+        return 0
+
+
+@dataclass(frozen=True)
+class Verify:
+    """Read all of an archive and check that everything is there, whole, and once.
+
+    dyntorch archive verify lab.archive
+    """
+
+    archive: FOLDER
+    """what 'dyntorch archive add' made"""
+
+    def run(self) -> int:
+        """Check, and say what is wrong, with what to do about it."""
+        with progress("reading everything", steps=False):
+            from indexing import Archive
+
+            found = Archive(self.archive).verify()
+        for problem in found.problems:
+            complain(problem)
+        if found.orphans:
+            left = count(len(found.orphans), "file")
+            say(f"note: {left} of interrupted additions hold nothing that is missed; the next addition takes them away")
+        where = f"{count(found.windows, 'window')} in {count(found.segments, 'segment')}"
+        say(f"{where}: all there, whole, and once" if found.ok else f"{where}: {count(len(found.problems), 'problem')}")
+        return 0 if found.ok else PROBLEMS
+
+
+@dataclass(frozen=True)
+class Remove:
+    """Take sources out of an archive; the files that they came from stay as they are.
+
+    dyntorch archive remove lab.archive recordings/monday.json
+    """
+
+    archive: FOLDER
+    """what 'dyntorch archive add' made"""
+    sources: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="SOURCE ...", help_behavior_hint="")]
+    """paths, or names as 'dyntorch archive info --sources' lists them"""
+
+    def run(self) -> int:
+        """Remove one after the other; what is not there is said, and the others are removed all the same."""
+        if not self.sources:
+            raise ValueError("no sources; give the names or paths of those to remove")
+        from indexing import Archive
+
+        archive, code = Archive(self.archive), 0
+        archive.info()  # says what is wrong with the archive, before its sources are blamed
+        for source in self.sources:
+            try:
+                say(f"{source}: {count(archive.remove(source), 'recording')} removed")
+            except ValueError as problem:
+                complain(str(problem))
+                code = PROBLEMS
+        return code
+
+
+# ---- who does the work ---------------------------------------------------------------------------------------------------
+def check_workers(workers: int | None, dask: str | None) -> None:
+    """Raise where the flags contradict each other or make no sense."""
+    if workers is not None and workers < 1:
+        raise ValueError(f"--workers {workers}: expected 1 or more; leave it out for as many as there are cores")
+    if workers is not None and dask is not None:
+        raise ValueError("--workers and --dask: a cluster has its own workers; leave one of them out")
+
+
+def workforce(
+    workers: int | None, dask: str | None, tasks: int | None = None, threads: bool = False
+) -> AbstractContextManager[Executor | None]:
+    """Who does the work: a cluster, threads or processes; ``None`` where this process is as quick by itself.
+
+    Args:
+        tasks: how many there are; threads: instead of processes, and only where a number was asked for.
+    """
+    if dask is not None:
+        return _cluster(dask)
+    if threads:
+        return contextlib.nullcontext() if workers is None else _threads(workers)
+    number = min(workers or os.cpu_count() or 1, tasks or 1)
+    return contextlib.nullcontext() if number == 1 else _processes(number)
+
+
+def _threads(workers: int) -> Executor:
+    from concurrent.futures import ThreadPoolExecutor
+
+    import torch
+
+    return ThreadPoolExecutor(workers, initializer=torch.set_num_threads, initargs=(1,))
+
+
+class QuietProcesses(ProcessPoolExecutor):
+    """Processes that leave an interruption to this one: they start while it ignores them, and take after it."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """As of any pool; a process starts here, where none is idle."""
+        with _interruptions_ignored():
+            return super().submit(fn, *args, **kwargs)
+
+
+@contextmanager
+def _processes(workers: int) -> Iterator[Executor]:
+    """A pool that ends with the work, or soon after an interruption."""
+    others = set(multiprocessing.active_children())
+    pool = QuietProcesses(workers, multiprocessing.get_context("spawn"), initializer=_one_thread)
+    try:
+        yield pool
+    except BaseException:
+        pool.shutdown(wait=False, cancel_futures=True)
+        for child in set(multiprocessing.active_children()) - others:
+            child.join(WORK.ending)  # a pool must have dropped what nobody began before its processes are ended, or it hangs
+            child.terminate()
+        raise
+    pool.shutdown()
+
+
+def _one_thread() -> None:
+    import torch
+
+    torch.set_num_threads(1)
+
+
+@contextmanager
+def _interruptions_ignored() -> Iterator[None]:
+    ours = threading.current_thread() is threading.main_thread()  # no other may say so
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN) if ours else None
+    try:
+        yield
+    finally:
+        if ours:
+            signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
+def _cluster(address: str) -> Iterator[Executor]:
+    """The workers of a Dask cluster.
+
+    Raises:
+        ValueError: nobody answers at the address, or Dask is not installed.
+    """
+    try:
+        from dask.distributed import Client
+    except ImportError:
+        raise ValueError(f'--dask {address}: needs Dask, which is not installed: pip install "dyntorch[cluster]"') from None
+    try:
+        client: Any = Client(address, timeout=WORK.patience)  # type: ignore[no-untyped-call]  # of a package without types
+    except Exception as problem:  # whatever answers at an address where no scheduler runs: a web server's answer is taken for sizes
+        said = one_line(problem) or type(problem).__name__
+        raise ValueError(f"--dask {address}: {said}; give the address of a scheduler that runs, such as tcp://head:8786") from None
+    try:
+        if not client.scheduler_info()["workers"]:
+            raise ValueError(f"--dask {address}: the cluster has no workers; start some with dask worker {address}")
+        yield client.get_executor()
+    finally:
+        client.close(timeout=WORK.patience)
+
+
+@contextmanager
+def rate(what: str, number: int) -> Iterator[Progress]:
+    """A bar on the terminal, with how many there are in a second and how long it still takes; moved by the share done."""
+    if not sys.stderr.isatty() or not number:
+        yield lambda share: None
+        return
+    from rich import progress as bar
+    from rich.console import Console
+    from rich.text import Text
+
+    class PerSecond(bar.ProgressColumn):
+        """Of what was done lately."""
+
+        def render(self, task: bar.Task) -> Text:
+            speed = task.finished_speed or task.speed
+            return Text("" if speed is None else f"{speed:.3g} a second")
+
+    columns = [bar.TextColumn("{task.description}", markup=False), bar.BarColumn(), bar.MofNCompleteColumn(), PerSecond()]
+    columns += [bar.TimeElapsedColumn(), bar.TextColumn("left"), bar.TimeRemainingColumn()]
+    with bar.Progress(*columns, console=Console(stderr=True), transient=True) as shown:
+        task = shown.add_task(one_line(what), total=number)
+        yield lambda share: shown.update(task, completed=round(share * number))
+
+
+# ---- what is read --------------------------------------------------------------------------------------------------------
+def _absolute(path: Path) -> Path:
+    """As whoever works elsewhere finds it."""
+    return path.expanduser().absolute()
+
+
+def _soon(sources: Sequence[ArchiveSource]) -> bool:
+    """Whether one process has read all before others could have helped."""
+    from indexing.archive.sources import stamp
+
+    size = 0
+    for source in sources:
+        with contextlib.suppress(OSError, ValueError):  # said when it is read
+            size += stamp(source).size
+    return len(sources) <= WORK.sources and size <= WORK.size
+
+
+def _options(reading: Following) -> dict[str, Any]:
+    """The flags that were given, as arguments of :func:`indexing.readers.read`: whoever adds without them reads alike."""
+    usual = Following()
+    given = {each.name: getattr(reading, each.name) for each in dataclasses.fields(reading)}
+    return {name: value for name, value in given.items() if value != getattr(usual, name)}
+
+
+def _example(text: str) -> Example:
+    """``file`` or ``file@2.1-3.0``; a label, as ``dyntorch index fit`` wants one, is no hindrance."""
+    found = parse_example(text)
+    whole = Path(f"{found.label}={found.path}")
+    return dataclasses.replace(found, path=whole) if found.label is not None and whole.expanduser().exists() else found
+
+
+def read_query(example: Example, reading: Reading, select: Sequence[str]) -> tuple[Clip, list[str]]:
+    """The one clip that is asked for, named as it was given, and what a reader should know of it.
+
+    Raises:
+        ValueError: it cannot be read, is several clips, or has no frame in the seconds given.
+    """
+    from indexing.cli.protocol import choose, known
+
+    clips = every = reading.read(example.path)
+    named, fields = [word[5:] for word in select if word[:5] == "name="], [word for word in select if word[:5] != "name="]
+    if named:
+        clips = clips[[i for i, clip in enumerate(every) if clip.name in named]]
+        if not clips:
+            have = names([clip.name for clip in every])
+            raise ValueError(f"--select name={named[0]}: {example.path} has no such clip; it holds {have}")
+    if fields:
+        clips = clips[choose(clips, fields, "--select")]
+    if len(clips) != 1:
+        several = f"{example.path}: holds {count(len(clips), 'clip')}, and one is asked for"
+        raise ValueError(f"{several}; choose it with --select name=NAME, or by a field; {known(clips)}")
+    name = example.path.name if len(every) == 1 else f"{example.path.name}: {clips[0].name}"
+    clip = clips[0].replace(name=name)
+    notes = remarks([clip], reading) + assumed([clip])
+    start = clip.times[0] if example.start is None else example.start
+    end = clip.times[-1] if example.end is None else example.end
+    if example.start is not None or example.end is not None:
+        clip = clip.between(start, end)
+        first, last = clips[0].times[0], clips[0].times[-1]
+        if start < first - CUT or end > last + CUT:
+            notes.append(
+                f"{example.path}: the recording runs from {first:.6g} to {last:.6g} s; {clip.duration:.3g} s of it are asked for"
+            )
+        clip = clip.replace(name=f"{name}, {clip.times[0]:.6g} to {clip.times[-1]:.6g} s")
+    return clip, notes
+
+
+# ---- what is printed -----------------------------------------------------------------------------------------------------
+def _long(seconds: float) -> str:
+    from indexing.report.recognition import duration
+
+    return duration(seconds)
+
+
+def _size(info: ArchiveInfo) -> str:
+    return f"{count(info.sources, 'source')} ({_long(info.seconds)})"
+
+
+def _kept(archive: Archive, before: int) -> str:
+    """What an interrupted addition leaves."""
+    again = "the same command goes on from there"
+    try:
+        info = archive.info()
+    except ValueError:
+        return f"nothing was added yet; {again}"
+    new = max(0, info.windows - before)
+    return f"the archive is whole: {_size(info)}, {count(new, 'window')} of it new; {again}"
+
+
+def _added_show(done: Addition) -> None:
+    rows = []
+    for outcome in ("added", "replaced", "known", "left out", "failed"):
+        some = done.of(outcome)
+        if some:
+            fresh = outcome in ("added", "replaced")
+            windows, seconds = sum(one.windows for one in some), sum(one.seconds for one in some)
+            rows.append([outcome, f"{len(some):,}", f"{windows:,}" if fresh else "", _long(seconds) if fresh else ""])
+    table(["", "sources ", "windows ", "time "], rows)
+    reasons: dict[str, list[str]] = {}
+    for one in done.sources:
+        if one.reason and one.outcome in ("added", "replaced", "left out"):
+            reasons.setdefault(f"{one.reason}{', left out' * (one.outcome == 'left out')}", []).append(one.source)
+    for reason, sources in reasons.items():
+        say(f"note: {reason}: {names(sources)}")
+
+
+def _hits_show(hits: Sequence[Hit], mirror: bool) -> None:
+    from indexing.report.page import even
+
+    people, scores = any(hit.person for hit in hits), even([hit.score for hit in hits])
+    rows = [
+        [
+            f"{number}", hit.source, *[hit.person] * people, f"{hit.start:.2f}", f"{hit.end:.2f}", score,
+            *["mirrored" * hit.mirrored] * mirror,
+        ]
+        for number, (hit, score) in enumerate(zip(hits, scores, strict=True), 1)
+    ]  # fmt: skip
+    if rows:
+        table(["rank ", "source", *["person"] * people, "start (s) ", "end (s) ", "score ", *[""] * mirror], rows)
+
+
+def _events_show(events: Sequence[ArchivedEvent], classes: Sequence[str]) -> None:
+    """Few events one by one; of many, how many there are of each action."""
+    from indexing.report.page import even
+
+    if 0 < len(events) <= SHOWN:
+        people = any(event.person for event in events)
+        scores, margins = even([event.score for event in events]), even([event.margin for event in events])
+        rows: list[list[object]] = [
+            [event.source, *[event.person] * people, event.label, f"{event.start:.2f}", f"{event.end:.2f}", score, margin]
+            for event, score, margin in zip(events, scores, margins, strict=True)
+        ]
+        table(["source", *["person"] * people, "action", "start (s) ", "end (s) ", "score ", "margin "], rows)
+    elif events:
+        times: dict[str, list[str]] = {label: [] for label in classes}
+        for event in events:
+            times.setdefault(str(event.label), []).append(event.source)
+        rows = [[label, f"{len(where):,}", f"{len(set(where)):,}"] for label, where in times.items()]
+        table(["action", "times ", "sources "], rows)
+        say("note: each event, with its times, is in events.csv of a report (--report FOLDER)")
+
+
+def _manifest(
+    verb: str, command: Any, inputs: Sequence[Path], archive: Archive, info: ArchiveInfo, timings: dict[str, float]
+) -> dict[str, Any]:
+    """How a report came about; of the archive what it held, not the hash of gigabytes."""
+    from indexing.files import manifest, plain
+
+    made = manifest(
+        {"command": f"archive {verb}", **dataclasses.asdict(command)}, [path.expanduser() for path in inputs], timings=timings
+    )
+    return {**made, "archive": {"path": str(archive.path), **plain(info)}}

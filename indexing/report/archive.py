@@ -1,0 +1,508 @@
+"""Reports on an archive: what resembles a query, and where in thousands of recordings learned actions were found.
+
+An archive may hold thousands of hours, so a page shows the best of what was found, counts the rest, and leaves the lists to
+``hits.csv`` and ``events.csv``.  Hits and events play beside the query or the example: key frames in a row that slide by behind a
+window of one frame, which style sheets do without a script.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from collections.abc import Hashable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from indexing import files
+from indexing.clip import Clip
+from indexing.opening import count
+from indexing.report.canvas import WIDTH, strip
+from indexing.report.page import LISTED, Script, even, markup, render, table_csv, write_files
+from indexing.report.pictures import colours
+from indexing.report.player import Player, players
+from indexing.report.recognition import duration, none
+from indexing.report.results import RecognitionReport, RecordingResult, by_recording
+from indexing.report.tallies import cell
+
+if TYPE_CHECKING:
+    from indexing.archive.results import ArchivedEvent, ArchivedRecording, ArchiveInfo, Hit
+
+PICTURED = 60  # hits, or events of all actions, that are drawn
+WEIGHT = 2_000_000  # characters of drawings in a page, beyond which no more are drawn: layouts of 133 joints are heavy
+LEAST, MOST = 3, 12  # events of each action that are drawn, whatever the number of actions
+DOUBTFUL = 3  # of them one is of the least margin
+ROWS = 1000  # hits that are listed
+FIRST = 25  # recordings with finds that are listed without a click
+FILM = (8, 24, 10.0)  # frames of a film at least and at most, and of each second
+AROUND = 0.7  # seconds of the recording before and after what is drawn, which say where a joint should be
+PLAYED, PLAYED_SECONDS = 12, 7200.0  # recordings, and seconds of them all, that have a player
+MARKS = 250  # events of a recording that its line of marks shows
+OURS = r"hits\.csv|events\.csv|repetitions\.csv|confusion\.png|timeline(-\d+)?\.png"  # of this and other reports
+HITS_HEAD = ("rank", "file", "start", "end", "score", "person", "mirrored")
+EVENTS_HEAD = ("file", "label", "start", "end", "score", "margin", "person")
+
+
+class Keeper(Protocol):
+    """What pictures need of an archive."""
+
+    def clip(self, source: str, start: float | None = None, end: float | None = None, person: str = "") -> Clip: ...
+
+
+@dataclass(frozen=True, eq=False)
+class SearchReport:
+    """What resembles a query.
+
+    Args:
+        query: what was asked for; its name is shown.
+        hits: best first.
+        archive: which holds them; info: what is in it.
+        notes: what a reader should know, a sentence each.
+        manifest: of :func:`indexing.files.manifest`.
+    """
+
+    query: Clip
+    hits: Sequence[Hit]
+    archive: Keeper
+    info: ArchiveInfo
+    notes: Sequence[str] = ()
+    manifest: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def title(self) -> str:
+        """Heading of the page."""
+        return f"What resembles {self.query.name or 'the query'}"
+
+
+@dataclass(frozen=True, eq=False)
+class FindReport:
+    """Where learned actions were found in an archive.
+
+    Args:
+        classes: the actions that the model knows.
+        events: in the order of source, person and start; ``exemplar`` is the number among those of its label.
+        recordings: all that were searched.
+        archive: which holds them.
+        exemplars: label -> the clips it was learned from.
+        notes: what a reader should know, a sentence each.
+        manifest: of :func:`indexing.files.manifest`.
+    """
+
+    classes: Sequence[Hashable]
+    events: Sequence[ArchivedEvent]
+    recordings: Sequence[ArchivedRecording]
+    archive: Keeper
+    exemplars: Mapping[Hashable, Sequence[Clip]] = field(default_factory=dict)
+    notes: Sequence[str] = ()
+    manifest: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def title(self) -> str:
+        """Heading of the page."""
+        return f"Actions in an archive of {count(len({one.source for one in self.recordings}), 'recording')}"
+
+
+def write_search(folder: str | Path, report: SearchReport) -> Path:
+    """Write what resembles a query: ``report.html``, ``hits.csv``, ``metrics.json`` and ``manifest.json``.
+
+    Returns:
+        the path of ``report.html``.
+
+    Raises:
+        ValueError: the folder or a file in it cannot be written.
+    """
+    measured = measure_search(report)
+    rows = _hit_rows(report)
+    scores = even([hit.score for hit in report.hits[:ROWS]])
+    rest = [
+        [f"{number}", hit.source, hit.person, *_when(hit.start, hit.end), score, "yes" if hit.mirrored else ""]
+        for number, (hit, score) in enumerate(zip(report.hits[:ROWS], scores, strict=True), 1)
+    ][len(rows) :]
+    html = render(
+        "hits", report, summary=_search_words(report, measured), cards=_search_cards(report, measured), notes=_noted(report),
+        query=strip(report.query, frames=8, alt="Key frames of the query") or none("no joint seen"),
+        rows=rows, rest=rest, unlisted=max(0, len(report.hits) - ROWS), sides=_sides(rows),
+    )  # fmt: skip
+    return _write(folder, report.manifest, {"hits.csv": hits_csv(report.hits), "metrics.json": measured, "report.html": html})
+
+
+def write_finds(folder: str | Path, report: FindReport) -> Path:
+    """Write where actions were found: ``report.html``, ``events.csv``, ``metrics.json`` and ``manifest.json``.
+
+    The page has a table of the actions, one of the recordings with a line of marks for when, and drawings of the surest and the
+    most doubtful finds of each action; where the recordings are few, it plays them.
+
+    Returns:
+        the path of ``report.html``.
+
+    Raises:
+        ValueError: the folder or a file in it cannot be written.
+    """
+    measured = measure_finds(report)
+    paint = colours([*report.classes, *(event.label for event in report.events)])
+    played = _played(report)
+    actions = _actions(report)
+    html = render(
+        "finds", report, summary=_find_words(report, measured), cards=_find_cards(measured), notes=_noted(report), actions=actions,
+        counts=_count_rows(report), found=_recording_rows(report, paint), FIRST=FIRST, paint=paint, played=played,
+        script=Script("player.js") if played else None, unlisted=max(0, measured["recordings_with_events"] - LISTED),
+        sides=any(_sides(rows) for one in actions for _, rows in one["groups"]),
+    )  # fmt: skip
+    return _write(folder, report.manifest, {"events.csv": events_csv(report.events), "metrics.json": measured, "report.html": html})
+
+
+def hits_csv(hits: Sequence[Hit]) -> str:
+    """All hits as CSV, best first: ``rank,file,start,end,score,person,mirrored``; seconds with 3 decimals.
+
+    Example:
+        >>> from indexing.archive.results import Hit
+        >>> hits_csv([Hit("monday.json", "", 2.0, 3.5, -0.25)]).splitlines()[1]
+        '1,monday.json,2.000,3.500,-0.25,,no'
+    """
+    rows = [
+        [
+            number, cell(hit.source), f"{hit.start:.3f}", f"{hit.end:.3f}", _number(hit.score), cell(hit.person),
+            "yes" if hit.mirrored else "no",
+        ]
+        for number, hit in enumerate(hits, 1)
+    ]  # fmt: skip
+    return table_csv(HITS_HEAD, rows)
+
+
+def events_csv(events: Sequence[ArchivedEvent]) -> str:
+    """All events as CSV: ``file,label,start,end,score,margin,person``, as a scan of the recordings writes them."""
+    rows = [
+        [
+            cell(event.source), cell(event.label), f"{event.start:.3f}", f"{event.end:.3f}", _number(event.score),
+            _number(event.margin), cell(event.person),
+        ]
+        for event in events
+    ]  # fmt: skip
+    return table_csv(EVENTS_HEAD, rows)
+
+
+def measure_search(report: SearchReport) -> dict[str, Any]:
+    """All numbers of a search, in JSON types."""
+    scores = [hit.score for hit in report.hits]
+    return {
+        "hits": len(report.hits),
+        "sources": len({hit.source for hit in report.hits}),
+        "best_score": max(scores, default=math.nan),
+        "last_score": min(scores, default=math.nan),
+        "query_seconds": report.query.duration,
+        "searched": {"sources": report.info.sources, "windows": report.info.windows, "seconds": report.info.seconds},
+        "notes": list(report.notes),
+    }
+
+
+def measure_finds(report: FindReport) -> dict[str, Any]:
+    """All numbers of a find, in JSON types."""
+    kinds = Counter(str(event.label) for event in report.events)
+    kinds.update(dict.fromkeys(map(str, report.classes), 0))
+    where: dict[str, set[str]] = {}
+    for event in report.events:
+        where.setdefault(str(event.label), set()).add(event.source)
+    return {
+        "events": len(report.events),
+        "events_by_class": dict(kinds.most_common()),
+        "recordings_by_class": {label: len(where.get(label, ())) for label, _ in kinds.most_common()},
+        "recordings": len({one.source for one in report.recordings}),
+        "recordings_with_events": len({event.source for event in report.events}),
+        "people": sum(bool(one.person) for one in report.recordings),
+        "seconds": float(sum(one.seconds for one in report.recordings)),
+        "notes": list(report.notes),
+    }
+
+
+# ---- what both pages share -----------------------------------------------------------------------------------------------
+def _write(folder: str | Path, manifest: Mapping[str, Any], contents: dict[str, Any]) -> Path:
+    where = files.prepare(folder)
+    names = sorted([*contents, files.MANIFEST])
+    files.remove_stale(where, names, OURS)
+    page = contents.pop("report.html")
+    return write_files(where, {**contents, files.MANIFEST: {**manifest, "files": names}, "report.html": page})
+
+
+def _noted(report: SearchReport | FindReport) -> list[tuple[str, str, str]]:
+    return [("", "", note) for note in report.notes]
+
+
+def _number(value: float) -> str:
+    return f"{value:.6g}" if np.isfinite(value) else ""
+
+
+def _when(start: float, end: float) -> tuple[str, str]:
+    return f"{start:.2f}", f"{end:.2f}"
+
+
+def _time(start: float, end: float) -> Any:
+    """When, how long, and what a clock shows then."""
+    minutes = f"{int(start) // 60 % 60:02d}:{int(start) % 60:02d}"
+    clock = f" · at {int(start) // 3600}:{minutes}" if end >= 60 else ""
+    return markup(
+        "{span}<small>{long} s long{clock}</small>", span=f"{start:.2f} to {end:.2f} s", long=f"{end - start:.1f}", clock=clock
+    )
+
+
+def _who(source: str, *more: str) -> Any:
+    """A recording, and in small print whatever else is to be said of it."""
+    small = " · ".join(word for word in more if word)
+    return markup('{name}<small class="quiet">{small}</small>', name=source, small=small) if small else source
+
+
+def _sides(rows: Sequence[Sequence[Any]]) -> bool:
+    """Whether some drawing tells left limbs from right ones."""
+    return any('class="l"' in str(item) or 'class="r"' in str(item) for row in rows for item in row)
+
+
+def frames_of(seconds: float) -> int:
+    """Frames of a film that lasts so long.
+
+    Example:
+        >>> [frames_of(seconds) for seconds in (0.5, 1.4, 9.0)]
+        [8, 14, 24]
+    """
+    least, most, rate = FILM
+    return min(max(round(seconds * rate), least), most)
+
+
+def film(drawing: str, seconds: float, mirrored: bool = False) -> Any:
+    """A strip as a film that plays when its row is pointed at: the strip slides by behind a window of one frame.
+
+    Args:
+        drawing: of :func:`indexing.report.canvas.strip`; seconds: that it takes; mirrored: shown as in a mirror, left for right.
+    """
+    found = re.search(r'viewBox="0 0 ([\d.]+) ', drawing)
+    if found is None:
+        return ""
+    steps, lasts = round(float(found[1]) / WIDTH), f"{max(seconds, 0.3):.2f}"
+    css = "film turned" if mirrored else "film"
+    html = '<span class="{css}" style="--steps:{steps};--lasts:{lasts}s">{drawing}</span>'
+    return markup(html, css=css, steps=steps, lasts=lasts, drawing=drawing)
+
+
+@dataclass
+class _Drawing:
+    """Draws stretches of an archive, until as much is drawn as a page may weigh."""
+
+    archive: Keeper
+    weight: int = 0
+
+    @property
+    def full(self) -> bool:
+        """Whether nothing more should be drawn."""
+        return self.weight >= WEIGHT
+
+    def beside(self, found: Hit | ArchivedEvent, model: Any, seconds: float, what: str) -> list[Any]:
+        """Key frames of what was found, and its film beside that of what it resembles, at the same pace.
+
+        Args:
+            model: drawing of what it resembles; seconds: that this lasts; what: for those who do not see it.
+        """
+        try:
+            clip = self.archive.clip(found.source, found.start - AROUND, found.end + AROUND, found.person)
+        except ValueError:  # removed since it was found
+            return [none("no longer stored"), ""]
+        alt = f"Key frames of {what}: {found.source} at {found.start:.1f} to {found.end:.1f} s"
+        drawn = strip(clip, found.start, found.end, alt=alt)
+        if not drawn:
+            return [none("no joint seen"), ""]
+        moving = strip(clip, found.start, found.end, frames=frames_of(seconds))
+        pair = markup(
+            '<span class="pair" tabindex="0" role="img" aria-label="{what}, played beside what it resembles">{one}{other}</span>',
+            what=what, one=film(model, seconds, getattr(found, "mirrored", False)), other=film(moving, seconds),
+        )  # fmt: skip
+        self.weight += len(drawn) + len(pair)
+        return [drawn, pair]
+
+
+# ---- search --------------------------------------------------------------------------------------------------------------
+def _hit_rows(report: SearchReport) -> list[list[Any]]:
+    """The hits that are drawn, the best first."""
+    drawing, lasts = _Drawing(report.archive), report.query.duration
+    model = strip(report.query, frames=frames_of(lasts))
+    scores, rows = even([hit.score for hit in report.hits[:ROWS]]), []
+    for number, hit in enumerate(report.hits[:PICTURED], 1):
+        if drawing.full:
+            break
+        small = (f"person {hit.person}" * bool(hit.person), "mirrored" * hit.mirrored)
+        name = markup('<span class="rank">{number}</span> {who}', number=number, who=_who(hit.source, *small))
+        pictures = drawing.beside(hit, model, lasts, f"hit {number}")
+        rows.append([name, _time(hit.start, hit.end), scores[number - 1], *pictures])
+    return rows
+
+
+def _search_words(report: SearchReport, measured: Mapping[str, Any]) -> str:
+    searched = f"{duration(report.info.seconds)} of {count(report.info.sources, 'source')}"
+    if not report.hits:
+        return f"Nothing was found in {searched}."
+    these = "This stretch resembles" if len(report.hits) == 1 else f"These {len(report.hits):,} stretches resemble"
+    where = count(measured["sources"], "recording")
+    return f"{these} the query most, seen from whatever side: in {where}, among {searched}."
+
+
+def _search_cards(report: SearchReport, measured: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    searched = f"{count(report.info.windows, 'window')} of {count(report.info.sources, 'source')}"
+    best, last = even([measured["best_score"], measured["last_score"]])
+    return [
+        ("Hits", f"{len(report.hits):,}", f"in {count(measured['sources'], 'recording')}"),
+        ("Scores", best, f"of the best; {last} of the last one shown"),
+        ("Searched", duration(report.info.seconds), searched),
+        ("Query", duration(report.query.duration), f"{count(report.query.joints.shape[1], 'joint')} in {report.query.dims}D"),
+    ]  # fmt: skip
+
+
+# ---- find ----------------------------------------------------------------------------------------------------------------
+def _by_label(report: FindReport) -> dict[str, list[ArchivedEvent]]:
+    """The events of each action that has some, the most frequent first."""
+    found: dict[str, list[ArchivedEvent]] = {}
+    for event in report.events:
+        found.setdefault(str(event.label), []).append(event)
+    return dict(sorted(found.items(), key=lambda item: (-len(item[1]), item[0])))
+
+
+def _find_words(report: FindReport, measured: Mapping[str, Any]) -> str:
+    where = f"{count(measured['recordings'], 'recording')} ({duration(measured['seconds'])} in all)"
+    if not report.events:
+        return f"None of the actions was found in {where}."
+    kinds = [name for name, number in measured["events_by_class"].items() if number]
+    often = f", most often {kinds[0]} ({measured['events_by_class'][kinds[0]]:,} times)" if len(kinds) > 1 else ""
+    were = "was" if measured["events"] == 1 else "were"
+    found = f"{count(measured['events'], 'action')} of {count(len(kinds), 'kind')} {were} found"
+    return f"{found} in {measured['recordings_with_events']:,} of {where}{often}."
+
+
+def _find_cards(measured: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    kinds = sum(number > 0 for number in measured["events_by_class"].values())
+    without = measured["recordings"] - measured["recordings_with_events"]
+    items = [
+        ("Actions found", f"{measured['events']:,}", f"of {count(kinds, 'kind')}"),
+        ("Recordings", f"{measured['recordings_with_events']:,}", f"with a find; {without:,} without"),
+        ("Searched", duration(measured["seconds"]), f"in {count(measured['recordings'], 'recording')}"),
+    ]
+    if measured["people"]:
+        items.append(("People", f"{measured['people']:,}", "each searched by itself"))
+    return items
+
+
+def _count_rows(report: FindReport) -> list[list[Any]]:
+    """Of each action: how often, in how many recordings, seconds in all, and its scores."""
+    found = _by_label(report)
+    best = even([max((event.score for event in events), default=math.nan) for events in found.values()])
+    middle = even([float(np.median([event.score for event in events])) for events in found.values()])
+    rows: list[list[Any]] = [
+        [
+            label, f"{len(events):,}", f"{len({event.source for event in events}):,}",
+            duration(sum(event.end - event.start for event in events)), top, usual,
+        ]
+        for (label, events), top, usual in zip(found.items(), best, middle, strict=True)
+    ]  # fmt: skip
+    absent = [name for name in map(str, report.classes) if name not in found]
+    return rows + [[name, "0", "0", none("none"), "", ""] for name in absent]
+
+
+def _actions(report: FindReport) -> list[dict[str, Any]]:
+    """Drawings of the surest and the most doubtful finds of each action."""
+    found, drawing = _by_label(report), _Drawing(report.archive)
+    room = min(max(PICTURED // max(len(found), 1), LEAST), MOST)
+    out = []
+    for label, events in found.items():
+        groups = []
+        for title, some in _chosen(events, room):
+            rows = list(_event_rows(report, drawing, some))
+            if rows:
+                groups.append((title, rows))
+        if groups:
+            out.append({"label": label, "events": len(events), "groups": groups})
+    return out
+
+
+def _chosen(events: Sequence[ArchivedEvent], room: int) -> list[tuple[str, list[ArchivedEvent]]]:
+    """All events, surest first, where they fit; else the surest, and those of the least margin."""
+    ordered = sorted(events, key=lambda event: -event.score)
+    if len(ordered) <= room:
+        return [("", ordered)]
+    surest = ordered[: room - room // DOUBTFUL]
+    rest = sorted(ordered[len(surest) :], key=lambda event: event.margin)
+    return [("The surest", surest), ("The most doubtful: hardly more than the next best action", rest[: room // DOUBTFUL])]
+
+
+def _event_rows(report: FindReport, drawing: _Drawing, events: Sequence[ArchivedEvent]) -> Iterator[list[Any]]:
+    scores, margins = even([event.score for event in events]), even([event.margin for event in events])
+    for event, score, margin in zip(events, scores, margins, strict=True):
+        if drawing.full:
+            return
+        clip = _example(report, event)
+        model = strip(clip, frames=frames_of(event.end - event.start)) if clip is not None else ""
+        pictures = drawing.beside(event, model, event.end - event.start, str(event.label))
+        yield [
+            _who(event.source, f"person {event.person}" * bool(event.person)),
+            _time(event.start, event.end),
+            score,
+            margin,
+            *pictures,
+        ]
+
+
+def _example(report: FindReport, event: ArchivedEvent) -> Clip | None:
+    return RecognitionReport("", exemplars=report.exemplars).exemplar(event)
+
+
+def _recording_rows(report: FindReport, paint: Mapping[str, str]) -> list[list[Any]]:
+    """Recordings with finds, those with most first: how often each action, and when."""
+    spans: dict[str, tuple[float, float]] = {}
+    for one in report.recordings:
+        low, high = spans.get(one.source, (math.inf, -math.inf))
+        spans[one.source] = (min(low, one.start), max(high, one.end))
+    found: dict[str, list[ArchivedEvent]] = {}
+    for event in report.events:
+        found.setdefault(event.source, []).append(event)
+    rows: list[list[Any]] = []
+    for source, events in sorted(found.items(), key=lambda item: (-len(item[1]), item[0]))[:LISTED]:
+        kinds = Counter(str(event.label) for event in events).most_common()
+        said = ", ".join(f"{number} {label}" for label, number in kinds[:6]) + f" and {len(kinds) - 6} more kinds" * (
+            len(kinds) > 6
+        )
+        low, high = spans.get(source, (events[0].start, events[-1].end))
+        rows.append([_who(source, duration(high - low)), f"{len(events):,}", said, marks(events[:MARKS], low, high, paint)])
+    return rows
+
+
+def marks(events: Sequence[ArchivedEvent], start: float, end: float, paint: Mapping[str, str]) -> Any:
+    """When a recording's events are, as a line of marks in the colours of their actions."""
+    lasts = max(end - start, 1e-9)
+    drawn = [
+        markup(
+            '<rect x="{x}" width="{wide}" height="10" fill="{colour}"/>', x=f"{1000 * (event.start - start) / lasts:.1f}",
+            wide=f"{max(1000 * (event.end - event.start) / lasts, 3.0):.1f}", colour=paint[str(event.label)],
+        )
+        for event in events
+    ]  # fmt: skip
+    return markup(
+        '<svg class="marks" viewBox="0 0 1000 10" preserveAspectRatio="none" aria-hidden="true">'
+        '<rect class="track" width="1000" height="10"/>{drawn}</svg>',
+        drawn=markup("").join(drawn),
+    )
+
+
+def _played(report: FindReport) -> list[dict[str, Any]]:
+    """Players of the recordings with finds, where they are few and short enough for a page."""
+    found = {event.source for event in report.events}
+    some = [one for one in report.recordings if one.source in found]
+    if len(found) > PLAYED or sum(one.seconds for one in some) > PLAYED_SECONDS:
+        return []
+    results, classes = [], [str(label) for label in report.classes]  # all, so that an action has one colour on all the page
+    for one in some:
+        try:
+            clip = report.archive.clip(one.source, person=one.person)
+        except ValueError:  # removed since it was searched
+            continue
+        events = [event for event in report.events if (event.source, event.person) == (one.source, one.person)]
+        unscored = np.full((len(clip), len(classes)), np.nan)
+        results.append(RecordingResult(one.source, clip, clip.times, classes, unscored, events, person=one.person))
+    groups = by_recording(results)
+    play: Sequence[Player | None] = players(groups, RecognitionReport("", exemplars=report.exemplars))
+    return [{"name": people[0].name, "player": player} for people, player in zip(groups, play, strict=True) if player is not None]
