@@ -296,7 +296,7 @@ def at_once(stage: Stage, times: int, rng: np.random.Generator) -> list[Trial]:
 
 
 def asked_meanwhile(stage: Stage, times: int, rng: np.random.Generator) -> list[Trial]:
-    """Somebody asks, lists and verifies all the time while others add."""
+    """Somebody asks and verifies all the time while others add."""
     trials = []
     for _ in range(times):
         folder, problems = stage.copy(), list[str]()
@@ -358,8 +358,8 @@ def disk(folder: Path, size: int) -> Iterator[Path]:
         PermissionError: this user may mount nothing.
     """
     folder.mkdir(exist_ok=True)
-    done = subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)], capture_output=True, check=False)
-    if done.returncode:
+    words = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)]
+    if not shutil.which("mount") or subprocess.run(words, capture_output=True, check=False).returncode:
         raise PermissionError(errno.EPERM, "may not mount a file system")
     try:
         yield folder

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import os
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Executor
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from indexing.archive import adding
-from indexing.archive.catalogue import Catalogue, RecordingRow, drop_recordings
+from indexing.archive.catalogue import Catalogue, drop_recordings, storable
 from indexing.archive.options import ArchiveOptions
 from indexing.archive.queries import checked, examples_of
 from indexing.archive.results import Addition, ArchivedEvent, ArchivedRecording, ArchiveInfo, Hit, Verification
@@ -25,6 +27,7 @@ if TYPE_CHECKING:
     from indexing.action.indexer import ActionIndexer
 
 Progress = Callable[[float], None] | None
+T = TypeVar("T")
 
 
 class Archive:
@@ -99,18 +102,18 @@ class Archive:
         catalogue = Catalogue.make(self.path, self.options.storage)
         return adding.add(catalogue, found, self.options, executor, dict(reading or {}), progress)
 
-    def remove(self, source: str) -> int:
+    def remove(self, source: str | os.PathLike[str]) -> int:
         """Take a source out: a file by its path or name, a clip by its name.  How many recordings it had.
 
         Raises:
-            ValueError: there is none of this name.
+            ValueError: there is none of this name, or another process writes.
         """
-        catalogue = self._catalogue()
+        catalogue, name = self._catalogue(), storable(os.fspath(source))
         with catalogue.alone():
-            resolved = str(Path(source).expanduser().resolve())
-            mine = [row for row in catalogue.sources().values() if source in (row.name, row.path) or resolved == row.path != ""]
+            resolved = storable(str(Path(source).expanduser().resolve()))
+            mine = [row for row in catalogue.sources().values() if name in (row.name, row.path) or resolved == row.path != ""]
             if not mine:
-                raise ValueError(f"{self.path}: has no source {source!r}; dyntorch archive info --sources lists them")
+                raise ValueError(f"{self.path}: has no source {name!r}; dyntorch archive info --sources lists them")
             count = 0
             with catalogue.writing() as connection:
                 for row in mine:
@@ -121,34 +124,32 @@ class Archive:
 
     def recordings(self) -> list[ArchivedRecording]:
         """Everybody in every recording, in the order of their addition."""
-        catalogue = self._catalogue()
-        contents = catalogue.contents()
+        contents, rows, sources = self._catalogue().moment()
         layouts = {row.id: contents.layouts[row.layout].name for row in contents.segments}
-        paths = {row.id: row.path for row in catalogue.sources().values()}
+        paths = {row.id: row.path for row in sources}
         return [
             ArchivedRecording(
                 row.name, paths[row.source], row.person, row.begins, row.ends, row.seconds, layouts[row.segment]
             )
-            for row in catalogue.recordings()
+            for row in rows
         ]  # fmt: skip
 
     def info(self) -> ArchiveInfo:
         """How much is in it."""
         catalogue = self._catalogue()
-        contents, rows = catalogue.contents(), catalogue.recordings()
+        contents, rows, sources = catalogue.moment()
         layouts = {row.id: row.layout for row in contents.segments}
         seconds = dict.fromkeys(contents.layouts, 0.0)
         for row in rows:
             seconds[layouts[row.segment]] += row.seconds
-        size = sum(one.stat().st_size for one in self.path.rglob("*") if one.is_file())
         return ArchiveInfo(
-            sources=len(catalogue.sources()),
+            sources=len(sources),
             recordings=len(rows),
             windows=contents.windows,
             seconds=sum(seconds.values()),
             segments=len(contents.segments),
             dead=sum(row.dead for row in contents.segments),
-            size=size,
+            size=sum(row.size for row in contents.segments) + catalogue.path.stat().st_size,
             layouts=tuple((one.name, one.joints, seconds[number]) for number, one in contents.layouts.items()),
             version=catalogue.version,
         )
@@ -162,18 +163,21 @@ class Archive:
         Raises:
             ValueError: there is none of this name, or nothing of it in that time.
         """
-        rows = [row for row in self._catalogue().by_name(source) if person in ("", row.person)]
-        if not rows:
-            who = f" with a person {person!r}" if person else ""
-            raise ValueError(f"{self.path}: has no recording {source!r}{who}; dyntorch archive info --sources lists them")
-        clip = self._stored(rows[0])
+        clip = self._again(lambda: self._stored(source, person))
         lowest = -np.inf if start is None else start - 0.5 / (clip.fps or 1.0)
         return clip.between(lowest, np.inf if end is None else end + 0.5 / (clip.fps or 1.0))
 
-    def _stored(self, row: RecordingRow) -> Clip:
+    def _stored(self, source: str, person: str) -> Clip:
         """All of a recording's first image."""
         library = self._opened()
-        number = next(i for i, one in enumerate(library.contents.segments) if one.id == row.segment)
+        rows = [row for row in self._catalogue().by_name(storable(source)) if person in ("", row.person)]
+        if not rows:
+            who = f" with a person {person!r}" if person else ""
+            raise ValueError(f"{self.path}: has no recording {source!r}{who}; dyntorch archive info --sources lists them")
+        row, numbers = rows[0], {one.id: i for i, one in enumerate(library.contents.segments)}
+        if row.segment not in numbers:
+            raise FileNotFoundError(errno.ENOENT, "segment of another moment", str(self.path))
+        number = numbers[row.segment]
         segment = library.segments[number]
         mine = np.flatnonzero((segment.tracks[:, 0] == row.id) & (segment.tracks[:, 1] == 0))
         mine = mine[np.argsort(segment.starts[mine])]
@@ -199,20 +203,15 @@ class Archive:
         """
         if isinstance(k, bool) or not isinstance(k, (int, np.integer)) or k < 1:
             raise ValueError(f"k must be a whole number of hits, 1 or more, got {k!r}")
-        for attempt in range(self.options.search.attempts):
-            library = self._opened()
-            if not library.contents.windows:
-                raise ValueError(f"{self.path}: holds no movement yet; add recordings first")
-            asked = checked(clip, library.contents.options.shortest, self.options.search)
-            examples = examples_of(asked, library.contents, self.options.search, mirror)
-            try:
-                pool = search(library, examples, int(k), self.options.search, executor, progress)
-                return self._hits(library, pool)
-            except FileNotFoundError:
-                self._library = None
-                if attempt == self.options.search.attempts - 1:
-                    raise
-        raise AssertionError("unreachable")
+        return self._again(lambda: self._searched(clip, int(k), executor, progress, mirror))
+
+    def _searched(self, clip: Clip, k: int, executor: Executor | None, progress: Progress, mirror: bool) -> list[Hit]:
+        library = self._opened()
+        if not library.contents.windows:
+            raise ValueError(f"{self.path}: holds no movement yet; add recordings first")
+        asked = checked(clip, library.contents.options.shortest, self.options.search)
+        examples = examples_of(asked, library.contents, self.options.search, mirror)
+        return self._hits(library, search(library, examples, k, self.options.search, executor, progress))
 
     def _hits(self, library: Snapshot, pool: Shortlist) -> list[Hit]:
         where = [
@@ -242,14 +241,7 @@ class Archive:
         """
         from indexing.archive.finding import find
 
-        for attempt in range(self.options.search.attempts):
-            try:
-                return find(self._opened(), self._catalogue(), model, self.options.find, executor, progress)
-            except FileNotFoundError:
-                self._library = None
-                if attempt == self.options.search.attempts - 1:
-                    raise
-        raise AssertionError("unreachable")
+        return self._again(lambda: find(self._opened(), self._catalogue(), model, self.options.find, executor, progress))
 
     def verify(self) -> Verification:
         """Whether every window of the catalogue is there, whole, and once; reads everything."""
@@ -264,28 +256,37 @@ class Archive:
             raise ValueError(f"{self.path}: is no archive yet; add recordings first")
         return Catalogue(self.path)
 
+    def _again(self, question: Callable[[], T]) -> T:
+        """The answer to a question; asked again where segments were put together meanwhile."""
+        for _ in range(self.options.search.attempts - 1):
+            with contextlib.suppress(FileNotFoundError):
+                return question()
+            self._library = None
+        try:
+            return question()
+        except FileNotFoundError as problem:
+            raise ValueError(f"{problem.filename}: is missing; dyntorch archive verify says what is lost") from None
+
     def _opened(self) -> Snapshot:
-        """As it is now; what was mapped before and has not changed stays mapped."""
+        """As it is now; what was mapped before and has not changed stays mapped.
+
+        Raises:
+            FileNotFoundError: a segment is no longer there.
+        """
         catalogue = self._catalogue()
         if self._library is not None and self._library.contents.generation == catalogue.generation():
             return self._library
-        for attempt in range(self.options.search.attempts):
-            contents = catalogue.contents()
-            known = {} if self._library is None else {one.path.name: one for one in self._library.segments}
-            try:
-                segments = tuple(
-                    known.get(row.file) or ArchiveSegment.open(catalogue.segments_folder / row.file) for row in contents.segments
-                )
-            except FileNotFoundError as problem:
-                if attempt == self.options.search.attempts - 1:
-                    raise ValueError(f"{problem.filename}: is missing; dyntorch archive verify says what is lost") from None
-                continue
-            dead = tuple(
-                frozenset(segment.tracks[:, 0].tolist()) - {one.id for one in catalogue.recordings(row.id)}
-                if row.dead
-                else frozenset()
-                for row, segment in zip(contents.segments, segments, strict=True)
-            )
-            self._library = Snapshot(catalogue.segments_folder, contents, segments, dead)
-            return self._library
-        raise AssertionError("unreachable")
+        contents, rows, _ = catalogue.moment()
+        known = {} if self._library is None else {one.path.name: one for one in self._library.segments}
+        segments = tuple(
+            known.get(row.file) or ArchiveSegment.open(catalogue.segments_folder / row.file) for row in contents.segments
+        )
+        live: dict[int, set[int]] = {row.id: set() for row in contents.segments}
+        for one in rows:
+            live[one.segment].add(one.id)
+        dead = tuple(
+            frozenset(segment.tracks[:, 0].tolist()) - live[row.id] if row.dead else frozenset()
+            for row, segment in zip(contents.segments, segments, strict=True)
+        )
+        self._library = Snapshot(catalogue.segments_folder, contents, segments, dead)
+        return self._library

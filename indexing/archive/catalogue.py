@@ -239,14 +239,17 @@ class Catalogue:
         except (ValueError, TypeError, KeyError, EOFError, zipfile.BadZipFile) as problem:
             raise _senseless(self.folder, problem) from problem
 
-    def moment(self) -> tuple[Contents, list[RecordingRow], list[SourceRow]]:
+    def moment(self, checked: bool = False) -> tuple[Contents, list[RecordingRow], list[SourceRow]]:
         """Contents, recordings and sources, all of one moment, whoever writes meanwhile.
+
+        Args:
+            checked: whether SQLite looks at the whole file first.
 
         Raises:
             ValueError: the file is damaged.
         """
         with self.reading() as connection:
-            (said,) = connection.execute("PRAGMA integrity_check(1)").fetchone()
+            (said,) = connection.execute("PRAGMA integrity_check(1)").fetchone() if checked else ("ok",)
             if said != "ok":
                 raise _senseless(self.folder, " ".join(str(said).split()))
             recordings = [RecordingRow(*row) for row in connection.execute("SELECT * FROM recordings ORDER BY id")]

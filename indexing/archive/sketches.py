@@ -150,13 +150,16 @@ def scan(
                 scores[:, torch.from_numpy(_outside(segment, gone, low, scores.shape[1], samples, stride))] = -1.0
                 for i, score in zip(mine, scores, strict=True):
                     _take(found, score, low, (first, last), probes[i].apart, i, stride)
+    for i, probe in enumerate(probes):
+        if probe.stride > 1:
+            _take_ends(found, segment, gone, probe, i, (begin, end))
     return settled(segment, probes, found.candidates(segment))
 
 
 def settled(segment: ArchiveSegment, probes: Sequence[Probe], found: Candidates) -> Candidates:
     """Candidates moved by less than a step of the scan to where they resemble the example best."""
     row, score = found.row.copy(), found.score.copy()
-    first, rows = segment.firsts[found.track], segment.tracks[found.track, 3]
+    rows = segment.tracks[found.track, 3]
     for number in np.unique(found.probe).tolist():
         probe = probes[number]
         mine = np.flatnonzero(found.probe == number)
@@ -165,16 +168,38 @@ def settled(segment: ArchiveSegment, probes: Sequence[Probe], found: Candidates)
         moved = np.arange(-(probe.stride // 2), probe.stride // 2 + 1)
         begin = found.row[mine, None] + moved  # (candidates, moves)
         inside = (begin >= 0) & (begin + probe.span < rows[mine, None])
-        at = np.where(inside, begin, found.row[mine, None]) + first[mine, None]
-        places = at[..., None] + np.arange(probe.samples) * probe.stride
-        x = torch.from_numpy(segment.codes[places] * segment.scales[places][..., None, None])  # (..., samples, 2, k)
-        c = torch.einsum("nmldk,elk->denm", x, torch.from_numpy(probe.codes)).flatten(2)[:, None]
-        gram = torch.einsum("nmldk,nmlek->denm", x, x).flatten(2)
-        each = correlation(c, torch.stack([gram[0, 0], gram[0, 1], gram[1, 1]])).view(inside.shape).numpy()
-        each = np.where(inside, each, -1.0)
+        at = np.where(inside, begin, found.row[mine, None]) + segment.firsts[found.track[mine], None]
+        each = np.where(inside, _scores_at(segment, probe, at), -1.0)
         best = each.argmax(axis=1)
         row[mine], score[mine] = begin[np.arange(len(mine)), best], each[np.arange(len(mine)), best]
     return Candidates(score, found.track, row, found.probe).best(len(found))
+
+
+def _scores_at(segment: ArchiveSegment, probe: Probe, first: NDArray[np.int64]) -> NDArray[np.float32]:
+    """Squared correlations of windows that begin at some rows of the segment, in an array of any shape."""
+    rows = first.reshape(-1, 1) + np.arange(probe.samples) * probe.stride
+    out = np.empty(len(rows), dtype=np.float32)
+    for low in range(0, len(rows), BLOCK):
+        some = rows[low : low + BLOCK]
+        x = torch.from_numpy(segment.codes[some] * segment.scales[some][..., None, None])  # (windows, samples, 2, k)
+        c = torch.einsum("nldk,elk->den", x, torch.from_numpy(probe.codes))[:, None]
+        gram = torch.einsum("nldk,nlek->den", x, x)
+        out[low : low + BLOCK] = correlation(c, torch.stack([gram[0, 0], gram[0, 1], gram[1, 1]]))[0].numpy()
+    return out.reshape(first.shape)
+
+
+def _take_ends(
+    found: _Kept, segment: ArchiveSegment, gone: NDArray[np.bool_], probe: Probe, number: int, inner: tuple[int, int]
+) -> None:
+    """The first and the last window of each track: what is hardly longer than a window may lie between two steps of the scan."""
+    rows = segment.tracks[:, 3]
+    there = ~gone & (rows > probe.span)
+    first = np.unique(np.concatenate([segment.firsts[there], (segment.firsts + rows - 1 - probe.span)[there]]))
+    first = first[(first >= inner[0]) & (first < inner[1])]
+    if len(first):
+        score = _scores_at(segment, probe, first)
+        better = score > found.threshold
+        found.add(score[better], first[better], number)
 
 
 def resembling(segment: ArchiveSegment, probes: Sequence[Probe], least: float, quiet: float = 0.0) -> NDArray[np.bool_]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from dyntorch.numerics import one_thread
 from indexing.archive.options import StorageOptions
 from indexing.cameras import rotation, y_up
-from indexing.clip import Clip, FloatArray, stretches
+from indexing.clip import Clip, FloatArray
 from indexing.windows import mended, ragged, sample
 
 MISSING = -(2**15)  # stored coordinate of a joint that was not seen
@@ -77,7 +78,8 @@ def tracks_of(clip: Clip, options: StorageOptions, recording: int = 0) -> list[T
             continue
         rows = np.flatnonzero(there)
         joints, times = y_up(image)[rows], image.times[rows]
-        for begin, end in stretches(times).tolist():
+        cuts = np.flatnonzero(np.diff(times) > options.bridged + 1e-6) + 1
+        for begin, end in pairwise([0, *cuts.tolist(), len(times)]):
             track = _track(joints[begin:end], times[begin:end], options, recording, view)
             found += [] if track is None else [track]
     return found

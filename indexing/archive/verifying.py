@@ -18,7 +18,7 @@ from indexing.opening import count, listed
 def verify(catalogue: Catalogue) -> Verification:
     """Every segment read and compared with the catalogue; again where somebody changed the archive meanwhile."""
     for attempt in range(SearchOptions.attempts):
-        contents, recordings, sources = catalogue.moment()
+        contents, recordings, sources = catalogue.moment(checked=True)
         problems = _problems(catalogue.segments_folder, contents, recordings, sources)
         if not problems or attempt == SearchOptions.attempts - 1 or catalogue.generation() == contents.generation:
             break

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 import signal
 import sys
 import threading
@@ -24,6 +23,7 @@ from indexing.archive import workers
 from indexing.archive.workers import InOrder, WorkerLost
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals and forked servers are those of Unix")
+resource = pytest.importorskip("resource", reason="limits are those of Unix")
 
 
 @pytest.fixture(scope="module")
