@@ -278,9 +278,8 @@ class Archive:
             return self._library
         contents, rows, _ = catalogue.moment()
         known = {} if self._library is None else {one.path.name: one for one in self._library.segments}
-        segments = tuple(
-            known.get(row.file) or ArchiveSegment.open(catalogue.segments_folder / row.file) for row in contents.segments
-        )
+        folder = catalogue.segments_folder
+        segments = tuple(known.get(row.file) or ArchiveSegment.open(folder / row.file) for row in contents.segments)
         live: dict[int, set[int]] = {row.id: set() for row in contents.segments}
         for one in rows:
             live[one.segment].add(one.id)
@@ -288,5 +287,5 @@ class Archive:
             frozenset(segment.tracks[:, 0].tolist()) - live[row.id] if row.dead else frozenset()
             for row, segment in zip(contents.segments, segments, strict=True)
         )
-        self._library = Snapshot(catalogue.segments_folder, contents, segments, dead)
+        self._library = Snapshot(folder, contents, segments, dead)
         return self._library

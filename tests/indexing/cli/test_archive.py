@@ -168,12 +168,20 @@ def test_add_refuses_bad_input(refuse, tmp_path: Path) -> None:
     (tmp_path / "full" / "x.txt").touch()
     refuse("add", "@/a", says=("no sources",))
     refuse("add", "@/a", "@/empty", says=("nothing to add",))
-    refuse("add", "@/a", "week", "nope.json", says=("nope.json", "no such file"))
     refuse("add", "@/file", "week", says=("is a file", "folder"))
     refuse("add", "@/full", "week", says=("full",))
     refuse("add", "@/a", "week", "--workers", "0", says=("--workers 0", "1 or more"))
     refuse("add", "@/a", "week", "--workers", "2", "--dask", "tcp://x:1", says=("leave one of them out",))
     assert not (tmp_path / "a").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"), [(("week", "nope.json"), 0), (("week", "nope.json", "--strict"), 2), (("nope.json",), 2)]
+)
+def test_a_source_that_is_not_there_is_said_at_the_end(run, words, expected) -> None:
+    code, out, err = run("add", "@/missing", *words)
+    assert code == expected and err.count("\n") == 1 and "nope.json: no such file" in err
+    assert "failed" in out and ("3 sources" in out) == ("week" in words)
 
 
 # ---- search --------------------------------------------------------------------------------------------------------------
