@@ -74,14 +74,17 @@ class SearchOptions:
     """How an example is searched."""
 
     candidates: int = 1000
-    """Moments that sketches choose, which are then compared exactly."""
+    """Moments that are compared exactly."""
     tempos: tuple[float, ...] = (0.8, 1.0, 1.25)
     """Durations that are searched, in those of the query: people differ."""
     samples: int = 4
-    """Steps that a window is divided into, at least where its duration allows: it is compared by the poses at their ends, and the
-    best are moved to where they fit best.  Right moment first / among ten, 280,000 windows of 1 s and 2 s: 4 give .79 / .97 and
-    .89 / .96, 8 .80 / .98 and .90 / .98, at twice the time."""
-    apart: float = 0.35
+    """Steps that a window is divided into by the scan, at least where its duration allows: it is compared by the poses at their
+    ends."""
+    settled: int = 4000
+    """Windows of the scan that are compared by more samples, and moved to the pose where they fit best."""
+    fine: int = 16
+    """Steps that they are divided into, at least where their duration allows."""
+    apart: float = 0.2
     """Durations between two candidates: nearer ones are one."""
     shifts: tuple[float, ...] = (-0.03, 0.0, 0.03)
     """Durations, in its own, by which one of the best candidates is moved where it is compared exactly."""

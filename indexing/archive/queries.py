@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -22,10 +22,15 @@ from indexing.windows import Ragged, mended, ragged, sample, unusable, whole
 
 @dataclass(frozen=True, eq=False)
 class Query:
-    """An example as it faces the recordings of one layout: its images as windows, and the probes made of them."""
+    """An example as it faces the recordings of one layout.
+
+    windows: its images; probes: made of them, at every tempo, for the scan; fine: the same with more samples, for
+    what it finds.
+    """
 
     windows: Windows
     probes: tuple[Probe, ...]
+    fine: tuple[Probe, ...]
 
 
 def checked(clip: Clip, shortest: float, options: SearchOptions) -> Clip:
@@ -89,12 +94,16 @@ def _example(clip: Clip, layout: Layout, rate: float, views: Sequence[float], op
         clips += [one.replace(joints=one.joints[:, swap.numpy()]) for one in clips]
         windows = _windows(clips, options.length)
     source = ragged(clips)
-    found = [
-        probe_of(source, i, layout, rate, tempo, options, mirrored=i >= count)
-        for i in range(len(clips))
-        for tempo in options.tempos
-    ]
-    return Query(windows, tuple(probe for probe in found if probe is not None))
+    coarse, fine = (
+        [
+            probe_of(source, i, layout, rate, tempo, replace(options, samples=samples), mirrored=i >= count)
+            for i in range(len(clips))
+            for tempo in options.tempos
+        ]
+        for samples in (options.samples, options.fine)
+    )
+    both = [(one, other) for one, other in zip(coarse, fine, strict=True) if one is not None and other is not None]
+    return Query(windows, tuple(one for one, _ in both), tuple(other for _, other in both))
 
 
 def _windows(clips: Sequence[Clip], length: int) -> Windows:

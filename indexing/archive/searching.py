@@ -24,7 +24,7 @@ from indexing.archive.comparing import Places, residuals
 from indexing.archive.options import SearchOptions
 from indexing.archive.queries import Query
 from indexing.archive.segments import ArchiveSegment
-from indexing.archive.sketches import TASK_BLOCK, Candidates, Probe, scan
+from indexing.archive.sketches import TASK_BLOCK, Candidates, Probe, scan, settled
 from indexing.archive.workers import InOrder, WorkerLost
 from indexing.clip import FloatArray
 
@@ -93,7 +93,7 @@ def search(
     library: Snapshot, examples: Mapping[int, Query], k: int, options: SearchOptions, executor: Executor | None, progress: Progress
 ) -> Shortlist:
     """The best ``k`` stretches, best first."""
-    found = candidates(library.tasks(examples, options.candidates), executor, progress)
+    found = candidates(library.tasks(examples, options.settled), executor, progress)
     pool = merged(library, examples, found, options)
     pool = ranked(library, examples, pool, k, options)
     return distinct(library, pool, options)[:k]
@@ -136,15 +136,16 @@ def candidates(tasks: Sequence[ScanTask], executor: Executor | None, progress: P
 def merged(
     library: Snapshot, examples: Mapping[int, Query], found: Sequence[tuple[int, Candidates]], options: SearchOptions
 ) -> Shortlist:
-    """The best candidates of all; of those of one track that nearly coincide, whatever their tempo, the best."""
+    """The best candidates of all, settled; of those of one track that nearly coincide, whatever their tempo, the best."""
     rows = library.contents.segments
     rate = library.contents.options.rate
-    segment = np.concatenate([np.zeros(0, np.intp), *(np.full(len(one), i, np.intp) for i, one in found)])
+    best = _settled(library, examples, found, options)
+    segment = np.concatenate([np.zeros(0, np.intp), *(np.full(len(one), i, np.intp) for i, one in best)])
     track, row, probe = (
-        np.concatenate([np.zeros(0, np.int64), *(getattr(one, name) for _, one in found)]) for name in ("track", "row", "probe")
+        np.concatenate([np.zeros(0, np.int64), *(getattr(one, name) for _, one in best)]) for name in ("track", "row", "probe")
     )
-    score = np.concatenate([np.zeros(0), *(one.score for _, one in found)])
-    asked = [examples[rows[i].layout].probes[p] for i, p in zip(segment.tolist(), probe.tolist(), strict=True)]
+    score = np.concatenate([np.zeros(0), *(one.score for _, one in best)])
+    asked = [examples[rows[i].layout].fine[p] for i, p in zip(segment.tolist(), probe.tolist(), strict=True)]
     middle = (row + np.array([one.span / 2 for one in asked])) / rate
     half = np.array([one.seconds / 2 for one in asked])
     kept: list[int] = []
@@ -159,6 +160,25 @@ def merged(
     chosen = np.array(kept, dtype=np.intp)
     places = Places(segment, track, middle - half, middle + half)
     return Shortlist(places, probe, score, np.array([one.mirrored for one in asked], dtype=bool))[chosen]
+
+
+def _settled(
+    library: Snapshot, examples: Mapping[int, Query], found: Sequence[tuple[int, Candidates]], options: SearchOptions
+) -> list[tuple[int, Candidates]]:
+    """The best of all scans, by more samples and to the pose: ``(segment, candidates)``."""
+    rows = library.contents.segments
+    number = np.concatenate([np.zeros(0, np.intp), *(np.full(len(one), n, np.intp) for n, (_, one) in enumerate(found))])
+    place = np.concatenate([np.zeros(0, np.intp), *(np.arange(len(one)) for _, one in found)])
+    score = np.concatenate([np.zeros(0), *(one.score for _, one in found)])
+    order = np.lexsort((place, number, -score))[: options.settled]
+    out: list[tuple[int, Candidates]] = []
+    for n in np.unique(number[order]).tolist():
+        i, one = found[n]
+        mine = np.sort(place[order[number[order] == n]])
+        some = Candidates(one.score[mine], one.track[mine], one.row[mine], one.probe[mine])
+        query = examples[rows[i].layout]
+        out.append((i, settled(library.segments[i], query.probes, query.fine, some)))
+    return out
 
 
 # ---- the exact comparison ------------------------------------------------------------------------------------------------

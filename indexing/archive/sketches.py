@@ -153,26 +153,30 @@ def scan(
     for i, probe in enumerate(probes):
         if probe.stride > 1:
             _take_ends(found, segment, gone, probe, i, (begin, end))
-    return settled(segment, probes, found.candidates(segment))
+    return found.candidates(segment)
 
 
-def settled(segment: ArchiveSegment, probes: Sequence[Probe], found: Candidates) -> Candidates:
-    """Candidates moved by less than a step of the scan to where they resemble the example best."""
+def settled(segment: ArchiveSegment, coarse: Sequence[Probe], fine: Sequence[Probe], found: Candidates) -> Candidates:
+    """Candidates of a scan, in their order, moved by less than a step of it to where they resemble the example best.
+
+    Args:
+        coarse: the probes of the scan; fine: the same with more samples, by which rows and scores are meant from now on.
+    """
     row, score = found.row.copy(), found.score.copy()
     rows = segment.tracks[found.track, 3]
     for number in np.unique(found.probe).tolist():
-        probe = probes[number]
+        step, probe = coarse[number].stride, fine[number]
         mine = np.flatnonzero(found.probe == number)
-        if probe.stride == 1:
-            continue
-        moved = np.arange(-(probe.stride // 2), probe.stride // 2 + 1)
-        begin = found.row[mine, None] + moved  # (candidates, moves)
-        inside = (begin >= 0) & (begin + probe.span < rows[mine, None])
-        at = np.where(inside, begin, found.row[mine, None]) + segment.firsts[found.track[mine], None]
-        each = np.where(inside, _scores_at(segment, probe, at), -1.0)
+        # windows have one middle; a track that the wider of both does not fit into is taken where it fits best
+        begin = found.row[mine] + (coarse[number].span - probe.span) // 2
+        last = rows[mine] - 1 - probe.span
+        begin = begin[:, None] + np.arange(-(step // 2), step // 2 + 1)  # (candidates, moves)
+        begin = np.clip(begin, 0, np.maximum(last, 0)[:, None])
+        each = _scores_at(segment, probe, begin + segment.firsts[found.track[mine], None])
+        each = np.where(last[:, None] >= 0, each, -1.0)
         best = each.argmax(axis=1)
         row[mine], score[mine] = begin[np.arange(len(mine)), best], each[np.arange(len(mine)), best]
-    return Candidates(score, found.track, row, found.probe).best(len(found))
+    return Candidates(score, found.track, row, found.probe)
 
 
 def _scores_at(segment: ArchiveSegment, probe: Probe, first: NDArray[np.int64]) -> NDArray[np.float32]:

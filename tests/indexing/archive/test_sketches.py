@@ -60,11 +60,11 @@ def reference(segment, probe):
     return found
 
 
-def probe(segment, layout, seconds=1.0, track=0, begin=4.0, tempo=1.0, moving=False):
+def probe(segment, layout, seconds=1.0, track=0, begin=4.0, tempo=1.0, moving=False, samples=4):
     rows = slice(round(begin * segment.rate), round((begin + seconds) * segment.rate) + 1)
     joints = segment.positions(track)[rows]
     source = ragged([Clip(joints, times=np.arange(len(joints)) / segment.rate)])
-    return probe_of(source, 0, layout, segment.rate, tempo, SearchOptions(), moving=moving)
+    return probe_of(source, 0, layout, segment.rate, tempo, SearchOptions(samples=samples), moving=moving)
 
 
 def test_correlation_is_that_of_the_planes():
@@ -156,17 +156,18 @@ def test_no_window_lies_in_two_tracks(segment):
 def test_candidates_settle_where_they_fit_best(segment):
     stored, layout = segment
     asked = probe(stored, layout, 2.5)
-    start = np.array([60, 58])
-    found = Candidates(np.zeros(2, np.float32), np.zeros(2, np.int64), start, np.zeros(2, np.int64))
-    moved = settled(stored, [asked], found)
-    half = asked.stride // 2
-    for row, score in zip(moved.row.tolist(), moved.score.tolist(), strict=True):
-        values = []
-        for at in range(start.min() - half, start.max() + half + 1):
-            window, example = planes(stored, asked, 0, at)
-            values.append(np.linalg.svd(np.linalg.qr(window.T)[0].T @ np.linalg.qr(example.T)[0], compute_uv=False)[0] ** 2)
-        assert score <= max(values) + 1e-3 and abs(row - 60) <= half + 2
-    assert moved.score.max() > 0.99  # the moment itself is within reach
+    exact = probe(stored, layout, 2.5, samples=16)
+    start = np.array([60, 58, 150])
+    found = Candidates(np.zeros(3, np.float32), np.zeros(3, np.int64), start, np.zeros(3, np.int64))
+    moved = settled(stored, [asked], [exact], found)
+    half, offset = asked.stride // 2, (asked.span - exact.span) // 2
+    for begin, row, score in zip(start.tolist(), moved.row.tolist(), moved.score.tolist(), strict=True):
+        values = {}
+        for at in range(begin + offset - half, begin + offset + half + 1):
+            window, example = planes(stored, exact, 0, at)
+            values[at] = np.linalg.svd(np.linalg.qr(window.T)[0].T @ np.linalg.qr(example.T)[0], compute_uv=False)[0] ** 2
+        assert score == pytest.approx(max(values.values()), abs=1e-3) and values[row] == pytest.approx(score, abs=1e-3)
+    assert moved.score[0] > 0.999 and exact.samples > 2 * asked.samples
 
 
 def test_only_movement_counts_where_it_is_asked_for(tmp_path):
