@@ -58,7 +58,7 @@ fuzz: install
 
 bench: install
 	@echo "All benchmarks: about half an hour on quiet cores, longer on busy ones; each says what it does and prints its table as it ends."
-	$(PIP) --constraint constraints.txt --editable '.[experiments]'
+	$(PIP) --constraint constraints.txt --editable '.[experiments,cluster]'
 	$(BIN)/python -m experiments.benchmarks.null_space
 	$(BIN)/python -m experiments.benchmarks.fits
 	$(BIN)/python -m experiments.benchmarks.robust_peers
@@ -68,6 +68,7 @@ bench: install
 	$(BIN)/python -m experiments.benchmarks.action_indexer
 	$(BIN)/python -m experiments.benchmarks.brightness_indexer
 	$(BIN)/python -m experiments.benchmarks.live
+	$(BIN)/python -m experiments.benchmarks.archive
 
 tables: install
 	@echo "All tables: hours.  Each is a command of its own, below, and prints its table as it ends."
@@ -114,6 +115,9 @@ tables: install
 	$(BIN)/python -m experiments.recognition.near_cameras
 	$(BIN)/python -m experiments.recognition.brightness_indexing
 	$(BIN)/python -m experiments.recognition.gestures
+	$(BIN)/python -m experiments.archive.moments
+	$(BIN)/python -m experiments.archive.performances
+	$(BIN)/python -m experiments.archive.growth
 
 docs: install
 	@echo "The documentation: one to three minutes, in which the examples of the gallery run; then open site/index.html."

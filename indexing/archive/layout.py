@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from indexing.action.bank import CHANNELS, JointMetric
+from indexing.action.symmetry import mirror_permutation
 from indexing.archive.options import SearchOptions, StorageOptions
 from indexing.archive.tracks import Track
 from indexing.clip import Clip, FloatArray
@@ -34,7 +35,7 @@ class Layout:
 
     joints: how many; skeleton: their names and bones, where known; covariance: ``(joints, joints)`` of centred poses, mean diagonal
     1; basis: ``(joints, dimensions)`` B; metric: ``(channels, joints, joints)`` covariances for the exact comparison; poses: from
-    how many all this was learned.
+    how many all this was learned; swap: ``(joints,)`` each joint's mirror image, where that can be told.
     """
 
     joints: int
@@ -43,6 +44,7 @@ class Layout:
     basis: NDArray[np.float32]
     metric: NDArray[np.float64]
     poses: int = 0
+    swap: NDArray[np.int64] | None = None
 
     @property
     def name(self) -> str:
@@ -64,8 +66,10 @@ class Layout:
         # the sign of a direction is nobody's choice: the largest entry is positive, on every machine
         vectors = vectors * np.sign(vectors[np.abs(vectors).argmax(axis=0), np.arange(vectors.shape[1])])
         basis = (vectors * (values + storage.floor) ** -storage.whitening).astype(np.float32)
-        metric = _metric(tracks, storage, search)
-        return cls(joints, skeleton, covariance, basis, metric, sum(map(len, tracks)))
+        windows, seen = _windows(tracks, storage, search)
+        mirrored = mirror_permutation(skeleton, windows, seen)
+        swap = None if mirrored is None else mirrored.numpy()
+        return cls(joints, skeleton, covariance, basis, _metric(windows, seen), sum(map(len, tracks)), swap)
 
     # ---- codes -------------------------------------------------------------------------------------------------------
     def project(self, poses: FloatArray) -> NDArray[np.float32]:
@@ -126,14 +130,22 @@ class Layout:
     def dump(self) -> bytes:
         """What was learned, as a file of numpy's."""
         stream = io.BytesIO()
-        np.savez(stream, covariance=self.covariance, basis=self.basis, metric=self.metric, poses=self.poses)
+        np.savez(
+            stream,
+            covariance=self.covariance,
+            basis=self.basis,
+            metric=self.metric,
+            poses=self.poses,
+            swap=[] if self.swap is None else self.swap,
+        )
         return stream.getvalue()
 
     @classmethod
     def load(cls, data: bytes, joints: int, skeleton: Skeleton | None) -> Layout:
         """From the same."""
         with np.load(io.BytesIO(data), allow_pickle=False) as found:
-            return cls(joints, skeleton, found["covariance"], found["basis"], found["metric"], int(found["poses"]))
+            swap = found["swap"].astype(np.int64) if len(found["swap"]) else None
+            return cls(joints, skeleton, found["covariance"], found["basis"], found["metric"], int(found["poses"]), swap)
 
 
 def layout_key(joints: int, skeleton: Skeleton | None) -> str:
@@ -167,8 +179,14 @@ def _grounded(gram: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(scaled)
 
 
-def _metric(tracks: Sequence[Track], storage: StorageOptions, search: SearchOptions) -> NDArray[np.float64]:
-    """``(channels, joints, joints)`` covariances over windows of a second, evenly spread."""
+def _metric(windows: Tensor, seen: Tensor) -> NDArray[np.float64]:
+    """``(channels, joints, joints)`` covariances over windows."""
+    covariance = JointMetric.learn(windows, seen, 1.0).covariance.numpy()
+    return np.stack([_grounded(one) for one in covariance]) if len(covariance) == len(CHANNELS) else covariance
+
+
+def _windows(tracks: Sequence[Track], storage: StorageOptions, search: SearchOptions) -> tuple[Tensor, Tensor]:
+    """``(N, length, joints, 2)`` windows of a second, evenly spread, and ``(N, joints)`` which joints were seen in each."""
     spans = [max(len(track) - round(storage.rate), 1) for track in tracks]
     step = max(1.0, sum(spans) / search.sampled)
     windows: list[Tensor] = []
@@ -185,9 +203,7 @@ def _metric(tracks: Sequence[Track], storage: StorageOptions, search: SearchOpti
         one = Ragged(source, times, np.array([0, len(track)]), known)
         windows.append(sample(one, np.zeros(len(first), dtype=np.intp), begin, begin + 1.0, search.length))
         seen.append(np.repeat(known, len(first), axis=0))
-    values, shown = torch.cat(windows), torch.from_numpy(np.concatenate(seen))
-    covariance = JointMetric.learn(values, shown, 1.0).covariance.numpy()
-    return np.stack([_grounded(one) for one in covariance]) if len(covariance) == len(CHANNELS) else covariance
+    return torch.cat(windows), torch.from_numpy(np.concatenate(seen))
 
 
 def filled(poses: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:

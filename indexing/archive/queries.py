@@ -9,7 +9,6 @@ import numpy as np
 import torch
 
 from indexing.action.bank import Windows
-from indexing.action.symmetry import mirror_permutation
 from indexing.archive.catalogue import Contents
 from indexing.archive.layout import Layout
 from indexing.archive.options import SearchOptions
@@ -87,11 +86,11 @@ def _example(clip: Clip, layout: Layout, rate: float, views: Sequence[float], op
     windows = _windows(clips, options.length)
     count = len(clips)
     if mirrored:
-        swap = mirror_permutation(layout.skeleton, windows.values, windows.seen)
+        swap = layout.swap
         if swap is None:
             raise ValueError(f"{clip.name!r}: which joints are left and right cannot be told; name the joints, or search as it is")
         # an image and its mirror image are of one shape: only the joints change places
-        clips += [one.replace(joints=one.joints[:, swap.numpy()]) for one in clips]
+        clips += [one.replace(joints=one.joints[:, swap]) for one in clips]
         windows = _windows(clips, options.length)
     source = ragged(clips)
     coarse, fine = (

@@ -167,15 +167,16 @@ def settled(segment: ArchiveSegment, coarse: Sequence[Probe], fine: Sequence[Pro
     for number in np.unique(found.probe).tolist():
         step, probe = coarse[number].stride, fine[number]
         mine = np.flatnonzero(found.probe == number)
-        # windows have one middle; a track that the wider of both does not fit into is taken where it fits best
-        begin = found.row[mine] + (coarse[number].span - probe.span) // 2
+        # both windows have one middle; one that hangs over the ends of its track stays as it is
+        middle = found.row[mine] + (coarse[number].span - probe.span) // 2
         last = rows[mine] - 1 - probe.span
-        begin = begin[:, None] + np.arange(-(step // 2), step // 2 + 1)  # (candidates, moves)
-        begin = np.clip(begin, 0, np.maximum(last, 0)[:, None])
-        each = _scores_at(segment, probe, begin + segment.firsts[found.track[mine], None])
-        each = np.where(last[:, None] >= 0, each, -1.0)
-        best = each.argmax(axis=1)
-        row[mine], score[mine] = begin[np.arange(len(mine)), best], each[np.arange(len(mine)), best]
+        fits = last >= 0
+        begin = np.clip(middle[:, None] + np.arange(-(step // 2), step // 2 + 1), 0, np.maximum(last, 0)[:, None])
+        at = (begin + segment.firsts[found.track[mine], None])[fits]
+        each = _scores_at(segment, probe, at)
+        best, index = each.argmax(axis=1), np.arange(len(each))
+        row[mine], score[mine[fits]] = middle, each[index, best]
+        row[mine[fits]] = begin[fits][index, best]
     return Candidates(score, found.track, row, found.probe)
 
 
