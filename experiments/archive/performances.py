@@ -49,8 +49,9 @@ ARCHIVE, EXHAUSTIVE, WARPED, CLIPS = "archive", "exhaustive", "DTW, windows", "D
 CHANGED: dict[str, dict[str, Any]] = {
     "archive, the query's tempo only": {"tempos": (1.0,)},
     "archive, five tempi": {"tempos": (0.64, 0.8, 1.0, 1.25, 1.56)},
-    "archive, windows in 16 steps": {"samples": 16},
-    "archive, candidates nearer to one another": {"apart": 0.15},
+    "archive, scanned in 16 steps": {"samples": 16},
+    "archive, settled in 4 steps": {"fine": 4},
+    "archive, candidates farther apart": {"apart": 0.35},
     "archive, nothing refined": {"shifts": (0.0,), "stretches": (1.0,)},
     "archive, 30 candidates": {"candidates": 30},
     "archive, 100 candidates": {"candidates": 100},

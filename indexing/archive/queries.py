@@ -142,5 +142,5 @@ def probe_of(
     if codes is None:
         return None
     moved = float(((each - mean) ** 2).sum() / max(float((each**2).sum()), 1e-30))
-    apart = max(1, round(options.apart * seconds * rate / stride))
+    apart = round(options.apart * seconds * rate / stride)
     return Probe(image, mirrored, seconds, stride, codes, apart, moved)
