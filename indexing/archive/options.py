@@ -77,16 +77,18 @@ class SearchOptions:
     """Moments that are compared exactly."""
     tempos: tuple[float, ...] = (0.8, 1.0, 1.25)
     """Durations that are searched, in those of the query: people differ."""
+    scanned: tuple[float, ...] = (1.0,)
+    """Durations that everything is scanned with; what is as long as one of the others has its first and last windows compared."""
     samples: int = 4
     """Steps that a window is divided into by the scan, at least where its duration allows: it is compared by the poses at their
     ends."""
-    settled: int = 4000
-    """Windows of the scan that are compared by more samples, and moved to the pose where they fit best."""
+    settled: int = 2000
+    """Windows of the scan that are compared at all tempos by more samples, and moved to the pose where they fit best."""
     fine: int = 16
     """Steps that they are divided into, at least where their duration allows."""
     apart: float = 0.05
-    """Durations between two candidates: nearer ones are one.  Of right ones among ten in exercises, .2 finds .49, .05 .54, as looking
-    at everything exactly does."""
+    """Durations between two candidates: nearer ones are one.  Of right ones among ten in exercises, .2 finds .49, .05 .54, as
+    looking at everything exactly does."""
     shifts: tuple[float, ...] = (-0.1, -0.05, 0.0, 0.05, 0.1)
     """Durations, in its own, by which one of the best candidates is moved where it is compared exactly."""
     stretches: tuple[float, ...] = (1.0,)

@@ -23,8 +23,7 @@ from indexing.windows import Ragged, mended, ragged, sample, unusable, whole
 class Query:
     """An example as it faces the recordings of one layout.
 
-    windows: its images; probes: made of them, at every tempo, for the scan; fine: the same with more samples, for
-    what it finds.
+    windows: its images; probes: made of them for the scan; fine: the same with more samples and at all tempos, for what it finds.
     """
 
     windows: Windows
@@ -97,12 +96,11 @@ def _example(clip: Clip, layout: Layout, rate: float, views: Sequence[float], op
         [
             probe_of(source, i, layout, rate, tempo, replace(options, samples=samples), mirrored=i >= count)
             for i in range(len(clips))
-            for tempo in options.tempos
+            for tempo in dict.fromkeys((*options.scanned, *options.tempos))
         ]
         for samples in (options.samples, options.fine)
     )
-    both = [(one, other) for one, other in zip(coarse, fine, strict=True) if one is not None and other is not None]
-    return Query(windows, tuple(one for one, _ in both), tuple(other for _, other in both))
+    return Query(windows, tuple(one for one in coarse if one is not None), tuple(one for one in fine if one is not None))
 
 
 def _windows(clips: Sequence[Clip], length: int) -> Windows:
@@ -143,4 +141,4 @@ def probe_of(
         return None
     moved = float(((each - mean) ** 2).sum() / max(float((each**2).sum()), 1e-30))
     apart = round(options.apart * seconds * rate / stride)
-    return Probe(image, mirrored, seconds, stride, codes, apart, moved)
+    return Probe(image, mirrored, seconds, stride, codes, apart, moved, tempo in options.scanned)

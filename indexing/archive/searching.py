@@ -214,7 +214,7 @@ def _scores(library: Snapshot, examples: Mapping[int, Query], pool: Shortlist, o
     for number in np.unique(layouts).tolist():
         mine = np.flatnonzero(layouts == number)
         example = examples[number]
-        image = np.array([example.probes[p].image for p in pool.probe[mine].tolist()], dtype=np.intp)
+        image = np.array([example.fine[p].image for p in pool.probe[mine].tolist()], dtype=np.intp)
         metric = library.contents.layouts[number].joint_metric(options)
         out[mine] = -residuals(example.windows, image, pool.places[mine], library.segments, metric, options.length)
     return out

@@ -33,7 +33,8 @@ class Probe:
 
     image: which image of the example; mirrored: whether it is the mirror image; seconds: duration of the windows; stride: poses
     from one sample to the next; codes: ``(2, samples, k)`` orthonormal, of x and y; apart: windows around a candidate that are
-    none; moved: share of movement in the energy of its poses.
+    none; moved: share of movement in the energy of its poses; everywhere: whether all windows are compared with it, or only the
+    first and the last of each track.
     """
 
     image: int
@@ -43,6 +44,7 @@ class Probe:
     codes: NDArray[np.float32]
     apart: int
     moved: float = 0.0
+    everywhere: bool = True
 
     @property
     def samples(self) -> int:
@@ -132,8 +134,8 @@ def scan(
     end = len(segment.codes) if end is None else min(end, len(segment.codes))
     found = _Kept(keep)
     gone = np.isin(segment.tracks[:, 0], list(dead)) if dead else np.zeros(len(segment), dtype=bool)
-    for stride in sorted({probe.stride for probe in probes}):
-        numbers = [i for i, probe in enumerate(probes) if probe.stride == stride]
+    for stride in sorted({probe.stride for probe in probes if probe.everywhere}):
+        numbers = [i for i, probe in enumerate(probes) if probe.stride == stride and probe.everywhere]
         halo = max(probes[i].apart for i in numbers)
         reach = max(probes[i].samples for i in numbers) - 1
         total = -(-len(segment.codes) // stride)
@@ -151,33 +153,38 @@ def scan(
                 for i, score in zip(mine, scores, strict=True):
                     _take(found, score, low, (first, last), probes[i].apart, i, stride)
     for i, probe in enumerate(probes):
-        if probe.stride > 1:
+        if probe.stride > 1 or not probe.everywhere:
             _take_ends(found, segment, gone, probe, i, (begin, end))
     return found.candidates(segment)
 
 
 def settled(segment: ArchiveSegment, coarse: Sequence[Probe], fine: Sequence[Probe], found: Candidates) -> Candidates:
-    """Candidates of a scan, in their order, moved by less than a step of it to where they resemble the example best.
+    """Candidates of a scan, at every tempo moved by less than a step of it to where they resemble the example best.
 
     Args:
-        coarse: the probes of the scan; fine: the same with more samples, by which rows and scores are meant from now on.
+        coarse: the probes of the scan; fine: the same images with more samples and at all tempos, by which rows, scores and probes
+            are meant from now on.
     """
-    row, score = found.row.copy(), found.score.copy()
-    rows = segment.tracks[found.track, 3]
+    parts: list[Candidates] = []
     for number in np.unique(found.probe).tolist():
-        step, probe = coarse[number].stride, fine[number]
         mine = np.flatnonzero(found.probe == number)
-        # both windows have one middle; one that hangs over the ends of its track stays as it is
-        middle = found.row[mine] + (coarse[number].span - probe.span) // 2
-        last = rows[mine] - 1 - probe.span
-        fits = last >= 0
-        begin = np.clip(middle[:, None] + np.arange(-(step // 2), step // 2 + 1), 0, np.maximum(last, 0)[:, None])
-        at = (begin + segment.firsts[found.track[mine], None])[fits]
-        each = _scores_at(segment, probe, at)
-        best, index = each.argmax(axis=1), np.arange(len(each))
-        row[mine], score[mine[fits]] = middle, each[index, best]
-        row[mine[fits]] = begin[fits][index, best]
-    return Candidates(score, found.track, row, found.probe)
+        track, image = found.track[mine], coarse[number].image
+        first, rows = segment.firsts[track], segment.tracks[track, 3]
+        for index, probe in enumerate(fine):
+            if probe.image != image:
+                continue
+            # both windows have one middle; one that hangs over the ends of its track stays as it is
+            row, score = found.row[mine] + (coarse[number].span - probe.span) // 2, found.score[mine].copy()
+            last = rows - 1 - probe.span
+            fits = last >= 0
+            moves = np.arange(-(coarse[number].stride // 2), coarse[number].stride // 2 + 1)
+            begin = np.clip(row[:, None] + moves, 0, np.maximum(last, 0)[:, None])[fits]
+            each = _scores_at(segment, probe, begin + first[fits, None])
+            best, count = each.argmax(axis=1), np.arange(len(each))
+            row[fits], score[fits] = begin[count, best], each[count, best]
+            parts.append(Candidates(score, track, row, np.full(len(row), index)))
+    names = ("score", "track", "row", "probe")
+    return Candidates(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
 def _scores_at(segment: ArchiveSegment, probe: Probe, first: NDArray[np.int64]) -> NDArray[np.float32]:

@@ -170,6 +170,17 @@ def test_candidates_settle_where_they_fit_best(segment):
     assert moved.score[0] > 0.999 and exact.samples > 2 * asked.samples
 
 
+def test_candidates_settle_at_every_tempo(segment):
+    stored, layout = segment
+    asked = probe(stored, layout, 2.0)
+    tempos = [probe(stored, layout, 2.0, tempo=tempo, samples=16) for tempo in (0.8, 1.0, 1.25)]
+    found = Candidates(np.zeros(1, np.float32), np.zeros(1, np.int64), np.array([60]), np.zeros(1, np.int64))
+    moved = settled(stored, [asked], tempos, found)
+    assert moved.probe.tolist() == [0, 1, 2] and moved.score.argmax() == 1
+    middles = moved.row + np.array([one.span / 2 for one in tempos])
+    assert np.abs(middles - (60 + asked.span / 2)).max() <= asked.stride / 2 + 1
+
+
 def test_only_movement_counts_where_it_is_asked_for(tmp_path):
     rng = np.random.default_rng(3)
     points = movement(rng, 12.0)
