@@ -69,6 +69,10 @@ def shown(value: Any) -> str:
         >>> shown("12"), shown(10**99)
         ("'12'", '1000000000000000000000000000...00000000000000000000000000000')
     """
+    if type(value) is int and value.bit_length() < VALUE:
+        return repr(value)  # asked for each of a hundred thousand detections
+    if type(value) is str and len(value) < VALUE // 2 and value.isascii() and value.isprintable() and " " not in value:
+        return repr(value)
     if isinstance(value, int) and value.bit_length() > 1000:  # Python refuses to print some thousand digits
         return f"a whole number of about {int(value.bit_length() * 0.30103)} digits"
     return clipped(SHORT.repr(value), VALUE)

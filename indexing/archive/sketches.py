@@ -310,6 +310,10 @@ class _Kept:
         self._count = 0
 
     def add(self, scores: NDArray[np.float32], rows: NDArray[np.int64], probe: int) -> None:
+        if len(scores) > self.keep:  # the first block, of which all is new: sorting it would take as long as comparing it
+            self.threshold = max(self.threshold, float(np.partition(scores, -self.keep)[-self.keep]))
+            mine = scores >= self.threshold
+            scores, rows = scores[mine], rows[mine]
         self._parts.append((scores, rows, probe))
         self._count += len(scores)
         if self._count > 8 * self.keep:
@@ -336,7 +340,7 @@ def _take(found: _Kept, score: Tensor, low: int, inner: tuple[int, int], apart: 
     first, last = inner[0] - low, min(inner[1] - low, len(score))
     if last <= first:
         return
-    highest = score.clone()
+    highest = score.clone() if apart else score
     for step in range(1, min(apart, len(score) - 1) + 1):
         torch.maximum(highest[step:], score[:-step], out=highest[step:])
         torch.maximum(highest[:-step], score[step:], out=highest[:-step])
