@@ -115,8 +115,8 @@ tables: install
 	$(BIN)/python -m experiments.recognition.near_cameras
 	$(BIN)/python -m experiments.recognition.brightness_indexing
 	$(BIN)/python -m experiments.recognition.gestures
-	$(BIN)/python -m experiments.archive.moments
-	$(BIN)/python -m experiments.archive.performances
+	$(BIN)/python -m experiments.archive.moments --windows 300000 --queries 100 --durations 1 2
+	$(BIN)/python -m experiments.archive.performances --changes --most 60
 	$(BIN)/python -m experiments.archive.growth
 
 docs: install
