@@ -40,7 +40,7 @@ from indexing import Archive, ArchiveOptions, Clip, ClipSet
 from indexing.archive.catalogue import Catalogue
 from indexing.archive.options import GrowthOptions
 from indexing.archive.results import Hit
-from indexing.archive.workers import process_pool
+from indexing.archive.workers import QuietProcesses
 
 OPTIONS = ArchiveOptions(growth=GrowthOptions(seconds=0.0, small=3))  # commits after every source, and puts four segments together
 PATIENCE = 120.0  # seconds for a process that is not killed
@@ -316,7 +316,7 @@ def workers_killed(stage: Stage, times: int, rng: np.random.Generator) -> list[T
     lasts, trials = span(stage), []
     for _ in range(times):
         folder = stage.copy()
-        with process_pool(2) as pool:
+        with QuietProcesses(2) as pool:
             for ready in [pool.submit(time.sleep, 0.2) for _ in range(2)]:
                 ready.result()
             victim = int(rng.choice(sorted(pool._processes)))
@@ -339,7 +339,7 @@ def deadly_sources(stage: Stage, times: int, rng: np.random.Generator) -> list[T
         deadly = Deadly(movement(9, 2.0).joints, name="deadly")
         given: list[Any] = [*files]
         given.insert(int(rng.integers(len(files) + 1)), deadly)
-        with process_pool(2) as pool:
+        with QuietProcesses(2) as pool:
             done = Archive(folder, OPTIONS).add(given, executor=pool)
         failed = [one.source for one in done.failed]
         problems = [] if failed == ["deadly"] else [f"failed: {failed}"]

@@ -31,7 +31,7 @@ from experiments.benchmarks.interleaved import interleaved
 from experiments.common.tables import Row, command, measured_on_one_thread, note
 from indexing import Archive, Clip, ClipSet
 from indexing.actors import ACTIONS, Person, dataset, detect, stream
-from indexing.archive.workers import process_pool
+from indexing.archive.workers import QuietProcesses
 from indexing.cameras import y_up
 
 HOUR = 3600.0
@@ -195,7 +195,7 @@ def two_workers(config: Config) -> list[Row]:
         note(f"... writing {config.files} files")
         for i in range(config.files):
             ClipSet([recording(60 * config.minutes, config.seed + 1 + i)]).save(folder / "in" / f"{i:03d}.npz")
-        executors: dict[str, Executor] = {"process pool": stack.enter_context(process_pool(WORKERS))}
+        executors: dict[str, Executor] = {"process pool": stack.enter_context(QuietProcesses(WORKERS))}
         if config.dask:
             executors["Dask"] = stack.enter_context(cluster())
         for kind in executors:

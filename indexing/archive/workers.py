@@ -9,9 +9,11 @@ import itertools
 import multiprocessing
 import os
 import signal
+import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
@@ -25,23 +27,47 @@ class WorkerLost(Exception):
     """A task's workers died every time, or the task did not reach one."""
 
 
-def process_pool(workers: int | None = None) -> ProcessPoolExecutor:
-    """Processes of one thread each, started afresh: threads of this one are none of their business.
+class QuietProcesses(ProcessPoolExecutor):
+    """Processes of one thread each, started afresh, that leave an interruption to the process that asked, which ends them.
 
     Args:
         workers: how many; by default as many as there are cores.
     """
-    context = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(workers or os.cpu_count() or 1, mp_context=context, initializer=_alone)
+
+    def __init__(self, workers: int | None = None) -> None:
+        super().__init__(workers or os.cpu_count() or 1, multiprocessing.get_context("spawn"), initializer=_alone)
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """As of any pool; a process starts here, where none is idle, and takes after this one."""
+        with _interruptions_later():
+            return super().submit(fn, *args, **kwargs)
 
 
 def _alone() -> None:
-    """One thread: the others are the other workers'.  Whoever interrupts means the process that asked, which ends these."""
+    """One thread: the others are the other workers'.  Whoever interrupts means the process that asked."""
     import torch
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-
     torch.set_num_threads(1)
+
+
+@contextmanager
+def _interruptions_later() -> Iterator[None]:
+    """Ctrl-C waits until the block has ended; processes that start in it do not listen to it."""
+    if threading.current_thread() is not threading.main_thread():  # no other may say so
+        yield
+        return
+    waiting: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, frame: waiting.append(number))
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}) if hasattr(signal, "pthread_sigmask") else None
+    try:
+        yield
+    finally:
+        if blocked is not None:
+            signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+        signal.signal(signal.SIGINT, before)
+    if waiting:
+        signal.raise_signal(signal.SIGINT)
 
 
 @dataclass
@@ -125,7 +151,7 @@ class InOrder(Generic[Task, Result]):
         if self._own is not None:
             self._own.shutdown(wait=False, cancel_futures=True)
         workers = int(getattr(pool, "_max_workers", 1))
-        self._executor = self._own = process_pool(workers)
+        self._executor = self._own = QuietProcesses(workers)
         for other in others:
             future = other.future
             if future is not None and not (future.done() and not future.cancelled() and future.exception() is None):

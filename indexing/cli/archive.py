@@ -6,12 +6,10 @@ import contextlib
 import dataclasses
 import multiprocessing
 import os
-import signal
 import sys
-import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -353,20 +351,13 @@ def _threads(workers: int) -> Executor:
     return ThreadPoolExecutor(workers, initializer=torch.set_num_threads, initargs=(1,))
 
 
-class QuietProcesses(ProcessPoolExecutor):
-    """Processes that leave an interruption to this one: they start while it ignores them, and take after it."""
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """As of any pool; a process starts here, where none is idle."""
-        with _interruptions_ignored():
-            return super().submit(fn, *args, **kwargs)
-
-
 @contextmanager
 def _processes(workers: int) -> Iterator[Executor]:
     """A pool that ends with the work, or soon after an interruption."""
+    from indexing.archive.workers import QuietProcesses
+
     others = set(multiprocessing.active_children())
-    pool = QuietProcesses(workers, multiprocessing.get_context("spawn"), initializer=_one_thread)
+    pool = QuietProcesses(workers)
     try:
         yield pool
     except BaseException:
@@ -376,23 +367,6 @@ def _processes(workers: int) -> Iterator[Executor]:
             child.terminate()
         raise
     pool.shutdown()
-
-
-def _one_thread() -> None:
-    import torch
-
-    torch.set_num_threads(1)
-
-
-@contextmanager
-def _interruptions_ignored() -> Iterator[None]:
-    ours = threading.current_thread() is threading.main_thread()  # no other may say so
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN) if ours else None
-    try:
-        yield
-    finally:
-        if ours:
-            signal.signal(signal.SIGINT, before)
 
 
 @contextmanager

@@ -39,7 +39,7 @@ def quick_pool(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], Executor]:
     def make(workers: int | None = None) -> Executor:
         return ProcessPoolExecutor(workers, mp_context=killed.forkserver())
 
-    monkeypatch.setattr(workers, "process_pool", make)
+    monkeypatch.setattr(workers, "QuietProcesses", make)
     return make
 
 
@@ -260,7 +260,7 @@ def _same(
 
 
 def test_processes_answer_the_same(tmp_path: Path, laboratory, in_process) -> None:
-    with workers.process_pool(1) as pool:
+    with workers.QuietProcesses(1) as pool:
         _same(tmp_path / "a", pool, laboratory, in_process)
 
 
@@ -287,3 +287,11 @@ def test_a_broken_pool_is_replaced(tmp_path: Path, quick_pool: Callable[[int], E
         archive = Archive(tmp_path / "a")
         assert len(archive.add(laboratory[0] / "week", executor=broken).of("added")) == 3
         assert archive.search(laboratory[2], k=8, executor=broken) == in_process[1][0]
+
+
+def test_an_interruption_while_a_process_starts_is_not_lost() -> None:
+    after: list[str] = []
+    with pytest.raises(KeyboardInterrupt), workers._interruptions_later():
+        signal.raise_signal(signal.SIGINT)
+        after.append("the block went on")
+    assert after and signal.getsignal(signal.SIGINT) is signal.default_int_handler

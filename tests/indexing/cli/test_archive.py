@@ -6,7 +6,9 @@ import contextlib
 import csv
 import io
 import json
+import os
 import re
+import signal
 import subprocess
 import sys
 import time
@@ -124,6 +126,26 @@ def test_an_interruption_keeps_what_was_read(run, tmp_path: Path, monkeypatch: p
     assert Archive(tmp_path / "a").verify().ok
     monkeypatch.undo()
     assert main(["archive", "add", str(tmp_path / "a"), str(Path(verbs.__file__).parent / "nothing.json")]) == 2
+
+
+@pytest.mark.skipif(not hasattr(os, "killpg"), reason="needs groups of processes")
+def test_ctrl_c_ends_the_workers_and_leaves_an_archive(data: Path, tmp_path: Path) -> None:
+    many = tmp_path / "many"
+    many.mkdir()
+    for i in range(60):
+        (many / f"{i}.npz").write_bytes((data / "week" / "monday.npz").read_bytes())
+    words = [sys.executable, "-m", "indexing.cli", "archive", "add", str(tmp_path / "a"), str(many), "--workers", "2"]
+    child = subprocess.Popen(words, start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    started = time.monotonic()
+    while not (tmp_path / "a" / "catalogue.sqlite").exists() and time.monotonic() - started < 120:
+        time.sleep(0.05)
+    os.killpg(child.pid, signal.SIGINT)
+    out, err = child.communicate(timeout=120)
+    assert child.returncode == 130 and out == "", err
+    assert err.startswith("dyntorch: interrupted; ") and err.count("\n") == 1  # the workers say nothing
+    with contextlib.redirect_stdout(io.StringIO()):
+        assert main(["archive", "add", str(tmp_path / "a"), str(many)]) == 0
+    assert Archive(tmp_path / "a").verify().ok and len(Archive(tmp_path / "a").recordings()) == 60
 
 
 def test_few_sources_need_no_processes(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
