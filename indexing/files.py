@@ -233,12 +233,13 @@ def _hashes(path: Path) -> str | dict[str, str]:
     try:
         if path.is_dir():
             files = sorted(child for child in path.rglob("*") if is_regular(child))
-            return {child.relative_to(path).as_posix(): _sha256(child) for child in files}
-        return _sha256(path)
+            return {child.relative_to(path).as_posix(): sha256_of(child) for child in files}
+        return sha256_of(path)
     except OSError as error:
         raise ValueError(f"input {str(path)!r}: cannot be read ({error.strerror or error}); check the path") from error
 
 
-def _sha256(path: Path) -> str:
+def sha256_of(path: Path) -> str:
+    """The hash of a file, read piece by piece."""
     with open(path, "rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -6,7 +6,6 @@ leave is explained by the indexer itself.  Workers need the file of a segment an
 
 from __future__ import annotations
 
-import hashlib
 import os
 import tempfile
 import warnings
@@ -39,6 +38,7 @@ if TYPE_CHECKING:
     from indexing.action.indexer import ActionIndexer
 
 Progress = Callable[[float], None] | None
+MODEL = "model.safetensors"
 
 
 @dataclass(frozen=True)
@@ -189,33 +189,17 @@ def marked_rows(track: ArchiveSegment, probes: Sequence[Probe], options: FindOpt
 
 def _dumped(indexer: ActionIndexer) -> bytes:
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "model.safetensors"
+        path = Path(folder) / MODEL
         indexer.save(path)
         return path.read_bytes()
 
 
-def _loaded(data: bytes) -> ActionIndexer:
-    return _kept(hashlib.sha256(data).hexdigest(), _Bytes(data))
-
-
-class _Bytes:
-    """Bytes that are all alike to a cache, which knows them by their hash."""
-
-    def __init__(self, data: bytes) -> None:
-        self.data = data
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Bytes)
-
-    def __hash__(self) -> int:
-        return 0
-
-
 @lru_cache(maxsize=4)
-def _kept(name: str, data: _Bytes) -> ActionIndexer:
+def _loaded(data: bytes) -> ActionIndexer:
+    """A worker loads a model once, however many tasks bring it along."""
     from indexing.action.indexer import ActionIndexer
 
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"{name[:8]}.safetensors"
-        path.write_bytes(data.data)
+        path = Path(folder) / MODEL
+        path.write_bytes(data)
         return ActionIndexer.load(path)

@@ -17,14 +17,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from indexing.action.bank import CHANNELS, JointMetric
+from indexing.action.bank import JointMetric
 from indexing.action.symmetry import mirror_permutation
 from indexing.archive.options import SearchOptions, StorageOptions
 from indexing.archive.tracks import Track
 from indexing.clip import Clip, FloatArray
 from indexing.joints import FEWEST, named, places
 from indexing.skeleton import Skeleton
-from indexing.windows import Ragged, sample
+from indexing.windows import bridged, sample
 
 EIGHT = 127  # largest whole number of 8 bits
 
@@ -181,8 +181,7 @@ def _grounded(gram: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _metric(windows: Tensor, seen: Tensor) -> NDArray[np.float64]:
     """``(channels, joints, joints)`` covariances over windows."""
-    covariance = JointMetric.learn(windows, seen, 1.0).covariance.numpy()
-    return np.stack([_grounded(one) for one in covariance]) if len(covariance) == len(CHANNELS) else covariance
+    return np.stack([_grounded(one) for one in JointMetric.learn(windows, seen, 1.0).covariance.numpy()])
 
 
 def _windows(tracks: Sequence[Track], storage: StorageOptions, search: SearchOptions) -> tuple[Tensor, Tensor]:
@@ -197,25 +196,9 @@ def _windows(tracks: Sequence[Track], storage: StorageOptions, search: SearchOpt
         offset += step * len(first) - span
         if not len(first):
             continue
-        source, known = filled(track.positions())
         times = np.arange(len(track)) / storage.rate
         begin = times[first.astype(np.intp)]
-        one = Ragged(source, times, np.array([0, len(track)]), known)
-        windows.append(sample(one, np.zeros(len(first), dtype=np.intp), begin, begin + 1.0, search.length))
-        seen.append(np.repeat(known, len(first), axis=0))
+        source = bridged(track.positions(), times, np.array([0, len(track)]))
+        windows.append(sample(source, np.zeros(len(first), dtype=np.intp), begin, begin + 1.0, search.length))
+        seen.append(np.repeat(source.seen, len(first), axis=0))
     return torch.cat(windows), torch.from_numpy(np.concatenate(seen))
-
-
-def filled(poses: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """``(rows, joints, 2)`` with gaps bridged in time, and ``(1, joints)`` which joints were seen at all."""
-    there: NDArray[np.bool_] = np.asarray(~np.isnan(poses).any(axis=2))
-    seen: NDArray[np.bool_] = np.asarray(there.any(axis=0))
-    if there.all():
-        return poses, seen[None]
-    out = np.where(there[..., None], poses, 0.0).astype(np.float32)
-    rows = np.arange(len(poses))
-    for joint in np.flatnonzero(seen & ~there.all(axis=0)):
-        known = rows[there[:, joint]]
-        for axis in range(2):
-            out[:, joint, axis] = np.interp(rows, known, poses[known, joint, axis])
-    return out, seen[None]

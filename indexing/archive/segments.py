@@ -25,7 +25,7 @@ from safetensors.numpy import save
 from indexing.archive.layout import Layout
 from indexing.archive.options import StorageOptions
 from indexing.archive.tracks import Track, positions
-from indexing.files import replacing
+from indexing.files import replacing, sha256_of
 
 FORMAT, VERSION = "dyntorch.archive-segment", 1
 HEADER = 2**26  # bytes of a header at most
@@ -82,8 +82,7 @@ def write_segment(folder: Path, tracks: Sequence[Track], layout: Layout, options
 def intact(path: Path, sha256: str) -> bool:
     """Whether a file is there and still what was written."""
     try:
-        with open(path, "rb") as stream:
-            return hashlib.file_digest(stream, "sha256").hexdigest() == sha256
+        return sha256_of(path) == sha256
     except OSError:
         return False
 

@@ -22,12 +22,12 @@ from indexing.archive.catalogue import CATALOGUE, storable
 from indexing.archive.options import GrowthOptions, StorageOptions
 from indexing.archive.tracks import Track, total_windows, tracks_of
 from indexing.clip import Clip, LabelledSet
+from indexing.files import sha256_of
 from indexing.opening import parse_json, read_text, size_of
 from indexing.readers.files import VIDEOS, frame_number
 from indexing.skeleton import Skeleton
 
 KEYPOINT_FILES = (".json", ".npz", ".csv")  # suffixes that are looked into where a folder is given
-CHUNK = 2**20  # bytes hashed at once
 READING = {"person": "everyone"}  # how files are read where nothing else is said
 
 Taken = Clip | LabelledSet[Clip] | str | os.PathLike[str]
@@ -232,14 +232,10 @@ def content(source: ArchiveSource) -> str:
     if source.clip is not None:
         return _hash_of(source.clip)
     assert source.path is not None
-    digest = hashlib.sha256()
-    for one in _files(source.path):
-        if source.path.is_dir():
-            digest.update(one.name.encode("utf-8", "surrogateescape") + b"\0")
-        with open(one, "rb") as stream:
-            while part := stream.read(CHUNK):
-                digest.update(part)
-    return digest.hexdigest()
+    if not source.path.is_dir():
+        return sha256_of(source.path)
+    each = (f"{one.name}\0{sha256_of(one)}\0" for one in _files(source.path))
+    return hashlib.sha256("".join(each).encode("utf-8", "surrogateescape")).hexdigest()
 
 
 def reading_key(reading: Mapping[str, Any]) -> str:

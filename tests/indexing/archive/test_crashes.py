@@ -291,7 +291,12 @@ def test_a_broken_pool_is_replaced(tmp_path: Path, quick_pool: Callable[[int], E
 
 def test_an_interruption_while_a_process_starts_is_not_lost() -> None:
     after: list[str] = []
-    with pytest.raises(KeyboardInterrupt), workers._interruptions_later():
-        signal.raise_signal(signal.SIGINT)
-        after.append("the block went on")
+
+    def start() -> None:
+        with workers._interruptions_later():
+            signal.raise_signal(signal.SIGINT)
+            after.append("the block went on")
+
+    with pytest.raises(KeyboardInterrupt):
+        start()
     assert after and signal.getsignal(signal.SIGINT) is signal.default_int_handler

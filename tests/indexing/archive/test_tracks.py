@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 
 from indexing import Archive
-from indexing.archive.layout import Layout, filled, layout_key
+from indexing.archive.layout import Layout, layout_key
 from indexing.archive.options import StorageOptions
 from indexing.archive.tracks import MISSING, images, positions, seen_around, tracks_of, windows_of
 from indexing.cameras import rotation
 from indexing.clip import Clip
 from indexing.skeleton import Skeleton
+from indexing.windows import bridged
 
 STORAGE = StorageOptions()
 
@@ -205,7 +206,8 @@ def test_gaps_are_bridged_in_time():
     poses[:, 0] = np.arange(5)[:, None]
     poses[1:4, 0] = np.nan
     poses[:, 1] = np.nan
-    out, seen = filled(poses)
+    found = bridged(poses, np.arange(5.0), np.array([0, 5]))
+    out, seen = found.joints, found.seen
     assert out[:, 0, 0].tolist() == [0, 1, 2, 3, 4] and seen.tolist() == [[True, False]] and not out[:, 1].any()
 
 
