@@ -178,10 +178,8 @@ def cluster() -> Iterator[Executor]:
     except ImportError:
         raise ValueError("dask is not installed; pip install 'dyntorch[cluster]', or give --no-dask") from None
     with (
-        LocalCluster(  # type: ignore[no-untyped-call]
-            n_workers=WORKERS, threads_per_worker=1, processes=True, dashboard_address=None
-        ) as local,
-        Client(local) as client,  # type: ignore[no-untyped-call]
+        LocalCluster(n_workers=WORKERS, threads_per_worker=1, processes=True, dashboard_address=None) as local,
+        Client(local) as client,
         client.get_executor() as executor,
     ):
         yield executor

@@ -19,7 +19,7 @@ from dyntorch.numerics import one_thread
 from indexing.archive.catalogue import Catalogue, SegmentRow, SourceRow, add_layout, drop_recordings
 from indexing.archive.layout import Layout, layout_key
 from indexing.archive.options import ArchiveOptions, StorageOptions
-from indexing.archive.results import Addition, SourceOutcome
+from indexing.archive.results import Addition, Outcome, SourceOutcome
 from indexing.archive.segments import ArchiveSegment, WrittenSegment, damaged, intact, write_segment
 from indexing.archive.sources import ArchiveSource, ReadRecording, ReadSource, Stamp, read_source, reading_key, stamp
 from indexing.archive.tracks import Track, total_windows
@@ -145,8 +145,8 @@ class Adder:
         grown = self.options.growth
         if self.staged.windows >= grown.windows or time.monotonic() - self.staged.since >= grown.seconds:
             self.commit()
-        outcome = "left out" if not read.windows else "added" if row is None else "replaced"
-        return SourceOutcome(source.name, outcome, read.note, read.windows, read.seconds)  # type: ignore[arg-type]
+        outcome: Outcome = "left out" if not read.windows else "added" if row is None else "replaced"
+        return SourceOutcome(source.name, outcome, read.note, read.windows, read.seconds)
 
     def _touch(self, row: SourceRow, now: Stamp) -> None:
         """The same content at another time."""

@@ -381,7 +381,7 @@ def _cluster(address: str) -> Iterator[Executor]:
     except ImportError:
         raise ValueError(f'--dask {address}: needs Dask, which is not installed: pip install "dyntorch[cluster]"') from None
     try:
-        client: Any = Client(address, timeout=WORK.patience)  # type: ignore[no-untyped-call]  # of a package without types
+        client: Any = Client(address, timeout=WORK.patience)
     except Exception as problem:  # whatever answers at an address where no scheduler runs: a web server's answer is taken for sizes
         said = one_line(problem) or type(problem).__name__
         raise ValueError(f"--dask {address}: {said}; give the address of a scheduler that runs, such as tcp://head:8786") from None
