@@ -46,7 +46,7 @@ from experiments.common.tables import Row, command, note
 from experiments.recognition.corruptions import missing_bursts
 from experiments.recognition.protocol import data_folder
 from indexing import Archive, Clip, ClipSet
-from indexing.archive.queries import checked, examples_of
+from indexing.archive.queries import checked, queries_of
 from indexing.archive.results import Hit
 from indexing.archive.searching import candidates, distinct, merged
 
@@ -104,13 +104,13 @@ def searched(archive: Archive, asked: Sequence[Question], mirror: bool = False) 
 
 def sketched(archive: Archive, asked: Sequence[Question]) -> list[float]:
     """Places by the archive's sketches: the stages of a search before the exact comparison, neighbours merged."""
-    library, options = archive._opened(), archive.options.search
+    snapshot, options = archive._opened(), archive.options.search
     places = []
     for one in asked:
-        examples = examples_of(checked(one.clip, library.contents.options.shortest, options), library.contents, options)
-        found = candidates(library.tasks(examples, options.candidates), None, None)
-        pool = distinct(library, merged(library, examples, found, options), options)
-        places.append(place(archive._hits(library, pool), one))
+        queries = queries_of(checked(one.clip, snapshot.contents.options.shortest, options), snapshot.contents, options)
+        found = candidates(snapshot.tasks(queries, options.settled), None, None)
+        pool = distinct(snapshot, merged(snapshot, queries, found, options), options)
+        places.append(place(archive._hits(snapshot, pool), one))
     return places
 
 

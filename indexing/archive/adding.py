@@ -21,7 +21,7 @@ from indexing.archive.layout import Layout, layout_key
 from indexing.archive.options import ArchiveOptions, StorageOptions
 from indexing.archive.results import Addition, Outcome, SourceOutcome
 from indexing.archive.segments import ArchiveSegment, WrittenSegment, damaged, intact, write_segment
-from indexing.archive.sources import ArchiveSource, ReadRecording, ReadSource, Stamp, read_source, reading_key, stamp
+from indexing.archive.sources import ArchiveSource, ReadRecording, ReadSource, Stamp, read_source, reading_key, stamp, told
 from indexing.archive.tracks import Track, total_windows
 from indexing.archive.workers import InOrder, WorkerLost
 from indexing.skeleton import Skeleton
@@ -58,7 +58,7 @@ def add(
         outcomes: dict[str, SourceOutcome] = {}
         news = list(_news(adder.known, sources, adder.reading, outcomes))
         work = InOrder(
-            partial(_read, reading=dict(reading), options=adder.storage), executor, options.growth.ahead, options.growth.tries
+            partial(read_source, reading=dict(reading), options=adder.storage), executor, options.growth.ahead, options.growth.tries
         )
         try:
             for done, (source, read) in enumerate(work(news), 1):
@@ -66,14 +66,10 @@ def add(
                 if progress is not None:
                     progress(done / len(news))
         finally:
-            # whoever interrupts keeps what was read; a second failure must not hide the first
+            # whoever interrupts keeps what was read
             adder.commit()
         tidy(catalogue, options)
     return Addition(tuple(outcomes[source.key] for source in sources))
-
-
-def _read(source: ArchiveSource, reading: Mapping[str, Any], options: Any) -> ReadSource:
-    return read_source(source, reading, options)
 
 
 def _news(
@@ -88,11 +84,9 @@ def _news(
         try:
             now = stamp(source)
         except (OSError, ValueError) as problem:
-            said = (
-                f"{source.name}: {problem.strerror or problem}" if isinstance(problem, OSError) else " ".join(str(problem).split())
+            outcomes[source.key] = SourceOutcome(
+                source.name, "failed", f"{told(source, problem)}; what is in the archive of it stays"
             )
-            reason = f"{said}; what is in the archive of it stays"
-            outcomes[source.key] = SourceOutcome(source.name, "failed", reason)
             continue
         same = now.sha256 == row.sha256 if source.clip is not None else (now.size, now.modified) == (row.size, row.modified)
         if same:

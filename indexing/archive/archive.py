@@ -15,7 +15,7 @@ import numpy as np
 from indexing.archive import adding
 from indexing.archive.catalogue import Catalogue, drop_recordings, storable
 from indexing.archive.options import ArchiveOptions
-from indexing.archive.queries import checked, examples_of
+from indexing.archive.queries import checked, queries_of
 from indexing.archive.results import Addition, ArchivedEvent, ArchivedRecording, ArchiveInfo, Hit, Verification
 from indexing.archive.searching import Shortlist, Snapshot, search
 from indexing.archive.segments import ArchiveSegment
@@ -59,7 +59,7 @@ class Archive:
 
     def __init__(self, path: str | os.PathLike[str], options: ArchiveOptions = ArchiveOptions()) -> None:
         self.path, self.options = Path(path).expanduser(), options
-        self._library: Snapshot | None = None
+        self._snapshot: Snapshot | None = None
         if self.path.exists() and not self.path.is_dir():
             raise ValueError(f"{self.path}: is a file; an archive is a folder")
         if self.path.is_dir() and any(self.path.iterdir()):
@@ -169,22 +169,22 @@ class Archive:
 
     def _stored(self, source: str, person: str) -> Clip:
         """All of a recording's first image."""
-        library = self._opened()
+        snapshot = self._opened()
         rows = [row for row in self._catalogue().by_name(storable(source)) if person in ("", row.person)]
         if not rows:
             who = f" with a person {person!r}" if person else ""
             raise ValueError(f"{self.path}: has no recording {source!r}{who}; dyntorch archive info --sources lists them")
-        row, numbers = rows[0], {one.id: i for i, one in enumerate(library.contents.segments)}
+        row, numbers = rows[0], {one.id: i for i, one in enumerate(snapshot.contents.segments)}
         if row.segment not in numbers:
             raise FileNotFoundError(errno.ENOENT, "segment of another moment", str(self.path))
         number = numbers[row.segment]
-        segment = library.segments[number]
+        segment = snapshot.segments[number]
         mine = np.flatnonzero((segment.tracks[:, 0] == row.id) & (segment.tracks[:, 1] == 0))
         mine = mine[np.argsort(segment.starts[mine])]
         rate = segment.rate
         joints = np.concatenate([segment.positions(i) for i in mine.tolist()])
         times = np.concatenate([segment.starts[i] + np.arange(int(segment.tracks[i, 3])) / rate for i in mine.tolist()])
-        layout = library.contents.layouts[library.contents.segments[number].layout]
+        layout = snapshot.contents.layouts[snapshot.contents.segments[number].layout]
         return Clip(joints, times=times, fps=rate, name=row.name, skeleton=layout.skeleton, up="y", meta={"person": row.person})
 
     # ---- asking it ---------------------------------------------------------------------------------------------------
@@ -206,16 +206,16 @@ class Archive:
         return self._again(lambda: self._searched(clip, int(k), executor, progress, mirror))
 
     def _searched(self, clip: Clip, k: int, executor: Executor | None, progress: Progress, mirror: bool) -> list[Hit]:
-        library = self._opened()
-        if not library.contents.windows:
+        snapshot = self._opened()
+        if not snapshot.contents.windows:
             raise ValueError(f"{self.path}: holds no movement yet; add recordings first")
-        asked = checked(clip, library.contents.options.shortest, self.options.search)
-        examples = examples_of(asked, library.contents, self.options.search, mirror)
-        return self._hits(library, search(library, examples, k, self.options.search, executor, progress))
+        asked = checked(clip, snapshot.contents.options.shortest, self.options.search)
+        queries = queries_of(asked, snapshot.contents, self.options.search, mirror)
+        return self._hits(snapshot, search(snapshot, queries, k, self.options.search, executor, progress))
 
-    def _hits(self, library: Snapshot, pool: Shortlist) -> list[Hit]:
+    def _hits(self, snapshot: Snapshot, found: Shortlist) -> list[Hit]:
         where = [
-            (library.segments[i], int(t)) for i, t in zip(pool.places.segment.tolist(), pool.places.track.tolist(), strict=True)
+            (snapshot.segments[i], int(t)) for i, t in zip(found.places.segment.tolist(), found.places.track.tolist(), strict=True)
         ]
         names = self._catalogue().named([int(segment.tracks[track, 0]) for segment, track in where])
         hits: list[Hit] = []
@@ -224,8 +224,8 @@ class Archive:
             if row is None:
                 continue  # removed meanwhile
             start, last = float(segment.starts[track]), (int(segment.tracks[track, 3]) - 1) / segment.rate
-            begin, end = max(0.0, float(pool.places.begin[i])), min(last, float(pool.places.end[i]))
-            hits.append(Hit(row.name, row.person, start + begin, start + end, float(pool.score[i]), bool(pool.mirrored[i])))
+            begin, end = max(0.0, float(found.places.begin[i])), min(last, float(found.places.end[i]))
+            hits.append(Hit(row.name, row.person, start + begin, start + end, float(found.score[i]), bool(found.mirrored[i])))
         return hits
 
     def find(
@@ -261,7 +261,7 @@ class Archive:
         for _ in range(self.options.search.attempts - 1):
             with contextlib.suppress(FileNotFoundError):
                 return question()
-            self._library = None
+            self._snapshot = None
         try:
             return question()
         except FileNotFoundError as problem:
@@ -274,10 +274,10 @@ class Archive:
             FileNotFoundError: a segment is no longer there.
         """
         catalogue = self._catalogue()
-        if self._library is not None and self._library.contents.generation == catalogue.generation():
-            return self._library
+        if self._snapshot is not None and self._snapshot.contents.generation == catalogue.generation():
+            return self._snapshot
         contents, rows, _ = catalogue.moment()
-        known = {} if self._library is None else {one.path.name: one for one in self._library.segments}
+        known = {} if self._snapshot is None else {one.path.name: one for one in self._snapshot.segments}
         folder = catalogue.segments_folder
         segments = tuple(known.get(row.file) or ArchiveSegment.open(folder / row.file) for row in contents.segments)
         live: dict[int, set[int]] = {row.id: set() for row in contents.segments}
@@ -287,5 +287,5 @@ class Archive:
             frozenset(segment.tracks[:, 0].tolist()) - live[row.id] if row.dead else frozenset()
             for row, segment in zip(contents.segments, segments, strict=True)
         )
-        self._library = Snapshot(folder, contents, segments, dead)
-        return self._library
+        self._snapshot = Snapshot(folder, contents, segments, dead)
+        return self._snapshot

@@ -58,7 +58,7 @@ class FindTask:
 
 @one_thread
 def find(
-    library: Snapshot,
+    snapshot: Snapshot,
     catalogue: Catalogue,
     model: ActionIndexer | str | os.PathLike[str],
     options: FindOptions,
@@ -70,14 +70,14 @@ def find(
 
     indexer = ActionIndexer.load(Path(model).expanduser()) if isinstance(model, (str, os.PathLike)) else model
     data = _dumped(indexer)
-    probes = probes_of(library, indexer, options)
+    probes = probes_of(snapshot, indexer, options)
     if not probes:
-        known = ", ".join(one.name for one in library.contents.layouts.values()) or "nothing"
+        known = ", ".join(one.name for one in snapshot.contents.layouts.values()) or "nothing"
         raise ValueError(
             f"{catalogue.folder}: joints: the model has too few in common with what is in the archive ({known}); use the same pose "
             "estimator for both"
         )
-    tasks = _tasks(library, probes, data, options)
+    tasks = _tasks(snapshot, probes, data, options)
     names = catalogue.named([number for task in tasks for number, _ in task.recordings])
     found: list[ArchivedEvent] = []
     for done, (task, events) in enumerate(InOrder(find_in, executor, tries=2)(tasks), 1):
@@ -94,16 +94,16 @@ def find(
     return sorted(found, key=lambda event: (event.source, event.person, event.start, event.end))
 
 
-def probes_of(library: Snapshot, indexer: ActionIndexer, options: FindOptions) -> dict[int, tuple[Probe, ...]]:
+def probes_of(snapshot: Snapshot, indexer: ActionIndexer, options: FindOptions) -> dict[int, tuple[Probe, ...]]:
     """How the exemplars move, for each layout that the model can be asked about."""
-    rate, asked = library.contents.options.rate, SearchOptions()
+    rate, asked = snapshot.contents.options.rate, SearchOptions()
     model = indexer.model_
     exemplars = [indexer.exemplar(i) for i in range(len(model.labels))]
     if model.symmetry is not None:  # those that count mirrored: an image and its mirror image are of one shape, but for the joints
         swap, mirrored = model.symmetry.numpy(), model.mirrored.tolist()
         exemplars += [one.replace(joints=one.joints[:, swap]) for one, too in zip(exemplars, mirrored, strict=True) if too]
     found: dict[int, tuple[Probe, ...]] = {}
-    for number, layout in library.contents.layouts.items():
+    for number, layout in snapshot.contents.layouts.items():
         facing = [layout.facing(clip) for clip in exemplars]
         if any(clip is None for clip in facing):
             continue
@@ -116,16 +116,16 @@ def probes_of(library: Snapshot, indexer: ActionIndexer, options: FindOptions) -
     return found
 
 
-def _tasks(library: Snapshot, probes: dict[int, tuple[Probe, ...]], model: bytes, options: FindOptions) -> list[FindTask]:
-    contents, tasks = library.contents, []
+def _tasks(snapshot: Snapshot, probes: dict[int, tuple[Probe, ...]], model: bytes, options: FindOptions) -> list[FindTask]:
+    contents, tasks = snapshot.contents, []
     for i, row in enumerate(contents.segments):
         if row.layout not in probes:
             continue
-        segment = library.segments[i]
+        segment = snapshot.segments[i]
         by_recording: dict[int, list[int]] = {}
         for track in np.flatnonzero(segment.tracks[:, 1] == 0).tolist():
             number = int(segment.tracks[track, 0])
-            if number not in library.dead[i]:
+            if number not in snapshot.dead[i]:
                 by_recording.setdefault(number, []).append(track)
         layout = contents.layouts[row.layout]
         tasks += [

@@ -57,7 +57,7 @@ def checked(clip: Clip, shortest: float, options: SearchOptions) -> Clip:
     return clip
 
 
-def examples_of(clip: Clip, contents: Contents, options: SearchOptions, mirrored: bool = False) -> dict[int, Query]:
+def queries_of(clip: Clip, contents: Contents, options: SearchOptions, mirrored: bool = False) -> dict[int, Query]:
     """The example, for each layout that it has enough joints of.
 
     Raises:
@@ -140,5 +140,4 @@ def probe_of(
     if codes is None:
         return None
     moved = float(((each - mean) ** 2).sum() / max(float((each**2).sum()), 1e-30))
-    apart = round(options.apart * seconds * rate / stride)
-    return Probe(image, mirrored, seconds, stride, codes, apart, moved, tempo in options.scanned)
+    return Probe(image, mirrored, seconds, stride, codes, moved, tempo in options.scanned)

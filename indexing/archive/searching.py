@@ -53,13 +53,13 @@ class Snapshot:
     segments: tuple[ArchiveSegment, ...]
     dead: tuple[frozenset[int], ...]
 
-    def tasks(self, examples: Mapping[int, Query], keep: int) -> list[ScanTask]:
+    def tasks(self, queries: Mapping[int, Query], keep: int) -> list[ScanTask]:
         """What there is to scan, in its order."""
         rows = self.contents.segments
         return [
-            ScanTask(self.folder / row.file, i, examples[row.layout].probes, keep, self.dead[i], begin, begin + TASK_BLOCK)
+            ScanTask(self.folder / row.file, i, queries[row.layout].probes, keep, self.dead[i], begin, begin + TASK_BLOCK)
             for i, row in enumerate(rows)
-            if row.layout in examples
+            if row.layout in queries
             for begin in range(0, len(self.segments[i].codes), TASK_BLOCK)
         ]
 
@@ -90,13 +90,13 @@ class Shortlist:
 
 @one_thread
 def search(
-    library: Snapshot, examples: Mapping[int, Query], k: int, options: SearchOptions, executor: Executor | None, progress: Progress
+    snapshot: Snapshot, queries: Mapping[int, Query], k: int, options: SearchOptions, executor: Executor | None, progress: Progress
 ) -> Shortlist:
     """The best ``k`` stretches, best first."""
-    found = candidates(library.tasks(examples, options.settled), executor, progress)
-    pool = merged(library, examples, found, options)
-    pool = ranked(library, examples, pool, k, options)
-    return distinct(library, pool, options)[:k]
+    found = candidates(snapshot.tasks(queries, options.settled), executor, progress)
+    shortlist = merged(snapshot, queries, found, options)
+    shortlist = ranked(snapshot, queries, shortlist, k, options)
+    return distinct(snapshot, shortlist, options)[:k]
 
 
 # ---- candidates ----------------------------------------------------------------------------------------------------------
@@ -134,18 +134,16 @@ def candidates(tasks: Sequence[ScanTask], executor: Executor | None, progress: P
 
 
 def merged(
-    library: Snapshot, examples: Mapping[int, Query], found: Sequence[tuple[int, Candidates]], options: SearchOptions
+    snapshot: Snapshot, queries: Mapping[int, Query], found: Sequence[tuple[int, Candidates]], options: SearchOptions
 ) -> Shortlist:
     """The best candidates of all, settled; of those of one track that nearly coincide, whatever their tempo, the best."""
-    rows = library.contents.segments
-    rate = library.contents.options.rate
-    best = _settled(library, examples, found, options)
-    segment = np.concatenate([np.zeros(0, np.intp), *(np.full(len(one), i, np.intp) for i, one in best)])
-    track, row, probe = (
-        np.concatenate([np.zeros(0, np.int64), *(getattr(one, name) for _, one in best)]) for name in ("track", "row", "probe")
-    )
-    score = np.concatenate([np.zeros(0), *(one.score for _, one in best)])
-    asked = [examples[rows[i].layout].fine[p] for i, p in zip(segment.tolist(), probe.tolist(), strict=True)]
+    rows = snapshot.contents.segments
+    rate = snapshot.contents.options.rate
+    best = _settled(snapshot, queries, found, options)
+    segment = np.repeat([i for i, _ in best], [len(one) for _, one in best]).astype(np.intp)
+    every = Candidates.joined([one for _, one in best])
+    track, row, probe, score = every.track, every.row, every.probe, every.score.astype(float)
+    asked = [queries[rows[i].layout].fine[p] for i, p in zip(segment.tolist(), probe.tolist(), strict=True)]
     middle = (row + np.array([one.span / 2 for one in asked])) / rate
     half = np.array([one.seconds / 2 for one in asked])
     kept: list[int] = []
@@ -163,31 +161,29 @@ def merged(
 
 
 def _settled(
-    library: Snapshot, examples: Mapping[int, Query], found: Sequence[tuple[int, Candidates]], options: SearchOptions
+    snapshot: Snapshot, queries: Mapping[int, Query], found: Sequence[tuple[int, Candidates]], options: SearchOptions
 ) -> list[tuple[int, Candidates]]:
     """The best of all scans, by more samples and to the pose: ``(segment, candidates)``."""
-    rows = library.contents.segments
-    number = np.concatenate([np.zeros(0, np.intp), *(np.full(len(one), n, np.intp) for n, (_, one) in enumerate(found))])
-    place = np.concatenate([np.zeros(0, np.intp), *(np.arange(len(one)) for _, one in found)])
-    score = np.concatenate([np.zeros(0), *(one.score for _, one in found)])
-    order = np.lexsort((place, number, -score))[: options.settled]
+    rows = snapshot.contents.segments
+    every = Candidates.joined([one for _, one in found])
+    scan_of = np.repeat(np.arange(len(found)), [len(one) for _, one in found])
+    best = np.argsort(-every.score, kind="stable")[: options.settled]
     out: list[tuple[int, Candidates]] = []
-    for n in np.unique(number[order]).tolist():
-        i, one = found[n]
-        mine = np.sort(place[order[number[order] == n]])
-        some = Candidates(one.score[mine], one.track[mine], one.row[mine], one.probe[mine])
-        query = examples[rows[i].layout]
-        out.append((i, settled(library.segments[i], query.probes, query.fine, some)))
+    for number in np.unique(scan_of[best]).tolist():
+        i = found[number][0]
+        query = queries[rows[i].layout]
+        mine = np.sort(best[scan_of[best] == number])
+        out.append((i, settled(snapshot.segments[i], query.probes, query.fine, every[mine])))
     return out
 
 
 # ---- the exact comparison ------------------------------------------------------------------------------------------------
 
 
-def ranked(library: Snapshot, examples: Mapping[int, Query], pool: Shortlist, k: int, options: SearchOptions) -> Shortlist:
+def ranked(snapshot: Snapshot, queries: Mapping[int, Query], shortlist: Shortlist, k: int, options: SearchOptions) -> Shortlist:
     """Candidates by their exact residual, best first; the best ones moved and stretched to where it is least."""
-    pool = _compared(library, examples, pool, options)
-    best = pool[: max(options.refined, 4 * k)]
+    shortlist = _sorted(shortlist.at(shortlist.places, _scores(snapshot, queries, shortlist, options)))
+    best = shortlist[: max(options.refined, 4 * k)]
     middle, half = (best.places.begin + best.places.end) / 2, (best.places.end - best.places.begin) / 2
     parts = [
         replace(best.places, begin=middle + (2 * shift - stretch) * half, end=middle + (2 * shift + stretch) * half)
@@ -196,48 +192,44 @@ def ranked(library: Snapshot, examples: Mapping[int, Query], pool: Shortlist, k:
     ]
     if not len(best):
         return best
-    tried = np.stack([_scores(library, examples, best.at(part, best.score), options) for part in parts])
+    tried = np.stack([_scores(snapshot, queries, best.at(part, best.score), options) for part in parts])
     which, index = np.argmax(tried, axis=0), np.arange(len(best))
     begin, end = (np.stack([getattr(part, name) for part in parts])[which, index] for name in ("begin", "end"))
     return _sorted(best.at(replace(best.places, begin=begin, end=end), tried[which, index]))
 
 
-def _compared(library: Snapshot, examples: Mapping[int, Query], pool: Shortlist, options: SearchOptions) -> Shortlist:
-    return _sorted(pool.at(pool.places, _scores(library, examples, pool, options)))
-
-
-def _scores(library: Snapshot, examples: Mapping[int, Query], pool: Shortlist, options: SearchOptions) -> FloatArray:
+def _scores(snapshot: Snapshot, queries: Mapping[int, Query], shortlist: Shortlist, options: SearchOptions) -> FloatArray:
     """``(windows,)`` minus the residual, layout by layout."""
-    rows = library.contents.segments
-    layouts = np.array([rows[i].layout for i in pool.places.segment.tolist()], dtype=np.intp)
-    out = np.full(len(pool), -np.inf)
+    rows = snapshot.contents.segments
+    layouts = np.array([rows[i].layout for i in shortlist.places.segment.tolist()], dtype=np.intp)
+    out = np.full(len(shortlist), -np.inf)
     for number in np.unique(layouts).tolist():
         mine = np.flatnonzero(layouts == number)
-        example = examples[number]
-        image = np.array([example.fine[p].image for p in pool.probe[mine].tolist()], dtype=np.intp)
-        metric = library.contents.layouts[number].joint_metric(options)
-        out[mine] = -residuals(example.windows, image, pool.places[mine], library.segments, metric, options.length)
+        query = queries[number]
+        image = np.array([query.fine[p].image for p in shortlist.probe[mine].tolist()], dtype=np.intp)
+        metric = snapshot.contents.layouts[number].joint_metric(options)
+        out[mine] = -residuals(query.windows, image, shortlist.places[mine], snapshot.segments, metric, options.length)
     return out
 
 
-def _sorted(pool: Shortlist) -> Shortlist:
-    places = pool.places
-    kept = np.flatnonzero(np.isfinite(pool.score))
-    order = np.lexsort((pool.probe, places.begin, places.track, places.segment, -pool.score))
-    return pool[order[np.isin(order, kept)]]
+def _sorted(shortlist: Shortlist) -> Shortlist:
+    """Best first, of equal ones in the order in which they lie; without those that could not be compared."""
+    places = shortlist.places
+    order = np.lexsort((shortlist.probe, places.begin, places.track, places.segment, -shortlist.score))
+    return shortlist[order[np.isfinite(shortlist.score[order])]]
 
 
-def distinct(library: Snapshot, pool: Shortlist, options: SearchOptions) -> Shortlist:
+def distinct(snapshot: Snapshot, shortlist: Shortlist, options: SearchOptions) -> Shortlist:
     """Windows, best first, without those that mostly cover what a better one of the same person covers, from whatever image."""
     kept: list[int] = []
     spans: dict[int, list[tuple[float, float]]] = {}
-    places = pool.places
-    for i in range(len(pool)):
-        segment, track = library.segments[int(places.segment[i])], int(places.track[i])
+    places = shortlist.places
+    for i in range(len(shortlist)):
+        segment, track = snapshot.segments[int(places.segment[i])], int(places.track[i])
         start = float(segment.starts[track])
         begin, end = start + float(places.begin[i]), start + float(places.end[i])
         others = spans.setdefault(int(segment.tracks[track, 0]), [])
         if all(min(end, b) - max(begin, a) < options.merged * min(end - begin, b - a) for a, b in others):
             others.append((begin, end))
             kept.append(i)
-    return pool[np.array(kept, dtype=np.intp)]
+    return shortlist[np.array(kept, dtype=np.intp)]

@@ -32,9 +32,8 @@ class Probe:
     """An example as it is slid along the codes.
 
     image: which image of the example; mirrored: whether it is the mirror image; seconds: duration of the windows; stride: poses
-    from one sample to the next; codes: ``(2, samples, k)`` orthonormal, of x and y; apart: windows around a candidate that are
-    none; moved: share of movement in the energy of its poses; everywhere: whether all windows are compared with it, or only the
-    first and the last of each track.
+    from one sample to the next; codes: ``(2, samples, k)`` orthonormal, of x and y; moved: share of movement in the energy of its
+    poses; everywhere: whether all windows are compared with it, or only the first and the last of each track.
     """
 
     image: int
@@ -42,7 +41,6 @@ class Probe:
     seconds: float
     stride: int
     codes: NDArray[np.float32]
-    apart: int
     moved: float = 0.0
     everywhere: bool = True
 
@@ -72,10 +70,19 @@ class Candidates:
     def __len__(self) -> int:
         return len(self.score)
 
+    @classmethod
+    def joined(cls, parts: Sequence[Candidates]) -> Candidates:
+        """Several, one after the other."""
+        types = {"score": np.float32, "track": np.int64, "row": np.int64, "probe": np.int64}
+        arrays = ([np.zeros(0, kind), *(getattr(part, name) for part in parts)] for name, kind in types.items())
+        return cls(*(np.concatenate(array) for array in arrays))
+
+    def __getitem__(self, index: NDArray[np.intp]) -> Candidates:
+        return Candidates(self.score[index], self.track[index], self.row[index], self.probe[index])
+
     def best(self, count: int) -> Candidates:
         """The best ones; equal ones in the order in which they lie."""
-        order = np.lexsort((self.probe, self.row, self.track, -self.score))[:count]
-        return Candidates(self.score[order], self.track[order], self.row[order], self.probe[order])
+        return self[np.lexsort((self.probe, self.row, self.track, -self.score))[:count]]
 
 
 def orthonormal(codes: NDArray[np.float32]) -> NDArray[np.float32] | None:
@@ -126,7 +133,7 @@ def scan(
     begin: int = 0,
     end: int | None = None,
 ) -> Candidates:
-    """The windows of a segment that resemble an example best; neighbours of better ones are left out.
+    """The windows of a segment that resemble an example best.
 
     Args:
         keep: windows at most; dead: recordings that were removed; begin, end: rows at which windows may begin.
@@ -134,24 +141,19 @@ def scan(
     end = len(segment.codes) if end is None else min(end, len(segment.codes))
     found = _Kept(keep)
     gone = np.isin(segment.tracks[:, 0], list(dead)) if dead else np.zeros(len(segment), dtype=bool)
-    for stride in sorted({probe.stride for probe in probes if probe.everywhere}):
-        numbers = [i for i, probe in enumerate(probes) if probe.stride == stride and probe.everywhere]
-        halo = max(probes[i].apart for i in numbers)
-        reach = max(probes[i].samples for i in numbers) - 1
-        total = -(-len(segment.codes) // stride)
-        for first in range(-(-begin // stride), -(-end // stride), BLOCK):
-            last = min(first + BLOCK, -(-end // stride))  # windows that may be candidates: first to last
-            low, high = max(0, first - halo), min(total, last + halo + reach)
-            x = _poses(segment, low, high, stride)
-            gram = _gram(x)
-            for samples in sorted({probes[i].samples for i in numbers}):
-                mine = [i for i in numbers if probes[i].samples == samples]
-                if high - low < samples:
-                    continue
-                scores = _scores(x, gram, [probes[i] for i in mine], samples)
-                scores[:, torch.from_numpy(_outside(segment, gone, low, scores.shape[1], samples, stride))] = -1.0
-                for i, score in zip(mine, scores, strict=True):
-                    _take(found, score, low, (first, last), probes[i].apart, i, stride)
+    groups = sorted({(probe.stride, probe.samples) for probe in probes if probe.everywhere})
+    for stride, samples in groups:
+        numbers = [i for i, one in enumerate(probes) if one.everywhere and (one.stride, one.samples) == (stride, samples)]
+        windows = -(-len(segment.codes) // stride) - samples + 1
+        for low in range(-(-begin // stride), min(windows, -(-end // stride)), BLOCK):
+            high = min(low + BLOCK, windows, -(-end // stride))  # windows that begin from low to high
+            x = _poses(segment, low, high + samples - 1, stride)
+            scores = _scores(x, _gram(x), [probes[i] for i in numbers])
+            scores[:, torch.from_numpy(_outside(segment, gone, low, high - low, samples, stride))] = -1.0
+            for i, score in zip(numbers, scores, strict=True):
+                better = (score > found.threshold).nonzero()[:, 0]
+                if len(better):
+                    found.add(score[better].numpy(), ((better + low) * stride).numpy(), i)
     for i, probe in enumerate(probes):
         if probe.stride > 1 or not probe.everywhere:
             _take_ends(found, segment, gone, probe, i, (begin, end))
@@ -183,8 +185,7 @@ def settled(segment: ArchiveSegment, coarse: Sequence[Probe], fine: Sequence[Pro
             best, count = each.argmax(axis=1), np.arange(len(each))
             row[fits], score[fits] = begin[count, best], each[count, best]
             parts.append(Candidates(score, track, row, np.full(len(row), index)))
-    names = ("score", "track", "row", "probe")
-    return Candidates(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+    return Candidates.joined(parts)
 
 
 def _scores_at(segment: ArchiveSegment, probe: Probe, first: NDArray[np.int64]) -> NDArray[np.float32]:
@@ -229,8 +230,11 @@ def resembling(segment: ArchiveSegment, probes: Sequence[Probe], least: float, q
         for low in range(0, total - samples + 1, BLOCK):
             x = _poses(segment, low, min(total, low + BLOCK + samples - 1), stride)
             gram = _gram(x)
-            scores = _scores(x, gram, mine, samples, moving=True)
-            scores[_moved(x, gram, samples) < quiet * torch.tensor([[probe.moved] for probe in mine])] = -1.0
+            resting = _gram(_summed(x, samples)) / samples
+            scores = _scores(x, gram, mine, resting)
+            energy = _summed(gram[0] + gram[2], samples)
+            moved = 1.0 - (resting[0] + resting[2]) / torch.where(energy > 0, energy, 1.0)
+            scores[moved < quiet * torch.tensor([[probe.moved] for probe in mine])] = -1.0
             best = scores.amax(dim=0)
             best[torch.from_numpy(_outside(segment, none, low, len(best), samples, stride))] = -1.0
             begin = (np.flatnonzero(best.numpy() >= least) + low) * stride
@@ -252,36 +256,31 @@ def _gram(x: Tensor) -> Tensor:
     return torch.stack([(x[0] * x[0]).sum(0), (x[0] * x[1]).sum(0), (x[1] * x[1]).sum(0)])
 
 
-def _scores(x: Tensor, gram: Tensor, probes: Sequence[Probe], samples: int, moving: bool = False) -> Tensor:
-    """``(probes, windows)`` of all windows whose poses are there.
+def _scores(x: Tensor, gram: Tensor, probes: Sequence[Probe], resting: Tensor | None = None) -> Tensor:
+    """``(probes, windows)`` of all windows whose poses are there, of probes with as many samples.
 
     Args:
-        moving: of how poses differ from their mean; the probes' codes have mean 0 then, so that C knows nothing of the mean.
+        resting: ``(3, windows)`` what G has of the mean pose, where it does not count; the probes' codes have mean 0 then, so
+            that C knows nothing of it.
     """
     codes = torch.from_numpy(np.stack([probe.codes for probe in probes]))  # (probes, 2, samples, k)
+    samples = codes.shape[2]
     count = x.shape[2] - samples + 1
     products = (codes.flatten(0, 2) @ x).view(2, len(probes), 2, samples, x.shape[2])
-    c, total = products[:, :, :, 0, :count].clone(), gram[:, :count].clone()
+    c = products[:, :, :, 0, :count].clone()
     for step in range(1, samples):
         c += products[:, :, :, step, step : step + count]
-        total += gram[:, step : step + count]
-    return correlation(c, total - _resting(x, samples) if moving else total)
+    total = _summed(gram, samples)
+    return correlation(c, total if resting is None else total - resting)
 
 
-def _resting(x: Tensor, samples: int) -> Tensor:
-    """``(3, windows)`` the part of G that a window has of its mean pose."""
-    count = x.shape[2] - samples + 1
-    means = x[:, :, :count].clone()
+def _summed(values: Tensor, samples: int) -> Tensor:
+    """``(..., windows)`` the sums over each window of ``(..., poses)``."""
+    count = values.shape[-1] - samples + 1
+    total = values[..., :count].clone()
     for step in range(1, samples):
-        means += x[:, :, step : step + count]
-    return _gram(means) / samples
-
-
-def _moved(x: Tensor, gram: Tensor, samples: int) -> Tensor:
-    """``(windows,)`` the share of movement in the energy of each window."""
-    energy = (gram[0] + gram[2]).unfold(0, samples, 1).sum(dim=1)
-    rest = _resting(x, samples)
-    return 1.0 - (rest[0] + rest[2]) / torch.where(energy > 0, energy, 1.0)
+        total += values[..., step : step + count]
+    return total
 
 
 def _outside(
@@ -333,18 +332,3 @@ class _Kept:
         scores, rows, probes = self._all()
         track = np.searchsorted(segment.firsts, rows, side="right") - 1
         return Candidates(scores, track, rows - segment.firsts[track], probes).best(self.keep)
-
-
-def _take(found: _Kept, score: Tensor, low: int, inner: tuple[int, int], apart: int, probe: int, stride: int) -> None:
-    """The local maxima among the inner windows."""
-    first, last = inner[0] - low, min(inner[1] - low, len(score))
-    if last <= first:
-        return
-    highest = score.clone() if apart else score
-    for step in range(1, min(apart, len(score) - 1) + 1):
-        torch.maximum(highest[step:], score[:-step], out=highest[step:])
-        torch.maximum(highest[:-step], score[step:], out=highest[:-step])
-    mine = score[first:last]
-    chosen = ((mine >= highest[first:last]) & (mine > found.threshold)).nonzero()[:, 0]
-    if len(chosen):
-        found.add(mine[chosen].numpy(), ((chosen + inner[0]) * stride).numpy(), probe)

@@ -293,14 +293,18 @@ def read_source(source: ArchiveSource, reading: Mapping[str, Any], options: Stor
         if not kept:
             note = note or f"nobody is in view for {options.shortest:g} s"
         return ReadSource(Stamp(before.size, before.modified, held), kept, note)
-    except (KeyboardInterrupt, SystemExit):
-        raise
-    except OSError as problem:
-        return ReadSource(Stamp(0, 0), failure=f"{source.name}: {problem.strerror or problem}; check the path and its permissions")
-    except ValueError as problem:
-        return ReadSource(Stamp(0, 0), failure=" ".join(str(problem).split()))
     except Exception as problem:  # one file among thousands must not end an addition, whatever a reader does with it
-        return ReadSource(Stamp(0, 0), failure=f"{source.name}: {type(problem).__name__}: {' '.join(str(problem).split())}")
+        remedy = "; check the path and its permissions" * isinstance(problem, OSError)
+        return ReadSource(Stamp(0, 0), failure=told(source, problem) + remedy)
+
+
+def told(source: ArchiveSource, problem: Exception) -> str:
+    """What is wrong with a source, as one line that names it; a reader's own words name it already."""
+    if isinstance(problem, ValueError):
+        return " ".join(str(problem).split())
+    if isinstance(problem, OSError):
+        return f"{source.name}: {problem.strerror or problem}"
+    return f"{source.name}: {type(problem).__name__}: {' '.join(str(problem).split())}"
 
 
 def _people(source: ArchiveSource, reading: Mapping[str, Any]) -> tuple[list[tuple[str, str, Clip]], str]:

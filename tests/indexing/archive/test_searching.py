@@ -9,7 +9,7 @@ from indexing import Archive, ArchiveOptions, Clip
 from indexing.actors import ACTIONS, Person, detect, perform, stream
 from indexing.archive.comparing import Places, residuals
 from indexing.archive.options import SearchOptions
-from indexing.archive.queries import checked, examples_of
+from indexing.archive.queries import checked, queries_of
 from indexing.skeleton import Skeleton
 
 SEARCH = SearchOptions()
@@ -82,7 +82,7 @@ def test_hits_are_those_of_looking_at_everything(archive, streams):
     clip = filmed(points, 130.0, 9).between(start, end)
     snapshot = archive._opened()
     asked = checked(clip, 0.5, SEARCH)
-    query = examples_of(asked, snapshot.contents, SEARCH)[1]
+    query = queries_of(asked, snapshot.contents, SEARCH)[1]
     metric = snapshot.contents.layouts[1].joint_metric(SEARCH)
     best, where = -np.inf, (0, 0.0)
     for number, segment in enumerate(snapshot.segments):

@@ -129,8 +129,7 @@ def test_parts_are_the_whole(segment):
     asked = [probe(stored, layout, 1.0)]
     whole = scan(stored, asked, 500)
     parts = [scan(stored, asked, 500, begin=at, end=at + 90) for at in range(0, len(stored.codes), 90)]
-    joined = Candidates(*(np.concatenate([getattr(one, name) for one in parts]) for name in ("score", "track", "row", "probe")))
-    assert same(whole, joined.best(500))
+    assert same(whole, Candidates.joined(parts).best(500))
 
 
 def test_the_best_are_kept(segment):
@@ -199,7 +198,7 @@ def same(one, other):
 
 
 def test_probe_lies_in_the_middle():
-    asked = Probe(0, False, 1.0, 3, np.zeros((2, 5, 8), np.float32), 1)
+    asked = Probe(0, False, 1.0, 3, np.zeros((2, 5, 8), np.float32))
     assert (asked.samples, asked.span) == (5, 12)
 
 
