@@ -239,7 +239,7 @@ def _hashes(path: Path) -> str | dict[str, str]:
         raise ValueError(f"input {str(path)!r}: cannot be read ({error.strerror or error}); check the path") from error
 
 
-def sha256_of(path: Path) -> str:
+def sha256_of(path: str | Path) -> str:
     """The hash of a file, read piece by piece."""
     with open(path, "rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()

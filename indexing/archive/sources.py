@@ -223,7 +223,7 @@ def stamp(source: ArchiveSource) -> Stamp:
     if source.clip is not None:
         return Stamp(source.clip.joints.nbytes, 0, _hash_of(source.clip))
     assert source.path is not None
-    facts = [one.stat() for one in _files(source.path)]
+    facts = [os.stat(one) for one in _files(source.path)]
     return Stamp(sum(one.st_size for one in facts), max((one.st_mtime_ns for one in facts), default=0))
 
 
@@ -234,7 +234,7 @@ def content(source: ArchiveSource) -> str:
     assert source.path is not None
     if not source.path.is_dir():
         return sha256_of(source.path)
-    each = (f"{one.name}\0{sha256_of(one)}\0" for one in _files(source.path))
+    each = (f"{os.path.basename(one)}\0{sha256_of(one)}\0" for one in _files(source.path))
     return hashlib.sha256("".join(each).encode("utf-8", "surrogateescape")).hexdigest()
 
 
@@ -258,11 +258,13 @@ def reading_key(reading: Mapping[str, Any]) -> str:
     return json.dumps(told, sort_keys=True, default=str)
 
 
-def _files(path: Path) -> list[Path]:
+def _files(path: Path) -> list[str]:
+    """A file, or those in a folder: names, as a detector that writes one for each frame makes a hundred thousand an hour."""
     if os.path.isdir(path):
-        return sorted(one for one in path.iterdir() if one.is_file())
+        with os.scandir(path) as inside:
+            return sorted(one.path for one in inside if one.is_file())
     size_of(path)  # says what is wrong with it, if anything
-    return [path]
+    return [str(path)]
 
 
 def _hash_of(clip: Clip) -> str:
