@@ -11,7 +11,7 @@ TORCH_VERSION := $(shell sed -n 's/^torch==//p' constraints.txt)
 PIP = $(BIN)/python -m pip install --quiet
 
 # what computes, apart from reading, drawing and the command line
-NUMERICAL := tests/dyntorch tests/battery tests/test_readme.py tests/indexing/action tests/indexing/brightness tests/indexing/phase tests/indexing/recordings tests/indexing/sync \
+NUMERICAL := tests/dyntorch tests/battery tests/test_readme.py tests/indexing/action tests/indexing/archive tests/indexing/brightness tests/indexing/phase tests/indexing/recordings tests/indexing/sync \
   tests/indexing/test_estimators.py dyntorch
 
 .PHONY: install demo test portable lint bench fuzz tables docs clean

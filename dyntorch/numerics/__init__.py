@@ -20,7 +20,6 @@ if TYPE_CHECKING:  # decorators keep the types of what they decorate only if the
 _HOME = {
     "one_thread": "dyntorch.numerics.blocks",
     "map_blocks": "dyntorch.numerics.blocks",
-    "workers": "dyntorch.numerics.blocks",
     "on_cpu": "dyntorch.numerics.arguments",
     "check_options": "dyntorch.numerics.arguments",
     "canonical_correlation": "dyntorch.numerics.subspaces",

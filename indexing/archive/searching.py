@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from dyntorch.numerics import one_thread, workers
+from dyntorch.numerics import one_thread
 from indexing.archive.catalogue import Contents
 from indexing.archive.comparing import Places, residuals
 from indexing.archive.options import SearchOptions
@@ -88,12 +88,18 @@ class Shortlist:
         return replace(self, places=places, score=score)
 
 
-@one_thread
 def search(
     snapshot: Snapshot, queries: Mapping[int, Query], k: int, options: SearchOptions, executor: Executor | None, progress: Progress
 ) -> Shortlist:
     """The best ``k`` stretches, best first."""
     found = candidates(snapshot.tasks(queries, options.settled), executor, progress)
+    return _chosen(snapshot, queries, found, k, options)
+
+
+@one_thread
+def _chosen(
+    snapshot: Snapshot, queries: Mapping[int, Query], found: Sequence[tuple[int, Candidates]], k: int, options: SearchOptions
+) -> Shortlist:
     shortlist = merged(snapshot, queries, found, options)
     shortlist = ranked(snapshot, queries, shortlist, k, options)
     return distinct(snapshot, shortlist, options)[:k]
@@ -102,6 +108,7 @@ def search(
 # ---- candidates ----------------------------------------------------------------------------------------------------------
 
 
+@one_thread
 def scan_task(task: ScanTask) -> Candidates:
     """What a worker does: it needs nothing but the file."""
     return scan(_opened(str(task.path)), task.probes, task.keep, task.dead, task.begin, task.end)
@@ -113,15 +120,16 @@ def _opened(path: str) -> ArchiveSegment:
 
 
 def candidates(tasks: Sequence[ScanTask], executor: Executor | None, progress: Progress) -> list[tuple[int, Candidates]]:
-    """``(segment, candidates)`` of every task; threads of this process do it where there is no executor.
+    """``(segment, candidates)`` of every task; as many threads of this process as torch has do it where there is no executor.
 
     Raises:
         FileNotFoundError: a segment is no longer there; ValueError: a task's workers died.
     """
     found: list[tuple[int, Candidates]] = []
     with contextlib.ExitStack() as stack:
-        if executor is None and workers() > 1 and len(tasks) > 1:
-            executor = stack.enter_context(ThreadPoolExecutor(workers(), initializer=torch.set_num_threads, initargs=(1,)))
+        threads = torch.get_num_threads()
+        if executor is None and threads > 1 and len(tasks) > 1:
+            executor = stack.enter_context(ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)))
         for task, result in InOrder(scan_task, executor, tries=2)(tasks):
             if isinstance(result, WorkerLost):
                 if not task.path.exists():
