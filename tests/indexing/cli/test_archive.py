@@ -113,11 +113,11 @@ def test_processes_add_the_same(run, tmp_path: Path) -> None:
 def test_an_interruption_keeps_what_was_read(run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     reads, read = [], adding.read_source
 
-    def stop(source, *more):
+    def stop(source, *more, **options):
         reads.append(source)
         if len(reads) == 3:
             raise KeyboardInterrupt
-        return read(source, *more)
+        return read(source, *more, **options)
 
     monkeypatch.setattr(adding, "read_source", stop)
     code, out, err = run("add", "@/a", "week")
