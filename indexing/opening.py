@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import errno
+import gc
 import io
 import json
 import os
@@ -215,6 +216,18 @@ def read_text(path: str | Path, remedy: str = TEXT_REMEDY, missing: str = "check
         return read_bytes(path, missing).decode("utf-8-sig")
     except UnicodeDecodeError:
         raise error(path, "is not a text file in UTF-8", remedy) from None
+
+
+@contextmanager
+def uncollected() -> Iterator[None]:
+    """Without Python's search for reference cycles: read objects make none, and among a million it takes a third of the time."""
+    before = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if before:
+            gc.enable()
 
 
 # ---- JSON and TOML -------------------------------------------------------------------------------------------------------

@@ -100,11 +100,9 @@ def wrong_joints(
         around, counts = _around(joint * len(starts) + clip, options.width)
         judged, places = asked[frame, joint] & (counts >= options.least), joints[frame, joint]
         if once == 0 and options.sampled > 1:
-            judged &= (np.arange(len(joint)) % options.sampled == 0) | _near_leaving(
-                places, times[frame], around, floor[clip], options
-            )
+            judged &= (np.arange(len(joint)) % options.sampled == 0) | _near_leaving(places, times[frame], floor[clip], options)
         rows = np.flatnonzero(judged)
-        far, spread = _deviations(places, times[frame], around, rows)
+        far, spread = _deviations(places, times[frame], rows, around[rows], options.width)
         if once == 0:
             told = rows % options.sampled == 0
             usual = options.usual * _share(far[told].max(axis=1), clip[rows[told]], len(starts) - 1, options.share)
@@ -113,8 +111,10 @@ def wrong_joints(
             break
         wrong[frame[rows[bad]], joint[rows[bad]]] = True
         # whoever had a wrong neighbour is asked once more
-        touched = (wrong[frame[around], joint[:, None]] & (around >= 0)).any(axis=1)
-        asked = np.zeros_like(there)
+        found = np.zeros(len(joint) + 1, dtype=np.intp)
+        found[rows[bad] + 1] = 1
+        first, last = found.cumsum()[around.T]
+        touched, asked = last > first, np.zeros_like(there)
         asked[frame[touched], joint[touched]] = True
     return wrong
 
@@ -133,16 +133,20 @@ def mended(clip: Clip, options: RepairOptions = RepairOptions()) -> Clip:
 
 
 def _around(path: NDArray[np.intp], width: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """``(sightings, width)`` the nearest sightings on the same path, -1 where a path has fewer; and how many it has."""
-    begin, end = np.searchsorted(path, path, side="left"), np.searchsorted(path, path, side="right")
+    """``(sightings, 2)`` the first and the end of the nearest sightings on the same path, ``width`` where it has so many; and how
+    many it has.
+
+    Args:
+        path: ``(sightings,)`` which path each lies on, in order.
+    """
+    cuts = np.concatenate([[0], np.flatnonzero(np.diff(path)) + 1, [len(path)]])
+    counts = np.diff(cuts).repeat(np.diff(cuts))
+    begin, end = (one.repeat(np.diff(cuts)) for one in (cuts[:-1], cuts[1:]))
     first = np.maximum(np.minimum(np.arange(len(path)) - width // 2, end - width), begin)
-    around = first[:, None] + np.arange(width)
-    return np.where(around < end[:, None], around, -1), end - begin
+    return np.stack([first, np.minimum(first + width, end)], axis=1), counts
 
 
-def _near_leaving(
-    places: FloatArray, times: FloatArray, around: NDArray[np.intp], floor: FloatArray, options: RepairOptions
-) -> NDArray[np.bool_]:
+def _near_leaving(places: FloatArray, times: FloatArray, floor: FloatArray, options: RepairOptions) -> NDArray[np.bool_]:
     """``(sightings,)`` whether one that leaves the middle of those before and after it is among the neighbours compared.
 
     A wrong sighting leaves it, and so do the first and the last of several; what no such one is near needs no closer look.
@@ -164,16 +168,21 @@ def _near_leaving(
 
 
 def _deviations(
-    places: FloatArray, times: FloatArray, around: NDArray[np.intp], rows: NDArray[np.intp]
+    places: FloatArray, times: FloatArray, rows: NDArray[np.intp], around: NDArray[np.intp], width: int
 ) -> tuple[FloatArray, FloatArray]:
-    """``(rows, dims)`` distance of sightings from the robust line through their neighbours, and the neighbours' spread."""
+    """``(rows, dims)`` distance of sightings from the robust line through their neighbours, and the neighbours' spread.
+
+    Args:
+        around: ``(rows, 2)`` the first and the end of each one's neighbours, ``width`` at most.
+    """
     far, spread = (np.empty((len(rows), places.shape[1]), places.dtype) for _ in range(2))
     x, clock = torch.from_numpy(places), torch.from_numpy(times)
-    lags = range(2, around.shape[1])  # neighbours further apart than one step
+    steps, lags = torch.arange(width), range(2, width)  # neighbours further apart than one step
     for at in range(0, len(rows), REPAIR_CHUNK):
         some = torch.from_numpy(rows[at : at + REPAIR_CHUNK])
-        index = torch.from_numpy(around)[some]
-        near = torch.where((index >= 0)[..., None], x[index], torch.nan).mT.contiguous()
+        first, end = torch.from_numpy(around[at : at + REPAIR_CHUNK]).T[..., None]
+        index = (first + steps).clamp_(max=len(x) - 1)
+        near = torch.where((first + steps < end)[..., None], x[index], torch.nan).mT.contiguous()
         since = (clock[index] - clock[some, None]).to(x)[:, None]
         rises, runs = (torch.cat([one[..., lag:] - one[..., :-lag] for lag in lags], dim=-1) for one in (near, since))
         slope = _median(rises / runs).nan_to_num()

@@ -174,10 +174,11 @@ def is_recording(folder: Path) -> bool:
     except OSError:
         return False
     for suffix in (".json", ".txt"):
-        frames = [one for one in files if one.suffix.lower() == suffix and one.name != "classes.txt"]
-        if not frames or any(
-            one.is_dir() or one.suffix.lower() in (*KEYPOINT_FILES, *VIDEOS) for one in files if one not in frames
-        ):
+        frames: list[Path] = []
+        others: list[Path] = []
+        for one in files:
+            (frames if one.suffix.lower() == suffix and one.name != "classes.txt" else others).append(one)
+        if not frames or any(one.is_dir() or one.suffix.lower() in (*KEYPOINT_FILES, *VIDEOS) for one in others):
             continue
         if any(frame_number(one.name) is None for one in frames):
             continue

@@ -10,7 +10,7 @@ from importlib import import_module
 from pathlib import Path
 
 from indexing.clip import Clip, ClipSet
-from indexing.opening import error, shown
+from indexing.opening import error, shown, uncollected
 from indexing.readers.detect import detect
 from indexing.readers.files import LinkOptions, Options, open_source
 
@@ -62,9 +62,10 @@ def read(
     options = Options(fps=fps, person=person, min_confidence=min_confidence, label=label, size=size, linking=linking)
     if format is not None and format not in FORMATS:
         raise ValueError(f"{path}: unknown format={shown(format)}; use one of {', '.join(FORMATS)}, or leave it out to detect it")
-    source = open_source(path)
-    module = import_module(f"{__name__}.{format or detect(source)}")
-    clips: ClipSet = module.read(source, options)
+    with uncollected():
+        source = open_source(path)
+        module = import_module(f"{__name__}.{format or detect(source)}")
+        clips: ClipSet = module.read(source, options)
     return clips
 
 

@@ -18,6 +18,7 @@ from indexing.readers.recording import Detection, flat, gather, to_clips, track_
 from indexing.skeleton import Skeleton, known
 
 REMEDY = "export COCO keypoint results: a list of {image_id, category_id, keypoints, score}"
+IDENTITIES = ("track_id", "tracking_id", "person_id", "idx")
 
 
 def read(source: Source, options: Options) -> ClipSet:
@@ -92,8 +93,5 @@ def _numbers(source: Source, images: dict[Hashable, Any]) -> dict[Hashable, int]
 
 def _track(person: dict[str, Any]) -> Hashable | None:
     attributes = person.get("attributes")
-    for key in ("track_id", "tracking_id", "person_id", "idx"):
-        value = person.get(key, attributes.get(key) if isinstance(attributes, dict) else None)
-        if value is not None:
-            return track_id(value)
-    return None
+    told = {**attributes, **person} if isinstance(attributes, dict) else person
+    return next((track_id(told[key]) for key in IDENTITIES if told.get(key) is not None), None)

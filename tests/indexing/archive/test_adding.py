@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from pathlib import Path
+from pathlib import Path, PurePath
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ import pytest
 from indexing import Archive, ArchiveOptions, Clip, ClipSet
 from indexing.archive import sources
 from indexing.archive.options import GrowthOptions, StorageOptions
-from indexing.archive.sources import gather, read_source, reading_key
+from indexing.archive.sources import gather, is_recording, read_source, reading_key
 from indexing.archive.tracks import tracks_of
 from indexing.opening import size_of
 from indexing.skeleton import Skeleton
@@ -156,6 +156,16 @@ def test_a_folder_of_frames_is_one_recording(archive: Archive, moves, tmp_path: 
     one.mkdir()
     (one / "a_000000_keypoints.json").write_bytes(next(folder.iterdir()).read_bytes())
     assert [source.path for source in gather(one)] == [one / "a_000000_keypoints.json"]  # one file is no sequence of frames
+
+
+def test_a_folder_of_many_frames_is_looked_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for i in range(400):  # an hour has a hundred thousand: nothing may be asked of every pair of them
+        (tmp_path / f"{i}.json").write_text('{"people": []}')
+    compared: list[Path] = []
+    equal = Path.__eq__
+    monkeypatch.setattr(PurePath, "__eq__", lambda one, other: compared.append(one) or equal(one, other))
+    assert is_recording(tmp_path)
+    assert len(compared) < 400
 
 
 def test_links_that_lead_back_are_not_followed(archive: Archive, saved, tmp_path: Path) -> None:

@@ -67,6 +67,7 @@ VARIANTS: dict[str, Callable[[np.ndarray], Any]] = {
     "coco reversed": lambda p: coco_results(p)[::-1],
     "coco rows": lambda p: [{"image_id": i, "keypoints": one.tolist()} for i, one in enumerate(p)],
     "alphapose idx": lambda p: coco_results(p, "{}.jpg".format, idx=[0.0], box=[1, 2, 3, 4]),
+    "coco attributes": lambda p: coco_results(p, idx=None, attributes={"track_id": 4, "idx": 2}),
     "coco dataset": coco_dataset,
     "mmpose frames": lambda p: [[mmpose_instance(one)] for one in p],
     "mmpose inferencer": lambda p: [{"frame_id": i, "instances": [mmpose_instance(one)]} for i, one in enumerate(p)],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from pathlib import Path
 
 import numpy as np
@@ -112,6 +113,16 @@ def test_naming_the_wrong_format_says_what_the_file_is(tmp_path: Path, name: str
     path = tmp_path / "set.npz"
     np.savez(path, joints=np.ones((3, 2, 2)))
     refused(path, "is a npz", name, "leave format= out", format=name)
+
+
+def test_reading_leaves_the_collector_of_cycles_as_it_was(tmp_path: Path) -> None:
+    for before in (True, False):
+        (gc.enable if before else gc.disable)()
+        try:
+            refused(tmp_path / "nothing.json", "no such file")
+            assert gc.isenabled() == before
+        finally:
+            gc.enable()
 
 
 def test_read_clip_wants_one_clip(tmp_path: Path) -> None:
