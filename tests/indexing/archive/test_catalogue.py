@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from safetensors.numpy import save
 
 from indexing import Archive, ArchiveOptions, Clip
@@ -510,6 +511,7 @@ def _as_nobody(folder: Path, query: Clip, new: Clip) -> list[Any]:
             signal.alarm(60)
             os.chdir("/")
             os.setuid(NOBODY)
+            torch.set_num_threads(1)  # the threads of a process do not follow into its fork
             archive = Archive(folder)
             said: list[Any] = [archive.search(query, k=1)[0].source, len(archive.recordings()), archive.verify().ok]
             try:
