@@ -78,7 +78,10 @@ class SearchOptions:
     tempos: tuple[float, ...] = (0.8, 1.0, 1.25)
     """Durations that are searched, in those of the query: people differ."""
     scanned: tuple[float, ...] = (1.0,)
-    """Durations that everything is scanned with; what is as long as one of the others has its first and last windows compared."""
+    """Durations that everything is scanned with."""
+    trimmed: float = 2.0
+    """Durations, at any tempo, of a recording up to which it may be one performance, cut out: its first and last windows are
+    compared, which may lie between two steps of the scan.  Of every recording, this would take half of the time of a search."""
     samples: int = 4
     """Steps that a window is divided into by the scan, at least where its duration allows: it is compared by the poses at their
     ends."""

@@ -140,4 +140,5 @@ def probe_of(
     if codes is None:
         return None
     moved = float(((each - mean) ** 2).sum() / max(float((each**2).sum()), 1e-30))
-    return Probe(image, mirrored, seconds, stride, codes, moved, tempo in options.scanned)
+    longest = int(options.trimmed * seconds * rate)
+    return Probe(image, mirrored, seconds, stride, codes, moved, tempo in options.scanned, longest)

@@ -33,7 +33,7 @@ class Probe:
 
     image: which image of the example; mirrored: whether it is the mirror image; seconds: duration of the windows; stride: poses
     from one sample to the next; codes: ``(2, samples, k)`` orthonormal, of x and y; moved: share of movement in the energy of its
-    poses; everywhere: whether all windows are compared with it, or only the first and the last of each track.
+    poses; everywhere: whether all windows are compared with it, or only those at the ends of short tracks; longest: poses of these.
     """
 
     image: int
@@ -43,6 +43,7 @@ class Probe:
     codes: NDArray[np.float32]
     moved: float = 0.0
     everywhere: bool = True
+    longest: int = 0
 
     @property
     def samples(self) -> int:
@@ -190,24 +191,26 @@ def settled(segment: ArchiveSegment, coarse: Sequence[Probe], fine: Sequence[Pro
 
 def _scores_at(segment: ArchiveSegment, probe: Probe, first: NDArray[np.int64]) -> NDArray[np.float32]:
     """Squared correlations of windows that begin at some rows of the segment, in an array of any shape."""
-    rows = first.reshape(-1, 1) + np.arange(probe.samples) * probe.stride
-    out = np.empty(len(rows), dtype=np.float32)
-    for low in range(0, len(rows), BLOCK):
-        some = rows[low : low + BLOCK]
-        x = torch.from_numpy(segment.codes[some] * segment.scales[some][..., None, None])  # (windows, samples, 2, k)
-        c = torch.einsum("nldk,elk->den", x, torch.from_numpy(probe.codes))[:, None]
-        gram = torch.einsum("nldk,nlek->den", x, x)
-        out[low : low + BLOCK] = correlation(c, torch.stack([gram[0, 0], gram[0, 1], gram[1, 1]]))[0].numpy()
+    begins, steps = first.reshape(-1), np.arange(probe.samples)[:, None] * probe.stride
+    axes, out = torch.from_numpy(probe.codes).flatten(1), np.empty(len(begins), dtype=np.float32)
+    stored, scales = np.asarray(segment.codes), np.asarray(segment.scales)
+    for low in range(0, len(begins), BLOCK):
+        rows = begins[low : low + BLOCK] + steps
+        # windows last, and a window's samples in one axis with its directions: all sums run over rows of windows
+        codes = torch.from_numpy(stored.take(rows, axis=0)).permute(2, 0, 3, 1).contiguous().float()  # (2, samples, k, windows)
+        x = codes.mul_(torch.from_numpy(scales.take(rows))[:, None]).flatten(1, 2)
+        out[low : low + BLOCK] = correlation((axes @ x)[:, None], _gram(x))[0].numpy()
     return out.reshape(first.shape)
 
 
 def _take_ends(
     found: _Kept, segment: ArchiveSegment, gone: NDArray[np.bool_], probe: Probe, number: int, inner: tuple[int, int]
 ) -> None:
-    """The first and the last window of each track: what is hardly longer than a window may lie between two steps of the scan."""
+    """The first and the last window of each short track: they may lie between two steps of the scan."""
     rows = segment.tracks[:, 3]
-    there = ~gone & (rows > probe.span)
-    first = np.unique(np.concatenate([segment.firsts[there], (segment.firsts + rows - 1 - probe.span)[there]]))
+    there = ~gone & (rows > probe.span) & (rows <= probe.longest)
+    first, last = segment.firsts[there], (segment.firsts + rows - 1 - probe.span)[there]
+    first = np.concatenate([first, last[last > first]])
     first = first[(first >= inner[0]) & (first < inner[1])]
     if len(first):
         score = _scores_at(segment, probe, first)

@@ -213,3 +213,19 @@ def test_a_track_as_long_as_the_window_is_found_wherever_it_lies(tmp_path):
         source = ragged([Clip(stored.positions(1), times=np.arange(len(tracks[1])) / stored.rate)])
         found = scan(stored, [probe_of(source, 0, layout, stored.rate, 1.0, SearchOptions())], 10)
         assert found.track[0] == 1 and found.score[0] > 0.999
+
+
+def test_ends_are_compared_of_what_may_be_one_performance(segment):
+    stored, layout = segment
+    asked = probe(stored, layout, 2.5)
+    found = scan(stored, [asked], 10_000)
+    first = stored.firsts[found.track]
+    between = {
+        (int(track), int(row))
+        for track, row, off in zip(found.track, found.row, (first + found.row) % asked.stride, strict=True)
+        if off
+    }
+    rows = stored.tracks[:, 3]
+    short = [i for i in range(len(stored)) if asked.span < rows[i] <= asked.longest]
+    ends = {(i, row) for i in short for row in (0, int(rows[i]) - 1 - asked.span) if (int(stored.firsts[i]) + row) % asked.stride}
+    assert between == ends and len(ends) >= 1 and len(short) < (rows > asked.span).sum()
