@@ -276,15 +276,12 @@ class Archive:
         catalogue = self._catalogue()
         if self._snapshot is not None and self._snapshot.contents.generation == catalogue.generation():
             return self._snapshot
-        contents, rows, _ = catalogue.moment()
+        contents, left = catalogue.searchable()
         known = {} if self._snapshot is None else {one.path.name: one for one in self._snapshot.segments}
         folder = catalogue.segments_folder
         segments = tuple(known.get(row.file) or ArchiveSegment.open(folder / row.file) for row in contents.segments)
-        live: dict[int, set[int]] = {row.id: set() for row in contents.segments}
-        for one in rows:
-            live[one.segment].add(one.id)
         dead = tuple(
-            frozenset(segment.tracks[:, 0].tolist()) - live[row.id] if row.dead else frozenset()
+            frozenset(segment.tracks[:, 0].tolist()) - left[row.id] if row.id in left else frozenset()
             for row, segment in zip(contents.segments, segments, strict=True)
         )
         self._snapshot = Snapshot(folder, contents, segments, dead)

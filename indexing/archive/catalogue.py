@@ -232,12 +232,21 @@ class Catalogue:
                 for row in connection.execute("SELECT id, joints, skeleton, learned FROM layouts")
             }
             segments = tuple(SegmentRow(*row) for row in connection.execute("SELECT * FROM segments ORDER BY id"))
-            windows = int(connection.execute("SELECT COALESCE(SUM(windows), 0) FROM recordings").fetchone()[0])
+            windows = sum(row.windows - row.dead for row in segments)
             stored = json.loads(facts["storage"])
             options = StorageOptions(**{**stored, "views": tuple(stored["views"]), "repair": RepairOptions(**stored["repair"])})
             return Contents(int(facts["generation"]), options, layouts, segments, windows)
         except (ValueError, TypeError, KeyError, EOFError, zipfile.BadZipFile) as problem:
             raise _senseless(self.folder, problem) from problem
+
+    def searchable(self) -> tuple[Contents, dict[int, set[int]]]:
+        """Contents, and of the segments from which something was removed the recordings that are left, all of one moment."""
+        with self.reading() as connection:
+            contents = self._contents(connection)
+            left: dict[int, set[int]] = {row.id: set() for row in contents.segments if row.dead}
+            for segment, mine in left.items():
+                mine.update(one for (one,) in connection.execute("SELECT id FROM recordings WHERE segment = ?", (segment,)))
+            return contents, left
 
     def moment(self, checked: bool = False) -> tuple[Contents, list[RecordingRow], list[SourceRow]]:
         """Contents, recordings and sources, all of one moment, whoever writes meanwhile.

@@ -11,12 +11,13 @@ import contextlib
 import hashlib
 import json
 import math
+import mmap
 import os
 import secrets
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +33,8 @@ HEADER = 2**26  # bytes of a header at most
 COLUMNS = 4  # of the table of tracks
 TYPES: dict[str, type[np.generic]] = {"I16": np.int16, "I8": np.int8, "F32": np.float32, "F64": np.float64, "I64": np.int64}
 SHAPES = {"joints": 3, "codes": 3, "scales": 1, "tracks": 2, "starts": 1, "origins": 2, "steps": 1}
+MAPPED = ("joints", "codes", "scales")
+SCATTERED = ("joints",)  # read here and there: with what lies around them, a system reads gigabytes for a thousand windows
 
 
 @dataclass(frozen=True)
@@ -121,18 +124,19 @@ class ArchiveSegment:
         """
         size = path.stat().st_size
         with open(path, "rb") as stream:
+            if hasattr(os, "posix_fadvise"):  # only what is asked for is read of the table of tracks
+                os.posix_fadvise(stream.fileno(), 0, 0, os.POSIX_FADV_RANDOM)
             length = int.from_bytes(stream.read(8), "little")
             if not 2 <= length <= min(HEADER, size - 8):
                 raise damaged(path, "its header is cut off")
             header = _header(path, stream.read(length))
-        try:
-            places = {name: _place(header[name], 8 + length) for name in SHAPES}
-            rate = float(header["__metadata__"]["rate"])
-        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as problem:
-            raise damaged(path, "its header makes no sense") from problem
-        arrays = {name: _mapped(path, *places[name], size, ndim) for name, ndim in SHAPES.items()}
-        small = {name: np.array(arrays[name]) for name in ("tracks", "starts", "origins", "steps")}
-        segment = cls(path, **{**arrays, **small}, rate=rate)
+            try:
+                places = {name: _place(header[name], 8 + length) for name in SHAPES}
+                rate = float(header["__metadata__"]["rate"])
+            except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as problem:
+                raise damaged(path, "its header makes no sense") from problem
+            arrays = {name: _array(path, stream, name, *places[name], size) for name in SHAPES}
+        segment = cls(path, **arrays, rate=rate)
         wrong = segment.check()
         if wrong is not None:
             raise damaged(path, wrong)
@@ -209,11 +213,20 @@ def _place(entry: dict[str, Any], base: int) -> tuple[int, int, tuple[int, ...],
     return base + begin, base + end, tuple(map(int, entry["shape"])), TYPES[entry["dtype"]]
 
 
-def _mapped(path: Path, begin: int, end: int, shape: tuple[int, ...], kind: type[np.generic], size: int, ndim: int) -> NDArray[Any]:
-    """One array of the file, which must lie in it."""
+def _array(
+    path: Path, stream: BinaryIO, name: str, begin: int, end: int, shape: tuple[int, ...], kind: type[np.generic], size: int
+) -> NDArray[Any]:
+    """One array of the file, which must lie in it: mapped where there is a row of it for each pose, read otherwise."""
     expected = math.prod(shape) * np.dtype(kind).itemsize
-    if len(shape) != ndim or min(shape) < 0 or end - begin != expected or end > size or begin < 0:
+    if len(shape) != SHAPES[name] or min(shape) < 0 or end - begin != expected or end > size or begin < 0:
         raise damaged(path, "it is cut off")
     if expected == 0:
         return np.zeros(shape, kind)
-    return np.memmap(path, dtype=kind, mode="r", offset=begin, shape=shape)
+    if name not in MAPPED:
+        stream.seek(begin)
+        return np.frombuffer(stream.read(expected), kind).reshape(shape)
+    lead = begin % mmap.ALLOCATIONGRANULARITY
+    mapped = mmap.mmap(stream.fileno(), expected + lead, access=mmap.ACCESS_READ, offset=begin - lead)
+    if name in SCATTERED and hasattr(mapped, "madvise"):
+        mapped.madvise(mmap.MADV_RANDOM)
+    return np.frombuffer(mapped, kind, offset=lead).reshape(shape)
