@@ -158,26 +158,27 @@ def test_ten_minutes_stay_below_a_megabyte(tmp_path):
     assert len(text.encode()) < 1_000_000 and "poses a second" in text
 
 
+# the browser's own frames come late, or not at all, where the machine is busy: here they come when the driver says
 DRIVER = """
+let waiting = null, clock = 0;
+window.requestAnimationFrame = (draw) => { waiting = draw; };
+const frame = (after) => { const draw = waiting; waiting = null; clock += after; draw(clock); };
 const player = document.querySelector(".player"), bars = [...player.querySelectorAll(".found")];
 const press = (key) => player.dispatchEvent(new KeyboardEvent("keydown", { key, bubbles: true, cancelable: true }));
 const said = {};
 const toggle = player.querySelector(".controls button:nth-child(2)");
 const note = (name) => { said[name] = [Number(player.dataset.time), toggle.textContent]; };
 note("begin"); press("ArrowRight"); note("step"); press("ArrowDown"); note("first"); press("ArrowDown"); note("second");
-press("ArrowUp"); note("back"); press(" "); note("stopped"); bars[1].click();
-let tries = 0;
-const wait = setInterval(() => {
-  if (Number(player.dataset.time) <= 1.5 && ++tries < 40) return;  // a busy machine draws its first frame late
-  clearInterval(wait); note("played"); press("Escape"); press(" ");
-  said.bars = bars.map((bar) => bar.getAttribute("aria-label"));
-  said.ink = [...player.querySelectorAll("canvas")].map((canvas) => {
-    const pixels = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data;
-    return pixels.some((value) => value > 0);
-  });
-  said.wide = document.documentElement.scrollWidth - window.innerWidth;
-  document.title = JSON.stringify(said);
-}, 100);
+press("ArrowUp"); note("back"); press(" "); note("stopped");
+bars[1].click(); frame(16); note("clicked"); frame(100); frame(200); note("played"); frame(240); note("again");
+frame(5000); note("late"); press("Escape"); press(" ");
+said.bars = bars.map((bar) => bar.getAttribute("aria-label"));
+said.ink = [...player.querySelectorAll("canvas")].map((canvas) => {
+  const pixels = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data;
+  return pixels.some((value) => value > 0);
+});
+said.wide = document.documentElement.scrollWidth - window.innerWidth;
+document.title = JSON.stringify(said);
 """
 
 
@@ -188,11 +189,14 @@ def test_it_plays_in_a_browser(tmp_path):
     free = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", text)  # which would stop the driver
     (tmp_path / "driven.html").write_text(free.replace("</body>", f"<script>{DRIVER}</script></body>"), encoding="utf-8")
     command = [BROWSER, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}", "--dump-dom"]
-    command += ["--virtual-time-budget=5000", "--window-size=600,900", (tmp_path / "driven.html").as_uri()]
+    command += ["--window-size=600,900", (tmp_path / "driven.html").as_uri()]
     done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120)
     said = json.loads(re.search(r"<title>(\{.*?\})</title>", done.stdout)[1])
     assert said["begin"] == [0.0, "Play"] and said["step"] == [pytest.approx(1 / 15, abs=2e-3), "Play"]
     assert said["first"] == [1.0, "Pause"] and said["second"] == [1.5, "Pause"] and said["back"] == [1.0, "Pause"]
-    assert said["stopped"] == [1.0, "Play"] and said["played"][1] == "Pause" and 1.5 < said["played"][0] <= 2.0
+    assert said["stopped"] == [1.0, "Play"] and said["clicked"] == [1.5, "Pause"]
+    assert said["played"] == [pytest.approx(1.8, abs=2e-3), "Pause"]
+    assert said["again"] == [1.5, "Pause"]  # past its end the chosen event begins anew
+    assert said["late"] == [pytest.approx(1.75, abs=2e-3), "Pause"]  # a frame that comes late skips no more than a quarter
     assert said["bars"] == ["found: squat, person 4, 1.00 to 2.00 s", "found: lunge, person 7, 1.50 to 2.00 s"]
     assert said["ink"] == [True, True] and said["wide"] <= 0
