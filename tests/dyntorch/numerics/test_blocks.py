@@ -94,7 +94,7 @@ def test_a_single_tensor_comes_back_as_a_tensor(two_threads):
 
 
 def test_blocks_run_at_the_same_time_in_other_threads(two_threads):
-    meeting = threading.Barrier(2, timeout=10)  # broken, hence an error, unless two blocks are there together
+    meeting = threading.Barrier(2, timeout=60)  # broken, hence an error, unless two blocks are there together
 
     def block(x):
         meeting.wait()
@@ -159,7 +159,7 @@ def test_a_forked_process_gets_a_pool_of_its_own(two_threads):
     if child == 0:
         ok = torch.equal(map_blocks(torch.neg, torch.arange(4), size=1), -torch.arange(4))
         os._exit(0 if ok else 1)
-    for _ in range(500):
+    for _ in range(6000):
         done, code = os.waitpid(child, os.WNOHANG)
         if done:
             assert code == 0

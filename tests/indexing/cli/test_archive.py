@@ -336,7 +336,6 @@ def test_the_bar_says_how_many_and_how_fast(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setenv("COLUMNS", "120")
     with verbs.rate("adding", 40) as bar:
         bar(0.25)
-        time.sleep(0.3)
         bar(0.5)
     assert "adding" in shown.getvalue() and "20/40" in shown.getvalue()
 
