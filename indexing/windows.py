@@ -140,8 +140,8 @@ def _around(path: NDArray[np.intp], width: int) -> tuple[NDArray[np.intp], NDArr
         path: ``(sightings,)`` which path each lies on, in order.
     """
     cuts = np.concatenate([[0], np.flatnonzero(np.diff(path)) + 1, [len(path)]])
-    counts = np.diff(cuts).repeat(np.diff(cuts))
-    begin, end = (one.repeat(np.diff(cuts)) for one in (cuts[:-1], cuts[1:]))
+    lengths = np.diff(cuts)
+    begin, end, counts = (one.repeat(lengths) for one in (cuts[:-1], cuts[1:], lengths))
     first = np.maximum(np.minimum(np.arange(len(path)) - width // 2, end - width), begin)
     return np.stack([first, np.minimum(first + width, end)], axis=1), counts
 
