@@ -1,4 +1,10 @@
-"""Joints by name: which joint of a clip is which of those learned, decided here for every indexer and command."""
+"""Joints by name: which joint of a clip is which of those learned, decided here for every indexer and command.
+
+A name counts whatever its spelling (``LShoulder``, ``left_shoulder``, ``shoulder.L``).  Different words are one joint only where
+they mean the same point (:data:`SAME`): the middle of the hips, and the top of the head.  What is only near has another name and
+is not matched: the upper neck of BODY_25B and the neck of BODY_25 between the shoulders, the centre of the head of depth sensors
+and its top, MediaPipe's ``foot_index`` and the big toe.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +15,28 @@ from collections.abc import Sequence
 import numpy as np
 
 from indexing.clip import Clip
-from indexing.skeleton import Skeleton
+from indexing.skeleton import MEASURED, Skeleton
 
 FEWEST = 3  # joints in common, and half of those learned: fewer cannot be compared
 LISTED = 4  # names in a message
+SAME = {
+    **dict.fromkeys(("midhip", "hip", "hips", "pelvis", "root", "chip", "centerhip"), "midhip"),
+    **dict.fromkeys(("head", "headtop", "topofhead"), "headtop"),
+}
+"""Words for one and the same point, by their letters alone; those with a side are put together by :func:`canonical`."""
+PARTS = "shoulder|elbow|wrist|hip|knee|ankle|heel|eye|ear|hand|foot|bigtoe|smalltoe|thumb|index|pinky|mouth|footindex"
+_SIDED = tuple(
+    re.compile(pattern)
+    for pattern in (
+        *(r"(?P<side>left|right)(?P<part>.+)", r"(?P<part>.+)(?P<side>left|right)"),
+        *(rf"(?P<side>[lr])(?P<part>{PARTS})", rf"(?P<part>{PARTS})(?P<side>[lr])"),
+    )
+)
+# of faces and hands: what they lack does not make another layout of a body
+_DETAIL = re.compile(
+    r"face|(left|right)(hand.|eye|ear)|brow|lip|jaw|contour|nosebridge|mouth|"
+    r"(left|right)(thumb|index|middle|ring|pinky|handtip)(?!toe)"
+)
 
 
 def named(skeleton: Skeleton | None) -> bool:
@@ -60,7 +84,8 @@ def matched(clip: Clip, known: Skeleton | None, who: str = "") -> tuple[Clip, st
     place = places(own, known)
     missing = [joint for joint, i in zip(known.joints, place, strict=True) if i < 0]
     shared = len(known.joints) - len(missing)
-    if shared < max(FEWEST, len(known.joints) / 2):
+    counted = _of_body(known)
+    if sum(place[i] >= 0 for i in counted) < max(FEWEST, len(counted) / 2):
         raise ValueError(
             f"{who}: joints: {shared} of its {len(own.joints)} ({_few(own.joints)}) have names of the {len(known.joints)} joints "
             f"learned ({_few(known.joints)}); use clips of one joint layout"
@@ -76,6 +101,8 @@ def matched(clip: Clip, known: Skeleton | None, who: str = "") -> tuple[Clip, st
         said = f"{who}: {shared} of the {len(known.joints)} joints learned are in it; not {_few(missing)}"
     elif shared < len(own.joints):
         said = f"{who}: of its {len(own.joints)} joints ({own.name}) the {shared} learned ({known.name}) are used"
+    if said and (own.name in MEASURED) != (known.name in MEASURED):
+        said += "; one layout is of markers or a depth sensor, so joints of the same name lie near each other, not on each other"
     return clip.replace(joints=joints, confidence=confidence, skeleton=known), said
 
 
@@ -87,7 +114,34 @@ def places(own: Skeleton, known: Skeleton) -> list[int]:
         [2, -1]
     """
     index = {_plain(joint): i for i, joint in enumerate(own.joints)}
-    return [index.get(_plain(joint), -1) for joint in known.joints]
+    words = [canonical(joint) for joint in own.joints]
+    wanted = [canonical(joint) for joint in known.joints]
+    alike = {word: i for i, word in enumerate(words) if words.count(word) == 1 and wanted.count(word) == 1}
+    found = [index.get(_plain(joint), -1) for joint in known.joints]
+    taken = set(found)
+    return [alike.get(word, -1) if i < 0 and alike.get(word, -1) not in taken else i for i, word in zip(found, wanted, strict=True)]
+
+
+def canonical(joint: str) -> str:
+    """What a joint is, whatever it is called.
+
+    Example:
+        >>> [canonical(name) for name in ("LShoulder", "shoulder.L", "Left Shoulder", "mid_hip", "hip", "l_hip", "Ear")]
+        ['leftshoulder', 'leftshoulder', 'leftshoulder', 'midhip', 'midhip', 'lefthip', 'ear']
+    """
+    plain = _plain(joint)
+    if plain in SAME:
+        return SAME[plain]
+    if plain == "rear" and not re.match(r"[rR](E|[\W_])", joint):  # the back of an animal
+        return plain
+    found = next((match for pattern in _SIDED if (match := pattern.fullmatch(plain))), None)
+    return plain if found is None else {"l": "left", "r": "right"}[found["side"][0]] + found["part"]
+
+
+def _of_body(known: Skeleton) -> list[int]:
+    """The joints that say whether a layout is another one: all but those of face and fingers, or all where there are no others."""
+    body = [i for i, joint in enumerate(known.joints) if not _DETAIL.search(canonical(joint))]
+    return body or list(range(len(known.joints)))
 
 
 def matched_all(clips: Sequence[Clip], known: Skeleton | None) -> list[Clip]:

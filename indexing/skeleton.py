@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 
 @dataclass(frozen=True)
@@ -27,11 +29,40 @@ def from_names(name: str, joints: Sequence[str], bones: Sequence[tuple[str, str]
 
 
 def known(joints: int) -> Skeleton | None:
-    """The common layout with this number of joints, where there is just one.
+    """The usual layout with this number of joints: what pose estimators write where they say no more than the number.
 
-    17: COCO, 25: OpenPose, 26: Halpe, 33: MediaPipe, 133: COCO-WholeBody.
+    17: COCO, 25: OpenPose, 26: Halpe, 33: MediaPipe, 133: COCO-WholeBody, 136: Halpe with face and hands.  Others have 17, 20 and
+    25 joints, too: :func:`candidates`, told apart by :mod:`indexing.readers.layouts`.
     """
-    return {17: COCO17, 25: BODY25, 26: HALPE26, 33: MEDIAPIPE33, 133: WHOLEBODY133}.get(joints)
+    return {17: COCO17, 25: BODY25, 26: HALPE26, 33: MEDIAPIPE33, 133: WHOLEBODY133, 136: HALPE136}.get(joints)
+
+
+def candidates(joints: int) -> tuple[Skeleton, ...]:
+    """The layouts of whole bodies that have this number of joints.
+
+    Example:
+        >>> [layout.name for layout in candidates(25)]
+        ['BODY_25', 'BODY_25B', 'NTU-25']
+    """
+    others = (HAND21, BLAZEPOSE33)  # no body, and the joints of MediaPipe
+    return tuple(layout for layout in LAYOUTS.values() if len(layout.joints) == joints and layout not in others)
+
+
+def layout_named(name: str) -> Skeleton:
+    """A layout by its name, whatever its capitals and hyphens.
+
+    Raises:
+        ValueError: there is none of this name; the message lists them.
+
+    Example:
+        >>> layout_named("body25b").name, len(layout_named("halpe_136").joints)
+        ('BODY_25B', 136)
+    """
+    plain = {re.sub(r"[\W_]+", "", known_name.lower()): layout for known_name, layout in LAYOUTS.items()}
+    found = plain.get(re.sub(r"[\W_]+", "", str(name).lower()))
+    if found is None:
+        raise ValueError(f"layout {str(name)[:60]!r}: there is none of this name; use one of {', '.join(LAYOUTS)}")
+    return found
 
 
 COCO17 = from_names(
@@ -86,6 +117,9 @@ MEDIAPIPE33 = from_names(
     ),
 )  # fmt: skip
 
+# what `dyntorch pose` writes: the same points, never smoothed
+BLAZEPOSE33 = Skeleton("blazepose33", MEDIAPIPE33.joints, MEDIAPIPE33.bones)
+
 _LIMBS = (
     ("neck", "right_shoulder"), ("right_shoulder", "right_elbow"), ("right_elbow", "right_wrist"), ("neck", "left_shoulder"),
     ("left_shoulder", "left_elbow"), ("left_elbow", "left_wrist"), ("right_hip", "right_knee"), ("right_knee", "right_ankle"),
@@ -127,6 +161,74 @@ HALPE26 = from_names(
     ),
 )  # fmt: skip
 
+BODY25B = from_names(
+    "BODY_25B",
+    (
+        *COCO17.joints, "upper_neck", "head_top", "left_big_toe", "left_small_toe", "left_heel", "right_big_toe", "right_small_toe",
+        "right_heel",
+    ),
+    (
+        ("upper_neck", "head_top"), ("upper_neck", "nose"), ("nose", "left_eye"), ("left_eye", "left_ear"), ("nose", "right_eye"),
+        ("right_eye", "right_ear"), ("upper_neck", "left_shoulder"), ("upper_neck", "right_shoulder"),
+        ("left_shoulder", "left_elbow"), ("left_elbow", "left_wrist"), ("right_shoulder", "right_elbow"),
+        ("right_elbow", "right_wrist"), ("left_shoulder", "left_hip"), ("right_shoulder", "right_hip"), ("left_hip", "right_hip"),
+        ("left_hip", "left_knee"), ("left_knee", "left_ankle"), ("right_hip", "right_knee"), ("right_knee", "right_ankle"),
+        *_FEET_BONES,
+    ),
+)  # fmt: skip
+
+# The points of the next three come from markers or a depth sensor: joints within the body, near those that pose estimators
+# are trained to see, and not on them.  Centres of hips and shoulders and the head have names of their own.
+H36M17 = from_names(
+    "H36M-17",
+    (
+        "root", "right_hip", "right_knee", "right_ankle", "left_hip", "left_knee", "left_ankle", "spine", "thorax", "neck_base",
+        "head", "left_shoulder", "left_elbow", "left_wrist", "right_shoulder", "right_elbow", "right_wrist",
+    ),
+    (
+        ("root", "right_hip"), ("right_hip", "right_knee"), ("right_knee", "right_ankle"), ("root", "left_hip"),
+        ("left_hip", "left_knee"), ("left_knee", "left_ankle"), ("root", "spine"), ("spine", "thorax"), ("thorax", "neck_base"),
+        ("neck_base", "head"), ("thorax", "left_shoulder"), ("left_shoulder", "left_elbow"), ("left_elbow", "left_wrist"),
+        ("thorax", "right_shoulder"), ("right_shoulder", "right_elbow"), ("right_elbow", "right_wrist"),
+    ),
+)  # fmt: skip
+
+_ARM, _LEG = ("shoulder", "elbow", "wrist", "hand"), ("hip", "knee", "ankle", "foot")
+_DEPTH_LIMBS = tuple(
+    (f"{side}_{a}", f"{side}_{b}") for side in ("left", "right") for limb in (_ARM, _LEG) for a, b in pairwise(limb)
+)
+
+NTU25 = from_names(  # Kinect v2
+    "NTU-25",
+    (
+        "spine_base", "spine_mid", "neck", "head_center",
+        *(f"{side}_{joint}" for limb in (_ARM, _LEG) for side in ("left", "right") for joint in limb),
+        "spine_shoulder", "left_hand_tip", "left_thumb", "right_hand_tip", "right_thumb",
+    ),
+    (
+        ("spine_base", "spine_mid"), ("spine_mid", "spine_shoulder"), ("spine_shoulder", "neck"), ("neck", "head_center"),
+        ("spine_shoulder", "left_shoulder"), ("spine_shoulder", "right_shoulder"), ("spine_base", "left_hip"),
+        ("spine_base", "right_hip"), *_DEPTH_LIMBS, ("left_hand", "left_hand_tip"), ("left_hand", "left_thumb"),
+        ("right_hand", "right_hand_tip"), ("right_hand", "right_thumb"),
+    ),
+)  # fmt: skip
+
+KINECT20 = from_names(  # Kinect v1
+    "Kinect-20",
+    (
+        "hip_center", "spine", "shoulder_center", "head_center",
+        *(f"{side}_{joint}" for limb in (_ARM, _LEG) for side in ("left", "right") for joint in limb),
+    ),
+    (
+        ("hip_center", "spine"), ("spine", "shoulder_center"), ("shoulder_center", "head_center"),
+        ("shoulder_center", "left_shoulder"), ("shoulder_center", "right_shoulder"), ("hip_center", "left_hip"),
+        ("hip_center", "right_hip"), *_DEPTH_LIMBS,
+    ),
+)  # fmt: skip
+
+MEASURED = (H36M17.name, NTU25.name, KINECT20.name)
+"""Layouts of markers and depth sensors, whose joints lie near those of the same name in the others."""
+
 _FINGERS = tuple(
     tuple(f"{finger}_{part}" for part in (("cmc", "mcp", "ip", "tip") if finger == "thumb" else ("mcp", "pip", "dip", "tip")))
     for finger in ("thumb", "index_finger", "middle_finger", "ring_finger", "pinky")
@@ -151,3 +253,24 @@ WHOLEBODY133 = from_names(
         *((f"{side}_hand_{a}", f"{side}_hand_{b}") for side in ("left", "right") for a, b in _HAND_BONES),
     ),
 )  # fmt: skip
+
+HALPE136 = from_names(
+    "Halpe-136",
+    (
+        *HALPE26.joints, *(f"face_{i}" for i in range(68)),
+        *(f"{side}_hand_{joint}" for side in ("left", "right") for joint in HAND21.joints),
+    ),
+    (
+        *((HALPE26.joints[a], HALPE26.joints[b]) for a, b in HALPE26.bones),
+        *((f"{side}_hand_{a}", f"{side}_hand_{b}") for side in ("left", "right") for a, b in _HAND_BONES),
+    ),
+)  # fmt: skip
+
+LAYOUTS = {
+    layout.name: layout
+    for layout in (
+        *(COCO17, H36M17, BODY25, BODY25B, NTU25, KINECT20, HALPE26, HALPE136, WHOLEBODY133, MEDIAPIPE33, BLAZEPOSE33, HAND21),
+        *(OPENPOSE18, OPENPOSE_MPI15),
+    )
+}
+"""Every layout by its name: what ``layout=`` and ``--layout`` take."""

@@ -59,11 +59,16 @@ FORMATS = {
     "indexing/cli/__init__.py": {"DONE", "BAD_INPUT", "REFUSED", "INTERRUPTED", "BROKEN_PIPE"},
     "indexing/cli/console.py": {"REFUSED"},
     "indexing/phase/saving.py": {"VERSION"},
+    "indexing/pose/blazepose.py": {"PICTURE", "REGION", "HEATMAP", "GRIDS", "POINTS", "LANDMARKS", "JOINTS", "HIPS", "CIRCLE", "CLIPPED"},
+    "indexing/pose/pieces.py": {"VERSION"},
     "indexing/readers/c3d.py": {"INTEL", "DEC", "MIPS", "MOST", "WORD"},
     "indexing/readers/clipset.py": {"LAST"},
+    "indexing/readers/hdf.py": {"RECORDED"},
+    "indexing/readers/sleap.py": {"SHIFTED", "HAND", "PREDICTED"},
     "indexing/readers/npz.py": {"HEADER", "AXES", "LAST_LETTER", "PACKED", "ENCRYPTED"},
     "indexing/readers/recording.py": {"LAST_FRAME"},
     "indexing/report/sync.py": {"PPM"},
+    "indexing/writers/c3d.py": {"KEY", "INTEL", "WORD", "LETTERS", "LABELS", "BLOCKS"},
 }
 """What a file format, an operating system or a unit prescribes."""
 SCENES = ("dyntorch/scenes/", "indexing/actors/", "indexing/cameras.py")
@@ -71,11 +76,12 @@ SCENES = ("dyntorch/scenes/", "indexing/actors/", "indexing/cameras.py")
 WORDING = {
     "indexing/cli/archive.py": {"SHOWN"},
     "indexing/cli/console.py": {"PLAIN_WIDTH", "SHOWN"},
-    "indexing/cli/inputs.py": {"LISTED"},
     "indexing/cli/protocol.py": {"LISTED"},
+    "indexing/cli/remarks.py": {"LISTED"},
     "indexing/joints.py": {"LISTED"},
     "indexing/opening.py": {"VALUE", "SAID", "LISTED"},
     "indexing/readers/matches.py": {"SHOWN"},
+    "indexing/remarks.py": {"NAMED"},
     "indexing/report/tallies.py": {"TIMES"},
     "indexing/sync/synchronize.py": {"LISTED"},
 }

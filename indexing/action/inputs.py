@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import warnings
 from collections.abc import Iterable
 from typing import Any
@@ -17,6 +16,8 @@ from indexing.action.options import ActionOptions
 from indexing.cameras import virtual
 from indexing.clip import Clip, as_clip
 from indexing.joints import layout_of, matched_all
+from indexing.movement import clip_of, clips_of, is_dataset
+from indexing.remarks import same_clips
 from indexing.skeleton import Skeleton
 from indexing.windows import check_clips, ragged, sample, torn
 
@@ -80,7 +81,9 @@ Array = NDArray[Any]
 
 
 def as_clips(clips: Iterable[Any], fps: float) -> list[Clip | tuple[Clip, ...]]:
-    """Clips, arrays, and tuples (or 4-D arrays) of synchronized views as clips."""
+    """Clips, arrays, movement's datasets, and tuples (or 4-D arrays) of synchronized views as clips."""
+    if is_dataset(clips):
+        return list(clips_of(clips, fps=fps))
     if isinstance(clips, (Clip, str, bytes)) or not isinstance(clips, Iterable):
         raise ValueError(
             f"clips: expected a list of clips or arrays, got {type(clips).__name__}; put a single clip in a list: [clip]"
@@ -89,6 +92,9 @@ def as_clips(clips: Iterable[Any], fps: float) -> list[Clip | tuple[Clip, ...]]:
     for i, value in enumerate(clips):
         if isinstance(value, (str, bytes)):
             raise ValueError(f"clips: item {i} is text ({value!r}); read a file first with Clip.load(path)")
+        if is_dataset(value):
+            found.append(clip_of(value, fps=fps))
+            continue
         several = isinstance(value, (tuple, list)) and value and all(isinstance(v, Clip) or _axes(v) == 3 for v in value)
         if several or (not isinstance(value, Clip) and _axes(value) == 4):
             found.append(tuple(as_clip(view, fps, f"{i} view {v}") for v, view in enumerate(value)))
@@ -183,20 +189,23 @@ def gather_labels(clips: list[Clip], owners: list[int], labels: ArrayLike | None
 
 
 def check_contradictions(clips: list[Clip], owners: list[int], labels: Array) -> None:
-    """Raise where one recording has two labels.
+    """Raise where one recording has two labels, and warn where it is given twice.
 
     Raises:
         ValueError: naming both clips and their labels.
     """
-    first: dict[tuple[Any, bytes], int] = {}
-    for i, clip in enumerate(clips):
-        other = first.setdefault((clip.joints.shape, hashlib.sha256(clip.joints.tobytes()).digest()), i)
+    twice = []
+    for other, i in same_clips(clips):
+        both = f"{owners[other]} ({clips[other].name!r}) and {owners[i]} ({clips[i].name!r})"
         if labels[other] != labels[i]:
-            both = f"{owners[other]} ({clips[other].name!r}) and {owners[i]} ({clip.name!r})"
             raise ValueError(
                 f"labels: clips {both} are the same recording, but one is {labels[other]!s} and the other {labels[i]!s}; correct a "
                 "label, or leave one out"
             )
+        twice += [both] if owners[other] != owners[i] else []
+    if twice:
+        more = f" (and {len(twice) - 1} more)" if len(twice) > 1 else ""
+        warnings.warn(f"clips {twice[0]}{more} are the same recording, which counts twice; leave one out", stacklevel=4)
 
 
 def gather_groups(clips: list[Clip], owners: list[int], groups: ArrayLike | None) -> Array | None:

@@ -114,7 +114,7 @@ def moments(model: ShapeModel, source: Ragged, owner: Array, at: Array, stream: 
     # all tempi at once: the exemplars are described once for all of them
     queries = stack([windows_at(source, owner, at, stream.window * tempo, stream.length) for tempo in stream.tempi])
     found = model.moment_scores(queries.to(stream.device)).unflatten(0, (len(stream.tempi), -1))
-    return found.amax(dim=0).cpu().numpy(), _motion(windows_at(source, owner, at, stream.window, stream.length))
+    return found.amax(dim=0).cpu().numpy(), motion_of(windows_at(source, owner, at, stream.window, stream.length))
 
 
 def presence(clip: Clip, cuts: Array, at: Array, owner: Array, stream: Stream, options: ActionOptions) -> Array:
@@ -153,7 +153,7 @@ def windows_at(source: Ragged, owner: Array, middle: Array, seconds: float, leng
     return Windows(values, torch.from_numpy(source.seen[owner]))
 
 
-def _motion(windows: Windows) -> Array:
+def motion_of(windows: Windows) -> Array:
     """``(N,)`` share of a window's energy that is change: 0 = a still pose."""
     known = windows.seen[:, None, :, None]
     whole = (channel(windows.values, "clip") * known).square().sum(dim=(1, 2, 3))
@@ -175,7 +175,7 @@ def motion_levels(model: ShapeModel) -> tuple[float, Array]:
     events = model.options.events
 
     def make() -> tuple[float, Array]:
-        motion, labels = _motion(model.exemplars.moments), model.labels[model.exemplars.owner].cpu().numpy()
+        motion, labels = motion_of(model.exemplars.moments), model.labels[model.exemplars.owner].cpu().numpy()
         each = np.array([np.quantile(motion[labels == c], events.calm) for c in range(model.classes)])
         return float(np.quantile(motion, events.still)), each
 

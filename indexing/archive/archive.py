@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import shutil
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Executor
 from pathlib import Path
@@ -19,7 +20,7 @@ from indexing.archive.queries import checked, queries_of
 from indexing.archive.results import Addition, ArchivedEvent, ArchivedRecording, ArchiveInfo, Hit, Verification
 from indexing.archive.searching import Shortlist, Snapshot, search
 from indexing.archive.segments import ArchiveSegment
-from indexing.archive.sources import Taken, gather
+from indexing.archive.sources import Taken, gather, keeping, poses_of
 from indexing.archive.verifying import verify
 from indexing.clip import Clip
 
@@ -86,7 +87,8 @@ class Archive:
         is there twice.
 
         Args:
-            sources: files, folders (walked), clips, sets of clips; one or many.
+            sources: files, folders (walked), clips, sets of clips, datasets as ``movement`` has them; one or many.  Videos, too, where
+                a pose model is there; their keypoints are kept in the archive's folder ``poses``.
             executor: anything with the interface of ``concurrent.futures``, such as a process pool or
                 ``dask.distributed.Client(...).get_executor()``; by default this process reads one source after the other.
             progress: told the share done.
@@ -98,7 +100,7 @@ class Archive:
         Raises:
             ValueError: another process adds, or the archive cannot be written.
         """
-        found = gather(sources)
+        found = keeping(gather(sources), self.path)
         catalogue = Catalogue.make(self.path, self.options.storage)
         return adding.add(catalogue, found, self.options, executor, dict(reading or {}), progress)
 
@@ -120,6 +122,8 @@ class Archive:
                     count += drop_recordings(connection, row.id)
                     connection.execute("DELETE FROM sources WHERE id = ?", (row.id,))
             adding.tidy(catalogue, self.options)
+            for row in mine:
+                shutil.rmtree(poses_of(self.path, row.key), ignore_errors=True)
         return count
 
     def recordings(self) -> list[ArchivedRecording]:

@@ -12,7 +12,7 @@ import json
 import os
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +24,12 @@ from indexing.archive.tracks import Track, total_windows, tracks_of
 from indexing.clip import Clip, LabelledSet
 from indexing.files import sha256_of
 from indexing.opening import parse_json, read_text, size_of
-from indexing.readers.files import VIDEOS, frame_number
+from indexing.movement import clips_of, is_dataset
+from indexing.pose import available, keypoint_file
+from indexing.readers.files import VIDEOS, WatchOptions, frame_number
 from indexing.skeleton import Skeleton
 
+POSES = "poses"  # the folder of an archive in which the keypoints of videos are kept
 KEYPOINT_FILES = (".json", ".npz", ".csv")  # suffixes that are looked into where a folder is given
 READING = {"person": "everyone"}  # how files are read where nothing else is said
 
@@ -37,13 +40,15 @@ Taken = Clip | LabelledSet[Clip] | str | os.PathLike[str]
 class ArchiveSource:
     """One thing to add.
 
-    key: what it is known by in the archive; name: what to call it; path: of a file or folder; clip: from memory.
+    key: what it is known by in the archive; name: what to call it; path: of a file or folder; clip: from memory; poses: of a video,
+    the folder in which the keypoints are kept that are found in it.
     """
 
     key: str
     name: str
     path: Path | None = None
     clip: Clip | None = None
+    poses: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -99,20 +104,26 @@ class ReadSource:
 def gather(given: Taken | Iterable[Taken]) -> list[ArchiveSource]:
     """All sources, folders walked, each once.
 
+    Videos in folders are taken where a pose model is there, unless keypoints of theirs lie beside them: files or folders whose
+    names begin as theirs.
+
     Raises:
         ValueError: nothing to add, or what is no file, clip or set of clips.
     """
-    listed: list[Any] = [given] if isinstance(given, (Clip, str, os.PathLike)) else list(given)
+    single = isinstance(given, (Clip, str, os.PathLike)) or is_dataset(given)
+    listed: list[Any] = [given] if single else list(given)  # type: ignore[arg-type, list-item]
     found: list[ArchiveSource] = []
     for one in listed:
         if isinstance(one, Clip):
             found.append(_of_clip(one))
         elif isinstance(one, (str, os.PathLike)):
             found += _of_path(Path(one))
+        elif is_dataset(one):
+            found += [_of_clip(clip) for clip in clips_of(one)]
         elif isinstance(one, LabelledSet) and all(isinstance(clip, Clip) for clip in one):
             found += [_of_clip(clip) for clip in one]
         else:
-            raise ValueError(f"sources: got {type(one).__name__}; give paths of files or folders, Clips or ClipSets")
+            raise ValueError(f"sources: got {type(one).__name__}; give paths of files or folders, Clips, ClipSets or datasets")
     if not found:
         raise ValueError("sources: nothing to add; give keypoint files, folders that hold some, Clips or ClipSets")
     return _once(found)
@@ -144,6 +155,7 @@ def _walked(folder: Path, walked: set[Path]) -> list[ArchiveSource]:
     except OSError:
         return [_of_file(folder)]
     found: list[ArchiveSource] = []
+    videos: list[Path] = []
     for one in inside:
         if one.name.startswith("."):
             continue
@@ -154,7 +166,26 @@ def _walked(folder: Path, walked: set[Path]) -> list[ArchiveSource]:
                 found += _walked(one, walked)
         elif one.suffix.lower() in KEYPOINT_FILES:
             found.append(_of_file(one))
+        elif one.suffix.lower() in VIDEOS:
+            videos.append(one)
+    if videos and available() is not None:
+        keypoints = [one.name for one in inside if one.is_dir() or one.suffix.lower() in KEYPOINT_FILES]
+        found += [_of_file(one) for one in videos if not any(name.startswith(one.stem) for name in keypoints)]
     return found
+
+
+def keeping(sources: Sequence[ArchiveSource], archive: Path) -> list[ArchiveSource]:
+    """The sources, of which videos know where the archive keeps their keypoints."""
+    return [replace(one, poses=poses_of(archive, one.key)) if _is_video(one.path) else one for one in sources]
+
+
+def poses_of(archive: Path, key: str) -> Path:
+    """The folder in which an archive keeps the keypoints of a video: found again when it is added under the same path."""
+    return archive / POSES / hashlib.sha256(key.encode("utf-8", "surrogateescape")).hexdigest()[:16]
+
+
+def _is_video(path: Path | None) -> bool:
+    return path is not None and path.suffix.lower() in VIDEOS and not os.path.isdir(path)
 
 
 def _resolved(path: Path) -> str:
@@ -320,7 +351,7 @@ def _people(source: ArchiveSource, reading: Mapping[str, Any]) -> tuple[list[tup
         return [(source.name, "", source.clip)], ""
     assert source.path is not None
     try:
-        clips = read(source.path, **{**READING, **reading})
+        clips = read(_keypoints(source, reading), **{**READING, **reading})
     except NobodySeen:
         return [], "nobody is in view in any frame"
     note = "30 frames per second assumed" if any(clip.fps_assumed for clip in clips) else ""
@@ -336,6 +367,16 @@ def _people(source: ArchiveSource, reading: Mapping[str, Any]) -> tuple[list[tup
         number = f" ({seen[clip.name]})" if seen[clip.name] > 1 else ""
         named.append((f"{source.name}: {clip.name}{number}", "", clip))
     return named, note
+
+
+def _keypoints(source: ArchiveSource, reading: Mapping[str, Any]) -> Path:
+    """The file to read: of a video, that of its keypoints, which are found now if they were not before."""
+    assert source.path is not None
+    if source.poses is None or available() is None:
+        return source.path  # whoever reads it says what is missing
+    how = reading.get("watching", WatchOptions())
+    made = keypoint_file(source.path, source.poses, how.people, model=how.model, every=how.every, fps=reading.get("fps"))
+    return made.path
 
 
 def _recording(clip: Clip, name: str, person: str, options: StorageOptions) -> ReadRecording:

@@ -1,4 +1,4 @@
-"""The command line ``dyntorch demo | index fit | index scan | index evaluate | archive add | ... | align | reconstruct | ...``.
+"""The command line ``dyntorch demo | pose | index fit | index scan | archive add | ... | align | reconstruct | ...``.
 
 Each has a file of its own: a dataclass whose fields are its flags, with ``run() -> exit code``.  Only what parsing needs is
 imported here, so that ``--help`` answers at once; a command imports its tools when it runs.
@@ -22,18 +22,26 @@ import tyro
 from indexing.cli.align import Align
 from indexing.cli.archive import Add, Find, Info, Remove, Search, Verify
 from indexing.cli.console import complain, reworded
+from indexing.cli.convert import Convert
 from indexing.cli.count import Count
 from indexing.cli.demo import Demo
 from indexing.cli.evaluate import Evaluate
 from indexing.cli.index import Fit, Scan
+from indexing.cli.pose import Pose
 from indexing.cli.reconstruct import Reconstruct
 from indexing.cli.segment import Segment
+from indexing.cli.suggest import Suggest
 from indexing.cli.sync import Sync
 
 DONE, BAD_INPUT, REFUSED, INTERRUPTED, BROKEN_PIPE = 0, 2, 3, 130, 141
 
 Command = tyro.conf.subcommand
-INDEX: Any = Annotated[Fit, Command("fit")] | Annotated[Scan, Command("scan")] | Annotated[Evaluate, Command("evaluate")]
+INDEX: Any = (
+    Annotated[Fit, Command("fit")]
+    | Annotated[Scan, Command("scan")]
+    | Annotated[Evaluate, Command("evaluate")]
+    | Annotated[Suggest, Command("suggest")]
+)
 ARCHIVE: Any = (
     Annotated[Add, Command("add")]
     | Annotated[Search, Command("search")]
@@ -46,15 +54,17 @@ COMMANDS: Any = (
     Annotated[Demo, Command("demo")]
     | Annotated[INDEX, Command("index", description="Learn actions from one clip each and find them elsewhere.")]
     | Annotated[ARCHIVE, Command("archive", description="Keep recordings as movement, and ask where else anybody did this.")]
+    | Annotated[Pose, Command("pose")]
     | Annotated[Align, Command("align")]
     | Annotated[Reconstruct, Command("reconstruct")]
     | Annotated[Segment, Command("segment")]
     | Annotated[Sync, Command("sync")]
+    | Annotated[Convert, Command("convert")]
     | Annotated[Count, Command("count")]
 )
 GROUPS = ("index", "archive")  # words that need another one behind them
-DESCRIPTION = """Geometry of scenes in which everything moves: learn actions from one clip each and find them in other clips, from
-other viewpoints (index); keep thousands of recordings and ask where else anybody did this (archive); find how a camera or 3D
+DESCRIPTION = """Geometry of scenes in which everything moves: find people in videos (pose); learn actions from one clip each and
+find them in other clips, from other viewpoints (index); keep thousands of recordings and ask where else anybody did this (archive); find how a camera or 3D
 sensor moved among things that move, and what stood still (align); find cameras, points and velocities from tracks through several
 views (reconstruct); find which matches of two images move together (segment); put cameras that nobody synchronized on one clock
 (sync); count how many matches such a problem takes (count).

@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from indexing.cli.console import REPORT_FILES, Progress, check_report, complain, count, names, one_line, progress, say, table
-from indexing.cli.inputs import CUT, Example, Following, Reading, assumed, parse_example, remarks
+from indexing.cli.inputs import CUT, Example, Following, Reading, assumed, parse_example
+from indexing.cli.remarks import remarks
 
 if TYPE_CHECKING:
     from indexing import Archive
@@ -65,7 +66,7 @@ class Add:
     archive: FOLDER
     """the archive's folder; it is made if it is not there"""
     sources: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="SOURCE ...", help_behavior_hint="")]
-    """keypoint files, clip sets, and folders, in which all of them are looked for"""
+    """keypoint files, clip sets, videos, and folders, in which all of them are looked for"""
     workers: WORKERS = None
     """processes that read; by default as many as there are cores"""
     dask: DASK = None
@@ -112,7 +113,7 @@ class Search:
     archive: FOLDER
     """what 'dyntorch archive add' made"""
     example: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="FILE", help_behavior_hint="")]
-    """keypoint file of one performance; file@2.1-3.0 takes these seconds of it"""
+    """keypoint file or video of one performance; file@2.1-3.0 takes these seconds of it"""
     k: Annotated[int, tyro.conf.arg(aliases=("-k",), name="hits", metavar="N")] = 10
     """how many hits at most"""
     mirror: bool = False
@@ -136,7 +137,9 @@ class Search:
             from indexing import Archive
 
             archive = Archive(_absolute(self.archive) if self.dask else self.archive)
-            clip, notes = read_query(example, self.reading, self.select)
+            reading = self.reading.watching([example.path], self.report)
+            clip, notes = read_query(example, reading, self.select)
+            notes = [*reading.watched.notes, *notes]
         started = time.perf_counter()
         with workforce(self.workers, self.dask, threads=True) as executor, progress("searching") as bar:
             hits = archive.search(clip, self.k, executor, bar, self.mirror)
@@ -437,8 +440,12 @@ def _soon(sources: Sequence[ArchiveSource]) -> bool:
 def _options(reading: Following) -> dict[str, Any]:
     """The flags that were given, as arguments of :func:`indexing.readers.read`: whoever adds without them reads alike."""
     usual = Following()
-    given = {each.name: getattr(reading, each.name) for each in dataclasses.fields(reading)}
-    return {name: value for name, value in given.items() if value != getattr(usual, name)}
+    if reading.footage.by == "pixels" or reading.footage.poses is not None:
+        flag = "--by pixels" if reading.footage.by == "pixels" else f"--poses {reading.footage.poses}"
+        raise ValueError(f"{flag}: an archive holds keypoints, and keeps those of videos itself; leave it out")
+    names_of = [each.name for each in dataclasses.fields(reading) if each.name not in ("footage", "watched")]
+    found = {name: getattr(reading, name) for name in names_of if getattr(reading, name) != getattr(usual, name)}
+    return found if reading.footage == usual.footage else {**found, "watching": reading.footage.watching}
 
 
 def _example(text: str) -> Example:

@@ -150,6 +150,30 @@ def progress(what: str, steps: bool = True) -> Iterator[Progress]:
         yield lambda share: bars.update(task, completed=share)
 
 
+@contextmanager
+def frames_bar(what: str) -> Iterator[Callable[[int, int], None] | None]:
+    """A bar on the terminal with frames per second and the time that is left; None where stderr is no terminal."""
+    if not sys.stderr.isatty():
+        yield None
+        return
+    from rich import progress as bar
+    from rich.console import Console
+    from rich.text import Text
+
+    class FramesPerSecond(bar.ProgressColumn):
+        """Of what was done lately."""
+
+        def render(self, task: bar.Task) -> Text:
+            speed = task.finished_speed or task.speed
+            return Text("" if speed is None else f"{speed:.3g} frames/s")
+
+    columns = [bar.TextColumn("{task.description}", markup=False), bar.BarColumn(), bar.MofNCompleteColumn(), FramesPerSecond()]
+    columns += [bar.TimeElapsedColumn(), bar.TextColumn("left"), bar.TimeRemainingColumn()]
+    with bar.Progress(*columns, console=Console(stderr=True), transient=True) as shown:
+        task = shown.add_task(one_line(what), total=None)
+        yield lambda done, total: shown.update(task, completed=done, total=total)
+
+
 # ----------------------------------------------------------------------------------------------------------------------
 # Where commands write: checked before the work begins, and never over their own inputs.
 

@@ -11,9 +11,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from indexing.cli.console import Progress, check_report, progress, say, table
+from indexing.cli.agreement import against_labels
+from indexing.cli.console import Progress, check_report, names, progress, say, table
 from indexing.cli.films import Pixels, are_films, refuse_film_flags
-from indexing.cli.inputs import Reading, assumed, usable
+from indexing.cli.inputs import Following, assumed, usable
+from indexing.cli.labels import Labelling, check_labelling
 
 if TYPE_CHECKING:
     import numpy as np
@@ -34,10 +36,15 @@ class Evaluate:
     dyntorch index evaluate SET.npz --train view=1,2 --test view=3 --report out/
 
     dyntorch index evaluate SET.npz --leave-out subject --camera virtual --azimuth 0,45,90
+
+    dyntorch index evaluate session.json -m moves.safetensors --labels session.boris      (a model, against what a person marked)
+
+    dyntorch index evaluate mine.eaf --labels yours.eaf      (two people, or a person and what was found)
     """
 
-    clips: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SET.npz")]
-    """a clip set with labels: joints, or frames (then pixels are learned from)"""
+    clips: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="SET.npz", help_behavior_hint="")]
+    """a clip set with labels: joints, or frames (then pixels are learned from); with --labels and -m, recordings; with --labels
+    alone, a file of labels"""
     train: Criteria = ()
     """learn from the clips with these values, e.g. view=1,2 (repeat the option for further fields); by default all but --test"""
     test: Criteria = ()
@@ -62,20 +69,30 @@ class Evaluate:
     """let examples count mirrored, too, where left and right are not different actions"""
     seed: int = 0
     """of noise, cameras and drawn examples"""
+    model: Annotated[Path | None, tyro.conf.arg(aliases=("-m",), metavar="FILE", help_behavior_hint="")] = None
+    """with --labels: what 'dyntorch index fit' wrote, to be compared with what is marked in the recordings"""
     report: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
     """where to write report.html, confusion.png, metrics.json and manifest.json; without it, print only"""
-    reading: Reading = field(default_factory=Reading)
+    labelling: Labelling = field(default_factory=Labelling)
+    found_tier: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
+    """of the file that is compared with --labels, only this tier"""
+    found_observation: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
+    """of the file that is compared with --labels, only this observation"""
+    reading: Following = field(default_factory=Following)
     pixels: Pixels = field(default_factory=Pixels)
 
     def run(self) -> int:
-        """Read, split, learn and ask for every fold; write the report and print the numbers."""
-        folder = check_report(self.report, [self.clips])
+        """Read, split, learn and ask for every fold, or compare with labels; write the report and print the numbers."""
+        if self.labelling.labels:
+            return against_labels(self)
+        check_labelling(self.labelling, [], False)
+        folder = check_report(self.report, [self.path])
         started = time.perf_counter()
         with progress("loading", steps=False):
             import indexing.action.indexer  # noqa: F401  (its import takes longer than the reading)
             from indexing.cli.protocol import check_classes, splits, strangers
 
-            clips, cameras, notes = self._films() if are_films([self.clips]) else self._load()
+            clips, cameras, notes = self._films() if are_films([self.path]) else self._load()
             folds, warned = splits(clips, self.train, self.test, self.leave_out)
             labels = clips.labels.astype(str)
             check_classes(folds, labels, clips.name)
@@ -99,22 +116,37 @@ class Evaluate:
             say(f"report: {page}")
         return 0
 
+    @property
+    def path(self) -> Path:
+        """The clip set.
+
+        Raises:
+            ValueError: it is not one, or something is asked for that needs labels.
+        """
+        given = [name for name in ("model", "found_tier", "found_observation") if getattr(self, name) is not None]
+        if given:
+            raise ValueError(f"--{given[0].replace('_', '-')}: to compare with labels; add --labels FILE, or leave it out")
+        if len(self.clips) != 1:
+            what = names([str(path) for path in self.clips]) if self.clips else "no clip set"
+            raise ValueError(f"{what}: give one clip set, SET.npz; or recordings with --labels FILE and --model FILE")
+        return self.clips[0]
+
     def _films(self) -> tuple[LabelledSet[Any], Viewing, list[str]]:
         from indexing.cli import films
 
         films.refuse_keypoint_flags(self, "camera", "azimuth", "exemplars", "view", "weights", "mirror")
-        return films.read_set(self.clips, self.reading), films.AsTheyAre(), []
+        return films.read_set(self.path, self.reading), films.AsTheyAre(), []
 
     def _load(self) -> tuple[LabelledSet[Any], Viewing, list[str]]:
         from indexing.cli.protocol import Cameras, check_dims
 
         refuse_film_flags(self.pixels)
-        clips = self.reading.read(self.clips)
+        clips = self.reading.read(self.path)
         if all(clip.label is None for clip in clips):
-            raise ValueError(f"{self.clips}: says nothing of the actions; give a clip set with 'action' (and 'action_names')")
-        clips, notes = usable(clips, self.clips)
+            raise ValueError(f"{self.path}: says nothing of the actions; give a clip set with 'action' (and 'action_names')")
+        clips, notes = usable(clips, self.path)
         cameras = Cameras(self.camera, self._azimuths(), self.exemplars == "3d", self.seed)
-        return clips, cameras, notes + assumed(clips, self.clips) + check_dims(clips, cameras)
+        return clips, cameras, notes + assumed(clips, self.path) + check_dims(clips, cameras)
 
     def _azimuths(self) -> tuple[float, ...]:
         if self.azimuth is None:
@@ -159,7 +191,7 @@ class Evaluate:
 
     def _indexer(self, examples: list[Any]) -> Any:
         """A new indexer of what the examples are."""
-        if are_films([self.clips]):
+        if are_films([self.path]):
             from indexing.cli.films import frame_rate
 
             return self.pixels.indexer(frame_rate(examples), reject=self.reject, none_label=REJECTED)
@@ -177,12 +209,12 @@ class Evaluate:
         from indexing.report import RecognitionReport, write_recognition
 
         report = RecognitionReport(
-            f"Recognition of {self.clips.name}",
+            f"Recognition of {self.path.name}",
             evaluations=results,
             metrics={"accuracy_by_group": groups} if groups else {},
             notes=notes,
             manifest=manifest(
-                {"command": "index evaluate", **dataclasses.asdict(self)}, [self.clips.expanduser()], self.seed, timings
+                {"command": "index evaluate", **dataclasses.asdict(self)}, [self.path.expanduser()], self.seed, timings
             ),
         )
         with progress("drawing the report", steps=False):

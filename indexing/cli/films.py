@@ -1,21 +1,24 @@
-"""Videos in place of keypoints: which inputs are pixels, what is read of them, and the indexer that learns from them."""
+"""Videos on the command line: as the keypoints of the people in them, where a pose model is there, or as pixels."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import tempfile
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from indexing.cli.console import names
+from indexing.cli.console import check_folder, count, frames_bar, names
 
 if TYPE_CHECKING:
     from indexing.brightness.indexer import BrightnessIndexer
     from indexing.cli.inputs import Example, Reading
     from indexing.readers.clipset import Film, FilmSet
+    from indexing.readers.files import WatchOptions
 
+NO_MODEL = "there is no pose model, so videos count as pixels; dyntorch pose --get-models fetches one"
 FASTEST = 30.0  # frames per second that are compared at most: the window of the method was chosen at 15 and 30
 
 
@@ -46,12 +49,136 @@ class Pixels:
         return (x0, y0, x1, y1)
 
 
+@dataclass(frozen=True)
+class Footage:
+    """What of videos is looked at."""
+
+    by: Literal["auto", "keypoints", "pixels"] = "auto"
+    """of videos: the keypoints of the people in them, or the pixels alone; auto: keypoints where a pose model is there"""
+    pose_model: Literal["auto", "heavy", "full", "lite"] = "auto"
+    """of videos: which network finds the keypoints; auto: the sharpest that is there"""
+    people: Annotated[int, tyro.conf.arg(metavar="N")] = 4
+    """of videos: how many people are looked for at most"""
+    every: Annotated[int, tyro.conf.arg(metavar="N")] = 1
+    """of videos: look for keypoints in one frame of so many"""
+    poses: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
+    """where the keypoints of videos are kept; by default in the folder pose beside the output"""
+
+    def as_keypoints(self, paths: Sequence[Path]) -> bool:
+        """Whether inputs are read as keypoints: files of keypoints, and videos unless their pixels are meant.
+
+        Raises:
+            ValueError: they are of two kinds, or of one that --by does not go with.
+        """
+        from indexing.readers.clipset import holds_frames
+
+        videos = [path for path in paths if is_video(path)]
+        frames = [path for path in paths if holds_frames(path)]
+        if self.by == "pixels" or frames:
+            if self.by == "keypoints":
+                raise ValueError(f"{frames[0]}: --by keypoints: holds frames, and keypoints are found in videos; leave --by out")
+            if not are_films(paths):
+                raise ValueError(f"{paths[0] if paths else 'no input'}: --by pixels: is no video; leave --by out, or give videos")
+            return False
+        return not videos or self.wanted() or not are_films(paths)
+
+    @property
+    def watching(self) -> WatchOptions:
+        """The same as the readers take it."""
+        from indexing.readers.files import WatchOptions
+
+        return WatchOptions(self.people, None if self.pose_model == "auto" else self.pose_model, self.every)
+
+    def wanted(self) -> bool:
+        """Whether the keypoints of a video are looked for."""
+        from indexing.pose import available
+
+        return self.by == "keypoints" or (self.by == "auto" and available() is not None)
+
+    def watch(self, paths: Iterable[Path], beside: Path | None, fps: float | None = None) -> Watched:
+        """Find the keypoints of all videos among some inputs, or find them where they were kept.
+
+        Args:
+            beside: the folder of the output; without one they are kept until the command ends.
+
+        Raises:
+            ValueError: no pose model is there, or a video cannot be read.
+        """
+        videos = list(dict.fromkeys(path for path in paths if is_video(path)))
+        if not videos:
+            return Watched({})
+        from indexing.pose.detection import NobodyInVideo, VideoTask, made_by, workers_here
+        from indexing.pose.models import load_models
+        from indexing.pose.writing import KeypointFile, keypoint_files
+
+        try:
+            model = load_models(None if self.pose_model == "auto" else self.pose_model)
+        except ValueError as problem:
+            raise ValueError(f"{videos[0]}: is a video, and its keypoints cannot be found: {problem}") from None
+        home = self.poses.expanduser() if self.poses is not None else None if beside is None else beside / "pose"
+        kept = Path(_passing().name) if home is None else check_folder(home)
+        found: dict[Path, Path | ValueError] = {}
+        notes, again = [], 0
+        for folder, some in _folders(videos, kept).items():
+            tasks = [VideoTask(video.expanduser(), self.people, self.every, fps, model.name) for video in some]
+            with frames_bar(f"finding people in {count(len(some), 'video')}") as bar:
+                made = list(keypoint_files(tasks, folder, made_by(model), workers_here(), bar, json=False))
+            for video, (_, one) in zip(some, made, strict=True):
+                if not isinstance(one, KeypointFile | NobodyInVideo):
+                    raise one
+                found[video] = one.path if isinstance(one, KeypointFile) else one
+                notes += [f"{video}: {note}" for note in getattr(getattr(one, "found", None), "notes", ())]
+                again += isinstance(one, KeypointFile) and one.reused
+        where = "" if home is None else f", kept in {kept}/" + f" ({again} found there)" * (again > 0)
+        said = f"people in {count(len(videos), 'video')} found by BlazePose {model.name}, not smoothed{where}"
+        return Watched(found, (said, *notes))
+
+
+@dataclass(frozen=True)
+class Watched:
+    """The keypoint file of each video, or why it has none: it shows nobody."""
+
+    files: Mapping[Path, Path | ValueError]
+    notes: tuple[str, ...] = ()
+
+
+_PASSING: list[tempfile.TemporaryDirectory[str]] = []
+
+
+def _passing() -> tempfile.TemporaryDirectory[str]:
+    """A folder that is gone when the command ends."""
+    if not _PASSING:
+        _PASSING.append(tempfile.TemporaryDirectory(prefix="dyntorch-pose-"))
+    return _PASSING[0]
+
+
+def _folders(videos: Sequence[Path], home: Path) -> dict[Path, list[Path]]:
+    """Where the keypoints of each video go: those of one name, in folders of their own, go to such again."""
+    owners: dict[Path, list[Path]] = {}
+    for video in videos:
+        same = [other for other in videos if other.stem.lower() == video.stem.lower()]
+        owners.setdefault(home / video.expanduser().resolve().parent.name if len(same) > 1 else home, []).append(video)
+    return owners
+
+
+def are_sets(examples: Sequence[Example]) -> bool:
+    """Whether all examples are sets of frames, which are pixels in any case."""
+    return not any(is_video(example.path) for example in examples)
+
+
+def is_video(path: Path) -> bool:
+    """Whether a path is called as videos are, and no folder."""
+    from indexing.readers.files import VIDEOS
+
+    return path.suffix.lower() in VIDEOS and not path.expanduser().is_dir()
+
+
 def refuse_film_flags(pixels: Pixels) -> None:
     """Raise where a flag is set that says nothing of keypoints."""
     given = [name for name, field in Pixels.__dataclass_fields__.items() if getattr(pixels, name) != field.default]
     if given:
         listed = names([f"--{name.replace('_', '-')}" for name in given])
-        raise ValueError(f"{listed}: of videos only, but the inputs are keypoints; leave it out")
+        raise ValueError(f"{listed}: of the pixels of videos only, but keypoints are compared; leave it out, or add --by pixels")
 
 
 def are_films(paths: Sequence[Path]) -> bool:

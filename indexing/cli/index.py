@@ -19,13 +19,23 @@ from indexing.cli.inputs import (
     KnownEvent,
     Lane,
     Reading,
-    on_classes,
     on_truth,
     parse_example,
     read_examples,
     read_recordings,
     read_truth,
 )
+from indexing.cli.labels import (
+    Labelling,
+    check_labelling,
+    check_write,
+    film_examples,
+    known_events,
+    labelled_examples,
+    read_marked,
+    write_found,
+)
+from indexing.cli.remarks import on_classes
 
 if TYPE_CHECKING:
     from indexing.action.indexer import ActionIndexer
@@ -42,12 +52,14 @@ class Fit:
 
     dyntorch index fit squat=a.json --background session.json -o squat.safetensors      (one action: "more of this")
 
-    dyntorch index fit raise=a.mp4 wave=b.mp4@3-5 -o moves.safetensors      (videos: from pixels alone, no pose estimator)
+    dyntorch index fit raise=a.mp4 wave=b.mp4@3-5 -o moves.safetensors      (videos: by the people in them; --by pixels without)
+
+    dyntorch index fit session.json --labels session.boris -o moves.safetensors      (what was marked in BORIS, ELAN, ...)
     """
 
     examples: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="LABEL=FILE ...", help_behavior_hint="")]
     """keypoint files or OpenPose folders, or videos, one or more per label; label=file@1.5-4 uses these seconds; a labelled set:
-    SET.npz"""
+    SET.npz; with --labels, recordings in which actions are marked"""
     output: Annotated[Path, tyro.conf.arg(aliases=("-o",), metavar="FILE")]
     """the model to write, usually *.safetensors"""
     select: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="FIELD=VALUES")] = ()
@@ -59,6 +71,9 @@ class Fit:
     background: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE ...", help_behavior_hint="")] = ()
     """recordings of other movement, of any length: what resembles them more than the actions is none; one action alone can be
     learned without them, too, and is found more surely with them"""
+    unlabelled_is_background: bool = False
+    """with --labels: the recordings are labelled throughout, and what lies between labels is other movement, to be told from the
+    actions; otherwise nobody knows what it is"""
     weights: Literal["equal", "learned"] = "equal"
     """of the kinds of evidence; learned: by what serves people best who are left out (clip sets with a field 'subject')"""
     report: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
@@ -67,6 +82,7 @@ class Fit:
     """let examples count mirrored, too, where left and right are not different actions"""
     seed: int = 0
     """of the virtual views"""
+    labelling: Labelling = field(default_factory=Labelling)
     reading: Reading = field(default_factory=Reading)
     pixels: Pixels = field(default_factory=Pixels)
 
@@ -75,14 +91,16 @@ class Fit:
         if not self.examples:
             raise ValueError("no examples; give an action or more, such as squat=a.json lunge=b.json, or a clip set SET.npz")
         examples = [parse_example(text) for text in self.examples]
-        paths = [example.path for example in examples] + list(self.background)
+        check_labelling(self.labelling, examples, self.unlabelled_is_background)
+        paths = [example.path for example in examples] + list(self.background) + list(self.labelling.labels)
         output, folder = check_file(self.output, paths), check_report(self.report, paths)
-        if are_films([example.path for example in examples]):
+        if not self.reading.footage.as_keypoints([example.path for example in examples]):
             return self._from_pixels(examples, output)
         refuse_film_flags(self.pixels)
+        reading = self.reading.watching([*(example.path for example in examples), *self.background], output.parent)
         with progress("reading", steps=False):
-            clips, notes = read_examples(examples, self.reading, self.select)
-            background = [clip for path in self.background for clip in self.reading.read(path)]
+            clips, background, notes = self._read(examples, reading)
+        notes = [*reading.watched.notes, *notes]
         started = time.perf_counter()
         with progress(f"learning from {count(len(clips), 'clip')}", steps=False):
             from indexing.action.indexer import ActionIndexer
@@ -110,6 +128,18 @@ class Fit:
             say(f"report: {page}")
         return code
 
+    def _read(self, examples: list[Example], reading: Reading) -> tuple[list[Clip], list[Clip], list[str]]:
+        """Labelled clips, other movement, and what a person should know of them."""
+        background = [clip for path in self.background for clip in reading.read(path)]
+        if not self.labelling.labels:
+            clips, notes = read_examples(examples, reading, self.select)
+            return clips, background, notes
+        given = [example for example in examples if example.label is not None]
+        clips, notes = read_examples(given, reading, self.select) if given else ([], [])
+        paths = [example.path for example in examples if example.label is None]
+        marked = labelled_examples(self.labelling, paths, reading, self.unlabelled_is_background, clips)
+        return [*clips, *marked.clips], [*background, *marked.background], notes + marked.notes
+
     def _write(self, folder: Path, indexer: ActionIndexer, clips: list[Clip], notes: list[str], paths: list[Path]) -> Path:
         from indexing.files import manifest
         from indexing.report.learned import write_learned
@@ -123,8 +153,11 @@ class Fit:
         from indexing.cli import films
         from indexing.files import prepare
 
-        films.refuse_keypoint_flags(self, "view", "weights", "mirror", "seed", "report", "background")
+        films.refuse_keypoint_flags(self, "view", "weights", "mirror", "seed", "report", "background", "unlabelled_is_background")
         with progress("reading", steps=False):
+            notes = [] if self.reading.footage.by == "pixels" or films.are_sets(examples) else [films.NO_MODEL]
+            if self.labelling.labels:
+                examples, notes = film_examples(examples, self.labelling, self.reading)
             sources, labels, lengths = films.read_examples(examples, self.reading, self.select)
         _check_two(labels, examples)
         started = time.perf_counter()
@@ -137,7 +170,8 @@ class Fit:
             mine = [seconds for name, seconds in zip(labels, lengths, strict=True) if name == label]
             lines.append([label, len(mine), f"{sum(mine):.1f}"])
         table(["action", "examples ", "seconds "], lines)
-        say(f"note: learned from pixels, at {indexer.fps:.3g} frames per second")
+        for note in [*notes, f"learned from pixels, at {indexer.fps:.3g} frames per second"]:
+            say(f"note: {note}")
         return _written(output, time.perf_counter() - started)
 
 
@@ -199,22 +233,28 @@ class Scan:
 
     dyntorch index scan session.json -m moves.safetensors --report out/
 
-    dyntorch index scan session.mp4 -m seen.safetensors --report out/       (a model that was learned from videos)
+    dyntorch index scan session.mp4 -m moves.safetensors --report out/       (a video: by the people in it)
+
+    dyntorch index scan session.json -m moves.safetensors --write session.eaf      (a tier of its own, beside yours)
     """
 
     recordings: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="FILE ...", help_behavior_hint="")]
-    """keypoint files (a folder in OpenPose form is one recording), or videos, whichever the model was learned from"""
+    """keypoint files (a folder in OpenPose form is one recording), or videos"""
     model: Annotated[Path, tyro.conf.arg(aliases=("-m",), metavar="FILE")]
     """what 'dyntorch index fit' wrote"""
     report: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
     """where to write report.html (which plays the recordings), events.csv, repetitions.csv, timeline.png, metrics.json and
     manifest.json; without it, print only"""
+    write: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
+    """write what was found for the program in which you look through it: .eaf (ELAN), .boris, .csv, .tsv, or .json (ActivityNet);
+    in a file that is there it gets a tier, or observation, of its own, and all else stays as it was"""
     truth: Annotated[Path | None, tyro.conf.arg(metavar="CSV", help_behavior_hint="")] = None
     """what is known to have happened: columns label,start,end in seconds (and file, where there are several recordings)"""
     reject: Annotated[float | None, tyro.conf.arg(metavar="R", help_behavior_hint="")] = None
     """rate of false alarms that is accepted, 0 to 1, or else the least score; by default that of the model"""
     rest: Rest = "usual"
     """who hardly moves rests, and what looks like an action then is held back: strict doubts more, off reports it"""
+    labelling: Labelling = field(default_factory=Labelling)
     reading: Following = field(default_factory=Following)
 
     def run(self) -> int:
@@ -223,24 +263,15 @@ class Scan:
 
         if not self.recordings:
             raise ValueError("no recordings; give at least one keypoint file or folder to search")
+        if self.truth is not None and self.labelling.labels:
+            raise ValueError(f"--truth {self.truth}: --labels says what is known, too; give one of them")
         inputs = [*self.recordings, self.model, *([self.truth] if self.truth is not None else [])]
-        folder = check_report(self.report, inputs)
-        started = time.perf_counter()
-        with progress("loading", steps=False):
-            indexer, recordings, notes = self._films() if self._of_films() else self._clips()
-        if self.reject is not None:
-            indexer.set_params(reject=self.reject)
-        names, people = [one.name for one in recordings], [getattr(one, "person", "") for one in recordings]
-        truth, unread = (None, []) if self.truth is None else read_truth(self.truth, names, people)
-        notes = notes + unread + _unknown(truth, indexer)
-        if truth is not None:
-            notes += on_truth(truth, recordings)
-        loaded = time.perf_counter()
-        results = [
-            self._scan(indexer, one, None if truth is None else truth[i], f" ({i + 1} of {len(names)})" if len(names) > 1 else "")
-            for i, one in enumerate(recordings)
-        ]
-        timings = {"load": loaded - started, "scan": time.perf_counter() - loaded}
+        folder, target = check_report(self.report, inputs), check_write(self.write, inputs, self.recordings)
+        inputs += self.labelling.labels
+        indexer, results, notes, timings = self.search()
+        if target is not None:
+            with progress(f"writing {target.name}", steps=False):
+                notes += write_found(target, results, self.recordings, self.labelling)
         page = None if folder is None else self._write(folder, indexer, results, notes, inputs, timings)
         _scan_show(results)
         _counts_show(results)
@@ -249,20 +280,56 @@ class Scan:
         for sentence in held_sentences(results):
             say(sentence)
         say(_summary(results, timings["scan"]))
-        if truth is not None:
+        if any(result.truth is not None for result in results):
             for sentence in [_against_truth(results), *_right(results)]:
                 say(sentence)
+        if target is not None:
+            say(f"written: {target}")
         if page is not None:
             say(f"report: {page}")
         return 0
 
-    def _of_films(self) -> bool:
-        """Whether the model was learned from videos; the recordings must be of the same kind."""
-        from indexing.modelfile import model_kind
+    def search(self) -> tuple[Any, list[RecordingResult], list[str], dict[str, float]]:
+        """The model, what it finds in each recording, person by person, what to know of that, and the seconds it took."""
+        started = time.perf_counter()
+        with progress("loading", steps=False):
+            indexer, recordings, notes = self._films() if self._of_films() else self._clips()
+        if self.reject is not None:
+            indexer.set_params(reject=self.reject)
+        names, people = [one.name for one in recordings], [getattr(one, "person", "") for one in recordings]
+        truth, unread = self._known(recordings, names, people)
+        notes = notes + unread + _unknown(truth, indexer)
+        if truth is not None:
+            notes += on_truth(truth, recordings)
+        loaded = time.perf_counter()
+        results = [
+            self._scan(indexer, one, None if truth is None else truth[i], f" ({i + 1} of {len(names)})" if len(names) > 1 else "")
+            for i, one in enumerate(recordings)
+        ]
+        return indexer, results, notes, {"load": loaded - started, "scan": time.perf_counter() - loaded}
 
-        of_films = model_kind(self.model) == "dyntorch.brightness-indexer"
-        if are_films(self.recordings) != of_films:
-            has, need = ("videos", "videos") if of_films else ("keypoints", "keypoint files")
+    def _known(
+        self, recordings: Sequence[Any], names: list[str], people: list[str]
+    ) -> tuple[list[list[KnownEvent] | None] | None, list[str]]:
+        """What is known to have happened in each recording, person by person, where anything is."""
+        if self.truth is not None:
+            return read_truth(self.truth, names, people)
+        if self.labelling.labels:
+            marked, notes = read_marked(self.labelling, recordings, self.reading)
+            return known_events(marked), notes
+        return None, []
+
+    def _of_films(self) -> bool:
+        """Whether the model was learned from pixels; the recordings must be of the same kind."""
+        from indexing.modelfile import model_kind
+        from indexing.readers.clipset import holds_frames
+
+        of_films, by = model_kind(self.model) == "dyntorch.brightness-indexer", self.reading.footage.by
+        has = "the pixels of videos" if of_films else "keypoints"
+        if by == ("keypoints" if of_films else "pixels"):
+            raise ValueError(f"--by {by}: the model {self.model} was learned from {has}; leave --by out")
+        if not (are_films(self.recordings) if of_films else not any(map(holds_frames, self.recordings))):
+            need = "videos" if of_films else "keypoint files, or videos as the camera wrote them"
             raise ValueError(f"{self.recordings[0]}: the model {self.model} was learned from {has}; give {need} to search")
         return of_films
 
@@ -274,8 +341,9 @@ class Scan:
         options = indexer.options or ActionOptions()
         told = dataclasses.replace(options.recordings, rest=RESTED[self.rest] * options.recordings.rest)
         indexer.set_params(options=dataclasses.replace(options, recordings=told))
-        lanes, notes = read_recordings(self.recordings, self.reading, indexer.n_joints_, self.model, indexer.skeleton_)
-        return indexer, lanes, notes + on_classes([str(label) for label in indexer.classes_])
+        reading = self.reading.watching(self.recordings, self.report or (None if self.write is None else self.write.parent))
+        lanes, notes = read_recordings(self.recordings, reading, indexer.n_joints_, self.model, indexer.skeleton_)
+        return indexer, lanes, [*reading.watched.notes, *notes, *on_classes([str(label) for label in indexer.classes_])]
 
     def _films(self) -> tuple[BrightnessIndexer, list[FilmRecording], list[str]]:
         from indexing.brightness.indexer import BrightnessIndexer

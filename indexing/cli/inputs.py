@@ -5,188 +5,28 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Hashable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Hashable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import tyro
 
+from dyntorch.numerics import worded
 from indexing.cli.console import count, names
+from indexing.cli.films import Footage, Watched
+from indexing.cli.remarks import WORDS, few, on_examples, on_gaps, on_people, remarks
 from indexing.opening import clipped, read_rows, shown
-
-# ----------------------------------------------------------------------------------------------------------------------
-# What a person should know of the clips that a command read: a sentence each, and nothing where all is as it should be.
-
-
-if TYPE_CHECKING:
-    from indexing.clip import Clip
-    from indexing.recordings.people import Appearance, Crowd
-
-SLOW, FAST = 5.0, 480.0  # frames per second given by hand, beyond which they are mentioned
-STILL = 0.005  # of a body's size: joints that stay this close to their places do not move
-LISTED = 3  # moments, and names of joints
-FOLLOWED = {"largest": "the largest", "confident": "the one that the detector trusts most", "tracked": "one who is tracked"}
-
-
-def remarks(clips: Sequence[Clip], reading: Reading) -> list[str]:
-    """On clips of any use: who is in them, in which units, and at which rate."""
-    found = [*_people(clips, reading), *_stretched(clips, reading)]
-    if reading.fps is not None and not SLOW <= reading.fps <= FAST and clips:
-        length = max(clip.duration for clip in clips)
-        found.append(f"--fps {reading.fps:g}: the longest clip lasts {length:.3g} s then; is that so?")
-    return found
-
-
-def on_examples(clips: Sequence[Clip]) -> list[str]:
-    """On clips to learn from."""
-    still = [clip.name for clip in clips if _is_still(clip)]
-    found = [f"{names(list(dict.fromkeys(still)))}: nobody moves there; a pose is learned, not an action"] if still else []
-    lost: dict[int, list[str]] = {}
-    for clip in clips:
-        lost.setdefault(int((~clip.seen.any(axis=0)).sum()), []).append(clip.name)
-    found += [
-        f"{missing} of {count(clips[0].joints.shape[1], 'joint')} are never seen in {names(list(dict.fromkeys(which)))}; what they "
-        "do is not learned"
-        for missing, which in sorted(lost.items())
-        if missing
-    ]
-    return [*found, *on_classes([str(clip.label) for clip in clips])]
-
-
-def on_classes(labels: Sequence[str]) -> list[str]:
-    """On what a model can tell apart."""
-    known = sorted(set(labels))
-    if len(known) != 2:
-        return []
-    return [
-        f"{known[0]} and {known[1]} are all that is known, and most of a recording looks like one of two: add examples of ordinary "
-        "movement, such as standing and walking about"
-    ]
-
-
-def on_gaps(clips: Sequence[Clip]) -> list[str]:
-    """On recordings that pause."""
-    from indexing.clip import stretches
-
-    found = []
-    for clip in clips:
-        cuts = stretches(clip.times)
-        if len(cuts) > 1:
-            ends = [f"{clip.times[end - 1]:.6g}" for _, end in cuts[:-1].tolist()]
-            listed = ", ".join(ends[:LISTED]) + " and more" * (len(ends) > LISTED)
-            found.append(f"{clip.name}: no frames for a while after {listed} s; its {len(cuts)} parts are searched by themselves")
-    return found
-
-
-def on_people(name: str, crowd: Crowd) -> list[str]:
-    """On who is in view, who comes and goes, and what was left out."""
-    found = []
-    if len(crowd.people) > 1:
-        told = "by the file's ids" if crowd.by_ids else "by position, as the file has no ids to rely on"
-        found.append(
-            f"{len(crowd.people)} people in view, told apart {told}; each is scanned by itself; --person largest follows one"
-        )
-    if not crowd.people:
-        found.append("nobody is in view for long enough to be scanned")
-    if crowd.ghosts:
-        reasons = ", ".join(f"{number} {reason}" for reason, number in crowd.ghosts.items())
-        found.append(f"{count(sum(crowd.ghosts.values()), 'track')} left out, as of no person ({reasons})")
-    if crowd.untracked:
-        found.append(f"{count(crowd.untracked, 'detection')} without an id left out; --person largest uses them")
-    found += _few([_appears(one) for one in crowd.appearances])
-    found += _few([_is_away(who, crowd) for who in dict.fromkeys(one.person for one in crowd.absences)])
-    swapped = "change places at {:.2f} s; their ids may be swapped there"
-    found += _few([f"persons {one.first} and {one.second} {swapped.format(one.at)}" for one in crowd.exchanges])
-    return [f"{name}: {sentence}" for sentence in found]
-
-
-def _appears(one: Appearance) -> str:
-    where = "where" if one.near else "elsewhere than"
-    perhaps = "may be the same" if one.near else "may be the same or not"
-    return f"person {one.person} appears at {one.at:.1f} s {where} person {one.left} left at {one.since:.1f} s: {perhaps}"
-
-
-def _is_away(who: str, crowd: Crowd) -> str:
-    spans = [f"{one.start:.1f} to {one.end:.1f} s" for one in crowd.absences if one.person == who]
-    listed = ", ".join(spans[:LISTED]) + f" and {count(len(spans) - LISTED, 'time')} more" * (len(spans) > LISTED)
-    if crowd.by_ids:
-        return f"person {who} is out of view from {listed}; that it is the same person says the file's id"
-    return f"nobody is in view from {listed}; whoever comes then may be somebody else"
-
-
-def _few(sentences: Sequence[str]) -> list[str]:
-    """The first of many, and how many more there are."""
-    more = len(sentences) - LISTED
-    return [*sentences[:LISTED], *([f"and so {count(more, 'time')} more"] if more > 0 else [])]
-
-
-def on_truth(truth: Sequence[Sequence[KnownEvent] | None], recordings: Sequence[Any]) -> list[str]:
-    """On known events that the recordings do not show; of videos that is not known before they are read."""
-    found = []
-    for one, events in zip(recordings, truth, strict=True):
-        if not isinstance(one, Lane):
-            continue
-        out = [event for event in events or [] if event[2] < one.times[0] or event[1] > one.times[-1]]
-        if out:
-            label, start, end = out[0]
-            first = f"{label} at {start:g} to {end:g} s" + ", ..." * (len(out) > 1)
-            who = f"{one.name}, person {one.person}," if one.person else one.name
-            runs = f"{who} runs from {one.times[0]:.6g} to {one.times[-1]:.6g} s"
-            found.append(f"{runs}: {count(len(out), 'known event')} outside of it cannot be found ({first})")
-    return found
-
-
-def _people(clips: Sequence[Clip], reading: Reading) -> list[str]:
-    from indexing.sync.people import jumps
-
-    found = []
-    for clip in clips:
-        people = clip.meta.get("people")
-        if people is None or reading.person not in FOLLOWED:
-            continue
-        moments = jumps(clip) if clip.dims == 2 else []
-        listed = ", ".join(f"{moment:.2f}" for moment in moments[:LISTED]) + " and more" * (len(moments) > LISTED)
-        where = f", somebody else from {listed} s on" if moments else ""
-        found.append(
-            f"{clip.name}: {people} people in view; followed is {FOLLOWED[reading.person]}{where}; --person says otherwise"
-        )
-    return found
-
-
-def _stretched(clips: Sequence[Clip], reading: Reading) -> list[str]:
-    """Pixel coordinates from 0 to 1: of images that are not square, people come out too wide or too narrow."""
-    import numpy as np
-
-    if reading.size is not None:
-        return []
-    some = [
-        clip.name
-        for clip in clips
-        if clip.dims == 2 and clip.up == "-y" and clip.seen.any() and float(np.nanmax(np.abs(clip.joints))) <= 1.5
-    ]
-    if not some:
-        return []
-    who = names(list(dict.fromkeys(some)))
-    return [f"{who}: coordinates from 0 to 1, so the shape of the image is not known and people may be stretched; give --size W H"]
-
-
-def _is_still(clip: Clip) -> bool:
-    import numpy as np
-
-    seen = clip.joints[:, clip.seen.any(axis=0)]
-    if len(seen) < 2:
-        return False
-    size = float(np.linalg.norm(np.nanmax(seen, axis=(0, 1)) - np.nanmin(seen, axis=(0, 1))))
-    moved = np.nanmax(seen, axis=0) - np.nanmin(seen, axis=0)
-    return bool(np.nanmax(np.linalg.norm(moved, axis=1)) <= STILL * size)
-
 
 if TYPE_CHECKING:
     from indexing.clip import Clip, ClipSet, FloatArray
     from indexing.skeleton import Skeleton
 
-Format = Literal["clipset", "openpose", "coco", "mediapipe", "deeplabcut", "mmpose", "ultralytics", "sleap"]
+Format = Literal[
+    "clipset", "openpose", "coco", "mediapipe", "deeplabcut", "mmpose", "ultralytics", "sleap", "trc", "mocap", "freemocap", "npy", "pyskl",
+    "movement",
+]  # fmt: skip
 People = Literal["largest", "confident", "tracked", "all", "everyone"]
 TRIM = re.compile(r"(?P<path>.+)@(?P<start>\d+(\.\d*)?|\.\d+)?-(?P<end>\d+(\.\d*)?|\.\d+)?")
 CUT = 0.1  # seconds that an example may end before it was said to: nobody counts frames
@@ -207,15 +47,39 @@ class Reading:
     """of the keypoint files; by default their content decides"""
     size: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="W H", help_behavior_hint="")] = None
     """width and height of the image in pixels, for files with coordinates from 0 to 1"""
+    layout: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
+    """which joint is which, such as BODY_25B; by default as the file says, or as the body looks"""
+
+    footage: Footage = field(default_factory=Footage)
+    watched: Annotated[Watched, tyro.conf.Suppress] = field(default_factory=lambda: Watched({}))
+
+    def watching(self, paths: Iterable[Path], beside: Path | None) -> Self:
+        """The same, with the keypoints of all videos among some inputs found, and kept beside the output."""
+        return replace(self, watched=self.footage.watch(paths, beside, self.fps))
 
     def read(self, path: Path, label: str | None = None) -> ClipSet:
-        """All clips of a file or folder."""
+        """All clips of a file or folder: here alone paths become clips."""
         from indexing.readers import read
 
-        return read(
-            path, format=self.format, fps=self.fps, person=self.person, min_confidence=self.min_confidence, label=label,
-            size=self.size,
-        )  # fmt: skip
+        refuse_range(path)
+        found = self.watched.files.get(path, path)
+        if isinstance(found, ValueError):
+            raise found
+        if found != path:  # keypoints of a video go by the name of the video
+            return _renamed(replace(self, watched=Watched({}), size=None, fps=None).read(found, label), found, path)
+        try:
+            return read(
+                path, format=self.format, fps=self.fps, person=self.person, min_confidence=self.min_confidence, label=label,
+                size=self.size, layout=self.layout,
+            )  # fmt: skip
+        except ValueError as problem:
+            if type(problem) is not ValueError:
+                raise  # nobody is in view, which some commands say in their own way
+            raise ValueError(worded(problem, WORDS)) from None
+
+
+def _renamed(clips: ClipSet, old: Path, new: Path) -> ClipSet:
+    return type(clips)([clip.replace(name=new.name + clip.name.removeprefix(old.name)) for clip in clips], new.name)
 
 
 @dataclass(frozen=True)
@@ -287,6 +151,17 @@ def _trimmed(text: str) -> Example:
     return Example(Path(match["path"]), None, start, end)
 
 
+def refuse_range(path: Path) -> None:
+    """Raise where a path that is not there ends in seconds: these are for examples, and all of a recording is looked at.
+
+    Raises:
+        ValueError: naming the file that is there.
+    """
+    file, at, seconds = str(path).rpartition("@")
+    if at and not path.expanduser().exists() and Path(file).expanduser().exists():
+        raise ValueError(f"{path}: seconds (@{seconds}) are for examples, and recordings are read as a whole; give {file}")
+
+
 def read_examples(examples: Sequence[Example], reading: Reading, select: Sequence[str]) -> tuple[list[Clip], list[str]]:
     """Labelled clips, and what a person should know about them.
 
@@ -327,7 +202,7 @@ def read_examples(examples: Sequence[Example], reading: Reading, select: Sequenc
             raise ValueError(
                 f"{example.path}: has {last} joints, but {examples[0].path} has {first}; use one pose estimator and joint layout"
             )
-    return clips, notes + assumed(guessed) + remarks(clips, reading) + on_examples(clips)
+    return clips, notes + assumed(guessed) + remarks(clips, reading) + on_examples(clips) + on_overlaps(examples)
 
 
 def of_layout(clips: Sequence[Clip], known: Skeleton | None, path: Path) -> tuple[list[Clip], list[str]]:
@@ -344,13 +219,49 @@ def _cut(clips: ClipSet, example: Example) -> tuple[ClipSet, list[str]]:
 
     start, end = example.start if example.start is not None else -math.inf, example.end if example.end is not None else math.inf
     found = ClipSet((clip.between(start, end) for clip in clips), clips.name)
-    short = [clip for clip in clips if -math.inf < start < clip.times[0] - CUT or clip.times[-1] + CUT < end < math.inf]
+    alone = [clip for clip in found if len(clip) == 1]
+    if alone and len(alone) == len(found):
+        raise ValueError(f"{_ranged(example)}: one frame only lies in these seconds ({alone[0].times[0]:.6g} s); give more of them")
+    short = [clip for clip in clips if on_range(example, clip.times[0], clip.times[-1])]
     if not short:
         return found, []
-    first, last = short[0].times[0], short[0].times[-1]
     left = f"{found[0].duration:.3g} s of it" if len(clips) == 1 else "the rest of it"
-    wanted = f"{example.start or 0:g}-{'' if example.end is None else format(example.end, 'g')}"
-    return found, [f"{example.path}@{wanted}: the recording runs from {first:.6g} to {last:.6g} s; {left} is used"]
+    return found, [f"{said}; {left} is used" for said in on_range(example, short[0].times[0], short[0].times[-1])]
+
+
+def on_range(example: Example, first: float, last: float) -> list[str]:
+    """On an example whose seconds lie beyond its recording, keypoints or video, which runs from ``first`` to ``last``."""
+    early = example.start is not None and example.start < first - CUT
+    late = example.end is not None and last + CUT < example.end
+    return [f"{_ranged(example)}: the recording runs from {first:.6g} to {last:.6g} s"] if early or late else []
+
+
+def on_overlaps(examples: Sequence[Example]) -> list[str]:
+    """On seconds of one file, keypoints or video, that are given to two actions.
+
+    Raises:
+        ValueError: one example is given to two actions.
+    """
+    found = []
+    known = [example for example in examples if example.label is not None]
+    for one, other in combinations(known, 2):
+        start = max(one.start or 0.0, other.start or 0.0)
+        end = min(math.inf if one.end is None else one.end, math.inf if other.end is None else other.end)
+        if one.label != other.label and end - start > CUT and one.path.expanduser().resolve() == other.path.expanduser().resolve():
+            if (one.start, one.end) == (other.start, other.end):
+                raise ValueError(
+                    f"{one.path}: is given as {one.label} and as {other.label}; correct a label, or give the seconds of each"
+                )
+            when = f"{start:g} s to the end" if end == math.inf else f"{start:g} to {end:g} s"
+            found.append(
+                f"{one.path}: {when} count both as {one.label} and as {other.label}; correct the ranges if they do not overlap"
+            )
+    return few(found)
+
+
+def _ranged(example: Example) -> str:
+    start, end = ("" if value is None else f"{value:g}" for value in (example.start, example.end))
+    return f"{example.path}@{start}-{end}"
 
 
 def _checked(clips: Sequence[Clip], path: Path) -> list[Clip]:
@@ -408,7 +319,7 @@ def read_recordings(
     found: list[list[Lane]] = []
     notes: list[str] = []
     for path in paths:
-        lanes, said = _lanes(path, reading)
+        lanes, said = lanes_of(path, reading)
         notes += said
         clips, said = of_layout([lane.clip for lane in lanes if lane.clip is not None], skeleton, path)
         notes += said
@@ -439,7 +350,7 @@ def _apart(paths: Sequence[Path], found: Sequence[Sequence[Lane]]) -> list[Lane]
     return out
 
 
-def _lanes(path: Path, reading: Reading) -> tuple[list[Lane], list[str]]:
+def lanes_of(path: Path, reading: Reading) -> tuple[list[Lane], list[str]]:
     """What one file holds, person by person, or recording by recording."""
     import numpy as np
 
@@ -463,6 +374,22 @@ def _lanes(path: Path, reading: Reading) -> tuple[list[Lane], list[str]]:
     empty = [clip.name for clip in clips if not clip.seen.any()]
     notes = [f"{path}: nobody is in view in any frame" + (f" of {names(empty)}" if len(clips) > 1 else "")] if empty else []
     return [Lane(clip.name, "", clip if clip.seen.any() else None, clip.times) for clip in clips], notes
+
+
+def on_truth(truth: Sequence[Sequence[KnownEvent] | None], recordings: Sequence[Any]) -> list[str]:
+    """On known events that the recordings do not show; of videos that is not known before they are read."""
+    found = []
+    for one, events in zip(recordings, truth, strict=True):
+        if not isinstance(one, Lane):
+            continue
+        out = [event for event in events or [] if event[2] < one.times[0] or event[1] > one.times[-1]]
+        if out:
+            label, start, end = out[0]
+            first = f"{label} at {start:g} to {end:g} s" + ", ..." * (len(out) > 1)
+            who = f"{one.name}, person {one.person}," if one.person else one.name
+            runs = f"{who} runs from {one.times[0]:.6g} to {one.times[-1]:.6g} s"
+            found.append(f"{runs}: {count(len(out), 'known event')} outside of it cannot be found ({first})")
+    return found
 
 
 def read_truth(

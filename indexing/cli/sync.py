@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -13,16 +13,17 @@ import tyro
 
 from dyntorch.numerics import Message, worded
 from indexing.cli.console import SHOWN, check_report, count, ended, flags, names, progress, say, table
-from indexing.cli.inputs import Format
+from indexing.cli.films import Footage, Watched
+from indexing.cli.inputs import Format, refuse_range
 
 if TYPE_CHECKING:
     from indexing.report.sync import SyncReport
     from indexing.sync.files import Plan
     from indexing.sync.people import Pairing
-    from indexing.sync.takes import Take
+    from indexing.sync.takes import By, Take
 
 WORDS = flags(
-    "fps", "person", "method", "measure", "max_shift", "min_confidence", "format", "size", "rate",
+    "fps", "person", "method", "measure", "max_shift", "min_confidence", "format", "size", "layout", "rate",
     calibration="--calibration FILE.toml",
 )  # fmt: skip
 
@@ -43,7 +44,8 @@ class Sync:
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
     """where to write report.html, sync.json, curve.png and pose-sync/; without it, print only"""
     method: Literal["auto", "keypoints", "tracks", "brightness"] = "auto"
-    """auto: keypoints where there are any; for videos tracks and brightness, which must agree"""
+    """auto: keypoints where there are any, or a pose model finds them; of videos that they do not decide tracks and brightness,
+    which must agree"""
     measure: Literal["profile", "window"] = "profile"
     """of --method brightness: what moves at which height, confirmed by the window kernel; or that kernel alone, as in the thesis"""
     fps: Annotated[str | None, tyro.conf.arg(metavar="N|N,N,...", help_behavior_hint="")] = None
@@ -64,12 +66,17 @@ class Sync:
     """of the keypoint files; by default their content decides"""
     size: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="W H", help_behavior_hint="")] = None
     """width and height of the image in pixels, for files with coordinates from 0 to 1"""
+    layout: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
+    """which joint is which, such as BODY_25B; by default as the files say, or as the body looks"""
+    footage: Footage = field(default_factory=Footage)
     title: Annotated[str | None, tyro.conf.arg(metavar="TEXT", help_behavior_hint="")] = None
     """heading of the report"""
 
     def run(self) -> int:
         """Read, synchronize, write, and say what was found."""
         self._check()
+        for path in self.cameras:
+            refuse_range(path)
         from indexing.files import manifest
         from indexing.report.sync import FILES, names_of
         from indexing.sync.files import check_target
@@ -81,8 +88,12 @@ class Sync:
         if folder is not None:
             check_target(folder, inputs)
         started = time.perf_counter()
+        by = self._by()
+        watched = Watched({})
+        if by != "pixels" and self.footage.wanted():
+            watched = self.footage.watch(found.values(), folder, self._rates(len(found))[0])
         with progress("reading", steps=False):
-            takes = self._read(found)
+            takes = self._read(found, by, watched)
         read = time.perf_counter()
         pairs = len(takes) * (len(takes) - 1) // 2
         with progress(f"comparing {count(pairs, 'pair')} of cameras") as done:
@@ -126,14 +137,30 @@ class Sync:
             raise ValueError(f"--fps gives {len(rates)} rates for {cameras} cameras; give one, or one per camera")
         return rates * ((cameras or 1) if len(rates) == 1 else 1)
 
-    def _read(self, found: dict[str, Path]) -> list[Take]:
+    def _by(self) -> By:
+        """What of videos is compared.
+
+        Raises:
+            ValueError: --method and --by contradict each other.
+        """
+        from indexing.sync.synchronize import BY
+
+        of_method, by = BY[self.method], self.footage.by
+        if "auto" not in (by, of_method) and by != of_method:
+            raise ValueError(f"--by {by}: --method {self.method} compares the {of_method} of videos; leave --by out")
+        return of_method if by == "auto" else by
+
+    def _read(self, found: dict[str, Path], by: By, watched: Watched) -> list[Take]:
         from indexing.sync.takes import take_of
 
         rates = self._rates(len(found))
-        options: dict[str, Any] = {"person": self.person, "min_confidence": self.min_confidence}
-        options |= {"format": self.format, "size": self.size}
+        options: dict[str, Any] = {"person": self.person, "min_confidence": self.min_confidence, "by": by}
+        options |= {"format": self.format, "size": self.size, "layout": self.layout}
         try:
-            return [take_of(path, name=name, fps=rate, **options) for (name, path), rate in zip(found.items(), rates, strict=True)]
+            return [
+                take_of(path, name=name, fps=rate, keypoints=watched.files.get(path), **options)
+                for (name, path), rate in zip(found.items(), rates, strict=True)
+            ]
         except ValueError as problem:
             raise ValueError(worded(problem, WORDS)) from problem
 

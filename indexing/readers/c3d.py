@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from indexing.clip import COARSEST, FINEST, UP_AXES
 from indexing.opening import error, read_bytes
 from indexing.readers.points import FloatArray, PointSequence
 
@@ -81,7 +82,7 @@ def read(path: Path) -> PointSequence:
     body = data[(start - 1) * BLOCK :]
     frames = last - first + 1
     if last == WORD or last < first:  # longer than the header can say
-        frames = max(frames, _whole(parameters.values.get("POINT:FRAMES")))
+        frames = max(frames, *(_whole(parameters.values.get(f"POINT:{name}")) for name in ("FRAMES", "LONG_FRAMES")))
     frames = min(frames, len(body) // width) if last == WORD else frames
     if frames < 1 or len(body) < frames * width:
         raise error(path, f"has {len(body) // width} of {frames} frames", "the file may be truncated: export it again")
@@ -91,7 +92,17 @@ def read(path: Path) -> PointSequence:
     places = points[..., :3] * (1.0 if real else scale)
     places[points[..., 3] < 0] = np.nan  # a negative residual: not seen
     places[~np.isfinite(places).all(axis=-1)] = np.nan
-    return PointSequence(str(path), places, parameters.labels(count), int(first))
+    units = "".join(_texts(parameters.values.get("POINT:UNITS"))[:1]).lower()
+    upward = "".join(_texts(parameters.values.get("POINT:Y_SCREEN"))[:1]).lower().lstrip("+")
+    up = upward if upward in UP_AXES else ""
+    return PointSequence(str(path), places, parameters.labels(count), int(first), _frequency(parameters, data), units, up)
+
+
+def _frequency(parameters: Parameters, data: bytes) -> float:
+    """Frames per second, of the parameter or of the header; 0 where neither is one."""
+    found = parameters.values.get("POINT:RATE")
+    rates = [*(found.ravel()[:1].tolist() if isinstance(found, np.ndarray) else []), *parameters.reals(data[20:24]).tolist()]
+    return next((float(rate) for rate in rates if COARSEST <= rate <= FINEST), 0.0)
 
 
 def _reals(data: bytes, kind: str) -> FloatArray:

@@ -18,7 +18,7 @@ anything ``(N, ...)``   what is known of each clip: becomes ``Clip.meta``; of ``
 from __future__ import annotations
 
 from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -30,8 +30,10 @@ from indexing.clip import UP_AXES, Clip, ClipSet, FloatArray, LabelledSet
 from indexing.files import replacing
 from indexing.opening import error, listed, shown
 from indexing.readers.files import Options, Source
+from indexing.readers.layouts import settled, told
 from indexing.readers.npz import NumpyArchive
-from indexing.skeleton import Skeleton
+from indexing.readers.recording import of_people, to_clips
+from indexing.skeleton import Skeleton, candidates
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Writing clip sets; the format is described in :mod:`indexing.readers.clipset`.
@@ -79,7 +81,8 @@ def write_clip_set(clips: Sequence[Clip], path: str | Path) -> None:
         data["confidence"] = np.concatenate(blank)
     data |= _bones(path, clips)
     for key in dict.fromkeys(key for clip in clips for key in clip.meta if key not in data):
-        data[key] = _column(path, clips, key)
+        if key not in NOTES or all(key in clip.meta for clip in clips):
+            data[key] = _column(path, clips, key)
     _write(path, data)
 
 
@@ -146,6 +149,7 @@ def _write(path: Path, data: dict[str, Array]) -> None:
 # keys that describe frames, joints or the whole set: never meta, whatever their length
 RESERVED = {"joints", "offsets", "action", "action_names", "times", "frame", "fps_assumed", "confidence", "up"}
 RESERVED |= {"bones", "parents", "joint_names", "skeleton_name"}
+NOTES = ("people", "layout", "may_lag")  # what readers say of some clips: left out of a set where not all have it
 SLOWEST, FASTEST = 1e-6, 1e6  # frames per second: two a month, and the fastest cameras there are
 LAST = 2**53  # whole numbers are exact below it
 FORMS = {"joints": "joints (F, n, 2 or 3)", "frames": "frames (F, height, width)"}
@@ -292,15 +296,24 @@ def plain(value: Any) -> Any:
 
 
 def read(source: Source, options: Options) -> ClipSet:
-    """Read a clip set; ``person`` does not matter, since a clip is one person already."""
+    """Read a clip set; ``person`` matters where its clips are the people of one recording, as ``dyntorch pose`` writes them."""
     source.need("clipset", "npz")
     if options.size is not None:
         raise error(source.path, "size= does not apply to a clip set", "leave size out")
-    return read_clip_set(source.path, fps=options.fps, label=options.label, min_confidence=options.min_confidence)
+    clips = read_clip_set(
+        source.path, fps=options.fps, label=options.label, min_confidence=options.min_confidence, layout=options.layout
+    )
+    people = of_people(clips)
+    return clips if people is None else to_clips(source.path, people, replace(options, label=clips[0].label))
 
 
 def read_clip_set(
-    path: str | Path, *, fps: float | None = None, label: Hashable | None = None, min_confidence: float = 0.0
+    path: str | Path,
+    *,
+    fps: float | None = None,
+    label: Hashable | None = None,
+    min_confidence: float = 0.0,
+    layout: str | None = None,
 ) -> ClipSet:
     """Read a clip-set ``.npz`` (its keys are listed above), without pickle.
 
@@ -308,6 +321,8 @@ def read_clip_set(
         fps: frames per second where the file has neither ``times`` nor ``fps``; without it 30 is assumed.
         label: replaces the labels of all clips.
         min_confidence: joints below it become NaN.
+        layout: which joint is which, as of :func:`indexing.readers.read`.  A set that names no joints has names only where the
+            body shows without doubt which layout it is (Kinect-20, COCO-17 ...).
 
     Raises:
         ValueError: not such a file, truncated, or inconsistent; the message names the file, the key and the clip.
@@ -342,7 +357,8 @@ def read_clip_set(
     wrong = next((axis for axis in dict.fromkeys(map(str, up)) if axis not in UP_AXES or (axis.endswith("z") and dims == 2)), None)
     if wrong is not None:
         raise error(path, f"up is {shown(wrong)} for {dims}D joints", f"save one of {', '.join(UP_AXES)} (z only for 3D joints)")
-    meta, skeleton = clip_meta(data, count, "joints"), _skeleton(path, data, joints.shape[1])
+    meta = {key: values for key, values in clip_meta(data, count, "joints").items() if key != "layout" or layout is None}
+    skeleton, said = _layout(path, data, joints, [str(axis) for axis in dict.fromkeys(up.tolist())], layout)
     clips = []
     for i, (start, end) in enumerate(pairwise(offsets.tolist())):
         known = None if confidence is None or np.isnan(confidence[start:end]).all() else confidence[start:end]
@@ -357,7 +373,7 @@ def read_clip_set(
                     name=names[i],
                     skeleton=skeleton,
                     up=str(up[i]),
-                    meta={key: plain(values[i]) for key, values in meta.items()},
+                    meta={**{key: plain(values[i]) for key, values in meta.items()}, **said},
                     fps_assumed=bool(assumed[i]),
                 )
             )
@@ -380,6 +396,19 @@ def _trusted(path: Path, data: Mapping[str, Array], joints: Array, min_confidenc
     if min_confidence > 0:
         joints = np.where((confidence < min_confidence)[..., None], np.nan, joints)
     return joints, confidence
+
+
+def _layout(
+    path: Path, data: Mapping[str, Array], joints: Array, ups: Sequence[str], name: str | None
+) -> tuple[Skeleton | None, dict[str, str]]:
+    """Which joint is which: as the caller or the file says, or as the body shows; and what to say about it."""
+    if name is not None:
+        return told(path, name, joints.shape[1]), {}
+    own = _skeleton(path, data, joints.shape[1])
+    if own is not None or len(ups) != 1:
+        return own, {}
+    layout, said, _ = settled(joints, None, candidates(joints.shape[1]), ups[0])
+    return layout, said
 
 
 def _skeleton(path: Path, data: Mapping[str, Array], joints: int) -> Skeleton | None:

@@ -1,4 +1,7 @@
-"""DeepLabCut CSV: header rows scorer, bodyparts, coords; with several animals: scorer, individuals, bodyparts, coords.
+"""DeepLabCut: header rows scorer, bodyparts, coords; with several animals: scorer, individuals, bodyparts, coords.
+
+In CSV they are the first rows; the default output, HDF5 (``..DLC_resnet50_...h5``), keeps them as a data frame of pandas
+(:mod:`indexing.readers.frames`).
 
 The columns are x, y, likelihood per body part (labels made by hand: x, y; triangulated: x, y, z), the first column or
 columns the frame number or the image's name.  Individuals are tracks; body parts that belong to no individual
@@ -9,9 +12,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from indexing.clip import ClipSet
+from indexing.clip import ClipSet, FloatArray
 from indexing.opening import error, shown
 from indexing.readers.files import Options, Source, frame_number, read_columns
+from indexing.readers.frames import read_frame
+from indexing.readers.hdf import opened_hdf5
 from indexing.readers.recording import IntArray, Recording, to_clips
 from indexing.skeleton import Skeleton
 
@@ -20,12 +25,18 @@ REMEDY = "export with deeplabcut.analyze_videos(..., save_as_csv=True) or analyz
 
 
 def read(source: Source, options: Options) -> ClipSet:
-    """Read a DeepLabCut CSV; times are frame number / fps.
+    """Read a DeepLabCut CSV or HDF5; times are frame number / fps.
 
     Raises:
         ValueError: a header row is missing, or a body part lacks x or y.
     """
-    source.need("deeplabcut", "csv")
+    source.need("deeplabcut", "csv", "hdf5")
+    if source.kind == "hdf5":
+        with opened_hdf5(source.path) as file:
+            frame = read_frame(file)
+        layout = _layout(source, frame.header["bodyparts"], frame.header["coords"], frame.header.get("individuals"))
+        table = frame.values[:, _columns(layout)]
+        return _clips(source, options, layout, table, _frames(source, frame.index), "individuals" in frame.header)
     header = {row[0].strip().lower(): [cell.strip() for cell in row] for row in source.data[:4]}
     lacking = [name for name in ("bodyparts", "coords") if name not in header]
     if lacking:
@@ -33,22 +44,30 @@ def read(source: Source, options: Options) -> ClipSet:
     if len({len(row) for row in header.values()}) > 1:
         raise error(source.path, "the header rows have different lengths", REMEDY)
     individuals = header.get("individuals")
-    skip = 4 if individuals else 3
     layout = _layout(source, header["bodyparts"], header["coords"], individuals)
-    parts = list(next(iter(layout.values())))
-    columns = [column for animal in layout.values() for part in parts for column in animal[part].values()]
-    kinds = list(next(iter(next(iter(layout.values())).values())))
     start = next(i for i, cell in enumerate(header["coords"]) if cell.lower() == "x")
-    values, keys = read_columns(source.path, skip, columns, [start - 1])
+    values, keys = read_columns(source.path, 4 if individuals else 3, _columns(layout), [start - 1])
+    return _clips(source, options, layout, values, _frames(source, keys[0]), individuals is not None)
+
+
+def _columns(layout: Layout) -> list[int]:
+    """The columns of all animals, in the order of the first one's body parts."""
+    parts = list(next(iter(layout.values())))
+    return [column for animal in layout.values() for part in parts for column in animal[part].values()]
+
+
+def _clips(source: Source, options: Options, layout: Layout, values: FloatArray, frames: IntArray, tracked: bool) -> ClipSet:
+    """Clips of a table with the columns of :func:`_columns`, a row per frame in ``frames``."""
+    first = next(iter(layout.values()))
+    parts, kinds = list(first), list(next(iter(first.values())))
     table = values.reshape(-1, len(parts), len(kinds))  # one row per frame and animal
     dims = 3 if "z" in kinds else 2
-    frames = _frames(source, keys[0])
     recording = Recording(
         frames=frames,
         at=np.repeat(np.arange(len(frames)), len(layout)),
         joints=table[..., :dims],
         confidence=table[..., kinds.index("likelihood")] if "likelihood" in kinds else None,
-        tracks=list(layout) * len(frames) if individuals else None,
+        tracks=list(layout) * len(frames) if tracked else None,
         skeleton=Skeleton(source.path.stem, tuple(parts)),
     )
     return to_clips(source.path, recording, options)
@@ -82,7 +101,7 @@ def _layout(source: Source, parts: list[str], coords: list[str], individuals: li
 
 def _frames(source: Source, keys: list[str]) -> IntArray:
     """Frame numbers from the index column: numbers, or names of images."""
-    numbers = [frame_number(key) for key in keys]
+    numbers = [int(key) if key.isdecimal() and len(key) < 16 else frame_number(key) for key in keys]
     if None in numbers:
         raise error(
             source.path, f"frame {shown(keys[numbers.index(None)])} has no number", "number the frames, or the images by frame"

@@ -9,9 +9,14 @@ from indexing.readers.files import Source
 
 DEEPEST = 3  # lists of people inside each other
 REMEDY = (
-    "export what OpenPose, COCO, MediaPipe, DeepLabCut, MMPose, Ultralytics or SLEAP write, or a clip set, or say the format "
-    "(--format, format=)"
+    "export what OpenPose, COCO, AlphaPose, MediaPipe, DeepLabCut, MMPose, Ultralytics, SLEAP, FreeMoCap, OpenSim, movement or "
+    "pyskl write, or a clip set, or say the format (--format, format=)"
 )
+KINDS = {
+    "video": "video", "npz": "clipset", "txt folder": "ultralytics", "trc": "trc", "c3d": "mocap", "pickle": "pyskl",
+    "npy folder": "freemocap",
+}  # fmt: skip
+"""Kinds of files that only one reader knows."""
 
 
 def detect(source: Source) -> str:
@@ -20,12 +25,16 @@ def detect(source: Source) -> str:
     Raises:
         ValueError: no reader knows this structure; the message says what was found.
     """
-    if source.kind == "npz":
-        return "clipset"
+    if source.kind in KINDS:
+        return KINDS[source.kind]
+    if source.kind == "hdf5":
+        return _detect_hdf5(source)
+    if source.kind == "npy":
+        from indexing.readers.freemocap import rank
+
+        return "npy" if rank(source.path.name) is None else "freemocap"
     if source.kind == "csv":
         return _detect_csv(source)
-    if source.kind == "txt folder":
-        return "ultralytics"
     if source.kind == "json folder":
         frames = [frame.data for frame in source.data]
         found, shown = next((name for frame in frames if (name := detect_json(frame))), None), frames[0]
@@ -91,6 +100,20 @@ def _detect_csv(source: Source) -> str:
     if find_columns(rows[0]) is None:
         raise error(source.path, f"text without keypoint columns that a reader knows (first row: {listed(rows[0], 6)})", REMEDY)
     return "mediapipe"
+
+
+def _detect_hdf5(source: Source) -> str:
+    from indexing.readers.frames import holds_frame
+    from indexing.readers.hdf import opened_hdf5
+    from indexing.readers.movement import holds_poses
+    from indexing.readers.sleap import holds_sleap
+
+    with opened_hdf5(source.path) as file:
+        found = {"deeplabcut": holds_frame, "sleap": holds_sleap, "movement": holds_poses}
+        name = next((name for name, holds in found.items() if holds(file)), None)
+        if name is None:
+            raise error(source.path, f"HDF5 without keypoints that a reader knows (it has {listed(file.names(), 6)})", REMEDY)
+    return name
 
 
 def _only_empty_lists(data: Any) -> bool:

@@ -8,15 +8,19 @@ from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from indexing.clip import FloatArray, check_fps
 from indexing.opening import VALUE, clipped, entries, error, head_of, listed, parse_json, read_rows, read_text, shown, size_of
+from indexing.skeleton import layout_named
 
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv")
 KEYPOINTS = "give keypoints as JSON, CSV or a clip-set .npz"
+BINARY = {b"\x89HDF": "hdf5", b"\x93NUMPY": "npy", b"PathFileType": "trc", **{b"\x80" + bytes([i]): "pickle" for i in range(2, 6)}}
+"""Kinds of files by how they begin."""
+PICKLES = (".pkl", ".pickle")
 HEADER_ROWS = 5  # enough to tell every CSV format apart
 
 
@@ -34,8 +38,10 @@ class Source:
 
     Args:
         path: as the caller gave it.
-        kind: ``"npz"``, ``"json"``, ``"csv"``, ``"json folder"`` or ``"txt folder"``.
-        data: nothing, the parsed JSON, the first rows, a list of :class:`FrameFile` (JSON parsed; text not yet read).
+        kind: ``"npz"``, ``"json"``, ``"csv"``, ``"trc"``, ``"c3d"``, ``"hdf5"``, ``"npy"``, ``"pickle"``, or ``"json folder"``,
+            ``"txt folder"``, ``"npy folder"``.
+        data: nothing, the parsed JSON, the first rows, a list of :class:`FrameFile` (JSON parsed; text not yet read), the paths of
+            the arrays of a folder.
     """
 
     path: Path
@@ -56,7 +62,7 @@ def open_source(path: str | Path) -> Source:
     """Look at what a path holds, without deciding on a format.
 
     Raises:
-        ValueError: it does not exist, is empty, or cannot hold keypoints (a video, a model, a pickle, HDF5).
+        ValueError: it does not exist, is empty, or cannot hold keypoints (a video, a model, weights of a network).
     """
     path = Path(path).expanduser()
     if os.path.isdir(path):
@@ -64,13 +70,16 @@ def open_source(path: str | Path) -> Source:
     size_of(path, what="file or folder")
     suffix = path.suffix.lower()
     if suffix in VIDEOS:
-        raise error(
-            path,
-            "is a video, but keypoints are expected, and no pose estimator ships here",
-            "run one first (RTMPose/MMPose, Ultralytics, OpenPose, MediaPipe, DeepLabCut) and give its keypoint file",
-        )
+        return Source(path, "video")
     head = head_of(path)
     _refuse_binary(path, suffix, head)
+    for start, kind in BINARY.items():
+        if head.startswith(start):
+            return Source(path, kind)
+    if suffix in PICKLES:
+        return Source(path, "pickle")
+    if suffix == ".c3d":
+        return Source(path, "c3d")
     if head.startswith(b"PK") or suffix == ".npz":
         return Source(path, "npz")
     if head.removeprefix(b"\xef\xbb\xbf").lstrip()[:1] in (b"{", b"["):
@@ -84,22 +93,28 @@ def open_source(path: str | Path) -> Source:
 def _refuse_binary(path: Path, suffix: str, head: bytes) -> None:
     if suffix == ".safetensors" or head[8:10] == b'{"':
         raise error(path, "is a model file, but keypoints are expected", "give it with -m (--model), or to ActionIndexer.load")
-    if head.startswith(b"\x89HDF"):
-        raise error(
-            path,
-            "is an HDF5 file, which is not read here",
-            "export CSV instead (SLEAP: File > Export Analysis CSV, or sleap-convert; DeepLabCut: save_as_csv=True)",
-        )
-    if suffix in (".pkl", ".pickle", ".pt", ".pth", ".joblib"):
+    if suffix in (".pt", ".pth", ".joblib"):
         raise error(path, "is a pickle, which can run code when it is read", "export JSON, CSV or a clip-set .npz instead")
-    if head.startswith(b"\x93NUMPY"):
-        raise error(path, "is a bare .npy array", "save it as a clip set: np.savez(file, joints=array, fps=...)")
-    if b"\0" in head and not head.startswith(b"PK") and suffix != ".npz":
+    if head.startswith(b"CDF"):
+        raise error(path, "is a netCDF file of version 3", "save it as netCDF 4: dataset.to_netcdf(path, engine='h5netcdf')")
+    if b"\0" in head and not head.startswith((b"PK", *BINARY)) and suffix not in (".npz", ".c3d", *PICKLES):
         raise error(path, "is a binary file that no reader knows", KEYPOINTS)
+
+
+def _arrays(folder: Path, visible: Sequence[Path]) -> list[Path]:
+    """The arrays of a recording of FreeMoCap, whose folder has them two floors down."""
+    found = [entry for entry in visible if entry.suffix.lower() == ".npy"]
+    for name in ("output_data", "raw_data"):
+        inside = next((entry for entry in visible if entry.name == name and entry.is_dir()), None)
+        if inside is not None:
+            found += _arrays(inside, entries(inside))
+    return found
 
 
 def _open_folder(folder: Path) -> Source:
     visible = entries(folder)
+    if any(entry.name == "output_data" for entry in visible):
+        return Source(folder, "npy folder", _arrays(folder, visible))
     for suffix in (".json", ".txt"):
         files = [entry for entry in visible if entry.suffix.lower() == suffix and entry.name != "classes.txt"]
         if not files:
@@ -124,6 +139,9 @@ def _open_folder(folder: Path) -> Source:
             size_of(file)  # a folder or a pipe among them is named before any of them is read
         read = load_json if suffix == ".json" else _nothing
         return Source(folder, f"{suffix[1:]} folder", [FrameFile(n, f, read(f)) for n, f in sorted(numbered.items())])
+    arrays = _arrays(folder, visible)
+    if arrays:
+        return Source(folder, "npy folder", arrays)
     inside = listed((entry.name for entry in visible), 5) if visible else "nothing"
     raise error(folder, f"the folder has no .json or .txt keypoint files (it has {inside})", "give the folder of one recording")
 
@@ -229,6 +247,18 @@ class LinkOptions:
 
 
 @dataclass(frozen=True)
+class WatchOptions:
+    """How people are found in a video, by :func:`indexing.pose.detect`."""
+
+    people: int = 4
+    """Looked for at most.  Where there is only one, looking for others costs a hundredth of the time."""
+    model: Literal["heavy", "full", "lite"] | None = None
+    """The network; the sharpest that is there where none is named."""
+    every: int = 1
+    """Frames of which one is looked at."""
+
+
+@dataclass(frozen=True)
 class Options:
     """The arguments of :func:`indexing.readers.read` that the format modules share.
 
@@ -242,6 +272,8 @@ class Options:
     label: Hashable | None = None
     size: tuple[float, float] | None = None
     linking: LinkOptions = LinkOptions()
+    layout: str | None = None
+    watching: WatchOptions = WatchOptions()
 
     def __post_init__(self) -> None:
         if self.fps is not None:
@@ -250,6 +282,10 @@ class Options:
             raise ValueError(f"unknown person={self.person!r}; use one of {', '.join(PEOPLE)}")
         if not isinstance(self.linking, LinkOptions):
             raise ValueError(f"linking must be LinkOptions, got {self.linking!r}; use dataclasses.replace(LinkOptions(), ...)")
+        if not isinstance(self.watching, WatchOptions):
+            raise ValueError(f"watching must be WatchOptions, got {self.watching!r}; use dataclasses.replace(WatchOptions(), ...)")
+        if self.layout is not None:
+            layout_named(self.layout)
         if not _is_number(self.min_confidence):
             raise ValueError(f"min_confidence must be a number (0 keeps every joint), got {self.min_confidence!r}")
         if self.size is not None:

@@ -16,7 +16,7 @@ from indexing.clip import ClipSet
 from indexing.opening import error
 from indexing.readers.files import Options, Source
 from indexing.readers.recording import Detection, gather, numbers, to_clips, track_id
-from indexing.skeleton import Skeleton, known
+from indexing.skeleton import Skeleton, candidates, known
 
 REMEDY = "export with MMPoseInferencer(..., pred_out_dir=...) or a demo script's --save-predictions"
 
@@ -34,8 +34,11 @@ def read(source: Source, options: Options) -> ClipSet:
     ]
     recording = gather(source.path, people)
     joints, dims = recording.joints.shape[1:]
-    layout = _layout(source, joints) or (known(joints) if dims == 2 else None)
-    return to_clips(source.path, replace(recording, skeleton=layout, up="-y" if dims == 2 else "z"), options)
+    layout, up = _layout(source, joints), "-y" if dims == 2 else "z"
+    rivals = candidates(joints) if layout is None and dims == 3 else ()  # a lifter's, which are Human3.6M's as a rule
+    if layout is None and dims == 2:
+        layout = known(joints)
+    return to_clips(source.path, replace(recording, skeleton=layout, up=up, layouts=rivals), options)
 
 
 def _frames(source: Source) -> list[tuple[int, list[Any]]]:
@@ -90,6 +93,9 @@ def _layout(source: Source, joints: int) -> Skeleton | None:
     try:
         named = {int(i): str(name) for i, name in meta["keypoint_id2name"].items()}  # type: ignore[index]
         bones = tuple((int(a), int(b)) for a, b in meta.get("skeleton_links", ()))  # type: ignore[union-attr]
-        return Skeleton(str(meta.get("dataset_name", "MMPose")), tuple(named[i] for i in range(joints)), bones)  # type: ignore[union-attr]
+        names = tuple(named[i] for i in range(joints))
+        if "neck_base" in names and "left_ankle" not in names:  # Human3.6M's word for the ankles
+            names = tuple(name.replace("_foot", "_ankle") for name in names)
+        return Skeleton(str(meta.get("dataset_name", "MMPose")), names, bones)  # type: ignore[union-attr]
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError):
         return None  # names are a convenience: without them the joints are as good

@@ -15,8 +15,13 @@ from indexing.opening import error
 from indexing.readers.files import Options, Source, frame_number
 from indexing.readers.recording import Detection, flat, gather, to_clips, track_id
 
-# layouts by number of joints: with OpenPose, unlike in general, these numbers have one meaning
-LAYOUTS = {25: skeleton.BODY25, 18: skeleton.OPENPOSE18, 15: skeleton.OPENPOSE_MPI15, 17: skeleton.COCO17, 33: skeleton.MEDIAPIPE33}
+# layouts by number of joints; AlphaPose and RTMPose write their own in OpenPose's form
+LAYOUTS = {
+    25: skeleton.BODY25, 18: skeleton.OPENPOSE18, 15: skeleton.OPENPOSE_MPI15, 17: skeleton.COCO17, 33: skeleton.MEDIAPIPE33,
+    26: skeleton.HALPE26, 133: skeleton.WHOLEBODY133, 136: skeleton.HALPE136,
+}  # fmt: skip
+RIVALS = {25: (skeleton.BODY25, skeleton.BODY25B)}
+"""Models of OpenPose that a number of joints does not tell apart."""
 
 
 def read(source: Source, options: Options) -> ClipSet:
@@ -27,7 +32,9 @@ def read(source: Source, options: Options) -> ClipSet:
     """
     source.need("openpose", "json folder", "json")
     recording = gather(source.path, [(number, _people(source, number, frame)) for number, frame in _frames(source)])
-    return to_clips(source.path, replace(recording, skeleton=LAYOUTS.get(recording.joints.shape[1])), options)
+    joints = recording.joints.shape[1]
+    recording = replace(recording, skeleton=LAYOUTS.get(joints), layouts=RIVALS.get(joints, ()))
+    return to_clips(source.path, recording, options)
 
 
 def _frames(source: Source) -> list[tuple[int, Any]]:

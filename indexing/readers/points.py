@@ -81,12 +81,17 @@ class PointSequence:
         values: ``(frames, n, d)``, NaN = missing.
         ids: ``n`` names; None = none.
         first: number of the first frame.
+        rate: frames per second; 0 = not known.
+        units: of the values; up: the direction that is up, as of a clip.  Empty = not known.
     """
 
     path: str
     values: FloatArray
     ids: tuple[str, ...] | None = None
     first: int = 0
+    rate: float = 0.0
+    units: str = ""
+    up: str = ""
 
     def views(self, frames: tuple[int, ...] | None) -> list[PointSet]:
         """The frames of these numbers; without numbers, all, where there are two or three.

@@ -6,8 +6,8 @@ frame by frame); :func:`to_clips` does the rest, the same for all formats.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,6 +18,7 @@ from dyntorch.numerics import Message
 from indexing.clip import LARGEST, Clip, ClipSet, FloatArray
 from indexing.opening import error, shown
 from indexing.readers.files import LinkOptions, Options
+from indexing.readers.layouts import settled, told
 from indexing.skeleton import Skeleton
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -184,6 +185,7 @@ def _areas(joints: FloatArray) -> FloatArray:
     return np.asarray(np.sort(_extents(joints), axis=1)[:, -2:].prod(axis=1))
 
 
+FOLLOWING = ("person", "followed", "untracked", "people")  # what is known of a clip because of who is followed in it
 LAST_FRAME = 2**53  # whole numbers are exact below it
 NORMALIZED = 4.0  # coordinates from 0 to 1 stay below it even for joints guessed outside the image; pixels do not
 
@@ -208,6 +210,8 @@ class Recording:
         tracks: one identity per detection (None = not tracked), or None where the file has none.
         times: ``(f,)`` seconds, where the file has them; otherwise times are frame number / fps.
         up: as in :class:`indexing.clip.Clip`.
+        layouts: that the joints may be of, where their number alone speaks for ``skeleton``.
+        meta: what else is known of everybody in it.
     """
 
     frames: IntArray
@@ -218,6 +222,8 @@ class Recording:
     times: FloatArray | None = None
     skeleton: Skeleton | None = None
     up: str = "-y"
+    layouts: tuple[Skeleton, ...] = ()
+    meta: Mapping[str, Any] = field(default_factory=dict)
 
 
 def numbers(path: Path, where: str, value: Any) -> FloatArray:
@@ -313,7 +319,7 @@ def to_clips(path: Path, recording: Recording, options: Options) -> ClipSet:
     Raises:
         ValueError: nobody was seen, frames or times do not increase, a confidence is NaN, or the person rule does not apply.
     """
-    recording = _mask(path, _scale(path, recording, options), options.min_confidence)
+    recording = _named(path, _mask(path, _scale(path, recording, options), options.min_confidence), options)
     times, fps = _times(path, recording, options.fps)
     name = path.name or path.resolve().name
     each = options.person in ("all", "everyone")
@@ -321,6 +327,7 @@ def to_clips(path: Path, recording: Recording, options: Options) -> ClipSet:
     own = {"followed": "position"} if ids is None else {"followed": "ids", "untracked": int((ids < 0).sum())}
     crowd = np.bincount(recording.at)
     others = {"people": int(crowd.max())} if (crowd > 1).mean() > options.linking.crowded else {}
+    known = dict(recording.meta)
     clips = []
     for track, rows in choose(path, recording, options.person, options.linking):
         # each person's clip spans what was seen of that person
@@ -337,11 +344,36 @@ def to_clips(path: Path, recording: Recording, options: Options) -> ClipSet:
                 name=f"{name}#{track}" if one else name,
                 skeleton=recording.skeleton,
                 up=recording.up,
-                meta={"person": track, **own} if each else others,
+                meta={**known, "person": track, **own} if each else known | others,
                 fps_assumed=recording.times is None and options.fps is None,
             )
         )
     return ClipSet(clips, name)
+
+
+def of_people(clips: Sequence[Clip]) -> Recording | None:
+    """The recording that clips are the people of, as :func:`to_clips` gives them for ``person="everyone"``; of others None."""
+    if not clips or not all("followed" in clip.meta and "person" in clip.meta for clip in clips):
+        return None
+    first, people = clips[0], [clip.meta["person"] for clip in clips]
+    kinds = {(clip.joints.shape[1:], clip.up, clip.label) for clip in clips}
+    if len(set(people)) < len(people) or len(kinds) > 1 or not any(clip.seen.any() for clip in clips):
+        return None
+    times = np.unique(np.concatenate([clip.times for clip in clips]))
+    seen = [clip.seen.any(axis=1) for clip in clips]
+    sure = [clip.seen * 1.0 if clip.confidence is None else clip.confidence for clip in clips]
+    given, alone = any(clip.confidence is not None for clip in clips), len(clips) == 1
+    return Recording(
+        frames=np.arange(len(times)),
+        at=np.concatenate([np.searchsorted(times, clip.times[rows]) for clip, rows in zip(clips, seen, strict=True)]),
+        joints=np.concatenate([clip.joints[rows] for clip, rows in zip(clips, seen, strict=True)]),
+        confidence=np.concatenate([one[rows] for one, rows in zip(sure, seen, strict=True)]) if given else None,
+        tracks=None if alone else [person for person, rows in zip(people, seen, strict=True) for _ in range(int(rows.sum()))],
+        times=times,
+        skeleton=first.skeleton,
+        up=first.up,
+        meta={key: value for key, value in first.meta.items() if key not in FOLLOWING or (alone and key == "people")},
+    )
 
 
 class NobodySeen(ValueError):
@@ -351,6 +383,16 @@ class NobodySeen(ValueError):
         what = f"no person was detected in any of {len(frames)} frames"
         super().__init__(*error(path, what, Message("check the video, the estimator's threshold and {arg:min_confidence}")).args)
         self.frames, self.times = frames, times
+
+
+def _named(path: Path, recording: Recording, options: Options) -> Recording:
+    """Which joint is which: as the caller says, or where only their number is known, as the body looks."""
+    if options.layout is not None:
+        return replace(recording, skeleton=told(path, options.layout, recording.joints.shape[1]))
+    if not recording.layouts:
+        return recording
+    layout, said, _ = settled(recording.joints, recording.skeleton, recording.layouts, recording.up)
+    return replace(recording, skeleton=layout, meta={**recording.meta, **said})
 
 
 def _around(times: FloatArray, at: IntArray, away: float) -> IntArray:

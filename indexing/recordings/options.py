@@ -98,3 +98,28 @@ class LiveOptions:
     """Seconds by which levels of scores are told, at most: cameras and people change."""
     recent: int = 30
     """Steps between the latest frames by which it is told that frames are too far apart for any window."""
+
+
+@dataclass(frozen=True)
+class SuggestOptions:
+    """Which parts of recordings are worth a person's time, measured by ``experiments.labels.suggesting``."""
+
+    candidates: int = 600
+    """Parts that are compared with each other, at most, spread evenly over the recordings: some 2 s for all pairs."""
+    shortest: float = 1.0
+    """Seconds of a part of what nothing explains, at least: of less nobody can say what it is."""
+    longest: float = 2.0
+    """Times an ordinary example, beyond which what was found is cut into parts: a wrong find may hold several actions."""
+    labelled: float = 0.3
+    """Share of a part that is labelled already, from which on it is not suggested again."""
+    still: float = 0.5
+    """Times the motion of still moments of the examples: where nobody moves more there is nothing to name."""
+    shown: float = 0.5
+    """Share of a part's frames that must show the person."""
+    unsure: float = 1.0
+    """How much more a part counts between two actions (margin 0) than where the action is sure (margin 1)."""
+    far: float = 0.33
+    """Of the residual between examples of different actions, from which on the reason that is given is that a part is unlike all of
+    them.  Actors: the actions that are known stand at .03 to .05 of it, others at .45 to .6."""
+    doubt: float = 0.5
+    """Margin, as a difference of probabilities, below which the reason that is given is that it may be either of two."""

@@ -123,7 +123,7 @@ class _Track:
 
 def of_recording(clips: Sequence[Clip]) -> bool:
     """Whether clips are the people of one recording, as the readers follow them, and not a set of recordings."""
-    return bool(clips) and all("followed" in clip.meta for clip in clips)
+    return bool(clips) and all({"followed", "person"} <= clip.meta.keys() for clip in clips)
 
 
 def tracked_people(clips: Sequence[Clip], name: str = "", options: PresenceOptions = PresenceOptions()) -> Crowd:

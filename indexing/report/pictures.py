@@ -128,12 +128,13 @@ def timeline_tips(
     return tips
 
 
-def confusion(counts: ArrayLike, classes: Sequence[object]) -> bytes:
+def confusion(counts: ArrayLike, classes: Sequence[object], sides: tuple[str, str] = ("performed", "recognized as")) -> bytes:
     """PNG of a confusion matrix: a row per true class and a column per predicted one; colour = share of the row.
 
     Args:
-        counts: ``(classes, classes)`` whole numbers.
+        counts: ``(classes, classes)`` numbers, written as they are.
         classes: names, in the order of the rows.
+        sides: what rows and columns are.
 
     Raises:
         ValueError: shapes do not fit.
@@ -160,8 +161,8 @@ def confusion(counts: ArrayLike, classes: Sequence[object]) -> bytes:
         axes.vlines(edges, -0.5, number - 0.5, color=LIGHT.line, linewidth=0.6)
         axes.set(xlim=(-0.5, number - 0.5), ylim=(number - 0.5, -0.5))
         axes.tick_params(length=0)
-        axes.set_xlabel("recognized as", labelpad=8)
-        axes.set_ylabel("performed", labelpad=8)
+        axes.set_xlabel(sides[1], labelpad=8, parse_math=False)
+        axes.set_ylabel(sides[0], labelpad=8, parse_math=False)
         for row, column in np.argwhere(table > 0):  # zeros stay blank: the eye then finds the errors
             colour = LIGHT.paper if share[row, column] > 0.55 else LIGHT.ink
             text = f"{table[row, column]}"

@@ -534,7 +534,7 @@ def drop_checks(folder: Path, written: Sequence[str]) -> None:
 
 
 def _shown(take: Take, person: int) -> Path | Clip:
-    if take.kind == "keypoints":
+    if take.kind == "keypoints" and take.video is None:
         return take.people[person]
     assert take.path is not None  # the command line has no frames without a file
     return take.path

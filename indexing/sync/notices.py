@@ -23,6 +23,10 @@ class SyncNotice(NoticeCode):
     """What each method says."""
     PEOPLE = "people", "several people in view: compared {first} with {second}, the best of {value:g} pairings"
     """Who was compared."""
+    BY_PIXELS = "by_pixels", "the keypoints do not decide ({keypoints}); this is what the videos' pixels say"
+    """Keypoints of videos that do not decide, and pixels that do."""
+    NEITHER = "neither", "the pixels do not decide, either: {pixels}"
+    """Neither keypoints nor pixels of two videos decide."""
     DISAGREE = (
         "disagree",
         f"{_METHODS}; record keypoints of the people, or a longer take with more motion",

@@ -75,6 +75,8 @@ class VideoOptions:
     """Moving points that must be followed in each video."""
     size: int = 320
     """Longer side at which brightness is read, pixels: all that the method looks at."""
+    people: int = 4
+    """Looked for in a video at most, where a pose model is there: pairings of more are not tried."""
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ import numpy as np
 
 from dyntorch.core import Notice, status_from
 from indexing.clip import Clip
+from indexing.joints import named, places
 from indexing.skeleton import Skeleton, known
 from indexing.sync.notices import SyncNotice, besides
 from indexing.sync.options import SyncOptions
@@ -130,19 +131,18 @@ def common_joints(a: Clip, b: Clip, options: SyncOptions = SyncOptions()) -> tup
         if count[0] == count[1]:
             return a, b, True, ""
     else:
-        shared = [name for name in first.joints if name in second.joints]
-        if len(shared) >= options.people.joints:
-            said = f"{first.name} and {second.name} share {len(shared)} joints; these are compared"
-            return _only(a, shared), _only(b, shared), True, said
+        there = [(i, j) for i, j in enumerate(places(second, first)) if j >= 0] if named(first) and named(second) else []
+        if len(there) >= options.people.joints:
+            names = tuple(first.joints[i] for i, _ in there)
+            said = f"{first.name} and {second.name} share {len(there)} joints; these are compared"
+            return _only(a, [i for i, _ in there], names), _only(b, [j for _, j in there], names), True, said
     names = [clip.skeleton.name if clip.skeleton is not None else f"{n} joints" for clip, n in zip((a, b), count, strict=True)]
     return a, b, False, f"different joints ({names[0]}, {names[1]}): compared as different points, which needs longer takes"
 
 
-def _only(clip: Clip, names: Sequence[str]) -> Clip:
-    assert clip.skeleton is not None
-    index = [clip.skeleton.joints.index(name) for name in names]
+def _only(clip: Clip, index: list[int], names: tuple[str, ...]) -> Clip:
     confidence = None if clip.confidence is None else clip.confidence[:, index]
-    return clip.replace(joints=clip.joints[:, index], confidence=confidence, skeleton=Skeleton("common joints", tuple(names)))
+    return clip.replace(joints=clip.joints[:, index], confidence=confidence, skeleton=Skeleton("common joints", names))
 
 
 def disagreements(a: Clip, b: Clip, shift: Shift, options: SyncOptions = SyncOptions()) -> list[tuple[float, float, float]]:

@@ -17,16 +17,19 @@ from torch import Tensor
 from dyntorch.core import Notice, status_from
 from dyntorch.numerics import Message, check_options, named
 from indexing.clip import Clip
+from indexing.remarks import is_normalized
 from indexing.sync.notices import SyncNotice, besides, noted
 from indexing.sync.options import MEASURES, Measure, SyncOptions
 from indexing.sync.people import Pairing, common_joints, disagreements, jumps, match_people
-from indexing.sync.takes import Take, take_of
+from indexing.sync.takes import By, Take, take_of
 
 if TYPE_CHECKING:
     from dyntorch import Shift
 
 Method = Literal["auto", "keypoints", "tracks", "brightness"]
 METHODS = ("auto", "keypoints", "tracks", "brightness")
+BY: dict[str, By] = {"auto": "auto", "keypoints": "keypoints", "tracks": "pixels", "brightness": "pixels"}
+"""What of videos each method compares."""
 LISTED = 3  # moments in a note
 
 
@@ -55,11 +58,12 @@ def synchronize(
     the same moving things: their trajectories span subspaces that meet at the right shift.  Brightness needs no points at all.
 
     Args:
-        a, b: a :class:`~indexing.Clip` with 2D joints; the path of keypoints in any format of :mod:`indexing.readers` (a file,
-            or a folder with one file per frame); the path of a video; keypoints ``(frames, joints, 2)``, pixels, NaN = missing;
-            or gray frames ``(frames, height, width)``.
-        method: ``"keypoints"``, ``"tracks"``, ``"brightness"``, or ``"auto"``: keypoints where both have them; for two videos
-            tracks and brightness, of which both must say the same.
+        a, b: a :class:`~indexing.Clip` with 2D joints, or a ``movement`` dataset of poses; the path of keypoints in any format of
+            :mod:`indexing.readers` (a file, or a folder with one file per frame); the path of a video; keypoints
+            ``(frames, joints, 2)``, pixels, NaN = missing; or gray frames ``(frames, height, width)``.
+        method: ``"keypoints"``, ``"tracks"``, ``"brightness"``, or ``"auto"``: keypoints where both have them, videos too, where a
+            pose model is there (:mod:`indexing.pose`); for two videos without one, or whose keypoints do not decide, tracks and
+            brightness, of which both must say the same.
         fps: frames per second of arrays and of files that have no times, of both or of each (30 by default, and then a note
             says so).
         max_shift: seconds, the largest offset that is searched; by default as far as the takes overlap enough to tell.
@@ -72,7 +76,7 @@ def synchronize(
             confirm; or ``"window"``, that kernel alone (see :func:`indexing.sync.brightness.brightness_shift`).
         options: every number that decides about recordings, people, tracks and brightness, by stage; ``dataclasses.replace``
             changes some of them.
-        more: for the reader (``format=``, ``size=``) and for :func:`dyntorch.synchronize`.
+        more: for the reader (``format=``, ``size=``, ``layout=``) and for :func:`dyntorch.synchronize`.
 
     Returns:
         :class:`dyntorch.Shift`: offset and sigma in seconds, rate, confidence, all peaks, ``ok`` and the reason where it is
@@ -100,10 +104,10 @@ def synchronize(
     if len(rates) != 2:
         raise ValueError(f"fps must be one number, or one for each of two cameras, got {fps!r}")
     check_options(options, SyncOptions)
-    how = {name: more.pop(name) for name in ("format", "size") if name in more}
+    how = {name: more.pop(name) for name in ("format", "size", "layout") if name in more}
     takes = [
         take_of(value, name="" if isinstance(value, (Clip, str, Path)) else name, fps=rate, person=person,
-                min_confidence=min_confidence, **how, options=options)
+                min_confidence=min_confidence, by=BY[method], **how, options=options)
         for value, name, rate in zip((a, b), "ab", rates, strict=True)
     ]  # fmt: skip
     takes = [dataclasses.replace(take, name=take.name or letter) for take, letter in zip(takes, "ab", strict=True)]
@@ -128,6 +132,10 @@ def pair(
 
     _check(a, b, method, measure, options)
     lens = lenses(calibration, [a.name, b.name])
+    shapeless = [take for take in (a, b) if take.kind == "keypoints" and is_normalized(take.people[0])]
+    if lens and shapeless:
+        text = "{path}: its coordinates go from 0 to 1, and {arg:calibration=} is of pixels; give {arg:size=}, or leave it out"
+        raise ValueError(Message(text, path=str(shapeless[0].path or shapeless[0].name)))
     names = {"a": a.name or "a", "b": b.name or "b"}
     more = {**more, "calibration": lens.values if lens else None}
     try:
@@ -151,9 +159,22 @@ def _compared(
             partial(_keypoints, quick=True, options=options, **more),
             options=options,
         )
-        return found, _swapped(a, b, found, options)
+        limits = _swapped(a, b, found, options)
+        if found.shift.ok or method != "auto" or a.video is None or b.video is None:
+            return found, limits
+        return _second(found, synchronize_videos(a.video, b.video, method, **more, options=options)), limits
 
     return Pairing(synchronize_videos(a, b, method, measure, **more, options=options), (0, 0)), []
+
+
+def _second(found: Pairing, seen: Shift) -> Pairing:
+    """What the pixels of two videos say where the people in them do not decide: taken where it is sure, and said in any case."""
+    first = found.shift
+    if seen.ok:
+        known = Notice(SyncNotice.BY_PIXELS, 0.0, {"keypoints": _why(first)})
+        return dataclasses.replace(found, shift=dataclasses.replace(seen, notices=(known, *seen.notices)))
+    known = Notice(SyncNotice.NEITHER, 0.0, {"pixels": _why(seen)})
+    return dataclasses.replace(found, shift=dataclasses.replace(first, notices=(*first.notices, known)))
 
 
 def _check(a: Take, b: Take, method: Method, measure: Measure, options: SyncOptions) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,13 +12,18 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from dyntorch.numerics import Message
 from indexing.clip import Clip, check_fps, stretches
+from indexing.movement import clips_of, is_dataset
 from indexing.readers.files import VIDEOS
+from indexing.remarks import remarks_on
 from indexing.sync.options import SyncOptions
 
 FloatArray = NDArray[np.float64]
 Kind = Literal["keypoints", "video", "frames"]
-CHOICES = ("auto", "largest", "confident", "tracked")
+By = Literal["auto", "keypoints", "pixels"]
+FOLLOWED = {"largest": "the largest", "confident": "the one that the detector trusts most", "tracked": "one who is tracked"}
+CHOICES = ("auto", *FOLLOWED)
 ASSUMED = 30.0  # frames per second where nobody says
 
 
@@ -38,6 +44,7 @@ class Take:
         times: ``(frames,)`` seconds, of all frames; of a video the first and the last.
         count: how many frames there are.
         notes: what a user should know, a sentence each.
+        video: what the people were found in by a pose model, if in a video: it may be compared by its pixels, too.
     """
 
     name: str
@@ -51,6 +58,7 @@ class Take:
     times: FloatArray = dataclasses.field(default_factory=lambda: np.zeros(0))
     count: int = 0
     notes: tuple[str, ...] = ()
+    video: Take | None = None
 
 
 def take_of(
@@ -62,9 +70,17 @@ def take_of(
     min_confidence: float = 0.0,
     format: str | None = None,  # noqa: A002  (the word of the readers)
     size: tuple[float, float] | None = None,
+    layout: str | None = None,
+    by: By = "auto",
+    keypoints: Path | ValueError | None = None,
     options: SyncOptions = SyncOptions(),
 ) -> Take:
     """A recording from whatever a user has of it: see :func:`indexing.sync.synchronize.synchronize`.
+
+    Args:
+        by: of a video: the keypoints that a pose model finds, or its pixels; ``"auto"``: keypoints where such a model is there, and
+            it finds somebody.
+        keypoints: of a video, where they were found already, or why there are none.
 
     Raises:
         ValueError: nothing usable; one line with the file, what is wrong and what to do.
@@ -73,8 +89,11 @@ def take_of(
         return value
     if fps is not None:
         check_fps(fps)
-    how = {"min_confidence": min_confidence, "format": format, "size": size}
-    return _without_pauses(_taken(value, name, fps, person, how, options), options)
+    how = {"min_confidence": min_confidence, "format": format, "size": size, "layout": layout}
+    take = _taken(value, name, fps, person, how, options)
+    if take.kind == "video" and by != "pixels":
+        take = _watched(take, by, keypoints, person, how, options)
+    return _without_pauses(take, options)
 
 
 def _taken(value: Any, name: str, fps: float | None, person: str, how: dict[str, Any], options: SyncOptions) -> Take:
@@ -82,6 +101,8 @@ def _taken(value: Any, name: str, fps: float | None, person: str, how: dict[str,
         raise ValueError(f"person must be one of {', '.join(CHOICES)}, got {person!r}")
     if isinstance(value, Clip):
         return _of_clips(name or value.name, None, [value], options)
+    if is_dataset(value):
+        return _of_clips(name, None, list(clips_of(value, fps=fps, name=name)), options)
     if isinstance(value, Sequence) and value and all(isinstance(item, Clip) for item in value):
         return _of_clips(name or value[0].name, None, list(value), options)
     if isinstance(value, (str, Path)):
@@ -136,7 +157,11 @@ def _of_clips(name: str, path: Path | None, people: list[Clip], options: SyncOpt
     first = people[0]
     times = np.unique(np.concatenate([clip.times for clip in people]))
     seen, rate = tuple(people), frame_rate(times, float(first.fps or ASSUMED), options=options)
-    return Take(name, "keypoints", path, seen, seen, fps=rate, fps_assumed=first.fps_assumed, times=times, count=len(times))
+    known = [clip.replace(name=name) for clip in people[:1]] if name else people[:1]  # a camera goes by its own name
+    return Take(
+        name, "keypoints", path, seen, seen, fps=rate, fps_assumed=first.fps_assumed, times=times, count=len(times),
+        notes=tuple(remarks_on(known)),
+    )  # fmt: skip
 
 
 def frame_rate(times: FloatArray, about: float, options: SyncOptions = SyncOptions()) -> float:
@@ -156,18 +181,28 @@ def _of_file(name: str, path: Path, fps: float | None, person: str, how: dict[st
 
     if person != "auto":
         clips = read(path, fps=fps, person=person, **how)
-        return _noted(_of_clips(name, path, [_single(path, list(clips))], options), options)
+        return _noted(_of_clips(name, path, [_single(path, list(clips))], options), options, FOLLOWED[person])
     everyone = list(read(path, fps=fps, person="everyone", **how))
     if any(clip.label is not None for clip in everyone) or "person" not in everyone[0].meta:  # a set of clips, not a recording
         return _of_clips(name, path, [_single(path, everyone)], options)
     largest = read(path, fps=fps, person="largest", **how)[0]  # this one has the frames without people, too
     tried = candidates(largest, everyone, options=options) if len(everyone) > 1 else []
-    return _noted(dataclasses.replace(_of_clips(name, path, [largest, *tried], options), everyone=tuple(everyone)), options)
+    found = dataclasses.replace(_of_clips(name, path, [largest, *tried], options), everyone=tuple(everyone))
+    return _noted(found, options, "" if tried else FOLLOWED["largest"])
 
 
-def _noted(take: Take, options: SyncOptions) -> Take:
-    """The recording with notes on frames that are missing, and on those that show nobody."""
-    notes, steps = [], np.diff(take.times) * take.fps
+def _noted(take: Take, options: SyncOptions, followed: str) -> Take:
+    """The recording with notes on frames that are missing, on those that show nobody, and on others in view than who is followed.
+
+    Args:
+        followed: who that is; empty where several are tried, which is said of those who are compared.
+    """
+    notes: list[str] = []
+    people = take.people[0].meta.get("people")
+    if people is not None and followed:
+        text = "{name}: {people} people in view; compared is {followed}; {arg:person=} says otherwise"
+        notes.append(Message(text, name=take.name, people=people, followed=followed))
+    steps = np.diff(take.times) * take.fps
     lost = (
         int(np.rint(steps - 1).clip(0).sum())
         if len(steps) and not (np.abs(steps - np.rint(steps)) > options.recording.uneven).any()
@@ -210,6 +245,31 @@ def _of_video(name: str, path: Path, fps: float | None) -> Take:
     info = probe(path, fps=fps)
     notes = tuple(f"{path.name}: {note}" for note in info.notes)
     return Take(name, "video", path, fps=info.fps, times=np.array([0.0, info.duration]), count=info.frames, notes=notes)
+
+
+def _watched(
+    video: Take, by: By, keypoints: Path | ValueError | None, person: str, how: dict[str, Any], options: SyncOptions
+) -> Take:
+    """The people in a video, as a pose model sees them; the video itself where there is no model, or nobody is seen."""
+    from indexing.pose import available, keypoint_file
+    from indexing.readers.recording import NobodySeen
+
+    assert video.path is not None
+    if by == "auto" and keypoints is None and available() is None:
+        return video
+    try:
+        if isinstance(keypoints, ValueError):
+            raise keypoints
+        with tempfile.TemporaryDirectory(prefix="dyntorch-pose-") as passing:
+            file = keypoints or keypoint_file(video.path, passing, options.video.people).path
+            take = _of_file(video.name, file, None, person, how, options)
+    except NobodySeen:
+        if by == "keypoints":
+            raise
+        said = f"{video.path.name}: nobody is seen in it, so it is compared by its pixels"
+        return dataclasses.replace(video, notes=(*video.notes, said))
+    said = f"{video.path.name}: compared by the people that BlazePose {take.people[0].meta['model']} finds in it"
+    return dataclasses.replace(take, path=video.path, video=video, notes=(*video.notes, *take.notes, said))
 
 
 def _of_array(name: str, value: Any, fps: float | None, options: SyncOptions) -> Take:

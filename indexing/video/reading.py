@@ -76,6 +76,7 @@ class VideoInfo:
         dropped: frames missing in gaps of the timestamps (of the median interval).
         codec: as FFmpeg calls it.
         notes: what a user should know.
+        timed: whether the frames' times are the file's own.
     """
 
     path: Path
@@ -93,6 +94,7 @@ class VideoInfo:
     dropped: int
     codec: str
     notes: tuple[str, ...]
+    timed: bool = True
 
 
 @dataclass(frozen=True)
@@ -198,6 +200,15 @@ def probe(path: str | Path, *, fps: float | None = None) -> VideoInfo:
         ...
         ValueError: video 'nothing.mp4': no such file; check the path
     """
+    return frame_times(path, fps=fps)[0]
+
+
+def frame_times(path: str | Path, *, fps: float | None = None) -> tuple[VideoInfo, NDArray[np.float64]]:
+    """What :func:`probe` says, and when every frame is shown: ``(frames,)`` seconds on the clock of :func:`read_video`.
+
+    Raises:
+        ValueError: as :func:`probe`.
+    """
     failed: list[str] = []
     stamps: list[int | None] = []
     first = None
@@ -218,7 +229,8 @@ def probe(path: str | Path, *, fps: float | None = None) -> VideoInfo:
         codec = stream.codec_context.name
     timed = np.sort(np.array([s for s in stamps if s is not None], np.float64)) * base
     notes = [f"reading stopped early: {text}" for text in failed]
-    if len(timed) < 0.5 * len(stamps):
+    has_times = len(timed) >= 0.5 * len(stamps)
+    if not has_times:
         notes.append(untimed(fps))
         timed, zero, nominal = np.arange(len(stamps)) / (fps or UNTIMED_FPS), 0, 0.0
     start = timed[0] if zero is None else zero * base
@@ -227,12 +239,13 @@ def probe(path: str | Path, *, fps: float | None = None) -> VideoInfo:
     duration = float(times[-1] - times[0])
     repeated = len(timed) - len(times)
     notes += _notes(uneven, dropped, repeated, claimed, times[-1] - start, upright)
-    return VideoInfo(
+    info = VideoInfo(
         path=Path(path), width=width, height=height, frames=len(times), duration=duration,
         fps=(len(times) - 1) / duration if duration else nominal, nominal=nominal, variable=uneven > UNEVEN,
         rotation=upright.rotation, mirrored=upright.mirrored, start=float(start), repeated=repeated, dropped=dropped, codec=codec,
-        notes=tuple(notes),
+        notes=tuple(notes), timed=has_times,
     )  # fmt: skip
+    return info, times - start
 
 
 def evenness(times: NDArray[np.float64], tick: float = 0.0) -> tuple[float, int]:
@@ -356,6 +369,16 @@ class Video:
 
     def _frames(self) -> Iterator[tuple[NDArray[np.uint8], float]]:
         """Upright frames of the span, one by one, with their times."""
+        shape: _Shape | None = None
+        for frame, time in self.stored():
+            if shape is None:
+                shape = _Shape(frame, self.size, self.gray)
+                self.scale = shape.scale
+            yield shape(frame), time
+        self.notes += () if shape is None else shape.notes
+
+    def stored(self) -> Iterator[tuple[Any, float]]:
+        """PyAV's own frames of the span, as they are stored (not turned, in the file's colours), one by one, with their times."""
         self.notes = ()
         start, stop = self.span
         with opened(self.path) as (container, stream):
@@ -363,7 +386,6 @@ class Video:
             if start > 0 and stream.start_time is not None:
                 _seek(container, stream, start)
             decoder = _Decoder(container, stream)
-            shape: _Shape | None = None
             last, seen, ended = -math.inf, 0, False
             for frame in decoder:
                 time = clock(frame)
@@ -372,12 +394,9 @@ class Video:
                 if time <= last or time < start:
                     clock.repeated += time <= last
                     continue
-                if shape is None:
-                    shape = _Shape(frame, self.size, self.gray)
-                    self.scale = shape.scale
-                yield shape(frame), time
+                yield frame, time
                 last, seen = time, seen + 1
-            self.notes = decoder.notes + clock.notes + (() if shape is None else shape.notes)
+            self.notes = decoder.notes + clock.notes
             claimed = stream.duration * float(stream.time_base) if stream.duration else None
         if not ended and last > -math.inf:
             self.notes += tuple(cut_off(claimed, last))

@@ -1,12 +1,14 @@
 """Clip and ClipSet: what they accept, what they say, and that they hold still."""
 
 import dataclasses
+import warnings
 
 import numpy as np
 import pytest
 import torch
 
-from indexing import Clip, ClipSet
+from indexing import ActionIndexer, Clip, ClipSet, synchronize
+from indexing.actors import Person, stream
 from indexing.clip import as_clip
 from indexing.skeleton import COCO17, Skeleton
 
@@ -209,3 +211,61 @@ def test_times_beyond_the_precision_of_numbers_are_refused():
     with pytest.raises(ValueError, match=r"clip 'a': times reach 3e\+14 s, where numbers are 0.062 s apart, but frames 0.033 s"):
         Clip(np.zeros((40, 3, 2)), times=times, name="a")
     Clip(np.zeros((40, 3, 2)), times=np.arange(40) / 30 + 1.8e9)  # a date
+
+
+# ---- a third column that is no depth ---------------------------------------------------------------------------------------
+def detected(frames=60, scale=(1280.0, 720.0)):
+    """Joints that move smoothly, and how sure a detector is of each: x, y and confidence."""
+    rng = np.random.default_rng(0)
+    body = rng.uniform(-0.1, 0.1, (1, 17, 2)) + 0.5 + 0.1 * np.sin(np.arange(frames) / 9)[:, None, None]
+    sure = rng.beta(5, 2, (frames, 17, 1))
+    return np.concatenate([body * scale, sure], axis=2)
+
+
+SURE = "which is the confidence of pixels, not depth; give joints\\[..., :2\\] and confidence=joints\\[..., 2\\]"
+MAYBE = "z goes from 0 to 1 as a confidence does, and is taken for depth; if it is none, give joints"
+
+
+def unseen(value):
+    """The same with some joints not seen: ``value`` at all three."""
+    joints = detected()
+    joints[::3, 5] = value
+    return joints
+
+
+@pytest.mark.parametrize(
+    "joints", [detected(), unseen(0.0), unseen(np.nan), detected() * [0.1, 0.1, 1]], ids=["all", "0", "NaN", "small"]
+)
+def test_confidence_of_pixels_is_no_depth(joints):
+    with pytest.raises(ValueError, match=SURE):
+        Clip(joints)
+    with pytest.raises(ValueError, match=SURE):
+        ActionIndexer().fit([joints, joints + 1], ["a", "b"])
+    with pytest.raises(ValueError, match=SURE):
+        synchronize(joints, joints)
+    with pytest.warns(UserWarning, match=MAYBE):  # stretched to 0 to 1, only the values say what they are
+        Clip(joints * [1 / 1280, 1 / 720, 1])
+
+
+def test_confidence_of_a_point():
+    point = detected()[:, :1]
+    with pytest.warns(UserWarning, match=MAYBE):
+        Clip(point)
+    point[3] = 0
+    with pytest.raises(ValueError, match=SURE):
+        Clip(point)
+    assert Clip(point[..., :2], confidence=point[..., 2]).dims == 2
+    with pytest.raises(ValueError, match=r"of x, y, z and a confidence give joints\[..., :3\]"):
+        Clip(np.ones((4, 3, 4)))
+
+
+def test_depth_is_depth():
+    """Bodies in 3D whose heights or depths go from 0 to 1: in metres, brought to a cube, far away, in millimetres."""
+    scene, _ = stream(["wave", "squat", "kick"], Person(), rng=1)
+    joints = scene.joints - scene.joints.min(axis=(0, 1))
+    unit = joints / np.ptp(joints)
+    far = joints / [1, 1, np.ptp(joints[..., 2])] + np.linspace(0, 80, len(joints))[:, None, None] * [1, 0, 0]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for one in (joints, unit, unit[..., [0, 2, 1]], unit[..., [2, 1, 0]], far, 1000 * joints, unit[:, :1], unit * [1, 1, 0]):
+            assert Clip(one).dims == 3

@@ -5,8 +5,21 @@ import pytest
 
 from indexing import ActionIndexer, Clip, PhaseIndexer
 from indexing.actors import Person, dataset, detect, stream
-from indexing.joints import layout_of, matched
-from indexing.skeleton import BODY25, COCO17, Skeleton
+from indexing.joints import canonical, layout_of, matched, places
+from indexing.skeleton import (
+    BODY25,
+    BODY25B,
+    COCO17,
+    H36M17,
+    HALPE26,
+    HALPE136,
+    HAND21,
+    KINECT20,
+    LAYOUTS,
+    NTU25,
+    WHOLEBODY133,
+    Skeleton,
+)
 
 KNOWN = ("squat", "wave", "jumping_jack")
 ORDER = np.random.default_rng(0).permutation(17)
@@ -81,3 +94,68 @@ def test_layouts_without_names_that_contradict_each_other_are_refused():
     assert matched(clip, star) == (clip, "") and matched(clip.replace(skeleton=None), None)[1] == ""
     assert "joint 0 is taken for joint 0" in matched(clip.replace(skeleton=None), chain)[1]
     assert layout_of([clip, clip.replace(skeleton=Skeleton("named", ("a", "b", "c", "d")))]).name == "named"
+
+
+@pytest.mark.parametrize("learned", [layout for layout in LAYOUTS.values() if layout is not HAND21], ids=lambda x: x.name)
+def test_a_model_of_any_layout_of_a_body_takes_coco(recording, learned):
+    clip, said = matched(recording, learned, "a.json")
+    shared = [name for name in COCO17.joints if name in learned.joints]
+    assert clip.skeleton is learned or learned is COCO17
+    for name in shared:
+        np.testing.assert_array_equal(clip.joints[:, learned.joints.index(name)], recording.joints[:, COCO17.joints.index(name)])
+    assert (said == "") == (learned is COCO17)
+    assert ("near each other" in said) == (learned in (H36M17, KINECT20, NTU25))
+
+
+def test_faces_and_fingers_do_not_make_another_layout(recording):
+    for learned, count in ((WHOLEBODY133, 133), (HALPE136, 136)):
+        said = matched(recording, learned, "a.json")[1]
+        assert said.startswith(f"a.json: 17 of the {count} joints learned are in it; not ")
+    with pytest.raises(ValueError, match=r"0 of its 17 \(nose, left_eye, right_eye, left_ear, ...\) have names of the 21 joints"):
+        matched(recording, HAND21)
+
+
+def test_a_model_of_openpose_scans_coco(recording):
+    lesson = dataset([Person.random(0)], KNOWN, azimuth=0.0, rng=0)
+    wide = [as_body25(clip) for clip in lesson]
+    indexer = ActionIndexer(scorer="nearest").fit(wide, lesson.labels)
+    with pytest.warns(UserWarning, match=r"17 of the 25 joints learned are in it; not neck, mid_hip"):
+        indexer.predict([recording])
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        ("LShoulder", "left_shoulder"), ("RBigToe", "right_big_toe"), ("knee.R", "right_knee"), ("l_ankle", "Left Ankle"),
+        ("lhip", "left_hip"), ("MidHip", "hip"), ("pelvis", "mid_hip"), ("root", "CHip"), ("Head", "head_top"),
+        ("mouth_left", "left_mouth"),
+    ],
+)  # fmt: skip
+def test_the_same_point_in_other_words(one, other):
+    assert canonical(one) == canonical(other)
+    assert places(Skeleton("a", ("x", one)), Skeleton("b", (other,))) == [1]
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        ("neck", "upper_neck"), ("head", "head_center"), ("left_hip", "mid_hip"), ("spine_base", "mid_hip"), ("neck", "thorax"),
+        ("left_foot_index", "left_big_toe"), ("rear", "right_ear"), ("left_foot", "left_ankle"), ("hip_center", "root"),
+    ],
+)  # fmt: skip
+def test_points_that_are_only_near_are_others(one, other):
+    assert canonical(one) != canonical(other)
+    assert places(Skeleton("a", (one,)), Skeleton("b", (other,))) == [-1]
+
+
+def test_two_joints_with_names_for_one_point_are_taken_by_their_own(recording):
+    assert places(Skeleton("a", ("hip", "mid_hip")), Skeleton("b", ("mid_hip", "hip"))) == [1, 0]
+    assert places(Skeleton("a", ("hip", "root", "nose")), Skeleton("b", ("pelvis", "nose"))) == [-1, 2]  # which one nobody knows
+    assert places(Skeleton("a", ("hip",)), Skeleton("b", ("hip", "pelvis"))) == [0, -1]
+
+
+def test_openpose_layouts_share_what_they_share():
+    found = {
+        (a.name, b.name): sum(i >= 0 for i in places(a, b)) for a in (BODY25, BODY25B, HALPE26) for b in (BODY25, BODY25B, HALPE26)
+    }
+    assert found["BODY_25", "Halpe-26"] == 25 and found["BODY_25B", "Halpe-26"] == 24 and found["BODY_25", "BODY_25B"] == 23

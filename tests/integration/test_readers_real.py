@@ -11,7 +11,7 @@ import pytest
 
 from indexing.clip import ClipSet
 from indexing.readers import read, read_clip
-from indexing.skeleton import BODY25
+from indexing.skeleton import BODY25B
 
 FOLDER = os.environ.get("DYNTORCH_DATA")
 pytestmark = pytest.mark.skipif(not FOLDER, reason="DYNTORCH_DATA is not set: no real data")
@@ -66,7 +66,7 @@ def test_openpose_of_four_cameras(camera: int, rule: str, tmp_path: Path) -> Non
     assert np.mean(same) >= 0.99  # in one frame of camera 0 the file's own choice is the bystander
     moved = np.nanmedian(np.linalg.norm(np.diff(clip.joints, axis=0), axis=2), axis=1)
     assert moved.max() < 60  # pixels per frame: nobody hops
-    assert clip.skeleton is BODY25
+    assert clip.skeleton is BODY25B
     np.testing.assert_allclose(clip.times, np.arange(100) / 60)
 
 

@@ -4,14 +4,17 @@ import csv
 import dataclasses
 import json
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from indexing import ActionIndexer, Clip, ClipSet
+from indexing import ActionIndexer, Clip, ClipSet, synchronize
 from indexing.actors import Person, dataset
 from indexing.cli import main
+from indexing.cli.inputs import Reading
+from indexing.cli.remarks import remarks
 from indexing.recordings.explanation import Withheld
 from indexing.recordings.options import ExplanationOptions
 from indexing.skeleton import BODY25, COCO17, Skeleton
@@ -64,9 +67,70 @@ def test_examples(run, clips):
     code, out, _ = run("index fit squat=squat wave=wave --fps 30 -o two.safetensors")
     assert "squat and wave are all that is known" in out and "add examples of ordinary movement" in out
     code, _, err = run("index fit a=squat b=squat -o m.safetensors")
-    assert code == 2 and "clips 0 ('squat') and 1 ('squat') are the same recording, but one is a and the other b" in err
+    assert code == 2 and "squat: is given as a and as b; correct a label, or give the seconds of each" in err
+    shutil.copytree("squat", "copy")
+    code, _, err = run("index fit a=squat b=copy -o m.safetensors")
+    assert code == 2 and "clips 0 ('squat') and 1 ('copy') are the same recording, but one is a and the other b" in err
+    code, out, err = run("index fit a=squat a=copy b=wave -o m.safetensors")
+    assert code == 0 and "warning: clips 0 ('squat') and 1 ('copy') are the same recording, which counts twice" in err
     code, out, _ = run("index fit a=squat@0-1 b=squat@1-9 --fps 30 -o m.safetensors")  # two parts of one recording may differ
-    assert code == 0
+    assert code == 0 and "count both as" not in out
+    code, out, _ = run("index fit a=squat@0-1 b=./squat@0.5-2 c=squat@1.8- --fps 30 -o m.safetensors")
+    assert code == 0 and "squat: 0.5 to 1 s count both as a and as b; correct the ranges" in out
+    assert "squat: 1.8 to 2 s count both as b and as c" in out
+
+
+RANGES = {
+    **dict.fromkeys(
+        ("1,5-4", "abc", "-", "1", "1:05-1:10", "-1-4", "1.5-4s", "", "1- 2", "1.5\u20134"), "is no range; write @start-end in"
+    ),
+    **dict.fromkeys(("4-2", "1-1"), "it ends at"),
+    "35-99": "no frame between 35 s and 99 s; it runs from 0 s to",
+    "35-": "no frame between 35 s and its end; it runs from 0 s to",
+    "-0.01": "squat@-0.01: one frame only lies in these seconds (0 s); give more of them",
+}
+
+
+@pytest.mark.parametrize("seconds", RANGES)
+def test_seconds_that_are_none(run, capsys, seconds):
+    main(["index", "fit", f"a=squat@{seconds}", "b=wave", "--fps", "30", "-o", "m.safetensors"])
+    err = capsys.readouterr().err
+    assert RANGES[seconds] in err and err.count("\n") == 1 and not Path("m.safetensors").exists()
+
+
+@pytest.mark.parametrize("command", ["index scan wave@1-2 -m m.safetensors", "sync wave@1-2 squat", "convert wave@1-2 -o a.trc"])
+def test_seconds_of_recordings(run, command):
+    run("index fit squat=squat wave=wave --fps 30 -o m.safetensors")
+    code, _, err = run(command)
+    assert code == 2 and "wave@1-2: seconds (@1-2) are for examples, and recordings are read as a whole; give wave" in err
+
+
+def test_one_tracked_point_is_no_person(run):
+    times = np.arange(90)
+    rows = "\n".join(f"{i},{300 + 90 * np.sin(i / 9):.2f},{200 + 60 * np.cos(i / 5):.2f}" for i in times)
+    Path("ball.csv").write_text(f"frame,x,y\n{rows}\n")
+    clip = Clip.load("ball.csv", fps=30)
+    assert clip.joints.shape == (90, 1, 2) and clip.skeleton.joints == ("point",) and np.array_equal(clip.times, times / 30)
+    code, _, err = run("index fit ball=ball.csv wave=wave -o m.safetensors")
+    assert code == 2 and "ball.csv: one tracked point, but an action is of joints that move against each other" in err
+    with pytest.raises(ValueError, match=r"clip 0 .*: joints: one tracked point"):
+        ActionIndexer().fit([clip.joints + 0, clip.joints[::-1]], ["a", "b"])
+
+
+def test_notes_of_readers(clips):
+    wave = clips["wave"].replace(up="-y", meta={"layout": "guessed: BODY_25, not BODY_25B", "may_lag": True}, name="a")
+    other = wave.replace(meta={"layout": "recognized: BODY_25B"}, name="b")
+    said = remarks([wave, wave.replace(name="c"), other], Reading())
+    assert said == [
+        "a, c: its joints are taken for BODY_25 by their number, though as many joints may be BODY_25B; --layout says otherwise",
+        "b: its joints are taken for BODY_25B, which is how the body looks; --layout says otherwise",
+        "a, c: may be smoothed by MediaPipe, whose tracking lags by up to 2.4 frames where movement is quick; 'dyntorch pose' does "
+        "not",
+    ]
+    assert remarks([clips["wave"]], Reading()) == []
+    notices = [one.text for one in synchronize(wave, clips["wave"]).notices]
+    assert any("taken for BODY_25 by their number" in text and "layout= says" in text for text in notices)
+    assert any("may be smoothed by MediaPipe" in text for text in notices)
 
 
 def test_recordings(run, clips):
@@ -114,15 +178,6 @@ def test_joints_by_name_and_a_recording_by_its_file(run, clips):
     assert code == 0 and rows[0] == rows[1]
     code, out, _ = run("index scan wave -m m.safetensors --fps 30")
     assert code == 0 and "wave: of its 25 joints (BODY_25) the 17 learned (COCO-17) are used" in out
-
-
-def test_confidence_is_no_depth():
-    x = np.random.default_rng(0).uniform(0, 1, (9, 17, 3)) * [1280, 720, 1]
-    with pytest.raises(ValueError, match=r"which is the confidence of pixels, not depth; give joints\[..., :2\]"):
-        ActionIndexer().fit([x, x + 1], ["a", "b"])
-    Clip(x * [1, 1, 700])
-    Clip(x * [1 / 720, 1 / 720, 1])
-    Clip(x * [1, 1, 0])
 
 
 def people(path, frames):

@@ -32,7 +32,10 @@ from indexing.cli import main
         ("index scan x -m m --persn all", "unknown option --persn; did you mean --person? see dyntorch index scan --help"),
         ("sync a b --fps 30 x", "unexpected 'x'; leave it out; see dyntorch sync --help"),
         ("index scan x", "missing: --model FILE (what 'dyntorch index fit' wrote); see dyntorch index scan --help"),
-        ("index scam x", "unknown command scam; did you mean scan? choose from fit, scan, evaluate; see dyntorch index --help"),
+        (
+            "index scam x",
+            "unknown command scam; did you mean scan? choose from fit, scan, evaluate, suggest; see dyntorch index --help",
+        ),
     ],
 )
 def test_one_clear_line(line: str, said: str, capsys: pytest.CaptureFixture[str]) -> None:

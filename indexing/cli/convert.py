@@ -1,0 +1,160 @@
+"""``dyntorch convert``: recordings in the format of another program."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from dyntorch.numerics import worded
+from indexing.cli.console import check_file, check_folder, count, flags, keep, names, progress, say
+from indexing.cli.inputs import Following, assumed
+from indexing.cli.remarks import remarks
+from indexing.opening import repeated
+
+if TYPE_CHECKING:
+    from indexing.clip import Clip
+
+WORDS = flags("fps", "units")
+SUFFIXES = (".npz", ".trc", ".c3d", ".nc")
+
+
+@dataclass(frozen=True)
+class Convert:
+    """Write recordings for another program: OpenSim (.trc), motion capture (.c3d), movement (.nc), or as a clip set (.npz).
+
+    dyntorch convert session.json -o session.trc
+
+    dyntorch convert a.json b.json pose/ --to c3d -o out/
+
+    dyntorch convert day/*.json -o day.npz      (one clip set of all)
+    """
+
+    recordings: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="FILE ...", help_behavior_hint="")]
+    """keypoint files of any format that is read, folders with one file per frame, clip sets, or videos"""
+    output: Annotated[Path, tyro.conf.arg(aliases=("-o",), metavar="FILE|FOLDER")]
+    """the file to write, whose end says the format; or a folder, for a file of each recording"""
+    to: Annotated[Literal["npz", "trc", "c3d", "nc"] | None, tyro.conf.arg(help_behavior_hint="")] = None
+    """the format of files in a folder"""
+    units: Annotated[Literal["m", "cm", "mm", "px"] | None, tyro.conf.arg(help_behavior_hint="")] = None
+    """of the coordinates, written into .trc and .c3d; coordinates stay as they are"""
+    reading: Following = field(default_factory=Following)
+
+    def run(self) -> int:
+        """Read all, write all or nothing, and say what the format does not hold."""
+        from indexing.files import prepare
+
+        if not self.recordings:
+            raise ValueError("no recordings; give at least one keypoint file or folder")
+        single = self._single()
+        target = check_file(self.output, self.recordings) if single else check_folder(self.output)
+        if self.units is not None and (self.to or target.suffix[1:].lower()) not in ("trc", "c3d"):
+            raise ValueError(f"--units {self.units}: of .trc and .c3d only; leave it out")
+        with progress("reading", steps=False):
+            read = [(path, *self._read(path)) for path in self.recordings]
+        found, notes = [(path, clips) for path, clips, _ in read], [note for *_, said in read for note in said]
+        if single and len(found) > 1 and target.suffix.lower() != ".npz":
+            raise ValueError(
+                f"{target}: one recording is a file, but {len(found)} are given; give a folder: --to {target.suffix[1:].lower()} "
+                f"-o {target.with_suffix('')}"
+            )
+        parts = [(target, [clip for _, clips in found for clip in clips])] if single else self._parts(found, target)
+        keep(self.recordings, [path for path, _ in parts])
+        with progress("writing", steps=False):
+            ready = [self._write(clips, path) for path, clips in parts]
+            prepare(target.parent if single else target)
+            about: dict[str, list[str]] = {}
+            for (path, _), (write, said) in zip(parts, ready, strict=True):
+                write()
+                for note in said:
+                    about.setdefault(note, []).append(path.name)
+        notes += [f"{names(which)}: {note}" for note, which in about.items()]
+        for note in dict.fromkeys(notes):
+            say(f"note: {note}")
+        size = sum(path.stat().st_size for path, _ in parts)
+        where = str(target) if single else f"{target}/ ({count(len(parts), 'file')})"
+        say(f"{count(sum(len(clips) for _, clips in parts), 'clip')} written to {where}, {max(1, round(size / 1000)):,} kB")
+        return 0
+
+    def _single(self) -> bool:
+        """Whether the output is one file.
+
+        Raises:
+            ValueError: it does not say which format, or two.
+        """
+        suffix = self.output.suffix.lower()
+        if suffix in SUFFIXES and not self.output.expanduser().is_dir():
+            if self.to is not None and f".{self.to}" != suffix:
+                raise ValueError(f"--to {self.to} and -o {self.output} say different formats; leave --to out")
+            return True
+        if self.to is None:
+            raise ValueError(
+                f"-o {self.output}: no format ends so; end it in {', '.join(SUFFIXES)}, or say it with --to for a folder"
+            )
+        return False
+
+    def _read(self, path: Path) -> tuple[list[Clip], list[str]]:
+        """The clips of a file, and what a reader should know: of a recording, those of its people."""
+        from indexing.recordings.people import of_recording, tracked_people
+
+        clips = list(self.reading.read(path))
+        notes = remarks(clips, self.reading) + assumed(clips)
+        if not of_recording(clips):
+            return clips, notes
+        crowd = tracked_people(clips, path.stem or path.resolve().name)
+        if crowd.ghosts:
+            notes.append(f"{path}: {count(sum(crowd.ghosts.values()), 'track')} left out, as of no person")
+        # whoever was too short in view to be a person of a recording is still what there is to convert
+        people = [who.clip.replace(meta={**who.clip.meta, "person": who.name or None}) for who in crowd.people] or clips
+        if len(people) > 1:
+            notes.append(f"{path}: {len(people)} people in view; --person largest takes one")
+        return people, notes
+
+    def _write(self, clips: Sequence[Clip], path: Path) -> tuple[Callable[[], object], list[str]]:
+        """What writes a file, and what is not in it: a format that cannot hold the clips is found before anything is written."""
+        from indexing.clip import ClipSet
+        from indexing.files import write_bytes
+        from indexing.writers import encode
+
+        if path.suffix.lower() == ".npz":
+            whole = len(self.recordings) == 1 or self.to is not None
+            return partial(ClipSet([_sharing(clip, clips, whole) for clip in clips], path.name).save, path), []
+        if path.suffix.lower() in (".trc", ".c3d"):
+            clips = [clip.replace(fps_assumed=False) for clip in clips]  # which was said of the recording
+        try:
+            data, notes = encode(clips, path, self.units)
+        except ValueError as problem:
+            raise ValueError(worded(problem, WORDS)) from None
+        return partial(write_bytes, path, data), [worded(note, WORDS) for note in notes]
+
+    def _parts(self, found: Sequence[tuple[Path, list[Clip]]], folder: Path) -> list[tuple[Path, list[Clip]]]:
+        """A file of each recording, of a set of clips one of each clip."""
+        from indexing.recordings.people import of_recording
+
+        parts = []
+        for path, clips in found:
+            stem = path.stem or path.resolve().name
+            together = len(clips) == 1 or of_recording(clips) or self.to == "npz"
+            parts += [(stem, clips)] if together else [(f"{stem}-{i + 1:04d}", [clip]) for i, clip in enumerate(clips)]
+        times = Counter(stem for stem, _ in parts)
+        stems = [stem if times[stem] == 1 else f"{stem}-{i + 1}" for i, (stem, _) in enumerate(parts)]
+        twice = repeated(stems)
+        if twice is not None:
+            raise ValueError(f"{folder}: two recordings would be {twice}.{self.to}; rename one, or convert them one by one")
+        return [(folder / f"{stem}.{self.to}", clips) for stem, (_, clips) in zip(stems, parts, strict=True)]
+
+
+def _sharing(clip: Clip, clips: Sequence[Clip], whole: bool) -> Clip:
+    """The clip with what is known of all of them, as a clip set has a column for each field.
+
+    Args:
+        whole: they are the people of one recording, which is known of nobody where several recordings are put together.
+    """
+    fields = [key for key in clip.meta if all(other.meta.get(key) is not None for other in clips)]
+    kept = fields if whole and "person" in fields else [key for key in fields if key not in ("followed", "untracked", "people")]
+    return clip.replace(meta={key: clip.meta[key] for key in kept})

@@ -1,0 +1,327 @@
+r"""How far two sets of labels of the same recordings agree: a person's and a model's, or those of two people.
+
+Time is integrated exactly, between the boundaries of the labels, so that no grid and no frame rate decides anything.  Of a span
+of time let :math:`d_i` be the durations between neighbouring boundaries, and :math:`K_i`, :math:`F_i` the labels that are known and
+found there.  **Confusion over time** is the table
+
+.. math:: T_{ab} = \sum_i d_i\, w_i(a, b), \qquad \sum_{ab} w_i(a, b) = 1
+
+whose rows are what is known and whose columns are what was found, no label among them.  Where at most one label holds at a time,
+:math:`w_i` is 1 for the pair and 0 elsewhere.  Where several hold, the moment is shared evenly: with
+:math:`m = \max(|K_i|, |F_i|)`, each label of both gives :math:`1 / m` to the diagonal, and the others of :math:`K_i` are spread
+evenly over the others of :math:`F_i`, of which the shorter list is filled up with no label.  So the table always sums to the time
+compared.
+
+**Cohen's kappa over time** (Cohen 1960) is agreement beyond chance,
+
+.. math:: \kappa = \frac{p - e}{1 - e}, \quad p = \frac{\operatorname{tr} T}{S}, \quad
+          e = \sum_a \frac{T_{a\cdot} T_{\cdot a}}{S^2}, \quad S = \sum_{ab} T_{ab},
+
+the limit of the usual kappa per frame as frames become short.  No label counts as one of the answers: a recording in which little
+happens agrees on much of its time.
+
+**F1 at an overlap k** is that of temporal segmentation (Lea et al. 2017; MS-TCN, Farha and Gall 2019): segments found are taken in
+order of time, each is compared with the known segment of its label with the largest temporal intersection over union, and is right
+where that is k or more and no earlier one took it.  Segments are compared by label, and within one person of one recording.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+Interval = tuple[Hashable, float, float]
+NONE = "(none)"
+SHARE_EPSILON = 1e-9  # an overlap of exactly one half is one half, however its ends were rounded
+
+
+@dataclass(frozen=True)
+class ComparingOptions:
+    """What is counted as the same segment, and how many kinds of label can be told apart in a table."""
+
+    overlaps: tuple[float, ...] = (0.1, 0.25, 0.5)
+    """Temporal intersection over union, of the F1s: those of the tables of temporal segmentation."""
+    labels: int = 500
+    """Different labels at most: free text is no label, and a table of more is neither read nor drawn."""
+
+
+@dataclass(frozen=True)
+class ComparedSpan:
+    """The time of one person in one recording, and the labels of both sides in it.
+
+    start, end: seconds that are compared; known, found: ``(label, start, end)``, in any order; person: empty where there is one.
+    """
+
+    name: str
+    start: float
+    end: float
+    known: Sequence[Interval]
+    found: Sequence[Interval]
+    person: str = ""
+
+
+@dataclass(frozen=True)
+class SegmentCounts:
+    """How many segments were found, how many are known, and how many of those found are right."""
+
+    right: int
+    found: int
+    known: int
+
+    def __add__(self, other: SegmentCounts) -> SegmentCounts:
+        return SegmentCounts(self.right + other.right, self.found + other.found, self.known + other.known)
+
+    @property
+    def precision(self) -> float:
+        """Share of what was found; NaN where nothing was."""
+        return self.right / self.found if self.found else math.nan
+
+    @property
+    def recall(self) -> float:
+        """Share of what is known; NaN where nothing is."""
+        return self.right / self.known if self.known else math.nan
+
+    @property
+    def f1(self) -> float:
+        """Harmonic mean of both; NaN where nothing is known and nothing was found."""
+        return 2 * self.right / (self.found + self.known) if self.found + self.known else math.nan
+
+
+@dataclass(frozen=True)
+class LabelAgreement:
+    """One label: seconds known, found, and both; kappa of this label against everything else; segments at each overlap."""
+
+    known: float
+    found: float
+    both: float
+    kappa: float
+    segments: Mapping[float, SegmentCounts]
+
+
+@dataclass(frozen=True, eq=False)
+class Agreement:
+    """How far two sets of labels agree.
+
+    labels: ``n``, in the order of the table, whose last row and column are no label; seconds: ``(n + 1, n + 1)``; by_label: what
+    holds of each; segments: over all labels, at each overlap.
+    """
+
+    labels: tuple[str, ...]
+    seconds: FloatArray
+    by_label: Mapping[str, LabelAgreement]
+    segments: Mapping[float, SegmentCounts]
+
+    @property
+    def compared(self) -> float:
+        """Seconds, of all people."""
+        return float(self.seconds.sum())
+
+    @property
+    def kappa(self) -> float:
+        """Cohen's, over time; NaN where both sides say one and the same throughout."""
+        return kappa(self.seconds)
+
+    @property
+    def agreement(self) -> float:
+        """Share of the time in which both say the same; NaN where no time is compared."""
+        return float(np.trace(self.seconds)) / self.compared if self.compared > 0 else math.nan
+
+    def plain(self) -> dict[str, Any]:
+        """All numbers in the types of JSON."""
+        by_label = {
+            name: {
+                "seconds_known": one.known,
+                "seconds_found": one.found,
+                "seconds_both": one.both,
+                "kappa": one.kappa,
+                "at_overlap": _at_overlap(one.segments),
+            }
+            for name, one in self.by_label.items()
+        }
+        return {
+            "seconds_compared": self.compared,
+            "agreement": self.agreement,
+            "kappa": self.kappa,
+            "at_overlap": _at_overlap(self.segments),
+            "by_label": by_label,
+            "confusion_seconds": {"labels": [*self.labels, NONE], "rows_known_columns_found": self.seconds.tolist()},
+        }
+
+
+def _at_overlap(segments: Mapping[float, SegmentCounts]) -> dict[str, Any]:
+    return {
+        f"{overlap:g}": {**vars(one), "precision": one.precision, "recall": one.recall, "f1": one.f1}
+        for overlap, one in segments.items()
+    }
+
+
+def compare(spans: Sequence[ComparedSpan], options: ComparingOptions = ComparingOptions()) -> Agreement:
+    """How far what was found agrees with what is known, over all spans together.
+
+    Labels of different people are compared each with their own; intervals are cut at the ends of their span, and those without
+    duration (points in time) or outside of it count for nothing.
+
+    Raises:
+        ValueError: an interval that is none, or more different labels than a table can show.
+
+    Example:
+        >>> known, found = [("squat", 0.0, 4.0), ("jump", 6.0, 8.0)], [("squat", 1.0, 5.0)]
+        >>> both = compare([ComparedSpan("a", 0.0, 10.0, known, found)])
+        >>> both.labels, both.seconds.tolist()
+        (('jump', 'squat'), [[0.0, 0.0, 2.0], [0.0, 3.0, 1.0], [0.0, 1.0, 3.0]])
+        >>> round(both.kappa, 3), both.segments[0.5].f1
+        (0.333, 0.667)
+    """
+    inside = [(_inside(one.known, one), _inside(one.found, one)) for one in spans]
+    names = sorted({str(label) for sides in inside for side in sides for label, _, _ in side})
+    if len(names) > options.labels:
+        raise ValueError(
+            f"{len(names):,} different labels, of which {options.labels} can be compared; are they free text? choose a tier that "
+            "holds names of actions"
+        )
+    number = {name: index for index, name in enumerate(names)}
+    table = np.zeros((len(names) + 1, len(names) + 1))
+    lasting = np.zeros((len(names), 3))
+    for span, (known, found) in zip(spans, inside, strict=True):
+        lengths, here, there = _moments(span, known, found, number)
+        table += time_table(lengths, here, there)
+        lasting += np.stack([lengths @ side for side in (here, there, here & there)], axis=1)
+    segments = {overlap: _counted(inside, names, overlap) for overlap in options.overlaps}
+    total = float(table.sum())
+    by_label = {
+        name: LabelAgreement(*map(float, lasting[i]), _one_against_all(lasting[i], total), {k: segments[k][i] for k in segments})
+        for i, name in enumerate(names)
+    }
+    together = {overlap: sum(each, SegmentCounts(0, 0, 0)) for overlap, each in segments.items()}
+    return Agreement(tuple(names), table, by_label, together)
+
+
+def _inside(intervals: Sequence[Interval], span: ComparedSpan) -> list[Interval]:
+    """Intervals cut at the ends of a span, in order of time."""
+    out = []
+    for label, start, end in intervals:
+        if not (math.isfinite(start) and math.isfinite(end) and start <= end):
+            raise ValueError(f"{span.name}: {label!r} from {start} s to {end} s is no interval; give seconds, start first")
+        low, high = max(start, span.start), min(end, span.end)
+        if high > low:
+            out.append((label, low, high))
+    return sorted(out, key=lambda one: (one[1], one[2], str(one[0])))
+
+
+def _moments(
+    span: ComparedSpan, known: Sequence[Interval], found: Sequence[Interval], number: Mapping[str, int]
+) -> tuple[FloatArray, NDArray[np.bool_], NDArray[np.bool_]]:
+    """Durations ``(M,)`` between neighbouring boundaries, and the labels ``(M, n)`` that are known and found there."""
+    edges = np.unique([t for side in (known, found) for _, start, end in side for t in (start, end)] + [span.start, span.end])
+    edges = edges[(edges >= span.start) & (edges <= span.end)]
+    sides = []
+    for side in (known, found):
+        change = np.zeros((len(edges), len(number)), dtype=np.int64)
+        if side:
+            rows = np.searchsorted(edges, [[start, end] for _, start, end in side])
+            columns = [number[str(label)] for label, _, _ in side]
+            np.add.at(change, (rows[:, 0], columns), 1)
+            np.add.at(change, (rows[:, 1], columns), -1)
+        sides.append(np.cumsum(change, axis=0)[:-1] > 0)
+    return np.diff(edges), sides[0], sides[1]
+
+
+def time_table(lengths: FloatArray, known: NDArray[np.bool_], found: NDArray[np.bool_]) -> FloatArray:
+    r"""``(n + 1, n + 1)`` seconds, rows known, columns found, the last of both no label; it sums to the sum of the lengths.
+
+    Args:
+        lengths: ``(M,)`` seconds of each moment; known, found: ``(M, n)`` which labels hold in it.
+
+    Example:
+        >>> two = np.array([[True, True]])
+        >>> time_table(np.array([1.0]), two, np.array([[True, False]])).tolist()
+        [[0.5, 0.0, 0.0], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]]
+    """
+    both = known & found
+    each = np.maximum(np.maximum(known.sum(axis=1), found.sum(axis=1)), 1)
+    apart = each - both.sum(axis=1)
+    share = lengths / each
+    rest = []
+    for side in (known, found):
+        alone = side & ~both
+        rest.append(np.column_stack([alone, apart - alone.sum(axis=1)]).astype(np.float64))
+    spread = np.divide(share, apart, out=np.zeros(len(lengths)), where=apart > 0)
+    table = (rest[0] * spread[:, None]).T @ rest[1]
+    table[np.arange(both.shape[1]), np.arange(both.shape[1])] += share @ both
+    return np.asarray(table)
+
+
+def kappa(table: FloatArray) -> float:
+    """Cohen's kappa of a square table of counts or seconds; NaN where chance alone explains everything.
+
+    Example:
+        >>> kappa(np.array([[20.0, 5.0], [10.0, 15.0]]))
+        0.4
+    """
+    total = float(table.sum())
+    if not total > 0:
+        return math.nan
+    said = float(np.trace(table)) / total
+    chance = float(table.sum(axis=1) @ table.sum(axis=0)) / total**2
+    return (said - chance) / (1 - chance) if chance < 1 - SHARE_EPSILON else math.nan
+
+
+def _one_against_all(lasting: FloatArray, total: float) -> float:
+    """Kappa of one label and everything else, from the seconds in which it is known, found, and both."""
+    known, found, both = lasting.tolist()
+    return kappa(np.array([[both, known - both], [found - both, total - known - found + both]]))
+
+
+def _counted(
+    inside: Sequence[tuple[Sequence[Interval], Sequence[Interval]]], names: Sequence[str], overlap: float
+) -> list[SegmentCounts]:
+    """Of each label, the segments of all spans."""
+    counts = {name: SegmentCounts(0, 0, 0) for name in names}
+    for known, found in inside:
+        sides = [_by_label(side) for side in (known, found)]
+        for name in {*sides[0], *sides[1]}:
+            mine, theirs = sides[0].get(name, []), sides[1].get(name, [])
+            counts[name] += SegmentCounts(right_segments(theirs, mine, overlap), len(theirs), len(mine))
+    return [counts[name] for name in names]
+
+
+def _by_label(side: Sequence[Interval]) -> dict[str, list[tuple[float, float]]]:
+    out: dict[str, list[tuple[float, float]]] = {}
+    for label, start, end in side:
+        out.setdefault(str(label), []).append((start, end))
+    return out
+
+
+def right_segments(found: Sequence[tuple[float, float]], known: Sequence[tuple[float, float]], overlap: float) -> int:
+    """How many segments found of one label are right: each of a known one of its own, with which it shares enough of the time.
+
+    Segments found are taken in order of time; each is compared with the known one that it shares most with.
+
+    Args:
+        found, known: starts and ends; overlap: least intersection over union.
+
+    Example:
+        >>> right_segments([(0.0, 1.1), (1.1, 2.0)], [(0.0, 2.0)], 0.1)
+        1
+    """
+    ends = np.array(sorted(known), dtype=np.float64).reshape(-1, 2)
+    # only those that begin before the end, behind the last one from which on nothing ended before the start, can share any time
+    latest = np.maximum.accumulate(ends[:, 1]) if len(ends) else ends[:, 1]
+    taken = np.zeros(len(ends), dtype=bool)
+    for start, end in sorted(found):
+        first, last = np.searchsorted(latest, start, side="right"), np.searchsorted(ends[:, 0], end)
+        if first >= last:
+            continue
+        near = ends[first:last]
+        both = np.maximum(np.minimum(near[:, 1], end) - np.maximum(near[:, 0], start), 0.0)
+        shares = both / ((near[:, 1] - near[:, 0]) + (end - start) - both)
+        best = int(shares.argmax())
+        if shares[best] >= overlap - SHARE_EPSILON and not taken[first + best]:
+            taken[first + best] = True
+    return int(taken.sum())

@@ -1,0 +1,122 @@
+"""Which file that labels are of is the recording at hand, and whose clock runs when several are played after each other."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import unquote
+
+from indexing.labels.gathering import Asked
+from indexing.opening import error, listed
+
+SUFFIX = re.compile(r"\.\w{1,8}$")
+REMEDY = "name the recording as its video is named, or say which it is (--media NAME)"
+
+
+@dataclass(frozen=True)
+class Span:
+    """A stretch of a clock on which one file is played.
+
+    Args:
+        media: the file.
+        begin, end: on that clock, in seconds; where nobody knows the end it is infinite.
+    """
+
+    media: str
+    begin: float = 0.0
+    end: float = math.inf
+
+
+def cut_up(start: float, end: float, spans: Sequence[Span]) -> list[tuple[str, float, float]]:
+    """A stretch of a clock, by the files that are played then: each file with start and end on its own clock.
+
+    What lies before the first span or after the last belongs to that one.
+
+    Example:
+        >>> cut_up(55.0, 70.0, [Span("a.mp4", 0.0, 60.0), Span("b.mp4", 60.0, 90.0)])
+        [('a.mp4', 55.0, 60.0), ('b.mp4', 0.0, 10.0)]
+    """
+    found = []
+    for number, span in enumerate(spans):
+        first = -math.inf if number == 0 else span.begin
+        last = math.inf if number == len(spans) - 1 else span.end
+        inside = first <= start < last if start == end else start < last and end > first
+        if inside:
+            found.append((span.media, max(start, first) - span.begin, min(end, last) - span.begin))
+    return found
+
+
+def base_name(name: str) -> str:
+    """The name of a file without folders, whatever system or address it was written on.
+
+    Example:
+        >>> base_name("C:\\\\films\\\\a.mp4"), base_name("file:///films/my%20film.mp4"), base_name("a/b.mp4")
+        ('a.mp4', 'my film.mp4', 'b.mp4')
+    """
+    plain = unquote(name) if "://" in name or name.startswith("file:") else name
+    return re.split(r"[\\/]", plain.rstrip("\\/"))[-1]
+
+
+def of_recording(names: Iterable[str], asked: Asked) -> set[str] | None:
+    """Those of the files in a label file that are the recording at hand; None where none is at hand.
+
+    The whole path decides, else the name of the file, else what stands before its last dot, else that one of the two stands in the
+    other as a word: ``session_keypoints.json`` and ``sessionDLC_resnet50.csv`` are ``session.mp4``.
+
+    Raises:
+        ValueError: it is none of them, or may be several.
+    """
+    known = list(dict.fromkeys(name for name in names if name))
+    if asked.media is not None:
+        same = {name for name in known if name == asked.media} or {name for name in known if base_name(name) == asked.media}
+        if not same:
+            said = f"has no labels of {asked.media}, only of {listed(known)}"
+            raise error(asked.path, said, "give one of these names (--media)")
+        return same
+    if asked.recording is None or not known:
+        return None
+    ranks = {name: _likeness(name, str(asked.recording)) for name in known}
+    best = max(ranks.values())
+    if not best:
+        own = base_name(str(asked.recording))
+        raise error(asked.path, f"its labels are of {listed(known)}, not of {own}", REMEDY)
+    found = [name for name in known if ranks[name] == best]
+    if len(found) > 1:
+        raise error(asked.path, f"{base_name(str(asked.recording))} may be any of {listed(found)}", REMEDY)
+    return set(found)
+
+
+def same_recording(name: str, other: str) -> bool:
+    """Whether two files are called alike, but for their folders and suffixes: a video and its keypoints.
+
+    Example:
+        >>> same_recording("films/session.mp4", "session.json"), same_recording("session.mp4", "session_2.json")
+        (True, False)
+    """
+    return SUFFIX.sub("", base_name(name)).casefold() == SUFFIX.sub("", base_name(other)).casefold()
+
+
+def _likeness(name: str, recording: str) -> tuple[int, int] | tuple[()]:
+    """How much a file of the labels is like the recording: empty where it is another one."""
+    folders = [re.split(r"[\\/]", text)[:-1] for text in (name, str(Path(recording).expanduser().absolute()))]
+    shared = 0
+    for a, b in zip(reversed(folders[0]), reversed(folders[1]), strict=False):
+        if a != b:
+            break
+        shared += 1
+    theirs, ours = base_name(name), base_name(recording)
+    if theirs == ours:
+        return 3, shared
+    stems = [SUFFIX.sub("", text).casefold() for text in (theirs, ours)]
+    if stems[0] == stems[1]:
+        return 2, shared
+    if all(stems) and (_holds(stems[1], stems[0]) or _holds(stems[0], stems[1])):
+        return 1, len(min(stems, key=len))
+    return ()
+
+
+def _holds(text: str, word: str) -> bool:
+    return re.search(rf"(?<![^\W_]){re.escape(word)}(?![^\W_])|^{re.escape(word)}dlc", text) is not None

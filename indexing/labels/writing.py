@@ -1,0 +1,143 @@
+"""Write labels: into a file of their own, or into a tier of their own beside those of a person."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+
+from indexing.labels import tables
+from indexing.labels.label import Label
+from indexing.labels.media import same_recording
+from indexing.labels.target import Target
+from indexing.opening import error, is_regular, listed, shown
+
+FORMATS = {
+    ".boris": "boris",
+    ".eaf": "elan",
+    ".csv": "csv",
+    ".tsv": "tsv",
+    ".json": "activitynet",
+}
+BY_NAME = ("label_studio", "via")
+BESIDE = ("boris", "elan")
+UNPRINTABLE = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]")  # what XML has no way to write
+
+
+def write_labels(
+    path: str | Path,
+    labels: Sequence[Label],
+    *,
+    recording: str | Path | None = None,
+    duration: float | None = None,
+    fps: float | None = None,
+    into: str | Path | None = None,
+    tier: str = "dyntorch",
+    annotator: str = "",
+    media: str | None = None,
+    format: str | None = None,  # noqa: A002
+) -> list[str]:
+    """Write labels, of a program or a person.
+
+    Where an ELAN file or a BORIS project is there already, labels go into a tier or an observation of their own in it; what a
+    person made stays as it is, and what dyntorch wrote under the same name is replaced.  Other files are written anew.
+
+    Args:
+        path: its suffix says what is written: ``.boris``, ``.eaf``, ``.csv``, ``.tsv``, ``.json`` (ActivityNet).
+        labels: of one recording, or of several that their ``media`` name (ELAN: of one).  Those with a ``tier`` (ELAN) or an
+            ``observation`` (BORIS) of their own keep it.
+        recording: the video that labels without ``media`` are of; written also where there is no label.
+        duration, fps: of the recording, in seconds and frames per second; Label Studio cannot do without ``fps``.
+        into: another ``.eaf`` or ``.boris`` whose content is taken over, instead of that of ``path``.
+        tier: how the tier (ELAN) or the observation (BORIS) is called.
+        annotator: who or what found them, for formats that ask.
+        media: how the file that is there calls the recording, where its name is another one there.
+        format: ``"boris"``, ``"elan"``, ``"csv"``, ``"tsv"``, ``"activitynet"``, ``"label_studio"`` or ``"via"``; by default the
+            suffix decides.
+
+    Returns:
+        what the format does not keep of these labels, a sentence each.
+
+    Raises:
+        ValueError: one line with the file, what is wrong and what to do; a file that is there is then as it was.
+
+    Example:
+        >>> import pathlib, tempfile
+        >>> from indexing.labels import read_labels
+        >>> path = pathlib.Path(tempfile.mkdtemp()) / "found.boris"
+        >>> write_labels(path, [Label(1.5, 4.0, "squat", score=4.4)], recording="session.mp4", duration=60)
+        []
+        >>> read_labels(path, recording="session.json")
+        [Label(1.5, 4.0, 'squat', media='session.mp4', observation='dyntorch session.mp4', score=4.4)]
+    """
+    target = Path(path)
+    name = _format(target, format)
+    _check(target, duration, fps, tier)
+    source = _source(target, into, name)
+    own = str(recording) if recording is not None else ""
+    if own:  # labels may name the video, and the recording be its keypoints
+        own = next((label.media for label in labels if label.media and same_recording(label.media, own)), own)
+    sound, notices = _sound(labels, own)
+    recordings = dict.fromkeys(([own] if own else []) + [label.media for label in sound])
+    where = Target(target, tuple(recordings), source, tier, duration, fps, annotator, media)
+    if name in ("csv", "tsv"):
+        return notices + tables.write(target, sound, "," if name == "csv" else "\t")
+    module = import_module(f"indexing.labels.{name}.writing" if name in BESIDE else f"indexing.labels.{name}")
+    said: list[str] = module.write(sound, where)
+    return notices + said
+
+
+def _format(path: Path, name: str | None) -> str:
+    """What is written.
+
+    Raises:
+        ValueError: neither the suffix nor ``format`` says so.
+    """
+    known = [*FORMATS.values(), *BY_NAME]
+    if name is not None:
+        if name not in known:
+            raise error(path, f"unknown format={shown(name)}", f"use one of {', '.join(known)}")
+        return name
+    found = FORMATS.get(path.suffix.lower())
+    if found is None:
+        said = f"the suffix {path.suffix!r} does not say which format to write"
+        raise error(path, said, f"end the name in one of {', '.join(FORMATS)}, or give format=")
+    return found
+
+
+def _check(path: Path, duration: float | None, fps: float | None, tier: str) -> None:
+    for what, value in (("duration", duration), ("fps", fps)):
+        if value is not None and not 0 < value < math.inf:
+            raise error(path, f"{what}={shown(value)} cannot be", "give a positive number, or leave it out")
+    if not tier.strip() or not tier.isprintable():
+        raise error(path, f"tier={shown(tier)} is no name", "give a name of letters")
+
+
+def _source(path: Path, into: str | Path | None, name: str) -> Path | None:
+    """The file whose content is taken over, if any.
+
+    Raises:
+        ValueError: there is none, or the format has no place for others' labels.
+    """
+    if into is not None and name not in BESIDE:
+        said = f"labels cannot be written beside those of {into}"
+        raise error(path, said, f"write a .boris or an .eaf ({listed(BESIDE)})")
+    if into is not None:
+        return Path(into)
+    return path if name in BESIDE and is_regular(path) else None
+
+
+def _sound(labels: Sequence[Label], recording: str) -> tuple[list[Label], list[str]]:
+    """Labels in characters that every format can write, each with its recording."""
+    found, changed = [], 0
+    for label in labels:
+        fields = {name: getattr(label, name) for name in ("label", "subject", "media", "tier", "observation", "comment")}
+        sound = {name: UNPRINTABLE.sub("\ufffd", value) for name, value in fields.items()}
+        modifiers = tuple(UNPRINTABLE.sub("\ufffd", part) for part in label.modifiers)
+        changed += sound != fields or modifiers != label.modifiers
+        sound["media"] = sound["media"] or recording
+        found.append(replace(label, modifiers=modifiers, **sound))
+    return found, [f"control characters in {changed} labels became \ufffd"] * bool(changed)

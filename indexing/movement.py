@@ -1,0 +1,234 @@
+"""Poses of ``movement`` datasets as clips, by what such a dataset looks like: neither movement nor xarray is imported.
+
+A dataset of poses has ``position`` with the axes time, space, keypoints and, where it says who is who, individuals (in any order;
+the names count), perhaps ``confidence`` with the same axes but space, coordinates (``time`` in seconds, or frames where nobody
+knows the rate), and attributes (``fps``, ``time_unit``, ``source_file``).  See https://movement.neuroinformatics.dev.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from indexing.clip import Clip, ClipSet, FloatArray, check_fps
+from indexing.opening import clipped, listed, shown
+from indexing.skeleton import Skeleton
+
+AXES = {
+    "time": ("time",),
+    "space": ("space",),
+    "keypoints": ("keypoints", "keypoint"),
+    "individuals": ("individuals", "individual"),
+}
+"""What the axes are called; a newer convention of the field has the singular."""
+CARTESIAN = ("x", "y", "z")
+NEEDED = "give a dataset of poses, as movement.io.load_poses gives it"
+
+
+def is_dataset(value: Any) -> bool:
+    """Whether a value looks like a dataset of movement: it has ``position`` with named axes.
+
+    Example:
+        >>> is_dataset(np.zeros((9, 3, 2))), is_dataset(Clip(np.zeros((9, 3, 2))))
+        (False, False)
+    """
+    return not isinstance(value, (Clip, ClipSet, np.ndarray, str, bytes, Path)) and hasattr(
+        getattr(value, "position", None), "dims"
+    )
+
+
+def clips_of(dataset: Any, *, fps: float | None = None, up: str | None = None, name: str = "") -> ClipSet:
+    """A clip of each individual of a dataset of poses.
+
+    Args:
+        dataset: with ``position (time, space, keypoints[, individuals])`` and perhaps ``confidence`` without space; NaN = not
+            seen.  A confidence that is NaN where the joint has coordinates, as of labels that a person made, counts as 1.
+        fps: frames per second where the dataset says nothing of time but frames; without it 30 is assumed.
+        up: the direction that points up, as of a :class:`~indexing.Clip`; by default what :meth:`Clip.to_movement` has noted, else
+            ``"-y"`` (pixels) in 2D and ``"z"`` in 3D, as where files of movement are read.
+        name: of the clips; by default that of the dataset's ``source_file``.
+
+    Returns:
+        clips in the order of the individuals, without those never seen.  Of several, ``meta["person"]`` says which one it is.
+
+    Raises:
+        ValueError: no poses (bounding boxes have no keypoints), no Cartesian coordinates, nobody seen, or times that do not
+            increase.
+
+    Example:
+        >>> from types import SimpleNamespace
+        >>> axes = ("time", "space", "keypoints", "individuals")
+        >>> position = SimpleNamespace(dims=axes, values=np.ones((4, 2, 3, 2)), shape=(4, 2, 3, 2))
+        >>> clips_of(SimpleNamespace(position=position, attrs={"fps": 50.0}))[1]
+        Clip('dataset#1', 4 frames x 3 joints x 2D, 0.06 s)
+    """
+    attrs = getattr(dataset, "attrs", None)
+    attrs = attrs if isinstance(attrs, Mapping) else {}
+    source = attrs.get("source_file")
+    name = name or (Path(source).name if isinstance(source, str) and source else "dataset")
+    values, axes = _values(dataset, "position", name)
+    lacking = [axis for axis in ("time", "space", "keypoints") if axis not in axes]
+    if lacking:
+        boxes = "bounding boxes have none; " if lacking == ["keypoints"] else ""
+        raise ValueError(f"{name}: position has the axes {listed(axes)}, but no {lacking[0]}; {boxes}{NEEDED}")
+    position = _ordered(values, axes, ("time", "individuals", "keypoints", "space"))[..., _spatial(dataset, axes, values, name)]
+    confidence = _confidence(dataset, position, name)
+    times, rate, assumed = _times(dataset, attrs, len(position), fps, name)
+    joints, people = _names(dataset, "keypoints", position.shape[2]), _names(dataset, "individuals", position.shape[1])
+    bones = _skeleton(attrs, joints, name)
+    known = ~np.isnan(position).any(axis=3)
+    clips = []
+    for i in range(position.shape[1]):
+        if not known[:, i].any():
+            continue
+        sure = None if confidence is None else confidence[:, i]
+        if sure is not None and np.isnan(sure).all():
+            sure = None
+        who = (people[i] if people else str(i)) if position.shape[1] > 1 else None
+        clips.append(
+            Clip(
+                np.ascontiguousarray(position[:, i]),
+                times=times,
+                confidence=None if sure is None else np.where(np.isnan(sure), known[:, i], sure),
+                fps=rate,
+                fps_assumed=assumed,
+                label=_label(attrs),
+                name=name if who is None else f"{name}#{who}",
+                skeleton=bones,
+                up=up or _up(attrs, position.shape[3]),
+                meta={} if who is None else {"person": who, "followed": "ids", "untracked": 0},
+            )
+        )
+    if not clips:
+        raise ValueError(f"{name}: nobody is seen in any of its {len(position)} frames (all NaN); leave it out")
+    return ClipSet(clips, name)
+
+
+def clip_of(dataset: Any, *, fps: float | None = None, name: str = "") -> Clip:
+    """The only individual of a dataset of poses.
+
+    Raises:
+        ValueError: as :func:`clips_of`, and where there are several.
+    """
+    clips = clips_of(dataset, fps=fps, name=name)
+    if len(clips) > 1:
+        people = listed(clip.meta["person"] for clip in clips)
+        raise ValueError(
+            f"{clips.name}: holds {len(clips)} individuals ({people}) where one is expected; choose one: "
+            "indexing.movement.clips_of(dataset)[0]"
+        )
+    return clips[0]
+
+
+def _values(dataset: Any, name: str, who: str) -> tuple[FloatArray, tuple[str, ...]]:
+    """A variable as numbers, and its axes by the names that they have here."""
+    variable = getattr(dataset, name)
+    try:
+        values = np.asarray(getattr(variable, "values", variable))
+        if values.dtype.kind not in "fiub":
+            raise TypeError(f"dtype {values.dtype}")
+    except (TypeError, ValueError) as problem:
+        raise ValueError(f"{who}: {name} holds no numbers ({clipped(problem)}); {NEEDED}") from None
+    called = {word: axis for axis, words in AXES.items() for word in words}
+    axes = tuple(called.get(str(axis), str(axis)) for axis in variable.dims)
+    strange = [axis for axis in axes if axis not in AXES]
+    if strange or len(axes) != values.ndim or len(set(axes)) < len(axes):
+        raise ValueError(
+            f"{who}: {name} has the axes {listed(axes)} and the shape {values.shape}; select one of what is no axis of poses"
+        )
+    return values.astype(values.dtype if values.dtype in (np.float32, np.float64) else np.float64), axes
+
+
+def _ordered(values: FloatArray, axes: tuple[str, ...], wanted: tuple[str, ...]) -> FloatArray:
+    """The axes in an order, those that are not there with one entry."""
+    there = [axis for axis in wanted if axis in axes]
+    values = values.transpose([axes.index(axis) for axis in there])
+    return np.asarray(values[tuple(slice(None) if axis in axes else None for axis in wanted)])
+
+
+def _coordinate(dataset: Any, axis: str) -> np.ndarray[Any, Any] | None:
+    """What the entries of an axis are called, or its numbers; None where the dataset does not say."""
+    coords = getattr(dataset, "coords", None)
+    for name in AXES[axis]:
+        try:
+            found = coords[name]  # type: ignore[index]
+        except (KeyError, TypeError, IndexError):
+            continue
+        return np.atleast_1d(np.asarray(getattr(found, "values", found)))
+    return None
+
+
+def _names(dataset: Any, axis: str, count: int) -> list[str]:
+    """Names of the entries of an axis; none where the dataset has none, or not as many."""
+    found = _coordinate(dataset, axis)
+    return [str(name) for name in found] if found is not None and found.shape == (count,) else []
+
+
+def _spatial(dataset: Any, axes: tuple[str, ...], values: FloatArray, who: str) -> list[int]:
+    """Where x, y and z are along the axis space."""
+    count = values.shape[axes.index("space")]
+    names = [name.lower() for name in _names(dataset, "space", count)] or list(CARTESIAN[:count])
+    if sorted(names) != sorted(CARTESIAN[:count]) or count < 2:
+        raise ValueError(f"{who}: space holds {listed(names)}; positions must be x, y or x, y, z (movement.utils.vector.pol2cart)")
+    return [names.index(axis) for axis in CARTESIAN[:count]]
+
+
+def _confidence(dataset: Any, position: FloatArray, who: str) -> FloatArray | None:
+    """``(time, individuals, keypoints)``, or None where nothing is known."""
+    if not hasattr(getattr(dataset, "confidence", None), "dims"):
+        return None
+    values, axes = _values(dataset, "confidence", who)
+    found = _ordered(values, axes, ("time", "individuals", "keypoints", "space"))
+    if found.shape != (*position.shape[:3], 1):
+        raise ValueError(
+            f"{who}: confidence has the axes {listed(axes)} and the shape {values.shape}, which do not fit position; {NEEDED}"
+        )
+    return np.asarray(found[..., 0])
+
+
+def _times(
+    dataset: Any, attrs: Mapping[str, Any], frames: int, fps: float | None, who: str
+) -> tuple[FloatArray, float | None, bool]:
+    """Seconds of the frames, frames per second, and whether nobody said how many."""
+    known = attrs.get("fps")
+    known = float(known) if isinstance(known, (int, float, np.integer, np.floating)) and known > 0 else None
+    rate = check_fps(30.0 if fps is None and known is None else known or fps, f"{who}: ")
+    assumed = known is None and fps is None
+    stamps = _coordinate(dataset, "time")
+    if stamps is None:
+        return np.arange(frames) / rate, rate, assumed
+    if stamps.shape != (frames,):
+        raise ValueError(f"{who}: time has the shape {stamps.shape} for {frames} frames; {NEEDED}")
+    if stamps.dtype.kind in "mM":  # durations, or dates, of which the first begins the clock
+        begin = stamps[0] if stamps.dtype.kind == "M" else np.timedelta64(0)
+        return np.asarray((stamps - begin) / np.timedelta64(1, "s")), known, False
+    if stamps.dtype.kind not in "fiu":
+        raise ValueError(f"{who}: time holds {shown(stamps.flat[0].item())}; give seconds, or numbers of frames")
+    unit = attrs.get("time_unit") or ("frames" if known is None else "seconds")
+    if unit not in ("seconds", "frames"):
+        raise ValueError(f"{who}: time_unit is {shown(unit)}; it must be 'seconds' or 'frames'")
+    return (stamps.astype(np.float64), known, False) if unit == "seconds" else (stamps / rate, rate, assumed)
+
+
+def _label(attrs: Mapping[str, Any]) -> str | int | None:
+    found = attrs.get("label")
+    return found.item() if isinstance(found, np.generic) else found if isinstance(found, (str, int)) else None
+
+
+def _up(attrs: Mapping[str, Any], dims: int) -> str:
+    return str(attrs["up"]) if isinstance(attrs.get("up"), str) else ("-y" if dims == 2 else "z")
+
+
+def _skeleton(attrs: Mapping[str, Any], joints: list[str], who: str) -> Skeleton | None:
+    """The joints by name, with the bones that :meth:`Clip.to_movement` has noted."""
+    if not joints or joints == [f"keypoint_{i}" for i in range(len(joints))]:  # which movement calls those without names
+        return None
+    try:
+        flat = np.asarray(attrs.get("bones", [])).reshape(-1, 2).astype(np.int64)
+        bones = tuple((int(a), int(b)) for a, b in flat)
+        return Skeleton(str(attrs.get("skeleton", who)), tuple(joints), bones)
+    except (TypeError, ValueError, OverflowError):
+        return Skeleton(who, tuple(joints))

@@ -1,0 +1,160 @@
+"""What the numbers mean that BlazePose's two networks give: people in a picture, and the joints of one person.
+
+The detector answers on a grid of anchors, of which each may give a box and four points; landmarks come as coordinates of a square
+region and as heatmaps, and the heatmaps refine the coordinates.  Coordinates here are parts of the picture or region, from 0 at its
+left or upper edge to 1 at the other.
+
+Source: Bazarevsky et al., "BlazePose: On-device Real-time Body Pose tracking", 2020; the graphs of MediaPipe 0.10 (Apache-2.0) say
+how the outputs are read, and everything here is written from that description.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from indexing.pose.options import DetectorOptions, LandmarkOptions
+
+Floats = NDArray[np.floating[Any]]
+
+# ---- the formats of the networks ----
+PICTURE, REGION = 224, 256  # pixels, the sides of what the detector and the network of landmarks see
+HEATMAP = 64  # cells, the sides of what the network of landmarks gives
+GRIDS = ((28, 2), (14, 2), (7, 6))  # cells per side, and anchors in each
+POINTS = 4  # of a detection: hips, circle about the body, shoulders, circle about the upper body
+LANDMARKS = 39  # 33 joints, two that say where the body is, four of the hands
+JOINTS, HIPS, CIRCLE = 33, 33, 34
+CLIPPED = 100.0  # of logits, before the exponential
+
+
+@cache
+def anchors() -> Floats:
+    """``(2254, 2)`` centres of the detector's anchors, in parts of the picture."""
+    found = []
+    for cells, each in GRIDS:
+        middle = (np.arange(cells) + 0.5) / cells
+        x, y = np.meshgrid(middle, middle)
+        found.append(np.repeat(np.stack([x, y], axis=-1).reshape(-1, 2), each, axis=0))
+    return np.concatenate(found)
+
+
+def sigmoid(logits: Any) -> Floats:
+    """Probabilities of logits."""
+    return np.asarray(1.0 / (1.0 + np.exp(-np.clip(np.asarray(logits, dtype=np.float64), -CLIPPED, CLIPPED))))
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """People in a picture, the surest first, in parts of it.
+
+    scores: ``(k,)``; boxes: ``(k, 4)`` left, top, right, bottom; points: ``(k, 4, 2)``: hips, a point of the circle about the body
+    that lies above the head, and the same two of the upper body.
+    """
+
+    scores: Floats
+    boxes: Floats
+    points: Floats
+
+    def __len__(self) -> int:
+        return len(self.scores)
+
+
+def candidates(raw: Floats, logits: Floats, options: DetectorOptions = DetectorOptions()) -> Candidates:
+    """People from the detector's outputs.
+
+    Args:
+        raw: ``(2254, 12)`` pixels of the network's picture, from each anchor's centre: middle and size of the box, and four points.
+        logits: ``(2254,)`` or ``(2254, 1)``.
+    """
+    scores = sigmoid(logits).reshape(-1)
+    chosen = np.flatnonzero(scores >= options.score)
+    values = np.asarray(raw, dtype=np.float64)[chosen].reshape(-1, 2 + POINTS, 2) / PICTURE
+    centre, size, points = values[:, 0] + anchors()[chosen], values[:, 1], values[:, 2:] + anchors()[chosen][:, None]
+    boxes = np.concatenate([centre - size / 2, centre + size / 2], axis=1)
+    fine = np.isfinite(values).all(axis=(1, 2)) & (size > 0).all(axis=1)
+    return merged(Candidates(scores[chosen][fine], boxes[fine], points[fine]), options.overlap)
+
+
+def merged(found: Candidates, overlap: float) -> Candidates:
+    """One candidate of each group whose boxes overlap: the mean of their coordinates, weighted by their scores.
+
+    A group is the surest candidate that is left and all that overlap with it by more than ``overlap``; its score is the highest.
+    """
+    left = np.argsort(-found.scores, kind="stable")
+    scores, boxes, points = [], [], []
+    while len(left):
+        same = overlaps(found.boxes[left[0]], found.boxes[left]) > overlap
+        same[0] = True
+        group, left = left[same], left[~same]
+        weights = found.scores[group] / found.scores[group].sum()
+        scores.append(found.scores[group[0]])
+        boxes.append(weights @ found.boxes[group])
+        points.append(np.tensordot(weights, found.points[group], axes=1))
+    shape = (-1, POINTS, 2)
+    return Candidates(np.array(scores), np.array(boxes).reshape(-1, 4), np.array(points).reshape(shape))
+
+
+def overlaps(box: Floats, boxes: Floats) -> Floats:
+    """``(k,)`` intersection over union of a box ``(4,)`` with others ``(k, 4)``."""
+    low, high = np.maximum(box[:2], boxes[:, :2]), np.minimum(box[2:], boxes[:, 2:])
+    common = np.clip(high - low, 0, None).prod(axis=1)
+    areas = np.clip(boxes[:, 2:] - boxes[:, :2], 0, None).prod(axis=1)
+    either = areas + np.clip(box[2:] - box[:2], 0, None).prod() - common
+    return np.asarray(np.where(either > 0, common / np.where(either > 0, either, 1.0), 0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Landmarks:
+    """One person in a region.
+
+    Attributes:
+        present: probability that there is a person.
+        places: ``(39, 2)`` in parts of the region; the first 33 are the joints.
+        confidence: ``(39,)`` the lower one of two probabilities: that the joint can be seen (nothing hides it), and that it lies in
+            the region at all.
+    """
+
+    present: float
+    places: Floats
+    confidence: Floats
+
+
+def landmarks(values: Floats, present: float, heatmap: Floats, options: LandmarkOptions = LandmarkOptions()) -> Landmarks:
+    """A person from the outputs of the network of landmarks.
+
+    Args:
+        values: ``(39, 5)``: x, y, z in pixels of the region, and the logits of being visible and of being there.
+        present: probability that there is a person.
+        heatmap: ``(h, w, 39)`` logits of where each landmark is.
+    """
+    table = np.asarray(values, dtype=np.float64).reshape(LANDMARKS, -1)
+    places = refined(table[:, :2] / REGION, heatmap, options)
+    return Landmarks(float(present), places, sigmoid(table[:, 3:5]).min(axis=1))
+
+
+def refined(places: Floats, heatmap: Floats, options: LandmarkOptions = LandmarkOptions()) -> Floats:
+    """Places moved to the mean of the heatmap's cells about them, where one of these is sure.
+
+    Args:
+        places: ``(n, 2)`` x, y in parts of the region.
+        heatmap: ``(h, w, n)`` logits.
+
+    A landmark outside of the region stays where it is.
+    """
+    rows, columns, count = heatmap.shape
+    column, row = np.nan_to_num(np.floor(places * [columns, rows]), nan=-1).clip(-1, max(rows, columns)).astype(np.intp).T
+    reach = np.arange(options.kernel) - (options.kernel - 1) // 2
+    y, x = (row[:, None] + reach)[:, :, None], (column[:, None] + reach)[:, None, :]
+    inside = (y >= 0) & (y < rows) & (x >= 0) & (x < columns)
+    cells = heatmap[y.clip(0, rows - 1), x.clip(0, columns - 1), np.arange(count)[:, None, None]]
+    sure = np.where(inside, sigmoid(cells), 0.0)
+    total = sure.sum(axis=(1, 2))
+    use = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+    use &= (sure.max(axis=(1, 2)) >= options.sure) & (total > 0)
+    weight = np.where(use, total, 1.0)
+    moved = np.stack([(sure * x).sum(axis=(1, 2)) / weight / columns, (sure * y).sum(axis=(1, 2)) / weight / rows], axis=1)
+    return np.asarray(np.where(use[:, None], moved, places))

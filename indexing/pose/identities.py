@@ -1,0 +1,135 @@
+"""Who is who in a video: tracks, which end where somebody is lost and where a piece of the video ends, joined to people.
+
+This needs nothing but the tracks, so that it comes out the same however the work was divided.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from indexing.pose.blazepose import Floats
+from indexing.pose.options import IdentityOptions
+
+Indices = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Sightings:
+    """Everybody in every frame of a video or a part of it.
+
+    Attributes:
+        times: ``(frames,)`` seconds.
+        at: ``(m,)`` the frame of each sighting, not decreasing.
+        tracks: ``(m,)`` which track it belongs to.
+        joints: ``(m, n, 2)`` pixels; confidence: ``(m, n)``.
+        crowd: ``(s,)`` how many people were in view, whenever the detector looked.
+        notes: what a user should know.
+    """
+
+    times: Floats
+    at: Indices
+    tracks: Indices
+    joints: Floats
+    confidence: Floats
+    crowd: Indices = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    notes: tuple[str, ...] = ()
+
+
+def joined(parts: Sequence[Sightings]) -> Sightings:
+    """Consecutive parts of a video as one; each has tracks of its own."""
+    frames = np.cumsum([0, *(len(part.times) for part in parts)])
+    tracks = np.cumsum([0, *(int(part.tracks.max(initial=-1)) + 1 for part in parts)])
+    return Sightings(
+        np.concatenate([part.times for part in parts]),
+        np.concatenate([part.at + first for part, first in zip(parts, frames, strict=False)]),
+        np.concatenate([part.tracks + first for part, first in zip(parts, tracks, strict=False)]),
+        np.concatenate([part.joints for part in parts]),
+        np.concatenate([part.confidence for part in parts]),
+        np.concatenate([part.crowd for part in parts]),
+        tuple(dict.fromkeys(note for part in parts for note in part.notes)),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Stretch:
+    """A track: when it begins and ends, what it shows there, and how large the person is."""
+
+    rows: Indices
+    begin: float
+    end: float
+    first: Floats
+    last: Floats
+
+    @property
+    def size(self) -> float:
+        return max(_size(self.first), _size(self.last))
+
+
+def identities(seen: Sightings, options: IdentityOptions = IdentityOptions()) -> list[Indices]:
+    """The sightings of each person, the largest person first.
+
+    A track that begins soon after another one has ended, and near, goes on with the same person; of several the nearest pairs
+    are joined first.  Sizes are areas of boxes, summed over all frames; of equals, who comes first.
+
+    Example:
+        >>> box = np.array([[0.0, 0.0], [10.0, 20.0]])
+        >>> joints, tracks = np.stack([box, box, box + 1]), np.array([0, 0, 1])
+        >>> seen = Sightings(np.arange(4) / 10, np.array([0, 1, 3]), tracks, joints, np.ones((3, 2)))
+        >>> [rows.tolist() for rows in identities(seen)]
+        [[0, 1, 2]]
+    """
+    order = np.argsort(seen.tracks, kind="stable")
+    groups = np.split(order, np.flatnonzero(np.diff(seen.tracks[order])) + 1) if len(order) else []
+    tracks = sorted((_stretch(seen, rows) for rows in groups), key=lambda one: (one.begin, -one.size))
+    owners: list[list[_Stretch]] = []
+    for moment in dict.fromkeys(one.begin for one in tracks):
+        fresh = [one for one in tracks if one.begin == moment]
+        cost = np.array([[_apart(owner[-1], one, options) for one in fresh] for owner in owners]).reshape(-1, len(fresh))
+        while cost.size and cost.min() <= 1:
+            i, j = (int(k) for k in np.unravel_index(int(np.argmin(cost)), cost.shape))
+            owners[i].append(fresh[j])
+            cost[i, :] = cost[:, j] = np.inf
+        taken = {id(owner[-1]) for owner in owners}
+        owners += [[one] for one in fresh if id(one) not in taken]
+    people = [np.sort(np.concatenate([one.rows for one in owner])) for owner in owners]
+    return sorted(people, key=lambda rows: (-float(_areas(seen.joints[rows]).sum()), int(rows[0])))
+
+
+def largest(seen: Sightings, people: Sequence[Indices]) -> Indices:
+    """One sighting a frame: of the person who is the largest over the whole video, among those who are there."""
+    rank = np.zeros(len(seen.at), dtype=np.int64)
+    for number, rows in enumerate(people):
+        rank[rows] = number
+    order = np.lexsort((rank, seen.at))
+    first = np.append(True, np.diff(seen.at[order]) > 0)[: len(order)]
+    return np.asarray(order[first])
+
+
+def _stretch(seen: Sightings, rows: Indices) -> _Stretch:
+    rows = rows[np.argsort(seen.at[rows], kind="stable")]
+    times = seen.times[seen.at[rows]]
+    return _Stretch(rows, float(times[0]), float(times[-1]), seen.joints[rows[0]], seen.joints[rows[-1]])
+
+
+def _apart(old: _Stretch, new: _Stretch, options: IdentityOptions) -> float:
+    """How far somebody is from where somebody was, in what is allowed; infinite where they cannot be the same."""
+    gap = new.begin - old.end
+    if not 0 < gap <= options.away:
+        return np.inf
+    size = max(_size(old.last), _size(new.first)) / 2
+    allowed = size * (options.reach + options.speed * gap)
+    far = float(np.linalg.norm(old.last - new.first, axis=1).mean())
+    return far / allowed if allowed > 0 else np.inf
+
+
+def _size(joints: Floats) -> float:
+    """The diagonal of the box about somebody."""
+    return float(np.linalg.norm(joints.max(axis=0) - joints.min(axis=0)))
+
+
+def _areas(joints: Floats) -> Floats:
+    return np.asarray((joints.max(axis=1) - joints.min(axis=1)).prod(axis=1))

@@ -1,0 +1,113 @@
+"""BlazePose's networks, run by LiteRT on one thread of the processor."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from importlib import import_module
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from indexing.opening import error
+from indexing.pose.blazepose import HEATMAP, LANDMARKS, POINTS, Floats, anchors
+from indexing.pose.models import AGAIN, ModelSet, needs
+
+Image = NDArray[np.uint8]
+QUIET = threading.Lock()  # the process has one stream of errors
+
+
+class Networks(Protocol):
+    """What is asked of the networks; not to be shared by threads."""
+
+    def detector(self, image: Image) -> tuple[Floats, Floats]:
+        """``(2254, 12)`` boxes and points, and ``(2254,)`` logits, of an RGB picture ``(224, 224, 3)``."""
+
+    def landmarks(self, image: Image) -> tuple[Floats, float, Floats]:
+        """``(39, 5)`` landmarks, the probability of a person, and ``(64, 64, 39)`` logits, of an RGB region ``(256, 256, 3)``."""
+
+
+NetworkMaker = Callable[[], Networks]
+
+
+class LiteNetworks:
+    """The networks of a set of model files.
+
+    Raises:
+        ValueError: the runtime is not installed, or a file is no such network.
+    """
+
+    def __init__(self, models: ModelSet) -> None:
+        self._detector = _interpreter(models.detector, str(models.paths[0]))
+        self._landmarks = _interpreter(models.landmarks, str(models.paths[1]))
+
+    def detector(self, image: Image) -> tuple[Floats, Floats]:
+        """See :class:`Networks`."""
+        self._detector.run(np.divide(image, 127.5, dtype=np.float32) - np.float32(1))
+        count = len(anchors())
+        return self._detector.output(count, 4 + 2 * POINTS), self._detector.output(count)
+
+    def landmarks(self, image: Image) -> tuple[Floats, float, Floats]:
+        """See :class:`Networks`."""
+        self._landmarks.run(np.divide(image, 255, dtype=np.float32))
+        heatmap = self._landmarks.output(HEATMAP, HEATMAP, LANDMARKS)
+        return self._landmarks.output(LANDMARKS, 5), float(self._landmarks.output(1)[0]), heatmap
+
+
+class _Interpreter:
+    """One network, whose outputs are known by their sizes."""
+
+    def __init__(self, running: Any, name: str) -> None:
+        self._running, self._name = running, name
+        self._input = running.get_input_details()[0]["index"]
+        self._outputs = {math.prod(map(int, one["shape"])): one["index"] for one in running.get_output_details()}
+
+    def run(self, image: Floats) -> None:
+        """Run it on an image."""
+        self._running.set_tensor(self._input, image[None])
+        self._running.invoke()
+
+    def output(self, *shape: int) -> Floats:
+        """What it gave in this shape."""
+        at = self._outputs.get(math.prod(shape))
+        if at is None:
+            raise error(self._name, f"has no output of shape {shape}", AGAIN)
+        return np.array(self._running.get_tensor(at)).reshape(shape)
+
+
+def _interpreter(model: bytes, name: str) -> _Interpreter:
+    try:
+        interpreter = import_module("ai_edge_litert.interpreter").Interpreter
+    except ImportError as problem:
+        raise needs(problem) from None
+    try:
+        with _quiet():
+            running = interpreter(model_content=model, num_threads=1)
+            running.allocate_tensors()
+    except (ValueError, RuntimeError):
+        raise error(name, "is no network that LiteRT can run", AGAIN) from None
+    return _Interpreter(running, name)
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Without the line that the runtime writes past Python on every start."""
+    with QUIET:
+        try:
+            sys.stderr.flush()
+            kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+        except (OSError, ValueError, AttributeError):  # no stream of errors at all
+            yield
+            return
+        os.dup2(nowhere, 2)
+        try:
+            yield
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+            os.close(nowhere)

@@ -1,0 +1,247 @@
+"""A video as pieces that are worked one by one, by one worker or several, and kept on the disk until all are there.
+
+Where a video is cut depends on the video alone, and every piece begins with a tracker of its own: the same people come out whatever
+number of workers there is, and however often the work was interrupted.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from indexing.files import prepare, replacing
+from indexing.opening import opened, size_of
+from indexing.pose.blazepose import JOINTS, Floats
+from indexing.pose.identities import Sightings
+from indexing.pose.networks import Networks
+from indexing.pose.options import PieceOptions, PoseOptions
+from indexing.pose.regions import VideoPicture
+from indexing.pose.tracking import Sighting, Tracker
+from indexing.readers.npz import NumpyArchive
+from indexing.video.reading import Video, VideoInfo, frame_times
+
+HEAD_BLOCK = 2**20  # bytes at both ends of a file that tell it from others
+VERSION = 1  # of the way from pictures to joints: kept pieces of another one are not used
+
+Stop = Callable[[], bool]
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """Frames of a video that one worker looks at.
+
+    Attributes:
+        number: of the piece.
+        frames: numbers of the frames that count, from 0.
+        lead: numbers of frames before these that are looked at, too.
+    """
+
+    number: int
+    frames: NDArray[np.int64]
+    lead: NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class VideoPlan:
+    """A video and how it is cut.
+
+    Attributes:
+        times: ``(frames,)`` seconds of every frame that the file announces.
+        model: name of the networks.
+        pieces: in order; together they hold every frame that is looked at.
+        made_from: what the result depends on, as a short hash: the video's content, the networks, and every option.
+    """
+
+    path: Path
+    info: VideoInfo
+    fps: float | None
+    times: Floats
+    people: int
+    every: int
+    model: str
+    pieces: tuple[Piece, ...]
+    options: PoseOptions
+    made_from: str
+
+    @property
+    def frames(self) -> int:
+        """Frames to look at."""
+        return sum(len(piece.frames) for piece in self.pieces)
+
+
+def plan(path: Path, people: int, every: int, fps: float | None, model: str, options: PoseOptions) -> VideoPlan:
+    """Look at a video file, and cut it.
+
+    Args:
+        model: name of the networks.
+
+    Raises:
+        ValueError: the file cannot be read as a video.
+    """
+    info, times = frame_times(path, fps=fps)
+    numbers = np.flatnonzero(times >= 0)
+    wanted = numbers[::every] if len(numbers) else np.arange(len(times))[::every]
+    # where the file has no times there is no way to go to one
+    cuts = cut(times[wanted], options.pieces) if info.timed else [(0, 0, len(wanted))]
+    pieces = tuple(Piece(number, wanted[a:b], wanted[lead:a]) for number, (lead, a, b) in enumerate(cuts))
+    about = (VERSION, content_of(path), model, people, every, fps, options)
+    made_from = hashlib.sha256(repr(about).encode()).hexdigest()[:16]
+    return VideoPlan(path, info, fps, times, people, every, model, pieces, options, made_from)
+
+
+def cut(times: Floats, options: PieceOptions = PieceOptions()) -> list[tuple[int, int, int]]:
+    """Where each piece's lead begins, where it begins, and where it ends.
+
+    Example:
+        >>> cut(np.arange(0, 70, 10.0), PieceOptions(seconds=30, lead=10))
+        [(0, 0, 3), (2, 3, 6), (5, 6, 7)]
+    """
+    if not len(times):
+        return []
+    number = np.floor((times - times[0]) / options.seconds + 1e-9).astype(np.int64)
+    starts = np.flatnonzero(np.diff(number, prepend=-1))
+    leads = np.searchsorted(times, times[starts] - options.lead - 1e-9)
+    ends = np.append(starts[1:], len(times))
+    return [(int(a), int(b), int(c)) for a, b, c in zip(leads, starts, ends, strict=True)]
+
+
+def content_of(path: Path) -> str:
+    """What tells a file from others: its size, and what stands at both its ends."""
+    size = size_of(path)
+    hashed = hashlib.sha256(str(size).encode())
+    with opened(path) as stream:
+        hashed.update(stream.read(HEAD_BLOCK))
+        stream.seek(max(0, size - HEAD_BLOCK))
+        hashed.update(stream.read(HEAD_BLOCK))
+    return hashed.hexdigest()
+
+
+class Stopped(Exception):
+    """The work was to be stopped."""
+
+
+def work(task: VideoPlan, piece: Piece, networks: Networks, moved: Callable[[], None], stop: Stop = lambda: False) -> Sightings:
+    """Look at the frames of a piece.
+
+    Args:
+        moved: called after every frame that counts.
+        stop: asked before every frame.
+
+    Raises:
+        ValueError: no frame of it can be decoded.
+        Stopped: ``stop`` said so.
+    """
+    tracker, kept = Tracker(networks, task.people, task.options), _Kept()
+    both = np.concatenate([piece.lead, piece.frames])
+    edge = np.diff(task.times).min(initial=1.0) / 2
+    span = max(0.0, float(task.times[both[0]] - edge)), float(task.times[both[-1]] + edge)
+    video = Video(task.path, False, None, span, 1, task.fps)
+    counted, looked = set(piece.frames.tolist()), set(both.tolist())
+    size: tuple[int, int] | None = None
+    changed, reformat = 0, import_module("av.video.reformatter").VideoReformatter().reformat
+    for frame, time in video.stored():
+        if stop():
+            raise Stopped
+        size = size or (frame.width, frame.height)
+        changed += (frame.width, frame.height) != size
+        number = nearest(task.times, time)
+        if number not in looked:
+            continue
+        looked.discard(number)
+        seen = tracker.step(VideoPicture(frame, size, reformat), time)
+        if number in counted:
+            kept.add(time, seen)
+            moved()
+    notes = [*video.notes, *([f"{changed} frames of another size than the first were brought to its size"] if changed else [])]
+    return kept.sightings(tracker.crowd, notes)
+
+
+def nearest(times: Floats, time: float) -> int:
+    """Which of increasing times is the nearest one.
+
+    Example:
+        >>> nearest(np.array([0.0, 1.0, 2.0]), 1.4)
+        1
+    """
+    after = int(np.searchsorted(times, time))
+    if after == 0 or (after < len(times) and times[after] - time < time - times[after - 1]):
+        return after
+    return after - 1
+
+
+@dataclass
+class _Kept:
+    """What was seen so far."""
+
+    times: list[float] = field(default_factory=list)
+    seen: list[list[Sighting]] = field(default_factory=list)
+
+    def add(self, time: float, seen: list[Sighting]) -> None:
+        self.times.append(time)
+        self.seen.append(seen)
+
+    def sightings(self, crowd: list[int], notes: Sequence[str]) -> Sightings:
+        flat = [one for seen in self.seen for one in seen]
+        joints = np.array([one.joints for one in flat], dtype=np.float32).reshape(-1, JOINTS, 2)
+        confidence = np.array([one.confidence for one in flat], dtype=np.float32).reshape(-1, JOINTS)
+        at = np.repeat(np.arange(len(self.seen)), [len(seen) for seen in self.seen]).astype(np.int64)
+        tracks = np.array([one.track for one in flat], dtype=np.int64)
+        return Sightings(np.array(self.times), at, tracks, joints, confidence, np.array(crowd, dtype=np.int64), tuple(notes))
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Pieces on the disk, in a hidden folder beside what is made of them.
+
+
+class Store:
+    """Finished pieces of one video.
+
+    Args:
+        folder: made when it is needed; what another video, another model or other options have left there is taken away.
+    """
+
+    def __init__(self, folder: Path, task: VideoPlan) -> None:
+        self.folder, self.task = folder, task
+        self._lock = threading.Lock()
+
+    def _path(self, piece: Piece) -> Path:
+        return self.folder / f"{self.task.made_from}-{piece.number:06d}.npz"
+
+    def get(self, piece: Piece) -> Sightings | None:
+        """A piece that was finished before, if it is whole."""
+        try:
+            data = NumpyArchive(self._path(piece))
+            found = Sightings(
+                *(data[key] for key in ("times", "at", "tracks", "joints", "confidence", "crowd")),
+                tuple(map(str, data["notes"])),
+            )
+        except (ValueError, KeyError):
+            return None
+        return found if len(found.joints) == len(found.at) == len(found.tracks) == len(found.confidence) else None
+
+    def put(self, piece: Piece, seen: Sightings) -> None:
+        """Keep a finished piece."""
+        with self._lock:
+            if not self.folder.is_dir():
+                prepare(self.folder)
+            for other in self.folder.glob("*.npz"):
+                if not other.name.startswith(self.task.made_from):
+                    other.unlink(missing_ok=True)
+        with replacing(self._path(piece)) as stream:
+            np.savez(
+                stream, times=seen.times, at=seen.at, tracks=seen.tracks, joints=seen.joints, confidence=seen.confidence,
+                crowd=seen.crowd, notes=np.array(seen.notes, dtype=np.str_),
+            )  # fmt: skip
+
+
+def clear(folder: Path) -> None:
+    """Take a folder of finished pieces away."""
+    shutil.rmtree(folder, ignore_errors=True)

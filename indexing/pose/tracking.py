@@ -1,0 +1,220 @@
+"""People followed through consecutive frames of a video: one tracker looks at one piece of it, in the order of its frames.
+
+1. Whoever was in the frame before is looked for where the network saw the body then, farther along where it moves fast.
+2. Who is not there any more is let go; of two tracks that came to sit on one person, the one that leapt.
+3. The detector looks at the whole picture when somebody is missing, and from time to time.
+4. Who is new there is looked at more than once, and followed from then on.
+
+Nothing is smoothed, and nothing is filled in: a frame shows what the network saw in it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from indexing.pose.blazepose import JOINTS, PICTURE, REGION, Floats, Landmarks, candidates, landmarks
+from indexing.pose.networks import Networks
+from indexing.pose.options import PoseOptions
+from indexing.pose.regions import Region, VideoPicture, of_candidates, of_landmarks
+
+
+@dataclass(frozen=True, eq=False)
+class Sighting:
+    """One person in one frame: which track, ``(33, 2)`` pixels, ``(33,)`` confidences."""
+
+    track: int
+    joints: Floats
+    confidence: Floats
+
+
+@dataclass(eq=False)
+class _Followed:
+    """Somebody who is followed: where to look next, how fast that moves (pixels per second), and what was seen last."""
+
+    number: int
+    region: Region
+    joints: Floats
+    confidence: Floats
+    time: float
+    speed: tuple[float, float] = (0.0, 0.0)
+    leap: float = 0.0
+
+
+@dataclass
+class Tracker:
+    """Follows up to so many people from frame to frame.
+
+    Args:
+        networks: of one thread.
+        people: at most, at once.
+
+    Attributes:
+        crowd: how many people were in view, whenever the detector looked.
+        begun: tracks so far.
+    """
+
+    networks: Networks
+    people: int
+    options: PoseOptions
+    crowd: list[int] = field(default_factory=list)
+    begun: int = 0
+    _followed: list[_Followed] = field(default_factory=list)
+    _searched: float = -math.inf
+    _looked_closer: float = -math.inf
+
+    def step(self, picture: VideoPicture, time: float) -> list[Sighting]:
+        """Everybody who is seen in a frame; frames come in order, at ``time`` seconds."""
+        before = len(self._followed)
+        self._follow(picture, time)
+        if self._due(before, time):
+            self._search(picture, time)
+        return [Sighting(one.number, one.joints, one.confidence) for one in self._followed]
+
+    # ---- who was there before ----
+    def _follow(self, picture: VideoPicture, time: float) -> None:
+        kept = []
+        for one in self._followed:
+            region = self._awaited(one, time)
+            if self._update(one, picture, region, time):
+                kept.append(one)
+        self._followed = self._apart(kept)
+
+    def _awaited(self, one: _Followed, time: float) -> Region:
+        """Where to look for somebody: where the body was, or farther along if it moves by more than noise does."""
+        step = time - one.time
+        dx, dy = one.speed[0] * step, one.speed[1] * step
+        reach = self._radius(one.region)
+        return one.region.moved(dx, dy) if self.options.follow.still * reach < math.hypot(dx, dy) < reach else one.region
+
+    def _update(self, one: _Followed, picture: VideoPicture, region: Region, time: float) -> bool:
+        """Look for somebody in a region; whether anybody is there."""
+        found = self._look(picture, region)
+        if found is None:
+            return False
+        seen, following = found
+        step = time - one.time
+        if step > 0:
+            one.speed = (following.x - one.region.x) / step, (following.y - one.region.y) / step
+        one.leap = math.hypot(following.x - region.x, following.y - region.y) / self._radius(following)
+        self._seen(one, seen, region, following, time)
+        return True
+
+    def _seen(self, one: _Followed, seen: Landmarks, region: Region, following: Region, time: float) -> None:
+        one.joints = region.to_picture(seen.places[:JOINTS])
+        one.confidence, one.region, one.time = seen.confidence[:JOINTS], following, time
+
+    def _look(self, picture: VideoPicture, region: Region) -> tuple[Landmarks, Region] | None:
+        """What a region shows and the next region; None where nobody is in it."""
+        if not region.usable(picture.width, picture.height, self.options.follow):
+            return None
+        options = self.options.landmarks
+        seen = landmarks(*self.networks.landmarks(picture.cut(region, REGION)), options)
+        if not (seen.present >= options.present and np.isfinite(seen.places).all()):
+            return None
+        following = of_landmarks(seen, region, options.expand)
+        return (seen, following) if following.usable(picture.width, picture.height, self.options.follow) else None
+
+    def _apart(self, people: list[_Followed]) -> list[_Followed]:
+        """Without those who sit on somebody else: the one that leapt farther goes, of equals the later one."""
+        gone: set[int] = set()
+        for i, one in enumerate(people):
+            for other in people[i + 1 :]:
+                if one.number not in gone and other.number not in gone and self._alike(one, other):
+                    gone.add(one.number if one.leap > other.leap + self.options.follow.alike else other.number)
+        return [one for one in people if one.number not in gone]
+
+    def _alike(self, one: _Followed, other: _Followed) -> bool:
+        apart = float(np.linalg.norm(one.joints - other.joints, axis=1).mean())
+        return apart < self.options.follow.alike * max(self._radius(one.region), self._radius(other.region))
+
+    def _radius(self, region: Region) -> float:
+        return region.side / (2 * self.options.landmarks.expand)
+
+    # ---- who is new ----
+    def _due(self, before: int, time: float) -> bool:
+        """Whether the detector should look: somebody was just lost, nobody is there, or it has not looked for long."""
+        if not self._followed or len(self._followed) < before:
+            return True
+        return time - self._searched >= self.options.follow.search
+
+    def _search(self, picture: VideoPicture, time: float) -> None:
+        """Look at the whole picture, and closer where nobody is found there, or from time to time where some are still wanted."""
+        wait = self.options.follow.search_closer if self._followed and self.people > 1 else self.options.follow.search
+        closer = time - self._looked_closer >= wait
+        self._searched = time
+        for shrink in self.options.detector.shrinks:
+            if shrink > 1:
+                if not closer or (self._followed if self.people == 1 else len(self._followed) >= self.people):
+                    break
+                self._looked_closer = time
+            found = [region for region in self._detect(picture, shrink) if not self._known(region)]
+            if shrink == 1:
+                self.crowd.append(len(found) + len(self._followed))
+            for region in found:
+                self._admit(picture, region, time)
+
+    def _admit(self, picture: VideoPicture, region: Region, time: float) -> None:
+        """Follow somebody new, if there is a place, or somebody much smaller has one."""
+        full = len(self._followed) >= self.people
+        smallest = min(self._followed, key=lambda one: one.region.side, default=None)
+        if not full:
+            self._begin(picture, region, time, None)
+        elif smallest is not None and region.side >= self.options.follow.larger * smallest.region.side:
+            self._begin(picture, region, time, smallest)
+
+    def _detect(self, picture: VideoPicture, shrink: int) -> list[Region]:
+        """Regions about the people whom the detector sees, the largest first."""
+        options = self.options.detector
+        least = options.score if shrink == 1 else options.closer_score
+        found: list[Region] = []
+        for window in windows(picture.width, picture.height, max(picture.width, picture.height) / shrink):
+            seen = candidates(*self.networks.detector(picture.cut(window, PICTURE, fill=True)), replace(options, score=least))
+            found += of_candidates(seen, window, self.options.landmarks.expand)
+        return self._distinct(found)[: options.most]
+
+    def _distinct(self, regions: list[Region]) -> list[Region]:
+        """The largest first, and each person once, though windows overlap."""
+        kept: list[Region] = []
+        for region in sorted(regions, key=lambda one: (-one.side, one.x, one.y)):
+            if not any(self._same_place(region, other) for other in kept):
+                kept.append(region)
+        return kept
+
+    def _known(self, region: Region) -> bool:
+        return any(self._same_place(region, one.region) for one in self._followed)
+
+    def _same_place(self, a: Region, b: Region) -> bool:
+        return math.hypot(a.x - b.x, a.y - b.y) < self.options.follow.place * max(self._radius(a), self._radius(b))
+
+    def _begin(self, picture: VideoPicture, region: Region, time: float, instead: _Followed | None) -> None:
+        """Follow somebody new, if the region shows a person who is not followed already."""
+        seen: Landmarks | None = None
+        used = following = region
+        for _ in range(self.options.landmarks.looks):
+            found = self._look(picture, following)
+            if found is None or found[0].present < self.options.landmarks.new:
+                return
+            used, (seen, following) = following, found
+        if seen is None:
+            return
+        one = _Followed(self.begun, following, np.empty(0), np.empty(0), time)
+        self._seen(one, seen, used, following, time)
+        others = [other for other in self._followed if other is not instead]
+        if any(self._alike(one, other) for other in self._followed):
+            return
+        self.begun += 1
+        self._followed = [*others, one]
+
+
+def windows(width: int, height: int, side: float) -> list[Region]:
+    """Squares that overlap by half and cover a picture; one, about its middle, where it is as large as the picture."""
+
+    def middles(length: int) -> list[float]:
+        count = 1 + math.ceil(max(0.0, length - side) / (side / 2) - 1e-9)
+        spare = max(0.0, length - side)
+        return [length / 2] if count == 1 else [side / 2 + spare * k / (count - 1) for k in range(count)]
+
+    return [Region(x, y, side) for y in middles(height) for x in middles(width)]

@@ -1,0 +1,236 @@
+"""Keypoint files of videos: a clip set for every command of this package, and a folder of JSON as OpenPose and Pose2Sim have it."""
+
+from __future__ import annotations
+
+import secrets
+import shutil
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from json import dumps
+from pathlib import Path
+
+import numpy as np
+
+from indexing.clip import Clip, ClipSet
+from indexing.files import prepare, recover_folder, replace_folder
+from indexing.opening import error
+from indexing.pose.blazepose import Floats
+from indexing.pose.detection import Detected, FrameProgress, ModelName, Progress, VideoTask, as_frames, check, made_by, run
+from indexing.pose.models import load_models
+from indexing.pose.networks import NetworkMaker
+from indexing.pose.options import PoseOptions
+from indexing.pose.pieces import clear, nearest, plan
+from indexing.readers.clipset import read_clip_set
+from indexing.readers.npz import NumpyArchive
+
+MARK = "made_from"  # the field by which a file of ours is known
+
+
+@dataclass(frozen=True, eq=False)
+class KeypointFile:
+    """The keypoint file of a video.
+
+    Attributes:
+        path: of the clip set.
+        folder: of the JSON, None where there is none.
+        clips: one per person.
+        reused: whether it was there before.
+        found: how it was made; None where it was there before.
+    """
+
+    path: Path
+    folder: Path | None
+    clips: ClipSet
+    reused: bool
+    found: Detected | None = None
+
+
+def keypoint_file(
+    video: str | Path,
+    folder: str | Path,
+    people: int = 1,
+    *,
+    model: ModelName | None = None,
+    models: str | Path | None = None,
+    every: int = 1,
+    fps: float | None = None,
+    workers: int = 1,
+    progress: Progress | None = None,
+    json: bool = False,
+    options: PoseOptions = PoseOptions(),
+) -> KeypointFile:
+    """The keypoints of a video from a folder, made where they are not there yet.
+
+    A file counts as there if it was made from the same content (size, and what stands at both ends of the file), by the same model
+    and the same arguments.  What was worked before an interruption is kept in a hidden folder and used.
+
+    Args:
+        video: a path.
+        folder: where ``NAME.npz`` is looked for and written, and with ``json`` the folder ``NAME_json``.
+        people, model, models, every, fps, workers, progress, options: as of :func:`indexing.pose.detect`.
+        json: whether to write the folder of JSON as well.
+
+    Raises:
+        ValueError: as :func:`indexing.pose.detect`, or a file of that name holds something else.
+    """
+    check(people, every, workers)
+    chosen = load_models(model, models)
+    task = VideoTask(Path(video).expanduser(), people, every, fps, chosen.name, options)
+    ((_, made),) = keypoint_files([task], Path(folder).expanduser(), made_by(chosen), workers, as_frames(progress), json)
+    if isinstance(made, ValueError):
+        raise made
+    return made
+
+
+def keypoint_files(
+    tasks: Sequence[VideoTask],
+    folder: Path,
+    networks: NetworkMaker,
+    workers: int = 1,
+    progress: FrameProgress | None = None,
+    json: bool = True,
+) -> Iterator[tuple[VideoTask, KeypointFile | ValueError]]:
+    """The keypoint files of many videos, in their order, each as soon as it is written, or what is wrong with it.
+
+    Raises:
+        ValueError: two videos of one name, or a folder that cannot be written.
+    """
+    targets = targets_of([task.path for task in tasks], folder)
+    there: dict[int, KeypointFile | ValueError] = {}
+    for number, (task, target) in enumerate(zip(tasks, targets, strict=True)):
+        try:
+            kept = _there(task, target, json)
+        except ValueError as problem:
+            there[number] = problem
+            continue
+        if kept is not None:
+            there[number] = kept
+    left = [replace(task, parts=_parts(target)) for number, (task, target) in enumerate(zip(tasks, targets, strict=True))
+            if number not in there]  # fmt: skip
+    fresh = not folder.exists()
+    if left:
+        prepare(folder)
+    working = run(left, networks, workers, progress)
+    for number, (task, target) in enumerate(zip(tasks, targets, strict=True)):
+        if number in there:
+            yield task, there[number]
+            continue
+        same, found = next(working)
+        if isinstance(found, ValueError):
+            clear(_parts(target))
+            yield task, found
+        else:
+            yield task, _written(same, found, target, json)
+    if fresh and left and not any(folder.iterdir()):
+        folder.rmdir()
+
+
+def targets_of(videos: Sequence[Path], folder: Path) -> list[Path]:
+    """The clip set of each video.
+
+    Raises:
+        ValueError: two of them would have one name.
+
+    Example:
+        >>> targets_of([Path("a/s.mp4"), Path("b/s.mov")], Path("pose"))
+        Traceback (most recent call last):
+        ...
+        ValueError: b/s.mov: would be written to pose/s.npz, as a/s.mp4; rename one of them, or give two folders
+    """
+    owners: dict[str, Path] = {}
+    for video in videos:
+        other = owners.setdefault(video.stem.lower(), video)
+        if other is not video:
+            said = f"would be written to {folder / video.stem}.npz, as {other}"
+            raise error(video, said, "rename one of them, or give two folders")
+    return [folder / f"{video.stem}.npz" for video in videos]
+
+
+def _parts(target: Path) -> Path:
+    return target.with_name(f".{target.stem}.parts")
+
+
+def _json(target: Path) -> Path:
+    return target.with_name(f"{target.stem}_json")
+
+
+def _there(task: VideoTask, target: Path, json: bool) -> KeypointFile | None:
+    """The file that was written before, if it is what would be written now.
+
+    Raises:
+        ValueError: the video cannot be read, or a file or folder of that name is not ours.
+    """
+    recover_folder(_json(target))
+    if not target.exists():
+        if json and _json(target).exists():
+            raise error(_json(target), "is there, and not of this video", "move it away, or write to another folder")
+        return None
+    try:
+        made_from = NumpyArchive(target).get(MARK, np.zeros(0))
+    except ValueError:
+        made_from = np.zeros(0)
+    if not made_from.size:
+        raise error(target, "is there, and no keypoint file of 'dyntorch pose'", "move it away, or write to another folder")
+    now = plan(task.path, task.people, task.every, task.fps, task.model, task.options)
+    if str(made_from.flat[0]) != now.made_from:
+        return None
+    clips = read_clip_set(target)
+    folder = _json(target) if json else None
+    if folder is not None and not folder.exists():
+        wanted = np.concatenate([piece.frames for piece in now.pieces])
+        if task.people == 1:  # this clip has every frame that could be decoded
+            wanted = np.array([nearest(now.times, time) for time in clips[0].times])
+        write_json_folder(clips, wanted, now.times[wanted], folder)
+    return KeypointFile(target, folder, clips, True)
+
+
+def _written(task: VideoTask, found: Detected, target: Path, json: bool) -> KeypointFile:
+    """Write what was found; the clip set last, so that it says that all is there."""
+    folder = _json(target) if json else None
+    if folder is not None:
+        write_json_folder(found.clips, found.frames, found.times, folder)
+    found.clips.save(target)
+    if task.parts is not None:
+        clear(task.parts)
+    return KeypointFile(target, folder, found.clips, False, found)
+
+
+def write_json_folder(clips: Sequence[Clip], numbers: Floats, times: Floats, folder: Path) -> Path:
+    """Write a file per frame, as OpenPose does and Pose2Sim reads: ``NAME_000000000000_keypoints.json``.
+
+    Each has ``people`` with ``pose_keypoints_2d`` (x, y, confidence of every joint; zeros where it was not seen) and ``person_id``,
+    and besides what OpenPose has, ``time`` in seconds.  The folder appears whole or not at all.
+
+    Args:
+        clips: one per person.
+        numbers: ``(frames,)`` that the files are called by; times: ``(frames,)`` seconds.
+    """
+    rows: list[dict[int, int]] = [{nearest(times, time): row for row, time in enumerate(clip.times)} for clip in clips]
+    ids = [clip.meta["person"] if clip.meta["followed"] == "ids" else -1 for clip in clips]
+    name = folder.name.removesuffix("_json")
+    building = folder.with_name(f".{folder.name}-{secrets.token_hex(8)}.tmp")
+    building.mkdir()
+    try:
+        for k, number in enumerate(numbers.tolist()):
+            people = [
+                {"person_id": [who], "pose_keypoints_2d": _flat(clip, row[k])}
+                for clip, row, who in zip(clips, rows, ids, strict=True)
+                if k in row and clip.seen[row[k]].any()
+            ]
+            frame = {"version": 1.3, "time": round(float(times[k]), 9), "people": people}
+            (building / f"{name}_{number:012d}_keypoints.json").write_text(dumps(frame), encoding="utf-8")
+        replace_folder(building, folder)
+    except OSError as problem:
+        said = f"cannot be written ({problem.strerror or problem})"
+        raise error(folder, said, "free the disk, or choose another folder") from None
+    finally:
+        shutil.rmtree(building, ignore_errors=True)
+    return folder
+
+
+def _flat(clip: Clip, row: int) -> list[float]:
+    """x, y, confidence of every joint, one after the other."""
+    assert clip.confidence is not None
+    table = np.concatenate([clip.joints[row], clip.confidence[row][:, None]], axis=1).astype(np.float64)
+    table[np.isnan(table).any(axis=1)] = 0.0
+    return np.round(table, 4).ravel().tolist()

@@ -1,0 +1,178 @@
+"""Data frames that pandas keeps in HDF5, both of its layouts: what DeepLabCut writes by default, read without pandas.
+
+*Fixed*: ``axis0_level<k>`` the words of each row of column names, ``axis0_label<k>`` which word each column has, ``axis1`` the
+index, ``block<i>_values`` the numbers.  *Table*: a table of records with a row of numbers as ``values_block_<i>``, whose column
+names are a pickle in an attribute (read by :mod:`indexing.readers.pickles`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from indexing.clip import FloatArray
+from indexing.opening import error, listed, shown
+from indexing.readers.hdf import AGAIN, Hdf5
+from indexing.readers.pickles import unpickled
+
+MOST_BLOCK = 100  # blocks of one frame, and rows of column names: usual are one, and three or four
+KEY = "df_with_missing"
+LEVELS = {3: ("scorer", "bodyparts", "coords"), 4: ("scorer", "individuals", "bodyparts", "coords")}  # where they have no names
+
+
+@dataclass(frozen=True, eq=False)
+class HdfFrame:
+    """A table of numbers.
+
+    Args:
+        header: rows of column names by their name, a name per column.
+        values: ``(rows, columns)``; index: a name or number per row.
+    """
+
+    header: dict[str, list[str]]
+    values: FloatArray
+    index: list[str]
+
+
+def holds_frame(file: Hdf5) -> bool:
+    """Whether pandas wrote the file."""
+    return bool(_keys(file))
+
+
+def read_frame(file: Hdf5) -> HdfFrame:
+    """The one frame of a file, or the one that DeepLabCut means.
+
+    Raises:
+        ValueError: there is none, or several; its parts do not fit each other.
+    """
+    keys = _keys(file)
+    key = KEY if KEY in keys else keys[0] if len(keys) == 1 else None
+    if key is None:
+        raise error(file.path, f"holds {len(keys)} tables of pandas ({listed(keys)}), none of them {KEY}", "save one per file")
+    kind = _word(file.attribute(key, "pandas_type"))
+    if kind == "frame_table":
+        return _table(file, key)
+    if kind != "frame":
+        raise error(file.path, f"{shown(key)} is a {shown(kind)} of pandas, not a data frame", AGAIN)
+    return _fixed(file, key)
+
+
+def _keys(file: Hdf5) -> list[str]:
+    return [name for name in file.names() if file.attribute(name, "pandas_type") is not None]
+
+
+def _fixed(file: Hdf5, key: str) -> HdfFrame:
+    count = _count(file, key, "nblocks")
+    columns, blocks = [], []
+    rows = _axis(file, f"{key}/axis1", _word(file.attribute(key, "axis1_variety")), _levels(file, key, "axis1"))
+    for i in range(count):
+        name = f"{key}/block{i}_items"
+        levels = _levels(file, key, f"block{i}_items")
+        parts = _rows(file, name, levels)
+        values = file.array(f"{key}/block{i}_values", 2).astype(np.float64)
+        if file.attribute(f"{key}/block{i}_values", "transposed") in (0, None) and values.shape != (len(rows), len(parts[0])):
+            values = values.T
+        if values.shape != (len(rows), len(parts[0])):
+            said = f"{key}: {len(rows)} rows and {len(parts[0])} columns, but values {values.shape}"
+            raise error(file.path, said, AGAIN)
+        if columns and len(parts) != len(columns[0]):
+            raise error(file.path, f"{key}: blocks with {len(columns[0])} and {len(parts)} rows of column names", AGAIN)
+        columns.append(parts)
+        blocks.append(values)
+    names = [_word(file.attribute(f"{key}/axis0_level{k}", "name")) for k in range(len(columns[0]))]
+    header = [[word for part in columns for word in part[k]] for k in range(len(names))]
+    return _frame(file, header, names, blocks, rows)
+
+
+def _table(file: Hdf5, key: str) -> HdfFrame:
+    table = f"{key}/table"
+    fields = file.fields(table)
+    blocks = [name for name in fields if name.startswith("values_block_")]
+    if not blocks or "index" not in fields or len(blocks) > MOST_BLOCK:
+        raise error(file.path, f"{shown(table)} has the fields {listed(fields)}, no index and values", AGAIN)
+    parts: list[tuple[str, ...]] = []
+    for block in blocks:
+        kind = file.attribute(table, f"{block}_kind")
+        found = unpickled(file.path, _raw(kind), f"{table}@{block}_kind")
+        if not isinstance(found, list) or not all(isinstance(one, tuple) and one for one in found):
+            raise error(file.path, f"{block} has no columns named by {' and '.join(LEVELS[3])}", AGAIN)
+        parts += [tuple(map(str, one)) for one in found]
+    records = file.records(table, ("index", *blocks))
+    values = [np.asarray(records[block], dtype=np.float64).reshape(len(records["index"]), -1) for block in blocks]
+    levels = {len(one) for one in parts}
+    if len(levels) != 1 or sum(block.shape[1] for block in values) != len(parts):
+        raise error(file.path, f"{shown(table)} has {len(parts)} names for {sum(b.shape[1] for b in values)} columns", AGAIN)
+    header = [[one[k] for one in parts] for k in range(levels.pop())]
+    return _frame(file, header, _level_names(file, key), values, [_word(name) for name in records["index"].tolist()])
+
+
+def _level_names(file: Hdf5, key: str) -> list[str]:
+    """What the rows of column names of a table are called; empty where it does not say."""
+    raw = file.attribute(key, "info")
+    try:
+        info = unpickled(file.path, _raw(raw), f"{key}@info")
+        return [str(name) for name in info[1]["names"]]
+    except (ValueError, KeyError, TypeError, IndexError):
+        return []
+
+
+def _frame(file: Hdf5, header: list[list[str]], names: list[str], blocks: list[FloatArray], rows: list[str]) -> HdfFrame:
+    usual = LEVELS.get(len(header), ())
+    named = names if len(names) == len(header) and "coords" in names else list(usual)
+    if not named:
+        raise error(file.path, f"has {len(header)} rows of column names, not {' or '.join(map(str, LEVELS))}", AGAIN)
+    if not rows:
+        raise error(file.path, "has columns but no rows", AGAIN)
+    return HdfFrame(dict(zip(named, header, strict=True)), np.concatenate(blocks, axis=1), rows)
+
+
+def _rows(file: Hdf5, name: str, levels: int) -> list[list[str]]:
+    """Each row of column names: words, and which of them each column has."""
+    found = []
+    for k in range(levels):
+        words = _words(file, f"{name}_level{k}")
+        which = file.array(f"{name}_label{k}", 1, "iu").astype(np.int64)
+        if which.size and not (which.min() >= -1 and which.max() < len(words)):
+            raise error(file.path, f"{shown(name)} names columns by words that are not there", AGAIN)
+        found.append([words[i] if i >= 0 else "" for i in which.tolist()])
+    if not found or len({len(row) for row in found}) > 1:
+        raise error(file.path, f"{shown(name)} has rows of column names of different lengths", AGAIN)
+    return found
+
+
+def _axis(file: Hdf5, name: str, variety: str, levels: int) -> list[str]:
+    """A name or number per row; of labelled images, the parts of their path."""
+    if variety == "multi":
+        return ["/".join(parts) for parts in zip(*_rows(file, name, levels), strict=True)]
+    return _words(file, name)
+
+
+def _words(file: Hdf5, name: str) -> list[str]:
+    data = file.array(name, 1, "iufS")
+    return [_word(value) for value in data.tolist()]
+
+
+def _levels(file: Hdf5, key: str, axis: str) -> int:
+    return 0 if file.attribute(key, f"{axis}_nlevels") is None else _count(file, key, f"{axis}_nlevels")
+
+
+def _count(file: Hdf5, key: str, name: str) -> int:
+    value: Any = file.attribute(key, name)
+    number = int(value) if isinstance(value, (int, np.integer)) else -1
+    if not 0 < number <= MOST_BLOCK:
+        raise error(file.path, f"{shown(key)}: {name} is {shown(value)}", AGAIN)
+    return number
+
+
+def _word(value: Any) -> str:
+    """A number or text as text."""
+    if isinstance(value, bytes):
+        return value.decode("utf-8", "replace").rstrip("\0")
+    return f"{value:g}" if isinstance(value, float) and value == value and abs(value) < 1e15 else str(value)
+
+
+def _raw(value: Any) -> bytes:
+    """The bytes of an attribute that holds a pickle."""
+    return value if isinstance(value, bytes) else str(value or "").encode("latin-1", "replace")

@@ -1,0 +1,191 @@
+"""The one gate to HDF5 files: what a dataset would take is known, and fits the file, before it is read; no link out is followed.
+
+Links to other files, values kept in other files and virtual datasets are refused: a file of keypoints holds what it says.  h5py is
+an extra (``pip install 'dyntorch[h5]'``) and imported when the first such file is opened.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from indexing.opening import LARGEST, VALUE, clipped, error, listed, shown, size_of
+
+MAGIC = b"\x89HDF\r\n\x1a\n"
+AGAIN = "export or copy it again"
+PLENTY_BLOCK = 2**26, 250  # bytes from which on a dataset must not be this many times as large as what is stored of it
+MOST_TEXTS_BLOCK = 20_000  # names in a dataset of text
+RECORDED = 7  # HDF5's class of references to other objects: values are read as numbers, text or records of these
+DAMAGED = (
+    OSError, RuntimeError, KeyError, ValueError, TypeError, AttributeError, OverflowError, MemoryError, IndexError, SystemError,
+    RecursionError,
+)  # fmt: skip
+"""What h5py raises over a file that is damaged: each layer has its own."""
+
+Array = NDArray[Any]
+T = TypeVar("T")
+
+
+class Hdf5:
+    """What an open HDF5 file holds; every failure is one line that names the file and the part.
+
+    Args:
+        path: of the file; handle: of h5py.
+    """
+
+    def __init__(self, path: Path, handle: Any, size: int) -> None:
+        self.path, self._handle, self._size = path, handle, size
+
+    def __contains__(self, name: str) -> bool:
+        group, _, last = name.rpartition("/")
+        return last in self.names(group or "/")
+
+    def names(self, group: str = "/") -> list[str]:
+        """What a group holds, less links that lead out of the file; empty where there is no such group."""
+
+        def inside() -> list[str]:
+            found = self._handle[group] if group == "/" or self._hard(group) else None
+            if found is None or not hasattr(found, "keys"):
+                return []
+            kinds = {name: type(found.get(name, getlink=True)).__name__ for name in found}
+            return [name for name, kind in kinds.items() if kind in ("HardLink", "SoftLink")]
+
+        return self._sure(inside, group)
+
+    def array(self, name: str, ndim: int | None = None, kinds: str = "biuf") -> Array:
+        """The values of a dataset.
+
+        Args:
+            ndim: how many axes it must have; kinds: of numpy, that its values may be of.
+
+        Raises:
+            ValueError: there is none, or it is larger than what is stored of it, kept elsewhere, or of other values.
+        """
+        data = self._dataset(name)
+        if data.dtype.kind not in kinds or (ndim is not None and data.ndim != ndim):
+            what = f"{data.ndim} axes of {data.dtype}" if data.dtype.kind != "O" else "text"
+            raise error(self.path, f"{shown(name)} has {what}, which it cannot have", AGAIN)
+        return np.asarray(self._sure(lambda: data[()], name))
+
+    def records(self, name: str, fields: tuple[str, ...]) -> dict[str, Array]:
+        """Fields of a table of records, a column each; a field may be a row of numbers itself.
+
+        Raises:
+            ValueError: as :meth:`array`, or a field is not there.
+        """
+        data = self._dataset(name)
+        there = data.dtype.names or ()
+        missing = [field for field in fields if field not in there]
+        if missing or data.ndim != 1:
+            raise error(self.path, f"{shown(name)} has no field {shown((missing or fields)[0])} (it has {listed(there)})", AGAIN)
+        kinds = {field: data.dtype[field].base.kind for field in fields}
+        odd = [field for field, kind in kinds.items() if kind not in "biufS"]
+        if odd:
+            raise error(self.path, f"{shown(name)}: {shown(odd[0])} has values that are no numbers", AGAIN)
+        whole = self._sure(lambda: data[()], name)
+        return {field: np.asarray(whole[field]) for field in fields}
+
+    def fields(self, name: str) -> tuple[str, ...]:
+        """Names of the fields of a table; empty where there is no such table."""
+        return tuple(self._dataset(name).dtype.names or ()) if name in self else ()
+
+    def shape(self, name: str) -> tuple[int, ...]:
+        """Of a dataset that is not read."""
+        return tuple(self._dataset(name).shape)
+
+    def texts(self, name: str) -> list[str]:
+        """The texts of a dataset with one axis, or of none (a single text)."""
+        data = self._dataset(name)
+        if data.ndim > 1 or data.size > MOST_TEXTS_BLOCK or data.dtype.kind not in "OS":
+            raise error(self.path, f"{shown(name)} is no list of names", AGAIN)
+        if data.dtype.kind == "O" and self._sure(lambda: data.id.get_type().get_class(), name) == RECORDED:
+            raise error(self.path, f"{shown(name)} is no list of names", AGAIN)
+        return [_text(value) for value in np.atleast_1d(self._sure(lambda: data[()], name))]
+
+    def attribute(self, name: str, key: str) -> Any:
+        """An attribute of a group or dataset, text as ``str`` or ``bytes``; ``None`` where there is none."""
+
+        def value() -> Any:
+            owner = self._handle[name] if name == "/" or self._hard(name) else None
+            if owner is None or key not in owner.attrs:
+                return None
+            size = owner.attrs.get_id(key).get_storage_size()
+            return owner.attrs[key] if size <= min(self._size, LARGEST) else None
+
+        return self._sure(value, f"{name}@{key}")
+
+    def scale_names(self, name: str) -> list[str]:
+        """What netCDF calls the axes of a dataset; empty text where it has no name."""
+        data = self._dataset(name)
+        return self._sure(lambda: [axis[0].name.rpartition("/")[2] if len(axis) else "" for axis in data.dims], name)
+
+    def _dataset(self, name: str) -> Any:
+        """A dataset that is what it says."""
+        found = self._sure(lambda: self._handle[name] if self._hard(name) else None, name)
+        if found is None or not hasattr(found, "shape"):
+            raise error(self.path, f"has no dataset {shown(name)} (it has {listed(self.names())})", AGAIN)
+
+        def elsewhere() -> bool:
+            return bool(found.external) or bool(found.is_virtual)
+
+        if self._sure(elsewhere, name):
+            raise error(self.path, f"{shown(name)} is kept in another file", "copy its values into one file")
+        if self._sure(lambda: found.shape is None, name):
+            raise error(self.path, f"{shown(name)} is empty", AGAIN)
+        size, stored = self._sure(lambda: (math.prod(found.shape) * found.dtype.itemsize, found.id.get_storage_size()), name)
+        large, times = PLENTY_BLOCK
+        if size > LARGEST or stored > self._size or size > max(large, times * stored):
+            raise error(self.path, f"{shown(name)} would take {size / 2**30:.1f} GB of {stored / 2**20:.1f} MB", AGAIN)
+        return found
+
+    def _hard(self, name: str) -> bool:
+        """Whether every step of a path is there, in this very file."""
+        at = ""
+        for step in name.strip("/").split("/"):
+            parent, at = at or "/", f"{at}/{step}"
+            owner = self._handle[parent]
+            if not hasattr(owner, "get") or type(owner.get(step, getlink=True)).__name__ != "HardLink":
+                return False
+        return True
+
+    def _sure(self, read: Callable[[], T], name: str) -> T:
+        try:
+            return read()
+        except DAMAGED as problem:
+            if type(problem) is ValueError and str(self.path) in str(problem):
+                raise
+            said = f"{shown(name)} cannot be read ({clipped(problem, VALUE)}; the file may be truncated)"
+            raise error(self.path, said, AGAIN) from None
+
+
+@contextmanager
+def opened_hdf5(path: Path) -> Iterator[Hdf5]:
+    """An HDF5 file, to be read.
+
+    Raises:
+        ValueError: it is none, is damaged, or h5py is not installed.
+    """
+    size = size_of(path)
+    try:
+        import h5py
+    except ImportError:
+        raise error(path, "is an HDF5 file, which takes h5py to read", "pip install 'dyntorch[h5]'") from None
+    try:
+        handle = h5py.File(path, "r", locking=False)
+    except DAMAGED as problem:
+        said = f"cannot be read as HDF5 ({clipped(problem, VALUE)}; the file may be truncated)"
+        raise error(path, said, AGAIN) from None
+    try:
+        yield Hdf5(path, handle, size)
+    finally:
+        handle.close()
+
+
+def _text(value: Any) -> str:
+    return value.decode("utf-8", "replace").rstrip("\0") if isinstance(value, bytes) else str(value)

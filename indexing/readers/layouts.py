@@ -1,0 +1,188 @@
+"""Which joint is which where a file only has numbers: decided by what a body looks like, said where it is not clear, or told.
+
+Layouts of one number of joints (BODY_25, BODY_25B and NTU-25; COCO-17 and H36M-17) are told apart by two numbers each:
+
+- *bones*: the mean length of the bones of the layout, over the mean distance of any two joints.  Joints of another layout that are
+  taken for these are joined across the body;
+- *posture*: the correlation of how high the joints are with how high they are in people who stand (body segments after Drillis
+  and Contini, as in Winter, Biomechanics and Motor Control of Human Movement).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from indexing.clip import LARGEST, UP_AXES, FloatArray
+from indexing.joints import canonical
+from indexing.opening import error
+from indexing.skeleton import Skeleton, candidates, layout_named
+
+HEIGHT = {
+    "head_top": 1.0, "head": 1.0, "head_center": 0.95, "eye": 0.94, "ear": 0.93, "nose": 0.92, "upper_neck": 0.87,
+    "neck_base": 0.87, "neck": 0.83, "thorax": 0.82, "spine_shoulder": 0.82, "shoulder_center": 0.82, "shoulder": 0.82,
+    "chest": 0.72, "spine": 0.67, "spine_mid": 0.67, "mid_hip": 0.53, "root": 0.53, "spine_base": 0.53, "hip_center": 0.53,
+    "hip": 0.53, "knee": 0.29, "ankle": 0.04, "heel": 0.01, "foot": 0.01, "foot_index": 0.01, "big_toe": 0.01, "small_toe": 0.01,
+}  # fmt: skip
+"""Of joints of people who stand, in heights of the body; hands are anywhere."""
+
+
+@dataclass(frozen=True)
+class LayoutOptions:
+    """When a layout is recognized by what the body looks like."""
+
+    longest_bones: float = 0.65
+    """Mean length of bones over the mean distance of two joints; .26 to .45 with the right layout (shared recordings of BODY_25B
+    and of Kinect-20, actors of COCO-17 from three sides), .34 to 1.06 with a wrong one, .9 to 1 of random points."""
+    posture: float = 0.8
+    """Correlation of heights with those of people who stand; .98 to 1 with the right layout, up to .75 with a wrong one, of people
+    upside down."""
+    apart: float = 0.2
+    """Posture less bones, by which the best of several layouts that could be is ahead of the next."""
+    frames: int = 200
+    """Frames looked at, evenly over the recording: a millisecond each would be noticed in an hour's recording."""
+    joints: int = 8
+    """Joints seen in a frame, of those whose height says something, that its posture counts."""
+
+
+class Fit(NamedTuple):
+    """How well joints are a body of a layout: bones and posture as in the module, and the direction that is up then."""
+
+    layout: Skeleton
+    bones: float
+    posture: float
+    up: str
+
+    @property
+    def value(self) -> float:
+        return self.posture - self.bones
+
+
+def fits(joints: FloatArray, layouts: Sequence[Skeleton], up: str | None, options: LayoutOptions = LayoutOptions()) -> list[Fit]:
+    """Each layout's fit, best first.
+
+    Args:
+        joints: ``(frames, n, 2 | 3)``, NaN = not seen.
+        up: the direction that is up, as of a clip; None where that is not known either.
+    """
+    some = np.asarray(joints[np.unique(np.linspace(0, len(joints) - 1, options.frames).round().astype(int))], dtype=np.float64)
+    some = np.where(np.abs(some) <= LARGEST, some, np.nan)
+    ups = [axis for axis in UP_AXES if "xyz".index(axis[-1]) < joints.shape[2]] if up is None else [up]
+    found = []
+    for layout in layouts:
+        bones = _bones(some, layout)
+        best = max(((_posture(some, layout, axis, options), axis) for axis in ups), default=(-1.0, "y"))
+        found.append(Fit(layout, bones, *best))
+    return sorted(found, key=lambda fit: -fit.value)
+
+
+def recognized(
+    joints: FloatArray, layouts: Sequence[Skeleton], up: str | None, options: LayoutOptions = LayoutOptions()
+) -> Fit | None:
+    """The layout that the joints are of, where that is clear.
+
+    Example:
+        >>> standing = {"nose": 9, "eye": 9.5, "ear": 9.4, "shoulder": 8, "elbow": 6.5, "wrist": 5, "hip": 5, "knee": 3, "ankle": 0}
+        >>> side = {"left": 1.0, "right": -1.0, "nose": 0.0}
+        >>> names = [joint.split("_") for joint in layout_named("COCO-17").joints]
+        >>> body = np.array([[(side[name[0]], standing[name[-1]]) for name in names]])
+        >>> recognized(body, candidates(17), "y").layout.name
+        'COCO-17'
+        >>> recognized(np.random.default_rng(0).normal(size=(9, 17, 2)), candidates(17), "y") is None
+        True
+    """
+    could = [
+        fit for fit in fits(joints, layouts, up, options) if fit.bones <= options.longest_bones and fit.posture >= options.posture
+    ]
+    return could[0] if len(could) == 1 or (could and could[0].value - could[1].value >= options.apart) else None
+
+
+def settled(
+    joints: FloatArray,
+    usual: Skeleton | None,
+    layouts: Sequence[Skeleton],
+    up: str | None,
+    options: LayoutOptions = LayoutOptions(),
+) -> tuple[Skeleton | None, dict[str, str], str | None]:
+    """The layout of joints whose number alone is known.
+
+    Args:
+        usual: what the number means where the body does not say; None: its joints have no names then.
+        layouts: that it may be.
+
+    Returns:
+        the layout, what to say of it (``{"layout": ...}``, for the meta of clips; empty where nothing is to be said), and the
+        direction that is up, where it was asked for and the body says so.
+    """
+    found = recognized(joints, layouts, up, options) if len(joints) else None
+    if found is not None:
+        said = {} if found.layout is usual else {"layout": f"recognized: {found.layout.name}"}
+        return found.layout, said, found.up
+    if usual is None or len(layouts) < 2:
+        return usual, {}, None
+    others = " or ".join(layout.name for layout in layouts if layout is not usual)
+    return usual, {"layout": f"guessed: {usual.name}, not {others}"}, None
+
+
+def upward(joints: FloatArray, names: Sequence[str], usual: str, options: LayoutOptions = LayoutOptions()) -> str:
+    """The direction that is up for a body whose joints have names; the usual one where the body does not show it.
+
+    Example:
+        >>> names = ("Nose", "LShoulder", "RShoulder", "LHip", "RHip", "LKnee", "RKnee", "LAnkle", "RAnkle")
+        >>> z = np.array([9.0, 8, 8, 5, 5, 3, 3, 0, 0])
+        >>> upward(np.stack([z * 0, np.arange(9.0), z], axis=1)[None], names, "y")
+        'z'
+    """
+    words = [canonical(name) for name in names]
+    plain = {word.replace("_", ""): word for word in HEIGHT}
+    known = [plain.get(word, plain.get(re.sub("^(left|right)", "", word), f"joint {i}")) for i, word in enumerate(words)]
+    found = fits(joints, [Skeleton("", tuple(known))], None, options)[0]
+    return found.up if found.posture >= options.posture else usual
+
+
+def told(path: Path, name: str, joints: int) -> Skeleton:
+    """The layout that a person names.
+
+    Raises:
+        ValueError: none has this name, or it has another number of joints.
+    """
+    layout = layout_named(name)
+    if len(layout.joints) != joints:
+        same = ", ".join(one.name for one in candidates(joints)) or "none"
+        what = f"has {joints} joints, but layout={layout.name} has {len(layout.joints)}"
+        raise error(path, what, f"name another one (of {joints} joints: {same}), or leave it out")
+    return layout
+
+
+def _bones(joints: FloatArray, layout: Skeleton) -> float:
+    """Mean length of bones over the mean distance of two joints; infinite where too little is seen."""
+    first, second = np.array(layout.bones, dtype=np.int64).reshape(-1, 2).T
+    bones = np.linalg.norm(joints[:, first] - joints[:, second], axis=2)
+    rows, columns = np.triu_indices(joints.shape[1], 1)
+    pairs = np.linalg.norm(joints[:, rows] - joints[:, columns], axis=2)
+    if not len(first) or np.isfinite(bones).any(axis=0).sum() < len(first) / 2 or not np.nansum(pairs) > 0:
+        return float("inf")
+    lengths = bones[:, np.isfinite(bones).any(axis=0)]
+    return float(np.nanmedian(lengths, axis=0).mean() / np.nanmean(pairs))
+
+
+def _posture(joints: FloatArray, layout: Skeleton, up: str, options: LayoutOptions) -> float:
+    """Median over the frames of the correlation of heights; -1 where too little is seen."""
+    names = [joint.removeprefix("left_").removeprefix("right_") for joint in layout.joints]
+    usual = np.array([HEIGHT.get(name, np.nan) for name in names])
+    high = (-1 if up.startswith("-") else 1) * joints[..., "xyz".index(up[-1])]
+    seen = np.isfinite(usual) & np.isfinite(high)
+    kept = seen.sum(axis=1) >= options.joints
+    if not kept.any():
+        return -1.0
+    seen, high = seen[kept], np.where(seen, high, 0.0)[kept]
+    usual = np.where(seen, usual, 0.0)
+    share = seen.sum(axis=1, keepdims=True)
+    a, b = (np.where(seen, values - values.sum(axis=1, keepdims=True) / share, 0.0) for values in (high, usual))
+    size = np.sqrt(np.square(a).sum(axis=1) * np.square(b).sum(axis=1))
+    return float(np.median((a * b).sum(axis=1) / np.where(size > 0, size, np.inf)))

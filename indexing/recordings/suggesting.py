@@ -1,0 +1,247 @@
+r"""Which parts of recordings to label next: those that are unlike what is known, and of which nobody can be sure.
+
+The stages: recordings are cut into parts, one per performance that was found and of what lies between them
+(:func:`parts_of`); each part is compared with all that is known and with all others, by the residual of the indexer, which does
+not see from where a camera looks (:func:`compared`); parts are chosen one after the other, each farthest from what is known and
+from those chosen before, the less sure the sooner (:func:`chosen`).  With :math:`r_{ij}` the residual between two parts,
+:math:`k_i` that of part :math:`i` to the nearest example, :math:`m_i` the margin between the probabilities of its two best actions,
+and :math:`C` what was chosen before,
+
+.. math:: \arg\max_i\; \min\bigl(k_i, \min_{j \in C} r_{ij}\bigr)\,\bigl(1 + w (1 - m_i)\bigr) .
+
+Source: Gonzalez 1985 and Sener and Savarese 2018 (farthest first, core sets); Scheffer et al. 2001 (margins).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from dyntorch.numerics import one_thread
+from indexing.action.bank import Bank, Copy, Windows, fused_residuals, fusion, planes_of, stack
+from indexing.action.inputs import check_queries
+from indexing.action.options import ActionOptions
+from indexing.action.stream import motion_levels, motion_of
+from indexing.clip import Clip, stretches
+from indexing.recordings.evidence import Durations
+from indexing.recordings.options import SuggestOptions
+from indexing.scoring import probabilities
+from indexing.windows import mended, ragged, sample
+
+if TYPE_CHECKING:
+    from indexing.action.indexer import ActionIndexer
+    from indexing.recordings.explanation import Explanation
+
+Array = NDArray[Any]
+Span = tuple[float, float]
+SuggestReason = Literal["unlike what is known", "either of two", "a variant of what is known"]
+
+
+@dataclass(frozen=True)
+class Suggestion:
+    """A part of a recording that is worth a label.
+
+    recording: its number among those given; start, end: seconds on its clock; guess, other: the two actions that it may be most
+    likely (None where there is no second, or none that is known); margin: between their probabilities, 0..1; unlike: residual to
+    the nearest example, 0..1; reason: why it was chosen.
+    """
+
+    recording: int
+    start: float
+    end: float
+    guess: Any
+    other: Any
+    margin: float
+    unlike: float
+    reason: SuggestReason
+
+
+@dataclass(frozen=True, eq=False)
+class Parts:
+    """Parts of recordings, and what is known of them.
+
+    owner: ``(N,)`` number of the recording; spans: ``(N, 2)`` seconds; windows: of all, resampled; worth: ``(N,)`` bool, whether
+    somebody is seen to move there.
+    """
+
+    owner: Array
+    spans: Array
+    windows: Windows
+    worth: Array
+
+
+@one_thread
+def suggest(
+    indexer: ActionIndexer,
+    clips: Sequence[Clip],
+    number: int = 10,
+    labelled: Sequence[Sequence[Span]] | None = None,
+    options: SuggestOptions = SuggestOptions(),
+    progress: Callable[[float], None] | None = None,
+) -> list[Suggestion]:
+    """The parts of recordings that are worth a label most, in the order in which they were chosen.
+
+    Args:
+        indexer: fitted; clips: recordings of one person each; number: how many, at most.
+        labelled: for each recording the spans (seconds) that are labelled already; they are not suggested again.
+        progress: called with the share done, 0..1.
+
+    Raises:
+        ValueError: a number that is not positive, or recordings that the indexer cannot read.
+
+    Example:
+        >>> from indexing import ActionIndexer
+        >>> from indexing.actors import Person, dataset, detect, stream
+        >>> known = dataset([Person()], ["squat", "wave"], azimuth=0, rng=0)
+        >>> scene, truth = stream(["squat", "kick", "wave"], Person(), rng=3)
+        >>> found = suggest(ActionIndexer().fit(known, known.labels), [detect(scene, azimuth=0, rng=3)], 1)
+        >>> _, start, end = truth[1]
+        >>> min(found[0].end, end) - max(found[0].start, start) > 0.5, found[0].reason
+        (True, 'unlike what is known')
+    """
+    if number < 1:
+        raise ValueError(f"number={number}: suggests nothing; give 1 or more")
+    found = []
+    for index, clip in enumerate(clips):
+        done = [] if labelled is None else labelled[index]
+        found.append(parts_of(indexer, clip, done, options))
+        if progress is not None:
+            progress(0.9 * (index + 1) / len(clips))
+    parts = _together(found, options)
+    if parts is None:
+        return []
+    classes = indexer.classes_.tolist()
+    likely, near, apart, usual = compared(indexer, parts.windows)
+    ranked = np.argsort(-likely, axis=1, kind="stable")
+    best = np.take_along_axis(likely, ranked, axis=1)
+    margin = best[:, 0] - best[:, 1] if best.shape[1] > 1 else np.ones(len(best))
+    out = []
+    for at in chosen(near, apart, margin, number, parts.worth, options):
+        names = [classes[which] if which < len(classes) else None for which in ranked[at, :2].tolist()]
+        reason: SuggestReason = "a variant of what is known"
+        if near[at] >= options.far * usual:
+            reason = "unlike what is known"
+        elif margin[at] < options.doubt and None not in names and len(names) > 1:
+            reason = "either of two"
+        start, end = parts.spans[at].tolist()
+        other = names[1] if len(names) > 1 else None
+        out.append(Suggestion(int(parts.owner[at]), start, end, names[0], other, float(margin[at]), float(near[at]), reason))
+    return out
+
+
+def parts_of(indexer: ActionIndexer, clip: Clip, labelled: Sequence[Span], options: SuggestOptions) -> Parts | None:
+    """A recording cut into parts; None where there are none.
+
+    What was found is a part each, long ones are cut; what lies between them is cut into parts as long as an ordinary example.
+    """
+    model, settings = indexer.model_, indexer.options or ActionOptions()
+    (image,) = check_queries([clip], indexer.fps, indexer.n_joints_, indexer.skeleton_, recordings=True)
+    begin = float(image.times[0])
+    image = image.replace(times=image.times - begin)
+    unit = Durations.of(model, indexer.window, 0.3 * indexer.window, settings.recordings).unit
+    spans = np.array(_cut(indexer.explain(clip), clip, max(unit, options.shortest), options)).reshape(-1, 2)
+    spans = spans[[_share(span, labelled) < options.labelled for span in spans.tolist()]]
+    if not len(spans):
+        return None
+    source = ragged([mended(image, settings.repair) if indexer.repair else image])
+    nobody = np.zeros(len(spans), dtype=np.intp)
+    values = sample(source, nobody, spans[:, 0] - begin, spans[:, 1] - begin, indexer.length)
+    windows = Windows(values, torch.from_numpy(source.seen[nobody]))
+    still, _ = motion_levels(model)
+    shown = np.concatenate([[0.0], np.cumsum(clip.seen.any(axis=1))])
+    first, last = np.searchsorted(clip.times, spans[:, 0]), np.searchsorted(clip.times, spans[:, 1], side="right")
+    seen = (shown[last] - shown[first]) / np.maximum(last - first, 1)
+    worth = (motion_of(windows) > options.still * still) & (seen >= options.shown) & (last - first > 1)
+    return Parts(nobody, spans, windows, worth)
+
+
+def _cut(told: Explanation, clip: Clip, unit: float, options: SuggestOptions) -> list[Span]:
+    """Spans of what was found, and of what lies between, in seconds of the recording's clock."""
+    out: list[Span] = []
+    found = sorted((event.start, event.end) for event in told.events)
+    for first, end in stretches(clip.times).tolist():
+        edge, last = float(clip.times[first]), float(clip.times[end - 1])
+        inside = [(max(a, edge), min(b, last)) for a, b in found if b > edge and a < last]
+        for start, stop in [*inside, (last, last)]:
+            if start - edge >= unit / 2:
+                out += _pieces(edge, start, unit)
+            if stop > start:
+                out += _pieces(start, stop, unit) if stop - start > options.longest * unit else [(start, stop)]
+            edge = max(edge, stop)
+    return out
+
+
+def _pieces(start: float, end: float, unit: float) -> list[Span]:
+    """A span in parts of about the same length."""
+    edges = np.linspace(start, end, max(1, round((end - start) / unit)) + 1).tolist()
+    return list(pairwise(edges))
+
+
+def _share(span: Sequence[float], others: Sequence[Span]) -> float:
+    """Of a span, what others cover; those do not overlap much, as a rule."""
+    start, end = span
+    return sum(max(0.0, min(end, b) - max(start, a)) for a, b in others) / max(end - start, 1e-9)
+
+
+def _together(found: Sequence[Parts | None], options: SuggestOptions) -> Parts | None:
+    """The parts of all recordings that are worth anything, thinned out evenly where they are too many to be compared."""
+    several = [(number, parts) for number, parts in enumerate(found) if parts is not None and parts.worth.any()]
+    if not several:
+        return None
+    owner = np.concatenate([np.full(int(parts.worth.sum()), number) for number, parts in several])
+    spans = np.concatenate([parts.spans[parts.worth] for _, parts in several])
+    windows = stack([parts.windows[torch.from_numpy(parts.worth)] for _, parts in several])
+    kept = np.unique(np.linspace(0, len(owner) - 1, options.candidates).round().astype(np.intp))
+    return Parts(owner[kept], spans[kept], windows[torch.from_numpy(kept)], np.ones(len(kept), dtype=bool))
+
+
+def compared(indexer: ActionIndexer, windows: Windows) -> tuple[Array, Array, Array, float]:
+    """``(N, classes)`` probabilities, ``(N,)`` residual to the nearest example, ``(N, N)`` residuals between parts, and how far
+    examples of different actions are apart, which is far.
+
+    Residuals are geometric means over the channels of 1 - the largest canonical correlation: 0 for two views of one movement.
+    """
+    model = indexer.model_
+    likely = probabilities(model.scores(windows).cpu().numpy(), model.blend.sharpness)
+    known = model.exemplars.crop(0)
+    everything = stack([known, windows])
+    copies = [Copy(everything)]
+    if model.symmetry is not None and bool(model.mirrored.any()):
+        copies.append(Copy(everything, None, model.symmetry))
+    term = fusion(("epi",))
+    (table,) = fused_residuals(everything, [Bank(copies, planes_of(model.metric))], [term])
+    residual = np.exp(table.cpu().numpy() / sum(term.powers))
+    count = len(known)
+    labels = model.labels.cpu().numpy()
+    others = np.where(labels[:, None] != labels[None], residual[:count, :count], np.inf).min(axis=1)
+    finite = others[np.isfinite(others)]
+    return likely, residual[count:, :count].min(axis=1), residual[count:, count:], float(np.median(finite)) if len(finite) else 1.0
+
+
+def chosen(near: Array, apart: Array, margin: Array, number: int, worth: Array, options: SuggestOptions) -> list[int]:
+    """Numbers of parts, one after the other: far from what is known and from those before, the less sure the sooner.
+
+    Args:
+        near: ``(N,)`` distance to what is known; apart: ``(N, N)``; margin: ``(N,)`` 0..1; worth: ``(N,)`` bool, which may be
+            chosen.
+
+    Example:
+        >>> near, apart = np.array([0.5, 0.45, 0.3]), np.array([[0.0, 0.05, 0.4], [0.05, 0.0, 0.4], [0.4, 0.4, 0.0]])
+        >>> chosen(near, apart, np.zeros(3), 2, np.ones(3, dtype=bool), SuggestOptions())
+        [0, 2]
+    """
+    free, distance = worth.copy(), near.astype(np.float64)
+    weight = 1.0 + options.unsure * (1.0 - margin)
+    out: list[int] = []
+    while free.any() and len(out) < number:
+        best = int(np.where(free, distance * weight, -np.inf).argmax())
+        out.append(best)
+        free[best] = False
+        distance = np.minimum(distance, apart[:, best])
+    return out

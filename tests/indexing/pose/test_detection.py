@@ -1,0 +1,233 @@
+"""Videos of made-up people to clips: who is found, where, when, and who is who."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from indexing.pose import NobodyInVideo, PoseOptions, detect
+from indexing.pose.options import DetectorOptions, PieceOptions
+from indexing.recordings.people import of_recording, tracked_people
+from tests.indexing.pose.scene import SceneNetworks, drawn, joints_of, written
+
+WIDTH, HEIGHT = 320, 240
+SHORT = PoseOptions(pieces=PieceOptions(seconds=0.5, lead=0.1))
+
+
+def person(x, y, height, lean=0.0):
+    """Hips and circle."""
+    return np.array([x, y]), np.array([x + height * np.sin(lean), y - height * np.cos(lean)])
+
+
+def walk(i, start=60.0, speed=4.0, height=60.0):
+    """One who walks and sways."""
+    return person(start + speed * i, 150 + 10 * np.sin(0.3 * i), height, 0.3 * np.sin(0.2 * i))
+
+
+def film(tmp_path, scenes, name="a.mp4", **how):
+    return written(tmp_path / name, [drawn(people, WIDTH, HEIGHT) for people in scenes], **how)
+
+
+def error_of(clip, truth):
+    """Largest distance of any joint, pixels."""
+    return float(np.linalg.norm(clip.joints - np.stack([joints_of(*one) for one in truth]), axis=2).max())
+
+
+def test_one_person_is_found_where_and_when_it_is(tmp_path, seeing):
+    truth = [walk(i) for i in range(40)]
+    clips = detect(film(tmp_path, [[one] for one in truth], fps=25))
+    assert len(clips) == 1 and len(clips[0]) == 40
+    assert error_of(clips[0], truth) < 2.0
+    np.testing.assert_allclose(clips[0].times, np.arange(40) / 25, atol=1e-9)
+    clip = clips[0]
+    assert clip.up == "-y" and clip.skeleton.name == "blazepose33" and clip.name == "a.mp4"
+    assert tuple(clip.meta["size"]) == (WIDTH, HEIGHT) and clip.meta["model"] == "heavy" and "people" not in clip.meta
+    np.testing.assert_allclose(clip.confidence, 1 / (1 + np.exp(-2)), atol=1e-6)
+    assert of_recording(clips) and [one.name for one in tracked_people(list(clips), "a.mp4").people] == [""]
+
+
+def test_a_person_that_is_followed_costs_few_looks_of_the_detector(tmp_path, seeing):
+    detect(film(tmp_path, [[walk(i)] for i in range(46)], fps=30))
+    (networks,) = seeing
+    assert networks.looks == {"detector": 4, "landmarks": 46 + 1}  # every half second; a new person is looked at twice
+
+
+@pytest.mark.parametrize("rotation", [90, 180, -90])
+def test_phone_videos_are_seen_upright(tmp_path, seeing, rotation):
+    av = pytest.importorskip("av")
+    if not hasattr(av.VideoStream, "set_display_rotation"):
+        pytest.skip("this PyAV cannot write rotated videos")
+    truth = [person(100 + i, 120, 60) for i in range(6)]
+    turns = rotation // 90  # what the file asks for, counter-clockwise
+    frames = [np.ascontiguousarray(np.rot90(drawn([one], WIDTH, HEIGHT), -turns)) for one in truth]
+    (clip,) = detect(written(tmp_path / "phone.mp4", frames, rotation=rotation))
+    assert error_of(clip, truth) < 2.0 and tuple(clip.meta["size"]) == (WIDTH, HEIGHT)
+
+
+def test_variable_frame_rates_keep_their_times(tmp_path, seeing):
+    stamps = [0, 33, 67, 150, 160, 400, 433, 900, 933, 1400, 1410, 1420]
+    truth = [walk(i) for i in range(len(stamps))]
+    (clip,) = detect(film(tmp_path, [[one] for one in truth], stamps=stamps), options=SHORT)
+    np.testing.assert_allclose(clip.times, np.array(stamps) / 1000, atol=1e-6)
+    assert error_of(clip, truth) < 2.0
+
+
+@pytest.mark.parametrize("every", [2, 3])
+def test_every_other_frame_is_every_other_frame_of_the_file(tmp_path, seeing, every):
+    truth = [walk(i) for i in range(41)]
+    path = film(tmp_path, [[one] for one in truth])
+    (clip,) = detect(path, every=every, options=SHORT)
+    np.testing.assert_allclose(clip.times, np.arange(0, 41, every) / 30, atol=1e-4)
+    assert error_of(clip, truth[::every]) < 2.0 and clip.meta["every"] == every
+
+
+@pytest.mark.parametrize("workers", [1, 3])
+def test_the_result_does_not_depend_on_who_works(tmp_path, seeing, workers):
+    path = film(tmp_path, [[walk(i, speed=2.0), person(280, 200, 45)] for i in range(60)], gop=7)
+    shares: list[float] = []
+    one = detect(path, people=2, options=SHORT)
+    other = detect(path, people=2, workers=workers, options=SHORT, progress=shares.append)
+    assert len(one) == len(other) == 2
+    for a, b in zip(one, other, strict=True):
+        assert a.joints.tobytes() == b.joints.tobytes() and a.times.tobytes() == b.times.tobytes() and a.meta == b.meta
+    assert len(one[0]) == 60 and shares == sorted(shares) and shares[-1] == 1.0
+
+
+def test_pieces_of_a_video_say_what_the_whole_says(tmp_path, seeing):
+    truth = [walk(i) for i in range(60)]
+    path = film(tmp_path, [[one] for one in truth])
+    (whole,), (cut,) = detect(path), detect(path, options=SHORT)
+    np.testing.assert_array_equal(whole.times, cut.times)
+    np.testing.assert_allclose(whole.joints, cut.joints, atol=1.5)
+
+
+def test_several_people_are_the_largest_first_and_each_once(tmp_path, seeing):
+    scenes = [[person(50 + i, 180, 40), person(160, 160, 80 + 0.1 * i), person(280 - i, 190, 50)] for i in range(30)]
+    clips = detect(film(tmp_path, scenes), people=5)
+    assert len(clips) == 3 and [clip.meta["person"] for clip in clips] == [1, 2, 3]
+    for clip, which in zip(clips, (1, 2, 0), strict=True):
+        assert error_of(clip, [scene[which] for scene in scenes]) < 2.5
+    crowd = tracked_people(list(clips), "a.mp4")
+    assert [one.name for one in crowd.people] == ["1", "2", "3"] and crowd.by_ids
+
+
+def test_one_of_several_is_the_largest_and_the_others_are_said(tmp_path, seeing):
+    scenes = [[person(60, 180, 40), person(200 + i, 160, 80)] for i in range(30)]
+    (clip,) = detect(film(tmp_path, scenes))
+    assert error_of(clip, [scene[1] for scene in scenes]) < 2.5
+    assert clip.meta["people"] == 2
+
+
+def test_a_larger_person_who_comes_later_takes_over(tmp_path, seeing):
+    scenes = [[person(60, 180, 40)] + ([person(320 - 3 * i, 170, 90)] if i >= 20 else []) for i in range(80)]
+    (clip,) = detect(film(tmp_path, scenes))
+    assert np.linalg.norm(clip.joints[5] - joints_of(*scenes[5][0]), axis=1).max() < 2
+    assert error_of(clip.between(40 / 30, 9), [scene[1] for scene in scenes[40:]]) < 3
+
+
+def test_people_who_pass_each_other_keep_their_names(tmp_path, seeing):
+    scenes = [[person(30 + 5 * i, 80, 40), person(290 - 5 * i, 210, 50)] for i in range(50)]
+    clips = detect(film(tmp_path, scenes), people=2)
+    assert len(clips) == 2
+    assert error_of(clips[0], [scene[1] for scene in scenes]) < 2.5
+    assert error_of(clips[1], [scene[0] for scene in scenes]) < 2.5
+
+
+@pytest.mark.parametrize(("gone", "back", "names"), [(10, 140, 1), (80, 140, 2), (10, 280, 2)])
+def test_who_is_lost_is_the_same_where_it_returns_soon_and_nearby(tmp_path, seeing, gone, back, names):
+    still = person(40, 200, 40)
+    scenes = [[still] + ([person(140 if i < 20 else back, 150, 60)] if not 20 <= i < 20 + gone else []) for i in range(40 + gone)]
+    clips = detect(film(tmp_path, scenes), people=2)
+    assert len(clips) == 1 + names
+    with_all = next(clip for clip in clips if len(clip) == len(scenes) and abs(np.nanmean(clip.joints[..., 0]) - 40) < 25)
+    assert error_of(with_all, [scene[0] for scene in scenes]) < 2.5
+    if names == 1:
+        (other,) = (clip for clip in clips if clip is not with_all)
+        assert np.isnan(other.joints[21:29]).all() and (other.confidence[21:29] == 0).all() and len(other) == 50
+
+
+def test_two_tracks_never_sit_on_one_person(tmp_path, seeing):
+    """Two people become one: the front one hides the other."""
+    scenes = [[person(100 + 2 * i, 150, 60), *([person(200, 150, 60)] if i < 20 else [])] for i in range(60)]
+    clips = detect(film(tmp_path, scenes), people=2)
+    times = [set(np.round(clip.times[clip.seen.any(axis=1)], 4)) for clip in clips]
+    assert len(clips) == 2 and max(times[0] & times[1]) < 21 / 30
+
+
+def test_small_people_are_found_by_looking_closer(tmp_path, seeing, monkeypatch):
+    seen = SceneNetworks.detector
+
+    def blind_to_small(self, image):
+        raw, logits = seen(self, image)
+        tiny = np.linalg.norm(raw[:, 6:8] - raw[:, 4:6], axis=1) < 25  # pixels of what the network sees
+        return raw, np.where(tiny, -20, logits)
+
+    monkeypatch.setattr(SceneNetworks, "detector", blind_to_small)
+    truth = [person(200 + i, 150, 30) for i in range(20)]
+    path = film(tmp_path, [[one] for one in truth])
+    (clip,) = detect(path)
+    assert error_of(clip, truth) < 2.5
+    with pytest.raises(NobodyInVideo):
+        detect(path, options=PoseOptions(DetectorOptions(shrinks=(1,))))
+
+
+def test_nobody_in_a_video_is_one_line(tmp_path, seeing):
+    path = film(tmp_path, [[]] * 12)
+    with pytest.raises(NobodyInVideo, match=r"a\.mp4: no person was found in any of its 12 frames; ") as caught:
+        detect(path)
+    assert "\n" not in str(caught.value) and isinstance(caught.value, ValueError) and len(caught.value.times) == 12
+
+
+def test_frames_without_the_person_are_empty(tmp_path, seeing):
+    scenes = [[walk(i)] if i < 10 or i >= 30 else [] for i in range(45)]
+    (clip,) = detect(film(tmp_path, scenes))
+    assert len(clip) == 45 and clip.seen[:10].all() and not clip.seen[10:30].any() and clip.seen[30:].all()
+
+
+def test_a_file_that_ends_early_gives_what_is_there(tmp_path, seeing):
+    pytest.importorskip("av")
+    path = film(tmp_path, [[walk(i)] for i in range(90)], name="a.mkv")
+    whole = path.read_bytes()
+    cut = tmp_path / "cut.mkv"
+    cut.write_bytes(whole[: int(0.6 * len(whole))])
+    (clip,) = detect(cut, options=SHORT)
+    assert 20 < len(clip) < 80 and clip.seen.all()
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [(b"", "is empty"), (b"nothing of a video" * 100, "cannot be read as video|has no video stream"), (None, "no such file")],
+)
+def test_what_is_no_video_is_said(tmp_path, seeing, content, said):
+    path = tmp_path / "a.mp4"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(ValueError, match=said) as caught:
+        detect(path)
+    assert "a.mp4" in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("how", [{"people": 0}, {"people": 1.5}, {"every": 0}, {"workers": 0}, {"people": True}])
+def test_numbers_that_make_no_sense(how):
+    ((name, _),) = how.items()
+    with pytest.raises(ValueError, match=f"detect: {name} must be a whole number from 1"):
+        detect("a.mp4", **how)
+
+
+def test_an_interruption_ends_the_work(tmp_path, seeing):
+    path = film(tmp_path, [[walk(i)] for i in range(60)])
+
+    def interrupt(share):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        detect(path, options=SHORT, progress=interrupt)
+
+
+def test_options_are_what_decides(tmp_path, seeing):
+    path = film(tmp_path, [[walk(i)] for i in range(10)])
+    blind = dataclasses.replace(PoseOptions(), detector=DetectorOptions(score=0.99, closer_score=0.99))
+    with pytest.raises(NobodyInVideo):
+        detect(path, options=blind)

@@ -1,0 +1,181 @@
+"""The model files: where they are looked for, what is said where they are not, and how they are fetched, by made-up clients."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import subprocess
+import tarfile
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from indexing.pose import available, get_models, models
+from indexing.pose.models import PACKAGE, VARIABLE, WHEEL, kept, load_models
+
+
+@pytest.fixture
+def content(monkeypatch):
+    """Small files take the place of the real ones, under the same names: name -> bytes."""
+    data = {file.name: f"the network {file.name}".encode() * 10 for file in models.FILES}
+
+    def small(file):
+        return replace(file, size=len(data[file.name]), sha256=hashlib.sha256(data[file.name]).hexdigest())
+
+    marks = {name: small(file) for name, file in models.LANDMARK_FILES.items()}
+    monkeypatch.setattr(models, "DETECTOR", small(models.DETECTOR))
+    monkeypatch.setattr(models, "LANDMARK_FILES", marks)
+    monkeypatch.setattr(models, "FILES", (models.DETECTOR, *marks.values()))
+    monkeypatch.setattr(models, "missing_parts", list)
+    monkeypatch.setattr(models.shutil, "which", lambda name: f"/somewhere/{name}")
+    return data
+
+
+class Clients:
+    """pip and npm, as far as they are asked; what they were told."""
+
+    def __init__(self, content, pip=0, npm=0, cut=None, other=b""):
+        self.content, self.codes, self.cut, self.other = content, {"pip": pip, "npm": npm}, cut, other
+        self.told: list[list[str]] = []
+
+    def __call__(self, command):
+        self.told.append(list(command))
+        program = "pip" if "pip" in command else "npm"
+        if self.codes[program]:
+            said = "WARNING: retrying\nERROR: No matching distribution found\nbye" if program == "pip" else "npm error network"
+            return subprocess.CompletedProcess(command, self.codes[program], "", said)
+        folder = Path(command[-1])
+        data = {name: self.other or value for name, value in self.content.items()}
+        if program == "pip":
+            path = folder / "mediapipe-0.10.21-cp312.whl"
+            with zipfile.ZipFile(path, "w") as archive:
+                for file in models.FILES:
+                    if file.package == WHEEL:
+                        archive.writestr(file.inside, data[file.name])
+        else:
+            path = folder / "mediapipe-pose.tgz"
+            with tarfile.open(path, "w:gz") as archive:
+                for file in models.FILES:
+                    if file.package == PACKAGE:
+                        info = tarfile.TarInfo(file.inside)
+                        info.size = len(data[file.name])
+                        archive.addfile(info, io.BytesIO(data[file.name]))
+        if self.cut == program:
+            path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+        return subprocess.CompletedProcess(command, 0, "", "")
+
+
+def test_all_files_are_fetched_checked_and_kept(tmp_path, content):
+    clients = Clients(content)
+    done = get_models(tmp_path / "cache", clients)
+    assert [one.state for one in done] == ["fetched"] * 4
+    assert {path.name: path.read_bytes() for path in (tmp_path / "cache").iterdir()} == content
+    pip, npm = clients.told
+    assert pip[1:5] == ["-m", "pip", "download", "mediapipe==0.10.21"] and "--no-deps" in pip
+    assert npm[1:3] == ["pack", PACKAGE]
+    assert available(tmp_path / "cache") == "heavy"
+    chosen = load_models(models=tmp_path / "cache")
+    assert (chosen.name, chosen.detector) == ("heavy", content["pose_detection.tflite"])
+    assert load_models("full", tmp_path / "cache").landmarks == content["pose_landmark_full.tflite"]
+
+
+def test_what_is_there_is_not_fetched_again(tmp_path, content):
+    get_models(tmp_path, Clients(content))
+    (tmp_path / "pose_landmark_lite.tflite").write_bytes(b"half")
+    clients = Clients(content)
+    states = {one.file: one.state for one in get_models(tmp_path, clients)}
+    assert len(clients.told) == 1 and states["pose_landmark_lite.tflite"] == "fetched"
+    assert set(states.values()) == {"there", "fetched"}
+
+
+def test_without_npm_the_wheel_is_enough(tmp_path, content, monkeypatch):
+    monkeypatch.setattr(models.shutil, "which", lambda name: None)
+    states = {one.file: (one.state, one.why) for one in get_models(tmp_path, Clients(content))}
+    assert states["pose_landmark_heavy.tflite"] == ("missing", "npm is not installed, which fetches it")
+    assert available(tmp_path) == "full" and load_models(models=tmp_path).name == "full"
+
+
+@pytest.mark.parametrize("how", [{"npm": 1}, {"cut": "npm"}])
+def test_where_npm_fails_it_is_said(tmp_path, content, how):
+    states = {one.file: one for one in get_models(tmp_path, Clients(content, **how))}
+    assert states["pose_landmark_heavy.tflite"].state == "missing" and "npm" in states["pose_landmark_heavy.tflite"].why + "npm"
+    assert states["pose_landmark_full.tflite"].state == "fetched"
+
+
+@pytest.mark.parametrize(
+    ("how", "said"),
+    [
+        ({"pip": 1}, r"pip: cannot download the pose model files \(ERROR: No matching distribution found\); check the connection"),
+        ({"cut": "pip"}, "the downloaded wheel is cut off or damaged; try again"),
+        ({"other": b"another"}, r"the download is another file than the one that is known \(by its SHA-256\)"),
+    ],
+)
+def test_where_pip_fails_nothing_is_written(tmp_path, content, how, said):
+    with pytest.raises(ValueError, match=said) as caught:
+        get_models(tmp_path, Clients(content, **how))
+    assert "\n" not in str(caught.value) and not list(tmp_path.iterdir())
+
+
+def test_no_pip_at_all(tmp_path, content):
+    def absent(command):
+        raise FileNotFoundError(2, "No such file or directory")
+
+    with pytest.raises(ValueError, match="pip: cannot be run"):
+        get_models(tmp_path, absent)
+
+
+def test_a_wheel_without_the_files(tmp_path, content, monkeypatch):
+    moved = tuple(replace(file, inside=f"elsewhere/{file.name}") for file in models.FILES)
+    clients = Clients(content)
+    packing = models.FILES
+
+    def run(command):
+        monkeypatch.setattr(models, "FILES", packing)
+        done = clients(command)
+        monkeypatch.setattr(models, "FILES", moved)
+        return done
+
+    monkeypatch.setattr(models, "FILES", moved)
+    with pytest.raises(ValueError, match="the downloaded wheel lacks a model file"):
+        get_models(tmp_path, run)
+
+
+def test_missing_files_say_what_to_type(tmp_path, content):
+    assert available(tmp_path) is None
+    with pytest.raises(ValueError, match=r"dyntorch pose --get-models once, or .* --models FOLDER") as caught:
+        load_models(models=tmp_path)
+    assert "\n" not in str(caught.value) and str(tmp_path) in str(caught.value)
+
+
+def test_a_file_that_is_another_one_is_not_used(tmp_path, content):
+    get_models(tmp_path, Clients(content))
+    path = tmp_path / "pose_landmark_heavy.tflite"
+    path.write_bytes(path.read_bytes()[::-1])
+    with pytest.raises(ValueError, match=r"pose_landmark_heavy\.tflite: is not the file that is known .*--get-models"):
+        load_models(models=tmp_path)
+
+
+def test_a_missing_extra_says_what_to_install(tmp_path, content, monkeypatch):
+    monkeypatch.setattr(models, "missing_parts", lambda: ["ai_edge_litert"])
+    assert available(tmp_path) is None
+    with pytest.raises(ValueError, match=r"no ai_edge_litert.*pip install 'dyntorch\[pose\]'"):
+        load_models(models=tmp_path)
+
+
+def test_the_folder_is_the_users_cache_or_the_one_that_is_named(monkeypatch, tmp_path):
+    for name in (VARIABLE, "XDG_CACHE_HOME", "LOCALAPPDATA"):
+        monkeypatch.delenv(name, raising=False)
+    assert kept().parts[-3:] == (".cache", "dyntorch", "pose")
+    monkeypatch.setenv("LOCALAPPDATA", str(tmp_path / "local"))
+    assert kept() == tmp_path / "local" / "dyntorch" / "pose"
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
+    assert kept() == tmp_path / "xdg" / "dyntorch" / "pose"
+    monkeypatch.setenv(VARIABLE, str(tmp_path / "own"))
+    assert kept() == tmp_path / "own"
+
+
+def test_the_real_files_are_known_by_size_and_hash():
+    assert [file.size for file in models.FILES] == [2959046, 27709200, 6440512, 2819824]
+    assert all(len(file.sha256) == 64 for file in models.FILES)

@@ -1,0 +1,287 @@
+"""DeepLabCut, SLEAP and movement: their default outputs, which are HDF5."""
+
+from __future__ import annotations
+
+import builtins
+import pickle
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+from indexing.readers import read, read_clip
+from indexing.readers.recording import NobodySeen
+from indexing.skeleton import COCO17
+from tests.indexing.readers import tools
+
+NAMES = COCO17.joints
+ASIDE = np.array([500.0, 0.0, 0.0])  # pixels, and no more confidence
+
+
+def unseen(person: np.ndarray) -> np.ndarray:
+    """As networks write a joint that was not seen: without coordinates, SLEAP without a score, too."""
+    out = person.copy()
+    out[2, 3] = np.nan
+    return out
+
+
+def refused(path: Path, *words: str, **options: Any) -> None:
+    with pytest.raises(ValueError, match=re.escape(path.name)) as caught:
+        read(path, **options)
+    said = str(caught.value)
+    assert type(caught.value) is ValueError
+    assert "\n" not in said and "; " in said and len(said.replace(str(path), "")) < 400
+    assert all(word in said for word in words), said
+
+
+MAKERS: dict[str, Callable[[Path, np.ndarray], Path]] = {
+    "deeplabcut table": lambda path, p: tools.deeplabcut(path, p, NAMES),
+    "deeplabcut fixed": lambda path, p: tools.deeplabcut(path, p, NAMES, "fixed"),
+    "deeplabcut one animal": lambda path, p: tools.deeplabcut(path, {"mouse": p}, NAMES),
+    "deeplabcut other key": lambda path, p: tools.deeplabcut(path, p, NAMES, key="keypoints"),
+    "sleap analysis": lambda path, p: tools.sleap_analysis(path, {"": unseen(p)}, NAMES),
+    "sleap analysis newer": lambda path, p: tools.sleap_analysis(path, {"track_0": unseen(p)}, NAMES, "standard"),
+    "sleap project": lambda path, p: tools.sleap_project(path, {"": unseen(p)}, NAMES, fps=25.0),
+    "sleap project tracked": lambda path, p: tools.sleap_project(path, {"A": unseen(p)}, NAMES, fps=25.0),
+    "movement": lambda path, p: tools.movement(path, {"id_0": unseen(p)}, NAMES),
+    "movement in frames": lambda path, p: tools.movement(path, {"id_0": unseen(p)}, NAMES, seconds=False),
+    "movement older": lambda path, p: tools.movement(
+        path, {"id_0": unseen(p)}, NAMES, axes=("time", "individuals", "keypoints", "space")
+    ),
+}
+
+
+@pytest.mark.parametrize("maker", MAKERS)
+def test_every_variant_gives_the_same_clip(maker: str, person: np.ndarray, expected: np.ndarray, tmp_path: Path) -> None:
+    clip = read_clip(MAKERS[maker](tmp_path / "take.h5", person), fps=25.0)
+    np.testing.assert_allclose(clip.joints, expected)
+    np.testing.assert_allclose(np.nan_to_num(clip.confidence), person[..., 2])
+    np.testing.assert_allclose(clip.times, np.arange(6) / 25)
+    assert (clip.up, clip.name, clip.fps_assumed) == ("-y", "take.h5", False)
+    assert clip.skeleton is not None and clip.skeleton.joints == NAMES
+
+
+@pytest.mark.parametrize("maker", [maker for maker in MAKERS if "project" in maker or maker.startswith("movement")])
+def test_a_rate_that_the_file_knows_is_its_rate(maker: str, person: np.ndarray, tmp_path: Path) -> None:
+    clip = read_clip(MAKERS[maker](tmp_path / "take.h5", person))
+    np.testing.assert_allclose(clip.times, np.arange(6) / 25)
+    assert not clip.fps_assumed
+
+
+def test_several_animals_are_tracks(person: np.ndarray, expected: np.ndarray, tmp_path: Path) -> None:
+    far = person + ASIDE
+    people = {"mouse1": unseen(person), "mouse2": unseen(far)}
+    for i, make in enumerate((tools.deeplabcut, tools.sleap_analysis, tools.sleap_project, tools.movement)):
+        clips = read(make(tmp_path / f"{i}.h5", people, NAMES), person="all")
+        assert [clip.meta["person"] for clip in clips] == ["mouse1", "mouse2"]
+        np.testing.assert_allclose(clips[0].joints, expected)
+        np.testing.assert_allclose(clips[1].joints, expected + ASIDE[:2])
+
+
+@pytest.mark.parametrize("layout", ["table", "fixed"])
+def test_labels_of_images_have_their_numbers(layout: str, person: np.ndarray, tmp_path: Path) -> None:
+    index = [f"labeled-data/walk/img{3 * i:04d}.png" for i in range(6)]
+    path = tools.deeplabcut(tmp_path / "CollectedData.h5", person[..., :2], NAMES, layout, index)
+    clip = read_clip(path, fps=30.0)
+    np.testing.assert_allclose(clip.times, np.arange(6) / 10)
+    assert clip.confidence is None
+
+
+# ---- SLEAP projects ------------------------------------------------------------------------------------------------------
+def test_what_a_person_set_replaces_what_was_predicted(person: np.ndarray, tmp_path: Path) -> None:
+    people = {"A": unseen(person), "B": unseen(person) + ASIDE}
+    hand = {(1, "A"): person[1, :, :2] + 7.0, (4, "B"): np.full((17, 2), np.nan)}
+    hand[4, "B"][0] = [9.0, 9.0]
+    clips = read(tools.sleap_project(tmp_path / "a.slp", people, NAMES, hand), person="all")
+    np.testing.assert_allclose(clips[0].joints[1], person[1, :, :2] + 7.0)
+    assert (clips[0].confidence[1] == 1).all()
+    np.testing.assert_allclose(clips[0].joints[0], person[0, :, :2])
+    np.testing.assert_allclose(clips[1].joints[1], person[1, :, :2] + ASIDE[:2])
+    np.testing.assert_allclose(clips[1].joints[4][0], [9.0, 9.0])
+    assert np.isnan(clips[1].joints[4][1:]).all()
+
+
+def test_one_untracked_animal_set_by_hand_replaces_all_predictions(person: np.ndarray, tmp_path: Path) -> None:
+    clip = read_clip(tools.sleap_project(tmp_path / "a.slp", {"": unseen(person)}, NAMES, {(0, ""): person[0, :, :2] + 3.0}))
+    np.testing.assert_allclose(clip.joints[0], person[0, :, :2] + 3.0)
+
+
+def test_the_order_of_the_nodes_is_the_skeletons(person: np.ndarray, tmp_path: Path) -> None:
+    order = np.random.default_rng(0).permutation(17)
+    clip = read_clip(tools.sleap_project(tmp_path / "a.slp", {"": unseen(person)}, NAMES, order=order.tolist()))
+    assert clip.skeleton is not None and clip.skeleton.joints == NAMES
+    assert clip.skeleton.bones[:2] == ((0, 1), (1, 2))
+
+
+def test_points_of_old_projects_count_from_the_corner_of_a_pixel(person: np.ndarray, expected: np.ndarray, tmp_path: Path) -> None:
+    clip = read_clip(tools.sleap_project(tmp_path / "a.slp", {"": unseen(person)}, NAMES, format_id=1.0))
+    np.testing.assert_allclose(clip.joints, expected - 0.5)
+
+
+def test_a_project_of_several_videos_is_refused_with_their_names(person: np.ndarray, tmp_path: Path) -> None:
+    path = tools.sleap_project(tmp_path / "a.slp", {"": unseen(person)}, NAMES, videos=["C:\\data\\one.mp4", "two.mp4"])
+    refused(path, "labels in 2 videos (one.mp4, two.mp4)", "export each video by itself")
+
+
+def test_a_project_without_labels_shows_nobody(tmp_path: Path) -> None:
+    path = tools.sleap_project(tmp_path / "a.slp", {"": np.full((4, 17, 3), np.nan)}, NAMES)
+    with pytest.raises(NobodySeen, match=r"no person was detected in any of 4 frames"):
+        read(path)
+
+
+# ---- broken --------------------------------------------------------------------------------------------------------------
+def changed(path: Path, change: Callable[[Any], None]) -> Path:
+    with h5py.File(path, "r+") as file:
+        change(file)
+    return path
+
+
+def put(file: Any, name: str, values: Any) -> None:
+    attributes = dict(file[name].attrs) if name in file else {}
+    if name in file:
+        del file[name]
+    file[name] = values
+    file[name].attrs.update(attributes)
+
+
+BROKEN: list[tuple[str, Callable[[Any], None], tuple[str, ...]]] = [
+    ("sleap analysis", lambda f: f.__delitem__("node_names"), ("without keypoints",)),
+    ("sleap analysis", lambda f: put(f, "node_names", np.array(["a"] * 17, "S")), ("node_names are a, a",)),
+    ("sleap analysis", lambda f: put(f, "node_names", np.array(["a", "b"], "S")), ("2 node_names",)),
+    ("sleap analysis", lambda f: put(f, "tracks", np.zeros((1, 4, 17, 6))), ("4 coordinates",)),
+    ("sleap analysis", lambda f: put(f, "tracks", np.zeros((2, 17, 6))), ("tracks",)),
+    ("sleap analysis", lambda f: put(f, "tracks", np.zeros((1, 2, 17, 0))), ("in 0 frames",)),
+    ("sleap analysis", lambda f: put(f, "point_scores", np.zeros((1, 17, 7))), ("point_scores are",)),
+    ("sleap analysis", lambda f: put(f, "track_names", np.array(["a", "b"], "S")), ("2 track_names",)),
+    ("sleap analysis newer", lambda f: f["tracks"].attrs.__setitem__("dims", '["frame", "x"]'), ("has the axes",)),
+    ("sleap analysis newer", lambda f: f["tracks"].attrs.__setitem__("dims", "[["), ("not valid JSON",)),
+    ("sleap project", lambda f: f["metadata"].attrs.__setitem__("json", "{}"), ("no nodes and skeletons",)),
+    ("sleap project", lambda f: f["metadata"].attrs.__delitem__("json"), ("metadata@json",)),
+    ("sleap project", lambda f: f.__delitem__("pred_points"), ("pred_points",)),
+    ("sleap project", lambda f: put(f, "pred_points", f["pred_points"][:9]), ("has no 17 points",)),
+    ("sleap project", lambda f: put(f, "instances", f["instances"][:3]), ("share out its 3 instances",)),
+    ("sleap project", lambda f: put(f, "frames", f["frames"][1:]), ("share out its 6 instances",)),
+    ("sleap project", lambda f: put(f, "frames", np.zeros(3)), ("no field 'video'",)),
+    ("sleap project tracked", lambda f: f.__delitem__("tracks_json"), ("is of track 0",)),
+    ("movement", lambda f: f.__delitem__("keypoints"), ("without keypoints",)),
+    ("movement", lambda f: put(f, "space", np.array(["u", "v"], h5py.string_dtype())), ("the axes u, v",)),
+    ("movement", lambda f: put(f, "time", np.arange(3.0)), ("time",)),
+    ("movement in frames", lambda f: f["time"].__setitem__(slice(None), 0.0), ("must be frame numbers that increase",)),
+    ("deeplabcut table", lambda f: f["df_with_missing"].__delitem__("table"), ("no index and values",)),
+    ("deeplabcut table", lambda f: f["df_with_missing/table"].attrs.__delitem__("values_block_0_kind"), ("kind",)),
+    ("deeplabcut table", lambda f: f["df_with_missing"].attrs.__setitem__("pandas_type", "series"), ("'series' of pandas",)),
+    ("deeplabcut fixed", lambda f: f["df_with_missing"].__delitem__("block0_values"), ("block0_values",)),
+    ("deeplabcut fixed", lambda f: f["df_with_missing/block0_items_label1"].__setitem__(0, 99), ("words that are not there",)),
+    ("deeplabcut fixed", lambda f: f["df_with_missing"].attrs.__setitem__("nblocks", 10**6), ("nblocks is",)),
+    ("deeplabcut fixed", lambda f: put(f, "df_with_missing/block0_values", np.zeros((6, 50))), ("51 columns",)),
+    ("deeplabcut fixed", lambda f: put(f, "df_with_missing/axis1", np.arange(5)), ("5 rows",)),
+    ("deeplabcut fixed", lambda f: put(f, "df_with_missing/axis1", np.array(["a"] * 6, "S")), ("has no number",)),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("maker", "change", "words"), BROKEN)
+def test_broken_files_are_refused_in_one_line(
+    maker: str, change: Callable[[Any], None], words: tuple[str, ...], person: np.ndarray, tmp_path: Path
+) -> None:
+    refused(changed(MAKERS[maker](tmp_path / "take.h5", person), change), *words)
+
+
+@pytest.mark.parametrize("maker", MAKERS)
+def test_files_that_are_cut_off_are_refused(maker: str, person: np.ndarray, tmp_path: Path) -> None:
+    path = MAKERS[maker](tmp_path / "take.h5", person)
+    whole = path.read_bytes()
+    for share in (0.01, 0.3, 0.7, 0.95):
+        path.write_bytes(whole[: int(share * len(whole))])
+        refused(path, "take.h5")
+
+
+def test_an_infinite_coordinate_is_named(person: np.ndarray, tmp_path: Path) -> None:
+    person[1, 2, 0] = np.inf
+    refused(tools.deeplabcut(tmp_path / "a.h5", person, NAMES), "frame 1, joint 2: infinite coordinates")
+
+
+# ---- hostile -------------------------------------------------------------------------------------------------------------
+def test_links_out_of_the_file_are_not_followed(person: np.ndarray, tmp_path: Path) -> None:
+    other = tools.sleap_analysis(tmp_path / "other.h5", {"a": person}, NAMES)
+    path = tools.sleap_analysis(tmp_path / "a.h5", {"a": person}, NAMES)
+
+    def outside(file: Any) -> None:
+        del file["tracks"]
+        file["tracks"] = h5py.ExternalLink(str(other), "/tracks")
+
+    refused(changed(path, outside), "without keypoints")
+    path = tools.sleap_analysis(tmp_path / "b.h5", {"a": person}, NAMES)
+
+    def softly(file: Any) -> None:
+        file["real"] = h5py.ExternalLink(str(other), "/tracks")
+        del file["tracks"]
+        file["tracks"] = h5py.SoftLink("/real")
+
+    refused(changed(path, softly), "no dataset 'tracks'")
+
+
+def test_values_kept_in_other_files_are_not_read(person: np.ndarray, tmp_path: Path) -> None:
+    (tmp_path / "secret").write_bytes(bytes(8 * 2 * 17 * 6))
+    path = tools.sleap_analysis(tmp_path / "a.h5", {"a": person}, NAMES)
+
+    def elsewhere(file: Any) -> None:
+        del file["tracks"]
+        file.create_dataset("tracks", (1, 2, 17, 6), "f8", external=[(str(tmp_path / "secret"), 0, 8 * 2 * 17 * 6)])
+
+    refused(changed(path, elsewhere), "kept in another file")
+
+    def virtual(file: Any) -> None:
+        del file["tracks"]
+        layout = h5py.VirtualLayout((1, 2, 17, 6), "f8")
+        layout[:] = h5py.VirtualSource(str(tmp_path / "x.h5"), "tracks", (1, 2, 17, 6))
+        file.create_virtual_dataset("tracks", layout)
+
+    refused(changed(path, virtual), "kept in another file")
+
+
+def test_declared_sizes_are_checked_before_anything_is_made(person: np.ndarray, tmp_path: Path) -> None:
+    path = tools.sleap_analysis(tmp_path / "a.h5", {"a": person}, NAMES)
+
+    def bomb(file: Any) -> None:
+        del file["tracks"], file["point_scores"]
+        file.create_dataset("tracks", (1, 2, 17, 3_000_000), "f8", chunks=(1, 2, 17, 1000), compression="gzip")  # nothing stored
+
+    refused(changed(path, bomb), "would take 0.8 GB of 0.0 MB")
+    path = tools.deeplabcut(tmp_path / "b.h5", person, NAMES, "fixed")
+
+    def wide(file: Any) -> None:
+        del file["df_with_missing/block0_values"]
+        file["df_with_missing"].create_dataset("block0_values", (10**7, 51), "f8", chunks=(1000, 51))
+
+    refused(changed(path, wide), "would take")
+
+
+class Harm:
+    def __reduce__(self) -> Any:
+        return builtins.eval, ("1/0",)
+
+
+def test_a_pickle_in_an_attribute_runs_nothing(person: np.ndarray, tmp_path: Path) -> None:
+    path = tools.deeplabcut(tmp_path / "a.h5", person, NAMES)
+
+    def harm(file: Any) -> None:
+        file["df_with_missing/table"].attrs["values_block_0_kind"] = np.bytes_(pickle.dumps(Harm(), 0))
+
+    refused(changed(path, harm), "the pickle holds the name", "eval")
+
+
+def test_without_h5py_one_line_says_what_to_install(person: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tools.deeplabcut(tmp_path / "a.h5", person, NAMES)
+    real = builtins.__import__
+
+    def without(name: str, *rest: Any, **more: Any) -> Any:
+        if name == "h5py":
+            raise ImportError(name)
+        return real(name, *rest, **more)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    refused(path, "takes h5py to read", "pip install 'dyntorch[h5]'")
