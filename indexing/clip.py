@@ -417,10 +417,13 @@ def _check_depth(joints: FloatArray, who: str) -> None:
     """
     if joints.shape[2] != 3:
         return
-    known = ~np.isnan(joints).any(axis=2)
-    third = joints[..., 2][known]
-    if not third.size or third.min() < 0 or not 0 < third.max() <= 1:
+    least, most = (float(edge.reduce(joints[..., 2], axis=None)) for edge in (np.fmin, np.fmax))
+    if not (least >= 0 and 0 < most <= 1):
+        return  # nearly always, or nothing is seen
+    known: NDArray[np.bool_] = np.asarray(~np.isnan(joints).any(axis=2))
+    if not known.any():
         return
+    third = joints[..., 2][known]
     low, high = (
         edge(np.where(known[..., None], joints[..., :2], fill), axis=1) for edge, fill in ((np.min, np.inf), (np.max, -np.inf))
     )

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from indexing.clip import Clip, ClipSet, FloatArray, check_fps
 from indexing.opening import clipped, listed, shown
@@ -79,7 +80,7 @@ def clips_of(dataset: Any, *, fps: float | None = None, up: str | None = None, n
     times, rate, assumed = _times(dataset, attrs, len(position), fps, name)
     joints, people = _names(dataset, "keypoints", position.shape[2]), _names(dataset, "individuals", position.shape[1])
     bones = _skeleton(attrs, joints, name)
-    known = ~np.isnan(position).any(axis=3)
+    known: NDArray[np.bool_] = np.asarray(~np.isnan(position).any(axis=3))
     clips = []
     for i in range(position.shape[1]):
         if not known[:, i].any():

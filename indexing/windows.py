@@ -337,11 +337,11 @@ def torn(clip: Clip) -> str | None:
     return None
 
 
-def unusable(clip: Clip, fewest: int = 2) -> str | None:
-    """Why a clip cannot be compared with others, or ``None``; ``fewest``: frames it must have."""
+def unusable(clip: Clip, fewest: int = 2, point: bool = False) -> str | None:
+    """Why a clip cannot be compared with others, or ``None``; ``fewest``: frames it must have; ``point``: one joint is enough."""
     if len(clip) < fewest:
         return "one frame only, but an action needs at least two"
-    if clip.joints.shape[1] == 1:
+    if clip.joints.shape[1] == 1 and not point:
         return "one tracked point, but an action is of joints that move against each other"
     if np.isfinite(clip.joints[0]).all() and (clip.joints[0] != clip.joints[0, 0]).any():
         return None  # the common case, without looking at every frame

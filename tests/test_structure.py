@@ -58,6 +58,7 @@ FORMATS = {
     "indexing/cli/archive.py": {"PROBLEMS", "INTERRUPTED"},
     "indexing/cli/__init__.py": {"DONE", "BAD_INPUT", "REFUSED", "INTERRUPTED", "BROKEN_PIPE"},
     "indexing/cli/console.py": {"REFUSED"},
+    "indexing/labels/via.py": {"TEXT", "CHECKBOX", "SELECT", "VIDEO", "LOCAL"},
     "indexing/phase/saving.py": {"VERSION"},
     "indexing/pose/blazepose.py": {"PICTURE", "REGION", "HEATMAP", "GRIDS", "POINTS", "LANDMARKS", "JOINTS", "HIPS", "CIRCLE", "CLIPPED"},
     "indexing/pose/pieces.py": {"VERSION"},

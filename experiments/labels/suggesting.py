@@ -6,7 +6,8 @@ Somebody labels recordings a few parts at a time, and after each round a model i
 recordings of other people: the share of the frames that are right.  A part is labelled with what happens in most of it, from its
 true begin to its true end, at most half of its length beyond it; parts in which nothing happens are learned as background.  All
 ways begin with the same two parts of two actions, drawn at random, and choose among the same kind of parts; *any*: drawn at random,
-the longer the likelier.  *Farthest*: those that are suggested where nobody asks how sure the model is.
+the longer the likelier.  *Each part alone*: farthest first, whatever else is like it; *however sure*: nobody asks how sure the
+model is.
 
 *Exercises*: the streams of one subject are labelled, those of the other asked; *UTKinect*: clips of four people joined to
 recordings, three others asked; *actors*: synthetic people who rest 1 to 4 s between thirteen actions; there frames without an
@@ -44,7 +45,8 @@ FIRST = 2.5  # seconds of the two parts that everybody begins with
 WAYS: dict[str, SuggestOptions | None] = {
     "any": None,
     "suggested": SuggestOptions(),
-    "farthest": SuggestOptions(unsure=0.0),
+    "suggested, each part alone": SuggestOptions(alike=False),
+    "suggested, however sure": SuggestOptions(unsure=0.0),
 }
 Marked = tuple[int, str, float, float]
 """Number of the recording, label, start and end in seconds."""
@@ -56,9 +58,9 @@ class Config:
 
     sets: tuple[SETS, ...] = ("exercises", "utkinect", "actors")
     """Which recordings."""
-    counts: tuple[int, ...] = (4, 8, 12, 16, 24)
+    counts: tuple[int, ...] = (4, 8, 16)
     """Labels after which the model is asked; as many at a time are chosen as lie between."""
-    seeds: int = 4
+    seeds: int = 3
     """Repetitions with other first labels, and other people."""
     out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("results/labels_suggesting")
     """Where the tables are written as JSON."""

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from indexing.cli.console import check_report, count, names, progress, say, table
-from indexing.cli.labels import Labelling, is_of, lasting
+from indexing.cli.labels import Labelling, lasting, of_medium
 from indexing.opening import error, listed
 
 if TYPE_CHECKING:
@@ -126,7 +126,8 @@ def _side(labelling: Labelling, path: Path, command: Evaluate, detections: bool)
     labels, others = lasting(path, file.labels)
     said += others
     if not labels:
-        raise error(path, "holds no label that lasts", "give a file in which something is marked, from its begin to its end")
+        remedy = "give a file in which something is marked, from its begin to its end"
+        raise error(path, "holds no label that lasts", f"{remedy}, or, for a recording, -m MODEL, too" if detections else remedy)
     return labels, [f"{path}: {note}" for note in file.notices] + said
 
 
@@ -174,7 +175,9 @@ def _recordings(
         return {name: (list(known), list(found))}, []
     out: dict[str, tuple[list[Label], list[Label]]] = {}
     for medium in media[1]:
-        same = [name for name in media[0] if name == medium or (medium and name and is_of(paths[0], [name], medium))]
+        same = [name for name in media[0] if name == medium] or (
+            of_medium(medium, [name for name in media[0] if name]) if medium else []
+        )
         if not same:
             said = f"is of {medium or 'a recording without a name'}, and {paths[0]} of {listed(media[0])}"
             raise error(paths[1], said, "compare labels of the same recordings, under the same names")

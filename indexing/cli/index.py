@@ -19,6 +19,8 @@ from indexing.cli.inputs import (
     KnownEvent,
     Lane,
     Reading,
+    on_overlaps,
+    on_range,
     on_truth,
     parse_example,
     read_examples,
@@ -156,9 +158,14 @@ class Fit:
         films.refuse_keypoint_flags(self, "view", "weights", "mirror", "seed", "report", "background", "unlabelled_is_background")
         with progress("reading", steps=False):
             notes = [] if self.reading.footage.by == "pixels" or films.are_sets(examples) else [films.NO_MODEL]
+            notes += on_overlaps(examples)
             if self.labelling.labels:
-                examples, notes = film_examples(examples, self.labelling, self.reading)
+                examples, said = film_examples(examples, self.labelling, self.reading)
+                notes += said
             sources, labels, lengths = films.read_examples(examples, self.reading, self.select)
+            if all(films.is_video(example.path) for example in examples):
+                for example, seconds in zip(examples, lengths, strict=True):
+                    notes += on_range(example, 0.0, (example.start or 0.0) + seconds)
         _check_two(labels, examples)
         started = time.perf_counter()
         with progress(f"learning from {count(len(sources), 'video')}", steps=False):

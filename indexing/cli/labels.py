@@ -148,7 +148,7 @@ def _of_recordings(labelling: Labelling, recordings: Sequence[str], reading: Rea
     out: dict[str, list[Path]] = {name: [] for name in recordings}
     for path in labelling.labels:
         media = labelling.open(path, None, reading.fps).media or (path.name,)
-        mine = [name for name in recordings if is_of(path, media, name)]
+        mine = list(dict.fromkeys(name for medium in media for name in of_medium(medium, recordings)))
         if not mine:
             raise error(
                 path, f"is of {listed(media)}, none of the recordings ({listed(recordings)})",
@@ -164,14 +164,22 @@ def _of_recordings(labelling: Labelling, recordings: Sequence[str], reading: Rea
     return out
 
 
-def is_of(path: Path, media: Sequence[str], recording: str) -> bool:
-    """Whether one of the files that labels are of is a recording."""
-    from indexing.labels.gathering import Asked
+def of_medium(medium: str, recordings: Sequence[str]) -> list[str]:
+    """The recordings that one file is which labels are of: those called like it, else those in whose name its name is a word."""
+    from indexing.labels.media import same_recording
+
+    return [name for name in recordings if same_recording(medium, name)] or [
+        name for name in recordings if _is_word_of(medium, name)
+    ]
+
+
+def _is_word_of(medium: str, recording: str) -> bool:
+    from indexing.labels.gathering import Request
     from indexing.labels.media import of_recording
 
     try:
-        return bool(of_recording(media, Asked(path, recording=recording)))
-    except ValueError:  # none of them
+        return bool(of_recording([medium], Request(Path(medium), recording=recording)))
+    except ValueError:  # it is another one
         return False
 
 
@@ -287,8 +295,8 @@ def labelled_examples(
             out.background += _between(lane.clip, _everything(labelling, lane, reading), options)
     if not out.clips:
         where = names([str(path) for path in labelling.labels])
-        why = f"; the first: {reasons[0]}" if reasons else ""
-        what = f"none of its {count(number, 'label')} can be learned from{why}" if number else "nothing is marked there"
+        first = f"; the first: {reasons[0]}" if reasons else ""
+        what = f"none of its {count(number, 'label')} can be learned from{first}" if number else "nothing is marked there"
         raise error(where, what, f"mark actions that {names([path.name for path in paths])} shows, each from its begin to its end")
     from indexing.cli.remarks import on_examples
 
@@ -359,10 +367,10 @@ def _cut_out(clip: Clip, lane: Lane, labels: Sequence[Label], options: CuttingOp
 
 def _everything(labelling: Labelling, lane: Lane, reading: Reading) -> list[Label]:
     """All that is marked in a recording, of whatever tier and subject, and suggestions, too: none of it is background."""
-    found = []
+    found: list[Label] = []
     for path in labelling.labels:
         file = replace(labelling, tier=None).open(path, None, _rate([lane], reading))
-        if not file.media or labelling.media is not None or is_of(path, file.media, lane.name):
+        if not file.media or labelling.media is not None or any(of_medium(medium, [lane.name]) for medium in file.media):
             found += replace(labelling, tier=None).open(path, lane.name, _rate([lane], reading)).labels
     return found
 

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from indexing.files import write_json
-from indexing.labels.gathering import Asked, Gathering, text_of
+from indexing.labels.gathering import Gathering, Request, text_of
 from indexing.labels.label import Label, LabelFile, in_order
 from indexing.labels.target import Target
 from indexing.opening import error, shown
@@ -22,7 +22,7 @@ REMEDY = "write segments as {'segment': [start, end], 'label': name}"
 TEXTS = ("subject", "tier", "observation", "comment")
 
 
-def read(data: Mapping[str, Any], asked: Asked) -> LabelFile:
+def read(data: Mapping[str, Any], asked: Request) -> LabelFile:
     """Read a file of annotations or results.
 
     Raises:
@@ -52,7 +52,7 @@ def read(data: Mapping[str, Any], asked: Asked) -> LabelFile:
     return out.finish()
 
 
-def _segments(asked: Asked, data: Mapping[str, Any]) -> Iterator[tuple[str, int, Any]]:
+def _segments(asked: Request, data: Mapping[str, Any]) -> Iterator[tuple[str, int, Any]]:
     """Video, number from 1, and segment."""
     for part, key in (("database", "annotations"), ("results", None)):
         for video, held in (data.get(part) or {}).items():

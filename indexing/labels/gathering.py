@@ -17,7 +17,7 @@ TIME_REMEDY = "give seconds"
 
 
 @dataclass(frozen=True)
-class Asked:
+class Request:
     """What somebody wants of a file; the arguments are those of :func:`indexing.labels.open_labels`."""
 
     path: Path
@@ -33,7 +33,7 @@ class Asked:
 class Gathering:
     """Labels of a file while it is read."""
 
-    def __init__(self, asked: Asked, name: str) -> None:
+    def __init__(self, asked: Request, name: str) -> None:
         self.asked = asked
         self.format = name
         self.labels: list[Label] = []

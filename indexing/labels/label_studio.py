@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from indexing.files import write_json
-from indexing.labels.gathering import Asked, Gathering, text_of, whole
+from indexing.labels.gathering import Gathering, Request, text_of, whole
 from indexing.labels.label import Label, LabelFile, in_order
 from indexing.labels.media import base_name
 from indexing.labels.target import Target
@@ -26,7 +26,7 @@ UPLOAD = re.compile(r"^[0-9a-f]{8}-")
 TEXTS = ("subject", "tier")
 
 
-def read(data: Any, asked: Asked) -> LabelFile:
+def read(data: Any, asked: Request) -> LabelFile:
     """Read an export.
 
     Raises:
@@ -103,6 +103,7 @@ def _region(out: Gathering, region: Mapping[str, Any], media: str, who: str, whe
         return
     found = value.get(kind) or value.get("timelinelabels")
     names = found if isinstance(found, list) else []
+    times: list[tuple[Any, Any]]
     if isinstance(value.get("ranges"), list):
         times = [_frames(out, one, where) for one in value["ranges"]]
     elif kind in SOUND and "text" not in value and "start" in value:  # with text, they count its letters

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from urllib.parse import unquote
 
-from indexing.labels.gathering import Asked
+from indexing.labels.gathering import Request
 from indexing.opening import error, listed
 
 SUFFIX = re.compile(r"\.\w{1,8}$")
@@ -60,7 +60,7 @@ def base_name(name: str) -> str:
     return re.split(r"[\\/]", plain.rstrip("\\/"))[-1]
 
 
-def of_recording(names: Iterable[str], asked: Asked) -> set[str] | None:
+def of_recording(names: Iterable[str], asked: Request) -> set[str] | None:
     """Those of the files in a label file that are the recording at hand; None where none is at hand.
 
     The whole path decides, else the name of the file, else what stands before its last dot, else that one of the two stands in the
@@ -101,7 +101,7 @@ def same_recording(name: str, other: str) -> bool:
 
 def _likeness(name: str, recording: str) -> tuple[int, int] | tuple[()]:
     """How much a file of the labels is like the recording: empty where it is another one."""
-    folders = [re.split(r"[\\/]", text)[:-1] for text in (name, str(Path(recording).expanduser().absolute()))]
+    folders = [re.split(r"[\\/]", text)[:-1] for text in (name, os.path.abspath(os.path.expanduser(recording)))]
     shared = 0
     for a, b in zip(reversed(folders[0]), reversed(folders[1]), strict=False):
         if a != b:

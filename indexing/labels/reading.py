@@ -11,7 +11,7 @@ from importlib import import_module
 from pathlib import Path
 
 from indexing.labels.detect import FORMATS, detect
-from indexing.labels.gathering import Asked, few
+from indexing.labels.gathering import Request, few
 from indexing.labels.label import Label, LabelFile
 from indexing.labels.media import of_recording
 from indexing.labels.options import LabelOptions
@@ -69,7 +69,7 @@ def open_labels(
         raise error(path, f"unknown format={shown(format)}", f"use one of {', '.join(FORMATS)}, or leave it out to detect it")
     if fps is not None and not 0 < fps < math.inf:
         raise error(path, f"fps={shown(fps)} is no frame rate", "give frames per second, such as 29.97")
-    asked = Asked(Path(path), recording, media, observation, subject, tier, fps, options)
+    asked = Request(Path(path), recording, media, observation, subject, tier, fps, options)
     with uncollected():
         detected, data = detect(asked.path)
         if format is not None and format != detected:
@@ -158,7 +158,7 @@ def read_labels(
     return list(found.labels)
 
 
-def _asked_for(found: LabelFile, asked: Asked) -> LabelFile:
+def _asked_for(found: LabelFile, asked: Request) -> LabelFile:
     """The labels of the recording, observation, subject and tier that somebody asked for."""
     labels: Iterable[Label] = found.labels
     notices = list(found.notices)

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from indexing.files import write_text
-from indexing.labels.gathering import Asked, Gathering, parse_seconds, whole
+from indexing.labels.gathering import Gathering, Request, parse_seconds, whole
 from indexing.labels.label import Label, LabelFile, in_order
 from indexing.opening import Row, clipped, error, listed, shown
 
@@ -38,7 +38,7 @@ FORM = "write it as CSV in UTF-8 with the columns label,start,end"
 WRITTEN = ("label", "start", "end", "subject", "media", "tier", "observation", "comment", "modifiers", "score")
 
 
-def read(rows: list[Row], asked: Asked) -> LabelFile:
+def read(rows: list[Row], asked: Request) -> LabelFile:
     """Read a table.
 
     Raises:

@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from indexing.files import write_json
-from indexing.labels.gathering import Asked, Gathering, text_of
+from indexing.labels.gathering import Gathering, Request, text_of
 from indexing.labels.label import Label, LabelFile, in_order
 from indexing.labels.media import base_name, of_recording
 from indexing.labels.target import Target
@@ -39,7 +39,7 @@ PLACES = {  # VIA fills them in
 Attributes = dict[str, dict[str, Any]]
 
 
-def read(data: Mapping[str, Any] | list[Row], asked: Asked) -> LabelFile:
+def read(data: Mapping[str, Any] | list[Row], asked: Request) -> LabelFile:
     """Read a project or an export.
 
     Raises:
@@ -140,15 +140,15 @@ def _read_table(out: Gathering, rows: list[Row]) -> None:
             attributes = _attributes(parse_json(path, line.partition("=")[2], REMEDY, "its attributes"))
     columns: dict[str, int] = {}
     left: Counter[str] = Counter()
-    for line, cells in rows:
+    for number, cells in rows:
         names = [cell.rpartition("=")[2].strip(" #").lower() for cell in cells]
         if not columns and ("csv_header" in cells[0].lower() or "temporal_segment_start" in names):
             columns = {name: at for at, name in enumerate(names)}
             if "metadata" not in columns or not {"temporal_coordinates", "temporal_segment_start"} & columns.keys():
-                raise error(path, f"line {line}: has no columns 'metadata' and 'temporal_coordinates'", REMEDY)
+                raise error(path, f"line {number}: has no columns 'metadata' and 'temporal_coordinates'", REMEDY)
         elif columns and not cells[0].lstrip().startswith("#"):
             row = {name: cells[at] if at < len(cells) else "" for name, at in columns.items()}
-            _table_row(out, row, attributes, f"line {line}", left)
+            _table_row(out, row, attributes, f"line {number}", left)
     _left_out(out, left)
 
 

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 from collections.abc import Sequence
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 from indexing.labels import tables
 from indexing.labels.label import Label
-from indexing.labels.media import same_recording
+from indexing.labels.media import base_name, same_recording
 from indexing.labels.target import Target
-from indexing.opening import error, is_regular, listed, shown
+from indexing.opening import count, error, is_regular, listed, shown
 
 FORMATS = {
     ".boris": "boris",
@@ -24,6 +26,8 @@ FORMATS = {
 }
 BY_NAME = ("label_studio", "via")
 BESIDE = ("boris", "elan")
+FILMS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv", ".wav")
+"""What annotation programs play."""
 UNPRINTABLE = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]")  # what XML has no way to write
 
 
@@ -49,7 +53,8 @@ def write_labels(
         path: its suffix says what is written: ``.boris``, ``.eaf``, ``.csv``, ``.tsv``, ``.json`` (ActivityNet).
         labels: of one recording, or of several that their ``media`` name (ELAN: of one).  Those with a ``tier`` (ELAN) or an
             ``observation`` (BORIS) of their own keep it.
-        recording: the video that labels without ``media`` are of; written also where there is no label.
+        recording: the video that labels without ``media`` are of, or its keypoints with the video beside them; written also where
+            there is no label.
         duration, fps: of the recording, in seconds and frames per second; Label Studio cannot do without ``fps``.
         into: another ``.eaf`` or ``.boris`` whose content is taken over, instead of that of ``path``.
         tier: how the tier (ELAN) or the observation (BORIS) is called.
@@ -79,8 +84,11 @@ def write_labels(
     source = _source(target, into, name)
     own = str(recording) if recording is not None else ""
     if own:  # labels may name the video, and the recording be its keypoints
-        own = next((label.media for label in labels if label.media and same_recording(label.media, own)), own)
+        own = next((label.media for label in labels if label.media and same_recording(label.media, own)), _film(own, target, name))
     sound, notices = _sound(labels, own)
+    if own and name in BESIDE and source is None and Path(own).suffix.lower() not in FILMS:
+        asks = {"boris": "BORIS", "elan": "ELAN"}[name]
+        notices.append(f"{base_name(own)} is no video: {asks} asks for one when you open {target.name}")
     recordings = dict.fromkeys(([own] if own else []) + [label.media for label in sound])
     where = Target(target, tuple(recordings), source, tier, duration, fps, annotator, media)
     if name in ("csv", "tsv"):
@@ -130,14 +138,33 @@ def _source(path: Path, into: str | Path | None, name: str) -> Path | None:
     return path if name in BESIDE and is_regular(path) else None
 
 
+def _film(recording: str, target: Path, name: str) -> str:
+    """The video of a recording, where it lies beside it, as the format names it: BORIS looks for it from where its project is."""
+    path = Path(os.path.expanduser(recording))
+    if not path.name:
+        return recording
+    if path.suffix.lower() not in FILMS:
+        path = next((film for film in map(path.with_suffix, FILMS) if is_regular(film)), path)
+        if path.suffix.lower() not in FILMS:
+            return recording
+    if name != "boris" or not is_regular(path):
+        return str(path)
+    film, folder = path.absolute(), target.absolute().parent
+    return film.relative_to(folder).as_posix() if film.is_relative_to(folder) else str(film)
+
+
 def _sound(labels: Sequence[Label], recording: str) -> tuple[list[Label], list[str]]:
     """Labels in characters that every format can write, each with its recording."""
     found, changed = [], 0
-    for label in labels:
-        fields = {name: getattr(label, name) for name in ("label", "subject", "media", "tier", "observation", "comment")}
-        sound = {name: UNPRINTABLE.sub("\ufffd", value) for name, value in fields.items()}
+    named = [label for label in labels if label.label.strip()]
+    for label in named:
+        texts = {name: getattr(label, name) for name in ("label", "subject", "media", "tier", "observation", "comment")}
+        sound: dict[str, Any] = {name: UNPRINTABLE.sub("\ufffd", text) for name, text in texts.items()}
         modifiers = tuple(UNPRINTABLE.sub("\ufffd", part) for part in label.modifiers)
-        changed += sound != fields or modifiers != label.modifiers
-        sound["media"] = sound["media"] or recording
-        found.append(replace(label, modifiers=modifiers, **sound))
-    return found, [f"control characters in {changed} labels became \ufffd"] * bool(changed)
+        changed += sound != texts or modifiers != label.modifiers
+        sound |= {"media": sound["media"] or recording, "modifiers": modifiers}
+        sound |= {name: sound[name].strip() for name in ("label", "subject", "tier", "observation")}
+        found.append(replace(label, **sound))
+    nameless = len(labels) - len(named)
+    notices = [f"{count(nameless, 'label')} without a name left out"] * bool(nameless)
+    return found, notices + [f"control characters in {count(changed, 'label')} became \ufffd"] * bool(changed)

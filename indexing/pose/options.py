@@ -16,6 +16,9 @@ class DetectorOptions:
     shrinks: tuple[int, ...] = (1, 2, 3)
     """The network looks at the whole picture, and where that is not enough, closer: at overlapping squares of one part in so many
     of its longer side."""
+    farther: tuple[int, ...] = (5,)
+    """The same where nobody is found by these.  People of 140 pixels in a picture of 1920: in .69 of the frames without it, in
+    .95 with it; of 100 pixels, in none and in .83."""
     closer_score: float = 0.65
     """As ``score``, when it looks closer: there parts of people and of furniture get up to .74, people whom it sees whole .7 and
     more (two frames of a laboratory with a bystander)."""

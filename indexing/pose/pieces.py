@@ -219,10 +219,9 @@ class Store:
         """A piece that was finished before, if it is whole."""
         try:
             data = NumpyArchive(self._path(piece))
-            found = Sightings(
-                *(data[key] for key in ("times", "at", "tracks", "joints", "confidence", "crowd")),
-                tuple(map(str, data["notes"])),
-            )
+            times, at, tracks, joints = data["times"], data["at"], data["tracks"], data["joints"]
+            notes = tuple(map(str, data["notes"]))
+            found = Sightings(times, at, tracks, joints, data["confidence"], data["crowd"], notes)
         except (ValueError, KeyError):
             return None
         return found if len(found.joints) == len(found.at) == len(found.tracks) == len(found.confidence) else None

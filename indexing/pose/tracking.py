@@ -145,8 +145,11 @@ class Tracker:
         wait = self.options.follow.search_closer if self._followed and self.people > 1 else self.options.follow.search
         closer = time - self._looked_closer >= wait
         self._searched = time
-        for shrink in self.options.detector.shrinks:
+        shrinks, farther = self.options.detector.shrinks, self.options.detector.farther
+        for shrink in (*shrinks, *farther):
             if shrink > 1:
+                if self._followed and shrink in farther:
+                    break
                 if not closer or (self._followed if self.people == 1 else len(self._followed) >= self.people):
                     break
                 self._looked_closer = time

@@ -16,6 +16,7 @@ from indexing.files import prepare, recover_folder, replace_folder
 from indexing.opening import error
 from indexing.pose.blazepose import Floats
 from indexing.pose.detection import Detected, FrameProgress, ModelName, Progress, VideoTask, as_frames, check, made_by, run
+from indexing.pose.identities import Indices
 from indexing.pose.models import load_models
 from indexing.pose.networks import NetworkMaker
 from indexing.pose.options import PoseOptions
@@ -162,7 +163,8 @@ def _there(task: VideoTask, target: Path, json: bool) -> KeypointFile | None:
     """
     recover_folder(_json(target))
     if not target.exists():
-        if json and _json(target).exists():
+        # a folder beside kept pieces is ours: the clip set is written after it, and the pieces go last
+        if json and _json(target).exists() and not _parts(target).is_dir():
             raise error(_json(target), "is there, and not of this video", "move it away, or write to another folder")
         return None
     try:
@@ -195,7 +197,7 @@ def _written(task: VideoTask, found: Detected, target: Path, json: bool) -> Keyp
     return KeypointFile(target, folder, found.clips, False, found)
 
 
-def write_json_folder(clips: Sequence[Clip], numbers: Floats, times: Floats, folder: Path) -> Path:
+def write_json_folder(clips: Sequence[Clip], numbers: Indices, times: Floats, folder: Path) -> Path:
     """Write a file per frame, as OpenPose does and Pose2Sim reads: ``NAME_000000000000_keypoints.json``.
 
     Each has ``people`` with ``pose_keypoints_2d`` (x, y, confidence of every joint; zeros where it was not seen) and ``person_id``,

@@ -7,6 +7,7 @@ names are a pickle in an attribute (read by :mod:`indexing.readers.pickles`).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -65,7 +66,8 @@ def _keys(file: Hdf5) -> list[str]:
 
 def _fixed(file: Hdf5, key: str) -> HdfFrame:
     count = _count(file, key, "nblocks")
-    columns, blocks = [], []
+    columns: list[list[list[str]]] = []
+    blocks: list[FloatArray] = []
     rows = _axis(file, f"{key}/axis1", _word(file.attribute(key, "axis1_variety")), _levels(file, key, "axis1"))
     for i in range(count):
         name = f"{key}/block{i}_items"
@@ -118,9 +120,10 @@ def _level_names(file: Hdf5, key: str) -> list[str]:
         return []
 
 
-def _frame(file: Hdf5, header: list[list[str]], names: list[str], blocks: list[FloatArray], rows: list[str]) -> HdfFrame:
+def _frame(file: Hdf5, header: list[list[str]], names: list[str], blocks: Sequence[FloatArray], rows: list[str]) -> HdfFrame:
     usual = LEVELS.get(len(header), ())
-    named = names if len(names) == len(header) and "coords" in names else list(usual)
+    told = len(set(names)) == len(header) and {"bodyparts", "coords"} <= set(names)
+    named = names if told else list(usual)
     if not named:
         raise error(file.path, f"has {len(header)} rows of column names, not {' or '.join(map(str, LEVELS))}", AGAIN)
     if not rows:

@@ -7,6 +7,7 @@ an extra (``pip install 'dyntorch[h5]'``) and imported when the first such file 
 from __future__ import annotations
 
 import math
+import mmap
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,9 +16,9 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from indexing.opening import LARGEST, VALUE, clipped, error, listed, shown, size_of
+from indexing.opening import LARGEST, VALUE, clipped, error, listed, opened, shown, size_of
 
-MAGIC = b"\x89HDF\r\n\x1a\n"
+HEAP = b"GCOL\x01\0\0\0"
 AGAIN = "export or copy it again"
 PLENTY_BLOCK = 2**26, 250  # bytes from which on a dataset must not be this many times as large as what is stored of it
 MOST_TEXTS_BLOCK = 20_000  # names in a dataset of text
@@ -120,11 +121,6 @@ class Hdf5:
 
         return self._sure(value, f"{name}@{key}")
 
-    def scale_names(self, name: str) -> list[str]:
-        """What netCDF calls the axes of a dataset; empty text where it has no name."""
-        data = self._dataset(name)
-        return self._sure(lambda: [axis[0].name.rpartition("/")[2] if len(axis) else "" for axis in data.dims], name)
-
     def _dataset(self, name: str) -> Any:
         """A dataset that is what it says."""
         found = self._sure(lambda: self._handle[name] if self._hard(name) else None, name)
@@ -176,6 +172,7 @@ def opened_hdf5(path: Path) -> Iterator[Hdf5]:
         import h5py
     except ImportError:
         raise error(path, "is an HDF5 file, which takes h5py to read", "pip install 'dyntorch[h5]'") from None
+    _check_heaps(path)
     try:
         handle = h5py.File(path, "r", locking=False)
     except DAMAGED as problem:
@@ -185,6 +182,30 @@ def opened_hdf5(path: Path) -> Iterator[Hdf5]:
         yield Hdf5(path, handle, size)
     finally:
         handle.close()
+
+
+def _check_heaps(path: Path) -> None:
+    """Refuse a heap of texts with an empty piece of free space: the library would go from it to itself without end.
+
+    A heap is ``GCOL``, its version and size, and pieces: index (0 = free), references, size, each a multiple of 8 bytes.
+
+    Raises:
+        ValueError: there is one, or the file cannot be read.
+    """
+    with opened(path) as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        at = data.find(HEAP)
+        while at >= 0:
+            size = min(int.from_bytes(data[at + 8 : at + 16], "little"), len(data) - at)
+            step, end = at + 16, at + size
+            while step + 16 <= end:
+                index, length = (
+                    int.from_bytes(data[step : step + 2], "little"),
+                    int.from_bytes(data[step + 8 : step + 16], "little"),
+                )
+                if not index and not length:
+                    raise error(path, "is damaged: one of its heaps of text has no end (the file may be truncated)", AGAIN)
+                step += length if not index else 16 + -(-length // 8) * 8
+            at = data.find(HEAP, at + 8)
 
 
 def _text(value: Any) -> str:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from indexing.clip import COARSEST, FINEST, ClipSet
+from indexing.clip import COARSEST, FINEST, UP_AXES, ClipSet
 from indexing.opening import error, listed, shown
 from indexing.readers.files import Options, Source
 from indexing.readers.hdf import Array, Hdf5, opened_hdf5
@@ -18,6 +18,7 @@ from indexing.readers.recording import Recording, to_clips
 from indexing.skeleton import Skeleton
 
 AXES = ("time", "individuals", "keypoints", "space")
+USUAL = ("time", "space", "keypoints", "individuals")
 REMEDY = "save it again from movement, with dataset.to_netcdf(path)"
 
 
@@ -65,21 +66,40 @@ def _recording(file: Hdf5, options: Options) -> Recording:
         tracks=animals * frames if len(animals) > 1 else None,
         times=times,
         skeleton=Skeleton(file.path.stem, tuple(joints)),
-        up="-y" if len(space) == 2 else "z",
+        up=_up(file, len(space)),
     )
 
 
 def _axes(file: Hdf5, name: str, wanted: tuple[str, ...]) -> tuple[Array, list[str]]:
     """An array with its axes in the order wanted, one of length 1 for each that it lacks, and the axes that it has."""
-    values, there = file.array(name, None, "fiu"), file.scale_names(name)
+    values, there = file.array(name, None, "fiu"), _names(file, name)
     unknown = [axis for axis in there if axis not in wanted]
-    if unknown or len(set(there)) < len(there) or not {"time", "keypoints"} <= set(there):
+    if unknown or len(set(there)) < len(there) or len(there) != values.ndim or not {"time", "keypoints"} <= set(there):
         raise error(file.path, f"{name} has the axes {listed(there)}, not {', '.join(wanted)}", REMEDY)
     values = values.transpose([there.index(axis) for axis in wanted if axis in there])
     for i, axis in enumerate(wanted):
         if axis not in there:
             values = np.expand_dims(values, i)
     return values, there
+
+
+def _names(file: Hdf5, name: str) -> list[str]:
+    """What the axes of an array are called: by the numbers that netCDF gives them, else in the order in which movement has them.
+
+    The scales of HDF5 say the same by references, which a damaged file can send the library after without end.
+    """
+    numbers = file.attribute(name, "_Netcdf4Coordinates")
+    axes = {_whole(file.attribute(axis, "_Netcdf4Dimid")): axis for axis in AXES if axis in file}
+    if isinstance(numbers, np.ndarray) and numbers.ndim == 1 and numbers.dtype.kind in "iu" and None not in axes:
+        found = [axes.get(int(number), str(number)) for number in numbers[: len(AXES) + 1]]
+        if len(found) == len(file.shape(name)):
+            return found
+    usual = [axis for axis in USUAL if axis != "space" or name == "position"]
+    return [axis for axis in usual if axis in file or axis in ("time", "space")]
+
+
+def _whole(value: Any) -> int | None:
+    return int(value) if isinstance(value, (int, np.integer)) else None
 
 
 def _times(file: Hdf5, frames: int, options: Options) -> tuple[Array, Array | None]:
@@ -96,6 +116,13 @@ def _times(file: Hdf5, frames: int, options: Options) -> tuple[Array, Array | No
         raise error(file.path, f"time ({shown(unit)}) must be frame numbers that increase", REMEDY)
     rate = options.fps or fps
     return whole.astype(np.int64), whole / rate if rate is not None else None
+
+
+def _up(file: Hdf5, dims: int) -> str:
+    """Which way is up: as :meth:`indexing.Clip.to_movement` notes it, else as of pixels, and of rooms."""
+    found = file.attribute("/", "up")
+    found = found.decode("utf-8", "replace") if isinstance(found, bytes) else found
+    return found if isinstance(found, str) and found in UP_AXES[: 2 * (dims - 1)] else "-y" if dims == 2 else "z"
 
 
 def _number(value: Any) -> float | None:

@@ -73,7 +73,7 @@ class _Kind:
         size = state[5] if len(state) > 5 else -1
         if type(size) is int and size > 0 and self.dtype.kind in "SU":
             self.dtype = np.dtype(f"{self.dtype.kind}{size // (4 if self.dtype.kind == 'U' else 1)}")
-        self.dtype = self.dtype.newbyteorder(order)
+        self.dtype = self.dtype.newbyteorder(order)  # type: ignore[arg-type]  # one of four, as it says above
 
 
 class _Array:
@@ -95,6 +95,7 @@ class _Name:
     """Stands in for one of the names that are known: it can be called, and nothing about it can be changed."""
 
     __slots__ = ("_called",)
+    _called: Callable[..., Any]
 
     def __init__(self, called: Callable[..., Any]) -> None:
         object.__setattr__(self, "_called", called)
@@ -128,7 +129,8 @@ class _Reader(pickle._Unpickler):
 
     def load(self) -> Any:
         """The value, or :class:`Refused`."""
-        self._unframer = pickle._Unframer(self._file_read, self._file_readline)
+        own: Any = pickle  # what its reader in Python is made of, which the stubs do not list
+        self._unframer = own._Unframer(self._file_read, self._file_readline)  # type: ignore[attr-defined]
         self.read, self.readinto, self.readline = self._unframer.read, self._unframer.readinto, self._unframer.readline
         self.metastack: list[Any] = []
         self.stack: list[Any] = []
@@ -143,7 +145,7 @@ class _Reader(pickle._Unpickler):
                 raise Refused(_OTHER.get(key[0], f"the step {shown(key)}"))
             try:
                 step(self)
-            except pickle._Stop as stop:
+            except own._Stop as stop:
                 return stop.value
         raise Refused("more steps than its size allows")
 

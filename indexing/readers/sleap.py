@@ -150,7 +150,7 @@ def _project(file: Hdf5, options: Options) -> Recording:
     frames = file.records("frames", ("video", "frame_idx", "instance_id_start", "instance_id_end"))
     about = _about(file)
     fps = _one_video(file, frames["video"])
-    fields = ("instance_type", "skeleton", "track", "point_id_start", "point_id_end")
+    fields: tuple[str, ...] = ("instance_type", "skeleton", "track", "point_id_start", "point_id_end")
     fields += ("from_predicted",) if "from_predicted" in file.fields("instances") else ()
     instances = file.records("instances", fields)
     which = _instances(file, frames, instances)

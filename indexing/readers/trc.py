@@ -57,12 +57,13 @@ def read(source: Source, options: Options) -> ClipSet:
     points[(points == 0).all(axis=2)] = np.nan
     frames = frame_numbers(path, values[:, 0])
     rate = _rate(path, about)
-    times = values[:, 1]
-    if np.isnan(times).all():
+    stamps = values[:, 1]
+    times: FloatArray | None = stamps
+    if np.isnan(stamps).all():
         fps = options.fps or rate
         times = None if fps is None else (frames - frames[0]) / fps
     elif rate is not None:
-        times = unrounded(times, frames, rate)
+        times = unrounded(stamps, frames, rate)
     return to_clips(path, of_markers(path, points, names, frames, times, about["units"], ""), options)
 
 

@@ -216,7 +216,7 @@ def _ghost(clip: Clip, step: float, length: float, least: int, options: Presence
         return "too short"
     if np.median(joints[shown]) < least:
         return "too few joints"
-    return "at one place" if unusable(clip) else None
+    return "at one place" if unusable(clip, point=True) else None
 
 
 def _together(tracks: Sequence[_Track]) -> bool:

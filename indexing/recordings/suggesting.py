@@ -2,14 +2,17 @@ r"""Which parts of recordings to label next: those that are unlike what is known
 
 The stages: recordings are cut into parts, one per performance that was found and of what lies between them
 (:func:`parts_of`); each part is compared with all that is known and with all others, by the residual of the indexer, which does
-not see from where a camera looks (:func:`compared`); parts are chosen one after the other, each farthest from what is known and
-from those chosen before, the less sure the sooner (:func:`chosen`).  With :math:`r_{ij}` the residual between two parts,
-:math:`k_i` that of part :math:`i` to the nearest example, :math:`m_i` the margin between the probabilities of its two best actions,
-and :math:`C` what was chosen before,
+not see from where a camera looks (:func:`compared`); parts are chosen one after the other, each the one that would leave the least
+that is unlike everything known, what nobody can be sure of counting more (:func:`chosen`).  With :math:`r_{ij}` the residual
+between two parts, :math:`k_j` that of part :math:`j` to the nearest example, :math:`m_j` the margin between the probabilities of
+its two best actions, :math:`C` what was chosen before, and :math:`D_j = \min(k_j, \min_{i \in C} r_{ij})`, the next one is
 
-.. math:: \arg\max_i\; \min\bigl(k_i, \min_{j \in C} r_{ij}\bigr)\,\bigl(1 + w (1 - m_i)\bigr) .
+.. math:: \arg\max_i \sum_j (1 + w (1 - m_j)) \max(D_j - r_{ij}, 0) .
 
-Source: Gonzalez 1985 and Sener and Savarese 2018 (farthest first, core sets); Scheffer et al. 2001 (margins).
+A part that nothing else is like counts for itself; one that is like ten others counts for all of them, once.
+
+Source: Nemhauser, Wolsey and Fisher 1978 (greedy coverage is within 1 - 1/e of the best); Gonzalez 1985 and Sener and Savarese 2018
+(farthest first, where only the part itself counts); Scheffer et al. 2001 (margins).
 """
 
 from __future__ import annotations
@@ -40,7 +43,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[Any]
 Span = tuple[float, float]
-SuggestReason = Literal["unlike what is known", "either of two", "a variant of what is known"]
+SuggestReason = Literal["unlike what is known", "either of two", "much else is like it"]
 
 
 @dataclass(frozen=True)
@@ -63,8 +66,8 @@ class Suggestion:
 
 
 @dataclass(frozen=True, eq=False)
-class Parts:
-    """Parts of recordings, and what is known of them.
+class RecordingParts:
+    """RecordingParts of recordings, and what is known of them.
 
     owner: ``(N,)`` number of the recording; spans: ``(N, 2)`` seconds; windows: of all, resampled; worth: ``(N,)`` bool, whether
     somebody is seen to move there.
@@ -124,7 +127,7 @@ def suggest(
     out = []
     for at in chosen(near, apart, margin, number, parts.worth, options):
         names = [classes[which] if which < len(classes) else None for which in ranked[at, :2].tolist()]
-        reason: SuggestReason = "a variant of what is known"
+        reason: SuggestReason = "much else is like it"
         if near[at] >= options.far * usual:
             reason = "unlike what is known"
         elif margin[at] < options.doubt and None not in names and len(names) > 1:
@@ -135,7 +138,7 @@ def suggest(
     return out
 
 
-def parts_of(indexer: ActionIndexer, clip: Clip, labelled: Sequence[Span], options: SuggestOptions) -> Parts | None:
+def parts_of(indexer: ActionIndexer, clip: Clip, labelled: Sequence[Span], options: SuggestOptions) -> RecordingParts | None:
     """A recording cut into parts; None where there are none.
 
     What was found is a part each, long ones are cut; what lies between them is cut into parts as long as an ordinary example.
@@ -158,7 +161,7 @@ def parts_of(indexer: ActionIndexer, clip: Clip, labelled: Sequence[Span], optio
     first, last = np.searchsorted(clip.times, spans[:, 0]), np.searchsorted(clip.times, spans[:, 1], side="right")
     seen = (shown[last] - shown[first]) / np.maximum(last - first, 1)
     worth = (motion_of(windows) > options.still * still) & (seen >= options.shown) & (last - first > 1)
-    return Parts(nobody, spans, windows, worth)
+    return RecordingParts(nobody, spans, windows, worth)
 
 
 def _cut(told: Explanation, clip: Clip, unit: float, options: SuggestOptions) -> list[Span]:
@@ -189,7 +192,7 @@ def _share(span: Sequence[float], others: Sequence[Span]) -> float:
     return sum(max(0.0, min(end, b) - max(start, a)) for a, b in others) / max(end - start, 1e-9)
 
 
-def _together(found: Sequence[Parts | None], options: SuggestOptions) -> Parts | None:
+def _together(found: Sequence[RecordingParts | None], options: SuggestOptions) -> RecordingParts | None:
     """The parts of all recordings that are worth anything, thinned out evenly where they are too many to be compared."""
     several = [(number, parts) for number, parts in enumerate(found) if parts is not None and parts.worth.any()]
     if not several:
@@ -198,7 +201,7 @@ def _together(found: Sequence[Parts | None], options: SuggestOptions) -> Parts |
     spans = np.concatenate([parts.spans[parts.worth] for _, parts in several])
     windows = stack([parts.windows[torch.from_numpy(parts.worth)] for _, parts in several])
     kept = np.unique(np.linspace(0, len(owner) - 1, options.candidates).round().astype(np.intp))
-    return Parts(owner[kept], spans[kept], windows[torch.from_numpy(kept)], np.ones(len(kept), dtype=bool))
+    return RecordingParts(owner[kept], spans[kept], windows[torch.from_numpy(kept)], np.ones(len(kept), dtype=bool))
 
 
 def compared(indexer: ActionIndexer, windows: Windows) -> tuple[Array, Array, Array, float]:
@@ -225,22 +228,25 @@ def compared(indexer: ActionIndexer, windows: Windows) -> tuple[Array, Array, Ar
 
 
 def chosen(near: Array, apart: Array, margin: Array, number: int, worth: Array, options: SuggestOptions) -> list[int]:
-    """Numbers of parts, one after the other: far from what is known and from those before, the less sure the sooner.
+    """Numbers of parts, one after the other: each leaves the least that is unlike what is known and what was chosen before.
 
     Args:
         near: ``(N,)`` distance to what is known; apart: ``(N, N)``; margin: ``(N,)`` 0..1; worth: ``(N,)`` bool, which may be
-            chosen.
+            chosen, and count.
 
     Example:
-        >>> near, apart = np.array([0.5, 0.45, 0.3]), np.array([[0.0, 0.05, 0.4], [0.05, 0.0, 0.4], [0.4, 0.4, 0.0]])
-        >>> chosen(near, apart, np.zeros(3), 2, np.ones(3, dtype=bool), SuggestOptions())
-        [0, 2]
+        >>> near = np.array([0.5, 0.3, 0.3, 0.3])
+        >>> apart = np.array([[0.0, 0.4, 0.4, 0.4], [0.4, 0.0, 0.1, 0.2], [0.4, 0.1, 0.0, 0.1], [0.4, 0.2, 0.1, 0.0]])
+        >>> some = np.zeros(4), 2, np.ones(4, dtype=bool)
+        >>> chosen(near, apart, *some, SuggestOptions()), chosen(near, apart, *some, SuggestOptions(alike=False))
+        ([2, 0], [0, 1])
     """
     free, distance = worth.copy(), near.astype(np.float64)
-    weight = 1.0 + options.unsure * (1.0 - margin)
+    weight = (1.0 + options.unsure * (1.0 - margin)) * worth
     out: list[int] = []
     while free.any() and len(out) < number:
-        best = int(np.where(free, distance * weight, -np.inf).argmax())
+        gain = weight @ np.maximum(distance[:, None] - apart, 0.0) if options.alike else weight * distance
+        best = int(np.where(free, gain, -np.inf).argmax())
         out.append(best)
         free[best] = False
         distance = np.minimum(distance, apart[:, best])

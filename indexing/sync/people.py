@@ -133,9 +133,9 @@ def common_joints(a: Clip, b: Clip, options: SyncOptions = SyncOptions()) -> tup
     else:
         there = [(i, j) for i, j in enumerate(places(second, first)) if j >= 0] if named(first) and named(second) else []
         if len(there) >= options.people.joints:
-            names = tuple(first.joints[i] for i, _ in there)
+            both = tuple(first.joints[i] for i, _ in there)
             said = f"{first.name} and {second.name} share {len(there)} joints; these are compared"
-            return _only(a, [i for i, _ in there], names), _only(b, [j for _, j in there], names), True, said
+            return _only(a, [i for i, _ in there], both), _only(b, [j for _, j in there], both), True, said
     names = [clip.skeleton.name if clip.skeleton is not None else f"{n} joints" for clip, n in zip((a, b), count, strict=True)]
     return a, b, False, f"different joints ({names[0]}, {names[1]}): compared as different points, which needs longer takes"
 

@@ -184,7 +184,7 @@ def _of_file(name: str, path: Path, fps: float | None, person: str, how: dict[st
         return _noted(_of_clips(name, path, [_single(path, list(clips))], options), options, FOLLOWED[person])
     everyone = list(read(path, fps=fps, person="everyone", **how))
     if any(clip.label is not None for clip in everyone) or "person" not in everyone[0].meta:  # a set of clips, not a recording
-        return _of_clips(name, path, [_single(path, everyone)], options)
+        return _noted(_of_clips(name, path, [_single(path, everyone)], options), options, "")
     largest = read(path, fps=fps, person="largest", **how)[0]  # this one has the frames without people, too
     tried = candidates(largest, everyone, options=options) if len(everyone) > 1 else []
     found = dataclasses.replace(_of_clips(name, path, [largest, *tried], options), everyone=tuple(everyone))

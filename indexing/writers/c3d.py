@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from indexing.opening import error
-from indexing.writers.markers import MARKERS, Markers, markers_of
+from indexing.writers.markers import MARKERS, FloatArray, Markers, markers_of
 
 if TYPE_CHECKING:
     from indexing.clip import Clip
@@ -49,7 +50,7 @@ def encode(clips: Sequence[Clip], path: Path, units: str | None = None) -> tuple
         "<BBHHHHHfHHf", header, 0, 2, KEY, count, 0, min(first, WORD), min(first + frames - 1, WORD), 0, -1.0, start, 0, spaced.rate
     )
     table = np.zeros((frames, count, 4), "<f4")
-    seen = ~np.isnan(spaced.places).any(axis=2)
+    seen: NDArray[np.bool_] = np.asarray(~np.isnan(spaced.places).any(axis=2))
     with np.errstate(over="ignore"):
         table[..., :3] = np.where(seen[..., None], spaced.places, 0.0)
     table[..., 3] = np.where(seen, 0.0, -1.0)
@@ -64,12 +65,11 @@ def _even(found: Markers, path: Path) -> tuple[Markers, int]:
     Raises:
         ValueError: times that are no such grid.
     """
-    # step by step: of rounded times the usual step is off a little, which adds up
-    steps = np.cumsum([0, *np.rint(np.diff(found.times) * found.rate).astype(np.int64).tolist()])
-    rate = float(steps[-1] / (found.times[-1] - found.times[0])) if len(steps) > 1 and steps[-1] > 0 else found.rate
-    rate = found.rate if abs(rate / found.rate - 1) < 1e-6 else rate
-    off = np.abs((found.times - found.times[0]) * rate - steps)
-    if (np.diff(steps) < 1).any() or off.max() > MARKERS.uneven:
+    rate, steps, off = _grid(found.times, found.rate)
+    if off.max() > MARKERS.uneven:  # frames left out of a faster recording, as of one of which every fifth is kept, or so
+        other = _grid(found.times, found.numbered)
+        rate, steps, off = other if other[2].max() <= MARKERS.uneven else (rate, steps, off)
+    if off.max() > MARKERS.uneven:
         at = int(off.argmax())
         what = f"times are uneven (frame {at} at {found.times[at]:.6g} s is {off[at]:.2g} frames off {rate:.6g} per second)"
         raise error(path, f"{what}, and C3D has a rate only", KEEP_TIMES)
@@ -80,9 +80,23 @@ def _even(found: Markers, path: Path) -> tuple[Markers, int]:
     if not 1 <= first <= WORD or abs((first - 1) / rate - float(found.times[0])) > MARKERS.uneven / rate:
         first = 1
         notes.append(f"it begins at {found.times[0]:.6g} s, which is 0 in the file")
+    absent = int(steps[-1]) + 1 - len(steps)
+    if absent:
+        notes.append(f"{absent} of {absent + len(steps)} frames are not there, and are written as if nothing was seen in them")
     places = np.full((int(steps[-1]) + 1, *found.places.shape[1:]), np.nan, found.places.dtype)
     places[steps] = found.places
     return replace(found, places=places, rate=rate, notes=tuple(notes)), first
+
+
+def _grid(times: FloatArray, about: float) -> tuple[float, NDArray[np.int64], FloatArray]:
+    """The even grid of about so many frames per second: its rate, the number of each frame, and how far that is off, in frames."""
+    # step by step: of rounded times the usual step is off a little, which adds up
+    steps = np.cumsum([0, *np.rint(np.diff(times) * about).astype(np.int64).tolist()])
+    rate = float(steps[-1] / (times[-1] - times[0])) if len(steps) > 1 and steps[-1] > 0 else about
+    rate = about if abs(rate / about - 1) < 1e-6 else rate
+    off = np.abs((times - times[0]) * rate - steps)
+    off[1:][np.diff(steps) < 1] = 1.0  # two frames of one number
+    return rate, steps, off
 
 
 def _parameters(found: Markers, first: int, path: Path) -> bytes:

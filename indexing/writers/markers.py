@@ -48,6 +48,7 @@ class Markers:
         times: ``(frames,)`` seconds.
         places: ``(frames, points, 3)``, NaN = not seen.
         rate: frames per second; of uneven times, the usual.
+        numbered: frames per second by which frames are numbered, where some are left out.
         units: of the places; up: as of a clip.
         notes: what a reader should know, a sentence each.
     """
@@ -56,6 +57,7 @@ class Markers:
     times: FloatArray
     places: FloatArray
     rate: float
+    numbered: float
     units: str
     up: str
     notes: tuple[str, ...] = field(default=())
@@ -88,11 +90,12 @@ def markers_of(clips: Sequence[Clip], path: Path, units: str | None = None) -> M
     if any(clip.confidence is not None for clip in clips):
         notes.append("confidences are left out, which the format has no place for")
     if any(clip.fps_assumed for clip in clips):
-        notes.append(Message("{fps:g} frames per second assumed; {arg:fps=} says otherwise", fps=float(first.fps or 30.0)))
+        notes.append(f"{float(first.fps or 30.0):g} frames per second are assumed, as nobody said how many")
     said, guessed = _units(clips, units)
     if guessed:
         notes.append(Message("the units are not known: by the size of the body, {units}; {arg:units} says otherwise", units=said))
-    return Markers(tuple(names), times, places, _rate(times, float(first.fps or 30.0)), said, first.up, tuple(notes))
+    told = float(first.fps or 30.0)
+    return Markers(tuple(names), times, places, _rate(times, told), told, said, first.up, tuple(notes))
 
 
 def _rate(times: FloatArray, told: float) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import pickle
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -38,7 +39,8 @@ def make(folder: Path) -> list[Seed]:
     folder.mkdir(parents=True, exist_ok=True)
     people = person(2)
     found = [*_json(folder, people), *_tables(folder, people), *_models(folder), *_sets(folder), *_points(folder), *_pairs(folder)]
-    found += [*_tracks(folder), *_settings(folder), *_pictures(folder)]
+    found += [*_arrays(folder, people), *_hdf5(folder, people), *_tracks(folder), *_settings(folder), *_pictures(folder)]
+    found += _labels(folder)
     return found
 
 
@@ -63,8 +65,12 @@ def written(path: Path, value: Any) -> Path:
 def keypoints(path: Path) -> Any:
     """Read as a command does, and look at every clip."""
     from indexing.readers import read
+    from indexing.readers.recording import NobodySeen
 
-    clips = read(path, person="largest")
+    try:
+        clips = read(path, person="largest")
+    except NobodySeen as nobody:  # an answer of its own kind, which commands word
+        raise ValueError(str(nobody)) from None
     for clip in clips:
         assert np.isfinite(clip.times).all()
         _ = clip.duration, clip.seen.any(), repr(clip)
@@ -137,6 +143,54 @@ def _tables(folder: Path, people: np.ndarray) -> list[Seed]:
         Seed(name, written(folder / name, "\n".join(",".join(map(str, row)) for row in rows) + "\n"), keypoints, _scan(folder))
         for name, rows in tables.items()
     ]
+
+
+def _arrays(folder: Path, people: np.ndarray) -> list[Seed]:
+    """Markers, bare arrays, a recording of FreeMoCap, and skeleton sets in pickles."""
+    rng = np.random.default_rng(4)
+    body = rng.normal(size=(FRAMES, 33, 3)).cumsum(axis=0)
+    names = [f"p{i}" for i in range(JOINTS)]
+    head = [
+        "PathFileType\t4\t(X/Y/Z)\ta.trc",
+        "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits",
+        f"30\t30\t{FRAMES}\t{JOINTS}\tmm",
+    ]
+    head += ["Frame#\tTime\t" + "\t\t\t".join(names), "\t\t" + "\t".join(f"X{i}\tY{i}\tZ{i}" for i in range(1, JOINTS + 1))]
+    rows = ["\t".join(map(str, [i + 1, i / 30, *frame.ravel()])) for i, frame in enumerate(people)]
+    written(folder / "markers.trc", "\n".join([*head, *rows]) + "\n")
+    np.save(folder / "body.npy", people[..., :2])
+    data = folder / "freemocap" / "output_data"
+    data.mkdir(parents=True)
+    np.save(data / "mediapipe_body_3d_xyz.npy", body)
+    written(folder / "recording.c3d", c3d())
+    one = {"label": 1, "img_shape": (480, 640), "keypoint": people[None, ..., :2], "keypoint_score": people[None, ..., 2]}
+    annotations = [{"frame_dir": f"clip{i}", "total_frames": FRAMES, **one} for i in range(2)]
+    for protocol in (0, 4):
+        skeletons = {"split": {"train": ["clip0"], "test": ["clip1"]}, "annotations": annotations}
+        written(folder / f"set{protocol}.pkl", pickle.dumps(skeletons, protocol))
+    files = ("markers.trc", "recording.c3d", "body.npy", "set0.pkl", "set4.pkl")
+    return [
+        *(Seed(name, folder / name, keypoints, _scan(folder)) for name in files),
+        Seed("freemocap", data, keypoints, _scan(folder)),
+    ]
+
+
+def _hdf5(folder: Path, people: np.ndarray) -> list[Seed]:
+    """DeepLabCut, SLEAP and movement, where h5py is there."""
+    try:
+        from tests.indexing.readers import tools
+    except ImportError:
+        return []
+    names = [f"p{i}" for i in range(JOINTS)]
+    both = {"a": people, "b": people + 1}
+    made = [
+        tools.deeplabcut(folder / "dlc_table.h5", both, names),
+        tools.deeplabcut(folder / "dlc_fixed.h5", people, names, "fixed"),
+        tools.sleap_analysis(folder / "sleap.h5", both, names),
+        tools.sleap_project(folder / "sleap.slp", both, names, {(1, "a"): people[1, :, :2]}, fps=30.0),
+        tools.movement(folder / "movement.nc", both, names),
+    ]
+    return [Seed(path.name, path, keypoints, _scan(folder), 2) for path in made]
 
 
 def _sets(folder: Path) -> list[Seed]:
@@ -366,6 +420,26 @@ def _settings(folder: Path) -> list[Seed]:
         Seed("truth.csv", folder / "truth.csv", partial(read_truth, recordings=["session.json"]), scan),
         Seed("Calib.toml", folder / "Calib.toml", read_calibration, ("sync", str(folder / "pose"), "--calibration", "{}")),
     ]
+
+
+def _labels(folder: Path) -> list[Seed]:
+    from indexing.labels import Label, write_labels
+
+    found = [Label(1, 3, "squat", "Ann", comment="c", score=1.5), Label(2, 4, "squat", "Ann"), Label(5, 5, "clap", tier="t")]
+    seeds = []
+    for name, suffix in {"boris": ".boris", "elan": ".eaf", "tsv": ".tsv", "label_studio": ".json", "via": ".json"}.items():
+        path = folder / f"labels_{name}{suffix}"
+        write_labels(path, found, recording="session.mp4", duration=60, fps=25, format=name)
+        seeds.append(Seed(path.name, path, labels))
+    return seeds
+
+
+def labels(path: Path) -> Any:
+    """Read labels of one hand, of a recording."""
+    from indexing.labels import choose_labels, open_labels, within
+
+    kept, notices = within(choose_labels(open_labels(path, recording="session.json", fps=25)).labels, 0.0, 10.0)
+    return [label.duration for label in kept], notices
 
 
 def _pictures(folder: Path) -> list[Seed]:

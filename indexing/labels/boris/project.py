@@ -16,7 +16,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from indexing.labels.gathering import Asked, Gathering, few, parse_seconds, text_of
+from indexing.labels.gathering import Gathering, Request, few, parse_seconds, text_of
 from indexing.labels.label import LabelFile
 from indexing.labels.media import Span, cut_up, of_recording
 from indexing.opening import count, error, listed, shown
@@ -24,11 +24,12 @@ from indexing.opening import count, error, listed, shown
 REMEDY = "save the project again in BORIS"
 MACHINE = "dyntorch:"  # how the description of an observation begins that a program wrote
 UNMODIFIED = ("", "None")
+NUMBERED = re.compile(r" \(\d+\)$")
 SCORE = re.compile(r"score (?P<score>-?\d[\d.e+-]*)(?:; (?P<comment>.*))?", re.DOTALL)
 
 
 @dataclass(frozen=True)
-class Event:
+class Entry:
     """An entry of an observation.
 
     Args:
@@ -41,7 +42,7 @@ class Event:
 
 
 @dataclass(frozen=True)
-class Stretch:
+class Interval:
     """A point event, or a START with its STOP, on the clock of the observation."""
 
     start: float
@@ -50,7 +51,7 @@ class Stretch:
     comment: str
 
 
-def read(data: Mapping[str, Any], asked: Asked) -> LabelFile:
+def read(data: Mapping[str, Any], asked: Request) -> LabelFile:
     """Read a project.
 
     Raises:
@@ -58,16 +59,17 @@ def read(data: Mapping[str, Any], asked: Asked) -> LabelFile:
     """
     out = Gathering(asked, "boris")
     observations = {str(name): _object(asked, value, f"observation {name!r}") for name, value in data["observations"].items()}
+    called = _names(observations)
     for name, observation in observations.items():
-        out.observations.setdefault(name)
-        if text_of(observation.get("description")).startswith(MACHINE):
-            out.machine.setdefault(name)
+        out.observations.setdefault(called[name])
+        if _by_machine(observation):
+            out.machine.setdefault(called[name])
         for media in files_of(observation):
             out.media.setdefault(media)
     for subject in _object(asked, data.get("subjects_conf") or {}, "subjects_conf").values():
         if isinstance(subject, dict) and text_of(subject.get("name")):
             out.subjects.setdefault(text_of(subject["name"]))
-    wanted = observations if asked.observation is None else {asked.observation: observations.get(asked.observation, {})}
+    wanted = {name: one for name, one in observations.items() if asked.observation in (None, called[name])}
     mine = of_recording((media for one in wanted.values() for media in files_of(one)), asked)
     types = ethogram(asked, data.get("behaviors_conf"))
     left: Counter[str] = Counter()
@@ -75,7 +77,7 @@ def read(data: Mapping[str, Any], asked: Asked) -> LabelFile:
     for name, observation in wanted.items():
         media_files = set(files_of(observation))
         if mine is None or mine & media_files or not (media_files or with_media):
-            _observation(out, name, observation, types, mine)
+            _observation(out, (name, called[name]), observation, types, mine)
         else:
             left[name] += len(_list(asked, observation.get("events"), f"observation {name!r}, events"))
     left += Counter()  # drops those without events
@@ -85,7 +87,21 @@ def read(data: Mapping[str, Any], asked: Asked) -> LabelFile:
     return out.finish()
 
 
-def ethogram(asked: Asked, conf: Any) -> dict[str, bool]:
+def _by_machine(observation: Mapping[str, Any]) -> bool:
+    return text_of(observation.get("description")).startswith(MACHINE)
+
+
+def _names(observations: Mapping[str, Any]) -> dict[str, str]:
+    """What each observation is called here: of those that a program wrote, the further ones as the first."""
+    found = {}
+    for name, observation in observations.items():
+        first = NUMBERED.sub("", name)
+        same = first in observations and _by_machine(observations[first]) and _by_machine(observation)
+        found[name] = first if same else name
+    return found
+
+
+def ethogram(asked: Request, conf: Any) -> dict[str, bool]:
     """Behaviours, and whether each is a state, which lasts."""
     found = {}
     for key, behaviour in _object(asked, conf or {}, "behaviors_conf").items():
@@ -96,9 +112,10 @@ def ethogram(asked: Asked, conf: Any) -> dict[str, bool]:
 
 # ---- one observation -----------------------------------------------------------------------------------------------------
 def _observation(
-    out: Gathering, name: str, observation: Mapping[str, Any], types: Mapping[str, bool], mine: set[str] | None
+    out: Gathering, names: tuple[str, str], observation: Mapping[str, Any], types: Mapping[str, bool], mine: set[str] | None
 ) -> None:
     """The labels of an observation, on the clock of the recording, or each on the clock of the file that is played then."""
+    name, called = names
     where = f"observation {name!r}"
     events = _events(out, observation, where)
     stretches = list(paired(out, events, types, where))
@@ -112,7 +129,7 @@ def _observation(
         start, end = stretch.start - offset, stretch.end - offset
         pieces = cut_up(start, end, spans) if spans else [("", start, end)]
         cut += len(pieces) > 1
-        comment, score = (stretch.comment, None) if name not in out.machine else scored(stretch.comment)
+        comment, score = (stretch.comment, None) if called not in out.machine else scored(stretch.comment)
         for media, first, last in pieces:
             if mine is None or media in mine or not spans:
                 out.add(
@@ -122,7 +139,7 @@ def _observation(
                     f"{where}, event {number + 1}",
                     subject=subject,
                     media=media,
-                    observation=name,
+                    observation=called,
                     comment=comment,
                     score=score,
                     modifiers=() if not modifiers.strip("|") else tuple(modifiers.split("|")),
@@ -133,9 +150,9 @@ def _observation(
         out.note(f"{where} names no media file; its clock is taken for that of {out.asked.recording}")
 
 
-def _events(out: Gathering, observation: Mapping[str, Any], where: str) -> list[Event]:
+def _events(out: Gathering, observation: Mapping[str, Any], where: str) -> list[Entry]:
     """The entries with a time, in order of it."""
-    found: list[Event] = []
+    found: list[Entry] = []
     timeless = 0
     pictures = observation.get("type") == "IMAGES"
     for number, entry in enumerate(_list(out.asked, observation.get("events"), f"{where}, events"), start=1):
@@ -150,27 +167,27 @@ def _events(out: Gathering, observation: Mapping[str, Any], where: str) -> list[
         if bad is not None:
             raise error(out.asked.path, f"{here}: {shown(bad)} is no name", REMEDY)
         subject, code, modifiers, comment = (text_of(value) for value in names)
-        found.append(Event(out.seconds(entry[0], here, "time"), (subject, code, modifiers), comment))
+        found.append(Entry(out.seconds(entry[0], here, "time"), (subject, code, modifiers), comment))
     if timeless:
         out.note(f"{where}: {count(timeless, 'event')} left out: of pictures without a time")
     found.sort(key=lambda event: event.time)
     return found
 
 
-def paired(out: Gathering, events: Sequence[Event], types: Mapping[str, bool], where: str) -> Iterator[Stretch]:
+def paired(out: Gathering, events: Sequence[Entry], types: Mapping[str, bool], where: str) -> Iterator[Interval]:
     """Point events as they are, and each START with its STOP."""
-    begun: dict[tuple[str, str, str], Event] = {}
+    begun: dict[tuple[str, str, str], Entry] = {}
     unknown: Counter[str] = Counter()
-    found: list[Stretch] = []
+    found: list[Interval] = []
     for event in events:
         lasts = types.get(event.key[1])
         if lasts is None:
             unknown[event.key[1]] += 1
         elif not lasts:
-            found.append(Stretch(event.time, event.time, event.key, event.comment))
+            found.append(Interval(event.time, event.time, event.key, event.comment))
         elif event.key in begun:
             start = begun.pop(event.key)
-            found.append(Stretch(start.time, event.time, event.key, joined(start.comment, event.comment)))
+            found.append(Interval(start.time, event.time, event.key, joined(start.comment, event.comment)))
         else:
             begun[event.key] = event
     found += _asked_at_stop(out, begun, where)
@@ -184,7 +201,7 @@ def paired(out: Gathering, events: Sequence[Event], types: Mapping[str, bool], w
     yield from sorted(found, key=lambda stretch: stretch.start)
 
 
-def _asked_at_stop(out: Gathering, begun: dict[tuple[str, str, str], Event], where: str) -> list[Stretch]:
+def _asked_at_stop(out: Gathering, begun: dict[tuple[str, str, str], Entry], where: str) -> list[Interval]:
     """States whose modifiers were asked for at STOP only: the START has none.  They are taken out of ``begun``."""
     found = []
     for event in sorted(begun.values(), key=lambda event: event.time):
@@ -198,7 +215,7 @@ def _asked_at_stop(out: Gathering, begun: dict[tuple[str, str, str], Event], whe
             if later:
                 stop = min(later, key=lambda other: other.time)
                 del begun[event.key], begun[stop.key]
-                found.append(Stretch(event.time, stop.time, stop.key, joined(event.comment, stop.comment)))
+                found.append(Interval(event.time, stop.time, stop.key, joined(event.comment, stop.comment)))
     if found:
         out.note(f"{where}: {count(len(found), 'state')} without modifiers at START paired with the STOP that has them")
     return found
@@ -287,13 +304,13 @@ def files_of(observation: Mapping[str, Any]) -> list[str]:
     return [media for files in _players(observation).values() for media in files]
 
 
-def _object(asked: Asked, value: Any, where: str) -> dict[str, Any]:
+def _object(asked: Request, value: Any, where: str) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise error(asked.path, f"{where} is {shown(value)}, not an object", REMEDY)
     return value
 
 
-def _list(asked: Asked, value: Any, where: str) -> list[Any]:
+def _list(asked: Request, value: Any, where: str) -> list[Any]:
     if value is None:
         return []
     if not isinstance(value, list):

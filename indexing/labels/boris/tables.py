@@ -12,10 +12,10 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from indexing.labels.boris.project import Event, Stretch, joined
-from indexing.labels.gathering import Asked, Gathering, few, parse_seconds
+from indexing.labels.boris.project import MACHINE, Entry, Interval, joined, scored
+from indexing.labels.gathering import Gathering, Request, few, parse_seconds
 from indexing.labels.label import LabelFile
-from indexing.labels.media import Span, cut_up, of_recording
+from indexing.labels.media import Span, base_name, cut_up, of_recording
 from indexing.opening import Row, count, error, listed, shown
 
 COLUMNS = {
@@ -30,12 +30,13 @@ COLUMNS = {
     "source": ("source",),
     "lengths": ("media duration (s)",),
     "offset": ("time offset (s)",),
+    "description": ("description",),
     "comment": ("comment", "comment start"),
     "comment_stop": ("comment stop",),
 }
 NOTHING = ("", "NA", "Not found", "nan")
 NOBODY = "No focal subject"
-PLAYER = re.compile(r"\s*player #(\d+)\s*:", re.IGNORECASE)
+PLAYER = re.compile(r"[|\s]*player #\d+\s*:", re.IGNORECASE)
 REMEDY = "export the events again from BORIS, or give its project (.boris)"
 
 
@@ -46,20 +47,22 @@ class Sitting:
     Args:
         files: of its first player, in order, as far as the table says; beside: those of other players.
         lengths: of them, in seconds; as many as files where they are known.
+        machine: whether a program wrote it.
     """
 
     name: str
     offset: float = 0.0
+    machine: bool = False
     files: dict[str, None] = field(default_factory=dict)
     beside: list[str] = field(default_factory=list)
     lengths: list[float] = field(default_factory=list)
-    stretches: list[tuple[Stretch, str]] = field(default_factory=list)
-    begun: dict[tuple[str, str, str], tuple[Event, str]] = field(default_factory=dict)
+    stretches: list[tuple[Interval, str]] = field(default_factory=list)
+    begun: dict[tuple[str, str, str], tuple[Entry, str]] = field(default_factory=dict)
     timeless: int = 0
     stray: list[str] = field(default_factory=list)
 
 
-def read(rows: list[Row], asked: Asked) -> LabelFile:
+def read(rows: list[Row], asked: Request) -> LabelFile:
     """Read an exported table.
 
     Raises:
@@ -75,18 +78,21 @@ def read(rows: list[Row], asked: Asked) -> LabelFile:
         if name not in sittings:
             offset = row.get("offset") or above.get("time offset (s)", "")
             sittings[name] = _sitting(out, name, offset, row, f"line {line}")
+            sittings[name].machine = (row.get("description") or above.get("description", "")).startswith(MACHINE)
         _row(out, sittings[name], row, [cells[i].strip() for i in modifiers if i < len(cells)], f"line {line}")
     for sitting in sittings.values():
         out.media.update(dict.fromkeys([*sitting.files, *sitting.beside]))
         if sitting.name:
             out.observations.setdefault(sitting.name)
+        if sitting.machine:
+            out.machine.setdefault(sitting.name)
     mine = of_recording(out.media, asked)
     for sitting in sittings.values():
         _place(out, sitting, mine)
     return out.finish()
 
 
-def _header(asked: Asked, rows: Sequence[Row]) -> tuple[int, dict[str, int], list[int]]:
+def _header(asked: Request, rows: Sequence[Row]) -> tuple[int, dict[str, int], list[int]]:
     """Which row names the columns, where each column stands, and those of modifiers."""
     for at, (_, cells) in enumerate(rows):
         names = [cell.strip().lower() for cell in cells]
@@ -102,15 +108,16 @@ def _header(asked: Asked, rows: Sequence[Row]) -> tuple[int, dict[str, int], lis
 def _sitting(out: Gathering, name: str, offset: str, row: dict[str, str], where: str) -> Sitting:
     """An observation with the files that it plays, where its rows say so."""
     sitting = Sitting(name, 0.0 if offset in NOTHING else out.seconds(offset, where, "column 'Time offset (s)':"))
-    source, lengths = row.get("source", ""), row.get("lengths", "")
-    if not PLAYER.match(source):
-        return sitting
-    padded = [*lengths.split("|"), *[""] * source.count("|")]
-    for number, (player, durations) in enumerate(zip(source.split("|"), padded, strict=False)):
-        files = [one.strip() for one in PLAYER.sub("", player, count=1).split(";") if one.strip()]
+    source, lengths = row.get("source", ""), row.get("lengths", "").split("|")
+    players = PLAYER.split(source)[1:]
+    if not players:  # before BORIS named the player, where there was one
+        own = base_name(row.get("media", ""))
+        players = [source] if own and own in map(base_name, source.split(";")) else []
+    for number, player in enumerate(players):
+        files = [one.strip() for one in player.split(";") if one.strip()]
         if number == 0:
             sitting.files.update(dict.fromkeys(files))
-            sitting.lengths = [length for length in map(parse_seconds, durations.split(";")) if length > 0]
+            sitting.lengths = [length for length in map(parse_seconds, lengths[0].split(";")) if length > 0]
         else:
             sitting.beside += files
     return sitting
@@ -119,7 +126,7 @@ def _sitting(out: Gathering, name: str, offset: str, row: dict[str, str], where:
 def _row(out: Gathering, sitting: Sitting, row: dict[str, str], modifiers: list[str], where: str) -> None:
     """A label, or what begins or ends one."""
     media = "" if row.get("media", "") in NOTHING else row["media"]
-    media = next((name for name in sitting.files if name == media or re.split(r"[\\/]", name)[-1] == media), media)
+    media = next((name for name in sitting.files if name == media or base_name(name) == media), media)
     if media:
         sitting.files.setdefault(media)
     subject = "" if row.get("subject", "") == NOBODY else row.get("subject", "")
@@ -132,16 +139,16 @@ def _row(out: Gathering, sitting: Sitting, row: dict[str, str], modifiers: list[
     comment = "" if row.get("comment", "") in NOTHING else row.get("comment", "")
     if stops:
         stop = "" if row.get("comment_stop", "") in NOTHING else row["comment_stop"]
-        sitting.stretches.append((Stretch(start, stops[0], key, joined(comment, stop)), media))
+        sitting.stretches.append((Interval(start, stops[0], key, joined(comment, stop)), media))
         return
-    _event(out, sitting, Event(start, key, comment), row["kind"].upper(), media, where)
+    _event(out, sitting, Entry(start, key, comment), row["kind"].upper(), media, where)
 
 
-def _event(out: Gathering, sitting: Sitting, event: Event, kind: str, media: str, where: str) -> None:
+def _event(out: Gathering, sitting: Sitting, event: Entry, kind: str, media: str, where: str) -> None:
     """A row of tabular events."""
     of = f"{event.key[1]} at {event.time:.6g} s"
     if kind == "POINT":
-        sitting.stretches.append((Stretch(event.time, event.time, event.key, event.comment), media))
+        sitting.stretches.append((Interval(event.time, event.time, event.key, event.comment), media))
     elif kind == "START":
         if event.key in sitting.begun:
             sitting.stray.append(f"{event.key[1]} at {sitting.begun[event.key][0].time:.6g} s")
@@ -149,7 +156,7 @@ def _event(out: Gathering, sitting: Sitting, event: Event, kind: str, media: str
     elif kind == "STOP":
         if event.key in sitting.begun:
             begin, first = sitting.begun.pop(event.key)
-            sitting.stretches.append((Stretch(begin.time, event.time, event.key, joined(begin.comment, event.comment)), first))
+            sitting.stretches.append((Interval(begin.time, event.time, event.key, joined(begin.comment, event.comment)), first))
         else:
             sitting.stray.append(of)
     else:
@@ -179,6 +186,7 @@ def _place(out: Gathering, sitting: Sitting, mine: set[str] | None) -> None:
         for name, first, last in pieces:
             if mine is None or not name or name in mine:
                 subject, code, modifiers = stretch.key
+                comment, score = scored(stretch.comment) if sitting.machine else (stretch.comment, None)
                 out.add(
                     code,
                     round(first, 6),
@@ -187,7 +195,8 @@ def _place(out: Gathering, sitting: Sitting, mine: set[str] | None) -> None:
                     subject=subject,
                     media=name,
                     observation=sitting.name,
-                    comment=stretch.comment,
+                    comment=comment,
+                    score=score,
                     modifiers=tuple(modifiers.split("|")) if modifiers else (),
                 )
     if lost:

@@ -19,7 +19,7 @@ from typing import Any
 
 from indexing.files import write_text
 from indexing.labels.boris.project import MACHINE, ethogram, files_of
-from indexing.labels.gathering import Asked, text_of
+from indexing.labels.gathering import Request, text_of
 from indexing.labels.label import Label, in_order
 from indexing.labels.media import base_name, of_recording
 from indexing.labels.target import Target
@@ -108,13 +108,13 @@ def _checked(path: Path, data: Any) -> dict[str, Any]:
 def _behaviours(draft: Draft, labels: Sequence[Label]) -> None:
     """Every label's behaviour, into the ethogram where it is not there; a state where some label lasts."""
     conf = draft.project["behaviors_conf"]
-    known = ethogram(Asked(draft.target.into or draft.target.path), conf)
+    known = ethogram(Request(draft.target.into or draft.target.path), conf)
     keys = {text_of(one.get("key")).lower() for one in conf.values()}
-    last: dict[str, bool] = {}
+    by_name: dict[str, list[Label]] = {}
     for label in sorted(labels, key=in_order):
-        last[label.label] = last.get(label.label, False) or _milli(label.end) > _milli(label.start)
-    for name, lasts in last.items():
-        code = name
+        by_name.setdefault(label.label, []).append(label)
+    for name, own in by_name.items():
+        code, lasts = name, any(_milli(label.end) > _milli(label.start) for label in own)
         while known.get(code) is False and lasts:  # there as a point event: BORIS cannot tell how long it lasts
             code += " (state)"
         if code != name:
@@ -131,7 +131,7 @@ def _behaviours(draft: Draft, labels: Sequence[Label]) -> None:
                 "description": "",
                 "color": "",
                 "category": "",
-                "modifiers": _modifier_sets([label for label in labels if label.label == name]),
+                "modifiers": _modifier_sets(own),
                 "excluded": "",
                 "coding map": "",
             }
@@ -208,7 +208,7 @@ def _machine(observation: Any) -> bool:
 
 def _there(target: Target, known: Mapping[str, Any], media: str) -> str:
     """How the project calls a recording."""
-    asked = Asked(target.into or target.path, media, target.name)
+    asked = Request(target.into or target.path, media, target.name)
     if target.name is not None:
         return next(iter(of_recording(known, asked) or {media}))
     try:

@@ -14,14 +14,14 @@ from typing import Any
 from xml.etree.ElementTree import Element
 
 from indexing.labels.elan.times import MACHINE, REMEDY, Annotation, Tier, place, take_over
-from indexing.labels.gathering import Asked, Gathering, whole
+from indexing.labels.gathering import Gathering, Request, whole
 from indexing.labels.label import LabelFile
 from indexing.labels.markup import Placed, parse_xml
 from indexing.labels.media import base_name, of_recording
 from indexing.opening import clipped, error, listed, read_bytes, repeated, shown
 
 
-def read(_: Any, asked: Asked) -> LabelFile:
+def read(_: Any, asked: Request) -> LabelFile:
     """Read an ELAN file.
 
     Raises:
@@ -29,7 +29,7 @@ def read(_: Any, asked: Asked) -> LabelFile:
             time is none.
     """
     out = Gathering(asked, "elan")
-    parts = Parts(asked)
+    parts = TierParts(asked)
     root, _ = parse_xml(asked.path, read_bytes(asked.path), parts.take, asked.options)
     if root.tag != "ANNOTATION_DOCUMENT":
         raise error(asked.path, f"is XML, but no ELAN file (its root is {clipped(root.tag, 40)})", "export an .eaf from ELAN")
@@ -59,13 +59,15 @@ def read(_: Any, asked: Asked) -> LabelFile:
 
 
 # ---- what the file has ---------------------------------------------------------------------------------------------------
-class Parts:
-    """Time slots and annotations, taken out of the tree while it is read: of a million, they take a third of the memory."""
+class TierParts:
+    """Time slots and annotations, taken out of the tree while it is read: elements of a million would take gigabytes.
 
-    def __init__(self, asked: Asked) -> None:
+    ``slots`` are the milliseconds of each time slot, None where it has none, in order of the file.
+    """
+
+    def __init__(self, asked: Request) -> None:
         self.asked = asked
         self.slots: dict[str, float | None] = {}
-        """Milliseconds of each time slot, None where it has none; in order of the file."""
         self.annotations: dict[Element, list[Annotation]] = {}
 
     def take(self, placed: Placed, parent: Element) -> bool:
@@ -105,7 +107,7 @@ def constraints(root: Element) -> dict[str, str]:
     return {kind.get("LINGUISTIC_TYPE_ID", ""): kind.get("CONSTRAINTS", "") for kind in root.iterfind("LINGUISTIC_TYPE")}
 
 
-def _tiers(asked: Asked, root: Element, parts: Parts) -> list[Tier]:
+def _tiers(asked: Request, root: Element, parts: TierParts) -> list[Tier]:
     """All tiers; their names and the ids of their annotations differ, their parents are there."""
     values = vocabulary(root)
     found = []
@@ -132,7 +134,7 @@ def tier_of(element: Element) -> Tier:
     return Tier(name, kind, element.get("PARTICIPANT", "").strip(), parent, annotator)
 
 
-def _check_parents(asked: Asked, tiers: Sequence[Tier]) -> None:
+def _check_parents(asked: Request, tiers: Sequence[Tier]) -> None:
     """Parents are there, and no tier is above itself."""
     above = {tier.name: tier.parent for tier in tiers}
     fine = {""}
@@ -148,7 +150,7 @@ def _check_parents(asked: Asked, tiers: Sequence[Tier]) -> None:
         fine.update(seen)
 
 
-def _annotation(asked: Asked, tier: str, element: Element) -> Annotation:
+def _annotation(asked: Request, tier: str, element: Element) -> Annotation:
     name, entry = element.get("ANNOTATION_ID", ""), element.get("CVE_REF", "")
     value = element.find("ANNOTATION_VALUE")
     text = (value.text or "") if value is not None else ""

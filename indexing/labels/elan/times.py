@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from indexing.labels.gathering import Asked, Gathering
+from indexing.labels.gathering import Gathering, Request
 from indexing.opening import count, error, listed, shown
 
 REMEDY = "open it in ELAN, mend it and save it again"
@@ -118,7 +118,7 @@ def _between_neighbours(known: dict[str, float], order: Sequence[str]) -> None:
         last = at
 
 
-def take_over(asked: Asked, tiers: Sequence[Tier], asks: dict[str, str]) -> None:
+def take_over(asked: Request, tiers: Sequence[Tier], asks: dict[str, str]) -> None:
     """Give annotations of symbolic tiers the time of their parent, or their share of it."""
     by_name = {one.name: one for tier in tiers for one in tier.annotations}
     home = {one.name: tier for tier in tiers for one in tier.annotations}
@@ -139,7 +139,7 @@ def take_over(asked: Asked, tiers: Sequence[Tier], asks: dict[str, str]) -> None
 
 
 def _upwards(
-    asked: Asked, one: Annotation, by_name: dict[str, Annotation], home: dict[str, Tier], settled: set[str]
+    asked: Request, one: Annotation, by_name: dict[str, Annotation], home: dict[str, Tier], settled: set[str]
 ) -> Iterator[Annotation]:
     """An annotation and those above it, up to one whose time is settled."""
     seen: set[str] = set()
@@ -154,7 +154,7 @@ def _upwards(
         one = by_name[one.parent]
 
 
-def _shares(asked: Asked, tier: Tier) -> dict[str, tuple[int, int]]:
+def _shares(asked: Request, tier: Tier) -> dict[str, tuple[int, int]]:
     """Which part of its parent each annotation of a subdividing tier is, of how many."""
     families: dict[str, list[Annotation]] = {}
     for one in tier.annotations:

@@ -7,6 +7,7 @@ have labels that overlap others of the same person (``dyntorch@Ann (2)``).
 from __future__ import annotations
 
 import datetime
+import os
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ from xml.sax.saxutils import escape, quoteattr
 from indexing.files import write_bytes
 from indexing.labels.elan.reading import media_of, tier_of
 from indexing.labels.elan.times import MACHINE, REMEDY
-from indexing.labels.gathering import Asked
+from indexing.labels.gathering import Request
 from indexing.labels.label import Label, in_order, spots
 from indexing.labels.markup import Placed, parse_xml
 from indexing.labels.media import base_name, of_recording
@@ -63,7 +64,7 @@ class Edit:
 
 
 @dataclass(frozen=True)
-class Row:
+class TierRow:
     """Annotations that become one tier: begin and end in milliseconds on the clock of the document."""
 
     name: str
@@ -152,7 +153,7 @@ def _empty(target: Target, media: str) -> bytes:
     """A document without tiers."""
     held = ""
     if media:
-        whole = Path(media).expanduser()
+        whole = Path(os.path.expanduser(media))
         address = whole.absolute().as_uri() if "://" not in media else media
         kind = MIME.get(whole.suffix.lower(), "unknown")
         held = f"{LINE}    <MEDIA_DESCRIPTOR MEDIA_URL={quoteattr(address)} MIME_TYPE={quoteattr(kind)}"
@@ -164,13 +165,13 @@ def _empty(target: Target, media: str) -> bytes:
 def _origin(document: Document, target: Target, media: str) -> float:
     """What the recording's clock shows when that of the document shows 0, in milliseconds."""
     known = media_of(document.root)
-    mine = of_recording([name for name, *_ in known], Asked(document.path, media or None, target.name))
+    mine = of_recording([name for name, *_ in known], Request(document.path, media or None, target.name))
     return next((origin for name, _, origin in known if mine is None or name in mine), 0.0)
 
 
-def _rows(labels: Sequence[Label], target: Target, origin: float) -> tuple[list[Row], list[str]]:
+def _rows(labels: Sequence[Label], target: Target, origin: float) -> tuple[list[TierRow], list[str]]:
     """The tiers to write: one a person, more where labels overlap."""
-    rows: dict[tuple[str, str], list[Row]] = {}
+    rows: dict[tuple[str, str], list[TierRow]] = {}
     early = []
     for label in sorted(labels, key=in_order):
         begin, end = (round(1000 * time - origin) for time in (label.start, label.end))
@@ -184,17 +185,17 @@ def _rows(labels: Sequence[Label], target: Target, origin: float) -> tuple[list[
         if row is None:
             name = base + f"@{label.subject}" * bool(label.subject)
             name += f" ({len(group) + 1})" * (bool(group) or NUMBERED.search(name) is not None)
-            row = Row(name, label.subject, [])
+            row = TierRow(name, label.subject, [])
             group.append(row)
         row.annotations.append((begin, end, label.label))
     if not labels:  # nothing was found: that is what the tier says
-        rows[target.tier, ""] = [Row(target.tier, "", [])]
+        rows[target.tier, ""] = [TierRow(target.tier, "", [])]
     said = f"{count(len(early), 'label')} left out: before the time at which the ELAN file begins ({spots(early)})"
     return [row for group in rows.values() for row in group], [said] * bool(early)
 
 
 # ---- edits ---------------------------------------------------------------------------------------------------------------
-def _edits(document: Document, rows: Sequence[Row], bases: set[str]) -> list[Edit]:
+def _edits(document: Document, rows: Sequence[TierRow], bases: set[str]) -> list[Edit]:
     """Take out the tiers of these names that dyntorch wrote, with their time slots, and put in the new ones."""
     if document.order is None:
         raise error(document.path, "is no sound ELAN file: it has no TIME_ORDER", REMEDY)
@@ -233,7 +234,7 @@ def _annotation(name: str, begin: str, end: str, value: str) -> str:
     )
 
 
-def _check_free(document: Document, old: Sequence[Placed], rows: Sequence[Row]) -> None:
+def _check_free(document: Document, old: Sequence[Placed], rows: Sequence[TierRow]) -> None:
     """No tier of a person has the name of a new one, or hangs on an old one."""
     gone = {part.element.get("TIER_ID") for part in old}
     for part in document.parts("TIER"):

@@ -38,7 +38,20 @@ def test_fit_and_scan_files(films, tmp_path, capsys):
     both = written(tmp_path / "both.mkv", np.concatenate([films["jumping_jack", 2], films["squat", 2]]))
     model = tmp_path / "moves.safetensors"
     assert main(["index", "fit", f"squat={squat}@0.1-2.5", f"jumping_jack={jack}", "-o", str(model)]) == 0
-    assert "learned from pixels, at 15 frames per second" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "learned from pixels, at 15 frames per second" in said and "count both" not in said
+    assert "squat.mkv@0.1-2.5: the recording runs from 0 to 2.2 s" in " ".join(said.split())
+    ranges = [f"a={squat}@0.1-99", f"b={squat}@0.5-", f"c={jack}"]
+    assert main(["index", "fit", *ranges, "-o", str(tmp_path / "other.safetensors")]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "squat.mkv@0.1-99: the recording runs from 0 to" in said and "squat.mkv: 0.5 to 99 s count both as a and as b" in said
+    for words, message in (
+        ([f"a={squat}", f"b={squat}"], "squat.mkv: is given as a and as b; correct a label, or give the seconds of each"),
+        ([f"a={squat}@50-99", f"b={jack}"], "no frame between 50 and 99 s"),
+        ([f"a={squat}@4-2", f"b={jack}"], "it ends at 2 s, but starts at 4 s"),
+    ):
+        assert main(["index", "fit", *words, "-o", str(tmp_path / "none.safetensors")]) == 2
+        assert message in capsys.readouterr().err and not (tmp_path / "none.safetensors").exists()
     assert main(["index", "scan", str(both), "-m", str(model), "--report", str(tmp_path / "out")]) == 0
     with (tmp_path / "out" / "events.csv").open() as file:
         events = list(csv.DictReader(file))

@@ -14,6 +14,8 @@ import pytest
 from indexing import ActionIndexer, Clip, ClipSet
 from indexing.actors import Person, detect, stream
 from indexing.cli import main
+from indexing.cli.inputs import Example, Reading
+from indexing.cli.labels import Labelling, film_examples
 from indexing.labels import Label, open_labels, write_labels
 from tests.indexing.cli.test_commands import coco
 
@@ -325,3 +327,27 @@ def test_evaluate_refuses_what_makes_no_sense(refuse, data: Path, tmp_path: Path
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "confusion.csv").write_bytes((data / "session.csv").read_bytes())
     refuse("index evaluate out/confusion.csv --labels @/session.csv --report out", "confusion.csv", "is an input")
+
+
+def test_a_name_within_a_name_is_the_recording_only_where_none_is_called_so(run, refuse, data: Path, tmp_path: Path) -> None:
+    for name in ("session_2.json", "sessionDLC_resnet.json"):
+        (tmp_path / name).write_bytes((data / "later.json").read_bytes())
+    refuse(
+        "index fit @/session.json session_2.json -o m.st --labels @/session.csv", "session_2.json", "none of the files of labels"
+    )
+    code, out, _ = run("index fit sessionDLC_resnet.json @/later.json --labels @/both.csv -o m.st")
+    assert code == 0 and np.bincount(ActionIndexer.load("m.st").model_.labels).tolist() == [4, 4, 4] and "left out" in out
+    table(tmp_path / "other.csv", "kick,0.7,2.7,garden.mp4", "wave,3.5,6.3,garden.mp4", head="label,start,end,file")
+    assert run("index fit @/session.json --labels other.csv --media garden.mp4 -o m.st")[0] == 0
+
+
+def test_labels_of_videos_are_examples_with_their_seconds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    table(tmp_path / "a.csv", "kick,1,2.5,a.mp4", "clap,1,1,a.mp4", "wave,4,6,b.mp4", head="label,start,end,file")
+    given = [Example(Path("a.mp4")), Example(Path("c.mp4"), "bow", None, 2.0)]
+    found, notes = film_examples(given, Labelling(labels=(Path("a.csv"),)), Reading())
+    assert found == [given[1], Example(Path("a.mp4"), "kick", 1.0, 2.5)]
+    assert any("of a moment" in note for note in notes) and any("of other recordings (b.mp4)" in note for note in notes)
+    table(tmp_path / "none.csv", "clap,1,1")
+    with pytest.raises(ValueError, match=r"none\.csv: nothing is marked there; mark actions"):
+        film_examples(given, Labelling(labels=(Path("none.csv"),)), Reading())

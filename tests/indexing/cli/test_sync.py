@@ -41,7 +41,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name, clip in zip(NAMES, short(), strict=True):
         write_openpose(folder / "pose" / f"{name}_json", [clip])
     ClipSet([short()[1].replace(label=None, meta={})]).save(folder / "cam02.npz")
-    np.save(folder / "bare.npy", short()[1].joints)
+    np.save(folder / "bare.npy", short()[1].joints[0])
     write_openpose(folder / "empty", [clip.replace(joints=np.full(clip.joints.shape, np.nan), confidence=None)])
     return folder
 

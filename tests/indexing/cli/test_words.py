@@ -22,8 +22,8 @@ from indexing.cli import main
         ("demo --people", "--people: its value is missing; see dyntorch demo --help"),
         (
             "index scan x -m m --format openpos",
-            "--format openpos: did you mean openpose? choose from clipset, coco, deeplabcut, mediapipe, mmpose, openpose, sleap, "
-            "ultralytics; see dyntorch index scan --help",
+            "--format openpos: did you mean openpose? choose from clipset, coco, deeplabcut, freemocap, mediapipe, mmpose, mocap, "
+            "movement, npy, openpose, pyskl, sleap, trc, ultralytics; see dyntorch index scan --help",
         ),
         (
             "index scan x -m m --person zz",
@@ -84,4 +84,5 @@ def test_a_file_of_no_known_format_is_answered_without_python(tmp_path: Path, ca
     (tmp_path / "x.json").write_text('{"some": "thing"}')
     assert main(["index", "fit", f"a={tmp_path / 'x.json'}", "b=take", "-o", f"{tmp_path / 'm'}"]) == 2
     said = capsys.readouterr().err
-    assert "OpenPose, COCO, MediaPipe, DeepLabCut, MMPose, Ultralytics or SLEAP" in said and "indexing.readers" not in said
+    assert "OpenPose, COCO, AlphaPose, MediaPipe, DeepLabCut, MMPose, Ultralytics, SLEAP, FreeMoCap, OpenSim, movement or" in said
+    assert "indexing.readers" not in said

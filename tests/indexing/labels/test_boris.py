@@ -168,8 +168,12 @@ def test_detections_have_observations_of_their_own(tmp_path: Path) -> None:
     found = choose_labels(open_labels(path, recording="session.json"))
     assert {label.observation for label in found.labels} == {"one"}
     assert "3 labels left out: a program found them" in found.notices[-1]
-    mine = open_labels(path, observation="dyntorch session.mp4 (2)").labels
-    assert [(label.start, label.end, label.comment, label.score) for label in mine] == [(2.0, 4.0, "again", 1.0)]
+    mine = open_labels(path, observation="dyntorch session.mp4").labels  # both of them
+    assert [(label.start, label.end, label.comment, label.score) for label in mine] == [
+        (1.0, 3.0, "", 4.4),
+        (2.0, 4.0, "again", 1.0),
+        (7.0, 7.0, "", None),
+    ]
 
 
 def test_a_second_run_replaces_the_first(tmp_path: Path) -> None:
@@ -259,6 +263,14 @@ def test_tabular_events_below_their_observation(tmp_path: Path) -> None:
     assert found.format == "boris_tables"
     assert found.labels == (Label(3.3, 7.75, "squat", "Ann", comment="deep", **of), Label(5.0, 5.0, "clap", **of))
     assert "1 event left out: START without STOP, or the other way round (squat at 19 s)" in found.notices[0]
+
+
+@pytest.mark.parametrize("source", ["a.mp4;b.mp4", "player #1: a.mp4;b.mp4 player #2: c.mp4"])
+def test_other_ways_to_name_the_files(source: str, tmp_path: Path) -> None:
+    row = f"one,2024,,90,Media file(s),{source},0.0,60.000;30.000,25.000,Ann,clap,,,,POINT,70.5,b.mp4,NA,NA,"
+    path = tmp_path / "a.csv"
+    path.write_text(NEW_HEAD + row)
+    assert [(label.start, label.media) for label in open_labels(path).labels] == [(10.5, "b.mp4")]
 
 
 def test_tabular_events_with_all_in_every_row(tmp_path: Path) -> None:

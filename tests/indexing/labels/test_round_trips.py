@@ -130,8 +130,14 @@ def test_labels_of_a_person_are_left_alone(name: str, seed: int, tmp_path: Path)
         assert len(after.labels) - len(theirs) == len({rounded(label, name) for label in found})
 
 
+def test_labels_without_a_name_are_not_written(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    assert write_labels(path, [Label(0, 1, " x "), Label(1, 2, " ")]) == ["1 label without a name left out"]
+    assert open_labels(path).labels == (Label(0, 1, "x"),)
+
+
 def test_characters_that_xml_cannot_write(tmp_path: Path) -> None:
     path = tmp_path / "a.eaf"
     said = write_labels(path, [Label(0, 1, "a\x00b\ud800")], recording="session.mp4")
-    assert said == ["control characters in 1 labels became \ufffd"]
+    assert said == ["control characters in 1 label became \ufffd"]
     assert open_labels(path).labels[0].label == "a\ufffdb\ufffd"

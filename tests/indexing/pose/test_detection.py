@@ -170,7 +170,7 @@ def test_small_people_are_found_by_looking_closer(tmp_path, seeing, monkeypatch)
     (clip,) = detect(path)
     assert error_of(clip, truth) < 2.5
     with pytest.raises(NobodyInVideo):
-        detect(path, options=PoseOptions(DetectorOptions(shrinks=(1,))))
+        detect(path, options=PoseOptions(DetectorOptions(shrinks=(1,), farther=())))
 
 
 def test_nobody_in_a_video_is_one_line(tmp_path, seeing):

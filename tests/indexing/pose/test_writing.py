@@ -135,6 +135,17 @@ def test_an_interrupted_video_goes_on_where_it_was_and_comes_out_the_same(tmp_pa
     assert [entry.name for entry in folder.iterdir()] == ["a.npz"]
 
 
+def test_what_was_killed_before_the_clip_set_was_written_goes_on(tmp_path, seeing, monkeypatch):
+    path = film(tmp_path, [[walk(i)] for i in range(12)])
+    with monkeypatch.context() as patch:
+        patch.setattr(ClipSet, "save", lambda self, path: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            keypoint_file(path, tmp_path / "pose", json=True)
+    assert (tmp_path / "pose" / "a_json").is_dir() and not (tmp_path / "pose" / "a.npz").exists()
+    keypoint_file(path, tmp_path / "pose", json=True)
+    assert sorted(entry.name for entry in (tmp_path / "pose").iterdir()) == ["a.npz", "a_json"]
+
+
 def test_kept_pieces_of_other_arguments_or_cut_off_ones_are_not_used(tmp_path, seeing):
     path = film(tmp_path, [[walk(i)] for i in range(50)])
 

@@ -25,10 +25,11 @@ def refused(path: Path, *words: str, **options: object) -> None:
 
 
 @pytest.mark.parametrize("name", ["a.mp4", "a.MOV", "a.avi", "a.mkv", "a.webm"])
-def test_a_video_is_refused_with_the_names_of_estimators(tmp_path: Path, name: str) -> None:
+def test_a_video_without_a_pose_model_is_refused(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("indexing.pose.available", lambda *_: None)
     path = tmp_path / name
     path.write_bytes(b"\x00\x00\x00\x18ftypmp42")
-    refused(path, "video", "no pose estimator ships", "RTMPose", "Ultralytics", "OpenPose", "MediaPipe", "DeepLabCut")
+    refused(path, "is a video", "no pose model", "or give keypoints")
 
 
 @pytest.mark.parametrize(
@@ -39,9 +40,10 @@ def test_a_video_is_refused_with_the_names_of_estimators(tmp_path: Path, name: s
         ("cut.json", b'[{"image_id": 1, "keypoints": [1.0, 2.', ("not valid JSON at line 1, column", "truncated")),
         ("model.safetensors", b"\x10\0\0\0\0\0\0\0{}", ("model file", "-m")),
         ("renamed.json", b'\x40\0\0\0\0\0\0\0{"__metadata__":{}}', ("model file", "-m")),
-        ("labels.slp", b"\x89HDF\r\n\x1a\n" + bytes(20), ("HDF5", "Export Analysis CSV", "save_as_csv")),
-        ("poses.pkl", b"\x80\x04\x95", ("pickle", "JSON, CSV")),
-        ("array.npy", b"\x93NUMPY\x01\x00", ("np.savez", "joints=")),
+        ("labels.slp", b"\x89HDF\r\n\x1a\n" + bytes(20), ("cannot be read as HDF5", "truncated", "export or copy it again")),
+        ("poses.pkl", b"\x80\x04\x95", ("the pickle cannot be read", "truncated", "nothing in it but numpy arrays")),
+        ("weights.pt", b"\x80\x04\x95", ("is a pickle", "JSON, CSV")),
+        ("array.npy", b"\x93NUMPY\x01\x00", ("no array of numpy", "truncated", "write it again")),
         ("photo.jpg", b"\xff\xd8\xff\xe0\x00\x10JFIF\x00", ("binary file", "JSON, CSV")),
         ("latin.csv", b"\xff\xfe\xe9x,y\n", ("UTF-8", "JSON, CSV")),
         ("prices.csv", b"date,price\n1,2\n", ("without keypoint columns", "date, price", "format=")),

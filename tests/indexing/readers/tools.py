@@ -181,10 +181,12 @@ def movement(
         file["time"] = clock
         for axis, words in (("space", ["x", "y"]), ("keypoints", list(names)), ("individuals", list(people))):
             file.create_dataset(axis, data=words, dtype=text)
-        for axis in usual:
+        for i, axis in enumerate(usual):
             file[axis].make_scale(axis)
+            file[axis].attrs["_Netcdf4Dimid"] = np.int32(i)
         for name, values, order in (("position", position, axes), ("confidence", confidence, rest)):
             file[name] = values
+            file[name].attrs["_Netcdf4Coordinates"] = np.array([usual.index(axis) for axis in order], dtype=np.int32)
             for k, axis in enumerate(order):
                 file[name].dims[k].attach_scale(file[axis])
         file.attrs.update({"time_unit": np.bytes_("seconds" if seconds and fps else "frames"), "ds_type": np.bytes_("poses")})

@@ -100,14 +100,35 @@ def test_too_many_parts_are_thinned_out(learned, recording) -> None:
     assert 1 <= len(found) <= 4
 
 
-def test_choosing_is_farthest_first() -> None:
-    rng = np.random.default_rng(0)
+def scattered(seed: int):
+    """Points, distances to what is known and between them, and which of them count."""
+    rng = np.random.default_rng(seed)
     points, known = rng.normal(size=(40, 2)), rng.normal(size=(3, 2))
     apart = np.linalg.norm(points[:, None] - points, axis=2)
-    near = np.linalg.norm(points[:, None] - known, axis=2).min(axis=1)
-    worth = rng.random(40) > 0.2
-    picked = chosen(near, apart, np.ones(40), 6, worth, SuggestOptions())
+    return points, known, apart, np.linalg.norm(points[:, None] - known, axis=2).min(axis=1), rng.random(40) > 0.2
+
+
+def left(points, centres, weight):
+    """What is unlike everything known, summed."""
+    return float(weight @ np.linalg.norm(points[:, None] - centres, axis=2).min(axis=1))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_each_leaves_the_least_that_is_unlike_what_is_known(seed: int) -> None:
+    points, known, apart, near, worth = scattered(seed)
+    margin = np.random.default_rng(seed).random(40)
+    picked = chosen(near, apart, margin, 6, worth, SuggestOptions(unsure=2.0))
     assert len(set(picked)) == 6 and worth[picked].all()
+    weight = (1 + 2.0 * (1 - margin)) * worth
+    for count, one in enumerate(picked):
+        before = np.concatenate([known, points[picked[:count]]])
+        tried = {i: left(points, np.concatenate([before, points[[i]]]), weight) for i in np.flatnonzero(worth)}
+        assert tried[one] == pytest.approx(min(tried.values()))
+
+
+def test_alone_it_is_farthest_first() -> None:
+    points, known, apart, near, worth = scattered(0)
+    picked = chosen(near, apart, np.ones(40), 6, worth, SuggestOptions(alike=False))
     for count, one in enumerate(picked):  # each as far as any from all that are known by then
         centres = np.concatenate([known, points[picked[:count]]])
         distance = np.linalg.norm(points[:, None] - centres, axis=2).min(axis=1)

@@ -55,7 +55,7 @@ def test_layouts_are_matched_by_what_joints_are_called_whatever_the_spelling(cam
     assert common_joints(a, Clip(a.joints, skeleton=numbers))[2] is False
 
 
-@pytest.mark.parametrize("head, row", [("frame,x,y", "{i},"), ("time,x,y", "{t},"), ("frame,x,y,score", "{i},")])
+@pytest.mark.parametrize(("head", "row"), [("frame,x,y", "{i},"), ("time,x,y", "{t},"), ("frame,x,y,score", "{i},")])
 def test_one_tracked_point_is_a_track(tmp_path, head, row):
     rng = np.random.default_rng(3)
     way = np.cumsum(np.cumsum(rng.normal(size=(420, 3)), axis=0) * 0.03, axis=0)

@@ -101,7 +101,9 @@ def header(path):
 def test_c3d_keeps_the_clock(tmp_path):
     frames = np.delete(np.arange(40), [7, 8, 20])
     clip = body(37, times=(frames + 15) / 30)
-    clip.save(tmp_path / "a.c3d", units="m")
+    assert clip.save(tmp_path / "a.c3d", units="m") == [
+        "3 of 40 frames are not there, and are written as if nothing was seen in them"
+    ]
     assert header(tmp_path / "a.c3d") == (17, 16, 55, -1.0, 30.0)
     found = read_c3d(tmp_path / "a.c3d")
     assert found.first == 16 and np.isnan(found.values[[7, 8, 20]]).all() and len(found.values) == 40
@@ -109,6 +111,9 @@ def test_c3d_keeps_the_clock(tmp_path):
     rounded = body(3000, times=np.round(np.arange(3000) / 30, 4))  # steps of 0.0333 and 0.0334 s
     rounded.save(tmp_path / "b.c3d", units="m")
     assert header(tmp_path / "b.c3d")[1:3] == (1, 3000) and header(tmp_path / "b.c3d")[4] == pytest.approx(30, rel=1e-5)
+    some = np.cumsum([0, *([5, 6, 4] * 10)])[:30]  # of 30 frames per second every fifth, or so
+    assert body(times=some / 30, fps=30.0).save(tmp_path / "d.c3d", units="m")[0].startswith("117 of 147 frames are not there")
+    assert header(tmp_path / "d.c3d") == (17, 1, 147, -1.0, 30.0)
     late = body(times=np.arange(30) / 100 + 3600)
     assert late.save(tmp_path / "c.c3d", units="m") == ["it begins at 3600 s, which is 0 in the file"]
 
@@ -235,6 +240,10 @@ def test_netcdf_and_back(tmp_path):
         there = np.isin(clip.times, given.times)
         assert np.array_equal(clip.joints[there], given.joints, equal_nan=True) and np.isnan(clip.joints[~there]).all()
         assert clip.skeleton == given.skeleton and clip.up == given.up
+    pytest.importorskip("h5py")
+    back = read(tmp_path / "a.nc", person="everyone")
+    assert [clip.meta["person"] for clip in back] == ["ann", "bob"] and {clip.up for clip in back} == {"y"}
+    assert np.array_equal(back[0].joints[~np.isnan(back[0].joints)], both[0].joints[~np.isnan(both[0].joints)])
 
 
 # ---- independent readers, where they are -----------------------------------------------------------------------------------

@@ -1,0 +1,1 @@
+"""Keypoints from videos: who is found, what it takes, and what can be done with the joints."""

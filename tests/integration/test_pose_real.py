@@ -1,0 +1,70 @@
+"""Poses in real videos, by the real networks; skipped where DYNTORCH_DATA names no folder, or the model files are not there."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+import pytest
+
+from indexing import synchronize
+from indexing.pose import available, detect, keypoint_file
+from indexing.pose.models import VARIABLE, kept
+from indexing.readers import read
+
+
+def fetched() -> Path:
+    """Where the model files are, whatever the tests of everything else are told."""
+    if available() is not None:
+        return kept()
+    with mock.patch.dict(os.environ):
+        os.environ.pop(VARIABLE, None)
+        return kept()
+
+
+MODELS = fetched()
+DATA = Path(os.environ.get("DYNTORCH_DATA") or ".")
+pytestmark = [
+    pytest.mark.skipif(not os.environ.get("DYNTORCH_DATA"), reason="DYNTORCH_DATA is not set: no real data"),
+    pytest.mark.skipif(available(MODELS) is None, reason="no pose model files: dyntorch pose --get-models fetches them"),
+]
+
+
+def test_two_videos_are_synchronized_by_what_the_sharp_network_sees() -> None:
+    if available(MODELS) != "heavy":
+        pytest.skip("the network heavy was not fetched")
+    a, b = (detect(DATA / "pose2sim" / f"{name}.mp4", models=MODELS)[0] for name in ("cam01", "cam02"))
+    assert a.seen.all() and b.seen.all() and len(a) == len(b) == 100
+    late = b.between(float(b.times[12]) - 1e-6, 9)
+    shift = synchronize(a, late.replace(times=late.times - late.times[0]))
+    assert shift.ok and abs(shift.offset * 60 + 12) < 0.5
+
+
+def test_the_person_and_the_bystander_are_two(tmp_path: Path) -> None:
+    made = keypoint_file(DATA / "pose2sim" / "cam01.mp4", tmp_path, 3, model="full", models=MODELS, every=5, json=True)
+    assert [clip.meta["person"] for clip in made.clips] == [1, 2] and all(clip.seen.all() for clip in made.clips)
+    large, small = (float(np.ptp(clip.joints[..., 1], axis=1).mean()) for clip in made.clips)
+    assert large > 1.5 * small
+    assert made.folder is not None and len(read(made.folder, fps=12.0, person="everyone")) == 2
+
+
+def test_joints_are_where_another_detector_sees_them() -> None:
+    with np.load(DATA / "pose2sim" / "pose2sim_balancing.npz") as file:
+        theirs = file["keypoints"][0]
+    (clip,) = detect(DATA / "pose2sim" / "cam01.mp4", model="full", models=MODELS, every=10)
+    assert clip.skeleton is not None
+    names = ("left_shoulder", "right_shoulder", "left_hip", "right_hip", "left_knee", "right_knee", "left_ankle", "right_ankle")
+    body25b = dict(zip(names, (5, 6, 11, 12, 13, 14, 15, 16), strict=True))
+    for name, index in body25b.items():
+        joint = clip.joints[:, clip.skeleton.joints.index(name)]
+        other = theirs[::10, index]
+        apart = np.linalg.norm(joint - other[:, :2], axis=1)[other[:, 2] > 0.3]
+        assert np.median(apart) < 60, name  # pixels, of a body of 850
+
+
+def test_signs_are_seen_in_every_frame() -> None:
+    for name in ("again", "brother", "walk"):
+        (clip,) = detect(DATA / "asl_gestures" / f"{name}.mkv", model="full", models=MODELS)
+        assert clip.seen.any(axis=1).mean() >= 0.99
