@@ -194,10 +194,11 @@ def compare(spans: Sequence[ComparedSpan], options: ComparingOptions = Comparing
         lasting += np.stack([lengths @ side for side in (here, there, here & there)], axis=1)
     segments = {overlap: _counted(inside, names, overlap) for overlap in options.overlaps}
     total = float(table.sum())
-    by_label = {
-        name: LabelAgreement(*map(float, lasting[i]), _one_against_all(lasting[i], total), {k: segments[k][i] for k in segments})
-        for i, name in enumerate(names)
-    }
+    by_label = {}
+    for i, name in enumerate(names):
+        mine, theirs, both = map(float, lasting[i])
+        alone = _one_against_all(lasting[i], total)
+        by_label[name] = LabelAgreement(mine, theirs, both, alone, {overlap: each[i] for overlap, each in segments.items()})
     together = {overlap: sum(each, SegmentCounts(0, 0, 0)) for overlap, each in segments.items()}
     return Agreement(tuple(names), table, by_label, together)
 
@@ -222,10 +223,10 @@ def _moments(
     edges = edges[(edges >= span.start) & (edges <= span.end)]
     sides = []
     for side in (known, found):
-        change = np.zeros((len(edges), len(number)), dtype=np.int64)
+        change: NDArray[Any] = np.zeros((len(edges), len(number)), dtype=np.int64)
         if side:
-            rows = np.searchsorted(edges, [[start, end] for _, start, end in side])
-            columns = [number[str(label)] for label, _, _ in side]
+            rows: NDArray[Any] = np.searchsorted(edges, [[start, end] for _, start, end in side])
+            columns: NDArray[Any] = np.array([number[str(label)] for label, _, _ in side])
             np.add.at(change, (rows[:, 0], columns), 1)
             np.add.at(change, (rows[:, 1], columns), -1)
         sides.append(np.cumsum(change, axis=0)[:-1] > 0)
@@ -311,7 +312,8 @@ def right_segments(found: Sequence[tuple[float, float]], known: Sequence[tuple[f
         1
     """
     ends = np.array(sorted(known), dtype=np.float64).reshape(-1, 2)
-    # only those that begin before the end, behind the last one from which on nothing ended before the start, can share any time
+    # sorted by their begins, those that can share time with a segment stand together: from the first one up to which anything ends
+    # behind its start, to the last one that begins before its end
     latest = np.maximum.accumulate(ends[:, 1]) if len(ends) else ends[:, 1]
     taken = np.zeros(len(ends), dtype=bool)
     for start, end in sorted(found):

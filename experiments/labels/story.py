@@ -11,8 +11,8 @@ first performance of each action that matters in ELAN.  Then every step is a com
 3. ten events (those with the least score) are corrected: names and times become the true ones, what does not matter is *other*;
 4. ``index fit`` again, from five and ten labels.
 
-The goal is one minute of the machine's time for the three commands.  What the second scan finds better than the first is measured
-besides, and not counted.
+The goal is one minute of the machine's time for the three commands: of its processor, and on the clock where nobody else works.
+What the second scan finds better than the first is measured besides, and not counted.
 """
 
 from __future__ import annotations
@@ -154,7 +154,8 @@ def run(config: Config) -> None:
         timed(*search)
         after = list(open_labels(labels, tier="dyntorch").labels)
     total = [sum(column) for column in zip(*seconds.values(), strict=True)]
-    goals = [Row("machine's time", "fit, scan, fit", total[0], GOAL, at_most=True, unit=" s")]
+    kinds = ("on the clock, whoever else works", "of the processor")
+    goals = [Row(f"seconds {kind}", "fit, scan, fit", time_, GOAL, at_most=True) for kind, time_ in zip(kinds, total, strict=True)]
     lines = {name: list(values) for name, values in seconds.items()} | {"together": total}
     title = (
         f"seconds, {len(clip):,} frames with {len(truth)} performances, {len(first)} labels and {config.corrections} corrections"

@@ -56,8 +56,8 @@ Marked = tuple[int, str, float, float]
 class Config:
     """What labels teach, suggested ones and any."""
 
-    sets: tuple[SETS, ...] = ("exercises", "utkinect", "actors")
-    """Which recordings."""
+    sets: tuple[SETS, ...] = ("exercises", "actors")
+    """Which recordings; ``utkinect`` takes several times longer than both others."""
     counts: tuple[int, ...] = (4, 8, 16)
     """Labels after which the model is asked; as many at a time are chosen as lie between."""
     seeds: int = 3

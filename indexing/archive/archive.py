@@ -87,8 +87,8 @@ class Archive:
         is there twice.
 
         Args:
-            sources: files, folders (walked), clips, sets of clips, datasets as ``movement`` has them; one or many.  Videos, too, where
-                a pose model is there; their keypoints are kept in the archive's folder ``poses``.
+            sources: files, folders (walked), clips, sets of clips, datasets as ``movement`` has them; one or many.  Videos, too,
+                where a pose model is there; their keypoints are kept in the archive's folder ``poses``.
             executor: anything with the interface of ``concurrent.futures``, such as a process pool or
                 ``dask.distributed.Client(...).get_executor()``; by default this process reads one source after the other.
             progress: told the share done.

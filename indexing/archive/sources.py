@@ -23,10 +23,11 @@ from indexing.archive.options import GrowthOptions, StorageOptions
 from indexing.archive.tracks import Track, total_windows, tracks_of
 from indexing.clip import Clip, LabelledSet
 from indexing.files import sha256_of
-from indexing.opening import parse_json, read_text, size_of
 from indexing.movement import clips_of, is_dataset
+from indexing.opening import parse_json, read_text, size_of
 from indexing.pose import available, keypoint_file
 from indexing.readers.files import VIDEOS, WatchOptions, frame_number
+from indexing.remarks import remarks_on
 from indexing.skeleton import Skeleton
 
 POSES = "poses"  # the folder of an archive in which the keypoints of videos are kept
@@ -325,7 +326,7 @@ def read_source(source: ArchiveSource, reading: Mapping[str, Any], options: Stor
         found = [_recording(clip, name, person, options) for name, person, clip in people]
         kept = tuple(one for one in found if one.windows)
         if not kept:
-            note = note or f"nobody is in view for {options.shortest:g} s"
+            note = f"nobody is in view for {options.shortest:g} s" if people else note
         return ReadSource(Stamp(before.size, before.modified, held), kept, note)
     except Exception as problem:  # one file among thousands must not end an addition, whatever a reader does with it
         remedy = "; check the path and its permissions" * isinstance(problem, OSError)
@@ -354,7 +355,8 @@ def _people(source: ArchiveSource, reading: Mapping[str, Any]) -> tuple[list[tup
         clips = read(_keypoints(source, reading), **{**READING, **reading})
     except NobodySeen:
         return [], "nobody is in view in any frame"
-    note = "30 frames per second assumed" if any(clip.fps_assumed for clip in clips) else ""
+    notes = ["30 frames per second assumed"] if any(clip.fps_assumed for clip in clips) else []
+    note = "; ".join([*notes, *(str(one).removeprefix(f"{source.path.name}: ") for one in remarks_on(clips))])
     if of_recording(clips):
         crowd = tracked_people(clips, source.name)
         return [(source.name, who.name, who.clip) for who in crowd.people], note

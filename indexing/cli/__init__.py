@@ -64,10 +64,11 @@ COMMANDS: Any = (
 )
 GROUPS = ("index", "archive")  # words that need another one behind them
 DESCRIPTION = """Geometry of scenes in which everything moves: find people in videos (pose); learn actions from one clip each and
-find them in other clips, from other viewpoints (index); keep thousands of recordings and ask where else anybody did this (archive); find how a camera or 3D
-sensor moved among things that move, and what stood still (align); find cameras, points and velocities from tracks through several
-views (reconstruct); find which matches of two images move together (segment); put cameras that nobody synchronized on one clock
-(sync); count how many matches such a problem takes (count).
+find them in other clips, from other viewpoints (index); keep thousands of recordings and ask where else anybody did this
+(archive); put cameras that nobody synchronized on one clock (sync); write recordings as other programs read them (convert); find
+how a camera or 3D sensor moved among things that move, and what stood still (align); find cameras, points and velocities from
+tracks through several views (reconstruct); find which matches of two images move together (segment); count how many matches such a
+problem takes (count).
 
 dyntorch COMMAND --help explains a command, dyntorch --version says the version."""
 

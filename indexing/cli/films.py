@@ -50,7 +50,7 @@ class Pixels:
 
 
 @dataclass(frozen=True)
-class Footage:
+class Watching:
     """What of videos is looked at."""
 
     by: Literal["auto", "keypoints", "pixels"] = "auto"

@@ -15,7 +15,7 @@ import tyro
 
 from dyntorch.numerics import worded
 from indexing.cli.console import count, names
-from indexing.cli.films import Footage, Watched
+from indexing.cli.films import Watched, Watching
 from indexing.cli.remarks import WORDS, few, on_examples, on_gaps, on_people, remarks
 from indexing.opening import clipped, read_rows, shown
 
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from indexing.skeleton import Skeleton
 
 Format = Literal[
-    "clipset", "openpose", "coco", "mediapipe", "deeplabcut", "mmpose", "ultralytics", "sleap", "trc", "mocap", "freemocap", "npy", "pyskl",
-    "movement",
+    "clipset", "openpose", "coco", "mediapipe", "deeplabcut", "mmpose", "ultralytics", "sleap", "trc", "mocap", "freemocap", "npy",
+    "pyskl", "movement",
 ]  # fmt: skip
 People = Literal["largest", "confident", "tracked", "all", "everyone"]
 TRIM = re.compile(r"(?P<path>.+)@(?P<start>\d+(\.\d*)?|\.\d+)?-(?P<end>\d+(\.\d*)?|\.\d+)?")
@@ -50,7 +50,7 @@ class Reading:
     layout: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
     """which joint is which, such as BODY_25B; by default as the file says, or as the body looks"""
 
-    footage: Footage = field(default_factory=Footage)
+    footage: Watching = field(default_factory=Watching)
     watched: Annotated[Watched, tyro.conf.Suppress] = field(default_factory=lambda: Watched({}))
 
     def watching(self, paths: Iterable[Path], beside: Path | None) -> Self:

@@ -13,7 +13,7 @@ import tyro
 
 from dyntorch.numerics import Message, worded
 from indexing.cli.console import SHOWN, check_report, count, ended, flags, names, progress, say, table
-from indexing.cli.films import Footage, Watched
+from indexing.cli.films import Watched, Watching
 from indexing.cli.inputs import Format, refuse_range
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ class Sync:
     """width and height of the image in pixels, for files with coordinates from 0 to 1"""
     layout: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
     """which joint is which, such as BODY_25B; by default as the files say, or as the body looks"""
-    footage: Footage = field(default_factory=Footage)
+    footage: Watching = field(default_factory=Watching)
     title: Annotated[str | None, tyro.conf.arg(metavar="TEXT", help_behavior_hint="")] = None
     """heading of the report"""
 

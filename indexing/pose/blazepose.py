@@ -48,7 +48,7 @@ def sigmoid(logits: Any) -> Floats:
 
 
 @dataclass(frozen=True, eq=False)
-class Candidates:
+class PersonCandidates:
     """People in a picture, the surest first, in parts of it.
 
     scores: ``(k,)``; boxes: ``(k, 4)`` left, top, right, bottom; points: ``(k, 4, 2)``: hips, a point of the circle about the body
@@ -63,7 +63,7 @@ class Candidates:
         return len(self.scores)
 
 
-def candidates(raw: Floats, logits: Floats, options: DetectorOptions = DetectorOptions()) -> Candidates:
+def candidates(raw: Floats, logits: Floats, options: DetectorOptions = DetectorOptions()) -> PersonCandidates:
     """People from the detector's outputs.
 
     Args:
@@ -76,10 +76,10 @@ def candidates(raw: Floats, logits: Floats, options: DetectorOptions = DetectorO
     centre, size, points = values[:, 0] + anchors()[chosen], values[:, 1], values[:, 2:] + anchors()[chosen][:, None]
     boxes = np.concatenate([centre - size / 2, centre + size / 2], axis=1)
     fine = np.isfinite(values).all(axis=(1, 2)) & (size > 0).all(axis=1)
-    return merged(Candidates(scores[chosen][fine], boxes[fine], points[fine]), options.overlap)
+    return merged(PersonCandidates(scores[chosen][fine], boxes[fine], points[fine]), options.overlap)
 
 
-def merged(found: Candidates, overlap: float) -> Candidates:
+def merged(found: PersonCandidates, overlap: float) -> PersonCandidates:
     """One candidate of each group whose boxes overlap: the mean of their coordinates, weighted by their scores.
 
     A group is the surest candidate that is left and all that overlap with it by more than ``overlap``; its score is the highest.
@@ -95,7 +95,7 @@ def merged(found: Candidates, overlap: float) -> Candidates:
         boxes.append(weights @ found.boxes[group])
         points.append(np.tensordot(weights, found.points[group], axes=1))
     shape = (-1, POINTS, 2)
-    return Candidates(np.array(scores), np.array(boxes).reshape(-1, 4), np.array(points).reshape(shape))
+    return PersonCandidates(np.array(scores), np.array(boxes).reshape(-1, 4), np.array(points).reshape(shape))
 
 
 def overlaps(box: Floats, boxes: Floats) -> Floats:

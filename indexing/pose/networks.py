@@ -5,9 +5,10 @@ from __future__ import annotations
 import contextlib
 import math
 import os
+import struct
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from importlib import import_module
 from typing import Any, Protocol
 
@@ -19,6 +20,7 @@ from indexing.pose.blazepose import HEATMAP, LANDMARKS, POINTS, Floats, anchors
 from indexing.pose.models import AGAIN, ModelSet, needs
 
 Image = NDArray[np.uint8]
+OUTPUTS_FIELD, OPERATORS_FIELD = 8, 10  # of a graph in LiteRT's files
 QUIET = threading.Lock()  # the process has one stream of errors
 
 
@@ -44,7 +46,8 @@ class LiteNetworks:
 
     def __init__(self, models: ModelSet) -> None:
         self._detector = _interpreter(models.detector, str(models.paths[0]))
-        self._landmarks = _interpreter(models.landmarks, str(models.paths[1]))
+        wanted = {LANDMARKS * 5, 1, HEATMAP * HEATMAP * LANDMARKS}
+        self._landmarks = _interpreter(pruned(models.landmarks, wanted), str(models.paths[1]))
 
     def detector(self, image: Image) -> tuple[Floats, Floats]:
         """See :class:`Networks`."""
@@ -92,6 +95,63 @@ def _interpreter(model: bytes, name: str) -> _Interpreter:
     except (ValueError, RuntimeError):
         raise error(name, "is no network that LiteRT can run", AGAIN) from None
     return _Interpreter(running, name)
+
+
+def pruned(model: bytes, wanted: Collection[int]) -> bytes:
+    """A network without the operators that only lead to outputs that nobody asks for; what is left computes the same, bit for bit.
+
+    BlazePose's networks of landmarks also draw the person's outline, at the full size of the region: without it ``full`` takes 11
+    instead of 18 ms and ``heavy`` 54 instead of 61 (one core of a busy machine).
+
+    Args:
+        model: the bytes of a file of LiteRT's.
+        wanted: how many values the wanted outputs have.
+
+    Returns:
+        the network; as it was, where it cannot be read so.
+    """
+    data = bytearray(model)
+    try:
+        graph = import_module("ai_edge_litert.schema_py_generated").Model.GetRootAs(data, 0).Subgraphs(0)
+        sizes = {int(one): math.prod(map(int, graph.Tensors(int(one)).ShapeAsNumpy())) for one in graph.OutputsAsNumpy()}
+        outputs = [one for one, size in sizes.items() if size in wanted]
+        operators = [graph.Operators(i) for i in range(graph.OperatorsLength())]
+        flow = [(one.InputsAsNumpy().tolist(), one.OutputsAsNumpy().tolist()) for one in operators]
+        kept = sorted(_needed(flow, outputs))
+        first = graph._tab.Vector(graph._tab.Offset(OPERATORS_FIELD))
+        # an operator is named by how far behind its place in the list it stands
+        places = [first + 4 * i + int.from_bytes(data[first + 4 * i : first + 4 * i + 4], "little") for i in kept]
+        _relist(data, first, [place - (first + 4 * i) for i, place in enumerate(places)])
+        _relist(data, graph._tab.Vector(graph._tab.Offset(OUTPUTS_FIELD)), outputs)
+    except (ImportError, AttributeError, TypeError, ValueError, IndexError, OverflowError, struct.error):
+        return model  # slower, and nothing else
+    return bytes(data)
+
+
+def _needed(flow: Sequence[tuple[list[int], list[int]]], outputs: Sequence[int]) -> set[int]:
+    """Which operators lead to some tensors.
+
+    Args:
+        flow: tensors that go into each operator, and that come out of it.
+
+    Example:
+        >>> sorted(_needed([([0], [1]), ([1], [2]), ([1], [3])], [3]))
+        [0, 2]
+    """
+    maker = {tensor: i for i, (_, made) in enumerate(flow) for tensor in made}
+    found: set[int] = set()
+    left = list(outputs)
+    while left:
+        operator = maker.get(left.pop())
+        if operator is not None and operator not in found:
+            found.add(operator)
+            left += flow[operator][0]
+    return found
+
+
+def _relist(data: bytearray, first: int, values: Sequence[int]) -> None:
+    """Put fewer values of four bytes into a list that begins at ``first``, its length standing before it."""
+    struct.pack_into(f"<I{len(values)}I", data, first - 4, len(values), *values)
 
 
 @contextlib.contextmanager

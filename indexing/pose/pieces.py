@@ -139,7 +139,7 @@ def work(task: VideoPlan, piece: Piece, networks: Networks, moved: Callable[[], 
         ValueError: no frame of it can be decoded.
         Stopped: ``stop`` said so.
     """
-    tracker, kept = Tracker(networks, task.people, task.options), _Kept()
+    tracker, kept = Tracker(networks, task.people, task.options), _Gathered()
     both = np.concatenate([piece.lead, piece.frames])
     edge = np.diff(task.times).min(initial=1.0) / 2
     span = max(0.0, float(task.times[both[0]] - edge)), float(task.times[both[-1]] + edge)
@@ -178,7 +178,7 @@ def nearest(times: Floats, time: float) -> int:
 
 
 @dataclass
-class _Kept:
+class _Gathered:
     """What was seen so far."""
 
     times: list[float] = field(default_factory=list)

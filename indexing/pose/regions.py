@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from indexing.pose.blazepose import CIRCLE, HIPS, Candidates, Floats, Landmarks
+from indexing.pose.blazepose import CIRCLE, HIPS, Floats, Landmarks, PersonCandidates
 from indexing.pose.options import FollowOptions
 from indexing.video.reading import Orientation, cv2, orientation
 
@@ -63,7 +63,7 @@ def about(centre: Floats, circle: Floats, expand: float) -> Region:
     return Region(x, y, 2 * expand * math.hypot(u - x, v - y), math.remainder(math.atan2(u - x, y - v), 2 * math.pi))
 
 
-def of_candidates(found: Candidates, window: Region, expand: float) -> list[Region]:
+def of_candidates(found: PersonCandidates, window: Region, expand: float) -> list[Region]:
     """The regions about detected people.
 
     Args:

@@ -405,10 +405,10 @@ def _layout(
     if name is not None:
         return told(path, name, joints.shape[1]), {}
     own = _skeleton(path, data, joints.shape[1])
-    if own is not None or len(ups) != 1:
+    if "joint_names" in data or len(ups) != 1:
         return own, {}
     layout, said, _ = settled(joints, None, candidates(joints.shape[1]), ups[0])
-    return layout, said
+    return layout or own, said
 
 
 def _skeleton(path: Path, data: Mapping[str, Array], joints: int) -> Skeleton | None:

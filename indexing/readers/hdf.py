@@ -107,7 +107,32 @@ class Hdf5:
             raise error(self.path, f"{shown(name)} is no list of names", AGAIN)
         if data.dtype.kind == "O" and self._sure(lambda: data.id.get_type().get_class(), name) == RECORDED:
             raise error(self.path, f"{shown(name)} is no list of names", AGAIN)
+        if data.dtype.kind == "O":
+            self._check_lengths(data, name)
         return [_text(value) for value in np.atleast_1d(self._sure(lambda: data[()], name))]
+
+    def _check_lengths(self, data: Any, name: str) -> None:
+        """Refuse texts that say they are longer than the file: the library would make room for them.
+
+        A text of any length is kept as its length (4 bytes), and where it is: a heap (8), and which of its pieces (4).
+        """
+
+        def places() -> list[tuple[int, int]]:
+            if data.chunks is None:
+                offset = data.id.get_offset()
+                return [] if offset is None else [(offset, 16 * data.size)]
+            if data.compression or data.shuffle or data.fletcher32:
+                return []  # a checksum or packing, which damage does not survive
+            found = [data.id.get_chunk_info(i) for i in range(data.id.get_num_chunks())]
+            return [(one.byte_offset, one.size) for one in found]
+
+        with opened(self.path) as file:
+            for offset, size in self._sure(places, name):
+                file.seek(min(offset, self._size))
+                raw = file.read(min(size, 16 * MOST_TEXTS_BLOCK))
+                lengths = np.frombuffer(raw[: len(raw) // 16 * 16], dtype=np.dtype([("length", "<u4"), ("rest", "V12")]))["length"]
+                if (lengths > self._size).any():
+                    raise error(self.path, f"{shown(name)} has a text longer than the file (which may be truncated)", AGAIN)
 
     def attribute(self, name: str, key: str) -> Any:
         """An attribute of a group or dataset, text as ``str`` or ``bytes``; ``None`` where there is none."""

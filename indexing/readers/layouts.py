@@ -50,7 +50,7 @@ class LayoutOptions:
     """Joints seen in a frame, of those whose height says something, that its posture counts."""
 
 
-class Fit(NamedTuple):
+class LayoutFit(NamedTuple):
     """How well joints are a body of a layout: bones and posture as in the module, and the direction that is up then."""
 
     layout: Skeleton
@@ -63,7 +63,9 @@ class Fit(NamedTuple):
         return self.posture - self.bones
 
 
-def fits(joints: FloatArray, layouts: Sequence[Skeleton], up: str | None, options: LayoutOptions = LayoutOptions()) -> list[Fit]:
+def fits(
+    joints: FloatArray, layouts: Sequence[Skeleton], up: str | None, options: LayoutOptions = LayoutOptions()
+) -> list[LayoutFit]:
     """Each layout's fit, best first.
 
     Args:
@@ -77,13 +79,13 @@ def fits(joints: FloatArray, layouts: Sequence[Skeleton], up: str | None, option
     for layout in layouts:
         bones = _bones(some, layout)
         best = max(((_posture(some, layout, axis, options), axis) for axis in ups), default=(-1.0, "y"))
-        found.append(Fit(layout, bones, *best))
+        found.append(LayoutFit(layout, bones, *best))
     return sorted(found, key=lambda fit: -fit.value)
 
 
 def recognized(
     joints: FloatArray, layouts: Sequence[Skeleton], up: str | None, options: LayoutOptions = LayoutOptions()
-) -> Fit | None:
+) -> LayoutFit | None:
     """The layout that the joints are of, where that is clear.
 
     Example:

@@ -108,7 +108,7 @@ def _analysis(file: Hdf5) -> Recording:
         at=np.repeat(np.arange(frames), animals),
         joints=joints,
         confidence=confidence,
-        tracks=_unlike(names) * frames if animals > 1 or any(names) else None,
+        tracks=_unlike(names or [""] * animals) * frames if animals > 1 or any(names) else None,
         skeleton=_skeleton(file.path.stem, nodes, _bones(file, len(nodes))),
     )
 

@@ -385,13 +385,14 @@ def _followed(cost: Array, rest: Array, turns: bool, options: RepetitionOptions)
     begin = options.begin_cycle if turns else options.begin
     place, back = np.arange(m), np.zeros((count, m + 1), int)
     before = np.stack([place, (place - 1) % m, (place - 2) % m, np.full(m, m)])
-    total = np.append(cost[0] + begin if turns else np.full(m, np.inf), rest[0])
+    total, after = np.append(cost[0] + begin if turns else np.full(m, np.inf), rest[0]), np.empty(m + 1)
     total[0] = cost[0, 0] + begin
+    ways = np.full((4, m), np.inf)  # what is not written below stays so; made once, as frames are many and places few
     for f in range(1, count):
         came, idle = total[:m], total[m]
-        ways = np.full((4, m), np.inf)
-        ways[0] = came + options.tempo
-        ways[1, 1:], ways[2, 2:] = came[:-1], came[:-2] + options.tempo
+        np.add(came, options.tempo, out=ways[0])
+        ways[1, 1:] = came[:-1]
+        np.add(came[:-2], options.tempo, out=ways[2, 2:])
         if turns:
             ways[1, 0], ways[2, :2], ways[3] = came[-1], came[-2:] + options.tempo, idle + begin
         else:
@@ -402,7 +403,9 @@ def _followed(cost: Array, rest: Array, turns: bool, options: RepetitionOptions)
             source[0] = m - 1
         last = int(came.argmin()) if turns else m - 1 if came[-1] <= came[-2] + options.tempo else m - 2
         back[f, :m], back[f, m] = source, m if idle <= came[last] else last
-        total = np.append(ways[way, place] + cost[f], min(idle, came[last]) + rest[f])
+        np.add(ways.min(axis=0), cost[f], out=after[:m])
+        after[m] = min(idle, came[last]) + rest[f]
+        total, after = after, total
     at = int(total.argmin()) if turns else m if total[m] <= total[m - 1] else m - 1
     best, path = float(total[at]), np.zeros(count, int)
     for f in range(count - 1, -1, -1):

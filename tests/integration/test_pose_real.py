@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from indexing import synchronize
-from indexing.pose import available, detect, keypoint_file
-from indexing.pose.models import VARIABLE, kept
+from indexing.pose import available, detect, keypoint_file, networks
+from indexing.pose.models import VARIABLE, kept, load_models
+from indexing.pose.networks import LiteNetworks
 from indexing.readers import read
 
 
@@ -62,6 +63,20 @@ def test_joints_are_where_another_detector_sees_them() -> None:
         other = theirs[::10, index]
         apart = np.linalg.norm(joint - other[:, :2], axis=1)[other[:, 2] > 0.3]
         assert np.median(apart) < 60, name  # pixels, of a body of 850
+
+
+@pytest.mark.parametrize("name", ["heavy", "full", "lite"])
+def test_a_pruned_network_computes_the_same(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    if not (MODELS / f"pose_landmark_{name}.tflite").exists():
+        pytest.skip(f"the network {name} was not fetched")
+    models = load_models(name, MODELS)
+    image = np.random.default_rng(0).integers(0, 255, (256, 256, 3)).astype(np.uint8)
+    short = LiteNetworks(models).landmarks(image)
+    monkeypatch.setattr("indexing.pose.networks.pruned", lambda model, wanted: model)
+    whole = LiteNetworks(models).landmarks(image)
+    assert len(networks.pruned(models.landmarks, {1})) == len(models.landmarks)
+    for a, b in zip(short, whole, strict=True):
+        np.testing.assert_array_equal(a, b)
 
 
 def test_signs_are_seen_in_every_frame() -> None:

@@ -10,7 +10,7 @@ from indexing.pose.blazepose import (
     LANDMARKS,
     PICTURE,
     REGION,
-    Candidates,
+    PersonCandidates,
     anchors,
     candidates,
     landmarks,
@@ -84,7 +84,7 @@ def test_people_are_merged_as_box_after_box_says(seed):
     rng = np.random.default_rng(seed)
     corner, size = rng.uniform(0, 1, (40, 2)), rng.uniform(0.1, 0.4, (40, 2))
     boxes, points, scores = np.hstack([corner, corner + size]), rng.normal(size=(40, 4, 2)), rng.uniform(0.5, 1, 40)
-    found = merged(Candidates(scores, boxes, points), 0.3)
+    found = merged(PersonCandidates(scores, boxes, points), 0.3)
     expected = brute_merge(scores, boxes, points, 0.3)
     assert len(found) == len(expected) < 40
     for i, (score, box, point) in enumerate(expected):

@@ -260,6 +260,25 @@ def test_declared_sizes_are_checked_before_anything_is_made(person: np.ndarray, 
     refused(changed(path, wide), "would take")
 
 
+def test_heaps_of_text_without_end_are_refused_before_the_library_walks_them(person: np.ndarray, tmp_path: Path) -> None:
+    path = tools.movement(tmp_path / "a.nc", {"id": person}, NAMES)
+    data = bytearray(path.read_bytes())
+    at = data.index(b"GCOL\x01") + 16
+    data[at : at + 16] = bytes(16)  # free, and of no size: the next piece is itself
+    path.write_bytes(data)
+    refused(path, "one of its heaps of text has no end")
+
+
+def test_a_text_longer_than_the_file_is_refused(person: np.ndarray, tmp_path: Path) -> None:
+    path = tools.sleap_project(tmp_path / "a.slp", {"A": unseen(person)}, NAMES)
+    with h5py.File(path) as file:
+        at = file["tracks_json"].id.get_offset()
+    data = bytearray(path.read_bytes())
+    data[at : at + 4] = (2**32 - 1).to_bytes(4, "little")
+    path.write_bytes(data)
+    refused(path, "'tracks_json' has a text longer than the file")
+
+
 class Harm:
     def __reduce__(self) -> Any:
         return builtins.eval, ("1/0",)

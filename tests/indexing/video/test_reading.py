@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from indexing.video import probe, read_video
-from indexing.video.reading import Orientation, evenness
+from indexing.video.reading import Orientation, evenness, frame_times
 
 
 def gather(video):
@@ -73,6 +73,19 @@ def test_variable_frame_rate_keeps_its_times(write):
     np.testing.assert_allclose(gather(video)[1], np.array(stamps) / 1000, atol=1e-3)
     assert video.info.variable and video.info.dropped == 3
     assert "variable frame rate" in video.info.notes[0]
+
+
+@pytest.mark.parametrize(
+    "stamps", [None, [0, 33, 67, 100, 200, 233, 267, 300, 333, 400], [500, 540, 580, 620, 660, 700, 740, 780, 820, 860]]
+)
+def test_times_are_known_before_anything_is_decoded(write, stamps):
+    path = write("t.mkv", numbered(10), stamps=stamps)
+    info, times = frame_times(path)
+    video = read_video(path)
+    np.testing.assert_allclose(times, gather(video)[1], atol=1e-9)
+    assert info == probe(path) and info.timed
+    stored = [(frame.width, time) for frame, time in video.stored()]
+    assert stored == [(64, time) for time in gather(video)[1].tolist()]
 
 
 def test_times_start_at_zero_whatever_the_container_says(write):

@@ -1,0 +1,80 @@
+"""Tracks to people: who goes on, by time and place, whatever the order of the work."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from indexing.pose.identities import Sightings, identities, joined, largest
+from indexing.pose.options import IdentityOptions
+from indexing.pose.tracking import windows
+
+BODY = np.array([[0.0, 0.0], [20.0, 30.0], [10.0, 80.0]])
+
+
+def tracks(*some, frames=60, fps=10.0):
+    """Sightings of tracks, each (first frame, last frame, x of the first, step, size)."""
+    rows = []
+    for number, (first, last, x, step, size) in enumerate(some):
+        rows += [(frame, number, size * BODY + [x + step * (frame - first), 0]) for frame in range(first, last + 1)]
+    rows.sort(key=lambda row: row[0])
+    at, track, joints = (np.array([row[k] for row in rows]) for k in range(3))
+    return Sightings(np.arange(frames) / fps, at, track, joints, np.ones(joints.shape[:2]))
+
+
+def groups(seen, **options):
+    return [sorted({int(seen.tracks[row]) for row in rows}) for rows in identities(seen, IdentityOptions(**options))]
+
+
+def test_a_track_goes_on_where_another_ended_soon_and_nearby():
+    assert groups(tracks((0, 20, 0, 0, 1), (25, 59, 8, 0, 1))) == [[0, 1]]
+    assert groups(tracks((0, 20, 0, 0, 1), (50, 59, 8, 0, 1))) == [[0], [1]]  # three seconds later
+    assert groups(tracks((0, 20, 0, 0, 1), (22, 59, 90, 0, 1))) == [[1], [0]]  # two bodies away
+    assert groups(tracks((0, 20, 0, 0, 1), (50, 59, 8, 0, 1)), away=5.0) == [[0, 1]]
+
+
+def test_two_who_are_there_at_once_are_two():
+    assert groups(tracks((0, 40, 0, 0, 1), (30, 59, 5, 0, 1))) == [[0], [1]]
+
+
+def test_at_a_cut_everybody_goes_on_with_the_nearest():
+    cut = tracks((0, 29, 0, 0, 1), (0, 29, 30, 0, 1.1), (30, 59, 31, 0, 1.1), (30, 59, 1, 0, 1))
+    assert groups(cut) == [[1, 2], [0, 3]]
+
+
+def test_the_largest_over_time_comes_first():
+    assert groups(tracks((0, 59, 0, 0, 1), (0, 9, 300, 0, 2))) == [[0], [1]]
+    assert groups(tracks((0, 59, 0, 0, 1), (0, 39, 300, 0, 2))) == [[1], [0]]
+
+
+def test_one_sighting_a_frame_is_of_the_largest_who_is_there():
+    seen = tracks((0, 59, 0, 0, 1), (20, 39, 300, 0, 3))
+    rows = largest(seen, identities(seen))
+    assert seen.at[rows].tolist() == list(range(60))
+    assert seen.tracks[rows].tolist() == [0] * 20 + [1] * 20 + [0] * 20
+
+
+def test_parts_joined_keep_their_tracks_apart():
+    one, other = tracks((0, 3, 0, 0, 1), frames=4), tracks((1, 2, 0, 0, 1), (2, 3, 90, 0, 1), frames=4)
+    both = joined([one, other])
+    assert both.at.tolist() == [0, 1, 2, 3, 5, 6, 6, 7] and len(both.times) == 8
+    assert both.tracks.tolist() == [0, 0, 0, 0, 1, *other.tracks[1:] + 1]
+
+
+def test_nobody_is_nobody():
+    nobody = Sightings(np.arange(3.0), *(np.zeros(0, dtype=np.int64),) * 2, np.zeros((0, 3, 2)), np.zeros((0, 3)))
+    assert identities(nobody) == [] and largest(nobody, []).tolist() == []
+    assert joined([nobody, nobody]).times.tolist() == [0, 1, 2, 0, 1, 2]
+
+
+@pytest.mark.parametrize(("width", "height", "shrink"), [(1920, 1080, 1), (1920, 1080, 2), (1080, 1920, 3), (640, 640, 2)])
+def test_windows_cover_a_picture_and_overlap(width, height, shrink):
+    side = max(width, height) / shrink
+    found = windows(width, height, side)
+    covered = np.zeros((height // 20, width // 20), dtype=int)
+    y, x = np.mgrid[: height // 20, : width // 20] * 20 + 10
+    for one in found:
+        covered += (abs(x - one.x) <= side / 2) & (abs(y - one.y) <= side / 2)
+    assert covered.min() >= 1 and len(found) == (1 if shrink == 1 else len(found))
+    steps = np.diff(sorted({one.x for one in found}))
+    assert (steps <= side / 2 + 1e-6).all()
