@@ -60,7 +60,9 @@ FORMATS = {
     "indexing/cli/console.py": {"REFUSED"},
     "indexing/labels/via.py": {"TEXT", "CHECKBOX", "SELECT", "VIDEO", "LOCAL"},
     "indexing/phase/saving.py": {"VERSION"},
-    "indexing/pose/blazepose.py": {"PICTURE", "REGION", "HEATMAP", "GRIDS", "POINTS", "LANDMARKS", "JOINTS", "HIPS", "CIRCLE", "CLIPPED"},
+    "indexing/pose/blazepose.py": {
+        *("PICTURE", "REGION", "HEATMAP", "GRIDS", "POINTS", "LANDMARKS", "JOINTS", "HIPS", "CIRCLE", "CLIPPED"),
+    },
     "indexing/pose/networks.py": {"OUTPUTS_FIELD", "OPERATORS_FIELD"},
     "indexing/pose/pieces.py": {"VERSION"},
     "indexing/readers/c3d.py": {"INTEL", "DEC", "MIPS", "MOST", "WORD"},

@@ -112,7 +112,7 @@ def gather(given: Taken | Iterable[Taken]) -> list[ArchiveSource]:
         ValueError: nothing to add, or what is no file, clip or set of clips.
     """
     single = isinstance(given, (Clip, str, os.PathLike)) or is_dataset(given)
-    listed: list[Any] = [given] if single else list(given)  # type: ignore[arg-type, list-item]
+    listed: list[Any] = [given] if single else list(given)  # type: ignore[arg-type]
     found: list[ArchiveSource] = []
     for one in listed:
         if isinstance(one, Clip):

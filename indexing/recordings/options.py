@@ -117,11 +117,12 @@ class SuggestOptions:
     shown: float = 0.5
     """Share of a part's frames that must show the person."""
     alike: bool = True
-    """Whether a part counts for all that is like it, or for itself alone (farthest first).  Frames right after 5 / 10 / 20 labels
-    of actors: .63 / .76 / .89, alone .67 / .74 / .84, of any parts .60 / .67 / .74."""
+    """Whether a part counts for all that is like it, or for itself alone (farthest first), which finds oddities: frames right after
+    4 / 8 / 16 labels of actors .62 / .67 / .76, alone .60 / .60 / .64."""
     unsure: float = 0.3
     """How much more a part counts between two actions (margin 0) than where the action is sure (margin 1).  Doubt alone teaches
-    little: with 1, .63 of the frames of exercises are right after 8 labels, with 0 .68 (actors, 10 labels: .67, .70)."""
+    little.  Frames right after 4 / 8 / 16 labels, exercises and actors, three repetitions, which differ by .04 to .1: with 0 .54 /
+    .68 / .75 and .61 / .67 / .75, with .3 .53 / .62 / .71 and .62 / .67 / .76; any parts .42 / .55 / .74 and .55 / .63 / .74."""
     far: float = 0.33
     """Of the residual between examples of different actions, from which on the reason that is given is that a part is unlike all of
     them.  Actors: the actions that are known stand at .03 to .05 of it, others at .45 to .6."""

@@ -74,7 +74,7 @@ def test_openpose_of_four_cameras(camera: int, rule: str, tmp_path: Path) -> Non
     ("name", "words"),
     [
         ("mocap6_exercises.npz", ("not a clip set", "no 'joints'")),
-        ("asl_gestures/eat.mkv", ("video", "no pose estimator ships")),
+        ("asl_gestures/eat.mkv", ("is a video", "no pose model")),
         ("asl_gestures", ("no .json or .txt",)),
         ("README.md", ("without keypoint columns",)),
     ],
