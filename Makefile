@@ -92,6 +92,10 @@ tables: install
 	$(BIN)/python -m experiments.segmentation.multibody
 	$(BIN)/python -m experiments.segmentation.segmentation
 	$(BIN)/python -m experiments.segmentation.sensitivity
+	$(BIN)/python -m experiments.pose.videos
+	$(BIN)/python -m experiments.pose.sizes
+	$(BIN)/python -m experiments.labels.suggesting
+	$(BIN)/python -m experiments.labels.story
 	$(BIN)/python -m experiments.synchronization.synchronization
 	$(BIN)/python -m experiments.synchronization.brightness
 	$(BIN)/python -m experiments.synchronization.cameras

@@ -117,8 +117,8 @@ def corrected(found: list[Label], truth: list[Label], number: int) -> list[Label
 
 def agreement(found: list[Label], truth: list[Label], end: float) -> list[float]:
     """F1 of segments at overlaps of .1, .25 and .5, and Cohen's kappa over time, of the actions that matter."""
-    sides = [[(one.label, one.start, one.end) for one in side if one.label != OTHER] for side in (truth, found)]
-    both = compare([ComparedSpan("hour", 0.0, end, *sides)])
+    known, said = ([(one.label, one.start, one.end) for one in side if one.label != OTHER] for side in (truth, found))
+    both = compare([ComparedSpan("hour", 0.0, end, known, said)])
     return [*(one.f1 for one in both.segments.values()), both.kappa]
 
 

@@ -29,7 +29,8 @@ from experiments.benchmarks.interleaved import threads
 from experiments.common.book import Book
 from experiments.common.tables import command, note
 from experiments.recognition import protocol
-from experiments.recognition.detection import Recording, end_to_end, segments
+from experiments.recognition.detection import Recording, end_to_end
+from experiments.recognition.detection_metrics import segments
 from experiments.recognition.protocol import Array
 from indexing import ActionIndexer, Clip
 from indexing.actors import ACTIONS, Person, detect, stream
