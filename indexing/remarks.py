@@ -26,6 +26,8 @@ class RemarkOptions:
 
 
 REMARK = RemarkOptions()
+FOLLOWED = {"largest": "the largest", "confident": "the one that the detector trusts most", "tracked": "one who is tracked"}
+"""Who of several people is followed, in words, by the rules of :mod:`indexing.readers.recording`."""
 
 
 def remarks_on(clips: Sequence[Clip], sized: bool = False) -> list[Message]:

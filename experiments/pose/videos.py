@@ -36,6 +36,7 @@ from experiments.recognition.protocol import Array, data_folder
 from indexing import ActionIndexer, Clip
 from indexing.pose import PoseOptions, detect
 from indexing.pose.blazepose import JOINTS, PICTURE, REGION
+from indexing.pose.detection import in_view
 from indexing.pose.models import load_models
 from indexing.pose.networks import LiteNetworks
 from indexing.pose.pieces import plan, work
@@ -188,7 +189,7 @@ def gray(frames: Array, fps: float, networks: LiteNetworks, people: int = 1) -> 
     for i, frame in enumerate(frames):
         image = av().VideoFrame.from_ndarray(np.repeat(frame[..., None], 3, axis=2), format="rgb24")
         for one in tracker.step(VideoPicture(image), i / fps):
-            joints[i], confidence[i] = one.joints, one.confidence
+            joints[i], confidence[i] = in_view(one.joints, one.confidence, (frames.shape[2], frames.shape[1]))
     return Clip(joints, confidence=confidence, fps=fps, up="-y")
 
 

@@ -105,8 +105,8 @@ class ReadSource:
 def gather(given: Taken | Iterable[Taken]) -> list[ArchiveSource]:
     """All sources, folders walked, each once.
 
-    Videos in folders are taken where a pose model is there, unless keypoints of theirs lie beside them: files or folders whose
-    names begin as theirs.
+    Videos in folders are taken where a pose model is there, unless keypoints of theirs lie beside them: ``cam1.json``,
+    ``cam1_json/``, ``cam1DLC_resnet50.csv`` of ``cam1.mp4``.
 
     Raises:
         ValueError: nothing to add, or what is no file, clip or set of clips.
@@ -171,8 +171,14 @@ def _walked(folder: Path, walked: set[Path]) -> list[ArchiveSource]:
             videos.append(one)
     if videos and available() is not None:
         keypoints = [one.name for one in inside if one.is_dir() or one.suffix.lower() in KEYPOINT_FILES]
-        found += [_of_file(one) for one in videos if not any(name.startswith(one.stem) for name in keypoints)]
+        found += [_of_file(one) for one in videos if not any(_begins(name, one.stem) for name in keypoints)]
     return found
+
+
+def _begins(name: str, stem: str) -> bool:
+    """Whether a file of keypoints is called as those of a video are: its name, and then nothing that could belong to the name."""
+    rest = name[len(stem) :]
+    return name.startswith(stem) and (not rest[:1].isalnum() or rest.startswith("DLC"))
 
 
 def keeping(sources: Sequence[ArchiveSource], archive: Path) -> list[ArchiveSource]:

@@ -107,19 +107,37 @@ class Watching:
         videos = list(dict.fromkeys(path for path in paths if is_video(path)))
         if not videos:
             return Watched({})
+        from indexing.pose.writing import kept_file
+
+        home = self.poses.expanduser() if self.poses is not None else None if beside is None else beside / "pose"
+        folders = _folders(videos, Path(_passing().name) if home is None else check_folder(home))
+        usual = (self.pose_model, self.people, self.every) == ("auto", Watching.people, Watching.every)
+        there = {video: kept_file(video.expanduser(), folder) for folder, some in folders.items() for video in some if usual}
+        found: dict[Path, Path | ValueError] = {video: file for video, file in there.items() if file is not None}
+        again = f"{count(len(found), 'video')}: the keypoints that were kept in {home} are used"
+        notes = [again] if found else []
+        left = {folder: [video for video in some if video not in found] for folder, some in folders.items()}
+        if any(left.values()):
+            made, said = self._found(left, fps, home)
+            found, notes = found | made, [*notes, *said]
+        return Watched(found, tuple(notes))
+
+    def _found(
+        self, folders: Mapping[Path, Sequence[Path]], fps: float | None, home: Path | None
+    ) -> tuple[dict[Path, Path | ValueError], list[str]]:
+        """The keypoint file of each video, made now, and what to know of them."""
         from indexing.pose.detection import NobodyInVideo, VideoTask, made_by, workers_here
         from indexing.pose.models import load_models
         from indexing.pose.writing import KeypointFile, keypoint_files
 
+        videos = [video for some in folders.values() for video in some]
         try:
             model = load_models(None if self.pose_model == "auto" else self.pose_model)
         except ValueError as problem:
             raise ValueError(f"{videos[0]}: is a video, and its keypoints cannot be found: {problem}") from None
-        home = self.poses.expanduser() if self.poses is not None else None if beside is None else beside / "pose"
-        kept = Path(_passing().name) if home is None else check_folder(home)
         found: dict[Path, Path | ValueError] = {}
-        notes, again = [], 0
-        for folder, some in _folders(videos, kept).items():
+        notes: list[str] = []
+        for folder, some in folders.items():
             tasks = [VideoTask(video.expanduser(), self.people, self.every, fps, model.name) for video in some]
             with frames_bar(f"finding people in {count(len(some), 'video')}") as bar:
                 made = list(keypoint_files(tasks, folder, made_by(model), workers_here(), bar, json=False))
@@ -128,10 +146,8 @@ class Watching:
                     raise one
                 found[video] = one.path if isinstance(one, KeypointFile) else one
                 notes += [f"{video}: {note}" for note in getattr(getattr(one, "found", None), "notes", ())]
-                again += isinstance(one, KeypointFile) and one.reused
-        where = "" if home is None else f", kept in {kept}/" + f" ({again} found there)" * (again > 0)
-        said = f"people in {count(len(videos), 'video')} found by BlazePose {model.name}, not smoothed{where}"
-        return Watched(found, (said, *notes))
+        kept = "" if home is None else f", kept in {home}/"
+        return found, [f"people in {count(len(videos), 'video')} found by BlazePose {model.name}, not smoothed{kept}", *notes]
 
 
 @dataclass(frozen=True)

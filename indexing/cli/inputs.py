@@ -243,11 +243,14 @@ def on_overlaps(examples: Sequence[Example]) -> list[str]:
         ValueError: one example is given to two actions.
     """
     found = []
-    known = [example for example in examples if example.label is not None]
-    for one, other in combinations(known, 2):
+    files: dict[Path, list[Example]] = {}
+    for example in examples:
+        if example.label is not None:
+            files.setdefault(example.path.expanduser().resolve(), []).append(example)
+    for one, other in (pair for same in files.values() for pair in combinations(same, 2)):
         start = max(one.start or 0.0, other.start or 0.0)
         end = min(math.inf if one.end is None else one.end, math.inf if other.end is None else other.end)
-        if one.label != other.label and end - start > CUT and one.path.expanduser().resolve() == other.path.expanduser().resolve():
+        if one.label != other.label and end - start > CUT:
             if (one.start, one.end) == (other.start, other.end):
                 raise ValueError(
                     f"{one.path}: is given as {one.label} and as {other.label}; correct a label, or give the seconds of each"

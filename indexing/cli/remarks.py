@@ -17,7 +17,6 @@ SLOW, FAST = 5.0, 480.0  # frames per second given by hand, beyond which they ar
 STILL = 0.005  # of a body's size: joints that stay this close to their places do not move
 LISTED = 3  # moments, and names of joints
 WORDS = flags("fps", "person", "min_confidence", "format", "layout", size="--size W H")
-FOLLOWED = {"largest": "the largest", "confident": "the one that the detector trusts most", "tracked": "one who is tracked"}
 
 
 def remarks(clips: Sequence[Clip], reading: Reading) -> list[str]:
@@ -115,6 +114,7 @@ def few(sentences: Sequence[str]) -> list[str]:
 
 
 def _people(clips: Sequence[Clip], reading: Reading) -> list[str]:
+    from indexing.remarks import FOLLOWED
     from indexing.sync.people import jumps
 
     found = []

@@ -21,7 +21,7 @@ import numpy as np
 
 from indexing.clip import Clip, ClipSet
 from indexing.opening import count, error
-from indexing.pose.blazepose import JOINTS
+from indexing.pose.blazepose import JOINTS, Floats
 from indexing.pose.identities import Indices, Sightings, identities, joined, largest
 from indexing.pose.models import ModelSet, load_models
 from indexing.pose.networks import LiteNetworks, NetworkMaker
@@ -100,8 +100,9 @@ def detect(
 
     Returns:
         one :class:`~indexing.Clip` per person, the largest first: ``joints (frames, 33, 2)`` in pixels of the upright picture, from
-        its upper left corner, NaN where the person is not seen; exact ``times``; ``confidence``, the lower one of the network's two
-        probabilities that a joint is visible and that it is in the picture; ``meta`` with ``size`` (width, height), ``model``,
+        its upper left corner, NaN where the person is not seen, and where a joint lies outside of the picture; exact ``times``;
+        ``confidence``, the lower one of the network's two probabilities that a joint is visible and that it is in the picture;
+        ``meta`` with ``size`` (width, height), ``model``,
         ``every`` and who it is.  With ``people=1`` the clip has all frames, otherwise those from a person's first to the last.
 
     Raises:
@@ -298,7 +299,7 @@ def detected(task: VideoPlan, seen: Sightings, seconds: float = 0.0, linking: Li
         raise NobodyInVideo(task.path, np.arange(len(seen.times)), seen.times)
     people = identities(seen, task.options.identity)
     name = task.path.name
-    known = {"size": (task.info.width, task.info.height), "every": task.every, "made_from": task.made_from}
+    known = {"size": (task.info.width, task.info.height), "every": task.every, "content": task.content, "made_from": task.made_from}
     if task.people == 1:
         rows = largest(seen, people)
         crowded = len(seen.crowd) > 0 and float((seen.crowd > 1).mean()) > linking.crowded
@@ -316,11 +317,28 @@ def detected(task: VideoPlan, seen: Sightings, seconds: float = 0.0, linking: Li
     return Detected(ClipSet(clips, name), index, seen.times, len(np.unique(seen.at)) / len(seen.times), seconds, notes)
 
 
+def in_view(joints: Floats, confidence: Floats, size: tuple[int, int]) -> tuple[Floats, Floats]:
+    """Joints less those that lie outside of the picture, where the network can only guess.
+
+    Of 18 grey videos of arm raises that end above the knees, .67 are recognized by those of another person with these guesses, and
+    all without (``heavy``; ``python -m experiments.pose.videos``).
+
+    Args:
+        joints: ``(..., n, 2)`` pixels; confidence: ``(..., n)``; size: width and height of the picture.
+
+    Example:
+        >>> in_view(np.array([[5.0, 5.0], [5.0, 25.0]]), np.ones(2), (20, 20))[1].tolist()
+        [1.0, 0.0]
+    """
+    out = ((joints < 0) | (joints > np.asarray(size))).any(axis=-1)
+    return np.where(out[..., None], np.nan, joints), np.where(out, 0.0, confidence)
+
+
 def _clip(task: VideoPlan, seen: Sightings, rows: Indices, frames: Indices, name: str, meta: dict[str, Any]) -> Clip:
     """One person in these frames, NaN and confidence 0 where it is not seen."""
     joints = np.full((len(frames), JOINTS, 2), np.nan, dtype=np.float32)
     confidence = np.zeros((len(frames), JOINTS), dtype=np.float32)
     at = seen.at[rows] - frames[0]
-    joints[at], confidence[at] = seen.joints[rows], seen.confidence[rows]
+    joints[at], confidence[at] = in_view(seen.joints[rows], seen.confidence[rows], (task.info.width, task.info.height))
     times = seen.times[frames]
     return Clip(joints, times, confidence, name=name, skeleton=BLAZEPOSE33, up="-y", meta={**meta, "model": task.model})

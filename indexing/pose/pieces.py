@@ -57,6 +57,7 @@ class VideoPlan:
         times: ``(frames,)`` seconds of every frame that the file announces.
         model: name of the networks.
         pieces: in order; together they hold every frame that is looked at.
+        content: of the video, as a hash.
         made_from: what the result depends on, as a short hash: the video's content, the networks, and every option.
     """
 
@@ -69,6 +70,7 @@ class VideoPlan:
     model: str
     pieces: tuple[Piece, ...]
     options: PoseOptions
+    content: str
     made_from: str
 
     @property
@@ -92,9 +94,10 @@ def plan(path: Path, people: int, every: int, fps: float | None, model: str, opt
     # where the file has no times there is no way to go to one
     cuts = cut(times[wanted], options.pieces) if info.timed else [(0, 0, len(wanted))]
     pieces = tuple(Piece(number, wanted[a:b], wanted[lead:a]) for number, (lead, a, b) in enumerate(cuts))
-    about = (VERSION, content_of(path), model, people, every, fps, options)
+    content = content_of(path)
+    about = (VERSION, content, model, people, every, fps, options)
     made_from = hashlib.sha256(repr(about).encode()).hexdigest()[:16]
-    return VideoPlan(path, info, fps, times, people, every, model, pieces, options, made_from)
+    return VideoPlan(path, info, fps, times, people, every, model, pieces, options, content, made_from)
 
 
 def cut(times: Floats, options: PieceOptions = PieceOptions()) -> list[tuple[int, int, int]]:

@@ -13,14 +13,14 @@ import numpy as np
 
 from indexing.clip import Clip, ClipSet
 from indexing.files import prepare, recover_folder, replace_folder
-from indexing.opening import error
+from indexing.opening import error, is_regular
 from indexing.pose.blazepose import Floats
 from indexing.pose.detection import Detected, FrameProgress, ModelName, Progress, VideoTask, as_frames, check, made_by, run
 from indexing.pose.identities import Indices
 from indexing.pose.models import load_models
 from indexing.pose.networks import NetworkMaker
 from indexing.pose.options import PoseOptions
-from indexing.pose.pieces import clear, nearest, plan
+from indexing.pose.pieces import clear, content_of, nearest, plan
 from indexing.readers.clipset import read_clip_set
 from indexing.readers.npz import NumpyArchive
 
@@ -81,6 +81,18 @@ def keypoint_file(
     if isinstance(made, ValueError):
         raise made
     return made
+
+
+def kept_file(video: Path, folder: Path) -> Path | None:
+    """The clip set of a video in a folder, made from this very video, however it was made; None where there is none."""
+    target = folder / f"{video.stem}.npz"
+    if not (is_regular(target) and is_regular(video)):
+        return None
+    try:
+        content = NumpyArchive(target).get("content", np.zeros(0))
+    except ValueError:
+        return None
+    return target if content.size and str(content.flat[0]) == content_of(video) else None
 
 
 def keypoint_files(

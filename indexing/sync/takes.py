@@ -16,13 +16,12 @@ from dyntorch.numerics import Message
 from indexing.clip import Clip, check_fps, stretches
 from indexing.movement import clips_of, is_dataset
 from indexing.readers.files import VIDEOS
-from indexing.remarks import remarks_on
+from indexing.remarks import FOLLOWED, remarks_on
 from indexing.sync.options import SyncOptions
 
 FloatArray = NDArray[np.float64]
 Kind = Literal["keypoints", "video", "frames"]
 By = Literal["auto", "keypoints", "pixels"]
-FOLLOWED = {"largest": "the largest", "confident": "the one that the detector trusts most", "tracked": "one who is tracked"}
 CHOICES = ("auto", *FOLLOWED)
 ASSUMED = 30.0  # frames per second where nobody says
 

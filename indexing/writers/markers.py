@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from indexing.clip import Clip
 
 FloatArray = NDArray[np.floating]
+UNIT = re.compile(r"[^\W\d_]{1,12}")  # a word, as the headers of files have a place for
 ONE = "give the clips of one recording, or a folder for a file of each"
 
 
@@ -128,10 +130,11 @@ def people_of(clips: Sequence[Clip], path: Path) -> list[str]:
 
 
 def joint_names(clip: Clip) -> list[str]:
-    """The joints by name; those without are numbered."""
+    """The joints by name; those without are numbered, and what is no text in UTF-8 is written as ``\\udcXX``."""
     if clip.skeleton is None:
         return [f"joint{i}" for i in range(clip.joints.shape[1])]
-    return [" ".join(joint.split()) or f"joint{i}" for i, joint in enumerate(clip.skeleton.joints)]
+    plain = [" ".join(joint.encode("utf-8", "backslashreplace").decode().split()) for joint in clip.skeleton.joints]
+    return [joint or f"joint{i}" for i, joint in enumerate(plain)]
 
 
 def together(clips: Sequence[Clip]) -> tuple[FloatArray, FloatArray]:
@@ -148,8 +151,8 @@ def together(clips: Sequence[Clip]) -> tuple[FloatArray, FloatArray]:
 
 def _units(clips: Sequence[Clip], asked: str | None) -> tuple[str, bool]:
     """What coordinates are in, and whether that is a guess."""
-    known = asked or clips[0].meta.get("units")
-    if isinstance(known, str) and known:
+    known = clips[0].meta.get("units") if asked is None else asked
+    if isinstance(known, str) and UNIT.fullmatch(known):
         return known, False
     if clips[0].dims == 2:
         return "px", False

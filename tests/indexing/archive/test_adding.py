@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path, PurePath
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -422,3 +423,23 @@ def test_a_source_read_by_itself_says_what_it_holds(saved, moves) -> None:
     (clip,) = gather(moves(0))
     again = read_source(clip, {}, StorageOptions())
     assert again.recordings[0].windows == found.windows and again.stamp.modified == 0
+
+
+def test_a_dataset_is_a_source_for_each_of_its_people(tmp_path: Path, moves) -> None:
+    both = moves(1), moves(2)
+    position = np.stack([clip.joints.transpose(0, 2, 1) for clip in both], axis=3)
+    coords = {"individuals": SimpleNamespace(values=np.array(["a", "b"]), dims=("individuals",))}
+    found = SimpleNamespace(
+        position=SimpleNamespace(values=position, dims=("time", "space", "keypoints", "individuals")),
+        attrs={"fps": 30.0, "source_file": "two.h5"}, coords=coords,
+    )  # fmt: skip
+    done = Archive(tmp_path / "lab").add(found)
+    assert said(done) == {"two.h5#a": "added", "two.h5#b": "added"}
+
+
+@pytest.mark.parametrize(
+    ("name", "of_video"),
+    [("cam1.json", True), ("cam1_json", True), ("cam1DLC_resnet.csv", True), ("cam10.json", False), ("cam.json", False)],
+)
+def test_keypoints_are_those_of_a_video_by_their_name(name: str, of_video: bool) -> None:
+    assert sources._begins(name, "cam1") is of_video

@@ -101,3 +101,10 @@ def test_bad_input_leaves_nothing(run, words):
     code, _, err = run(words)
     assert code == 2 and BAD[words] in err and err.count("\n") == 1
     assert sorted(Path().rglob("*")) == before
+
+
+def test_fields_that_not_all_have_are_named(run):
+    for name, more in (("a", {"subject": 1}), ("b", {})):
+        ClipSet([Clip(BODY, fps=30.0, label=name, name=name, meta=more)]).save(f"{name}.npz")
+    code, said, _ = run("convert a.npz b.npz -o both.npz")
+    assert code == 0 and "both.npz: left out, as it is not known of all: subject" in said

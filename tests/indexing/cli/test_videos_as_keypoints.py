@@ -59,7 +59,9 @@ def test_learned_and_found_by_the_people_in_videos(films, model, capsys):
     assert sorted(one.name for one in (films / "pose").iterdir()) == ["hop.npz", "nod.npz"]
     looks = len(model)
     assert fit(films) == 0
-    assert "(2 found there)" in capsys.readouterr().out and len(model) == looks
+    assert "2 videos: the keypoints that were kept in" in capsys.readouterr().out and len(model) == looks
+    assert fit(films, "--people", "1") == 0
+    assert "people in 2 videos found" in capsys.readouterr().out and len(model) > looks
     out = films / "out"
     assert main(["index", "scan", str(films / "session.mp4"), "-m", str(films / "m.safetensors"), "--report", str(out)]) == 0
     said = capsys.readouterr().out

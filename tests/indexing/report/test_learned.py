@@ -37,5 +37,5 @@ def test_the_report_says_what_was_learned(folder):
 def test_flags_of_the_other_kind_of_input_are_refused(folder, capsys):
     words = ["index", "fit", str(folder / "set.npz"), "-o", str(folder / "n.safetensors")]
     assert main([*words, "--region", "all"]) == 2
-    assert "--region: of videos only" in capsys.readouterr().err
+    assert "--region: of the pixels of videos only" in capsys.readouterr().err
     assert not (folder / "n.safetensors").exists()

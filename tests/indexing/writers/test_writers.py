@@ -183,6 +183,16 @@ def test_what_is_refused_leaves_nothing(tmp_path, case):
     assert path.read_text() == "older" and list(tmp_path.iterdir()) == [path]
 
 
+@pytest.mark.parametrize("suffix", [".trc", ".c3d"])
+def test_what_headers_have_no_place_for(tmp_path, suffix):
+    names = ("a\udcff", "b c", *(f"j{i}" for i in range(15)))
+    clip = body(skeleton=Skeleton("s", names)).replace(meta={"units": "m\nm" + "x" * 300})
+    notes = write([clip], tmp_path / f"a{suffix}")
+    assert any("the units are not known" in str(note) for note in notes)
+    (back,) = read(tmp_path / f"a{suffix}")
+    assert back.skeleton.joints[0] == "a\\udcff" and back.joints.shape == clip.joints.shape
+
+
 def test_unknown_formats_and_folders(tmp_path):
     with pytest.raises(ValueError, match=r"no format ends in '.abc'; end the name in one of .npz, .trc, .c3d, .nc"):
         write([body()], tmp_path / "a.abc")
