@@ -124,8 +124,9 @@ class Convert:
         if path.suffix.lower() == ".npz":
             whole = len(self.recordings) == 1 or self.to is not None
             kept = [_sharing(clip, clips, whole) for clip in clips]
-            lost = sorted({key for clip in clips for key in clip.meta} - set(kept[0].meta) - {"followed", "untracked", "people"})
-            notes = [f"{path}: left out, as it is not known of all: {', '.join(lost)}"] if lost else []
+            given = {key for clip in clips for key, value in clip.meta.items() if value is not None}
+            lost = sorted(given - set(kept[0].meta) - {"followed", "untracked", "people"})
+            notes = [f"left out, as it is not known of all: {', '.join(lost)}"] if lost else []
             return partial(ClipSet(kept, path.name).save, path), notes
         if path.suffix.lower() in (".trc", ".c3d"):
             clips = [clip.replace(fps_assumed=False) for clip in clips]  # which was said of the recording

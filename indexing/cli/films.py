@@ -110,8 +110,10 @@ class Watching:
         from indexing.pose.writing import kept_file
 
         home = self.poses.expanduser() if self.poses is not None else None if beside is None else beside / "pose"
-        folders = _folders(videos, Path(_passing().name) if home is None else check_folder(home))
         usual = (self.pose_model, self.people, self.every) == ("auto", Watching.people, Watching.every)
+        if home is not None and not usual:  # beside what was found as usual, or by dyntorch pose, which stays
+            home /= f"{self.pose_model}-{self.people}-{self.every}"
+        folders = _folders(videos, Path(_passing().name) if home is None else check_folder(home))
         there = {video: kept_file(video.expanduser(), folder) for folder, some in folders.items() for video in some if usual}
         found: dict[Path, Path | ValueError] = {video: file for video, file in there.items() if file is not None}
         again = f"{count(len(found), 'video')}: the keypoints that were kept in {home} are used"

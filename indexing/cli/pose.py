@@ -27,7 +27,8 @@ class Pose:
 
     For session.mp4 it writes pose/session.npz (exact times, confidences, everybody) and pose/session_json/ (a file per frame, as
     OpenPose has them).  Joints are what the network sees in each frame: nothing is smoothed.  The same command again goes on where
-    it was interrupted, and leaves alone what is there.
+    it was interrupted, and leaves alone what is finished; other options make the files of a video again.  Files and folders of
+    these names that are not of this video are never replaced: that is said, and the video is left out.
     """
 
     videos: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="VIDEO ...", help_behavior_hint="")] = ()
@@ -62,6 +63,10 @@ class Pose:
         for name, value in (("people", self.people), ("every", self.every)):
             if value < 1:
                 raise ValueError(f"--{name} {value}: expected 1 or more")
+        if self.fps is not None:
+            from indexing.clip import check_fps
+
+            check_fps(self.fps, "--")
         check_workers(self.workers, None)
         folder = check_folder(self.out)
         return self._work(folder)

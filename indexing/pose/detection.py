@@ -19,14 +19,14 @@ from typing import Any, Literal
 
 import numpy as np
 
-from indexing.clip import Clip, ClipSet
+from indexing.clip import Clip, ClipSet, check_fps
 from indexing.opening import count, error
 from indexing.pose.blazepose import JOINTS, Floats
 from indexing.pose.identities import Indices, Sightings, identities, joined, largest
 from indexing.pose.models import ModelSet, load_models
 from indexing.pose.networks import LiteNetworks, NetworkMaker
 from indexing.pose.options import PoseOptions
-from indexing.pose.pieces import Piece, Stopped, Store, VideoPlan, plan, work
+from indexing.pose.pieces import Piece, PieceLost, Stopped, Store, VideoPlan, plan, work
 from indexing.readers.files import LinkOptions
 from indexing.readers.recording import NobodySeen
 from indexing.skeleton import BLAZEPOSE33
@@ -42,9 +42,9 @@ DEFAULT = PoseOptions()
 class NobodyInVideo(NobodySeen):
     """A video in which no person was found."""
 
-    def __init__(self, path: Path, frames: Indices, times: Any) -> None:
+    def __init__(self, path: Path, frames: Indices, times: Any, notes: Sequence[str] = ()) -> None:
         super().__init__(path, frames, times)
-        what = f"no person was found in any of its {count(len(frames), 'frame')}"
+        what = "; ".join([f"no person was found in any of its {count(len(frames), 'frame')}", *notes])
         self.args = error(path, what, "a person must be in view as a whole, and not too small; see docs/guide/pose.md").args
 
 
@@ -116,7 +116,7 @@ def detect(
         ...
         ValueError: detect: people must be a whole number from 1, got 0
     """
-    check(people, every, workers)
+    check(people, every, workers, fps)
     chosen = load_models(model, models)
     task = VideoTask(Path(path).expanduser(), people, every, fps, chosen.name, options)
     ((_, found),) = run([task], made_by(chosen), workers, as_frames(progress))
@@ -125,11 +125,13 @@ def detect(
     return found.clips
 
 
-def check(people: int, every: int, workers: int = 1, who: str = "detect: ") -> None:
+def check(people: int, every: int, workers: int = 1, fps: float | None = None, who: str = "detect: ") -> None:
     """Raise where a number makes no sense."""
     for name, value in (("people", people), ("every", every), ("workers", workers)):
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
             raise ValueError(f"{who}{name} must be a whole number from 1, got {value!r}")
+    if fps is not None:
+        check_fps(fps, who)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -151,7 +153,7 @@ class VideoTask:
 
 @dataclass(eq=False)
 class _Job:
-    """A video that is being worked."""
+    """A video that is being worked; what is wrong with it ends its other pieces, too."""
 
     task: VideoTask
     plan: VideoPlan | None = None
@@ -182,19 +184,24 @@ def run(
             return kept
         if halted.is_set() or job.problem is not None:
             raise Stopped
-        if not hasattr(own, "networks"):
-            own.networks = networks()
         before = meter.of_thread()
         try:
+            if not hasattr(own, "networks"):
+                own.networks = networks()
             seen = work(task, piece, own.networks, meter.add, lambda: halted.is_set() or job.problem is not None)
+            if job.store is not None:
+                job.store.put(piece, seen)
+        except PieceLost:
+            raise
+        except ValueError as problem:
+            job.problem = job.problem or problem
+            raise
         finally:
             job.seconds += time.perf_counter() - begun
         meter.add(len(piece.frames) - (meter.of_thread() - before))
-        if job.store is not None:
-            job.store.put(piece, seen)
         return seen
 
-    with _one_thread_each(workers), ThreadPoolExecutor(workers) as pool:
+    with ALONE.kept(), ThreadPoolExecutor(workers) as pool:
         try:
             for job in jobs:
                 if job.plan is not None:
@@ -218,7 +225,11 @@ def _planned(task: VideoTask) -> _Job:
 
 
 def _outcome(job: _Job) -> Detected | ValueError:
-    """What became of a video, when all of its pieces are done; of an early end only the pieces before it are there."""
+    """What became of a video, when all of its pieces are done.
+
+    Pieces that cannot be decoded are left out, and that is said; whatever else went wrong with one may go well the next time, and
+    nothing is made of the others.
+    """
     if job.plan is None:
         assert job.problem is not None
         return job.problem
@@ -227,8 +238,14 @@ def _outcome(job: _Job) -> Detected | ValueError:
     for piece in job.pieces:
         try:
             parts.append(piece.result())
-        except ValueError as problem:
+        except PieceLost as problem:
             first = first or problem
+        except ValueError as problem:
+            return problem
+        except Stopped:
+            if job.problem is None:
+                raise
+            return job.problem
     if not parts:
         return first or error(job.task.path, "has no frame to look at", "leave --every out")
     lost = [] if first is None else [f"{count(len(job.pieces) - len(parts), 'part')} of it cannot be decoded ({first})"]
@@ -259,15 +276,31 @@ class _Meter:
         return getattr(self._own, "frames", 0)
 
 
-@contextmanager
-def _one_thread_each(workers: int) -> Iterator[None]:
-    """Without OpenCV's own threads: on pictures this small they only wait for each other."""
-    before = cv2().getNumThreads()
-    cv2().setNumThreads(1)
-    try:
-        yield
-    finally:
-        cv2().setNumThreads(before)
+class _Alone:
+    """OpenCV without threads of its own, while anybody works: on pictures this small they only wait for each other."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._users, self._before = 0, 0
+
+    @contextmanager
+    def kept(self) -> Iterator[None]:
+        """As long as this lasts; the last one who leaves gives the threads back."""
+        with self._lock:
+            if not self._users:
+                self._before = cv2().getNumThreads()
+                cv2().setNumThreads(1)
+            self._users += 1
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._users -= 1
+                if not self._users:
+                    cv2().setNumThreads(self._before)
+
+
+ALONE = _Alone()  # the process has one OpenCV
 
 
 def workers_here() -> int:
@@ -296,7 +329,7 @@ def detected(task: VideoPlan, seen: Sightings, seconds: float = 0.0, linking: Li
         NobodyInVideo: there is none.
     """
     if not len(seen.at):
-        raise NobodyInVideo(task.path, np.arange(len(seen.times)), seen.times)
+        raise NobodyInVideo(task.path, np.arange(len(seen.times)), seen.times, seen.notes)
     people = identities(seen, task.options.identity)
     name = task.path.name
     known = {"size": (task.info.width, task.info.height), "every": task.every, "content": task.content, "made_from": task.made_from}
@@ -330,7 +363,7 @@ def in_view(joints: Floats, confidence: Floats, size: tuple[int, int]) -> tuple[
         >>> in_view(np.array([[5.0, 5.0], [5.0, 25.0]]), np.ones(2), (20, 20))[1].tolist()
         [1.0, 0.0]
     """
-    out = ((joints < 0) | (joints > np.asarray(size))).any(axis=-1)
+    out = np.asarray(((joints < 0) | (joints > np.asarray(size))).any(axis=-1))
     return np.where(out[..., None], np.nan, joints), np.where(out, 0.0, confidence)
 
 

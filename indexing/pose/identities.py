@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import groupby
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,15 +87,20 @@ def identities(seen: Sightings, options: IdentityOptions = IdentityOptions()) ->
     groups = np.split(order, np.flatnonzero(np.diff(seen.tracks[order])) + 1) if len(order) else []
     tracks = sorted((_stretch(seen, rows) for rows in groups), key=lambda one: (one.begin, -one.size))
     owners: list[list[_Stretch]] = []
-    for moment in dict.fromkeys(one.begin for one in tracks):
-        fresh = [one for one in tracks if one.begin == moment]
-        cost = np.array([[_apart(owner[-1], one, options) for one in fresh] for owner in owners]).reshape(-1, len(fresh))
+    recent: list[list[_Stretch]] = []  # those of them who may return; an hour has thousands of tracks
+    for moment, begun in groupby(tracks, key=lambda one: one.begin):
+        fresh = list(begun)
+        recent = [owner for owner in recent if moment - owner[-1].end <= options.away]
+        cost = np.array([[_apart(owner[-1], one, options) for one in fresh] for owner in recent]).reshape(-1, len(fresh))
+        taken = set()
         while cost.size and cost.min() <= 1:
             i, j = (int(k) for k in np.unravel_index(int(np.argmin(cost)), cost.shape))
-            owners[i].append(fresh[j])
+            recent[i].append(fresh[j])
+            taken.add(j)
             cost[i, :] = cost[:, j] = np.inf
-        taken = {id(owner[-1]) for owner in owners}
-        owners += [[one] for one in fresh if id(one) not in taken]
+        new = [[one] for j, one in enumerate(fresh) if j not in taken]
+        owners += new
+        recent += new
     people = [np.sort(np.concatenate([one.rows for one in owner])) for owner in owners]
     return sorted(people, key=lambda rows: (-float(_areas(seen.joints[rows]).sum()), int(rows[0])))
 

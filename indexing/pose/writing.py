@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import re
 import secrets
 import shutil
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from json import dumps
 from pathlib import Path
@@ -13,9 +16,20 @@ import numpy as np
 
 from indexing.clip import Clip, ClipSet
 from indexing.files import prepare, recover_folder, replace_folder
-from indexing.opening import error, is_regular
+from indexing.opening import entries, error, is_regular, parse_json, read_text
 from indexing.pose.blazepose import Floats
-from indexing.pose.detection import Detected, FrameProgress, ModelName, Progress, VideoTask, as_frames, check, made_by, run
+from indexing.pose.detection import (
+    Detected,
+    FrameProgress,
+    ModelName,
+    NobodyInVideo,
+    Progress,
+    VideoTask,
+    as_frames,
+    check,
+    made_by,
+    run,
+)
 from indexing.pose.identities import Indices
 from indexing.pose.models import load_models
 from indexing.pose.networks import NetworkMaker
@@ -24,7 +38,10 @@ from indexing.pose.pieces import clear, content_of, nearest, plan
 from indexing.readers.clipset import read_clip_set
 from indexing.readers.npz import NumpyArchive
 
-MARK = "made_from"  # the field by which a file of ours is known
+MADE_FROM, CONTENT = "made_from", "content"  # the fields by which a file of ours is known
+MARK = ".dyntorch"  # the file by which a folder is; not .json, of which Pose2Sim reads hidden ones, too
+FRAME = r"_\d{12,}_keypoints\.json"  # how the names of its files end
+MOVE = "move it away, or write to another folder"
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,26 +75,29 @@ def keypoint_file(
     workers: int = 1,
     progress: Progress | None = None,
     json: bool = False,
+    own: bool = False,
     options: PoseOptions = PoseOptions(),
 ) -> KeypointFile:
     """The keypoints of a video from a folder, made where they are not there yet.
 
     A file counts as there if it was made from the same content (size, and what stands at both ends of the file), by the same model
-    and the same arguments.  What was worked before an interruption is kept in a hidden folder and used.
+    and the same arguments; made by others, it is replaced.  What was worked before an interruption or an error is kept in a hidden
+    folder and used.  What is not ours, or of another video of this name, is never replaced.
 
     Args:
         video: a path.
         folder: where ``NAME.npz`` is looked for and written, and with ``json`` the folder ``NAME_json``.
         people, model, models, every, fps, workers, progress, options: as of :func:`indexing.pose.detect`.
-        json: whether to write the folder of JSON as well.
+        json: whether to write the folder of JSON as well.  One that was written before is kept up with the clip set in any case.
+        own: whether the folder belongs to this video alone, so that what is there of its older content is replaced.
 
     Raises:
-        ValueError: as :func:`indexing.pose.detect`, or a file of that name holds something else.
+        ValueError: as :func:`indexing.pose.detect`, or a file or folder of that name holds something else.
     """
-    check(people, every, workers)
+    check(people, every, workers, fps)
     chosen = load_models(model, models)
     task = VideoTask(Path(video).expanduser(), people, every, fps, chosen.name, options)
-    ((_, made),) = keypoint_files([task], Path(folder).expanduser(), made_by(chosen), workers, as_frames(progress), json)
+    ((_, made),) = keypoint_files([task], Path(folder).expanduser(), made_by(chosen), workers, as_frames(progress), json, own)
     if isinstance(made, ValueError):
         raise made
     return made
@@ -89,7 +109,7 @@ def kept_file(video: Path, folder: Path) -> Path | None:
     if not (is_regular(target) and is_regular(video)):
         return None
     try:
-        content = NumpyArchive(target).get("content", np.zeros(0))
+        content = NumpyArchive(target).get(CONTENT, np.zeros(0))
     except ValueError:
         return None
     return target if content.size and str(content.flat[0]) == content_of(video) else None
@@ -102,6 +122,7 @@ def keypoint_files(
     workers: int = 1,
     progress: FrameProgress | None = None,
     json: bool = True,
+    own: bool = False,
 ) -> Iterator[tuple[VideoTask, KeypointFile | ValueError]]:
     """The keypoint files of many videos, in their order, each as soon as it is written, or what is wrong with it.
 
@@ -112,7 +133,7 @@ def keypoint_files(
     there: dict[int, KeypointFile | ValueError] = {}
     for number, (task, target) in enumerate(zip(tasks, targets, strict=True)):
         try:
-            kept = _there(task, target, json)
+            kept = _there(task, target, json, own)
         except ValueError as problem:
             there[number] = problem
             continue
@@ -129,11 +150,12 @@ def keypoint_files(
             yield task, there[number]
             continue
         same, found = next(working)
-        if isinstance(found, ValueError):
+        if isinstance(found, NobodyInVideo):
             clear(_parts(target))
-            yield task, found
-        else:
-            yield task, _written(same, found, target, json)
+        made = found if isinstance(found, ValueError) else _written(same, found, target, json)
+        with suppress(OSError):  # pieces that are kept for the next run stay
+            _parts(target).rmdir()
+        yield task, made
     if fresh and left and not any(folder.iterdir()):
         folder.rmdir()
 
@@ -167,64 +189,132 @@ def _json(target: Path) -> Path:
     return target.with_name(f"{target.stem}_json")
 
 
-def _there(task: VideoTask, target: Path, json: bool) -> KeypointFile | None:
+def _there(task: VideoTask, target: Path, json: bool, own: bool) -> KeypointFile | None:
     """The file that was written before, if it is what would be written now.
 
     Raises:
-        ValueError: the video cannot be read, or a file or folder of that name is not ours.
+        ValueError: the video cannot be read, or a file or folder of that name is not ours, or is of another video.
     """
-    recover_folder(_json(target))
-    if not target.exists():
-        # a folder beside kept pieces is ours: the clip set is written after it, and the pieces go last
-        if json and _json(target).exists() and not _parts(target).is_dir():
-            raise error(_json(target), "is there, and not of this video", "move it away, or write to another folder")
+    folder = _json(target)
+    recover_folder(folder)
+    kept, beside = _of_file(target), _of_folder(folder)
+    if json and beside is None:
+        _refuse(folder)
+    if kept is None and beside is None:
         return None
-    try:
-        made_from = NumpyArchive(target).get(MARK, np.zeros(0))
-    except ValueError:
-        made_from = np.zeros(0)
-    if not made_from.size:
-        raise error(target, "is there, and no keypoint file of 'dyntorch pose'", "move it away, or write to another folder")
     now = plan(task.path, task.people, task.every, task.fps, task.model, task.options)
-    if str(made_from.flat[0]) != now.made_from:
+    for path, origin in ((target, kept), (folder, beside if json else None)):
+        if origin is not None and origin.content != now.content and not own:
+            raise error(path, "holds the keypoints of another video of this name", MOVE)
+    with_json = json or _of_video(beside, now.content)
+    if kept is None or kept.made_from != now.made_from:
+        if with_json:
+            _refuse(folder)
         return None
     clips = read_clip_set(target)
-    folder = _json(target) if json else None
-    if folder is not None and not folder.exists():
+    if with_json and (beside is None or beside.made_from != now.made_from):
         wanted = np.concatenate([piece.frames for piece in now.pieces])
         if task.people == 1:  # this clip has every frame that could be decoded
             wanted = np.array([nearest(now.times, time) for time in clips[0].times])
         write_json_folder(clips, wanted, now.times[wanted], folder)
-    return KeypointFile(target, folder, clips, True)
+    return KeypointFile(target, folder if with_json else None, clips, True)
 
 
-def _written(task: VideoTask, found: Detected, target: Path, json: bool) -> KeypointFile:
-    """Write what was found; the clip set last, so that it says that all is there."""
-    folder = _json(target) if json else None
-    if folder is not None:
-        write_json_folder(found.clips, found.frames, found.times, folder)
-    found.clips.save(target)
+def _written(task: VideoTask, found: Detected, target: Path, json: bool) -> KeypointFile | ValueError:
+    """Write what was found; the clip set last, so that it says that all is there.
+
+    A folder of JSON that an earlier run left beside it is written again even if none is asked for, as the two must agree.
+    """
+    folder = _json(target)
+    with_json = json or _of_video(_of_folder(folder), str(found.clips[0].meta[CONTENT]))
+    try:
+        _of_file(target)  # again: somebody may have put one there meanwhile
+        if with_json:
+            write_json_folder(found.clips, found.frames, found.times, folder)
+        found.clips.save(target)
+    except ValueError as problem:
+        return problem
     if task.parts is not None:
         clear(task.parts)
-    return KeypointFile(target, folder, found.clips, False, found)
+    return KeypointFile(target, folder if with_json else None, found.clips, False, found)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# What is ours, and of which video; nothing else is ever replaced.
+
+
+@dataclass(frozen=True)
+class _Origin:
+    """What a file or folder of ours was made from; see :class:`indexing.pose.pieces.VideoPlan`."""
+
+    made_from: str
+    content: str
+
+
+def _of_file(target: Path) -> _Origin | None:
+    """Of a clip set; None where there is none.
+
+    Raises:
+        ValueError: it is not ours.
+    """
+    if not target.exists():
+        return None
+    try:
+        fields = NumpyArchive(target)
+        made_from, content = fields.get(MADE_FROM, np.zeros(0)), fields.get(CONTENT, np.zeros(0))
+    except ValueError:
+        made_from = content = np.zeros(0)
+    if not (made_from.size and content.size):
+        raise error(target, "is there, and no keypoint file of 'dyntorch pose'", MOVE)
+    return _Origin(str(made_from.flat[0]), str(content.flat[0]))
+
+
+def _of_folder(folder: Path) -> _Origin | None:
+    """Of a folder of JSON; None where there is none, or one that is not ours."""
+    try:
+        told = parse_json(folder / MARK, read_text(folder / MARK), "")
+        return _Origin(str(told[MADE_FROM]), str(told[CONTENT]))
+    except (ValueError, KeyError, TypeError):
+        return None
+
+
+def _of_video(origin: _Origin | None, content: str) -> bool:
+    return origin is not None and origin.content == content
+
+
+def _refuse(folder: Path) -> None:
+    """Raise where something would be lost if the folder were replaced: it is not ours, or somebody keeps files in it."""
+    if not os.path.lexists(folder):
+        return
+    if _of_folder(folder) is None:
+        raise error(folder, "is there, and no folder of 'dyntorch pose'", MOVE)
+    frame = re.compile(re.escape(_name(folder)) + FRAME)
+    other = next((entry for entry in entries(folder) if not frame.fullmatch(entry.name)), None)
+    if other is not None:
+        raise error(other, "is no file of 'dyntorch pose', and its folder is to be written again", MOVE)
 
 
 def write_json_folder(clips: Sequence[Clip], numbers: Indices, times: Floats, folder: Path) -> Path:
     """Write a file per frame, as OpenPose does and Pose2Sim reads: ``NAME_000000000000_keypoints.json``.
 
     Each has ``people`` with ``pose_keypoints_2d`` (x, y, confidence of every joint; zeros where it was not seen) and ``person_id``,
-    and besides what OpenPose has, ``time`` in seconds.  The folder appears whole or not at all.
+    and besides what OpenPose has, ``time`` in seconds.  The folder appears whole or not at all; a hidden file in it says that it is
+    ours.
 
     Args:
         clips: one per person.
         numbers: ``(frames,)`` that the files are called by; times: ``(frames,)`` seconds.
+
+    Raises:
+        ValueError: it cannot be written, or what is there is not ours.
     """
+    _refuse(folder)
     rows: list[dict[int, int]] = [{nearest(times, time): row for row, time in enumerate(clip.times)} for clip in clips]
     ids = [clip.meta["person"] if clip.meta["followed"] == "ids" else -1 for clip in clips]
-    name = folder.name.removesuffix("_json")
+    mark = {key: str(clips[0].meta[key]) for key in (MADE_FROM, CONTENT)}
     building = folder.with_name(f".{folder.name}-{secrets.token_hex(8)}.tmp")
-    building.mkdir()
     try:
+        building.mkdir()
         for k, number in enumerate(numbers.tolist()):
             people = [
                 {"person_id": [who], "pose_keypoints_2d": _flat(clip, row[k])}
@@ -232,7 +322,8 @@ def write_json_folder(clips: Sequence[Clip], numbers: Indices, times: Floats, fo
                 if k in row and clip.seen[row[k]].any()
             ]
             frame = {"version": 1.3, "time": round(float(times[k]), 9), "people": people}
-            (building / f"{name}_{number:012d}_keypoints.json").write_text(dumps(frame), encoding="utf-8")
+            (building / f"{_name(folder)}_{number:012d}_keypoints.json").write_text(dumps(frame), encoding="utf-8")
+        (building / MARK).write_text(dumps(mark), encoding="utf-8")
         replace_folder(building, folder)
     except OSError as problem:
         said = f"cannot be written ({problem.strerror or problem})"
@@ -240,6 +331,10 @@ def write_json_folder(clips: Sequence[Clip], numbers: Indices, times: Floats, fo
     finally:
         shutil.rmtree(building, ignore_errors=True)
     return folder
+
+
+def _name(folder: Path) -> str:
+    return folder.name.removesuffix("_json")
 
 
 def _flat(clip: Clip, row: int) -> list[float]:

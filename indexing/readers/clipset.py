@@ -402,9 +402,9 @@ def _layout(
     path: Path, data: Mapping[str, Array], joints: Array, ups: Sequence[str], name: str | None
 ) -> tuple[Skeleton | None, dict[str, str]]:
     """Which joint is which: as the caller or the file says, or as the body shows; and what to say about it."""
-    if name is not None:
-        return told(path, name, joints.shape[1]), {}
     own = _skeleton(path, data, joints.shape[1])
+    if name is not None:
+        return told(path, name, joints.shape[1], own), {}
     if "joint_names" in data or len(ups) != 1:
         return own, {}
     layout, said, _ = settled(joints, None, candidates(joints.shape[1]), ups[0])

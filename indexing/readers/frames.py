@@ -7,6 +7,7 @@ names are a pickle in an attribute (read by :mod:`indexing.readers.pickles`).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -18,7 +19,9 @@ from indexing.opening import error, listed, shown
 from indexing.readers.hdf import AGAIN, Hdf5
 from indexing.readers.pickles import unpickled
 
+NAMES_BLOCK = 2**22  # names of the columns of a frame, each row of them counted, or of its rows: a day at 48 frames per second
 MOST_BLOCK = 100  # blocks of one frame, and rows of column names: usual are one, and three or four
+WORD = 2**10  # bytes of a name that is a value of numpy's, which is copied for each column
 KEY = "df_with_missing"
 LEVELS = {3: ("scorer", "bodyparts", "coords"), 4: ("scorer", "individuals", "bodyparts", "coords")}  # where they have no names
 
@@ -98,7 +101,7 @@ def _table(file: Hdf5, key: str) -> HdfFrame:
     for block in blocks:
         kind = file.attribute(table, f"{block}_kind")
         found = unpickled(file.path, _raw(kind), f"{table}@{block}_kind")
-        if not isinstance(found, list) or not all(isinstance(one, tuple) and one for one in found):
+        if not isinstance(found, list) or not all(_named(one) for one in found):
             raise error(file.path, f"{block} has no columns named by {' and '.join(LEVELS[3])}", AGAIN)
         parts += [tuple(map(str, one)) for one in found]
     records = file.records(table, ("index", *blocks))
@@ -115,9 +118,20 @@ def _level_names(file: Hdf5, key: str) -> list[str]:
     raw = file.attribute(key, "info")
     try:
         info = unpickled(file.path, _raw(raw), f"{key}@info")
-        return [str(name) for name in info[1]["names"]]
+        names = tuple(info[1]["names"])
+        return list(map(str, names)) if _named(names) else []
     except (ValueError, KeyError, TypeError, IndexError):
         return []
+
+
+def _named(one: Any) -> bool:
+    """Whether the words of a column's name are text and numbers: text of a tuple of tuples can be without end."""
+
+    def is_word(word: Any) -> bool:
+        short = word.nbytes < WORD if isinstance(word, np.generic) else type(word) is int and abs(word) < 2**63
+        return type(word) in (str, float) or short
+
+    return isinstance(one, tuple) and 0 < len(one) <= MOST_BLOCK and all(map(is_word, one))
 
 
 def _frame(file: Hdf5, header: list[list[str]], names: list[str], blocks: Sequence[FloatArray], rows: list[str]) -> HdfFrame:
@@ -135,6 +149,8 @@ def _rows(file: Hdf5, name: str, levels: int) -> list[list[str]]:
     """Each row of column names: words, and which of them each column has."""
     found = []
     for k in range(levels):
+        if levels * math.prod(file.shape(f"{name}_label{k}")) > NAMES_BLOCK:
+            raise error(file.path, f"{shown(name)} has more names than any table of points", AGAIN)
         words = _words(file, f"{name}_level{k}")
         which = file.array(f"{name}_label{k}", 1, "iu").astype(np.int64)
         if which.size and not (which.min() >= -1 and which.max() < len(words)):
@@ -153,6 +169,8 @@ def _axis(file: Hdf5, name: str, variety: str, levels: int) -> list[str]:
 
 
 def _words(file: Hdf5, name: str) -> list[str]:
+    if math.prod(file.shape(name)) > NAMES_BLOCK:
+        raise error(file.path, f"{shown(name)} has more names than any table of points", AGAIN)
     data = file.array(name, 1, "iufS")
     return [_word(value) for value in data.tolist()]
 

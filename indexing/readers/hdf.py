@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import math
 import mmap
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -22,7 +24,9 @@ HEAP = b"GCOL\x01\0\0\0"
 AGAIN = "export or copy it again"
 PLENTY_BLOCK = 2**26, 250  # bytes from which on a dataset must not be this many times as large as what is stored of it
 MOST_TEXTS_BLOCK = 20_000  # names in a dataset of text
-RECORDED = 7  # HDF5's class of references to other objects: values are read as numbers, text or records of these
+TEXT = 3  # HDF5's class of text, among others whose values are Python's objects: references, rows of any length
+GZIP = 1  # HDF5's number of this filter
+ENTRY = 16  # bytes of a text of any length in its dataset: its length (4), its heap (8), and which of its pieces (4)
 DAMAGED = (
     OSError, RuntimeError, KeyError, ValueError, TypeError, AttributeError, OverflowError, MemoryError, IndexError, SystemError,
     RecursionError,
@@ -89,6 +93,8 @@ class Hdf5:
         odd = [field for field, kind in kinds.items() if kind not in "biufS"]
         if odd:
             raise error(self.path, f"{shown(name)}: {shown(odd[0])} has values that are no numbers", AGAIN)
+        if data.dtype.hasobject:  # a piece of a heap may be the field of every record, and is copied for each
+            raise error(self.path, f"{shown(name)} has fields that are neither numbers nor text of one length", AGAIN)
         whole = self._sure(lambda: data[()], name)
         return {field: np.asarray(whole[field]) for field in fields}
 
@@ -105,34 +111,27 @@ class Hdf5:
         data = self._dataset(name)
         if data.ndim > 1 or data.size > MOST_TEXTS_BLOCK or data.dtype.kind not in "OS":
             raise error(self.path, f"{shown(name)} is no list of names", AGAIN)
-        if data.dtype.kind == "O" and self._sure(lambda: data.id.get_type().get_class(), name) == RECORDED:
+        if data.dtype.kind == "O" and self._sure(lambda: data.id.get_type().get_class(), name) != TEXT:
             raise error(self.path, f"{shown(name)} is no list of names", AGAIN)
         if data.dtype.kind == "O":
             self._check_lengths(data, name)
         return [_text(value) for value in np.atleast_1d(self._sure(lambda: data[()], name))]
 
     def _check_lengths(self, data: Any, name: str) -> None:
-        """Refuse texts that say they are longer than the file: the library would make room for them.
+        """Refuse texts that say they are longer than the file, alone or together: the library would make room for each of them.
 
-        A text of any length is kept as its length (4 bytes), and where it is: a heap (8), and which of its pieces (4).
+        Each is written to a heap by itself, so that together they fit the file, unless it sends several to the same piece.
         """
-
-        def places() -> list[tuple[int, int]]:
-            if data.chunks is None:
-                offset = data.id.get_offset()
-                return [] if offset is None else [(offset, 16 * data.size)]
-            if data.compression or data.shuffle or data.fletcher32:
-                return []  # a checksum or packing, which damage does not survive
-            found = [data.id.get_chunk_info(i) for i in range(data.id.get_num_chunks())]
-            return [(one.byte_offset, one.size) for one in found]
-
+        total = 0
         with opened(self.path) as file:
-            for offset, size in self._sure(places, name):
+            for offset, size, packed in self._sure(lambda: _places(data), name):
                 file.seek(min(offset, self._size))
-                raw = file.read(min(size, 16 * MOST_TEXTS_BLOCK))
-                lengths = np.frombuffer(raw[: len(raw) // 16 * 16], dtype=np.dtype([("length", "<u4"), ("rest", "V12")]))["length"]
-                if (lengths > self._size).any():
-                    raise error(self.path, f"{shown(name)} has a text longer than the file (which may be truncated)", AGAIN)
+                raw = file.read(min(size, ENTRY * MOST_TEXTS_BLOCK))
+                lengths = self._sure(partial(_lengths, raw, packed), name)
+                total += int(lengths.sum(dtype=np.uint64))
+                if total > self._size:
+                    what = "a text longer" if (lengths > self._size).any() else "texts that are together longer"
+                    raise error(self.path, f"{shown(name)} has {what} than the file (which may be truncated)", AGAIN)
 
     def attribute(self, name: str, key: str) -> Any:
         """An attribute of a group or dataset, text as ``str`` or ``bytes``; ``None`` where there is none."""
@@ -141,8 +140,10 @@ class Hdf5:
             owner = self._handle[name] if name == "/" or self._hard(name) else None
             if owner is None or key not in owner.attrs:
                 return None
-            size = owner.attrs.get_id(key).get_storage_size()
-            return owner.attrs[key] if size <= min(self._size, LARGEST) else None
+            about = owner.attrs.get_id(key)
+            if about.dtype.hasobject and math.prod(about.shape) > 1:  # texts that may be one piece of a heap, copied for each
+                return None
+            return owner.attrs[key] if about.get_storage_size() <= min(self._size, LARGEST) else None
 
         return self._sure(value, f"{name}@{key}")
 
@@ -231,6 +232,49 @@ def _check_heaps(path: Path) -> None:
                     raise error(path, "is damaged: one of its heaps of text has no end (the file may be truncated)", AGAIN)
                 step += length if not index else 16 + -(-length // 8) * 8
             at = data.find(HEAP, at + 8)
+
+
+def _places(data: Any) -> list[tuple[int, int, bool]]:
+    """Where a dataset keeps its values: offset and size of each block, and whether it is packed.
+
+    Raises:
+        ValueError: they are not where programs that write text of any length put it, or went through other filters.
+    """
+    whole = data.file.id.get_create_plist()
+    if whole.get_sizes() != (8, 8) or whole.get_userblock():
+        raise ValueError("text is kept in an uncommon way")
+    if data.chunks is None:
+        offset = data.id.get_offset()
+        if offset is None and data.id.get_storage_size():
+            raise ValueError("text is kept in an uncommon way")
+        return [] if offset is None else [(offset, ENTRY * data.size, False)]
+    plan = data.id.get_create_plist()
+    filters = [plan.get_filter(i)[0] for i in range(plan.get_nfilters())]
+    found = []
+    for i in range(data.id.get_num_chunks()):
+        one = data.id.get_chunk_info(i)
+        used = [number for k, number in enumerate(filters) if not one.filter_mask >> k & 1]  # a set bit: it was passed over
+        if used not in ([], [GZIP]):
+            raise ValueError("text is packed in an uncommon way")
+        found.append((one.byte_offset, one.size, bool(used)))
+    return found
+
+
+def _lengths(raw: bytes, packed: bool) -> Array:
+    """Lengths of the texts of a block.
+
+    Raises:
+        ValueError: the block is damaged, or larger than one of so many texts.
+    """
+    if packed:
+        most = ENTRY * MOST_TEXTS_BLOCK
+        try:
+            raw = zlib.decompressobj().decompress(raw, most + 1)
+        except zlib.error as problem:
+            raise ValueError(str(problem)) from None
+        if len(raw) > most:
+            raise ValueError("a block of text is too large")
+    return np.frombuffer(raw[: len(raw) // ENTRY * ENTRY], np.dtype([("length", "<u4"), ("place", "V12")]))["length"]
 
 
 def _text(value: Any) -> str:

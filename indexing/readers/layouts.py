@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from dyntorch.numerics import Message
 from indexing.clip import LARGEST, UP_AXES, FloatArray
 from indexing.joints import canonical
 from indexing.opening import error
@@ -147,17 +148,26 @@ def upward(joints: FloatArray, names: Sequence[str], usual: str, options: Layout
     return found.up if found.posture >= options.posture else usual
 
 
-def told(path: Path, name: str, joints: int) -> Skeleton:
+def told(path: Path, name: str, joints: int, own: Skeleton | None = None) -> Skeleton:
     """The layout that a person names.
 
+    Args:
+        own: what the file itself calls its joints, if it does.
+
     Raises:
-        ValueError: none has this name, or it has another number of joints.
+        ValueError: none has this name, it has another number of joints, or the file has its names in other places.
     """
     layout = layout_named(name)
     if len(layout.joints) != joints:
         same = ", ".join(one.name for one in candidates(joints)) or "none"
         what = f"has {joints} joints, but layout={layout.name} has {len(layout.joints)}"
         raise error(path, what, f"name another one (of {joints} joints: {same}), or leave it out")
+    known = {canonical(joint) for joint in layout.joints}
+    pairs = zip(own.joints if own is not None else (), layout.joints, strict=False)  # names that the layout has elsewhere
+    other = next(((a, b) for a, b in pairs if canonical(a) in known and canonical(a) != canonical(b)), None)
+    if other is not None:
+        said = f"names its joints itself ({other[0]} where layout={layout.name} has {other[1]})"
+        raise error(path, said, Message("leave {arg:layout=} out, or correct the names in the file"))
     return layout
 
 

@@ -45,7 +45,8 @@ def _recording(file: Hdf5, options: Options) -> Recording:
     animals = file.texts("individuals") if "individuals" in there else [""]
     space = file.texts("space") if "space" in file else ["x", "y", "z"][: position.shape[3]]
     frames = len(position)
-    if position.shape[1:] != (len(animals), len(joints), len(space)) or space not in (["x", "y"], ["x", "y", "z"]) or not frames:
+    fits = position.size and position.shape[1:] == (len(animals), len(joints), len(space))
+    if not fits or space not in (["x", "y"], ["x", "y", "z"]):
         said = f"{len(animals)} individuals, {len(joints)} keypoints and the axes {listed(space)}"
         raise error(file.path, f"position is {position.shape} for {said}", REMEDY)
     confidence = None

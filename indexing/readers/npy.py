@@ -40,6 +40,8 @@ def recording_of(joints: FloatArray, confidence: FloatArray | None = None) -> Re
     usual, flat = known(joints.shape[1]), joints.shape[2] == 2
     could = candidates(joints.shape[1])
     layout, said, up = settled(joints, usual, could, "-y" if flat else None)
+    if layout is not None and not said:  # the file says nothing of it
+        said = {"layout": f"recognized: {layout.name}"}
     frames = np.arange(len(joints))
     return Recording(frames, frames, joints, confidence, skeleton=layout, up=up or ("-y" if flat else "y"), meta=said)
 

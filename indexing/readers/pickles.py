@@ -6,7 +6,8 @@ parts, having checked them.  Every other name is refused, and said.  Nothing tha
 more memory than the file has bytes, and there are no more steps than a file of its size needs.
 
 Python's own reader in C is not used: it lays out a table as large as a number in the file says (``LONG_BINPUT``), and attributes of
-the functions that it is handed can be set by a file (``BUILD``).
+the functions that it is handed can be set by a file (``BUILD``).  Keys of dictionaries are text and numbers: a tuple is hashed by
+going into it, which a tuple of tuples can make endless, or deeper than the stack.  There are no sets, which hash what they hold.
 """
 
 from __future__ import annotations
@@ -32,18 +33,23 @@ STEPS = {
     *("FRAME", "NONE", "NEWTRUE", "NEWFALSE", "INT", "BININT", "BININT1", "BININT2", "LONG", "LONG1", "LONG4", "FLOAT", "BINFLOAT"),
     *("STRING", "BINSTRING", "SHORT_BINSTRING", "UNICODE", "SHORT_BINUNICODE", "BINUNICODE", "BINUNICODE8", "BINBYTES"),
     *("SHORT_BINBYTES", "BINBYTES8", "BYTEARRAY8", "EMPTY_LIST", "APPEND", "APPENDS", "LIST", "EMPTY_TUPLE", "TUPLE", "TUPLE1"),
-    *("TUPLE2", "TUPLE3", "EMPTY_DICT", "DICT", "SETITEM", "SETITEMS", "EMPTY_SET", "ADDITEMS", "FROZENSET"),
+    *("TUPLE2", "TUPLE3", "EMPTY_DICT", "DICT", "SETITEM", "SETITEMS"),
     *("GLOBAL", "STACK_GLOBAL", "REDUCE", "BUILD"),
 }
 # what a step that is not known may do, in words
 OTHERS = {
     "PERSID": "a persistent id", "BINPERSID": "a persistent id", "EXT1": "an extension code", "EXT2": "an extension code",
-    "EXT4": "an extension code", "NEXT_BUFFER": "values outside of the file",
+    "EXT4": "an extension code", "NEXT_BUFFER": "values outside of the file", "EMPTY_SET": "a set", "ADDITEMS": "a set",
+    "FROZENSET": "a set",
 }  # fmt: skip
 PLAIN = "biufSU"  # kinds of arrays: numbers and text
 STEP_BLOCK = 2**16, 4, 2**24  # steps of any file, bytes of a file per further step, and steps of the largest file
 MADE_BLOCK = 2**20, 4  # bytes, and bytes per byte of the file, of what is decoded
 LATIN = ("latin1", "latin-1")
+KEYS = (str, bytes, int, float, bool, type(None))  # types of keys that are hashed in time that a file cannot choose
+WHOLE = 2**53  # whole numbers beyond it are no keys: those that are 2^61 - 1 apart have one hash
+NUMBERED_BLOCK = 2**13  # keys of a dictionary with numbers among them: names of classes are some hundred
+LONGEST_CODE = 12  # characters of a type's name, such as <f8 or U100
 
 
 class Refused(Exception):
@@ -56,8 +62,8 @@ class _Kind:
     __slots__ = ("dtype",)
 
     def __init__(self, code: Any) -> None:
-        code = code.decode("latin-1") if isinstance(code, bytes) else code
-        if not isinstance(code, str) or not code[1:].isdigit() or code[:1] not in PLAIN:
+        code = code.decode("latin-1") if isinstance(code, bytes) and len(code) <= LONGEST_CODE else code
+        if not isinstance(code, str) or len(code) > LONGEST_CODE or not code[1:].isdigit() or code[:1] not in PLAIN:
             raise Refused(f"an array of {shown(code)}, neither numbers nor text")
         try:
             self.dtype = np.dtype(code)
@@ -79,16 +85,16 @@ class _Kind:
 class _Array:
     """An array, on its way to numpy's."""
 
-    __slots__ = ("values",)
+    __slots__ = ("bytes_of", "values")
 
-    def __init__(self, values: NDArray[Any] | None = None) -> None:
-        self.values = values
+    def __init__(self, bytes_of: Callable[[int], None], values: NDArray[Any] | None = None) -> None:
+        self.bytes_of, self.values = bytes_of, values
 
     def __setstate__(self, state: Any) -> None:
         if not isinstance(state, tuple) or len(state) != 5:
             raise Refused("an array without its parts")
         _, shape, kind, fortran, data = state
-        self.values = _values(data, kind, shape, "F" if fortran else "C")
+        self.values = _values(data, kind, shape, "F" if fortran else "C", self.bytes_of)
 
 
 class _Name:
@@ -110,12 +116,23 @@ class _Name:
         raise Refused("a change to a function")
 
 
+class _Memo(dict[Any, Any]):
+    """What a file keeps under numbers that it chooses: by their digits, whose hashes it cannot choose."""
+
+    def __setitem__(self, key: int, value: Any) -> None:
+        super().__setitem__(str(key), value)
+
+    def __getitem__(self, key: int) -> Any:
+        return super().__getitem__(str(key))
+
+
 class _Reader(pickle._Unpickler):
     """Python's own reader of pickles, less all that it can do but containers, numbers, text and six names."""
 
     def __init__(self, data: bytes) -> None:
         super().__init__(io.BytesIO(data), encoding="latin1")  # of arrays that Python 2 wrote
         self._bytes, self._made = len(data), 0
+        self.memo = _Memo()
         most, per, last = STEP_BLOCK
         self._steps = min(most + len(data) // per, last)
         ndarray = _Name(self._never)
@@ -177,19 +194,35 @@ class _Reader(pickle._Unpickler):
     def _reconstruct(self, ndarray: _Name, kind: Any, *_: Any) -> _Array:
         if kind is not ndarray:
             raise Refused("an array of another class")
-        return _Array()
+        return _Array(self.bytes_of)
 
     def _scalar(self, kind: Any, data: Any = None) -> Any:
-        return _values(data, kind, (), "C")[()]
+        values = _values(data, kind, (), "C", self.bytes_of)
+        self.bytes_of(values.nbytes)
+        return values[()]
 
     def _frombuffer(self, data: Any, kind: Any, shape: Any, order: Any) -> _Array:
-        return _Array(_values(data, kind, shape, "F" if order == "F" else "C"))
+        return _Array(self.bytes_of, _values(data, kind, shape, "F" if order == "F" else "C", self.bytes_of))
 
     def _encode(self, text: Any, encoding: Any = None) -> bytes:
         if not isinstance(text, str) or encoding not in LATIN:
             raise Refused(f"text in the encoding {shown(encoding)}")
         self.bytes_of(len(text))
         return text.encode("latin-1")
+
+    # ---- steps of its own --------------------------------------------------------------------------------------------
+    def _dict(self) -> None:
+        made: dict[Any, Any] = {}
+        _fill(made, self.pop_mark())  # type: ignore[attr-defined]  # the stubs do not list what the reader is made of
+        self.append(made)
+
+    def _setitem(self) -> None:
+        value, key = self.stack.pop(), self.stack.pop()
+        _fill(self.stack[-1], [key, value])
+
+    def _setitems(self) -> None:
+        items = self.pop_mark()  # type: ignore[attr-defined]
+        _fill(self.stack[-1], items)
 
     def _bytearray(self) -> None:
         (size,) = struct.unpack("<Q", self.read(8))
@@ -198,26 +231,48 @@ class _Reader(pickle._Unpickler):
         self.append(bytes(self.read(size)))
 
 
-def _values(data: Any, kind: Any, shape: Any, order: Any) -> NDArray[Any]:
-    """An array from its parts, each of which is checked."""
+def _fill(into: Any, items: list[Any]) -> None:
+    """Put keys and values, which take turns, into a dictionary.
+
+    Raises:
+        Refused: it is none, or a key is neither text nor a number.
+    """
+    if type(into) is not dict or len(items) % 2:
+        raise Refused("keys and values without a dictionary")
+    for key, value in zip(items[::2], items[1::2], strict=True):
+        if type(key) not in KEYS:
+            raise Refused(f"a key of the type {clipped(type(key).__name__, VALUE)}")
+        if type(key) is int and abs(key) > WHOLE:
+            raise Refused(f"the key {shown(key)}")
+        if type(key) in (int, float) and len(into) >= NUMBERED_BLOCK:
+            raise Refused(f"more than {NUMBERED_BLOCK} numbers as keys")
+        into[key] = value
+
+
+def _values(data: Any, kind: Any, shape: Any, order: Any, bytes_of: Callable[[int], None]) -> NDArray[Any]:
+    """An array from its parts, each of which is checked; what is copied is counted by ``bytes_of``."""
     if not isinstance(kind, _Kind) or not isinstance(shape, tuple) or not all(type(side) is int and side >= 0 for side in shape):
         raise Refused("an array without its parts")
     if isinstance(data, str):  # as Python 2 wrote it
+        bytes_of(len(data))
         data = data.encode("latin-1")
     if not isinstance(data, bytes):
         raise Refused("an array of Python objects")
-    if len(shape) > 32 or math.prod(shape) * kind.dtype.itemsize != len(data):
+    if len(shape) > 32 or max(shape, default=0) >= 2**63 or math.prod(shape) * kind.dtype.itemsize != len(data):
         raise Refused(f"an array of {len(data)} bytes for the shape {shown(shape)}")
     if not len(data):
-        if max(shape, default=0) > LARGEST:
+        if max(shape, default=0) > LARGEST or (not kind.dtype.itemsize and math.prod(shape) > 1):  # numpy makes U0 a U1
             raise Refused(f"an array of the shape {shown(shape)}")
         return np.zeros(shape, kind.dtype)
     return np.frombuffer(data, kind.dtype).reshape(shape, order=order)
 
 
 _CODES = {opcode.name: opcode.code.encode("latin-1")[0] for opcode in pickletools.opcodes}
+_OWN: dict[str, Callable[[Any], None]] = {
+    "BYTEARRAY8": _Reader._bytearray, "DICT": _Reader._dict, "SETITEM": _Reader._setitem, "SETITEMS": _Reader._setitems,
+}  # fmt: skip
 _STEPS: dict[int, Callable[[Any], None]] = {
-    _CODES[name]: _Reader._bytearray if name == "BYTEARRAY8" else pickle._Unpickler.dispatch[_CODES[name]] for name in STEPS
+    _CODES[name]: _OWN.get(name) or pickle._Unpickler.dispatch[_CODES[name]] for name in STEPS
 }
 _OTHER = {_CODES[name]: OTHERS.get(name, f"the step {name}") for name in _CODES if name not in STEPS}
 

@@ -45,8 +45,11 @@ def read(source: Source, options: Options) -> ClipSet:
     clips: list[Clip] = []
     nobody: NobodySeen | None = None
     for i, one in enumerate(annotations):
+        if _is_empty(one):
+            nobody = nobody or NobodySeen(source.path, np.zeros(0, dtype=np.int64))
+            continue
         recording, name = _annotation(source, i, one)
-        used += 8 * recording.joints.size
+        used += 8 * (recording.joints.size + len(recording.frames))
         if used > room:
             raise error(source.path, f"annotation {i}: the same array again and again", REMEDY)
         label = options.label if options.label is not None else _label(source, i, one)
@@ -63,6 +66,12 @@ def read(source: Source, options: Options) -> ClipSet:
     return ClipSet(clips, source.path.name)
 
 
+def _is_empty(one: Any) -> bool:
+    """Whether an annotation has no people: a detector found nobody."""
+    keypoint = one.get("keypoint") if isinstance(one, dict) else None
+    return isinstance(keypoint, np.ndarray) and keypoint.ndim == 4 and keypoint.shape[0] == 0
+
+
 def _annotation(source: Source, index: int, one: Any) -> tuple[Recording, str]:
     """What an annotation shows, and what it is called."""
     if not isinstance(one, dict) or not isinstance(one.get("keypoint"), np.ndarray):
@@ -72,7 +81,7 @@ def _annotation(source: Source, index: int, one: Any) -> tuple[Recording, str]:
     where, keypoint = f"annotation {index} ({shown(name)})", one["keypoint"]
     if keypoint.ndim == 3:
         keypoint = keypoint[None]
-    if keypoint.ndim != 4 or keypoint.shape[3] not in (2, 3) or keypoint.dtype.kind not in "fiu" or not all(keypoint.shape[1:]):
+    if keypoint.ndim != 4 or keypoint.shape[3] not in (2, 3) or keypoint.dtype.kind not in "fiu" or not all(keypoint.shape):
         said = f"{where}: keypoint must be (people, frames, joints, 2 or 3), got {keypoint.dtype} {keypoint.shape}"
         raise error(source.path, said, REMEDY)
     people, frames, joints, dims = keypoint.shape
@@ -96,7 +105,7 @@ def _annotation(source: Source, index: int, one: Any) -> tuple[Recording, str]:
 def _label(source: Source, index: int, one: dict[str, Any]) -> Hashable | None:
     label = one.get("label")
     label = label.item() if isinstance(label, (np.generic, np.ndarray)) and label.size == 1 else label
-    if label is None or (isinstance(label, (int, str)) and not isinstance(label, bool)):
+    if label is None or isinstance(label, str) or (isinstance(label, int) and not isinstance(label, bool) and label < 2**63):
         return None if isinstance(label, int) and label < 0 else label
     raise error(source.path, f"annotation {index}: label must be a number or text, got {shown(label)}", REMEDY)
 
@@ -118,6 +127,9 @@ def _splits(source: Source, data: Any) -> Any:
         return lambda name: {}
     if not isinstance(split, dict) or not all(isinstance(names, list) for names in split.values()):
         raise error(source.path, f"split must be lists of names, got {shown(split)}", REMEDY)
+    # one list may be every part of the set; a name, and a part of a clip's, take a byte of the file at least
+    if sum(map(len, split.values())) + len(split) * len(data["annotations"]) > size_of(source.path):
+        raise error(source.path, f"split has {len(split)} parts with more names than the file has bytes", REMEDY)
     parts = {str(part): {name for name in names if isinstance(name, str)} for part, names in split.items()}
     if sum(map(len, parts.values())) == len(set().union(*parts.values())):
         return lambda name: {"split": next((part for part, names in parts.items() if name in names), "")}

@@ -19,7 +19,7 @@ from indexing.clip import LARGEST, Clip, ClipSet, FloatArray
 from indexing.opening import error, shown
 from indexing.readers.files import LinkOptions, Options
 from indexing.readers.layouts import settled, told
-from indexing.skeleton import Skeleton
+from indexing.skeleton import LAYOUTS, Skeleton
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Who is who where a frame shows several people: the one place where that is decided.
@@ -388,7 +388,9 @@ class NobodySeen(ValueError):
 def _named(path: Path, recording: Recording, options: Options) -> Recording:
     """Which joint is which: as the caller says, or where only their number is known, as the body looks."""
     if options.layout is not None:
-        return replace(recording, skeleton=told(path, options.layout, recording.joints.shape[1]))
+        own = None if any(recording.skeleton is one for one in LAYOUTS.values()) else recording.skeleton  # by its number alone
+        meta = {key: value for key, value in recording.meta.items() if key != "layout"}
+        return replace(recording, skeleton=told(path, options.layout, recording.joints.shape[1], own), meta=meta)
     if not recording.layouts:
         return recording
     layout, said, _ = settled(recording.joints, recording.skeleton, recording.layouts, recording.up)

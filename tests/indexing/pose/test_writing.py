@@ -10,10 +10,14 @@ import pytest
 
 from indexing import ClipSet
 from indexing.pose import PoseOptions, detect, keypoint_file
+from indexing.pose.detection import VideoTask
 from indexing.pose.options import PieceOptions
+from indexing.pose.pieces import Store
+from indexing.pose.writing import keypoint_files, write_json_folder
 from indexing.readers import read
 from indexing.readers.clipset import read_clip_set
-from tests.indexing.pose.scene import drawn, joints_of, written
+from indexing.video.reading import Video
+from tests.indexing.pose.scene import SceneNetworks, drawn, joints_of, written
 from tests.indexing.pose.test_detection import HEIGHT, WIDTH, film, person, walk
 
 SHORT = PoseOptions(pieces=PieceOptions(seconds=0.5, lead=0.1))
@@ -29,6 +33,22 @@ def same(one: ClipSet, other: ClipSet) -> bool:
     )
 
 
+def frames_in(folder: Path) -> dict[str, str]:
+    """What a folder of JSON holds that others read, by name."""
+    return {file.name: file.read_text() for file in sorted(folder.iterdir()) if not file.name.startswith(".")}
+
+
+def interrupted(path: Path, folder: Path, **how) -> None:
+    """A run that ends when two of four pieces or more are kept."""
+
+    def interrupt(share):
+        if share > 0.7:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        keypoint_file(path, folder, options=SHORT, progress=interrupt, **how)
+
+
 def test_the_file_holds_what_was_found(tmp_path, seeing):
     path = film(tmp_path, [[walk(i)] for i in range(12)], fps=25)
     made = keypoint_file(path, tmp_path / "pose", json=True)
@@ -42,9 +62,11 @@ def test_the_file_holds_what_was_found(tmp_path, seeing):
 def test_a_file_per_frame_as_openpose_has_them(tmp_path, seeing):
     scenes = [[walk(i, speed=2.0)] if i != 4 else [] for i in range(9)]
     made = keypoint_file(film(tmp_path, scenes, fps=10), tmp_path, every=2, json=True)
-    files = sorted(made.folder.iterdir())
-    assert [file.name for file in files] == [f"a_{number:012d}_keypoints.json" for number in (0, 2, 4, 6, 8)]
-    frames = [json.loads(file.read_text()) for file in files]
+    files = frames_in(made.folder)
+    assert list(files) == [f"a_{number:012d}_keypoints.json" for number in (0, 2, 4, 6, 8)]
+    assert not (made.folder / ".dyntorch").suffix  # Pose2Sim takes hidden files that end with .json for frames
+    assert [file.name for file in made.folder.iterdir() if file.name not in files] == [".dyntorch"]
+    frames = [json.loads(text) for text in files.values()]
     assert [frame["time"] for frame in frames] == pytest.approx([0, 0.2, 0.4, 0.6, 0.8])
     assert [len(frame["people"]) for frame in frames] == [1, 1, 0, 1, 1]
     (one,) = frames[1]["people"]
@@ -59,7 +81,7 @@ def test_a_file_per_frame_as_openpose_has_them(tmp_path, seeing):
 def test_several_people_have_ids_in_both_files(tmp_path, seeing):
     scenes = [[person(60, 180, 40), *([person(200 + i, 160, 80)] if i > 5 else [])] for i in range(30)]
     made = keypoint_file(film(tmp_path, scenes), tmp_path, people=3, json=True)
-    frames = [json.loads(file.read_text()) for file in sorted(made.folder.iterdir())]
+    frames = [json.loads(text) for text in frames_in(made.folder).values()]
     assert [one["person_id"] for one in frames[0]["people"]] == [[2]]
     assert [one["person_id"] for one in frames[-1]["people"]] == [[1], [2]]
     everyone = read(made.folder, fps=30, person="everyone")
@@ -88,22 +110,63 @@ def test_other_arguments_make_another_file(tmp_path, seeing, how):
     assert not keypoint_file(path, tmp_path / "pose").reused
 
 
-def test_another_video_of_the_same_name_makes_another_file(tmp_path, seeing):
-    path = film(tmp_path, [[walk(i)] for i in range(12)])
-    keypoint_file(path, tmp_path / "pose")
+def test_another_video_of_the_same_name_is_refused_before_any_work(tmp_path, seeing):
+    path, folder = film(tmp_path, [[walk(i)] for i in range(12)]), tmp_path / "pose"
+    made = keypoint_file(path, folder, json=True)
+    before = made.path.read_bytes(), frames_in(made.folder), len(seeing)
     film(tmp_path, [[walk(i + 1)] for i in range(12)])
-    assert not keypoint_file(path, tmp_path / "pose").reused
+    said = r"a\.npz: holds the keypoints of another video of this name; move it away, or write to another folder"
+    for how in ({}, {"json": True}, {"every": 2}):
+        with pytest.raises(ValueError, match=said) as caught:
+            keypoint_file(path, folder, **how)
+        assert "\n" not in str(caught.value)
+    assert (made.path.read_bytes(), frames_in(made.folder), len(seeing)) == before
+    made.path.rename(tmp_path / "moved.npz")
+    with pytest.raises(ValueError, match="a_json: holds the keypoints of another video of this name"):
+        keypoint_file(path, folder, json=True)
+    assert frames_in(made.folder) == before[1] and len(seeing) == before[2]
+    made.folder.rename(tmp_path / "moved_json")
+    assert not keypoint_file(path, folder, json=True).reused
+
+
+def test_a_folder_of_one_video_follows_its_content(tmp_path, seeing):
+    path = film(tmp_path, [[walk(i)] for i in range(12)])
+    keypoint_file(path, tmp_path / "pose", own=True)
+    film(tmp_path, [[walk(i + 1)] for i in range(14)])
+    again = keypoint_file(path, tmp_path / "pose", own=True)
+    assert not again.reused and len(read_clip_set(again.path)[0]) == 14
+
+
+@pytest.mark.parametrize("asked", [True, False])
+def test_other_arguments_leave_no_stale_json(tmp_path, seeing, asked):
+    path, folder = film(tmp_path, [[walk(i)] for i in range(12)]), tmp_path / "pose"
+    keypoint_file(path, folder, json=True)
+    made = keypoint_file(path, folder, every=3, json=asked)
+    assert not made.reused and made.folder == folder / "a_json" and len(frames_in(made.folder)) == 4
+    again = keypoint_file(path, folder, every=3, json=asked)
+    assert again.reused and again.folder == made.folder
+
+
+def test_json_and_clip_set_agree_after_a_kill_between_them(tmp_path, seeing, monkeypatch):
+    path, folder = film(tmp_path, [[walk(i)] for i in range(12)]), tmp_path / "pose"
+    before = frames_in(keypoint_file(path, folder, json=True).folder)
+    with monkeypatch.context() as patch:
+        patch.setattr(ClipSet, "save", lambda self, path: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            keypoint_file(path, folder, every=3, json=True)
+    assert frames_in(folder / "a_json") != before
+    assert keypoint_file(path, folder).reused and frames_in(folder / "a_json") == before
 
 
 def test_a_folder_of_json_that_is_gone_comes_back(tmp_path, seeing):
     path = film(tmp_path, [[walk(i)] for i in range(12)])
     made = keypoint_file(path, tmp_path / "pose", json=True)
-    before = {file.name: file.read_text() for file in made.folder.iterdir()}
+    before = frames_in(made.folder)
     for file in made.folder.iterdir():
         file.unlink()
     made.folder.rmdir()
     assert keypoint_file(path, tmp_path / "pose", json=True).reused
-    assert {file.name: file.read_text() for file in made.folder.iterdir()} == before
+    assert frames_in(made.folder) == before
 
 
 def test_files_of_others_are_left_alone(tmp_path, seeing):
@@ -111,22 +174,66 @@ def test_files_of_others_are_left_alone(tmp_path, seeing):
     np.savez(tmp_path / "a.npz", joints=np.ones((3, 2, 2)))
     with pytest.raises(ValueError, match=r"a\.npz: is there, and no keypoint file of 'dyntorch pose'; move it away"):
         keypoint_file(path, tmp_path)
-    (tmp_path / "pose" / "a_json").mkdir(parents=True)
-    with pytest.raises(ValueError, match="a_json: is there, and not of this video"):
-        keypoint_file(path, tmp_path / "pose", json=True)
+
+
+@pytest.mark.parametrize("marked", ["", "{", "[]", "3", '{"made_from": "x"}'])
+def test_a_folder_of_others_is_never_replaced(tmp_path, seeing, marked):
+    path, folder = film(tmp_path, [[walk(i)] for i in range(50)]), tmp_path / "pose"
+    theirs = folder / "a_json" / "mine.json"
+    theirs.parent.mkdir(parents=True)
+    theirs.write_text("mine")
+    if marked:
+        (theirs.parent / ".dyntorch").write_text(marked)
+    said = r"a_json: is there, and no folder of 'dyntorch pose'; move it away, or write to another folder"
+    with pytest.raises(ValueError, match=said):
+        keypoint_file(path, folder, json=True)
+    interrupted(path, folder)
+    looks = len(seeing)
+    with pytest.raises(ValueError, match=said):  # kept pieces say nothing of the folder
+        keypoint_file(path, folder, json=True, options=SHORT)
+    assert len(seeing) == looks
+    assert keypoint_file(path, folder, options=SHORT).folder is None
+    for how in ({"options": SHORT}, {"every": 2}):
+        with pytest.raises(ValueError, match=said):
+            keypoint_file(path, folder, json=True, **how)
+    assert keypoint_file(path, folder, every=2).folder is None and theirs.read_text() == "mine"
+
+
+def test_a_folder_that_somebody_makes_meanwhile_is_not_replaced(tmp_path, seeing):
+    path, folder = film(tmp_path, [[walk(i)] for i in range(50)]), tmp_path / "pose"
+
+    def meanwhile(share):
+        (folder / "a_json").mkdir(exist_ok=True)
+
+    with pytest.raises(ValueError, match="a_json: is there, and no folder of 'dyntorch pose'"):
+        keypoint_file(path, folder, json=True, options=SHORT, progress=meanwhile)
+    (folder / "a_json").rmdir()
+    before = len(seeing)
+    assert same(keypoint_file(path, folder, json=True, options=SHORT).clips, detect(path, options=SHORT))
+    assert len(seeing) == before + 1  # for detect: every piece was kept
+
+
+def test_what_somebody_keeps_in_our_folder_is_not_lost(tmp_path, seeing):
+    path, folder = film(tmp_path, [[walk(i)] for i in range(12)]), tmp_path / "pose"
+    made = keypoint_file(path, folder, json=True)
+    (made.folder / "notes.txt").write_text("mine")
+    assert keypoint_file(path, folder, json=True).reused
+    for asked in (True, False):
+        with pytest.raises(ValueError, match=r"notes\.txt: is no file of 'dyntorch pose', and its folder is to be written again"):
+            keypoint_file(path, folder, every=2, json=asked)
+    assert (made.folder / "notes.txt").exists() and keypoint_file(path, folder).reused
+
+
+def test_a_folder_of_json_that_cannot_be_made_is_one_line(tmp_path, seeing):
+    clips = detect(film(tmp_path, [[walk(i)] for i in range(5)]))
+    with pytest.raises(ValueError, match=r"a_json: cannot be written \(No such file or directory\); free the disk"):
+        write_json_folder(clips, np.arange(5), clips[0].times, tmp_path / "none" / "a_json")
 
 
 def test_an_interrupted_video_goes_on_where_it_was_and_comes_out_the_same(tmp_path, seeing):
     path = film(tmp_path, [[walk(i), person(280, 200, 45)] for i in range(50)])
-    expected = detect(path, people=2, options=SHORT)
-
-    def interrupt(share):
-        if share > 0.7:
-            raise KeyboardInterrupt
-
-    folder = tmp_path / "pose"
-    with pytest.raises(KeyboardInterrupt):
-        keypoint_file(path, folder, people=2, options=SHORT, progress=interrupt)
+    expected, folder = detect(path, people=2, options=SHORT), tmp_path / "pose"
+    interrupted(path, folder, people=2)
     assert not (folder / "a.npz").exists() and len(list((folder / ".a.parts").iterdir())) == 2
     before = len(seeing)
     made = keypoint_file(path, folder, people=2, options=SHORT)
@@ -148,19 +255,103 @@ def test_what_was_killed_before_the_clip_set_was_written_goes_on(tmp_path, seein
 
 def test_kept_pieces_of_other_arguments_or_cut_off_ones_are_not_used(tmp_path, seeing):
     path = film(tmp_path, [[walk(i)] for i in range(50)])
-
-    def interrupt(share):
-        if share > 0.7:
-            raise KeyboardInterrupt
-
     for every in (2, 1):
-        with pytest.raises(KeyboardInterrupt):
-            keypoint_file(path, tmp_path / "pose", options=SHORT, every=every, progress=interrupt)
+        interrupted(path, tmp_path / "pose", every=every)
     kept = sorted((tmp_path / "pose" / ".a.parts").iterdir())
     assert len({file.name.partition("-")[0] for file in kept}) == 1
     kept[0].write_bytes(kept[0].read_bytes()[:200])
     made = keypoint_file(path, tmp_path / "pose", options=SHORT)
     assert same(made.clips, detect(path, options=SHORT))
+
+
+def test_a_piece_that_cannot_be_kept_ends_the_video_and_the_next_run_completes_it(tmp_path, seeing, monkeypatch):
+    path, folder = film(tmp_path, [[walk(i)] for i in range(50)]), tmp_path / "pose"
+    expected, put, failed = detect(path, options=SHORT), Store.put, []
+
+    def full_once(self, piece, seen):
+        if piece.number == 1 and not failed:
+            failed.append(piece)
+            raise ValueError("cannot write 'x' (No space left on device); free the disk")
+        put(self, piece, seen)
+
+    monkeypatch.setattr(Store, "put", full_once)
+    with pytest.raises(ValueError, match="No space left on device"):
+        keypoint_file(path, folder, json=True, options=SHORT)
+    assert [entry.name for entry in folder.iterdir()] == [".a.parts"] and len(list((folder / ".a.parts").iterdir())) == 1
+    made = keypoint_file(path, folder, json=True, options=SHORT)
+    assert not made.reused and same(made.clips, expected) and not made.found.notes
+
+
+def test_networks_that_fail_make_nothing_final(tmp_path, seeing, monkeypatch):
+    path, folder = film(tmp_path, [[walk(i)] for i in range(50)]), tmp_path / "pose"
+    interrupted(path, folder)
+    with monkeypatch.context() as patch:
+        patch.setattr("indexing.pose.detection.LiteNetworks", lambda models: (_ for _ in ()).throw(ValueError("no such network")))
+        with pytest.raises(ValueError, match="no such network"):
+            keypoint_file(path, folder, options=SHORT, workers=2)
+    assert [entry.name for entry in folder.iterdir()] == [".a.parts"] and len(list((folder / ".a.parts").iterdir())) == 2
+    assert same(keypoint_file(path, folder, options=SHORT).clips, detect(path, options=SHORT))
+
+
+@pytest.mark.parametrize("becomes", [None, b"another"])
+def test_a_video_that_is_gone_or_changed_meanwhile_makes_nothing_final(tmp_path, seeing, becomes):
+    path, folder = film(tmp_path, [[walk(i)] for i in range(50)]), tmp_path / "pose"
+    content, expected, gone = path.read_bytes(), detect(path, options=SHORT), []
+
+    def meanwhile(share):
+        if share > 0.5 and not gone:
+            gone.append(share)
+            path.unlink()
+            if becomes is not None:
+                path.write_bytes(becomes)
+
+    with pytest.raises(ValueError, match=r"a\.mp4: (no such file|has changed while it was worked)"):
+        keypoint_file(path, folder, options=SHORT, progress=meanwhile)
+    assert not (folder / "a.npz").exists()
+    path.write_bytes(content)
+    assert same(keypoint_file(path, folder, options=SHORT).clips, expected)
+
+
+def test_pieces_that_cannot_be_decoded_are_left_out_and_said(tmp_path, seeing, monkeypatch):
+    path, stored = film(tmp_path, [[walk(i)] for i in range(50)]), Video.stored
+
+    def damaged(self):
+        if 0.8 < self.span[0] < 1.2:
+            raise ValueError("nothing can be decoded")
+        return stored(self)
+
+    monkeypatch.setattr(Video, "stored", damaged)
+    made = keypoint_file(path, tmp_path / "pose", options=SHORT, json=True)
+    assert made.found.notes == ("1 part of it cannot be decoded (nothing can be decoded)",)
+    assert len(made.clips[0]) == 35 and len(frames_in(made.folder)) == 35
+    assert keypoint_file(path, tmp_path / "pose", options=SHORT).reused
+
+
+def test_a_video_that_cannot_be_read_now_keeps_its_pieces(tmp_path, seeing):
+    path, folder = film(tmp_path, [[walk(i)] for i in range(50)]), tmp_path / "pose"
+    interrupted(path, folder)
+    kept = path.rename(tmp_path / "elsewhere.mp4")
+    with pytest.raises(ValueError, match="no such file"):
+        keypoint_file(path, folder, options=SHORT)
+    assert len(list((folder / ".a.parts").iterdir())) == 2
+    kept.rename(path)
+    assert same(keypoint_file(path, folder, options=SHORT).clips, detect(path, options=SHORT))
+
+
+def test_a_clip_set_that_cannot_be_written_ends_only_its_video(tmp_path, seeing, monkeypatch):
+    paths = [film(tmp_path, [[walk(i)] for i in range(50)], name) for name in ("a.mp4", "b.mp4")]
+    save, folder = ClipSet.save, tmp_path / "pose"
+
+    def full(self, path):
+        if path.name == "a.npz":
+            raise ValueError("cannot write 'a.npz'")
+        save(self, path)
+
+    monkeypatch.setattr(ClipSet, "save", full)
+    tasks = [VideoTask(path, 1, 1, None, "heavy", SHORT) for path in paths]
+    (_, one), (_, two) = keypoint_files(tasks, folder, SceneNetworks, json=False)
+    assert str(one) == "cannot write 'a.npz'" and two.path == folder / "b.npz"
+    assert sorted(entry.name for entry in folder.iterdir()) == [".a.parts", "b.npz"]
 
 
 def test_a_video_without_anybody_writes_nothing(tmp_path, seeing):

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import builtins
+import json
 import pickle
 import re
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,6 +16,7 @@ import numpy as np
 import pytest
 
 from indexing.readers import read, read_clip
+from indexing.readers.hdf import opened_hdf5
 from indexing.readers.recording import NobodySeen
 from indexing.skeleton import COCO17
 from tests.indexing.readers import tools
@@ -148,6 +151,12 @@ def put(file: Any, name: str, values: Any) -> None:
     file[name].attrs.update(attributes)
 
 
+def filled(file: Any, name: str, field: str, value: float) -> None:
+    table = file[name][()]
+    table[field] = value
+    file[name][...] = table
+
+
 BROKEN: list[tuple[str, Callable[[Any], None], tuple[str, ...]]] = [
     ("sleap analysis", lambda f: f.__delitem__("node_names"), ("without keypoints",)),
     ("sleap analysis", lambda f: put(f, "node_names", np.array(["a"] * 17, "S")), ("node_names are a, a",)),
@@ -167,6 +176,7 @@ BROKEN: list[tuple[str, Callable[[Any], None], tuple[str, ...]]] = [
     ("sleap project", lambda f: put(f, "frames", f["frames"][1:]), ("share out its 6 instances",)),
     ("sleap project", lambda f: put(f, "frames", np.zeros(3)), ("no field 'video'",)),
     ("sleap project tracked", lambda f: f.__delitem__("tracks_json"), ("is of track 0",)),
+    ("sleap project", lambda f: filled(f, "instances", "instance_type", 2), ("of the type 2",)),
     ("movement", lambda f: f.__delitem__("keypoints"), ("without keypoints",)),
     ("movement", lambda f: put(f, "space", np.array(["u", "v"], h5py.string_dtype())), ("the axes u, v",)),
     ("movement", lambda f: put(f, "time", np.arange(3.0)), ("time",)),
@@ -279,6 +289,135 @@ def test_a_text_longer_than_the_file_is_refused(person: np.ndarray, tmp_path: Pa
     refused(path, "'tracks_json' has a text longer than the file")
 
 
+@pytest.mark.parametrize("packing", [{}, {"chunks": (100,)}, {"compression": "gzip"}, {"compression": "gzip", "shuffle": True}])
+def test_many_texts_in_one_piece_of_a_heap_are_refused(packing: dict[str, Any], person: np.ndarray, tmp_path: Path) -> None:
+    path = tools.sleap_project(tmp_path / "a.slp", {"A": unseen(person)}, NAMES)
+    names = [f'[0, "{"x" * 2000}"]', *(f'[0, "{i}"]' for i in range(299))]
+    text = h5py.string_dtype()
+
+    def shared(file: Any) -> None:
+        del file["tracks_json"]
+        file.create_dataset("tracks_json", data=names, dtype=text, **packing)
+
+    assert len(read(changed(path, shared))) == 1  # each has a piece of its own
+    with h5py.File(path, "r+") as file:
+        data = file["tracks_json"]
+        if not packing:
+            at = data.id.get_offset()
+        elif "compression" not in packing:
+            at = data.id.get_chunk_info(0).byte_offset
+        else:  # the same entries, packed again
+            mask, packed = data.id.read_direct_chunk((0,))
+            raw = zlib.decompress(packed)
+            data.id.write_direct_chunk((0,), zlib.compress(raw[:16] * (len(raw) // 16)), mask)
+    if "compression" not in packing:
+        raw = bytearray(path.read_bytes())
+        count = 100 if packing else 300
+        raw[at : at + 16 * count] = raw[at : at + 16] * count
+        path.write_bytes(raw)
+    refused(path, "'tracks_json' has texts that are together longer than the file")
+
+
+@pytest.mark.parametrize("where", ["packed", "compact", "aside"])
+def test_texts_whose_lengths_cannot_be_seen_are_refused(where: str, person: np.ndarray, tmp_path: Path) -> None:
+    path = tools.sleap_project(tmp_path / "a.slp", {"A": unseen(person)}, NAMES)
+    if where == "aside":
+        with h5py.File(tmp_path / "b.slp", "w", userblock_size=512) as file:
+            file.create_dataset("names", data=["A"], dtype=h5py.string_dtype())
+        with opened_hdf5(tmp_path / "b.slp") as file, pytest.raises(ValueError, match="text is kept in an uncommon way"):
+            file.texts("names")
+        return
+
+    def hidden(file: Any) -> None:
+        del file["tracks_json"]
+        if where == "packed":
+            file.create_dataset("tracks_json", data=['[0, "A"]'] * 99, dtype=h5py.string_dtype(), compression="lzf")
+            return
+        plan = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        plan.set_layout(h5py.h5d.COMPACT)
+        kind, space = h5py.h5t.py_create(h5py.string_dtype(), logical=True), h5py.h5s.create_simple((1,))
+        h5py.Dataset(h5py.h5d.create(file.id, b"tracks_json", kind, space, plan))[0] = '[0, "A"]'
+
+    refused(changed(path, hidden), "in an uncommon way")
+
+
+def test_rows_of_any_length_are_no_names(person: np.ndarray, tmp_path: Path) -> None:
+    path = tools.sleap_project(tmp_path / "a.slp", {"A": unseen(person)}, NAMES)
+
+    def rows(file: Any) -> None:
+        del file["tracks_json"]
+        file.create_dataset("tracks_json", (2,), dtype=h5py.vlen_dtype(np.float64))
+
+    refused(changed(path, rows), "is no list of names")
+
+
+def test_records_with_fields_of_any_length_are_refused(person: np.ndarray, tmp_path: Path) -> None:
+    path = tools.sleap_project(tmp_path / "a.slp", {"A": unseen(person)}, NAMES)
+
+    def more(file: Any) -> None:
+        old = file["pred_points"][()]
+        new = np.zeros(len(old), dtype=[*old.dtype.descr, ("more", h5py.vlen_dtype(np.uint8))])
+        for field in old.dtype.names:
+            new[field] = old[field]
+        new["more"] = [np.zeros(1, np.uint8) for _ in new]
+        del file["pred_points"]
+        file.create_dataset("pred_points", data=new, dtype=new.dtype)
+
+    refused(changed(path, more), "'pred_points' has fields that are neither numbers nor text of one length")
+
+
+def test_many_texts_in_an_attribute_are_not_read(person: np.ndarray, tmp_path: Path) -> None:
+    path = tools.sleap_analysis(tmp_path / "a.h5", {"a": person}, NAMES)
+    with h5py.File(path, "r+") as file:
+        file.attrs.create("many", ["a", "b"], dtype=h5py.string_dtype())
+        file.attrs["one"] = "a"
+    with opened_hdf5(path) as file:
+        assert (file.attribute("/", "many"), file.attribute("/", "one")) == (None, "a")
+
+
+def test_animals_are_checked_before_room_is_made_for_them(
+    person: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tools.sleap_project(tmp_path / "a.slp", {"A": unseen(person)}, NAMES)
+    count = 100_000
+
+    def many(file: Any) -> None:  # of 17 points each, all of them the same
+        table = np.repeat(file["instances"][:1], count)
+        frames = file["frames"][()]
+        frames["instance_id_start"][1:] = frames["instance_id_end"] = count
+        put(file, "frames", frames)
+        del file["instances"]
+        file.create_dataset("instances", data=table, compression="gzip")
+
+    refused(changed(path, many), "pred_points: 100000 animals of 17 points share 102")
+
+    def wide(file: Any) -> None:
+        about = json.loads(file["metadata"].attrs["json"])
+        about["nodes"] = [{"name": str(i)} for i in range(1500)]
+        about["skeletons"][0]["nodes"] = [{"id": i} for i in range(1500)]
+        file["metadata"].attrs["json"] = np.bytes_(json.dumps(about))
+
+    real = np.full
+
+    def checked(shape: Any, *rest: Any) -> Any:
+        assert isinstance(shape, int), "room is made before the animals are checked"
+        return real(shape, *rest)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(np, "full", checked)
+        refused(changed(path, wide), "pred_points: an animal has no 1500 points")
+
+
+def test_poses_of_no_joints_are_refused_whatever_their_number_of_frames(person: np.ndarray, tmp_path: Path) -> None:
+    path = tools.movement(tmp_path / "a.nc", {"id": person}, NAMES)
+
+    def none(file: Any) -> None:
+        put(file, "position", np.zeros((10**9, 2, 0, 1)))
+        put(file, "keypoints", np.zeros(0, h5py.string_dtype()))
+
+    refused(changed(path, none), "position is (1000000000, 1, 0, 2)")
+
+
 class Harm:
     def __reduce__(self) -> Any:
         return builtins.eval, ("1/0",)
@@ -291,6 +430,39 @@ def test_a_pickle_in_an_attribute_runs_nothing(person: np.ndarray, tmp_path: Pat
         file["df_with_missing/table"].attrs["values_block_0_kind"] = np.bytes_(pickle.dumps(Harm(), 0))
 
     refused(changed(path, harm), "the pickle holds the name", "eval")
+
+
+TUPLE_KEY = b"})" + b"2\x86" * 60 + b"Ns."
+TUPLE_WORD = b"(()" + b"2\x86" * 60 + b"\x85l."
+MANY_WORDS = b"(" + b"(" + b"N" * 101 + b"t" + b"2" * 9 + b"l."
+
+
+@pytest.mark.parametrize(
+    ("program", "words"),
+    [(TUPLE_KEY, "a key of the type tuple"), (TUPLE_WORD, "no columns named by"), (MANY_WORDS, "no columns named by")],
+)
+def test_names_of_columns_without_end_are_refused(program: bytes, words: str, person: np.ndarray, tmp_path: Path) -> None:
+    path = tools.deeplabcut(tmp_path / "a.h5", person, NAMES)
+
+    def endless(file: Any) -> None:
+        file["df_with_missing/table"].attrs["values_block_0_kind"] = np.bytes_(program)
+
+    refused(changed(path, endless), words)
+    path = tools.deeplabcut(tmp_path / "b.h5", person, NAMES)
+    info = b"}K\x01}X\x05\x00\x00\x00names" + program[:-1] + b"ss."
+    clip = read_clip(changed(path, lambda file: file["df_with_missing"].attrs.__setitem__("info", np.bytes_(info))))
+    assert clip.skeleton is not None and clip.skeleton.joints == NAMES  # as usual, where it does not say
+
+
+@pytest.mark.parametrize("name", ["axis1", "block0_items_label1", "block0_items_level1"])
+def test_more_names_than_any_table_has_are_refused(name: str, person: np.ndarray, tmp_path: Path) -> None:
+    path = tools.deeplabcut(tmp_path / "a.h5", person, NAMES, "fixed")
+
+    def many(file: Any) -> None:
+        del file[f"df_with_missing/{name}"]
+        file["df_with_missing"].create_dataset(name, data=np.zeros(2**22 + 1, np.int8), compression="gzip")
+
+    refused(changed(path, many), "has more names than any table of points")
 
 
 def test_without_h5py_one_line_says_what_to_install(person: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

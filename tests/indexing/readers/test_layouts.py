@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from indexing.clip import ClipSet
+from indexing.clip import Clip, ClipSet
 from indexing.readers import read, read_clip
 from indexing.readers.layouts import fits, recognized
 from indexing.skeleton import (
@@ -197,3 +197,17 @@ def test_a_lifter_of_mmpose_gives_the_joints_of_human36m(write_json: Callable[..
     meta = {"dataset_name": "h36m", "keypoint_id2name": {str(i): name for i, name in enumerate(names)}, "skeleton_links": []}
     clip = read_clip(write_json({"meta_info": meta, "instance_info": frames}, "named.json"))
     assert clip.skeleton is not None and clip.skeleton.joints == H36M17.joints
+
+
+def test_a_layout_does_not_overrule_names_that_a_file_carries(tmp_path):
+    from indexing.skeleton import COCO17, Skeleton
+
+    joints = np.random.default_rng(0).normal(size=(9, 17, 2)) * 50 + 300
+    mixed = Skeleton("mine", (COCO17.joints[1], COCO17.joints[0], *COCO17.joints[2:]))
+    for name, own in (("named", mixed), ("numbered", Skeleton("any", tuple(map(str, range(17)))))):
+        ClipSet([Clip(joints, skeleton=own, up="-y", fps=30.0)]).save(tmp_path / f"{name}.npz")
+    with pytest.raises(ValueError, match=r"named.npz: names its joints itself \(left_eye where layout=COCO-17 has nose\); leave"):
+        read(tmp_path / "named.npz", layout="COCO-17")
+    assert read(tmp_path / "numbered.npz", layout="COCO-17")[0].skeleton.joints == COCO17.joints
+    np.save(tmp_path / "bare.npy", joints)
+    assert read(tmp_path / "bare.npy", layout="H36M-17")[0].skeleton.name == "H36M-17"

@@ -130,7 +130,7 @@ def test_arrays_have_the_layout_and_the_direction_of_their_body(tmp_path: Path) 
         assert (clip.skeleton, clip.up, clip.dims, clip.fps_assumed) == (layout, up, 3, True)
     np.save(tmp_path / "a.npy", tools.standing(COCO17).astype(np.float32))
     clip = read_clip(tmp_path / "a.npy", fps=25.0)
-    assert (clip.skeleton, clip.up, dict(clip.meta)) == (COCO17, "-y", {})
+    assert (clip.skeleton, clip.up, dict(clip.meta)) == (COCO17, "-y", {"layout": "recognized: COCO-17"})
     np.save(tmp_path / "a.npy", np.random.default_rng(0).normal(size=(9, 17, 2)))
     assert read_clip(tmp_path / "a.npy").meta == {"layout": "guessed: COCO-17, not H36M-17"}
     np.save(tmp_path / "a.npy", np.random.default_rng(0).normal(size=(9, 7, 3)))

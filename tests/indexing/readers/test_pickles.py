@@ -22,7 +22,7 @@ import pytest
 
 from indexing.readers import pyskl as reader
 from indexing.readers import read
-from indexing.readers.pickles import read_pickle, unpickled
+from indexing.readers.pickles import _Reader, read_pickle, unpickled
 from indexing.readers.recording import NobodySeen
 from indexing.skeleton import COCO17, NTU25
 from tests.indexing.readers import tools
@@ -114,7 +114,8 @@ SOUND = {"frame_dir": "a", "label": 0, "keypoint": np.ones((1, 4, 17, 2), np.flo
         ([SOUND | {"keypoint": np.ones((4, 17))}], ("annotation 0 ('a')", "(people, frames, joints, 2 or 3)")),
         ([SOUND | {"keypoint": np.ones((1, 4, 17, 5))}], ("(1, 4, 17, 5)",)),
         ([SOUND | {"keypoint": np.ones((1, 0, 17, 2))}], ("(1, 0, 17, 2)",)),
-        ([SOUND | {"keypoint": np.array([[[["a", "b"]]]])}], ("<U1",)),
+        ([SOUND | {"keypoint": np.ones((1, 300_000_000, 0, 2), np.float32)}], ("(1, 300000000, 0, 2)",)),
+        ([SOUND | {"keypoint": np.array([[[["a", "b"]]]])}], ("<U1",)), ([SOUND | {"label": 2**63}], ("label must be a number",)),
         ([SOUND | {"keypoint_score": np.ones((1, 4, 9))}], ("keypoint_score must be (1, 4, 17)",)),
         ([SOUND | {"keypoint_score": 0.5}], ("got a float",)), ([SOUND | {"label": [1, 2]}], ("label must be a number or text",)),
         ({"split": 3, "annotations": [SOUND]}, ("split must be lists of names",)),
@@ -137,6 +138,25 @@ def test_one_array_in_a_million_clips_is_refused(tmp_path: Path, monkeypatch: py
     monkeypatch.setattr(reader, "GROWTH_BLOCK", (2**20, 4))
     (tmp_path / "set.pkl").write_bytes(pickle.dumps([{**SOUND, "keypoint": np.ones((1, 400, 17, 2))}] * 5000))
     refused(tmp_path / "set.pkl", "the same array again and again")
+
+
+def test_frames_count_as_what_clips_take(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reader, "GROWTH_BLOCK", (8 * 4 * (34 + 1) - 1, 0))
+    (tmp_path / "set.pkl").write_bytes(pickle.dumps([SOUND]))
+    refused(tmp_path / "set.pkl", "the same array again and again")
+    monkeypatch.setattr(reader, "GROWTH_BLOCK", (8 * 4 * (34 + 1), 0))
+    assert len(read(tmp_path / "set.pkl")) == 1
+
+
+def test_one_list_of_names_in_many_parts_is_refused(tmp_path: Path) -> None:
+    names = [f"{i:x}" for i in range(500)]
+    data = {"split": {f"{i:x}": names for i in range(100)}, "annotations": [SOUND]}
+    (tmp_path / "set.pkl").write_bytes(pickle.dumps(data))
+    refused(tmp_path / "set.pkl", "split has 100 parts with more names than the file has bytes")
+    empty: list[str] = []
+    data = {"split": {f"{i:x}": empty for i in range(2000)}, "annotations": [SOUND] * 100}
+    (tmp_path / "set.pkl").write_bytes(pickle.dumps(data))
+    refused(tmp_path / "set.pkl", "split has 2000 parts with more names")
 
 
 # ---- hostile pickles -----------------------------------------------------------------------------------------------------
@@ -198,6 +218,8 @@ FLOAT = (
 )
 TYPE = name("numpy", "dtype") + b"(X\x02\x00\x00\x00f8\x89\x88tR"
 OBJECT = name("numpy", "dtype") + b"(X\x02\x00\x00\x00O8\x89\x88tR"
+
+PADDING = b"B" + struct.pack("<I", 2**20) + bytes(2**20) + b"0"  # a file of that size may have so many steps
 
 PROGRAMS: dict[str, tuple[bytes, str]] = {
     "system by its other name": (name("posix", "system") + b"(X\x02\x00\x00\x00lstR.", "posix.system"),
@@ -264,7 +286,30 @@ PROGRAMS: dict[str, tuple[bytes, str]] = {
     "a protocol of the future": (b"\x80\x63N.", "cannot be read"),
     "no step": (b"\xff.", "the step"),
     "a list that is none": (b"K\x01K\x02a.", "cannot be read"),
-    "an unhashable key": (b"}]K\x01s.", "cannot be read"),
+    "an unhashable key": (b"}]K\x01s.", "a key of the type list"),
+    # tuples in tuples: hashed by going into them, so deep that C has no stack left, or 2^60 times
+    "a deep key": (PADDING + b"})" + b"\x85" * 200_000 + b"Ns.", "a key of the type tuple"),
+    "a deep key among others": (PADDING + b"}()" + b"\x85" * 200_000 + b"Nu.", "a key of the type tuple"),
+    "a deep key of a dictionary": (PADDING + b"()" + b"\x85" * 200_000 + b"Nd.", "a key of the type tuple"),
+    "a wide key": (b"})" + b"2\x86" * 60 + b"Ns.", "a key of the type tuple"),
+    "a deep value of a set": (PADDING + b"\x8f()" + b"\x85" * 200_000 + b"\x90.", "a set"),
+    "a deep value of a frozen set": (PADDING + b"()" + b"\x85" * 200_000 + b"\x91.", "a set"),
+    "a value of numpy's as a key": (
+        b"}" + name(MULTIARRAY, "scalar") + FLOAT + b"C\x08abcdefgh\x86RNs.",
+        "a key of the type float64",
+    ),
+    "keys of one hash": (
+        b"}(" + b"".join(b"\x8a\x0a" + (i * (2**61 - 1) + 5).to_bytes(10, "little") + b"N" for i in range(20_000)) + b"u.",
+        "the key 2305843009213693956",
+    ),
+    "many numbers as keys": (b"}(" + b"".join(b"J" + struct.pack("<i", i) + b"N" for i in range(10_000)) + b"u.", "8192 numbers"),
+    "keys of a list": (b"](K\x01K\x02u.", "without a dictionary"),
+    "a key without a value": (b"}(K\x01u.", "without a dictionary"),
+    "a type of many digits": (name("numpy", "dtype") + b"X\x0d\x00\x00\x00f000000000008\x85R.", "neither numbers nor text"),
+    "a shape of empty texts": (
+        ARRAY + b"(K\x01M\xff\xffM\xff\xff\x86" + name("numpy", "dtype") + b"X\x02\x00\x00\x00U0\x85R\x89C\x00tb.",
+        "an array of the shape",
+    ),
 }
 
 
@@ -284,6 +329,34 @@ def test_the_same_bytes_again_and_again_are_refused(tmp_path: Path) -> None:
     program = name("_codecs", "encode") + b"q\x000" + text + b"X\x06\x00\x00\x00latin1\x86q\x010" + again * 1000 + b"N."
     (tmp_path / "a.pkl").write_bytes(program)
     refused(tmp_path / "a.pkl", "the same bytes again and again", action=read_pickle)
+
+
+def test_values_of_the_same_bytes_again_and_again_are_refused(tmp_path: Path) -> None:
+    size, long = 2**20, struct.pack("<I", 2**20)
+    code = name("numpy", "dtype") + b"X\x08\x00\x00\x00S1048576\x85R"
+    scalars = (
+        name(MULTIARRAY, "scalar") + b"q\x00" + code + b"B" + long + b"x" * size + b"\x86q\x01(" + b"h\x00h\x01R" * 2000 + b"l."
+    )
+    made = name(MULTIARRAY, "_reconstruct") + b"q\x00" + name("numpy", "ndarray") + b"K\x00\x85C\x01b\x87q\x01"
+    state = b"(K\x01J" + long + b"\x85" + name("numpy", "dtype") + b"X\x02\x00\x00\x00u1\x85R\x89X" + long + b"x" * size + b"tq\x02"
+    for program in (scalars, made + state + b"(" + b"h\x00h\x01Rh\x02b" * 2000 + b"l."):
+        (tmp_path / "a.pkl").write_bytes(program)
+        refused(tmp_path / "a.pkl", "the same bytes again and again", action=read_pickle)
+
+
+def test_numbers_of_the_memo_are_the_files_but_not_their_hashes() -> None:
+    numbers = [i * (2**61 - 1) + 5 for i in range(20_000)]  # all of one hash
+    program = b"N" + b"".join(b"p%d\n" % number for number in numbers) + b"0](" + b"g%d\ng%d\n" % (numbers[0], numbers[-1]) + b"e."
+    assert unpickled(Path("a.pkl"), program + bytes(2**16), "") == [None, None]
+    reader_ = _Reader(program)
+    assert reader_.load() == [None, None]
+    assert len({hash(key) for key in reader_.memo}) > 19_000
+
+
+def test_keys_that_files_have_are_read() -> None:
+    value = {"a": 1, b"b": 2, 3: 3, -(2**53): 4, 2.5: 5, None: 6, False: 7, **{f"class {i}": i for i in range(9000)}}
+    for protocol in range(6):
+        assert unpickled(Path("a.pkl"), pickle.dumps(value, protocol), "") == value
 
 
 def test_lists_a_million_deep_are_refused_without_recursion(tmp_path: Path) -> None:
@@ -335,3 +408,12 @@ def test_weights_of_networks_stay_refused(tmp_path: Path) -> None:
     for file in ("a.pt", "a.pth", "a.joblib"):
         (tmp_path / file).write_bytes(pickle.dumps([SOUND]))
         refused(tmp_path / file, "is a pickle")
+
+
+def test_annotations_without_people_are_left_out(tmp_path: Path) -> None:
+    nobody = SOUND | {"keypoint": np.ones((0, 300_000_000, 17, 2), np.float32), "keypoint_score": np.ones((0, 300_000_000, 17))}
+    for name, data in (("some.pkl", [nobody, SOUND]), ("none.pkl", [nobody])):
+        (tmp_path / name).write_bytes(pickle.dumps(data))
+    assert len(read(tmp_path / "some.pkl")) == 1
+    with pytest.raises(ValueError, match="no person was detected"):
+        read(tmp_path / "none.pkl")
