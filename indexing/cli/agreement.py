@@ -91,11 +91,11 @@ def _of_files(command: Evaluate) -> _Compared:
     (path,), (other,) = command.clips, command.labelling.labels
     theirs = replace(command.labelling, observation=command.found_observation, tier=command.found_tier, subject=())
     with progress("reading", steps=False):
-        known, notes = _side(command.labelling, other, command, False)
-        found, said = _side(theirs, path, command, True)
+        known, _, notes = _side(command.labelling, other, command, False)
+        found, media, said = _side(theirs, path, command, True)
     notes += said
     known = _renamed(known, command.labelling, other)
-    spans, said = _paired(known, found, (other, path))
+    spans, said = _paired(known, found, media, (other, path))
     return _Compared(spans, _called(other, path, command), notes + said, {})
 
 
@@ -108,27 +108,35 @@ def _called(known: Path, found: Path, command: Evaluate) -> tuple[str, str]:
     return (str(first or known), str(second or found)) if (first or known) != (second or found) else ("known", "found")
 
 
-def _side(labelling: Labelling, path: Path, command: Evaluate, detections: bool) -> tuple[list[Label], list[str]]:
-    """The labels of one hand; of detections those of a program, where there are any beside those of a person."""
+def _side(labelling: Labelling, path: Path, command: Evaluate, detections: bool) -> tuple[list[Label], list[str], list[str]]:
+    """The labels of one hand, the media that they are of, and what to know; of detections those of a program, where one looked.
+
+    That nothing was found says something, too: then there are media without labels.
+    """
+    from indexing.cli.suggest import TIER
     from indexing.labels import choose_labels
 
     file = labelling.open(path, None, command.reading.fps)
-    ours = [one for one in file.labels if {one.observation, one.tier} & set(file.machine)]
+    programs = {name for name in file.machine if not name.startswith(TIER)}  # a suggestion says nothing of what was found
+    ours = [one for one in file.labels if {one.observation, one.tier} & programs]
     asked = labelling.observation is not None or labelling.tier is not None
-    if detections and not asked and ours and len(ours) < len(file.labels):
-        file = replace(file, labels=tuple(ours))
-        said = [
-            f"{path}: compared is what a program found ({listed(file.machine)}); --found-tier, --found-observation choose others"
-        ]
-    else:
-        said = []
+    looked = [one for one in file.watched if one[0] in programs]
+    said = []
+    if detections and not asked and (ours or looked):
+        which = f"what a program found ({listed(sorted(programs))}); --found-tier, --found-observation choose others"
+        said = [f"{path}: compared is {which}"] * (len(ours) < len(file.labels))
+        file = replace(file, labels=tuple(ours), watched=tuple(looked))
+    media = list(dict.fromkeys([*(one.media for one in file.labels), *(medium for _, medium in file.watched)])) or [""]
+    nothing = detections and not file.labels
     file = choose_labels(file)
     labels, others = lasting(path, file.labels)
     said += others
-    if not labels:
+    if nothing:
+        said.append(f"{path}: nothing was found there")
+    elif not labels:
         remedy = "give a file in which something is marked, from its begin to its end"
         raise error(path, "holds no label that lasts", f"{remedy}, or, for a recording, -m MODEL, too" if detections else remedy)
-    return labels, [f"{path}: {note}" for note in file.notices] + said
+    return labels, media, [f"{path}: {note}" for note in file.notices] + said
 
 
 def _renamed(labels: Sequence[Label], labelling: Labelling, path: Path) -> list[Label]:
@@ -143,13 +151,15 @@ def _renamed(labels: Sequence[Label], labelling: Labelling, path: Path) -> list[
     return [replace(one, subject=people[one.subject] or one.subject) for one in labels if one.subject in people]
 
 
-def _paired(known: Sequence[Label], found: Sequence[Label], paths: tuple[Path, Path]) -> tuple[list[ComparedSpan], list[str]]:
+def _paired(
+    known: Sequence[Label], found: Sequence[Label], media: Sequence[str], paths: tuple[Path, Path]
+) -> tuple[list[ComparedSpan], list[str]]:
     """What is compared: each recording that both sides know, from 0 to where its last label ends, subject by subject."""
     from indexing.comparing import ComparedSpan
 
     spans: list[ComparedSpan] = []
     notes: list[str] = []
-    recordings, left = _recordings(known, found, paths)
+    recordings, left = _recordings(known, found, media, paths)
     for name, (mine, theirs) in recordings.items():
         low, high = min(0.0, *(one.start for one in (*mine, *theirs))), max(one.end for one in (*mine, *theirs))
         for person, sides in _subjects(mine, theirs, paths).items():
@@ -162,14 +172,17 @@ def _paired(known: Sequence[Label], found: Sequence[Label], paths: tuple[Path, P
 
 
 def _recordings(
-    known: Sequence[Label], found: Sequence[Label], paths: tuple[Path, Path]
+    known: Sequence[Label], found: Sequence[Label], searched: Sequence[str], paths: tuple[Path, Path]
 ) -> tuple[dict[str, tuple[list[Label], list[Label]]], list[str]]:
     """The labels of both sides by recording, and the recordings that are known only.
+
+    Args:
+        searched: the media that were looked through, also those in which nothing was found.
 
     Raises:
         ValueError: what was found is of other recordings.
     """
-    media = [list(dict.fromkeys(one.media for one in side)) for side in (known, found)]
+    media = [list(dict.fromkeys(one.media for one in known)), searched]
     if len(media[0]) == 1 and (len(media[1]) == 1 and "" in (*media[0], *media[1])):
         name = media[0][0] or media[1][0] or paths[0].name
         return {name: (list(known), list(found))}, []
@@ -178,11 +191,16 @@ def _recordings(
         same = [name for name in media[0] if name == medium] or (
             of_medium(medium, [name for name in media[0] if name]) if medium else []
         )
+        if not same and searched != [medium] and not any(one.media == medium for one in found):
+            continue  # nothing is known of it, and nothing was found
         if not same:
             said = f"is of {medium or 'a recording without a name'}, and {paths[0]} of {listed(media[0])}"
             raise error(paths[1], said, "compare labels of the same recordings, under the same names")
         mine = out.setdefault(same[0], ([one for one in known if one.media == same[0]], []))
         mine[1].extend(one for one in found if one.media == medium)
+    if not out:
+        said = f"is of {listed(searched)}, and {paths[0]} of {listed(media[0])}"
+        raise error(paths[1], said, "compare labels of the same recordings, under the same names")
     return out, [name for name in media[0] if name not in out]
 
 

@@ -273,7 +273,7 @@ class Scan:
         if self.truth is not None and self.labelling.labels:
             raise ValueError(f"--truth {self.truth}: --labels says what is known, too; give one of them")
         inputs = [*self.recordings, self.model, *([self.truth] if self.truth is not None else [])]
-        folder, target = check_report(self.report, inputs), check_write(self.write, inputs, self.recordings)
+        folder, target = check_report(self.report, inputs), check_write(self.write, inputs, self.recordings, self.labelling.media)
         inputs += self.labelling.labels
         indexer, results, notes, timings = self.search()
         if target is not None:

@@ -71,6 +71,12 @@ class CuttingOptions:
     some tenths of a second off, and what touches an action looks like it."""
 
 
+def _why_nothing(notes: Sequence[str]) -> str:
+    """Why there is no label: what was left out, where anything was."""
+    left = next((note.partition(": ")[2] for note in notes if "left out" in note or "suggested" in note), "")
+    return f"nothing is marked there ({left})" if left else "nothing is marked there"
+
+
 # ----------------------------------------------------------------------------------------------------------------------
 # Whose labels are which.
 
@@ -296,7 +302,7 @@ def labelled_examples(
     if not out.clips:
         where = names([str(path) for path in labelling.labels])
         first = f"; the first: {reasons[0]}" if reasons else ""
-        what = f"none of its {count(number, 'label')} can be learned from{first}" if number else "nothing is marked there"
+        what = f"none of its {count(number, 'label')} can be learned from{first}" if number else _why_nothing(out.notes)
         raise error(where, what, f"mark actions that {names([path.name for path in paths])} shows, each from its begin to its end")
     from indexing.cli.remarks import on_examples
 
@@ -400,7 +406,7 @@ def film_examples(examples: Sequence[Example], labelling: Labelling, reading: Re
         given += [Example(example.path, one.label, one.start, one.end) for one in labels or ()]
     if len(given) == len(examples) - len(unnamed):
         files = names([str(path) for path in labelling.labels])
-        raise error(files, "nothing is marked there", "mark actions, each from its begin to its end")
+        raise error(files, _why_nothing(notes), "mark actions, each from its begin to its end")
     return given, notes
 
 
@@ -421,11 +427,17 @@ SEVERAL = (".boris", ".csv", ".tsv", ".json")
 WRITTEN = (".eaf", *SEVERAL)
 
 
-def check_write(path: Path | None, inputs: Sequence[Path], recordings: Sequence[Path]) -> Path | None:
+def check_write(
+    path: Path | None, inputs: Sequence[Path], recordings: Sequence[Path], media: str | None = None, tier: str = "dyntorch"
+) -> Path | None:
     """The file that labels will be written to, if it can be, said before anything is searched.
 
+    Args:
+        media: how the file that is there calls the recording; tier: that labels will be written into.
+
     Raises:
-        ValueError: no format of labels, a format of one recording for several, an input, or what is there cannot be read.
+        ValueError: no format of labels, a format of one recording for several, an input, or what is there cannot be read, or would
+            be lost although somebody made or corrected it.
     """
     if path is None:
         return None
@@ -440,16 +452,17 @@ def check_write(path: Path | None, inputs: Sequence[Path], recordings: Sequence[
             f"write them one by one, or into one file such as {path.with_suffix('.boris').name} or {path.with_suffix('.csv').name}",
         )  # fmt: skip
     path = check_file(path, inputs)
-    if path.exists():
-        from indexing.labels import open_labels
+    if not path.exists():
+        return path
+    from indexing.labels import Label, open_labels, write_labels
 
-        # a table is written anew: what a person marked would be lost
-        by_hand = [one for one in open_labels(path).labels if one.score is None and not one.label.startswith(UNCONFIRMED)]
-        if by_hand and kind not in BESIDE:
-            raise error(
-                path, f"is there already, with {count(len(by_hand), 'label')} that a person made",
-                "give another name, or a format that keeps both (.eaf, .boris)",
-            )  # fmt: skip
+    if kind not in BESIDE:  # no row of it says whether somebody made or corrected it
+        raise error(path, "is there already", "give another name, or a format that keeps what is there (.eaf, .boris)")
+    open_labels(path)
+    # as it will be done, but for the labels, which nobody knows yet
+    alone = recordings[0].expanduser() if len(recordings) == 1 else None
+    labels = [Label(0.0, 1.0, UNCONFIRMED, media=one.name) for one in recordings if alone is None]
+    write_labels(path, labels, recording=alone, tier=tier, media=media, dry=True)
     return path
 
 

@@ -50,7 +50,7 @@ class Suggest:
             raise ValueError("no recordings; give at least one keypoint file or folder")
         if self.number < 1:
             raise ValueError(f"--number {self.number}: suggests nothing; give 1 or more")
-        target = check_write(self.write, [*self.recordings, self.model], self.recordings)
+        target = check_write(self.write, [*self.recordings, self.model], self.recordings, self.labelling.media, TIER)
         with progress("loading", steps=False):
             indexer, lanes, notes = self._read()
             done: list[list[Label] | None] = [None] * len(lanes)

@@ -29,7 +29,7 @@ def read(data: Mapping[str, Any], asked: Request) -> LabelFile:
         ValueError: naming video and segment.
     """
     out = Gathering(asked, "activitynet")
-    for video, number, segment in _segments(asked, data):
+    for video, number, segment in _segments(out, data):
         where = f"video {video!r}, segment {number}"
         if not isinstance(segment, dict):
             raise error(asked.path, f"{where} is {shown(segment)}", REMEDY)
@@ -52,10 +52,16 @@ def read(data: Mapping[str, Any], asked: Request) -> LabelFile:
     return out.finish()
 
 
-def _segments(asked: Request, data: Mapping[str, Any]) -> Iterator[tuple[str, int, Any]]:
-    """Video, number from 1, and segment."""
+def _segments(out: Gathering, data: Mapping[str, Any]) -> Iterator[tuple[str, int, Any]]:
+    """Video, number from 1, and segment; videos without a segment are watched nevertheless."""
+    asked = out.asked
     for part, key in (("database", "annotations"), ("results", None)):
-        for video, held in (data.get(part) or {}).items():
+        videos = data.get(part) or {}
+        if not isinstance(videos, dict):
+            raise error(asked.path, f"{part!r} is {shown(videos)}, no object of videos", REMEDY)
+        for video, held in videos.items():
+            out.watched.setdefault(("", video))
+            out.media.setdefault(video)
             found = held.get(key) if key is not None and isinstance(held, dict) else held
             if found is None:
                 continue

@@ -42,6 +42,7 @@ class Gathering:
         self.subjects: dict[str, None] = {}
         self.media: dict[str, None] = {}
         self.machine: dict[str, None] = {}
+        self.watched: dict[tuple[str, str], None] = {}
         self.notices: list[str] = []
         self._nameless: list[Label] = []
 
@@ -111,6 +112,7 @@ class Gathering:
             subjects=tuple(self.subjects),
             media=tuple(self.media),
             machine=tuple(self.machine),
+            watched=tuple(self.watched),
             notices=tuple(self.notices),
         )
 

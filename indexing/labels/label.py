@@ -88,6 +88,7 @@ class LabelFile:
         labels: sorted by start; times on the clock of the medium that each is of.
         observations, tiers, subjects, media: all names that the file has, also those without labels, in its order.
         machine: of the observations and tiers, those that a program wrote: found, and confirmed by nobody.
+        watched: observation or tier, and a medium that it is of, also where nothing is marked there.
         notices: what was left out, dropped or assumed, a sentence each.
     """
 
@@ -99,6 +100,7 @@ class LabelFile:
     subjects: tuple[str, ...] = ()
     media: tuple[str, ...] = ()
     machine: tuple[str, ...] = ()
+    watched: tuple[tuple[str, str], ...] = ()
     notices: tuple[str, ...] = field(default=(), repr=False)
 
 

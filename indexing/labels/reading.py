@@ -172,10 +172,12 @@ def _asked_for(found: LabelFile, asked: Request) -> LabelFile:
                 raise error(asked.path, f"has no {what} {shown(wanted)}, only {listed(known)}", f"give one of these (--{what})")
             labels = [label for label in labels if getattr(label, what) == wanted]
     mine = of_recording(found.media, asked)
+    names = [name for name in (asked.observation, asked.tier) if name is not None]
+    watched = (one for one in found.watched if (not names or one[0] in names) and (mine is None or one[1] in mine))
     if mine is not None:
         others = Counter(label.media for label in labels if label.media and label.media not in mine)
         labels = [label for label in labels if not label.media or label.media in mine]
         if others:
             total = sum(others.values())
             notices.append(f"{count(total, 'label')} left out: of other recordings ({few(others, asked.options)})")
-    return replace(found, labels=tuple(labels), notices=tuple(notices))
+    return replace(found, labels=tuple(labels), watched=tuple(watched), notices=tuple(notices))

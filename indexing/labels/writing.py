@@ -43,11 +43,13 @@ def write_labels(
     annotator: str = "",
     media: str | None = None,
     format: str | None = None,  # noqa: A002
+    dry: bool = False,
 ) -> list[str]:
     """Write labels, of a program or a person.
 
     Where an ELAN file or a BORIS project is there already, labels go into a tier or an observation of their own in it; what a
-    person made stays as it is, and what dyntorch wrote under the same name is replaced.  Other files are written anew.
+    person made stays as it is, and what dyntorch wrote under the same name is replaced, unless somebody has changed it since: then
+    nothing is written.  Other files are written anew.
 
     Args:
         path: its suffix says what is written: ``.boris``, ``.eaf``, ``.csv``, ``.tsv``, ``.json`` (ActivityNet).
@@ -62,6 +64,7 @@ def write_labels(
         media: how the file that is there calls the recording, where its name is another one there.
         format: ``"boris"``, ``"elan"``, ``"csv"``, ``"tsv"``, ``"activitynet"``, ``"label_studio"`` or ``"via"``; by default the
             suffix decides.
+        dry: write nothing; what would be refused is.
 
     Returns:
         what the format does not keep of these labels, a sentence each.
@@ -90,7 +93,9 @@ def write_labels(
         asks = {"boris": "BORIS", "elan": "ELAN"}[name]
         notices.append(f"{base_name(own)} is no video: {asks} asks for one when you open {target.name}")
     recordings = dict.fromkeys(([own] if own else []) + [label.media for label in sound])
-    where = Target(target, tuple(recordings), source, tier, duration, fps, annotator, media)
+    where = Target(target, tuple(recordings), source, tier, duration, fps, annotator, media, dry)
+    if dry and name not in BESIDE:
+        return notices
     if name in ("csv", "tsv"):
         return notices + tables.write(target, sound, "," if name == "csv" else "\t")
     module = import_module(f"indexing.labels.{name}.writing" if name in BESIDE else f"indexing.labels.{name}")

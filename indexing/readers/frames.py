@@ -21,7 +21,7 @@ from indexing.readers.pickles import unpickled
 
 NAMES_BLOCK = 2**22  # names of the columns of a frame, each row of them counted, or of its rows: a day at 48 frames per second
 MOST_BLOCK = 100  # blocks of one frame, and rows of column names: usual are one, and three or four
-WORD = 2**10  # bytes of a name that is a value of numpy's, which is copied for each column
+WORD_BLOCK = 2**10  # bytes of a name that is a value of numpy's, which is copied for each column
 KEY = "df_with_missing"
 LEVELS = {3: ("scorer", "bodyparts", "coords"), 4: ("scorer", "individuals", "bodyparts", "coords")}  # where they have no names
 
@@ -128,7 +128,7 @@ def _named(one: Any) -> bool:
     """Whether the words of a column's name are text and numbers: text of a tuple of tuples can be without end."""
 
     def is_word(word: Any) -> bool:
-        short = word.nbytes < WORD if isinstance(word, np.generic) else type(word) is int and abs(word) < 2**63
+        short = word.nbytes < WORD_BLOCK if isinstance(word, np.generic) else type(word) is int and abs(word) < 2**63
         return type(word) in (str, float) or short
 
     return isinstance(one, tuple) and 0 < len(one) <= MOST_BLOCK and all(map(is_word, one))

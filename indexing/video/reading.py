@@ -286,7 +286,7 @@ def nothing_decoded(path: str | Path, received: int) -> ValueError:
 
 
 def _claimed(container: Any, stream: Any) -> float | None:
-    """Seconds that a file says its pictures last; of Matroska files a text says so, or the length of all, where there is no sound."""
+    """Seconds that a file says its pictures last; of Matroska a text says so, or the length of all, where there is no sound."""
     if stream.duration:
         return float(stream.duration * stream.time_base)
     parts = str(stream.metadata.get("DURATION", "")).split(":")

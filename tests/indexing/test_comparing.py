@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -177,11 +178,43 @@ def test_bad_input_says_what_is_wrong():
         compare([span([("squat", 3, 2)], [])])
     with pytest.raises(ValueError, match="is no interval"):
         compare([span([], [("squat", 0.0, math.nan)])])
+    for start, end in ((0.0, math.nan), (math.nan, 1.0), (0.0, math.inf), (2.0, 1.0)):
+        with pytest.raises(ValueError, match=f"a: {start} s to {end} s is no span of time; give seconds, start first"):
+            compare([ComparedSpan("a", start, end, [("squat", 0.0, 1.0)], [])])
     texts = [(f"remark {i}", float(i), i + 0.5) for i in range(4)]
     with pytest.raises(ValueError, match="4 different labels, of which 3 can be compared; are they free text"):
         compare([span(texts, [])], ComparingOptions(labels=3))
 
 
-def test_many_labels_take_no_time_that_grows_with_their_square():
-    many = [("squat", i / 10, i / 10 + 0.05) for i in range(20_000)]
-    assert compare([span(many, many, end=2000.0)]).segments[0.5].right == 20_000
+def test_many_labels_are_compared_with_those_near_them_only(monkeypatch):
+    many = [("squat", i / 10, i / 10 + 0.05) for i in range(2000)]
+    sizes = []
+    whole = np.maximum
+
+    def counted(a, b, *args, **more):
+        sizes.append(np.size(a))
+        return whole(a, b, *args, **more)
+
+    counted.accumulate = whole.accumulate
+    monkeypatch.setattr("indexing.comparing.np.maximum", counted)
+    assert right_segments([one[1:] for one in many], [one[1:] for one in many], 0.5) == 2000
+    assert len(sizes) == 2 * 2000 and sum(sizes) <= 3 * 2 * 2000
+
+
+def test_blocks_change_nothing_and_bound_what_is_held():
+    rng = np.random.default_rng(0)
+    starts = np.sort(rng.uniform(0, 1000, size=(2, 1500)))
+    sides = [[(f"l{rng.integers(300):03d}", a, a + 2.0) for a in side] for side in starts.tolist()]
+    one = span(*sides, end=1002.0)
+    blocks = [compare([one], ComparingOptions(block=block)) for block in (7, 128, 10**6)]
+    for other in blocks[1:]:
+        assert np.allclose(blocks[0].seconds, other.seconds, atol=1e-9) and blocks[0].segments == other.segments
+        assert other.by_label["l007"].both == pytest.approx(blocks[0].by_label["l007"].both)
+    assert blocks[0].compared == pytest.approx(1002.0)
+    held = []
+    for block in (64, 10**6):
+        tracemalloc.start()
+        compare([one], ComparingOptions(block=block))
+        held.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert held[0] < 6e6 < 20e6 < held[1]

@@ -66,6 +66,7 @@ def read(data: Mapping[str, Any], asked: Request) -> LabelFile:
             out.machine.setdefault(called[name])
         for media in files_of(observation):
             out.media.setdefault(media)
+            out.watched.setdefault((called[name], media))
     for subject in _object(asked, data.get("subjects_conf") or {}, "subjects_conf").values():
         if isinstance(subject, dict) and text_of(subject.get("name")):
             out.subjects.setdefault(text_of(subject["name"]))

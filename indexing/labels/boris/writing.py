@@ -22,9 +22,11 @@ from indexing.labels.boris.project import MACHINE, ethogram, files_of
 from indexing.labels.gathering import Request, text_of
 from indexing.labels.label import Label, in_order
 from indexing.labels.media import base_name, of_recording
-from indexing.labels.target import Target
+from indexing.labels.target import Target, changed, seal
 from indexing.opening import clipped, error, parse_json, read_text
 
+SEAL = re.compile(r"\[([0-9a-f]{8})\]")
+LATEST = 1e9  # seconds, thirty years: no time is later
 PLAYERS = "12345678"
 VERSION = "7.0"
 STATE, POINT = "State event", "Point event"
@@ -69,7 +71,8 @@ def write(labels: Sequence[Label], target: Target) -> list[str]:
     if any(label.tier for label in labels):
         draft.notices.append("BORIS keeps no tiers")
     indent = re.match(r"\s*\{\r?\n([ \t]*)", text) if text else re.match("()", "")
-    write_text(target.path, json.dumps(project, indent=(indent[1] or 1) if indent else None, ensure_ascii=False) + "\n")
+    if not target.dry:
+        write_text(target.path, json.dumps(project, indent=(indent[1] or 1) if indent else None, ensure_ascii=False) + "\n")
     return draft.notices
 
 
@@ -184,26 +187,63 @@ def _observations(draft: Draft, labels: Sequence[Label]) -> None:
     groups |= {("", media): [] for media in target.media if media in empty}
     there = {media: _there(target, known, media) for _, media in groups}
     replaced = [[there[media]] for observation, media in groups if not observation]
-    kept = {
-        name: one
-        for name, one in before.items()
-        if not (_machine(one) and name.startswith(f"{target.tier} ") and files_of(one) in replaced)
-    }
+    kept = _kept(target, before, replaced)
     written: dict[str, Any] = {}
     for (observation, media), own in groups.items():
         base = base_name(there[media])
         if sum(base_name(one) == base for one in there.values()) > 1:
             base = there[media]
-        for number, layer in enumerate(_layers(own)):
+        layers = _layers(own)
+        for number, layer in enumerate(layers):
             name = (observation or f"{target.tier} {base}".strip()) + f" ({number + 1})" * (number > 0)
             if name in kept or name in written:
                 raise error(target.into or target.path, f"somebody's observation is called {name!r}", "choose another name (tier=)")
-            written[name] = _observation(draft, layer, there[media], known.get(there[media]), not observation)
+            written[name] = _observation(draft, layer, there[media], known.get(there[media]))
+            if not observation:
+                by = f" ({target.annotator})" * bool(target.annotator)
+                mark = _seal(name, written[name], len(layers))
+                written[name]["description"] = f"{MACHINE} found by a program, confirmed by nobody{by} [{mark}]"
     draft.project["observations"] = kept | written
+
+
+def _kept(target: Target, before: Mapping[str, Any], replaced: Sequence[list[str]]) -> dict[str, Any]:
+    """The observations that stay: all but those that dyntorch wrote of these files.
+
+    Raises:
+        ValueError: somebody has changed what would be replaced.
+    """
+    old = {
+        name: one
+        for name, one in before.items()
+        if _machine(one) and name.startswith(f"{target.tier} ") and files_of(one) in replaced
+    }
+    for name, one in old.items():
+        number = sum(files_of(other) == files_of(one) for other in old.values())
+        found = SEAL.search(text_of(one.get("description")))
+        if found is None or found[1] != _seal(name, one, number):
+            raise changed(target, f"observation {clipped(name)!r}")
+    return {name: one for name, one in before.items() if name not in old}
 
 
 def _machine(observation: Any) -> bool:
     return text_of(observation.get("description")).startswith(MACHINE)
+
+
+def _seal(name: str, observation: Mapping[str, Any], layers: int) -> str:
+    """The mark of an observation, one of several that were written of the recording: what a person may correct in it."""
+    rows = []
+    for event in observation["events"] if isinstance(observation.get("events"), list) else ():
+        time = _time(event[0]) if isinstance(event, list) and event else None
+        if time is None:
+            return ""  # no event of ours
+        texts = [" ".join(text_of(part).split()) for part in [*event[1:5], "", "", "", ""][:4]]
+        rows.append((time, *("" if text == "None" else text for text in texts)))
+    return seal(name, layers, _time(observation.get("time offset")) or 0, *(part for row in sorted(rows) for part in row))
+
+
+def _time(value: Any) -> int | None:
+    """Milliseconds, None where that is no time of ours."""
+    return _milli(value) if isinstance(value, int | float) and abs(value) < LATEST else None
 
 
 def _there(target: Target, known: Mapping[str, Any], media: str) -> str:
@@ -233,9 +273,7 @@ def _layers(labels: Sequence[Label]) -> list[list[Label]]:
     return layers
 
 
-def _observation(
-    draft: Draft, labels: Sequence[Label], media: str, like: Mapping[str, Any] | None, machine: bool
-) -> dict[str, Any]:
+def _observation(draft: Draft, labels: Sequence[Label], media: str, like: Mapping[str, Any] | None) -> dict[str, Any]:
     """An observation of one recording; what is known of it is taken over from an observation that has it."""
     target = draft.target
     last = max((label.end for label in labels), default=0.0)
@@ -244,12 +282,11 @@ def _observation(
     for part, value in info.items():
         values = known.get(part) if isinstance(known, dict) else None
         info[part] = values.get(media, value) if isinstance(values, dict) else value
-    by = f" ({target.annotator})" * bool(target.annotator)
     return {
         "file": {player: [media] * (player == "1") for player in PLAYERS},
         "type": "MEDIA",
         "date": datetime.datetime.now().isoformat(timespec="seconds"),
-        "description": f"{MACHINE} found by a program, confirmed by nobody{by}" if machine else "",
+        "description": "",
         "time offset": 0.0,
         "events": _events(draft, labels),
         "observation time interval": [0, 0],

@@ -42,6 +42,7 @@ def read(_: Any, asked: Request) -> LabelFile:
     media, origin = _medium(out, root)
     for tier in tiers:
         out.tiers.setdefault(tier.shown)
+        out.watched.setdefault((tier.shown, media))
         if tier.machine:
             out.machine.setdefault(tier.shown)
         if tier.participant:
@@ -122,6 +123,11 @@ def _tiers(asked: Request, root: Element, parts: TierParts) -> list[Tier]:
     if twice is not None:
         raise error(asked.path, f"two tiers are called {shown(twice)}", "rename one (ELAN: Tier > Change Tier Attributes)")
     _check_parents(asked, found)
+    kinds = constraints(root)
+    lost = next((tier for tier in found if tier.kind and tier.kind not in kinds), None)
+    if lost is not None:
+        said = f"tier {shown(lost.name)}: its linguistic type {shown(lost.kind)} is not there"
+        raise error(asked.path, said, "give it another one (ELAN: Tier > Change Tier Attributes)")
     same = repeated(one.name for tier in found for one in tier.annotations)
     if same is not None:
         raise error(asked.path, f"two annotations have the id {shown(same)}", REMEDY)

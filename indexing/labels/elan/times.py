@@ -10,7 +10,9 @@ from indexing.labels.gathering import Gathering, Request
 from indexing.opening import count, error, listed, shown
 
 REMEDY = "open it in ELAN, mend it and save it again"
-MACHINE = "dyntorch"  # the linguistic type of tiers that a program wrote, and their annotator until a person takes them over
+MACHINE = (
+    "dyntorch"  # the linguistic type of tiers that a program wrote, and how their annotator begins until a person takes them over
+)
 
 
 @dataclass(slots=True, eq=False)
@@ -48,7 +50,7 @@ class Tier:
     @property
     def machine(self) -> bool:
         """Whether a program wrote it, and nobody else has put a name to it since."""
-        return self.kind == MACHINE and self.annotator == MACHINE
+        return self.kind == MACHINE and self.annotator.split(" ")[0] == MACHINE
 
     @property
     def shown(self) -> str:
@@ -68,10 +70,7 @@ def place(out: Gathering, tiers: Sequence[Tier], slots: Mapping[str, float | Non
                 if slot not in slots:
                     said = f"tier {shown(tier.name)}, annotation {one.name}: its time slot {shown(slot)} is not there"
                     raise error(out.asked.path, said, REMEDY)
-    between = 0
-    if len(known) < len(slots):
-        between = sum(_interpolate(tier, known) for tier in tiers)
-        _between_neighbours(known, list(slots))
+    between = _fill(tiers, known, slots) if len(known) < len(slots) else 0
     nowhere = []
     for tier in tiers:
         for one in tier.annotations:
@@ -87,10 +86,18 @@ def place(out: Gathering, tiers: Sequence[Tier], slots: Mapping[str, float | Non
         out.note(f"{count(len(nowhere), 'annotation')} left out: without a time ({listed(nowhere, out.asked.options.named)})")
 
 
-def _interpolate(tier: Tier, known: dict[str, float]) -> int:
-    """Times of slots at which one annotation of a tier ends and the next begins; how many there were."""
+def _fill(tiers: Sequence[Tier], known: dict[str, float], slots: Mapping[str, float | None]) -> int:
+    """Times of slots that nobody set; of how many at which annotations begin or end."""
+    for tier in tiers:
+        _interpolate(tier, known)
+    _between_neighbours(known, list(slots))
+    used = {slot for tier in tiers for one in tier.annotations for slot in one.slots or ()}
+    return sum(slots[slot] is None and slot in known for slot in used)
+
+
+def _interpolate(tier: Tier, known: dict[str, float]) -> None:
+    """Times of slots at which one annotation of a tier ends and the next begins."""
     following = {one.slots[0]: one.slots[1] for one in tier.annotations if one.slots is not None}
-    found = 0
     for one in tier.annotations:
         if one.slots is None or one.slots[0] not in known or one.slots[1] in known:
             continue
@@ -101,8 +108,6 @@ def _interpolate(tier: Tier, known: dict[str, float]) -> int:
             first, last, parts = known[chain[0]], known[chain[-1]], len(chain) - 1
             for number, slot in enumerate(chain[1:-1], start=1):
                 known[slot] = first + (last - first) * number / parts
-                found += 1
-    return found
 
 
 def _between_neighbours(known: dict[str, float], order: Sequence[str]) -> None:

@@ -22,7 +22,7 @@ from indexing.labels.gathering import Request
 from indexing.labels.label import Label, in_order, spots
 from indexing.labels.markup import Placed, parse_xml
 from indexing.labels.media import base_name, of_recording
-from indexing.labels.target import Target
+from indexing.labels.target import Target, changed, seal
 from indexing.opening import count, error, listed, read_bytes, shown
 
 ENCODING = re.compile(rb"<\?xml[^>]*?encoding\s*=\s*[\"']([^\"']*)")
@@ -65,8 +65,10 @@ class Edit:
 
 @dataclass(frozen=True)
 class TierRow:
-    """Annotations that become one tier: begin and end in milliseconds on the clock of the document."""
+    """Annotations that become one tier: begin and end in milliseconds on the clock of the document; base: its name without what
+    tells people and overlapping rows apart."""
 
+    base: str
     name: str
     participant: str
     annotations: list[tuple[int, int, str]]
@@ -84,6 +86,8 @@ class Document:
         self.slots: dict[str, tuple[int, int]] = {}
         self.uses: dict[Element, list[str]] = {}
         self.numbers: dict[Element, int] = {}
+        self.times: dict[str, int] = {}
+        self.ours: dict[Element, list[tuple[str, str, str]]] = {}
         self.properties: list[Placed] = []
         self.root, self.placed = parse_xml(path, data, self._take)
         if self.root.tag != "ANNOTATION_DOCUMENT":
@@ -95,9 +99,14 @@ class Document:
         element = placed.element
         if parent.tag == "TIME_ORDER":
             self.slots[element.get("TIME_SLOT_ID", "")] = placed.first, placed.last
+            self.times[element.get("TIME_SLOT_ID", "")] = _number("", element.get("TIME_VALUE", ""))
         elif parent.tag == "TIER":
+            machine = tier_of(parent).machine
             for one in element:
-                self.uses.setdefault(parent, []).extend(one.get(key, "") for key in ("TIME_SLOT_REF1", "TIME_SLOT_REF2"))
+                slots = one.get("TIME_SLOT_REF1", ""), one.get("TIME_SLOT_REF2", "")
+                self.uses.setdefault(parent, []).extend(slots)
+                if machine:
+                    self.ours.setdefault(parent, []).append((*slots, one.findtext("ANNOTATION_VALUE", "")))
                 number = max(self.numbers.get(parent, 0), _number("a", one.get("ANNOTATION_ID", "")))
                 self.numbers[parent] = number
         else:
@@ -136,14 +145,15 @@ def write(labels: Sequence[Label], target: Target) -> list[str]:
     media = target.media[0] if target.media else ""
     document = Document(target.into or target.path, _empty(target, media) if target.into is None else read_bytes(target.into))
     rows, notices = _rows(labels, target, _origin(document, target, media))
-    edits = _edits(document, rows, {label.tier or target.tier for label in labels} or {target.tier})
+    edits = _edits(document, target, rows, {label.tier or target.tier for label in labels} or {target.tier})
     data, at = bytearray(), 0
     for edit in sorted(edits, key=lambda edit: (edit.first, edit.last)):
         data += document.data[at : edit.first] + edit.data
         at = max(at, edit.last)
     data += document.data[at:]
     parse_xml(target.path, bytes(data), lambda placed, parent: True)  # what was put together is sound, or nothing is written
-    write_bytes(target.path, bytes(data))
+    if not target.dry:
+        write_bytes(target.path, bytes(data))
     kept = {"comment": "comments", "modifiers": "modifiers", "score": "scores", "observation": "observations"}
     lost = [what for name, what in kept.items() if any(getattr(label, name) not in ("", (), None) for label in labels)]
     return notices + [f"ELAN keeps no {' and no '.join(lost)}"] * bool(lost)
@@ -180,27 +190,28 @@ def _rows(labels: Sequence[Label], target: Target, origin: float) -> tuple[list[
             continue
         base = label.tier or target.tier
         group = rows.setdefault((base, label.subject), [])
-        end = max(end, begin + 1)
+        end = begin + 1 if label.point else max(end, begin + 2)  # a millisecond is a moment
         row = next((row for row in group if row.annotations[-1][1] <= begin), None)
         if row is None:
             name = base + f"@{label.subject}" * bool(label.subject)
             name += f" ({len(group) + 1})" * (bool(group) or NUMBERED.search(name) is not None)
-            row = TierRow(name, label.subject, [])
+            row = TierRow(base, name, label.subject, [])
             group.append(row)
         row.annotations.append((begin, end, label.label))
     if not labels:  # nothing was found: that is what the tier says
-        rows[target.tier, ""] = [TierRow(target.tier, "", [])]
+        rows[target.tier, ""] = [TierRow(target.tier, target.tier, "", [])]
     said = f"{count(len(early), 'label')} left out: before the time at which the ELAN file begins ({spots(early)})"
     return [row for group in rows.values() for row in group], [said] * bool(early)
 
 
 # ---- edits ---------------------------------------------------------------------------------------------------------------
-def _edits(document: Document, rows: Sequence[TierRow], bases: set[str]) -> list[Edit]:
+def _edits(document: Document, target: Target, rows: Sequence[TierRow], bases: set[str]) -> list[Edit]:
     """Take out the tiers of these names that dyntorch wrote, with their time slots, and put in the new ones."""
     if document.order is None:
         raise error(document.path, "is no sound ELAN file: it has no TIME_ORDER", REMEDY)
     tiers_there = list(document.parts("TIER"))
     old = [part for part in tiers_there if tier_of(part.element).machine and tier_of(part.element).shown in bases]
+    _check_unchanged(document, target, old)
     _check_free(document, old, rows)
     gone = {part.element for part in old}
     used = {slot for part in tiers_there if part.element not in gone for slot in document.uses.get(part.element, ())}
@@ -211,7 +222,9 @@ def _edits(document: Document, rows: Sequence[TierRow], bases: set[str]) -> list
     order, tiers = [], []
     for row in rows:
         participant = f" PARTICIPANT={quoteattr(row.participant)}" * bool(row.participant)
-        head = f"TIER ANNOTATOR={quoteattr(MACHINE)} LINGUISTIC_TYPE_REF={quoteattr(MACHINE)}{participant}"
+        layers = sum((other.base, other.participant) == (row.base, row.participant) for other in rows)
+        mark = f"{MACHINE} {_seal(row.name, row.participant, layers, row.annotations)}"
+        head = f"TIER ANNOTATOR={quoteattr(mark)} LINGUISTIC_TYPE_REF={quoteattr(MACHINE)}{participant}"
         tiers.append(f"{LINE}<{head} TIER_ID={quoteattr(row.name)}{'>' if row.annotations else '/>'}")
         for begin, end, value in row.annotations:
             slot, number = slot + 2, number + 1
@@ -232,6 +245,23 @@ def _annotation(name: str, begin: str, end: str, value: str) -> str:
         f'TIME_SLOT_REF2="{end}">{LINE}            <ANNOTATION_VALUE>{text}</ANNOTATION_VALUE>'
         f"{LINE}        </ALIGNABLE_ANNOTATION>{LINE}    </ANNOTATION>"
     )
+
+
+def _seal(name: str, participant: str, layers: int, annotations: Sequence[tuple[int, int, str]]) -> str:
+    """The mark of a tier, one of several that were written of a person: what somebody may correct in it."""
+    rows = sorted((begin, end, " ".join(value.split())) for begin, end, value in annotations)
+    return seal(name, participant, layers, *(part for row in rows for part in row))
+
+
+def _check_unchanged(document: Document, target: Target, old: Sequence[Placed]) -> None:
+    """What dyntorch wrote is as it was."""
+    tiers = [tier_of(part.element) for part in old]
+    for part, tier in zip(old, tiers, strict=True):
+        layers = sum((other.shown, other.participant) == (tier.shown, tier.participant) for other in tiers)
+        ours = document.ours.get(part.element, ())
+        there = [(document.times.get(begin, 0), document.times.get(end, 0), value) for begin, end, value in ours]
+        if tier.annotator != f"{MACHINE} {_seal(tier.name, tier.participant, layers, there)}":
+            raise changed(target, f"tier {shown(tier.name)}")
 
 
 def _check_free(document: Document, old: Sequence[Placed], rows: Sequence[TierRow]) -> None:

@@ -15,7 +15,7 @@ from indexing import ActionIndexer, Clip, ClipSet
 from indexing.actors import Person, detect, stream
 from indexing.cli import main
 from indexing.cli.inputs import Example, Reading
-from indexing.cli.labels import Labelling, film_examples
+from indexing.cli.labels import Labelling, check_write, film_examples
 from indexing.labels import Label, open_labels, write_labels
 from tests.indexing.cli.test_commands import coco
 
@@ -256,8 +256,30 @@ def test_scan_refuses_before_it_begins(refuse, data: Path, tmp_path: Path, monke
     refuse(f"{scan} --write folder.eaf", "is a folder")
     refuse(f"{scan} --truth @/session.csv --labels @/session.csv", "--truth", "--labels")
     (tmp_path / "file.csv").write_bytes((data / "session.csv").read_bytes())
-    refuse(f"{scan} --write file.csv", "is there already, with 6 labels that a person made", ".eaf, .boris")
+    refuse(f"{scan} --write file.csv", "is there already", ".eaf, .boris")
     refuse(f"{scan} --write file.csv/found.csv", "is a file")
+
+
+def test_corrections_are_not_written_over(refuse, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ActionIndexer, "explain", None)  # said before anything is searched
+    found = [Label(1, 3, "kick", score=2.0), Label(4, 6, "wave", score=1.0)]
+    scan = "index scan @/session.json -m @/m.st --write"
+    for suffix in (".csv", ".tsv", ".json"):  # no row says whether somebody corrected it
+        write_labels(f"found{suffix}", found, recording="session.mp4")
+        refuse(f"{scan} found{suffix}", f"found{suffix}: is there already; give another name", ".eaf, .boris")
+    Path("keypoints.json").write_text('[{"image_id": 1, "keypoints": [1.0, 2.0, 0.5]}]')  # nor is what holds no labels ours
+    refuse(f"{scan} keypoints.json", "keypoints.json: is there already")
+    for tier, command in (("dyntorch", "scan"), ("to label", "suggest")):
+        write_labels("found.eaf", found, recording="session.mp4", tier=tier)
+        write_labels("found.boris", [replace(one, media="session.mp4") for one in found], recording="later.mp4", tier=tier)
+        eaf, boris = Path("found.eaf"), Path("found.boris")
+        eaf.write_text(eaf.read_text().replace('"3000"', '"3100"'))
+        boris.write_text(boris.read_text().replace("3.0", "3.1"))
+        line = f"index {command} @/session.json -m @/m.st --write"
+        refuse(f"{line} found.eaf", f"found.eaf: tier '{tier}'", "somebody has corrected it; rename it to take it over, delete it")
+        refuse(f"{line} found.boris", f"found.boris: observation '{tier} session.mp4'", "somebody has corrected it", "another file")
+        refuse(f"{line.replace('@/s', '@/later.json @/s')} found.boris", f"observation '{tier} session.mp4'")
+    assert check_write(Path("found.boris"), [], [Path("later.json")], tier="to label") == Path("found.boris")  # another recording
 
 
 # ---- evaluate --------------------------------------------------------------------------------------------------------
@@ -312,6 +334,54 @@ def test_recordings_are_compared_each_with_their_own(run, refuse, tmp_path: Path
     assert (tmp_path / "out" / "timeline-2.png").exists()
 
 
+HAND = ["squat,1,3,a.mp4", "squat,1,2,b.mp4", "squat,4,5,b.mp4"]
+
+
+@pytest.mark.parametrize("suffix", [".boris", ".json"])
+def test_where_nothing_was_found_everything_was_missed(run, suffix: str, tmp_path: Path) -> None:
+    table(tmp_path / "mine.csv", *HAND, head="label,start,end,media")
+    found = tmp_path / f"found{suffix}"
+    write_labels(found, [Label(1, 3, "squat", media="a.mp4", score=2.0)], recording="b.mp4")
+    code, out, _ = run(f"index evaluate {found.name} --labels mine.csv --report out")
+    assert code == 0 and "left out: b.mp4" not in out
+    measured = json.loads(Path("out/metrics.json").read_text())
+    half = measured["at_overlap"]["0.5"]
+    assert (half["right"], half["found"], half["known"], half["f1"]) == (1, 1, 3, 0.5)
+    # of 3 + 5 s both say squat for 2 and nothing for 4; by chance (4 * 2 + 4 * 6) / 64
+    assert measured["seconds_compared"] == 8 and measured["agreement"] == 0.75 and measured["kappa"] == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("suffix", [".boris", ".eaf", ".csv", ".json"])
+def test_nothing_found_at_all_is_compared(run, refuse, suffix: str, tmp_path: Path) -> None:
+    table(tmp_path / "mine.csv", *HAND[1:], head="label,start,end,media")
+    write_labels(f"found{suffix}", [], recording="b.mp4")
+    code, out, err = run(f"index evaluate found{suffix} --labels mine.csv --report out")
+    assert (code, err) == (0, "") and f"found{suffix}: nothing was found there" in out
+    measured = json.loads(Path("out/metrics.json").read_text())
+    assert measured["at_overlap"]["0.5"]["known"] == 2 and measured["at_overlap"]["0.5"]["f1"] == 0
+    assert measured["agreement"] == pytest.approx(0.6) and measured["kappa"] == 0
+    refuse(f"index evaluate mine.csv --labels found{suffix}", f"found{suffix}", "holds no label that lasts")
+    if suffix in (".boris", ".eaf"):
+        table(tmp_path / "other.csv", "squat,1,2,c.mp4", head="label,start,end,media")
+        refuse(f"index evaluate found{suffix} --labels other.csv", "is of b.mp4", "c.mp4", "the same recordings")
+
+
+def test_an_empty_tier_beside_those_of_a_person_says_that_nothing_was_found(run, tmp_path: Path) -> None:
+    table(tmp_path / "mine.csv", *HAND[1:], head="label,start,end,media")
+    write_labels("b.eaf", [Label(1, 2, "squat"), Label(4, 5, "squat")], recording="b.mp4", tier="Ann")
+    text = Path("b.eaf").read_text()
+    Path("b.eaf").write_text(text.replace('ANNOTATOR="dyntorch ', 'ANNOTATOR="Ann '))
+    write_labels("b.eaf", [], recording="b.mp4")
+    code, out, _ = run("index evaluate b.eaf --labels mine.csv")
+    assert code == 0 and "compared is what a program found (dyntorch)" in out and "nothing was found there" in out
+    assert "0.5 0 0 2" in out
+    Path("b.eaf").write_text(Path("b.eaf").read_text().replace('TIER_ID="dyntorch"', 'TIER_ID="to label"'))
+    code, out, _ = run("index evaluate b.eaf --labels mine.csv")  # where nothing was suggested, the person's count
+    assert code == 0 and "0.5 2 2 2" in out
+    code, out, _ = run("index evaluate b.eaf --labels mine.csv --found-tier Ann")
+    assert code == 0 and "0.5 2 2 2" in out
+
+
 def test_evaluate_refuses_what_makes_no_sense(refuse, data: Path, tmp_path: Path) -> None:
     table(tmp_path / "points.csv", "kick,1,1")
     labels = "--labels @/session.csv"
@@ -349,5 +419,5 @@ def test_labels_of_videos_are_examples_with_their_seconds(tmp_path: Path, monkey
     assert found == [given[1], Example(Path("a.mp4"), "kick", 1.0, 2.5)]
     assert any("of a moment" in note for note in notes) and any("of other recordings (b.mp4)" in note for note in notes)
     table(tmp_path / "none.csv", "clap,1,1")
-    with pytest.raises(ValueError, match=r"none\.csv: nothing is marked there; mark actions"):
+    with pytest.raises(ValueError, match=r"none\.csv: nothing is marked there \(1 label left out: of a moment, .*\); mark actions"):
         film_examples(given, Labelling(labels=(Path("none.csv"),)), Reading())

@@ -83,7 +83,7 @@ def test_suggestions_are_replaced_by_those_of_the_next_round(run, tmp_path: Path
         ("nope.json -m @/m.st", ("nope.json", "no such file")),
         ("@/session.json -m nope.st", ("nope.st",)),
         ("@/session.json -m @/m.st --write todo.doc", ("todo.doc", "no format that labels are written in")),
-        ("@/session.json -m @/m.st --write @/session.csv", ("session.csv", "2 labels that a person made")),
+        ("@/session.json -m @/m.st --write @/session.csv", ("session.csv", "is there already")),
         ("@/session.json -m @/m.st --tier arms", ("--tier", "--labels FILE")),
         ("@/session.json -m @/m.st --labels nope.csv", ("nope.csv",)),
     ],

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -185,6 +187,54 @@ def test_a_second_run_replaces_the_first(tmp_path: Path) -> None:
     assert found.observations == ("one", "dyntorch other.mp4", "dyntorch session.mp4")
     assert found.machine == ("dyntorch other.mp4", "dyntorch session.mp4")
     assert len(found.labels) == 4
+
+
+def test_corrections_are_not_written_over(tmp_path: Path) -> None:
+    path = tmp_path / "a.boris"
+    found = [Label(1, 3, "squat", score=2.0), Label(2, 4, "squat", score=1.0), Label(5, 6, "wave")]
+    write_labels(path, found, recording="session.mp4")
+    sound = json.loads(path.read_text())
+    name = "dyntorch session.mp4"
+
+    def changed(change: Callable[[dict[str, Any]], Any]) -> None:
+        whole = json.loads(json.dumps(sound))
+        change(whole["observations"])
+        path.write_text(json.dumps(whole))
+
+    def refused(change: Callable[[dict[str, Any]], Any], which: str = name) -> None:
+        changed(change)
+        before = path.read_bytes()
+        for dry in (True, False):
+            said = rf"a\.boris: observation '{re.escape(which)}' is not as dyntorch wrote it: somebody has corrected it; rename it"
+            with pytest.raises(ValueError, match=said):
+                write_labels(path, found, recording="session.mp4", dry=dry)
+        assert path.read_bytes() == before
+
+    def end(at: dict[str, Any]) -> None:
+        at[name]["events"][1][0] += 0.1
+
+    def saved_again(at: dict[str, Any]) -> None:
+        at[name]["events"] = [[event[0] + 1e-9, *event[1:3], event[3] or "None", event[4]] for event in at[name]["events"][::-1]]
+
+    refused(end)
+    refused(lambda at: at[name]["events"].pop())
+    refused(lambda at: at[name]["events"].clear())
+    refused(lambda at: at[name]["events"][0].__setitem__(2, "wave"))
+    refused(lambda at: at[f"{name} (2)"]["events"][0].__setitem__(4, "surely"), f"{name} (2)")
+    refused(lambda at: at.pop(f"{name} (2)"))
+    refused(lambda at: at[name].update({"time offset": 1.0}))
+    refused(lambda at: at[name].update(events=[["soon", "", "squat", "", ""]]))
+    refused(lambda at: at[name].update(description="dyntorch: mine now"))
+    for same in (saved_again, lambda at: at[name].update(date="2030-01-01T00:00:00")):
+        changed(same)
+        write_labels(path, found[1:], recording="session.mp4")
+        assert len(open_labels(path).labels) == 2
+    changed(lambda at: at.update({"Ann": at.pop(name)}))  # taken over, but for the second, which stands alone now
+    with pytest.raises(ValueError, match=r"session\.mp4 \(2\)' is not as"):
+        write_labels(path, found, recording="session.mp4")
+    changed(lambda at: at.update({"Ann": at.pop(name)} | {"other": at.pop(f"{name} (2)")}))
+    write_labels(path, found, recording="session.mp4")
+    assert list(json.loads(path.read_text())["observations"]) == ["Ann", "other", name, f"{name} (2)"]
 
 
 def test_a_point_event_of_the_project_cannot_last(tmp_path: Path) -> None:

@@ -251,12 +251,44 @@ def test_times_are_those_of_the_document(tmp_path: Path) -> None:
 def test_a_tier_that_a_person_took_over_is_theirs(tmp_path: Path) -> None:
     path = eaf(tmp_path / "a.eaf", TIMES, ACTS)
     write_labels(path, FOUND[2:], recording="session.mp4")
-    path.write_text(path.read_text().replace('ANNOTATOR="dyntorch"', 'ANNOTATOR="Ann"'))
+    path.write_text(re.sub('ANNOTATOR="dyntorch [0-9a-f]{8}"', 'ANNOTATOR="Ann"', path.read_text()))
     assert open_labels(path).machine == ()
     before = path.read_bytes()
     with pytest.raises(ValueError, match="somebody's tier is called 'dyntorch'; choose another name"):
         write_labels(path, FOUND, recording="session.mp4")
     assert path.read_bytes() == before
+
+
+def test_corrections_are_not_written_over(tmp_path: Path) -> None:
+    path = eaf(tmp_path / "a.eaf", TIMES, ACTS)
+    write_labels(path, [Label(1, 3, "squat", "Ann"), Label(2, 4, "squat", "Ann")], recording="session.mp4")
+    sound = path.read_text()
+    second = sound[sound.index("<TIER ANNOTATOR", sound.index('TIER_ID="dyntorch@Ann"')) :]
+    second = second[: second.index("</TIER>") + 7]
+    assert 'TIER_ID="dyntorch@Ann (2)"' in second and "<ANNOTATION_VALUE>squat" in second
+    saved_again = sound.replace("\n    <ANNOTATION>", "\r\n\t<ANNOTATION>")  # by ELAN: other bytes, the same annotations
+    for same in (sound, saved_again):
+        path.write_text(same, newline="")
+        write_labels(path, [Label(1, 3, "squat", "Ann"), Label(2, 4, "squat", "Ann")], recording="session.mp4")
+        assert open_labels(path, tier="dyntorch").labels[0].label == "squat"
+    for wrong, tier_ in (
+        (sound.replace(second, second.replace(">squat<", ">lunge<")), "dyntorch@Ann (2)"),
+        (sound.replace('TIME_VALUE="3000"', 'TIME_VALUE="3100"'), "dyntorch@Ann"),
+        (sound.replace(second, ""), "dyntorch@Ann"),  # what is taken out is a correction, too
+    ):
+        assert wrong != sound
+        path.write_text(wrong)
+        before = path.read_bytes()
+        for dry in (True, False):
+            with pytest.raises(ValueError, match=rf"a\.eaf: tier '{re.escape(tier_)}' is not as dyntorch wrote it.*; rename it to"):
+                write_labels(path, FOUND, recording="session.mp4", dry=dry)
+        assert path.read_bytes() == before
+
+
+def test_what_lasts_is_no_moment_however_short(tmp_path: Path) -> None:
+    path = tmp_path / "a.eaf"
+    write_labels(path, [Label(1.0, 1.001, "a"), Label(2.0, 2.0003, "b"), Label(3.0, 3.0, "c")], recording="session.mp4")
+    assert [(one.start, one.end) for one in open_labels(path).labels] == [(1.0, 1.002), (2.0, 2.002), (3.0, 3.0)]
 
 
 def test_a_tier_that_others_hang_on_is_not_replaced(tmp_path: Path) -> None:
@@ -310,3 +342,10 @@ def test_empty_elements_and_tags_in_strange_places(tmp_path: Path) -> None:
     assert '<TIER TIER_ID="/&gt;" C=">"></TIER>\n    <TIER ANNOTATOR' in text
     assert text.endswith("x/><!-- <TIER> --></ANNOTATION_DOCUMENT>")
     assert [label.label for label in open_labels(path, tier="dyntorch").labels] == ["clap"]
+
+
+def test_a_linguistic_type_that_is_not_there_is_named(tmp_path: Path) -> None:
+    path = eaf(tmp_path / "a.eaf", TIMES, ACTS)
+    path.write_text(path.read_text().replace('LINGUISTIC_TYPE_REF="', 'LINGUISTIC_TYPE_REF="other '))
+    with pytest.raises(ValueError, match=r"a.eaf: tier 'acts': its linguistic type 'other .*' is not there; give it another one"):
+        open_labels(path)

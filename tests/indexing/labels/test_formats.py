@@ -77,6 +77,21 @@ def test_activitynet(tmp_path: Path) -> None:
         open_labels(saved(tmp_path / "c.json", bad))
 
 
+@pytest.mark.parametrize("part", ["database", "results"])
+@pytest.mark.parametrize("wrong", [[1], "a", 3, True])
+def test_parts_of_activitynet_that_are_no_object(part: str, wrong: Any, tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    path.write_text(json.dumps({"database": {}, "results": {}} | {part: wrong}))
+    with pytest.raises(ValueError, match=rf"a\.json: '{part}' is .*, no object of videos; write segments as"):
+        open_labels(path)
+
+
+def test_videos_without_a_segment_are_known(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    path.write_text(json.dumps({"database": {"a": {"annotations": []}}, "results": {"b": []}}))
+    assert open_labels(path).media == ("a", "b") and open_labels(path).watched == (("", "a"), ("", "b"))
+
+
 def test_results_name_recordings_without_labels(tmp_path: Path) -> None:
     write_labels(tmp_path / "a.json", [Label(1, 2, "x", media="a.mp4", score=1.0)], recording="b.mp4")
     assert json.loads((tmp_path / "a.json").read_text())["results"]["b.mp4"] == []

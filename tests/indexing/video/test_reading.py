@@ -123,9 +123,10 @@ def test_a_file_without_times_gets_them_and_says_so(write):
     assert "30 fps assumed" in probe(path).notes[0]
 
 
-def test_a_cut_off_file_gives_what_is_there(write):
+@pytest.mark.parametrize("name", ["cut.mp4", "cut.mkv"])
+def test_a_cut_off_file_gives_what_is_there(write, name):
     rng = np.random.default_rng(0)
-    path = write("cut.mp4", rng.integers(0, 255, (60, 48, 64), dtype=np.uint8), fps=10)
+    path = write(name, rng.integers(0, 255, (60, 48, 64), dtype=np.uint8), fps=10)
     data = path.read_bytes()
     path.write_bytes(data[: len(data) // 2])
     video = read_video(path)
