@@ -3,11 +3,12 @@
     python -m experiments.labels.story
 
 Needs no recordings: for an hour a synthetic person does five actions that matter and four that do not, with rests of 2 to 8 s, seen
-by a noisy detector that loses joints; what it sees is a COCO keypoint file of 108,000 frames at 30 per second.  Somebody marks the
-first performance of each action that matters in ELAN.  Then every step is a command of its own, its start included:
+by a noisy detector that loses joints; what it sees is a clip set of 108,000 frames, 30 per second, as ``dyntorch pose`` writes it.
+Somebody marks the first performance of each action that matters in ELAN.  Then every step is a command of its own, its start
+included:
 
-1. ``index fit hour.json --labels hour.eaf`` learns from five labels;
-2. ``index scan hour.json --write hour.eaf`` writes what is found into a tier beside them;
+1. ``index fit hour.npz --labels hour.eaf`` learns from five labels;
+2. ``index scan hour.npz --write hour.eaf`` writes what is found into a tier beside them;
 3. ten events (those with the least score) are corrected: names and times become the true ones, what does not matter is *other*;
 4. ``index fit`` again, from five and ten labels.
 
@@ -17,7 +18,6 @@ What the second scan finds better than the first is measured besides, and not co
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
@@ -35,7 +35,6 @@ from experiments.common.tables import Row, command, note
 from indexing import Clip
 from indexing.actors import Person, detect, stream
 from indexing.comparing import ComparedSpan, compare
-from indexing.files import write_text
 from indexing.labels import Label, open_labels, write_labels
 
 ACTIONS = ("squat", "wave", "kick", "throw", "bow")
@@ -74,17 +73,8 @@ def recorded(config: Config) -> tuple[Clip, list[Label]]:
     frames = round(60 * config.minutes * FPS)
     joints = np.concatenate([part.joints for part in parts])[:frames]
     confidence = np.concatenate([np.asarray(part.confidence) for part in parts])[:frames]
-    clip = parts[0].replace(joints=joints, confidence=confidence, times=np.arange(len(joints)) / FPS, name="hour.json")
+    clip = parts[0].replace(joints=joints, confidence=confidence, times=np.arange(len(joints)) / FPS, name="hour.npz")
     return clip, [label for label in truth if label.end <= clip.times[-1]]
-
-
-def write_coco(path: Path, clip: Clip) -> None:
-    """The recording as COCO keypoint results, as detectors write them."""
-    triples = np.concatenate([np.nan_to_num(clip.joints), np.asarray(clip.confidence)[..., None]], axis=2).round(2)
-    rows = [
-        {"image_id": frame, "category_id": 1, "keypoints": one.ravel().tolist(), "score": 0.9} for frame, one in enumerate(triples)
-    ]
-    write_text(path, json.dumps(rows))
 
 
 def timed(*words: str | Path) -> tuple[float, float]:
@@ -133,10 +123,10 @@ def run(config: Config) -> None:
     book = Book(config.out)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        keypoints, labels, model = folder / "hour.json", folder / "hour.eaf", folder / "moves.safetensors"
+        keypoints, labels, model = folder / "hour.npz", folder / "hour.eaf", folder / "moves.safetensors"
         note("... the recording")
         clip, truth = recorded(config)
-        write_coco(keypoints, clip)
+        clip.save(keypoints)
         first = [next(one for one in truth if one.label == action) for action in ACTIONS]
         write_labels(labels, first, recording=folder / "hour.mp4", tier="Ann", duration=clip.duration, fps=FPS)
         learn = ("index", "fit", keypoints, "--fps", f"{FPS:g}", "--labels", labels, "--tier", "Ann", "-o", model)

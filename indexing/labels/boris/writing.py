@@ -197,7 +197,9 @@ def _observations(draft: Draft, labels: Sequence[Label]) -> None:
         for number, layer in enumerate(layers):
             name = (observation or f"{target.tier} {base}".strip()) + f" ({number + 1})" * (number > 0)
             if name in kept or name in written:
-                raise error(target.into or target.path, f"somebody's observation is called {name!r}", "choose another name (tier=)")
+                raise error(
+                    target.into or target.path, f"somebody's observation is called {name!r}", "rename it, or write to another file"
+                )
             written[name] = _observation(draft, layer, there[media], known.get(there[media]))
             if not observation:
                 by = f" ({target.annotator})" * bool(target.annotator)

@@ -270,10 +270,10 @@ def _check_free(document: Document, old: Sequence[Placed], rows: Sequence[TierRo
     for part in document.parts("TIER"):
         tier = tier_of(part.element)
         if tier.name not in gone and any(row.name == tier.name for row in rows):
-            raise error(document.path, f"somebody's tier is called {shown(tier.name)}", "choose another name (tier=)")
+            raise error(document.path, f"somebody's tier is called {shown(tier.name)}", "rename it, or write to another file")
         if tier.name not in gone and tier.parent in gone:
             said = f"tier {shown(tier.name)} hangs on {shown(tier.parent)}, which would be replaced"
-            raise error(document.path, said, "choose another name (tier=), or free that tier in ELAN")
+            raise error(document.path, said, "free that tier in ELAN, or write to another file")
 
 
 def _number(prefix: str, name: str) -> int:

@@ -248,7 +248,9 @@ def test_a_point_event_of_the_project_cannot_last(tmp_path: Path) -> None:
 def test_an_observation_of_a_person_is_not_overwritten(tmp_path: Path) -> None:
     path = project(tmp_path / "a.boris", {"dyntorch session.mp4": observation(EVENTS)})
     before = path.read_bytes()
-    with pytest.raises(ValueError, match=r"somebody's observation is called 'dyntorch session\.mp4'; choose another name"):
+    with pytest.raises(
+        ValueError, match=r"somebody's observation is called 'dyntorch session\.mp4'; rename it, or write to another file"
+    ):
         write_labels(path, FOUND, recording="session.mp4")
     assert path.read_bytes() == before
 

@@ -254,7 +254,7 @@ def test_a_tier_that_a_person_took_over_is_theirs(tmp_path: Path) -> None:
     path.write_text(re.sub('ANNOTATOR="dyntorch [0-9a-f]{8}"', 'ANNOTATOR="Ann"', path.read_text()))
     assert open_labels(path).machine == ()
     before = path.read_bytes()
-    with pytest.raises(ValueError, match="somebody's tier is called 'dyntorch'; choose another name"):
+    with pytest.raises(ValueError, match="somebody's tier is called 'dyntorch'; rename it, or write to another file"):
         write_labels(path, FOUND, recording="session.mp4")
     assert path.read_bytes() == before
 
