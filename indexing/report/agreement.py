@@ -76,7 +76,8 @@ def write_agreement(folder: str | Path, report: AgreementReport) -> Path:
     names = [*both.labels, NONE]
     each = [(span, compare([span])) for span in report.spans]
     drawn = {timeline_name(i): _timeline(span) for i, span in enumerate(report.spans[:TIMELINES])}
-    drawn_confusion = pictures.confusion(both.seconds.round(1), names, report.sides)
+    sides = f"seconds known ({report.sides[0]})", f"seconds found ({report.sides[1]})"
+    drawn_confusion = pictures.confusion(both.seconds.round(1), names, sides)
     values: dict[str, Any] = {
         "summary": described(report),
         "cards": _cards(both),

@@ -222,3 +222,11 @@ def test_an_archive_without_a_model_leaves_videos_out(films, seeing, monkeypatch
     assert main(["archive", "add", str(films / "lab"), str(films / "nod.mp4"), "--workers", "1"]) == 2
     error = capsys.readouterr().err
     assert "nod.mp4: is a video, and there is no pose model" in error and "dyntorch pose --get-models" in error
+
+
+def test_an_archive_takes_a_video_anew_that_has_changed(films, model):
+    archive = Archive(films / "lab")
+    archive.add(films / "nod.mp4")
+    (films / "hop.mp4").replace(films / "nod.mp4")
+    (done,) = archive.add(films / "nod.mp4").sources
+    assert done.outcome == "replaced" and len(list((films / "lab" / "poses").rglob("*.npz"))) == 1
