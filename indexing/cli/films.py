@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -107,6 +108,9 @@ class Watching:
         videos = list(dict.fromkeys(path for path in paths if is_video(path)))
         if not videos:
             return Watched({})
+        for name, value in (("people", self.people), ("every", self.every)):
+            if value < 1:
+                raise ValueError(f"--{name} {value}: expected 1 or more")
         from indexing.pose.writing import kept_file
 
         home = self.poses.expanduser() if self.poses is not None else None if beside is None else beside / "pose"
@@ -173,9 +177,10 @@ def _passing() -> tempfile.TemporaryDirectory[str]:
 def _folders(videos: Sequence[Path], home: Path) -> dict[Path, list[Path]]:
     """Where the keypoints of each video go: those of one name, in folders of their own, go to such again."""
     owners: dict[Path, list[Path]] = {}
+    times = Counter(video.stem.lower() for video in videos)
     for video in videos:
-        same = [other for other in videos if other.stem.lower() == video.stem.lower()]
-        owners.setdefault(home / video.expanduser().resolve().parent.name if len(same) > 1 else home, []).append(video)
+        alone = times[video.stem.lower()] == 1
+        owners.setdefault(home if alone else home / video.expanduser().resolve().parent.name, []).append(video)
     return owners
 
 
