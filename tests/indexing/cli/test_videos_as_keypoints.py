@@ -119,7 +119,10 @@ def test_a_model_and_a_recording_of_two_kinds(films, model, monkeypatch, capsys)
 
 
 def test_numbers_that_make_no_sense(films, model, capsys):
-    for words, said in ((["--people", "0"], "--people 0: expected 1 or more"), (["--every", "-1"], "--every -1: expected 1 or more")):
+    for words, said in (
+        (["--people", "0"], "--people 0: expected 1 or more"),
+        (["--every", "-1"], "--every -1: expected 1 or more"),
+    ):
         assert fit(films, *words) == 2
         assert said in capsys.readouterr().err and not (films / "pose").exists()
 
