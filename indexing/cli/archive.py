@@ -6,7 +6,6 @@ import contextlib
 import dataclasses
 import multiprocessing
 import os
-import sys
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
@@ -17,7 +16,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from indexing.cli.console import REPORT_FILES, Progress, check_report, complain, count, names, one_line, progress, say, table
+from indexing.cli.console import (
+    REPORT_FILES,
+    Progress,
+    check_report,
+    complain,
+    count,
+    counted,
+    names,
+    one_line,
+    progress,
+    say,
+    table,
+)
 from indexing.cli.inputs import CUT, Example, Following, Reading, assumed, parse_example
 from indexing.cli.remarks import remarks
 
@@ -399,25 +410,13 @@ def _cluster(address: str) -> Iterator[Executor]:
 @contextmanager
 def rate(what: str, number: int) -> Iterator[Progress]:
     """A bar on the terminal, with how many there are in a second and how long it still takes; moved by the share done."""
-    if not sys.stderr.isatty() or not number:
+    if not number:
         yield lambda share: None
         return
-    from rich import progress as bar
-    from rich.console import Console
-    from rich.text import Text
-
-    class PerSecond(bar.ProgressColumn):
-        """Of what was done lately."""
-
-        def render(self, task: bar.Task) -> Text:
-            speed = task.finished_speed or task.speed
-            return Text("" if speed is None else f"{speed:.3g} a second")
-
-    columns = [bar.TextColumn("{task.description}", markup=False), bar.BarColumn(), bar.MofNCompleteColumn(), PerSecond()]
-    columns += [bar.TimeElapsedColumn(), bar.TextColumn("left"), bar.TimeRemainingColumn()]
-    with bar.Progress(*columns, console=Console(stderr=True), transient=True) as shown:
-        task = shown.add_task(one_line(what), total=number)
-        yield lambda share: shown.update(task, completed=round(share * number))
+    with counted(what, "a second") as bar:
+        if bar is not None:
+            bar(0, number)
+        yield lambda share: None if bar is None else bar(round(share * number), number)
 
 
 # ---- what is read --------------------------------------------------------------------------------------------------------

@@ -151,8 +151,15 @@ def progress(what: str, steps: bool = True) -> Iterator[Progress]:
 
 
 @contextmanager
-def frames_bar(what: str) -> Iterator[Callable[[int, int], None] | None]:
-    """A bar on the terminal with frames per second and the time that is left; None where stderr is no terminal."""
+def counted(what: str, unit: str) -> Iterator[Callable[[int, int], None] | None]:
+    """A bar on the terminal with how many are done in a second and the time that is left; None where stderr is no terminal.
+
+    Args:
+        unit: what stands behind how many, such as ``"frames/s"``.
+
+    Yields:
+        what is called with how many are done, and of how many.
+    """
     if not sys.stderr.isatty():
         yield None
         return
@@ -160,14 +167,14 @@ def frames_bar(what: str) -> Iterator[Callable[[int, int], None] | None]:
     from rich.console import Console
     from rich.text import Text
 
-    class FramesPerSecond(bar.ProgressColumn):
+    class PerSecond(bar.ProgressColumn):
         """Of what was done lately."""
 
         def render(self, task: bar.Task) -> Text:
             speed = task.finished_speed or task.speed
-            return Text("" if speed is None else f"{speed:.3g} frames/s")
+            return Text("" if speed is None else f"{speed:.3g} {unit}")
 
-    columns = [bar.TextColumn("{task.description}", markup=False), bar.BarColumn(), bar.MofNCompleteColumn(), FramesPerSecond()]
+    columns = [bar.TextColumn("{task.description}", markup=False), bar.BarColumn(), bar.MofNCompleteColumn(), PerSecond()]
     columns += [bar.TimeElapsedColumn(), bar.TextColumn("left"), bar.TimeRemainingColumn()]
     with bar.Progress(*columns, console=Console(stderr=True), transient=True) as shown:
         task = shown.add_task(one_line(what), total=None)

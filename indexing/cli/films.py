@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from indexing.cli.console import check_folder, count, frames_bar, names
+from indexing.cli.console import check_folder, count, counted, names
 
 if TYPE_CHECKING:
     from indexing.brightness.indexer import BrightnessIndexer
@@ -145,7 +145,7 @@ class Watching:
         notes: list[str] = []
         for folder, some in folders.items():
             tasks = [VideoTask(video.expanduser(), self.people, self.every, fps, model.name) for video in some]
-            with frames_bar(f"finding people in {count(len(some), 'video')}") as bar:
+            with counted(f"finding people in {count(len(some), 'video')}", "frames/s") as bar:
                 made = list(keypoint_files(tasks, folder, made_by(model), workers_here(), bar, json=False))
             for video, (_, one) in zip(some, made, strict=True):
                 if not isinstance(one, KeypointFile | NobodyInVideo):

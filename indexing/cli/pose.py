@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from indexing.cli.archive import INTERRUPTED, PROBLEMS, WORKERS, check_workers
-from indexing.cli.console import check_folder, complain, count, frames_bar, progress, say, table
+from indexing.cli.console import check_folder, complain, count, counted, progress, say, table
 
 if TYPE_CHECKING:
     from indexing.pose.detection import VideoTask
@@ -96,7 +96,7 @@ class Pose:
         workers = self.workers or workers_here()
         begun, rows, notes, failed, done = time.perf_counter(), [], [], [], 0
         try:
-            with frames_bar("looking at " + count(len(tasks), "video")) as bar:
+            with counted("looking at " + count(len(tasks), "video"), "frames/s") as bar:
                 for task, made in keypoint_files(tasks, folder, made_by(models), workers, bar, self.json):
                     if isinstance(made, ValueError):
                         failed.append(made)

@@ -116,10 +116,10 @@ class Terminal(io.StringIO):
 
 
 def test_the_bar_shows_frames(monkeypatch):
-    with console.frames_bar("x") as bar:
+    with console.counted("x", "frames/s") as bar:
         assert bar is None  # no terminal
     monkeypatch.setattr(sys, "stderr", Terminal())
-    with console.frames_bar("looking") as bar:
+    with console.counted("looking", "frames/s") as bar:
         for done in range(0, 101, 10):
             bar(done, 100)
         shown = sys.stderr

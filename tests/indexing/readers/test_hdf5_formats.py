@@ -5,7 +5,6 @@ from __future__ import annotations
 import builtins
 import json
 import pickle
-import re
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -20,6 +19,7 @@ from indexing.readers.hdf import opened_hdf5
 from indexing.readers.recording import NobodySeen
 from indexing.skeleton import COCO17
 from tests.indexing.readers import tools
+from tests.indexing.readers.tools import refused
 
 NAMES = COCO17.joints
 ASIDE = np.array([500.0, 0.0, 0.0])  # pixels, and no more confidence
@@ -30,15 +30,6 @@ def unseen(person: np.ndarray) -> np.ndarray:
     out = person.copy()
     out[2, 3] = np.nan
     return out
-
-
-def refused(path: Path, *words: str, **options: Any) -> None:
-    with pytest.raises(ValueError, match=re.escape(path.name)) as caught:
-        read(path, **options)
-    said = str(caught.value)
-    assert type(caught.value) is ValueError
-    assert "\n" not in said and "; " in said and len(said.replace(str(path), "")) < 400
-    assert all(word in said for word in words), said
 
 
 MAKERS: dict[str, Callable[[Path, np.ndarray], Path]] = {

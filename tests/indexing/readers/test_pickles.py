@@ -10,10 +10,8 @@ import io
 import operator
 import os
 import pickle
-import re
 import struct
 import subprocess
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -26,15 +24,7 @@ from indexing.readers.pickles import _Reader, read_pickle, unpickled
 from indexing.readers.recording import NobodySeen
 from indexing.skeleton import COCO17, NTU25
 from tests.indexing.readers import tools
-
-
-def refused(path: Path, *words: str, action: Callable[[Path], Any] = read) -> None:
-    with pytest.raises(ValueError, match=re.escape(path.name)) as caught:
-        action(path)
-    said = str(caught.value)
-    assert type(caught.value) is ValueError
-    assert "\n" not in said and "; " in said and len(said.replace(str(path), "")) < 400
-    assert all(word in said for word in words), said
+from tests.indexing.readers.tools import refused
 
 
 @pytest.fixture

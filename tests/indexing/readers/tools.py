@@ -1,17 +1,31 @@
-"""Files as the tools make them: the same structure, names and types, with people that a test chooses."""
+"""Files as the tools make them: the same structure, names and types, with people that a test chooses; and how they are refused."""
 
 from __future__ import annotations
 
 import json
 import pickle
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
+import pytest
+
+from indexing.readers import read
 
 SCORER = "DLC_resnet50_walkJan1shuffle1_100000"
+
+
+def refused(path: Path, *words: str, action: Callable[..., Any] = read, **options: Any) -> None:
+    """Reading fails with one line of bearable length that names the file, has a remedy, and all the words."""
+    with pytest.raises(ValueError, match=re.escape(path.name)) as caught:
+        action(path, **options)
+    said = str(caught.value)
+    assert type(caught.value) is ValueError
+    assert "\n" not in said and "; " in said and len(said.replace(str(path), "")) < 400
+    assert all(word in said for word in words), said
 
 
 # ---- DeepLabCut: data frames of pandas -----------------------------------------------------------------------------------
