@@ -8,7 +8,8 @@ What a view measures fulfils multilinear invariants; every one of them is estima
 - :func:`align_planar`, :func:`align_points`, :func:`align_lines` find the motion of the camera or sensor, and what stood still;
 - :func:`segment`, :func:`translating_planes` find which matches move together, and how;
 - :func:`reconstruct`, :func:`triangulate_trajectories` find cameras, points and velocities from tracks;
-- :func:`synchronize`, :func:`synchronize_cameras`, :func:`reconstruct_pair` put cameras on one clock, and the scene in space.
+- :func:`synchronize`, :func:`synchronize_cameras`, :func:`reconstruct_pair` put cameras on one clock, and the scene in space;
+  :func:`calibrate` finds the cameras themselves.
 
 Points are ``(*batch, n, d)``, as measured; a batch gives what a loop would; NaN is missing; a failed problem has a
 :class:`Status` and never spoils its batch.  ``dyntorch.scenes`` makes scenes with known truth to try things on,
@@ -71,6 +72,8 @@ _HOME = {
     "synchronize_cameras": "dyntorch.tasks.synchronize.cameras",
     "combine_shifts": "dyntorch.tasks.synchronize.cameras",
     "Clocks": "dyntorch.tasks.synchronize.result",
+    "calibrate": "dyntorch.tasks.calibrate.calibrate",
+    "Calibration": "dyntorch.tasks.calibrate.result",
     "reconstruct_pair": "dyntorch.tasks.pair.pair",
     "PairReconstruction": "dyntorch.tasks.pair.result",
     "Motion": "dyntorch.tasks.reconstruct.motions",
@@ -81,6 +84,7 @@ _HOME = {
     "Fourier": "dyntorch.shapes.basis",
     # the numbers that decide in a task
     "AlignOptions": "dyntorch.tasks.align.options",
+    "CalibrateOptions": "dyntorch.tasks.calibrate.options",
     "PairOptions": "dyntorch.tasks.pair.options",
     "PlanesOptions": "dyntorch.tasks.planes.options",
     "ReconstructOptions": "dyntorch.tasks.reconstruct.options",

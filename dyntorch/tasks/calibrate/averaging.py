@@ -1,0 +1,232 @@
+r"""First cameras from epipolar geometry: relative rotations of pairs, rotations by averaging them, then centres and points.
+
+With focal lengths for a start, every pair's F gives :math:`E = K_j^T F K_i` and from it the rotation :math:`R_{ij} = R_j R_i^T`.
+All rotations at once are the three leading eigenvectors of the matrix of the :math:`w_{ij} R_{ij}`.  With rotations known, centres
+and points follow from one more eigenvector: a point lies on the ray of every camera that sees it,
+
+.. math:: \min_{\sum C = 0,\ |C| = 1}\ \sum_{ij} w_{ij}\, |(I - d_{ij} d_{ij}^T)(X_j - C_i)|^2, \qquad
+    d_{ij} = R_i^T K_i^{-1} x_{ij},
+
+from which each :math:`X_j` is eliminated in closed form.  Cameras on one line are no harder than others: no translation of a pair
+is ever averaged.
+
+Source: Arie-Nachimson et al. 2012, Global motion estimation from point matches; Pan et al. 2024, Global structure-from-motion
+revisited (positions from rays).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import combinations
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from dyntorch.geometry.epipolar_fit import fit_fundamental
+from dyntorch.geometry.homogeneous import homogeneous
+from dyntorch.geometry.rigid import nearest_rotation
+from dyntorch.tasks.calibrate.observations import Views
+from dyntorch.tasks.calibrate.options import RigStartOptions
+
+
+@dataclass(frozen=True)
+class PairGeometry:
+    """Epipolar geometry of two cameras.
+
+    Attributes:
+        F: ``(3, 3)``, :math:`x_j^T F x_i = 0` in ``unit`` from the principal points.
+        x1, x2: ``(m, 2)`` matches in ``unit`` from the principal points.
+        weights: ``(m,)``, 1 for those that agree.
+        unit: pixels.
+        sigma: px, robust standard deviation of the Sampson distance.
+        matches: positions that both saw at once.
+    """
+
+    F: Tensor
+    x1: Tensor
+    x2: Tensor
+    weights: Tensor
+    unit: float
+    sigma: float
+    matches: int
+
+
+Graph = Mapping[tuple[int, int], PairGeometry]
+
+
+def pair_graph(views: Views, clocks: Tensor, fewest: int, options: RigStartOptions) -> dict[tuple[int, int], PairGeometry]:
+    """Epipolar geometry of all pairs that see enough at once.
+
+    Args:
+        views: of c cameras.
+        clocks: ``(c, 2)``.
+        fewest: matches of a pair.
+        options: see :class:`RigStartOptions`.
+    """
+    seen = views.at(clocks[None])
+    x, weights = seen.x[0].flatten(1, 2), seen.weights[0].flatten(1, 2)
+    unit = float(views.centers.max()) * 2
+    found = {}
+    for i, j in combinations(range(len(x)), 2):
+        both = ((weights[i] > 0) & (weights[j] > 0)).nonzero()[:, 0]
+        if len(both) >= fewest:
+            some = both[:: max(1, len(both) // options.matches)]
+            x1, x2 = (x[i, some] - views.centers[i]) / unit, (x[j, some] - views.centers[j]) / unit
+            found[i, j] = _fitted(x1, x2, unit, len(both), options)
+    return found
+
+
+def _fitted(x1: Tensor, x2: Tensor, unit: float, matches: int, options: RigStartOptions) -> PairGeometry:
+    weights = torch.ones(1, len(x1), dtype=torch.float64)
+    F, _ = fit_fundamental(x1, x2, weights, [1e-3 * scale for scale in options.scales])
+    sigma = _spread(F[0], x1, x2)
+    F, _ = fit_fundamental(x1, x2, weights, [scale * sigma for scale in options.sigmas], F[:, None])
+    sigma = _spread(F[0], x1, x2)
+    inside = sampson_distances(F[0], x1, x2) <= options.sigmas[0] * sigma
+    return PairGeometry(F[0], x1, x2, inside.double(), unit, sigma * unit, matches)
+
+
+def _spread(F: Tensor, x1: Tensor, x2: Tensor) -> float:
+    return max(1.4826 * float(sampson_distances(F, x1, x2).median()), 1e-9)
+
+
+def sampson_distances(F: Tensor, x1: Tensor, x2: Tensor) -> Tensor:
+    """``(n,)`` of matches ``(n, 2)``."""
+    one, two = homogeneous(x1), homogeneous(x2)
+    left, right = one @ F.mT, two @ F
+    slope = left[:, :2].square().sum(-1) + right[:, :2].square().sum(-1)
+    return (two * left).sum(-1).abs() / slope.sqrt().clamp(min=1e-300)
+
+
+def relative_rotations(pair: PairGeometry, first: float, second: float) -> tuple[Tensor, Tensor]:
+    """The two rotations ``(2, 3, 3)`` from camera i to camera j, and the share ``(2,)`` of matches before both cameras.
+
+    Of the four pairs of a rotation and a direction those that differ in the sign of the direction share their rotation.
+
+    Args:
+        pair: with its F.
+        first, second: focal lengths, px.
+    """
+    f1, f2 = first / pair.unit, second / pair.unit
+    E = torch.tensor([f2, f2, 1.0], dtype=torch.float64)[:, None] * pair.F * torch.tensor([f1, f1, 1.0], dtype=torch.float64)
+    U, _, Vt = torch.linalg.svd(E)
+    U, Vt = U * torch.linalg.det(U), Vt * torch.linalg.det(Vt)
+    W = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    turns = torch.stack([U @ W @ Vt, U @ W.mT @ Vt])
+    one = homogeneous(pair.x1 / f1) @ turns.mT  # (2, m, 3): rays of i in the frame of j
+    two, base = homogeneous(pair.x2 / f2).expand_as(one), U[:, 2].expand_as(one)
+    # depths of z_2 d_2 = z_1 R d_1 + b by cross products: their signs are enough
+    across = torch.linalg.cross(one, two)
+    first_sign = (torch.linalg.cross(two, base) * across).sum(-1)
+    second_sign = (torch.linalg.cross(one, base) * across).sum(-1)
+    before = ((first_sign > 0) & (second_sign > 0)).double() @ pair.weights
+    behind = ((first_sign < 0) & (second_sign < 0)).double() @ pair.weights
+    return turns, torch.maximum(before, behind) / pair.weights.sum().clamp(min=1.0)
+
+
+def averaged_rotations(
+    turns: Mapping[tuple[int, int], Tensor], weights: Mapping[tuple[int, int], float], cameras: int, options: RigStartOptions
+) -> Tensor:
+    """Rotations ``(c, 3, 3)`` whose ratios :math:`R_j R_i^T` are nearest to given ones; the first is the identity.
+
+    Reweighted by how far each pair is off, so that a pair that is wrong drops out.
+
+    Args:
+        turns: (i, j) to ``(3, 3)``.
+        weights: of the pairs.
+        cameras: c.
+        options: see :class:`RigStartOptions`.
+
+    Example:
+        >>> import torch
+        >>> turn = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+        >>> R = averaged_rotations({(0, 1): turn, (1, 2): turn, (0, 2): turn @ turn}, {(0, 1): 1.0, (1, 2): 1.0, (0, 2): 1.0}, 3,
+        ...                        RigStartOptions())
+        >>> torch.allclose(R[2], turn @ turn)
+        True
+    """
+    soft = dict.fromkeys(turns, 1.0)
+    R = torch.eye(3, dtype=torch.float64).repeat(cameras, 1, 1)
+    for _ in range(options.averaging):
+        blocks = torch.zeros(cameras, 3, cameras, 3, dtype=torch.float64)
+        degree = torch.zeros(cameras, dtype=torch.float64)
+        for (i, j), turn in turns.items():
+            w = weights[i, j] * soft[i, j]
+            blocks[j, :, i], blocks[i, :, j] = w * turn, w * turn.mT
+            degree[[i, j]] += w
+        root = degree.clamp(min=1e-12).rsqrt()
+        blocks = blocks * root[:, None, None, None] * root[:, None]
+        leading = torch.linalg.eigh(blocks.reshape(3 * cameras, 3 * cameras)).eigenvectors[:, -3:]
+        stacked = leading.view(cameras, 3, 3) * root[:, None, None]
+        R = nearest_rotation(stacked if float(torch.linalg.det(stacked).sum()) > 0 else -stacked)
+        away = {(i, j): float((R[j] @ R[i].mT - turn).norm()) for (i, j), turn in turns.items()}
+        soft = {pair: 1 / (1 + (value / options.disagreement) ** 2) for pair, value in away.items()}
+    return R @ R[0].mT
+
+
+def _across(R: Tensor, rays: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Rays ``(c, m, 3)`` in the world, and the projectors across them times the weights, ``(c, m, 3, 3)``."""
+    d = normalize(rays @ R, dim=-1)
+    eye = torch.eye(3, dtype=torch.float64)
+    return d, weights[..., None, None] * (eye - d[..., :, None] * d[..., None, :])
+
+
+def meeting_points(R: Tensor, centers: Tensor, rays: Tensor, weights: Tensor) -> Tensor:
+    """Points ``(m, 3)`` nearest to the rays of all cameras.
+
+    Args:
+        R: ``(c, 3, 3)``.
+        centers: ``(c, 3)``.
+        rays: ``(c, m, 3)`` in the cameras' frames.
+        weights: ``(c, m)``, 0 where not seen.
+    """
+    _, across = _across(R, rays, weights)
+    inverse = torch.linalg.pinv(across.sum(0), hermitian=True)
+    return (inverse @ torch.einsum("amij,aj->mi", across, centers)[..., None])[..., 0]
+
+
+def positioned(R: Tensor, rays: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Centres ``(c, 3)`` and points ``(m, 3)`` from rotations and rays, as the equation of this file says.
+
+    Args:
+        R: ``(c, 3, 3)``.
+        rays: ``(c, m, 3)`` in the cameras' frames.
+        weights: ``(c, m)``, 0 where not seen.
+    """
+    c = len(R)
+    weights = weights * ((weights > 0).sum(0) >= 2)
+    d, across = _across(R, rays, weights)
+    inverse = torch.linalg.pinv(across.sum(0), hermitian=True)
+    matrix = torch.block_diag(*across.sum(1)) - torch.einsum("amij,mjk,bmkl->aibl", across, inverse, across).reshape(3 * c, 3 * c)
+    # a shift of all changes nothing: those three directions are lifted above all others
+    shift = torch.eye(3, dtype=torch.float64).repeat(c, 1) / c**0.5
+    matrix = matrix + shift @ shift.mT * matrix.diagonal().sum()
+    centers = torch.linalg.eigh(matrix).eigenvectors[:, 0].view(c, 3)
+    points = (inverse @ torch.einsum("amij,aj->mi", across, centers)[..., None])[..., 0]
+    ahead = ((points - centers[:, None]) * d).sum(-1)
+    sign = -1.0 if float((ahead.sign() * weights).sum()) < 0 else 1.0
+    return sign * centers, sign * points
+
+
+def first_cameras(
+    views: Views, graph: Graph, clocks: Tensor, focals: Tensor, options: RigStartOptions
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Rotations ``(c, 3, 3)``, centres ``(c, 3)`` and points ``(T, n, 3)`` for focal lengths ``(c,)`` px."""
+    turns, weights = {}, {}
+    for (i, j), pair in graph.items():
+        both, share = relative_rotations(pair, float(focals[i]), float(focals[j]))
+        best = int(share.argmax())
+        turns[i, j], weights[i, j] = both[best], float(pair.weights.sum() * share[best])
+    R = averaged_rotations(turns, weights, len(focals), options)
+    rays, known = viewing_rays(views, clocks, focals)
+    centers, points = positioned(R, rays, known)
+    return R, centers, points.view(len(views.times), -1, 3)
+
+
+def viewing_rays(views: Views, clocks: Tensor, focals: Tensor) -> tuple[Tensor, Tensor]:
+    """Rays ``(c, m, 3)`` of all positions in the cameras' frames, lenses apart, and weights ``(c, m)``."""
+    seen = views.at(clocks[None])
+    rays = homogeneous((seen.x[0] - views.centers[:, None, None]) / focals[:, None, None, None])
+    return rays.flatten(1, 2), (seen.weights[0] > 0).double().flatten(1, 2)

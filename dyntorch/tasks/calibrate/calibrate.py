@@ -1,0 +1,259 @@
+"""Calibrate cameras on tripods from the people who move before them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dyntorch.core.outcome import Notice, Status, status_from
+from dyntorch.numerics.arguments import check_options, on_cpu
+from dyntorch.numerics.blocks import one_thread
+from dyntorch.tasks.calibrate import diagnosis
+from dyntorch.tasks.calibrate.adjusting import Adjusted, Freedom, adjusted, compared_starts, pose_of
+from dyntorch.tasks.calibrate.averaging import pair_graph
+from dyntorch.tasks.calibrate.input import Rig, Scale, given_clocks, read_clocks, read_rig
+from dyntorch.tasks.calibrate.observations import Views, common_views
+from dyntorch.tasks.calibrate.options import CalibrateOptions
+from dyntorch.tasks.calibrate.result import Calibration, CalibrationNotice
+from dyntorch.tasks.calibrate.structure import structure
+from dyntorch.tasks.calibrate.world import World, world_of
+from dyntorch.tasks.synchronize.cameras import synchronize_cameras
+from dyntorch.tasks.synchronize.result import Clocks
+
+
+@one_thread
+@on_cpu
+def calibrate(
+    tracks: Sequence[Tensor],
+    fps: float | Sequence[float] = 30.0,
+    sizes: Any = None,
+    *,
+    focal: float | Sequence[float | None] | None = None,
+    clocks: Any = None,
+    height: float | None = None,
+    lengths: Mapping[tuple[int, int], float] | None = None,
+    times: Sequence[Tensor | None] | None = None,
+    weights: Sequence[Tensor] | None = None,
+    calibration: Sequence[Any] | None = None,
+    one_lens: bool = False,
+    max_shift: float | None = None,
+    rate: float | None = None,
+    options: CalibrateOptions = CalibrateOptions(),
+) -> Calibration:
+    r"""Cameras, lenses and clocks from what moves before them: no board, no known lens, no common clock.
+
+    The stages, each in a file of this room:
+
+    1. clocks of all pairs from the same tracks (:func:`dyntorch.synchronize_cameras`);
+    2. F of every pair at common moments; for focal lengths that are tried, rotations and centres by averaging over the pairs;
+    3. the best of these starts adjusted: cameras, focal lengths, one term of distortion, clocks, points and lengths of limbs at
+       once (see ``adjustment.py`` for what is minimized);
+    4. up from upright bodies, the scale from a height or lengths;
+    5. what the data leave open: standard deviations, rival rigs, halves of the take.
+
+    It computes on the CPU wherever its tensors are, and the result returns to their device.
+
+    Args:
+        tracks: per camera ``(frames, n, 2)`` px, NaN = missing; point k is point k in all of them.  Several people stand side by
+            side.
+        fps: frames per second, of all cameras or of each.
+        sizes: width and height of the pictures in px, of all cameras or of each.
+        focal: focal length in px, of all cameras or of each; None = unknown.
+        clocks: None = unknown; else offsets in seconds ``(c,)``, offsets and rates ``(c, 2)``, or what ``synchronize_cameras``
+            returned: these are held.
+        height: metres between the highest and the lowest point of the tallest body when it stands upright.
+        lengths: metres between points (k, l), instead of ``height``.
+        times: per camera ``(frames,)`` seconds of its clock, instead of ``fps``.
+        weights: per camera ``(frames, n)``, confidences of the positions; 0 = ignore.
+        calibration: per camera ``(K, dist)`` of a known lens as for ``synchronize_cameras``, or None.
+        one_lens: whether focal length and distortion are the same in all cameras.
+        max_shift: seconds that clocks differ by at most.
+        rate: of all clocks against the first one's, which is held, such as 1 where one clock drives all cameras; by default found.
+        options: every number that decides, by stage.
+
+    Returns:
+        See :class:`dyntorch.Calibration`; ``ok`` is False, and ``reason`` says why, where the data do not decide.
+
+    Raises:
+        ValueError: fewer than two cameras or more than eight, tracks of other points, sizes that contradict the positions, a camera
+            that is given twice, cameras that never run at the same time, or numbers that are none.
+
+    Source: thesis, chapter 7 for the clocks; Triggs et al. 2000; Pan et al. 2024; Lee et al. 2022, Extrinsic camera calibration
+    from a moving person, which takes known lenses and clocks.
+
+    Example:
+        >>> import torch
+        >>> from dyntorch.geometry.rigid import rotation_exponential
+        >>> g = torch.Generator().manual_seed(0)
+        >>> t = torch.arange(120, dtype=torch.float64)[:, None, None] / 30
+        >>> way = torch.randn(3, 8, 3, generator=g, dtype=torch.float64)
+        >>> body = 0.4 * way[0] + 0.6 * torch.sin(1.3 * t + way[1]) + 0.3 * torch.sin(2.9 * t + way[2])
+        >>> tracks = []
+        >>> for k in range(4):
+        ...     turn = rotation_exponential(torch.tensor([0.3 * (k % 2), 1.5 * k, 0.0], dtype=torch.float64))
+        ...     seen = body @ turn.mT + torch.tensor([0.1 * k, 0.0, 5.0], dtype=torch.float64)
+        ...     tracks.append(1500 * seen[..., :2] / seen[..., 2:] + torch.tensor([960.0, 540.0], dtype=torch.float64))
+        >>> rig = calibrate(tracks, fps=30.0, sizes=(1920, 1080), clocks=[0.0, 0.0, 0.0, 0.0])
+        >>> rig.ok, [round(f, -1) for f in rig.focals.tolist()]
+        (True, [1500.0, 1500.0, 1500.0, 1500.0])
+    """
+    check_options(options, CalibrateOptions)
+    if sizes is None:
+        raise ValueError("sizes: give the width and height of the pictures in px, (w, h), or one pair per camera")
+    rig = read_rig(tracks, fps, times, sizes, focal, calibration, weights, one_lens, Scale(height, lengths), options)
+    # 1. clocks
+    found_clocks = _clocks(rig, clocks, max_shift, rate, options)
+    told = _told(found_clocks)
+    if bool(found_clocks.offsets.isnan().any()):
+        return _nothing(rig, found_clocks, told)
+    # 2. first cameras
+    values = torch.stack([found_clocks.offsets, found_clocks.rates], dim=-1)
+    views = common_views(rig.tracks, rig.centers, values, options.adjust.width, options.synchronize)
+    own = torch.stack([(values[:, 1] - 1) * views.middle + values[:, 0], values[:, 1].log()], dim=-1)
+    n = rig.tracks[0].x.shape[1]
+    used = views.some(max(1, math.ceil(options.adjust.positions / n)))
+    graph = pair_graph(used, own, options.input.fewest_matches, options.start)
+    hopeless = diagnosis.unmatched(graph, rig, options) or diagnosis.still(rig, options)
+    if hopeless is not None:
+        return _nothing(rig, found_clocks, (*told, hopeless))
+    freedom = Freedom.of(rig, own, clocks is not None, rate is not None, found_clocks.rate_sigmas, options)
+    few = used.some(options.start.moments)
+    starts, worse = compared_starts(rig, few, graph, own, freedom, options)
+    # 3. space and time at once
+    best = adjusted(used, starts.of(torch.tensor([0])), freedom, options)
+    halves = _halves(used, best, freedom, options)
+    # 4. the world, and the points of every frame
+    others = [(pose_of(starts, k), float(worse[k])) for k in range(1, len(worse))]
+    limits = [
+        diagnosis.planar(graph, options),
+        diagnosis.unsure(best, rig, options),
+        diagnosis.rival(pose_of(starts), others, options),
+        diagnosis.moved(halves, options),
+    ]
+    return _result(rig, views, best, found_clocks, [*told, *(limit for limit in limits if limit is not None)], options)
+
+
+def _clocks(rig: Rig, clocks: Any, max_shift: float | None, rate: float | None, options: CalibrateOptions) -> Clocks:
+    """As given, or as the tracks say."""
+    c = len(rig.tracks)
+    if clocks is not None:
+        return given_clocks(clocks, read_clocks(clocks, c), float(rig.tracks[0].times.mean()))
+    return synchronize_cameras(
+        rig.x,
+        times=[track.times for track in rig.tracks],
+        weights=[track.weights for track in rig.tracks],
+        max_shift=max_shift,
+        rate=rate,
+        options=options.synchronize,
+    )
+
+
+def _told(clocks: Clocks) -> tuple[Notice, ...]:
+    """What synchronization says that concerns the rig."""
+    if not clocks.ok:
+        return (Notice(CalibrationNotice.CLOCKS, 0.0, {"first": clocks.reason}),)
+    return ()
+
+
+def _halves(views: Views, best: Adjusted, freedom: Freedom, options: CalibrateOptions) -> tuple[Adjusted, Adjusted] | None:
+    """Both halves of the take by themselves, from the whole; None where a half has too little.
+
+    Lenses and clocks are those of the whole: only poses may differ.
+    """
+    held = replace(freedom, whole=_only_poses(freedom.whole), shape=_only_poses(freedom.shape))
+    found = []
+    for part in (views.between(-math.inf, 0.0), views.between(0.0, math.inf)):
+        if not len(part.times) or int((part.steady(best.state.clocks) > 0).sum()) < options.trust.half:
+            return None
+        few = part.some(options.start.moments)
+        found.append(adjusted(few, best.state, held, options))
+    return found[0], found[1]
+
+
+def _only_poses(basis: Tensor) -> Tensor:
+    """The columns that change nothing but poses."""
+    other = basis.view(-1, 11, basis.shape[1])[:, 6:].abs().sum((0, 1))
+    return basis[:, other == 0]
+
+
+def _result(rig: Rig, views: Views, best: Adjusted, clocks: Clocks, limits: list[Notice], options: CalibrateOptions) -> Calibration:
+    """The solution in its world, with the points of all frames."""
+    state, c = best.state, len(rig.tracks)
+    found = structure(views, best, options)
+    limits += [limit for limit in [diagnosis.foreign(found.inliers, options)] if limit is not None]
+    world = world_of(state.R[0], state.centers[0], found.points, best.ends, rig.scale, options.world)
+    R, t = world.cameras(state.R[0], state.t[0])
+    K = torch.eye(3, dtype=torch.float64).repeat(c, 1, 1)
+    K[:, 0, 0] = K[:, 1, 1] = state.lens[0, :, 0].exp()
+    K[:, :2, 2] = rig.centers
+    distortion = torch.zeros(c, max([5, *(len(lens[1]) for lens in rig.lenses if lens is not None)]), dtype=torch.float64)
+    distortion[:, :2] = state.lens[0, :, 1:]
+    for i, lens in enumerate(rig.lenses):
+        if lens is not None:
+            K[i], distortion[i, : len(lens[1])] = lens
+    if not any(limit.code.refuses for limit in limits):
+        limits += _besides(rig, world, state.centers[0])
+    return Calibration(
+        K=K, R=R, t=t, distortion=distortion, sizes=rig.sizes,
+        clocks=_adjusted_clocks(clocks, best, views.middle),
+        times=views.times + views.middle,
+        points=world.points(found.points),
+        sigmas=world.scale * found.sigmas,
+        metric=world.metric, upright=world.by_people,
+        covariance=_in_world(best.covariance, world),
+        residuals=found.residuals, inliers=found.inliers, fps=rig.fps,
+        status=status_from(limits), notices=tuple(limits),
+    )  # fmt: skip
+
+
+def _besides(rig: Rig, world: World, centers: Tensor) -> list[Notice]:
+    """What to know beside a good result."""
+    found = []
+    if len(rig.tracks) == 2:
+        found.append(Notice(CalibrationNotice.TWO))
+    if diagnosis.collinear(centers):
+        found.append(Notice(CalibrationNotice.LINE))
+    if not world.metric:
+        found.append(Notice(CalibrationNotice.UNKNOWN_SCALE))
+    if not world.by_people:
+        found.append(Notice(CalibrationNotice.CAMERA_UP, 100 * (0.0 if math.isnan(world.upright) else world.upright)))
+    return found
+
+
+def _adjusted_clocks(clocks: Clocks, best: Adjusted, middle: float) -> Clocks:
+    """Offsets and rates after the adjustment, and their standard deviations at the middle."""
+    values, variance = best.state.clocks[0], best.covariance.diagonal(dim1=-2, dim2=-1)
+    rates = values[:, 1].exp()
+    if not bool(variance[:, 9:].any()):
+        return clocks
+    return replace(
+        clocks, offsets=values[:, 0] - (rates - 1) * middle, rates=rates, sigmas=variance[:, 9].sqrt(),
+        rate_sigmas=variance[:, 10].sqrt() * rates, center=middle,
+    )  # fmt: skip
+
+
+def _in_world(covariance: Tensor, world: World) -> Tensor:
+    """Centres of the world's coordinates; what else a covariance is about does not change with them."""
+    change = torch.eye(covariance.shape[-1], dtype=torch.float64)
+    change[3:6, 3:6] = world.scale * world.turn
+    return change @ covariance @ change.mT
+
+
+def _nothing(rig: Rig, clocks: Clocks, limits: tuple[Notice, ...]) -> Calibration:
+    """A result without cameras: these are NaN."""
+    c, n = len(rig.tracks), rig.tracks[0].x.shape[1]
+
+    def empty(*shape: int) -> Tensor:
+        return torch.full(shape, math.nan, dtype=torch.float64)
+
+    status = status_from(limits)
+    return Calibration(
+        K=empty(c, 3, 3), R=empty(c, 3, 3), t=empty(c, 3), distortion=empty(c, 5), sizes=rig.sizes, clocks=clocks, times=empty(0),
+        points=empty(0, n, 3), sigmas=empty(0, n), metric=False, upright=False, covariance=empty(c, 11, 11), residuals=empty(c, n),
+        inliers=empty(c), fps=rig.fps, status=status if int(status) else torch.tensor(int(Status.TOO_FEW)), notices=limits,
+    )  # fmt: skip

@@ -1,0 +1,82 @@
+"""The points of every frame, when the cameras are known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from dyntorch.numerics.least_squares import minimize
+from dyntorch.tasks.calibrate.adjusting import RAYLEIGH, Adjusted, met_points
+from dyntorch.tasks.calibrate.adjustment import Adjustment, RigState, images
+from dyntorch.tasks.calibrate.observations import Views
+from dyntorch.tasks.calibrate.options import CalibrateOptions
+
+
+@dataclass(frozen=True)
+class Structure:
+    """Points and how well they agree with the pictures.
+
+    Attributes:
+        points: ``(T, n, 3)``, NaN where two cameras do not tell.
+        sigmas: ``(T, n)`` root mean square of the standard deviations along the axes.
+        residuals: ``(c, n)`` px, root mean square of the positions that agree.
+        inliers: ``(c,)`` share of the positions that agree.
+    """
+
+    points: Tensor
+    sigmas: Tensor
+    residuals: Tensor
+    inliers: Tensor
+
+
+def structure(views: Views, found: Adjusted, options: CalibrateOptions) -> Structure:
+    """Points of all moments of views, each the least squares of the positions that see it, with the noise of Student's t.
+
+    Args:
+        views: of the cameras.
+        found: the cameras.
+        options: see :class:`CalibrateOptions`.
+    """
+    n = views.grids[0].x.shape[1]
+    step = max(1, options.points.block // n)
+    parts = [_block(replace(views, times=times), found, options) for times in views.times.split(step)]
+    points, sigmas = (torch.cat([part[k] for part in parts]) for k in (0, 1))
+    square, agree, seen = (torch.stack([part[k] for part in parts]).sum(0) for k in (2, 3, 4))
+    residuals = torch.where(agree > 0, (square / agree.clamp(min=1)).sqrt(), torch.nan)
+    inliers = agree.sum(1) / seen.sum(1).clamp(min=1)
+    return Structure(points, sigmas, residuals, inliers)
+
+
+def _block(views: Views, found: Adjusted, options: CalibrateOptions) -> tuple[Tensor, ...]:
+    """Points, their standard deviations, and per camera and point: sum of squares and number of what agrees, number of all."""
+    state = found.state._replace(lengths=found.state.lengths[:, :0])
+    weights = views.at(state.clocks).weights
+    weights = weights * ((weights > 0).sum(1, keepdim=True) >= 2)
+    held = found.problem.basis[:, :0]
+    problem = Adjustment(views, weights, found.problem.sigma, found.problem.freedom, found.problem.priors, held)
+    state = state._replace(points=met_points(views, state)[None])
+    settings = replace(options.descent, iterations=options.points.steps, tolerance=options.adjust.tolerance)
+    state = RigState(*minimize(problem, problem.evaluate(tuple(state)), settings).theta)
+    sigmas = _sigmas(problem, state)
+    far = (state.centers[0, :, None, None] - state.points[0]).norm(dim=-1).median(0).values
+    known = (weights[0] > 0).any(0) & (sigmas <= options.points.sigma * far)
+    error = (images(state, views.centers) - views.at(state.clocks).x)[0].norm(dim=-1)
+    seen = (weights[0] > 0) & known
+    agree = seen & (error <= options.points.outlying * RAYLEIGH * problem.sigma[0, :, None, None])
+    return (
+        torch.where(known[..., None], state.points[0], torch.nan),
+        torch.where(known, sigmas, torch.nan),
+        torch.where(agree, error.square() / 2, 0.0).sum(1),
+        agree.double().sum(1),
+        seen.double().sum(1),
+    )
+
+
+def _sigmas(problem: Adjustment, state: RigState) -> Tensor:
+    """Root mean square ``(T, n)`` of the standard deviations of points along the axes; infinite where they have none."""
+    blocks = problem.linear(state).matrix[0]
+    values = torch.linalg.eigvalsh(blocks).clamp(min=0)
+    variance = torch.where(values > 0, 1 / values, torch.inf).mean(-1)
+    return variance.sqrt().view(state.points.shape[1:3])
