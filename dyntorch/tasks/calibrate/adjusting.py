@@ -166,7 +166,7 @@ def compared_starts(
         problem = _problem(views, state, freedom.poses, freedom.priors, options)
         state = _descended(problem, state, steps, options)
         if k == 0 and len(state.R) > options.start.kept:
-            sigma = _noise(state, problem).log().sum(1)
+            sigma = _noise(state, problem, options).log().sum(1)
             state = state.of(sigma.argsort(stable=True)[: options.start.kept])
     # all by the noise of the best one: what is more likely is then not what makes more noise
     problem = _problem(views, state, freedom.poses, freedom.priors, options)
@@ -212,18 +212,27 @@ def met_points(views: Views, state: RigState) -> Tensor:
 def _problem(views: Views, state: RigState, basis: Tensor, priors: Priors, options: CalibrateOptions) -> Adjustment:
     """With positions that are seen now, and the noise that is left now."""
     b, c = state.R.shape[:2]
-    start = Adjustment(
-        views, views.steady(state.clocks), torch.ones(b, c, dtype=torch.float64), options.adjust.freedom, priors, basis
-    )
-    return replace(start, sigma=_noise(state, start).clamp(min=options.adjust.least_noise))
+    unit = torch.ones(b, c, dtype=torch.float64)
+    start = Adjustment(views, views.steady(state.clocks), unit, options.adjust.freedom, priors, basis)
+    return replace(start, sigma=_noise(state, start, options))
 
 
-def _noise(state: RigState, problem: Adjustment) -> Tensor:
-    """Robust standard deviation ``(b, c)`` px of each camera's errors."""
+def _noise(state: RigState, problem: Adjustment, options: CalibrateOptions) -> Tensor:
+    """Robust standard deviation ``(b, c)`` px of each camera's noise.
+
+    Points take 3 of the 2 v coordinates that v cameras see of them, and leave errors that are smaller than the noise by
+    sqrt((2 v - 3) / 2 v).  Cameras may not differ by much: a camera of less and less noise would draw all points to its rays.
+    """
     seen = problem.views.at(state.clocks)
+    known = problem.weights * seen.weights > 0
     far = (images(state, problem.views.centers) - seen.x).norm(dim=-1)
-    far = torch.where(problem.weights * seen.weights > 0, far, torch.nan).flatten(2)
-    return far.nanmedian(-1).values.nan_to_num(1e6) / RAYLEIGH
+    sigma = torch.where(known, far, torch.nan).flatten(2).nanmedian(-1).values.nan_to_num(1e6) / RAYLEIGH
+    views = known.sum(1)
+    mean = (views.sum((1, 2)) / (views > 0).sum((1, 2)).clamp(min=1)).clamp(min=2)
+    sigma = sigma * (2 * mean / (2 * mean - 3)).sqrt()[:, None]
+    middle = sigma.log().mean(1, keepdim=True).exp()
+    ratio = options.adjust.noise_ratio
+    return sigma.clamp(middle / ratio, middle * ratio).clamp(min=options.adjust.least_noise)
 
 
 def _descended(problem: Adjustment, state: RigState, steps: int, options: CalibrateOptions) -> RigState:

@@ -156,7 +156,9 @@ def _clocks(rig: Rig, clocks: Any, max_shift: float | None, rate: float | None, 
 def _told(clocks: Clocks) -> tuple[Notice, ...]:
     """What synchronization says that concerns the rig."""
     if not clocks.ok:
-        return (Notice(CalibrationNotice.CLOCKS, 0.0, {"first": clocks.reason}),)
+        # the sentence itself, so that whoever prints it names its cameras and arguments
+        first = next((notice.text for notice in clocks.notices if notice.code.refuses is not None), clocks.reason)
+        return (Notice(CalibrationNotice.CLOCKS, 0.0, {"first": first}),)
     return ()
 
 
@@ -168,7 +170,9 @@ def _halves(views: Views, best: Adjusted, freedom: Freedom, options: CalibrateOp
     held = replace(freedom, whole=_only_poses(freedom.whole), shape=_only_poses(freedom.shape))
     found = []
     for part in (views.between(-math.inf, 0.0), views.between(0.0, math.inf)):
-        if not len(part.times) or int((part.steady(best.state.clocks) > 0).sum()) < options.trust.half:
+        if not len(part.times) or 2 * float(part.times.abs().max()) < 2 * options.trust.half_seconds:
+            return None
+        if int((part.steady(best.state.clocks) > 0).sum()) < options.trust.half:
             return None
         few = part.some(options.start.moments)
         found.append(adjusted(few, best.state, held, options))

@@ -62,6 +62,8 @@ class RigAdjustOptions:
     """Steps of the rounds of the last adjustment; the noise, the bones and who is seen are learned between rounds."""
     tolerance: float = 1e-5
     """Share of the cost by which a step lowers it at most that ends a round."""
+    noise_ratio: float = 1.5
+    """Noise of a camera over the geometric mean of all at most, and its inverse."""
     least_noise: float = 0.05
     """Standard deviation of the noise at least, px: exact data have no scale."""
     focal: float = 0.85
@@ -125,7 +127,7 @@ class RigTrustOptions:
     """The same of the focal length, as a share."""
     center: float = 0.04
     """The same of a centre, as a share of the distance from the people."""
-    still: float = 3.0
+    still: float = 2.0
     """Motion of the points in standard deviations of their noise below which nothing moves."""
     plane: float = 2.0
     """Residual of the best homography over that of F below which two cameras see a plane."""
@@ -133,12 +135,15 @@ class RigTrustOptions:
     """Twice the logarithm of the likelihood ratio below which another rig fits as well."""
     apart: float = 2.0
     """Degrees from which on two rigs are different."""
-    moved: float = 1.0
+    moved: float = 1.5
     """Degrees or hundredths of the distance between the poses of a camera in both halves of the take from which on it moved."""
     moved_sigmas: float = 5.0
     """The same in standard deviations."""
     half: int = 1_000
     """Positions that a half must have to be judged by itself."""
+    half_seconds: float = 2.5
+    """Seconds that a half must last: what a detector gets wrong goes on for a second, and looks like a camera that moved
+    (Pose2Sim's recording of 1.7 s, two and three cameras: 4 and 7 degrees)."""
     agree: float = 0.6
     """Share of the positions of a camera that must agree with the others."""
 
