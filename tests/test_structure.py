@@ -45,6 +45,8 @@ ALGEBRA = {
     "dyntorch/scenes/scene.py": {"OUTLIER", "STATIC", "MOVING"},
     "dyntorch/tasks/planes/input.py": {"PLANE_MATCHES", "BODY_MATCHES"},
     "dyntorch/tasks/segment/result.py": {"OUTLIER"},
+    "indexing/calibrate/rig.py": {"Y_UP"},
+    "indexing/report/calibration.py": {"FOCAL", "K1", "OFFSET", "RATE"},
 }
 """Index sets, primes, minimal samples and the numbers of labels."""
 FORMATS = {
@@ -55,6 +57,7 @@ FORMATS = {
     "indexing/archive/tracks.py": {"MISSING", "LARGEST"},
     "indexing/brightness/footage.py": {"LUMA"},
     "indexing/brightness/indexer.py": {"VERSION"},
+    "indexing/calibrate/lenses.py": {"FOCAL_35"},
     "indexing/cli/archive.py": {"PROBLEMS", "INTERRUPTED"},
     "indexing/cli/__init__.py": {"DONE", "BAD_INPUT", "REFUSED", "INTERRUPTED", "BROKEN_PIPE"},
     "indexing/cli/console.py": {"REFUSED"},
@@ -72,6 +75,7 @@ FORMATS = {
     "indexing/readers/sleap.py": {"SHIFTED", "HAND", "PREDICTED"},
     "indexing/readers/npz.py": {"HEADER", "AXES", "LAST_LETTER", "PACKED", "ENCRYPTED"},
     "indexing/readers/recording.py": {"LAST_FRAME"},
+    "indexing/report/rig.py": {"MISSING"},
     "indexing/report/sync.py": {"PPM"},
     "indexing/writers/c3d.py": {"KEY", "INTEL", "WORD", "LETTERS", "LABELS", "BLOCKS"},
 }
@@ -118,6 +122,7 @@ DRAWING = {
         *("WIDTH", "FOOT", "TITLE", "TICKS", "SHOWN", "TANGLE", "LONG", "ROOM", "TALL", "STRAYS", "GAP", "LEFT"),
         *("TRACKS_TALL", "TRACKS_STRAYS"),
     },
+    "indexing/report/rig.py": {"WIDTH", "TALL", "BESIDE", "EDGE", "FOOT", "CELL", "LEFT", "ROOF", "LONGEST"},
     "indexing/report/segmentation.py": {
         *("WIDTH", "TALL", "EDGE", "GAP", "HEAD", "TICKS", "FOOT", "WIDE", "STRAYS", "SLIM"),
     },

@@ -295,25 +295,46 @@ def epipolar_variance(moments: Tensor, noise: tuple[float, float] = (1.0, 1.0)) 
     inner = mean[..., :8, :8] - edge[..., :, None] * edge[..., None, :]
     ridge = RIDGE * mean[..., :8, :8].diagonal(dim1=-2, dim2=-1).sum(-1)
     inner = inner + ridge[..., None, None] * unit[:8, :8]
+    variance, f = least_ratio(inner, form, present)
+    whole = torch.cat([f, -(edge[..., None, :] @ f[..., None])[..., 0]], dim=-1)
+    bad = ~variance.isfinite()[..., None]
+    whole = torch.where(bad, 0.0, whole / torch.where(bad, 1.0, whole.norm(dim=-1, keepdim=True)))
+    return variance, whole.unflatten(-1, (3, 3))
+
+
+def least_ratio(inner: Tensor, form: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
+    r"""The least :math:`f^T A f / f^T N f` of positive definite A and positive semidefinite N, by inverse iteration.
+
+    Args:
+        inner: ``(*batch, D, D)`` A.
+        form: ``(*batch, D, D)`` N.
+        present: ``(*batch,)`` bool: elsewhere there is nothing to find.
+
+    Returns:
+        ``(*batch,)`` ratios, infinite where there is none, and ``(*batch, D)`` unit vectors f, arbitrary there.
+
+    Example:
+        >>> import torch
+        >>> ratio, f = least_ratio(torch.diag(torch.tensor([2.0, 3.0])), torch.diag(torch.tensor([0.0, 2.0])), torch.tensor(True))
+        >>> float(ratio), f.abs().tolist()
+        (1.5, [0.0, 1.0])
+    """
     factor, failed = torch.linalg.cholesky_ex(inner)
     bad = ~present | (failed > 0)
-    factor = torch.where(bad[..., None, None], unit[:8, :8], factor)
+    factor = torch.where(bad[..., None, None], torch.eye(inner.shape[-1], dtype=inner.dtype, device=inner.device), factor)
     f = _start(form, factor)
     for _ in range(ITERATIONS):
         f = torch.cholesky_solve(form @ f, factor)
         f = f / f.norm(dim=-2, keepdim=True)
     above, below = (f * (inner @ f)).sum((-2, -1)), (f * (form @ f)).sum((-2, -1))
-    variance = torch.where(bad | (below <= 0), torch.inf, above / torch.where(below > 0, below, 1.0))
-    whole = torch.cat([f[..., 0], -(edge[..., None, :] @ f)[..., 0]], dim=-1)
-    whole = torch.where(bad[..., None], 0.0, whole / whole.norm(dim=-1, keepdim=True))
-    return variance, whole.unflatten(-1, (3, 3))
+    return torch.where(bad | (below <= 0), torch.inf, above / torch.where(below > 0, below, 1.0)), f[..., 0]
 
 
 def _start(form: Tensor, factor: Tensor) -> Tensor:
-    """``(*batch, 8, 1)``: of the columns of inner^-1 form, the longest: rich in the wanted eigenvector."""
+    """``(*batch, D, 1)``: of the columns of inner^-1 form, the longest: rich in the wanted eigenvector."""
     columns = torch.cholesky_solve(form, factor)
     best = columns.square().sum(-2).argmax(-1)
-    start = columns.gather(-1, best[..., None, None].expand(*best.shape, 8, 1))
+    start = columns.gather(-1, best[..., None, None].expand(*best.shape, form.shape[-1], 1))
     return start / start.norm(dim=-2, keepdim=True)
 
 

@@ -308,6 +308,53 @@ def epipolar_moments(
     return _places(found, _epipolar_places(found.device)), counts
 
 
+def resection_moments(
+    x: Tensor, points: Tensor, lags: Lags | None = None, weights: tuple[Tensor, Tensor] | None = None, per_point: bool = False
+) -> tuple[Tensor, Tensor]:
+    r"""Moment matrices of the projection of the same points in space into one camera, at all lags.
+
+    .. math:: M_k(s) = \sum_{ij} w_{1,ij}\, w_{2,(i+s)j}\; c_k(x_{ij})\, \tilde X_{(i+s)j} \tilde X_{(i+s)j}^T, \qquad
+              c(x) = (1,\; u,\; v,\; u^2 + v^2), \quad x = (u, v),
+
+    with :math:`\tilde X = (X, 1)`.  The 12 x 12 moments of the two rows :math:`P_1 \tilde X - u P_3 \tilde X` and
+    :math:`P_2 \tilde X - v P_3 \tilde X` in the entries of the camera P are made of them:
+
+    .. math:: \begin{pmatrix} M_0 & 0 & -M_1 \\ 0 & M_0 & -M_2 \\ -M_1 & -M_2 & M_3 \end{pmatrix}.
+
+    Args:
+        x: ``(*batch, T1, n, 2)`` what the camera sees, best normalized (mean 0, size 1); NaN where weight is 0.
+        points: ``(*batch, T2, n, 3)`` in space, best normalized, too.
+        lags: first and last lag, in frames; None for all.
+        weights: ``(*batch, T1, n)`` and ``(*batch, T2, n)``, not negative, 0 = missing; None for 1.
+        per_point: moments of each point rather than of all together.
+
+    Returns:
+        Moments ``(*batch, [n,] L, 4, 4, 4)`` float64, k first, not divided by the counts, and counts ``(*batch, [n,] L)``.  Both 0
+        where nothing overlaps.
+
+    Raises:
+        ValueError: shapes that do not match, or a weight that is negative or not finite.
+
+    Source: Hartley and Zisserman 2004, section 7.1, for the rows; the correlation theorem.
+
+    Example:
+        >>> import torch
+        >>> points = torch.rand(30, 4, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        >>> moments, counts = resection_moments(points[5:, :, :2], points, (0, 9))
+        >>> whole = (points[5:, :, :2, None] * points[5:, :, None]).sum((0, 1))  # at lag 5: products of x and y with X, Y, Z
+        >>> bool((moments[5, 1:3, 3, :3] - whole).abs().max() < 1e-12), int(counts[5])
+        (True, 100)
+    """
+    if x.ndim < 3 or points.ndim < 3 or x.shape[-2] != points.shape[-2] or (x.shape[-1], points.shape[-1]) != (2, 3):
+        raise ValueError(
+            f"the same points are (*batch, frames, n, 2) in a camera and (*batch, frames, n, 3) in space, got {tuple(x.shape)} and "
+            f"{tuple(points.shape)}"
+        )
+    span = _span(x, points, lags, 3)
+    found, counts = _lifted_moments(x, points, span, weights, _of_camera_and_space, per_point)
+    return _places(found, _resection_places(found.device)), counts
+
+
 def lag_covariances(
     a: Tensor, b: Tensor, lags: Lags | None = None, weights: tuple[Tensor, Tensor] | None = None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -367,6 +414,16 @@ def _monomials(x: Tensor) -> Tensor:
     return torch.stack([wx * x, wx * y, wy * y, wx, wy, w], dim=2)
 
 
+def _of_camera_and_space(x: Tensor) -> Tensor:
+    """Of a camera ``(b, t, n, 3)`` w (xx + yy), w x, w y, w; of space ``(b, t, n, 4)`` the ten products of X, Y, Z, 1, w last."""
+    *place, w = x.movedim(1, -1).unbind(2)
+    place = [torch.where(w > 0, value, 0.0) for value in place]
+    weighted = [w * value for value in place]
+    if len(place) == 2:
+        return torch.stack([weighted[0] * place[0] + weighted[1] * place[1], *weighted, w], dim=2)
+    return torch.stack([*(weighted[i] * place[j] for i in range(3) for j in range(i, 3)), *weighted, w], dim=2)
+
+
 def _camera_moments(
     x1: Tensor, x2: Tensor, lags: Lags | None, weights: tuple[Tensor, Tensor] | None, per_point: bool
 ) -> tuple[Tensor, Tensor]:
@@ -375,13 +432,19 @@ def _camera_moments(
         raise ValueError(
             f"the same points in both cameras are (*batch, frames, n, 2) each, got {tuple(x1.shape)} and {tuple(x2.shape)}"
         )
-    span = _span(x1, x2, lags, 3)
+    return _lifted_moments(x1, x2, _span(x1, x2, lags, 3), weights, _monomials, per_point)
+
+
+def _lifted_moments(
+    x1: Tensor, x2: Tensor, span: Lags, weights: tuple[Tensor, Tensor] | None, lift: Lift, per_point: bool
+) -> tuple[Tensor, Tensor]:
+    """Sums of products of a monomial of each ``(*b, [n,] p q, L)``, whose last are the weights alone, and counts."""
     given: tuple[Tensor | None, Tensor | None] = weights or (None, None)
     x1, x2 = (torch.cat([x.double(), _point_weights(x, w)[..., None]], dim=-1) for x, w in zip((x1, x2), given, strict=True))
     shape, first, second = _flat(x1, x2, 3)
-    found = correlate(first, second, span, _monomials, per_point).flatten(-3, -2)
-    one, two = (x[..., 2] if per_point else x[..., 2].flatten(1)[..., None] for x in (first, second))
-    counts = _counts(found[..., 35, :], one, two, per_point)
+    found = correlate(first, second, span, lift, per_point).flatten(-3, -2)
+    one, two = (x[..., -1] if per_point else x[..., -1].flatten(1)[..., None] for x in (first, second))
+    counts = _counts(found[..., -1, :], one, two, per_point)
     found = torch.where(counts[..., None, :] > 0, found, 0.0)
     return _batched(found, shape), _batched(counts, shape)
 
@@ -418,8 +481,8 @@ def _check_weights(weights: Tensor) -> None:
 
 
 def _places(found: Tensor, place: Tensor) -> Tensor:
-    """Matrices ``(*, L, d, d)`` of the sums ``(*, 36, L)``; the lags stay last in memory."""
-    return found.index_select(-2, place.flatten()).unflatten(-2, place.shape).movedim(-1, -3)
+    """Matrices ``(*, L, ..., d, d)`` of the sums ``(*, p q, L)``; the lags stay last in memory."""
+    return found.index_select(-2, place.flatten()).unflatten(-2, place.shape).movedim(-1, -1 - place.ndim)
 
 
 @constant
@@ -427,6 +490,13 @@ def _epipolar_places(device: torch.device) -> Tensor:
     """Which of the 6 x 6 sums each entry of a ``(9, 9)`` moment matrix is: row and column are 3 (entry of x2~) + entry of x1~."""
     entry = torch.tensor([[0, 1, 3], [1, 2, 4], [3, 4, 5]])  # of xx, xy, yy, x, y, 1
     return (6 * entry[None, :, None, :] + entry[:, None, :, None]).reshape(9, 9).to(device)
+
+
+@constant
+def _resection_places(device: torch.device) -> Tensor:
+    """Which of the 4 x 10 sums each entry of the ``(4, 4, 4)`` moments is."""
+    entry = torch.tensor([[0, 1, 2, 6], [1, 3, 4, 7], [2, 4, 5, 8], [6, 7, 8, 9]])  # of XX, XY, XZ, YY, YZ, ZZ, X, Y, Z, 1
+    return (10 * torch.tensor([3, 1, 2, 0])[:, None, None] + entry).to(device)
 
 
 def _span(a: Tensor, b: Tensor, lags: Lags | None, dims: int) -> Lags:

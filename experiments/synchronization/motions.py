@@ -9,12 +9,19 @@ from typing import Any
 import torch
 from torch import Generator, Tensor
 
-from experiments.synchronization.data import MOVING, RECORDED, Filming, Pair, cmu_pair, draw, filmed, moving, played
+from experiments.synchronization.data import MOVING, RECORDED, Filming, Motion, Pair, cmu_pair, draw, filmed, moving, played
 
 
 def periodic_pair(joints: Tensor, generator: Generator, **settings: Any) -> Pair:
-    """Two cameras around a person who repeats .8 to 1.4 s of a take in place, exactly: six harmonics of it."""
+    """Two cameras around a person who repeats .8 to 1.4 s of a take in place, exactly."""
     filming = Filming(**settings)
+    motion = periodic_motion(joints, generator)
+    largest = filming.max_shift / filming.rates[0]
+    return filmed(motion, draw(-largest, largest, generator), filming, generator)
+
+
+def periodic_motion(joints: Tensor, generator: Generator) -> Motion:
+    """A person who repeats .8 to 1.4 s of a take in place, exactly: six harmonics of it."""
     period, times = draw(0.8, 1.4, generator), torch.linspace(0, 1, 65, dtype=torch.float64)[:-1]
     take, last = played(joints - joints[:, :1] + joints[:, :1].mean(0)), (len(joints) - 1) / RECORDED
     for _ in range(20):
@@ -30,13 +37,19 @@ def periodic_pair(joints: Tensor, generator: Generator, **settings: Any) -> Pair
         turns = torch.exp(2j * math.pi * moments[:, None] / period * torch.arange(7))
         return torch.einsum("tk,kni->tni", turns * twice, spectrum).real
 
-    largest = filming.max_shift / filming.rates[0]
-    return filmed(motion, draw(-largest, largest, generator), filming, generator)
+    return motion
 
 
 def still_pair(joints: Tensor, generator: Generator, **settings: Any) -> Pair:
     """Two cameras around a person who stands as in one frame of a take and sways by 3 mm."""
     filming = Filming(**settings)
+    motion = still_motion(joints, generator)
+    largest = filming.max_shift / filming.rates[0]
+    return filmed(motion, draw(-largest, largest, generator), filming, generator)
+
+
+def still_motion(joints: Tensor, generator: Generator) -> Motion:
+    """A person who stands as in one frame of a take and sways by 3 mm."""
     pose = joints[int(torch.randint(len(joints), (1,), generator=generator))]
     phases, speeds = (2 * math.pi * torch.rand(3, 2, generator=generator, dtype=torch.float64) for _ in range(2))
 
@@ -44,8 +57,7 @@ def still_pair(joints: Tensor, generator: Generator, **settings: Any) -> Pair:
         sway = torch.sin(moments[:, None, None] * speeds / 2 + phases).sum(-1)
         return pose + 0.003 * sway[:, None] * (pose[:, 1:2] - pose[:, 1].min()) / 1.5
 
-    largest = filming.max_shift / filming.rates[0]
-    return filmed(motion, draw(-largest, largest, generator), filming, generator)
+    return motion
 
 
 def unrelated_pair(joints: Tensor, others: Tensor, generator: Generator, **settings: Any) -> Pair:

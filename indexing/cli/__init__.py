@@ -21,6 +21,7 @@ import tyro
 
 from indexing.cli.align import Align
 from indexing.cli.archive import Add, Find, Info, Remove, Search, Verify
+from indexing.cli.calibrate import Calibrate
 from indexing.cli.console import complain, reworded
 from indexing.cli.convert import Convert
 from indexing.cli.count import Count
@@ -59,16 +60,17 @@ COMMANDS: Any = (
     | Annotated[Reconstruct, Command("reconstruct")]
     | Annotated[Segment, Command("segment")]
     | Annotated[Sync, Command("sync")]
+    | Annotated[Calibrate, Command("calibrate")]
     | Annotated[Convert, Command("convert")]
     | Annotated[Count, Command("count")]
 )
 GROUPS = ("index", "archive")  # words that need another one behind them
 DESCRIPTION = """Geometry of scenes in which everything moves: find people in videos (pose); learn actions from one clip each and
 find them in other clips, from other viewpoints (index); keep thousands of recordings and ask where else anybody did this
-(archive); put cameras that nobody synchronized on one clock (sync); write recordings as other programs read them (convert); find
-how a camera or 3D sensor moved among things that move, and what stood still (align); find cameras, points and velocities from
-tracks through several views (reconstruct); find which matches of two images move together (segment); count how many matches such a
-problem takes (count).
+(archive); put cameras that nobody synchronized on one clock (sync); find where they stand, and the movement in 3D, from the people
+in view (calibrate); write recordings as other programs read them (convert); find how a camera or 3D sensor moved among things that
+move, and what stood still (align); find cameras, points and velocities from tracks through several views (reconstruct); find which
+matches of two images move together (segment); count how many matches such a problem takes (count).
 
 dyntorch COMMAND --help explains a command, dyntorch --version says the version."""
 

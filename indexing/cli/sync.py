@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -20,12 +21,24 @@ if TYPE_CHECKING:
     from indexing.report.sync import SyncReport
     from indexing.sync.files import Plan
     from indexing.sync.people import Pairing
+    from indexing.sync.synchronize import Method
     from indexing.sync.takes import By, Take
+    from indexing.sync.trial import Trial
+    from indexing.sync.trimming import CameraFilm
 
 WORDS = flags(
-    "fps", "person", "method", "measure", "max_shift", "min_confidence", "format", "size", "layout", "rate",
+    "fps", "person", "method", "measure", "max_shift", "min_confidence", "format", "size", "layout", "rate", "sound",
     calibration="--calibration FILE.toml",
 )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Hearing(Watching):
+    """What of videos is looked at, or listened to."""
+
+    by: Literal["auto", "keypoints", "pixels", "sound"] = "auto"  # type: ignore[assignment]  # one word more
+    """of videos: the keypoints of the people in them, the pixels alone, or the sound alone; auto: keypoints where a pose model is
+    there"""
 
 
 @dataclass(frozen=True)
@@ -36,16 +49,22 @@ class Sync:
 
     dyntorch sync pose/ --fps 60 --calibration Calib.toml --out .
 
-    dyntorch sync left.mp4 right.mp4 --check --out sync/
+    dyntorch sync left.mp4 right.mp4 --check --videos --out sync/
+
+    dyntorch sync TRIAL/
+
+    dyntorch sync cam1/ cam2/ vicon.c3d --out sync/
     """
 
     cameras: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="CAMERA ...", help_behavior_hint="")]
-    """per camera a keypoint file, a folder with one file per frame, or a video; or one folder that holds those of all"""
+    """per camera a keypoint file, a folder with one file per frame, or a video; or one folder that holds those of all, such as a
+    trial of Pose2Sim (Config.toml, pose/, videos/), or a session of several; one may be motion capture: a C3D, TRC or other file of
+    points in space"""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
-    """where to write report.html, sync.json, curve.png and pose-sync/; without it, print only"""
-    method: Literal["auto", "keypoints", "tracks", "brightness"] = "auto"
+    """where to write report.html, sync.json, curve.png and pose-sync/; without it, print only, and a trial gets them itself"""
+    method: Literal["auto", "keypoints", "tracks", "brightness", "sound"] = "auto"
     """auto: keypoints where there are any, or a pose model finds them; of videos that they do not decide tracks and brightness,
-    which must agree"""
+    which must agree; sound: what their microphones heard, alone (the same as --by sound)"""
     measure: Literal["profile", "window"] = "profile"
     """of --method brightness: what moves at which height, confirmed by the window kernel; or that kernel alone, as in the thesis"""
     fps: Annotated[str | None, tyro.conf.arg(metavar="N|N,N,...", help_behavior_hint="")] = None
@@ -58,6 +77,15 @@ class Sync:
     """who is compared where several people are in view; auto tries the likely ones and says whom it took"""
     rate: bool = True
     """clocks may run at different rates; --no-rate where one clock drives all cameras"""
+    sound: bool = True
+    """of videos that have any: what it says must agree with what the pictures say; --no-sound leaves it aside"""
+    videos: bool = False
+    """write synchronized_videos/ as well: what all cameras recorded, with equal numbers of frames; of keypoints the videos beside
+    them, of the same name"""
+    videos_fps: Annotated[float | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
+    """frames per second of synchronized_videos/; by default those of the first camera"""
+    breaks: bool = True
+    """look for frames that a camera lost, or wrote twice, without saying so, and mend its clock; --no-breaks where none did"""
     check: bool = False
     """write check.mp4 as well (check-NAME.mp4 for more than two cameras), with the same moments side by side"""
     min_confidence: Annotated[float, tyro.conf.arg(metavar="C")] = 0.0
@@ -68,7 +96,7 @@ class Sync:
     """width and height of the image in pixels, for files with coordinates from 0 to 1"""
     layout: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
     """which joint is which, such as BODY_25B; by default as the files say, or as the body looks"""
-    footage: Watching = field(default_factory=Watching)
+    footage: Hearing = field(default_factory=Hearing)
     title: Annotated[str | None, tyro.conf.arg(metavar="TEXT", help_behavior_hint="")] = None
     """heading of the report"""
 
@@ -77,33 +105,57 @@ class Sync:
         self._check()
         for path in self.cameras:
             refuse_range(path)
+        from indexing.sync.takes import find_cameras
+        from indexing.sync.trial import trial_of, trials_in
+
+        paths = [path.expanduser() for path in self.cameras]
+        home = paths[0] if len(paths) == 1 and paths[0].is_dir() else None
+        trial = None if home is None else trial_of(home)
+        if trial is None and home is not None and (inner := trials_in(home)):
+            return self._session(home, inner)
+        return self._one(find_cameras(paths) if trial is None else trial.cameras, trial)
+
+    def _session(self, home: Path, trials: list[Path]) -> int:
+        """All trials of a session, one after the other; the worst exit code."""
+        codes = []
+        for number, path in enumerate(trials):
+            say(f"{'' if not number else '--- '}trial {path.relative_to(home)}:")
+            out = None if self.out is None else self.out / path.relative_to(home)
+            codes.append(dataclasses.replace(self, cameras=(path,), out=out).run())
+        return max(codes)
+
+    def _one(self, found: dict[str, Path], trial: Trial | None) -> int:
+        """The cameras of one scene."""
         from indexing.files import manifest
         from indexing.report.sync import FILES, names_of
         from indexing.sync.files import check_target
-        from indexing.sync.takes import find_cameras
+        from indexing.sync.trimming import check_videos
 
-        found = find_cameras([path.expanduser() for path in self.cameras])
         inputs = [*found.values(), *([self.calibration.expanduser()] if self.calibration else [])]
-        folder = check_report(self.out, inputs, [*FILES, *names_of(list(found))])
+        out = trial.folder if trial is not None and self.out is None else self.out
+        folder = check_report(out, inputs, [*FILES, *names_of(list(found))])
         if folder is not None:
             check_target(folder, inputs)
+        if folder is not None and self.videos:
+            check_videos(folder, [*inputs, *(trial.films.values() if trial is not None else ())])
         started = time.perf_counter()
         by = self._by()
         watched = Watched({})
         if by != "pixels" and self.footage.wanted():
             watched = self.footage.watch(found.values(), folder, self._rates(len(found))[0])
         with progress("reading", steps=False):
-            takes = self._read(found, by, watched)
+            takes = self._read(found, by, watched, trial)
+            _check_spatial(takes, folder, inputs)
+            films = self._films(takes)
         read = time.perf_counter()
         pairs = len(takes) * (len(takes) - 1) // 2
         with progress(f"comparing {count(pairs, 'pair')} of cameras") as done:
-            report = self._solve(takes, done)
+            report = self._mended(self._solve(takes, done, trial), done, trial)
         timings = {"read": read - started, "synchronize": time.perf_counter() - read}
         page = None
         if folder is not None:
-            with progress("writing", steps=False):
-                made = manifest({"command": "sync", **dataclasses.asdict(self)}, inputs, None, timings)
-                report, page = self._write(folder, dataclasses.replace(report, manifest=made))
+            made = manifest({"command": "sync", **dataclasses.asdict(self)}, inputs, None, timings)
+            report, page = self._write(folder, dataclasses.replace(report, manifest=made), films, trial is not None)
         show(report, folder)
         return ended(page, None if report.ok else report.reason)
 
@@ -111,9 +163,15 @@ class Sync:
         """Raise on flags that make no sense by themselves, before any file is read."""
         if self.max_shift is not None and not 0 < self.max_shift < math.inf:
             raise ValueError(f"--max-shift must be a positive number of seconds, got {self.max_shift:g}")
-        if self.check and self.out is None:
-            raise ValueError("--check writes a video; say where with --out")
-        if self.check:
+        trial = len(self.cameras) == 1 and (self.cameras[0].expanduser() / "Config.toml").is_file()
+        for flag, asked in (("check", self.check), ("videos", self.videos)):
+            if asked and self.out is None and not trial:
+                raise ValueError(f"--{flag} writes {'a video' if flag == 'check' else 'videos'}; say where with --out")
+        if self.videos_fps is not None and not 0 < self.videos_fps < math.inf:
+            raise ValueError(f"--videos-fps must be a positive number of frames per second, got {self.videos_fps:g}")
+        if self.videos_fps is not None and not self.videos:
+            raise ValueError("--videos-fps is of the videos that --videos writes; add --videos, or leave it out")
+        if self.check or self.videos:
             from indexing.video.reading import av, cv2
 
             av(), cv2()  # said now rather than when all is done
@@ -146,40 +204,78 @@ class Sync:
         from indexing.sync.synchronize import BY
 
         of_method, by = BY[self.method], self.footage.by
-        if "auto" not in (by, of_method) and by != of_method:
-            raise ValueError(f"--by {by}: --method {self.method} compares the {of_method} of videos; leave --by out")
+        said = "sound" if self.method == "sound" else of_method
+        if "auto" not in (by, said) and by != said:
+            raise ValueError(f"--by {by}: --method {self.method} compares the {said} of videos; leave --by out")
+        if by == "sound":
+            return "pixels"
         return of_method if by == "auto" else by
 
-    def _read(self, found: dict[str, Path], by: By, watched: Watched) -> list[Take]:
+    @property
+    def _method(self) -> Method:
+        return "sound" if self.footage.by == "sound" else self.method
+
+    def _films(self, takes: list[Take]) -> list[CameraFilm] | None:
+        """The videos to cut, looked for before the work."""
+        from indexing.sync.trimming import film_of
+
+        return [film_of(take) for take in takes if not take.spatial] if self.videos else None
+
+    def _read(self, found: dict[str, Path], by: By, watched: Watched, trial: Trial | None = None) -> list[Take]:
         from indexing.sync.takes import take_of
 
-        rates = self._rates(len(found))
+        rates = self._rates(len(found)) if trial is None or self.fps is not None else trial.rates()
         options: dict[str, Any] = {"person": self.person, "min_confidence": self.min_confidence, "by": by}
         options |= {"format": self.format, "size": self.size, "layout": self.layout}
         try:
-            return [
-                take_of(path, name=name, fps=rate, keypoints=watched.files.get(path), **options)
-                for (name, path), rate in zip(found.items(), rates, strict=True)
-            ]
+            takes = []
+            for (name, path), rate in zip(found.items(), rates, strict=True):
+                # a C3D file says all of it itself, and one --fps is of the files that do not
+                own = path.suffix.lower() == ".c3d"
+                how = {**options, "format": None, "size": None, "layout": None} if own else options
+                rate = None if own and "," not in (self.fps or "") else rate
+                takes.append(take_of(path, name=name, fps=rate, keypoints=watched.files.get(path), **how))
+            return takes if trial is None else trial.filmed(takes)
         except ValueError as problem:
             raise ValueError(worded(problem, WORDS)) from problem
 
-    def _solve(self, takes: list[Take], done: Any) -> SyncReport:
+    def _mended(self, report: SyncReport, done: Any, trial: Trial | None = None) -> SyncReport:
+        """The report, where clocks broke with what is found when they are mended."""
+        from indexing.sync.breaking import find_breaks
+
+        if not self.breaks or self._method not in ("auto", "keypoints"):
+            return report
+        lenses, _ = self._lenses(report.takes, trial)
+        found = find_breaks(report.takes, report.compared, report.together, calibration=lenses, max_shift=self.max_shift)
+        if found is None:
+            return report
+        again = self._solve(list(found.takes), done, trial)
+        return dataclasses.replace(again, takes=report.takes, remarks=report.remarks, mended=found)
+
+    def _lenses(self, takes: Sequence[Take], trial: Trial | None) -> tuple[Any, tuple[str, ...]]:
+        """The lenses of the cameras, and what to say about them."""
+        from indexing.sync.calibration import named_lenses
+
+        called = [take.name for take in takes if not take.spatial]
+        if self.calibration is not None:
+            return named_lenses(self.calibration, called)
+        return (None, ()) if trial is None else trial.lenses(called)
+
+    def _solve(self, takes: list[Take], done: Any, trial: Trial | None = None) -> SyncReport:
         """All pairs, and what they say together."""
         import dyntorch
         from indexing.report.sync import SyncReport
-        from indexing.sync.calibration import named_lenses
         from indexing.sync.synchronize import pair, remarks
 
-        lenses, told = (None, ()) if self.calibration is None else named_lenses(self.calibration, [take.name for take in takes])
+        lenses, told = self._lenses(takes, trial)
         options: dict[str, Any] = {"max_shift": self.max_shift, "calibration": lenses, "rate": None if self.rate else 1.0}
-        options["measure"] = self.measure
+        options |= {"measure": self.measure, "sound": self.sound}
         total = len(takes) * (len(takes) - 1) // 2
         compared: dict[tuple[int, int], Pairing] = {}
 
         def compare(a: Take, b: Take, *_: Any, **__: Any) -> Any:
             try:
-                found = pair(a, b, self.method, **options)
+                found = pair(a, b, self._method, **options)
             except ValueError as problem:
                 said = problem.args[0] if problem.args else str(problem)
                 known = said.startswith(tuple(str(word) for take in (a, b) for word in (take.name, take.path or take.name)))
@@ -200,29 +296,102 @@ class Sync:
         known: dict[str, Any] = {"remarks": [*(one.text for one in remarks(takes)), *told], "heading": self.title or ""}
         return SyncReport(takes=takes, compared=compared, together=clocks, words=WORDS, **known)
 
-    def _write(self, folder: Path, report: SyncReport) -> tuple[SyncReport, Path]:
-        """The shifted files where the data decide, the check video where asked for, and the report."""
+    def _write(
+        self, folder: Path, report: SyncReport, films: list[CameraFilm] | None = None, trial: bool = False
+    ) -> tuple[SyncReport, Path]:
+        """The shifted files and the cut videos where the data decide, the check video where asked for, and the report."""
         from indexing.files import prepare
         from indexing.report.sync import drop_checks, write_checks, write_sync
-        from indexing.sync.files import drop_poses, plan, write_poses
 
         prepare(folder)
-        notes, first = [], report.reference
-        poses = {i: clock for i, clock in enumerate(report.clocks) if clock.take.kind == "keypoints"}
-        if report.ok and poses:
-            plans = {i: plan(clock.take, clock.offset, clock.rate, first.take.fps) for i, clock in poses.items()}
-            write_poses(folder, list(plans.values()))
-            notes += early(list(plans.values()), first.name)
-            report = dataclasses.replace(report, shifted={i: _shifted(one) for i, one in plans.items()})
-        elif drop_poses(folder):
-            notes.append("pose-sync of an earlier run was removed, because this one does not decide")
+        report, notes = self._write_videos(folder, report, films)  # first: what cannot be written is mostly this
+        with progress("writing", steps=False):
+            report, more = _write_poses(folder, report, trial)
+            notes = more + notes
+            report, more = _write_mocap(folder, report)
+            notes += more
         videos: list[str] = []
-        if self.check and any(len(pair.shift.peaks) for pair in report.pairs):  # of the best candidate, sure or not
-            videos, failed = write_checks(folder, report)
-            notes += failed
-        drop_checks(folder, videos)
-        report = dataclasses.replace(report, afterwards=notes)
-        return report, write_sync(folder, report, videos)
+        with progress("writing", steps=False):
+            if self.check and any(len(pair.shift.peaks) for pair in report.pairs):  # of the best candidate, sure or not
+                videos, failed = write_checks(folder, report)
+                notes += failed
+            drop_checks(folder, videos)
+            report = dataclasses.replace(report, afterwards=notes)
+            return report, write_sync(folder, report, videos)
+
+    def _write_videos(self, folder: Path, report: SyncReport, films: list[CameraFilm] | None) -> tuple[SyncReport, list[str]]:
+        """``synchronized_videos/``, if they are asked for and the data decide."""
+        from indexing.sync.trimming import clock_of, drop_videos, told, trim, write_videos
+
+        if films is None or not report.ok:
+            removed = drop_videos(folder)
+            why = "this one does not decide" if films is not None else "this one writes none"
+            return report, [f"the videos of an earlier run in synchronized_videos were removed, because {why}"] if removed else []
+        clocks = [clock for clock in report.clocks if not clock.take.spatial]
+        if report.mended is not None:
+            new = {take.name: take.times for take in report.mended.takes}
+            films = [
+                dataclasses.replace(film, times=clock_of(clock.take, film.path, film.stamps, new[film.name]))
+                for film, clock in zip(films, clocks, strict=True)
+            ]
+        chosen = trim(films, [clock.against(clocks[0]) for clock in clocks], self.videos_fps)
+        with progress(f"writing {count(len(films), 'video')} of {count(chosen.frames, 'frame')}") as done:
+            write_videos(folder, chosen, done)
+        return dataclasses.replace(report, videos=told(chosen)), []
+
+
+def _check_spatial(takes: list[Take], folder: Path | None, inputs: list[Path]) -> None:
+    """Raise where there is more than one motion capture, or what is written of it would replace something."""
+    from indexing.sync.mocap import check_mocap
+
+    spatial = [take for take in takes if take.spatial]
+    if len(spatial) > 1:
+        said = names([take.name for take in spatial])
+        raise ValueError(f"{spatial[1].path or spatial[1].name}: {said} are both motion capture; give one, and cameras")
+    if spatial and folder is not None:
+        check_mocap(folder, inputs)
+
+
+def _write_mocap(folder: Path, report: SyncReport) -> tuple[SyncReport, list[str]]:
+    """``mocap-sync/``, if the data decide and its clock is not the reference itself, and what to say about it."""
+    from indexing.sync.mocap import FOLDER, drop_mocap, retimed, write_mocap
+
+    spatial = [i for i, clock in enumerate(report.clocks) if clock.take.spatial]
+    removed = drop_mocap(folder)
+    if not report.ok or spatial in ([], [0]):
+        why = "this one writes none" if report.ok else "this one does not decide"
+        return report, [f"{FOLDER} of an earlier run was removed, because {why}"] if removed else []
+    clock = report.clocks[spatial[0]]
+    one = retimed(clock.take, clock.offset, clock.rate)
+    if one is None:
+        return report, [f"{clock.name} ended before number 0 of {report.reference.name}, so nothing is written of it"]
+    notes = write_mocap(folder, one)
+    told = {"folder": f"{FOLDER}/{one.name}", "files": 1, "shift": one.first, "rest": one.rest, "repeated": 0}
+    told["left_out"] = one.first
+    return dataclasses.replace(report, shifted={**report.shifted, spatial[0]: told}), notes
+
+
+def _write_poses(folder: Path, report: SyncReport, trial: bool) -> tuple[SyncReport, list[str]]:
+    """``pose-sync/``, if the data decide, and what to say about it."""
+    from indexing.sync.files import drop_poses, plan, write_poses
+    from indexing.sync.trial import numbers, shortest
+
+    poses = {i: clock for i, clock in enumerate(report.clocks) if clock.take.kind == "keypoints" and not clock.take.spatial}
+    if not (report.ok and poses):
+        removed = drop_poses(folder)
+        return report, ["pose-sync of an earlier run was removed, because this one does not decide"] if removed else []
+    first = report.clocks[shortest(report.takes)] if trial else report.reference
+    # on the clock of motion capture frames are numbered as often as a camera takes them
+    fps = next(iter(poses.values())).take.fps if first.take.spatial else first.take.fps
+    plans = {}
+    for i, clock in poses.items():
+        told, times = clock.against(first), None if report.mended is None else report.mended.takes[i].times
+        plans[i] = plan(clock.take, told.offset, told.rate, fps, times)
+    write_poses(folder, list(plans.values()), numbers(list(plans.values())) if trial else None)
+    notes = early(list(plans.values()), first.name)
+    if trial and first is not report.reference:
+        notes.append(f"frame numbers in pose-sync are those of {first.name}, the shortest recording, as in Pose2Sim")
+    return dataclasses.replace(report, shifted={i: _shifted(one) for i, one in plans.items()}), notes
 
 
 def early(plans: list[Plan], reference: str) -> list[str]:
@@ -232,8 +401,10 @@ def early(plans: list[Plan], reference: str) -> list[str]:
 
 
 def _shifted(one: Plan) -> dict[str, Any]:
+    from indexing.sync.files import folder_of
+
     return {
-        "folder": f"pose-sync/{one.take.name}_json", "files": len(one.numbers), "shift": one.shift, "rest": one.rest,
+        "folder": f"pose-sync/{folder_of(one.take)}", "files": len(one.numbers), "shift": one.shift, "rest": one.rest,
         "repeated": one.repeated, "left_out": one.before,
     }  # fmt: skip
 
@@ -265,12 +436,25 @@ def show(report: SyncReport, folder: Path | None = None) -> None:
         say(f"and {len(open_pairs) - SHOWN} more pairs refused")
     for note in report.notes:
         say(f"note: {note}")
-    moved = [clock for clock in report.clocks if clock.shifted is not None]
+    _show_written(report, folder)
+
+
+def _show_written(report: SyncReport, folder: Path | None) -> None:
+    for clock in (clock for clock in report.clocks if clock.take.spatial and clock.shifted is not None):
+        assert clock.shifted is not None
+        where = Path(clock.shifted["folder"]) if folder is None else folder / clock.shifted["folder"]
+        say(f"motion capture: {where}, on the clock of {report.reference.name}, within {1000 * clock.shifted['rest']:.1f} ms")
+    moved = [clock for clock in report.clocks if clock.shifted is not None and not clock.take.spatial]
     if moved:
         rest = 1000 * max(clock.shifted["rest"] for clock in moved if clock.shifted is not None)
         written = ", ".join(clock.name for clock in moved)
         where = Path("pose-sync") if folder is None else folder / "pose-sync"
         say(f"shifted files: {where}/ ({written}), within {rest:.1f} ms of {report.reference.name}")
+    if report.videos:
+        rest = 1000 * max(one["rest"] for one in report.videos["cameras"].values())
+        where = Path(report.videos["folder"]) if folder is None else folder / report.videos["folder"]
+        said = f"{count(len(report.videos['cameras']), 'video')} of {count(report.videos['frames'], 'frame')}"
+        say(f"videos: {where}/, {said}, {report.videos['fps']:.6g} per second, within {rest:.1f} ms of {report.reference.name}")
 
 
 def _show_pairs(report: SyncReport) -> None:

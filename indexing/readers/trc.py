@@ -20,7 +20,7 @@ from indexing.readers.mocap import of_markers
 from indexing.readers.recording import IntArray, frame_numbers, to_clips
 
 HEAD = "PathFileType"
-UNITS = ("m", "cm", "mm", "px", "in", "meters", "metres", "millimeters", "inches", "pixels")
+UNITS = ("m", "cm", "mm", "px", "in", "meters", "metres", "millimeters", "inches", "pixels", "unknown")
 MISSING = ("", "nan", "na", "n/a", "none", "null")
 REMEDY = "export it again as TRC, with tabs between the cells"
 

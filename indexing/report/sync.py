@@ -19,6 +19,7 @@ from dyntorch.numerics import as_python, worded
 from indexing.clip import Clip
 from indexing.report.canvas import LIGHT, new_figure, png, shorten, style
 from indexing.report.page import Picture, markup, render, sentence, write_files
+from indexing.sync.breaking import Mended
 from indexing.sync.notices import besides
 from indexing.sync.people import Pairing, joint_names, who
 from indexing.sync.takes import Take
@@ -31,8 +32,10 @@ FILES = ("report.html", "sync.json", "curve.png")
 METHODS = {
     "epipolar": "same points, epipolar",
     "affine": "same points, affine",
+    "camera": "a camera and the same points in space",
     "subspace": "different points, subspaces",
     "brightness": "brightness",
+    "sound": "sound",
 }
 PPM = 1e6
 UNKNOWN = 1e3  # seconds of standard deviation that say nothing
@@ -73,6 +76,11 @@ class Clock:
     def inverse(self, times: Any) -> Any:
         """Times of the reference's clock, of the moments at ``times`` of this one."""
         return (times - self.offset) / self.rate
+
+    def against(self, first: Clock) -> Clock:
+        """The same clock, told on another camera's than the reference's."""
+        rate = self.rate / first.rate
+        return dataclasses.replace(self, offset=self.offset - rate * first.offset, rate=rate)
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,6 +145,8 @@ class SyncReport:
         remarks: on the recordings, a sentence each.
         afterwards: what a user should know of the files written, a sentence each.
         shifted: by the number of the camera, what was written of it.
+        videos: the videos that were cut: of :func:`indexing.sync.trimming.told`.
+        mended: the takes with the times at which their frames were taken, where clocks broke; clocks and pairs are of these.
         heading: of the page; by default what was found.
         words: what whoever reads the report calls the arguments that sentences of the library speak of.
         manifest: of :func:`indexing.files.manifest`.
@@ -148,6 +158,8 @@ class SyncReport:
     remarks: Sequence[str] = ()
     afterwards: Sequence[str] = ()
     shifted: Mapping[int, Mapping[str, Any]] = field(default_factory=dict)
+    videos: Mapping[str, Any] = field(default_factory=dict)
+    mended: Mended | None = None
     heading: str = ""
     words: Callable[[str, str | None], str] = as_python
     manifest: Mapping[str, Any] = field(default_factory=dict)
@@ -229,7 +241,9 @@ class SyncReport:
         if self.together is not None:  # what the pairs say is told with them
             more = [notice for notice in besides(self.spoken) if notice.code != "of_pair"]
             own = [str(notice.worded(self.words).text) for notice in more] + own
-        return [*dict.fromkeys([*(worded(note, self.words) for note in self.remarks), *own]), *self.afterwards]
+        broke = [] if self.mended is None else [str(notice.worded(self.words).text) for notice in self.mended.found.notices]
+        broke += ["offsets, rates and written files are as if it had not broken"] * bool(broke)
+        return [*dict.fromkeys([*(worded(note, self.words) for note in self.remarks), *broke, *own]), *self.afterwards]
 
 
 def describe(report: SyncReport) -> str:
@@ -303,6 +317,17 @@ def clock_rows(report: SyncReport) -> list[list[Any]]:
     return rows
 
 
+def video_rows(report: SyncReport) -> list[list[Any]]:
+    """The page's table of videos that were cut."""
+    return [
+        [
+            quiet(name, one["file"]), one["frames"], f"{one['first']} to {one['last']}", one["repeated"], one["left_out"],
+            f"{1000 * one['rest']:.1f} ms",
+        ]
+        for name, one in report.videos.get("cameras", {}).items()
+    ]  # fmt: skip
+
+
 def pair_rows(report: SyncReport) -> list[list[Any]]:
     """The page's table of pairs; of two cameras there is nothing else that the pair could be off."""
     rows = []
@@ -354,6 +379,7 @@ def write_sync(folder: str | Path, report: SyncReport, videos: Sequence[str] = (
 def page(report: SyncReport, drawn: bytes, videos: Sequence[str] = ()) -> str:
     """The page, with a picture of the curves."""
     values: dict[str, Any] = {"noted": noted(report), "clock_rows": clock_rows(report), "pair_rows": pair_rows(report)}
+    values["video_rows"] = video_rows(report)
     values |= {"picture": Picture(drawn), "videos": videos, "drawn": DRAWN, "drift_of": drift_of, "ppm": ppm, "sigma": sigma_text}
     return render("sync", report, summary=describe(report), **values)
 
@@ -375,6 +401,8 @@ def as_json(report: SyncReport) -> dict[str, Any]:
             for clock in report.clocks
         ],
         "pairs": [_pair_json(pair) for pair in report.pairs],
+        "videos": report.videos or None,
+        "breaks": [] if report.mended is None else report.mended.told(),
         "cycle_error": report.cycle,
         "outlier_pair": list(report.outlier) if report.outlier else None,
         "notes": report.notes,
@@ -392,7 +420,20 @@ def _pair_json(pair: Compared) -> dict[str, Any]:
         "confidence": shift.confidence, "center": shift.center, "offset_at_center": pair.apart, "fps": list(shift.fps),
         "peaks": [{"offset": offset, "score": score} for offset, score in shift.peaks.tolist()],
         "wrong_points": pair.wrong, "people": list(pair.people) if any(pair.people) else None, "residual": pair.residual,
-        "fundamental": fundamental, "notes": list(shift.notes),
+        "fundamental": fundamental, "projection": None if shift.projection is None else shift.projection.tolist(),
+        "sound": _sound_json(pair), "notes": list(shift.notes),
+    }  # fmt: skip
+
+
+def _sound_json(pair: Compared) -> dict[str, Any] | None:
+    """What the sound of both cameras says by itself; None where there is none, or none was asked."""
+    heard = pair.pairing.sound
+    if heard is None:
+        return None
+    return {
+        "ok": heard.ok, "reason": heard.reason or None, "offset": heard.offset, "sigma": heard.sigma, "rate": heard.rate,
+        "rate_sigma": heard.rate_sigma, "confidence": heard.confidence,
+        "later": float(heard.at(pair.shift.center)) - float(pair.shift.at(pair.shift.center)),
     }  # fmt: skip
 
 

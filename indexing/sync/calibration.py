@@ -28,12 +28,14 @@ class Lens:
         matrix: ``(3, 3)``.
         distortions: ``(k,)`` in OpenCV's order: k1, k2, p1, p2, k3, ...
         fisheye: whether they are those of OpenCV's fisheye model.
+        size: width and height of its picture in pixels, where the file says.
     """
 
     name: str
     matrix: Tensor
     distortions: Tensor
     fisheye: bool = False
+    size: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +97,8 @@ def read_calibration(path: str | Path) -> list[Lens]:
                 raise error(path, f"[{section}] distortions: expected 4, 5 or 8 numbers, got {len(distortions)}", REMEDY)
             name = values.get("name", key)
             name = name if isinstance(name, str) else shown(name)
-            found.append(Lens(name, matrix / matrix[2, 2], distortions, bool(values.get("fisheye", False))))
+            lens = Lens(name, matrix / matrix[2, 2], distortions, bool(values.get("fisheye", False)), _size(values.get("size")))
+            found.append(lens)
     if not found:
         raise error(path, "has no camera: no section with a 'matrix'", REMEDY)
     return found
@@ -134,7 +137,7 @@ def match(cameras: Sequence[Lens], names: Sequence[str], path: str | Path) -> tu
     known_names = listed(lens.name for lens in cameras)
     if len(cameras) == len(names):
         return list(cameras), (f"calibration taken in the order of its file ({known_names}), because names differ",)
-    raise error(path, f"its cameras are {known_names}, and {listed(names)} are to be synchronized", "name sections as the cameras")
+    raise error(path, f"its cameras are {known_names}, and {listed(names)} are asked for", "name sections as the cameras")
 
 
 def _plain(name: str) -> str:
@@ -154,6 +157,12 @@ def _is_inner(matrix: Tensor) -> bool:
         return False
     scaled = matrix / matrix[2, 2]
     return bool((scaled.abs() < LARGEST).all() and (scaled.diagonal() > 0).all() and (scaled[2, :2] == 0).all())
+
+
+def _size(value: Any) -> tuple[float, float] | None:
+    """Width and height, where they are two positive numbers: nothing else of a file hangs on them."""
+    numbers = [x for x in value if isinstance(x, (int, float)) and 0 < x < LARGEST] if isinstance(value, list) else []
+    return (float(numbers[0]), float(numbers[1])) if len(numbers) == len(value or ()) == 2 else None
 
 
 def _numbers(path: Path, section: str, key: str, value: Any) -> Tensor:

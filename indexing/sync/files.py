@@ -8,6 +8,7 @@ frames where the clocks run alike, and a frame repeated or left out now and then
 from __future__ import annotations
 
 import json
+import math
 import re
 import secrets
 import shutil
@@ -28,6 +29,7 @@ from indexing.sync.takes import Take
 
 FOLDER = "pose-sync"
 NEAR = 0.5 + 1e-6  # frames: no other frame is nearer
+EMPTY = json.dumps({"version": 1.3, "people": []})  # a frame that shows nobody
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,13 +62,15 @@ class Plan:
         return int(off[0]) if len(off) == 1 else None
 
 
-def plan(take: Take, offset: float, rate: float, fps: float) -> Plan:
+def plan(take: Take, offset: float, rate: float, fps: float, times: NDArray[np.float64] | None = None) -> Plan:
     """Match a camera's frames with the frame numbers of the reference camera.
 
     Args:
         take: keypoints.
         offset, rate: the camera's clock is the reference's times rate plus offset.
         fps: frames per second of the reference.
+        times: ``(frames,)`` seconds of the camera's clock at which its frames were taken, where that is not what its files say,
+            because frames were lost in between.
 
     Returns:
         the plan; of a camera that ended before the reference's number 0 it has no frames.
@@ -78,7 +82,7 @@ def plan(take: Take, offset: float, rate: float, fps: float) -> Plan:
         >>> late.numbers.tolist(), late.rows.tolist(), round(late.rest, 3), late.before
         ([0, 1, 2, 3], [2, 3, 4, 5], 0.01, 2)
     """
-    times = take.times
+    times = take.times if times is None else times
     nearest = np.floor((times - offset) / rate * fps).astype(np.int64)
     reach = int(np.ceil(NEAR * fps / (rate * take.fps)))  # numbers on either side that one frame may stand for
     numbers = np.unique(nearest[:, None] + np.arange(-reach, reach + 2))
@@ -119,17 +123,21 @@ def ours(folder: Path) -> bool:
         return False
 
 
-def write_poses(folder: Path, plans: Sequence[Plan]) -> Path:
+def write_poses(folder: Path, plans: Sequence[Plan], count: int | None = None) -> Path:
     """Write ``pose-sync/<camera>_json/`` for every camera: all of them, or nothing.
 
     Frames of an OpenPose folder are copied as they are, under their new numbers; other formats are written as OpenPose JSON.
+
+    Args:
+        count: how many frame numbers every camera has a file for; one without people where it shows nothing, as Pose2Sim looks at
+            as many numbers as the camera with the fewest files has files.  None = files for the frames that are there.
     """
     target = folder / FOLDER
     recover_folder(target)
     building = folder / f".{FOLDER}-{secrets.token_hex(8)}.tmp"
     try:
         for one in (one for one in plans if len(one.rows)):
-            _write_camera(building / f"{one.take.name}_json", one)
+            _write_camera(building / folder_of(one.take), one, count)
         replace_folder(building, target)
     except OSError as problem:
         raise ValueError(
@@ -149,22 +157,41 @@ def drop_poses(folder: Path) -> bool:
     return True
 
 
-def _write_camera(folder: Path, one: Plan) -> None:
+def folder_of(take: Take) -> str:
+    """The name of the folder of a camera's shifted files: that of its own files, by which Pose2Sim finds them again.
+
+    Example:
+        >>> folder_of(Take("cam1", "keypoints"))
+        'cam1_json'
+    """
+    own = take.path is not None and take.path.is_dir() and "json" in take.path.name
+    return take.path.name if own and take.path is not None else f"{take.name}_json"
+
+
+def _write_camera(folder: Path, one: Plan, count: int | None = None) -> None:
     folder.mkdir(parents=True)
-    sources = _openpose_files(one.take.path)
+    sources = openpose_files(one.take.path)
+    pairs = zip(one.numbers.tolist(), one.rows.tolist(), strict=True)
+    chosen = {number: row for number, row in pairs if number < (count or math.inf)}
+    written, like = set(), f"{one.take.name}_000000.json"
     if sources:
         by_number = {int(np.rint(time * one.take.fps)): row for row, time in enumerate(one.take.times)}
         paths = {by_number[number]: path for number, path in sources.items() if number in by_number}
-        for number, row in zip(one.numbers.tolist(), one.rows.tolist(), strict=True):
+        like = next(iter(sources.values())).name
+        for number, row in chosen.items():
             if row in paths:
                 shutil.copyfile(paths[row], folder / renumbered(paths[row].name, number))
-        return
-    texts = openpose_frames(one.take)
-    for number, row in zip(one.numbers.tolist(), one.rows.tolist(), strict=True):
-        (folder / f"{one.take.name}_{number:06d}.json").write_text(texts[row], encoding="utf-8")
+                written.add(number)
+    else:
+        texts = openpose_frames(one.take)
+        for number, row in chosen.items():
+            (folder / renumbered(like, number)).write_text(texts[row], encoding="utf-8")
+            written.add(number)
+    for number in set(range(count or 0)) - written:
+        (folder / renumbered(like, number)).write_text(EMPTY, encoding="utf-8")
 
 
-def _openpose_files(path: Path | None) -> dict[int, Path]:
+def openpose_files(path: Path | None) -> dict[int, Path]:
     """Frame number -> file, where the camera is a folder of OpenPose JSON."""
     if path is None or not path.is_dir():
         return {}

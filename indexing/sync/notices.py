@@ -52,6 +52,46 @@ class SyncNotice(NoticeCode):
     """Pairings of other people that are as sure."""
 
 
+class SoundNotice(NoticeCode):
+    """What the sound of two videos says, and why it does not decide."""
+
+    NONE = "no_sound", "{camera:{which}} has no sound; use keypoints or pixels", Status.TOO_FEW
+    """A video without a stream of sound."""
+    SILENT = "silent", "the sound of {camera:{which}} is silence; use keypoints or pixels", Status.DEGENERATE
+    """A microphone that was off."""
+    SHORT = (
+        "short",
+        "the sounds overlap by less than {value:g} s at every shift that is searched; film longer, or raise {arg:max_shift}",
+        Status.TOO_FEW,
+    )
+    """Nothing to compare."""
+    NOTHING = (
+        "no_peak",
+        "no shift of the sound stands out: the microphones heard too little, or different things; clap at some uneven moments",
+        Status.AMBIGUOUS,
+    )
+    """No peak stands out."""
+    REPEATED = (
+        "sound_repeats",
+        "the sound repeats itself: {value:+.3f} s fits hardly better than {rivals} s; clap at some uneven moments",
+        Status.AMBIGUOUS,
+    )
+    """Several peaks, as of a metronome."""
+    AGREES = "sound_agrees", "sound agrees: {value:+.3f} s"
+    """The sound says the same; the value is how much later."""
+    OPEN = "sound_open", "the sound does not decide: {why}"
+    """The sound is no witness."""
+    ALONE = "sound_alone", "the sound says {offset} ± {sigma} s; {arg:method='sound'} takes its word"
+    """The sound decides where nothing else does."""
+    CONTRADICTS = (
+        "sound_contradicts",
+        "the sound says {offset} ± {sigma} s, and the pictures say {found} ± {own} s: one of them is wrong; {arg:method='sound'} "
+        "takes the word of the sound, {arg:sound=False} that of the pictures",
+        Status.NO_CONSENSUS,
+    )
+    """The sound says something else."""
+
+
 class BrightnessNotice(NoticeCode):
     """Why the brightness of two videos does not decide, or what to know besides."""
 

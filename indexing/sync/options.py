@@ -80,6 +80,95 @@ class VideoOptions:
 
 
 @dataclass(frozen=True)
+class SoundOptions:
+    """What two microphones heard, as a witness or alone.  Measurements: ``python -m experiments.synchronization.sound``."""
+
+    samples: int = 16_000
+    """Per second, to which all sound is brought: the bands below need no more."""
+    gap: float = 0.02
+    """Seconds that the timestamps of a file may be off its samples before a gap is taken for one; Matroska rounds to .001."""
+    quiet: float = 3e-4
+    """Of full scale: a recording that is nowhere louder holds the rounding of its samples, 10 steps of 16 bits."""
+    lowest: float = 200.0
+    """Hertz: below are hum of the mains, wind and hands on the phone, of one microphone alone."""
+    highest: float = 7000.0
+    """Hertz: what phones' noise suppression leaves."""
+    bands: int = 8
+    """Bands of pitch, of equal ratio."""
+    window: float = 0.01
+    """Seconds of a spectrum."""
+    hop: float = 0.002
+    """Seconds from one to the next, of the envelopes that offset and rate are read from."""
+    step: float = 0.01
+    """Seconds, of the envelopes in which shifts are searched."""
+    smooth: float = 0.05
+    """Hertz over which magnitudes are averaged in the phase transform.  Least evidence against the next peak, music at 10 dB,
+    0 / .05 / .5 Hz: 7.3 / 7.4 / 5.0; the same of all kinds at -5 dB: 1.6 / 3.0 / 2.9."""
+    slowest: float = 0.5
+    """Hertz: slower changes of loudness are those of automatic gain."""
+    overlap: float = 2.0
+    """Seconds that both must have recorded at once."""
+    drift: float = 2e-4
+    """Seconds per second that one clock may gain on the other: those of phones and cameras gain 5e-5 at most."""
+    piece: float = 30.0
+    """Seconds within which drift is not looked at, 6 ms at most."""
+    shortest_piece: float = 2.0
+    """Seconds of the pieces whose scatter tells how sure offset and rate are, at least."""
+    fewest_pieces: int = 12
+    """How many of them there are in an overlap that is long enough."""
+    blur: float = 0.003
+    """Seconds, standard deviation by which scores are smoothed about the peak, for their slope and curvature."""
+    long: float = 30.0
+    """Seconds of overlap from which a rate is looked for: 1e-4 moves the ends by 3 ms then."""
+    sure: float = 3.0
+    """Standard deviations that a rate must be off 1, and two witnesses off each other to contradict."""
+    rounds: int = 8
+    """Newton's steps."""
+    peaks: int = 7
+    """Peaks that are looked at."""
+    apart: float = 0.1
+    """Seconds within which a peak is the slope of a higher one: half of this is a band's envelope, and a room's first echoes."""
+    stretch: float = 0.03
+    """Seconds that speak as one, a clap.  Evidence (sum over root of squares) at .02 / .03 / .05 / .1 s, recordings of 60 s: speech
+    at 10 dB 23 / 20 / 17 / 13, steps at -5 dB 7.1 / 6.7 / 6.3 / 6.0; the strongest of 600 unrelated pairs 4.8 / 4.7 / 5.0 / 4.9."""
+    chance: float = 1e-2
+    """Probability of evidence as strong by chance at any shift, at most, by a bound that is far above it: evidence of 5.3 for
+    recordings of 60 s, 4.9 for 10 s."""
+    apart_by: float = 3.0
+    """Sum over root of squares of what short stretches say for the best shift rather than another one, at least.  1,200 unrelated
+    pairs reach 1.5, wrong answers to a metronome 1.9; right ones of 60 s 4.8 and more, music at -5 dB 2.9 to 6.8."""
+    nearer: float = 3.0
+    """Metres, standard deviation of how much nearer the sound is to one camera: 10 m, 29 ms, is then the limit."""
+    speed: float = 343.0
+    """Metres per second, of sound at 20 degrees."""
+    latency: float = 0.015
+    """Seconds, standard deviation between sound and pictures of a file: three of them are the 45 ms that ITU-R BT.1359-1 finds to
+    be noticed."""
+    shown: int = 20_000
+    """Points of the curve that are kept for its picture."""
+
+
+@dataclass(frozen=True)
+class TrimOptions:
+    """Videos that are cut to what all cameras recorded."""
+
+    same: float = 0.25
+    """Of a frame, by which times of keypoints are those of the video's frames at most."""
+    longer: float = 2.0
+    """Frames by which keypoints may run over the end of their video."""
+    denominator: int = 1001
+    """Of the frame rate as a fraction, at most: 30000/1001."""
+    crf: str = "17"
+    """Quality of H.264: the eye sees no difference from 18 down, and who looks for keypoints should not, either."""
+    preset: str = "veryfast"
+    """Of H.264: speed for size."""
+    mpeg4: str = "2"
+    """Quality of MPEG-4, where there is no H.264."""
+    every: int = 20
+    """Frames from one report of progress to the next."""
+
+
+@dataclass(frozen=True)
 class GrayOptions:
     """What is kept of a gray video."""
 
@@ -256,6 +345,7 @@ class SyncOptions:
     recording: RecordingOptions = RecordingOptions()
     people: PeopleOptions = PeopleOptions()
     video: VideoOptions = VideoOptions()
+    sound: SoundOptions = SoundOptions()
     gray: GrayOptions = GrayOptions()
     profile: ProfileOptions = ProfileOptions()
     kernel: KernelOptions = KernelOptions()

@@ -32,11 +32,13 @@ class Pairing:
         shift: of b's clock against a's.
         people: the numbers of both among the people of their takes.
         rivals: offsets at which other pairings are sure, too, best first.
+        sound: what the sound of both videos says by itself; None where there is none, or none was asked.
     """
 
     shift: Shift
     people: tuple[int, int]
     rivals: tuple[float, ...] = ()
+    sound: Shift | None = None
 
 
 def match_people(a: Take, b: Take, solve: Solve, trial: Solve | None = None, *, options: SyncOptions = SyncOptions()) -> Pairing:

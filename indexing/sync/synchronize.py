@@ -18,7 +18,7 @@ from dyntorch.core import Notice, status_from
 from dyntorch.numerics import Message, check_options, named
 from indexing.clip import Clip
 from indexing.remarks import is_normalized
-from indexing.sync.notices import SyncNotice, besides, noted
+from indexing.sync.notices import SoundNotice, SyncNotice, besides, noted
 from indexing.sync.options import MEASURES, Measure, SyncOptions
 from indexing.sync.people import Pairing, common_joints, disagreements, jumps, match_people
 from indexing.sync.takes import By, Take, take_of
@@ -26,9 +26,9 @@ from indexing.sync.takes import By, Take, take_of
 if TYPE_CHECKING:
     from dyntorch import Shift
 
-Method = Literal["auto", "keypoints", "tracks", "brightness"]
-METHODS = ("auto", "keypoints", "tracks", "brightness")
-BY: dict[str, By] = {"auto": "auto", "keypoints": "keypoints", "tracks": "pixels", "brightness": "pixels"}
+Method = Literal["auto", "keypoints", "tracks", "brightness", "sound"]
+METHODS = ("auto", "keypoints", "tracks", "brightness", "sound")
+BY: dict[str, By] = {"auto": "auto", "keypoints": "keypoints", "tracks": "pixels", "brightness": "pixels", "sound": "pixels"}
 """What of videos each method compares."""
 LISTED = 3  # moments in a note
 
@@ -44,6 +44,7 @@ def synchronize(
     person: str = "auto",
     min_confidence: float = 0.0,
     measure: Measure = "profile",
+    sound: bool = True,
     options: SyncOptions = SyncOptions(),
     **more: Any,
 ) -> Shift:
@@ -60,10 +61,12 @@ def synchronize(
     Args:
         a, b: a :class:`~indexing.Clip` with 2D joints, or a ``movement`` dataset of poses; the path of keypoints in any format of
             :mod:`indexing.readers` (a file, or a folder with one file per frame); the path of a video; keypoints
-            ``(frames, joints, 2)``, pixels, NaN = missing; or gray frames ``(frames, height, width)``.
+            ``(frames, joints, 2)``, pixels, NaN = missing; or gray frames ``(frames, height, width)``.  One of both may be motion
+            capture: a clip with 3D joints, the path of a C3D, TRC or other file of 3D points, or ``(frames, markers, 3)``, in any
+            unit and with any axis up.  Joints of the same names are then the same points, others different ones.
         method: ``"keypoints"``, ``"tracks"``, ``"brightness"``, or ``"auto"``: keypoints where both have them, videos too, where a
             pose model is there (:mod:`indexing.pose`); for two videos without one, or whose keypoints do not decide, tracks and
-            brightness, of which both must say the same.
+            brightness, of which both must say the same; or ``"sound"``: what the microphones of two videos heard, alone.
         fps: frames per second of arrays and of files that have no times, of both or of each (30 by default, and then a note
             says so).
         max_shift: seconds, the largest offset that is searched; by default as far as the takes overlap enough to tell.
@@ -74,6 +77,8 @@ def synchronize(
         min_confidence: joints that the detector trusts less are taken as not seen.
         measure: of ``method="brightness"``: ``"profile"``, how much moves at which height, which the thesis's window kernel must
             confirm; or ``"window"``, that kernel alone (see :func:`indexing.sync.brightness.brightness_shift`).
+        sound: whether the sound of two videos is a witness: where it decides, what the pictures say must agree with it (see
+            :func:`indexing.sync.sound.sound_shift`).
         options: every number that decides about recordings, people, tracks and brightness, by stage; ``dataclasses.replace``
             changes some of them.
         more: for the reader (``format=``, ``size=``, ``layout=``) and for :func:`dyntorch.synchronize`.
@@ -112,7 +117,15 @@ def synchronize(
     ]  # fmt: skip
     takes = [dataclasses.replace(take, name=take.name or letter) for take, letter in zip(takes, "ab", strict=True)]
     shift = pair(
-        takes[0], takes[1], method, max_shift=max_shift, calibration=calibration, measure=measure, options=options, **more
+        takes[0],
+        takes[1],
+        method,
+        max_shift=max_shift,
+        calibration=calibration,
+        measure=measure,
+        sound=sound,
+        options=options,
+        **more,
     ).shift
     return dataclasses.replace(shift, notices=(*remarks(takes), *shift.notices))
 
@@ -124,6 +137,7 @@ def pair(
     *,
     calibration: Any = None,
     measure: Measure = "profile",
+    sound: bool = True,
     options: SyncOptions = SyncOptions(),
     **more: Any,
 ) -> Pairing:
@@ -131,20 +145,33 @@ def pair(
     from indexing.sync.calibration import lenses
 
     _check(a, b, method, measure, options)
-    lens = lenses(calibration, [a.name, b.name])
+    lens = lenses(calibration, [take.name for take in (a, b) if not take.spatial])
     shapeless = [take for take in (a, b) if take.kind == "keypoints" and is_normalized(take.people[0])]
     if lens and shapeless:
         text = "{path}: its coordinates go from 0 to 1, and {arg:calibration=} is of pixels; give {arg:size=}, or leave it out"
         raise ValueError(Message(text, path=str(shapeless[0].path or shapeless[0].name)))
     names = {"a": a.name or "a", "b": b.name or "b"}
-    more = {**more, "calibration": lens.values if lens else None}
+    more = {**more, "calibration": _of_both(a, b, lens.values) if lens else None}
     try:
-        found, limits = _compared(a, b, method, measure, more, options)
+        if method == "sound":
+            heard = listened(a, b, options, **more)
+            limits: list[Notice] = []
+            found = Pairing(heard, (0, 0), sound=heard)
+        else:
+            found, limits = _compared(a, b, method, measure, more, options)
+            found = _witnessed(found, a, b, options, more) if sound else found
     except ValueError as problem:
         raise ValueError(named(problem, names)) from problem
     said = [notice.named(names) for notice in [*noted(lens.notes if lens else ()), *limits, *found.shift.notices]]
     unique = {(notice.code, str(notice.text)): notice for notice in said}
     return dataclasses.replace(found, shift=dataclasses.replace(found.shift, notices=tuple(unique.values())))
+
+
+def _of_both(a: Take, b: Take, values: Any) -> Any:
+    """Lenses of a and of b: motion capture has none."""
+    if len(values) == 2 or not (a.spatial or b.spatial):
+        return values
+    return (None, *values) if a.spatial else (*values, None)
 
 
 def _compared(
@@ -165,6 +192,34 @@ def _compared(
         return _second(found, synchronize_videos(a.video, b.video, method, **more, options=options)), limits
 
     return Pairing(synchronize_videos(a, b, method, measure, **more, options=options), (0, 0)), []
+
+
+def listened(a: Take, b: Take, options: SyncOptions = SyncOptions(), **more: Any) -> Shift:
+    """What the sound of two cameras says.
+
+    Raises:
+        ValueError: a video cannot be read.
+    """
+    from indexing.sync.listening import hear
+    from indexing.sync.sound import sound_shift
+
+    known = {name: value for name, value in more.items() if name in ("max_shift", "rate")}
+    sounds = [None if take.footage is None else hear(take.footage, options.sound) for take in (a, b)]
+    return sound_shift(sounds[0], sounds[1], fps=(a.fps, b.fps), options=options.sound, **known)
+
+
+def _witnessed(found: Pairing, a: Take, b: Take, options: SyncOptions, more: dict[str, Any]) -> Pairing:
+    """What was found, and what the sound of both cameras says to it, where they have any."""
+    from indexing.sync.sound import witnessed
+
+    if a.footage is None or b.footage is None:
+        return found
+    try:
+        heard = listened(a, b, options, **more)
+    except ValueError as problem:  # the pictures could be read, and need no witness
+        said = Notice(SoundNotice.OPEN, 0.0, {"why": problem.args[0] if problem.args else str(problem)})
+        return dataclasses.replace(found, shift=dataclasses.replace(found.shift, notices=(*found.shift.notices, said)))
+    return dataclasses.replace(found, shift=witnessed(found.shift, heard, options.sound), sound=heard)
 
 
 def _second(found: Pairing, seen: Shift) -> Pairing:
@@ -193,6 +248,9 @@ def _check(a: Take, b: Take, method: Method, measure: Measure, options: SyncOpti
         if method == "keypoints" and take.kind != "keypoints":
             text = "{path}: is a video, and {arg:method='keypoints'} needs keypoints; run a pose estimator first, or use "
             raise ValueError(Message(text + "{arg:method='tracks'} or {arg:method='brightness'}", path=str(take.path or take.name)))
+        if method == "sound" and take.footage is None:
+            text = "{path}: is no video, and {arg:method='sound'} needs their sound; give the videos, or use "
+            raise ValueError(Message(text + "{arg:method='keypoints'}", path=str(take.path or take.name)))
         if method == "brightness" and take.kind == "keypoints":
             text = "{path}: holds keypoints, and {arg:method='brightness'} needs videos; give the videos, or use "
             raise ValueError(Message(text + "{arg:method='keypoints'}", path=str(take.path or take.name)))

@@ -1,4 +1,7 @@
-"""What one camera recorded, ready to be compared with what another one did: people over time, a video, or gray frames."""
+"""What one camera recorded, ready to be compared with what another one did: people over time, a video, or gray frames.
+
+Motion capture is such a recording, too: people, or markers, in space.
+"""
 
 from __future__ import annotations
 
@@ -44,6 +47,7 @@ class Take:
         count: how many frames there are.
         notes: what a user should know, a sentence each.
         video: what the people were found in by a pose model, if in a video: it may be compared by its pixels, too.
+        film: the video of keypoints that were found in it by others, where that is known: for its sound, and to be cut.
     """
 
     name: str
@@ -58,6 +62,19 @@ class Take:
     count: int = 0
     notes: tuple[str, ...] = ()
     video: Take | None = None
+    film: Path | None = None
+
+    @property
+    def spatial(self) -> bool:
+        """Whether it is of motion capture: points in space rather than what a camera sees."""
+        return bool(self.people) and self.people[0].dims == 3
+
+    @property
+    def footage(self) -> Path | None:
+        """The video of this camera, where there is one."""
+        if self.video is not None:
+            return self.video.path
+        return self.path if self.kind == "video" else self.film
 
 
 def take_of(
@@ -147,13 +164,9 @@ def camera_name(path: Path) -> str:
 
 
 def _of_clips(name: str, path: Path | None, people: list[Clip], options: SyncOptions) -> Take:
-    flat = [clip for clip in people if clip.dims != 2]
-    if flat:
-        raise ValueError(
-            f"{path or name or 'clip'}: has {flat[0].dims}D joints, and cameras are synchronized from what they see; "
-            "give 2D keypoints in pixels"
-        )
     first = people[0]
+    if any(clip.dims != first.dims for clip in people):
+        raise ValueError(f"{path or name or 'clip'}: holds 2D and 3D joints; give the people of one camera, or of motion capture")
     times = np.unique(np.concatenate([clip.times for clip in people]))
     seen, rate = tuple(people), frame_rate(times, float(first.fps or ASSUMED), options=options)
     known = [clip.replace(name=name) for clip in people[:1]] if name else people[:1]  # a camera goes by its own name
@@ -283,8 +296,8 @@ def _of_array(name: str, value: Any, fps: float | None, options: SyncOptions) ->
     rate = float(fps or ASSUMED)
     if array.ndim != 3 or not len(array):
         raise ValueError(
-            f"{name or 'recording'}: expected keypoints (frames, joints, 2) or gray frames (frames, height, width), got shape "
-            f"{array.shape}; give one camera at a time"
+            f"{name or 'recording'}: expected keypoints (frames, joints, 2), motion capture (frames, markers, 3) or gray frames "
+            f"(frames, height, width), got shape {array.shape}; give one camera at a time"
         )
     if array.shape[2] > 3:
         times = np.arange(len(array)) / rate

@@ -129,12 +129,6 @@ class Adjusted:
         """Cameras and the middle of the points."""
         return pose_of(self.state)
 
-    @property
-    def ends(self) -> Tensor:
-        """``(B, 2)`` of the bones."""
-        bones = self.problem.bones
-        return torch.zeros(0, 2, dtype=torch.long) if bones is None else bones.ends
-
 
 def pose_of(state: RigState, place: int = 0) -> Pose:
     """Cameras of one of several adjustments."""
@@ -221,18 +215,17 @@ def _noise(state: RigState, problem: Adjustment, options: CalibrateOptions) -> T
     """Robust standard deviation ``(b, c)`` px of each camera's noise.
 
     Points take 3 of the 2 v coordinates that v cameras see of them, and leave errors that are smaller than the noise by
-    sqrt((2 v - 3) / 2 v).  Cameras may not differ by much: a camera of less and less noise would draw all points to its rays.
+    sqrt((2 v - 3) / 2 v).  How the noise of cameras compares is said by the tracks, not by these errors: a camera that is trusted
+    more draws the points to its rays, and is trusted even more.
     """
     seen = problem.views.at(state.clocks)
     known = problem.weights * seen.weights > 0
-    far = (images(state, problem.views.centers) - seen.x).norm(dim=-1)
-    sigma = torch.where(known, far, torch.nan).flatten(2).nanmedian(-1).values.nan_to_num(1e6) / RAYLEIGH
+    far = (images(state, problem.views.centers) - seen.x).norm(dim=-1) / problem.views.noise[:, None, None]
+    sigma = torch.where(known, far, torch.nan).flatten(1).nanmedian(-1).values.nan_to_num(1e6) / RAYLEIGH
     views = known.sum(1)
     mean = (views.sum((1, 2)) / (views > 0).sum((1, 2)).clamp(min=1)).clamp(min=2)
-    sigma = sigma * (2 * mean / (2 * mean - 3)).sqrt()[:, None]
-    middle = sigma.log().mean(1, keepdim=True).exp()
-    ratio = options.adjust.noise_ratio
-    return sigma.clamp(middle / ratio, middle * ratio).clamp(min=options.adjust.least_noise)
+    sigma = (sigma * (2 * mean / (2 * mean - 3)).sqrt()).clamp(min=options.adjust.least_noise)
+    return sigma[:, None] * problem.views.noise
 
 
 def _descended(problem: Adjustment, state: RigState, steps: int, options: CalibrateOptions) -> RigState:
@@ -245,7 +238,9 @@ def _with_bones(state: RigState, problem: Adjustment, options: CalibrateOptions)
     adjust = options.adjust
     if not adjust.lengths or state.points.shape[2] > adjust.length_points:
         return state._replace(lengths=state.lengths[:, :0]), problem
-    bones = learned(state.points[0], (problem.weights[0] > 0).sum(0) >= 2, adjust)
+    blocks = replace(problem, bones=None).linear(state._replace(lengths=state.lengths[:, :0])).matrix[0]
+    covariance = torch.linalg.pinv(blocks, hermitian=True).view(*state.points.shape[1:], 3)
+    bones = learned(state.points[0], (problem.weights[0] > 0).sum(0) >= 2, covariance, adjust)
     lengths = state.lengths[:, :0] if bones is None else bones.lengths
     return state._replace(lengths=lengths), replace(problem, bones=bones)
 

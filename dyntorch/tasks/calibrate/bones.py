@@ -28,10 +28,13 @@ class Bones:
     """``(b, B)``: how much their logarithms vary."""
     seen: Tensor
     """``(b, T, B)``, 1 where both ends are seen by two cameras."""
+    excess: Tensor
+    """``(b, T, B)``: by how much noise makes the logarithm longer, see :func:`noise_excess`."""
 
     def subset(self, keep: Tensor) -> Bones:
         """Of some of the adjustments."""
-        return replace(self, lengths=self.lengths[keep], sigma=self.sigma[keep], seen=self.seen[keep])
+        parts = {name: getattr(self, name)[keep] for name in ("lengths", "sigma", "seen", "excess")}
+        return replace(self, **parts)
 
     def stretched(self, points: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor]:
         """Logarithms ``(b, T, B)`` of bones over their lengths ``(b, B)``, and their derivatives by the first end ``(b, T, B, 3)``.
@@ -41,24 +44,50 @@ class Bones:
         one, other = self.ends.unbind(-1)
         along = points[:, :, one] - points[:, :, other]
         square = along.square().sum(-1).clamp(min=1e-24)
-        return 0.5 * square.log() - lengths[:, None], along / square[..., None]
+        return 0.5 * square.log() - self.excess - lengths[:, None], along / square[..., None]
 
 
-def learned(points: Tensor, known: Tensor, options: RigAdjustOptions) -> Bones | None:
-    """The bones of points; None where no distance stays the same.
+def noise_excess(points: Tensor, covariance: Tensor, one: Tensor, other: Tensor) -> Tensor:
+    r"""By how much noise lengthens the logarithm of a distance d of direction u, in the mean.
+
+    .. math:: \operatorname{E} \log |d + \epsilon| - \log |d| \approx (\operatorname{tr} \Sigma - 2 u^T \Sigma u) / 2 |d|^2
+
+    Noise across a bone lengthens it, noise along it does not; as cameras see along some directions worse, bones would seem longer
+    in some directions of the room, and the room would be bent until they do not.
+
+    Args:
+        points: ``(T, n, 3)``.
+        covariance: ``(T, n, 3, 3)`` of each point.
+        one, other: ``(B,)`` ends.
+
+    Returns:
+        ``(T, B)``.
+    """
+    along = points[:, one] - points[:, other]
+    square = along.square().sum(-1).clamp(min=1e-24)
+    spread = covariance[:, one] + covariance[:, other]
+    inside = (along[..., None, :] @ spread @ along[..., None])[..., 0, 0] / square
+    return (spread.diagonal(dim1=-2, dim2=-1).sum(-1) - 2 * inside) / (2 * square)
+
+
+def rigid_pairs(points: Tensor, known: Tensor, spread: float) -> tuple[Tensor, Tensor, Tensor]:
+    """The pairs of a spanning forest whose distances vary least.
 
     Args:
         points: ``(T, n, 3)``.
         known: ``(T, n)`` bool.
-        options: see :class:`RigAdjustOptions`.
+        spread: of a distance over itself, at most.
+
+    Returns:
+        ends ``(B, 2)``, median distances ``(B,)`` and their spreads ``(B,)``.
 
     Example:
         >>> import torch
         >>> turn = torch.linspace(0, 6, 100, dtype=torch.float64)
         >>> hip, knee = torch.zeros(100, 3, dtype=torch.float64), torch.stack([turn.cos(), turn.sin(), 0 * turn], dim=-1)
         >>> points = torch.stack([hip, knee, knee * turn[:, None]], dim=1)
-        >>> found = learned(points, torch.ones(100, 3, dtype=torch.bool), RigAdjustOptions())
-        >>> found.ends.tolist(), round(float(found.lengths.exp()), 3)
+        >>> ends, length, _ = rigid_pairs(points, torch.ones(100, 3, dtype=torch.bool), 0.1)
+        >>> ends.tolist(), round(float(length), 3)
         ([[0, 1]], 1.0)
     """
     n = points.shape[1]
@@ -66,8 +95,8 @@ def learned(points: Tensor, known: Tensor, options: RigAdjustOptions) -> Bones |
     both = known[:, one] & known[:, other]
     far = torch.where(both, (points[:, one] - points[:, other]).norm(dim=-1), torch.nan)
     length = far.nanmedian(0).values
-    spread = 1.4826 * (far - length).abs().nanmedian(0).values
-    share = (spread / length).nan_to_num(torch.inf)
+    away = 1.4826 * (far - length).abs().nanmedian(0).values
+    share = (away / length).nan_to_num(torch.inf)
     root = list(range(n))
 
     def find(place: int) -> int:
@@ -78,17 +107,33 @@ def learned(points: Tensor, known: Tensor, options: RigAdjustOptions) -> Bones |
     chosen = []
     for k in share.argsort(stable=True).tolist():
         a, b = find(int(one[k])), find(int(other[k]))
-        if share[k] > options.length_spread:
+        if share[k] > spread:
             break
         if a != b:
             root[a] = b
             chosen.append(k)
-    if not chosen:
+    kept = torch.tensor(sorted(chosen), dtype=torch.long)
+    return torch.stack([one[kept], other[kept]], dim=-1), length[kept], share[kept]
+
+
+def learned(points: Tensor, known: Tensor, covariance: Tensor, options: RigAdjustOptions) -> Bones | None:
+    """The bones of points; None where no distance stays the same.
+
+    Args:
+        points: ``(T, n, 3)``.
+        known: ``(T, n)`` bool.
+        covariance: ``(T, n, 3, 3)`` of the points.
+        options: see :class:`RigAdjustOptions`.
+    """
+    ends, length, share = rigid_pairs(points, known, options.length_spread)
+    if not len(ends):
         return None
-    kept = torch.tensor(sorted(chosen))
-    # exact data have no spread
-    sigma = options.length_sigma * share[kept].clamp(min=1e-3)
-    return Bones(torch.stack([one[kept], other[kept]], dim=-1), length[None, kept].log(), sigma[None], both[None, :, kept].double())
+    one, other = ends.unbind(-1)
+    # what is hardly longer than its noise says nothing; exact data have no spread
+    excess = noise_excess(points, covariance, one, other)
+    seen = (known[:, one] & known[:, other] & (excess.abs() < options.length_excess)).double()
+    sigma = options.length_sigma * share.clamp(min=1e-3)
+    return Bones(ends, length[None].log(), sigma[None], seen[None], excess[None])
 
 
 def bodies(ends: Tensor, points: int) -> list[list[int]]:

@@ -113,7 +113,7 @@ def calibrate(
         return _nothing(rig, found_clocks, told)
     # 2. first cameras
     values = torch.stack([found_clocks.offsets, found_clocks.rates], dim=-1)
-    views = common_views(rig.tracks, rig.centers, values, options.adjust.width, options.synchronize)
+    views = common_views(rig.tracks, rig.centers, values, options)
     own = torch.stack([(values[:, 1] - 1) * views.middle + values[:, 0], values[:, 1].log()], dim=-1)
     n = rig.tracks[0].x.shape[1]
     used = views.some(max(1, math.ceil(options.adjust.positions / n)))
@@ -190,7 +190,7 @@ def _result(rig: Rig, views: Views, best: Adjusted, clocks: Clocks, limits: list
     state, c = best.state, len(rig.tracks)
     found = structure(views, best, options)
     limits += [limit for limit in [diagnosis.foreign(found.inliers, options)] if limit is not None]
-    world = world_of(state.R[0], state.centers[0], found.points, best.ends, rig.scale, options.world)
+    world = world_of(state.R[0], state.centers[0], found.points, rig.scale, options.world)
     R, t = world.cameras(state.R[0], state.t[0])
     K = torch.eye(3, dtype=torch.float64).repeat(c, 1, 1)
     K[:, 0, 0] = K[:, 1, 1] = state.lens[0, :, 0].exp()

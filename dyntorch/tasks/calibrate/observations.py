@@ -10,8 +10,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from dyntorch.tasks.calibrate.options import CalibrateOptions
 from dyntorch.tasks.synchronize.epipolar import Grid
-from dyntorch.tasks.synchronize.options import SynchronizeOptions
 from dyntorch.tasks.synchronize.tracks import Tracks
 
 
@@ -36,6 +36,7 @@ class Views:
         middle: the moment in the middle, seconds of the reference clock.
         times: ``(T,)`` seconds from the middle.
         frames: ``(c,)`` seconds from one frame to the next.
+        noise: ``(c,)`` of the tracks, over its geometric mean.
     """
 
     grids: tuple[Grid, ...]
@@ -43,6 +44,7 @@ class Views:
     middle: float
     times: Tensor
     frames: Tensor
+    noise: Tensor
 
     def at(self, clocks: Tensor, shift: float = 0.0) -> Seen:
         """What is seen with clocks ``(b, c, 2)``: against the reference clock at the middle, and the logarithm of the rate.
@@ -74,15 +76,14 @@ class Views:
         return replace(self, times=self.times[(self.times >= start) & (self.times < end)])
 
 
-def common_views(tracks: Sequence[Tracks], centers: Tensor, clocks: Tensor, width: float, options: SynchronizeOptions) -> Views:
+def common_views(tracks: Sequence[Tracks], centers: Tensor, clocks: Tensor, options: CalibrateOptions) -> Views:
     """Views at the moments at which two cameras at least run, a frame of the slowest camera apart.
 
     Args:
         tracks: of each camera, on its own clock.
         centers: ``(c, 2)``.
         clocks: ``(c, 2)`` offset and rate: a camera's clock = rate * reference clock + offset.
-        width: standard deviation of the kernel in frames of the slowest camera.
-        options: of synchronization: how tracks are smoothed.
+        options: see :class:`CalibrateOptions`.
 
     Raises:
         ValueError: no moment is common to two cameras.
@@ -97,5 +98,11 @@ def common_views(tracks: Sequence[Tracks], centers: Tensor, clocks: Tensor, widt
         )
     middle = 0.5 * (start + end)
     times = start - middle + step * torch.arange(math.floor((end - start) / step + 1e-9) + 1, dtype=torch.float64)
-    grids = tuple(Grid.of(t, width * step * r, options) for t, (_, r) in zip(tracks, clocks.tolist(), strict=True))
-    return Views(grids, centers, middle, times, torch.tensor([t.step for t in tracks], dtype=torch.float64))
+    grids = tuple(
+        Grid.of(t, options.adjust.width * step * r, options.synchronize) for t, (_, r) in zip(tracks, clocks.tolist(), strict=True)
+    )
+    frames, noise = torch.tensor([[t.step, t.noise] for t in tracks], dtype=torch.float64).unbind(-1)
+    most = math.log(options.adjust.noise_ratio)
+    noise = noise.clamp(min=options.adjust.least_noise).log()
+    noise = (noise - noise.mean()).clamp(-most, most).exp()
+    return Views(grids, centers, middle, times, frames, noise)

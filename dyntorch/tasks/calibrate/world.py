@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from dyntorch.tasks.calibrate.bones import bodies
+from dyntorch.tasks.calibrate.bones import bodies, rigid_pairs
 from dyntorch.tasks.calibrate.input import Scale
 from dyntorch.tasks.calibrate.options import RigWorldOptions
 
@@ -44,18 +44,19 @@ class World:
         return turned, self.scale * t - (turned @ self.origin[:, None])[..., 0]
 
 
-def world_of(R: Tensor, centers: Tensor, points: Tensor, ends: Tensor, scale: Scale, options: RigWorldOptions) -> World:
+def world_of(R: Tensor, centers: Tensor, points: Tensor, scale: Scale, options: RigWorldOptions) -> World:
     r"""Up from the long axes of upright bodies, the ground below them, the scale from a height or lengths.
 
     Args:
         R: ``(c, 3, 3)``.
         centers: ``(c, 3)``.
         points: ``(T, n, 3)``, NaN = unknown.
-        ends: ``(B, 2)`` bones, whose trees are the bodies; without any all points are one.
         scale: what is known of lengths.
         options: see :class:`RigWorldOptions`.
     """
     n = points.shape[1]
+    # several people stand side by side: what keeps its distances is one body
+    ends, _, _ = rigid_pairs(points.nan_to_num(0.0), points.isfinite().all(-1), options.body_spread)
     groups = bodies(ends, n) or [list(range(n))]
     from_cameras = normalize(-R[:, 1].sum(0), dim=0)
     up, share = upward(points, groups, from_cameras, options)

@@ -21,6 +21,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from dyntorch.numerics.lags import compress
 from dyntorch.tasks.synchronize.measures import LagCovariances, shared
 from dyntorch.tasks.synchronize.options import SynchronizeOptions
 from dyntorch.tasks.synchronize.subspace import completed, filled, smooth
@@ -47,6 +48,11 @@ class Films:
     options: SynchronizeOptions
 
     @property
+    def spatial(self) -> bool:
+        """Whether a is of points in space, ``(frames, n, 3)``."""
+        return self.a.x.shape[-1] == 3
+
+    @property
     def width(self) -> float:
         """Standard deviation of the kernel, seconds: from one frame on noise is alike at all moments."""
         return self.options.rows.width * max(self.step, self.a.step, self.b.step)
@@ -60,11 +66,11 @@ class Films:
 
     @cached_property
     def first(self) -> Tensor:
-        """``(T, n, 2)`` a's points, complete."""
+        """``(T, n, d)`` a's points, complete."""
         return self._points(self.a, self.times[0], self.width)
 
     def second(self, fraction: float) -> Tensor:
-        """``(T', m, 2)`` b's points, so much of a frame later."""
+        """``(T', m, d)`` b's points, so much of a frame later."""
         return self._points(self.b, self.times[1] + fraction * self.step * self.rate, self.width * self.rate)
 
     def _points(self, tracks: Tracks, times: Tensor, width: float) -> Tensor:
@@ -77,15 +83,33 @@ class Films:
         least = self.options.rows.exact * tracks.scale
         return max(tracks.noise, least, 1e-150) ** 2 * min(1.0, tracks.step / (2 * math.sqrt(math.pi) * width))
 
-    @property
-    def variances(self) -> tuple[float, float]:
-        """Of a's and of b's coordinates."""
-        return self.variance(self.a, self.width), self.variance(self.b, self.width * self.rate)
+    def variances(self, energies: tuple[float, float]) -> tuple[float, float]:
+        """Of a's and of b's coordinates.
+
+        Args:
+            energies: mean squares of their rows.  Points in space count as no better known, over that, than a camera sees
+                them: they would agree with anything.
+        """
+        found = self.variance(self.a, self.width), self.variance(self.b, self.width * self.rate)
+        if not (self.spatial and min(energies) > 0):
+            return found
+        share = max(v / energy for v, energy in zip(found, energies, strict=True))
+        return share * energies[0], share * energies[1]
 
     @property
     def samples(self) -> float:
         """Independent ones of the noise per frame."""
         return min(1.0, self.step / (2 * math.sqrt(math.pi) * self.width))
+
+    @property
+    def completed(self) -> Films:
+        """With what is missing filled in once, in the frames as they are, rather than at every moment that is asked for."""
+        whole = []
+        for tracks in (self.a, self.b):
+            seen = tracks.weights > 0
+            x = completed(filled(tracks.x, seen, self.options), seen, self.options)
+            whole.append(replace(tracks, x=x, weights=torch.ones_like(tracks.weights)))
+        return replace(self, a=whole[0], b=whole[1])
 
     def only(self, a: Tensor, b: Tensor) -> Films:
         """Of these points ``(n,)`` and ``(m,)`` bool alone."""
@@ -93,7 +117,7 @@ class Films:
 
 
 def rows_of(x: Tensor, kind: Kind, slow: float) -> Tensor:
-    """Rows ``(T, 2n)`` of mean 0 of points ``(T, n, 2)`` as a camera of this kind needs them.
+    """Rows ``(T, d n)`` of mean 0 of points ``(T, n, d)`` as a camera of this kind needs them.
 
     Args:
         slow: frames that the size of the whole changes in.
@@ -190,6 +214,9 @@ class KindMoments:
         options = films.options.rows
         slow = films.options.subspace.size_width / films.step
         a, bs = rows_of(films.first, kind, slow), [rows_of(part, kind, slow) for part in second]
+        energies = float(a.square().mean()), float(bs[0].square().mean())
+        if films.spatial:
+            a = compress(a, noise=math.sqrt(films.variances(energies)[0] * options.noise))
         parts = [LagCovariances.of(a, b, lags) for b in bs]
         moments = LagCovariances(
             *(torch.stack([getattr(part, name) for part in parts], dim=1).flatten(0, 1) for name in ("aa", "bb", "ab", "counts"))
@@ -200,12 +227,15 @@ class KindMoments:
         places = (places + torch.arange(len(bs), dtype=a.dtype, device=a.device) / len(bs)).flatten()
         within = places <= lags[1]  # fractions after the last lag are beyond the search
         moments, places = LagCovariances(*(getattr(moments, x)[within] for x in ("aa", "bb", "ab", "counts"))), places[within]
-        energies = float(a.square().mean()), float(bs[0].square().mean())
         return KindMoments(films, kind, moments, chance, moments.counts >= least, chance.counts >= least, places, energies)
 
     def only(self, a: Tensor, b: Tensor) -> KindMoments:
-        """Of these points ``(n,)`` and ``(m,)`` bool alone: their rows are combinations of all points' rows."""
-        one, two = (self._combined(kept) for kept in (a, b))
+        """Of these points ``(n,)`` and ``(m,)`` bool alone: their rows are combinations of all points' rows.
+
+        Points in space are all kept.
+        """
+        one, two = torch.eye(self.moments.aa.shape[-1], dtype=self.moments.aa.dtype, device=a.device), self._combined(b)
+        one = one if self.films.spatial else self._combined(a)
         return replace(self, moments=self.moments.combined(one, two), chance=self.chance.combined(one, two))
 
     def _combined(self, kept: Tensor) -> Tensor:
@@ -218,7 +248,8 @@ class KindMoments:
         """What all lags share at a level of noise; None without motion."""
         options, measure = self.films.options.rows, self.films.options.different.measure
         first, second = (
-            v * options.noise + level**2 * energy for v, energy in zip(self.films.variances, self.energies, strict=True)
+            v * options.noise + level**2 * energy
+            for v, energy in zip(self.films.variances(self.energies), self.energies, strict=True)
         )
         if not (0 < first < math.inf and 0 < second < math.inf and min(self.energies) > 0):
             return None
@@ -279,13 +310,13 @@ class Place:
 def refined(films: Films, found: Hypothesis) -> Place:
     """Lag of most information near a hypothesis's best; of cameras that may zoom, with the ratio of their zooms."""
     start = float(found.lags[found.best])
-    plain = _climbed(_Between(films, found.kind, found.level), start)
+    plain = _climbed(_Between(films, found.kind, found.level, around=start), start)
     if found.kind == "affine" or films.options.different.measure not in ("auto", "log_determinant"):
         return plain
     place = plain
     rounds = films.options.rows.zoom_rounds
     for level in [max(films.options.rows.levels)] + [found.level] * (rounds - 1):  # a wide optimum first
-        between = _Between(films, "affine_moving", level, place.zoom)
+        between = _Between(films, "affine_moving", level, place.zoom, around=start)
         place = _climbed(replace(between, zoom=between.freed(place.lag)), place.lag)
     # a function of time is fitted with so many numbers, each worth half the logarithm of the samples
     price = 0.5 * films.options.rows.zoom_terms * math.log(max(len(films.first) * films.samples, 2.0))
@@ -310,12 +341,16 @@ def _climbed(score: _Between, place: float) -> Place:
 
 @dataclass(frozen=True)
 class _Between:
-    """Nats at any lag, by one kind of camera and level of noise; ``zoom`` as of :class:`Place`."""
+    """Nats at any lag near one, by one kind of camera and level of noise; ``zoom`` as of :class:`Place`.
+
+    All are of the same frames of a: a frame more at one of the lags would count for more than where they lie.
+    """
 
     films: Films
     kind: Kind
     level: float
     zoom: Tensor | None = None
+    around: float = 0.0
 
     def __call__(self, lag: float) -> float:
         a, b = self.rows(lag)
@@ -340,12 +375,18 @@ class _Between:
         else:
             a = ((first - first.mean(1, keepdim=True)) * torch.exp(-self.zoom)[:, None, None]).flatten(1)
             b = (second - second.mean(1, keepdim=True)).flatten(1)
-        units = []
-        for variance, x in zip(films.variances, (a, b), strict=True):
-            spread = float((x - x.mean(0)).square().mean())
-            units.append(math.sqrt(variance * films.options.rows.noise + self.level**2 * spread))
-        start, end = max(0, -whole), max(min(len(a), len(b) - whole), 0)
+        spreads = [float((x - x.mean(0)).square().mean()) for x in (a, b)]
+        units = [
+            math.sqrt(variance * films.options.rows.noise + self.level**2 * spread)
+            for variance, spread in zip(films.variances((spreads[0], spreads[1])), spreads, strict=True)
+        ]
+        start, end = self.span(len(a), len(b), whole)
         return a[start:end] / units[0], b[start + whole : max(end + whole, 0)] / units[1]
+
+    def span(self, first: int, second: int, whole: int) -> tuple[int, int]:
+        """First frame of a, and that after the last, that has a partner at a lag, and at all up to one frame from the start."""
+        low, high = min(whole, math.floor(self.around) - 1), max(whole, math.ceil(self.around) + 1)
+        return max(0, -low), max(min(first, second - high), 0)
 
     def freed(self, lag: float) -> Tensor:
         r"""The ratio of the zooms that makes the row spaces meet best, by steps of least squares.
@@ -361,7 +402,7 @@ class _Between:
         time = (torch.arange(frames, dtype=zoom.dtype, device=zoom.device) + 0.5) / frames
         order = torch.arange(1, options.zoom_terms + 1, dtype=zoom.dtype, device=zoom.device)
         basis = torch.cos(torch.acos(2 * time - 1)[:, None] * order)  # Chebyshev polynomials
-        start = max(0, -math.floor(lag))
+        start, _ = self.span(frames, len(self.films.times[1]), math.floor(lag))
         for _ in range(options.zoom_steps):
             a, b = replace(self, zoom=zoom).rows(lag)
             u, v, rho = _canonical(a, b)

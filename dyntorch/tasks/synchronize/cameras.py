@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
 from math import exp, isfinite, log, nan
@@ -15,6 +15,7 @@ from torch import Tensor
 from dyntorch.core.outcome import Notice, status_from
 from dyntorch.numerics.arguments import check_options, on_cpu
 from dyntorch.numerics.blocks import one_thread
+from dyntorch.tasks.synchronize.breaks import camera_breaks
 from dyntorch.tasks.synchronize.options import SynchronizeOptions
 from dyntorch.tasks.synchronize.result import Clocks, ClocksNotice, Pair, Shift
 from dyntorch.tasks.synchronize.synchronize import synchronize
@@ -329,6 +330,7 @@ def synchronize_cameras(
     reference: int = 0,
     pairs: Sequence[tuple[int, int]] | None = None,
     pair: Callable[..., Shift] | None = None,
+    breaks: bool = False,
     options: SynchronizeOptions = SynchronizeOptions(),
     **further: Any,
 ) -> Clocks:
@@ -349,6 +351,7 @@ def synchronize_cameras(
         reference: the camera whose clock the others are told in.
         pairs: which pairs of cameras to compare; all, by default.
         pair: what compares two cameras, with the arguments of ``dyntorch.synchronize`` (the default).
+        breaks: whether to look for frames that a camera lost or wrote twice; the clocks are those of ``clocks.breaks.times``.
         options: every number that decides, by stage, here and in ``dyntorch.synchronize``.
         further: arguments of ``pair``.
 
@@ -374,6 +377,8 @@ def synchronize_cameras(
     count = len(tracks)
     if count < 2:
         raise ValueError(f"tracks: {count} camera given, two are needed at least")
+    if breaks and not correspondence:
+        raise ValueError("breaks are told by corresponding points: give correspondence=True, or leave breaks out")
     every: dict[str, Sequence[Any] | None] = {
         "fps": [float(fps)] * count if isinstance(fps, (int, float)) else fps,
         "times": times,
@@ -393,7 +398,13 @@ def synchronize_cameras(
             shifts[i, j] = pair(tracks[i], tracks[j], correspondence, max_shift=max_shift, **given, **further)
         except ValueError as error:
             raise ValueError(f"cameras {i} and {j}: {error}") from error
-    return combine_shifts(shifts, count, reference, options=options)
+    clocks = combine_shifts(shifts, count, reference, options=options)
+    if not breaks:
+        return clocks
+    found = camera_breaks(tracks, clocks, max_shift=max_shift, options=options, **every)
+    given = {name: values for name, values in every.items() if name not in ("fps", "times")}
+    again = partial(synchronize_cameras, max_shift=max_shift, reference=reference, pairs=pairs, pair=pair, options=options)
+    return replace(again(tracks, times=found.times, **given, **further) if found.breaks else clocks, breaks=found)
 
 
 @on_cpu

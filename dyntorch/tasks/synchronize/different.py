@@ -89,7 +89,7 @@ def wobble(curve: SubspaceCurve, lag: int, options: SynchronizeOptions) -> float
             both = torch.cat([x[start:end], y[start + at : end + at], torch.ones_like(w)[:, None]], dim=1) * w[:, None]
             kept.append(torch.stack([part.mT @ part for part in both.split(sizes)]))
     shape, motion = (_without(torch.stack(kept)) for kept in (shapes, motions))
-    before, here, after = information(shape, a.rows.shape[1], motion, options).unflatten(0, (3, options.different.blocks))
+    before, here, after = information(shape, motion, (a, b), options).unflatten(0, (3, options.different.blocks))
     bend = float((before - 2 * here + after).mean())
     return (
         math.sqrt((options.different.blocks - 1) * float(((after - before) / 2).var(correction=0))) / -bend
@@ -260,6 +260,7 @@ def different_points(a: Tracks, b: Tracks, *, max_shift: float | None, rate: flo
         if value not in known:
             raise ValueError(f"options.different.{name} must be one of {', '.join(known)}, got {value!r}")
     step = max(a.step, b.step, options.different.finest)
+    a, b = _upright(a, b, step, rate or 1.0, max_shift, options)
     found = _Samples(a, b, step, rate or 1.0, options=options)
     curve = found.curve(max_shift)
     best = found.shift(curve)
@@ -276,7 +277,7 @@ def different_points(a: Tracks, b: Tracks, *, max_shift: float | None, rate: flo
     body = _result(a, b, found, curve, _to_a_frame(best, step, max(a.step, b.step), options), rate_sigma)
     spaces = row_space_shift(a, b, step=step, rate=body.rate, max_shift=max_shift, around=body.offset, options=options)
     if options.different.measure == options.different.camera == "auto":
-        return _combined(body, spaces, options)
+        return _forwards(_combined(body, spaces, options), curve, options)
     return _of_spaces(body, spaces, 1 / min(body.fps), options)
 
 
@@ -300,6 +301,22 @@ def _combined(body: Shift, spaces: RowSpaceShift | None, options: SynchronizeOpt
     if spaces.strength < options.rows.heard:
         return _refused(body, spaces)
     return body if away <= frame else _blunt(body, math.hypot(body.sigma, away / 2), frame)
+
+
+def _forwards(shift: Shift, curve: SubspaceCurve, options: SynchronizeOptions) -> Shift:
+    """Refused where b played backwards tells about as much at its best lag: chance does that, and a film that somebody reversed."""
+    if not shift.ok or curve.bodies is None:
+        return shift
+    first, second = curve.bodies
+    lags = int(curve.lags[0]), int(curve.lags[-1])
+    other = bodies_curve(first, second.reversed, lags, first.step, options=options)
+    best, backwards = (float(one.scores.nan_to_num(-math.inf).max()) for one in (curve, other))
+    more = (best - backwards if backwards > -math.inf else math.inf) - options.different.forward
+    confidence = shift.confidence / (1 + math.exp(-max(min(more, 700.0), -700.0)))
+    if more >= 0:
+        return dataclasses.replace(shift, confidence=confidence)
+    notice = Notice(ShiftNotice.BACKWARDS, best - backwards)
+    return dataclasses.replace(shift, status=status_from((notice,)), notices=(notice, *shift.notices), confidence=confidence)
 
 
 def _blunt(shift: Shift, sigma: float, frame: float) -> Shift:
@@ -355,6 +372,22 @@ def _to_a_frame(best: SubspaceShift, step: float, frame: float, options: Synchro
     if not best.ok or best.sigma * step <= options.different.sharp_frames * frame:
         return best
     return dataclasses.replace(best, refusal=Notice(ShiftNotice.BLUNT, best.sigma * step, {"case": "frame", "frame": frame}))
+
+
+def _upright(
+    a: Tracks, b: Tracks, step: float, rate: float, max_shift: float | None, options: SynchronizeOptions
+) -> tuple[Tracks, Tracks]:
+    """Both, points in space with that axis second which shares most with the y of the camera: files have y or z up."""
+    if a.x.shape[-1] == b.x.shape[-1]:
+        return a, b
+    first = a.x.shape[-1] == 3
+    space, film = (a, b) if first else (b, a)
+    rolled = [dataclasses.replace(space, x=space.x.roll(by, -1)) for by in range(3)]
+    turned = [(one, film) if first else (film, one) for one in rolled]
+    best = [
+        float(_Samples(*both, step, rate, options=options).curve(max_shift).scores.nan_to_num(-math.inf).max()) for both in turned
+    ]
+    return turned[best.index(max(best))]
 
 
 class _Samples:

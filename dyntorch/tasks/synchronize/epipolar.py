@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Self
 
 import torch
 from torch import Tensor
 
-from dyntorch.geometry.epipolar import epipolar_variance, rank_two
+from dyntorch.geometry.epipolar import epipolar_variance, gradient_moments, rank_two
 from dyntorch.geometry.homogeneous import homogeneous
 from dyntorch.numerics.lags import epipolar_moments
 from dyntorch.numerics.least_squares import damped_step
@@ -43,14 +45,14 @@ class Samples:
     rate: float
     noise: tuple[float, float]
 
-    @staticmethod
-    def of(a: Tracks, b: Tracks, step: float, rate: float = 1.0, *, options: SynchronizeOptions) -> Samples:
+    @classmethod
+    def of(cls, a: Tracks, b: Tracks, step: float, rate: float = 1.0, *, options: SynchronizeOptions) -> Self:
         """b's clock goes ``rate`` seconds in one of a's.  The kernel is as wide as a step."""
         first, w1 = _sampled(a, step, step, options)
         second, w2 = _sampled(b, step * rate, step * rate, options)
         noise = float(a.change[0, 0]), float(b.change[0, 0]) * noise_ratio(a, b)
         start = float(b.times[0]) / rate - float(a.times[0])
-        return Samples(first, second, w1, w2, step, start, rate, noise)
+        return cls(first, second, w1, w2, step, start, rate, noise)
 
     def lags(self, max_shift: float | None) -> tuple[int, int]:
         """First and last lag, in steps, with some overlap and shifts within ``max_shift`` seconds."""
@@ -64,6 +66,20 @@ class Samples:
         """These points ``(n,)`` bool alone."""
         x1, x2, w1, w2 = (part[:, points] for part in (self.x1, self.x2, self.w1, self.w2))
         return dataclasses.replace(self, x1=x1, x2=x2, w1=w1, w2=w2)
+
+    def moments(self, lags: tuple[int, int], per_point: bool = False) -> tuple[Tensor, Tensor]:
+        """Moments ``([n,] L, ...)`` of the residual at lags, and counts ``([n,] L)`` of pairs of positions."""
+        return epipolar_moments(self.x1, self.x2, lags, (self.w1, self.w2), per_point)
+
+    def solved(self, moments: Tensor) -> tuple[Tensor, Tensor]:
+        """Variances ``(L,)`` of the residual, px^2 of a, and the geometry ``(L, ...)`` that has it."""
+        return epipolar_variance(moments, self.noise)
+
+    def variances_by(self, geometry: Tensor, moments: Tensor) -> Tensor:
+        """``(n,)`` each point's residual variance by one geometry; NaN where it is never seen."""
+        f = geometry.flatten()
+        below = torch.einsum("i,nij,j->n", f, gradient_moments(moments, self.noise), f)
+        return torch.where(below > 0, torch.einsum("i,nij,j->n", f, moments, f) / torch.where(below > 0, below, 1.0), torch.nan)
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,14 +167,14 @@ def epipolar_curve(
 
 
 def _piece(samples: Samples, lo: int, hi: int) -> tuple[Tensor, Tensor]:
-    moments, counts = epipolar_moments(samples.x1, samples.x2, (lo, hi), (samples.w1, samples.w2))
-    return epipolar_variance(moments, samples.noise)[0], counts
+    moments, counts = samples.moments((lo, hi))
+    return samples.solved(moments)[0], counts
 
 
 def _sampled(tracks: Tracks, step: float, width: float, options: SynchronizeOptions) -> tuple[Tensor, Tensor]:
     x, _, weights = smoothed(tracks, tracks.every(step), width, options)
-    change = tracks.change
-    return torch.where((weights > 0)[..., None], x @ change[:2, :2].mT + change[:2, 2], 0.0), weights
+    linear, moved = tracks.change[:-1, :-1], tracks.change[:-1, -1]
+    return torch.where((weights > 0)[..., None], x @ linear.mT + moved, 0.0), weights
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -171,7 +187,7 @@ class Grid:
 
     start: float
     step: float
-    x: Tensor  # (m, n, 2)
+    x: Tensor  # (m, n, d)
     v: Tensor
     calm: Tensor  # velocities to differentiate by
     weights: Tensor  # (m, n)
@@ -220,7 +236,7 @@ class EpipolarFit:
         sigma: of the shift there, seconds; robust against what residuals have in common over time.
         rate_sigma: of the rate.
         residual: robust standard deviation of the Sampson distance, px of a.
-        fundamental: ``(3, 3)`` of norm 1, of the coordinates given.
+        fundamental: ``(3, 3)`` of norm 1, of the coordinates given; of a camera and points in space the camera ``(3, 4)``.
         distances: ``(frames, n)`` signed Sampson distances over ``residual``; NaN where not both are seen.
         times: ``(frames,)`` of a's clock.
         effective: how many independent residuals there are.
@@ -286,7 +302,7 @@ class ShiftDescent:
         matched = self._matched(offset, rate)
         return math.inf if matched is None else float(self._moment_fit(matched)[0])
 
-    def _matched(self, offset: float, rate: float, every: int = 1) -> _Matched | None:
+    def _matched(self, offset: float, rate: float, every: int = 1) -> Matched | None:
         """Normalized positions of both cameras at the same moments, or at some of them; None where too few."""
         x2, v2, w2 = self.grid.at(self.times[::every] * rate + offset)
         sure = self.weights[::every] * w2
@@ -295,14 +311,24 @@ class ShiftDescent:
             return None
         first, second = self.changes
         p, q = homogeneous(self.x[::every][both]) @ first.mT, homogeneous(x2[both]) @ second.mT
-        return _Matched(p, q, torch.nn.functional.pad(v2[both], (0, 1)) @ second.mT, both, sure[both])
+        return Matched(p, q, torch.nn.functional.pad(v2[both], (0, 1)) @ second.mT, both, sure[both])
 
-    def _moment_fit(self, matched: _Matched) -> tuple[Tensor, Tensor]:
+    def _moment_fit(self, matched: Matched) -> tuple[Tensor, Tensor]:
         """Variance and F by the moments alone."""
         products = matched.products
         return epipolar_variance(products.mT @ (matched.sure[:, None] * products), self.noise)
 
-    def _rows(self, state: _State, every: int = 1) -> _Rows | None:
+    @staticmethod
+    def _nearest(matrix: Tensor) -> Tensor:
+        """The nearest F of norm 1."""
+        return rank_two(matrix)
+
+    @staticmethod
+    def _tangent(matrix: Tensor) -> Tensor:
+        """``(7, 9)`` orthonormal directions in which F may change."""
+        return _tangent(matrix)
+
+    def _rows(self, state: _State, every: int = 1) -> Residuals | None:
         """Residuals and their derivatives at a state; a first F where there is none."""
         matched = self._matched(state.offset, state.rate, every)
         if matched is None:
@@ -311,19 +337,25 @@ class ShiftDescent:
         if state.center is None:
             state.center = float(times.mean())
         if state.F is None:
-            state.F = rank_two(self._moment_fit(matched)[1])
-        Fp, Fq = matched.p @ state.F.mT, matched.q @ state.F
+            state.F = self._nearest(self._moment_fit(matched)[1])
+        return self._residuals(state.F, matched, times)
+
+    def _residuals(self, F: Tensor, matched: Matched, times: Tensor) -> Residuals:
+        """Residuals, and their derivatives by the entries of F and by the shift."""
+        Fp, Fq = matched.p @ F.mT, matched.q @ F
         s1, s2 = self.noise
         gradient = (s1**2 * Fq[:, :2].square().sum(-1) + s2**2 * Fp[:, :2].square().sum(-1)).clamp(min=1e-300).sqrt()
         residual = (matched.q * Fp).sum(-1) / gradient
         along = (matched.speed * Fp).sum(-1) / gradient
-        return _Rows(residual, matched.products / gradient[:, None], along, times, matched.both, matched.sure, options=self.options)
+        return Residuals(
+            residual, matched.products / gradient[:, None], along, times, matched.both, matched.sure, options=self.options
+        )
 
-    def _step(self, state: _State, rows: _Rows, free_rate: bool) -> float:
+    def _step(self, state: _State, rows: Residuals, free_rate: bool) -> float:
         """One step of iteratively reweighted least squares; its length in seconds, at the ends of the overlap."""
         assert state.F is not None
         assert state.center is not None
-        tangent = _tangent(state.F)
+        tangent = self._tangent(state.F)
         columns = [rows.products @ tangent.mT, rows.along[:, None]]
         lever = float((rows.times - state.center).abs().max())
         if free_rate:
@@ -336,18 +368,18 @@ class ShiftDescent:
         moves = -step[turns:]
         limit = self.options.descent.largest_step * self.frame
         share = min(1.0, limit / max(float(moves.abs().max()), 1e-300))
-        state.F = rank_two(state.F - share * (step[:turns] @ tangent).unflatten(0, (3, 3)))
+        state.F = self._nearest(state.F - share * (step[:turns] @ tangent).unflatten(0, state.F.shape))
         shift = share * float(moves[0])
         change = share * float(moves[1]) / max(lever, 1e-9) if free_rate else 0.0
         state.rate += change
         state.offset += shift - change * state.center
         return abs(shift) + abs(change) * lever
 
-    def _fit(self, state: _State, rows: _Rows, free_rate: bool) -> EpipolarFit:
+    def _fit(self, state: _State, rows: Residuals, free_rate: bool) -> EpipolarFit:
         """What is found, and how sure: each frame's influence on the estimate, with what neighbouring frames have in common."""
         assert state.F is not None
         assert state.center is not None
-        tangent = _tangent(state.F)
+        tangent = self._tangent(state.F)
         J = torch.cat([rows.products @ tangent.mT, rows.along[:, None], (rows.along * (rows.times - state.center))[:, None]], 1)
         J = J if free_rate else J[:, :-1]
         w = rows.weights()
@@ -356,19 +388,18 @@ class ShiftDescent:
         inverse = torch.linalg.pinv(H, hermitian=True, rtol=1e-12) / scale[:, None] / scale
         influence = (J * (w * rows.residual)[:, None]) @ inverse[:, len(tangent) :]
         frames = torch.zeros(len(self.times), influence.shape[1], dtype=J.dtype, device=J.device)
-        frames.index_add_(0, rows.both.nonzero()[:, 0], influence)
+        frames.index_add_(0, rows.frames, influence)
         step = float(self.times[1] - self.times[0]) if len(self.times) > 1 else self.frame
-        sigmas = _long_run(
+        sigmas = long_run(
             frames,
             round(
                 min(self.options.descent.memory, float(rows.times[-1] - rows.times[0]) / self.options.descent.memory_parts) / step
             ),
         )
         scale_of = rows.scale()
-        first, second = self.changes
-        F = second.mT @ state.F @ first
+        F = self._given(state.F)
         distances = torch.full(rows.both.shape, torch.nan, dtype=J.dtype, device=J.device)
-        distances[rows.both] = rows.residual / max(scale_of, 1e-300)
+        distances[rows.both] = rows.distances / max(scale_of, 1e-300)
         correlated = 2 * math.sqrt(math.pi) * self.width / step  # frames that the kernel makes into one
         return EpipolarFit(
             offset=state.offset,
@@ -383,6 +414,36 @@ class ShiftDescent:
             effective=float(rows.sure.sum() / rows.sure.max()) / max(1.0, correlated),
         )
 
+    def jumps(self, fit: EpipolarFit, moments: Sequence[float]) -> tuple[Tensor, Tensor]:
+        """What the offset changes by, beyond the fit, after each of some moments of a's clock: seconds ``(k,)``, and their standard
+        deviations.
+
+        One step of least squares from the fit, of all jumps with F and the offset.
+        """
+        first, second = self.changes
+        F = torch.linalg.inv(second).mT @ fit.fundamental @ torch.linalg.inv(first)
+        state = _State(fit.offset, fit.rate, F / F.norm(), fit.center)
+        rows = self._rows(state)
+        assert rows is not None
+        tangent = self._tangent(F / F.norm())
+        later = [rows.along * (rows.times > moment) for moment in moments]
+        J = torch.cat([rows.products @ tangent.mT, torch.stack([rows.along, *later], dim=1)], dim=1)
+        w = rows.weights()
+        scale = J.square().mul(w[:, None]).sum(0).sqrt().clamp(min=1e-300)
+        H = (J / scale).mT @ (J / scale * w[:, None])
+        inverse = torch.linalg.pinv(H, hermitian=True, rtol=1e-12) / scale[:, None] / scale
+        influence = (J * (w * rows.residual)[:, None]) @ inverse[:, -len(later) :]
+        frames = torch.zeros(len(self.times), len(later), dtype=J.dtype, device=J.device)
+        frames.index_add_(0, rows.frames, influence)
+        memory = min(self.options.descent.memory, float(rows.times[-1] - rows.times[0]) / self.options.descent.memory_parts)
+        sigmas = self.options.descent.optimism * long_run(frames, round(memory / self.frame))
+        return -influence.sum(0), sigmas.hypot(torch.as_tensor(self.options.descent.least_sigma * self.frame))
+
+    def _given(self, F: Tensor) -> Tensor:
+        """The same F, of the coordinates given."""
+        first, second = self.changes
+        return second.mT @ F @ first
+
 
 @dataclass
 class _State:
@@ -393,7 +454,9 @@ class _State:
 
 
 @dataclass(frozen=True, eq=False)
-class _Matched:
+class Matched:
+    """Normalized positions of both at the same moments."""
+
     p: Tensor  # (m, 3) of a
     q: Tensor  # (m, 3) of b
     speed: Tensor  # (m, 3) derivative of q by b's clock
@@ -407,7 +470,9 @@ class _Matched:
 
 
 @dataclass(frozen=True, eq=False)
-class _Rows:
+class Residuals:
+    """Residuals at a state, with their derivatives."""
+
     residual: Tensor  # (m,) px of a
     products: Tensor  # (m, 9): by the entries of F
     along: Tensor  # (m,): by the shift
@@ -416,14 +481,25 @@ class _Rows:
     sure: Tensor  # (m,): weights of the positions
     options: SynchronizeOptions
 
+    @property
+    def distances(self) -> Tensor:
+        """``(m,)`` of every pair of positions."""
+        return self.residual
+
+    @property
+    def frames(self) -> Tensor:
+        """Frame of every residual."""
+        return self.both.nonzero()[:, 0]
+
     def scale(self) -> float:
-        return 1.4826 * float(self.residual.abs().median())
+        return 1.4826 * float(self.distances.abs().median())
 
     def weights(self) -> Tensor:
         """Of Geman and McClure, by the scale of each point and of each second or so: who is nearer errs by more pixels."""
         pooled = max(self.scale(), 1e-300)
         every = torch.full(self.both.shape, torch.nan, dtype=torch.float64, device=self.residual.device)
-        every[self.both] = self.residual.abs() * (1.4826 / pooled)
+        distances = self.distances
+        every[self.both] = distances.abs() * (1.4826 / pooled)
         point = every.nanmedian(0).values.nan_to_num(1.0).clamp(*self.options.descent.unequal)
         pad = -len(every) % self.options.descent.block_frames
         blocks = (
@@ -438,7 +514,7 @@ class _Rows:
             .repeat_interleave(self.options.descent.block_frames)[: len(every)]
         )
         own = (moment[:, None] * point)[self.both]
-        return self.sure * (1 + (self.residual / (self.options.descent.cut * pooled * own)).square()).pow(-2) / own.square()
+        return self.sure * (1 + (distances / (self.options.descent.cut * pooled * own)).square()).pow(-2) / own.square()
 
 
 def _tangent(F: Tensor) -> Tensor:
@@ -448,7 +524,24 @@ def _tangent(F: Tensor) -> Tensor:
     return torch.linalg.qr(normals.mT, mode="complete")[0][:, 2:].mT
 
 
-def _long_run(influence: Tensor, memory: int) -> Tensor:
+@dataclass(frozen=True)
+class PairModel:
+    """What is compared: the classes that score all shifts, and that descend from one.
+
+    Attributes:
+        method: its name in results.
+    """
+
+    method: str
+    samples: type[Samples]
+    descent: type[ShiftDescent]
+
+
+EPIPOLAR = PairModel("epipolar", Samples, ShiftDescent)
+"""Two cameras that see the same points."""
+
+
+def long_run(influence: Tensor, memory: int) -> Tensor:
     """Standard deviations of sums ``(frames, k)`` of what neighbouring frames have in common (Newey and West)."""
     variance = influence.square().sum(0)
     for lag in range(1, min(memory, len(influence) - 1) + 1):

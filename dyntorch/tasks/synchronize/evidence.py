@@ -10,11 +10,9 @@ from functools import cached_property
 import torch
 from torch import Generator, Tensor
 
-from dyntorch.geometry.epipolar import epipolar_variance, gradient_moments
-from dyntorch.numerics.lags import epipolar_moments
-from dyntorch.tasks.synchronize.epipolar import Curve, EpipolarFit, Samples, ShiftDescent, epipolar_curve
+from dyntorch.tasks.synchronize.epipolar import EPIPOLAR, Curve, EpipolarFit, PairModel, Samples, epipolar_curve
 from dyntorch.tasks.synchronize.options import SynchronizeOptions
-from dyntorch.tasks.synchronize.tracks import Tracks
+from dyntorch.tasks.synchronize.tracks import Tracks, image_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +28,7 @@ class Attempt:
         points: ``(n,)`` bool, who takes part.
         method: ``"epipolar"`` or ``"affine"``.
         pruned: whether positions that did not fit were left out.
+        model: what is compared.
     """
 
     a: Tracks
@@ -43,6 +42,7 @@ class Attempt:
     method: str
     options: SynchronizeOptions
     pruned: bool = False
+    model: PairModel = EPIPOLAR
 
     @property
     def frame(self) -> float:
@@ -73,7 +73,8 @@ class Attempt:
         rough = [self.curve.misfit(self._lag(shift)) for shift, _ in self.peaks] or [0.0]
         if self.fit is None or len(rough) == 1:
             return rough
-        descent = ShiftDescent(self.a, self.b, max(self.frame, self.step), rows=self.options.evidence.rows, options=self.options)
+        width = max(self.frame, self.step)
+        descent = self.model.descent(self.a, self.b, width, rows=self.options.evidence.rows, options=self.options)
         steps = self.step * torch.linspace(-1, 1, self.options.evidence.fractions, dtype=torch.float64)
         level = max(self.curve.level, 1e-300)
         for k, (shift, _) in enumerate(self.peaks[: self.options.evidence.rivals + 1]):
@@ -89,6 +90,31 @@ class Attempt:
         return rough
 
     @cached_property
+    def forward(self) -> float:
+        r"""Nats by which the residual is smaller than with b played backwards, at whatever shift.
+
+        .. math:: \tfrac12 \log \min_s \lambda_{\text{backwards}}(s) - \tfrac12 \log \lambda
+
+        A film that somebody reversed fits for a while where a movement turns round, and far better the other way; so does a wrong
+        shift of films that have nothing in common, half of the time.
+        """
+        if self.fit is None:
+            return 0.0
+        backwards = dataclasses.replace(self.samples, x2=self.samples.x2.flip(0), w2=self.samples.w2.flip(0))
+        curve = epipolar_curve(backwards, self.max_shift, options=self.options)
+        judged = curve.scores.isfinite()
+        if not bool(judged.any()) or not self.misfits:
+            return 0.0
+        tiny = 1e-300
+        own = self.misfits[0] - 0.5 * math.log(max(self.curve.level, tiny))
+        return own + 0.5 * math.log(max(float(curve.variance[judged].min()), tiny))
+
+    @property
+    def needed_forward(self) -> float:
+        """The same for a decision: more where something may have been made to fit."""
+        return self.options.evidence.forward + self.options.evidence.forward_doubtful * self.doubtful
+
+    @cached_property
     def halves(self) -> tuple[float, float]:
         """Shifts in which the first and the second half of the overlap are best, from the fit's, in frames; NaN where none."""
         return tuple(self._away(curve) for curve in self.half_curves)  # type: ignore[return-value]
@@ -100,9 +126,9 @@ class Attempt:
         if self.fit is None:
             return math.inf
         first, second = self.halves
-        apart = abs(first - second) / 2 * self.frame if self.agree and self.step <= self.frame else 0.0
+        differing = abs(first - second) / 2 * self.frame if self.agree and self.step <= self.frame else 0.0
         # as much is expected; short halves may differ by more than the whole is uncertain
-        beyond = math.sqrt(max(apart**2 - self.fit.sigma**2, 0.0))
+        beyond = math.sqrt(max(differing**2 - self.fit.sigma**2, 0.0))
         return math.hypot(self.fit.sigma, min(beyond, 3 * self.fit.sigma))
 
     @cached_property
@@ -126,7 +152,18 @@ class Attempt:
     @cached_property
     def agree(self) -> bool:
         """Whether both halves of the overlap say the same shift as the whole."""
-        return self.fit is not None and all(abs(away) <= self.options.evidence.apart for away in self.halves)
+        return self.fit is not None and self.apart == 0
+
+    @cached_property
+    def apart(self) -> float:
+        """Frames by which halves of the overlap may differ from the whole, where one does by more, or both do to the same side; 0
+        where they agree."""
+        first, second = self.halves
+        evidence = self.options.evidence
+        if not (abs(first) <= evidence.apart and abs(second) <= evidence.apart):
+            return evidence.apart
+        leaning = first * second > 0 and min(abs(first), abs(second)) > evidence.leaning
+        return evidence.leaning if leaning else 0.0
 
     @cached_property
     def wander(self) -> float:
@@ -142,7 +179,8 @@ class Attempt:
     @cached_property
     def decided(self) -> bool:
         """Whether the shift is beyond doubt."""
-        return self.fit is not None and self.sharp and not self.edge and self.margin >= self.needed and self.agree
+        sure = self.fit is not None and self.sharp and not self.edge and self.margin >= self.needed and self.agree
+        return sure and self.forward >= self.needed_forward
 
     @property
     def sharp(self) -> bool:
@@ -154,21 +192,38 @@ class Attempt:
     @property
     def needed(self) -> float:
         """Nats above the next peak, for a decision."""
-        least = self.options.evidence.margin if self.method == "epipolar" else self.options.evidence.affine_margin
-        # with a residual far above the noise something may have been made to fit, the more so by leaving out what does not
-        usual = (
-            self.options.evidence.usual_roughness_pruned
-            if self.pruned or not bool(self.points.all())
-            else self.options.evidence.usual_roughness
-        )
-        return least + self.options.evidence.rough_margin * min(max(math.log(max(self.roughness, 1e-300) / usual), 0.0), 1.0)
+        evidence = self.options.evidence
+        if self.method == "affine":
+            usual = evidence.usual_roughness_pruned if self.chosen else evidence.usual_roughness_affine
+            rough = math.log(max(self.roughness, 1e-300) / usual)
+            return evidence.affine_margin + evidence.rough_margin * min(max(rough, 0.0), 1.0)
+        return evidence.margin + evidence.rough_margin * self.doubtful
+
+    @property
+    def chosen(self) -> bool:
+        """Whether points or positions that did not fit were left out."""
+        return self.pruned or not bool(self.points.all())
+
+    @property
+    def doubtful(self) -> float:
+        """0 where all points fit as well as their noise lets them; 1 where something may have been made to fit.
+
+        That is with a residual that the noise does not explain, or by leaving out what does not fit, unless b played backwards fits
+        far worse nevertheless.
+        """
+        evidence = self.options.evidence
+        rough = math.log(max(self.roughness, 1e-300) / evidence.usual_roughness)
+        if self.chosen and self.forward < evidence.forward_clear:
+            return 1.0
+        return min(max(rough / evidence.rough_growth, 0.0), 1.0)
 
     @property
     def roughness(self) -> float:
         """Residual over what white noise and the smoothing kernel leave of it."""
         assert self.fit is not None
         left = math.sqrt(0.5 / math.sqrt(math.pi))  # by a Gaussian kernel of one frame
-        return self.fit.residual / (left * max(self.a.noise, 1e-6 * self.a.scale))
+        image = image_of(self.a, self.b)
+        return self.fit.residual / (left * max(image.noise, 1e-6 * image.scale))
 
     @property
     def edge(self) -> bool:
@@ -190,9 +245,18 @@ class Attempt:
         return (
             own
             * rival
+            * self._forward_share
             * (self.options.evidence.agreeing if self.agree else self.options.evidence.disagreeing)
             * (1.0 if self.sharp and not self.edge else self.options.evidence.blurred)
         )
+
+    @property
+    def _forward_share(self) -> float:
+        """Odds of a film that runs forwards, as a factor of the confidence; where the rest is hopeless that is not looked at."""
+        evidence = self.options.evidence
+        if self.margin < evidence.even_margin * self.needed:
+            return 1.0
+        return 1 / (1 + math.exp(-min((self.forward - self.needed_forward) / evidence.forward_scale, 700.0)))
 
     def _shift(self, lag: float) -> float:
         """Of b's clock against a's at the center, of a lag of the curve."""
@@ -228,7 +292,7 @@ def consistent_points(
 ) -> Tensor | None:
     """Points ``(n,)`` bool whose epipolar residual agrees with the others' at one and the same shift; None where there are too few.
 
-    Subsets of six are drawn; each has its own best shift and fundamental matrix, by which all points are judged.  The subset
+    Subsets of six are drawn; each has its own best shift and geometry, by which all points are judged.  The subset
     counts that is fitted best by 70 of 100 points: a plain fit starts at a wrong shift, from where no reweighting returns.
 
     Source: Fischler and Bolles 1981, Random sample consensus, over points instead of matches.
@@ -238,23 +302,20 @@ def consistent_points(
     if n < options.points.fewest or lo > hi:
         return None
     step = found.step * max(1, -(-(hi - lo) // options.points.most_lags))
-    samples = Samples.of(a, b, step, found.samples.rate, options=options)
-    moments, counts = epipolar_moments(
-        samples.x1, samples.x2, samples.lags(found.max_shift), (samples.w1, samples.w2), per_point=True
-    )
+    samples = found.model.samples.of(a, b, step, found.samples.rate, options=options)
+    moments, counts = samples.moments(samples.lags(found.max_shift), per_point=True)
     total = counts.sum(0)
     judged = (total >= options.curve.least_overlap * total.max()) & (total >= options.curve.fewest_pairs)
     if not bool(judged.any()):
         return None
     moments, counts = moments[:, judged], counts[:, judged]
-    forms = gradient_moments(moments, samples.noise)
     generator = generator or torch.Generator().manual_seed(0)
     best: tuple[float, Tensor] | None = None
     for _ in range(options.points.subsets):
         chosen = torch.randperm(n, generator=generator)[: options.points.subset].to(moments.device)
-        variance, F = epipolar_variance(moments[chosen].sum(0), samples.noise)
+        variance, geometry = samples.solved(moments[chosen].sum(0))
         lag = int((variance / counts[chosen].sum(0).clamp(min=1).sqrt()).argmin())
-        each = _variances(moments[:, lag], forms[:, lag], F[lag])
+        each = samples.variances_by(geometry[lag], moments[:, lag])
         cost = float(each.nanquantile(options.points.share))
         if best is None or cost < best[0]:
             best = cost, each
@@ -263,10 +324,3 @@ def consistent_points(
     level = each[each <= best[0]].median()
     kept = ~(each > options.points.wrong**2 * level)
     return kept if int(kept.sum()) >= options.points.share * n else None
-
-
-def _variances(moments: Tensor, forms: Tensor, F: Tensor) -> Tensor:
-    """``(n,)`` each point's residual variance by one F; NaN where it is never seen."""
-    f = F.flatten()
-    below = torch.einsum("i,nij,j->n", f, forms, f)
-    return torch.where(below > 0, torch.einsum("i,nij,j->n", f, moments, f) / torch.where(below > 0, below, 1.0), torch.nan)

@@ -97,6 +97,8 @@ class ShiftDescentOptions:
     """Residuals that a descent takes at most, of longer takes at moments at equal distances: beyond, only sigma would shrink."""
     fewest_pairs: int = 16
     """Pairs of positions below which there is no descent."""
+    nearest: float = 0.05
+    """Least depth of a point in space before the camera, over the median one, that its image is taken from."""
     memory: float = 2.0
     """Seconds over which residuals are taken to depend on each other: detectors err for that long."""
     memory_parts: int = 6
@@ -117,14 +119,34 @@ class EvidenceOptions:
     affine_margin: float = 0.5
     """The same for affine cameras: what they leave unexplained differs from period to period of a gait."""
     rough_margin: float = 0.5
-    """Nats more for a decision where the residual is e times the usual."""
-    usual_roughness: float = 4.0
-    """Usual residual over what the noise explains; synthetic takes that have nothing in common were made to fit with margins up to
-    .42 and residuals of 7 to 22 times, real detectors have 4 to 9 times and margins above 1.2."""
+    """Nats more for a decision where points or positions were left out, or the residual is beyond the usual one by
+    ``rough_growth``: two walks of one person were made to fit with a margin of .53, other traps with .52 and less; real detectors
+    have margins above .86."""
+    usual_roughness: float = 1.25
+    """Usual residual over what the noise explains: .9 to 1.2 on virtual cameras; the two walks had 1.6, synthetic takes that have
+    nothing in common 7 to 22, real detectors have 5 to 10."""
+    rough_growth: float = 0.25
+    """Logarithm of the residual over the usual one at which all of that margin is asked for."""
+    usual_roughness_affine: float = 4.0
+    """Usual residual of affine cameras, which leave perspective unexplained."""
     usual_roughness_pruned: float = 2.0
     """The same where points or positions were left out."""
+    forward: float = -0.35
+    """Nats by which the residual has to be below that of b played backwards, for a decision: films that run backwards and were
+    called ok had -.9 to -1.9, good pairs -.1 to 2.7 (9 in 10 above .3): training trials of experiments.synchronization.silent."""
+    forward_doubtful: float = 0.55
+    """Nats more for a decision where points or positions were left out, or the noise does not explain the residual; a detector's
+    good pairs have .4 to 1.3."""
+    forward_clear: float = 0.6
+    """Nats of it from which leaving out points is no reason for doubt: of 40 virtual pairs with wrong joints, outliers or gaps all
+    but one had .7 to 2.1, traps that were made to fit so .2 and less."""
+    forward_scale: float = 0.04
+    """Nats of it by which the odds of a film that runs forwards grow e times."""
     apart: float = 2.5
     """Frames within which peaks are one, and halves of a take agree."""
+    leaning: float = 0.8
+    """Frames by which both halves may differ from the whole to the same side: of good virtual pairs .3 at most, of a detector's .3;
+    a mirrored film with left and right renamed was wrong by 1.1 frames, and its halves by 1.5 and 2.0."""
     half_overlap: float = 0.5
     """Share of the largest overlap below which a half of the take does not judge a shift."""
     rivals: int = 3
@@ -337,6 +359,9 @@ class DifferentPointOptions:
     clear: float = 7.0
     """Nats above the next peak at an equal overlap for a decision; of motion that repeats itself exactly 98 of 100 gaits stay below
     3, sums of harmonics reach 13, so this alone is not enough."""
+    forward: float = 5.0
+    """Nats by which the best lag has to tell more than the best one of b played backwards, for a decision; good pairs had 7.7 and
+    more, films of other takes or people 0 +- 8, training trials of experiments.synchronization.silent."""
     telling: float = 1.5
     """Nats per second below which nothing is shared."""
     sharp: float = 0.6
@@ -433,6 +458,40 @@ class ProjectiveOptions:
 
 
 @dataclass(frozen=True)
+class CombinedOptions:
+    """Where between frames the shift of a camera and motion capture lies that share no point."""
+
+    most_combinations: int = 12
+    """Combinations of the points in space, besides their middle."""
+    start_combinations: int = 4
+    """Those that the first affine camera is told by."""
+    start_ridge: float = 1e-3
+    """Ridge of the regressions for it, mean squares of coordinates of order 1."""
+    above: float = 1.0
+    """Movement of a combination, over the noise of the camera, from which it counts."""
+    usual_weight: float = 1.0
+    """Standard deviation of a combination's weights; a point that is one of the recorded has weights of norm 1 at most."""
+    reach: float = 3.0
+    """Frames from the lag of the row spaces within which the shift is looked for."""
+    fewest: int = 24
+    """Frames of each point that are needed at least."""
+    most_rows: int = 40_000
+    """Positions at most; of longer films frames at equal distances."""
+    rounds: int = 4
+    """Times that weights are told anew from the residuals."""
+    iterations: int = 30
+    """Steps of each."""
+    tolerance: float = 1e-7
+    """Share of the cost by which a step must lower it."""
+    exact: float = 1e-6
+    """Residual of normalized coordinates that is rounding."""
+    optimism: float = 1.6
+    """Errors over the sigma that the residuals alone say."""
+    least_sigma: float = 0.02
+    """Error at least, frames."""
+
+
+@dataclass(frozen=True)
 class NetworkOptions:
     """Several cameras on one clock, from the shifts of their pairs."""
 
@@ -466,6 +525,45 @@ class NetworkOptions:
 
 
 @dataclass(frozen=True)
+class BreakOptions:
+    """Clocks that break: frames that were lost, or written twice, in the middle of a film."""
+
+    window: float = 4.0
+    """Seconds of a window that has a best shift by itself, where the search starts."""
+    most_windows: int = 8
+    """Windows at most."""
+    window_overlap: float = 0.6
+    """Share of a window that has to overlap for a shift to be judged."""
+    longest: float = 2.0
+    """Seconds that a jump may have."""
+    near: float = 4.0
+    """Frames from the offset so far within which half frames are compared, too."""
+    least: float = 0.7
+    """Frames that a jump must have."""
+    shortest: float = 0.7
+    """Seconds of the shortest piece: less says nothing."""
+    dependence: float = 2.0
+    """Residuals that count as one, beside those that smoothing makes alike: detectors err for longer."""
+    resolved: float = 0.2
+    """Frames that the search resolves: less motion than that is no residual."""
+    unseen: float = 1.0
+    """Nats that a position costs, before those that are alike are made one, that the other camera does not show: twice what one
+    that fits does."""
+    penalty: float = 12.0
+    """Nats that a jump costs, in the search."""
+    evidence: float = 25.0
+    """Nats by which a jump has to explain the residuals better than one offset on both of its sides."""
+    rounds: int = 6
+    """Rounds of the search and the fit at most."""
+    alone: float = 3.0
+    """Seconds from which a piece has to have the same best shift by itself."""
+    together: float = 1.0
+    """Seconds within which the breaks that pairs of cameras tell are one."""
+    whole: float = 0.3
+    """Frames by which a jump may differ from a whole number of frames and still be one."""
+
+
+@dataclass(frozen=True)
 class SynchronizeOptions:
     """Every number that decides in :func:`dyntorch.synchronize`, :func:`dyntorch.synchronize_cameras` and
     :func:`dyntorch.combine_shifts`, by stage; frames are those of the slower camera."""
@@ -482,3 +580,5 @@ class SynchronizeOptions:
     different: DifferentPointOptions = DifferentPointOptions()
     cameras: NetworkOptions = NetworkOptions()
     projective: ProjectiveOptions = ProjectiveOptions()
+    combined: CombinedOptions = CombinedOptions()
+    breaks: BreakOptions = BreakOptions()

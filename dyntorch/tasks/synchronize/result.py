@@ -60,6 +60,13 @@ class ShiftNotice(NoticeCode):
         Status.AMBIGUOUS,
     )
     """Other shifts fit as well."""
+    BACKWARDS = (
+        "backwards",
+        "{camera:b} played backwards fits as well or better ({value:+.2g} nats for forwards): check that no film runs backwards, "
+        "and film something that happens once",
+        Status.NO_CONSENSUS,
+    )
+    """One of the films may run backwards."""
     HALVES = (
         "halves",
         "the halves of the take say {halves}, more than {apart:g} frames from {best:+.3g} s: the cameras may show different "
@@ -191,8 +198,8 @@ class Shift(ClockOutcome):
             Offsets are those at ``center``: :math:`t_b - t_a` there.
         status: OK where the data decide, as ``ok`` says; ``reason`` says why not, in one sentence with what to do.
         notices: that reason, and what a user should know besides (``notes``).
-        method: ``"epipolar"``, ``"affine"`` (both: same points), ``"subspace"``, ``"projective"`` (both: different points),
-            ``"brightness"``.
+        method: ``"epipolar"``, ``"affine"`` (both: same points), ``"camera"`` (a camera, and the same points in space),
+            ``"subspace"``, ``"projective"`` (both: different points), ``"brightness"``.
         fps: frames per second of a and of b, of the timestamps' median where these were given.
         center: a's time in the middle of the overlap: where offset and rate are least correlated.
         lags: ``(L,)`` seconds, at ``center``: the abscissa of ``scores``.
@@ -201,6 +208,8 @@ class Shift(ClockOutcome):
             where points do not correspond.
         fundamental: ``(3, 3)`` of norm 1, :math:`x_b^T F x_a = 0` in the coordinates given (after removal of lens distortion, where
             that was asked for); None where there is none.
+        projection: ``(3, 4)`` of norm 1, the camera that shows the points in space, :math:`x \\sim P X`, where one of the takes is
+            of motion capture; None where there is none.
     """
 
     offset: float
@@ -216,6 +225,7 @@ class Shift(ClockOutcome):
     scores: Tensor
     points: Tensor | None = None
     fundamental: Tensor | None = None
+    projection: Tensor | None = None
 
     TASK = "synchronize"
 
@@ -377,6 +387,7 @@ class Clocks(ClockOutcome):
         reference: the camera whose clock is t.
         center: time of the reference camera in the middle of the overlaps.
         shifts: what the pairs said.
+        breaks: what was mended, where that was asked for; the clocks are those of ``breaks.times``.
     """
 
     offsets: Tensor
@@ -391,6 +402,7 @@ class Clocks(ClockOutcome):
     reference: int
     center: float
     shifts: Mapping[tuple[int, int], Shift]
+    breaks: Breaks | None = None
 
     TASK = "synchronize_cameras"
 
@@ -415,6 +427,7 @@ class Clocks(ClockOutcome):
             own = ", the reference" if camera == self.reference else ""
             lines.append(f"  camera {camera}: {offset:+.4f} ± {sigma:.4f} s{drift}{own}")
         lines += [f"  pair {row}" for row in map(_row, self.pairs)]
+        lines += [] if self.breaks is None else [f"  break: {note}" for note in self.breaks.notes]
         return "\n".join([*lines, *(f"  note: {note}" for note in self.notes)])
 
 
@@ -423,3 +436,109 @@ def _row(pair: Pair) -> str:
     use = "" if pair.peak == 0 else ", not used" if pair.peak < 0 else f", used with its peak {pair.peak + 1}"
     i, j = pair.cameras
     return f"{i}-{j}: {pair.shift:+.4f} ± {pair.sigma:.4f} s, residual {pair.residual:+.4f} s, {state}{use}"
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# What breaks() and camera_breaks() return: moments at which a camera lost frames, or wrote some twice, without saying so.
+
+
+class BreakNotice(NoticeCode):
+    """What happened to a clock, and how it is said."""
+
+    LOST = (
+        "lost_frames",
+        {
+            "frames": "{lost:# frame|# frames} lost by {camera:{which}} at {at:.2f} s of its clock, or there twice in "
+            "{camera:{other}} at {there:.2f} s of its own: of two cameras nothing tells; a third one would",
+            "seconds": "{lost:g} s lost by {camera:{which}} at {at:.2f} s of its clock, or there twice in {camera:{other}} at "
+            "{there:.2f} s of its own: of two cameras nothing tells; a third one would",
+            "frames of one": "{camera:{which}} lost {lost:# frame|# frames} at {at:.2f} s of its clock",
+            "seconds of one": "{camera:{which}} lost {lost:g} s at {at:.2f} s of its clock",
+        },
+    )
+    """Frames are missing."""
+    TWICE = (
+        "frames_twice",
+        {
+            "frames of one": "{camera:{which}} shows {lost:# frame|# frames} twice at {at:.2f} s of its clock",
+            "seconds of one": "{camera:{which}} shows {lost:g} s twice at {at:.2f} s of its clock",
+        },
+    )
+    """Frames are there twice."""
+    UNDECIDED = (
+        "undecided",
+        "whether a clock breaks is not decided, as no single shift is sure: {said}",
+        Status.AMBIGUOUS,
+    )
+    """Not even pieces of the take can be synchronized."""
+
+
+@dataclass(frozen=True)
+class ClockBreak:
+    """A moment at which a camera lost frames, or wrote some twice, while the frame numbers of its file went on."""
+
+    candidates: tuple[int, ...]
+    """The camera; of two that nothing tells apart, first the one that would have lost frames, then the one that would have them
+    twice.  0 and 1 are a and b."""
+    moments: tuple[float, ...]
+    """Seconds of each candidate's own clock, as its file counts: behind the last frame before the break."""
+    sigma: float
+    """Standard deviation of the moment, seconds."""
+    jump: float
+    """Seconds by which the clock of the camera jumps against the others', negative where it lost frames; of two candidates that of
+    camera 1's clock against camera 0's (of the later one's against the earlier one's)."""
+    jump_sigma: float
+    """Its standard deviation."""
+    frames: int | None
+    """Frames of the first candidate that were lost, or are there twice; None where no whole number fits."""
+    evidence: float
+    """Nats by which one offset on both sides explains the residuals worse."""
+    residuals: tuple[float, float]
+    """Robust standard deviation of the distance from epipolar lines, px of the first camera of the pair: with one offset on both
+    sides, and with the break."""
+
+    @property
+    def camera(self) -> int | None:
+        """The camera that broke; None where two may be it."""
+        return self.candidates[0] if len(self.candidates) == 1 else None
+
+    @property
+    def time(self) -> float:
+        """Seconds of the first candidate's own clock."""
+        return self.moments[0]
+
+    @property
+    def doubled(self) -> bool:
+        """Whether frames are there twice, as far as is known."""
+        return self.camera is not None and self.jump > 0
+
+    def seconds(self, step: float) -> float:
+        """How much of the first candidate's time is lost or there twice; whole frames, ``step`` seconds apart, where those fit."""
+        return abs(self.jump) if self.frames is None else self.frames * step
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Breaks(ClockOutcome):
+    """Clocks that broke, and times as if they had not.
+
+    Attributes:
+        breaks: in the order of time; empty where nothing broke.
+        times: ``(frames,)`` seconds per camera: what to give as ``times`` from here on.
+        clocks: of two cameras the :class:`Shift` with these times; of several the :class:`Clocks` that were given.
+        status: OK where the data decide whether something broke.
+        notices: what happened, in words (``notes``), and what stands against a decision.
+    """
+
+    breaks: tuple[ClockBreak, ...]
+    times: tuple[Tensor, ...]
+    clocks: Shift | Clocks
+
+    TASK = "breaks"
+
+    def __repr__(self) -> str:
+        state = "ok" if self.ok else f"refused: {self.reason}"
+        lines = [f"Breaks({len(self.breaks)} in {len(self.times)} cameras, {state})"]
+        for one, note in zip(self.breaks, self.notes, strict=False):
+            sure = f"{one.evidence:.0f} nats, residual {one.residuals[0]:.2f} -> {one.residuals[1]:.2f} px"
+            lines.append(f"  {note} ± {one.sigma:.2f} s ({1e3 * one.jump:+.0f} ± {1e3 * one.jump_sigma:.0f} ms, {sure})")
+        return "\n".join(lines)

@@ -68,6 +68,11 @@ class RowSpaceShift:
         """Probability that the lag is right, from how clear it is."""
         return _sigmoid((_strength(self.clearness, self.votes, self.options) - 1) * self.options.rows.odds + math.log(19))
 
+    def turned(self, rate: float) -> RowSpaceShift:
+        """The same with a and b exchanged; ``rate`` of the new b's clock."""
+        lag, sigma, seconds = -self.lag * rate, self.sigma * rate, -self.seconds * rate
+        return replace(self, lag=lag, sigma=sigma, seconds=seconds, foreign=(self.foreign[1], self.foreign[0]))
+
 
 def _strength(clearness: float, votes: float, options: SynchronizeOptions) -> float:
     """Clearness over what these votes need: 1 decides."""
@@ -95,7 +100,12 @@ def row_space_shift(
     """
     if a.still or b.still:
         return None
+    if b.x.shape[-1] == 3:  # what is looked at between frames is the second, and a camera is the shorter take of fewer points
+        back = {"step": step * rate, "rate": 1 / rate, "around": -around / rate}
+        other = row_space_shift(b, a, max_shift=max_shift, options=options, **back)
+        return None if other is None else other.turned(rate)
     films = Films(a, b, step, rate, options)
+    films = films.completed if films.spatial else films
     ta, tb = films.times
     if min(len(ta), len(tb)) < 3:
         return None
@@ -170,7 +180,7 @@ def _left_out(kinds: list[KindMoments], best: Hypothesis, options: SynchronizeOp
     clearest = best.clearness
     for _ in range(math.ceil(options.rows.foreign * max(counts))):
         found: tuple[float, int, int] | None = None
-        for side in (0, 1):
+        for side in (1,) if kinds[0].films.spatial else (0, 1):
             if int(kept[side].sum()) <= max(options.rows.fewest, (1 - options.rows.foreign) * counts[side]):
                 continue
             for point in kept[side].nonzero()[:, 0].tolist():

@@ -26,12 +26,14 @@ class Body:
     """One camera's points over time.
 
     Attributes:
-        rows: ``(T', 2n)`` without the ends, coordinates about the body's middle over its size, smoothed, in units of noise.
-        motion: ``(T', 2)`` px per frame, the median velocity of the points.
+        rows: ``(T', d n)`` without the ends, coordinates about the body's middle over its size, smoothed, in units of noise; of
+            points in space combinations of them.
+        motion: ``(T', d)`` px per frame, the median velocity of the points.
         weights: ``(T',)`` 1 where a frame is seen, else 0.
-        points: ``(T, n, 2)`` px, what is missing filled in.
+        points: ``(T, n, d)`` px, what is missing filled in; d = 2, of points in space 3.
         seen: ``(T, n)`` bool.
         step: seconds from frame to frame.
+        noise: variance of a coordinate's noise, over the squared size of the body.
     """
 
     rows: Tensor
@@ -41,6 +43,12 @@ class Body:
     seen: Tensor
     step: float
     options: SynchronizeOptions
+    noise: float = TINY**2
+
+    @property
+    def dims(self) -> int:
+        """Coordinates of a point; that with number 1 is upright."""
+        return self.points.shape[-1]
 
     @property
     def bend(self) -> float:
@@ -55,7 +63,7 @@ class Body:
         x = x - t * (w * t * x).sum(0) / torch.where(square > 0, square, 1.0)
         extent = float(self.points.flatten(0, 1).std(0).norm())
         noise = max(_noise(self.points, self.seen), (self.options.subspace.rounding * extent) ** 2, 1e-300)
-        return float((w * x.square()).sum() / (2 * spare.sum()).clamp(min=1)) / noise
+        return float((w * x.square()).sum() / (x.shape[-1] * spare.sum()).clamp(min=1)) / noise
 
     @property
     def reversed(self) -> Body:
@@ -80,16 +88,22 @@ class Body:
         return float((values / (values + 1)).sum())
 
 
-def body_of(x: Tensor, weights: Tensor, step: float = STEP, *, options: SynchronizeOptions) -> Body:
-    """Rows, motion and weights of tracks ``(T, n, 2)`` with weights ``(T, n)``, 0 = missing; some frames less at each end."""
+def body_of(x: Tensor, weights: Tensor, step: float = STEP, *, least: float = TINY**2, options: SynchronizeOptions) -> Body:
+    """Rows, motion and weights of tracks ``(T, n, d)`` with weights ``(T, n)``, 0 = missing; some frames less at each end.
+
+    Args:
+        least: variance of the noise over the squared size of the body, at least: what is known better than the other camera sees it
+            would agree with anything.
+    """
     seen = (weights > 0) & x.isfinite().all(-1)
     x = torch.where(seen[..., None], x, 0.0).double()
     whole = seen.sum(-1) >= min(2, seen.shape[1])
     edge = _edge(step, options)
     if not bool(whole.any()) or len(x) <= 2 * edge:
         rest = max(len(x) - 2 * edge, 1)
-        return Body(x.new_zeros(rest, 2 * x.shape[1]), x.new_zeros(rest, 2), x.new_zeros(rest), x, seen, step, options=options)
-    return _body(completed(filled(x, seen, options), seen, options), seen, whole, step, options)
+        rows, motion = x.new_zeros(rest, x[0].numel()), x.new_zeros(rest, x.shape[-1])
+        return Body(rows, motion, x.new_zeros(rest), x, seen, step, options=options)
+    return _body(completed(filled(x, seen, options), seen, options), seen, whole, step, least, options)
 
 
 def halves(body: Body, options: SynchronizeOptions) -> tuple[Body, Body]:
@@ -98,23 +112,35 @@ def halves(body: Body, options: SynchronizeOptions) -> tuple[Body, Body]:
     order = torch.randperm(n, generator=torch.Generator().manual_seed(0)).to(body.points.device)
     whole = body.seen.sum(-1) >= min(2, n)
     first, second = (
-        _body(body.points[:, part], body.seen[:, part], whole, body.step, options)
+        _body(body.points[:, part], body.seen[:, part], whole, body.step, body.noise, options)
         for part in (order[: (n + 1) // 2], order[n // 2 :])
     )
     return first, second
 
 
-def _body(held: Tensor, seen: Tensor, whole: Tensor, step: float, options: SynchronizeOptions) -> Body:
+def _body(held: Tensor, seen: Tensor, whole: Tensor, step: float, least: float, options: SynchronizeOptions) -> Body:
     """The body of complete points."""
     width, edge = _width(step, options), _edge(step, options)
     size, middle = _frame(held, options.subspace.size_width / step, options)
     shape = (held - middle) / size[:, None, None]
-    variance = max(_noise(shape, seen), TINY**2) * options.subspace.noise / (2 * math.sqrt(math.pi) * width)
-    rows = smooth(shape, width).flatten(1)
+    noise = max(_noise(shape, seen), least)
+    variance = noise * options.subspace.noise / (2 * math.sqrt(math.pi) * width)
     inside = slice(edge, -edge)
-    rows = rows[inside]
-    rows = (rows - rows.mean(0)) / math.sqrt(variance)
-    return Body(rows, _motion(held, width)[inside], whole.double()[inside], held, seen, step, options=options)
+    places = smooth(shape, width)[inside]
+    places = (places - places.mean(0)) / math.sqrt(variance)
+    rows = (places if held.shape[-1] == 2 else _fewer(places)).flatten(1)
+    return Body(rows, _motion(held, width)[inside], whole.double()[inside], held, seen, step, options=options, noise=noise)
+
+
+def _fewer(places: Tensor) -> Tensor:
+    """As many combinations ``(T, k, d)`` of points ``(T, n, d)`` as move by more than noise of variance 1: what all tell, sooner.
+
+    They are orthonormal, and the same for every coordinate, so that the noise stays as it is and upright stays upright.
+    """
+    by_point = places.movedim(1, 0).flatten(1)
+    values, vectors = torch.linalg.eigh(by_point @ by_point.mT / max(by_point.shape[1], 1))
+    kept = max(int((values > 1).sum()), 1)
+    return torch.einsum("tnd,nk->tkd", places, vectors[:, -kept:].flip(-1))
 
 
 def _width(step: float, options: SynchronizeOptions) -> float:
@@ -163,7 +189,7 @@ def _noise(x: Tensor, seen: Tensor) -> float:
 
 
 def completed(x: Tensor, seen: Tensor, options: SynchronizeOptions) -> Tensor:
-    r"""Positions ``(T, n, 2)``, those missing by regression on the other points of their frame, over and over.
+    r"""Positions ``(T, n, d)``, those missing by regression on the other points of their frame, over and over.
 
     .. math:: x_j \leftarrow x_j - K_{jj}^{-1} (K x)_j, \qquad K = (C + \sigma^2 I)^{-1}
 
@@ -173,20 +199,20 @@ def completed(x: Tensor, seen: Tensor, options: SynchronizeOptions) -> Tensor:
     if bool(seen.all()):
         return x
     mean = x.mean(0)
-    rows, n = (x - mean).flatten(1), x.shape[1]
+    rows, (n, dims) = (x - mean).flatten(1), x.shape[1:]
     noise = max(_noise(x, seen), 1e-6 * float(rows.square().mean()), 1e-300)
-    unit = torch.eye(2 * n, dtype=x.dtype, device=x.device)
+    unit = torch.eye(dims * n, dtype=x.dtype, device=x.device)
     for _ in range(options.subspace.fill_rounds):
         inverse = torch.linalg.inv(rows.mT @ rows / len(rows) + noise * unit)
-        own = inverse.unflatten(0, (n, 2)).unflatten(2, (n, 2)).diagonal(dim1=0, dim2=2).movedim(-1, 0)  # (n, 2, 2)
-        change = torch.linalg.solve(own, (rows @ inverse).unflatten(1, (n, 2)).movedim(0, 2)).movedim(2, 0)
+        own = inverse.unflatten(0, (n, dims)).unflatten(2, (n, dims)).diagonal(dim1=0, dim2=2).movedim(-1, 0)  # (n, d, d)
+        change = torch.linalg.solve(own, (rows @ inverse).unflatten(1, (n, dims)).movedim(0, 2)).movedim(2, 0)
         nearby = filled(torch.where(seen[..., None], change, 0.0), seen, options)
         rows = rows - torch.where(seen[..., None], 0.0, change - nearby).flatten(1)
-    return rows.unflatten(1, (n, 2)) + mean
+    return rows.unflatten(1, (n, dims)) + mean
 
 
 def _motion(x: Tensor, width: float) -> Tensor:
-    """Median velocity ``(T, 2)`` of the points: a few that go elsewhere do not matter."""
+    """Median velocity ``(T, d)`` of the points: a few that go elsewhere do not matter."""
     velocity = torch.gradient(smooth(x, width), dim=0)[0]
     return 0.5 * (velocity.median(1).values - (-velocity).median(1).values)  # of both middle ones
 
@@ -255,8 +281,8 @@ def subspace_curve(
     velocities, and m the seconds that overlap.
 
     Args:
-        a: ``(Ta, n, 2)`` px, frames ``step`` apart.
-        b: ``(Tb, m, 2)``, the same step.
+        a: ``(Ta, n, 2)`` px, frames ``step`` apart; or points in space ``(Ta, n, 3)``, the second coordinate upright.
+        b: ``(Tb, m, 2)``, the same step; or points in space, where a is none.
         wa: ``(Ta, n)``, 0 = missing.
         wb: ``(Tb, m)``.
         lags: first and last, frames.
@@ -282,7 +308,13 @@ def subspace_curve(
         >>> int(curve.lags[curve.scores.nan_to_num(-torch.inf).argmax()])
         -7
     """
-    return bodies_curve(body_of(a, wa, step, options=options), body_of(b, wb, step, options=options), lags, step, options=options)
+    if a.shape[-1] == 3:
+        second = body_of(b, wb, step, options=options)
+        first = body_of(a, wa, step, least=second.noise, options=options)
+    else:
+        first = body_of(a, wa, step, options=options)
+        second = body_of(b, wb, step, least=first.noise if b.shape[-1] == 3 else TINY**2, options=options)
+    return bodies_curve(first, second, lags, step, options=options)
 
 
 def bodies_curve(
@@ -316,7 +348,8 @@ def _curves(a: Body, b: Body, lags: tuple[int, int], options: SynchronizeOptions
         span = lo, min(lo + PIECE - 1, lags[1])
         aa, bb, ab, counts = lag_covariances(a.rows, b.rows, span, weights)
         *motion, _ = lag_covariances(a.motion, b.motion, span, weights)
-        found.append((_shared(aa, bb, ab), _shared(*_vertical(aa, bb, ab)), _correlated(*motion, options=options), counts))
+        upright = _vertical((aa, bb, ab), (a.dims, b.dims))
+        found.append((_shared(aa, bb, ab), _shared(*upright), _correlated(*motion, options=options), counts))
     return [torch.cat(parts) for parts in zip(*found, strict=True)]
 
 
@@ -333,7 +366,7 @@ def _chance(a: Body, b: Body, counts: Tensor, judged: Tensor, lags: tuple[int, i
         share = 1 / max(len(both), 1)
         c = (share * both.mT @ both)[None]
         parts = c[:, :n, :n], c[:, n:, n:], c[:, :n, n:]
-        told.append(torch.cat([_shared(*parts), _shared(*_vertical(*parts))]))
+        told.append(torch.cat([_shared(*parts), _shared(*_vertical(parts, (a.dims, b.dims)))]))
         inverse.append([1.0, share])
     design = torch.tensor(inverse, dtype=torch.float64, device=counts.device)
     # the default driver reads an order of pivots that nobody wrote: last digits that differ from run to run (pytorch issue 187411)
@@ -341,18 +374,26 @@ def _chance(a: Body, b: Body, counts: Tensor, judged: Tensor, lags: tuple[int, i
     return line[0] + line[1] / counts.clamp(min=1.0)[:, None]
 
 
-def information(shape: Tensor, n: int, motion: Tensor, options: SynchronizeOptions) -> Tensor:
-    """Evidence per second ``(L,)`` of joint covariances: of shapes, whose first n rows are a's, and of motions; chance is in it."""
-    parts = shape[:, :n, :n], shape[:, n:, n:], shape[:, :n, n:]
-    told = options.subspace.shape_rate * _shared(*parts) + options.subspace.height_rate * _shared(*_vertical(*parts))
-    return told + options.subspace.motion_rate * _correlated(
-        motion[:, :2, :2], motion[:, 2:, 2:], motion[:, :2, 2:], options=options
-    )
+def information(shape: Tensor, motion: Tensor, bodies: tuple[Body, Body], options: SynchronizeOptions) -> Tensor:
+    """Evidence per second ``(L,)`` of joint covariances of the bodies' shapes and motions; chance is in it."""
+    dims, n = (bodies[0].dims, bodies[1].dims), bodies[0].rows.shape[1]
+    parts = _parts(shape, n)
+    told = options.subspace.shape_rate * _shared(*parts) + options.subspace.height_rate * _shared(*_vertical(parts, dims))
+    return told + options.subspace.motion_rate * _correlated(*_parts(motion, dims[0]), options=options)
 
 
-def _vertical(aa: Tensor, bb: Tensor, ab: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Covariances of the y of points alone."""
-    return aa[..., 1::2, 1::2], bb[..., 1::2, 1::2], ab[..., 1::2, 1::2]
+_Parts = tuple[Tensor, Tensor, Tensor]
+
+
+def _parts(joint: Tensor, n: int) -> _Parts:
+    """Covariances of a and of b, and between them, of joint ones whose first n rows are a's."""
+    return joint[:, :n, :n], joint[:, n:, n:], joint[:, :n, n:]
+
+
+def _vertical(parts: _Parts, dims: tuple[int, int]) -> _Parts:
+    """Covariances of the upright coordinate of points alone."""
+    (aa, bb, ab), (da, db) = parts, dims
+    return aa[..., 1::da, 1::da], bb[..., 1::db, 1::db], ab[..., 1::da, 1::db]
 
 
 def _shared(aa: Tensor, bb: Tensor, ab: Tensor) -> Tensor:

@@ -19,11 +19,12 @@ from dyntorch.numerics.blocks import one_thread
 from dyntorch.numerics.messages import Message
 from dyntorch.tasks.synchronize.batches import synchronize_batch
 from dyntorch.tasks.synchronize.different import different_points
-from dyntorch.tasks.synchronize.epipolar import Curve, EpipolarFit, Samples, ShiftDescent, epipolar_curve
+from dyntorch.tasks.synchronize.epipolar import EPIPOLAR, Curve, EpipolarFit, PairModel, ShiftDescent, epipolar_curve
 from dyntorch.tasks.synchronize.evidence import Attempt, consistent_points
 from dyntorch.tasks.synchronize.options import SynchronizeOptions
 from dyntorch.tasks.synchronize.projective import projective_points
 from dyntorch.tasks.synchronize.result import Shift, ShiftNotice
+from dyntorch.tasks.synchronize.space import CAMERA
 from dyntorch.tasks.synchronize.tracks import Tracks, cleaned, frame_scaled, read_tracks, smoothed, without
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -39,7 +40,8 @@ class ShiftSearch:
         max_shift: seconds, None for all shifts with some overlap.
         rates: of b's clock, to search at.
         free_rate: whether the descent may change the rate.
-        method: ``"epipolar"`` or ``"affine"``: what the tracks were made for.
+        method: ``"epipolar"``, ``"camera"`` or ``"affine"``: what the tracks were made for.
+        model: what is compared.
     """
 
     step: float = 0.0
@@ -47,6 +49,7 @@ class ShiftSearch:
     rates: tuple[float, ...] = (1.0,)
     free_rate: bool = True
     method: str = "epipolar"
+    model: PairModel = EPIPOLAR
 
 
 def attempt(a: Tracks, b: Tracks, search: ShiftSearch, points: Tensor | None = None, *, options: SynchronizeOptions) -> Attempt:
@@ -60,20 +63,21 @@ def attempt(a: Tracks, b: Tracks, search: ShiftSearch, points: Tensor | None = N
     step = max(a.step, b.step, search.step)
     searched = [
         (samples, epipolar_curve(samples, search.max_shift, options=options))
-        for samples in (Samples.of(a, b, step, r, options=options) for r in search.rates)
+        for samples in (search.model.samples.of(a, b, step, r, options=options) for r in search.rates)
     ]
-    fit = _best(a, b, [curve for _, curve in searched], step, search.free_rate, options)
+    fit = _best(a, b, [curve for _, curve in searched], step, search, options)
     samples, curve = min(searched, key=lambda found: abs(found[0].rate - (fit.rate if fit else 1.0)))
     if fit is not None and abs(fit.rate - samples.rate) * (float(a.times[-1]) - float(a.times[0])) > 0.25 * step:
-        samples = Samples.of(a, b, step, fit.rate, options=options)
+        samples = search.model.samples.of(a, b, step, fit.rate, options=options)
         curve = epipolar_curve(samples, search.max_shift, options=options)
-    return Attempt(a, b, fit, curve, samples, step, search.max_shift, points, search.method, options=options)
+    return Attempt(a, b, fit, curve, samples, step, search.max_shift, points, search.method, options=options, model=search.model)
 
 
 def _best(
-    a: Tracks, b: Tracks, curves: list[Curve], step: float, free_rate: bool, options: SynchronizeOptions
+    a: Tracks, b: Tracks, curves: list[Curve], step: float, search: ShiftSearch, options: SynchronizeOptions
 ) -> EpipolarFit | None:
     """The likeliest minimum near the peaks of the curves."""
+    free_rate = search.free_rate
     frame = max(a.step, b.step)
     starts = sorted(
         ((score, lag * curve.rate, curve.rate) for curve in curves for lag, score in curve.peaks(options.evidence.peaks)),
@@ -87,7 +91,7 @@ def _best(
     widths = [step]
     while widths[-1] > frame:
         widths.append(max(frame, widths[-1] / 3))
-    descent = ShiftDescent(a, b, step, options=options)
+    descent = search.model.descent(a, b, step, options=options)
     found = []
     for score, offset, rate in starts[: options.evidence.peaks if several else 1]:
         fit = descent.run(offset, rate, free_rate=free_rate and step > frame)
@@ -98,7 +102,7 @@ def _best(
         return None
     best = max(found, key=lambda pair: pair[0])[1]
     for width in widths[1:]:
-        descent = ShiftDescent(a, b, width, options=options)
+        descent = search.model.descent(a, b, width, options=options)
         best = descent.run(best.offset, best.rate, free_rate=free_rate) or best
     long = float(best.times[-1] - best.times[0]) > options.search.drifting
     return _settled(descent, best, options) if free_rate and long else best
@@ -143,16 +147,21 @@ def same_points(
     lenses: bool,
     generator: Generator | None,
     options: SynchronizeOptions,
+    model: PairModel = EPIPOLAR,
 ) -> Result:
-    """The shift of cameras that see the same points.
+    """The shift of cameras that see the same points, or of a camera and the same points in space.
 
     Args:
+        model: which of the two.
         rate: of b's clock, where it is known.
         camera: ``"perspective"``, ``"affine"`` or ``"auto"``.
         lenses: whether nobody calibrated the cameras, and distortion may be looked for.
     """
     span = min(float(t.times[-1] - t.times[0]) for t in (a, b))
-    search = ShiftSearch(step=span / options.search.most_steps, max_shift=max_shift, rates=(rate or 1.0,), free_rate=rate is None)
+    search = ShiftSearch(
+        step=span / options.search.most_steps, max_shift=max_shift, rates=(rate or 1.0,), free_rate=rate is None,
+        method=model.method, model=model,
+    )  # fmt: skip
     seen = (a.weights > 0).any(0) & (b.weights > 0).any(0)
     if a.still or b.still:
         return Result(dataclasses.replace(attempt(a, b, search, options=options), fit=None), (), seen)
@@ -164,7 +173,7 @@ def same_points(
     known: tuple[Notice, ...] = ()
     if lenses and found.fit is not None and found.roughness > options.search.rough:
         found, known = _straightened(found, a, b, search, generator, options)
-    if camera == "auto" and not found.decided:
+    if camera == "auto" and model is EPIPOLAR and not found.decided:
         scaled = _affine(a, b, search, generator, options)
         # without the place in the picture a gait repeats itself, so that affine cameras alone may be sure of a wrong period
         if scaled.decided and _agree(scaled, found, options):
@@ -362,6 +371,47 @@ def synchronize(
         )  # fmt: skip
     check_options(options, SynchronizeOptions)
     _check(correspondence, fps, times, weights, max_shift, rate, camera)
+    first, second, origin = prepared(a, b, fps=fps, times=times, weights=weights, calibration=calibration, options=options)
+    spatial = _spatial((first, second), camera)
+    if camera == "projective":
+        return projective_points(first, second, max_shift=max_shift, rate=rate, options=options).since(origin)
+    if not correspondence:
+        return different_points(first, second, max_shift=max_shift, rate=rate, options=options).since(origin)
+    if a.shape[1] != b.shape[1]:
+        text = (
+            "{camera:a} has {a} points and {camera:b} {b}: corresponding points are as many; "
+            "give the same ones in the same order, or {arg:correspondence=False}"
+        )
+        raise ValueError(Message(text, a=a.shape[1], b=b.shape[1]))
+    result = same_points(
+        first,
+        second,
+        max_shift=max_shift,
+        rate=rate,
+        camera=camera,
+        lenses=calibration is None and not spatial,
+        generator=generator,
+        options=options,
+        model=CAMERA if spatial else EPIPOLAR,
+    )
+    return _shift(result, options).since(origin)
+
+
+def prepared(
+    a: Tensor,
+    b: Tensor,
+    *,
+    fps: float | tuple[float, float] | None,
+    times: tuple[Tensor, Tensor] | None,
+    weights: tuple[Tensor | None, Tensor | None] | None,
+    calibration: tuple[Any, Any] | None,
+    options: SynchronizeOptions,
+) -> tuple[Tracks, Tracks, float]:
+    """Tracks of checked input, without outliers, and the time that both clocks are counted from: a's first frame.
+
+    Raises:
+        ValueError: naming a or b, what is wrong with it, and what to do.
+    """
     pair: tuple[float | None, float | None] = (None, None)
     if fps is not None:
         pair = (float(fps[0]), float(fps[1])) if isinstance(fps, Sequence) else (float(fps), float(fps))
@@ -379,27 +429,7 @@ def synchronize(
     # both clocks count from a's first frame: timestamps may be of any era, and products of rates with them lose digits
     origin = float(tracks[0].times[0])
     first, second = (cleaned(dataclasses.replace(one, times=one.times - origin), options) for one in tracks)
-    if camera == "projective":
-        return projective_points(first, second, max_shift=max_shift, rate=rate, options=options).since(origin)
-    if not correspondence:
-        return different_points(first, second, max_shift=max_shift, rate=rate, options=options).since(origin)
-    if a.shape[1] != b.shape[1]:
-        text = (
-            "{camera:a} has {a} points and {camera:b} {b}: corresponding points are as many; "
-            "give the same ones in the same order, or {arg:correspondence=False}"
-        )
-        raise ValueError(Message(text, a=a.shape[1], b=b.shape[1]))
-    result = same_points(
-        first,
-        second,
-        max_shift=max_shift,
-        rate=rate,
-        camera=camera,
-        lenses=calibration is None,
-        generator=generator,
-        options=options,
-    )
-    return _shift(result, options).since(origin)
+    return first, second, origin
 
 
 def _check(
@@ -436,7 +466,26 @@ def _pairwise(calibration: Any) -> Sequence[Any]:
     return calibration
 
 
+def _spatial(tracks: Sequence[Tracks], camera: str) -> bool:
+    """Whether one of both is of points in space.
+
+    Raises:
+        ValueError: both are, or the kind of camera is one of two cameras.
+    """
+    count = sum(one.x.shape[-1] == 3 for one in tracks)
+    if count == 2:
+        text = "{camera:a} and {camera:b} both hold points in space (frames, points, 3): one must be a camera (frames, points, 2)"
+        raise ValueError(Message(text))
+    if count and camera in ("affine", "projective"):
+        raise ValueError(f"camera={camera!r} is for two cameras, and one of both holds points in space; leave it out")
+    return count == 1
+
+
 def _straight(name: str, tracks: Tracks, lens: Any) -> Tracks:
+    if tracks.x.shape[-1] == 3:
+        if lens is None:
+            return tracks
+        raise ValueError(Message("calibration of {camera:{which}}: it holds points in space; give None for it", which=name))
     try:
         x = undistorted(tracks.x, lens)
     except ValueError as problem:
@@ -481,6 +530,7 @@ def _shift(result: Result, options: SynchronizeOptions) -> Shift:
         scores=found.curve.scores,
         points=points,
         fundamental=fit.fundamental if found.method == "epipolar" else None,
+        projection=fit.fundamental if found.method == "camera" else None,
         status=status_from(limits),
         notices=limits,
     )
@@ -502,6 +552,8 @@ def _refusal(found: Attempt, options: SynchronizeOptions) -> Notice:
     assert fit is not None
     if fit.sigma > options.search.blind * found.frame:
         return _nothing(found)
+    if found.agree and found.margin >= found.needed and found.forward < found.needed_forward:
+        return Notice(ShiftNotice.BACKWARDS, found.forward)
     if found.edge:
         return Notice(ShiftNotice.EDGE, fit.shift, {"best": fit.shift})
     if not found.sharp:
@@ -514,4 +566,4 @@ def _refusal(found: Attempt, options: SynchronizeOptions) -> Notice:
     first, second = found.halves
     shifts = (f"{fit.shift + away * found.frame:+.3g} s" for away in (first, second))
     said = " and ".join("nothing" if "nan" in shift else shift for shift in shifts)
-    return Notice(ShiftNotice.HALVES, 0.0, {"halves": said, "apart": options.evidence.apart, "best": fit.shift})
+    return Notice(ShiftNotice.HALVES, 0.0, {"halves": said, "apart": found.apart, "best": fit.shift})

@@ -25,7 +25,7 @@ class Tracks:
     """Points of one camera.
 
     Attributes:
-        x: ``(frames, n, 2)`` float64, 0 where missing.
+        x: ``(frames, n, 2)`` float64, 0 where missing; of points in space ``(frames, n, 3)``.
         weights: ``(frames, n)``, 0 where missing.
         times: ``(frames,)`` seconds, increasing.
         step: seconds from one frame to the next, the median.
@@ -65,7 +65,7 @@ class Tracks:
 
     @cached_property
     def change(self) -> Tensor:
-        """``(3, 3)`` similarity to mean 0 and root mean square distance sqrt(2)."""
+        """``(3, 3)`` similarity to mean 0 and root mean square distance sqrt(2); of points in space ``(4, 4)``."""
         share = (self.weights / self.weights.sum().clamp(min=1e-300))[..., None]
         scale = math.sqrt(2) / self.scale if self.scale > 0 else 1.0
         return similarity(torch.as_tensor(scale, dtype=torch.float64, device=self.x.device), (self.x * share).sum((0, 1)))
@@ -83,14 +83,15 @@ class Tracks:
 def read_tracks(
     name: str, x: Tensor, fps: float | None, times: Tensor | None, weights: Tensor | None, options: SynchronizeOptions
 ) -> Tracks:
-    """Tracks of checked input.
+    """Tracks of checked input, of a camera or of points in space.
 
     Raises:
         ValueError: naming a or b, what is wrong with it, and what to do.
     """
-    if not isinstance(x, Tensor) or x.ndim != 3 or x.shape[-1] != 2:
+    if not isinstance(x, Tensor) or x.ndim != 3 or x.shape[-1] not in (2, 3):
         got = tuple(x.shape) if isinstance(x, Tensor) else type(x).__name__
-        raise ValueError(Message("{camera:{which}} must be a tensor (frames, points, 2), got {got}", which=name, got=got))
+        text = "{camera:{which}} must be a tensor (frames, points, 2), got {got}; of motion capture (frames, points, 3)"
+        raise ValueError(Message(text, which=name, got=got))
     if x.shape[1] == 0:
         raise ValueError(
             Message("{camera:{which}} has no points: shape {shape}; give (frames, points, 2)", which=name, shape=tuple(x.shape))
@@ -178,6 +179,11 @@ def noise_ratio(a: Tracks, b: Tracks) -> float:
     return min(max(noise, size / 2), size * 2)
 
 
+def image_of(a: Tracks, b: Tracks) -> Tracks:
+    """Of a camera and points in space the camera; of two cameras the first."""
+    return a if a.x.shape[-1] == 2 else b
+
+
 def smoothed(tracks: Tracks, at: Tensor, width: float, options: SynchronizeOptions) -> tuple[Tensor, Tensor, Tensor]:
     r"""Positions and velocities at any moments, by a line fitted to the frames around each, with Gaussian weights.
 
@@ -196,7 +202,7 @@ def smoothed(tracks: Tracks, at: Tensor, width: float, options: SynchronizeOptio
         where frames on one side are missing, 0 in gaps.
     """
     taps = 2 * (math.ceil(options.cleaning.kernel_end * width / tracks.step) + 1) + 1
-    rows = max(1, PIECE // max(1, taps * tracks.x.shape[1] * 2))
+    rows = max(1, PIECE // max(1, taps * tracks.x[0].numel()))
     pieces = [_smoothed(tracks, piece, width, taps // 2, options) for piece in at.split(rows)] or [
         _smoothed(tracks, at, width, taps // 2, options)
     ]
@@ -204,16 +210,16 @@ def smoothed(tracks: Tracks, at: Tensor, width: float, options: SynchronizeOptio
 
 
 def _smoothed(tracks: Tracks, at: Tensor, width: float, taps: int, options: SynchronizeOptions) -> tuple[Tensor, Tensor, Tensor]:
-    frames, points = tracks.weights.shape
+    frames = len(tracks.weights)
     near = torch.searchsorted(tracks.times, at.contiguous())[:, None] + torch.arange(-taps, taps + 1, device=at.device)
     index = near.clamp(0, frames - 1)
     u = (tracks.times[index] - at[:, None]) / width
     kernel = torch.exp(-0.5 * u.square()) * (near == index)  # (m, taps)
-    w, x = tracks.weights[index], tracks.x[index].flatten(2)  # (m, taps, n), (m, taps, 2n)
+    w, x = tracks.weights[index], tracks.x[index].flatten(2)  # (m, taps, n), (m, taps, d n)
     powers = torch.stack([kernel, kernel * u, kernel * u * u], dim=1)  # (m, 3, taps)
     s0, s1, s2 = torch.bmm(powers, w).unbind(1)
-    wx = (w[..., None] * x.unflatten(2, (points, 2))).flatten(2)
-    t0, t1 = torch.bmm(powers[:, :2], wx).unflatten(2, (points, 2)).unbind(1)
+    wx = (w[..., None] * x.unflatten(2, tracks.x.shape[1:])).flatten(2)
+    t0, t1 = torch.bmm(powers[:, :2], wx).unflatten(2, tracks.x.shape[1:]).unbind(1)
     full = math.sqrt(2 * math.pi) * width / tracks.step
     determinant = s0 * s2 - s1.square()
     usual = torch.bmm(powers[:, :1], (w > 0).double())[:, 0]  # the kernel's weight on frames that show the point

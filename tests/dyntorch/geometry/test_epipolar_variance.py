@@ -5,7 +5,7 @@ import pytest
 import scipy.linalg
 import torch
 
-from dyntorch.geometry.epipolar import epipolar_variance, gradient_moments, sampson_squared
+from dyntorch.geometry.epipolar import epipolar_variance, gradient_moments, least_ratio, sampson_squared
 from dyntorch.geometry.homogeneous import homogeneous
 from dyntorch.scenes import filmed
 
@@ -125,3 +125,19 @@ def test_fewer_matches_than_unknowns_have_no_variance():
     variance, F = epipolar_variance(moments_of(x1[:5], x2[:5]))
     assert not variance.isnan() and F.isfinite().all()
     assert variance == torch.inf or variance < 1e-9
+
+
+@pytest.mark.parametrize("size", [2, 4, 8])
+def test_the_least_ratio_is_the_least_generalized_eigenvalue(size):
+    draw = torch.Generator().manual_seed(size)
+    inner, form = (torch.randn(3, size, size, generator=draw, dtype=torch.float64) for _ in range(2))
+    inner = inner @ inner.mT + torch.diag_embed(10.0 ** torch.arange(size, dtype=torch.float64))
+    form = form @ form.mT
+    form[:, -1], form[:, :, -1] = 0.0, 0.0  # a direction that costs nothing is never the answer
+    ratio, vector = least_ratio(inner, form, torch.tensor([True, True, False]))
+    for k in range(2):
+        expected = 1 / scipy.linalg.eigh(form[k].numpy(), inner[k].numpy(), eigvals_only=True)[-1]
+        assert float(ratio[k]) >= expected * (1 - 1e-9)  # inverse iteration comes from above
+        assert float(ratio[k]) == pytest.approx(expected, rel=0.1)
+        assert float(vector[k].norm()) == pytest.approx(1)
+    assert ratio[2] == torch.inf

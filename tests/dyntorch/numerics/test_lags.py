@@ -259,3 +259,26 @@ def test_the_engine_lifts_blocks_not_sequences():
     x = normal(0, 1, 20_000, 1, 1)
     correlate(x, x, (-5, 5), lift)
     assert max(seen) <= 2048
+
+
+@pytest.mark.parametrize("per_point", [False, True])
+def test_resection_moments_equal_the_loop(per_point):
+    x, X, w1, w2 = normal(20, 7, 3, 2), normal(21, 9, 3, 3), normal(22, 7, 3).abs(), normal(23, 9, 3).abs()
+    w1[2, 1], w2[4] = 0.0, 0.0
+    x[2, 1], X[3, 2] = torch.nan, torch.inf
+    found, counts = lags.resection_moments(x, X, None, (w1, w2), per_point)
+    w1, w2 = (torch.where(y.isfinite().all(-1), w, 0.0) for y, w in ((x, w1), (X, w2)))
+    x, X = (torch.where(w[..., None] > 0, y, 0.0) for y, w in ((x, w1), (X, w2)))
+    X = torch.cat([X, torch.ones(9, 3, 1)], -1)
+    of_image = torch.stack([torch.ones(7, 3), x[..., 0], x[..., 1], x.square().sum(-1)], -1)
+    for k, window in enumerate(overlaps(7, 9, None)):
+        a, b = window
+        w = w1[a] * w2[b]
+        expected = torch.einsum("tn,tnk,tni,tnj->nkij", w, of_image[a], X[b], X[b])
+        assert_same(found[:, k] if per_point else found[k], expected if per_point else expected.sum(0))
+        assert torch.allclose(counts[:, k] if per_point else counts[k], w.sum(0) if per_point else w.sum())
+
+
+def test_resection_moments_of_what_is_no_camera_and_space_are_refused():
+    with pytest.raises(ValueError, match=r"\(\*batch, frames, n, 2\) in a camera and \(\*batch, frames, n, 3\) in space"):
+        lags.resection_moments(normal(0, 5, 3, 3), normal(1, 5, 3, 2))

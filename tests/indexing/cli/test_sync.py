@@ -17,6 +17,7 @@ import dyntorch
 from dyntorch.numerics import Message
 from dyntorch.tasks.synchronize.cameras import synchronize_cameras
 from indexing.clip import Clip, ClipSet
+from tests.indexing.sync.footage import microphone, noises, numbers_of, write_film
 from tests.indexing.sync.scene import FPS, SKIPPED, cut, filmed, shift, write_openpose
 
 # torch's own, when it first loads its transforms; hidden outside of tests
@@ -199,6 +200,13 @@ def test_what_is_there_is_not_lost(run, library, data, tmp_path):
         ("@/pose --fps fast", "--fps must be one positive number"),
         ("@/pose --max-shift -1", "--max-shift must be a positive number of seconds, got -1"),
         ("@/pose --check", "--check writes a video; say where with --out"),
+        ("@/pose --videos", "--videos writes videos; say where with --out"),
+        ("@/pose --videos --out out", "cam01_json: no video of this camera is known: give the video itself, or put it beside"),
+        ("@/pose --videos --videos-fps 0 --out out", "--videos-fps must be a positive number of frames per second, got 0"),
+        ("@/pose --videos-fps 25", "--videos-fps is of the videos that --videos writes; add --videos"),
+        ("@/pose --by sound", "cam01_json: is no video, and --method sound needs their sound; give the videos, or use --method k"),
+        ("@/pose --by sound --method tracks", "--by sound: --method tracks compares the pixels of videos; leave --by out"),
+        ("@/pose --by pixels --method sound", "--by pixels: --method sound compares the sound of videos; leave --by out"),
         ("@/pose --method brightness", "holds keypoints, and --method brightness needs videos"),
         ("@/pose --method guess", "see dyntorch sync --help"),
         ("@/pose --calibration no.toml", "no.toml: no such file"),
@@ -209,6 +217,62 @@ def test_bad_input_is_one_line_and_code_2(run, library, tmp_path, line, says):
     code, out, err = run(line)
     assert (code, out) == (2, "") and list(tmp_path.iterdir()) == []
     assert err.startswith("dyntorch: ") and err.count("\n") == 1 and says in err
+
+
+# ---- videos with sound -----------------------------------------------------------------------------------------------------
+@pytest.fixture(scope="module")
+def films(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """``left.mp4`` and ``right.mp4``, which began 1.4 s later; ``mute.mp4``; and ``other.mp4`` of another place."""
+    pytest.importorskip("av")
+    folder, scene = tmp_path_factory.mktemp("films"), noises(25.0, 2)
+    for i, (name, start) in enumerate((("left", 1.0), ("right", 2.4))):
+        numbers = np.round((start + np.arange(int(20 * FPS)) / FPS) * 100).astype(np.int64)
+        write_film(folder / f"{name}.mp4", numbers, FPS, microphone(scene, start, 20.0, i))
+    write_film(folder / "other.mp4", np.arange(600), FPS, microphone(noises(25.0, 7), 0.0, 20.0, 5))
+    write_film(folder / "mute.mp4", np.arange(60), FPS)
+    return folder
+
+
+def test_sound_alone_and_videos_of_equal_frames(run, films):
+    code, out, err = run(f"{films}/left.mp4 {films}/right.mp4 --by sound --videos --out out")
+    assert (code, err) == (0, "") and "right began 1.4" in out
+    [pair] = read()["pairs"]
+    assert pair["method"] == "sound" and pair["offset"] == pytest.approx(-1.4, abs=0.003) and pair["sound"]["later"] == 0
+    videos = read()["videos"]
+    first, second = (np.array(numbers_of(Path("out") / one["file"])) for one in videos["cameras"].values())
+    assert len(first) == len(second) == videos["frames"] and abs(videos["frames"] - 18.6 * FPS) <= 2
+    assert np.abs(first - second).max() <= 0.5 / FPS * 100 + 1
+    assert f"videos: out/synchronized_videos/, 2 videos of {videos['frames']} frames, 30 per second, within" in out
+    assert "frame k of every file is one moment" in Path("out/report.html").read_text()
+    assert run(f"{films}/left.mp4 {films}/right.mp4 --method sound --out out")[0] == 0
+    assert read()["videos"] is None and not Path("out/synchronized_videos").exists()
+    assert "videos of an earlier run in synchronized_videos were removed" in Path("out/report.html").read_text()
+
+
+def test_sound_that_does_not_decide(run, films):
+    code, _, err = run(f"{films}/left.mp4 {films}/other.mp4 --by sound --videos --out out")
+    assert code == 3 and "no shift of the sound stands out" in err and not Path("out/synchronized_videos").exists()
+    assert "mute has no sound" in run(f"{films}/left.mp4 {films}/mute.mp4 --by sound")[2]
+
+
+def test_sound_is_a_witness(run, films, monkeypatch):
+    said: dict = {"offset": -1.39}
+    monkeypatch.setattr("indexing.sync.synchronize.synchronize_videos", lambda *_, **__: shift(**said))
+    line = f"{films}/left.mp4 {films}/right.mp4 --by pixels --out out"
+    code, out, _ = run(line)
+    assert code == 0 and "note: sound agrees: -0.010 s" in out and read()["pairs"][0]["sound"]["ok"]
+    said["offset"] = -0.9
+    code, out, err = run(line)
+    assert code == 3 and "the sound says -1.400 ± 0.017 s, and the pictures say -0.900 ± 0.002 s" in err
+    assert "--method sound takes the word of the sound, --no-sound that of the pictures" in err
+    assert run(f"{line} --no-sound")[0] == 0 and read()["pairs"][0]["sound"] is None
+    code, out, _ = run(f"{films}/left.mp4 {films}/other.mp4 --by pixels")
+    assert code == 0 and "note: the sound does not decide: no shift of the sound stands out" in out
+    code, out, _ = run(f"{films}/left.mp4 {films}/mute.mp4 --by pixels")
+    assert code == 0 and "sound" not in out
+    said.update(ok=False, reason="too still")
+    code, out, err = run(line)
+    assert code == 3 and "too still" in err and "the sound says -1.400 ± 0.017 s; --method sound takes its word" in out
 
 
 def test_help_loads_nothing_heavy():

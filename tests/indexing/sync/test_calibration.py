@@ -32,6 +32,10 @@ def test_calibration_files(tmp_path, cameras, library):
     by_order = lenses(path, ["left", "right"])
     assert by_order is not None and by_order.values[0][0][0, 0] == 1671.5 and "in the order of its file" in by_order.notes[0]
     assert lenses(None, ["a", "b"]) is None
+    assert [lens.size for lens in read_calibration(path)] == [(1088.0, 1920.0)] * 2
+    for odd in ("[1088]", "[0, 5]", '"large"', "[nan, 1]", "[]"):
+        path.write_text(TOML.format(1).replace("[ 1088.0, 1920.0]", odd))
+        assert read_calibration(path)[0].size is None  # nothing hangs on it
 
 
 def test_lenses_of_many_cameras_by_order_have_their_names(tmp_path):
@@ -53,7 +57,7 @@ def test_lenses_of_many_cameras_by_order_have_their_names(tmp_path):
         (TOML.format(1).replace("1671.5", "-1.0"), r"\[int_cam1_img\] matrix: expected 3 x 3 with positive focal lengths"),
         (TOML.format(1).replace("-0.05,", ""), r"distortions: expected 4, 5 or 8 numbers, got 3"),
         (TOML.format(1).replace("-0.05", "nan"), r"distortions: expected finite numbers"),
-        (TOML.format(1), r"its cameras are int_cam1_img, and cam1, cam2 are to be synchronized"),
+        (TOML.format(1), r"its cameras are int_cam1_img, and cam1, cam2 are asked for"),
         (TOML.format(1).replace("false", "true") + TOML.format(2), r"has a fisheye lens"),
     ],
 )

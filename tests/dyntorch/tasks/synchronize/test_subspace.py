@@ -228,7 +228,7 @@ def test_the_jackknife_is_that_of_blocks_left_out():
             blocks = shape[:, :14, :14], shape[:, 14:, 14:], shape[:, :14, 14:]
             told.append(
                 SynchronizeOptions().subspace.shape_rate * _shared(*blocks)
-                + SynchronizeOptions().subspace.height_rate * _shared(*_vertical(*blocks))
+                + SynchronizeOptions().subspace.height_rate * _shared(*_vertical(blocks, (2, 2)))
             )
             told[-1] = float(
                 told[-1]

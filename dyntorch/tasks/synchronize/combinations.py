@@ -1,0 +1,247 @@
+r"""A camera and motion capture that share no point: what the camera sees as combinations of what was recorded, between frames.
+
+A joint that a network finds is near a fixed combination of markers, :math:`X_i = \bar X + \sum_k w_{ik} Y_k`: of the middle of all
+markers and of few orthonormal combinations :math:`Y_k` of them, those that move most.  Combinations, camera and shift are fitted
+together to the distances in the image,
+
+.. math:: \min_{s, P, w} \sum_{it} \rho\bigl(|x_{it} - P(\bar X + \textstyle\sum_k w_{ik} Y_k)(t + s)|^2\bigr) + \sigma^2 |w|^2 / \omega^2,
+
+from the lag that the row spaces give: these know whole frames well, and places between them as well as an affine camera does.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dyntorch.numerics.least_squares import Iterate, LeastSquares, LeastSquaresOptions, Tensors, minimize
+from dyntorch.tasks.synchronize.epipolar import Grid, long_run
+from dyntorch.tasks.synchronize.options import SynchronizeOptions
+from dyntorch.tasks.synchronize.subspace import completed, filled
+from dyntorch.tasks.synchronize.tracks import Tracks, smoothed
+
+
+@dataclass(frozen=True, eq=False)
+class CombinedFit:
+    """A minimum.
+
+    Attributes:
+        offset: of the space's clock at time 0 of the camera's, seconds.
+        sigma: its standard deviation, robust against what residuals have in common over time.
+        residual: robust standard deviation of a coordinate, px.
+        camera: ``(3, 4)``, of normalized coordinates.
+        weights: ``(n, k)``.
+    """
+
+    offset: float
+    sigma: float
+    residual: float
+    camera: Tensor
+    weights: Tensor
+
+
+def combined_fit(film: Tracks, space: Tracks, offset: float, rate: float, options: SynchronizeOptions) -> CombinedFit | None:
+    """The shift near an offset at which combinations of the points in space are what the camera sees; None where none is found.
+
+    Args:
+        film: of the camera.
+        space: of points in space.
+        offset, rate: of the space's clock against the camera's, the offset good to a frame or two.
+    """
+    problem = _Problem.of(film, space, offset, rate, options)
+    if problem is None:
+        return None
+    theta = problem.started()
+    if theta is None:
+        return None
+    chosen = options.combined
+    for _ in range(chosen.rounds):
+        start = problem.evaluate(theta)
+        if not bool(start.cost.isfinite()):
+            return None
+        theta = minimize(problem, start, LeastSquaresOptions(iterations=chosen.iterations, tolerance=chosen.tolerance)).theta
+        problem = problem.weighed(theta)
+    return problem.fit(theta)
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem(LeastSquares):
+    """One problem: parameters are the camera ``(1, 3, 4)``, weights ``(1, n, k)`` and the shift from the start, frames ``(1, 1)``."""
+
+    x: Tensor  # (T, n, 2) normalized
+    sure: Tensor  # (T, n) weights as given, 0 where not seen
+    robust: Tensor  # (T, n)
+    times: Tensor  # (T,) of the space's clock at the start
+    grid: Grid  # of the middle and the combinations, (m, 1 + k, 3)
+    frame: float
+    offset: float
+    width: float
+    unit: float  # normalized per px
+    ridge: float
+    options: SynchronizeOptions
+
+    @staticmethod
+    def of(film: Tracks, space: Tracks, offset: float, rate: float, options: SynchronizeOptions) -> _Problem | None:
+        frame = max(film.step, space.step)
+        stride = max(1, math.ceil(len(film.times) * film.x.shape[1] / options.combined.most_rows))
+        times = film.every(frame * stride)
+        x, _, sure = smoothed(film, times, frame, options)
+        change = film.change
+        x = torch.where((sure > 0)[..., None], x @ change[:2, :2].mT + change[:2, 2], 0.0)
+        grid = Grid.of(_combinations(space, film.noise / max(film.scale, 1e-300), options), frame, options)
+        there = times * rate + offset
+        reach = options.combined.reach * frame
+        first, last = grid.start + reach, grid.start + (len(grid.x) - 1) * grid.step - reach
+        sure = torch.where(((there >= first) & (there <= last))[:, None], sure, 0.0)
+        if int((sure > 0).sum()) < options.combined.fewest * film.x.shape[1]:
+            return None
+        unit = float(change[0, 0])
+        return _Problem(x, sure, torch.ones_like(sure), there, grid, frame, offset, frame, unit, unit**2, options)
+
+    def started(self) -> Tensors | None:
+        """An affine camera and weights: regressions of all coordinates on those in space have the form :math:`w_i \\otimes A`."""
+        places, _, _ = self.grid.at(self.times)
+        kept = min(places.shape[1] - 1, self.options.combined.start_combinations)
+        design = torch.cat([places[:, : 1 + kept].flatten(1), torch.ones_like(places[:, 0, :1])], 1)
+        weights = self.sure.mT  # (n, T)
+        normal = torch.einsum("nt,ti,tj->nij", weights, design, design)
+        size = weights.sum(-1)[:, None, None] * torch.eye(design.shape[1], dtype=design.dtype, device=design.device)
+        right = torch.einsum("nt,ti,tnc->nic", weights, design, self.x)
+        found, failed = torch.linalg.solve_ex(normal + self.options.combined.start_ridge * size, right)
+        if bool(failed.any()) or not bool(found.isfinite().all()):
+            return None
+        own = found[:, :3].mean(0)  # (3, 2) of the middle
+        block = found[:, 3 : 3 + 3 * kept].unflatten(1, (kept, 3))  # (n, k, 3, 2)
+        left, values, right = torch.linalg.svd(block.flatten(2).flatten(0, 1), full_matrices=False)
+        camera = right[0].unflatten(0, (3, 2))
+        along = float((own * camera).sum())
+        scale = along if abs(along) > 1e-9 else 1.0
+        shares = (left[:, 0] * values[0] / scale).unflatten(0, (len(found), kept))
+        P = self.x.new_zeros(3, 4)
+        P[:2, :3] = scale * camera.mT
+        P[2, 3] = 1.0
+        W = self.x.new_zeros(len(found), places.shape[1] - 1)
+        W[:, :kept] = shares
+        whole = places[:, None, 0] + torch.einsum("nk,tkd->tnd", W, places[:, 1:])
+        away = self.x - whole @ P[:2, :3].mT
+        P[:2, 3] = (away * self.sure[..., None]).sum((0, 1)) / self.sure.sum()
+        return P[None], W[None], self.x.new_zeros(1, 1)
+
+    def _images(self, theta: Tensors) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """Images ``(T, n, 2)``, depths, points ``(T, n, 3)``, their velocities, and the combinations ``(T, 1 + k, 3)``."""
+        P, W, shift = (part[0] for part in theta)
+        places, speeds, _ = self.grid.at(self.times + self.frame * shift)
+        X = places[:, None, 0] + torch.einsum("nk,tkd->tnd", W, places[:, 1:])
+        V = speeds[:, None, 0] + torch.einsum("nk,tkd->tnd", W, speeds[:, 1:])
+        local = X @ P[:, :3].mT + P[:, 3]
+        return local[..., :2] / local[..., 2:], local[..., 2], X, V, places
+
+    def evaluate(self, theta: Tensors) -> Iterate:
+        """The cost; infinite where a point is not before the camera, or the shift has left."""
+        P, W, shift = theta
+        P = P / P.flatten(1).norm(dim=-1)[:, None, None].clamp(min=1e-30)
+        theta = (P, W, shift)
+        images, depth, *_ = self._images(theta)
+        weight = self.sure * self.robust
+        # depths are of one sign; the camera may have either
+        front = bool(((depth > 0) | (weight == 0)).all()) or bool(((depth < 0) | (weight == 0)).all())
+        inside = float(shift.abs().max()) <= self.options.combined.reach
+        cost = (weight * (images - self.x).square().sum(-1)).sum() + self.ridge * W.square().sum()
+        return Iterate(theta, cost[None] if front and inside else torch.full_like(shift[:, 0], math.inf), ())
+
+    def _derivatives(self, theta: Tensors) -> tuple[Tensor, Tensor, Tensor]:
+        """Residuals ``(n, 2 T)``, and derivatives by the weights ``(n, 2 T, k)`` and by camera and shift ``(n, 2 T, 13)``."""
+        P = theta[0][0]
+        images, depth, X, V, places = self._images(theta)
+        root = (self.sure * self.robust).sqrt()[..., None] / 1.0
+        rows = (P[:2, :3] - images[..., None] * P[2, :3]) / depth[..., None, None]  # (T, n, 2, 3) by the point
+        by_weights = torch.einsum("tncd,tkd->tnck", rows, places[:, 1:])
+        by_shift = self.frame * torch.einsum("tncd,tnd->tnc", rows, V)
+        rays = torch.cat([X, torch.ones_like(depth)[..., None]], -1) / depth[..., None]
+        by_camera = X.new_zeros(*images.shape, 3, 4)
+        by_camera[..., 0, 0, :] = by_camera[..., 1, 1, :] = rays
+        by_camera[..., 2, :] = -images[..., None] * rays[..., None, :]
+        common = torch.cat([by_camera.flatten(-2), by_shift[..., None]], -1)
+        residual = (images - self.x) * root
+        return (
+            residual.movedim(1, 0).flatten(1),
+            (by_weights * root[..., None]).movedim(1, 0).flatten(1, 2),
+            (common * root[..., None]).movedim(1, 0).flatten(1, 2),
+        )
+
+    def step(self, at: Iterate, damping: Tensor) -> Tensors:
+        """The weights of each point are eliminated: what is left is camera and shift."""
+        P, W, _ = at.theta
+        residual, own, common = self._derivatives(at.theta)
+        A = own.mT @ own
+        unit = torch.eye(A.shape[-1], dtype=A.dtype, device=A.device)
+        A = A + self.ridge * unit + damping * torch.diag_embed(A.diagonal(dim1=-2, dim2=-1))
+        B, C = own.mT @ common, (common.mT @ common).sum(0)
+        gradient = (own.mT @ residual[..., None])[..., 0] + self.ridge * W[0]
+        shared = torch.einsum("nti,nt->i", common, residual)
+        solved = torch.linalg.solve_ex(A, torch.cat([B, gradient[..., None]], -1))[0]
+        inner = C + damping * torch.diag(C.diagonal()) - (B.mT @ solved[..., :-1]).sum(0)
+        # the norm of the camera is free
+        normal = torch.cat([P[0].flatten(), P.new_zeros(1)])
+        inner = inner + inner.diagonal().abs().max() * torch.outer(normal, normal)
+        move = torch.linalg.solve_ex(inner, shared - torch.einsum("nki,nk->i", B, solved[..., -1]))[0]
+        weights = solved[..., -1] - solved[..., :-1] @ move
+        return move[:12].unflatten(0, (1, 3, 4)), weights[None], move[12:][None]
+
+    def subset(self, keep: Tensor) -> _Problem:
+        """There is one."""
+        return self
+
+    def weighed(self, theta: Tensors) -> _Problem:
+        """With robust weights at these parameters, and the ridge that the residual asks for."""
+        distance = (self._images(theta)[0] - self.x).norm(dim=-1)
+        scale = float(distance[self.sure > 0].median()) / 1.1774
+        scale = max(scale, self.options.combined.exact)
+        robust = (1 + (distance / (self.options.descent.cut * scale * math.sqrt(2))).square()).pow(-2)
+        return dataclasses.replace(self, robust=robust, ridge=(scale / self.options.combined.usual_weight) ** 2)
+
+    def fit(self, theta: Tensors) -> CombinedFit | None:
+        """What is found, with the influence of every frame on the shift."""
+        residual, own, common = self._derivatives(theta)
+        A = own.mT @ own + self.ridge * torch.eye(own.shape[-1], dtype=own.dtype, device=own.device)
+        free = common - own @ torch.linalg.solve_ex(A, own.mT @ common)[0]
+        inner = (common.mT @ free).sum(0)
+        inverse = torch.linalg.pinv((inner + inner.mT) / 2, hermitian=True, rtol=1e-10)
+        influence = torch.einsum("nti,i->nt", free, inverse[:, 12]) * residual
+        frames = influence.unflatten(1, (len(self.times), 2)).sum((0, 2))[:, None]
+        step = float(self.times[1] - self.times[0])
+        span = float(self.times[-1] - self.times[0])
+        descent = self.options.descent
+        memory = round(min(descent.memory, span / descent.memory_parts) / step)
+        sigma = self.frame * self.options.combined.optimism * float(long_run(frames, memory)[0])
+        if not math.isfinite(sigma):
+            return None
+        distance = (self._images(theta)[0] - self.x).norm(dim=-1)[self.sure > 0]
+        shift = float(theta[2]) * self.frame
+        return CombinedFit(
+            offset=self.offset + shift,
+            sigma=math.hypot(sigma, self.options.combined.least_sigma * self.frame),
+            residual=float(distance.median()) / 1.1774 / self.unit,
+            camera=theta[0][0],
+            weights=theta[1][0],
+        )
+
+
+def _combinations(space: Tracks, noise: float, options: SynchronizeOptions) -> Tracks:
+    """The middle of all points, then orthonormal combinations about it that move by more than the noise, in units of the size."""
+    seen = space.weights > 0
+    x = completed(filled(space.x, seen, options), seen, options)
+    middle = x.mean(1, keepdim=True)
+    about = (x - middle) / max(float((x - middle).square().sum((1, 2)).mean().sqrt()), 1e-300)
+    by_point = about.movedim(1, 0).flatten(1)
+    values, vectors = torch.linalg.eigh(by_point @ by_point.mT / len(x))
+    kept = int((values > (options.combined.above * noise) ** 2).sum())
+    kept = min(max(kept, options.combined.start_combinations), options.combined.most_combinations, len(values))
+    parts = torch.einsum("tnd,nk->tkd", about, vectors[:, len(values) - kept :].flip(-1))
+    scale = max(float((x - middle).square().sum((1, 2)).mean().sqrt()), 1e-300)
+    whole = torch.cat([(middle - middle.mean(0)) / scale, parts], dim=1)
+    return dataclasses.replace(space, x=whole, weights=torch.ones_like(whole[..., 0]))

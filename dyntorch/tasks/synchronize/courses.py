@@ -1,0 +1,397 @@
+"""An offset that jumps: the cheapest course of lags under one fundamental matrix, and what speaks for each of its jumps."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from dyntorch.geometry.epipolar import epipolar_variance
+from dyntorch.numerics.lags import epipolar_moments
+from dyntorch.tasks.synchronize.epipolar import EpipolarFit, Grid, Samples, ShiftDescent, epipolar_curve
+from dyntorch.tasks.synchronize.options import SynchronizeOptions
+from dyntorch.tasks.synchronize.tracks import Tracks, smoothed
+
+# ----------------------------------------------------------------------------------------------------------------------
+# One fundamental matrix, and at every moment the lag that it explains best: the cheapest course of lags that seldom jumps.
+
+
+@dataclass(frozen=True)
+class Jump:
+    """Where the offset changes, on a's clock, as the frames' own times say.
+
+    Attributes:
+        moment: seconds of a's clock: the last moment before.
+        sigma: of the moment, seconds.
+        size: seconds by which the offset grows; negative where b lost frames.
+    """
+
+    moment: float
+    sigma: float
+    size: float
+
+
+@dataclass(frozen=True)
+class Course:
+    """An offset with jumps.
+
+    Attributes:
+        rate: of b's clock that was taken out.
+        offset: of the first piece, seconds.
+        jumps: in order.
+        fit: of everything, with what was lost put back.
+        scale: ``(n,)`` standard deviation of each point's residuals, px.
+    """
+
+    rate: float
+    offset: float
+    jumps: tuple[Jump, ...]
+    fit: EpipolarFit
+    scale: Tensor
+
+    def at(self, moment: float) -> float:
+        """The offset at a moment of a's clock, seconds."""
+        return self.offset + sum(jump.size for jump in self.jumps if jump.moment < moment)
+
+
+class CourseSearch:
+    """Both cameras at equal steps of a's clock, for one rate of b's."""
+
+    def __init__(self, a: Tracks, b: Tracks, rate: float, max_shift: float | None, options: SynchronizeOptions) -> None:
+        self.a, self.b, self.rate, self.options = a, b, rate, options
+        self.step = max(a.step, b.step)
+        self.samples = Samples.of(a, b, self.step, rate, options=options)
+        self.max_shift = max_shift
+        self.times = a.every(self.step)
+        self.x, _, self.weights = smoothed(a, self.times, self.step, options)
+        self.grid = Grid.of(b, self.step, options)
+
+    def starts(self) -> list[tuple[float, float, Tensor]]:
+        """Middle, offset and fundamental matrix (px) of windows of the take by themselves: within most of them nothing jumps."""
+        options, w1 = self.options.breaks, self.samples.w1
+        size = round(options.window / self.step)
+        count = min(options.most_windows, max(1, round(2 * len(w1) / size) - 1))
+        found = []
+        for first in np.linspace(0, max(0, len(w1) - size), count).round().astype(int).tolist():
+            part = torch.zeros_like(w1)
+            part[first : first + size] = w1[first : first + size]
+            samples = dataclasses.replace(self.samples, w1=part)
+            best = epipolar_curve(samples, self.max_shift, options.window_overlap, options=self.options).peaks(1)
+            if best:
+                middle = float(self.times[min(first + size // 2, len(self.times) - 1)])
+                found.append((middle, best[0][0] * self.rate, self._fundamental(samples, best[0][0])))
+        return found
+
+    def _fundamental(self, samples: Samples, lag: float) -> Tensor:
+        """Of px, by the pairs at the nearest step."""
+        at = round((lag - samples.start) / samples.step)
+        moments, _ = epipolar_moments(samples.x1, samples.x2, (at, at), (samples.w1, samples.w2))
+        F = epipolar_variance(moments, samples.noise)[1][0]
+        return self.b.change.mT @ F @ self.a.change
+
+    def residuals(self, F: Tensor, offset: float) -> Tensor:
+        """Signed Sampson distances ``(T, n)`` in px of a at one offset; NaN where not both are seen."""
+        x2, _, w2 = self.grid.at(self.times * self.rate + offset)
+        ratio = self._ratio
+        Fp, Fq = _mapped(self.x, F), _mapped(x2, F.mT)
+        gradient = Fq[..., :2].square().sum(-1) + ratio**2 * Fp[..., :2].square().sum(-1)
+        distance = ((x2 * Fp[..., :2]).sum(-1) + Fp[..., 2]) / gradient.clamp(min=1e-300).sqrt()
+        return torch.where((self.weights > 0) & (w2 > 0), distance, torch.nan)
+
+    @cached_property
+    def _ratio(self) -> float:
+        s1, s2 = self.samples.noise
+        return s2 / s1 * float(self.a.change[0, 0]) / float(self.b.change[0, 0])
+
+    def costs(self, F: Tensor, offsets: Tensor, scale: Tensor) -> NDArray[np.float64]:
+        """Nats ``(T, L)`` that the residuals of every moment cost at each offset; a little more than usual where nothing is seen,
+        or the course would go where that is so."""
+        unseen = self.options.breaks.unseen
+        return np.stack([_cost(self.residuals(F, one), scale, self.options, unseen) for one in offsets.tolist()], axis=1)
+
+    def scale(self, F: Tensor, offset: float) -> Tensor:
+        """``(n,)`` robust standard deviation of each point's residuals at an offset, px."""
+        return torch.maximum(_spread(self.residuals(F, offset), self.options), self.finest(F, offset))
+
+    def finest(self, F: Tensor, offset: float) -> Tensor:
+        """``(n,)`` px that a part of a frame makes: what lags that are frames apart cannot tell."""
+        moved = self.residuals(F, offset + self.step) - self.residuals(F, offset)
+        return self.options.breaks.resolved * _spread(moved, self.options).clamp(min=1e-9 * self.a.scale)
+
+    def course(self, offset: float, F: Tensor) -> Course | None:
+        """From a start: the cheapest lags, what was lost put back, and one fit of all that, until the jumps stay."""
+        options = self.options.breaks
+        scale, known, fit = self.scale(F, offset), None, None
+        for _ in range(options.rounds):
+            offsets = self._offsets(offset)
+            if not len(offsets):
+                return None  # gone astray
+            costs = self.costs(F, offsets, scale)
+            path = cheapest(costs, options.penalty)
+            jumps = self._jumps(path, offsets, costs)
+            first = float(offsets[path[0]])
+            mended_a, mended_b = mended(self.a, self.b, self.rate, first, jumps)
+            fit = ShiftDescent(mended_a, mended_b, self.step, options=self.options).run(first, self.rate)
+            if fit is None:
+                return None
+            same, known = _same(jumps, known, self.step), jumps
+            offset, F = fit.offset, fit.fundamental
+            scale = torch.maximum(_spread(fit.distances * fit.residual, self.options), self.finest(F, offset))
+            if same:
+                break
+        assert known is not None
+        assert fit is not None
+        return Course(self.rate, fit.offset, known, fit, scale)
+
+    def _offsets(self, middle: float) -> Tensor:
+        """What is compared ``(L,)``: half frames near the middle, as one fit of two pieces lies between both, else whole ones."""
+        options = self.options.breaks
+        reach, near = round(options.longest / self.step), round(options.near)
+        whole = torch.arange(-reach, reach + 1, dtype=torch.float64)
+        half = torch.arange(-near, near, dtype=torch.float64) + 0.5
+        offsets = middle + self.step * torch.cat([whole, half]).sort().values
+        # the clocks were started within ``max_shift``, and what was lost since adds to it
+        return offsets if self.max_shift is None else offsets[offsets.abs() <= self.max_shift + options.longest]
+
+    def _jumps(self, path: NDArray[np.int64], offsets: Tensor, costs: NDArray[np.float64]) -> tuple[Jump, ...]:
+        """Where the course changes, with the moments that the costs of both sides allow."""
+        options = self.options.breaks
+        path = _without_short(path, costs, round(options.shortest / self.step))
+        at = np.flatnonzero(np.diff(path))
+        found = []
+        for place, (before, after) in enumerate(zip([0, *(at + 1)], [*(at + 1), len(path)], strict=True)):
+            if place == len(at):
+                break
+            end = int(at[place + 1]) + 1 if place + 1 < len(at) else len(path)
+            left, right = int(path[before]), int(path[after])
+            size = float(offsets[right] - offsets[left])
+            lost = round(-size / self.rate / self.step) if size < 0 else 0
+            moment, sigma = _moment(costs[before:end, left], costs[before:end, right], lost)
+            start = float(self.times[0]) + self.step * int(before)
+            found.append(Jump(start + self.step * moment, self.step * max(sigma, 0.5), size))
+        return tuple(found)
+
+
+def _mapped(x: Tensor, F: Tensor) -> Tensor:
+    """Homogeneous lines ``(..., 3)`` of points ``(..., 2)``."""
+    return x @ F[:, :2].mT + F[:, 2]
+
+
+def _cost(far: Tensor, scale: Tensor, options: SynchronizeOptions, unseen: float = 0.0) -> NDArray[np.float64]:
+    """Nats per moment, of residuals ``(T, n)``: quadratic where they fit, bounded where they do not, ``unseen`` where there are
+    none."""
+    square = (far / scale).square()
+    cut = options.descent.cut**2
+    alike = 2 * math.sqrt(math.pi)  # frames that a kernel of one frame makes into one
+    return (0.5 * square / (1 + square / cut)).nan_to_num(unseen).sum(-1).div(alike * options.breaks.dependence).numpy()
+
+
+def _spread(far: Tensor, options: SynchronizeOptions) -> Tensor:
+    """``(n,)`` robust standard deviation of each point's residuals ``(T, n)``."""
+    pooled = max(1.4826 * float(far.abs().nanmedian().nan_to_num(0.0)), 1e-300)
+    own = (1.4826 * far.abs().nanmedian(0).values / pooled).nan_to_num(1.0)
+    return pooled * own.clamp(*options.descent.unequal)
+
+
+def _same(jumps: tuple[Jump, ...], known: tuple[Jump, ...] | None, step: float) -> bool:
+    if known is None or len(jumps) != len(known):
+        return False
+    return all(abs(x.size - y.size) < 0.6 * step and abs(x.moment - y.moment) < 2 * step for x, y in zip(jumps, known, strict=True))
+
+
+def cheapest(costs: NDArray[np.float64], penalty: float) -> NDArray[np.int64]:
+    r"""The course of states ``(T,)`` that costs least where every change costs the same.
+
+    .. math:: \min_{s_1 \dots s_T} \sum_t c_{t, s_t} + p\, |\{t : s_t \ne s_{t-1}\}|
+
+    Args:
+        costs: ``(T, S)``.
+        penalty: p.
+
+    Source: Viterbi 1967; Jackson et al. 2005, An algorithm for optimal partitioning of data on an interval.
+
+    Example:
+        >>> costs = np.array([[0.0, 3.0], [0.0, 3.0], [0.5, 0.0], [3.0, 0.0], [3.0, 0.0]])
+        >>> cheapest(costs, 1.0).tolist(), cheapest(costs, 9.0).tolist()
+        ([0, 0, 1, 1, 1], [1, 1, 1, 1, 1])
+    """
+    count, states = costs.shape
+    total, here = costs[0].copy(), np.arange(states)
+    came = np.empty((count, states), dtype=np.int64)
+    for moment in range(1, count):
+        best = int(total.argmin())
+        jumps = total > total[best] + penalty
+        came[moment] = np.where(jumps, best, here)
+        total = np.where(jumps, total[best] + penalty, total) + costs[moment]
+    path = np.empty(count, dtype=np.int64)
+    path[-1] = int(total.argmin())
+    for moment in range(count - 1, 0, -1):
+        path[moment - 1] = came[moment, path[moment]]
+    return path
+
+
+def _without_short(path: NDArray[np.int64], costs: NDArray[np.float64], shortest: int) -> NDArray[np.int64]:
+    """Pieces that are too short to say anything join the neighbour that costs less there."""
+    path = path.copy()
+    while True:
+        edges = [0, *(np.flatnonzero(np.diff(path)) + 1).tolist(), len(path)]
+        sizes = np.diff(edges)
+        if len(sizes) == 1 or int(sizes.min()) >= shortest:
+            return path
+        k = int(sizes.argmin())
+        part = slice(edges[k], edges[k + 1])
+        beside = [int(path[at]) for at in (edges[k] - 1, edges[k + 1]) if 0 <= at < len(path)]
+        path[part] = min(beside, key=lambda state: float(costs[part, state].sum()))
+
+
+def _moment(left: NDArray[np.float64], right: NDArray[np.float64], lost: int) -> tuple[float, float]:
+    """Steps after the first at which the offset changes, mean and standard deviation, by the costs of both sides.
+
+    Args:
+        lost: steps of a's clock that b did not record: there neither side fits, which says nothing.
+    """
+    count = len(left)
+    before = np.concatenate([[0.0], np.cumsum(left)])
+    after = np.concatenate([np.cumsum(right[::-1])[::-1], [0.0]])
+    usual = min(float(np.median(left)), float(np.median(right)))
+    at = np.arange(1, max(2, count - lost))
+    cost = before[at] + after[np.minimum(at + lost, count)] + usual * lost
+    weight = np.exp(-(cost - cost.min()))
+    weight /= weight.sum()
+    mean = float((weight * at).sum())
+    return mean - 0.5, math.sqrt(float((weight * (at - mean) ** 2).sum()) + 1 / 12)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# What was lost put back: the frames' times, as a camera that keeps time would have told them.
+
+
+def mended(a: Tracks, b: Tracks, rate: float, offset: float, jumps: Sequence[Jump]) -> tuple[Tracks, Tracks]:
+    """Tracks with times that leave room for what was lost: by b where the offset falls, by a where it grows."""
+    ta, tb = a.times.clone(), b.times.clone()
+    for jump in jumps:
+        there = jump.moment * rate + offset
+        if jump.size < 0:
+            tb = torch.where(b.times > there, tb - jump.size, tb)
+        else:
+            ta = torch.where(a.times > jump.moment, ta + jump.size / rate, ta)
+        offset += jump.size
+    return dataclasses.replace(a, times=ta), dataclasses.replace(b, times=tb)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# What speaks for every jump: against one offset, and of each piece by itself.
+
+
+class JumpEvidence:
+    """The cheapest course of several, without the jumps that a fit without them explains nearly as well."""
+
+    def __init__(self, a: Tracks, b: Tracks, rates: Sequence[float], start: float | None, max_shift: float | None,
+                 options: SynchronizeOptions) -> None:  # fmt: skip
+        self.a, self.b, self.options, self.max_shift = a, b, options, max_shift
+        self.frame = max(a.step, b.step)
+        found: list[Course] = []
+        for rate in dict.fromkeys(rates):
+            search = CourseSearch(a, b, rate, max_shift, options)
+            plain = None if start is None else self._fit((), start, rate)
+            starts = [] if plain is None else [(plain.center, plain.offset, plain.fundamental)]
+            courses: list[Course] = []
+            for moment, offset, F in starts + search.starts():
+                # a window that a course explains already leads to the same one
+                if all(abs(one.at(moment) - offset) > 1.5 * self.frame for one in courses):
+                    course = search.course(offset, F)
+                    courses += [] if course is None else [course]
+            found += courses
+        self.course = self._best(found, rates[0])
+
+    def _best(self, courses: list[Course], given: float) -> Course | None:
+        """The one whose residuals and jumps cost least, on the scale of the one with the least residuals."""
+        if not courses:
+            return None
+        scale = min(courses, key=lambda one: one.fit.residual).scale
+        penalty = self.options.breaks.penalty
+        return min(
+            courses,
+            key=lambda one: self._cost(one.fit, scale) + penalty * (len(one.jumps) + (one.rate != given)),
+        )
+
+    def _cost(self, fit: EpipolarFit, scale: Tensor) -> float:
+        """Nats of all residuals of a fit, for as many as there could be."""
+        cost = _cost(fit.distances * fit.residual, scale, self.options)
+        seen = float(fit.distances.isfinite().sum())
+        return float(cost.sum()) / max(seen, 1.0) * float((self.a.weights > 0).sum())
+
+    def _fit(self, jumps: Sequence[Jump], offset: float, rate: float) -> EpipolarFit | None:
+        a, b = mended(self.a, self.b, rate, offset, jumps)
+        return ShiftDescent(a, b, self.frame, options=self.options).run(offset, rate)
+
+    def told(self) -> tuple[Course, list[float], list[float]] | None:
+        """The course with the jumps that are beyond doubt, nats for each of them, and the residual without it, px."""
+        course = self.course
+        while course is not None:
+            scale = course.scale
+            own = self._cost(course.fit, scale)
+            nats, residuals = [], []
+            for k in range(len(course.jumps)):
+                worse = self._without(course, k)
+                fit = min(worse, key=lambda one: self._cost(one, scale), default=None)
+                nats.append(math.inf if fit is None else self._cost(fit, scale) - own)
+                residuals.append(math.inf if fit is None else fit.residual)
+            least = self.options.breaks.least * min(self.a.step, self.b.step)
+            sizes = [abs(jump.size) for jump in course.jumps]
+            weak = [k for k, one in enumerate(nats) if one < self.options.breaks.evidence or sizes[k] < least]
+            if not weak:
+                return course, nats, residuals
+            course = self._dropped(course, min(weak, key=nats.__getitem__))
+        return None
+
+    def _without(self, course: Course, k: int) -> list[EpipolarFit]:
+        """Fits of one offset on both sides of a jump, from that of either side."""
+        rest = (*course.jumps[:k], *course.jumps[k + 1 :])
+        size = course.jumps[k].size
+        found = [self._fit(rest, course.offset + share * size, course.rate) for share in (0.0, 0.5, 1.0)]
+        return [fit for fit in found if fit is not None]
+
+    def _dropped(self, course: Course, k: int) -> Course | None:
+        """The course without a jump; of neighbouring pieces the longer keeps its place."""
+        rest = list(course.jumps[:k]) + list(course.jumps[k + 1 :])
+        fits = self._without(course, k)
+        if not fits:
+            return None
+        fit = min(fits, key=lambda one: one.residual)
+        return Course(course.rate, fit.offset, tuple(rest), fit, course.scale)
+
+    def sizes(self, course: Course) -> tuple[list[float], list[float]]:
+        """Seconds by which the offset changes at each jump, and their standard deviations, by least squares of all at once."""
+        a, b = mended(self.a, self.b, course.rate, course.offset, course.jumps)
+        gained, moments = 0.0, []
+        for jump in course.jumps:
+            moments.append(jump.moment + gained)
+            gained += max(jump.size, 0.0) / course.rate
+        descent = ShiftDescent(a, b, self.frame, options=self.options)
+        moved, sigmas = descent.jumps(course.fit, moments)
+        return [jump.size + more for jump, more in zip(course.jumps, moved.tolist(), strict=True)], sigmas.tolist()
+
+    def contradicted(self, course: Course) -> bool:
+        """Whether a piece that is long enough to say so is elsewhere by itself, with a fundamental matrix of its own."""
+        a, b = mended(self.a, self.b, course.rate, course.offset, course.jumps)
+        samples = Samples.of(a, b, self.frame, course.rate, options=self.options)
+        times = float(a.times[0]) + self.frame * torch.arange(len(samples.x1), dtype=torch.float64)
+        edges = [-math.inf, *(jump.moment for jump in course.jumps), math.inf]
+        for low, high in itertools.pairwise(edges):
+            inside = (times > low) & (times <= high)
+            if float(inside.sum()) * self.frame < self.options.breaks.alone:
+                continue
+            part = dataclasses.replace(samples, w1=torch.where(inside[:, None], samples.w1, 0.0))
+            best = epipolar_curve(part, self.max_shift, self.options.evidence.half_overlap, options=self.options).peaks(1)
+            if best and abs(best[0][0] * course.rate - course.fit.offset) > self.options.evidence.apart * self.frame:
+                return True
+        return False

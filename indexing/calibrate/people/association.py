@@ -1,0 +1,297 @@
+"""Who is who in all cameras, which nobody calibrated: the stages, from the people of each camera's tracker to identities."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from dyntorch.core import Notice, status_from
+from dyntorch.numerics import check_options
+from indexing.calibrate.people.doubts import alike, certainties, cut_again, strangers
+from indexing.calibrate.people.options import AssociationOptions
+from indexing.calibrate.people.relations import PieceView, view
+from indexing.calibrate.people.result import Association, Exchange, PeopleNotice
+from indexing.calibrate.people.sorting import Sorting, calibrated, everybody_clocks, identities, sorted_out, tree
+from indexing.calibrate.people.tracklets import Booleans, Floats, Integers, Sightings, cut, sightings
+from indexing.clip import Clip
+from indexing.joints import named, places
+from indexing.sync.takes import Take
+
+if TYPE_CHECKING:
+    from dyntorch import Calibration, Clocks
+
+
+def associate(
+    takes: Sequence[Take | Clip | Sequence[Clip]],
+    clocks: Clocks | ArrayLike | None = None,
+    *,
+    calibration: Calibration | None = None,
+    options: AssociationOptions = AssociationOptions(),
+) -> Association:
+    r"""Who is who in cameras that nobody calibrated, by the epipolar distance over time.
+
+    The joints of one person fulfil :math:`x_j^T F_{ij} x_i = 0` at all times, those of two people hardly ever.  Every camera's
+    tracks are cut into pieces of surely one person; clock and F of two cameras come from two pieces that fit each other, confirmed
+    by all the others; then pieces are sorted into people
+
+    .. math:: \max_z \sum_{p < q,\ z_p = z_q} s_{pq}, \qquad
+              s_{pq} = \sum_t \sum_k \log\frac{p(r_{pq,k}(t) \mid \text{same})}{p(r_{pq,k}(t) \mid \text{others})},
+
+    nobody twice at once in a camera, with r the Sampson distances; and clocks, F and the sorting are repeated with everybody until
+    they stay.
+
+    Args:
+        takes: per camera what was read of it, or the people that its tracker tells apart: clips with times on the camera's clock.
+            Numbers may be exchanged where people cross, people may come and go, and some may not be there at all.
+        clocks: where they are known: :class:`dyntorch.Clocks`, offsets ``(cameras,)`` in seconds, or ``(cameras, 2)`` offsets and
+            rates, :math:`t_i = \text{rate}_i\, t + \text{offset}_i`.
+        calibration: the cameras where they are known, for a second and surer pass: clocks (unless they are given) and fundamental
+            matrices are theirs, and distances those of pixels without lens distortion.  The Sampson distance is then the
+            reprojection error of the point that two cameras see, to first order.
+        options: every number that decides, by stage.
+
+    Returns:
+        The people of all cameras in one order; refused where clocks or identities are not decided.
+
+    Raises:
+        ValueError: fewer than two cameras, people with other joints, or clocks or a calibration of other cameras.
+
+    Source:
+        Clustering: Bansal, Blum and Chawla 2004, Correlation clustering; distances: Hartley and Zisserman, section 11.4.3.
+
+    Example:
+        >>> from indexing import cameras
+        >>> from indexing.actors import Person, stream
+        >>> first, _ = stream(["wave", "squat", "kick"], Person(), rng=1)
+        >>> second, _ = stream(["kick", "jump", "wave"], Person(), rng=2)
+        >>> aside = second.replace(joints=second.joints + [1.5, 0.0, 0.5])
+        >>> left, right = ([cameras.virtual(one, azimuth=turn) for one in (first, aside)] for turn in (0.0, 70.0))
+        >>> found = associate([left, right[::-1]], clocks=[0.0, 0.0])
+        >>> found.people, found.tracks[0][0].tolist() == found.tracks[1][0][::-1].tolist()
+        (2, True)
+    """
+    check_options(options, AssociationOptions)
+    everyone, names = _people(takes)
+    joints = _common_joints(everyone, names, options)
+    seen = [sightings(clips, name, places_) for clips, name, places_ in zip(everyone, names, joints, strict=True)]
+    if calibration is not None:
+        _check_cameras(calibration, len(seen))
+        seen = [_straight(one, calibration, camera) for camera, one in enumerate(seen)]
+        clocks = calibration.clocks if clocks is None else clocks
+    known = None if clocks is None else _clock_table(clocks, len(seen))
+    views = [view(one, cut(one, options)) for one in seen]
+    if not any(len(one.pieces) for one in views):
+        empty = Sorting(views, {}, np.zeros(0, dtype=np.int64))
+        return _result(everyone, empty, clocks, np.tile([0.0, 1.0], (len(seen), 1)), [_nobody(options)], options)
+    if calibration is None or known is None:
+        times, relations, lost = tree(views, known, options)
+    else:
+        times, relations, lost = known, calibrated(views, known, calibration, options), []
+    sorting = sorted_out(views, times, relations, options)
+    limits: list[Notice] = []
+    if known is None:
+        clocks, times, limits = everybody_clocks(sorting, times, lost, options)
+        sorting = sorted_out(sorting.views, times, sorting.relations, options)
+    for _ in range(options.clusters.cuts):
+        views, changed = cut_again(sorting, options)
+        if not changed:
+            break
+        sorting = sorted_out(views, times, sorting.relations, options)
+    if calibration is None:
+        lost = sorted({*lost, *strangers(sorting, options)})
+    limits += _lost(lost, names) + alike(sorting, names, options)
+    return _result(everyone, sorting, clocks, times, limits, options)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# What is given.
+
+
+def _people(takes: Sequence[Take | Clip | Sequence[Clip]]) -> tuple[list[list[Clip]], list[str]]:
+    if len(takes) < 2:
+        raise ValueError(
+            f"takes: {len(takes)} camera given, two at least have somebody in common; give one list of people for each"
+        )
+    people: list[list[Clip]] = []
+    names: list[str] = []
+    for number, take in enumerate(takes, start=1):
+        clips = list(take.everyone) if isinstance(take, Take) else [take] if isinstance(take, Clip) else list(take)
+        name = (take.name if isinstance(take, Take) else clips[0].name if clips else "") or f"camera {number}"
+        if not clips:
+            raise ValueError(f"{name}: no people given; give the clips of its tracker, or leave the camera out")
+        flat = next((clip for clip in clips if clip.dims != 2), None)
+        if flat is not None:
+            raise ValueError(
+                f"{name}: has {flat.dims}D joints, and people are compared by what cameras see; give 2D keypoints in pixels"
+            )
+        people.append(clips)
+        names.append(name)
+    if len(set(names)) < len(names):
+        names = [f"{name} ({number})" for number, name in enumerate(names, start=1)]
+    return people, names
+
+
+def _common_joints(everyone: Sequence[Sequence[Clip]], names: Sequence[str], options: AssociationOptions) -> list[list[int]]:
+    """Per camera the places of the joints that all have, in one order."""
+    first = [clips[0] for clips in everyone]
+    for name, clips, one in zip(names, everyone, first, strict=True):
+        other = next((clip for clip in clips if clip.joints.shape[1] != one.joints.shape[1]), None)
+        if other is not None:
+            counts = f"{one.joints.shape[1]} and {other.joints.shape[1]}"
+            raise ValueError(f"{name}: its people have {counts} joints; people of one camera have the same")
+    skeletons = [one.skeleton for one in first]
+    widths = {one.joints.shape[1] for one in first}
+    if len(widths) == 1 and len({skeleton.joints if skeleton is not None else None for skeleton in skeletons}) == 1:
+        return [list(range(first[0].joints.shape[1]))] * len(first)
+    nameless = next((name for name, skeleton in zip(names, skeletons, strict=True) if not named(skeleton)), None)
+    if nameless is not None:
+        if len(widths) == 1:
+            return [list(range(first[0].joints.shape[1]))] * len(first)
+        raise ValueError(f"{nameless}: its joints have no names, and other cameras have another number of joints; name the layout")
+    layouts = [skeleton for skeleton in skeletons if skeleton is not None]
+    rows = [places(own, layouts[0]) for own in layouts]
+    shared = [k for k in range(len(layouts[0].joints)) if all(row[k] >= 0 for row in rows)]
+    if len(shared) < options.pieces.common:
+        layouts_ = ", ".join(sorted({layout.name for layout in layouts}))
+        raise ValueError(
+            f"joints: the cameras ({layouts_}) have {len(shared)} joints of the same name, {options.pieces.common} are needed; "
+            "use one pose model for all"
+        )
+    return [[row[k] for k in shared] for row in rows]
+
+
+def _clock_table(clocks: Clocks | ArrayLike, cameras: int) -> Floats:
+    """``(cameras, 2)`` offsets and rates."""
+    from dyntorch import Clocks
+
+    if isinstance(clocks, Clocks):
+        values = np.stack([clocks.offsets.numpy(), clocks.rates.numpy()], axis=1)
+    else:
+        values = np.asarray(clocks, dtype=np.float64)
+        values = np.stack([values, np.ones(len(values))], axis=1) if values.ndim == 1 else values
+    if values.shape != (cameras, 2) or not np.isfinite(values).all() or (values[:, 1] <= 0).any():
+        raise ValueError(f"clocks: expected a finite offset, or offset and rate, for each of {cameras} cameras, got {clocks!r}")
+    return values
+
+
+def _check_cameras(calibration: Calibration, cameras: int) -> None:
+    if len(calibration.K) != cameras:
+        raise ValueError(f"calibration: is of {len(calibration.K)} cameras, and there are {cameras} takes; give one for each")
+
+
+def _straight(seen: Sightings, calibration: Calibration, camera: int) -> Sightings:
+    """Without the distortion of the lens."""
+    import torch
+
+    from dyntorch.geometry import undistort
+
+    lens = calibration.distortion[camera]
+    if not bool(lens.any()):
+        return seen
+    flat = torch.from_numpy(seen.places.reshape(1, -1, 2))
+    straight = undistort(flat, calibration.K[camera][None], lens[None]).numpy().reshape(seen.places.shape)
+    known = np.isfinite(straight).all(-1)
+    return replace(seen, places=np.where(known[..., None], straight, np.nan), trust=np.where(known, seen.trust, 0.0))
+
+
+def _nobody(options: AssociationOptions) -> Notice:
+    return Notice(PeopleNotice.NOBODY, options.geometry.shortest)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# What is returned.
+
+
+def _lost(lost: Sequence[int], names: Sequence[str]) -> list[Notice]:
+    return [Notice(PeopleNotice.LOST, float(len(lost)), {"names": ", ".join(names[k] for k in lost)})] if lost else []
+
+
+def _result(
+    everyone: Sequence[Sequence[Clip]],
+    sorting: Sorting,
+    clocks: Any,
+    times: Floats,
+    limits: list[Notice],
+    options: AssociationOptions,
+) -> Association:
+    from dyntorch import Clocks
+
+    kept = identities(sorting, options)
+    if not kept and not limits:
+        limits = [_nobody(options)]
+    certain = certainties(sorting, options) if len(sorting.labels) else np.zeros(0)
+    joints, confidence, tracks, certainty, left_out, exchanges = [], [], [], [], [], []
+    said: list[Notice] = []
+    for camera, (one, clips) in enumerate(zip(sorting.views, everyone, strict=True)):
+        frames, own = len(one.times), sorting.of(camera)
+        place = np.full(len(own) + 1, -1)
+        for k, group in enumerate(kept):
+            place[:-1][own == group] = k
+        person = place[one.piece]
+        rows, slots = np.nonzero(person >= 0)
+        track = np.full((frames, len(kept)), -1, dtype=np.int64)
+        track[rows, person[rows, slots]] = one.track[rows, slots]
+        sure = np.full((frames, len(kept)), np.nan)
+        sure[rows, person[rows, slots]] = certain[sorting.starts[camera] :][one.piece[rows, slots]]
+        x, w = _of_tracks(one.seen, clips, track)
+        missed: Booleans = np.asarray(one.seen.trust.any(2))
+        missed[rows, one.track[rows, slots]] = False
+        moments = [Exchange(camera, k, *row) for k in range(len(kept)) for row in _exchanges(one.times, track[:, k])]
+        said += _told(one, camera, moments, missed, options)
+        joints.append(x)
+        confidence.append(w)
+        tracks.append(track)
+        certainty.append(sure)
+        left_out.append(missed)
+        exchanges += moments
+    return Association(
+        status=status_from(limits),
+        notices=(*limits, *said),
+        names=tuple(one.seen.name for one in sorting.views),
+        times=tuple(one.times for one in sorting.views),
+        joints=tuple(joints),
+        confidence=tuple(confidence),
+        tracks=tuple(tracks),
+        certainty=tuple(certainty),
+        left_out=tuple(left_out),
+        exchanges=tuple(exchanges),
+        clocks=clocks if isinstance(clocks, Clocks) else None,
+        offsets_rates=times,
+        fundamentals={pair: relation.fundamental for pair, relation in sorting.relations.items()},
+        sigmas={pair: relation.sigma for pair, relation in sorting.relations.items()},
+        skeletons=tuple(clips[0].skeleton for clips in everyone),
+    )
+
+
+def _of_tracks(seen: Sightings, clips: Sequence[Clip], track: Integers) -> tuple[Floats, Floats]:
+    """All joints of a camera's clips in the order of identities, and what the detector trusts them."""
+    whole = sightings(clips, seen.name)
+    chosen = np.maximum(track, 0)
+    rows = np.arange(len(track))[:, None]
+    there = (track >= 0)[..., None]
+    return np.where(there[..., None], whole.places[rows, chosen], np.nan), np.where(there, whole.trust[rows, chosen], 0.0)
+
+
+def _exchanges(times: Floats, track: Integers) -> list[tuple[float, int, int]]:
+    rows = np.flatnonzero(track >= 0)
+    changed = np.flatnonzero(np.diff(track[rows])) + 1
+    return [(float(times[rows[k]]), int(track[rows[k - 1]]), int(track[rows[k]])) for k in changed]
+
+
+def _told(one: PieceView, camera: int, moments: Sequence[Exchange], missed: Booleans, options: AssociationOptions) -> list[Notice]:
+    """What a user should know of a camera."""
+    found = []
+    name = one.seen.name
+    if moments:
+        when = sorted({round(moment.time, 2) for moment in moments})
+        most = options.verdict.listed
+        listed = ", ".join(f"{time:.2f}" for time in when[:most]) + " s" + " and more" * (len(when) > most)
+        found.append(Notice(PeopleNotice.EXCHANGED, float(len(when)), {"name": name, "times": listed, "camera": camera}))
+    there = int(one.seen.trust.any(2).sum())
+    if there and missed.sum() > options.verdict.left * there:
+        found.append(Notice(PeopleNotice.ALONE, 100.0 * float(missed.sum()) / there, {"name": name, "camera": camera}))
+    return found

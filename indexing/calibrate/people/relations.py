@@ -1,0 +1,418 @@
+"""Two cameras: clock and epipolar geometry, and what they say about which piece of one is which piece of the other."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from indexing.calibrate.people.clusters import clustered
+from indexing.calibrate.people.options import AssociationOptions
+from indexing.calibrate.people.tracklets import Booleans, Floats, Integers, Sightings, Tracklets
+
+if TYPE_CHECKING:
+    from dyntorch import Shift
+
+
+@dataclass(frozen=True, eq=False)
+class PieceView:
+    """A camera whose detections are sorted by pieces.
+
+    Args:
+        seen: the detections.
+        pieces: how they are cut.
+        places: ``(frames, slots, joints, 2)`` px; a piece stays in one slot.
+        trust: ``(frames, slots, joints)``.
+        piece: ``(frames, slots)``, -1 = empty.
+        track: ``(frames, slots)`` where the detection is in ``seen``.
+    """
+
+    seen: Sightings
+    pieces: Tracklets
+    places: Floats
+    trust: Floats
+    piece: Integers
+    track: Integers
+
+    @property
+    def times(self) -> Floats:
+        """``(frames,)`` seconds."""
+        return self.seen.times
+
+    @property
+    def lengths(self) -> Integers:
+        """``(pieces,)`` frames in which each is seen."""
+        return np.bincount(self.piece[self.piece >= 0], minlength=len(self.pieces)).astype(np.int64)
+
+
+def view(seen: Sightings, pieces: Tracklets) -> PieceView:
+    """Sort the detections of a camera by pieces: as few slots as hold all at once."""
+    frames, joints = len(seen.times), seen.places.shape[2]
+    free: list[int] = []
+    slot = np.zeros(len(pieces), dtype=np.int64)
+    for one in np.argsort(pieces.starts, kind="stable").tolist():
+        open_slots = [k for k, until in enumerate(free) if until < pieces.starts[one]]
+        slot[one] = open_slots[0] if open_slots else len(free)
+        if open_slots:
+            free[slot[one]] = int(pieces.ends[one])
+        else:
+            free.append(int(pieces.ends[one]))
+    width = max(1, len(free))
+    places, trust = np.full((frames, width, joints, 2), np.nan), np.zeros((frames, width, joints))
+    piece, track = (np.full((frames, width), -1, dtype=np.int64) for _ in range(2))
+    rows, columns = np.nonzero(pieces.number >= 0)
+    target = slot[pieces.number[rows, columns]]
+    places[rows, target], trust[rows, target] = seen.places[rows, columns], seen.trust[rows, columns]
+    piece[rows, target], track[rows, target] = pieces.number[rows, columns], columns
+    return PieceView(seen, pieces, places, trust, piece, track)
+
+
+def seen_at(one: PieceView, times: Floats, options: AssociationOptions) -> tuple[Floats, Floats, Integers]:
+    """What a camera saw at any times of its clock: linear between frames, the nearest frame where a piece has no other.
+
+    Returns:
+        places ``(T, slots, joints, 2)``, trust ``(T, slots, joints)`` and pieces ``(T, slots)``.
+    """
+    last = len(one.times) - 1
+    after = np.clip(np.searchsorted(one.times, times), min(1, last), last)
+    before = np.maximum(after - 1, 0)
+    width = np.maximum(one.times[after] - one.times[before], 1e-12)
+    share = (times - one.times[before]) / width
+    step = 1.0 / one.seen.fps
+    nearest = np.where(share > 0.5, after, before)
+    other = np.where(share > 0.5, before, after)
+    near = np.abs(times - one.times[nearest]) <= options.geometry.nearest * step
+    piece = np.where(near[:, None], one.piece[nearest], -1)
+    weight = np.minimum(share, 1 - share)[:, None]
+    between = (one.piece[other] == piece) & (piece >= 0) & (weight >= 0) & (width <= options.geometry.between * step)[:, None]
+    factor = np.where(between, weight, 0.0)[..., None, None]
+    places = (1 - factor) * one.places[nearest] + np.where(between[..., None, None], factor * one.places[other], 0.0)
+    trust = np.where(between[..., None], np.minimum(one.trust[nearest], one.trust[other]), one.trust[nearest])
+    known = np.isfinite(places).all(-1) & (piece >= 0)[..., None]
+    return np.where(known[..., None], places, np.nan), np.where(known, trust, 0.0), piece
+
+
+@dataclass(frozen=True, eq=False)
+class Relation:
+    """How camera b relates to camera a.
+
+    Args:
+        offset, rate: b's clock = rate * a's clock + offset, seconds.
+        fundamental: ``(3, 3)``, x_b^T F x_a = 0.
+        sigma: px, of the distances of the same person.
+        shift: where the clock comes from a comparison, what that says.
+        held: the fundamental matrix is known, and no fit changes it.
+    """
+
+    offset: float
+    rate: float
+    fundamental: Floats
+    sigma: float
+    shift: Shift | None = None
+    held: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class CommonMoments:
+    """What both cameras saw at the same times: those of the first camera's frames.
+
+    Args:
+        a, b: places ``(T, slots, joints, 2)`` px.
+        trust_a, trust_b: ``(T, slots, joints)``.
+        piece_a, piece_b: ``(T, slots)``.
+        fps: of a.
+        spread: px, how far two people usually are from each other's epipolar lines.
+    """
+
+    a: Floats
+    b: Floats
+    trust_a: Floats
+    trust_b: Floats
+    piece_a: Integers
+    piece_b: Integers
+    fps: float
+    spread: float
+
+
+def common(
+    a: PieceView, b: PieceView, offset: float, rate: float, options: AssociationOptions, most: int | None = None
+) -> CommonMoments:
+    """Both cameras at the frames of the first one, as far as the second one runs.
+
+    Args:
+        most: frames that are taken at most, evenly.
+    """
+    moments = rate * a.times + offset
+    margin = options.geometry.nearest / b.seen.fps
+    rows = np.flatnonzero((moments >= b.times[0] - margin) & (moments <= b.times[-1] + margin))
+    every = 1 if most is None else max(1, math.ceil(len(rows) / most))
+    rows = rows[::every]
+    places, trust, piece = seen_at(b, moments[rows], options)
+    spread = options.geometry.spread * math.sqrt(a.pieces.size * b.pieces.size)
+    return CommonMoments(a.places[rows], places, a.trust[rows], trust, a.piece[rows], piece, a.seen.fps / every, spread)
+
+
+def distances(fundamental: Floats, a: Floats, b: Floats) -> Floats:
+    """Sampson distances ``(T, slots_a, slots_b, joints)`` px of everybody from everybody; NaN where one is not seen.
+
+    .. math:: x_b^T F x_a / \\sqrt{(F x_a)_1^2 + (F x_a)_2^2 + (F^T x_b)_1^2 + (F^T x_b)_2^2}
+    """
+    of_a = a @ fundamental[:, :2].T + fundamental[:, 2]  # lines in b
+    of_b = b @ fundamental[:2] + fundamental[2]  # lines in a
+    square_a, square_b = np.square(of_a[..., :2]).sum(-1), np.square(of_b[..., :2]).sum(-1)
+    value = np.einsum("tbkc,takc->tabk", b, of_a[..., :2]) + of_a[:, :, None, :, 2]
+    return np.asarray(value / np.sqrt(np.maximum(square_a[:, :, None] + square_b[:, None], 1e-300)))
+
+
+def evidence(relation: Relation, both: CommonMoments, options: AssociationOptions) -> Floats:
+    """Nats for being the same person, ``(T, slots_a, slots_b)``; 0 where nothing can be compared.
+
+    A joint at distance r says :math:`\\log p_3(r / \\sigma) / \\sigma - \\log p_1(r / S) / S`: Student's t with 3 degrees of
+    freedom for the same person, Cauchy's with the usual spread S of other people.  Joints of one body and frames of one moment are
+    not independent: they count as ``options.geometry.joints`` and one in ``options.geometry.lasting`` seconds.
+    """
+    return _evidence_of(distances(relation.fundamental, both.a, both.b), relation.sigma, both, options)
+
+
+def _evidence_of(away: Floats, sigma: float, both: CommonMoments, options: AssociationOptions) -> Floats:
+    weight = np.sqrt(both.trust_a[:, :, None] * both.trust_b[:, None])
+    known = np.isfinite(away) & (weight > 0)
+    r = np.where(known, away, 0.0)
+    same = math.log(2 / (math.pi * math.sqrt(3))) - math.log(sigma) - 2 * np.log1p(np.square(r / sigma) / 3)
+    other = -math.log(math.pi) - math.log(both.spread) - np.log1p(np.square(r / both.spread))
+    each = np.where(known, weight * (same - other), 0.0)
+    joints = known.sum(-1)
+    worth = options.geometry.joints / max(1, away.shape[-1]) / max(1.0, both.fps * options.geometry.lasting)
+    return np.asarray(np.where(joints >= options.pieces.seen, worth * each.sum(-1), 0.0))
+
+
+def table(found: Floats, both: CommonMoments, shape: tuple[int, int]) -> Floats:
+    """Evidence ``(T, slots_a, slots_b)`` summed over time for every two pieces."""
+    first, second = np.broadcast_arrays(both.piece_a[:, :, None], both.piece_b[:, None])
+    known = (first >= 0) & (second >= 0)
+    flat = np.bincount(first[known] * shape[1] + second[known], weights=found[known], minlength=shape[0] * shape[1])
+    return np.asarray(flat.reshape(shape))
+
+
+def fitted(
+    relation: Relation,
+    both: CommonMoments,
+    matched: Booleans,
+    rounds: int,
+    options: AssociationOptions,
+    most: int | None = None,
+) -> Relation | None:
+    """The relation with the fundamental matrix and sigma of those who are the same, by reweighted least squares.
+
+    Args:
+        matched: ``(pieces_a, pieces_b)`` bool.
+        rounds: steps.
+        most: points at most, evenly.
+
+    Returns:
+        None where too few points are the same.
+    """
+    import torch
+
+    import dyntorch
+
+    x1, x2, weight = _pairs(both, matched)
+    every = 1 if most is None else max(1, math.ceil(len(x1) / most))
+    x1, x2, weight = x1[::every], x2[::every], weight[::every]
+    if len(x1) < options.geometry.matches:
+        return None
+    first, second = torch.from_numpy(x1), torch.from_numpy(x2)
+    fundamental, sigma = relation.fundamental, relation.sigma
+    if relation.held:
+        return replace(relation, sigma=_usual(_sampson(fundamental, x1, x2)[0], options))
+    for _ in range(rounds):
+        if np.isfinite(fundamental).all():
+            r, gradient = _sampson(fundamental, x1, x2)
+            w = weight / (1 + np.square(r / sigma) / 3) / gradient
+        else:
+            w = weight
+        solved = dyntorch.fit(dyntorch.FundamentalMatrix, first, second, weights=torch.from_numpy(w / w.max()))
+        if int(solved.status) not in (dyntorch.Status.OK, dyntorch.Status.AMBIGUOUS):
+            return None
+        fundamental = solved.tensor.numpy()
+        r, _ = _sampson(fundamental, x1, x2)
+        sigma = _usual(r, options)
+    return replace(relation, fundamental=fundamental, sigma=sigma)
+
+
+T3_MEDIAN = 0.7648923284
+"""Median of the absolute value of Student's t with 3 degrees of freedom."""
+
+
+def _usual(away: Floats, options: AssociationOptions) -> float:
+    """Sigma of Student's t by the median distance."""
+    return max(float(np.median(np.abs(away))) / T3_MEDIAN, options.geometry.finest)
+
+
+def _pairs(both: CommonMoments, matched: Booleans) -> tuple[Floats, Floats, Floats]:
+    """The points of those who are the same, ``(n, 2)`` each, and their weights."""
+    same = matched[both.piece_a[:, :, None], both.piece_b[:, None]] & (both.piece_a >= 0)[:, :, None] & (both.piece_b >= 0)[:, None]
+    t, i, j = np.nonzero(same)
+    x1, x2 = both.a[t, i].reshape(-1, 2), both.b[t, j].reshape(-1, 2)
+    weight = np.sqrt(both.trust_a[t, i] * both.trust_b[t, j]).reshape(-1)
+    known = (weight > 0) & np.isfinite(x1).all(1) & np.isfinite(x2).all(1)
+    return x1[known], x2[known], weight[known]
+
+
+def _sampson(fundamental: Floats, x1: Floats, x2: Floats) -> tuple[Floats, Floats]:
+    """Distances and squared gradients of matches ``(n, 2)``."""
+    of_a, of_b = x1 @ fundamental[:, :2].T + fundamental[:, 2], x2 @ fundamental[:2] + fundamental[2]
+    gradient = np.maximum(np.square(of_a[:, :2]).sum(1) + np.square(of_b[:, :2]).sum(1), 1e-300)
+    return ((x2 * of_a[:, :2]).sum(1) + of_a[:, 2]) / np.sqrt(gradient), gradient
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """A relation with who is who by it.
+
+    Args:
+        relation: clock and geometry.
+        score: nats for everybody who was matched.
+        explained: of the frames of people that could have a partner, the share that has one.
+        size: px, of a body.
+    """
+
+    relation: Relation
+    score: float
+    explained: float
+    size: float
+
+    def sure(self, options: AssociationOptions) -> bool:
+        """Whether nothing better is to be looked for."""
+        how = options.geometry
+        decided = self.relation.shift is None or self.relation.shift.ok
+        return decided and self.explained >= how.explained and self.relation.sigma <= how.sure_sigma * self.size
+
+
+def settled(a: PieceView, b: PieceView, relation: Relation, options: AssociationOptions) -> Hypothesis | None:
+    """Match everybody by a relation that may come from two people only, and fit it to all who were matched."""
+    how = options.geometry
+    both = common(a, b, relation.offset, relation.rate, options, how.frames)
+    if not len(both.a):
+        return None
+    shape, size = (len(a.pieces), len(b.pieces)), math.sqrt(a.pieces.size * b.pieces.size)
+    conflicts = _joined(a.pieces.conflicts, b.pieces.conflicts)
+    chosen: Hypothesis | None = None
+    for _ in range(how.rounds):
+        found = evidence(relation, both, options)
+        scores = table(found, both, shape)
+        labels = clustered(_joined_scores(scores), conflicts, options)
+        matched = (labels[: shape[0], None] == labels[None, shape[0] :]) & (scores > 0)
+        one = Hypothesis(relation, float(scores[matched].sum()), _explained(both, matched), size)
+        if chosen is not None and one.score <= chosen.score * (1 + how.gain):
+            return chosen if chosen.score >= one.score else one
+        chosen = one
+        again = fitted(relation, both, matched, how.reweighted, options)
+        if again is None:
+            return chosen
+        relation = again
+    return chosen
+
+
+def _joined(first: Booleans, second: Booleans) -> Booleans:
+    n, m = len(first), len(second)
+    out = np.zeros((n + m, n + m), dtype=bool)
+    out[:n, :n], out[n:, n:] = first, second
+    return out
+
+
+def _joined_scores(scores: Floats) -> Floats:
+    n, m = scores.shape
+    out = np.zeros((n + m, n + m))
+    out[:n, n:], out[n:, :n] = scores, scores.T
+    return out
+
+
+def _explained(both: CommonMoments, matched: Booleans) -> float:
+    first, second = both.piece_a, both.piece_b
+    same = matched[first[:, :, None], second[:, None]] & (first >= 0)[:, :, None] & (second >= 0)[:, None]
+    could = np.minimum((first >= 0).sum(1), (second >= 0).sum(1)).sum()
+    return float(same.any(2).sum() / max(1, could))
+
+
+def seeds(a: PieceView, b: PieceView, options: AssociationOptions) -> list[tuple[int, int]]:
+    """The pieces that are compared to find clock and geometry: the longest of both cameras, longest first."""
+    how = options.geometry
+    longest = [
+        [k for k in np.argsort(-one.lengths, kind="stable")[: how.seeds].tolist() if one.lengths[k] >= how.shortest * one.seen.fps]
+        for one in (a, b)
+    ]
+    every = [(i, j) for i in longest[0] for j in longest[1]]
+    return sorted(every, key=lambda both: -min(a.lengths[both[0]], b.lengths[both[1]]))
+
+
+def unsynchronized(a: PieceView, b: PieceView, options: AssociationOptions) -> Iterator[Relation]:
+    """Relations by comparing pieces of people whose clocks nobody knows."""
+    for i, j in seeds(a, b, options):
+        shift = compared(_alone(a, i), _alone(b, j), options, quick=True)
+        if shift is not None and shift.fundamental is not None and math.isfinite(shift.offset):
+            yield Relation(shift.offset, shift.rate, shift.fundamental.numpy().astype(np.float64), math.nan, shift)
+
+
+def _alone(one: PieceView, piece: int) -> tuple[Floats, Floats, Floats]:
+    """Times, places and trust of one piece."""
+    rows, slots = np.nonzero(one.piece == piece)
+    return one.times[rows], one.places[rows, slots], one.trust[rows, slots]
+
+
+def compared(
+    a: tuple[Floats, Floats, Floats], b: tuple[Floats, Floats, Floats], options: AssociationOptions, quick: bool = False
+) -> Shift | None:
+    """:func:`dyntorch.synchronize` of times, places ``(frames, n, 2)`` and trust; None where it takes neither.
+
+    Args:
+        quick: looks for no lens distortion, drift, or weak perspective.
+    """
+    import torch
+
+    import dyntorch
+
+    if min(len(a[0]), len(b[0])) < options.geometry.fewest:
+        return None
+    more: dict[str, Any] = {"options": options.points}
+    if quick:  # two people who are not the same have no points that are: nothing to look for
+        every = replace(options.points, points=replace(options.points.points, fewest=1 + a[1].shape[1]))
+        more = {"camera": "perspective", "rate": 1.0, "calibration": (None, None), "options": every}
+    times, places, trust = ((torch.from_numpy(x), torch.from_numpy(y)) for x, y in zip(a, b, strict=True))
+    shift: Shift = dyntorch.synchronize(places[0], places[1], times=times, weights=trust, correspondence=True, **more)
+    return shift
+
+
+def synchronized(a: PieceView, b: PieceView, offset: float, rate: float, options: AssociationOptions) -> Iterator[Relation]:
+    """Relations of people who may be the same, where the clocks are known."""
+    how = options.geometry
+    both = common(a, b, offset, rate, options, how.frames)
+    for i, j in seeds(a, b, options):
+        matched = np.zeros((len(a.pieces), len(b.pieces)), dtype=bool)
+        matched[i, j] = True
+        start = Relation(offset, rate, np.full((3, 3), np.nan), both.spread)
+        found = fitted(start, both, matched, how.reweighted + 2, options) if len(both.a) else None
+        if found is not None:
+            yield found
+
+
+def relate(a: PieceView, b: PieceView, options: AssociationOptions, clock: tuple[float, float] | None = None) -> Hypothesis | None:
+    """The relation of two cameras that explains most people, or None where there is none.
+
+    Args:
+        clock: offset and rate where they are known.
+    """
+    how = options.geometry
+    best: Hypothesis | None = None
+    for start in unsynchronized(a, b, options) if clock is None else synchronized(a, b, *clock, options):
+        first = how.first_sigma * math.sqrt(a.pieces.size * b.pieces.size)
+        relation = start if math.isfinite(start.sigma) else replace(start, sigma=first)
+        found = settled(a, b, relation, options)
+        if found is not None and (best is None or found.score > best.score):
+            best = found
+        if best is not None and best.sure(options):
+            break
+    return best

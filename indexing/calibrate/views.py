@@ -1,0 +1,308 @@
+"""What the cameras saw, as :func:`dyntorch.calibrate` takes it: the same joints in all, frame by frame on each camera's clock."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from dyntorch.numerics import Message
+from indexing.calibrate.options import ViewOptions
+from indexing.clip import Clip
+from indexing.joints import canonical, named
+from indexing.opening import listed
+from indexing.remarks import is_normalized, remarks_on, same_clips
+from indexing.skeleton import Skeleton, known
+from indexing.sync.takes import Take
+
+FloatArray = NDArray[np.float64]
+Size = tuple[int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One camera's part in a calibration.
+
+    Attributes:
+        take: what it recorded.
+        people: one clip for each person, in an order that all cameras share; None: this one does not show that person.
+        size: width and height of its picture, pixels.
+        times: ``(frames,)`` seconds on its own clock: all moments at which one of the people may be seen.
+    """
+
+    take: Take
+    people: tuple[Clip | None, ...]
+    size: Size
+    times: FloatArray
+
+    @property
+    def name(self) -> str:
+        """The camera's."""
+        return self.take.name
+
+    def table(self, places: Sequence[int]) -> tuple[Tensor, Tensor]:
+        """Positions ``(frames, people * n, 2)`` and confidences ``(frames, people * n)``; NaN and 0 where there are none.
+
+        Args:
+            places: where each of the n joints is among those of a clip; -1 = it has none.
+        """
+        shape = len(self.times), len(self.people), len(places)
+        tracks, trust = np.full((*shape, 2), np.nan), np.zeros(shape)
+        here = np.flatnonzero(np.array(places) >= 0)
+        own = np.array(places)[here]
+        for who, clip in enumerate(self.people):
+            if clip is None:
+                continue
+            rows = np.searchsorted(self.times, clip.times)[:, None]
+            sure = np.ones(clip.joints.shape[:2]) if clip.confidence is None else np.nan_to_num(clip.confidence)
+            tracks[rows, who, here], trust[rows, who, here] = clip.joints[:, own], np.where(clip.seen, sure, 0.0)[:, own]
+        tracks[np.isnan(tracks).any(axis=3)] = np.nan
+        flat = (shape[0], shape[1] * shape[2])
+        return torch.from_numpy(tracks.reshape(*flat, 2)), torch.from_numpy(trust.reshape(flat))
+
+    def mended(self, tracks: FloatArray, trust: FloatArray, places: Sequence[int]) -> View:
+        """The same with other positions, as :meth:`table` has them, of the joints that are in both."""
+        here = np.flatnonzero(np.array(places) >= 0)
+        own = np.array(places)[here]
+        shape = len(self.times), len(self.people), len(places)
+        x, w = tracks.reshape(*shape, 2), trust.reshape(shape)
+        people: list[Clip | None] = []
+        for who, clip in enumerate(self.people):
+            if clip is None:
+                people.append(None)
+                continue
+            rows = np.searchsorted(self.times, clip.times)[:, None]
+            joints = np.array(clip.joints, dtype=np.float64)
+            joints[:, own] = x[rows, who, here]
+            confidence = None if clip.confidence is None else np.array(clip.confidence, dtype=np.float64)
+            if confidence is not None:
+                confidence[:, own] = w[rows, who, here]
+            people.append(clip.replace(joints=joints, confidence=confidence))
+        return dataclasses.replace(self, people=tuple(people))
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Which joint of one camera is which of another.
+
+
+@dataclass(frozen=True)
+class Joints:
+    """The joints that two cameras or more have.
+
+    Attributes:
+        skeleton: their names and bones; None where nobody knows which is which.
+        places: for each camera, where each of them is among the camera's own; -1 = it has none.
+        note: what to say about layouts that differ.
+    """
+
+    skeleton: Skeleton | None
+    count: int
+    places: tuple[tuple[int, ...], ...]
+    note: str = ""
+
+
+def common(clips: Sequence[Clip], names: Sequence[str], options: ViewOptions = ViewOptions()) -> Joints:
+    """The joints of many layouts by their names: those that two cameras or more have.
+
+    Args:
+        clips: one of each camera.
+        names: of the cameras.
+
+    Raises:
+        ValueError: a camera shares too few with any other one, or layouts without names that differ in number.
+
+    Example:
+        >>> from indexing.skeleton import BODY25, COCO17
+        >>> a, b = (Clip(np.zeros((1, len(s.joints), 2)), skeleton=s) for s in (COCO17, BODY25))
+        >>> found = common([a, b], ["left", "right"])
+        >>> found.count, found.places[1][:3]
+        (17, (0, 16, 15))
+    """
+    layouts = [clip.skeleton or known(clip.joints.shape[1]) for clip in clips]
+    sizes = [clip.joints.shape[1] for clip in clips]
+    alike = all(layout is None or layouts[0] is None or layout.joints == layouts[0].joints for layout in layouts)
+    if len(set(sizes)) == 1 and alike:
+        shown = next((layout for layout in layouts if layout is not None), None)
+        return Joints(shown, sizes[0], tuple(tuple(range(sizes[0])) for _ in clips))
+    unnamed = [i for i, layout in enumerate(layouts) if not named(layout)]
+    if unnamed:
+        i = unnamed[0]
+        other = next(j for j in range(len(clips)) if sizes[j] != sizes[i] or layouts[j] != layouts[i])
+        text = (
+            "{name}: has {own} joints without names, {other} has {many}, so nobody knows which is which; "
+            "give {arg:layout=}, or files of one pose estimator"
+        )
+        raise ValueError(Message(text, name=names[i], own=sizes[i], other=names[other], many=sizes[other]))
+    return _by_name([layout for layout in layouts if layout is not None], names, options)
+
+
+def _by_name(layouts: Sequence[Skeleton], names: Sequence[str], options: ViewOptions) -> Joints:
+    words = [{canonical(joint): i for i, joint in reversed(list(enumerate(layout.joints)))} for layout in layouts]
+    called: dict[str, str] = {}
+    for layout in layouts:
+        for joint in layout.joints:
+            called.setdefault(canonical(joint), joint)
+    kept = [word for word in called if sum(word in own for own in words) > 1]
+    for name, own, layout in zip(names, words, layouts, strict=True):
+        most = max(len(own.keys() & other.keys()) for other in words if other is not own)
+        if most < options.joints:
+            text = (
+                "{name}: its joints ({own}) share {most} names with those of any other camera, and {needed} are needed; "
+                "use files of one kind of pose estimator"
+            )
+            raise ValueError(Message(text, name=name, own=listed(layout.joints), most=most, needed=options.joints))
+    index = {word: i for i, word in enumerate(kept)}
+    bones: dict[tuple[int, int], None] = {}
+    for layout in layouts:
+        for a, b in layout.bones:
+            ends = [index.get(canonical(layout.joints[end]), -1) for end in (a, b)]
+            if min(ends) >= 0 and (ends[1], ends[0]) not in bones:
+                bones[ends[0], ends[1]] = None
+    skeleton = Skeleton("joints of several layouts", tuple(called[word] for word in kept), tuple(bones))
+    kinds = list(dict.fromkeys(layout.name for layout in layouts))
+    places = tuple(tuple(own.get(word, -1) for word in kept) for own in words)
+    return Joints(skeleton, len(kept), places, f"the cameras have {listed(kinds)}: {len(kept)} joints are used, by their names")
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Cameras from recordings: their pictures' sizes, their grids, and whether they make sense together.
+
+
+def sized(take: Take, size: Size | None) -> tuple[Take, Size]:
+    """A take in pixels, and how large its picture is.
+
+    Args:
+        size: as it was given; without one, what the file or the video says.
+
+    Raises:
+        ValueError: nobody knows, or joints lie outside of the picture by far.
+    """
+    own = _own_size(take)
+    size = size or own
+    if size is None:
+        text = "{name}: the size of its picture is not known; give {arg:size=} such as 1920x1080, of all cameras or of each"
+        raise ValueError(Message(text, name=take.name))
+    if take.people and is_normalized(take.people[0]):
+        told = {str(note) for note in remarks_on(take.people[:1])}
+        people, everyone = (tuple(_scaled(clip, size) for clip in clips) for clips in (take.people, take.everyone))
+        kept = tuple(note for note in take.notes if str(note) not in told and "from 0 to 1" not in str(note))
+        take = dataclasses.replace(take, people=people, everyone=everyone, notes=kept)
+    return take, size
+
+
+def _scaled(clip: Clip, size: Size) -> Clip:
+    return clip.replace(joints=clip.joints * np.asarray(size, dtype=np.float64))
+
+
+def _own_size(take: Take) -> Size | None:
+    """What a keypoint file or a video says of its pictures."""
+    for clip in take.people:
+        said = clip.meta.get("size")
+        if said is not None and np.shape(said) == (2,):
+            return int(said[0]), int(said[1])
+    if take.path is not None and (take.video is not None or take.kind == "video"):
+        from indexing.video import probe
+
+        info = probe(take.path)
+        return info.width, info.height
+    return None
+
+
+def check_size(take: Take, clips: Sequence[Clip], size: Size, options: ViewOptions = ViewOptions()) -> None:
+    """Raise where joints lie outside of the picture by far.
+
+    Raises:
+        ValueError: the size contradicts the keypoints; says whether the picture was turned.
+    """
+    places = np.concatenate([clip.joints[clip.seen] for clip in clips]) if clips else np.zeros((0, 2))
+    if not len(places):
+        return
+    share = _outside(places, size, options)
+    if share <= options.strays:
+        return
+    low, high = np.percentile(places, [1, 99], axis=0)
+    turned = size[::-1]
+    hint = f"is it {turned[0]}x{turned[1]}? " if _outside(places, turned, options) <= options.strays else ""
+    text = (
+        "{name}: its picture of {size} does not hold its keypoints, which go from {low} to {high} "
+        "({share:.0f} % of them are far outside); {hint}give the size of the pictures in which they were found ({arg:size=})"
+    )
+    low_text, high_text = (f"({x:.0f}, {y:.0f})" for x, y in (low, high))
+    values = {"name": take.name, "size": f"{size[0]}x{size[1]}", "low": low_text, "high": high_text, "share": 100 * share}
+    raise ValueError(Message(text, **values, hint=hint))
+
+
+def _outside(places: NDArray[np.floating], size: Size, options: ViewOptions) -> float:
+    room = options.outside * np.array(size)
+    return float(((places < -room) | (places > np.array(size) + room)).any(axis=1).mean())
+
+
+def view_of(take: Take, people: Sequence[Clip | None], size: Size, options: ViewOptions = ViewOptions()) -> View:
+    """A camera with who is seen by it.
+
+    Raises:
+        ValueError: its clock runs over far more than its frames; joints outside of its picture.
+    """
+    seen = [clip for clip in people if clip is not None]
+    check_size(take, seen, size, options)
+    times = np.unique(np.concatenate([clip.times for clip in seen])) if seen else take.times
+    span = float(times[-1] - times[0])
+    if span * take.fps > max(options.longest * len(times), options.longest_frames):
+        text = "{name}: {count} frames over {span:.0f} s at {fps:g} per second: nearly all gap; cut it to the part that all share"
+        raise ValueError(Message(text, name=take.name, count=len(times), span=span, fps=take.fps))
+    there = len(np.unique(np.concatenate([clip.times[clip.seen.any(axis=1)] for clip in seen]))) if seen else 0
+    if there < options.frames:
+        text = "{name}: {count:# frame shows|# frames show} somebody, {needed} are needed at least; film longer, or give all frames"
+        raise ValueError(Message(text, name=str(take.path or take.name), count=there, needed=options.frames))
+    return View(take, tuple(people), size, np.asarray(times, dtype=np.float64))
+
+
+def check_cameras(takes: Sequence[Take], options: ViewOptions = ViewOptions()) -> None:
+    """Raise where recordings cannot be those of one rig.
+
+    Raises:
+        ValueError: too few or too many, one without keypoints, or one given twice.
+    """
+    if not 2 <= len(takes) <= options.cameras:
+        remedy = "add a camera" if len(takes) < 2 else "leave some out, the others share what is measured"
+        raise ValueError(
+            f"{len(takes)} camera{'s' * (len(takes) != 1)}: two to {options.cameras} are calibrated together; {remedy}"
+        )
+    bare = next((take for take in takes if take.kind != "keypoints" or not take.people), None)
+    if bare is not None:
+        text = "{name}: has no keypoints, and cameras are calibrated from people's joints; find them with dyntorch pose first"
+        raise ValueError(Message(text, name=str(bare.path or bare.name)))
+    twice = same_clips([take.people[0] for take in takes])
+    if twice:
+        a, b = (takes[i].name for i in twice[0])
+        raise ValueError(f"{a} and {b} hold the same recording: a camera is given twice; name every camera once")
+
+
+def check_overlap(views: Sequence[View], clocks: Tensor) -> None:
+    """Raise where cameras whose clocks are known have no moment in common with any other one.
+
+    Args:
+        clocks: ``(cameras, 2)`` offset and rate of each against the first one's.
+
+    Raises:
+        ValueError: naming two of them.
+    """
+    starts, ends = (
+        [(float(view.times[at]) - offset) / rate for view, (offset, rate) in zip(views, clocks.tolist(), strict=True)]
+        for at in (0, -1)
+    )
+    for i, view in enumerate(views):
+        shared = [min(ends[i], ends[j]) - max(starts[i], starts[j]) for j in range(len(views)) if j != i]
+        if max(shared) < 0:
+            j = 0 if i else 1
+            text = (
+                "{name} recorded from {start:.3f} to {end:.3f} s, {other} from {first:.3f} to {last:.3f} s of one clock: "
+                "they have no time in common; give recordings that overlap, or leave {arg:clocks} out if they are not synchronized"
+            )
+            values = {"start": starts[i], "end": ends[i], "first": starts[j], "last": ends[j]}
+            raise ValueError(Message(text, name=view.name, other=views[j].name, **values))

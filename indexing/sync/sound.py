@@ -1,0 +1,398 @@
+"""What the microphones of two cameras heard: a witness to how their clocks run, or, where asked, the only one.
+
+Two microphones in one room do not record one waveform: reverberation, automatic gain and the electronics differ.  What they share
+is *when* it gets loud, and at which pitch.  So the sound is cut into bands of pitch, the logarithm of the energy in each is taken
+over time (its envelope), and the envelopes are compared by the generalized cross-correlation with phase transform: every rate of
+change counts alike, however much of it there is, which makes the correlation of anything but a repeating sound a single peak.
+
+A peak must have many moments behind it.  One clap fits any other clap; what speaks for a shift is the sum of what short stretches
+of the overlap say, over the root of the sum of their squares.  By chance this ratio exceeds t with a probability of at most
+exp(-t^2 / 2), however loud single moments are, and the same ratio of the differences between the best shift and the next one says
+whether a sound that repeats leaves the two apart.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from dyntorch.core import Notice, status_from
+from indexing.sync.listening import Sound
+from indexing.sync.notices import SoundNotice
+from indexing.sync.options import SoundOptions
+
+if TYPE_CHECKING:
+    from dyntorch import Shift
+
+Floats = NDArray[np.float64]
+
+
+def sound_shift(
+    a: Sound | None,
+    b: Sound | None,
+    *,
+    fps: tuple[float, float] = (30.0, 30.0),
+    max_shift: float | None = None,
+    rate: float | None = None,
+    options: SoundOptions = SoundOptions(),
+) -> Shift:
+    """How the clock of one camera runs against that of another, by what their microphones heard.
+
+    With :math:`e_k` the whitened envelope of band k, a shift :math:`\\tau` scores
+
+    .. math:: c(\\tau) = \\sum_k \\sum_t e^a_k(t)\\, e^b_k(t + \\tau),
+
+    and is believed where the sums :math:`c_w` of short stretches w have :math:`\\sum_w c_w \\ge T \\sqrt{\\sum_w c_w^2}`, and so
+    have their differences from those of every other peak.
+
+    Args:
+        a, b: of :func:`indexing.sync.listening.hear`; None = a camera without a microphone, which is refused.
+        fps: frames per second of both, for the result.
+        max_shift: seconds, the largest offset that is searched; by default as far as the recordings overlap enough.
+        rate: of b's clock against a's; None = searched where the overlap is long enough.
+        options: every number that decides.
+
+    Returns:
+        :class:`dyntorch.Shift` with ``method="sound"``.  Its sigma holds what the sound itself leaves open, how much nearer the
+        source may be to one camera, and how far sound and pictures of one file may be apart.
+
+    Source:
+        C. Knapp, G. Carter, The generalized correlation method for estimation of time delay, IEEE Trans. ASSP 24 (1976).
+
+    Example:
+        >>> rng = np.random.default_rng(0)
+        >>> claps = np.zeros(16000 * 20, np.float32)
+        >>> for at in rng.integers(0, len(claps) - 400, 60):
+        ...     claps[at : at + 400] += rng.normal(size=400).astype(np.float32) * 0.1
+        >>> found = sound_shift(Sound(claps, 16000.0), Sound(claps[16000 * 2 :], 16000.0))  # b began two seconds later
+        >>> bool(found.ok), round(found.offset, 2)
+        (True, -2.0)
+    """
+    missing = [which for which, one in zip("ab", (a, b), strict=True) if one is None]
+    if a is None or b is None:
+        return _refused(fps, *(Notice(SoundNotice.NONE, 0.0, {"which": which}) for which in missing))
+    dead = [Notice(SoundNotice.SILENT, 0.0, {"which": which}) for which, one in zip("ab", (a, b), strict=True) if one.silent]
+    if dead:
+        return _refused(fps, *dead)
+    search = SoundSearch(a, b, max_shift, 0.0 if rate is None else rate - 1, rate is None, options)
+    if not search.lags.size:
+        return _refused(fps, Notice(SoundNotice.SHORT, options.overlap))
+    return search.shift(fps)
+
+
+def _refused(fps: tuple[float, float], *limits: Notice) -> Shift:
+    from dyntorch import Shift
+
+    none = torch.zeros(0, dtype=torch.float64)
+    return Shift(
+        offset=0.0, sigma=math.inf, rate=1.0, rate_sigma=0.0, confidence=0.0, peaks=none.reshape(0, 2), method="sound", fps=fps,
+        center=0.0, lags=none, scores=none, status=status_from(limits), notices=limits,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class SoundPeak:
+    """A shift that is worth a look.
+
+    Args:
+        lag: steps that b is later than a, in the middle of a.
+        drift: steps per step.
+        score: times the usual size of the curve.
+    """
+
+    lag: float
+    drift: float
+    score: float
+
+
+class SoundSearch:
+    """Two sounds, and the score of every shift between them."""
+
+    def __init__(self, a: Sound, b: Sound, max_shift: float | None, drift: float, free: bool, options: SoundOptions):
+        self.a, self.b, self.options, self.free, self.given = a, b, options, free, drift
+        self.step = options.step
+        self.between = b.first - a.first  # seconds between the clocks at a shift of 0 steps
+        one, two = a.coarse.shape[1], b.coarse.shape[1]
+        self.middle = (one - 1) / 2
+        every = np.arange(1 - one, two)
+        count = np.minimum(np.minimum(one, two - every), np.minimum(one + every, two))
+        keep = count >= options.overlap / self.step
+        if max_shift is not None:
+            keep &= np.abs(every * self.step + self.between) <= max_shift
+        self.lags, self.count, self._keep = every[keep], count[keep], keep
+
+    def _drifts(self) -> Floats:
+        """Drifts that are told apart by the ends of the recordings, steps per step."""
+        if not self.free:
+            return np.array([self.given])
+        length = min(self.a.coarse.shape[1], self.b.coarse.shape[1])
+        many = int(self.options.drift * length / 2)  # the ends of a stretch move by one step from one to the next
+        return np.arange(-many, many + 1) * 2 / length
+
+    @cached_property
+    def scored(self) -> tuple[Floats, Floats, Floats]:
+        """``(L,)`` score of every lag at its best drift, those drifts, and ``(L,)`` the score before any is chosen."""
+        from scipy import fft
+
+        one, two = self.a.coarse, self.b.coarse
+        size = fft.next_fast_len(one.shape[1] + two.shape[1], real=True)
+        other = fft.rfft(two, size, axis=1)
+        drifts = self._drifts()
+        length = one.shape[1] if len(drifts) == 1 and not drifts[0] else round(self.options.piece / self.step)
+        sums = np.zeros((len(drifts), len(self._keep)))
+        for begin in range(0, one.shape[1], length):
+            part = one[:, begin : begin + length]
+            found = fft.irfft((np.conj(fft.rfft(part, size, axis=1)) * other).sum(axis=0), size)
+            curve = np.take(found, np.arange(1 - one.shape[1], two.shape[1]) + begin, mode="wrap")
+            away = begin + part.shape[1] / 2 - self.middle
+            for row, drift in enumerate(drifts):
+                sums[row] += np.roll(curve, -round(drift * away))
+        scores = sums[:, self._keep] / np.sqrt(self.count)
+        usual = 1.4826 * float(np.median(np.abs(scores))) or 1.0  # of a normal distribution: its standard deviation
+        best = scores.argmax(axis=0)
+        return scores.max(axis=0) / usual, drifts[best], drifts
+
+    def peaks(self) -> list[SoundPeak]:
+        """The best shifts that are not the slope of a better one, best first."""
+        scores, drifts, _ = self.scored
+        left = scores.copy()
+        found: list[SoundPeak] = []
+        away = self.options.apart / self.step
+        while len(found) < self.options.peaks and np.isfinite(left).any():
+            at = int(np.nanargmax(left))
+            if not left[at] > 0:
+                break
+            found.append(SoundPeak(float(self.lags[at]), float(drifts[at]), float(scores[at])))
+            left[np.abs(self.lags - self.lags[at]) <= away] = -np.inf
+        return found
+
+    def said(self, peak: SoundPeak) -> Floats:
+        """What each short stretch of a says for a shift; 0 where b recorded nothing."""
+        one, two = self.a.coarse, self.b.coarse
+        rows = np.arange(one.shape[1])
+        other = rows + np.rint(peak.lag + peak.drift * (rows - self.middle)).astype(np.int64)
+        there = (other >= 0) & (other < two.shape[1])
+        products = np.zeros(len(rows))
+        products[there] = np.einsum("kt,kt->t", one[:, there], two[:, other[there]])
+        size = max(1, round(self.options.stretch / self.step))
+        whole = np.pad(products, (0, -len(products) % size))
+        return np.asarray(whole.reshape(-1, size).sum(axis=1), dtype=np.float64)
+
+    def shift(self, fps: tuple[float, float]) -> Shift:
+        """The best shift, and whether it is to be believed."""
+        from dyntorch import Shift
+
+        peaks = self.peaks()
+        if not peaks:
+            return _refused(fps, Notice(SoundNotice.NOTHING, 0.0))
+        said = [self.said(one) for one in peaks]
+        order = sorted(range(len(peaks)), key=lambda i: -ratio(said[i]))  # a score is of chance where the overlap is short
+        peaks, said = [peaks[i] for i in order], [said[i] for i in order]
+        best, strength = peaks[0], ratio(said[0])
+        apart = [ratio(said[0] - other) for other in said[1:]]
+        chance = len(self.lags) * len(self._drifts()) * math.exp(-(max(strength, 0.0) ** 2) / 2)
+        rivals = sum(math.exp(-(max(value, 0.0) ** 2) / 2) for value in apart)
+        fit = SoundFit(self, best)
+        close = [one for one, value in zip(peaks[1:], apart, strict=True) if value < self.options.apart_by]
+        limits = self._limits(best, chance, close)
+        scores, _, _ = self.scored
+        lags = self.lags * self.step + self.between
+        kept = _thinned(lags, scores, self.options.shown)
+        near = self.options
+        return Shift(
+            offset=fit.offset,
+            sigma=math.sqrt(fit.sigma**2 + (near.nearer / near.speed) ** 2 + near.latency**2),
+            rate=fit.rate,
+            rate_sigma=fit.rate_sigma,
+            confidence=1 / (1 + chance + rivals),
+            peaks=torch.tensor([[self.seconds(one, fit.center), one.score] for one in peaks], dtype=torch.float64),
+            method="sound",
+            fps=fps,
+            center=fit.center,
+            lags=torch.from_numpy(kept[0]),
+            scores=torch.from_numpy(kept[1]),
+            status=status_from(limits),
+            notices=limits,
+        )
+
+    def _limits(self, best: SoundPeak, chance: float, rivals: list[SoundPeak]) -> tuple[Notice, ...]:
+        """Why the best shift is not to be believed."""
+        if chance > self.options.chance:
+            return (Notice(SoundNotice.NOTHING, self.seconds(best)),)
+        if rivals:
+            said = ", ".join(f"{self.seconds(one):+.3f}" for one in rivals[:3])
+            return (Notice(SoundNotice.REPEATED, self.seconds(best), {"rivals": said}),)
+        return ()
+
+    def seconds(self, peak: SoundPeak, center: float | None = None) -> float:
+        """Between the clocks at a shift, in the middle of a or at a time of a's."""
+        away = 0.0 if center is None else (center - self.a.first) / self.step - self.middle
+        return (peak.lag + peak.drift * away) * self.step + self.between
+
+
+def ratio(values: Floats) -> float:
+    """The sum of values over the root of the sum of their squares; of values as likely positive as negative rarely above 4.
+
+    Example:
+        >>> ratio(np.ones(16)), ratio(np.array([9.0, 0.1, -0.1]))
+        (4.0, 1.0)
+    """
+    size = float(np.sqrt((values**2).sum()))
+    return round(float(values.sum()) / size, 3) if size else 0.0
+
+
+def _thinned(lags: Floats, scores: Floats, most: int) -> tuple[Floats, Floats]:
+    """The highest of every few values of a curve of many."""
+    every = -(-len(lags) // most)
+    if every == 1:
+        return lags, scores
+    rows = np.arange(0, len(lags), every)
+    best = np.array([row + int(scores[row : row + every].argmax()) for row in rows])
+    return lags[best], scores[best]
+
+
+class SoundFit:
+    """Offset and rate about a peak, to a fraction of a millisecond.
+
+    Every piece of the overlap has its own curve of scores near the peak; offset and rate are where the sum of the curves along
+    them is highest.  Their covariance is that of an M-estimator: the slopes of the single pieces between two inverse Hessians.
+
+    Attributes:
+        center: seconds on a's clock, the middle of the overlap.
+        offset, sigma, rate, rate_sigma: as of :class:`dyntorch.Shift`; sigma at the center.
+    """
+
+    def __init__(self, search: SoundSearch, peak: SoundPeak):
+        options, self.search = search.options, search
+        self.hop = options.hop
+        a, b = search.a, search.b
+        self.between = search.between
+        ends = [search.seconds(peak, a.first), search.seconds(peak, a.first + a.seconds)]
+        low, high = max(a.first, b.first - ends[0]), min(a.first + a.seconds, b.first + b.seconds - ends[1])
+        self.center = (low + high) / 2
+        self.times, self.curves = self._pieces(peak, low, high)
+        lags = np.arange(self.curves.shape[1]) - (self.curves.shape[1] - 1) / 2
+        self._at = lags
+        drift = peak.drift
+        long = search.free and high - low >= options.long
+        place, slope, covariance = self._best(drift, free=long)
+        if long and abs(slope - 0.0) <= options.sure * math.sqrt(covariance[1, 1]):  # nothing speaks for a drift
+            long, (place, slope, covariance) = False, self._best(0.0, free=False)
+        self.rate = 1 + slope
+        self.rate_sigma = math.sqrt(covariance[1, 1]) if long else 0.0
+        self.sigma = math.sqrt(covariance[0, 0])
+        self.offset = search.seconds(peak, self.center) + place + self.center - self.rate * self.center
+
+    def _pieces(self, peak: SoundPeak, low: float, high: float) -> tuple[Floats, Floats]:
+        """``(p,)`` seconds from the center, and ``(p, lags)`` smoothed scores about the peak's lag at the center."""
+        from scipy import fft, ndimage
+
+        options, a, b = self.search.options, self.search.a.fine, self.search.b.fine
+        about = self.search.seconds(peak, self.center)
+        shift = round((about - self.between) / self.hop)
+        self._whole = shift * self.hop + self.between - about
+        length = float(np.clip((high - low) / options.fewest_pieces, options.shortest_piece, options.piece))
+        reach = round((options.apart + options.drift * (high - low) / 2) / self.hop)
+        first, last = round((low - self.search.a.first) / self.hop), round((high - self.search.a.first) / self.hop)
+        size, times, curves = round(length / self.hop), [], []
+        for begin in range(max(0, first), max(first + 1, last - size // 2), size):
+            end = min(begin + size, a.shape[1])
+            one = a[:, begin:end]
+            other = np.zeros((len(b), one.shape[1] + 2 * reach), np.float32)
+            start = begin + shift - reach
+            inside = slice(max(0, start), max(0, min(b.shape[1], start + other.shape[1])))
+            other[:, inside.start - start : inside.stop - start] = b[:, inside]
+            n = fft.next_fast_len(other.shape[1], real=True)
+            found = fft.irfft((np.conj(fft.rfft(one, n, axis=1)) * fft.rfft(other, n, axis=1)).sum(axis=0), n)
+            times.append((begin + end - 1) / 2 * self.hop + self.search.a.first - self.center)
+            curves.append(ndimage.gaussian_filter1d(found[: 2 * reach + 1], options.blur / self.hop))
+        return np.array(times), np.array(curves, dtype=np.float64)
+
+    def _along(self, place: float, slope: float) -> tuple[Floats, Floats, Floats]:
+        """Score, slope and curvature of every piece's curve where offset and drift put it."""
+        from scipy import ndimage
+
+        at = (place - self._whole + slope * self.times) / self.hop - self._at[0]
+        rows = np.arange(len(at))
+        values = [ndimage.map_coordinates(self.curves, [rows, at + off], order=3, mode="nearest") for off in (-1.0, 0.0, 1.0)]
+        before, here, after = values
+        return here, (after - before) / (2 * self.hop), (after - 2 * here + before) / self.hop**2
+
+    def _best(self, drift: float, free: bool) -> tuple[float, float, Floats]:
+        """Seconds from the peak, drift, and the covariance of both: a grid, then Newton's steps while they go up."""
+        options = self.search.options
+        reach = options.apart / 2
+        places = np.arange(-reach, reach + self.hop / 2, self.hop)
+        half = max(float(np.abs(self.times).max()), self.hop)
+        steps = np.arange(-options.drift, options.drift + 1e-12, self.hop / half) if free else np.array([drift])
+        totals = [[float(self._along(place, slope)[0].sum()) for place in places.tolist()] for slope in steps.tolist()]
+        row, column = np.unravel_index(int(np.argmax(totals)), np.shape(totals))
+        found = np.array([places[column], steps[row]])
+        both = 2 if free else 1
+        for _ in range(options.rounds):
+            here, first, second = self._along(float(found[0]), float(found[1]))
+            design = np.stack([np.ones_like(self.times), self.times], axis=1)[:, :both]
+            hessian = -(design * second[:, None]).T @ design
+            if np.linalg.eigvalsh(hessian).min() <= 0:
+                break
+            move = np.zeros(2)
+            move[:both] = np.linalg.solve(hessian, design.T @ first)
+            next_place, next_slope = (found + move).tolist()
+            if self._along(next_place, next_slope)[0].sum() < here.sum():
+                break
+            found = found + move
+        return float(found[0]), float(found[1]), self._covariance(found, both)
+
+    def _covariance(self, found: Floats, both: int) -> Floats:
+        """``(2, 2)`` of seconds and drift."""
+        _, first, second = self._along(float(found[0]), float(found[1]))
+        design = np.stack([np.ones_like(self.times), self.times], axis=1)[:, :both]
+        hessian = -(design * second[:, None]).T @ design
+        covariance = np.zeros((2, 2))
+        covariance[0, 0] = self.search.options.apart**2
+        if np.linalg.eigvalsh(hessian).min() > 0:
+            inverse = np.linalg.inv(hessian)
+            slopes = design * first[:, None]
+            covariance[:both, :both] = inverse @ (slopes.T @ slopes) @ inverse * len(first) / max(1, len(first) - both)
+        covariance[0, 0] += (self.hop / math.sqrt(12)) ** 2
+        return covariance
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# A witness to what keypoints or pixels say.
+
+
+def apart(one: Shift, other: Shift) -> float:
+    """Seconds that another result is later, in the middle of the first's overlap."""
+    return float(other.at(one.center)) - float(one.at(one.center))
+
+
+def witnessed(found: Shift, heard: Shift, options: SoundOptions = SoundOptions()) -> Shift:
+    """What keypoints or pixels say, with what the sound says to it: it agrees, contradicts (a refusal), or does not decide.
+
+    Args:
+        found: of keypoints or pixels.
+        heard: of :func:`sound_shift`, of the same two cameras.
+    """
+    if not heard.ok:
+        if all(notice.code is SoundNotice.NONE for notice in heard.notices):
+            return found
+        why = next((notice.text for notice in heard.notices if notice.code.refuses is not None), heard.reason)
+        return dataclasses.replace(found, notices=(*found.notices, Notice(SoundNotice.OPEN, 0.0, {"why": why})))
+    said = {"offset": f"{heard.at(heard.center) - heard.center:+.3f}", "sigma": f"{heard.sigma:.3f}"}
+    if not found.ok:
+        return dataclasses.replace(found, notices=(*found.notices, Notice(SoundNotice.ALONE, 0.0, said)))
+    off = apart(found, heard)
+    if abs(off) <= options.sure * math.hypot(found.sigma, heard.sigma):
+        return dataclasses.replace(found, notices=(*found.notices, Notice(SoundNotice.AGREES, off)))
+    said["found"] = f"{found.at(found.center) - found.center:+.3f}"
+    said["own"] = f"{found.sigma:.3f}"
+    limits = (Notice(SoundNotice.CONTRADICTS, off, said), *found.notices)
+    return dataclasses.replace(found, status=status_from(limits), notices=limits)

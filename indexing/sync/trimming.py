@@ -1,0 +1,378 @@
+"""Videos cut to what all cameras recorded, with equal numbers of frames at equal moments: ``synchronized_videos/``.
+
+Programs that want synchronized videos (FreeMoCap among them) take frame k of every file for one moment.  So every moment of the
+reference's clock takes the nearest frame of each camera, and all files have one constant frame rate: a clock that runs faster has
+a frame left out now and then, one that runs slower has one twice, and none is off by more than half of its own frame.
+"""
+
+from __future__ import annotations
+
+import math
+import secrets
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from indexing.files import recover_folder, replace_folder
+from indexing.opening import entries, parse_json, read_text
+from indexing.readers.files import VIDEOS
+from indexing.sync.options import TrimOptions
+from indexing.sync.takes import Take
+
+FOLDER = "synchronized_videos"
+Floats = NDArray[np.float64]
+
+
+class CameraClock(Protocol):
+    """What is needed of a camera's clock against the reference's."""
+
+    def at(self, times: Any) -> Any:
+        """Times of this clock, of the reference's."""
+
+    def inverse(self, times: Any) -> Any:
+        """Times of the reference's clock, of this one's."""
+
+
+@dataclass(frozen=True, eq=False)
+class CameraFilm:
+    """A camera's video, and when its frames were taken.
+
+    Args:
+        name: of the camera.
+        path: of the video.
+        stamps: ``(frames,)`` seconds of every frame as the video file says.
+        times: ``(frames,)`` the same moments on the camera's clock, that of its keypoints.
+    """
+
+    name: str
+    path: Path
+    stamps: Floats
+    times: Floats
+
+    @property
+    def frame(self) -> float:
+        """Seconds from one frame to the next, usually."""
+        return float(np.median(np.diff(self.times))) if len(self.times) > 1 else math.inf
+
+
+@dataclass(frozen=True, eq=False)
+class Cut:
+    """Which frames of a video are written.
+
+    Args:
+        film: the video.
+        rows: ``(k,)`` the frame that is nearest to each moment.
+        rest: seconds, the greatest distance that is left.
+    """
+
+    film: CameraFilm
+    rows: NDArray[np.int64]
+    rest: float
+
+    @property
+    def file(self) -> str:
+        """The name of the file that is written."""
+        return f"{self.film.name}.mp4"
+
+    @property
+    def repeated(self) -> int:
+        """How many frames stand for more than one moment."""
+        return len(self.rows) - len(np.unique(self.rows))
+
+    @property
+    def left_out(self) -> int:
+        """How many frames between the first and the last are not written."""
+        return int(self.rows[-1] - self.rows[0] + 1 - len(np.unique(self.rows)))
+
+    def told(self) -> dict[str, Any]:
+        """The same in plain types."""
+        first, last = int(self.rows[0]), int(self.rows[-1])
+        return {
+            "file": f"{FOLDER}/{self.file}", "of": str(self.film.path), "frames": len(self.rows), "first": first, "last": last,
+            "repeated": self.repeated, "left_out": self.left_out, "rest": self.rest,
+        }  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Trim:
+    """What all cameras recorded, frame by frame.
+
+    Args:
+        fps: frames per second of all files.
+        start: seconds on the reference's clock, of the first frame.
+        cuts: of each camera.
+    """
+
+    fps: Fraction
+    start: float
+    cuts: tuple[Cut, ...]
+
+    @property
+    def frames(self) -> int:
+        """Of every file."""
+        return len(self.cuts[0].rows)
+
+
+def film_of(take: Take, times: Floats | None = None) -> CameraFilm:
+    """The video of a camera: what it is itself, what its keypoints were found in, or the one that lies beside them.
+
+    Args:
+        times: ``(frames,)`` of the keypoints, where they are not those of the take: of a clock that broke.
+
+    Raises:
+        ValueError: there is none, it cannot be read, or its frames are not those of the keypoints.
+    """
+    from indexing.video.reading import frame_times
+
+    path = take.footage or beside(take)
+    if path is None:
+        where = take.path or take.name
+        raise ValueError(
+            f"{where}: no video of this camera is known: give the video itself, or put it beside the keypoints under the name "
+            f"{take.name}.mp4 (or in a folder videos/ there)"
+        )
+    stamps = frame_times(path)[1]
+    return CameraFilm(take.name, path, stamps, clock_of(take, path, stamps, times))
+
+
+def beside(take: Take) -> Path | None:
+    """The video that lies beside a camera's keypoints and has its name, or in a folder ``videos`` there or one above."""
+    if take.path is None or take.kind != "keypoints":
+        return None
+    home = take.path.resolve().parent
+    for folder in (home, home / "videos", home.parent / "videos"):
+        files = sorted(folder.iterdir()) if folder.is_dir() else []
+        found = [file for file in files if file.suffix.lower() in VIDEOS and file.stem == take.name and file.is_file()]
+        if len(found) == 1:
+            return found[0]
+    return None
+
+
+def clock_of(take: Take, path: Path, stamps: Floats, mended: Floats | None = None, options: TrimOptions = TrimOptions()) -> Floats:
+    """When the frames of a video were taken, on the clock of a camera's keypoints.
+
+    Keypoints know their times (those of the video), or only numbers: then number / fps is the clock, whatever the video says.
+
+    Args:
+        mended: ``(frames,)`` of the keypoints, instead of those of the take.
+
+    Raises:
+        ValueError: there are keypoints of frames that the video does not have.
+    """
+    if take.kind != "keypoints":
+        return stamps
+    near = np.abs(stamps[np.clip(np.searchsorted(stamps, take.times), 1, len(stamps) - 1) - [[1], [0]]] - take.times).min(axis=0)
+    own = stamps if near.max(initial=0.0) <= options.same / take.fps else np.arange(len(stamps)) / take.fps
+    if take.times[-1] > own[-1] + options.longer / take.fps:
+        raise ValueError(
+            f"{path}: has {len(stamps)} frames, but there are keypoints of {take.name} up to frame "
+            f"{round(take.times[-1] * take.fps)}; give the video that they were found in"
+        )
+    if mended is None:
+        return own
+    rows = np.clip(np.searchsorted(take.times, own, side="right") - 1, 0, len(mended) - 1)
+    return np.asarray(own + (mended - take.times)[rows], dtype=np.float64)
+
+
+def trim(
+    films: Sequence[CameraFilm], clocks: Sequence[CameraClock], fps: float | None = None, options: TrimOptions = TrimOptions()
+) -> Trim:
+    """Choose the frames of what all cameras recorded: at each moment the nearest one of each.
+
+    Args:
+        films: the reference's first.
+        clocks: of the cameras, told on the reference's.
+        fps: frames per second to write; by default those of the reference, whose own frames are then the moments.
+
+    Raises:
+        ValueError: the cameras have no moment in common.
+
+    Example:
+        >>> from indexing.report.sync import Clock
+        >>> films = [CameraFilm(name, Path(f"{name}.mp4"), np.arange(50) / 25, np.arange(50) / 25) for name in ("a", "b")]
+        >>> made = trim(films, [Clock(Take(name, "video"), offset, 0.0) for name, offset in (("a", 0.0), ("b", -0.4))])
+        >>> made.frames, [int(cut.rows[0]) for cut in made.cuts], made.fps
+        (40, [10, 0], Fraction(25, 1))
+    """
+    first = films[0]
+    own = (len(first.times) - 1) / (first.times[-1] - first.times[0]) if len(first.times) > 1 else 0.0
+    if fps is None and not own > 0:
+        raise ValueError(f"{first.path}: has one frame, and so no frame rate; give it (--videos-fps)")
+    exact = Fraction(own if fps is None else fps).limit_denominator(options.denominator)
+    half = [min(film.frame / 2, 1.0) for film in films]
+    begins = [float(clock.inverse(film.times[0] - off)) for film, clock, off in zip(films, clocks, half, strict=True)]
+    ends = [float(clock.inverse(film.times[-1] + off)) for film, clock, off in zip(films, clocks, half, strict=True)]
+    begin, end, step = max(begins), min(ends), float(1 / exact)
+    zero = float(first.times[0])
+    number = math.ceil((begin - zero) / step - 1e-6)
+    count = math.floor((end - zero) / step + 1e-6) - number + 1
+    if count < 1:
+        late, early = films[int(np.argmax(begins))].name, films[int(np.argmin(ends))].name
+        raise ValueError(
+            f"{early} ended {begin - end:.2f} s before {late} began, so no moment is in the videos of all cameras; leave one of "
+            "them out"
+        )
+    moments = zero + (number + np.arange(count)) * step
+    cuts = tuple(_cut(film, np.asarray(clock.at(moments), np.float64)) for film, clock in zip(films, clocks, strict=True))
+    return Trim(exact, float(moments[0]), cuts)
+
+
+def _cut(film: CameraFilm, wanted: Floats) -> Cut:
+    """The frame nearest to each time of the camera's clock."""
+    after = np.clip(np.searchsorted(film.times, wanted), 0, len(film.times) - 1)
+    before = np.maximum(after - 1, 0)
+    rows = np.where(np.abs(film.times[before] - wanted) <= np.abs(film.times[after] - wanted), before, after)
+    return Cut(film, rows, float(np.abs(film.times[rows] - wanted).max()))
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Writing.
+
+
+def check_videos(folder: Path, inputs: Sequence[Path]) -> None:
+    """Raise where the trimmed videos would replace an input, or files that this command did not write.
+
+    Raises:
+        ValueError: naming what is in the way.
+    """
+    target = folder / FOLDER
+    recover_folder(target)
+    inside = [path for path in inputs if target.resolve() in (path.resolve(), *path.resolve().parents)]
+    if inside:
+        raise ValueError(f"{inside[0]}: is an input, and {target} would be replaced; choose another folder for --out")
+    if target.exists() and not target.is_dir():
+        raise ValueError(f"{target}: is a file, and a folder of this name is to be written; move it away")
+    known = written_before(folder)
+    other = next((file for file in entries(target) if file.name not in known), None) if target.exists() else None
+    if other is not None:
+        raise ValueError(f"{other}: is there, and not from this command; move it away, or choose another folder for --out")
+
+
+def written_before(folder: Path) -> set[str]:
+    """The names of the trimmed videos that an earlier run of this command wrote."""
+    try:
+        known = parse_json(folder, read_text(folder / "sync.json"), "")
+        if str(known["manifest"]["arguments"]["command"]) != "sync":
+            return set()
+        return {Path(str(one["file"])).name for one in known["videos"]["cameras"].values()}
+    except (ValueError, KeyError, TypeError, AttributeError):
+        return set()
+
+
+def drop_videos(folder: Path) -> bool:
+    """Remove the trimmed videos of an earlier run, which this one does not stand for."""
+    target = folder / FOLDER
+    known = written_before(folder)
+    if not (known and target.is_dir() and {file.name for file in entries(target)} <= known):
+        return False
+    shutil.rmtree(target)
+    return True
+
+
+def write_videos(
+    folder: Path, chosen: Trim, done: Callable[[float], None] | None = None, options: TrimOptions = TrimOptions()
+) -> Path:
+    """Write ``synchronized_videos/<camera>.mp4`` for every camera: all of them, or nothing.
+
+    H.264 where FFmpeg has it (else MPEG-4), upright, without sound.
+
+    Args:
+        done: is told the share that is written.
+
+    Raises:
+        ValueError: a video cannot be read, or the folder cannot be written.
+    """
+    from indexing.video.reading import av
+
+    target = folder / FOLDER
+    building = folder / f".{FOLDER}-{secrets.token_hex(8)}.tmp"
+    total = chosen.frames * len(chosen.cuts)
+    try:
+        building.mkdir(parents=True)
+        for i, cut in enumerate(chosen.cuts):
+            written = 0
+            for written in _encoded(building / cut.file, cut, chosen.fps, options):
+                if done is not None and written % options.every == 0:
+                    done((i * chosen.frames + written) / total)
+            if written < chosen.frames:
+                raise ValueError(
+                    f"{cut.film.path}: reading stopped at frame {written} of {chosen.frames}; copy it again from the camera"
+                )
+        replace_folder(building, target)
+    except (OSError, av().FFmpegError) as problem:
+        said = getattr(problem, "strerror", None) or problem
+        raise ValueError(f"cannot write {str(target)!r} ({said}); free the name or the disk, or choose another folder") from problem
+    finally:
+        shutil.rmtree(building, ignore_errors=True)
+    return target
+
+
+def _encoded(path: Path, cut: Cut, fps: Fraction, options: TrimOptions) -> Iterator[int]:
+    """Write a file frame by frame; how many are written."""
+    from indexing.video.reading import av
+
+    codec, how = "mpeg4", {"qscale": options.mpeg4}
+    if "libx264" in av().codecs_available:
+        codec, how = "libx264", {"crf": options.crf, "preset": options.preset}
+    with av().open(str(path), "w", format="mp4") as container:
+        stream = container.add_stream(codec, rate=fps, options=how)
+        stream.pix_fmt = "yuv420p"
+        for number, frame in enumerate(_frames(cut)):
+            if number == 0:
+                stream.width, stream.height = frame.width, frame.height
+            frame.pts, frame.time_base = number, 1 / fps
+            frame.pict_type = av().video.frame.PictureType.NONE
+            container.mux(stream.encode(frame))
+            yield number + 1
+        container.mux(stream.encode())
+
+
+def _frames(cut: Cut) -> Iterator[Any]:
+    """PyAV's frame of every moment, upright, of even size."""
+    from indexing.video.reading import read_video
+
+    wanted = cut.film.stamps[cut.rows]
+    close = cut.film.frame / 4
+    source = read_video(cut.film.path, start=max(0.0, float(wanted[0]) - 1.0)).stored()
+    shape: tuple[int, int] | None = None
+    here: Any = None
+    made: Any = None
+    ahead = next(source, None)
+    for moment in wanted.tolist():
+        while ahead is not None and (here is None or ahead[1] <= moment + 1e-9 or abs(ahead[1] - moment) < abs(here[1] - moment)):
+            here, ahead = ahead, next(source, None)
+            made = None
+        if here is None or (ahead is None and abs(here[1] - moment) > max(close, 1e-3)):
+            return
+        if made is None:
+            made = _upright(here[0], shape)
+            shape = shape or (made.width, made.height)
+        yield made
+
+
+def _upright(frame: Any, shape: tuple[int, int] | None) -> Any:
+    """A frame turned as the file asks for, of even size (a last row or column is cut), in the colours that play everywhere."""
+    from indexing.video.reading import Orientation, av, orientation
+
+    turned = orientation(frame)
+    if turned == Orientation() and frame.width % 2 == frame.height % 2 == 0 and shape in (None, (frame.width, frame.height)):
+        return frame if frame.format.name == "yuv420p" else frame.reformat(format="yuv420p")
+    image = turned(frame.to_ndarray(format="rgb24"))
+    image = image[: image.shape[0] // 2 * 2, : image.shape[1] // 2 * 2]
+    made = av().VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
+    width, height = shape or (made.width, made.height)
+    return made.reformat(width, height, "yuv420p")
+
+
+def told(chosen: Trim) -> dict[str, Any]:
+    """What was written, in plain types, as sync.json has it."""
+    return {
+        "folder": FOLDER, "frames": chosen.frames, "fps": float(chosen.fps), "start": chosen.start,
+        "cameras": {cut.film.name: cut.told() for cut in chosen.cuts},
+    }  # fmt: skip

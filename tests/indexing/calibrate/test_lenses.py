@@ -1,0 +1,94 @@
+"""What is known of lenses: focal lengths, files, what phones write, and what is done with them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from indexing.calibrate.lenses import DIAGONAL, focal_35, known_lenses
+from indexing.sync.takes import take_of
+from tests.indexing.calibrate.scene import SIZE, filmed, write_cameras
+
+SIZES = [SIZE] * 3
+TAKES = [take_of(own, name=f"cam{i}") for i, own in enumerate(filmed(), start=1)]
+
+
+def section(name, fx=1500.0, fy=1480.0, cx=950.0, cy=545.0, bent="[-0.1, 0.02, 0.001, -0.002]", more=""):
+    return f"[{name}]\nmatrix = [[{fx}, 0, {cx}], [0, {fy}, {cy}], [0, 0, 1]]\ndistortions = {bent}\n{more}\n"
+
+
+def test_focal_lengths():
+    assert known_lenses(TAKES, SIZES).focals is None and known_lenses(TAKES, SIZES, focal=1500).focals == (1500,) * 3
+    several = known_lenses(TAKES, SIZES, focal=[1, 1500, 1600])
+    assert several.focals == (1, 1500, 1600) and "cam1 (1 px" in several.notes[0] and "cam2" not in several.notes[0]
+    assert known_lenses(TAKES, SIZES, one_lens=True).one_lens
+    with pytest.raises(ValueError, match="focal must be positive, in pixels, got 0"):
+        known_lenses(TAKES, SIZES, focal=0)
+    with pytest.raises(ValueError, match="focal gives 2 focal lengths for 3 cameras"):
+        known_lenses(TAKES, SIZES, focal=[1500, 1600])
+    with pytest.raises(ValueError, match="focal and one_lens both say what the focal lengths are"):
+        known_lenses(TAKES, SIZES, focal=1500, one_lens=True)
+
+
+def test_a_calibration_file_is_matched_by_names(tmp_path):
+    file = tmp_path / "Calib.toml"
+    file.write_text(section("Cam_3", 1600) + section("Cam_1") + section("Cam_2", 1700, more=f"size = [{SIZE[0]}.0, {SIZE[1]}.0]"))
+    known = known_lenses(TAKES, SIZES, calibration=file)
+    assert known.focals == pytest.approx([np.sqrt(f * 1480) for f in (1500, 1700, 1600)])
+    (K, bent), *_ = known.given
+    assert K.tolist() == [[1500, 0, 950], [0, 1480, 545], [0, 0, 1]] and bent.tolist() == [-0.1, 0.02, 0.001, -0.002]
+    assert [float(K[0, 0]) for K, _ in known.given] == [1500, 1700, 1600] and known.source == "given by Calib.toml, and held"
+    assert known_lenses(TAKES, SIZES).given is None
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (section("cam1") + section("cam2"), r"its cameras are cam1, cam2, and cam1, cam2, cam3"),
+        (section("cam1") + section("cam2") + section("cam3", more="fisheye = true"), r"\[cam3\] has a fisheye lens"),
+        (
+            section("cam1") + section("cam2") + section("cam3", more="size = [640, 480]"),
+            r"cam3 \(640x480, its pictures 1920x1080\)",
+        ),
+        (section("cam1") + section("cam2") + section("cam3", fx=0), "with positive focal lengths"),
+    ],
+)
+def test_files_that_do_not_fit(tmp_path, content, said):
+    file = tmp_path / "Calib.toml"
+    file.write_text(content)
+    with pytest.raises(ValueError, match=said):
+        known_lenses(TAKES, SIZES, calibration=file)
+
+
+def test_what_a_phone_wrote_into_a_photo(tmp_path):
+    image = pytest.importorskip("PIL.Image")
+    folders = [write_cameras(tmp_path) / f"cam{i}" for i in (1, 2)]
+    takes = [take_of(folder, fps=30.0) for folder in folders]
+    with pytest.raises(ValueError, match="cam1, cam2: no 35 mm equivalent is written in its video, nor in a photo"):
+        known_lenses(takes, SIZES[:2], exif=True)
+    for folder in folders:
+        exif = image.Exif()
+        exif.get_ifd(0x8769)[41989] = 26
+        image.new("RGB", (8, 8)).save(folder / "room.jpg", exif=exif)
+        Path(folder / "broken.jpeg").write_bytes(b"no picture")
+    assert focal_35(takes[0]) == (26.0, "room.jpg") and focal_35(TAKES[0]) is None
+    found = known_lenses(takes, SIZES[:2], exif=True)
+    assert (
+        found.focals == pytest.approx([26 * np.hypot(*SIZE) / DIAGONAL] * 2) and "cam1 26 mm (room.jpg): 1324 px" in found.notes[0]
+    )
+
+
+def test_what_a_phone_wrote_into_a_video(tmp_path):
+    av = pytest.importorskip("av")
+    path = tmp_path / "a.mov"
+    with av.open(str(path), "w", options={"movflags": "use_metadata_tags"}) as container:
+        container.metadata["com.apple.quicktime.camera.focal_length.35mm_equivalent"] = "24"
+        stream = container.add_stream("mpeg4", rate=30)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        for _ in range(3):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.zeros((48, 64), np.uint8), format="gray")))
+        container.mux(stream.encode())
+    take = type(TAKES[0])(**{**vars(TAKES[0]), "path": path, "video": TAKES[0]})
+    assert focal_35(take) == (24.0, "com.apple.quicktime.camera.focal_length.35mm_equivalent of a.mov")

@@ -1,0 +1,296 @@
+"""Who is who in cameras that nobody calibrated."""
+
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import pytest
+import torch
+
+from dyntorch import Status
+from indexing.calibrate.people import AssociationOptions, PeopleNotice, associate
+from indexing.calibrate.people.clusters import clustered
+from indexing.calibrate.people.options import ClusterOptions
+from indexing.calibrate.people.relations import common, distances, view
+from indexing.calibrate.people.sorting import calibrated
+from indexing.calibrate.people.tracklets import cut, sightings
+from indexing.clip import Clip
+from indexing.skeleton import Skeleton
+from tests.indexing.calibrate.crowd import LAYOUT, NAMES, Person, cameras, clips, crossing, filmed
+
+AROUND = (0.2, 1.5, 3.6)
+OPTIONS = AssociationOptions()
+
+
+def exchanged(tracks, frames):
+    """The two first tracks of a camera with their numbers exchanged from each of these frames on."""
+    out = tracks.copy()
+    for frame in frames:
+        out[frame:, [0, 1]] = out[frame:, [1, 0]]
+    return out
+
+
+def right(found, truth):
+    """Share of the people in all frames that have their identity; truth: per camera ``(frames, tracks)``, -1 nobody."""
+    agreed = np.zeros((max(int(one.max()) for one in truth) + 1, found.people))
+    total = 0
+    for tracks, who in zip(found.tracks, truth, strict=True):
+        total += (who >= 0).sum()
+        for k in range(found.people):
+            rows = np.flatnonzero(tracks[:, k] >= 0)
+            people = who[rows, tracks[rows, k]]
+            agreed[:, k] += np.bincount(people[people >= 0], minlength=len(agreed))
+    from scipy.optimize import linear_sum_assignment
+
+    rows, columns = linear_sum_assignment(-agreed)
+    return agreed[rows, columns].sum() / total
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """Two people in three cameras: numbers exchanged here and there, clocks apart."""
+    rig = cameras(AROUND, offsets=[0.0, 0.31, -0.22])
+    seen = filmed(crossing(np.random.default_rng(3)), rig)
+    order, swaps = ([0, 1], [1, 0], [0, 1]), ([60], [40, 100], [75])
+    tracks = [exchanged(one[:, which], at) for one, which, at in zip(seen, order, swaps, strict=True)]
+    numbers = [np.tile(np.array(which), (len(one), 1)) for one, which in zip(seen, order, strict=True)]
+    truth = [exchanged(one, at) for one, at in zip(numbers, swaps, strict=True)]
+    return rig, tracks, truth, seen
+
+
+def test_exchanged_numbers_are_mended_and_clocks_found(scene):
+    rig, tracks, truth, seen = scene
+    found = associate([clips(one, name=f"cam{k}") for k, one in enumerate(tracks)])
+    assert found.ok and found.people == 2
+    assert right(found, truth) > 0.99
+    assert (found.clocks.offsets - rig.clocks.offsets).abs().max() < 0.5 / 30
+    first = int(truth[0][0, found.tracks[0][0, 0]])
+    for own, one in zip(found.joints, seen, strict=True):  # the positions are those of the person, in every camera
+        there = np.isfinite(own[:, 0, 0, 0])
+        assert np.array_equal(own[there, 0], one[there, first])
+    assert {(e.camera, round(e.time * 30)) for e in found.exchanges} >= {(0, 60), (1, 40), (1, 100), (2, 75)}
+    assert found.sure > 0.9
+    assert all(len(found.clips(k)) == 2 and found.clips(k)[1].meta["person"] == 1 for k in range(3))
+
+
+def test_fundamental_matrices_are_those_of_the_cameras(scene):
+    rig, tracks, _, _ = scene
+    found = associate([clips(one) for one in tracks], clocks=rig.clocks.offsets.numpy())
+    points = STANDING_POINTS
+    for (i, j), matrix in found.fundamentals.items():
+        x, y = (image(rig, camera, points) for camera in (i, j))
+        line = np.c_[x, np.ones(len(x))] @ matrix.T
+        away = np.abs((np.c_[y, np.ones(len(y))] * line).sum(1)) / np.linalg.norm(line[:, :2], axis=1)
+        assert np.median(away) < 4.0
+    assert found.clocks is None and np.allclose(found.offsets_rates[:, 0], rig.clocks.offsets)
+
+
+STANDING_POINTS = np.random.default_rng(0).uniform([-0.8, -0.8, 0.1], [0.8, 0.8, 1.7], (40, 3))
+
+
+def image(rig, camera, points):
+    seen = points @ rig.R[camera].numpy().T + rig.t[camera].numpy()
+    return seen[:, :2] / seen[:, 2:] * float(rig.K[camera, 0, 0]) + rig.K[camera, :2, 2].numpy()
+
+
+def test_known_cameras(scene):
+    rig, tracks, truth, _ = scene
+    bent = cameras(AROUND, offsets=[0.0, 0.31, -0.22], k1=-0.15)
+    seen = filmed(crossing(np.random.default_rng(3)), bent)
+    found = associate([clips(one) for one in seen], calibration=bent)
+    assert found.ok and found.people == 2
+    assert right(found, [np.tile([0, 1], (150, 1))] * 3) > 0.99
+    assert max(found.sigmas.values()) < 4.0  # without the lens they would be off by more
+    with pytest.raises(ValueError, match="is of 3 cameras, and there are 2 takes"):
+        associate([clips(one) for one in seen[:2]], calibration=bent)
+
+
+def test_relations_of_known_cameras_hold_for_every_point():
+    rig = cameras(AROUND)
+    views = [
+        view(one, cut(one, OPTIONS))
+        for one in (sightings(clips(x), "") for x in filmed(crossing(np.random.default_rng(0)), rig, 20))
+    ]
+    relations = calibrated(views, np.tile([0.0, 1.0], (3, 1)), rig, OPTIONS)
+    assert set(relations) == {(0, 1), (0, 2), (1, 2)}
+    for (i, j), relation in relations.items():
+        x, y = image(rig, i, STANDING_POINTS), image(rig, j, STANDING_POINTS)
+        away = distances(relation.fundamental, x[None, None], y[None, None])
+        assert np.abs(away).max() < 1e-6
+
+
+def test_distances_are_sampsons():
+    rng = np.random.default_rng(1)
+    F, x, y = rng.standard_normal((3, 3)), rng.standard_normal((1, 2, 5, 2)), rng.standard_normal((1, 3, 5, 2))
+    found = distances(F, x, y)
+    for a, b, k in product(range(2), range(3), range(5)):
+        p, q = np.append(x[0, a, k], 1), np.append(y[0, b, k], 1)
+        below = np.hypot(np.linalg.norm((F @ p)[:2]), np.linalg.norm((F.T @ q)[:2]))
+        assert found[0, a, b, k] == pytest.approx(q @ F @ p / below)
+
+
+def test_false_detections_are_nobody_and_people_come_and_go(scene):
+    rig, tracks, truth, seen = scene
+    rng = np.random.default_rng(5)
+    ghost = np.full((150, 1, len(NAMES), 2), np.nan)
+    ghost[30:70, 0] = seen[0][100, 0] + [300.0, -90.0] + 2 * rng.standard_normal((40, len(NAMES), 2))
+    given = [np.concatenate([tracks[0], ghost], axis=1), tracks[1].copy(), tracks[2].copy()]
+    given[1][80:110, 0] = np.nan
+    who = [np.concatenate([truth[0], np.full((150, 1), -1)], axis=1), truth[1].copy(), truth[2]]
+    who[1][80:110, 0] = -1
+    found = associate([clips(one, name=f"cam{k}") for k, one in enumerate(given)], clocks=rig.clocks.offsets.numpy())
+    assert found.ok and found.people == 2
+    assert right(found, who) > 0.98
+    assert found.left_out[0][30:70, 2].all() and not (found.tracks[0] == 2).any()
+    assert any(notice.code is PeopleNotice.ALONE and "cam0" in notice.text for notice in found.notices)
+    away = np.isnan(found.joints[1]).all((2, 3))
+    assert away[80:110].sum() == 30 and (found.tracks[1][80:110] == -1).sum() == 30
+
+
+def test_other_layouts_are_compared_by_name(scene):
+    rig, tracks, truth, _ = scene
+    order = np.random.default_rng(2).permutation(len(NAMES))
+    other = Skeleton("turned", (*(NAMES[k] for k in order), "tail"))
+    with_tail = np.concatenate([tracks[1][:, :, order], tracks[1][:, :, :1] + 50], axis=2)
+    found = associate([clips(tracks[0]), clips(with_tail, layout=other), clips(tracks[2])], clocks=rig.clocks.offsets.numpy())
+    assert found.ok and right(found, truth) > 0.99
+    assert found.joints[1].shape == (150, 2, len(NAMES) + 1, 2)
+    few = Skeleton("few", ("nose", *(f"x{k}" for k in range(len(NAMES) - 1))))
+    with pytest.raises(ValueError, match="1 joints of the same name, 8 are needed"):
+        associate([clips(tracks[0]), clips(tracks[1], layout=few)])
+
+
+def test_two_who_do_the_same_side_by_side_before_far_cameras_are_refused():
+    # far away and level: whoever steps aside on the floor stays on the epipolar lines
+    rng = np.random.default_rng(4)
+    one, two = Person(rng, [0.0, -0.6], [0.1, 0.0]), Person(rng, [0.0, 0.6], [0.1, 0.0])
+    two.rates, two.phases, two.sizes, two.speed = one.rates, one.phases, one.sizes, one.speed
+    rig = cameras((0.2, 1.4), distance=400.0, focal=110_000.0)
+    rig.t[:, 1] += 0.0
+    found = associate([clips(x) for x in filmed([one, two], rig)], clocks=[0.0, 0.0])
+    assert not found.ok and found.status == Status.AMBIGUOUS
+    assert "persons 0 and 1 exchanged fit as well" in found.reason
+    with pytest.raises(ValueError, match="do the same at the same time"):
+        found.check()
+
+
+def test_a_camera_of_other_people_is_named(scene):
+    rig, tracks, _, _ = scene
+    strangers = filmed(crossing(np.random.default_rng(99)), cameras((0.4, 2.0)), seed=7)[0]
+    given = [clips(tracks[0], name="a"), clips(tracks[1], name="b"), clips(strangers, name="elsewhere")]
+    found = associate(given, clocks=[0.0, 0.31, 0.0])
+    assert not found.ok and "elsewhere" in found.reason
+
+
+def test_nobody():
+    nothing = clips(np.full((50, 1, len(NAMES), 2), np.nan))
+    found = associate([nothing, nothing])
+    assert not found.ok and found.people == 0 and found.status == Status.TOO_FEW
+    assert "nobody is seen" in found.reason and np.isnan(found.sure)
+
+
+@pytest.mark.parametrize(
+    ("takes", "more", "said"),
+    [
+        (lambda x: [x], {}, "two at least"),
+        (lambda x: [x, []], {}, "no people given"),
+        (lambda x: [x, [Clip(np.zeros((20, 5, 3)) + np.arange(3), fps=30.0, name="deep")]], {}, "deep: has 3D joints"),
+        (lambda x: [x, [*x, Clip(np.zeros((20, 5, 2)), fps=30.0)]], {}, "people of one camera have the same"),
+        (lambda x: [x, [Clip(np.zeros((20, 5, 2)), fps=30.0)]], {}, "have no names"),
+        (lambda x: [x, x], {"clocks": [0.0]}, "for each of 2 cameras"),
+        (lambda x: [x, x], {"clocks": [[0.0, 1.0], [0.0, -1.0]]}, "for each of 2 cameras"),
+        (lambda x: [x, x], {"options": ClusterOptions()}, "options"),
+    ],
+)
+def test_bad_input(takes, more, said):
+    x = clips(np.zeros((20, 1, len(NAMES), 2)) + np.arange(20)[:, None, None, None])
+    with pytest.raises((ValueError, TypeError), match=said):
+        associate(takes(x), **more)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# The stages.
+
+
+def test_pieces_follow_the_body_whatever_number_it_has():
+    seen = filmed(crossing(np.random.default_rng(3)), cameras(AROUND))[0]
+    pieces = cut(sightings(clips(exchanged(seen, [50])), "a"), OPTIONS)
+    assert len(pieces) == 2
+    assert pieces.number[0, 0] == pieces.number[149, 1] and pieces.number[0, 1] == pieces.number[149, 0]
+    assert pieces.conflicts.tolist() == [[False, True], [True, False]]
+
+
+def test_pieces_end_where_two_bodies_are_one():
+    rng = np.random.default_rng(0)
+    body = filmed(crossing(np.random.default_rng(3)), cameras(AROUND), 61, noise=0.0)[0][:1, 0]
+    way = np.linspace(-150, 150, 61)[:, None, None] * [1.0, 0.0]
+    both = np.stack([body + way, body - way], axis=1) + rng.standard_normal((61, 2, len(NAMES), 2))
+    pieces = cut(sightings(clips(both), "a"), OPTIONS)
+    assert len(pieces) > 2
+    first, last = pieces.number[0], pieces.number[-1]
+    assert not set(first.tolist()) & set(last.tolist())
+    for piece in range(len(pieces)):  # before and after they meet, a piece is one of both
+        rows, tracks = np.nonzero(pieces.number == piece)
+        far = np.abs(rows - 30) > 3
+        assert len(set(tracks[far].tolist())) <= 1 or len({row > 30 for row in rows[far]}) == 1
+
+
+def test_common_moments_of_another_clock():
+    seen = filmed([Person(np.random.default_rng(0), [0, 0], [1, 0])], cameras((0.0, 1.0), offsets=[0.0, 0.25]), noise=0.0)
+    a, b = (view(one, cut(one, OPTIONS)) for one in (sightings(clips(x), "") for x in seen))
+    both = common(a, b, 0.25, 1.0, OPTIONS)
+    # what b saw a quarter of a second later by its own clock, between two of its frames
+    expected = 0.5 * (seen[1][7:9, 0] + seen[1][8:10, 0])
+    assert np.abs(both.b[:2, 0] - expected).max() < 1e-9
+
+
+def random_scores(seed, n=7):
+    rng = np.random.default_rng(seed)
+    scores = np.triu(rng.standard_normal((n, n)) * 3, 1)
+    conflicts = np.triu(rng.uniform(size=(n, n)) < 0.3, 1)
+    return scores + scores.T, conflicts | conflicts.T
+
+
+def total(scores, labels):
+    return sum(scores[p, q] for p in range(len(labels)) for q in range(p) if labels[p] == labels[q])
+
+
+def partitions(n):
+    """All labelings up to the names of the groups."""
+    out = [[0]]
+    for _ in range(n - 1):
+        out = [[*one, k] for one in out for k in range(max(one) + 2)]
+    return out
+
+
+def test_clusters_are_nearly_always_the_best_of_all():
+    best_of_all = 0
+    every = [np.array(one) for one in partitions(7)]
+    for seed in range(12):
+        scores, conflicts = random_scores(seed)
+        labels = clustered(scores, conflicts, OPTIONS, np.arange(7.0))
+        assert not (conflicts & (labels[:, None] == labels)).any()
+        most = max(total(scores, one) for one in every if not (conflicts & (one[:, None] == one)).any())
+        best_of_all += total(scores, labels) > most - 1e-9
+    assert best_of_all >= 9
+
+
+def test_no_clusters_of_nothing():
+    assert clustered(np.zeros((0, 0)), np.zeros((0, 0), dtype=bool), OPTIONS).shape == (0,)
+    labels = clustered(np.full((3, 3), -1.0), np.zeros((3, 3), dtype=bool), OPTIONS)
+    assert sorted(labels.tolist()) == [0, 1, 2]
+
+
+def test_two_groups_exchange_what_comes_after():
+    # 0, 1 then 2, 3: the pieces of both moments were put together the wrong way round
+    scores = np.zeros((4, 4))
+    for p, q, s in ((0, 2, -2.0), (1, 3, -2.0), (0, 3, 2.0), (1, 2, 2.0)):
+        scores[p, q] = scores[q, p] = s
+    conflicts = np.zeros((4, 4), dtype=bool)
+    conflicts[0, 1] = conflicts[1, 0] = conflicts[2, 3] = conflicts[3, 2] = True
+    labels = clustered(scores, conflicts, replace(OPTIONS, clusters=ClusterOptions(sweeps=1)), np.array([0.0, 0.0, 1.0, 1.0]))
+    assert labels[0] == labels[3] != labels[1] == labels[2]
+
+
+def test_layout_of_the_scene():
+    assert len(LAYOUT.joints) == 13 and torch.float64 == cameras((0.0,)).K.dtype

@@ -1,0 +1,181 @@
+"""Clocks from sound: right to a millisecond; refused where it is silent, repeats itself or is another; a witness to pictures."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from indexing.sync.listening import Sound, flattened, hear
+from indexing.sync.options import SoundOptions
+from indexing.sync.sound import apart, sound_shift, witnessed
+from indexing.sync.synchronize import synchronize
+from tests.indexing.sync.footage import RATE, clicks, microphone, noises, write_film
+from tests.indexing.sync.scene import shift, told
+
+STARTS = (3.0, 7.4321)  # seconds of the scene at which two cameras begin
+LATER = STARTS[0] - STARTS[1]
+
+
+def heard(scene: np.ndarray, start: float, seconds: float = 25.0, seed: int = 0, noise: float = 0.01) -> Sound:
+    return Sound(microphone(scene, start, seconds, seed, noise), RATE)
+
+
+@pytest.fixture(scope="module")
+def scene() -> np.ndarray:
+    return noises(40.0, 1)
+
+
+# ---- what is found -------------------------------------------------------------------------------------------------------
+def test_two_microphones_agree_to_a_millisecond(scene):
+    found = sound_shift(heard(scene, STARTS[0]), heard(scene, STARTS[1], seed=1))
+    assert found.ok and found.method == "sound" and found.confidence > 0.99 and found.rate == 1
+    assert found.offset == pytest.approx(LATER, abs=1e-3)
+    assert found.sigma == pytest.approx(np.hypot(0.015, 3 / 343), rel=0.05)  # distance and latency, not the fit, are what is unsure
+    assert found.peaks[0, 0].item() == pytest.approx(LATER, abs=0.02) and (found.peaks[1:, 1] < found.peaks[0, 1]).all()
+    assert found.lags[found.scores.argmax()].item() == pytest.approx(LATER, abs=0.02)
+
+
+def test_the_starts_on_the_clocks_of_the_pictures_count(scene):
+    first = dataclasses.replace(heard(scene, STARTS[0]), start=0.25)
+    assert sound_shift(first, heard(scene, STARTS[1], seed=1)).offset == pytest.approx(LATER - 0.25, abs=1e-3)
+
+
+def test_other_rates_and_types_of_samples(scene):
+    whole = microphone(scene, STARTS[0], 25.0, 0)
+    half = Sound((whole[::2] / 32768).astype(np.float32), RATE / 2)
+    assert sound_shift(half, heard(scene, STARTS[1], seed=1)).offset == pytest.approx(LATER, abs=2e-3)
+
+
+def test_noise_and_levels(scene):
+    loud, quiet = heard(scene, STARTS[0], noise=0.1), heard(scene, STARTS[1], seed=1, noise=0.1)
+    quiet = dataclasses.replace(quiet, samples=quiet.samples // 50)
+    found = sound_shift(loud, quiet)
+    assert found.ok and found.offset == pytest.approx(LATER, abs=3e-3)
+
+
+def test_a_clock_that_drifts(scene):
+    gained = 1 + 1.5e-4
+    second = microphone(scene, STARTS[1], 30.0, 1)
+    moments = np.arange(int(28 * RATE)) / gained
+    slower = np.interp(moments, np.arange(len(second)), second).astype(np.int16)
+    found = sound_shift(heard(scene, STARTS[0], 36.0), Sound(slower, RATE))
+    middle = found.center
+    assert found.at(middle) == pytest.approx(gained * (middle + LATER), abs=1e-3)
+    short = sound_shift(heard(scene, STARTS[0], 36.0), Sound(slower, RATE), options=SoundOptions(long=10.0))
+    assert short.rate == pytest.approx(gained, abs=4 * short.rate_sigma) and 0 < short.rate_sigma < 5e-5
+    held = sound_shift(heard(scene, STARTS[0], 36.0), Sound(slower, RATE), rate=1.0, options=SoundOptions(long=10.0))
+    assert held.rate == 1 and held.rate_sigma == 0
+
+
+def test_a_long_recording_whose_ends_are_many_steps_apart():
+    scene, gained = noises(140.0, 4), 1 + 2e-4
+    slower = np.interp(np.arange(int(130 * RATE)) / gained, np.arange(len(scene)), scene)
+    found = sound_shift(Sound(scene.astype(np.float32), RATE), Sound(slower.astype(np.float32), RATE))
+    assert found.ok and found.rate == pytest.approx(gained, abs=5e-6) and found.offset == pytest.approx(0.0, abs=1e-3)
+
+
+def test_max_shift_bounds_the_search(scene):
+    pair = heard(scene, STARTS[0]), heard(scene, STARTS[1], seed=1)
+    assert sound_shift(*pair, max_shift=4.5).offset == pytest.approx(LATER, abs=1e-3)
+    found = sound_shift(*pair, max_shift=3.0)
+    assert not found.ok and found.lags.abs().max() <= 3.0
+    nothing = sound_shift(dataclasses.replace(pair[0], start=100.0), pair[1], max_shift=3.0)
+    assert not nothing.ok and "overlap by less than 2 s" in nothing.reason
+
+
+# ---- what is refused -----------------------------------------------------------------------------------------------------
+def test_unrelated_sounds_are_refused():
+    sounds = [heard(noises(12.0, 10 + seed), 0.0, 10.0, seed) for seed in range(6)]
+    found = [sound_shift(a, b) for i, a in enumerate(sounds) for b in sounds[:i]]
+    assert not any(one.ok for one in found) and all("no shift of the sound stands out" in one.reason for one in found)
+
+
+def test_one_clap_fits_any_other_clap():
+    made = []
+    for at in (4.0, 7.0):
+        samples = np.random.default_rng(int(at)).normal(size=12 * RATE) * 1e-3
+        samples[int(at * RATE) :][:500] += np.random.default_rng(9).normal(size=500)
+        made.append(Sound(samples.astype(np.float32), RATE))
+    assert not sound_shift(*made).ok
+
+
+def test_a_metronome_is_refused_and_says_why():
+    click = clicks(40.0)
+    found = sound_shift(heard(click, 3.0, noise=1e-3), heard(click, 7.1, seed=1, noise=1e-3))
+    assert not found.ok and found.confidence < 0.9
+    regular = noises(2.0, 3)
+    loop = np.tile(regular, 15)
+    found = sound_shift(heard(loop, 1.0), heard(loop, 4.3, seed=1))
+    assert not found.ok and "the sound repeats itself" in found.reason
+
+
+def test_silence_and_no_sound(scene):
+    speaking, off = heard(scene, 3.0), Sound(np.zeros(25 * RATE, np.int16), RATE)
+    assert "the sound of b is silence" in sound_shift(speaking, off).reason.replace("camera ", "")
+    assert "has no sound" in sound_shift(None, speaking).reason and off.silent and not speaking.silent
+    assert not sound_shift(speaking, Sound(np.full(50, 900, np.int16), RATE)).ok  # a few milliseconds
+    with pytest.raises(ValueError, match=r"one channel \(n,\) of numbers, got shape \(3, 2\)"):
+        Sound(np.zeros((3, 2)), RATE)
+    with pytest.raises(ValueError, match="positive number of samples per second, got 0"):
+        Sound(np.zeros(3), 0)
+
+
+def test_the_phase_transform_makes_every_rate_of_change_count_alike():
+    curves = np.random.default_rng(0).normal(size=(2, 3000)).cumsum(axis=1).astype(np.float32)
+    made = flattened(curves, 100.0, 1.0, 0.5)
+    power = np.abs(np.fft.rfft(made, axis=1)) ** 2
+    slow, fast = power[:, 30:300].mean(), power[:, 900:1400].mean()  # 1 to 10 Hz, 30 to 47 Hz
+    assert slow == pytest.approx(fast, rel=0.6) and power[:, :10].mean() < 0.15 * slow
+    assert not flattened(np.ones((1, 500), np.float32), 100.0, 1.0, 0.5).any()
+
+
+# ---- from files ----------------------------------------------------------------------------------------------------------
+@pytest.fixture(scope="module")
+def films(tmp_path_factory: pytest.TempPathFactory, scene):
+    pytest.importorskip("av")
+    folder = tmp_path_factory.mktemp("films")
+    for i, (name, start) in enumerate(zip("ab", STARTS, strict=True)):
+        numbers = np.arange(90)
+        write_film(folder / f"{name}.mp4", numbers, 30.0, microphone(scene, start, 20.0, i))
+    write_film(folder / "late.mp4", np.arange(90), 30.0, microphone(scene, STARTS[1] + 0.5, 20.0, 5), delay=0.5)
+    write_film(folder / "mute.mp4", np.arange(90), 30.0)
+    return folder
+
+
+def test_sound_is_placed_on_the_clock_of_the_pictures(films):
+    a, b, late = (hear(films / f"{name}.mp4") for name in ("a", "b", "late"))
+    assert a is not None and b is not None and late is not None
+    assert a.seconds == pytest.approx(20.0, abs=0.1) and a.rate == RATE and late.start == pytest.approx(0.5, abs=0.07)
+    assert sound_shift(a, b).offset == pytest.approx(LATER, abs=2e-3)
+    assert sound_shift(a, late).offset == pytest.approx(LATER, abs=2e-3)
+    assert hear(films / "mute.mp4") is None and hear(films / "a.mp4") is a  # heard once
+
+
+def test_videos_by_sound_alone(films):
+    found = synchronize(films / "a.mp4", films / "b.mp4", "sound")
+    assert found.ok and found.offset == pytest.approx(LATER, abs=2e-3) and found.fps == pytest.approx((30.0, 30.0))
+    mute = synchronize(films / "a.mp4", films / "mute.mp4", "sound")
+    assert not mute.ok and "mute has no sound" in mute.reason
+    with pytest.raises(ValueError, match=r"is no video, and method='sound' needs their sound"):
+        synchronize(np.ones((30, 5, 2)), np.ones((30, 5, 2)), "sound", fps=30.0)
+
+
+# ---- a witness -----------------------------------------------------------------------------------------------------------
+def test_a_witness_agrees_contradicts_or_says_nothing():
+    sure = shift(-0.4, sigma=0.002)
+    sound = dataclasses.replace(shift(-0.39, method="sound"), sigma=0.017)
+    found = witnessed(sure, sound)
+    assert found.ok and found.offset == -0.4 and found.notes == ("sound agrees: +0.010 s",)
+    assert apart(sure, sound) == pytest.approx(0.01)
+    away = dataclasses.replace(sound, offset=0.7)
+    found = witnessed(sure, away)
+    assert not found.ok and "the sound says +0.700 ± 0.017 s, and the pictures say -0.400 ± 0.002 s" in found.reason
+    assert "method='sound'" in found.reason and "sound=False" in found.reason and found.offset == -0.4
+    open_ = dataclasses.replace(sure, **told({"ok": False, "reason": "periodic"}))
+    found = witnessed(open_, sound)
+    assert not found.ok and found.reason == "periodic" and "the sound says -0.390 ± 0.017 s" in found.notes[-1]
+    unsure = dataclasses.replace(sound, **told({"ok": False, "reason": "too quiet"}))
+    assert witnessed(sure, unsure).ok and witnessed(sure, unsure).notes == ("the sound does not decide: too quiet",)
+    assert witnessed(sure, sound_shift(None, None)) is sure
