@@ -57,7 +57,7 @@ class SideNotice(NoticeCode):
         "from {start:.2f} to {end:.2f} s as many cameras exchange the {limb} of person {person} as do not, and all stays as it is",
     )
     """As many cameras for one reading as for the other."""
-    MENDED = "mended", "{limb} of person {person} exchanged in camera {camera} from {start:.2f} to {end:.2f} s, mended"
+    MENDED = "mended", "{limb} of person {person} exchanged in {which:cameras} from {start:.2f} to {end:.2f} s, mended"
     """What was exchanged."""
 
 
@@ -175,8 +175,9 @@ def sides(
             untouched[camera][:, person] = labels[place, camera]
             found += _stretches(untouched[camera][:, person], costs[place, camera], own, camera, person, pairs)
     mended, trusted = _mended(x, w, untouched, pairs, len(joints))
-    told = ("limb", "person", "camera", "start", "end")
-    said += [Notice(SideNotice.MENDED, one.evidence, {name: getattr(one, name) for name in told}) for one in found]
+    for one in found:
+        values = {"limb": one.limb, "person": one.person, "which": [one.camera], "start": one.start, "end": one.end}
+        said.append(Notice(SideNotice.MENDED, one.evidence, values))
     return Sides(
         status=status_from(()),
         notices=tuple(said),

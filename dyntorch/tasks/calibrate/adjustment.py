@@ -318,9 +318,12 @@ def camera_covariance(reduced: Tensor, basis: Tensor, unseen: Tensor) -> Tensor:
     world = torch.linalg.qr(inside.mT @ unseen).Q
     allowed = inside @ torch.linalg.qr(world, mode="complete").Q[:, 7:]
     matrix = allowed.mT @ reduced @ allowed
-    scale = matrix.diagonal().clamp(min=torch.finfo(matrix.dtype).tiny).rsqrt()
-    values, vectors = torch.linalg.eigh(scale[:, None] * matrix * scale)
+    diagonal = matrix.diagonal()
+    # rounding may leave less than nothing of what is not known
+    scale = diagonal.clamp(min=max(1e-20 * float(diagonal.max()), torch.finfo(matrix.dtype).tiny)).rsqrt()
     # what the images do not tell has no information: its variance is as large as numbers can say
-    spread = scale[:, None] * vectors * values.clamp(min=1e-14).rsqrt()
-    half = allowed @ spread
-    return half @ half.mT
+    eye = torch.eye(len(matrix), dtype=matrix.dtype)
+    factor, failed = torch.linalg.cholesky_ex(scale[:, None] * matrix * scale + 1e-12 * eye)
+    inverse = 1e12 * eye if int(failed) else torch.cholesky_inverse(factor)
+    spread = scale[:, None] * inverse * scale
+    return allowed @ spread @ allowed.mT

@@ -4,7 +4,8 @@ A joint that a network finds is near a fixed combination of markers, :math:`X_i 
 markers and of few orthonormal combinations :math:`Y_k` of them, those that move most.  Combinations, camera and shift are fitted
 together to the distances in the image,
 
-.. math:: \min_{s, P, w} \sum_{it} \rho\bigl(|x_{it} - P(\bar X + \textstyle\sum_k w_{ik} Y_k)(t + s)|^2\bigr) + \sigma^2 |w|^2 / \omega^2,
+.. math:: \min_{s, P, w} \sum_{it} \rho\bigl(|x_{it} - P(\bar X + \textstyle\sum_k w_{ik} Y_k)(t + s)|^2\bigr)
+          + \sigma^2 |w|^2 / \omega^2,
 
 from the lag that the row spaces give: these know whole frames well, and places between them as well as an affine camera does.
 """
@@ -70,7 +71,7 @@ def combined_fit(film: Tracks, space: Tracks, offset: float, rate: float, option
 
 @dataclass(frozen=True, eq=False)
 class _Problem(LeastSquares):
-    """One problem: parameters are the camera ``(1, 3, 4)``, weights ``(1, n, k)`` and the shift from the start, frames ``(1, 1)``."""
+    """One problem: parameters are the camera ``(1, 3, 4)``, weights ``(1, n, k)`` and the shift from the start in frames."""
 
     x: Tensor  # (T, n, 2) normalized
     sure: Tensor  # (T, n) weights as given, 0 where not seen
@@ -157,7 +158,7 @@ class _Problem(LeastSquares):
         """Residuals ``(n, 2 T)``, and derivatives by the weights ``(n, 2 T, k)`` and by camera and shift ``(n, 2 T, 13)``."""
         P = theta[0][0]
         images, depth, X, V, places = self._images(theta)
-        root = (self.sure * self.robust).sqrt()[..., None] / 1.0
+        root = (self.sure * self.robust).sqrt()[..., None]
         rows = (P[:2, :3] - images[..., None] * P[2, :3]) / depth[..., None, None]  # (T, n, 2, 3) by the point
         by_weights = torch.einsum("tncd,tkd->tnck", rows, places[:, 1:])
         by_shift = self.frame * torch.einsum("tncd,tnd->tnc", rows, V)

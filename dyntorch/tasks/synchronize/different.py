@@ -11,9 +11,10 @@ from torch import Tensor
 
 from dyntorch.core.outcome import Notice, Status, status_from
 from dyntorch.tasks.synchronize.camera_models import KINDS
+from dyntorch.tasks.synchronize.combinations import combined_fit
 from dyntorch.tasks.synchronize.measures import MEASURES
 from dyntorch.tasks.synchronize.options import SynchronizeOptions
-from dyntorch.tasks.synchronize.result import Shift, ShiftNotice
+from dyntorch.tasks.synchronize.result import Shift, ShiftNotice, refusing
 from dyntorch.tasks.synchronize.row_spaces import RowSpaceShift, row_space_shift
 from dyntorch.tasks.synchronize.subspace import STEP, Body, SubspaceCurve, bodies_curve, halves, information, subspace_curve
 from dyntorch.tasks.synchronize.tracks import Tracks, smoothed
@@ -277,7 +278,7 @@ def different_points(a: Tracks, b: Tracks, *, max_shift: float | None, rate: flo
     body = _result(a, b, found, curve, _to_a_frame(best, step, max(a.step, b.step), options), rate_sigma)
     spaces = row_space_shift(a, b, step=step, rate=body.rate, max_shift=max_shift, around=body.offset, options=options)
     if options.different.measure == options.different.camera == "auto":
-        return _forwards(_combined(body, spaces, options), curve, options)
+        return _forwards(_between_frames(a, b, _combined(body, spaces, options), options), curve, options)
     return _of_spaces(body, spaces, 1 / min(body.fps), options)
 
 
@@ -301,6 +302,28 @@ def _combined(body: Shift, spaces: RowSpaceShift | None, options: SynchronizeOpt
     if spaces.strength < options.rows.heard:
         return _refused(body, spaces)
     return body if away <= frame else _blunt(body, math.hypot(body.sigma, away / 2), frame)
+
+
+def _between_frames(a: Tracks, b: Tracks, shift: Shift, options: SynchronizeOptions) -> Shift:
+    """Of a camera and points in space, which are seen as combinations of these, the place between frames that a camera tells."""
+    blunt = [notice for notice in shift.notices if notice.code == ShiftNotice.BLUNT]
+    if a.x.shape[-1] == b.x.shape[-1] or not (shift.ok or blunt):
+        return shift
+    turned = a.x.shape[-1] == 3  # the fit goes from the camera to the space
+    offset, rate = (-shift.offset / shift.rate, 1 / shift.rate) if turned else (shift.offset, shift.rate)
+    found = combined_fit(b, a, offset, rate, options) if turned else combined_fit(a, b, offset, rate, options)
+    frame = 1 / min(shift.fps)
+    sigma = math.inf if found is None else found.sigma * (shift.rate if turned else 1.0)
+    if found is None or sigma > min(shift.sigma, options.different.sharp_frames * frame):
+        return shift
+    place = -found.offset * shift.rate if turned else found.offset
+    rest = tuple(notice for notice in shift.notices if notice not in blunt)
+    confidence = options.different.sure if blunt and not refusing(rest) else shift.confidence
+    peaks = shift.peaks.clone()
+    peaks[:1, 0] += place - shift.offset
+    return dataclasses.replace(
+        shift, offset=place, sigma=sigma, status=status_from(rest), notices=rest, confidence=confidence, peaks=peaks
+    )
 
 
 def _forwards(shift: Shift, curve: SubspaceCurve, options: SynchronizeOptions) -> Shift:

@@ -193,11 +193,26 @@ class Attempt:
     def needed(self) -> float:
         """Nats above the next peak, for a decision."""
         evidence = self.options.evidence
-        if self.method == "affine":
-            usual = evidence.usual_roughness_pruned if self.chosen else evidence.usual_roughness_affine
+        affine = self.method == "affine"
+        least = evidence.affine_margin if affine else evidence.margin
+        if affine or self.doubtful == 0:
+            # with a residual far above the noise something may have been made to fit, the more so by leaving out what does not
+            usual = evidence.usual_roughness_pruned if self.chosen else evidence.usual_roughness_clear
             rough = math.log(max(self.roughness, 1e-300) / usual)
-            return evidence.affine_margin + evidence.rough_margin * min(max(rough, 0.0), 1.0)
-        return evidence.margin + evidence.rough_margin * self.doubtful
+            return least + evidence.rough_margin * min(max(rough, 0.0), 1.0) + evidence.short_margin * self.short
+        return least + evidence.rough_margin * self.doubtful + evidence.short_margin * self.short
+
+    @property
+    def short(self) -> float:
+        """0 to 1: how much shorter than the longest overlap it is, where points or positions were left out: so little fits easily."""
+        assert self.fit is not None
+        counts = self.curve.counts
+        if not self.chosen or not len(counts):
+            return 0.0
+        place = int((self.curve.lags - self._lag(self.fit.shift)).abs().argmin())
+        share = float(counts[place] / counts.max().clamp(min=1e-300))
+        evidence = self.options.evidence
+        return min(max((evidence.short_overlap - share) / (0.5 * evidence.short_overlap), 0.0), 1.0)
 
     @property
     def chosen(self) -> bool:
@@ -208,14 +223,18 @@ class Attempt:
     def doubtful(self) -> float:
         """0 where all points fit as well as their noise lets them; 1 where something may have been made to fit.
 
-        That is with a residual that the noise does not explain, or by leaving out what does not fit, unless b played backwards fits
-        far worse nevertheless.
+        That is with a residual that the noise does not explain, or by leaving out what does not fit, unless b played backwards, or
+        every other shift with as long an overlap, fits far worse.
         """
         evidence = self.options.evidence
         rough = math.log(max(self.roughness, 1e-300) / evidence.usual_roughness)
-        if self.chosen and self.forward < evidence.forward_clear:
-            return 1.0
-        return min(max(rough / evidence.rough_growth, 0.0), 1.0)
+        if not self.chosen and rough <= 0:
+            return 0.0
+        own, *others = (score for _, score in self.peaks)
+        alone = own - max(others, default=-math.inf) >= evidence.score_clear
+        if self.short == 0 and (alone or self.forward >= evidence.forward_clear):
+            return 0.0
+        return 1.0 if self.chosen else min(rough / evidence.rough_growth, 1.0)
 
     @property
     def roughness(self) -> float:

@@ -127,10 +127,15 @@ class EvidenceOptions:
     nothing in common 7 to 22, real detectors have 5 to 10."""
     rough_growth: float = 0.25
     """Logarithm of the residual over the usual one at which all of that margin is asked for."""
-    usual_roughness_affine: float = 4.0
-    """Usual residual of affine cameras, which leave perspective unexplained."""
+    usual_roughness_clear: float = 4.0
+    """Usual residual where b played backwards fits far worse, and of affine cameras, which leave perspective unexplained."""
     usual_roughness_pruned: float = 2.0
     """The same where points or positions were left out."""
+    short_margin: float = 0.6
+    """Nats more for a decision where points or positions were left out of an overlap of half ``short_overlap``: traps were made to
+    fit so with margins up to 1.1."""
+    short_overlap: float = 0.5
+    """Share of the longest overlap below which it is short."""
     forward: float = -0.35
     """Nats by which the residual has to be below that of b played backwards, for a decision: films that run backwards and were
     called ok had -.9 to -1.9, good pairs -.1 to 2.7 (9 in 10 above .3): training trials of experiments.synchronization.silent."""
@@ -140,6 +145,8 @@ class EvidenceOptions:
     forward_clear: float = 0.6
     """Nats of it from which leaving out points is no reason for doubt: of 40 virtual pairs with wrong joints, outliers or gaps all
     but one had .7 to 2.1, traps that were made to fit so .2 and less."""
+    score_clear: float = 0.9
+    """Score above that of every other peak from which the same is no reason: traps had .3 and less, but for short overlaps."""
     forward_scale: float = 0.04
     """Nats of it by which the odds of a film that runs forwards grow e times."""
     apart: float = 2.5
@@ -461,14 +468,15 @@ class ProjectiveOptions:
 class CombinedOptions:
     """Where between frames the shift of a camera and motion capture lies that share no point."""
 
-    most_combinations: int = 12
-    """Combinations of the points in space, besides their middle."""
+    most_combinations: int = 8
+    """Combinations of the points in space, besides their middle: rms error of 15 films of 5 s, 8 / 12 / 20: .25 / .26 / .26
+    frames."""
     start_combinations: int = 4
     """Those that the first affine camera is told by."""
     start_ridge: float = 1e-3
     """Ridge of the regressions for it, mean squares of coordinates of order 1."""
     above: float = 1.0
-    """Movement of a combination, over the noise of the camera, from which it counts."""
+    """Movement of a combination, over the noise of the camera, from which it counts: rms error at .5 / 1 / 2: .26 / .26 / .42."""
     usual_weight: float = 1.0
     """Standard deviation of a combination's weights; a point that is one of the recorded has weights of norm 1 at most."""
     reach: float = 3.0
@@ -485,9 +493,9 @@ class CombinedOptions:
     """Share of the cost by which a step must lower it."""
     exact: float = 1e-6
     """Residual of normalized coordinates that is rounding."""
-    optimism: float = 1.6
-    """Errors over the sigma that the residuals alone say."""
-    least_sigma: float = 0.02
+    optimism: float = 3.0
+    """Errors over the sigma that the residuals alone say: a joint is only nearly a combination of others."""
+    least_sigma: float = 0.05
     """Error at least, frames."""
 
 

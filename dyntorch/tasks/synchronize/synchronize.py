@@ -319,11 +319,18 @@ def synchronize(
     shift at which the two cameras' coordinates share most information.  The result is refused (``ok`` false, with a reason)
     where the motion repeats itself, is too small, or where parts of the take disagree.
 
+    One of both may be motion capture, points in space in any unit, with any axis up: then one camera explains what the other sees,
+
+    .. math:: \min_{s, P} \sum_{ij} |x_{a,j}(t_i) - P X_{b,j}(t_i + s)|^2,
+
+    in the same two steps (:mod:`dyntorch.tasks.synchronize.space`); different points are combinations of those in space.
+
     A search: it computes on the CPU wherever its tensors are, and the result returns to their device.
 
     Args:
-        a: ``(frames_a, n, 2)`` px, y down; NaN = missing.  Point k of a is point k of b.
-        b: ``(frames_b, n, 2)``; without correspondence ``(frames_b, m, 2)``.  Both may have batch dimensions in front, ``times``
+        a: ``(frames_a, n, 2)`` px, y down; NaN = missing; of motion capture ``(frames_a, n, 3)``.  Point k of a is point k of b.
+        b: ``(frames_b, n, 2)``; without correspondence ``(frames_b, m, 2)``; of motion capture, where a is a camera, with 3
+            coordinates.  Both may have batch dimensions in front, ``times``
             and ``weights`` too: takes of different lengths end in frames of NaN; each problem is searched by itself.
         correspondence: whether points correspond.
         fps: frames per second of both, or of each; frame 0 is at 0 s.

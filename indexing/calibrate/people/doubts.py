@@ -102,7 +102,7 @@ def alike(sorting: Sorting, names: Sequence[str], options: AssociationOptions) -
         own = sorting.of(camera)
         with_it = sorted((pair for pair in trials if camera in pair), key=lambda pair: (-trials[pair].right, pair))[: how.partners]
         for p, q in combinations(kept, 2):
-            if not with_it or not ((own == p).any() and (own == q).any()):
+            if not with_it or not ((own == p).any() or (own == q).any()):
                 continue
             lead = sum(trials[pair].lead(camera, (p, q)) for pair in with_it)
             if lead < how.margin:

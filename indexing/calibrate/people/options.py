@@ -77,8 +77,11 @@ class EpipolarOptions:
     """Frames that :func:`dyntorch.synchronize` takes at least."""
     explained: float = 0.75
     """Share of the people who could have a partner that have one, from which a relation is not searched further."""
-    sure_sigma: float = 0.03
-    """Body sizes that its distances are at most then."""
+    sure_sigma: float = 0.015
+    """Body sizes that its distances are at most then: .008 to .010 with 6 px of noise; of two different people, whom a relation of
+    their own can fit, .03 (pose2sim)."""
+    odd_sigma: float = 0.03
+    """Body sizes that the distances of a pair of cameras are at most, for it to take part besides those that were searched."""
     related: float = 10.0
     """Nats for everybody together from which two cameras show the same people."""
     people: int = 2

@@ -175,7 +175,7 @@ def _refitted(
         rounds = options.geometry.reweighted + (2 if old is None else 0)
         found = fitted(start, moments, matched, rounds, options) if len(moments.a) else None
         if found is not None and (
-            old is not None or found.sigma <= options.geometry.sure_sigma * moments.spread / options.geometry.spread
+            old is not None or found.sigma <= options.geometry.odd_sigma * moments.spread / options.geometry.spread
         ):
             out[i, j] = found
         elif old is not None:

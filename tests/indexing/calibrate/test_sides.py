@@ -1,7 +1,7 @@
 """Left and right exchanged: found by what the other cameras see."""
 
 from dataclasses import replace
-from itertools import product
+from itertools import pairwise, product
 
 import numpy as np
 import pytest
@@ -136,7 +136,7 @@ def test_viterbi_is_the_best_of_all_ways():
 
         def cost(way, energy=energy):
             return sum(energy[t, s] for t, s in enumerate(way)) + 0.7 * sum(
-                abs(states[a] - states[b]).sum() for a, b in zip(way[:-1], way[1:], strict=True)
+                abs(states[a] - states[b]).sum() for a, b in pairwise(way)
             )
 
         assert cost(found) == pytest.approx(min(cost(way) for way in product(range(4), repeat=5)))

@@ -9,6 +9,7 @@ from scipy.linalg import eigh
 
 from dyntorch import synchronize, synchronize_cameras
 from dyntorch.numerics.lags import resection_moments
+from dyntorch.tasks.synchronize.combinations import _Problem, combined_fit
 from dyntorch.tasks.synchronize.options import SynchronizeOptions
 from dyntorch.tasks.synchronize.space import SpaceDescent, SpaceSamples, camera_variance
 from dyntorch.tasks.synchronize.tracks import read_tracks
@@ -267,3 +268,43 @@ def test_options_are_those_of_two_cameras():
     film, space = taken(18)
     strict = dataclasses.replace(SynchronizeOptions(), evidence=dataclasses.replace(SynchronizeOptions().evidence, margin=50.0))
     assert not synchronize(film, space, fps=(FPS, RECORDED), options=strict).ok
+
+
+def test_the_steps_of_the_combined_fit_are_those_of_the_whole_problem():
+    """The weights of every point are eliminated; camera, weights and shift at once have the same step."""
+    film, space = taken(19, points=6, noise=1.0)
+    options = SynchronizeOptions()
+    a, b = (read_tracks(n, x, f, None, None, options) for n, x, f in (("a", film, FPS), ("b", space, RECORDED)))
+    problem = _Problem.of(a, b, OFFSET, 1.0, options)
+    at = problem.evaluate(problem.started())
+    damping = torch.full((1,), 0.1, dtype=torch.float64)
+    camera, weights, shift = problem.step(at, damping)
+    residual, own, common = problem._derivatives(at.theta)
+    n, k = own.shape[0], own.shape[2]
+    J = torch.cat([torch.block_diag(*own), common.flatten(0, 1)], 1)
+    W = torch.cat([at.theta[1].flatten(), torch.zeros(13, dtype=torch.float64)])
+    ridge = problem.ridge * torch.cat([torch.ones(n * k), torch.zeros(13)]).double()
+    H = J.T @ J + torch.diag(ridge)
+    H = H + 0.1 * torch.diag((J.T @ J).diagonal())
+    normal = torch.cat([torch.zeros(n * k), at.theta[0].flatten(), torch.zeros(1)]).double()
+    H = H + 1e6 * float(H.diagonal().max()) * torch.outer(normal, normal)  # along the camera itself nothing moves
+    whole = torch.linalg.solve(H, J.T @ residual.flatten() + ridge * W)
+    step = torch.cat([weights.flatten(), camera.flatten(), shift.flatten()])
+    step[n * k : -1] -= (step[n * k : -1] @ at.theta[0].flatten()) * at.theta[0].flatten()
+    expected = float((J @ whole).norm())
+    assert float((J @ (step - whole)).norm()) < 0.05 * expected  # how the free norm is fixed is all that differs
+
+
+@pytest.mark.parametrize("start", [-0.8, 0.6])
+def test_combinations_of_what_was_recorded_tell_the_place_between_frames(start):
+    film, space = taken(20, points=8, noise=2.0)
+    seen = motion_of(20, points=8)(OFFSET + torch.arange(120, dtype=torch.float64) / FPS)
+    between = torch.stack([seen[:, [k, k + 1, k + 2]].mean(1) for k in range(6)], dim=1)
+    film = seen_by(between, noise=2.0, generator=seeded(3))
+    options = SynchronizeOptions()
+    a, b = (read_tracks(n, x, f, None, None, options) for n, x, f in (("a", film, FPS), ("b", space, RECORDED)))
+    found = combined_fit(a, b, OFFSET + start / FPS, 1.0, options)
+    assert abs(found.offset - OFFSET) < 0.2 / FPS and abs(found.offset - OFFSET) < 4 * found.sigma
+    assert found.residual < 4 and found.weights.shape[0] == 6
+    nothing = read_tracks("a", torch.full((40, 3, 2), torch.nan), FPS, None, None, options)
+    assert combined_fit(nothing, b, 0.0, 1.0, options) is None
