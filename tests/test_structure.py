@@ -28,6 +28,8 @@ MATHEMATICS = {
     "dyntorch/tasks/align/planar.py": {"LINES", "FEWEST", "NOTICES_MINIMAL", "LABELLED"},
     "dyntorch/tasks/align/result.py": {"OUTLIER", "STATIC", "MOVING"},
     "dyntorch/tasks/align/velocity.py": {"GAUGE", "ENTRIES"},
+    "dyntorch/tasks/calibrate/adjusting.py": {"RAYLEIGH"},
+    "dyntorch/tasks/calibrate/adjustment.py": {"PARAMETERS"},
     "dyntorch/tasks/reconstruct/motions.py": {"STENCIL", "STEP", "RANK"},
     "dyntorch/tasks/reconstruct/robust.py": {"FAR"},
     "dyntorch/tasks/segment/affine.py": {"MATCHES"},
@@ -214,7 +216,7 @@ def test_what_is_explained_is_there(kind):
 RESULTS = {
     "Solution", "Alignment", "Segmentation", "AffineSegmentation", "Reconstruction", "ProjectiveFactorization",
     "VelocityFactorization", "TranslatingPlanes", "PairReconstruction", "Trajectories", "TrajectoryCameras", "Shift", "Clocks",
-    "MovingShapes", "Recovery", "DeformableShapes",
+    "MovingShapes", "Recovery", "DeformableShapes", "Calibration", "Breaks",
 }  # fmt: skip
 """What the verbs of dyntorch return."""
 

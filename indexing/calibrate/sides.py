@@ -234,13 +234,14 @@ def _checked(
     moments = [np.arange(len(one)) / rate for one, rate in zip(x, rates, strict=True)]
     if times is not None:
         moments = [np.asarray(one, dtype=np.float64) for one in times]
-    w: list[Floats] = [np.isfinite(one).all(2).astype(np.float64) for one in x]
+    w: list[Floats] = [np.asarray(np.isfinite(one).all(2), dtype=np.float64) for one in x]
     if weights is not None:
         given = [np.asarray(one, dtype=np.float64) for one in weights]
         for k, (one, own) in enumerate(zip(given, w, strict=True)):
             if one.shape != own.shape:
                 raise ValueError(f"weights[{k}]: expected {own.shape} as the tracks have it, got {one.shape}")
-        w = [np.multiply(own, np.nan_to_num(np.clip(one, 0.0, None))) for one, own in zip(given, w, strict=True)]
+        trust = [np.nan_to_num(np.clip(one, 0.0, None)) for one in given]
+        w = [np.asarray(own * one, dtype=np.float64) for one, own in zip(trust, w, strict=True)]
     for k, (one, own) in enumerate(zip(moments, x, strict=True)):
         if one.shape != (len(own),) or not (np.diff(one) > 0).all():
             raise ValueError(f"times[{k}]: expected {len(own)} increasing seconds, got shape {one.shape}; give one for each frame")

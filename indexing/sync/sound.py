@@ -331,7 +331,8 @@ class SoundFit:
         reach = options.apart / 2
         places = np.arange(-reach, reach + self.hop / 2, self.hop)
         half = max(float(np.abs(self.times).max()), self.hop)
-        steps = np.arange(-options.drift, options.drift + 1e-12, self.hop / half) if free else np.array([drift])
+        near = min(options.drift, 2 * options.step / half)  # what the search before could not tell apart
+        steps = drift + np.arange(-near, near + 1e-12, self.hop / half) if free else np.array([drift])
         totals = [[float(self._along(place, slope)[0].sum()) for place in places.tolist()] for slope in steps.tolist()]
         row, column = np.unravel_index(int(np.argmax(totals)), np.shape(totals))
         found = np.array([places[column], steps[row]])

@@ -11,6 +11,7 @@ from torch import Tensor
 
 import dyntorch as dyn
 from dyntorch import scenes
+from dyntorch.geometry.rigid import rotation_exponential
 
 F64 = torch.float64
 
@@ -74,6 +75,17 @@ def planes(count: int = 5, bodies: int = 0) -> scenes.TranslatingScene:
 def filmed(n: int = 8, **options: Any) -> tuple[Tensor, Tensor]:
     scene = scenes.filmed(n, 2.5, offset=0.2, noise=0.3, generator=draw(2), **options)
     return scene.a, scene.b
+
+
+def walkers() -> tuple[Tensor, ...]:
+    """Images ``(90, 6, 2)`` in three cameras of points that go smooth ways of their own."""
+    t, phase = torch.arange(90, dtype=F64)[:, None, None] / 30, randn(3, 6, 3)
+    body = 0.5 * phase[0] + 0.6 * torch.sin(1.3 * t + phase[1]) + 0.3 * torch.sin(2.9 * t + phase[2])
+    views = []
+    for k in range(3):
+        turn = rotation_exponential(torch.tensor([0.3 * (k % 2), 1.5 * k, 0.0], dtype=F64))
+        views.append(1500 * inhomogeneous(body @ turn.mT + torch.tensor([0.1 * k, 0.0, 5.0])) + torch.tensor([960.0, 540.0]))
+    return tuple(views)
 
 
 def nonrigid() -> tuple[Tensor, Tensor]:
@@ -322,6 +334,12 @@ VERBS: tuple[Verb, ...] = (
         lambda: ({(0, 1): shift(1.0), (0, 2): shift(3.0), (1, 2): shift(2.01)},),
         lambda shifts: dyn.combine_shifts(shifts, 3),
     ),
+    Verb(
+        "calibrate",
+        walkers,
+        lambda *x: dyn.calibrate(list(x), fps=30.0, sizes=(1920, 1080), clocks=[0.0, 0.0, 0.0]),
+        tolerance=1e-5,
+    ),
     Verb("reconstruct_pair", nonrigid, lambda a, b: dyn.reconstruct_pair(a, b, 0.12, fps=25.0)),
     Verb("reconstruct_pair same", filmed, lambda a, b: dyn.reconstruct_pair(a, b, 0.2, True, fps=30.0, generator=draw())),
     Verb(
@@ -485,6 +503,7 @@ WAITS = {
     "synchronize": (2, LENT),
     "synchronize_cameras": (3, LENT),
     "combine_shifts": (12, LENT),
+    "calibrate": (2, LENT),
     "reconstruct_pair": (2, LENT),
     "fit_distortion": (2, LENT),
 }
@@ -506,6 +525,7 @@ NOT_VERBS = {
     **dict.fromkeys(
         (
             "Alignment",
+            "Calibration",
             "Clocks",
             "DeformableShapes",
             "MovingShapes",

@@ -13,7 +13,7 @@ from dyntorch.tasks.calibrate.adjustment import (
     CLOCK,
     LENS,
     PARAMETERS,
-    Adjustment,
+    RigAdjustment,
     Priors,
     RigState,
     camera_covariance,
@@ -23,7 +23,7 @@ from dyntorch.tasks.calibrate.adjustment import (
 from dyntorch.tasks.calibrate.averaging import Graph, first_cameras, meeting_points, viewing_rays
 from dyntorch.tasks.calibrate.bones import learned
 from dyntorch.tasks.calibrate.input import Rig
-from dyntorch.tasks.calibrate.observations import Views
+from dyntorch.tasks.calibrate.observations import RigViews
 from dyntorch.tasks.calibrate.options import CalibrateOptions
 
 RAYLEIGH = 1.1774
@@ -109,7 +109,7 @@ class Pose:
 
 
 @dataclass(frozen=True)
-class Adjusted:
+class RigSolution:
     """A solution.
 
     Attributes:
@@ -121,7 +121,7 @@ class Adjusted:
 
     state: RigState
     cost: float
-    problem: Adjustment
+    problem: RigAdjustment
     covariance: Tensor
 
     @property
@@ -137,7 +137,7 @@ def pose_of(state: RigState, place: int = 0) -> Pose:
 
 
 def compared_starts(
-    rig: Rig, views: Views, graph: Graph, clocks: Tensor, freedom: Freedom, options: CalibrateOptions
+    rig: Rig, views: RigViews, graph: Graph, clocks: Tensor, freedom: Freedom, options: CalibrateOptions
 ) -> tuple[RigState, Tensor]:
     """The best starts, adjusted on some of the moments, best first, and by how much each is worse than the first.
 
@@ -174,7 +174,7 @@ def compared_starts(
     return state.of(order), (cost[order] - cost[order[0]]) / repeats
 
 
-def adjusted(views: Views, start: RigState, freedom: Freedom, options: CalibrateOptions) -> Adjusted:
+def adjusted(views: RigViews, start: RigState, freedom: Freedom, options: CalibrateOptions) -> RigSolution:
     """The solution next to a start, at all the moments of views.
 
     Args:
@@ -194,24 +194,24 @@ def adjusted(views: Views, start: RigState, freedom: Freedom, options: Calibrate
     _, reduced, _ = normal.eliminated(torch.zeros(1, dtype=torch.float64))
     repeats = _repeats(problem, state)
     covariance = repeats * camera_covariance(reduced[0], freedom.shape, gauge(state.R[0], state.t[0]))
-    return Adjusted(state, float(problem.evaluate(tuple(state)).cost) / repeats, problem, _of_centers(covariance, state.R[0]))
+    return RigSolution(state, float(problem.evaluate(tuple(state)).cost) / repeats, problem, _of_centers(covariance, state.R[0]))
 
 
-def met_points(views: Views, state: RigState) -> Tensor:
+def met_points(views: RigViews, state: RigState) -> Tensor:
     """Points ``(T, n, 3)`` nearest to the rays of one adjustment, lenses left out."""
     rays, known = viewing_rays(views, state.clocks[0], state.lens[0, :, 0].exp())
     return meeting_points(state.R[0], state.centers[0], rays, known).view(len(views.times), -1, 3)
 
 
-def _problem(views: Views, state: RigState, basis: Tensor, priors: Priors, options: CalibrateOptions) -> Adjustment:
+def _problem(views: RigViews, state: RigState, basis: Tensor, priors: Priors, options: CalibrateOptions) -> RigAdjustment:
     """With positions that are seen now, and the noise that is left now."""
     b, c = state.R.shape[:2]
     unit = torch.ones(b, c, dtype=torch.float64)
-    start = Adjustment(views, views.steady(state.clocks), unit, options.adjust.freedom, priors, basis)
+    start = RigAdjustment(views, views.steady(state.clocks), unit, options.adjust.freedom, priors, basis)
     return replace(start, sigma=_noise(state, start, options))
 
 
-def _noise(state: RigState, problem: Adjustment, options: CalibrateOptions) -> Tensor:
+def _noise(state: RigState, problem: RigAdjustment, options: CalibrateOptions) -> Tensor:
     """Robust standard deviation ``(b, c)`` px of each camera's noise.
 
     Points take 3 of the 2 v coordinates that v cameras see of them, and leave errors that are smaller than the noise by
@@ -228,12 +228,12 @@ def _noise(state: RigState, problem: Adjustment, options: CalibrateOptions) -> T
     return sigma[:, None] * problem.views.noise
 
 
-def _descended(problem: Adjustment, state: RigState, steps: int, options: CalibrateOptions) -> RigState:
+def _descended(problem: RigAdjustment, state: RigState, steps: int, options: CalibrateOptions) -> RigState:
     settings = replace(options.descent, iterations=steps, tolerance=options.adjust.tolerance)
     return RigState(*minimize(problem, problem.evaluate(tuple(state)), settings).theta)
 
 
-def _with_bones(state: RigState, problem: Adjustment, options: CalibrateOptions) -> tuple[RigState, Adjustment]:
+def _with_bones(state: RigState, problem: RigAdjustment, options: CalibrateOptions) -> tuple[RigState, RigAdjustment]:
     """With the lengths that stay the same, where these are asked for."""
     adjust = options.adjust
     if not adjust.lengths or state.points.shape[2] > adjust.length_points:
@@ -245,7 +245,7 @@ def _with_bones(state: RigState, problem: Adjustment, options: CalibrateOptions)
     return state._replace(lengths=lengths), replace(problem, bones=bones)
 
 
-def _repeats(problem: Adjustment, state: RigState) -> float:
+def _repeats(problem: RigAdjustment, state: RigState) -> float:
     r"""By how much fewer residuals there are than it seems: :math:`1 + 2 \sum_k \rho_k` of how they repeat themselves in time.
 
     Until the first lag at which they do not, a quarter of the moments at most; pooled over cameras, points and coordinates.

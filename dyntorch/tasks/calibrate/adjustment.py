@@ -28,7 +28,7 @@ from dyntorch.geometry.homogeneous import cofactors, skew
 from dyntorch.geometry.rigid import rotation_exponential
 from dyntorch.numerics.least_squares import Iterate, LeastSquares, Tensors, damped_step
 from dyntorch.tasks.calibrate.bones import Bones
-from dyntorch.tasks.calibrate.observations import Seen, Views
+from dyntorch.tasks.calibrate.observations import Seen, RigViews
 
 TURN, MOVE, LENS, CLOCK = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 11)
 """Places of a camera's parameters: rotation vector and translation; logarithm of the focal length, k1, k2; offset, log rate."""
@@ -92,8 +92,8 @@ class Priors:
 
 
 @dataclass(frozen=True)
-class Normal:
-    """Normal equations of G groups of s coordinates of points, and of P = 11 c + B others."""
+class RigNormal:
+    """RigNormal equations of G groups of s coordinates of points, and of P = 11 c + B others."""
 
     matrix: Tensor
     """``(b, G, s, s)``."""
@@ -122,10 +122,10 @@ class Normal:
 
 
 @dataclass(frozen=True)
-class Adjustment(LeastSquares):
+class RigAdjustment(LeastSquares):
     """b adjustments of the same views from different starts."""
 
-    views: Views
+    views: RigViews
     weights: Tensor
     """``(b, c, T, n)``: which positions take part, held while a descent goes on."""
     sigma: Tensor
@@ -137,7 +137,7 @@ class Adjustment(LeastSquares):
     """``(11 c, q)``: the q free parameters, each a column that says which of the cameras' parameters it changes."""
     bones: Bones | None = None
 
-    def subset(self, keep: Tensor) -> Adjustment:
+    def subset(self, keep: Tensor) -> RigAdjustment:
         """Only some of the starts."""
         bones = None if self.bones is None else self.bones.subset(keep)
         return replace(self, weights=self.weights[keep], sigma=self.sigma[keep], bones=bones)
@@ -196,7 +196,7 @@ class Adjustment(LeastSquares):
         known = self.weights * (seen.weights > 0)
         return error, known * (self.freedom + 2) / self.freedom / (1 + share) / spread
 
-    def linear(self, state: RigState) -> Normal:
+    def linear(self, state: RigState) -> RigNormal:
         """The normal equations at a state."""
         b, T, n = state.points.shape[:3]
         c, bones = state.R.shape[1], self.bones
@@ -218,11 +218,11 @@ class Adjustment(LeastSquares):
             gradient[:, place] = (rows @ error.flatten(1, 3))[..., 0]
         self._add_priors(state, reduced, gradient)
         if bones is None:
-            return Normal(blocks.flatten(1, 2), mixed.flatten(1, 2), reduced, gradient)
+            return RigNormal(blocks.flatten(1, 2), mixed.flatten(1, 2), reduced, gradient)
         matrix = state.points.new_zeros(b, T, n, 3, n, 3)
         matrix.diagonal(dim1=2, dim2=4).copy_(blocks.permute(0, 1, 3, 4, 2))
         _add_bones(state, bones, c * PARAMETERS, matrix, mixed, reduced, gradient)
-        return Normal(matrix.reshape(b, T, 3 * n, 3 * n), mixed.flatten(2, 3), reduced, gradient)
+        return RigNormal(matrix.reshape(b, T, 3 * n, 3 * n), mixed.flatten(2, 3), reduced, gradient)
 
     def _add_priors(self, state: RigState, reduced: Tensor, gradient: Tensor) -> None:
         weights, slopes = self.priors.equations(state)

@@ -27,7 +27,7 @@ from torch.nn.functional import normalize
 from dyntorch.geometry.epipolar_fit import fit_fundamental
 from dyntorch.geometry.homogeneous import homogeneous
 from dyntorch.geometry.rigid import nearest_rotation
-from dyntorch.tasks.calibrate.observations import Views
+from dyntorch.tasks.calibrate.observations import RigViews
 from dyntorch.tasks.calibrate.options import RigStartOptions
 
 
@@ -56,7 +56,7 @@ class PairGeometry:
 Graph = Mapping[tuple[int, int], PairGeometry]
 
 
-def pair_graph(views: Views, clocks: Tensor, fewest: int, options: RigStartOptions) -> dict[tuple[int, int], PairGeometry]:
+def pair_graph(views: RigViews, clocks: Tensor, fewest: int, options: RigStartOptions) -> dict[tuple[int, int], PairGeometry]:
     """Epipolar geometry of all pairs that see enough at once.
 
     Args:
@@ -211,7 +211,7 @@ def positioned(R: Tensor, rays: Tensor, weights: Tensor) -> tuple[Tensor, Tensor
 
 
 def first_cameras(
-    views: Views, graph: Graph, clocks: Tensor, focals: Tensor, options: RigStartOptions
+    views: RigViews, graph: Graph, clocks: Tensor, focals: Tensor, options: RigStartOptions
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Rotations ``(c, 3, 3)``, centres ``(c, 3)`` and points ``(T, n, 3)`` for focal lengths ``(c,)`` px."""
     turns, weights = {}, {}
@@ -225,7 +225,7 @@ def first_cameras(
     return R, centers, points.view(len(views.times), -1, 3)
 
 
-def viewing_rays(views: Views, clocks: Tensor, focals: Tensor) -> tuple[Tensor, Tensor]:
+def viewing_rays(views: RigViews, clocks: Tensor, focals: Tensor) -> tuple[Tensor, Tensor]:
     """Rays ``(c, m, 3)`` of all positions in the cameras' frames, lenses apart, and weights ``(c, m)``."""
     seen = views.at(clocks[None])
     rays = homogeneous((seen.x[0] - views.centers[:, None, None]) / focals[:, None, None, None])

@@ -14,10 +14,10 @@ from dyntorch.core.outcome import Notice, Status, status_from
 from dyntorch.numerics.arguments import check_options, on_cpu
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.tasks.calibrate import diagnosis
-from dyntorch.tasks.calibrate.adjusting import Adjusted, Freedom, adjusted, compared_starts, pose_of
+from dyntorch.tasks.calibrate.adjusting import RigSolution, Freedom, adjusted, compared_starts, pose_of
 from dyntorch.tasks.calibrate.averaging import pair_graph
 from dyntorch.tasks.calibrate.input import Rig, Scale, given_clocks, read_clocks, read_rig
-from dyntorch.tasks.calibrate.observations import Views, common_views
+from dyntorch.tasks.calibrate.observations import RigViews, common_views
 from dyntorch.tasks.calibrate.options import CalibrateOptions
 from dyntorch.tasks.calibrate.result import Calibration, CalibrationNotice
 from dyntorch.tasks.calibrate.structure import structure
@@ -162,7 +162,9 @@ def _told(clocks: Clocks) -> tuple[Notice, ...]:
     return ()
 
 
-def _halves(views: Views, best: Adjusted, freedom: Freedom, options: CalibrateOptions) -> tuple[Adjusted, Adjusted] | None:
+def _halves(
+    views: RigViews, best: RigSolution, freedom: Freedom, options: CalibrateOptions
+) -> tuple[RigSolution, RigSolution] | None:
     """Both halves of the take by themselves, from the whole; None where a half has too little.
 
     Lenses and clocks are those of the whole: only poses may differ.
@@ -185,7 +187,9 @@ def _only_poses(basis: Tensor) -> Tensor:
     return basis[:, other == 0]
 
 
-def _result(rig: Rig, views: Views, best: Adjusted, clocks: Clocks, limits: list[Notice], options: CalibrateOptions) -> Calibration:
+def _result(
+    rig: Rig, views: RigViews, best: RigSolution, clocks: Clocks, limits: list[Notice], options: CalibrateOptions
+) -> Calibration:
     """The solution in its world, with the points of all frames."""
     state, c = best.state, len(rig.tracks)
     found = structure(views, best, options)
@@ -229,7 +233,7 @@ def _besides(rig: Rig, world: World, centers: Tensor) -> list[Notice]:
     return found
 
 
-def _adjusted_clocks(clocks: Clocks, best: Adjusted, middle: float) -> Clocks:
+def _adjusted_clocks(clocks: Clocks, best: RigSolution, middle: float) -> Clocks:
     """Offsets and rates after the adjustment, and their standard deviations at the middle."""
     values, variance = best.state.clocks[0], best.covariance.diagonal(dim1=-2, dim2=-1)
     rates = values[:, 1].exp()

@@ -11,7 +11,7 @@ from torch import Tensor
 from dyntorch.core.outcome import Notice
 from dyntorch.geometry.homogeneous import homogeneous
 from dyntorch.geometry.rigid import nearest_rotation
-from dyntorch.tasks.calibrate.adjusting import Adjusted, Pose
+from dyntorch.tasks.calibrate.adjusting import RigSolution, Pose
 from dyntorch.tasks.calibrate.averaging import Graph, PairGeometry
 from dyntorch.tasks.calibrate.input import Rig
 from dyntorch.tasks.calibrate.options import CalibrateOptions
@@ -125,7 +125,7 @@ def collinear(centers: Tensor) -> bool:
     return bool(spread[1] < 0.06 * spread[0])
 
 
-def unsure(found: Adjusted, rig: Rig, options: CalibrateOptions) -> Notice | None:
+def unsure(found: RigSolution, rig: Rig, options: CalibrateOptions) -> Notice | None:
     """Whether standard deviations are too large, the focal lengths first: they are what most often stays open."""
     variance = found.covariance.diagonal(dim1=-2, dim2=-1)
     if len(rig.tracks) == 2 and not bool(rig.focals.isfinite().any()) and not rig.one_lens:
@@ -153,7 +153,7 @@ def foreign(inliers: Tensor, options: CalibrateOptions) -> Notice | None:
     return Notice(CalibrationNotice.DISAGREES, 100 * float(inliers.min()), {"cameras": which}) if which else None
 
 
-def moved(halves: tuple[Adjusted, Adjusted] | None, options: CalibrateOptions) -> Notice | None:
+def moved(halves: tuple[RigSolution, RigSolution] | None, options: CalibrateOptions) -> Notice | None:
     """Cameras whose poses in both halves of the take differ by more than they may."""
     if halves is None:
         return None

@@ -27,7 +27,7 @@ class Seen(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Views:
+class RigViews:
     """The tracks of c cameras, ready to be read at T moments of the reference clock.
 
     Attributes:
@@ -67,17 +67,17 @@ class Views:
         steady = torch.where((before > 0) & (after > 0), now, 0.0)
         return steady * ((steady > 0).sum(1, keepdim=True) >= 2)
 
-    def some(self, count: int) -> Views:
+    def some(self, count: int) -> RigViews:
         """About ``count`` of the moments, evenly spread."""
         return replace(self, times=self.times[:: max(1, len(self.times) // count)])
 
-    def between(self, start: float, end: float) -> Views:
+    def between(self, start: float, end: float) -> RigViews:
         """The moments from ``start`` on and before ``end``, seconds from the middle."""
         return replace(self, times=self.times[(self.times >= start) & (self.times < end)])
 
 
-def common_views(tracks: Sequence[Tracks], centers: Tensor, clocks: Tensor, options: CalibrateOptions) -> Views:
-    """Views at the moments at which two cameras at least run, a frame of the slowest camera apart.
+def common_views(tracks: Sequence[Tracks], centers: Tensor, clocks: Tensor, options: CalibrateOptions) -> RigViews:
+    """RigViews at the moments at which two cameras at least run, a frame of the slowest camera apart.
 
     Args:
         tracks: of each camera, on its own clock.
@@ -105,4 +105,4 @@ def common_views(tracks: Sequence[Tracks], centers: Tensor, clocks: Tensor, opti
     most = math.log(options.adjust.noise_ratio)
     noise = noise.clamp(min=options.adjust.least_noise).log()
     noise = (noise - noise.mean()).clamp(-most, most).exp()
-    return Views(grids, centers, middle, times, frames, noise)
+    return RigViews(grids, centers, middle, times, frames, noise)

@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from dyntorch.numerics.least_squares import minimize
-from dyntorch.tasks.calibrate.adjusting import RAYLEIGH, Adjusted, met_points
-from dyntorch.tasks.calibrate.adjustment import Adjustment, RigState, images
-from dyntorch.tasks.calibrate.observations import Views
+from dyntorch.tasks.calibrate.adjusting import RAYLEIGH, RigSolution, met_points
+from dyntorch.tasks.calibrate.adjustment import RigAdjustment, RigState, images
+from dyntorch.tasks.calibrate.observations import RigViews
 from dyntorch.tasks.calibrate.options import CalibrateOptions
 
 
@@ -31,7 +31,7 @@ class Structure:
     inliers: Tensor
 
 
-def structure(views: Views, found: Adjusted, options: CalibrateOptions) -> Structure:
+def structure(views: RigViews, found: RigSolution, options: CalibrateOptions) -> Structure:
     """Points of all moments of views, each the least squares of the positions that see it, with the noise of Student's t.
 
     Args:
@@ -49,13 +49,13 @@ def structure(views: Views, found: Adjusted, options: CalibrateOptions) -> Struc
     return Structure(points, sigmas, residuals, inliers)
 
 
-def _block(views: Views, found: Adjusted, options: CalibrateOptions) -> tuple[Tensor, ...]:
+def _block(views: RigViews, found: RigSolution, options: CalibrateOptions) -> tuple[Tensor, ...]:
     """Points, their standard deviations, and per camera and point: sum of squares and number of what agrees, number of all."""
     state = found.state._replace(lengths=found.state.lengths[:, :0])
     weights = views.at(state.clocks).weights
     weights = weights * ((weights > 0).sum(1, keepdim=True) >= 2)
     held = found.problem.basis[:, :0]
-    problem = Adjustment(views, weights, found.problem.sigma, found.problem.freedom, found.problem.priors, held)
+    problem = RigAdjustment(views, weights, found.problem.sigma, found.problem.freedom, found.problem.priors, held)
     state = state._replace(points=met_points(views, state)[None])
     settings = replace(options.descent, iterations=options.points.steps, tolerance=options.adjust.tolerance)
     state = RigState(*minimize(problem, problem.evaluate(tuple(state)), settings).theta)
@@ -74,7 +74,7 @@ def _block(views: Views, found: Adjusted, options: CalibrateOptions) -> tuple[Te
     )
 
 
-def _sigmas(problem: Adjustment, state: RigState) -> Tensor:
+def _sigmas(problem: RigAdjustment, state: RigState) -> Tensor:
     """Root mean square ``(T, n)`` of the standard deviations of points along the axes; infinite where they have none."""
     blocks = problem.linear(state).matrix[0]
     values = torch.linalg.eigvalsh(blocks).clamp(min=0)

@@ -204,7 +204,7 @@ class Attempt:
 
     @property
     def short(self) -> float:
-        """0 to 1: how much shorter than the longest overlap it is, where points or positions were left out: so little fits easily."""
+        """0 to 1: how much shorter than the longest overlap it is, where points were left out: so little fits easily."""
         assert self.fit is not None
         counts = self.curve.counts
         if not self.chosen or not len(counts):

@@ -10,7 +10,7 @@ from __future__ import annotations
 from indexing.calibrate.people.association import associate as associate
 from indexing.calibrate.people.options import AssociationOptions as AssociationOptions
 from indexing.calibrate.people.result import Association as Association
-from indexing.calibrate.people.result import Exchange as Exchange
 from indexing.calibrate.people.result import PeopleNotice as PeopleNotice
+from indexing.calibrate.people.result import TrackExchange as TrackExchange
 
-__all__ = ["Association", "AssociationOptions", "Exchange", "PeopleNotice", "associate"]
+__all__ = ["Association", "AssociationOptions", "PeopleNotice", "TrackExchange", "associate"]

@@ -14,9 +14,9 @@ from dyntorch.numerics import check_options
 from indexing.calibrate.people.doubts import alike, certainties, cut_again, strangers
 from indexing.calibrate.people.options import AssociationOptions
 from indexing.calibrate.people.relations import PieceView, view
-from indexing.calibrate.people.result import Association, Exchange, PeopleNotice
+from indexing.calibrate.people.result import Association, PeopleNotice, TrackExchange
 from indexing.calibrate.people.sorting import Sorting, calibrated, everybody_clocks, identities, sorted_out, tree
-from indexing.calibrate.people.tracklets import Booleans, Floats, Integers, Sightings, cut, sightings
+from indexing.calibrate.people.tracklets import Booleans, CameraSightings, Floats, Integers, cut, sightings
 from indexing.clip import Clip
 from indexing.joints import named, places
 from indexing.sync.takes import Take
@@ -183,7 +183,7 @@ def _check_cameras(calibration: Calibration, cameras: int) -> None:
         raise ValueError(f"calibration: is of {len(calibration.K)} cameras, and there are {cameras} takes; give one for each")
 
 
-def _straight(seen: Sightings, calibration: Calibration, camera: int) -> Sightings:
+def _straight(seen: CameraSightings, calibration: Calibration, camera: int) -> CameraSightings:
     """Without the distortion of the lens."""
     import torch
 
@@ -240,7 +240,7 @@ def _result(
         x, w = _of_tracks(one.seen, clips, track)
         missed: Booleans = np.asarray(one.seen.trust.any(2))
         missed[rows, one.track[rows, slots]] = False
-        moments = [Exchange(camera, k, *row) for k in range(len(kept)) for row in _exchanges(one.times, track[:, k])]
+        moments = [TrackExchange(camera, k, *row) for k in range(len(kept)) for row in _exchanges(one.times, track[:, k])]
         said += _told(one, camera, moments, missed, options)
         joints.append(x)
         confidence.append(w)
@@ -267,7 +267,7 @@ def _result(
     )
 
 
-def _of_tracks(seen: Sightings, clips: Sequence[Clip], track: Integers) -> tuple[Floats, Floats]:
+def _of_tracks(seen: CameraSightings, clips: Sequence[Clip], track: Integers) -> tuple[Floats, Floats]:
     """All joints of a camera's clips in the order of identities, and what the detector trusts them."""
     whole = sightings(clips, seen.name)
     chosen = np.maximum(track, 0)
@@ -282,7 +282,9 @@ def _exchanges(times: Floats, track: Integers) -> list[tuple[float, int, int]]:
     return [(float(times[rows[k]]), int(track[rows[k - 1]]), int(track[rows[k]])) for k in changed]
 
 
-def _told(one: PieceView, camera: int, moments: Sequence[Exchange], missed: Booleans, options: AssociationOptions) -> list[Notice]:
+def _told(
+    one: PieceView, camera: int, moments: Sequence[TrackExchange], missed: Booleans, options: AssociationOptions
+) -> list[Notice]:
     """What a user should know of a camera."""
     found = []
     name = one.seen.name

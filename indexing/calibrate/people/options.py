@@ -8,7 +8,7 @@ from dyntorch import SynchronizeOptions
 
 
 @dataclass(frozen=True)
-class PieceOptions:
+class TrackletOptions:
     """How the tracks of one camera are cut into pieces of surely one person."""
 
     seen: int = 4
@@ -139,7 +139,7 @@ class AssociationVerdictOptions:
 class AssociationOptions:
     """Every number that decides who is who, by stage."""
 
-    pieces: PieceOptions = PieceOptions()
+    pieces: TrackletOptions = TrackletOptions()
     geometry: EpipolarOptions = EpipolarOptions()
     clusters: ClusterOptions = ClusterOptions()
     verdict: AssociationVerdictOptions = AssociationVerdictOptions()

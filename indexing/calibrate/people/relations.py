@@ -11,7 +11,7 @@ import numpy as np
 
 from indexing.calibrate.people.clusters import clustered
 from indexing.calibrate.people.options import AssociationOptions
-from indexing.calibrate.people.tracklets import Booleans, Floats, Integers, Sightings, Tracklets
+from indexing.calibrate.people.tracklets import Booleans, CameraSightings, Floats, Integers, Tracklets
 
 if TYPE_CHECKING:
     from dyntorch import Shift
@@ -30,7 +30,7 @@ class PieceView:
         track: ``(frames, slots)`` where the detection is in ``seen``.
     """
 
-    seen: Sightings
+    seen: CameraSightings
     pieces: Tracklets
     places: Floats
     trust: Floats
@@ -48,7 +48,7 @@ class PieceView:
         return np.bincount(self.piece[self.piece >= 0], minlength=len(self.pieces)).astype(np.int64)
 
 
-def view(seen: Sightings, pieces: Tracklets) -> PieceView:
+def view(seen: CameraSightings, pieces: Tracklets) -> PieceView:
     """Sort the detections of a camera by pieces: as few slots as hold all at once."""
     frames, joints = len(seen.times), seen.places.shape[2]
     free: list[int] = []
@@ -243,13 +243,9 @@ def fitted(
     return replace(relation, fundamental=fundamental, sigma=sigma)
 
 
-T3_MEDIAN = 0.7648923284
-"""Median of the absolute value of Student's t with 3 degrees of freedom."""
-
-
 def _usual(away: Floats, options: AssociationOptions) -> float:
-    """Sigma of Student's t by the median distance."""
-    return max(float(np.median(np.abs(away))) / T3_MEDIAN, options.geometry.finest)
+    """Sigma by the median distance, which for Student's t with 3 degrees of freedom is .765 of it."""
+    return max(float(np.median(np.abs(away))) / 0.7648923284, options.geometry.finest)
 
 
 def _pairs(both: CommonMoments, matched: Booleans) -> tuple[Floats, Floats, Floats]:

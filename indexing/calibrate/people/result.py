@@ -54,7 +54,7 @@ class PeopleNotice(NoticeCode):
 
 
 @dataclass(frozen=True)
-class Exchange:
+class TrackExchange:
     """A moment from which on a tracker gives a person another number.
 
     Attributes:
@@ -98,7 +98,7 @@ class Association(Outcome):
     tracks: tuple[Integers, ...]
     certainty: tuple[Floats, ...]
     left_out: tuple[Booleans, ...]
-    exchanges: tuple[Exchange, ...]
+    exchanges: tuple[TrackExchange, ...]
     clocks: Clocks | None
     offsets_rates: Floats
     fundamentals: Mapping[tuple[int, int], Floats]

@@ -19,7 +19,7 @@ Booleans = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
-class Sightings:
+class CameraSightings:
     """One camera: all detections of all frames.
 
     Args:
@@ -40,7 +40,7 @@ class Sightings:
         return 1.0 / float(np.median(np.diff(self.times))) if len(self.times) > 1 else 30.0
 
 
-def sightings(clips: Sequence[Clip], name: str, joints: Sequence[int] | None = None) -> Sightings:
+def sightings(clips: Sequence[Clip], name: str, joints: Sequence[int] | None = None) -> CameraSightings:
     """The people of a camera on the common grid of its frames.
 
     Args:
@@ -57,7 +57,7 @@ def sightings(clips: Sequence[Clip], name: str, joints: Sequence[int] | None = N
         places[rows, track] = clip.joints[:, chosen]
         sure = np.ones(clip.joints.shape[:2]) if clip.confidence is None else np.clip(clip.confidence, 0.0, 1.0)
         trust[rows, track] = np.where(np.isfinite(clip.joints).all(2), np.nan_to_num(sure), 0.0)[:, chosen]
-    return Sightings(name, times, places, trust)
+    return CameraSightings(name, times, places, trust)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +102,7 @@ class _End:
     velocity: Floats
 
 
-def cut(seen: Sightings, options: AssociationOptions) -> Tracklets:
+def cut(seen: CameraSightings, options: AssociationOptions) -> Tracklets:
     """Follow everybody from frame to frame by the joints, and cut where two people could be exchanged.
 
     Somebody who is at :math:`x_k` in one frame is near :math:`x_k + v` in the next.  Of two people, who is who is clear where the
@@ -148,7 +148,7 @@ def cut(seen: Sightings, options: AssociationOptions) -> Tracklets:
     return _with_links(seen, number, begun, last, step, size, options)
 
 
-def _usual_size(seen: Sightings, there: Booleans) -> float:
+def _usual_size(seen: CameraSightings, there: Booleans) -> float:
     """Median diagonal of the boxes, px."""
     if not there.any():
         return 1.0
@@ -157,7 +157,7 @@ def _usual_size(seen: Sightings, there: Booleans) -> float:
     return max(float(np.median(np.linalg.norm(extent, axis=1))), 1e-9)
 
 
-def _usual_step(seen: Sightings, there: Booleans) -> float:
+def _usual_step(seen: CameraSightings, there: Booleans) -> float:
     """Median way of a joint from frame to frame, px."""
     steps = np.linalg.norm(np.diff(seen.places, axis=0), axis=-1)[there[1:] & there[:-1]]
     known = steps[np.isfinite(steps)]
@@ -176,7 +176,7 @@ def _cost(away: Floats, step: float, options: AssociationOptions) -> Floats:
 
 def _followed(
     ends: Sequence[_End],
-    seen: Sightings,
+    seen: CameraSightings,
     frame: int,
     tracks: Integers,
     step: float,
@@ -224,7 +224,7 @@ def _moved(old: _End, place: Floats, frame: int, track: int, smooth: float) -> _
 
 
 def _with_links(
-    seen: Sightings,
+    seen: CameraSightings,
     number: Integers,
     begun: Sequence[_End],
     last: Sequence[_End],
