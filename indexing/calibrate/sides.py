@@ -150,6 +150,24 @@ def sides(
 
     Source:
         Viterbi 1967, Error bounds for convolutional codes; triangulation: Hartley and Zisserman, chapter 12.
+
+    Example:
+        >>> import torch
+        >>> from types import SimpleNamespace
+        >>> turn = torch.tensor([0.0, 1.0, 2.5], dtype=torch.float64)  # three cameras around two knees, 4 m away
+        >>> c, s, one, none = turn.cos(), turn.sin(), torch.ones_like(turn), torch.zeros_like(turn)
+        >>> R = torch.stack([c, s, none, none, none, -one, -s, c, none], -1).reshape(3, 3, 3)
+        >>> K = torch.diag(torch.tensor([1000.0, 1000.0, 1.0], dtype=torch.float64)).repeat(3, 1, 1)
+        >>> t, clocks = torch.stack([none, none, 4 * one], -1), SimpleNamespace(offsets=none, rates=one)
+        >>> rig = SimpleNamespace(K=K, R=R, t=t, distortion=torch.zeros(3, 5, dtype=torch.float64), clocks=clocks)
+        >>> step = 0.2 * torch.arange(30, dtype=torch.float64)[:, None].sin()
+        >>> knees = torch.stack([torch.cat([step - 0.15, step + 0.15], 1), torch.cat([step, -step], 1), 0.5 + 0 * step.repeat(1, 2)], -1)
+        >>> seen = torch.einsum("cij,tnj->ctni", R, knees) + t[:, None, None]
+        >>> x = 1000 * seen[..., :2] / seen[..., 2:]
+        >>> x[1, 10:20] = x[1, 10:20].flip(1)  # the second camera takes one knee for the other
+        >>> found = sides(list(x), rig, ("left_knee", "right_knee"))
+        >>> [(e.camera, e.limb, round(e.start, 2), round(e.end, 2)) for e in found.exchanges]
+        [(1, 'body', 0.33, 0.63)]
     """
     check_options(options, SideOptions)
     x, w, moments, people = _checked(tracks, cameras, joints, times, fps, weights)

@@ -18,10 +18,10 @@ import numpy as np
 from indexing.clip import Clip
 from indexing.files import prepare, write_bytes
 from indexing.opening import parse_json, read_text
+from indexing.readers.mocap import METRES
 from indexing.sync.takes import Take
 
 FOLDER = "mocap-sync"
-MILLIMETRES = 1000.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +86,7 @@ def _moved(clip: Clip, offset: float, rate: float, since: float, more: float, mi
     meta = {**clip.meta, "units": "mm"} if known else clip.meta
     fps = None if clip.fps is None else clip.fps * rate
     confidence = None if clip.confidence is None else clip.confidence[kept]
-    joints = clip.joints[kept] * (MILLIMETRES if known else 1.0)
+    joints = clip.joints[kept] / (METRES["mm"] if known else 1.0)
     return clip.replace(joints=joints, times=times, fps=fps, confidence=confidence, meta=meta)
 
 

@@ -137,8 +137,8 @@ class SoundSearch:
         return np.arange(-many, many + 1) * 2 / length
 
     @cached_property
-    def scored(self) -> tuple[Floats, Floats, Floats]:
-        """``(L,)`` score of every lag at its best drift, those drifts, and ``(L,)`` the score before any is chosen."""
+    def scored(self) -> tuple[Floats, Floats]:
+        """``(L,)`` score of every lag at its best drift, and those drifts."""
         from scipy import fft
 
         one, two = self.a.coarse, self.b.coarse
@@ -157,11 +157,11 @@ class SoundSearch:
         scores = sums[:, self._keep] / np.sqrt(self.count)
         usual = 1.4826 * float(np.median(np.abs(scores))) or 1.0  # of a normal distribution: its standard deviation
         best = scores.argmax(axis=0)
-        return scores.max(axis=0) / usual, drifts[best], drifts
+        return scores.max(axis=0) / usual, drifts[best]
 
     def peaks(self) -> list[SoundPeak]:
         """The best shifts that are not the slope of a better one, best first."""
-        scores, drifts, _ = self.scored
+        scores, drifts = self.scored
         left = scores.copy()
         found: list[SoundPeak] = []
         away = self.options.apart / self.step
@@ -202,7 +202,7 @@ class SoundSearch:
         fit = SoundFit(self, best)
         close = [one for one, value in zip(peaks[1:], apart, strict=True) if value < self.options.apart_by]
         limits = self._limits(best, chance, close)
-        scores, _, _ = self.scored
+        scores, _ = self.scored
         lags = self.lags * self.step + self.between
         kept = _thinned(lags, scores, self.options.shown)
         near = self.options

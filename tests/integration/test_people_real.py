@@ -32,14 +32,11 @@ def recording() -> tuple[list[list[Clip]], np.ndarray]:
     return cameras, one
 
 
-@pytest.mark.parametrize("clocks", [None, [0.0] * 4])
-def test_the_balancing_person_is_one_in_all_cameras(clocks: list[float] | None) -> None:
+def test_the_balancing_person_is_one_in_all_cameras() -> None:
     cameras, one = recording()
-    found = associate(cameras, clocks)
+    found = associate(cameras, [0.0] * 4)
     assert found.ok and found.people == 2  # one stands aside, and two cameras show him
     for own, true in zip(found.joints, one, strict=True):
         known = np.isfinite(own[:, 0]).all(2)
         assert known.mean() > 0.8
         assert np.mean(np.abs(own[:, 0] - true).max(-1)[known] < 1.0) > 0.98
-    if found.clocks is not None:
-        assert float(found.clocks.offsets.abs().max()) < 0.5 / 60

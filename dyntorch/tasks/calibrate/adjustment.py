@@ -28,7 +28,7 @@ from dyntorch.geometry.homogeneous import cofactors, skew
 from dyntorch.geometry.rigid import rotation_exponential
 from dyntorch.numerics.least_squares import Iterate, LeastSquares, Tensors, damped_step
 from dyntorch.tasks.calibrate.bones import Bones
-from dyntorch.tasks.calibrate.observations import Seen, RigViews
+from dyntorch.tasks.calibrate.observations import RigViews, Seen
 
 TURN, MOVE, LENS, CLOCK = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 11)
 """Places of a camera's parameters: rotation vector and translation; logarithm of the focal length, k1, k2; offset, log rate."""

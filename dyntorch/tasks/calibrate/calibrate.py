@@ -14,7 +14,7 @@ from dyntorch.core.outcome import Notice, Status, status_from
 from dyntorch.numerics.arguments import check_options, on_cpu
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.tasks.calibrate import diagnosis
-from dyntorch.tasks.calibrate.adjusting import RigSolution, Freedom, adjusted, compared_starts, pose_of
+from dyntorch.tasks.calibrate.adjusting import Freedom, RigSolution, adjusted, compared_starts, pose_of
 from dyntorch.tasks.calibrate.averaging import pair_graph
 from dyntorch.tasks.calibrate.input import Rig, Scale, given_clocks, read_clocks, read_rig
 from dyntorch.tasks.calibrate.observations import RigViews, common_views

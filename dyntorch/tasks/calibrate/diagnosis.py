@@ -11,7 +11,7 @@ from torch import Tensor
 from dyntorch.core.outcome import Notice
 from dyntorch.geometry.homogeneous import homogeneous
 from dyntorch.geometry.rigid import nearest_rotation
-from dyntorch.tasks.calibrate.adjusting import RigSolution, Pose
+from dyntorch.tasks.calibrate.adjusting import Pose, RigSolution
 from dyntorch.tasks.calibrate.averaging import Graph, PairGeometry
 from dyntorch.tasks.calibrate.input import Rig
 from dyntorch.tasks.calibrate.options import CalibrateOptions

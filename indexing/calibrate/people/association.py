@@ -67,10 +67,12 @@ def associate(
         >>> from indexing import cameras
         >>> from indexing.actors import Person, stream
         >>> first, _ = stream(["wave", "squat", "kick"], Person(), rng=1)
-        >>> second, _ = stream(["kick", "jump", "wave"], Person(), rng=2)
-        >>> aside = second.replace(joints=second.joints + [1.5, 0.0, 0.5])
-        >>> left, right = ([cameras.virtual(one, azimuth=turn) for one in (first, aside)] for turn in (0.0, 70.0))
-        >>> found = associate([left, right[::-1]], clocks=[0.0, 0.0])
+        >>> second, _ = stream(["kick", "lunge", "wave"], Person(), rng=2)
+        >>> both = np.concatenate([first.joints[:150], second.joints[:150] + [1.5, 0.0, 0.5]], axis=1)
+        >>> n = first.joints.shape[1]
+        >>> left, right = (cameras.virtual(Clip(both, fps=30.0), azimuth=turn).joints for turn in (0.0, 70.0))
+        >>> a, b = ([Clip(x[:, k : k + n], fps=30.0) for k in order] for x, order in ((left, (0, n)), (right, (n, 0))))
+        >>> found = associate([a, b], clocks=[0.0, 0.0])  # the second camera numbers them the other way round
         >>> found.people, found.tracks[0][0].tolist() == found.tracks[1][0][::-1].tolist()
         (2, True)
     """

@@ -125,7 +125,7 @@ def test_bad_input_is_one_line(cameras, library, tmp_path, a, options, says):
         ("text", r"text: no such file or folder"),
         ([["a"]], r"a: expected a clip, a path or an array, got list"),
         (Clip(np.zeros((3, 4, 3)), name="deep"), r"deep: 3 frames, 12 are needed"),
-        ([Clip(np.zeros((3, 4, 3)), name="deep"), Clip(np.zeros((3, 4, 2)))], r"deep: holds 2D and 3D joints"),
+        ([Clip(np.zeros((3, 4, 3)), name="deep"), Clip(np.zeros((3, 4, 2)))], r"a: holds 2D and 3D joints"),
     ],
 )
 def test_arrays_of_other_kinds_are_refused(cameras, library, value, says):
