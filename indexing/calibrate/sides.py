@@ -161,7 +161,8 @@ def sides(
         >>> t, clocks = torch.stack([none, none, 4 * one], -1), SimpleNamespace(offsets=none, rates=one)
         >>> rig = SimpleNamespace(K=K, R=R, t=t, distortion=torch.zeros(3, 5, dtype=torch.float64), clocks=clocks)
         >>> step = 0.2 * torch.arange(30, dtype=torch.float64)[:, None].sin()
-        >>> knees = torch.stack([torch.cat([step - 0.15, step + 0.15], 1), torch.cat([step, -step], 1), 0.5 + 0 * step.repeat(1, 2)], -1)
+        >>> across, along = torch.cat([step - 0.15, step + 0.15], 1), torch.cat([step, -step], 1)
+        >>> knees = torch.stack([across, along, torch.full_like(along, 0.5)], -1)
         >>> seen = torch.einsum("cij,tnj->ctni", R, knees) + t[:, None, None]
         >>> x = 1000 * seen[..., :2] / seen[..., 2:]
         >>> x[1, 10:20] = x[1, 10:20].flip(1)  # the second camera takes one knee for the other
@@ -185,7 +186,7 @@ def sides(
     for person in range(people):
         rows = slice(person * len(joints), (person + 1) * len(joints))
         labels, costs = _readings(seen[:, :, rows], trust[:, :, rows], _projections(cameras), pairs, grid, options)
-        labels, tied = _untied(labels, costs, grid, person, options)
+        labels, tied = _untied(labels, grid, person, options)
         said += tied
         for camera, own in enumerate(moments):
             common = (own - _clock(cameras, camera)[0]) / _clock(cameras, camera)[1]
@@ -239,7 +240,7 @@ def _checked(
     for name, values in (("tracks", tracks), ("times", times), ("weights", weights)):
         if values is not None and len(values) != count:
             raise ValueError(f"{name}: {len(values)} given, and there are {count} cameras; give one for each")
-    x = [np.array(one, dtype=np.float64) for one in tracks]
+    x = [np.array(np.asarray(one), dtype=np.float64) for one in tracks]
     for k, one in enumerate(x):
         if one.ndim != 3 or one.shape[2] != 2 or not len(joints) or one.shape[1] % len(joints) or one.shape[1] != x[0].shape[1]:
             raise ValueError(
@@ -444,13 +445,17 @@ def _viterbi(energy: Floats, states: Integers, change: float) -> Integers:
     return out
 
 
-def _untied(labels: Booleans, costs: Floats, grid: Floats, person: int, options: SideOptions) -> tuple[Booleans, list[Notice]]:
-    """Without the exchanges that nothing tells from those of the other cameras: as many here as there."""
+def _untied(labels: Booleans, grid: Floats, person: int, options: SideOptions) -> tuple[Booleans, list[Notice]]:
+    """Without the exchanges that nothing tells from those of the other cameras: as many here as there, before and after, too."""
     out, said = labels.copy(), []
+    count = labels.shape[1]
     for k, limb in enumerate(LIMBS):
-        tied = 2 * labels[:, :, k].sum(1) == labels.shape[1]
-        out[tied, :, k] = False
-        for start, end in _runs(tied):
+        for start, end in _runs(2 * labels[:, :, k].sum(1) == count):
+            # cameras that change at the ends of the stretch, and how many would if the others were the exchanged ones
+            ends = [labels[at, :, k] != labels[at - 1, :, k] for at in (start, end) if 0 < at < len(labels)]
+            if sum(int(one.sum()) for one in ends) < sum(count - int(one.sum()) for one in ends):
+                continue
+            out[start:end, :, k] = False
             if grid[end - 1] - grid[start] >= options.told:
                 values = {"limb": limb, "person": person, "start": float(grid[start]), "end": float(grid[end - 1])}
                 said.append(Notice(SideNotice.TIED, float(end - start), values))

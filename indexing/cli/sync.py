@@ -249,8 +249,13 @@ class Sync:
         found = find_breaks(report.takes, report.compared, report.together, calibration=lenses, max_shift=self.max_shift)
         if found is None:
             return report
-        again = self._solve(list(found.takes), done, trial)
-        return dataclasses.replace(again, takes=report.takes, remarks=report.remarks, mended=found)
+        if found.sure:
+            again = self._solve(list(found.takes), done, trial)
+            if again.ok >= report.ok and again.decided >= report.decided:
+                return dataclasses.replace(again, takes=report.takes, remarks=report.remarks, mended=found)
+        why = "fewer pairs decide when it is mended" if found.sure else "other pairs of these cameras see nothing of it"
+        doubts = [f"doubtful, and not mended, as {why}: {notice.text}" for notice in found.found.notices]
+        return dataclasses.replace(report, remarks=[*report.remarks, *doubts])
 
     def _lenses(self, takes: Sequence[Take], trial: Trial | None) -> tuple[Any, tuple[str, ...]]:
         """The lenses of the cameras, and what to say about them."""
@@ -454,7 +459,8 @@ def _show_written(report: SyncReport, folder: Path | None) -> None:
         rest = 1000 * max(one["rest"] for one in report.videos["cameras"].values())
         where = Path(report.videos["folder"]) if folder is None else folder / report.videos["folder"]
         said = f"{count(len(report.videos['cameras']), 'video')} of {count(report.videos['frames'], 'frame')}"
-        say(f"videos: {where}/, {said}, {report.videos['fps']:.6g} per second, within {rest:.1f} ms of {report.reference.name}")
+        most = f"{rest:.1f} ms of {report.reference.name}{'' if report.mended is None else ' where frames were lost'}"
+        say(f"videos: {where}/, {said}, {report.videos['fps']:.6g} per second, within {most}")
 
 
 def _show_pairs(report: SyncReport) -> None:

@@ -198,7 +198,7 @@ def heat_picture(rig: CameraRig) -> bytes | None:
             (LEFT / max(width, 4.0), 0.15 / height, CELL * len(shown) / max(width, 4.0), CELL * len(cells) / height)
         )
         top = float(np.nanpercentile(cells, 98)) or 1.0
-        panel.imshow(np.ma.masked_array(cells, ~np.isfinite(cells)), cmap=cmap(), vmin=0, vmax=top, aspect="auto")
+        panel.imshow(cells, cmap=cmap(), vmin=0, vmax=top, aspect="auto")
         for i, j in np.ndindex(cells.shape):
             value = cells[i, j]
             ink = LIGHT.paper if math.isfinite(value) and value > 0.55 * top else LIGHT.ink

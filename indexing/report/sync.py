@@ -200,6 +200,11 @@ class SyncReport:
         return bool(self.pairs[0].shift.ok if self.together is None else self.together.ok)
 
     @property
+    def decided(self) -> int:
+        """How many pairs decide by themselves."""
+        return sum(bool(pair.shift.ok) for pair in self.pairs)
+
+    @property
     def reason(self) -> str:
         """Why not, and what to do."""
         return self.pairs[0].reason if self.together is None else str(self.spoken.refusal(self.words))
@@ -242,7 +247,7 @@ class SyncReport:
             more = [notice for notice in besides(self.spoken) if notice.code != "of_pair"]
             own = [str(notice.worded(self.words).text) for notice in more] + own
         broke = [] if self.mended is None else [str(notice.worded(self.words).text) for notice in self.mended.found.notices]
-        broke += ["offsets, rates and written files are as if it had not broken"] * bool(broke)
+        broke += ["offsets, rates and written files are as if no frame had been lost or doubled"] * bool(broke)
         return [*dict.fromkeys([*(worded(note, self.words) for note in self.remarks), *broke, *own]), *self.afterwards]
 
 

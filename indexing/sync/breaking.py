@@ -39,6 +39,11 @@ class Mended:
     found: Any
     takes: tuple[Take, ...]
 
+    @property
+    def sure(self) -> bool:
+        """Whether it is known whose clock broke, as far as it can be: of three cameras the other pairs of both must say so, too."""
+        return len(self.takes) == 2 or all(one.camera is not None for one in self.found.breaks)
+
     def told(self) -> list[dict[str, Any]]:
         """Every break in plain types."""
         return [

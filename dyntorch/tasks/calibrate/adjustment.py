@@ -93,7 +93,7 @@ class Priors:
 
 @dataclass(frozen=True)
 class RigNormal:
-    """RigNormal equations of G groups of s coordinates of points, and of P = 11 c + B others."""
+    """Normal equations of G groups of s coordinates of points, and of P = 11 c + B others."""
 
     matrix: Tensor
     """``(b, G, s, s)``."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import NamedTuple
 
 import torch
@@ -77,7 +78,7 @@ class RigViews:
 
 
 def common_views(tracks: Sequence[Tracks], centers: Tensor, clocks: Tensor, options: CalibrateOptions) -> RigViews:
-    """RigViews at the moments at which two cameras at least run, a frame of the slowest camera apart.
+    """Views at the moments at which two cameras at least run, a frame of the slowest camera apart.
 
     Args:
         tracks: of each camera, on its own clock.
@@ -91,7 +92,8 @@ def common_views(tracks: Sequence[Tracks], centers: Tensor, clocks: Tensor, opti
     runs = [((float(t.times[0]) - o) / r, (float(t.times[-1]) - o) / r) for t, (o, r) in zip(tracks, clocks.tolist(), strict=True)]
     start, end = sorted(run[0] for run in runs)[1], sorted(run[1] for run in runs)[-2]
     step = max(t.step / r for t, (_, r) in zip(tracks, clocks.tolist(), strict=True))
-    if not start + step < end:
+    # the second start and the last end but one may lie in a gap, or in one camera's run alone
+    if not any(max(a[0], b[0]) + step < min(a[1], b[1]) for a, b in combinations(runs, 2)):
         said = ", ".join(f"camera {i} {a:.3g} to {b:.3g} s" for i, (a, b) in enumerate(runs))
         raise ValueError(
             f"tracks: no two cameras run at the same time ({said} of the reference clock): check clocks, fps and times"

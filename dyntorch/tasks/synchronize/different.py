@@ -14,7 +14,7 @@ from dyntorch.tasks.synchronize.camera_models import KINDS
 from dyntorch.tasks.synchronize.combinations import combined_fit
 from dyntorch.tasks.synchronize.measures import MEASURES
 from dyntorch.tasks.synchronize.options import SynchronizeOptions
-from dyntorch.tasks.synchronize.result import Shift, ShiftNotice, refusing
+from dyntorch.tasks.synchronize.result import Shift, ShiftNotice
 from dyntorch.tasks.synchronize.row_spaces import RowSpaceShift, row_space_shift
 from dyntorch.tasks.synchronize.subspace import STEP, Body, SubspaceCurve, bodies_curve, halves, information, subspace_curve
 from dyntorch.tasks.synchronize.tracks import Tracks, smoothed
@@ -305,25 +305,26 @@ def _combined(body: Shift, spaces: RowSpaceShift | None, options: SynchronizeOpt
 
 
 def _between_frames(a: Tracks, b: Tracks, shift: Shift, options: SynchronizeOptions) -> Shift:
-    """Of a camera and points in space, which are seen as combinations of these, the place between frames that a camera tells."""
-    blunt = [notice for notice in shift.notices if notice.code == ShiftNotice.BLUNT]
+    """Of a camera and points in space, which are seen as combinations of these, the place between frames that a camera tells.
+
+    Whether the shift decides is not asked again.  What both ways of looking differ by is uncertain as well: a detector errs in ways
+    that neither knows.
+    """
+    blunt = any(notice.code == ShiftNotice.BLUNT for notice in shift.notices)
     if a.x.shape[-1] == b.x.shape[-1] or not (shift.ok or blunt):
         return shift
     turned = a.x.shape[-1] == 3  # the fit goes from the camera to the space
     offset, rate = (-shift.offset / shift.rate, 1 / shift.rate) if turned else (shift.offset, shift.rate)
     found = combined_fit(b, a, offset, rate, options) if turned else combined_fit(a, b, offset, rate, options)
-    frame = 1 / min(shift.fps)
-    sigma = math.inf if found is None else found.sigma * (shift.rate if turned else 1.0)
-    if found is None or sigma > min(shift.sigma, options.different.sharp_frames * frame):
+    if found is None:
         return shift
-    place = -found.offset * shift.rate if turned else found.offset
-    rest = tuple(notice for notice in shift.notices if notice not in blunt)
-    confidence = options.different.sure if blunt and not refusing(rest) else shift.confidence
+    place, sigma = (-found.offset * shift.rate, found.sigma * shift.rate) if turned else (found.offset, found.sigma)
+    sigma = math.hypot(sigma, (place - shift.offset) / 2)
+    if sigma > shift.sigma:
+        return shift
     peaks = shift.peaks.clone()
     peaks[:1, 0] += place - shift.offset
-    return dataclasses.replace(
-        shift, offset=place, sigma=sigma, status=status_from(rest), notices=rest, confidence=confidence, peaks=peaks
-    )
+    return dataclasses.replace(shift, offset=place, sigma=sigma, peaks=peaks)
 
 
 def _forwards(shift: Shift, curve: SubspaceCurve, options: SynchronizeOptions) -> Shift:

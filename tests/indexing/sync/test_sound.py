@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -151,6 +152,54 @@ def test_sound_is_placed_on_the_clock_of_the_pictures(films):
     assert sound_shift(a, b).offset == pytest.approx(LATER, abs=2e-3)
     assert sound_shift(a, late).offset == pytest.approx(LATER, abs=2e-3)
     assert hear(films / "mute.mp4") is None and hear(films / "a.mp4") is a  # heard once
+
+
+def write_sound(path, samples, rate, codec, layout="stereo", gap=0.0):
+    """Pictures, and sound of two channels that stops for ``gap`` seconds in the middle."""
+    import av
+
+    with av.open(str(path), "w") as file:
+        stream = file.add_stream("mpeg4", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        track = file.add_stream(codec, rate=rate, layout=layout)
+        for _ in range(20):
+            file.mux(stream.encode(av.VideoFrame.from_ndarray(np.zeros((48, 64, 3), np.uint8), format="rgb24")))
+        file.mux(stream.encode())
+        for begin in range(0, len(samples), 960):
+            part = np.repeat(samples[begin : begin + 960], 2)[None]
+            frame = av.AudioFrame.from_ndarray(part, format="s16", layout="stereo")
+            late = round(gap * rate) if begin >= len(samples) // 2 else 0
+            frame.sample_rate, frame.pts, frame.time_base = rate, begin + late, Fraction(1, rate)
+            file.mux(track.encode(frame))
+        file.mux(track.encode())
+    return path
+
+
+CONTAINERS = [
+    ("b.mkv", "libopus", 48_000, 0.005),
+    ("b.mov", "pcm_s16le", 44_100, 0.005),
+    ("b.avi", "mp3", 44_100, 0.03),  # does not say that an encoder of MP3 is 25 ms late
+]
+
+
+@pytest.mark.parametrize(("name", "codec", "rate", "off"), CONTAINERS)
+def test_other_containers_and_codecs(films, scene, tmp_path, name, codec, rate, off):
+    import av
+
+    if codec not in av.codecs_available:
+        pytest.skip(f"FFmpeg has no {codec}")
+    samples = microphone(scene, STARTS[1], 15.0, 1)
+    wide = np.interp(np.arange(int(15 * rate)) * RATE / rate, np.arange(len(samples)), samples).astype(np.int16)
+    heard_b = hear(write_sound(tmp_path / name, wide, rate, codec))
+    assert sound_shift(hear(films / "a.mp4"), heard_b).offset == pytest.approx(LATER, abs=off)
+
+
+def test_a_gap_in_the_sound_keeps_its_length(tmp_path):
+    samples = np.random.default_rng(0).normal(size=10 * RATE) * 3000
+    found = hear(write_sound(tmp_path / "gap.mkv", samples.astype(np.int16), RATE, "pcm_s16le", gap=2.0))
+    assert found is not None and found.seconds == pytest.approx(12.0, abs=0.1)
+    quiet = np.abs(found.samples[int(5.2 * RATE) : int(6.8 * RATE)].astype(int)).max()
+    assert quiet == 0 and np.abs(found.samples[int(7.2 * RATE) :].astype(int)).max() > 3000
 
 
 def test_videos_by_sound_alone(films):

@@ -100,7 +100,7 @@ def test_common_joints_are_those_of_one_name(cameras):
         ("no.json", {}, r"no\.json: no such file or folder"),
         ("empty", {}, r"empty: no person was detected in any of 5 frames"),
         ("cam1", {"method": "brightness"}, r"cam1: holds keypoints, and method='brightness' needs videos"),
-        ("cam1", {"method": "guess"}, r"method must be one of auto, keypoints, tracks, brightness, got 'guess'"),
+        ("cam1", {"method": "guess"}, r"method must be one of auto, keypoints, tracks, brightness, sound, got 'guess'"),
         ("cam1", {"fps": 0}, r"fps must be a positive number of frames per second, got 0"),
         ("cam1", {"fps": (1, 2, 3)}, r"fps must be one number, or one for each of two cameras"),
         ("cam1", {"person": "me"}, r"person must be one of auto, largest, confident, tracked, got 'me'"),

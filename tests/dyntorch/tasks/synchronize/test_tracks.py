@@ -158,7 +158,7 @@ RISING = torch.arange(5.0)
     ("arguments", "words"),
     [
         (([[1.0]], 30.0, None, None), r"a must be a tensor \(frames, points, 2\), got list"),
-        ((torch.zeros(5, 2, 3), 30.0, None, None), r"a must be a tensor \(frames, points, 2\), got \(5, 2, 3\)"),
+        ((torch.zeros(5, 2, 4), 30.0, None, None), r"a must be a tensor \(frames, points, 2\), got \(5, 2, 4\)"),
         ((torch.zeros(5, 2), 30.0, None, None), r"got \(5, 2\)"),
         ((GOOD.int(), 30.0, None, None), r"a must hold floating point numbers, got torch.int32; use a.double\(\)"),
         ((GOOD, None, None, None), r"fps of a must be a positive number of frames per second, got None; or give times="),
