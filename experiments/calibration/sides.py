@@ -3,9 +3,9 @@
     DYNTORCH_DATA=... python -m experiments.calibration.sides
 
 Virtual rigs (:mod:`experiments.calibration.rigs`): motion capture, 300 frames at 30 fps, 6 px of heavy-tailed noise, 10 % of the
-joints missing.  *Mirrored*: one camera takes left for right in the whole take.  *Stretches*: in every camera two stretches of 4 to 40
-frames in which it exchanges the arms, the legs, or all.  The share of limbs (arms and legs, frame by frame and camera by camera) whose
-sides are wrong, as given and as mended.
+joints missing.  *Mirrored*: one camera takes left for right in the whole take.  *Stretches*: in every camera two stretches of 4 to
+40 frames in which it exchanges the arms, the legs, or all.  The share of limbs (arms and legs, frame by frame and camera by camera)
+whose sides are wrong, as given and as mended.
 """
 
 from __future__ import annotations

@@ -503,7 +503,7 @@ WAITS = {
     "synchronize": (2, LENT),
     "synchronize_cameras": (3, LENT),
     "combine_shifts": (12, LENT),
-    "calibrate": (2, LENT),
+    "calibrate": (3, LENT),
     "reconstruct_pair": (2, LENT),
     "fit_distortion": (2, LENT),
 }

@@ -83,23 +83,26 @@ def _plane_residual(pair: PairGeometry) -> float:
     Both are one coordinate of an error: a homography that is right leaves what F leaves, along the lines as across them.
     """
     one, two = homogeneous(pair.x1), homogeneous(pair.x2)
-    weights = pair.weights
-    H = torch.eye(3, dtype=torch.float64)
+    # a camera that sees the plane from its edge predicts nothing of the other picture, but that predicts its own
+    scale = min(_transfer_residual(one, two, pair.weights), _transfer_residual(two, one, pair.weights))
+    # the median of a distance in two coordinates is 1.18 standard deviations of one; both pictures share the error
+    return scale * pair.unit / 1.18 / math.sqrt(2)
+
+
+def _transfer_residual(one: Tensor, two: Tensor, given: Tensor) -> float:
+    """Median distance of points ``(m, 3)`` from where the best homography of others puts them, reweighted until it stays."""
+    weights, scale = given, given.new_zeros(())
     for _ in range(6):
         zero = torch.zeros_like(one)
-        rows = torch.cat(
-            [
-                torch.cat([one, zero, -two[:, :1] * one], dim=-1) * weights[:, None],
-                torch.cat([zero, one, -two[:, 1:2] * one], dim=-1) * weights[:, None],
-            ]
-        )
+        first = torch.cat([one, zero, -two[:, :1] * one], dim=-1) * weights[:, None]
+        second = torch.cat([zero, one, -two[:, 1:2] * one], dim=-1) * weights[:, None]
+        rows = torch.cat([first, second])
         H = torch.linalg.eigh(rows.mT @ rows).eigenvectors[:, 0].view(3, 3)
         image = one @ H.mT
-        away = (image[:, :2] / image[:, 2:] - pair.x2).norm(dim=-1).nan_to_num(1e3)
-        scale = away[pair.weights > 0].median().clamp(min=1e-9)
-        weights = pair.weights / (1 + (away / scale).square()) / image[:, 2].abs().clamp(min=1e-6)
-    # the median of a distance in two coordinates is 1.18 standard deviations of one; both pictures share the error
-    return float(scale) * pair.unit / 1.18 / math.sqrt(2)
+        away = (image[:, :2] / image[:, 2:] - two[:, :2]).norm(dim=-1).nan_to_num(1e3)
+        scale = away[given > 0].median().clamp(min=1e-9)
+        weights = given / (1 + (away / scale).square()) / image[:, 2].abs().clamp(min=1e-6)
+    return float(scale)
 
 
 def rival(best: Pose, others: Sequence[tuple[Pose, float]], options: CalibrateOptions) -> Notice | None:

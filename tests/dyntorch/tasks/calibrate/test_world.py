@@ -24,7 +24,7 @@ def scene(people=1, lying=False, frames=60):
         turn = torch.stack([exponential(torch.tensor([0.0, 0.0, s + k])) for s in t.tolist()])
         body = BODY * (1 - 0.1 * k)
         body = body @ exponential(torch.tensor([1.5, 0.0, 0.0])).mT if lying else body
-        every.append(body @ turn.mT + torch.stack([(t + k).sin() + 2 * k, ((1 + k) * t).cos(), 0 * t], -1)[:, None])
+        every.append(body @ turn.mT + torch.stack([(-1) ** k * (1 + k) * 0.8 * (t - 2), (t + k).cos(), 0 * t], -1)[:, None])
     points = torch.cat(every, 1)
     centers, R = [], []
     for k in range(4):
@@ -50,7 +50,7 @@ def test_metres_up_and_ground(people, scale):
     world = world_of(R, centers, x, scale, RigWorldOptions())
     assert world.metric and world.by_people and world.upright > 0.9
     found = world.points(x)
-    assert torch.allclose(found[:, :, 2].nan_to_num(), torch.where(x[..., 0].isnan(), 0.0, truth[:, :, 2]), atol=0.01)
+    assert torch.allclose(found[:, :, 2].nan_to_num(), torch.where(x[..., 0].isnan(), 0.0, truth[:, :, 2]), atol=0.03)
     turned, t = world.cameras(R, -(R @ centers[..., None])[..., 0])
     assert torch.allclose(-(turned.mT @ t[..., None])[..., 0], world.points(centers), atol=1e-9)
     assert torch.allclose(world.points(centers)[:, 2], true_centers[:, 2], atol=0.1)
