@@ -72,8 +72,6 @@ _HOME = {
     "synchronize_cameras": "dyntorch.tasks.synchronize.cameras",
     "combine_shifts": "dyntorch.tasks.synchronize.cameras",
     "Clocks": "dyntorch.tasks.synchronize.result",
-    "breaks": "dyntorch.tasks.synchronize.breaks",
-    "camera_breaks": "dyntorch.tasks.synchronize.breaks",
     "calibrate": "dyntorch.tasks.calibrate.calibrate",
     "Calibration": "dyntorch.tasks.calibrate.result",
     "reconstruct_pair": "dyntorch.tasks.pair.pair",

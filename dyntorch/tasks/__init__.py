@@ -7,6 +7,8 @@ from typing import Any
 from dyntorch import _lazily
 
 _HOME = {
+    "breaks": "dyntorch.tasks.synchronize.breaks",
+    "camera_breaks": "dyntorch.tasks.synchronize.breaks",
     "affine_segmentation": "dyntorch.tasks.segment.affine",
     "projective_factorization": "dyntorch.tasks.reconstruct.factorization",
     "velocity_factorization": "dyntorch.tasks.reconstruct.factorization",

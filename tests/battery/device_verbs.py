@@ -329,6 +329,14 @@ VERBS: tuple[Verb, ...] = (
         lambda: (*filmed(), filmed()[0]),
         lambda *x: dyn.synchronize_cameras(list(x), fps=30.0, rate=1.0, max_shift=1.0),
     ),
+    Verb("breaks", filmed, lambda a, b: dyn.tasks.breaks(a, b, shift(0.2), fps=30.0, max_shift=1.0)),
+    Verb(
+        "camera_breaks",
+        lambda: (*filmed(), filmed()[0]),
+        lambda *x: dyn.tasks.camera_breaks(
+            list(x), dyn.combine_shifts({(0, 1): shift(0.2), (0, 2): shift(0.0), (1, 2): shift(-0.2)}, 3), fps=30.0, max_shift=1.0
+        ),
+    ),
     Verb(
         "combine_shifts",
         lambda: ({(0, 1): shift(1.0), (0, 2): shift(3.0), (1, 2): shift(2.01)},),
@@ -502,6 +510,8 @@ WAITS = {
     "reconstruct": (2, LENT),
     "synchronize": (2, LENT),
     "synchronize_cameras": (3, LENT),
+    "breaks": (2, LENT),
+    "camera_breaks": (3, LENT),
     "combine_shifts": (12, LENT),
     "calibrate": (3, LENT),
     "reconstruct_pair": (2, LENT),
