@@ -98,6 +98,13 @@ tables: install
 	$(BIN)/python -m experiments.labels.story
 	$(BIN)/python -m experiments.synchronization.synchronization
 	$(BIN)/python -m experiments.synchronization.brightness
+	$(BIN)/python -m experiments.synchronization.mocap
+	$(BIN)/python -m experiments.synchronization.sound
+	$(BIN)/python -m experiments.synchronization.silent
+	$(BIN)/python -m experiments.calibration.virtual
+	$(BIN)/python -m experiments.calibration.real
+	$(BIN)/python -m experiments.calibration.people
+	$(BIN)/python -m experiments.calibration.sides
 	$(BIN)/python -m experiments.synchronization.cameras
 	$(BIN)/python -m experiments.reconstruction.pair
 	$(BIN)/python -m experiments.reconstruction.bodies

@@ -1,6 +1,6 @@
 """Clocks that break: frames that a camera lost, or wrote twice, without saying so, and recordings whose times say it.
 
-After a break the files of two cameras are in step no more, whatever one offset says.  ``dyntorch.breaks`` finds the moments from
+After a break the files of two cameras are in step no more, whatever one offset says.  ``dyntorch.tasks.breaks`` finds the moments from
 the same joints in both; here they are looked for in what was compared, and the takes get the times of their frames as they were.
 """
 
@@ -32,7 +32,7 @@ class Mended:
     """Recordings whose clocks broke, with times as if they had not.
 
     Args:
-        found: of ``dyntorch.breaks`` or ``dyntorch.camera_breaks``: what broke; its notices call cameras by name.
+        found: of ``dyntorch.tasks.breaks`` or ``dyntorch.tasks.camera_breaks``: what broke; its notices call cameras by name.
         takes: the recordings with these times.
     """
 
@@ -92,9 +92,9 @@ def find_breaks(
     }
     tracks = [torch.from_numpy(np.array(clip.joints, dtype=np.float64)) for clip in people]
     if together is None:
-        found = dyntorch.breaks(tracks[0], tracks[1], compared[0, 1].shift, **given)
+        found = dyntorch.tasks.breaks(tracks[0], tracks[1], compared[0, 1].shift, **given)
     else:
-        found = dyntorch.camera_breaks(tracks, together, **given)
+        found = dyntorch.tasks.camera_breaks(tracks, together, **given)
     if not (found.ok and found.breaks):
         return None
     names = {str(i): take.name for i, take in enumerate(takes)}

@@ -62,7 +62,7 @@ def library(monkeypatch):
         asked["times"].append(times)
         return shift(0.0)
 
-    monkeypatch.setattr(dyntorch, "breaks", breaks, raising=False)
+    monkeypatch.setattr(dyntorch.tasks, "breaks", breaks, raising=False)
     monkeypatch.setattr(dyntorch, "synchronize", answer, raising=False)
     return asked
 
@@ -141,7 +141,7 @@ def doubtful(library, monkeypatch):
         found = library.get("sees", told)(times)
         return dataclasses.replace(found, times=(*found.times, times[2]))
 
-    monkeypatch.setattr(dyntorch, "camera_breaks", camera_breaks, raising=False)
+    monkeypatch.setattr(dyntorch.tasks, "camera_breaks", camera_breaks, raising=False)
     monkeypatch.setattr("indexing.report.sync.picture_of", lambda report: b"\x89PNG".ljust(16, b"\0") + bytes([0, 0, 0, 9]) * 2)
     return library
 
