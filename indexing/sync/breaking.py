@@ -1,7 +1,7 @@
 """Clocks that break: frames that a camera lost, or wrote twice, without saying so, and recordings whose times say it.
 
 After a break the files of two cameras are in step no more, whatever one offset says.  ``dyntorch.tasks.breaks`` finds the moments
-from the same joints in both; here they are looked for in what was compared, and the takes get the times of their frames as they were.
+from the same joints in both; here they are looked for in what was compared, and takes get the times of their frames as they were.
 """
 
 from __future__ import annotations
