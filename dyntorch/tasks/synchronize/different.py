@@ -337,8 +337,10 @@ def _forwards(shift: Shift, curve: SubspaceCurve, options: SynchronizeOptions) -
     best, backwards = (float(one.scores.nan_to_num(-math.inf).max()) for one in (curve, other))
     more = (best - backwards if backwards > -math.inf else math.inf) - options.different.forward
     confidence = shift.confidence / (1 + math.exp(-max(min(more, 700.0), -700.0)))
-    if more >= 0:
-        return dataclasses.replace(shift, confidence=confidence)
+    # a shift that is far clear of all others is no chance, whatever another film tells
+    clear = len(shift.peaks) < 2 or float(shift.peaks[0, 1] - shift.peaks[1, 1]) >= options.different.forward_clear
+    if more >= 0 or clear:
+        return dataclasses.replace(shift, confidence=shift.confidence if clear else confidence)
     notice = Notice(ShiftNotice.BACKWARDS, best - backwards)
     return dataclasses.replace(shift, status=status_from((notice,)), notices=(notice, *shift.notices), confidence=confidence)
 

@@ -369,6 +369,9 @@ class DifferentPointOptions:
     forward: float = 5.0
     """Nats by which the best lag has to tell more than the best one of b played backwards, for a decision; good pairs had 7.7 and
     more, films of other takes or people 0 +- 8, training trials of experiments.synchronization.silent."""
+    forward_clear: float = 20.0
+    """Nats above the next peak from which on a film played backwards has no say: a good pair with two foreign tracks of nine led by
+    26, and was told better by 7 backwards."""
     telling: float = 1.5
     """Nats per second below which nothing is shared."""
     sharp: float = 0.6

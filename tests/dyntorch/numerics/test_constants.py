@@ -37,6 +37,7 @@ from dyntorch.tasks.synchronize import projective
 CPU = torch.device("cpu")
 TABLES = [
     (lags._epipolar_places, (CPU,)),
+    (lags._resection_places, (CPU,)),
     (epipolar_variance._plane, (CPU,)),
     (covariances._packing, (3, CPU)),
     (extensors._levi_civita, (3, torch.float64, CPU)),
