@@ -96,10 +96,12 @@ def _detect_csv(source: Source) -> str:
     if "frame_idx" in header and any(cell.endswith(".x") for cell in header):
         return "sleap"
     from indexing.readers.mediapipe import find_columns
+    from indexing.readers.spatial import is_spatial
 
-    if find_columns(rows[0]) is None:
+    columns = find_columns(rows[0])
+    if columns is None:
         raise error(source.path, f"text without keypoint columns that a reader knows (first row: {listed(rows[0], 6)})", REMEDY)
-    return "mediapipe"
+    return "mocap" if is_spatial(source, columns) else "mediapipe"
 
 
 def _detect_hdf5(source: Source) -> str:

@@ -6,7 +6,8 @@ One point, a row per frame: ``frame, x, y``.
 Optional columns: ``frame``, a time (``time``, ``timestamp``, ``time_ms``...), and a person where several poses were kept.
 
 Image landmarks run from 0 to 1 in x and in y, so the picture is stretched by its aspect ratio: give ``size=(width, height)``
-to get pixels back.  ``z`` (a guess relative to the hips, not a measured depth) is dropped.
+to get pixels back.  ``z`` (a guess relative to the hips, not a measured depth) is dropped; tables of points that were measured in
+space are told apart by :mod:`indexing.readers.spatial`.
 
 MediaPipe's own interface smooths landmarks as they come, which makes them late where movement is quick, by up to 2.4 frames: bad
 for clocks.  ``Clip.meta["may_lag"]`` says that of a body of 33 landmarks, unless the noise of calm moments shows that nothing was
@@ -63,6 +64,17 @@ class Columns(NamedTuple):
     person: int | None
 
 
+class Table(NamedTuple):
+    """A table of points: ``m`` rows of somebody in a frame, in ``f`` frames."""
+
+    frames: IntArray  # (f,) numbers
+    at: IntArray  # (m,) which of the frames
+    times: FloatArray | None  # (f,) seconds
+    values: FloatArray  # (m, names, kinds)
+    people: list[str] | None  # (m,)
+    names: list[str]
+
+
 def find_columns(header: Sequence[str]) -> Columns | None:
     """The columns of a landmark table, or None where the header is not one.
 
@@ -108,7 +120,24 @@ def read(source: Source, options: Options) -> ClipSet:
     if columns is None:
         raise error(source.path, "has no columns like nose_x, nose_y or landmark, x, y", "export landmarks with a header row")
     recorded = all("v" in kinds for kinds in columns.joints.values())
-    kinds = ("x", "y", "v") if recorded else ("x", "y")
+    found = read_table(source, columns, "xy", recorded)
+    table, people = found.values, found.people
+    confidence = table[..., 2] if recorded and (table[..., 2] > 0).any() else None  # hand models write 0 for every landmark
+    tracks = None if people is None else [person or None for person in people]
+    recording = Recording(found.frames, found.at, table[..., :2], confidence, tracks, found.times, layout_of(source, found.names))
+    clips = to_clips(source.path, recording, options)
+    if recording.skeleton is not MEDIAPIPE33:
+        return clips
+    return ClipSet([clip.replace(meta={**clip.meta, "may_lag": True}) if may_lag(clip) else clip for clip in clips], clips.name)
+
+
+def read_table(source: Source, columns: Columns, axes: str, recorded: bool) -> Table:
+    """The rows of a table, of which values are the axes (``"xy"`` or ``"xyz"``) and, where it is recorded, the confidence.
+
+    Raises:
+        ValueError: a cell that is not a number, or frames and times that do not increase.
+    """
+    kinds = (*axes, "v") if recorded else tuple(axes)
     numeric = [place for place in (columns.frame, columns.time) if place is not None]
     numeric += [joint[kind] for joint in columns.joints.values() for kind in kinds]
     text = [place for place in (columns.person, columns.landmark) if place is not None]
@@ -120,16 +149,12 @@ def read(source: Source, options: Options) -> ClipSet:
     names = list(columns.joints)
     if columns.landmark is not None:
         at, table, people, names = _widen(source, at, table[:, 0], people, words[-1])
+        if recorded:
+            table[..., -1] = np.nan_to_num(table[..., -1])
     elif people is None and len(frames) < len(at):
         back = np.flatnonzero(np.diff(at) <= 0)[0]
         raise error(source.path, f"frame {frames[at[back + 1]]} comes twice", "drop repeated rows, or add a column 'person'")
-    confidence = table[..., 2] if recorded and (table[..., 2] > 0).any() else None  # hand models write 0 for every landmark
-    tracks = None if people is None else [person or None for person in people]
-    recording = Recording(frames, at, table[..., :2], confidence, tracks, times, _skeleton(source, names))
-    clips = to_clips(source.path, recording, options)
-    if recording.skeleton is not MEDIAPIPE33:
-        return clips
-    return ClipSet([clip.replace(meta={**clip.meta, "may_lag": True}) if may_lag(clip) else clip for clip in clips], clips.name)
+    return Table(frames, at, times, table, people, names)
 
 
 def may_lag(clip: Clip, options: SmoothingOptions = SmoothingOptions()) -> bool:
@@ -221,12 +246,10 @@ def _widen(
     check_dense(source.path, len(keys) * len(names), len(rows), f"{len(keys)} people and {len(names)} landmarks", ONE_NAME)
     table = np.full((len(keys), len(names), rows.shape[1]), np.nan)
     table[person, joint] = rows
-    if rows.shape[1] == 3:
-        table[..., 2] = np.nan_to_num(table[..., 2])
     return keys[:, 0], table, None if people is None else [people[i] for i in first], names
 
 
-def _skeleton(source: Source, names: list[str]) -> Skeleton:
+def layout_of(source: Source, names: list[str]) -> Skeleton:
     """MediaPipe's own layouts where the names or, for numbered landmarks, their count are theirs."""
     plain = [re.sub(r"^(pose|landmark|lm|joint|kp|point|hand)s?[ _.\-]?(?=\d+$)", "", name) for name in names]
     for layout in (MEDIAPIPE33, HAND21):

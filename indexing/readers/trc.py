@@ -16,7 +16,7 @@ import numpy as np
 from indexing.clip import COARSEST, FINEST, ClipSet, FloatArray
 from indexing.opening import WIDEST, error, listed, read_text, repeated, shown
 from indexing.readers.files import Options, Source
-from indexing.readers.mocap import of_markers
+from indexing.readers.markers import of_markers
 from indexing.readers.recording import IntArray, frame_numbers, to_clips
 
 HEAD = "PathFileType"

@@ -18,7 +18,7 @@ import numpy as np
 from indexing.clip import Clip
 from indexing.files import prepare, write_bytes
 from indexing.opening import parse_json, read_text
-from indexing.readers.mocap import METRES
+from indexing.readers.markers import METRES
 from indexing.sync.takes import Take
 
 FOLDER = "mocap-sync"

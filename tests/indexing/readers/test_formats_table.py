@@ -128,6 +128,15 @@ def markers(folder: Path) -> Made:
     return Made(folder / "a.c3d", layout=None, dims=3)
 
 
+def points_in_space(folder: Path) -> Made:
+    lines = ["time," + ",".join(f"{name}_{axis}" for name in COCO17.joints for axis in "xyz")]
+    lines += [
+        f"{i / 50:.3f}," + ",".join(f"{v:.6g}" for v in 1000 * f.ravel()) for i, f in enumerate(body(dims=3, confidence=False))
+    ]
+    (folder / "a.csv").write_text("\n".join(lines))
+    return Made(folder / "a.csv", 50.0, dims=3)
+
+
 def numpy_array(folder: Path) -> Made:
     np.save(folder / "a.npy", body(H36M17, 3, confidence=False))
     return Made(folder / "a.npy", layout=H36M17, dims=3)
@@ -170,6 +179,7 @@ TOOLS: dict[str, Callable[[Path], Made]] = {
         layout=None,
     ),
     "Vicon, Qualisys, OptiTrack": markers,
+    "points in space": points_in_space,
     "movement": lambda f: Made(tools.movement(f / "a.nc", TWO, COCO17.joints), 25.0, ("a", "b")),
     "pyskl, mmaction2": lambda f: Made(
         tools.pyskl(f / "ntu60_hrnet.pkl", {"x": np.stack(list(TWO.values()))}, [3], {"xsub_train": ["x"]}), people=("0", "1")
@@ -215,6 +225,6 @@ def test_the_output_opens_and_keeps_what_the_table_says(tool: str, tmp_path: Pat
 def test_every_format_can_be_said(tool: str, tmp_path: Path) -> None:
     made = TOOLS[tool](tmp_path)
     assert len(read(made.path, format=ROWS[tool][0])) == made.clips
-    other = "sleap" if ROWS[tool][0] not in ("sleap", "deeplabcut", "movement", "mediapipe") else "openpose"
+    other = "sleap" if ROWS[tool][0] not in ("sleap", "deeplabcut", "movement", "mediapipe", "mocap") else "openpose"
     with pytest.raises(ValueError, match=r"but the format '\w+' is a .*; leave format= out to detect it"):
         read(made.path, format=other)

@@ -53,6 +53,9 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write([millimetres], folder / "vicon.c3d", "mm")
     write([recorded], folder / "vicon.trc", "m")
     write_openpose(folder / "cam1", [camera()])
+    header = ["time", *(f"{name}_{axis}" for name in recorded.skeleton.joints for axis in "xyz")]
+    rows = [[t, *one.ravel()] for t, one in zip(recorded.times, recorded.joints, strict=True)]
+    (folder / "points.csv").write_text("\n".join([",".join(header), *(",".join(f"{v:.6f}" for v in row) for row in rows)]))
     return folder
 
 
@@ -61,7 +64,7 @@ def assert_found(shift, sign=1, within=0.5):
     assert abs(sign * shift.offset - LATE / FPS) < within / FPS
 
 
-@pytest.mark.parametrize("name", ["vicon.c3d", "vicon.trc"])
+@pytest.mark.parametrize("name", ["vicon.c3d", "vicon.trc", "points.csv"])
 def test_files_of_motion_capture_are_compared_with_keypoints(data, name):
     shift = synchronize(camera(), data / name)
     assert_found(shift)
@@ -114,6 +117,15 @@ def test_the_command_writes_motion_capture_on_the_clock_of_the_camera(data, tmp_
     assert "mocap-sync of an earlier run was removed" in capsys.readouterr().out
     frames = sorted((tmp_path / "out" / "pose-sync" / "cam1_json").iterdir())
     assert abs(int(frames[0].name.split("_")[1]) - LATE) <= 1  # frame k is at k / 30 s of the motion capture
+
+
+def test_a_table_of_points_in_space_is_motion_capture(data, tmp_path):
+    out = tmp_path / "out"
+    assert main(["sync", str(data / "cam1"), str(data / "points.csv"), "--fps", "30", "--out", str(out)]) == 0
+    results = json.loads((out / "sync.json").read_text())
+    assert results["pairs"][0]["method"] == "camera"
+    assert results["cameras"][1]["offset"] == pytest.approx(LATE / FPS, abs=0.5 / FPS)
+    assert read(out / FOLDER / "points.trc")[0].dims == 3
 
 
 def test_what_is_in_the_way_and_two_of_them_are_said_before_the_work(data, tmp_path, capsys):

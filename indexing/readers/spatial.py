@@ -1,0 +1,113 @@
+"""Points in space in CSV: a row per frame with ``name_x, name_y, name_z`` of every point, or a row per frame and point.
+
+The columns are found, and times read, as in :mod:`indexing.readers.mediapipe`, whose tables have a ``z`` too, that was never
+measured.  What tells them apart:
+
+=====================================  ===============================  =======================
+columns                                x and y within 0 and 1           x and y beyond
+=====================================  ===============================  =======================
+visibility                             MediaPipe                        MediaPipe
+the 33 or 21 landmarks of MediaPipe    MediaPipe                        not known: refused
+other points with a confidence         MediaPipe                        in space
+other points without one               not known: refused               in space
+=====================================  ===============================  =======================
+
+Units are not known and coordinates stay as they are; which way is up is decided as for C3D.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from dyntorch.numerics import Message
+from indexing.clip import ClipSet
+from indexing.opening import error, listed
+from indexing.readers.files import Options, Source
+from indexing.readers.markers import of_markers, people_of
+from indexing.readers.mediapipe import PREFIX, SUFFIX, Columns, find_columns, layout_of, read_table
+from indexing.readers.recording import to_clips
+from indexing.skeleton import HAND21, MEDIAPIPE33
+
+VISIBILITY = ("visibility", "vis", "v", "c")
+REMEDY = Message(
+    "say which it is: {arg:format='mocap'} (points in space) or {arg:format='mediapipe'} (x and y in an image); beside files of "
+    "other formats, first write it so with dyntorch convert"
+)
+
+
+@dataclass(frozen=True)
+class SpatialOptions:
+    """When a table without a column of visibility holds coordinates of an image."""
+
+    inside: float = 0.8
+    """Share of x and y from 0 to 1, from where on they may be MediaPipe's, which guesses limbs outside the image, too: both legs
+    from the knee down below it are 8 of the 33 landmarks, in y only, which leaves 88 % (counted, not measured)."""
+
+
+def is_spatial(source: Source, columns: Columns, options: SpatialOptions = SpatialOptions()) -> bool:
+    """Whether a table holds points in space rather than landmarks in an image.
+
+    Raises:
+        ValueError: its names and values may be either's; the message says what to give.
+    """
+    joints = columns.joints
+    flat = [joint for joint, kinds in joints.items() if "z" not in kinds]
+    if len(flat) == len(joints) or any("v" in kinds and _visibility(source, kinds["v"]) for kinds in joints.values()):
+        return False
+    if flat:
+        raise error(source.path, f"has z of some points, but not of {listed(flat)}", REMEDY)
+    rated = any("v" in kinds for kinds in joints.values())
+    table = read_table(source, columns, "xy", False)
+    values = table.values[np.isfinite(table.values)]
+    inside = len(values) > 0 and float(((values >= 0) & (values <= 1)).mean()) >= options.inside
+    landmarks = layout_of(source, table.names) in (MEDIAPIPE33, HAND21)
+    if inside and not (landmarks or rated):
+        raise error(source.path, "x and y run from 0 to 1, as in an image, but there is a z and no visibility", REMEDY)
+    if landmarks and not inside:
+        raise error(source.path, "has MediaPipe's landmarks with z, but no visibility, and x and y beyond 0 to 1", REMEDY)
+    return not inside
+
+
+def read_spatial(source: Source, options: Options) -> ClipSet:
+    """Read a table of points in space; times come from the time column where there is one, else from frame number / fps.
+
+    Raises:
+        ValueError: a point without x, y and z, a cell that is not a number, or frames and times that do not increase.
+    """
+    columns = find_columns(source.data[0])
+    flat = None if columns is None else [joint or "the points" for joint, kinds in columns.joints.items() if "z" not in kinds]
+    if columns is None or flat:
+        what = "has no columns like hip_x, hip_y, hip_z" if flat is None else f"has no z of {listed(flat)}"
+        raise error(source.path, what, "export x, y and z of every point, with a header row")
+    rated = all("v" in kinds for kinds in columns.joints.values())
+    table = read_table(source, columns, "xyz", rated)
+    points = table.values[..., :3]
+    points = np.where(np.isfinite(points).all(axis=2, keepdims=True), points, np.nan)
+    names = table.names if columns.landmark is not None else [_spelled(source, columns, joint) for joint in table.names]
+    people = people_of(names)[0]
+    if table.people is not None and len(people) > 1:
+        raise error(source.path, f"names people in a column and before the points ({listed(people)})", "keep one of the two")
+    recording = of_markers(source.path, points, names, table.frames, table.times, "", "")
+    if rated:
+        recording = replace(recording, confidence=table.values[..., 3].reshape(recording.joints.shape[:2]))
+    if table.people is not None:
+        recording = replace(recording, at=table.at, tracks=[person or None for person in table.people])
+    return to_clips(source.path, recording, options)
+
+
+def _visibility(source: Source, column: int) -> bool:
+    """Whether a column of confidences has the name that MediaPipe has for it."""
+    name = source.data[0][column].strip().lower()
+    if found := SUFFIX.fullmatch(name):
+        return found[2] in VISIBILITY
+    found = PREFIX.fullmatch(name)
+    return (found[1] if found else name) in VISIBILITY
+
+
+def _spelled(source: Source, columns: Columns, joint: str) -> str:
+    """A point's name with the capitals of the file."""
+    cell = source.data[0][columns.joints[joint]["x"]].strip()
+    found = cell[: len(joint)] if SUFFIX.fullmatch(cell.lower()) else cell[-len(joint) :]
+    return found if found.lower() == joint else joint
