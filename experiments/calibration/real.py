@@ -22,7 +22,8 @@ import tyro
 from torch import Tensor
 
 import dyntorch as dyn
-from dyntorch.geometry.rigid import nearest_rotation, rotation_exponential
+from dyntorch.geometry.rigid import rotation_exponential
+from experiments.calibration.rigs import turned
 from experiments.common.tables import aligned, command, note
 from experiments.recognition.protocol import data_folder
 from indexing.files import manifest, prepare, write_json
@@ -65,13 +66,6 @@ def balancing() -> Recording:
     return Recording(x, points[..., 2], size, K, turns, t)
 
 
-def rotation_errors(found: Tensor, true: Tensor) -> Tensor:
-    """Degrees ``(c,)`` of rotations against true ones, after the rotation of the world that fits best."""
-    turn = nearest_rotation((true.mT @ found).sum(0))
-    relative = (found @ turn.mT @ true.mT).diagonal(dim1=-2, dim2=-1).sum(-1)
-    return torch.rad2deg(((relative - 1) / 2).clamp(-1, 1).arccos())
-
-
 def row(recording: Recording, cameras: Sequence[int], starts: Sequence[int], told: str) -> list[str]:
     """Of one cut."""
     keep = list(cameras)
@@ -80,7 +74,7 @@ def row(recording: Recording, cameras: Sequence[int], starts: Sequence[int], tol
     clock = time.process_time()
     found = dyn.calibrate(tracks, 60.0, recording.sizes[keep], focal=focal, one_lens="one lens" in told)
     seconds = time.process_time() - clock
-    away = rotation_errors(found.R, recording.R[keep])
+    _, away = turned(found.R, recording.R[keep])
     share = (found.focals / recording.K[keep, 0, 0] - 1).abs()
     late = torch.tensor([starts[keep[0]] - starts[i] for i in keep], dtype=torch.float64)
     frames = (60 * found.clocks.offsets - late).abs()[1:]

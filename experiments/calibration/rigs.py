@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.geometry import distort
-from dyntorch.geometry.rigid import rigid_alignment
+from dyntorch.geometry.rigid import nearest_rotation, rigid_alignment
 from experiments.recognition.protocol import data_folder
 
 BODY = (
@@ -89,7 +89,6 @@ class Motion:
 
     joints: Tensor
     fps: float
-    cache: dict[str, Any] = field(default_factory=dict, repr=False)
 
     def at(self, times: Tensor) -> Tensor:
         """``(T, n, 3)``; Catmull-Rom between frames."""
@@ -221,9 +220,7 @@ def errors(found: Any, rig: Rig) -> RigErrors:
     The similarity between both worlds: the rotation is the mean of those that the cameras ask for, scale and shift are those
     that carry the true centres onto the found ones.
     """
-    turn = rigid_rotation((rig.R.mT @ found.R).mean(0))
-    relative = found.R @ turn.mT @ rig.R.mT
-    angle = torch.rad2deg(((relative.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2).clamp(-1, 1).arccos())
+    turn, angle = turned(found.R, rig.R)
     true, got = rig.centers, found.centers @ turn.mT
     a, b = true - true.mean(0), got - got.mean(0)
     scale = (a * b).sum() / b.square().sum()
@@ -240,8 +237,8 @@ def errors(found: Any, rig: Rig) -> RigErrors:
     )
 
 
-def rigid_rotation(matrix: Tensor) -> Tensor:
-    """The rotation nearest to a matrix."""
-    from dyntorch.geometry.rigid import nearest_rotation
-
-    return nearest_rotation(matrix)
+def turned(found: Tensor, true: Tensor) -> tuple[Tensor, Tensor]:
+    """The rotation ``(3, 3)`` of the true world that the cameras found ask for in the mean, and what is left: degrees ``(c,)``."""
+    turn = nearest_rotation((true.mT @ found).mean(0))
+    relative = (found @ turn.mT @ true.mT).diagonal(dim1=-2, dim2=-1).sum(-1)
+    return turn, torch.rad2deg(((relative - 1) / 2).clamp(-1, 1).arccos())

@@ -75,13 +75,13 @@ CASES = {
     "30, 29.97, 25 and 30 frames per second, k1 down to -.2": Case(RigSpec(fps=(30.0, 29.97, 25.0, 30.0), k1=(-0.2, 0.0))),
     "clocks 50 and 100 ppm apart, 20 seconds": Case(RigSpec(frames=600, rates=(1.0, 1 + 5e-5, 1 - 1e-4, 1.0))),
     "eight cameras": Case(RigSpec(cameras=8, apart=15.0)),
+    "all cameras in a line": Case(spoiled="line"),
 }
 SPOILED = {
     "two cameras, focal lengths unknown": Case(RigSpec(cameras=2)),
     "nobody moves": Case(spoiled="still"),
     "motion in one plane": Case(spoiled="plane"),
     "a camera moved by 4 degrees": Case(spoiled="moved"),
-    "all cameras in a line": Case(spoiled="line"),
 }
 
 
@@ -95,7 +95,7 @@ def outcome(case: Case, seed: int) -> Outcome:
         rig.tracks, rig.fps, rig.sizes, focal=rig.K[:, 0, 0].tolist() if case.focal else None, one_lens=case.one_lens, clocks=clocks
     )
     seconds = time.process_time() - clock
-    known = bool(found.K.isfinite().all()) and not case.spoiled
+    known = bool(found.K.isfinite().all()) and case.spoiled in ("", "line")
     return Outcome(errors(found, rig) if known else None, bool(found.ok), found.reason, seconds)
 
 

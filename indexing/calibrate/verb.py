@@ -285,22 +285,13 @@ def _who(
 
 def _undecided(views: Sequence[View], joints: Joints, found: Any) -> Calibration:
     """What is known of the cameras where nobody knows who is who: nothing."""
-    c, n = len(views), joints.count
-
-    def empty(*shape: int) -> torch.Tensor:
-        return torch.full(shape, math.nan, dtype=torch.float64)
-
+    nowhere = torch.full((len(views),), math.nan, dtype=torch.float64)
     clocks = Clocks(
-        status=found.status, notices=(), offsets=empty(c), rates=empty(c), sigmas=empty(c), rate_sigmas=empty(c), confidence=0.0,
+        status=found.status, notices=(), offsets=nowhere, rates=nowhere, sigmas=nowhere, rate_sigmas=nowhere, confidence=0.0,
         pairs=(), cycle_error=math.nan, worst_cycle=None, outliers=[], reference=0, center=0.0, shifts={},
     )  # fmt: skip
-    return Calibration(
-        status=found.status, notices=found.notices, K=empty(c, 3, 3), R=empty(c, 3, 3), t=empty(c, 3), distortion=empty(c, 5),
-        sizes=torch.tensor([view.size for view in views], dtype=torch.float64), clocks=clocks, times=empty(0),
-        points=empty(0, n, 3),
-        sigmas=empty(0, n), metric=False, upright=False, covariance=empty(c, 11, 11), residuals=empty(c, n), inliers=empty(c),
-        fps=tuple(view.take.fps for view in views),
-    )  # fmt: skip
+    sizes = torch.tensor([view.size for view in views], dtype=torch.float64)
+    return Calibration.unknown(sizes, joints.count, clocks, tuple(view.take.fps for view in views), found.notices)
 
 
 def _sides(

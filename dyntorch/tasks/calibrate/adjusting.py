@@ -114,13 +114,11 @@ class RigSolution:
 
     Attributes:
         state: of one adjustment.
-        cost: twice the negative logarithm of the likelihood, over by how much residuals repeat themselves in time.
         problem: what it solves.
         covariance: ``(c, 11, 11)`` of the cameras, centres in place of translations.
     """
 
     state: RigState
-    cost: float
     problem: RigAdjustment
     covariance: Tensor
 
@@ -170,7 +168,7 @@ def compared_starts(
     )
     cost = problem.evaluate(tuple(state)).cost
     order = cost.argsort(stable=True)
-    repeats = _repeats(problem.subset(order[:1]), state.of(order[:1]))
+    repeats = _repeats(problem.subset(order[:1]), state.of(order[:1]), options)
     return state.of(order), (cost[order] - cost[order[0]]) / repeats
 
 
@@ -192,9 +190,8 @@ def adjusted(views: RigViews, start: RigState, freedom: Freedom, options: Calibr
         state = _descended(problem, state, steps, options)
     normal = problem.linear(state)
     _, reduced, _ = normal.eliminated(torch.zeros(1, dtype=torch.float64))
-    repeats = _repeats(problem, state)
-    covariance = repeats * camera_covariance(reduced[0], freedom.shape, gauge(state.R[0], state.t[0]))
-    return RigSolution(state, float(problem.evaluate(tuple(state)).cost) / repeats, problem, _of_centers(covariance, state.R[0]))
+    covariance = _repeats(problem, state, options) * camera_covariance(reduced[0], freedom.shape, gauge(state.R[0], state.t[0]))
+    return RigSolution(state, problem, _of_centers(covariance, state.R[0]))
 
 
 def met_points(views: RigViews, state: RigState) -> Tensor:
@@ -245,7 +242,7 @@ def _with_bones(state: RigState, problem: RigAdjustment, options: CalibrateOptio
     return state._replace(lengths=lengths), replace(problem, bones=bones)
 
 
-def _repeats(problem: RigAdjustment, state: RigState) -> float:
+def _repeats(problem: RigAdjustment, state: RigState, options: CalibrateOptions) -> float:
     r"""By how much fewer residuals there are than it seems: :math:`1 + 2 \sum_k \rho_k` of how they repeat themselves in time.
 
     Until the first lag at which they do not, a quarter of the moments at most; pooled over cameras, points and coordinates.
@@ -256,7 +253,7 @@ def _repeats(problem: RigAdjustment, state: RigState) -> float:
     power = float(rows.square().sum()) / max(count, 1)
     for lag in range(1, max(2, count // 4)):
         rho = float((rows[lag:] * rows[:-lag]).sum()) / max(count - lag, 1) / max(power, 1e-300)
-        if not rho > 0.02:
+        if not rho > options.adjust.repeated:
             break
         total += 2 * rho
     return total

@@ -24,6 +24,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from dyntorch.geometry.epipolar import sampson_squared
 from dyntorch.geometry.epipolar_fit import fit_fundamental
 from dyntorch.geometry.homogeneous import homogeneous
 from dyntorch.geometry.rigid import nearest_rotation
@@ -84,20 +85,12 @@ def _fitted(x1: Tensor, x2: Tensor, unit: float, matches: int, options: RigStart
     sigma = _spread(F[0], x1, x2)
     F, _ = fit_fundamental(x1, x2, weights, [scale * sigma for scale in options.sigmas], F[:, None])
     sigma = _spread(F[0], x1, x2)
-    inside = sampson_distances(F[0], x1, x2) <= options.sigmas[0] * sigma
+    inside = sampson_squared(F[0], x1, x2) <= (options.sigmas[0] * sigma) ** 2
     return PairGeometry(F[0], x1, x2, inside.double(), unit, sigma * unit, matches)
 
 
 def _spread(F: Tensor, x1: Tensor, x2: Tensor) -> float:
-    return max(1.4826 * float(sampson_distances(F, x1, x2).median()), 1e-9)
-
-
-def sampson_distances(F: Tensor, x1: Tensor, x2: Tensor) -> Tensor:
-    """``(n,)`` of matches ``(n, 2)``."""
-    one, two = homogeneous(x1), homogeneous(x2)
-    left, right = one @ F.mT, two @ F
-    slope = left[:, :2].square().sum(-1) + right[:, :2].square().sum(-1)
-    return (two * left).sum(-1).abs() / slope.sqrt().clamp(min=1e-300)
+    return max(1.4826 * float(sampson_squared(F, x1, x2).sqrt().median()), 1e-9)
 
 
 def relative_rotations(pair: PairGeometry, first: float, second: float) -> tuple[Tensor, Tensor]:

@@ -91,9 +91,9 @@ def rigid_pairs(points: Tensor, known: Tensor, spread: float) -> tuple[Tensor, T
         ([[0, 1]], 1.0)
     """
     n = points.shape[1]
-    one, other = torch.tensor(list(combinations(range(n), 2))).unbind(-1) if n > 1 else torch.zeros(2, 0, dtype=torch.long)
     if n < 2:
         return torch.zeros(0, 2, dtype=torch.long), points.new_zeros(0), points.new_zeros(0)
+    one, other = torch.tensor(list(combinations(range(n), 2))).unbind(-1)
     both = known[:, one] & known[:, other]
     far = torch.where(both, (points[:, one] - points[:, other]).norm(dim=-1), torch.nan)
     length = far.nanmedian(0).values

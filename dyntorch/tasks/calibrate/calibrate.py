@@ -10,11 +10,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dyntorch.core.outcome import Notice, Status, status_from
+from dyntorch.core.outcome import Notice, status_from
 from dyntorch.numerics.arguments import check_options, on_cpu
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.tasks.calibrate import diagnosis
 from dyntorch.tasks.calibrate.adjusting import Freedom, RigSolution, adjusted, compared_starts, pose_of
+from dyntorch.tasks.calibrate.adjustment import LENS, PARAMETERS
 from dyntorch.tasks.calibrate.averaging import pair_graph
 from dyntorch.tasks.calibrate.input import Rig, Scale, given_clocks, read_clocks, read_rig
 from dyntorch.tasks.calibrate.observations import RigViews, common_views
@@ -51,8 +52,8 @@ def calibrate(
 
     1. clocks of all pairs from the same tracks (:func:`dyntorch.synchronize_cameras`);
     2. F of every pair at common moments; for focal lengths that are tried, rotations and centres by averaging over the pairs;
-    3. the best of these starts adjusted: cameras, focal lengths, one term of distortion, clocks, points and lengths of limbs at
-       once (see ``adjustment.py`` for what is minimized);
+    3. the best of these starts adjusted: cameras, focal lengths, one term of distortion, clocks and points at once (see
+       ``adjustment.py`` for what is minimized);
     4. up from upright bodies, the scale from a height or lengths;
     5. what the data leave open: standard deviations, rival rigs, halves of the take.
 
@@ -172,7 +173,7 @@ def _halves(
     held = replace(freedom, whole=_only_poses(freedom.whole), shape=_only_poses(freedom.shape))
     found = []
     for part in (views.between(-math.inf, 0.0), views.between(0.0, math.inf)):
-        if not len(part.times) or 2 * float(part.times.abs().max()) < 2 * options.trust.half_seconds:
+        if not len(part.times) or float(part.times.abs().max()) < options.trust.half_seconds:
             return None
         if int((part.steady(best.state.clocks) > 0).sum()) < options.trust.half:
             return None
@@ -183,7 +184,7 @@ def _halves(
 
 def _only_poses(basis: Tensor) -> Tensor:
     """The columns that change nothing but poses."""
-    other = basis.view(-1, 11, basis.shape[1])[:, 6:].abs().sum((0, 1))
+    other = basis.view(-1, PARAMETERS, basis.shape[1])[:, LENS.start :].abs().sum((0, 1))
     return basis[:, other == 0]
 
 
@@ -193,7 +194,8 @@ def _result(
     """The solution in its world, with the points of all frames."""
     state, c = best.state, len(rig.tracks)
     found = structure(views, best, options)
-    limits += [limit for limit in [diagnosis.foreign(found.inliers, options)] if limit is not None]
+    foreign = diagnosis.foreign(found.inliers, options)
+    limits += [foreign] if foreign is not None else []
     world = world_of(state.R[0], state.centers[0], found.points, rig.scale, options.world)
     R, t = world.cameras(state.R[0], state.t[0])
     K = torch.eye(3, dtype=torch.float64).repeat(c, 1, 1)
@@ -205,7 +207,7 @@ def _result(
         if lens is not None:
             K[i], distortion[i, : len(lens[1])] = lens
     if not any(limit.code.refuses for limit in limits):
-        limits += _besides(rig, world, state.centers[0])
+        limits += _besides(rig, world, state.centers[0], options)
     return Calibration(
         K=K, R=R, t=t, distortion=distortion, sizes=rig.sizes,
         clocks=_adjusted_clocks(clocks, best, views.middle),
@@ -219,12 +221,12 @@ def _result(
     )  # fmt: skip
 
 
-def _besides(rig: Rig, world: World, centers: Tensor) -> list[Notice]:
+def _besides(rig: Rig, world: World, centers: Tensor, options: CalibrateOptions) -> list[Notice]:
     """What to know beside a good result."""
     found = []
     if len(rig.tracks) == 2:
         found.append(Notice(CalibrationNotice.TWO))
-    if diagnosis.collinear(centers):
+    if diagnosis.collinear(centers, options):
         found.append(Notice(CalibrationNotice.LINE))
     if not world.metric:
         found.append(Notice(CalibrationNotice.UNKNOWN_SCALE))
@@ -253,15 +255,5 @@ def _in_world(covariance: Tensor, world: World) -> Tensor:
 
 
 def _nothing(rig: Rig, clocks: Clocks, limits: tuple[Notice, ...]) -> Calibration:
-    """A result without cameras: these are NaN."""
-    c, n = len(rig.tracks), rig.tracks[0].x.shape[1]
-
-    def empty(*shape: int) -> Tensor:
-        return torch.full(shape, math.nan, dtype=torch.float64)
-
-    status = status_from(limits)
-    return Calibration(
-        K=empty(c, 3, 3), R=empty(c, 3, 3), t=empty(c, 3), distortion=empty(c, 5), sizes=rig.sizes, clocks=clocks, times=empty(0),
-        points=empty(0, n, 3), sigmas=empty(0, n), metric=False, upright=False, covariance=empty(c, 11, 11), residuals=empty(c, n),
-        inliers=empty(c), fps=rig.fps, status=status if int(status) else torch.tensor(int(Status.TOO_FEW)), notices=limits,
-    )  # fmt: skip
+    """A result without cameras."""
+    return Calibration.unknown(rig.sizes, rig.tracks[0].x.shape[1], clocks, rig.fps, limits)

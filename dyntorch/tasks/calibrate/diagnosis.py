@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from dyntorch.core.outcome import Notice
-from dyntorch.geometry.homogeneous import homogeneous
+from dyntorch.geometry.homography import homography, homography_sampson_squared
 from dyntorch.geometry.rigid import nearest_rotation
-from dyntorch.tasks.calibrate.adjusting import Pose, RigSolution
+from dyntorch.tasks.calibrate.adjusting import RAYLEIGH, Pose, RigSolution
 from dyntorch.tasks.calibrate.averaging import Graph, PairGeometry
+from dyntorch.tasks.calibrate.bones import bodies
 from dyntorch.tasks.calibrate.input import Rig
 from dyntorch.tasks.calibrate.options import CalibrateOptions
 from dyntorch.tasks.calibrate.result import CalibrationNotice
@@ -46,13 +46,8 @@ def differences(one: Pose, other: Pose) -> tuple[Tensor, Tensor]:
 
 def unmatched(graph: Graph, rig: Rig, options: CalibrateOptions) -> Notice | None:
     """Cameras that share too little with others to have a place in the rig."""
-    c = len(rig.tracks)
-    reached = {0}
-    for _ in range(c):
-        reached |= {camera for pair in graph if reached & set(pair) for camera in pair}
-    lost = tuple(camera for camera in range(c) if camera not in reached)
-    if len(lost) == c - 1 and c > 2:
-        lost = (0,) if len({camera for pair in graph for camera in pair}) == c - 1 else lost
+    together = bodies(torch.tensor(list(graph)).reshape(-1, 2), len(rig.tracks))
+    lost = tuple(sorted(set(range(len(rig.tracks))) - set(together[0] if together else [0])))
     if not lost:
         return None
     return Notice(CalibrationNotice.APART, 0.0, {"cameras": lost, "needed": options.input.fewest_matches})
@@ -71,38 +66,18 @@ def still(rig: Rig, options: CalibrateOptions) -> Notice | None:
 
 def planar(graph: Graph, options: CalibrateOptions) -> Notice | None:
     """Whether every pair of cameras sees one plane, as two cameras see people who walk along one line seen from the side."""
-    ratios = {pair: _plane_residual(geometry) / geometry.sigma for pair, geometry in graph.items()}
+    ratios = {pair: _plane_residual(geometry, options) / geometry.sigma for pair, geometry in graph.items()}
     if not ratios or max(ratios.values()) > options.trust.plane:
         return None
     return Notice(CalibrationNotice.PLANE, max(ratios.values()), {"pairs": tuple(ratios)})
 
 
-def _plane_residual(pair: PairGeometry) -> float:
-    """Robust standard deviation, px, across the lines of F of what the best homography predicts.
-
-    Both are one coordinate of an error: a homography that is right leaves what F leaves, along the lines as across them.
-    """
-    one, two = homogeneous(pair.x1), homogeneous(pair.x2)
-    # a camera that sees the plane from its edge predicts nothing of the other picture, but that predicts its own
-    scale = min(_transfer_residual(one, two, pair.weights), _transfer_residual(two, one, pair.weights))
-    # the median of a distance in two coordinates is 1.18 standard deviations of one; both pictures share the error
-    return scale * pair.unit / 1.18 / math.sqrt(2)
-
-
-def _transfer_residual(one: Tensor, two: Tensor, given: Tensor) -> float:
-    """Median distance of points ``(m, 3)`` from where the best homography of others puts them, reweighted until it stays."""
-    weights, scale = given, given.new_zeros(())
-    for _ in range(6):
-        zero = torch.zeros_like(one)
-        first = torch.cat([one, zero, -two[:, :1] * one], dim=-1) * weights[:, None]
-        second = torch.cat([zero, one, -two[:, 1:2] * one], dim=-1) * weights[:, None]
-        rows = torch.cat([first, second])
-        H = torch.linalg.eigh(rows.mT @ rows).eigenvectors[:, 0].view(3, 3)
-        image = one @ H.mT
-        away = (image[:, :2] / image[:, 2:] - two[:, :2]).norm(dim=-1).nan_to_num(1e3)
-        scale = away[given > 0].median().clamp(min=1e-9)
-        weights = given / (1 + (away / scale).square()) / image[:, 2].abs().clamp(min=1e-6)
-    return float(scale)
+def _plane_residual(pair: PairGeometry, options: CalibrateOptions) -> float:
+    """Robust standard deviation, px, of what the best homography leaves, in both pictures: of a plane it is what F leaves."""
+    scale = options.start.sigmas[0] * pair.sigma / pair.unit
+    H, _ = homography(pair.x1, pair.x2, pair.weights[None], scale)
+    away = homography_sampson_squared(H[0], pair.x1, pair.x2).sqrt()
+    return pair.unit * float(away[pair.weights > 0].median()) / RAYLEIGH
 
 
 def rival(best: Pose, others: Sequence[tuple[Pose, float]], options: CalibrateOptions) -> Notice | None:
@@ -120,12 +95,12 @@ def rival(best: Pose, others: Sequence[tuple[Pose, float]], options: CalibrateOp
     return None
 
 
-def collinear(centers: Tensor) -> bool:
+def collinear(centers: Tensor, options: CalibrateOptions) -> bool:
     """Whether three cameras or more stand nearly in a line."""
     if len(centers) < 3:
         return False
     spread = torch.linalg.svdvals(centers - centers.mean(0))
-    return bool(spread[1] < 0.06 * spread[0])
+    return bool(spread[1] < options.trust.line * spread[0])
 
 
 def unsure(found: RigSolution, rig: Rig, options: CalibrateOptions) -> Notice | None:
@@ -136,7 +111,7 @@ def unsure(found: RigSolution, rig: Rig, options: CalibrateOptions) -> Notice | 
     focal = variance[:, 6].sqrt()
     pose = found.pose
     if float(focal.max()) > options.trust.focal:
-        case = "line" if collinear(pose.centers) else ""
+        case = "line" if collinear(pose.centers, options) else ""
         which = tuple((focal > options.trust.focal).nonzero().flatten().tolist())
         return Notice(CalibrationNotice.FOCAL, 100 * float(focal.max()), {"case": case, "cameras": which})
     turn = torch.rad2deg(variance[:, :3].sum(-1).sqrt())
@@ -167,7 +142,7 @@ def moved(halves: tuple[RigSolution, RigSolution] | None, options: CalibrateOpti
     far = (one.pose.centers - one.pose.middle).norm(dim=-1)
     spread = 100 * variance[:, 3:6].sum(-1).sqrt() / far
     turned = (angle > options.trust.moved) & (angle > options.trust.moved_sigmas * sigma)
-    went = (away > 3 * options.trust.moved) & (away > options.trust.moved_sigmas * spread)
+    went = (away > options.trust.went) & (away > options.trust.moved_sigmas * spread)
     which = turned | went
     if not bool(which.any()):
         return None

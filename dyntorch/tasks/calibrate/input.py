@@ -213,7 +213,7 @@ def _check_inside(x: Tensor, size: Tensor, options: CalibrateOptions) -> None:
             f"sizes say {width}x{height} px, but points lie from {low} to {high}: give the size of the pictures that they were "
             "found in"
         )
-    if float(seen.max()) <= 2.0:
+    if float(seen.max()) <= options.input.shares:
         raise ValueError("points lie between 0 and 1, as shares of the picture: multiply them by its size in px")
 
 

@@ -18,6 +18,8 @@ class RigInputOptions:
     """Positions that two cameras must see at the same moments: ten times the seven unknowns of F is little."""
     outside: float = 0.5
     """Share of the picture by which positions may lie outside of it: beyond, sizes and keypoints do not belong together."""
+    shares: float = 2.0
+    """Largest coordinate up to which they are shares of the picture and no pixels."""
     outside_share: float = 0.05
     """Share of the positions that may lie farther out."""
 
@@ -77,6 +79,8 @@ class RigAdjustOptions:
     """Of the second term; 0 holds it at 0."""
     rate_sigma: float = 1e-4
     """Of the logarithm of a clock rate beside what the pairs say: what quartz clocks differ by."""
+    repeated: float = 0.02
+    """Correlation of residuals with those some moments later from which on they repeat themselves."""
     lengths: bool = False
     """Whether distances between joints that stay the same take part.  They make it worse: of five virtual rigs of three and four
     cameras focal lengths are 2.4 % off in the median with them, 1.3 % without; the kernel shortens limbs that turn."""
@@ -112,6 +116,14 @@ class RigWorldOptions:
     """Degrees from their middle within which long axes of bodies count as upright."""
     upright_share: float = 0.4
     """Share of the axes that must be so."""
+    moments: int = 2_000
+    """Moments that are looked at, evenly spread."""
+    seen: float = 0.6
+    """Share of the points of a body that must be known for a long axis of it."""
+    whole: float = 0.9
+    """The same for its height, or as many as ever are."""
+    ground: float = 0.01
+    """Quantile of the points' heights that is the ground."""
     elongation: float = 1.5
     """Ratio of the first two principal spreads from which a body has a long axis."""
     cameras: float = 40.0
@@ -137,12 +149,16 @@ class RigTrustOptions:
     """Motion of the points in standard deviations of their noise below which nothing moves."""
     plane: float = 2.0
     """Residual of the best homography over that of F below which two cameras see a plane."""
+    line: float = 0.06
+    """Spread of the cameras across a line over that along it below which they stand in it."""
     rival: float = 10.0
     """Twice the logarithm of the likelihood ratio below which another rig fits as well."""
     apart: float = 2.0
     """Degrees from which on two rigs are different."""
     moved: float = 1.5
-    """Degrees or hundredths of the distance between the poses of a camera in both halves of the take from which on it moved."""
+    """Degrees between the poses of a camera in both halves of the take from which on it moved."""
+    went: float = 4.5
+    """The same of its place, hundredths of its distance from the people."""
     moved_sigmas: float = 5.0
     """The same in standard deviations."""
     half: int = 1_000

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dyntorch.core.outcome import NoticeCode, Status
+from dyntorch.core.outcome import Notice, NoticeCode, Status, status_from
 from dyntorch.geometry.lens import distort
 from dyntorch.tasks.synchronize.result import ClockOutcome, Clocks
 
@@ -105,8 +105,6 @@ class CalibrationNotice(NoticeCode):
     """Nothing checks two cameras."""
     LINE = "line", "all cameras stand nearly in a line: depths along it are less sure"
     """Cameras in a line."""
-    OF_CLOCKS = "of_clocks", "{note}"
-    """What synchronization says."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -153,6 +151,30 @@ class Calibration(ClockOutcome):
     fps: tuple[float, ...]
 
     TASK = "calibrate"
+
+    @classmethod
+    def unknown(
+        cls, sizes: Tensor, points: int, clocks: Clocks, fps: tuple[float, ...], notices: tuple[Notice, ...]
+    ) -> Calibration:
+        """A result without cameras, which are NaN.
+
+        Args:
+            sizes: ``(c, 2)`` px.
+            points: n.
+            clocks: as far as they are known.
+            fps: of the cameras.
+            notices: why there are none; the first that refuses says the status.
+        """
+        c = len(sizes)
+
+        def empty(*shape: int) -> Tensor:
+            return torch.full(shape, torch.nan, dtype=torch.float64)
+
+        return cls(
+            K=empty(c, 3, 3), R=empty(c, 3, 3), t=empty(c, 3), distortion=empty(c, 5), sizes=sizes, clocks=clocks, times=empty(0),
+            points=empty(0, points, 3), sigmas=empty(0, points), metric=False, upright=False, covariance=empty(c, 11, 11),
+            residuals=empty(c, points), inliers=empty(c), fps=fps, status=status_from(notices), notices=notices,
+        )  # fmt: skip
 
     @property
     def centers(self) -> Tensor:

@@ -54,6 +54,7 @@ def world_of(R: Tensor, centers: Tensor, points: Tensor, scale: Scale, options: 
         scale: what is known of lengths.
         options: see :class:`RigWorldOptions`.
     """
+    points = points[:: max(1, len(points) // options.moments)]
     n = points.shape[1]
     # several people stand side by side: what keeps its distances is one body
     ends, _, _ = rigid_pairs(points.nan_to_num(0.0), points.isfinite().all(-1), options.body_spread)
@@ -71,7 +72,7 @@ def world_of(R: Tensor, centers: Tensor, points: Tensor, scale: Scale, options: 
     known = known[known.isfinite().all(-1)]
     if not len(known):
         return World(turn, size, torch.zeros(3, dtype=torch.float64), metric, share, by_people)
-    low = torch.stack([*known[:, :2].median(0).values, known[:, 2].quantile(0.01) if len(known) < 10**7 else known[:, 2].min()])
+    low = torch.stack([*known[:, :2].median(0).values, known[:, 2].quantile(options.ground)])
     return World(turn, size, -size * low, metric, share, by_people)
 
 
@@ -90,7 +91,7 @@ def upward(points: Tensor, groups: list[list[int]], guess: Tensor, options: RigW
     for group in groups:
         body = points[:, group]
         seen = body.isfinite().all(-1)
-        enough = seen.sum(1) >= max(3, math.ceil(0.6 * len(group)))
+        enough = seen.sum(1) >= max(3, math.ceil(options.seen * len(group)))
         body, seen = body[enough].nan_to_num(0.0), seen[enough].double()[..., None]
         centred = (body - (body * seen).sum(1, keepdim=True) / seen.sum(1, keepdim=True)) * seen
         values, vectors = torch.linalg.eigh(centred.mT @ centred)
@@ -124,7 +125,8 @@ def _scale(
             return float(torch.tensor(found).median()), True
     if scale.height is not None:
         up = turned[:, body, 2]
-        whole = up[up.isfinite().double().mean(1) >= min(0.9, float(up.isfinite().double().mean(1).max()))]
+        share = up.isfinite().double().mean(1)
+        whole = up[share >= min(options.whole, float(share.max()))]
         extent = whole.nan_to_num(-math.inf).amax(1) - whole.nan_to_num(math.inf).amin(1)
         if len(extent):
             return scale.height / float(extent.quantile(options.standing)), True
