@@ -101,6 +101,7 @@ tables: install
 	$(BIN)/python -m experiments.synchronization.mocap
 	$(BIN)/python -m experiments.synchronization.sound
 	$(BIN)/python -m experiments.synchronization.silent
+	$(BIN)/python -m experiments.synchronization.breaks
 	$(BIN)/python -m experiments.calibration.virtual
 	$(BIN)/python -m experiments.calibration.real
 	$(BIN)/python -m experiments.calibration.people

@@ -17,6 +17,9 @@ from dyntorch.tasks.calibrate.options import CalibrateOptions
 from dyntorch.tasks.synchronize.result import Clocks
 from dyntorch.tasks.synchronize.tracks import Tracks, cleaned, read_tracks
 
+SAID_BLOCK = 1_000_000
+"""Positions that say where points lie: torch takes quantiles of 16 million numbers at most."""
+
 
 @dataclass(frozen=True)
 class Rig:
@@ -207,7 +210,8 @@ def _check_inside(x: Tensor, size: Tensor, options: CalibrateOptions) -> None:
         raise ValueError("no point is seen; check the detections")
     far = ((seen < -options.input.outside * size) | (seen > (1 + options.input.outside) * size)).any(-1).double().mean()
     if float(far) > options.input.outside_share:
-        low, high = (seen.quantile(q, dim=0).round().int().tolist() for q in (0.02, 0.98))
+        some = seen[:: max(1, len(seen) // SAID_BLOCK)]
+        low, high = (some.quantile(q, dim=0).round().int().tolist() for q in (0.02, 0.98))
         width, height = size.int().tolist()
         raise ValueError(
             f"sizes say {width}x{height} px, but points lie from {low} to {high}: give the size of the pictures that they were "
