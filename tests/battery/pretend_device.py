@@ -120,7 +120,11 @@ class PretendTensor(Tensor):
 def pretend_device() -> torch.device:
     """The device; skips the test where torch cannot have it."""
     if not _LIBRARIES:
-        pytest.skip(f"torch {torch.__version__} has no backends written in Python")
+        pytest.skip(
+            "a real accelerator is here"
+            if torch.cuda.is_available()
+            else f"torch {torch.__version__} has no backends written in Python"
+        )
     return _device()
 
 
@@ -258,9 +262,12 @@ _LIBRARIES: list[torch.library.Library] = []  # their kernels last as long as th
 
 
 def register() -> None:
-    """Make the device known, before the first backward pass of the process: autograd counts the devices then."""
+    """Make the device known, before the first backward pass of the process: autograd counts the devices then.
+
+    Not beside CUDA: autograd takes the streams of one accelerator, and a backward pass on the other fails inside torch.
+    """
     setup: Callable[..., None] | None = getattr(backend_registration, "_setup_privateuseone_for_python_backend", None)
-    if setup is None or _LIBRARIES:
+    if setup is None or _LIBRARIES or torch.cuda.is_available():
         return
     setup(NAME, backend_module=_Module)
     library = torch.library.Library("aten", "IMPL")

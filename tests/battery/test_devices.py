@@ -39,7 +39,7 @@ DEVICES = ("pretend", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cu
 
 
 def device_of(name: str) -> torch.device:
-    return pretend_device() if name == "pretend" else torch.device(name)
+    return pretend_device() if name == "pretend" else torch.device(name, 0)
 
 
 def parts(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
