@@ -6,7 +6,7 @@ What a view measures fulfils multilinear invariants; every one of them is estima
 - :func:`fit`, :func:`robust_fit`, :func:`refine` and :func:`sampson` take an invariant (:class:`HomographyTensor`,
   :class:`JoinTensor`, :class:`GrassmannTensor`, :class:`ShapeTensor`, ...) and the matches, and give a :class:`Solution`;
 - :func:`align_planar`, :func:`align_points`, :func:`align_lines` find the motion of the camera or sensor, and what stood still;
-- :func:`segment`, :func:`translating_planes` find which matches move together, and how;
+- :func:`segment`, :func:`segment_tracks`, :func:`translating_planes` find which points move together, and how;
 - :func:`reconstruct`, :func:`triangulate_trajectories` find cameras, points and velocities from tracks;
 - :func:`synchronize`, :func:`synchronize_cameras`, :func:`reconstruct_pair` put cameras on one clock, and the scene in space;
   :func:`calibrate` finds the cameras themselves.
@@ -62,9 +62,11 @@ _HOME = {
     "align_points": "dyntorch.tasks.align.points",
     "align_lines": "dyntorch.tasks.align.lines",
     "segment": "dyntorch.tasks.segment.segment",
+    "segment_tracks": "dyntorch.tasks.segment_tracks.segment_tracks",
     "translating_planes": "dyntorch.tasks.planes.planes",
     "TranslatingPlanes": "dyntorch.tasks.planes.planes",
     "Segmentation": "dyntorch.tasks.segment.result",
+    "TrackSegmentation": "dyntorch.tasks.segment_tracks.result",
     "Reconstruction": "dyntorch.tasks.reconstruct.result",
     "reconstruct": "dyntorch.tasks.reconstruct.reconstruct",
     "synchronize": "dyntorch.tasks.synchronize.synchronize",
@@ -91,6 +93,7 @@ _HOME = {
     "RobustOptions": "dyntorch.core.options",
     "SegmentOptions": "dyntorch.tasks.segment.options",
     "SynchronizeOptions": "dyntorch.tasks.synchronize.options",
+    "TrackSegmentOptions": "dyntorch.tasks.segment_tracks.options",
     "TrajectoryOptions": "dyntorch.tasks.trajectories.options",
 }
 _MODULES = {

@@ -1,0 +1,105 @@
+"""How many bodies there are, and which of the segmentations into them is the best."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from math import log1p
+
+import torch
+from torch import Tensor
+
+from dyntorch.tasks.segment.search import one_hot
+from dyntorch.tasks.segment_tracks.descent import Candidates, TrackEvidence, descended
+from dyntorch.tasks.segment_tracks.merging import Judge, merged, weakest_separation
+from dyntorch.tasks.segment_tracks.options import TrackSegmentOptions
+
+
+@dataclass(frozen=True)
+class Start:
+    """What the search for bodies starts from.
+
+    Attributes:
+        evidence: links and pairs of frames.
+        judge: of groups of tracks.
+        cuts: labels ``(n,)`` of the pieces, once for each number of pieces.
+    """
+
+    evidence: TrackEvidence
+    judge: Judge
+    cuts: Sequence[Tensor]
+
+    @cached_property
+    def trees(self) -> list[dict[int, Tensor]]:
+        """Labels ``(n,)`` with any number of bodies, for each of the cuts."""
+        most = max(int(cut.max()) + 1 for cut in self.cuts)
+        return [merged(self.judge, cut, range(1, most + 1)) for cut in self.cuts]
+
+    def best(self, bodies: int, options: TrackSegmentOptions) -> Candidates | None:
+        """The best segmentation into so many bodies: separate, and of little cost; None where there is none."""
+        starts = [tree[bodies] for tree in self.trees if bodies in tree]
+        if not starts:
+            return None
+        distinct = [x for place, x in enumerate(starts) if not any(torch.equal(x, other) for other in starts[:place])]
+        found = descended(self.evidence, torch.stack(distinct), bodies, options)
+        count = len(self.evidence.count)
+
+        def value(which: int) -> float:
+            one = found.of(which)
+            if not bool(one.energy.isfinite()):
+                return float("-inf")
+            apart = weakest_separation(self.judge, one, options.choice.links) if bodies > 1 else 0.0
+            return apart - options.choice.energy * float(one.energy) / count
+
+        values = [value(which) for which in range(len(distinct))]
+        best = max(range(len(values)), key=values.__getitem__)
+        return found.of(best) if values[best] > float("-inf") else None
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """The segmentation that was chosen, and whether one body less would do."""
+
+    candidate: Candidates
+    spare: bool = False
+
+
+def bodies_of(start: Start, bodies: int | None, options: TrackSegmentOptions) -> Chosen | None:
+    """The best segmentation into ``bodies``, or fewer where there are no so many; for None into as many as there are."""
+    if bodies is not None:
+        for number in range(bodies, 0, -1):
+            found = start.best(number, options)
+            if found is not None:
+                fewer = start.best(number - 1, options) if number > 1 else None
+                return Chosen(found, fewer is not None and evidence_of_another(start, fewer, found, options) < 0)
+        return None
+    chosen = start.best(1, options)
+    if chosen is None:
+        return None
+    for number in range(2, options.merge.bodies + 1):
+        more = start.best(number, options)
+        if more is None or evidence_of_another(start, chosen, more, options) < 0:
+            break
+        chosen = more
+    return Chosen(chosen)
+
+
+def evidence_of_another(start: Start, fewer: Candidates, more: Candidates, options: TrackSegmentOptions) -> float:
+    r"""Logarithm of the odds that there is one body more,
+
+    .. math:: a_0 + a_1 \log\Big(1 + \frac{x}{o + f}\Big) - a_2 \log(l + l_0) + a_3 \log\Big(1 + \frac{\Delta E}{\sqrt n}\Big),
+
+    with the excess x, the own cost o and the links l of the two bodies that take the place of one, and the cost that it saves.
+    """
+    how, member = options.choice, one_hot(more.labels[0], more.bodies) > 0
+    before = one_hot(fewer.labels[0], fewer.bodies) > 0
+    apart = start.judge.separation(member)
+    # the two bodies whose union is most like a body of the other segmentation
+    union = (member[apart.first] | member[apart.second]).double()
+    shared = union @ before.double().mT
+    likeness = shared / (union.sum(-1, keepdim=True) + before.double().sum(-1) - shared)
+    split = int(likeness.amax(-1).argmax())
+    ratio, links = apart.ratio(options.merge)[split], apart.links[split] + options.merge.unlinked
+    saved = float(fewer.energy - more.energy) / len(start.evidence.count) ** 0.5
+    return float(how.base + how.ratio * ratio - how.unlinked * links.log() + how.saved * log1p(max(saved, 0.0)))

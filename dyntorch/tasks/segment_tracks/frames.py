@@ -1,0 +1,174 @@
+"""Which frames are compared: pairs near and far, the tracks that both show, and how well these are measured."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from dyntorch.geometry.homogeneous import similarity
+from dyntorch.tasks.segment.coherence import Links
+from dyntorch.tasks.segment.energy import View
+from dyntorch.tasks.segment_tracks.options import FrameOptions
+
+Pair = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class FramePair:
+    """Two frames, and the tracks that both show.
+
+    Attributes:
+        frames: their numbers, the earlier one first.
+        index: ``(m,)`` of these tracks.
+        view: their places, without links.
+        precision: ``(m,)`` in [0, 1]: the inverse variance of a track beside that of one that does not move.
+    """
+
+    frames: Pair
+    index: Tensor
+    view: View
+    precision: Tensor
+
+    def of(self, place: Tensor) -> FramePair:
+        """The pair for some of the tracks: ``place (n,)`` holds the new index of each, -1 where it is left out."""
+        kept = place[self.index] >= 0
+        view = View(self.view.x1[kept], self.view.x2[kept], self.view.pixel, self.view.links)
+        return FramePair(self.frames, place[self.index[kept]], view, self.precision[kept])
+
+
+@dataclass(frozen=True)
+class Film:
+    """The tracks of one problem, centred and of about unit size, all frames alike.
+
+    Attributes:
+        x: ``(frames, n, 2)``, 0 where a track is missing.
+        seen: ``(frames, n)`` bool.
+        pixel: a pixel of the options, in these coordinates.
+        change: ``(3, 3)`` similarity from pixels to them.
+        scale: of that.
+    """
+
+    x: Tensor
+    seen: Tensor
+    pixel: float
+    change: Tensor
+    scale: float
+
+    @staticmethod
+    def of(tracks: Tensor, threshold: float) -> Film:
+        """Of tracks ``(frames, n, 2)``, NaN = missing, whose threshold is that of 2.5 pixels."""
+        seen = tracks.isfinite().all(-1)
+        there = tracks[seen]
+        centre = there.median(0).values
+        distance = torch.hypot(*(there - centre).unbind(-1))
+        spread = distance[distance > 0].median() if bool(distance.any()) else torch.ones_like(distance[0])
+        scale = 1 / spread
+        x = torch.where(seen[..., None], (tracks - centre) * scale, 0.0)
+        return Film(x, seen, threshold / 2.5 * float(scale), similarity(scale, centre), float(scale))
+
+    @cached_property
+    def lengths(self) -> Tensor:
+        """``(n,)`` frames from the first to the last that show a track."""
+        number = torch.arange(len(self.seen), device=self.seen.device)[:, None]
+        last = torch.where(self.seen, number, -1).amax(0)
+        first = torch.where(self.seen, number, len(self.seen)).amin(0)
+        return (last - first + 1).clamp(min=0)
+
+    def pair(self, frames: Pair, options: FrameOptions) -> FramePair:
+        """Two frames."""
+        first, second = frames
+        index = (self.seen[first] & self.seen[second]).nonzero().flatten()
+        x1, x2 = self.x[first][index], self.x[second][index]
+        moved = (x2 - x1).norm(dim=-1) / self.pixel
+        none = Links(index[:, None][:, :0], x1[:, :0])
+        return FramePair(frames, index, View(x1, x2, self.pixel, none), 1 / (1 + moved / options.grows))
+
+
+def spread_evenly(count: int, gap: int, most: int) -> list[Pair]:
+    """Up to ``most`` pairs of ``count`` frames with a gap, from the first to the last."""
+    last = count - 1 - gap
+    number = min(most, last + 1)
+    places = torch.linspace(0, last, number).round().long().tolist() if number > 1 else [last // 2] * (number == 1)
+    return [(a, a + gap) for a in places]
+
+
+def pairs_near(film: Film, gaps: tuple[int, ...], starts: int, common: int) -> list[Pair]:
+    """Pairs of frames with the given gaps, evenly spread; in a video longer than its tracks there are more of them."""
+    count = len(film.seen)
+    length = float(film.lengths.double().median())
+    most = round(starts * max(1.0, count / max(length, 4.0) / 1.5))
+    found = dict.fromkeys(pair for gap in gaps for pair in spread_evenly(count, min(gap, count - 1), most))
+    return [pair for pair in found if _common(film, pair) >= common]
+
+
+def chosen_pairs(film: Film, options: FrameOptions) -> list[Pair]:
+    """The pairs of frames that bodies are judged by: wide ones, narrower ones for short tracks, all tracks in some of them.
+
+    They are taken one after the other, each for what it adds: tracks that are in few pairs so far, and motion.
+    """
+    count = len(film.seen)
+    common = min(options.common, max(8, film.x.shape[1] // 2))
+    gap = int(min(count - 1, max(1.0, float(film.lengths.double().quantile(options.long)) - 1)))
+    offered: dict[Pair, Tensor] = {}
+    for _ in range(options.halvings):
+        step = max(1, gap // 2)
+        for a in {*range(0, count - gap, step), count - 1 - gap}:
+            both = film.seen[a] & film.seen[a + gap]
+            if int(both.sum()) >= common:
+                offered[a, a + gap] = both
+        gap = max(1, gap // 2)
+    if not offered:
+        return []
+    pairs = list(offered)
+    both = torch.stack([offered[pair] for pair in pairs]).double()
+    wide = torch.tensor([float(b - a) for a, b in pairs], dtype=both.dtype, device=both.device).sqrt()
+    have, kept = torch.zeros_like(both[0]), torch.zeros(len(pairs), dtype=torch.bool, device=both.device)
+    alive = int((both.sum(0) > 0).sum())
+    while not bool(kept.all()) and int(kept.sum()) < options.most:
+        if int(kept.sum()) >= options.least and float(have.sum()) >= options.each * alive:
+            break
+        gain = (both @ (1 / (1 + have)) * wide).masked_fill(kept, -1.0)
+        best = int(gain.argmax())
+        kept[best] = True
+        have += both[best]
+    return sorted(pair for pair, taken in zip(pairs, kept.tolist(), strict=True) if taken)
+
+
+@dataclass(frozen=True)
+class SceneCut:
+    """Where a video goes on with another scene: the first frame of that, and the share of the tracks that go on, or how many times
+    farther they jump than elsewhere (0: few go on)."""
+
+    frame: int
+    share: float
+    jump: float = 0.0
+
+
+def cut_of(film: Film, options: FrameOptions) -> SceneCut | None:
+    """The first cut of a video, if there is one."""
+    number = torch.arange(len(film.seen), device=film.seen.device)[:, None]
+    last = torch.where(film.seen, number, -1).amax(0)
+    first = torch.where(film.seen, number, len(film.seen)).amin(0)
+    steps = []
+    for frame in range(1, len(film.seen)):
+        before, after = (first < frame) & (last >= frame - 1), (first <= frame) & (last >= frame)
+        across = before & after
+        least = float(torch.minimum(before.sum(), after.sum()))
+        if least >= options.common and float(across.sum()) < options.cut * least:
+            return SceneCut(frame, float(across.sum()) / least)
+        both = film.seen[frame - 1] & film.seen[frame]
+        steps.append((film.x[frame] - film.x[frame - 1])[both].norm(dim=-1) / film.pixel)
+    usual = [float(step.median()) for step in steps if len(step)]
+    if len(usual) > 2:
+        typical = max(float(torch.tensor(usual).median()), 1.0)
+        for frame, step in enumerate(steps, start=1):
+            if len(step) and float((step > options.jumped * typical).double().mean()) > options.jump:
+                return SceneCut(frame, 1.0, float(step.median()) / typical)
+    return None
+
+
+def _common(film: Film, pair: Pair) -> int:
+    return int((film.seen[pair[0]] & film.seen[pair[1]]).sum())

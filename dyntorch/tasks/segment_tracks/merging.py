@@ -1,0 +1,230 @@
+"""From pieces that move as one to bodies: pieces of the graph of links, joined where one motion explains two of them."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import torch
+from sklearn.cluster import spectral_clustering
+from torch import Tensor
+
+from dyntorch.geometry.epipolar import null_vector
+from dyntorch.geometry.homogeneous import homogeneous
+from dyntorch.numerics.chi_square import median
+from dyntorch.tasks.segment.search import one_hot
+from dyntorch.tasks.segment_tracks.descent import Candidates, TrackEvidence, fitted, improbable, relief_cost, squares
+from dyntorch.tasks.segment_tracks.frames import Film, Pair
+from dyntorch.tasks.segment_tracks.options import FrameOptions, MergeOptions, TrackSegmentOptions
+
+BLOCK = 16
+"""Groups fitted at a time."""
+
+
+def pieces(sparse: Tensor, count: int) -> Tensor:
+    """Labels ``(n,)`` from 0 of so many pieces of a graph ``(n, n)``, by normalized cuts.
+
+    Source: Damle, Minden and Ying, Simple, direct and efficient multi-way spectral clustering, 2019.
+    """
+    # tracks without links are a piece's worth of trouble: all get a little of everything
+    graph = sparse.double() + 1e-6 * float(sparse.max().clamp(min=1e-12))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # a graph of several components is welcome
+        found = spectral_clustering(
+            graph.cpu().numpy(), n_clusters=count, eigen_solver="arpack", assign_labels="cluster_qr", random_state=0
+        )
+    return torch.from_numpy(found).long().to(sparse.device)
+
+
+@dataclass(frozen=True)
+class Separation:
+    """How separate pairs of groups are.
+
+    Attributes:
+        first, second: ``(q,)`` the groups of each pair.
+        excess: ``(q,)`` what their joint motion costs more than their own ones, for each sighting of the smaller group.
+        own: ``(q,)`` what a sighting costs in its own group.
+        links: ``(q,)`` links between them, for each track of the smaller group.
+        sightings: ``(q,)`` of the smaller group.
+    """
+
+    first: Tensor
+    second: Tensor
+    excess: Tensor
+    own: Tensor
+    links: Tensor
+    sightings: Tensor
+
+    def value(self, weight: float, options: MergeOptions) -> Tensor:
+        r"""``(q,)``, large for groups that are surely two bodies: :math:`\log(1 + x / (o + f)) - w \log(l + l_0)`."""
+        return self.ratio(options) - weight * torch.log(self.links + options.unlinked)
+
+    def ratio(self, options: MergeOptions) -> Tensor:
+        r"""``(q,)`` what joining costs beside what the groups cost: :math:`\log(1 + x / (o + f))`."""
+        return torch.log1p(self.excess.clamp(min=0) / (self.own.clamp(min=0) + options.floor))
+
+
+class NearPairs:
+    """Linear fits of many groups of tracks between many pairs of near frames at a time.
+
+    Between near frames these are good enough to say that two groups move differently, in a hundredth of the time of the most likely
+    fits.  No rank is enforced: a group that is a plane leaves a family of matrices, all of which fit.
+    """
+
+    def __init__(self, film: Film, pairs: Sequence[Pair], options: FrameOptions, cap: float) -> None:
+        """Of pairs of frames ``(p, 2)``."""
+        self.cap = cap
+        first, second = torch.tensor(list(pairs), device=film.x.device).reshape(-1, 2).unbind(-1)
+        x1, x2 = film.x[first], film.x[second]
+        self.seen = film.seen[first] & film.seen[second]
+        moved = (x2 - x1).norm(dim=-1) / film.pixel
+        self.precision = self.seen / (1 + moved / options.grows) / film.pixel**2
+        self.first, self.second = homogeneous(x1), homogeneous(x2)
+        rows = (self.second[..., :, None] * self.first[..., None, :]).flatten(-2)
+        self.rows = rows  # (p, n, 9)
+        self.upper = torch.triu_indices(9, 9, device=film.x.device)
+        self.products = rows[..., self.upper[0]] * rows[..., self.upper[1]]
+        self.count = self.seen.sum(0).double()
+
+    def squares(self, groups: Tensor, scale: float, rounds: int = 2) -> Tensor:
+        """Squared distances ``(p, g, n)`` in pixels at rest of all tracks from the motions of groups ``(g, n)`` bool.
+
+        Args:
+            groups: of tracks.
+            scale: of the distances that count in the fits, pixels at rest.
+            rounds: of weights.
+        """
+        member = groups.double() * self.seen[:, None].double()
+        weight = member
+        square = member
+        for remaining in range(rounds, -1, -1):
+            F = self._least(weight)
+            value, gradient = F @ self.rows.mT, self._gradient(F.unflatten(-1, (3, 3)))
+            square = value.square() / gradient * self.precision[:, None]
+            if remaining:
+                weight = member / (gradient * (1 + square / (4 * scale**2)).square())
+                weight = weight / weight.amax(-1, keepdim=True).clamp(min=1e-200)
+        return square
+
+    def costs(self, groups: Tensor, scale: float) -> Tensor:
+        """Costs ``(g,)`` of groups ``(g, n)`` bool: the squared distances of all sightings over the noise, each at most the cap."""
+        square = (self.squares(groups, scale) / scale**2).clamp(max=self.cap)
+        return (square * (groups & self.seen[:, None])).sum((0, 2))
+
+    def _least(self, weight: Tensor) -> Tensor:
+        """Unit vectors ``(p, g, 9)`` of least squares."""
+        sums = weight @ self.products
+        gram = sums.new_zeros(*sums.shape[:-1], 9, 9)
+        gram[..., self.upper[0], self.upper[1]] = sums
+        gram[..., self.upper[1], self.upper[0]] = sums
+        return null_vector(gram)
+
+    def _gradient(self, F: Tensor) -> Tensor:
+        """Squared gradients ``(p, g, n)`` of the constraint."""
+        there, here = F[..., :2, :] @ self.first.mT[:, None], F.mT[..., :2, :] @ self.second.mT[:, None]
+        return (there.square().sum(-2) + here.square().sum(-2)).clamp(min=1e-12)
+
+
+class FarPairs:
+    """Most likely fits of groups of tracks between frames of any distance, with the relief of each group: exact, and slow."""
+
+    def __init__(self, evidence: TrackEvidence, options: TrackSegmentOptions) -> None:
+        """Of pairs of frames and links."""
+        self.pairs, self.count, self.options = evidence.pairs, evidence.count, options
+
+    def costs(self, groups: Tensor, scale: float) -> Tensor:
+        """Costs ``(g,)`` of groups ``(g, n)`` bool, as in the energy of a segmentation."""
+        how = self.options.descent
+        fine = max(how.fit_scale * scale, how.least_fit_scale)
+        total = torch.zeros(len(groups), dtype=torch.float64, device=groups.device)
+        for pair, F in zip(self.pairs, fitted(self.pairs, groups, (4.0, 1.0, fine)), strict=True):
+            member = groups[:, pair.index].double()
+            cost = improbable(squares(pair, F) / scale**2, how) + how.relief * relief_cost(pair, F, member, self.options.views)
+            total += (cost * member).sum(-1)
+        return total
+
+
+@dataclass
+class Judge:
+    """Costs of groups of tracks under one motion each, every group fitted once.
+
+    Attributes:
+        near: pairs of frames.
+        alike: ``(n, n)`` how alike tracks move, beyond chance.
+        scale: of the costs, pixels at rest.
+        options: of all stages.
+    """
+
+    near: NearPairs | FarPairs
+    alike: Tensor
+    scale: float
+    options: MergeOptions
+    known: dict[bytes, float] = field(default_factory=dict)
+
+    @staticmethod
+    def of(near: NearPairs, kernel: Tensor, groups: Tensor, options: MergeOptions) -> Judge:
+        """With the noise of groups ``(g, n)`` bool that are surely pure."""
+        square = near.squares(groups, options.first_scale)
+        noise = (float(square[(groups & near.seen[:, None])].median()) / median(1)) ** 0.5
+        alike = (kernel - options.chance).clamp(min=0)
+        return Judge(near, alike, options.widened * max(noise, options.least_scale), options)
+
+    def cost(self, groups: Tensor) -> Tensor:
+        """``(g,)`` of groups ``(g, n)`` bool."""
+        names = [group.cpu().numpy().tobytes() for group in groups]
+        fresh = [place for place, name in enumerate(names) if name not in self.known]
+        for some in [fresh[start : start + BLOCK] for start in range(0, len(fresh), BLOCK)]:
+            total = self.near.costs(groups[some], self.scale)
+            self.known.update(zip((names[place] for place in some), total.tolist(), strict=True))
+        return torch.tensor([self.known[name] for name in names], dtype=torch.float64, device=groups.device)
+
+    def separation(self, groups: Tensor) -> Separation:
+        """Of all pairs of groups ``(g, n)`` bool."""
+        first, second = torch.triu_indices(len(groups), len(groups), 1, device=groups.device)
+        alone, joint = self.cost(groups), self.cost(groups[first] | groups[second])
+        member = groups.double()
+        size, seen = member.sum(-1), (member @ self.near.count).clamp(min=1.0)
+        between = (groups.float() @ self.alike @ groups.float().mT).double()
+        return Separation(
+            first=first,
+            second=second,
+            excess=(joint - alone[first] - alone[second]) / torch.minimum(seen[first], seen[second]),
+            own=(alone[first] + alone[second]) / (seen[first] + seen[second]),
+            links=between[first, second] / torch.minimum(size[first], size[second]).clamp(min=1.0),
+            sightings=torch.minimum(seen[first], seen[second]),
+        )
+
+
+Apart = Callable[[Separation], Tensor]
+"""How separate pairs of groups are, ``(q,)``."""
+
+
+def merged(judge: Judge, labels: Tensor, counts: Sequence[int], apart: Apart | None = None) -> dict[int, Tensor]:
+    """Labels ``(n,)`` from 0 with each number of bodies, from pieces ``(n,)`` that are joined one pair after the other.
+
+    The least separate pair of all is joined first.
+    """
+    groups = one_hot(labels, int(labels.max()) + 1) > 0
+    groups = groups[groups.any(-1)]
+    found: dict[int, Tensor] = {}
+    while True:
+        if len(groups) in counts:
+            found[len(groups)] = groups.long().argmax(0)
+        if len(groups) <= max(1, min(counts)):
+            return found
+        pairs = judge.separation(groups)
+        value = pairs.value(judge.options.links, judge.options) if apart is None else apart(pairs)
+        weakest = int(value.argmin())
+        one, other = int(pairs.first[weakest]), int(pairs.second[weakest])
+        rest = torch.ones(len(groups), dtype=torch.bool, device=groups.device)
+        rest[[one, other]] = False
+        groups = torch.cat([groups[rest], (groups[one] | groups[other])[None]])
+
+
+def weakest_separation(judge: Judge, candidate: Candidates, weight: float) -> float:
+    """Of the least separate bodies of one candidate; infinite for a single body."""
+    member = one_hot(candidate.labels[0], candidate.bodies) > 0
+    if len(member) < 2:
+        return float("inf")
+    return float(judge.separation(member).value(weight, judge.options).min())

@@ -1,0 +1,156 @@
+r"""Which tracks move alike: those that prefer the same hypotheses about the motion between two frames, in many pairs of frames.
+
+Hypotheses are affine maps, homographies and fundamental matrices of a few tracks near each other.  Each track ranks them by its
+distance; the share of the first ranks that two tracks have in common says how alike they move, whatever the noise.  Affine maps
+and homographies tell cars on one road apart that share an epipolar geometry, fundamental matrices hold together what has depth.
+
+Source: Chin, Wang and Suter, The ordered residual kernel for robust motion subspace clustering, 2009; Xu, Cheong and Li, Motion
+segmentation by exploiting complementary geometric models, 2018 (several models, many pairs of frames).
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from dyntorch.geometry.homogeneous import cofactors, homogeneous
+from dyntorch.numerics.blocks import uniform
+from dyntorch.tasks.segment.coherence import Links
+from dyntorch.tasks.segment_tracks.frames import Film, FramePair, pairs_near
+from dyntorch.tasks.segment_tracks.options import FrameOptions, PreferenceOptions
+
+SAMPLE = 8
+"""Tracks of a hypothesis: three of them give an affine map, four a homography, all of them a fundamental matrix."""
+TINY = 1e-12
+
+
+def preference_kernel(
+    film: Film, searched: Tensor, generator: torch.Generator | None, frames: FrameOptions, options: PreferenceOptions
+) -> Tensor:
+    r"""How alike tracks move: the mean share of preferred hypotheses that they have in common,
+
+    .. math:: W_{ij} = \frac{1}{|P_{ij}|} \sum_{p \in P_{ij}} \frac{1}{3 h} \sum_{\text{models}} |\theta_{ip} \cap \theta_{jp}|,
+
+    over the pairs of frames :math:`P_{ij}` in which both are seen, with the h hypotheses :math:`\theta_{ip}` that fit track i best.
+
+    Args:
+        film: all tracks.
+        searched: ``(m,)`` indices of the tracks that make hypotheses and that others are compared with.
+        generator: of the samples.
+        frames, options: of the pairs and the hypotheses.
+
+    Returns:
+        ``(n, m)`` float32 in [0, 1]; 0 for a track and itself.
+    """
+    count = film.x.shape[1]
+    place = torch.full((count,), -1, device=searched.device)
+    place[searched] = torch.arange(len(searched), device=searched.device)
+    kernel = torch.zeros(count, len(searched), device=searched.device)
+    met = torch.zeros_like(kernel)
+    for pair in pairs_near(film, options.gaps, options.starts, 2 * SAMPLE):
+        both = film.pair(pair, frames)
+        column = place[both.index]
+        own = (column >= 0).nonzero().flatten()
+        if len(own) < 2 * SAMPLE:
+            continue
+        liked = _preferred(both, own, generator, options)
+        shared = liked @ liked[own].mT
+        rows, columns = both.index[:, None], column[own][None]
+        kernel[rows, columns] += shared
+        met[rows, columns] += 1
+    kernel = kernel / met.clamp(min=1)
+    kernel[searched, torch.arange(len(searched), device=searched.device)] = 0.0
+    return kernel
+
+
+def _preferred(both: FramePair, own: Tensor, generator: torch.Generator | None, options: PreferenceOptions) -> Tensor:
+    """``(m, 3 h)`` 1 for what a track prefers, else 0, over the root of the number of preferences."""
+    x1, x2 = both.view.x1, both.view.x2
+    sample = own[_samples(x1[own], generator, options)]
+    a, b = x1[sample], x2[sample]
+    squares = [
+        _transfer(affine_map(a[:, :3], b[:, :3]), x1, x2),
+        _transfer(homography_of_four(a[:, :4], b[:, :4]), x1, x2),
+        _epipolar(fundamental_of_eight(a, b), x1, x2),
+    ]
+    few = max(1, round(options.preferred * len(sample)))
+    liked = [(square <= square.kthvalue(few, dim=0, keepdim=True).values).float() for square in squares]
+    return torch.cat(liked).mT / (3 * few) ** 0.5
+
+
+def _samples(x: Tensor, generator: torch.Generator | None, options: PreferenceOptions) -> Tensor:
+    """``(h, 8)`` different points ``(m, 2)``: one at random, the others by a normal distribution about it, of some width."""
+    count, number = len(x), options.hypotheses
+    low, high = x.quantile(x.new_tensor([0.02, 0.98]), dim=0)
+    extent = (high - low).norm() / 2**0.5
+    seed = (uniform(number, generator=generator, device=x.device) * count).long().clamp(max=count - 1)
+    radius = options.near * (options.far / options.near) ** uniform(number, 1, generator=generator, device=x.device) * extent
+    # Gumbel's trick: the largest of log p + noise are a sample without replacement
+    noise = -(-uniform(number, count, generator=generator, device=x.device).clamp(min=1e-300).log()).log()
+    chance = noise - torch.cdist(x[seed], x).square() / (2 * radius.square()).clamp(min=TINY)
+    chance.scatter_(1, seed[:, None], torch.inf)
+    return chance.topk(SAMPLE, dim=-1).indices
+
+
+def affine_map(x1: Tensor, x2: Tensor) -> Tensor:
+    """Affine maps ``(*batch, 3, 3)`` that take three points ``(*batch, 3, 2)`` to three others; huge where these are on a line."""
+    here, there = homogeneous(x1).mT, homogeneous(x2).mT
+    adjoint = cofactors(here).mT
+    determinant = (here[..., 0, :] * adjoint[..., :, 0]).sum(-1)
+    return there @ adjoint / torch.where(determinant.abs() < TINY, TINY, determinant)[..., None, None]
+
+
+def homography_of_four(x1: Tensor, x2: Tensor) -> Tensor:
+    """Homographies ``(*batch, 3, 3)`` of norm 1 that take four points ``(*batch, 4, 2)`` to four others.
+
+    Through the projective basis of the four points on either side (Hartley and Zisserman, section 4.1.4, in closed form).
+    """
+
+    def basis(x: Tensor) -> Tensor:
+        points = homogeneous(x).mT
+        weights = cofactors(points[..., :3]).mT @ points[..., 3:]
+        return points[..., :3] * weights.mT
+
+    found = basis(x2) @ cofactors(basis(x1)).mT
+    return found / found.flatten(-2).norm(dim=-1).clamp(min=1e-300)[..., None, None]
+
+
+def fundamental_of_eight(x1: Tensor, x2: Tensor) -> Tensor:
+    """Matrices ``(*batch, 3, 3)`` of norm 1 with :math:`x_2^T F x_1 = 0` for eight matches ``(*batch, 8, 2)``, of any rank."""
+    rows = (homogeneous(x2)[..., :, None] * homogeneous(x1)[..., None, :]).flatten(-2)
+    found, info = torch.linalg.solve_ex(rows[..., :8], -rows[..., 8:])
+    found = torch.cat([torch.where((info == 0)[..., None], found[..., 0], 0.0), torch.ones_like(rows[..., 0, :1])], dim=-1)
+    return (found / found.norm(dim=-1, keepdim=True)).unflatten(-1, (3, 3))
+
+
+def _transfer(H: Tensor, x1: Tensor, x2: Tensor) -> Tensor:
+    """Squared distances ``(h, m)`` in the second frame."""
+    mapped = (H @ homogeneous(x1).mT).float()
+    depth = torch.where(mapped[:, 2].abs() < 1e-9, 1e-9, mapped[:, 2])
+    x, y = x2.float().mT
+    return ((mapped[:, 0] / depth - x).square() + (mapped[:, 1] / depth - y).square()).nan_to_num(nan=1e30, posinf=1e30)
+
+
+def _epipolar(F: Tensor, x1: Tensor, x2: Tensor) -> Tensor:
+    """Squared Sampson distances ``(h, m)``, in single precision: they are only ranked."""
+    first, second = homogeneous(x1).mT, homogeneous(x2).mT
+    lines, others = (F @ first).float(), (F.mT[:, :2] @ second).float()
+    value = (lines * second.float()).sum(-2)
+    return value.square() / (lines[:, :2].square().sum(-2) + others.square().sum(-2)).clamp(min=1e-30)
+
+
+def strongest(kernel: Tensor, neighbours: int) -> Tensor:
+    """A symmetric kernel ``(m, m)`` with the largest entries of every row or column alone."""
+    kept = min(neighbours, len(kernel) - 1)
+    least = kernel.topk(kept, dim=-1).values[:, -1:]
+    sparse = torch.where((kernel >= least) & (kernel > 0), kernel, 0.0)
+    return torch.maximum(sparse, sparse.mT)
+
+
+def links_of(sparse: Tensor, total: float) -> Links:
+    r"""Links of weight :math:`t\, W_{ij} / \sqrt{d_i d_j}` with the degrees d: about ``total`` for each track."""
+    degree = sparse.sum(-1).clamp(min=1e-9)
+    weight = sparse / (degree[:, None] * degree).sqrt() * total
+    width = max(1, int((weight > 0).sum(-1).max()))
+    top = weight.topk(width, dim=-1)
+    return Links(top.indices, top.values.double())

@@ -1,0 +1,337 @@
+"""segment_tracks(): which tracks of a video move together, how each body moved, and which one stands still."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dyntorch.core.outcome import Notice, Status, status_from
+from dyntorch.core.problems import of_problem, one_by_one
+from dyntorch.geometry.pairs import order_of_bodies
+from dyntorch.numerics.arguments import check_options, check_threshold, on_cpu
+from dyntorch.numerics.blocks import one_thread, uniform
+from dyntorch.tasks.segment.search import one_hot
+from dyntorch.tasks.segment_tracks.choosing import Chosen, Start, bodies_of
+from dyntorch.tasks.segment_tracks.descent import Candidates, TrackEvidence, costs, unlinked
+from dyntorch.tasks.segment_tracks.frames import Film, FramePair, chosen_pairs, cut_of, pairs_near
+from dyntorch.tasks.segment_tracks.labels import agreeing, distances, motions, outliers, resting
+from dyntorch.tasks.segment_tracks.merging import Judge, NearPairs, pieces
+from dyntorch.tasks.segment_tracks.options import TrackSegmentOptions
+from dyntorch.tasks.segment_tracks.preferences import SAMPLE, links_of, preference_kernel, strongest
+from dyntorch.tasks.segment_tracks.result import TrackNotice, TrackSegmentation
+
+MINIMAL = 8
+"""Fewest tracks: seven determine a fundamental matrix, and one has to agree with it."""
+
+
+@dataclass(frozen=True)
+class TrackRequest:
+    """What was asked for, as in :func:`dyntorch.segment_tracks`."""
+
+    bodies: int | None
+    threshold: float
+    generator: torch.Generator | None
+    options: TrackSegmentOptions
+
+
+@one_thread
+@on_cpu
+def segment_tracks(
+    tracks: Tensor,
+    bodies: int | None = None,
+    threshold: float = 2.5,
+    *,
+    cameras: Tensor | None = None,
+    generator: torch.Generator | None = None,
+    options: TrackSegmentOptions = TrackSegmentOptions(),
+) -> TrackSegmentation:
+    r"""Bodies that move independently through a video, from tracks that live in any part of it.
+
+    Between any two frames a and b each body has a fundamental matrix of its own, :math:`x_b^T F_k^{ab} x_a = 0`.  Tracks that
+    prefer the same hypotheses about the motion, in many pairs of frames, are linked; the graph of the links is cut into more
+    pieces than there are bodies, and pieces are joined as long as one motion explains two of them.  Labels and the most likely
+    geometries of near and far pairs of frames then descend in turns to the least cost
+
+    .. math:: \sum_i \frac{m}{|P_i|} \sum_{(a, b) \in P_i} \Big[\rho\Big(\frac{r_{i k_i ab}^2}{\sigma^2\, v_{iab}}\Big) + \mu\,
+        \text{relief}_{i k_i ab}\Big] + \sum_{ij:\ k_i \ne k_j} L_{ij},
+
+    with Sampson distances r, the noise :math:`\sigma` found from the tracks, and the growth v of its variance with the motion of a
+    track.  Cost grows with the number of tracks times that of pairs of frames; of very many tracks a part is searched, and the
+    others follow.
+
+    A search: it computes on the CPU wherever its tensors are, and the result returns to their device.
+
+    Args:
+        tracks: ``(*batch, frames, n, 2)`` pixels; NaN where a track is not seen.
+        bodies: how many, those that stand still included; None finds out.
+        threshold: greatest usual distance of a track from the epipolar lines of its body, in the unit of the tracks; all scales
+            follow it.
+        cameras: ``(*batch, frames, 3, 4)`` projections that the camera is known to have had, up to scale; the body that agrees
+            with them stands still.
+        generator: source of all randomness; None is torch's global one.
+        options: every number that decides, by stage; ``dataclasses.replace`` changes some of them.
+
+    Returns:
+        A :class:`~dyntorch.tasks.segment_tracks.result.TrackSegmentation`, without gradients.
+
+    Raises:
+        ValueError: fewer than eight tracks or two frames, shapes or dtypes that do not fit, a threshold or a number of bodies that
+            is not positive.
+
+    Source: thesis chapter 6, for many views; Chin, Wang and Suter 2009 (preferences); Xu, Cheong and Li 2018 (several models).
+
+    Example:
+        >>> import torch, dyntorch as dyn
+        >>> from dyntorch import scenes
+        >>> draw = torch.Generator().manual_seed(0)
+        >>> street = scenes.streets(bodies=2, frames=8, tracks=120, generator=draw)
+        >>> found = dyn.segment_tracks(street.tracks, bodies=2, generator=draw)
+        >>> tuple(found.labels.shape), int(found.bodies)
+        ((120,), 2)
+    """
+    check_threshold(threshold)
+    check_options(options, TrackSegmentOptions)
+    _check(tracks, bodies, cameras, generator)
+    batch = tracks.shape[:-3]
+    request = TrackRequest(bodies, threshold, generator, options)
+
+    def solve(place: int) -> TrackSegmentation:
+        own = None if cameras is None else of_problem(cameras, place, batch, 3)
+        return _solve(of_problem(tracks, place, batch, 3).double(), own, request)
+
+    with torch.no_grad():
+        if batch:
+            found = one_by_one(batch, solve, lambda said: _nothing(tracks.shape[-2], request, [], Status.TOO_FEW))
+        else:
+            found = solve(0)
+    return _as(found, tracks.dtype)
+
+
+def _check(tracks: Tensor, bodies: int | None, cameras: Tensor | None, generator: torch.Generator | None) -> None:
+    if not isinstance(tracks, Tensor) or tracks.ndim < 3 or tracks.shape[-1] != 2 or not tracks.is_floating_point():
+        kind = f"{tuple(tracks.shape)} {tracks.dtype}" if isinstance(tracks, Tensor) else type(tracks).__name__
+        raise ValueError(f"tracks must be a floating-point tensor (*batch, frames, n, 2), NaN = missing, got {kind}")
+    if tracks.shape[-3] < 2:
+        raise ValueError(f"tracks hold {tracks.shape[-3]} frame, and motion needs two; give (frames, n, 2)")
+    if tracks.shape[-2] < MINIMAL:
+        raise ValueError(
+            f"segment_tracks needs at least {MINIMAL} tracks, got {tracks.shape[-2]}: add {MINIMAL - tracks.shape[-2]}"
+        )
+    if bodies is not None and (isinstance(bodies, bool) or not isinstance(bodies, int) or bodies < 1):
+        raise ValueError(f"bodies must be a positive whole number, or None to find out, got {bodies!r}")
+    if cameras is not None and (not isinstance(cameras, Tensor) or cameras.shape[-3:] != (tracks.shape[-3], 3, 4)):
+        shape = tuple(cameras.shape) if isinstance(cameras, Tensor) else type(cameras).__name__
+        raise ValueError(f"cameras must be (*batch, {tracks.shape[-3]}, 3, 4), a projection for every frame, got {shape}")
+    if generator is not None and not isinstance(generator, torch.Generator):
+        raise ValueError(f"generator must be a torch.Generator or None, got {generator!r}; use torch.Generator().manual_seed(0)")
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# One problem, stage by stage.
+
+
+def _solve(tracks: Tensor, cameras: Tensor | None, request: TrackRequest) -> TrackSegmentation:
+    options, count = request.options, tracks.shape[1]
+    seen = tracks.isfinite().all(-1)
+    # 1. what is there: tracks in two frames at least, frames with tracks in common, motion, one scene
+    if not bool((seen.sum(0) > 1).any()):
+        return _nothing(count, request, [Notice(TrackNotice.SHORT)])
+    film = Film.of(torch.where((seen.sum(0) > 1)[:, None], tracks, torch.nan), request.threshold)
+    refused = _refusal(film, request)
+    frames = [] if refused else chosen_pairs(film, options.frames)
+    if refused or not frames:
+        common = int((film.seen[:-1] & film.seen[1:]).sum(-1).max())
+        few = Notice(TrackNotice.FEW_COMMON, float(common), {"least": MINIMAL})
+        return _nothing(count, request, [refused or few])
+    # 2. which tracks move alike, and the bodies of those that are searched
+    searched = _searched(film, request)
+    kernel = preference_kernel(film, searched, request.generator, options.frames, options.preferences)
+    start = _start(film, frames, kernel, searched, request)
+    chosen = bodies_of(start, request.bodies, options)
+    if chosen is None:
+        return _nothing(count, request, [], Status.NO_CONSENSUS)
+    # 3. all tracks follow, and what belongs to no body is told
+    pairs = [film.pair(pair, options.frames) for pair in frames]
+    member = _followed(film, pairs, kernel, searched, chosen.candidate, options)
+    return _outcome(tracks, cameras, film, pairs, kernel, searched, member, chosen, request)
+
+
+def _refusal(film: Film, request: TrackRequest) -> Notice | None:
+    """Why there is nothing to segment."""
+    cut = cut_of(film, request.options.frames)
+    if cut is not None:
+        values = {"frame": cut.frame, "case": "jump" if cut.jump else ""}
+        return Notice(TrackNotice.CUT, cut.jump or cut.share, values)
+    low = torch.where(film.seen[..., None], film.x, torch.inf).amin(0)
+    high = torch.where(film.seen[..., None], film.x, -torch.inf).amax(0)
+    way = (high - low).norm(dim=-1)[film.seen.any(0)] / film.pixel
+    farthest, least = float(way.quantile(0.95)), request.options.outliers.still
+    if farthest < least:
+        unit = request.threshold / 2.5
+        return Notice(TrackNotice.STILL, farthest * unit, {"least": least * unit})
+    return None
+
+
+def _searched(film: Film, request: TrackRequest) -> Tensor:
+    """Indices of the tracks that the search looks at: all, or a random part of very many."""
+    alive = film.seen.any(0).nonzero().flatten()
+    most = request.options.preferences.searched
+    if len(alive) <= most:
+        return alive
+    order = uniform(len(alive), generator=request.generator, device=alive.device).argsort()
+    return alive[order[:most]].sort().values
+
+
+def _start(film: Film, frames: Sequence[tuple[int, int]], kernel: Tensor, searched: Tensor, request: TrackRequest) -> Start:
+    """What the search for bodies starts from: links, pairs of frames and pieces of the searched tracks."""
+    options = request.options
+    part = Film(film.x[:, searched], film.seen[:, searched], film.pixel, film.change, film.scale)
+    inner = kernel[searched]
+    inner = (inner + inner.mT) / 2
+    sparse = strongest(inner, options.preferences.neighbours)
+    pairs = [part.pair(pair, options.frames) for pair in frames]
+    evidence = TrackEvidence.of(pairs, links_of(sparse, options.preferences.cut))
+    near = NearPairs(
+        part, pairs_near(part, options.merge.gaps, options.merge.starts, 2 * SAMPLE) or frames, options.frames, options.merge.cap
+    )
+    least, most = request.bodies or 1, max(1, len(searched) // options.merge.members)
+    cuts = [pieces(sparse, max(min(number, most), min(least, most))) for number in options.merge.pieces]
+    judge = Judge.of(near, inner, one_hot(cuts[0], int(cuts[0].max()) + 1) > 0, options.merge)
+    return Start(evidence, judge, cuts)
+
+
+def _followed(
+    film: Film, pairs: list[FramePair], kernel: Tensor, searched: Tensor, found: Candidates, options: TrackSegmentOptions
+) -> Tensor:
+    """Probabilities ``(K, n)`` of all tracks: those searched have theirs, the others those of what they move like."""
+    count = film.x.shape[1]
+    member = torch.zeros(found.bodies, count, dtype=torch.float64, device=film.x.device)
+    member[:, searched] = found.member[0].double()
+    rest = film.seen.any(0)
+    rest[searched] = False
+    rest = rest.nonzero().flatten()
+    if len(rest):
+        near = kernel[rest].topk(min(options.preferences.neighbours, len(searched)), dim=-1)
+        weight = near.values.double() / near.values.double().sum(-1, keepdim=True).clamp(min=1e-9)
+        pulled = (member[:, searched][:, near.indices] * weight).sum(-1) * options.preferences.cut
+        evidence = TrackEvidence.of(pairs, unlinked(count, film.x.device))
+        cost = costs(evidence, found.geometry, found.scale, member[None], options)[0][:, rest]
+        member[:, rest] = torch.softmax(pulled - cost, dim=0)
+    return member
+
+
+def _outcome(
+    tracks: Tensor,
+    cameras: Tensor | None,
+    film: Film,
+    pairs: list[FramePair],
+    kernel: Tensor,
+    searched: Tensor,
+    member: Tensor,
+    chosen: Chosen,
+    request: TrackRequest,
+) -> TrackSegmentation:
+    """Labels by size, with motions, the body that stands still, and what limits all that."""
+    options, count = request.options, tracks.shape[1]
+    alive = film.seen.any(0)
+    labels = member.argmax(0)
+    geometry = chosen.candidate.geometry
+    far = distances(pairs, geometry, count)
+    wrong = outliers(far, labels, _support(kernel, labels[searched], labels, options), options.outliers) | ~alive
+    hard = one_hot(labels, len(member)) * ~wrong
+    order = order_of_bodies(hard > 0)
+    order = order[(hard.sum(-1) >= options.descent.members)[order]]
+    member, hard, far = member[order], hard[order], far[:, order]
+    if not len(order):
+        return _nothing(count, request, [], Status.NO_CONSENSUS)
+    named = torch.where(hard.any(0), hard.argmax(0) + 1, 0)
+    own = far.gather(1, (named - 1).clamp(min=0).expand(len(far), 1, -1))[:, 0]
+    nearest = torch.where(named > 0, own.square().nanmean(0), far.square().nanmean(0).nan_to_num(nan=torch.inf).amin(0))
+    evidence = TrackEvidence.of(pairs, unlinked(count, film.x.device))
+    moved = motions(evidence, [F[:, order] for F in geometry], hard, film, options)
+    static, notices = _static(tracks, cameras, film, hard, pairs, request)
+    notices = [*_about(len(order), chosen, request), *notices]
+    bodies = member / member.sum(0).clamp(min=1e-12) * (named > 0)
+    missing = (named == 0) & alive
+    return TrackSegmentation(
+        labels=named,
+        bodies=torch.tensor(len(order)),
+        static_body=torch.tensor(static),
+        pairs=torch.tensor([pair.frames for pair in pairs]),
+        geometries=moved.fundamentals,
+        homographies=moved.homographies,
+        planar=moved.planar,
+        probabilities=torch.cat([missing.double()[None], bodies]).mT,
+        residuals=torch.where(nearest.isfinite(), nearest, 0.0).sqrt() * request.threshold / 2.5,
+        threshold=torch.tensor(request.threshold, dtype=torch.float64),
+        status=status_from(notices) if request.bodies in (None, len(order)) else torch.tensor(int(Status.NO_CONSENSUS)),
+        notices=tuple(notices),
+    )
+
+
+def _support(kernel: Tensor, searched: Tensor, labels: Tensor, options: TrackSegmentOptions) -> Tensor:
+    """``(n,)`` share of what a track is linked with that has its label: ``(n,)`` of all, ``(m,)`` of the searched ones."""
+    top = kernel.topk(min(options.preferences.neighbours, kernel.shape[1]), dim=-1)
+    same = (searched[top.indices] == labels[:, None]) * top.values
+    return (same.sum(-1) / top.values.sum(-1).clamp(min=1e-9)).double()
+
+
+def _about(found: int, chosen: Chosen, request: TrackRequest) -> list[Notice]:
+    said = []
+    if request.bodies is not None and found < request.bodies:
+        said.append(Notice(TrackNotice.FEWER_BODIES, float(found), {"asked": request.bodies}))
+    elif request.bodies is not None and chosen.spare:
+        said.append(Notice(TrackNotice.SPARE_BODY, 0.0, {"asked": request.bodies}))
+    if request.bodies is None and found == 1:
+        said.append(Notice(TrackNotice.ONE_BODY, 1.0))
+    return said
+
+
+def _static(
+    tracks: Tensor, cameras: Tensor | None, film: Film, hard: Tensor, pairs: list[FramePair], request: TrackRequest
+) -> tuple[int, list[Notice]]:
+    """The number of the body that stands still, 0 where it is not known, and why."""
+    options = request.options.static
+    if cameras is not None:
+        off = agreeing(tracks, hard, cameras.double(), pairs)
+        best = int(off.argmin())
+        if float(off[best]) <= options.agrees * request.threshold:
+            return best + 1, []
+        return 0, [Notice(TrackNotice.DISAGREEING, float(off[best]))]
+    rests = resting(film, hard, options)
+    if rests is not None:
+        return rests + 1, []
+    return 0, [Notice(TrackNotice.UNSURE_STATIC, float(hard.sum(-1).max() / hard.sum()))]
+
+
+def _nothing(count: int, request: TrackRequest, notices: list[Notice], status: Status | None = None) -> TrackSegmentation:
+    """No bodies: all tracks are outliers."""
+    none = torch.zeros(0, 0, 3, 3, dtype=torch.float64)
+    return TrackSegmentation(
+        labels=torch.zeros(count, dtype=torch.long),
+        bodies=torch.tensor(0),
+        static_body=torch.tensor(0),
+        pairs=torch.zeros(0, 2, dtype=torch.long),
+        geometries=none,
+        homographies=none,
+        planar=torch.zeros(0, 0, dtype=torch.bool),
+        probabilities=torch.ones(count, 1, dtype=torch.float64),
+        residuals=torch.zeros(count, dtype=torch.float64),
+        threshold=torch.tensor(request.threshold, dtype=torch.float64),
+        status=status_from(notices) if status is None else torch.tensor(int(status)),
+        notices=tuple(notices),
+    )
+
+
+def _as(found: TrackSegmentation, dtype: torch.dtype) -> TrackSegmentation:
+    """With floating-point parts of the type of the tracks, and 0 where a batch is filled up."""
+    parts: dict[str, Any] = {}
+    for one in fields(found):
+        value = getattr(found, one.name)
+        if isinstance(value, Tensor) and value.is_floating_point():
+            parts[one.name] = value.nan_to_num(nan=0.0).to(dtype)
+    return replace(found, **parts)
