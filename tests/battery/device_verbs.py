@@ -225,7 +225,13 @@ VERBS: tuple[Verb, ...] = (
     ),
     Verb("null_space", lambda: (randn(3, 12, 9),), dyn.null_space),
     Verb("align_planar", planar, lambda *x: dyn.align_planar(*x, threshold=1.5, generator=draw())),
-    Verb("plane_motions", lambda: (torch.eye(3, dtype=F64) + 0.2 * randn(4, 3, 3),), dyn.geometry.plane_motions),
+    Verb(
+        "plane_motions",
+        lambda: (torch.eye(3, dtype=F64) + 0.2 * randn(4, 3, 3),),
+        dyn.geometry.plane_motions,
+        # the two solutions come in either order
+        compare=lambda found: (found.rotations.sum(-3), found.translations.sum(-2), found.normal.sum(-2)),
+    ),
     Verb(
         "align_planar calibration",
         planar,
@@ -433,7 +439,14 @@ VERBS: tuple[Verb, ...] = (
         lambda s, x: dyn.shapes.recover_times(s, dyn.Polynomial(1), x),
     ),
     Verb("fit_perspective_shapes", lambda: moving_shapes()[:2], dyn.shapes.fit_perspective_shapes, tolerance=1e-4),
-    Verb("deformable_shapes", deforming_images, lambda a, b: dyn.shapes.deformable_shapes(a, b, 2), tolerance=1e-4),
+    Verb(
+        "deformable_shapes",
+        deforming_images,
+        lambda a, b: dyn.shapes.deformable_shapes(a, b, 2),
+        # mirrored shapes before mirrored cameras fit alike
+        compare=lambda found: (found.status, found.coefficients.abs(), found.points.square().sum(-1), found.residual, found.sigma),
+        tolerance=1e-4,
+    ),
     Verb(
         "recover_perspective_times",
         lambda: (moving_shapes()[2], moving_shapes()[0]),
@@ -473,7 +486,13 @@ VERBS: tuple[Verb, ...] = (
         )
         for form in ("joint", "basis", "span")
     ),
-    Verb("affine_factorization", affine_tracks, dyn.numerics.affine_factorization),
+    Verb(
+        "affine_factorization",
+        affine_tracks,
+        dyn.numerics.affine_factorization,
+        # the signs of singular vectors are free
+        compare=lambda found: (found[0][..., None, :, :] @ found[1], found[2]),
+    ),
     Verb("metric_upgrade", lambda: dyn.numerics.affine_factorization(*affine_tracks())[:2], dyn.numerics.metric_upgrade),
 )
 
