@@ -92,6 +92,8 @@ tables: install
 	$(BIN)/python -m experiments.segmentation.multibody
 	$(BIN)/python -m experiments.segmentation.segmentation
 	$(BIN)/python -m experiments.segmentation.sensitivity
+	$(BIN)/python -m experiments.segmentation.tracks
+	$(BIN)/python -m experiments.segmentation.colmap
 	$(BIN)/python -m experiments.pose.videos
 	$(BIN)/python -m experiments.pose.sizes
 	$(BIN)/python -m experiments.labels.suggesting

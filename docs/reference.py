@@ -15,7 +15,7 @@ from types import ModuleType
 from typing import Any
 
 PACKAGES = ("dyntorch", "indexing")
-FACES = {"indexing": ("actors", "calibrate", "labels", "pose")}
+FACES = {"indexing": ("actors", "calibrate", "colmap", "labels", "pose")}
 """Public packages that no table names, as they are imported by their own name."""
 
 QUOTED = re.compile(r"(``.*?``|:\w+(?::\w+)?:`.*?`|`.*?`)")

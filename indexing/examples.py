@@ -38,6 +38,7 @@ dyntorch sync cam1/ cam2/ cam3/ --fps 30 --out sync/
 dyntorch sync cam1/ another-take/ --fps 30
 dyntorch align a.csv b.csv c.csv --out align/
 dyntorch segment matches.npz --out segment/
+dyntorch segment street.csv --bodies 3 --size 1242 375 --out street/
 dyntorch reconstruct tracks.csv --motion constant_velocity_3d --static parked.csv --fps 25 --out reconstruct/
 """
 VIDEO_COMMANDS = """\
@@ -72,7 +73,7 @@ def write_examples(folder: str | Path) -> list[str]:
 
 
 def _geometry(where: Path) -> None:
-    """Three views of a road, matches of two images, tracks of six views."""
+    """Three views of a road, matches of two images, tracks of six views, and of a street through 20 frames."""
     road = scenes.planar(n=120, sigma=0.5, static=0.4, outliers=0.15, generator=torch.Generator().manual_seed(4))
     for name, view in zip("abc", road.views, strict=True):
         _table(where / f"{name}.csv", ("x", "y"), view.tolist())
@@ -85,6 +86,9 @@ def _geometry(where: Path) -> None:
     rows = [(view, point, *xy.tolist()) for view, points in enumerate(scene.tracks) for point, xy in enumerate(points)]
     _table(where / "tracks.csv", ("frame", "id", "x", "y"), [row for row in rows if np.isfinite(row[2])])
     _table(where / "parked.csv", ("id",), [(int(point),) for point in torch.nonzero(known)])
+    street = scenes.streets(3, frames=20, tracks=240, sigma=0.2, generator=torch.Generator().manual_seed(7)).tracks.tolist()
+    rows = [(frame, point, f"{x:.2f}", f"{y:.2f}") for frame, points in enumerate(street) for point, (x, y) in enumerate(points)]
+    _table(where / "street.csv", ("frame", "id", "x", "y"), [row for row in rows if row[2] != "nan"])
 
 
 def _cameras(where: Path) -> None:

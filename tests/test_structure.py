@@ -63,6 +63,7 @@ FORMATS = {
     "indexing/cli/archive.py": {"PROBLEMS", "INTERRUPTED"},
     "indexing/cli/__init__.py": {"DONE", "BAD_INPUT", "REFUSED", "INTERRUPTED", "BROKEN_PIPE"},
     "indexing/cli/console.py": {"REFUSED"},
+    "indexing/colmap/masks.py": {"BLACK", "WHITE"},
     "indexing/labels/via.py": {"TEXT", "CHECKBOX", "SELECT", "VIDEO", "LOCAL"},
     "indexing/phase/saving.py": {"VERSION"},
     "indexing/pose/blazepose.py": {
@@ -115,6 +116,11 @@ DRAWING = {
             "MARKS",
         ),
     },
+    "indexing/cli/bodies.py": {"UNTIMED"},
+    "indexing/report/bodies.py": {"ALIVE"},
+    "indexing/report/bodies_picture.py": {
+        *("PANELS", "WIDTH", "TALL", "EDGE", "GAP", "HEAD", "TICKS", "FOOT", "WIDE", "NARROW", "TAIL", "FRINGE", "DRAWN"),
+    },
     "indexing/report/canvas.py": {"DPI", "FADE", "FRAMES", "AROUND", "WIDTH", "HEIGHT"},
     "indexing/report/learned.py": {"COLUMNS", "PANEL", "PIECES", "THIN", "THICK", "DOT", "HEAD", "TRAIL", "NAMED"},
     "indexing/report/page.py": {"PIXEL_RATIO", "LISTED", "LINES"},
@@ -128,10 +134,15 @@ DRAWING = {
     "indexing/report/segmentation.py": {
         *("WIDTH", "TALL", "EDGE", "GAP", "HEAD", "TICKS", "FOOT", "WIDE", "STRAYS", "SLIM"),
     },
+    "indexing/report/static.py": {"PANELS", "COLUMNS", "WIDE", "EDGE", "HEAD", "FOOT", "ROWS"},
     "indexing/report/sync.py": {
         *("WIDTH", "TOP", "ROW", "GAP", "FOOT", "LEFT", "MIDDLE", "CLOSE", "EDGE", "DRAWN", "NEAR", "LISTED"),
     },
     "indexing/video/check.py": {"STRIP", "PAPER", "INK", "BONE", "JOINT", "SMOOTHEST"},
+    "indexing/video/overlay.py": {
+        *("WIDEST", "LARGER", "TAIL", "SLOWEST", "FASTEST", "CALM", "LIGHTER"),
+        *("STRAY", "STRIP", "PAPER", "INK", "MUTED", "SUBPIXEL"),
+    },
 }
 """Sizes, colours and lengths of pictures, tables and check videos."""
 EXPLAINED = (MATHEMATICS, ALGEBRA, FORMATS, WORDING, DRAWING)
@@ -216,7 +227,7 @@ def test_what_is_explained_is_there(kind):
 RESULTS = {
     "Solution", "Alignment", "Segmentation", "AffineSegmentation", "Reconstruction", "ProjectiveFactorization",
     "VelocityFactorization", "TranslatingPlanes", "PairReconstruction", "Trajectories", "TrajectoryCameras", "Shift", "Clocks",
-    "MovingShapes", "Recovery", "DeformableShapes", "Calibration", "Breaks",
+    "MovingShapes", "Recovery", "DeformableShapes", "Calibration", "Breaks", "TrackSegmentation",
 }  # fmt: skip
 """What the verbs of dyntorch return."""
 

@@ -6,6 +6,7 @@ from dyntorch.scenes.lifts import LiftedScene, lifted
 from dyntorch.scenes.plane import lines_concurrent, planar, translating_lines
 from dyntorch.scenes.scene import Scene
 from dyntorch.scenes.space import collineation, constant_velocity, dynamic, moving_points, two_view
+from dyntorch.scenes.streets import Street, StreetOptions, streets
 from dyntorch.scenes.translation import TranslatingScene, translating_planes
 
 __all__ = [
@@ -13,6 +14,8 @@ __all__ = [
     "LiftedScene",
     "NonrigidScene",
     "Scene",
+    "Street",
+    "StreetOptions",
     "TranslatingScene",
     "bodies",
     "collineation",
@@ -25,6 +28,7 @@ __all__ = [
     "moving_points",
     "nonrigid_pair",
     "planar",
+    "streets",
     "translating_lines",
     "translating_planes",
     "two_view",

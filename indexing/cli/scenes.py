@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -67,6 +68,16 @@ class Asked:
         if self.every is not None and self.every < 1:
             raise ValueError(f"--every must be a whole number from 1, got {self.every}")
 
+    def span(self) -> tuple[int, int] | None:
+        """The first and the last frame, where ``--frames`` is ``FIRST-LAST``."""
+        found = re.fullmatch(r"\s*(\d+)\s*-\s*(\d+)\s*", self.frames or "")
+        if found is None:
+            return None
+        first, last = int(found[1]), int(found[2])
+        if last <= first:
+            raise ValueError(f"--frames {self.frames}: the last frame must come after the first, such as --frames 0-99")
+        return first, last
+
     def numbers(self) -> list[int] | None:
         """Those of ``--frames``.
 
@@ -118,7 +129,6 @@ def follow(
     """
     from indexing.video.options import SceneOptions
     from indexing.video.scene import track_scene
-    from indexing.video.sequence import PictureSequence, in_order
 
     numbers, moments = asked.numbers(), asked.moments()
     for flag, given in (("frames", numbers), ("at", moments)):
@@ -126,13 +136,53 @@ def follow(
         if given is not None and (len(given) < least or (exactly and len(given) > least)):
             needed = f"{'' if exactly else 'at least '}{least} are needed"
             raise ValueError(f"--{flag} {getattr(asked, flag)}: {len(given)} given, {needed}")
-    files = [path.expanduser() for path in paths]
-    source: Any = files[0] if len(files) == 1 else in_order(files)
-    if moments is not None and fps is None and _kind(files[0]) != "video":
-        frames = len(PictureSequence(source))
-        raise ValueError(f"--at {asked.at}: pictures have no times; give their numbers, --frames with some of 0 to {frames - 1}")
+    source = source_of(paths)
+    if fps is None:
+        _check_moments(paths, source, asked)
     few = None if numbers or moments or asked.every else views or SceneOptions().several
     return track_scene(source, frames=numbers, at=moments, every=asked.every, views=few, missing=missing, fps=fps)
+
+
+def follow_whole(paths: Sequence[Path], asked: Asked) -> SceneTracks:
+    """Points of a whole video or of all pictures, from where they appear to where they are lost.
+
+    Raises:
+        ValueError: flags that make no sense, or as :func:`indexing.video.track_whole`.
+    """
+    from indexing.video.whole import track_whole
+
+    span = asked.span()
+    numbers, moments = _spanned(*span) if span else asked.numbers(), asked.moments()
+    for flag, given in (("frames", numbers), ("at", moments)):
+        if given is not None and len(given) < 2:
+            raise ValueError(f"--{flag} {getattr(asked, flag)}: {len(given)} given, at least 2 are needed")
+    source = source_of(paths)
+    _check_moments(paths, source, asked)
+    return track_whole(source, frames=numbers, at=moments, every=asked.every)
+
+
+def _spanned(first: int, last: int) -> list[int]:
+    """Frames from the first to the last, of many every so many, as of a whole video."""
+    from indexing.video.options import SceneOptions
+
+    return list(range(first, last + 1, -(-(last + 1 - first) // SceneOptions().most)))
+
+
+def source_of(paths: Sequence[Path]) -> Any:
+    """A video, a folder or a pattern; or pictures in the order of their numbers."""
+    from indexing.video.sequence import in_order
+
+    files = [path.expanduser() for path in paths]
+    return files[0] if len(files) == 1 else in_order(files)
+
+
+def _check_moments(paths: Sequence[Path], source: Any, asked: Asked) -> None:
+    """Raise where moments of pictures are asked for."""
+    from indexing.video.sequence import PictureSequence
+
+    if asked.at is not None and _kind(paths[0].expanduser()) != "video":
+        frames = len(PictureSequence(source))
+        raise ValueError(f"--at {asked.at}: pictures have no times; give their numbers, --frames with some of 0 to {frames - 1}")
 
 
 def inputs_of(paths: Sequence[Path]) -> list[Path]:
@@ -146,14 +196,15 @@ def inputs_of(paths: Sequence[Path]) -> list[Path]:
 
 
 def photographs(tracks: SceneTracks) -> list[Photograph]:
-    """The frames taken, to draw on."""
+    """The frames taken, to draw on, or those of them that were kept."""
     import numpy as np
 
     from indexing.readers.pairs import Photograph
 
     size = (float(tracks.size[0]), float(tracks.size[1]))
+    kept = tracks.frames if tracks.pictured is None else [tracks.frames[i] for i in tracks.pictured]
     gray = [np.divide(image, 255, dtype=np.float32) for image in tracks.pictures]
-    return [Photograph(f"frame {k}", image, size) for k, image in zip(tracks.frames, gray, strict=True)]
+    return [Photograph(f"frame {k}", image, size) for k, image in zip(kept, gray, strict=True)]
 
 
 def named(tracks: SceneTracks) -> tuple[str, ...]:

@@ -26,7 +26,7 @@ KEYS = "give x1 and x2 (n, 2), and perhaps label, weights, ids, wh; of several p
 EXTRA = {"label": KNOWN, "weights": points.WEIGHTS, "ids": ("ids", "id"), "wh": ("wh", "size")}
 MOST = 2**31  # labels
 TRACKS = ("y", "tracks")  # (frames, n, 2), as of Hopkins 155
-FRAMES = "it seems to hold tracks (frames, n, 2): save two frames as matches, numpy.savez('m.npz', x1=tracks[0], x2=tracks[-1])"
+FRAMES = "it seems to hold tracks (frames, n, 2): leave --pair out, or say which with --key"
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from indexing.opening import VALUE, Row, check_dense, clipped, error, head_of, is_regular, listed, shown, size_of
 from indexing.readers.matches import open_points
-from indexing.readers.npz import NumpyArchive
+from indexing.readers.npz import NumpyArchive, read_npy
 from indexing.readers.points import (
     IDS,
     STATIC,
@@ -48,6 +48,7 @@ class TrackSet:
         notes: what a reader should know, a sentence each.
         by_time: whether the views are named by their times.
         start: the time from which ``times`` count, in full: that of the first view where they begin at 0.
+        known: ``(n,)`` known labels, 0 outlier, 1.. the bodies; None = not known.
     """
 
     path: str
@@ -60,6 +61,7 @@ class TrackSet:
     notes: tuple[str, ...] = field(default=())
     by_time: bool = False
     start: float = 0.0
+    known: NDArray[np.int64] | None = None
 
     def since_first(self) -> TrackSet:
         """The same with times that begin at 0; views that are named by their times are named by the new ones.
@@ -111,6 +113,7 @@ class TrackSet:
             ids=tuple(name for name, keep in zip(self.ids, kept, strict=True) if keep),
             weights=None if self.weights is None else self.weights[:, kept],
             static=None if self.static is None else self.static[kept],
+            known=None if self.known is None else self.known[kept],
             notes=(*self.notes, said),
         )
 
@@ -290,6 +293,8 @@ def _static(path: Path, rows: Sequence[Row], names: Sequence[str], columns: IntA
 
 KEYS = "give 'tracks' (views, n, 2 or 3) or 'y' (frames, points, 2), and perhaps 'times', 'ids', 'static', 'weights'"
 EXTRA = ("times", "ids", "static", "weights")
+VISIBLE = ("vis", "visible", "visibility")
+KNOWN = ("label", "labels", "s")  # the last one as in the files of Hopkins 155
 
 
 def read_arrays(path: Path, key: str | None) -> TrackSet:
@@ -310,9 +315,28 @@ def read_arrays(path: Path, key: str | None) -> TrackSet:
             raise error(path, f"{kind} has shape {extra[kind].shape}, {name} has {values.shape}", f"expected {shape}")
     ids = tuple(map(str, extra["ids"].tolist())) if "ids" in extra else numbered(n)
     return TrackSet(
-        str(path), flat.reshape(values.shape), ids, tuple(map(str, range(views))), _reals(path, extra, "times"),
+        str(path), _hidden(archive, before, flat.reshape(values.shape)), ids, tuple(map(str, range(views))),
+        _reals(path, extra, "times"),
         _reals(path, extra, "weights", 0.0), None if "static" not in extra else extra["static"].astype(bool),
+        known=_known(archive, before, n),
     )  # fmt: skip
+
+
+def _hidden(archive: NumpyArchive, before: str, values: FloatArray) -> FloatArray:
+    """The same, NaN where the file says that a point is not visible."""
+    for name in (before + kind for kind in VISIBLE):
+        if name in archive and archive[name].shape == values.shape[:2]:
+            return np.where((archive[name] != 0)[..., None], values, np.nan)
+    return values
+
+
+def _known(archive: NumpyArchive, before: str, count: int) -> NDArray[np.int64] | None:
+    """Labels of the tracks, where the file has some that can be meant."""
+    for name in (before + kind for kind in KNOWN):
+        labels = archive[name] if name in archive else np.zeros(0)
+        if labels.shape == (count,) and labels.dtype.kind in "iub" and (labels >= 0).all():
+            return np.asarray(labels, dtype=np.int64)
+    return None
 
 
 def _chosen(path: Path, names: list[str], key: str | None) -> tuple[str, str]:
@@ -407,6 +431,20 @@ def _read(files: Sequence[Path], key: str | None) -> TrackSet:
     if len(views) == 1:
         raise error(views[0].path, "holds the points of one view", FORMATS)
     return _joined(views)
+
+
+def holds_tracks(path: Path) -> bool:
+    """Whether a file is one of tracks through frames, rather than of matches; False where it cannot be read."""
+    start = _start(path)
+    try:
+        if start.startswith(b"PK"):
+            names = [name.rpartition("/")[2] for name in NumpyArchive(path)]
+            return "x1" not in names and bool({"tracks", "y"} & set(names))
+        if start.startswith(b"\x93NUMPY"):
+            return read_npy(path).ndim == 3
+        return _is_text(path) and is_long(heading(path))
+    except ValueError:
+        return False
 
 
 def _start(path: Path) -> bytes:

@@ -156,6 +156,7 @@ def write_segmentation(folder: str | Path, report: SegmentationReport) -> Path:
             "segmentation.npz": as_npz(report),
             "segmentation.json": as_json(report),
             "tracks.csv": None,
+            "segmentation.mp4": None,
             **report.besides,
             "report.html": html,
         },
@@ -349,11 +350,11 @@ def _draw_ways(panel: Any, paths: FloatArray, label: int, box: Box) -> None:
 
 
 def _draw_points(panel: Any, points: FloatArray, label: int, size: float, theme: Theme) -> None:
-    look: Any = {"marker": _mark_of(label), "edgecolor": theme.paper, "linewidth": 0.4}
+    look: Any = {"marker": mark_of(label), "edgecolor": theme.paper, "linewidth": 0.4}
     panel.scatter(*points.T, s=size, c=colour_of(label), zorder=4, **look)
 
 
-def _mark_of(label: int) -> str:
+def mark_of(label: int) -> str:
     return MARKS[(label - 1) // len(COLOURS) % len(MARKS)]
 
 
@@ -364,7 +365,7 @@ def _handles(report: SegmentationReport, theme: Theme) -> list[Any]:
     counts, found = report.counts, []
     for label, model in enumerate(report.models, start=1):
         text = f"body {label}: {counts[f'body {label}']:,}" + " (homography)" * (model == "homography")
-        found.append(Line2D([], [], color=colour_of(label), marker=_mark_of(label), linestyle="", markersize=5.5, label=text))
+        found.append(Line2D([], [], color=colour_of(label), marker=mark_of(label), linestyle="", markersize=5.5, label=text))
     if counts["outlier"]:
         noun = "outlier" if report.bodies else "unlabelled"
         text = f"{counts['outlier']:,} {noun}{'s' * (report.bodies > 0 and counts['outlier'] > 1)}"

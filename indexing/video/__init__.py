@@ -20,3 +20,4 @@ from indexing.video.scene import track_scene as track_scene
 from indexing.video.sequence import PictureSequence as PictureSequence
 from indexing.video.tracks import Tracks as Tracks
 from indexing.video.tracks import track_points as track_points
+from indexing.video.whole import track_whole as track_whole

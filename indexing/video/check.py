@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Iterator
-from fractions import Fraction
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -15,7 +13,8 @@ from numpy.typing import NDArray
 from indexing.clip import Clip
 from indexing.files import write_bytes
 from indexing.skeleton import known
-from indexing.video.reading import av, cv2, read_video
+from indexing.video.overlay import encoded
+from indexing.video.reading import cv2, read_video
 
 Image = NDArray[np.uint8]
 
@@ -83,7 +82,7 @@ def write_check_video(
     moments = start + np.arange(1 + math.floor((stop - start) * rate + 1e-6)) / rate
     pictures = zip(left.shown(moments), right.shown(np.asarray(shift.at(moments), np.float64)), strict=True)
     frames = (_compose(*pair, names) for pair in pictures)
-    return write_bytes(path, _encoded(frames, rate))
+    return write_bytes(path, encoded(frames, rate))
 
 
 class _Film:
@@ -162,23 +161,6 @@ def _compose(left: tuple[Image, float], right: tuple[Image, float], names: tuple
         panels.append(np.concatenate([strip, image]))
     gap = np.full((panels[0].shape[0], 4, 3), INK, np.uint8)
     return np.concatenate([panels[0], gap, panels[1]], axis=1)
-
-
-def _encoded(frames: Iterator[Image], fps: float) -> bytes:
-    """An MP4 file of RGB frames."""
-    codec, options = (
-        ("libx264", {"crf": "23", "preset": "veryfast"}) if "libx264" in av().codecs_available else ("mpeg4", {"qscale": "4"})
-    )
-    data = io.BytesIO()
-    with av().open(data, "w", format="mp4") as container:
-        stream = container.add_stream(codec, rate=Fraction(fps).limit_denominator(1001), options=options)
-        stream.pix_fmt = "yuv420p"
-        for i, frame in enumerate(frames):
-            if i == 0:
-                stream.height, stream.width = frame.shape[:2]
-            container.mux(stream.encode(av().VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")))
-        container.mux(stream.encode())
-    return data.getvalue()
 
 
 def _even(pixels: float) -> int:

@@ -102,6 +102,18 @@ class SceneOptions:
     the edges of what moves drag them along."""
     anchors: int = 24
     """Pictures taken up to which that is done: it costs their number squared."""
+    most: int = 200
+    """Pictures taken at most where a whole video is followed and nobody says which."""
+    tracks: int = 3000
+    """Points kept at most of a whole video."""
+    brief: int = 5
+    """Pictures taken that must show a point of a whole video; half of them where there are fewer than twice as many."""
+    span: int = 16
+    """Pictures of a whole video after which a point is compared with a newer one: its first one is too unlike by then.  Share of
+    the points of a rendered room of 90 pictures that end more than 3 pixels off: without a comparison .14, with spans of
+    8 / 16 / 24 pictures .039 / .030 / .024."""
+    kept: int = 4
+    """Pictures of a whole video that are kept, to draw on."""
     fewest: int = 12
     """Points that must be there in two pictures."""
     rest: float = 1.0

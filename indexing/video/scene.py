@@ -18,7 +18,8 @@ from indexing.video.reading import Chunk, Source, cv2
 from indexing.video.sequence import PictureSequence, chunks
 from indexing.video.tracks import Book
 
-Images = list[NDArray[np.uint8]]
+Picture = NDArray[np.uint8]
+Images = list[Picture]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -33,6 +34,7 @@ class SceneTracks:
         size: width and height of the video as shown.
         pictures: gray values of the pictures, each ``(h, w)`` uint8, at the size at which points were followed.
         notes: what a user should know; first, which frames were taken and why.
+        pictured: places in ``frames`` of those that ``pictures`` holds; None = all.
     """
 
     points: Tensor
@@ -42,6 +44,7 @@ class SceneTracks:
     size: tuple[int, int]
     pictures: tuple[NDArray[np.uint8], ...]
     notes: tuple[str, ...]
+    pictured: tuple[int, ...] | None = None
 
     def __repr__(self) -> str:
         views, count = self.points.shape[:2]
@@ -97,31 +100,31 @@ def track_scene(
         ((0, 19), [-38.0, 0.0])
     """
     check_options(options, SceneOptions)
-    wanted = _Wanted.of(frames, at, every, views, options)
+    wanted = Wanted.of(frames, at, every, views, options)
     stream = chunks(source, size=options.follow.working, fps=fps)
     if iter(stream) is stream:
         raise ValueError("track_scene: chunks that can be read only once, and two passes are needed; give a list of them")
     book, times, first, why = _follow(stream, wanted, options)
-    taken = wanted.taken(times, first, _name(source))
+    taken = wanted.taken(times, first, name_of(source))
     pictures = _pictures(stream, taken)
     scale = getattr(stream, "scale", (1.0, 1.0))
     least = max(2, round(options.present * len(taken))) if missing else len(taken)
     positions = _seen(_anchored(_at(book, [k - first for k in taken]), pictures, options), least)
     shape = pictures[0].shape
     shown = (round(shape[1] / scale[0]), round(shape[0] / scale[1]))
-    _check(positions, taken, _name(source), options)
+    check(positions, taken, name_of(source), options)
     points = transform(np.asarray(np.linalg.inv(shrinking(scale)), np.float64), positions)
     moments = np.array([times[k] for k in taken])
     known = isinstance(stream, PictureSequence) and stream.fps is None
-    notes = [_said(taken, moments, len(times), known) + why, *getattr(stream, "notes", ())]
+    notes = [frames_said(taken, moments, len(times), known) + why, *getattr(stream, "notes", ())]
     return SceneTracks(
         torch.from_numpy(points), torch.from_numpy(moments), tuple(taken), len(times), shown, tuple(pictures), tuple(notes)
     )
 
 
 @dataclass(frozen=True)
-class _Wanted:
-    """Which frames are asked for."""
+class Wanted:
+    """Which frames are asked for: by number, by moment, every so many, or how many of all."""
 
     frames: tuple[int, ...] | None
     at: tuple[float, ...] | None
@@ -131,7 +134,7 @@ class _Wanted:
     @staticmethod
     def of(
         frames: Sequence[int] | None, at: Sequence[float] | None, every: int | None, views: int | None, options: SceneOptions
-    ) -> _Wanted:
+    ) -> Wanted:
         if sum(given is not None for given in (frames, at, every, views)) > 1:
             raise ValueError("track_scene: frames, at, every and views each say which frames to take; give one of them")
         for name, given in (("frames", frames), ("at", at)):
@@ -141,7 +144,7 @@ class _Wanted:
             raise ValueError(f"track_scene: every must be a whole number from 1, got {every!r}")
         if views is not None and views < 2:
             raise ValueError(f"track_scene: views must be at least 2, got {views!r}")
-        return _Wanted(None if frames is None else tuple(frames), None if at is None else tuple(at), every, views or options.views)
+        return Wanted(None if frames is None else tuple(frames), None if at is None else tuple(at), every, views or options.views)
 
     def begins(self, index: int, time: float) -> bool:
         """Whether the first frame of interest is this one or an earlier one."""
@@ -153,15 +156,25 @@ class _Wanted:
             return index >= self.frames[-1]
         return self.at is not None and time >= self.at[-1] - 1e-6
 
+    @staticmethod
+    def enough(times: list[float], name: str) -> int:
+        """How many frames were read.
+
+        Raises:
+            ValueError: fewer than two.
+        """
+        count = len(times)
+        if count < 2:
+            raise ValueError(f"{name}: has {count} frame{'s' * (count != 1)}, and motion needs at least 2; give a longer video")
+        return count
+
     def taken(self, times: list[float], first: int, name: str) -> list[int]:
         """Numbers of the frames that are taken, of those that were read, ``first`` being the first that was followed.
 
         Raises:
             ValueError: there are no such frames.
         """
-        count = len(times)
-        if count < 2:
-            raise ValueError(f"{name}: has {count} frame{'s' * (count != 1)}, and motion needs at least 2; give a longer video")
+        count = self.enough(times, name)
         if self.frames is not None:
             lost = next((k for k in self.frames if k >= count), None)
             if lost is not None:
@@ -186,7 +199,7 @@ class _Wanted:
         return [int(k) for k in np.linspace(0, count - 1, self.views).round()]
 
 
-def _follow(stream: Iterable[Chunk], wanted: _Wanted, options: SceneOptions) -> tuple[Book, list[float], int, str]:
+def _follow(stream: Iterable[Chunk], wanted: Wanted, options: SceneOptions) -> tuple[Book, list[float], int, str]:
     """All points through the frames of interest, the times of all frames, the first one followed, and why it ended early."""
     book, first, why = Book(options.count, options.follow), -1, ""
     times: list[float] = []
@@ -253,24 +266,27 @@ def _anchored(positions: Floats, pictures: Images, options: SceneOptions) -> Flo
         return positions
     seen = np.isfinite(positions[..., 0])
     first = seen.argmax(axis=0)
-    how = {"winSize": options.follow.patch, "maxLevel": 1, "criteria": (3, 30, 0.003), "flags": cv2().OPTFLOW_USE_INITIAL_FLOW}
     out = positions.copy()
     for j in np.unique(first).tolist():
         for k in range(j + 1, views):
             rows = np.flatnonzero((first == j) & seen[k])
-            if not len(rows):
-                continue
-            here, there = (np.ascontiguousarray(positions[v, rows], np.float32) for v in (j, k))
-            moved, ok, _ = cv2().calcOpticalFlowPyrLK(pictures[j], pictures[k], here, there.copy(), **how)
-            back, ok_back, _ = cv2().calcOpticalFlowPyrLK(pictures[k], pictures[j], moved, here.copy(), **how)
-            good = (ok.ravel() > 0) & (ok_back.ravel() > 0)
-            good &= np.linalg.norm(back - here, axis=1) < options.follow.back
-            good &= np.linalg.norm(moved - there, axis=1) < options.anchored
-            out[k, rows] = np.where(good[:, None], moved, np.nan)
+            if len(rows):
+                out[k, rows] = matched(pictures[j], pictures[k], positions[j, rows], positions[k, rows], options)
     return out
 
 
-def _check(positions: Floats, taken: list[int], name: str, options: SceneOptions) -> None:
+def matched(before: Picture, after: Picture, here: Floats, there: Floats, options: SceneOptions) -> Floats:
+    """Where points ``here (n, 2)`` of one picture are in another, near ``there``; NaN where that is not so, there and back."""
+    how = {"winSize": options.follow.patch, "maxLevel": 1, "criteria": (3, 30, 0.003), "flags": cv2().OPTFLOW_USE_INITIAL_FLOW}
+    origin, goal = (np.ascontiguousarray(points, np.float32) for points in (here, there))
+    moved, ok, _ = cv2().calcOpticalFlowPyrLK(before, after, origin, goal.copy(), **how)
+    back, ok_back, _ = cv2().calcOpticalFlowPyrLK(after, before, moved, origin.copy(), **how)
+    good = (ok.ravel() > 0) & (ok_back.ravel() > 0) & (np.linalg.norm(back - origin, axis=1) < options.follow.back)
+    good &= np.linalg.norm(moved - goal, axis=1) < options.anchored
+    return np.where(good[:, None], moved, np.nan).astype(np.float64)
+
+
+def check(positions: Floats, taken: list[int], name: str, options: SceneOptions) -> None:
     """Raise where there is too little to tell anything from."""
     count = positions.shape[1]
     where = f"frames {', '.join(map(str, taken[:4]))}{', ...' * (len(taken) > 4)}"
@@ -285,7 +301,7 @@ def _check(positions: Floats, taken: list[int], name: str, options: SceneOptions
         raise ValueError(f"{said}; take frames further apart")
 
 
-def _said(taken: list[int], moments: Floats, total: int, untimed: bool) -> str:
+def frames_said(taken: list[int], moments: Floats, total: int, untimed: bool) -> str:
     """Which frames are taken."""
     steps = np.diff(taken)
     if len(taken) > 4 and (steps == steps[0]).all():
@@ -296,7 +312,7 @@ def _said(taken: list[int], moments: Floats, total: int, untimed: bool) -> str:
     return f"frames {which} of the {total} that were read{spans}"
 
 
-def _name(source: object) -> str:
+def name_of(source: object) -> str:
     if isinstance(source, (str, Path)):
         return str(source)
     if isinstance(source, Sequence) and source and isinstance(source[0], (str, Path)):

@@ -216,10 +216,14 @@ class Book:
                 same = (looks * self.looks).sum(1) > self.options.same
                 self.looks = looks
                 self._keep(same)
-        for key, position in zip(self.ids.tolist(), self.alive, strict=True):
-            self.histories[key][1].append(position)
+        self._write()
         if self.frame % self.options.renew == 0:
             self._replace(image)
+
+    def _write(self) -> None:
+        """Where all points are now."""
+        for key, position in zip(self.ids.tolist(), self.alive, strict=True):
+            self.histories[key][1].append(position)
 
     def _replace(self, image: NDArray[np.uint8]) -> None:
         """New points where there are none."""
@@ -238,10 +242,14 @@ class Book:
         found = found.reshape(-1, 2)
         ids = np.arange(self.next, self.next + len(found))
         self.next += len(found)
-        for key, position in zip(ids.tolist(), found, strict=True):
-            self.histories[key] = (self.frame, [position])
+        self._begin(ids, found)
         self.alive, self.ids = np.r_[self.alive, found], np.r_[self.ids, ids]
         self.looks = np.r_[self.looks, patches(image, found, options=self.options)]
+
+    def _begin(self, ids: NDArray[np.int_], found: NDArray[np.float32]) -> None:
+        """The histories of new points."""
+        for key, position in zip(ids.tolist(), found, strict=True):
+            self.histories[key] = (self.frame, [position])
 
     def _keep(self, good: NDArray[np.bool_]) -> None:
         self._finish(self.ids[~good])

@@ -13,7 +13,7 @@ from dyntorch.geometry.homogeneous import skew, unit
 from dyntorch.tasks.segment.labels import choose
 from dyntorch.tasks.segment_tracks.descent import Geometry, TrackEvidence
 from dyntorch.tasks.segment_tracks.frames import Film, FramePair
-from dyntorch.tasks.segment_tracks.options import OutlierOptions, StaticOptions, TrackSegmentOptions
+from dyntorch.tasks.segment_tracks.options import StaticOptions, StrayOptions, TrackSegmentOptions
 
 
 def distances(pairs: Sequence[FramePair], geometry: Geometry, count: int) -> Tensor:
@@ -28,7 +28,7 @@ def distances(pairs: Sequence[FramePair], geometry: Geometry, count: int) -> Ten
     return found
 
 
-def outliers(distance: Tensor, labels: Tensor, support: Tensor, options: OutlierOptions) -> Tensor:
+def outliers(distance: Tensor, labels: Tensor, support: Tensor, options: StrayOptions) -> Tensor:
     """``(n,)`` bool: tracks that are usually farther from their body than a track of it may be.
 
     Args:
@@ -43,7 +43,7 @@ def outliers(distance: Tensor, labels: Tensor, support: Tensor, options: Outlier
 
 
 @dataclass(frozen=True)
-class Motions:
+class BodyMotions:
     """Of K bodies between the frames of P pairs, in the coordinates of the input: F and H ``(P, K, 3, 3)``, planar ``(P, K)``."""
 
     fundamentals: Tensor
@@ -51,7 +51,7 @@ class Motions:
     planar: Tensor
 
 
-def motions(evidence: TrackEvidence, geometry: Geometry, member: Tensor, film: Film, options: TrackSegmentOptions) -> Motions:
+def motions(evidence: TrackEvidence, geometry: Geometry, member: Tensor, film: Film, options: TrackSegmentOptions) -> BodyMotions:
     """With members ``(K, n)``, 0 or 1; 0 where two frames have too few of them in common."""
     back = torch.linalg.inv(film.change)
     fundamentals, homographies, planar = [], [], []
@@ -63,7 +63,7 @@ def motions(evidence: TrackEvidence, geometry: Geometry, member: Tensor, film: F
         fundamentals.append(torch.where(there[:, None, None], unit(film.change.mT @ F[0] @ film.change), 0.0))
         homographies.append(torch.where(flat[:, None, None], unit(back @ models.homographies @ film.change), 0.0))
         planar.append(flat)
-    return Motions(torch.stack(fundamentals), torch.stack(homographies), torch.stack(planar))
+    return BodyMotions(torch.stack(fundamentals), torch.stack(homographies), torch.stack(planar))
 
 
 def widths(film: Film, member: Tensor, options: StaticOptions) -> Tensor:

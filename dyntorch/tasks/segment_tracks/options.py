@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from dyntorch.tasks.segment.options import SegmentOptions
+from dyntorch.tasks.segment.options import EnergyOptions, SegmentOptions
 
 
 @dataclass(frozen=True)
@@ -42,6 +42,8 @@ class PreferenceOptions:
     """Frames between those of a pair."""
     starts: int = 20
     """Pairs of frames of each gap, in a video as long as its tracks; longer ones have more."""
+    common: int = 16
+    """Tracks that both frames of such a pair must show."""
     hypotheses: int = 200
     """Of each kind, for a pair of frames: affine maps of three tracks, homographies of four, fundamental matrices of eight."""
     preferred: float = 0.1
@@ -142,7 +144,7 @@ class ChoiceOptions:
 
 
 @dataclass(frozen=True)
-class OutlierOptions:
+class StrayOptions:
     """Which tracks belong to no body."""
 
     farthest: float = 2.5
@@ -178,7 +180,8 @@ class TrackSegmentOptions:
     merge: MergeOptions = MergeOptions()
     descent: TrackDescentOptions = TrackDescentOptions()
     choice: ChoiceOptions = ChoiceOptions()
-    outliers: OutlierOptions = OutlierOptions()
+    outliers: StrayOptions = StrayOptions()
     static: StaticOptions = StaticOptions()
-    views: SegmentOptions = SegmentOptions()
-    """What two views show: parallax, and whether a body is a plane."""
+    views: SegmentOptions = SegmentOptions(energy=EnergyOptions(parallax_scale=0.5))
+    """What two views show: parallax, and whether a body is a plane.  Tracks are measured finely: before a camera that stands, what
+    moves would else pass for relief of what rests."""

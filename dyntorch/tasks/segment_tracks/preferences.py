@@ -19,8 +19,6 @@ from dyntorch.tasks.segment.coherence import Links
 from dyntorch.tasks.segment_tracks.frames import Film, FramePair, pairs_near
 from dyntorch.tasks.segment_tracks.options import FrameOptions, PreferenceOptions
 
-SAMPLE = 8
-"""Tracks of a hypothesis: three of them give an affine map, four a homography, all of them a fundamental matrix."""
 TINY = 1e-12
 
 
@@ -47,11 +45,11 @@ def preference_kernel(
     place[searched] = torch.arange(len(searched), device=searched.device)
     kernel = torch.zeros(count, len(searched), device=searched.device)
     met = torch.zeros_like(kernel)
-    for pair in pairs_near(film, options.gaps, options.starts, 2 * SAMPLE):
+    for pair in pairs_near(film, options.gaps, options.starts, options.common):
         both = film.pair(pair, frames)
         column = place[both.index]
         own = (column >= 0).nonzero().flatten()
-        if len(own) < 2 * SAMPLE:
+        if len(own) < options.common:
             continue
         liked = _preferred(both, own, generator, options)
         shared = liked @ liked[own].mT
@@ -66,6 +64,7 @@ def preference_kernel(
 def _preferred(both: FramePair, own: Tensor, generator: torch.Generator | None, options: PreferenceOptions) -> Tensor:
     """``(m, 3 h)`` 1 for what a track prefers, else 0, over the root of the number of preferences."""
     x1, x2 = both.view.x1, both.view.x2
+    # three of eight tracks give an affine map, four a homography, all of them a fundamental matrix
     sample = own[_samples(x1[own], generator, options)]
     a, b = x1[sample], x2[sample]
     squares = [
@@ -89,7 +88,7 @@ def _samples(x: Tensor, generator: torch.Generator | None, options: PreferenceOp
     noise = -(-uniform(number, count, generator=generator, device=x.device).clamp(min=1e-300).log()).log()
     chance = noise - torch.cdist(x[seed], x).square() / (2 * radius.square()).clamp(min=TINY)
     chance.scatter_(1, seed[:, None], torch.inf)
-    return chance.topk(SAMPLE, dim=-1).indices
+    return chance.topk(8, dim=-1).indices
 
 
 def affine_map(x1: Tensor, x2: Tensor) -> Tensor:

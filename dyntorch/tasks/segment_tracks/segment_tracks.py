@@ -15,17 +15,15 @@ from dyntorch.geometry.pairs import order_of_bodies
 from dyntorch.numerics.arguments import check_options, check_threshold, on_cpu
 from dyntorch.numerics.blocks import one_thread, uniform
 from dyntorch.tasks.segment.search import one_hot
+from dyntorch.tasks.segment.segment import MINIMAL
 from dyntorch.tasks.segment_tracks.choosing import Chosen, Start, bodies_of
 from dyntorch.tasks.segment_tracks.descent import Candidates, TrackEvidence, costs, unlinked
 from dyntorch.tasks.segment_tracks.frames import Film, FramePair, chosen_pairs, cut_of, pairs_near
 from dyntorch.tasks.segment_tracks.labels import agreeing, distances, motions, outliers, resting
 from dyntorch.tasks.segment_tracks.merging import Judge, NearPairs, pieces
 from dyntorch.tasks.segment_tracks.options import TrackSegmentOptions
-from dyntorch.tasks.segment_tracks.preferences import SAMPLE, links_of, preference_kernel, strongest
+from dyntorch.tasks.segment_tracks.preferences import links_of, preference_kernel, strongest
 from dyntorch.tasks.segment_tracks.result import TrackNotice, TrackSegmentation
-
-MINIMAL = 8
-"""Fewest tracks: seven determine a fundamental matrix, and one has to agree with it."""
 
 
 @dataclass(frozen=True)
@@ -195,9 +193,8 @@ def _start(film: Film, frames: Sequence[tuple[int, int]], kernel: Tensor, search
     sparse = strongest(inner, options.preferences.neighbours)
     pairs = [part.pair(pair, options.frames) for pair in frames]
     evidence = TrackEvidence.of(pairs, links_of(sparse, options.preferences.cut))
-    near = NearPairs(
-        part, pairs_near(part, options.merge.gaps, options.merge.starts, 2 * SAMPLE) or frames, options.frames, options.merge.cap
-    )
+    beside = pairs_near(part, options.merge.gaps, options.merge.starts, options.preferences.common)
+    near = NearPairs(part, beside or frames, options.frames, options.merge.cap)
     least, most = request.bodies or 1, max(1, len(searched) // options.merge.members)
     cuts = [pieces(sparse, max(min(number, most), min(least, most))) for number in options.merge.pieces]
     judge = Judge.of(near, inner, one_hot(cuts[0], int(cuts[0].max()) + 1) > 0, options.merge)

@@ -13,7 +13,7 @@ import torch
 
 from indexing.actors.sheets import render, sheet
 from indexing.cli import main
-from indexing.video import check
+from indexing.video.overlay import encoded
 
 SIZE, FRAMES = (240, 180), 10
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated")
@@ -37,7 +37,7 @@ def data(tmp_path_factory):
         cv2.imwrite(str(folder / "wall" / f"f{i}.png"), frame)
     for name, frames in (("wall", video.frames), ("still", video.frames[[0] * 4]), ("one", video.frames[:1])):
         colour = (np.repeat(frame[..., None], 3, axis=2) for frame in frames)
-        (folder / f"{name}.mp4").write_bytes(check._encoded(colour, 25))
+        (folder / f"{name}.mp4").write_bytes(encoded(colour, 25))
     (folder / "text.mp4").write_text("no video")
     (folder / "none").mkdir()
     np.savez(folder / "m.npz", x1=np.zeros((9, 2)), x2=np.zeros((9, 2)))
@@ -111,11 +111,18 @@ BAD = {
     "align @/wall --at 0,1,2": "--at 0,1,2: pictures have no times",
     "align @/wall.mp4 --model rigid": "--model rigid needs 3D points or lines, and a video has 2D points",
     "align @/wall.mp4 @/m.npz": "wall.mp4: is a video, and 2 inputs are given",
-    "segment @/wall.mp4 --frames 0,4,9": "--frames 0,4,9: 3 given, 2 are needed",
+    "segment @/wall.mp4 --frames 4": "--frames 4: 1 given, at least 2 are needed",
+    "segment @/wall.mp4 --frames 0,4,90": "wall.mp4: has no frame 90; its 10 frames are 0 to 9",
+    "segment @/wall.mp4 --every 30": "so every 30 is one frame",
+    "segment @/wall.mp4 --no-spatial": "--no-spatial is of two images, and more frames are given",
+    "segment @/wall.mp4 --key a": "--key is of files of tracks",
+    "segment @/wall --at 0,1,2": "--at 0,1,2: pictures have no times",
+    "segment @/still.mp4": "still.mp4: nothing moves:",
+    "segment @/one.mp4": "one.mp4: has 1 frame, and motion needs at least 2",
     "segment @/m.npz --at 0,1": "--at 0,1: it is for a video or a sequence of pictures",
     "segment @/m.npz --frames 0,1": "--frames 0,1: it is for a video or a sequence of pictures",
     "segment @/wall.mp4 --pair a": "--pair is of files of matches",
-    "segment": "no matches; give a file with x1, x2, or a video",
+    "segment": "no input; give a video, a file of tracks, or a file of matches with x1, x2",
     "reconstruct @/wall.mp4 --every 0": "--every must be a whole number from 1, got 0",
     "reconstruct @/wall.mp4 --every 30": "so every 30 is one frame",
     "reconstruct @/wall.mp4 --fps 25": "--fps 25: a video has the times of its frames",

@@ -236,7 +236,7 @@ def test_a_doubtful_result_is_shown_and_refused(run, solved, monkeypatch):
 @pytest.mark.parametrize(
     ("line", "says"),
     [
-        ("", "no matches; give a file with x1, x2, or a video"),
+        ("", "no input; give a video, a file of tracks, or a file of matches with x1, x2"),
         ("no.npz", "no.npz: no such file; check the path"),
         ("@/", "small.png: has 200 x 200 pixels, left.png 640 x 480; pictures of one sequence"),
         ("@/left.png", "left.png: has 1 frame, and motion needs at least 2"),
@@ -246,7 +246,11 @@ def test_a_doubtful_result_is_shown_and_refused(run, solved, monkeypatch):
         ("@/m.npz --seed -1", "--seed must be a whole number"),
         ("@/m.npz --size 0 480", "--size must be width and height in pixels"),
         ("@/m.npz --size 640 480 --images @/left.png @/right.jpg", "--size and --images both say"),
-        ("@/m.npz --images @/left.png", "see dyntorch segment --help"),
+        ("@/m.npz --images @/left.png", "--images: 1 is given, and matches are drawn on two; give both images"),
+        ("@/m.npz --images", "--images: its value is missing"),
+        ("@/m.npz @/m.csv", "2 files; give one file of tracks or of matches, or pictures alone"),
+        ("@/m.npz --key desk", "m.npz: has no array 'desk'"),
+        ("@/m.npz --every 2", "--every 2: it is for a video"),
         ("@/m.npz --images @/left.png no.png", "no.png: no such file; give an image"),
         ("@/m.npz --images @/m.csv @/left.png", "m.csv: cannot be read as an image"),
         ("@/m.npz --pair desk", "m.npz: has no pair 'desk'; it holds one pair: leave --pair out"),
@@ -255,6 +259,11 @@ def test_a_doubtful_result_is_shown_and_refused(run, solved, monkeypatch):
         ("@/several.npz --pair chair", "several.npz: has no pair 'chair'; its pairs are desk, shelf"),
         ("@/several.npz --pair shelf", "several.npz: has no shelf/x2 (its arrays are desk/x1"),
         ("@/m.npz --out @/m.npz", "is a file; choose another folder"),
+        ("@/m.npz --masks masks", "--masks masks: it is for --colmap DATABASE; leave it out"),
+        ("@/m.npz --colmap a.db --out b.db", "m.npz: --colmap a.db gives the matches; leave one out"),
+        ("--colmap a.db --out b.db --frames 0,1", "--frames does not go with --colmap; leave it out"),
+        ("--colmap a.db --out b.db --bodies 2", "--bodies 2 does not go with --colmap"),
+        ("--colmap a.db --out b.db --images x y", "--images: 2 are given; with --colmap, give the folder of the images"),
     ],
 )
 def test_bad_input_is_one_line_and_code_2(run, solved, tmp_path, line, says):
@@ -277,6 +286,15 @@ def test_an_input_is_not_overwritten(run, data, solved):
     Path("labels.csv").write_text(before)
     code, _, err = run("labels.csv --out .")
     assert code == 2 and "labels.csv: is an input" in err and Path("labels.csv").read_text() == before
+
+
+def test_a_database_of_colmap_goes_its_own_way(run, monkeypatch):
+    jobs = []
+    monkeypatch.setattr("indexing.cli.colmap.run_colmap", lambda job, arguments: jobs.append((job, arguments)) or 3)
+    assert run("--colmap a.db --out b.db --images photos --masks m --threshold auto --no-spatial --seed 4 --title Yard")[0] == 3
+    (job, arguments), path = jobs[0], Path
+    assert (job.database, job.out, job.images, job.masks) == (path("a.db"), path("b.db"), path("photos"), path("m"))
+    assert (job.threshold, job.spatial, job.seed, job.title) == (None, False, 4, "Yard") and arguments["colmap"] == path("a.db")
 
 
 def test_help_loads_nothing_heavy():

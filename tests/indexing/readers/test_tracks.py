@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from indexing.readers.tracks import read_tracks
+from indexing.readers.tracks import holds_tracks, read_tracks
 
 NAN = float("nan")
 VALUES = np.array([[[1.0, 2.0], [3.0, 4.0]], [[5.0, 6.0], [NAN, NAN]], [[7.0, 8.0], [9.0, 1.0]]])
@@ -29,6 +29,32 @@ def test_a_table_with_frames_and_times(write):
     assert found.ids == ("p", "q") and found.views == ("10", "20", "30") and found.static is None and found.weights is None
     np.testing.assert_array_equal(found.values, VALUES)
     np.testing.assert_array_equal(found.times, [0, 0.5, 2])
+
+
+def test_what_an_archive_knows_besides(tmp_path):
+    seen = np.isfinite(VALUES).all(-1)
+    np.savez(tmp_path / "a.npz", **{"desk/y": np.nan_to_num(VALUES), "desk/vis": seen, "desk/s": np.array([2, 1], np.uint8)})
+    found = read_tracks([tmp_path / "a.npz"], key="desk")
+    np.testing.assert_array_equal(found.values, VALUES)
+    assert found.known.tolist() == [2, 1] and found.seen(3).known.tolist() == [2]
+    np.savez(tmp_path / "b.npz", tracks=VALUES, labels=np.array([0.5, 1]), visible=seen[:2])  # neither can be meant
+    found = read_tracks([tmp_path / "b.npz"])
+    assert found.known is None
+    np.testing.assert_array_equal(found.values, VALUES)
+
+
+def test_which_files_hold_tracks(write, tmp_path):
+    np.savez(tmp_path / "t.npz", tracks=VALUES)
+    np.savez(tmp_path / "several.npz", **{"desk/y": VALUES})
+    np.savez(tmp_path / "m.npz", x1=VALUES[0], x2=VALUES[1])
+    np.savez(tmp_path / "both.npz", **{"a/x1": VALUES[0], "a/y": VALUES})
+    np.save(tmp_path / "t.npy", VALUES)
+    np.save(tmp_path / "m.npy", np.zeros((9, 4)))
+    write("frame,id,x,y\n0,a,1,2\n", "t.csv")
+    write("x1,y1,x2,y2\n1,2,3,4\n", "m.csv")
+    write("PK broken", "broken.npz")
+    names = [path.name for path in sorted(tmp_path.iterdir()) if holds_tracks(path)]
+    assert names == ["several.npz", "t.csv", "t.npy", "t.npz"] and not holds_tracks(tmp_path / "no.csv")
 
 
 def test_times_alone_are_the_views_and_unsorted_rows_are_sorted(write):

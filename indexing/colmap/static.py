@@ -1,0 +1,209 @@
+"""Which matches of a COLMAP database stand still: its stages in order."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from indexing.archive.workers import InOrder
+from indexing.colmap.database import MatchDatabase, PairGeometry, write_database
+from indexing.colmap.dividing import PairBodies, SeenImage, chosen, divide, left_open, seen, task, verified
+from indexing.colmap.options import SpreadOptions, StaticOptions
+from indexing.colmap.voting import DividedPair, Votes, vote
+from indexing.opening import count, listed
+
+IntArray = NDArray[np.int64]
+Told = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class StaticPoints:
+    """What stands still in the images of a database.
+
+    Attributes:
+        database: what was read.
+        keypoints: for each image ``(n,)``: 1 stands still, -1 moves, 0 not known.
+        bodies: for each pair how it was divided.
+        signs: for each pair ``(K,)`` of its bodies: 1 static, -1 moving, 0 undecided.
+        kept: for each pair ``(k, 2)`` its static matches.
+        geometries: for each pair what COLMAP's estimation makes of them.
+        spread: ``(images,)`` in [0, 1] how far static keypoints spread over each image.
+        lead: spread of the static body over that of the next one.
+        refused: places of the images in which too little stands still.
+        reason: why there is no answer; empty where there is.
+        notes: what a reader should know, a sentence each.
+    """
+
+    database: MatchDatabase
+    keypoints: tuple[IntArray, ...]
+    bodies: tuple[PairBodies, ...]
+    signs: tuple[IntArray, ...]
+    kept: tuple[IntArray, ...]
+    geometries: tuple[PairGeometry, ...]
+    spread: NDArray[np.float64]
+    lead: float
+    refused: tuple[int, ...]
+    reason: str = ""
+    notes: tuple[str, ...] = ()
+
+    @property
+    def ok(self) -> bool:
+        """Whether there is an answer."""
+        return not self.reason
+
+    def check(self) -> StaticPoints:
+        """Itself.
+
+        Raises:
+            ValueError: there is no answer; the message names the images, and says what to do.
+        """
+        if self.reason:
+            raise ValueError(f"{self.database.path}: {self.reason}")
+        return self
+
+    def write(self, path: str | Path) -> Path:
+        """Write a copy of the database that holds static matches only; see :func:`indexing.colmap.database.write_database`.
+
+        Raises:
+            ValueError: there is no answer, or the file is there already or cannot be written.
+        """
+        self.check()
+        pairs = self.database.pairs
+        matches = {pair.key: kept for pair, kept in zip(pairs, self.kept, strict=True)}
+        geometries = {pair.key: found for pair, found in zip(pairs, self.geometries, strict=True)}
+        return write_database(self.database, path, matches, geometries)
+
+
+def find_static(
+    database: MatchDatabase,
+    threshold: float | None = 2.5,
+    spatial: bool = True,
+    seed: int = 0,
+    options: StaticOptions = StaticOptions(),
+    progress: Told | None = None,
+    executor: Executor | None = None,
+) -> StaticPoints:
+    """The matches of a COLMAP database that stand still, by what moves apart in its pairs of images.
+
+    Each pair is divided into bodies by itself (:func:`dyntorch.segment`), bodies of different pairs that share keypoints vote on
+    each other, and of the answers that are possible the one is taken whose points spread widest over all images, however many
+    matches the others have.  COLMAP's own estimation then verifies what is kept.
+
+    Args:
+        database: of :func:`indexing.colmap.read_database`.
+        threshold: of :func:`dyntorch.segment`, pixels; None estimates it for each pair.
+        spatial: whether bodies are regions of the images.
+        seed: of the random samples.
+        options: every number that decides, by stage.
+        progress: called with how many pairs are divided, and of how many.
+        executor: whoever divides pairs, anything with the interface of ``concurrent.futures``; None does it here.
+
+    Raises:
+        ValueError: pycolmap is not installed (``pip install 'dyntorch[colmap]'``), or it does not know a camera.
+    """
+    images = seen(database)
+    places = chosen(database, options.divide)
+    bodies = [left_open(pair) for pair in database.pairs]
+    tasks = (task(database.pairs[place], images, threshold, spatial, seed, options.divide) for place in places)
+    for done, (place, (_, divided)) in enumerate(zip(places, InOrder(divide, executor)(tasks), strict=True)):
+        if isinstance(divided, PairBodies):  # a pair that its workers did not survive is left to the votes
+            bodies[place] = divided
+        if progress is not None:
+            progress(done + 1, len(places))
+    starts = np.cumsum([0, *(len(image.points) for image in database.images)])
+    votes = _voted(database, bodies, starts, options)
+    reach = threshold if threshold is not None else options.keep.distance
+    kept = [_kept(database, place, bodies[place], votes, starts, reach) for place in range(len(database.pairs))]
+    geometries = [
+        verified(database, pair, rows, images, seed, options.keep) for pair, rows in zip(database.pairs, kept, strict=True)
+    ]
+    return _found(database, bodies, votes, kept, geometries, starts, images, options)
+
+
+def _voted(database: MatchDatabase, bodies: list[PairBodies], starts: IntArray, options: StaticOptions) -> Votes:
+    """The votes over the graph of pairs."""
+    pairs = [
+        DividedPair(starts[pair.first] + pair.matches[:, 0], starts[pair.second] + pair.matches[:, 1], found.labels)
+        for pair, found in zip(database.pairs, bodies, strict=True)
+    ]
+    cells = np.concatenate(
+        [_cells(image.points, image.camera.width, image.camera.height, options.spread) for image in database.images]
+    )
+    image = np.repeat(np.arange(len(database.images)), np.diff(starts))
+    return vote(pairs, cells, image, options.vote, options.spread)
+
+
+def _cells(points: NDArray[np.float64], width: int, height: int, options: SpreadOptions) -> IntArray:
+    """The cell of the grid that each keypoint is in; those outside of the image are in the nearest."""
+    at = np.floor(points / [width, height] * options.cells).astype(np.int64).clip(0, options.cells - 1)
+    return np.asarray(at[:, 1] * options.cells + at[:, 0])
+
+
+def _kept(database: MatchDatabase, place: int, bodies: PairBodies, votes: Votes, starts: IntArray, reach: float) -> IntArray:
+    """The static matches of a pair.
+
+    Those of its static bodies, unless their keypoints move; and of what is in no body, what both keypoints say stands still and
+    the motion of a static body agrees with.  Where the pair has no static body, keypoints alone decide.
+    """
+    pair, signs = database.pairs[place], votes.signs[place]
+    first, second = (votes.keypoints[starts[image] + pair.matches[:, k]] for k, image in enumerate((pair.first, pair.second)))
+    moves, stands = np.minimum(first, second) < 0, np.minimum(first, second) > 0
+    static = np.flatnonzero(signs > 0)
+    if not len(static):
+        return pair.matches[stands & ~np.isin(bodies.labels, 1 + np.flatnonzero(signs < 0))]
+    near = bodies.distances[static].min(axis=0) <= reach
+    mine = np.isin(bodies.labels, 1 + static)
+    return pair.matches[(mine & ~moves) | (~mine & stands & near)]
+
+
+def _found(
+    database: MatchDatabase,
+    bodies: list[PairBodies],
+    votes: Votes,
+    kept: list[IntArray],
+    geometries: list[PairGeometry],
+    starts: IntArray,
+    images: list[SeenImage],
+    options: StaticOptions,
+) -> StaticPoints:
+    """All of it, and whether it is an answer."""
+    held: list[set[int]] = [set() for _ in images]
+    matched: set[int] = set()
+    for pair, found in zip(database.pairs, geometries, strict=True):
+        matched |= {pair.first, pair.second}
+        held[pair.first].update(found.inliers[:, 0].tolist())
+        held[pair.second].update(found.inliers[:, 1].tolist())
+    refused = tuple(sorted(place for place in matched if len(held[place]) < options.keep.points))
+    names = [image.name for image in database.images]
+    few = f"fewer than {options.keep.points} points stand still in {listed(names[place] for place in refused)}"
+    reason, notes = "", []
+    if len(matched) - len(refused) < max(2, options.keep.images * len(matched)):
+        reason = f"{few}, {len(refused)} of {count(len(matched), 'image')}; add images, or matches of what stands still"
+        if len(set(refused) & set(votes.open)) > len(refused) / 2:
+            where = listed(names[place] for place in votes.open)
+            reason = (
+                f"what stands still is open: two bodies spread alike over {where}; add images in which more of the scene is seen"
+            )
+    elif refused:
+        notes.append(f"{few}: COLMAP will leave {'it' if len(refused) == 1 else 'them'} out")
+    if not reason and not any((signs < 0).any() for signs in votes.signs):
+        notes.append("nothing moves: no pair of images has a second body; what is left out are wrong matches")
+    keypoints = np.split(np.sign(votes.keypoints).astype(np.int64), starts[1:-1])
+    return StaticPoints(
+        database,
+        tuple(keypoints),
+        tuple(bodies),
+        votes.signs,
+        tuple(kept),
+        tuple(geometries),
+        votes.spread,
+        votes.lead,
+        refused,
+        reason,
+        tuple(notes),
+    )

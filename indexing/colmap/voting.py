@@ -1,0 +1,278 @@
+"""Which bodies of all pairs are the ones that stand still: one decision over the graph of pairs that share keypoints.
+
+Two images say what moves apart, not what moves.  The bodies of different pairs share keypoints, and a keypoint is on one thing.  So
+an answer is a sign for every body of every pair (static, moving, or none): it starts from one body, whose keypoints vote static and
+those of its pair's other bodies moving, and goes from keypoints to the bodies that hold them and back until nothing changes.  Of
+the answers, each consistent in itself, the one is taken whose static keypoints spread widest, over each image and over all images:
+a scene surrounds what moves in it, however many matches that has.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from indexing.colmap.options import SpreadOptions, VoteOptions
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class DividedPair:
+    """Matches of two images, divided.
+
+    Attributes:
+        first, second: ``(m,)`` keypoints, numbered through all images.
+        labels: ``(m,)`` 0 = of no body, 1..K the bodies.
+    """
+
+    first: IntArray
+    second: IntArray
+    labels: IntArray
+
+    @property
+    def bodies(self) -> int:
+        """K."""
+        return int(self.labels.max(initial=0))
+
+
+@dataclass(frozen=True, eq=False)
+class Votes:
+    """The answer.
+
+    Attributes:
+        keypoints: ``(q,)`` mean vote in [-1, 1] on every keypoint: positive stands still, negative moves, 0 nothing is known.
+        signs: for each pair the signs ``(K,)`` of its bodies: 1 static, -1 moving, 0 undecided.
+        lead: spread of the answer over that of the next one, the least of all parts of the graph; infinite where there is no other.
+        spread: ``(images,)`` in [0, 1] how far the static keypoints spread over each image.
+        open: the images of parts in which another body spreads as widely, so that nothing has a sign there.
+    """
+
+    keypoints: FloatArray
+    signs: tuple[IntArray, ...]
+    lead: float
+    spread: FloatArray
+    open: tuple[int, ...] = ()
+
+
+def vote(pairs: Sequence[DividedPair], cells: IntArray, image: IntArray, vote: VoteOptions, spread: SpreadOptions) -> Votes:
+    """Decide what stands still.
+
+    Args:
+        pairs: as divided.
+        cells: ``(q,)`` cell of its image's grid that a keypoint is in, from 0, row by row.
+        image: ``(q,)`` image of a keypoint, from 0.
+        vote: how bodies agree.
+        spread: how the static one is chosen.
+
+    Example:
+        >>> q = np.arange(64)
+        >>> pair = DividedPair(q, q + 64, np.where(q % 8 < 6, 1, 2))  # body 2: two columns at the right
+        >>> found = vote([pair], np.tile(q, 2), np.repeat([0, 1], 64), VoteOptions(), SpreadOptions())
+        >>> found.signs[0].tolist(), bool(found.lead > 2)
+        ([1, -1], True)
+    """
+    graph = _Graph(pairs, cells, image, vote, spread)
+    signs = np.zeros(graph.nodes, dtype=np.int64)
+    lead, undecided = np.inf, list[int]()
+    tried = np.zeros(len(pairs), dtype=bool)
+    while True:
+        seeds = graph.seeds(signs, tried, vote.seeds)
+        if not len(seeds):
+            break
+        best, ahead = _answer(graph, seeds, signs)
+        told = best != signs
+        tried[graph.pair[seeds]] = True
+        lead = min(lead, ahead)
+        if ahead >= spread.lead:
+            signs = best
+        else:
+            tried[graph.pair[told]] = True
+            undecided += graph.images_of(told)
+    keypoints = graph.carried(signs)
+    split = np.split(graph.joined(signs), np.cumsum([pair.bodies for pair in pairs])[:-1]) if pairs else []
+    return Votes(keypoints, tuple(split), float(lead), graph.spread(keypoints > 0), tuple(sorted(set(undecided))))
+
+
+def _answer(graph: _Graph, seeds: IntArray, signs: IntArray) -> tuple[IntArray, float]:
+    """The best answer from any of the bodies, beside the signs that stand already, and its lead over the next one."""
+    found = []
+    for seed in seeds.tolist():
+        mine = graph.settled(graph.started(seed, signs))
+        static = graph.voted(mine) > 0
+        found.append((float(graph.spread(static).sum()), mine, static))
+    found.sort(key=lambda answer: -answer[0])
+    spread, best, static = found[0]
+    others = [other for other, _, also in found[1:] if _common(static, also) < graph.alike]
+    before = float(graph.spread(graph.voted(signs) > 0).sum())  # of parts of the graph that were decided earlier
+    return best, (spread - before) / max(max(others, default=0.0) - before, 1e-9) if others else np.inf
+
+
+def _common(first: NDArray[np.bool_], second: NDArray[np.bool_]) -> float:
+    either = int((first | second).sum())
+    return int((first & second).sum()) / either if either else 1.0
+
+
+class _Graph:
+    """Bodies of pairs (nodes) and the keypoints that they hold."""
+
+    def __init__(
+        self, pairs: Sequence[DividedPair], cells: IntArray, image: IntArray, vote: VoteOptions, spread: SpreadOptions
+    ) -> None:
+        from scipy.sparse import coo_array
+
+        bodies = [pair.bodies for pair in pairs]
+        self.nodes, self.options, self.alike = sum(bodies), vote, spread.alike
+        self.pair = np.repeat(np.arange(len(pairs)), bodies)
+        self.weights = np.repeat([vote.alone if count == 1 else 1.0 for count in bodies], bodies)
+        ends, nodes, links = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [np.zeros((2, 0), np.int64)]
+        for pair, start in zip(pairs, np.cumsum([0, *bodies]).tolist(), strict=False):
+            held = pair.labels > 0
+            ends += [pair.first[held], pair.second[held]]
+            nodes += [start + pair.labels[held] - 1] * 2
+            links.append(np.stack([pair.first[held], pair.second[held]]))
+        # a keypoint counts once in a body, however many matches of a pair it is in
+        entry = np.unique(np.stack([np.concatenate(nodes), np.concatenate(ends)]), axis=1)
+        self.node, self.keypoint = entry
+        self.sizes = np.bincount(self.node, minlength=self.nodes)
+        link = np.concatenate(links, axis=1)
+        both = np.concatenate([link, link[::-1]], axis=1)
+        self.links = coo_array((np.ones(both.shape[1]), (both[0], both[1])), shape=(len(image), len(image))).tocsr()
+        self.image, self.images = image, int(image.max(initial=-1)) + 1
+        self.part = self._parts(len(pairs))
+        self._grid(cells, spread)
+
+    def _grid(self, cells: IntArray, spread: SpreadOptions) -> None:
+        """Cells of all images, by their weight: those that hold a keypoint of any body; of each image they sum to 1."""
+        many = spread.cells**2
+        self.cell = self.image * many + cells
+        row, column = np.divmod(np.arange(many), spread.cells)
+        edge = (np.minimum(row, column) == 0) | (np.maximum(row, column) == spread.cells - 1)
+        held = np.zeros(self.images * many)
+        held[self.cell[np.unique(self.keypoint)]] = 1
+        whole = held.reshape(self.images, many)
+        outer = whole * edge
+        inner, border = (part / np.maximum(part.sum(axis=1, keepdims=True), 1) for part in (whole, outer))
+        share = np.where(outer.any(axis=1, keepdims=True), spread.border, 0.0)
+        self.worth = (1 - share) * inner + share * border
+
+    def spread(self, static: NDArray[np.bool_]) -> FloatArray:
+        """``(images,)`` how far keypoints spread over each."""
+        held = np.zeros(self.worth.size)
+        held[self.cell[static]] = 1
+        return np.asarray((held.reshape(self.worth.shape) * self.worth).sum(axis=1))
+
+    def images_of(self, nodes: NDArray[np.bool_]) -> list[int]:
+        """The images whose keypoints some bodies hold."""
+        return [int(image) for image in np.unique(self.image[self.keypoint[nodes[self.node]]])]
+
+    def seeds(self, signs: IntArray, tried: NDArray[np.bool_], most: int) -> IntArray:
+        """Bodies to start from: those of the largest pairs none of whose bodies has a sign, and of their part of the graph."""
+        count = len(tried)
+        signed = np.zeros(count, dtype=bool)
+        signed[self.pair[signs != 0]] = True
+        sizes = np.bincount(self.pair, weights=self.sizes, minlength=count)
+        open_ = np.flatnonzero(~signed & ~tried & (sizes > 0))
+        if not len(open_):
+            return np.zeros(0, dtype=np.int64)
+        # of the part with the largest pair: elsewhere other bodies decide
+        first = open_[np.argmax(sizes[open_])]
+        open_ = open_[self.part[open_] == self.part[first]]
+        chosen = open_[np.argsort(-sizes[open_], kind="stable")][:most]
+        return np.flatnonzero(np.isin(self.pair, chosen))
+
+    def _parts(self, pairs: int) -> IntArray:
+        """Connected parts of the graph, by pair: those that share keypoints."""
+        from scipy.sparse import coo_array
+        from scipy.sparse.csgraph import connected_components
+
+        keypoint = pairs + self.keypoint
+        total = pairs + len(self.image)
+        edges = coo_array((np.ones(len(keypoint)), (self.pair[self.node], keypoint)), shape=(total, total))
+        return np.asarray(connected_components(edges, directed=False)[1][:pairs], dtype=np.int64)
+
+    def started(self, seed: int, signs: IntArray) -> IntArray:
+        """The signs that stand, and one body static in its pair."""
+        mine = signs.copy()
+        mine[self.pair == self.pair[seed]] = -1
+        mine[seed] = 1
+        return mine
+
+    def settled(self, signs: IntArray) -> IntArray:
+        """Signs of all bodies that keypoints lead to, from those of some."""
+        for _ in range(self.options.turns):
+            agreement, known = self.agreement(signs)
+            told = known >= self.options.shared
+            new = np.where(told, np.where(np.abs(agreement) >= self.options.agreed, np.sign(agreement), 0), signs).astype(np.int64)
+            # beside a static body, one that other pairs know nothing of moves
+            beside = np.zeros(int(self.pair.max(initial=-1)) + 1, dtype=bool)
+            beside[self.pair[new > 0]] = True
+            new = np.where(~told & (new == 0) & beside[self.pair], -1, new)
+            new = self._one(new, np.where(told, agreement * known, self.sizes))
+            if np.array_equal(new, signs):
+                break
+            signs = new
+        return signs
+
+    def _one(self, signs: IntArray, support: FloatArray) -> IntArray:
+        """At most one static body in a pair, the one with most support: the pair says that they move apart.
+
+        A body that moves with the scene between some images gets their votes, but those of all pairs in which it does not.  A
+        part of the scene that some pairs take for a body has the votes of all others.
+        """
+        static = np.flatnonzero(signs > 0)
+        order = static[np.lexsort((-support[static], self.pair[static]))]
+        first = np.unique(self.pair[order], return_index=True)[1]
+        rest = np.setdiff1d(order, order[first])
+        signs = signs.copy()
+        signs[rest] = -1
+        return signs
+
+    def joined(self, signs: IntArray) -> IntArray:
+        """The signs, with the parts of the scene that some pairs take for bodies of their own static again."""
+        agreement, known = self.agreement(signs)
+        again = (signs < 0) & (known >= self.options.shared) & (agreement >= self.options.agreed)
+        return np.where(again, 1, signs)
+
+    def agreement(self, signs: IntArray) -> tuple[FloatArray, IntArray]:
+        """``(nodes,)`` how far the other pairs agree on the keypoints of a body, in [-1, 1], and on how many there is a vote.
+
+        Keypoints on which they contradict each other count less: the mean vote over the mean of its absolute values.
+        """
+        votes, total = self._sums(signs)
+        weight = self.weights * np.abs(signs)
+        others = total[self.keypoint] - weight[self.node]
+        mean = (votes[self.keypoint] - (weight * signs)[self.node]) / np.maximum(others, 1e-9)
+        there = others > 1e-6
+        node, mean = self.node[there], mean[there]
+        known = np.bincount(node, minlength=self.nodes)
+        sums, sizes = (np.bincount(node, each, minlength=self.nodes) for each in (mean, np.abs(mean)))
+        return np.asarray(sums / np.maximum(sizes, 1e-9)), known
+
+    def _sums(self, signs: IntArray) -> tuple[FloatArray, FloatArray]:
+        """``(q,)`` weighted votes on each keypoint, and the weights."""
+        weight = self.weights * np.abs(signs)
+        votes, total = (
+            np.bincount(self.keypoint, each[self.node], minlength=len(self.image)).astype(np.float64)
+            for each in (weight * signs, weight)
+        )
+        return votes, total
+
+    def voted(self, signs: IntArray) -> FloatArray:
+        """``(q,)`` mean vote on every keypoint, 0 where there is none."""
+        votes, total = self._sums(signs)
+        return np.asarray(votes / np.maximum(total, 1e-9))
+
+    def carried(self, signs: IntArray) -> FloatArray:
+        """The same with the votes on the keypoints that a keypoint is matched with."""
+        own, total = self._sums(signs)
+        mean = own / np.maximum(total, 1e-9)
+        for _ in range(self.options.passes):
+            known = (np.abs(mean) > 0).astype(np.float64)
+            votes = own + self.options.neighbours * (self.links @ mean)
+            mean = votes / np.maximum(total + self.options.neighbours * (self.links @ known), 1e-9)
+        return np.asarray(mean)

@@ -1,0 +1,363 @@
+"""The report on bodies through many frames: what moves with which body, when each lives, how it moves, which stands still."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dyntorch.core import Notice
+from indexing.opening import count
+from indexing.readers.pairs import Photograph
+from indexing.readers.tracks import TrackSet
+from indexing.report.bodies_picture import picture_of
+from indexing.report.canvas import DARK
+from indexing.report.page import (
+    Picture,
+    ResultReport,
+    even,
+    markup,
+    npz,
+    render,
+    safe_cell,
+    sentence,
+    table_csv,
+    write_files,
+)
+from indexing.report.segmentation import SURE, colour_of, share
+
+FloatArray = NDArray[np.float64]
+FILES = ("report.html", "segmentation.npz", "segmentation.json", "labels.csv", "tracks.csv", "segmentation.png")
+FILM = "segmentation.mp4"
+WRITTEN = (*FILES, FILM)  # the last one where there are pictures
+ALIVE = 3  # tracks that a frame must show of a body; fewer where it has fewer
+GEOMETRY = {False: "with depth: fundamental matrices", True: "a plane, or under a rotation alone: homographies"}
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class BodiesReport(ResultReport):
+    """Everything that the report on bodies through many frames says.
+
+    Args:
+        tracks: what was given.
+        photographs: pictures of some of the views, by their places.
+        size: width and height of the pictures; None = not known.
+    """
+
+    tracks: TrackSet
+    photographs: Mapping[int, Photograph] = field(default_factory=dict)
+    size: tuple[float, float] | None = None
+
+    TITLES = ("What moves with what", "The tracks do not decide")
+
+    @property
+    def bodies(self) -> int:
+        """How many bodies."""
+        return int(self.found.bodies)
+
+    @property
+    def static(self) -> int:
+        """The body that stands still; 0 = the data do not say."""
+        return int(self.found.static_body) if int(self.found.static_body) <= self.bodies else 0
+
+    @property
+    def status(self) -> str:
+        """The status's name; that there are no bodies is no answer."""
+        status = super().status
+        return status if status != "OK" or self.bodies else "NO_CONSENSUS"
+
+    @functools.cached_property
+    def told(self) -> list[Notice]:
+        """The notices, frames by their names: the library numbers them from 0."""
+        found = []
+        for notice in self.result.notices:
+            values = {key: self._frame(value) if key in ("frame", "frames") else value for key, value in notice.values.items()}
+            found.append(dataclasses.replace(notice, values=values).worded(self.words))
+        return found
+
+    def _frame(self, value: Any) -> Any:
+        if isinstance(value, Sequence) and not isinstance(value, str):
+            return ", ".join(str(self._frame(one)) for one in value)
+        views = self.tracks.views
+        return views[int(value)] if isinstance(value, (int, float)) and 0 <= int(value) < len(views) else value
+
+    @functools.cached_property
+    def warnings(self) -> list[tuple[str, float, str]]:
+        """Code, figure and sentence of every notice."""
+        return [(notice.code.value, notice.value, str(notice.text)) for notice in self.told]
+
+    @property
+    def reason(self) -> str:
+        """Why the data do not decide, and what to do; empty where they do."""
+        from dyntorch import Status
+
+        return str(dataclasses.replace(self.result, notices=tuple(self.told)).refusal(self.words, Status[self.status]))
+
+    @functools.cached_property
+    def there(self) -> NDArray[np.bool_]:
+        """``(views, n)`` where each track is seen."""
+        return np.asarray(np.isfinite(self.tracks.values).all(axis=-1))
+
+    @functools.cached_property
+    def seen(self) -> NDArray[np.bool_]:
+        """``(n,)`` tracks that two views see at least: of the others nothing can be known."""
+        return np.asarray(self.there.sum(axis=0) > 1)
+
+    @property
+    def names(self) -> list[str]:
+        """What labels mean: outlier, body 1, body 2, ..."""
+        return ["outlier", *(f"body {i}" for i in range(1, self.bodies + 1))]
+
+    @property
+    def kinds(self) -> list[str]:
+        """What each track is: one of the names, or too short."""
+        labels = self.found.labels.tolist()
+        return [self.names[label] if there else "too short" for label, there in zip(labels, self.seen.tolist(), strict=True)]
+
+    @functools.cached_property
+    def counts(self) -> dict[str, int]:
+        """How many tracks of each kind, bodies first."""
+        kinds = self.kinds
+        return {name: kinds.count(name) for name in (*self.names[1:], "outlier", "too short")}
+
+    @property
+    def certainty(self) -> FloatArray:
+        """``(n,)`` probability of the label of each track; NaN where it is too short."""
+        own = np.take_along_axis(self.found.probabilities, self.found.labels[:, None], axis=1)[:, 0]
+        return np.where(self.seen, own, np.nan)
+
+    @property
+    def doubtful(self) -> NDArray[np.bool_]:
+        """``(n,)`` tracks that might well have another label."""
+        return np.asarray(self.certainty < SURE)
+
+    @property
+    def pairs(self) -> NDArray[np.int64]:
+        """``(P, 2)`` places of the views that were compared."""
+        return np.asarray(self.found.pairs[(self.found.pairs >= 0).all(axis=-1)])
+
+    @property
+    def misclassified(self) -> float | None:
+        """Share of the tracks that are not labelled as the file says, whatever the bodies' numbers; None where it does not say."""
+        if self.tracks.known is None or not self.bodies:
+            return None
+        import torch
+
+        from dyntorch import metrics
+
+        known, seen = torch.from_numpy(self.tracks.known), torch.from_numpy(self.seen)
+        return float(metrics.misclassification(self.result.labels[seen], known[seen]))
+
+    def rms(self, label: int | None = None) -> float:
+        """Root mean square of the residuals of one body, or of all; NaN where there are no tracks."""
+        mine = self.seen & ((self.found.labels > 0) if label is None else (self.found.labels == label))
+        return float(np.sqrt(np.mean(np.square(self.found.residuals[mine])))) if mine.any() else float("nan")
+
+    def life(self, label: int) -> tuple[int, int] | None:
+        """Places of the first and the last view that show a body; None = none does."""
+        mine = self.there[:, self.found.labels == label].sum(axis=1)
+        alive = np.flatnonzero((mine > 0) & (mine >= min(ALIVE, mine.max(initial=0))))
+        return (int(alive[0]), int(alive[-1])) if len(alive) else None
+
+    def motion(self, label: int) -> float:
+        """Median way of a body's points in the picture, pixels per frame; the camera's own motion is in it."""
+        values = self.tracks.values[:, self.found.labels == label]
+        steps = np.linalg.norm(np.diff(values, axis=0), axis=-1) / self._apart[:, None]
+        steps = steps[np.isfinite(steps)]
+        return float(np.median(steps)) if len(steps) else float("nan")
+
+    def planar(self, label: int) -> bool | None:
+        """Whether most pairs of views see a body as a plane, or under a rotation; None where no pair shows it."""
+        shown = np.abs(self.found.geometries[:, label - 1]).sum(axis=(1, 2)) > 0
+        flat = self.found.planar[:, label - 1]
+        shown |= flat
+        return bool(flat[shown].mean() > 0.5) if shown.any() else None
+
+    @functools.cached_property
+    def _apart(self) -> FloatArray:
+        """Frames between a view and the next."""
+        numbers = self.tracks.views
+        if self.tracks.by_time or not all(re.fullmatch(r"-?\d+", name) for name in numbers):
+            return np.ones(len(numbers) - 1)
+        return np.maximum(1.0, np.abs(np.diff([float(name) for name in numbers])))
+
+
+def standing(report: BodiesReport) -> str:
+    """Which body stands still, in a sentence."""
+    if report.static:
+        return f"body {report.static} stands still"
+    return "the tracks do not say which body stands still"
+
+
+def describe(report: BodiesReport) -> str:
+    """The result in plain words."""
+    number, counts, frames = int(report.seen.sum()), report.counts, len(report.tracks.views)
+    if report.status != "OK":
+        start = f"The {number:,} tracks through {frames:,} frames do not decide what moves with what. {sentence(report.reason)}"
+        return start + " What follows is the best segmentation found, and not to be relied on." * (report.bodies > 0)
+    *most, last = [f"{counts[name]:,}" for name in report.names[1:]]
+    moved = f"{number - counts['outlier']:,} move "
+    moved += f"with one of {report.bodies} bodies ({', '.join(most)} and {last})" if most else "as one body"
+    rest = f"; {count(counts['outlier'], 'fits', 'fit')} none" * (counts["outlier"] > 0)
+    still = f" {sentence(standing(report))}" if most else ""
+    return f"Of {number:,} tracks through {frames:,} frames, {moved}{rest}.{still}"
+
+
+def rows_of(report: BodiesReport) -> list[list[str]]:
+    """A row of words for every body: tracks, share, frames, motion, residual, doubtful, geometry."""
+    labels = range(1, report.bodies + 1)
+    # a point that rests goes nowhere, whatever the tracker's last digits say
+    moved = even([round(report.motion(label), 2) for label in labels])
+    noise = even([round(report.rms(label), 4) for label in labels])
+    rows = []
+    for label in labels:
+        mine = report.seen & (report.found.labels == label)
+        life, flat = report.life(label), report.planar(label)
+        names = "" if life is None else f"{report.tracks.views[life[0]]} to {report.tracks.views[life[1]]}"
+        figures = [f"{mine.sum():,}", share(int(mine.sum()), int(report.seen.sum())), names, moved[label - 1], noise[label - 1]]
+        rows.append([*figures, f"{int((mine & report.doubtful).sum()):,}", "" if flat is None else GEOMETRY[flat]])
+    return rows
+
+
+def write_bodies(folder: str | Path, report: BodiesReport) -> Path:
+    """Write a report into a folder: the files of :data:`FILES`, each whole or not at all, ``report.html`` last.
+
+    Returns:
+        the path of ``report.html``.
+
+    Raises:
+        ValueError: the folder or a file in it cannot be written.
+    """
+    drawn = picture_of(report)
+    picture = Picture(drawn, dark=picture_of(report, DARK) if report.photographs else None)
+    doubtful = ["doubtful" if odd else "" for odd in report.doubtful.tolist()]
+    rms = report.rms()
+    values = {"summary": describe(report), "picture": picture, "doubtful": doubtful, "share": share, "standing": standing(report)}
+    html = render("bodies", report, **values, rms=f"{rms:.3g}" if np.isfinite(rms) else "", film=FILM, **_tables(report))
+    return write_files(
+        folder,
+        {
+            "segmentation.png": drawn,
+            "labels.csv": labels_csv(report),
+            "tracks.csv": tracks_csv(report),
+            "segmentation.npz": as_npz(report),
+            "segmentation.json": as_json(report),
+            FILM: None,
+            **report.besides,
+            "report.html": html,
+        },
+    )
+
+
+def _tables(report: BodiesReport) -> dict[str, list[list[Any]]]:
+    """Rows of the page's tables: the bodies, and how many tracks of every known body were found to be of which."""
+    dot = '<span class="drawn" style="color:{colour}" aria-hidden="true">●</span> body {label}{still}'
+    bodies: list[list[Any]] = []
+    for label, row in enumerate(rows_of(report), start=1):
+        still = ", stands still" if label == report.static else ""
+        name = markup(dot, colour=colour_of(label), label=label, still=still)
+        bodies.append([name, *row[:2], markup("{words}{span}", words=row[2], span=_span(report, label)), *row[3:]])
+    compared: list[list[Any]] = []
+    known = report.tracks.known
+    if known is not None and report.bodies:
+        for label in sorted(np.unique(known[report.seen]).tolist(), key=lambda label: (label == 0, label)):
+            of = report.found.labels[report.seen & (known == label)]
+            cells = [int((of == i).sum()) for i in (*range(1, report.bodies + 1), 0)]
+            compared.append([f"body {label}" if label else "outlier", *(f"{cell:,}" if cell else "" for cell in cells)])
+    return {"bodies": bodies, "compared": compared}
+
+
+def _span(report: BodiesReport, label: int) -> Any:
+    """How many tracks of a body each frame shows, as a small outline below the frames' names."""
+    mine = report.there[:, report.found.labels == label].sum(axis=1)
+    most, views = max(1, int(mine.max(initial=0))), len(mine)
+    edge = " ".join(f"{100 * i / max(1, views - 1):.1f},{8 - 8 * n / most:.1f}" for i, n in enumerate(mine.tolist()))
+    return markup(
+        '<svg class="bar" viewBox="0 0 100 8" preserveAspectRatio="none" aria-hidden="true">'
+        '<rect class="track" width="100" height="8"/><polygon points="0,8 {edge} 100,8" fill="{colour}"/></svg>',
+        edge=edge, colour=colour_of(label),
+    )  # fmt: skip
+
+
+def as_npz(report: BodiesReport) -> bytes:
+    """All arrays, without pickle; ``tracks, ids, frames`` are those that were given."""
+    found, bodies = report.found, report.bodies
+    compared = (found.pairs >= 0).all(axis=-1)
+    arrays: dict[str, Any] = {name: getattr(found, name) for name in ("labels", "residuals", "threshold")}
+    arrays |= {name: getattr(found, name)[compared][:, :bodies] for name in ("geometries", "homographies", "planar")}
+    arrays |= {"probabilities": found.probabilities[:, : bodies + 1], "pairs": report.pairs, "static_body": report.static}
+    arrays |= {"status": report.status, "tracks": report.tracks.values, "ids": np.array(report.tracks.ids)}
+    arrays |= {"frames": np.array(report.tracks.views)}
+    return npz(arrays if report.tracks.known is None else {**arrays, "known": report.tracks.known})
+
+
+def as_json(report: BodiesReport) -> dict[str, Any]:
+    """The result as numbers: bodies, when they live and how they move, which stands still, counts, status, and how it was made."""
+    views, bodies = report.tracks.views, []
+    for label in range(1, report.bodies + 1):
+        number, life = report.counts[f"body {label}"], report.life(label)
+        bodies.append({
+            "label": label,
+            "tracks": number,
+            "share": number / max(1, int(report.seen.sum())),
+            "first_frame": None if life is None else views[life[0]],
+            "last_frame": None if life is None else views[life[1]],
+            "pixels_per_frame": report.motion(label),
+            "planar": report.planar(label),
+            "rms_residual": report.rms(label),
+        })  # fmt: skip
+    return {
+        "status": report.status,
+        "reason": report.reason or None,
+        "tracks": len(report.tracks.ids),
+        "frames": len(views),
+        "bodies": bodies,
+        "static_body": report.static or None,
+        "counts": report.counts,
+        "doubtful": int(report.doubtful.sum()),
+        "pairs": [[views[a], views[b]] for a, b in report.pairs.tolist()],
+        "rms_residual": report.rms(),
+        "threshold": float(report.found.threshold),
+        "misclassified": report.misclassified,
+        "warnings": report.warnings_json,
+        "notes": list(report.notes),
+        "manifest": report.manifest,
+    }
+
+
+def labels_csv(report: BodiesReport) -> str:
+    """``id, label, name, probability, residual, frames, first, last`` of every track; label 0 is an outlier, or too short.
+
+    The probability is that of the label, the residual the rms distance from the own body over the pairs of frames.
+    """
+    rows: list[list[Any]] = []
+    views = report.tracks.views
+    for i, (name, kind, sure) in enumerate(zip(report.tracks.ids, report.kinds, report.certainty, strict=True)):
+        seen = np.flatnonzero(report.there[:, i])
+        lived = [len(seen), views[seen[0]], views[seen[-1]]] if len(seen) else [0, "", ""]
+        short = kind == "too short"
+        figures = ["" if short else f"{sure:.4f}", "" if short or not report.bodies else f"{report.found.residuals[i]:.6g}"]
+        rows.append([safe_cell(name), int(report.found.labels[i]), kind, *figures, *lived])
+    return table_csv(["id", "label", "name", "probability", "residual", "frames", "first", "last"], rows)
+
+
+def tracks_csv(report: BodiesReport) -> str:
+    """``frame, time, id, x, y, label`` of every track in every frame that shows it: what ``dyntorch reconstruct`` reads, too."""
+    tracks = report.tracks
+    head = ["frame", "id", "x", "y", "label"]
+    timed = tracks.times is not None and not tracks.by_time
+    rows: list[list[Any]] = []
+    for view, (name, there) in enumerate(zip(tracks.views, report.there, strict=True)):
+        moment = [f"{tracks.times[view]:.6g}"] if tracks.times is not None and timed else []
+        for i in np.flatnonzero(there).tolist():
+            x, y = tracks.values[view, i, :2]
+            rows.append([name, *moment, safe_cell(tracks.ids[i]), f"{x:.4f}", f"{y:.4f}", int(report.found.labels[i])])
+    head = ["time" if tracks.by_time else "frame", *(["time"] if timed else []), *head[1:]]
+    return table_csv(head, rows)

@@ -1,0 +1,215 @@
+"""The report on a COLMAP database: what stands still in its images, and what was kept of its pairs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from indexing.colmap import MatchDatabase, StaticPoints
+from indexing.opening import count
+from indexing.readers.pairs import Photograph
+from indexing.report.canvas import DARK, LIGHT, Theme, draw_photograph, new_figure, png, shorten, style
+from indexing.report.page import Picture, bar, render, safe_cell, sentence, table_csv, write_files
+from indexing.report.reconstruction_picture import finish, foot
+
+FILES = ("report.html", "static.json", "images.csv", "pairs.csv", "static.png")
+PANELS, COLUMNS, WIDE, EDGE, HEAD, FOOT = 6, 3, 10.2, 0.15, 0.32, 0.5  # of the picture: images, and inches
+ROWS = 100  # images and pairs that the page lists
+KINDS = {1: "stands still", -1: "moves", 0: "not known"}
+COLOURS = {1: "#2f7fb8", -1: "#e8741e"}
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class StaticReport:
+    """Everything that the report on a database says.
+
+    Args:
+        found: what stands still.
+        written: name of the database that was written; empty = none.
+        masks: name of the folder of masks; empty = none.
+        photographs: of the images, by their places; those of a folder that has some of them.
+        notes: what a reader should know about the input, a sentence each.
+        manifest: of :func:`indexing.files.manifest`.
+    """
+
+    found: StaticPoints
+    written: str = ""
+    masks: str = ""
+    photographs: Mapping[int, Photograph] = field(default_factory=dict)
+    heading: str = ""
+    notes: Sequence[str] = ()
+    manifest: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def title(self) -> str:
+        """Heading of the page."""
+        return self.heading or ("What stands still" if self.found.ok else "The matches do not decide what stands still")
+
+    @property
+    def matches(self) -> int:
+        """Of all pairs of the database."""
+        return self.found.database.matches
+
+    @property
+    def kept(self) -> int:
+        """Matches that stand still."""
+        return sum(map(len, self.found.kept))
+
+    @property
+    def inliers(self) -> list[int]:
+        """Verified static matches of each pair."""
+        return [len(geometry.inliers) for geometry in self.found.geometries]
+
+    @property
+    def remarks(self) -> list[str]:
+        """What a reader should note, a sentence each, less the refusal."""
+        return [*self.notes, *self.found.notes]
+
+
+def describe(report: StaticReport) -> str:
+    """The result in plain words."""
+    database = report.found.database
+    given = f"{count(report.matches, 'match', 'matches')} of {count(len(database.pairs), 'pair')} of {len(database.images)} images"
+    if not report.found.ok:
+        return f"The {given} do not decide. {sentence(report.found.reason)} No database was written."
+    share = report.kept / max(1, report.matches)
+    enough = count(sum(map(bool, report.inliers)), "pair has", "pairs have")
+    return f"Of {given}, {report.kept:,} ({100 * share:.0f} %) stand still; {enough} enough of them."
+
+
+def image_rows(report: StaticReport) -> list[list[Any]]:
+    """Name, keypoints in matches, static ones, moving ones, spread of the static ones, and whether too few of them are left."""
+    found = report.found
+    used: list[set[int]] = [set() for _ in found.database.images]
+    for pair in found.database.pairs:
+        used[pair.first].update(pair.matches[:, 0].tolist())
+        used[pair.second].update(pair.matches[:, 1].tolist())
+    return [
+        [image.name, len(used[k]), int((kinds > 0).sum()), int((kinds < 0).sum()), float(found.spread[k]), k in found.refused]
+        for k, (image, kinds) in enumerate(zip(found.database.images, found.keypoints, strict=True))
+    ]
+
+
+def pair_rows(report: StaticReport) -> list[list[Any]]:
+    """Names of both images, matches, bodies, how many of these stand still, matches kept, verified, and how the division ended."""
+    found, rows = report.found, []
+    for k, pair in enumerate(found.database.pairs):
+        names = [found.database.images[place].name for place in (pair.first, pair.second)]
+        static = int((found.signs[k] > 0).sum())
+        state = found.bodies[k].state.lower().replace("_", " ") or "left to the votes"
+        rows.append([*names, len(pair.matches), len(found.signs[k]), static, len(found.kept[k]), report.inliers[k], state])
+    return rows
+
+
+def as_json(report: StaticReport) -> dict[str, Any]:
+    """The result as numbers."""
+    heads = ("name", "matched", "static", "moving", "spread", "refused")
+    columns = ("first", "second", "matches", "bodies", "static_bodies", "kept", "verified", "division")
+    return {
+        "status": "OK" if report.found.ok else "REFUSED",
+        "reason": report.found.reason or None,
+        "matches": report.matches,
+        "kept": report.kept,
+        "verified": sum(report.inliers),
+        "lead": report.found.lead,
+        "images": [dict(zip(heads, row, strict=True)) for row in image_rows(report)],
+        "pairs": [dict(zip(columns, row, strict=True)) for row in pair_rows(report)],
+        "database": report.written or None,
+        "masks": report.masks or None,
+        "notes": report.remarks,
+        "manifest": report.manifest,
+    }
+
+
+def write_report(folder: str | Path, report: StaticReport) -> Path:
+    """Write a report into a folder: the files of :data:`FILES`, each whole or not at all, ``report.html`` last.
+
+    Returns:
+        the path of ``report.html``.
+
+    Raises:
+        ValueError: the folder or a file in it cannot be written.
+    """
+    drawn = picture_of(report)
+    images, pairs = image_rows(report), pair_rows(report)
+    values = {
+        "summary": describe(report),
+        "picture": Picture(drawn, dark=picture_of(report, DARK) if report.photographs else None),
+        "images": [[name, *(f"{n:,}" for n in row[:3]), bar(row[3]), "refused" if row[4] else ""] for name, *row in images],
+        "pairs": [[f"{a} and {b}", *(f"{n:,}" for n in row[:5]), row[5]] for a, b, *row in pairs],
+        "rows": ROWS,
+    }
+    html = render("static", report, **values)
+    image_head = ["image", "matched", "static", "moving", "spread", "refused"]
+    pair_head = ["first", "second", "matches", "bodies", "static_bodies", "kept", "verified", "division"]
+    csv_images = [[safe_cell(name), *row[:3], f"{row[3]:.3f}", int(row[4])] for name, *row in images]
+    csv_pairs = [[safe_cell(a), safe_cell(b), *row] for a, b, *row in pairs]
+    return write_files(
+        folder,
+        {
+            "static.png": drawn,
+            "images.csv": table_csv(image_head, csv_images),
+            "pairs.csv": table_csv(pair_head, csv_pairs),
+            "static.json": as_json(report),
+            "report.html": html,
+        },
+    )
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# The picture: some of the images, from the first to the last, and what stands still in them.
+
+
+def images_drawn(database: MatchDatabase) -> list[int]:
+    """Places of the images that the picture shows: evenly from those in matches."""
+    used = sorted({place for pair in database.pairs for place in (pair.first, pair.second)})
+    return [used[k] for k in np.unique(np.linspace(0, len(used) - 1, min(PANELS, len(used))).round().astype(int)).tolist()]
+
+
+def picture_of(report: StaticReport, theme: Theme = LIGHT) -> bytes:
+    """PNG: keypoints in matches, by what is known of them."""
+    from matplotlib.lines import Line2D
+
+    found = report.found
+    places = images_drawn(found.database)
+    columns = min(COLUMNS, len(places))
+    rows = math.ceil(len(places) / columns)
+    sizes = [(found.database.images[k].camera.width, found.database.images[k].camera.height) for k in places]
+    wide = (WIDE - EDGE * (columns - 1)) / columns
+    tall = max(wide * height / width for width, height in sizes)
+    tall = min(tall, wide * 2)
+    height = rows * (tall + HEAD) + FOOT
+    with style(theme):
+        figure = new_figure(WIDE, height)
+        for i, (place, size) in enumerate(zip(places, sizes, strict=True)):
+            row, column = divmod(i, columns)
+            bottom = 1 - ((row + 1) * (tall + HEAD)) / height
+            panel = figure.add_axes(((column * (wide + EDGE)) / WIDE, bottom, wide / WIDE, tall / height))
+            photograph = report.photographs.get(place)
+            if photograph is not None:
+                draw_photograph(panel, photograph, theme)
+            image = found.database.images[place]
+            _draw_points(panel, image.points - 0.5, found.keypoints[place], theme)
+            finish(panel, np.array([-0.5, -0.5]), np.array(size) - 0.5, True, shorten(image.name, 32))
+            panel.set(xticks=[], yticks=[])
+        kinds = np.concatenate(found.keypoints)
+        handles = [
+            Line2D([], [], color=colour, marker="o", linestyle="", markersize=5, label=f"{KINDS[kind]}: {(kinds == kind).sum():,}")
+            for kind, colour in COLOURS.items()
+        ]
+        foot(figure, handles, ink=theme.ink)
+        return png(figure, tight=True)
+
+
+def _draw_points(panel: Any, points: NDArray[np.float64], kinds: NDArray[np.int64], theme: Theme) -> None:
+    """Static ones below, moving ones above, and what nothing is known of small and gray."""
+    size = float(np.clip(3000 / max(1, len(points)), 2, 12))
+    panel.scatter(*points[kinds == 0].T, s=0.3 * size, c=theme.muted, linewidth=0, alpha=0.35, zorder=2)
+    for kind, colour in COLOURS.items():
+        panel.scatter(*points[kinds == kind].T, s=size, c=colour, linewidth=0, zorder=3)

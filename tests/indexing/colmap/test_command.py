@@ -1,0 +1,113 @@
+"""``dyntorch segment --colmap``: what is written and said, and bad input in one line."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import indexing.colmap
+from indexing.cli import main
+from indexing.cli.colmap import ColmapJob, run_colmap
+from indexing.report.static import FILES
+from tests.indexing.colmap.test_database import changed, sha256
+
+
+@pytest.fixture
+def quick(found, monkeypatch):
+    """What was found once is found again at once."""
+    monkeypatch.setattr(indexing.colmap, "find_static", lambda database, *_, **__: replace(found, database=database))
+
+
+def test_everything_is_written(given, quick, tmp_path, capsys):
+    before = sha256(given)
+    (tmp_path / "images").mkdir()
+    Image.fromarray(np.full((720, 960), 128, dtype=np.uint8)).save(tmp_path / "images" / "000.png")
+    Image.fromarray(np.full((72, 96), 128, dtype=np.uint8)).save(tmp_path / "images" / "001.png")
+    job = ColmapJob(given, tmp_path / "static.db", images=tmp_path / "images", title="Street <1>")
+    assert run_colmap(job, {"colmap": str(given)}) == 0
+    assert sha256(given) == before
+    said = capsys.readouterr().out
+    assert "stand still; 15 pairs have enough of them" in said
+    assert f"database: {tmp_path / 'static.db'}" in said and f"masks: {tmp_path / 'static-masks'}" in said
+    assert "has no 002.png, 003.png, 004.png and 1 more" in said
+    assert "001.png in --images" in said and "has another size" in said
+    assert sorted(path.name for path in (tmp_path / "static-report").iterdir()) == sorted(FILES)
+    assert len(list((tmp_path / "static-masks").iterdir())) == 6
+    page = (tmp_path / "static-report" / "report.html").read_text(encoding="utf-8")
+    assert "Street &lt;1&gt;" in page and "000.png and 001.png" in page
+    kept = json.loads((tmp_path / "static-report" / "static.json").read_text(encoding="utf-8"))
+    assert kept["status"] == "OK" and len(kept["images"]) == 6 and len(kept["pairs"]) == 15
+    assert kept["manifest"]["inputs"] == {str(given): before}
+    with open(tmp_path / "static-report" / "images.csv", encoding="utf-8") as stream:
+        rows = list(csv.DictReader(stream))
+    assert [row["image"] for row in rows] == [f"{k:03d}.png" for k in range(6)]
+    assert all(int(row["static"]) > 50 and int(row["moving"]) > 50 for row in rows)
+
+
+def test_a_refusal_writes_a_report_and_no_database(given, found, tmp_path, monkeypatch, capsys):
+    few = replace(found, refused=(0, 1, 2, 3), reason="fewer than 15 points stand still in 000.png, 4 of 6 images; add images")
+    monkeypatch.setattr(indexing.colmap, "find_static", lambda *_, **__: few)
+    assert run_colmap(ColmapJob(given, tmp_path / "static.db"), {}) == 3
+    assert "refused: fewer than 15 points stand still in 000.png" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["static-report"]
+    assert "Refused" in (tmp_path / "static-report" / "report.html").read_text(encoding="utf-8")
+
+
+def test_bad_input_is_one_line(given, tmp_path):
+    out = tmp_path / "static.db"
+    (tmp_path / "text.db").write_text("no database, but long enough for one")
+    (tmp_path / "there.db").touch()
+    empty = changed(given, tmp_path / "empty.db", "DELETE FROM matches", "DELETE FROM two_view_geometries")
+    cases = [
+        (ColmapJob(given, None), "where to"),
+        (ColmapJob(given, given), "is the database that is read"),
+        (ColmapJob(given, tmp_path / "there.db"), "is there already"),
+        (ColmapJob(given, tmp_path / "text.db" / "static.db"), "is a file"),
+        (ColmapJob(tmp_path / "none.db", out), "no such database"),
+        (ColmapJob(tmp_path / "text.db", out), "is no SQLite database"),
+        (ColmapJob(empty, out), "no matches; run a matcher first"),
+        (ColmapJob(given, out, images=tmp_path / "none"), "no such folder"),
+        (ColmapJob(given, out, images=given), "is a file"),
+        (ColmapJob(given, out, masks=given), "is a file"),
+        (ColmapJob(given, out, images=tmp_path, masks=tmp_path), "is the folder of the images"),
+    ]
+    before = set(tmp_path.iterdir())
+    for job, said in cases:
+        with pytest.raises(ValueError, match=said) as caught:
+            run_colmap(job, {})
+        assert "\n" not in str(caught.value)
+    assert set(tmp_path.iterdir()) == before
+
+
+def test_relative_names_and_home(given, quick, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert run_colmap(ColmapJob(given, Path("~/a.db"), masks=Path("black")), {}) == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a-report", "a.db", "black"]
+
+
+def test_the_command(given, quick, tmp_path, capsys):
+    out = tmp_path / "static.db"
+    assert main(["segment", "--colmap", str(given), "--out", str(out)]) == 0
+    assert out.exists() and "stand still" in capsys.readouterr().out
+    cases = [
+        (["--out", str(out)], r"static\.db: is there already; choose another name for --out"),
+        ([], "--colmap: where to"),
+        (["m.npz", "--out", "b.db"], r"m\.npz: --colmap .* gives the matches"),
+        (["--out", "b.db", "--images", "l.png", "r.png"], "give the folder of the images"),
+        (["--out", "b.db", "--pair", "book"], "--pair does not go with --colmap"),
+        (["--out", "b.db", "--bodies", "2"], "--bodies 2 does not go with --colmap"),
+    ]
+    for words, said in cases:
+        assert main(["segment", *words, "--colmap", str(given)]) == 2
+        told = capsys.readouterr().err
+        assert re.search(said, told) and told.count("\n") == 1
+    assert main(["segment", "--masks", "black"]) == 2
+    assert "--masks black: it is for --colmap" in capsys.readouterr().err
