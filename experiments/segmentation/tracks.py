@@ -12,8 +12,9 @@ figures are of whole sets.
 - **kt3d**: 12 street sequences of KT3DMoSeg, 10 to 20 frames.  **kt3d_two_views**: their first and last frame only, by
   :func:`dyntorch.segment`: the tracks and bodies that both show.
 - **hopkins**: 86 sequences of Hopkins155.  **mtpv**: 6 of MTPV62; its label 0 is an outlier; "bodies' tracks" leaves these out.
-- **streets**: made by :func:`dyntorch.scenes.streets`, 2 to 4 bodies, 20 frames, 500 tracks.  **other_streets**: of other kinds
-  (``OTHERS``), which nothing was tuned to.  **streets_two_views**: two frames of the streets, 6 apart, by :func:`dyntorch.segment`.
+- **streets**: made by :func:`dyntorch.scenes.streets`, 2 to 4 bodies, 20 frames, 500 tracks, with .5 px of noise; **quiet_streets**
+  with .1.  **other_streets**: of other kinds (``OTHERS``), which nothing was tuned to.  **streets_two_views**: two frames of the
+  streets, 6 apart, by :func:`dyntorch.segment`.
 - **time**: of one call.
 """
 
@@ -179,12 +180,15 @@ def mtpv(config: Config) -> list[Row]:
     return _both(mtpv_tracks()[:: 4 if config.quick else 1], config, Goals(1.0), Goals(3.0))
 
 
-def made_streets(config: Config, options: StreetOptions = LIKE_KITTI, tracks: int = 500, later: int = 0) -> list[Tracks]:
-    """Streets of 2, 3, 4, 2, ... bodies; their seeds begin ``later`` than the configuration says."""
+def made_streets(
+    config: Config, options: StreetOptions = LIKE_KITTI, tracks: int = 500, later: int = 0, sigma: float = 0.5
+) -> list[Tracks]:
+    """Streets of 2, 3, 4, 2, ... bodies with noise ``sigma`` px; their seeds begin ``later`` than the configuration says."""
     found = []
     for number in range(_scenes(config)):
         seed = config.first + later + number
-        street = streets(2 + number % 3, tracks=tracks, options=options, generator=torch.Generator().manual_seed(seed))
+        draw = torch.Generator().manual_seed(seed)
+        street = streets(2 + number % 3, tracks=tracks, sigma=sigma, options=options, generator=draw)
         found.append(Tracks(f"street {seed}: {', '.join(street.kinds)}", street.tracks, street.labels))
     return found
 
@@ -196,6 +200,11 @@ def _scenes(config: Config) -> int:
 def street_table(config: Config) -> list[Row]:
     """Streets like KT3DMoSeg's."""
     return _both(made_streets(config), config, Goals(4.0, 1.0), NO_GOALS)
+
+
+def quiet_streets(config: Config) -> list[Row]:
+    """The same with a noise that is about that of KT3DMoSeg's tracks."""
+    return _both(made_streets(config, sigma=QUIET), config, Goals(4.0, 1.0), NO_GOALS)
 
 
 def other_streets(config: Config) -> list[Row]:
@@ -229,12 +238,15 @@ def durations(config: Config) -> list[Row]:
     return table
 
 
+QUIET = 0.1
+"""px: that of the tracks of KT3DMoSeg at 15 px of motion."""
 TABLES: dict[str, tuple[str, Callable[[Config], list[Row]]]] = {
     "kt3d": ("KT3DMoSeg, whole sequences", kt3d),
     "kt3d_two_views": ("KT3DMoSeg, first and last frame", kt3d_two_views),
     "hopkins": ("Hopkins155, whole sequences", hopkins),
     "mtpv": ("MTPV62, whole sequences", mtpv),
-    "streets": ("Streets of 2 to 4 bodies, 20 frames, 500 tracks", street_table),
+    "streets": ("Streets of 2 to 4 bodies, 20 frames, 500 tracks, noise .5 px", street_table),
+    "quiet_streets": ("The same streets, noise .1 px", quiet_streets),
     "streets_two_views": (f"The same streets, two frames {APART} apart", streets_two_views),
     "other_streets": ("Streets of other kinds, 2 to 4 bodies, 20 frames", other_streets),
     "time": ("Seconds of a call", durations),

@@ -68,6 +68,12 @@ def tracks(motion: str, n: int, views: int, **options: Any) -> tuple[Tensor]:
     return (scenes.lifted(motion, n, views=views, generator=draw(3), **{"sigma": 0.3, **options}).tracks,)
 
 
+def driven() -> tuple[Tensor, Tensor]:
+    """Tracks ``(6, 60, 2)`` of a street with one car, and its cameras."""
+    street = scenes.streets(2, frames=6, tracks=60, sigma=0.1, generator=draw(3))
+    return street.tracks, street.cameras
+
+
 def planes(count: int = 5, bodies: int = 0) -> scenes.TranslatingScene:
     return scenes.translating_planes(count, bodies, sigma=0.1, n=20, generator=draw(2))
 
@@ -289,6 +295,16 @@ VERBS: tuple[Verb, ...] = (
         "segment spatial",
         lambda: scenes.bodies((30, 30), sigma=0.3, generator=draw(1)).views,
         lambda *x: dyn.segment(*x, generator=draw()),
+    ),
+    Verb(
+        "segment_tracks",
+        lambda: driven()[:1],
+        lambda x: dyn.segment_tracks(x, 2, generator=draw()),
+    ),
+    Verb(
+        "segment_tracks cameras",
+        driven,
+        lambda x, cameras: dyn.segment_tracks(x, 2, cameras=cameras, generator=draw()),
     ),
     Verb("translating_planes", lambda: (planes().homographies,), dyn.translating_planes),
     Verb(
@@ -526,6 +542,7 @@ WAITS = {
     **dict.fromkeys(("affine_segmentation", "multibody_matrix"), (1, ASKED)),
     **dict.fromkeys(("trajectory_cameras", "projective_factorization"), (1, LENT)),
     "segment": (2, LENT),
+    "segment_tracks": (2, LENT),
     "reconstruct": (2, LENT),
     "synchronize": (2, LENT),
     "synchronize_cameras": (3, LENT),
@@ -564,6 +581,7 @@ NOT_VERBS = {
             "Segmentation",
             "Shift",
             "Solution",
+            "TrackSegmentation",
             "TranslatingPlanes",
         ),
         "results",

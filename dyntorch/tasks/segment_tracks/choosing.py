@@ -92,7 +92,8 @@ def evidence_of_another(start: Start, fewer: Candidates, more: Candidates, optio
 
     with the excess x, the own cost o and the links l of the two bodies that take the place of one, and the cost that it saves.
     """
-    how, member = options.choice, one_hot(more.labels[0], more.bodies) > 0
+    how = options.choice
+    member = one_hot(more.labels[0], more.bodies) > 0
     before = one_hot(fewer.labels[0], fewer.bodies) > 0
     apart = start.judge.separation(member)
     # the two bodies whose union is most like a body of the other segmentation

@@ -154,7 +154,8 @@ def costs(
 
 def descended(evidence: TrackEvidence, labels: Tensor, bodies: int, options: TrackSegmentOptions) -> Candidates:
     """Labels and epipolar geometries in turns, from several labellings ``(B, n)`` from 0."""
-    how, count = options.descent, len(labels)
+    how = options.descent
+    count = len(labels)
     member = one_hot(labels, bodies).float()
     found = fitted(evidence.pairs, member.flatten(0, 1), (4.0, 1.0))
     geometry = [F.unflatten(0, (count, bodies)) for F in found]

@@ -14,12 +14,9 @@ from dyntorch.geometry.epipolar import null_vector
 from dyntorch.geometry.homogeneous import homogeneous
 from dyntorch.numerics.chi_square import median
 from dyntorch.tasks.segment.search import one_hot
-from dyntorch.tasks.segment_tracks.descent import Candidates, TrackEvidence, fitted, improbable, relief_cost, squares
+from dyntorch.tasks.segment_tracks.descent import Candidates
 from dyntorch.tasks.segment_tracks.frames import Film, Pair
-from dyntorch.tasks.segment_tracks.options import FrameOptions, MergeOptions, TrackSegmentOptions
-
-BLOCK = 16
-"""Groups fitted at a time."""
+from dyntorch.tasks.segment_tracks.options import FrameOptions, MergeOptions
 
 
 def pieces(sparse: Tensor, count: int) -> Tensor:
@@ -46,7 +43,9 @@ class Separation:
         excess: ``(q,)`` what their joint motion costs more than their own ones, for each sighting of the smaller group.
         own: ``(q,)`` what a sighting costs in its own group.
         links: ``(q,)`` links between them, for each track of the smaller group.
-        sightings: ``(q,)`` of the smaller group.
+        met: ``(q,)`` bool, whether they are ever seen together; only then can anything be said.
+
+    The smaller group is that with fewer tracks, or sightings, beside the other one.
     """
 
     first: Tensor
@@ -54,11 +53,13 @@ class Separation:
     excess: Tensor
     own: Tensor
     links: Tensor
-    sightings: Tensor
+    met: Tensor
 
     def value(self, weight: float, options: MergeOptions) -> Tensor:
         r"""``(q,)``, large for groups that are surely two bodies: :math:`\log(1 + x / (o + f)) - w \log(l + l_0)`."""
-        return self.ratio(options) - weight * torch.log(self.links + options.unlinked)
+        value = self.ratio(options) - weight * torch.log(self.links + options.unlinked)
+        # groups that never meet are one body only if others join them
+        return torch.where(self.met, value, options.never)
 
     def ratio(self, options: MergeOptions) -> Tensor:
         r"""``(q,)`` what joining costs beside what the groups cost: :math:`\log(1 + x / (o + f))`."""
@@ -72,77 +73,69 @@ class NearPairs:
     fits.  No rank is enforced: a group that is a plane leaves a family of matrices, all of which fit.
     """
 
-    def __init__(self, film: Film, pairs: Sequence[Pair], options: FrameOptions, cap: float) -> None:
+    def __init__(self, film: Film, pairs: Sequence[Pair], frames: FrameOptions, options: MergeOptions) -> None:
         """Of pairs of frames ``(p, 2)``."""
-        self.cap = cap
+        self.options = options
         first, second = torch.tensor(list(pairs), device=film.x.device).reshape(-1, 2).unbind(-1)
         x1, x2 = film.x[first], film.x[second]
         self.seen = film.seen[first] & film.seen[second]
         moved = (x2 - x1).norm(dim=-1) / film.pixel
-        self.precision = self.seen / (1 + moved / options.grows) / film.pixel**2
+        self.precision = self.seen / (1 + moved / frames.grows) / film.pixel**2
         self.first, self.second = homogeneous(x1), homogeneous(x2)
         rows = (self.second[..., :, None] * self.first[..., None, :]).flatten(-2)
         self.rows = rows  # (p, n, 9)
         self.upper = torch.triu_indices(9, 9, device=film.x.device)
-        self.products = rows[..., self.upper[0]] * rows[..., self.upper[1]]
         self.count = self.seen.sum(0).double()
 
-    def squares(self, groups: Tensor, scale: float, rounds: int = 2) -> Tensor:
-        """Squared distances ``(p, g, n)`` in pixels at rest of all tracks from the motions of groups ``(g, n)`` bool.
+    def squares(self, group: Tensor, scale: float, rounds: int = 2) -> tuple[Tensor, Tensor]:
+        """Squared distances in pixels at rest of the tracks of a group ``(n,)`` bool from its motion.
 
         Args:
-            groups: of tracks.
+            group: of tracks.
             scale: of the distances that count in the fits, pixels at rest.
             rounds: of weights.
+
+        Returns:
+            ``(q, m)`` for the pairs that show some of its tracks, and which are seen there.
         """
-        member = groups.double() * self.seen[:, None].double()
-        weight = member
-        square = member
+        index = group.nonzero().flatten()
+        live = (self.seen[:, index].sum(-1) >= self.options.together).nonzero().flatten()
+        member = self.seen[live][:, index].double()
+        rows = self.rows[live][:, index]
+        products = rows[..., self.upper[0]] * rows[..., self.upper[1]]
+        first, second = self.first[live][:, index], self.second[live][:, index]
+        precision = self.precision[live][:, index]
+        weight = square = member
         for remaining in range(rounds, -1, -1):
-            F = self._least(weight)
-            value, gradient = F @ self.rows.mT, self._gradient(F.unflatten(-1, (3, 3)))
-            square = value.square() / gradient * self.precision[:, None]
+            F = self._least(weight, products)
+            matrix = F.unflatten(-1, (3, 3))
+            there, here = first @ matrix[:, :2].mT, second @ matrix[:, :, :2]
+            gradient = (there.square().sum(-1) + here.square().sum(-1)).clamp(min=1e-12)
+            square = (rows @ F[..., None])[..., 0].square() / gradient * precision
             if remaining:
                 weight = member / (gradient * (1 + square / (4 * scale**2)).square())
                 weight = weight / weight.amax(-1, keepdim=True).clamp(min=1e-200)
-        return square
+        return square, member > 0
 
-    def costs(self, groups: Tensor, scale: float) -> Tensor:
-        """Costs ``(g,)`` of groups ``(g, n)`` bool: the squared distances of all sightings over the noise, each at most the cap."""
-        square = (self.squares(groups, scale) / scale**2).clamp(max=self.cap)
-        return (square * (groups & self.seen[:, None])).sum((0, 2))
-
-    def _least(self, weight: Tensor) -> Tensor:
-        """Unit vectors ``(p, g, 9)`` of least squares."""
-        sums = weight @ self.products
+    def _least(self, weight: Tensor, products: Tensor) -> Tensor:
+        """Unit vectors ``(q, 9)`` of least squares."""
+        sums = (weight[:, None] @ products)[:, 0]
         gram = sums.new_zeros(*sums.shape[:-1], 9, 9)
         gram[..., self.upper[0], self.upper[1]] = sums
         gram[..., self.upper[1], self.upper[0]] = sums
         return null_vector(gram)
 
-    def _gradient(self, F: Tensor) -> Tensor:
-        """Squared gradients ``(p, g, n)`` of the constraint."""
-        there, here = F[..., :2, :] @ self.first.mT[:, None], F.mT[..., :2, :] @ self.second.mT[:, None]
-        return (there.square().sum(-2) + here.square().sum(-2)).clamp(min=1e-12)
+    def meetings(self, groups: Tensor) -> tuple[Tensor, Tensor]:
+        """Tracks of each group ``(g, n)`` that are seen beside others of each group, and their sightings there, ``(g, g)`` both."""
+        member, seen = groups.double(), self.seen.double()
+        there = ((seen @ member.mT) >= self.options.together).double()  # (p, g)
+        beside = ((seen.mT @ there) > 0).double()  # (n, g)
+        return member @ beside, member @ seen.mT @ there
 
-
-class FarPairs:
-    """Most likely fits of groups of tracks between frames of any distance, with the relief of each group: exact, and slow."""
-
-    def __init__(self, evidence: TrackEvidence, options: TrackSegmentOptions) -> None:
-        """Of pairs of frames and links."""
-        self.pairs, self.count, self.options = evidence.pairs, evidence.count, options
-
-    def costs(self, groups: Tensor, scale: float) -> Tensor:
-        """Costs ``(g,)`` of groups ``(g, n)`` bool, as in the energy of a segmentation."""
-        how = self.options.descent
-        fine = max(how.fit_scale * scale, how.least_fit_scale)
-        total = torch.zeros(len(groups), dtype=torch.float64, device=groups.device)
-        for pair, F in zip(self.pairs, fitted(self.pairs, groups, (4.0, 1.0, fine)), strict=True):
-            member = groups[:, pair.index].double()
-            cost = improbable(squares(pair, F) / scale**2, how) + how.relief * relief_cost(pair, F, member, self.options.views)
-            total += (cost * member).sum(-1)
-        return total
+    def cost(self, group: Tensor, scale: float) -> float:
+        """Cost of a group ``(n,)`` bool: the squared distances of all sightings over the noise, each at most the cap."""
+        square, seen = self.squares(group, scale)
+        return float(((square / scale**2).clamp(max=self.options.cap) * seen).sum())
 
 
 @dataclass
@@ -156,7 +149,7 @@ class Judge:
         options: of all stages.
     """
 
-    near: NearPairs | FarPairs
+    near: NearPairs
     alike: Tensor
     scale: float
     options: MergeOptions
@@ -165,34 +158,34 @@ class Judge:
     @staticmethod
     def of(near: NearPairs, kernel: Tensor, groups: Tensor, options: MergeOptions) -> Judge:
         """With the noise of groups ``(g, n)`` bool that are surely pure."""
-        square = near.squares(groups, options.first_scale)
-        noise = (float(square[(groups & near.seen[:, None])].median()) / median(1)) ** 0.5
+        found = [near.squares(group, options.first_scale) for group in groups]
+        own = torch.cat([square[seen] for square, seen in found])
+        noise = (float(own.median()) / median(1)) ** 0.5 if len(own) else options.first_scale
         alike = (kernel - options.chance).clamp(min=0)
         return Judge(near, alike, options.widened * max(noise, options.least_scale), options)
 
     def cost(self, groups: Tensor) -> Tensor:
         """``(g,)`` of groups ``(g, n)`` bool."""
         names = [group.cpu().numpy().tobytes() for group in groups]
-        fresh = [place for place, name in enumerate(names) if name not in self.known]
-        for some in [fresh[start : start + BLOCK] for start in range(0, len(fresh), BLOCK)]:
-            total = self.near.costs(groups[some], self.scale)
-            self.known.update(zip((names[place] for place in some), total.tolist(), strict=True))
+        for name, group in zip(names, groups, strict=True):
+            if name not in self.known:
+                self.known[name] = self.near.cost(group, self.scale)
         return torch.tensor([self.known[name] for name in names], dtype=torch.float64, device=groups.device)
 
     def separation(self, groups: Tensor) -> Separation:
         """Of all pairs of groups ``(g, n)`` bool."""
         first, second = torch.triu_indices(len(groups), len(groups), 1, device=groups.device)
         alone, joint = self.cost(groups), self.cost(groups[first] | groups[second])
-        member = groups.double()
-        size, seen = member.sum(-1), (member @ self.near.count).clamp(min=1.0)
+        size, seen = self.near.meetings(groups)
         between = (groups.float() @ self.alike @ groups.float().mT).double()
+        either, other = (first, second), (second, first)
         return Separation(
             first=first,
             second=second,
-            excess=(joint - alone[first] - alone[second]) / torch.minimum(seen[first], seen[second]),
-            own=(alone[first] + alone[second]) / (seen[first] + seen[second]),
-            links=between[first, second] / torch.minimum(size[first], size[second]).clamp(min=1.0),
-            sightings=torch.minimum(seen[first], seen[second]),
+            excess=(joint - alone[first] - alone[second]) / torch.minimum(seen[either], seen[other]).clamp(min=1.0),
+            own=(alone[first] + alone[second]) / (seen.diagonal()[first] + seen.diagonal()[second]).clamp(min=1.0),
+            links=between[first, second] / torch.minimum(size[either], size[other]).clamp(min=1.0),
+            met=torch.minimum(seen[either], seen[other]) > 0,
         )
 
 

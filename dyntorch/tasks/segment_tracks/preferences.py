@@ -73,7 +73,9 @@ def _preferred(both: FramePair, own: Tensor, generator: torch.Generator | None, 
         _epipolar(fundamental_of_eight(a, b), x1, x2),
     ]
     few = max(1, round(options.preferred * len(sample)))
-    liked = [(square <= square.kthvalue(few, dim=0, keepdim=True).values).float() for square in squares]
+    # exactly so many, also where several fit alike
+    best = [square.topk(few, dim=0, largest=False).indices for square in squares]
+    liked = [torch.zeros_like(square).scatter_(0, index, 1.0) for square, index in zip(squares, best, strict=True)]
     return torch.cat(liked).mT / (3 * few) ** 0.5
 
 
@@ -125,9 +127,11 @@ def fundamental_of_eight(x1: Tensor, x2: Tensor) -> Tensor:
 def _transfer(H: Tensor, x1: Tensor, x2: Tensor) -> Tensor:
     """Squared distances ``(h, m)`` in the second frame."""
     mapped = (H @ homogeneous(x1).mT).float()
-    depth = torch.where(mapped[:, 2].abs() < 1e-9, 1e-9, mapped[:, 2])
+    finite = mapped[:, 2].abs() > 1e-9
+    depth = torch.where(finite, mapped[:, 2], 1.0)
     x, y = x2.float().mT
-    return ((mapped[:, 0] / depth - x).square() + (mapped[:, 1] / depth - y).square()).nan_to_num(nan=1e30, posinf=1e30)
+    square = (mapped[:, 0] / depth - x).square() + (mapped[:, 1] / depth - y).square()
+    return torch.where(finite, square, 1e30).nan_to_num(nan=1e30, posinf=1e30)
 
 
 def _epipolar(F: Tensor, x1: Tensor, x2: Tensor) -> Tensor:

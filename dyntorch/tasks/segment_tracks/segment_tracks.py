@@ -86,10 +86,10 @@ def segment_tracks(
         >>> import torch, dyntorch as dyn
         >>> from dyntorch import scenes
         >>> draw = torch.Generator().manual_seed(0)
-        >>> street = scenes.streets(bodies=2, frames=8, tracks=120, generator=draw)
+        >>> street = scenes.streets(bodies=2, frames=10, tracks=150, sigma=0.1, generator=draw)
         >>> found = dyn.segment_tracks(street.tracks, bodies=2, generator=draw)
         >>> tuple(found.labels.shape), int(found.bodies)
-        ((120,), 2)
+        ((150,), 2)
     """
     check_threshold(threshold)
     check_options(options, TrackSegmentOptions)
@@ -121,9 +121,12 @@ def _check(tracks: Tensor, bodies: int | None, cameras: Tensor | None, generator
         )
     if bodies is not None and (isinstance(bodies, bool) or not isinstance(bodies, int) or bodies < 1):
         raise ValueError(f"bodies must be a positive whole number, or None to find out, got {bodies!r}")
-    if cameras is not None and (not isinstance(cameras, Tensor) or cameras.shape[-3:] != (tracks.shape[-3], 3, 4)):
+    shapes = [(*batch, tracks.shape[-3], 3, 4) for batch in ((), tracks.shape[:-3])]
+    if cameras is not None and (not isinstance(cameras, Tensor) or tuple(cameras.shape) not in shapes):
         shape = tuple(cameras.shape) if isinstance(cameras, Tensor) else type(cameras).__name__
         raise ValueError(f"cameras must be (*batch, {tracks.shape[-3]}, 3, 4), a projection for every frame, got {shape}")
+    if cameras is not None and not bool(cameras.isfinite().all()):
+        raise ValueError("cameras hold numbers that are not finite; give the projection of every frame, or none")
     if generator is not None and not isinstance(generator, torch.Generator):
         raise ValueError(f"generator must be a torch.Generator or None, got {generator!r}; use torch.Generator().manual_seed(0)")
 
@@ -194,7 +197,7 @@ def _start(film: Film, frames: Sequence[tuple[int, int]], kernel: Tensor, search
     pairs = [part.pair(pair, options.frames) for pair in frames]
     evidence = TrackEvidence.of(pairs, links_of(sparse, options.preferences.cut))
     beside = pairs_near(part, options.merge.gaps, options.merge.starts, options.preferences.common)
-    near = NearPairs(part, beside or frames, options.frames, options.merge.cap)
+    near = NearPairs(part, beside or frames, options.frames, options.merge)
     least, most = request.bodies or 1, max(1, len(searched) // options.merge.members)
     cuts = [pieces(sparse, max(min(number, most), min(least, most))) for number in options.merge.pieces]
     judge = Judge.of(near, inner, one_hot(cuts[0], int(cuts[0].max()) + 1) > 0, options.merge)
