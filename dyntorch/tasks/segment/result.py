@@ -32,6 +32,12 @@ class SegmentNotice(NoticeCode):
         "{value:# body explains|# bodies explain} the matches no worse than {asked}: one may be a part of another; ask for fewer",
     )
     """Fewer bodies than were asked for explain the matches as well."""
+    UNDECIDED = (
+        "undecided",
+        "two views hardly decide: another segmentation costs {value:.2g} more, and from 1 on it would be clear; follow the points "
+        "through more frames (segment_tracks)",
+    )
+    """Another segmentation costs about as much."""
     REPEATED = (
         "repeated",
         "a share of {value:.2g} of the matches repeats others and says nothing new; remove repeated matches",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from math import prod
+from math import inf, prod
 
 import torch
 from torch import Tensor
@@ -47,6 +47,8 @@ class Best:
     spare: bool = False
     further: Candidate | None = None
     """The best segmentation into one body more, where their number was open."""
+    rival: float = inf
+    """What the best other segmentation into as many costs more, in units of the root of the number of matches."""
 
 
 def best(search: Search, matches: int, bodies: int | None, penalty: float, options: SegmentOptions) -> Best | None:
@@ -57,32 +59,46 @@ def best(search: Search, matches: int, bodies: int | None, penalty: float, optio
     """
     room = max(1, matches // LEAST)
     known: dict[int, Candidate] = {}
+    rivals: dict[int, float] = {}
 
     def penalized(count: int) -> float:
         return known[count].energy + penalty * count * matches**0.5
 
+    def cheapest(counts: Sequence[int]) -> dict[int, Candidate]:
+        found = {count: candidates for count, candidates in search(counts).items() if candidates}
+        rivals.update({count: _rival(candidates, options) / matches**0.5 for count, candidates in found.items()})
+        return {count: candidates[0] for count, candidates in found.items()}
+
     if bodies is not None:
         for count in range(min(bodies, room), 0, -1):
             # one body fewer tells whether so many were needed
-            known |= _cheapest(search(range(max(1, count - 1), count + 1)))
+            known |= cheapest(range(max(1, count - 1), count + 1))
             if count in known:
-                return Best(known[count], count > 1 and count - 1 in known and penalized(count - 1) < penalized(count))
+                spare = count > 1 and count - 1 in known and penalized(count - 1) < penalized(count)
+                return Best(known[count], spare, rival=rivals[count])
         return None
     top = 0
     while top < min(room, options.count.most):
         last, top = top, min(top + (options.count.further if top else options.count.first), room, options.count.most)
-        known |= _cheapest(search(range(last + 1, top + 1)))
+        known |= cheapest(range(last + 1, top + 1))
         chosen = min(known, key=penalized, default=0)
         if chosen < top:
             break
     if not known:
         return None
     count = min(known, key=penalized)
-    return Best(known[count], further=known.get(count + 1))
+    return Best(known[count], further=known.get(count + 1), rival=rivals[count])
 
 
-def _cheapest(found: dict[int, list[Candidate]]) -> dict[int, Candidate]:
-    return {count: candidates[0] for count, candidates in found.items() if candidates}
+def _rival(candidates: Sequence[Candidate], options: SegmentOptions) -> float:
+    """What the best segmentation costs more that is another one than the best of all, not the same with a few other labels."""
+    best = candidates[0]
+    member = one_hot(best.labels, len(best.fundamentals))
+    for other in candidates[1:]:
+        shared = member @ one_hot(other.labels, len(other.fundamentals)).mT
+        if float(shared.amax(0).sum()) < options.count.same * len(best.labels):
+            return other.energy - best.energy
+    return inf
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -146,6 +162,7 @@ class SegmentedProblem:
         linked: share of matches that move like neighbours of theirs.
         spare: whether fewer bodies than were asked for explain the matches as well.
         coarse: the threshold over the spread of the points, where it is too large to tell anything; else 0.
+        rival: what the best other segmentation costs more, in units of the root of the number of matches.
     """
 
     labels: Tensor
@@ -161,6 +178,7 @@ class SegmentedProblem:
     linked: float
     spare: bool = False
     coarse: float = 0.0
+    rival: float = inf
 
     @property
     def count(self) -> int:
@@ -249,6 +267,8 @@ def segmentation_notices(
         # where a body got lost, the notice above says so
         spare = torch.tensor([outcome.spare for outcome in found]) & (count == bodies)
         note(SegmentNotice.SPARE_BODY, count - 1, spare, asked=bodies)
+    rival = torch.tensor([outcome.rival for outcome in found])
+    note(SegmentNotice.UNDECIDED, rival, tried & (count > 1) & (rival < options.count.decided))
     note(SegmentNotice.REPEATED, repeated, repeated > options.input.repeated)
     note(SegmentNotice.INCOHERENT, linked, tried & spatial & (linked < options.input.sparse))
     return tuple(said)
@@ -328,7 +348,7 @@ def _solve(
         # matches that move like their neighbours and fit no body: there is another one, which the truncated distances hid
         other = _labelled(given, chosen.further, request, options)
         labelled = other if _left(given, other) < 0.5 * left else labelled
-    return outcome(given, labelled, threshold, request.bodies, chosen.spare, options)
+    return replace(outcome(given, labelled, threshold, request.bodies, chosen.spare, options), rival=chosen.rival)
 
 
 def _labelled(given: GivenMatches, candidate: Candidate, request: Request, options: SegmentOptions) -> Labelling:

@@ -137,9 +137,9 @@ class ChoiceOptions:
     """Weight of the links cut between the least separate bodies."""
     energy: float = 0.5
     """Weight of the cost of a segmentation, for each of its tracks."""
-    base: float = -5.4
+    base: float = -5.7
     """Logarithm of the odds of one body more, without what follows."""
-    ratio: float = 0.26
+    ratio: float = 0.4
     """Weight of what one motion of both costs beside two."""
     unlinked: float = 1.6
     """Weight of the logarithm of the links between them, for each track of the smaller one."""

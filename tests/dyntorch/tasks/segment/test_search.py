@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from math import inf
+
 import pytest
 import torch
 
 from dyntorch import scenes
+from dyntorch.core.outcome import Status
 from dyntorch.geometry.epipolar import sampson_squared
 from dyntorch.metrics import misclassification
 from dyntorch.tasks.segment.coherence import coherence
 from dyntorch.tasks.segment.energy import View, energy
 from dyntorch.tasks.segment.options import SegmentOptions
-from dyntorch.tasks.segment.search import search
+from dyntorch.tasks.segment.result import BodyModel
+from dyntorch.tasks.segment.search import Candidate, search
+from dyntorch.tasks.segment.segment import best, nothing, segmentation_notices
 
 F64 = torch.float64
 SCALE = 1 / 200
@@ -84,3 +90,25 @@ def test_randomness_comes_from_the_generator():
     for count in (2, 3):
         assert [c.energy for c in first[count]] == [c.energy for c in second[count]]
         assert all(torch.equal(a.labels, b.labels) for a, b in zip(first[count], second[count], strict=True))
+
+
+@pytest.mark.parametrize(("moved", "costs", "rival"), [(0, 5.0, inf), (4, 5.0, inf), (40, 5.0, 0.5), (40, 30.0, 3.0)])
+def test_another_segmentation_of_little_more_cost_is_a_rival(moved, costs, rival):
+    """Not the same one with a few other labels; in units of the root of the number of matches."""
+    labels = torch.arange(100) % 2
+    other = torch.where(torch.arange(100) < moved, 1 - labels, labels)
+    pair = torch.zeros(2, 3, 3, dtype=torch.float64)
+
+    def search(counts):
+        return {count: [Candidate(100.0, labels, pair), Candidate(100.0 + costs, other, pair)] for count in counts if count == 2}
+
+    chosen = best(search, 100, 2, penalty=4.5, options=SegmentOptions())
+    assert chosen is not None and chosen.rival == pytest.approx(rival)
+
+
+@pytest.mark.parametrize(("rival", "said"), [(0.5, True), (3.0, False), (inf, False)])
+def test_two_views_that_hardly_decide_say_so(rival, said):
+    problem = nothing(torch.ones(30, dtype=F64), 2.5, Status.OK, 0.0, 1.0)
+    problem = replace(problem, models=(BodyModel.FUNDAMENTAL,) * 2, rival=rival)
+    told = [str(notice) for notice in segmentation_notices([problem], None, (), SegmentOptions())]
+    assert any("through more frames" in text for text in told) is said
