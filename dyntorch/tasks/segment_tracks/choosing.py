@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from math import log1p
 
@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from dyntorch.tasks.segment.search import one_hot
-from dyntorch.tasks.segment_tracks.descent import Candidates, TrackEvidence, descended
+from dyntorch.tasks.segment_tracks.descent import Candidates, TrackEvidence, descended, energy
+from dyntorch.tasks.segment_tracks.exchange import Exchanges
 from dyntorch.tasks.segment_tracks.merging import Judge, merged, weakest_separation
 from dyntorch.tasks.segment_tracks.options import TrackSegmentOptions
 
@@ -36,25 +37,40 @@ class Start:
         most = max(int(cut.max()) + 1 for cut in self.cuts)
         return [merged(self.judge, cut, range(1, most + 1)) for cut in self.cuts]
 
-    def best(self, bodies: int, options: TrackSegmentOptions) -> Candidates | None:
-        """The best segmentation into so many bodies: separate, and of little cost; None where there is none."""
+    def best(self, bodies: int, options: TrackSegmentOptions, thorough: bool = False) -> Candidates | None:
+        """The best segmentation into so many bodies: separate, and of little cost; None where there is none.
+
+        Args:
+            bodies: how many.
+            options: of all stages.
+            thorough: let the bodies exchange pieces first, and weigh relief less in the comparison.
+        """
         starts = [tree[bodies] for tree in self.trees if bodies in tree]
         if not starts:
             return None
+        if thorough and bodies > 1:
+            for cut, tree in zip(self.cuts, self.trees, strict=True):
+                if bodies in tree:
+                    exchanges = Exchanges(self.evidence, cut, options)
+                    starts += [exchanges.improved(tree[bodies], weight) for weight in options.exchange.weights]
         distinct = [x for place, x in enumerate(starts) if not any(torch.equal(x, other) for other in starts[:place])]
         found = descended(self.evidence, torch.stack(distinct), bodies, options)
-        count = len(self.evidence.count)
-
-        def value(which: int) -> float:
-            one = found.of(which)
-            if not bool(one.energy.isfinite()):
-                return float("-inf")
-            apart = weakest_separation(self.judge, one, options.choice.links) if bodies > 1 else 0.0
-            return apart - options.choice.energy * float(one.energy) / count
-
-        values = [value(which) for which in range(len(distinct))]
+        values = [self._value(found.of(which), options, thorough) for which in range(len(distinct))]
         best = max(range(len(values)), key=values.__getitem__)
         return found.of(best) if values[best] > float("-inf") else None
+
+    def _value(self, one: Candidates, options: TrackSegmentOptions, thorough: bool) -> float:
+        """How good a segmentation is beside others into as many bodies."""
+        if not bool(one.energy.isfinite()):
+            return float("-inf")
+        apart = weakest_separation(self.judge, one, options.choice.links) if one.bodies > 1 else 0.0
+        count = len(self.evidence.count)
+        if not thorough:
+            return apart - options.choice.energy * float(one.energy) / count
+        plain = replace(options, descent=replace(options.descent, relief=options.exchange.relief))
+        cost = energy(self.evidence, one.geometry, one.labels, one.scale, plain)
+        cut = self.evidence.links.cut(one_hot(one.labels, one.bodies).double())
+        return options.exchange.apart * apart - float(cost + (options.exchange.links - 1) * cut) / count
 
 
 @dataclass(frozen=True)
@@ -69,7 +85,7 @@ def bodies_of(start: Start, bodies: int | None, options: TrackSegmentOptions) ->
     """The best segmentation into ``bodies``, or fewer where there are no so many; for None into as many as there are."""
     if bodies is not None:
         for number in range(bodies, 0, -1):
-            found = start.best(number, options)
+            found = start.best(number, options, thorough=True)
             if found is not None:
                 fewer = start.best(number - 1, options) if number > 1 else None
                 return Chosen(found, fewer is not None and evidence_of_another(start, fewer, found, options) < 0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -189,11 +189,7 @@ class Judge:
         )
 
 
-Apart = Callable[[Separation], Tensor]
-"""How separate pairs of groups are, ``(q,)``."""
-
-
-def merged(judge: Judge, labels: Tensor, counts: Sequence[int], apart: Apart | None = None) -> dict[int, Tensor]:
+def merged(judge: Judge, labels: Tensor, counts: Sequence[int]) -> dict[int, Tensor]:
     """Labels ``(n,)`` from 0 with each number of bodies, from pieces ``(n,)`` that are joined one pair after the other.
 
     The least separate pair of all is joined first.
@@ -207,8 +203,7 @@ def merged(judge: Judge, labels: Tensor, counts: Sequence[int], apart: Apart | N
         if len(groups) <= max(1, min(counts)):
             return found
         pairs = judge.separation(groups)
-        value = pairs.value(judge.options.links, judge.options) if apart is None else apart(pairs)
-        weakest = int(value.argmin())
+        weakest = int(pairs.value(judge.options.links, judge.options).argmin())
         one, other = int(pairs.first[weakest]), int(pairs.second[weakest])
         rest = torch.ones(len(groups), dtype=torch.bool, device=groups.device)
         rest[[one, other]] = False

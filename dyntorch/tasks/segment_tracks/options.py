@@ -126,6 +126,27 @@ class TrackDescentOptions:
 
 
 @dataclass(frozen=True)
+class ExchangeOptions:
+    """How bodies exchange pieces where their number is given, and which of the segmentations that come of it is the best."""
+
+    weights: tuple[float, ...] = (1.0, 3.0)
+    """Weights of the links cut, over that in the descent, one search each: either finds segmentations that the other misses."""
+    links: float = 3.0
+    """Their weight in the comparison: at 1, bodies that share an epipolar geometry swallow parts of each other."""
+    fit_scales: tuple[float, float] = (4.0, 1.0)
+    """Scales of the fits of sets of pieces, one after the other, pixels."""
+    most: int = 12
+    """Exchanges at most."""
+    gain: float = 1e-6
+    """Cost that an exchange must save."""
+    apart: float = 0.5
+    """Weight of the separation of the least separate bodies beside the cost of a segmentation for each of its tracks."""
+    relief: float = 0.04
+    """Weight of the parallax in that cost: on streets relief prefers halves of what rests to bodies; without it, one of six
+    sequences of MTPV62 comes out wrong."""
+
+
+@dataclass(frozen=True)
 class ChoiceOptions:
     """Which of several segmentations is the best, and how many bodies there are.
 
@@ -183,6 +204,7 @@ class TrackSegmentOptions:
     frames: FrameOptions = FrameOptions()
     preferences: PreferenceOptions = PreferenceOptions()
     merge: MergeOptions = MergeOptions()
+    exchange: ExchangeOptions = ExchangeOptions()
     descent: TrackDescentOptions = TrackDescentOptions()
     choice: ChoiceOptions = ChoiceOptions()
     outliers: StrayOptions = StrayOptions()

@@ -176,14 +176,3 @@ def test_merged_labels_are_nested_and_end_at_the_bodies():
     truth = scene.labels[:, None] == scene.labels
     assert bool(((found[3][:, None] == found[3]) == truth).all())
     assert sorted(merged(judge, halves(scene), [2, 4])) == [2, 4]
-
-
-def test_what_is_joined_first_may_be_said():
-    scene = shot((40, 40), sigma=0.1)
-    judge = judge_of(scene, halves(scene))
-
-    def fewest_links(apart):
-        return -apart.links
-
-    found = merged(judge, halves(scene), [2], fewest_links)
-    assert sorted(found) == [2] and found[2].dtype == torch.long

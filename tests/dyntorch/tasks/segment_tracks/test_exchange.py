@@ -1,0 +1,55 @@
+"""Bodies that exchange pieces: wrong joinings are mended, and right ones stay."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+import dyntorch as dyn
+from dyntorch.metrics import misclassification
+from dyntorch.tasks.segment_tracks.descent import TrackEvidence, unlinked
+from dyntorch.tasks.segment_tracks.exchange import Exchanges
+from dyntorch.tasks.segment_tracks.frames import Film, chosen_pairs
+from tests.dyntorch.tasks.segment_tracks.films import shot
+
+OPTIONS = dyn.TrackSegmentOptions()
+COUNTS = (48, 40)
+
+
+def exchanges() -> tuple[Exchanges, torch.Tensor, torch.Tensor]:
+    """Of six pieces, three of each of two bodies, without links: the labels of the pieces and of the bodies, from 0."""
+    scene = shot(COUNTS, frames=6, sigma=0.1)
+    film = Film.of(scene.tracks, 2.5)
+    pairs = [film.pair(pair, OPTIONS.frames) for pair in chosen_pairs(film, OPTIONS.frames)]
+    evidence = TrackEvidence.of(pairs, unlinked(sum(COUNTS), film.x.device))
+    truth = scene.labels - 1
+    place = torch.cat([torch.arange(count) * 3 // count for count in COUNTS])
+    return Exchanges(evidence, 3 * truth + place, OPTIONS), 3 * truth + place, truth
+
+
+@pytest.mark.parametrize("weight", OPTIONS.exchange.weights)
+@pytest.mark.parametrize("wrong", [(), (1,), (0, 4)])
+def test_pieces_in_the_wrong_body_are_put_right(wrong, weight):
+    search, pieces, truth = exchanges()
+    labels = truth.clone()
+    for piece in wrong:
+        labels[pieces == piece] = 1 - labels[pieces == piece]
+    found = search.improved(labels, weight)
+    assert float(misclassification(found + 1, truth + 1)) == 0.0
+
+
+def test_bodies_stay_as_many_as_they_are():
+    search, _, truth = exchanges()
+    few = Exchanges(search.evidence, search.cut, replace(OPTIONS, exchange=replace(OPTIONS.exchange, most=1)))
+    for one in (search, few):
+        assert len(one.improved(1 - truth, 1.0).unique()) == 2
+
+
+def test_sets_of_pieces_are_fitted_once():
+    search, _, truth = exchanges()
+    search.improved(truth, 1.0)
+    known = dict(search.known)
+    search.improved(truth, 1.0)
+    assert search.known == known
