@@ -99,7 +99,7 @@ def test_tables_count_errors_and_bodies(told, tmp_path, capsys):
 
 def test_other_streets_are_of_other_kinds(told, tmp_path, monkeypatch):
     monkeypatch.setattr(experiment, "OTHERS", {"night": (120, StreetOptions(texture=0.15))})
-    experiment.run(experiment.Config(only=("other_streets",), scenes=2, quick=True, out=tmp_path / "out.json"))
+    experiment.run(experiment.Config(only=("other_streets",), scenes=6, quick=True, out=tmp_path / "out.json"))
     (rows,) = json.loads((tmp_path / "out.json").read_text())["tables"].values()
     assert rows[0]["task"] == "night, K known, mean error" and rows[0]["measured"] == pytest.approx(100 * WRONG / 120)
     assert [ask for ask in told if ask[1] is not None] == [(120, 2), (120, 3)]
