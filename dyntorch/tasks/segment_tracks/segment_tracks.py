@@ -91,6 +91,10 @@ def segment_tracks(
         >>> tuple(found.labels.shape), int(found.bodies)
         ((150,), 2)
     """
+    if threshold is None:
+        raise ValueError(
+            "threshold must be a positive distance in the unit of the tracks, got None; 2.5 is right for most trackers"
+        )
     check_threshold(threshold)
     check_options(options, TrackSegmentOptions)
     _check(tracks, bodies, cameras, generator)

@@ -344,6 +344,7 @@ GOOD = shot((8,), frames=4).tracks
         (GOOD, {"bodies": 0}, "bodies must be a positive whole number, or None.*got 0"),
         (GOOD, {"bodies": 2.0}, "bodies must be a positive whole number.*got 2.0"),
         (GOOD, {"bodies": True}, "bodies must be a positive whole number.*got True"),
+        (GOOD, {"threshold": None}, "threshold.*None"),
         (GOOD, {"threshold": 0.0}, "threshold.*0.0"),
         (GOOD, {"threshold": float("nan")}, "threshold.*nan"),
         (GOOD, {"cameras": torch.zeros(3, 3, 4)}, r"cameras must be \(\*batch, 4, 3, 4\).*got \(3, 3, 4\)"),
