@@ -142,6 +142,11 @@ def _epipolar(F: Tensor, x1: Tensor, x2: Tensor) -> Tensor:
     return value.square() / (lines[:, :2].square().sum(-2) + others.square().sum(-2)).clamp(min=1e-30)
 
 
+def common_share(kernel: Tensor) -> float:
+    """How much the usual track has in common with the five that move most like it, from a kernel ``(n, m)``."""
+    return float(kernel.topk(min(5, kernel.shape[1]), dim=-1).values.mean(-1).median())
+
+
 def strongest(kernel: Tensor, neighbours: int) -> Tensor:
     """A symmetric kernel ``(m, m)`` with the largest entries of every row or column alone."""
     kept = min(neighbours, len(kernel) - 1)

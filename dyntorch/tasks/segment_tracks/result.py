@@ -43,6 +43,13 @@ class TrackNotice(NoticeCode):
         Status.DEGENERATE,
     )
     """The frames show two scenes."""
+    INCOHERENT = (
+        "incoherent",
+        "the tracks move each by itself: a usual one has {value:.0%} of what it prefers in common with the most alike, as random "
+        "tracks have; clean the tracks, or follow more points",
+        Status.NO_CONSENSUS,
+    )
+    """Tracks have no motion in common."""
     FEWER_BODIES = (
         "fewer_bodies",
         "{asked:# body was|# bodies were} asked for, the tracks carry {value:g}; ask for fewer, or give more tracks of the others",

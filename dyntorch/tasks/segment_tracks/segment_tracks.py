@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from math import log
 from typing import Any
 
 import torch
@@ -22,7 +23,7 @@ from dyntorch.tasks.segment_tracks.frames import Film, FramePair, chosen_pairs, 
 from dyntorch.tasks.segment_tracks.labels import agreeing, distances, motions, outliers, resting
 from dyntorch.tasks.segment_tracks.merging import Judge, NearPairs, pieces
 from dyntorch.tasks.segment_tracks.options import TrackSegmentOptions
-from dyntorch.tasks.segment_tracks.preferences import links_of, preference_kernel, strongest
+from dyntorch.tasks.segment_tracks.preferences import common_share, links_of, preference_kernel, strongest
 from dyntorch.tasks.segment_tracks.result import TrackNotice, TrackSegmentation
 
 
@@ -155,6 +156,10 @@ def _solve(tracks: Tensor, cameras: Tensor | None, request: TrackRequest) -> Tra
     # 2. which tracks move alike, and the bodies of those that are searched
     searched = _searched(film, request)
     kernel = preference_kernel(film, searched, request.generator, options.frames, options.preferences)
+    alike = common_share(kernel[searched])
+    how = options.preferences
+    if alike < how.coherent + how.coherent_grows * log(len(searched)):
+        return _nothing(count, request, [Notice(TrackNotice.INCOHERENT, alike)])
     start = _start(film, frames, kernel, searched, request)
     chosen = bodies_of(start, request.bodies, options)
     if chosen is None:

@@ -363,3 +363,11 @@ def test_bad_input_is_refused_with_the_value_and_a_remedy(tracks, given, words):
 def test_an_empty_batch_is_refused():
     with pytest.raises(ValueError, match="holds no problem; give one at least"):
         segmented(torch.zeros(0, 5, 20, 2))
+
+
+@pytest.mark.parametrize(("count", "frames"), [(20, 5), (120, 12)])
+def test_random_tracks_are_no_bodies(count, frames):
+    tracks = 300 * torch.rand(frames, count, 2, generator=draw(), dtype=torch.float64)
+    found = dyn.segment_tracks(tracks, generator=draw())
+    assert int(found.status) == Status.NO_CONSENSUS and not found.labels.any()
+    assert "by itself" in found.reason
