@@ -10,7 +10,7 @@ the number of bodies given ("K known") and without ("K unknown").  The recording
 figures are of whole sets.
 
 - **kt3d**: 12 street sequences of KT3DMoSeg, 10 to 20 frames.  **kt3d_two_views**: their first and last frame only, by
-  :func:`dyntorch.segment`: the tracks and bodies that both show.
+  :func:`dyntorch.segment`, then by :func:`dyntorch.segment_tracks`: the tracks and bodies that both show.
 - **hopkins**: 86 sequences of Hopkins155.  **mtpv**: 6 of MTPV62; its label 0 is an outlier; "bodies' tracks" leaves these out.
 - **streets**: made by :func:`dyntorch.scenes.streets`, 2 to 4 bodies, 20 frames, 500 tracks, with .5 px of noise; **quiet_streets**
   with .1.  **other_streets**: of other kinds (``OTHERS``), which nothing was tuned to.  **streets_two_views**: two frames of the
@@ -167,7 +167,11 @@ def kt3d(config: Config) -> list[Row]:
 def kt3d_two_views(config: Config) -> list[Row]:
     """KT3DMoSeg, first and last frame."""
     pairs = [video.pair() for video in kt3d_tracks()[:: 4 if config.quick else 1]]
-    return rows("K known", [paired(pair, pair.bodies, config.seed) for pair in pairs], Goals(6.0))
+    videos = [Tracks(pair.name, torch.stack([pair.x1, pair.x2]), pair.labels) for pair in pairs]
+    return [
+        *rows("K known", [paired(pair, pair.bodies, config.seed) for pair in pairs], Goals(6.0)),
+        *rows("segment_tracks of both, K known", [segmented(video, video.bodies, config.seed) for video in videos], Goals(6.0)),
+    ]
 
 
 def hopkins(config: Config) -> list[Row]:

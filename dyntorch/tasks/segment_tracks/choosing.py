@@ -85,7 +85,7 @@ def bodies_of(start: Start, bodies: int | None, options: TrackSegmentOptions) ->
     """The best segmentation into ``bodies``, or fewer where there are no so many; for None into as many as there are."""
     if bodies is not None:
         for number in range(bodies, 0, -1):
-            found = start.best(number, options, thorough=True)
+            found = start.best(number, options, thorough=len(start.evidence.pairs) >= options.exchange.pairs)
             if found is not None:
                 fewer = start.best(number - 1, options) if number > 1 else None
                 return Chosen(found, fewer is not None and evidence_of_another(start, fewer, found, options) < 0)

@@ -135,6 +135,8 @@ class TrackDescentOptions:
 class ExchangeOptions:
     """How bodies exchange pieces where their number is given, and which of the segmentations that come of it is the best."""
 
+    pairs: int = 4
+    """Pairs of frames from which bodies exchange pieces: the epipolar geometry of two views alone bears wrong exchanges."""
     weights: tuple[float, ...] = (1.0, 3.0)
     """Weights of the links cut, over that in the descent, one search each: either finds segmentations that the other misses."""
     links: float = 3.0
