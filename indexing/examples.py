@@ -86,7 +86,7 @@ def _geometry(where: Path) -> None:
     rows = [(view, point, *xy.tolist()) for view, points in enumerate(scene.tracks) for point, xy in enumerate(points)]
     _table(where / "tracks.csv", ("frame", "id", "x", "y"), [row for row in rows if np.isfinite(row[2])])
     _table(where / "parked.csv", ("id",), [(int(point),) for point in torch.nonzero(known)])
-    street = scenes.streets(3, frames=20, tracks=240, sigma=0.2, generator=torch.Generator().manual_seed(7)).tracks.tolist()
+    street = scenes.streets(3, frames=20, tracks=240, sigma=0.1, generator=torch.Generator().manual_seed(7)).tracks.tolist()
     rows = [(frame, point, f"{x:.2f}", f"{y:.2f}") for frame, points in enumerate(street) for point, (x, y) in enumerate(points)]
     _table(where / "street.csv", ("frame", "id", "x", "y"), [row for row in rows if row[2] != "nan"])
 
