@@ -57,18 +57,19 @@ def refuse_vmap(name: str, value: Tensor, remedy: str = "give all problems at on
         raise ValueError(f"{name} is mapped over by torch.func.vmap; {remedy}")
 
 
-def check_threshold(threshold: float | None) -> None:
-    """Refuse what is not one distance.
+def check_threshold(threshold: float | None, estimated: bool = True) -> None:
+    """Refuse what is not one distance, or None where that means that it is ``estimated``.
 
     Raises:
         ValueError: not a number, not positive, or not finite.
     """
     try:
-        value = 1.0 if threshold is None else float(threshold)
+        value = 1.0 if threshold is None and estimated else float(threshold)  # type: ignore[arg-type]
     except (TypeError, ValueError, RuntimeError):
         value = float("nan")
     if not 0 < value < float("inf"):
-        raise ValueError(f"threshold must be a positive distance in the unit of the points, got {threshold!r}; None estimates it")
+        remedy = "None estimates it" if estimated else "2.5 pixels are right for most"
+        raise ValueError(f"threshold must be a positive distance in the unit of the points, got {threshold!r}; {remedy}")
 
 
 def check_weights(weights: Tensor | None, what: str) -> None:

@@ -325,7 +325,7 @@ class Pictures:
         from matplotlib.colors import to_rgb
 
         from indexing.report.bodies import FILM
-        from indexing.report.segmentation import colour_of
+        from indexing.report.labelled import colour_of
         from indexing.video.overlay import Overlay, write_overlay
 
         tracks = report.tracks
@@ -359,7 +359,7 @@ def show(report: BodiesReport) -> None:
     """Print the result."""
     from indexing.report.bodies import rows_of
 
-    number = max(1, int(report.seen.sum()))
+    number = max(1, int(report.present.sum()))
     rows: list[list[object]] = []
     for label, (tracks, _, lives, moved, noise, _, geometry) in enumerate(rows_of(report), start=1):
         still = " (static)" * (label == report.static)

@@ -19,9 +19,9 @@ from indexing.readers.pairs import Photograph
 from indexing.readers.tracks import TrackSet
 from indexing.report.bodies_picture import picture_of
 from indexing.report.canvas import DARK
+from indexing.report.labelled import LabelledReport, colour_of, share
 from indexing.report.page import (
     Picture,
-    ResultReport,
     even,
     markup,
     npz,
@@ -31,7 +31,6 @@ from indexing.report.page import (
     table_csv,
     write_files,
 )
-from indexing.report.segmentation import SURE, colour_of, share
 
 FloatArray = NDArray[np.float64]
 FILES = ("report.html", "segmentation.npz", "segmentation.json", "labels.csv", "tracks.csv", "segmentation.png")
@@ -42,7 +41,7 @@ GEOMETRY = {False: "with depth: fundamental matrices", True: "a plane, or under 
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class BodiesReport(ResultReport):
+class BodiesReport(LabelledReport):
     """Everything that the report on bodies through many frames says.
 
     Args:
@@ -56,22 +55,22 @@ class BodiesReport(ResultReport):
     size: tuple[float, float] | None = None
 
     TITLES = ("What moves with what", "The tracks do not decide")
+    ABSENT = "too short"
+
+    @functools.cached_property
+    def present(self) -> NDArray[np.bool_]:
+        """``(n,)`` tracks that two views see at least: of the others nothing can be known."""
+        return np.asarray(self.there.sum(axis=0) > 1)
 
     @property
-    def bodies(self) -> int:
-        """How many bodies."""
-        return int(self.found.bodies)
+    def known(self) -> NDArray[np.int64] | None:
+        """``(n,)`` labels that the file has."""
+        return self.tracks.known
 
     @property
     def static(self) -> int:
         """The body that stands still; 0 = the data do not say."""
         return int(self.found.static_body) if int(self.found.static_body) <= self.bodies else 0
-
-    @property
-    def status(self) -> str:
-        """The status's name; that there are no bodies is no answer."""
-        status = super().status
-        return status if status != "OK" or self.bodies else "NO_CONSENSUS"
 
     @functools.cached_property
     def told(self) -> list[Notice]:
@@ -105,60 +104,10 @@ class BodiesReport(ResultReport):
         """``(views, n)`` where each track is seen."""
         return np.asarray(np.isfinite(self.tracks.values).all(axis=-1))
 
-    @functools.cached_property
-    def seen(self) -> NDArray[np.bool_]:
-        """``(n,)`` tracks that two views see at least: of the others nothing can be known."""
-        return np.asarray(self.there.sum(axis=0) > 1)
-
-    @property
-    def names(self) -> list[str]:
-        """What labels mean: outlier, body 1, body 2, ..."""
-        return ["outlier", *(f"body {i}" for i in range(1, self.bodies + 1))]
-
-    @property
-    def kinds(self) -> list[str]:
-        """What each track is: one of the names, or too short."""
-        labels = self.found.labels.tolist()
-        return [self.names[label] if there else "too short" for label, there in zip(labels, self.seen.tolist(), strict=True)]
-
-    @functools.cached_property
-    def counts(self) -> dict[str, int]:
-        """How many tracks of each kind, bodies first."""
-        kinds = self.kinds
-        return {name: kinds.count(name) for name in (*self.names[1:], "outlier", "too short")}
-
-    @property
-    def certainty(self) -> FloatArray:
-        """``(n,)`` probability of the label of each track; NaN where it is too short."""
-        own = np.take_along_axis(self.found.probabilities, self.found.labels[:, None], axis=1)[:, 0]
-        return np.where(self.seen, own, np.nan)
-
-    @property
-    def doubtful(self) -> NDArray[np.bool_]:
-        """``(n,)`` tracks that might well have another label."""
-        return np.asarray(self.certainty < SURE)
-
     @property
     def pairs(self) -> NDArray[np.int64]:
         """``(P, 2)`` places of the views that were compared."""
         return np.asarray(self.found.pairs[(self.found.pairs >= 0).all(axis=-1)])
-
-    @property
-    def misclassified(self) -> float | None:
-        """Share of the tracks that are not labelled as the file says, whatever the bodies' numbers; None where it does not say."""
-        if self.tracks.known is None or not self.bodies:
-            return None
-        import torch
-
-        from dyntorch import metrics
-
-        known, seen = torch.from_numpy(self.tracks.known), torch.from_numpy(self.seen)
-        return float(metrics.misclassification(self.result.labels[seen], known[seen]))
-
-    def rms(self, label: int | None = None) -> float:
-        """Root mean square of the residuals of one body, or of all; NaN where there are no tracks."""
-        mine = self.seen & ((self.found.labels > 0) if label is None else (self.found.labels == label))
-        return float(np.sqrt(np.mean(np.square(self.found.residuals[mine])))) if mine.any() else float("nan")
 
     def life(self, label: int) -> tuple[int, int] | None:
         """Places of the first and the last view that show a body; None = none does."""
@@ -198,7 +147,7 @@ def standing(report: BodiesReport) -> str:
 
 def describe(report: BodiesReport) -> str:
     """The result in plain words."""
-    number, counts, frames = int(report.seen.sum()), report.counts, len(report.tracks.views)
+    number, counts, frames = int(report.present.sum()), report.counts, len(report.tracks.views)
     if report.status != "OK":
         start = f"The {number:,} tracks through {frames:,} frames do not decide what moves with what. {sentence(report.reason)}"
         return start + " What follows is the best segmentation found, and not to be relied on." * (report.bodies > 0)
@@ -218,10 +167,10 @@ def rows_of(report: BodiesReport) -> list[list[str]]:
     noise = even([round(report.rms(label), 4) for label in labels])
     rows = []
     for label in labels:
-        mine = report.seen & (report.found.labels == label)
+        mine = report.of(label)
         life, flat = report.life(label), report.planar(label)
         names = "" if life is None else f"{report.tracks.views[life[0]]} to {report.tracks.views[life[1]]}"
-        figures = [f"{mine.sum():,}", share(int(mine.sum()), int(report.seen.sum())), names, moved[label - 1], noise[label - 1]]
+        figures = [f"{mine.sum():,}", share(int(mine.sum()), int(report.present.sum())), names, moved[label - 1], noise[label - 1]]
         rows.append([*figures, f"{int((mine & report.doubtful).sum()):,}", "" if flat is None else GEOMETRY[flat]])
     return rows
 
@@ -238,9 +187,8 @@ def write_bodies(folder: str | Path, report: BodiesReport) -> Path:
     drawn = picture_of(report)
     picture = Picture(drawn, dark=picture_of(report, DARK) if report.photographs else None)
     doubtful = ["doubtful" if odd else "" for odd in report.doubtful.tolist()]
-    rms = report.rms()
     values = {"summary": describe(report), "picture": picture, "doubtful": doubtful, "share": share, "standing": standing(report)}
-    html = render("bodies", report, **values, rms=f"{rms:.3g}" if np.isfinite(rms) else "", film=FILM, **_tables(report))
+    html = render("bodies", report, **values, rms=report.rms_text(), film=FILM, **_tables(report))
     return write_files(
         folder,
         {
@@ -264,14 +212,7 @@ def _tables(report: BodiesReport) -> dict[str, list[list[Any]]]:
         still = ", stands still" if label == report.static else ""
         name = markup(dot, colour=colour_of(label), label=label, still=still)
         bodies.append([name, *row[:2], markup("{words}{span}", words=row[2], span=_span(report, label)), *row[3:]])
-    compared: list[list[Any]] = []
-    known = report.tracks.known
-    if known is not None and report.bodies:
-        for label in sorted(np.unique(known[report.seen]).tolist(), key=lambda label: (label == 0, label)):
-            of = report.found.labels[report.seen & (known == label)]
-            cells = [int((of == i).sum()) for i in (*range(1, report.bodies + 1), 0)]
-            compared.append([f"body {label}" if label else "outlier", *(f"{cell:,}" if cell else "" for cell in cells)])
-    return {"bodies": bodies, "compared": compared}
+    return {"bodies": bodies, "compared": report.compared}
 
 
 def _span(report: BodiesReport, label: int) -> Any:
@@ -306,7 +247,7 @@ def as_json(report: BodiesReport) -> dict[str, Any]:
         bodies.append({
             "label": label,
             "tracks": number,
-            "share": number / max(1, int(report.seen.sum())),
+            "share": number / max(1, int(report.present.sum())),
             "first_frame": None if life is None else views[life[0]],
             "last_frame": None if life is None else views[life[1]],
             "pixels_per_frame": report.motion(label),

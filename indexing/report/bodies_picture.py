@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from indexing.report.canvas import LIGHT, Theme, draw_photograph, new_figure, png, shorten, style
+from indexing.report.labelled import colour_of
 from indexing.report.reconstruction_picture import finish, foot, limits
-from indexing.report.segmentation import STRAYS, colour_of, mark_of
+from indexing.report.segmentation import STRAYS, mark_of
 from indexing.video.whole import spread
 
 if TYPE_CHECKING:
@@ -85,7 +86,7 @@ def _draw(panel: Any, report: BodiesReport, view: int, theme: Theme) -> None:
 
     tail = max(FRINGE, round(TAIL * len(report.tracks.views)))
     part = report.tracks.values[max(0, view - tail) : view + 1, :, :2]
-    here = np.isfinite(part[-1]).all(axis=-1) & report.seen
+    here = np.isfinite(part[-1]).all(axis=-1) & report.present
     size = float(np.clip(3000 / max(1, int(here.sum())), 3, 16))
     strays = part[-1, here & (report.found.labels == 0)]
     panel.scatter(*strays.T, s=0.8 * size, c=theme.muted, marker="x", linewidth=0.8, alpha=0.65, zorder=2)

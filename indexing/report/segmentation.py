@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from indexing.opening import count
 from indexing.readers.pairs import MatchedPair, Photograph
 from indexing.report.canvas import DARK, LIGHT, Theme, draw_photograph, new_figure, png, shorten, style
+from indexing.report.labelled import COLOURS, LabelledReport, colour_of, share
 from indexing.report.page import (
     Picture,
-    ResultReport,
     markup,
     matrix,
     npz,
@@ -30,7 +30,6 @@ from indexing.report.reconstruction_picture import finish, foot, layout, limits,
 FloatArray = NDArray[np.float64]
 FILES = ("report.html", "segmentation.npz", "segmentation.json", "labels.csv", "segmentation.png")
 WRITTEN = (*FILES, "tracks.csv")  # the last one of videos
-SURE = 0.9  # probability of its label below which a match is called doubtful
 MOTION = {
     "fundamental": "fundamental matrix: a rigid body with depth",
     "homography": "homography: a plane, or a body seen under a rotation alone",
@@ -38,7 +37,7 @@ MOTION = {
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class SegmentationReport(ResultReport):
+class SegmentationReport(LabelledReport):
     """Everything that the report on a segmentation says.
 
     Args:
@@ -52,11 +51,17 @@ class SegmentationReport(ResultReport):
     size: tuple[float, float] | None = None
 
     TITLES = ("What moves with what", "The matches do not decide")
+    ABSENT = "missing"
 
     @property
-    def bodies(self) -> int:
-        """How many bodies."""
-        return int(self.found.bodies)
+    def present(self) -> NDArray[np.bool_]:
+        """``(n,)`` matches that are there in both images."""
+        return self.pair.seen
+
+    @property
+    def known(self) -> NDArray[np.int64] | None:
+        """``(n,)`` labels that the file has."""
+        return self.pair.known
 
     @property
     def models(self) -> list[str]:
@@ -64,60 +69,9 @@ class SegmentationReport(ResultReport):
         return [str(model) for model in self.found.models[: self.bodies]]
 
     @property
-    def status(self) -> str:
-        """The status's name; that there are no bodies is no answer."""
-        status = super().status
-        return status if status != "OK" or self.bodies else "NO_CONSENSUS"
-
-    @property
     def seen(self) -> int:
         """How many matches are there in both images."""
-        return int(self.pair.seen.sum())
-
-    @property
-    def misclassified(self) -> float | None:
-        """Share of the matches that are not labelled as the file says, whatever the bodies' numbers; None where it does not say."""
-        if self.pair.known is None or not self.bodies:
-            return None
-        import torch
-
-        from dyntorch import metrics
-
-        known, seen = torch.from_numpy(self.pair.known), torch.from_numpy(self.pair.seen)
-        return float(metrics.misclassification(self.result.labels[seen], known[seen]))
-
-    @property
-    def names(self) -> list[str]:
-        """What labels mean: outlier, body 1, body 2, ..."""
-        return ["outlier", *(f"body {i}" for i in range(1, self.bodies + 1))]
-
-    @property
-    def kinds(self) -> list[str]:
-        """What each match is: one of the names, or missing."""
-        seen = self.pair.seen.tolist()
-        return [self.names[label] if there else "missing" for label, there in zip(self.found.labels.tolist(), seen, strict=True)]
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """How many matches of each kind, bodies first."""
-        kinds = self.kinds
-        return {name: kinds.count(name) for name in (*self.names[1:], "outlier", "missing")}
-
-    @property
-    def certainty(self) -> FloatArray:
-        """``(n,)`` probability of the label of each match; NaN where it is missing."""
-        own = np.take_along_axis(self.found.probabilities, self.found.labels[:, None], axis=1)[:, 0]
-        return np.where(self.pair.seen, own, np.nan)
-
-    @property
-    def doubtful(self) -> NDArray[np.bool_]:
-        """``(n,)`` matches that might well have another label."""
-        return np.asarray(self.certainty < SURE)
-
-    def rms(self, label: int | None = None) -> float:
-        """Root mean square of the residuals of one body, or of all; NaN where there are no matches."""
-        mine = self.pair.seen & ((self.found.labels > 0) if label is None else (self.found.labels == label))
-        return float(np.sqrt(np.mean(np.square(self.found.residuals[mine])))) if mine.any() else float("nan")
+        return int(self.present.sum())
 
 
 def describe(report: SegmentationReport) -> str:
@@ -146,7 +100,7 @@ def write_segmentation(folder: str | Path, report: SegmentationReport) -> Path:
     drawn = picture_of(report)
     picture = Picture(drawn, dark=picture_of(report, DARK) if report.photographs else None)
     doubtful = ["doubtful" if odd else "" for odd in report.doubtful.tolist()]
-    values = {"summary": describe(report), "picture": picture, "doubtful": doubtful, "share": share, "rms": rms_text(report)}
+    values = {"summary": describe(report), "picture": picture, "doubtful": doubtful, "share": share, "rms": report.rms_text()}
     html = render("segmentation", report, **values, **tables(report))
     return write_files(
         folder,
@@ -165,39 +119,16 @@ def write_segmentation(folder: str | Path, report: SegmentationReport) -> Path:
 
 def tables(report: SegmentationReport) -> dict[str, list[list[Any]]]:
     """Rows of the page's tables: the bodies, their matrices, and how many matches of every known body were found to be of which."""
-    bodies, matrices, compared = [], [], []
+    bodies, matrices = [], []
     for label, model in enumerate(report.models, start=1):
-        mine = report.pair.seen & (report.found.labels == label)
+        mine = report.of(label)
         dot = '<span class="drawn" style="color:{colour}" aria-hidden="true">●</span> body {label}'
-        figures = [f"{mine.sum():,}", share(int(mine.sum()), report.seen), rms_text(report, label)]
+        figures = [f"{mine.sum():,}", share(int(mine.sum()), report.seen), report.rms_text(label)]
         doubtful = f"{int((mine & report.doubtful).sum()):,}"
         bodies.append([markup(dot, colour=colour_of(label), label=label), *figures, doubtful, MOTION.get(model, model)])
         found = report.found.homographies if model == "homography" else report.found.fundamentals
         matrices.append([f"body {label}", model, matrix(found[label - 1])])
-    known = report.pair.known
-    if known is not None and report.bodies:
-        for label in sorted(np.unique(known[report.pair.seen]).tolist(), key=lambda label: (label == 0, label)):
-            of = report.found.labels[report.pair.seen & (known == label)]
-            cells = [int((of == i).sum()) for i in (*range(1, report.bodies + 1), 0)]
-            compared.append([f"body {label}" if label else "outlier", *(f"{cell:,}" if cell else "" for cell in cells)])
-    return {"bodies": bodies, "matrices": matrices, "compared": compared}
-
-
-def rms_text(report: SegmentationReport, label: int | None = None) -> str:
-    """Root mean square of the residuals of one body or of all, empty where there are none."""
-    value = report.rms(label)
-    return f"{value:.3g}" if np.isfinite(value) else ""
-
-
-def share(part: int, whole: int) -> str:
-    """A share in whole percents.
-
-    Example:
-        >>> share(1, 3), share(1, 300)
-        ('33 %', 'under 1 %')
-    """
-    percent = 100 * part / max(1, whole)
-    return "under 1 %" if 0 < percent < 1 else f"{percent:.0f} %"
+    return {"bodies": bodies, "matrices": matrices, "compared": report.compared}
 
 
 def as_npz(report: SegmentationReport) -> bytes:
@@ -261,23 +192,11 @@ def labels_csv(report: SegmentationReport) -> str:
 
 
 Box = tuple[FloatArray, FloatArray]
-# neighbours in the list are apart for colour-blind eyes, too, on both papers and on gray
-COLOURS = ("#2f7fb8", "#e8741e", "#2fa36b", "#c2478f", "#b99a0d", "#7d62c9", "#1fa6a6", "#d1493f")
 MARKS = ("o", "s", "^", "D")  # one for every round through the colours
 WIDTH, TALL, EDGE, GAP, HEAD, TICKS, FOOT = 10.2, 5.2, 0.45, 0.5, 0.32, 0.3, 0.5  # inches
 WIDE = 0.42  # height over width below which images are drawn one above the other
 STRAYS = 0.995  # of the matches, those that a panel without image shows
 SLIM = 0.2  # least ratio of the sides of such a panel
-
-
-def colour_of(label: int) -> str:
-    """The colour of a body.
-
-    Example:
-        >>> colour_of(1), colour_of(9) == colour_of(1)
-        ('#2f7fb8', True)
-    """
-    return COLOURS[(label - 1) % len(COLOURS)]
 
 
 def picture_of(report: SegmentationReport, theme: Theme = LIGHT) -> bytes:
@@ -291,9 +210,9 @@ def picture_of(report: SegmentationReport, theme: Theme = LIGHT) -> bytes:
         for i, (panel, points, photograph, box) in enumerate(zip(panels, places, photographs, boxes, strict=True)):
             if photograph is not None:
                 draw_photograph(panel, photograph, theme)
-            _draw_outliers(panel, points[report.pair.seen & (report.found.labels == 0)], size, theme)
+            _draw_outliers(panel, points[report.of(0)], size, theme)
             for label in range(1, report.bodies + 1):  # the small ones on top: dense bodies would hide them otherwise
-                mine = report.pair.seen & (report.found.labels == label)
+                mine = report.of(label)
                 if i == 0:
                     _draw_ways(panel, np.stack([points[mine], places[1][mine]]), label, box)
                 _draw_points(panel, points[mine], label, size, theme)

@@ -51,11 +51,21 @@ def energy(view: View, fundamentals: Tensor, member: Tensor, options: SegmentOpt
     """
     square = sampson_squared(fundamentals, view.x1, view.x2) / (options.energy.noise * view.pixel) ** 2
     distances = (square.clamp(max=options.energy.cap) * member).sum((-2, -1))
+    cost = relief(view, fundamentals, member, options)
+    return distances + options.energy.cut * view.links.cut(member) + options.energy.parallax * (cost * member).sum((-2, -1))
+
+
+def relief(view: View, fundamentals: Tensor, member: Tensor, options: SegmentOptions) -> Tensor:
+    r"""Cost ``(B, K, n)`` of the parallax of every match beside every body: :math:`(\nu + 1) \log(1 + p^2 / \nu t^2) + \log t^2`.
+
+    Args:
+        view: matches.
+        fundamentals: ``(B, K, 3, 3)``.
+        member: ``(B, K, n)`` weights.
+    """
     value, scale = parallax(view, fundamentals, member, options)
-    relief = (options.energy.parallax_freedom + 1) * torch.log1p(
-        value.square() / (options.energy.parallax_freedom * scale[..., None])
-    ) + scale.log()[..., None]
-    return distances + options.energy.cut * view.links.cut(member) + options.energy.parallax * (relief * member).sum((-2, -1))
+    freedom = options.energy.parallax_freedom
+    return (freedom + 1) * torch.log1p(value.square() / (freedom * scale[..., None])) + scale.log()[..., None]
 
 
 def parallax(view: View, fundamentals: Tensor, member: Tensor, options: SegmentOptions) -> tuple[Tensor, Tensor]:

@@ -12,8 +12,7 @@ from torch import Tensor
 from dyntorch.geometry.epipolar import sampson_squared
 from dyntorch.geometry.epipolar_fit import descend, fit_fundamental
 from dyntorch.tasks.segment.coherence import Links
-from dyntorch.tasks.segment.energy import mean_field, parallax
-from dyntorch.tasks.segment.options import SegmentOptions
+from dyntorch.tasks.segment.energy import mean_field, relief
 from dyntorch.tasks.segment.search import one_hot
 from dyntorch.tasks.segment_tracks.frames import FramePair
 from dyntorch.tasks.segment_tracks.options import TrackDescentOptions, TrackSegmentOptions
@@ -87,16 +86,18 @@ def unlinked(count: int, device: torch.device) -> Links:
 def fitted(pairs: Sequence[FramePair], groups: Tensor, scales: Sequence[float], steps: int = 2) -> Geometry:
     """Fundamental matrices ``(B, 3, 3)`` of groups of tracks ``(B, n)``, weights, for every pair of frames.
 
-    Scales are in pixels at rest: the last ones grow with the motion, as the noise does.
+    Args:
+        pairs: of frames.
+        groups: weights.
+        scales: of the fits, one after the other, pixels.
+        steps: at each of them.
     """
-    found = []
-    for pair in pairs:
-        weight = groups[:, pair.index].double() * pair.precision / pair.precision.mean()
-        # two coarse scales find the motion, the fine one is that of the noise
-        typical = float(pair.precision.median()) ** -0.5 if len(pair.index) else 1.0
-        sizes = [scale * (typical if scale < 1 else 1.0) * pair.view.pixel for scale in scales]
-        found.append(fit_fundamental(pair.view.x1, pair.view.x2, weight, sizes, steps=steps)[0])
-    return found
+    return [
+        fit_fundamental(
+            pair.view.x1, pair.view.x2, pair.weighed(groups), [scale * pair.view.pixel for scale in scales], steps=steps
+        )[0]
+        for pair in pairs
+    ]
 
 
 def squares(pair: FramePair, fundamentals: Tensor) -> Tensor:
@@ -108,15 +109,6 @@ def improbable(square: Tensor, options: TrackDescentOptions) -> Tensor:
     r"""Cost of squared distances over the variance, :math:`(\nu + 1) \log(1 + \min(z, c^2) / \nu)`."""
     worst = (options.freedom + 1) * log1p(options.cutoff**2 / options.freedom)
     return ((options.freedom + 1) * torch.log1p(square / options.freedom)).clamp(max=worst)
-
-
-def relief_cost(pair: FramePair, F: Tensor, member: Tensor, options: SegmentOptions) -> Tensor:
-    """Cost ``(*B, K, m)`` of the parallax of tracks against the mean planes of bodies with members ``(*B, K, m)``."""
-    several = F if F.ndim == 4 else F[None]
-    value, spread = parallax(pair.view, several, member if F.ndim == 4 else member[None], options)
-    freedom = options.energy.parallax_freedom
-    found = (freedom + 1) * torch.log1p(value.square() / (freedom * spread[..., None])) + spread.log()[..., None]
-    return found if F.ndim == 4 else found[0]
 
 
 def noise(pairs: Sequence[FramePair], geometry: Geometry, member: Tensor, options: TrackDescentOptions) -> Tensor:
@@ -141,13 +133,13 @@ def costs(
     evidence: TrackEvidence, geometry: Geometry, scale: Tensor, member: Tensor | None, options: TrackSegmentOptions
 ) -> Tensor:
     """Cost ``(B, K, n)`` of every track in every body without links; with the relief of bodies of members ``(B, K, n)``."""
-    how, views = options.descent, options.views
+    how = options.descent
     B, K = geometry[0].shape[:2]
     total = torch.zeros(B, K, len(evidence.count), dtype=torch.float64, device=scale.device)
     for pair, F in zip(evidence.pairs, geometry, strict=True):
         cost = improbable(squares(pair, F) / scale.square()[:, None, None], how)
         if member is not None and how.relief > 0:
-            cost = cost + how.relief * relief_cost(pair, F, member[..., pair.index].double(), views)
+            cost = cost + how.relief * relief(pair.view, F, member[..., pair.index].double(), options.views)
         total[..., pair.index] += cost
     return total * evidence.share(how)
 
@@ -157,7 +149,7 @@ def descended(evidence: TrackEvidence, labels: Tensor, bodies: int, options: Tra
     how = options.descent
     count = len(labels)
     member = one_hot(labels, bodies).float()
-    found = fitted(evidence.pairs, member.flatten(0, 1), (4.0, 1.0))
+    found = fitted(evidence.pairs, member.flatten(0, 1), how.first_fit_scales)
     geometry = [F.unflatten(0, (count, bodies)) for F in found]
 
     def turn(member: Tensor, geometry: Geometry) -> tuple[Tensor, Tensor]:
@@ -176,8 +168,9 @@ def descended(evidence: TrackEvidence, labels: Tensor, bodies: int, options: Tra
 
 
 def _refitted(pair: FramePair, F: Tensor, member: Tensor, scale: float, options: TrackDescentOptions) -> Tensor:
-    weight = member[..., pair.index].flatten(0, 1).double() * (pair.precision / pair.precision.mean())
+    # the noise grows with the motion, and with it the scale
     size = max(scale * float(pair.precision.median()) ** -0.5, options.least_fit_scale) * pair.view.pixel
+    weight = pair.weighed(member.flatten(0, 1))
     return descend(F.flatten(0, 1), pair.view.x1, pair.view.x2, weight, size, steps=2).unflatten(0, F.shape[:2])
 
 

@@ -35,7 +35,7 @@ class Exchanges:
         self.count = int(cut.max()) + 1
         self.members = one_hot(cut, self.count).double()
         self.sizes = [int(size) for size in self.members.sum(-1)]
-        geometry = [F[None] for F in fitted(evidence.pairs, self.members, options.exchange.fit_scales, steps=1)]
+        geometry = [F[None] for F in fitted(evidence.pairs, self.members, options.descent.first_fit_scales, steps=1)]
         self.scale = noise(evidence.pairs, geometry, self.members[None], options.descent)
         self.between = self.members @ evidence.links.pull(self.members).mT
         self.known: dict[Body, tuple[float, float]] = {}
@@ -83,7 +83,7 @@ class Exchanges:
             return
         chosen = self.members.new_tensor([[float(piece in body) for piece in range(self.count)] for body in new])
         groups = chosen @ self.members
-        geometry = [F[None] for F in fitted(self.evidence.pairs, groups, self.options.exchange.fit_scales, steps=1)]
+        geometry = [F[None] for F in fitted(self.evidence.pairs, groups, self.options.descent.first_fit_scales, steps=1)]
         own = (costs(self.evidence, geometry, self.scale, None, self.options)[0] * groups).sum(-1)
         cut = ((chosen @ self.between) * (1 - chosen)).sum(-1) / 2
         self.known.update(zip(new, zip(own.tolist(), cut.tolist(), strict=True), strict=True))

@@ -32,11 +32,9 @@ class FramePair:
     view: View
     precision: Tensor
 
-    def of(self, place: Tensor) -> FramePair:
-        """The pair for some of the tracks: ``place (n,)`` holds the new index of each, -1 where it is left out."""
-        kept = place[self.index] >= 0
-        view = View(self.view.x1[kept], self.view.x2[kept], self.view.pixel, self.view.links)
-        return FramePair(self.frames, place[self.index[kept]], view, self.precision[kept])
+    def weighed(self, groups: Tensor) -> Tensor:
+        """Weights ``(B, m)`` of these tracks in fits of groups ``(B, n)``: by their precision, of mean 1."""
+        return groups[:, self.index].double() * (self.precision / self.precision.mean())
 
 
 @dataclass(frozen=True)
@@ -48,18 +46,16 @@ class Film:
         seen: ``(frames, n)`` bool.
         pixel: a pixel of the options, in these coordinates.
         change: ``(3, 3)`` similarity from pixels to them.
-        scale: of that.
     """
 
     x: Tensor
     seen: Tensor
     pixel: float
     change: Tensor
-    scale: float
 
     @staticmethod
-    def of(tracks: Tensor, threshold: float) -> Film:
-        """Of tracks ``(frames, n, 2)``, NaN = missing, whose threshold is that of 2.5 pixels."""
+    def of(tracks: Tensor, pixel: float = 1.0) -> Film:
+        """Of tracks ``(frames, n, 2)``, NaN = missing, in whose unit a pixel of the options is so long."""
         seen = tracks.isfinite().all(-1)
         there = tracks[seen]
         centre = there.median(0).values
@@ -67,14 +63,18 @@ class Film:
         spread = distance[distance > 0].median() if bool(distance.any()) else torch.ones_like(distance[0])
         scale = 1 / spread
         x = torch.where(seen[..., None], (tracks - centre) * scale, 0.0)
-        return Film(x, seen, threshold / 2.5 * float(scale), similarity(scale, centre), float(scale))
+        return Film(x, seen, pixel * float(scale), similarity(scale, centre))
+
+    @cached_property
+    def ends(self) -> tuple[Tensor, Tensor]:
+        """``(n,)`` the first and the last frame that shows a track; of one that none shows the last is before the first."""
+        number = torch.arange(len(self.seen), device=self.seen.device)[:, None]
+        return torch.where(self.seen, number, len(self.seen)).amin(0), torch.where(self.seen, number, -1).amax(0)
 
     @cached_property
     def lengths(self) -> Tensor:
         """``(n,)`` frames from the first to the last that show a track."""
-        number = torch.arange(len(self.seen), device=self.seen.device)[:, None]
-        last = torch.where(self.seen, number, -1).amax(0)
-        first = torch.where(self.seen, number, len(self.seen)).amin(0)
+        first, last = self.ends
         return (last - first + 1).clamp(min=0)
 
     def pair(self, frames: Pair, options: FrameOptions) -> FramePair:
@@ -149,9 +149,7 @@ class SceneCut:
 
 def cut_of(film: Film, options: FrameOptions) -> SceneCut | None:
     """The first cut of a video, if there is one."""
-    number = torch.arange(len(film.seen), device=film.seen.device)[:, None]
-    last = torch.where(film.seen, number, -1).amax(0)
-    first = torch.where(film.seen, number, len(film.seen)).amin(0)
+    first, last = film.ends
     steps = []
     for frame in range(1, len(film.seen)):
         before, after = (first < frame) & (last >= frame - 1), (first <= frame) & (last >= frame)

@@ -11,7 +11,7 @@ from torch import Tensor
 from dyntorch.geometry.epipolar import sampson_squared
 from dyntorch.geometry.homogeneous import skew, unit
 from dyntorch.tasks.segment.labels import choose
-from dyntorch.tasks.segment_tracks.descent import Geometry, TrackEvidence
+from dyntorch.tasks.segment_tracks.descent import Geometry
 from dyntorch.tasks.segment_tracks.frames import Film, FramePair
 from dyntorch.tasks.segment_tracks.options import StaticOptions, StrayOptions, TrackSegmentOptions
 
@@ -51,11 +51,13 @@ class BodyMotions:
     planar: Tensor
 
 
-def motions(evidence: TrackEvidence, geometry: Geometry, member: Tensor, film: Film, options: TrackSegmentOptions) -> BodyMotions:
+def motions(
+    pairs: Sequence[FramePair], geometry: Geometry, member: Tensor, film: Film, options: TrackSegmentOptions
+) -> BodyMotions:
     """With members ``(K, n)``, 0 or 1; 0 where two frames have too few of them in common."""
     back = torch.linalg.inv(film.change)
     fundamentals, homographies, planar = [], [], []
-    for pair, F in zip(evidence.pairs, geometry, strict=True):
+    for pair, F in zip(pairs, geometry, strict=True):
         some = member[:, pair.index]
         there = some.sum(-1) >= options.descent.members
         models = choose(pair.view, F[0], some, options.views)
@@ -107,5 +109,5 @@ def agreeing(tracks: Tensor, member: Tensor, cameras: Tensor, pairs: Sequence[Fr
         distance = sampson_squared(F, x1, x2).sqrt()
         for own, some in zip(found, member[:, pair.index] > 0, strict=True):
             own.append(distance[some])
-    empty = tracks.new_tensor([torch.inf])
-    return torch.stack([torch.cat(own).median() if sum(map(len, own)) else empty[0] for own in found])
+    none = tracks.new_tensor(torch.inf)
+    return torch.stack([torch.cat(own).median() if sum(map(len, own)) else none for own in found])

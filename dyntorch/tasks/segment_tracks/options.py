@@ -123,6 +123,8 @@ class TrackDescentOptions:
     """Rounds of labels and geometries."""
     turns: int = 3
     """Turns of the mean field over the labels in each round."""
+    first_fit_scales: tuple[float, float] = (4.0, 1.0)
+    """Scales of the first fits, one after the other, pixels."""
     fit_scale: float = 3.0
     """Scale of the fits, in standard deviations."""
     least_fit_scale: float = 0.15
@@ -141,8 +143,6 @@ class ExchangeOptions:
     """Weights of the links cut, over that in the descent, one search each: either finds segmentations that the other misses."""
     links: float = 3.0
     """Their weight in the comparison: at 1, bodies that share an epipolar geometry swallow parts of each other."""
-    fit_scales: tuple[float, float] = (4.0, 1.0)
-    """Scales of the fits of sets of pieces, one after the other, pixels."""
     most: int = 12
     """Exchanges at most."""
     gain: float = 1e-6

@@ -36,6 +36,11 @@ class TrackRequest:
     generator: torch.Generator | None
     options: TrackSegmentOptions
 
+    @property
+    def pixel(self) -> float:
+        """A pixel of the options in the unit of the tracks: all of them follow the threshold."""
+        return self.threshold / self.options.views.units.threshold_in_pixels
+
 
 @one_thread
 @on_cpu
@@ -92,11 +97,7 @@ def segment_tracks(
         >>> tuple(found.labels.shape), int(found.bodies)
         ((150,), 2)
     """
-    if threshold is None:
-        raise ValueError(
-            "threshold must be a positive distance in the unit of the tracks, got None; 2.5 is right for most trackers"
-        )
-    check_threshold(threshold)
+    check_threshold(threshold, estimated=False)
     check_options(options, TrackSegmentOptions)
     _check(tracks, bodies, cameras, generator)
     batch = tracks.shape[:-3]
@@ -146,7 +147,7 @@ def _solve(tracks: Tensor, cameras: Tensor | None, request: TrackRequest) -> Tra
     # 1. what is there: tracks in two frames at least, frames with tracks in common, motion, one scene
     if not bool((seen.sum(0) > 1).any()):
         return _nothing(count, request, [Notice(TrackNotice.SHORT)])
-    film = Film.of(torch.where((seen.sum(0) > 1)[:, None], tracks, torch.nan), request.threshold)
+    film = Film.of(torch.where((seen.sum(0) > 1)[:, None], tracks, torch.nan), request.pixel)
     refused = _refusal(film, request)
     frames = [] if refused else chosen_pairs(film, options.frames)
     if refused or not frames:
@@ -181,8 +182,7 @@ def _refusal(film: Film, request: TrackRequest) -> Notice | None:
     way = (high - low).norm(dim=-1)[film.seen.any(0)] / film.pixel
     farthest, least = float(way.quantile(0.95)), request.options.outliers.still
     if farthest < least:
-        unit = request.threshold / 2.5
-        return Notice(TrackNotice.STILL, farthest * unit, {"least": least * unit})
+        return Notice(TrackNotice.STILL, farthest * request.pixel, {"least": least * request.pixel})
     return None
 
 
@@ -199,7 +199,7 @@ def _searched(film: Film, request: TrackRequest) -> Tensor:
 def _start(film: Film, frames: Sequence[tuple[int, int]], kernel: Tensor, searched: Tensor, request: TrackRequest) -> Start:
     """What the search for bodies starts from: links, pairs of frames and pieces of the searched tracks."""
     options = request.options
-    part = Film(film.x[:, searched], film.seen[:, searched], film.pixel, film.change, film.scale)
+    part = Film(film.x[:, searched], film.seen[:, searched], film.pixel, film.change)
     inner = kernel[searched]
     inner = (inner + inner.mT) / 2
     sparse = strongest(inner, options.preferences.neighbours)
@@ -260,8 +260,7 @@ def _outcome(
     named = torch.where(hard.any(0), hard.argmax(0) + 1, 0)
     own = far.gather(1, (named - 1).clamp(min=0).expand(len(far), 1, -1))[:, 0]
     nearest = torch.where(named > 0, own.square().nanmean(0), far.square().nanmean(0).nan_to_num(nan=torch.inf).amin(0))
-    evidence = TrackEvidence.of(pairs, unlinked(count, film.x.device))
-    moved = motions(evidence, [F[:, order] for F in geometry], hard, film, options)
+    moved = motions(pairs, [F[:, order] for F in geometry], hard, film, options)
     static, notices = _static(tracks, cameras, film, hard, pairs, request)
     notices = [*_about(len(order), chosen, request), *notices]
     bodies = member / member.sum(0).clamp(min=1e-12) * (named > 0)
@@ -275,7 +274,7 @@ def _outcome(
         homographies=moved.homographies,
         planar=moved.planar,
         probabilities=torch.cat([missing.double()[None], bodies]).mT,
-        residuals=torch.where(nearest.isfinite(), nearest, 0.0).sqrt() * request.threshold / 2.5,
+        residuals=torch.where(nearest.isfinite(), nearest, 0.0).sqrt() * request.pixel,
         threshold=torch.tensor(request.threshold, dtype=torch.float64),
         status=status_from(notices) if request.bodies in (None, len(order)) else torch.tensor(int(Status.NO_CONSENSUS)),
         notices=tuple(notices),

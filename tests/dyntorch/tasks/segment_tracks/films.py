@@ -40,9 +40,9 @@ class Shot:
         centre = torch.linalg.svd(a)[2][-1]
         return unit(skew(b @ centre) @ b @ torch.linalg.pinv(a))
 
-    def film(self, threshold: float = 2.5) -> Film:
+    def film(self, pixel: float = 1.0) -> Film:
         """As the stages see it."""
-        return Film.of(self.tracks, threshold)
+        return Film.of(self.tracks, pixel)
 
 
 def draw(seed: int = 0) -> torch.Generator:

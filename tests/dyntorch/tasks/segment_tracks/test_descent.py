@@ -10,6 +10,7 @@ import torch
 
 from dyntorch.geometry.epipolar import sampson_squared
 from dyntorch.tasks.segment.coherence import Links
+from dyntorch.tasks.segment.energy import relief
 from dyntorch.tasks.segment.search import one_hot
 from dyntorch.tasks.segment_tracks.descent import (
     TrackEvidence,
@@ -19,7 +20,6 @@ from dyntorch.tasks.segment_tracks.descent import (
     fitted,
     improbable,
     noise,
-    relief_cost,
     squares,
     unlinked,
 )
@@ -129,18 +129,18 @@ def test_the_energy_is_the_sum_that_is_said():
     labels = scene.labels - 1
     total = 0.0
     reliefs = [
-        relief_cost(pair, F[0], member[0][:, pair.index], OPTIONS.views) for pair, F in zip(evidence.pairs, geometry, strict=True)
+        relief(pair.view, F, member[..., pair.index], OPTIONS.views)[0] for pair, F in zip(evidence.pairs, geometry, strict=True)
     ]
     for track in range(28):
         own = int(labels[track])
         said = 0.0
-        for pair, F, relief in zip(evidence.pairs, geometry, reliefs, strict=True):
+        for pair, F, hills in zip(evidence.pairs, geometry, reliefs, strict=True):
             if track not in pair.index.tolist():
                 continue
             place = pair.index.tolist().index(track)
             z = float(squares(pair, F[0])[own, place]) / 0.17**2
             said += (HOW.freedom + 1) * log(1 + min(z, HOW.cutoff**2) / HOW.freedom) + log(0.17**2)
-            said += HOW.relief * float(relief[own, place])
+            said += HOW.relief * float(hills[own, place])
         total += HOW.evidence * said / int(evidence.count[track])
     for track in range(28):
         for place, weight in zip(links.index[track].tolist(), links.weight[track].tolist(), strict=True):

@@ -21,7 +21,7 @@ COUNTS = (48, 40)
 def exchanges() -> tuple[Exchanges, torch.Tensor, torch.Tensor]:
     """Of six pieces, three of each of two bodies, without links: the labels of the pieces and of the bodies, from 0."""
     scene = shot(COUNTS, frames=6, sigma=0.1)
-    film = Film.of(scene.tracks, 2.5)
+    film = Film.of(scene.tracks)
     pairs = [film.pair(pair, OPTIONS.frames) for pair in chosen_pairs(film, OPTIONS.frames)]
     evidence = TrackEvidence.of(pairs, unlinked(sum(COUNTS), film.x.device))
     truth = scene.labels - 1

@@ -21,7 +21,7 @@ def long_film(frames: int, length: int = 10, each: int = 6, shortest: int = 2) -
     number = torch.arange(frames)[:, None]
     there = (number >= start) & (number < start + lives)
     x = 500 * torch.rand(count, 2, generator=generator, dtype=F64) + 4.0 * number[..., None]
-    return Film.of(torch.where(there[..., None], x, torch.nan), 2.5)
+    return Film.of(torch.where(there[..., None], x, torch.nan))
 
 
 def kept(pairs, film):
@@ -33,11 +33,11 @@ def test_coordinates_are_centred_and_no_shift_or_scale_changes_them():
     scene = shot((40, 20))
     film = scene.film()
     assert float(film.x.reshape(-1, 2).norm(dim=-1).median()) == pytest.approx(1.0, abs=0.1)
-    moved = Film.of(3.5 * scene.tracks + torch.tensor([1000.0, -70.0], dtype=F64), 3.5 * 2.5)
+    moved = Film.of(3.5 * scene.tracks + torch.tensor([1000.0, -70.0], dtype=F64), 3.5)
     torch.testing.assert_close(moved.x, film.x, rtol=0, atol=1e-9)
     assert moved.pixel == pytest.approx(film.pixel)
     torch.testing.assert_close(apply(film.change, scene.tracks[3]), film.x[3], rtol=0, atol=1e-9)
-    assert float((scene.tracks[3][1] - scene.tracks[3][0]).norm() * film.scale) == pytest.approx(
+    assert float((scene.tracks[3][1] - scene.tracks[3][0]).norm() * film.change[0, 0]) == pytest.approx(
         float((film.x[3][1] - film.x[3][0]).norm())
     )
 
@@ -47,14 +47,14 @@ def test_what_is_missing_is_zero_and_not_seen():
     tracks = scene.tracks.clone()
     tracks[2:5, 7] = torch.nan
     tracks[0, 3, 0] = torch.inf  # half a point is none
-    film = Film.of(tracks, 2.5)
+    film = Film.of(tracks)
     assert not bool(film.seen[2:5, 7].any()) and not bool(film.seen[0, 3]) and int((~film.seen).sum()) == 4
     assert bool((film.x[~film.seen] == 0).all()) and bool(film.x.isfinite().all())
     assert film.lengths.tolist() == [10] * 3 + [9] + [10] * 36  # from the first to the last frame, holes included
 
 
 def test_equal_points_do_not_divide_by_zero():
-    film = Film.of(torch.full((3, 10, 2), 5.0, dtype=F64), 2.5)
+    film = Film.of(torch.full((3, 10, 2), 5.0, dtype=F64))
     assert bool(film.x.isfinite().all()) and film.pixel > 0
 
 
@@ -66,13 +66,8 @@ def test_a_pair_holds_the_tracks_of_both_frames_and_trusts_those_that_move_littl
     torch.testing.assert_close(pair.view.x2, film.x[13][pair.index])
     still = film.pair((10, 10), OPTIONS.frames)
     assert bool((still.precision == 1).all()) and bool((pair.precision < 1).all()) and bool((pair.precision > 0).all())
-    place = torch.full((film.x.shape[1],), -1)
-    some = pair.index[::2]
-    place[some] = torch.arange(len(some))
-    part = pair.of(place)
-    assert part.index.tolist() == list(range(len(some)))
-    torch.testing.assert_close(part.view.x2, film.x[13][some])
-    torch.testing.assert_close(part.precision, pair.precision[::2])
+    groups = torch.ones(1, film.x.shape[1], dtype=torch.bool)
+    torch.testing.assert_close(pair.weighed(groups)[0] * pair.precision.mean(), pair.precision)
 
 
 def test_pairs_are_spread_evenly():
@@ -124,7 +119,7 @@ def test_no_pair_where_no_frames_have_enough_in_common():
     tracks = torch.full_like(scene.tracks, torch.nan)
     for track in range(30):
         tracks[track % 6, track] = scene.tracks[track % 6, track]
-    assert chosen_pairs(Film.of(tracks, 2.5), OPTIONS.frames) == []
+    assert chosen_pairs(Film.of(tracks), OPTIONS.frames) == []
 
 
 def test_plain_videos_have_no_cut():
@@ -139,7 +134,7 @@ def test_a_cut_is_where_the_tracks_end_and_others_begin(frame):
     before, after = tracks.clone(), tracks.clone()
     before[frame:], after[:frame] = torch.nan, torch.nan
     before[:, :4] = tracks[:, :4]  # a few are taken for the same
-    cut = cut_of(Film.of(torch.cat([before, after], 1), 2.5), OPTIONS.frames)
+    cut = cut_of(Film.of(torch.cat([before, after], 1)), OPTIONS.frames)
     assert cut is not None and cut.frame == frame
     assert cut.share == pytest.approx(4 / 60, abs=0.02) and cut.jump == 0
 
@@ -150,11 +145,11 @@ def test_a_cut_is_where_all_tracks_jump(frame):
     tracks = scene.tracks.clone()
     shuffled = torch.randperm(80, generator=draw(1))
     tracks[frame:] = tracks[frame:][:, shuffled]
-    cut = cut_of(Film.of(tracks, 2.5), OPTIONS.frames)
+    cut = cut_of(Film.of(tracks), OPTIONS.frames)
     assert cut is not None and cut.frame == frame and cut.jump > 5
 
 
 def test_some_tracks_that_jump_are_no_cut():
     tracks = shot((60, 20)).tracks.clone()
     tracks[5:, :20] += 300.0
-    assert cut_of(Film.of(tracks, 2.5), OPTIONS.frames) is None
+    assert cut_of(Film.of(tracks), OPTIONS.frames) is None

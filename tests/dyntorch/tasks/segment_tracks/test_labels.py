@@ -11,7 +11,6 @@ from dyntorch.geometry.epipolar import sampson_squared
 from dyntorch.geometry.homogeneous import apply
 from dyntorch.metrics import relative_error
 from dyntorch.tasks.segment.search import one_hot
-from dyntorch.tasks.segment_tracks.descent import TrackEvidence, unlinked
 from dyntorch.tasks.segment_tracks.frames import Film
 from dyntorch.tasks.segment_tracks.labels import agreeing, distances, motions, outliers, resting, widths
 from tests.dyntorch.tasks.segment_tracks.films import F64, OPTIONS, Shot, shot
@@ -37,8 +36,7 @@ def true_geometry(scene: Shot) -> list[torch.Tensor]:
 
 
 def moved(scene: Shot):
-    evidence = TrackEvidence.of(pairs_of(scene), unlinked(len(scene.labels), torch.device("cpu")))
-    return motions(evidence, true_geometry(scene), members(scene), scene.film(), OPTIONS)
+    return motions(pairs_of(scene), true_geometry(scene), members(scene), scene.film(), OPTIONS)
 
 
 def test_distances_are_in_pixels_and_missing_where_a_track_is():
